@@ -145,7 +145,7 @@ def test_a_zip_is_kept_without_ever_being_whole_in_memory(services: Services, tm
     assert len(load_asset_files(services.store, AssetKind.OBJECT, asset.digest)) == 5
 
 
-def test_a_zip_on_disk_and_its_files_in_memory_are_the_same_asset() -> None:
+def test_a_zip_on_disk_and_in_memory_are_the_same_asset() -> None:
     data = folder_of(2, 100_000)
     streamed = files_of_upload(AssetKind.OBJECT, "thing.zip", data, limit_bytes=MIB)
     held = dict(streamed)

@@ -182,7 +182,7 @@ def test_a_full_disk_is_said_and_the_upload_may_come_again(
     assert http.post("/v1/objects", files={"file": ("box.stl", STL)}).status_code == 202
 
 
-def test_redis_that_drops_in_the_middle_of_a_claim_forgets_a_quota_not_a_job() -> None:
+def test_redis_lost_in_the_middle_of_a_claim_forgets_no_job() -> None:
     class Dropping:
         calls = 0
 

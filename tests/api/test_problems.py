@@ -69,7 +69,7 @@ def test_a_page_has_between_1_and_200_items(http: TestClient, limit: int) -> Non
     problem(http.get("/v1/jobs", params={"limit": limit}), 422, "invalid-input")
 
 
-def test_a_body_over_the_limit_is_refused_by_its_length_or_while_it_arrives(http: TestClient) -> None:
+def test_a_body_over_the_limit_is_refused_by_length_or_arrival(http: TestClient) -> None:
     for content in (b" " * (2 << 20), (b" " * 65536 for _ in range(32))):
         problem(http.post("/v1/jobs", content=content), 413, "too-large")
 

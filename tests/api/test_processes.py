@@ -127,7 +127,7 @@ def test_both_count_one_rate(twins: Twins) -> None:
     assert [clients[i % 2].get("/v1/jobs", headers=headers).status_code for i in range(4)] == [200] * 2 + [429] * 2
 
 
-def test_a_session_of_one_opens_the_other_until_its_key_is_revoked(twins: Twins) -> None:
+def test_a_session_opens_both_until_its_key_is_revoked(twins: Twins) -> None:
     token = twins.keys.add("browser", Scope.READ)
     answer = httpx.post(f"{twins.urls[0]}/login", data={"key": token}, trust_env=False, timeout=60)
     cookies = {"graspd_session": answer.cookies["graspd_session"]}

@@ -125,7 +125,7 @@ def test_chosen_cells_stay_chosen_while_the_matrix_moves(page: Any, services: Se
     assert page.inner_text("[data-chosen]") == "1 cell chosen"
 
 
-def test_a_press_on_a_head_takes_the_column_and_submits_its_cells(page: Any) -> None:
+def test_a_press_on_a_head_takes_and_submits_the_column(page: Any) -> None:
     page.goto("/datasets")
     page.click("thead button:has-text('allegro')")
     assert page.inner_text("[data-chosen]") == "3 cells chosen"
@@ -305,7 +305,7 @@ def test_an_error_is_a_page_of_its_own(page: Any) -> None:
     assert "Back to the overview" in answer.text()
 
 
-def test_grasps_are_chosen_by_keyboard_tagged_found_by_their_tag_and_taken_home(page: Any, services: Services) -> None:
+def test_grasps_are_chosen_tagged_found_and_exported_by_keyboard(page: Any, services: Services) -> None:
     finish_all(services, add_job(services))
     page.goto("/grasps?view=table")
     assert page.is_disabled("button:has-text('Export')")

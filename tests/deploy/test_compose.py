@@ -39,7 +39,7 @@ def test_the_specification_refuses_a_gpu_without_capabilities(tmp_path: Any) -> 
     assert subprocess.run(command, capture_output=True, check=False).returncode == 1
 
 
-def test_gpu_workers_see_every_gpu_and_share_the_folder_that_tells_them_apart() -> None:
+def test_gpu_workers_see_every_gpu_and_share_a_folder() -> None:
     """With `count: 1` Docker gives each of them the first GPU."""
     gpu = composition.load(FILLED | {"GRASPD_GPU_WORKERS": "4"})["services"]["worker-gpu"]
     (devices,) = gpu["deploy"]["resources"]["reservations"]["devices"]
@@ -48,7 +48,7 @@ def test_gpu_workers_see_every_gpu_and_share_the_folder_that_tells_them_apart() 
 
 
 @pytest.mark.parametrize("name", sorted(SERVICES))
-def test_every_service_has_a_version_limits_a_restart_policy_and_bounded_logs(name: str) -> None:
+def test_every_service_has_a_version_limits_and_bounded_logs(name: str) -> None:
     service = SERVICES[name]
     assert re.match(r"v?\d", service["image"].partition(":")[2]), f"{service['image']} floats"
     assert "memory" in service["deploy"]["resources"]["limits"]
@@ -68,7 +68,7 @@ def test_the_environment_is_made_of_settings_that_can_be_read(name: str, monkeyp
 
 
 @pytest.mark.parametrize("name", OURS)
-def test_docker_waits_for_our_containers_and_they_have_no_rights_to_lose(name: str) -> None:
+def test_docker_waits_for_our_containers_without_rights(name: str) -> None:
     service = SERVICES[name]
     wait = composition.seconds(service["stop_grace_period"])
     assert wait > float(service["environment"]["GRASPD_STOP_GRACE_S"])
@@ -141,6 +141,6 @@ def test_secrets_stay_out_of_the_repository() -> None:
 
 
 @pytest.mark.parametrize("name", [name for name in OURS if name.startswith("worker")])
-def test_a_worker_makes_room_before_its_container_is_killed_for_memory(name: str) -> None:
+def test_a_worker_makes_room_before_its_container_is_killed(name: str) -> None:
     limit_gb = int(SERVICES[name]["deploy"]["resources"]["limits"]["memory"].removesuffix("G"))
     assert int(SERVICES[name]["environment"]["GRASPD_WORKER_MAX_MEMORY_MB"]) < 1000 * limit_gb

@@ -92,7 +92,7 @@ def test_the_images_run_a_python_that_graspd_supports() -> None:
 
 
 @pytest.mark.parametrize("image", IMAGES)
-def test_an_image_starts_a_command_of_graspd_as_a_numbered_user_and_tells_its_health(image: str) -> None:
+def test_an_image_starts_graspd_as_a_numbered_user(image: str) -> None:
     assert re.fullmatch(r"[1-9]\d{3,}:[1-9]\d{3,}", last(image, "USER"))
     assert json.loads(last(image, "ENTRYPOINT")) == ["graspd"]
     assert json.loads(last(image, "CMD"))[0] in COMMANDS
@@ -137,7 +137,7 @@ def test_any_user_of_group_0_may_write_the_two_folders() -> None:
 
 
 @pytest.mark.parametrize("name", sorted(name for name, service in SERVICES.items() if "build" in service))
-def test_compose_builds_targets_that_exist_and_runs_commands_that_exist(name: str) -> None:
+def test_compose_builds_targets_and_runs_commands_that_exist(name: str) -> None:
     service = SERVICES[name]
     assert service["build"]["target"] in IMAGES
     assert service["command"][0] in COMMANDS

@@ -86,7 +86,7 @@ def without_engine(*command: str, absent: str = "warp,newton,trimesh,mujoco,scip
 
 
 @pytest.mark.parametrize("command", ["worker", "synth", "demo", "up", "admin gallery"])
-def test_a_command_of_a_room_that_is_not_installed_says_what_to_install(command: str) -> None:
+def test_a_command_that_is_not_installed_says_what_to_install(command: str) -> None:
     done = without_engine(*command.split())
     assert done.returncode == 1
     assert done.stderr.startswith(f"graspd: `graspd {command}` is not part of this install; run pip install 'graspd[")

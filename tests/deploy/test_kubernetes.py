@@ -99,7 +99,7 @@ def test_the_documents_of_keda_hold_only_fields_that_keda_has() -> None:
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_a_variant_can_be_rendered_with_all_images_pinned_and_ours_of_the_package(variant: str) -> None:
+def test_a_variant_is_rendered_with_all_images_pinned(variant: str) -> None:
     images = re.findall(r"image: (\S+)", yaml.safe_dump_all(rendered(variant)))
     assert images and [image for image in images if not re.search(r":v?\d+\.\d+\.\d+", image)] == []
     assert {image.partition(":")[2] for image in images if image.startswith("graspd-")} == {PACKAGE_VERSION}
@@ -218,7 +218,7 @@ def test_the_probes_are_routes_and_checks_that_exist() -> None:
 
 
 @pytest.mark.parametrize("name", sorted({name for name, _ in pods()} - {"api", "redis"}))
-def test_a_controller_or_worker_that_stands_still_is_started_again(name: str) -> None:
+def test_a_controller_or_worker_that_hangs_is_started_again(name: str) -> None:
     for found, container in containers():
         if found == name:
             assert container["livenessProbe"]["periodSeconds"] * container["livenessProbe"]["failureThreshold"] >= 60

@@ -34,7 +34,7 @@ def _is_installed(name: str) -> bool:
         return False
 
 
-def test_every_package_is_on_the_page_with_a_licence_that_is_accepted(licences: ModuleType) -> None:
+def test_every_package_is_on_the_page_with_an_accepted_licence(licences: ModuleType) -> None:
     wanted = [one for one in licences.pin.requirements(*licences.EXTRAS) if _is_installed(one.name)]
     rows = dict(
         line.strip("| ").split(" | ") for line in licences.PAGE.read_text().splitlines() if line.startswith("| ")

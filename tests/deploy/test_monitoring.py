@@ -51,7 +51,7 @@ def parsed(expression: str) -> Any:
 
 
 @pytest.mark.parametrize(("who", "expression"), expressions(), ids=lambda text: text[:40])
-def test_series_and_labels_exist_and_only_what_grows_is_taken_for_a_rate(who: str, expression: str) -> None:
+def test_series_and_labels_exist_and_rates_are_of_counters(who: str, expression: str) -> None:
     asked: set[str] = set()
     for node in nodes(parsed(expression)):
         if isinstance(node, promql_parser.Call) and node.func.name in ("rate", "increase"):

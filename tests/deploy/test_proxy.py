@@ -104,14 +104,14 @@ def proxy(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Proxy]:
             process.wait(timeout=60)
 
 
-def test_a_key_opens_the_api_through_tls_and_a_stranger_is_asked_for_one(proxy: Proxy) -> None:
+def test_a_key_opens_the_api_through_tls(proxy: Proxy) -> None:
     assert proxy.client.get("/v1/jobs").status_code == 401
     answer = proxy.client.get("/v1/jobs", headers={"Authorization": f"Bearer {proxy.key}"})
     assert answer.status_code == 200, answer.text
     assert "max-age" in answer.headers["strict-transport-security"]
 
 
-def test_a_browser_signs_in_through_the_proxy_but_not_from_another_page(proxy: Proxy) -> None:
+def test_a_browser_signs_in_through_the_proxy(proxy: Proxy) -> None:
     assert proxy.client.get("/login").status_code == 200
     own = {"Origin": f"https://{proxy.host}", "Sec-Fetch-Site": "same-origin"}
     answer = proxy.client.post("/login", data={"key": proxy.key}, headers=own)

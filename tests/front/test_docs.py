@@ -52,7 +52,7 @@ def test_the_page_runs_as_it_is_printed(environment: dict[str, str], tmp_path: P
     assert "no_such_file.stl" in said
 
 
-def test_every_public_name_has_a_docstring_whose_first_line_is_short() -> None:
+def test_every_public_name_has_a_docstring_that_begins_short() -> None:
     named = {name: getattr(graspd, name) for name in graspd.__all__ if not name.startswith("_")}
     for name, value in list(named.items()):
         if inspect.isclass(value):

@@ -32,7 +32,7 @@ def test_commands_of_a_page_are_those_of_the_command_line(page: Path) -> None:
     assert {text: fault for text, fault in faults.items() if fault} == {}
 
 
-def test_commands_in_sentences_messages_and_examples_of_help_exist() -> None:
+def test_commands_in_sentences_messages_and_help_exist() -> None:
     files = [*REPOSITORY.glob("*.md")]
     for room in ("api", "docker", "docs", "graspd", "service", "worker"):
         files += [file for file in (REPOSITORY / room).rglob("*") if file.suffix in {".html", ".md", ".py", ".yaml"}]
@@ -84,7 +84,7 @@ def test_blocks_of_both_kinds_are_read_and_comments_are_not(tmp_path: Path) -> N
         ("bottle: 3 faces, repaired\n", "bottle: 3 faces, repaired"),
     ],
 )
-def test_what_a_page_shows_is_held_against_what_came_but_for_numbers(shown: str, missed: str) -> None:
+def test_what_a_page_shows_is_compared_but_for_numbers(shown: str, missed: str) -> None:
     came = "mug: 12 grasps, 12 valid\ngraspd: refused: the mesh is 178.5 m long, too large to grasp; say --units mm\n"
     assert Line("page.md", "graspd jobs", shown=shown).misses(came) == missed
 

@@ -40,7 +40,7 @@ def test_a_closed_output_is_no_fault() -> None:
     assert (done.returncode, done.stderr) == (0, "")
 
 
-def test_a_file_that_is_opened_does_not_take_the_place_of_a_closed_output(tmp_path: Path) -> None:
+def test_a_file_does_not_take_the_place_of_a_closed_output(tmp_path: Path) -> None:
     code = (
         "import os, sys; from service.cli import at_the_door; "
         "at_the_door(lambda: (os.write(1, b'noise'), open(sys.argv[1], 'w').close(), os.write(1, b'noise')))"
@@ -154,7 +154,5 @@ def test_a_file_of_no_kind_is_named(command: str, tmp_path: Path, monkeypatch: p
     assert "FILE" in refused(command, tmp_path, monkeypatch)
 
 
-def test_a_folder_in_the_place_of_a_file_is_refused_before_the_work(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_folder_in_the_place_of_a_file_is_refused_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert "is a folder" in refused("synth --hand allegro --object mug -o .", tmp_path, monkeypatch)

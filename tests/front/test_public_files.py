@@ -147,7 +147,7 @@ def test_the_errors_are_one_tree() -> None:
 
 
 @pytest.mark.parametrize("marker", ["__init__.py", None])
-def test_a_folder_that_hides_one_of_graspds_own_is_named_in_one_line(tmp_path: Path, marker: str | None) -> None:
+def test_a_folder_that_hides_one_of_graspds_own_is_named(tmp_path: Path, marker: str | None) -> None:
     hiding = tmp_path / "worker"
     hiding.mkdir()
     if marker:

@@ -38,7 +38,7 @@ def test_the_floors_are_those_that_the_contracts_keep(package: str) -> None:
     assert layers == [set(re.findall(r"\w+", layer)) for layer in kept]
 
 
-def test_the_files_to_open_for_a_change_are_there_and_as_many_as_it_says() -> None:
+def test_the_files_to_open_for_a_change_are_there() -> None:
     rows = rows_of("I want to ... | open these files | files")
     assert len(rows) >= 8
     for wish, files, number in rows:

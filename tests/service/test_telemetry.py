@@ -142,9 +142,7 @@ def test_a_controller_lives_also_while_redis_is_away(
         thread.join()
 
 
-def test_a_file_that_cannot_be_touched_is_said_once_and_ends_nothing(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_file_that_cannot_be_touched_ends_nothing(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     alive = HeartbeatFile(tmp_path / "absent" / "alive")
     alive.touch()
     alive.touch()

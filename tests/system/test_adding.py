@@ -106,7 +106,7 @@ def test_a_hand_that_cannot_be_used_is_refused_with_the_mend(graspd: Shell) -> N
     assert "slide_left" in said and len(said.strip().splitlines()) == 1
 
 
-def test_an_object_is_refused_and_gets_in_with_the_mend_that_was_named(graspd: Shell) -> None:
+def test_a_refused_object_gets_in_with_the_named_fix(graspd: Shell) -> None:
     code, _, said = graspd("objects", "add", "brick.stl")
     assert code == 2 and "--units mm" in said
     code, brick, _ = graspd("objects", "add", "brick.stl", "--units", "mm", "--density", "500")

@@ -38,7 +38,7 @@ def makers(system: System) -> set[str]:
 
 
 @pytest.mark.chaos
-def test_a_worker_makes_room_after_so_many_tasks_and_no_task_is_disturbed(start: Start) -> None:
+def test_a_worker_makes_room_after_so_many_tasks(start: Start) -> None:
     system = start(worker_max_tasks=2)
     (done,) = system.finish(system.submit(request(grasps=32 * 6)))
     assert (done.state, done.grasps) == (State.SUCCEEDED, 32 * 6)
@@ -128,9 +128,7 @@ def test_steady_small_jobs_do_not_stop_a_dataset(start: Start) -> None:
 
 
 @pytest.mark.chaos
-def test_a_worker_whose_engine_breaks_hands_its_tasks_back_and_returns_when_it_is_mended(
-    start: Callable[..., System], tmp_path: Path
-) -> None:
+def test_a_worker_whose_engine_breaks_returns_when_it_is_fixed(start: Callable[..., System], tmp_path: Path) -> None:
     broken = tmp_path / "broken"
     system = start(api=True, environment={"FAKE_BROKEN": str(broken)})
     system.finish(system.submit(request(seed=1)))
@@ -196,7 +194,7 @@ def load() -> Iterator[None]:
 @pytest.mark.chaos
 @pytest.mark.slow
 @pytest.mark.timeout(_LONGEST_S)
-def test_on_a_busy_machine_no_worker_is_lost_though_its_tasks_let_nothing_else_run(
+def test_on_a_busy_machine_no_worker_is_lost(
     start: Callable[..., System],
 ) -> None:
     """Each task holds the interpreter lock for two leases, as a kernel that compiles does."""

@@ -28,7 +28,7 @@ def submitted(system: System, grasps: int, *, span: int) -> str:
     return job_actions.enter(system.services, record.model_copy(update={"span": span}))[0].id
 
 
-def test_the_range_of_a_killed_worker_is_made_again_and_its_result_appears_once(start: Start) -> None:
+def test_the_range_of_a_killed_worker_is_made_again_once(start: Start) -> None:
     system = start(lease_s=2.0)
     system.hold.touch()
     job = submitted(system, 32 * 5, span=3)
@@ -51,7 +51,7 @@ def test_the_range_of_a_killed_worker_is_made_again_and_its_result_appears_once(
     assert len(np.unique(rows, axis=0)) == 160, "no batch is there twice"
 
 
-def test_a_worker_killed_between_shard_and_event_has_its_task_done_all_the_same(start: Start, tmp_path: Path) -> None:
+def test_a_worker_killed_before_its_event_has_its_task_done(start: Start, tmp_path: Path) -> None:
     killed = tmp_path / "killed"
     system = start(environment={"FAKE_DIE_UNTOLD": str(killed)})
     job = submitted(system, 96, span=3)

@@ -65,9 +65,7 @@ def test_a_worker_killed_in_mid_synthesis_leaves_the_same_grasps(start: Callable
 
 @pytest.mark.chaos
 @pytest.mark.slow
-def test_a_job_with_an_uploaded_network_gives_the_grasps_of_synth_with_the_file(
-    start: Callable[..., System], tmp_path: Path
-) -> None:
+def test_a_job_with_a_network_gives_the_grasps_of_synth(start: Callable[..., System], tmp_path: Path) -> None:
     hand = hand_from_path("barrett")
     file = tmp_path / "net.npz"
     file.write_bytes(to_bytes(random_network(hand.joint_names, hand=hand.name, digest=hand.digest)))

@@ -35,7 +35,7 @@ def closed(settings: Settings, services: Services, keys: KeyFile) -> Iterator[tu
         yield client, tokens
 
 
-def test_without_a_key_or_with_a_wrong_one_a_closed_service_answers_401(
+def test_a_closed_service_answers_401_without_a_good_key(
     closed: tuple[TestClient, dict[Scope, str]],
 ) -> None:
     client, tokens = closed
@@ -51,7 +51,7 @@ def test_without_a_key_or_with_a_wrong_one_a_closed_service_answers_401(
 
 
 @pytest.mark.parametrize("scope", Scope)
-def test_a_reader_may_read_and_a_wider_scope_includes_the_narrower(
+def test_a_reader_only_reads_and_a_wider_scope_includes_it(
     closed: tuple[TestClient, dict[Scope, str]], keys: KeyFile, scope: Scope
 ) -> None:
     client, tokens = closed
@@ -107,7 +107,7 @@ def test_keys_are_kept_hashed_in_a_private_file(keys: KeyFile) -> None:
     assert stat.S_IMODE(keys.path.stat().st_mode) == 0o600
 
 
-def test_two_live_keys_cannot_share_a_name_but_a_revoked_one_is_free(keys: KeyFile) -> None:
+def test_two_live_keys_cannot_share_a_name(keys: KeyFile) -> None:
     keys.add("me", Scope.READ)
     with pytest.raises(ConflictError):
         keys.add("me", Scope.READ)
@@ -118,7 +118,7 @@ def test_two_live_keys_cannot_share_a_name_but_a_revoked_one_is_free(keys: KeyFi
         keys.revoke("nobody")
 
 
-def test_a_rotated_key_keeps_its_scope_and_limits_and_loses_its_secret(keys: KeyFile) -> None:
+def test_a_rotated_key_keeps_scope_and_limits_not_its_secret(keys: KeyFile) -> None:
     old = keys.add("me", Scope.SUBMIT, limits=KeyLimits(jobs_per_day=3))
     new = keys.rotate("me")
     found = keys.find(new)
@@ -220,7 +220,7 @@ def test_a_form_on_a_foreign_page_is_refused(http: TestClient, name: str, value:
     assert http.post("/submit", data=JOB, headers={name: value}).status_code == 403
 
 
-def test_a_rebound_host_name_reaches_nothing_while_the_service_is_open(http: TestClient) -> None:
+def test_a_rebound_host_name_reaches_nothing_of_an_open_service(http: TestClient) -> None:
     assert http.get("/v1/jobs", headers={"Host": "evil.example"}).status_code == 421
 
 

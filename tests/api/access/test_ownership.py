@@ -52,7 +52,7 @@ def submitted(client: TestClient, headers: Headers) -> str:
 
 
 @WHO
-def test_a_job_is_cancelled_retried_and_deleted_by_its_key_or_an_admin(
+def test_a_job_is_changed_by_its_key_or_an_admin(
     client: TestClient, people: dict[str, Headers], services: Services, who: str, may: bool
 ) -> None:
     job = submitted(client, people["ann"])
@@ -78,7 +78,7 @@ def test_a_dataset_of_another_key_is_left_alone(
 
 
 @WHO
-def test_a_dataset_is_cancelled_deleted_and_restored_by_its_key_or_an_admin(
+def test_a_dataset_is_changed_by_its_key_or_an_admin(
     client: TestClient, people: dict[str, Headers], services: Services, who: str, may: bool
 ) -> None:
     client.post("/v1/datasets", json=MATRIX, headers=people["ann"])
@@ -92,7 +92,7 @@ def test_a_dataset_is_cancelled_deleted_and_restored_by_its_key_or_an_admin(
     assert client.get("/v1/datasets/d", headers=people["eve"]).status_code == (200 if may else 404)
 
 
-def test_a_job_of_another_key_survives_the_end_of_a_dataset_that_has_it_too(
+def test_a_shared_job_survives_the_end_of_another_keys_dataset(
     client: TestClient, people: dict[str, Headers], services: Services
 ) -> None:
     job = submitted(client, people["ann"])
@@ -125,7 +125,7 @@ def test_a_job_from_before_there_were_keys_takes_an_admin(
     assert client.post(f"/v1/jobs/{old}/cancel", headers=people["root"]).status_code == 202
 
 
-def test_a_rotated_key_keeps_what_it_submitted_and_a_later_one_of_its_name_has_nothing(
+def test_a_rotated_key_keeps_its_jobs_and_a_later_one_has_none(
     client: TestClient, people: dict[str, Headers], keys: KeyFile
 ) -> None:
     job, other = submitted(client, people["ann"]), bearer(keys.rotate("ann"))
@@ -192,7 +192,7 @@ def test_chosen_jobs_of_others_are_counted_as_left(client: TestClient, people: d
 
 
 @WHO
-def test_objects_networks_and_sets_are_changed_by_their_key_or_an_admin(
+def test_objects_networks_and_sets_are_changed_by_their_key(
     client: TestClient, people: dict[str, Headers], who: str, may: bool
 ) -> None:
     def put(headers: Headers, *objects: str) -> int:

@@ -67,9 +67,7 @@ def refused(answer: Any) -> str:
     return str(answer.json()["detail"])
 
 
-def test_keys_of_a_project_share_its_grasps_in_work_and_another_project_has_its_own(
-    ask: Ask, settings: Settings, services: Services
-) -> None:
+def test_keys_of_a_project_share_its_grasps_in_work(ask: Ask, settings: Settings, services: Services) -> None:
     limit(settings, grasps_in_flight=64)
     first = ask("ann", 1).json()["id"]
     assert ask("amy", 2).status_code == 202
@@ -79,9 +77,7 @@ def test_keys_of_a_project_share_its_grasps_in_work_and_another_project_has_its_
     assert ask("amy", 3).status_code == 202, "one of ann's ended"
 
 
-def test_keys_of_a_project_share_the_grasps_that_it_may_ask_for_on_a_day(
-    ask: Ask, settings: Settings, services: Services
-) -> None:
+def test_keys_of_a_project_share_its_grasps_of_a_day(ask: Ask, settings: Settings, services: Services) -> None:
     limit(settings, grasps_per_day=96)
     first = ask("ann", 1).json()["id"]
     finish_all(services, read_record(JobRecord, services.store, names.job_record(first)))
@@ -95,9 +91,7 @@ def test_keys_of_a_project_share_the_grasps_that_it_may_ask_for_on_a_day(
     assert ask("bob", 2).status_code == 202
 
 
-def test_a_project_that_used_up_its_gpu_seconds_of_the_day_submits_no_more(
-    ask: Ask, settings: Settings, services: Services
-) -> None:
+def test_a_project_without_gpu_seconds_left_submits_no_more(ask: Ask, settings: Settings, services: Services) -> None:
     limit(settings, gpu_seconds_per_day=60)
     made = [ask("ann", seed).json()["id"] for seed in (1, 2)]
     waiting = ask("ann", 3).json()["id"]
@@ -111,7 +105,7 @@ def test_a_project_that_used_up_its_gpu_seconds_of_the_day_submits_no_more(
     assert not services.index.jobs.get(waiting).state.is_final, "what was submitted before goes on"
 
 
-def test_usage_is_told_as_a_document_and_as_a_table_of_the_own_project_alone(
+def test_usage_is_told_of_the_own_project_alone(
     ask: Ask, service: TestClient, settings: Settings, services: Services
 ) -> None:
     for name, seed in (("ann", 1), ("bob", 2)):

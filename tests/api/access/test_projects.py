@@ -235,7 +235,7 @@ def _state(world: World) -> Any:
     return gone, jobs, data["cancelled"], data["state"], get("/v1/object-sets/red-secret-set")["objects"]
 
 
-def test_what_is_not_within_reach_is_refused_as_if_it_were_not_there(world: World) -> None:
+def test_what_is_out_of_scope_is_refused_as_if_it_were_absent(world: World) -> None:
     gone, waiting, shard = "nothing-of-this-name", world.said["waiting"], world.said["shard_id"]
     hidden = {"jobs": waiting, "datasets": "red-secret-data", "objects": "red-secret-ball", "shards": shard}
     for kind, name in hidden.items():
@@ -264,7 +264,7 @@ def test_lists_of_a_project_hold_what_is_its_own(world: World) -> None:
     assert world.client.get("/v1/grasps", headers=world.people["old"]).json()["items"] == []
 
 
-def test_the_same_request_of_two_projects_is_two_jobs_whose_shards_are_made_once(world: World) -> None:
+def test_one_request_of_two_projects_is_two_jobs_of_one_shard(world: World) -> None:
     job = world.post("/v1/jobs", world.people["bob"], json=JOB).json()
     assert job["id"] != world.said["job_id"] and job["state"] == "succeeded"
     assert world.said["shard_id"] in [shard["id"] for shard in job["shards"]]
@@ -304,7 +304,7 @@ def test_the_same_network_of_two_projects_is_two_networks(world: World) -> None:
     assert world.client.get("/v1/networks/red-secret-net", headers=world.people["ann"]).status_code == 200
 
 
-def test_what_is_shared_is_used_by_every_project_and_deleted_by_its_own(world: World) -> None:
+def test_what_is_shared_is_used_by_all_and_deleted_by_its_own(world: World) -> None:
     data = {"name": "common", "shared": "true"}
     file = {"file": ("common.stl", _BALL.replace(b"ball", b"common"))}
     made = world.post("/v1/objects", world.people["ann"], data=data, files=file).json()
@@ -317,7 +317,7 @@ def test_what_is_shared_is_used_by_every_project_and_deleted_by_its_own(world: W
     assert world.client.delete("/v1/objects/common", headers=world.people["amy"]).status_code == 204
 
 
-def test_an_upload_that_brings_the_mark_of_a_project_is_not_that_projects_object(world: World) -> None:
+def test_an_upload_with_the_mark_of_a_project_is_not_its_own(world: World) -> None:
     made = world.services.index.assets.get(AssetKind.OBJECT, world.said["objects_digest"])
     stored = world.services.store.get(names.asset_files(AssetKind.OBJECT, made.digest))
     with zipfile.ZipFile(io.BytesIO(stored)) as archive:
@@ -330,7 +330,7 @@ def test_an_upload_that_brings_the_mark_of_a_project_is_not_that_projects_object
         world.client.delete("/v1/objects/forged", headers=world.people["old"])
 
 
-def test_a_name_that_another_project_took_is_refused_without_a_word_of_it(world: World) -> None:
+def test_a_name_of_another_project_is_refused_without_detail(world: World) -> None:
     matrix = {"name": "red-secret-data", "hands": ["allegro"], "objects": ["mug"], "grasps": 32}
     answer = world.post("/v1/datasets", world.people["bob"], json=matrix)
     assert answer.status_code == 409 and "bottle" not in answer.text and "another dataset" not in answer.text

@@ -57,7 +57,7 @@ def test_whom_the_proxy_vouches_for_has_the_rights_of_the_group(
     assert key is not None and (key.name, key.project, key.scope) == ("ann@lab.example", project, scope)
 
 
-def test_people_of_a_project_find_their_jobs_and_not_those_of_another(behind: Settings, services: Services) -> None:
+def test_people_of_a_project_find_their_jobs_and_no_others(behind: Settings, services: Services) -> None:
     http = client(behind, services, PROXY)
     job = http.post("/v1/jobs", json=JOB, headers=headers()).json()["id"]
     assert http.get(f"/v1/jobs/{job}", headers=headers("amy@lab.example")).json()["project"] == "red"
@@ -91,7 +91,7 @@ def test_forged_headers_open_nothing(
 
 @pytest.mark.parametrize("claim", ['["x", 9999999999]', "[]", "3", "{", '{"a": 1}', '["x", "y"]', "null"])
 @pytest.mark.parametrize("path", ["/", "/v1/jobs", "/login"])
-def test_a_session_that_is_signed_with_the_empty_secret_opens_nothing(
+def test_a_session_signed_with_the_empty_secret_opens_nothing(
     behind: Settings, services: Services, claim: str, path: str
 ) -> None:
     assert not behind.resolved_keys_file.exists()

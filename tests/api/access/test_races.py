@@ -79,7 +79,7 @@ def test_thirty_jobs_at_once_over_two_apis_stay_within_the_quota(
     assert answers == [202] * 4 + [429] * 26
 
 
-def test_a_job_that_is_being_entered_is_not_taken_for_one_that_ended(
+def test_a_job_that_is_being_entered_is_not_taken_for_ended(
     quotas: Callable[[Unfinished], Quotas], rq_queue: RqQueue
 ) -> None:
     nothing_known = quotas(lambda ids: set())
@@ -88,7 +88,7 @@ def test_a_job_that_is_being_entered_is_not_taken_for_one_that_ended(
     assert held(rq_queue) == 20
 
 
-def test_a_job_that_is_retried_while_somebody_looks_stays_counted(
+def test_a_job_that_is_retried_meanwhile_stays_counted(
     quotas: Callable[[Unfinished], Quotas], rq_queue: RqQueue
 ) -> None:
     one = quotas(lambda ids: set())
@@ -207,7 +207,7 @@ def projects(settings: Settings) -> list[dict[str, str]]:
     return list(people_of(settings, red=(Scope.SUBMIT, "red"), blue=(Scope.SUBMIT, "blue")).values())
 
 
-def test_of_two_projects_that_want_one_name_of_a_set_at_once_one_gets_it(
+def test_of_two_projects_that_want_one_set_name_one_gets_it(
     twins: list[TestClient], projects: list[dict[str, str]], services: Services
 ) -> None:
     for number in range(ROUNDS):
@@ -217,7 +217,7 @@ def test_of_two_projects_that_want_one_name_of_a_set_at_once_one_gets_it(
     assert strayed(services) == []
 
 
-def test_of_two_versions_of_a_set_at_once_the_later_follows_the_earlier(
+def test_of_two_versions_of_a_set_at_once_one_follows_the_other(
     twins: list[TestClient], headers: dict[str, str], services: Services
 ) -> None:
     for number in range(ROUNDS):

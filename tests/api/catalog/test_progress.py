@@ -45,7 +45,7 @@ def status_of(stage: StageProgress, *tasks: TaskView, paces: Paces | None = None
     return status
 
 
-def test_the_rate_of_a_running_batch_is_what_it_did_since_it_was_first_seen() -> None:
+def test_the_rate_of_a_batch_is_what_it_did_since_first_seen() -> None:
     clock = Clock()
     paces = Paces(clock)
     stage = StageProgress(stage=Stage.SYNTHESIZE, tasks=1, running=1, done=0.2)
@@ -68,14 +68,14 @@ def test_a_stage_that_waits_says_why() -> None:
     ("queued", "succeeded", "reused", "seconds", "eta"),
     [(2, 2, 0, 20.0, pytest.approx(20.0)), (1, 3, 2, 10.0, pytest.approx(10.0)), (2, 2, 2, 0.0, None)],
 )
-def test_finished_batches_that_are_not_reused_give_the_rate_when_none_is_seen_running(
+def test_finished_batches_give_the_rate_unless_they_were_reused(
     queued: int, succeeded: int, reused: int, seconds: float, eta: Any
 ) -> None:
     counts = {"tasks": 4, "queued": queued, "succeeded": succeeded, "reused": reused, "done": float(succeeded)}
     assert status_of(StageProgress(stage=Stage.SYNTHESIZE, seconds=seconds, **counts)).eta_s == eta
 
 
-def test_a_job_has_no_end_in_sight_while_the_pace_of_a_stage_is_unknown() -> None:
+def test_a_job_has_no_end_in_sight_while_a_pace_is_unknown() -> None:
     known = StageProgress(stage=Stage.SYNTHESIZE, tasks=2, running=1, succeeded=1, done=1.0, seconds=10.0)
     unknown = StageProgress(stage=Stage.SCENE, tasks=2, queued=2)
     whole = job(known, unknown)
@@ -84,7 +84,7 @@ def test_a_job_has_no_end_in_sight_while_the_pace_of_a_stage_is_unknown() -> Non
     assert eta_of_job(part, stage_statuses(part, [], Paces(Clock()))) == pytest.approx(10.0)
 
 
-def test_without_a_terminal_progress_is_plain_lines_with_the_end_of_each_stage() -> None:
+def test_without_a_terminal_progress_is_plain_lines() -> None:
     screen = io.StringIO()
     running = StageProgress(stage=Stage.SYNTHESIZE, tasks=1, running=1, done=0.5)
     ended = StageProgress(stage=Stage.SYNTHESIZE, tasks=1, succeeded=1, done=1.0, seconds=8.0)

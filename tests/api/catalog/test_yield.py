@@ -54,9 +54,7 @@ def test_a_dataset_of_unjudged_grasps_has_no_yield(http: TestClient, services: S
         assert "not judged" in http.get(page).text, page
 
 
-def test_grasps_that_nobody_judged_are_found_as_such_and_not_among_the_rejected(
-    http: TestClient, jobs: dict[str, str]
-) -> None:
+def test_unjudged_grasps_are_not_among_the_rejected(http: TestClient, jobs: dict[str, str]) -> None:
     def found(**query: str) -> set[str]:
         rows = http.get("/v1/grasps", params={"limit": 200, **query}).json()["items"]
         assert rows

@@ -44,7 +44,7 @@ def add(monkeypatch: pytest.MonkeyPatch, http: TestClient, *arguments: str) -> t
     return result.exit_code, json.loads(result.stdout.splitlines()[-1])
 
 
-def test_every_object_of_a_folder_is_uploaded_and_a_bad_one_stops_nothing(
+def test_a_folder_is_uploaded_and_a_bad_object_stops_nothing(
     monkeypatch: pytest.MonkeyPatch, http: TestClient, folder: Path
 ) -> None:
     code, told = add(monkeypatch, http, str(folder), "--units", "mm")
@@ -86,7 +86,7 @@ def test_a_size_that_is_none_is_a_mistake(text: str) -> None:
         sizes_of(text)
 
 
-def test_a_zip_of_several_meshes_is_a_set_and_of_one_is_an_object(tmp_path: Path) -> None:
+def test_a_zip_of_several_meshes_is_a_set(tmp_path: Path) -> None:
     (tmp_path / "many.zip").write_bytes(pack({"egad/A0.obj": b"v", "egad/B1.obj": b"v"}))
     (tmp_path / "one.zip").write_bytes(pack({"A0.obj": b"v"}))
     described = {"asset.json": b'{"file": "a.obj"}', "a.obj": b"v", "b.obj": b"v"}

@@ -123,7 +123,7 @@ def test_a_file_that_cannot_be_opened_is_the_callers_mistake(tmp_path: Path) -> 
         client.upload(AssetKind.OBJECT, tmp_path / "nowhere.stl")
 
 
-def test_requests_that_come_too_fast_are_sent_again_when_the_service_says() -> None:
+def test_requests_that_come_too_fast_are_sent_again() -> None:
     answers = iter([429, 429, 200])
 
     def handler(request: httpx.Request) -> httpx.Response:

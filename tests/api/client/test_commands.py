@@ -219,7 +219,7 @@ def test_a_mistake_is_one_line_and_exit_2(graspd: Shell, arguments: tuple[str, .
 @pytest.mark.parametrize(
     "command", ["submit --hand alegro --object mug", "datasets estimate --hands alegro --objects mug --scenes 0"]
 )
-def test_a_name_that_nobody_knows_is_followed_by_the_one_that_is_like_it(graspd: Shell, command: str) -> None:
+def test_an_unknown_name_is_followed_by_the_one_that_is_like_it(graspd: Shell, command: str) -> None:
     done = graspd(*command.split())
     assert done.returncode == 2
     assert "'alegro'" in done.stderr and "did you mean allegro?" in done.stderr
@@ -289,7 +289,7 @@ def test_the_keys_that_scripts_rely_on_are_there() -> None:
     assert set(summary["mean"]) == {"epsilon", "contact_area_cm2", "intersection_volume_cm3"}
 
 
-def test_a_job_with_a_target_says_which_fidelity_was_chosen_and_by_what(graspd: Shell, service: Supervisor) -> None:
+def test_a_job_with_a_target_says_how_its_fidelity_was_chosen(graspd: Shell, service: Supervisor) -> None:
     asked = ("submit", "--hand", "allegro", "--object", "mug", "--scene", "shelf", "--fidelity", "auto", "--target")
     done = graspd(*asked, "lift>=0.8")
     assert done.returncode == 2 and "graspd chart --scene shelf --publish" in said(done)

@@ -77,7 +77,7 @@ def test_a_mistake_is_one_line_that_says_what(graspd: Shell, changes: str, words
     assert done.returncode == 2 and words in said(done)
 
 
-def test_a_set_goes_by_its_name_beside_the_folder_it_was_added_from(
+def test_a_set_goes_by_its_name_beside_its_folder(
     graspd: Shell, service: Supervisor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with Client(service.api_url) as client:

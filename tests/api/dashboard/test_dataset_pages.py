@@ -84,7 +84,7 @@ def test_a_dataset_is_made_watched_retried_and_frozen(http: TestClient, services
     assert len(services.index.datasets.snapshots("kitchen").items) == 1
 
 
-def test_a_dataset_without_a_hand_is_explained_and_what_was_typed_stays(http: TestClient) -> None:
+def test_a_dataset_form_without_a_hand_keeps_what_was_typed(http: TestClient) -> None:
     answer = http.post("/datasets", data={"name": "kitchen", "grasps": "7", "objects": ["mug"]})
     assert answer.status_code == 422
     assert all(words in answer.text for words in ("hands", 'value="kitchen"', 'value="7"'))
@@ -123,7 +123,7 @@ def test_cells_of_one_state_are_a_list(http: TestClient, services: Services) -> 
         ({"referee": "none", "want": "raw"}, "32 kept"),
     ],
 )
-def test_grasps_that_nobody_judged_are_counted_and_not_called_valid(
+def test_unjudged_grasps_are_counted_and_not_called_valid(
     http: TestClient, services: Services, options: dict[str, str], shown: str
 ) -> None:
     given = {"name": "k", "hands": ["allegro"], "objects": ["mug"], "grasps": 32}
@@ -141,7 +141,7 @@ def test_grasps_that_nobody_judged_are_counted_and_not_called_valid(
 
 
 @pytest.mark.parametrize(("scene", "place"), [("free", ""), ("bin", " in a bin")])
-def test_the_share_of_a_cell_says_in_which_scene_its_grasps_are_valid(
+def test_the_share_of_a_cell_says_in_which_scene_it_is_valid(
     http: TestClient, services: Services, scene: str, place: str
 ) -> None:
     given = {"name": "k", "hands": ["allegro"], "objects": ["mug"], "grasps": 32, "scene": scene}

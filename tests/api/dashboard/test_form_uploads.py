@@ -80,9 +80,7 @@ def test_a_refused_file_is_what_the_form_goes_on_to_show(http: TestClient, servi
     assert known.status_code == 303 and jobs(services) == ["block"]
 
 
-def test_a_refused_file_is_checked_again_in_other_units_without_being_sent_again(
-    http: TestClient, services: Services
-) -> None:
+def test_a_refused_file_is_checked_in_other_units_unsent(http: TestClient, services: Services) -> None:
     first = uploaded(http, services, "refuse")
     waiting = http.post("/submit", data=fields_of(sent(http)) | {"units": "mm"})
     assert waiting.status_code == 409 and "still being checked" in waiting.text
@@ -114,7 +112,7 @@ def test_a_mistake_in_another_field_keeps_the_file(http: TestClient, services: S
     assert fields_of(page.text)["object"] == "part"
 
 
-def test_a_form_that_names_no_object_or_one_that_is_not_there_gets_none(http: TestClient, services: Services) -> None:
+def test_a_form_that_names_no_known_object_gets_none(http: TestClient, services: Services) -> None:
     answer = http.post("/submit", data={key: value for key, value in FORM.items() if key != "object"})
     assert answer.status_code == 422 and "choose a known object, or a file" in answer.text
     assert http.post("/submit", data=FORM | {"object": "", "object_held": "0" * 32}).status_code == 422
@@ -160,7 +158,7 @@ def test_a_refusal_is_told_in_words_with_buttons(http: TestClient, services: Ser
         ("Scale it to this size", {"object_scale_to": "120"}, {"scale_to": 0.12}),
     ],
 )
-def test_the_button_of_a_fix_checks_the_file_again_and_submits_nothing(
+def test_the_button_of_a_fix_checks_again_and_submits_nothing(
     http: TestClient, services: Services, words: str, field: dict[str, str], said: dict[str, Any]
 ) -> None:
     uploaded(http, services, "refuse", TOO_LARGE)
@@ -223,7 +221,7 @@ def test_a_name_of_something_refused_is_free(http: TestClient, services: Service
     assert http.get("/v1/objects/part").json()["digest"] == answer.json()["digest"]
 
 
-def test_a_file_of_other_content_and_the_same_name_is_another_object(http: TestClient, services: Services) -> None:
+def test_a_file_of_other_content_is_another_object(http: TestClient, services: Services) -> None:
     first = uploaded(http, services, "accept")
     other = {"file": ("part.stl", b"solid another\nendsolid\n")}
     assert http.post("/v1/objects", files=other).status_code == 409
@@ -233,7 +231,7 @@ def test_a_file_of_other_content_and_the_same_name_is_another_object(http: TestC
     assert (again["name"], again["digest"]) == ("part", first.digest)
 
 
-def test_a_refused_file_is_found_again_though_its_name_stands_for_another(http: TestClient, services: Services) -> None:
+def test_a_refused_file_is_found_again_though_its_name_is_taken(http: TestClient, services: Services) -> None:
     refused = uploaded(http, services, "refuse")
     good = http.post("/v1/objects", files={"file": ("part.stl", b"solid another\nendsolid\n")}).json()
     for sent in ({}, {"name": "other"}):

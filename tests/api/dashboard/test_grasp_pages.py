@@ -26,9 +26,7 @@ def test_a_grasp_is_the_row_of_its_shard(http: TestClient, services: Services) -
     assert document["hand_digest"] == manifest.hand_digest
 
 
-def test_a_grasp_that_is_not_there_is_named_and_one_whose_file_is_gone_an_error(
-    http: TestClient, services: Services
-) -> None:
+def test_an_absent_grasp_is_named_and_a_lost_file_an_error(http: TestClient, services: Services) -> None:
     manifest = finish_all(services, add_job(services))[0]
     for row in (32, -1):
         answer = http.get(f"/v1/grasps/{manifest.shard_id}/{row}")
@@ -89,9 +87,7 @@ def test_grasps_of_a_scene_job_say_where_they_are_for(http: TestClient, services
     assert "Valid in their scenes" not in http.get(f"/jobs/{free.id}").text
 
 
-def test_robust_grasps_are_found_by_their_share_and_by_what_they_fail_of_first(
-    http: TestClient, services: Services
-) -> None:
+def test_robust_grasps_are_found_by_share_and_first_failure(http: TestClient, services: Services) -> None:
     plain = finish_all(services, add_job(services))[0].shard_id
     document = http.get(f"/v1/grasps/{plain}/0").json()
     assert (document["robust_share"], document["robust_weakest"]) == (None, None)

@@ -31,9 +31,7 @@ def test_an_empty_service_says_what_to_do(http: TestClient) -> None:
 
 
 @pytest.mark.parametrize("path", ["/", "/workers"])
-def test_damage_of_the_store_is_shown_with_its_mend_and_only_while_there_is_some(
-    http: TestClient, services: Services, path: str
-) -> None:
+def test_damage_of_the_store_is_shown_while_there_is_some(http: TestClient, services: Services, path: str) -> None:
     assert "graspd admin store verify" not in http.get(path).text
     services.index.damage.mark([Damage(f"shards/base/{n}.h5", "its <file> is gone", f"{n}") for n in range(7)])
     page = http.get(path).text
@@ -75,7 +73,7 @@ def test_a_finished_job_shows_quality_views_files_and_code(http: TestClient, ser
     assert f"client.job(&#34;{record.id}&#34;).grasps()" in page
 
 
-def test_a_waiting_and_a_running_job_have_a_page_with_a_way_to_cancel(http: TestClient, services: Services) -> None:
+def test_a_job_that_has_not_ended_can_be_cancelled_on_its_page(http: TestClient, services: Services) -> None:
     record = add_job(services, grasps=96, scenes=1)
     page = http.get(f"/jobs/{record.id}").text
     assert f'action="/jobs/{record.id}/cancel"' in page
@@ -134,9 +132,7 @@ def test_the_form_submits_a_job_and_shows_it(http: TestClient) -> None:
     ("change", "words"),
     [({"grasps": "0"}, "must be at least 1"), ({"views": "3", "scenes": "0"}, "views need scenes")],
 )
-def test_a_form_in_error_keeps_what_was_typed_and_says_what_is_wrong(
-    http: TestClient, change: dict[str, str], words: str
-) -> None:
+def test_a_form_in_error_keeps_what_was_typed(http: TestClient, change: dict[str, str], words: str) -> None:
     answer = http.post("/submit", data=FORM | {"seed": "77"} | change)
     assert answer.status_code == 422
     assert words in answer.text
@@ -215,6 +211,6 @@ def test_what_came_with_the_service_was_not_added(http: TestClient) -> None:
 
 
 @pytest.mark.parametrize("said", [{}, {"mass": "0.4", "min_payload": "0.5"}])
-def test_the_form_tells_what_each_fidelity_costs_whatever_is_left_empty(http: TestClient, said: dict[str, str]) -> None:
+def test_the_form_tells_what_each_fidelity_costs(http: TestClient, said: dict[str, str]) -> None:
     page = http.get("/submit", params=said).text
     assert page.count("on one worker") == len(OFFERED)

@@ -63,9 +63,7 @@ def test_the_bar_of_what_is_within_reach_is_whole() -> None:
     assert shares == [("good", 2, 0.0, 50.0), ("weak", 2, 50.0, 50.0)]
 
 
-def test_the_page_shows_the_maps_that_were_published_last_and_what_they_mean(
-    http: TestClient, services: Services
-) -> None:
+def test_the_page_shows_the_latest_maps_and_what_they_mean(http: TestClient, services: Services) -> None:
     publish(services.store, "stability", a_record("2026-11-21T13:00:00.000Z"))
     publish(services.store, "stability", a_record(measure="an older measure"))
     page = http.get("/stability").text

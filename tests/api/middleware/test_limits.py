@@ -59,7 +59,7 @@ def keys(settings: Settings) -> KeyFile:
     return KeyFile(settings.resolved_keys_file)
 
 
-def test_two_applications_share_one_rate_and_a_refusal_says_when_to_come_again(twins: Twins, keys: KeyFile) -> None:
+def test_two_applications_share_one_rate_and_say_when_to_come(twins: Twins, keys: KeyFile) -> None:
     headers = bearer(keys.add("me", Scope.READ, limits=KeyLimits(requests_per_minute=2)))
     first, second = twins()
     assert first.get("/v1/stats", headers=headers).status_code == 200
@@ -72,22 +72,20 @@ def test_two_applications_share_one_rate_and_a_refusal_says_when_to_come_again(t
     assert 1 <= int(answer.headers["retry-after"]) <= 30
 
 
-def test_a_key_without_a_limit_of_its_own_has_that_of_the_settings(twins: Twins, keys: KeyFile) -> None:
+def test_a_key_without_a_limit_has_that_of_the_settings(twins: Twins, keys: KeyFile) -> None:
     headers = bearer(keys.add("me", Scope.READ))
     client, _ = twins(requests_per_minute=1)
     assert [client.get("/v1/stats", headers=headers).status_code for _ in range(2)] == [200, 429]
 
 
-def test_strangers_are_counted_by_address_and_do_not_use_up_a_key(twins: Twins, keys: KeyFile) -> None:
+def test_strangers_are_counted_by_address(twins: Twins, keys: KeyFile) -> None:
     headers = bearer(keys.add("me", Scope.READ))
     client, _ = twins(address_requests_per_minute=2)
     assert [client.get("/v1/stats", headers=bearer("gd_guess")).status_code for _ in range(3)] == [401, 401, 429]
     assert client.get("/v1/stats", headers=headers).status_code == 200
 
 
-def test_whoever_guesses_keys_at_the_login_is_slowed_down_and_health_is_never_refused(
-    twins: Twins, keys: KeyFile
-) -> None:
+def test_guesses_at_the_login_are_slowed_down_and_health_is_not(twins: Twins, keys: KeyFile) -> None:
     keys.add("me", Scope.READ)
     client, _ = twins(address_requests_per_minute=3)
     answers = [client.post("/login", data={"key": f"gd_{i}"}).status_code for i in range(4)]
@@ -139,12 +137,12 @@ def test_requests_of_a_killed_process_count_for_a_minute_at_most(redis_server: s
     assert 0 < rq_queue.connection.pttl("graspd:held:key:me") <= 60_000
 
 
-def test_a_clock_set_back_shuts_nobody_out_for_longer_than_a_minute(redis_server: str, rq_queue: RqQueue) -> None:
+def test_a_clock_set_back_shuts_nobody_out_for_long(redis_server: str, rq_queue: RqQueue) -> None:
     rq_queue.connection.set("graspd:rate:key:me", time.time() + 86400)
     assert enter(redis_server, Allowance(10, 0)).seconds <= 60
 
 
-def test_more_jobs_a_day_than_the_quota_are_refused_until_midnight(twins: Twins, keys: KeyFile) -> None:
+def test_jobs_over_the_daily_quota_are_refused_until_midnight(twins: Twins, keys: KeyFile) -> None:
     """What is refused, or the same again, costs nothing, and another key has a quota of its own."""
     headers = bearer(keys.add("me", Scope.SUBMIT, limits=KeyLimits(jobs_per_day=2, grasps_in_flight=96)))
     clients = twins()
@@ -167,9 +165,7 @@ def test_grasps_in_flight_come_free_as_jobs_end(twins: Twins, keys: KeyFile, ser
     assert client.post("/v1/jobs", json=JOB | {"seed": 1, "grasps": 33}, headers=headers).status_code == 202
 
 
-def test_a_dataset_counts_with_the_grasps_of_all_its_cells_until_it_ends(
-    twins: Twins, keys: KeyFile, services: Services
-) -> None:
+def test_a_dataset_counts_with_all_its_cells_until_it_ends(twins: Twins, keys: KeyFile, services: Services) -> None:
     headers = bearer(keys.add("me", Scope.SUBMIT, limits=KeyLimits(grasps_in_flight=64)))
     client, _ = twins()
     matrix = {"name": "d", "hands": ["allegro", "barrett"], "objects": ["mug"], "grasps": 32}

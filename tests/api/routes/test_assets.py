@@ -43,7 +43,7 @@ def test_an_upload_is_kept_whole_and_waits_for_its_check(http: TestClient, servi
     assert http.post("/v1/jobs", json={"hand": "allegro", "object": "My-box-2"}).status_code == 409
 
 
-def test_a_self_test_is_asked_for_with_the_hand_and_shown_with_its_facts(http: TestClient, services: Services) -> None:
+def test_a_self_test_is_asked_for_and_shown_with_its_facts(http: TestClient, services: Services) -> None:
     asked = {"name": "mine", "self_test": "true"}
     answer = http.post("/v1/hands", files={"file": ("mine.urdf", b"<robot name='mine'/>")}, data=asked)
     assert answer.status_code == 202
@@ -58,7 +58,7 @@ def test_a_self_test_is_asked_for_with_the_hand_and_shown_with_its_facts(http: T
     assert "ready: 90 % hold" in http.get("/hands").text
 
 
-def test_the_same_upload_twice_is_one_object_and_a_name_stands_for_one_content(http: TestClient) -> None:
+def test_the_same_upload_is_one_object_and_a_name_one_content(http: TestClient) -> None:
     def upload(data: bytes, **said: str) -> Any:
         return http.post("/v1/objects", files={"file": ("box.stl", data)}, data=said)
 
@@ -100,7 +100,7 @@ def test_a_zip_bomb_is_refused_by_what_it_unpacks_to() -> None:
         files_of_upload(AssetKind.OBJECT, "bomb.zip", bomb, limit_bytes=1024)
 
 
-def test_files_of_a_zip_are_those_of_its_folder_or_those_its_asset_json_names() -> None:
+def test_files_of_a_zip_are_its_folders_or_its_asset_jsons() -> None:
     data = zipped({"hand/hand.urdf": b"<robot/>", "hand/meshes/palm.stl": STL})
     files = files_of_upload(AssetKind.HAND, "hand.zip", data, limit_bytes=1 << 20)
     assert set(files) == {"asset.json", "hand.urdf", "meshes/palm.stl"}

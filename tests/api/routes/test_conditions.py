@@ -39,9 +39,7 @@ def test_what_a_client_has_is_not_sent_again(
 
 
 @pytest.mark.parametrize("validator", ["{}", '"other"', "W/{}", "Sat, 21 Nov 2026 00:00:00 GMT"])
-def test_half_a_file_is_completed_where_it_is_the_same_and_else_sent_whole(
-    http: TestClient, file: str, validator: str
-) -> None:
+def test_half_a_file_is_completed_only_where_it_is_the_same(http: TestClient, file: str, validator: str) -> None:
     whole = http.get(file)
     answer = http.get(file, headers={"Range": "bytes=100-", "If-Range": validator.format(whole.headers["etag"])})
     wanted = (206, whole.content[100:]) if validator == "{}" else (200, whole.content)
@@ -64,7 +62,7 @@ def test_no_dataset_takes_the_name_of_the_estimates(http: TestClient) -> None:
     assert http.post("/v1/datasets", json=matrix).status_code == 422
 
 
-def test_a_body_of_two_lengths_is_refused_and_the_connection_ends(http: TestClient) -> None:
+def test_a_body_of_two_lengths_ends_the_connection(http: TestClient) -> None:
     both = {"Transfer-Encoding": "chunked", "Content-Length": "2"}
     answer = http.post("/v1/jobs", content=b"{}", headers=both)
     assert (answer.status_code, answer.headers["connection"]) == (400, "close")
@@ -97,9 +95,7 @@ def test_allow_names_head_beside_get(http: TestClient) -> None:
 @pytest.mark.parametrize(
     ("method", "path"), [("POST", "/v1/jobs"), ("POST", "/v1/objects"), ("POST", "/submit"), ("DELETE", "/v1/jobs/x")]
 )
-def test_a_body_that_is_encoded_is_refused_by_the_name_of_its_encoding(
-    http: TestClient, method: str, path: str, encoding: str
-) -> None:
+def test_an_encoded_body_is_refused_by_its_encoding(http: TestClient, method: str, path: str, encoding: str) -> None:
     answer = http.request(method, path, content=b"x", headers={"Content-Encoding": encoding})
     assert (answer.status_code, answer.headers["accept-encoding"]) == (415, "identity")
     assert encoding in answer.text

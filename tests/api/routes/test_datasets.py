@@ -32,9 +32,7 @@ def finish_cells(services: Services, http: TestClient, count: int) -> None:
         finish_all(services, read_record(JobRecord, services.store, names.job_record(cell["job_id"])))
 
 
-def test_a_new_dataset_is_accepted_with_its_place_and_found_again_when_it_is_done(
-    http: TestClient, services: Services
-) -> None:
+def test_a_new_dataset_has_a_place_and_a_done_one_is_found(http: TestClient, services: Services) -> None:
     answer = http.post("/v1/datasets", json=WANTED)
     assert answer.status_code == 202
     assert answer.headers["Location"] == "/v1/datasets/kitchen" and answer.headers["Retry-After"] == "1"
@@ -69,7 +67,7 @@ def test_with_auto_each_cell_says_which_fidelity_it_got(http: TestClient, servic
     assert "auto (gsr&gt;=0.6)" in http.get("/datasets/kitchen").text
 
 
-def test_with_auto_cells_in_scenes_are_chosen_by_the_chart_of_such_scenes(http: TestClient, services: Services) -> None:
+def test_cells_in_scenes_are_chosen_by_the_chart_of_such_scenes(http: TestClient, services: Services) -> None:
     wanted = WANTED | {"scene": "table", "views": 0, "fidelity": "auto", "target": "lift>=0.8"}
     publish(services.store, "charts", CHART)
     answer = http.post("/v1/datasets", json=wanted)

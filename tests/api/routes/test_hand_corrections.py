@@ -29,9 +29,7 @@ def corrected(http: TestClient, body: dict[str, Any], hand: str = "barrett") -> 
     return http.post(f"/v1/hands/{hand}/corrections", json=body)
 
 
-def test_a_corrected_hand_is_another_one_of_the_same_files_that_says_it_all(
-    http: TestClient, services: Services
-) -> None:
+def test_a_corrected_hand_is_another_one_of_the_same_files(http: TestClient, services: Services) -> None:
     answer = corrected(http, {"closing": {"finger_1_spread": 1}, "preshape": {"finger_2_medial": -0.3}})
     assert answer.status_code == 202, answer.text
     made = http.get(answer.headers["location"]).json()
@@ -46,7 +44,7 @@ def test_a_corrected_hand_is_another_one_of_the_same_files_that_says_it_all(
     assert [check.name for check in services.index.feed.ready_checks(now=1e12, limit=9)] == ["barrett-2"]
 
 
-def test_the_same_corrections_are_the_same_hand_and_others_get_the_next_number(http: TestClient) -> None:
+def test_the_same_corrections_are_the_same_hand(http: TestClient) -> None:
     first = corrected(http, {"closing": {"finger_1_spread": 1}}).json()
     assert corrected(http, {"closing": {"finger_1_spread": 1}}).json()["digest"] == first["digest"]
     assert corrected(http, {"closing": {"finger_1_spread": -1}}).json()["name"] == "barrett-3"
@@ -91,7 +89,7 @@ def test_a_number_that_is_none_is_refused(http: TestClient, number: str) -> None
     assert answer.status_code == 422
 
 
-def test_an_unknown_hand_is_not_found_and_one_without_a_model_waits(http: TestClient) -> None:
+def test_an_unknown_hand_or_one_without_a_model_is_not_found(http: TestClient) -> None:
     assert corrected(http, SAID, hand="nobody").status_code == 404
     http.post("/v1/hands", files={"file": ("new.urdf", b"<robot/>")})
     assert corrected(http, SAID, hand="new").status_code == 404
@@ -112,9 +110,7 @@ def mug(http: TestClient) -> str:
     return str(http.get("/v1/objects/mug").json()["digest"])
 
 
-def test_who_may_only_read_corrects_nothing_and_who_corrects_owns_the_hand(
-    settings: Settings, services: Services
-) -> None:
+def test_a_reader_corrects_nothing_and_a_writer_owns_the_hand(settings: Settings, services: Services) -> None:
     people = people_of(settings, reader=(Scope.READ, ""), writer=(Scope.SUBMIT, ""))
     app: FastAPI = create_app(settings, services)
     with TestClient(app, base_url=BASE_URL, raise_server_exceptions=False) as http:
@@ -127,7 +123,7 @@ def test_who_may_only_read_corrects_nothing_and_who_corrects_owns_the_hand(
         assert load_asset(services.store, AssetKind.HAND, made["digest"]).owner == made["owner"] != ""
 
 
-def test_the_page_has_a_field_for_all_that_was_guessed_and_works_without_scripts(http: TestClient) -> None:
+def test_the_page_has_a_field_for_each_guess_without_scripts(http: TestClient) -> None:
     page = http.get("/hands/barrett").text
     assert page.count('type="radio" name="closing.') == 3 * page.count('name="preshape.')
     assert 'name="palm_link"' in page and 'name="fingertip"' in page and "asset.json" in page
@@ -157,7 +153,7 @@ def test_a_wrong_form_is_shown_again_with_what_is_wrong(http: TestClient, field:
     assert says in answer.text and "That cannot be kept" in answer.text
 
 
-def test_hands_are_listed_with_what_they_say_of_themselves_as_text(http: TestClient) -> None:
+def test_hands_are_listed_with_their_own_words_as_text(http: TestClient) -> None:
     options = {"facts": {"dofs": 7, "fingertips": "<b>", "guessed": 3}}
     http.post("/v1/hands", files={"file": ("odd.urdf", b"<robot/>")}, data={"options": json.dumps(options)})
     page = http.get("/hands")

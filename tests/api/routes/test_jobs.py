@@ -21,7 +21,7 @@ from tests.waiting import until
 JOB = {"hand": "allegro", "object": "mug", "grasps": 64, "scenes": 1, "views": 1}
 
 
-def test_a_submitted_job_is_accepted_with_its_address_and_is_one_job(http: TestClient) -> None:
+def test_a_submitted_job_has_an_address_and_is_one_job(http: TestClient) -> None:
     answer = http.post("/v1/jobs", json=JOB)
     assert answer.status_code == 202
     assert answer.headers["location"] == f"/v1/jobs/{answer.json()['id']}"
@@ -34,7 +34,7 @@ def test_a_submitted_job_is_accepted_with_its_address_and_is_one_job(http: TestC
     assert len(http.get("/v1/jobs").json()["items"]) == 1
 
 
-def test_a_job_in_a_scene_with_auto_says_how_its_fidelity_was_chosen(http: TestClient, services: Services) -> None:
+def test_a_job_in_a_scene_with_auto_says_how_it_was_chosen(http: TestClient, services: Services) -> None:
     """Also where the job was there by its fidelity before."""
     scene = {**JOB, "views": 0, "scene": "table"}
     wanted = scene | {"fidelity": "auto", "target": "lift>=0.8"}
@@ -55,7 +55,7 @@ def test_a_job_in_a_scene_with_auto_says_how_its_fidelity_was_chosen(http: TestC
     assert (named["id"], named["choice"], chosen["choice"]["reached"]) == (chosen["id"], None, 0.95)
 
 
-def test_a_finished_job_is_found_again_with_its_counts_means_and_shards(http: TestClient, services: Services) -> None:
+def test_a_finished_job_is_found_again_with_counts_and_means(http: TestClient, services: Services) -> None:
     record = add_job(services, grasps=40, scenes=2, views=3, stereo=True)
     add_job(services, seed=2)
     manifests = finish_all(services, record)

@@ -35,7 +35,7 @@ def upload(http: TestClient, data: bytes, filename: str = "net.npz", **said: str
     return http.post("/v1/networks", files={"file": (filename, data)}, data=said)
 
 
-def test_an_upload_can_be_used_at_once_and_says_whose_grasps_it_proposes(http: TestClient, services: Services) -> None:
+def test_an_uploaded_network_can_be_used_at_once(http: TestClient, services: Services) -> None:
     data = of_hand(http)
     answer = upload(http, data)
     assert answer.status_code == 201, answer.text
@@ -49,7 +49,7 @@ def test_an_upload_can_be_used_at_once_and_says_whose_grasps_it_proposes(http: T
     assert list(services.index.feed.ready_checks(now=1e12, limit=9)) == [], "no worker is asked"
 
 
-def test_the_same_file_is_the_same_network_whatever_it_was_called(http: TestClient) -> None:
+def test_the_same_file_is_the_same_network(http: TestClient) -> None:
     data = of_hand(http)
     first, second = (upload(http, data, filename, name="net").json() for filename in ("a.npz", "b.npz"))
     assert first["digest"] == second["digest"]
@@ -116,7 +116,7 @@ def test_a_job_names_a_network_and_keeps_its_digest(http: TestClient, services: 
         ({"options": {"network": "/etc/passwd"}}, 404, "there is no network"),
     ],
 )
-def test_a_job_that_the_network_does_not_fit_is_refused_in_a_line(
+def test_a_job_that_the_network_does_not_fit_is_refused(
     http: TestClient, changes: dict[str, Any], status: int, words: str
 ) -> None:
     upload(http, of_hand(http))

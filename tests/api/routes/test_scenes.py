@@ -15,7 +15,7 @@ PLANE = {"kind": "half_space"}
 UPRIGHT = [0, 0, 0, 1, 0, 0, 0]
 
 
-def test_a_job_in_a_scene_tells_its_stages_and_its_scene_and_another_nothing_of_one(http: TestClient) -> None:
+def test_a_job_in_a_scene_tells_its_stages_and_its_scene(http: TestClient) -> None:
     answer = http.post("/v1/jobs", json={**JOB, "scene": "table", "views": 1})
     assert answer.status_code == 202
     job = answer.json()

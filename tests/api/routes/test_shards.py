@@ -23,7 +23,7 @@ def shard(http: TestClient, services: Services) -> str:
     return finish_all(services, record)[0].shard_id
 
 
-def test_a_downloaded_shard_opens_as_hdf5_and_its_sum_is_its_etag(http: TestClient, shard: str) -> None:
+def test_a_downloaded_shard_is_hdf5_with_its_sum_as_etag(http: TestClient, shard: str) -> None:
     answer = http.get(f"/v1/shards/{shard}/file")
     assert answer.headers["content-type"] == "application/x-hdf5"
     assert answer.headers["etag"] == f'"{http.get(f"/v1/shards/{shard}").json()["sha256"]}"'

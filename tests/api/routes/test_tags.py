@@ -159,9 +159,7 @@ def test_what_is_not_there_or_too_much_gets_no_tag(
     assert "the most" in refused(413, grasps=named(made.shard_id, 1))
 
 
-def test_a_project_has_tags_of_its_own_and_a_key_changes_only_what_is_its(
-    services: Services, made: ShardManifest
-) -> None:
+def test_a_project_has_tags_of_its_own(services: Services, made: ShardManifest) -> None:
     submits = {name: (Scope.SUBMIT, project) for name, project in (("old", ""), ("new", ""), ("bob", "blue"))}
     people = people_of(services.settings, **submits, eve=(Scope.READ, ""), root=(Scope.ADMIN, ""))
     body = {"name": "good", "grasps": named(made.shard_id, 1)}
@@ -181,9 +179,7 @@ def test_a_project_has_tags_of_its_own_and_a_key_changes_only_what_is_its(
         assert does("root", "DELETE", "/v1/tags/good") == 204
 
 
-def test_a_tag_is_taken_home_as_rows_and_as_shards_of_its_grasps_alone(
-    http: TestClient, made: ShardManifest, services: Services
-) -> None:
+def test_a_tag_is_exported_as_rows_and_as_shards(http: TestClient, made: ShardManifest, services: Services) -> None:
     give(http, "good", grasps=named(made.shard_id, 2, 30))
     give(http, "best", grasps=named(made.shard_id, 2))
     address = "/v1/grasps/export?tag=good&format="
@@ -207,7 +203,7 @@ def test_a_tag_is_taken_home_as_rows_and_as_shards_of_its_grasps_alone(
     assert http.get("/v1/grasps/export?tag=good&format=zip").content == answer.content
 
 
-def test_a_zip_of_nothing_of_too_much_or_of_a_damaged_shard_is_refused(
+def test_a_zip_of_nothing_too_much_or_a_damaged_shard_is_refused(
     http: TestClient, made: ShardManifest, services: Services, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     address = "/v1/grasps/export?format=zip"

@@ -119,9 +119,7 @@ def test_what_is_sent_is_signed_with_the_time(http: TestClient, services: Servic
     assert MASTER not in str(headers) + hook["secret"] + str(body)
 
 
-def test_what_is_not_taken_is_tried_again_with_longer_waits_and_then_given_up(
-    http: TestClient, services: Services, ear: Ear
-) -> None:
+def test_what_is_not_taken_is_retried_with_longer_waits(http: TestClient, services: Services, ear: Ear) -> None:
     hook = add(http)
     end_a_job(services)
     ear.answer = Answer(500, "answered 500")
@@ -147,9 +145,7 @@ def test_a_webhook_is_told_of_the_ends_it_asked_for_from_then_on(
     assert ear.round() == 0 and len(http.get("/v1/webhooks").json()) == 1
 
 
-def test_webhooks_are_in_the_store_and_tell_nothing_old_after_a_rebuild(
-    http: TestClient, services: Services, ear: Ear
-) -> None:
+def test_webhooks_survive_a_rebuild_and_tell_nothing_old(http: TestClient, services: Services, ear: Ear) -> None:
     hook = add(http)
     end_a_job(services)
     ear.round()
@@ -290,7 +286,7 @@ def test_an_address_that_failed_rests_with_all_that_waits_for_it(services: Servi
     assert [json.loads(body)["subject"] for _, body, _ in ear.heard] == ["a0", "a0", "a1", "a2", "anew"]
 
 
-def test_addresses_that_failed_leave_half_of_the_room_to_the_others(services: Services) -> None:
+def test_addresses_that_failed_leave_half_of_the_room(services: Services) -> None:
     ear = Silent(services)
     hooks(services, AT_ONCE, "a", "dead")
     end_jobs_of(services, "a")

@@ -172,9 +172,7 @@ def remove_only_the_file(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("remove", [remove_file, remove_only_the_file])
-def test_an_index_removed_under_its_readers_is_made_again_for_all_of_them(
-    services: Services, remove: Callable[[Path], None]
-) -> None:
+def test_an_index_removed_under_its_readers_is_made_again(services: Services, remove: Callable[[Path], None]) -> None:
     controller = Controller(services)
     controller.round()
     other = Index(services.settings.resolved_index_url)

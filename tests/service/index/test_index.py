@@ -232,7 +232,7 @@ def test_the_jobs_of_a_key_are_fed_in_turn_batch_by_batch(services: Services) ->
     assert len({task.job.id for task in ready[:2]}) == 2
 
 
-def test_a_key_with_many_jobs_gets_no_more_turns_than_one_with_a_single_job(services: Services) -> None:
+def test_a_key_with_many_jobs_gets_no_more_turns(services: Services) -> None:
     for seed in range(5):
         _submit_as(services, "greedy", seed)
     _submit_as(services, "modest", 9)
@@ -394,7 +394,7 @@ def test_what_was_made_adds_up_in_intervals_of_any_length(services: Services) ->
         assert starts == sorted({t - t % bucket_s for t in seconds}), bucket_s
 
 
-def test_writers_at_once_leave_the_rows_that_follow_from_the_store(services: Services, index_url: str) -> None:
+def test_writers_at_once_leave_the_rows_of_the_store(services: Services, index_url: str) -> None:
     """The controller indexes shards while the API of another process cancels and retries their job, over and over."""
     job, _ = job_actions.submit(services, request(grasps=32 * 12, scenes=1))
     record = read_record(JobRecord, services.store, names.job_record(job.id))
@@ -478,7 +478,7 @@ def enter(services: Services, place: int, seed: int, *, batches: int = 1) -> Job
     return record
 
 
-def test_controllers_that_index_at_once_leave_the_rows_that_follow_from_the_store(processes: list[Services]) -> None:
+def test_controllers_at_once_leave_the_rows_of_the_store(processes: list[Services]) -> None:
     """Each indexes two jobs of eight; each job wants what a job of another wants as well."""
     jobs = [enter(processes[0], 2 * place, place % 4, batches=2) for place in range(8)]
     messages = {job.id: [message_of(job, task, attempt=1, max_attempt=3) for task in plan(job)] for job in jobs}

@@ -59,7 +59,7 @@ def test_what_was_made_is_summed_for_each_project_and_day(services: Services) ->
     ]
 
 
-def test_gpu_seconds_of_a_day_are_those_of_gpu_workers_for_that_project(services: Services) -> None:
+def test_gpu_seconds_of_a_day_are_those_of_gpu_workers(services: Services) -> None:
     make(services, enter(services, "red", 1, batches=3))
     make(services, enter(services, "red", 2), device="cpu")
     make(services, enter(services, "red", 3), day=NEXT)
@@ -68,7 +68,7 @@ def test_gpu_seconds_of_a_day_are_those_of_gpu_workers_for_that_project(services
         assert services.index.usage.gpu_seconds(project, day) == seconds
 
 
-def test_a_shard_that_two_projects_asked_for_is_charged_to_the_first(services: Services) -> None:
+def test_a_shard_that_two_projects_want_is_charged_to_the_first(services: Services) -> None:
     first = enter(services, "red", 1)
     second = first.model_copy(update={"id": "f" * 32, "project": "blue"})
     services.index.write.add_job(second)
@@ -101,7 +101,7 @@ def test_usage_is_the_same_after_the_index_was_made_anew(services: Services) -> 
     assert services.index.usage.days("2000-01-01", "2999-01-01") == before
 
 
-def test_projects_share_the_queue_evenly_whatever_their_keys_and_jobs_are(services: Services) -> None:
+def test_projects_share_the_queue_evenly(services: Services) -> None:
     for seed in range(6):
         enter(services, "greedy", seed, key=f"greedy-{seed % 3}", batches=6, where=seed * 2)
     enter(services, "modest", 9, batches=12, where=5)

@@ -40,7 +40,7 @@ def index(tmp_path: Path, values: np.ndarray) -> Iterator[Index]:
     opened.close()
 
 
-def test_a_summary_is_the_mean_and_range_of_what_passes_the_filter(index: Index, values: np.ndarray) -> None:
+def test_a_summary_is_of_what_passes_the_filter(index: Index, values: np.ndarray) -> None:
     """Of a metric that no grasp has, and where no grasp passes, there is none."""
     summaries = index.statistics.summaries(GraspFilter(valid=True), ("epsilon", "contact_area_cm2"))
     found, passed = summaries.pop("epsilon"), values[::2]
@@ -66,7 +66,7 @@ def test_distributions_of_few_grasps_are_exact(index: Index, values: np.ndarray)
     assert found.metrics["epsilon"].mean == pytest.approx(passed.mean())
 
 
-def test_distributions_of_many_grasps_come_from_a_fair_sample_of_shards(index: Index) -> None:
+def test_distributions_of_many_grasps_come_from_a_fair_sample(index: Index) -> None:
     with index.database.writing() as connection:
         for number in range(400):
             shard = hashlib.sha256(str(number).encode()).hexdigest()[:32]

@@ -37,9 +37,7 @@ def v1(root: Path, folder: str, quota: int) -> None:
     (place / "cpu.cfs_period_us").write_text("100000\n")
 
 
-def test_without_control_groups_the_affinity_counts_not_the_machine(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_control_groups_the_affinity_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert available_cores(tmp_path) == MACHINE
     monkeypatch.delattr(os, "sched_getaffinity")
     assert available_cores(tmp_path) == 2 * MACHINE
@@ -83,9 +81,7 @@ def test_no_other_count_of_cores_is_asked_for() -> None:
     ]
 
 
-def test_the_files_are_read_once_in_a_moment_and_a_changed_quota_is_heard_of(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_files_are_read_once_in_a_moment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     now = [100.0]
     monkeypatch.setattr(cores.time, "monotonic", lambda: now[0])
     root = system(tmp_path, "0::/", cpu_max="300000 100000")

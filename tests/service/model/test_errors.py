@@ -28,7 +28,7 @@ def test_a_quoted_line_break_does_not_make_a_second_line(kind: type[GraspdError]
 
 
 @pytest.mark.parametrize("character", ["\r", "\x1b", "\x85", "\u2028", "\x00"])
-def test_separators_and_escapes_of_a_terminal_do_not_come_through(character: str) -> None:
+def test_separators_and_escapes_of_a_terminal_are_quoted(character: str) -> None:
     assert str(GraspdError(f"a{character}b")).isprintable()
 
 
@@ -127,7 +127,7 @@ def test_a_redis_url_that_cannot_be_used_is_not_told(url: str) -> None:
 @pytest.mark.parametrize(
     "url", [f"postgresql+psycopg://me:x@host:{SECRET}/db", f"mysql://me:{SECRET}@host/db", f"{SECRET}", f"{SECRET}://x"]
 )
-def test_an_index_url_that_cannot_be_used_is_one_line_without_its_password(url: str) -> None:
+def test_an_index_url_that_is_refused_is_told_without_password(url: str) -> None:
     for opened in (Index, look):
         with pytest.raises(InputError, match=r"\(GRASPD_INDEX_URL\) cannot be used"):
             opened(url)
@@ -137,7 +137,7 @@ def test_an_index_url_that_cannot_be_used_is_one_line_without_its_password(url: 
         assert SECRET not in str(refused.value)
 
 
-def test_a_store_url_that_cannot_be_used_is_told_without_its_password() -> None:
+def test_a_store_url_that_is_refused_is_told_without_password() -> None:
     with pytest.raises(InputError) as refused:
         open_store(f"s4://me:{SECRET}@host")
     assert SECRET not in str(refused.value)
@@ -165,7 +165,7 @@ def test_the_file_of_a_thing_with_a_long_name_is_refused() -> None:
         name_of_upload(f"{LONG}.stl")
 
 
-def test_a_long_name_of_others_is_cut_told_and_stays_one_of_its_own(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_long_name_of_others_is_cut_told_and_stays_its_own(caplog: pytest.LogCaptureFixture) -> None:
     fitted.cache_clear()
     first, second = plain_name(LONG), plain_name(f"{LONG}2")
     assert first != second and len(first) == len(second) == 64

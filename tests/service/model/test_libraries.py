@@ -23,9 +23,7 @@ def test_what_is_not_installed_has_none() -> None:
         version_of("no-such-library-of-graspd")
 
 
-def test_the_first_place_counts_and_two_versions_in_one_are_left_to_python(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_first_place_counts_and_doubts_are_left_to_python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for folder in ("one/My.Library-1.0.dist-info", "two/my_library-2.0.dist-info", "two/my_library-3.0.dist-info"):
         (tmp_path / folder).mkdir(parents=True)
         (tmp_path / folder / "METADATA").write_text(f"Name: my-library\nVersion: {folder[-13:-10]}\n")

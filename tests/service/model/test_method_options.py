@@ -15,7 +15,7 @@ def shard(stage: Stage, wanted: JobRequest) -> str:
     return shard_id(stage, request=wanted, hand_digest="a", object_digest="b", batch=0, count=32, revision=1)
 
 
-def test_other_options_make_another_shard_of_grasps_but_not_of_scenes() -> None:
+def test_other_options_make_another_shard_of_grasps_alone() -> None:
     plain, changed = request(method="graspit"), request(method="graspit", options={"steps": 40_000})
     assert shard(Stage.SYNTHESIZE, plain) != shard(Stage.SYNTHESIZE, changed)
     assert shard(Stage.SCENE, plain) == shard(Stage.SCENE, changed)

@@ -40,7 +40,7 @@ def test_the_metric_is_in_no_table_of_this_process() -> None:
     assert f"quality/{NAME}" not in SCHEMAS["base"]
 
 
-def test_shard_manifest_and_index_have_it_and_an_older_index_gets_its_column(found: Found) -> None:
+def test_shard_manifest_and_index_have_it_and_an_older_index_too(found: Found) -> None:
     assert found["schema"] == MEANING
     assert found["manifest"][0] == 0 and found["manifest"][-1] == 20
     assert NAME in found["index columns"] and f"grasps_{NAME}" in found["index indexes"]
@@ -55,7 +55,7 @@ def test_the_api_filters_and_sorts_by_it_and_tells_it(found: Found) -> None:
     assert all(f'"{word}"' in found["openapi"] for word in (NAME, f"min_{NAME}", f"max_{NAME}", MEANING))
 
 
-def test_the_dashboard_has_its_column_its_filter_and_its_distribution(found: Found) -> None:
+def test_the_dashboard_has_its_column_filter_and_distribution(found: Found) -> None:
     page = found["list"]
     assert f"sort={NAME}" in page and f'name="min_{NAME}"' in page and 'max="50"' in page
     assert TITLE in found["grasp page"] and TITLE in found["job page"]

@@ -42,7 +42,7 @@ def test_a_job_is_cut_into_batches_of_32_and_the_last_is_smaller() -> None:
     assert [(task.batch, task.count) for task in plan(record(request(grasps=70)))] == [(0, 32), (1, 32), (2, 6)]
 
 
-def test_only_what_was_asked_for_is_planned_and_reads_what_the_stage_before_writes() -> None:
+def test_only_what_was_asked_for_is_planned_stage_by_stage() -> None:
     (alone,) = plan(record(request()))
     assert (alone.stage, alone.inputs) == (Stage.SYNTHESIZE, ())
     assert [task.stage for task in plan(record(request(scenes=2)))] == [Stage.SYNTHESIZE, Stage.SCENE]
@@ -51,7 +51,7 @@ def test_only_what_was_asked_for_is_planned_and_reads_what_the_stage_before_writ
     assert (base.inputs, scene.inputs, views.inputs) == ((), (base.output,), (scene.output,))
 
 
-def test_more_views_are_other_pictures_of_the_same_grasps_and_scenes() -> None:
+def test_more_views_are_other_pictures_of_the_same_grasps() -> None:
     few, many = (list(plan(record(request(scenes=2, views=views)))) for views in (3, 4))
     assert [task.output for task in few[:2]] == [task.output for task in many[:2]]
     assert few[2].output != many[2].output

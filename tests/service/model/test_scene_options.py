@@ -33,7 +33,7 @@ def record(wanted: JobRequest) -> JobRecord:
     return JobRecord(id=job_id(wanted, HAND, OBJECT), request=wanted, lane=Lane.BULK, created=timestamp(), **digests)
 
 
-def test_a_job_without_a_scene_keeps_its_id_its_record_and_its_message() -> None:
+def test_a_job_without_a_scene_keeps_its_id_and_its_record() -> None:
     wanted = {**PLAIN, "hand": "gripper", "object": "ball"}
     job = record(request())
     assert job.request.model_dump(mode="json") == wanted
@@ -57,7 +57,7 @@ def test_scenes_after_the_grasps_have_the_address_that_they_had() -> None:
     assert digest_json(said) == shard_id(Stage.SCENE, request=request(scenes=3), **of)
 
 
-def test_a_job_in_a_scene_is_another_job_and_makes_its_scenes_first() -> None:
+def test_a_job_in_a_scene_makes_its_scenes_first() -> None:
     job = record(request(scene="table", views=2))
     assert job.id != record(request(scenes=SCENES, views=2)).id
     scene, base, views = plan(job)
@@ -91,7 +91,7 @@ def test_a_document_is_a_scene_and_comes_back_as_it_was() -> None:
     assert JobRequest.model_validate_json(wanted.model_dump_json()) == wanted
 
 
-def test_fingertips_may_touch_unless_the_request_or_its_document_says_otherwise() -> None:
+def test_fingertips_may_touch_unless_it_is_said_otherwise() -> None:
     assert "touch" not in request(scene="table").model_dump()
     assert record(request(scene="table", touch=0)).id == record(request(scene="table")).id
     assert request(scene="table").place.touch == 0

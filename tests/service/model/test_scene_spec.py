@@ -14,7 +14,7 @@ from service.model.scene_spec import MAX_FILE_BYTES, SceneSpec, parse_scene, sce
 TABLE = {"supports": [{"kind": "half_space"}]}
 
 
-def test_a_kind_is_a_scene_and_an_unknown_one_lists_those_there_are() -> None:
+def test_a_kind_is_a_scene_and_an_unknown_one_lists_them() -> None:
     for kind in ("free", "table", "bin", "shelf"):
         assert parse_scene(kind) == SceneSpec(kind=kind)
     with pytest.raises(InputError, match="free, table, bin, shelf"):
@@ -57,7 +57,7 @@ def test_a_file_says_supports_and_the_targets_pose(tmp_path: Path, suffix: str) 
         ),
     ],
 )
-def test_nonsense_in_a_file_is_told_in_one_line_that_names_the_file(tmp_path: Path, said: object, reason: str) -> None:
+def test_nonsense_in_a_file_is_told_in_one_line(tmp_path: Path, said: object, reason: str) -> None:
     path = tmp_path / "scene.json"
     path.write_text(json.dumps(said))
     with pytest.raises(InputError) as error:

@@ -47,7 +47,7 @@ def test_a_tick_is_short_and_says_all(value: float | str, text: str) -> None:
     assert tick(value) == text
 
 
-def test_what_still_breaks_are_the_broken_cells_that_a_job_can_come_to() -> None:
+def test_what_still_breaks_are_broken_cells_in_reach_of_a_job() -> None:
     broken = [(1.0, "draft"), (1.0, "fine"), (3.0, "draft"), (3.0, "fine"), (9.0, "fine")]
     one = a_map(
         *(MapCell("a", x, y, 0.0, "broken", reached=True) for x, y in broken),
@@ -59,7 +59,7 @@ def test_what_still_breaks_are_the_broken_cells_that_a_job_can_come_to() -> None
     assert counts(one.reached()) == {"good": 1, "weak": 0, "broken": 5, "refused": 1}
 
 
-def test_a_record_survives_the_store_without_numbers_that_json_does_not_know() -> None:
+def test_a_record_survives_the_store_without_odd_numbers() -> None:
     cells = [MapCell("a", 1, 10.0, _INF, "broken", label="×∞"), MapCell("a", "inside out", 10.0, _NAN, "refused")]
     record = Stability("2026-11-21T12:00:00.000Z", "graspd stability", {"graspd": "0"}, [a_map(*cells)])
     assert publish(open_store("memory://"), "stability", record.as_json()) == "stability/20261121T120000000Z.json"

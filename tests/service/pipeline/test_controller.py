@@ -104,7 +104,7 @@ def test_a_job_goes_through_all_its_stages_and_tells_listeners(bench: Bench) -> 
     assert {e.job_id for e in told if e.kind is EventKind.JOB} == {job.id}
 
 
-def test_a_task_of_a_lost_worker_is_queued_again_with_its_reason_kept(bench: Bench) -> None:
+def test_a_task_of_a_lost_worker_is_queued_with_its_reason_kept(bench: Bench) -> None:
     job, _ = job_actions.submit(bench.services, request())
     bench.take()
     bench.pass_time(bench.services.settings.lease_s + 2)
@@ -119,7 +119,7 @@ def test_a_task_of_a_lost_worker_is_queued_again_with_its_reason_kept(bench: Ben
     assert differences(bench.services.index, bench.services.store) == []
 
 
-def test_who_beats_keeps_its_task_and_a_pause_of_the_controller_is_no_silence(bench: Bench) -> None:
+def test_a_worker_that_beats_keeps_its_task(bench: Bench) -> None:
     job_actions.submit(bench.services, request())
     delivery = bench.take()
     bench.pass_time(100, beating=delivery)
@@ -147,7 +147,7 @@ def test_while_redis_takes_no_writes_nobody_is_called_silent(bench: Bench, monke
     assert bench.services.index.jobs.attempts() == []
 
 
-def test_a_worker_that_was_only_slow_changes_nothing_when_it_ends(bench: Bench) -> None:
+def test_a_worker_that_was_only_slow_changes_nothing(bench: Bench) -> None:
     job, _ = job_actions.submit(bench.services, request())
     slow = bench.take()
     bench.pass_time(bench.services.settings.lease_s + 2)
@@ -161,7 +161,7 @@ def test_a_worker_that_was_only_slow_changes_nothing_when_it_ends(bench: Bench) 
     assert bench.services.index.overview.stats().grasps == 32
 
 
-def test_a_worker_lost_after_its_manifest_was_put_costs_no_attempt(bench: Bench) -> None:
+def test_a_worker_lost_after_its_manifest_costs_no_attempt(bench: Bench) -> None:
     job, _ = job_actions.submit(bench.services, request())
     delivery = bench.take()
     assert isinstance(delivery.message, TaskMessage)
@@ -185,7 +185,7 @@ def test_a_task_that_kills_every_worker_stops_after_its_attempts(bench: Bench) -
     assert differences(bench.services.index, bench.services.store) == []
 
 
-def test_a_failing_task_fails_its_job_alone_and_keeps_each_reason(bench: Bench) -> None:
+def test_a_failing_task_fails_its_job_alone(bench: Bench) -> None:
     bad, _ = job_actions.submit(bench.services, request(seed=1))
     for _ in range(3):
         bench.do(bench.take(), synthesize=explode)
@@ -315,9 +315,7 @@ def test_tasks_queued_while_the_controller_looks_are_queued_once(bench: Bench, m
     assert len(taken) == 1 and bench.queue.waiting() == set(), "the worker's task waits a second time"
 
 
-def test_a_check_queued_while_the_controller_looks_is_queued_once(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_check_queued_meanwhile_is_queued_once(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     """The controller has read the queue before, and the index before the check is marked there."""
     asset = add_upload(bench)
     bench.pass_time(1)
@@ -352,7 +350,7 @@ def test_a_task_between_queue_and_worker_is_not_taken_for_lost(bench: Bench) -> 
     assert bench.queue.waiting() == set()
 
 
-def test_files_below_an_asset_do_not_stop_a_controller_or_a_rebuild(bench: Bench) -> None:
+def test_files_below_an_asset_do_not_stop_a_controller(bench: Bench) -> None:
     (digest, *_) = [digest for kind, digest in stored_assets(bench.services.store) if kind is AssetKind.OBJECT]
     bench.services.store.put(names.object_pieces(digest, "32"), b"pieces")
     bench.controller.round()
@@ -436,9 +434,7 @@ def test_an_upload_that_kills_every_worker_is_refused(bench: Bench) -> None:
     assert bench.services.index.assets.get(AssetKind.HAND, "upload").verdict == "refuse"
 
 
-def test_the_loop_outlives_parts_that_are_away_and_ends_when_told(
-    services: Services, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_loop_outlives_parts_that_are_away(services: Services, monkeypatch: pytest.MonkeyPatch) -> None:
     stop, rounds = threading.Event(), 0
 
     def failing(*, wait_s: float = 0.0) -> None:

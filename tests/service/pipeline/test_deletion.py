@@ -62,7 +62,7 @@ def graceless(services: Services) -> GarbageCollector:
     return GarbageCollector(with_settings(services, shard_grace_s=-1.0))
 
 
-def test_a_deleted_job_is_gone_at_once_and_its_shards_after_the_grace_time(services: Services) -> None:
+def test_a_deleted_job_is_gone_and_its_shards_after_a_grace_time(services: Services) -> None:
     job = finished(services)
     delete_job(services, job)
     with pytest.raises(NotFoundError):
@@ -90,7 +90,7 @@ def test_a_shard_that_another_job_needs_stays(services: Services) -> None:
     assert services.index.jobs.get(long).grasps == 64
 
 
-def test_a_deleted_job_may_be_submitted_again_and_finds_its_shards(services: Services) -> None:
+def test_a_deleted_job_may_be_submitted_again(services: Services) -> None:
     job = finished(services)
     delete_job(services, job)
     with pytest.raises(ConflictError, match="still being removed"):
@@ -190,7 +190,7 @@ def test_a_job_entered_while_its_hand_is_deleted_is_not_kept(services: Services)
 
 
 @pytest.mark.parametrize("what", ["job", "dataset", "object"])
-def test_a_deletion_that_broke_off_is_carried_out_by_the_next_controller(
+def test_the_next_controller_carries_out_a_broken_deletion(
     services: Services, what: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """At each removal of an object in turn, and between the record and the rows."""
@@ -247,7 +247,7 @@ def test_a_deleted_job_is_restored_as_it_was(services: Services, collected: bool
 
 
 @COLLECTED
-def test_a_deleted_dataset_is_restored_with_its_jobs_and_snapshots(services: Services, collected: bool) -> None:
+def test_a_deleted_dataset_is_restored_with_jobs_and_snapshots(services: Services, collected: bool) -> None:
     dataset(services)
     actions.snapshot(services, "d")
     before = services.index.datasets.get("d"), services.index.datasets.snapshots("d").items, _jobs(services)

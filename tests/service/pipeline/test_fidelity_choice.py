@@ -92,7 +92,7 @@ def test_the_chart_published_last_is_the_latest(tmp_path: Path) -> None:
     assert found is not None and found["created"] == "2026-11-21T11:00:00.000Z"
 
 
-def test_a_job_with_fidelity_auto_is_stored_with_the_one_the_chart_promises(services: Services) -> None:
+def test_a_job_with_fidelity_auto_is_stored_with_the_chosen_one(services: Services) -> None:
     publish(services.store, "charts", CHART)
     job, _ = job_actions.submit(services, request(fidelity="auto", target="gsr>=0.75"))
     assert (job.request.fidelity, job.request.target) == ("standard", "")
@@ -153,7 +153,7 @@ def test_end_to_end_speed_counts_before_the_planners_own() -> None:
     assert pick("gsr>=0.5", chart={"runs": runs}) == "fine"
 
 
-def test_a_job_in_a_scene_is_chosen_by_the_chart_of_its_kind_of_scene_and_says_so(services: Services) -> None:
+def test_a_job_in_a_scene_is_chosen_by_the_chart_of_its_scene(services: Services) -> None:
     publish(services.store, "charts", CHART)
     key = publish(services.store, charts_of(SceneSpec(kind="table")), scene_chart())
     publish(services.store, charts_of(SceneSpec(kind="bin")), scene_chart("bin") | {"runs": [lifts("fine", 1, 0.99)]})
@@ -166,7 +166,7 @@ def test_a_job_in_a_scene_is_chosen_by_the_chart_of_its_kind_of_scene_and_says_s
     assert job_actions.submit(services, request(scene="table", seed=9))[0].choice is None
 
 
-def test_a_free_chart_is_no_chart_of_scenes_and_the_other_way_round(services: Services) -> None:
+def test_a_free_chart_is_no_chart_of_scenes_nor_the_reverse(services: Services) -> None:
     publish(services.store, charts_of(SceneSpec(kind="table")), scene_chart())
     with pytest.raises(InputError, match="run `graspd chart --publish` once"):
         job_actions.submit(services, request(fidelity="auto", target="gsr>=0.6"))

@@ -70,7 +70,7 @@ def test_the_next_stage_is_queued_without_waiting_for_a_sweep(services: Services
     assert [delivery.message.stage for delivery in taken(services)] == [Stage.SCENE]
 
 
-def test_what_runs_is_not_queued_again_and_many_ends_are_one_round(services: Services, controller: Controller) -> None:
+def test_what_runs_is_not_queued_and_many_ends_are_one_round(services: Services, controller: Controller) -> None:
     job, _ = job_actions.submit(services, request(grasps=32 * 150), lane=Lane.BULK)
     held = taken(services)
     finish(services, held[0])
@@ -83,9 +83,7 @@ def test_what_runs_is_not_queued_again_and_many_ends_are_one_round(services: Ser
     assert (done.state, done.grasps) == (State.SUCCEEDED, 32 * 150)
 
 
-def test_how_far_a_task_is_reaches_the_index_and_goes_with_its_worker(
-    services: Services, controller: Controller
-) -> None:
+def test_progress_of_a_task_reaches_the_index_and_goes(services: Services, controller: Controller) -> None:
     job, _ = job_actions.submit(services, request())
     (held,) = taken(services)
     services.queue.report(held.message.task_id, Report(attempt=1, done=3.0, total=4.0, message="descending"))
@@ -224,7 +222,7 @@ def test_a_job_whose_record_is_gone_is_given_up(services: Services, work_off: Wo
 
 
 @pytest.mark.slow
-def test_five_jobs_of_a_million_grasps_delay_a_small_one_by_less_than_three_seconds(services: Services) -> None:
+def test_five_jobs_of_a_million_delay_a_small_one_by_under_3_s(services: Services) -> None:
     stop, waits = threading.Event(), list[float]()
     leading = Controller(services)
     leading.round()

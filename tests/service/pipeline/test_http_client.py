@@ -126,9 +126,7 @@ def test_what_is_no_address_is_refused_when_it_is_made(url: str) -> None:
 
 
 @pytest.mark.parametrize("addresses", [["10.20.30.40"], ["93.184.216.34", "10.20.30.40"]])
-def test_a_name_with_a_private_address_is_refused_without_telling_it(
-    monkeypatch: pytest.MonkeyPatch, addresses: list[str]
-) -> None:
+def test_a_name_with_a_private_address_is_refused_untold(monkeypatch: pytest.MonkeyPatch, addresses: list[str]) -> None:
     found = [(socket.AF_INET, 1, 6, "", (one, 80)) for one in addresses]
     monkeypatch.setattr(http_client.socket, "getaddrinfo", lambda *_, **__: found)
     answer = post("http://db.internal/", b"{}", {})
@@ -136,7 +134,7 @@ def test_a_name_with_a_private_address_is_refused_without_telling_it(
     assert "GRASPD_WEBHOOK_NETWORKS" in answer.detail and "10.20" not in answer.detail
 
 
-def test_a_name_that_cannot_be_looked_up_tells_nothing_of_the_network(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_name_that_cannot_be_looked_up_tells_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     def unknown(*_: object, **__: object) -> None:
         raise OSError("resolver 10.0.0.2: NXDOMAIN")
 

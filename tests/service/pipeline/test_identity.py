@@ -35,7 +35,7 @@ def first(tmp_path: Path) -> Services:
     return made
 
 
-def test_a_second_service_on_a_store_is_refused_with_the_ways_out(first: Services, tmp_path: Path) -> None:
+def test_a_second_service_on_a_store_is_refused(first: Services, tmp_path: Path) -> None:
     second = service(tmp_path / "second", store=first.store)
     for _ in range(2):
         with pytest.raises(BusyError, match=r"belongs to another graspd service.*a store of its own.*index rebuild"):
@@ -43,7 +43,7 @@ def test_a_second_service_on_a_store_is_refused_with_the_ways_out(first: Service
     assert second.queue.service() is None
 
 
-def test_a_second_service_on_a_redis_is_refused_with_the_ways_out(first: Services, tmp_path: Path) -> None:
+def test_a_second_service_on_a_redis_is_refused(first: Services, tmp_path: Path) -> None:
     second = service(tmp_path / "second", queue=first.queue)
     for take_over in (False, False, True):
         with pytest.raises(BusyError, match=r"Redis belongs to another graspd service.*GRASPD_REDIS_URL"):
@@ -71,12 +71,12 @@ def test_a_lost_redis_becomes_the_services_again(first: Services) -> None:
     assert identify(emptied) == emptied.queue.service() == first.queue.service()
 
 
-def test_an_index_on_another_machine_or_a_lost_one_is_the_services(first: Services, tmp_path: Path) -> None:
+def test_an_index_elsewhere_or_a_lost_one_is_the_services(first: Services, tmp_path: Path) -> None:
     other = service(tmp_path / "other", store=first.store, queue=first.queue)
     assert identify(other) == first.index.notes.service() == other.index.notes.service()
 
 
-def test_a_data_folder_whose_index_and_redis_are_lost_remembers_its_service(tmp_path: Path) -> None:
+def test_a_data_folder_remembers_its_service(tmp_path: Path) -> None:
     store = open_store((tmp_path / "store").as_uri())
     made = service(tmp_path / "first", store=store)
     mine = identify(made, folder=made.settings.data_dir)
@@ -125,7 +125,7 @@ def test_an_index_of_another_store_is_refused(first: Services, tmp_path: Path) -
         identify(mixed)
 
 
-def test_a_controller_ends_when_another_service_takes_over_its_store(first: Services, tmp_path: Path) -> None:
+def test_a_controller_ends_when_its_store_is_taken_over(first: Services, tmp_path: Path) -> None:
     now = [0.0]
     controller = Controller(first, clock=lambda: now[0])
     controller.round()

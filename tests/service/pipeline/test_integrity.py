@@ -116,7 +116,7 @@ def test_what_comes_out_otherwise_is_not_put(services: Services, shards: list[Sh
     assert differences(services.index, services.store) == []
 
 
-def test_a_foreign_object_is_moved_aside_and_a_damaged_record_needs_a_copy(
+def test_a_foreign_object_is_moved_and_a_bad_record_needs_a_copy(
     services: Services, shards: list[ShardManifest]
 ) -> None:
     services.store.put("shards/base/notes.txt", b"mine")

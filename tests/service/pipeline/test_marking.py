@@ -99,7 +99,7 @@ def test_an_older_copy_of_the_index_is_made_anew(tmp_path: Path, rebuilt: list[o
     assert len(rebuilt) == 2
 
 
-def test_an_older_copy_of_the_store_is_believed_and_the_index_made_anew(tmp_path: Path, rebuilt: list[object]) -> None:
+def test_an_older_copy_of_the_store_is_believed(tmp_path: Path, rebuilt: list[object]) -> None:
     data, backup = tmp_path / "data", tmp_path / "backup"
     in_service(data, submit(1))
     shutil.copytree(data / "store", backup)
@@ -130,7 +130,7 @@ def test_a_copy_that_is_as_new_as_the_store_is_kept(tmp_path: Path, rebuilt: lis
     assert rebuilt == []
 
 
-def test_an_index_exchanged_while_the_controller_runs_is_made_anew(tmp_path: Path, rebuilt: list[object]) -> None:
+def test_an_index_exchanged_meanwhile_is_made_anew(tmp_path: Path, rebuilt: list[object]) -> None:
     data, backup = tmp_path / "data", tmp_path / "backup"
     in_service(data, submit(1))
     copy_index(data, backup)
@@ -148,7 +148,7 @@ def test_an_index_exchanged_while_the_controller_runs_is_made_anew(tmp_path: Pat
     services.close()
 
 
-def test_a_controller_killed_between_index_and_store_leaves_nothing_to_mend(
+def test_a_controller_killed_between_index_and_store_is_harmless(
     tmp_path: Path, rebuilt: list[object], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     data, real = tmp_path / "data", Notes.set_marked

@@ -76,7 +76,7 @@ def test_damage_of_the_store_is_told(services: Services) -> None:
     assert b"graspd_store_damaged 1.0" in Metrics().render(shown)
 
 
-def test_unfinished_jobs_and_the_yield_of_the_last_minute_are_told(services: Services) -> None:
+def test_unfinished_jobs_and_the_latest_yield_are_told(services: Services) -> None:
     submit(services, request(grasps=32))
     manifest = make_shard(services.store, message_for())
     services.index.write.add_manifest(manifest)

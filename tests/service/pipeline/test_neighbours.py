@@ -79,7 +79,7 @@ def test_a_document_places_its_neighbours(services: Services) -> None:
     assert {one.digest for one in found} == {cup}
 
 
-def test_a_neighbour_is_needed_until_its_job_and_its_dataset_are_deleted(services: Services) -> None:
+def test_a_neighbour_is_needed_until_its_users_are_deleted(services: Services) -> None:
     add(services, "cup")
     job = submit(services, neighbours=("cup",))
     needed_until_its_users_are_deleted(services, AssetKind.OBJECT, "cup", job.id, dataset_of(scene="bin"))
@@ -143,7 +143,7 @@ def test_a_neighbour_that_is_being_checked_is_waited_for(services: Services) -> 
         submit(services, neighbours=("cup",))
 
 
-def test_a_forged_entry_cannot_name_a_neighbour_without_its_files(services: Services) -> None:
+def test_a_forged_entry_cannot_name_a_neighbour_by_name_alone(services: Services) -> None:
     add(services, "cup")
     job = submit(services, neighbours=("cup",))
     said = message_of(job, next(plan(job)), attempt=1, max_attempt=3).model_dump(mode="json", by_alias=True)

@@ -79,7 +79,7 @@ def test_a_retried_job_sets_out_from_the_network_it_had(services: Services) -> N
     assert queue.take("w").message.request.network == net
 
 
-def test_a_network_is_needed_until_its_job_and_its_dataset_are_deleted(services: Services) -> None:
+def test_a_network_is_needed_until_its_users_are_deleted(services: Services) -> None:
     add(services)
     job = submit(services)
     wanted = DatasetRequest(name="d", hands=("gripper",), objects=("ball",), grasps=64, **LEARNED, **NAMED)

@@ -55,7 +55,7 @@ def test_a_controller_takes_packs_apart_when_it_starts(services: Services) -> No
     assert not services.index.jobs.attempts(job=job)
 
 
-def test_what_a_worker_of_0_2_packs_meanwhile_is_found_and_no_attempt_is_used_up(services: Services) -> None:
+def test_what_a_worker_of_0_2_packs_meanwhile_is_found(services: Services) -> None:
     bench = Bench(services)
     bench.controller.round()
     job, tasks = submit(services, 3)
@@ -70,7 +70,7 @@ def test_what_a_worker_of_0_2_packs_meanwhile_is_found_and_no_attempt_is_used_up
     assert (services.index.jobs.attempts(job=job), services.queue.waiting()) == ([], set())
 
 
-def test_what_is_harmed_in_a_pack_is_made_again_with_the_checksum_it_had(services: Services) -> None:
+def test_what_is_harmed_in_a_pack_is_made_again(services: Services) -> None:
     job, tasks = submit(services, 2)
     key = pack(services.store, tasks)
     overwrite(services.store, key, flipped(services.store.get(key), len(services.store.get(key)) - 200))
@@ -83,7 +83,7 @@ def test_what_is_harmed_in_a_pack_is_made_again_with_the_checksum_it_had(service
     assert is_whole(services, job)
 
 
-def test_readers_name_the_command_and_then_read_a_snapshot_of_places_in_packs(services: Services) -> None:
+def test_readers_name_the_command_and_read_places_in_packs(services: Services) -> None:
     job, tasks = submit(services, 2)
     pack(services.store, tasks)
     folder = services.settings.data_dir

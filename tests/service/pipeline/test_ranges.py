@@ -71,7 +71,7 @@ def test_tasks_are_of_one_length_and_shared_evenly(batches: int, by_time: int, w
         assert found <= math.ceil(batches / workers), "no worker waits while another has two"
 
 
-def test_a_task_of_a_larger_job_lasts_about_as_long_as_the_settings_say(services: Services) -> None:
+def test_a_task_of_a_larger_job_lasts_as_the_settings_say(services: Services) -> None:
     here(services, worker())
     assert span(services, 32 * 100) == 4, "nothing was measured: a stored rate on two cores, 7 s a batch"
     # Half of what the fakes make is valid, so that a job of so many valid ones takes twice the tries of a batch.
@@ -121,7 +121,7 @@ def test_cells_of_a_dataset_share_the_workers(services: Services, cells: int, ta
     assert {cell.tasks for cell in services.index.datasets.cells("d").items} == {tasks}
 
 
-def test_a_small_job_goes_batch_by_batch_but_on_a_gpu_in_one_launch(services: Services) -> None:
+def test_a_small_job_goes_batch_by_batch_but_on_a_gpu(services: Services) -> None:
     measured(services, 0.01)
     here(services, worker())
     assert span(services, 128, Lane.INTERACTIVE) == 1
@@ -155,7 +155,7 @@ def test_rates_and_workers_are_read_once_for_many_jobs(services: Services) -> No
     assert ranges.sized(job).span > 4
 
 
-def test_a_job_of_ranges_goes_through_its_stages_and_the_index_is_the_store(services: Services) -> None:
+def test_a_job_of_ranges_goes_through_its_stages(services: Services) -> None:
     bench = Bench(services)
     bench.controller.round()
     here(services, worker())

@@ -60,7 +60,7 @@ def test_what_nobody_can_do_is_held_back_with_the_reason(present: list[WorkerBea
     assert why in Routes(present).place(need).held
 
 
-def test_a_task_asks_for_the_schema_of_the_newest_field_that_it_uses() -> None:
+def test_a_task_asks_for_the_schema_of_its_newest_field() -> None:
     since = {"friction": 3, "touch": 4}
     assert needed_schema(request(), since) == OWN.schemas[0]
     assert needed_schema(request(friction=0.5), since) == 3
@@ -83,7 +83,7 @@ def test_a_worker_looks_apart_only_for_what_it_can_do() -> None:
     assert names[: len(apart) + 1] == [*apart, "interactive-synthesize"]
 
 
-def test_tasks_that_wait_apart_are_seen_and_leave_with_those_who_take_them(rq_queue: RqQueue) -> None:
+def test_tasks_that_wait_apart_are_seen_and_leave(rq_queue: RqQueue) -> None:
     message = message_for()
     name = f"rq:queue:{queue_name(Lane.BULK, Stage.SYNTHESIZE, NEED)}"
     assert rq_queue.enqueue([message], Lane.BULK, apart=True) == 1

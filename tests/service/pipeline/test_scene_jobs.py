@@ -51,7 +51,7 @@ def test_scenes_are_made_before_grasps_and_told_in_that_order(services: Services
 
 
 @pytest.mark.parametrize("kind", ["SceneError", "LoadError"])
-def test_a_job_ends_when_its_first_batch_finds_nothing_in_its_scenes(services: Services, kind: str) -> None:
+def test_a_job_ends_when_its_first_batch_finds_nothing(services: Services, kind: str) -> None:
     job = submit(services, grasps=128)
     for batch in range(2):
         make(services, job, Stage.SCENE, batch)
@@ -90,7 +90,7 @@ def test_a_later_batch_or_another_fault_stops_no_other_batch(services: Services,
     assert services.index.jobs.get(job.id).state is State.RUNNING
 
 
-def test_grasps_are_found_by_their_scene_and_what_they_hold_there(services: Services) -> None:
+def test_grasps_are_found_by_their_scene(services: Services) -> None:
     free = read_record(JobRecord, services.store, names.job_record(job_actions.submit(services, request())[0].id))
     make(services, free, Stage.SYNTHESIZE)
     table, inside = submit(services), submit(services, scene="bin", seed=1)

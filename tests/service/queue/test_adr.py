@@ -50,9 +50,7 @@ def held(services: Services, rq_queue: RqQueue) -> tuple[Services, Job]:
     return services, taken
 
 
-def test_a_clock_that_is_ahead_takes_no_task_from_a_worker_that_lives(
-    held: tuple[Services, Job], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_clock_that_is_ahead_takes_no_task_away(held: tuple[Services, Job], monkeypatch: pytest.MonkeyPatch) -> None:
     services, job = held
     registry = StartedJobRegistry(NAME, connection=services.queue.connection, serializer=JSONSerializer)  # type: ignore[attr-defined]
     now = [0.0]
@@ -71,7 +69,7 @@ def test_a_clock_that_is_ahead_takes_no_task_from_a_worker_that_lives(
     assert not registry.connection.exists(held_key(NAME))
 
 
-def test_a_command_that_is_published_while_nobody_listens_is_lost_and_a_key_is_not(held: tuple[Services, Job]) -> None:
+def test_a_command_that_nobody_hears_is_lost_and_a_key_is_not(held: tuple[Services, Job]) -> None:
     services, job = held
     connection = services.queue.connection  # type: ignore[attr-defined]
     job.worker_name = "w"
@@ -95,7 +93,7 @@ def _fail() -> None:
     raise RuntimeError("as a task does")
 
 
-def test_retries_that_redis_counts_are_lost_with_it_and_those_of_the_store_are_not(held: tuple[Services, Job]) -> None:
+def test_retries_that_redis_counts_are_lost_with_it(held: tuple[Services, Job]) -> None:
     services, job = held
     connection = services.queue.connection  # type: ignore[attr-defined]
     plain = Queue("plain", connection=connection, serializer=JSONSerializer)

@@ -50,7 +50,7 @@ def test_tasks_are_added_together_and_none_twice(rq_queue: RqQueue) -> None:
     assert rq_queue.enqueue(tasks, Lane.BULK, again=True) == 700
 
 
-def test_a_report_replaces_the_last_one_and_goes_with_the_attempt(queue: MemoryQueue | RqQueue) -> None:
+def test_a_report_replaces_the_last_and_goes_with_the_attempt(queue: MemoryQueue | RqQueue) -> None:
     queue.report("a", Report(attempt=1, done=1.0, total=4.0, message="descending"))
     queue.report("b", Report(attempt=1, done=1.0))
     queue.report("a", Report(attempt=1, done=2.0, total=4.0))

@@ -99,7 +99,7 @@ def services(tmp_path: Path, rq_queue: RqQueue) -> Services:
 
 
 @pytest.mark.parametrize("what", FORGERIES)
-def test_a_forged_entry_stops_neither_feeding_nor_reaping_nor_pages(services: Services, what: str) -> None:
+def test_a_forged_entry_stops_nothing(services: Services, what: str) -> None:
     now = [1000.0]
     controller = Controller(services, clock=lambda: now[0])
     queue: Any = services.queue

@@ -199,7 +199,7 @@ def test_a_lease_says_who_holds_which_attempt_of_what(sides: tuple[RqQueue, Work
     assert queue.leases() == []
 
 
-def test_a_lease_changes_with_each_sign_of_life_and_not_by_reading(sides: tuple[RqQueue, Worker]) -> None:
+def test_a_lease_changes_with_each_beat_and_not_by_reading(sides: tuple[RqQueue, Worker]) -> None:
     queue, worker = sides
     queue.enqueue([task("a")], Lane.BULK)
     worker.take()
@@ -292,7 +292,7 @@ def test_a_part_is_there_as_long_as_it_says_so(sides: tuple[RqQueue, Worker]) ->
     assert queue.announced("controller")
 
 
-def test_of_those_who_want_to_lead_one_does_until_it_is_silent_or_resigns(sides: tuple[RqQueue, Worker]) -> None:
+def test_one_leads_until_it_is_silent_or_resigns(sides: tuple[RqQueue, Worker]) -> None:
     queue, _ = sides
 
     assert queue.lead("a", 600)
@@ -306,7 +306,7 @@ def test_of_those_who_want_to_lead_one_does_until_it_is_silent_or_resigns(sides:
     assert not queue.lead("b", 600)
 
 
-def test_a_controller_that_is_started_again_under_its_name_leads_at_once(rq_queue: RqQueue) -> None:
+def test_a_controller_that_is_started_again_leads_at_once(rq_queue: RqQueue) -> None:
     assert rq_queue.lead("node-1", 600)
     again = RqQueue(rq_queue.connection)
     assert not again.lead("node-2", 600)

@@ -47,7 +47,7 @@ def on_box(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.where(inward > 0, outward, -inward), normal
 
 
-def test_points_of_the_object_lie_on_it_and_their_normals_are_its_faces(pictures: Pictures) -> None:
+def test_points_of_the_object_lie_on_it(pictures: Pictures) -> None:
     for sample in pictures.clouds(500, frame="object"):
         assert sample["cloud/points"].shape == sample["cloud/normals"].shape == (500, 3)
         distance, normal = on_box(sample["cloud/points"].astype(float))
@@ -100,7 +100,7 @@ def test_views_fused_agree_and_show_more_than_each(pictures: Pictures) -> None:
         assert faces[0] > faces[1]
 
 
-def test_labels_stand_in_each_frame_and_are_the_valid_grasps_of_the_scene(pictures: Pictures, folder: Path) -> None:
+def test_labels_stand_in_each_frame_and_are_the_valid_grasps(pictures: Pictures, folder: Path) -> None:
     base = read_shard(folder / "base.h5")
     clouds = pictures.clouds(8, postures=("pregrasp", "grasp", "squeeze"))
     for index in (1, VIEWS + 2):
@@ -122,7 +122,7 @@ def test_labels_stand_in_each_frame_and_are_the_valid_grasps_of_the_scene(pictur
             np.testing.assert_array_equal(sample[f"{posture}/joint_positions"], joints)
 
 
-def test_the_same_seed_gives_the_same_clouds_and_another_epoch_others(pictures: Pictures) -> None:
+def test_the_same_seed_gives_the_same_clouds(pictures: Pictures) -> None:
     def points(epoch: int, **options: Any) -> np.ndarray:
         clouds = pictures.clouds(256, noise="stereo", **options)
         clouds.epoch = epoch
@@ -166,7 +166,7 @@ def test_where_nothing_is_seen_the_cloud_is_zero_and_says_so(pictures: Pictures)
     assert not sample["cloud/points"].any() and not sample["cloud/graspness"].any()
 
 
-def test_graspness_is_the_share_of_the_grasps_that_touch_the_point() -> None:
+def test_graspness_is_the_share_of_grasps_that_touch_the_point() -> None:
     points = np.array([[0, 0, 0], [0.01, 0, 0], [0.5, 0, 0]])
     hands = np.array([[[0, 0, 0.004], [0.011, 0, 0]], [[0.009, 0, 0], [0.2, 0, 0]], [[0, 0.0051, 0], [1, 1, 1]]])
     assert graspness(points, hands, touch_m=0.005).tolist() == pytest.approx([1 / 3, 2 / 3, 0])

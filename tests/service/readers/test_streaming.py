@@ -92,7 +92,7 @@ def test_pictures_leave_nothing_on_the_disk(folder: Path, shards: Shards, tmp_pa
     assert base.read_bytes() == (folder / "base.h5").read_bytes()
 
 
-def test_a_request_brings_all_that_is_read_in_turn_or_the_bytes_of_one_picture(
+def test_a_request_brings_what_is_read_in_turn(
     folder: Path, shards: Shards, asked: list[tuple[str, int, int]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pictures = Pictures(shards, ["image/rgb", "image/depth"])
@@ -121,7 +121,7 @@ def test_what_is_held_is_bounded(folder: Path, tmp_path: Path, monkeypatch: pyte
     assert set(reader._objects) == {"object-4", "object-5"}
 
 
-def test_damage_is_told_with_the_row_and_what_is_gone_with_its_name(folder: Path, tmp_path: Path) -> None:
+def test_damage_is_told_with_the_row_or_the_name(folder: Path, tmp_path: Path) -> None:
     store = open_store(f"file://{tmp_path / 'store'}")
     shards = streamed(folder, store, tmp_path / "cache")
     pictures = Pictures(shards, ["image/depth"])
@@ -161,7 +161,7 @@ def test_a_store_that_is_away_is_told_and_not_taken_for_damage(
         pictures[0]
 
 
-def test_a_process_that_keeps_the_error_of_a_shard_that_is_none_ends_well() -> None:
+def test_a_kept_error_of_a_bad_shard_ends_the_process_well() -> None:
     """HDF5 crashes at the end of a process in which something still holds a file that it could not open."""
     code = """
 from service.model.errors import InputError
@@ -180,7 +180,7 @@ except InputError as error:
     assert (done.returncode, "not a readable HDF5 file" in done.stdout) == (0, True), done.stderr[-1000:]
 
 
-def test_a_reader_goes_to_another_process_and_begins_there_with_nothing(folder: Path, tmp_path: Path) -> None:
+def test_a_reader_begins_with_nothing_in_another_process(folder: Path, tmp_path: Path) -> None:
     store = open_store(f"file://{tmp_path / 'store'}")
     pictures = Pictures(streamed(folder, store, tmp_path / "cache"))
     first = pictures[3]
@@ -190,7 +190,7 @@ def test_a_reader_goes_to_another_process_and_begins_there_with_nothing(folder: 
 
 
 @pytest.mark.parametrize("stream", [True, False])
-def test_a_fork_is_told_to_start_anew_instead_of_waiting_for_ever(
+def test_a_fork_is_told_to_start_anew(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stream: bool
 ) -> None:
     remote = Store(MemoryStore(), "s3://bucket/graspd")
@@ -261,7 +261,7 @@ def test_what_is_packed_in_another_way_is_read_by_the_library(tmp_path: Path) ->
     assert not table.row(0, ["half"], lambda _: [])["half"].any()
 
 
-def test_a_picture_whose_bytes_turned_is_refused_and_the_others_are_read(views: Path, tmp_path: Path) -> None:
+def test_a_picture_whose_bytes_turned_is_refused_alone(views: Path, tmp_path: Path) -> None:
     folder = tmp_path / "set"
     folder.mkdir()
     (folder / "base.h5").write_bytes((views.parent / "base.h5").read_bytes())

@@ -31,13 +31,13 @@ def shard(*, in_scene: bool) -> Shard:
     return Shard("base", {}, arrays)
 
 
-def test_a_free_grasp_goes_from_the_pregrasp_over_the_grasp_to_the_squeeze():
+def test_a_free_grasp_goes_from_pregrasp_to_squeeze():
     way = way_of(shard(in_scene=False), 0)
     assert [point.name for point in way] == ["pregrasp", "grasp", "squeeze"]
     assert stop_places(way).tolist() == [0, 1, 2]
 
 
-def test_a_grasp_in_a_scene_comes_from_its_standoff_and_carries_the_object_up():
+def test_a_grasp_in_a_scene_comes_from_standoff_and_lifts():
     way = way_of(shard(in_scene=True), 0)
     assert [point.name for point in way if point.name] == ["standoff", "pregrasp", "grasp", "squeeze", "lift"]
     assert way[0].hand_pose[0] == 0.2

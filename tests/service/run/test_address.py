@@ -44,9 +44,7 @@ def asked() -> str:
         return client.url
 
 
-def test_the_client_asks_the_service_of_its_data_folder_unless_a_url_was_given(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_client_asks_the_service_of_its_data_folder(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert asked() == "http://127.0.0.1:8000", "without a record the usual address"
     record_address(folder, URL)
     assert stat.S_IMODE((folder / "api.json").stat().st_mode) == 0o600
@@ -85,7 +83,7 @@ def test_only_the_process_that_wrote_the_record_takes_it_away(folder: Path) -> N
     assert recorded_address(folder) is None
 
 
-def test_a_service_on_any_free_port_is_found_by_its_data_folder_until_it_stops(folder: Path) -> None:
+def test_a_service_on_any_free_port_is_found_until_it_stops(folder: Path) -> None:
     supervisor = Supervisor(Settings(data_dir=folder, port=0, device="cpu"), workers=0)
     with supervisor:
         assert not supervisor.api_url.endswith(":0")
@@ -121,9 +119,7 @@ def test_the_file_holds_what_a_shell_reads_and_nobody_else_may(joining_settings:
     assert list(file.parent.iterdir()) == [file], "no draft is left"
 
 
-def test_a_service_forgets_its_own_file_and_not_that_of_its_successor(
-    joining_settings: Settings, tmp_path: Path
-) -> None:
+def test_a_service_forgets_its_own_file_and_not_its_successors(joining_settings: Settings, tmp_path: Path) -> None:
     first, second = (joining(joining_settings, tmp_path / "join.env", host="127.0.0.1") for _ in range(2))
     assert first.password != second.password
     first.write(joining_settings, "http://a")
@@ -230,9 +226,7 @@ def test_up_ends_neither_itself_nor_its_parent_nor_nonsense(pid: object, tmp_pat
     assert end_leftovers(tmp_path) == []
 
 
-def test_the_address_of_a_service_whose_number_another_process_has_is_not_believed(
-    stranger: subprocess.Popen[bytes], tmp_path: Path
-) -> None:
+def test_the_address_of_a_foreign_process_is_not_believed(stranger: subprocess.Popen[bytes], tmp_path: Path) -> None:
     record_address(tmp_path, "http://127.0.0.1:45678")
     record = json.loads((tmp_path / "api.json").read_text())
     (tmp_path / "api.json").write_text(json.dumps(record | {"pid": stranger.pid}))

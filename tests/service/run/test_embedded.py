@@ -73,7 +73,7 @@ def test_a_long_data_folder_still_gets_a_socket(tmp_path: Path) -> None:
     assert deep != socket_path(tmp_path / ("y" * 120))
 
 
-def test_the_socket_is_private_and_what_was_written_survives_kill_9(tmp_path: Path) -> None:
+def test_the_socket_is_private_and_writes_survive_kill_9(tmp_path: Path) -> None:
     settings = Settings(data_dir=tmp_path)
     for start in range(2):
         with subprocess.Popen(server_command(settings), stdout=subprocess.DEVNULL) as process:
@@ -108,7 +108,7 @@ HARMS = {"base.rdb": (make_newer, scribble, cut, Path.unlink), "incr.aof": (scri
 
 
 @pytest.mark.parametrize(("name", "harm"), [(f"*.{kind}", harm) for kind, harms in HARMS.items() for harm in harms])
-def test_a_log_of_writes_that_redis_cannot_read_gives_way_to_an_empty_one(
+def test_a_log_that_redis_cannot_read_gives_way_to_an_empty_one(
     tmp_path: Path, name: str, harm: Callable[[Path], None], caplog: pytest.LogCaptureFixture
 ) -> None:
     settings = Settings(data_dir=tmp_path)

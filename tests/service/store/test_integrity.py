@@ -147,7 +147,7 @@ def test_where_nobody_judged_nothing_is_valid() -> None:
     assert validity.chosen(columns, unjudged=True).tolist() == [True, True, False]
 
 
-def test_a_shard_of_graspd_0_1_that_nobody_judged_is_not_taken_for_judged() -> None:
+def test_an_unjudged_shard_of_0_1_is_not_taken_for_judged() -> None:
     assert not validity.valid({"quality/valid": FLAGS}).any()
     assert validity.chosen({"quality/valid": FLAGS}, unjudged=True).tolist() == [True, True, False]
 

@@ -95,7 +95,7 @@ def test_a_name_that_could_leave_the_store_is_refused(store: Store, key: str) ->
             call(key)
 
 
-def test_an_unfinished_local_write_is_never_seen_and_a_put_leaves_no_other_file(tmp_path: Path) -> None:
+def test_an_unfinished_write_is_never_seen(tmp_path: Path) -> None:
     store = open_store(tmp_path.as_uri())
     for data in (b"whole", b"again"):
         store.put("shards/base/a.h5", data)
@@ -152,7 +152,7 @@ def signing(s3_url: str, s3_server: S3Server) -> Store:
 
 
 @pytest.mark.s3
-def test_a_large_object_comes_back_chunk_by_chunk_and_is_written_once(remote_store: Store) -> None:
+def test_a_large_object_comes_in_chunks_and_is_written_once(remote_store: Store) -> None:
     # Larger than what the client sends in one part: parts must not slip past the refusal of a second put.
     data = os.urandom(24 * 2**20)
     assert remote_store.put("shards/views/large.h5", data) is True
@@ -177,7 +177,7 @@ def test_a_listing_goes_on_behind_a_thousand_objects(remote_store: Store) -> Non
 
 
 @pytest.mark.s3
-def test_anybody_with_the_signed_address_may_read_that_object_and_no_other(signing: Store) -> None:
+def test_a_signed_address_opens_that_object_and_no_other(signing: Store) -> None:
     signing.put("shards/base/a.h5", bytes(range(100)))
     signing.put("shards/base/b.h5", b"secret")
     address = signing.sign("shards/base/a.h5", seconds=60)

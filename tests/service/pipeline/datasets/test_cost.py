@@ -60,7 +60,7 @@ def test_valid_grasps_cost_the_tries_that_fail(services: Services) -> None:
     assert scarce.tried == 3200 and scarce.valid == round(3200 * rate.valid_yield)
 
 
-def test_another_object_takes_the_hand_and_another_hand_takes_all(services: Services) -> None:
+def test_another_object_takes_the_hand_another_hand_takes_all(services: Services) -> None:
     run(services, hands=("claw",), objects=("cube",))
     for hand, obj, words in (
         ("claw", "cube", "measured here: claw on cube, cpu"),
@@ -89,7 +89,7 @@ def test_another_recipe_is_not_measured_by_this_one(services: Services) -> None:
         assert all(rate.origin.startswith(ORIGIN) for rate in found.rates) and found.measured_share == 0
 
 
-def test_what_was_measured_at_one_fidelity_scales_the_stored_rates_of_all(services: Services) -> None:
+def test_one_measured_fidelity_scales_the_stored_rates_of_all(services: Services) -> None:
     """So fidelities stand in the order of their cost; and so do scenes and pictures."""
     fresh = estimate(services.index, wanted(scenes=2, views=2)).seconds_by_stage
     done = run(services)
@@ -110,7 +110,7 @@ def test_what_was_measured_at_one_fidelity_scales_the_stored_rates_of_all(servic
         assert scaled[stage] == pytest.approx(factor * fresh[stage])  # type: ignore[index]
 
 
-def test_an_interval_holds_the_estimate_and_shrinks_with_what_is_known(services: Services) -> None:
+def test_an_interval_holds_the_estimate_and_shrinks(services: Services) -> None:
     unknown = estimate(services.index, wanted(fidelity="fine"))
     assert unknown.machine_factor is None
     run(services)

@@ -80,7 +80,7 @@ def test_a_name_stands_for_one_dataset(services: Services) -> None:
         actions.create(services, wanted(objects=("ball",), grasps=64))
 
 
-def test_a_dataset_of_an_older_graspd_with_fewer_options_is_the_same(services: Services) -> None:
+def test_a_dataset_of_an_older_graspd_is_the_same(services: Services) -> None:
     actions.create(services, wanted())
     old = json.loads(services.store.get(names.dataset_record("grasps")))
     del old["options"]["robustness"], old["checksum"]
@@ -98,7 +98,7 @@ def test_a_dataset_keeps_the_versions_it_was_created_with(services: Services) ->
     assert services.index.jobs.get(jobs_of(services, "grasps")[0]).object_digest == first
 
 
-def test_what_cannot_be_used_is_refused_before_anything_is_recorded(services: Services) -> None:
+def test_what_cannot_be_used_is_refused_before_it_is_recorded(services: Services) -> None:
     add_asset(services, "object", "torn", verdict="refuse")
     add_asset(services, "object", "fresh", verdict=None)
     for changes, error, words in (
@@ -140,7 +140,7 @@ def test_status_tells_each_cell(either: Services) -> None:
     assert whole.seconds == pytest.approx(1.5) and whole.shards == 3
 
 
-def test_a_dataset_that_found_fewer_grasps_says_what_became_of_the_others(either: Services) -> None:
+def test_a_dataset_that_found_fewer_grasps_tells_the_outcomes(either: Services) -> None:
     actions.create(either, wanted(objects=("ball",)))
     plan_all(either)
     first, second = jobs_of(either, "grasps")
@@ -197,7 +197,7 @@ def test_a_job_that_another_dataset_waits_for_goes_on(either: Services) -> None:
     assert states == ["cancelled", "queued", "cancelled", "cancelled"]
 
 
-def test_retry_starts_failed_and_cancelled_cells_again_and_repeats_nothing(services: Services) -> None:
+def test_retry_starts_failed_and_cancelled_cells_again(services: Services) -> None:
     actions.create(services, wanted(grasps=64))
     plan_all(services)
     jobs = jobs_of(services, "grasps")
@@ -220,7 +220,7 @@ def test_retry_starts_failed_and_cancelled_cells_again_and_repeats_nothing(servi
         actions.retry(services, "grasps")
 
 
-def test_an_event_reaches_a_job_once_however_often_the_planner_runs(services: Services) -> None:
+def test_an_event_reaches_a_job_once(services: Services) -> None:
     actions.create(services, wanted())
     plan_all(services)
     actions.cancel(services, "grasps")
@@ -271,7 +271,7 @@ def test_a_difference_between_index_and_store_is_found(services: Services) -> No
     ]
 
 
-def test_a_set_of_objects_is_spelled_out_when_the_dataset_is_created(services: Services) -> None:
+def test_a_set_of_objects_is_spelled_out_at_creation(services: Services) -> None:
     actions.add_object_set(services, "round", ["cone", "ball"])
     actions.create(services, wanted(objects=("cube",), sets=("round",)))
     actions.add_object_set(services, "round", ["ball"])

@@ -86,14 +86,14 @@ def test_with_auto_each_cell_gets_what_the_chart_promises_for_it(either: Service
     assert [cell.fidelity for cell in either.index.datasets.cells("grasps").items] == CHOSEN
 
 
-def test_a_cell_that_auto_chose_is_the_job_that_names_its_fidelity(services: Services) -> None:
+def test_a_cell_that_auto_chose_is_the_job_of_that_fidelity(services: Services) -> None:
     publish(services.store, "charts", chart())
     actions.create(services, wanted("chosen", **AUTO))
     actions.create(services, wanted("named", fidelity="fine"))
     assert jobs_of(services, "chosen")[2:] == jobs_of(services, "named")[2:]
 
 
-def test_a_later_chart_changes_nothing_of_a_dataset_that_is_there(services: Services) -> None:
+def test_a_later_chart_changes_nothing_of_a_dataset(services: Services) -> None:
     publish(services.store, "charts", chart())
     actions.create(services, wanted(**AUTO))
     before = jobs_of(services, "grasps")
@@ -111,7 +111,7 @@ def test_a_target_out_of_reach_on_one_cell_makes_no_dataset(services: Services) 
     assert not services.store.exists(names.dataset_record("grasps"))
 
 
-def test_the_cost_of_auto_is_that_of_the_fidelities_it_stands_for(services: Services) -> None:
+def test_the_cost_of_auto_is_that_of_the_chosen_fidelities(services: Services) -> None:
     publish(services.store, "charts", chart())
     both = estimate(services.index, wanted(hands=("gripper",), **AUTO), Resolver(services.store))
     apart = [
@@ -129,7 +129,7 @@ def test_a_record_from_before_has_neither_and_is_read(services: Services) -> Non
     assert DatasetRecord.model_validate(stored) == load_dataset(services.store, "grasps")
 
 
-def test_each_cell_of_a_dataset_in_scenes_says_how_its_fidelity_was_chosen(either: Services) -> None:
+def test_each_cell_in_scenes_says_how_its_fidelity_was_chosen(either: Services) -> None:
     runs = [run_of("draft", 20, lift, "gripper", obj, IN_SCENE) for obj, lift in (("ball", 0.8), ("cube", 0.92))]
     runs += [run_of("standard", 15, lift, "gripper", obj, IN_SCENE) for obj, lift in (("ball", 0.95), ("cube", 0.99))]
     place = SceneSpec(kind="table")

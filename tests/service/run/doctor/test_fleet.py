@@ -161,7 +161,7 @@ def test_what_has_the_port_is_told(tmp_path: Path, status: int, body: str, ok: b
     assert told in found.message
 
 
-def test_a_port_that_is_free_is_good_and_an_address_of_others_is_bad(tmp_path: Path) -> None:
+def test_a_free_port_is_good_and_an_address_of_others_bad(tmp_path: Path) -> None:
     (free,) = free_ports(1)
     assert port(Settings(data_dir=tmp_path, port=free)).condition is Condition.GOOD
     found = port(Settings(data_dir=tmp_path, host="192.0.2.1", port=0))
@@ -169,7 +169,7 @@ def test_a_port_that_is_free_is_good_and_an_address_of_others_is_bad(tmp_path: P
     assert "GRASPD_HOST" in found.mend
 
 
-def test_the_service_of_the_data_folder_is_asked_where_it_wrote_that_it_is(tmp_path: Path) -> None:
+def test_the_service_of_the_data_folder_is_asked_at_its_address(tmp_path: Path) -> None:
     (gone,) = free_ports(1)
     record_address(tmp_path, f"http://127.0.0.1:{gone}")
     found = port(Settings(data_dir=tmp_path))

@@ -44,7 +44,7 @@ def test_a_data_folder_that_others_can_read_is_told(tmp_path: Path) -> None:
     assert data_folder(Settings(data_dir=tmp_path)).condition is Condition.GOOD
 
 
-def test_a_data_folder_on_a_network_is_told_where_locks_are_needed(tmp_path: Path) -> None:
+def test_a_data_folder_on_a_network_is_told(tmp_path: Path) -> None:
     mounts = tmp_path / "mounts"
     kinds = f"/dev/sda / ext4 rw 0 0\nserver:/home {tmp_path} nfs4 rw 0 0\ntmpfs {tmp_path}/tmp tmpfs rw 0 0\n"
     mounts.write_text(kinds)

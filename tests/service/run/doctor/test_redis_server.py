@@ -58,7 +58,7 @@ def test_the_redis_of_graspd_up_is_good_and_keeps_its_tasks(own: Settings, clien
     assert client.keys("graspd:doctor:*") == [], "a probe was left behind"
 
 
-def test_where_nothing_was_started_there_is_nothing_to_mend_and_one_that_is_away_is_bad(tmp_path: Path) -> None:
+def test_a_redis_never_started_is_skipped_and_a_lost_one_bad(tmp_path: Path) -> None:
     found = redis(Settings(data_dir=tmp_path))
     assert found.condition is Condition.SKIPPED and "graspd up" in found.message
     away = Settings(data_dir=tmp_path, redis_url=(url := f"redis://127.0.0.1:{free_ports(1)[0]}/0"))
