@@ -11,13 +11,10 @@ from opentelemetry.sdk.trace.export.in_memory_span_exporter import InMemorySpanE
 from starlette.testclient import TestClient
 
 from service import telemetry
-from service.model import names
 from service.model.planning import message_of, plan
-from service.model.records import JobRecord
 from service.model.states import Stage
 from service.pipeline.backends import Services
-from service.store.records import read_record
-from tests.fakes import fake_stages
+from tests.fakes import fake_stages, record_of
 from worker.process.runner import Runner
 from worker.stages.context import TaskContext
 
@@ -37,7 +34,7 @@ def test_a_task_is_in_the_trace_of_the_request_that_submitted_it(
 ) -> None:
     body = {"hand": "allegro", "object": "mug", "grasps": 32}
     made = http.post("/v1/jobs", json=body, headers={"traceparent": _PARENT}).json()
-    record = read_record(JobRecord, services.store, names.job_record(made["id"]))
+    record = record_of(services, made["id"])
     task = next(task for task in plan(record) if task.stage is Stage.SYNTHESIZE)
     message = message_of(record, task, attempt=1, max_attempt=3)
     runner = Runner(fake_stages(), worker="w", publish=lambda event: None)

@@ -13,14 +13,12 @@ from starlette.testclient import TestClient
 from api.access.keys import KeyFile, ProjectLimits, Scope
 from api.app import create_app
 from service.index.tables import shards
-from service.model import names
-from service.model.records import JobRecord
 from service.pipeline.backends import Services
 from service.queue.rq_queue import RqQueue
 from service.settings import Settings
-from service.store.records import read_record
 from tests.api.conftest import TODAY
 from tests.api.factories import finish_all, people_of
+from tests.fakes import record_of
 
 JOB = {"hand": "allegro", "object": "mug", "grasps": 32}
 Ask = Callable[..., Any]
@@ -55,7 +53,7 @@ def limit(settings: Settings, **limits: int) -> None:
 
 def done(services: Services, job: str, *, seconds: float, device: str = "cuda:0", day: str = TODAY) -> None:
     """A job of a single task is done: on that day, in that time."""
-    (made,) = finish_all(services, read_record(JobRecord, services.store, names.job_record(job)))
+    (made,) = finish_all(services, record_of(services, job))
     values = {"device": device, "created": f"{day}T11:00:00.000000Z", "seconds": seconds}
     with services.index.database.writing() as connection:
         connection.execute(update(shards).where(shards.c.id == made.shard_id).values(**values))
@@ -73,14 +71,14 @@ def test_keys_of_a_project_share_its_grasps_in_work(ask: Ask, settings: Settings
     assert ask("amy", 2).status_code == 202
     assert "the project 'red' has 64 grasps in work and may have 64" in refused(ask("amy", 3))
     assert ask("bob", 3).status_code == 202
-    finish_all(services, read_record(JobRecord, services.store, names.job_record(first)))
+    finish_all(services, record_of(services, first))
     assert ask("amy", 3).status_code == 202, "one of ann's ended"
 
 
 def test_keys_of_a_project_share_its_grasps_of_a_day(ask: Ask, settings: Settings, services: Services) -> None:
     limit(settings, grasps_per_day=96)
     first = ask("ann", 1).json()["id"]
-    finish_all(services, read_record(JobRecord, services.store, names.job_record(first)))
+    finish_all(services, record_of(services, first))
     too_many = ask("amy", 2, grasps=65)
     assert "has asked for 32 of its 96 grasps of today" in refused(too_many), "also for what is done"
     assert 12 * 3600 <= int(too_many.headers["retry-after"]) <= 12 * 3600 + 1, "until midnight, and not before"

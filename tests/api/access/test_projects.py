@@ -24,14 +24,13 @@ from service.index.rebuild import differences, rebuild
 from service.model import names
 from service.model.errors import InputError
 from service.model.planning import plan
-from service.model.records import JobRecord
 from service.model.states import AssetKind
 from service.pipeline.backends import Services
 from service.settings import Settings
 from service.store.network_file import to_bytes
-from service.store.records import read_record
 from service.store.store import open_store
 from tests.api.factories import add_worker, fail, finish_all, people_of
+from tests.fakes import record_of
 from tests.memory_queue import MemoryQueue
 from tests.networks import random_network
 from tests.planning import plan_all
@@ -67,12 +66,12 @@ class World:
     def __post_init__(self) -> None:
         ann = self.people["ann"]
         job = self.post("/v1/jobs", ann, json=JOB).json()["id"]
-        record = read_record(JobRecord, self.services.store, names.job_record(job))
+        record = record_of(self.services, job)
         finish_all(self.services, record)
         shard = next(task.output for task in plan(record))
         views = [task.output for task in plan(record)][-1]
         failed = self.post("/v1/jobs", ann, json=JOB | {"seed": 78}).json()["id"]
-        fail(self.services, read_record(JobRecord, self.services.store, names.job_record(failed)), "red-secret broke")
+        fail(self.services, record_of(self.services, failed), "red-secret broke")
         waiting = self.post("/v1/jobs", ann, json=JOB | {"seed": 79}).json()["id"]
         for kind, name in (("objects", "red-secret-ball"), ("hands", "red-secret-hand")):
             file = ("ball.stl", _BALL) if kind == "objects" else ("hand.urdf", _URDF)

@@ -17,7 +17,6 @@ from api.access.keys import Key, KeyFile, KeyLimits, Scope
 from api.access.quotas import Quotas
 from api.app import create_app
 from service.index.rebuild import differences
-from service.model import names
 from service.model.errors import ConflictError, QuotaError
 from service.model.records import JobRecord, ObjectSet, object_set_of
 from service.model.webhooks import MOST_HOOKS
@@ -29,6 +28,7 @@ from service.store import library
 from service.store.records import read_record
 from service.store.store import Store
 from tests.api.factories import bearer, finish_all, people_of
+from tests.fakes import record_of
 
 #: Often enough for two requests to meet.
 ROUNDS = 10
@@ -282,7 +282,7 @@ def test_a_tag_given_twice_at_once_has_the_grasps_of_both(
     twins: list[TestClient], headers: dict[str, str], services: Services
 ) -> None:
     job = twins[0].post("/v1/jobs", json=JOB, headers=headers).json()["id"]
-    shard = finish_all(services, read_record(JobRecord, services.store, names.job_record(job)))[0].shard_id
+    shard = finish_all(services, record_of(services, job))[0].shard_id
 
     def give(http: TestClient, number: int) -> Response:
         chosen = {"name": "good", "grasps": [{"shard_id": shard, "row": number}]}

@@ -5,13 +5,11 @@ from __future__ import annotations
 import pytest
 from starlette.testclient import TestClient
 
-from service.model import names
-from service.model.records import JobRecord
 from service.pipeline.backends import Services
 from service.pipeline.datasets import actions
 from service.pipeline.datasets.spec import DatasetRequest
-from service.store.records import read_record
 from tests.api.factories import add_job, finish_all
+from tests.fakes import record_of
 from tests.planning import plan_all
 
 
@@ -46,7 +44,7 @@ def test_a_dataset_of_unjudged_grasps_has_no_yield(http: TestClient, services: S
     actions.create(services, DatasetRequest.model_validate(wanted))
     plan_all(services)
     (job,) = services.index.jobs.page().items
-    finish_all(services, read_record(JobRecord, services.store, names.job_record(job.id)))
+    finish_all(services, record_of(services, job.id))
     (cell,) = http.get("/v1/datasets/d/cells").json()["items"]
     assert (cell["tried"], cell["judged"], cell["valid_yield"]) == (32, 0, None)
     assert http.get("/v1/datasets/d").json()["valid_yield"] is None

@@ -15,13 +15,11 @@ from api.access.keys import KeyFile, KeyLimits, Scope
 from api.app import create_app
 from api.middleware.body_limit import BodyLimit
 from api.middleware.rate_limit import Allowance, Rates
-from service.model import names
-from service.model.records import JobRecord
 from service.pipeline.backends import Services
 from service.queue.rq_queue import RqQueue
 from service.settings import Settings
-from service.store.records import read_record
 from tests.api.factories import bearer, finish_all
+from tests.fakes import record_of
 from tests.planning import plan_all
 from tests.waiting import PATIENCE_S
 
@@ -161,7 +159,7 @@ def test_grasps_in_flight_come_free_as_jobs_end(twins: Twins, keys: KeyFile, ser
     client, _ = twins()
     first = client.post("/v1/jobs", json=JOB, headers=headers).json()["id"]
     assert client.post("/v1/jobs", json=JOB | {"seed": 1, "grasps": 33}, headers=headers).status_code == 429
-    finish_all(services, read_record(JobRecord, services.store, names.job_record(first)))
+    finish_all(services, record_of(services, first))
     assert client.post("/v1/jobs", json=JOB | {"seed": 1, "grasps": 33}, headers=headers).status_code == 202
 
 

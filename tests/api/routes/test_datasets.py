@@ -7,11 +7,10 @@ from typing import Any
 import pytest
 from starlette.testclient import TestClient
 
-from service.model import names
-from service.model.records import JobRecord
 from service.pipeline.backends import Services
-from service.store.records import publish, read_record
+from service.store.records import publish
 from tests.api.factories import finish_all
+from tests.fakes import record_of
 from tests.planning import plan_all
 from tests.service.pipeline.test_fidelity_choice import CHART, scene_chart
 
@@ -29,7 +28,7 @@ def finish_cells(services: Services, http: TestClient, count: int) -> None:
     """Do all tasks of the first cells."""
     plan_all(services)
     for cell in http.get("/v1/datasets/kitchen/cells").json()["items"][:count]:
-        finish_all(services, read_record(JobRecord, services.store, names.job_record(cell["job_id"])))
+        finish_all(services, record_of(services, cell["job_id"]))
 
 
 def test_a_new_dataset_has_a_place_and_a_done_one_is_found(http: TestClient, services: Services) -> None:

@@ -13,13 +13,12 @@ from starlette.testclient import TestClient
 from api.uploads import files_of_upload
 from service.model import names
 from service.model.errors import LimitError
-from service.model.records import JobRecord
 from service.model.states import AssetKind
 from service.pipeline.backends import Services
 from service.store import network_file
 from service.store.library import load_asset_files
 from service.store.network_file import NETWORK_FILE, to_bytes
-from service.store.records import read_record
+from tests.fakes import record_of
 from tests.networks import random_network
 from tests.service.store.test_network_file import HOSTILE
 
@@ -97,7 +96,7 @@ def test_a_job_names_a_network_and_keeps_its_digest(http: TestClient, services: 
     digest = upload(http, of_hand(http)).json()["digest"]
     answer = http.post("/v1/jobs", json=JOB)
     assert answer.status_code == 202, answer.text
-    record = read_record(JobRecord, services.store, names.job_record(answer.json()["id"]))
+    record = record_of(services, answer.json()["id"])
     assert record.request.network == digest
     refused = http.delete("/v1/networks/net")
     assert refused.status_code == 409 and record.id in refused.json()["detail"]
