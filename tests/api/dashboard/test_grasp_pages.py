@@ -130,6 +130,7 @@ def test_forms_tag_chosen_grasps_and_lead_back_to_the_list(http: TestClient, ser
     # What a form says of where it stands leads nowhere else; and a form that chooses nothing says so.
     assert does("tag", grasp=f"{shard}:1", here="//example.org").startswith("/grasps?")
     assert does("tag") == does("tag", all="true", filter="job=none") == does("export", grasp="../../x:1") == "422"
+    assert "no grasp is chosen" in http.post("/grasps/tag", data={"tag": "good"}).text
     assert http.post("/grasps/tag", data=filters, headers={"Origin": "https://example.org"}).status_code == 403
     assert http.post("/grasps/export", data={"grasp": f"{shard}:1", "format": "csv"}).text.count("\r\n") == 2
     assert http.post("/tags/good/delete").status_code == 422, "its name was not typed"

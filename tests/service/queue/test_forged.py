@@ -6,6 +6,7 @@ import contextlib
 import json
 import zlib
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -23,24 +24,12 @@ from service.queue.port import Event, EventKind
 from service.queue.rq_queue import EVENTS, METRICS, WORKERS, RqQueue, worker_key
 from service.settings import Settings
 from service.store.store import open_store
-from tests.fakes import add_assets, request
+from tests.fakes import add_assets, beat_of, request
 from tests.indexes import empty_index
 
 WIP = "rq:wip:interactive-synthesize"
 WAITING = "rq:queue:interactive-synthesize"
-BEAT = {
-    "name": "w",
-    "host": "h",
-    "pid": 2**70,
-    "device": "cpu",
-    "device_name": "",
-    "stages": [],
-    "version": "0",
-    "state": "idle",
-    "task_id": "",
-    "started": "",
-    "seen": "",
-}
+BEAT = asdict(beat_of(pid=2**70))
 EVENT = {"kind": EventKind.FINISHED.value, "at": timestamp(), "stage": "synthesize", "task_id": "t"}
 
 
