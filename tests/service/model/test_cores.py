@@ -1,4 +1,4 @@
-"""Cores are those that the process is given: affinity and control groups of both versions."""
+"""Cores and memory are those that the process is given: affinity and control groups of both versions."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ from pathlib import Path
 import pytest
 
 from service.model import cores
-from service.model.cores import available_cores
+from service.model.cores import available_cores, available_memory
 
 MACHINE = 16
+MACHINE_MB = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**20
 
 
 @pytest.fixture(autouse=True)
@@ -20,21 +21,23 @@ def many_cores(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(MACHINE)), raising=False)
 
 
+def write(root: Path, files: dict[str, str]) -> None:
+    for name, text in files.items():
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_text(text + "\n")
+
+
 def system(root: Path, group: str, **files: str) -> Path:
     """A file system in which this process is in `group`; names of files are paths, with __ for a slash."""
-    held = {"proc/self/cgroup": group + "\n"}
+    held = {"proc/self/cgroup": group}
     held |= {"sys/fs/cgroup/" + name.replace("__", "/").replace("_max", ".max"): text for name, text in files.items()}
-    for name, text in held.items():
-        (root / name).parent.mkdir(parents=True, exist_ok=True)
-        (root / name).write_text(text)
+    write(root, held)
     return root
 
 
 def v1(root: Path, folder: str, quota: int) -> None:
-    place = root / "sys/fs/cgroup" / folder
-    place.mkdir(parents=True)
-    (place / "cpu.cfs_quota_us").write_text(f"{quota}\n")
-    (place / "cpu.cfs_period_us").write_text("100000\n")
+    place = f"sys/fs/cgroup/{folder}"
+    write(root, {f"{place}/cpu.cfs_quota_us": str(quota), f"{place}/cpu.cfs_period_us": "100000"})
 
 
 def test_without_control_groups_the_affinity_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -75,10 +78,8 @@ def test_no_other_count_of_cores_is_asked_for() -> None:
     here = Path(__file__).parents[3]
     packages = ("api", "service", "worker", "benchmarks", "examples")
     files = [file for package in packages for file in (here / package).rglob("*.py")] + list(here.glob("*.py"))
-    words = re.compile(r"cpu_count\(|sched_getaffinity\(")
-    assert [str(file.relative_to(here)) for file in files if words.search(file.read_text())] == [
-        "service/model/cores.py"
-    ]
+    asking = [file for file in files if re.search(r"cpu_count\(|sched_getaffinity\(", file.read_text())]
+    assert asking == [here / "service/model/cores.py"]
 
 
 def test_the_files_are_read_once_in_a_moment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -90,3 +91,22 @@ def test_the_files_are_read_once_in_a_moment(tmp_path: Path, monkeypatch: pytest
     assert available_cores(root) == 3
     now[0] += 2
     assert available_cores(root) == 2
+
+
+@pytest.mark.parametrize(
+    ("group", "files", "limit"),
+    [
+        ("0::/a/b", {"a/b/memory.max": "104857600"}, 100.0),
+        ("0::/a/b", {"a/memory.max": "104857600", "a/b/memory.max": "max"}, 100.0),
+        ("0::/", {"memory.max": "104857600"}, 100.0),
+        ("9:memory:/c", {"memory/c/memory.limit_in_bytes": "209715200"}, 200.0),
+        ("9:memory:/c", {"memory/c/memory.limit_in_bytes": "9223372036854771712"}, MACHINE_MB),
+        ("0::/a", {"a/memory.max": "max"}, MACHINE_MB),
+        ("9:cpu:/c", {}, MACHINE_MB),
+    ],
+)
+def test_the_smallest_limit_around_the_process_counts(
+    tmp_path: Path, group: str, files: dict[str, str], limit: float
+) -> None:
+    write(tmp_path, {"proc/self/cgroup": group, **{f"sys/fs/cgroup/{name}": text for name, text in files.items()}})
+    assert available_memory(tmp_path) / 2**20 == pytest.approx(limit)
