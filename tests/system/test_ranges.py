@@ -8,13 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.model import names
 from service.model.planning import plan
-from service.model.records import JobRecord
 from service.model.states import Lane, Stage, State
 from service.pipeline import job_actions
 from service.store.manifests import load_shard
-from service.store.records import read_record
+from tests.fakes import record_of
 from tests.fakes import request as wanted
 from tests.system.conftest import System, alive
 
@@ -41,7 +39,7 @@ def test_the_range_of_a_killed_worker_is_made_again_once(start: Start) -> None:
     assert (done.state, done.grasps) == (State.SUCCEEDED, 160)
     (attempt,) = system.services.index.jobs.attempts(job=job)
     assert attempt.kind == "WorkerLost" and f"-{killed}-" in attempt.worker
-    record = read_record(JobRecord, system.services.store, names.job_record(job))
+    record = record_of(system.services, job)
     made = [load_shard(system.services.store, Stage.SYNTHESIZE, task.output) for task in plan(record)]
     assert [(shard.attributes["batch"], shard.attributes["batch_rows"]) for shard in made] == [
         (0, "[32, 32, 32]"),

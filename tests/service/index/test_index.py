@@ -32,7 +32,7 @@ from service.model.states import AssetKind, Lane, Stage, State
 from service.pipeline import job_actions
 from service.pipeline.backends import Services
 from service.settings import Settings
-from service.store.records import put_record, read_record
+from service.store.records import put_record
 from service.store.store import Store, open_store
 from tests.fakes import add_assets, fail_task, make_shard, make_task, record_of, request, with_settings
 from tests.indexes import empty_index
@@ -397,7 +397,7 @@ def test_what_was_made_adds_up_in_intervals_of_any_length(services: Services) ->
 def test_writers_at_once_leave_the_rows_of_the_store(services: Services, index_url: str) -> None:
     """The controller indexes shards while the API of another process cancels and retries their job, over and over."""
     job, _ = job_actions.submit(services, request(grasps=32 * 12, scenes=1))
-    record = read_record(JobRecord, services.store, names.job_record(job.id))
+    record = record_of(services, job.id)
     messages = [message_of(record, task, attempt=1, max_attempt=3) for task in plan(record)]
     other = Services(services.settings, services.store, Index(index_url), services.queue)
     done = threading.Event()

@@ -7,16 +7,15 @@ from typing import Any
 
 import pytest
 
-from service.model import names
 from service.model.errors import InputError
-from service.model.records import Choice, JobRecord
+from service.model.records import Choice
 from service.model.scene_spec import SceneSpec
 from service.pipeline import job_actions
 from service.pipeline.backends import Services
 from service.pipeline.fidelity_choice import cheapest, parse_target
-from service.store.records import charts_of, latest, publish, read_record, scene_kinds
+from service.store.records import charts_of, latest, publish, scene_kinds
 from service.store.store import open_store
-from tests.fakes import request
+from tests.fakes import record_of, request
 
 
 def run(fidelity: str, speed: float, gsr: float, *, hand: str = "allegro", object_: str = "mug") -> dict[str, Any]:
@@ -161,7 +160,7 @@ def test_a_job_in_a_scene_is_chosen_by_the_chart_of_its_scene(services: Services
     job, _ = job_actions.submit(services, wanted)
     choice = Choice(target="lift>=0.84", chart=key, measured_on="all", reached=0.875)
     assert (job.request.fidelity, job.request.target, job.choice) == ("standard", "", choice)
-    assert read_record(JobRecord, services.store, names.job_record(job.id)).choice == choice
+    assert record_of(services, job.id).choice == choice
     assert job_actions.submit(services, wanted.model_copy(update={"scene": "bin"}))[0].request.fidelity == "fine"
     assert job_actions.submit(services, request(scene="table", seed=9))[0].choice is None
 

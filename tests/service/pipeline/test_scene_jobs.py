@@ -17,7 +17,6 @@ from service.pipeline import job_actions
 from service.pipeline.backends import Services
 from service.pipeline.job_actions import check_scene
 from service.store.library import load_asset
-from service.store.records import read_record
 from tests.fakes import fail_task, make_task, record_of, request
 
 
@@ -91,7 +90,7 @@ def test_a_later_batch_or_another_fault_stops_no_other_batch(services: Services,
 
 
 def test_grasps_are_found_by_their_scene(services: Services) -> None:
-    free = read_record(JobRecord, services.store, names.job_record(job_actions.submit(services, request())[0].id))
+    free = record_of(services, job_actions.submit(services, request())[0].id)
     make(services, free, Stage.SYNTHESIZE)
     table, inside = submit(services), submit(services, scene="bin", seed=1)
     for job in (table, inside):
