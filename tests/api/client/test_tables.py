@@ -153,6 +153,8 @@ def test_a_report_names_the_standing_of_what_it_counts(services: Services, refer
     judged = "not judged" if referee == "none" else "at"
     assert f"per {word} grasp" in out.getvalue() and f"{made}/32 {judged}" in out.getvalue()
     assert other not in out.getvalue()
+    reasons = [line for line in out.getvalue().splitlines() if line.startswith("reason: ")]
+    assert reasons == ([] if referee == "none" else [f"reason: {dataset.reason}"])
 
 
 def test_raw_grasps_that_nobody_judges_are_merely_kept() -> None:
