@@ -8,6 +8,7 @@ import os
 import sys
 import time
 from collections.abc import Collection, Mapping
+from dataclasses import replace
 from functools import partial
 from multiprocessing import Pipe
 from pathlib import Path
@@ -16,18 +17,21 @@ from typing import Any
 
 import numpy as np
 
+from graspd.service.index.views import TaskView
 from graspd.service.model import names
 from graspd.service.model.clock import timestamp
 from graspd.service.model.domain import JobRequest
 from graspd.service.model.messages import TaskMessage
-from graspd.service.model.planning import message_of, plan
-from graspd.service.model.records import JobRecord
+from graspd.service.model.planning import PlannedTask, message_of, plan
+from graspd.service.model.records import AttemptRecord, JobRecord
 from graspd.service.model.states import AssetKind, Priority, Stage
 from graspd.service.model.version import STAGE_REVISIONS
+from graspd.service.model.workers import WorkerBeat
 from graspd.service.pipeline.backends import Services
 from graspd.service.store.integrity import put_document
 from graspd.service.store.library import publish_asset
 from graspd.service.store.manifests import ShardManifest, load_shard, publish_shard
+from graspd.service.store.records import put_record, read_record
 from graspd.service.store.store import Store
 from graspd.worker.process.engine import Engine
 from graspd.worker.process.fitness import Check
@@ -123,6 +127,39 @@ def add_assets(services: Services) -> None:
         check = {"verdict": "accept", "message": "fine", "repairs": [], "facts": {}}
         put_document(services.store, names.asset_check(kind, asset.digest), check)
         services.index.write.add_asset(asset, {"verdict": "accept", "message": "fine"})
+
+
+def with_settings(services: Services, **changes: Any) -> Services:
+    """The same service with other settings."""
+    return replace(services, settings=services.settings.model_copy(update=changes))
+
+
+def record_of(services: Services, job: str) -> JobRecord:
+    """What the store says of a job."""
+    return read_record(JobRecord, services.store, names.job_record(job))
+
+
+def make_task(services: Services, job: JobRecord, task: PlannedTask, **info: Any) -> ShardManifest:
+    """A task of a job done on the spot, in store and index; the index believes `info` in its manifest."""
+    made = make_shard(services.store, message_of(job, task, attempt=1, max_attempt=3))
+    services.index.write.add_manifest(made.model_copy(update={"info": info}) if info else made)
+    return made
+
+
+def fail_task(services: Services, job: str, task: PlannedTask | TaskView, number: int = 1, **changes: Any) -> str:
+    """A failed attempt at a task, the last one, in store and index; its key."""
+    fields = {"kind": "ValueError", "reason": "it broke", "worker": "w", "ended": timestamp(), "last": True, **changes}
+    attempt = AttemptRecord(task_id=task.id, job_id=job, stage=task.stage, number=number, **fields)
+    put_record(services.store, key := names.attempt(task.id, number), attempt)
+    services.index.write.add_attempt(attempt)
+    return key
+
+
+def beat_of(name: str = "w", **changes: Any) -> WorkerBeat:
+    """An idle worker on a CPU."""
+    now = timestamp()
+    beat = WorkerBeat(name, "host", 1, "cpu", "CPU", tuple(Stage), "0", "idle", "", now, now)
+    return replace(beat, **changes)
 
 
 def request(**changes: Any) -> JobRequest:

@@ -7,22 +7,24 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from graspd.api.access.keys import KeyFile, Scope
 from graspd.service.model import names
 from graspd.service.model.clock import timestamp
 from graspd.service.model.digests import job_id
 from graspd.service.model.domain import JobRequest
 from graspd.service.model.metrics import Axis
 from graspd.service.model.planning import PlannedTask, message_of, plan
-from graspd.service.model.records import AttemptRecord, JobRecord
+from graspd.service.model.records import JobRecord
 from graspd.service.model.states import AssetKind, Priority, Stage
 from graspd.service.model.transforms import pose_to_matrix
-from graspd.service.model.workers import WorkerBeat
 from graspd.service.pipeline.backends import Services
+from graspd.service.settings import Settings
 from graspd.service.store.columns import Attribute
 from graspd.service.store.library import publish_builtins
 from graspd.service.store.manifests import ShardManifest, manifest_of, publish_shard
 from graspd.service.store.records import put_record
 from graspd.service.store.shards import check_columns, read_shard, write_shard
+from tests.fakes import beat_of, fail_task
 
 JOINTS = 16
 Arrays = dict[str, NDArray[np.generic]]
@@ -39,14 +41,8 @@ def add_job(services: Services, **fields: object) -> JobRecord:
     request = JobRequest.model_validate({"hand": "allegro", "object": "mug", "grasps": 32} | fields)
     hand = services.index.assets.get(AssetKind.HAND, request.hand).digest
     object_ = services.index.assets.get(AssetKind.OBJECT, request.object).digest
-    record = JobRecord(
-        id=job_id(request, hand, object_),
-        request=request,
-        hand_digest=hand,
-        object_digest=object_,
-        priority=Priority.INTERACTIVE,
-        created=timestamp(),
-    )
+    of = {"id": job_id(request, hand, object_), "hand_digest": hand, "object_digest": object_}
+    record = JobRecord(**of, request=request, priority=Priority.INTERACTIVE, created=timestamp())
     put_record(services.store, names.job_record(record.id), record)
     services.index.write.add_job(record)
     return record
@@ -99,41 +95,24 @@ def finish_all(services: Services, record: JobRecord) -> list[ShardManifest]:
 def fail(services: Services, record: JobRecord, reason: str) -> None:
     """The first task of a job, failed for the last time."""
     task = next(plan(record))
-    now = timestamp()
-    attempt = AttemptRecord(
-        task_id=task.id,
-        job_id=record.id,
-        stage=task.stage,
-        number=1,
-        kind="MeshError",
-        reason=reason,
-        trace=None,
-        worker="worker-1",
-        started=now,
-        ended=now,
-        last=True,
-    )
-    put_record(services.store, names.attempt(task.id, 1), attempt)
-    services.index.write.add_attempt(attempt)
+    fail_task(services, record.id, task, kind="MeshError", reason=reason, worker="worker-1", started=timestamp())
 
 
 def add_worker(services: Services, name: str = "worker-1", state: str = "idle") -> None:
     """A worker that lives."""
-    now = timestamp()
-    beat = WorkerBeat(
-        name=name,
-        host="here",
-        pid=1,
-        device="cpu",
-        device_name="x86_64, 2 cores",
-        stages=tuple(Stage),
-        version="0.1.0",
-        state=state,
-        task_id="",
-        started=now,
-        seen=now,
-    )
+    beat = beat_of(name, host="here", device_name="x86_64, 2 cores", version="0.1.0", state=state)
     services.index.live.set_workers([beat], forget_before="2000-01-01T00:00:00Z")
+
+
+def bearer(token: str) -> dict[str, str]:
+    """The header that a key comes in."""
+    return {"Authorization": f"Bearer {token}"}
+
+
+def people_of(settings: Settings, **people: tuple[Scope, str]) -> dict[str, dict[str, str]]:
+    """Headers of keys, by name; of each its scope and its project."""
+    keys = KeyFile(settings.resolved_keys_file)
+    return {name: bearer(keys.add(name, scope, project=project)) for name, (scope, project) in people.items()}
 
 
 def poses(random: np.random.Generator, count: int) -> NDArray[np.float64]:

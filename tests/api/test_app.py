@@ -1,16 +1,30 @@
-"""The application as a whole."""
+"""The application as a whole: its socket, its imports, its OpenAPI document, its scrape."""
 
 from __future__ import annotations
 
+import asyncio
+import socket
+import subprocess
+import sys
+from functools import cache
 from typing import Any
 
 import pytest
+import typer
 from pydantic import TypeAdapter
 from starlette.testclient import TestClient
+from typer.core import TyperGroup
 
+import graspd.cli
 from graspd.api.app import create_app
+from graspd.api.metrics import Metrics, Snapshot
+from graspd.api.server import bind
+from graspd.service.model.series import SERIES
 from graspd.service.pipeline.backends import Services
+from graspd.service.queue.port import QueueStatus
 from graspd.service.settings import Settings
+from tests.conftest import REPOSITORY
+from tests.fakes import beat_of
 
 
 @pytest.mark.parametrize("path", ["/v1/jobs", "/v1/datasets", "/", "/healthz"])
@@ -25,3 +39,110 @@ def test_the_first_request_builds_no_route(
     monkeypatch.setattr(TypeAdapter, "__init__", built_late)
     with TestClient(app, base_url="http://127.0.0.1:8000") as client:
         assert client.get(path).is_success
+
+
+def test_answers_are_sent_without_delay() -> None:
+    """Else Nagle holds an answer's body back for the 40 ms that a client waits before it acknowledges the head."""
+
+    async def option() -> int:
+        found: asyncio.Future[int] = asyncio.get_running_loop().create_future()
+
+        def accepted(_: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            connection = writer.get_extra_info("socket")
+            found.set_result(connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY))
+            writer.close()
+
+        async with await asyncio.start_server(accepted, sock=bind("127.0.0.1", 0)) as server:
+            _, writer = await asyncio.open_connection(*server.sockets[0].getsockname())
+            value = await found
+            writer.close()
+            await writer.wait_closed()
+            return value
+
+    assert asyncio.run(option()) == 1
+
+
+STATES = ("checking", "idle", "busy", "stopping", "quarantined")
+
+
+def test_workers_are_counted_in_every_state_that_they_can_be_in() -> None:
+    """An alert on workers in quarantine asks for this very series; none is 0 and not absent."""
+    snapshot = Snapshot()
+    beats = [beat_of(str(i), state=state) for i, state in enumerate(["idle", "quarantined", "quarantined"])]
+    snapshot.add_queue(QueueStatus(workers={beat.name: (beat, 0.1) for beat in beats}), is_kept=True)
+    text = Metrics().render(snapshot).decode()
+    assert all(state in SERIES["graspd_workers"].meaning for state in STATES)
+    counts = {state: float(text.partition(f'graspd_workers{{state="{state}"}} ')[2].split()[0]) for state in STATES}
+    assert counts == {"checking": 0, "idle": 1, "busy": 0, "stopping": 0, "quarantined": 2}
+
+
+@pytest.mark.parametrize("lives", [True, False])
+def test_the_controller_is_up_while_one_gives_signs_of_life(lives: bool) -> None:
+    snapshot = Snapshot()
+    snapshot.add_queue(QueueStatus(), is_kept=lives)
+    assert f"graspd_controller_up {float(lives)}" in Metrics().render(snapshot).decode().splitlines()
+
+
+HEAVY = ("warp", "newton", "trimesh", "mujoco", "scipy", "yourdfpy", "graspd.worker")
+
+
+@cache
+def modules_after(statement: str) -> frozenset[str]:
+    """Libraries by their names, and graspd's own packages."""
+    code = f"{statement}\nimport sys\nprint(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    parts = (name.split(".") for name in done.stdout.split())
+    return frozenset(".".join(part[:2]) if part[0] == "graspd" else part[0] for part in parts)
+
+
+SERVER = {"jinja2", "uvicorn", "fastapi", "starlette", "sqlalchemy", "redis"}
+OVERVIEW = """
+import contextlib, io, sys
+import graspd.cli
+sys.argv = ["graspd", "--help"]
+with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):
+    graspd.cli.main()
+"""
+CLIENT = "from graspd.client import client, commands, add_commands, dataset_commands, access_commands, tag_commands"
+
+
+@pytest.mark.parametrize(
+    ("statement", "absent"),
+    [
+        ("import graspd.api.app", HEAVY),
+        (CLIENT, {*HEAVY, *SERVER}),
+        (OVERVIEW, {*HEAVY, "fastapi", "sqlalchemy", "h5py", "numpy"}),
+    ],
+    ids=["server", "client", "overview"],
+)
+def test_each_part_imports_no_more_than_it_needs(statement: str, absent: set[str]) -> None:
+    assert modules_after(statement).isdisjoint(absent)
+
+
+def operations(http: TestClient) -> dict[str, dict[str, object]]:
+    paths = http.get("/openapi.json").json()["paths"]
+    return {f"{method} {path}": operation for path, methods in paths.items() for method, operation in methods.items()}
+
+
+def test_every_error_is_a_problem_document_and_v1_may_need_a_key(http: TestClient) -> None:
+    for name, operation in operations(http).items():
+        answers: Any = operation["responses"]
+        for status in [status for status in answers if status.startswith("4")]:
+            assert set(answers[status]["content"]) == {"application/problem+json"}, f"{name} {status}"
+        assert "/v1/" not in name or "401" in answers, name
+
+
+def test_the_page_of_the_api_lists_every_route(http: TestClient) -> None:
+    page = (REPOSITORY / "docs" / "reference" / "http.md").read_text()
+    answer = http.get("/openapi.json")
+    assert [path for path in answer.json()["paths"] if f"`{path}`" not in page] == []
+    wanted = {part.partition('"')[0] for part in answer.text.split("#/components/schemas/")[1:]}
+    assert wanted <= set(answer.json()["components"]["schemas"])
+
+
+@pytest.mark.parametrize("name", [name for name, module, _, _ in graspd.cli.COMMANDS if module != "graspd.demo"])
+def test_every_command_of_the_overview_opens(name: str) -> None:
+    module = next(module for known, module, _, _ in graspd.cli.COMMANDS if known == name)
+    root = typer.main.get_command(graspd.cli.build())
+    assert isinstance(root, TyperGroup)
+    assert graspd.cli.load(module, name) is not None

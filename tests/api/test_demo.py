@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from PIL import Image
 from graspd.service.run.supervisor import Supervisor
 from graspd.service.settings import Settings
 from graspd.service.store.shards import read_shard
+from tests.shell import completed
 
 #: The least that passes all stages; the first run on a machine compiles kernels as well.
 SMALL = ("--grasps", "4", "--scenes", "1", "--views", "1", "--fidelity", "draft")
@@ -29,7 +29,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def result(folder: Path) -> dict[str, Any]:
     command = [sys.executable, "-m", "graspd", "demo", "--out", str(folder), "--json", *SMALL]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=280, check=False)
+    done = completed(command, timeout=280)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout.splitlines()[-1])
 
@@ -72,13 +72,13 @@ def test_nothing_of_it_still_runs(result: dict[str, Any], folder: Path) -> None:
 def test_a_demo_on_a_folder_in_use_is_refused(folder: Path) -> None:
     with Supervisor(Settings(data_dir=folder / "service", port=0), workers=0, api=False):
         command = [sys.executable, "-m", "graspd", "demo", "--out", str(folder), *SMALL]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+        done = completed(command, timeout=60)
     assert done.returncode == 1
     assert "owns" in done.stderr or "in use" in done.stderr or "another graspd" in done.stderr
 
 
 def test_a_wrong_number_is_refused_before_anything_starts(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "graspd", "demo", "--out", str(tmp_path / "out"), "--grasps", "0"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    done = completed(command, timeout=60)
     assert done.returncode == 2
     assert not (tmp_path / "out").exists()

@@ -18,135 +18,7 @@ from graspd.api.app import create_app
 from graspd.service.pipeline.backends import Services
 from graspd.service.settings import Settings
 from tests.api.factories import add_job, finish_all
-
-_NAMES = [
-    "host",
-    "origin",
-    "referer",
-    "cookie",
-    "authorization",
-    "range",
-    "if-none-match",
-    "if-modified-since",
-    "if-match",
-    "if-range",
-    "accept",
-    "accept-encoding",
-    "accept-language",
-    "content-length",
-    "content-type",
-    "content-encoding",
-    "transfer-encoding",
-    "expect",
-    "connection",
-    "upgrade",
-    "forwarded",
-    "x-forwarded-for",
-    "x-forwarded-host",
-    "x-forwarded-proto",
-    "x-forwarded-user",
-    "x-real-ip",
-    "via",
-    "idempotency-key",
-    "last-event-id",
-    "x-request-id",
-    "traceparent",
-    "tracestate",
-    "sec-fetch-site",
-    "x-http-method-override",
-    "hx-request",
-    "hx-target",
-    "user-agent",
-]
-_VALUES = (
-    "",
-    " ",
-    "*",
-    "null",
-    "http://[",
-    "http://[::1",
-    "//[",
-    "http://\u00e9",
-    "\u00ff\u00fe",
-    "http://a:99999/",
-    "http://a:b",
-    "[",
-    "[::1]:x",
-    "a" * 8000,
-    "9" * 5000,
-    "-1",
-    "0x10",
-    "1e400",
-    "NaN",
-    "bytes=",
-    "bytes=-",
-    "bytes=9-1",
-    "bytes=0-" + "9" * 400,
-    "bytes=a-b",
-    "bytes=0-0,1-1," + "2-2," * 200,
-    'W/"',
-    '"' * 400,
-    "W/*",
-    "Thu, 99 Foo 9999 99:99:99 GMT",
-    "Bearer",
-    "Bearer ",
-    "Bearer gd_\u00e9",
-    "Bearer \u00a0",
-    "Basic !!!",
-    "Bearer " + "a" * 4000,
-    "graspd_session=",
-    "graspd_session=\u00ff; a=b; ;;=",
-    "a=" + '"\\',
-    "=",
-    "application/json; charset=nonsense",
-    "multipart/form-data",
-    "multipart/form-data; boundary=",
-    "text/html;q=\u00b2",
-    "gzip, br",
-    'for="[::1";by=',
-    "1.2.3.4, , \u00e9",
-    "127.0.0.1:x",
-    "%00",
-    "\x01",
-    "../../etc/passwd",
-    "<script>",
-    "{}",
-    "00-" + "0" * 60,
-    "cross-site",
-)
-_PATHS = [
-    "/",
-    "/v1/jobs",
-    "/v1/jobs/{job}",
-    "/v1/jobs/{job}/cancel",
-    "/v1/shards/{shard}",
-    "/v1/shards/{shard}/file",
-    "/v1/grasps",
-    "/v1/stats",
-    "/v1/hands",
-    "/v1/hands/allegro",
-    "/v1/objects",
-    "/v1/datasets",
-    "/v1/webhooks",
-    "/v1/tags",
-    "/v1/events",
-    "/healthz",
-    "/readyz",
-    "/metrics",
-    "/login",
-    "/submit",
-    "/jobs",
-    "/jobs/{job}",
-    "/datasets",
-    "/grasps",
-    "/hands",
-    "/workers",
-    "/static/app.css",
-    "/openapi.json",
-    "/v1/hands/allegro/model.glb",
-    "/nowhere",
-]
-_METHODS = ("GET", "GET", "GET", "POST", "HEAD", "DELETE", "PUT", "OPTIONS", "PATCH")
+from tests.api.hostile import JOB_BODY, METHODS, NAMES, PATHS, VALUES
 
 
 @pytest.fixture
@@ -155,28 +27,16 @@ def applications(settings: Settings, services: Services) -> Iterator[tuple[list[
     record = add_job(services)
     finish_all(services, record)
     shard = services.index.shards.page(job=record.id).items[0].id
-    paths = [path.format(job=record.id, shard=shard) for path in _PATHS]
+    paths = [path.format(job=record.id, shard=shard) for path in PATHS]
     closed = settings.model_copy(update={"keys_file": settings.data_dir / "other-keys.json"})
     key = KeyFile(closed.resolved_keys_file).add("k", Scope.ADMIN)
     yield [create_app(settings, services), create_app(closed, services)], key, paths
 
 
 async def ask(app: Any, method: str, path: str, headers: list[tuple[bytes, bytes]], body: bytes) -> int:
-    scope = {
-        "type": "http",
-        "asgi": {"version": "3.0"},
-        "http_version": "1.1",
-        "method": method,
-        "scheme": "http",
-        "path": path,
-        "raw_path": path.encode(),
-        "query_string": b"",
-        "root_path": "",
-        "headers": headers,
-        "client": ("127.0.0.1", 5000),
-        "server": ("127.0.0.1", 8000),
-        "state": {},
-    }
+    said = {"method": method, "path": path, "raw_path": path.encode(), "query_string": b"", "root_path": ""}
+    http = {"type": "http", "asgi": {"version": "3.0"}, "http_version": "1.1", "scheme": "http", "state": {}}
+    scope = said | http | {"headers": headers, "client": ("127.0.0.1", 5000), "server": ("127.0.0.1", 8000)}
     status, sent = 0, False
 
     async def receive() -> dict[str, Any]:
@@ -200,18 +60,16 @@ def walk(applications: tuple[list[Any], str, list[str]], requests: int, seed: in
 
     async def run() -> None:
         for _ in range(requests):
-            path, method = chance.choice(paths), chance.choice(_METHODS)
+            path, method = chance.choice(paths), chance.choice(METHODS)
             headers = {
                 "host": "127.0.0.1",
                 "authorization": f"Bearer {key}",
                 "accept": chance.choice(("text/html", "*/*")),
             }
-            for name in chance.sample(_NAMES, chance.randint(1, 4)):
-                headers[name] = chance.choice(_VALUES)
+            for name in chance.sample(NAMES, chance.randint(1, 4)):
+                headers[name] = chance.choice(VALUES)
             raw = [(name.encode(), value.encode("latin-1", "replace")) for name, value in headers.items()]
-            body = chance.choice(
-                (b"", b"{}", b"[", b"\xff" * 50, b'{"hand": "allegro", "object": "mug", "grasps": 32}')
-            )
+            body = chance.choice((b"", b"{}", b"[", b"\xff" * 50, JOB_BODY))
             try:
                 status = await ask(chance.choice(apps), method, path, raw, body)
             except Exception as error:
@@ -227,9 +85,9 @@ def walk(applications: tuple[list[Any], str, list[str]], requests: int, seed: in
 
 
 def test_no_header_ends_in_a_5xx(applications: tuple[list[Any], str, list[str]]) -> None:
-    found = walk(applications, 1000, seed=1)
+    found = walk(applications, 600, seed=1)
     # The walk meets what it is to meet: answers, refusals, and things that are not there.
-    assert found[200] > 100 and {401, 403, 404} <= set(found)
+    assert found[200] > 60 and {401, 403, 404} <= set(found)
 
 
 @pytest.mark.slow

@@ -23,45 +23,11 @@ from graspd.service.pipeline.backends import Services
 from graspd.service.queue.rq_queue import RqQueue
 from graspd.service.settings import Settings
 from tests.api.factories import add_job, finish_all
+from tests.api.hostile import JOB_BODY, METHODS, NAMES, PATHS, VALUES
 from tests.waiting import PATIENCE_S
 
-_METHODS = (b"GET", b"GET", b"GET", b"POST", b"POST", b"HEAD", b"PUT", b"PATCH", b"DELETE", b"OPTIONS", b"TRACE", b"X")
-_PATHS = (
-    b"/",
-    b"/v1/jobs",
-    b"/v1/jobs/JOB",
-    b"/v1/jobs/JOB/cancel",
-    b"/v1/shards/SHARD/file",
-    b"/v1/grasps",
-    b"/v1/hands",
-    b"/v1/hands/allegro",
-    b"/v1/hands/allegro/model",
-    b"/v1/objects",
-    b"/v1/datasets",
-    b"/v1/datasets/estimate",
-    b"/v1/tags",
-    b"/v1/events",
-    b"/v1/usage",
-    b"/v1/stats",
-    b"/v1/object-sets",
-    b"/v1/webhooks",
-    b"/healthz",
-    b"/metrics",
-    b"/login",
-    b"/logout",
-    b"/submit",
-    b"/jobs/JOB",
-    b"/grasps",
-    b"/hands/allegro",
-    b"/usage",
-    b"/events",
-    b"/static/style.css",
-    b"/openapi.json",
-    b"/problems/x",
-    b"//evil.example/x",
-    b"*",
-    b"/v1/jobs/",
-)
+_QUERY_KEYS = "limit cursor since until state where sort hand tag format views x"
+_KEYS = _QUERY_KEYS.encode().split()
 _TAILS = (
     b"",
     b"/",
@@ -75,136 +41,17 @@ _TAILS = (
     b"/\\",
     b"/%u0041",
 )
-_KEYS = (
-    b"limit",
-    b"cursor",
-    b"since",
-    b"until",
-    b"state",
-    b"where",
-    b"sort",
-    b"hand",
-    b"tag",
-    b"format",
-    b"views",
-    b"x",
-)
-_WORDS = (
-    b"",
-    b"0",
-    b"-1",
-    b"1e400",
-    b"NaN",
-    b"9" * 400,
-    b"%00",
-    b"%ff",
-    b"%",
-    b"%zz",
-    b"[",
-    b"[[" * 400,
-    b"a" * 3000,
-    b"null",
-    b"true",
-    b"'",
-    b'"',
-    b"1_0",
-    b"\xff\xfe",
-    b"%F0%9F%A4%96",
-    b"2026-01-31",
-    b"../../etc/passwd",
-    b"${x}",
-    b"epsilon > 1e999",
-)
-_NAMES = (
-    b"Host",
-    b"Origin",
-    b"Referer",
-    b"Cookie",
-    b"Authorization",
-    b"Range",
-    b"If-Range",
-    b"If-None-Match",
-    b"If-Match",
-    b"If-Modified-Since",
-    b"Accept",
-    b"Accept-Encoding",
-    b"Accept-Language",
-    b"Content-Type",
-    b"Content-Length",
-    b"Content-Encoding",
-    b"Transfer-Encoding",
-    b"Expect",
-    b"Upgrade",
-    b"Forwarded",
-    b"X-Forwarded-For",
-    b"Via",
-    b"X-Forwarded-Host",
-    b"X-Forwarded-Proto",
-    b"X-Forwarded-Groups",
-    b"Idempotency-Key",
-    b"Last-Event-ID",
-    b"Te",
-    b"X-Request-Id",
-    b"traceparent",
-    b"Sec-Fetch-Site",
-    b"HX-Request",
-    b"User-Agent",
-)
-_VALUES = (
-    b"",
-    b"*",
-    b"null",
-    b"http://[",
-    b"http://[::1",
-    b"//[",
-    b"[",
-    b"[::1]:x",
-    b"http://a:99999",
-    b"http://a:b",
-    b"-1",
-    b"\xff\xfe",
-    b"9" * 5000,
-    b"0x10",
-    b"bytes=",
-    b"bytes=9-1",
-    b"bytes=0-" + b"9" * 400,
-    b"bytes=0-0,1-1",
-    b'W/"',
-    b'"' * 400,
-    b"Thu, 99 Foo 9999 99:99:99 GMT",
-    b"Bearer",
-    b"Bearer \xa0",
-    b"Basic !!!",
-    b"Basic " + b"QQ==" * 500,
-    b"graspd_session=\xff; =; ;;=",
-    b"graspd_session=W10=." + b"0" * 64,
-    b"application/json; charset=nonsense",
-    b"100-continue",
-    b"multipart/form-data",
-    b"multipart/form-data; boundary=",
-    b"multipart/form-data; boundary=b",
-    b"text/html;q=\xb2",
-    b"application/x-www-form-urlencoded",
-    b"gzip, br",
-    b'for="[::1";by=',
-    b"1.2.3.4, , \xe9",
-    b"chunked",
-    b"h2c",
-    b"cross-site",
-    b"<script>",
-    b"00-" + b"0" * 60,
-    b"../../x",
-    b"{}",
-    b"\x7f",
-    b"text/html",
-)
+_ODD = b"|0|-1|1e400|NaN|%00|%ff|%|%zz|[|null|true|'|\"|1_0|\xff\xfe|%F0%9F%A4%96|2026-01-31|../../etc/passwd|${x}"
+_WORDS = (*_ODD.split(b"|"), b"9" * 400, b"[[" * 400, b"a" * 3000, b"epsilon > 1e999")
+#: Without a controller a service is not ready, and says so.
+_ASKED = [path for path in PATHS if path != "/readyz"]
 _BODIES = (
     b"",
     b"{}",
     b"[",
     b"[" * 50_000,
     b"\xff" * 50,
-    b'{"hand": "allegro", "object": "mug", "grasps": 32}',
+    JOB_BODY,
     b'{"hand": "\\ud800"}',
     b'{"name": "d", "hands": ["allegro"], "objects": ["mug"], "grasps": 1e400}',
     b"key=%ff&key=gd_",
@@ -218,7 +65,7 @@ _BODIES = (
 )
 
 #: One that stands alone is the last, and true.
-_LENGTHS = re.compile(rb"\r\n(?:Content-Length|Transfer-Encoding): ")
+_LENGTHS = re.compile(rb"\r\n(?i:content-length|transfer-encoding): ")
 Ask = Callable[[bytes], int]
 
 
@@ -241,7 +88,7 @@ def ask(settings: Settings, services: Services, redis_server: str, rq_queue: RqQ
         running.append((server, thread, listener.getsockname()))
 
     def send(request: bytes) -> int:
-        filled = request.replace(b"JOB", record.id.encode()).replace(b"SHARD", shard.encode()).replace(b"KEY", key)
+        filled = request.replace(b"{job}", record.id.encode()).replace(b"{shard}", shard.encode()).replace(b"KEY", key)
         place = running[len(request) % 2][2]
         with socket.create_connection(place, timeout=PATIENCE_S) as connection:
             answer = b""
@@ -277,17 +124,17 @@ def walk(ask: Ask, requests: int, seed: int) -> Counter[int]:
 
 
 def _request(chance: random.Random) -> bytes:
-    path = chance.choice(_PATHS) + (chance.choice(_TAILS) if chance.random() < 0.2 else b"")
+    path = chance.choice(_ASKED).encode() + (chance.choice(_TAILS) if chance.random() < 0.2 else b"")
     query = b"&".join(chance.choice(_KEYS) + b"=" + chance.choice(_WORDS) for _ in range(chance.choice((0, 0, 1, 3))))
     headers = [
         (b"Host", b"127.0.0.1"),
         (b"Authorization", b"Bearer KEY"),
         (b"Accept", chance.choice((b"text/html", b"*/*"))),
     ]
-    for name in chance.sample(_NAMES, chance.choice((0, 1, 2, 4))):
-        headers = [one for one in headers if one[0] != name or chance.random() < 0.2]
-        headers.append((name, chance.choice(_VALUES)))
-    method, body = chance.choice(_METHODS), chance.choice(_BODIES) if chance.random() < 0.5 else b""
+    for name in chance.sample(NAMES, chance.choice((0, 1, 2, 4))):
+        headers = [one for one in headers if one[0].lower() != name.encode() or chance.random() < 0.2]
+        headers.append((name.encode(), chance.choice(VALUES).encode("latin-1")))
+    method, body = chance.choice(METHODS).encode(), chance.choice(_BODIES) if chance.random() < 0.5 else b""
     headers.append((b"Content-Length", b"%d" % len(body)))
     if method in (b"POST", b"PUT") and chance.random() < 0.7:
         kind = b"multipart/form-data; boundary=b" if body.startswith(b"--b") else b"application/json"
@@ -297,9 +144,9 @@ def _request(chance: random.Random) -> bytes:
 
 
 def test_no_bytes_end_in_a_5xx(ask: Ask) -> None:
-    found = walk(ask, 1500, seed=1)
+    found = walk(ask, 800, seed=1)
     # The walk meets what it is to meet: answers, refusals, and things that are not there.
-    assert found[200] > 100 and {400, 401, 403, 404, 405, 422} <= set(found)
+    assert found[200] > 50 and {400, 401, 403, 404, 405, 422} <= set(found)
 
 
 @pytest.mark.slow

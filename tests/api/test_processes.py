@@ -113,13 +113,11 @@ def test_what_one_process_is_told_the_other_knows(twins: Twins) -> None:
     assert made.status_code == 202
     assert twins.client(1).get(made.headers["location"]).json()["id"] == made.json()["id"]
     assert twins.client(1).post("/v1/jobs", json=JOB).json()["id"] == made.json()["id"]
-
-
-def test_an_idempotency_key_holds_at_both(twins: Twins) -> None:
-    headers = {"Idempotency-Key": "once"}
-    assert twins.client(0).post("/v1/jobs", json=JOB | {"seed": 1}, headers=headers).status_code == 202
-    assert twins.client(1).post("/v1/jobs", json=JOB | {"seed": 1}, headers=headers).status_code == 202
-    assert twins.client(1).post("/v1/jobs", json=JOB | {"seed": 2}, headers=headers).status_code == 422
+    once = {"Idempotency-Key": "once"}
+    answers = [
+        twins.client(n).post("/v1/jobs", json=JOB | {"seed": s}, headers=once) for n, s in ((0, 1), (1, 1), (1, 2))
+    ]
+    assert [answer.status_code for answer in answers] == [202, 202, 422]
 
 
 def test_both_count_one_rate(twins: Twins) -> None:
@@ -129,7 +127,7 @@ def test_both_count_one_rate(twins: Twins) -> None:
     assert [clients[i % 2].get("/v1/jobs", headers=headers).status_code for i in range(4)] == [200] * 2 + [429] * 2
 
 
-def test_a_session_of_one_opens_the_other_until_its_key_is_revoked(twins: Twins) -> None:
+def test_a_session_opens_both_until_its_key_is_revoked(twins: Twins) -> None:
     token = twins.keys.add("browser", Scope.READ)
     answer = httpx.post(f"{twins.urls[0]}/login", data={"key": token}, trust_env=False, timeout=60)
     cookies = {"graspd_session": answer.cookies["graspd_session"]}
@@ -163,28 +161,19 @@ def lines_of(logs: Path, process: str, **about: str) -> list[dict[str, Any]]:
     return [line for line in found if all(line.get(name) == value for name, value in about.items())]
 
 
-@pytest.mark.parametrize("process", ["api", "worker-0"])
-def test_the_id_of_a_request_is_in_the_logs_of_api_and_worker(followed: Any, process: str) -> None:
+def test_a_request_and_its_job_are_in_the_logs_of_every_process(followed: Any) -> None:
     logs, job, _ = followed
-    assert lines_of(logs, process, request="follow-me", job=job["id"])
-
-
-def test_every_task_of_the_job_knows_its_request(followed: Any) -> None:
-    logs, job, _ = followed
+    for process in ("api", "controller", "worker-0"):
+        assert lines_of(logs, process, job=job["id"])
+    assert lines_of(logs, "api", request="follow-me", job=job["id"])
     lines = lines_of(logs, "worker-0", request="follow-me", job=job["id"])
     # Two batches of two stages; the controller queues the second stage.
     assert len({line["task"] for line in lines}) == 4
 
 
-@pytest.mark.parametrize("process", ["api", "controller", "worker-0"])
-def test_the_id_of_a_job_is_in_the_logs_of_every_process(followed: Any, process: str) -> None:
-    logs, job, _ = followed
-    assert lines_of(logs, process, job=job["id"])
-
-
-@pytest.mark.parametrize(
-    "line",
-    [
+def test_metrics_tell_what_the_service_did(followed: Any) -> None:
+    told = followed[2]().splitlines()
+    for line in (
         'graspd_grasps_total{verdict="all"} 64.0',
         'graspd_shards_total{stage="synthesize"} 2.0',
         'graspd_shards_total{stage="scene"} 2.0',
@@ -193,7 +182,5 @@ def test_the_id_of_a_job_is_in_the_logs_of_every_process(followed: Any, process:
         'graspd_workers{state="idle"} 1.0',
         "graspd_controller_up 1.0",
         'graspd_part_up{part="store"} 1.0',
-    ],
-)
-def test_metrics_tell_what_the_service_did(followed: Any, line: str) -> None:
-    assert line in followed[2]()
+    ):
+        assert line in told

@@ -11,15 +11,12 @@ from opentelemetry.sdk.trace.export.in_memory_span_exporter import InMemorySpanE
 from starlette.testclient import TestClient
 
 from graspd.service import telemetry
-from graspd.service.model import names
 from graspd.service.model.planning import message_of, plan
-from graspd.service.model.records import JobRecord
 from graspd.service.model.states import Stage
 from graspd.service.pipeline.backends import Services
-from graspd.service.store.records import read_record
 from graspd.worker.process.runner import Runner
 from graspd.worker.stages.context import TaskContext
-from tests.fakes import fake_stages
+from tests.fakes import fake_stages, record_of
 
 _PARENT = "00-" + "a" * 32 + "-" + "b" * 16 + "-01"
 
@@ -37,7 +34,7 @@ def test_a_task_is_in_the_trace_of_the_request_that_submitted_it(
 ) -> None:
     body = {"hand": "allegro", "object": "mug", "grasps": 32}
     made = http.post("/v1/jobs", json=body, headers={"traceparent": _PARENT}).json()
-    record = read_record(JobRecord, services.store, names.job_record(made["id"]))
+    record = record_of(services, made["id"])
     task = next(task for task in plan(record) if task.stage is Stage.SYNTHESIZE)
     message = message_of(record, task, attempt=1, max_attempt=3)
     runner = Runner(fake_stages(), worker="w", publish=lambda event: None)

@@ -23,16 +23,11 @@ from tests.waiting import PATIENCE_S, until_a_worker_is_idle
 __all__ = ["app", "furnished", "services", "settings"]
 
 #: SwiftShader draws WebGL without a GPU; the rest keeps the browser from calling home.
-ARGUMENTS = (
-    "--no-sandbox",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-)
+_ARGUMENTS = """
+    --no-sandbox --use-angle=swiftshader --enable-unsafe-swiftshader --disable-quic --no-first-run
+    --disable-background-networking --disable-component-update --disable-sync
+"""
+ARGUMENTS = tuple(_ARGUMENTS.split())
 #: Longest wait for something on a page, on a machine that is busy with other things.
 SHOWN_MS = 1000 * PATIENCE_S
 

@@ -35,21 +35,10 @@ WORK_S: Final = 3600.0
 SHOWN_MS: Final = 60_000
 LAPTOP: Final = (1440, 900)
 PHONE: Final = (390, 844)
-VIEWED: Final[dict[str, Any]] = {
-    "hand": "allegro",
-    "object": "mug",
-    "grasps": 64,
-    "scenes": 2,
-    "views": 2,
-    "stereo": True,
-}
-DATASET: Final[dict[str, Any]] = {
-    "name": "kitchen-1",
-    "hands": ["allegro", "barrett"],
-    "objects": ["mug", "bottle", "block"],
-    "grasps": 32,
-    "fidelity": "draft",
-}
+_PAIR: Final = {"hand": "allegro", "object": "mug"}
+VIEWED: Final[dict[str, Any]] = _PAIR | {"grasps": 64, "scenes": 2, "views": 2, "stereo": True}
+_MATRIX: Final = {"hands": ["allegro", "barrett"], "objects": ["mug", "bottle", "block"]}
+DATASET: Final[dict[str, Any]] = _MATRIX | {"name": "kitchen-1", "grasps": 32, "fidelity": "draft"}
 LONG: Final[dict[str, Any]] = {"hand": "shadow", "object": "mug", "grasps": 640, "fidelity": "draft"}
 
 

@@ -29,7 +29,7 @@ pytestmark = [pytest.mark.browser, pytest.mark.timeout(900)]
 WORK_MS = 500_000
 
 
-def test_a_user_submits_watches_filters_inspects_downloads_cancels_and_retries(real_page: Any, tmp_path: Path) -> None:
+def test_a_user_goes_from_a_submission_to_a_retry(real_page: Any, tmp_path: Path) -> None:
     page = real_page
     mesh = tmp_path / "my block.stl"
     mesh.write_bytes(builtin_files(AssetKind.OBJECT, "block")["block.stl"])
@@ -113,7 +113,7 @@ def colours(canvas: Any) -> int:
     return len(np.unique(pixels.reshape(-1, 3), axis=0))
 
 
-def test_an_upload_is_checked_at_once_shown_and_a_bad_one_says_why(real_page: Any, tmp_path: Path) -> None:
+def test_an_upload_is_checked_shown_and_a_bad_one_says_why(real_page: Any, tmp_path: Path) -> None:
     page = real_page
     bad = tmp_path / "broken.stl"
     bad.write_bytes(b"solid broken\nfacet normal 0 0 1\nouter loop\nvertex 0 0\nendloop\nendfacet\nendsolid\n")
@@ -134,9 +134,7 @@ def test_an_upload_is_checked_at_once_shown_and_a_bad_one_says_why(real_page: An
     assert page.input_value("#object") == "wedge"
 
 
-def test_a_refused_file_stays_holds_the_button_and_runs_once_its_units_are_right(
-    real_page: Any, tmp_path: Path
-) -> None:
+def test_a_refused_file_stays_and_runs_once_its_units_are_right(real_page: Any, tmp_path: Path) -> None:
     page = real_page
     mesh = trimesh.creation.box((60.0, 40.0, 50.0))
     file = tmp_path / "in millimetres.stl"

@@ -56,9 +56,7 @@ def drawn(page: Any) -> bytes:
     return bytes(page.locator(".viewer canvas").screenshot())
 
 
-def test_a_wrong_guess_is_seen_corrected_and_kept_as_a_hand_that_jobs_can_use(
-    page: Any, services: Services, address: str
-) -> None:
+def test_a_wrong_guess_is_corrected_and_kept_as_a_hand(page: Any, services: Services, address: str) -> None:
     file = ("claw.urdf", CLAW)
     httpx.post(f"{address}/v1/hands", files={"file": file}, trust_env=False, timeout=60).raise_for_status()
     # A small canvas is drawn quickly without a GPU.

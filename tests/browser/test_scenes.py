@@ -44,9 +44,7 @@ def bin_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_one_slider_leads_from_the_standoff_to_the_lift_in_the_scene(
-    page: Any, services: Services, bin_file: Path
-) -> None:
+def test_one_slider_leads_from_the_standoff_to_the_lift(page: Any, services: Services, bin_file: Path) -> None:
     shard = finish_with(services, bin_file).shard_id
     # A small canvas is drawn quickly without a GPU.
     page.set_viewport_size({"width": 700, "height": 700})

@@ -13,6 +13,7 @@ from typing import Any
 
 from tests.conftest import REPOSITORY
 from tests.deploy import composition
+from tests.shell import completed
 
 DOCKERFILE = REPOSITORY / "docker" / "Dockerfile"
 _BUILD_S = 3600.0
@@ -28,7 +29,7 @@ def docker(*arguments: str, timeout: float = 120.0, check: bool = True) -> str:
     Raises:
         AssertionError: it failed; with its last words.
     """
-    done = subprocess.run(["docker", *arguments], capture_output=True, text=True, timeout=timeout, check=False)
+    done = completed(["docker", *arguments], timeout=timeout)
     assert not check or done.returncode == 0, f"docker {' '.join(arguments)}: {(done.stdout + done.stderr)[-3000:]}"
     return done.stdout
 
@@ -53,7 +54,7 @@ def look_for_engine() -> None:
         "docker buildx": ["docker", "buildx", "version"],
     }.items():
         try:
-            done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+            done = completed(command, timeout=60)
         except (OSError, subprocess.TimeoutExpired) as error:
             raise NoEngine(f"no {what} here ({error})") from None
         if done.returncode:
@@ -62,9 +63,7 @@ def look_for_engine() -> None:
         if subprocess.run(["docker", "image", "inspect", image], capture_output=True, check=False).returncode == 0:
             continue
         try:
-            done = subprocess.run(
-                ["docker", "pull", "-q", image], capture_output=True, text=True, timeout=900, check=False
-            )
+            done = completed(["docker", "pull", "-q", image], timeout=900)
         except subprocess.TimeoutExpired:
             raise NoEngine(f"the base image {image} did not come within 15 minutes") from None
         if done.returncode:

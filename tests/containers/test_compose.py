@@ -7,7 +7,6 @@ so.
 from __future__ import annotations
 
 import json
-import subprocess
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -18,6 +17,7 @@ import pytest
 
 from tests.containers.engine import NoEngine, Project, docker, look_for_engine
 from tests.servers import free_ports
+from tests.shell import completed
 
 pytestmark = [pytest.mark.slow, pytest.mark.containers, pytest.mark.timeout(5400)]
 
@@ -77,7 +77,7 @@ def test_profiles_of_the_env_file_bring_s3_and_postgresql(project: Project) -> N
 def test_any_user_plans_on_a_read_only_disk(project: Project) -> None:
     """No cache volume, no network, a user that the image does not know; it says where its cache is instead."""
     wanted = "--hand allegro --object mug --grasps 2 --fidelity draft --out /tmp/out.h5"
-    done = subprocess.run(
+    done = completed(
         [
             "docker",
             "run",
@@ -95,10 +95,7 @@ def test_any_user_plans_on_a_read_only_disk(project: Project) -> None:
             "synth",
             *wanted.split(),
         ],
-        capture_output=True,
-        text=True,
         timeout=PATIENCE_S,
-        check=False,
     )
     said = done.stdout + done.stderr
     assert done.returncode == 0 and "Traceback" not in said, said[-3000:]

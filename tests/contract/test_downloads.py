@@ -45,7 +45,7 @@ def test_the_store_hands_files_out_where_users_reach_it(tmp_path: Path, s3_url: 
         assert hashlib.sha256(data).hexdigest() == sha256
 
 
-def test_files_go_through_the_api_where_users_do_not_reach_the_store(tmp_path: Path, s3_url: str) -> None:
+def test_files_go_through_the_api_where_stores_are_not_reached(tmp_path: Path, s3_url: str) -> None:
     with front_door(tmp_path, s3_url, None) as (http, path, sha256):
         whole = http.get(path, follow_redirects=False)
         assert (whole.status_code, hashlib.sha256(whole.content).hexdigest()) == (200, sha256)

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Final
 
 from tests.conftest import REPOSITORY
+from tests.shell import completed
 
 TEXT: Final = "\n".join((REPOSITORY / "docs" / "how-to" / page).read_text() for page in ("install.md", "operations.md"))
 _TRIED: Final = re.compile(r"<!-- tried: ([\w-]+) -->\n```sh\n(.*?)```", re.DOTALL)
@@ -28,11 +29,8 @@ def run(name: str, folder: Path, environment: Mapping[str, str]) -> subprocess.C
     shim = shims / "graspd"
     shim.write_text(f'#!/bin/sh\nexec {sys.executable} -m graspd "$@"\n')
     shim.chmod(0o755)
-    return subprocess.run(
+    return completed(
         ["bash", "-euo", "pipefail", "-c", tried()[name]],
         cwd=folder,
         env=os.environ | {"PATH": f"{shims}:{os.environ['PATH']}", "PYTHONPATH": str(REPOSITORY)} | dict(environment),
-        capture_output=True,
-        text=True,
-        check=False,
     )

@@ -16,20 +16,13 @@ from pathlib import Path
 from typing import Final
 
 #: Options of sbatch that a script may use, and what each looks like.
-_OPTIONS: Final = {
-    "job-name": r"[\w-]+",
-    "nodes": r"1",
-    "ntasks": r"1",
-    "cpus-per-task": r"\d+",
-    "mem": r"\d+[MG]",
-    "time": r"(\d+-)?\d\d:\d\d:\d\d",
-    "requeue": r"",
-    "open-mode": r"append",
-    "signal": r"B:USR1@\d+",
-    "output": r"[\w%-]+\.log",
-    "array": r"\d+-\d+",
-    "gpus": r"\d+",
-}
+_OPTIONS: Final = (
+    dict.fromkeys(("nodes", "ntasks"), r"1")
+    | dict.fromkeys(("cpus-per-task", "gpus"), r"\d+")
+    | {"requeue": r""}
+    | {"job-name": r"[\w-]+", "mem": r"\d+[MG]", "time": r"(\d+-)?\d\d:\d\d:\d\d", "open-mode": r"append"}
+    | {"signal": r"B:USR1@\d+", "output": r"[\w%-]+\.log", "array": r"\d+-\d+"}
+)
 
 
 def directives(script: Path) -> dict[str, str]:

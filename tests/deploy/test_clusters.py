@@ -31,7 +31,7 @@ def options_of(command: str) -> set[str]:
 
 
 @pytest.mark.parametrize("file", FILES, ids=lambda file: file.name)
-def test_every_file_is_on_the_page_and_uses_settings_and_options_that_exist(file: Path) -> None:
+def test_every_file_uses_settings_and_options_that_exist(file: Path) -> None:
     assert f"docker/{file.parent.name}/{file.name}" in PAGE
     text = file.read_text()
     # `GRASPD=` is the command itself.

@@ -13,6 +13,7 @@ import yaml
 from graspd.service.settings import Settings
 from tests.conftest import REPOSITORY
 from tests.deploy import composition
+from tests.shell import completed
 
 FILLED = {"REDIS_PASSWORD": "secret"}
 SERVICES = composition.SERVICES
@@ -23,11 +24,8 @@ PREFIXES = ("AWS_", "REDIS_", "REDISCLI_", "POSTGRES_", "FORWARDED_", "OTEL_")
 
 
 def test_it_is_what_the_compose_specification_says() -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "check_jsonschema", "--builtin-schema", "vendor.compose-spec", str(composition.COMPOSE)],
-        capture_output=True,
-        text=True,
-        check=False,
+    done = completed(
+        [sys.executable, "-m", "check_jsonschema", "--builtin-schema", "vendor.compose-spec", str(composition.COMPOSE)]
     )
     assert done.returncode == 0, done.stdout + done.stderr
 
@@ -41,7 +39,7 @@ def test_the_specification_refuses_a_gpu_without_capabilities(tmp_path: Any) -> 
     assert subprocess.run(command, capture_output=True, check=False).returncode == 1
 
 
-def test_gpu_workers_see_every_gpu_and_share_the_folder_that_tells_them_apart() -> None:
+def test_gpu_workers_see_every_gpu_and_share_a_folder() -> None:
     """With `count: 1` Docker gives each of them the first GPU."""
     gpu = composition.load(FILLED | {"GRASPD_GPU_WORKERS": "4"})["services"]["worker-gpu"]
     (devices,) = gpu["deploy"]["resources"]["reservations"]["devices"]
@@ -50,21 +48,19 @@ def test_gpu_workers_see_every_gpu_and_share_the_folder_that_tells_them_apart() 
 
 
 @pytest.mark.parametrize("name", sorted(SERVICES))
-def test_every_image_has_a_version(name: str) -> None:
-    _, _, tag = SERVICES[name]["image"].partition(":")
-    assert re.match(r"v?\d", tag), f"{SERVICES[name]['image']} floats"
+def test_every_service_has_a_version_limits_and_bounded_logs(name: str) -> None:
+    service = SERVICES[name]
+    assert re.match(r"v?\d", service["image"].partition(":")[2]), f"{service['image']} floats"
+    assert "memory" in service["deploy"]["resources"]["limits"]
+    assert service["restart"] == "unless-stopped"
+    assert {"max-size", "max-file"} <= service["logging"]["options"].keys()
 
 
 @pytest.mark.parametrize("name", OURS)
-def test_the_environment_is_made_of_settings(name: str) -> None:
+def test_the_environment_is_made_of_settings_that_can_be_read(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     environment = SERVICES[name]["environment"]
-    unknown = {key for key in environment if key not in SETTINGS and not key.startswith(PREFIXES)}
-    assert not unknown
-
-
-@pytest.mark.parametrize("name", OURS)
-def test_the_defaults_are_settings_that_can_be_read(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    for key, value in SERVICES[name]["environment"].items():
+    assert not {key for key in environment if key not in SETTINGS and not key.startswith(PREFIXES)}
+    for key, value in environment.items():
         monkeypatch.setenv(key, value)
     settings = Settings()
     assert settings.redis_url is not None
@@ -72,24 +68,11 @@ def test_the_defaults_are_settings_that_can_be_read(name: str, monkeypatch: pyte
 
 
 @pytest.mark.parametrize("name", OURS)
-def test_docker_waits_longer_than_a_process_may_take_to_stop(name: str) -> None:
+def test_docker_waits_for_our_containers_without_rights(name: str) -> None:
     service = SERVICES[name]
     wait = composition.seconds(service["stop_grace_period"])
     assert wait > float(service["environment"]["GRASPD_STOP_GRACE_S"])
     assert wait > float(composition.example()["GRASPD_STOP_GRACE_S"])
-
-
-@pytest.mark.parametrize("name", sorted(SERVICES))
-def test_every_service_has_limits_a_restart_policy_and_bounded_logs(name: str) -> None:
-    service = SERVICES[name]
-    assert "memory" in service["deploy"]["resources"]["limits"]
-    assert service["restart"] == "unless-stopped"
-    assert {"max-size", "max-file"} <= service["logging"]["options"].keys()
-
-
-@pytest.mark.parametrize("name", OURS)
-def test_our_containers_have_no_rights_to_lose(name: str) -> None:
-    service = SERVICES[name]
     assert service["read_only"] is True
     assert service["cap_drop"] == ["ALL"]
     assert "no-new-privileges:true" in service["security_opt"]
@@ -158,6 +141,6 @@ def test_secrets_stay_out_of_the_repository() -> None:
 
 
 @pytest.mark.parametrize("name", [name for name in OURS if name.startswith("worker")])
-def test_a_worker_makes_room_before_its_container_is_killed_for_memory(name: str) -> None:
+def test_a_worker_makes_room_before_its_container_is_killed(name: str) -> None:
     limit_gb = int(SERVICES[name]["deploy"]["resources"]["limits"]["memory"].removesuffix("G"))
     assert int(SERVICES[name]["environment"]["GRASPD_WORKER_MAX_MEMORY_MB"]) < 1000 * limit_gb

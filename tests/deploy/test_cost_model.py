@@ -18,19 +18,10 @@ from tests.service.conftest import services  # noqa: F401
 from tests.service.index.test_index import run_all
 
 PAGE = (REPOSITORY / "docs" / "explanation" / "scaling.md").read_text()
-ONE_OF_EACH = Measured(
-    core_s_per_grasp=1.0,
-    core_s_per_scene=10.0,
-    core_s_per_picture=100.0,
-    busy=0.5,
-    base_bytes_per_grasp=1.0,
-    scene_bytes=1000.0,
-    picture_bytes=1e6,
-    manifest_bytes=0.0,
-    redis_ops_per_task=86_400.0,
-    redis_ops_worker=1.0,
-    redis_ops_controller=5.0,
-)
+_CORE_S = {"core_s_per_grasp": 1.0, "core_s_per_scene": 10.0, "core_s_per_picture": 100.0, "busy": 0.5}
+_BYTES = {"base_bytes_per_grasp": 1.0, "scene_bytes": 1000.0, "picture_bytes": 1e6, "manifest_bytes": 0.0}
+_REDIS = {"redis_ops_per_task": 86_400.0, "redis_ops_worker": 1.0, "redis_ops_controller": 5.0}
+ONE_OF_EACH = Measured(**_CORE_S, **_BYTES, **_REDIS)
 
 
 def test_the_model_is_the_sum_done_by_hand() -> None:
@@ -88,14 +79,11 @@ def test_sizes_are_measured_on_a_data_folder(services: Services, tmp_path: Path)
     kept = Services(services.settings, store, services.index, services.queue)
     for entry in [*services.store.list("assets")]:
         store.put(entry.key, services.store.get(entry.key))
+    with pytest.raises(SystemExit, match="no shard"):
+        sizes(tmp_path)
     run_all(kept, job_actions.submit(kept, request(grasps=64))[0].id)
     shards = list((tmp_path / "store" / "shards" / "base").glob("*.h5"))
     assert sizes(tmp_path)["base_bytes_per_grasp"] == sum(shard.stat().st_size for shard in shards) / 64
-
-
-def test_a_folder_without_shards_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(SystemExit, match="no shard"):
-        sizes(tmp_path)
 
 
 def test_every_input_is_an_option(capsys: pytest.CaptureFixture[str]) -> None:

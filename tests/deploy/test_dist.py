@@ -14,6 +14,7 @@ import pytest
 
 from graspd.service.model.version import PACKAGE_VERSION
 from tests.conftest import REPOSITORY
+from tests.shell import completed
 
 pytestmark = [
     pytest.mark.slow,
@@ -80,11 +81,6 @@ def test_the_wheel_works_outside_the_repository(first: dict[str, Path], tmp_path
 
 def test_all_of_its_extras_can_be_installed_beside_it(first: dict[str, Path]) -> None:
     """pip resolves `wheel[all]` with what this environment has, in which the tests pass; nothing is fetched."""
-    done = subprocess.run(
-        [sys.executable, "-m", "pip", "install", "--dry-run", "--no-index", f"{first['.whl']}[all]"],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = completed([sys.executable, "-m", "pip", "install", "--dry-run", "--no-index", f"{first['.whl']}[all]"])
     assert done.returncode == 0, done.stderr
     assert f"graspd-{PACKAGE_VERSION}" in done.stdout + done.stderr

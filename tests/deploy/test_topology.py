@@ -12,14 +12,21 @@ from pathlib import Path
 
 import httpx
 import pytest
+import redis
 
 from graspd.service.index.index import Index
 from graspd.service.index.rebuild import differences
+from graspd.service.queue.connection import connect
+from graspd.service.queue.rq_queue import RqQueue
 from graspd.service.run.embedded import find_server
 from graspd.service.store.store import open_store
+from tests.api.factories import bearer
 from tests.conftest import REPOSITORY
 from tests.deploy import composition
 from tests.servers import PostgresServer, S3Server, free_ports
+from tests.service.conftest import wait_for_redis
+from tests.shell import completed
+from tests.waiting import until
 
 _READY_S = 120.0
 
@@ -49,13 +56,8 @@ class Topology:
             )
 
     def graspd(self, service: str, *arguments: str, **more: str) -> subprocess.CompletedProcess[str]:
-        return subprocess.run(
-            [sys.executable, "-m", "graspd", *arguments],
-            env=self.environment(service) | more,
-            cwd=REPOSITORY,
-            capture_output=True,
-            text=True,
-            check=False,
+        return completed(
+            [sys.executable, "-m", "graspd", *arguments], env=self.environment(service) | more, cwd=REPOSITORY
         )
 
     def until_ready(self) -> None:
@@ -118,36 +120,23 @@ def key_of(topology: Topology) -> str:
 def test_the_services_of_the_compose_file_do_a_job_together(
     topology: Topology, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    key = key_of(topology)
+    headers = bearer(key_of(topology))
     for number, port in enumerate(topology.ports):
         topology.start(f"api-{number}", "api", "graspd", "api", GRASPD_PORT=str(port))
     topology.start("controller", "controller", "graspd", "controller")
     for number in range(2):
         topology.start(f"worker-{number}", "worker-cpu", "tests.fakes", GRASPD_DEVICE="cpu")
     topology.until_ready()
-
-    first, second = (
-        httpx.Client(
-            base_url=f"http://127.0.0.1:{port}",
-            headers={"Authorization": f"Bearer {key}"},
-            trust_env=False,
-            timeout=60,
-        )
-        for port in topology.ports
-    )
+    urls = [f"http://127.0.0.1:{port}" for port in topology.ports]
+    first, second = (httpx.Client(base_url=url, headers=headers, trust_env=False, timeout=60) for url in urls)
     with first, second:
         assert httpx.get(f"{first.base_url}/v1/jobs", trust_env=False, timeout=60).status_code == 401
-        deadline = time.monotonic() + _READY_S
-        while not first.get("/v1/objects").json()["items"]:  # the controller publishes what comes with graspd
-            assert time.monotonic() < deadline, topology.logs()
-            time.sleep(0.2)
+        # The controller publishes what comes with graspd.
+        until(lambda: first.get("/v1/objects").json()["items"], "objects are there")
         job = first.post("/v1/jobs", json={"hand": "allegro", "object": "mug", "grasps": 128, "scenes": 1})
         assert job.status_code == 202, job.text
-        while second.get(job.headers["location"]).json()["state"] != "succeeded":
-            assert time.monotonic() < deadline, topology.logs()
-            time.sleep(0.2)
+        until(lambda: second.get(job.headers["location"]).json()["state"] == "succeeded", "the job ends")
         assert second.get("/v1/stats").json()["grasps"] == 128
-
     assert topology.graspd("controller", "controller", "--check").returncode == 0
     assert topology.graspd("worker-cpu", "worker", "--check").returncode == 0
     for name, value in topology.environment("api").items():
@@ -168,26 +157,18 @@ def test_a_check_fails_where_nothing_lives(topology: Topology) -> None:
 
 
 def test_redis_refuses_those_without_the_password(tmp_path: Path) -> None:
-    import redis
-
     (port,) = free_ports(1)
     service = composition.SERVICES["redis"]
     command = composition.redis_command(service, find_server()[0], port, tmp_path)
     with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
+        queue = RqQueue(connect(f"redis://:secret@127.0.0.1:{port}/0", patience=0))
         try:
-            with redis.Redis(port=port, password="secret") as client:
-                deadline = time.monotonic() + _READY_S
-                while True:
-                    try:
-                        client.ping()
-                        break
-                    except redis.ConnectionError:
-                        assert time.monotonic() < deadline
-                        time.sleep(0.05)
-                assert client.config_get("appendonly") == {"appendonly": "yes"}
-                assert client.config_get("maxmemory-policy") == {"maxmemory-policy": "noeviction"}
+            wait_for_redis(queue)
+            assert queue.connection.config_get("appendonly") == {"appendonly": "yes"}
+            assert queue.connection.config_get("maxmemory-policy") == {"maxmemory-policy": "noeviction"}
             with redis.Redis(port=port) as stranger, pytest.raises(redis.AuthenticationError):
                 stranger.ping()
         finally:
+            queue.close()
             process.terminate()
     assert (tmp_path / "appendonlydir").is_dir()

@@ -105,7 +105,7 @@ def test_the_face_held_back_looks_least_like_the_others() -> None:
     assert apart(np.concatenate([sides[:5], [[0, 0, 1.0]], sides[5:]])) == 5
 
 
-def test_most_alike_grasps_lie_nearer_together_than_most_unlike_ones() -> None:
+def test_most_alike_grasps_lie_nearer_than_most_unlike_ones() -> None:
     rng = np.random.default_rng(0)
     rows = rng.normal(size=(40, 12 + 3 * JOINTS))
     scene = Scene("block", "a" * 64, 0)
@@ -150,7 +150,7 @@ def test_the_nearest_picture_gives_its_grasps_turned_with_it() -> None:
     assert own in ({tuple(np.round(place, 6)) for place in side} for side in (there, half))
 
 
-def test_a_hand_that_would_stand_in_the_table_is_raised_out_of_it(hand: HandModel) -> None:
+def test_a_hand_that_would_stand_in_the_table_is_raised(hand: HandModel) -> None:
     sight = block_of((0.06, 0.06, 0.05))
     given = across(hand, sight, 2, squeeze=SQUEEZE, rng=np.random.default_rng(0))
     pose = given.hand_pose.copy()
@@ -179,9 +179,7 @@ def test_fingers_open_as_wide_as_the_table_has_room_for(hand: HandModel) -> None
 
 
 @pytest.mark.parametrize(("off", "clear"), [(0.5, False), (2.0, True)])
-def test_a_hand_is_clear_that_keeps_its_distance_from_what_was_seen_on_its_way(
-    hand: HandModel, off: float, clear: bool
-) -> None:
+def test_a_hand_is_clear_that_keeps_its_distance_on_its_way(hand: HandModel, off: float, clear: bool) -> None:
     sight = block_of((0.06, 0.06, 0.12))
     given = across(hand, sight, 1, squeeze=SQUEEZE, rng=np.random.default_rng(0))
     ready = execution.made_ready(hand, given, sight)
@@ -215,7 +213,7 @@ def test_where_a_hand_is_to_squeeze_raises_it_by_nothing(hand: HandModel) -> Non
 
 
 @pytest.mark.slow
-def test_a_block_is_lifted_by_a_hand_across_it_and_not_by_one_beside_it(hand: HandModel) -> None:
+def test_a_block_is_lifted_by_a_hand_across_it_alone(hand: HandModel) -> None:
     block = object_from_path("block")
     scene = Sight(Scene("block", "a" * 64, 0), *_block_seen(block.vertices))
     exam = Exam.of("block", OBJECT, block, [scene] * 2, 2)

@@ -102,7 +102,7 @@ def hands_at(hand: HandModel, places: np.ndarray) -> net.Proposals:
 
 
 @pytest.mark.usefixtures("one_thread")
-def test_an_evaluator_tells_hands_at_the_object_from_hands_beside_it(hand: HandModel) -> None:
+def test_an_evaluator_tells_hands_at_the_object_from_others(hand: HandModel) -> None:
     sight, rng = ball(), np.random.default_rng(1)
 
     def around(count: int) -> tuple[net.Proposals, np.ndarray]:
@@ -119,7 +119,7 @@ def test_an_evaluator_tells_hands_at_the_object_from_hands_beside_it(hand: HandM
 
 
 @pytest.mark.usefixtures("one_thread")
-def test_a_verdict_is_of_how_hand_and_object_lie_to_one_another_and_to_the_table(hand: HandModel) -> None:
+def test_a_verdict_is_of_how_hand_object_and_table_lie(hand: HandModel) -> None:
     torch.manual_seed(0)
     evaluator, sight = Evaluator(hand).eval(), ball()
     hands = hands_at(hand, np.array([[0.02, 0.01, 0.33]]))
@@ -136,7 +136,7 @@ def test_a_verdict_is_of_how_hand_and_object_lie_to_one_another_and_to_the_table
     np.testing.assert_allclose(scores(evaluator, hand, sight, hands), same, atol=1e-3)
 
 
-def test_moves_of_no_size_leave_a_hand_and_others_stay_within_its_limits(hand: HandModel) -> None:
+def test_moves_stay_within_the_limits_and_none_leaves_a_hand(hand: HandModel) -> None:
     hands = hands_at(hand, np.zeros((40, 3)))
     rng = np.random.default_rng(0)
     still = moved(hand, hands, 0.0, rng)
@@ -148,7 +148,7 @@ def test_moves_of_no_size_leave_a_hand_and_others_stay_within_its_limits(hand: H
     np.testing.assert_allclose(np.linalg.norm(far.approach, axis=1), 1.0)
 
 
-def test_moves_squeeze_more_or_less_and_keep_the_fingers_way_to_the_grasp(hand: HandModel) -> None:
+def test_moves_squeeze_more_or_less_and_keep_the_fingers_way(hand: HandModel) -> None:
     hands = hands_at(hand, np.zeros((40, 3)))
     middle = np.tile(hand.expand(0.5 * (hand.lower + hand.upper)), (40, 1))  # no limit is near
     hands = dataclasses.replace(hands, joints=middle, pregrasp=middle, squeeze=middle)
@@ -189,7 +189,7 @@ def test_hands_move_to_where_the_evaluator_believes_in_them(hand: HandModel) -> 
     assert moved_on[0] < moved_on[1]
 
 
-def test_tries_of_two_rounds_keep_each_its_picture_and_its_verdict(hand: HandModel) -> None:
+def test_tries_of_two_rounds_keep_their_picture_and_verdict(hand: HandModel) -> None:
     high = ball()
     low = dataclasses.replace(high, points=high.points - [0.0, 0.0, 0.1])
     one = Attempts.of(hand, [high, low], [hands_at(hand, np.full((1, 3), 0.1 * k)) for k in (1, 2)], np.array([1, 0]))
@@ -202,7 +202,7 @@ def test_tries_of_two_rounds_keep_each_its_picture_and_its_verdict(hand: HandMod
 
 
 @pytest.mark.slow
-def test_practice_lifts_what_is_known_to_lift_and_not_what_is_far_away(hand: HandModel) -> None:
+def test_practice_lifts_what_is_known_to_lift(hand: HandModel) -> None:
     block = object_from_path("block")
     pose = np.array([0.0, 0.0, -block.vertices[:, 2].min(), 1.0, 0, 0, 0])
     points = block.vertices[np.random.default_rng(0).choice(len(block.vertices), 512)] + pose[:3]

@@ -1,4 +1,4 @@
-"""docs/reference/python.md, the notebook and what of docs/how-to/hands.md needs a service, run as printed."""
+"""Tutorials, docs/reference/python.md, the notebook and what needs a service, run as printed."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ import json
 import os
 import re
 import shlex
-import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import httpx
 import pytest
@@ -20,6 +20,8 @@ import graspd
 from graspd.service.run.supervisor import Supervisor
 from graspd.service.settings import Settings
 from tests.conftest import REPOSITORY
+from tests.docs_commands import run_page
+from tests.shell import completed
 from tests.waiting import PATIENCE_S, until_a_worker_is_idle
 from tests.worker.hands.my_hand import write_my_hand
 
@@ -35,9 +37,7 @@ def environment(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, 
 
 
 def run(code: str, environment: dict[str, str], folder: Path) -> str:
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=False, env=environment, cwd=folder
-    )
+    done = completed([sys.executable, "-c", code], env=environment, cwd=folder)
     assert done.returncode == 0, done.stderr[-2000:]
     return done.stdout
 
@@ -52,7 +52,7 @@ def test_the_page_runs_as_it_is_printed(environment: dict[str, str], tmp_path: P
     assert "no_such_file.stl" in said
 
 
-def test_every_public_name_has_a_docstring_whose_first_line_is_short() -> None:
+def test_every_public_name_has_a_docstring_that_begins_short() -> None:
     named = {name: getattr(graspd, name) for name in graspd.__all__ if not name.startswith("_")}
     for name, value in list(named.items()):
         if inspect.isclass(value):
@@ -100,14 +100,7 @@ def test_a_hand_is_added_corrected_and_used_as_the_page_says(environment: dict[s
         program, *arguments = shlex.split(line, comments=True) or ["", ""]
         if program != "graspd" or arguments[:2] == ["hands", "check"]:
             continue
-        done = subprocess.run(
-            [sys.executable, "-m", "graspd", *arguments],
-            capture_output=True,
-            text=True,
-            check=False,
-            env=environment,
-            cwd=tmp_path,
-        )
+        done = completed([sys.executable, "-m", "graspd", *arguments], env=environment, cwd=tmp_path)
         assert done.returncode == 0, done.stderr[-2000:]
     (curl,) = [shlex.split(line) for line in lines if line.startswith("curl ")]
     url = next(part for part in curl if part.startswith("http"))
@@ -116,3 +109,23 @@ def test_a_hand_is_added_corrected_and_used_as_the_page_says(environment: dict[s
         answer = http.post(httpx.URL(url).path, json=body)
         assert answer.status_code == 202, answer.text
         assert http.get("/v1/jobs", params={"hand": "my_hand"}).json()["items"][0]["state"] == "succeeded"
+
+
+TUTORIALS = sorted((REPOSITORY / "docs" / "tutorials").glob("*.md"))
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize("page", TUTORIALS, ids=lambda page: page.stem)
+def test_the_commands_of_a_tutorial_run(page: Path, tmp_path: Path) -> None:
+    assert run_page(page, "", tmp_path) == []
+
+
+def test_the_lines_that_read_the_first_grasps_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    graspd.synthesize("allegro", "mug", count=4, fidelity="draft", seed=1).save("mug.h5")
+    (block,) = re.findall(r"```python\n(.*?)```", (TUTORIALS[0]).read_text(), re.DOTALL)
+    said: dict[str, Any] = {}
+    exec(block, said)
+    best = said["best"]
+    assert (len(best), best.joint_positions.shape) == (3, (3, 16)) and (best.metric("epsilon") > 0).all()

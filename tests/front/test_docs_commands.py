@@ -1,18 +1,28 @@
-"""The command line knows what README and docs print, option by option; `make docs-commands` runs it."""
+"""README and docs: commands known to the command line, links, answers to questions, and a strict site."""
 
 from __future__ import annotations
 
+import math
 import re
+import sys
+from collections import Counter
+from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import pytest
+import yaml
 
 from tests import docs_commands
 from tests.conftest import PACKAGES, REPOSITORY
 from tests.docs_commands import NOT_RUN, PAGES, Line, lines_of
+from tests.shell import completed
 
 #: `graspd jobs`, <pre>graspd jobs</pre>, epilog="graspd jobs".
 _NAMED = re.compile(r'(?:`|>|epilog=")(graspd\s+[a-z](?:(?!\.\.\.)[^"`{}<…,;])*)')
+
+
 ALL = [line for page in PAGES for line in lines_of(page)]
 
 
@@ -22,7 +32,7 @@ def test_commands_of_a_page_are_those_of_the_command_line(page: Path) -> None:
     assert {text: fault for text, fault in faults.items() if fault} == {}
 
 
-def test_commands_in_sentences_messages_and_examples_of_help_exist() -> None:
+def test_commands_in_sentences_messages_and_help_exist() -> None:
     files = [*REPOSITORY.glob("*.md")]
     for room in (*PACKAGES, "docker", "docs"):
         files += [file for file in (REPOSITORY / room).rglob("*") if file.suffix in {".html", ".md", ".py", ".yaml"}]
@@ -74,7 +84,7 @@ def test_blocks_of_both_kinds_are_read_and_comments_are_not(tmp_path: Path) -> N
         ("bottle: 3 faces, repaired\n", "bottle: 3 faces, repaired"),
     ],
 )
-def test_what_a_page_shows_is_held_against_what_came_but_for_numbers(shown: str, missed: str) -> None:
+def test_what_a_page_shows_is_compared_but_for_numbers(shown: str, missed: str) -> None:
     came = "mug: 12 grasps, 12 valid\ngraspd: refused: the mesh is 178.5 m long, too large to grasp; say --units mm\n"
     assert Line("page.md", "graspd jobs", shown=shown).misses(came) == missed
 
@@ -106,3 +116,149 @@ def test_a_page_that_ended_well_waits_for_a_change(tmp_path: Path, monkeypatch: 
     page.write_text("```sh\ngraspd jobs --json\n```\n")
     assert docs_commands.main(once) == 0
     assert len(ran) == 4
+
+
+_FOLDERS = (REPOSITORY.glob("*.md"), *((REPOSITORY / name).rglob("*.md") for name in ("docs", "examples")))
+LINKING = sorted(page for pages in _FOLDERS for page in pages if page.is_file())
+
+
+#: Sources whose comments, messages and help name pages.
+SOURCES = (*PACKAGES, "benchmarks", "docker", "examples")
+
+
+_LINKED = re.compile(r"(?<![\w/.])(?:docs|README|CONTRIBUTING|ARCHITECTURE|SECURITY)[\w/-]*\.md\b")
+
+
+_CODE = re.compile(r"^```.*?^```|`[^`\n]*`", re.DOTALL | re.MULTILINE)
+
+
+_LINK = re.compile(r"\]\(([^()\s]+)\)|(?:src|href)=\"([^\"]+)\"")
+
+
+def anchors(page: Path) -> set[str]:
+    """Names that GitHub gives the headings of a page."""
+    text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.DOTALL | re.MULTILINE)
+    found: dict[str, int] = {}
+    names = set()
+    for heading in re.findall(r"^#+ +(.+?)\s*$", text, re.MULTILINE):
+        plain = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", heading)
+        name = re.sub(r"[^\w\- ]", "", plain.lower()).replace(" ", "-")
+        count = found.get(name, 0)
+        found[name] = count + 1
+        names.add(f"{name}-{count}" if count else name)
+    return names
+
+
+@pytest.mark.parametrize("page", LINKING, ids=lambda page: str(page.relative_to(REPOSITORY)))
+def test_links_of_a_page_lead_somewhere(page: Path) -> None:
+    dead = []
+    for one, other in _LINK.findall(_CODE.sub("", page.read_text())):
+        link = one or other
+        if re.match(r"[a-z]+:", link):
+            continue
+        place, _, anchor = link.partition("#")
+        target = (page.parent / place).resolve() if place else page
+        if not target.exists() or (anchor and target.suffix == ".md" and anchor not in anchors(target)):
+            dead.append(link)
+    assert dead == []
+
+
+@pytest.mark.parametrize("room", SOURCES)
+def test_pages_that_sources_name_exist(room: str) -> None:
+    suffixes = {".py", ".sh", ".toml", ".yaml", ".yml", ".sbatch", ".html", ".ipynb"}
+    files = [file for file in (REPOSITORY / room).rglob("*") if file.suffix in suffixes]
+    assert files
+    named = {(str(file.relative_to(REPOSITORY)), page) for file in files for page in _LINKED.findall(file.read_text())}
+    assert {(file, page) for file, page in named if not (REPOSITORY / page).is_file()} == set()
+
+
+DOCS = REPOSITORY / "docs"
+
+
+QUESTIONS: list[dict[str, Any]] = yaml.safe_load((REPOSITORY / "tests" / "docs_questions.yaml").read_text())
+
+
+#: Results that a reader looks at before another search.
+LOOKED_AT = 5
+
+
+@cache
+def pages() -> dict[str, Counter[str]]:
+    """Words of each page, those of its headings ten times, as searches weigh them."""
+    found = {}
+    for page in DOCS.rglob("*.md"):
+        text = page.read_text().lower()
+        headings = " ".join(re.findall(r"^#+ (.*)$", text, re.MULTILINE))
+        found[str(page.relative_to(DOCS))] = Counter(re.findall(r"\w+", text + f" {headings}" * 10))
+    return found
+
+
+def ranked(search: str) -> list[str]:
+    """Pages by BM25 (Robertson and Zaragoza 2009: k1 = 1.2, b = 0.75), as the site's search ranks them."""
+    mean = sum(words.total() for words in pages().values()) / len(pages())
+    scores: Counter[str] = Counter()
+    for word in re.findall(r"\w+", search.lower()):
+        having = sum(word in words for words in pages().values())
+        rare = math.log(1 + (len(pages()) - having + 0.5) / (having + 0.5))
+        for page, words in pages().items():
+            scores[page] += rare * 2.2 * words[word] / (words[word] + 1.2 * (0.25 + 0.75 * words.total() / mean))
+    return [page for page, _ in scores.most_common()]
+
+
+def test_there_are_thirty_questions_of_all_parts() -> None:
+    assert len({asked["question"] for asked in QUESTIONS}) == len(QUESTIONS) >= 30
+    assert {asked["page"].split("/")[0] for asked in QUESTIONS} == {"how-to", "reference", "explanation"}
+
+
+@pytest.mark.parametrize("asked", QUESTIONS, ids=lambda asked: asked["question"])
+def test_a_question_is_answered_within_one_search_and_one_page(asked: dict[str, Any]) -> None:
+    text = (DOCS / asked["page"]).read_text()
+    assert [words for words in asked["words"] if words not in text] == []
+    assert asked["page"] in ranked(asked["search"])[:LOOKED_AT]
+
+
+#: What a browser fetches by itself: a link that a reader follows may lead anywhere.
+_FETCHED = re.compile(
+    r"<(?:script|img|iframe|source)[^>]* src=\"((?:https?:)?//[^\"]+)|<link[^>]* href=\"((?:https?:)?//[^\"]+)"
+)
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    if not (find_spec("material") and find_spec("mkdocstrings")):
+        pytest.skip("needs pip install '.[docs]'; make docs-site brings it")
+    folder = tmp_path_factory.mktemp("site")
+    done = completed(
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", folder], cwd=REPOSITORY
+    )
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+def test_every_page_of_the_docs_is_a_page_of_the_site(site: Path) -> None:
+    pages = [page.relative_to(REPOSITORY / "docs") for page in (REPOSITORY / "docs").rglob("*.md")]
+    names = {page.with_name("index.html" if page.name == "README.md" else f"{page.stem}.html") for page in pages}
+    assert {name for name in names if not (site / name).is_file()} == set()
+    assert "First grasps" in (site / "index.html").read_text()
+
+
+def test_the_site_fetches_nothing_from_elsewhere(site: Path) -> None:
+    fetched = {
+        (str(page.relative_to(site)), one or other)
+        for page in site.rglob("*.html")
+        for one, other in _FETCHED.findall(page.read_text())
+    }
+    styles = {
+        (str(sheet.relative_to(site)), url)
+        for sheet in site.rglob("*.css")
+        for url in re.findall(r"(?:@import|url\()\s*[\"']?((?:https?:)?//[^\"')]+)", sheet.read_text())
+    }
+    assert fetched | styles == set()
+
+
+def test_every_public_name_is_in_the_reference(site: Path) -> None:
+    import graspd
+
+    text = (site / "reference" / "api.html").read_text()
+    names = {name for name in graspd.__all__ if not name.startswith("_")}
+    assert {name for name in names if not re.search(rf'id="[\w.]+\.{name}"', text)} == set()

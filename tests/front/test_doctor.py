@@ -15,16 +15,14 @@ from graspd.doctor import all_checks, app
 from graspd.service.settings import Settings
 from tests.conftest import REPOSITORY
 from tests.servers import free_ports
+from tests.shell import completed
 
 QUICK = "disk,data-folder,limits,versions,redis,store,index,port,keys"
 
 
 def run(*arguments: str, folder: Path, **environment: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
+    return completed(
         [sys.executable, "-m", "graspd", "doctor", *arguments],
-        capture_output=True,
-        text=True,
-        check=False,
         timeout=120,
         env={**os.environ, "GRASPD_DATA_DIR": str(folder), "GRASPD_PORT": str(free_ports(1)[0]), **environment},
     )

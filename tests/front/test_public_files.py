@@ -1,8 +1,10 @@
-"""Files that a public project keeps beside its sources: valid by their schemas, and true of this repository."""
+"""Files that a public project keeps beside its sources are valid; `import graspd` is light and complete."""
 
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -13,12 +15,18 @@ import yaml
 from click.testing import CliRunner
 from packaging.specifiers import SpecifierSet
 
+import graspd
 from graspd.service.model.version import PACKAGE_VERSION
 from tests.conftest import REPOSITORY
 from tests.docs_commands import Line
+from tests.shell import completed
 
 FORGE = REPOSITORY / ".github"
+
+
 WORKFLOWS = sorted((FORGE / "workflows").glob("*"))
+
+
 #: Name of a schema that check-jsonschema brings, and the files that it describes.
 SCHEMAS = {
     "citation-file-format": [REPOSITORY / "CITATION.cff"],
@@ -26,6 +34,8 @@ SCHEMAS = {
     "github-issue-forms": sorted((FORGE / "ISSUE_TEMPLATE").glob("*")),
     "github-workflows": WORKFLOWS,
 }
+
+
 PROSE = [
     *(REPOSITORY / name for name in ("CONTRIBUTING.md", "SECURITY.md", "CODE_OF_CONDUCT.md")),
     FORGE / "pull_request_template.md",
@@ -105,3 +115,36 @@ def test_a_commit_is_checked_by_the_tools_of_make_check() -> None:
     checked = set(re.findall(r"\$\(BIN\)/([\w-]+)", recipe))
     tools = {hook["entry"].split()[0] for repository in config["repos"] for hook in repository["hooks"]}
     assert tools <= {f".venv/bin/{name}" for name in checked}
+
+
+HEAVY = ("numpy", "pydantic", "warp", "newton", "trimesh", "mujoco", "h5py", "httpx")
+
+
+#: All that it imports of its own: `libraries` imports the others without the garbage collector.
+OWN = {"graspd", "graspd.service", "graspd.service.model", "graspd.service.model.libraries"}
+
+
+def python(code: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    return completed([sys.executable, "-c", code], cwd=cwd)
+
+
+def test_the_import_loads_nothing_that_takes_time() -> None:
+    done = python("import graspd, sys; print(*sys.modules)", REPOSITORY)
+    loaded = set(done.stdout.split())
+    assert "graspd" in loaded, done.stderr
+    assert {name for name in loaded if name.partition(".")[0] == "graspd"} == OWN
+    assert {name.partition(".")[0] for name in loaded}.isdisjoint(HEAVY)
+
+
+def test_every_public_name_is_there() -> None:
+    assert [name for name in graspd.__all__ if getattr(graspd, name, None) is None] == []
+
+
+def test_an_unknown_name_is_an_attribute_error() -> None:
+    with pytest.raises(AttributeError, match="no_such_name"):
+        _ = graspd.no_such_name
+
+
+def test_the_errors_are_one_tree() -> None:
+    named = [getattr(graspd, name) for name in graspd.__all__ if name.endswith("Error")]
+    assert all(issubclass(one, graspd.GraspdError) for one in named)

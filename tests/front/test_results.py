@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shlex
-import subprocess
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -19,6 +18,7 @@ from benchmarks.results.studies import BY_NAME, STUDIES, Study, is_raw
 from graspd.service.model.version import STAGE_REVISIONS
 from tests.conftest import REPOSITORY
 from tests.docs_commands import Line
+from tests.shell import completed
 
 MOST_BYTES, MOST_LINES = 8_000_000, 6_000
 ADD = Study(
@@ -40,7 +40,7 @@ def test_the_manifest_holds_every_figure_and_picture_as_it_is() -> None:
 
 
 def test_git_keeps_what_readers_see_and_no_raw_results() -> None:
-    listed = subprocess.run(["git", "ls-files", "docs"], cwd=REPOSITORY, capture_output=True, text=True)
+    listed = completed(["git", "ls-files", "docs"], cwd=REPOSITORY)
     if listed.returncode:
         pytest.skip("no checkout of git")
     files = [REPOSITORY / name for name in listed.stdout.split() if (REPOSITORY / name).is_file()]
@@ -52,7 +52,7 @@ def test_git_keeps_what_readers_see_and_no_raw_results() -> None:
     assert sum(file.read_text().count("\n") for file in texts) <= MOST_LINES
 
 
-def test_a_page_keeps_no_link_to_a_raw_result_and_a_picture_gets_a_palette(tmp_path: Path) -> None:
+def test_a_page_links_no_raw_result_and_pictures_get_a_palette(tmp_path: Path) -> None:
     draws = "from PIL import Image; Image.merge('RGB', [Image.effect_noise((99, 99), 50)] * 3).save(sys.argv[2])"
     writes = "open(sys.argv[1], 'w').write('[all](raw.json), [seen](seen.png)')"
     line = f'python -c "import sys; {writes}; {draws}" OUT/results/page.md OUT/results/seen.png'
@@ -69,15 +69,9 @@ def test_a_picture_that_would_show_steps_keeps_its_colours(tmp_path: Path) -> No
     assert (tmp_path / "depth.png").read_bytes() == before
 
 
-def test_raw_results_stand_beside_the_pages_and_not_in_the_manifest(tmp_path: Path) -> None:
-    raw = Study(
-        "add",
-        "a sum",
-        ("results/sum.json",),
-        (*ADD.run, ADD.run[0].replace("total.txt", "sum.json")),
-        prints=ADD.prints,
-    )
-    runner(tmp_path).run(raw)
+def test_raw_results_stand_beside_the_pages_alone(tmp_path: Path) -> None:
+    run = (*ADD.run, ADD.run[0].replace("total.txt", "sum.json"))
+    runner(tmp_path).run(Study("add", "a sum", ("results/sum.json",), run, prints=ADD.prints))
     assert (tmp_path / "docs/results/sum.json").is_file()
     assert set(load(tmp_path / "docs")["add"]["files"]) == {"results/sum.md"}
 
@@ -89,14 +83,10 @@ def test_each_file_belongs_to_one_study() -> None:
 
 
 @pytest.mark.parametrize("path", page.PAGES, ids=lambda path: path.name)
-def test_what_a_page_cites_is_held(path: Path) -> None:
+def test_what_a_page_cites_is_held_and_its_tables_are_current(path: Path) -> None:
     held = {name for record in load(DOCS).values() for name in record["files"]} | {INDEX, manifest.MANIFEST}
     folders = {str(parent) for name in held for parent in Path(name).parents}
     assert set(page.cited(path)) <= held | folders
-
-
-@pytest.mark.parametrize("path", page.PAGES, ids=lambda path: path.name)
-def test_tables_of_a_page_are_those_of_the_figures(path: Path) -> None:
     text = path.read_text()
     assert page.renewed(text, DOCS) == text, "run: make docs"
 
@@ -104,7 +94,7 @@ def test_tables_of_a_page_are_those_of_the_figures(path: Path) -> None:
 @pytest.mark.parametrize(
     "path", sorted((DOCS / "results").glob("*stability/stability.md")), ids=lambda path: path.parent.name
 )
-def test_what_the_atlas_finds_broken_within_reach_of_a_job_is_named_among_the_limits(path: Path) -> None:
+def test_what_the_atlas_finds_broken_is_among_the_limits(path: Path) -> None:
     still = path.read_text().partition("## What still breaks")[2].partition("\n## ")[0]
     _, _, *rows = [row.split(" | ") for row in still.splitlines() if row.startswith("| ")]
     assert rows
@@ -125,7 +115,7 @@ def test_a_figure_of_older_algorithms_is_shown_as_stale() -> None:
     assert staleness(study, record | {"stage_revisions": dict(STAGE_REVISIONS)}) == ""
 
 
-def test_a_revision_that_makes_the_same_leaves_figures_fresh_but_those_that_it_changes(
+def test_a_revision_leaves_figures_fresh_but_those_it_changes(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setitem(STAGE_REVISIONS, "synthesize", 9)
@@ -166,7 +156,7 @@ def test_older_algorithms_are_run_again(tmp_path: Path, monkeypatch: pytest.Monk
     assert not runner(tmp_path).holds(ADD)
 
 
-def test_a_study_that_fails_leaves_no_record_and_says_which_command(tmp_path: Path) -> None:
+def test_a_study_that_fails_leaves_no_record(tmp_path: Path) -> None:
     fails = Study("add", "a sum", ADD.files, (*ADD.run, "python -c 'raise SystemExit(3)'"))
     assert "`python -c 'raise SystemExit(3)'` ended with 3" in runner(tmp_path).run(fails)
     assert load(tmp_path / "docs") == {}
@@ -180,16 +170,10 @@ def test_what_a_study_lacks_is_said(tmp_path: Path) -> None:
 
 def test_folders_of_this_machine_are_not_in_the_figures(tmp_path: Path) -> None:
     tells = "import sys, json; json.dump(sys.argv[1:], open(sys.argv[2], 'w'))"
-    says = Study(
-        "add",
-        "a sum",
-        ("results/where.json",),
-        (f'python -c "{tells}" DATA/hands OUT/results/where.json',),
-        prints="results/where.md",
-    )
+    line = f'python -c "{tells}" DATA/hands OUT/results/where.json'
     made = runner(tmp_path)
     made.places["DATA"] = tmp_path / "data"
-    made.run(says)
+    made.run(Study("add", "a sum", ("results/where.json",), (line,), prints="results/where.md"))
     assert json.loads((tmp_path / "docs/results/where.json").read_text()) == ["DATA/hands", "docs/results/where.json"]
 
 

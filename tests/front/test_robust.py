@@ -26,7 +26,7 @@ def test_a_file_of_robust_grasps_says_so_to_every_reader(tmp_path: Path) -> None
     assert len(grasps.where(lambda g: g.metric("robust_share") >= 0.5)) == 2
 
 
-def test_grasps_in_scenes_are_robust_if_they_lift_in_other_models(tmp_path: Path) -> None:
+def test_grasps_in_scenes_are_robust_if_other_models_lift_them(tmp_path: Path) -> None:
     (tmp_path / "made").mkdir()
     file, copies = tmp_path / "made" / "table.h5", tmp_path / "validated"
     asked = ["--hand", "barrett", "--object", "block", "--scene", "table", "--scenes", "2", "--fidelity", "draft"]

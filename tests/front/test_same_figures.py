@@ -48,7 +48,7 @@ def test_pads_of_the_hands_hold_the_built_in_objects(name: str) -> None:
     assert not any(sizes.values()), sizes
 
 
-def test_in_scenes_points_are_not_pulled_and_palms_set_out_from_where_they_did() -> None:
+def test_in_scenes_no_point_is_pulled_and_palms_start_as_before() -> None:
     hand, obj = hand_from_path("barrett"), object_from_path("block")
     pair = pair_of(hand, obj, FIDELITIES["standard"], "cpu")
     table = Environment((Obstacle.half_space([0, 0, 1], -0.05),), np.array([0.0, 0.0, 1.0]))

@@ -131,7 +131,7 @@ def test_a_client_tells_the_range(grasps: graspd.Grasps) -> None:
         _ = grasps[6]
 
 
-def test_grasps_of_another_object_are_not_saved_as_those_of_the_first(tmp_path: Path) -> None:
+def test_grasps_of_another_object_are_not_saved_as_the_firsts(tmp_path: Path) -> None:
     shard(tmp_path / "a.h5"), shard(tmp_path / "b.h5", obj="bowl")
     both = graspd.open(tmp_path)
     first, second = both.objects

@@ -40,14 +40,15 @@ def redis_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 
 def wait_for_redis(queue: RqQueue) -> None:
     """Until it answers."""
+    until(lambda: is_up(queue), "Redis answers")
 
-    def answers() -> bool:
-        try:
-            return queue.ping() >= 0
-        except QueueUnavailable:
-            return False
 
-    until(answers, "Redis answers")
+def is_up(queue: RqQueue) -> bool:
+    """Whether it answers now."""
+    try:
+        return queue.ping() >= 0
+    except QueueUnavailable:
+        return False
 
 
 @pytest.fixture

@@ -1,12 +1,18 @@
-"""ARCHITECTURE.md is true: its fault table names tests that exist, its layers are kept, its files are there."""
+"""ARCHITECTURE.md and docs say what the code does: tests, layers, files, light imports."""
 
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
 import tomllib
+from pathlib import Path
 
 import pytest
 
+from graspd import service
+from graspd.service.docs import PAGES, PARTS, renewed
+from graspd.service.settings import GONE, Settings
 from tests.conftest import PACKAGES, REPOSITORY
 
 
@@ -32,7 +38,7 @@ def test_the_layers_are_those_that_the_contracts_keep(package: str) -> None:
     assert layers == [set(re.findall(r"\w+", layer)) for layer in kept]
 
 
-def test_the_files_to_open_for_a_change_are_there_and_as_many_as_it_says() -> None:
+def test_the_files_to_open_for_a_change_are_there() -> None:
     rows = rows_of("I want to ... | open these files | files")
     assert len(rows) >= 8
     for wish, files, number in rows:
@@ -76,3 +82,47 @@ def test_the_product_stays_within_its_budget(what: str, budget: int) -> None:
         "lines that the formatter skips": sum(text.count("fmt: skip") for text in texts),
     }
     assert 0 < found[what] <= budget
+
+
+MODULES = sorted(
+    "graspd.service."
+    + ".".join(path.relative_to(Path(service.__file__).parent).with_suffix("").parts).removesuffix(".__init__")
+    for path in Path(service.__file__).parent.rglob("*.py")
+    # The readers' module for torch is for those who have it.
+    if path.name not in ("__init__.py", "torch_data.py")
+)
+
+
+HEAVY = {"warp", "trimesh", "mujoco", "scipy", "newton", "torch", "graspd.worker", "graspd.api"}
+
+
+def test_no_line_spells_a_key_of_rq() -> None:
+    """RQ itself says where it keeps what: `service.queue.lists` asks it."""
+    root = Path(service.__file__).parents[1]
+    files = [file for room in PACKAGES for file in (root / room).rglob("*.py")]
+    assert [str(file) for file in files if re.search(r"""["']rq:""", file.read_text())] == []
+
+
+def test_the_service_package_is_light() -> None:
+    code = f"import sys, {', '.join(MODULES)}; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert not HEAVY & set(done.stdout.split())
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_the_tables_of_a_page_are_up_to_date(page: str) -> None:
+    text = (REPOSITORY / page).read_text()
+    assert renewed(text) == text, "run: make docs"
+
+
+def test_every_part_stands_on_some_page() -> None:
+    text = "".join((REPOSITORY / page).read_text() for page in PAGES)
+    assert all(f"<!-- {name} -->" in text for name in PARTS)
+
+
+def test_settings_named_in_the_docs_exist() -> None:
+    pages = [*REPOSITORY.glob("*.md"), *REPOSITORY.glob("docs/**/*.md"), REPOSITORY / "Makefile"]
+    known = {f"GRASPD_{name.upper()}" for name in Settings.model_fields} | GONE.keys()
+    for page in pages:
+        named = set(re.findall(r"GRASPD_[A-Z][A-Z_]*[A-Z]", page.read_text()))
+        assert named <= known, f"{page.name} names unknown settings"

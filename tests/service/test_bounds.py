@@ -25,7 +25,7 @@ def used(queue: RqQueue) -> int:
     return int(queue.connection.info("memory")["used_memory_dataset"])
 
 
-def test_a_waiting_task_takes_a_few_kilobytes_of_redis_and_gives_them_back(rq_queue: RqQueue) -> None:
+def test_a_waiting_task_takes_a_few_kilobytes_of_redis(rq_queue: RqQueue) -> None:
     message = message_for(scenes=2)
     tasks = [message.model_copy(update={"task_id": f"{number:032x}"}) for number in range(500)]
 
@@ -46,17 +46,8 @@ def test_a_waiting_task_takes_a_few_kilobytes_of_redis_and_gives_them_back(rq_qu
 
 
 def test_the_stream_of_events_takes_a_bounded_part_of_redis(rq_queue: RqQueue) -> None:
-    event = Event(
-        kind=EventKind.FINISHED,
-        at=timestamp(),
-        task_id="0" * 32,
-        job_id="1" * 32,
-        attempt=1,
-        worker="host-12345-abcdef",
-        seconds=12.5,
-        output="2" * 32,
-        message="was there already",
-    )
+    ids = {"task_id": "0" * 32, "job_id": "1" * 32, "output": "2" * 32, "worker": "host-12345-abcdef"}
+    event = Event(kind=EventKind.FINISHED, at=timestamp(), attempt=1, seconds=12.5, message="was there already", **ids)
     for _ in range(1000):
         rq_queue.publish(event)
     size = rq_queue.connection.memory_usage(EVENTS, samples=0)
@@ -71,7 +62,7 @@ def test_an_index_grows_by_about_a_kilobyte_a_grasp(tmp_path: Path) -> None:
     assert (tmp_path / "index.sqlite").stat().st_size < counts["grasps"] * GRASP_BYTES
 
 
-def test_everything_in_redis_that_is_not_of_a_fixed_number_has_an_end(rq_queue: RqQueue) -> None:
+def test_everything_in_redis_of_no_fixed_number_has_an_end(rq_queue: RqQueue) -> None:
     rq_queue.enqueue([message_for()], Priority.BULK)
     rq_queue.discard(["0" * 32])
     rq_queue.announce("controller", 5)

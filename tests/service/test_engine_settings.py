@@ -18,7 +18,7 @@ def nothing_set(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.delenv(name)
 
 
-def test_where_nothing_is_set_they_are_the_defaults_of_all_settings() -> None:
+def test_where_nothing_is_set_they_are_the_defaults() -> None:
     whole = load_settings()
     assert engine_settings() == EngineSettings() == EngineSettings(whole.prefilter, whole.processes)
 

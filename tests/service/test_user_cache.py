@@ -102,7 +102,7 @@ def test_without_any_folder_nothing_is_kept_and_nothing_fails(monkeypatch: pytes
     assert user_cache.load(file) is None
 
 
-def test_processes_that_keep_the_same_entry_leave_one_that_is_whole(tmp_path: Path) -> None:
+def test_processes_that_keep_one_entry_leave_a_whole_one(tmp_path: Path) -> None:
     write = (
         "import sys, pathlib; from service import user_cache\n"
         "for _ in range(200):\n"

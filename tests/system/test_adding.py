@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ from graspd.service.index.rebuild import differences
 from graspd.service.run.supervisor import Supervisor
 from graspd.service.settings import Settings
 from graspd.service.store.store import open_store
+from tests.shell import completed
 from tests.waiting import PATIENCE_S, until_a_worker_is_idle
 
 GRIPPER = """\
@@ -54,9 +54,7 @@ class Shell:
     def __call__(self, *arguments: str) -> tuple[int, dict[str, Any], str]:
         """Exit code, the JSON object on the last line, standard error."""
         command = [sys.executable, "-m", "graspd", *arguments, "--json"]
-        done = subprocess.run(
-            command, capture_output=True, text=True, env=self.environment, cwd=self.folder, timeout=280, check=False
-        )
+        done = completed(command, env=self.environment, cwd=self.folder, timeout=280)
         lines = done.stdout.strip().splitlines()
         return done.returncode, json.loads(lines[-1]) if lines else {}, done.stderr
 
@@ -108,7 +106,7 @@ def test_a_hand_that_cannot_be_used_is_refused_with_the_mend(graspd: Shell) -> N
     assert "slide_left" in said and len(said.strip().splitlines()) == 1
 
 
-def test_an_object_is_refused_and_gets_in_with_the_mend_that_was_named(graspd: Shell) -> None:
+def test_a_refused_object_gets_in_with_the_named_fix(graspd: Shell) -> None:
     code, _, said = graspd("objects", "add", "brick.stl")
     assert code == 2 and "--units mm" in said
     code, brick, _ = graspd("objects", "add", "brick.stl", "--units", "mm", "--density", "500")

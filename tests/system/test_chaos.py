@@ -47,7 +47,7 @@ def running_on(system: System, job: str) -> str | None:
     return tasks[0].worker if tasks else None
 
 
-def test_a_task_whose_worker_is_killed_runs_again_and_its_result_appears_once(system: System) -> None:
+def test_a_task_whose_worker_is_killed_runs_again_once(system: System) -> None:
     reference = system.submit(wanted(seed=1))
     (untouched,) = system.finish(reference)
     system.hold.touch()
@@ -94,7 +94,7 @@ def test_redis_killed_in_the_middle_comes_back_with_its_tasks(two_workers: Syste
     assert differences(system.services.index, system.services.store) == []
 
 
-def test_five_jobs_for_two_workers_finish_and_a_rebuild_changes_no_row(two_workers: System) -> None:
+def test_five_jobs_finish_and_a_rebuild_changes_no_row(two_workers: System) -> None:
     system = two_workers
     # One that still checks its engine takes no tasks, and the other might do them all.
     system.until(lambda: [beat.state for beat in system.services.queue.workers()] == ["idle"] * 2, "both can work")
@@ -122,7 +122,7 @@ def test_a_job_that_kills_its_worker_fails_and_the_others_go_on(start: Start) ->
     assert differences(system.services.index, system.services.store) == []
 
 
-def test_a_running_job_is_cancelled_long_before_its_task_would_end(system: System) -> None:
+def test_a_running_job_is_cancelled_long_before_its_end(system: System) -> None:
     system.hold.touch()
     job = system.submit(wanted(seed=6))
     system.until(lambda: running_on(system, job), "the task runs")
@@ -176,7 +176,7 @@ def test_forged_entries_run_nothing_and_stop_nobody(system: System, tmp_path: Pa
     assert system.supervisor.pids["worker-0"] == worker, "the worker was not even restarted"
 
 
-def test_a_second_up_on_the_same_data_is_refused_and_says_by_whom(system: System) -> None:
+def test_a_second_up_on_the_same_data_is_refused(system: System) -> None:
     second = Supervisor(Settings(data_dir=system.supervisor.settings.data_dir, port=0), api=False)
     with pytest.raises(BusyError, match=f"in use by process {os.getpid()}"):
         second.start()
@@ -207,7 +207,7 @@ time.sleep(600)
 """
 
 
-def test_no_process_outlives_a_killed_supervisor_and_the_next_one_starts(tmp_path: Path) -> None:
+def test_no_process_outlives_a_killed_supervisor(tmp_path: Path) -> None:
     command = [sys.executable, "-c", _UP_IN_A_PROCESS, str(tmp_path / "data"), str(PATIENCE_S)]
     with subprocess.Popen(command, stdout=subprocess.PIPE) as parent:
         assert parent.stdout is not None

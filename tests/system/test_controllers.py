@@ -24,7 +24,7 @@ def house(tmp_path: Path) -> Iterator[House]:
 
 
 @pytest.mark.chaos
-def test_a_controller_that_is_killed_or_stands_still_gives_way_and_nothing_is_lost(house: House) -> None:
+def test_a_controller_killed_or_stopped_gives_way(house: House) -> None:
     house.controller("first")
     house.until(lambda: house.says("first", "this controller leads"), "the first leads")
     house.controller("second")

@@ -1,13 +1,18 @@
-"""Workers that come and go as they should, and whose turn it is."""
+"""Workers that come, go and step aside as they should, whose turn it is, and a machine with too much to do."""
 
 from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
 
+import httpx
 import pytest
 
 from graspd.service.model.clock import timestamp
@@ -16,11 +21,13 @@ from graspd.service.pipeline import job_actions
 from tests.fakes import request
 from tests.system.conftest import System
 
-pytestmark = pytest.mark.chaos
 Start = Callable[..., System]
+
 
 #: Batches of a dataset that wait in the queue before a later small job.
 _WAITING = 500
+
+
 #: Of these may be done before it: those that run, every fourth turn, and what one worker does while the other has it.
 _BEFORE_IT = 150
 
@@ -30,6 +37,7 @@ def makers(system: System) -> set[str]:
     return {shard.worker for shard in system.services.index.shards.page(limit=200).items}
 
 
+@pytest.mark.chaos
 def test_a_worker_that_leaks_makes_room_before_it_holds_too_much(start: Start) -> None:
     system = start(environment={"FAKE_LEAK_MB": "200"}, worker_max_memory_mb=450)
     (done,) = system.finish(system.submit(request(grasps=32 * 6)))
@@ -39,6 +47,7 @@ def test_a_worker_that_leaks_makes_room_before_it_holds_too_much(start: Start) -
     assert "lost" not in {worker.state for worker in system.services.index.overview.workers()}
 
 
+@pytest.mark.chaos
 def test_a_worker_that_was_stopped_is_not_shown_as_lost(start: Start) -> None:
     system = start()
     system.until(system.services.index.overview.workers, "the worker is listed")
@@ -55,6 +64,7 @@ def test_a_worker_that_was_stopped_is_not_shown_as_lost(start: Start) -> None:
     assert "lost" not in seen
 
 
+@pytest.mark.chaos
 def test_a_worker_that_was_killed_is_shown_as_lost(start: Start) -> None:
     system = start(lease_s=2.0)
     system.until(system.services.index.overview.workers, "the worker is listed")
@@ -63,6 +73,7 @@ def test_a_worker_that_was_killed_is_shown_as_lost(start: Start) -> None:
     system.until(lambda: "lost" in states(), "it is lost")
 
 
+@pytest.mark.chaos
 def test_somebody_at_a_screen_does_not_wait_for_a_dataset(start: Start) -> None:
     system = start(workers=2, environment={"FAKE_SECONDS": "0.3"})
     bulk = job_actions.submit(system.services, request(grasps=100_000), priority=Priority.BULK)[0].id
@@ -81,6 +92,7 @@ def test_somebody_at_a_screen_does_not_wait_for_a_dataset(start: Start) -> None:
     assert len(between) <= _BEFORE_IT, f"of {_WAITING} batches that waited before it, {len(between)} went first"
 
 
+@pytest.mark.chaos
 def test_steady_small_jobs_do_not_stop_a_dataset(start: Start) -> None:
     system = start(environment={"FAKE_SECONDS": "0.05"})
     bulk = job_actions.submit(system.services, request(grasps=3200), priority=Priority.BULK)[0].id
@@ -109,3 +121,85 @@ def test_steady_small_jobs_do_not_stop_a_dataset(start: Start) -> None:
     finally:
         ended.set()
         thread.join()
+
+
+@pytest.mark.chaos
+def test_a_worker_whose_engine_breaks_returns_when_it_is_fixed(start: Callable[..., System], tmp_path: Path) -> None:
+    broken = tmp_path / "broken"
+    system = start(api=True, environment={"FAKE_BROKEN": str(broken)})
+    system.finish(system.submit(request(seed=1)))
+    broken.touch()
+    jobs = [system.submit(request(seed=seed)) for seed in (2, 3)]
+    url = f"{system.supervisor.api_url}/v1/workers"
+    found: list[dict[str, str]] = []
+
+    def is_shown() -> bool:
+        found[:] = [worker for worker in httpx.get(url, timeout=60).json() if worker["state"] == "quarantined"]
+        return bool(found)
+
+    system.until(is_shown, "the worker is shown in quarantine")
+    assert found[0]["reason"] == "no kernel can be loaded"
+    page = httpx.get(f"{system.supervisor.api_url}/workers", timeout=60).text
+    assert "takes no tasks: no kernel can be loaded" in page
+    broken.unlink()
+    done = system.finish(*jobs)
+    assert {job.state for job in done} == {State.SUCCEEDED}
+    assert system.services.index.jobs.attempts() == [], "it cost no attempt"
+
+
+@pytest.mark.chaos
+def test_a_worker_that_cannot_load_its_engine_takes_no_task(start: Callable[..., System], tmp_path: Path) -> None:
+    broken = tmp_path / "broken"
+    system = start(environment={"FAKE_BROKEN": str(broken)})
+    broken.touch()
+    first = system.kill("worker-0")
+    job = system.submit(request())
+    states = lambda: {worker.state for worker in system.services.index.overview.workers()}  # noqa: E731
+    system.until(lambda: "quarantined" in states(), "its successor is in quarantine")
+    assert system.supervisor.pids["worker-0"] != first
+    assert system.services.index.jobs.get(job).state is State.QUEUED
+    assert system.services.index.jobs.attempts() == []
+
+
+#: Busy processes a core.
+BUSY = 7.5
+
+
+#: A busy process ends by itself, should nobody end it [s].
+_LONGEST_S = 600
+
+
+_BUSY = f"import time\nend = time.monotonic() + {_LONGEST_S}\nwhile time.monotonic() < end: pass"
+
+
+@contextmanager
+def load() -> Iterator[None]:
+    """Busy processes: 15 on two cores."""
+    count = round(BUSY * len(os.sched_getaffinity(0)))
+    command = [sys.executable, "-m", "graspd.service.run.launch", str(os.getpid()), sys.executable, "-c", _BUSY]
+    busy = [subprocess.Popen(command) for _ in range(count)]
+    try:
+        yield
+    finally:
+        for process in busy:
+            process.kill()
+        for process in busy:
+            process.wait()
+
+
+@pytest.mark.chaos
+@pytest.mark.slow
+@pytest.mark.timeout(_LONGEST_S)
+def test_on_a_busy_machine_no_worker_is_lost(
+    start: Callable[..., System],
+) -> None:
+    """Each task holds the interpreter lock for two leases, as a kernel that compiles does."""
+    system = start(workers=2, environment={"FAKE_LOCK_S": "4"}, lease_s=2.0, task_attempts=1)
+    # That they start is no part of it, and would take the tests beside this one their processors for long.
+    system.until(lambda: [beat.state for beat in system.services.queue.workers()] == ["idle"] * 2, "both can work")
+    with load():
+        job = system.submit(request(grasps=32 * 2))
+        (done,) = system.finish(job, seconds=_LONGEST_S / 2)
+    assert system.services.index.jobs.attempts() == []
+    assert (done.state, done.grasps) == (State.SUCCEEDED, 32 * 2)
+    assert "lost" not in {worker.state for worker in system.services.index.overview.workers()}

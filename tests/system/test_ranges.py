@@ -8,13 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from graspd.service.model import names
 from graspd.service.model.planning import plan
-from graspd.service.model.records import JobRecord
 from graspd.service.model.states import Priority, Stage, State
 from graspd.service.pipeline import job_actions
 from graspd.service.store.manifests import load_shard
-from graspd.service.store.records import read_record
+from tests.fakes import record_of
 from tests.fakes import request as wanted
 from tests.system.conftest import System, alive
 
@@ -28,7 +26,7 @@ def submitted(system: System, grasps: int, *, span: int) -> str:
     return job_actions.enter(system.services, record.model_copy(update={"span": span}))[0].id
 
 
-def test_the_range_of_a_killed_worker_is_made_again_and_its_result_appears_once(start: Start) -> None:
+def test_the_range_of_a_killed_worker_is_made_again_once(start: Start) -> None:
     system = start(lease_s=2.0)
     system.hold.touch()
     job = submitted(system, 32 * 5, span=3)
@@ -41,7 +39,7 @@ def test_the_range_of_a_killed_worker_is_made_again_and_its_result_appears_once(
     assert (done.state, done.grasps) == (State.SUCCEEDED, 160)
     (attempt,) = system.services.index.jobs.attempts(job=job)
     assert attempt.kind == "WorkerLost" and f"-{killed}-" in attempt.worker
-    record = read_record(JobRecord, system.services.store, names.job_record(job))
+    record = record_of(system.services, job)
     made = [load_shard(system.services.store, Stage.SYNTHESIZE, task.output) for task in plan(record)]
     assert [(shard.attributes["batch"], shard.attributes["batch_rows"]) for shard in made] == [
         (0, "[32, 32, 32]"),
@@ -51,7 +49,7 @@ def test_the_range_of_a_killed_worker_is_made_again_and_its_result_appears_once(
     assert len(np.unique(rows, axis=0)) == 160, "no batch is there twice"
 
 
-def test_a_worker_killed_between_shard_and_event_has_its_task_done_all_the_same(start: Start, tmp_path: Path) -> None:
+def test_a_worker_killed_before_its_event_has_its_task_done(start: Start, tmp_path: Path) -> None:
     killed = tmp_path / "killed"
     system = start(environment={"FAKE_DIE_UNTOLD": str(killed)})
     job = submitted(system, 96, span=3)

@@ -100,9 +100,7 @@ def test_preemption_a_lost_node_and_a_time_limit_lose_nothing(tmp_path: Path, sl
 
 @pytest.mark.slow
 @pytest.mark.chaos
-def test_the_service_of_a_lost_node_starts_anew_elsewhere_and_the_workers_find_it(
-    tmp_path: Path, slurm: FakeSlurm
-) -> None:
+def test_the_service_of_a_lost_node_starts_anew_elsewhere(tmp_path: Path, slurm: FakeSlurm) -> None:
     """The node's disk is lost with it: index and queue are made again from the store."""
     shared = tmp_path / "shared"
     add_assets_to(shared)
@@ -167,7 +165,7 @@ def submitted(shared: Path, slurm: FakeSlurm) -> str:
     return str(answer.json()["id"])
 
 
-def test_redis_asks_for_the_password_of_the_file_and_nobody_else_reads_it(tmp_path: Path) -> None:
+def test_redis_asks_for_the_password_of_the_file(tmp_path: Path) -> None:
     settings = Settings(data_dir=tmp_path / "data", store_url=(tmp_path / "store").as_uri())
     others = joining(settings, tmp_path / "shared" / "join.env", host="127.0.0.1")
     with Supervisor(settings, workers=0, api=False, joining=others) as supervisor:

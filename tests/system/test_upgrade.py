@@ -48,7 +48,7 @@ def older_worker(house: House, folder: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.chaos
-def test_each_version_of_worker_takes_what_it_can_and_the_controller_holds_back_the_rest(
+def test_each_version_of_worker_takes_what_it_can(
     house: House, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def submit(seed: int, *, revision: int) -> str:

@@ -23,9 +23,6 @@ def test_without_keys_only_this_machine_is_served(settings: Settings, tmp_path: 
     assert not found.ok
     assert found.fix == "graspd keys add admin --scope admin"
     assert keys(Settings(data_dir=tmp_path)).condition is Condition.GOOD
-
-
-def test_a_live_admin_is_good(settings: Settings) -> None:
     KeyFile(settings.resolved_keys_file).add("admin", Scope.ADMIN)
     assert keys(settings).condition is Condition.GOOD
 

@@ -12,14 +12,11 @@ from graspd.api.access.keys import Key, KeyFile, Scope
 from graspd.api.app import create_app
 from graspd.service.index.index import Index
 from graspd.service.index.rebuild import rebuild
-from graspd.service.model import names
-from graspd.service.model.records import JobRecord
 from graspd.service.model.states import AssetKind, State
 from graspd.service.pipeline.backends import Services
 from graspd.service.settings import Settings
 from graspd.service.store.network_file import to_bytes
-from graspd.service.store.records import read_record
-from tests.api.factories import add_job, fail
+from tests.api.factories import add_job, bearer, people_of
 from tests.networks import random_network
 from tests.planning import plan_all
 
@@ -34,10 +31,14 @@ def keys(settings: Settings) -> KeyFile:
 
 
 @pytest.fixture
-def people(keys: KeyFile) -> dict[str, Headers]:
+def people(settings: Settings) -> dict[str, Headers]:
     """Headers of two keys that may submit, of one that may read and of one that may all."""
     scopes = {"ann": Scope.SUBMIT, "bob": Scope.SUBMIT, "eve": Scope.READ, "root": Scope.ADMIN}
-    return {name: {"Authorization": f"Bearer {keys.add(name, scope)}"} for name, scope in scopes.items()}
+    return people_of(settings, **{name: (scope, "") for name, scope in scopes.items()})
+
+
+#: Who may change what ann submitted.
+WHO = pytest.mark.parametrize(("who", "may"), [("ann", True), ("bob", False), ("eve", False), ("root", True)])
 
 
 @pytest.fixture
@@ -50,23 +51,20 @@ def submitted(client: TestClient, headers: Headers) -> str:
     return str(client.post("/v1/jobs", json=JOB, headers=headers).json()["id"])
 
 
-@pytest.mark.parametrize(("who", "status"), [("ann", 202), ("bob", 403), ("eve", 403), ("root", 202)])
-def test_a_job_is_cancelled_by_its_key_or_an_admin(
-    client: TestClient, people: dict[str, Headers], who: str, status: int
+@WHO
+def test_a_job_is_changed_by_its_key_or_an_admin(
+    client: TestClient, people: dict[str, Headers], services: Services, who: str, may: bool
 ) -> None:
     job = submitted(client, people["ann"])
-    assert client.post(f"/v1/jobs/{job}/cancel", headers=people[who]).status_code == status
-    cancelled = client.get(f"/v1/jobs/{job}", headers=people["eve"]).json()["state"] == "cancelled"
-    assert cancelled is (status == 202)
-
-
-@pytest.mark.parametrize(("who", "status"), [("ann", 202), ("bob", 403), ("root", 202)])
-def test_a_job_is_retried_by_its_key_or_an_admin(
-    client: TestClient, people: dict[str, Headers], services: Services, who: str, status: int
-) -> None:
-    job = submitted(client, people["ann"])
-    fail(services, read_record(JobRecord, services.store, names.job_record(job)), "it broke")
-    assert client.post(f"/v1/jobs/{job}/retry", headers=people[who]).status_code == status
+    path = f"/v1/jobs/{job}"
+    assert client.delete(path, headers=people["root"]).status_code == 409, "it has not ended"
+    assert client.post(f"{path}/cancel", headers=people[who]).status_code == (202 if may else 403)
+    assert (client.get(path, headers=people["eve"]).json()["state"] == "cancelled") is may
+    client.post(f"{path}/cancel", headers=people["ann"])
+    assert client.post(f"{path}/retry", headers=people[who]).status_code == (202 if may else 403)
+    client.post(f"{path}/cancel", headers=people["ann"])
+    assert client.delete(path, headers=people[who]).status_code == (204 if may else 403)
+    assert client.get(path, headers=people["eve"]).status_code == (404 if may else 200)
 
 
 @pytest.mark.parametrize("action", ["cancel", "retry"])
@@ -79,19 +77,29 @@ def test_a_dataset_of_another_key_is_left_alone(
     assert client.get("/v1/datasets/d", headers=people["bob"]).json()["cancelled"] is False
 
 
-@pytest.mark.parametrize("who", ["ann", "root"])
-def test_a_dataset_is_cancelled_by_its_key_or_an_admin(
-    client: TestClient, people: dict[str, Headers], who: str
+@WHO
+def test_a_dataset_is_changed_by_its_key_or_an_admin(
+    client: TestClient, people: dict[str, Headers], services: Services, who: str, may: bool
 ) -> None:
     client.post("/v1/datasets", json=MATRIX, headers=people["ann"])
-    assert client.post("/v1/datasets/d/cancel", headers=people[who]).status_code == 202
+    assert client.post("/v1/datasets/d/cancel", headers=people[who]).status_code == (202 if may else 403)
+    client.post("/v1/datasets/d/cancel", headers=people["ann"])
+    plan_all(services)
+    assert client.delete("/v1/datasets/d", headers=people[who]).status_code == (204 if may else 403)
+    client.delete("/v1/datasets/d", headers=people["root"])
+    assert [one["name"] for one in client.get("/v1/deletions", headers=people["ann"]).json()] == ["d"]
+    assert client.post("/v1/datasets/d/restore", headers=people[who]).status_code == (200 if may else 403)
+    assert client.get("/v1/datasets/d", headers=people["eve"]).status_code == (200 if may else 404)
 
 
-def test_a_job_of_another_key_survives_the_end_of_a_dataset_that_has_it_too(
+def test_a_shared_job_survives_the_end_of_another_keys_dataset(
     client: TestClient, people: dict[str, Headers], services: Services
 ) -> None:
     job = submitted(client, people["ann"])
+    assert submitted(client, people["bob"]) == job
+    assert client.post(f"/v1/jobs/{job}/cancel", headers=people["bob"]).status_code == 403, "he only found it"
     client.post("/v1/datasets", json=MATRIX | {"objects": ["mug", "bottle"]}, headers=people["bob"])
+    assert client.delete("/v1/datasets/d", headers=people["bob"]).status_code == 409, "it has not ended"
     plan_all(services)
     assert client.post("/v1/datasets/d/cancel", headers=people["bob"]).status_code == 202
     plan_all(services)
@@ -109,12 +117,6 @@ def test_jobs_of_a_dataset_belong_to_its_key(
     assert client.post(f"/v1/jobs/{job}/cancel", headers=people["ann"]).status_code == 202
 
 
-def test_who_finds_a_job_that_was_there_may_not_cancel_it(client: TestClient, people: dict[str, Headers]) -> None:
-    job = submitted(client, people["ann"])
-    assert submitted(client, people["bob"]) == job
-    assert client.post(f"/v1/jobs/{job}/cancel", headers=people["bob"]).status_code == 403
-
-
 def test_a_job_from_before_there_were_keys_takes_an_admin(
     client: TestClient, people: dict[str, Headers], services: Services
 ) -> None:
@@ -123,19 +125,14 @@ def test_a_job_from_before_there_were_keys_takes_an_admin(
     assert client.post(f"/v1/jobs/{old}/cancel", headers=people["root"]).status_code == 202
 
 
-def test_a_rotated_key_keeps_what_it_submitted(client: TestClient, people: dict[str, Headers], keys: KeyFile) -> None:
-    job = submitted(client, people["ann"])
-    fresh = {"Authorization": f"Bearer {keys.rotate('ann')}"}
-    assert client.post(f"/v1/jobs/{job}/cancel", headers=fresh).status_code == 202
-
-
-def test_a_later_key_of_the_same_name_owns_nothing_of_the_old_one(
+def test_a_rotated_key_keeps_its_jobs_and_a_later_one_has_none(
     client: TestClient, people: dict[str, Headers], keys: KeyFile
 ) -> None:
-    job = submitted(client, people["ann"])
+    job, other = submitted(client, people["ann"]), bearer(keys.rotate("ann"))
+    assert client.post(f"/v1/jobs/{job}/cancel", headers=other).status_code == 202
     keys.revoke("ann")
-    other = {"Authorization": f"Bearer {keys.add('ann', Scope.SUBMIT)}"}
-    assert client.post(f"/v1/jobs/{job}/cancel", headers=other).status_code == 403
+    later = bearer(keys.add("ann", Scope.SUBMIT))
+    assert client.post(f"/v1/jobs/{job}/retry", headers=later).status_code == 403
 
 
 def test_keys_of_before_there_were_ids_have_one_through_rotation(keys: KeyFile) -> None:
@@ -161,11 +158,6 @@ def test_owners_are_in_the_store_and_survive_a_lost_index(
     assert found == (ann, ann, ann)
 
 
-def test_who_has_no_key_changes_everything_while_the_service_is_open(http: TestClient) -> None:
-    job = str(http.post("/v1/jobs", json=JOB).json()["id"])
-    assert http.post(f"/v1/jobs/{job}/cancel").status_code == 202
-
-
 @pytest.mark.parametrize(("scope", "passes"), [(Scope.READ, False), (Scope.SUBMIT, False), (Scope.ADMIN, True)])
 def test_what_has_no_owner_is_changed_by_an_admin_alone(scope: Scope, passes: bool) -> None:
     token = caller.set(Key(id="1", name="me", scope=scope, sha256="", created=""))
@@ -179,22 +171,16 @@ def test_what_has_no_owner_is_changed_by_an_admin_alone(scope: Scope, passes: bo
         caller.reset(token)
 
 
-@pytest.mark.parametrize(("who", "shown"), [("ann", True), ("bob", False), ("eve", False), ("root", True)])
+@WHO
 def test_pages_show_a_button_only_to_whom_it_would_serve(
-    client: TestClient, people: dict[str, Headers], who: str, shown: bool
+    client: TestClient, people: dict[str, Headers], who: str, may: bool
 ) -> None:
     job = submitted(client, people["ann"])
     client.post("/v1/datasets", json=MATRIX, headers=people["ann"])
     for page, action in ((f"/jobs/{job}", f"/jobs/{job}/cancel"), ("/datasets/d", "/datasets/d/cancel")):
-        assert (f'action="{action}"' in client.get(page, headers=people[who]).text) is shown
-
-
-@pytest.mark.parametrize(("who", "shown"), [("bob", True), ("eve", False)])
-def test_who_may_only_read_sees_nothing_to_submit(
-    client: TestClient, people: dict[str, Headers], who: str, shown: bool
-) -> None:
-    page = client.get("/datasets", headers=people[who]).text
-    assert ('action="/datasets"' in page, 'value="cancel"' in page, 'href="/submit"' in page) == (shown,) * 3
+        assert (f'action="{action}"' in client.get(page, headers=people[who]).text) is may
+    page, submits = client.get("/datasets", headers=people[who]).text, who != "eve"
+    assert ('action="/datasets"' in page, 'value="cancel"' in page, 'href="/submit"' in page) == (submits,) * 3
 
 
 def test_chosen_jobs_of_others_are_counted_as_left(client: TestClient, people: dict[str, Headers]) -> None:
@@ -205,70 +191,23 @@ def test_chosen_jobs_of_others_are_counted_as_left(client: TestClient, people: d
     assert client.get(f"/v1/jobs/{job}", headers=people["bob"]).json()["state"] == "queued"
 
 
-@pytest.mark.parametrize(("who", "status"), [("ann", 204), ("bob", 403), ("eve", 403), ("root", 204)])
-def test_a_job_is_deleted_by_its_key_or_an_admin(
-    client: TestClient, people: dict[str, Headers], who: str, status: int
-) -> None:
-    job = submitted(client, people["ann"])
-    assert client.delete(f"/v1/jobs/{job}", headers=people["root"]).status_code == 409, "it has not ended"
-    client.post(f"/v1/jobs/{job}/cancel", headers=people["ann"])
-    assert client.delete(f"/v1/jobs/{job}", headers=people[who]).status_code == status
-    assert client.get(f"/v1/jobs/{job}", headers=people["eve"]).status_code == (404 if status == 204 else 200)
-
-
-@pytest.mark.parametrize(("who", "status"), [("ann", 204), ("bob", 403), ("root", 204)])
-def test_an_object_is_deleted_by_its_key_or_an_admin(
-    client: TestClient, people: dict[str, Headers], who: str, status: int
-) -> None:
-    client.post("/v1/objects", files={"file": ("box.stl", b"solid")}, headers=people["ann"])
-    assert client.delete("/v1/objects/box", headers=people[who]).status_code == status
-    assert client.delete("/v1/objects/mug", headers=people[who]).status_code == 409, "it comes with graspd"
-
-
-@pytest.mark.parametrize(("who", "status"), [("ann", 204), ("bob", 403), ("eve", 403), ("root", 204)])
-def test_a_network_is_deleted_by_its_key_or_an_admin(
-    client: TestClient, people: dict[str, Headers], who: str, status: int
-) -> None:
-    file = {"file": ("net.npz", to_bytes(random_network()))}
-    assert client.post("/v1/networks", files=file, headers=people["eve"]).status_code == 403, "a reader adds none"
-    client.post("/v1/networks", files=file, headers=people["ann"])
-    assert client.delete("/v1/networks/net", headers=people[who]).status_code == status
-
-
-@pytest.mark.parametrize(("who", "status"), [("ann", 204), ("bob", 403), ("root", 204)])
-def test_a_dataset_is_deleted_by_its_key_or_an_admin(
-    client: TestClient, people: dict[str, Headers], services: Services, who: str, status: int
-) -> None:
-    client.post("/v1/datasets", json=MATRIX, headers=people["ann"])
-    assert client.delete("/v1/datasets/d", headers=people["ann"]).status_code == 409, "it has not ended"
-    client.post("/v1/datasets/d/cancel", headers=people["ann"])
-    plan_all(services)
-    assert client.delete("/v1/datasets/d", headers=people[who]).status_code == status
-
-
-@pytest.mark.parametrize(("who", "status"), [("ann", 200), ("bob", 403), ("eve", 403), ("root", 200)])
-def test_a_dataset_is_restored_by_its_key_or_an_admin(
-    client: TestClient, people: dict[str, Headers], services: Services, who: str, status: int
-) -> None:
-    client.post("/v1/datasets", json=MATRIX, headers=people["ann"])
-    client.post("/v1/datasets/d/cancel", headers=people["ann"])
-    plan_all(services)
-    assert client.delete("/v1/datasets/d", headers=people["root"]).status_code == 204
-    assert [one["name"] for one in client.get("/v1/deletions", headers=people["ann"]).json()] == ["d"]
-    assert client.post("/v1/datasets/d/restore", headers=people[who]).status_code == status
-    assert client.get("/v1/datasets/d", headers=people["eve"]).status_code == (200 if status == 200 else 404)
-
-
-@pytest.mark.parametrize(("who", "status"), [("ann", 201), ("bob", 403), ("eve", 403), ("root", 201)])
-def test_a_set_of_objects_gets_a_new_version_from_its_key_or_an_admin(
-    client: TestClient, people: dict[str, Headers], who: str, status: int
+@WHO
+def test_objects_networks_and_sets_are_changed_by_their_key(
+    client: TestClient, people: dict[str, Headers], who: str, may: bool
 ) -> None:
     def put(headers: Headers, *objects: str) -> int:
         return client.post("/v1/object-sets", json={"name": "s", "objects": objects}, headers=headers).status_code
 
-    assert put(people["ann"], "mug") == 201
-    assert put(people["root"], "mug") == 201
-    assert put(people[who], "mug", "block") == status
+    file = {"file": ("net.npz", to_bytes(random_network()))}
+    assert client.post("/v1/networks", files=file, headers=people["eve"]).status_code == 403, "a reader adds none"
+    client.post("/v1/networks", files=file, headers=people["ann"])
+    client.post("/v1/objects", files={"file": ("box.stl", b"solid")}, headers=people["ann"])
+    for address in ("/v1/objects/box", "/v1/networks/net"):
+        assert client.delete(address, headers=people[who]).status_code == (204 if may else 403)
+    built_in = client.delete("/v1/objects/mug", headers=people[who]).status_code
+    assert built_in == (403 if who == "eve" else 409), "it comes with graspd"
+    assert put(people["ann"], "mug") == put(people["root"], "mug") == 201
+    assert put(people[who], "mug", "block") == (201 if may else 403)
     held = client.get("/v1/object-sets/s", headers=people["eve"]).json()["objects"]
-    assert ("block" in held) is (status == 201)
+    assert ("block" in held) is may
     assert put(people["ann"], "block") == 201

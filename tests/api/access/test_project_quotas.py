@@ -13,14 +13,12 @@ from starlette.testclient import TestClient
 from graspd.api.access.keys import KeyFile, ProjectLimits, Scope
 from graspd.api.app import create_app
 from graspd.service.index.tables import shards
-from graspd.service.model import names
-from graspd.service.model.records import JobRecord
 from graspd.service.pipeline.backends import Services
 from graspd.service.queue.rq_queue import RqQueue
 from graspd.service.settings import Settings
-from graspd.service.store.records import read_record
 from tests.api.conftest import TODAY
-from tests.api.factories import finish_all
+from tests.api.factories import finish_all, people_of
+from tests.fakes import record_of
 
 JOB = {"hand": "allegro", "object": "mug", "grasps": 32}
 Ask = Callable[..., Any]
@@ -39,13 +37,12 @@ def service(
 @pytest.fixture
 def ask(service: TestClient, settings: Settings) -> Ask:
     """Submits a job in the name of a key: two are of `red`, one of `blue`."""
-    keys = KeyFile(settings.resolved_keys_file)
     projects = {"ann": "red", "amy": "red", "bob": "blue"}
-    tokens = {name: keys.add(name, Scope.SUBMIT, project=project) for name, project in projects.items()}
+    people = people_of(settings, **{name: (Scope.SUBMIT, project) for name, project in projects.items()})
 
     def submit(who: str, seed: int, path: str = "/v1/jobs", /, **changes: Any) -> Any:
         body = {**JOB, "seed": seed, **changes} if path == "/v1/jobs" else changes
-        return service.post(path, json=body, headers={"Authorization": f"Bearer {tokens[who]}"})
+        return service.post(path, json=body, headers=people[who])
 
     return submit
 
@@ -56,7 +53,7 @@ def limit(settings: Settings, **limits: int) -> None:
 
 def done(services: Services, job: str, *, seconds: float, device: str = "cuda:0", day: str = TODAY) -> None:
     """A job of a single task is done: on that day, in that time."""
-    (made,) = finish_all(services, read_record(JobRecord, services.store, names.job_record(job)))
+    (made,) = finish_all(services, record_of(services, job))
     values = {"device": device, "created": f"{day}T11:00:00.000000Z", "seconds": seconds}
     with services.index.database.writing() as connection:
         connection.execute(update(shards).where(shards.c.id == made.shard_id).values(**values))
@@ -68,24 +65,20 @@ def refused(answer: Any) -> str:
     return str(answer.json()["detail"])
 
 
-def test_keys_of_a_project_share_its_grasps_in_work_and_another_project_has_its_own(
-    ask: Ask, settings: Settings, services: Services
-) -> None:
+def test_keys_of_a_project_share_its_grasps_in_work(ask: Ask, settings: Settings, services: Services) -> None:
     limit(settings, grasps_in_flight=64)
     first = ask("ann", 1).json()["id"]
     assert ask("amy", 2).status_code == 202
     assert "the project 'red' has 64 grasps in work and may have 64" in refused(ask("amy", 3))
     assert ask("bob", 3).status_code == 202
-    finish_all(services, read_record(JobRecord, services.store, names.job_record(first)))
+    finish_all(services, record_of(services, first))
     assert ask("amy", 3).status_code == 202, "one of ann's ended"
 
 
-def test_keys_of_a_project_share_the_grasps_that_it_may_ask_for_on_a_day(
-    ask: Ask, settings: Settings, services: Services
-) -> None:
+def test_keys_of_a_project_share_its_grasps_of_a_day(ask: Ask, settings: Settings, services: Services) -> None:
     limit(settings, grasps_per_day=96)
     first = ask("ann", 1).json()["id"]
-    finish_all(services, read_record(JobRecord, services.store, names.job_record(first)))
+    finish_all(services, record_of(services, first))
     too_many = ask("amy", 2, grasps=65)
     assert "has asked for 32 of its 96 grasps of today" in refused(too_many), "also for what is done"
     assert 12 * 3600 <= int(too_many.headers["retry-after"]) <= 12 * 3600 + 1, "until midnight, and not before"
@@ -96,9 +89,7 @@ def test_keys_of_a_project_share_the_grasps_that_it_may_ask_for_on_a_day(
     assert ask("bob", 2).status_code == 202
 
 
-def test_a_project_that_used_up_its_gpu_seconds_of_the_day_submits_no_more(
-    ask: Ask, settings: Settings, services: Services
-) -> None:
+def test_a_project_without_gpu_seconds_left_submits_no_more(ask: Ask, settings: Settings, services: Services) -> None:
     limit(settings, gpu_seconds_per_day=60)
     made = [ask("ann", seed).json()["id"] for seed in (1, 2)]
     waiting = ask("ann", 3).json()["id"]
@@ -112,7 +103,7 @@ def test_a_project_that_used_up_its_gpu_seconds_of_the_day_submits_no_more(
     assert not services.index.jobs.get(waiting).state.is_final, "what was submitted before goes on"
 
 
-def test_usage_is_told_as_a_document_and_as_a_table_of_the_own_project_alone(
+def test_usage_is_told_of_the_own_project_alone(
     ask: Ask, service: TestClient, settings: Settings, services: Services
 ) -> None:
     for name, seed in (("ann", 1), ("bob", 2)):

@@ -17,21 +17,20 @@ from fastapi.routing import APIRoute
 from pydantic import SecretStr
 from starlette.testclient import TestClient
 
-from graspd.api.access.keys import Key, KeyFile, Scope
+from graspd.api.access.keys import KeyFile, Scope
 from graspd.api.app import create_app
 from graspd.service.index.index import Index
 from graspd.service.index.rebuild import differences, rebuild
 from graspd.service.model import names
 from graspd.service.model.errors import InputError
 from graspd.service.model.planning import plan
-from graspd.service.model.records import JobRecord
 from graspd.service.model.states import AssetKind
 from graspd.service.pipeline.backends import Services
 from graspd.service.settings import Settings
 from graspd.service.store.network_file import to_bytes
-from graspd.service.store.records import read_record
 from graspd.service.store.store import open_store
-from tests.api.factories import add_worker, fail, finish_all
+from tests.api.factories import add_worker, fail, finish_all, people_of
+from tests.fakes import record_of
 from tests.memory_queue import MemoryQueue
 from tests.networks import random_network
 from tests.planning import plan_all
@@ -46,25 +45,13 @@ def world(tmp_path_factory: pytest.TempPathFactory, furnished: Path) -> Iterator
     """A service with a job that is done, one that failed, a dataset, a hand, objects and a set of project `red`."""
     settings = Settings(data_dir=tmp_path_factory.mktemp("projects") / "data", webhook_secret=SecretStr("s" * 16))
     shutil.copytree(furnished, settings.data_dir)
-    services = Services(
-        settings, open_store(settings.resolved_store_url), Index(settings.resolved_index_url), MemoryQueue()
-    )
-    keys = KeyFile(settings.resolved_keys_file)
-    made = {
-        "ann": (Scope.SUBMIT, "red"),
-        "amy": (Scope.SUBMIT, "red"),
-        "bob": (Scope.SUBMIT, "blue"),
-        "eve": (Scope.READ, "blue"),
-        "old": (Scope.SUBMIT, ""),
-        "root": (Scope.ADMIN, ""),
-    }
-    people = {
-        name: {"Authorization": f"Bearer {keys.add(name, scope, project=project)}"}
-        for name, (scope, project) in made.items()
-    }
-    with TestClient(
-        create_app(settings, services), base_url="https://graspd.example", follow_redirects=False
-    ) as client:
+    store, index = open_store(settings.resolved_store_url), Index(settings.resolved_index_url)
+    services = Services(settings, store, index, MemoryQueue())
+    of_red = {"ann": (Scope.SUBMIT, "red"), "amy": (Scope.SUBMIT, "red")}
+    of_blue = {"bob": (Scope.SUBMIT, "blue"), "eve": (Scope.READ, "blue")}
+    people = people_of(settings, **of_red, **of_blue, old=(Scope.SUBMIT, ""), root=(Scope.ADMIN, ""))
+    app = create_app(settings, services)
+    with TestClient(app, base_url="https://graspd.example", follow_redirects=False) as client:
         yield World(client, services, people)
     services.close()
 
@@ -79,12 +66,12 @@ class World:
     def __post_init__(self) -> None:
         ann = self.people["ann"]
         job = self.post("/v1/jobs", ann, json=JOB).json()["id"]
-        record = read_record(JobRecord, self.services.store, names.job_record(job))
+        record = record_of(self.services, job)
         finish_all(self.services, record)
         shard = next(task.output for task in plan(record))
         views = [task.output for task in plan(record)][-1]
         failed = self.post("/v1/jobs", ann, json=JOB | {"seed": 78}).json()["id"]
-        fail(self.services, read_record(JobRecord, self.services.store, names.job_record(failed)), "red-secret broke")
+        fail(self.services, record_of(self.services, failed), "red-secret broke")
         waiting = self.post("/v1/jobs", ann, json=JOB | {"seed": 79}).json()["id"]
         for kind, name in (("objects", "red-secret-ball"), ("hands", "red-secret-hand")):
             file = ("ball.stl", _BALL) if kind == "objects" else ("hand.urdf", _URDF)
@@ -133,20 +120,12 @@ _URDF = b"""<robot name="two"><link name="base"/><link name="tip"/><joint name="
 <child link="tip"/><axis xyz="0 0 1"/><limit lower="0" upper="1" effort="1" velocity="1"/></joint></robot>"""
 
 #: For each parameter of a path: what of the project it may name.
-_VALUES = {
-    "job_id": ("job_id", "failed", "waiting"),
-    "shard_id": ("shard_id", "views"),
-    "kind": ("object", "hand"),
-    "digest": ("digest", "objects_digest"),
-    "row": ("0",),
-    "number": ("0",),
-    "index": ("0",),
-    "channel": ("rgb",),
-    "slug": ("not-found",),
-    "webhook_id": ("webhook",),
-    "action": ("cancel", "retry", "snapshot", "delete"),
-    "what": ("object",),
-}
+_VALUES: dict[str, tuple[str, ...]] = (
+    {"job_id": ("job_id", "failed", "waiting"), "shard_id": ("shard_id", "views"), "kind": ("object", "hand")}
+    | {"digest": ("digest", "objects_digest"), "row": ("0",), "number": ("0",), "index": ("0",), "channel": ("rgb",)}
+    | {"slug": ("not-found",), "webhook_id": ("webhook",), "action": ("cancel", "retry", "snapshot", "delete")}
+    | {"what": ("object",)}
+)
 _NAMES = {
     "hands": ("red-secret-hand", "hands_digest"),
     "objects": ("red-secret-ball", "red-secret-gone", "objects_digest"),
@@ -160,12 +139,8 @@ _NAMES = {
 
 
 def _routes(world: World) -> list[tuple[str, str]]:
-    return sorted(
-        (method, route.path)
-        for route in world.client.app.routes  # type: ignore[attr-defined]
-        if isinstance(route, APIRoute)
-        for method in route.methods
-    )
+    routes = [route for route in world.client.app.routes if isinstance(route, APIRoute)]  # type: ignore[attr-defined]
+    return sorted((method, route.path) for route in routes for method in route.methods)
 
 
 def _addresses(world: World, template: str) -> Iterator[str]:
@@ -175,13 +150,9 @@ def _addresses(world: World, template: str) -> Iterator[str]:
         yield template
         return
     name = parameter[1]
-    if name == "name":
-        section = next(part for part in template.split("/") if part in _NAMES)
-        values = _NAMES[section]
-    else:
-        assert name in _VALUES, f"say in this test what of a project {{{name}}} in {template} may name"
-        values = _VALUES[name]
-    for value in values:
+    assert name == "name" or name in _VALUES, f"say in this test what {{{name}}} in {template} may name"
+    section = next((part for part in template.split("/") if part in _NAMES), "")
+    for value in _NAMES[section] if name == "name" else _VALUES[name]:
         filled = template[: parameter.start()] + world.said.get(value, value) + template[parameter.end() :]
         yield from _addresses(world, filled)
 
@@ -263,26 +234,14 @@ def _state(world: World) -> Any:
     return gone, jobs, data["cancelled"], data["state"], get("/v1/object-sets/red-secret-set")["objects"]
 
 
-def test_the_streams_of_another_project_are_not_there(world: World) -> None:
-    answer = world.client.get(f"/v1/jobs/{world.said['waiting']}/events", headers=world.people["bob"])
-    assert answer.status_code == 404
-
-
-def test_what_is_not_within_reach_is_refused_as_if_it_were_not_there(world: World) -> None:
-    gone = "nothing-of-this-name"
-    for kind, hidden in {
-        "jobs": world.said["waiting"],
-        "datasets": "red-secret-data",
-        "objects": "red-secret-ball",
-        "shards": world.said["shard_id"],
-    }.items():
-        path = f"/v1/{kind}/{{}}"
-        answers = [world.client.get(path.format(one), headers=world.people["bob"]) for one in (hidden, gone)]
-        assert [answer.status_code for answer in answers] == [404, 404]
-        details = [
-            answer.json()["detail"].replace(one, "X") for answer, one in zip(answers, (hidden, gone), strict=True)
-        ]
-        assert details[0] == details[1]
+def test_what_is_out_of_scope_is_refused_as_if_it_were_absent(world: World) -> None:
+    gone, waiting, shard = "nothing-of-this-name", world.said["waiting"], world.said["shard_id"]
+    hidden = {"jobs": waiting, "datasets": "red-secret-data", "objects": "red-secret-ball", "shards": shard}
+    for kind, name in hidden.items():
+        answers = {one: world.client.get(f"/v1/{kind}/{one}", headers=world.people["bob"]) for one in (name, gone)}
+        assert {answer.status_code for answer in answers.values()} == {404}
+        assert len({answer.json()["detail"].replace(one, "X") for one, answer in answers.items()}) == 1
+    assert world.client.get(f"/v1/jobs/{waiting}/events", headers=world.people["bob"]).status_code == 404
 
 
 def test_the_project_itself_and_an_admin_see_all_of_it(world: World) -> None:
@@ -304,7 +263,7 @@ def test_lists_of_a_project_hold_what_is_its_own(world: World) -> None:
     assert world.client.get("/v1/grasps", headers=world.people["old"]).json()["items"] == []
 
 
-def test_the_same_request_of_two_projects_is_two_jobs_whose_shards_are_made_once(world: World) -> None:
+def test_one_request_of_two_projects_is_two_jobs_of_one_shard(world: World) -> None:
     job = world.post("/v1/jobs", world.people["bob"], json=JOB).json()
     assert job["id"] != world.said["job_id"] and job["state"] == "succeeded"
     assert world.said["shard_id"] in [shard["id"] for shard in job["shards"]]
@@ -344,7 +303,7 @@ def test_the_same_network_of_two_projects_is_two_networks(world: World) -> None:
     assert world.client.get("/v1/networks/red-secret-net", headers=world.people["ann"]).status_code == 200
 
 
-def test_what_is_shared_is_used_by_every_project_and_deleted_by_its_own(world: World) -> None:
+def test_what_is_shared_is_used_by_all_and_deleted_by_its_own(world: World) -> None:
     data = {"name": "common", "shared": "true"}
     file = {"file": ("common.stl", _BALL.replace(b"ball", b"common"))}
     made = world.post("/v1/objects", world.people["ann"], data=data, files=file).json()
@@ -357,7 +316,7 @@ def test_what_is_shared_is_used_by_every_project_and_deleted_by_its_own(world: W
     assert world.client.delete("/v1/objects/common", headers=world.people["amy"]).status_code == 204
 
 
-def test_an_upload_that_brings_the_mark_of_a_project_is_not_that_projects_object(world: World) -> None:
+def test_an_upload_with_the_mark_of_a_project_is_not_its_own(world: World) -> None:
     made = world.services.index.assets.get(AssetKind.OBJECT, world.said["objects_digest"])
     stored = world.services.store.get(names.asset_files(AssetKind.OBJECT, made.digest))
     with zipfile.ZipFile(io.BytesIO(stored)) as archive:
@@ -370,7 +329,7 @@ def test_an_upload_that_brings_the_mark_of_a_project_is_not_that_projects_object
         world.client.delete("/v1/objects/forged", headers=world.people["old"])
 
 
-def test_a_name_that_another_project_took_is_refused_without_a_word_of_it(world: World) -> None:
+def test_a_name_of_another_project_is_refused_without_detail(world: World) -> None:
     matrix = {"name": "red-secret-data", "hands": ["allegro"], "objects": ["mug"], "grasps": 32}
     answer = world.post("/v1/datasets", world.people["bob"], json=matrix)
     assert answer.status_code == 409 and "bottle" not in answer.text and "another dataset" not in answer.text
@@ -392,11 +351,6 @@ def test_projects_are_in_the_store_and_survive_a_lost_index(world: World) -> Non
         assert fresh.jobs.get(cell).project == "red"
     finally:
         fresh.close()
-
-
-def test_keys_and_records_of_before_there_were_projects_belong_to_the_one_without_a_name() -> None:
-    old = {"name": "ann", "scope": "submit", "sha256": "a" * 64, "created": "2026-01-01T00:00:00Z"}
-    assert Key.model_validate(old).project == ""
 
 
 @pytest.mark.parametrize("project", ["Red", "a b", "../x", "x" * 33, "-a"])

@@ -17,7 +17,6 @@ from graspd.api.access.keys import Key, KeyFile, KeyLimits, Scope
 from graspd.api.access.quotas import Quotas
 from graspd.api.app import create_app
 from graspd.service.index.rebuild import differences
-from graspd.service.model import names
 from graspd.service.model.errors import ConflictError, QuotaError
 from graspd.service.model.records import JobRecord, ObjectSet, object_set_of
 from graspd.service.model.webhooks import MOST_HOOKS
@@ -28,7 +27,8 @@ from graspd.service.settings import Settings
 from graspd.service.store import library
 from graspd.service.store.records import read_record
 from graspd.service.store.store import Store
-from tests.api.factories import finish_all
+from tests.api.factories import bearer, finish_all, people_of
+from tests.fakes import record_of
 
 #: Often enough for two requests to meet.
 ROUNDS = 10
@@ -56,8 +56,7 @@ def twins(
 
 @pytest.fixture
 def headers(settings: Settings) -> dict[str, str]:
-    keys = KeyFile(settings.resolved_keys_file)
-    return {"Authorization": f"Bearer {keys.add('me', Scope.SUBMIT, limits=KEY.limits)}"}
+    return bearer(KeyFile(settings.resolved_keys_file).add("me", Scope.SUBMIT, limits=KEY.limits))
 
 
 @pytest.fixture
@@ -80,7 +79,7 @@ def test_thirty_jobs_at_once_over_two_apis_stay_within_the_quota(
     assert answers == [202] * 4 + [429] * 26
 
 
-def test_a_job_that_is_being_entered_is_not_taken_for_one_that_ended(
+def test_a_job_that_is_being_entered_is_not_taken_for_ended(
     quotas: Callable[[Unfinished], Quotas], rq_queue: RqQueue
 ) -> None:
     nothing_known = quotas(lambda ids: set())
@@ -89,7 +88,7 @@ def test_a_job_that_is_being_entered_is_not_taken_for_one_that_ended(
     assert held(rq_queue) == 20
 
 
-def test_a_job_that_is_retried_while_somebody_looks_stays_counted(
+def test_a_job_that_is_retried_meanwhile_stays_counted(
     quotas: Callable[[Unfinished], Quotas], rq_queue: RqQueue
 ) -> None:
     one = quotas(lambda ids: set())
@@ -106,29 +105,19 @@ def test_a_job_that_is_retried_while_somebody_looks_stays_counted(
     assert held(rq_queue) == 20
 
 
-@pytest.mark.parametrize("first_made_it", [True, False])
+@pytest.mark.parametrize(("first_made", "second_made"), [(True, False), (False, True), (False, False)])
 def test_of_two_claims_of_one_job_the_one_that_made_it_counts(
-    quotas: Callable[[Unfinished], Quotas], rq_queue: RqQueue, first_made_it: bool
+    quotas: Callable[[Unfinished], Quotas], rq_queue: RqQueue, first_made: bool, second_made: bool
 ) -> None:
-    one = quotas(set)
+    one, was_made = quotas(set), first_made or second_made
     with one.claim(KEY, "a", 20) as first:
         with one.claim(KEY, "a", 20) as second:
-            second.counts = not first_made_it
-        first.counts = first_made_it
-    assert held(rq_queue) == 20
-    today = next(iter(rq_queue.connection.scan_iter("graspd:quota:me:2*")))
-    assert int(rq_queue.connection.get(today)) == 1
-
-
-def test_claims_of_a_job_that_was_there_already_cost_nothing(
-    quotas: Callable[[Unfinished], Quotas], rq_queue: RqQueue
-) -> None:
-    one = quotas(set)
-    with one.claim(KEY, "a", 20) as first:
-        with one.claim(KEY, "a", 20) as second:
-            second.counts = False
-        first.counts = False
-    assert held(rq_queue) == 0
+            second.counts = second_made
+        first.counts = first_made
+    assert held(rq_queue) == (20 if was_made else 0)
+    if was_made:
+        today = next(iter(rq_queue.connection.scan_iter("graspd:quota:me:2*")))
+        assert int(rq_queue.connection.get(today)) == 1
 
 
 def test_a_retry_of_fewer_grasps_leaves_the_sum_true(quotas: Callable[[Unfinished], Quotas], rq_queue: RqQueue) -> None:
@@ -154,15 +143,6 @@ def test_a_claim_of_a_process_that_died_ends(
     with one.claim(KEY, "b", 5):
         pass
     assert held(rq_queue) == 5
-
-
-def test_jobs_that_ended_make_room(
-    twins: list[TestClient], headers: dict[str, str], services: Services, rq_queue: RqQueue
-) -> None:
-    first = twins[0].post("/v1/jobs", json=JOB | {"grasps": 20}, headers=headers).json()["id"]
-    assert twins[1].post("/v1/jobs", json=JOB, headers=headers).status_code == 429
-    finish_all(services, read_record(JobRecord, services.store, names.job_record(first)))
-    assert twins[1].post("/v1/jobs", json=JOB, headers=headers).status_code == 202
 
 
 @pytest.mark.parametrize("refused", [{"object": "unheard-of"}, {"grasps": 21}])
@@ -224,33 +204,26 @@ def strayed(services: Services) -> list[str]:
 @pytest.fixture
 def projects(settings: Settings) -> list[dict[str, str]]:
     """Headers of a key of each of two projects."""
-    keys = KeyFile(settings.resolved_keys_file)
-    names = ("red", "blue")
-    return [{"Authorization": f"Bearer {keys.add(name, Scope.SUBMIT, project=name)}"} for name in names]
+    return list(people_of(settings, red=(Scope.SUBMIT, "red"), blue=(Scope.SUBMIT, "blue")).values())
 
 
-def test_of_two_projects_that_want_one_name_of_a_set_at_once_one_gets_it(
+def test_of_two_projects_that_want_one_set_name_one_gets_it(
     twins: list[TestClient], projects: list[dict[str, str]], services: Services
 ) -> None:
     for number in range(ROUNDS):
         body = {"name": f"set{number}", "objects": ["mug"]}
-        assert codes(at_once(twins, lambda http, n, body=body: http.post(SETS, json=body, headers=projects[n]))) == [
-            201,
-            409,
-        ]
+        answers = at_once(twins, lambda http, n, body=body: http.post(SETS, json=body, headers=projects[n]))
+        assert codes(answers) == [201, 409]
     assert strayed(services) == []
 
 
-def test_of_two_versions_of_a_set_at_once_the_later_follows_the_earlier(
+def test_of_two_versions_of_a_set_at_once_one_follows_the_other(
     twins: list[TestClient], headers: dict[str, str], services: Services
 ) -> None:
-    objects = (["mug"], ["block"])
     for number in range(ROUNDS):
         name = f"set{number}"
-        answers = at_once(
-            twins,
-            lambda http, n, name=name: http.post(SETS, json={"name": name, "objects": objects[n]}, headers=headers),
-        )
+        bodies = [{"name": name, "objects": objects} for objects in (["mug"], ["block"])]
+        answers = at_once(twins, lambda http, n, bodies=bodies: http.post(SETS, json=bodies[n], headers=headers))
         assert codes(answers) == [201, 201]
         kept = [read_record(ObjectSet, services.store, one.key) for one in services.store.list(f"object_sets/{name}")]
         first = next(one for one in kept if one.digest == object_set_of(name, one.objects).digest)
@@ -286,21 +259,13 @@ def test_of_two_cancellations_at_once_one_counts(
 ) -> None:
     """Each leaves an event in the store: of two with one number a rebuild would not know which came last."""
     for number in range(4):
-        if what == "job":
-            name = twins[0].post("/v1/jobs", json=JOB | {"grasps": 1, "seed": number}, headers=headers).json()["id"]
-        else:
-            name = f"all{number}"
-            twins[0].post("/v1/datasets", json=MATRIX | {"name": name, "grasps": 1}, headers=headers)
-        path = f"/v1/{what}s/{name}"
-        assert codes(at_once(twins, lambda http, _, path=path: http.post(f"{path}/cancel", headers=headers))) == [
-            202,
-            409,
-        ]
-        events = list(services.store.list(f"{what}s/{name}/events"))
-        assert len(events) == 1
-        answers = at_once(twins, lambda http, _, path=path: http.post(f"{path}/retry", headers=headers))
-        assert codes(answers) == [202, 409]
-        assert len(list(services.store.list(f"{what}s/{name}/events"))) == 2
+        body = JOB | {"grasps": 1, "seed": number} if what == "job" else MATRIX | {"name": f"all{number}", "grasps": 1}
+        made = twins[0].post(f"/v1/{what}s", json=body, headers=headers).json()
+        name = made["id"] if what == "job" else made["name"]
+        for count, action in enumerate(("cancel", "retry"), start=1):
+            path = f"/v1/{what}s/{name}/{action}"
+            assert codes(at_once(twins, lambda http, _, path=path: http.post(path, headers=headers))) == [202, 409]
+            assert len(list(services.store.list(f"{what}s/{name}/events"))) == count
 
 
 def test_two_snapshots_at_once_are_one(twins: list[TestClient], headers: dict[str, str], services: Services) -> None:
@@ -317,7 +282,7 @@ def test_a_tag_given_twice_at_once_has_the_grasps_of_both(
     twins: list[TestClient], headers: dict[str, str], services: Services
 ) -> None:
     job = twins[0].post("/v1/jobs", json=JOB, headers=headers).json()["id"]
-    shard = finish_all(services, read_record(JobRecord, services.store, names.job_record(job)))[0].shard_id
+    shard = finish_all(services, record_of(services, job))[0].shard_id
 
     def give(http: TestClient, number: int) -> Response:
         chosen = {"name": "good", "grasps": [{"shard_id": shard, "row": number}]}

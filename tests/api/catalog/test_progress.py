@@ -3,69 +3,56 @@
 from __future__ import annotations
 
 import io
+import math
+from typing import Any
 
 import pytest
 from rich.console import Console
 
 from graspd.api.catalog.jobs import TaskRates, eta_of_job, stage_statuses
 from graspd.api.formatting import duration, metric, percent, size
-from graspd.api.models import Job
+from graspd.api.models import Job, StageStatus
 from graspd.client.reports import JobDisplay
 from graspd.service.index.views import JobView, StageProgress, TaskView
 from graspd.service.model.domain import JobRequest
 from graspd.service.model.states import Priority, Stage, State
-
-
-class Clock:
-    now = 0.0
-
-    def __call__(self) -> float:
-        return self.now
+from tests.waiting import Clock
 
 
 def task(done: float) -> TaskView:
-    return TaskView(
-        id="t",
-        job_id="j",
-        stage=Stage.SYNTHESIZE,
-        batch=0,
-        count=32,
-        state=State.RUNNING,
-        shard_id="s",
-        attempt=1,
-        worker="w",
-        device="cpu",
-        done=done,
-        total=100.0,
-        message="phase 1",
-        reason=None,
-        seconds=None,
-        finished=None,
-    )
+    what = {"id": "t", "job_id": "j", "stage": Stage.SYNTHESIZE, "batch": 0, "count": 32, "shard_id": "s"}
+    running = {"state": State.RUNNING, "attempt": 1, "worker": "w", "device": "cpu", "total": 100.0}
+    ended = dict.fromkeys(("reason", "seconds", "finished"))
+    return TaskView(**what, **running, **ended, done=done, message="phase 1")
 
 
 def job(*stages: StageProgress, state: State = State.RUNNING) -> JobView:
-    return JobView(
-        id="j",
-        state=state,
-        priority=Priority.INTERACTIVE,
-        request=JobRequest(hand="allegro", object="mug", grasps=64),
-        hand_digest="",
-        object_digest="",
-        created="2026-01-01T00:00:00Z",
-        finished=None,
-        reason=None,
-        stages=list(stages),
-    )
+    request = JobRequest(hand="allegro", object="mug", grasps=64)
+    what = {
+        "id": "j",
+        "priority": Priority.INTERACTIVE,
+        "hand_digest": "",
+        "object_digest": "",
+        "finished": None,
+        "reason": None,
+    }
+    return JobView(**what, state=state, request=request, created="2026-01-01T00:00:00Z", stages=list(stages))
 
 
-def test_the_rate_of_a_running_batch_is_what_it_did_since_it_was_first_seen() -> None:
+def status_of(stage: StageProgress, *tasks: TaskView, paces: TaskRates | None = None, **of: Any) -> StageStatus:
+    """What is told of a stage alone."""
+    (status,) = stage_statuses(job(stage, **of), list(tasks), paces or TaskRates(Clock()))
+    return status
+
+
+def test_the_rate_of_a_batch_is_what_it_did_since_first_seen() -> None:
     clock = Clock()
     paces = TaskRates(clock)
     stage = StageProgress(stage=Stage.SYNTHESIZE, tasks=1, running=1, done=0.2)
-    stage_statuses(job(stage), [task(20)], paces)
-    clock.now = 10.0
-    (status,) = stage_statuses(job(stage.model_copy(update={"done": 0.7})), [task(70)], paces)
+    once = status_of(stage, task(20), paces=paces)
+    assert (once.rate_per_s, once.eta_s) == (None, None)
+    clock.now += 10.0
+    status = status_of(stage.model_copy(update={"done": 0.7}), task(70), paces=paces)
     assert status.rate_per_s == pytest.approx(0.05)
     assert status.eta_s == pytest.approx(6.0)
     assert status.message == "phase 1"
@@ -73,33 +60,22 @@ def test_the_rate_of_a_running_batch_is_what_it_did_since_it_was_first_seen() ->
 
 def test_a_stage_that_waits_says_why() -> None:
     waits = task(0).model_copy(update={"state": State.QUEUED, "message": "held back"})
-    stage = StageProgress(stage=Stage.SYNTHESIZE, tasks=1, queued=1)
-    (status,) = stage_statuses(job(stage, state=State.QUEUED), [waits], TaskRates(Clock()))
+    status = status_of(StageProgress(stage=Stage.SYNTHESIZE, tasks=1, queued=1), waits, state=State.QUEUED)
     assert (status.message, status.rate_per_s) == ("held back", None)
 
 
-def test_a_batch_seen_once_has_no_rate() -> None:
-    (status,) = stage_statuses(
-        job(StageProgress(stage=Stage.SYNTHESIZE, tasks=1, running=1, done=0.2)), [task(20)], TaskRates(Clock())
-    )
-    assert (status.rate_per_s, status.eta_s) == (None, None)
+@pytest.mark.parametrize(
+    ("queued", "succeeded", "reused", "seconds", "eta"),
+    [(2, 2, 0, 20.0, pytest.approx(20.0)), (1, 3, 2, 10.0, pytest.approx(10.0)), (2, 2, 2, 0.0, None)],
+)
+def test_finished_batches_give_the_rate_unless_they_were_reused(
+    queued: int, succeeded: int, reused: int, seconds: float, eta: Any
+) -> None:
+    counts = {"tasks": 4, "queued": queued, "succeeded": succeeded, "reused": reused, "done": float(succeeded)}
+    assert status_of(StageProgress(stage=Stage.SYNTHESIZE, seconds=seconds, **counts)).eta_s == eta
 
 
-def test_finished_batches_give_the_rate_when_none_is_seen_running() -> None:
-    stage = StageProgress(stage=Stage.SYNTHESIZE, tasks=4, queued=2, succeeded=2, done=2.0, seconds=20.0)
-    (status,) = stage_statuses(job(stage), [], TaskRates(Clock()))
-    assert status.eta_s == pytest.approx(20.0)
-
-
-def test_reused_batches_say_nothing_of_the_rate() -> None:
-    stage = StageProgress(stage=Stage.SYNTHESIZE, tasks=4, queued=1, succeeded=3, reused=2, done=3.0, seconds=10.0)
-    (status,) = stage_statuses(job(stage), [], TaskRates(Clock()))
-    assert status.eta_s == pytest.approx(10.0)
-    old = stage.model_copy(update={"succeeded": 2, "queued": 2, "seconds": 0.0})
-    assert stage_statuses(job(old), [], TaskRates(Clock()))[0].eta_s is None
-
-
-def test_a_job_has_no_end_in_sight_while_the_pace_of_a_stage_is_unknown() -> None:
+def test_a_job_has_no_end_in_sight_while_a_pace_is_unknown() -> None:
     known = StageProgress(stage=Stage.SYNTHESIZE, tasks=2, running=1, succeeded=1, done=1.0, seconds=10.0)
     unknown = StageProgress(stage=Stage.SCENE, tasks=2, queued=2)
     whole = job(known, unknown)
@@ -108,29 +84,15 @@ def test_a_job_has_no_end_in_sight_while_the_pace_of_a_stage_is_unknown() -> Non
     assert eta_of_job(part, stage_statuses(part, [], TaskRates(Clock()))) == pytest.approx(10.0)
 
 
-def test_without_a_terminal_progress_is_plain_lines_with_the_end_of_each_stage() -> None:
+def test_without_a_terminal_progress_is_plain_lines() -> None:
     screen = io.StringIO()
     running = StageProgress(stage=Stage.SYNTHESIZE, tasks=1, running=1, done=0.5)
     ended = StageProgress(stage=Stage.SYNTHESIZE, tasks=1, succeeded=1, done=1.0, seconds=8.0)
+    words = dict.fromkeys(("id", "hand", "object", "method", "fidelity", "created"), "x")
+    numbers = {"requested": 32, "grasps": 0, "valid": 0, "progress": 0.5}
     with JobDisplay(Console(file=screen)) as display:
         for stage in (running, ended):
-            view = job(stage)
-            display.update(
-                Job(
-                    id="j",
-                    state=State.RUNNING,
-                    hand="h",
-                    object="o",
-                    method="m",
-                    fidelity="f",
-                    requested=32,
-                    grasps=0,
-                    valid=0,
-                    progress=0.5,
-                    created="",
-                    stages=stage_statuses(view, [], TaskRates(Clock())),
-                )
-            )
+            display.update(Job(**words, **numbers, state=State.RUNNING, stages=[status_of(stage)]))
     first, last = screen.getvalue().splitlines()
     assert ("running" in first, "50 %" in first) == (True, True)
     assert ("succeeded" in last, "8.0 s" in last) == (True, True)
@@ -140,7 +102,7 @@ def test_without_a_terminal_progress_is_plain_lines_with_the_end_of_each_stage()
     ("value", "text"),
     [
         (None, "–"),
-        (float("nan"), "–"),
+        (math.nan, "–"),
         (0, "0"),
         (2.5e-7, "< 0.001"),
         (0.12345, "0.123"),

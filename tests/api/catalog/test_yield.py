@@ -6,13 +6,11 @@ from __future__ import annotations
 import pytest
 from starlette.testclient import TestClient
 
-from graspd.service.model import names
-from graspd.service.model.records import JobRecord
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.datasets import actions
 from graspd.service.pipeline.datasets.spec import DatasetRequest
-from graspd.service.store.records import read_record
 from tests.api.factories import add_job, finish_all
+from tests.fakes import record_of
 from tests.planning import plan_all
 
 
@@ -33,16 +31,16 @@ def share(http: TestClient, job: str) -> float:
     return sum(row["valid"] for row in rows) / len(rows)
 
 
-def test_the_service_counts_as_tries_only_what_was_validated(http: TestClient, jobs: dict[str, str]) -> None:
+def test_service_and_job_count_as_tries_only_what_was_validated(http: TestClient, jobs: dict[str, str]) -> None:
     stats = http.get("/v1/stats").json()
     assert (stats["candidates"], stats["validated"]) == (352, 32)
-    assert stats["valid_yield"] == share(http, jobs["validated"])
-
-
-def test_a_job_tells_its_yield_or_that_nobody_validated(http: TestClient, jobs: dict[str, str]) -> None:
     told = {name: http.get(f"/v1/jobs/{job}").json() for name, job in jobs.items()}
-    assert told["validated"]["valid_yield"] == share(http, jobs["validated"])
+    assert stats["valid_yield"] == told["validated"]["valid_yield"] == share(http, jobs["validated"])
     assert (told["unvalidated"]["validated"], told["unvalidated"]["valid_yield"]) == (0, None)
+    words = f"{int(100 * share(http, jobs['validated']) + 1e-9)} %"
+    home = http.get("/").text
+    assert words in home and "320 more are not validated" in home
+    assert words in http.get("/datasets").text
 
 
 def test_a_dataset_of_unjudged_grasps_has_no_yield(http: TestClient, services: Services) -> None:
@@ -50,7 +48,7 @@ def test_a_dataset_of_unjudged_grasps_has_no_yield(http: TestClient, services: S
     actions.create(services, DatasetRequest.model_validate(wanted))
     plan_all(services)
     (job,) = services.index.jobs.page().items
-    finish_all(services, read_record(JobRecord, services.store, names.job_record(job.id)))
+    finish_all(services, record_of(services, job.id))
     (cell,) = http.get("/v1/datasets/d/cells").json()["items"]
     assert (cell["candidates"], cell["validated"], cell["valid_yield"]) == (32, 0, None)
     assert http.get("/v1/datasets/d").json()["valid_yield"] is None
@@ -58,16 +56,7 @@ def test_a_dataset_of_unjudged_grasps_has_no_yield(http: TestClient, services: S
         assert "not validated" in http.get(page).text, page
 
 
-def test_pages_show_the_share_of_the_validated(http: TestClient, jobs: dict[str, str]) -> None:
-    words = f"{int(100 * share(http, jobs['validated']) + 1e-9)} %"
-    home = http.get("/").text
-    assert words in home and "320 more are not validated" in home
-    assert words in http.get("/datasets").text
-
-
-def test_grasps_that_nobody_validated_are_found_as_such_and_not_among_the_rejected(
-    http: TestClient, jobs: dict[str, str]
-) -> None:
+def test_unjudged_grasps_are_not_among_the_rejected(http: TestClient, jobs: dict[str, str]) -> None:
     def found(**query: str) -> set[str]:
         rows = http.get("/v1/grasps", params={"limit": 200, **query}).json()["items"]
         assert rows

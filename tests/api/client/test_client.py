@@ -31,20 +31,9 @@ def client_of(handler: Handler) -> Client:
 
 
 def job(state: State) -> Job:
-    return Job(
-        id="a" * 32,
-        state=state,
-        hand="allegro",
-        object="mug",
-        method="fast_graspd",
-        fidelity="standard",
-        requested=32,
-        grasps=0,
-        valid=0,
-        progress=0.0,
-        created="2026-01-01T00:00:00Z",
-        stages=[],
-    )
+    asked = {"hand": "allegro", "object": "mug", "method": "fast_graspd", "fidelity": "standard", "requested": 32}
+    found = {"grasps": 0, "valid": 0, "progress": 0.0, "created": "2026-01-01T00:00:00Z", "stages": []}
+    return Job(id="a" * 32, state=state, **asked, **found)
 
 
 def event(name: str, state: State) -> bytes:
@@ -88,23 +77,12 @@ def test_the_key_goes_with_every_request() -> None:
 
 
 def test_lists_are_read_to_their_last_page() -> None:
+    plain = dict.fromkeys(("name", "digest", "filename", "created"), "") | {"kind": "hand", "files": []}
+    plain |= {"size_bytes": 1, "builtin": True, "verdict": "accept", "message": None, "repairs": [], "facts": {}}
+
     def handler(request: httpx.Request) -> httpx.Response:
         cursor = request.url.params.get("cursor")
-        name = {None: "one", "2": "two"}[cursor]
-        asset = {
-            "kind": "hand",
-            "name": name,
-            "digest": "d",
-            "filename": "h.urdf",
-            "files": [],
-            "size_bytes": 1,
-            "created": "",
-            "builtin": True,
-            "verdict": "accept",
-            "message": None,
-            "repairs": [],
-            "facts": {},
-        }
+        asset = plain | {"name": {None: "one", "2": "two"}[cursor]}
         return httpx.Response(200, json={"items": [asset], "next": "2" if cursor is None else None})
 
     with client_of(handler) as client:
@@ -131,27 +109,10 @@ def test_a_download_that_breaks_leaves_no_file(tmp_path: Path) -> None:
     def broken(request: httpx.Request) -> httpx.Response:
         raise httpx.ReadError("connection lost", request=request)
 
-    shard = Shard(
-        id="a",
-        kind="base",
-        stage=Stage.SYNTHESIZE,
-        key="k",
-        sha256="",
-        size_bytes=1,
-        count=1,
-        hand="h",
-        object="o",
-        hand_digest="",
-        object_digest="",
-        batch=0,
-        seed=0,
-        inputs=[],
-        device="cpu",
-        worker="w",
-        seconds=1.0,
-        created="",
-        file="/v1/shards/a/file",
-    )
+    words = ("key", "sha256", "hand", "object", "hand_digest", "object_digest", "device", "worker", "created")
+    numbers = dict.fromkeys(("size_bytes", "count", "batch", "seed", "seconds"), 1)
+    what = {"id": "a", "kind": "base", "stage": Stage.SYNTHESIZE, "inputs": [], "file": "/v1/shards/a/file"}
+    shard = Shard(**what, **numbers, **dict.fromkeys(words, ""))
     with client_of(broken) as client, pytest.raises(UnavailableError, match="connection lost"):
         client.download(shard, tmp_path / "a.h5")
     assert list(tmp_path.iterdir()) == []
@@ -162,7 +123,7 @@ def test_a_file_that_cannot_be_opened_is_the_callers_mistake(tmp_path: Path) -> 
         client.upload(AssetKind.OBJECT, tmp_path / "nowhere.stl")
 
 
-def test_requests_that_come_too_fast_are_sent_again_when_the_service_says() -> None:
+def test_requests_that_come_too_fast_are_sent_again() -> None:
     answers = iter([429, 429, 200])
 
     def handler(request: httpx.Request) -> httpx.Response:
@@ -185,15 +146,8 @@ def test_a_quota_that_is_used_up_is_reported_at_once() -> None:
 @pytest.mark.parametrize(
     "url",
     [
-        "http://::1:8000",
-        "http://[::1",
-        "http://127.0\r.0.1:8000",
-        "localhost:8000",
-        "ftp://host",
-        "http://",
-        "",
-        "http://host:port",
-        "http://me:pass/word@host:8000",
+        *["http://::1:8000", "http://[::1", "http://127.0\r.0.1:8000", "localhost:8000", "ftp://host", "http://", ""],
+        *["http://host:port", "http://me:pass/word@host:8000"],
     ],
 )
 def test_an_address_that_cannot_be_used_is_one_line_with_the_fix(url: str) -> None:

@@ -30,6 +30,7 @@ from graspd.service.store.records import publish
 from graspd.service.store.store import open_store
 from tests.networks import random_network
 from tests.service.pipeline.test_fidelity_choice import scene_chart
+from tests.shell import completed
 from tests.waiting import PATIENCE_S
 
 STL = b"solid box\nendsolid box\n"
@@ -49,9 +50,7 @@ class Shell:
     def __call__(self, *arguments: str) -> subprocess.CompletedProcess[str]:
         command = [sys.executable, "-m", "graspd", *arguments]
         if not self.in_process:
-            return subprocess.run(
-                command, capture_output=True, text=True, env=self.environment, timeout=60, check=False
-            )
+            return completed(command, env=self.environment, timeout=60)
         ours = {name: None for name in os.environ if name.startswith("GRASPD_")}
         done = CliRunner().invoke(build(), arguments, env={**ours, **self.environment})
         return subprocess.CompletedProcess(command, done.exit_code, done.stdout, done.stderr)
@@ -92,16 +91,12 @@ def test_a_submitted_job_is_listed_shown_cancelled_and_retried(graspd: Shell) ->
     assert graspd.json("logs", job["job"])["attempts"] == []
 
 
-def test_a_job_can_ask_for_larger_pictures_with_more_channels(graspd: Shell) -> None:
-    wanted = ("--scenes", "1", "--views", "1", "--channels", "normals", "--width", "640", "--height", "480")
-    plain = graspd.json("submit", "--hand", "allegro", "--object", "mug", "--scenes", "1", "--views", "1")
-    rich = graspd.json("submit", "--hand", "allegro", "--object", "mug", *wanted)
-    assert rich["state"] == "queued"
-    assert rich["job"] != plain["job"], "other pictures are another job"
-
-
-def test_a_job_has_neighbours_by_name_and_in_a_scene_file(graspd: Shell, tmp_path: Path) -> None:
+def test_a_job_asks_for_pictures_and_neighbours(graspd: Shell, tmp_path: Path) -> None:
     pair = ("--hand", "allegro", "--object", "mug")
+    pictures = (*pair, "--scenes", "1", "--views", "1")
+    rich = graspd.json("submit", *pictures, "--channels", "normals", "--width", "640", "--height", "480")
+    assert rich["state"] == "queued"
+    assert rich["job"] != graspd.json("submit", *pictures)["job"], "other pictures are another job"
     named = graspd.json("submit", *pair, "--scene", "bin", "--with", "block", "--with", "bottle")
     assert named["state"] == "queued"
     assert named["job"] != graspd.json("submit", *pair, "--scene", "bin", "--with", "block")["job"]
@@ -112,11 +107,6 @@ def test_a_job_has_neighbours_by_name_and_in_a_scene_file(graspd: Shell, tmp_pat
 def test_the_built_in_hands_and_objects_are_there(graspd: Shell) -> None:
     assert "allegro" in {hand["name"] for hand in graspd.apart.json("hands", "list")["hands"]}
     assert graspd.json("objects", "show", "mug")["verdict"] == "accept"
-
-
-def test_an_object_can_be_added_from_a_file(graspd: Shell, tmp_path: Path) -> None:
-    (tmp_path / "box.stl").write_bytes(STL)
-    assert graspd.json("objects", "add", str(tmp_path / "box.stl"), "--no-wait")["name"] == "box"
 
 
 def test_a_network_is_added_named_by_a_job_and_deleted(graspd: Shell, tmp_path: Path) -> None:
@@ -146,13 +136,18 @@ def test_a_network_is_added_named_by_a_job_and_deleted(graspd: Shell, tmp_path: 
 
 
 @pytest.mark.parametrize("kind", ["delete", "objects delete", "datasets delete"])
-def test_nothing_is_deleted_unasked(graspd: Shell, kind: str) -> None:
+def test_what_is_deleted_by_a_word_is_restored(graspd: Shell, kind: str) -> None:
     """Without a terminal to ask at it takes a word."""
     name, _ = _deletable(graspd, kind)
-    done = graspd(*kind.split(), name)
+    command, group = kind.split(), kind.split()[:-1]
+    done = graspd(*command, name)
     assert (done.returncode, done.stdout) == (2, "")
     assert "--yes deletes it without asking" in said(done)
-    assert graspd(*kind.split(), name, "--yes").returncode == 0, "it was still there"
+    gone = graspd(*command, name, "--yes")
+    assert gone.returncode == 0, gone.stderr
+    done = graspd(*group, "restore", name)
+    assert done.returncode == 0 and f"{name[:8]}" in done.stdout and "is restored" in done.stdout
+    assert graspd(*group, "restore", name).returncode == 2, "it is not deleted any more"
 
 
 @pytest.mark.parametrize(("answer", "code"), [("n", 2), ("y", 0)])
@@ -161,25 +156,12 @@ def test_at_a_terminal_the_question_is_answered(graspd: Shell, answer: str, code
     ours, theirs = os.openpty()
     os.write(ours, f"{answer}\n".encode())
     command = [sys.executable, "-m", "graspd", "datasets", "delete", name]
-    done = subprocess.run(
-        command, stdin=theirs, capture_output=True, text=True, env=graspd.environment, timeout=60, check=False
-    )
+    done = completed(command, stdin=theirs, env=graspd.environment, timeout=60)
     for end in (ours, theirs):
         os.close(end)
     assert done.returncode == code, done.stderr
     assert words in done.stdout
     assert graspd("datasets", "status", name).returncode == 2 - code
-
-
-@pytest.mark.parametrize("kind", ["delete", "objects delete", "datasets delete"])
-def test_what_was_deleted_is_restored(graspd: Shell, kind: str) -> None:
-    name, _ = _deletable(graspd, kind)
-    group = kind.split()[:-1]
-    gone = graspd(*kind.split(), name, "--yes")
-    assert gone.returncode == 0, gone.stderr
-    done = graspd(*group, "restore", name)
-    assert done.returncode == 0 and f"{name[:8]}" in done.stdout and "is restored" in done.stdout
-    assert graspd(*group, "restore", name).returncode == 2, "it is not deleted any more"
 
 
 def _deletable(graspd: Shell, kind: str) -> tuple[str, str]:
@@ -203,10 +185,11 @@ def _deletable(graspd: Shell, kind: str) -> tuple[str, str]:
     raise AssertionError(kind)
 
 
-def test_the_licence_of_an_object_is_kept_with_its_files(graspd: Shell, tmp_path: Path) -> None:
+def test_an_object_is_added_from_a_file_and_its_licence_kept(graspd: Shell, tmp_path: Path) -> None:
     (tmp_path / "crate.stl").write_bytes(STL + b" ")
     said = ("--licence", "CC-BY-4.0", "--source", "https://example.org/crate")
     made = graspd.json("objects", "add", str(tmp_path / "crate.stl"), *said, "--no-wait")
+    assert made["name"] == "crate"
     store = open_store((Path(graspd.environment["GRASPD_DATA_DIR"]) / "store").as_uri())
     kept = json.loads(load_asset_files(store, AssetKind.OBJECT, made["digest"])["asset.json"])
     assert (kept["licence"], kept["source"]) == ("CC-BY-4.0", "https://example.org/crate")
@@ -236,7 +219,7 @@ def test_a_mistake_is_one_line_and_exit_2(graspd: Shell, arguments: tuple[str, .
 @pytest.mark.parametrize(
     "command", ["submit --hand alegro --object mug", "datasets estimate --hands alegro --objects mug --scenes 0"]
 )
-def test_a_name_that_nobody_knows_is_followed_by_the_one_that_is_like_it(graspd: Shell, command: str) -> None:
+def test_an_unknown_name_is_followed_by_the_one_that_is_like_it(graspd: Shell, command: str) -> None:
     done = graspd(*command.split())
     assert done.returncode == 2
     assert "'alegro'" in done.stderr and "did you mean allegro?" in done.stderr
@@ -261,26 +244,18 @@ def test_an_address_that_is_no_graspd_is_said_so(graspd: Shell) -> None:
     assert "static" in said(done)
 
 
-def test_a_taken_port_is_one_line_and_exit_1(graspd: Shell) -> None:
+def test_an_api_that_cannot_start_says_why_in_one_line(graspd: Shell, tmp_path: Path) -> None:
+    (tmp_path / "file").write_bytes(b"")
+    no_store = Shell(graspd.environment | {"GRASPD_STORE_URL": (tmp_path / "file" / "store").as_uri()})
     with socket.create_server(("127.0.0.1", 0)) as taken:
-        done = graspd.apart("api", "--port", str(taken.getsockname()[1]))
-    assert done.returncode == 1
-    assert "taken" in said(done)
-
-
-def test_the_api_refuses_strangers_without_a_key(graspd: Shell) -> None:
-    done = graspd.apart("api", "--host", "0.0.0.0", "--port", "0")
-    assert done.returncode == 2
-    assert "graspd keys add" in said(done)
-
-
-def test_a_store_that_cannot_be_written_is_one_line_and_exit_1(graspd: Shell, tmp_path: Path) -> None:
-    blocked = tmp_path / "file"
-    blocked.write_bytes(b"")
-    environment = graspd.environment | {"GRASPD_STORE_URL": (blocked / "store").as_uri()}
-    done = Shell(environment).apart("api", "--port", "0")
-    assert done.returncode == 1
-    assert str(blocked) in said(done)
+        for shell, arguments, code, words in (
+            (graspd, ("--port", str(taken.getsockname()[1])), 1, "taken"),
+            (graspd, ("--host", "0.0.0.0", "--port", "0"), 2, "graspd keys add"),
+            (no_store, ("--port", "0"), 1, str(tmp_path / "file")),
+        ):
+            done = shell.apart("api", *arguments)
+            assert done.returncode == code
+            assert words in said(done)
 
 
 def test_keys_are_made_listed_and_revoked(graspd: Shell, tmp_path: Path) -> None:
@@ -304,32 +279,17 @@ def test_an_idempotency_key_binds_to_its_request(service: Supervisor) -> None:
 
 
 def test_the_keys_that_scripts_rely_on_are_there() -> None:
-    job = JobDetail(
-        id="a" * 32,
-        state=State.SUCCEEDED,
-        hand="allegro",
-        object="mug",
-        method="fast_graspd",
-        fidelity="standard",
-        requested=32,
-        grasps=32,
-        valid=20,
-        progress=1.0,
-        created="2026-01-01T00:00:00Z",
-        stages=[],
-        request=JobRequest(hand="allegro", object="mug"),
-        hand_digest="b" * 32,
-        object_digest="c" * 32,
-        attempts=[],
-        mean=MeanMetrics(epsilon=0.1),
-        shards=[],
-    )
-    summary = job_summary(job)
+    asked = {"hand": "allegro", "object": "mug", "method": "fast_graspd", "fidelity": "standard", "requested": 32}
+    found = {"grasps": 32, "valid": 20, "progress": 1.0, "created": "2026-01-01T00:00:00Z", "stages": []}
+    more = {"request": JobRequest(hand="allegro", object="mug"), "attempts": [], "shards": []}
+    digests = {"hand_digest": "b" * 32, "object_digest": "c" * 32}
+    mean = MeanMetrics(epsilon=0.1)
+    summary = job_summary(JobDetail(id="a" * 32, state=State.SUCCEEDED, mean=mean, **asked, **found, **more, **digests))
     assert {"job", "state", "grasps", "valid", "stages", "mean", "shards"} <= set(summary)
     assert set(summary["mean"]) == {"epsilon", "contact_area_cm2", "intersection_volume_cm3"}
 
 
-def test_a_job_with_a_target_says_which_fidelity_was_chosen_and_by_what(graspd: Shell, service: Supervisor) -> None:
+def test_a_job_with_a_target_says_how_its_fidelity_was_chosen(graspd: Shell, service: Supervisor) -> None:
     asked = ("submit", "--hand", "allegro", "--object", "mug", "--scene", "shelf", "--fidelity", "auto", "--target")
     done = graspd(*asked, "lift>=0.8")
     assert done.returncode == 2 and "graspd chart --scene shelf --publish" in said(done)

@@ -99,7 +99,7 @@ def test_a_scene_is_a_kind_or_a_file_beside_the_spec(tmp_path: Path) -> None:
         asked(spec(tmp_path, text + '"moon"'))
 
 
-def test_neighbours_are_named_in_a_spec_in_an_option_and_in_a_scene_file(tmp_path: Path) -> None:
+def test_neighbours_are_named_in_spec_option_and_scene_file(tmp_path: Path) -> None:
     text = 'hands = ["allegro"]\nobjects = ["mug"]\nscene = "table"\n'
     told = asked(spec(tmp_path, text + 'neighbours = ["block", "bottle"]')).options["neighbours"]
     assert [one["object"] for one in told] == ["block", "bottle"]

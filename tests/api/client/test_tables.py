@@ -1,62 +1,61 @@
-"""What a terminal of 80 columns shows: every name, id and time whole, and as it is written."""
+"""Tables of jobs, datasets and their estimates on a terminal."""
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from rich.console import Console
 from rich.progress import Progress
 from typer.testing import CliRunner
 
 from graspd.cli import build
-from graspd.client.reports import JobDisplay
+from graspd.client.reports import JobDisplay, print_cells, print_dataset, print_estimate
 from graspd.service.cli import plain_console, plain_table
 from graspd.service.model.domain import JobOptions
 from graspd.service.model.states import State
+from graspd.service.pipeline.backends import Services
+from graspd.service.pipeline.datasets import actions
+from graspd.service.pipeline.datasets.cost import estimate
+from graspd.service.pipeline.datasets.spec import DatasetRequest
+from tests.api.factories import add_job, finish_all
+from tests.planning import plan_all
 
 NAME = "[red]mug[/] :mug: " + "a-very-long-name-of-an-object-that-somebody-gave-to-it"[:46]
+
+
 ID = "0123456789ab"
+
+
 CREATED = "2026-11-26T03:14:11.123456Z"
-JOB = SimpleNamespace(
-    id=ID + "0" * 20,
-    state=State.SUCCEEDED,
-    hand=NAME,
-    object=NAME,
-    progress=1.0,
-    valid=100_000,
-    grasps=100_000,
-    requested=100_000,
-    standing="valid",
-    created=CREATED,
-)
-DATASET = SimpleNamespace(
-    name=NAME,
-    state=State.SUCCEEDED,
-    cells=1000,
-    progress=1.0,
-    counted=10**6,
-    asked=10**6,
-    size_bytes=10**9 + 1,
-    created=CREATED,
-    options=JobOptions(),
-)
+
+
+_DONE = {"state": State.SUCCEEDED, "progress": 1.0, "created": CREATED}
+_JOB = {"id": ID + "0" * 20, "hand": NAME, "object": NAME, "standing": "valid"}
+JOB = SimpleNamespace(**dict.fromkeys(("valid", "grasps", "requested"), 100_000), **_JOB, **_DONE)
+
+
+_DATASET = {"name": NAME, "cells": 1000, "counted": 10**6, "asked": 10**6, "size_bytes": 10**9 + 1}
+DATASET = SimpleNamespace(**_DATASET, **_DONE, options=JobOptions())
+
+
 ASSET = SimpleNamespace(
     name=NAME, filename=NAME, size_bytes=10**6, builtin=False, verdict="ok", facts={}, digest=ID + "0" * 52
 )
+
+
 TAG = {"name": NAME, "grasps": 10**6, "changed": CREATED}
+
+
 WEBHOOK = {"id": ID, "url": "https://example.org/" + NAME, "states": ["failed", "succeeded"], "created": CREATED}
-DELIVERY = {
-    "kind": "job",
-    "subject": ID,
-    "ended": "succeeded",
-    "state": "delivered",
-    "attempts": 3,
-    "tried": CREATED,
-    "detail": NAME,
-}
+
+
+_ENDED = {"kind": "job", "subject": ID, "ended": "succeeded", "state": "delivered"}
+DELIVERY = _ENDED | {"attempts": 3, "tried": CREATED, "detail": NAME}
 
 
 class Service:
@@ -133,3 +132,30 @@ def test_progress_shows_messages_as_they_are(monkeypatch: pytest.MonkeyPatch) ->
     with console.capture() as got:
         console.print(progress)
     assert "[red]mug[/] [/nothing]" in got.get()
+
+
+@pytest.mark.parametrize("validation", ["none", "standard"])
+def test_a_report_names_the_standing_of_what_it_counts(services: Services, validation: str) -> None:
+    given = {"name": "k", "hands": ["allegro"], "objects": ["mug"], "grasps": 32, "validation": validation}
+    wanted = DatasetRequest.model_validate(given)
+    actions.create(services, wanted)
+    plan_all(services)
+    finish_all(services, add_job(services, validation=validation))
+    out = io.StringIO()
+    console = Console(file=out, width=200)
+    dataset = services.index.datasets.get("k")
+    print_estimate(estimate(services.index, wanted), console)
+    print_dataset(dataset, console)
+    print_cells(dataset, services.index.datasets.cells("k").items, console)
+    made = 32 if validation == "none" else dataset.valid
+    word, other = ("feasible", "valid") if validation == "none" else ("valid", "feasible")
+    assert f"grasps: {made} {word} of 32 candidates" in out.getvalue()
+    validated = "not validated" if validation == "none" else "at"
+    assert f"per {word} grasp" in out.getvalue() and f"{made}/32 {validated}" in out.getvalue()
+    assert other not in out.getvalue()
+    reasons = [line for line in out.getvalue().splitlines() if line.startswith("reason: ")]
+    assert reasons == ([] if validation == "none" else [f"reason: {dataset.reason}"])
+
+
+def test_candidate_grasps_that_nobody_judges_are_merely_kept() -> None:
+    assert JobOptions(want="candidates", validation="none").standing == "kept"

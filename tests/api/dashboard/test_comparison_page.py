@@ -37,20 +37,12 @@ def test_the_page_shows_what_differs_and_every_cell(http: TestClient, services: 
 def test_a_dataset_beside_itself_differs_in_nothing(http: TestClient, services: Services) -> None:
     _two(services)
     page = http.get("/compare", params={"one": "rough", "other": "rough"}).text
-    assert "They ask for the same" in page
-    assert "+0 points" in page
-
-
-def test_without_a_choice_the_page_offers_datasets(http: TestClient, services: Services) -> None:
-    _two(services)
+    assert "They ask for the same" in page and "+0 points" in page
+    assert "No grasp yet" in http.get("/compare", params={"one": "fine", "other": "fine"}).text
+    assert http.get("/compare", params={"one": "rough", "other": "gone"}).status_code == 404
     page = http.get("/compare").text
     assert page.count("<option>rough</option>") == page.count("<option>fine</option>") == 2
     assert "/compare?one=rough&amp;other=fine" in http.get("/datasets").text
-
-
-def test_a_dataset_that_is_not_there_is_not_found(http: TestClient, services: Services) -> None:
-    _two(services)
-    assert http.get("/compare", params={"one": "rough", "other": "gone"}).status_code == 404
 
 
 def test_distributions_of_two_share_their_bins_and_count_all(services: Services) -> None:
@@ -73,8 +65,3 @@ def test_more_cells_than_anybody_reads_are_left_out(services: Services, monkeypa
     monkeypatch.setattr("graspd.api.catalog.datasets.MOST_CELLS", 1)
     datasets = Datasets(services, None)  # type: ignore[arg-type]
     assert Comparisons(services, datasets).of("rough", "fine").pairs == []
-
-
-def test_datasets_without_a_grasp_say_so(http: TestClient, services: Services) -> None:
-    actions.create(services, DatasetRequest.model_validate({"name": "k", "hands": ["allegro"], "objects": ["mug"]}))
-    assert "No grasp yet" in http.get("/compare", params={"one": "k", "other": "k"}).text

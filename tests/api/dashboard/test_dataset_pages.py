@@ -45,13 +45,9 @@ def test_pairs_without_work_have_a_cell_to_choose() -> None:
 
 def test_chosen_pairs_are_submitted(http: TestClient, services: Services) -> None:
     form = {"action": "submit", "cell": ["allegro|mug", "shadow|block"], "grasps": "64", "fidelity": "draft"}
-    answer = http.post("/datasets/cells", data=form)
-    assert "2 jobs submitted." in answer.text
-    made = services.index.jobs.page().items
-    assert {(job.request.hand, job.request.object, job.request.grasps) for job in made} == {
-        ("allegro", "mug", 64),
-        ("shadow", "block", 64),
-    }
+    assert "2 jobs submitted." in http.post("/datasets/cells", data=form).text
+    made = {(r.hand, r.object, r.grasps) for r in (job.request for job in services.index.jobs.page().items)}
+    assert made == {("allegro", "mug", 64), ("shadow", "block", 64)}
 
 
 def test_chosen_pairs_are_cancelled_and_retried(http: TestClient, services: Services) -> None:
@@ -79,13 +75,8 @@ def test_a_dataset_is_made_watched_retried_and_frozen(http: TestClient, services
     assert "kitchen" in page
     assert page.count('class="cell queued') == 2
     plan_all(services)
-    assert (
-        "1 job cancelled"
-        in http.post(
-            "/datasets/kitchen/cells",
-            data={"action": "cancel", "cell": [services.index.datasets.cells("kitchen").items[0].job_id]},
-        ).text
-    )
+    chosen = {"action": "cancel", "cell": [services.index.datasets.cells("kitchen").items[0].job_id]}
+    assert "1 job cancelled" in http.post("/datasets/kitchen/cells", data=chosen).text
     assert http.post("/datasets/kitchen/retry").status_code == 200
     finish_all(services, add_job(services, fidelity="draft"))
     answer = http.post("/datasets/kitchen/snapshot")
@@ -93,12 +84,10 @@ def test_a_dataset_is_made_watched_retried_and_frozen(http: TestClient, services
     assert len(services.index.datasets.snapshots("kitchen").items) == 1
 
 
-def test_a_dataset_without_a_hand_is_explained_and_what_was_typed_stays(http: TestClient) -> None:
+def test_a_dataset_form_without_a_hand_keeps_what_was_typed(http: TestClient) -> None:
     answer = http.post("/datasets", data={"name": "kitchen", "grasps": "7", "objects": ["mug"]})
     assert answer.status_code == 422
-    assert "hands" in answer.text
-    assert 'value="kitchen"' in answer.text
-    assert 'value="7"' in answer.text
+    assert all(words in answer.text for words in ("hands", 'value="kitchen"', 'value="7"'))
 
 
 def test_a_dataset_is_made_in_scenes_with_neighbours(http: TestClient, services: Services) -> None:
@@ -116,9 +105,8 @@ def test_a_dataset_says_how_near_fingertips_come_to_supports(http: TestClient, s
     assert http.post("/datasets", data=form).status_code == 200
     assert services.index.datasets.get("flat").options.touch == -0.5
     wrong = http.post("/datasets", data=form | {"name": "too-deep", "touch": "-3"})
-    assert (
-        wrong.status_code == 422 and 'name="touch" type="number" min="-1" max="2" step="any" value="-3"' in wrong.text
-    )
+    assert wrong.status_code == 422
+    assert 'name="touch" type="number" min="-1" max="2" step="any" value="-3"' in wrong.text
 
 
 def test_cells_of_one_state_are_a_list(http: TestClient, services: Services) -> None:
@@ -135,7 +123,7 @@ def test_cells_of_one_state_are_a_list(http: TestClient, services: Services) -> 
         ({"validation": "none", "want": "candidates"}, "32 kept"),
     ],
 )
-def test_grasps_that_nobody_validated_are_counted_and_not_called_valid(
+def test_unjudged_grasps_are_counted_and_not_called_valid(
     http: TestClient, services: Services, options: dict[str, str], shown: str
 ) -> None:
     given = {"name": "k", "hands": ["allegro"], "objects": ["mug"], "grasps": 32}
@@ -153,7 +141,7 @@ def test_grasps_that_nobody_validated_are_counted_and_not_called_valid(
 
 
 @pytest.mark.parametrize(("scene", "place"), [("free", ""), ("bin", " in a bin")])
-def test_the_share_of_a_cell_says_in_which_scene_its_grasps_are_valid(
+def test_the_share_of_a_cell_says_in_which_scene_it_is_valid(
     http: TestClient, services: Services, scene: str, place: str
 ) -> None:
     given = {"name": "k", "hands": ["allegro"], "objects": ["mug"], "grasps": 32, "scene": scene}

@@ -58,55 +58,43 @@ def fields_of(page: str) -> dict[str, str]:
     return FORM | picked | hidden
 
 
+def sent(http: TestClient, **fields: str) -> str:
+    """The page after the form was sent with the mesh."""
+    return http.post("/submit", data=FORM | fields, files={"file": MESH}).text
+
+
+def stored_options(services: Services, asset: AssetView) -> dict[str, Any]:
+    return dict(json.loads(load_asset_files(services.store, AssetKind.OBJECT, asset.digest)["asset.json"]))
+
+
 def test_a_refused_file_is_what_the_form_goes_on_to_show(http: TestClient, services: Services) -> None:
     uploaded(http, services, "refuse")
     answer = http.post("/submit", data=FORM, files={"file": MESH})
-    assert answer.status_code == 422
-    assert "a thing of 60 m" in answer.text
+    for page in (answer, http.post("/submit", data=fields_of(answer.text))):  # pressed again, it runs no other object
+        assert page.status_code == 422 and "a thing of 60 m" in page.text
+        assert jobs(services) == []
     assert fields_of(answer.text)["object"] == ""
     assert "your file part (refused)" in answer.text
     assert 'data-model="/v1/objects/mug/model"' not in answer.text
-    assert jobs(services) == []
+    known = http.post("/submit", data=fields_of(answer.text) | {"object": "block"}, follow_redirects=False)
+    assert known.status_code == 303 and jobs(services) == ["block"]
 
 
-def test_pressing_again_does_not_run_another_object(http: TestClient, services: Services) -> None:
-    uploaded(http, services, "refuse")
-    page = http.post("/submit", data=FORM, files={"file": MESH}).text
-    again = http.post("/submit", data=fields_of(page))
-    assert again.status_code == 422 and "a thing of 60 m" in again.text
-    assert jobs(services) == []
-
-
-def test_a_refused_file_is_checked_again_in_other_units_without_being_sent_again(
-    http: TestClient, services: Services
-) -> None:
+def test_a_refused_file_is_checked_in_other_units_unsent(http: TestClient, services: Services) -> None:
     first = uploaded(http, services, "refuse")
-    page = http.post("/submit", data=FORM, files={"file": MESH}).text
-    waiting = http.post("/submit", data=fields_of(page) | {"units": "mm"})
+    waiting = http.post("/submit", data=fields_of(sent(http)) | {"units": "mm"})
     assert waiting.status_code == 409 and "still being checked" in waiting.text
     meant = services.index.assets.get(AssetKind.OBJECT, "part")
     check(services, meant, "accept")
     assert http.post("/submit", data=fields_of(waiting.text), follow_redirects=False).status_code == 303
     assert jobs(services) == ["part"]
     assert meant.digest != first.digest
-    assert json.loads(load_asset_files(services.store, AssetKind.OBJECT, meant.digest)["asset.json"]) == {
-        "file": "part.stl",
-        "units": "mm",
-    }
+    assert stored_options(services, meant) == {"file": "part.stl", "units": "mm"}
 
 
 def test_units_stay_chosen_on_a_page_in_error(http: TestClient, services: Services) -> None:
     uploaded(http, services, "refuse", units="mm")
-    page = http.post("/submit", data=FORM | {"units": "mm"}, files={"file": MESH}).text
-    assert fields_of(page)["units"] == "mm"
-
-
-def test_a_known_object_can_be_chosen_instead_of_the_refused_file(http: TestClient, services: Services) -> None:
-    uploaded(http, services, "refuse")
-    page = http.post("/submit", data=FORM, files={"file": MESH}).text
-    answer = http.post("/submit", data=fields_of(page) | {"object": "block"}, follow_redirects=False)
-    assert answer.status_code == 303
-    assert jobs(services) == ["block"]
+    assert fields_of(sent(http, units="mm"))["units"] == "mm"
 
 
 def test_a_file_that_cannot_be_kept_is_asked_for_again(http: TestClient, services: Services) -> None:
@@ -124,22 +112,14 @@ def test_a_mistake_in_another_field_keeps_the_file(http: TestClient, services: S
     assert fields_of(page.text)["object"] == "part"
 
 
-def test_a_form_that_names_no_object_gets_none(http: TestClient, services: Services) -> None:
+def test_a_form_that_names_no_known_object_gets_none(http: TestClient, services: Services) -> None:
     answer = http.post("/submit", data={key: value for key, value in FORM.items() if key != "object"})
     assert answer.status_code == 422 and "choose a known object, or a file" in answer.text
+    assert http.post("/submit", data=FORM | {"object": "", "object_held": "0" * 32}).status_code == 422
     assert jobs(services) == []
-
-
-def test_an_object_that_is_not_known_is_not_shown_as_the_first_of_those_that_are(http: TestClient) -> None:
     page = http.get("/submit", params={"object": "lost"}).text
     assert fields_of(page)["object"] == "lost"
     assert "lost (not known here)" in page
-
-
-def test_what_a_form_holds_must_be_there(http: TestClient, services: Services) -> None:
-    answer = http.post("/submit", data=FORM | {"object": "", "object_held": "0" * 32})
-    assert answer.status_code == 422
-    assert jobs(services) == []
 
 
 #: What the check of a mesh in millimetres tells beside its message.
@@ -178,19 +158,15 @@ def test_a_refusal_is_told_in_words_with_buttons(http: TestClient, services: Ser
         ("Scale it to this size", {"object_scale_to": "120"}, {"scale_to": 0.12}),
     ],
 )
-def test_the_button_of_a_fix_checks_the_file_again_and_submits_nothing(
+def test_the_button_of_a_fix_checks_again_and_submits_nothing(
     http: TestClient, services: Services, words: str, field: dict[str, str], said: dict[str, Any]
 ) -> None:
     uploaded(http, services, "refuse", TOO_LARGE)
-    page = http.post("/submit", data=FORM, files={"file": MESH}).text
+    page = sent(http)
     again = http.post("/submit", data=fields_of(page) | field | {"object_fix": fixes_of(page)[words]})
     assert again.status_code == 200 and jobs(services) == []
     assert fields_of(again.text)["object"] == "part"
-    meant = services.index.assets.get(AssetKind.OBJECT, "part")
-    assert json.loads(load_asset_files(services.store, AssetKind.OBJECT, meant.digest)["asset.json"]) == {
-        "file": "part.stl",
-        **said,
-    }
+    assert stored_options(services, services.index.assets.get(AssetKind.OBJECT, "part")) == {"file": "part.stl", **said}
 
 
 @pytest.mark.parametrize("typed", ["", "wide"])
@@ -245,7 +221,7 @@ def test_a_name_of_something_refused_is_free(http: TestClient, services: Service
     assert http.get("/v1/objects/part").json()["digest"] == answer.json()["digest"]
 
 
-def test_a_file_of_other_content_and_the_same_name_is_another_object(http: TestClient, services: Services) -> None:
+def test_a_file_of_other_content_is_another_object(http: TestClient, services: Services) -> None:
     first = uploaded(http, services, "accept")
     other = {"file": ("part.stl", b"solid another\nendsolid\n")}
     assert http.post("/v1/objects", files=other).status_code == 409
@@ -255,7 +231,7 @@ def test_a_file_of_other_content_and_the_same_name_is_another_object(http: TestC
     assert (again["name"], again["digest"]) == ("part", first.digest)
 
 
-def test_a_refused_file_is_found_again_though_its_name_stands_for_another(http: TestClient, services: Services) -> None:
+def test_a_refused_file_is_found_again_though_its_name_is_taken(http: TestClient, services: Services) -> None:
     refused = uploaded(http, services, "refuse")
     good = http.post("/v1/objects", files={"file": ("part.stl", b"solid another\nendsolid\n")}).json()
     for sent in ({}, {"name": "other"}):

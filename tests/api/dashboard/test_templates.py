@@ -43,7 +43,7 @@ def test_a_template_compiles_and_calls_what_there_is(name: str) -> None:
     assert missing == set()
 
 
-def test_a_macro_that_is_not_imported_is_found_in_a_branch_that_is_rarely_rendered() -> None:
+def test_a_missing_macro_is_found_in_a_rare_branch() -> None:
     source = '{% from "parts.html" import when %}{% if rare %}{% call delete_dialog("a") %}x{% endcall %}{% endif %}'
     assert unknown_calls(parsed("", source)) == {"delete_dialog"}
     assert unknown_calls(parsed("", source.replace("when", "when, delete_dialog"))) == set()

@@ -70,7 +70,7 @@ def scenes_of(kind: str, *runs: dict[str, object]) -> dict[str, object]:
     return {"created": "2026-11-21T10:00:00.000Z", "scene": SceneSpec(kind=kind).model_dump(mode="json"), "runs": runs}
 
 
-def test_speeds_in_scenes_are_what_was_lifted_over_the_seconds_of_all_pairs() -> None:
+def test_speeds_in_scenes_are_lifted_grasps_over_seconds() -> None:
     runs = [lifted("draft", 16), lifted("draft", 0, object="block"), lifted("draft", 4, way=FILTERED)]
     drawn = draw(Measured.model_validate(scenes_of("table", *runs)), axis="lift")
     assert [(point.method, point.speed, point.accuracy) for point in drawn.points] == [

@@ -15,13 +15,11 @@ from graspd.api.access.keys import KeyFile, KeyLimits, Scope
 from graspd.api.app import create_app
 from graspd.api.middleware.body_limit import BodyLimit
 from graspd.api.middleware.rate_limit import Allowance, Rates
-from graspd.service.model import names
-from graspd.service.model.records import JobRecord
 from graspd.service.pipeline.backends import Services
 from graspd.service.queue.rq_queue import RqQueue
 from graspd.service.settings import Settings
-from graspd.service.store.records import read_record
-from tests.api.factories import finish_all
+from tests.api.factories import bearer, finish_all
+from tests.fakes import record_of
 from tests.planning import plan_all
 from tests.waiting import PATIENCE_S
 
@@ -59,23 +57,12 @@ def keys(settings: Settings) -> KeyFile:
     return KeyFile(settings.resolved_keys_file)
 
 
-def bearer(token: str) -> dict[str, str]:
-    return {"Authorization": f"Bearer {token}"}
-
-
-def test_two_applications_share_one_rate(twins: Twins, keys: KeyFile) -> None:
-    headers = bearer(keys.add("me", Scope.READ, limits=KeyLimits(requests_per_minute=3)))
-    first, second = twins()
-    answers = [client.get("/v1/stats", headers=headers).status_code for client in (first, second) * 2]
-    assert answers == [200] * 3 + [429]
-
-
-def test_a_refusal_says_when_to_come_again(twins: Twins, keys: KeyFile) -> None:
+def test_two_applications_share_one_rate_and_say_when_to_come(twins: Twins, keys: KeyFile) -> None:
     headers = bearer(keys.add("me", Scope.READ, limits=KeyLimits(requests_per_minute=2)))
-    client, _ = twins()
-    client.get("/v1/stats", headers=headers)
-    assert client.get("/v1/stats", headers=headers).headers["ratelimit"].startswith('"requests";r=0;t=')
-    answer = client.get("/v1/stats", headers=headers)
+    first, second = twins()
+    assert first.get("/v1/stats", headers=headers).status_code == 200
+    assert second.get("/v1/stats", headers=headers).headers["ratelimit"].startswith('"requests";r=0;t=')
+    answer = first.get("/v1/stats", headers=headers)
     assert (answer.status_code, answer.headers["content-type"]) == (429, "application/problem+json")
     assert answer.json()["type"] == "/problems/too-many-requests"
     assert answer.headers["ratelimit-policy"] == '"requests";q=2;w=60'
@@ -83,29 +70,24 @@ def test_a_refusal_says_when_to_come_again(twins: Twins, keys: KeyFile) -> None:
     assert 1 <= int(answer.headers["retry-after"]) <= 30
 
 
-def test_a_key_without_a_limit_of_its_own_has_that_of_the_settings(twins: Twins, keys: KeyFile) -> None:
+def test_a_key_without_a_limit_has_that_of_the_settings(twins: Twins, keys: KeyFile) -> None:
     headers = bearer(keys.add("me", Scope.READ))
     client, _ = twins(requests_per_minute=1)
     assert [client.get("/v1/stats", headers=headers).status_code for _ in range(2)] == [200, 429]
 
 
-def test_strangers_are_counted_by_address_and_do_not_use_up_a_key(twins: Twins, keys: KeyFile) -> None:
+def test_strangers_are_counted_by_address(twins: Twins, keys: KeyFile) -> None:
     headers = bearer(keys.add("me", Scope.READ))
     client, _ = twins(address_requests_per_minute=2)
     assert [client.get("/v1/stats", headers=bearer("gd_guess")).status_code for _ in range(3)] == [401, 401, 429]
     assert client.get("/v1/stats", headers=headers).status_code == 200
 
 
-def test_whoever_guesses_keys_at_the_login_is_slowed_down(twins: Twins, keys: KeyFile) -> None:
+def test_guesses_at_the_login_are_slowed_down_and_health_is_not(twins: Twins, keys: KeyFile) -> None:
     keys.add("me", Scope.READ)
     client, _ = twins(address_requests_per_minute=3)
     answers = [client.post("/login", data={"key": f"gd_{i}"}).status_code for i in range(4)]
     assert answers == [401, 401, 401, 429]
-
-
-def test_health_is_never_refused(twins: Twins, keys: KeyFile) -> None:
-    keys.add("me", Scope.READ)
-    client, _ = twins(address_requests_per_minute=1)
     assert {client.get("/healthz").status_code for _ in range(4)} == {200}
 
 
@@ -135,54 +117,41 @@ def test_only_so_many_requests_are_answered_at_once(redis_server: str, rq_queue:
     assert asyncio.run(use()) == ["", "", "concurrency", "", ""]
 
 
+def enter(redis_server: str, allowance: Allowance) -> Any:
+    """How a request of a key is let in."""
+
+    async def ask() -> Any:
+        rates = Rates(redis_server)
+        admission = await rates.enter("key:me", allowance, "new")
+        await rates.close()
+        return admission
+
+    return asyncio.run(ask())
+
+
 def test_requests_of_a_killed_process_count_for_a_minute_at_most(redis_server: str, rq_queue: RqQueue) -> None:
     rq_queue.connection.zadd("graspd:held:key:me", {"lost": time.time() - 1})
-
-    async def enter() -> str:
-        rates = Rates(redis_server)
-        admission = await rates.enter("key:me", Allowance(0, 1), "new")
-        await rates.close()
-        assert admission is not None
-        return admission.refused
-
-    assert asyncio.run(enter()) == ""
+    assert enter(redis_server, Allowance(0, 1)).refused == ""
     assert 0 < rq_queue.connection.pttl("graspd:held:key:me") <= 60_000
 
 
-def test_a_clock_set_back_shuts_nobody_out_for_longer_than_a_minute(redis_server: str, rq_queue: RqQueue) -> None:
+def test_a_clock_set_back_shuts_nobody_out_for_long(redis_server: str, rq_queue: RqQueue) -> None:
     rq_queue.connection.set("graspd:rate:key:me", time.time() + 86400)
-
-    async def enter() -> float:
-        rates = Rates(redis_server)
-        admission = await rates.enter("key:me", Allowance(10, 0), "new")
-        await rates.close()
-        assert admission is not None
-        return admission.seconds
-
-    assert asyncio.run(enter()) <= 60
+    assert enter(redis_server, Allowance(10, 0)).seconds <= 60
 
 
-def test_more_jobs_a_day_than_the_quota_are_refused_until_midnight(twins: Twins, keys: KeyFile) -> None:
-    headers = bearer(keys.add("me", Scope.SUBMIT, limits=KeyLimits(jobs_per_day=2)))
+def test_jobs_over_the_daily_quota_are_refused_until_midnight(twins: Twins, keys: KeyFile) -> None:
+    """What is refused, or the same again, costs nothing, and another key has a quota of its own."""
+    headers = bearer(keys.add("me", Scope.SUBMIT, limits=KeyLimits(jobs_per_day=2, grasps_in_flight=96)))
     clients = twins()
-    answers = [clients[i % 2].post("/v1/jobs", json=JOB | {"seed": i}, headers=headers) for i in range(3)]
-    assert [answer.status_code for answer in answers] == [202, 202, 429]
-    assert answers[2].json()["type"] == "/problems/quota-exceeded"
-    assert int(answers[2].headers["retry-after"]) == 12 * 3600 + 1
-
-
-def test_the_same_job_again_costs_nothing(twins: Twins, keys: KeyFile) -> None:
-    headers = bearer(keys.add("me", Scope.SUBMIT, limits=KeyLimits(jobs_per_day=1, grasps_in_flight=32)))
-    client, _ = twins()
-    assert {client.post("/v1/jobs", json=JOB, headers=headers).status_code for _ in range(3)} == {202}
-    assert client.post("/v1/jobs", json=JOB | {"seed": 1}, headers=headers).status_code == 429
-
-
-def test_a_refused_submission_costs_nothing(twins: Twins, keys: KeyFile) -> None:
-    headers = bearer(keys.add("me", Scope.SUBMIT, limits=KeyLimits(jobs_per_day=1)))
-    client, _ = twins()
-    assert client.post("/v1/jobs", json=JOB | {"hand": "claw"}, headers=headers).status_code == 404
-    assert client.post("/v1/jobs", json=JOB, headers=headers).status_code == 202
+    assert clients[0].post("/v1/jobs", json=JOB | {"hand": "claw"}, headers=headers).status_code == 404
+    seeds = (0, 0, 0, 1, 2)
+    answers = [clients[i % 2].post("/v1/jobs", json=JOB | {"seed": s}, headers=headers) for i, s in enumerate(seeds)]
+    assert [answer.status_code for answer in answers] == [202, 202, 202, 202, 429]
+    assert answers[-1].json()["type"] == "/problems/quota-exceeded"
+    assert int(answers[-1].headers["retry-after"]) == 12 * 3600 + 1
+    other = bearer(keys.add("you", Scope.SUBMIT, limits=KeyLimits(jobs_per_day=1)))
+    assert clients[0].post("/v1/jobs", json=JOB | {"seed": 2}, headers=other).status_code == 202
 
 
 def test_grasps_in_flight_come_free_as_jobs_end(twins: Twins, keys: KeyFile, services: Services) -> None:
@@ -190,13 +159,11 @@ def test_grasps_in_flight_come_free_as_jobs_end(twins: Twins, keys: KeyFile, ser
     client, _ = twins()
     first = client.post("/v1/jobs", json=JOB, headers=headers).json()["id"]
     assert client.post("/v1/jobs", json=JOB | {"seed": 1, "grasps": 33}, headers=headers).status_code == 429
-    finish_all(services, read_record(JobRecord, services.store, names.job_record(first)))
+    finish_all(services, record_of(services, first))
     assert client.post("/v1/jobs", json=JOB | {"seed": 1, "grasps": 33}, headers=headers).status_code == 202
 
 
-def test_a_dataset_counts_with_the_grasps_of_all_its_cells_until_it_ends(
-    twins: Twins, keys: KeyFile, services: Services
-) -> None:
+def test_a_dataset_counts_with_all_its_cells_until_it_ends(twins: Twins, keys: KeyFile, services: Services) -> None:
     headers = bearer(keys.add("me", Scope.SUBMIT, limits=KeyLimits(grasps_in_flight=64)))
     client, _ = twins()
     matrix = {"name": "d", "hands": ["allegro", "barrett"], "objects": ["mug"], "grasps": 32}
@@ -211,15 +178,6 @@ def test_a_dataset_counts_with_the_grasps_of_all_its_cells_until_it_ends(
     assert client.post("/v1/datasets/d/retry", headers=headers).status_code == 429
 
 
-def test_the_quota_of_one_key_is_not_that_of_another(twins: Twins, keys: KeyFile) -> None:
-    mine, yours = (keys.add(name, Scope.SUBMIT, limits=KeyLimits(jobs_per_day=1)) for name in ("me", "you"))
-    client, _ = twins()
-    answers = [
-        client.post("/v1/jobs", json=JOB | {"seed": i}, headers=bearer(key)) for i, key in enumerate((mine, yours))
-    ]
-    assert {answer.status_code for answer in answers} == {202}
-
-
 def test_an_idempotency_key_belongs_to_the_key_that_sent_it(twins: Twins, keys: KeyFile) -> None:
     mine, yours = (bearer(keys.add(name, Scope.SUBMIT)) | {"Idempotency-Key": "1"} for name in ("me", "you"))
     first, second = twins()
@@ -228,33 +186,34 @@ def test_an_idempotency_key_belongs_to_the_key_that_sent_it(twins: Twins, keys: 
     assert second.post("/v1/jobs", json=JOB | {"seed": 1}, headers=yours).status_code == 202
 
 
-def test_a_body_that_stops_coming_is_given_up() -> None:
+async def reads_all(scope: Any, receive: Any, send: Any) -> None:
+    while (await receive()).get("more_body"):
+        pass
+
+
+def answer_to(receive: Callable[[], Any], **options: float) -> int:
+    """Status that the limit answers while a body comes."""
     sent: list[dict[str, Any]] = []
-
-    async def reads_all(scope: Any, receive: Any, send: Any) -> None:
-        while (await receive()).get("more_body"):
-            pass
-
-    async def silent() -> dict[str, Any]:
-        await asyncio.sleep(60)
-        return {}
 
     async def send(message: Any) -> None:
         sent.append(message)
 
-    limit = BodyLimit(reads_all, upload_paths=frozenset(), upload_bytes=1, piece_s=0.05)
+    limit = BodyLimit(reads_all, upload_paths=frozenset(), upload_bytes=1, **options)
     scope = {"type": "http", "method": "POST", "path": "/v1/jobs", "headers": [], "query_string": b"", "server": None}
-    asyncio.run(limit(scope, silent, send))
-    assert sent[0]["status"] == 408
+    asyncio.run(limit(scope, receive, send))
+    return int(sent[0]["status"])
+
+
+def test_a_body_that_stops_coming_is_given_up() -> None:
+    async def silent() -> dict[str, Any]:
+        await asyncio.sleep(60)
+        return {}
+
+    assert answer_to(silent, piece_s=0.05) == 408
 
 
 def test_a_body_that_trickles_in_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    sent: list[dict[str, Any]] = []
-    pieces = 0
-
-    async def reads_all(scope: Any, receive: Any, send: Any) -> None:
-        while (await receive()).get("more_body"):
-            pass
+    clock, pieces = [0.0], 0
 
     async def trickling() -> dict[str, Any]:
         nonlocal pieces
@@ -262,12 +221,5 @@ def test_a_body_that_trickles_in_is_given_up(monkeypatch: pytest.MonkeyPatch) ->
         clock[0] += 20.0
         return {"type": "http.request", "body": b"x", "more_body": True}
 
-    async def send(message: Any) -> None:
-        sent.append(message)
-
-    clock = [0.0]
     monkeypatch.setattr("graspd.api.middleware.body_limit.time.monotonic", lambda: clock[0])
-    limit = BodyLimit(reads_all, upload_paths=frozenset(), upload_bytes=1)
-    scope = {"type": "http", "method": "POST", "path": "/v1/jobs", "headers": [], "query_string": b"", "server": None}
-    asyncio.run(limit(scope, trickling, send))
-    assert sent[0]["status"] == 408 and pieces == 2
+    assert answer_to(trickling) == 408 and pieces == 2

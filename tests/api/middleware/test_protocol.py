@@ -20,9 +20,7 @@ async def refuses(scope: Any, receive: Any, send: Any) -> None:
         await send({"type": "http.response.body", "body": b""})
 
 
-def test_a_body_that_trickles_in_after_its_answer_keeps_no_connection(
-    connect: Connect, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_body_that_trickles_after_its_answer_is_cut_off(connect: Connect, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(_Quick, "rest_s", 0.2)
     connection = connect(_HEAD % 1_000_000, app=refuses)
     assert b" 403 " in connection.recv(65536)
@@ -40,9 +38,7 @@ def test_a_body_that_trickles_in_after_its_answer_keeps_no_connection(
     until(trickle, "the server ends the connection")
 
 
-def test_a_body_that_comes_whole_after_its_answer_keeps_its_connection(
-    connect: Connect, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_body_that_comes_whole_after_its_answer_is_read(connect: Connect, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(_Quick, "rest_s", 0.2)
     connection = connect(_HEAD % 4, app=refuses)
     assert b" 403 " in connection.recv(65536)

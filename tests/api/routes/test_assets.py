@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import zipfile
+from typing import Any
 
 import pytest
 from starlette.testclient import TestClient
@@ -28,8 +29,8 @@ def zipped(files: dict[str, bytes]) -> bytes:
 
 
 def test_the_built_in_hands_and_objects_are_listed(http: TestClient) -> None:
-    assert "allegro" in {asset["name"] for asset in http.get("/v1/hands").json()["items"]}
-    assert "mug" in {asset["name"] for asset in http.get("/v1/objects").json()["items"]}
+    for kind, name in (("hands", "allegro"), ("objects", "mug")):
+        assert name in {asset["name"] for asset in http.get(f"/v1/{kind}").json()["items"]}
 
 
 def test_an_upload_is_kept_whole_and_waits_for_its_check(http: TestClient, services: Services) -> None:
@@ -39,9 +40,10 @@ def test_an_upload_is_kept_whole_and_waits_for_its_check(http: TestClient, servi
     assert (asset["name"], asset["verdict"]) == ("My-box-2", None)
     assert load_asset_files(services.store, AssetKind.OBJECT, asset["digest"])["My box (2).stl"] == STL
     assert [check.name for check in services.index.feed.ready_checks(now=1e12, limit=9)] == ["My-box-2"]
+    assert http.post("/v1/jobs", json={"hand": "allegro", "object": "My-box-2"}).status_code == 409
 
 
-def test_a_self_test_is_asked_for_with_the_hand_and_shown_with_its_facts(http: TestClient, services: Services) -> None:
+def test_a_self_test_is_asked_for_and_shown_with_its_facts(http: TestClient, services: Services) -> None:
     asked = {"name": "mine", "self_test": "true"}
     answer = http.post("/v1/hands", files={"file": ("mine.urdf", b"<robot name='mine'/>")}, data=asked)
     assert answer.status_code == 202
@@ -56,33 +58,17 @@ def test_a_self_test_is_asked_for_with_the_hand_and_shown_with_its_facts(http: T
     assert "ready: 90 % hold" in http.get("/hands").text
 
 
-def test_only_hands_are_tried(http: TestClient) -> None:
-    answer = http.post("/v1/objects", files={"file": ("box.stl", STL)}, data={"self_test": "true"})
-    assert answer.status_code == 422
-    assert "only a hand" in answer.json()["detail"]
+def test_the_same_upload_is_one_object_and_a_name_one_content(http: TestClient) -> None:
+    def upload(data: bytes, **said: str) -> Any:
+        return http.post("/v1/objects", files={"file": ("box.stl", data)}, data=said)
 
-
-def test_the_same_upload_twice_is_one_object(http: TestClient) -> None:
-    first, second = (http.post("/v1/objects", files={"file": ("box.stl", STL)}).json() for _ in range(2))
+    first, second = upload(STL).json(), upload(STL).json()
     assert first == second
-
-
-def test_a_name_stands_for_one_content(http: TestClient) -> None:
-    http.post("/v1/objects", files={"file": ("box.stl", STL)})
-    answer = http.post("/v1/objects", files={"file": ("box.stl", STL + b" ")})
-    assert answer.status_code == 409
-    assert "'box'" in answer.json()["detail"]
-
-
-def test_a_name_may_be_given(http: TestClient) -> None:
-    answer = http.post("/v1/objects", files={"file": ("box.stl", STL)}, data={"name": "crate"})
-    assert answer.json()["name"] == "crate"
-
-
-def test_an_object_that_waits_for_its_check_takes_no_job(http: TestClient) -> None:
-    http.post("/v1/objects", files={"file": ("box.stl", STL)})
-    answer = http.post("/v1/jobs", json={"hand": "allegro", "object": "box"})
-    assert answer.status_code == 409
+    answer = upload(STL + b" ")
+    assert answer.status_code == 409 and "'box'" in answer.json()["detail"]
+    assert upload(STL + b" ", name="crate").json()["name"] == "crate"
+    refused = upload(STL, self_test="true")
+    assert refused.status_code == 422 and "only a hand" in refused.json()["detail"]
 
 
 def test_an_upload_over_the_limit_is_refused_and_leaves_nothing(http: TestClient, settings: Settings) -> None:
@@ -114,20 +100,16 @@ def test_a_zip_bomb_is_refused_by_what_it_unpacks_to() -> None:
         files_of_upload(AssetKind.OBJECT, "bomb.zip", bomb, limit_bytes=1024)
 
 
-def test_a_folder_zipped_whole_loses_its_own_name() -> None:
+def test_files_of_a_zip_are_its_folders_or_its_asset_jsons() -> None:
     data = zipped({"hand/hand.urdf": b"<robot/>", "hand/meshes/palm.stl": STL})
     files = files_of_upload(AssetKind.HAND, "hand.zip", data, limit_bytes=1 << 20)
     assert set(files) == {"asset.json", "hand.urdf", "meshes/palm.stl"}
-
-
-def test_an_asset_json_in_the_zip_stands() -> None:
-    data = zipped({"asset.json": b'{"file": "b.stl"}', "a.stl": STL, "b.stl": STL})
-    assert files_of_upload(AssetKind.OBJECT, "two.zip", data, limit_bytes=1 << 20)["asset.json"] == b'{"file": "b.stl"}'
-
-
-def test_a_zip_with_two_meshes_says_the_mend() -> None:
+    two = {"a.stl": STL, "b.stl": STL}
+    described = zipped({"asset.json": b'{"file": "b.stl"}', **two})
+    files = files_of_upload(AssetKind.OBJECT, "two.zip", described, limit_bytes=1 << 20)
+    assert files["asset.json"] == b'{"file": "b.stl"}'
     with pytest.raises(InputError, match=r"asset\.json"):
-        files_of_upload(AssetKind.OBJECT, "two.zip", zipped({"a.stl": STL, "b.stl": STL}), limit_bytes=1 << 20)
+        files_of_upload(AssetKind.OBJECT, "two.zip", zipped(two), limit_bytes=1 << 20)
 
 
 @pytest.mark.parametrize(

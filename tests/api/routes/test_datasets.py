@@ -7,11 +7,10 @@ from typing import Any
 import pytest
 from starlette.testclient import TestClient
 
-from graspd.service.model import names
-from graspd.service.model.records import JobRecord
 from graspd.service.pipeline.backends import Services
-from graspd.service.store.records import publish, read_record
+from graspd.service.store.records import publish
 from tests.api.factories import finish_all
+from tests.fakes import record_of
 from tests.planning import plan_all
 from tests.service.pipeline.test_fidelity_choice import CHART, scene_chart
 
@@ -29,10 +28,10 @@ def finish_cells(services: Services, http: TestClient, count: int) -> None:
     """Do all tasks of the first cells."""
     plan_all(services)
     for cell in http.get("/v1/datasets/kitchen/cells").json()["items"][:count]:
-        finish_all(services, read_record(JobRecord, services.store, names.job_record(cell["job_id"])))
+        finish_all(services, record_of(services, cell["job_id"]))
 
 
-def test_a_new_dataset_is_accepted_with_its_place(http: TestClient) -> None:
+def test_a_new_dataset_has_a_place_and_a_done_one_is_found(http: TestClient, services: Services) -> None:
     answer = http.post("/v1/datasets", json=WANTED)
     assert answer.status_code == 202
     assert answer.headers["Location"] == "/v1/datasets/kitchen" and answer.headers["Retry-After"] == "1"
@@ -40,11 +39,6 @@ def test_a_new_dataset_is_accepted_with_its_place(http: TestClient) -> None:
     assert dataset == answer.json()
     assert (dataset["cells"], dataset["state"], dataset["asked"]) == (4, "queued", 256)
     assert [one["name"] for one in http.get("/v1/datasets").json()["items"]] == ["kitchen"]
-
-
-def test_a_dataset_that_is_done_is_found_again_with_200(
-    http: TestClient, services: Services, kitchen: dict[str, Any]
-) -> None:
     finish_cells(services, http, 4)
     again = http.post("/v1/datasets", json=WANTED)
     assert again.status_code == 200 and again.json()["state"] == "succeeded"
@@ -72,7 +66,7 @@ def test_with_auto_each_cell_says_which_fidelity_it_got(http: TestClient, servic
     assert "auto (gsr&gt;=0.6)" in http.get("/datasets/kitchen").text
 
 
-def test_with_auto_cells_in_scenes_are_chosen_by_the_chart_of_such_scenes(http: TestClient, services: Services) -> None:
+def test_cells_in_scenes_are_chosen_by_the_chart_of_such_scenes(http: TestClient, services: Services) -> None:
     wanted = WANTED | {"scene": "table", "views": 0, "fidelity": "auto", "target": "lift>=0.8"}
     publish(services.store, "charts", CHART)
     answer = http.post("/v1/datasets", json=wanted)
@@ -80,11 +74,8 @@ def test_with_auto_cells_in_scenes_are_chosen_by_the_chart_of_such_scenes(http: 
     key = publish(services.store, "scene_charts/table", scene_chart())
     assert http.post("/v1/datasets", json=wanted).status_code == 202
     cells = http.get("/v1/datasets/kitchen/cells").json()["items"]
-    assert [(cell["hand"], cell["object"], cell["fidelity"], cell["choice"]["measured_on"]) for cell in cells] == [
-        ("allegro", "mug", "standard", "hand and object"),
-        ("allegro", "block", "draft", "hand"),
-        ("barrett", "mug", "standard", "hand"),
-        ("barrett", "block", "standard", "hand"),
+    assert [(cell["fidelity"], cell["choice"]["measured_on"]) for cell in cells] == [
+        *[("standard", "hand and object"), ("draft", "hand"), ("standard", "hand"), ("standard", "hand")]
     ]
     assert {cell["choice"]["chart"] for cell in cells} == {key}
 
@@ -111,10 +102,7 @@ def test_cells_come_in_pages_with_a_link_to_the_next(
         ({"hands": []}, 422, "hands"),
         ({"grasps": 0}, 422, "grasps"),
         ({"views": 2}, 422, "views need scenes"),
-        ({"fidelity": "superb"}, 422, "unknown fidelity"),
-        ({"scene": "table", "method": "graspit"}, 422, "graspit plans around free objects only"),
         ({"scene": "bin", "neighbours": ["teapot"]}, 404, "there is no object 'teapot'"),
-        ({"neighbours": ["mug"]}, 422, "neighbours stand in a scene"),
         ({"name": "../etc"}, 422, "name"),
         ({"colour": "red"}, 422, "colour"),
     ],
@@ -128,8 +116,7 @@ def test_what_cannot_be_made_is_refused(http: TestClient, changes: dict[str, Any
 
 def test_another_dataset_of_the_same_name_is_a_conflict(http: TestClient, kitchen: dict[str, Any]) -> None:
     answer = http.post("/v1/datasets", json=WANTED | {"grasps": 32})
-    assert answer.status_code == 409
-    assert answer.json()["detail"] == "there is another dataset named 'kitchen' (its grasps is 64); take another name"
+    assert answer.status_code == 409 and "another dataset named 'kitchen'" in answer.json()["detail"]
 
 
 def test_an_estimate_records_nothing(http: TestClient) -> None:

@@ -15,9 +15,7 @@ from graspd.service.model.errors import UnavailableError
 from tests.waiting import PATIENCE_S
 
 
-def test_sixty_uploads_that_take_long_keep_no_other_request_waiting(
-    app: FastAPI, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_sixty_long_uploads_keep_no_other_request_waiting(app: FastAPI, monkeypatch: pytest.MonkeyPatch) -> None:
     hold = threading.Event()
     inside = threading.Semaphore(0)
 

@@ -13,13 +13,12 @@ from starlette.testclient import TestClient
 from graspd.api.uploads import files_of_upload
 from graspd.service.model import names
 from graspd.service.model.errors import LimitError
-from graspd.service.model.records import JobRecord
 from graspd.service.model.states import AssetKind
 from graspd.service.pipeline.backends import Services
 from graspd.service.store import network_file
 from graspd.service.store.library import load_asset_files
 from graspd.service.store.network_file import NETWORK_FILE, to_bytes
-from graspd.service.store.records import read_record
+from tests.fakes import record_of
 from tests.networks import random_network
 from tests.service.store.test_network_file import HOSTILE
 
@@ -35,7 +34,7 @@ def upload(http: TestClient, data: bytes, filename: str = "net.npz", **said: str
     return http.post("/v1/networks", files={"file": (filename, data)}, data=said)
 
 
-def test_an_upload_can_be_used_at_once_and_says_whose_grasps_it_proposes(http: TestClient, services: Services) -> None:
+def test_an_uploaded_network_can_be_used_at_once(http: TestClient, services: Services) -> None:
     data = of_hand(http)
     answer = upload(http, data)
     assert answer.status_code == 201, answer.text
@@ -49,7 +48,7 @@ def test_an_upload_can_be_used_at_once_and_says_whose_grasps_it_proposes(http: T
     assert list(services.index.feed.ready_checks(now=1e12, limit=9)) == [], "no worker is asked"
 
 
-def test_the_same_file_is_the_same_network_whatever_it_was_called(http: TestClient) -> None:
+def test_the_same_file_is_the_same_network(http: TestClient) -> None:
     data = of_hand(http)
     first, second = (upload(http, data, filename, name="net").json() for filename in ("a.npz", "b.npz"))
     assert first["digest"] == second["digest"]
@@ -93,16 +92,11 @@ def test_a_file_larger_than_any_network_is_not_read(monkeypatch: pytest.MonkeyPa
     assert file.tell() == 0
 
 
-def test_a_network_has_no_model_to_show(http: TestClient) -> None:
-    upload(http, of_hand(http))
-    assert http.get("/v1/networks/net/model").status_code == 404
-
-
 def test_a_job_names_a_network_and_keeps_its_digest(http: TestClient, services: Services) -> None:
     digest = upload(http, of_hand(http)).json()["digest"]
     answer = http.post("/v1/jobs", json=JOB)
     assert answer.status_code == 202, answer.text
-    record = read_record(JobRecord, services.store, names.job_record(answer.json()["id"]))
+    record = record_of(services, answer.json()["id"])
     assert record.request.network == digest
     refused = http.delete("/v1/networks/net")
     assert refused.status_code == 409 and record.id in refused.json()["detail"]
@@ -121,36 +115,25 @@ def test_a_job_names_a_network_and_keeps_its_digest(http: TestClient, services: 
         ({"options": {"network": "/etc/passwd"}}, 404, "there is no network"),
     ],
 )
-def test_a_job_that_the_network_does_not_fit_is_refused_in_a_line(
+def test_a_job_that_the_network_does_not_fit_is_refused(
     http: TestClient, changes: dict[str, Any], status: int, words: str
 ) -> None:
     upload(http, of_hand(http))
-    for path, body in (
-        ("/v1/jobs", JOB | changes),
-        (
-            "/v1/datasets",
-            {
-                **{k: v for k, v in (JOB | changes).items() if k not in ("hand", "object")},
-                "name": "d",
-                "hands": [(JOB | changes)["hand"]],
-                "objects": ["mug"],
-            },
-        ),
-    ):
+    job = JOB | changes
+    options = {name: value for name, value in job.items() if name not in ("hand", "object")}
+    dataset = {"name": "d", "hands": [job["hand"]], "objects": [job["object"]], **options}
+    for path, body in (("/v1/jobs", job), ("/v1/datasets", dataset)):
         answer = http.post(path, json=body)
         assert answer.status_code == status, answer.text
         assert words in json.dumps(answer.json(), ensure_ascii=False) and "\n" not in answer.json()["detail"]
 
 
-def test_a_network_that_nothing_needs_is_deleted(http: TestClient) -> None:
-    upload(http, of_hand(http))
-    assert http.delete("/v1/networks/net").status_code == 204
-    assert http.get("/v1/networks/net").status_code == 404
-
-
-def test_the_page_of_hands_shows_networks_once_there_are_any(http: TestClient) -> None:
+def test_the_page_of_hands_shows_networks_while_there_are_any(http: TestClient) -> None:
     assert "Networks" not in http.get("/hands").text
     digest = upload(http, of_hand(http)).json()["digest"]
     page = http.get("/hands").text
     barrett = http.get("/v1/hands/barrett").json()["digest"]
     assert digest[:12] in page and f"barrett ({barrett[:12]})" in page and "drawn by chance" in page
+    assert http.get("/v1/networks/net/model").status_code == 404
+    assert http.delete("/v1/networks/net").status_code == 204
+    assert http.get("/v1/networks/net").status_code == 404

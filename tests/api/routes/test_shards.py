@@ -23,16 +23,12 @@ def shard(http: TestClient, services: Services) -> str:
     return finish_all(services, record)[0].shard_id
 
 
-def test_a_downloaded_shard_opens_as_hdf5(http: TestClient, shard: str) -> None:
+def test_a_downloaded_shard_is_hdf5_with_its_sum_as_etag(http: TestClient, shard: str) -> None:
     answer = http.get(f"/v1/shards/{shard}/file")
     assert answer.headers["content-type"] == "application/x-hdf5"
+    assert answer.headers["etag"] == f'"{http.get(f"/v1/shards/{shard}").json()["sha256"]}"'
     with h5py.File(io.BytesIO(answer.content)) as file:
         assert file["grasp/hand_pose"].shape == (32, 7)
-
-
-def test_the_sum_of_a_shard_is_its_etag(http: TestClient, shard: str) -> None:
-    sha256 = http.get(f"/v1/shards/{shard}").json()["sha256"]
-    assert http.get(f"/v1/shards/{shard}/file").headers["etag"] == f'"{sha256}"'
 
 
 @pytest.mark.parametrize(
@@ -65,21 +61,15 @@ def test_a_store_that_signs_hands_the_file_out_itself(
     assert (answer.status_code, answer.headers["location"]) == (307, "https://bucket.example/signed")
 
 
-def test_grasps_come_in_the_order_asked_for(http: TestClient, shard: str) -> None:
+def test_grasps_come_in_the_order_and_by_the_filters_asked_for(http: TestClient, shard: str) -> None:
     grasps = http.get("/v1/grasps", params={"sort": "penetration_depth_mm", "order": "asc"}).json()["items"]
     depths = [grasp["penetration_depth_mm"] for grasp in grasps]
     assert depths == sorted(depths)
-
-
-def test_every_filter_of_grasps_holds(http: TestClient, shard: str) -> None:
     query = {"hand": "allegro", "valid": "true", "min_epsilon": 0.1, "max_intersection_volume_cm3": 0.3}
     grasps = http.get("/v1/grasps", params=query).json()["items"]
     assert grasps
     assert all(g["valid"] and g["epsilon"] >= 0.1 and g["intersection_volume_cm3"] <= 0.3 for g in grasps)
     assert http.get("/v1/grasps", params=query | {"hand": "shadow"}).json()["items"] == []
-
-
-def test_an_unknown_filter_is_refused(http: TestClient) -> None:
     assert http.get("/v1/grasps", params={"colour": "red"}).status_code == 422
 
 

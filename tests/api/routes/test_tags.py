@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from starlette.testclient import TestClient
 
-from graspd.api.access.keys import KeyFile, Scope
+from graspd.api.access.keys import Scope
 from graspd.api.app import create_app
 from graspd.service.index.rebuild import differences, rebuild
 from graspd.service.model import names
@@ -22,7 +22,7 @@ from graspd.service.pipeline.backends import Services
 from graspd.service.readers.where import parse
 from graspd.service.store.manifests import ShardManifest
 from graspd.service.store.shards import Shard, read_shard
-from tests.api.factories import add_job, finish_all
+from tests.api.factories import add_job, finish_all, people_of
 from tests.planning import plan_all
 
 Grasps = list[dict[str, Any]]
@@ -159,20 +159,9 @@ def test_what_is_not_there_or_too_much_gets_no_tag(
     assert "the most" in refused(413, grasps=named(made.shard_id, 1))
 
 
-def test_a_project_has_tags_of_its_own_and_a_key_changes_only_what_is_its(
-    services: Services, made: ShardManifest
-) -> None:
-    keys = KeyFile(services.settings.resolved_keys_file)
-    people = {
-        name: {"Authorization": f"Bearer {keys.add(name, scope, project=project)}"}
-        for name, scope, project in [
-            ("old", Scope.SUBMIT, ""),
-            ("new", Scope.SUBMIT, ""),
-            ("eve", Scope.READ, ""),
-            ("root", Scope.ADMIN, ""),
-            ("bob", Scope.SUBMIT, "blue"),
-        ]
-    }
+def test_a_project_has_tags_of_its_own(services: Services, made: ShardManifest) -> None:
+    submits = {name: (Scope.SUBMIT, project) for name, project in (("old", ""), ("new", ""), ("bob", "blue"))}
+    people = people_of(services.settings, **submits, eve=(Scope.READ, ""), root=(Scope.ADMIN, ""))
     body = {"name": "good", "grasps": named(made.shard_id, 1)}
     with TestClient(create_app(services.settings, services), base_url="https://graspd.example") as http:
 
@@ -190,9 +179,7 @@ def test_a_project_has_tags_of_its_own_and_a_key_changes_only_what_is_its(
         assert does("root", "DELETE", "/v1/tags/good") == 204
 
 
-def test_a_tag_is_taken_home_as_rows_and_as_shards_of_its_grasps_alone(
-    http: TestClient, made: ShardManifest, services: Services
-) -> None:
+def test_a_tag_is_exported_as_rows_and_as_shards(http: TestClient, made: ShardManifest, services: Services) -> None:
     give(http, "good", grasps=named(made.shard_id, 2, 30))
     give(http, "best", grasps=named(made.shard_id, 2))
     address = "/v1/grasps/export?tag=good&format="
@@ -216,7 +203,7 @@ def test_a_tag_is_taken_home_as_rows_and_as_shards_of_its_grasps_alone(
     assert http.get("/v1/grasps/export?tag=good&format=zip").content == answer.content
 
 
-def test_a_zip_of_nothing_of_too_much_or_of_a_damaged_shard_is_refused(
+def test_a_zip_of_nothing_too_much_or_a_damaged_shard_is_refused(
     http: TestClient, made: ShardManifest, services: Services, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     address = "/v1/grasps/export?format=zip"

@@ -16,7 +16,7 @@ from graspd.service.index.rebuild import differences, rebuild
 from graspd.service.model import names
 from graspd.service.model.errors import IndexUnavailable
 from graspd.service.model.planning import plan
-from graspd.service.model.records import AttemptRecord, JobRecord
+from graspd.service.model.records import JobRecord
 from graspd.service.model.states import AssetKind, State
 from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.backends import Services
@@ -24,12 +24,13 @@ from graspd.service.pipeline.controller import Controller
 from graspd.service.run.commands import app
 from graspd.service.settings import Settings
 from graspd.service.store.library import stored_assets
-from graspd.service.store.records import add_job_event, put_record, read_record
+from graspd.service.store.records import add_job_event, read_record
 from graspd.service.store.store import open_store
 from tests.damage import overwrite
-from tests.fakes import add_assets, make_shard, message_for, request
+from tests.fakes import add_assets, fail_task, make_shard, message_for, record_of, request
 from tests.indexes import empty_index
 from tests.memory_queue import MemoryQueue
+from tests.waiting import Clock
 
 GOOD = 3
 DAMAGED = b'{"x": 1}'
@@ -76,17 +77,12 @@ def made_one(services: Services) -> tuple[object, str]:  # type: ignore[type-arg
 
 
 def of_attempt(services: Services) -> str:
-    task = next(plan(read_record(JobRecord, services.store, of_job(services))))
-    key = names.attempt(task.id, 1)
-    fields = {"stage": task.stage, "number": 1, "kind": "K", "reason": "r", "worker": "w", "ended": "", "last": False}
-    put_record(services.store, key, AttemptRecord(task_id=task.id, job_id=a_job(services), **fields))
-    return key
+    return fail_task(services, job := a_job(services), next(plan(record_of(services, job))), last=False)
 
 
 def of_event(services: Services) -> str:
-    return names.job_event(
-        a_job(services), add_job_event(services.store, a_job(services), "cancelled").number, "cancelled"
-    )
+    event = add_job_event(services.store, a_job(services), "cancelled")
+    return names.job_event(a_job(services), event.number, "cancelled")
 
 
 def of_asset(services: Services) -> str:
@@ -166,13 +162,6 @@ def test_a_damaged_attempt_fails_its_task_and_stops_no_round(services: Services)
     assert sum(job.state is State.FAILED for job in services.index.jobs.page().items) <= 1
 
 
-class Clock:
-    now = 1000.0
-
-    def __call__(self) -> float:
-        return self.now
-
-
 def remove_file(folder: Path) -> None:
     for path in folder.glob("index.sqlite*"):
         path.unlink()
@@ -183,9 +172,7 @@ def remove_only_the_file(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("remove", [remove_file, remove_only_the_file])
-def test_an_index_removed_under_its_readers_is_made_again_for_all_of_them(
-    services: Services, remove: Callable[[Path], None]
-) -> None:
+def test_an_index_removed_under_its_readers_is_made_again(services: Services, remove: Callable[[Path], None]) -> None:
     controller = Controller(services)
     controller.round()
     other = Index(services.settings.resolved_index_url)

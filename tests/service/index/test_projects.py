@@ -5,32 +5,23 @@ from __future__ import annotations
 from graspd.service.index.rebuild import rebuild
 from graspd.service.index.views import UsageDay
 from graspd.service.model import names
-from graspd.service.model.clock import timestamp
 from graspd.service.model.messages import Origin
 from graspd.service.model.planning import RoundRobin, message_of, plan
 from graspd.service.model.projects import ProjectScope
 from graspd.service.model.records import JobRecord
-from graspd.service.model.states import AssetKind, Priority
+from graspd.service.model.states import Priority
+from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.backends import Services
 from graspd.service.store.records import put_record
-from tests.fakes import make_shard, request
+from tests.fakes import make_shard, make_task, request
 
-_PAIR = ((AssetKind.HAND, "gripper"), (AssetKind.OBJECT, "ball"))
 DAY, NEXT = "2026-11-20", "2026-11-21"
 
 
 def enter(services: Services, project: str, seed: int, *, key: str = "", batches: int = 1, where: int = 0) -> JobRecord:
     """A bulk job of a project, none of it in the queue; `where` is the first digit of its id."""
-    hand, obj = (services.index.assets.get(kind, name).digest for kind, name in _PAIR)
-    record = JobRecord(
-        id=f"{where:x}{seed:031x}",
-        request=request(grasps=32 * batches, seed=seed),
-        hand_digest=hand,
-        object_digest=obj,
-        priority=Priority.BULK,
-        created=timestamp(),
-        origin=Origin(key=key or project),
-        project=project,
+    record = job_actions.prepare(services, request(grasps=32 * batches, seed=seed), priority=Priority.BULK).model_copy(
+        update={"id": f"{where:x}{seed:031x}", "origin": Origin(key=key or project), "project": project}
     )
     put_record(services.store, names.job_record(record.id), record)
     services.index.write.add_job(record)
@@ -47,10 +38,9 @@ def make(
     return sum(manifest.valid or 0 for manifest in made)
 
 
-def usage(project: str, day: str, *, batches: int, valid: int, gpu: float = 0.0, cpu: float = 0.0) -> UsageDay:
-    return UsageDay(
-        project=project, day=day, grasps=32 * batches, valid=valid, tasks=batches, gpu_seconds=gpu, cpu_seconds=cpu
-    )
+def usage(project: str, day: str, *, batches: int, gpu: float = 0.0, cpu: float = 0.0, **more: int) -> UsageDay:
+    made = {"grasps": 32 * batches, "tasks": batches, "gpu_seconds": gpu, "cpu_seconds": cpu, **more}
+    return UsageDay(project=project, day=day, **made)
 
 
 def test_what_was_made_is_summed_for_each_project_and_day(services: Services) -> None:
@@ -69,20 +59,16 @@ def test_what_was_made_is_summed_for_each_project_and_day(services: Services) ->
     ]
 
 
-def test_gpu_seconds_of_a_day_are_those_of_gpu_workers_for_that_project(services: Services) -> None:
+def test_gpu_seconds_of_a_day_are_those_of_gpu_workers(services: Services) -> None:
     make(services, enter(services, "red", 1, batches=3))
     make(services, enter(services, "red", 2), device="cpu")
     make(services, enter(services, "red", 3), day=NEXT)
     make(services, enter(services, "blue", 4))
-    assert [services.index.usage.gpu_seconds(*of) for of in (("red", DAY), ("red", NEXT), ("blue", DAY))] == [
-        30,
-        10,
-        10,
-    ]
-    assert services.index.usage.gpu_seconds("green", DAY) == 0
+    for project, day, seconds in (("red", DAY, 30), ("red", NEXT, 10), ("blue", DAY, 10), ("green", DAY, 0)):
+        assert services.index.usage.gpu_seconds(project, day) == seconds
 
 
-def test_a_shard_that_two_projects_asked_for_is_charged_to_the_first(services: Services) -> None:
+def test_a_shard_that_two_projects_want_is_charged_to_the_first(services: Services) -> None:
     first = enter(services, "red", 1)
     second = first.model_copy(update={"id": "f" * 32, "project": "blue"})
     services.index.write.add_job(second)
@@ -107,17 +93,15 @@ def test_what_was_deleted_stays_counted(services: Services) -> None:
 
 def test_usage_is_the_same_after_the_index_was_made_anew(services: Services) -> None:
     for seed, project in enumerate(("red", "blue")):
-        record = enter(services, project, seed)
-        for task in plan(record):
-            manifest = make_shard(services.store, message_of(record, task, attempt=1, max_attempt=3))
-            services.index.write.add_manifest(manifest)
+        for task in plan(record := enter(services, project, seed)):
+            make_task(services, record, task)
     before = services.index.usage.days("2000-01-01", "2999-01-01")
     assert {day.project for day in before} == {"red", "blue"}
     rebuild(services.index, services.store)
     assert services.index.usage.days("2000-01-01", "2999-01-01") == before
 
 
-def test_projects_share_the_queue_evenly_whatever_their_keys_and_jobs_are(services: Services) -> None:
+def test_projects_share_the_queue_evenly(services: Services) -> None:
     for seed in range(6):
         enter(services, "greedy", seed, key=f"greedy-{seed % 3}", batches=6, where=seed * 2)
     enter(services, "modest", 9, batches=12, where=5)

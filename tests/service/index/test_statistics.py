@@ -40,30 +40,21 @@ def index(tmp_path: Path, values: np.ndarray) -> Iterator[Index]:
     opened.close()
 
 
-def test_a_summary_is_the_mean_and_range_of_what_passes_the_filter(index: Index, values: np.ndarray) -> None:
-    found = index.statistics.summaries(GraspFilter(valid=True), ("epsilon",))["epsilon"]
-    passed = values[::2]
-    assert found.count == len(passed)
+def test_a_summary_is_of_what_passes_the_filter(index: Index, values: np.ndarray) -> None:
+    """Of a metric that no grasp has, and where no grasp passes, there is none."""
+    summaries = index.statistics.summaries(GraspFilter(valid=True), ("epsilon", "contact_area_cm2"))
+    found, passed = summaries.pop("epsilon"), values[::2]
+    assert found.count == len(passed) and summaries == {}
     assert (found.mean, found.low, found.high) == pytest.approx((passed.mean(), passed.min(), passed.max()))
-
-
-def test_a_metric_that_no_grasp_has_is_left_out(index: Index) -> None:
-    assert set(index.statistics.summaries(GraspFilter(), ("epsilon", "contact_area_cm2"))) == {"epsilon"}
-
-
-def test_no_grasp_has_no_summary(index: Index) -> None:
     assert index.statistics.summaries(GraspFilter(hand="other"), ("epsilon",)) == {}
 
 
 def test_a_histogram_counts_as_numpy_does(index: Index, values: np.ndarray) -> None:
-    low, high = float(values.min()), float(values.max())
+    low, high, one = float(values.min()), float(values.max()), float(values[3])
     expected, _ = np.histogram(values, BINS, (low, high))
     assert index.statistics.histogram(GraspFilter(), "epsilon", low, high, BINS) == expected.tolist()
-
-
-def test_values_that_are_all_alike_fall_into_one_bin(index: Index, values: np.ndarray) -> None:
-    one = float(values[3])
-    assert index.statistics.histogram(GraspFilter(), "epsilon", one, one, BINS) == [1] + [0] * (BINS - 1)
+    alike = index.statistics.histogram(GraspFilter(), "epsilon", one, one, BINS)
+    assert alike == [1] + [0] * (BINS - 1)
 
 
 def test_distributions_of_few_grasps_are_exact(index: Index, values: np.ndarray) -> None:
@@ -75,7 +66,7 @@ def test_distributions_of_few_grasps_are_exact(index: Index, values: np.ndarray)
     assert found.metrics["epsilon"].mean == pytest.approx(passed.mean())
 
 
-def test_distributions_of_many_grasps_come_from_a_fair_sample_of_shards(index: Index) -> None:
+def test_distributions_of_many_grasps_come_from_a_fair_sample(index: Index) -> None:
     with index.database.writing() as connection:
         for number in range(400):
             shard = hashlib.sha256(str(number).encode()).hexdigest()[:32]
@@ -93,12 +84,4 @@ def test_distributions_of_many_grasps_come_from_a_fair_sample_of_shards(index: I
 def _shard(shard: str, **fields: object) -> dict[str, object]:
     texts = dict.fromkeys(("key", "sha256", "hand_digest", "object_digest", "device", "worker", "created"), "x")
     numbers = dict.fromkeys(("size_bytes", "valid", "batch", "seed", "seconds"), 0)
-    return {
-        "id": shard,
-        "kind": "base",
-        "stage": "synthesize",
-        "inputs": [],
-        "manifest": {},
-        **texts,
-        **numbers,
-    } | fields
+    return {"id": shard, "kind": "base", "stage": "synthesize", "inputs": [], "manifest": {}} | texts | numbers | fields

@@ -1,10 +1,25 @@
-"""What every error of graspd keeps: one line, whatever it quotes."""
+"""What every error keeps: one line, no secret, words of this project; and names that do not fit."""
 
 from __future__ import annotations
 
-import pytest
+import logging
+from typing import Any, Literal
 
-from graspd.service.model.errors import ERRORS, GraspdError
+import pytest
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+
+from graspd.api.uploads import name_of_upload
+from graspd.exchange.plan import plain_name
+from graspd.service.index.index import Index
+from graspd.service.index.sample import look
+from graspd.service.model.base import Name, refusal
+from graspd.service.model.errors import ERRORS, GraspdError, InputError, without_secrets
+from graspd.service.model.names import fitted
+from graspd.service.queue.connection import connect
+from graspd.service.run.address import ListenAddress
+from graspd.service.settings import Settings
+from graspd.service.store.store import open_store
+from graspd.service.telemetry import JsonLines, _TextLines
 
 
 @pytest.mark.parametrize("kind", ERRORS.values(), ids=ERRORS.keys())
@@ -13,9 +28,153 @@ def test_a_quoted_line_break_does_not_make_a_second_line(kind: type[GraspdError]
 
 
 @pytest.mark.parametrize("character", ["\r", "\x1b", "\x85", "\u2028", "\x00"])
-def test_separators_and_escapes_of_a_terminal_do_not_come_through(character: str) -> None:
+def test_separators_and_escapes_of_a_terminal_are_quoted(character: str) -> None:
     assert str(GraspdError(f"a{character}b")).isprintable()
 
 
 def test_a_message_in_another_script_stays_as_it_is() -> None:
     assert str(GraspdError("no hand 'Hände 手'")) == "no hand 'Hände 手'"
+
+
+class Kind(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+    n: int = Field(1, ge=1, le=9)
+    share: float = Field(0.5, gt=0, lt=1)
+    on: bool = True
+    name: Name = "mug"
+    fidelity: Literal["draft", "standard", "fine"] = "draft"
+    text: str = Field("", max_length=3)
+    names: tuple[str, ...] = Field((), max_length=1)
+
+    @field_validator("text")
+    @classmethod
+    def _no_x(cls, text: str) -> str:
+        if text == "x":
+            raise ValueError("x is taken")
+        return text
+
+
+@pytest.mark.parametrize(
+    ("given", "line"),
+    [
+        ({"n": 0}, "n: must be at least 1"),
+        ({"n": 10}, "n: must be at most 9"),
+        ({"n": "many"}, "n: must be a whole number"),
+        ({"n": 1.5}, "n: must be a whole number"),
+        ({"share": 0}, "share: must be more than 0"),
+        ({"share": 1}, "share: must be less than 1"),
+        ({"share": "half"}, "share: must be a number"),
+        ({"on": "perhaps"}, "on: must be true or false"),
+        (
+            {"name": "a/b"},
+            "name: must begin with a letter or digit and hold at most 64 letters, digits, dots, dashes and underscores",
+        ),
+        ({"fidelity": "strandard"}, "fidelity: must be one of draft, standard, fine; did you mean standard?"),
+        ({"fidelity": 3}, "fidelity: must be one of draft, standard, fine"),
+        ({"text": "long"}, "text: must have at most 3 characters"),
+        ({"text": "x"}, "text: x is taken"),
+        ({"names": ["a", "b"]}, "names: must have at most 1 item"),
+        ({"knob": 1}, "knob: is not known"),
+    ],
+)
+def test_the_first_mistake_is_one_line(given: dict[str, Any], line: str) -> None:
+    with pytest.raises(ValidationError) as refused:
+        Kind.model_validate(given)
+    assert refusal(refused.value).startswith(line)
+    assert "nput should" not in refusal(refused.value)
+
+
+SECRET = "s3cr3t"
+
+
+QUOTING = [
+    f"redis://:{SECRET}@host:6379/0 is away",
+    f"redis://:a/b#{SECRET}@host:6379",
+    f"postgresql+psycopg://me:{SECRET}@host/db?sslmode=require",
+    f"postgresql://host/db?user=me&password={SECRET}&x=1",
+    f"https://bucket.example/x?X-Amz-Signature={SECRET}&X-Amz-Expires=60",
+    f"az://box?sig={SECRET}",
+    f"'Authorization': 'Bearer gd_{SECRET}_and_more'",
+]
+
+
+@pytest.mark.parametrize("text", QUOTING)
+def test_an_error_and_a_log_line_hold_no_secret(text: str) -> None:
+    record = logging.LogRecord("graspd", logging.WARNING, "", 0, "%s", (text,), None)
+    record.detail = text
+    told = (str(GraspdError(text)), JsonLines("api").format(record), _TextLines().format(record))
+    assert not [one for one in told if SECRET in one]
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["file:///srv/a@b/store", "see https://example.org/a?x=1", "unix:///srv/a@b", "mail a@b.c", "graspd: gd_x"],
+)
+def test_what_is_no_secret_stays(text: str) -> None:
+    assert without_secrets(text) == text
+
+
+@pytest.mark.parametrize(
+    "url", [f"redis://:{SECRET}/x@host:6379", f"redis://:x@host:{SECRET}", f"http://me:{SECRET}@host", f"{SECRET}"]
+)
+def test_a_redis_url_that_cannot_be_used_is_not_told(url: str) -> None:
+    with pytest.raises(GraspdError, match=r"\(GRASPD_REDIS_URL\) cannot be used") as refused:
+        connect(url)
+    assert SECRET not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    "url", [f"postgresql+psycopg://me:x@host:{SECRET}/db", f"mysql://me:{SECRET}@host/db", f"{SECRET}", f"{SECRET}://x"]
+)
+def test_an_index_url_that_is_refused_is_told_without_password(url: str) -> None:
+    for opened in (Index, look):
+        with pytest.raises(InputError, match=r"\(GRASPD_INDEX_URL\) cannot be used"):
+            opened(url)
+    if not url.startswith(f"{SECRET}:"):
+        with pytest.raises(InputError) as refused:
+            Index(url)
+        assert SECRET not in str(refused.value)
+
+
+def test_a_store_url_that_is_refused_is_told_without_password() -> None:
+    with pytest.raises(InputError) as refused:
+        open_store(f"s4://me:{SECRET}@host")
+    assert SECRET not in str(refused.value)
+
+
+def test_settings_show_no_secret(monkeypatch: pytest.MonkeyPatch) -> None:
+    given = dict.fromkeys(("redis_url", "index_url", "api_key", "proxy_secret"), f"redis://:{SECRET}@host")
+    shown = Settings(**given)
+    assert SECRET not in f"{shown!r} {shown}"
+    monkeypatch.setenv("GRASPD_WEBHOOK_SECRET", SECRET)
+    with pytest.raises(ValidationError) as refused:
+        Settings()
+    assert SECRET not in f"{refused.value!r} {refused.value}"
+
+
+def test_what_other_machines_join_with_is_not_shown(tmp_path: object) -> None:
+    assert SECRET not in repr(ListenAddress(tmp_path, "host", "127.0.0.1", 1, SECRET))  # type: ignore[arg-type]
+
+
+LONG = "mujoco-Office_Depot_Canon_CL211XL_Remanufactured_Ink_Cartridge_TriColor"
+
+
+def test_the_file_of_a_thing_with_a_long_name_is_refused() -> None:
+    with pytest.raises(InputError, match=f"the name {LONG} has 71 characters, at most 64 are taken; give a shorter"):
+        name_of_upload(f"{LONG}.stl")
+
+
+def test_a_long_name_of_others_is_cut_told_and_stays_its_own(caplog: pytest.LogCaptureFixture) -> None:
+    fitted.cache_clear()
+    first, second = plain_name(LONG), plain_name(f"{LONG}2")
+    assert first != second and len(first) == len(second) == 64
+    assert plain_name(LONG) == first
+    assert [record.getMessage() for record in caplog.records] == [
+        f"the name {name} has more than 64 characters; it becomes {short}"
+        for name, short in ((LONG, first), (f"{LONG}2", second))
+    ]
+
+
+def test_a_short_name_stays_as_it_is() -> None:
+    assert plain_name("sem-Bottle a86d") == "sem-Bottle-a86d" and name_of_upload("mug.stl") == "mug"

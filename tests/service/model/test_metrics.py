@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
 import sys
 from typing import Any
 
@@ -16,6 +15,7 @@ from graspd.service.store.columns import SCHEMAS
 from graspd.service.store.store import open_store
 from tests.conftest import REPOSITORY
 from tests.one_more_metric import MEANING, NAME, TITLE
+from tests.shell import completed
 
 Found = dict[str, Any]
 
@@ -30,7 +30,7 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> Found:
     index.close()
     command = [sys.executable, "-m", "tests.one_more_metric", str(folder / "new"), older]
     (folder / "new").mkdir()
-    done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=False)
+    done = completed(command, cwd=REPOSITORY)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout.splitlines()[-1])
 
@@ -40,16 +40,10 @@ def test_the_metric_is_in_no_table_of_this_process() -> None:
     assert f"quality/{NAME}" not in SCHEMAS["base"]
 
 
-def test_a_shard_has_it_and_its_manifest_tells_it_of_each_grasp(found: Found) -> None:
+def test_shard_manifest_and_index_have_it_and_an_older_index_too(found: Found) -> None:
     assert found["schema"] == MEANING
     assert found["manifest"][0] == 0 and found["manifest"][-1] == 20
-
-
-def test_a_new_index_has_its_column_and_its_index(found: Found) -> None:
     assert NAME in found["index columns"] and f"grasps_{NAME}" in found["index indexes"]
-
-
-def test_an_index_that_was_made_before_gets_its_column_and_keeps_its_rows(found: Found) -> None:
     assert found["older index"] == [None] * 50
 
 
@@ -57,26 +51,17 @@ def test_the_api_filters_and_sorts_by_it_and_tells_it(found: Found) -> None:
     assert len(found["answer"]) >= 8
     assert found["answer"] == sorted(found["answer"]) and 5 <= found["answer"][0] <= found["answer"][-1] <= 10
     assert found["one grasp"] == 0 and 0 < found["mean"][NAME] < 20
-
-
-def test_a_filter_beyond_its_bounds_is_refused(found: Found) -> None:
     assert found["out of bounds"] == 422
-
-
-def test_the_openapi_document_has_its_parameters_and_says_what_it_means(found: Found) -> None:
     assert all(f'"{word}"' in found["openapi"] for word in (NAME, f"min_{NAME}", f"max_{NAME}", MEANING))
 
 
-def test_the_dashboard_has_its_column_its_filter_and_its_distribution(found: Found) -> None:
+def test_the_dashboard_has_its_column_filter_and_distribution(found: Found) -> None:
     page = found["list"]
     assert f"sort={NAME}" in page and f'name="min_{NAME}"' in page and 'max="50"' in page
     assert TITLE in found["grasp page"] and TITLE in found["job page"]
 
 
-def test_the_card_sums_it_up(found: Found) -> None:
+def test_the_card_sums_it_up_and_the_docs_explain_it(found: Found) -> None:
     assert all(hand[NAME]["max"] == 20 for hand in found["card"].values())
     assert f"| {TITLE.lower()}, N | " in found["card's table"]
-
-
-def test_the_docs_explain_it(found: Found) -> None:
     assert f"| `quality/{NAME}` | (N) | f8 | N | none | {MEANING} *(may be absent)* |" in found["docs"]

@@ -42,7 +42,7 @@ def test_where_nothing_is_seen_there_is_neither_point_nor_normal() -> None:
     assert np.isnan(surface_normals(points)).all()
 
 
-def test_a_fitted_normal_is_the_planes_on_both_sides_of_an_edge_and_at_the_rim() -> None:
+def test_a_fitted_normal_is_the_planes_beside_edges_and_rims() -> None:
     left, right = np.array([0.6, 0, -0.8]), np.array([0.0, 0.6, -0.8])
     depth = np.where(np.arange(WIDTH) < 30, plane_depth(left, -0.3), plane_depth(right, -0.6))
     points = back_project(K, depth)

@@ -1,6 +1,9 @@
-"""From jobs to tasks, and from facts to states."""
+"""From jobs to tasks, from facts to states, and what is told where fewer grasps were found than asked."""
 
 from __future__ import annotations
+
+import math
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -16,9 +19,12 @@ from graspd.service.model.planning import (
     batch_ready,
     batch_states,
     job_state,
+    limit_told,
     message_of,
     plan,
     priority_of,
+    shortfall,
+    totals,
 )
 from graspd.service.model.records import JobRecord
 from graspd.service.model.states import Priority, Stage, State
@@ -28,42 +34,26 @@ HAND, OBJECT = "a" * 32, "b" * 32
 
 
 def record(wanted: JobRequest) -> JobRecord:
+    digests = {"hand_digest": HAND, "object_digest": OBJECT}
     return JobRecord(
-        id=job_id(wanted, HAND, OBJECT),
-        request=wanted,
-        hand_digest=HAND,
-        object_digest=OBJECT,
-        priority=Priority.BULK,
-        created=timestamp(),
+        id=job_id(wanted, HAND, OBJECT), request=wanted, priority=Priority.BULK, created=timestamp(), **digests
     )
 
 
 def test_a_job_is_cut_into_batches_of_32_and_the_last_is_smaller() -> None:
-    tasks = list(plan(record(request(grasps=70))))
-    assert [task.count for task in tasks] == [32, 32, 6]
-    assert [task.batch for task in tasks] == [0, 1, 2]
+    assert [(task.batch, task.count) for task in plan(record(request(grasps=70)))] == [(0, 32), (1, 32), (2, 6)]
 
 
-@pytest.mark.parametrize(
-    ("changes", "stages"),
-    [
-        ({}, [Stage.SYNTHESIZE]),
-        ({"scenes": 2}, [Stage.SYNTHESIZE, Stage.SCENE]),
-        ({"scenes": 2, "views": 3}, [Stage.SYNTHESIZE, Stage.SCENE, Stage.RENDER]),
-    ],
-)
-def test_only_what_was_asked_for_is_planned(changes: dict[str, int], stages: list[Stage]) -> None:
-    assert [task.stage for task in plan(record(request(**changes)))] == stages
-
-
-def test_each_stage_reads_what_the_stage_before_writes() -> None:
+def test_only_what_was_asked_for_is_planned_stage_by_stage() -> None:
+    (alone,) = plan(record(request()))
+    assert (alone.stage, alone.inputs) == (Stage.SYNTHESIZE, ())
+    assert [task.stage for task in plan(record(request(scenes=2)))] == [Stage.SYNTHESIZE, Stage.SCENE]
     base, scene, views = plan(record(request(scenes=2, views=3)))
-    assert base.inputs == ()
-    assert scene.inputs == (base.output,)
-    assert views.inputs == (scene.output,)
+    assert [task.stage for task in (base, scene, views)] == [Stage.SYNTHESIZE, Stage.SCENE, Stage.RENDER]
+    assert (base.inputs, scene.inputs, views.inputs) == ((), (base.output,), (scene.output,))
 
 
-def test_more_views_are_other_pictures_of_the_same_grasps_and_scenes() -> None:
+def test_more_views_are_other_pictures_of_the_same_grasps() -> None:
     few, many = (list(plan(record(request(scenes=2, views=views)))) for views in (3, 4))
     assert [task.output for task in few[:2]] == [task.output for task in many[:2]]
     assert few[2].output != many[2].output
@@ -97,42 +87,31 @@ def facts(*stages: Stage, **of_first: object) -> list[TaskFacts]:
 CHAIN = (Stage.SYNTHESIZE, Stage.SCENE, Stage.RENDER)
 
 
-def test_only_the_first_stage_may_start_at_first() -> None:
-    states = batch_states(facts(*CHAIN), job_cancelled=False)
-    assert states == [State.QUEUED] * 3
-    assert batch_ready(states) == [True, False, False]
+DONE, QUEUED, FAILED, GONE = State.SUCCEEDED, State.QUEUED, State.FAILED, State.CANCELLED
 
 
-def test_a_finished_stage_frees_the_next_one() -> None:
-    states = batch_states(facts(*CHAIN, done=True), job_cancelled=False)
-    assert states == [State.SUCCEEDED, State.QUEUED, State.QUEUED]
-    assert batch_ready(states) == [False, True, False]
+OVER = {"last_attempt": 3, "exhausted": True}
 
 
-def test_what_follows_a_failed_task_is_cancelled_not_left_waiting() -> None:
-    states = batch_states(facts(*CHAIN, last_attempt=3, exhausted=True), job_cancelled=False)
-    assert states == [State.FAILED, State.CANCELLED, State.CANCELLED]
-    assert batch_ready(states) == [False] * 3
-
-
-def test_a_retried_task_waits_again_and_so_does_what_follows() -> None:
-    states = batch_states(facts(*CHAIN, last_attempt=3, exhausted=True, retried_upto=3), job_cancelled=False)
-    assert states == [State.QUEUED] * 3
-
-
-def test_a_failure_after_the_retry_counts() -> None:
-    chain = facts(*CHAIN, last_attempt=6, exhausted=True, retried_upto=3)
-    assert batch_states(chain, job_cancelled=False)[0] is State.FAILED
-
-
-def test_a_cancelled_job_keeps_what_is_done() -> None:
-    states = batch_states(facts(*CHAIN, done=True), job_cancelled=True)
-    assert states == [State.SUCCEEDED, State.CANCELLED, State.CANCELLED]
-
-
-def test_a_shard_that_turns_up_after_a_failure_counts_as_success() -> None:
-    states = batch_states(facts(*CHAIN, done=True, last_attempt=3, exhausted=True), job_cancelled=False)
-    assert states[0] is State.SUCCEEDED
+@pytest.mark.parametrize(
+    ("first", "cancelled", "states", "ready"),
+    [
+        ({}, False, [QUEUED] * 3, 0),
+        ({"done": True}, False, [DONE, QUEUED, QUEUED], 1),
+        (OVER, False, [FAILED, GONE, GONE], None),
+        (OVER | {"retried_upto": 3}, False, [QUEUED] * 3, 0),
+        (OVER | {"last_attempt": 6, "retried_upto": 3}, False, [FAILED, GONE, GONE], None),
+        ({"done": True}, True, [DONE, GONE, GONE], None),
+        (OVER | {"done": True}, False, [DONE, QUEUED, QUEUED], 1),
+    ],
+    ids=["new", "done", "failed", "retried", "failed after it", "cancelled", "a shard after a failure"],
+)
+def test_states_of_a_batch_follow_from_facts(
+    first: dict[str, Any], cancelled: bool, states: list[State], ready: int | None
+) -> None:
+    found = batch_states(facts(*CHAIN, **first), job_cancelled=cancelled)
+    assert found == states
+    assert batch_ready(found) == [place == ready for place in range(3)]
 
 
 @pytest.mark.parametrize(
@@ -154,3 +133,33 @@ def test_the_state_of_a_job_follows_from_its_tasks(tasks: set[str], state: str) 
 def test_the_wait_doubles_up_to_a_bound() -> None:
     assert [backoff(2.0, failures) for failures in (1, 2, 3)] == [2.0, 4.0, 8.0]
     assert backoff(2.0, 1000) == MAX_BACKOFF_S
+
+
+def test_all_that_were_asked_for_need_no_reason() -> None:
+    assert shortfall(8, 8, "valid", 12, 4, {"slipped": 4}) is None
+
+
+def test_the_counts_are_told_the_most_frequent_first() -> None:
+    lost = totals([{"slipped": 4, "no_place": 1}, {"slipped": 1, "turned": 2, "alike": 0}])
+    assert lost == {"no_place": 1, "turned": 2, "slipped": 5}
+    assert shortfall(0, 2, "valid", 8, 4, lost) == (
+        "found 0 of 2 valid grasps in 8 candidates: 5 slipped, 2 turned in the hand, 1 without a clear place or way in "
+        "the scene; the budget of 4 candidates for each ended first"
+    )
+
+
+def test_repeated_attempts_are_tries_of_the_budget() -> None:
+    said = str(shortfall(1, 4, "valid", 7, 4, {"not_lifted": 6, "repeated": 9}))
+    assert said.startswith(
+        "found 1 of 4 valid grasps in 16 candidates: 9 repeated attempts, 6 not lifted; the budget of 4"
+    )
+
+
+def test_a_limit_of_the_hand_stands_where_the_budget_would() -> None:
+    limit = limit_told("barrett", 0.6, 16, 5.66, math.inf, 100.0)
+    assert limit == "barrett lifts 5.7 kg at friction 0.6 in the best of 16 grasps; 100 kg are wanted"
+    assert str(shortfall(0, 4, "valid", 4, 4, {}, limit)) == f"found 0 of 4 valid grasps in 4 candidates; {limit}"
+
+
+def test_an_outcome_of_a_newer_version_is_told_by_its_name() -> None:
+    assert "3 fell apart" in str(shortfall(0, 2, "valid", 8, 4, totals([{"fell_apart": 3}])))

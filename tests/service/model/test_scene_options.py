@@ -20,41 +20,22 @@ from tests.fakes import request
 
 HAND, OBJECT = "a" * 32, "b" * 32
 #: A job as it was written before jobs had scenes.
-PLAIN: dict[str, Any] = {
-    "grasps": 32,
-    "method": "fast_graspd",
-    "fidelity": "standard",
-    "seed": 0,
-    "scenes": 0,
-    "views": 0,
-    "stereo": False,
-    "width": 320,
-    "height": 240,
-    "channels": [],
-    "friction": 1.0,
-    "want": "valid",
-    "budget": 4.0,
-    "validation": "standard",
-    "rechecks": 8,
-    "robustness": 0,
-    "options": {},
-    "target": "",
-}
+PLAIN: dict[str, Any] = (
+    {"grasps": 32, "method": "fast_graspd", "fidelity": "standard", "seed": 0, "scenes": 0, "views": 0}
+    | {"stereo": False, "width": 320, "height": 240, "channels": [], "friction": 1.0, "want": "valid", "budget": 4.0}
+    | {"validation": "standard", "rechecks": 8, "robustness": 0, "options": {}, "target": ""}
+)
 PLANE = {"kind": "half_space"}
 
 
 def record(wanted: JobRequest) -> JobRecord:
+    digests = {"hand_digest": HAND, "object_digest": OBJECT}
     return JobRecord(
-        id=job_id(wanted, HAND, OBJECT),
-        request=wanted,
-        hand_digest=HAND,
-        object_digest=OBJECT,
-        priority=Priority.BULK,
-        created=timestamp(),
+        id=job_id(wanted, HAND, OBJECT), request=wanted, priority=Priority.BULK, created=timestamp(), **digests
     )
 
 
-def test_a_job_without_a_scene_keeps_its_id_its_record_and_its_message() -> None:
+def test_a_job_without_a_scene_keeps_its_id_and_its_record() -> None:
     wanted = {**PLAIN, "hand": "gripper", "object": "ball"}
     job = record(request())
     assert job.request.model_dump(mode="json") == wanted
@@ -65,9 +46,8 @@ def test_a_job_without_a_scene_keeps_its_id_its_record_and_its_message() -> None
 
 
 def test_a_dataset_without_a_scene_keeps_its_digest() -> None:
-    made = describe(
-        "d", [Member(name="h", digest=HAND)], [Member(name="o", digest=OBJECT)], JobOptions(), lambda one: (one, None)
-    )
+    hands, objects = [Member(name="h", digest=HAND)], [Member(name="o", digest=OBJECT)]
+    made = describe("d", hands, objects, JobOptions(), lambda one: (one, None))
     options = {name: value for name, value in PLAIN.items() if name not in ("options", "target")}
     assert made.digest == digest_json({"hands": [["h", HAND]], "objects": [["o", OBJECT]], "options": options})
 
@@ -75,19 +55,11 @@ def test_a_dataset_without_a_scene_keeps_its_digest() -> None:
 def test_scenes_after_the_grasps_have_the_address_that_they_had() -> None:
     common = {"hand": HAND, "object": OBJECT, "names": ["gripper", "ball"], "batch": 1, "count": 32, "seed": 0}
     said = {**common, "stage": "scene", "revision": 2, "inputs": ["x"], "scenes": 3}
-    assert digest_json(said) == shard_id(
-        Stage.SCENE,
-        request=request(scenes=3),
-        hand_digest=HAND,
-        object_digest=OBJECT,
-        batch=1,
-        count=32,
-        revision=2,
-        inputs=("x",),
-    )
+    of = {"hand_digest": HAND, "object_digest": OBJECT, "batch": 1, "count": 32, "revision": 2, "inputs": ("x",)}
+    assert digest_json(said) == shard_id(Stage.SCENE, request=request(scenes=3), **of)
 
 
-def test_a_job_in_a_scene_is_another_job_and_makes_its_scenes_first() -> None:
+def test_a_job_in_a_scene_makes_its_scenes_first() -> None:
     job = record(request(scene="table", views=2))
     assert job.id != record(request(scenes=SCENES, views=2)).id
     scene, base, views = plan(job)
@@ -96,21 +68,15 @@ def test_a_job_in_a_scene_is_another_job_and_makes_its_scenes_first() -> None:
 
 
 @pytest.mark.parametrize(
-    "changes",
+    ("name", "value"),
     [
-        {"scene": "bin"},
-        {"scene": {"supports": [PLANE]}},
-        {"scenes": 5},
-        {"faces": "all"},
-        {"seed": 1},
-        {"touch": 2},
-        {"touch": -0.5},
-        {"fidelity": "draft"},
+        *[("scene", "bin"), ("scene", {"supports": [PLANE]}), ("scenes", 5), ("faces", "all"), ("seed", 1)],
+        *[("touch", 2), ("touch", -0.5), ("fidelity", "draft")],
     ],
 )
-def test_whatever_moves_scenes_gives_them_another_address(changes: dict[str, Any]) -> None:
+def test_whatever_moves_scenes_gives_them_another_address(name: str, value: Any) -> None:
     first = next(plan(record(request(scene="table"))))
-    assert next(plan(record(request(**{"scene": "table", **changes})))).output != first.output
+    assert next(plan(record(request(**{"scene": "table", name: value})))).output != first.output
 
 
 def test_where_no_number_of_scenes_is_named_there_are_a_few() -> None:
@@ -127,7 +93,7 @@ def test_a_document_is_a_scene_and_comes_back_as_it_was() -> None:
     assert JobRequest.model_validate_json(wanted.model_dump_json()) == wanted
 
 
-def test_fingertips_may_touch_unless_the_request_or_its_document_says_otherwise() -> None:
+def test_fingertips_may_touch_unless_it_is_said_otherwise() -> None:
     assert "touch" not in request(scene="table").model_dump()
     assert record(request(scene="table", touch=0)).id == record(request(scene="table")).id
     assert request(scene="table").place.touch == 0

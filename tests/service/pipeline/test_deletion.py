@@ -21,7 +21,7 @@ from graspd.service.pipeline.deletion import delete_asset, delete_dataset, delet
 from graspd.service.pipeline.garbage_collector import GarbageCollector
 from graspd.service.store.library import publish_asset
 from graspd.service.store.records import deletions, pending
-from tests.fakes import OBJECT_FILES, make_shard, request
+from tests.fakes import OBJECT_FILES, make_shard, request, with_settings
 from tests.planning import plan_all
 from tests.service.pipeline.datasets.makers import fail
 
@@ -59,11 +59,10 @@ def keys(services: Services, *prefixes: str) -> set[str]:
 
 def graceless(services: Services) -> GarbageCollector:
     """A garbage collector to which every released shard is old."""
-    eager = services.settings.model_copy(update={"shard_grace_s": -1.0})
-    return GarbageCollector(Services(eager, services.store, services.index, services.queue))
+    return GarbageCollector(with_settings(services, shard_grace_s=-1.0))
 
 
-def test_a_deleted_job_is_gone_at_once_and_its_objects_with_the_controller(services: Services) -> None:
+def test_a_deleted_job_is_gone_and_its_shards_after_a_grace_time(services: Services) -> None:
     job = finished(services)
     delete_job(services, job)
     with pytest.raises(NotFoundError):
@@ -72,18 +71,14 @@ def test_a_deleted_job_is_gone_at_once_and_its_objects_with_the_controller(servi
     assert not GarbageCollector(services).advance()
     assert keys(services, "jobs", "tasks", "deletions") == set()
     assert differences(services.index, services.store) == []
-
-
-def test_shards_that_nobody_needs_go_after_the_grace_time(services: Services) -> None:
-    job = finished(services)
-    delete_job(services, job)
-    GarbageCollector(services).advance()
     assert not GarbageCollector(services).collect()
     assert len(keys(services, "shards")) == 2, "there is grace"
     assert not graceless(services).collect(budget_s=60)
-    assert keys(services, "shards", "released") == set()
+    assert keys(services, "shards", "released", "removed") == set()
     assert services.index.overview.stats().grasps == 0
     assert differences(services.index, services.store) == []
+    with pytest.raises(NotFoundError, match="was deleted in the last 7 days"):
+        restore(services, "job", job, permit=lambda _: None)
 
 
 def test_a_shard_that_another_job_needs_stays(services: Services) -> None:
@@ -95,7 +90,7 @@ def test_a_shard_that_another_job_needs_stays(services: Services) -> None:
     assert services.index.jobs.get(long).grasps == 64
 
 
-def test_a_deleted_job_may_be_submitted_again_and_finds_its_shards(services: Services) -> None:
+def test_a_deleted_job_may_be_submitted_again(services: Services) -> None:
     job = finished(services)
     delete_job(services, job)
     with pytest.raises(ConflictError, match="still being removed"):
@@ -109,18 +104,25 @@ def test_a_deleted_job_may_be_submitted_again_and_finds_its_shards(services: Ser
     assert differences(services.index, services.store) == []
 
 
-def test_a_job_that_runs_is_in_use(services: Services) -> None:
-    job, _ = job_actions.submit(services, request())
+def test_what_runs_or_belongs_to_another_thing_is_in_use(services: Services) -> None:
+    job, _ = job_actions.submit(services, request(seed=3))
     with pytest.raises(ConflictError, match="is queued; cancel it first"):
         delete_job(services, job.id)
-    assert not pending(services.store)
-
-
-def test_a_job_of_a_dataset_is_in_use(services: Services) -> None:
-    dataset(services)
-    (job,) = services.index.jobs.page().items
+    actions.create(services, DatasetRequest(name="d", hands=("gripper",), objects=("ball",)))
+    with pytest.raises(ConflictError, match="cancel it first"):
+        delete_dataset(services, "d")
+    plan_all(services)
+    (of_dataset,) = set(_jobs(services)) - {job.id}
+    for one in (job.id, of_dataset):
+        job_actions.cancel(services, one)
     with pytest.raises(ConflictError, match="belongs to dataset 'd'"):
-        delete_job(services, job.id)
+        delete_job(services, of_dataset)
+    delete_job(services, job.id)
+    delete_dataset(services, "d")
+    collect_garbage(services)
+    actions.add_object_set(services, "kitchen", ["ball"])
+    with pytest.raises(ConflictError, match="the set of objects 'kitchen'"):
+        delete_asset(services, AssetKind.OBJECT, "ball")
 
 
 def test_a_deleted_dataset_takes_its_own_jobs_with_it(services: Services) -> None:
@@ -128,13 +130,14 @@ def test_a_deleted_dataset_takes_its_own_jobs_with_it(services: Services) -> Non
     dataset(services)
     dataset(services, "other", grasps=64)
     actions.snapshot(services, "d")
+    with pytest.raises(ConflictError, match=r"has 1 snapshot.*--with-snapshots"):
+        delete_dataset(services, "d")
+    assert services.index.datasets.get("d").name == "d" and not pending(services.store)
     delete_dataset(services, "d", with_snapshots=True)
     assert differences(services.index, services.store) == []
     with pytest.raises(ConflictError, match="still being removed"):
         dataset(services)
-    while GarbageCollector(services).advance():
-        pass
-    GarbageCollector(services).advance()
+    collect_garbage(services)
     assert {view.name for view in services.index.datasets.page().items} == {"other"}
     assert len(services.index.jobs.page().items) == 2
     assert services.index.jobs.get(own)
@@ -143,33 +146,18 @@ def test_a_deleted_dataset_takes_its_own_jobs_with_it(services: Services) -> Non
     dataset(services, "d", grasps=96)
 
 
-def test_a_dataset_that_runs_is_in_use(services: Services) -> None:
-    actions.create(services, DatasetRequest(name="d", hands=("gripper",), objects=("ball",)))
-    with pytest.raises(ConflictError, match="cancel it first"):
-        delete_dataset(services, "d")
-
-
-def test_a_dataset_that_was_just_cancelled_can_be_deleted(services: Services) -> None:
-    """Before the planner has told its jobs; those end with it."""
-    actions.create(services, DatasetRequest(name="d", hands=("gripper",), objects=("ball",)))
-    plan_all(services)
-    assert actions.cancel(services, "d").state is State.CANCELLED
-    delete_dataset(services, "d")
-    GarbageCollector(services).advance()
-    assert not services.index.jobs.page().items
-
-
-def test_a_cancelled_dataset_has_ended_though_another_waits_for_its_jobs(services: Services) -> None:
-    for name in ("d", "other"):
+@pytest.mark.parametrize("names", [["d"], ["d", "other"]])
+def test_a_dataset_that_was_just_cancelled_can_be_deleted(services: Services, names: list[str]) -> None:
+    """Before the planner has told its jobs; those end with it, unless another dataset waits for them."""
+    for name in names:
         actions.create(services, DatasetRequest(name=name, hands=("gripper",), objects=("ball",)))
     plan_all(services)
     assert actions.cancel(services, "d").state is State.CANCELLED
-    plan_all(services)
+    if "other" in names:
+        plan_all(services)
     delete_dataset(services, "d")
-    while GarbageCollector(services).advance():
-        pass
-    (job,) = services.index.jobs.page().items
-    assert job.state is State.QUEUED, "the other dataset waits for it"
+    collect_garbage(services)
+    assert [job.state for job in services.index.jobs.page().items] == [State.QUEUED] * (len(names) - 1)
 
 
 def test_a_hand_that_a_job_needs_is_in_use(services: Services) -> None:
@@ -180,12 +168,6 @@ def test_a_hand_that_a_job_needs_is_in_use(services: Services) -> None:
     delete_asset(services, AssetKind.HAND, "gripper")
     with pytest.raises(NotFoundError):
         job_actions.submit(services, request())
-
-
-def test_an_object_of_a_set_is_in_use(services: Services) -> None:
-    actions.add_object_set(services, "kitchen", ["ball"])
-    with pytest.raises(ConflictError, match="the set of objects 'kitchen'"):
-        delete_asset(services, AssetKind.OBJECT, "ball")
 
 
 def test_a_deleted_object_frees_its_name_and_its_files(services: Services) -> None:
@@ -208,7 +190,7 @@ def test_a_job_entered_while_its_hand_is_deleted_is_not_kept(services: Services)
 
 
 @pytest.mark.parametrize("what", ["job", "dataset", "object"])
-def test_a_deletion_that_broke_off_is_carried_out_by_the_next_controller(
+def test_the_next_controller_carries_out_a_broken_deletion(
     services: Services, what: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """At each removal of an object in turn, and between the record and the rows."""
@@ -239,15 +221,6 @@ def test_a_deletion_that_broke_off_is_carried_out_by_the_next_controller(
     )
 
 
-def test_a_dataset_with_a_snapshot_is_deleted_only_by_a_further_word(services: Services) -> None:
-    dataset(services)
-    actions.snapshot(services, "d")
-    with pytest.raises(ConflictError, match=r"has 1 snapshot.*--with-snapshots"):
-        delete_dataset(services, "d")
-    assert services.index.datasets.get("d").name == "d"
-    assert not pending(services.store)
-
-
 COLLECTED = pytest.mark.parametrize("collected", [False, True], ids=["at once", "after the controller"])
 
 
@@ -274,7 +247,7 @@ def test_a_deleted_job_is_restored_as_it_was(services: Services, collected: bool
 
 
 @COLLECTED
-def test_a_deleted_dataset_is_restored_with_its_jobs_and_snapshots(services: Services, collected: bool) -> None:
+def test_a_deleted_dataset_is_restored_with_jobs_and_snapshots(services: Services, collected: bool) -> None:
     dataset(services)
     actions.snapshot(services, "d")
     before = services.index.datasets.get("d"), services.index.datasets.snapshots("d").items, _jobs(services)
@@ -332,16 +305,6 @@ def test_a_deleted_tag_is_restored_with_its_grasps(services: Services) -> None:
     restore(services, "tag", "good", permit=lambda _: None)
     assert [(tag.name, tag.grasps) for tag in services.index.tags.all()] == [("good", 2)]
     assert not deletions(services.store)
-
-
-def test_after_the_grace_time_nothing_comes_back(services: Services) -> None:
-    job = finished(services)
-    delete_job(services, job)
-    collect_garbage(services)
-    assert not graceless(services).collect(budget_s=60)
-    assert keys(services, "removed") == set()
-    with pytest.raises(NotFoundError, match="was deleted in the last 7 days"):
-        restore(services, "job", job, permit=lambda _: None)
 
 
 def _jobs(services: Services) -> list[str]:

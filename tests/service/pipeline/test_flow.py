@@ -1,25 +1,33 @@
-"""Many tasks through one controller: reports, events in bulk, and stages that follow one another between two sweeps."""
+"""Many tasks through one controller: reports, events in bulk, stages between two sweeps, large jobs in pieces."""
 
 from __future__ import annotations
 
+import contextlib
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
+import pytest
+from sqlalchemy import func, select
+
+from graspd.service.index.changes.records import RANGES_AT_ONCE
+from graspd.service.index.rebuild import differences
+from graspd.service.index.tables import tasks
+from graspd.service.model import names
 from graspd.service.model.clock import timestamp
+from graspd.service.model.errors import ConflictError
 from graspd.service.model.states import Priority, Stage, State
-from graspd.service.model.workers import WorkerBeat, own_ability
+from graspd.service.model.workers import own_ability
 from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.backends import Services
-from graspd.service.pipeline.controller import Controller
+from graspd.service.pipeline.controller import Controller, PeriodicDuty
+from graspd.service.pipeline.deletion import delete_job
 from graspd.service.queue.port import Event, EventKind
-from tests.fakes import make_shard, request
+from tests.fakes import beat_of, make_shard, request, with_settings
 from tests.memory_queue import Delivery, MemoryQueue
-
-
-class Clock:
-    now = 1000.0
-
-    def __call__(self) -> float:
-        return self.now
+from tests.waiting import Clock
 
 
 def taken(services: Services) -> list[Delivery]:
@@ -47,9 +55,15 @@ def _event(delivery: Delivery, kind: EventKind) -> Event:
     )
 
 
-def test_the_next_stage_is_queued_without_waiting_for_a_sweep(services: Services) -> None:
-    controller = Controller(services, clock=Clock())
-    controller.round()
+@pytest.fixture
+def controller(services: Services) -> Controller:
+    """One that leads, to whom time passes by its clock alone."""
+    made = Controller(services, clock=Clock())
+    made.round()
+    return made
+
+
+def test_the_next_stage_is_queued_without_waiting_for_a_sweep(services: Services, controller: Controller) -> None:
     job_actions.submit(services, request(scenes=2))
     (first,) = taken(services)
     finish(services, first)
@@ -57,76 +71,177 @@ def test_the_next_stage_is_queued_without_waiting_for_a_sweep(services: Services
     assert [delivery.message.stage for delivery in taken(services)] == [Stage.SCENE]
 
 
-def test_a_task_that_runs_is_not_queued_again_between_two_sweeps(services: Services) -> None:
-    controller = Controller(services, clock=Clock())
-    controller.round()
-    job_actions.submit(services, request(grasps=96), priority=Priority.BULK)
+def test_what_runs_is_not_queued_and_many_ends_are_one_round(services: Services, controller: Controller) -> None:
+    job, _ = job_actions.submit(services, request(grasps=32 * 150), priority=Priority.BULK)
     held = taken(services)
     finish(services, held[0])
     controller.round()
     assert services.queue.waiting() == set()
-
-
-def test_many_ends_at_once_are_one_round(services: Services) -> None:
-    controller = Controller(services, clock=Clock())
-    controller.round()
-    job, _ = job_actions.submit(services, request(grasps=32 * 150), priority=Priority.BULK)
-    for delivery in taken(services):
+    for delivery in held[1:]:
         finish(services, delivery)
     controller.round()
     done = services.index.jobs.get(job.id)
     assert (done.state, done.grasps) == (State.SUCCEEDED, 32 * 150)
 
 
-def test_how_far_a_task_is_reaches_the_index_until_it_ends(services: Services) -> None:
-    clock = Clock()
-    controller = Controller(services, clock=clock)
-    controller.round()
+def test_progress_of_a_task_reaches_the_index_and_goes(services: Services, controller: Controller) -> None:
     job, _ = job_actions.submit(services, request())
     (held,) = taken(services)
     assert isinstance(services.queue, MemoryQueue)
-    busy = replace(WorkerBeat.of_this_process("w0", "cpu", Stage), task_id=held.message.task_id)
+    busy = replace(beat_of("w0"), task_id=held.message.task_id)
     services.queue._workers["w0"] = replace(busy, done=3.0, total=4.0, message="descending")
-    clock.now += 1.0
+    controller._clock.now += 1.0
     controller.round()
     (task,) = services.index.jobs.tasks(job=job.id).items
     assert (task.done, task.total, task.message) == (3.0, 4.0, "descending")
     finish(services, held)  # and its worker has not said so yet
     services.queue._workers["w0"] = replace(busy, done=4.0, total=4.0, message="late")
     for _ in range(2):
-        clock.now += 1.0
+        controller._clock.now += 1.0
         controller.round()
     (task,) = services.index.jobs.tasks(job=job.id).items
     assert task.state is State.SUCCEEDED and task.message != "late"
 
 
 def test_a_fleet_larger_than_the_window_finds_work(services: Services) -> None:
-    small = Services(
-        services.settings.model_copy(update={"queue_window": 1}), services.store, services.index, services.queue
-    )
+    small = with_settings(services, queue_window=1)
     assert isinstance(services.queue, MemoryQueue)
-    now, own = timestamp(), own_ability()
-    for name in map(str, range(20)):
-        services.queue._workers[name] = WorkerBeat(
-            name,
-            "h",
-            1,
-            "cpu",
-            "",
-            (Stage.SYNTHESIZE,),
-            "0",
-            "idle",
-            "",
-            now,
-            now,
-            "",
-            own.schemas,
-            dict(own.revisions),
-        )
-    clock = Clock()
-    controller = Controller(small, clock=clock)
+    own = own_ability()
+    can = {"stages": (Stage.SYNTHESIZE,), "schemas": own.schemas, "revisions": dict(own.revisions)}
+    services.queue._workers.update({name: beat_of(name, **can) for name in map(str, range(20))})
+    controller = Controller(small, clock=(clock := Clock()))
     controller.round()
     job_actions.submit(small, request(grasps=32 * 100), priority=Priority.BULK)
     clock.now += 1.0
     controller.round()
     assert len(services.queue.waiting()) == 40
+
+
+@pytest.mark.parametrize(
+    ("cost_s", "pause_s"), [(0.0, 1.0), (0.25, 1.0), (1.0, 4.0), (3.0, 6.0)], ids=["free", "cheap", "dear", "bounded"]
+)
+def test_the_pause_follows_from_the_cost(cost_s: float, pause_s: float) -> None:
+    clock, done = Clock(), list[float]()
+
+    def work() -> None:
+        clock.now += cost_s
+        done.append(clock.now)
+
+    duty = PeriodicDuty(clock, work, 1.0, share=0.2, longest_s=6.0)
+    duty()
+    clock.now += pause_s - 0.01
+    duty()
+    assert len(done) == 1
+    clock.now += 0.02
+    duty()
+    assert len(done) == 2
+
+
+@pytest.mark.parametrize("work", [lambda: 1 / 0, lambda: True], ids=["broke off", "has more to do"])
+def test_what_is_not_done_is_due_at_once(work: Callable[[], object]) -> None:
+    begun: list[int] = []
+    duty = PeriodicDuty(Clock(), lambda: begun.append(1) or work(), 1.0)  # type: ignore[func-returns-value]
+    for _ in range(2):
+        with contextlib.suppress(ZeroDivisionError):
+            duty()
+    assert len(begun) == 2
+
+
+WorkOff = Callable[[], list[tuple[str, int]]]
+
+
+LARGE = 32 * (2 * RANGES_AT_ONCE + 1)
+
+
+def entered(services: Services) -> int:
+    with services.index.database.reading() as connection:
+        return int(connection.scalar(select(func.count()).select_from(tasks)) or 0)
+
+
+@pytest.fixture
+def now() -> list[float]:
+    """The time that the entering reads."""
+    return [0.0]
+
+
+@pytest.fixture
+def entering(services: Services, now: list[float]) -> Controller:
+    """One that leads already: the index is whole."""
+    made = Controller(services, clock=lambda: now[0])
+    made.round()
+    return made
+
+
+@pytest.fixture
+def work_off(services: Services, entering: Controller, now: list[float]) -> WorkOff:
+    """Enters all that is left, and gives the job and the number of rows of each turn."""
+
+    def enter() -> list[tuple[str, int]]:
+        turns = []
+        while services.index.write.entering():
+            before = entered(services)
+            now[0] += 10.0
+            entering.round()
+            turns.append((entering._entered, entered(services) - before))
+        return turns
+
+    return enter
+
+
+def test_turns_are_short_and_alternate(services: Services, work_off: WorkOff) -> None:
+    jobs = [job_actions.submit(services, request(grasps=LARGE, seed=seed))[0].id for seed in range(2)]
+    assert entered(services) == 2 * RANGES_AT_ONCE
+    turns = work_off()
+    assert [job for job, _ in turns] == 2 * sorted(jobs)
+    assert [rows for _, rows in turns] == [RANGES_AT_ONCE, RANGES_AT_ONCE, 1, 1]
+    assert differences(services.index, services.store) == []
+
+
+def test_a_job_is_told_whole_before_it_is_entered(services: Services) -> None:
+    job, _ = job_actions.submit(services, request(grasps=LARGE))
+    assert [(stage.tasks, stage.queued) for stage in job.stages] == [(LARGE // 32, LARGE // 32)]
+
+
+def test_a_job_that_is_being_entered_has_not_ended(services: Services, work_off: WorkOff) -> None:
+    job, _ = job_actions.submit(services, request(grasps=LARGE))
+    assert not job_actions.cancel(services, job.id).state.is_final
+    with pytest.raises(ConflictError):
+        delete_job(services, job.id)
+    work_off()
+    assert services.index.jobs.get(job.id).state is State.CANCELLED
+    assert differences(services.index, services.store) == []
+
+
+def test_the_same_job_again_begins_nothing_anew(services: Services, work_off: WorkOff) -> None:
+    job, _ = job_actions.submit(services, request(grasps=LARGE))
+    work_off()
+    again, new = job_actions.submit(services, request(grasps=LARGE))
+    assert (again.id, new, services.index.write.entering()) == (job.id, False, [])
+
+
+def test_a_job_whose_record_is_gone_is_given_up(services: Services, work_off: WorkOff) -> None:
+    job, _ = job_actions.submit(services, request(grasps=LARGE))
+    services.store.delete(names.job_record(job.id))
+    assert work_off() == [(job.id, 0)]
+
+
+@pytest.mark.slow
+def test_five_jobs_of_a_million_delay_a_small_one_by_under_3_s(services: Services) -> None:
+    stop, waits = threading.Event(), list[float]()
+    leading = Controller(services)
+    leading.round()
+    entering = threading.Thread(target=leading.run, args=(stop,))
+    entering.start()
+    with ThreadPoolExecutor(5) as pool:
+        large = [pool.submit(job_actions.submit, services, request(grasps=10**6, seed=seed)) for seed in range(5)]
+        number = 0
+        while not all(one.done() for one in large) or services.index.write.entering():
+            number += 1
+            start = time.monotonic()
+            job_actions.submit(services, request(grasps=1, seed=100 + number))
+            waits.append(time.monotonic() - start)
+    stop.set()
+    entering.join()
+    print(f"{number} small jobs beside five large ones: longest wait {max(waits):.2f} s")
+    assert entered(services) == 5 * 31_250 + number
+    assert max(waits) < 3

@@ -35,7 +35,7 @@ def first(tmp_path: Path) -> Services:
     return made
 
 
-def test_a_second_service_on_a_store_is_refused_with_the_ways_out(first: Services, tmp_path: Path) -> None:
+def test_a_second_service_on_a_store_is_refused(first: Services, tmp_path: Path) -> None:
     second = service(tmp_path / "second", store=first.store)
     for _ in range(2):
         with pytest.raises(BusyError, match=r"belongs to another graspd service.*a store of its own.*index rebuild"):
@@ -43,11 +43,11 @@ def test_a_second_service_on_a_store_is_refused_with_the_ways_out(first: Service
     assert second.queue.service() is None
 
 
-def test_a_second_service_on_a_redis_is_refused_with_the_ways_out(first: Services, tmp_path: Path) -> None:
+def test_a_second_service_on_a_redis_is_refused(first: Services, tmp_path: Path) -> None:
     second = service(tmp_path / "second", queue=first.queue)
-    for _ in range(2):
+    for take_over in (False, False, True):
         with pytest.raises(BusyError, match=r"Redis belongs to another graspd service.*GRASPD_REDIS_URL"):
-            identify(second)
+            identify(second, take_over=take_over)
 
 
 def test_a_worker_of_another_store_is_refused(first: Services, tmp_path: Path) -> None:
@@ -62,6 +62,7 @@ def test_processes_that_begin_a_service_at_once_agree(tmp_path: Path) -> None:
     one = service(tmp_path)
     other = Services(one.settings, one.store, Index(one.settings.resolved_index_url), one.queue)
     assert identify(one) == identify(other) == one.queue.service()
+    assert identify(one, take_over=True) == one.queue.service(), "a rebuild of its own index"
     assert len(service_ids(one.store)) == 1
 
 
@@ -70,12 +71,12 @@ def test_a_lost_redis_becomes_the_services_again(first: Services) -> None:
     assert identify(emptied) == emptied.queue.service() == first.queue.service()
 
 
-def test_an_index_on_another_machine_or_a_lost_one_is_the_services(first: Services, tmp_path: Path) -> None:
+def test_an_index_elsewhere_or_a_lost_one_is_the_services(first: Services, tmp_path: Path) -> None:
     other = service(tmp_path / "other", store=first.store, queue=first.queue)
     assert identify(other) == first.index.notes.service() == other.index.notes.service()
 
 
-def test_a_data_folder_whose_index_and_redis_are_lost_remembers_its_service(tmp_path: Path) -> None:
+def test_a_data_folder_remembers_its_service(tmp_path: Path) -> None:
     store = open_store((tmp_path / "store").as_uri())
     made = service(tmp_path / "first", store=store)
     mine = identify(made, folder=made.settings.data_dir)
@@ -116,17 +117,6 @@ def test_a_service_that_takes_over_is_the_only_one_from_then_on(first: Services,
         identify(second)
 
 
-def test_a_rebuild_of_the_services_own_index_changes_no_identity(first: Services) -> None:
-    assert identify(first, take_over=True) == first.queue.service()
-    assert len(service_ids(first.store)) == 1
-
-
-def test_a_take_over_takes_nobodys_redis(first: Services, tmp_path: Path) -> None:
-    second = service(tmp_path / "second", queue=first.queue)
-    with pytest.raises(BusyError, match="Redis belongs to another"):
-        identify(second, take_over=True)
-
-
 def test_an_index_of_another_store_is_refused(first: Services, tmp_path: Path) -> None:
     second = service(tmp_path / "second")
     identify(second)
@@ -135,7 +125,7 @@ def test_an_index_of_another_store_is_refused(first: Services, tmp_path: Path) -
         identify(mixed)
 
 
-def test_a_controller_ends_when_another_service_takes_over_its_store(first: Services, tmp_path: Path) -> None:
+def test_a_controller_ends_when_its_store_is_taken_over(first: Services, tmp_path: Path) -> None:
     now = [0.0]
     controller = Controller(first, clock=lambda: now[0])
     controller.round()

@@ -7,7 +7,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
+from graspd.service.index.notes import Damage
 from graspd.service.index.rebuild import differences
 from graspd.service.model import names
 from graspd.service.model.errors import DamagedShard
@@ -18,6 +20,7 @@ from graspd.service.pipeline.controller import Controller
 from graspd.service.pipeline.integrity import BAD_MANIFEST, FOREIGN, MISSING, NO_MANIFEST, scan
 from graspd.service.pipeline.repair import repair
 from graspd.service.queue.port import EventKind
+from graspd.service.run import commands, store_commands
 from graspd.service.store.manifests import ShardManifest, load_manifest, load_shard
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.process.runner import Runner
@@ -32,6 +35,10 @@ SHARDS = 6
 @pytest.fixture(params=["files", pytest.param("s3", marks=pytest.mark.s3)])
 def services(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Services]:
     yield from parts_on(request.param, request, tmp_path)
+
+
+def findings(services: Services) -> list[Damage]:
+    return [wrong for _, wrong in scan(services.store) if wrong is not None]
 
 
 @pytest.fixture
@@ -80,88 +87,67 @@ def harm(services: Services, shards: list[ShardManifest]) -> dict[str, str]:
 
 
 def test_five_kinds_of_damage_are_five_findings(services: Services, shards: list[ShardManifest]) -> None:
-    assert [wrong for _, wrong in scan(services.store) if wrong is not None] == []
+    assert findings(services) == []
     done = harm(services, shards)
-    found = {wrong.shard: wrong.what for _, wrong in scan(services.store) if wrong is not None}
+    found = {wrong.shard: wrong.what for wrong in findings(services)}
     assert found.keys() == done.keys()
     assert all(done[shard] in what for shard, what in found.items())
 
 
 def test_what_is_made_again_has_the_checksum_it_had(services: Services, shards: list[ShardManifest]) -> None:
     harm(services, shards)
-    before = {m.shard_id: m.sha256 for m in shards}
-    found = [wrong for _, wrong in scan(services.store) if wrong is not None]
-    repaired, left = repair(services, found)
+    repaired, left = repair(services, findings(services))
     # The worker of a file without a manifest may be about to put it.
     assert [one.what for one in left] == [f"{NO_MANIFEST}; its manifest may be on its way; run it again in a minute"]
     assert len(repaired) == 4
     work_off(services)
     for manifest in (*shards[:4], shards[5]):
         load_shard(services.store, manifest.stage, manifest.shard_id)
-        made = load_manifest(services.store, manifest.stage, manifest.shard_id)
-        assert made.sha256 == before[manifest.shard_id]
-    assert [wrong.what for _, wrong in scan(services.store) if wrong is not None] == [NO_MANIFEST]
+        assert load_manifest(services.store, manifest.stage, manifest.shard_id).sha256 == manifest.sha256
+    assert [wrong.what for wrong in findings(services)] == [NO_MANIFEST]
 
 
 def test_what_comes_out_otherwise_is_not_put(services: Services, shards: list[ShardManifest]) -> None:
     remove(services.store, shards[0].key)
-    repair(services, [wrong for _, wrong in scan(services.store) if wrong is not None])
+    repair(services, findings(services))
     assert work_off(services, device="cuda:0") == [EventKind.CANCELLED]
     with pytest.raises(DamagedShard):
         load_shard(services.store, shards[0].stage, shards[0].shard_id)
     assert differences(services.index, services.store) == []
 
 
-def test_a_foreign_object_is_found_and_moved_aside(services: Services, shards: list[ShardManifest]) -> None:
+def test_a_foreign_object_is_moved_and_a_bad_record_needs_a_copy(
+    services: Services, shards: list[ShardManifest]
+) -> None:
     services.store.put("shards/base/notes.txt", b"mine")
-    found = [wrong for _, wrong in scan(services.store) if wrong is not None]
+    found = findings(services)
     assert [one.what for one in found] == [FOREIGN]
     repair(services, found)
     assert services.store.get("damaged/shards/base/notes.txt") == b"mine"
-    assert [wrong for _, wrong in scan(services.store) if wrong is not None] == []
-
-
-def test_a_damaged_record_is_found_and_said_to_need_a_copy(services: Services, shards: list[ShardManifest]) -> None:
+    assert findings(services) == []
     key = names.job_record(services.index.jobs.page().items[0].id)
     overwrite(services.store, key, b'{"x": 1}')
-    found = [wrong for _, wrong in scan(services.store) if wrong is not None]
+    found = findings(services)
     assert [one.key for one in found] == [key]
     repaired, left = repair(services, found)
-    assert not repaired
-    assert "put a copy in its place" in left[0].what
+    assert not repaired and "put a copy in its place" in left[0].what
 
 
-def test_the_command_tells_what_is_damaged_and_exits_with_1(
+def test_the_commands_tell_what_is_damaged_and_exit_with_1(
     services: Services, shards: list[ShardManifest], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from typer.testing import CliRunner
-
-    from graspd.service.run.store_commands import app
-
     monkeypatch.setenv("GRASPD_STORE_URL", services.store.url)
-    command = ["store", "verify", "--json", "--data-dir", str(services.settings.data_dir)]
-    feasible = CliRunner().invoke(app, command)
+    folder = ["--data-dir", str(services.settings.data_dir)]
+    verify, check = ["store", "verify", "--json", *folder], ["index", "rebuild", "--check", *folder]
+    feasible = CliRunner().invoke(store_commands.app, verify)
     assert (feasible.exit_code, json.loads(feasible.stdout)["damaged"]) == (0, []), feasible.output
+    assert CliRunner().invoke(commands.app, check).exit_code == 0
     done = harm(services, shards)
-    told = CliRunner().invoke(app, command)
+    told = CliRunner().invoke(store_commands.app, verify)
     assert told.exit_code == 1
     said = json.loads(told.stdout.splitlines()[-1])
     assert {one["shard"] for one in said["damaged"]} | set(said["missing"]) == done.keys()
     assert said["missing"] == [shards[2].shard_id]
     assert services.index.damage.known()[0] == 5
-
-
-def test_a_check_of_the_index_sees_damaged_shards_too(
-    services: Services, shards: list[ShardManifest], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from typer.testing import CliRunner
-
-    from graspd.service.run.commands import app
-
-    monkeypatch.setenv("GRASPD_STORE_URL", services.store.url)
-    command = ["index", "rebuild", "--check", "--data-dir", str(services.settings.data_dir)]
-    assert CliRunner().invoke(app, command).exit_code == 0
-    flip(services.store, shards[0].key)
-    told = CliRunner().invoke(app, command)
-    assert told.exit_code == 1
-    assert shards[0].key in told.output
+    told = CliRunner().invoke(commands.app, check)
+    assert told.exit_code == 1 and shards[0].key in told.output

@@ -6,21 +6,22 @@ import threading
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
 from graspd.service.model import names
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.controller import Controller
 from graspd.service.pipeline.integrity import FOLDERS, MISSING, NO_MANIFEST
 from graspd.service.pipeline.integrity_scan import IntegrityScan, Interrupted, ReadPermit
+from graspd.service.run.store_commands import app
 from graspd.service.settings import Settings
 from graspd.service.store.manifests import ShardManifest
 from graspd.service.store.store import open_store
 from tests.damage import flip, overwrite, remove
-from tests.fakes import make_shard, message_for
+from tests.fakes import make_shard, message_for, with_settings
 from tests.indexes import empty_index
 from tests.memory_queue import MemoryQueue
-
-WAIT_S = 30.0
+from tests.waiting import PATIENCE_S, until
 
 
 class Slept(threading.Event):
@@ -93,13 +94,7 @@ def test_a_file_whose_manifest_may_be_on_its_way_is_no_damage(services: Services
 def test_it_reads_no_faster_than_the_settings_say(services: Services, shards: list[ShardManifest]) -> None:
     size = sum(manifest.size_bytes for manifest in shards)
     stop = Slept()
-    slow = Services(
-        services.settings.model_copy(update={"integrity_scan_mb_per_s": size / 2**20 / 100}),
-        services.store,
-        services.index,
-        services.queue,
-    )
-    a_round(slow, stop)
+    a_round(with_settings(services, integrity_scan_mb_per_s=size / 2**20 / 100), stop)
     assert stop.now > 99.0
 
 
@@ -138,27 +133,17 @@ def test_it_makes_way_for_a_verify_and_goes_on_afterwards(services: Services, sh
 
 
 def test_a_verify_takes_the_turn_from_a_controller(services: Services) -> None:
-    controller = ReadPermit(services, is_controller=True)
-    assert controller.is_mine()
+    assert ReadPermit(services, is_controller=True).is_mine()
     assert not ReadPermit(services, is_controller=True).is_mine()
     assert ReadPermit(services, is_controller=False).is_mine()
 
 
-def test_a_second_verify_is_refused(
-    services: Services, shards: list[ShardManifest], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    from typer.testing import CliRunner
-
-    from graspd.service.run.store_commands import app
-
-    folder = tmp_path / "one"
-    settings = Settings(data_dir=folder)
-    other = Services(
-        settings, open_store(settings.resolved_store_url), empty_index(settings.resolved_index_url), MemoryQueue()
-    )
+def test_a_second_verify_is_refused(tmp_path: Path) -> None:
+    settings = Settings(data_dir=tmp_path)
+    index = empty_index(settings.resolved_index_url)
+    other = Services(settings, open_store(settings.resolved_store_url), index, MemoryQueue())
     assert ReadPermit(other, is_controller=False).is_mine()
-    command = ["store", "verify", "--data-dir", str(folder)]
-    refused = CliRunner().invoke(app, command)
+    refused = CliRunner().invoke(app, ["store", "verify", "--data-dir", str(tmp_path)])
     other.close()
     assert refused.exit_code == 2
     assert "another `graspd admin store verify`" in refused.output
@@ -169,26 +154,17 @@ def test_the_controller_scans_beside_its_rounds_unless_it_is_off(
     services: Services, shards: list[ShardManifest], rate: float
 ) -> None:
     flip(services.store, shards[0].key)
-    set_so = Services(
-        services.settings.model_copy(update={"integrity_scan_mb_per_s": rate, "controller_interval_s": 0.05}),
-        services.store,
-        services.index,
-        services.queue,
-    )
+    set_so = with_settings(services, integrity_scan_mb_per_s=rate, controller_interval_s=0.05)
     stop = threading.Event()
     thread = threading.Thread(target=Controller(set_so).run, args=(stop,))
     thread.start()
     names_now = {one.name for one in threading.enumerate()}
     try:
         if rate:
-            pause = threading.Event()
-            for _ in range(round(WAIT_S / 0.05)):
-                if found(services):
-                    break
-                pause.wait(0.05)
+            until(lambda: found(services), "the damage is found")
     finally:
         stop.set()
-        thread.join(WAIT_S)
+        thread.join(PATIENCE_S)
     assert found(services).keys() == ({shards[0].shard_id} if rate else set())
     assert ("integrity scan" in names_now) <= bool(rate)
     assert not any(one.name == "integrity scan" for one in threading.enumerate())

@@ -12,7 +12,7 @@ from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.backends import Services
 from graspd.service.store.library import publish_asset
 from graspd.service.store.records import job_events
-from tests.fakes import HAND_FILES, request
+from tests.fakes import HAND_FILES, request, with_settings
 from tests.memory_queue import MemoryQueue
 from tests.service.index.test_index import fail, run_all
 
@@ -32,14 +32,11 @@ def test_a_submitted_job_is_in_store_index_and_queue(services: Services) -> None
 
 def test_the_same_request_is_the_same_job(services: Services) -> None:
     first, _ = job_actions.submit(services, request())
-    second, new = job_actions.submit(services, request())
-    assert (second.id, second.created, new) == (first.id, first.created, False)
-    assert len(services.queue.waiting()) == 1
-
-
-def test_a_hand_named_by_its_digest_is_the_same_job(services: Services) -> None:
     digest = services.index.assets.get(AssetKind.HAND, "gripper").digest
-    assert job_actions.submit(services, request(hand=digest))[0].id == job_actions.submit(services, request())[0].id
+    for hand in ("gripper", digest):
+        again, new = job_actions.submit(services, request(hand=hand))
+        assert (again.id, again.created, new) == (first.id, first.created, False)
+    assert len(services.queue.waiting()) == 1
 
 
 def test_an_unknown_hand_or_object_leaves_nothing_behind(services: Services) -> None:
@@ -49,23 +46,23 @@ def test_an_unknown_hand_or_object_leaves_nothing_behind(services: Services) -> 
     assert list(services.store.list(names.JOBS)) == []
 
 
-def test_a_refused_hand_cannot_be_used_and_says_why(services: Services) -> None:
+@pytest.mark.parametrize(
+    ("check", "error", "why"),
+    [
+        ({"verdict": "refuse", "message": "it has no joints"}, InputError, "it has no joints"),
+        (None, ConflictError, "still being checked"),
+    ],
+)
+def test_a_hand_that_was_not_found_good_cannot_be_used(
+    services: Services, check: dict[str, str] | None, error: type[Exception], why: str
+) -> None:
     asset = publish_asset(services.store, AssetKind.HAND, "broken", HAND_FILES | {"extra": b"1"})
-    services.index.write.add_asset(asset, {"verdict": "refuse", "message": "it has no joints"})
-    with pytest.raises(InputError, match="it has no joints"):
+    services.index.write.add_asset(asset, check)
+    with pytest.raises(error, match=why):
         job_actions.submit(services, request(hand="broken"))
 
 
-def test_an_unchecked_hand_must_wait_for_its_check(services: Services) -> None:
-    asset = publish_asset(services.store, AssetKind.HAND, "fresh", HAND_FILES | {"extra": b"2"})
-    services.index.write.add_asset(asset, None)
-    with pytest.raises(ConflictError, match="still being checked"):
-        job_actions.submit(services, request(hand="fresh"))
-
-
-def test_without_redis_a_submit_is_refused_and_nothing_is_recorded(
-    services: Services, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_redis_nothing_is_recorded_of_a_submit(services: Services, monkeypatch: pytest.MonkeyPatch) -> None:
     def gone() -> float:
         raise QueueUnavailable("Redis does not answer")
 
@@ -77,8 +74,7 @@ def test_without_redis_a_submit_is_refused_and_nothing_is_recorded(
 
 
 def test_a_large_job_fills_the_window_and_no_more(services: Services) -> None:
-    small = services.settings.model_copy(update={"queue_window": 10})
-    job, _ = job_actions.submit(Services(small, services.store, services.index, services.queue), request(grasps=3200))
+    job, _ = job_actions.submit(with_settings(services, queue_window=10), request(grasps=3200))
     assert len(services.queue.waiting()) == 10
     assert job.priority is Priority.BULK
     assert job.stages[0].tasks == 100
@@ -95,8 +91,10 @@ def test_a_cancelled_job_leaves_the_queue(services: Services) -> None:
     assert [event.what for event in job_events(services.store, job.id)] == ["cancelled"]
 
 
-def test_where_a_cancelled_task_ran_is_no_difference_to_the_store(services: Services) -> None:
+def test_where_a_cancelled_task_ran_is_no_difference(services: Services) -> None:
     job, _ = job_actions.submit(services, request())
+    with pytest.raises(ConflictError, match="queued"):
+        job_actions.retry(services, job.id)
     services.index.live.set_running({task.id: "w" for task in services.index.jobs.tasks(job=job.id).items})
     job_actions.cancel(services, job.id)
     assert differences(services.index, services.store) == []
@@ -109,7 +107,7 @@ def test_a_finished_job_cannot_be_cancelled(services: Services) -> None:
         job_actions.cancel(services, job.id)
 
 
-def test_a_retried_job_gets_fresh_attempts_and_keeps_what_is_done(services: Services) -> None:
+def test_a_retried_job_gets_fresh_attempts(services: Services) -> None:
     job, _ = job_actions.submit(services, request(grasps=64))
     run_all(services, job.id, batches=1)
     for number in (1, 2, 3):
@@ -125,9 +123,3 @@ def test_a_retried_job_gets_fresh_attempts_and_keeps_what_is_done(services: Serv
     assert delivery is not None
     assert (delivery.message.attempt, delivery.message.max_attempt) == (4, 6)
     assert len(services.index.jobs.attempts(job=job.id)) == 3, "the history stays"
-
-
-def test_only_what_failed_or_was_cancelled_can_be_retried(services: Services) -> None:
-    job, _ = job_actions.submit(services, request())
-    with pytest.raises(ConflictError, match="queued"):
-        job_actions.retry(services, job.id)

@@ -54,7 +54,7 @@ def leadership(queue: MemoryQueue, *, file: Path | None = None) -> Leadership:
     return Leadership(queue, lease_s=LEASE_S, alive=HeartbeatFile(file))
 
 
-def test_a_lease_is_renewed_for_as_long_as_it_is_held_and_then_given_back() -> None:
+def test_a_lease_is_renewed_while_held_and_given_back() -> None:
     queue, stop = MemoryQueue(), threading.Event()
     mine = leadership(queue)
     assert mine.wait(stop)
@@ -68,7 +68,7 @@ def test_a_lease_is_renewed_for_as_long_as_it_is_held_and_then_given_back() -> N
     assert queue.lead("another", 600)
 
 
-def test_who_waits_leads_within_a_lease_and_a_look_after_the_other_fell_silent(
+def test_who_waits_leads_soon_after_the_other_fell_silent(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("graspd.service.pipeline.leading._RENEWALS", 3.0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,7 @@ from graspd.service.pipeline.job_actions import submit
 from graspd.service.pipeline.metrics import MOST_KINDS, OTHER_KIND, Tally
 from graspd.service.queue.rq_queue import WORKERS, RqQueue, worker_key
 from tests.conftest import REPOSITORY
-from tests.fakes import make_shard, message_for, request
+from tests.fakes import beat_of, make_shard, message_for, request
 from tests.indexes import empty_index
 
 
@@ -76,7 +77,7 @@ def test_damage_of_the_store_is_told(services: Services) -> None:
     assert b"graspd_store_damaged 1.0" in Metrics().render(shown)
 
 
-def test_unfinished_jobs_and_the_yield_of_the_last_minute_are_told(services: Services) -> None:
+def test_unfinished_jobs_and_the_latest_yield_are_told(services: Services) -> None:
     submit(services, request(grasps=32))
     manifest = make_shard(services.store, message_for())
     services.index.write.add_manifest(manifest)
@@ -87,25 +88,10 @@ def test_unfinished_jobs_and_the_yield_of_the_last_minute_are_told(services: Ser
     assert found.valid_per_s == pytest.approx(manifest.valid / 60)
 
 
-_BUSY = {
-    "name": "w1",
-    "host": "here",
-    "pid": 1,
-    "device": "cpu",
-    "device_name": "",
-    "stages": [],
-    "version": "0",
-    "state": "busy",
-    "task_id": "",
-    "started": "",
-    "seen": "",
-}
-
-
 def test_depth_age_and_workers_are_told_from_redis(rq_queue: RqQueue) -> None:
     rq_queue.enqueue(tasks(2), Priority.BULK)
     rq_queue.connection.sadd(WORKERS, "w1", "gone")
-    rq_queue.connection.set(worker_key("w1"), json.dumps(_BUSY), px=400_000)
+    rq_queue.connection.set(worker_key("w1"), json.dumps(asdict(beat_of("w1", state="busy"))), px=400_000)
     found = rq_queue.now(lease_s=600)
     place = (Priority.BULK, Stage.SYNTHESIZE)
     assert found.depth[place] == 2

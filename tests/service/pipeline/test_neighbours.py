@@ -22,8 +22,7 @@ from graspd.service.pipeline.datasets import actions
 from graspd.service.pipeline.datasets.spec import DatasetRequest
 from graspd.service.pipeline.deletion import delete_asset
 from graspd.service.store.library import publish_asset
-from graspd.service.store.records import read_record
-from tests.fakes import make_shard, request
+from tests.fakes import make_task, record_of, request
 from tests.planning import plan_all
 from tests.service.pipeline.needed import needed_until_its_users_are_deleted
 
@@ -42,8 +41,12 @@ def add(services: Services, name: str, *, words: str = "", **facts: Any) -> str:
 
 
 def submit(services: Services, **changes: Any) -> JobRecord:
-    job, _ = job_actions.submit(services, request(**{"scene": "table", **changes}))
-    return read_record(JobRecord, services.store, names.job_record(job.id))
+    return record_of(services, job_actions.submit(services, request(**{"scene": "table", **changes}))[0].id)
+
+
+def dataset_of(**changes: Any) -> DatasetRequest:
+    given: Any = {"name": "d", "hands": ("gripper",), "objects": ("ball",), "grasps": 32, "neighbours": ("cup",)}
+    return DatasetRequest(**given | changes)
 
 
 def test_a_job_keeps_the_very_files_of_its_neighbours(services: Services) -> None:
@@ -76,22 +79,17 @@ def test_a_document_places_its_neighbours(services: Services) -> None:
     assert {one.digest for one in found} == {cup}
 
 
-def test_a_neighbour_is_needed_until_its_job_and_its_dataset_are_deleted(services: Services) -> None:
+def test_a_neighbour_is_needed_until_its_users_are_deleted(services: Services) -> None:
     add(services, "cup")
     job = submit(services, neighbours=("cup",))
-    wanted = DatasetRequest(
-        name="d", hands=("gripper",), objects=("ball",), grasps=32, scene="bin", neighbours=("cup",)
-    )
-    needed_until_its_users_are_deleted(services, AssetKind.OBJECT, "cup", job.id, wanted)
+    needed_until_its_users_are_deleted(services, AssetKind.OBJECT, "cup", job.id, dataset_of(scene="bin"))
     with pytest.raises(NotFoundError, match="there is no object 'cup'"):
         submit(services, neighbours=("cup",))
 
 
 def test_a_dataset_hands_its_neighbours_on_to_each_job(services: Services) -> None:
     cup = add(services, "cup")
-    wanted = DatasetRequest(
-        name="d", hands=("gripper",), objects=("ball", "cup"), grasps=32, scene="table", neighbours=("cup",)
-    )
+    wanted = dataset_of(objects=("ball", "cup"), scene="table")
     made, new = actions.create(services, wanted)
     assert new and made.options.beside[0].digest == cup
     plan_all(services)
@@ -106,8 +104,7 @@ def test_a_rebuilt_index_knows_the_same_of_neighbours(services: Services) -> Non
     add(services, "cup")
     job = submit(services, neighbours=("cup",))
     for stage in (Stage.SCENE, Stage.SYNTHESIZE):
-        task = next(task for task in plan(job) if task.stage is stage)
-        services.index.write.add_manifest(make_shard(services.store, message_of(job, task, attempt=1, max_attempt=3)))
+        make_task(services, job, next(task for task in plan(job) if task.stage is stage))
     assert differences(services.index, services.store) == []
     found = services.index.grasps.page(GraspFilter(neighbours=True), limit=200).items
     assert len(found) == 32 and {grasp.neighbours for grasp in found} == {1}
@@ -146,7 +143,7 @@ def test_a_neighbour_that_is_being_checked_is_waited_for(services: Services) -> 
         submit(services, neighbours=("cup",))
 
 
-def test_a_forged_entry_cannot_name_a_neighbour_without_its_files(services: Services) -> None:
+def test_a_forged_entry_cannot_name_a_neighbour_by_name_alone(services: Services) -> None:
     add(services, "cup")
     job = submit(services, neighbours=("cup",))
     said = message_of(job, next(plan(job)), attempt=1, max_attempt=3).model_dump(mode="json", by_alias=True)

@@ -24,9 +24,8 @@ from graspd.service.pipeline.deletion import delete_asset
 from graspd.service.pipeline.garbage_collector import GarbageCollector
 from graspd.service.store.library import publish_asset
 from graspd.service.store.network_file import check_network
-from graspd.service.store.records import read_record
 from tests.api.factories import fail
-from tests.fakes import request
+from tests.fakes import record_of, request
 from tests.networks import network_files, random_network
 from tests.planning import plan_all
 from tests.service.pipeline.needed import needed_until_its_users_are_deleted
@@ -47,8 +46,7 @@ def add(services: Services, name: str = "net", *, seed: int = 0, hand: str = "gr
 
 
 def submit(services: Services, **changes: Any) -> JobRecord:
-    job, _ = job_actions.submit(services, request(**{**LEARNED, **NAMED, **changes}))
-    return read_record(JobRecord, services.store, names.job_record(job.id))
+    return record_of(services, job_actions.submit(services, request(**{**LEARNED, **NAMED, **changes}))[0].id)
 
 
 def grasps_of(job: JobRecord) -> str:
@@ -81,7 +79,7 @@ def test_a_retried_job_sets_out_from_the_network_it_had(services: Services) -> N
     assert queue.take("w").message.request.network == net
 
 
-def test_a_network_is_needed_until_its_job_and_its_dataset_are_deleted(services: Services) -> None:
+def test_a_network_is_needed_until_its_users_are_deleted(services: Services) -> None:
     add(services)
     job = submit(services)
     wanted = DatasetRequest(name="d", hands=("gripper",), objects=("ball",), grasps=64, **LEARNED, **NAMED)
@@ -109,17 +107,11 @@ def test_a_dataset_hands_its_network_on_to_each_job(services: Services) -> None:
     assert new and made.options.network == net
     plan_all(services)
     assert [job.request.network for job in services.index.jobs.page().items] == [net]
+    assert differences(services.index, services.store) == []
     assert actions.create(services, wanted)[1] is False, "the same again is the same dataset"
     add(services, seed=1)
     with pytest.raises(ConflictError, match="its options is"):
         actions.create(services, wanted)
-
-
-def test_a_rebuilt_index_knows_the_same_of_networks(services: Services) -> None:
-    add(services)
-    submit(services)
-    actions.create(services, DatasetRequest(name="d", hands=("gripper",), objects=("ball",), **LEARNED, **NAMED))
-    assert differences(services.index, services.store) == []
 
 
 def test_a_network_of_another_hand_is_refused_in_a_line(services: Services) -> None:

@@ -14,22 +14,21 @@ from graspd.service.index.rebuild import differences
 from graspd.service.model import names
 from graspd.service.model.clock import timestamp
 from graspd.service.model.errors import InputError
-from graspd.service.model.records import JobRecord, Snapshot
+from graspd.service.model.records import Snapshot
 from graspd.service.model.states import Stage, State
 from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.backends import Services
-from graspd.service.pipeline.integrity import scan
 from graspd.service.pipeline.repair import repair
 from graspd.service.readers import open_shards
 from graspd.service.run import commands, store_commands
 from graspd.service.store.packs import has_packs
-from graspd.service.store.records import put_record, read_record
+from graspd.service.store.records import put_record
 from tests.damage import flipped, overwrite
-from tests.fakes import request
+from tests.fakes import record_of, request
 from tests.packs import pack, tasks_of
 from tests.service.pipeline.on_store import parts_on
 from tests.service.pipeline.test_controller import Bench
-from tests.service.pipeline.test_integrity import work_off
+from tests.service.pipeline.test_integrity import findings, work_off
 
 
 @pytest.fixture
@@ -40,7 +39,7 @@ def services(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Service
 def submit(services: Services, batches: int) -> tuple[str, list[Any]]:
     """A job, and its first tasks."""
     job, _ = job_actions.submit(services, request(grasps=32 * batches))
-    return job.id, tasks_of(read_record(JobRecord, services.store, names.job_record(job.id)))
+    return job.id, tasks_of(record_of(services, job.id))
 
 
 def is_whole(services: Services, job: str) -> bool:
@@ -56,7 +55,7 @@ def test_a_controller_takes_packs_apart_when_it_starts(services: Services) -> No
     assert not services.index.jobs.attempts(job=job)
 
 
-def test_what_a_worker_of_0_2_packs_meanwhile_is_found_and_no_attempt_is_used_up(services: Services) -> None:
+def test_what_a_worker_of_0_2_packs_meanwhile_is_found(services: Services) -> None:
     bench = Bench(services)
     bench.controller.round()
     job, tasks = submit(services, 3)
@@ -71,51 +70,39 @@ def test_what_a_worker_of_0_2_packs_meanwhile_is_found_and_no_attempt_is_used_up
     assert (services.index.jobs.attempts(job=job), services.queue.waiting()) == ([], set())
 
 
-def test_what_is_harmed_in_a_pack_is_made_again_with_the_checksum_it_had(services: Services) -> None:
+def test_what_is_harmed_in_a_pack_is_made_again(services: Services) -> None:
     job, tasks = submit(services, 2)
     key = pack(services.store, tasks)
     overwrite(services.store, key, flipped(services.store.get(key), len(services.store.get(key)) - 200))
     Bench(services).controller.round()
-    found = [wrong for _, wrong in scan(services.store) if wrong is not None]
+    found = findings(services)
     assert [wrong.shard for wrong in found] == [tasks[1].output]
     assert repair(services, found) == (found, [])
     work_off(services)
-    assert [wrong for _, wrong in scan(services.store) if wrong is not None] == []
+    assert findings(services) == []
     assert is_whole(services, job)
 
 
-def test_readers_name_the_command_and_then_read_a_snapshot_of_places_in_packs(services: Services) -> None:
+def test_readers_name_the_command_and_read_places_in_packs(services: Services) -> None:
     job, tasks = submit(services, 2)
     pack(services.store, tasks)
-    for source in (services.store, services.settings.data_dir / "store"):
+    folder = services.settings.data_dir
+    for source in (services.store, folder / "store"):
         with pytest.raises(InputError, match="graspd admin store upgrade"):
             open_shards(source, job=job)
-    told = CliRunner().invoke(
-        store_commands.app, ["store", "upgrade", "--json", "--data-dir", str(services.settings.data_dir)]
-    )
+    told = CliRunner().invoke(store_commands.app, ["store", "upgrade", "--json", "--data-dir", str(folder)])
     assert json.loads(told.stdout.splitlines()[-1]) == {"shards": 2}
-    found = open_shards(services.store, job=job, cache=services.settings.data_dir / "cache")
+    found = open_shards(services.store, job=job, cache=folder / "cache")
+    of_all = {"kind": "base", "size_bytes": 1, "count": 32, "valid": 1, "hand": "gripper", "object": "ball"}
+    place = f"packs/{'a' * 32}/{'b' * 32}.pack@{{}}+100"
     shards = [
-        {
-            "id": file.id,
-            "kind": "base",
-            "key": f"packs/{'a' * 32}/{'b' * 32}.pack@{row}+100",
-            "sha256": file.sha256,
-            "size_bytes": 1,
-            "count": 32,
-            "valid": 1,
-            "hand": "gripper",
-            "object": "ball",
-            "batch": row,
-        }
+        of_all | {"id": file.id, "key": place.format(row), "sha256": file.sha256, "batch": row}
         for row, file in enumerate(found)
     ]
     sums = {"complete": True, "grasps": 64, "valid": 2, "size_bytes": 2, "dataset_digest": "d" * 32}
     taken = Snapshot(dataset="d", digest="c" * 32, created=timestamp(), shards=shards, **sums)
     put_record(services.store, f"{names.DATASETS}/d/snapshots/{taken.digest}.json", taken)
-    of_snapshot = open_shards(
-        services.store, dataset="d", snapshot=taken.digest, cache=services.settings.data_dir / "cache"
-    )
+    of_snapshot = open_shards(services.store, dataset="d", snapshot=taken.digest, cache=folder / "cache")
     assert [of_snapshot.path(file) for file in of_snapshot] == [found.path(file) for file in found]
 
 

@@ -13,7 +13,6 @@ from pydantic import ValidationError
 
 from graspd.service.index.changes.records import Changes
 from graspd.service.index.rebuild import differences
-from graspd.service.model.clock import timestamp
 from graspd.service.model.planning import message_of, plan
 from graspd.service.model.records import JobRecord
 from graspd.service.model.states import AssetKind, Priority, Stage, State
@@ -28,7 +27,7 @@ from graspd.service.settings import Settings
 from graspd.service.store.library import publish_asset
 from graspd.service.store.manifests import ShardManifest, publish_shard
 from graspd.worker.stages.context import TaskContext, shard_of
-from tests.fakes import OBJECT_FILES, fake_stages, request
+from tests.fakes import OBJECT_FILES, beat_of, fake_stages, request, with_settings
 from tests.planning import plan_all
 from tests.service.pipeline.test_controller import Bench
 
@@ -36,26 +35,11 @@ from tests.service.pipeline.test_controller import Bench
 @pytest.fixture
 def services(services: Services) -> Services:
     """A service whose tasks last half a minute."""
-    return replace(services, settings=services.settings.model_copy(update={"task_s": 30.0}))
+    return with_settings(services, task_s=30.0)
 
 
 def worker(name: str = "w", *, device: str = "cpu", schemas: tuple[int, int] = (2, TASK_SCHEMA)) -> WorkerBeat:
-    now = timestamp()
-    return WorkerBeat(
-        name=name,
-        host="h",
-        pid=1,
-        device=device,
-        device_name="d",
-        stages=tuple(Stage),
-        version="0",
-        state="idle",
-        task_id="",
-        started=now,
-        seen=now,
-        schemas=schemas,
-        revisions=dict(STAGE_REVISIONS),
-    )
+    return beat_of(name, device=device, schemas=schemas, revisions=dict(STAGE_REVISIONS))
 
 
 def here(services: Services, *workers: WorkerBeat) -> None:
@@ -78,18 +62,16 @@ def span(services: Services, grasps: int, priority: Priority = Priority.BULK, **
 
 
 @given(st.integers(1, 40_000), st.integers(0, 5000), st.integers(0, 300))
-def test_tasks_are_of_one_length_and_no_worker_waits_while_another_has_two(
-    batches: int, by_time: int, workers: int
-) -> None:
+def test_tasks_are_of_one_length_and_shared_evenly(batches: int, by_time: int, workers: int) -> None:
     found = span_of(batches, by_time, workers)
     assert 1 <= found <= max(1, min(64, by_time))
     tasks = math.ceil(batches / found)
     assert found * tasks - batches < tasks, "all but the last are full, and it lacks less than one batch a task"
     if workers:
-        assert found <= math.ceil(batches / workers)
+        assert found <= math.ceil(batches / workers), "no worker waits while another has two"
 
 
-def test_a_task_of_a_larger_job_lasts_about_as_long_as_the_settings_say(services: Services) -> None:
+def test_a_task_of_a_larger_job_lasts_as_the_settings_say(services: Services) -> None:
     here(services, worker())
     assert span(services, 32 * 100) == 4, "nothing was measured: a stored rate on two cores, 7 s a batch"
     # Half of what the fakes make is valid, so that a job of so many valid ones takes twice the candidates of a batch.
@@ -101,14 +83,14 @@ def test_a_task_of_a_larger_job_lasts_about_as_long_as_the_settings_say(services
 
 def test_a_job_of_ten_thousand_grasps_makes_few_objects(services: Services) -> None:
     here(services, worker())
-    usual = replace(services, settings=Settings(data_dir=services.settings.data_dir))
-    on_two_cores = job_actions.prepare(usual, request(grasps=10_000), priority=Priority.BULK)
-    assert 2 * len(list(plan(on_two_cores))) == 80
+
+    def objects(services: Services) -> int:
+        return 2 * len(list(plan(job_actions.prepare(services, request(grasps=10_000), priority=Priority.BULK))))
+
+    assert objects(replace(services, settings=Settings(data_dir=services.settings.data_dir))) == 80, "on two cores"
     measured(services, 0.1)
-    job = job_actions.prepare(services, request(grasps=10_000), priority=Priority.BULK)
-    assert 2 * len(list(plan(job))) <= 12
-    slow = replace(services, settings=services.settings.model_copy(update={"task_s": 0.0}))
-    assert 2 * len(list(plan(job_actions.prepare(slow, request(grasps=10_000), priority=Priority.BULK)))) == 626
+    assert objects(services) <= 12
+    assert objects(with_settings(services, task_s=0.0)) == 626
 
 
 def test_workers_share_a_job_fairly(services: Services) -> None:
@@ -139,9 +121,7 @@ def test_cells_of_a_dataset_share_the_workers(services: Services, cells: int, ta
     assert {cell.tasks for cell in services.index.datasets.cells("d").items} == {tasks}
 
 
-def test_a_small_job_shows_its_grasps_batch_by_batch_but_for_a_gpu_that_makes_them_in_one_launch(
-    services: Services,
-) -> None:
+def test_a_small_job_goes_batch_by_batch_but_on_a_gpu(services: Services) -> None:
     measured(services, 0.01)
     here(services, worker())
     assert span(services, 128, Priority.INTERACTIVE) == 1
@@ -167,11 +147,7 @@ def test_rates_and_workers_are_read_once_for_many_jobs(services: Services) -> No
     here(services, worker())
     now = 0.0
     ranges = TaskRanges(services, clock=lambda: now)
-    job = job_actions.prepare(
-        replace(services, settings=services.settings.model_copy(update={"task_s": 0.0})),
-        request(grasps=3200),
-        priority=Priority.BULK,
-    )
+    job = job_actions.prepare(with_settings(services, task_s=0.0), request(grasps=3200), priority=Priority.BULK)
     assert ranges.sized(job).span == 4
     measured(services, 0.01)
     assert ranges.sized(job).span == 4
@@ -179,7 +155,7 @@ def test_rates_and_workers_are_read_once_for_many_jobs(services: Services) -> No
     assert ranges.sized(job).span > 4
 
 
-def test_a_job_of_ranges_goes_through_its_stages_and_the_index_is_the_store(services: Services) -> None:
+def test_a_job_of_ranges_goes_through_its_stages(services: Services) -> None:
     bench = Bench(services)
     bench.controller.round()
     here(services, worker())

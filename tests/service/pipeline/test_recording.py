@@ -5,6 +5,7 @@ from __future__ import annotations
 import sqlite3
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
+from typing import Any
 
 import pytest
 from sqlalchemy import Connection, make_url
@@ -15,16 +16,14 @@ from graspd.service.index.index import Index
 from graspd.service.index.rebuild import differences
 from graspd.service.model import names
 from graspd.service.model.errors import IndexUnavailable
-from graspd.service.model.records import JobRecord
+from graspd.service.model.planning import plan
 from graspd.service.model.states import AssetKind
 from graspd.service.pipeline import job_actions, tagging
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.datasets import actions
 from graspd.service.pipeline.datasets.spec import DatasetRequest
 from graspd.service.pipeline.deletion import delete_asset, delete_job
-from graspd.service.store.records import read_record
-from tests.fakes import make_shard, request
-from tests.packs import tasks_of
+from tests.fakes import make_task, record_of, request
 
 ALL = (names.JOBS, names.DATASETS, names.OBJECT_SETS, names.TAGS, names.DELETIONS)
 
@@ -32,8 +31,8 @@ ALL = (names.JOBS, names.DATASETS, names.OBJECT_SETS, names.TAGS, names.DELETION
 def finished(services: Services, **changes: object) -> str:
     """A job that succeeded."""
     job, _ = job_actions.submit(services, request(**changes))
-    record = read_record(JobRecord, services.store, names.job_record(job.id))
-    services.index.write.add_manifests([make_shard(services.store, task) for task in tasks_of(record)])
+    for task in plan(record := record_of(services, job.id)):
+        make_task(services, record, task)
     return job.id
 
 
@@ -47,23 +46,20 @@ def cancelled(services: Services) -> str:
     return job.id
 
 
+NOBODYS: dict[str, Any] = {"project": "", "owner": "", "permit": lambda tag: None}
+
+
 #: What is there before, and what a user does then, given the id of that.
 ACTS: dict[str, tuple[Callable[[Services], str | object], Callable[[Services, str], object]]] = {
     "submit": (lambda services: "", lambda services, _: job_actions.submit(services, request())),
     "cancel": (lambda services: job_actions.submit(services, request())[0].id, job_actions.cancel),
     "retry": (cancelled, job_actions.retry),
     "delete a job": (finished, delete_job),
-    "delete an object": (
-        lambda services: "ball",
-        lambda services, name: delete_asset(services, AssetKind.OBJECT, name),
-    ),
+    "delete an object": (lambda _: "ball", lambda services, name: delete_asset(services, AssetKind.OBJECT, name)),
     "create": (lambda services: "", lambda services, _: create(services)),
     "cancel a dataset": (create, lambda services, _: actions.cancel(services, "d")),
     "name objects": (lambda services: "", lambda services, _: actions.add_object_set(services, "s", ["ball"])),
-    "tag": (
-        lambda services: "",
-        lambda services, _: tagging.give(services, "t", [("a" * 32, 0)], project="", owner="", permit=lambda tag: None),
-    ),
+    "tag": (lambda services: "", lambda services, _: tagging.give(services, "t", [("a" * 32, 0)], **NOBODYS)),
 }
 
 

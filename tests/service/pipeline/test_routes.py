@@ -15,7 +15,7 @@ from graspd.service.pipeline.routes import Route, Routes
 from graspd.service.queue import entries
 from graspd.service.queue.lists import known_lists, queue_name, queue_names
 from graspd.service.queue.rq_queue import RqQueue
-from tests.fakes import message_for, request
+from tests.fakes import beat_of, message_for, request
 
 OWN = own_ability()
 REVISION = OWN.revisions["synthesize"]
@@ -25,9 +25,7 @@ NEED = Requirements(Stage.SYNTHESIZE, OWN.schemas[0], OWN.schemas[1], REVISION)
 def beat(
     *, schemas: tuple[int, int] = OWN.schemas, revision: int = REVISION, stage: Stage = Stage.SYNTHESIZE
 ) -> WorkerBeat:
-    now = "2026-01-01T00:00:00.000Z"
-    revisions = {**OWN.revisions, "synthesize": revision}
-    return WorkerBeat("w", "h", 1, "cpu", "CPU", (stage,), "0", "idle", "", now, now, "", schemas, revisions)
+    return beat_of(stages=(stage,), schemas=schemas, revisions={**OWN.revisions, "synthesize": revision})
 
 
 NEXT = beat(revision=REVISION + 1)
@@ -66,7 +64,7 @@ def test_what_nobody_can_do_is_held_back_with_the_reason(
     assert why in Routes(present).place(need).held
 
 
-def test_a_task_asks_for_the_schema_of_the_newest_field_that_it_uses() -> None:
+def test_a_task_asks_for_the_schema_of_its_newest_field() -> None:
     since = {"friction": 3, "touch": 4}
     assert needed_schema(request(), since) == OWN.schemas[0]
     assert needed_schema(request(friction=0.5), since) == 3
@@ -89,7 +87,7 @@ def test_a_worker_looks_apart_only_for_what_it_can_do() -> None:
     assert names[: len(apart) + 1] == [*apart, "interactive-synthesize"]
 
 
-def test_tasks_that_wait_apart_are_seen_and_leave_with_those_who_take_them(rq_queue: RqQueue) -> None:
+def test_tasks_that_wait_apart_are_seen_and_leave(rq_queue: RqQueue) -> None:
     message = message_for()
     name = f"rq:queue:{queue_name(Priority.BULK, Stage.SYNTHESIZE, NEED)}"
     assert rq_queue.enqueue([message], Priority.BULK, apart=True) == 1

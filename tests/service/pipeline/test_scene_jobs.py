@@ -1,47 +1,37 @@
-"""Jobs whose grasps are planned in scenes: their stages, their end where nothing can be found, and their grasps."""
+"""Jobs whose grasps are planned in scenes: what is refused, their stages, their end, and their grasps."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import pytest
 
 from graspd.service.index.queries.grasps import GraspFilter, GraspSort
+from graspd.service.index.views import AssetView
 from graspd.service.model import names
-from graspd.service.model.clock import timestamp
-from graspd.service.model.planning import message_of, plan
-from graspd.service.model.records import AttemptRecord, JobRecord
-from graspd.service.model.states import Stage, State
+from graspd.service.model.errors import SceneError
+from graspd.service.model.planning import plan
+from graspd.service.model.records import JobRecord
+from graspd.service.model.states import AssetKind, Stage, State
 from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.backends import Services
-from graspd.service.store.records import put_record, read_record
-from tests.fakes import make_shard, request
+from graspd.service.pipeline.job_actions import check_scene
+from graspd.service.store.library import load_asset
+from tests.fakes import fail_task, make_task, record_of, request
 
 
 def submit(services: Services, **changes: object) -> JobRecord:
-    job, _ = job_actions.submit(services, request(**{"scene": "table", **changes}))
-    return read_record(JobRecord, services.store, names.job_record(job.id))
+    return record_of(services, job_actions.submit(services, request(**{"scene": "table", **changes}))[0].id)
 
 
 def make(services: Services, job: JobRecord, stage: Stage, batch: int = 0) -> None:
-    task = next(task for task in plan(job) if task.stage is stage and task.batch == batch)
-    services.index.write.add_manifest(make_shard(services.store, message_of(job, task, attempt=1, max_attempt=3)))
+    make_task(services, job, next(task for task in plan(job) if task.stage is stage and task.batch == batch))
 
 
 def fail(services: Services, job: JobRecord, batch: int, kind: str, number: int = 1) -> None:
     """The last attempt at a batch's grasps."""
     task = next(task for task in plan(job) if task.stage is Stage.SYNTHESIZE and task.batch == batch)
-    attempt = AttemptRecord(
-        task_id=task.id,
-        job_id=job.id,
-        stage=task.stage,
-        number=number,
-        kind=kind,
-        reason="none of 128 candidates is valid in its scene",
-        worker="w",
-        ended=timestamp(),
-        last=True,
-    )
-    put_record(services.store, names.attempt(task.id, number), attempt)
-    services.index.write.add_attempt(attempt)
+    fail_task(services, job.id, task, number, kind=kind, reason="none of 128 candidates is valid in its scene")
 
 
 def states(services: Services, job: JobRecord) -> dict[tuple[int, Stage], State]:
@@ -52,18 +42,15 @@ def test_scenes_are_made_before_grasps_and_told_in_that_order(services: Services
     job = submit(services, grasps=64, views=1)
     assert len(services.queue.waiting()) == 2, "the scenes of both batches"
     told = services.index.jobs.get(job.id).stages
-    assert [(stage.stage, stage.tasks) for stage in told] == [
-        (Stage.SCENE, 2),
-        (Stage.SYNTHESIZE, 2),
-        (Stage.RENDER, 2),
-    ]
+    order = (Stage.SCENE, Stage.SYNTHESIZE, Stage.RENDER)
+    assert [(stage.stage, stage.tasks) for stage in told] == [(stage, 2) for stage in order]
     make(services, job, Stage.SCENE)
     ready = [(task.task.batch, task.task.stage) for task in services.index.feed.ready_of_job(job.id, limit=9)]
     assert ready == [(0, Stage.SYNTHESIZE)], "the other batch's scenes are queued already"
 
 
 @pytest.mark.parametrize("kind", ["SceneError", "LoadError"])
-def test_a_job_ends_when_its_first_batch_finds_nothing_in_its_scenes(services: Services, kind: str) -> None:
+def test_a_job_ends_when_its_first_batch_finds_nothing(services: Services, kind: str) -> None:
     job = submit(services, grasps=128)
     for batch in range(2):
         make(services, job, Stage.SCENE, batch)
@@ -102,8 +89,8 @@ def test_a_later_batch_or_another_fault_stops_no_other_batch(services: Services,
     assert services.index.jobs.get(job.id).state is State.RUNNING
 
 
-def test_grasps_are_found_by_their_scene_and_what_they_hold_there(services: Services) -> None:
-    free = read_record(JobRecord, services.store, names.job_record(job_actions.submit(services, request())[0].id))
+def test_grasps_are_found_by_their_scene(services: Services) -> None:
+    free = record_of(services, job_actions.submit(services, request())[0].id)
     make(services, free, Stage.SYNTHESIZE)
     table, inside = submit(services), submit(services, scene="bin", seed=1)
     for job in (table, inside):
@@ -122,3 +109,53 @@ def test_grasps_are_found_by_their_scene_and_what_they_hold_there(services: Serv
     ).items
     assert far and {grasp.scene_kind for grasp in far} == {"table", "bin"}
     assert far[0].clearance_m == max(grasp.clearance_m for grasp in far)
+
+
+UPRIGHT = [1.0, 0, 0, 0]
+
+
+GROUND = {"kind": "half_space", "normal": [0, 0, 2], "offset": 0.2}
+
+
+SLOPE = {"kind": "box", "size": [0.2, 0.2, 0.2], "pose": [0.5, 0, 0, 0.8, 0, 0.6, 0]}
+
+
+def ball(centre: Any) -> AssetView:
+    what = {"kind": AssetKind.OBJECT, "name": "ball", "digest": "b" * 32, "filename": "ball.stl", "files": []}
+    found = {"verdict": "accept", "message": None, "repairs": [], "facts": {"centre_of_mass_m": centre}}
+    return AssetView(**what, **found, size_bytes=1, created="", builtin=False)
+
+
+@pytest.mark.parametrize(
+    ("supports", "target", "said"),
+    [
+        # The plane lies at 0.2 / |normal| = 0.1 m, the centre at 0.03.
+        ([GROUND], [0, 0, 0, *UPRIGHT], "support 0 of its scene: its centre lies 70 mm deep"),
+        ([GROUND], [0, 0, 0.0995, *UPRIGHT], None),
+        # The box's middle is 20 mm from the centre, whichever way the box is turned.
+        ([GROUND, SLOPE], [0.52, 0, 0.3, *UPRIGHT], None),
+        ([SLOPE], [0.5, 0, -0.03, *UPRIGHT], "support 0 of its scene: its centre lies 100 mm deep"),
+        # Turned upside down about x the centre hangs below the frame.
+        ([GROUND], [0, 0, 0.12, 0, 1, 0, 0], "support 0 of its scene: its centre lies 10 mm deep"),
+    ],
+)
+def test_a_target_whose_centre_lies_in_a_support_is_refused(supports: Any, target: Any, said: str | None) -> None:
+    wanted = request(scene={"supports": supports, "target": target})
+    if said is None:
+        check_scene(wanted, ball([0, 0, 0.03]))
+        return
+    with pytest.raises(SceneError, match=said):
+        check_scene(wanted, ball([0, 0, 0.03]))
+
+
+def test_where_the_centre_is_not_known_a_worker_tells() -> None:
+    check_scene(request(scene={"supports": [GROUND], "target": [0, 0, -1, *UPRIGHT]}), ball(None))
+
+
+def test_a_refused_scene_leaves_no_job_behind(services: Services) -> None:
+    asset = services.index.assets.get(AssetKind.OBJECT, "ball")
+    facts = {"verdict": "accept", "facts": {"centre_of_mass_m": [0.0, 0.0, 0.0]}}
+    services.index.write.add_asset(load_asset(services.store, AssetKind.OBJECT, asset.digest), facts)
+    with pytest.raises(SceneError, match="ball stands in support 0"):
+        job_actions.submit(services, request(scene={"supports": [GROUND], "target": [0, 0, 0, *UPRIGHT]}))
+    assert list(services.store.list(names.JOBS)) == []

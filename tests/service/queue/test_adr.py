@@ -50,9 +50,7 @@ def held(services: Services, rq_queue: RqQueue) -> tuple[Services, Job]:
     return services, taken
 
 
-def test_a_clock_that_is_ahead_takes_no_task_from_a_worker_that_lives(
-    held: tuple[Services, Job], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_clock_that_is_ahead_takes_no_task_away(held: tuple[Services, Job], monkeypatch: pytest.MonkeyPatch) -> None:
     services, job = held
     registry = StartedJobRegistry(NAME, connection=services.queue.connection, serializer=JSONSerializer)  # type: ignore[attr-defined]
     now = [0.0]
@@ -71,7 +69,7 @@ def test_a_clock_that_is_ahead_takes_no_task_from_a_worker_that_lives(
     assert not registry.connection.exists(held_key(NAME))
 
 
-def test_a_command_that_is_published_while_nobody_listens_is_lost_and_a_key_is_not(held: tuple[Services, Job]) -> None:
+def test_a_command_that_nobody_hears_is_lost_and_a_key_is_not(held: tuple[Services, Job]) -> None:
     services, job = held
     connection = services.queue.connection  # type: ignore[attr-defined]
     job.worker_name = "w"
@@ -81,10 +79,8 @@ def test_a_command_that_is_published_while_nobody_listens_is_lost_and_a_key_is_n
     send_stop_job_command(connection, job.id, serializer=JSONSerializer)
     listener.subscribe("rq:pubsub:w")  # the worker is connected again
     time.sleep(0.1)
-    said = [
-        message for _ in range(3) if (message := listener.get_message(timeout=0.1)) and message["type"] == "message"
-    ]
-    assert said == []
+    heard = [listener.get_message(timeout=0.1) for _ in range(3)]
+    assert not any(message and message["type"] == "message" for message in heard)
     task = job.id.rpartition("-")[0]
     services.queue.discard([task])
     assert connection.exists(cancel_key(task)), "its next beat finds this"
@@ -95,7 +91,7 @@ def _fail() -> None:
     raise RuntimeError("as a task does")
 
 
-def test_retries_that_redis_counts_are_lost_with_it_and_those_of_the_store_are_not(held: tuple[Services, Job]) -> None:
+def test_retries_that_redis_counts_are_lost_with_it(held: tuple[Services, Job]) -> None:
     services, job = held
     connection = services.queue.connection  # type: ignore[attr-defined]
     plain = Queue("plain", connection=connection, serializer=JSONSerializer)
@@ -128,9 +124,8 @@ def test_a_work_horse_loads_everything_anew_for_each_job(rq_queue: RqQueue) -> N
     def loaded(worker: type[BaseWorker]) -> list[Any]:
         LOADED.clear()
         jobs = [plain.enqueue(_load) for _ in range(2)]
-        worker([plain], connection=rq_queue.connection, serializer=JSONSerializer).work(
-            burst=True, logging_level="CRITICAL"
-        )
+        work = worker([plain], connection=rq_queue.connection, serializer=JSONSerializer).work
+        work(burst=True, logging_level="CRITICAL")
         return [job.return_value() for job in jobs]
 
     assert loaded(Worker) == [1, 1]
@@ -139,13 +134,8 @@ def test_a_work_horse_loads_everything_anew_for_each_job(rq_queue: RqQueue) -> N
 
 #: What of RQ's worker is its own here, each a hook of RQ's: the order of the lists, what happens around a task, what is
 #: passed over, what a signal stops, and that nobody commands.
-OVERRIDDEN = {
-    "dequeue_job_and_maintain_ttl",
-    "execute_job",
-    "handle_warm_shutdown_request",
-    "reorder_queues",
-    "subscribe",
-}
+OVERRIDDEN = {"dequeue_job_and_maintain_ttl", "execute_job", "handle_warm_shutdown_request"}
+OVERRIDDEN |= {"reorder_queues", "subscribe"}
 
 
 def test_rq_is_used_as_rq() -> None:

@@ -89,7 +89,7 @@ def test_a_forged_job_cannot_stay_for_a_year(rq_queue: RqQueue) -> None:
     assert job.result_ttl == 0
 
 
-def test_a_forged_job_has_neither_a_limit_nor_retries_nor_a_list_of_its_own(rq_queue: RqQueue) -> None:
+def test_a_forged_job_has_no_limit_retries_or_list_of_its_own(rq_queue: RqQueue) -> None:
     name = forge(rq_queue, TASK_FUNCTION, {}, timeout=1, retry=Retry(max=1000))
     rq_queue.connection.hset(f"rq:job:{name}", mapping={"origin": "elsewhere", "repeats_left": 1000})
     job = fetch(rq_queue, name)

@@ -14,33 +14,20 @@ from rq.serializers import JSONSerializer
 from graspd.service.model.clock import timestamp
 from graspd.service.model.messages import IngestMessage, TaskMessage
 from graspd.service.model.states import Priority, Stage
-from graspd.service.model.workers import WorkerBeat
 from graspd.service.queue.lists import queue_names
 from graspd.service.queue.port import BULK_EVERY, Event, EventKind
 from graspd.service.queue.rq_queue import LEAD, RqQueue, lease_state, list_worker, renew_lease, worker_key
 from graspd.worker.process.heartbeat import Heartbeat
 from graspd.worker.stages.context import StopReason
-from tests.fakes import request
+from tests.fakes import beat_of, message_for
 from tests.memory_queue import MemoryQueue
 from tests.waiting import until
 
 DIGEST = "0" * 32
 
 
-def task(name: str, *, stage: Stage = Stage.SYNTHESIZE, attempt: int = 1) -> TaskMessage:
-    return TaskMessage(
-        schema_=1,
-        task_id=name,
-        job_id="job",
-        stage=stage,
-        batch=0,
-        count=32,
-        attempt=attempt,
-        request=request(),
-        hand_digest=DIGEST,
-        object_digest=DIGEST,
-        output=DIGEST,
-    )
+def task(name: str = "a", *, stage: Stage = Stage.SYNTHESIZE, attempt: int = 1) -> TaskMessage:
+    return message_for().model_copy(update={"task_id": name, "stage": stage, "attempt": attempt})
 
 
 @dataclass
@@ -123,11 +110,6 @@ def one_beat(connection: Any, name: str) -> None:
     list_worker(connection, asdict(beat_of(name)), 6)
 
 
-def beat_of(name: str) -> WorkerBeat:
-    now = timestamp()
-    return WorkerBeat(name, "host", 1, "cpu", "CPU", (Stage.SYNTHESIZE,), "0", "idle", "", now, now)
-
-
 @pytest.fixture(params=["memory", "redis"])
 def sides(request: pytest.FixtureRequest) -> tuple[RqQueue, Worker]:
     """A queue and a worker's side of it."""
@@ -139,18 +121,34 @@ def sides(request: pytest.FixtureRequest) -> tuple[RqQueue, Worker]:
     return redis, Worker(side.take, side.beat, side.finish)
 
 
-def test_tasks_come_out_as_they_went_in(sides: tuple[RqQueue, Worker]) -> None:
-    queue, worker = sides
-    assert queue.enqueue([task("a"), task("b")], Priority.BULK) == 2
+@pytest.fixture
+def queue(sides: tuple[RqQueue, Worker]) -> RqQueue:
+    return sides[0]
+
+
+@pytest.fixture
+def worker(sides: tuple[RqQueue, Worker]) -> Worker:
+    return sides[1]
+
+
+@pytest.fixture
+def busy(queue: RqQueue, worker: Worker) -> Worker:
+    """A worker that has taken the task "a"."""
+    queue.enqueue([task()], Priority.BULK)
+    worker.take()
+    return worker
+
+
+def test_tasks_come_out_as_they_went_in(queue: RqQueue, worker: Worker) -> None:
+    assert queue.enqueue([task(), task("b")], Priority.BULK) == 2
     assert queue.waiting() == {"a", "b"}
     assert queue.depths()[Priority.BULK, Stage.SYNTHESIZE] == 2
-    assert worker.take() == task("a")
+    assert worker.take() == task()
     worker.finish()
     assert worker.take() == task("b")
 
 
-def test_interactive_tasks_go_before_bulk_but_do_not_starve_it(sides: tuple[RqQueue, Worker]) -> None:
-    queue, worker = sides
+def test_interactive_tasks_go_before_bulk_but_do_not_starve_it(queue: RqQueue, worker: Worker) -> None:
     queue.enqueue([task(f"bulk{i}") for i in range(20)], Priority.BULK)
     queue.enqueue([task(f"urgent{i}") for i in range(20)], Priority.INTERACTIVE)
     taken = []
@@ -162,8 +160,7 @@ def test_interactive_tasks_go_before_bulk_but_do_not_starve_it(sides: tuple[RqQu
     assert taken == 3 * [*["urgent"] * (BULK_EVERY - 1), "bulk"]
 
 
-def test_bulk_runs_at_full_rate_while_nothing_is_urgent(sides: tuple[RqQueue, Worker]) -> None:
-    queue, worker = sides
+def test_bulk_runs_at_full_rate_while_nothing_is_urgent(queue: RqQueue, worker: Worker) -> None:
     queue.enqueue([task(f"bulk{i}") for i in range(2 * BULK_EVERY)], Priority.BULK)
     for number in range(2 * BULK_EVERY):
         assert worker.take() == task(f"bulk{number}")
@@ -171,80 +168,63 @@ def test_bulk_runs_at_full_rate_while_nothing_is_urgent(sides: tuple[RqQueue, Wo
     assert worker.take() is None
 
 
-def test_a_waiting_task_is_not_queued_twice(sides: tuple[RqQueue, Worker]) -> None:
-    queue, worker = sides
-    queue.enqueue([task("a")], Priority.BULK)
-    assert queue.enqueue([task("a")], Priority.BULK) == 0
+def test_a_waiting_task_is_not_queued_twice(queue: RqQueue, worker: Worker) -> None:
+    queue.enqueue([task()], Priority.BULK)
+    assert queue.enqueue([task()], Priority.BULK) == 0
     assert worker.take() is not None
-    assert queue.enqueue([task("a")], Priority.BULK) == 0, "it is running"
+    assert queue.enqueue([task()], Priority.BULK) == 0, "it is running"
     assert worker.take() is None
 
 
-def test_the_next_attempt_of_a_task_is_another_entry(sides: tuple[RqQueue, Worker]) -> None:
-    queue, worker = sides
-    queue.enqueue([task("a")], Priority.BULK)
-    worker.take()
-    assert queue.enqueue([task("a", attempt=2)], Priority.BULK) == 1
+def test_the_next_attempt_of_a_task_is_another_entry(queue: RqQueue, busy: Worker) -> None:
+    assert queue.enqueue([task(attempt=2)], Priority.BULK) == 1
 
 
-def test_a_lease_says_who_holds_which_attempt_of_what(sides: tuple[RqQueue, Worker]) -> None:
-    queue, worker = sides
-    queue.enqueue([task("a", attempt=2)], Priority.BULK)
+def test_a_lease_says_who_holds_which_attempt_of_what(queue: RqQueue, worker: Worker) -> None:
+    queue.enqueue([task(attempt=2)], Priority.BULK)
     worker.take()
     (lease,) = queue.leases()
     assert (lease.task_id, lease.attempt) == ("a", 2)
-    assert queue.holder(lease) == ("w", task("a", attempt=2))
+    assert queue.holder(lease) == ("w", task(attempt=2))
     assert queue.waiting() == set()
     worker.finish()
     assert queue.leases() == []
 
 
-def test_a_lease_changes_with_each_sign_of_life_and_not_by_reading(sides: tuple[RqQueue, Worker]) -> None:
-    queue, worker = sides
-    queue.enqueue([task("a")], Priority.BULK)
-    worker.take()
+def test_a_lease_changes_with_each_beat_and_not_by_reading(queue: RqQueue, busy: Worker) -> None:
     first = queue.leases()[0].beat
     assert queue.leases()[0].beat == first
-    assert worker.beat() is None
+    assert busy.beat() is None
     assert queue.leases()[0].beat != first
 
 
-def test_a_worker_whose_lease_was_released_notices(sides: tuple[RqQueue, Worker]) -> None:
-    queue, worker = sides
-    queue.enqueue([task("a")], Priority.BULK)
-    worker.take()
+def test_a_worker_whose_lease_was_released_notices(queue: RqQueue, busy: Worker) -> None:
     queue.release(queue.leases()[0])
     assert queue.leases() == []
-    assert worker.beat() is StopReason.LEASE_LOST
+    assert busy.beat() is StopReason.LEASE_LOST
     assert queue.leases() == [], "a late sign of life does not bring the lease back"
 
 
-def test_a_discarded_task_never_starts(sides: tuple[RqQueue, Worker]) -> None:
-    queue, worker = sides
-    queue.enqueue([task("a"), task("b")], Priority.BULK)
+def test_a_discarded_task_never_starts(queue: RqQueue, worker: Worker) -> None:
+    queue.enqueue([task(), task("b")], Priority.BULK)
     queue.discard(["a"])
     assert queue.waiting() == {"b"}
     assert worker.take() == task("b")
 
 
-def test_a_discarded_running_task_is_told_to_stop(sides: tuple[RqQueue, Worker]) -> None:
-    queue, worker = sides
-    queue.enqueue([task("a")], Priority.BULK)
-    worker.take()
+def test_a_discarded_running_task_is_told_to_stop(queue: RqQueue, busy: Worker) -> None:
     queue.discard(["a"])
-    assert worker.beat() is StopReason.CANCELLED
+    assert busy.beat() is StopReason.CANCELLED
 
 
-def test_a_task_queued_again_after_it_was_discarded_runs(sides: tuple[RqQueue, Worker]) -> None:
-    queue, worker = sides
+def test_a_task_queued_again_after_it_was_discarded_runs(queue: RqQueue, worker: Worker) -> None:
     queue.discard(["a"])
-    queue.enqueue([task("a")], Priority.BULK)
+    queue.enqueue([task()], Priority.BULK)
     worker.take()
     assert worker.beat() is None
 
 
-def test_events_come_once_in_order_and_again_if_not_acknowledged(sides: tuple[RqQueue, Worker]) -> None:
-    queue, _ = sides
+def test_events_come_once_in_order_and_again_if_not_acknowledged(queue: RqQueue) -> None:
     for name in "abc":
         queue.publish(Event(kind=EventKind.STARTED, at=timestamp(), task_id=name))
     first = queue.consume(limit=2, wait_s=0)
@@ -265,8 +245,7 @@ def _restarted(queue: RqQueue) -> RqQueue:
     return RqQueue(queue.connection)
 
 
-def test_any_number_of_readers_follow_the_stream(sides: tuple[RqQueue, Worker]) -> None:
-    queue, _ = sides
+def test_any_number_of_readers_follow_the_stream(queue: RqQueue) -> None:
     queue.publish(Event(kind=EventKind.JOB, at=timestamp(), job_id="j", message="queued"))
     ((first_id, first),) = queue.tail("0", limit=9, wait_s=0)
     assert first.message == "queued"
@@ -276,15 +255,13 @@ def test_any_number_of_readers_follow_the_stream(sides: tuple[RqQueue, Worker]) 
     assert len(queue.tail("0", limit=9, wait_s=0)) == 2
 
 
-def test_a_check_travels_like_any_task(sides: tuple[RqQueue, Worker]) -> None:
-    queue, _ = sides
+def test_a_check_travels_like_any_task(queue: RqQueue) -> None:
     message = IngestMessage(schema_=1, task_id="i", kind="hand", name="h", digest=DIGEST)
     queue.enqueue([message], Priority.INTERACTIVE)
     assert queue.depths()[Priority.INTERACTIVE, Stage.INGEST] == 1
 
 
-def test_a_part_is_there_as_long_as_it_says_so(sides: tuple[RqQueue, Worker]) -> None:
-    queue, _ = sides
+def test_a_part_is_there_as_long_as_it_says_so(queue: RqQueue) -> None:
     assert not queue.announced("controller")
     queue.announce("controller", 600)
     queue.announce("brief", 0.05)
@@ -292,9 +269,7 @@ def test_a_part_is_there_as_long_as_it_says_so(sides: tuple[RqQueue, Worker]) ->
     assert queue.announced("controller")
 
 
-def test_of_those_who_want_to_lead_one_does_until_it_is_silent_or_resigns(sides: tuple[RqQueue, Worker]) -> None:
-    queue, _ = sides
-
+def test_one_leads_until_it_is_silent_or_resigns(queue: RqQueue) -> None:
     assert queue.lead("a", 600)
     assert not queue.lead("b", 600)
     assert queue.lead("a", 600), "who leads may go on"
@@ -306,7 +281,7 @@ def test_of_those_who_want_to_lead_one_does_until_it_is_silent_or_resigns(sides:
     assert not queue.lead("b", 600)
 
 
-def test_a_controller_that_is_started_again_under_its_name_leads_at_once(rq_queue: RqQueue) -> None:
+def test_a_controller_that_is_started_again_leads_at_once(rq_queue: RqQueue) -> None:
     assert rq_queue.lead("node-1", 600)
     again = RqQueue(rq_queue.connection)
     assert not again.lead("node-2", 600)
@@ -328,15 +303,13 @@ def test_a_lease_that_is_none_keeps_nobody_from_leading(rq_queue: RqQueue, forge
     assert rq_queue.lead("a", 600)
 
 
-def test_sums_add_up_and_each_name_has_its_own(sides: tuple[RqQueue, Worker]) -> None:
-    counters, _ = sides
-    counters.count({"a": 1.5, "b": 2.0})
-    counters.count({"a": 1.0})
-    assert counters.counted() == {"a": 2.5, "b": 2.0}
+def test_sums_add_up_and_each_name_has_its_own(queue: RqQueue) -> None:
+    queue.count({"a": 1.5, "b": 2.0})
+    queue.count({"a": 1.0})
+    assert queue.counted() == {"a": 2.5, "b": 2.0}
 
 
-def test_what_waits_is_told_by_lane_and_stage(sides: tuple[RqQueue, Worker]) -> None:
-    queue, _ = sides
+def test_what_waits_is_told_by_lane_and_stage(queue: RqQueue) -> None:
     queue.enqueue([task("x"), task("y"), task("z", stage=Stage.RENDER)], Priority.BULK)
     shown = queue.now(lease_s=6.0)
     assert {place: depth for place, depth in shown.depth.items() if depth} == {
@@ -348,7 +321,7 @@ def test_what_waits_is_told_by_lane_and_stage(sides: tuple[RqQueue, Worker]) -> 
 
 
 def test_a_worker_is_listed_while_it_gives_signs_of_life(rq_queue: RqQueue, redis_server: str) -> None:
-    heart = Heartbeat(redis_server, beat_of("alive"), lease_s=6)
+    heart = Heartbeat(redis_server, beat_of("alive", stages=(Stage.SYNTHESIZE,)), lease_s=6)
     heart.start()
     try:
         until(rq_queue.workers, "its first sign of life")
@@ -370,7 +343,7 @@ def test_the_stream_of_events_is_bounded(rq_queue: RqQueue, monkeypatch: pytest.
 def test_redis_keeps_nothing_of_a_finished_task(rq_queue: RqQueue) -> None:
     side = RqSide(rq_queue)
     before = {key for key in rq_queue.connection.keys("*") if b"queues" not in key}
-    rq_queue.enqueue([task("a")], Priority.BULK)
+    rq_queue.enqueue([task()], Priority.BULK)
     side.take()
     side.finish()
     after = {key for key in rq_queue.connection.keys("*") if b"queues" not in key}

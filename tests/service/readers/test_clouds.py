@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +15,14 @@ from graspd.service.model.errors import InputError
 from graspd.service.readers import Pictures, open_shards
 from graspd.service.readers.clouds import Clouds, graspness
 from graspd.service.store.shards import read_shard
+from tests.conftest import REPOSITORY
 from tests.service.readers import box_scenes
 from tests.service.readers.box_scenes import EYES, POSES, SCENE_OF_GRASP, SIZE, VALID
 
 #: Pictures keep depth in float32: half a unit in the last place of half a metre is 3e-8, of a point 6e-8 [m].
 DEPTH_M = 1e-7
+
+
 VIEWS = len(EYES)
 
 
@@ -42,7 +47,7 @@ def on_box(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.where(inward > 0, outward, -inward), normal
 
 
-def test_points_of_the_object_lie_on_it_and_their_normals_are_its_faces(pictures: Pictures) -> None:
+def test_points_of_the_object_lie_on_it(pictures: Pictures) -> None:
     for sample in pictures.clouds(500, frame="object"):
         assert sample["cloud/points"].shape == sample["cloud/normals"].shape == (500, 3)
         distance, normal = on_box(sample["cloud/points"].astype(float))
@@ -95,7 +100,7 @@ def test_views_fused_agree_and_show_more_than_each(pictures: Pictures) -> None:
         assert faces[0] > faces[1]
 
 
-def test_labels_stand_in_each_frame_and_are_the_valid_grasps_of_the_scene(pictures: Pictures, folder: Path) -> None:
+def test_labels_stand_in_each_frame_and_are_the_valid_grasps(pictures: Pictures, folder: Path) -> None:
     base = read_shard(folder / "base.h5")
     clouds = pictures.clouds(8, postures=("pregrasp", "grasp", "squeeze"))
     for index in (1, VIEWS + 2):
@@ -117,7 +122,7 @@ def test_labels_stand_in_each_frame_and_are_the_valid_grasps_of_the_scene(pictur
             np.testing.assert_array_equal(sample[f"{posture}/joint_positions"], joints)
 
 
-def test_the_same_seed_gives_the_same_clouds_and_another_epoch_others(pictures: Pictures) -> None:
+def test_the_same_seed_gives_the_same_clouds(pictures: Pictures) -> None:
     def points(epoch: int, **options: Any) -> np.ndarray:
         clouds = pictures.clouds(256, noise="stereo", **options)
         clouds.epoch = epoch
@@ -161,7 +166,7 @@ def test_where_nothing_is_seen_the_cloud_is_zero_and_says_so(pictures: Pictures)
     assert not sample["cloud/points"].any() and not sample["cloud/graspness"].any()
 
 
-def test_graspness_is_the_share_of_the_grasps_that_touch_the_point() -> None:
+def test_graspness_is_the_share_of_grasps_that_touch_the_point() -> None:
     points = np.array([[0, 0, 0], [0.01, 0, 0], [0.5, 0, 0]])
     hands = np.array([[[0, 0, 0.004], [0.011, 0, 0]], [[0.009, 0, 0], [0.2, 0, 0]], [[0, 0.0051, 0], [1, 1, 1]]])
     assert graspness(points, hands, touch_m=0.005).tolist() == pytest.approx([1 / 3, 2 / 3, 0])
@@ -190,17 +195,33 @@ def test_graspness_of_a_cloud_is_that_of_its_true_points(pictures: Pictures) -> 
 
 
 @pytest.mark.parametrize(
-    "options",
+    ("option", "value"),
     [
-        {"noise": "lidar"},
-        {"frame": "moon"},
-        {"fuse": True, "frame": "camera"},
-        {"postures": ["rest"]},
-        {"points": 0},
-        {"voxel_m": -1.0},
-        {"seed": -1},
+        *[("noise", "lidar"), ("frame", "moon"), ("postures", ["rest"]), ("points", 0), ("voxel_m", -1.0)],
+        *[("seed", -1), ("frame", "camera")],
     ],
 )
-def test_what_no_cloud_can_be_is_refused(pictures: Pictures, options: dict[str, Any]) -> None:
+def test_what_no_cloud_can_be_is_refused(pictures: Pictures, option: str, value: Any) -> None:
     with pytest.raises(InputError):
-        pictures.clouds(**options)
+        pictures.clouds(**{"fuse": value == "camera", option: value})
+
+
+def test_the_page_runs_as_it_is_printed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "demo-out").mkdir()
+    box_scenes.write(tmp_path / "demo-out" / "shards")
+    monkeypatch.chdir(tmp_path)
+    page = (REPOSITORY / "docs" / "how-to" / "clouds.md").read_text()
+    said: dict[str, Any] = {}
+    for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
+        if "torch" not in block or find_spec("torch") is not None:
+            exec(block, said)
+    sample = said["sample"]
+    assert sample["cloud/points"].shape == (1024, 3) and sample["cloud/seen"] > 100
+    listed = re.findall(r"^\| (`[^|]*`) \| ", page, re.MULTILINE)
+    keys = {name for cell in listed for name in re.findall(r"`([\w/]+)`", cell) if "/" in name or name == "base_id"}
+    sample = said["views"].clouds(8, hand_surface=lambda _, rows: np.zeros((len(rows), 1, 3)))[0]
+    assert keys <= set(sample), "the table names what is not there"
+    of_clouds = {
+        name for name in sample if name.split("/")[0] in ("cloud", "camera", "table", "object") and "/" in name
+    }
+    assert of_clouds <= keys, "the table leaves something out"

@@ -61,13 +61,13 @@ def test_depths_are_steps_of_disparity() -> None:
     np.testing.assert_allclose(steps, np.round(steps), atol=1e-9)
 
 
-def test_the_same_seed_gives_the_same_picture_and_another_another() -> None:
+def test_the_same_seed_gives_the_same_picture() -> None:
     first, again, other = (NOISES["stereo"].apply(plane(0.5), K, np.random.default_rng(seed)) for seed in (3, 3, 4))
     np.testing.assert_array_equal(first, again)
     assert (first != other).mean() > 0.5
 
 
-def test_what_the_second_eye_does_not_see_is_a_hole_beside_the_near_surface() -> None:
+def test_what_the_second_eye_does_not_see_is_a_hole() -> None:
     """A board at 0.4 m before a wall at 0.8 m hides a band as wide as its disparity exceeds the wall's, on its left."""
     depth = plane(0.8)
     depth[60:180, 140:200] = 0.4
@@ -84,7 +84,7 @@ def test_what_the_second_eye_does_not_see_is_a_hole_beside_the_near_surface() ->
     assert not hidden[:60, int(wall) + 1 :].any()
 
 
-def test_the_share_of_holes_on_a_wall_is_what_drops_out_and_what_falls_off_the_side() -> None:
+def test_the_share_of_holes_on_a_wall_is_as_the_model_says() -> None:
     noise = still(NOISES["stereo"])
     seen = noise.apply(plane(0.5), K, np.random.default_rng(5))
     disparity = 330 * 0.05 / 0.5
@@ -103,7 +103,7 @@ def test_grazing_surfaces_and_those_too_near_give_nothing() -> None:
     assert np.isnan(noise.apply(plane(0.16), K, draw)).all()  # 424 px x 50 mm / 126 px = 168 mm
 
 
-def test_edges_bleed_and_pixels_on_them_fly_only_as_far_as_the_model_lets_them() -> None:
+def test_edges_bleed_and_pixels_on_them_fly_a_little() -> None:
     depth = plane(0.8)
     depth[:, :160] = 0.4  # its shadow falls off the other side
     draw = np.random.default_rng(7)

@@ -1,23 +1,34 @@
-"""Reading shards back: from files, jobs and snapshots; what is kept, and how pictures and grasps belong together."""
+"""Reading shards back: from files, jobs, snapshots and S3, ahead of need; how pictures and grasps belong together."""
 
 from __future__ import annotations
 
 import hashlib
+import os
+import threading
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from graspd.service.model.errors import DamagedShard, InputError, NotFoundError
 from graspd.service.model.names import dataset_snapshot, shard_file
-from graspd.service.model.records import JobRecord, Snapshot, SnapshotShard
+from graspd.service.model.records import JobRecord, Snapshot
+from graspd.service.model.states import Stage
 from graspd.service.model.transforms import compose, pose_from_matrix
 from graspd.service.pipeline.backends import Services
-from graspd.service.readers import Grasps, Pictures, ShardCache, Shards, open_shards
+from graspd.service.readers import Grasps, Pictures, ShardCache, Shards, open_shards, prefetched
+from graspd.service.settings import Settings
 from graspd.service.store.records import put_record
 from graspd.service.store.shards import Shard, read_shard
+from graspd.service.store.store import open_store
 from tests.api import factories
 from tests.damage import flipped, flipped_values
+from tests.indexes import empty_index
+from tests.memory_queue import MemoryQueue
+from tests.servers import S3Server
+from tests.service.readers import box_scenes
 
 GRASPS = 40
 
@@ -41,59 +52,49 @@ def folder(services: Services, job: JobRecord, tmp_path: Path) -> Path:
     return out
 
 
+@pytest.fixture
+def shards(services: Services, job: JobRecord, tmp_path: Path) -> Shards:
+    """Of the job, in the store."""
+    return open_shards(services.store, job=job.id, cache=tmp_path / "cache")
+
+
 def bases(services: Services, shards: Shards) -> list[Shard]:
     return [read_shard(services.store.get(file.key), kind="base") for file in shards.of("base")]
 
 
-def test_a_job_in_a_store_is_read_whole(services: Services, job: JobRecord, tmp_path: Path) -> None:
-    shards = open_shards(services.store, job=job.id, cache=tmp_path / "cache")
+def test_a_job_in_a_store_is_read_valid_or_whole(services: Services, shards: Shards) -> None:
     assert [file.kind for file in shards] == ["base", "scene", "views"] * 2
     assert len(Grasps(shards, valid=False)) == GRASPS
-
-
-def test_only_valid_grasps_are_read_unless_all_are_wanted(services: Services, job: JobRecord, tmp_path: Path) -> None:
-    shards = open_shards(services.store, job=job.id, cache=tmp_path / "cache")
     valid = sum(int(np.count_nonzero(base["quality/valid"])) for base in bases(services, shards))
     assert 0 < valid < GRASPS
     assert len(Grasps(shards)) == valid
 
 
-def test_a_sample_is_a_row_of_its_shard(services: Services, job: JobRecord, tmp_path: Path) -> None:
-    shards = open_shards(services.store, job=job.id, cache=tmp_path / "cache")
-    sample = Grasps(shards)[-1]
+def test_a_sample_is_a_row_and_arrays_hold_them_in_order(shards: Shards) -> None:
+    grasps = Grasps(shards)
+    sample = grasps[-1]
     base = read_shard(shards.path(shards.by_id(sample["shard_id"])), kind="base")
     np.testing.assert_array_equal(sample["grasp/hand_pose"], base["grasp/hand_pose"][sample["row"]])
     assert (sample["hand"], sample["object"]) == ("allegro", "mug")
-
-
-def test_arrays_hold_the_samples_in_their_order(services: Services, job: JobRecord, tmp_path: Path) -> None:
-    grasps = Grasps(open_shards(services.store, job=job.id, cache=tmp_path / "cache"))
     arrays = grasps.arrays("quality/epsilon")
     np.testing.assert_array_equal(arrays["quality/epsilon"], [sample["quality/epsilon"] for sample in grasps])
     assert len(arrays["hand"]) == len(grasps)
 
 
-def test_a_condition_keeps_the_grasps_it_holds_for(services: Services, job: JobRecord, tmp_path: Path) -> None:
-    shards = open_shards(services.store, job=job.id, cache=tmp_path / "cache")
+def test_a_condition_keeps_the_grasps_it_holds_for(shards: Shards) -> None:
     good = Grasps(shards, where=lambda columns: columns["quality/penetration_depth_mm"] < 0.5)
     assert 0 < len(good) < len(Grasps(shards))
     assert all(sample["quality/penetration_depth_mm"] < 0.5 for sample in good)
-
-
-def test_a_condition_of_the_wrong_length_is_told(folder: Path) -> None:
     with pytest.raises(InputError, match="mask of shape"):
-        Grasps(open_shards(folder), where=lambda columns: np.ones(3, bool))
+        Grasps(shards, where=lambda columns: np.ones(3, bool))
 
 
-def test_files_in_a_folder_are_the_same_dataset(
-    services: Services, job: JobRecord, folder: Path, tmp_path: Path
-) -> None:
-    stored = Grasps(open_shards(services.store, job=job.id, cache=tmp_path / "cache")).arrays()
-    local = Grasps(open_shards(folder)).arrays()
+def test_files_in_a_folder_are_the_same_dataset(shards: Shards, folder: Path) -> None:
+    stored, local = (Grasps(source).arrays() for source in (shards, open_shards(folder)))
     np.testing.assert_array_equal(local["grasp/joint_positions"], stored["grasp/joint_positions"])
 
 
-def test_a_picture_comes_with_its_scenes_grasps_in_the_camera_frame(folder: Path) -> None:
+def test_a_picture_comes_with_its_grasps_in_the_camera_frame(folder: Path) -> None:
     shards = open_shards(folder)
     picture = next(sample for sample in Pictures(shards) if len(sample["grasp/hand_pose"]))
     views = read_shard(shards.path(shards.by_id(picture["shard_id"])), kind="views")
@@ -110,43 +111,31 @@ def test_a_picture_comes_with_its_scenes_grasps_in_the_camera_frame(folder: Path
 
 
 def test_every_picture_is_there_once(folder: Path) -> None:
-    pictures = Pictures(open_shards(folder))
+    shards = open_shards(folder)
+    pictures = Pictures(shards)
     places = {(sample["shard_id"], sample["row"]) for sample in pictures}
     assert len(places) == len(pictures) == 2 * 2 * 2  # batches, scenes, views
-
-
-def test_a_scene_shard_that_is_missing_is_named(folder: Path) -> None:
-    shards = open_shards(folder)
     with pytest.raises(NotFoundError, match="not among"):
         Pictures(Shards(shards.of("views")))
 
 
-def test_the_newest_snapshot_of_a_dataset_is_read(services: Services, job: JobRecord, tmp_path: Path) -> None:
-    shards = open_shards(services.store, job=job.id, cache=tmp_path / "cache")
+def test_the_newest_snapshot_of_a_dataset_is_read(services: Services, shards: Shards, tmp_path: Path) -> None:
+    with pytest.raises(NotFoundError, match="graspd datasets snapshot kitchen"):
+        open_shards(services.store, dataset="kitchen", cache=tmp_path / "cache")
     for number, some in enumerate((shards.files[:1], shards.files)):
         _put_snapshot(services, "kitchen", Shards(some), created=f"2026-01-0{number + 1}T00:00:00Z")
     assert len(open_shards(services.store, dataset="kitchen", cache=tmp_path / "cache")) == len(shards)
 
 
-def test_a_dataset_without_a_snapshot_says_how_to_take_one(services: Services, tmp_path: Path) -> None:
-    with pytest.raises(NotFoundError, match="graspd datasets snapshot kitchen"):
-        open_shards(services.store, dataset="kitchen", cache=tmp_path / "cache")
-
-
-def test_a_file_that_changed_in_the_store_is_refused(services: Services, job: JobRecord, tmp_path: Path) -> None:
-    shard = open_shards(services.store, job=job.id, cache=tmp_path / "cache").files[0]
-    cache = ShardCache(tmp_path / "other")
+def test_a_file_that_changed_is_refused_or_fetched_again(services: Services, shards: Shards, tmp_path: Path) -> None:
+    shard = shards.files[0]
     with pytest.raises(DamagedShard, match=shard.id):
-        cache.fetch(services.store, shard.key, "0" * 64)
+        ShardCache(tmp_path / "other").fetch(services.store, shard.key, "0" * 64)
     assert not list((tmp_path / "other").iterdir())
-
-
-def test_a_cached_file_that_changed_is_fetched_again(services: Services, job: JobRecord, tmp_path: Path) -> None:
-    shards = open_shards(services.store, job=job.id, cache=tmp_path / "cache")
-    path = shards.path(shards.files[0])
+    path = shards.path(shard)
     data = path.read_bytes()
     path.write_bytes(flipped(data))
-    assert shards.path(shards.files[0]).read_bytes() == data
+    assert shards.path(shard).read_bytes() == data
 
 
 def test_a_wrong_value_in_a_file_is_refused_and_not_handed_out(folder: Path) -> None:
@@ -159,48 +148,128 @@ def test_a_wrong_value_in_a_file_is_refused_and_not_handed_out(folder: Path) -> 
 
 
 def test_a_full_cache_drops_what_was_unused_longest(services: Services, tmp_path: Path) -> None:
-    from graspd.service.model.states import Stage
-
-    data = [bytes([number]) * 1000 for number in range(3)]
-    keys = [shard_file(Stage.SYNTHESIZE, f"{number:032x}") for number in range(3)]
-    sums = [hashlib.sha256(blob).hexdigest() for blob in data]
-    for key, blob in zip(keys, data, strict=True):
+    blobs = {shard_file(Stage.SYNTHESIZE, f"{number:032x}"): bytes([number]) * 1000 for number in range(3)}
+    for key, blob in blobs.items():
         services.store.put(key, blob)
     cache = ShardCache(tmp_path / "small", limit_bytes=2500)
-    import os
-
-    for age, (key, digest) in enumerate(zip(keys[:2], sums[:2], strict=True)):
-        os.utime(cache.fetch(services.store, key, digest), (1000 - 100 * age, 1000 - 100 * age))
-    cache.fetch(services.store, keys[2], sums[2])
+    sums = [hashlib.sha256(blob).hexdigest() for blob in blobs.values()]
+    for age, (key, digest) in enumerate(zip(blobs, sums, strict=True)):
+        path = cache.fetch(services.store, key, digest)
+        if age < 2:
+            os.utime(path, (1000 - 100 * age, 1000 - 100 * age))
     assert {path.stem for path in cache.folder.iterdir()} == {sums[0], sums[2]}
 
 
 def _put_snapshot(services: Services, dataset: str, shards: Shards, *, created: str) -> None:
     digest = hashlib.sha256(created.encode()).hexdigest()[:32]
-    listed = tuple(
-        SnapshotShard(
-            id=file.id,
-            kind=file.kind,
-            key=file.key,
-            sha256=file.sha256,
-            size_bytes=1,
-            count=1,
-            valid=1,
-            hand=file.hand,
-            object=file.object,
-            batch=file.batch,
-        )
-        for file in shards
-    )
-    taken = Snapshot(
-        dataset=dataset,
-        dataset_digest="a" * 32,
-        digest=digest,
-        complete=True,
-        grasps=1,
-        valid=1,
-        size_bytes=1,
-        created=created,
-        shards=listed,
-    )
+    same = ("id", "kind", "key", "sha256", "hand", "object", "batch")
+    sums = {"size_bytes": 1, "valid": 1}
+    listed = [{name: getattr(file, name) for name in same} | sums | {"count": 1} for file in shards]
+    of = {"dataset": dataset, "dataset_digest": "a" * 32, "digest": digest, "complete": True, "grasps": 1}
+    taken = Snapshot(**of, **sums, created=created, shards=listed)
     put_record(services.store, dataset_snapshot(dataset, digest), taken)
+
+
+@pytest.fixture
+def remote(tmp_path: Path, s3_url: str) -> Iterator[Services]:
+    index = empty_index(f"sqlite:///{tmp_path / 'index.sqlite'}")
+    made = Services(Settings(data_dir=tmp_path), open_store(s3_url), index, MemoryQueue())
+    factories.add_builtins(made)
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def remote_job(remote: Services) -> JobRecord:
+    record = factories.add_job(remote, grasps=40, scenes=2, views=2, width=24, height=16)
+    factories.finish_all(remote, record)
+    return record
+
+
+@pytest.mark.s3
+def test_what_is_read_from_s3_is_what_was_written(
+    remote: Services, remote_job: JobRecord, s3_url: str, tmp_path: Path
+) -> None:
+    shards = open_shards(s3_url, job=remote_job.id, cache=tmp_path / "cache")
+    written = [remote.store.get(file.key) for file in shards]
+    assert [shards.path(file).read_bytes() for file in shards] == written
+    assert len(Grasps(shards, valid=False)) == 40 and len(Pictures(shards)) == 8
+
+
+@pytest.mark.s3
+def test_what_was_read_once_needs_the_server_no_more(
+    remote: Services, remote_job: JobRecord, s3_url: str, s3_server: S3Server, tmp_path: Path
+) -> None:
+    shards = open_shards(s3_url, job=remote_job.id, cache=tmp_path / "cache")
+    first = Grasps(shards).arrays("grasp/hand_pose")
+    s3_server.kill()
+    try:
+        again = Grasps(shards).arrays("grasp/hand_pose")
+    finally:
+        s3_server.start()
+    np.testing.assert_array_equal(again["grasp/hand_pose"], first["grasp/hand_pose"])
+
+
+@pytest.mark.s3
+def test_a_cache_smaller_than_the_job_still_reads_all_of_it(
+    remote: Services, remote_job: JobRecord, s3_url: str, tmp_path: Path
+) -> None:
+    shards = open_shards(s3_url, job=remote_job.id, cache=tmp_path / "cache", cache_bytes=60_000)
+    largest = max(len(remote.store.get(file.key)) for file in shards)
+    assert sum(1 for _ in Grasps(shards, valid=False)) == 40
+    held = sum(path.stat().st_size for path in (tmp_path / "cache").iterdir())
+    assert held <= max(60_000, largest) < sum(len(remote.store.get(file.key)) for file in shards)
+
+
+class Counted(Sequence[dict[str, Any]]):
+    """Numbers as samples; number `bad` cannot be read."""
+
+    def __init__(self, bad: int = -1) -> None:
+        self.bad, self.asked, self._lock = bad, 0, threading.Lock()
+
+    def __len__(self) -> int:
+        return 30
+
+    def __getitem__(self, index: Any) -> Any:
+        with self._lock:
+            self.asked += 1
+        if index == self.bad:
+            raise InputError("no such number")
+        return {"number": index}
+
+
+def test_samples_come_in_order_and_none_is_left_out() -> None:
+    assert [sample["number"] for sample in prefetched(Counted(), workers=3, ahead=4)] == list(range(30))
+    order = [7, 3, 3, 29]
+    assert [sample["number"] for sample in prefetched(Counted(), order, workers=2, ahead=50)] == order
+
+
+def test_no_more_are_read_than_may_be_held() -> None:
+    source = Counted()
+    found = prefetched(source, workers=2, ahead=5)
+    for _ in range(3):
+        next(found)
+    assert source.asked <= 3 + 5
+    found.close()
+    assert not [thread for thread in threading.enumerate() if thread.name.startswith("prefetch")]
+
+
+def test_an_error_comes_when_it_is_its_turn() -> None:
+    found = prefetched(Counted(bad=4), workers=2, ahead=10)
+    assert [next(found)["number"] for _ in range(4)] == [0, 1, 2, 3]
+    with pytest.raises(InputError, match="no such number"):
+        next(found)
+
+
+@pytest.mark.parametrize("options", [{"workers": 0}, {"ahead": 0}])
+def test_numbers_below_one_are_refused_at_once(options: dict[str, int]) -> None:
+    with pytest.raises(InputError, match="at least one"):
+        prefetched(Counted(), **options)
+
+
+def test_pictures_and_clouds_are_the_same_ahead(tmp_path: Path) -> None:
+    pictures = Pictures(open_shards(box_scenes.write(tmp_path / "box")))
+    for source in (pictures, pictures.clouds(64, noise="tof")):
+        for index, sample in enumerate(prefetched(source, workers=3)):
+            for name, value in source[index].items():
+                np.testing.assert_array_equal(sample[name], value)

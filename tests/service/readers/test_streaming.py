@@ -1,27 +1,30 @@
-"""Pictures read from a store by ranges of bytes: the same pictures, few requests, nothing on disk, faults by name."""
+"""Pictures read from a store by ranges of bytes past the HDF5 library: the same, few requests, faults by name."""
 
 from __future__ import annotations
 
 import hashlib
 import os
 import pickle
-import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 from obstore.store import MemoryStore
 
 from graspd.service.model.errors import DamagedShard, InputError, StoreUnavailable
 from graspd.service.readers import Pictures, ShardCache, ShardFile, Shards, open_shards, prefetched, ranges
+from graspd.service.readers.ranges import RowTable, read_file
+from graspd.service.store.columns import SCHEMAS
 from graspd.service.store.store import Store, open_store
 from tests.conftest import REPOSITORY
 from tests.service.readers import box_scenes
 from tests.service.readers.box_scenes import VIEWS
+from tests.shell import completed
 
 VIEWS_KEY = f"shards/views/{'c' * 32}.h5"
 
@@ -29,6 +32,11 @@ VIEWS_KEY = f"shards/views/{'c' * 32}.h5"
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return box_scenes.write(tmp_path_factory.mktemp("box"))
+
+
+@pytest.fixture
+def shards(folder: Path, tmp_path: Path) -> Shards:
+    return streamed(folder, open_store("memory://"), tmp_path / "cache")
 
 
 @pytest.fixture
@@ -78,32 +86,22 @@ def test_the_samples_are_those_of_the_files(
     same(remote.clouds(64, noise="stereo", fuse=True), local.clouds(64, noise="stereo", fuse=True))
 
 
-def test_pictures_leave_nothing_on_the_disk(folder: Path, tmp_path: Path) -> None:
-    pictures = Pictures(streamed(folder, open_store("memory://"), tmp_path / "cache"))
-    assert sum(1 for _ in pictures) == VIEWS
+def test_pictures_leave_nothing_on_the_disk(folder: Path, shards: Shards, tmp_path: Path) -> None:
+    assert sum(1 for _ in Pictures(shards)) == VIEWS
     (base,) = (tmp_path / "cache").iterdir()
     assert base.read_bytes() == (folder / "base.h5").read_bytes()
 
 
-def test_a_request_brings_all_that_is_read_in_turn(
-    folder: Path, tmp_path: Path, asked: list[tuple[str, int, int]]
+def test_a_request_brings_what_is_read_in_turn(
+    folder: Path, shards: Shards, asked: list[tuple[str, int, int]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    shards = streamed(folder, open_store("memory://"), tmp_path)
     pictures = Pictures(shards, ["image/rgb", "image/depth"])
     pictures[0]
     asked.clear()
     shards.ranges.forget()
     assert sum(1 for _ in pictures) == VIEWS
     assert [key for key, _, _ in asked] == [VIEWS_KEY]
-
-
-def test_a_picture_drawn_from_a_large_shard_brings_its_own_bytes(
-    folder: Path, tmp_path: Path, asked: list[tuple[str, int, int]], monkeypatch: pytest.MonkeyPatch
-) -> None:
     monkeypatch.setattr(ranges, "GAP_BYTES", 0)
-    shards = streamed(folder, open_store("memory://"), tmp_path)
-    pictures = Pictures(shards, ["image/rgb", "image/depth"])
-    pictures[0]
     shards.ranges.forget()
     asked.clear()
     pictures[4]
@@ -123,7 +121,7 @@ def test_what_is_held_is_bounded(folder: Path, tmp_path: Path, monkeypatch: pyte
     assert set(reader._objects) == {"object-4", "object-5"}
 
 
-def test_damage_is_told_with_the_row_and_what_is_gone_with_its_name(folder: Path, tmp_path: Path) -> None:
+def test_damage_is_told_with_the_row_or_the_name(folder: Path, tmp_path: Path) -> None:
     store = open_store(f"file://{tmp_path / 'store'}")
     shards = streamed(folder, store, tmp_path / "cache")
     pictures = Pictures(shards, ["image/depth"])
@@ -149,10 +147,9 @@ def test_damage_is_told_with_the_row_and_what_is_gone_with_its_name(folder: Path
 
 @pytest.mark.parametrize("largest", [0, 1 << 22], ids=["ranges", "whole"])
 def test_a_store_that_is_away_is_told_and_not_taken_for_damage(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, largest: int
+    shards: Shards, monkeypatch: pytest.MonkeyPatch, largest: int
 ) -> None:
     monkeypatch.setattr(ranges, "AHEAD_BYTES", largest)
-    shards = streamed(folder, open_store("memory://"), tmp_path)
     pictures = Pictures(shards)
 
     def away(*_: object) -> bytes:
@@ -164,7 +161,7 @@ def test_a_store_that_is_away_is_told_and_not_taken_for_damage(
         pictures[0]
 
 
-def test_a_process_that_keeps_the_error_of_a_shard_that_is_none_ends_well() -> None:
+def test_a_kept_error_of_a_bad_shard_ends_the_process_well() -> None:
     """HDF5 crashes at the end of a process in which something still holds a file that it could not open."""
     code = """
 from graspd.service.model.errors import InputError
@@ -179,11 +176,11 @@ except InputError as error:
     kept = error
     print(kept)
 """
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=REPOSITORY)
+    done = completed([sys.executable, "-c", code], cwd=REPOSITORY)
     assert (done.returncode, "not a readable HDF5 file" in done.stdout) == (0, True), done.stderr[-1000:]
 
 
-def test_a_reader_goes_to_another_process_and_begins_there_with_nothing(folder: Path, tmp_path: Path) -> None:
+def test_a_reader_begins_with_nothing_in_another_process(folder: Path, tmp_path: Path) -> None:
     store = open_store(f"file://{tmp_path / 'store'}")
     pictures = Pictures(streamed(folder, store, tmp_path / "cache"))
     first = pictures[3]
@@ -193,7 +190,7 @@ def test_a_reader_goes_to_another_process_and_begins_there_with_nothing(folder: 
 
 
 @pytest.mark.parametrize("stream", [True, False])
-def test_a_fork_is_told_to_start_anew_instead_of_waiting_for_ever(
+def test_a_fork_is_told_to_start_anew(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stream: bool
 ) -> None:
     remote = Store(MemoryStore(), "s3://bucket/graspd")
@@ -220,3 +217,78 @@ def test_ranges_with_little_between_them_are_one() -> None:
 def test_pictures_of_s3_are_those_of_the_files(folder: Path, tmp_path: Path, s3_url: str) -> None:
     remote = Pictures(streamed(folder, open_store(s3_url), tmp_path))
     same(list(prefetched(remote, workers=4)), Pictures(open_shards(folder)))
+
+
+@pytest.fixture(scope="module")
+def views(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return box_scenes.write(tmp_path_factory.mktemp("box")) / "views.h5"
+
+
+def test_every_row_of_every_column_is_what_h5py_reads(views: Path) -> None:
+    with h5py.File(views) as file:
+        columns = [name for name in SCHEMAS["views"] if name in file]
+        table = RowTable.of(file, columns, "views")
+        assert {"image/rgb", "image/depth"} <= set(table.packed) and "camera/eye" in table.held
+        for row in range(len(file["camera/eye"])):
+            found = table.row(row, columns, lambda ranges: read_file(views, ranges))
+            for name in columns:
+                expected = file[name][row]
+                assert found[name].dtype == expected.dtype
+                np.testing.assert_array_equal(found[name], expected)
+
+
+def test_what_is_packed_in_another_way_is_read_by_the_library(tmp_path: Path) -> None:
+    values = np.arange(2 * 6 * 5, dtype=np.float32).reshape(2, 6, 5)
+    ways = {
+        "whole": {},
+        "two": {"chunks": (2, 6, 5), "compression": "gzip"},
+        "lzf": {"chunks": (1, 6, 5), "compression": "lzf"},
+        "bare": {"chunks": (1, 6, 5)},
+        "plain": {"chunks": (1, 6, 5), "compression": "gzip"},
+        "summed": {"chunks": (1, 6, 5), "compression": "gzip", "fletcher32": True},
+    }
+    with h5py.File(tmp_path / "other.h5", "w") as file:
+        for name, options in ways.items():
+            file.create_dataset(name, data=values, **options)
+        half = file.create_dataset("half", shape=values.shape, dtype="f4", chunks=(1, 6, 5), compression="gzip")
+        half[1] = values[1]
+    with h5py.File(tmp_path / "other.h5") as file:
+        table = RowTable.of(file, [*ways, "half"], "other")
+    assert set(table.packed) == {"plain"}
+    found = table.row(1, ways, lambda ranges: read_file(tmp_path / "other.h5", ranges))
+    for name in ways:
+        np.testing.assert_array_equal(found[name], values[1])
+    assert not table.row(0, ["half"], lambda _: [])["half"].any()
+
+
+def test_a_picture_whose_bytes_turned_is_refused_alone(views: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "set"
+    folder.mkdir()
+    (folder / "base.h5").write_bytes((views.parent / "base.h5").read_bytes())
+    with h5py.File(views) as file:
+        start, length = RowTable.of(file, ["image/depth"], "views").packed["image/depth"].places[2]
+    data = bytearray(views.read_bytes())
+    data[start + length // 2] ^= 0x10
+    (folder / "views.h5").write_bytes(data)
+    pictures = Pictures(open_shards(folder), ["image/depth"])
+    with pytest.raises(DamagedShard, match="row 2 of image/depth") as told:
+        pictures[2]
+    assert "\n" not in str(told.value)
+    assert pictures[1]["image/depth"].shape == pictures[3]["image/depth"].shape
+
+
+def test_a_file_that_ends_too_early_is_refused(views: Path, tmp_path: Path) -> None:
+    with h5py.File(views) as file:
+        table = RowTable.of(file, ["image/rgb"], "views")
+    (tmp_path / "cut.h5").write_bytes(views.read_bytes()[:3000])
+    with pytest.raises(DamagedShard, match="views is damaged"):
+        table.row(1, ["image/rgb"], lambda ranges: read_file(tmp_path / "cut.h5", ranges))
+
+
+def test_a_sample_is_the_callers_own(views: Path) -> None:
+    pictures = Pictures(open_shards(views.parent), ["image/rgb", "image/depth", "camera/intrinsics"])
+    first = pictures[0]
+    for value in first.values():
+        if isinstance(value, np.ndarray):
+            value[...] = 0
+    assert pictures[0]["image/rgb"].any() and pictures[0]["camera/intrinsics"].any()

@@ -44,7 +44,7 @@ def test_ranks_share_the_grasps(shards: Shards) -> None:
     assert len(parts[0]) + len(parts[1]) == len(Grasps(shards))
 
 
-def test_another_epoch_has_another_order_and_the_same_epoch_the_same(shards: Shards) -> None:
+def test_another_epoch_has_another_order(shards: Shards) -> None:
     stream = ShuffledShards(shards, seed=3)
     first, again = rows(DataLoader(stream, batch_size=8)), rows(DataLoader(stream, batch_size=8))
     stream.epoch = 1

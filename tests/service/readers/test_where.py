@@ -64,7 +64,6 @@ def test_an_expression_chooses_what_it_says(text: str, rows: list[int]) -> None:
         ("hand < allegro", "a word"),
         ("epsilon > 1; import os", "cannot be read"),
         ("__import__('os').system('true')", "cannot be read"),
-        ("__import__ > 1", "there is no '__import__'"),
         ("epsilon > 0x10", "cannot be read|left over|compared with"),
         ("(" * 200 + "valid" + ")" * 200, "nested"),
         ("not " * 200 + "valid", "nested"),

@@ -1,4 +1,4 @@
-"""The service of a data folder is found where it says it answers, and not where one that is gone did."""
+"""The service of a data folder: found where it answers, joined by others; nothing of an earlier one is in its way."""
 
 from __future__ import annotations
 
@@ -8,15 +8,20 @@ import socket
 import stat
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from graspd.api.server import bind
 from graspd.client.reports import open_client
-from graspd.service.run.address import forget_address, record_address, recorded_address
+from graspd.service.model.errors import GraspdError, InputError, UnavailableError
+from graspd.service.run.address import forget_address, joining, record_address, recorded_address
+from graspd.service.run.children import Child, end_leftovers, start_of
 from graspd.service.run.supervisor import Supervisor, _reserve
 from graspd.service.settings import Settings
+from tests.servers import free_ports
+from tests.waiting import until
 
 URL = "http://127.0.0.1:45678"
 
@@ -39,21 +44,16 @@ def asked() -> str:
         return client.url
 
 
-def test_the_client_asks_the_service_of_its_data_folder(folder: Path) -> None:
+def test_the_client_asks_the_service_of_its_data_folder(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert asked() == "http://127.0.0.1:8000", "without a record the usual address"
     record_address(folder, URL)
+    assert stat.S_IMODE((folder / "api.json").stat().st_mode) == 0o600
+    assert [file.name for file in folder.iterdir()] == ["api.json"]
     assert asked() == URL
-
-
-def test_a_url_that_was_given_goes_before(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    record_address(folder, URL)
     monkeypatch.setenv("GRASPD_API_URL", "http://127.0.0.1:1234")
     assert asked() == "http://127.0.0.1:1234"
     with open_client("http://127.0.0.1:99") as client:
         assert client.url == "http://127.0.0.1:99"
-
-
-def test_without_a_record_the_client_asks_the_usual_address(folder: Path) -> None:
-    assert asked() == "http://127.0.0.1:8000"
 
 
 def test_the_record_of_a_service_that_is_gone_is_not_believed(folder: Path) -> None:
@@ -64,28 +64,13 @@ def test_the_record_of_a_service_that_is_gone_is_not_believed(folder: Path) -> N
     assert asked() == "http://127.0.0.1:8000"
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "",
-        "{",
-        "[]",
-        "3",
-        '{"api_url": 5, "pid": 1}',
-        '{"api_url": "file:///x", "pid": 1}',
-        '{"api_url": "http://x", "pid": "1"}',
-        '{"api_url": "http://x", "pid": ' + "9" * 40 + "}",
-    ],
-)
+_NO_RECORDS = '|{|[]|3|{"api_url": 5, "pid": 1}|{"api_url": "file:///x", "pid": 1}|{"api_url": "http://x", "pid": "1"}'
+
+
+@pytest.mark.parametrize("text", [*_NO_RECORDS.split("|"), f'{{"api_url": "http://x", "pid": {"9" * 40}}}'])
 def test_a_record_that_makes_no_sense_is_no_record(folder: Path, text: str) -> None:
     (folder / "api.json").write_text(text)
     assert recorded_address(folder) is None
-
-
-def test_the_record_is_for_its_user_alone_and_leaves_no_scraps(folder: Path) -> None:
-    record_address(folder, URL)
-    assert stat.S_IMODE((folder / "api.json").stat().st_mode) == 0o600
-    assert [file.name for file in folder.iterdir()] == ["api.json"]
 
 
 def test_only_the_process_that_wrote_the_record_takes_it_away(folder: Path) -> None:
@@ -98,7 +83,7 @@ def test_only_the_process_that_wrote_the_record_takes_it_away(folder: Path) -> N
     assert recorded_address(folder) is None
 
 
-def test_a_service_on_any_free_port_is_found_by_its_data_folder_until_it_stops(folder: Path) -> None:
+def test_a_service_on_any_free_port_is_found_until_it_stops(folder: Path) -> None:
     supervisor = Supervisor(Settings(data_dir=folder, port=0, device="cpu"), workers=0)
     with supervisor:
         assert not supervisor.api_url.endswith(":0")
@@ -114,3 +99,135 @@ def test_a_port_that_was_found_free_is_kept_for_the_api() -> None:
             stranger.bind(address)
         for _ in range(2):  # an API that is started again takes it again
             bind(*address).close()
+
+
+@pytest.fixture
+def joining_settings(tmp_path: Path) -> Settings:
+    return Settings(data_dir=tmp_path / "data", store_url=f"file://{tmp_path}/the store")
+
+
+def test_the_file_holds_what_a_shell_reads_and_nobody_else_may(joining_settings: Settings, tmp_path: Path) -> None:
+    file = tmp_path / "shared" / "join.env"
+    others = joining(joining_settings, file, host="127.0.0.1")
+    others.write(joining_settings, "http://127.0.0.1:8000")
+    assert file.read_text().splitlines() == [
+        f"GRASPD_REDIS_URL=redis://:{others.password}@127.0.0.1:{others.port}/0",
+        f"GRASPD_STORE_URL='file://{tmp_path}/the store'",
+        "GRASPD_API_URL=http://127.0.0.1:8000",
+    ]
+    assert stat.S_IMODE(file.stat().st_mode) == 0o600
+    assert list(file.parent.iterdir()) == [file], "no draft is left"
+
+
+def test_a_service_forgets_its_own_file_and_not_its_successors(joining_settings: Settings, tmp_path: Path) -> None:
+    first, second = (joining(joining_settings, tmp_path / "join.env", host="127.0.0.1") for _ in range(2))
+    assert first.password != second.password
+    first.write(joining_settings, "http://a")
+    second.write(joining_settings, "http://b")
+    first.forget()
+    assert "http://b" in (tmp_path / "join.env").read_text()
+    second.forget()
+    second.forget()
+    assert not (tmp_path / "join.env").exists()
+
+
+@pytest.mark.parametrize(
+    ("changes", "host", "told"),
+    [
+        ({"store_url": None}, "127.0.0.1", "GRASPD_STORE_URL"),
+        ({"redis_url": "redis://elsewhere"}, "127.0.0.1", "GRASPD_REDIS_URL"),
+        ({}, "192.0.2.1", "--share-host"),
+        ({}, "no-such-host.invalid", "--share-host"),
+    ],
+)
+def test_what_cannot_be_shared_is_refused_with_its_mend(
+    joining_settings: Settings, tmp_path: Path, changes: dict[str, str | None], host: str, told: str
+) -> None:
+    with pytest.raises(InputError, match=told):
+        joining(joining_settings.model_copy(update=changes), tmp_path / "join.env", host=host)
+
+
+def test_a_port_that_is_wished_for_is_taken_or_refused(joining_settings: Settings, tmp_path: Path) -> None:
+    (port,) = free_ports(1)
+    assert joining(joining_settings, tmp_path / "join.env", host="127.0.0.1", port=port).port == port
+
+
+def test_a_folder_that_cannot_be_written_is_an_error_of_ours(joining_settings: Settings, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UnavailableError) as error:
+        joining(joining_settings, tmp_path / "file" / "join.env", host="127.0.0.1").write(joining_settings, "http://a")
+    assert isinstance(error.value, GraspdError)
+
+
+_WAIT = "import signal; signal.pause()"
+
+
+@pytest.fixture
+def stranger(tmp_path: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """An editor, say: the folder's path is in its command line and in its environment."""
+    command = [sys.executable, "-c", _WAIT, str(tmp_path)]
+    with subprocess.Popen(command, env={**os.environ, "GRASPD_DATA_DIR": str(tmp_path)}) as process:
+        yield process
+        process.kill()
+
+
+@pytest.fixture
+def child(tmp_path: Path) -> Iterator[Child]:
+    made = Child("worker-0", (sys.executable, "-c", _WAIT), {}, tmp_path)
+    made.start()
+    assert made.process is not None
+    # While it becomes its program, its environment cannot be read.
+    command = Path(f"/proc/{made.process.pid}/cmdline")
+    until(lambda: _WAIT in command.read_text() and "launch" not in command.read_text(), "the child runs")
+    yield made
+    made.process.kill()
+    made.process.wait()
+
+
+def pid_file(folder: Path, content: object) -> Path:
+    file = folder / "run" / "worker-0.pid"
+    file.parent.mkdir(exist_ok=True)
+    file.write_text(content if isinstance(content, str) else json.dumps(content))
+    return file
+
+
+def test_a_child_that_was_left_behind_is_ended(child: Child, tmp_path: Path) -> None:
+    assert child.process is not None
+    assert end_leftovers(tmp_path) == [child.process.pid]
+    assert child.process.wait(timeout=60) < 0
+    assert not list((tmp_path / "run").iterdir())
+
+
+def test_a_process_that_got_the_number_of_a_child_lives_on(
+    child: Child, stranger: subprocess.Popen[bytes], tmp_path: Path
+) -> None:
+    assert child.pid_file is not None
+    _, started, token = json.loads(child.pid_file.read_text())
+    for stale in (
+        [stranger.pid, started, token],
+        [stranger.pid, start_of(stranger.pid), token],
+        [stranger.pid, "", ""],
+        str(stranger.pid),
+    ):
+        file = pid_file(tmp_path, stale)
+        assert end_leftovers(tmp_path) == []
+        assert stranger.poll() is None
+        assert not file.exists()
+
+
+@pytest.mark.parametrize(
+    "pid",
+    [os.getpid(), os.getppid(), 0, -1, 1, "1", None, 10**30, True],
+    ids=["itself", "parent", "0", "-1", "1", "text", "none", "huge", "true"],
+)
+def test_up_ends_neither_itself_nor_its_parent_nor_nonsense(pid: object, tmp_path: Path) -> None:
+    started = start_of(pid) if isinstance(pid, int) else ""
+    pid_file(tmp_path, [pid, started, ""])
+    assert end_leftovers(tmp_path) == []
+
+
+def test_the_address_of_a_foreign_process_is_not_believed(stranger: subprocess.Popen[bytes], tmp_path: Path) -> None:
+    record_address(tmp_path, "http://127.0.0.1:45678")
+    record = json.loads((tmp_path / "api.json").read_text())
+    (tmp_path / "api.json").write_text(json.dumps(record | {"pid": stranger.pid}))
+    assert recorded_address(tmp_path) is None

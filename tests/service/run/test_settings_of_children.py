@@ -52,9 +52,7 @@ def test_a_setting_reaches_the_children(name: str, monkeypatch: pytest.MonkeyPat
 @pytest.mark.parametrize(
     "name", [name for name, field in Settings.model_fields.items() if field.default is None and name not in _SETTLED]
 )
-def test_a_setting_that_was_taken_back_does_not_come_from_the_environment(
-    name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_setting_taken_back_does_not_come_from_the_environment(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     value = value_of(name)
     monkeypatch.setenv(
         f"GRASPD_{name.upper()}", value.get_secret_value() if isinstance(value, SecretStr) else str(value)

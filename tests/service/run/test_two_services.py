@@ -1,4 +1,4 @@
-"""A second service is refused by every command that would work for it, in one line and with exit code 1."""
+"""A second service is refused by every command that would work for it; a data folder may have any name."""
 
 from __future__ import annotations
 
@@ -11,12 +11,18 @@ from pathlib import Path
 
 import pytest
 
+from graspd.service.index.index import Index
+from graspd.service.model.errors import InputError
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.identity import identify
 from graspd.service.queue.connection import connect
 from graspd.service.queue.rq_queue import RqQueue
+from graspd.service.run.supervisor import Supervisor
 from graspd.service.settings import Settings
+from graspd.service.store.store import open_store
 from tests.indexes import empty_index
+from tests.shell import completed
+from tests.waiting import PATIENCE_S
 
 COMMANDS = [["up", "--workers", "0", "--port", "0"], ["api", "--port", "0"], ["controller"], ["worker"]]
 
@@ -42,9 +48,7 @@ def beside(redis_server: str) -> str:
 
 def run(command: list[str], folder: Path, **environment: str) -> subprocess.CompletedProcess[str]:
     variables = {**os.environ, "GRASPD_DATA_DIR": str(folder), "GRASPD_LOG_LEVEL": "ERROR", **environment}
-    return subprocess.run(
-        [sys.executable, "-m", "graspd", *command], env=variables, capture_output=True, text=True, check=False
-    )
+    return completed([sys.executable, "-m", "graspd", *command], env=variables)
 
 
 @pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
@@ -62,11 +66,8 @@ def test_a_command_of_a_second_service_on_a_store_is_refused(
     command: list[str], first: Services, beside: str, tmp_path: Path
 ) -> None:
     done = run(command, tmp_path / "second", GRASPD_STORE_URL=first.store.url, GRASPD_REDIS_URL=beside)
-    said = done.stderr.splitlines()[-1]
-    assert (done.returncode, said.partition(" graspd service")[0]) == (
-        1,
-        f"graspd: the store {first.store.url} belongs to another",
-    )
+    assert done.returncode == 1
+    assert done.stderr.splitlines()[-1].startswith(f"graspd: the store {first.store.url} belongs to another graspd")
 
 
 def test_the_doctor_says_so(first: Services, redis_server: str, tmp_path: Path) -> None:
@@ -84,3 +85,46 @@ def test_another_number_of_database_is_another_redis(first: Services, beside: st
     second = Services.open(settings)
     assert identify(second) != first.queue.service()
     second.close()
+
+
+NAMES = "100% a%20b a#b what? größe q'u\"o\\te a&b=c;d [1] a:b@c {x} ~ $HOME"
+
+
+@pytest.mark.parametrize("name", [*NAMES.split(), "a b", "a\nb"])
+def test_store_and_index_lie_in_the_folder_and_nothing_beside_it(name: str, tmp_path: Path) -> None:
+    settings = Settings(data_dir=tmp_path / name)
+    store = open_store(settings.resolved_store_url)
+    store.put("jobs/one/job.json", b"{}")
+    assert [(entry.key, store.get(entry.key)) for entry in store.list("jobs")] == [("jobs/one/job.json", b"{}")]
+    assert (settings.data_dir / "store" / "jobs" / "one" / "job.json").exists()
+    index = Index(settings.resolved_index_url)
+    index.notes.name_service("one")
+    index.close()
+    again = Index(settings.resolved_index_url)
+    assert again.notes.service() == "one"
+    again.close()
+    assert (settings.data_dir / "index.sqlite").exists()
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+@pytest.mark.parametrize("name", ["100% #1? ü", "a\nb 'c' \"d\" \\e", "x" * 100])
+def test_a_whole_service_gets_ready_in_an_odd_folder(name: str, tmp_path: Path) -> None:
+    settings = Settings(data_dir=tmp_path / name, port=0)
+    with Supervisor(settings, workers=0) as supervisor:
+        assert supervisor.wait_ready(PATIENCE_S)
+        services = Services.open(supervisor.settings)
+        assert services.queue.service() == services.index.notes.service()
+        services.close()
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+@pytest.mark.parametrize("end", ["a?b", "a#b", "a\nb", "a\tb", "a?", "a#"])
+def test_a_store_url_that_would_be_cut_off_is_refused(end: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="%3F"):
+        open_store(f"file://{tmp_path}/{end}")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_store_url_is_read_as_it_is_quoted(tmp_path: Path) -> None:
+    open_store((tmp_path / "100% #1?").as_uri()).put("health/one", b"1")
+    assert (tmp_path / "100% #1?" / "health" / "one").exists()

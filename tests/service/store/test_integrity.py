@@ -1,21 +1,29 @@
-"""Shards that are not what they were: refused by name, wherever they are read."""
+"""Shards that are not what they were, or hold what is not theirs: refused by name, wherever they are read."""
 
 from __future__ import annotations
 
 import hashlib
 import os
+import resource
+import zlib
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import h5py
+import numpy as np
 import pytest
 
-from graspd.service.model.errors import DamagedShard
+from graspd.service.model.errors import DamagedShard, InputError, NotFoundError
 from graspd.service.model.states import Stage
+from graspd.service.store import validity
 from graspd.service.store.integrity import CheckedObjects, read_checked
 from graspd.service.store.manifests import ShardManifest, load_shard
 from graspd.service.store.shards import read_shard
 from graspd.service.store.store import Store, open_store
 from tests.damage import cut, flip, flipped, flipped_values, overwrite, remove
 from tests.fakes import make_shard, message_for
+from tests.worker.files.test_curation import shard as base_shard
 
 HARMS = (flip, cut, remove)
 
@@ -31,14 +39,19 @@ def shard(store: Store) -> ShardManifest:
 
 
 @pytest.mark.parametrize("harm", HARMS)
-def test_a_harmed_shard_is_refused_with_its_name(store: Store, shard: ShardManifest, harm: object) -> None:
-    harm(store, shard.key)  # type: ignore[operator]
-    with pytest.raises(DamagedShard, match=shard.shard_id):
-        load_shard(store, Stage.SYNTHESIZE, shard.shard_id)
-    with pytest.raises(DamagedShard, match=shard.shard_id):
-        read_checked(store, shard.key, shard.sha256)
-    with pytest.raises(DamagedShard, match=shard.shard_id):
-        CheckedObjects(store).check(shard.key, shard.sha256)
+def test_a_harmed_shard_is_refused_with_its_name(store: Store, shard: ShardManifest, harm: Any) -> None:
+    """Also where it was good when it was checked before."""
+    checked = CheckedObjects(store)
+    checked.check(shard.key, shard.sha256)
+    harm(store, shard.key)
+    for read in (
+        lambda: load_shard(store, Stage.SYNTHESIZE, shard.shard_id),
+        lambda: read_checked(store, shard.key, shard.sha256),
+        lambda: CheckedObjects(store).check(shard.key, shard.sha256),
+        lambda: checked.check(shard.key, shard.sha256),
+    ):
+        with pytest.raises(DamagedShard, match=shard.shard_id):
+            read()
 
 
 def test_an_intact_shard_is_read_through_once(
@@ -50,15 +63,6 @@ def test_an_intact_shard_is_read_through_once(
     for _ in range(3):
         checked.check(shard.key, shard.sha256)
     assert len(reads) == 1
-
-
-@pytest.mark.parametrize("harm", HARMS)
-def test_harm_after_a_check_is_noticed(store: Store, shard: ShardManifest, harm: object) -> None:
-    checked = CheckedObjects(store)
-    checked.check(shard.key, shard.sha256)
-    harm(store, shard.key)  # type: ignore[operator]
-    with pytest.raises(DamagedShard):
-        checked.check(shard.key, shard.sha256)
 
 
 def test_a_file_beside_its_manifest_is_checked_against_it(tmp_path: Path, store: Store, shard: ShardManifest) -> None:
@@ -132,3 +136,115 @@ def test_a_large_file_is_cut_off_before_what_turned(tmp_path: Path, store: Store
     with pytest.raises(DamagedShard):
         got.extend(checked.stream("large.bin", digest, 0, len(data)))
     assert b"".join(got) == data[: 2 << 20]
+
+
+FLAGS = np.array([1, 1, 0], np.uint8)
+
+
+def test_where_nobody_validated_nothing_is_valid() -> None:
+    columns = {"quality/valid": np.zeros(3, np.uint8), "quality/feasible": FLAGS}
+    assert not validity.valid(columns).any()
+    assert validity.chosen(columns, unvalidated=True).tolist() == [True, True, False]
+
+
+def test_an_unjudged_shard_of_0_1_is_not_taken_for_validated() -> None:
+    assert not validity.valid({"quality/valid": FLAGS}).any()
+    assert validity.chosen({"quality/valid": FLAGS}, unvalidated=True).tolist() == [True, True, False]
+
+
+@pytest.mark.parametrize("verdict, valid, unvalidated", [(1, [True, True, False], []), (-1, [], [True, True, False])])
+def test_a_verdict_counts_only_where_there_is_one(verdict: int, valid: list[bool], unvalidated: list[bool]) -> None:
+    columns = {"quality/valid": FLAGS, "quality/feasible": FLAGS, "quality/success": np.full(3, verdict, np.int8)}
+    assert validity.valid(columns).tolist() == (valid or [False] * 3)
+    assert validity.chosen(columns, unvalidated=True).tolist() == (unvalidated or [False] * 3)
+
+
+def test_a_grasp_that_was_validated_and_dropped_is_neither() -> None:
+    columns = {
+        "quality/valid": np.zeros(1, np.uint8),
+        "quality/feasible": np.ones(1, np.uint8),
+        "quality/success": np.zeros(1, np.int8),
+    }
+    assert not validity.chosen(columns).any()
+    assert not validity.chosen(columns, unvalidated=True).any()
+
+
+def external_link(file: h5py.File, secret: Path) -> None:
+    file["grasp/hand_pose"] = h5py.ExternalLink(str(secret), "/secret")
+
+
+def soft_link(file: h5py.File, _: Path) -> None:
+    file["grasp/hand_pose"] = h5py.SoftLink("/pregrasp/hand_pose")
+
+
+def external_storage(file: h5py.File, secret: Path) -> None:
+    file.create_dataset("grasp/hand_pose", (4, 7), "f8", external=[(str(secret), 0, 4 * 7 * 8)])
+
+
+def virtual(file: h5py.File, secret: Path) -> None:
+    layout = h5py.VirtualLayout((4, 7), "f8")
+    layout[:] = h5py.VirtualSource(str(secret), "secret", (4, 7))
+    file.create_virtual_dataset("grasp/hand_pose", layout)
+
+
+def made_up(file: h5py.File, _: Path) -> None:
+    file.create_dataset("grasp/hand_pose", (50_000_000, 7), "f8", chunks=(4096, 7), fillvalue=1.0)
+
+
+def deflated_zeros(file: h5py.File, _: Path) -> None:
+    dataset = file.create_dataset("grasp/hand_pose", (50_000_000, 7), "f8", chunks=(1 << 20, 7), compression="gzip")
+    piece = zlib.compress(bytes(dataset.chunks[0] * 7 * 8), 9)
+    for start in range(0, 48 << 20, 1 << 20):
+        dataset.id.write_direct_chunk((start, 0), piece)
+
+
+def one_dataset_under_many_names(file: h5py.File, _: Path) -> None:
+    file["grasp/hand_pose"] = np.zeros((1000, 7))
+    for number in range(500):
+        file[f"name{number}"] = file["grasp/hand_pose"]
+
+
+def many(file: h5py.File, _: Path) -> None:
+    for number in range(1200):
+        file.create_group(f"g{number}")
+
+
+CHANGES = (
+    external_link,
+    soft_link,
+    external_storage,
+    virtual,
+    made_up,
+    deflated_zeros,
+    one_dataset_under_many_names,
+    many,
+)
+
+
+@pytest.mark.parametrize("change", CHANGES)
+@pytest.mark.parametrize("as_bytes", [False, True])
+def test_values_from_elsewhere_are_refused(
+    change: Callable[[h5py.File, Path], None], as_bytes: bool, tmp_path: Path
+) -> None:
+    secret, shard = tmp_path / "secret.h5", tmp_path / "shard.h5"
+    with h5py.File(secret, "w") as file:
+        file["secret"] = np.full((4, 7), 42.0)
+    base_shard(shard, 1)
+    with h5py.File(shard, "r+") as file:
+        if "grasp/hand_pose" in file and change is not many:
+            del file["grasp/hand_pose"]
+        change(file, secret)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(InputError, match=r"link|another file|claims|more than 1000"):
+        read_shard(shard.read_bytes() if as_bytes else shard)
+    # The file that makes values up claims 2.8 GB; KiB.
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 500 * 1024
+
+
+def test_what_is_no_hdf5_is_told_in_our_words(tmp_path: Path) -> None:
+    (tmp_path / "a.h5").write_text("no")
+    with pytest.raises(InputError, match="not a readable HDF5 file; give a shard"):
+        read_shard(tmp_path / "a.h5")
+    for absent in (tmp_path / "absent.h5", tmp_path):
+        with pytest.raises(NotFoundError, match="does not exist, or is no file"):
+            read_shard(absent)

@@ -42,7 +42,7 @@ def with_meta(arrays: Arrays, **change: Any) -> bytes:
     return packed(arrays | {"meta": np.array(json.dumps(json.loads(str(arrays["meta"])) | change))})
 
 
-def test_a_network_comes_back_as_it_was_and_its_file_is_the_same_each_time(network: ProposalNetwork) -> None:
+def test_a_network_comes_back_as_it_was(network: ProposalNetwork) -> None:
     data = to_bytes(network)
     back = from_bytes(data, "it")
     assert to_bytes(back) == data == to_bytes(network)

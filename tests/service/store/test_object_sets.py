@@ -1,12 +1,15 @@
-"""A folder of meshes becomes a set of objects with the names a user expects."""
+"""A folder of meshes becomes a set of objects; an archive without memory to read it is told."""
 
 from __future__ import annotations
 
+import zipfile
+import zlib
 from pathlib import Path
 
 import pytest
 
 from graspd.service.model.errors import InputError, LimitError
+from graspd.service.store.assets import pack, unpack
 from graspd.service.store.object_sets import object_set, read_set
 
 
@@ -58,3 +61,13 @@ def test_a_set_over_the_limit_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a.stl").write_bytes(b"x" * 101)
     with pytest.raises(LimitError):
         read_set(tmp_path, limit_bytes=100)
+
+
+def test_a_machine_without_memory_damages_no_archive(monkeypatch: pytest.MonkeyPatch) -> None:
+    def starved(*_: object) -> bytes:
+        raise zlib.error("Error -4 while decompressing data")
+
+    data = pack({"asset.json": b"{}"})
+    monkeypatch.setattr(zipfile.ZipExtFile, "read", starved)
+    with pytest.raises(MemoryError):
+        unpack(data, limit_bytes=100)

@@ -31,7 +31,7 @@ def there(store: Store, messages: list[TaskMessage]) -> list[bool]:
     return [shard_exists(store, Stage.SYNTHESIZE, message.output) for message in messages]
 
 
-def test_what_was_in_a_pack_has_a_file_of_its_own_and_is_what_it_was(store: Store) -> None:
+def test_what_was_in_a_pack_has_a_file_of_its_own(store: Store) -> None:
     assert not has_packs(store)
     messages = batches(3)
     pack(store, messages)
@@ -97,7 +97,7 @@ def test_a_file_of_its_own_counts_before_one_in_a_pack(store: Store) -> None:
 
 
 @pytest.mark.parametrize("place", ["directory", "manifest", "file", "end"])
-def test_harm_moves_the_pack_aside_and_costs_no_more_than_what_is_harmed(store: Store, place: str) -> None:
+def test_harm_moves_the_pack_aside_and_costs_no_more(store: Store, place: str) -> None:
     messages = batches(2)
     key = pack(store, messages)
     data = store.get(key)

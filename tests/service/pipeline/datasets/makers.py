@@ -6,15 +6,12 @@ import json
 from typing import Any
 
 from graspd.service.model import names
-from graspd.service.model.clock import timestamp
-from graspd.service.model.planning import message_of, plan
-from graspd.service.model.records import AttemptRecord, JobRecord
+from graspd.service.model.planning import plan
 from graspd.service.model.states import AssetKind, Stage
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.datasets.spec import DatasetRequest
 from graspd.service.store.library import publish_asset
-from graspd.service.store.records import put_record, read_record
-from tests.fakes import make_shard
+from tests.fakes import fail_task, make_task, record_of
 
 
 def add_asset(services: Services, kind: str, name: str, *, content: str = "", verdict: str | None = "accept") -> str:
@@ -36,33 +33,16 @@ def wanted(name: str = "grasps", **changes: Any) -> DatasetRequest:
 
 def finish(services: Services, job: str, *, batches: int | None = None, lost: dict[str, int] | None = None) -> None:
     """Do the first tasks of a job; of each, so many candidates are `lost` by outcome."""
-    record = read_record(JobRecord, services.store, names.job_record(job))
-    for task in plan(record):
+    for task in plan(record := record_of(services, job)):
         if batches is None or task.batch < batches:
-            made = make_shard(services.store, message_of(record, task, attempt=1, max_attempt=3))
-            services.index.write.add_manifest(made.model_copy(update={"info": {"outcomes": lost}}) if lost else made)
+            make_task(services, record, task, **({"outcomes": lost} if lost else {}))
 
 
 def fail(services: Services, job: str, reason: str = "it broke") -> None:
     """The first task of each batch of a job, failed for the last time."""
-    record = read_record(JobRecord, services.store, names.job_record(job))
-    for task in plan(record):
-        if task.stage is not Stage.SYNTHESIZE:
-            continue
-        number = services.index.jobs.task(task.id).attempt
-        attempt = AttemptRecord(
-            task_id=task.id,
-            job_id=job,
-            stage=task.stage,
-            number=number,
-            kind="ValueError",
-            reason=reason,
-            worker="w",
-            ended=timestamp(),
-            last=True,
-        )
-        put_record(services.store, names.attempt(task.id, number), attempt)
-        services.index.write.add_attempt(attempt)
+    for task in plan(record_of(services, job)):
+        if task.stage is Stage.SYNTHESIZE:
+            fail_task(services, job, task, services.index.jobs.task(task.id).attempt, reason=reason)
 
 
 def jobs_of(services: Services, name: str) -> list[str]:

@@ -1,23 +1,39 @@
-"""A dataset from its creation to its end: what it plans, repeats, cancels, retries; and that the store tells it all."""
+"""A dataset from its creation to its end and its export; and that the store tells it all."""
 
 from __future__ import annotations
 
+import hashlib
 import json
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
 
+import h5py
 import pytest
 
 from graspd.service.index.rebuild import differences, rebuild
 from graspd.service.model import names
 from graspd.service.model.domain import JobRequest
-from graspd.service.model.errors import ConflictError, InputError, LimitError, NotFoundError
+from graspd.service.model.errors import (
+    ConflictError,
+    DamagedShard,
+    InputError,
+    LimitError,
+    NotFoundError,
+    StoreUnavailable,
+)
+from graspd.service.model.records import Snapshot, SnapshotShard
 from graspd.service.model.states import AssetKind, Priority, State
 from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.datasets import actions
+from graspd.service.pipeline.datasets.cost import estimate
+from graspd.service.pipeline.datasets.export import export_shards, path_of
 from graspd.service.pipeline.datasets.rounds import DatasetRounds
 from graspd.service.store.records import job_events
 from graspd.service.store.store import open_store
 from tests.dataset_status import status
+from tests.fakes import with_settings
 from tests.planning import plan_all
 from tests.service.pipeline.datasets.makers import add_asset, fail, finish, jobs_of, wanted
 
@@ -26,13 +42,10 @@ def test_a_dataset_has_a_job_for_each_hand_and_object(either: Services) -> None:
     dataset, new = actions.create(either, wanted(scenes=1))
     assert new and (dataset.cells, dataset.asked, dataset.state) == (4, 128, State.QUEUED)
     plan_all(either)
-    pairs = [
-        (either.index.jobs.get(job).request.hand, either.index.jobs.get(job).request.object)
-        for job in jobs_of(either, "grasps")
-    ]
+    jobs = [either.index.jobs.get(job) for job in jobs_of(either, "grasps")]
+    pairs = [(job.request.hand, job.request.object) for job in jobs]
     assert pairs == [("gripper", "ball"), ("gripper", "cube"), ("claw", "ball"), ("claw", "cube")]
-    assert {either.index.jobs.get(job).priority for job in jobs_of(either, "grasps")} == {Priority.BULK}
-    assert {either.index.jobs.get(job).request.scenes for job in jobs_of(either, "grasps")} == {1}
+    assert {(job.priority, job.request.scenes) for job in jobs} == {(Priority.BULK, 1)}
 
 
 def test_the_same_dataset_again_is_the_same_and_repeats_nothing(services: Services) -> None:
@@ -58,18 +71,14 @@ def test_a_planner_that_was_stopped_is_continued(services: Services) -> None:
     assert not DatasetRounds(services).advance(10)
 
 
-def test_two_datasets_share_the_jobs_that_both_want(services: Services) -> None:
+def test_datasets_and_jobs_of_their_own_share_what_all_want(services: Services) -> None:
+    job, _ = job_actions.submit(services, JobRequest(hand="claw", object="ball", grasps=32))
     actions.create(services, wanted("one"))
     actions.create(services, wanted("two", hands=("gripper",), objects=("cube", "cone")))
     plan_all(services)
     assert jobs_of(services, "one")[1] == jobs_of(services, "two")[0]
+    assert jobs_of(services, "one")[2] == job.id
     assert len(services.index.jobs.page().items) == 5
-
-
-def test_a_job_that_was_submitted_by_itself_is_a_cell(services: Services) -> None:
-    job, _ = job_actions.submit(services, JobRequest(hand="claw", object="ball", grasps=32))
-    actions.create(services, wanted())
-    assert jobs_of(services, "grasps")[2] == job.id
 
 
 def test_a_name_stands_for_one_dataset(services: Services) -> None:
@@ -78,7 +87,7 @@ def test_a_name_stands_for_one_dataset(services: Services) -> None:
         actions.create(services, wanted(objects=("ball",), grasps=64))
 
 
-def test_a_dataset_of_an_older_graspd_with_fewer_options_is_the_same(services: Services) -> None:
+def test_a_dataset_of_an_older_graspd_is_the_same(services: Services) -> None:
     actions.create(services, wanted())
     old = json.loads(services.store.get(names.dataset_record("grasps")))
     del old["options"]["robustness"], old["checksum"]
@@ -96,7 +105,7 @@ def test_a_dataset_keeps_the_versions_it_was_created_with(services: Services) ->
     assert services.index.jobs.get(jobs_of(services, "grasps")[0]).object_digest == first
 
 
-def test_what_cannot_be_used_is_refused_before_anything_is_recorded(services: Services) -> None:
+def test_what_cannot_be_used_is_refused_before_it_is_recorded(services: Services) -> None:
     add_asset(services, "object", "torn", verdict="refuse")
     add_asset(services, "object", "fresh", verdict=None)
     for changes, error, words in (
@@ -113,8 +122,9 @@ def test_what_cannot_be_used_is_refused_before_anything_is_recorded(services: Se
 
 
 def test_a_matrix_over_the_limit_is_refused(services: Services) -> None:
-    with pytest.raises(LimitError, match="over 100000 cells"):
-        actions.create(services, wanted(hands=("gripper", "claw"), objects=[f"o{i}" for i in range(60_000)]))
+    for refuse in (actions.create, lambda of, asked: estimate(of.index, asked)):
+        with pytest.raises(LimitError, match="over 100000 cells"):
+            refuse(services, wanted(hands=("gripper", "claw"), objects=[f"o{i}" for i in range(60_000)]))
 
 
 def test_status_tells_each_cell(either: Services) -> None:
@@ -137,7 +147,7 @@ def test_status_tells_each_cell(either: Services) -> None:
     assert whole.seconds == pytest.approx(1.5) and whole.shards == 3
 
 
-def test_a_dataset_that_found_fewer_grasps_says_what_became_of_the_others(either: Services) -> None:
+def test_a_dataset_that_found_fewer_grasps_tells_the_outcomes(either: Services) -> None:
     actions.create(either, wanted(objects=("ball",)))
     plan_all(either)
     first, second = jobs_of(either, "grasps")
@@ -190,15 +200,11 @@ def test_a_job_that_another_dataset_waits_for_goes_on(either: Services) -> None:
     plan_all(either)
     actions.cancel(either, "one")
     plan_all(either)
-    assert [cell.state for cell in status(either.index, "one").cells] == [
-        "cancelled",
-        "queued",
-        "cancelled",
-        "cancelled",
-    ]
+    states = [cell.state for cell in status(either.index, "one").cells]
+    assert states == ["cancelled", "queued", "cancelled", "cancelled"]
 
 
-def test_retry_starts_failed_and_cancelled_cells_again_and_repeats_nothing(services: Services) -> None:
+def test_retry_starts_failed_and_cancelled_cells_again(services: Services) -> None:
     actions.create(services, wanted(grasps=64))
     plan_all(services)
     jobs = jobs_of(services, "grasps")
@@ -221,7 +227,7 @@ def test_retry_starts_failed_and_cancelled_cells_again_and_repeats_nothing(servi
         actions.retry(services, "grasps")
 
 
-def test_an_event_reaches_a_job_once_however_often_the_planner_runs(services: Services) -> None:
+def test_an_event_reaches_a_job_once(services: Services) -> None:
     actions.create(services, wanted())
     plan_all(services)
     actions.cancel(services, "grasps")
@@ -236,8 +242,7 @@ def test_an_event_reaches_a_job_once_however_often_the_planner_runs(services: Se
 
 
 def test_a_large_dataset_leaves_the_queue_to_others(services: Services) -> None:
-    small = services.settings.model_copy(update={"queue_window": 10})
-    services = Services(small, services.store, services.index, services.queue)
+    services = with_settings(services, queue_window=10)
     actions.create(services, wanted(grasps=320))
     plan_all(services)
     assert len(services.queue.waiting()) == 10
@@ -273,7 +278,7 @@ def test_a_difference_between_index_and_store_is_found(services: Services) -> No
     ]
 
 
-def test_a_set_of_objects_is_spelled_out_when_the_dataset_is_created(services: Services) -> None:
+def test_a_set_of_objects_is_spelled_out_at_creation(services: Services) -> None:
     actions.add_object_set(services, "round", ["cone", "ball"])
     actions.create(services, wanted(objects=("cube",), sets=("round",)))
     actions.add_object_set(services, "round", ["ball"])
@@ -308,3 +313,65 @@ def test_the_same_shards_are_the_same_snapshot(services: Services) -> None:
     assert [(shard.hand, shard.object) for shard in last.shards][1:3] == [("gripper", "cube"), ("claw", "ball")]
     assert last.size_bytes == sum(services.store.size(shard.key) for shard in last.shards)
     assert actions.load_snapshot(services.store, "grasps", first.digest) == first
+
+
+@pytest.fixture
+def snapshot(services: Services) -> Snapshot:
+    actions.create(services, wanted(scenes=1))
+    plan_all(services)
+    for job in jobs_of(services, "grasps"):
+        finish(services, job)
+    return actions.snapshot(services, "grasps")[0]
+
+
+class Source:
+    """The store as a source of shards, which counts what it gives and can break off."""
+
+    def __init__(self, services: Services, *, breaks_at: int = -1) -> None:
+        self._services = services
+        self._breaks_at = breaks_at
+        self.given = 0
+
+    def __call__(self, shard: SnapshotShard) -> Iterator[bytes]:
+        if self.given == self._breaks_at:
+            raise StoreUnavailable("away")
+        self.given += 1
+        yield from self._services.store.stream(shard.key)
+
+
+def test_every_file_is_there_with_its_checksum(services: Services, snapshot: Snapshot, tmp_path: Path) -> None:
+    assert export_shards(snapshot, tmp_path / "out", Source(services)) == 8
+    check = subprocess.run(["sha256sum", "-c", "--quiet", "SHA256SUMS"], cwd=tmp_path / "out", check=False)
+    assert check.returncode == 0
+    assert Snapshot.model_validate_json((tmp_path / "out" / "snapshot.json").read_text()) == snapshot
+    with h5py.File(tmp_path / "out" / "claw" / "cube" / "base-00000.h5") as file:
+        assert file.attrs["hand"] == "claw" and len(file["grasp/hand_pose"]) == 32
+
+
+def test_an_export_that_broke_off_is_gone_on_with(services: Services, snapshot: Snapshot, tmp_path: Path) -> None:
+    with pytest.raises(StoreUnavailable):
+        export_shards(snapshot, tmp_path / "out", Source(services, breaks_at=5))
+    assert not (tmp_path / "out" / "snapshot.json").exists() and not list(tmp_path.rglob("*.part"))
+    assert export_shards(snapshot, tmp_path / "out", Source(services)) == 3
+
+
+def test_a_file_that_was_changed_is_fetched_again(services: Services, snapshot: Snapshot, tmp_path: Path) -> None:
+    export_shards(snapshot, tmp_path, Source(services))
+    spoilt = tmp_path / path_of(snapshot.shards[0])
+    spoilt.write_bytes(b"x" * snapshot.shards[0].size_bytes)
+    assert export_shards(snapshot, tmp_path, Source(services)) == 1
+    assert hashlib.sha256(spoilt.read_bytes()).hexdigest() == snapshot.shards[0].sha256
+
+
+def test_a_wrong_checksum_leaves_no_file(services: Services, snapshot: Snapshot, tmp_path: Path) -> None:
+    with pytest.raises(DamagedShard, match=snapshot.shards[0].id):
+        export_shards(snapshot, tmp_path / "out", lambda shard: [b"something else"])
+    assert [path for path in (tmp_path / "out").rglob("*") if path.is_file()] == []
+
+
+def test_a_folder_that_cannot_be_made_is_the_callers_mistake(
+    services: Services, snapshot: Snapshot, tmp_path: Path
+) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="cannot be made"):
+        export_shards(snapshot, tmp_path / "file" / "out", Source(services))

@@ -11,7 +11,7 @@ from graspd.service.index.rebuild import rebuild
 from graspd.service.model import digests, names
 from graspd.service.model.domain import JobRequest
 from graspd.service.model.errors import ConflictError, InputError
-from graspd.service.model.records import DatasetRecord, JobRecord, request_of
+from graspd.service.model.records import DatasetRecord, request_of
 from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.model.studies import IN_SCENE
 from graspd.service.pipeline.backends import Services
@@ -19,7 +19,8 @@ from graspd.service.pipeline.datasets import actions
 from graspd.service.pipeline.datasets.cost import estimate
 from graspd.service.pipeline.datasets.spec import DatasetRequest
 from graspd.service.pipeline.fidelity_choice import Resolver
-from graspd.service.store.records import charts_of, load_dataset, publish, read_record
+from graspd.service.store.records import charts_of, load_dataset, publish
+from tests.fakes import record_of
 from tests.planning import plan_all
 from tests.service.pipeline.datasets.makers import finish, jobs_of, wanted
 
@@ -27,29 +28,27 @@ ANNEALED = {"method": "graspit", "options": {"keep": 20, "steps": 40000}}
 AUTO = {"fidelity": "auto", "target": "gsr>=0.6"}
 
 
+def run_of(fidelity: str, speed: float, reached: float, hand: str, object_: str, way: str = "") -> dict[str, Any]:
+    what = {"method": "fast_graspd", "fidelity": fidelity, "hand": hand, "object": object_}
+    if way:
+        return what | {"way": way, "end_to_end_per_second": speed, "lift": reached}
+    return what | {"valid_per_second": speed, "gsr": reached, "epsilon": 0.3, "pd_mm": 0.1}
+
+
 def chart(created: str = "2026-11-21T10:00:00.000Z", *, claw: str = "fine") -> dict[str, Any]:
     """The gripper needs standard on all but the cube, the claw a fidelity of one's choice on all."""
-
-    def run(fidelity: str, speed: float, gsr: float, hand: str, object_: str) -> dict[str, Any]:
-        return {
-            "method": "fast_graspd",
-            "fidelity": fidelity,
-            "hand": hand,
-            "object": object_,
-            "valid_per_second": speed,
-            "gsr": gsr,
-            "epsilon": 0.3,
-            "pd_mm": 0.1,
-        }
-
-    runs = [run("draft", 40, 0.3, "gripper", "ball"), run("standard", 15, 0.8, "gripper", "ball")]
-    runs += [run("draft", 40, 0.9, "gripper", "cube"), run(claw, 6, 0.7, "claw", "elsewhere")]
+    runs = [run_of("draft", 40, 0.3, "gripper", "ball"), run_of("standard", 15, 0.8, "gripper", "ball")]
+    runs += [run_of("draft", 40, 0.9, "gripper", "cube"), run_of(claw, 6, 0.7, "claw", "elsewhere")]
     return {"created": created, "runs": runs}
+
+
+#: Of each cell, by that chart.
+CHOSEN = ["standard", "draft", "fine", "fine"]
 
 
 def requests_of(services: Services, name: str = "grasps") -> list[JobRequest]:
     plan_all(services)
-    return [read_record(JobRecord, services.store, names.job_record(job)).request for job in jobs_of(services, name)]
+    return [record_of(services, job).request for job in jobs_of(services, name)]
 
 
 def test_a_cell_without_options_is_the_job_it_always_was(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -63,12 +62,8 @@ def test_a_cell_without_options_is_the_job_it_always_was(monkeypatch: pytest.Mon
 def test_options_of_the_method_are_those_of_each_cells_job(either: Services) -> None:
     actions.create(either, wanted(**ANNEALED))
     assert [(r.method, r.options) for r in requests_of(either)] == 4 * [("graspit", {"keep": 20, "steps": 40000})]
-
-
-def test_other_options_are_another_dataset(services: Services) -> None:
-    actions.create(services, wanted(**ANNEALED))
     with pytest.raises(ConflictError, match="its options is"):
-        actions.create(services, wanted(**ANNEALED | {"options": {"keep": 5}}))
+        actions.create(either, wanted(**ANNEALED | {"options": {"keep": 5}}))
 
 
 def test_batches_with_other_options_say_nothing_about_the_cost(services: Services) -> None:
@@ -84,25 +79,21 @@ def test_batches_with_other_options_say_nothing_about_the_cost(services: Service
 def test_with_auto_each_cell_gets_what_the_chart_promises_for_it(either: Services) -> None:
     publish(either.store, "charts", chart())
     actions.create(either, wanted(**AUTO))
-    assert [(r.fidelity, r.target) for r in requests_of(either)] == [
-        ("standard", ""),
-        ("draft", ""),
-        ("fine", ""),
-        ("fine", ""),
-    ]
-    cells = either.index.datasets.cells("grasps").items
-    assert [cell.fidelity for cell in cells] == ["standard", "draft", "fine", "fine"]
+    assert [(r.fidelity, r.target) for r in requests_of(either)] == [(fidelity, "") for fidelity in CHOSEN]
+    assert [cell.fidelity for cell in either.index.datasets.cells("grasps").items] == CHOSEN
     assert either.index.datasets.get("grasps").options.target == "gsr>=0.6"
+    rebuild(either.index, either.store)
+    assert [cell.fidelity for cell in either.index.datasets.cells("grasps").items] == CHOSEN
 
 
-def test_a_cell_that_auto_chose_is_the_job_that_names_its_fidelity(services: Services) -> None:
+def test_a_cell_that_auto_chose_is_the_job_of_that_fidelity(services: Services) -> None:
     publish(services.store, "charts", chart())
     actions.create(services, wanted("chosen", **AUTO))
     actions.create(services, wanted("named", fidelity="fine"))
     assert jobs_of(services, "chosen")[2:] == jobs_of(services, "named")[2:]
 
 
-def test_a_later_chart_changes_nothing_of_a_dataset_that_is_there(services: Services) -> None:
+def test_a_later_chart_changes_nothing_of_a_dataset(services: Services) -> None:
     publish(services.store, "charts", chart())
     actions.create(services, wanted(**AUTO))
     before = jobs_of(services, "grasps")
@@ -113,18 +104,6 @@ def test_a_later_chart_changes_nothing_of_a_dataset_that_is_there(services: Serv
     assert actions.create(services, wanted(**AUTO))[1] is False
 
 
-def test_a_rebuilt_index_knows_the_fidelity_of_each_cell(services: Services) -> None:
-    publish(services.store, "charts", chart())
-    actions.create(services, wanted(**AUTO))
-    rebuild(services.index, services.store)
-    assert [cell.fidelity for cell in services.index.datasets.cells("grasps").items] == [
-        "standard",
-        "draft",
-        "fine",
-        "fine",
-    ]
-
-
 def test_a_target_out_of_reach_on_one_cell_makes_no_dataset(services: Services) -> None:
     publish(services.store, "charts", chart())
     with pytest.raises(InputError, match=r"no fidelity of fast_graspd meets gsr>=0\.75"):
@@ -132,7 +111,7 @@ def test_a_target_out_of_reach_on_one_cell_makes_no_dataset(services: Services) 
     assert not services.store.exists(names.dataset_record("grasps"))
 
 
-def test_the_cost_of_auto_is_that_of_the_fidelities_it_stands_for(services: Services) -> None:
+def test_the_cost_of_auto_is_that_of_the_chosen_fidelities(services: Services) -> None:
     publish(services.store, "charts", chart())
     both = estimate(services.index, wanted(hands=("gripper",), **AUTO), Resolver(services.store))
     apart = [
@@ -150,26 +129,9 @@ def test_a_record_from_before_has_neither_and_is_read(services: Services) -> Non
     assert DatasetRecord.model_validate(stored) == load_dataset(services.store, "grasps")
 
 
-@pytest.mark.parametrize("changes", [{"fidelity": "auto"}, {"target": "gsr>=0.6"}])
-def test_auto_and_target_go_together(changes: dict[str, str]) -> None:
-    with pytest.raises(ValueError, match="target"):
-        wanted(**changes)
-
-
-def test_each_cell_of_a_dataset_in_scenes_says_how_its_fidelity_was_chosen(either: Services) -> None:
-    def run(fidelity: str, speed: float, lift: float, hand: str, object_: str) -> dict[str, Any]:
-        return {
-            "way": IN_SCENE,
-            "method": "fast_graspd",
-            "fidelity": fidelity,
-            "hand": hand,
-            "object": object_,
-            "end_to_end_per_second": speed,
-            "lift": lift,
-        }
-
-    runs = [run("draft", 20, 0.8, "gripper", "ball"), run("standard", 15, 0.95, "gripper", "ball")]
-    runs += [run("draft", 20, 0.92, "gripper", "cube"), run("standard", 15, 0.99, "gripper", "cube")]
+def test_each_cell_in_scenes_says_how_its_fidelity_was_chosen(either: Services) -> None:
+    runs = [run_of("draft", 20, lift, "gripper", obj, IN_SCENE) for obj, lift in (("ball", 0.8), ("cube", 0.92))]
+    runs += [run_of("standard", 15, lift, "gripper", obj, IN_SCENE) for obj, lift in (("ball", 0.95), ("cube", 0.99))]
     place = SceneSpec(kind="table")
     created = {"created": "2026-11-21T10:00:00.000Z", "scene": place.model_dump(mode="json")}
     key = publish(either.store, charts_of(place), created | {"runs": runs})
@@ -178,12 +140,9 @@ def test_each_cell_of_a_dataset_in_scenes_says_how_its_fidelity_was_chosen(eithe
     cells = either.index.datasets.cells("grasps").items
     assert [cell.fidelity for cell in cells] == ["standard", "draft", "standard", "standard"]
     assert [(c.choice.measured_on, c.choice.reached, c.choice.chart) for c in cells if c.choice] == [
-        ("hand and object", 0.95, key),
-        ("hand and object", 0.92, key),
-        ("all", 0.97, key),
-        ("all", 0.97, key),
+        (on, reached, key)
+        for on, reached in [("hand and object", 0.95), ("hand and object", 0.92), ("all", 0.97), ("all", 0.97)]
     ]
     plan_all(either)
-    jobs = [read_record(JobRecord, either.store, names.job_record(job)) for job in jobs_of(either, "grasps")]
-    assert [job.choice for job in jobs] == [cell.choice for cell in cells]
+    assert [record_of(either, job).choice for job in jobs_of(either, "grasps")] == [cell.choice for cell in cells]
     assert len(load_dataset(either.store, "grasps").choices) == 3

@@ -6,7 +6,7 @@ import json
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from typing import Any
@@ -16,13 +16,13 @@ import pytest
 from graspd.service.model.clock import timestamp
 from graspd.service.model.states import Priority, Stage
 from graspd.service.model.version import PACKAGE_VERSION
-from graspd.service.model.workers import WorkerBeat
 from graspd.service.pipeline.leading import PART
 from graspd.service.queue.rq_queue import WORKERS, RqQueue, worker_key
 from graspd.service.run.address import record_address
 from graspd.service.run.doctor.checks import Condition
 from graspd.service.run.doctor.fleet import clocks, controller, port, workers
 from graspd.service.settings import Settings
+from tests.fakes import beat_of
 from tests.servers import PostgresServer, free_ports
 from tests.service.queue.test_queue import task
 
@@ -34,10 +34,9 @@ def settings(rq_queue: RqQueue, redis_server: str, tmp_path: Path) -> Settings:
 
 def present(queue: RqQueue, name: str = "w", **facts: Any) -> None:
     """A worker that gave a sign of life."""
-    now = timestamp()
-    beat = WorkerBeat(name, "node1", 1, "cpu", "CPU", tuple(Stage), PACKAGE_VERSION, "idle", "", now, now)
+    beat = beat_of(name, **{"host": "node1", "version": PACKAGE_VERSION, **facts})
     queue.connection.sadd(WORKERS, name)
-    queue.connection.set(worker_key(name), json.dumps(asdict(replace(beat, **facts))), ex=60)
+    queue.connection.set(worker_key(name), json.dumps(asdict(beat)), ex=60)
 
 
 def test_a_controller_that_lives_and_one_that_does_not(settings: Settings, rq_queue: RqQueue) -> None:
@@ -162,7 +161,7 @@ def test_what_has_the_port_is_told(tmp_path: Path, status: int, body: str, ok: b
     assert told in found.message
 
 
-def test_a_port_that_is_free_is_good_and_an_address_of_others_is_bad(tmp_path: Path) -> None:
+def test_a_free_port_is_good_and_an_address_of_others_bad(tmp_path: Path) -> None:
     (free,) = free_ports(1)
     assert port(Settings(data_dir=tmp_path, port=free)).condition is Condition.GOOD
     found = port(Settings(data_dir=tmp_path, host="192.0.2.1", port=0))
@@ -170,7 +169,7 @@ def test_a_port_that_is_free_is_good_and_an_address_of_others_is_bad(tmp_path: P
     assert "GRASPD_HOST" in found.fix
 
 
-def test_the_service_of_the_data_folder_is_asked_where_it_wrote_that_it_is(tmp_path: Path) -> None:
+def test_the_service_of_the_data_folder_is_asked_at_its_address(tmp_path: Path) -> None:
     (gone,) = free_ports(1)
     record_address(tmp_path, f"http://127.0.0.1:{gone}")
     found = port(Settings(data_dir=tmp_path))

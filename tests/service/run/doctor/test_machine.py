@@ -1,15 +1,23 @@
-"""The machine as the doctor sees it."""
+"""Machine and store as the doctor sees them, and checks side by side."""
 
 from __future__ import annotations
 
 import os
+import threading
+from collections.abc import Iterator
 from pathlib import Path
+from typing import IO
 
+import obstore
 import pytest
+from obstore.store import MemoryStore
 
-from graspd.service.run.doctor.checks import Condition
+from graspd.service.model.errors import StoreUnavailable
+from graspd.service.run.doctor.backends import check_store, store
+from graspd.service.run.doctor.checks import Check, Condition, Finding, good, run_checks
 from graspd.service.run.doctor.machine import data_folder, disk, filesystem, limits, versions
 from graspd.service.settings import Settings
+from graspd.service.store.store import Entry, Store, open_store
 
 GIB = 2**30
 
@@ -36,22 +44,18 @@ def test_a_data_folder_that_others_can_read_is_told(tmp_path: Path) -> None:
     assert data_folder(Settings(data_dir=tmp_path)).condition is Condition.GOOD
 
 
-def test_a_data_folder_on_a_network_is_told_where_locks_are_needed(tmp_path: Path) -> None:
+def test_a_data_folder_on_a_network_is_told(tmp_path: Path) -> None:
     mounts = tmp_path / "mounts"
-    mounts.write_text(
-        f"/dev/sda / ext4 rw 0 0\nserver:/home {tmp_path} nfs4 rw 0 0\ntmpfs {tmp_path}/tmp tmpfs rw 0 0\n"
-    )
+    kinds = f"/dev/sda / ext4 rw 0 0\nserver:/home {tmp_path} nfs4 rw 0 0\ntmpfs {tmp_path}/tmp tmpfs rw 0 0\n"
+    mounts.write_text(kinds)
     folder = tmp_path / "data"
     found = data_folder(Settings(data_dir=folder), mounts=mounts)
     assert found.condition is Condition.WARNING
     assert "nfs4" in found.message
     elsewhere = Settings(data_dir=folder, redis_url="redis://other", index_url="postgresql+psycopg://other/graspd")
     assert data_folder(elsewhere, mounts=mounts).condition is Condition.GOOD
-    assert [filesystem(path, mounts) for path in (folder, tmp_path / "tmp" / "x", Path("/etc"))] == [
-        "nfs4",
-        "tmpfs",
-        "ext4",
-    ]
+    for path, kind in ((folder, "nfs4"), (tmp_path / "tmp" / "x", "tmpfs"), (Path("/etc"), "ext4")):
+        assert filesystem(path, mounts) == kind
     assert not folder.exists()
 
 
@@ -88,3 +92,98 @@ def test_few_files_and_little_memory_are_told() -> None:
     assert limits(files=4096, memory=16 * GIB).condition is Condition.GOOD
     assert "ulimit" in limits(files=256, memory=16 * GIB).fix
     assert "more memory" in limits(files=4096, memory=GIB).fix
+
+
+def test_findings_come_in_order_and_one_that_hangs_is_bad() -> None:
+    hold = threading.Event()
+
+    def hang() -> Finding:
+        hold.wait(30)
+        return good("hangs", "late")
+
+    def break_off() -> Finding:
+        raise ZeroDivisionError("by nothing")
+
+    def away() -> Finding:
+        raise StoreUnavailable("the store is away")
+
+    checks = [
+        Check("hangs", hang, limit_s=0.05, mend_hang="restart it"),
+        Check("breaks", break_off),
+        Check("away", away),
+        Check("good", lambda: good("good", "fine")),
+    ]
+    try:
+        found = list(run_checks(checks))
+    finally:
+        hold.set()
+    assert [one.name for one in found] == ["hangs", "breaks", "away", "good"]
+    assert [one.condition for one in found] == [Condition.BAD] * 3 + [Condition.GOOD]
+    assert found[0].fix == "restart it"
+    assert "ZeroDivisionError: by nothing" in found[1].message
+    assert found[2].message == "the store is away"
+
+
+def test_a_folder_is_good_and_nothing_is_left_in_it(tmp_path: Path) -> None:
+    settings = Settings(data_dir=tmp_path)
+    assert store(settings).condition is Condition.GOOD
+    assert not (tmp_path / "store").exists(), "a look makes no store"
+    (tmp_path / "store").mkdir()
+    found = store(settings)
+    assert found.condition is Condition.GOOD, found
+    assert [path for path in (tmp_path / "store").rglob("*") if path.is_file()] == []
+
+
+@pytest.mark.s3
+def test_a_bucket_is_good_and_nothing_is_left_in_it(tmp_path: Path, s3_url: str) -> None:
+    found = store(Settings(data_dir=tmp_path, store_url=s3_url))
+    assert found.ok, found
+    assert "refuses a name that is taken" in found.message
+    assert list(open_store(s3_url).list("health")) == []
+
+
+@pytest.mark.s3
+def test_a_wrong_secret_is_bad_and_the_mend_names_the_variables(
+    tmp_path: Path, s3_url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "of-somebody-else")
+    found = store(Settings(data_dir=tmp_path, store_url=s3_url))
+    assert not found.ok
+    assert "AWS_SECRET_ACCESS_KEY" in found.fix
+    assert "of-somebody-else" not in str(found)
+
+
+def test_a_store_in_memory_is_gone_with_its_process() -> None:
+    assert check_store("store", open_store("memory://")).condition is Condition.WARNING
+
+
+class Overwriting(Store):
+    """As S3 servers do that know no conditional put."""
+
+    def put_file(self, key: str, file: IO[bytes]) -> bool:
+        file.seek(0)
+        obstore.put(self._backend, key, file.read(), mode="overwrite")
+        return True
+
+
+class Deaf(Store):
+    """Refuses a second put, and lists nothing yet."""
+
+    def list(self, prefix: str, *, offset: str | None = None) -> Iterator[Entry]:
+        return iter(())
+
+
+class Keeping(Store):
+    """Removes nothing but once nobody looks."""
+
+    def exists(self, key: str) -> bool:
+        return True
+
+
+@pytest.mark.parametrize(
+    ("kind", "word"), [(Overwriting, "overwritten"), (Deaf, "not in the list"), (Keeping, "still there")]
+)
+def test_a_store_that_breaks_a_promise_is_bad(kind: type[Store], word: str) -> None:
+    found = check_store("store", kind(MemoryStore(), "fake://"))
+    assert not found.ok
+    assert word in found.message

@@ -58,10 +58,13 @@ def test_the_redis_of_graspd_up_is_good_and_keeps_its_tasks(own: Settings, clien
     assert client.keys("graspd:doctor:*") == [], "a probe was left behind"
 
 
-def test_where_nothing_was_started_there_is_nothing_to_mend(tmp_path: Path) -> None:
+def test_a_redis_never_started_is_skipped_and_a_lost_one_bad(tmp_path: Path) -> None:
     found = redis(Settings(data_dir=tmp_path))
-    assert found.condition is Condition.SKIPPED
-    assert "graspd up" in found.message
+    assert found.condition is Condition.SKIPPED and "graspd up" in found.message
+    away = Settings(data_dir=tmp_path, redis_url=(url := f"redis://127.0.0.1:{free_ports(1)[0]}/0"))
+    found = redis(away)
+    assert not found.ok and url in found.message
+    assert persistence(away).condition is Condition.SKIPPED
 
 
 def test_a_policy_that_evicts_is_bad_once_memory_is_bounded(own: Settings, client: Redis) -> None:
@@ -97,18 +100,8 @@ def test_without_a_log_of_writes_a_crash_costs_a_pause(own: Settings, client: Re
 
 def test_a_password_that_is_missing_is_named_and_never_shown(tmp_path: Path) -> None:
     (port,) = free_ports(1)
-    server = [
-        str(find_server()[0]),
-        "--port",
-        str(port),
-        "--bind",
-        "127.0.0.1",
-        "--requirepass",
-        "s3cret",
-        "--save",
-        "",
-    ]
-    with subprocess.Popen(server, stdout=subprocess.DEVNULL, cwd=tmp_path) as process:
+    options = f"--port {port} --bind 127.0.0.1 --requirepass s3cret --save".split()
+    with subprocess.Popen([find_server()[0], *options, ""], stdout=subprocess.DEVNULL, cwd=tmp_path) as process:
         right = f"redis://:s3cret@127.0.0.1:{port}/0"
         queue = RqQueue(connect(right, patience=0))
         wait_for_redis(queue)
@@ -118,11 +111,3 @@ def test_a_password_that_is_missing_is_named_and_never_shown(tmp_path: Path) -> 
     assert [one.condition for one in found] == [Condition.GOOD, Condition.BAD]
     assert "redis://:PASSWORD@" in found[1].fix
     assert "s3cret" not in str(found)
-
-
-def test_one_that_is_away_is_bad_with_its_address(tmp_path: Path) -> None:
-    url = f"redis://127.0.0.1:{free_ports(1)[0]}/0"
-    found = redis(Settings(data_dir=tmp_path, redis_url=url))
-    assert not found.ok
-    assert url in found.message
-    assert persistence(Settings(data_dir=tmp_path, redis_url=url)).condition is Condition.SKIPPED

@@ -1,4 +1,4 @@
-"""A folder of meshes on the command line: which objects it is, and that one bad mesh stops nothing."""
+"""Hands and folders of meshes on the command line: what is sent, and that one bad mesh stops nothing."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from starlette.testclient import TestClient
 from typer.testing import CliRunner
 
 from graspd.client import add_commands
-from graspd.client.add_commands import add_object
+from graspd.client.add_commands import add_object, upload_of
 from graspd.client.client import Client
 from graspd.service.model.errors import InputError
 from graspd.service.model.states import AssetKind
 from graspd.service.store.asset_options import sizes_of
-from graspd.service.store.assets import pack
+from graspd.service.store.assets import pack, unpack
 from graspd.service.store.object_sets import files_of_set
 
 STL = b"solid box\nendsolid box\n"
@@ -44,7 +44,7 @@ def add(monkeypatch: pytest.MonkeyPatch, http: TestClient, *arguments: str) -> t
     return result.exit_code, json.loads(result.stdout.splitlines()[-1])
 
 
-def test_every_object_of_a_folder_is_uploaded_and_a_bad_one_stops_nothing(
+def test_a_folder_is_uploaded_and_a_bad_object_stops_nothing(
     monkeypatch: pytest.MonkeyPatch, http: TestClient, folder: Path
 ) -> None:
     code, told = add(monkeypatch, http, str(folder), "--units", "mm")
@@ -86,7 +86,7 @@ def test_a_size_that_is_none_is_a_mistake(text: str) -> None:
         sizes_of(text)
 
 
-def test_a_zip_of_several_meshes_is_a_set_and_of_one_is_an_object(tmp_path: Path) -> None:
+def test_a_zip_of_several_meshes_is_a_set(tmp_path: Path) -> None:
     (tmp_path / "many.zip").write_bytes(pack({"egad/A0.obj": b"v", "egad/B1.obj": b"v"}))
     (tmp_path / "one.zip").write_bytes(pack({"A0.obj": b"v"}))
     described = {"asset.json": b'{"file": "a.obj"}', "a.obj": b"v", "b.obj": b"v"}
@@ -94,3 +94,54 @@ def test_a_zip_of_several_meshes_is_a_set_and_of_one_is_an_object(tmp_path: Path
     assert set(files_of_set(tmp_path / "many.zip") or {}) == {"A0", "B1"}
     assert files_of_set(tmp_path / "one.zip") is None
     assert files_of_set(tmp_path / "described.zip") is None
+
+
+MESH = '<mesh filename="{}"/>'
+
+
+@pytest.fixture
+def hand_folder(tmp_path: Path) -> Path:
+    """A folder with a URDF, its meshes, other things, and a secret beside it."""
+    folder = tmp_path / "claw"
+    (folder / "meshes").mkdir(parents=True)
+    for name in ("a.stl", "b.stl", "c.stl"):
+        (folder / "meshes" / name).write_bytes(name.encode())
+    (folder / "README.md").write_text("notes")
+    (tmp_path / "secret.stl").write_text("secret")
+    (folder / "link.stl").symlink_to(tmp_path / "secret.stl")
+    named = ("meshes/a.stl", "package://claw/meshes/b.stl", "../secret.stl", "link.stl", "meshes/missing.stl")
+    (folder / "claw.urdf").write_text(f"<robot>{''.join(MESH.format(name) for name in named)}</robot>")
+    return folder
+
+
+def sent(path: Path) -> set[str]:
+    with upload_of(path) as (upload, _):
+        return set(unpack(upload.read_bytes(), limit_bytes=10_000))
+
+
+def test_a_urdf_brings_the_meshes_that_it_names(hand_folder: Path) -> None:
+    assert sent(hand_folder / "claw.urdf") == {"claw.urdf", "meshes/a.stl", "meshes/b.stl"}
+
+
+def test_a_folder_brings_urdf_and_all_meshes_inside(hand_folder: Path) -> None:
+    (hand_folder / "asset.json").write_text("{}")
+    assert sent(hand_folder) == {"asset.json", "claw.urdf", "meshes/a.stl", "meshes/b.stl", "meshes/c.stl"}
+
+
+def test_the_upload_is_named_after_the_hand(hand_folder: Path) -> None:
+    for path in (hand_folder, hand_folder / "claw.urdf"):
+        with upload_of(path) as (upload, _):
+            assert upload.name == "claw.zip"
+        assert not upload.exists()
+
+
+def test_other_files_are_sent_as_they_are(hand_folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "plain.urdf").write_text("<robot/>")
+    for path in (tmp_path / "plain.urdf", tmp_path / "hand_folder.zip", tmp_path / "missing.urdf"):
+        with upload_of(path) as (upload, _):
+            assert upload == path
+
+
+def test_a_folder_without_a_urdf_is_a_mistake(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="holds no URDF"), upload_of(tmp_path):
+        pass
