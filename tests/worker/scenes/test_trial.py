@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.worker.quality.test_lift import BOX, HAND, PLACED, WHOLE, grasp
-from tests.worker.quality.test_short_tests import LEAST
+from tests.worker.quality.test_lift import LEAST
 from worker.grasps import joined
 from worker.quality.referee.judge import KnownTrials, judge
 from worker.quality.referee.lift import Lift

@@ -2,20 +2,37 @@
 
 from __future__ import annotations
 
+import dataclasses
+import logging
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
 import numpy as np
 import pytest
 
-from service.model.errors import TaskCancelled
+from service.model.domain import JobOptions
+from service.model.errors import InputError, TaskCancelled
+from service.model.fidelity import FIDELITIES
+from service.store.columns import SCHEMAS
 from tests.worker.quality.first.engine import Stand
 from tests.worker.quality.helpers import posture
 from tests.worker.quality.test_referee import BOX, PADS, WHOLE, grasp_of, many_grasps
+from worker.certified import scored
 from worker.grasps import GraspSet, joined
-from worker.quality.referee.first import screening
+from worker.hands.load import hand_from_path
+from worker.meeting import Meeting
+from worker.objects.prepare import object_from_path
+from worker.planners import synthesize
+from worker.planners.port import Wanted
+from worker.quality.referee.decomposition import decompose
+from worker.quality.referee.first import screening, trials
 from worker.quality.referee.first.screening import ROWS, WorldPool
 from worker.quality.referee.first.trials import FirstTrials
 from worker.quality.referee.judge import Verdicts, judge
+from worker.quality.referee.key import Level
 from worker.quality.referee.model import MujocoOptions, build
-from worker.quality.referee.protocol import Outcome
+from worker.quality.referee.protocol import JudgedBy, Outcome
 from worker.run import Run
 
 
@@ -44,14 +61,11 @@ def found() -> FirstTrials:
         return pool(monkeypatch, Stand(), 4).judge(every_kind())
 
 
-def test_outcomes_are_the_certificates(found: FirstTrials, certificate: Verdicts) -> None:
+def test_outcomes_margins_and_depths_are_the_certificates(found: FirstTrials, certificate: Verdicts) -> None:
     kinds = {Outcome(int(one)) for one in certificate.outcome.ravel()}
     assert kinds >= {Outcome.HELD, Outcome.PENETRATION, Outcome.LOST_WHILE_CLOSING, Outcome.DISPLACED}
     np.testing.assert_array_equal(found.outcome, certificate.outcome)
     np.testing.assert_array_equal(found.held, certificate.success == 1)
-
-
-def test_margins_and_depths_are_the_certificates(found: FirstTrials, certificate: Verdicts) -> None:
     held = certificate.success == 1
     # State is single precision between two steps; a creep of 1e-5 of the limit in a push is what that makes.
     np.testing.assert_allclose(found.margin[held], certificate.margin[held], atol=2e-3)
@@ -81,15 +95,12 @@ def test_grasps_that_need_more_room_are_judged_again_with_it(
     np.testing.assert_array_equal(found.outcome, certificate.outcome)
 
 
-def test_what_finds_no_room_is_said_and_never_clear(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_finds_no_room_or_blows_up_is_said_and_never_clear(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(screening, "DOUBLINGS", 1)
     found = pool(monkeypatch, Stand(needs_rows=1 << 30), 4).judge(grasp_of())
     assert found.held.all()
     assert found.overflow.all()
     assert not (found.clearly_held | found.clearly_failed).any()
-
-
-def test_a_simulation_that_blows_up_is_never_clear(monkeypatch: pytest.MonkeyPatch) -> None:
     found = pool(monkeypatch, Stand(diverges=True), 1).judge(grasp_of())
     assert Outcome.DIVERGED in found.outcome[0]
     assert not (found.clearly_held | found.clearly_failed).any()
@@ -113,3 +124,173 @@ def test_the_band_is_clear_of_neither_side() -> None:
 def test_it_stops_when_told(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(TaskCancelled):
         pool(monkeypatch, Stand(), 4).judge(many_grasps(), Run(cancelled=lambda: True))
+
+
+ON = Run(first_judge="on", threads=1)
+
+
+@pytest.fixture(autouse=True)
+def stand_in(monkeypatch: pytest.MonkeyPatch) -> Iterator[Stand]:
+    """MuJoCo itself as the engine; the pads pass for a hand, which grippers do not."""
+    engine = Stand()
+    monkeypatch.setattr(screening, "mujoco_warp", lambda: engine)
+    monkeypatch.setattr(screening, "mujoco_warp_version", lambda: "stand-in 1")
+    monkeypatch.setattr(screening, "jaws_of", lambda hand: None)
+    monkeypatch.setattr(screening, "AUDIT_ONE_IN", 1 << 62)
+    screening._pools.clear()
+    yield engine
+    screening._pools.clear()
+
+
+def verdicts(run: Run, level: Level = "certificate", grasps: GraspSet | None = None) -> Verdicts:
+    return judge(PADS, BOX, grasps or every_kind(), level=level, pieces=WHOLE, run=run)
+
+
+def test_at_level_certificate_the_first_judge_only_refuses() -> None:
+    alone, found = verdicts(Run()), verdicts(ON)
+    np.testing.assert_array_equal(found.outcome, alone.outcome)
+    assert (found.judged_by[found.success == 1] == JudgedBy.MUJOCO).all()
+    assert (found.judged_by == JudgedBy.MUJOCO_WARP).any()
+    assert (alone.judged_by == JudgedBy.MUJOCO).all()
+
+
+def test_at_level_screen_clear_verdicts_stand_both_ways_and_the_band_is_the_cpus(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    first = verdicts(ON, "screen")
+    for held in (0, 1):
+        assert (first.judged_by[first.success == held] == JudgedBy.MUJOCO_WARP).any()
+    certificate = verdicts(Run())
+    assert first.level == "screen"
+    np.testing.assert_array_equal(first.success, certificate.success)
+    monkeypatch.setattr(trials, "BAND", (0.0, 1e9))
+    band = verdicts(ON, "screen")
+    inside = band.outcome[:, 0] == 2
+    assert (band.judged_by[~inside] == JudgedBy.MUJOCO).all()
+    np.testing.assert_array_equal(band.margin[~inside], certificate.margin[~inside])
+
+
+def test_the_letter_and_grippers_are_the_cpus(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = verdicts(ON, "letter")
+    assert (found.judged_by == JudgedBy.MUJOCO).all()
+    assert found.terms == verdicts(Run(), "letter").terms
+    monkeypatch.setattr(screening, "jaws_of", lambda hand: object())
+    assert screening.first_terms(PADS, "certificate", ON) == []
+
+
+def test_the_key_says_who_judges() -> None:
+    keys = {verdicts(run).terms for run in (Run(), Run(first_judge="off"), Run(device="cpu", first_judge="auto"))}
+    assert len(keys) == 1
+    assert verdicts(ON).terms not in keys
+
+
+def test_who_insists_on_it_is_told_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.undo()
+    monkeypatch.setattr(screening, "jaws_of", lambda hand: None)
+    monkeypatch.setattr(screening, "has_mujoco_warp", lambda: False)
+    with pytest.raises(InputError, match=r"pip install 'graspd\[gpu\]'"):
+        verdicts(ON)
+
+
+def lies(found: FirstTrials) -> FirstTrials:
+    """Of every grasp that fails the first judge says that it clearly holds."""
+    return dataclasses.replace(found, outcome=np.ones_like(found.outcome), margin=np.zeros(len(found.margin)))
+
+
+def test_a_first_judge_that_the_cpu_contradicts_is_not_believed(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    true = screening.WorldPool.judge
+    monkeypatch.setattr(screening.WorldPool, "judge", lambda *some, **more: lies(true(*some, **more)))
+    unaudited = verdicts(ON, "screen")
+    assert unaudited.success.all()
+    assert unaudited.audited == 0
+    monkeypatch.setattr(screening, "AUDIT_ONE_IN", 2)
+    with caplog.at_level(logging.WARNING):
+        found = verdicts(ON, "screen")
+    assert found.contradicted > 1
+    assert found.audited >= found.contradicted
+    assert (found.judged_by == JudgedBy.MUJOCO).all()
+    np.testing.assert_array_equal(found.success, verdicts(Run()).success)
+    assert "the CPU judges all" in caplog.text
+
+
+def test_where_a_gpu_has_no_memory_for_it_the_cpu_judges(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def full(*_: Any) -> Any:
+        raise RuntimeError("Failed to allocate 4096 bytes on device 'cuda:0'")
+
+    monkeypatch.setattr(screening, "WorldPool", full)
+    with caplog.at_level(logging.WARNING):
+        found = verdicts(ON)
+    assert (found.judged_by == JudgedBy.MUJOCO).all()
+    assert "no memory for the first judge" in caplog.text
+
+
+def test_an_audit_follows_the_grasp_and_not_its_batch(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(screening, "AUDIT_ONE_IN", 2)
+    grasps = every_kind()
+    drawn = screening._drawn(grasps)
+    assert 0 < drawn.sum() < len(grasps)
+    np.testing.assert_array_equal(screening._drawn(grasps.take(np.arange(3, 9))), drawn[3:9])
+
+
+@pytest.mark.parametrize("mode", ["on", "off"])
+def test_a_shard_tells_of_each_grasp_who_judged_it(mode: Any) -> None:
+    request = JobOptions(grasps=1, referee="screen", want="raw", audits=0)
+    run = Run(first_judge=mode, threads=1)
+    found = scored(PADS, BOX, every_kind(), request, pieces=lambda obj: WHOLE, run=run)
+    columns = found.columns
+    assert ("quality/judged_by" in columns) == (mode == "on")
+    assert found.verdict_key == verdicts(run, "screen").terms
+    if mode == "on":
+        assert (columns["quality/judged_by"] == JudgedBy.MUJOCO_WARP).any()
+        assert columns.keys() <= SCHEMAS["base"].keys()
+
+
+def test_members_of_a_meeting_are_judged_in_one_launch() -> None:
+    grasps = every_kind()
+    halves = [grasps.take(np.arange(0, 6)), grasps.take(np.arange(6, len(grasps)))]
+    alone = [verdicts(ON, "screen", half) for half in halves]
+    with Meeting(2, 64) as meeting:
+        run = dataclasses.replace(ON, meeting=meeting)
+
+        def member(half: GraspSet) -> Any:
+            try:
+                return verdicts(run, "screen", half)
+            finally:
+                meeting.leave()
+
+        with ThreadPoolExecutor(2) as pool:
+            together = list(pool.map(member, halves))
+    assert meeting.served == [2]
+    for one, other in zip(alone, together, strict=True):
+        np.testing.assert_array_equal(one.outcome, other.outcome)
+        np.testing.assert_array_equal(one.judged_by, other.judged_by)
+
+
+GRASPS = 84
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+def test_clear_verdicts_on_500_grasps_of_three_hands_are_the_certificates() -> None:
+    """At least 99 % of them, and at least four of five verdicts are clear."""
+    pytest.importorskip("mujoco_warp", reason="the first judge needs the extra gpu")
+    clear, same, kinds = list[bool](), list[bool](), set[bool]()
+    for hand_name in ("allegro", "barrett", "shadow"):
+        for object_name in ("bottle", "mug"):
+            hand, obj = hand_from_path(hand_name), object_from_path(object_name)
+            grasps = synthesize(hand, obj, Wanted(count=GRASPS, fidelity=FIDELITIES["draft"], seed=77))
+            held = judge(hand, obj, grasps).success == 1
+            found = WorldPool(build(hand, obj, decompose(obj), MujocoOptions()), "cpu", GRASPS).judge(grasps)
+            assert not found.overflow.any()
+            is_clear = found.clearly_held | found.clearly_failed
+            clear += is_clear.tolist()
+            same += (found.clearly_held == held)[is_clear].tolist()
+            kinds |= set(held.tolist())
+    assert kinds == {False, True}, "the set must hold both kinds"
+    assert len(clear) >= 500
+    assert np.mean(clear) > 0.8
+    assert np.mean(same) >= 0.99
