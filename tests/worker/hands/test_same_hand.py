@@ -42,12 +42,9 @@ def test_the_other_base_is_found() -> None:
     assert found.fingertips_m < 1e-8
 
 
-def test_names_count_without_what_all_begin_with_and_without_case() -> None:
+def test_neither_order_nor_case_nor_a_common_prefix_of_names_counts() -> None:
     other = named(HAND, [f"robot0:{name.lower()}" for name in HAND.joint_names])
     assert same_hand(HAND, other).joints.tolist() == list(range(len(HAND.joint_names)))
-
-
-def test_order_does_not_count() -> None:
     order = np.arange(len(HAND.joint_names))[::-1]
     names, body = [HAND.joint_names[k] for k in order], HAND.joint_body[order]
     other = dataclasses.replace(named(HAND, names), joint_body=body)

@@ -12,7 +12,7 @@ import pytest
 
 from tests.worker.files.test_evaluate import BOX, HAND, plates_case
 from tests.worker.hands.mjcfs import CLAW
-from tests.worker.hands.test_tendons import load
+from tests.worker.hands.test_mjcf import load
 from worker.files.evaluate import combine, evaluate
 from worker.hands.model import Drag, HandModel
 from worker.hands.same_hand import same_hand

@@ -35,7 +35,7 @@ from worker.quality.referee.short import (
 )
 from worker.quality.referee.variant import NOMINAL, Variant
 from worker.quality.referee.varied import Models, VariantLift, motion_of, seen, upright
-from worker.simulation.obstacles import body_distances
+from worker.simulation.obstacles import obstacle_room
 from worker.simulation.surroundings import Neighbour, Obstacle, Placed
 
 HALF, HEIGHT = 0.03, 0.05
@@ -110,7 +110,7 @@ def test_fingertips_press_into_the_table_as_deep_as_it_says_and_no_deeper(tips_m
     """A way that ends with the pads 0.8 mm in the table."""
     placed = Placed((dataclasses.replace(PLACED.supports[0], tips_m=tips_m),), PLACED.object_pose, PLACED.index)
     given = grasp(0.05)
-    down = body_distances(HAND, given.grasp, placed.scenes[0])[0].min() + 0.0008
+    down = obstacle_room(HAND, given.grasp, PLACED.scenes)[0] + 0.0008
     assert given.approach is not None
     for part in (given.grasp.hand_pose, given.pregrasp.hand_pose, given.squeeze.hand_pose, given.approach[0]):
         part[:, 2] += down
