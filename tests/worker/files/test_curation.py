@@ -1,4 +1,4 @@
-"""Parts of datasets: chosen by an expression, balanced, and compared."""
+"""Parts of datasets: chosen by an expression or by kind, balanced, and compared."""
 
 from __future__ import annotations
 
@@ -12,10 +12,11 @@ from typer.testing import CliRunner
 
 from service.model.errors import InputError
 from service.readers import Grasps, open_shards
-from service.store.shards import read_shard, write_shard
+from service.store.shards import Shard, read_shard, write_shard
 from worker.commands.curate import app
 from worker.files.cases import expand
 from worker.files.curation import Balance, faces
+from worker.files.subsets import choose
 
 COUNT = 40
 
@@ -99,15 +100,12 @@ def test_no_kind_is_more_frequent_than_the_median_one(folder: Path, tmp_path: Pa
         assert np.array_equal(one["grasp/hand_pose"], read_shard(other)["grasp/hand_pose"])
 
 
-def test_faces_are_told_by_what_lies_below() -> None:
+def test_faces_are_told_by_what_lies_below_and_unknown_kinds_refused() -> None:
+    for by in (["beauty"], []):
+        with pytest.raises(InputError, match="type, direction, face"):
+            Balance(by)
     tilted = [np.sin(0.1), 0.0, -np.cos(0.1)]
     assert faces(np.array([[0, 0, -1.0], [0, 1.0, 0], tilted, [0.0, 0, 0], [0, 0, 1.0]])).tolist() == [0, 1, 0, -1, 2]
-
-
-@pytest.mark.parametrize("by", ["beauty", ""])
-def test_a_kind_that_there_is_not_is_refused(by: str) -> None:
-    with pytest.raises(InputError, match="type, direction, face"):
-        Balance([by] if by else [])
 
 
 def test_a_difference_names_cells_counts_and_settings(folder: Path, tmp_path: Path) -> None:
@@ -121,3 +119,35 @@ def test_a_difference_names_cells_counts_and_settings(folder: Path, tmp_path: Pa
     assert cells == {"mug": (2 * COUNT, COUNT, COUNT), "block": (0, COUNT, 0)}
     assert found["settings"] == {"seed": {"first": ["0"], "second": ["0", "9"]}}
     assert "the same grasps in 2 cells" in run("diff", folder, folder).stdout
+
+
+def base_of(valid: list[int], sound: list[int], success: list[int] | None) -> Shard:
+    arrays = {"quality/valid": np.array(valid, np.uint8), "quality/sound": np.array(sound, np.uint8)}
+    return Shard("base", {}, arrays | ({} if success is None else {"quality/success": np.array(success, np.int8)}))
+
+
+JUDGED = base_of([1, 0, 0], [1, 1, 0], [1, 0, 1])
+UNJUDGED = base_of([0, 0], [1, 0], None)
+
+
+def test_valid_grasps_are_taken_unless_others_are_asked_for() -> None:
+    assert choose(JUDGED)[0].tolist() == [True, False, False]
+    assert choose(JUDGED, every=True)[0].all()
+    assert choose(UNJUDGED, unjudged=True)[0].tolist() == [True, False]
+    words = [choose(JUDGED)[1], choose(UNJUDGED, unjudged=True)[1], choose(JUDGED, every=True)[1]]
+    assert words == ["valid grasps", "sound grasps that nobody judged", "grasps of any kind"]
+
+
+@pytest.mark.parametrize(
+    "base, wish, mend",
+    [
+        (UNJUDGED, {}, "take them with --unjudged"),
+        (JUDGED, {"unjudged": True}, "leave out --unjudged"),
+        (base_of([0], [1], [0]), {}, "take them with --all"),
+        (base_of([], [], []), {"every": True}, "no grasp at all"),
+        (JUDGED, {"unjudged": True, "every": True}, "exclude each other"),
+    ],
+)
+def test_none_of_that_kind_is_told_with_the_mend(base: Shard, wish: dict[str, bool], mend: str) -> None:
+    with pytest.raises(InputError, match=mend):
+        choose(base, **wish)

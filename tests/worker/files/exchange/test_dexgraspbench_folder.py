@@ -75,7 +75,7 @@ def test_the_evaluators_hand_stands_where_ours_does(name: str, block: ObjectMode
             assert_at(found.data.body(PREFIX + body), pose)
 
 
-def test_the_evaluators_actuators_aim_at_the_joints_of_a_posture(bench: Path, hand: HandModel) -> None:
+def test_the_evaluators_bodies_and_actuators_are_those_of_the_hand(bench: Path, hand: HandModel) -> None:
     found = load(bench, files_of(bench, "graspd_barrett")[0], "graspd_barrett")
     qpos = found.grasp["squeeze_qpos"]
     found.at(qpos)
@@ -86,10 +86,6 @@ def test_the_evaluators_actuators_aim_at_the_joints_of_a_posture(bench: Path, ha
         assert target == pytest.approx(qpos[int(joint.qposadr[0])], abs=1e-12)
         assert found.model.actuator_gainprm[number, 0] == pytest.approx(5.0)
     assert found.model.neq == 1 + len(hand.joint_names) - hand.dofs  # the weld, and what follows another joint
-
-
-def test_the_bodies_that_the_configuration_names_are_in_the_model(bench: Path, hand: HandModel) -> None:
-    found = load(bench, files_of(bench, "graspd_barrett")[0], "graspd_barrett")
     known = {found.model.body(number).name for number in range(found.model.nbody)}
     said = found.hand
     assert {PREFIX + name for name in said["valid_body_name"]} <= known

@@ -16,7 +16,7 @@ from service.model.errors import InputError
 from service.model.transforms import IDENTITY_POSE, apply, compose, pose_from_matrix
 from service.readers import Pictures, open_shards
 from service.store.shards import Shard, read_shard, write_shard
-from tests.worker.files.exchange.conftest import run
+from tests.worker.commands_run import graspd
 from tests.worker.files.exchange.dexgraspnet2_loader import graspness_at, pointed, sample, some_views
 from worker.files.exchange import dexgraspnet2
 from worker.files.exchange.dexgraspnet2 import load_npz
@@ -38,7 +38,7 @@ POINT_M = 8e-5
 @pytest.fixture(scope="module")
 def root(on_tables: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("dexgraspnet2")
-    said = run("export", on_tables, "--format", "dexgraspnet2", "-o", folder)
+    said = graspd("export --format dexgraspnet2 -o", folder, on_tables)
     assert (said["scenes"], said["views"], said["files"]) == (4, 8, 4)
     return folder
 
@@ -103,15 +103,6 @@ def test_the_object_of_the_cloud_is_where_grasps_mean_it(
         assert np.abs(apply(pose_from_matrix(on_table), rest)[:, 2]).max(initial=0) < POINT_M
 
 
-def test_a_grasp_points_at_the_object(root: Path, block: ObjectModel) -> None:
-    mesh = trimesh.Trimesh(block.vertices, block.faces, process=False)
-    for file in sorted((root / "data" / "dex_grasps_new").rglob("block.npz")):
-        place = dexgraspnet2._object_pose(file, 0)
-        turn = trimesh.transformations.quaternion_matrix(place[3:])[:3, :3]
-        points = (np.load(file)["point"] - place[:3]) @ turn
-        assert np.abs(trimesh.proximity.closest_point(mesh, points)[1]).max() < ROUNDING_M
-
-
 def placed(root: Path, scene: str, view: int, points: np.ndarray) -> np.ndarray:
     """Points of the object's frame in the camera of a view."""
     meta = scipy.io.loadmat(root / "data" / "scenes" / scene / "realsense" / "meta" / f"{view:04}.mat")
@@ -166,7 +157,7 @@ def test_graspness_lies_as_its_loader_expects_it(root: Path) -> None:
 def test_graspness_belongs_to_the_cloud_that_a_depth_camera_tells(
     on_tables: Path, hand: HandModel, tmp_path: Path
 ) -> None:
-    run("export", on_tables, "--format", "dexgraspnet2", "--noise", "stereo", "-o", tmp_path)
+    graspd("export --format dexgraspnet2 --noise stereo -o", tmp_path, on_tables)
     for scene, view in some_views(tmp_path, TRAIN, 4, seed=8):
         found = sample(tmp_path, scene, view, "barrett", list(hand.joint_names))
         assert found.has_graspness and (found.graspness[found.seg == 1] > np.log(1e-3)).any()
@@ -181,7 +172,7 @@ def test_a_view_of_nothing_has_no_cloud_and_no_graspness(on_tables: Path, hand: 
     (shards / "block.h5").write_bytes((on_tables / "block.h5").read_bytes())
     arrays = {**views.arrays, "image/segmentation": labels}
     (shards / "views.h5").write_bytes(write_shard("views", arrays, views.attributes))
-    run("export", shards, "--format", "dexgraspnet2", "-o", tmp_path / "out")
+    graspd("export --format dexgraspnet2 -o", tmp_path / "out", shards)
     for folder in (tmp_path / "out" / "data" / "dex_graspness_new").glob("*/realsense"):
         assert sorted(file.name for file in folder.iterdir()) == [f"{view:04}.npy" for view in range(1, 256, 2)]
         assert sample(tmp_path / "out", folder.parent.name, 3, "barrett", list(hand.joint_names)).has_graspness
@@ -241,35 +232,26 @@ def test_a_file_without_its_scene_is_told(root: Path, tmp_path: Path) -> None:
         dexgraspnet2.read(place, hand="barrett", obj="block")
 
 
-def test_objects_in_an_archive_are_not_unpickled(tmp_path: Path) -> None:
+def test_archives_are_neither_unpickled_nor_believed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     np.savez(tmp_path / "x.npz", point=np.array([{"a": 1}], dtype=object))
     with pytest.raises(InputError, match="read safely"):
         load_npz(tmp_path / "x.npz")
-
-
-def test_an_archive_that_unpacks_to_too_much_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    header = b"\x93NUMPY\x01\x00v\x00{'descr': '<f8', 'fortran_order': False, 'shape': (30000000000,), }"
+    with zipfile.ZipFile(tmp_path / "x.npz", "w") as archive:
+        archive.writestr("point.npy", header.ljust(127) + b"\n")
+    with pytest.raises(InputError, match="read safely"):
+        load_npz(tmp_path / "x.npz")
     monkeypatch.setattr(dexgraspnet2, "LARGEST", 2**20)
     np.savez_compressed(tmp_path / "x.npz", point=np.zeros(2**20))
     with pytest.raises(InputError, match="unpacks to more"):
         load_npz(tmp_path / "x.npz")
 
 
-def test_a_header_that_promises_what_is_not_there_is_told(tmp_path: Path) -> None:
-    header = b"\x93NUMPY\x01\x00v\x00{'descr': '<f8', 'fortran_order': False, 'shape': (30000000000,), }"
-    with zipfile.ZipFile(tmp_path / "x.npz", "w") as archive:
-        archive.writestr("point.npy", header.ljust(127) + b"\n")
-    with pytest.raises(InputError, match="read safely"):
-        load_npz(tmp_path / "x.npz")
-
-
-def test_no_pictures_no_scenes(on_tables: Path, tmp_path: Path) -> None:
-    with pytest.raises(AssertionError, match="no picture shows"):
-        run("export", on_tables / "block.h5", "--format", "dexgraspnet2", "-o", tmp_path / "out")
-
-
-def test_pictures_of_scenes_in_which_no_grasp_is_clear_are_told(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_what_shows_no_scene_or_no_clear_grasp_is_told(
+    on_tables: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    with pytest.raises(AssertionError, match="no picture shows"):
+        graspd("export --format dexgraspnet2 -o", tmp_path / "out", on_tables / "block.h5")
     none = Look(0, "base", "views", 0, np.eye(4), IDENTITY_POSE, np.zeros(0, np.intp))
     monkeypatch.setattr(dexgraspnet2, "looks", lambda pictures: [none])
     lots: list[Any] = [SimpleNamespace(id="base")]

@@ -25,7 +25,7 @@ from service.model.errors import InputError
 from service.model.transforms import IDENTITY_POSE
 from service.store import validity
 from service.store.shards import Shard
-from tests.worker.files.exchange.conftest import run
+from tests.worker.commands_run import graspd
 from tests.worker.hands.grippers import OPENING, gripper
 from worker.files.exchange import graspgen
 from worker.hands.kinematics import body_poses
@@ -39,7 +39,7 @@ ROUNDING_M = 1e-12
 @pytest.fixture(scope="module")
 def data(on_tables: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("graspgen") / "data"
-    said = run("export", on_tables, "--format", "graspgen", "-o", folder)
+    said = graspd("export --format graspgen -o", folder, on_tables)
     assert (said["grasps"], said["objects"], said["files"]) == (16, 2, 1)
     return folder
 
@@ -135,7 +135,7 @@ def test_an_object_among_several_is_named(data: Path) -> None:
 
 def test_what_nobody_judged_has_no_label(on_tables: Path, tmp_path: Path) -> None:
     with pytest.raises(AssertionError, match="whether it holds"):
-        run("export", on_tables, "--format", "graspgen", "--unjudged", "-o", tmp_path / "out")
+        graspd("export --format graspgen --unjudged -o", tmp_path / "out", on_tables)
 
 
 @pytest.mark.parametrize(
@@ -157,13 +157,12 @@ def test_a_record_that_is_wrong_is_told(data: Path, tmp_path: Path, change: dict
         graspgen.read(path, hand="barrett", obj="block")
 
 
-def test_a_record_that_is_too_large_is_not_read(data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_links_compressed_and_large_files_are_not_followed(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(graspgen, "LARGEST", 1000)
     with pytest.raises(InputError, match="larger than"):
         graspgen.read(data / "grasps" / "barrett", hand="barrett", obj="block", object_name="block")
-
-
-def test_links_and_compressed_files_are_not_followed(tmp_path: Path) -> None:
     link = tarfile.TarInfo("block.grasps.json")
     link.type, link.linkname = tarfile.SYMTYPE, "/etc/passwd"
     with tarfile.open(tmp_path / "links.tar", "w") as tar:

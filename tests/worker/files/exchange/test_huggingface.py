@@ -17,7 +17,7 @@ from service.model.errors import InputError
 from service.model.transforms import apply, compose, pose_from_matrix
 from service.readers import Pictures, open_shards
 from service.store.shards import Shard
-from tests.worker.files.exchange.conftest import run
+from tests.worker.commands_run import graspd
 from worker.files.exchange import huggingface
 from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
@@ -30,7 +30,7 @@ ROUNDING_M = 1e-12
 @pytest.fixture(scope="module")
 def folder(on_tables: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("huggingface") / "data"
-    said = run("export", on_tables, "--format", "huggingface", "--all", "-o", out)
+    said = graspd("export --format huggingface --all -o", out, on_tables)
     assert (said["grasps"], said["pictures"], said["files"]) == (16, 8, 4)
     return out
 
@@ -118,12 +118,9 @@ def test_grasps_come_back_as_they_were_with_tables_and_verdicts(folder: Path, st
     np.testing.assert_array_equal(back.placed.object_pose[back.placed.index], poses)
 
 
-def test_an_object_among_several_is_named(folder: Path) -> None:
+def test_what_is_no_table_of_grasps_is_told(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(InputError, match="block, mug"):
         huggingface.read(folder, hand="barrett", obj="block")
-
-
-def test_what_is_no_table_of_grasps_is_told(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "x.parquet").write_bytes(b"PAR1 no table PAR1")
     with pytest.raises(InputError, match="no Parquet file"):
         huggingface.read(tmp_path / "x.parquet", hand="barrett", obj="block")

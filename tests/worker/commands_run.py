@@ -1,0 +1,17 @@
+"""Commands of graspd as a test runs them."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from typer.testing import CliRunner
+
+from graspd.cli import build
+
+
+def graspd(words: str, *more: object, code: int = 0) -> dict[str, Any]:
+    """What a command tells with --json; `words` are cut at spaces, `more` are whole arguments."""
+    result = CliRunner().invoke(build(), [*words.split(), *(str(word) for word in more), "--json"])
+    assert result.exit_code == code, result.output
+    return dict(json.loads(result.stdout.splitlines()[-1]))
