@@ -8,23 +8,39 @@ import numpy as np
 import pytest
 import trimesh
 
-from service.model.fidelity import resolve_fidelity
-from service.model.transforms import apply, quat_from_matrix, quat_rotate
+from service.model.domain import JobOptions
+from service.model.fidelity import FIDELITIES, resolve_fidelity
+from service.model.scene_spec import SceneSpec
+from service.model.transforms import IDENTITY_POSE, apply, quat_from_matrix, quat_rotate
 from tests.worker.models import object_from_mesh
 from tests.worker.simulation.rigs import ball
+from worker.certified import certified_grasps
+from worker.commands.synth import _said
+from worker.files.synthesis import synthesized
 from worker.grasps import Posture
-from worker.hands.jaws import pads_of
+from worker.hands.jaws import pads_of, thinnest_fingertip
 from worker.hands.kinematics import body_poses
 from worker.hands.load import hand_from_path
 from worker.hands.oppositions import oppositions_of
 from worker.hands.pinches import pinches_of
 from worker.objects.prepare import object_from_path
-from worker.planners.fast_graspd.across import ACROSS, NEAR_M, Openings, across, crossings_of, outlines_of, promising
+from worker.planners.fast_graspd.across import (
+    ACROSS,
+    NEAR_M,
+    Openings,
+    across,
+    crossings_of,
+    outlines_of,
+    promising,
+    room_beside,
+    why_narrow,
+)
 from worker.planners.fast_graspd.candidates import posture_of
 from worker.planners.fast_graspd.pairs import pair_of
 from worker.planners.fast_graspd.scene_starts import REACHING, clear_scene_starts, free_ways
 from worker.planners.fast_graspd.starts import CLEAR, start_generator
 from worker.planners.fast_graspd.withdrawal import hindrance
+from worker.run import Run
 from worker.simulation.data import HandState
 from worker.simulation.obstacles import MARGIN_M, DeviceObstacles, body_room
 from worker.simulation.surroundings import Obstacle, Scenes, Surroundings
@@ -211,3 +227,80 @@ def test_what_lies_flat_on_a_table_is_between_the_fingers_of_hands_that_set_out(
     low, high = thin.vertices.min(axis=0), thin.vertices.max(axis=0)
     between = ((line > low - 0.01) & (line < high + 0.01)).all(axis=-1).any(axis=1)
     assert between.mean() > 0.7
+
+
+SIZE = np.array([0.05, 0.06, 0.08])
+BOX = object_from_mesh(trimesh.creation.box(SIZE))
+UPRIGHT = (1.0, 0.0, 0.0, 0.0)
+
+
+def beside_walls(gap: float, axes: tuple[int, ...]) -> Surroundings:
+    """The box on a table, with a wall as high as itself beside it along +x, +y or both [m]."""
+    found = [Obstacle.half_space(UP, -0.5 * SIZE[2])]
+    for axis in axes:
+        centre, size = np.zeros(3), np.full(3, 0.4)
+        centre[axis], size[axis] = 0.5 * SIZE[axis] + gap + 0.01, 0.02
+        found.append(Obstacle.box((*centre, *UPRIGHT), size))
+    return Surroundings(tuple(found), UP)
+
+
+def test_a_gap_is_named_with_the_fingertip_that_does_not_fit(barrett) -> None:
+    told = why_narrow(barrett, BOX, [beside_walls(0.008, (0, 1))])
+    assert told is not None
+    assert "about 8 mm" in told
+    assert f"{1e3 * thinnest_fingertip(barrett):.0f} mm" in told
+    # One of several scenes that has room is enough, and so is one axis that is free.
+    assert why_narrow(barrett, BOX, [beside_walls(0.008, (0, 1)), beside_walls(0.03, (0, 1))]) is None
+    assert why_narrow(barrett, BOX, [beside_walls(0.008, (0,))]) is None
+    assert why_narrow(barrett, BOX, [beside_walls(0.008, ())]) is None
+
+
+def test_what_is_too_wide_or_too_low_is_told(barrett) -> None:
+    large = object_from_mesh(trimesh.creation.box([0.4, 0.4, 0.4]))
+    table = Surroundings((Obstacle.half_space(UP, -0.2),), UP)
+    assert f"opens to {1e3 * oppositions_of(barrett).widest:.0f} mm" in str(why_narrow(barrett, large, [table]))
+    sheet = object_from_mesh(trimesh.creation.box([0.08, 0.08, 0.004]))
+    table = Surroundings((Obstacle.half_space(UP, -0.002),), UP)
+    assert "lies 4 mm high" in str(why_narrow(hand_from_path("allegro"), sheet, [table]))
+
+
+def test_a_ball_beside_a_pair_keeps_its_distance_from_a_wall() -> None:
+    pairs, gap, width = crossings_of(BOX), 0.03, 0.02
+    right = pairs.ends()[1][:, 0] > 0.5 * SIZE[0] - 1e-6
+    across = right & (pairs.axis[:, 0] > 0.999)
+    assert across.any()
+    room = room_beside(pairs, beside_walls(gap, (0,)), width)
+    assert room[across] == pytest.approx(gap - width, abs=1e-4)
+    assert np.isinf(room_beside(pairs, beside_walls(gap, ()), width)).all()
+
+
+def test_pairs_with_room_for_fingertips_are_drawn_more_often(barrett) -> None:
+    scene, known = beside_walls(0.008, (0,)), oppositions_of(barrett)
+
+    def share(tip: float) -> float:
+        opening = Openings.of(known, BOX, scene, tip=tip)
+        chance = np.diff(opening.sums, prepend=0.0)
+        return float(chance[np.abs(opening.pairs.axis[:, 1]) > 0.9].sum())
+
+    assert share(thinnest_fingertip(barrett)) > 0.85 > share(0.0)
+
+
+def test_a_batch_without_a_valid_grasp_says_the_reason(barrett) -> None:
+    walls = beside_walls(0.008, (0, 1)).obstacles
+    scenes = Scenes(walls, np.array([IDENTITY_POSE]))
+    request = JobOptions(grasps=1, budget=1.0, audits=0, scene="table", fidelity=FIDELITIES["draft"])
+    found = certified_grasps(barrett, BOX, request, count=1, scenes=scenes, run=Run(threads=1))
+    assert not len(found.grasps)
+    assert found.narrow == why_narrow(barrett, BOX, scenes.placed(np.zeros(1, int)).scenes)
+    assert "8 mm" in str(found.narrow)
+
+
+def test_raw_grasps_none_of_which_is_valid_come_with_the_reason(tmp_path) -> None:
+    sheet = tmp_path / "sheet.stl"
+    trimesh.creation.box([0.08, 0.08, 0.004]).export(sheet)
+    place, request = SceneSpec(kind="table"), JobOptions(want="raw", grasps=1, fidelity="draft", scene="table")
+    made = synthesized("allegro", str(sheet), request, place=place, scenes=1)
+    found = made.summary()
+    assert (found["grasps"], found["valid"], found["reason"]) == (1, 0, None)
+    assert "lies 4 mm high" in found["narrow"]
+    assert _said({"file": "g.h5", **found}).endswith(found["narrow"])

@@ -77,47 +77,40 @@ def taken(
     return rows, sorted(tries), sorted(seats)
 
 
-def test_the_first_that_is_good_enough_is_taken_and_nobody_after_it_is_tried(monkeypatch: pytest.MonkeyPatch) -> None:
-    rows, tries, _ = taken([[0.5, 0.1, 0.1], [3.0, 0.9, 0.1]], monkeypatch)
-    assert rows == [0, 4]
-    assert tries == [0, 3, 4]
+BAD = 2 * candidates.HOPEFUL
+
+
+@pytest.mark.parametrize(
+    ("scores", "given", "rows", "tries"),
+    [
+        # The first that is good enough is taken, and nobody after it is tried.
+        ([[0.5, 0.1, 0.1], [3.0, 0.9, 0.1]], {}, [0, 4], [0, 3, 4]),
+        # Of the seated the one of better merit is tried first.
+        ([[0.5, 0.5, 0.5]], {"merit": [[0.2, 0.1, 0.0]]}, [1], [1]),
+        # What balances too badly is tried only where there is nothing else.
+        (
+            [[3.0, 0.1, 0.1, 0.2], [3.0, 2.6, 0.1, 0.1]],
+            {"merit": [[0.0, BAD, BAD, 0.1], [2 * BAD, BAD, BAD, BAD]]},
+            [3, 5],
+            [0, 3, 5],
+        ),
+        # What is unsound is not tried, and taken only where there is nothing else.
+        ([[0.5, 3.0], [4.0, 0.5]], {"unsound": (0,)}, [1, 3], [1, 2, 3]),
+        ([[0.5, 0.6]], {"unsound": (0, 1)}, [0], []),
+        # Where none is good enough the least score is taken, of equal ones the first, and no score is the worst.
+        ([[3.0, 2.6, 4.0]], {}, [1], [0, 1, 2]),
+        ([[2.0, 2.0]], {}, [0], [0, 1]),
+        ([[np.nan, 2.0, np.inf], [np.nan, np.inf, np.nan]], {}, [1, 3], None),
+    ],
+)
+def test_which_candidate_is_taken_and_which_are_tried(scores, given, rows, tries, monkeypatch) -> None:
+    took, tried, _ = taken(scores, monkeypatch, **given)
+    assert took == rows and tries in (None, tried)
 
 
 def test_the_others_are_seated_only_where_the_first_two_fail(monkeypatch: pytest.MonkeyPatch) -> None:
     rows, _, seats = taken([[0.5, 3.0, 3.0, 3.0], [3.0, 3.0, 3.0, 0.5]], monkeypatch)
-    assert rows == [0, 7]
-    assert seats == [0, 1, 4, 5, 6, 7]
-
-
-def test_of_the_seated_the_one_of_better_merit_is_tried_first(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert taken([[0.5, 0.5, 0.5]], monkeypatch, merit=[[0.2, 0.1, 0.0]])[:2] == ([1], [1])
-
-
-def test_what_balances_too_badly_is_not_tried_but_where_there_is_nothing_else(monkeypatch: pytest.MonkeyPatch) -> None:
-    bad = 2 * candidates.HOPEFUL
-    merit = [[0.0, bad, bad, 0.1], [2 * bad, bad, bad, bad]]
-    rows, tries, _ = taken([[3.0, 0.1, 0.1, 0.2], [3.0, 2.6, 0.1, 0.1]], monkeypatch, merit=merit)
-    assert tries == [0, 3, 5]
-    assert rows == [3, 5]
-
-
-def test_what_is_unsound_is_not_tried(monkeypatch: pytest.MonkeyPatch) -> None:
-    took, tries, _ = taken([[0.5, 3.0], [4.0, 0.5]], monkeypatch, unsound=(0,))
-    assert (took, sorted(tries)) == ([1, 3], [1, 2, 3])
-
-
-def test_what_is_unsound_is_taken_where_there_is_nothing_else(monkeypatch: pytest.MonkeyPatch) -> None:
-    took, tries, _ = taken([[0.5, 0.6]], monkeypatch, unsound=(0, 1))
-    assert (took, tries) == ([0], [])
-
-
-def test_where_none_is_good_enough_the_least_score_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert taken([[3.0, 2.6, 4.0]], monkeypatch)[:2] == ([1], [0, 1, 2])
-
-
-def test_of_equal_scores_the_first_is_taken_and_no_score_is_the_worst(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert taken([[2.0, 2.0]], monkeypatch)[0] == [0]
-    assert taken([[np.nan, 2.0, np.inf], [np.nan, np.inf, np.nan]], monkeypatch)[0] == [1, 3]
+    assert (rows, seats) == ([0, 7], [0, 1, 4, 5, 6, 7])
 
 
 @pytest.fixture(scope="module")

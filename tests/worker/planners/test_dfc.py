@@ -46,26 +46,23 @@ def contacts_at(points: list[list[float]]) -> np.ndarray:
     return evaluated(found, pivot)
 
 
-def test_contacts_that_balance_have_no_force_closure_energy() -> None:
-    terms = contacts_at([[0.025, 0, 0], [-0.025, 0, 0], [0, 0.025, 0], [0, -0.025, 0]])
-    np.testing.assert_allclose(terms[:2], [0, 0], atol=1e-6)
-
-
-def test_contacts_on_one_face_push_with_all_their_normals() -> None:
-    """|4 n|^2 = 16, and no torque about the middle."""
-    terms = contacts_at([[0.025, 0.01, 0], [0.025, -0.01, 0], [0.025, 0, 0.01], [0.025, 0, -0.01]])
-    assert terms[0] == pytest.approx(16.0, rel=1e-4)
-
-
-def test_opposite_contacts_that_do_not_face_each_other_have_the_energy_of_their_torque() -> None:
-    """Two couples of arm 0.02 m about z: |2 * 0.02|^2."""
-    terms = contacts_at([[0.025, 0.01, 0], [-0.025, -0.01, 0], [0.025, 0.01, 0], [-0.025, -0.01, 0]])
-    assert terms[0] == pytest.approx(0.04**2, rel=1e-3)
-
-
-def test_distance_energy_is_the_sum_of_distances_on_either_side() -> None:
-    terms = contacts_at([[0.028, 0, 0], [-0.026, 0, 0], [0, 0.023, 0], [0, -0.025, 0]])
-    assert terms[1] == pytest.approx(0.003 + 0.001 + 0.002, abs=1e-6)
+@pytest.mark.parametrize(
+    ("points", "closure", "distance"),
+    [
+        # In balance.
+        ([[0.025, 0, 0], [-0.025, 0, 0], [0, 0.025, 0], [0, -0.025, 0]], 0.0, 0.0),
+        # On one face: |4 n|^2 = 16, and no torque about the middle.
+        ([[0.025, 0.01, 0], [0.025, -0.01, 0], [0.025, 0, 0.01], [0.025, 0, -0.01]], 16.0, None),
+        # Two couples of arm 0.02 m about z: |2 * 0.02|^2.
+        ([[0.025, 0.01, 0], [-0.025, -0.01, 0], [0.025, 0.01, 0], [-0.025, -0.01, 0]], 0.04**2, None),
+        # Off the surface on either side of it.
+        ([[0.028, 0, 0], [-0.026, 0, 0], [0, 0.023, 0], [0, -0.025, 0]], None, 0.006),
+    ],
+)
+def test_energies_of_contacts(points: list[list[float]], closure: float | None, distance: float | None) -> None:
+    terms = contacts_at(points)
+    assert closure is None or terms[0] == pytest.approx(closure, rel=1e-3, abs=1e-6)
+    assert distance is None or terms[1] == pytest.approx(distance, abs=1e-6)
 
 
 @pytest.mark.parametrize("q", [(0.1, 0.3), (-0.35, 0.25), (1.3, 1.3)])

@@ -17,12 +17,8 @@ from worker.planners.threads import Steps
 from worker.run import ALONE, Run
 
 
-def test_the_temperature_follows_ingbers_schedule() -> None:
-    """Values of T0 exp(-7 k^(1/8)) worked out by hand: 30000^(1/8) = 3.6277, 70000^(1/8) = 4.0331."""
+def test_temperature_and_jumps_follow_ingbers_schedule() -> None:
     np.testing.assert_allclose(temperature(np.array([0, 30_000, 70_000])), [1e6, 9.37e-6, 5.49e-7], rtol=5e-3)
-
-
-def test_a_jump_reaches_its_largest_only_at_the_ends_of_the_uniform_number() -> None:
     for t in (1e-6, 1e-2, 1.0, 1e6):
         np.testing.assert_allclose(jump_share(np.array([0.0, 0.5, 1.0]), t), [-1, 0, 1], atol=1e-9)
     # Hot: nearly uniform. Cold: half of all jumps are shorter than sqrt(T).
@@ -87,8 +83,12 @@ def test_barrett_has_graspits_own_eigengrasps() -> None:
 
 
 @pytest.mark.parametrize("name", ["allegro", "barrett", "shadow"])
-def test_amplitudes_at_their_limits_reach_the_joint_limits(name: str) -> None:
+def test_contacts_lie_on_every_finger_and_amplitudes_reach_the_limits(name: str) -> None:
     hand = hand_from_path(name)
+    found = virtual_contacts(hand)
+    assert set(hand.fingertips) <= set(found.body.tolist())
+    palm = found.normal[found.body == 0]
+    assert len(palm) >= 1 and np.all(palm @ hand.palm.approach > 0.7)
     found = eigengrasps(hand)
     corners = np.array([[a, b] for a in found.limits[0] for b in found.limits[1]])
     q = found.posture(corners, hand)
@@ -97,16 +97,7 @@ def test_amplitudes_at_their_limits_reach_the_joint_limits(name: str) -> None:
     assert np.any(np.ptp(q, axis=0)[moving] > 0.5 * (hand.upper - hand.lower)[moving])
 
 
-@pytest.mark.parametrize("name", ["allegro", "barrett", "shadow"])
-def test_virtual_contacts_lie_on_every_finger_and_on_the_palm(name: str) -> None:
-    hand = hand_from_path(name)
-    found = virtual_contacts(hand)
-    assert set(hand.fingertips) <= set(found.body.tolist())
-    palm = found.normal[found.body == 0]
-    assert len(palm) >= 1 and np.all(palm @ hand.palm.approach > 0.7)
-
-
-def test_annealing_lowers_the_energy_and_stops_at_its_step() -> None:
+def test_annealing_lowers_the_energy_and_keeps_states_that_differ() -> None:
     search = Search(
         ground_of(two_finger_hand(), object_from_mesh(trimesh.creation.box((0.05, 0.05, 0.05))), "cpu", kernels)
     )
@@ -116,12 +107,6 @@ def test_annealing_lowers_the_energy_and_stops_at_its_step() -> None:
     assert told[-1] == 4 * 50
     many = search.run([[0, 0, c] for c in range(4)], steps=FIRST_STEP + 2000, keep=1, tell=steps)
     assert np.linalg.norm(many.pivot, axis=1).mean() < np.linalg.norm(few.pivot, axis=1).mean()
-
-
-def test_the_states_kept_of_a_chain_differ() -> None:
-    search = Search(
-        ground_of(two_finger_hand(), object_from_mesh(trimesh.creation.box((0.05, 0.05, 0.05))), "cpu", kernels)
-    )
     kept = search.run([[3]], steps=FIRST_STEP + 1500, keep=4, tell=Steps(1, ALONE))
     apart = np.linalg.norm(kept.pivot[:, None] - kept.pivot[None], axis=2)
     assert len(kept.pivot) == 4
