@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.worker.quality.test_lift import BOX, HAND, PLACED, WHOLE, grasp
-from tests.worker.quality.test_lift import LEAST
+from tests.worker.quality.test_lift import BOX, HAND, LEAST, PLACED, WHOLE, grasp
 from worker.grasps import joined
 from worker.quality.referee.judge import KnownTrials, judge
 from worker.quality.referee.lift import Lift
@@ -36,13 +35,23 @@ def lifts(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return done
 
 
-def test_a_lift_that_is_known_is_not_simulated_again(lifts: list[int]) -> None:
+def test_what_was_judged_once_is_not_simulated_again(lifts: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
     known: KnownLifts = {}
     first = judge_lifts(HAND, BOX, MANY, WHERE, pieces=WHOLE, known=known)
     again = judge_lifts(HAND, BOX, MANY, WHERE, pieces=WHOLE, known=known)
     assert len(lifts) == 3
     assert np.array_equal(first.outcome, again.outcome)
     assert np.array_equal(first.margin, again.margin)
+    rows: list[int] = []
+    certificate = Test.certificate
+    monkeypatch.setattr(Test, "certificate", lambda self, given, row: rows.append(row) or certificate(self, given, row))
+    known: KnownTrials = {}
+    first = judge(HAND, BOX, MANY, pieces=WHOLE, known=known)
+    again = judge(HAND, BOX, MANY.take(np.array([2, 0])), pieces=WHOLE, known=known)
+    assert sorted(rows) == [0, 1, 2]
+    assert np.array_equal(again.outcome, first.outcome[[2, 0]])
+    judge(HAND, BOX, MANY, pieces=WHOLE, hard=True, known=known)
+    assert len(rows) == 6
 
 
 @pytest.mark.parametrize("other", ["friction", "squeeze", "scene"])
@@ -112,16 +121,3 @@ def test_a_free_grasp_that_the_referee_drops_is_no_good_candidate(
     monkeypatch.setattr(trials, "push_trial", lambda *_: lambda grasps, *_: np.array([0.2, 4.0, 4.0]))
     monkeypatch.setattr(trials, "judge", lambda *_, **__: type("Verdicts", (), {"success": np.array([verdict])}))
     assert hold_trial(HAND, BOX, lambda: WHOLE)(MANY, None).tolist() == pytest.approx([score, 4.0, 4.0])
-
-
-def test_a_verdict_that_is_known_is_not_found_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    rows: list[int] = []
-    certificate = Test.certificate
-    monkeypatch.setattr(Test, "certificate", lambda self, given, row: rows.append(row) or certificate(self, given, row))
-    known: KnownTrials = {}
-    first = judge(HAND, BOX, MANY, pieces=WHOLE, known=known)
-    again = judge(HAND, BOX, MANY.take(np.array([2, 0])), pieces=WHOLE, known=known)
-    assert sorted(rows) == [0, 1, 2]
-    assert np.array_equal(again.outcome, first.outcome[[2, 0]])
-    judge(HAND, BOX, MANY, pieces=WHOLE, hard=True, known=known)
-    assert len(rows) == 6
