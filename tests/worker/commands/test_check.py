@@ -56,11 +56,6 @@ def test_a_folder_of_objects_gets_a_verdict_each_and_exit_code_2_if_one_is_refus
     assert code == 0 and report["refused"] == []
 
 
-def test_a_folder_without_a_mesh_is_a_mistake(tmp_path: Path) -> None:
-    told = CliRunner().invoke(build(), ["objects", "check", str(tmp_path)])
-    assert told.exit_code == 2 and "no mesh" in told.stderr
-
-
 @pytest.mark.parametrize(
     ("file", "options", "verdict"),
     [
@@ -91,30 +86,23 @@ def test_what_is_not_there_is_refused_and_the_built_ins_are_named(kind: str) -> 
     assert report["verdict"] == "refuse" and ("allegro" in report["message"]) == (kind == "hands")
 
 
-def test_without_json_a_refusal_is_one_line_on_stderr(tmp_path: Path) -> None:
+def test_without_json_refusals_are_one_line_and_guesses_are_told(tmp_path: Path) -> None:
     (tmp_path / "o.stl").write_bytes(b"")
     result = CliRunner().invoke(build(), ["objects", "check", str(tmp_path / "o.stl")])
+    told = CliRunner().invoke(build(), ["objects", "check", str(tmp_path.parent / "none")])
+    assert told.exit_code == 2 and "no mesh" in told.stderr
     assert (result.exit_code, result.stdout) == (2, "")
     assert len(result.stderr.splitlines()) == 1 and "o.stl" in result.stderr
-
-
-def test_without_json_the_guesses_are_told() -> None:
     said = CliRunner().invoke(build(), ["hands", "check", "barrett", "--no-self-test"]).stdout
     for word in ("palm", "approach", "fingertips", "dofs", "pre-shape"):
         assert word in said
 
 
-def test_a_hand_option_goes_over_the_guess() -> None:
+def test_options_go_over_guesses_drop_fingers_and_weigh() -> None:
     _, report = check("hands", "check", "allegro", "--fix", "thumb_rotation=1.0,index_distal=0.2")
     assert len(report["facts"]["dofs"]) == 14
-
-
-def test_a_dropped_link_takes_its_finger_along() -> None:
     _, report = check("hands", "check", "allegro", "--drop", "ring_proximal_link")
     assert not [name for name in report["facts"]["fingertips"] if name.startswith("ring")]
-
-
-def test_a_mass_follows_from_the_density_given() -> None:
     _, report = check("objects", "check", "block", "--density", "500")
     assert report["facts"]["mass_kg"] == pytest.approx(500 * report["facts"]["volume_m3"])
 

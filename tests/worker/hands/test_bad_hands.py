@@ -21,7 +21,7 @@ from service.store.store import open_store
 from tests.worker.hands.mjcfs import CLAW, FOUR_BAR
 from tests.worker.hands.urdfs import chain, joint, link, load, report, robot
 from tests.worker.objects.test_colours import BOMB, SCENE, dae
-from tests.worker.stages.test_hostile_uploads import upload, zipped
+from tests.worker.stages.test_ingest import upload, zipped
 from worker.commands.hands import report_hand
 from worker.hands.check import check_hand
 from worker.hands.load import load_hand

@@ -43,7 +43,7 @@ def test_mass_properties_are_exact_anywhere_and_turn_with_the_body() -> None:
     turn *= np.sign(np.linalg.det(turn))
     expected = turn @ mass_properties(vertices, faces).inertia @ turn.T
     np.testing.assert_allclose(mass_properties(vertices @ turn.T, faces).inertia, expected, atol=1e-14)
-    vertices, faces = sphere(0.04, 256)
+    mass = mass_properties(*sphere(0.04, 256))
     # An inscribed sphere of 256 segments is short of the ball by (pi / 256)^2 in volume, to a small factor.
     assert mass.volume == pytest.approx(4 / 3 * np.pi * 0.04**3, rel=1e-3)
     np.testing.assert_allclose(mass.inertia, 0.4 * 0.04**2 * np.eye(3), rtol=2e-3, atol=1e-9)
@@ -57,6 +57,7 @@ def test_corner_normals_of_boxes_and_spheres_are_those_of_their_shape() -> None:
     face /= np.linalg.norm(face, axis=1, keepdims=True)
     np.testing.assert_allclose(normals, np.repeat(face[:, None], 3, axis=1), atol=1e-12)
     vertices, faces = sphere(0.04, 128)
+    normals = corner_normals(vertices, faces.astype(np.int32))
     exact = vertices[faces] / np.linalg.norm(vertices[faces], axis=2, keepdims=True)
     assert np.einsum("ijk,ijk->ij", normals, exact).min() > np.cos(np.deg2rad(2))
 

@@ -35,27 +35,20 @@ def hand() -> HandModel:
     return load_hand({"h.urdf": urdf, "part.stl": part}, name="h", digest="0" * 32)
 
 
-def test_visual_meshes_have_their_colours_and_missing_ones_are_left_out(hand: HandModel) -> None:
+def test_what_is_seen_has_its_colours_what_is_not_its_collision_shapes(hand: HandModel) -> None:
     palm = [part for part in hand_parts(hand) if part.body == 0]
     assert sorted((part.look.base, len(part.solid.faces)) for part in palm) == [((0, 0, 1), 80), ((1, 0, 0), 12)]
-
-
-def test_a_body_without_visuals_is_drawn_by_its_collision_shapes(hand: HandModel) -> None:
     (finger,) = [part for part in hand_parts(hand) if part.body == 1]
     assert np.ptp(finger.solid.vertices, axis=0) == pytest.approx([0.02, 0.02, 0.04])
 
 
 def test_collision_shapes_are_drawn_on_a_toggle(hand: HandModel) -> None:
     bare = without_visuals(hand)
+    assert bare.pieces is hand.pieces and bare.content != hand.content
     assert drawn_bodies(bare) == [0, 1] and drawn_bodies(hand) == [0, 0, 1]
     assert np.ptp(hand_parts(bare)[0].solid.vertices, axis=0) == pytest.approx([0.02, 0.02, 0.04])
     above = without_visuals(replace(hand, mounting=hand)).mounting
     assert above is not None and drawn_bodies(above) == [0, 1]
-
-
-def test_looks_change_nothing_that_is_computed(hand: HandModel) -> None:
-    bare = without_visuals(hand)
-    assert bare.pieces is hand.pieces and bare.content != hand.content
 
 
 def test_a_model_for_viewers_has_the_colours(hand: HandModel) -> None:

@@ -33,24 +33,8 @@ def arm(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def export(shard: Path, arm: Path, folder: Path, format_: str = "csv", base: str = "-0.45 0 0 1 0 0 0") -> Any:
-    return run(
-        "export",
-        shard,
-        "--format",
-        format_,
-        "--all",
-        "--arm",
-        arm,
-        "--mount",
-        "flange",
-        "--mount-pose",
-        MOUNT_POSE,
-        "--base",
-        base,
-        "-o",
-        folder,
-        "--json",
-    )
+    carried = ["--arm", arm, "--mount-pose", MOUNT_POSE, "--base", base]
+    return run(f"export --format {format_} --all --mount flange --json -o", folder, shard, *carried)
 
 
 @pytest.fixture(scope="module")
@@ -172,24 +156,8 @@ def test_a_real_arm_carries_grasps(table_shard: Path, tmp_path: Path, name: str)
     folder = next((one for one in packages if (one / name).is_file()), None)
     if folder is None:
         pytest.skip("example-robot-data is not installed")
-    found = run(
-        "export",
-        table_shard,
-        "--format",
-        "csv",
-        "--all",
-        "--arm",
-        folder / name,
-        "--mount",
-        "panda_link8",
-        "--mount-pose",
-        MOUNT_POSE,
-        "--base",
-        "-0.5 0 0 1 0 0 0",
-        "-o",
-        tmp_path,
-        "--json",
-    )
+    carried = ["--arm", folder / name, "--mount-pose", MOUNT_POSE, "--base", "-0.5 0 0 1 0 0 0"]
+    found = run("export --format csv --all --mount panda_link8 --json -o", tmp_path, table_shard, *carried)
     assert found.exit_code == 0, found.output
     assert json.loads(found.stdout.splitlines()[-1])["reach_share"] > 0
 

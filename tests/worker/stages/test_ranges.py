@@ -7,30 +7,22 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.model import names
-from service.model.clock import timestamp
-from service.model.digests import job_id
-from service.model.domain import JobRequest
 from service.model.errors import DamagedShard, TaskCancelled
 from service.model.planning import message_of, plan
 from service.model.records import JobRecord
-from service.model.states import AssetKind, Lane, Stage
+from service.model.states import Stage
 from service.queue.port import EventKind
-from service.store.assets import builtin_files
-from service.store.library import publish_asset
 from service.store.manifests import load_manifest, load_shard
-from service.store.records import put_record
 from service.store.shards import Shard
 from service.store.store import Store, open_store
+from tests.worker.stages.jobs import end_of, job_of
 from worker import certified
 from worker.planners import NoPlace
-from worker.process.runner import Runner
 from worker.run import Run
-from worker.stages import scene, synthesize
+from worker.stages import synthesize
 from worker.stages.context import StopReason, TaskContext
 from worker.stages.ranges import base_rows, batches_of
 
-STAGES = {Stage.SCENE: scene.run, Stage.SYNTHESIZE: synthesize.run}
 #: Batches as small as they can be, so that several take a few seconds.
 SIZE = 3
 
@@ -43,29 +35,11 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def made(store: Store, span: int, **request: Any) -> tuple[JobRecord, list[tuple[Stage, Shard, Any]]]:
     """What a job makes whose tasks have so many batches: stage, shard and manifest of each task."""
-    hand = publish_asset(store, AssetKind.HAND, "barrett", builtin_files(AssetKind.HAND, "barrett"))
-    obj = publish_asset(store, AssetKind.OBJECT, "block", builtin_files(AssetKind.OBJECT, "block"))
-    wanted = JobRequest(hand="barrett", object="block", fidelity="draft", seed=3, **request)
-    job = JobRecord(
-        id=job_id(wanted, hand.digest, obj.digest),
-        request=wanted,
-        hand_digest=hand.digest,
-        object_digest=obj.digest,
-        lane=Lane.BULK,
-        span=span,
-        created=timestamp(),
-    )
-    put_record(store, names.job_record(job.id), job)
-    runner = Runner(STAGES, worker="w", publish=lambda event: None)  # type: ignore[arg-type]
-    found = []
-    for task in plan(job):
-        message = message_of(job, task, attempt=1, max_attempt=3)
-        event = runner.run(message.model_dump(mode="json", by_alias=True), TaskContext(store, Run(threads=2)))
-        assert event is not None and event.kind is EventKind.FINISHED, event
-        found.append(
-            (task.stage, load_shard(store, task.stage, task.output), load_manifest(store, task.stage, task.output))
-        )
-    return job, found
+    job = job_of(store, span, fidelity="draft", seed=3, **request)
+    end = end_of(store, job)
+    assert end.kind is EventKind.FINISHED, end
+    tasks = [(task.stage, task.output) for task in plan(job)]
+    return job, [(stage, load_shard(store, stage, out), load_manifest(store, stage, out)) for stage, out in tasks]
 
 
 @pytest.mark.parametrize(

@@ -12,44 +12,30 @@ import numpy as np
 import pytest
 
 from service.model import names
-from service.model.clock import timestamp
-from service.model.digests import job_id
-from service.model.domain import JobRequest
 from service.model.errors import TaskRefused
 from service.model.planning import message_of, plan
 from service.model.records import AttemptRecord, JobRecord
 from service.model.scene_spec import supports_in
-from service.model.states import AssetKind, Lane, Stage
+from service.model.states import AssetKind, Stage
 from service.queue.port import EventKind
 from service.readers import Grasps, Pictures, open_shards
 from service.store.assets import builtin_files
 from service.store.library import publish_asset
 from service.store.manifests import load_manifest, load_shard
-from service.store.records import put_record, read_record
+from service.store.records import read_record
 from service.store.shards import Shard
 from service.store.store import Store, open_store
+from tests.worker.stages.jobs import STAGES, end_of, job_of
 from worker.files.provenance import placed_of_shard
 from worker.files.synthesis import synthesized
 from worker.process.runner import Runner
 from worker.rendering import Extras
 from worker.rendering import render as pictures
-from worker.run import Run
-from worker.stages import render, scene, synthesize
 from worker.stages.assets import object_of
 from worker.stages.context import TaskContext, batch_seed
 
-TABLE = {
-    "grasps": 6,
-    "fidelity": "draft",
-    "seed": 3,
-    "audits": 0,
-    "scene": "table",
-    "scenes": 2,
-    "views": 1,
-    "width": 48,
-    "height": 36,
-}
-STAGES = {Stage.SCENE: scene.run, Stage.SYNTHESIZE: synthesize.run, Stage.RENDER: render.run}
+TABLE = {"grasps": 6, "fidelity": "draft", "seed": 3, "audits": 0, "scene": "table", "scenes": 2}
+TABLE |= {"views": 1, "width": 48, "height": 36}
 
 
 @dataclass
@@ -61,29 +47,12 @@ class Bench:
 
     def run(self, **request: Any) -> tuple[EventKind, str]:
         """Kind and words of the end of a job's first batch."""
-        hand = publish_asset(self.store, AssetKind.HAND, "barrett", builtin_files(AssetKind.HAND, "barrett"))
-        obj = publish_asset(self.store, AssetKind.OBJECT, "block", builtin_files(AssetKind.OBJECT, "block"))
         for one in request.get("neighbours", ()):
             files = builtin_files(AssetKind.OBJECT, one["object"])
             one["digest"] = publish_asset(self.store, AssetKind.OBJECT, one["object"], files).digest
-        wanted = JobRequest(hand="barrett", object="block", **request)
-        self.job = JobRecord(
-            id=job_id(wanted, hand.digest, obj.digest),
-            request=wanted,
-            hand_digest=hand.digest,
-            object_digest=obj.digest,
-            lane=Lane.BULK,
-            created=timestamp(),
-        )
-        put_record(self.store, names.job_record(self.job.id), self.job)
-        runner = Runner(STAGES, worker="w", publish=lambda event: None)  # type: ignore[arg-type]
-        for task in plan(self.job):
-            message = message_of(self.job, task, attempt=1, max_attempt=3).model_dump(mode="json", by_alias=True)
-            event = runner.run(message, TaskContext(self.store, Run(threads=2)))
-            assert event is not None
-            if event.kind is not EventKind.FINISHED:
-                break
-        return event.kind, event.message
+        self.job = job_of(self.store, **request)
+        end = end_of(self.store, self.job)
+        return end.kind, end.message
 
     def made(self, stage: Stage) -> Shard:
         return load_shard(self.store, stage, next(task for task in plan(self.job) if task.stage is stage).output)

@@ -61,7 +61,7 @@ _FEWER: Final = (
     "what is not clear on its way or not lifted is never valid; a run whose budget ends first says how many were "
     "found; a scene that leaves no way to the object is refused in a line"
 )
-_TEST: Final = "tests/worker/studies/test_stability_scenes.py::"
+_TEST: Final = "tests/worker/studies/test_stability.py::"
 
 
 def height_map(
