@@ -202,19 +202,14 @@ def test_a_lane_that_fails_stops_the_others() -> None:
         side_by_side([0, 1], work, Run(), size=lambda _: 1)
 
 
-def test_lanes_tell_how_far_all_of_them_are() -> None:
+def test_lanes_tell_how_far_they_are_and_are_cancelled_as_one() -> None:
     told: list[float] = []
 
     def work(part: int, run: Run) -> None:
         run.progress(1.0, 1.0, "done")
+        run.check("a lane")
 
     side_by_side([0, 1, 2], work, Run(progress=lambda done, total, _: told.append(done / total)), size=lambda _: 2)
     assert told[-1] == max(told) == pytest.approx(1.0) and len(told) == 3
-
-
-def test_lanes_are_cancelled_as_one() -> None:
-    def work(part: int, run: Run) -> None:
-        run.check("a lane")
-
     with pytest.raises(TaskCancelled):
         side_by_side([0, 1], work, Run(cancelled=lambda: True), size=lambda _: 1)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from service.model.domain import JobOptions
 from service.model.errors import InputError, MeshError, TaskCancelled
 from service.model.fidelity import resolve_fidelity
+from tests.worker.test_lanes import assert_same as same_batch
 from worker import together
 from worker.certified import Certified, certified_grasps
 from worker.engines.joins import batches_at_once, fitting, parse_join
@@ -37,15 +37,8 @@ def alone(pair):
 
 def assert_same(batches, others) -> None:
     for one, other in zip(batches, others, strict=True):
-        assert (one.tried, one.rejected, one.planned, one.verdict_key) == (
-            other.tried,
-            other.rejected,
-            other.planned,
-            other.verdict_key,
-        )
-        columns = one.grasps.to_columns() | one.columns
-        for name, values in (other.grasps.to_columns() | other.columns).items():
-            np.testing.assert_array_equal(columns[name], values, err_msg=name)
+        assert one.planned == other.planned
+        same_batch(one, other)
 
 
 def test_joined_batches_of_a_job_are_the_same_from_plan_to_verdict(
@@ -94,30 +87,24 @@ def test_grasps_alike_in_two_batches_are_replaced_by_those_of_another(pair) -> N
     assert distinct_batches(pair[0], raw, [first, third], more) == [first, third]
 
 
-def test_what_becomes_of_one_batch_ends_the_job(pair) -> None:
+def test_a_batch_that_fails_or_a_cancelled_job_stops_all_batches(pair) -> None:
     def torn(obj: object) -> object:
         raise MeshError("no pieces")
 
     with pytest.raises(MeshError, match="no pieces"):
         certified_batches(*pair, REQUEST, sizes=[2, 2], join=2, pieces=torn, run=Run(threads=1))  # type: ignore[arg-type]
-
-
-def test_a_job_that_is_cancelled_stops_all_its_batches(pair) -> None:
     told: list[str] = []
     run = Run(threads=1, progress=lambda done, total, message: told.append(message), cancelled=lambda: bool(told))
     with pytest.raises(TaskCancelled):
         certified_batches(*pair, REQUEST, sizes=[2, 2], join=2, run=run)
 
 
-def test_how_many_are_joined_where_nobody_says() -> None:
+def test_how_many_are_joined_where_nobody_says(tmp_path: Path) -> None:
     assert [parse_join(text) for text in ("auto", "1", "32")] == [None, 1, 32]
     assert batches_at_once("cpu", None) == 1
     assert batches_at_once("cpu", 4) == 4
     # Of an H100 and an H200 (132 multiprocessors), of a GPU with 20, and of one whose memory is nearly full.
     assert [fitting(132, 80 << 30), fitting(20, 8 << 30), fitting(132, 1 << 30), fitting(132, 0)] == [32, 4, 4, 1]
-
-
-@pytest.mark.parametrize("text", ["0", "-1", "many", "1.5", ""])
-def test_what_is_no_number_of_batches_is_refused(text: str, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="--join takes a number of batches"):
-        synthesized("barrett", str(tmp_path / "none.stl"), REQUEST, join=text)
+    for text in ("0", "-1", "many", "1.5", ""):
+        with pytest.raises(InputError, match="--join takes a number of batches"):
+            synthesized("barrett", str(tmp_path / "none.stl"), REQUEST, join=text)

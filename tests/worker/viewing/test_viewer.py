@@ -10,7 +10,6 @@ import sys
 import urllib.request
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -84,12 +83,6 @@ def first(request) -> None:
         made.choose("all")
 
 
-def test_the_page_is_answered_on_the_loopback(viewer):
-    assert viewer.url.startswith("http://127.0.0.1:")
-    with urllib.request.urlopen(viewer.url, timeout=60) as answer:
-        assert b"<html" in answer.read().lower()
-
-
 @pytest.mark.parametrize(("place", "height", "joint"), [(0, 0.16, -0.1), (1, 0.06, 0), (2, 0.06, 0.1), (4, 0.16, 0.2)])
 def test_the_slider_moves_the_bodies_of_the_hand_where_its_kinematics_say(viewer, place, height, joint):
     viewer.slider.value = place
@@ -102,14 +95,17 @@ def test_the_slider_moves_the_bodies_of_the_hand_where_its_kinematics_say(viewer
         assert abs(node.wxyz @ bodies[body, 3:]) == pytest.approx(1, abs=1e-6)
 
 
-def test_the_object_is_carried_up_with_the_hand_and_not_before(viewer):
+def test_the_page_is_on_the_loopback_and_the_object_goes_up_with_the_hand(viewer):
+    assert viewer.url.startswith("http://127.0.0.1:")
+    with urllib.request.urlopen(viewer.url, timeout=60) as answer:
+        assert b"<html" in answer.read().lower()
     for place, height in ((0, 0.0), (3, 0.0), (3.5, LIFT_M / 2), (4, LIFT_M)):
         viewer.slider.value = place
         viewer.show()
         np.testing.assert_allclose(viewer.models.thing.position, [0, 0, height], atol=1e-9)
 
 
-def test_the_next_grasp_stands_in_its_own_scene_and_after_the_last_comes_the_first(viewer):
+def test_grasps_follow_one_another_each_in_its_own_scene(viewer) -> None:
     assert viewer.row == 0
     viewer.step(2)
     assert viewer.row == 2
@@ -117,9 +113,6 @@ def test_the_next_grasp_stands_in_its_own_scene_and_after_the_last_comes_the_fir
     viewer.step(1)
     assert viewer.row == 0
     np.testing.assert_allclose(viewer.models.rest.position, [0.05, 0, 0.03])
-
-
-def test_only_valid_grasps_are_shown_where_that_is_chosen(viewer):
     assert viewer.filters == ("valid only", "all")
     viewer.choose("valid only")
     assert viewer.row == 1
@@ -155,13 +148,16 @@ def test_a_grasp_in_a_bin_has_five_supports_around_it_and_they_can_be_hidden(vie
     assert not any(node.visible for node in nodes if node is not None)
 
 
-def test_without_viser_one_line_says_how_to_install_it(tmp_path, monkeypatch):
+def test_without_viser_or_a_shard_one_line_says_so(tmp_path, monkeypatch):
     from worker.commands.render import app
 
+    file = tmp_path / "grasps.h5"
+    file.write_text("nothing")
+    result = CliRunner().invoke(app, ["view", str(file)])
+    assert result.exit_code == 2 and "grasps.h5 is not a readable HDF5 file" in result.output
     monkeypatch.setitem(sys.modules, "viser", None)
-    result = CliRunner().invoke(app, ["view", str(tmp_path / "grasps.h5")])
-    assert result.exit_code == 2
-    assert "pip install 'graspd[view]'" in result.output
+    result = CliRunner().invoke(app, ["view", str(file)])
+    assert result.exit_code == 2 and "pip install 'graspd[view]'" in result.output
     assert len(result.output.strip().splitlines()) == 1
 
 
@@ -195,16 +191,6 @@ def test_the_command_tells_its_address_and_ends_with_ctrl_c(tmp_path):
             assert answer.status == 200
         process.send_signal(signal.SIGINT)
         assert process.wait(60) == 0
-
-
-def test_the_file_that_is_no_shard_is_one_line(tmp_path: Path):
-    from worker.commands.render import app
-
-    file = tmp_path / "grasps.h5"
-    file.write_text("nothing")
-    result = CliRunner().invoke(app, ["view", str(file)])
-    assert result.exit_code == 2
-    assert "grasps.h5 is not a readable HDF5 file" in result.output
 
 
 def test_links_above_the_root_are_drawn_at_the_angles_of_the_wrist_of_each_grasp(block) -> None:
