@@ -219,9 +219,7 @@ def test_hands_that_are_no_numbers_are_dropped_and_counted(
     factor=st.floats(1, 100),
     rates=st.lists(st.floats(0, 1), min_size=1, max_size=8),
 )
-def test_rounds_end_with_enough_grasps_or_with_the_budget_used_up(
-    wanted: int, factor: float, rates: list[float]
-) -> None:
+def test_rounds_end_with_enough_grasps_or_with_budget_used_up(wanted: int, factor: float, rates: list[float]) -> None:
     budget = int(np.ceil(wanted * factor))
     valid = tried = number = 0
     while size := next_round(wanted, valid, tried, budget):

@@ -103,9 +103,7 @@ def test_a_round_ends_as_soon_as_enough_are_found(pair, monkeypatch: pytest.Monk
     assert_same(parts, rounds)
 
 
-def test_a_lane_without_a_place_ends_blocked_where_another_has_one(
-    pair, scenes, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_lane_without_a_place_ends_blocked_where_another_has_one(pair, scenes, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = certified.synthesize
     refused: list[int] = []
 

@@ -36,7 +36,7 @@ def test_a_quiet_part_tells_nothing_and_can_still_be_stopped() -> None:
         run.check("the work")
 
 
-def test_without_a_number_of_threads_it_takes_the_cores_there_are() -> None:
+def test_without_number_of_threads_it_takes_the_cores_there_are() -> None:
     assert (Run().cores, Run(threads=3).cores) == (available_cores(), 3)
 
 

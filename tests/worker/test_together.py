@@ -41,9 +41,7 @@ def assert_same(batches, others) -> None:
         same_batch(one, other)
 
 
-def test_joined_batches_of_a_job_are_the_same_from_plan_to_verdict(
-    pair, alone, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_joined_batches_of_job_are_the_same_from_plan_to_verdict(pair, alone, monkeypatch: pytest.MonkeyPatch) -> None:
     launches: list[Meeting] = []
 
     class Noted(Meeting):
@@ -61,7 +59,7 @@ def test_joined_batches_of_a_job_are_the_same_from_plan_to_verdict(
     assert all(done <= total for done, total in told)
 
 
-def test_batches_that_other_processes_judge_and_measure_are_the_same(pair, alone) -> None:
+def test_batches_that_other_processes_judge_and_measure_are_same(pair, alone) -> None:
     told: list[tuple[float, float]] = []
     with Pool(2, MODULES) as pool:
         run = Run(threads=2, pool=pool, progress=lambda done, total, message: told.append((done, total)))
@@ -70,7 +68,7 @@ def test_batches_that_other_processes_judge_and_measure_are_the_same(pair, alone
     assert told[-1] == (6, 6)
 
 
-def test_grasps_alike_in_two_batches_are_replaced_by_those_of_another(pair) -> None:
+def test_grasps_alike_in_two_batches_are_replaced_by_others(pair) -> None:
     request = REQUEST.model_copy(update={"referee": "none"})
     first, third = (certified_batches(*pair, request, sizes=[size], run=Run(threads=2))[0] for size in (2, 3))
     asked: list[tuple[int, int]] = []

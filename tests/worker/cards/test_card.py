@@ -162,7 +162,7 @@ def test_a_dataset_without_scenes_has_a_card(tmp_path: Path) -> None:
     assert found.card["composition"]["pictures"] == 0
 
 
-def test_the_card_of_a_dataset_in_scenes_says_where_its_grasps_are_valid(tmp_path: Path) -> None:
+def test_the_card_of_a_dataset_says_where_its_grasps_are_valid(tmp_path: Path) -> None:
     made = case(tmp_path, drawn=False, scene="bin", neighbours=("mug",), views=0)
     try:
         assert (made.card["making"]["scenes"], made.card["making"]["neighbours"]) == (["bin"], ["mug"])
@@ -311,7 +311,7 @@ def test_only_valid_grasps_count(tmp_path: Path) -> None:
     assert found.card["table"]["grasps"] == 80 and found.card["directions"]["by_hand"]["allegro"]["grasps"] == 40
 
 
-def test_audits_that_overturn_a_verdict_are_told_with_an_interval(tmp_path: Path) -> None:
+def test_audits_that_overturn_verdict_are_told_with_an_interval(tmp_path: Path) -> None:
     def drop(hand: str, obj: str, columns: dict[str, Array]) -> None:
         if (hand, obj) == ("barrett", "mug") and "quality/audit" in columns:
             columns["quality/audit"][:2] = 0
@@ -391,7 +391,7 @@ def test_grasps_that_repeat_are_counted(tmp_path: Path) -> None:
     assert found.card["repeated"] == 8 and "**8 valid grasps equal another**" in found.page
 
 
-def test_cells_of_the_sphere_are_equal_and_one_direction_is_one_cell() -> None:
+def test_cells_of_sphere_are_equal_and_one_direction_is_one_cell() -> None:
     rng = np.random.default_rng(3)
     vectors = rng.normal(size=(48_000, 3))
     counts = cell_counts(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))

@@ -37,9 +37,7 @@ def test_a_built_in_is_accepted_with_exit_code_0(kind: str, name: str) -> None:
     assert report["verdict"] == "accept" and report["repairs"] == [] and report["message"] and report["facts"]
 
 
-def test_a_folder_of_objects_gets_a_verdict_each_and_exit_code_2_if_one_is_refused(
-    shared_data: Path, tmp_path: Path
-) -> None:
+def test_a_folder_gets_a_verdict_each_and_code_2_if_refused(shared_data: Path, tmp_path: Path) -> None:
     for source, name in (("quads_and_ngons.obj", "prism"), ("inverted_normals.stl", "mug"), ("garbage.stl", "noise")):
         folder = tmp_path / "set" / name
         folder.mkdir(parents=True)
@@ -80,7 +78,7 @@ def test_a_file_gets_its_verdict_and_exit_code(
 
 
 @pytest.mark.parametrize("kind", ["hands", "objects"])
-def test_what_is_not_there_is_refused_and_the_built_ins_are_named(kind: str) -> None:
+def test_what_is_not_there_is_refused_and_built_ins_are_named(kind: str) -> None:
     code, report = check(kind, "check", "nowhere")
     assert code == 2
     assert report["verdict"] == "refuse" and ("allegro" in report["message"]) == (kind == "hands")

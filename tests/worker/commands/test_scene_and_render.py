@@ -128,7 +128,7 @@ def in_bin(base) -> Path:
     return path
 
 
-def test_render_shows_the_supports_and_the_best_grasp_of_grasps_in_scenes(in_bin):
+def test_render_shows_the_supports_and_the_best_grasp(in_bin):
     output = in_bin.with_name("bin_views.h5")
     arguments = ["render", str(in_bin), "--views", "2", "--width", "48", "--height", "36", "--device", "cpu"]
     result = CliRunner().invoke(rendering, [*arguments, "-o", str(output)])
@@ -141,7 +141,7 @@ def test_render_shows_the_supports_and_the_best_grasp_of_grasps_in_scenes(in_bin
     assert json.loads(str(views.attributes["scene"]))["kind"] == "bin"
 
 
-def test_pictures_of_grasps_in_scenes_show_walls_and_the_whole_way(in_bin):
+def test_pictures_of_grasps_in_scenes_show_walls_and_whole_way(in_bin):
     for more, columns in ([], 1), (["--way"], 4), (["--three-sides", "--palette"], 3):
         output = in_bin.with_name("bin.png")
         arguments = ["pictures", str(in_bin), "-n", "1", "--size", "48", "--device", "cpu", "-o", str(output), *more]
@@ -212,7 +212,7 @@ def test_a_shard_of_another_kind_is_refused(base):
     assert "a scene shard is needed here" in result.output
 
 
-def test_render_writes_the_channels_cameras_and_hand_that_are_asked_for(base, scene_shard):
+def test_render_writes_the_channels_cameras_and_hand_asked_for(base, scene_shard):
     cameras, output = base.with_name("cameras.json"), base.with_name("more.h5")
     cameras.write_text(
         '{"width": 48, "height": 36, "intrinsics": {"fx": 50, "fy": 50, "cx": 24, "cy": 18},'
@@ -231,7 +231,7 @@ def test_render_writes_the_channels_cameras_and_hand_that_are_asked_for(base, sc
     assert kept.tolist() == [2, 2]
 
 
-def test_three_sides_of_a_grasp_take_fewer_rays_than_one_large_picture(base, monkeypatch):
+def test_three_sides_of_a_grasp_take_fewer_rays_than_a_picture(base, monkeypatch):
     traced = []
 
     def count(hand, obj, pose, joints, size, sides, *, samples, **options):
@@ -245,7 +245,7 @@ def test_three_sides_of_a_grasp_take_fewer_rays_than_one_large_picture(base, mon
     assert traced[1] < 0.6 * traced[0] and traced[2] == 2 * traced[0]
 
 
-def test_neighbours_travel_from_the_scene_to_the_labels_of_the_exported_pictures(base):
+def test_neighbours_travel_from_scene_to_labels_of_pictures(base):
     scene, views, folder = (base.with_name(name) for name in ("crowd.h5", "crowd_views.h5", "crowd"))
     result = CliRunner().invoke(scenes, [str(base), "--scenes", "1", "--with", "mug", "-o", str(scene)])
     assert result.exit_code == 0, result.output

@@ -62,7 +62,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path / "all"
 
 
-def test_a_subset_holds_what_the_expression_chooses_and_nothing_else(folder: Path, tmp_path: Path) -> None:
+def test_subset_holds_what_expression_chooses_and_nothing_else(folder: Path, tmp_path: Path) -> None:
     out = tmp_path / "subset"
     told = json.loads(
         run("grasps", "where", "type = precision and epsilon >= 0.2", "--from", folder, "-o", out, "--json").stdout
@@ -77,7 +77,7 @@ def test_a_subset_holds_what_the_expression_chooses_and_nothing_else(folder: Pat
     assert names <= {"base-00000.h5", "base-00001.h5"}, "what tells of the subset is no file of grasps"
 
 
-def test_a_subset_of_nothing_and_one_over_a_folder_that_is_there_are_refused(folder: Path, tmp_path: Path) -> None:
+def test_a_subset_of_nothing_or_over_a_folder_is_refused(folder: Path, tmp_path: Path) -> None:
     out = tmp_path / "none"
     nothing = run("grasps", "where", "epsilon > 1e6", "--from", folder, "-o", out)
     assert nothing.exit_code == 2 and "none of 120 grasps" in nothing.stderr and not out.exists()
@@ -100,7 +100,7 @@ def test_no_kind_is_more_frequent_than_the_median_one(folder: Path, tmp_path: Pa
         assert np.array_equal(one["grasp/hand_pose"], read_shard(other)["grasp/hand_pose"])
 
 
-def test_faces_are_told_by_what_lies_below_and_unknown_kinds_refused() -> None:
+def test_faces_are_told_by_what_lies_below() -> None:
     for by in (["beauty"], []):
         with pytest.raises(InputError, match="type, direction, face"):
             Balance(by)

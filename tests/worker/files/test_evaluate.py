@@ -70,7 +70,7 @@ def test_what_holds_is_judged_in_other_models_when_asked(tmp_path: Path) -> None
     assert "robust_share" not in evaluate(plates_case(), cache=tmp_path)
 
 
-def test_published_results_agree_where_known_and_displacement_judges_none(tmp_path: Path) -> None:
+def test_published_results_agree_where_they_are_known(tmp_path: Path) -> None:
     row = evaluate(plates_case(), protocol="displacement", cache=tmp_path)
     assert row["gsr"] is None
     assert row["sd_cm"] < 1.0
@@ -101,7 +101,7 @@ def test_several_objects_are_weighed_and_seconds_add_up(tmp_path: Path) -> None:
     assert whole["level"] == "certificate"
 
 
-def test_published_grasps_are_read_with_their_results_from_a_folder(shared_data: Path) -> None:
+def test_published_grasps_are_read_with_results_from_a_folder(shared_data: Path) -> None:
     found = expand(shared_data / "reference_grasps")
     assert len(found) == 8
     assert found[0].name == "003_cracker_box.json"
@@ -123,7 +123,7 @@ def test_what_holds_no_grasps_is_refused_by_its_name(tmp_path: Path) -> None:
         load_case(other)
 
 
-def test_published_contacts_lie_on_the_fingertips_as_we_pose_them(shared_data: Path) -> None:
+def test_published_contacts_lie_on_fingertips_as_we_pose_them(shared_data: Path) -> None:
     file = shared_data / "reference_grasps" / "frogger_allegro" / "056_tennis_ball.json"
     case = load_case(file)
     stored = json.loads(file.read_text())["grasps"]
@@ -155,7 +155,7 @@ def known_pair(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("known_pair")
-def test_dexgraspbench_folders_round_trip_with_their_hand_and_object(tmp_path: Path) -> None:
+def test_dexgraspbench_folders_round_trip_with_hand_and_object(tmp_path: Path) -> None:
     case = load_case(bench_folder(tmp_path / "bench"), hand="plates", obj="box")
     ours = plates_case().grasps
     assert np.allclose(case.grasps.squeeze.joint_positions, ours.squeeze.joint_positions)

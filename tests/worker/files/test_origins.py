@@ -122,7 +122,7 @@ def test_views_of_scenes_are_the_same(made: Any, tmp_path: Path, place: str) -> 
 
 
 @AWAY
-def test_a_model_stands_where_its_file_says_in_numbers_about_its_middle(boxes: dict[str, Path], place: str) -> None:
+def test_a_model_stands_where_its_file_says(boxes: dict[str, Path], place: str) -> None:
     import io
 
     scene = trimesh.load(io.BytesIO(object_glb(object_from_path(boxes[place]))), file_type="glb")

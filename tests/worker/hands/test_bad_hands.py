@@ -29,7 +29,7 @@ from worker.hands.robot import MAX_LINKS
 from worker.hands.urdf import MAX_BYTES, read_urdf
 
 
-def test_every_bad_urdf_gets_its_verdict_and_a_message_that_names_the_defect(shared_data: Path) -> None:
+def test_every_bad_urdf_gets_a_verdict_that_names_the_defect(shared_data: Path) -> None:
     entries = json.loads((shared_data / "bad" / "INDEX.json").read_text())["inputs"]
     urdfs = [entry for entry in entries if entry["kind"].startswith("urdf")]
     assert len(urdfs) >= 20
@@ -49,7 +49,7 @@ def test_an_external_entity_reads_no_file(tmp_path: Path) -> None:
     assert found["verdict"] == "refuse" and "hidden" not in found["message"]
 
 
-def test_a_mesh_behind_a_symbolic_link_out_of_the_folder_is_not_read(tmp_path: Path) -> None:
+def test_mesh_behind_symbolic_link_out_of_the_folder_is_not_read(tmp_path: Path) -> None:
     outside = tmp_path / "outside.stl"
     outside.write_bytes(b"secret")
     folder = tmp_path / "hand"
@@ -77,7 +77,7 @@ def test_a_joint_type_that_no_hand_has_is_refused(kind: str) -> None:
         read_urdf(chain(joint("j1", "palm", "a", kind=kind), links="a"))
 
 
-def test_a_path_that_is_neither_file_nor_built_in_is_refused_with_the_names_there_are() -> None:
+def test_a_path_of_nothing_is_refused_with_the_names_there_are() -> None:
     assert report_hand("alegro")["message"].endswith("; did you mean allegro?")
     found = report_hand("no_such_hand")
     assert found["verdict"] == "refuse" and "allegro" in found["message"]
@@ -134,7 +134,7 @@ def test_limits_of_a_follower_that_would_bind_are_told() -> None:
     assert "not used" not in report(jaws('<limit lower="-0.04" upper="0"/>'))["message"]
 
 
-def test_a_joint_whose_limits_leave_one_value_stands_still_and_is_told() -> None:
+def test_a_joint_whose_limits_leave_one_value_stands_still() -> None:
     wrist = joint("wrist", "left", "tip", limit='<limit lower="0.2" upper="0.2"/>')
     found = report(jaws().replace(b"</robot>", (link("tip") + wrist + "</robot>").encode()))
     assert found["verdict"] == "accept" and found["facts"]["dofs"] == ["jl"]
@@ -258,7 +258,7 @@ def test_what_a_model_has_beside_its_hand_does_not_matter(model: bytes, root: st
     assert found["facts"]["root"] == "palm"
 
 
-def test_models_and_their_loops_are_passed_over_told_or_coupled_once() -> None:
+def test_models_and_loops_are_passed_over_told_or_coupled() -> None:
     found = check_hand({"h.xml": mjcf_claw('euler="10 20 30">', 'euler="10 20 30"><freejoint/>')}, "h")
     assert "'mount' is free to float, and taken as fixed" in found["facts"]["notes"]
     again = '<equality><joint joint1="left_spread" joint2="right_curl" polycoef="0.2 -2 0 0 0"/>'

@@ -85,7 +85,7 @@ def test_what_is_stated_of_one_joint_counts_for_it_alone() -> None:
     assert stated == {**closing_of(hand_of(text)), "thumb_bend": -1}
 
 
-def test_a_finger_that_no_joint_closes_is_told_and_the_closing_is_in_the_json(tmp_path: Path) -> None:
+def test_a_finger_that_no_joint_closes_is_told(tmp_path: Path) -> None:
     text = urdf(*opposing_thumb(limit(-0.2, 1.5)))
     closed = check_hand({"r.urdf": text}, "r", {"approach": [0, 1, 0]})
     assert "no joint closes" not in closed["message"]
@@ -134,7 +134,7 @@ def apart(hand: HandModel, share: float) -> float:
     return float(np.ptp(poses[1:, :3] + ends, axis=0).max())
 
 
-def test_fingers_that_meet_at_zero_close_towards_it_unless_stated() -> None:
+def test_fingers_that_meet_at_zero_close_to_it_unless_stated() -> None:
     hand = three_fingers(1.0)
     assert hand.closing.tolist() == [-1, -1, -1]
     assert hand.preshape == pytest.approx(0.75 * hand.upper)
@@ -248,7 +248,7 @@ def test_a_turned_root_frame_turns_the_palm_with_it(degrees: float) -> None:
 
 
 @pytest.mark.parametrize("mirrored", [False, True])
-def test_two_fingers_that_oppose_one_take_hold_between_them_and_not_sideways(mirrored: bool) -> None:
+def test_two_fingers_that_oppose_one_take_hold_between_them(mirrored: bool) -> None:
     """What the tips do as such a hand closes points half to the side."""
     side = -1 if mirrored else 1
     places = ((side * 0.05, 0.0, 0.0), (-side * 0.05, 0.03, np.pi), (-side * 0.05, -0.03, np.pi))
@@ -279,12 +279,12 @@ def test_a_published_hand_in_a_turned_root_frame_faces_as_it_did() -> None:
     assert turned.closing.tolist() == as_it_is.closing.tolist()
 
 
-def test_limits_of_twice_as_far_one_way_close_whatever_their_last_digit_is() -> None:
+def test_limits_twice_as_far_one_way_close_whatever_the_digit() -> None:
     for lower in ("-0.7", "-0.7000001", "-0.6999999"):
         assert (load(claw(3, TURNS["upright"]).replace(b'"-0.4"', f'"{lower}"'.encode())).closing == 1).all()
 
 
-def test_a_tip_that_only_turns_about_itself_presses_where_the_joint_before_it_moves_it() -> None:
+def test_a_tip_that_turns_in_place_presses_by_the_joint_before() -> None:
     roll = joint("roll{0}", "b{0}", "c{0}", origin="0 0 0.045", axis="0 0 1")
     ball = (
         '<collision><origin xyz="0 0 0.01"/><geometry><cylinder radius="0.008" length="0.02"/></geometry></collision>'

@@ -77,7 +77,7 @@ def test_corrections_and_options_make_the_same_hand(
     assert set(there) >= {"root", "palm", "preshape", "closing", "fingertips", "file"}
 
 
-def test_a_corrected_approach_is_a_direction_and_leaves_the_rest_as_it_was() -> None:
+def test_a_corrected_approach_is_a_direction_and_no_more() -> None:
     hand = load_hand({"claw.urdf": CLAW}, name="claw", digest="")
     said = HandCorrections.model_validate({"palm": {"link": "palm", "approach": [0, 2, 0]}})
     there = corrected({"file": "claw.urdf", "approach": [1, 0, 0]}, facts_of(hand_glb(hand)), said)

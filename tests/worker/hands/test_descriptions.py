@@ -88,7 +88,7 @@ def test_check_add_and_use_agree_whatever_lies_beside_the_urdf(urdf: Path, descr
     assert expected[3] == ([0.95, 0.95] if noted else [1.0, 1.0])
 
 
-def test_notes_on_another_urdf_say_nothing_and_assumed_torques_are_told(urdf: Path) -> None:
+def test_notes_on_another_urdf_and_assumed_torques_are_told(urdf: Path) -> None:
     bare = facts(report_hand(str(urdf)))
     urdf.with_name("hand.json").write_text(json.dumps(NOTES | {"urdf": "other.urdf"}))
     assert facts(report_hand(str(urdf))) == facts(added(urdf)) == bare
@@ -151,7 +151,7 @@ def test_a_workspace_of_several_packages_is_one_upload(tmp_path: Path) -> None:
     assert report_hand(str(tmp_path / "src"))["verdict"] == "accept"
 
 
-def test_nothing_out_of_a_package_or_above_a_plain_folder_is_read(tmp_path: Path) -> None:
+def test_nothing_out_of_package_or_above_a_plain_folder_is_read(tmp_path: Path) -> None:
     (tmp_path / "secret.stl").write_bytes(b"secret")
     urdf = package(tmp_path / "claw_description", "../../secret.stl", manifest=True)
     assert set(files_from_path(urdf)[1]) == {"urdf/claw.urdf"}
@@ -285,7 +285,7 @@ def test_a_part_of_a_xacro_file_is_not_taken_for_the_hand(tmp_path: Path) -> Non
     assert verdicts(files, "h.xacro", tmp_path) == ["accept"] * 3
 
 
-def test_a_model_whose_meshes_are_named_in_an_included_file_is_read_by_its_name_alone(tmp_path: Path) -> None:
+def test_a_model_with_an_included_file_is_read_by_its_name_alone(tmp_path: Path) -> None:
     start, end = CLAW.index("<default>"), CLAW.index("<asset>")
     files = {
         "h.xml": b'<mujoco><compiler angle="degree" meshdir="assets"/><include file="parts/meshes.xml"/>'

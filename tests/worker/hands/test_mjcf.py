@@ -116,7 +116,7 @@ def test_an_equality_couples_joints() -> None:
     assert q["right_curl"] == pytest.approx(0.1 - 0.5 * values["left_spread"])
 
 
-def test_joints_on_a_tendon_and_servos_go_as_far_as_limits_let_them() -> None:
+def test_joints_on_tendons_and_servos_go_as_far_as_limits_let() -> None:
     hand = load(TENDON_CLAW)
     assert hand.dof_names == ("left", "right")
     q = dict(zip(hand.joint_names, hand.expand(np.array([0.6, 0.4])), strict=True))
@@ -200,7 +200,7 @@ def with_inside(text: str) -> str:
         (CLAW.replace(' range="0 0.025"', ""), "slides without a range"),
     ],
 )
-def test_a_bad_model_is_refused_in_one_line_that_names_the_defect(text: str, named: str) -> None:
+def test_bad_model_is_refused_in_one_line_that_names_the_defect(text: str, named: str) -> None:
     report = report_of(text)
     assert report["verdict"] == "refuse" and named in report["message"]
     assert "\n" not in report["message"] and len(report["message"]) < 400
@@ -242,7 +242,7 @@ def pulls(hand: HandModel) -> dict[str, dict[str, float]]:
     return {t.name: {hand.dof_names[d]: c for d, c in zip(t.dofs, t.coefficients, strict=True)} for t in hand.tendons}
 
 
-def test_joints_of_a_finger_on_one_actuated_tendon_are_free_and_share_it() -> None:
+def test_joints_on_one_actuated_tendon_are_free_and_share_it() -> None:
     hand = load()
     ((name, pulled),) = pulls(hand).items()
     assert pulled == {"left_bend": 1.0, "left_curl": 0.5}
@@ -268,7 +268,7 @@ def test_a_command_of_torques_commands_the_pull_that_exerts_them() -> None:
     assert tendon.gain(stiffness) * length[0] == pytest.approx(pull)
 
 
-def test_asset_json_puts_joints_on_a_tendon_over_a_ratio_and_takes_it_away() -> None:
+def test_asset_json_puts_joints_on_a_tendon_and_takes_it_away() -> None:
     barrett = hand_from_path("barrett")
     assert "finger_1_distal" not in barrett.dof_names
     said = {"cord": {"finger_1_medial": 1.0, "finger_1_distal": 0.3}}

@@ -51,9 +51,7 @@ def test_a_wide_hand_opposes_over_a_range_one_finger_nothing() -> None:
     assert alone.widest == 0.0
 
 
-def test_postures_that_the_machine_keeps_are_those_that_were_found(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_postures_that_machine_keeps_are_those_that_were_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     hand = hand_from_path("barrett")
     found = []
@@ -68,7 +66,7 @@ HEIGHT_M = 0.012
 
 
 @pytest.mark.parametrize("name", ["allegro", "barrett", "shadow"])
-def test_opposed_fingertips_end_on_one_plane_and_nothing_else_is_as_low(name: str) -> None:
+def test_opposed_fingertips_end_on_one_plane_and_none_is_as_low(name: str) -> None:
     hand, found = hand_from_path(name), pinches_of(hand_from_path(name), HEIGHT_M)
     assert len(found) >= 20
     assert (np.diff(found.width) >= 0).all()
@@ -99,7 +97,7 @@ def test_what_reaches_the_pads_has_no_such_postures() -> None:
 
 
 @pytest.mark.parametrize("size", ["small", "wide"])
-def test_the_hand_looks_at_the_thing_from_both_sides_and_leaves_it_room(size: Size) -> None:
+def test_hand_looks_at_thing_from_both_sides_and_leaves_it_room(size: Size) -> None:
     hand = hand_from_path("allegro")
     found, points = spans_of(hand, size), sample_surface(hand, 3000)
     assert len(found) >= 10
@@ -164,7 +162,7 @@ def pointer() -> HandModel:
     return load_hand(files, name="pointer", digest="0" * 32)
 
 
-def test_grasps_of_a_hand_without_opposing_digits_are_not_even_planned() -> None:
+def test_without_opposing_digits_grasps_are_not_even_planned() -> None:
     ball = object_from_mesh(trimesh.creation.icosphere(2, 0.02))
     with pytest.raises(HandError, match=r"pointer: no two opposing digits.*--root"):
         certified_grasps(pointer(), ball, JobOptions(want="raw", grasps=1), count=1)

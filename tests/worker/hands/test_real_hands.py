@@ -48,7 +48,7 @@ def test_forward_kinematics_agrees_with_yourdfpy(real: tuple[str, Path, HandMode
             np.testing.assert_allclose(poses[body], expected, atol=FRAME_TOLERANCE, err_msg=link)
 
 
-def test_every_real_hand_has_a_surface_a_palm_and_closes_to_a_point(real: tuple[str, Path, HandModel]) -> None:
+def test_every_real_hand_has_surface_palm_and_closes_to_a_point(real: tuple[str, Path, HandModel]) -> None:
     _, _, hand = real
     assert np.linalg.norm(hand.palm.approach) == pytest.approx(1.0)
     assert (hand.lower < hand.upper).all() and (hand.effort > 0).all() and (hand.masses > 0).all()
@@ -184,7 +184,7 @@ def test_barrett_with_couplings_is_the_same_hand_as_bh280(shared_data: Path) -> 
         assert np.linalg.norm(a - b) < 0.5e-3
 
 
-def test_shadows_meshes_of_two_units_are_closed_hulls_and_efforts_stay(shared_data: Path) -> None:
+def test_shadows_meshes_of_two_units_are_closed_hulls(shared_data: Path) -> None:
     hand = load(shared_data, "shadow")
     extents = {p.link: float(np.ptp(p.vertices, axis=0).max()) for p in hand.pieces if p.kind == "hull"}
     # The knuckle is in metres, the distal link in millimetres with a scale: 16 mm and 27 mm parts.
@@ -222,7 +222,7 @@ def test_shadows_arm_is_left_out_told_or_kept(shared_data: Path) -> None:
     assert hand.dofs == 22 and hand.root_link == "world"
 
 
-def test_on_its_forearm_a_palm_faces_where_its_fingers_close_and_the_wrist_closes_nothing(shared_data: Path) -> None:
+def test_on_its_forearm_a_palm_faces_where_its_fingers_close(shared_data: Path) -> None:
     hand = hand_from_path(shared_data / "hands/shadow/shadow_hand_right.urdf", {"root": "world"})
     # Noted in the frame of the palm link, (0, -1, 0); the forearm turns that by a quarter about z.
     np.testing.assert_allclose(hand.palm.approach, [1, 0, 0], atol=1e-4)

@@ -61,7 +61,7 @@ def test_a_humanoid_is_told_its_hands() -> None:
     assert report(humanoid("left", "right"), root="right_hand_palm")["verdict"] == "accept"
 
 
-def test_the_one_hand_of_a_robot_begins_behind_its_arm_which_is_kept() -> None:
+def test_one_hand_of_a_robot_begins_behind_its_arm_which_is_kept() -> None:
     hand = load_hand({"r.urdf": humanoid("right")}, name="r", digest="0" * 32)
     assert hand.root_link == "right_hand_palm" and hand.dofs == 2
     assert [j.name for j in hand.arm] == ["right_arm0_joint", "right_arm1_joint", "right_hand_palm_mount"]
@@ -81,7 +81,7 @@ def test_a_robot_without_a_hand_is_refused_with_the_mend(hands: tuple[str, ...])
         load_hand({"r.urdf": urdf}, name="r", digest="0" * 32)
 
 
-def test_fingers_without_shapes_are_named_foreign_prefixes_passed_over() -> None:
+def test_fingers_without_shapes_are_named_prefixes_passed_over() -> None:
     parts = [link("palm", BOX.format(0.08, 0.04, 0.02)), link("a", ""), link("b", "")]
     parts += [joint("ja", "palm", "a"), joint("jb", "palm", "b")]
     assert "a, b have no collision shapes" in report(robot(*parts))["message"]
@@ -143,7 +143,7 @@ def _q(hand: HandModel, **values: float) -> np.ndarray:
     return np.array([values.get(name, 0.0) for name in hand.dof_names])
 
 
-def test_joints_that_turn_as_an_arms_or_stand_far_off_are_no_wrist() -> None:
+def test_joints_that_turn_as_arms_or_stand_far_off_are_no_wrist() -> None:
     assert links_of(load(with_wrist(yaw=limits(-2.9, 2.9)))) == {"wrist"}
     mounting = load(humanoid("right")).mounting
     assert mounting is not None and {piece.link for piece in mounting.pieces} == {"right_arm1"}
@@ -164,7 +164,7 @@ def test_a_stated_angle_holds_a_wrist_and_a_dropped_link_ends_it() -> None:
     assert links_of(load(with_wrist(), root="hub", drop=["forearm"])) == {"wrist"}
 
 
-def test_what_is_wrong_with_shapes_above_a_hand_is_told_and_does_not_refuse_it() -> None:
+def test_bad_shapes_above_a_hand_are_told_and_do_not_refuse_it() -> None:
     lost = with_wrist(forearm='<collision><geometry><mesh filename="lost.stl"/></geometry></collision>')
     hand = load(lost)
     assert hand.mounting is None and hand.dofs == 2

@@ -29,7 +29,7 @@ TESSELLATION = 0.03
 
 
 @pytest.mark.parametrize("kind", sorted(SIZES))
-def test_a_tessellation_is_closed_outward_and_inside_the_true_solid(kind: str) -> None:
+def test_tessellation_is_closed_outward_and_inside_true_solid(kind: str) -> None:
     vertices, faces = primitives.tessellate(kind, SIZES[kind])
     volume = primitives.volume("hull", (), vertices, faces)
     true = primitives.volume(kind, SIZES[kind], vertices, faces)
@@ -38,7 +38,7 @@ def test_a_tessellation_is_closed_outward_and_inside_the_true_solid(kind: str) -
 
 
 @pytest.mark.parametrize("kind", sorted(SIZES))
-def test_samples_lie_on_the_surface_and_their_normals_are_its_gradient(kind: str) -> None:
+def test_samples_lie_on_the_surface_with_its_normals(kind: str) -> None:
     vertices, faces = primitives.tessellate(kind, SIZES[kind])
     points, normals = primitives.sample(kind, SIZES[kind], vertices, faces, 500, np.random.default_rng(0))
     distance = [
@@ -122,7 +122,7 @@ def hand_with_mesh(scale: str, size: float) -> dict[str, bytes]:
     return {"h.urdf": urdf, "m.stl": stl_bytes(vertices, faces.astype(np.int64))}
 
 
-def test_the_scale_of_millimetres_is_used_and_asked_for_where_missing() -> None:
+def test_millimetres_are_scaled_and_asked_for_where_missing() -> None:
     hand = load_hand(hand_with_mesh(' scale="0.001 0.001 0.001"', 20.0), name="h", digest="0" * 32)
     np.testing.assert_allclose(np.ptp(hand.pieces[-1].vertices, axis=0), 0.02, rtol=1e-6)
     with pytest.raises(HandError, match=r"0\.001"):
@@ -286,7 +286,7 @@ def test_a_thin_plate_has_exactly_the_count_on_both_sides(count: int) -> None:
     assert count < 400 or 0.8 < top / bottom < 1.25
 
 
-def test_the_same_seed_gives_the_same_points_and_another_seed_others() -> None:
+def test_same_seed_gives_the_same_points_and_another_seed_others() -> None:
     first, other = hand_from_path("allegro"), hand_from_path("allegro")
     a = sample_surface(first, 500, seed=3)
     surface._samples.clear()
@@ -297,7 +297,7 @@ def test_the_same_seed_gives_the_same_points_and_another_seed_others() -> None:
     assert not np.array_equal(a.position, sample_surface(first, 500, seed=4).position)
 
 
-def test_a_surface_is_sampled_once_however_the_hand_is_said_to_close_and_anew_in_another_pre_shape() -> None:
+def test_a_surface_is_sampled_once_and_anew_in_another_pre_shape() -> None:
     hand = hand_from_path("allegro")
     points = sample_surface(hand, 300)
     assert sample_surface(replace(hand, closing=-hand.closing), 300) is points

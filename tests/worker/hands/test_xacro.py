@@ -155,7 +155,7 @@ def test_an_expansion_that_the_machine_ended_refuses_no_hand(code: str, monkeypa
         "import_module('ctypes')",
     ],
 )
-def test_code_that_climbs_out_of_an_expression_finds_the_doors_closed(attempt: str) -> None:
+def test_code_that_climbs_out_of_expression_finds_doors_closed(attempt: str) -> None:
     code = (
         "import os, socket; from importlib import import_module; from worker.hands import xacro_child as child;"
         f"child._close_doors(5, 2**30)\ntry:\n    {attempt}\nexcept BaseException as error:\n"

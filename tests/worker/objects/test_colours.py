@@ -153,7 +153,7 @@ def colours(files: dict[str, bytes], mesh: str = "m/part.obj") -> dict[object, i
     return {mesh.colour: len(mesh.faces) for mesh in hand.visuals.meshes}
 
 
-def test_an_obj_has_the_colours_of_its_library_and_the_mean_of_its_picture() -> None:
+def test_obj_has_colours_of_its_library_and_mean_of_its_picture() -> None:
     files = {"m/part.obj": OBJ, "m/looks/part.mtl": MTL, "m/looks/skin.png": picture()}
     assert colours(files) == {GREEN: 2, RED: 1, None: 2}
     # Where the picture is missing or no picture, the number counts.
@@ -202,7 +202,7 @@ def test_names_lead_nowhere_else(reference: str) -> None:
     assert beside("m/part.obj", reference, there.__contains__) is None
 
 
-def test_a_hand_brings_the_looks_that_its_meshes_name_and_nothing_from_outside(tmp_path: Path) -> None:
+def test_a_hand_brings_looks_its_meshes_name_none_from_outside(tmp_path: Path) -> None:
     folder = tmp_path / "hand"
     (folder / "m" / "looks").mkdir(parents=True)
     outside = b"newmtl other\nmap_Kd ../../secret.png\n"

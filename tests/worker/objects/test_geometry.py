@@ -30,7 +30,7 @@ from worker.objects.prepare import from_bytes, load_object, object_from_path, si
 from worker.objects.topology import components, is_closed
 
 
-def test_mass_properties_are_exact_anywhere_and_turn_with_the_body() -> None:
+def test_mass_properties_are_exact_anywhere_and_turn_with_body() -> None:
     x, y, z = 0.06, 0.05, 0.04
     at = np.array([3.0, -2.0, 1.0])
     vertices, faces = box(x, y, z, at=tuple(at))
@@ -49,7 +49,7 @@ def test_mass_properties_are_exact_anywhere_and_turn_with_the_body() -> None:
     np.testing.assert_allclose(mass.inertia, 0.4 * 0.04**2 * np.eye(3), rtol=2e-3, atol=1e-9)
 
 
-def test_corner_normals_of_boxes_and_spheres_are_those_of_their_shape() -> None:
+def test_corner_normals_of_boxes_and_spheres_are_of_their_shape() -> None:
     vertices, faces = box()
     normals = corner_normals(vertices, faces.astype(np.int32))
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
@@ -62,7 +62,7 @@ def test_corner_normals_of_boxes_and_spheres_are_those_of_their_shape() -> None:
     assert np.einsum("ijk,ijk->ij", normals, exact).min() > np.cos(np.deg2rad(2))
 
 
-def test_corner_normals_of_a_cylinder_are_radial_on_the_wall_and_flat_on_the_lids() -> None:
+def test_corner_normals_of_a_cylinder_are_radial_on_the_wall() -> None:
     vertices, faces = cylinder()
     normals = corner_normals(vertices, faces.astype(np.int32))
     corners = vertices[faces]
@@ -95,7 +95,7 @@ def test_mesh_distance_equals_the_minimum_over_all_triangles(shared_data: Path) 
     np.testing.assert_allclose(MeshDistance(model.vertices, faces)(points), brute, atol=1e-12)
 
 
-def test_deviation_of_two_concentric_spheres_is_the_difference_of_their_radii() -> None:
+def test_deviation_of_concentric_spheres_is_that_of_radii() -> None:
     # Chords of 128 segments lie up to r (pi / 128)^2 / 2 = 0.012 mm inside.
     assert deviation(sphere(0.04, 128), sphere(0.041, 128)) == pytest.approx(1e-3, abs=3e-5)
 
@@ -113,7 +113,7 @@ def test_simplification_keeps_its_bound_and_the_mesh_closed(name: str, error: fl
     assert model.deviation_m <= error
 
 
-def test_simplification_is_monotone_exact_at_zero_and_keen_on_flats() -> None:
+def test_simplification_is_monotone_and_exact_at_zero() -> None:
     counts = [len(object_from_path("bottle", error).faces) for error in (1e-4, 3e-4, 1e-3)]
     assert counts == sorted(counts, reverse=True)
     vertices, faces = sphere(segments=128)
@@ -169,7 +169,7 @@ def test_a_box_has_the_same_bits_wherever_its_origin_lies(place: tuple[float, ..
     np.testing.assert_allclose(there.vertices, here.vertices + place, atol=3e-9)
 
 
-def test_what_lies_about_its_origin_or_belongs_to_no_face_moves_nothing() -> None:
+def test_what_belongs_to_no_face_moves_nothing() -> None:
     there, here = (loaded("b.stl", stl_of(box_at(at))) for at in (FAR, (0.0, 0.0, 0.0)))
     assert there.centred.content == here.centred.content
     assert set(np.abs(loaded("b.obj", obj_of(box_at((0, 0, 0)))).vertices).ravel()) == {0.03, 0.025, 0.05}
@@ -182,7 +182,7 @@ def test_a_scaled_mesh_too(place: tuple[float, ...]) -> None:
     assert there.centred.content == here.centred.content
 
 
-def test_coordinates_of_a_scan_move_by_no_more_than_a_hundred_millionth_of_its_size() -> None:
+def test_coordinates_of_a_scan_move_by_1e_8_of_its_size_at_most() -> None:
     points = np.random.default_rng(0).uniform(-0.1, 0.1, (2000, 3)).astype(np.float32).astype(float)
     found = centred(points)
     np.testing.assert_allclose(found.points + found.centre, points, atol=2e-9)
@@ -195,7 +195,7 @@ def test_a_prepared_object_is_kept_with_its_place() -> None:
 
 
 @PLACES
-def test_poses_come_back_from_the_frame_of_the_file_with_the_same_bits(place: tuple[float, ...]) -> None:
+def test_poses_come_back_from_frame_of_file_with_the_same_bits(place: tuple[float, ...]) -> None:
     rng = np.random.default_rng(0)
     pose = np.hstack([rng.uniform(-0.3, 0.3, (200, 3)), rng.normal(size=(200, 4))])
     pose[:, 3:] /= np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)
@@ -225,7 +225,7 @@ def refused(data: bytes) -> str:
     [(refused, UTM), (lambda data: str(check_object({"b.stl": data}, "box")["message"]), (3000.0, 0.0, 0.0))],
     ids=["refused", "a note"],
 )
-def test_a_file_whose_numbers_do_not_tell_its_points_apart_is_told(
+def test_file_whose_numbers_do_not_tell_its_points_apart_is_told(
     tell: Callable[[bytes], str], place: tuple[float, ...]
 ) -> None:
     told = tell(stl_of(box_at(place)))
@@ -280,7 +280,7 @@ def flask() -> trimesh.Trimesh:
     return trimesh.creation.revolve(outline, sections=24)
 
 
-def test_copies_that_are_turned_mirrored_scaled_or_meshed_anew_are_of_one_family(flask: trimesh.Trimesh) -> None:
+def test_copies_turned_scaled_or_meshed_anew_are_of_one_family(flask: trimesh.Trimesh) -> None:
     turned = flask.copy().apply_transform(trimesh.transformations.rotation_matrix(1.1, [1, 2, 3], [0.1, 0, 0]))
     finer, larger = flask.subdivide(), flask.copy().apply_scale(1.4)
     others = {

@@ -51,7 +51,7 @@ def test_what_was_made_is_read_bit_for_bit(own_cache: Path) -> None:
     assert [file.suffix for file in (own_cache / "things").iterdir()] == [".npz"]
 
 
-def test_entries_differ_with_terms_and_code_and_damaged_ones_are_remade(own_cache: Path) -> None:
+def test_entries_differ_with_terms_and_code_bad_ones_are_remade(own_cache: Path) -> None:
     arrays_kept_or_made("things", ("x", 1), (disk_cache,), lambda: made(1))
     assert arrays_kept_or_made("things", ("x", 2), (disk_cache,), lambda: made(2))["a"][0, 0] == 2
     assert arrays_kept_or_made("things", ("x", 1), (surface,), lambda: made(3))["a"][0, 0] == 3
@@ -60,7 +60,7 @@ def test_entries_differ_with_terms_and_code_and_damaged_ones_are_remade(own_cach
     assert arrays_kept_or_made("things", ("x", 1), (disk_cache,), lambda: made(4))["a"][0, 0] == 4
 
 
-def test_samples_of_hand_and_object_are_those_of_a_process_without_a_cache() -> None:
+def test_samples_are_those_of_a_process_without_a_cache() -> None:
     hand = two_finger_hand()
     ball = load_object(stl(sphere(segments=24)), name="ball", digest="", face_error_m=0.0)
     for _ in range(2):
@@ -70,7 +70,7 @@ def test_samples_of_hand_and_object_are_those_of_a_process_without_a_cache() -> 
         assert np.array_equal(sampling.object_samples(ball, 90, seed=1), sampling._sampled(ball, 90, 1))
 
 
-def test_small_steps_are_kept_together_and_each_follows_from_what_it_was_given(own_cache: Path) -> None:
+def test_small_steps_are_kept_together_each_by_what_it_is_given(own_cache: Path) -> None:
     def halves(array: np.ndarray) -> np.ndarray:
         return recalled("half", [array], lambda: [array / 2])["0"]
 

@@ -29,7 +29,7 @@ def check(mesh: Mesh, **options: Any) -> dict[str, Any]:
     return check_object(stl(mesh), "m", face_error_m=0.0, **options)
 
 
-def test_every_bad_mesh_gets_its_verdict_and_a_message_that_names_the_defect(shared_data: Path) -> None:
+def test_every_bad_mesh_gets_a_verdict_that_names_the_defect(shared_data: Path) -> None:
     entries = json.loads((shared_data / "bad" / "INDEX.json").read_text())["inputs"]
     meshes = [entry for entry in entries if entry["kind"].startswith("mesh")]
     assert len(meshes) >= 20
@@ -191,7 +191,7 @@ def test_a_sound_surface_passes_through_itself_nowhere(mesh: Mesh) -> None:
     assert found is not None and not len(found)
 
 
-def test_crossings_are_faces_that_pass_through_and_not_that_touch() -> None:
+def test_crossings_are_faces_that_pass_through_not_that_touch() -> None:
     large, small = box(0.06, 0.06, 0.06), box(0.02, 0.02, 0.02, at=(0.03, 0.002, 0.001))
     found = crossings(*join(large, small))
     assert found is not None and len(found)
@@ -249,7 +249,7 @@ def test_eight_cubes_of_a_block_are_one_cube() -> None:
     assert report["verdict"] == "repair" and report["facts"]["volume_m3"] == pytest.approx(0.06**3)
 
 
-def test_parts_within_a_millimetre_are_one_body_apart_they_are_a_choice() -> None:
+def test_parts_within_a_millimetre_are_one_body() -> None:
     assert check_parts(boxes(0.001))["verdict"] == "accept"
     report = check_parts(boxes(0.0009))
     assert (

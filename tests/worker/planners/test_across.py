@@ -91,7 +91,7 @@ def test_what_a_hand_cannot_span_or_reach_is_told(block, barrett) -> None:
     assert not len(opening.sums)
 
 
-def test_hands_reach_across_what_lies_flat_with_the_ends_of_their_fingertips_from_above(barrett) -> None:
+def test_hands_reach_across_what_lies_flat_from_above(barrett) -> None:
     flat = object_from_mesh(trimesh.creation.box([0.06, 0.06, 0.01]))
     scene, standing = lying(flat), Surroundings((Obstacle.half_space([1.0, 0, 0], -0.03),), np.array([1.0, 0, 0]))
     opening = Openings.in_scene(barrett, flat, scene)
@@ -103,7 +103,7 @@ def test_hands_reach_across_what_lies_flat_with_the_ends_of_their_fingertips_fro
     assert (found.away @ UP).min() > 0.6
 
 
-def test_hands_hold_the_middle_between_their_fingers_and_come_from_a_free_way(block, barrett) -> None:
+def test_hands_hold_the_middle_and_come_from_a_free_way(block, barrett) -> None:
     rng = np.random.default_rng(0)
     opening, known = Openings.of(oppositions_of(barrett), block, lying(block)), oppositions_of(barrett)
     uniform = rng.random((40, 6))
@@ -121,7 +121,7 @@ def test_hands_hold_the_middle_between_their_fingers_and_come_from_a_free_way(bl
     assert (found.away[level, 2] > 0.3).all()
 
 
-def test_a_hand_around_an_edge_is_hindered_and_one_before_it_is_not(block, barrett) -> None:
+def test_hand_around_edge_is_hindered_and_one_before_it_is_not(block, barrett) -> None:
     pair = pair_of(barrett, block, resolve_fidelity("draft"), "cpu")
     solids = DeviceObstacles.create(barrett, [lying(block)], block.centre_of_mass, "cpu")
     model = pair.model(pair.coarse, solids)
@@ -153,7 +153,7 @@ def test_a_hand_below_a_board_is_hindered_where_it_cannot_rise(block, barrett, r
     assert (hindrance(model, state, placed)[0] > 0.1) == hindered
 
 
-def test_how_far_a_pair_is_beside_the_pads_of_a_hand_that_was_moved(block, barrett) -> None:
+def test_how_far_pair_is_beside_pads_of_a_hand_that_was_moved(block, barrett) -> None:
     opening = Openings.of(oppositions_of(barrett), block, lying(block))
     uniform, ways = np.random.default_rng(0).random((30, 6)), np.array([[0.0, 0, 1]])
     found = across(barrett, block, opening, uniform, ways)
@@ -206,7 +206,7 @@ def test_draws_that_need_not_rise_come_first_in_their_order(block, barrett) -> N
     assert np.array_equal(few[0], order[3, :7]) and np.array_equal(least[0], off[3, :7])
 
 
-def test_what_lies_flat_on_a_table_is_between_the_fingers_of_hands_that_set_out(block, barrett) -> None:
+def test_what_lies_flat_is_between_the_fingers_at_the_start(block, barrett) -> None:
     scale = np.array([1.0, 0.6, 0.4])
     thin = replace(block, vertices=block.vertices * scale, centre_of_mass=block.centre_of_mass * scale, digest="7" * 64)
     thin = replace(thin, hull_vertices=block.hull_vertices * scale)

@@ -124,7 +124,7 @@ def scene():
     )
 
 
-def test_a_trial_keeps_what_holds_and_finds_more_whatever_the_threads(scene) -> None:
+def test_trial_keeps_what_holds_and_finds_more_whatever_threads(scene) -> None:
     hand, obj, placed = scene
     wanted = Wanted(4, QUICK, seed=4, placed=placed)
     plain = synthesize(hand, obj, wanted, Run(threads=1))
@@ -152,9 +152,7 @@ def attempts(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 
 @pytest.mark.parametrize(("score", "made"), [(0.5, 1), (1.5, 2), (9.0, 6)])
-def test_in_scenes_a_grasp_sets_out_again_while_it_fails_and_once_if_it_lifts_barely(
-    scene, attempts: list[int], score: float, made: int
-) -> None:
+def test_in_scenes_a_grasp_sets_out_again_while_it_fails(scene, attempts: list[int], score: float, made: int) -> None:
     hand, obj, placed = scene
     wanted = Wanted(4, QUICK, seed=4, placed=placed, trial=lambda grasps, *_: np.full(len(grasps), score))
     found = synthesize(hand, obj, wanted, Run(threads=1))
@@ -163,7 +161,7 @@ def test_in_scenes_a_grasp_sets_out_again_while_it_fails_and_once_if_it_lifts_ba
 
 
 @pytest.mark.parametrize(("better", "times"), [(True, GENTLER), (False, 1.0)])
-def test_a_hand_that_nearly_lifts_squeezes_gently_where_that_helps(scene, better: bool, times: float) -> None:
+def test_hand_that_nearly_lifts_squeezes_gently_where_that_helps(scene, better: bool, times: float) -> None:
     hand, obj, placed = scene
 
     def squeezed(grasps: GraspSet, times: float) -> np.ndarray:
@@ -190,9 +188,7 @@ def free():
     return free_case("barrett")
 
 
-def test_of_a_grasps_hands_the_one_that_lies_around_more_of_a_free_object_is_tried_first(
-    free, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_hand_around_more_of_an_object_is_tried_first(free, monkeypatch: pytest.MonkeyPatch) -> None:
     """Where nearness outweighs the balance."""
     hand, obj, wanted, trial = free
     shares, orders = [], []
@@ -216,7 +212,7 @@ def test_of_a_grasps_hands_the_one_that_lies_around_more_of_a_free_object_is_tri
     assert (in_order[:, 0] > in_order[:, 1]).any() and (orders[0][:, 0] > orders[0][:, 1]).any()
 
 
-def test_free_grasps_that_fail_their_trial_set_out_again_and_more_of_them_hold() -> None:
+def test_free_grasps_that_fail_set_out_again_and_more_hold() -> None:
     """Slender fingers: 3, 4 and 8 of 12 hold without a trial with three seeds; with one 7, 8 and 9."""
     hand, obj, wanted, trial = free_case("shadow")
     plain = synthesize(hand, obj, wanted, Run(threads=1))
@@ -225,7 +221,7 @@ def test_free_grasps_that_fail_their_trial_set_out_again_and_more_of_them_hold()
     assert after.sum() > before.sum()
 
 
-def test_what_a_trial_chooses_of_a_free_grasp_depends_on_no_other_grasp_and_no_thread(free) -> None:
+def test_what_a_trial_chooses_depends_on_no_other_grasp(free) -> None:
     hand, obj, wanted, trial = free
     one = synthesize(hand, obj, replace(wanted, trial=trial), Run(threads=1))
     threads = synthesize(hand, obj, replace(wanted, trial=trial), Run(threads=3))
@@ -234,9 +230,7 @@ def test_what_a_trial_chooses_of_a_free_grasp_depends_on_no_other_grasp_and_no_t
     assert np.array_equal(one.grasp.hand_pose[:2], fewer.grasp.hand_pose)
 
 
-def test_a_grasp_that_nobody_holds_sets_out_as_often_as_it_may_and_the_least_bad_hand_stays(
-    free, attempts: list[int]
-) -> None:
+def test_a_grasp_nobody_holds_sets_out_as_often_as_it_may(free, attempts: list[int]) -> None:
     hand, obj, wanted, _ = free
     scores: list[float] = []
 
@@ -253,7 +247,7 @@ def test_a_grasp_that_nobody_holds_sets_out_as_often_as_it_may_and_the_least_bad
 
 
 @pytest.mark.parametrize(("score", "made"), [(0.5, 1 + CLOSER), (1.5, 1 + CLOSER), (2.5, 1 + ATTEMPTS)])
-def test_a_free_grasp_whose_finger_stands_off_sets_out_again_a_few_times(
+def test_a_grasp_whose_finger_stands_off_sets_out_again(
     free, attempts: list[int], monkeypatch: pytest.MonkeyPatch, score: float, made: int
 ) -> None:
     hand, obj, wanted, _ = free
@@ -263,7 +257,7 @@ def test_a_free_grasp_whose_finger_stands_off_sets_out_again_a_few_times(
     assert attempts == list(range(made))
 
 
-def test_of_free_grasps_that_hold_one_is_chosen_whose_fingers_touch(free, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_of_grasps_that_hold_one_whose_fingers_touch_is_chosen(free, monkeypatch: pytest.MonkeyPatch) -> None:
     hand, obj, wanted, _ = free
     seen: list[bool] = []
 
@@ -281,9 +275,7 @@ def test_of_free_grasps_that_hold_one_is_chosen_whose_fingers_touch(free, monkey
     assert (synthesize(hand, obj, one, Run(threads=1)).grasp.hand_pose != first.grasp.hand_pose).any()
 
 
-def test_hands_are_drawn_to_a_free_object_when_they_first_set_out_and_not_again(
-    free, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_hands_are_drawn_to_an_object_at_their_first_start_alone(free, monkeypatch: pytest.MonkeyPatch) -> None:
     hand, obj, wanted, _ = free
     pulls: list[tuple[float, float]] = []
     work = planner._work
@@ -301,7 +293,7 @@ def test_hands_are_drawn_to_a_free_object_when_they_first_set_out_and_not_again(
     assert set(pulls[1:]) == {(0.0, 0.0)}
 
 
-def test_attempts_made_ahead_give_the_grasps_of_one_after_the_other(free, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_attempts_made_ahead_give_grasps_of_one_after_the_other(free, monkeypatch: pytest.MonkeyPatch) -> None:
     hand, obj, wanted, _ = free
 
     def picky(grasps: GraspSet, placed: Placed | None, _: object = None) -> np.ndarray:

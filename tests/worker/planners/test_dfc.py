@@ -94,7 +94,7 @@ def probed(iteration: np.ndarray, rise: np.ndarray, uniform: np.ndarray) -> tupl
     return tuple(array.numpy() for array in found)
 
 
-def test_steps_and_temperature_decay_by_a_twentieth_every_50_and_30_iterations() -> None:
+def test_steps_and_temperature_decay_every_50_and_30_iterations() -> None:
     np.testing.assert_allclose(step_size(np.array([0, 49, 50, 5999])), [5e-3, 5e-3, 4.75e-3, 5e-3 * 0.95**119])
     np.testing.assert_allclose(temperature(np.array([0, 29, 30, 5999])), [18, 18, 17.1, 18 * 0.95**199])
     iteration = np.array([0, 49, 50, 3000, 5999])
@@ -103,7 +103,7 @@ def test_steps_and_temperature_decay_by_a_twentieth_every_50_and_30_iterations()
     np.testing.assert_allclose(cold, temperature(iteration), rtol=1e-4)
 
 
-def test_a_fall_is_always_accepted_and_a_rise_with_its_boltzmann_factor() -> None:
+def test_a_fall_is_accepted_and_a_rise_with_its_boltzmann_factor() -> None:
     """20,000 draws at a rise of T: a share of 1/e, standard error 0.3 points."""
     n = 20_000
     uniform = np.random.default_rng(5).random(n)

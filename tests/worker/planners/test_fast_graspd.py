@@ -52,7 +52,7 @@ def test_the_seed_and_batch_alone_decide_a_grasp_bit_for_bit() -> None:
     assert not np.allclose(a.grasp.hand_pose, grasps(2, batch=1).grasp.hand_pose)
 
 
-def test_a_grasp_does_not_depend_on_the_batch_it_sits_in_or_on_threads() -> None:
+def test_grasp_does_not_depend_on_batch_it_sits_in_or_on_threads() -> None:
     small, large = grasps(3), grasps(9, threads=2)
     assert np.array_equal(small.grasp.hand_pose, large.grasp.hand_pose[:3])
     assert np.array_equal(small.grasp.joint_positions, large.grasp.joint_positions[:3])
@@ -104,7 +104,7 @@ def test_hands_that_are_pulled_lie_around_more_of_the_object(monkeypatch: pytest
     assert pulled > 1.1 * area("not pulled")
 
 
-def test_a_projection_that_draws_in_what_is_farther_off_leaves_more_of_the_hand_at_a_free_object(
+def test_drawing_in_what_is_farther_off_leaves_more_of_the_hand(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """7 to 24 % more area with each of three seeds; half of the least is asked for."""
@@ -113,7 +113,7 @@ def test_a_projection_that_draws_in_what_is_farther_off_leaves_more_of_the_hand_
     assert farther > 1.04 * area("drawn in as among obstacles")
 
 
-def test_hands_enter_a_free_object_less_where_more_of_its_surface_is_tested(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_hands_enter_an_object_less_where_more_of_it_is_tested(monkeypatch: pytest.MonkeyPatch) -> None:
     """Depth is measured at points that the planner has not seen: .06 to .62 of it with each of three seeds."""
 
     def depth(name: str) -> float:
@@ -124,7 +124,7 @@ def test_hands_enter_a_free_object_less_where_more_of_its_surface_is_tested(monk
     assert dense < 0.75 * depth("sparse")
 
 
-def test_an_object_in_a_scene_and_one_that_nothing_projects_out_of_are_tested_where_the_fidelity_says() -> None:
+def test_a_surface_is_tested_where_the_fidelity_says() -> None:
     def samples(fidelity: Fidelity, **of: bool) -> int:
         pair = pairs.pair_of(hand_from_path("barrett"), object_from_path("mug"), fidelity, "cpu", **of)
         return len(pair.fine.obj.samples)
@@ -135,7 +135,7 @@ def test_an_object_in_a_scene_and_one_that_nothing_projects_out_of_are_tested_wh
     assert found == [3 * QUICK.object_points, QUICK.object_points, QUICK.object_points, 13_000]
 
 
-def test_recipes_without_pull_or_a_fine_phase_and_plain_descent_run() -> None:
+def test_recipes_without_pull_or_fine_phase_and_descent_run() -> None:
     assert schedule.loss_options(FIDELITIES["standard"]).pull == schedule.PULL > 0
     assert schedule.loss_options(FIDELITIES["paper"]).pull == 0
     assert schedule.loss_options(FIDELITIES["control"]).pull == 0
@@ -192,7 +192,7 @@ def parts(count: int, threads: int = 1) -> planner.Part:
     return found[0]
 
 
-def test_what_balances_poorly_sets_out_once_more_and_the_better_one_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_balances_poorly_sets_out_again_the_better_stays(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(planner, "SET_OUT_AGAIN", np.inf)
     once = parts(6)
     limit = float(np.median(once.merit))

@@ -58,7 +58,7 @@ def probed(
 
 
 @pytest.mark.parametrize("cells", [16, 32, 48])
-def test_the_grid_tells_a_spheres_distance_with_an_error_of_second_order(cells: int) -> None:
+def test_grid_tells_spheres_distance_with_error_of_second_order(cells: int) -> None:
     """Trilinear interpolation of |x| - R is off by at most 3/8 h^2 max |d''|, and |d''| <= 2 / |x| in the cell."""
     rng = np.random.default_rng(3)
     direction = rng.normal(size=(2000, 3))
@@ -74,7 +74,7 @@ def ring(depth: float) -> np.ndarray:
     return (RADIUS - depth) * np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, -1]])
 
 
-def test_points_inside_push_the_object_away_and_rub_against_its_motion() -> None:
+def test_points_inside_push_the_object_away_and_rub_against_it() -> None:
     box = distance_grid(ground_of(two_finger_hand(), BOX, "cpu", kernels).fine.obj, CELLS)
     faces = 0.024 * np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, -1]])
     distance, force, _ = probed(faces, (0.0, 0.0, 0.01), box)
@@ -97,7 +97,7 @@ def test_the_slope_of_the_force_is_its_difference_quotient(velocity: tuple[float
     np.testing.assert_allclose(slope, quotient, atol=0.05 * STIFFNESS)
 
 
-def test_points_outside_leak_a_share_of_the_slope_so_that_they_are_drawn_in() -> None:
+def test_points_outside_leak_a_share_of_the_slope() -> None:
     assert np.all(probed(ring(-0.002), (0.0, 0.0, 0.01))[1] == 0), "points outside press with nothing"
     outside, inside = (probed(ring(depth))[2] for depth in (-0.001, 0.001))
     np.testing.assert_allclose(outside, LEAK * inside, atol=0.02 * STIFFNESS)
@@ -130,7 +130,7 @@ def settled(pull: float) -> tuple[np.ndarray, np.ndarray]:
     return batch.force.numpy()[0], np.stack(forces, axis=1)
 
 
-def test_the_relaxation_departs_from_hard_contact_as_its_weight_says() -> None:
+def test_relaxation_departs_from_hard_contact_as_its_weight_says() -> None:
     relaxed, hard = settled(0.0)
     assert np.abs(hard).max() > 0.5
     np.testing.assert_allclose(relaxed, hard, atol=0.02)

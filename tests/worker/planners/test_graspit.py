@@ -70,7 +70,7 @@ def palm_only(gap: float, turn: float) -> float:
         (0.03, 0.0, 30.0),
     ],
 )
-def test_contact_energy_is_distance_in_millimetres_and_misalignment(gap: float, turn: float, expected: float) -> None:
+def test_contact_energy_is_distance_and_misalignment(gap: float, turn: float, expected: float) -> None:
     """Absolute 0.01 near the surface; 0.3 mm far from it, where a grid of 5 mm cells answers."""
     assert palm_only(gap, turn) == pytest.approx(expected, abs=0.3 if gap > 0.01 else 0.01)
 
@@ -83,7 +83,7 @@ def test_barrett_has_graspits_own_eigengrasps() -> None:
 
 
 @pytest.mark.parametrize("name", ["allegro", "barrett", "shadow"])
-def test_contacts_lie_on_every_finger_and_amplitudes_reach_the_limits(name: str) -> None:
+def test_contacts_lie_on_every_finger_amplitudes_reach_limits(name: str) -> None:
     hand = hand_from_path(name)
     found = virtual_contacts(hand)
     assert set(hand.fingertips) <= set(found.body.tolist())
@@ -97,7 +97,7 @@ def test_contacts_lie_on_every_finger_and_amplitudes_reach_the_limits(name: str)
     assert np.any(np.ptp(q, axis=0)[moving] > 0.5 * (hand.upper - hand.lower)[moving])
 
 
-def test_annealing_lowers_the_energy_and_keeps_states_that_differ() -> None:
+def test_annealing_lowers_energy_and_keeps_states_that_differ() -> None:
     search = Search(
         ground_of(two_finger_hand(), object_from_mesh(trimesh.creation.box((0.05, 0.05, 0.05))), "cpu", kernels)
     )

@@ -47,16 +47,14 @@ def assert_same(one: GraspSet | Exception, other: GraspSet) -> None:
 
 
 @pytest.mark.parametrize("threads", [1, 2])
-def test_joined_batches_are_those_of_separate_launches_bit_for_bit(pair, threads: int) -> None:
+def test_joined_batches_are_those_of_separate_launches(pair, threads: int) -> None:
     wanted = [Wanted(5, QUICK, 1, 0), Wanted(3, QUICK, 1, 1), Wanted(4, QUICK, 7, 1 << 20)]
     joined = made(pair, [Asked(one, Run(threads=threads)) for one in wanted])
     for one, alone in zip(joined, wanted, strict=True):
         assert_same(one, synthesize(*pair, alone, Run(threads=1)))
 
 
-def test_a_launch_for_which_memory_does_not_suffice_is_halved_across_batches(
-    pair, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_launch_without_memory_is_halved_across_batches(pair, monkeypatch: pytest.MonkeyPatch) -> None:
     wanted = [Wanted(3, QUICK, 1, 0), Wanted(3, QUICK, 1, 1)]
     alone = [synthesize(*pair, one, Run(threads=1)) for one in wanted]
 
@@ -82,7 +80,7 @@ def good_enough(grasps: GraspSet, *_: object) -> np.ndarray:
     return np.zeros(len(grasps))
 
 
-def test_what_is_the_matter_with_one_batch_leaves_the_others_as_they_are(pair) -> None:
+def test_what_is_matter_with_one_batch_leaves_others_as_they_are(pair) -> None:
     hand, obj = pair
     below = on_table(obj, 2, 3)
     below = replace(below, object_pose=below.object_pose - np.array([0, 0, 1.0, 0, 0, 0, 0]))
@@ -106,7 +104,7 @@ def test_what_is_the_matter_with_one_batch_leaves_the_others_as_they_are(pair) -
         assert_same(joined, synthesize(hand, obj, alone, Run(threads=1)))
 
 
-def test_a_batch_that_is_cancelled_on_the_way_leaves_the_others_as_they_are(pair) -> None:
+def test_a_batch_that_is_cancelled_leaves_the_others_alone(pair) -> None:
     wanted = [Wanted(2, QUICK, 1, 0), Wanted(2, QUICK, 1, 1)]
     told: list[str] = []
     stopping = Run(

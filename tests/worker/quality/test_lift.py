@@ -106,7 +106,7 @@ def test_a_hand_that_comes_through_box_or_table_has_touched_them() -> None:
 
 
 @pytest.mark.parametrize(("tips_m", "touched"), [(None, True), (0.0, True), (-0.0005, True), (-0.001, False)])
-def test_fingertips_press_into_the_table_as_deep_as_it_says_and_no_deeper(tips_m: float | None, touched: bool) -> None:
+def test_fingertips_press_into_the_table_as_deep_as_it_says(tips_m: float | None, touched: bool) -> None:
     """A way that ends with the pads 0.8 mm in the table."""
     placed = Placed((dataclasses.replace(PLACED.supports[0], tips_m=tips_m),), PLACED.object_pose, PLACED.index)
     given = grasp(0.05)
@@ -118,7 +118,7 @@ def test_fingertips_press_into_the_table_as_deep_as_it_says_and_no_deeper(tips_m
     assert (found.outcome is LiftOutcome.TOUCHED_ON_THE_WAY) == touched
 
 
-def test_a_box_whose_mesh_has_its_origin_elsewhere_stands_still_and_is_lifted_alike() -> None:
+def test_a_box_with_its_origin_elsewhere_is_lifted_alike() -> None:
     away = np.array([0.02, 0.01, HEIGHT])
     box = object_from_mesh(
         trimesh.creation.box((2 * HALF, 0.04, HEIGHT), trimesh.transformations.translation_matrix(away))
@@ -162,7 +162,7 @@ def test_a_neighbour_counts_only_where_the_hand_comes_through_it() -> None:
     assert beside((0.0, 0.09), size).lift(coming, 0).outcome is LiftOutcome.LIFTED
 
 
-def test_a_neighbour_has_its_own_mass_which_moves_the_key_of_lifts() -> None:
+def test_neighbour_has_its_own_mass_which_moves_the_key_of_lifts() -> None:
     light, heavy = (beside((0.0, 0.3), (0.05, 0.05, 0.1), mass) for mass in (0.05, 2.0))
     for test, mass in ((light, 0.05), (heavy, 2.0)):
         test._begin(grasp(0.05), 0)
@@ -173,7 +173,7 @@ def test_a_neighbour_has_its_own_mass_which_moves_the_key_of_lifts() -> None:
     assert keys[0] != keys[1]
 
 
-def test_a_neighbour_that_leans_or_slides_has_moved_one_that_turns_not() -> None:
+def test_a_neighbour_that_leans_or_slides_has_moved() -> None:
     test = beside((0.0, 0.3), (0.05, 0.05, 0.1))
     test._begin(grasp(0.05), 0)
     free = test.scene.neighbours[0]
@@ -215,13 +215,13 @@ def test_the_box_falls_by_what_friction_does_not_carry() -> None:
     assert 0.0 <= firm < 0.05
 
 
-def test_what_holds_at_half_the_friction_needs_twice_the_squeeze_for_its_pull() -> None:
+def test_half_the_friction_needs_twice_the_squeeze() -> None:
     slips, holds = scores(0.9 * LEAST_AT_HALF, 1.1 * LEAST_AT_HALF)
     assert SLIPS <= slips < SLIPS + 0.05
     assert holds < 0.05
 
 
-def test_what_must_hold_at_half_the_friction_to_be_better_is_not_asked_of_the_whole() -> None:
+def test_half_friction_to_be_better_is_not_asked_of_the_whole() -> None:
     placed = Placed(PLACED.supports, PLACED.object_pose, np.zeros(3, int))
     grasps = joined([grasp(squeeze) for squeeze in (1.1 * LEAST, 2.4 * LEAST, 1.1 * LEAST)])
     found = ShortLifts(HAND, BOX, lambda: WHOLE).scores(grasps, placed, np.array([1.5, 1.5, np.inf]))
@@ -254,7 +254,7 @@ def pushed(*squeezes: float, threads: int = 1) -> np.ndarray:
     return push_trial(HAND, BOX, lambda: WHOLE, threads=threads)(grasps, None)
 
 
-def test_a_free_box_is_pushed_away_the_less_the_firmer_it_is_held() -> None:
+def test_free_box_is_pushed_away_the_less_the_firmer_it_is_held() -> None:
     found = pushed(*(np.array([-0.2, 0.3, 0.6, 0.9, 1.2, 2.4]) * ACROSS * LEAST_PUSHED))
     # Pads that hardly touch turn the box as they are brushed: it is lost either way.
     assert (np.diff(found[1:]) < 0).all()
@@ -262,12 +262,12 @@ def test_a_free_box_is_pushed_away_the_less_the_firmer_it_is_held() -> None:
     assert (found[:2] >= SLIPS + 1.0).all()
 
 
-def test_a_free_box_hardly_moves_where_friction_carries_the_pushes() -> None:
+def test_free_box_hardly_moves_where_friction_carries_the_pushes() -> None:
     # Twice the squeeze that holds at the whole friction holds at half of it; pads and their drives give a little.
     assert pushed(2.4 * ACROSS * LEAST_PUSHED)[0] < 0.2
 
 
-def test_a_free_box_that_nothing_holds_flies_as_far_as_the_push_takes_it() -> None:
+def test_a_free_box_that_nothing_holds_flies_as_far_as_pushed() -> None:
     seconds = round(STAGE_S * PUSHED / PHYSICS.timestep) * PHYSICS.timestep
     freely = 0.5 * PULL * ACCELERATION * seconds**2 / MAX_DISPLACEMENT_M
     # Along the pads' normals they are in its way; it turns where it meets one.
@@ -296,7 +296,7 @@ def by_luck(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("level", ["letter", "lift"])
-def test_the_nominal_model_has_the_verdicts_of_the_lift_test_bit_for_bit(level: str) -> None:
+def test_nominal_model_has_verdicts_of_the_lift_test_bit_for_bit(level: str) -> None:
     verdicts = judge_lifts(HAND, BOX, MANY, WHERE, level=level, pieces=WHOLE)  # type: ignore[arg-type]
     found = [models().lift(MANY, row, WHERE, NOMINAL, letter=level == "letter") for row in range(len(MANY))]
     assert [trial.outcome for trial in found] == verdicts.outcome.tolist()
@@ -315,7 +315,7 @@ def test_half_the_friction_is_the_hard_lift() -> None:
     assert 0 < hard.success.sum() < plain.success.sum()
 
 
-def test_only_what_lifts_is_asked_and_the_first_eight_of_sixteen_models_are_those_of_eight() -> None:
+def test_only_what_lifts_is_asked_eight_of_sixteen_are_the_first() -> None:
     few = MANY.take(np.array([0, 3]))
     where = WHERE.take(slice(0, 2))
     held = judge_lifts(HAND, BOX, few, where, pieces=WHOLE).success
@@ -327,9 +327,7 @@ def test_only_what_lifts_is_asked_and_the_first_eight_of_sixteen_models_are_thos
 
 
 @pytest.mark.parametrize("wanted", [0.25, 0.75, 0.9])
-def test_lifts_that_end_early_say_of_the_wanted_share_what_all_of_them_say(
-    monkeypatch: pytest.MonkeyPatch, wanted: float
-) -> None:
+def test_lifts_that_end_early_say_of_the_share_what_all_say(monkeypatch: pytest.MonkeyPatch, wanted: float) -> None:
     by_luck(monkeypatch)
     whole, early = (robust(HAND, BOX, MANY, placed=WHERE, pieces=WHOLE, wanted=one) for one in (0.0, wanted))
     assert ((early.share >= wanted - 1e-9) == (whole.share >= wanted - 1e-9)).all()
@@ -348,7 +346,7 @@ def test_a_heavier_object_weighs_more_and_takes_more_to_lift() -> None:
     assert lifted == [True, False]
 
 
-def test_an_object_that_stands_off_slides_on_its_table_and_the_hand_stays_over_that() -> None:
+def test_an_object_that_stands_off_slides_and_the_hand_stays() -> None:
     up = WHERE.scenes[0].up
     variant = upright(Variant(object_shift_m=(0.001, -0.0015, 0.0005), object_turn=(0.01, 0.0, 0.02)), up)
     assert np.array(variant.object_shift_m) @ up == pytest.approx(0.0, abs=1e-12)

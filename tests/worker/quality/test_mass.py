@@ -74,7 +74,7 @@ def test_the_payload_of_a_pinch_is_what_its_friction_bears(friction: float) -> N
     assert 0.95 * bears < payload(friction) < bears
 
 
-def test_what_is_slippery_or_out_of_touch_bears_nothing_a_stop_all() -> None:
+def test_what_is_slippery_or_out_of_touch_bears_nothing_stop_all() -> None:
     assert np.isnan(payload(0.01))
     away = Posture(pinch().grasp.hand_pose - np.eye(7)[2], pinch().grasp.joint_positions)
     assert capacities(HAND, BOX, away, UP).tolist() == [0.0]
@@ -83,7 +83,7 @@ def test_what_is_slippery_or_out_of_touch_bears_nothing_a_stop_all() -> None:
 
 
 @pytest.mark.parametrize("friction", [0.3, FRICTION, 1.0])
-def test_what_friction_bears_with_the_accelerations_of_the_shake_survives_it(friction: float) -> None:
+def test_what_friction_bears_of_the_shake_survives_it(friction: float) -> None:
     # Along the line of the fingers an acceleration takes from the forces that press: mg <= friction (2 F - ma).
     accelerated = AMPLITUDE_M * (2 * np.pi * FREQUENCY_HZ) ** 2
     bears = 2 * friction * TORQUE / LEVER_M / (ACCELERATION + friction * accelerated)
@@ -133,7 +133,7 @@ def test_what_is_said_with_a_job_goes_over_what_the_file_says() -> None:
         BOX.weighing(density=1e7)
 
 
-def test_whoever_says_what_the_object_weighs_is_told_what_the_grasps_lift(tmp_path: Path) -> None:
+def test_whoever_says_the_weight_is_told_what_the_grasps_lift(tmp_path: Path) -> None:
     words = [
         "synth",
         "--hand",
@@ -205,7 +205,7 @@ def bears(friction: float) -> float:
 
 
 @pytest.mark.parametrize("friction", [0.01, 0.3, FRICTION, 1.0])
-def test_a_pinch_could_bear_what_the_pyramids_around_its_cones_bear(friction: float) -> None:
+def test_pinch_could_bear_what_pyramids_around_its_cones_bear(friction: float) -> None:
     found = capacities(HAND, BOX.weighing(friction=friction), pinch().grasp, UP)
     assert found == pytest.approx(bears(friction) / math.cos(math.pi / EDGES), rel=2e-3)
 
@@ -241,7 +241,7 @@ def test_what_is_wanted_is_told_with_what_the_best_grasp_lifts() -> None:
 
 
 @pytest.mark.parametrize("wanted", [ENOUGH // 2, ENOUGH])
-def test_a_weight_out_of_reach_ends_the_work_with_what_the_hand_lifts(tmp_path: Path, wanted: int) -> None:
+def test_weight_out_of_reach_ends_work_with_what_the_hand_lifts(tmp_path: Path, wanted: int) -> None:
     words = [
         "synth",
         "--hand",

@@ -102,7 +102,7 @@ def test_pregrasp_is_clear_and_within_limits() -> None:
     assert (before.joint_positions < held.joint_positions).all()
 
 
-def test_pregrasp_backs_the_palm_away_and_opens_no_further_than_it_must() -> None:
+def test_pregrasp_backs_away_and_opens_no_further_than_it_must() -> None:
     hand = two_finger_hand()
     found = Probe(hand, BOX).measure(pregrasp(hand, BOX, posture(((0, 0, -0.095), (0.05, 0.05)))))
     fingers = np.isin(Probe(hand, BOX).points.body, [1, 2])
@@ -185,12 +185,12 @@ def test_a_finger_opens_no_farther_than_its_neighbour_lets_it() -> None:
     assert free[0] == pytest.approx(0.004)
 
 
-def test_what_is_light_is_held_more_gently_and_what_is_heavy_more_firmly() -> None:
+def test_what_is_light_is_held_gently_what_is_heavy_firmly() -> None:
     forces = [normal_force(dataclasses.replace(BOX, mass=mass)) for mass in (0.02, 0.1, 0.5, 1.0)]
     assert forces == pytest.approx([10.0, 50.0, 50.0, 100.0])
 
 
-def test_a_finger_stands_off_that_is_near_the_object_and_does_not_touch_it() -> None:
+def test_a_finger_stands_off_that_is_near_and_does_not_touch() -> None:
     # The left plate touches; the right one stands at distances around both limits.
     near, far = STANDS_OFF_M
     rights = np.array([0.0, near - 1e-3, near + 1e-3, far - 1e-3, far + 1e-3])
@@ -244,7 +244,7 @@ def test_forces_balance_as_in_numpy(case: tuple[HandModel, Probe, Posture]) -> N
     assert 0 < np.count_nonzero(held.residual < 1.0) < len(grasp)
 
 
-def test_fingers_that_stand_off_are_commanded_to_close_as_in_numpy(case: tuple[HandModel, Probe, Posture]) -> None:
+def test_fingers_that_stand_off_close_as_in_numpy(case: tuple[HandModel, Probe, Posture]) -> None:
     hand, probe, grasp = case
     wanted = reference.balanced(probe, grasp, total_normal_force=20.0, friction=0.3, closing=CLOSING_M)
     near = reference.balanced(probe, grasp, total_normal_force=20.0, friction=0.3)
@@ -303,7 +303,7 @@ def test_pads_press_with_the_limit_of_their_drive(coupled: bool, effort: float, 
         assert low <= force <= 1.02 * each
 
 
-def test_a_gripper_opens_for_the_way_in_and_squeezes_within_its_stroke() -> None:
+def test_gripper_opens_for_way_in_and_squeezes_within_its_stroke() -> None:
     for coupled in (True, False):
         hand = gripper(coupled=coupled)
         opened = pregrasp(hand, BALL, grasp_of(hand)).joint_positions[0]
@@ -364,7 +364,7 @@ def test_the_kernel_needs_no_second_way(monkeypatch: pytest.MonkeyPatch) -> None
     nonnegative_weights(systems(64, 96, 9), np.full(64, 96))
 
 
-def test_weights_keep_to_their_columns_and_leave_out_what_makes_worse() -> None:
+def test_weights_keep_to_their_columns_and_leave_out_the_worse() -> None:
     made = np.zeros((1, 2, 23))
     made[0, 0, 6], made[0, 1, 6] = 10.0, -10.0
     found = nonnegative_weights(made, np.array([2]))

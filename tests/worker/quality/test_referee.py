@@ -65,7 +65,7 @@ def many_grasps() -> GraspSet:
     return grasp_of(contact=posture(*rows))
 
 
-def test_a_pressed_box_is_held_a_free_one_falls_a_deep_one_is_refused() -> None:
+def test_pressed_box_is_held_free_one_falls_deep_one_is_refused() -> None:
     verdict = judge(PADS, BOX, grasp_of(), level="letter", pieces=WHOLE)
     assert verdict.reasons == ["held"]
     assert verdict.success.tolist() == [1]
@@ -106,7 +106,7 @@ def test_a_free_object_moves_as_newton_says() -> None:
 
 
 @pytest.mark.parametrize("level", ["letter", "certificate", "screen"])
-def test_penetration_counts_at_the_pregrasp_where_the_simulation_starts(level: str) -> None:
+def test_penetration_counts_at_pregrasp_where_simulation_starts(level: str) -> None:
     deep, clear = posture(((0, 0, 0), (0.08, 0.08))), posture(((0, 0, 0), (0.06, 0.06)))
     from_outside = GraspSet(deep, clear, deep, np.full(1, np.nan))
     from_inside = GraspSet(clear, deep, clear, np.full(1, np.nan))
@@ -131,7 +131,7 @@ def test_the_engine_has_the_numbers_of_hand_and_object() -> None:
 
 
 @pytest.mark.parametrize(("jaws", "contacts"), [(False, 2), (True, 8)], ids=["hand", "gripper"])
-def test_a_pair_of_convex_pieces_has_one_contact_as_the_protocol_pins_but_between_jaws(
+def test_a_pair_of_pieces_has_one_contact_but_between_jaws(
     jaws: bool, contacts: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if not jaws:
@@ -166,7 +166,7 @@ def test_the_root_turns_at_an_even_rate_between_two_postures() -> None:
     assert turns == pytest.approx([0.1 * np.pi, 0.5 * np.pi, 0.9 * np.pi])
 
 
-def test_a_push_from_the_saved_state_is_a_push_after_closing_anew() -> None:
+def test_push_from_the_saved_state_is_a_push_after_closing_anew() -> None:
     grasps, test = many_grasps(), Test(build(PADS, BOX, WHOLE, MujocoOptions()))
     ends = []
     for anew in (False, True):
@@ -204,7 +204,7 @@ def test_hard_holds_no_more_and_threads_change_nothing() -> None:
     assert one.key == two.key
 
 
-def test_progress_is_told_by_one_thread_at_a_time_and_counts_every_grasp() -> None:
+def test_progress_is_told_by_one_thread_and_counts_every_grasp() -> None:
     told, alone, overlaps = [], threading.Lock(), 0
 
     def progress(done: float, total: float, message: str) -> None:
@@ -221,7 +221,7 @@ def test_progress_is_told_by_one_thread_at_a_time_and_counts_every_grasp() -> No
     assert told == list(range(1, len(many_grasps()) + 1))
 
 
-def test_terms_do_not_depend_on_the_grasps_and_follow_everything_else(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_terms_depend_not_on_grasps_but_on_everything_else(monkeypatch: pytest.MonkeyPatch) -> None:
     terms = verdict_key(PADS, BOX, "letter", False, pieces=WHOLE)
     found = [judge(PADS, BOX, grasp_of(force=force), level="letter", pieces=WHOLE) for force in (10.0, 20.0)]
     assert [verdicts.terms for verdicts in found] == [terms, terms]
@@ -256,7 +256,7 @@ def test_a_constant_moves_the_keys_of_the_levels_that_it_moves(monkeypatch: pyte
     assert [a == b for a, b in zip(before, terms(), strict=True)] == [True, True, False]
 
 
-def test_every_constant_of_the_protocol_is_said_to_move_verdicts_or_not_to() -> None:
+def test_every_constant_is_said_to_move_verdicts_or_not() -> None:
     # A new constant belongs in key.py, or here if no verdict depends on it.
     # These move lifts: lifting.py has them.
     still = {"postures.ROOM_M", "postures.WIDE", "model.TOUCH_ROUNDING_M"}
@@ -360,7 +360,7 @@ def test_only_grasps_that_held_are_tried_with_noise() -> None:
     assert (all_of_them[0], all_of_them[-1]) == (1.0, 0.0), "a firm grasp survives noise, a grazing one gains nothing"
 
 
-def test_unknown_levels_are_refused_and_a_cancelled_referee_stops() -> None:
+def test_unknown_levels_are_refused_and_cancelled_referee_stops() -> None:
     with pytest.raises(InputError, match="letter, certificate, screen"):
         judge(PADS, BOX, grasp_of(), level="quick", pieces=WHOLE)
     with pytest.raises(TaskCancelled):
@@ -383,7 +383,7 @@ def test_a_convex_object_is_one_piece_and_an_l_is_cut_and_kept(tmp_path: Path) -
 
 
 @pytest.mark.slow
-def test_a_shell_that_convex_pieces_fill_in_is_refused_with_the_reason(tmp_path: Path) -> None:
+def test_shell_that_convex_pieces_fill_in_is_refused_with_reason(tmp_path: Path) -> None:
     """At this radius even the most pieces allowed stand more than 2 mm away from the inner wall."""
     shell = trimesh.creation.icosphere(subdivisions=2, radius=0.15)
     inner = trimesh.creation.icosphere(subdivisions=2, radius=0.1495)
@@ -531,7 +531,7 @@ def told(trials: list[Trial]) -> list[tuple[object, ...]]:
 
 
 @pytest.mark.parametrize("hand", [SHORT_PADS, PLATES])
-def test_trials_in_kept_models_are_those_of_fresh_ones_bit_for_bit(hand: object) -> None:
+def test_trials_in_kept_models_are_those_of_fresh_ones(hand: object) -> None:
     rows = [((0, 0, z), (gap, gap)) for z in np.linspace(0.0, 0.055, 4) for gap in (0.0655, 0.071)]
     grasps = grasp_set(posture(*rows))
     fresh = Whole(build(hand, BOX, WHOLE, MujocoOptions()))  # type: ignore[arg-type]
@@ -543,7 +543,7 @@ def test_trials_in_kept_models_are_those_of_fresh_ones_bit_for_bit(hand: object)
     assert max(t[2] for t in wanted) > 0.0, "some of them reach into the box"  # type: ignore[operator, type-var]
 
 
-def test_verdicts_and_displacements_are_the_same_when_asked_again() -> None:
+def test_verdicts_and_displacements_are_same_when_asked_again() -> None:
     grasps = grasp_set(posture(*[((0, 0, z), (0.066, 0.066)) for z in (0.0, 0.02, 0.05)]))
     first, second = (judge(SHORT_PADS, BOX, grasps, pieces=WHOLE) for _ in range(2))
     assert np.array_equal(first.outcome, second.outcome) and np.array_equal(first.margin, second.margin)
@@ -554,7 +554,7 @@ def test_verdicts_and_displacements_are_the_same_when_asked_again() -> None:
 HAND = plate_hand()
 
 
-def test_displacement_is_free_fall_without_a_hand_and_none_at_rest() -> None:
+def test_displacement_is_free_fall_without_hand_and_none_at_rest() -> None:
     away = posture(((0, 0, 1.0), (0.0, 0.0)))
     # Symplectic Euler: the sum of n steps of growing velocity.
     fall = GRAVITY * TIMESTEP_S**2 * STEPS * (STEPS + 1) / 2
@@ -571,7 +571,7 @@ def test_displacement_is_free_fall_without_a_hand_and_none_at_rest() -> None:
 THUMB = ("joint_12.0", "joint_13.0", "joint_14.0", "joint_15.0")
 
 
-def test_a_published_grasp_without_its_thumb_is_refused_with_a_reason(shared_data: Path) -> None:
+def test_a_published_grasp_without_its_thumb_is_refused(shared_data: Path) -> None:
     case = load_case(shared_data / "reference_grasps" / "frogger_allegro" / "056_tennis_ball.json")
     some = case.grasps.take(np.arange(3))
     thumb = np.array([name in THUMB for name in case.hand.joint_names])
@@ -586,7 +586,7 @@ def test_a_published_grasp_without_its_thumb_is_refused_with_a_reason(shared_dat
     assert all(reason.startswith(("rotated", "displaced", "lost")) for reason in found.reasons)
 
 
-def test_an_object_that_lies_in_the_open_palm_is_pushed_out_of_it() -> None:
+def test_object_that_lies_in_the_open_palm_is_pushed_out_of_it() -> None:
     hand, obj = hand_from_path("allegro"), object_from_path("block")
     half = hand.palm.approach + np.array([0.0, 0, 1])
     half = half / np.linalg.norm(half) if np.linalg.norm(half) > 1e-6 else np.array([1.0, 0, 0])
@@ -603,7 +603,7 @@ GRASPS = 32
 
 
 @pytest.mark.slow
-def test_cheap_levels_agree_with_the_letter_on_grasps_that_nobody_chose() -> None:
+def test_cheap_levels_agree_with_the_letter() -> None:
     """99 % is what larger studies find; two grasps of 32 leave room for one chance event more than that."""
     hand, obj = hand_from_path("allegro"), object_from_path("bottle")
     grasps = synthesize(hand, obj, Wanted(count=GRASPS, fidelity=FIDELITIES["draft"], seed=77))
@@ -615,7 +615,7 @@ def test_cheap_levels_agree_with_the_letter_on_grasps_that_nobody_chose() -> Non
         assert cheap.steps < work * letter.steps, level
 
 
-def test_measured_tests_the_held_grasps_by_row_and_may_be_stopped() -> None:
+def test_measured_tests_held_grasps_by_row_and_may_be_stopped() -> None:
     held = np.array([False, True, False, True])
     found = measured(4, held, lambda: 10.0, lambda test, row: test + row, run=ALONE, name="test")
     np.testing.assert_array_equal(found, [np.nan, 11.0, np.nan, 13.0])

@@ -56,7 +56,7 @@ def by_luck(monkeypatch: pytest.MonkeyPatch, odds: float = 0.7) -> None:
     monkeypatch.setattr(Models, "certificate", certificate)
 
 
-def test_in_models_that_are_all_the_same_a_grasp_holds_in_all_or_none(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_in_models_that_are_all_same_grasp_holds_in_all_or_none(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(robustness, "draw", lambda axis, hand, rng: NOMINAL)
     grasps = many_grasps()
     found = robust(PADS, BOX, grasps, models=3, pieces=WHOLE)
@@ -76,7 +76,7 @@ def test_only_what_holds_in_the_nominal_model_is_tried(monkeypatch: pytest.Monke
 
 @pytest.mark.parametrize("models", [1, 8])
 @pytest.mark.parametrize("wanted", [0.25, 0.75, 0.9])
-def test_judging_that_ends_early_says_of_the_wanted_share_what_all_models_say(
+def test_judging_that_ends_early_says_of_the_share_what_all_say(
     monkeypatch: pytest.MonkeyPatch, models: int, wanted: float
 ) -> None:
     by_luck(monkeypatch)
@@ -121,7 +121,7 @@ def test_so_many_models_make_a_share(wanted: float, models: int, least: int) -> 
     assert needed(wanted, models) == least
 
 
-def test_a_grasp_meets_the_same_models_each_axis_once_wherever_it_stands() -> None:
+def test_a_grasp_meets_the_same_models_each_axis_once() -> None:
     grasps = many_grasps()
     turned = grasps.take(np.arange(len(grasps))[::-1])
     assert models_of(PADS, grasps, 2, 8, 5) == models_of(PADS, turned, len(grasps) - 3, 8, 5)
@@ -221,7 +221,7 @@ def test_a_thin_shape_does_not_vanish_when_it_shrinks() -> None:
     ("kind", "size"), [("box", (0.02, 0.03, 0.05)), ("cylinder", (0.01, 0.06)), ("capsule", (0.012, 0.03)),
                        ("cylinder", (0.03, 0.01))],
 )  # fmt: skip
-def test_the_primitive_nearest_to_the_hull_of_a_primitive_is_that_primitive(kind: str, size: tuple[float, ...]) -> None:
+def test_the_primitive_nearest_to_the_hull_of_one_is_that_one(kind: str, size: tuple[float, ...]) -> None:
     vertices, faces = tessellate(kind, size)
     turned = apply(np.array([0.01, 0.02, 0.03, *(np.array([1, 2, 3, 4]) / np.sqrt(30))]), vertices)
     hulls = piece(0, trimesh.Trimesh(turned, faces, process=False), "hull", (), (0, 0, 0))
@@ -243,7 +243,7 @@ def test_fits_that_change_nothing_are_not_offered() -> None:
     assert refitted(ball, "capsule") is ball
 
 
-def test_the_nominal_variant_has_the_verdicts_of_the_judge_bit_for_bit() -> None:
+def test_nominal_variant_has_verdicts_of_the_judge_bit_for_bit() -> None:
     grasps = pressing_grasps()
     verdicts = judge(PADS, BOX, grasps, pieces=WHOLE)
     found = [models().certificate(grasps, row, NOMINAL) for row in range(len(grasps))]
@@ -252,7 +252,7 @@ def test_the_nominal_variant_has_the_verdicts_of_the_judge_bit_for_bit() -> None
     assert {True, False} == set((verdicts.success == 1).tolist())
 
 
-def test_variants_reach_the_engine_and_leave_the_nominal_model_as_it_was() -> None:
+def test_variants_reach_engine_and_leave_nominal_model_as_it_was() -> None:
     around = models()
     own = around.scene(NOMINAL).model
     scene = around.scene(Variant(armature=3e-4, dry_friction=0.02, damping=0.5, gain=2.0, friction=0.75, mass=1.5))
@@ -304,7 +304,7 @@ def test_the_centre_of_mass_moves_and_the_object_stays() -> None:
     assert test._offset() == pytest.approx([0, 0, 0], abs=1e-12), "the mesh's frame is where it was"
 
 
-def test_an_object_or_a_hand_that_is_off_is_met_the_other_way_round() -> None:
+def test_object_or_a_hand_that_is_off_is_met_the_other_way_round() -> None:
     grasps = pressing_grasps()
     shift, turn = (0.001, -0.002, 0.0005), (0.0, 0.0, 0.03)
     moved = seen(BOX, grasps, 3, Variant(object_shift_m=shift))
@@ -422,7 +422,7 @@ def test_each_reading_moves_as_it_says() -> None:
     assert (first, second) == pytest.approx((0.2 + 0.5 / 16, 0.2 + 0.5 / 16), abs=5e-3)
 
 
-def test_a_ratio_keeps_what_both_can_do_and_no_tendon_changes_nothing() -> None:
+def test_a_ratio_keeps_what_both_can_do() -> None:
     hand = recoupled(tied(), "ratio")
     assert (hand.dofs, hand.tendons) == (1, ())
     assert (hand.lower[0], hand.upper[0]) == (-0.2, 1.1)

@@ -55,7 +55,7 @@ def test_cross_polytope_has_radius_one_over_root_dimension(dimension: int, volum
     assert measure_space(points) == pytest.approx((1 / math.sqrt(dimension), volume), abs=PRINTED)
 
 
-def test_antipodal_forces_reach_the_apothem_of_the_friction_pyramid() -> None:
+def test_antipodal_forces_reach_apothem_of_the_friction_pyramid() -> None:
     forces = cone_edges(np.array([[1.0, 0, 0], [-1.0, 0, 0]]), 0.5)
     assert measure_space(forces) == pytest.approx(
         (0.5 * math.cos(math.pi / 8), 8 * 0.25 * math.sin(math.pi / 4)), abs=PRINTED
@@ -179,7 +179,7 @@ def frogger_edges(grasp: dict[str, list[list[float]]]) -> np.ndarray:
     return np.concatenate([force, np.cross(np.array(grasp["contact_points_object"])[:, None], force)], axis=-1)
 
 
-def test_published_frogger_grasps_have_their_ferrari_canny_recomputed(shared_data: Path) -> None:
+def test_published_frogger_grasps_have_their_ferrari_canny(shared_data: Path) -> None:
     files = sorted((shared_data / "reference_grasps" / "frogger_allegro").glob("*.json"))
     worst, count = 0.0, 0
     for file in files:
@@ -301,7 +301,7 @@ def test_the_radius_alone_is_that_of_the_whole_hull(count: int, friction: float,
     assert found == pytest.approx(whole, abs=1e-12)  # the same planes, made in another order
 
 
-def test_the_radius_alone_of_a_cube_and_of_a_cloud_beside_the_origin() -> None:
+def test_radius_alone_of_a_cube_and_of_a_cloud_beside_the_origin() -> None:
     corners = np.array(np.meshgrid(*[[-1.0, 1.0]] * 6)).reshape(6, -1).T
     inner = np.random.default_rng(0).uniform(-0.9, 0.9, (60, 6))
     assert hull_of(np.vstack([inner, corners]), False)[0] == pytest.approx(1.0, rel=JOGGLED)

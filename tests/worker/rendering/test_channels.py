@@ -55,7 +55,7 @@ def points(views: dict[str, np.ndarray], view: int) -> np.ndarray:
     return (local - e[:3, 3]) @ e[:3, :3]
 
 
-def test_ray_distance_is_the_way_from_the_optical_centre_to_the_point(views):
+def test_ray_distance_is_way_from_optical_centre_to_the_point(views):
     for view, e in enumerate(views["camera/extrinsics"]):
         centre = -e[:3, :3].T @ e[:3, 3]
         expected = np.linalg.norm(points(views, view) - centre, axis=-1)
@@ -64,7 +64,7 @@ def test_ray_distance_is_the_way_from_the_optical_centre_to_the_point(views):
         np.testing.assert_allclose(views["image/distance"][view][seen], expected[seen], atol=1e-6)
 
 
-def test_normals_of_a_ball_point_away_from_its_centre_and_those_of_the_table_up(views):
+def test_normals_of_a_ball_point_outward_those_of_the_table_up(views):
     for view, scene in enumerate(views["camera/scene_index"]):
         normals = views["image/normals"][view].astype(float)
         segmentation = views["image/segmentation"][view]
@@ -86,7 +86,7 @@ def test_extra_channels_change_no_other_dataset(ball, views):
     assert views["box/occlusion_ratio"].tolist() == [0.0] * 4, "alone on its table it is not occluded"
 
 
-def test_a_ball_behind_another_is_hidden_as_far_as_their_discs_overlap(ball):
+def test_a_ball_behind_another_is_hidden_as_far_as_discs_overlap(ball):
     """Two equal balls on one line of sight: the nearer covers the farther one, whose disc is smaller."""
     eye, target = np.array([0.5, 0, RADIUS]), np.array([0.0, 0, RADIUS])
     given = GivenCameras(extrinsics=np.stack([look_at(eye, target), look_at(-eye * [1, 1, -1], target)]))
@@ -126,7 +126,7 @@ def test_given_cameras_are_those_of_every_scene(ball):
         assert np.abs(away - RADIUS).max() < DEPTH_M
 
 
-def test_cameras_keep_the_object_in_a_narrow_field_or_are_refused(ball) -> None:
+def test_cameras_keep_object_in_a_narrow_field_or_are_refused(ball) -> None:
     k = intrinsics(*SIZE, field_of_view=np.radians(20))
     seen = shoot(ball, extras=Extras(cameras=GivenCameras(k)))
     boxes = seen["box/bounding_box_2d_loose"]

@@ -79,7 +79,7 @@ def test_colours_labels_depth_and_normals_come_back_exactly(views, tmp_path) -> 
             np.testing.assert_array_equal(half, views["image/normals"][view][..., k])
 
 
-def test_png_depth_is_right_to_half_a_step_and_ends_at_sixteen_bits(views, tmp_path) -> None:
+def test_png_depth_is_right_to_half_a_step(views, tmp_path) -> None:
     export_images(views, tmp_path, depth="png")
     steps = pixels(tmp_path / "distance_to_image_plane_0000.png")
     assert steps.dtype in (np.uint16, np.int32)
@@ -92,7 +92,7 @@ def test_png_depth_is_right_to_half_a_step_and_ends_at_sixteen_bits(views, tmp_p
     assert not list(tmp_path.glob("distance*.exr"))
 
 
-def test_the_sidecar_tells_the_camera_and_what_is_not_seen_is_null(views, tmp_path):
+def test_sidecar_tells_the_camera_and_what_is_not_seen_is_null(views, tmp_path):
     export_images(views, tmp_path)
     left, right = (json.loads((tmp_path / f"view_{view:04}.json").read_text()) for view in range(2))
     assert (left["eye"], right["eye"], right["scene"], left["width"], left["height"]) == ("left", "right", 1, W, H)
@@ -115,7 +115,7 @@ def test_a_second_export_does_not_mix_with_the_first(views, tmp_path):
 DEPTH_M = 1e-4
 
 
-def test_points_of_a_rendered_object_lie_on_its_mesh_and_their_normals_are_its_faces(tmp_path: Path) -> None:
+def test_points_of_a_rendered_object_lie_on_its_mesh(tmp_path: Path) -> None:
     mesh = trimesh.creation.capsule(height=0.05, radius=0.03, count=[24, 24])
     views = render(
         object_from_mesh(mesh, "box"), box_scenes.POSES, views=2, stereo=False, width=96, height=72, seed=1, samples=2
@@ -134,7 +134,7 @@ def test_points_of_a_rendered_object_lie_on_its_mesh_and_their_normals_are_its_f
         assert np.median(cosine) > np.cos(np.radians(4))
 
 
-def test_the_surface_of_the_hand_of_a_shard_follows_its_kinematics() -> None:
+def test_surface_of_the_hand_of_a_shard_follows_its_kinematics() -> None:
     """All of a hand moves with its root; the points of a body that no joint carries move with nothing else."""
     from worker.hands.load import hand_from_path
     from worker.hands.surface import sample_surface

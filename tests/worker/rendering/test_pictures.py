@@ -61,7 +61,7 @@ def test_every_grasp_is_shown_from_every_side(pictures):
     assert len({picture.tobytes() for picture in pictures.reshape(6, -1)}) == 6
 
 
-def test_a_picture_shows_the_object_and_the_fingertips_in_their_colours(pictures):
+def test_picture_shows_object_and_fingertips_in_their_colours(pictures):
     for picture in pictures.reshape(6, 64, 80, 3):
         hue = hues(picture)
         # Orange object, teal fingertips, hue in 256 steps.
@@ -69,7 +69,7 @@ def test_a_picture_shows_the_object_and_the_fingertips_in_their_colours(pictures
         assert np.sum((hue > 115) & (hue < 135)) > 5
 
 
-def test_a_grasp_looks_the_same_whatever_grasps_are_drawn_with_it(block, pictures):
+def test_grasp_looks_the_same_whatever_grasps_are_drawn_with_it(block, pictures):
     alone = grasp_pictures(HAND, block, POSES[1:], JOINTS[1:], (80, 64), THREE_SIDES, samples=4)
     np.testing.assert_array_equal(alone[0], pictures[1])
     none = grasp_pictures(HAND, block, np.zeros((0, 7)), np.zeros((0, 2)), (80, 64), THREE_SIDES)
@@ -86,7 +86,7 @@ def quality(count: int) -> dict[str, np.ndarray]:
     }
 
 
-def test_the_best_have_the_largest_epsilon_and_captions_quote_5_mm() -> None:
+def test_best_have_the_largest_epsilon_and_captions_quote_5_mm() -> None:
     chosen = np.array([True, True, True, True, False])
     assert best(quality(5), 3, chosen).tolist() == [3, 2, 1]
     assert best(quality(5), 9, chosen).tolist() == [3, 2, 1, 0]
@@ -117,7 +117,7 @@ def test_a_views_page_has_a_row_per_placement(block, stereo, cells):
     assert page.shape[0] > 2 * 48
 
 
-def test_a_views_page_shows_the_pictures_with_a_hand_where_there_are_any(block):
+def test_views_page_shows_pictures_with_hand_where_there_are_any(block):
     pose = np.array([[0, 0, 0.03, 1.0, 0, 0, 0]])
     views = render(block, pose, views=1, stereo=False, width=64, height=48, seed=0, samples=2)
     without = opened(views_page(views, title="block"))
@@ -166,7 +166,7 @@ def test_the_lifted_object_is_higher_in_the_picture(block):
     assert orange(floating).sum() > 20, "a free grasp floats over a floor"
 
 
-def test_the_whole_hand_is_in_the_picture_where_that_is_asked_for(block):
+def test_whole_hand_is_in_the_picture_where_that_is_asked_for(block):
     frames = [[replace(at("", 0.5), carried=np.zeros(3)), at("grasp")]]
     around = Around((HalfSpace(),), REST)
     near, whole = (way_pictures(HAND, block, frames, around, (48, 48), whole=w, samples=2)[0, 0] for w in (False, True))
@@ -196,7 +196,7 @@ def test_each_grasp_stands_in_its_own_scene(block):
     assert (first != second).any()
 
 
-def test_links_above_the_root_are_drawn_at_the_angles_of_the_wrist(block):
+def test_links_above_root_are_drawn_at_the_angles_of_the_wrist(block):
     # A copy of the hand behind its root serves as a forearm with two wrist joints.
     back = np.array([0, 0, -0.12])
     forearm = replace(HAND, pieces=tuple(replace(p, vertices=p.vertices + back) for p in HAND.pieces))
@@ -226,7 +226,7 @@ def colours() -> np.ndarray:
 
 
 @pytest.mark.parametrize("suffix", sorted(KINDS))
-def test_every_picture_is_shown_for_its_time_and_the_film_begins_anew(suffix):
+def test_every_picture_is_shown_for_its_time_and_again(suffix):
     if suffix == ".webp" and not features.check("webp"):
         pytest.skip("this Pillow writes no WebP")
     with Image.open(io.BytesIO(animation(colours(), SECONDS, suffix))) as film:

@@ -83,7 +83,7 @@ def mug_views(mug, mug_poses) -> dict[str, np.ndarray]:
     return shoot(mug, mug_poses)
 
 
-def test_depths_are_those_of_sphere_and_plane_and_infinite_elsewhere(ball_views, ball) -> None:
+def test_depths_are_of_sphere_and_plane_and_infinite_elsewhere(ball_views, ball) -> None:
     for view in range(4):
         origin, rays = world_rays(ball_views, view)
         to_centre = REST[0, :3] - origin
@@ -119,7 +119,7 @@ def test_unprojected_depth_lies_on_the_mesh(mug, mug_poses, mug_views):
         assert distance.max() < 5e-4
 
 
-def test_a_point_projected_by_the_cameras_matrices_lands_on_its_pixel(mug_views):
+def test_point_projected_by_cameras_matrices_lands_on_its_pixel(mug_views):
     points = cameras(mug_views).unproject(np.where(np.isfinite(mug_views["image/depth"]), mug_views["image/depth"], 1))
     for view in range(len(points)):
         k, e = mug_views["camera/intrinsics"][view], mug_views["camera/extrinsics"][view]
@@ -147,7 +147,7 @@ def test_the_right_eye_sees_every_point_shifted_by_its_disparity(mug_views):
         assert np.mean(other < mine + 0.004) > 0.9
 
 
-def test_boxes_are_tight_around_the_mask_and_contain_what_is_visible(mug_views) -> None:
+def test_boxes_are_tight_around_mask_and_contain_what_is_visible(mug_views) -> None:
     for view, mask in enumerate(mug_views["image/segmentation"] == 2):
         cells = np.argwhere(mask)
         (top, left), (bottom, right) = cells.min(axis=0), cells.max(axis=0) + 1
@@ -235,7 +235,7 @@ def test_the_object_casts_a_shadow(ball, ball_views):
         assert np.percentile(table, 2) < 0.75 * np.median(table)
 
 
-def test_a_cancelled_render_stops_and_progress_ends_with_all_pictures(ball, monkeypatch) -> None:
+def test_a_cancelled_render_stops_and_progress_ends_with_all(ball, monkeypatch) -> None:
     monkeypatch.setattr("worker.rendering.tracer.PIXELS_OF_A_CORE", 1)
     answers = iter([False, True])
     with pytest.raises(TaskCancelled):
@@ -276,7 +276,7 @@ def sampled(seed: int, views: int = 12) -> Cameras:
     return Cameras(320, 240, intrinsics(320, 240), np.stack(extrinsics))
 
 
-def test_a_camera_looks_at_its_target_upright_with_its_field_of_view() -> None:
+def test_a_camera_looks_at_its_target_upright_in_its_field() -> None:
     matrix = look_at(np.array([0.3, 0.2, 0.4]), CENTRE)
     camera = Cameras(320, 240, intrinsics(320, 240), matrix[None])
     pixels, depth = camera.project(CENTRE + np.array([[0, 0, 0], [0, 0, 0.05]]))
@@ -314,7 +314,7 @@ def test_unprojecting_what_was_projected_gives_the_point_back():
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_sampled_cameras_stand_on_the_hemisphere_and_see_the_whole_object(seed):
+def test_sampled_cameras_on_the_hemisphere_see_the_object(seed):
     camera = sampled(seed)
     away = camera.centre - CENTRE
     distance = np.linalg.norm(away, axis=1)

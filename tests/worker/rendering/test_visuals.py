@@ -35,7 +35,7 @@ def hand() -> HandModel:
     return load_hand({"h.urdf": urdf, "part.stl": part}, name="h", digest="0" * 32)
 
 
-def test_what_is_seen_has_its_colours_what_is_not_its_collision_shapes(hand: HandModel) -> None:
+def test_what_is_seen_has_its_colours_else_collision_shapes(hand: HandModel) -> None:
     palm = [part for part in hand_parts(hand) if part.body == 0]
     assert sorted((part.look.base, len(part.solid.faces)) for part in palm) == [((0, 0, 1), 80), ((1, 0, 0), 12)]
     (finger,) = [part for part in hand_parts(hand) if part.body == 1]

@@ -84,9 +84,7 @@ def test_joints_stay_within_their_limits_of_place_and_speed(carried: tuple[dict[
             assert np.abs(np.diff(values) / np.diff(time)).max() <= 0.5 * speed + 1e-6
 
 
-def test_the_arms_scene_opens_in_mujoco_and_nothing_of_the_arm_touches(
-    table_shard: Path, arm: Path, tmp_path: Path
-) -> None:
+def test_arms_scene_opens_in_mujoco_and_nothing_of_arm_touches(table_shard: Path, arm: Path, tmp_path: Path) -> None:
     assert export(table_shard, arm, tmp_path, "mujoco").exit_code == 0
     model = mujoco.MjModel.from_xml_path(str(tmp_path / "arm.xml"))
     data = mujoco.MjData(model)
@@ -101,9 +99,7 @@ def test_the_arms_scene_opens_in_mujoco_and_nothing_of_the_arm_touches(
     assert mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, "gripper") == -1, "what the mount carried is left out"
 
 
-def test_moveit_is_told_poses_in_the_arms_base_and_joints_of_arm_and_hand(
-    table_shard: Path, arm: Path, tmp_path: Path
-) -> None:
+def test_moveit_is_told_poses_in_the_arms_base_and_all_joints(table_shard: Path, arm: Path, tmp_path: Path) -> None:
     import yaml
 
     assert export(table_shard, arm, tmp_path, "moveit").exit_code == 0
@@ -132,7 +128,7 @@ def test_an_arm_that_cannot_is_refused_in_a_line(
     assert not (tmp_path / "out").exists()
 
 
-def test_a_base_without_an_arm_and_an_arm_without_mink_are_refused(
+def test_base_without_an_arm_and_an_arm_without_mink_are_refused(
     free_shard: Path, arm: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     found = run("export", free_shard, "--format", "csv", "--base", "0 0 0 1 0 0 0", "-o", tmp_path)

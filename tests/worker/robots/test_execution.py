@@ -68,7 +68,7 @@ def test_a_free_grasp_is_reached_and_left_over_ten_centimetres(free: Executions)
     np.testing.assert_allclose(free.retreat, -free.approach, atol=1e-12)
 
 
-def test_the_open_hand_touches_nothing_of_a_free_object_on_its_way(free: Executions) -> None:
+def test_open_hand_touches_nothing_of_a_free_object_on_its_way(free: Executions) -> None:
     """MuJoCo is the oracle: its convex pieces of the object stand out from the surface by up to 2 mm."""
     trial = Trial(build(free.hand, free.obj, decompose(free.obj), MujocoOptions()))
     assert len(free) >= 4
@@ -85,7 +85,7 @@ def test_the_open_hand_touches_nothing_of_a_free_object_on_its_way(free: Executi
 
 
 @pytest.mark.slow
-def test_a_grasp_without_a_free_way_is_left_out_and_none_at_all_is_refused() -> None:
+def test_grasps_without_a_free_way_are_left_out_none_is_refused() -> None:
     hand = two_finger_hand()
     shell = trimesh.creation.icosphere(subdivisions=3, radius=0.12)
     inner = trimesh.creation.icosphere(subdivisions=3, radius=0.105)
@@ -96,9 +96,7 @@ def test_a_grasp_without_a_free_way_is_left_out_and_none_at_all_is_refused() -> 
         executions(hand, ball, caught, rows=np.zeros(1, int), placed=None, tool=TOOL, quality={})
 
 
-def test_in_a_scene_the_ways_of_the_shard_are_kept_in_the_frame_of_the_scene(
-    table_shard: Path, on_table: Executions
-) -> None:
+def test_in_scene_ways_of_shard_are_kept_in_frame_of_the_scene(table_shard: Path, on_table: Executions) -> None:
     shard = read_shard(table_shard, kind="base")
     at = shard["scene/object_pose"][shard["grasp/scene_index"]]
     np.testing.assert_array_equal(on_table.object_pose, at)
@@ -140,7 +138,7 @@ def test_a_tool_frame_that_is_none_is_refused_in_a_line(text: str, said: str) ->
 
 
 @pytest.mark.parametrize("speed", [0.2, 1.0])
-def test_trajectories_stay_within_the_limits_and_reach_every_posture(free: Executions, speed: float) -> None:
+def test_trajectories_stay_within_limits_and_reach_every_posture(free: Executions, speed: float) -> None:
     velocity = np.linspace(0.3, 2.0, len(free.hand.joint_names))
     for row in range(len(free)):
         found = timed(straight_paths(free, row), free.hand.joint_names, velocity, speed=speed)
@@ -159,7 +157,7 @@ def test_trajectories_stay_within_the_limits_and_reach_every_posture(free: Execu
             )
 
 
-def test_limits_are_those_of_the_hand_and_where_it_has_none_they_are_assumed(free: Executions) -> None:
+def test_limits_are_those_of_the_hand_or_assumed(free: Executions) -> None:
     hand = replace(free.hand, velocity=np.concatenate([[3.0], np.zeros(free.hand.dofs - 1)]))
     found: Limits = hand_limits(hand)
     leads = hand.dof[hand.joint_body] == 0

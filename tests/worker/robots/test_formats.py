@@ -102,7 +102,7 @@ def test_a_mujoco_scene_replays_to_the_verdict_of_the_referee(
     }
 
 
-def test_a_mujoco_scene_has_the_hands_names_and_a_key_frame_for_each_posture(table_shard: Path, tmp_path: Path) -> None:
+def test_a_mujoco_scene_has_the_hands_names_and_key_frames(table_shard: Path, tmp_path: Path) -> None:
     export(table_shard, "mujoco", tmp_path)
     model = mujoco.MjModel.from_xml_path(str(tmp_path / "scene.xml"))
     data = mujoco.MjData(model)
@@ -245,7 +245,7 @@ def expected(shard: Path, row: int) -> tuple[dict[str, np.ndarray], np.ndarray]:
 
 
 @pytest.mark.parametrize("which", ["free_shard", "table_shard"])
-def test_trimesh_reads_a_grasp_whose_parts_stand_where_they_should(
+def test_trimesh_reads_grasp_whose_parts_stand_where_they_should(
     which: str, request: pytest.FixtureRequest, tmp_path: Path
 ) -> None:
     shard = request.getfixturevalue(which)
@@ -269,9 +269,7 @@ def test_trimesh_reads_a_grasp_whose_parts_stand_where_they_should(
             np.testing.assert_allclose(found.max(axis=0), turned.max(axis=0), atol=ROUNDING_M)
 
 
-def test_usd_opens_a_grasp_in_metres_that_moves_from_the_standoff_to_the_lift(
-    table_shard: Path, tmp_path: Path
-) -> None:
+def test_usd_opens_a_grasp_in_metres_that_moves_to_the_lift(table_shard: Path, tmp_path: Path) -> None:
     usd = pytest.importorskip("pxr.Usd")
     geometry = pytest.importorskip("pxr.UsdGeom")
     export(table_shard, "usd", tmp_path)

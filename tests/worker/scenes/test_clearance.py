@@ -35,7 +35,7 @@ def lowest_vertex(posture: Posture, object_pose: np.ndarray) -> np.ndarray:
     return np.min([apply(bodies[:, p.body][:, None], p.vertices)[..., 2].min(axis=1) for p in HAND.pieces], axis=0)
 
 
-def test_clearance_agrees_with_all_corners_of_all_pieces_on_the_way():
+def test_clearance_agrees_with_all_corners_of_all_pieces_on_way():
     rng = np.random.default_rng(0)
     grasp, pregrasp = postures(rng, 5), postures(rng, 5)
     scenes = postures(rng, 3).hand_pose
@@ -46,7 +46,7 @@ def test_clearance_agrees_with_all_corners_of_all_pieces_on_the_way():
     np.testing.assert_allclose(found, expected, atol=TESSELLATION_M)
 
 
-def test_transferred_poses_are_the_base_poses_seen_from_the_table():
+def test_transferred_poses_are_base_poses_seen_from_the_table():
     rng = np.random.default_rng(1)
     grasp, scenes = postures(rng, 4), postures(rng, 2).hand_pose
     result = transfer(HAND, grasp, grasp, scenes)
@@ -74,7 +74,7 @@ def test_a_grasp_is_valid_from_the_stated_margin_on(gap, valid):
     assert transfer(HAND, posture, posture, IDENTITY)["grasp/valid"].tolist() == [valid]
 
 
-def test_a_hand_that_sweeps_through_the_table_between_its_two_postures_is_caught():
+def test_a_hand_that_sweeps_through_the_table_is_caught():
     """Fingers point sideways at both ends and straight down half-way."""
     y = np.array([0.0, 1, 0])
     start, end = (np.concatenate([[0, 0, 0.075], quat_from_axis_angle(y, np.asarray(np.pi + a))]) for a in (-1.4, 1.4))
@@ -104,7 +104,7 @@ def test_many_grasps_give_what_each_gives_alone():
     np.testing.assert_allclose(together[[0, 64, 129]], alone, atol=1e-12)
 
 
-def test_no_grasps_are_empty_and_without_pregrasps_or_too_many_refused() -> None:
+def test_no_grasps_are_empty_too_many_are_refused() -> None:
     none = Posture(np.zeros((0, 7)), np.zeros((0, 2)))
     result = transfer(HAND, none, none, IDENTITY)
     assert result["grasp/hand_pose"].shape == (0, 7)
@@ -114,8 +114,6 @@ def test_no_grasps_are_empty_and_without_pregrasps_or_too_many_refused() -> None
         transfer(HAND, postures(rng, 2), postures(rng, 1), IDENTITY)
     with pytest.raises(InputError, match="1 to 8"):
         drop_together(box(0.05, 0.05, 0.05), [box(0.02, 0.02, 0.02)] * 9, count=1, seed=0)
-
-
 
 
 #: MuJoCo stores meshes in float32 and its GJK stops at 1e-6 of the size.
@@ -157,7 +155,7 @@ def _axes(pose: np.ndarray) -> np.ndarray:
     return apply(np.concatenate([np.zeros(3), pose[3:]]), np.eye(3))
 
 
-def test_the_same_seed_gives_the_same_scenes_and_more_scenes_keep_the_first():
+def test_same_seed_gives_same_scenes_and_more_scenes_keep_first():
     objects = [box(0.05, 0.06, 0.07), box(0.04, 0.04, 0.12)]
     first, more = (drop_together(objects[0], objects[1:], count=n, seed=3) for n in (2, 3))
     for name, values in first.items():
@@ -172,9 +170,7 @@ def test_clearance_from_a_box_is_the_gap_or_the_depth(height):
     assert found[0, 0] == pytest.approx(0.25 - 0.079 - height, abs=ENGINE_M)
 
 
-
-
-def test_clearance_is_no_larger_than_any_distance_of_corners_and_capped():
+def test_clearance_is_a_capped_lower_bound_of_corner_distances():
     rng = np.random.default_rng(0)
     block = box(0.04, 0.05, 0.06)
     posture, poses = postures(rng, 12), np.array([[[0.15, 0.1, 0.03, 1.0, 0, 0, 0]]])
@@ -190,7 +186,7 @@ def test_clearance_is_no_larger_than_any_distance_of_corners_and_capped():
     assert (found == FARTHEST_M).any() and (found < FARTHEST_M).any()
 
 
-def test_a_grasp_that_a_neighbour_blocks_is_rejected_with_the_reason():
+def test_grasp_that_neighbour_blocks_is_rejected_with_the_reason():
     low = np.array([[0, 0, 0.2, *DOWN[3:]]])
     high = np.array([[0, 0, 0.3, *DOWN[3:]]])
     still = np.zeros((1, 2))
@@ -213,5 +209,3 @@ def test_the_table_comes_before_the_neighbours_among_the_reasons():
     tower = Neighbours([box(0.02, 0.02, 0.15)], np.array([[[0.04, 0, 0.075, 1.0, 0, 0, 0]]]))
     posture = Posture(into_table, np.zeros((1, 2)))
     assert transfer(HAND, posture, posture, LEVEL, tower)["grasp/rejection"][0] == Rejection.TABLE_AT_CONTACT
-
-

@@ -102,7 +102,7 @@ def test_a_grasp_does_not_depend_on_the_scenes_of_the_others(planned) -> None:
     assert np.array_equal(found.grasp.hand_pose, grasps.grasp.hand_pose[:3])
 
 
-def test_a_scene_without_obstacles_leaves_the_hand_free_to_come_from_below() -> None:
+def test_without_obstacles_a_hand_may_come_from_below() -> None:
     hand, obj = hand_from_path("barrett"), object_from_path("block", face_error_m=QUICK.face_error_m)
     nothing = Placed((), np.array([[0, 0, 0, 1.0, 0, 0, 0]]), np.zeros(8, int))
     found = synthesize(hand, obj, Wanted(count=8, fidelity=QUICK, seed=4, placed=nothing))
@@ -132,8 +132,6 @@ def test_what_is_of_free_objects_only_is_refused_in_scenes(tmp_path: Path) -> No
     ):
         result = CliRunner().invoke(build(), [str(word) for word in words])
         assert result.exit_code == 2 and told in result.output
-
-
 
 
 TABLE = {"kind": "half_space"}
@@ -207,7 +205,7 @@ def planned_beside():
     return hand, thing, placed, grasps
 
 
-def test_the_whole_way_between_neighbours_is_as_clear_as_it_says_by_mujocos_distances(planned_beside) -> None:
+def test_a_way_between_neighbours_is_as_clear_as_mujoco_says(planned_beside) -> None:
     """At a hundred postures; those between the ones that were looked at may be nearer by what a finger's arc deviates
     from its chord."""
     hand, thing, placed, grasps = planned_beside
@@ -227,7 +225,7 @@ def test_the_whole_way_between_neighbours_is_as_clear_as_it_says_by_mujocos_dist
             assert np.min(found) >= MARGIN_M - 5e-4
 
 
-def test_without_its_neighbours_the_same_hand_would_reach_through_them(planned_beside) -> None:
+def test_without_neighbours_the_hand_would_reach_through_them(planned_beside) -> None:
     """The test above would pass for a scene in which nothing is in the way."""
     hand, thing, placed, _ = planned_beside
     alone = type(placed)(placed.supports, placed.object_pose, placed.index)
@@ -236,7 +234,7 @@ def test_without_its_neighbours_the_same_hand_would_reach_through_them(planned_b
     assert np.min(least) < 0
 
 
-def test_synth_with_neighbours_writes_them_and_lifts_are_judged_alike(tmp_path: Path) -> None:
+def test_synth_with_neighbours_writes_them_lifts_judge_alike(tmp_path: Path) -> None:
     out = tmp_path / "g.h5"
     table = "--scene table --with mug --scenes 1 -n 4 --want raw --fidelity draft"
     said = graspd(f"synth --hand barrett --object block {table} -o", out)

@@ -61,15 +61,13 @@ def test_the_simulated_inertia_is_the_meshs_and_not_the_hulls():
 
 
 @pytest.mark.parametrize("name", ["025_mug", "037_scissors", "006_mustard_bottle"])
-def test_scanned_objects_rest_with_their_centre_of_mass_over_their_support(shared_data, name):
+def test_scanned_objects_rest_with_their_centre_over_the_support(shared_data, name):
     obj = scan(shared_data, name)
     for pose in drop(obj, count=6, seed=3)["scene/object_pose"]:
         assert overhang(obj, pose) < 0
 
 
-
-
-def test_the_lowest_point_touches_the_table_and_the_object_stays_near_the_middle():
+def test_lowest_point_touches_table_and_object_stays_near_middle():
     obj = bracket()
     poses = drop(obj, count=8, seed=1)["scene/object_pose"]
     heights = apply(poses[:, None], obj.hull_vertices)[..., 2].min(axis=1)
@@ -99,7 +97,7 @@ def test_a_thin_slab_almost_never_stands_on_an_edge():
     assert np.all(np.abs(result["scene/rest_probability"] - 0.5) < 4 * 0.0625)
 
 
-def test_the_same_seed_gives_the_same_scenes_and_more_scenes_keep_the_first():
+def test_same_seed_gives_same_scenes_and_more_scenes_keep_first():
     obj = bracket()
     first, again, more = drop(obj, count=3, seed=7), drop(obj, count=3, seed=7), drop(obj, count=5, seed=7)
     for name, values in first.items():
@@ -124,7 +122,7 @@ def test_stable_faces_agree_with_trimeshs():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("size", [(0.04, 0.06, 0.09), (0.05, 0.06, 0.07)])
-def test_bricks_rest_on_each_pair_of_faces_as_often_as_the_quasi_static_theory_says(size):
+def test_bricks_rest_on_faces_as_often_as_theory_says(size):
     """Chi-square of 300 drops against Goldberg et al. (1999), which knows no bouncing: contacts here hardly bounce."""
     mesh = trimesh.creation.box(size)
     poses = drop(object_from_mesh(mesh), count=300, seed=0)["scene/object_pose"]
@@ -152,7 +150,7 @@ CONVEX = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CONVEX)
-def test_convex_objects_rest_on_each_face_as_often_as_the_quasi_static_theory_says(name):
+def test_convex_objects_rest_on_faces_as_often_as_theory_says(name):
     mesh = CONVEX[name]
     poses = drop(object_from_mesh(mesh, name), count=300, seed=0)["scene/object_pose"]
     down = quat_rotate(poses[:, 3:] * np.array([1, -1, -1, -1]), np.array([0.0, 0, -1]))
@@ -197,7 +195,7 @@ def test_reference_drops_are_simulated_once_on_a_machine(dropped):
     "harm",
     [{"face": np.full(64, 99)}, {"face": np.zeros(3, np.int64)}, {"face": np.zeros(64)}, {"other": np.zeros(64)}],
 )
-def test_kept_drops_that_cannot_be_those_of_the_object_are_simulated_again(dropped, tmp_path, harm):
+def test_kept_drops_of_another_object_are_simulated_again(dropped, tmp_path, harm):
     next_process()
     first = drop(bracket(), count=1, seed=5)
     (file,) = tmp_path.rglob("drops/*.npz")
@@ -214,8 +212,6 @@ def test_no_scenes_are_empty_and_negative_counts_refused() -> None:
     assert result["scene/rest_probability"].shape == result["scene/drop_seconds"].shape == (0,)
     with pytest.raises(InputError, match="must not be negative"):
         drop(bracket(), count=-1, seed=0)
-
-
 
 
 def test_a_flat_object_is_refused_by_name():
@@ -241,7 +237,7 @@ def face_along(faces: RestingFaces, normal: tuple[float, float, float]) -> int:
     return int((faces.normal @ np.array(normal)).argmax())
 
 
-def test_a_plate_topples_from_an_edge_whose_tilt_passes_its_middle() -> None:
+def test_plate_topples_from_an_edge_whose_tilt_passes_its_middle() -> None:
     # Height 30 mm, half the thickness t / 2 inside: 1 mm of change tilts by 1 / t, so t t / 2 must pass 30 mm^2.
     for thickness, falls in ((0.0074, True), (0.0080, False)):
         faces = resting_faces(plate(thickness))
@@ -303,8 +299,6 @@ def test_the_object_stands_on_its_support_and_in_nothing_else(kind: str) -> None
         assert sorted(distances)[1:] == sorted(d for d in distances if d > 1e-4)[-len(distances) + 1 :]
 
 
-
-
 def test_all_faces_are_those_that_enough_drops_end_on() -> None:
     found = rest_poses(SceneSpec(kind="table", faces="all"), BLOCK, count=1, seed=0)
     heights = sorted(np.round(2 * found["scene/object_pose"][:, 2], 6).tolist())
@@ -318,23 +312,19 @@ def test_all_faces_are_those_that_enough_drops_end_on() -> None:
     assert 1 <= len(found["scene/object_pose"]) <= 20
 
 
-def test_an_object_too_large_for_a_bin_is_refused_with_both_sizes() -> None:
+def test_object_too_large_for_a_bin_is_refused_with_both_sizes() -> None:
     plank = object_from_mesh(trimesh.creation.box((0.5, 0.05, 0.05)), "plank")
     with pytest.raises(InputError, match=r"plank lies .* mm and there is room for 380 x 280 mm"):
         rest_poses(SceneSpec(kind="bin"), plank, count=2, seed=0)
 
 
-
-
-def test_a_target_stands_where_it_is_told_and_not_under_its_support() -> None:
+def test_a_target_stands_where_told_and_not_under_its_support() -> None:
     spec = SceneSpec(kind="file", supports=({"kind": "half_space"},), target=(0.1, 0, 0.055, 1, 0, 0, 0))
     found = rest_poses(spec, BLOCK, count=2, seed=0)["scene/object_pose"]
     assert np.array_equal(found, np.tile([0.1, 0, 0.055, 1, 0, 0, 0], (2, 1)))
     spec = SceneSpec(kind="file", supports=({"kind": "half_space"},), target=(0, 0, 0, 1, 0, 0, 0))
     with pytest.raises(InputError, match="deep in support 0"):
         rest_poses(spec, BLOCK, count=1, seed=0)
-
-
 
 
 def box(*size: float, name: str = "box"):
@@ -354,7 +344,7 @@ def corners_of(obj, poses: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("kind", ["bin", "shelf"])
-def test_neighbours_stand_within_the_walls_apart_and_on_the_floor(kind: str) -> None:
+def test_neighbours_stand_within_walls_apart_and_on_the_floor(kind: str) -> None:
     others = [LOW, TALL, LOW]
     spec, scenes, poses = laid(kind, others, count=4)
     room = np.asarray(room_in(spec)) / 2 - GAP
@@ -372,7 +362,7 @@ def test_neighbours_stand_within_the_walls_apart_and_on_the_floor(kind: str) -> 
     assert not np.allclose(poses["scene/neighbour_pose"][:, 0], poses["scene/neighbour_pose"][:, 2]), "two lie apart"
 
 
-def test_more_scenes_keep_the_first_ones_and_the_object_lies_where_it_lies_alone() -> None:
+def test_more_scenes_keep_the_first_and_where_the_object_lies() -> None:
     _, _, few = laid("bin", [LOW], count=2)
     _, _, more = laid("bin", [LOW], count=3)
     np.testing.assert_array_equal(more["scene/neighbour_pose"][:2], few["scene/neighbour_pose"])
@@ -388,7 +378,7 @@ def test_on_a_table_each_face_has_its_neighbours() -> None:
     assert poses["scene/neighbour_pose"].shape == (len(ups), 2, 7)
 
 
-def test_as_many_as_a_scene_may_have_find_room_around_one_like_them() -> None:
+def test_as_many_as_may_be_find_room_around_one_like_them() -> None:
     """Dropped together their bounding balls would never fit on one ring."""
     _, _, poses = laid("table", [THING] * 8, count=1)
     together = np.concatenate([poses["scene/object_pose"][:, None], poses["scene/neighbour_pose"]], axis=1)

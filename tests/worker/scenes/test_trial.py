@@ -106,7 +106,7 @@ def test_a_score_is_that_of_the_lift(monkeypatch: pytest.MonkeyPatch) -> None:
     assert found[0] <= BEST
 
 
-def test_a_hand_that_must_lift_at_half_the_friction_to_be_better_and_does_not_is_no_better(
+def test_lifting_at_half_the_friction_is_asked_to_be_better(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     outcomes = {True: [LIFTED, FELL], False: [LIFTED, LIFTED]}
@@ -115,7 +115,7 @@ def test_a_hand_that_must_lift_at_half_the_friction_to_be_better_and_does_not_is
 
 
 @pytest.mark.parametrize(("verdict", "score"), [(1, 0.2), (0, SLIPS + 1.0 + FALLS * 0.2)])
-def test_a_free_grasp_that_the_referee_drops_is_no_good_candidate(
+def test_free_grasp_that_the_referee_drops_is_no_good_candidate(
     monkeypatch: pytest.MonkeyPatch, verdict: int, score: float
 ) -> None:
     monkeypatch.setattr(trials, "push_trial", lambda *_: lambda grasps, *_: np.array([0.2, 4.0, 4.0]))

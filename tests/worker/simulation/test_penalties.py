@@ -62,7 +62,7 @@ def fist_in_ball(hand: HandModel) -> HandState:
 
 
 @pytest.mark.parametrize("name", ["allegro", "shadow"])
-def test_object_points_inside_links_push_the_hand_along_the_true_gradient(name: str) -> None:
+def test_object_points_inside_links_push_along_the_gradient(name: str) -> None:
     hand, obj = hand_from_path(name), ball()
     state = fist_in_ball(hand)
     samples = object_samples(obj, 1000) - obj.centre_of_mass
@@ -128,7 +128,7 @@ def beside_a_ball(hand: HandModel, gap: float) -> HandState:
 
 
 @pytest.mark.parametrize("name", ["allegro", "barrett"])
-def test_points_that_touch_nothing_are_pulled_along_the_true_gradient(name: str) -> None:
+def test_points_that_touch_nothing_are_pulled_by_the_gradient(name: str) -> None:
     """Against the energy -2 w d l sum w_i exp(-rho_i / l) over points beyond the surface of a ball in closed form."""
     hand, radius = hand_from_path(name), 0.035
     points, weight, pull, length, band = sample_surface(hand, 300), 40.0, 3e-4, 0.013, 0.2
@@ -156,7 +156,7 @@ def test_points_that_touch_nothing_are_pulled_along_the_true_gradient(name: str)
     np.testing.assert_allclose(found, expected, atol=1e-2 * np.abs(expected).max())
 
 
-def test_the_share_of_a_hand_that_is_near_is_its_area_over_the_whole() -> None:
+def test_share_of_a_hand_that_is_near_is_its_area_over_the_whole() -> None:
     hand, radius, reach = hand_from_path("allegro"), 0.035, 0.02
     points = sample_surface(hand, 300)
     states = [beside_a_ball(hand, gap) for gap in (0.012, 0.03, 1.0)]
@@ -171,7 +171,7 @@ def test_the_share_of_a_hand_that_is_near_is_its_area_over_the_whole() -> None:
     np.testing.assert_allclose(data.near_share(reach, 3), expected, atol=1 / 200)
 
 
-def test_the_range_and_limit_penalties_have_their_closed_form_gradient() -> None:
+def test_range_and_limit_penalties_have_closed_form_gradients() -> None:
     hand = hand_from_path("barrett")
     q = hand.upper + 0.1
     state = HandState(np.array([[0.5, 0.0, 0.0]]), np.array([[1.0, 0.0, 0.0, 0.0]]), q[None])
@@ -342,7 +342,7 @@ def test_obstacles_push_the_hand_along_the_true_gradient(name: str, scene: str) 
 
 
 @pytest.mark.parametrize("name", ["allegro", "barrett", "shadow"])
-def test_the_depth_is_what_the_nearest_feature_lacks_of_its_margin(name: str) -> None:
+def test_depth_is_what_the_nearest_feature_lacks_of_its_margin(name: str) -> None:
     hand, obstacles = hand_from_path(name), SCENES["table"]
     model, data = simulation_in(hand, obstacles)
     data.set_state(reaching(hand))
@@ -352,7 +352,7 @@ def test_the_depth_is_what_the_nearest_feature_lacks_of_its_margin(name: str) ->
     np.testing.assert_allclose(data.deepest(1)[0], expected, atol=1e-6)
 
 
-def test_a_start_keeps_a_quarter_of_its_room_under_fingertips_that_may_touch() -> None:
+def test_a_start_keeps_a_quarter_of_its_room_under_fingertips() -> None:
     hand, (table,) = hand_from_path("barrett"), SCENES["a table to press into"]
     model, data = simulation_in(hand, (table,))
     data.set_state(reaching(hand))
@@ -382,7 +382,7 @@ def test_a_hand_without_a_scene_feels_no_obstacle() -> None:
 
 
 @pytest.mark.parametrize("name", ["allegro", "barrett", "shadow"])
-def test_the_projection_brings_a_hand_out_of_a_stick_between_its_corners(name: str) -> None:
+def test_projection_brings_hand_out_of_stick_between_its_corners(name: str) -> None:
     """The stick is pushed into the largest face of the palm: no corner of the hand is near it."""
     hand = hand_from_path(name)
     state = reaching(hand)

@@ -216,7 +216,7 @@ def test_marked_points_get_the_slots_of_a_counter(count: int) -> None:
     assert totals[0].numpy()[2] == -1
 
 
-def test_a_batch_has_the_same_bits_where_threads_come_in_any_order(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_batch_has_the_same_bits_where_threads_come_in_any_order(monkeypatch: pytest.MonkeyPatch) -> None:
     box = object_from_mesh(trimesh.creation.box((0.05, 0.05, 0.08)))
     states = []
     for serial in (True, False):

@@ -77,7 +77,7 @@ def test_the_smoothed_distance_is_continuous_across_the_surface() -> None:
     assert np.abs(np.diff(found, axis=1))[near].max() < 1.2e-5
 
 
-def test_normals_of_a_fine_ball_point_outward_on_both_sides_and_on_the_surface() -> None:
+def test_normals_of_a_fine_ball_point_outward_everywhere() -> None:
     obj = ball(0.035, subdivisions=4)
     rng = np.random.default_rng(4)
     points = np.concatenate([around(rng, 0.035, 0.003), obj.vertices[:20]])
@@ -89,7 +89,7 @@ def test_normals_of_a_fine_ball_point_outward_on_both_sides_and_on_the_surface()
 
 
 @pytest.mark.parametrize("alpha", [0.0, 0.5])
-def test_the_normal_is_the_gradient_of_the_distance_away_from_the_surface(alpha: float) -> None:
+def test_normal_is_gradient_of_distance_away_from_the_surface(alpha: float) -> None:
     obj = ball(0.035, subdivisions=4)
     points = around(np.random.default_rng(5), 0.05, 0.01, 100)
     _, normals = probe(obj, points, alpha=alpha)
@@ -105,7 +105,7 @@ def test_the_normal_is_the_gradient_of_the_distance_away_from_the_surface(alpha:
     assert np.median(cosine) > 0.9995 and cosine.min() > 0.99
 
 
-def test_the_grid_agrees_with_the_mesh_and_is_not_asked_when_near() -> None:
+def test_grid_agrees_with_the_mesh_and_is_not_asked_when_near() -> None:
     obj = ball(0.035)
     points = around(np.random.default_rng(6), 0.05, 0.012)
     grid = probe(obj, points, alpha=0.5, cell=0.005, exact_below=0.0)[0]
@@ -124,7 +124,7 @@ def test_a_thin_plate_has_an_inside_and_two_outsides() -> None:
     np.testing.assert_allclose(found, np.abs(z) - 0.0005, atol=FLOAT32)
 
 
-def test_points_far_away_on_edges_and_on_vertices_give_finite_results() -> None:
+def test_points_far_away_on_edges_and_vertices_are_finite() -> None:
     box = object_of(trimesh.creation.box((0.06, 0.04, 0.08)))
     corner = np.array([0.03, 0.02, 0.04])
     points = np.array([corner, corner * [1, 1, 0], [0, 0, 0], [5.0, 5, 5], corner + 1e-9])
@@ -185,7 +185,7 @@ def test_lists_of_faces_give_the_distances_and_signs_of_the_tree() -> None:
         np.testing.assert_array_equal(found.numpy()[apart] < 0, inside)
 
 
-def test_normals_of_features_are_those_of_the_solid_at_edges_and_corners() -> None:
+def test_normals_of_features_are_of_the_solid_at_edges() -> None:
     box = trimesh.creation.box((2.0, 2.0, 2.0))
     normals = feature_normals(np.asarray(box.vertices), np.asarray(box.faces))
     corners = normals[:, 4:].reshape(-1, 3)
@@ -223,7 +223,7 @@ def distances_from(hand: HandModel, index: int, points: np.ndarray) -> np.ndarra
 
 
 @pytest.mark.parametrize("name", ["allegro", "barrett", "shadow"])
-def test_depths_inside_every_piece_agree_with_the_float64_distance(name: str) -> None:
+def test_depths_inside_every_piece_agree_with_float64_distance(name: str) -> None:
     kernels.load("cpu")
     hand = hand_from_path(name)
     rng = np.random.default_rng(0)

@@ -24,7 +24,7 @@ TILTED = np.array([0.1, -0.2, 0.3, 0.8, 0.2, -0.4, 0.4]) / [1, 1, 1, 1, 1, 1, 1]
 TILTED[3:] /= np.linalg.norm(TILTED[3:])
 
 
-def test_distances_are_closed_forms_over_faces_and_a_bound_beyond_edges() -> None:
+def test_distances_are_closed_forms_and_a_bound_beyond_edges() -> None:
     plane = Obstacle.half_space([0, 0, 2], 0.5)
     np.testing.assert_allclose(plane.distance(np.array([[1, 2, 3], [0, 0, 0.1]])), [2.75, -0.15], atol=1e-12)
     box = Obstacle.box([0, 0, 0, 1, 0, 0, 0], [0.2, 0.4, 0.6])
@@ -77,7 +77,7 @@ def test_the_distance_of_a_hand_from_a_plane_is_mujocos(name: str) -> None:
     np.testing.assert_allclose(found, mujoco_distances(hand, postures, plane), atol=1e-5)
 
 
-def test_fingertips_have_more_room_over_what_they_may_touch_and_nothing_else_has() -> None:
+def test_only_fingertips_have_more_room_over_what_they_may_touch() -> None:
     hand = hand_from_path("barrett")
     posture = Posture(np.array([[0, 0, 0, 1.0, 0, 0, 0]]), hand.expand(hand.preshape[None]))
     table, wall = Obstacle.half_space([0, 0, 1], -0.3), Obstacle.half_space([1, 0, 0], -0.4)
@@ -226,7 +226,7 @@ def test_a_link_through_a_board_is_in_it(kind: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["allegro", "barrett", "shadow"])
-def test_no_hand_is_nearer_to_a_solid_than_it_says_by_mujocos_distances(name: str) -> None:
+def test_no_hand_is_nearer_to_a_solid_than_it_says_by_mujoco(name: str) -> None:
     """Exact for links that are boxes or round (1e-5 m: MuJoCo's meshes are float32 and converge to 1e-6); for hulls a
     lower bound."""
     hand, rng = hand_from_path(name), np.random.default_rng(2)

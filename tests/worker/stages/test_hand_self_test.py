@@ -60,7 +60,7 @@ def test_objects_are_as_wide_as_suits_the_opening() -> None:
         assert np.ptp(obj.vertices, axis=0).min() == pytest.approx(width, rel=0.01)
 
 
-def test_a_hand_that_drops_one_kind_or_lifts_little_is_suspicious() -> None:
+def test_hand_that_drops_one_kind_or_lifts_little_is_suspicious() -> None:
     held = SelfTest(0.91, 64, 0.04, {"box": 0.9, "sphere": 0.92}, 0.6, 16)
     assert held.line == "ready: 91 % hold, 60 % lift off a table"
     dropped = replace(held, gsr=0.5, by_object={"box": 0.1, "sphere": 0.9})
@@ -99,7 +99,7 @@ def three_fingers_urdf() -> bytes:
     return robot(link("palm", _PALM), *fingers)
 
 
-def test_a_finger_of_one_joint_reaches_to_its_pad_and_not_only_to_its_base() -> None:
+def test_a_finger_of_one_joint_reaches_to_its_pad() -> None:
     files = {"r.urdf": three_fingers_urdf()}
     hand = load_hand(files, name="r", digest="0" * 32, options={"approach": [0, 0, 1]})
     assert jaws_of(hand) is None

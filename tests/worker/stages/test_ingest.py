@@ -53,7 +53,7 @@ def run(store: Store, context: TaskContext, files: dict[str, bytes], kind: Asset
     return found
 
 
-def test_objects_are_taken_with_their_facts_or_refused_with_a_reason(context: TaskContext) -> None:
+def test_objects_are_taken_with_facts_or_refused_with_a_reason(context: TaskContext) -> None:
     found = run(context.store, context, OBJECT, AssetKind.OBJECT)
     assert found["verdict"] in ("accept", "repair"), found["message"]
     assert found["facts"]
@@ -125,7 +125,7 @@ def child_does(monkeypatch: pytest.MonkeyPatch, code: str) -> None:
     monkeypatch.setattr(ingest.subprocess, "Popen", other)
 
 
-def test_a_check_that_the_machine_killed_says_nothing_about_the_file(
+def test_check_that_machine_killed_says_nothing_about_the_file(
     context: TaskContext, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     child_does(monkeypatch, "os.kill(os.getpid(), signal.SIGKILL)")
@@ -179,7 +179,7 @@ def test_a_check_loads_no_engine() -> None:
     assert not {"warp", "newton", "mujoco"} & set(done.stdout.split())
 
 
-def test_a_finding_that_is_long_and_a_check_that_complains_are_told(
+def test_finding_that_is_long_and_check_that_complains_are_told(
     context: TaskContext, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(ingest, "_FINDING_BYTES", 10)
@@ -343,9 +343,7 @@ def test_an_attack_is_refused_and_the_worker_does_the_next_task(filename: str, d
     ],
     ids=["slip", "absolute", "nested", "bomb", "link", "many", "damaged", "lzma"],
 )
-def test_an_archive_that_attacks_is_refused_at_the_door_and_reaches_no_worker(
-    archive: Callable[[], bytes], says: str
-) -> None:
+def test_an_archive_that_attacks_is_refused_at_the_door(archive: Callable[[], bytes], says: str) -> None:
     data, start = archive(), computed()
     with pytest.raises(InputError, match=says):
         publish_asset(
@@ -369,7 +367,7 @@ def rough(segments: int) -> bytes:
     ("limits", "says"),
     [({"cpu_s": 1}, "takes longer than 1 s"), ({"memory_bytes": 400 * 2**20}, "needs more than 0.391 GiB")],
 )
-def test_a_mesh_that_costs_too_much_is_refused_and_the_next_one_is_taken(limits: dict[str, int], says: str) -> None:
+def test_a_mesh_that_costs_too_much_is_refused_the_next_taken(limits: dict[str, int], says: str) -> None:
     context, start = TaskContext(open_store("memory://")), computed()
     files = {"asset.json": b'{"file": "m.stl"}', "m.stl": rough(512)}
     found, _ = ingest.check_in_child(AssetKind.OBJECT, "rough", files, context, **limits)  # type: ignore[arg-type]

@@ -76,7 +76,7 @@ def test_the_grasps_of_a_job_are_those_of_synth_with_the_file(
     assert (made["grasp/hand_pose"] != other.arrays["grasp/hand_pose"]).any(), "the network is followed"
 
 
-def test_files_in_the_store_that_are_not_what_their_digest_says_fail_the_job_in_a_line(
+def test_files_that_are_not_what_their_digest_says_fail_the_job(
     store: Store, network: Asset, files: dict[str, bytes]
 ) -> None:
     key = names.asset_files(AssetKind.NETWORK, network.digest)
@@ -119,7 +119,7 @@ def test_a_network_whose_finding_was_lost_is_checked_by_a_worker(
         {"supports": [{"kind": "box", "size": [1, 1, 0.1]}]},
     ],
 )
-def test_a_scene_is_refused_at_the_door_where_the_planner_finds_no_table(scene: Any) -> None:
+def test_scene_is_refused_at_door_where_planner_finds_no_table(scene: Any) -> None:
     place = JobOptions(scene=scene).place
     assert place == scene_of(JobOptions(scene=scene).scene, faces="drawn", touch=0.0, beside=())
     try:

@@ -114,7 +114,7 @@ def test_an_objects_model_is_its_prepared_mesh() -> None:
 
 
 @pytest.mark.parametrize("kind", list(AssetKind))
-def test_the_models_that_come_with_graspd_are_those_of_its_assets(kind: AssetKind) -> None:
+def test_models_that_come_with_graspd_are_those_of_its_assets(kind: AssetKind) -> None:
     for name in builtin_names(kind):
         assert model_of(kind, name, builtin_files(kind, name)) == builtin_model(kind, name), (
             "python -m worker.stages.models"

@@ -97,7 +97,7 @@ def test_a_base_shard_of_other_batches_is_refused() -> None:
         base_rows(base, message.model_copy(update={"count": 3 * SIZE}))
 
 
-def test_a_range_tells_how_far_it_is_and_stops_where_it_is_told_to(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_range_tells_how_far_it_is_and_stops_where_it_is_told_to(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("worker.stages.context.REPORT_EVERY_S", 0.0)
     store = open_store("memory://")
     job, _ = made(store, 2, grasps=2 * SIZE, want="raw")
@@ -123,7 +123,7 @@ def test_a_range_tells_how_far_it_is_and_stops_where_it_is_told_to(monkeypatch: 
 
 
 @pytest.mark.parametrize(("refused", "rows"), [({1}, f"[{SIZE}, 0, 1]"), ({0}, ""), ({0, 1, 2}, "")])
-def test_a_batch_whose_scenes_leave_no_place_has_no_grasps_but_for_the_first_of_a_job(
+def test_a_batch_without_a_place_has_no_grasps_but_for_the_first(
     monkeypatch: pytest.MonkeyPatch, refused: set[int], rows: str
 ) -> None:
     """As where none is found within the budget: the grasps of the other batches stay."""

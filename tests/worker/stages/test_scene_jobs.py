@@ -95,7 +95,7 @@ def test_pictures_show_the_scene_with_and_without_the_best_hand(table: Bench) ->
     assert set(np.unique(views["image/segmentation"])) <= {0, 1, 2}
 
 
-def test_readers_give_the_way_of_a_grasp_and_the_grasps_of_a_picture(table: Bench) -> None:
+def test_readers_give_way_of_a_grasp_and_the_grasps_of_a_picture(table: Bench) -> None:
     shards = open_shards(table.store, job=table.job.id)
     columns = ("grasp/approach", "grasp/lift", "grasp/scene_index", "quality/lift_hard", "quality/clearance_m")
     grasps = Grasps(shards, columns)
@@ -168,7 +168,7 @@ def test_a_scene_without_a_way_in_fails_the_job_and_says_so(table: Bench) -> Non
 
 
 @pytest.mark.parametrize("scene", ["table", "free"])
-def test_a_payload_out_of_reach_fails_the_job_with_what_the_hand_lifts(table: Bench, scene: str) -> None:
+def test_payload_out_of_reach_fails_job_with_what_the_hand_lifts(table: Bench, scene: str) -> None:
     bench = Bench(table.store)
     wanted = {"scene": scene, "scenes": 0, "views": 0, "grasps": 8, "budget": 4, "min_payload": 90}
     kind, words = bench.run(**TABLE | wanted)

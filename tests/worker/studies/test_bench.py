@@ -65,7 +65,7 @@ def test_kernels_on_the_processor_are_no_time_of_the_host() -> None:
     assert host < 0.5 * 1e3 * (time.thread_time() - began) / count
 
 
-def test_kernel_shares_add_up_and_the_distance_query_is_among_them() -> None:
+def test_kernel_shares_add_up_and_distance_query_is_among_them() -> None:
     fidelity = FIDELITIES["draft"]
     pair = pair_of(hand_from_path("barrett"), object_from_path("block"), fidelity, "cpu")
     for phase in kernel_shares(pair, fidelity, 4).values():

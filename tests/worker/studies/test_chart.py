@@ -40,7 +40,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], Path
     return json.loads(done.stdout.strip().splitlines()[-1]), folder
 
 
-def test_valid_grasps_per_second_are_those_that_held_over_the_seconds(made: tuple[dict[str, Any], Path]) -> None:
+def test_valid_grasps_per_second_are_those_held_over_seconds(made: tuple[dict[str, Any], Path]) -> None:
     runs = [(run["method"], run["fidelity"]) for run in made[0]["runs"]]
     assert runs == [("fast_graspd", "draft"), ("autograsp", "as published")]
     for run in made[0]["runs"]:
@@ -53,7 +53,7 @@ def test_valid_grasps_per_second_are_those_that_held_over_the_seconds(made: tupl
         assert run["gsr_low"] <= run["gsr"] <= run["gsr_high"]
 
 
-def test_end_to_end_counts_what_is_valid_over_all_that_a_job_does(made: tuple[dict[str, Any], Path]) -> None:
+def test_end_to_end_counts_what_is_valid_over_all_that_job_does(made: tuple[dict[str, Any], Path]) -> None:
     for run in made[0]["runs"]:
         assert run["kept"] <= run["valid"]
         assert all(whole > planned for whole, planned in zip(run["end_seconds"], run["seconds"], strict=True))
@@ -96,7 +96,7 @@ def test_a_wrong_option_is_the_callers_mistake(arguments: list[str]) -> None:
     assert done.exit_code == 2
 
 
-def test_a_method_can_be_charted_with_options_and_a_batch_of_its_own() -> None:
+def test_method_can_be_charted_with_options_and_batch_of_its_own() -> None:
     plain, kept = settings_of(
         ["graspit", "graspit:keep=5@10"],
         ["draft"],
@@ -120,7 +120,7 @@ def test_the_front_has_no_point_that_another_beats() -> None:
         assert (i in front) != beaten
 
 
-def test_the_first_valid_grasp_takes_as_many_calls_as_a_coin_of_that_bias() -> None:
+def test_the_first_valid_grasp_takes_the_calls_of_a_coin() -> None:
     """Against 20,000 simulated waits; standard error below 1 %."""
     share, grasps = 0.3, 2
     rng = np.random.default_rng(1)
@@ -140,7 +140,7 @@ def run_of(method: str, valid: int, seconds: float, pd: float) -> dict[str, Any]
     return row
 
 
-def test_sums_divide_all_valid_by_all_seconds_and_none_is_on_no_front() -> None:
+def test_sums_divide_all_valid_by_all_seconds() -> None:
     (row,) = summed([run_of("a", 8, 1.0, 0.1), run_of("a", 2, 4.0, 0.3)])
     assert row["valid_per_second"] == pytest.approx(10 / 5.0)
     assert row["end_to_end_per_second"] == pytest.approx(10 / 10.0)
@@ -235,7 +235,7 @@ def text_of(word: Any) -> Any:
     return Text.get_window_extent(word)
 
 
-def test_a_point_that_stands_alone_has_its_word_close_by_and_no_line() -> None:
+def test_a_point_alone_has_its_word_close_by_and_no_line() -> None:
     axes, (word,) = drawn([(10.0, 0.5)])
     box, point = word.get_window_extent(), axes.transData.transform((10.0, 0.5))
     assert word.arrow_patch is None

@@ -59,7 +59,7 @@ def test_ranking_power_of_perfect_reversed_and_blind_scores(score: list[float], 
     assert auc(np.array(score, float), np.array([False, False, True, True])) == expected
 
 
-def test_rankings_count_what_can_be_told_apart_shares_are_wilsons() -> None:
+def test_rankings_count_what_is_told_apart_shares_are_wilsons() -> None:
     scores = [np.arange(6.0), np.zeros(4)]
     found = ranking(scores, [np.arange(6) > 2, np.ones(4, bool)])
     assert (found["value"], found["n"]) == (1.0, 6)
@@ -68,7 +68,7 @@ def test_rankings_count_what_can_be_told_apart_shares_are_wilsons() -> None:
     assert (found["low"], found["high"]) == (pytest.approx(0.490, abs=1e-3), pytest.approx(0.943, abs=1e-3))
 
 
-def test_convex_objects_fall_as_their_hull_and_forearms_end_below() -> None:
+def test_convex_objects_fall_as_their_hull_forearms_end_below() -> None:
     (found,) = drops([object_from_path("block")], 4)
     assert (found["pieces"], found["same_face"]["value"], found["distance"]) == (1, 1.0, 0.0)
     half = np.sqrt(0.5)
@@ -96,7 +96,7 @@ def test_the_page_cites_the_measured_tables() -> None:
     assert f"{cell('pads', 'within 5 mm', 1)} cm² within 5 mm" in text
 
 
-def test_the_pages_recipe_finds_the_point_of_the_mesh_behind_each_pixel(tmp_path: Path) -> None:
+def test_pages_recipe_finds_point_of_the_mesh_behind_each_pixel(tmp_path: Path) -> None:
     obj = object_from_path("block")
     poses = drop(obj, count=1, seed=2)["scene/object_pose"]
     arrays = render(obj, poses, views=1, stereo=False, width=40, height=30, seed=3, samples=2, run=Run(threads=1))

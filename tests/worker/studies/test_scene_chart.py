@@ -85,9 +85,7 @@ def test_a_run_that_was_stopped_plans_only_what_is_missing(
     assert again["runs"] == found["runs"]
 
 
-def test_a_chart_measured_earlier_is_published_apart_from_free_ones_and_drawn(
-    made: tuple[dict[str, Any], Path], tmp_path: Path
-) -> None:
+def test_a_chart_of_earlier_is_published_apart_and_drawn(made: tuple[dict[str, Any], Path], tmp_path: Path) -> None:
     found, folder = made
     arguments = ["--from", str(folder / "chart.json"), "--publish", "--data-dir", str(tmp_path), "--out", str(tmp_path)]
     done = CliRunner().invoke(app, ["chart", *arguments])
@@ -158,7 +156,7 @@ def run_of(way: str, pair: str, lifted: int, seconds: float, grasps: int = 10) -
     return {**said, **counts, **figures([counts]), "scenes": 1, "seconds_to_first": seconds if lifted else None}
 
 
-def test_a_gain_is_the_median_of_the_pairs_in_which_filtering_found_any() -> None:
+def test_gain_is_median_of_pairs_in_which_filtering_found_any() -> None:
     runs = [run_of(IN_SCENE, pair, 8, 2.0) for pair in "abc"]
     runs += [run_of(FILTERED, pair, lifted, 1.0) for pair, lifted in (("a", 1), ("b", 2), ("c", 0))]
     inside, outside = summed(runs)

@@ -56,7 +56,7 @@ def pair(hand: HandModel) -> Pair:
 
 
 @pytest.mark.parametrize("name", ["direct (default)", "Gauss-Seidel, one sweep", "Jacobi, averaged"])
-def test_the_planners_own_step_lies_where_its_integrators_are_good(name: str) -> None:
+def test_planners_own_step_lies_where_its_integrators_are_good(name: str) -> None:
     way = LossOptions().step  # time step x speed [m]
     energy, sunk = integrators.position_based(integrators.SOLVERS[name], dt=1e-3, speed=way / 1e-3)
     assert graded(energy, *integrators.ENERGY) == "good"
@@ -220,7 +220,7 @@ def test_a_ring_has_as_many_dofs_as_its_drives(coupling: Coupling, dofs: int) ->
     assert ring_hand(4, coupling=coupling).dofs == dofs
 
 
-def test_fingers_open_outward_scale_with_the_size_and_follow_by_ratio() -> None:
+def test_fingers_open_outward_scale_and_follow_by_ratio() -> None:
     hand = ring_hand(3)
     wide, closed = (
         np.linalg.norm(tips(hand, hand.expand(posture))[:, :2], axis=1) for posture in (hand.lower, 0.5 * hand.upper)
@@ -238,7 +238,7 @@ def test_fingers_open_outward_scale_with_the_size_and_follow_by_ratio() -> None:
     assert by_name["joint_0_2"] == pytest.approx(0.5 * by_name["joint_0_1"])
 
 
-def test_a_palm_without_fingers_is_refused_and_three_of_them_hold() -> None:
+def test_palm_without_fingers_is_refused_and_three_of_them_hold() -> None:
     backend.start()
     found = assets.hand_map(
         fingers=(0, 3), sizes=(), ratios=(), couplings=("distal follows",), fidelity="draft", count=4
@@ -264,7 +264,7 @@ def judged(monkeypatch: pytest.MonkeyPatch, name: str, amounts: tuple[float, ...
     return model_error_map([hand], obj, errors=[name], fidelity="draft", count=3).cells
 
 
-def test_the_models_own_friction_keeps_what_holds_and_ice_keeps_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_models_friction_keeps_what_holds_ice_keeps_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     ice, own = judged(monkeypatch, FRICTION, (0.01, 1.0))
     assert (own.value, own.outcome, own.reached) == (1.0, "good", True)
     assert (ice.value, ice.outcome, ice.reached) == (0.0, "broken", False)
@@ -339,7 +339,7 @@ def test_a_plate_flat_on_a_table_ends_with_fewer_and_says_so(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("gap", [5, 30])
-def test_an_object_in_a_narrow_well_is_refused_or_comes_out_valid(hand: HandModel, gap: float) -> None:
+def test_object_in_a_narrow_well_is_refused_or_comes_out_valid(hand: HandModel, gap: float) -> None:
     sides, spec = scenes._standing(scenes.TARGET_MM, scenes._walls(scenes.WALLS["four"], gap))
     try:
         found = scenes.planned(hand, sides, spec, "draft", 2)
@@ -368,7 +368,7 @@ def test_a_cube_that_does_not_fit_its_bin_is_refused(hand: HandModel) -> None:
         scenes.planned(hand, (350, 350, 350), SceneSpec(kind="bin"), "draft", 2)
 
 
-def test_refused_scenes_are_cells_that_say_why_and_walls_stand_off(hand: HandModel) -> None:
+def test_refused_scenes_are_cells_that_say_why_walls_stand_off(hand: HandModel) -> None:
     found = scenes.wall_map([hand], gaps=(-5,), walls=("one",), count=2)
     (cell,) = found.cells
     assert cell.outcome == "refused" and "deep in support" in cell.note

@@ -84,7 +84,7 @@ def first(request) -> None:
 
 
 @pytest.mark.parametrize(("place", "height", "joint"), [(0, 0.16, -0.1), (1, 0.06, 0), (2, 0.06, 0.1), (4, 0.16, 0.2)])
-def test_the_slider_moves_the_bodies_of_the_hand_where_its_kinematics_say(viewer, place, height, joint):
+def test_slider_moves_bodies_of_hand_where_its_kinematics_say(viewer, place, height, joint):
     viewer.slider.value = place
     viewer.show()
     root = np.concatenate([[0, 0, height], arrays(2)["grasp/hand_pose"][0, 3:]])
@@ -95,7 +95,7 @@ def test_the_slider_moves_the_bodies_of_the_hand_where_its_kinematics_say(viewer
         assert abs(node.wxyz @ bodies[body, 3:]) == pytest.approx(1, abs=1e-6)
 
 
-def test_the_page_is_on_the_loopback_and_the_object_goes_up_with_the_hand(viewer):
+def test_page_is_on_loopback_and_object_goes_up_with_the_hand(viewer):
     assert viewer.url.startswith("http://127.0.0.1:")
     with urllib.request.urlopen(viewer.url, timeout=60) as answer:
         assert b"<html" in answer.read().lower()
@@ -120,7 +120,7 @@ def test_grasps_follow_one_another_each_in_its_own_scene(viewer) -> None:
     assert viewer.row == 1
 
 
-def test_what_a_grasp_lifts_and_whether_it_survives_the_shake_is_told() -> None:
+def test_what_grasp_lifts_and_whether_it_survives_shake_is_told() -> None:
     from worker.viewing import _figures
 
     found = {"quality/payload_kg": np.array([np.nan, 0.8, 1.5]), "quality/shake_margin": np.array([np.nan, 0.2, 1.0])}
@@ -141,7 +141,7 @@ def test_dots_are_where_the_hand_is_near_the_object(viewer):
     assert len(points) and ((points > low) & (points < high)).all()
 
 
-def test_a_grasp_in_a_bin_has_five_supports_around_it_and_they_can_be_hidden(viewer):
+def test_a_grasp_in_a_bin_has_five_supports_that_can_be_hidden(viewer):
     nodes = [viewer.server.scene.get_handle_by_name(f"/scene/support{k}") for k in range(6)]
     assert sum(node is not None for node in nodes) == 5
     viewer.models.show_scene(False)
@@ -193,7 +193,7 @@ def test_the_command_tells_its_address_and_ends_with_ctrl_c(tmp_path):
         assert process.wait(60) == 0
 
 
-def test_links_above_the_root_are_drawn_at_the_angles_of_the_wrist_of_each_grasp(block) -> None:
+def test_links_above_the_root_are_drawn_at_each_grasps_wrist(block) -> None:
     from worker.viewing import Shown, Viewer
 
     # A copy of the hand behind its root serves as a forearm with two wrist joints.
@@ -219,7 +219,7 @@ def test_links_above_the_root_are_drawn_at_the_angles_of_the_wrist_of_each_grasp
         made.close()
 
 
-def test_collision_shapes_take_the_place_of_what_the_hand_looks_like(block) -> None:
+def test_collision_shapes_take_place_of_what_the_hand_looks_like(block) -> None:
     from worker.viewing import Shown, Viewer
 
     seen = '<visual><geometry><sphere radius="0.03"/></geometry></visual>'

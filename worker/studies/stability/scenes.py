@@ -123,7 +123,7 @@ def wall_map(
         reachable(cells, lambda cell: True),
         _SHOWS,
         _FEWER,
-        _TEST + "test_an_object_in_a_narrow_well_is_refused_or_comes_out_valid",
+        _TEST + "test_object_in_a_narrow_well_is_refused_or_comes_out_valid",
         reach="all: bins, shelves and files bring such walls",
     )
 

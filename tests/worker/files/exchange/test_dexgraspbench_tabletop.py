@@ -140,9 +140,7 @@ def test_its_tabletop_test_says_what_our_letter_says(bench: Path, shard: Path) -
     assert np.median(apart) < 0.02
 
 
-def test_grasps_on_a_table_come_back_with_their_scenes_ways_and_verdicts(
-    bench: Path, shard: Path, stored: Shard
-) -> None:
+def test_grasps_on_a_table_come_back_with_scenes_and_verdicts(bench: Path, shard: Path, stored: Shard) -> None:
     folder = bench / "output" / f"{EXPERIMENT}_{CONFIG}"
     (back,) = dexgraspbench.read(folder, hand="barrett", obj="block")
     assert back.placed is not None

@@ -154,9 +154,7 @@ def test_graspness_lies_as_its_loader_expects_it(root: Path) -> None:
     assert sorted(file.name for file in (root / "data" / "dex_graspness_new").iterdir()) == [s.name for s in scenes]
 
 
-def test_graspness_belongs_to_the_cloud_that_a_depth_camera_tells(
-    on_tables: Path, hand: HandModel, tmp_path: Path
-) -> None:
+def test_graspness_belongs_to_cloud_that_a_depth_camera_tells(on_tables: Path, hand: HandModel, tmp_path: Path) -> None:
     graspd("export --format dexgraspnet2 --noise stereo -o", tmp_path, on_tables)
     for scene, view in some_views(tmp_path, TRAIN, 4, seed=8):
         found = sample(tmp_path, scene, view, "barrett", list(hand.joint_names))

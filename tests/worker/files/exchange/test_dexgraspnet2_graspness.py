@@ -29,7 +29,7 @@ ABOVE = np.array([[0.0, 0, 0.1]])
 K = np.array([[100.0, 0, 1], [0, 100, 0.5], [0, 0, 1]])
 
 
-def test_a_grasp_points_straight_ahead_within_30_degrees_or_nearest() -> None:
+def test_a_grasp_points_straight_ahead_or_nearest_within_30_deg() -> None:
     # Where all lie as deep, the angle decides.
     surface = np.array([[0.02, 0, 0], [0.005, 0, 0], [-0.03, 0, 0]])
     assert pointed_at(ABOVE, DOWN, surface).tolist() == [1]
@@ -52,7 +52,7 @@ def test_what_lies_20_mm_behind_the_first_point_is_not_seen() -> None:
     assert pointed_at(ABOVE, DOWN, np.array([[aside, 0, 0], [0, 0, -0.019]])).tolist() == [1]
 
 
-def test_a_grasp_counts_a_tenth_at_each_150th_of_a_metre_without_none(hand: HandModel, block: ObjectModel) -> None:
+def test_grasp_counts_tenth_at_each_150th_of_metre_without_none(hand: HandModel, block: ObjectModel) -> None:
     surface = np.array([[0.0, 0, 0], [1 / 150, 0, 0], [3 / 150, 0, 0]])
     np.testing.assert_allclose(summed(surface, np.array([0, 0, 1])), [2.1, 1.2, 0.012], rtol=1e-12)
     none = Posture(np.zeros((0, 7)), np.zeros((0, len(hand.joint_names))))

@@ -99,7 +99,7 @@ def test_a_cloud_of_a_free_object_lies_on_it_where_it_is_itself(on_tables: Path,
         assert 1e-4 < np.abs(trimesh.proximity.closest_point(mesh, noisy)[1]).max() < 0.05
 
 
-def test_collected_grasps_come_back_with_their_scenes_and_verdicts(checkout: Path, stored: Shard) -> None:
+def test_collected_grasps_come_back_with_scenes_and_verdicts(checkout: Path, stored: Shard) -> None:
     sets = dexgraspbench.read(checkout / "assets" / "grasp" / NAME / "succ_collect", hand="barrett", obj="block")
     (back,) = sets
     assert back.placed is not None and len(back.grasps) == 16
@@ -134,7 +134,7 @@ def test_a_scene_that_lies_elsewhere_is_refused(checkout: Path, tmp_path: Path, 
         dexgraspbench.read(tmp_path / "x.npy", hand="barrett", obj="block")
 
 
-def test_without_pictures_it_is_told_that_there_is_nothing_to_see(on_tables: Path, tmp_path: Path) -> None:
+def test_without_pictures_nothing_to_see_is_told(on_tables: Path, tmp_path: Path) -> None:
     said = graspd("export --format dexlearn --all -o", tmp_path / "out", on_tables / "block.h5")
     assert said["clouds"] == 0 and any("no pictures" in note for note in said["notes"])
     assert any("one object" in note for note in said["notes"])

@@ -50,7 +50,7 @@ def test_a_verdict_of_others_is_yes_no_or_none() -> None:
     assert verdicts(np.array([[1], [0], [-1]])).tolist() == [1, 0, -1]
 
 
-def test_dexgraspbench_there_and_back_is_the_same_grasp_with_the_same_verdict(
+def test_dexgraspbench_there_and_back_is_the_same_grasp(
     hand: HandModel, block: ObjectModel, grasps: GraspSet, tmp_path: Path
 ) -> None:
     dexgraspbench.write(hand, block, grasps, range(len(grasps)), tmp_path)
@@ -61,7 +61,7 @@ def test_dexgraspbench_there_and_back_is_the_same_grasp_with_the_same_verdict(
     np.testing.assert_array_equal(theirs, ours)
 
 
-def test_dexgraspbench_grasps_are_told_in_the_frame_of_their_moved_object(
+def test_dexgraspbench_grasps_are_in_their_moved_objects_frame(
     hand: HandModel, block: ObjectModel, grasps: GraspSet, tmp_path: Path
 ) -> None:
     (path, *_) = dexgraspbench.write(hand, block, grasps, [0], tmp_path)
@@ -99,7 +99,7 @@ def test_dexgraspnets_angles_turn_about_the_fixed_axes(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.grasps.grasp.hand_pose[0, :3], [0.1, 0.2, -0.3])
 
 
-def test_dexgraspnets_joints_are_one_number_more_its_scale_the_meshs(tmp_path: Path, block: ObjectModel) -> None:
+def test_dexgraspnets_joints_are_one_number_more_its_scale_meshs(tmp_path: Path, block: ObjectModel) -> None:
     qpos = dict.fromkeys(("WRJTx", "WRJTy", "WRJTz", "WRJRx", "WRJRy", "WRJRz"), 0.0)
     (found,) = published.read_dexgraspnet(
         _dexgraspnet(tmp_path, qpos | {"robot0:THJ4": 0.37}, 1.0), hand="shadow", obj="block"

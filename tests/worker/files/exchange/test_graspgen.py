@@ -114,9 +114,7 @@ def test_grasps_come_back_as_they_were(data: Path, stored: Shard) -> None:
     np.testing.assert_array_equal(back.published == 1, validity.valid(stored.arrays))
 
 
-def test_of_grasps_without_joints_the_fingers_close_until_they_touch(
-    data: Path, hand: HandModel, tmp_path: Path
-) -> None:
+def test_of_grasps_without_joints_fingers_close_until_they_touch(data: Path, hand: HandModel, tmp_path: Path) -> None:
     record = record_of(data, "block")
     del record["gripper"]
     path = tmp_path / "block.json"

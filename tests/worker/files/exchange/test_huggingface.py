@@ -56,7 +56,7 @@ def picture(cell: dict[str, Any]) -> np.ndarray:
         return np.array(image)
 
 
-def test_its_card_names_all_files_and_the_files_say_which_columns_are_pictures(folder: Path) -> None:
+def test_its_card_names_all_files_and_columns_of_pictures(folder: Path) -> None:
     found = configs(folder)
     assert {table: sorted(splits) for table, splits in found.items()} == {
         table: ["test", "train"] for table in ("grasps", "pictures")
@@ -81,7 +81,7 @@ def test_a_row_is_a_grasp_of_ours(folder: Path, stored: Shard, hand: HandModel) 
             assert row[f"{name}_joints"] == stored[f"{name}/joint_positions"][row["row"]].tolist()
 
 
-def test_a_picture_has_what_was_seen_and_fingertips_where_they_are(
+def test_picture_has_what_was_seen_and_fingertips_where_they_are(
     folder: Path, on_tables: Path, hand: HandModel, stored: Shard
 ) -> None:
     pictures = Pictures(open_shards(on_tables), valid=False)

@@ -61,7 +61,7 @@ def views() -> Shard:
     return Shard("views", {"object": "mug"}, arrays)
 
 
-def test_the_3d_box_of_replicators_layout_has_the_corners_of_ours(views: Shard, tmp_path: Path) -> None:
+def test_3d_box_of_replicators_layout_has_the_corners_of_ours(views: Shard, tmp_path: Path) -> None:
     replicator.write(views, tmp_path)
     (row,) = np.load(tmp_path / "bounding_box_3d_0000.npy")
     local = box_corners(

@@ -81,7 +81,7 @@ def assert_same(one: GraspSet, other: GraspSet) -> None:
 
 
 @pytest.mark.slow
-def test_a_grasp_depends_on_seed_and_index_but_not_on_batch_or_threads(hand, block, network) -> None:
+def test_a_grasp_depends_on_seed_and_index_alone(hand, block, network) -> None:
     small, large = made(hand, block, network, 2), made(hand, block, network, 8, threads=2)
     assert_same(small, large.take(slice(0, 2)))
     other = made(hand, block, network, 2, seed=2)
@@ -135,7 +135,7 @@ def down(hand: HandModel, height: float) -> Proposals:
     return Proposals(np.concatenate([root, turn])[None], way, joints, joints, joints)
 
 
-def test_hands_set_out_as_proposed_backed_off_along_their_way_until_they_are_clear(hand, block, network) -> None:
+def test_hands_set_out_as_proposed_backed_off_until_clear(hand, block, network) -> None:
     pair, placed = pair_of(hand, block, QUICK, "cpu"), on_table(block, 2)
     fixed = proposing(network, down(hand, 0.1), np.zeros(3))
     state, depth, probe = started(pair, Seeds(fixed, 2), placed, 2)
@@ -159,7 +159,7 @@ def test_hands_set_out_as_proposed_backed_off_along_their_way_until_they_are_cle
 
 
 @pytest.mark.parametrize("height", [-0.5, 3.0, 1e30])
-def test_where_no_proposal_is_clear_and_near_hands_set_out_as_without_a_network(hand, block, network, height) -> None:
+def test_with_no_proposal_clear_hands_set_out_without_a_network(hand, block, network, height) -> None:
     pair, placed = pair_of(hand, block, QUICK, "cpu"), on_table(block, 2)
     state, depth, probe = started(pair, Seeds(proposing(network, down(hand, height), np.zeros(3)), 2), placed, 2)
     assert (depth <= CLEAR).all() and (probe.depths(state) <= CLEAR).all()
@@ -197,7 +197,7 @@ def mug() -> ObjectModel:
     return object_from_path("mug")
 
 
-def test_points_lie_on_the_surface_look_at_the_camera_and_nothing_is_before_them(mug: ObjectModel) -> None:
+def test_points_lie_on_the_surface_and_are_seen_by_the_camera(mug: ObjectModel) -> None:
     seen, rng = Seen.of(mug), np.random.default_rng(3)
     mesh = trimesh.Trimesh(apply(POSE, mug.vertices), mug.faces, process=False)
     for _ in range(3):

@@ -154,7 +154,7 @@ def test_at_level_certificate_the_first_judge_only_refuses() -> None:
     assert (alone.judged_by == JudgedBy.MUJOCO).all()
 
 
-def test_at_level_screen_clear_verdicts_stand_both_ways_and_the_band_is_the_cpus(
+def test_at_level_screen_clear_verdicts_stand_both_ways(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     first = verdicts(ON, "screen")
@@ -275,7 +275,7 @@ GRASPS = 84
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
-def test_clear_verdicts_on_500_grasps_of_three_hands_are_the_certificates() -> None:
+def test_clear_verdicts_on_500_grasps_are_the_certificates() -> None:
     """At least 99 % of them, and at least four of five verdicts are clear."""
     pytest.importorskip("mujoco_warp", reason="the first judge needs the extra gpu")
     clear, same, kinds = list[bool](), list[bool](), set[bool]()
