@@ -35,18 +35,21 @@ from worker.cards.tally import CellTally, JointUse, Tally, cell_counts, elevatio
 from worker.commands.exchange import app
 
 
-def test_the_head_of_the_page_is_yaml_that_says_licence_and_size(kitchen: Case) -> None:
+def test_the_page_its_links_and_figures_agree_with_the_card(kitchen: Case) -> None:
     head = yaml.safe_load(kitchen.page.split("---")[1])
     assert head["pretty_name"] == "kitchen" and head["license"] == "cc-by-4.0"
     assert head["size_categories"] == ["n<1K"] and set(HANDS) < set(head["tags"])
-
-
-def test_every_link_picture_and_plot_of_the_page_is_there(kitchen: Case) -> None:
     targets = re.findall(r"\]\(([^)]+)\)", kitchen.page)
     assert {name for name in targets if name.endswith((".png", ".jpg"))} == set(kitchen.card["plots"])
     assert [target for target in targets if not (kitchen.folder / target).is_file()] == []
     names = {"yield.png", "quality.png", "directions.png", "table.png", "joints.png", "sizes.png", "samples.jpg"}
     assert names <= set(kitchen.card["plots"])
+    stored = json.loads((kitchen.folder / "card.json").read_text())
+    assert stored["composition"] == kitchen.card["composition"]
+    assert [(cell["hand"], cell["object"]) for cell in stored["cells"]] == [(h, o) for h in HANDS for o in OBJECTS]
+    assert f"{stored['composition']['valid']:,} valid grasps of 2 robot hands on 2 objects" in kitchen.page
+    assert stored["snapshot"]["digest"] == kitchen.made.snapshot.digest
+    assert kitchen.made.snapshot.digest in kitchen.page
 
 
 def test_the_checksums_are_those_of_an_export(kitchen: Case, export: Path, tmp_path: Path) -> None:
@@ -67,15 +70,6 @@ def test_what_the_page_says_of_opening_it_works(kitchen: Case, export: Path) -> 
     assert done.stdout.startswith("80 (80, 7) ['index_abduction'")  # the first hand's grasps of two cells of 40
 
 
-def test_the_figures_are_on_the_page_and_in_json(kitchen: Case) -> None:
-    stored = json.loads((kitchen.folder / "card.json").read_text())
-    assert stored["composition"] == kitchen.card["composition"]
-    assert [(cell["hand"], cell["object"]) for cell in stored["cells"]] == [(h, o) for h in HANDS for o in OBJECTS]
-    assert f"{stored['composition']['valid']:,} valid grasps of 2 robot hands on 2 objects" in kitchen.page
-    assert stored["snapshot"]["digest"] == kitchen.made.snapshot.digest
-    assert kitchen.made.snapshot.digest in kitchen.page
-
-
 def test_a_folder_of_shards_has_the_same_figures(kitchen: Case, export: Path, tmp_path: Path) -> None:
     found = write_card(contents_of_folder(export), tmp_path / "card")
     for part in ("quality", "table", "elevation", "directions", "joints", "contact_threshold_m"):
@@ -94,13 +88,6 @@ def test_what_a_folder_does_not_know_is_said_to_be_missing(export: Path, tmp_pat
     assert subprocess.run(command, cwd=tmp_path / "plain", capture_output=True, check=False).returncode == 0
     assert "| revisions of the stages | not recorded |" in page
     assert "No licence was stated for this dataset" in page and "Not measured: robustness" in page
-
-
-def test_few_pictures_are_fetched(kitchen: Case) -> None:
-    views = {shard.sha256 for shard in kitchen.made.snapshot.shards if shard.kind == "views"}
-    cached = {path.stem for path in (kitchen.folder.parent / "cache").iterdir()}
-    # but for the few that are shown: at most one of each pair of hand and object
-    assert len(views) == 8 and len(views & cached) <= 4
 
 
 @pytest.mark.s3
@@ -153,13 +140,6 @@ def test_a_cell_that_failed_is_told_with_its_reason(tmp_path: Path) -> None:
     assert "**Not complete**" in found.page
     failed = next(cell for cell in found.card["cells"] if cell["hand"] == "barrett" and cell["object"] == "mug")
     assert (failed["grasps"], failed["of_judged"]) == (0, None)
-
-
-def test_a_dataset_without_scenes_has_a_card(tmp_path: Path) -> None:
-    found = case(tmp_path, scenes=0, views=0)
-    found.made.services.close()
-    assert "table.png" not in found.card["plots"] and "clearance of the table (no scenes)" in found.page
-    assert found.card["composition"]["pictures"] == 0
 
 
 def test_the_card_of_a_dataset_says_where_its_grasps_are_valid(tmp_path: Path) -> None:
@@ -231,23 +211,16 @@ def matrix(valid: int) -> tuple[Contents, Tally]:
     return Contents("many", Shards(()), {"claw": AssetFacts("claw")}, assets), tally
 
 
-def test_long_tables_are_folded_and_findings_bounded() -> None:
+def test_the_card_of_many_objects_is_folded_and_bounded(tmp_path: Path) -> None:
     contents, tally = matrix(40)
     text = page(numbers(contents, tally), {})
     assert "<details><summary>Objects: 200</summary>" in text
     assert "Licence not recorded** for 200 objects" in text and "and 192 more" in text
-
-
-def test_the_matrix_of_many_objects_stays_a_picture_of_a_page(tmp_path: Path) -> None:
-    contents, tally = matrix(40)
     plots = draw(numbers(contents, tally), tally, tmp_path)
     assert {"yield.png", "quality.png", "sizes.png"} == set(plots)
     for name in plots:
         with Image.open(tmp_path / name) as picture:
             assert picture.height < 1200, name
-
-
-def test_the_size_in_the_head_is_that_of_the_valid_grasps() -> None:
     for valid, words in ((4, "n<1K"), (40, "1K<n<10K"), (5_000, "1M<n<10M")):
         contents, tally = matrix(valid)
         assert f'size_categories: ["{words}"]' in front_matter(numbers(contents, tally))
@@ -259,7 +232,7 @@ def changed(tmp_path: Path, change: Any, **options: Any) -> Case:
     return found
 
 
-def test_counts_are_those_of_the_manifests(kitchen: Case) -> None:
+def test_counts_costs_and_clearance_are_those_of_the_dataset(kitchen: Case) -> None:
     store, shards = kitchen.made.services.store, kitchen.made.snapshot.shards
     base = [load_manifest(store, Stage.SYNTHESIZE, shard.id) for shard in shards if shard.kind == "base"]
     made, valid = kitchen.card["composition"], kitchen.card["validity"]
@@ -268,14 +241,23 @@ def test_counts_are_those_of_the_manifests(kitchen: Case) -> None:
     assert sum(made["bytes"].values()) == kitchen.made.snapshot.size_bytes
     assert (made["scenes"], made["pictures"]) == (16, 16)
     assert valid["rejected"]["gate"] == len(base)
-
-
-def test_cost_is_the_sum_of_the_stages(kitchen: Case) -> None:
     making, batches = kitchen.card["making"], 8
     stages = {"base": Stage.SYNTHESIZE, "scene": Stage.SCENE, "views": Stage.RENDER}
     assert making["seconds"] == {kind: batches * SECONDS[stage] for kind, stage in stages.items()}
     assert making["seconds_per_1000_valid"] == pytest.approx(1000 * batches * 4.0 / 160)
     assert making["synthesis_parts"] == {"planner": batches * 1.0}
+    clear = pairs = 0
+    for file in kitchen.contents.shards.of("scene"):
+        scene = read_shard(kitchen.contents.shards.path(file))
+        pairs += int((scene["grasp/valid"] == 1).sum())
+        clear += len(set(scene["grasp/base_index"][scene["grasp/valid"] == 1].tolist()))
+    table = kitchen.card["table"]
+    assert (table["clear"], table["clear_pairs"], table["grasps"], table["pairs"]) == (clear, pairs, 160, 320)
+    assert table["too_near"] == {"the table at contact": 320 - pairs}
+    views = {shard.sha256 for shard in kitchen.made.snapshot.shards if shard.kind == "views"}
+    cached = {path.stem for path in (kitchen.folder.parent / "cache").iterdir()}
+    # but for the few that are shown: at most one of each pair of hand and object
+    assert len(views) == 8 and len(views & cached) <= 4
 
 
 @pytest.mark.parametrize("name", ["epsilon", "penetration_depth_mm"])
@@ -287,17 +269,6 @@ def test_distributions_are_those_of_the_readers(kitchen: Case, name: str) -> Non
     # float32 columns: 1e-6 of the value
     assert found["median"] == pytest.approx(np.median(values), rel=1e-5)
     assert found["p95"] == pytest.approx(np.percentile(values, 95), rel=1e-5)
-
-
-def test_clearance_is_that_of_the_scene_shards(kitchen: Case) -> None:
-    clear = pairs = 0
-    for file in kitchen.contents.shards.of("scene"):
-        scene = read_shard(kitchen.contents.shards.path(file))
-        pairs += int((scene["grasp/valid"] == 1).sum())
-        clear += len(set(scene["grasp/base_index"][scene["grasp/valid"] == 1].tolist()))
-    table = kitchen.card["table"]
-    assert (table["clear"], table["clear_pairs"], table["grasps"], table["pairs"]) == (clear, pairs, 160, 320)
-    assert table["too_near"] == {"the table at contact": 320 - pairs}
 
 
 def test_only_valid_grasps_count(tmp_path: Path) -> None:
@@ -328,12 +299,18 @@ def test_audits_that_overturn_verdict_are_told_with_an_interval(tmp_path: Path) 
     assert "**Audits overturned 2 of 32 verdicts**" in found.page and "barrett on mug (2 of 8)" in found.page
 
 
-def test_nothing_is_known_of_no_audits(tmp_path: Path) -> None:
-    def without(hand: str, obj: str, columns: dict[str, Array]) -> None:
+def test_no_scenes_no_audits_and_repeats_are_told(tmp_path: Path) -> None:
+    def change(hand: str, obj: str, columns: dict[str, Array]) -> None:
         columns.pop("quality/audit", None)
+        for name in ("grasp/hand_pose", "grasp/joint_positions"):
+            columns[name][1] = columns[name][0]
 
-    found = changed(tmp_path, without, scenes=0, views=0)
+    found = case(tmp_path, change=change, scenes=0, views=0)
+    found.made.services.close()
     assert found.card["validity"]["false_valid"] is None and "**No audits**" in found.page
+    assert found.card["repeated"] == 8 and "**8 valid grasps equal another**" in found.page
+    assert "table.png" not in found.card["plots"] and "clearance of the table (no scenes)" in found.page
+    assert found.card["composition"]["pictures"] == 0
 
 
 def test_directions_that_no_hand_comes_from_are_told(tmp_path: Path) -> None:
@@ -380,15 +357,6 @@ def test_a_still_joint_is_told_and_no_flaw_that_is_not_there(kitchen: Case) -> N
     told = "\n".join(findings(kitchen.card))
     for words in ("Audits overturned", "ran out of budget", "equal another", "Mixed", "Licence not recorded", "lacks"):
         assert words not in told
-
-
-def test_grasps_that_repeat_are_counted(tmp_path: Path) -> None:
-    def repeat(hand: str, obj: str, columns: dict[str, Array]) -> None:
-        for name in ("grasp/hand_pose", "grasp/joint_positions"):
-            columns[name][1] = columns[name][0]
-
-    found = changed(tmp_path, repeat, scenes=0, views=0)
-    assert found.card["repeated"] == 8 and "**8 valid grasps equal another**" in found.page
 
 
 def test_cells_of_sphere_are_equal_and_one_direction_is_one_cell() -> None:

@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 from service.model.errors import InputError
 from service.readers import Grasps, open_shards
 from service.store.shards import Shard, read_shard, write_shard
+from tests.worker.models import quality_columns
 from worker.commands.curate import app
 from worker.files.cases import expand
 from worker.files.curation import Balance, faces
@@ -25,21 +26,11 @@ def columns(seed: int) -> dict[str, Any]:
     """40 valid grasps, three in four of type power."""
     rng = np.random.default_rng(seed)
     pose = np.concatenate([rng.normal(0, 0.1, (COUNT, 3)), np.tile([1.0, 0, 0, 0], (COUNT, 1))], axis=1)
-    found: dict[str, Any] = {"quality/thresholds_m": np.array([0.005])}
+    found: dict[str, Any] = quality_columns(COUNT) | {"quality/epsilon": np.repeat(rng.random((COUNT, 1)), 2, axis=1)}
     for posture in ("grasp", "pregrasp", "squeeze"):
         found |= {f"{posture}/hand_pose": pose, f"{posture}/joint_positions": rng.random((COUNT, 2))}
-    found |= {f"quality/{name}": rng.random((COUNT, 1)) for name in ("epsilon", "wrench_volume", "contact_area_cm2")}
-    found |= {
-        f"quality/{name}": rng.random(COUNT)
-        for name in ("intersection_volume_cm3", "penetration_depth_mm", "self_penetration_depth_mm", "stability_loss")
-    }
-    return found | {
-        "quality/contact_links": np.full(COUNT, 3, np.int32),
-        "quality/valid": np.ones(COUNT, np.uint8),
-        "quality/success": np.ones(COUNT, np.int8),
-        "quality/grasp_type": np.where(np.arange(COUNT) % 4 < 3, 1, 2).astype(np.int32),
-        "quality/approach_cell": rng.integers(0, 2, COUNT).astype(np.int32),
-    }
+    found["quality/grasp_type"] = np.where(np.arange(COUNT) % 4 < 3, 1, 2).astype(np.int32)
+    return found | {"quality/approach_cell": rng.integers(0, 2, COUNT).astype(np.int32)}
 
 
 def shard(path: Path, number: int, obj: str = "mug", batch: int = 0, **changes: Any) -> Path:

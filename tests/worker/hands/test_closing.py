@@ -17,9 +17,7 @@ from service.store.asset_summary import summary
 from service.store.assets import builtin_files
 from tests.worker.hands.urdfs import joint, link, load, report, robot
 from worker.hands.check import check_hand
-from worker.hands.closing import posture
 from worker.hands.jaws import fingertip_pad, sign_of
-from worker.hands.kinematics import body_poses
 from worker.hands.load import load_hand
 from worker.hands.model import HandModel
 
@@ -69,20 +67,17 @@ def closing_of(hand: HandModel) -> dict[str, int]:
 
 
 def test_thumbs_close_to_the_fingers_whatever_their_limits() -> None:
-    found = closing_of(hand_of(urdf(*opposing_thumb(limit(-1.5, 0.2)))))
+    text = urdf(*opposing_thumb(limit(-1.5, 0.2)))
+    found = closing_of(hand_of(text))
     assert (found["thumb_bend"], found["thumb_tip"]) == (1, 1)
+    stated = closing_of(hand_of(text, closing={"thumb_bend": -1}))
+    assert stated == {**found, "thumb_bend": -1}, "what is stated of one joint counts for it alone"
     assert closing_of(hand_of(urdf(*opposing_thumb(limit(-1.2, 0.8)))))["thumb_bend"] == 1
     assert closing_of(hand_of(urdf(*opposing_thumb(limit(-1.2, 1.2)))))["thumb_bend"] == 0
     assert closing_of(hand_of(urdf(*opposing_thumb(limit(-0.2, 1.5)))))["thumb_axial"] == 0
     found = closing_of(hand_of(urdf(*opposing_thumb(limit(-0.2, 1.5)), bends=limit(-1.0, 1.5))))
     assert [found[f"{name}_spread"] for name in ("index", "ring")] == [0, 0]
     assert [found[f"{name}_{part}"] for name in ("index", "ring") for part in ("bend", "tip")] == [1, 1, 1, 1]
-
-
-def test_what_is_stated_of_one_joint_counts_for_it_alone() -> None:
-    text = urdf(*opposing_thumb(limit(-1.5, 0.2)))
-    stated = closing_of(hand_of(text, closing={"thumb_bend": -1}))
-    assert stated == {**closing_of(hand_of(text)), "thumb_bend": -1}
 
 
 def test_a_finger_that_no_joint_closes_is_told(tmp_path: Path) -> None:
@@ -125,13 +120,6 @@ def three_fingers(outwards: float, **options: object) -> HandModel:
         ]
     urdf = robot(link("palm", _PLATE_PALM), *parts)
     return load_hand({"r.urdf": urdf}, name="r", digest="0" * 32, options={"approach": [0, 0, 1], **options})
-
-
-def apart(hand: HandModel, share: float) -> float:
-    """Distance of the fingertips' ends from their middle [m]."""
-    poses = body_poses(hand, np.array([0.0, 0, 0, 1, 0, 0, 0]), hand.expand(posture(hand, share)))[0]
-    ends = np.array([p.vertices[np.argmax(p.vertices[:, 2])] for p in hand.pieces if p.body > 0])
-    return float(np.ptp(poses[1:, :3] + ends, axis=0).max())
 
 
 def test_fingers_that_meet_at_zero_close_to_it_unless_stated() -> None:
@@ -219,12 +207,6 @@ def test_the_palm_faces_along_the_fingers_and_all_of_them_close(fingers: int, tu
     assert np.linalg.norm(model.palm.centre - (model.palm.centre @ axis) * axis) < 1e-6
 
 
-@pytest.mark.parametrize("noise", [1e-12, 1e-9, 1e-6, 1e-4])
-def test_rounding_does_not_turn_the_palm(noise: float) -> None:
-    model = load(claw(3, TURNS["upright"], noise=noise))
-    np.testing.assert_allclose(model.palm.approach, [0, 0, 1], atol=1e-9)
-
-
 def test_a_tie_is_told_and_one_that_is_settled_is_not() -> None:
     # Fingers that lie in the plane in which they begin, half closed: nothing tells its upper side.
     flat = claw(3, TURNS["upright"], lower=-np.pi)
@@ -279,7 +261,13 @@ def test_a_published_hand_in_a_turned_root_frame_faces_as_it_did() -> None:
     assert turned.closing.tolist() == as_it_is.closing.tolist()
 
 
-def test_limits_twice_as_far_one_way_close_whatever_the_digit() -> None:
+def test_rounding_turns_neither_palm_nor_jaws_nor_closing() -> None:
+    for noise in (1e-12, 1e-9, 1e-6, 1e-4):
+        np.testing.assert_allclose(load(claw(3, TURNS["upright"], noise=noise)).palm.approach, [0, 0, 1], atol=1e-9)
+    for noise in (1e-17, -1e-17):
+        line = np.array([noise, 1.0, -noise])
+        assert sign_of(line) == 1 and sign_of(-line) == -1
+        assert sign_of(np.array([1.0, -1.0 - noise, 0])) == 1
     for lower in ("-0.7", "-0.7000001", "-0.6999999"):
         assert (load(claw(3, TURNS["upright"]).replace(b'"-0.4"', f'"{lower}"'.encode())).closing == 1).all()
 
@@ -295,10 +283,3 @@ def test_a_tip_that_turns_in_place_presses_by_the_joint_before() -> None:
     for tip in still.fingertips:
         # Inwards: -x of the finger's frame, as even as the points of its surface are.
         assert fingertip_pad(still, tip).normal[0] < -0.9
-
-
-def test_the_order_of_two_jaws_is_not_that_of_rounding() -> None:
-    for noise in (1e-17, -1e-17):
-        line = np.array([noise, 1.0, -noise])
-        assert sign_of(line) == 1 and sign_of(-line) == -1
-        assert sign_of(np.array([1.0, -1.0 - noise, 0])) == 1

@@ -83,15 +83,11 @@ def test_a_gripper_without_fingers_is_refused() -> None:
 
 
 @pytest.mark.parametrize("name", ["allegro", "barrett", "shadow"])
-def test_a_hand_of_several_fingers_is_no_gripper(name: str) -> None:
-    """So it starts, steps, opens and squeezes as a hand does: its grasps are what they were without jaws."""
+def test_hands_of_several_fingers_are_no_grippers(name: str) -> None:
+    """So they start, step, open and squeeze as hands do: their grasps are what they were without jaws."""
     hand = hand_from_path(name)
-    assert jaws_of(hand) is None
-    assert (joint_units(hand) == 1.0).all()
-
-
-@pytest.mark.parametrize("fingers", [3, 4, 6])
-def test_digits_that_close_around_a_place_are_no_jaws(fingers: int) -> None:
+    assert jaws_of(hand) is None and (joint_units(hand) == 1.0).all()
+    fingers = {"allegro": 3, "barrett": 4, "shadow": 6}[name]
     hand = ring_hand(fingers, coupling="one drive")
     assert jaws_of(hand) is None
     assert sorted(hand.body_names[tip] for tip in hand.fingertips) == [f"finger_{k}_2" for k in range(fingers)]

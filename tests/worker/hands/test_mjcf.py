@@ -206,12 +206,6 @@ def test_bad_model_is_refused_in_one_line_that_names_the_defect(text: str, named
     assert "\n" not in report["message"] and len(report["message"]) < 400
 
 
-def test_an_include_in_the_folder_is_put_in() -> None:
-    part = b'<mujocoinclude><body name="extra"><geom type="sphere" size="0.01"/></body></mujocoinclude>'
-    text = with_inside('<include file="parts/extra.xml"/>')
-    assert report_of(text, **{"parts/extra.xml": part})["verdict"] == "accept"
-
-
 def test_nothing_but_the_upload_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # MuJoCo would find these on the disk: the reader must not let it look.
     monkeypatch.chdir(tmp_path)
@@ -223,7 +217,7 @@ def test_nothing_but_the_upload_is_read(tmp_path: Path, monkeypatch: pytest.Monk
             load(text)
 
 
-def test_a_model_brings_what_it_includes_and_names(tmp_path: Path) -> None:
+def test_a_model_brings_what_it_includes_and_reads_nothing_else(tmp_path: Path) -> None:
     (tmp_path / "meshes").mkdir()
     (tmp_path / "meshes" / "tip.stl").write_bytes(tip())
     (tmp_path / "meshes" / "other.stl").write_bytes(tip())
@@ -233,6 +227,9 @@ def test_a_model_brings_what_it_includes_and_names(tmp_path: Path) -> None:
     assert set(found) == {"claw.xml", "extra.xml", "meshes/tip.stl"}
     assert (name, stated) == ("claw", {"file": "claw.xml"})
     assert report_hand(str(tmp_path))["verdict"] == "accept"
+    part = b'<mujocoinclude><body name="extra"><geom type="sphere" size="0.01"/></body></mujocoinclude>'
+    text = with_inside('<include file="parts/extra.xml"/>')
+    assert report_of(text, **{"parts/extra.xml": part})["verdict"] == "accept"
 
 
 FINGERS = ("FF", "MF", "RF", "LF")
@@ -252,20 +249,17 @@ def test_joints_on_one_actuated_tendon_are_free_and_share_it() -> None:
     assert hand.tendons[0].limit(hand.effort) == pytest.approx(2.0)
 
 
-def test_jaws_side_by_side_on_one_tendon_keep_their_ratio() -> None:
-    text = re.sub('<joint joint="left_curl" coef="0.5"/>', '<joint joint="right_slide" coef="0.5"/>', CLAW)
-    hand = load(re.sub('<position joint="right_slide"[^>]*>', "", text))
-    assert not hand.tendons
-    assert "right_slide" not in hand.dof_names
-
-
-def test_a_command_of_torques_commands_the_pull_that_exerts_them() -> None:
+def test_a_command_of_torques_pulls_jaws_keep_their_ratio() -> None:
     tendon, stiffness = Tendon("t", (0, 2), (1.0, 0.4)), np.array([5.0, 9.0, 2.0])
     pull = 0.7
     told = pull * np.array([1.0, 0.0, 0.4]) / stiffness
     length = actuators((tendon,), 3) @ told
     assert length.tolist() == pytest.approx([told[0] + 0.4 * told[2], told[1]])
     assert tendon.gain(stiffness) * length[0] == pytest.approx(pull)
+    text = re.sub('<joint joint="left_curl" coef="0.5"/>', '<joint joint="right_slide" coef="0.5"/>', CLAW)
+    hand = load(re.sub('<position joint="right_slide"[^>]*>', "", text))
+    assert not hand.tendons
+    assert "right_slide" not in hand.dof_names
 
 
 def test_asset_json_puts_joints_on_a_tendon_and_takes_it_away() -> None:

@@ -118,12 +118,19 @@ def links_of(hand: HandModel) -> set[str]:
     return set() if hand.mounting is None else {piece.link for piece in hand.mounting.pieces}
 
 
-def test_the_mounting_reaches_up_the_wrist_to_the_arm() -> None:
+def test_the_mounting_reaches_up_the_wrist_from_rest_to_limits() -> None:
     hand = load(with_wrist())
     assert hand.root_link == "hub" and hand.mounting is not None
     assert links_of(hand) == {"wrist", "forearm", "camera"}
     assert hand.mounting.joint_names == ("pitch", "yaw")
     assert hand.mounting.lower.tolist() == [-0.7, -0.5] and hand.mounting.upper.tolist() == [0.4, 0.2]
+    mounting = load(with_wrist()).mounting
+    assert mounting is not None
+    found = wrist_positions(mounting)
+    assert found[0].tolist() == [0.0, 0.0] and len(found) == 25
+    assert (np.diff(np.linalg.norm(found, axis=1)) >= -1e-12).all()
+    assert (found.min(axis=0) == mounting.lower).all() and (found.max(axis=0) == mounting.upper).all()
+    assert np.linalg.norm(found, axis=1).max() < math.pi
 
 
 @pytest.mark.parametrize("pitch, yaw", [(0.0, 0.0), (0.3, -0.4)])
@@ -173,13 +180,3 @@ def test_bad_shapes_above_a_hand_are_told_and_do_not_refuse_it() -> None:
     assert "what stands above 'hub'" in note and "lost.stl" in note
     assert report["verdict"] == "accept" and note in report["message"]
     assert "no obstacle in scenes" not in check_hand({"r.urdf": with_wrist()}, "r")["message"]
-
-
-def test_wrist_positions_begin_at_rest_and_keep_the_limits() -> None:
-    mounting = load(with_wrist()).mounting
-    assert mounting is not None
-    found = wrist_positions(mounting)
-    assert found[0].tolist() == [0.0, 0.0] and len(found) == 25
-    assert (np.diff(np.linalg.norm(found, axis=1)) >= -1e-12).all()
-    assert (found.min(axis=0) == mounting.lower).all() and (found.max(axis=0) == mounting.upper).all()
-    assert np.linalg.norm(found, axis=1).max() < math.pi

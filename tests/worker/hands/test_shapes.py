@@ -81,11 +81,6 @@ def test_a_reduced_hull_keeps_its_volume_and_stays_close() -> None:
     assert outside < 0.06 * 0.012 and beyond < 0.06 * 0.012
 
 
-def test_flat_points_have_no_hull() -> None:
-    with pytest.raises(HandError, match="flat"):
-        primitives.hull(np.random.default_rng(0).random((10, 3)) * [1, 1, 0])
-
-
 @pytest.mark.parametrize(
     ("offset", "expected"), [((0.3, 0, 0), 0.1), ((0.3, 0.3, 0), 0.1 * np.sqrt(2)), ((0.1, 0.05, 0), 0.0)]
 )
@@ -93,6 +88,8 @@ def test_distance_of_two_boxes(offset: tuple[float, float, float], expected: flo
     box, _ = primitives.tessellate("box", (0.2, 0.2, 0.2))
     # The sums of the weights are held to 1 in 1e6 of the size.
     assert hull_distance(box, box + np.array(offset)) == pytest.approx(expected, abs=1e-5)
+    with pytest.raises(HandError, match="flat"):
+        primitives.hull(np.random.default_rng(0).random((10, 3)) * [1, 1, 0])
 
 
 @pytest.mark.parametrize(
@@ -286,7 +283,7 @@ def test_a_thin_plate_has_exactly_the_count_on_both_sides(count: int) -> None:
     assert count < 400 or 0.8 < top / bottom < 1.25
 
 
-def test_same_seed_gives_the_same_points_and_another_seed_others() -> None:
+def test_samples_follow_their_seed_and_are_drawn_once_a_pre_shape() -> None:
     first, other = hand_from_path("allegro"), hand_from_path("allegro")
     a = sample_surface(first, 500, seed=3)
     surface._samples.clear()
@@ -295,9 +292,6 @@ def test_same_seed_gives_the_same_points_and_another_seed_others() -> None:
     np.testing.assert_array_equal(a.position, b.position)
     np.testing.assert_array_equal(a.area, b.area)
     assert not np.array_equal(a.position, sample_surface(first, 500, seed=4).position)
-
-
-def test_a_surface_is_sampled_once_and_anew_in_another_pre_shape() -> None:
     hand = hand_from_path("allegro")
     points = sample_surface(hand, 300)
     assert sample_surface(replace(hand, closing=-hand.closing), 300) is points

@@ -56,8 +56,6 @@ from worker.run import Run
 SINGLE = 1e-6
 #: Area is a sum over points: one point more or less at each edge of the zone.
 ONE_ROW = 0.03
-#: Volume of the tessellated round pieces against the ideal ones.
-TESSELLATION = 0.01
 
 BOX = object_from_mesh(trimesh.creation.box((0.06, 0.04, 0.05)))
 

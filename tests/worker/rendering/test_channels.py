@@ -195,15 +195,13 @@ def test_the_drawn_hand_is_in_its_own_pictures_and_in_no_other(ball):
     assert not changed[2:].any()
 
 
-def test_channels_are_named_in_any_order_and_kept_in_one():
+def test_channels_are_named_in_any_order_and_move_pictures_alone() -> None:
     assert parse_channels(["occlusion", " distance"]) == ("distance", "occlusion")
     assert parse_channels(["all"]) == ("distance", "normals", "occlusion")
     assert parse_channels([""]) == ()
     with pytest.raises(InputError, match="unknown channel 'flow'"):
         parse_channels(["flow"])
 
-
-def test_a_jobs_channels_move_its_pictures_and_nothing_else():
     def address(stage: Stage, *channels: str) -> str:
         request = JobRequest(hand="h", object="o", scenes=1, views=1, channels=channels)
         return shard_id(stage, request=request, hand_digest="a", object_digest="b", batch=0, count=1, revision=1)

@@ -56,12 +56,9 @@ def hues(picture: np.ndarray) -> np.ndarray:
     return hsv[(hsv[:, 1] > 90) & (hsv[:, 2] > 30)][:, 0]
 
 
-def test_every_grasp_is_shown_from_every_side(pictures):
+def test_every_side_shows_object_and_fingertips_in_their_colours(pictures) -> None:
     assert pictures.shape == (2, 3, 64, 80, 3)
     assert len({picture.tobytes() for picture in pictures.reshape(6, -1)}) == 6
-
-
-def test_picture_shows_object_and_fingertips_in_their_colours(pictures):
     for picture in pictures.reshape(6, 64, 80, 3):
         hue = hues(picture)
         # Orange object, teal fingertips, hue in 256 steps.

@@ -205,20 +205,26 @@ def test_the_same_seed_gives_the_same_pixels_whatever_is_beside(mug, mug_poses, 
     np.testing.assert_array_equal(alone["image/segmentation"], mug_views["image/segmentation"][:4])
 
 
-def test_many_pictures_are_traced_in_parts_that_do_not_show(mug, mug_poses, mug_views, monkeypatch):
-    monkeypatch.setattr("worker.rendering.tracer.PIXELS_OF_A_CORE", SIZE[0] * SIZE[1])
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("worker.rendering.tracer.PIXELS_OF_A_CORE", SIZE[0] * SIZE[1]),
+        ("worker.run.available_cores", lambda: 1),
+        ("worker.run.available_cores", lambda: 3),
+    ],
+    ids=["parts", "1 core", "3 cores"],
+)
+def test_pixels_do_not_depend_on_parts_and_cores(mug, mug_poses, mug_views, monkeypatch, name, value):
+    monkeypatch.setattr(name, value)
     again = shoot(mug, mug_poses)
     np.testing.assert_array_equal(mug_views["image/rgb"], again["image/rgb"])
     np.testing.assert_array_equal(mug_views["image/depth"], again["image/depth"])
 
 
-def test_the_datasets_are_those_of_a_views_shard(mug_views):
+def test_columns_are_of_a_views_shard_and_mono_pictures_say_so(mug_views, ball) -> None:
     assert check_columns("views", mug_views)["V"] == 8
     assert mug_views["camera/eye"].tolist() == [1, 2] * 4
     assert mug_views["camera/scene_index"].tolist() == [0] * 4 + [1] * 4
-
-
-def test_mono_pictures_say_so_and_no_views_are_refused(ball) -> None:
     mono = shoot(ball, REST, stereo=False)
     assert mono["camera/eye"].tolist() == [0, 0]
     assert mono["camera/stereo_baseline_m"].tolist() == [0.0, 0.0]
@@ -259,14 +265,6 @@ def test_memory_stays_flat_over_repeated_renders(ball):
     assert peak() - before < 4096
 
 
-@pytest.mark.parametrize("cores", [1, 3])
-def test_pixels_do_not_depend_on_the_number_of_cores(mug, mug_poses, mug_views, monkeypatch, cores):
-    monkeypatch.setattr("worker.run.available_cores", lambda: cores)
-    again = shoot(mug, mug_poses)
-    np.testing.assert_array_equal(mug_views["image/rgb"], again["image/rgb"])
-    np.testing.assert_array_equal(mug_views["image/depth"], again["image/depth"])
-
-
 CENTRE, OBJECT_RADIUS = np.array([0.05, -0.02, 0.04]), 0.07
 
 
@@ -290,14 +288,11 @@ def test_a_camera_looks_at_its_target_upright_in_its_field() -> None:
     np.testing.assert_allclose(top, [-159.5 / k[0, 0], -119.5 / k[1, 1], 1.0])
 
 
-@pytest.mark.parametrize("eye", [(0.0, 0.0, 0.5), (0.3, -0.2, 0.1)])
-def test_extrinsics_are_rigid_and_right_handed(eye):
-    rotation = look_at(np.array(eye), np.zeros(3))[:3, :3]
-    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
-    assert np.linalg.det(rotation) == pytest.approx(1.0)
-
-
-def test_the_right_eye_stands_a_baseline_along_the_cameras_x():
+def test_extrinsics_are_rigid_and_the_right_eye_stands_along_x():
+    for eye in ((0.0, 0.0, 0.5), (0.3, -0.2, 0.1)):
+        rotation = look_at(np.array(eye), np.zeros(3))[:3, :3]
+        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+        assert np.linalg.det(rotation) == pytest.approx(1.0)
     middle = look_at(np.array([0.3, 0.2, 0.4]), CENTRE)
     pair = Cameras(320, 240, intrinsics(320, 240), np.stack(stereo_pair(middle, 0.06)))
     np.testing.assert_allclose(pair.centre[1] - pair.centre[0], 0.06 * middle[0, :3], atol=1e-12)

@@ -75,9 +75,11 @@ def test_kernel_shares_add_up_and_distance_query_is_among_them() -> None:
         assert phase["queries_per_second"] > 0
 
 
-def test_an_unknown_fidelity_is_the_callers_mistake() -> None:
-    done = CliRunner().invoke(app, ["bench", "--fidelity", "superb"])
-    assert done.exit_code == 2
+def test_unknown_fidelities_and_no_networks_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert CliRunner().invoke(app, ["bench", "--fidelity", "superb"]).exit_code == 2
+    (tmp_path / "net.npz").write_bytes(b"no network")
+    assert learned.main(["--network", str(tmp_path / "net.npz")]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
 
 
 def test_a_study_plans_the_grasps_of_a_job() -> None:
@@ -108,9 +110,3 @@ def test_both_methods_are_told_side_by_side(
     page = (tmp_path / "out" / "learned.md").read_text()
     assert learned.table(found["rows"]) in page and learned.table(found["rows"]) + "\n" == capsys.readouterr().out
     assert str(tmp_path) not in page
-
-
-def test_a_file_that_is_no_network_is_said_in_a_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "net.npz").write_bytes(b"no network")
-    assert learned.main(["--network", str(tmp_path / "net.npz")]) == 2
-    assert capsys.readouterr().err.count("\n") == 1

@@ -40,7 +40,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], Path
     return json.loads(done.stdout.strip().splitlines()[-1]), folder
 
 
-def test_valid_grasps_per_second_are_those_held_over_seconds(made: tuple[dict[str, Any], Path]) -> None:
+def test_runs_have_the_rates_that_their_counts_and_seconds_give(made: tuple[dict[str, Any], Path]) -> None:
     runs = [(run["method"], run["fidelity"]) for run in made[0]["runs"]]
     assert runs == [("fast_graspd", "draft"), ("autograsp", "as published")]
     for run in made[0]["runs"]:
@@ -51,9 +51,6 @@ def test_valid_grasps_per_second_are_those_held_over_seconds(made: tuple[dict[st
         assert run["valid_per_second"] == pytest.approx(run["valid"] / used, rel=1e-5 + rounded)
         assert run["gsr"] == pytest.approx(run["valid"] / run["grasps"])
         assert run["gsr_low"] <= run["gsr"] <= run["gsr_high"]
-
-
-def test_end_to_end_counts_what_is_valid_over_all_that_job_does(made: tuple[dict[str, Any], Path]) -> None:
     for run in made[0]["runs"]:
         assert run["kept"] <= run["valid"]
         assert all(whole > planned for whole, planned in zip(run["end_seconds"], run["seconds"], strict=True))
@@ -235,14 +232,11 @@ def text_of(word: Any) -> Any:
     return Text.get_window_extent(word)
 
 
-def test_a_point_alone_has_its_word_close_by_and_no_line() -> None:
+def test_a_word_stands_close_to_its_point_and_on_no_other() -> None:
     axes, (word,) = drawn([(10.0, 0.5)])
     box, point = word.get_window_extent(), axes.transData.transform((10.0, 0.5))
     assert word.arrow_patch is None
     assert 0 < box.x0 - point[0] < 15 and 0 < box.y0 - point[1] < 15
-
-
-def test_a_point_without_a_word_is_kept_free_all_the_same() -> None:
     figure = Figure(figsize=(5.0, 4.0))
     axes = figure.subplots()
     # The second point lies where the first one's word would stand.

@@ -40,7 +40,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], Path
     return json.loads(done.stdout.strip().splitlines()[-1]), folder
 
 
-def test_lifted_per_second_are_those_lifted_over_the_seconds(made: tuple[dict[str, Any], Path]) -> None:
+def test_rates_and_files_are_those_of_the_runs(made: tuple[dict[str, Any], Path]) -> None:
     # Who plans in scenes does both, others are filtered.
     ways = [(run["method"], run["way"]) for run in made[0]["runs"]]
     assert ways == [("fast_graspd", IN_SCENE), ("fast_graspd", FILTERED), ("autograsp", FILTERED)]
@@ -52,9 +52,6 @@ def test_lifted_per_second_are_those_lifted_over_the_seconds(made: tuple[dict[st
         assert run["end_to_end_per_second"] == pytest.approx(run["lift_count"] / run["end_seconds"], rel=1e-4)
         assert (run["robust"] is None) == (run["seconds_to_first"] is None) == (run["lift_count"] == 0)
         assert run["robust"] is None or 0 <= run["robust_low"] <= run["robust"] <= run["robust_high"] <= 1
-
-
-def test_all_files_are_written_and_agree(made: tuple[dict[str, Any], Path]) -> None:
     found, folder = made
     assert json.loads((folder / "chart.json").read_text())["runs"] == found["runs"]
     with (folder / "chart.csv").open() as stream:

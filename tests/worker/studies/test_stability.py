@@ -129,11 +129,6 @@ def test_a_quick_run_takes_less_than_the_minute_that_it_promises() -> None:
     assert [one.name for one in found] == list(STUDIES) and all(one.cells for one in found)
 
 
-def test_what_is_no_number_is_broken() -> None:
-    found = [graded(value, 1.0, 2.0) for value in (0.5, 1.5, 2.5, math.nan, math.inf)]
-    assert found == ["good", "weak", "broken", "broken", "broken"]
-
-
 def a_map(**changes: object) -> StabilityMap:
     cells = [
         MapCell("a", 1.0, 10.0, 0.1, "good", reached=True),
@@ -149,6 +144,8 @@ def a_record(*maps: StabilityMap) -> Stability:
 
 
 def test_a_report_has_pictures_tables_and_says_what_still_breaks(tmp_path: Path) -> None:
+    found = [graded(value, 1.0, 2.0) for value in (0.5, 1.5, 2.5, math.nan, math.inf)]
+    assert found == ["good", "weak", "broken", "broken", "broken"]
     written = write(a_record(), tmp_path)
     assert {path.name for path in written} == {"stability.json", "stability.md", "stability-demo.png"}
     assert json.loads(written[0].read_text())["maps"][0]["cells"][1]["value"] is None
@@ -194,17 +191,14 @@ def test_published_maps_are_the_latest_in_the_store(tmp_path: Path) -> None:
     assert from_json(stored).as_json() == a_record().as_json()
 
 
-@pytest.mark.parametrize("text", ["no json", "{}", '{"maps": 3}'])
-def test_a_file_that_holds_no_maps_is_the_callers_mistake(tmp_path: Path, text: str) -> None:
-    (tmp_path / "wrong.json").write_text(text)
+@pytest.mark.parametrize("words", ["no json", "{}", '{"maps": 3}', "--only magic", "--from nowhere.json"])
+def test_wrong_files_and_options_are_the_callers_mistake(tmp_path: Path, words: str) -> None:
+    if words.startswith("--"):
+        assert command(*words.split())[0] == 2
+        return
+    (tmp_path / "wrong.json").write_text(words)
     code, said = command("--from", str(tmp_path / "wrong.json"))
-    assert code == 2
-    assert "no stability.json" in said
-
-
-@pytest.mark.parametrize("arguments", [["--only", "magic"], ["--from", "nowhere.json"]])
-def test_wrong_files_and_options_are_the_callers_mistake(arguments: list[str]) -> None:
-    assert command(*arguments)[0] == 2
+    assert code == 2 and "no stability.json" in said
 
 
 def tips(hand: HandModel, joints: np.ndarray) -> np.ndarray:

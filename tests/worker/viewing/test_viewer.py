@@ -20,7 +20,7 @@ from service.model.scene_spec import SceneSpec
 from service.model.transforms import quat_from_axis_angle
 from service.store.shards import Shard, json_attribute, write_shard
 from tests.worker.hands.urdfs import BOX, joint, link, robot
-from tests.worker.models import object_from_mesh, two_finger_hand
+from tests.worker.models import attributes_of, object_from_mesh, quality_columns, two_finger_hand
 from worker.hands.kinematics import body_poses
 from worker.hands.load import hand_from_path, load_hand
 from worker.objects.prepare import object_from_path
@@ -48,12 +48,7 @@ def arrays(joints: int) -> dict[str, np.ndarray]:
     made |= {"grasp/lift": lift, "grasp/scene_index": np.array([0, 0, 1])}
     made["scene/object_pose"] = np.array([[0.05, 0, 0.03, 1, 0, 0, 0], [-0.05, 0, 0.03, 1, 0, 0, 0]])
     made["scene/rest_probability"] = np.ones(2)
-    per_grasp = np.linspace(0.1, 0.3, GRASPS)
-    swept = ("contact_area_cm2", "epsilon", "wrench_volume")
-    plain = ("intersection_volume_cm3", "penetration_depth_mm", "self_penetration_depth_mm", "stability_loss")
-    made |= {f"quality/{name}": np.repeat(per_grasp[:, None], 2, axis=1) for name in swept}
-    made |= {f"quality/{name}": per_grasp for name in plain}
-    made |= {"quality/thresholds_m": np.array([0.002, 0.005]), "quality/contact_links": np.full(GRASPS, 4)}
+    made |= quality_columns(GRASPS)
     return made | {"quality/valid": np.array([0, 1, 0], np.uint8), "quality/success": np.array([0, 1, 0], np.int8)}
 
 
@@ -164,20 +159,8 @@ def test_without_viser_or_a_shard_one_line_says_so(tmp_path, monkeypatch):
 @pytest.mark.timeout(180)
 def test_the_command_tells_its_address_and_ends_with_ctrl_c(tmp_path):
     hand, block = hand_from_path("barrett"), object_from_path("block")
-    said = {
-        "hand": "barrett",
-        "hand_digest": hand.digest,
-        "object": "block",
-        "object_digest": block.digest,
-        "method": "none",
-        "fidelity": json_attribute({"face_error_m": 3e-4}),
-        "seed": 0,
-        "batch": 0,
-        "joint_names": list(hand.joint_names),
-        "scene": SCENE,
-    }
     file = tmp_path / "grasps.h5"
-    file.write_bytes(write_shard("base", arrays(len(hand.joint_names)), said))
+    file.write_bytes(write_shard("base", arrays(len(hand.joint_names)), attributes_of(hand, block, scene=SCENE)))
     command = [sys.executable, "-m", "graspd", "view", str(file), "--port", "0"]
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, text=True, env=os.environ | {"SSH_CONNECTION": ""}

@@ -92,8 +92,8 @@ def test_2d_boxes_are_whole_pixels_of_what_is_in_view(views: Shard, tmp_path: Pa
     labels = json.loads((tmp_path / "bounding_box_2d_tight_labels_0000.json").read_text())
     assert labels == {"0": {"class": "mug"}}
     views.arrays["box/bounding_box_2d_tight"] = np.full((1, 4), np.nan, np.float32)
-    replicator.write(views, tmp_path)
-    assert len(np.load(tmp_path / "bounding_box_2d_tight_0000.npy")) == 0
+    replicator.write(views, tmp_path / "unseen")
+    assert len(np.load(tmp_path / "unseen" / "bounding_box_2d_tight_0000.npy")) == 0
 
 
 @pytest.fixture
@@ -122,7 +122,7 @@ def test_every_picture_is_one_sample_with_its_grasps(shards: Shards, tmp_path: P
     assert len(keys) == len(Pictures(shards)) == 4
     assert all(services == {"rgb.png", "depth.exr", "segmentation.png", "json"} for services in keys.values())
     assert len(written) == 2
-    (path,) = webdataset.write(shards, tmp_path / "tars")
+    (path,) = webdataset.write(shards, tmp_path / "one")
     expected = Pictures(shards)[1]
     with tarfile.open(path) as tar:
         record = json.loads(tar.extractfile("00000001.json").read())  # type: ignore[union-attr]
@@ -131,4 +131,4 @@ def test_every_picture_is_one_sample_with_its_grasps(shards: Shards, tmp_path: P
     np.testing.assert_allclose(record["grasps"]["hand_pose"], expected["grasp/hand_pose"])
     assert record["grasp_frame"] == "camera"
     with pytest.raises(InputError, match="no picture"):
-        webdataset.write(Shards(shards.of("base")), tmp_path / "tars")
+        webdataset.write(Shards(shards.of("base")), tmp_path / "none")
