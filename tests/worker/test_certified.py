@@ -214,11 +214,7 @@ def test_hands_that_are_no_numbers_are_dropped_and_counted(
     assert np.isfinite(found.grasps.grasp.hand_pose).all()
 
 
-@given(
-    wanted=st.integers(1, 32),
-    factor=st.floats(1, 100),
-    rates=st.lists(st.floats(0, 1), min_size=1, max_size=8),
-)
+@given(wanted=st.integers(1, 32), factor=st.floats(1, 100), rates=st.lists(st.floats(0, 1), min_size=1, max_size=8))
 def test_rounds_end_with_enough_grasps_or_with_budget_used_up(wanted: int, factor: float, rates: list[float]) -> None:
     budget = int(np.ceil(wanted * factor))
     valid = tried = number = 0

@@ -104,9 +104,7 @@ def test_hands_that_are_pulled_lie_around_more_of_the_object(monkeypatch: pytest
     assert pulled > 1.1 * area("not pulled")
 
 
-def test_drawing_in_what_is_farther_off_leaves_more_of_the_hand(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_drawing_in_what_is_farther_off_leaves_more_of_the_hand(monkeypatch: pytest.MonkeyPatch) -> None:
     """7 to 24 % more area with each of three seeds; half of the least is asked for."""
     farther = area("drawn in")
     monkeypatch.setattr(planner, "AROUND", ProjectionOptions())

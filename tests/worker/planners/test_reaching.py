@@ -23,14 +23,7 @@ from worker.planners.fast_graspd import starts
 from worker.planners.fast_graspd.candidates import posture_of
 from worker.planners.fast_graspd.pairs import pair_of
 from worker.planners.fast_graspd.reaching import Reaching
-from worker.planners.fast_graspd.starts import (
-    CLEAR,
-    NO_PLACE,
-    RETREATS,
-    clear_starts,
-    open_further,
-    start_generator,
-)
+from worker.planners.fast_graspd.starts import CLEAR, NO_PLACE, RETREATS, clear_starts, open_further, start_generator
 from worker.run import Run
 from worker.simulation.data import HandState
 from worker.simulation.model import Model

@@ -28,12 +28,7 @@ from worker.hands.surface import sample_surface
 from worker.objects import disk_cache
 from worker.objects.model import ObjectModel
 from worker.quality import diversity, probe
-from worker.quality.contact import (
-    choose_contacts,
-    contact_distance_consistency_mm,
-    finger_of_body,
-    spread_contacts,
-)
+from worker.quality.contact import choose_contacts, contact_distance_consistency_mm, finger_of_body, spread_contacts
 from worker.quality.diversity import (
     POINTS,
     approach_cells,

@@ -106,9 +106,7 @@ def test_a_score_is_that_of_the_lift(monkeypatch: pytest.MonkeyPatch) -> None:
     assert found[0] <= BEST
 
 
-def test_lifting_at_half_the_friction_is_asked_to_be_better(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_lifting_at_half_the_friction_is_asked_to_be_better(monkeypatch: pytest.MonkeyPatch) -> None:
     outcomes = {True: [LIFTED, FELL], False: [LIFTED, LIFTED]}
     found = trial_of(monkeypatch, [0.2, 0.3], outcomes, np.array([1.5, 1.5]))
     assert found == pytest.approx([0.2, 1.5])

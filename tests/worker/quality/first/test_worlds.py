@@ -154,9 +154,7 @@ def test_at_level_certificate_the_first_judge_only_refuses() -> None:
     assert (alone.judged_by == JudgedBy.MUJOCO).all()
 
 
-def test_at_level_screen_clear_verdicts_stand_both_ways(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_at_level_screen_clear_verdicts_stand_both_ways(monkeypatch: pytest.MonkeyPatch) -> None:
     first = verdicts(ON, "screen")
     for held in (0, 1):
         assert (first.judged_by[first.success == held] == JudgedBy.MUJOCO_WARP).any()
