@@ -86,8 +86,9 @@ def test_what_is_not_there_is_refused_and_built_ins_are_named(kind: str) -> None
 
 def test_without_json_refusals_are_one_line_and_guesses_are_told(tmp_path: Path) -> None:
     (tmp_path / "o.stl").write_bytes(b"")
+    (tmp_path / "none").mkdir()
     result = CliRunner().invoke(build(), ["objects", "check", str(tmp_path / "o.stl")])
-    told = CliRunner().invoke(build(), ["objects", "check", str(tmp_path.parent / "none")])
+    told = CliRunner().invoke(build(), ["objects", "check", str(tmp_path / "none")])
     assert told.exit_code == 2 and "no mesh" in told.stderr
     assert (result.exit_code, result.stdout) == (2, "")
     assert len(result.stderr.splitlines()) == 1 and "o.stl" in result.stderr

@@ -155,6 +155,7 @@ def test_a_test_that_ends_badly_is_told_and_stops_nothing(
 
     monkeypatch.setattr(hand_self_test, "self_test", breaks)
     assert tried_softly(gripper)["says"] == says
+    monkeypatch.undo()
     with pytest.raises(TaskCancelled):
         tried_softly(gripper, Run(cancelled=lambda: True))
 

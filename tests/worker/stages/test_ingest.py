@@ -86,9 +86,10 @@ def test_a_hand_is_tried_if_its_record_says_so(context: TaskContext, monkeypatch
         raise InputError("no way in")
 
     monkeypatch.setattr(hand_self_test, "self_test", finds_none)
-    asset = store_files(context.store, AssetKind.HAND, "mine", files, said={"self_test": True})
+    other = {**files, "note.txt": b"y"}
+    asset = store_files(context.store, AssetKind.HAND, "other", other, said={"self_test": True})
     record_asset(context.store, asset)
-    ingest.run(message.model_copy(update={"digest": asset.digest}), context)
+    ingest.run(message.model_copy(update={"digest": asset.digest, "name": "other"}), context)
     found = json.loads(context.store.get(names.asset_check(AssetKind.HAND, asset.digest)))
     assert (found["verdict"], found["facts"]["self_test"]["says"]) == ("accept", "suspicious: no way in")
 
@@ -182,8 +183,9 @@ def test_a_check_loads_no_engine() -> None:
 def test_finding_that_is_long_and_check_that_complains_are_told(
     context: TaskContext, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(ingest, "_FINDING_BYTES", 10)
-    found, _ = ingest.check_in_child(AssetKind.OBJECT, "t", OBJECT, context)
+    with monkeypatch.context() as patch:
+        patch.setattr(ingest, "_FINDING_BYTES", 10)
+        found, _ = ingest.check_in_child(AssetKind.OBJECT, "t", OBJECT, context)
     assert found["verdict"] == "refuse"
     assert "finds more to say" in found["message"] and "ended the checker" not in found["message"]
     environment = ingest._environment()

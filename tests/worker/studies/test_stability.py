@@ -7,6 +7,7 @@ import math
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -374,6 +375,12 @@ def test_refused_scenes_are_cells_that_say_why_walls_stand_off(hand: HandModel) 
 
     # From a BarrettHand's data sheet: 335 mm at most, fingers stretched; the preshape is about two thirds open.
     assert 0.1 < scenes.span_of(hand) < 0.335
+
+
+@pytest.mark.parametrize(("valid", "outcome"), [([0, 0], "broken"), ([1, 0, 0], "weak"), ([1, 0], "good")])
+def test_a_cell_of_a_scene_tells_the_share_of_valid_grasps(valid: list[int], outcome: str) -> None:
+    found = SimpleNamespace(columns={"quality/valid": np.array(valid)}, shares={"clear_share": 0.0})
+    assert scenes._told(found)[:2] == (np.mean(valid), outcome)  # type: ignore[arg-type]
 
 
 def test_maps_of_several_runs_are_drawn_and_published_as_one(tmp_path: Path) -> None:

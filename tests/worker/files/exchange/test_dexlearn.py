@@ -124,13 +124,21 @@ def test_a_file_that_names_only_its_scene_is_read_with_it(checkout: Path, tmp_pa
     np.testing.assert_allclose(found.placed.object_pose[0], pose, atol=ROUNDING_M)
 
 
-@pytest.mark.parametrize("path", ["/etc/passwd", "assets/../../secret.npy", "other/scene.npy"])
-def test_a_scene_that_lies_elsewhere_is_refused(checkout: Path, tmp_path: Path, path: str) -> None:
+@pytest.mark.parametrize(
+    ("path", "says"),
+    [
+        ("/etc/passwd", "below assets"),
+        ("assets/../../secret.npy", "below assets"),
+        ("other/scene.npy", "below assets"),
+        ("assets/none.npy", "which is in no folder above"),
+    ],
+)
+def test_a_scene_that_lies_elsewhere_is_refused(checkout: Path, tmp_path: Path, path: str, says: str) -> None:
     (file, *_) = sorted((checkout / "assets" / "grasp" / NAME / "succ_collect").rglob("*.npy"))
     record = np.load(file, allow_pickle=True).item()
     del record["obj_pose"]
     save(tmp_path / "x.npy", record | {"scene_path": path})
-    with pytest.raises(InputError, match="below assets"):
+    with pytest.raises(InputError, match=says):
         dexgraspbench.read(tmp_path / "x.npy", hand="barrett", obj="block")
 
 
