@@ -110,6 +110,7 @@ def test_a_difference_names_cells_counts_and_settings(folder: Path, tmp_path: Pa
     assert cells == {"mug": (2 * COUNT, COUNT, COUNT), "block": (0, COUNT, 0)}
     assert found["settings"] == {"seed": {"first": ["0"], "second": ["0", "9"]}}
     assert "the same grasps in 2 cells" in run("diff", folder, folder).stdout
+    assert "write the digest of a snapshot after @" in run("diff", "kitchen@", folder).stderr
 
 
 def base_of(valid: list[int], sound: list[int], success: list[int] | None) -> Shard:

@@ -97,7 +97,9 @@ def test_several_objects_are_weighed_and_seconds_add_up(tmp_path: Path) -> None:
     assert row["sgs_without_referee"] is None
     row = evaluate(plates_case(), cache=tmp_path)
     whole = combine([row, {**row, "mu": 0.5}])
-    assert whole["mu"] is None
+    assert whole["mu"] is None and "clear_share" not in whole
+    clear = [{**row, "clear_share": 1.0}, {**row, "n": 1, "clear_share": 0.0}]
+    assert combine(clear)["clear_share"] == pytest.approx(row["n"] / (row["n"] + 1))
     assert whole["level"] == "certificate"
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 from pathlib import Path
 from typing import Any
@@ -77,15 +78,22 @@ def test_root_and_palm_normal_are_guessed_from_the_urdf_alone(
     np.testing.assert_allclose(hand.palm.approach, normal, atol=1e-9)
 
 
+@functools.cache
 def load(shared_data: Path, name: str) -> HandModel:
     return hand_from_path(shared_data / "hands" / URDFS[name])
 
 
 def bare(shared_data: Path, name: str, **options: object) -> HandModel:
     """The hand from its URDF and meshes alone, without the notes beside them."""
-    return load_hand(bare_files(shared_data, name), name=name, digest="0" * 32, options=options)
+    return _bare(shared_data, name, json.dumps(options))
 
 
+@functools.cache
+def _bare(shared_data: Path, name: str, options: str) -> HandModel:
+    return load_hand(bare_files(shared_data, name), name=name, digest="0" * 32, options=json.loads(options))
+
+
+@functools.cache
 def bare_files(shared_data: Path, name: str) -> dict[str, bytes]:
     _, files, _ = files_from_path(shared_data / "hands" / URDFS[name])
     return {file: content for file, content in files.items() if file != "hand.json"}

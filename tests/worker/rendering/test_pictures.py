@@ -18,7 +18,7 @@ from tests.worker.models import object_from_mesh, two_finger_hand
 from worker.commands.grasp_sheet import waypoints
 from worker.grasps import Posture
 from worker.hands.kinematics import body_poses
-from worker.rendering import Extras, render
+from worker.rendering import Extras, render, sheets
 from worker.rendering.hands import DrawnHand, drawn_bodies
 from worker.rendering.pictures import THREE_SIDES, grasp_pictures
 from worker.rendering.scenery import TABLE, TABLE_SIZE, seen_share, slab_poses, slabs
@@ -123,6 +123,19 @@ def test_views_page_shows_pictures_with_hand_where_there_are_any(block):
     assert page.shape[1] == without.shape[1] + 64 + GAP
     shown = (page == [255, 0, 255]).all(axis=-1)
     assert shown.sum() == 48 * 64 and not shown[:, : without.shape[1] - MARGIN].any()
+
+
+def test_boxes_are_drawn_the_loose_ones_with_the_wider_line() -> None:
+    views = {
+        "image/rgb": np.zeros((1, 60, 80, 3)),
+        "image/segmentation": np.zeros((1, 60, 80)),
+        "box/bounding_box_3d": np.tile([-10.0, -10, 1], (1, 8, 1)),
+        "camera/intrinsics": np.eye(3)[None],
+        "box/bounding_box_2d_loose": np.array([[10.0, 10, 70, 50]]),
+        "box/bounding_box_2d_tight": np.array([[30.0, 20, 60, 40]]),
+    }
+    row = np.asarray(sheets._boxes(views, 0).convert("L"), float)[30]
+    assert row[5:20].sum() > 1.5 * row[25:35].sum() > 0
 
 
 def test_depth_colours_darken_with_distance_and_grey_is_nothing():

@@ -182,16 +182,17 @@ def cast(origin: np.ndarray, rays: np.ndarray, triangles: np.ndarray) -> np.ndar
 def test_segmentation_agrees_with_a_brute_force_ray_caster(mug, mug_poses, mug_views):
     view = 4
     origin, rays = world_rays(mug_views, view)
-    rays = rays.reshape(-1, 3)
+    few = slice(None, None, 5)
+    rays = rays.reshape(-1, 3)[few]
     depth = cast(origin, rays, apply(mug_poses[1], mug.vertices)[mug.faces])
     plane = np.where(rays[:, 2] < 0, -origin[2] / rays[:, 2], np.inf)
     object_first = depth < plane
-    ours = (mug_views["image/segmentation"][view] == 2).ravel()
-    assert object_first.sum() > 500
+    ours = (mug_views["image/segmentation"][view] == 2).ravel()[few]
+    assert object_first.sum() > 100
     assert np.mean(ours == object_first) >= 0.995
     both = ours & object_first
     # Where one part of the mug hides another the two may see different parts, as along the outline.
-    assert np.quantile(np.abs(mug_views["image/depth"][view].ravel()[both] - depth[both]), 0.995) < DEPTH_M
+    assert np.quantile(np.abs(mug_views["image/depth"][view].ravel()[few][both] - depth[both]), 0.995) < DEPTH_M
 
 
 def test_the_same_seed_gives_the_same_pixels_whatever_is_beside(mug, mug_poses, mug_views) -> None:

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from service.model.errors import InputError
 from service.model.transforms import compose, quat_to_matrix
 from service.store.shards import read_shard
+from worker.commands.exchange import IMPORTS, read_sets
 from worker.files.exchange import dexgraspbench, published
 from worker.files.exchange.imported import Origin, load_npy, verdicts
 from worker.files.exchange.scoring import write_scored
@@ -184,3 +185,39 @@ def test_a_missing_joint_is_told_and_two_scales_are_two_objects() -> None:
 
     # What is kept of a pair between calls is found by digest.
     assert len({scaled_object("block", scale).digest for scale in (1.0, 0.5, 2.0)}) == 3
+
+
+#: What reads each format.
+READERS = {
+    "dexgraspbench": "dexgraspbench.read",
+    "dexlearn": "dexgraspbench.read",
+    "graspgen": "graspgen.read",
+    "huggingface": "huggingface.read",
+    "lerobot": "lerobot.read",
+    "dexgraspnet": "published.read_dexgraspnet",
+    "dexgraspnet2": "dexgraspnet2.read",
+    "multidex": "published.read_multidex",
+    "ddgc": "published.read_ddgc",
+    "reference": "published.read_reference",
+}
+
+
+@pytest.mark.parametrize("name", IMPORTS)
+def test_each_format_has_its_reader(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for reader in set(READERS.values()):
+        told = [reader]
+        monkeypatch.setattr(f"worker.files.exchange.{reader}", lambda *_, told=told, **__: told)
+    options = {"robot": "r", "object_name": "o", "number": 0}
+    assert read_sets(name, tmp_path, "h", "o", options) == [READERS[name]]
+    if name != "reference":
+        with pytest.raises(InputError, match="name both: --hand and --object"):
+            read_sets(name, tmp_path, "h", None, options)
+
+
+@pytest.mark.parametrize(
+    ("name", "source", "says"),
+    [("foo", "", "no import format"), ("ddgc", "none", "does not exist"), ("multidex", "", "--robot and --name")],
+)
+def test_what_no_import_can_read_is_told(name: str, source: str, says: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=says):
+        read_sets(name, tmp_path / source, "h", "o", {"robot": "", "object_name": "", "number": 0})
