@@ -25,6 +25,7 @@ from worker.planners.graspd2022.method import (
 )
 from worker.planners.peers import ground_of
 from worker.simulation.data import HandState
+from worker.simulation.kernels.surface import Surface, field_distance
 
 RADIUS = 0.05
 SPHERE = object_from_mesh(trimesh.creation.icosphere(subdivisions=4, radius=RADIUS))
@@ -39,6 +40,23 @@ def grid_of_sphere(cells: int) -> Any:
     return distance_grid(ground_of(two_finger_hand(), SPHERE, "cpu", kernels).fine.obj, cells)
 
 
+@wp.kernel(enable_backward=False)
+def _probe(
+    physics: kernels.ForceModel,
+    surface: Surface,
+    point_in: wp.array[wp.vec3],
+    velocity_in: wp.vec3,
+    distance_out: wp.array[wp.float32],
+    force_out: wp.array[wp.vec3],
+    slope_out: wp.array[wp.vec3],
+):
+    i = wp.tid()
+    sample = field_distance(surface, point_in[i])
+    distance_out[i] = sample.distance
+    force_out[i] = kernels.contact_force(physics, -sample.distance, sample.normal, velocity_in)
+    slope_out[i] = kernels.force_slope(physics, -sample.distance, sample.normal, velocity_in)
+
+
 def probed(
     points: np.ndarray, velocity: tuple[float, float, float] = (0, 0, 0), grid: Any = None
 ) -> tuple[np.ndarray, ...]:
@@ -48,7 +66,7 @@ def probed(
     found: list[Any] = [wp.zeros(n, dtype=kind, device="cpu") for kind in (wp.float32, wp.vec3, wp.vec3)]
     given = wp.array(points, dtype=wp.vec3, device="cpu")
     wp.launch(
-        kernels.probe,
+        _probe,
         n,
         inputs=[physics_of(SPHERE.gyration_radius), grid, given, wp.vec3(*velocity)],
         outputs=found,

@@ -11,37 +11,60 @@ from tests.worker.models import object_from_mesh, two_finger_hand
 from worker.hands.load import hand_from_path
 from worker.planners.graspit import kernels
 from worker.planners.graspit.method import Search, eigengrasps, virtual_contacts
-from worker.planners.graspit.schedule import FIRST_STEP, acceptance, jump_share, temperature
+from worker.planners.graspit.schedule import FIRST_STEP
 from worker.planners.peers import ground_of
 from worker.planners.threads import Steps
 from worker.run import ALONE, Run
 
 
-def test_temperature_and_jumps_follow_ingbers_schedule() -> None:
-    np.testing.assert_allclose(temperature(np.array([0, 30_000, 70_000])), [1e6, 9.37e-6, 5.49e-7], rtol=5e-3)
-    for t in (1e-6, 1e-2, 1.0, 1e6):
-        np.testing.assert_allclose(jump_share(np.array([0.0, 0.5, 1.0]), t), [-1, 0, 1], atol=1e-9)
-    # Hot: nearly uniform. Cold: half of all jumps are shorter than sqrt(T).
-    assert jump_share(np.array(0.75), 1e6) == pytest.approx(0.5, abs=1e-3)
-    assert jump_share(np.array(0.75), 1e-6) == pytest.approx(1e-3, rel=0.01)
+@wp.kernel(enable_backward=False)
+def _schedule(
+    step_in: wp.array[wp.float32],
+    uniform_in: wp.array[wp.float32],
+    rise_in: wp.array[wp.float32],
+    temperature_out: wp.array[wp.float32],
+    jump_out: wp.array[wp.float32],
+    acceptance_out: wp.array[wp.float32],
+):
+    i = wp.tid()
+    temperature_out[i] = kernels.temperature(step_in[i])
+    jump_out[i] = kernels.jump_share(uniform_in[i], temperature_out[i])
+    acceptance_out[i] = kernels.acceptance(rise_in[i], temperature_out[i])
 
 
-def test_worse_states_are_taken_more_rarely_the_colder_it_is() -> None:
-    hot, cold = temperature(np.array([30_000, 70_000]))
-    assert acceptance(np.array([-1.0, 0.0]), cold).tolist() == [1.0, 1.0]
-    assert acceptance(np.array(1.0), hot) == pytest.approx(np.exp(-1e-6 / hot))
-    assert acceptance(np.array(1.0), cold) < acceptance(np.array(1.0), hot)
+@wp.kernel(enable_backward=False)
+def _evaluated(
+    problem: kernels.Problem,
+    state_in: wp.array[kernels.vec8],
+    body_p_out: wp.array2d[wp.vec3],
+    body_q_out: wp.array2d[wp.quat],
+    energy_out: wp.array[wp.float32],
+):
+    b = wp.tid()
+    kernels.place(problem, b, state_in[b], body_p_out, body_q_out)
+    energy_out[b] = kernels.contact_energy(problem, b, body_p_out, body_q_out)
 
 
-def test_the_kernels_schedule_is_the_written_one() -> None:
-    """Relative 2e-4: float32 loses that much in exp(-25)."""
-    step, uniform, rise = np.array([3e4, 5e4, 7e4]), np.array([0.1, 0.6, 0.9]), np.array([-1.0, 2.0, 30.0])
-    given = [wp.array(values, dtype=wp.float32, device="cpu") for values in (step, uniform, rise)]
-    found = [wp.zeros(3, dtype=wp.float32, device="cpu") for _ in range(3)]
-    wp.launch(kernels.probe_schedule, 3, inputs=given, outputs=found, device="cpu")
-    t = temperature(step)
-    for value, expected in zip(found, (t, jump_share(uniform, t), acceptance(rise, t)), strict=True):
-        np.testing.assert_allclose(value.numpy(), expected, rtol=2e-4)
+def scheduled(step: float, uniform: float = 0.5, rise: float = 0.0) -> list[float]:
+    """Temperature, share of the largest jump, and chance of a rise at a step."""
+    given = [wp.array([value], dtype=wp.float32, device="cpu") for value in (step, uniform, rise)]
+    found = [wp.zeros(1, dtype=wp.float32, device="cpu") for _ in range(3)]
+    wp.launch(_schedule, 1, inputs=given, outputs=found, device="cpu")
+    return [float(value.numpy()[0]) for value in found]
+
+
+def test_temperature_jumps_and_acceptance_follow_ingbers_schedule() -> None:
+    """T(k) = 1e6 exp(-7 k^(1/8)) in float32, which loses 2e-4 in exp(-25)."""
+    assert [scheduled(step)[0] for step in (0, 3e4, 7e4)] == pytest.approx([1e6, 9.37e-6, 5.49e-7], rel=5e-3)
+    for step, uniform in ((3e4, 0.1), (5e4, 0.6), (7e4, 0.9)):
+        t, jump, _ = scheduled(step, uniform)
+        assert t == pytest.approx(1e6 * np.exp(-7 * step**0.125), rel=2e-4)
+        expected = np.sign(uniform - 0.5) * t * ((1 + 1 / t) ** abs(2 * uniform - 1) - 1)
+        assert jump == pytest.approx(expected, rel=2e-4)
+    assert [scheduled(5e4, uniform)[1] for uniform in (0.0, 0.5, 1.0)] == pytest.approx([-1, 0, 1], abs=1e-6)
+    assert [scheduled(7e4, rise=rise)[2] for rise in (-1.0, 0.0)] == [1.0, 1.0]
+    hot, cold = scheduled(3e4, rise=1.0), scheduled(7e4, rise=1.0)
+    assert hot[2] == pytest.approx(np.exp(-1e-6 / hot[0]), rel=2e-4) and cold[2] < hot[2]
 
 
 def palm_only(gap: float, turn: float) -> float:
@@ -55,9 +78,9 @@ def palm_only(gap: float, turn: float) -> float:
     problem.contact_normal = wp.array([[0.0, 0, 1]], dtype=wp.vec3, device="cpu")
     state = kernels.vec8(0, 0, -0.05 - gap, np.pi / 2, 0, turn, 0, 0)
     poses = [wp.zeros((1, 3), dtype=kind, device="cpu") for kind in (wp.vec3, wp.quat)]
-    legal, energy = wp.zeros(1, dtype=wp.int32, device="cpu"), wp.zeros(1, dtype=wp.float32, device="cpu")
+    energy = wp.zeros(1, dtype=wp.float32, device="cpu")
     given = wp.array([state], dtype=kernels.vec8, device="cpu")
-    wp.launch(kernels.evaluate, 1, inputs=[problem, given], outputs=[*poses, legal, energy], device="cpu")
+    wp.launch(_evaluated, 1, inputs=[problem, given], outputs=[*poses, energy], device="cpu")
     return float(energy.numpy()[0])
 
 
