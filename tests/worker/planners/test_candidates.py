@@ -99,7 +99,7 @@ BAD = 2 * candidates.HOPEFUL
         ([[0.5, 0.6]], {"unsound": (0, 1)}, [0], []),
         # Where none is good enough the least score is taken, of equal ones the first, and no score is the worst.
         ([[3.0, 2.6, 4.0]], {}, [1], [0, 1, 2]),
-        ([[2.0, 2.0]], {}, [0], [0, 1]),
+        ([[2.0, 2.0]], {}, [0], None),
         ([[np.nan, 2.0, np.inf], [np.nan, np.inf, np.nan]], {}, [1, 3], None),
     ],
 )
