@@ -8,14 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-from typer.testing import CliRunner
 
-from graspd.cli import build
 from service.model.domain import JobOptions
 from service.model.fidelity import FIDELITIES
 from service.model.scene_spec import SceneSpec, parse_scene
 from service.model.transforms import apply
 from service.store.shards import write_shard
+from tests.worker.commands_run import graspd
 from worker.files.cases import load_case
 from worker.files.evaluate import evaluate
 from worker.files.synthesis import Synthesized, synthesized
@@ -113,9 +112,7 @@ def test_views_of_scenes_are_the_same(made: Any, tmp_path: Path, place: str) -> 
     seen = []
     for at in ("origin", place):
         shard, views = file_of(made[at, "table"], tmp_path / f"{at}.h5"), tmp_path / f"{at}-views.h5"
-        words = ["render", shard, "--views", "1", "--width", "48", "--height", "36", "--device", "cpu", "-o", views]
-        done = CliRunner().invoke(build(), [str(word) for word in words])
-        assert done.exit_code == 0, done.output
+        graspd("render --views 1 --width 48 --height 36 --device cpu -o", views, shard)
         seen.append(read_shard(views, kind="views").arrays)
     for name in seen[0]:
         np.testing.assert_array_equal(seen[1][name], seen[0][name], err_msg=name)

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from graspd.cli import build
 from service.model.states import AssetKind
 from service.model.transforms import Floats, quat_from_axis_angle, quat_multiply, quat_rotate
 from service.store.asset_summary import summary
 from service.store.assets import builtin_files
+from tests.worker.commands_run import graspd
 from tests.worker.hands.urdfs import joint, link, load, report, robot
 from worker.hands.check import check_hand
 from worker.hands.jaws import fingertip_pad, sign_of
@@ -87,9 +85,8 @@ def test_a_finger_that_no_joint_closes_is_told(tmp_path: Path) -> None:
     still = {"approach": [0, 1, 0], "closing": dict.fromkeys(("thumb_axial", "thumb_bend", "thumb_tip"), 0)}
     assert "no joint closes the finger of thumb2:" in check_hand({"r.urdf": text}, "r", still)["message"]
     (tmp_path / "r.urdf").write_bytes(text)
-    command = ["hands", "check", str(tmp_path / "r.urdf"), "--approach", "0,1,0", "--no-self-test", "--json"]
-    told = CliRunner().invoke(build(), command)
-    assert json.loads(told.stdout)["closing"] == closing_of(hand_of(text))
+    told = graspd("hands check --approach 0,1,0 --no-self-test", tmp_path / "r.urdf")
+    assert told["closing"] == closing_of(hand_of(text))
 
 
 _PLATE_PALM = '<collision><geometry><box size="0.09 0.09 0.02"/></geometry></collision>'

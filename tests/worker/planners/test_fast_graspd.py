@@ -97,18 +97,25 @@ def area(name: str) -> float:
     return float(np.mean(measured(name, "barrett", "mug")["quality/contact_area_cm2"]))
 
 
-def test_hands_that_are_pulled_lie_around_more_of_the_object(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture(scope="module")
+def plain_area() -> float:
+    return area("plain")
+
+
+def test_hands_that_are_pulled_lie_around_more_of_the_object(
+    plain_area: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A fifth more area with each of three seeds, of which a half is asked for."""
-    pulled = area("pulled")
     monkeypatch.setattr(schedule, "PULL", 0.0)
-    assert pulled > 1.1 * area("not pulled")
+    assert plain_area > 1.1 * area("not pulled")
 
 
-def test_drawing_in_what_is_farther_off_leaves_more_of_the_hand(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_drawing_in_what_is_farther_off_leaves_more_of_the_hand(
+    plain_area: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """7 to 24 % more area with each of three seeds; half of the least is asked for."""
-    farther = area("drawn in")
     monkeypatch.setattr(planner, "AROUND", ProjectionOptions())
-    assert farther > 1.04 * area("drawn in as among obstacles")
+    assert plain_area > 1.04 * area("drawn in as among obstacles")
 
 
 def test_hands_enter_an_object_less_where_more_of_it_is_tested(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -10,13 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from typer.testing import CliRunner
 
-from graspd.cli import build
 from service.model.domain import JobOptions
 from service.model.errors import MeshError
 from service.model.matter import ACCELERATION, FRICTION, MASS_KG
 from service.store.shards import read_shard
+from tests.worker.commands_run import graspd
 from tests.worker.models import object_from_mesh, two_finger_hand
 from worker.grasps import GraspSet, Posture
 from worker.objects.options import as_asked
@@ -133,28 +131,14 @@ def test_what_is_said_with_a_job_goes_over_what_the_file_says() -> None:
         BOX.weighing(density=1e7)
 
 
+BARRETT = "synth --hand barrett --object block --scene table --fidelity draft --seed 3"
+
+
 def test_whoever_says_the_weight_is_told_what_the_grasps_lift(tmp_path: Path) -> None:
-    words = [
-        "synth",
-        "--hand",
-        "barrett",
-        "--object",
-        "block",
-        "--scene",
-        "table",
-        "-n",
-        "1",
-        "--fidelity",
-        "draft",
-        "--seed",
-        "3",
-        "--json",
-        "-o",
-        str(tmp_path / "g.h5"),
-    ]
     keys = {"mass_kg", "lift_share", "lift_hard_share", "payload_kg"}
-    for more, told in ((["--mass", "0.37"], keys), (["--mass", "0.37", "--no-payload"], keys - {"payload_kg"})):
-        said = json.loads(CliRunner().invoke(build(), words + more).stdout.splitlines()[-1])
+    words = f"{BARRETT} -n 1 --mass 0.37 -o"
+    for more, told in (((), keys), (("--no-payload",), keys - {"payload_kg"})):
+        said = graspd(words, tmp_path / "g.h5", *more)
         assert keys & said.keys() == told
         assert said["mass_kg"] == 0.37 and said.get("payload_kg", 1.0) >= 0.37
 
@@ -163,32 +147,8 @@ def test_whoever_says_the_weight_is_told_what_the_grasps_lift(tmp_path: Path) ->
 def test_a_job_counts_grasps_that_lift_the_wanted_payload(
     tmp_path: Path, least: float, kept: int, outcomes: dict[str, int]
 ) -> None:
-    words = [
-        "synth",
-        "--hand",
-        "barrett",
-        "--object",
-        "block",
-        "--mass",
-        "0.2",
-        "--scene",
-        "table",
-        "-n",
-        "2",
-        "--budget",
-        "1",
-        "--fidelity",
-        "draft",
-        "--seed",
-        "3",
-        "--min-payload",
-        str(least),
-        "--shake",
-        "--json",
-        "-o",
-        str(tmp_path / "g.h5"),
-    ]
-    told = json.loads(CliRunner().invoke(build(), words).stdout.splitlines()[-1])
+    words = f"{BARRETT} -n 2 --budget 1 --mass 0.2 --min-payload {least} --shake -o"
+    told = graspd(words, tmp_path / "g.h5", code=0 if kept else 3)
     shard = read_shard(tmp_path / "g.h5")
     assert (told["grasps"], told["mass_kg"], shard.attributes["object_mass_kg"]) == (kept, 0.2, 0.2)
     assert {name: told["outcomes"].get(name) for name in outcomes} == outcomes
@@ -242,29 +202,8 @@ def test_what_is_wanted_is_told_with_what_the_best_grasp_lifts() -> None:
 
 @pytest.mark.parametrize("wanted", [ENOUGH // 2, ENOUGH])
 def test_weight_out_of_reach_ends_work_with_what_the_hand_lifts(tmp_path: Path, wanted: int) -> None:
-    words = [
-        "synth",
-        "--hand",
-        "allegro",
-        "--object",
-        "block",
-        "--mass",
-        "20",
-        "--scene",
-        "table",
-        "-n",
-        str(wanted),
-        "--fidelity",
-        "draft",
-        "--seed",
-        "3",
-        "--json",
-        "-o",
-        str(tmp_path / "g.h5"),
-    ]
-    result = CliRunner().invoke(build(), words)
-    told = json.loads(result.stdout.splitlines()[-1])
-    assert result.exit_code == 3
+    words = f"synth --hand allegro --object block --mass 20 --scene table -n {wanted} --fidelity draft --seed 3 -o"
+    told = graspd(words, tmp_path / "g.h5", code=3)
     assert (told["grasps"], told["tried"]) == (0, wanted), "the budget would be four times as many"
     assert 0.3 < told["limit"]["lifts_kg"] <= told["limit"]["bound_kg"] < 10
     tries = wanted + told["outcomes"]["repeated"]

@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from typer.testing import CliRunner
 
-from graspd.cli import build
+from tests.worker.commands_run import graspd, refused
 from tests.worker.hands.urdfs import joint, link, robot
 from worker.hands.load import hand_from_path, load_hand
 from worker.hands.model import HandModel
@@ -70,25 +69,19 @@ def test_what_check_writes_leaves_nothing_to_guess(tmp_path: Path) -> None:
     ]
     urdf = tmp_path / "claw.urdf"
     urdf.write_bytes(robot(link("palm", BOX), *fingers, *joints))
-    said = ["--palm", "palm", "--approach", "0,0,1", "--pre-shape", "ja=0.2", "--closing", "ja=-1", "--fingertips", "a"]
+    said = "--palm palm --approach 0,0,1 --pre-shape ja=0.2 --closing ja=-1 --fingertips a"
     target = tmp_path / "asset.json"
-    told = CliRunner().invoke(
-        build(), ["hands", "check", str(urdf), *said, "--no-self-test", "--write", str(target), "--json"]
-    )
-    facts = json.loads(told.stdout.splitlines()[-1])["facts"]
+    facts = graspd(f"hands check --no-self-test {said} --write", target, urdf)["facts"]
     assert json.loads(target.read_text())["file"] == "claw.urdf"
     hand = hand_from_path(urdf)
     assert hand.closing.tolist() == [-1, 1] and hand.preshape[0] == pytest.approx(0.2)
     assert [hand.body_names[tip] for tip in hand.fingertips] == ["a"]
-    again = CliRunner().invoke(build(), ["hands", "check", str(urdf), "--no-self-test", "--json"])
-    found = json.loads(again.stdout.splitlines()[-1])["facts"]
-    assert {
-        key: found[key] for key in ("palm_centre", "palm_approach", "closing", "preshape", "fingertips", "root")
-    } == {key: facts[key] for key in ("palm_centre", "palm_approach", "closing", "preshape", "fingertips", "root")}
+    found = graspd("hands check --no-self-test", urdf)["facts"]
+    for key in ("palm_centre", "palm_approach", "closing", "preshape", "fingertips", "root"):
+        assert found[key] == facts[key]
     assert "palm" not in found["guessed"] and "closing" not in found["guessed"]
 
 
-@pytest.mark.parametrize("said", [("--closing", "ja=2"), ("--closing", "ja"), ("--xacro", "x")])
-def test_an_option_that_cannot_be_read_is_the_callers_mistake(said: tuple[str, str]) -> None:
-    told = CliRunner().invoke(build(), ["hands", "check", "allegro", "--no-self-test", *said])
-    assert told.exit_code == 2 and said[0] in told.stderr
+@pytest.mark.parametrize("said", ["--closing ja=2", "--closing ja", "--xacro x"])
+def test_an_option_that_cannot_be_read_is_the_callers_mistake(said: str) -> None:
+    assert said.split()[0] in refused(f"hands check allegro --no-self-test {said}")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import sys
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ import pytest
 import yourdfpy
 
 from service.model.transforms import IDENTITY_POSE, compose, pose_from_matrix
+from tests.worker.commands_run import graspd
 from tests.worker.robots.arms import JOINTS, write_arm
 from tests.worker.robots.shards import run
 from worker.robots.arm import read_arm
@@ -34,15 +34,13 @@ def arm(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def export(shard: Path, arm: Path, folder: Path, format_: str = "csv", base: str = "-0.45 0 0 1 0 0 0") -> Any:
     carried = ["--arm", arm, "--mount-pose", MOUNT_POSE, "--base", base]
-    return run(f"export --format {format_} --all --mount flange --json -o", folder, shard, *carried)
+    return graspd(f"export --format {format_} --all --mount flange -o", folder, shard, *carried)
 
 
 @pytest.fixture(scope="module")
 def carried(table_shard: Path, arm: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], Path]:
     folder = tmp_path_factory.mktemp("carried")
-    found = export(table_shard, arm, folder)
-    assert found.exit_code == 0, found.output
-    return json.loads(found.stdout.splitlines()[-1]), folder
+    return export(table_shard, arm, folder), folder
 
 
 def rows(folder: Path, table: str = "trajectories") -> list[dict[str, str]]:
@@ -85,7 +83,7 @@ def test_joints_stay_within_their_limits_of_place_and_speed(carried: tuple[dict[
 
 
 def test_arms_scene_opens_in_mujoco_and_nothing_of_arm_touches(table_shard: Path, arm: Path, tmp_path: Path) -> None:
-    assert export(table_shard, arm, tmp_path, "mujoco").exit_code == 0
+    export(table_shard, arm, tmp_path, "mujoco")
     model = mujoco.MjModel.from_xml_path(str(tmp_path / "arm.xml"))
     data = mujoco.MjData(model)
     assert model.nkey % 6 == 0 and model.nkey >= 12
@@ -102,7 +100,7 @@ def test_arms_scene_opens_in_mujoco_and_nothing_of_arm_touches(table_shard: Path
 def test_moveit_is_told_poses_in_the_arms_base_and_all_joints(table_shard: Path, arm: Path, tmp_path: Path) -> None:
     import yaml
 
-    assert export(table_shard, arm, tmp_path, "moveit").exit_code == 0
+    export(table_shard, arm, tmp_path, "moveit")
     grasps = yaml.safe_load((tmp_path / "grasps.yaml").read_text())
     assert {grasp["grasp_pose"]["header"]["frame_id"] for grasp in grasps} == {"base"}
     file = sorted((tmp_path / "trajectories").iterdir())[0]
@@ -140,8 +138,7 @@ def test_base_without_an_arm_and_an_arm_without_mink_are_refused(
 
 def test_speeds_that_the_arm_does_not_state_are_assumed_and_told(free_shard: Path, tmp_path: Path) -> None:
     found = export(free_shard, write_arm(tmp_path, velocities=False), tmp_path / "out", base="-0.45 0 -0.3 1 0 0 0")
-    assert found.exit_code == 0, found.output
-    notes = json.loads(found.stdout.splitlines()[-1])["notes"]
+    notes = found["notes"]
     assert any(f"6 joints have no velocity limit (pan, shoulder, elbow, ...): {ASSUMED_RAD_S:g}" in n for n in notes)
 
 
@@ -153,9 +150,8 @@ def test_a_real_arm_carries_grasps(table_shard: Path, tmp_path: Path, name: str)
     if folder is None:
         pytest.skip("example-robot-data is not installed")
     carried = ["--arm", folder / name, "--mount-pose", MOUNT_POSE, "--base", "-0.5 0 0 1 0 0 0"]
-    found = run("export --format csv --all --mount panda_link8 --json -o", tmp_path, table_shard, *carried)
-    assert found.exit_code == 0, found.output
-    assert json.loads(found.stdout.splitlines()[-1])["reach_share"] > 0
+    found = graspd("export --format csv --all --mount panda_link8 -o", tmp_path, table_shard, *carried)
+    assert found["reach_share"] > 0
 
 
 @pytest.mark.parametrize("kind", ["floating", "planar"])

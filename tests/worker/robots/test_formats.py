@@ -21,6 +21,7 @@ import service
 from service.model.transforms import compose, invert, pose_to_matrix, quat_to_matrix
 from service.store.shards import read_shard, write_shard
 from tests.conftest import REPOSITORY
+from tests.worker.commands_run import graspd
 from tests.worker.robots.arms import write_arm
 from tests.worker.robots.shards import COMMON, make, run
 from worker.files.cases import load_case
@@ -37,9 +38,7 @@ POINT = {"positions", "velocities", "accelerations", "effort", "time_from_start"
 
 
 def export(shard: Path, format_: str, folder: Path, *more: str) -> dict[str, Any]:
-    found = run("export", shard, "--format", format_, "--all", "-o", folder, "--json", *more)
-    assert found.exit_code == 0, found.output
-    return json.loads(found.stdout.splitlines()[-1])
+    return graspd(f"export --format {format_} --all -o", folder, shard, *more)
 
 
 def limp(shard: Path, out: Path) -> Path:
@@ -82,8 +81,7 @@ def judged(shard: Path) -> list[bool]:
     """What the referee says of each row."""
     case = load_case(shard)
     protocol = "dexgraspbench" if case.placed is None else "lift"
-    found = run("evaluate", shard, "--protocol", protocol, "--json")
-    return [one["held"] for one in json.loads(found.stdout.splitlines()[-1])["verdicts"]]
+    return [one["held"] for one in graspd(f"evaluate --protocol {protocol}", shard)["verdicts"]]
 
 
 @pytest.mark.parametrize("which", ["free_shard", "table_shard", "pressing_shard", "clutter_shard"])
