@@ -94,7 +94,7 @@ def test_a_colour_that_cannot_be_read_leaves_the_shape(change: object) -> None:
     assert np.isnan(colour(changed(textured(), change))).all()
 
 
-def test_a_texture_that_promises_too_much_is_not_unpacked() -> None:
+def test_pictures_that_promise_too_much_and_endless_libraries_end() -> None:
     material = {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}
     picture = large()
     document = {
@@ -104,6 +104,13 @@ def test_a_texture_that_promises_too_much_is_not_unpacked() -> None:
         "bufferViews": [{"byteLength": len(picture)}],
     }
     assert np.isnan(material_colour(document, picture, {"material": 0})).all()
+    many = b"".join(b"newmtl m%d\nmap_Kd p%d.png\n" % (k, k) for k in range(10_000))
+    files = {"a.obj": b"mtllib a.mtl\n" * 10_000, "a.mtl": many, **{f"p{k}.png": b"" for k in range(10_000)}}
+    assert len(looks_of("a.obj", files)) <= MAX_NAMES
+    asked: list[str] = []
+    text = OBJ.replace(b"looks/part.mtl", b"a.mtl")
+    read_mesh("a.obj", text, lambda name: asked.append(name) or (many if name == "a.mtl" else None))
+    assert len(asked) <= 1 + MAX_NAMES
 
 
 def test_an_obj_has_the_colours_of_its_vertices() -> None:
@@ -221,16 +228,6 @@ def test_a_hand_brings_looks_its_meshes_name_none_from_outside(tmp_path: Path) -
     assert {mesh.colour for mesh in hand.visuals.meshes} == {None, GREEN, RED}
 
 
-def test_a_library_that_names_itself_or_very_much_ends() -> None:
-    many = b"".join(b"newmtl m%d\nmap_Kd p%d.png\n" % (k, k) for k in range(10_000))
-    files = {"a.obj": b"mtllib a.mtl\n" * 10_000, "a.mtl": many, **{f"p{k}.png": b"" for k in range(10_000)}}
-    assert len(looks_of("a.obj", files)) <= MAX_NAMES
-    asked: list[str] = []
-    text = OBJ.replace(b"looks/part.mtl", b"a.mtl")
-    read_mesh("a.obj", text, lambda name: asked.append(name) or (many if name == "a.mtl" else None))
-    assert len(asked) <= 1 + MAX_NAMES
-
-
 HEAD = '<?xml version="1.0"?><COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">'
 #: A tetrahedron and a square of four corners, each in a colour of its own, in millimetres, moved and turned.
 SCENE = """
@@ -266,7 +263,7 @@ def dae(body: str = SCENE) -> bytes:
     return f"{HEAD}{body}</COLLADA>".encode()
 
 
-def test_triangles_are_placed_scaled_and_coloured() -> None:
+def test_a_mesh_that_trimesh_wrote_comes_back_ours_is_placed() -> None:
     soup = read_mesh("a.dae", dae())
     assert len(soup.faces) == 6
     # 2 (R_z(90) p + 100 x) mm
@@ -274,9 +271,6 @@ def test_triangles_are_placed_scaled_and_coloured() -> None:
     found = np.unique(soup.vertices.round(9), axis=0)
     np.testing.assert_allclose(found, np.unique(expected.round(9), axis=0), atol=1e-12)
     assert {colour: len(faces) for colour, faces in soup.by_colour()} == {(1.0, 0.0, 0.0): 4, None: 2}
-
-
-def test_a_mesh_that_trimesh_wrote_comes_back() -> None:
     pytest.importorskip("collada")
     mesh = trimesh.creation.icosphere(2, 0.03)
     soup = read_mesh("a.dae", bytes(mesh.export(file_type="dae")))

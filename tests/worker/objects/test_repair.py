@@ -93,22 +93,25 @@ def test_a_cavity_stays_a_cavity_however_it_is_wound(inwards: bool) -> None:
     assert report["facts"]["volume_m3"] == pytest.approx(hollow, rel=1e-4)
 
 
-def test_overlapping_solids_become_one() -> None:
+def test_touching_or_overlapping_solids_become_one() -> None:
     report = check(join(box(), box(at=(0.03, 0.0, 0.0))))
     assert report["verdict"] == "repair" and "intersect" in report["message"]
     assert report["facts"]["volume_m3"] == pytest.approx(0.09 * 0.05 * 0.04, rel=1e-4)
+    cubes = []
+    for corner in np.indices((2, 2, 2)).reshape(3, -1).T:
+        cubes.append(trimesh.creation.box((0.03, 0.03, 0.03)))
+        cubes[-1].apply_translation(0.03 * corner)
+    report = check_parts(trimesh.util.concatenate(cubes))
+    assert report["verdict"] == "repair" and report["facts"]["volume_m3"] == pytest.approx(0.06**3)
 
 
-def test_a_small_hole_is_filled_and_a_large_one_refused() -> None:
+def test_small_holes_are_filled_others_and_inner_walls_refused() -> None:
     vertices, faces = sphere(segments=128)
     low = np.argsort(vertices[faces].mean(axis=1)[:, 2])
     small = check((vertices, faces[low[1:]]))
     assert small["verdict"] == "repair" and "hole" in small["message"]
     large = check((vertices, faces[low[len(low) // 4 :]]))
     assert large["verdict"] == "refuse" and "--allow-open" in large["message"]
-
-
-def test_a_wall_inside_a_mesh_is_no_hole_and_no_traceback() -> None:
     (one, faces), (other, more) = box(), box(at=(0.06, 0.0, 0.0))
     # Their common face is there once: its four edges have three faces each.
     kept = ~np.isclose(other[more][:, :, 0], 0.03).all(axis=1)
@@ -238,15 +241,6 @@ def test_parts_that_share_a_face_are_united(upper: tuple[float, float, float], s
     report = check_parts(mesh, suffix)
     assert report["verdict"] == "repair" and "united 2 touching" in report["message"]
     assert report["facts"]["volume_m3"] == pytest.approx(abs(mesh.volume), rel=1e-5)
-
-
-def test_eight_cubes_of_a_block_are_one_cube() -> None:
-    cubes = []
-    for corner in np.indices((2, 2, 2)).reshape(3, -1).T:
-        cubes.append(trimesh.creation.box((0.03, 0.03, 0.03)))
-        cubes[-1].apply_translation(0.03 * corner)
-    report = check_parts(trimesh.util.concatenate(cubes))
-    assert report["verdict"] == "repair" and report["facts"]["volume_m3"] == pytest.approx(0.06**3)
 
 
 def test_parts_within_a_millimetre_are_one_body() -> None:

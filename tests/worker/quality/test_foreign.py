@@ -69,7 +69,7 @@ def test_one_joint_of_tendon_takes_what_limit_of_other_leaves(tmp_path: Path) ->
     assert q[bend] == pytest.approx(0.5 + 0.5 * (0.8 - q[curl]), abs=1e-3)
 
 
-def test_the_key_of_a_hand_without_tendons_is_the_one_it_had(tmp_path: Path) -> None:
+def test_the_first_judge_and_the_key_know_of_tendons(tmp_path: Path) -> None:
     hand = load(root="palm")
     pieces = decompose(BOX, cache=tmp_path)
     separate = dataclasses.replace(hand, tendons=())
@@ -77,6 +77,7 @@ def test_the_key_of_a_hand_without_tendons_is_the_one_it_had(tmp_path: Path) -> 
     assert len(keys) == 2
     dragged = dataclasses.replace(separate, drag=Drag(np.zeros(hand.bodies), np.zeros(hand.bodies)))
     assert verdict_key(dragged, BOX, "certificate", False, pieces=pieces) not in keys
+    assert first_terms(load(root="palm"), "certificate", Run(first_judge="on")) == []
 
 
 def test_a_drive_stays_what_it_is_with_followers_or_on_a_tendon() -> None:
@@ -90,10 +91,6 @@ def test_a_drive_stays_what_it_is_with_followers_or_on_a_tendon() -> None:
     assert forth.effort[dof] == pytest.approx(2 * cord.limit(tendon.effort))
     assert 4 * cord.gain(back.stiffness) == pytest.approx(ratio.stiffness[dof])
     assert 2 * cord.limit(back.effort) == pytest.approx(ratio.effort[dof])
-
-
-def test_the_first_judge_leaves_hands_with_tendons_to_the_cpu() -> None:
-    assert first_terms(load(root="palm"), "certificate", Run(first_judge="on")) == []
 
 
 def test_the_same_model_gives_the_same_verdicts(tmp_path: Path) -> None:

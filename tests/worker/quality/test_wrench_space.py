@@ -6,6 +6,7 @@ import json
 import math
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -49,49 +50,19 @@ def test_tangents_form_a_right_handed_orthonormal_frame() -> None:
     assert np.allclose(frames.transpose(0, 2, 1) @ frames, np.eye(3), atol=1e-12)
 
 
-@pytest.mark.parametrize(("dimension", "volume"), [(6, 64 / 720), (3, 4 / 3)])
-def test_cross_polytope_has_radius_one_over_root_dimension(dimension: int, volume: float) -> None:
-    points = np.vstack([np.eye(dimension), -np.eye(dimension)])[:, None, :]
-    assert measure_space(points) == pytest.approx((1 / math.sqrt(dimension), volume), abs=PRINTED)
-
-
-def test_antipodal_forces_reach_apothem_of_the_friction_pyramid() -> None:
-    forces = cone_edges(np.array([[1.0, 0, 0], [-1.0, 0, 0]]), 0.5)
-    assert measure_space(forces) == pytest.approx(
+def test_spaces_of_closed_form() -> None:
+    for dimension, volume in ((6, 64 / 720), (3, 4 / 3)):
+        points = np.vstack([np.eye(dimension), -np.eye(dimension)])[:, None, :]
+        assert measure_space(points) == pytest.approx((1 / math.sqrt(dimension), volume), abs=PRINTED)
+    # The apothem of the friction pyramid of antipodal forces, which resist no torsion.
+    opposed = np.array([[1.0, 0, 0], [-1.0, 0, 0]])
+    assert measure_space(cone_edges(opposed, 0.5)) == pytest.approx(
         (0.5 * math.cos(math.pi / 8), 8 * 0.25 * math.sin(math.pi / 4)), abs=PRINTED
     )
-
-
-def test_antipodal_hard_fingers_cannot_resist_torsion() -> None:
-    assert sphere_space(np.array([[1.0, 0, 0], [-1.0, 0, 0]]), 0.5) == (0.0, 0.0)
-
-
-@pytest.mark.parametrize(
-    ("friction", "epsilon", "volume"),
-    [(0.2, 0.163299, 0.024992), (0.5, 0.408248, 0.598634), (1.0, 0.816497, 10.615952)],
-)
-def test_octahedral_contacts_on_the_unit_sphere(friction: float, epsilon: float, volume: float) -> None:
-    assert epsilon == pytest.approx(friction * math.sqrt(2 / 3), abs=PRINTED)
-    assert sphere_space(OCTAHEDRON, friction) == pytest.approx((epsilon, volume), abs=PRINTED)
-
-
-@pytest.mark.parametrize(("friction", "volume"), [(0.2, 0.014643), (0.5, 0.3125), (1.0, 4.088889)])
-def test_octahedral_contacts_with_four_edges(friction: float, volume: float) -> None:
-    found = sphere_space(OCTAHEDRON, friction, edges=4)
-    assert found == pytest.approx((friction / math.sqrt(3), volume), abs=PRINTED)
-
-
-def test_torque_scale_divides_the_volume_by_its_cube() -> None:
-    assert sphere_space(OCTAHEDRON, 0.5, radius=2.0) == pytest.approx((0.204124, 0.598634 / 8), abs=PRINTED)
-
-
-def test_six_face_centres_of_a_cube() -> None:
-    points = 0.05 * OCTAHEDRON
-    edges = wrenches(points, -OCTAHEDRON, friction=0.5, centre=ORIGIN, radius=0.05 * math.sqrt(3))
+    assert sphere_space(opposed, 0.5) == (0.0, 0.0)
+    # Face centres of a cube; and forces of unit length along the edges of the cone.
+    edges = wrenches(0.05 * OCTAHEDRON, -OCTAHEDRON, friction=0.5, centre=ORIGIN, radius=0.05 * math.sqrt(3))
     assert measure_space(edges) == pytest.approx((0.235702, 0.115207), abs=PRINTED)
-
-
-def test_unit_force_convention_shrinks_the_octahedral_space() -> None:
     force = cone_edges(-OCTAHEDRON, 0.5, unit="force")
     edges = np.concatenate([force, np.cross(OCTAHEDRON[:, None], force)], axis=-1)
     assert measure_space(edges) == pytest.approx((0.365148, 0.306500), abs=PRINTED)
@@ -102,15 +73,19 @@ TRIPOD = np.array([[math.cos(a), math.sin(a), 0.0] for a in 2 * np.pi * np.arang
 
 
 @pytest.mark.parametrize(
-    ("points", "friction", "epsilon", "volume"),
-    [(TETRAHEDRON, 0.2, 0.137258, 0.009218), (TETRAHEDRON, 0.5, 0.343027, 0.269793),
-     (TETRAHEDRON, 1.0, 0.689186, 5.588981), (TRIPOD, 0.2, 0.103717, 0.001378), (TRIPOD, 0.5, 0.275925, 0.078880),
-     (TRIPOD, 1.0, 0.554694, 2.211303)],
+    ("points", "options", "friction", "epsilon", "volume"),
+    [(OCTAHEDRON, {}, 0.2, 0.2 * math.sqrt(2 / 3), 0.024992), (OCTAHEDRON, {}, 0.5, 0.5 * math.sqrt(2 / 3), 0.598634),
+     (OCTAHEDRON, {}, 1.0, math.sqrt(2 / 3), 10.615952), (OCTAHEDRON, {"edges": 4}, 0.2, 0.2 / math.sqrt(3), 0.014643),
+     (OCTAHEDRON, {"edges": 4}, 0.5, 0.5 / math.sqrt(3), 0.3125), (OCTAHEDRON, {"edges": 4}, 1, 1 / math.sqrt(3), 4.088889),
+     (OCTAHEDRON, {"radius": 2.0}, 0.5, 0.204124, 0.598634 / 8),
+     (TETRAHEDRON, {}, 0.2, 0.137258, 0.009218), (TETRAHEDRON, {}, 0.5, 0.343027, 0.269793),
+     (TETRAHEDRON, {}, 1.0, 0.689186, 5.588981), (TRIPOD, {}, 0.2, 0.103717, 0.001378),
+     (TRIPOD, {}, 0.5, 0.275925, 0.078880), (TRIPOD, {}, 1.0, 0.554694, 2.211303)],
 )  # fmt: skip
-def test_four_and_three_contacts_on_the_unit_sphere(
-    points: np.ndarray, friction: float, epsilon: float, volume: float
+def test_contacts_on_the_unit_sphere(
+    points: np.ndarray, options: dict[str, Any], friction: float, epsilon: float, volume: float
 ) -> None:
-    assert sphere_space(points, friction) == pytest.approx((epsilon, volume), abs=PRINTED)
+    assert sphere_space(points, friction, **options) == pytest.approx((epsilon, volume), abs=PRINTED)
 
 
 @pytest.mark.parametrize(("friction", "epsilon", "volume"), [(0.5, 0.469, 1.485), (1.0, 0.939, 23.9)])
@@ -228,20 +203,13 @@ def contacts(count: int, friction: float = 1.0, seed: int = 0) -> np.ndarray:
     return wrenches(points, normals, friction=friction, centre=np.zeros(3), radius=1.0).reshape(-1, 6)
 
 
-@pytest.mark.parametrize(("count", "friction"), [(4, 0.5), (8, 1.0), (20, 0.2), (20, 1.0)])
-def test_radius_and_volume_are_qhull_s(count: int, friction: float) -> None:
-    points = contacts(count, friction)
-    theirs = ConvexHull(points, qhull_options="QJ")
-    wanted = (-theirs.equations[:, -1].max(), theirs.volume)
-    assert hull_of(points) == pytest.approx(wanted, rel=JOGGLED, abs=JOGGLED)
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_gaussian_clouds_are_measured_like_qhull_does(seed: int) -> None:
-    points = np.random.default_rng(seed).normal(size=(120, 6)) + 0.3
-    theirs = ConvexHull(points)
-    wanted = (-theirs.equations[:, -1].max(), theirs.volume)
-    assert hull_of(points) == pytest.approx(wanted, rel=JOGGLED, abs=JOGGLED)
+def test_radius_and_volume_are_qhull_s() -> None:
+    clouds = [contacts(count, friction) for count, friction in ((4, 0.5), (8, 1.0), (20, 0.2), (20, 1.0))]
+    clouds += [np.random.default_rng(seed).normal(size=(120, 6)) + 0.3 for seed in range(5)]
+    for points in clouds:
+        theirs = ConvexHull(points, qhull_options="QJ")
+        wanted = (-theirs.equations[:, -1].max(), theirs.volume)
+        assert hull_of(points) == pytest.approx(wanted, rel=JOGGLED, abs=JOGGLED)
 
 
 def test_hulls_of_closed_form() -> None:

@@ -18,7 +18,7 @@ from service.store.shards import read_shard
 from tests.worker.commands_run import graspd, refused
 from tests.worker.hands.grippers import gripper
 from tests.worker.models import object_from_mesh
-from tests.worker.simulation.test_surroundings import geom_distances, mujoco_distances, mujoco_room, parted
+from tests.worker.simulation.test_surroundings import mujoco_distances, mujoco_room, parted
 from worker.certified import certified_grasps
 from worker.grasps import Posture
 from worker.hands.load import hand_from_path
@@ -215,7 +215,7 @@ def test_a_way_between_neighbours_is_as_clear_as_mujoco_says(planned_beside) -> 
         lifting.hand_pose[:, :3] += np.linspace(0, 0.1, 30)[:, None] * scene.up
         for part in (coming, closing, lifting):
             found = [mujoco_room(hand, part, scene.obstacles[0])]
-            found += [geom_distances(hand, part, solid) for solid in scene.obstacles[1:]]
+            found += [mujoco_distances(hand, part, solid) for solid in scene.obstacles[1:]]
             assert np.min(found) >= MARGIN_M - 5e-4
 
 
@@ -224,7 +224,7 @@ def test_without_neighbours_the_hand_would_reach_through_them(planned_beside) ->
     hand, thing, placed, _ = planned_beside
     alone = type(placed)(placed.supports, placed.object_pose, placed.index)
     grasps = synthesize(hand, thing, Wanted(count=8, fidelity=QUICK, seed=4, placed=alone))
-    least = [geom_distances(hand, grasps.grasp, solid) for solid in placed.scenes[0].obstacles[1:]]
+    least = [mujoco_distances(hand, grasps.grasp, solid) for solid in placed.scenes[0].obstacles[1:]]
     assert np.min(least) < 0
 
 

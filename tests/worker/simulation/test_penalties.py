@@ -61,6 +61,17 @@ def fist_in_ball(hand: HandModel) -> HandState:
     return HandState(np.array([[0.03, 0.002, -0.001]]), np.array([[0.0, 0.0, 0.0, 1.0]]), q[None])
 
 
+def gradient_of(model: Model, data: Data, state: HandState, **weights: float) -> np.ndarray:
+    """The gradient at a state with these weights of the schedule, all others 0."""
+    schedule = still()
+    for name, value in weights.items():
+        getattr(schedule, name)[:] = value
+    data.set_schedule(schedule)
+    data.set_state(state)
+    record_evaluation(model, data).run()
+    return np.array(data.gradient.numpy()[0])
+
+
 @pytest.mark.parametrize("name", ["allegro", "shadow"])
 def test_object_points_inside_links_push_along_the_gradient(name: str) -> None:
     hand, obj = hand_from_path(name), ball()
@@ -76,12 +87,7 @@ def test_object_points_inside_links_push_along_the_gradient(name: str) -> None:
         return total * REFERENCE_SAMPLES / len(samples)
 
     model, data = rig(hand, obj, capacity=1, options=LossOptions(simulate=False, leak=0.0, range_weight=0.0))
-    schedule = still()
-    schedule.object_penetration[:] = 1.0
-    data.set_schedule(schedule)
-    data.set_state(state)
-    record_evaluation(model, data).run()
-    found = data.gradient.numpy()[0]
+    found = gradient_of(model, data, state, object_penetration=1.0)
     expected = differences(energy, state, len(found))
     assert np.linalg.norm(expected) > 0.01, "the state penetrates"
     np.testing.assert_allclose(found, expected, atol=RELATIVE * np.abs(expected).max())
@@ -111,12 +117,7 @@ def test_links_inside_links_are_parted_along_the_true_gradient(name: str) -> Non
 
     options = LossOptions(simulate=False, leak=0.0, range_weight=0.0, self_margin=0.0)
     model, data = rig(hand, ball(), capacity=1, options=options)
-    schedule = still()
-    schedule.self_penetration[:] = 1.0
-    data.set_schedule(schedule)
-    data.set_state(state)
-    record_evaluation(model, data).run()
-    found = data.gradient.numpy()[0]
+    found = gradient_of(model, data, state, self_penetration=1.0)
     expected = differences(energy, state, len(found))
     assert np.linalg.norm(expected) > 1e-4, "the links touch"
     np.testing.assert_allclose(found, expected, atol=RELATIVE * np.abs(expected).max())
@@ -145,12 +146,7 @@ def test_points_that_touch_nothing_are_pulled_by_the_gradient(name: str) -> None
     )
     # A fine ball, faces as they are: its distances are those of a sphere to 0.02 mm.
     model, data = rig(hand, ball(radius, subdivisions=5), capacity=1, options=options, alpha=0.0)
-    schedule = still()
-    schedule.penetration[:] = weight
-    data.set_schedule(schedule)
-    data.set_state(state)
-    record_evaluation(model, data).run()
-    found = data.gradient.numpy()[0]
+    found = gradient_of(model, data, state, penetration=weight)
     expected = differences(energy, state, len(found))
     # Normals of faces are off by 0.3 degrees.
     np.testing.assert_allclose(found, expected, atol=1e-2 * np.abs(expected).max())
@@ -329,13 +325,8 @@ def test_obstacles_push_the_hand_along_the_true_gradient(name: str, scene: str) 
         return float(sum((s**2).sum() for s in short))
 
     model, data = simulation_in(hand, obstacles)
-    schedule = still()
-    schedule.penetration[:] = 1.0
-    data.set_schedule(schedule)
-    data.set_state(state)
-    record_evaluation(model, data).run()
+    found = gradient_of(model, data, state, penetration=1.0)
     assert data.depths.points.numpy()[0] == 0.0, "the object pushes nothing here"
-    found = data.gradient.numpy()[0]
     expected = differences(energy, state, len(found))
     assert np.linalg.norm(expected) > 1e-3, "the state is too near"
     np.testing.assert_allclose(found, expected, atol=RELATIVE * np.abs(expected).max())

@@ -129,11 +129,13 @@ def mujoco_room(hand, postures: Posture, obstacle: Obstacle) -> np.ndarray:
 
 
 def mujoco_distances(hand, postures: Posture, obstacle: Obstacle) -> np.ndarray:
+    """(P,) least distance of a hand from an obstacle, by MuJoCo; at most 10 m."""
     from worker.scenes.neighbours import _add_piece
 
     spec = mujoco.MjSpec()
     if len(obstacle.corners):
-        spec.add_mesh(name="obstacle", uservert=obstacle.corners.ravel())
+        convex = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
+        spec.add_mesh(name="obstacle", inertia=convex, uservert=np.asarray(obstacle.corners, np.float32).ravel())
         spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="obstacle")
     else:
         geom = spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.1])
@@ -237,34 +239,13 @@ def test_no_hand_is_nearer_to_a_solid_than_it_says_by_mujoco(name: str) -> None:
     quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
     postures = Posture(np.concatenate([rng.normal(size=(60, 3)) * 0.12, quaternion], axis=1), hand.expand(q))
     found = obstacle_room(hand, postures, [Surroundings((solid,), UP)])
-    true = geom_distances(hand, postures, solid)
+    true = mujoco_distances(hand, postures, solid)
     apart = true > 0
     assert (found[apart] <= true[apart] + 1e-5).all()
     assert (found[~apart] < 1e-5).all()
     assert 10 < apart.sum() < 55
     if not any(one.kind == "hull" for one in hand.pieces):
         np.testing.assert_allclose(found[apart], np.minimum(true[apart], FAR_M), atol=1e-5)
-
-
-def geom_distances(hand: HandModel, postures: Posture, solid: Obstacle) -> np.ndarray:
-    """(P,) least distance of a hand from a convex solid, by MuJoCo; at most 1 m."""
-    from worker.scenes.neighbours import _add_piece
-
-    spec = mujoco.MjSpec()
-    mesh = spec.add_mesh(name="solid", inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX)
-    mesh.uservert = np.asarray(solid.corners, np.float32).ravel()
-    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="solid")
-    for k, one in enumerate(hand.pieces):
-        _add_piece(spec, spec.worldbody.add_body(mocap=True), f"p{k}", one)
-    model = spec.compile()
-    data = mujoco.MjData(model)
-    least = []
-    for row in body_poses(hand, postures.hand_pose, postures.joint_positions):
-        placed = row[[one.body for one in hand.pieces]]
-        data.mocap_pos[:], data.mocap_quat[:] = placed[:, :3], placed[:, 3:]
-        mujoco.mj_kinematics(model, data)
-        least.append(min(mujoco.mj_geomDistance(model, data, 0, k + 1, 1.0, None) for k in range(len(hand.pieces))))
-    return np.array(least)
 
 
 def test_an_outer_solid_holds_its_points_and_is_a_box_of_a_box() -> None:
