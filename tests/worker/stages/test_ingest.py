@@ -191,7 +191,8 @@ def test_finding_that_is_long_and_check_that_complains_are_told(
     environment = ingest._environment()
     # Python tells each import: more than a pipe holds.
     monkeypatch.setattr(ingest, "_environment", lambda: {**environment, "PYTHONVERBOSE": "1"})
-    assert ingest.check_in_child(AssetKind.OBJECT, "t", OBJECT, context)[0]["verdict"] == "accept"
+    found, model = ingest.check_in_child(AssetKind.OBJECT, "t", OBJECT, context)
+    assert found["verdict"] == "accept" and model.startswith(b"glTF")
 
 
 UPLOAD_BYTES = 64 * 2**20
