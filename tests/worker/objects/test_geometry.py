@@ -246,6 +246,7 @@ def test_too_much_computing_or_a_lost_child_makes_no_other_shape(monkeypatch: py
     ending(endless, monkeypatch)
     with pytest.raises(TooMuchWork, match="more than 1 s"):
         coacd_parts(_CORNERS, _FACES, {}, 1)
+    monkeypatch.undo()
     ending("os.kill(os.getpid(), signal.SIGKILL)", monkeypatch)
     with pytest.raises(OSError, match="was killed"):
         coacd_parts(_CORNERS, _FACES, {}, 1)
