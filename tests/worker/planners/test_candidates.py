@@ -306,7 +306,7 @@ def test_attempts_made_ahead_give_grasps_of_one_after_the_other(free, monkeypatc
     found = {}
     for ahead in (1, 4):
         monkeypatch.setattr(planner, "AHEAD", ahead)
-        found[ahead] = synthesize(hand, obj, replace(wanted, count=16, trial=picky), Run(threads=16))
+        found[ahead] = synthesize(hand, obj, replace(wanted, count=8, trial=picky), Run(threads=8))
     np.testing.assert_array_equal(found[4].grasp.hand_pose, found[1].grasp.hand_pose)
     np.testing.assert_array_equal(found[4].squeeze.joint_positions, found[1].squeeze.joint_positions)
     assert (picky(found[1], None) < 1).sum() > len(found[1].stability_loss) // 2
