@@ -551,6 +551,21 @@ FACETS_OF_FOUR = (
 )
 
 
-def test_a_facet_of_more_than_three_corners_is_refused() -> None:
-    with pytest.raises(MeshError, match="more than three"):
-        read_mesh("m.stl", FACETS_OF_FOUR)
+def test_what_trimesh_loses_of_these_files_is_read_or_refused() -> None:
+    """Why the readers are our own: docs/adr/0006-own-mesh-readers.md."""
+
+    def trimesh_reads(name: str, data: bytes) -> trimesh.Trimesh:
+        return trimesh.load(io.BytesIO(data), file_type=name[-3:], process=False, force="mesh")
+
+    for name in ("u.obj", "u.ply"):
+        soup = read_mesh(name, text(name))
+        ours = trimesh.Trimesh(soup.vertices, soup.faces, process=False)
+        assert trimesh_reads(name, text(name)).area > 1.05 * ours.area, "a re-entrant polygon"
+    assert len(read_mesh("u.off", text("u.off")).faces)
+    with pytest.raises(TypeError):
+        trimesh_reads("u.off", text("u.off"))  # polygons of several sizes
+    skinned = glb(box(), {"skin": 0})
+    for name, data, told in (("m.stl", FACETS_OF_FOUR, "more than three"), ("m.glb", skinned, "skinned")):
+        with pytest.raises(MeshError, match=told):
+            read_mesh(name, data)
+        assert len(trimesh_reads(name, data).faces)
