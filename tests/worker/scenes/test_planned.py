@@ -26,6 +26,7 @@ from worker.objects.prepare import object_from_path
 from worker.planners import synthesize
 from worker.planners.port import Wanted
 from worker.run import Run
+from worker.scenes import neighbours
 from worker.scenes.beside import gaps_between, joined_pieces, neighbour_of, scenes_of
 from worker.scenes.clearance import MARGIN_M, approach
 from worker.scenes.kinds import rest_poses, supports_of
@@ -251,7 +252,10 @@ def test_synth_with_neighbours_writes_them_lifts_judge_alike(tmp_path: Path) -> 
         ("--scene table --with no-such-thing", "no-such-thing"),
     ],
 )
-def test_what_cannot_stand_beside_an_object_is_told_in_one_line(tmp_path: Path, args: str, words: str) -> None:
+def test_what_cannot_stand_beside_an_object_is_told_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, args: str, words: str
+) -> None:
+    monkeypatch.setattr(neighbours, "_DRAWS", 2)
     said = refused(f"synth --hand barrett --object block {args} -o", tmp_path / "g.h5")
     assert words in said and "Traceback" not in said
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -163,8 +164,9 @@ def test_convex_objects_rest_on_faces_as_often_as_theory_says(name):
 
 
 @pytest.fixture
-def dropped(monkeypatch, tmp_path) -> list[tuple[int, int]]:
+def dropped(monkeypatch, tmp_path) -> Iterator[list[tuple[int, int]]]:
     """Keys of the drops that are simulated, in a cache of their own."""
+    monkeypatch.setattr(simulate, "REFERENCE_DROPS", 8)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     keys: list[tuple[int, int]] = []
     whole = simulate._redo_until_rest
@@ -174,7 +176,8 @@ def dropped(monkeypatch, tmp_path) -> list[tuple[int, int]]:
         return whole(table, name, key)
 
     monkeypatch.setattr(simulate, "_redo_until_rest", counted)
-    return keys
+    yield keys
+    next_process()
 
 
 def next_process() -> None:
@@ -195,8 +198,8 @@ def test_kept_drops_of_another_object_are_simulated_again(dropped, tmp_path):
     next_process()
     first = drop(bracket(), count=1, seed=5)
     (file,) = tmp_path.rglob("drops/*.npz")
-    for harm in (np.full(64, 99), np.zeros(3, np.int64), np.zeros(64), None):
-        np.savez(file, **({"other": np.zeros(64)} if harm is None else {"face": harm}))
+    for harm in (np.full(8, 99), np.zeros(3, np.int64), np.zeros(8), None):
+        np.savez(file, **({"other": np.zeros(8)} if harm is None else {"face": harm}))
         next_process()
         dropped.clear()
         again = drop(bracket(), count=1, seed=5)
