@@ -202,6 +202,7 @@ def test_the_command_prints_json_or_a_table(shared_data: Path) -> None:
         (["--joint-map", "FFJ3=bend"], "name that hand"),
         (["--judge-hand", "shadow", "--joint-map", "FFJ3"], "must be OURS=THEIRS"),
         (["--judge-hand", "shadow", "--joint-map", "FFJ3=a,FFJ3=b"], "once for each joint"),
+        (["--judge-hand", "shadow", "--joint-map", "FFJ3=bend,FFJ4=knuckle"], "grasps.h5"),
         (["--judge-hand", "shadow", "--protocol", "lift"], "judges by protocol dexgraspbench"),
         (["--level", "quick"], "unknown"),
         (["--protocol", "throw"], "unknown"),
