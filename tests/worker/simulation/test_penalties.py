@@ -242,6 +242,27 @@ def test_small_descent_steps_never_raise_the_loss() -> None:
     assert max(np.diff(losses)) < 1e-5
 
 
+@pytest.mark.parametrize("optimizer", OPTIMIZERS)
+def test_a_step_moves_and_turns_a_hand_against_its_gradient(optimizer: str) -> None:
+    """The first step of Adam is as long as its rate; that of plain descent is the rate times the gradient."""
+    hand, one = hand_from_path("allegro"), np.ones(1)
+    state = fist_in_ball(hand)
+    model, data = rig(hand, ball(), capacity=1, options=LossOptions(leak=0.0, range_weight=0.0))
+    rates = np.array([1e-3, 2e-3, 3e-3] if optimizer == "adam" else [1e-6, 1e-4, 1e-5])
+    data.set_schedule(Schedule(0.004 * one, one, one, one, rates[None]))
+    data.set_state(state)
+    record_iteration(model, data, optimizer).run()
+    gradient = data.gradient.numpy()[0].astype(float)
+    step = -np.repeat(rates, [3, 3, hand.dofs]) * (np.sign(gradient) if optimizer == "adam" else gradient)
+    angle = np.linalg.norm(step[3:6])
+    assert angle > 1e-4 and np.abs(step[:3]).max() > 1e-5
+    found = data.state(1)
+    np.testing.assert_allclose(found.pivot[0], state.pivot[0] + step[:3], atol=1e-6)
+    turned = quat_multiply(quat_from_axis_angle(step[3:6] / angle, np.asarray(angle)), state.rotation[0])
+    np.testing.assert_allclose(found.rotation[0], turned, atol=1e-6)
+    np.testing.assert_allclose(found.q[0], np.clip(state.q[0] + step[6:], hand.lower, hand.upper), atol=1e-6)
+
+
 MARGIN = 0.004
 
 

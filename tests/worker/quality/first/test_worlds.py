@@ -226,6 +226,17 @@ def test_where_a_gpu_has_no_memory_for_it_the_cpu_judges(
     assert "no memory for the first judge" in caplog.text
 
 
+def test_grasps_that_overflow_the_first_judge_are_the_cpus(
+    stand_in: Stand, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    verdicts(ON, grasps=grasp_of())
+    assert "overflow" not in caplog.text
+    monkeypatch.setattr(screening, "DOUBLINGS", 1)
+    stand_in.needs_rows = 1 << 30
+    assert (verdicts(ON, grasps=grasp_of()).judged_by == JudgedBy.MUJOCO).all()
+    assert "1 of 1 grasps overflow the first judge" in caplog.text
+
+
 def test_an_audit_follows_the_grasp_and_not_its_batch(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(screening, "AUDIT_ONE_IN", 2)
     grasps = every_kind()
