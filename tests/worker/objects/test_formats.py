@@ -160,6 +160,8 @@ def test_accessors_beyond_their_buffer_and_cycles_are_refused() -> None:
     document = {"nodes": [{"children": [1]}, {"children": [0]}], "scenes": [{"nodes": [0]}]}
     with pytest.raises(MeshError, match="cyclic"):
         read_mesh("m.glb", pack_glb(document, b""))
+    with pytest.raises(MeshError, match="holds no object"):
+        read_mesh("m.glb", pack_glb([document], b""))  # type: ignore[arg-type]
 
 
 def test_more_faces_than_limit_are_refused_before_they_are_read() -> None:
