@@ -136,7 +136,7 @@ def test_a_row_that_is_no_valid_grasp_is_drawn_only_with_all(base):
     assert graspd(*words, "--all")["rows"] == [1]
 
 
-def test_other_objects_neighbours_and_kinds_of_shards_are_refused(base):
+def test_other_objects_neighbours_and_kinds_are_refused(base):
     output, crowd = base.with_name("none.h5"), base.with_name("crowd_of_mugs.h5")
     said = refused("scene --object mug -o", output, base)
     assert "give the file it was made with as --object" in said and not output.exists()

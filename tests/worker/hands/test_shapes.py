@@ -283,7 +283,7 @@ def test_a_thin_plate_has_exactly_the_count_on_both_sides(count: int) -> None:
     assert count < 400 or 0.8 < top / bottom < 1.25
 
 
-def test_samples_follow_their_seed_and_are_drawn_once_a_pre_shape() -> None:
+def test_samples_follow_their_seed_and_are_drawn_once_pre_shape() -> None:
     first, other = hand_from_path("allegro"), hand_from_path("allegro")
     a = sample_surface(first, 500, seed=3)
     surface._samples.clear()

@@ -116,7 +116,7 @@ def test_what_reaches_out_or_is_wrong_is_refused_in_one_line(body: str, named: s
     assert named in refusal(body, **{"package.xml": b"<package><name>other</name></package>"})
 
 
-def test_entities_are_refused_and_an_expansion_without_end_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_entities_are_refused_and_expansion_without_end_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(HandError, match="entities"):
         expand({"x.xacro": b'<!DOCTYPE robot [<!ENTITY a "b">]><robot name="${1}">&a;</robot>'}, "x.xacro", {})
     monkeypatch.setattr("worker.hands.xacro.CPU_LIMIT_S", 1)

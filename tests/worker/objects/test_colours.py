@@ -94,7 +94,7 @@ def test_a_colour_that_cannot_be_read_leaves_the_shape(change: object) -> None:
     assert np.isnan(colour(changed(textured(), change))).all()
 
 
-def test_pictures_that_promise_too_much_and_endless_libraries_end() -> None:
+def test_pictures_that_promise_too_much_and_endless_names_end() -> None:
     material = {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}
     picture = large()
     document = {

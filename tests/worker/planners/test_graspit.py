@@ -53,7 +53,7 @@ def scheduled(step: float, uniform: float = 0.5, rise: float = 0.0) -> list[floa
     return [float(value.numpy()[0]) for value in found]
 
 
-def test_temperature_jumps_and_acceptance_follow_ingbers_schedule() -> None:
+def test_temperature_jumps_and_chances_follow_ingbers_schedule() -> None:
     """T(k) = 1e6 exp(-7 k^(1/8)) in float32, which loses 2e-4 in exp(-25)."""
     assert [scheduled(step)[0] for step in (0, 3e4, 7e4)] == pytest.approx([1e6, 9.37e-6, 5.49e-7], rel=5e-3)
     for step, uniform in ((3e4, 0.1), (5e4, 0.6), (7e4, 0.9)):

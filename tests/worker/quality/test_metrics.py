@@ -394,7 +394,7 @@ def test_distance_of_a_shifted_hand_is_the_shift(by: float) -> None:
     assert distances(moved(pad_hand(), by), FIRST, SECOND) == pytest.approx([by], abs=1e-12)
 
 
-def test_a_shifted_hand_is_off_by_the_shift_a_joint_by_its_points() -> None:
+def test_shifted_hand_is_off_by_the_shift_a_joint_by_its_points() -> None:
     hand = plate_hand()
     points = hand_points(hand, posture(((0, 0, 0), (0.02, 0.02)), ((0, 0, 0), (0.03, 0.02))))
     slid = np.linalg.norm(points[0] - points[1], axis=1) > 1e-9
