@@ -308,21 +308,3 @@ def accept(
         gradient_inout[b, column] = new_gradient_in[b, column]
     for term in range(terms_inout.shape[1]):
         terms_inout[b, term] = new_terms_in[b, term]
-
-
-@wp.kernel
-def probe(
-    # In:
-    iteration_in: wp.array(dtype=wp.int32),
-    rise_in: wp.array(dtype=wp.float32),
-    uniform_in: wp.array(dtype=wp.float32),
-    # Out:
-    size_out: wp.array(dtype=wp.float32),
-    temperature_out: wp.array(dtype=wp.float32),
-    accepted_out: wp.array(dtype=wp.int32),
-):
-    """The schedule's functions, for tests. Launch over the rows."""
-    i = wp.tid()
-    size_out[i] = step_size(iteration_in[i])
-    temperature_out[i] = temperature(iteration_in[i])
-    accepted_out[i] = accepted(rise_in[i], temperature(iteration_in[i]), uniform_in[i])

@@ -9,10 +9,6 @@ from __future__ import annotations
 
 from typing import Final
 
-import numpy as np
-
-from graspd.service.model.transforms import Floats
-
 STEPS: Final = 6000
 CONTACTS: Final = 4
 DISTANCE_WEIGHT: Final = 100.0
@@ -28,13 +24,3 @@ TEMPERATURE_PERIOD: Final = 30
 DECAY: Final = 0.95
 MOMENT: Final = 0.98
 SWITCH: Final = 0.5
-
-
-def step_size(iteration: Floats) -> Floats:
-    """Length of a step in units of each gradient's root mean square [m or rad]."""
-    return STEP_SIZE * DECAY ** np.floor(np.asarray(iteration, float) / STEP_PERIOD)
-
-
-def temperature(iteration: Floats) -> Floats:
-    """Temperature of the acceptance test."""
-    return TEMPERATURE * DECAY ** np.floor(np.asarray(iteration, float) / TEMPERATURE_PERIOD)

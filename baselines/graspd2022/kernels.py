@@ -186,24 +186,3 @@ def nearest(
     body = point_body_in[i]
     x = body_p_in[b, body] + wp.quat_rotate(body_q_in[b, body], point_position_in[i])
     wp.atomic_min(least_inout, b, field_distance(surface, x).distance)
-
-
-@wp.kernel
-def probe(
-    # Model:
-    physics: ForceModel,
-    surface: Surface,
-    # In:
-    point_in: wp.array(dtype=wp.vec3),
-    velocity_in: wp.vec3,
-    # Out:
-    distance_out: wp.array(dtype=wp.float32),
-    force_out: wp.array(dtype=wp.vec3),
-    slope_out: wp.array(dtype=wp.vec3),
-):
-    """Distance, contact force and its slope at given points, for tests. Launch over them."""
-    i = wp.tid()
-    sample = field_distance(surface, point_in[i])
-    distance_out[i] = sample.distance
-    force_out[i] = contact_force(physics, -sample.distance, sample.normal, velocity_in)
-    slope_out[i] = force_slope(physics, -sample.distance, sample.normal, velocity_in)

@@ -11,10 +11,6 @@ from __future__ import annotations
 
 from typing import Final
 
-import numpy as np
-
-from graspd.service.model.transforms import Floats
-
 START_TEMPERATURE: Final = 1e6
 COOLING: Final = 7.0
 DIMENSIONS: Final = 8
@@ -22,20 +18,3 @@ FIRST_STEP: Final = 30_000
 ENERGY_SCALE: Final = 1e-6
 #: Neighbours tried for one step until one is free of collisions; without one the step does not count.
 ATTEMPTS: Final = 11
-
-
-def temperature(step: Floats) -> Floats:
-    """T(k)."""
-    return START_TEMPERATURE * np.exp(-COOLING * np.asarray(step, float) ** (1.0 / DIMENSIONS))
-
-
-def jump_share(uniform: Floats, temperature: Floats) -> Floats:
-    """Share of the largest jump, in [-1, 1], for uniform numbers in [0, 1]."""
-    u = np.asarray(uniform, float)
-    size = temperature * np.expm1(np.abs(2 * u - 1) * np.log1p(1 / np.asarray(temperature, float)))
-    return np.sign(u - 0.5) * size
-
-
-def acceptance(rise: Floats, temperature: Floats) -> Floats:
-    """Probability with which a move that raises the energy by `rise` (mm of contact energy) is taken."""
-    return np.exp(-ENERGY_SCALE * np.maximum(rise, 0.0) / temperature)

@@ -295,7 +295,7 @@ def hand_map(
         "few or no valid grasps, and a low share in the hand's self-test",
         "a hand without two parts that oppose each other is refused; the self-test of a new hand says which share "
         "holds plain objects; a job that finds too few says so",
-        "tests/studies/test_stability_hands.py::test_a_palm_without_fingers_is_refused_and_three_of_them_hold",
+        "tests/studies/test_stability.py::test_palm_without_fingers_is_refused_and_three_of_them_hold",
         reach="all: users bring such hands",
     )
 

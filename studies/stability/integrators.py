@@ -196,7 +196,7 @@ def time_step_map(time_steps: Sequence[float] = TIME_STEPS, speeds: Sequence[flo
         "an object that is thrown out of the hand, or hands that sink into it",
         "the planner takes one step of 1 mm (time step x speed), where its integrators are good; the validator steps "
         "MuJoCo's implicit solver",
-        "tests/studies/test_stability.py::test_the_planners_own_step_lies_where_its_integrators_are_good",
+        "tests/studies/test_stability.py::test_planners_own_step_lies_where_its_integrators_are_good",
         reach=f"the offered solvers at a step of {1e3 * step:g} mm; the step is no option of a job",
     )
 

@@ -126,7 +126,7 @@ def model_error_map(
         "a grasp that is valid here fails on a robot that is another one",
         "`--robust` keeps what holds in the wanted share of models that are off by so much; `robust_share` and "
         "`robust_weakest` are stored. What is farther off is another hand: `graspd evaluate --validation-hand`",
-        "tests/studies/test_stability_model_errors.py::test_amounts_within_reach_are_those_that_robust_draws",
+        "tests/studies/test_stability.py::test_amounts_within_reach_are_those_that_robust_draws",
         reach="amounts that `--robust` draws: a job that asks for it is validated there",
     )
 

@@ -61,7 +61,7 @@ _FEWER: Final = (
     "what is not clear on its way or not lifted is never valid; a run whose budget ends first says how many were "
     "found; a scene that leaves no way to the object is refused in a line"
 )
-_TEST: Final = "tests/studies/test_stability_scenes.py::"
+_TEST: Final = "tests/studies/test_stability.py::"
 
 
 def height_map(
@@ -123,7 +123,7 @@ def wall_map(
         reachable(cells, lambda cell: True),
         _SHOWS,
         _FEWER,
-        _TEST + "test_an_object_in_a_narrow_well_is_refused_or_comes_out_valid",
+        _TEST + "test_object_in_a_narrow_well_is_refused_or_comes_out_valid",
         reach="all: bins, shelves and files bring such walls",
     )
 

@@ -34,7 +34,7 @@ def test_each_finger_stops_at_its_own_first_contact() -> None:
     assert abs(found.state.q[0, 0] - found.state.q[0, 1]) > 0.1
 
 
-def test_a_finger_that_meets_nothing_closes_to_its_limit_or_the_other_finger() -> None:
+def test_a_finger_that_meets_nothing_closes_to_its_limit() -> None:
     found, distance = closed((0.01, 0.01, 0.01), shift=0.2)
     assert np.all(distance[0] > 0.02)
     assert np.all(found.state.q[0] > 0.2)

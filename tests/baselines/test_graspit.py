@@ -10,42 +10,61 @@ import warp as wp
 from graspd.baselines.common import ground_of
 from graspd.baselines.graspit import kernels
 from graspd.baselines.graspit.method import Search, eigengrasps, virtual_contacts
-from graspd.baselines.graspit.schedule import FIRST_STEP, acceptance, jump_share, temperature
+from graspd.baselines.graspit.schedule import FIRST_STEP
 from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.planners.threads import StepCounter
 from tests.worker.models import object_from_mesh, two_finger_hand
 
 
-def test_the_temperature_follows_ingbers_schedule() -> None:
-    """Values of T0 exp(-7 k^(1/8)) worked out by hand: 30000^(1/8) = 3.6277, 70000^(1/8) = 4.0331."""
-    np.testing.assert_allclose(temperature(np.array([0, 30_000, 70_000])), [1e6, 9.37e-6, 5.49e-7], rtol=5e-3)
+@wp.kernel(enable_backward=False)
+def _schedule(
+    step_in: wp.array[wp.float32],
+    uniform_in: wp.array[wp.float32],
+    rise_in: wp.array[wp.float32],
+    temperature_out: wp.array[wp.float32],
+    jump_out: wp.array[wp.float32],
+    acceptance_out: wp.array[wp.float32],
+):
+    i = wp.tid()
+    temperature_out[i] = kernels.temperature(step_in[i])
+    jump_out[i] = kernels.jump_share(uniform_in[i], temperature_out[i])
+    acceptance_out[i] = kernels.acceptance(rise_in[i], temperature_out[i])
 
 
-def test_a_jump_reaches_its_largest_only_at_the_ends_of_the_uniform_number() -> None:
-    for t in (1e-6, 1e-2, 1.0, 1e6):
-        np.testing.assert_allclose(jump_share(np.array([0.0, 0.5, 1.0]), t), [-1, 0, 1], atol=1e-9)
-    # Hot: nearly uniform. Cold: half of all jumps are shorter than sqrt(T).
-    assert jump_share(np.array(0.75), 1e6) == pytest.approx(0.5, abs=1e-3)
-    assert jump_share(np.array(0.75), 1e-6) == pytest.approx(1e-3, rel=0.01)
+@wp.kernel(enable_backward=False)
+def _evaluated(
+    problem: kernels.Problem,
+    state_in: wp.array[kernels.vec8],
+    body_p_out: wp.array2d[wp.vec3],
+    body_q_out: wp.array2d[wp.quat],
+    energy_out: wp.array[wp.float32],
+):
+    b = wp.tid()
+    kernels.place(problem, b, state_in[b], body_p_out, body_q_out)
+    energy_out[b] = kernels.contact_energy(problem, b, body_p_out, body_q_out)
 
 
-def test_worse_states_are_taken_more_rarely_the_colder_it_is() -> None:
-    hot, cold = temperature(np.array([30_000, 70_000]))
-    assert acceptance(np.array([-1.0, 0.0]), cold).tolist() == [1.0, 1.0]
-    assert acceptance(np.array(1.0), hot) == pytest.approx(np.exp(-1e-6 / hot))
-    assert acceptance(np.array(1.0), cold) < acceptance(np.array(1.0), hot)
+def scheduled(step: float, uniform: float = 0.5, rise: float = 0.0) -> list[float]:
+    """Temperature, share of the largest jump, and chance of a rise at a step."""
+    given = [wp.array([value], dtype=wp.float32, device="cpu") for value in (step, uniform, rise)]
+    found = [wp.zeros(1, dtype=wp.float32, device="cpu") for _ in range(3)]
+    wp.launch(_schedule, 1, inputs=given, outputs=found, device="cpu")
+    return [float(value.numpy()[0]) for value in found]
 
 
-def test_the_kernels_schedule_is_the_written_one() -> None:
-    """Relative 2e-4: float32 loses that much in exp(-25)."""
-    step, uniform, rise = np.array([3e4, 5e4, 7e4]), np.array([0.1, 0.6, 0.9]), np.array([-1.0, 2.0, 30.0])
-    given = [wp.array(values, dtype=wp.float32, device="cpu") for values in (step, uniform, rise)]
-    found = [wp.zeros(3, dtype=wp.float32, device="cpu") for _ in range(3)]
-    wp.launch(kernels.probe_schedule, 3, inputs=given, outputs=found, device="cpu")
-    t = temperature(step)
-    for value, expected in zip(found, (t, jump_share(uniform, t), acceptance(rise, t)), strict=True):
-        np.testing.assert_allclose(value.numpy(), expected, rtol=2e-4)
+def test_temperature_jumps_and_chances_follow_ingbers_schedule() -> None:
+    """T(k) = 1e6 exp(-7 k^(1/8)) in float32, which loses 2e-4 in exp(-25)."""
+    assert [scheduled(step)[0] for step in (0, 3e4, 7e4)] == pytest.approx([1e6, 9.37e-6, 5.49e-7], rel=5e-3)
+    for step, uniform in ((3e4, 0.1), (5e4, 0.6), (7e4, 0.9)):
+        t, jump, _ = scheduled(step, uniform)
+        assert t == pytest.approx(1e6 * np.exp(-7 * step**0.125), rel=2e-4)
+        expected = np.sign(uniform - 0.5) * t * ((1 + 1 / t) ** abs(2 * uniform - 1) - 1)
+        assert jump == pytest.approx(expected, rel=2e-4)
+    assert [scheduled(5e4, uniform)[1] for uniform in (0.0, 0.5, 1.0)] == pytest.approx([-1, 0, 1], abs=1e-6)
+    assert [scheduled(7e4, rise=rise)[2] for rise in (-1.0, 0.0)] == [1.0, 1.0]
+    hot, cold = scheduled(3e4, rise=1.0), scheduled(7e4, rise=1.0)
+    assert hot[2] == pytest.approx(np.exp(-1e-6 / hot[0]), rel=2e-4) and cold[2] < hot[2]
 
 
 def palm_only(gap: float, turn: float) -> float:
@@ -59,9 +78,9 @@ def palm_only(gap: float, turn: float) -> float:
     problem.contact_normal = wp.array([[0.0, 0, 1]], dtype=wp.vec3, device="cpu")
     state = kernels.vec8(0, 0, -0.05 - gap, np.pi / 2, 0, turn, 0, 0)
     poses = [wp.zeros((1, 3), dtype=kind, device="cpu") for kind in (wp.vec3, wp.quat)]
-    legal, energy = wp.zeros(1, dtype=wp.int32, device="cpu"), wp.zeros(1, dtype=wp.float32, device="cpu")
+    energy = wp.zeros(1, dtype=wp.float32, device="cpu")
     given = wp.array([state], dtype=kernels.vec8, device="cpu")
-    wp.launch(kernels.evaluate, 1, inputs=[problem, given], outputs=[*poses, legal, energy], device="cpu")
+    wp.launch(_evaluated, 1, inputs=[problem, given], outputs=[*poses, energy], device="cpu")
     return float(energy.numpy()[0])
 
 
@@ -74,7 +93,7 @@ def palm_only(gap: float, turn: float) -> float:
         (0.03, 0.0, 30.0),
     ],
 )
-def test_contact_energy_is_distance_in_millimetres_and_misalignment(gap: float, turn: float, expected: float) -> None:
+def test_contact_energy_is_distance_and_misalignment(gap: float, turn: float, expected: float) -> None:
     """Absolute 0.01 near the surface; 0.3 mm far from it, where a grid of 5 mm cells answers."""
     assert palm_only(gap, turn) == pytest.approx(expected, abs=0.3 if gap > 0.01 else 0.01)
 
@@ -87,8 +106,12 @@ def test_barrett_has_graspits_own_eigengrasps() -> None:
 
 
 @pytest.mark.parametrize("name", ["allegro", "barrett", "shadow"])
-def test_amplitudes_at_their_limits_reach_the_joint_limits(name: str) -> None:
+def test_contacts_lie_on_every_finger_amplitudes_reach_limits(name: str) -> None:
     hand = hand_from_path(name)
+    found = virtual_contacts(hand)
+    assert set(hand.fingertips) <= set(found.body.tolist())
+    palm = found.normal[found.body == 0]
+    assert len(palm) >= 1 and np.all(palm @ hand.palm.approach > 0.7)
     found = eigengrasps(hand)
     corners = np.array([[a, b] for a in found.limits[0] for b in found.limits[1]])
     q = found.posture(corners, hand)
@@ -97,16 +120,7 @@ def test_amplitudes_at_their_limits_reach_the_joint_limits(name: str) -> None:
     assert np.any(np.ptp(q, axis=0)[moving] > 0.5 * (hand.upper - hand.lower)[moving])
 
 
-@pytest.mark.parametrize("name", ["allegro", "barrett", "shadow"])
-def test_virtual_contacts_lie_on_every_finger_and_on_the_palm(name: str) -> None:
-    hand = hand_from_path(name)
-    found = virtual_contacts(hand)
-    assert set(hand.fingertips) <= set(found.body.tolist())
-    palm = found.normal[found.body == 0]
-    assert len(palm) >= 1 and np.all(palm @ hand.palm.approach > 0.7)
-
-
-def test_annealing_lowers_the_energy_and_stops_at_its_step() -> None:
+def test_annealing_lowers_energy_and_keeps_states_that_differ() -> None:
     search = Search(
         ground_of(two_finger_hand(), object_from_mesh(trimesh.creation.box((0.05, 0.05, 0.05))), "cpu", kernels)
     )
@@ -116,12 +130,6 @@ def test_annealing_lowers_the_energy_and_stops_at_its_step() -> None:
     assert told[-1] == 4 * 50
     many = search.run([[0, 0, c] for c in range(4)], steps=FIRST_STEP + 2000, keep=1, tell=steps)
     assert np.linalg.norm(many.pivot, axis=1).mean() < np.linalg.norm(few.pivot, axis=1).mean()
-
-
-def test_the_states_kept_of_a_chain_differ() -> None:
-    search = Search(
-        ground_of(two_finger_hand(), object_from_mesh(trimesh.creation.box((0.05, 0.05, 0.05))), "cpu", kernels)
-    )
     kept = search.run([[3]], steps=FIRST_STEP + 1500, keep=4, tell=StepCounter(1, DEFAULT_CONTEXT))
     apart = np.linalg.norm(kept.pivot[:, None] - kept.pivot[None], axis=2)
     assert len(kept.pivot) == 4

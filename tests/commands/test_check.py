@@ -37,9 +37,7 @@ def test_a_built_in_is_accepted_with_exit_code_0(kind: str, name: str) -> None:
     assert report["verdict"] == "accept" and report["repairs"] == [] and report["message"] and report["facts"]
 
 
-def test_a_folder_of_objects_gets_a_verdict_each_and_exit_code_2_if_one_is_refused(
-    shared_data: Path, tmp_path: Path
-) -> None:
+def test_a_folder_gets_a_verdict_each_and_code_2_if_refused(shared_data: Path, tmp_path: Path) -> None:
     for source, name in (("quads_and_ngons.obj", "prism"), ("inverted_normals.stl", "mug"), ("garbage.stl", "noise")):
         folder = tmp_path / "set" / name
         folder.mkdir(parents=True)
@@ -54,11 +52,6 @@ def test_a_folder_of_objects_gets_a_verdict_each_and_exit_code_2_if_one_is_refus
     (tmp_path / "set" / "noise" / "garbage.stl").unlink()
     code, report = check("objects", "check", str(tmp_path / "set"))
     assert code == 0 and report["refused"] == []
-
-
-def test_a_folder_without_a_mesh_is_a_mistake(tmp_path: Path) -> None:
-    told = CliRunner().invoke(build(), ["objects", "check", str(tmp_path)])
-    assert told.exit_code == 2 and "no mesh" in told.stderr
 
 
 @pytest.mark.parametrize(
@@ -85,36 +78,30 @@ def test_a_file_gets_its_verdict_and_exit_code(
 
 
 @pytest.mark.parametrize("kind", ["hands", "objects"])
-def test_what_is_not_there_is_refused_and_the_built_ins_are_named(kind: str) -> None:
+def test_what_is_not_there_is_refused_and_built_ins_are_named(kind: str) -> None:
     code, report = check(kind, "check", "nowhere")
     assert code == 2
     assert report["verdict"] == "refuse" and ("allegro" in report["message"]) == (kind == "hands")
 
 
-def test_without_json_a_refusal_is_one_line_on_stderr(tmp_path: Path) -> None:
+def test_without_json_refusals_are_one_line_and_guesses_are_told(tmp_path: Path) -> None:
     (tmp_path / "o.stl").write_bytes(b"")
+    (tmp_path / "none").mkdir()
     result = CliRunner().invoke(build(), ["objects", "check", str(tmp_path / "o.stl")])
+    told = CliRunner().invoke(build(), ["objects", "check", str(tmp_path / "none")])
+    assert told.exit_code == 2 and "no mesh" in told.stderr
     assert (result.exit_code, result.stdout) == (2, "")
     assert len(result.stderr.splitlines()) == 1 and "o.stl" in result.stderr
-
-
-def test_without_json_the_guesses_are_told() -> None:
     said = CliRunner().invoke(build(), ["hands", "check", "barrett", "--no-self-test"]).stdout
     for word in ("palm", "approach", "fingertips", "dofs", "pre-shape"):
         assert word in said
 
 
-def test_a_hand_option_goes_over_the_guess() -> None:
+def test_options_go_over_guesses_drop_fingers_and_weigh() -> None:
     _, report = check("hands", "check", "allegro", "--fix", "thumb_rotation=1.0,index_distal=0.2")
     assert len(report["facts"]["dofs"]) == 14
-
-
-def test_a_dropped_link_takes_its_finger_along() -> None:
     _, report = check("hands", "check", "allegro", "--drop", "ring_proximal_link")
     assert not [name for name in report["facts"]["fingertips"] if name.startswith("ring")]
-
-
-def test_a_mass_follows_from_the_density_given() -> None:
     _, report = check("objects", "check", "block", "--density", "500")
     assert report["facts"]["mass_kg"] == pytest.approx(500 * report["facts"]["volume_m3"])
 

@@ -8,105 +8,55 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image, ImageSequence
-from typer.testing import CliRunner, Result
 
 from graspd.commands import grasp_sheet, render
-from graspd.commands.exchange import app as exchange
 from graspd.commands.grasp_sheet import AFTER_S, BEFORE_S
-from graspd.commands.render import app as rendering
-from graspd.commands.scene import app as scenes
 from graspd.exchange.robots.execution import SHORTEST_S
 from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.store.shards import json_attribute, read_shard, write_shard
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.objects.prepare import object_from_path
+from tests.worker.commands_run import graspd, refused
+from tests.worker.models import attributes_of, quality_columns
 
 GRASPS = 3
+SMALL = "--width 48 --height 36 --device cpu"
+PICTURES = "--size 48 --device cpu"
 
 
 @pytest.fixture(scope="module")
 def base(tmp_path_factory) -> Path:
     """A base shard of the built-in hand above the built-in block: the postures are not good grasps, but well-formed."""
     hand, obj = hand_from_path("allegro"), object_from_path("block")
-    joints = np.tile(hand.expand(hand.preshape), (GRASPS, 1))
-    pose = np.tile([0.0, 0, 0.25, 1, 0, 0, 0], (GRASPS, 1))
-    arrays = {
-        f"{name}/{what}": value
-        for name in ("grasp", "pregrasp", "squeeze")
-        for what, value in (("hand_pose", pose), ("joint_positions", joints))
-    }
-    per_grasp = np.linspace(0.1, 0.3, GRASPS)
-    arrays |= {
-        f"quality/{name}": np.repeat(per_grasp[:, None], 2, axis=1)
-        for name in ("contact_area_cm2", "epsilon", "wrench_volume")
-    }
-    arrays |= {
-        f"quality/{name}": per_grasp
-        for name in ("intersection_volume_cm3", "penetration_depth_mm", "self_penetration_depth_mm", "stability_loss")
-    }
-    arrays |= {
-        "quality/thresholds_m": np.array([0.002, 0.005]),
-        "quality/contact_links": np.full(GRASPS, 4),
-        "quality/valid": np.ones(GRASPS, np.uint8),
-        "quality/success": np.ones(GRASPS, np.int8),
-    }
-    attributes = {
-        "hand": "allegro",
-        "hand_digest": hand.digest,
-        "object": "block",
-        "object_digest": obj.digest,
-        "method": "none",
-        "fidelity": json_attribute({"face_error_m": 3e-4}),
-        "seed": 5,
-        "batch": 0,
-        "joint_names": list(hand.joint_names),
-    }
+    arrays = quality_columns(GRASPS)
+    for name in ("grasp", "pregrasp", "squeeze"):
+        arrays[f"{name}/hand_pose"] = np.tile([0.0, 0, 0.25, 1, 0, 0, 0], (GRASPS, 1))
+        arrays[f"{name}/joint_positions"] = np.tile(hand.expand(hand.preshape), (GRASPS, 1))
     path = tmp_path_factory.mktemp("shards") / "base.h5"
-    path.write_bytes(write_shard("base", arrays, attributes))
+    path.write_bytes(write_shard("base", arrays, attributes_of(hand, obj)))
     return path
 
 
 @pytest.fixture(scope="module")
 def scene_shard(base) -> Path:
-    path = base.with_name("scenes.h5")
-    result = CliRunner().invoke(scenes, [str(base), "--scenes", "2", "-o", str(path), "--json"])
-    assert result.exit_code == 0, result.output
-    return path
-
-
-def last_line(result: Result) -> dict[str, object]:
-    return json.loads(result.stdout.splitlines()[-1])
+    graspd("scene --scenes 2 -o", base.with_name("scenes.h5"), base)
+    return base.with_name("scenes.h5")
 
 
 def test_scene_writes_every_grasp_in_every_scene(scene_shard):
     shard = read_shard(scene_shard, kind="scene")
     assert shard["scene/object_pose"].shape == (2, 7)
     assert shard["grasp/base_index"].tolist() == [0, 1, 2, 0, 1, 2]
-    assert shard.attributes["object"] == "block"
-    assert shard.attributes["seed"] == 5
+    assert (shard.attributes["object"], shard.attributes["seed"]) == ("block", 5)
 
 
 def test_render_makes_a_stereo_pair_per_placement_and_a_page(scene_shard):
     output, page = scene_shard.with_name("views.h5"), scene_shard.with_name("views.png")
-    arguments = ["render", str(scene_shard), "--views", "2", "--stereo", "--width", "48", "--height", "36"]
-    result = CliRunner().invoke(
-        rendering, [*arguments, "--device", "cpu", "-o", str(output), "--page", str(page), "--json"]
-    )
-    assert result.exit_code == 0, result.output
-    assert last_line(result)["pictures"] == 8
+    found = graspd(f"render --views 2 --stereo {SMALL} -o", output, "--page", page, scene_shard)
+    assert found["pictures"] == 8
     assert read_shard(output, kind="views")["image/rgb"].shape == (8, 36, 48, 3)
     with Image.open(page) as image:
         assert image.size[1] > 4 * 36
-
-
-def test_pictures_draws_the_best_first(base):
-    output = base.with_name("sheet.png")
-    arguments = ["pictures", str(base), "-n", "2", "--size", "48", "--device", "cpu", "-o", str(output), "--json"]
-    result = CliRunner().invoke(rendering, arguments)
-    assert result.exit_code == 0, result.output
-    assert last_line(result)["rows"] == [2, 1]
-    with Image.open(output) as image:
-        assert image.format == "PNG"
 
 
 @pytest.fixture(scope="module")
@@ -128,11 +78,9 @@ def in_bin(base) -> Path:
     return path
 
 
-def test_render_shows_the_supports_and_the_best_grasp_of_grasps_in_scenes(in_bin):
+def test_render_shows_the_supports_and_the_best_grasp(in_bin):
     output = in_bin.with_name("bin_views.h5")
-    arguments = ["render", str(in_bin), "--views", "2", "--width", "48", "--height", "36", "--device", "cpu"]
-    result = CliRunner().invoke(rendering, [*arguments, "-o", str(output)])
-    assert result.exit_code == 0, result.output
+    graspd(f"render --views 2 {SMALL} -o", output, in_bin)
     views = read_shard(output, kind="views")
     # Walls all around: less of the picture is background than on a table, which ends.
     assert (views["image/segmentation"] == 0).mean() < 0.2
@@ -141,35 +89,28 @@ def test_render_shows_the_supports_and_the_best_grasp_of_grasps_in_scenes(in_bin
     assert json.loads(str(views.attributes["scene"]))["kind"] == "bin"
 
 
-def test_pictures_of_grasps_in_scenes_show_walls_and_the_whole_way(in_bin):
-    for more, columns in ([], 1), (["--way"], 4), (["--three-sides", "--palette"], 3):
+def test_pictures_of_grasps_in_scenes_show_walls_and_whole_way(in_bin):
+    for more, columns in ("", 1), ("--way", 4), ("--three-sides --palette", 3):
         output = in_bin.with_name("bin.png")
-        arguments = ["pictures", str(in_bin), "-n", "1", "--size", "48", "--device", "cpu", "-o", str(output), *more]
-        result = CliRunner().invoke(rendering, arguments)
-        assert result.exit_code == 0, result.output
+        graspd(f"pictures -n 1 {PICTURES} {more} -o", output, in_bin)
         with Image.open(output) as image:
             assert image.width > columns * 48
             assert (image.mode == "P") == ("--palette" in more)
 
 
-def test_pictures_of_a_way_show_each_posture_of_a_free_grasp(base):
+def test_pictures_draw_the_best_first_and_each_posture_of_a_way(base):
     output = base.with_name("way.png")
-    arguments = ["pictures", str(base), "-n", "2", "--size", "48", "--device", "cpu", "-o", str(output), "--json"]
-    alone, ways = (CliRunner().invoke(rendering, [*arguments, *more]) for more in ([], ["--way"]))
-    assert alone.exit_code == ways.exit_code == 0, ways.output
-    assert last_line(ways)["rows"] == [2, 1]
-    with Image.open(output) as image:
-        # Two rows of three pictures and their margins.
-        assert image.width > 3 * 48 and image.height > 2 * 48 + 74
-    assert CliRunner().invoke(rendering, [*arguments, "--way", "--three-sides"]).exit_code == 2
+    for more, columns in ("", 1), ("--way", 3):
+        assert graspd(f"pictures -n 2 {PICTURES} {more} -o", output, base)["rows"] == [2, 1]
+        with Image.open(output) as image:
+            # Two rows of three pictures and their margins, where the way is asked for.
+            assert image.width > columns * 48 and (not more or image.height > 2 * 48 + 74)
+    refused(f"pictures {PICTURES} --way --three-sides -o", output, base)
 
 
 def test_a_film_shows_the_way_of_the_grasp_that_is_named(in_bin):
-    output = in_bin.with_name("lift.webp")
-    arguments = ["pictures", str(in_bin), "--device", "cpu", "--json", "--size", "32", "--row", "1"]
-    result = CliRunner().invoke(rendering, [*arguments, "--animate", "-o", str(output)])
-    assert result.exit_code == 0, result.output
-    assert last_line(result)["rows"] == [1]
+    output, words = in_bin.with_name("lift.webp"), "pictures --device cpu --size 32"
+    assert graspd(f"{words} --row 1 --animate -o", output, in_bin)["rows"] == [1]
     with Image.open(output) as film:
         assert (film.format, film.size) == ("WEBP", (32, 24))
         # How long a picture is shown is known once it is read.
@@ -178,12 +119,11 @@ def test_a_film_shows_the_way_of_the_grasp_that_is_named(in_bin):
         assert len(shown) > 3
         assert sum(shown) >= 1000 * (BEFORE_S + 5 * SHORTEST_S + AFTER_S)
     for more, said in (
-        (["--animate", "-o", "lift.mp4"], "an animation is written as .gif, .webp, .png, not as .mp4"),
-        (["--animate", "--way"], "exclude one another"),
-        (["--row", "3"], "has the rows 0 to 2: there is no row 3"),
+        ("--row 1 --animate -o lift.mp4", "an animation is written as .gif, .webp, .png, not as .mp4"),
+        ("--row 1 --animate --way", "exclude one another"),
+        ("--row 3", "has the rows 0 to 2: there is no row 3"),
     ):
-        refused = CliRunner().invoke(rendering, [*arguments, *more])
-        assert refused.exit_code == 2 and said in " ".join(refused.output.split()), refused.output
+        assert said in refused(f"{words} {more}", in_bin)
 
 
 def test_a_row_that_is_no_valid_grasp_is_drawn_only_with_all(base):
@@ -191,36 +131,28 @@ def test_a_row_that_is_no_valid_grasp_is_drawn_only_with_all(base):
     failed = base.with_name("failed.h5")
     arrays = dict(shard.arrays) | {"quality/valid": np.array([1, 0, 1], np.uint8)}
     failed.write_bytes(write_shard("base", arrays, shard.attributes))
-    arguments = ["pictures", str(failed), "--row", "1", "--size", "32", "--device", "cpu"]
-    arguments += ["-o", str(base.with_name("row.png")), "--json"]
-    refused = CliRunner().invoke(rendering, arguments)
-    assert refused.exit_code == 2 and "--all takes any" in refused.output
-    assert last_line(CliRunner().invoke(rendering, [*arguments, "--all"]))["rows"] == [1]
+    words = ("pictures --row 1 --size 32 --device cpu -o", base.with_name("row.png"), failed)
+    assert "--all takes any" in refused(*words)
+    assert graspd(*words, "--all")["rows"] == [1]
 
 
-def test_another_object_than_the_shards_is_refused(base):
-    output = base.with_name("other.h5")
-    result = CliRunner().invoke(scenes, [str(base), "--object", "mug", "-o", str(output)])
-    assert result.exit_code == 2
-    assert "give the file it was made with as --object" in result.output
-    assert not output.exists()
+def test_other_objects_neighbours_and_kinds_are_refused(base):
+    output, crowd = base.with_name("none.h5"), base.with_name("crowd_of_mugs.h5")
+    said = refused("scene --object mug -o", output, base)
+    assert "give the file it was made with as --object" in said and not output.exists()
+    graspd("scene --scenes 1 --with mug -o", crowd, base)
+    assert "neighbour 'mug' has digest" in refused("render --with bottle -o", output, crowd)
+    assert "a scene shard is needed here" in refused("render -o", output, base)
 
 
-def test_a_shard_of_another_kind_is_refused(base):
-    result = CliRunner().invoke(rendering, ["render", str(base), "-o", str(base.with_name("none.h5"))])
-    assert result.exit_code == 2
-    assert "a scene shard is needed here" in result.output
-
-
-def test_render_writes_the_channels_cameras_and_hand_that_are_asked_for(base, scene_shard):
+def test_render_writes_the_channels_cameras_and_hand_asked_for(base, scene_shard):
     cameras, output = base.with_name("cameras.json"), base.with_name("more.h5")
     cameras.write_text(
         '{"width": 48, "height": 36, "intrinsics": {"fx": 50, "fy": 50, "cx": 24, "cy": 18},'
         ' "cameras": [{"eye": [0.5, 0, 0.4], "target": [0, 0, 0.05]}]}'
     )
-    arguments = ["render", str(scene_shard), "--channels", "all", "--cameras", str(cameras), "--with-hand", str(base)]
-    result = CliRunner().invoke(rendering, [*arguments, "--device", "cpu", "-o", str(output), "--json"])
-    assert result.exit_code == 0, result.output
+    more = ("--cameras", cameras, "--with-hand", base, "-o", output)
+    graspd("render --channels all --device cpu", scene_shard, *more)
     views = read_shard(output, kind="views")
     assert views["image/distance"].shape == (2, 36, 48)
     assert views["image/rgb_hand"].shape == views["image/normals"].shape == (2, 36, 48, 3)
@@ -231,7 +163,7 @@ def test_render_writes_the_channels_cameras_and_hand_that_are_asked_for(base, sc
     assert kept.tolist() == [2, 2]
 
 
-def test_three_sides_of_a_grasp_take_fewer_rays_than_one_large_picture(base, monkeypatch):
+def test_three_sides_of_a_grasp_take_fewer_rays_than_a_picture(base, monkeypatch):
     traced = []
 
     def count(hand, obj, pose, joints, size, sides, *, samples, **options):
@@ -239,44 +171,24 @@ def test_three_sides_of_a_grasp_take_fewer_rays_than_one_large_picture(base, mon
         return np.zeros((len(pose), len(sides), size[1], size[0], 3), np.uint8)
 
     monkeypatch.setattr(grasp_sheet, "grasp_pictures", count)
-    for arguments in ([], ["--three-sides"], ["--three-sides", "--size", "300"]):
-        output = str(base.with_name("sheet.png"))
-        assert CliRunner().invoke(rendering, ["pictures", str(base), "-o", output, *arguments]).exit_code == 0
+    for words in ("", "--three-sides", "--three-sides --size 300"):
+        graspd(f"pictures {words} -o", base.with_name("sheet.png"), base)
     assert traced[1] < 0.6 * traced[0] and traced[2] == 2 * traced[0]
 
 
-def test_neighbours_travel_from_the_scene_to_the_labels_of_the_exported_pictures(base):
+def test_neighbours_travel_from_scene_to_labels_of_pictures(base):
     scene, views, folder = (base.with_name(name) for name in ("crowd.h5", "crowd_views.h5", "crowd"))
-    result = CliRunner().invoke(scenes, [str(base), "--scenes", "1", "--with", "mug", "-o", str(scene)])
-    assert result.exit_code == 0, result.output
-    arguments = ["render", str(scene), "--views", "1", "--width", "32", "--height", "24", "--device", "cpu"]
-    result = CliRunner().invoke(rendering, [*arguments, "-o", str(views)])
-    assert result.exit_code == 0, result.output
-    result = CliRunner().invoke(exchange, ["export", str(views), "--depth", "png", "-o", str(folder), "--json"])
-    assert result.exit_code == 0, result.output
+    graspd("scene --scenes 1 --with mug -o", scene, base)
+    graspd("render --views 1 --width 32 --height 24 --device cpu -o", views, scene)
     # Labels, and per picture colour, depth, segmentation and what is known about it.
-    assert last_line(result)["files"] == 5
+    assert graspd("export --depth png -o", folder, views)["files"] == 5
     assert json.loads((folder / "labels.json").read_text())["3"] == {"class": "mug"}
-
-
-def test_another_neighbour_than_the_shards_is_refused(base):
-    scene = base.with_name("crowd_of_mugs.h5")
-    assert CliRunner().invoke(scenes, [str(base), "--scenes", "1", "--with", "mug", "-o", str(scene)]).exit_code == 0
-    arguments = ["render", str(scene), "--with", "bottle", "-o", str(base.with_name("none.h5"))]
-    result = CliRunner().invoke(rendering, arguments)
-    assert result.exit_code == 2
-    assert "neighbour 'mug' has digest" in result.output
 
 
 def test_hands_of_grasps_in_scenes_are_drawn_with_their_wrists(base: Path):
     shard, wrist = read_shard(base), 0.1 * np.arange(2.0 * GRASPS).reshape(GRASPS, 2)
-    shard.arrays.update(
-        {
-            "scene/object_pose": np.tile([0.0, 0, 0, 1, 0, 0, 0], (GRASPS, 1)),
-            "grasp/scene_index": np.arange(GRASPS),
-            "grasp/wrist_positions": wrist,
-        }
-    )
+    at = {"scene/object_pose": np.tile([0.0, 0, 0, 1, 0, 0, 0], (GRASPS, 1)), "grasp/scene_index": np.arange(GRASPS)}
+    shard.arrays.update(at | {"grasp/wrist_positions": wrist})
     shard.attributes["scene"] = json_attribute({"kind": "table"})
     around, drawn = grasp_sheet.around_of(shard, np.array([2, 0])), render._drawn_in(shard, None)
     assert np.array_equal(around.wrist, wrist[[2, 0]])

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
-from typing import Any
 
 import pytest
-from typer.testing import CliRunner
 
-from graspd.cli import build
 from graspd.service.model.fidelity import FIDELITIES
 from graspd.service.store.shards import Shard, read_shard, write_shard
 from graspd.worker.engines import backend
@@ -20,6 +16,7 @@ from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners import synthesize
 from graspd.worker.planners.port import PlanRequest
+from tests.worker.commands_run import graspd
 
 
 @pytest.fixture(scope="session")
@@ -44,23 +41,9 @@ def on_tables(tmp_path_factory: pytest.TempPathFactory) -> Path:
     and pictures is not true of it: their numbers are the block's, which is all that writers and readers see of them."""
     folder = tmp_path_factory.mktemp("on-tables")
     block, views = folder / "block.h5", folder / "block-views.h5"
-    words = [
-        "--hand",
-        "barrett",
-        "--object",
-        "block",
-        "--scene",
-        "table",
-        "--scenes",
-        "2",
-        "-n",
-        "8",
-        "--want",
-        "candidates",
-    ]
-    words += ["--seed", "1"]  # all eight of these are valid
-    run("synth", *words, "--fidelity", "draft", "-o", block)
-    run("render", block, "--views", "2", "--width", "96", "--height", "72", "-o", views)
+    table = "--hand barrett --object block --scene table --scenes 2 -n 8 --want candidates --fidelity draft"
+    graspd(f"synth {table} --seed 1 -o", block)  # all eight of these are valid
+    graspd("render --views 2 --width 96 --height 72 -o", views, block)
     base, seen = read_shard(block, kind="base"), read_shard(views, kind="views")
     mug = {"object": "mug", "object_digest": object_from_path("mug").digest}
     base_id, seen_id = "a" * 64, "b" * 64
@@ -76,10 +59,3 @@ def on_tables(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def stored(on_tables: Path) -> Shard:
     """The block's grasps among these."""
     return read_shard(on_tables / "block.h5", kind="base")
-
-
-def run(*words: object) -> dict[str, Any]:
-    """What a command says with --json."""
-    result = CliRunner().invoke(build(), [str(word) for word in (*words, "--json")])
-    assert result.exit_code == 0, result.output
-    return dict(json.loads(result.stdout.splitlines()[-1]))

@@ -51,7 +51,7 @@ def test_the_object_weighs_what_the_evaluator_wants(bench: Path, block: ObjectMo
     assert info["mass"] == pytest.approx(info["density"] * block.volume, rel=0.05)  # the pieces' against the mesh's
 
 
-def test_every_file_beside_the_pieces_is_a_piece_also_after_a_second_export(
+def test_every_file_beside_the_pieces_is_a_piece_also_later(
     bench: Path, hand: HandModel, block: ObjectModel, grasps: GraspSet
 ) -> None:
     pieces = bench / np.load(files_of(bench, "graspd_barrett")[0], allow_pickle=True).item()["obj_path"] / "urdf/meshes"
@@ -75,7 +75,7 @@ def test_the_evaluators_hand_stands_where_ours_does(name: str, block: ObjectMode
             assert_at(found.data.body(PREFIX + body), pose)
 
 
-def test_the_evaluators_actuators_aim_at_the_joints_of_a_posture(bench: Path, hand: HandModel) -> None:
+def test_evaluators_bodies_and_actuators_are_those_of_the_hand(bench: Path, hand: HandModel) -> None:
     found = load(bench, files_of(bench, "graspd_barrett")[0], "graspd_barrett")
     qpos = found.grasp["squeeze_qpos"]
     found.at(qpos)
@@ -86,10 +86,6 @@ def test_the_evaluators_actuators_aim_at_the_joints_of_a_posture(bench: Path, ha
         assert target == pytest.approx(qpos[int(joint.qposadr[0])], abs=1e-12)
         assert found.model.actuator_gainprm[number, 0] == pytest.approx(5.0)
     assert found.model.neq == 1 + len(hand.joint_names) - hand.dofs  # the weld, and what follows another joint
-
-
-def test_the_bodies_that_the_configuration_names_are_in_the_model(bench: Path, hand: HandModel) -> None:
-    found = load(bench, files_of(bench, "graspd_barrett")[0], "graspd_barrett")
     known = {found.model.body(number).name for number in range(found.model.nbody)}
     said = found.hand
     assert {PREFIX + name for name in said["valid_body_name"]} <= known
@@ -155,7 +151,7 @@ _SHADOW_THUMB = [
         ("shadow/shadow_hand_right.urdf", "shadow", [0, 0, 0.034, 1, 0, 0, 0], _SHADOW_THUMB, 17, "THJ1"),
     ],
 )
-def test_a_hand_that_the_benchmark_has_is_mapped_onto_its_own_model(
+def test_hand_that_benchmark_has_is_mapped_onto_its_own_model(
     shared_data: Path,
     block: ObjectModel,
     tmp_path: Path,
@@ -184,7 +180,7 @@ def test_a_hand_that_the_benchmark_has_is_mapped_onto_its_own_model(
     assert [ours for _, ours in mapping["joints"]][first + len(chain) - 1] == tip
 
 
-def test_grasps_for_the_benchmarks_own_model_come_back_as_they_were(block: ObjectModel, tmp_path: Path) -> None:
+def test_grasps_for_benchmarks_own_model_come_back_as_they_were(block: ObjectModel, tmp_path: Path) -> None:
     hand = hand_from_path("shadow")
     grasps = random_postures(hand)
     dexgraspbench.write(hand, block, grasps, [0, 1], tmp_path)

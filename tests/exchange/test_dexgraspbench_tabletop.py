@@ -9,9 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from graspd.cli import build
 from graspd.exchange import dexgraspbench
 from graspd.exchange.bench_hand import body_names
 from graspd.exchange.bench_scene import check_table
@@ -24,6 +22,7 @@ from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.simulation.environment import Obstacle, PlacedGrasps
 from tests.exchange.bench_loader import PREFIX, files_of, load, tabletop_test
+from tests.worker.commands_run import graspd
 
 CONFIG, EXPERIMENT = "graspd_barrett", "graspd_tabletop"
 #: Rounding of a pose in float64 through text of 12 digits [m].
@@ -32,34 +31,12 @@ COUNT = 12
 LIMP = 3
 
 
-def graspd(*words: object) -> dict[str, Any]:
-    """What a command says with --json."""
-    result = CliRunner().invoke(build(), [str(word) for word in (*words, "--json")])
-    assert result.exit_code == 0, result.output
-    return dict(json.loads(result.stdout.splitlines()[-1]))
-
-
 @pytest.fixture(scope="module")
 def shard(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Candidates in two scenes: most lift, the first `LIMP` do not, for they squeeze no more than the open hand."""
     out = tmp_path_factory.mktemp("scenes") / "g.h5"
     graspd(
-        "synth",
-        "--hand",
-        "barrett",
-        "--object",
-        "block",
-        "--scene",
-        "table",
-        "--scenes",
-        2,
-        "-n",
-        COUNT,
-        "--want",
-        "candidates",
-        "--fidelity",
-        "draft",
-        "-o",
+        f"synth --hand barrett --object block --scene table --scenes 2 -n {COUNT} --want candidates --fidelity draft -o",
         out,
     )
     made = read_shard(out, kind="base")
@@ -73,7 +50,7 @@ def shard(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def bench(shard: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("bench")
-    assert graspd("export", shard, "--format", "dexgraspbench", "--all", "-o", root)["grasps"] == COUNT
+    assert graspd("export --format dexgraspbench --all -o", root, shard)["grasps"] == COUNT
     return root
 
 
@@ -99,7 +76,7 @@ def test_a_grasp_stands_where_its_object_lies_on_the_table(bench: Path, stored: 
             np.testing.assert_allclose(found[f"{name}_qpos"][:7], root, atol=ROUNDING_M)
 
 
-def test_the_way_in_ends_at_the_pregrasp_and_the_lift_is_ten_centimetres_up(bench: Path, stored: Shard) -> None:
+def test_the_way_in_ends_at_the_pregrasp_and_scenes_have_a_table(bench: Path, stored: Shard) -> None:
     width = 7 + stored["grasp/joint_positions"].shape[1]
     for file in files_of(bench, CONFIG, EXPERIMENT):
         found = np.load(file, allow_pickle=True).item()
@@ -110,9 +87,6 @@ def test_the_way_in_ends_at_the_pregrasp_and_the_lift_is_ten_centimetres_up(benc
         np.testing.assert_allclose(
             found["lift_qpos"] - found["squeeze_qpos"], [0, 0, 0.1, *[0] * (width - 3)], atol=1e-8
         )
-
-
-def test_the_scene_of_a_grasp_has_its_object_and_a_table(bench: Path) -> None:
     for file in files_of(bench, CONFIG, EXPERIMENT):
         record = np.load(file, allow_pickle=True).item()
         path = bench / record["scene_path"]
@@ -150,7 +124,7 @@ def geom_bottom(found: Any, geom: int) -> float:
 
 
 def test_its_tabletop_test_says_what_our_letter_says(bench: Path, shard: Path) -> None:
-    said = graspd("evaluate", shard, "--protocol", "lift", "--level", "dexgraspbench")
+    said = graspd("evaluate --protocol lift --level dexgraspbench", shard)
     ours = {one["row"]: one for one in said["verdicts"]}
     decided, apart = 0, []
     for file in files_of(bench, CONFIG, EXPERIMENT):
@@ -167,9 +141,7 @@ def test_its_tabletop_test_says_what_our_letter_says(bench: Path, shard: Path) -
     assert np.median(apart) < 0.02
 
 
-def test_grasps_on_a_table_come_back_with_their_scenes_ways_and_verdicts(
-    bench: Path, shard: Path, stored: Shard
-) -> None:
+def test_grasps_on_a_table_come_back_with_scenes_and_verdicts(bench: Path, shard: Path, stored: Shard) -> None:
     folder = bench / "output" / f"{EXPERIMENT}_{CONFIG}"
     (back,) = dexgraspbench.read(folder, hand="barrett", obj="block")
     assert back.placed is not None
@@ -181,9 +153,8 @@ def test_grasps_on_a_table_come_back_with_their_scenes_ways_and_verdicts(
     np.testing.assert_allclose(
         back.placed.object_pose[back.placed.index], stored["scene/object_pose"][given.scene], atol=ROUNDING_M
     )
-    lift = ("--protocol", "lift", "--level", "dexgraspbench")
-    again = graspd("evaluate", folder, "--hand", "barrett", "--object", "block", *lift)
-    first = graspd("evaluate", shard, *lift)
+    again = graspd("evaluate --protocol lift --level dexgraspbench --hand barrett --object block", folder)
+    first = graspd("evaluate --protocol lift --level dexgraspbench", shard)
     there = {one["row"]: one["held"] for one in first["verdicts"]}
     assert [one["held"] for one in again["verdicts"]] == [there[row] for row in rows]
 
@@ -191,22 +162,8 @@ def test_grasps_on_a_table_come_back_with_their_scenes_ways_and_verdicts(
 def test_an_import_is_validated_by_its_lift(bench: Path, stored: Shard, tmp_path: Path) -> None:
     folder = bench / "output" / f"{EXPERIMENT}_{CONFIG}"
     out = tmp_path / "imported"
-    graspd(
-        "import",
-        folder,
-        "--format",
-        "dexgraspbench",
-        "--hand",
-        "barrett",
-        "--object",
-        "block",
-        "--source",
-        "a test",
-        "--licence",
-        "CC0-1.0",
-        "-o",
-        out,
-    )
+    given = "import --format dexgraspbench --hand barrett --object block --source test --licence CC0-1.0 -o"
+    graspd(given, out, folder)
     (file,) = out.glob("*.h5")
     found = read_shard(file, kind="base")
     assert json.loads(str(found.attributes["scene"]))["kind"] == "table"

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import tracemalloc
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -14,19 +16,29 @@ import trimesh
 
 from graspd.exchange import dexgraspnet2
 from graspd.exchange.dexgraspnet2 import load_npz
-from graspd.exchange.dexgraspnet2_graspness import surface_samples
+from graspd.exchange.dexgraspnet2_graspness import (
+    SAMPLES,
+    SceneGraspness,
+    back_projected,
+    in_workspace,
+    lines_of_sight,
+    pointed_at,
+    summed,
+    surface_samples,
+)
 from graspd.exchange.plan import PictureReference
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import IDENTITY_POSE, apply, compose, pose_from_matrix
 from graspd.service.readers import Pictures, open_shards
 from graspd.service.store.shards import Shard, read_shard, write_shard
+from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.jaws import fingertip_pad
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.rendering.annotate import TABLE
-from tests.exchange.conftest import run
 from tests.exchange.dexgraspnet2_loader import graspness_at, pointed, sample, some_views
+from tests.worker.commands_run import graspd, refused
 
 TRAIN, VAL = range(90), range(90, 100)
 #: Poses go through matrices in float64 and there and back between frames [m].
@@ -38,7 +50,7 @@ POINT_M = 8e-5
 @pytest.fixture(scope="module")
 def root(on_tables: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("dexgraspnet2")
-    said = run("export", on_tables, "--format", "dexgraspnet2", "-o", folder)
+    said = graspd("export --format dexgraspnet2 -o", folder, on_tables)
     assert (said["scenes"], said["views"], said["files"]) == (4, 8, 4)
     return folder
 
@@ -103,15 +115,6 @@ def test_the_object_of_the_cloud_is_where_grasps_mean_it(
         assert np.abs(apply(pose_from_matrix(on_table), rest)[:, 2]).max(initial=0) < POINT_M
 
 
-def test_a_grasp_points_at_the_object(root: Path, block: ObjectModel) -> None:
-    mesh = trimesh.Trimesh(block.vertices, block.faces, process=False)
-    for file in sorted((root / "data" / "dex_grasps_new").rglob("block.npz")):
-        place = dexgraspnet2._object_pose(file, 0)
-        turn = trimesh.transformations.quaternion_matrix(place[3:])[:3, :3]
-        points = (np.load(file)["point"] - place[:3]) @ turn
-        assert np.abs(trimesh.proximity.closest_point(mesh, points)[1]).max() < ROUNDING_M
-
-
 def placed(root: Path, scene: str, view: int, points: np.ndarray) -> np.ndarray:
     """Points of the object's frame in the camera of a view."""
     meta = scipy.io.loadmat(root / "data" / "scenes" / scene / "realsense" / "meta" / f"{view:04}.mat")
@@ -163,10 +166,8 @@ def test_graspness_lies_as_its_loader_expects_it(root: Path) -> None:
     assert sorted(file.name for file in (root / "data" / "dex_graspness_new").iterdir()) == [s.name for s in scenes]
 
 
-def test_graspness_belongs_to_the_cloud_that_a_depth_camera_tells(
-    on_tables: Path, hand: HandModel, tmp_path: Path
-) -> None:
-    run("export", on_tables, "--format", "dexgraspnet2", "--noise", "stereo", "-o", tmp_path)
+def test_graspness_belongs_to_cloud_that_a_depth_camera_tells(on_tables: Path, hand: HandModel, tmp_path: Path) -> None:
+    graspd("export --format dexgraspnet2 --noise stereo -o", tmp_path, on_tables)
     for scene, view in some_views(tmp_path, TRAIN, 4, seed=8):
         found = sample(tmp_path, scene, view, "barrett", list(hand.joint_names))
         assert found.has_graspness and (found.graspness[found.seg == 1] > np.log(1e-3)).any()
@@ -181,7 +182,7 @@ def test_a_view_of_nothing_has_no_cloud_and_no_graspness(on_tables: Path, hand: 
     (shards / "block.h5").write_bytes((on_tables / "block.h5").read_bytes())
     arrays = {**views.arrays, "image/segmentation": labels}
     (shards / "views.h5").write_bytes(write_shard("views", arrays, views.attributes))
-    run("export", shards, "--format", "dexgraspnet2", "-o", tmp_path / "out")
+    graspd("export --format dexgraspnet2 -o", tmp_path / "out", shards)
     for folder in (tmp_path / "out" / "data" / "dex_graspness_new").glob("*/realsense"):
         assert sorted(file.name for file in folder.iterdir()) == [f"{view:04}.npy" for view in range(1, 256, 2)]
         assert sample(tmp_path / "out", folder.parent.name, 3, "barrett", list(hand.joint_names)).has_graspness
@@ -241,37 +242,131 @@ def test_a_file_without_its_scene_is_told(root: Path, tmp_path: Path) -> None:
         dexgraspnet2.read(place, hand="barrett", obj="block")
 
 
-def test_objects_in_an_archive_are_not_unpickled(tmp_path: Path) -> None:
+def test_archives_are_neither_unpickled_nor_believed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     np.savez(tmp_path / "x.npz", point=np.array([{"a": 1}], dtype=object))
     with pytest.raises(InputError, match="read safely"):
         load_npz(tmp_path / "x.npz")
-
-
-def test_an_archive_that_unpacks_to_too_much_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    header = b"\x93NUMPY\x01\x00v\x00{'descr': '<f8', 'fortran_order': False, 'shape': (30000000000,), }"
+    with zipfile.ZipFile(tmp_path / "x.npz", "w") as archive:
+        archive.writestr("point.npy", header.ljust(127) + b"\n")
+    with pytest.raises(InputError, match="read safely"):
+        load_npz(tmp_path / "x.npz")
     monkeypatch.setattr(dexgraspnet2, "LARGEST", 2**20)
     np.savez_compressed(tmp_path / "x.npz", point=np.zeros(2**20))
     with pytest.raises(InputError, match="unpacks to more"):
         load_npz(tmp_path / "x.npz")
 
 
-def test_a_header_that_promises_what_is_not_there_is_told(tmp_path: Path) -> None:
-    header = b"\x93NUMPY\x01\x00v\x00{'descr': '<f8', 'fortran_order': False, 'shape': (30000000000,), }"
-    with zipfile.ZipFile(tmp_path / "x.npz", "w") as archive:
-        archive.writestr("point.npy", header.ljust(127) + b"\n")
-    with pytest.raises(InputError, match="read safely"):
-        load_npz(tmp_path / "x.npz")
-
-
-def test_no_pictures_no_scenes(on_tables: Path, tmp_path: Path) -> None:
-    with pytest.raises(AssertionError, match="no picture shows"):
-        run("export", on_tables / "block.h5", "--format", "dexgraspnet2", "-o", tmp_path / "out")
-
-
-def test_pictures_of_scenes_in_which_no_grasp_is_clear_are_told(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_what_shows_no_scene_or_no_clear_grasp_is_told(
+    on_tables: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    said = refused("export --format dexgraspnet2 -o", tmp_path / "out", on_tables / "block.h5")
+    assert "no picture shows" in said
     none = PictureReference(0, "base", "views", 0, np.eye(4), IDENTITY_POSE, np.zeros(0, np.intp))
     monkeypatch.setattr(dexgraspnet2, "looks", lambda pictures: [none])
     lots: list[Any] = [SimpleNamespace(id="base")]
     with pytest.raises(InputError, match="no grasp is valid and clear"):
         dexgraspnet2.write(lots, cast(Pictures, None), tmp_path, frozenset())
+
+
+DOWN = np.array([[0.0, 0, -1]])
+ABOVE = np.array([[0.0, 0, 0.1]])
+#: 100 px to a metre at a metre, a picture of 2 x 4.
+K = np.array([[100.0, 0, 1], [0, 100, 0.5], [0, 0, 1]])
+
+
+def test_a_grasp_points_straight_ahead_or_nearest_within_30_deg() -> None:
+    # Where all lie as deep, the angle decides.
+    surface = np.array([[0.02, 0, 0], [0.005, 0, 0], [-0.03, 0, 0]])
+    assert pointed_at(ABOVE, DOWN, surface).tolist() == [1]
+    outside, behind = 0.1 * np.tan(np.radians(31)), 0.12
+    assert pointed_at(ABOVE, DOWN, np.array([[outside, 0, 0], [0, 0, behind], [0, 0, -0.05]])).tolist() == [2]
+    assert pointed_at(ABOVE, DOWN, np.array([[0.3, 0, 0], [0, 0, 0.12]])).tolist() == [1]
+
+
+@pytest.mark.parametrize(("degrees", "best"), [(4.5, 1), (5.5, 0)])
+def test_ten_degrees_weigh_as_fifteen_millimetres(degrees: float, best: int) -> None:
+    # The first lies 7.5 mm deeper on the line, which is worth five degrees.
+    aside = 0.1 * np.tan(np.radians(degrees))
+    assert pointed_at(ABOVE, DOWN, np.array([[0, 0, -0.0075], [aside, 0, 0]])).tolist() == [best]
+
+
+def test_what_lies_20_mm_behind_the_first_point_is_not_seen() -> None:
+    # By weight alone the deeper point would win: 28 degrees cost 2.8, 21 mm only 1.4.
+    aside = 0.1 * np.tan(np.radians(28))
+    assert pointed_at(ABOVE, DOWN, np.array([[aside, 0, 0], [0, 0, -0.021]])).tolist() == [0]
+    assert pointed_at(ABOVE, DOWN, np.array([[aside, 0, 0], [0, 0, -0.019]])).tolist() == [1]
+
+
+def test_grasp_counts_tenth_at_each_150th_of_metre_without_none(hand: HandModel, block: ObjectModel) -> None:
+    surface = np.array([[0.0, 0, 0], [1 / 150, 0, 0], [3 / 150, 0, 0]])
+    np.testing.assert_allclose(summed(surface, np.array([0, 0, 1])), [2.1, 1.2, 0.012], rtol=1e-12)
+    none = Posture(np.zeros((0, 7)), np.zeros((0, len(hand.joint_names))))
+    found = SceneGraspness.of(hand, none, surface_samples(block))
+    assert found.values.shape == (SAMPLES,) and not found.values.any() and len(found.pointed) == 0
+
+
+def test_pixels_of_the_object_take_what_is_nearest() -> None:
+    """The camera looks at a wall 0.5 m away, its pixels 5 mm apart; right above on the table's x-y."""
+    depth = np.full((2, 4), 0.5)
+    depth[1, 1] = 0
+    labels = np.array([[1, 1, 2, 0], [1, 0, 0, 0]], np.uint8)
+    surface = np.array([[-0.005, -0.0025, 0.0], [0.0, -0.0025, 0.0]])
+    scene = SceneGraspness(surface, np.array([0]), np.array([1.0, 0.25]))
+    ahead = np.array([0, 0, 0.5, 1, 0, 0, 0])
+    values = scene.of_view(depth, labels, K, np.eye(4), ahead)
+    # Row by row: two of the object, its neighbour, table; the object again, a hole, which is no point, and table.
+    assert values.shape == (7, 1)
+    np.testing.assert_allclose(values[:, 0], [1, 0.25, 0, 0, 1, 0, 0])
+    # An object that stands 13 cm from where the picture shows it is out of reach.
+    assert not scene.of_view(depth, labels, K, np.eye(4), ahead + np.array([0, 0, 0.13, 0, 0, 0, 0])).any()
+
+
+def test_the_workspace_is_20_mm_about_what_is_labelled() -> None:
+    depth = np.full((2, 40), 0.5)
+    labels = np.zeros((2, 40), np.uint8)
+    labels[:, 10] = 1
+    inside = in_workspace(back_projected(depth, K), depth, labels, np.eye(4))
+    # Pixels are 5 mm apart: three on each side, for the fourth lies on the border or a rounding from it.
+    assert inside[:, 7:14].all() and not inside[:, :6].any() and not inside[:, 15:].any()
+    # A labelled hole is a place at the camera, which widens the box.
+    depth[0, 10] = 0
+    assert not in_workspace(back_projected(depth, K), depth, labels, np.eye(4))[0, 10]
+    assert in_workspace(back_projected(depth, K), depth, labels, np.eye(4))[:, 2].all()
+
+
+def test_a_hand_looks_between_its_thumb_and_its_fingers(hand: HandModel, grasps: GraspSet) -> None:
+    palm, line = lines_of_sight(hand, grasps.grasp)
+    np.testing.assert_allclose(np.linalg.norm(line, axis=1), 1)
+    assert palm.shape == (len(grasps.grasp), 3)
+    one = replace(hand, fingertips=hand.fingertips[:1])
+    still = Posture(IDENTITY_POSE[None], hand.expand(hand.preshape)[None])
+    np.testing.assert_allclose(lines_of_sight(one, still)[1], hand.palm.approach[None])
+    # A Barrett's fingers meet before its palm.
+    assert lines_of_sight(hand, still)[1] @ hand.palm.approach > 0.9
+
+
+def test_points_are_even_and_the_same_each_time(block: ObjectModel) -> None:
+    points = surface_samples(block)
+    np.testing.assert_array_equal(points, surface_samples(block))
+    apart = np.linalg.norm(points[:, None] - points[None], axis=2) + np.eye(SAMPLES)
+    area = (
+        float(np.linalg.norm(np.cross(*np.moveaxis(np.diff(block.vertices[block.faces], axis=1), 1, 0)), axis=1).sum())
+        / 2
+    )
+    assert apart.min(axis=1).min() > 0.4 * np.sqrt(area / SAMPLES)
+
+
+def test_many_grasps_take_no_more_memory(block: ObjectModel) -> None:
+    surface = surface_samples(block)
+
+    def most(count: int) -> int:
+        palm = np.random.default_rng(0).normal(size=(count, 3)) * 0.2
+        line = -palm / np.linalg.norm(palm, axis=1, keepdims=True)
+        tracemalloc.start()
+        summed(surface, pointed_at(palm, line, surface))
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        return peak
+
+    assert most(1536) < 1.2 * most(512) < 100 * 2**20

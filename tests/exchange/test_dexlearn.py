@@ -22,8 +22,8 @@ from graspd.service.store.shards import Shard
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
-from tests.exchange.conftest import run
 from tests.exchange.dexlearn_loader import Data
+from tests.worker.commands_run import graspd
 
 NAME = "graspd_tabletop_graspd_barrett"
 #: A pose in float64 through a model in text of 12 digits [m].
@@ -35,7 +35,7 @@ POINT_M = 2e-5
 @pytest.fixture(scope="module")
 def checkout(on_tables: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("dexlearn")
-    said = run("export", on_tables, "--format", "dexlearn", "--all", "-o", folder)
+    said = graspd("export --format dexlearn --all -o", folder, on_tables)
     assert (said["grasps"], said["scenes"], said["clouds"]) == (16, 4, 8)
     return folder
 
@@ -51,7 +51,7 @@ def test_all_that_may_be_drawn_is_there(checkout: Path) -> None:
             assert sample.hand_joint.shape == (count, 3, 8)
             assert all(cloud.ndim == 2 and cloud.shape[1] == 3 and len(cloud) for cloud in sample.clouds)
             assert len(data.types) == 1 or sample.grasp_type_id == int(sample.file.parts[-4].split("_")[0])
-    assert len(data.test_scenes()) == 2
+    assert data.types and len(data.test_scenes()) == 2
 
 
 def test_a_fingertip_stands_where_ours_does(checkout: Path, hand: HandModel, stored: Shard) -> None:
@@ -99,7 +99,7 @@ def test_a_cloud_of_a_free_object_lies_on_it_where_it_is_itself(on_tables: Path,
         assert 1e-4 < np.abs(trimesh.proximity.closest_point(mesh, noisy)[1]).max() < 0.05
 
 
-def test_collected_grasps_come_back_with_their_scenes_and_verdicts(checkout: Path, stored: Shard) -> None:
+def test_collected_grasps_come_back_with_scenes_and_verdicts(checkout: Path, stored: Shard) -> None:
     sets = dexgraspbench.read(checkout / "assets" / "grasp" / NAME / "succ_collect", hand="barrett", obj="block")
     (back,) = sets
     assert back.placed is not None and len(back.grasps) == 16
@@ -124,24 +124,26 @@ def test_a_file_that_names_only_its_scene_is_read_with_it(checkout: Path, tmp_pa
     np.testing.assert_allclose(found.placed.object_pose[0], pose, atol=ROUNDING_M)
 
 
-@pytest.mark.parametrize("path", ["/etc/passwd", "assets/../../secret.npy", "other/scene.npy"])
-def test_a_scene_that_lies_elsewhere_is_refused(checkout: Path, tmp_path: Path, path: str) -> None:
+@pytest.mark.parametrize(
+    ("path", "says"),
+    [
+        ("/etc/passwd", "below assets"),
+        ("assets/../../secret.npy", "below assets"),
+        ("other/scene.npy", "below assets"),
+        ("assets/none.npy", "which is in no folder above"),
+    ],
+)
+def test_a_scene_that_lies_elsewhere_is_refused(checkout: Path, tmp_path: Path, path: str, says: str) -> None:
     (file, *_) = sorted((checkout / "assets" / "grasp" / NAME / "succ_collect").rglob("*.npy"))
     record = np.load(file, allow_pickle=True).item()
     del record["obj_pose"]
     save(tmp_path / "x.npy", record | {"scene_path": path})
-    with pytest.raises(InputError, match="below assets"):
+    with pytest.raises(InputError, match=says):
         dexgraspbench.read(tmp_path / "x.npy", hand="barrett", obj="block")
 
 
-def test_types_that_only_one_split_has_are_not_listed(checkout: Path) -> None:
-    """Its loader draws a type first, and then fails where the split has none of its objects."""
-    data = Data(checkout, NAME)
-    assert data.types and all(data.samples(split) for split in ("train", "test"))
-
-
-def test_without_pictures_it_is_told_that_there_is_nothing_to_see(on_tables: Path, tmp_path: Path) -> None:
-    said = run("export", on_tables / "block.h5", "--format", "dexlearn", "--all", "-o", tmp_path / "out")
+def test_without_pictures_nothing_to_see_is_told(on_tables: Path, tmp_path: Path) -> None:
+    said = graspd("export --format dexlearn --all -o", tmp_path / "out", on_tables / "block.h5")
     assert said["clouds"] == 0 and any("no pictures" in note for note in said["notes"])
     assert any("one object" in note for note in said["notes"])
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from graspd.commands.exchange import IMPORTS, read_sets
 from graspd.exchange import dexgraspbench, published
 from graspd.exchange.imported import Origin, load_npy, verdicts
 from graspd.exchange.scoring import write_scored
@@ -38,32 +39,19 @@ def test_a_file_that_would_run_code_is_refused_and_does_not(tmp_path: Path, monk
     with pytest.raises(InputError, match="cannot be read safely"):
         load_npy(Path("bomb.npy"))
     assert not Path("bomb-went-off").exists()
-
-
-@pytest.mark.parametrize("content", [b"", b"\x93NUMPY", b"no array at all"])
-def test_what_is_no_numpy_file_is_told(tmp_path: Path, content: bytes) -> None:
-    path = tmp_path / "x.npy"
-    path.write_bytes(content)
-    with pytest.raises(InputError, match=r"x\.npy"):
-        load_npy(path)
+    for content in (b"", b"\x93NUMPY", b"no array at all"):
+        Path("x.npy").write_bytes(content)
+        with pytest.raises(InputError, match=r"x\.npy"):
+            load_npy(Path("x.npy"))
 
 
 def test_a_verdict_of_others_is_yes_no_or_none() -> None:
-    assert verdicts([1, 0, True, False, 1.0, None, "yes", 300, float("nan")]).tolist() == [
-        1,
-        0,
-        1,
-        0,
-        1,
-        -1,
-        -1,
-        -1,
-        -1,
-    ]
+    assert verdicts([1, 0, True, False, 1.0]).tolist() == [1, 0, 1, 0, 1]
+    assert verdicts([None, "yes", 300, float("nan")]).tolist() == [-1] * 4
     assert verdicts(np.array([[1], [0], [-1]])).tolist() == [1, 0, -1]
 
 
-def test_dexgraspbench_there_and_back_is_the_same_grasp_with_the_same_verdict(
+def test_dexgraspbench_there_and_back_is_the_same_grasp(
     hand: HandModel, block: ObjectModel, grasps: GraspSet, tmp_path: Path
 ) -> None:
     dexgraspbench.write(hand, block, grasps, range(len(grasps)), tmp_path)
@@ -74,7 +62,7 @@ def test_dexgraspbench_there_and_back_is_the_same_grasp_with_the_same_verdict(
     np.testing.assert_array_equal(theirs, ours)
 
 
-def test_dexgraspbench_grasps_are_told_in_the_frame_of_their_moved_object(
+def test_dexgraspbench_grasps_are_in_their_moved_objects_frame(
     hand: HandModel, block: ObjectModel, grasps: GraspSet, tmp_path: Path
 ) -> None:
     (path, *_) = dexgraspbench.write(hand, block, grasps, [0], tmp_path)
@@ -89,7 +77,7 @@ def test_dexgraspbench_grasps_are_told_in_the_frame_of_their_moved_object(
     np.testing.assert_allclose(turn, quat_to_matrix(grasps.grasp.hand_pose[0, 3:]), atol=TINY)
 
 
-def test_dexgraspbench_scales_become_sets_of_their_own(
+def test_dexgraspbench_scales_are_sets_and_another_hand_is_told(
     hand: HandModel, block: ObjectModel, grasps: GraspSet, tmp_path: Path
 ) -> None:
     paths = dexgraspbench.write(hand, block, grasps, range(2), tmp_path)
@@ -97,11 +85,6 @@ def test_dexgraspbench_scales_become_sets_of_their_own(
     sets = dexgraspbench.read(tmp_path, hand="barrett", obj="block")
     assert [one.scale for one in sets] == [0.5, 1.0]
     assert np.ptp(sets[0].obj.vertices, axis=0) == pytest.approx(np.ptp(block.vertices, axis=0) / 2, rel=1e-6)
-
-
-def test_dexgraspbench_of_another_hand_is_told(
-    hand: HandModel, block: ObjectModel, grasps: GraspSet, tmp_path: Path
-) -> None:
     dexgraspbench.write(hand, block, grasps, [0], tmp_path)
     with pytest.raises(InputError, match="is --hand the right hand"):
         dexgraspbench.read(tmp_path, hand="allegro", obj="block")
@@ -117,17 +100,13 @@ def test_dexgraspnets_angles_turn_about_the_fixed_axes(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.grasps.grasp.hand_pose[0, :3], [0.1, 0.2, -0.3])
 
 
-def test_dexgraspnets_joints_are_the_urdfs_of_one_number_more(tmp_path: Path) -> None:
+def test_dexgraspnets_joints_are_one_number_more_its_scale_meshs(tmp_path: Path, block: ObjectModel) -> None:
     qpos = dict.fromkeys(("WRJTx", "WRJTy", "WRJTz", "WRJRx", "WRJRy", "WRJRz"), 0.0)
     (found,) = published.read_dexgraspnet(
         _dexgraspnet(tmp_path, qpos | {"robot0:THJ4": 0.37}, 1.0), hand="shadow", obj="block"
     )
     at = next(k for k, name in enumerate(found.hand.joint_names) if name.endswith("THJ5"))
     assert found.grasps.grasp.joint_positions[0, at] == 0.37
-
-
-def test_dexgraspnets_scale_is_put_on_the_mesh(block: ObjectModel, tmp_path: Path) -> None:
-    qpos = dict.fromkeys(("WRJTx", "WRJTy", "WRJTz", "WRJRx", "WRJRy", "WRJRz"), 0.0)
     (found,) = published.read_dexgraspnet(_dexgraspnet(tmp_path, qpos, 1.5), hand="shadow", obj="block")
     assert np.ptp(found.obj.vertices, axis=0) == pytest.approx(1.5 * np.ptp(block.vertices, axis=0), rel=1e-6)
 
@@ -138,16 +117,12 @@ def _dexgraspnet(folder: Path, qpos: dict[str, float], scale: float) -> Path:
     return path
 
 
-def test_two_columns_of_a_rotation_give_it_back() -> None:
-    matrices = Rotation.random(20, rng=np.random.default_rng(1)).as_matrix()
+def test_columns_and_rotating_axes_are_scipys_rotations() -> None:
+    rotations = Rotation.random(20, rng=np.random.default_rng(1))
+    matrices, angles = rotations.as_matrix(), rotations.as_euler("XYZ")  # capital letters are rotating axes
     columns = np.concatenate([matrices[:, :, 0], matrices[:, :, 1]], axis=1)
-    np.testing.assert_allclose(quat_to_matrix(published.rotation_of_columns(columns)), matrices, atol=1e-12)
-
-
-def test_rotating_axes_are_scipys_capital_letters() -> None:
-    angles = np.random.default_rng(2).uniform(-3, 3, (20, 3))
-    expected = Rotation.from_euler("XYZ", angles).as_matrix()
-    np.testing.assert_allclose(quat_to_matrix(published.rotation_of_angles(angles)), expected, atol=1e-12)
+    for found in (published.rotation_of_columns(columns), published.rotation_of_angles(angles)):
+        np.testing.assert_allclose(quat_to_matrix(found), matrices, atol=1e-12)
 
 
 def test_multidex_gives_the_grasps_of_one_robot_on_one_object(hand: HandModel, tmp_path: Path) -> None:
@@ -201,15 +176,48 @@ def test_published_reference_grasps_come_in_by_name(shared_data: Path) -> None:
     assert found.published.mean() == pytest.approx(0.64, abs=0.005)  # the rate that DATA.md states
 
 
-def test_a_hand_that_lacks_a_joint_is_told() -> None:
+def test_a_missing_joint_is_told_and_two_scales_are_two_objects() -> None:
     from graspd.exchange.imported import joints_by_name
 
     with pytest.raises(InputError, match="has no joint 'elbow'"):
         joints_by_name(hand_from_path("barrett"), ["elbow"], [[0.0]], what="x")
-
-
-def test_an_object_at_two_scales_is_two_objects() -> None:
     from graspd.exchange.imported import scaled_object
 
     # What is kept of a pair between calls is found by digest.
     assert len({scaled_object("block", scale).digest for scale in (1.0, 0.5, 2.0)}) == 3
+
+
+#: What reads each format.
+READERS = {
+    "dexgraspbench": "dexgraspbench.read",
+    "dexlearn": "dexgraspbench.read",
+    "graspgen": "graspgen.read",
+    "huggingface": "huggingface.read",
+    "lerobot": "lerobot.read",
+    "dexgraspnet": "published.read_dexgraspnet",
+    "dexgraspnet2": "dexgraspnet2.read",
+    "multidex": "published.read_multidex",
+    "ddgc": "published.read_ddgc",
+    "reference": "published.read_reference",
+}
+
+
+@pytest.mark.parametrize("name", IMPORTS)
+def test_each_format_has_its_reader(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for reader in set(READERS.values()):
+        told = [reader]
+        monkeypatch.setattr(f"graspd.exchange.{reader}", lambda *_, told=told, **__: told)
+    options = {"robot": "r", "object_name": "o", "number": 0}
+    assert read_sets(name, tmp_path, "h", "o", options) == [READERS[name]]
+    if name != "reference":
+        with pytest.raises(InputError, match="name both: --hand and --object"):
+            read_sets(name, tmp_path, "h", None, options)
+
+
+@pytest.mark.parametrize(
+    ("name", "source", "says"),
+    [("foo", "", "no import format"), ("ddgc", "none", "does not exist"), ("multidex", "", "--robot and --name")],
+)
+def test_what_no_import_can_read_is_told(name: str, source: str, says: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=says):
+        read_sets(name, tmp_path / source, "h", "o", {"robot": "", "object_name": "", "number": 0})

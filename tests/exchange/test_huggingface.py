@@ -20,7 +20,7 @@ from graspd.service.readers import Pictures, open_shards
 from graspd.service.store.shards import Shard
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
-from tests.exchange.conftest import run
+from tests.worker.commands_run import graspd
 
 pq = pytest.importorskip("pyarrow.parquet", reason="pyarrow is not installed; pip install 'graspd[parquet]'")
 #: Poses in float64 from one frame into another [m].
@@ -30,7 +30,7 @@ ROUNDING_M = 1e-12
 @pytest.fixture(scope="module")
 def folder(on_tables: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("huggingface") / "data"
-    said = run("export", on_tables, "--format", "huggingface", "--all", "-o", out)
+    said = graspd("export --format huggingface --all -o", out, on_tables)
     assert (said["grasps"], said["pictures"], said["files"]) == (16, 8, 4)
     return out
 
@@ -56,7 +56,7 @@ def picture(cell: dict[str, Any]) -> np.ndarray:
         return np.array(image)
 
 
-def test_its_card_names_all_files_and_the_files_say_which_columns_are_pictures(folder: Path) -> None:
+def test_its_card_names_all_files_and_columns_of_pictures(folder: Path) -> None:
     found = configs(folder)
     assert {table: sorted(splits) for table, splits in found.items()} == {
         table: ["test", "train"] for table in ("grasps", "pictures")
@@ -81,7 +81,7 @@ def test_a_row_is_a_grasp_of_ours(folder: Path, stored: Shard, hand: HandModel) 
             assert row[f"{name}_joints"] == stored[f"{name}/joint_positions"][row["row"]].tolist()
 
 
-def test_a_picture_has_what_was_seen_and_fingertips_where_they_are(
+def test_picture_has_what_was_seen_and_fingertips_where_they_are(
     folder: Path, on_tables: Path, hand: HandModel, stored: Shard
 ) -> None:
     pictures = Pictures(open_shards(on_tables), valid=False)
@@ -118,12 +118,9 @@ def test_grasps_come_back_as_they_were_with_tables_and_verdicts(folder: Path, st
     np.testing.assert_array_equal(back.placed.object_pose[back.placed.index], poses)
 
 
-def test_an_object_among_several_is_named(folder: Path) -> None:
+def test_what_is_no_table_of_grasps_is_told(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(InputError, match="block, mug"):
         huggingface.read(folder, hand="barrett", obj="block")
-
-
-def test_what_is_no_table_of_grasps_is_told(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "x.parquet").write_bytes(b"PAR1 no table PAR1")
     with pytest.raises(InputError, match="no Parquet file"):
         huggingface.read(tmp_path / "x.parquet", hand="barrett", obj="block")

@@ -25,7 +25,7 @@ from graspd.service.readers import Pictures, open_shards
 from graspd.service.store.shards import Shard
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
-from tests.exchange.conftest import run
+from tests.worker.commands_run import graspd, refused
 
 pq = pytest.importorskip("pyarrow.parquet", reason="pyarrow is not installed; pip install 'graspd[parquet]'")
 #: Joints and roots are float32 there: 6e-8 of a radian or metre, along a finger of 0.2 m and a chain of 4 [m].
@@ -35,7 +35,7 @@ FLOAT32_M = 1e-6
 @pytest.fixture(scope="module")
 def root(on_tables: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("lerobot") / "data"
-    said = run("export", on_tables, "--format", "lerobot", "--all", "-o", folder)
+    said = graspd("export --format lerobot --all -o", folder, on_tables)
     assert (said["grasps"], said["files"]) == (16, 1)
     return folder
 
@@ -65,13 +65,16 @@ def episodes(root: Path) -> list[dict[str, Any]]:
     return sorted(rows, key=lambda row: row["episode_index"])
 
 
-def test_info_says_what_is_there(root: Path) -> None:
+def test_info_says_what_is_there_and_pandas_finds_the_tasks(root: Path) -> None:
     info = json.loads((root / "meta" / "info.json").read_text())
     assert info["codebase_version"] == "v3.0" and info["fps"] > 0 and info["chunks_size"] > 0
     assert info["total_frames"] == len(frames(root)) and info["total_episodes"] == len(episodes(root)) == 16
     ends = {name: [int(end) for end in span.split(":")] for name, span in info["splits"].items()}
     assert ends["train"][0] == 0 and ends["train"][1] == ends["test"][0] and ends["test"][1] == 16
     assert not any("/" in name for name in info["features"])  # it takes / for a level of statistics
+    told = json.loads(pq.read_schema(root / "meta" / "tasks.parquet").metadata[b"pandas"])
+    assert told["index_columns"] == ["task"]
+    assert {column["field_name"] for column in told["columns"]} == {"task", "task_index"}
 
 
 def test_each_episode_lies_where_the_list_says(root: Path) -> None:
@@ -87,12 +90,6 @@ def test_each_episode_lies_where_the_list_says(root: Path) -> None:
         # Its check of times: frame over fps to within 0.1 ms.
         np.testing.assert_allclose([row["timestamp"] for row in some], np.arange(len(some)) / info["fps"], atol=1e-4)
         assert {tasks[row["task_index"]] for row in some} == set(episode["tasks"])
-
-
-def test_pandas_finds_the_tasks_by_their_words(root: Path) -> None:
-    told = json.loads(pq.read_schema(root / "meta" / "tasks.parquet").metadata[b"pandas"])
-    assert told["index_columns"] == ["task"]
-    assert {column["field_name"] for column in told["columns"]} == {"task", "task_index"}
 
 
 def test_statistics_are_those_of_the_frames(root: Path) -> None:
@@ -161,5 +158,5 @@ def test_a_data_set_of_somebody_else_is_told(root: Path, tmp_path: Path) -> None
 
 
 def test_grasps_without_pictures_are_no_episodes(on_tables: Path, tmp_path: Path) -> None:
-    with pytest.raises(AssertionError, match="no picture shows"):
-        run("export", on_tables / "block.h5", "--format", "lerobot", "--all", "-o", tmp_path / "out")
+    said = refused("export --format lerobot --all -o", tmp_path / "out", on_tables / "block.h5")
+    assert "no picture shows" in said

@@ -1,12 +1,15 @@
-"""What an export wrote is opened by a library of its target before the export says that it is done."""
+"""What an export writes: names that its libraries take, and files that they open before it says it is done."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from graspd.exchange.opening import READERS, opened
+from graspd.exchange.plan import prim_name, prim_names
 from graspd.service.model.errors import GraspdError
 
 
@@ -26,3 +29,23 @@ def test_a_file_that_is_written_anew_is_looked_at(tmp_path: Path) -> None:
     (tmp_path / "scene.xml").write_text("<mujoco/>")
     with pytest.raises(GraspdError, match="scene"), opened(tmp_path):
         (tmp_path / "scene.xml").write_text("<mujoco><tendon><fixed/></tendon></mujoco>")
+
+
+Sdf = pytest.importorskip("pxr.Sdf")
+
+
+@given(st.text(max_size=30))
+def test_any_name_becomes_one_that_usd_takes_for_a_prim(name: str) -> None:
+    assert Sdf.Path.IsValidIdentifier(prim_name(name))
+
+
+@pytest.mark.parametrize(
+    ("name", "prim"),
+    [("003_cracker_box", "_003_cracker_box"), ("mug.v2.final", "mug_v2_final"), ("tasse-caf-1", "tasse_caf_1")],
+)
+def test_a_prim_keeps_what_it_can_of_the_name(name: str, prim: str) -> None:
+    assert prim_name(name) == prim
+
+
+def test_siblings_whose_names_become_the_same_are_told_apart() -> None:
+    assert prim_names(["a-b", "a_b", "a.b", "a_b_2"]) == ["a_b", "a_b_2", "a_b_3", "a_b_2_2"]

@@ -1,4 +1,4 @@
-"""The benchmark's contract, and that it measures what it says."""
+"""Benchmarks measure what they say: the planner's rate, grasps as of a job, and seeds from a network."""
 
 from __future__ import annotations
 
@@ -6,30 +6,28 @@ import json
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from benchmarks import learned
+from benchmarks.cells import planned
+from graspd.baselines.learned.network import save
 from graspd.commands.studies import app
+from graspd.service.model.domain import JobOptions
 from graspd.service.model.fidelity import FIDELITIES
 from graspd.studies.timing import host_ms, kernel_shares
 from graspd.worker.execution_context import ExecutionContext
+from graspd.worker.generation import validated_grasps
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners.fast_graspd.pairs import pair_of
 from graspd.worker.planners.fast_graspd.planner import plan
 from graspd.worker.planners.port import PlanRequest
+from tests.networks import random_network
 
-RUN_KEYS = {
-    "fidelity",
-    "batch",
-    "processes",
-    "hand_points",
-    "faces",
-    "iterations",
-    "ms_per_iteration",
-    "grasps_per_second",
-    "peak_memory_mb",
-}
+RUN_KEYS = {"fidelity", "batch", "processes", "hand_points", "faces", "iterations", "ms_per_iteration"}
+RUN_KEYS |= {"grasps_per_second", "peak_memory_mb"}
 
 
 @pytest.fixture(scope="module")
@@ -44,26 +42,19 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, object],
     return json.loads(done.stdout.strip().splitlines()[-1]), out
 
 
-def test_every_run_has_the_keys_of_the_contract(result: tuple[dict[str, object], Path]) -> None:
-    found, _ = result
+def test_every_run_has_the_keys_of_the_contract_and_adds_up(result: tuple[dict[str, object], Path]) -> None:
+    found, out = result
     assert found["device"]
-    runs = found["runs"]
+    runs, host = found["runs"], found["host_ms_per_grasp"]
     assert isinstance(runs, list) and [(run["batch"], run["join"]) for run in runs] == [(1, 1), (1, 2), (4, 1), (4, 2)]
-    assert all(set(run) >= RUN_KEYS for run in runs)
-
-
-def test_the_rate_is_that_of_all_batches_of_a_launch(result: tuple[dict[str, object], Path]) -> None:
-    runs = result[0]["runs"]
-    assert isinstance(runs, list)
     for run in runs:
+        assert set(run) >= RUN_KEYS
         assert run["grasps_per_second"] == pytest.approx(run["batch"] * run["join"] / run["seconds"], rel=0.01)
         assert run["ms_per_iteration"] == pytest.approx(1e3 * run["seconds"] / run["iterations"], rel=0.01)
-
-
-def test_the_host_takes_some_of_the_time_of_a_grasp_and_not_all(result: tuple[dict[str, object], Path]) -> None:
-    host, runs = result[0]["host_ms_per_grasp"], result[0]["runs"]
-    assert isinstance(runs, list) and isinstance(host, float)
-    assert 0.0 < host < max(1e3 * run["seconds"] / run["grasps"] for run in runs)
+    assert isinstance(host, float) and 0.0 < host < max(1e3 * run["seconds"] / run["grasps"] for run in runs)
+    assert json.loads((out / "bench.json").read_text())["runs"] == runs
+    assert "| draft | 2 × 4 |" in (out / "bench.md").read_text()
+    assert (out / "bench.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_kernels_on_the_processor_are_no_time_of_the_host() -> None:
@@ -74,14 +65,7 @@ def test_kernels_on_the_processor_are_no_time_of_the_host() -> None:
     assert host < 0.5 * 1e3 * (time.thread_time() - began) / count
 
 
-def test_json_table_and_plot_are_written(result: tuple[dict[str, object], Path]) -> None:
-    found, out = result
-    assert json.loads((out / "bench.json").read_text())["runs"] == found["runs"]
-    assert "| draft | 2 × 4 |" in (out / "bench.md").read_text()
-    assert (out / "bench.png").read_bytes().startswith(b"\x89PNG")
-
-
-def test_kernel_shares_add_up_and_the_distance_query_is_among_them() -> None:
+def test_kernel_shares_add_up_and_distance_query_is_among_them() -> None:
     fidelity = FIDELITIES["draft"]
     pair = pair_of(hand_from_path("barrett"), object_from_path("block"), fidelity, "cpu")
     for phase in kernel_shares(pair, fidelity, 4).values():
@@ -91,6 +75,38 @@ def test_kernel_shares_add_up_and_the_distance_query_is_among_them() -> None:
         assert phase["queries_per_second"] > 0
 
 
-def test_an_unknown_fidelity_is_the_callers_mistake() -> None:
-    done = CliRunner().invoke(app, ["bench", "--fidelity", "superb"])
-    assert done.exit_code == 2
+def test_unknown_fidelities_and_no_networks_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert CliRunner().invoke(app, ["bench", "--fidelity", "superb"]).exit_code == 2
+    (tmp_path / "net.npz").write_bytes(b"no network")
+    assert learned.main(["--network", str(tmp_path / "net.npz")]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_a_study_plans_the_grasps_of_a_job() -> None:
+    wish = JobOptions(want="candidates", fidelity="draft", seed=5, rechecks=0)
+    hand, obj = hand_from_path("barrett"), object_from_path("block", face_error_m=wish.knobs.face_error_m)
+    made = validated_grasps(hand, obj, wish, count=2).grasps
+    found = planned(hand, obj, count=2, seed=5, fidelity="draft")
+    assert np.array_equal(found.grasp.hand_pose, made.grasp.hand_pose)
+    assert np.array_equal(found.squeeze.joint_positions, made.squeeze.joint_positions)
+
+
+def test_both_methods_are_told_side_by_side(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(learned, "BUDGET", 2.0)
+    hand = hand_from_path("barrett")
+    save(random_network(hand.joint_names, hand=hand.name, digest=hand.digest), tmp_path / "net.npz")
+    words = ["--network", str(tmp_path / "net.npz"), "--objects", "block", "--many", "2", "--seeds", "1"]
+    assert learned.main([*words, "--starts", "2", "--out", str(tmp_path / "out")]) == 0
+    found = json.loads((tmp_path / "out" / "learned.json").read_text())
+    own, other = found["rows"]
+    assert [own["method"], other["method"]] == ["fast_graspd", "learned starts=2"]
+    for row in found["rows"]:
+        assert (row["hand"], row["object"]) == ("barrett", "block")
+        assert row["first"] == pytest.approx(row["firsts"][0], abs=1e-3) and row["first"] > 0 and row["found"] in (0, 1)
+        assert row["rate"] == pytest.approx(2 * row["valid"] / row["seconds"])
+    assert list(found["networks"].values()) == ["barrett. drawn by chance"]
+    page = (tmp_path / "out" / "learned.md").read_text()
+    assert learned.table(found["rows"]) in page and learned.table(found["rows"]) + "\n" == capsys.readouterr().out
+    assert str(tmp_path) not in page

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import csv
+import itertools
 import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from typer.testing import CliRunner
 
 from graspd.commands.studies import app
@@ -16,6 +18,7 @@ from graspd.service.model.fidelity import FIDELITIES
 from graspd.service.store.records import latest
 from graspd.service.store.store import open_store
 from graspd.studies.chart.chart import settings_of
+from graspd.studies.chart.figure import Label, place
 from graspd.studies.chart.report import markdown
 from graspd.studies.chart.statistics import first_valid, pareto, summed
 from graspd.studies.chart.sweeps import KnobValue, _make, asking_each, turns
@@ -23,21 +26,8 @@ from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.objects.prepare import object_from_path
 
-RUN_KEYS = {
-    "method",
-    "fidelity",
-    "hand",
-    "object",
-    "valid_per_second",
-    "seconds_to_first_valid",
-    "gsr",
-    "epsilon",
-    "pd_mm",
-    "end_to_end_per_second",
-    "dexgraspbench",
-    "hard",
-    "robust",
-}
+RUN_KEYS = {"method", "fidelity", "hand", "object", "valid_per_second", "seconds_to_first_valid", "gsr", "epsilon"}
+RUN_KEYS |= {"pd_mm", "end_to_end_per_second", "dexgraspbench", "hard", "robust"}
 
 
 @pytest.fixture(scope="module")
@@ -50,26 +40,17 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], Path
     return json.loads(done.stdout.strip().splitlines()[-1]), folder
 
 
-def test_every_run_has_the_keys_of_the_contract(made: tuple[dict[str, Any], Path]) -> None:
-    runs = made[0]["runs"]
-    assert [(run["method"], run["fidelity"]) for run in runs] == [
-        ("fast_graspd", "draft"),
-        ("autograsp", "as published"),
-    ]
-    assert all(set(run) >= RUN_KEYS for run in runs)
-
-
-def test_valid_grasps_per_second_are_those_that_held_over_the_seconds(made: tuple[dict[str, Any], Path]) -> None:
+def test_runs_have_the_rates_that_their_counts_and_seconds_give(made: tuple[dict[str, Any], Path]) -> None:
+    runs = [(run["method"], run["fidelity"]) for run in made[0]["runs"]]
+    assert runs == [("fast_graspd", "draft"), ("autograsp", "as published")]
     for run in made[0]["runs"]:
+        assert set(run) >= RUN_KEYS
         used = sum(run["seconds"])
         # Seconds are printed to the microsecond, the rate is not rounded so.
         rounded = 0.5e-6 * len(run["seconds"]) / used
         assert run["valid_per_second"] == pytest.approx(run["valid"] / used, rel=1e-5 + rounded)
         assert run["gsr"] == pytest.approx(run["valid"] / run["grasps"])
         assert run["gsr_low"] <= run["gsr"] <= run["gsr_high"]
-
-
-def test_end_to_end_counts_what_is_valid_over_all_that_a_job_does(made: tuple[dict[str, Any], Path]) -> None:
     for run in made[0]["runs"]:
         assert run["kept"] <= run["valid"]
         assert all(whole > planned for whole, planned in zip(run["end_seconds"], run["seconds"], strict=True))
@@ -90,13 +71,8 @@ def test_all_files_are_written_and_agree(made: tuple[dict[str, Any], Path]) -> N
     assert (folder / "chart.hands.png").read_bytes().startswith(b"\x89PNG")
     assert (folder / "chart.png").read_bytes().startswith(b"\x89PNG")
     assert "<svg" in (folder / "chart.svg").read_text()
-
-
-def test_a_published_chart_is_the_latest_in_the_store(made: tuple[dict[str, Any], Path]) -> None:
-    found, folder = made
     stored = latest(open_store((folder / "data" / "store").as_uri()), "charts")
-    assert stored is not None
-    assert stored["runs"] == found["runs"]
+    assert stored is not None and stored["runs"] == found["runs"]
 
 
 @pytest.mark.parametrize(
@@ -117,7 +93,7 @@ def test_a_wrong_option_is_the_callers_mistake(arguments: list[str]) -> None:
     assert done.exit_code == 2
 
 
-def test_a_method_can_be_charted_with_options_and_a_batch_of_its_own() -> None:
+def test_method_can_be_charted_with_options_and_batch_of_its_own() -> None:
     plain, kept = settings_of(
         ["graspit", "graspit:keep=5@10"],
         ["draft"],
@@ -141,7 +117,7 @@ def test_the_front_has_no_point_that_another_beats() -> None:
         assert (i in front) != beaten
 
 
-def test_the_first_valid_grasp_takes_as_many_calls_as_a_coin_of_that_bias() -> None:
+def test_the_first_valid_grasp_takes_the_calls_of_a_coin() -> None:
     """Against 20,000 simulated waits; standard error below 1 %."""
     share, grasps = 0.3, 2
     rng = np.random.default_rng(1)
@@ -170,15 +146,12 @@ def run_of(method: str, valid: int, seconds: float, pd: float) -> dict[str, Any]
     return row
 
 
-def test_sums_divide_all_valid_grasps_by_all_seconds() -> None:
+def test_sums_divide_all_valid_by_all_seconds() -> None:
     (row,) = summed([run_of("a", 8, 1.0, 0.1), run_of("a", 2, 4.0, 0.3)])
     assert row["valid_per_second"] == pytest.approx(10 / 5.0)
     assert row["end_to_end_per_second"] == pytest.approx(10 / 10.0)
     assert row["gsr"] == row["dexgraspbench"] == pytest.approx(0.5)
     assert row["pd_mm"] == pytest.approx(0.2)
-
-
-def test_a_method_that_makes_nothing_valid_is_on_no_front() -> None:
     able, unable = summed([run_of("a", 5, 1.0, 0.5), run_of("b", 0, 0.1, 0.0)])
     assert able["front"] == ["dexgraspbench", "hard", "robust", "gsr", "epsilon", "pd_mm"]
     assert unable["front"] == [] and unable["robust"] is None
@@ -205,13 +178,10 @@ def test_a_ratio_to_a_method_without_a_valid_grasp_is_a_bound() -> None:
     )
 
 
-def test_each_knob_has_the_default_among_its_values_once() -> None:
+def test_each_knob_has_its_default_once_and_can_be_turned_alone() -> None:
     found = turns()
     for knob in {turn.knob for turn in found}:
         assert sum(turn.default for turn in found if turn.knob == knob) == 1
-
-
-def test_one_knob_can_be_turned_alone() -> None:
     assert [(turn.knob, turn.value) for turn in turns(knobs=["queries"])] == [
         ("queries", "shared"),
         ("queries", "one per velocity"),
@@ -227,3 +197,59 @@ def test_asking_for_distances_anew_changes_no_grasp() -> None:
     )
     np.testing.assert_array_equal(shared.grasp.hand_pose, anew.grasp.hand_pose)
     np.testing.assert_array_equal(shared.grasp.joint_positions, anew.grasp.joint_positions)
+
+
+CROWDS = {
+    "beside each other": [(10.0, 0.98), (13.0, 0.95), (14.0, 0.93), (22.0, 0.94)],
+    "above each other": [(5.0, 0.50), (5.0, 0.52), (5.0, 0.54), (5.1, 0.48)],
+    "in the corners": [(1.0, 0.0), (100.0, 1.0), (1.0, 1.0), (100.0, 0.0)],
+    "at the same place": [(3.0, 0.3), (3.0, 0.3), (3.0, 0.3)],
+}
+
+
+def drawn(points: list[tuple[float, float]]) -> tuple[Any, list[Any]]:
+    figure = Figure(figsize=(5.0, 4.0), layout="constrained")
+    axes = figure.subplots()
+    axes.set_xscale("log")
+    axes.set_xlim(0.8, 130.0)
+    axes.set_ylim(-0.07, 1.07)
+    labels = [
+        Label(axes, x, y, f"standard {n}", "black", y_bar=(y - 0.03, y + 0.03)) for n, (x, y) in enumerate(points)
+    ]
+    words = place(figure, labels)
+    figure.draw_without_rendering()
+    return axes, words
+
+
+@pytest.mark.parametrize("crowd", CROWDS)
+def test_no_word_lies_on_another_or_on_a_point_or_outside(crowd: str) -> None:
+    axes, words = drawn(CROWDS[crowd])
+    boxes = [word.get_window_extent() if word.arrow_patch is None else text_of(word) for word in words]
+    assert len(boxes) == len(CROWDS[crowd])
+    for one, other in itertools.combinations(boxes, 2):
+        assert one.x1 <= other.x0 or other.x1 <= one.x0 or one.y1 <= other.y0 or other.y1 <= one.y0
+    panel = axes.get_window_extent()
+    for box in boxes:
+        assert not any(box.contains(x, y) for x, y in axes.transData.transform(CROWDS[crowd]))
+        assert panel.x0 - 1 <= box.x0 and box.x1 <= panel.x1 + 1 and panel.y0 - 1 <= box.y0 and box.y1 <= panel.y1 + 1
+
+
+def text_of(word: Any) -> Any:
+    """The word's box without the line that leads to it."""
+    from matplotlib.text import Text
+
+    return Text.get_window_extent(word)
+
+
+def test_a_word_stands_close_to_its_point_and_on_no_other() -> None:
+    axes, (word,) = drawn([(10.0, 0.5)])
+    box, point = word.get_window_extent(), axes.transData.transform((10.0, 0.5))
+    assert word.arrow_patch is None
+    assert 0 < box.x0 - point[0] < 15 and 0 < box.y0 - point[1] < 15
+    figure = Figure(figsize=(5.0, 4.0))
+    axes = figure.subplots()
+    # The second point lies where the first one's word would stand.
+    axes.set_xlim(0, 10)
+    axes.set_ylim(0, 10)
+    (word,) = place(figure, [Label(axes, 5.0, 5.0, "here", "black"), Label(axes, 5.4, 5.4, "", "black")])
+    assert not text_of(word).contains(*axes.transData.transform((5.4, 5.4)))

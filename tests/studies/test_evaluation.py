@@ -24,21 +24,8 @@ from graspd.worker.hands.surface import piece_distance
 from tests.worker.models import object_from_mesh
 from tests.worker.quality.helpers import pad_hand, posture
 
-CONTRACT = {
-    "n",
-    "protocol",
-    "gsr",
-    "osr",
-    "sgs",
-    "pd_mm",
-    "spd_mm",
-    "ca_cm2",
-    "iv_cm3",
-    "epsilon",
-    "wrench_volume",
-    "sd_cm",
-    "diversity",
-}
+CONTRACT = {"n", "protocol", "gsr", "osr", "sgs", "pd_mm", "spd_mm", "ca_cm2", "iv_cm3", "epsilon", "wrench_volume"}
+CONTRACT |= {"sd_cm", "diversity"}
 BOX = object_from_mesh(trimesh.creation.box((0.06, 0.04, 0.05)))
 HAND = pad_hand()
 
@@ -57,6 +44,13 @@ def test_row_has_the_contract_s_keys_and_counts_what_holds(tmp_path: Path) -> No
     assert row["sgs"] < row["sgs_without_validation"] == pytest.approx(2.0)
     assert row["reasons"] == {"held": 2, "displaced under +x": 1}
     json.dumps(row, allow_nan=False)
+    verdicts = row["verdicts"]
+    assert [one["row"] for one in verdicts] == [0, 1, 2]
+    assert [one["held"] for one in verdicts] == [True, True, False]
+    assert all(set(one) == {"row", "held", "outcomes", "margin", "reason"} for one in verdicts)
+    assert verdicts[0]["outcomes"] == ["held"] * 6 and verdicts[0]["margin"] < 1
+    assert verdicts[2]["outcomes"] == ["displaced"] + ["not_tried"] * 5 and verdicts[2]["margin"] > 1
+    assert verdicts[2]["reason"] == "displaced under +x"
 
 
 def test_what_holds_is_validated_in_other_models_when_asked(tmp_path: Path) -> None:
@@ -76,71 +70,62 @@ def test_what_holds_is_validated_in_other_models_when_asked(tmp_path: Path) -> N
     assert "robust_share" not in evaluate(plates_case(), cache=tmp_path)
 
 
-def test_displacement_protocol_judges_nothing(tmp_path: Path) -> None:
+def test_published_results_agree_where_they_are_known(tmp_path: Path) -> None:
     row = evaluate(plates_case(), protocol="displacement", cache=tmp_path)
     assert row["gsr"] is None
     assert row["sd_cm"] < 1.0
-
-
-def test_agreement_counts_known_published_results_only(tmp_path: Path) -> None:
     row = evaluate(plates_case(published=np.array([1, 0, -1], np.int8)), cache=tmp_path)
     assert row["agreement_published"] == 0.5
-
-
-def test_several_objects_are_weighed_by_their_grasps(tmp_path: Path) -> None:
-    row = evaluate(plates_case(), cache=tmp_path)
-    whole = combine([row, {**row, "n": 1, "gsr": 0.0, "osr": 0.0}])
-    assert whole["n"] == 4
-    assert whole["gsr"] == pytest.approx(0.5)
-    assert whole["osr"] == 0.5
-
-
-def test_seconds_of_several_objects_add_up(tmp_path: Path) -> None:
-    row = {**evaluate(plates_case(seconds=1.0), cache=tmp_path), "sgs": 1.0, "sgs_without_validation": 2.0}
-    whole = combine([row, {**row, "sgs": 0.5, "sgs_without_validation": 1.0}])
-    # Two held grasps in 2 s and two in 4 s; without the validator in 1 s and in 2 s.
-    assert whole["sgs"] == pytest.approx(4 / 6)
-    assert whole["sgs_without_validation"] == pytest.approx(4 / 3)
-
-
-def test_seconds_of_grasps_validated_before_hold_the_validator_already(tmp_path: Path) -> None:
-    row = evaluate(plates_case(seconds=1.0, validated=True), cache=tmp_path)
-    assert row["sgs"] == pytest.approx(2.0)
-    assert row["sgs_without_validation"] is None
-
-
-def test_what_rows_do_not_agree_on_has_no_one_value(tmp_path: Path) -> None:
-    row = evaluate(plates_case(), cache=tmp_path)
-    whole = combine([row, {**row, "mu": 0.5}])
-    assert whole["mu"] is None
-    assert whole["level"] == "standard"
-
-
-def test_agreement_of_several_objects_is_weighed_by_what_is_known(tmp_path: Path) -> None:
     row = evaluate(plates_case(published=np.array([1, 1, -1], np.int8)), cache=tmp_path)
     whole = combine([row, {**row, "agreement_published": 0.0, "published": 6}])
     assert whole["agreement_published"] == pytest.approx(0.25)
 
 
-def test_folder_stands_for_the_files_in_it(shared_data: Path) -> None:
+def test_several_objects_are_weighed_and_seconds_add_up(tmp_path: Path) -> None:
+    row = evaluate(plates_case(), cache=tmp_path)
+    whole = combine([row, {**row, "n": 1, "gsr": 0.0, "osr": 0.0}])
+    assert whole["n"] == 4
+    assert whole["gsr"] == pytest.approx(0.5)
+    assert whole["osr"] == 0.5
+    row = {**evaluate(plates_case(seconds=1.0), cache=tmp_path), "sgs": 1.0, "sgs_without_validation": 2.0}
+    whole = combine([row, {**row, "sgs": 0.5, "sgs_without_validation": 1.0}])
+    # Two held grasps in 2 s and two in 4 s; without the validator in 1 s and in 2 s.
+    assert whole["sgs"] == pytest.approx(4 / 6)
+    assert whole["sgs_without_validation"] == pytest.approx(4 / 3)
+    row = evaluate(plates_case(seconds=1.0, validated=True), cache=tmp_path)
+    assert row["sgs"] == pytest.approx(2.0)
+    assert row["sgs_without_validation"] is None
+    row = evaluate(plates_case(), cache=tmp_path)
+    whole = combine([row, {**row, "mu": 0.5}])
+    assert whole["mu"] is None and "clear_share" not in whole
+    clear = [{**row, "clear_share": 1.0}, {**row, "n": 1, "clear_share": 0.0}]
+    assert combine(clear)["clear_share"] == pytest.approx(row["n"] / (row["n"] + 1))
+    assert whole["level"] == "standard"
+
+
+def test_published_grasps_are_read_with_results_from_a_folder(shared_data: Path) -> None:
     found = expand(shared_data / "reference_grasps")
     assert len(found) == 8
     assert found[0].name == "003_cracker_box.json"
-
-
-def test_folder_without_grasps_is_refused_with_what_it_should_hold(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no shards"):
-        expand(tmp_path)
-
-
-def test_published_grasps_are_read_with_their_results(shared_data: Path) -> None:
     case = load_case(shared_data / "reference_grasps" / "frogger_allegro" / "056_tennis_ball.json")
     assert len(case.grasps) == 22
     assert case.published is not None
     assert (case.published == 1).mean() == pytest.approx(0.91, abs=0.005)
 
 
-def test_published_contacts_lie_on_the_fingertips_as_we_pose_them(shared_data: Path) -> None:
+def test_what_holds_no_grasps_is_refused_by_its_name(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no shards"):
+        expand(tmp_path)
+    with pytest.raises(NotFoundError, match=r"nothing\.h5 does not exist"):
+        load_case(tmp_path / "nothing.h5")
+    other = tmp_path / "a" / "b" / "other.json"
+    other.parent.mkdir(parents=True)
+    other.write_text('{"grasps": []}')
+    with pytest.raises(InputError, match="no file of reference grasps"):
+        load_case(other)
+
+
+def test_published_contacts_lie_on_fingertips_as_we_pose_them(shared_data: Path) -> None:
     file = shared_data / "reference_grasps" / "frogger_allegro" / "056_tennis_ball.json"
     case = load_case(file)
     stored = json.loads(file.read_text())["grasps"]
@@ -172,11 +157,13 @@ def known_pair(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("known_pair")
-def test_dexgraspbench_folder_round_trips(tmp_path: Path) -> None:
+def test_dexgraspbench_folders_round_trip_with_hand_and_object(tmp_path: Path) -> None:
     case = load_case(bench_folder(tmp_path / "bench"), hand="plates", obj="box")
     ours = plates_case().grasps
     assert np.allclose(case.grasps.squeeze.joint_positions, ours.squeeze.joint_positions)
     assert np.allclose(case.grasps.grasp.hand_pose, ours.grasp.hand_pose)
+    with pytest.raises(InputError, match="--hand and --object"):
+        load_case(bench_folder(tmp_path / "bench"))
 
 
 class Exploit:
@@ -188,31 +175,13 @@ class Exploit:
 
 @pytest.mark.usefixtures("known_pair")
 def test_dexgraspbench_file_that_would_run_code_is_refused(tmp_path: Path) -> None:
+    assert pickle.loads(pickle.dumps(Exploit())) == 0, "on a trusting reader it works"
     folder = bench_folder(tmp_path / "bench", extra=Exploit())
     with pytest.raises(InputError, match=r"it would run (posix|nt)\.system"):
         load_case(folder, hand="plates", obj="box")
 
 
-@pytest.mark.usefixtures("known_pair")
-def test_dexgraspbench_folder_needs_hand_and_object(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="--hand and --object"):
-        load_case(bench_folder(tmp_path / "bench"))
-
-
-def test_missing_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(NotFoundError, match=r"nothing\.h5 does not exist"):
-        load_case(tmp_path / "nothing.h5")
-
-
-def test_json_that_holds_no_grasps_is_refused(tmp_path: Path) -> None:
-    other = tmp_path / "a" / "b" / "other.json"
-    other.parent.mkdir(parents=True)
-    other.write_text('{"grasps": []}')
-    with pytest.raises(InputError, match="no file of reference grasps"):
-        load_case(other)
-
-
-def test_command_prints_one_json_object_on_its_last_line(shared_data: Path) -> None:
+def test_the_command_prints_json_or_a_table(shared_data: Path) -> None:
     file = shared_data / "reference_grasps" / "frogger_allegro" / "056_tennis_ball.json"
     done = CliRunner().invoke(app, [str(file), "--json", "--level", "fast"])
     assert done.exit_code == 0, done.output
@@ -221,36 +190,10 @@ def test_command_prints_one_json_object_on_its_last_line(shared_data: Path) -> N
     assert row["level"] == "fast"
     # The ball's published pick success is 0.91; ours must be in the same region for the same grasps.
     assert row["gsr"] == pytest.approx(0.91, abs=0.1)
-
-
-def test_command_prints_a_table(shared_data: Path) -> None:
-    file = shared_data / "reference_grasps" / "frogger_allegro" / "056_tennis_ball.json"
     done = CliRunner().invoke(app, [str(file), "--protocol", "displacement"])
     assert done.exit_code == 0, done.output
     assert "056_tennis_ball" in done.stdout
     assert "not validated" in done.stdout
-
-
-@pytest.mark.parametrize("option", [["--level", "quick"], ["--protocol", "throw"]])
-def test_wrong_choice_is_the_caller_s_mistake(option: list[str], tmp_path: Path) -> None:
-    done = CliRunner().invoke(app, [str(tmp_path), *option])
-    assert done.exit_code == 2
-    assert "unknown" in done.stderr
-
-
-def test_pickle_in_this_file_is_dangerous_without_the_guard() -> None:
-    """The refusal above is worth something only if the exploit works on a trusting reader."""
-    assert pickle.loads(pickle.dumps(Exploit())) == 0
-
-
-def test_each_grasp_has_its_verdict_with_the_reason(tmp_path: Path) -> None:
-    verdicts = evaluate(plates_case(), cache=tmp_path)["verdicts"]
-    assert [one["row"] for one in verdicts] == [0, 1, 2]
-    assert [one["held"] for one in verdicts] == [True, True, False]
-    assert all(set(one) == {"row", "held", "outcomes", "margin", "reason"} for one in verdicts)
-    assert verdicts[0]["outcomes"] == ["held"] * 6 and verdicts[0]["margin"] < 1
-    assert verdicts[2]["outcomes"] == ["displaced"] + ["not_tried"] * 5 and verdicts[2]["margin"] > 1
-    assert verdicts[2]["reason"] == "displaced under +x"
 
 
 @pytest.mark.parametrize(
@@ -258,7 +201,11 @@ def test_each_grasp_has_its_verdict_with_the_reason(tmp_path: Path) -> None:
     [
         (["--joint-map", "FFJ3=bend"], "name that hand"),
         (["--validation-hand", "shadow", "--joint-map", "FFJ3"], "must be OURS=THEIRS"),
+        (["--validation-hand", "shadow", "--joint-map", "FFJ3=a,FFJ3=b"], "once for each joint"),
+        (["--validation-hand", "shadow", "--joint-map", "FFJ3=bend,FFJ4=knuckle"], "grasps.h5"),
         (["--validation-hand", "shadow", "--protocol", "lift"], "validates by protocol dexgraspbench"),
+        (["--level", "quick"], "unknown"),
+        (["--protocol", "throw"], "unknown"),
     ],
 )
 def test_another_model_is_asked_for_in_full(options: list[str], says: str) -> None:

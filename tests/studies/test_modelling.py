@@ -59,24 +59,18 @@ def test_ranking_power_of_perfect_reversed_and_blind_scores(score: list[float], 
     assert auc(np.array(score, float), np.array([False, False, True, True])) == expected
 
 
-def test_objects_whose_grasps_all_hold_do_not_count_in_a_ranking() -> None:
+def test_rankings_count_what_is_told_apart_shares_are_wilsons() -> None:
     scores = [np.arange(6.0), np.zeros(4)]
     found = ranking(scores, [np.arange(6) > 2, np.ones(4, bool)])
     assert (found["value"], found["n"]) == (1.0, 6)
-
-
-def test_a_share_has_wilsons_interval() -> None:
     # 8 of 10: 0.490 to 0.943 (Wilson 1927, as tabulated by Newcombe 1998 for method 3).
     found = share(8, 10)
     assert (found["low"], found["high"]) == (pytest.approx(0.490, abs=1e-3), pytest.approx(0.943, abs=1e-3))
 
 
-def test_a_convex_object_falls_the_same_way_as_hull_and_as_its_one_piece() -> None:
+def test_convex_objects_fall_as_their_hull_forearms_end_below() -> None:
     (found,) = drops([object_from_path("block")], 4)
     assert (found["pieces"], found["same_face"]["value"], found["distance"]) == (1, 1.0, 0.0)
-
-
-def test_the_far_end_of_a_forearm_is_below_above_or_beside_the_hand() -> None:
     half = np.sqrt(0.5)
     # Fingers up, fingers down, lying on its side; the root half a metre above the table.
     turns = [[1, 0, 0, 0], [0, 1, 0, 0], [half, half, 0, 0]]
@@ -102,7 +96,7 @@ def test_the_page_cites_the_measured_tables() -> None:
     assert f"{cell('pads', 'within 5 mm', 1)} cm² within 5 mm" in text
 
 
-def test_the_pages_recipe_finds_the_point_of_the_mesh_behind_each_pixel(tmp_path: Path) -> None:
+def test_pages_recipe_finds_point_of_the_mesh_behind_each_pixel(tmp_path: Path) -> None:
     obj = object_from_path("block")
     poses = drop(obj, count=1, seed=2)["scene/object_pose"]
     arrays = render(

@@ -40,15 +40,10 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], Path
     return json.loads(done.stdout.strip().splitlines()[-1]), folder
 
 
-def test_who_plans_in_scenes_does_both_and_others_are_filtered(made: tuple[dict[str, Any], Path]) -> None:
-    assert [(run["method"], run["way"]) for run in made[0]["runs"]] == [
-        ("fast_graspd", IN_SCENE),
-        ("fast_graspd", FILTERED),
-        ("autograsp", FILTERED),
-    ]
-
-
-def test_lifted_per_second_are_those_lifted_over_the_seconds(made: tuple[dict[str, Any], Path]) -> None:
+def test_rates_and_files_are_those_of_the_runs(made: tuple[dict[str, Any], Path]) -> None:
+    # Who plans in scenes does both, others are filtered.
+    ways = [(run["method"], run["way"]) for run in made[0]["runs"]]
+    assert ways == [("fast_graspd", IN_SCENE), ("fast_graspd", FILTERED), ("autograsp", FILTERED)]
     for run in made[0]["runs"]:
         assert 0 <= run["lift_hard_count"] <= run["lift_count"] <= run["clear_count"] <= run["grasps"]
         assert run["valid_per_second"] == pytest.approx(run["lift_count"] / run["seconds"], rel=1e-4)
@@ -57,9 +52,6 @@ def test_lifted_per_second_are_those_lifted_over_the_seconds(made: tuple[dict[st
         assert run["end_to_end_per_second"] == pytest.approx(run["lift_count"] / run["end_seconds"], rel=1e-4)
         assert (run["robust"] is None) == (run["seconds_to_first"] is None) == (run["lift_count"] == 0)
         assert run["robust"] is None or 0 <= run["robust_low"] <= run["robust"] <= run["robust_high"] <= 1
-
-
-def test_all_files_are_written_and_agree(made: tuple[dict[str, Any], Path]) -> None:
     found, folder = made
     assert json.loads((folder / "chart.json").read_text())["runs"] == found["runs"]
     with (folder / "chart.csv").open() as stream:
@@ -90,14 +82,7 @@ def test_a_run_that_was_stopped_plans_only_what_is_missing(
     assert again["runs"] == found["runs"]
 
 
-def test_a_sweep_is_refused_with_a_scene() -> None:
-    done = CliRunner().invoke(app, ["chart", *ARGUMENTS, "--objects", "block", "--sweep"])
-    assert done.exit_code == 2 and "leave out --scene" in done.output
-
-
-def test_a_chart_measured_earlier_is_published_apart_from_free_ones_and_drawn(
-    made: tuple[dict[str, Any], Path], tmp_path: Path
-) -> None:
+def test_a_chart_of_earlier_is_published_apart_and_drawn(made: tuple[dict[str, Any], Path], tmp_path: Path) -> None:
     found, folder = made
     arguments = ["--from", str(folder / "chart.json"), "--publish", "--data-dir", str(tmp_path), "--out", str(tmp_path)]
     done = CliRunner().invoke(app, ["chart", *arguments])
@@ -123,6 +108,8 @@ def test_a_file_that_is_no_chart_is_refused_in_a_line(tmp_path: Path, content: s
     file.write_text(content)
     done = CliRunner().invoke(app, ["chart", "--from", str(file)])
     assert done.exit_code == 2 and words in " ".join(done.output.split())
+    done = CliRunner().invoke(app, ["chart", *ARGUMENTS, "--objects", "block", "--sweep"])
+    assert done.exit_code == 2 and "leave out --scene" in done.output
 
 
 def test_seconds_are_those_of_the_clock_of_the_settings_device(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -174,7 +161,7 @@ def run_of(way: str, pair: str, lifted: int, seconds: float, grasps: int = 10) -
     return {**said, **counts, **figures([counts]), "scenes": 1, "seconds_to_first": seconds if lifted else None}
 
 
-def test_a_gain_is_the_median_of_the_pairs_in_which_filtering_found_any() -> None:
+def test_gain_is_median_of_pairs_in_which_filtering_found_any() -> None:
     runs = [run_of(IN_SCENE, pair, 8, 2.0) for pair in "abc"]
     runs += [run_of(FILTERED, pair, lifted, 1.0) for pair, lifted in (("a", 1), ("b", 2), ("c", 0))]
     inside, outside = summed(runs)

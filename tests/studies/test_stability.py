@@ -1,4 +1,4 @@
-"""The maps of failure say what physics says, and the guards that they name hold."""
+"""The maps of failure say what physics says of integrators, hands, models and scenes, and the guards they name hold."""
 
 from __future__ import annotations
 
@@ -7,30 +7,42 @@ import math
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import trimesh
 from matplotlib.figure import Figure
 from typer.testing import CliRunner
 
+from graspd.cli import build
 from graspd.commands.studies import STUDIES, app
 from graspd.service.model.domain import JobRequest
-from graspd.service.model.errors import MeshError
+from graspd.service.model.errors import InputError, MeshError
 from graspd.service.model.fidelity import FIDELITIES
+from graspd.service.model.metrics import Axis
+from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.model.studies import MapCell, Stability, StabilityMap, from_json, graded
 from graspd.service.store.records import latest
 from graspd.service.store.store import open_store
-from graspd.studies.stability import assets, descents, gradients, integrators, report, studies
+from graspd.studies.stability import assets, descents, gradients, integrators, model_errors, report, scenes, studies
+from graspd.studies.stability.assets import Coupling, ring_hand
+from graspd.studies.stability.model_errors import ERRORS, model_error_map
 from graspd.studies.stability.report import markdown, write
 from graspd.worker.engines import backend
 from graspd.worker.execution_context import DEFAULT_CONTEXT
-from graspd.worker.generation import validated_grasps
+from graspd.worker.generation import ValidatedBatch, validated_grasps
+from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners.fast_graspd.pairs import Pair, pair_of
+from graspd.worker.scenes.kinds import supports_of
+from graspd.worker.scenes.trajectory import MARGIN_M
 from graspd.worker.simulation.data import HandState
 from graspd.worker.simulation.model import LossOptions
+from graspd.worker.validation.variant import Variant, draw
+from tests.worker.simulation.test_surroundings import mujoco_room
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +57,7 @@ def pair(hand: HandModel) -> Pair:
 
 
 @pytest.mark.parametrize("name", ["direct (default)", "Gauss-Seidel, one sweep", "Jacobi, averaged"])
-def test_the_planners_own_step_lies_where_its_integrators_are_good(name: str) -> None:
+def test_planners_own_step_lies_where_its_integrators_are_good(name: str) -> None:
     way = LossOptions().step  # time step x speed [m]
     energy, sunk = integrators.position_based(integrators.SOLVERS[name], dt=1e-3, speed=way / 1e-3)
     assert graded(energy, *integrators.ENERGY) == "good"
@@ -120,16 +132,6 @@ def test_a_quick_run_takes_less_than_the_minute_that_it_promises() -> None:
     assert [one.name for one in found] == list(STUDIES) and all(one.cells for one in found)
 
 
-def test_what_is_no_number_is_broken() -> None:
-    assert [graded(value, 1.0, 2.0) for value in (0.5, 1.5, 2.5, math.nan, math.inf)] == [
-        "good",
-        "weak",
-        "broken",
-        "broken",
-        "broken",
-    ]
-
-
 def a_map(**changes: object) -> StabilityMap:
     cells = [
         MapCell("a", 1.0, 10.0, 0.1, "good", reached=True),
@@ -144,15 +146,14 @@ def a_record(*maps: StabilityMap) -> Stability:
     return Stability("2026-11-21T12:00:00.000Z", "graspd stability", {"graspd": "0"}, list(maps or [a_map()]))
 
 
-def test_a_report_has_a_picture_and_a_table_for_each_map(tmp_path: Path) -> None:
+def test_a_report_has_pictures_tables_and_says_what_still_breaks(tmp_path: Path) -> None:
+    found = [graded(value, 1.0, 2.0) for value in (0.5, 1.5, 2.5, math.nan, math.inf)]
+    assert found == ["good", "weak", "broken", "broken", "broken"]
     written = write(a_record(), tmp_path)
     assert {path.name for path in written} == {"stability.json", "stability.md", "stability-demo.png"}
     assert json.loads(written[0].read_text())["maps"][0]["cells"][1]["value"] is None
     assert "| a | 1 | 0 | 2 | 0 |" in markdown(a_record())
     assert written[2].read_bytes().startswith(b"\x89PNG")
-
-
-def test_a_report_says_what_still_breaks_and_how_a_user_sees_it() -> None:
     said = markdown(a_record())
     assert "| A demo | 1 | 0 | 1 | 0 | a 2 (10) | it flies |" in said
     whole = [replace(cell, outcome="good") for cell in a_map().cells]
@@ -193,14 +194,207 @@ def test_published_maps_are_the_latest_in_the_store(tmp_path: Path) -> None:
     assert from_json(stored).as_json() == a_record().as_json()
 
 
-@pytest.mark.parametrize("text", ["no json", "{}", '{"maps": 3}'])
-def test_a_file_that_holds_no_maps_is_the_callers_mistake(tmp_path: Path, text: str) -> None:
-    (tmp_path / "wrong.json").write_text(text)
+@pytest.mark.parametrize("words", ["no json", "{}", '{"maps": 3}', "--only magic", "--from nowhere.json"])
+def test_wrong_files_and_options_are_the_callers_mistake(tmp_path: Path, words: str) -> None:
+    if words.startswith("--"):
+        assert command(*words.split())[0] == 2
+        return
+    (tmp_path / "wrong.json").write_text(words)
     code, said = command("--from", str(tmp_path / "wrong.json"))
-    assert code == 2
-    assert "no stability.json" in said
+    assert code == 2 and "no stability.json" in said
 
 
-@pytest.mark.parametrize("arguments", [["--only", "magic"], ["--from", "nowhere.json"]])
-def test_a_wrong_option_is_the_callers_mistake(arguments: list[str]) -> None:
-    assert command(*arguments)[0] == 2
+def tips(hand: HandModel, joints: np.ndarray) -> np.ndarray:
+    """(fingers, 3) origins of the last links."""
+    poses = body_poses(hand, np.array([[0.0, 0, 0, 1, 0, 0, 0]]), joints[None])
+    return np.array([poses[0, body, :3] for body, name in enumerate(hand.body_names) if name.endswith("_2")])
+
+
+@pytest.mark.parametrize(
+    ("coupling", "dofs"), [("each joint", 12), ("distal follows", 8), ("a drive a finger", 4), ("one drive", 1)]
+)
+def test_a_ring_has_as_many_dofs_as_its_drives(coupling: Coupling, dofs: int) -> None:
+    assert ring_hand(4, coupling=coupling).dofs == dofs
+
+
+def test_fingers_open_outward_scale_and_follow_by_ratio() -> None:
+    hand = ring_hand(3)
+    wide, closed = (
+        np.linalg.norm(tips(hand, hand.expand(posture))[:, :2], axis=1) for posture in (hand.lower, 0.5 * hand.upper)
+    )
+    assert (wide > 0.06).all()
+    assert (closed < 0.03).all()
+    small, large = (ring_hand(3, size=size) for size in (1.0, 2.0))
+    # The URDF has six decimals of a metre.
+    np.testing.assert_allclose(
+        tips(large, large.expand(large.lower)), 2 * tips(small, small.expand(small.lower)), atol=3e-6
+    )
+    hand = ring_hand(2, coupling="distal follows", ratio=0.5)
+    joints = hand.expand(np.full(hand.dofs, 0.6))
+    by_name = dict(zip(hand.joint_names, joints, strict=True))
+    assert by_name["joint_0_2"] == pytest.approx(0.5 * by_name["joint_0_1"])
+
+
+def test_palm_without_fingers_is_refused_and_three_of_them_hold() -> None:
+    backend.start()
+    found = assets.hand_map(
+        fingers=(0, 3), sizes=(), ratios=(), couplings=("distal follows",), fidelity="draft", count=4
+    )
+    by_fingers = {cell.x: cell for cell in found.cells}
+    assert by_fingers[0].outcome == "refused"
+    assert by_fingers[3].value > 0
+
+
+def test_fingers_of_one_drive_hold_a_cube_between_them() -> None:
+    backend.start()
+    found = assets.hand_map(fingers=(3, 5), sizes=(), ratios=(), couplings=("one drive",), fidelity="draft", count=4)
+    assert [cell.outcome for cell in found.cells] == ["good", "good"]
+
+
+FRICTION, MASS = "friction over the model's", "mass over the model's"
+
+
+def validated(monkeypatch: pytest.MonkeyPatch, name: str, amounts: tuple[float, ...]) -> list[MapCell]:
+    monkeypatch.setitem(ERRORS, name, replace(ERRORS[name], amounts=amounts))
+    backend.start()
+    hand, obj = hand_from_path("barrett"), object_from_path("block")
+    return model_error_map([hand], obj, errors=[name], fidelity="draft", count=3).cells
+
+
+def test_the_models_friction_keeps_what_holds_ice_keeps_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    ice, own = validated(monkeypatch, FRICTION, (0.01, 1.0))
+    assert (own.value, own.outcome, own.reached) == (1.0, "good", True)
+    assert (ice.value, ice.outcome, ice.reached) == (0.0, "broken", False)
+
+
+#: What of a variant stands for an error's amount.
+AMOUNTS = {
+    "shapes of the hand stand out [mm]": (Axis.SHAPES, lambda v: 1e3 * v.grown_m),
+    FRICTION: (Axis.FRICTION, lambda v: v.friction),
+    MASS: (Axis.MASS, lambda v: v.mass),
+    "gains over the model's": (Axis.JOINTS, lambda v: v.gain),
+    "armature [1e-4 kg m²]": (Axis.JOINTS, lambda v: 1e4 * (v.armature or 0.0)),
+    "dry friction of joints [N m]": (Axis.JOINTS, lambda v: v.dry_friction or 0.0),
+    "object stands off by [mm]": (Axis.POSE, lambda v: 1e3 * np.linalg.norm(v.object_shift_m)),
+    "object is turned by [°]": (Axis.POSE, lambda v: np.degrees(np.linalg.norm(v.object_turn))),
+    "hand stands off by [mm]": (Axis.CALIBRATION, lambda v: 1e3 * np.linalg.norm(v.hand_shift_m)),
+    "centre of mass is off by [mm]": (Axis.CENTRE, lambda v: 1e3 * np.linalg.norm(v.centre_m)),
+    "last finger begins later by [share of closing]": (Axis.ORDER, lambda v: max(v.lags)),
+}
+
+
+@pytest.mark.parametrize("name", ERRORS)
+def test_amounts_within_reach_are_those_that_robust_draws(name: str) -> None:
+    hand, rng, (axis, amount) = hand_from_path("barrett"), np.random.default_rng(3), AMOUNTS[name]
+    drawn = [amount(draw(axis, hand, rng)) for _ in range(400)]
+    low, high = ERRORS[name].drawn
+    assert low - 1e-9 <= min(drawn) and max(drawn) <= high + 1e-9
+    # Draws come near the ends, but for that of nothing: the bounds are no wider than they need be.
+    assert high - max(drawn) < 0.2 * (high - low)
+    assert low == 0.0 or min(drawn) - low < 0.2 * (high - low)
+
+
+@pytest.mark.parametrize("name", ERRORS)
+def test_an_amount_departs_along_one_axis_only(name: str) -> None:
+    error, along = ERRORS[name], np.array([0.6, 0.0, 0.8])
+    one = error.variant(hand_from_path("barrett"), error.amounts[-1], along)
+    changed = [field for field, value in vars(one).items() if value != getattr(Variant(), field)]
+    assert len(changed) == 1
+    assert AMOUNTS[name][1](one) == pytest.approx(error.amounts[-1])
+
+
+def test_a_hand_without_valid_grasps_is_no_number_and_broken(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = model_errors.validated_grasps
+
+    def none(*arguments: object, **options: object) -> object:
+        made = found(*arguments, **options)  # type: ignore[arg-type]
+        return replace(made, grasps=made.grasps.take(np.zeros(0, int)))
+
+    monkeypatch.setattr(model_errors, "validated_grasps", none)
+    (cell,) = validated(monkeypatch, MASS, (1.0,))
+    assert cell.outcome == "broken" and not np.isfinite(cell.value)
+
+
+def assert_valid_ones_are_clear(hand: HandModel, found: ValidatedBatch, spec: SceneSpec) -> None:
+    """By MuJoCo's distances at the grasp, whatever the planner thinks of its clearance."""
+    rows = np.flatnonzero(found.columns["quality/valid"] == 1)
+    assert (found.columns["quality/clearance_m"][rows] >= MARGIN_M).all()
+    assert spec.target is not None
+    for support in supports_of(spec) if len(rows) else ():
+        seen = support.seen_from(np.asarray(spec.target, float))
+        assert mujoco_room(hand, found.grasps.grasp.take(rows), seen).min() >= MARGIN_M - 1e-6
+
+
+def test_a_plate_flat_on_a_table_ends_with_fewer_and_says_so(tmp_path: Path) -> None:
+    plate = tmp_path / "plate.stl"
+    trimesh.creation.box((0.15, 0.15, 0.003)).export(plate)
+    words = "synth --hand barrett --units m --scene table --faces all --scenes 1 -n 2 --budget 2 --fidelity draft"
+    result = CliRunner().invoke(build(), [*words.split(" "), "--object", str(plate), "-o", str(tmp_path / "g.h5")])
+    assert result.exit_code == 3, result.output
+    assert "the budget of 2 candidates for each ended first" in result.output
+    assert "of the candidates are clear of what stands there" in result.output
+
+
+@pytest.mark.parametrize("gap", [5, 30])
+def test_object_in_a_narrow_well_is_refused_or_comes_out_valid(hand: HandModel, gap: float) -> None:
+    sides, spec = scenes._standing(scenes.TARGET_MM, scenes._walls(scenes.WALLS["four"], gap))
+    try:
+        found = scenes.planned(hand, sides, spec, "draft", 2)
+    except InputError as error:
+        assert "\n" not in str(error) and ("no room" in str(error) or "on every side" in str(error))
+    else:
+        assert_valid_ones_are_clear(hand, found, spec)
+
+
+def test_one_wall_nearby_costs_grasps_but_is_no_reason_to_refuse(hand: HandModel) -> None:
+    sides, spec = scenes._standing(scenes.TARGET_MM, scenes._walls(scenes.WALLS["one"], 20))
+    found = scenes.planned(hand, sides, spec, "draft", 6)
+    assert found.shares["clear_share"] > 0.5
+    assert_valid_ones_are_clear(hand, found, spec)
+
+
+def test_a_box_among_boxes_is_lifted_out_or_not_valid(hand: HandModel) -> None:
+    sides, spec = scenes._standing(scenes.TARGET_MM, scenes._neighbours(scenes.NEIGHBOURS["four"], 120))
+    found = scenes.planned(hand, sides, spec, "draft", 6)
+    assert found.shares["lift_share"] > 0, "with so much room some must come out"
+    assert_valid_ones_are_clear(hand, found, spec)
+
+
+def test_a_cube_that_does_not_fit_its_bin_is_refused(hand: HandModel) -> None:
+    with pytest.raises(InputError, match="there is room for 380 x 280 mm"):
+        scenes.planned(hand, (350, 350, 350), SceneSpec(kind="bin"), "draft", 2)
+
+
+def test_refused_scenes_are_cells_that_say_why_walls_stand_off(hand: HandModel) -> None:
+    found = scenes.wall_map([hand], gaps=(-5,), walls=("one",), count=2)
+    (cell,) = found.cells
+    assert cell.outcome == "refused" and "deep in support" in cell.note
+    half = np.array(scenes.TARGET_MM[:2]) * scenes.MILLIMETRES / 2
+    for boxes in (scenes._walls(scenes.WALLS["four"], 20), scenes._neighbours(scenes.NEIGHBOURS["eight"], 20)):
+        for box in boxes:
+            away = np.abs(box.pose[:2]) - np.array(box.size[:2]) / 2 - half
+            assert away.max() == pytest.approx(0.02)
+
+    # From a BarrettHand's data sheet: 335 mm at most, fingers stretched; the preshape is about two thirds open.
+    assert 0.1 < scenes.span_of(hand) < 0.335
+
+
+@pytest.mark.parametrize(("valid", "outcome"), [([0, 0], "broken"), ([1, 0, 0], "weak"), ([1, 0], "good")])
+def test_a_cell_of_a_scene_tells_the_share_of_valid_grasps(valid: list[int], outcome: str) -> None:
+    found = SimpleNamespace(columns={"quality/valid": np.array(valid)}, shares={"clear_share": 0.0})
+    assert scenes._told(found)[:2] == (np.mean(valid), outcome)  # type: ignore[arg-type]
+
+
+def test_maps_of_several_runs_are_drawn_and_published_as_one(tmp_path: Path) -> None:
+    cells = [MapCell("one", 1.0, "a", 0.5, "good")]
+    for name, value in (("first", 1.0), ("second", 2.0)):
+        one = StabilityMap("shared", name, "x", "y", "m", "b", cells, "s", "g")
+        own = StabilityMap(name, name, "x", "y", "m", "b", cells, "s", "g")
+        run = Stability(f"2026-01-0{value:.0f}T00:00:00Z", f"graspd stability {name}", {"graspd": "0"}, [one, own])
+        (tmp_path / f"{name}.json").write_text(json.dumps(run.as_json()))
+    words = [part for name in ("first", "second") for part in ("--from", str(tmp_path / f"{name}.json"))]
+    result = CliRunner().invoke(app, ["stability", *words, "--out", str(tmp_path / "out"), "--json"])
+    assert result.exit_code == 0, result.output
+    found = from_json(json.loads((tmp_path / "out" / "stability.json").read_text()))
+    assert {one.name: one.title for one in found.maps} == {"shared": "second", "first": "first", "second": "second"}
+    assert found.command == "graspd stability first; graspd stability second"

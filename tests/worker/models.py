@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import trimesh
 
+from graspd.service.store.shards import json_attribute
 from graspd.worker.hands.model import ConvexPiece, HandModel, PalmFrame
 from graspd.worker.objects.model import ObjectModel
 
@@ -84,3 +85,21 @@ def two_finger_hand() -> HandModel:
         neighbours=frozenset({(0, 1), (0, 2)}),
         masses=np.array([0.3, 0.05, 0.05]),
     )
+
+
+def quality_columns(count: int) -> dict[str, np.ndarray]:
+    """Measures of valid grasps for a base shard; they rise from 0.1 to 0.3."""
+    rising = np.linspace(0.1, 0.3, count)
+    swept = ("contact_area_cm2", "epsilon", "wrench_volume")
+    plain = ("intersection_volume_cm3", "penetration_depth_mm", "self_penetration_depth_mm", "stability_loss")
+    made = {f"quality/{name}": np.repeat(rising[:, None], 2, axis=1) for name in swept}
+    made |= {f"quality/{name}": rising for name in plain}
+    made |= {"quality/thresholds_m": np.array([0.002, 0.005]), "quality/contact_links": np.full(count, 4)}
+    return made | {"quality/valid": np.ones(count, np.uint8), "quality/success": np.ones(count, np.int8)}
+
+
+def attributes_of(hand: HandModel, obj: ObjectModel, **more: object) -> dict[str, object]:
+    """What a base shard says of the grasps of a hand on an object."""
+    said = {"hand": hand.name, "hand_digest": hand.digest, "object": obj.name, "object_digest": obj.digest}
+    said |= {"method": "none", "fidelity": json_attribute({"face_error_m": 3e-4}), "seed": 5, "batch": 0}
+    return {**said, "joint_names": list(hand.joint_names), **more}

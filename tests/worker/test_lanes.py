@@ -109,9 +109,7 @@ def test_a_round_ends_as_soon_as_enough_are_found(pair, monkeypatch: pytest.Monk
     assert_same(parts, rounds)
 
 
-def test_a_lane_without_a_place_ends_blocked_where_another_has_one(
-    pair, scenes, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_lane_without_a_place_ends_blocked_where_another_has_one(pair, scenes, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = generation.synthesize
     refused: list[int] = []
 
@@ -210,21 +208,16 @@ def test_a_lane_that_fails_stops_the_others() -> None:
         side_by_side([0, 1], work, ExecutionContext(), size=lambda _: 1)
 
 
-def test_lanes_tell_how_far_all_of_them_are() -> None:
+def test_lanes_tell_how_far_they_are_and_are_cancelled_as_one() -> None:
     told: list[float] = []
 
     def work(part: int, run: ExecutionContext) -> None:
         run.progress(1.0, 1.0, "done")
+        run.check("a priority")
 
     side_by_side(
         [0, 1, 2], work, ExecutionContext(progress=lambda done, total, _: told.append(done / total)), size=lambda _: 2
     )
     assert told[-1] == max(told) == pytest.approx(1.0) and len(told) == 3
-
-
-def test_lanes_are_cancelled_as_one() -> None:
-    def work(part: int, run: ExecutionContext) -> None:
-        run.check("a priority")
-
     with pytest.raises(TaskCancelled):
         side_by_side([0, 1], work, ExecutionContext(cancelled=lambda: True), size=lambda _: 1)

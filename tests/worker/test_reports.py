@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ import yaml
 from graspd.commands.hands import report_hand
 from graspd.commands.objects import report_object
 from graspd.worker.objects.prepare import object_from_path
-from tests.exchange.robots.shards import run
+from tests.worker.commands_run import graspd
 
 Report = dict[str, Any]
 
@@ -32,10 +31,7 @@ def refused(report: Report, *words: str) -> Report:
 
 
 def synthesized(folder: Path, hand: str, obj: Path, count: int) -> Report:
-    found = run(
-        "synth", "--hand", hand, "--object", obj, "-n", count, "--fidelity", "draft", "-o", folder / "g.h5", "--json"
-    )
-    return dict(json.loads(found.stdout.splitlines()[-1]))
+    return graspd(f"synth --hand {hand} --fidelity draft --object", obj, "-n", count, "-o", folder / "g.h5")
 
 
 def floating_base(folder: Path, _: Path) -> None:
@@ -107,7 +103,7 @@ def prim_names(folder: Path, out: Path) -> None:
     usd = pytest.importorskip("pxr.Usd")
     synthesized(out, "barrett", folder / "003_cracker_box.obj", 2)
     for format_ in ("isaac", "usd"):
-        assert run("export", out / "g.h5", "--format", format_, "-o", out / format_).exit_code == 0
+        graspd(f"export --format {format_} -o", out / format_, out / "g.h5")
     (isaac,) = (yaml.safe_load(file.read_text()) for file in (out / "isaac").glob("*.yaml"))
     stage = usd.Stage.Open(str(next((out / "usd").glob("*.usd"))))
     assert isaac["object_frame_link"] == "/World/_003_cracker_box"

@@ -11,7 +11,6 @@ from typing import Any, Final
 
 import numpy as np
 import warp as wp
-from numpy.typing import NDArray
 
 from graspd.service.model.transforms import Floats
 from graspd.worker.grasps import Posture
@@ -151,16 +150,6 @@ def solved(matrix: Any, target: Floats, ridge: float, count: Any) -> Any:
             found[b] = _plain(columns[b], target, ridge, int(used[b]))
         x.assign(found)
     return x
-
-
-def nonnegative_weights(matrix: Floats, target: Floats, ridge: float, count: NDArray[np.integer[Any]]) -> Floats:
-    """`solved` for systems that are in NumPy, on the CPU."""
-    if not len(matrix):
-        return np.zeros(matrix.shape[:2])
-    with wp.ScopedDevice("cpu"):
-        given = wp.array(matrix, dtype=wp.float64), wp.array(count, dtype=wp.int32)
-    found: Floats = np.array(solved(given[0], target, ridge, given[1]).numpy())
-    return found
 
 
 def _plain(matrix: Floats, target: Floats, ridge: float, count: int) -> Floats:

@@ -230,11 +230,6 @@ def _sample(vertices: Floats, faces: Ints) -> Floats:
     return a * (1 - root) + b * (root * (1 - v)) + c * (root * v)
 
 
-def hull_error(vertices: Floats, faces: Ints, parts: tuple[Floats, ...]) -> float:
-    """Error [m] of convex pieces, given by their corners, of a mesh."""
-    return _OpenSurface(*_simplified(vertices, faces)).error(parts)
-
-
 class _OpenSurface:
     """Points on a mesh with the directions in which each is seen from outside."""
 

@@ -81,22 +81,6 @@ def wrenches(
     return np.concatenate([force, torque], axis=-1)
 
 
-def measure_space(edge_wrenches: Floats, *, norm: Norm = "l1") -> tuple[float, float]:
-    """Epsilon and volume of the wrench space of N contacts.
-
-    Args:
-        edge_wrenches: (N, E, D) edge wrenches of each contact; D is 6, or fewer for a subspace.
-        norm: l1 or linf.
-
-    Raises:
-        InputError: linf with more than `MAX_LINF_CONTACTS` contacts.
-    """
-    (epsilon,), (volume,) = measure_spaces(
-        edge_wrenches[None], np.array([len(edge_wrenches)]), np.ones(1, bool), norm=norm
-    )
-    return float(epsilon), float(volume)
-
-
 def measure_spaces(
     edge_wrenches: Floats, contacts: NDArray[np.integer], with_volume: NDArray[np.bool_], *, norm: Norm = "l1"
 ) -> tuple[Floats, Floats]:
@@ -261,18 +245,6 @@ def measure_hulls(clouds: Floats, count: NDArray[np.integer], whole: NDArray[np.
         found = _grown(points[firm], number[firm], np.asarray(whole)[some][firm], corners[firm], scale[firm])
         radius[some[firm]], volume[some[firm]] = found
     return radius, volume
-
-
-def radius_and_volume(points: Floats) -> tuple[float, float] | None:
-    """Radius and volume of the hull of points (P, 6), as in `measure_hulls`; None where it has none."""
-    radius, volume = measure_hulls(points[None], np.array([len(points)]), np.ones(1, bool))
-    return (float(radius[0]), float(volume[0])) if np.isfinite([radius[0], volume[0]]).all() else None
-
-
-def radius(points: Floats) -> float | None:
-    """The radius alone, exact as well, in about a tenth of the time; any value up to 0 if the origin is outside."""
-    found = measure_hulls(points[None], np.array([len(points)]), np.zeros(1, bool))[0]
-    return float(found[0]) if np.isfinite(found[0]) else None
 
 
 def _grown(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -60,18 +60,8 @@ class PosedFeatures:
         return np.asarray((self.centre @ normal.T - offset - reach).max(axis=-1))
 
 
-def body_distances(hand: HandModel, postures: Posture, scene: Environment) -> Floats:
-    """(P, L) signed distance of each of the hand's bodies from the nearest obstacle [m]; inf where there is none.
-
-    Against half-spaces it is exact, and against solids that the hand is apart from, but for links that are hulls near
-    an edge or a corner: there it is a lower bound. Farther than `FAR_M` from a solid counts as that.
-    """
-    alike = Environment(tuple(replace(o, tips_m=None) for o in scene.obstacles), scene.up)
-    return body_room(hand, postures, [alike])
-
-
 def _solid_distances(hand: HandModel, postures: Posture, scene: Environment) -> Floats:
-    """(P, L) as `body_distances`, in float32: coordinates of 0.3 m are known to 3e-8."""
+    """(P, L) as `body_room` without what fingertips may, in float32: coordinates of 0.3 m are known to 3e-8."""
     bodies = body_poses(hand, postures.hand_pose, postures.joint_positions)
     device = _device_hand(hand)
     obstacles = DeviceObstacles.create(hand, [scene], np.zeros(3), "cpu")
@@ -102,17 +92,17 @@ def _device_hand(hand: HandModel) -> DeviceHand:
         return found
 
 
-def obstacle_distances(hand: HandModel, postures: Posture, scene: Environment) -> Floats:
-    """(P,) least of the `body_distances` of each posture [m]."""
-    return np.asarray(body_distances(hand, postures, scene).min(axis=1))
-
-
 def body_room(
     hand: HandModel, postures: Posture, scenes: Sequence[Environment], which: NDArray[np.integer[Any]] | None = None
 ) -> Floats:
-    """(P, L) as `body_distances`, in the scene `which` (P,) of each posture or else in the first, but fingertips count
-    as farther from supports that they may come near: by what makes `CLEAR_M` of the distance that they are to keep [m].
-    So a hand is clear where nothing of it is below `CLEAR_M`."""
+    """(P, L) signed distance of each of the hand's bodies from the nearest obstacle [m], in the scene `which` (P,) of
+    each posture or else in the first; inf where there is none.
+
+    Fingertips count as farther from supports that they may come near: by what makes `CLEAR_M` of the distance that they
+    are to keep. So a hand is clear where nothing of it is below `CLEAR_M`. Against half-spaces the distance is exact,
+    and against solids that the hand is apart from, but for links that are hulls near an edge or a corner: there it is a
+    lower bound. Farther than `FAR_M` from a solid counts as that.
+    """
     which = np.zeros(len(postures), np.int32) if which is None else np.asarray(which, np.int32)
     out = _half_space_room(hand, postures, scenes, which)
     tips = np.isin(np.arange(hand.bodies), hand.fingertips)

@@ -9,13 +9,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 
-from graspd.baselines.learned.method import RETREATS, Seeds
+from graspd.baselines.learned.method import ELEVATION, NEAREST_M, RETREATS, Seeds, SurfaceView
 from graspd.baselines.learned.network import Proposals, encode, save
 from graspd.service.model.errors import InputError
 from graspd.service.model.fidelity import resolve_fidelity
 from graspd.service.model.scene_spec import SceneSpec
-from graspd.service.model.transforms import compose, quat_from_matrix, quat_rotate
+from graspd.service.model.transforms import apply, compose, quat_from_axis_angle, quat_from_matrix, quat_rotate
 from graspd.service.store.network_file import ProposalNetwork
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.grasps import GraspSet
@@ -82,7 +83,7 @@ def assert_same(one: GraspSet, other: GraspSet) -> None:
 
 
 @pytest.mark.slow
-def test_a_grasp_depends_on_seed_and_index_but_not_on_batch_or_threads(hand, block, network) -> None:
+def test_a_grasp_depends_on_seed_and_index_alone(hand, block, network) -> None:
     small, large = made(hand, block, network, 2), made(hand, block, network, 8, threads=2)
     assert_same(small, large.take(slice(0, 2)))
     other = made(hand, block, network, 2, seed=2)
@@ -138,7 +139,7 @@ def down(hand: HandModel, height: float) -> Proposals:
     return Proposals(np.concatenate([root, turn])[None], way, joints, joints, joints)
 
 
-def test_hands_set_out_as_proposed_backed_off_along_their_way_until_they_are_clear(hand, block, network) -> None:
+def test_hands_set_out_as_proposed_backed_off_until_clear(hand, block, network) -> None:
     pair, placed = pair_of(hand, block, QUICK, "cpu"), on_table(block, 2)
     fixed = proposing(network, down(hand, 0.1), np.zeros(3))
     state, depth, probe = started(pair, Seeds(fixed, 2), placed, 2)
@@ -162,7 +163,7 @@ def test_hands_set_out_as_proposed_backed_off_along_their_way_until_they_are_cle
 
 
 @pytest.mark.parametrize("height", [-0.5, 3.0, 1e30])
-def test_where_no_proposal_is_clear_and_near_hands_set_out_as_without_a_network(hand, block, network, height) -> None:
+def test_with_no_proposal_clear_hands_set_out_without_a_network(hand, block, network, height) -> None:
     pair, placed = pair_of(hand, block, QUICK, "cpu"), on_table(block, 2)
     state, depth, probe = started(pair, Seeds(proposing(network, down(hand, height), np.zeros(3)), 2), placed, 2)
     assert (depth <= CLEAR).all() and (probe.depths(state) <= CLEAR).all()
@@ -192,3 +193,47 @@ def test_what_it_cannot_do_is_said_in_a_line(hand, block, network, tmp_path: Pat
     assert of_this_machine("graspit", {"steps": "3"}) == {"steps": "3"}
     with pytest.raises(InputError, match="cannot be read"):
         of_this_machine("learned", {"network": str(tmp_path / "none.npz")})
+
+
+POSE = np.concatenate([[0.2, -0.1, 0.05], quat_from_axis_angle(np.array([0.0, 0, 1]), np.asarray(0.7))])
+
+
+@pytest.fixture(scope="module")
+def mug() -> ObjectModel:
+    return object_from_path("mug")
+
+
+def test_points_lie_on_the_surface_and_are_seen_by_the_camera(mug: ObjectModel) -> None:
+    seen, rng = SurfaceView.of(mug), np.random.default_rng(3)
+    mesh = trimesh.Trimesh(apply(POSE, mug.vertices), mug.faces, process=False)
+    for _ in range(3):
+        camera = seen.camera(POSE, rng)
+        points, normals = seen.cloud(POSE, camera, 400, rng)
+        assert points.shape == normals.shape == (400, 3)
+        rays = points - camera
+        assert ((rays * normals).sum(axis=1) < 0).all()
+        far = np.linalg.norm(rays, axis=1)
+        # The exact first hit of the ray through each point.
+        where, ray, _ = mesh.ray.intersects_location(np.tile(camera, (400, 1)), rays, multiple_hits=False)
+        gap = far[ray] - np.linalg.norm(where - camera, axis=1)
+        assert len(set(ray.tolist())) >= 396  # a ray along an edge may miss
+        # A pixel whose front no sample fell into shows what is behind: inside of the mug, the wall behind the handle.
+        assert (np.abs(gap) < 1e-3).mean() > 0.97
+
+
+def test_cameras_stand_where_pictures_have_them(mug: ObjectModel) -> None:
+    seen, rng = SurfaceView.of(mug), np.random.default_rng(0)
+    middle = apply(POSE, mug.centre_of_mass)
+    out = np.array([seen.camera(POSE, rng) - middle for _ in range(200)])
+    distance = np.linalg.norm(out, axis=1)
+    elevation = np.arcsin(out[:, 2] / distance)
+    assert (elevation >= ELEVATION[0] - 1e-9).all() and (elevation <= ELEVATION[1] + 1e-9).all()
+    assert (distance >= NEAREST_M + mug.radius - 1e-9).all() and (distance < 0.8).all()
+    assert np.linalg.norm((out[:, :2] / distance[:, None]).mean(axis=0)) < 0.15  # from all sides
+
+
+def test_few_pixels_still_fill_a_cloud(mug: ObjectModel) -> None:
+    seen = SurfaceView.of(mug)
+    rng = np.random.default_rng(0)
+    points, _ = seen.cloud(POSE, seen.camera(POSE, rng), 8192, rng)
+    assert points.shape == (8192, 3) and np.isfinite(points).all()

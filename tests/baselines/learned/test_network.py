@@ -60,7 +60,7 @@ def float64_rows(network: net.ProposalNetwork, noise: Floats, label: float) -> F
 
 
 @pytest.mark.parametrize("label", [1.0, 0.0])
-def test_proposals_are_those_of_the_definition_in_double_precision(label: float) -> None:
+def test_proposals_are_those_of_definition_in_double_precision(label: float) -> None:
     network = random_network(["a", "b", "c"])
     noise = np.random.default_rng(7).standard_normal((3, network.numbers))
     expected = net.decode(float64_rows(network, noise, label), cloud()[0].mean(axis=0))
@@ -110,7 +110,7 @@ def test_a_proposal_does_not_depend_on_how_many_are_asked_for() -> None:
     assert len(np.unique(many.hand_pose[:, 0])) == 70
 
 
-def test_the_order_of_points_and_where_the_table_stands_do_not_matter() -> None:
+def test_order_of_points_and_where_table_stands_do_not_matter() -> None:
     network = random_network()
     points, normals = cloud()
     given: dict[str, Any] = {"count": 4, "table_height": 0.45}
@@ -124,7 +124,7 @@ def test_the_order_of_points_and_where_the_table_stands_do_not_matter() -> None:
     np.testing.assert_allclose(moved.joints, first.joints, atol=1e-5)
 
 
-def test_a_grasp_survives_its_row_and_a_bad_row_gives_a_rotation_all_the_same() -> None:
+def test_a_grasp_survives_its_row_and_a_bad_row_is_a_rotation() -> None:
     network = random_network(["a", "b", "c"])
     found = proposed(network, 5)
     np.testing.assert_allclose(np.linalg.norm(found.hand_pose[:, 3:], axis=1), 1, atol=1e-12)
@@ -140,7 +140,7 @@ def test_a_grasp_survives_its_row_and_a_bad_row_gives_a_rotation_all_the_same() 
     np.testing.assert_allclose(made.approach, [[0, 0, -1]] * 3, atol=1e-12)
 
 
-def test_clouds_that_are_none_and_numbers_that_run_away_are_refused_in_a_line() -> None:
+def test_clouds_that_are_none_and_wild_numbers_are_refused() -> None:
     network = random_network()
     points, normals = cloud()
     for p, n in ((points[:0], normals[:0]), (points, normals[:-1]), (points * np.nan, normals), (points.T, normals.T)):

@@ -1,9 +1,11 @@
-"""Each format of robots, opened by what reads it."""
+"""Each format of robots, opened by what reads it; the page of robots works as it stands."""
 
 from __future__ import annotations
 
 import csv
 import json
+import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -12,38 +14,31 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+import trimesh
 import yaml
 
 from graspd import service
 from graspd.exchange.inputs import load_case
-from graspd.service.model.transforms import compose, invert
+from graspd.exchange.robot_export import ALIASES, FORMATS
+from graspd.service.model.transforms import compose, invert, pose_to_matrix, quat_to_matrix
 from graspd.service.store.shards import read_shard, write_shard
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.urdf import read_urdf
+from graspd.worker.rendering.hands import drawn_bodies, hand_solids
+from tests.conftest import REPOSITORY
+from tests.exchange.robots.arms import write_arm
 from tests.exchange.robots.shards import COMMON, make, run
+from tests.worker.commands_run import graspd
 
 BLOCK = next(Path(service.__file__).parent.glob("builtin/objects/block/*.stl"))
-#: Fields of the messages, from docs.ros.org (moveit_msgs, trajectory_msgs).
-GRASP = {
-    "id",
-    "pre_grasp_posture",
-    "grasp_posture",
-    "grasp_pose",
-    "grasp_quality",
-    "pre_grasp_approach",
-    "post_grasp_retreat",
-    "post_place_retreat",
-    "max_contact_force",
-    "allowed_touch_objects",
-}
+GRASP = {"id", "pre_grasp_posture", "grasp_posture", "grasp_pose", "grasp_quality", "pre_grasp_approach"}
+GRASP |= {"post_grasp_retreat", "post_place_retreat", "max_contact_force", "allowed_touch_objects"}
 POINT = {"positions", "velocities", "accelerations", "effort", "time_from_start"}
 
 
 def export(shard: Path, format_: str, folder: Path, *more: str) -> dict[str, Any]:
-    found = run("export", shard, "--format", format_, "--all", "-o", folder, "--json", *more)
-    assert found.exit_code == 0, found.output
-    return json.loads(found.stdout.splitlines()[-1])
+    return graspd(f"export --format {format_} --all -o", folder, shard, *more)
 
 
 def limp(shard: Path, out: Path) -> Path:
@@ -59,7 +54,7 @@ def export_of(hand: str, format_: str, folder: Path) -> Path:
     """Export grasps of a built-in hand on an object whose name no format takes as it is."""
     thing = folder / "003_mug.v2-final.stl"
     thing.write_bytes(BLOCK.read_bytes())
-    made = make(["--hand", hand, "--object", str(thing), "-n", "2", *COMMON], folder / "grasps.h5")
+    made = make(f"--hand {hand} -n 2 {COMMON}", folder / "grasps.h5", "--object", thing)
     export(made, format_, folder / format_)
     return folder / format_
 
@@ -86,8 +81,7 @@ def validated(shard: Path) -> list[bool]:
     """What the validator says of each row."""
     case = load_case(shard)
     protocol = "dexgraspbench" if case.placed is None else "lift"
-    found = run("evaluate", shard, "--protocol", protocol, "--json")
-    return [one["held"] for one in json.loads(found.stdout.splitlines()[-1])["verdicts"]]
+    return [one["held"] for one in graspd(f"evaluate --protocol {protocol}", shard)["verdicts"]]
 
 
 @pytest.mark.parametrize("which", ["free_shard", "table_shard", "pressing_shard", "clutter_shard"])
@@ -106,7 +100,7 @@ def test_a_mujoco_scene_replays_to_the_verdict_of_the_validator(
     }
 
 
-def test_a_mujoco_scene_has_the_hands_names_and_a_key_frame_for_each_posture(table_shard: Path, tmp_path: Path) -> None:
+def test_a_mujoco_scene_has_the_hands_names_and_key_frames(table_shard: Path, tmp_path: Path) -> None:
     export(table_shard, "mujoco", tmp_path)
     model = mujoco.MjModel.from_xml_path(str(tmp_path / "scene.xml"))
     data = mujoco.MjData(model)
@@ -227,3 +221,114 @@ def test_a_mistake_is_one_line_and_writes_nothing(
     found = run("export", free_shard, "--format", "csv", *options, "-o", tmp_path / "out")
     assert found.exit_code == 2 and said in found.output and found.output.strip().count("\n") == 0
     assert not (tmp_path / "out").exists()
+
+
+#: Positions in float32 and poses with seven digits [m].
+ROUNDING_M = 2e-6
+
+
+def expected(shard: Path, row: int) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Vertices of the hand's bodies in the frame of the scene or the object, and the object's matrix there."""
+    case = load_case(shard)
+    at = np.array([0, 0, 0, 1, 0, 0, 0.0]) if case.placed is None else case.placed.object_pose[case.placed.index[row]]
+    grasp = case.grasps.grasp
+    bodies = pose_to_matrix(at) @ pose_to_matrix(
+        body_poses(case.hand, grasp.hand_pose[row], grasp.joint_positions[row])[0]
+    )
+    found = {
+        case.hand.body_names[body]: trimesh.transform_points(solid.vertices, bodies[body])
+        for body, solid in zip(drawn_bodies(case.hand), hand_solids(case.hand), strict=True)
+    }
+    return found, pose_to_matrix(at)
+
+
+@pytest.mark.parametrize("which", ["free_shard", "table_shard"])
+def test_trimesh_reads_grasp_whose_parts_stand_where_they_should(
+    which: str, request: pytest.FixtureRequest, tmp_path: Path
+) -> None:
+    shard = request.getfixturevalue(which)
+    told = export(shard, "glb", tmp_path)
+    files = sorted(tmp_path.glob("*.glb"))
+    assert len(files) == told["grasps"]
+    upright = np.eye(4)
+    upright[:3, :3] = quat_to_matrix(np.array([np.sqrt(0.5), -np.sqrt(0.5), 0, 0]))
+    for file in files[:2]:
+        scene = trimesh.load(file)
+        bodies, thing = expected(shard, int(file.stem.removeprefix("grasp_")))
+        case = load_case(shard)
+        wanted = bodies | {case.obj.name: trimesh.transform_points(case.obj.vertices, thing)}
+        assert ("support_0" in scene.graph.nodes) == (which == "table_shard")
+        assert "tool_frame" in scene.graph.nodes
+        for name, vertices in wanted.items():
+            matrix, geometry = scene.graph[name]
+            found = trimesh.transform_points(scene.geometry[geometry].vertices, matrix)
+            turned = trimesh.transform_points(vertices, upright)
+            np.testing.assert_allclose(found.min(axis=0), turned.min(axis=0), atol=ROUNDING_M)
+            np.testing.assert_allclose(found.max(axis=0), turned.max(axis=0), atol=ROUNDING_M)
+
+
+def test_usd_opens_a_grasp_in_metres_that_moves_to_the_lift(table_shard: Path, tmp_path: Path) -> None:
+    usd = pytest.importorskip("pxr.Usd")
+    geometry = pytest.importorskip("pxr.UsdGeom")
+    export(table_shard, "usd", tmp_path)
+    file = sorted(tmp_path.glob("*.usd"))[0]
+    stage = usd.Stage.Open(str(file))
+    assert geometry.GetStageMetersPerUnit(stage) == 1.0 and geometry.GetStageUpAxis(stage) == "Z"
+    assert stage.GetDefaultPrim().GetPath() == "/World"
+    bodies, thing = expected(table_shard, int(file.stem.removeprefix("grasp_")))
+
+    def vertices(path: str, time: float | None) -> np.ndarray:
+        code = usd.TimeCode.Default() if time is None else usd.TimeCode(time)
+        mesh = geometry.Mesh(stage.GetPrimAtPath(f"{path}/mesh"))
+        matrix = np.array(geometry.Xformable(mesh).ComputeLocalToWorldTransform(code)).T
+        return trimesh.transform_points(np.array(mesh.GetPointsAttr().Get()), matrix)
+
+    for name, points in bodies.items():
+        np.testing.assert_allclose(vertices(f"/World/barrett/{name}", None), points, atol=ROUNDING_M)
+    end = stage.GetEndTimeCode()
+    rest, lifted = vertices("/World/bottle", 0.0), vertices("/World/bottle", end)
+    bottle = load_case(table_shard).obj
+    np.testing.assert_allclose(rest, trimesh.transform_points(bottle.vertices, thing), atol=ROUNDING_M)
+    np.testing.assert_allclose(lifted - rest, np.tile([0, 0, 0.1], (len(rest), 1)), atol=1e-5)
+    palm = vertices("/World/barrett/palm", 0.0), vertices("/World/barrett/palm", None)
+    assert np.linalg.norm((palm[1] - palm[0]).mean(axis=0)) >= 0.1 - 1e-3, "the standoff"
+    assert stage.GetPrimAtPath("/World/scene/support_0/mesh").IsValid()
+
+
+def test_without_usd_core_a_line_says_what_to_install(
+    free_shard: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pxr", None)
+    found = run("export", free_shard, "--format", "usd", "-o", tmp_path)
+    assert found.exit_code == 2 and "pip install 'graspd[usd]'" in found.output
+
+
+PAGE = (REPOSITORY / "docs" / "how-to" / "robots.md").read_text()
+
+
+def commands() -> list[list[str]]:
+    blocks = re.findall(r"```sh\n(.*?)```", PAGE, re.DOTALL)
+    return [shlex.split(line, comments=True) for block in blocks for line in block.splitlines() if line.strip()]
+
+
+@pytest.mark.slow
+def test_every_command_of_the_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("mink")
+    pytest.importorskip("pxr")
+    monkeypatch.chdir(tmp_path)
+    write_arm(tmp_path).rename("arm.urdf")
+    assert len(commands()) >= 12
+    for program, *arguments in commands():
+        if program == "python":
+            subprocess.run([sys.executable, "-I", *arguments], check=True, capture_output=True)
+            continue
+        assert program == "graspd"
+        found = run(*arguments)
+        assert found.exit_code == 0, f"{arguments}: {found.output}"
+        assert Path(arguments[arguments.index("-o") + 1]).exists()
+
+
+def test_every_format_of_the_command_is_on_the_page() -> None:
+    on_page = {line.partition("|")[2].partition("|")[0].strip(" `") for line in PAGE.splitlines()}
+    assert set(FORMATS) <= on_page
+    assert all(name in PAGE for name in ALIASES)

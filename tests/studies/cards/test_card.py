@@ -8,35 +8,55 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 import yaml
+from PIL import Image
 from typer.testing import CliRunner
 
 from graspd.commands.exchange import app
 from graspd.service.model.errors import InputError, NotFoundError
+from graspd.service.model.metrics import BANDS, SECTORS, evenness
+from graspd.service.model.states import Stage
+from graspd.service.model.transforms import quat_from_axis_angle
+from graspd.service.readers import Grasps, Shards
+from graspd.service.store.manifests import load_manifest
+from graspd.service.store.shards import read_shard
 from graspd.studies.cards.card import write_card
-from graspd.studies.cards.contents import contents_of_folder, contents_of_store, with_provenance
-from graspd.studies.cards.findings import _qualities
+from graspd.studies.cards.contents import (
+    AssetFacts,
+    Contents,
+    contents_of_folder,
+    contents_of_store,
+    pieces,
+    with_provenance,
+)
+from graspd.studies.cards.findings import _qualities, findings
+from graspd.studies.cards.numbers import numbers, share
+from graspd.studies.cards.page import front_matter, page
+from graspd.studies.cards.plots import draw
+from graspd.studies.cards.tally import CellTally, JointUse, Tally, cell_counts, elevations, tally_of
 from tests.studies.cards.conftest import Case, case
-from tests.studies.cards.makers import HANDS, OBJECTS, dataset
+from tests.studies.cards.makers import HANDS, OBJECTS, SECONDS, STILL_HAND, STILL_JOINT, Array, dataset
 
 
-def test_the_head_of_the_page_is_yaml_that_says_licence_and_size(kitchen: Case) -> None:
+def test_the_page_its_links_and_figures_agree_with_the_card(kitchen: Case) -> None:
     head = yaml.safe_load(kitchen.page.split("---")[1])
     assert head["pretty_name"] == "kitchen" and head["license"] == "cc-by-4.0"
     assert head["size_categories"] == ["n<1K"] and set(HANDS) < set(head["tags"])
-
-
-def test_every_link_and_picture_of_the_page_is_there(kitchen: Case) -> None:
     targets = re.findall(r"\]\(([^)]+)\)", kitchen.page)
     assert {name for name in targets if name.endswith((".png", ".jpg"))} == set(kitchen.card["plots"])
     assert [target for target in targets if not (kitchen.folder / target).is_file()] == []
-
-
-def test_the_plots_of_a_dataset_with_scenes_are_all_there(kitchen: Case) -> None:
     names = {"yield.png", "quality.png", "directions.png", "table.png", "joints.png", "sizes.png", "samples.jpg"}
     assert names <= set(kitchen.card["plots"])
+    stored = json.loads((kitchen.folder / "card.json").read_text())
+    assert stored["composition"] == kitchen.card["composition"]
+    assert [(cell["hand"], cell["object"]) for cell in stored["cells"]] == [(h, o) for h in HANDS for o in OBJECTS]
+    assert f"{stored['composition']['valid']:,} valid grasps of 2 robot hands on 2 objects" in kitchen.page
+    assert stored["snapshot"]["digest"] == kitchen.made.snapshot.digest
+    assert kitchen.made.snapshot.digest in kitchen.page
 
 
 def test_the_checksums_are_those_of_an_export(kitchen: Case, export: Path, tmp_path: Path) -> None:
@@ -57,16 +77,12 @@ def test_what_the_page_says_of_opening_it_works(kitchen: Case, export: Path) -> 
     assert done.stdout.startswith("80 (80, 7) ['index_abduction'")  # the first hand's grasps of two cells of 40
 
 
-def test_the_figures_are_on_the_page_and_in_json(kitchen: Case) -> None:
-    stored = json.loads((kitchen.folder / "card.json").read_text())
-    assert stored["composition"] == kitchen.card["composition"]
-    assert f"{stored['composition']['valid']:,} valid grasps of 2 robot hands on 2 objects" in kitchen.page
-    assert stored["snapshot"]["digest"] == kitchen.made.snapshot.digest
-    assert kitchen.made.snapshot.digest in kitchen.page
+def undrawn(contents: Contents) -> dict[str, Any]:
+    return numbers(contents, tally_of(contents, pieces(contents)))
 
 
-def test_a_folder_of_shards_has_the_same_figures(kitchen: Case, export: Path, tmp_path: Path) -> None:
-    found = write_card(contents_of_folder(export), tmp_path / "card")
+def test_a_folder_of_shards_has_the_same_figures(kitchen: Case, export: Path) -> None:
+    found = undrawn(contents_of_folder(export))
     for part in ("quality", "table", "elevation", "directions", "joints", "contact_threshold_m"):
         assert found[part] == kitchen.card[part], part
     for key in ("grasps", "valid", "scenes", "pairs", "pictures", "shards", "bytes"):
@@ -77,25 +93,12 @@ def test_a_folder_of_shards_has_the_same_figures(kitchen: Case, export: Path, tm
 def test_what_a_folder_does_not_know_is_said_to_be_missing(export: Path, tmp_path: Path) -> None:
     shutil.copytree(export, tmp_path / "plain")
     (tmp_path / "plain" / "snapshot.json").unlink()
-    write_card(contents_of_folder(tmp_path / "plain"), tmp_path / "card")
-    page = (tmp_path / "card" / "README.md").read_text()
-    assert "| revisions of the stages | not recorded |" in page
-    assert "No licence was stated for this dataset" in page and "Not measured: robustness" in page
-
-
-def test_the_checksums_of_plain_files_are_computed(export: Path, tmp_path: Path) -> None:
-    shutil.copytree(export, tmp_path / "plain")
-    (tmp_path / "plain" / "snapshot.json").unlink()
     write_card(contents_of_folder(tmp_path / "plain"), tmp_path / "plain")
+    page = (tmp_path / "plain" / "README.md").read_text()
     command = ["sha256sum", "-c", "--strict", "checksums.sha256"]
     assert subprocess.run(command, cwd=tmp_path / "plain", capture_output=True, check=False).returncode == 0
-
-
-def test_few_pictures_are_fetched(kitchen: Case) -> None:
-    views = {shard.sha256 for shard in kitchen.made.snapshot.shards if shard.kind == "views"}
-    cached = {path.stem for path in (kitchen.folder.parent / "cache").iterdir()}
-    # but for the few that are shown: at most one of each pair of hand and object
-    assert len(views) == 8 and len(views & cached) <= 4
+    assert "| revisions of the stages | not recorded |" in page
+    assert "No licence was stated for this dataset" in page and "Not measured: robustness" in page
 
 
 @pytest.mark.s3
@@ -103,7 +106,7 @@ def test_a_snapshot_on_s3_has_the_same_card(kitchen: Case, tmp_path: Path, s3_ur
     made = dataset(tmp_path, s3_url)
     try:
         contents = contents_of_store(made.services.store, "kitchen", cache=tmp_path / "cache")
-        found = write_card(contents, tmp_path / "card")
+        found = undrawn(contents)
     finally:
         made.services.close()
     for part in ("quality", "table", "directions", "joints", "cells"):
@@ -150,14 +153,7 @@ def test_a_cell_that_failed_is_told_with_its_reason(tmp_path: Path) -> None:
     assert (failed["grasps"], failed["of_validated"]) == (0, None)
 
 
-def test_a_dataset_without_scenes_has_a_card(tmp_path: Path) -> None:
-    found = case(tmp_path, scenes=0, views=0)
-    found.made.services.close()
-    assert "table.png" not in found.card["plots"] and "clearance of the table (no scenes)" in found.page
-    assert found.card["composition"]["pictures"] == 0
-
-
-def test_the_card_of_a_dataset_in_scenes_says_where_its_grasps_are_valid(tmp_path: Path) -> None:
+def test_the_card_of_a_dataset_says_where_its_grasps_are_valid(tmp_path: Path) -> None:
     made = case(tmp_path, drawn=False, scene="bin", neighbours=("mug",), views=0)
     try:
         assert (made.card["making"]["scenes"], made.card["making"]["neighbours"]) == (["bin"], ["mug"])
@@ -203,12 +199,206 @@ def test_a_mistake_is_one_line_and_exit_2(
     assert words in done.stderr and not (tmp_path / "out").exists()
 
 
-def test_the_matrix_is_that_of_the_dataset(kitchen: Case) -> None:
-    pairs = [(cell["hand"], cell["object"]) for cell in kitchen.card["cells"]]
-    assert pairs == [(hand, obj) for hand in HANDS for obj in OBJECTS]
-
-
 def test_a_card_says_in_how_many_models_half_of_its_grasps_hold() -> None:
     told = [_qualities({"quality": {"allegro": {"robust_share": {"median": median}}}}) for median in (0.625, 1.0)]
     assert "allegro: half hold in 62 % or less of the models around the nominal one" in told[0]
     assert told[1] == ""
+
+
+MANY = [f"object-{number:03}" for number in range(200)]
+
+
+def matrix(valid: int) -> tuple[Contents, Tally]:
+    """One hand on 200 objects, so many valid grasps each, without their shards."""
+    rng = np.random.default_rng(0)
+    tally = Tally()
+    for name in MANY:
+        columns = {"epsilon": [rng.random(50).astype(np.float32)]}
+        tally.cells["claw", name] = CellTally(
+            grasps=valid, valid=valid, candidates=2 * valid, validated=2 * valid, columns=columns
+        )
+    extents = {"extents_m": [0.05, 0.06, 0.1]}
+    assets = {name: AssetFacts(name, "d" * 32, facts=extents) for name in MANY}
+    return Contents("many", Shards(()), {"claw": AssetFacts("claw")}, assets), tally
+
+
+def test_the_card_of_many_objects_is_folded_and_bounded(tmp_path: Path) -> None:
+    contents, tally = matrix(40)
+    text = page(numbers(contents, tally), {})
+    assert "<details><summary>Objects: 200</summary>" in text
+    assert "Licence not recorded** for 200 objects" in text and "and 192 more" in text
+    plots = draw(numbers(contents, tally), tally, tmp_path)
+    assert {"yield.png", "quality.png", "sizes.png"} == set(plots)
+    for name in plots:
+        with Image.open(tmp_path / name) as picture:
+            assert picture.height < 1200, name
+    for valid, words in ((4, "n<1K"), (40, "1K<n<10K"), (5_000, "1M<n<10M")):
+        contents, tally = matrix(valid)
+        assert f'size_categories: ["{words}"]' in front_matter(numbers(contents, tally))
+
+
+def changed(tmp_path: Path, change: Any, **options: Any) -> Case:
+    found = case(tmp_path, drawn=False, change=change, **options)
+    found.made.services.close()
+    return found
+
+
+def test_counts_costs_and_clearance_are_those_of_the_dataset(kitchen: Case) -> None:
+    store, shards = kitchen.made.services.store, kitchen.made.snapshot.shards
+    base = [load_manifest(store, Stage.SYNTHESIZE, shard.id) for shard in shards if shard.kind == "base"]
+    made, valid = kitchen.card["composition"], kitchen.card["validity"]
+    assert made["valid"] == sum(one.valid for one in base) and valid["candidates"] == sum(
+        one.candidates for one in base
+    )
+    assert (valid["rechecked"], valid["recheck_dropped"]) == (32, 0)
+    assert sum(made["bytes"].values()) == kitchen.made.snapshot.size_bytes
+    assert (made["scenes"], made["pictures"]) == (16, 16)
+    assert valid["rejected"]["gate"] == len(base)
+    making, batches = kitchen.card["making"], 8
+    stages = {"base": Stage.SYNTHESIZE, "scene": Stage.SCENE, "views": Stage.RENDER}
+    assert making["seconds"] == {kind: batches * SECONDS[stage] for kind, stage in stages.items()}
+    assert making["seconds_per_1000_valid"] == pytest.approx(1000 * batches * 4.0 / 160)
+    assert making["synthesis_parts"] == {"planner": batches * 1.0}
+    clear = pairs = 0
+    for file in kitchen.contents.shards.of("scene"):
+        scene = read_shard(kitchen.contents.shards.path(file))
+        pairs += int((scene["grasp/valid"] == 1).sum())
+        clear += len(set(scene["grasp/base_index"][scene["grasp/valid"] == 1].tolist()))
+    table = kitchen.card["table"]
+    assert (table["clear"], table["clear_pairs"], table["grasps"], table["pairs"]) == (clear, pairs, 160, 320)
+    assert table["too_near"] == {"the table at contact": 320 - pairs}
+    views = {shard.sha256 for shard in kitchen.made.snapshot.shards if shard.kind == "views"}
+    cached = {path.stem for path in (kitchen.folder.parent / "cache").iterdir()}
+    # but for the few that are shown: at most one of each pair of hand and object
+    assert len(views) == 8 and len(views & cached) <= 4
+
+
+@pytest.mark.parametrize("name", ["epsilon", "penetration_depth_mm"])
+def test_distributions_are_those_of_the_readers(kitchen: Case, name: str) -> None:
+    values = Grasps(kitchen.contents.shards.only(hands=["allegro"])).arrays(f"quality/{name}")[f"quality/{name}"]
+    values = values[:, 1] if values.ndim == 2 else values  # the threshold of 5 mm
+    found = kitchen.card["quality"]["allegro"][name]
+    assert kitchen.card["contact_threshold_m"] == 0.005
+    # float32 columns: 1e-6 of the value
+    assert found["median"] == pytest.approx(np.median(values), rel=1e-5)
+    assert found["p95"] == pytest.approx(np.percentile(values, 95), rel=1e-5)
+
+
+def test_only_valid_grasps_count(tmp_path: Path) -> None:
+    def halve(hand: str, obj: str, columns: dict[str, Array]) -> None:
+        columns["quality/valid"][::2] = 0
+        columns["quality/epsilon"][::2] = 99.0
+
+    found = changed(tmp_path, halve)
+    assert found.card["composition"]["grasps"] == 160 and found.card["composition"]["valid"] == 80
+    assert found.card["quality"]["allegro"]["epsilon"]["max"] < 10
+    assert found.card["table"]["grasps"] == 80 and found.card["directions"]["by_hand"]["allegro"]["grasps"] == 40
+
+
+def test_audits_that_overturn_verdict_are_told_with_an_interval(tmp_path: Path) -> None:
+    def drop(hand: str, obj: str, columns: dict[str, Array]) -> None:
+        if (hand, obj) == ("barrett", "mug") and "quality/recheck" in columns:
+            columns["quality/recheck"][:2] = 0
+
+    found = changed(tmp_path, drop)
+    rate = found.card["validity"]["by_hand"]["barrett"]["false_valid"]
+    # Wilson's interval of 2 in 16, by its formula
+    z, n, p = 1.959964, 16, 2 / 16
+    middle, half = (
+        (p + z * z / (2 * n)) / (1 + z * z / n),
+        z / (1 + z * z / n) * np.sqrt(p * (1 - p) / n + z * z / (4 * n * n)),
+    )
+    assert (rate["low"], rate["high"]) == pytest.approx((middle - half, middle + half), abs=1e-6)
+    assert "**Rechecks overturned 2 of 32 verdicts**" in found.page and "barrett on mug (2 of 8)" in found.page
+
+
+def test_no_scenes_no_audits_and_repeats_are_told(tmp_path: Path) -> None:
+    def change(hand: str, obj: str, columns: dict[str, Array]) -> None:
+        columns.pop("quality/recheck", None)
+        for name in ("grasp/hand_pose", "grasp/joint_positions"):
+            columns[name][1] = columns[name][0]
+
+    found = case(tmp_path, change=change, scenes=0, views=0)
+    found.made.services.close()
+    assert found.card["validity"]["false_valid"] is None and "**No rechecks**" in found.page
+    assert found.card["repeated"] == 8 and "**8 valid grasps equal another**" in found.page
+    assert "table.png" not in found.card["plots"] and "clearance of the table (no scenes)" in found.page
+    assert found.card["composition"]["pictures"] == 0
+
+
+def test_directions_that_no_hand_comes_from_are_told(tmp_path: Path) -> None:
+    def from_above(hand: str, obj: str, columns: dict[str, Array]) -> None:
+        if obj == "mug":
+            # Barrett's palm looks along +z, Allegro's along +x: turned about y both look down.
+            angle = np.pi if hand == "barrett" else np.pi / 2
+            count = len(columns["grasp/hand_pose"])
+            columns["grasp/hand_pose"][:, 3:] = quat_from_axis_angle(np.array([0.0, 1, 0]), np.full(count, angle))
+
+    found = changed(tmp_path, from_above, grasps=160, scenes=0, views=0)
+    rows = found.card["directions"]["by_object"]
+    assert rows["mug"]["empty"] > 40 > rows["block"]["empty"]
+    assert "**Directions never used**" in found.page and f"mug ({rows['mug']['empty']})" in found.page
+
+
+def test_a_cell_that_ran_out_of_budget_is_told(tmp_path: Path) -> None:
+    def few(hand: str, obj: str, columns: dict[str, Array]) -> None:
+        if (hand, obj) == ("allegro", "block"):
+            for name in [name for name in columns if name != "quality/thresholds_m"]:
+                columns[name] = columns[name][:3]
+
+    found = changed(tmp_path, few)
+    assert (
+        "**1 of 4 cells ran out of budget**" in found.page
+        and "allegro on block (6 of 40 after 8 candidates)" in found.page
+    )
+
+
+def test_directions_that_are_preferred_are_told(tmp_path: Path) -> None:
+    found = case(tmp_path, drawn=False)
+    found.made.services.close()
+    level = np.zeros(36, int)
+    level[17:19], level[30] = 80, 40
+    found.card["elevation"] = {"barrett": {"all": level.tolist(), "clear": level.tolist()}}
+    told = "\n".join(findings(found.card))
+    # two bins of 5 degrees hold 160 of 200; those within 10 degrees of the horizontal, sin(10 deg) of the sphere
+    assert "**Preferred directions**: of all palms over the table, 80 % within 10° of the horizontal (17 % if" in told
+    assert "clear of the table 20 % have the palm come from 45° or more" in told and "vertical" not in told
+
+
+def test_a_still_joint_is_told_and_no_flaw_that_is_not_there(kitchen: Case) -> None:
+    assert kitchen.card["joints"][STILL_HAND][STILL_JOINT]["used"] < 0.05
+    assert f"**{STILL_HAND} hardly moves** `{STILL_JOINT}`" in kitchen.page
+    told = "\n".join(findings(kitchen.card))
+    for words in (
+        "Rechecks overturned",
+        "ran out of budget",
+        "equal another",
+        "Mixed",
+        "Licence not recorded",
+        "lacks",
+    ):
+        assert words not in told
+
+
+def test_cells_of_sphere_are_equal_and_one_direction_is_one_cell() -> None:
+    rng = np.random.default_rng(3)
+    vectors = rng.normal(size=(48_000, 3))
+    counts = cell_counts(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
+    assert counts.shape == (BANDS, SECTORS) and counts.sum() == 48_000
+    assert np.abs(counts - 1000).max() < 6 * np.sqrt(1000)  # six standard deviations of a count
+    assert evenness(counts.ravel(), counts.size) == pytest.approx(1.0, abs=0.01)
+    counts = cell_counts(np.tile([0.0, 0.0, 1.0], (10, 1)))
+    assert evenness(counts.ravel(), counts.size) == pytest.approx(1 / 48) and evenness([0] * 48, 48) == 0
+    angles = np.radians([-88.0, 2.0, 88.0])
+    vectors = np.stack([np.cos(angles), np.zeros(3), np.sin(angles)], axis=1)
+    assert np.flatnonzero(elevations(vectors)).tolist() == [0, 18, 35]
+
+
+def test_the_use_of_a_joint_is_a_share_of_its_limits() -> None:
+    use = JointUse.of(("a", "b"), {"lower": {"a": -1.0}, "upper": {"a": 1.0}})
+    use.add(("a", "b"), np.stack([np.linspace(-0.5, 0.5, 1001), np.zeros(1001)], axis=1))
+    (found,) = use.shares().values()
+    # bins are 1/200 of the range
+    assert found["used"] == pytest.approx(0.49, abs=0.01) and found["median"] == pytest.approx(0.5, abs=0.005)
+    assert list(use.shares()) == ["a"]
+    assert share(0, 0) is None

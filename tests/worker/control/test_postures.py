@@ -4,17 +4,38 @@ from __future__ import annotations
 
 import dataclasses
 
+import mujoco
 import numpy as np
 import pytest
 import trimesh
+import warp as wp
 
-from graspd.service.model.transforms import apply
+from graspd.service.model.transforms import apply, quat_rotate
+from graspd.worker.control import squeeze as squeezing
 from graspd.worker.control.opening import CLEARANCE_M, JAM_M, PALM_CLEARANCE_M
-from graspd.worker.control.postures import STANDS_OFF_M, hold_forces, normal_force, pregrasp, squeeze, standing_off
+from graspd.worker.control.postures import (
+    CLOSING_M,
+    STANDS_OFF_M,
+    hold_forces,
+    normal_force,
+    pregrasp,
+    squeeze,
+    standing_off,
+    touching_links,
+)
+from graspd.worker.control.squeeze import solved
 from graspd.worker.grasps import Posture
 from graspd.worker.hands.kinematics import body_poses, generalized_forces
+from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.objects.prepare import object_from_path
+from graspd.worker.quality.contact import LINK_CONTACT_M
 from graspd.worker.quality.probe import Probe
+from graspd.worker.validation.decomposition import decompose
+from graspd.worker.validation.model import MujocoOptions, build
+from tests.worker.control import postures_reference as reference
+from tests.worker.hands.grippers import gripper
 from tests.worker.models import object_from_mesh, piece, two_finger_hand
 from tests.worker.quality.helpers import plate_hand, posture
 
@@ -81,16 +102,12 @@ def test_pregrasp_is_clear_and_within_limits() -> None:
     assert (before.joint_positions < held.joint_positions).all()
 
 
-def test_pregrasp_opens_no_further_than_it_must() -> None:
+def test_pregrasp_backs_away_and_opens_no_further_than_it_must() -> None:
     hand = two_finger_hand()
     found = Probe(hand, BOX).measure(pregrasp(hand, BOX, posture(((0, 0, -0.095), (0.05, 0.05)))))
     fingers = np.isin(Probe(hand, BOX).points.body, [1, 2])
     # One step of 0.05 rad moves a tip at most 79 mm times that.
     assert found.distance[0, fingers].min() < CLEARANCE_M + 0.05 * 0.079
-
-
-def test_pregrasp_backs_the_palm_away() -> None:
-    hand = two_finger_hand()
     touching = posture(((0, 0, -0.025), (-0.2, -0.2)))
     before = pregrasp(hand, BOX, touching)
     assert before.hand_pose[0, 2] < touching.hand_pose[0, 2] - PALM_CLEARANCE_M
@@ -106,26 +123,20 @@ def test_fingers_leave_along_the_contact_normals() -> None:
     assert (opened >= CLEARANCE_M).all()
 
 
-def test_pregrasp_of_no_grasps_is_empty() -> None:
-    none = Posture(np.zeros((0, 7)), np.zeros((0, 2)))
-    assert len(pregrasp(two_finger_hand(), BOX, none)) == len(squeeze(two_finger_hand(), BOX, none)) == 0
-
-
-def test_forces_on_a_box_between_plates_balance() -> None:
+def test_forces_between_plates_balance_one_sided_ones_do_not() -> None:
     held = hold_forces(plate_hand(), BOX, CLOSED, total_normal_force=20.0)
     assert held.residual[0] < 0.01
     assert held.torque[0] == pytest.approx([10.0, 10.0], rel=0.02)
+    held = hold_forces(plate_hand(), BOX, posture(((0, 0, 0), (0.065, 0.0))))
+    assert held.residual[0] > 0.5
 
 
-def test_plates_press_with_the_stated_force() -> None:
+def test_plates_press_with_the_stated_force_within_their_stroke() -> None:
     hand = rigid_plates()
     command = squeeze(hand, BOX, CLOSED, total_normal_force=20.0)
     pressed = (command.joint_positions - CLOSED.joint_positions) * hand.stiffness
     # Each plate carries half of the sum of normal forces, along its own slide.
     assert pressed[0] == pytest.approx([10.0, 10.0], rel=0.02)
-
-
-def test_plates_are_not_told_to_go_beyond_their_stroke() -> None:
     # At 100 N/m the force would need a command 0.1 m behind the object: 35 mm are left.
     command = squeeze(plate_hand(), BOX, CLOSED, total_normal_force=20.0)
     assert command.joint_positions[0] == pytest.approx([0.1, 0.1])
@@ -149,14 +160,11 @@ def test_squeeze_respects_a_coupling() -> None:
     assert moved[0, 1] == pytest.approx(0.5 * moved[0, 0])
 
 
-def test_one_sided_contact_cannot_be_balanced() -> None:
-    held = hold_forces(plate_hand(), BOX, posture(((0, 0, 0), (0.065, 0.0))))
-    assert held.residual[0] > 0.5
-
-
-def test_squeeze_without_contact_is_the_grasp() -> None:
+def test_squeeze_without_contact_or_grasps_is_the_grasp() -> None:
     away = posture(((0, 0, 1.0), (0.01, 0.01)))
     assert np.array_equal(squeeze(plate_hand(), BOX, away).joint_positions, away.joint_positions)
+    none = Posture(np.zeros((0, 7)), np.zeros((0, 2)))
+    assert len(pregrasp(two_finger_hand(), BOX, none)) == len(squeeze(two_finger_hand(), BOX, none)) == 0
 
 
 def test_a_grasp_s_postures_do_not_depend_on_its_companions() -> None:
@@ -177,12 +185,12 @@ def test_a_finger_opens_no_farther_than_its_neighbour_lets_it() -> None:
     assert free[0] == pytest.approx(0.004)
 
 
-def test_what_is_light_is_held_more_gently_and_what_is_heavy_more_firmly() -> None:
+def test_what_is_light_is_held_gently_what_is_heavy_firmly() -> None:
     forces = [normal_force(dataclasses.replace(BOX, mass=mass)) for mass in (0.02, 0.1, 0.5, 1.0)]
     assert forces == pytest.approx([10.0, 50.0, 50.0, 100.0])
 
 
-def test_a_finger_stands_off_that_is_near_the_object_and_does_not_touch_it() -> None:
+def test_a_finger_stands_off_that_is_near_and_does_not_touch() -> None:
     # The left plate touches; the right one stands at distances around both limits.
     near, far = STANDS_OFF_M
     rights = np.array([0.0, near - 1e-3, near + 1e-3, far - 1e-3, far + 1e-3])
@@ -191,3 +199,179 @@ def test_a_finger_stands_off_that_is_near_the_object_and_does_not_touch_it() -> 
         np.stack([np.full(len(rights), 0.065), 0.065 - rights], axis=1),
     )
     assert standing_off(PLATES, BOX, grasps).tolist() == [False, False, True, True, False]
+
+
+OBJ = object_from_path("mug", face_error_m=0.002)
+#: Room for the single precision of distances, which weigh the ways of fingers [rad and m].
+SINGLE = 1e-6
+
+
+def around(hand: HandModel, count: int) -> Posture:
+    """Half closed hands around the object: clear ones, touching ones, deep ones."""
+    rng = np.random.default_rng(5)
+    rotation = rng.normal(size=(count, 4))
+    rotation /= np.linalg.norm(rotation, axis=1, keepdims=True)
+    back = quat_rotate(rotation, hand.palm.approach) * rng.uniform(0.02, 0.08, (count, 1))
+    root = OBJ.centre_of_mass - back - quat_rotate(rotation, hand.palm.centre)
+    q = hand.preshape + rng.uniform(0.0, 0.5, (count, hand.dofs)) * hand.closing * hand.span
+    return Posture(np.concatenate([root, rotation], axis=1), hand.expand(np.clip(q, hand.lower, hand.upper)))
+
+
+@pytest.fixture(scope="module", params=["allegro", "barrett"])
+def case(request: pytest.FixtureRequest) -> tuple[HandModel, Probe, Posture]:
+    hand = hand_from_path(request.param)
+    return hand, Probe(hand, OBJ, hand_points=600, object_points=64), around(hand, 24)
+
+
+def test_hands_open_as_in_numpy(case: tuple[HandModel, Probe, Posture]) -> None:
+    hand, probe, grasp = case
+    found, wanted = pregrasp(hand, OBJ, grasp), reference.pregrasp(probe, grasp)
+    np.testing.assert_allclose(found.joint_positions, wanted.joint_positions, atol=SINGLE)
+    np.testing.assert_allclose(found.hand_pose, wanted.hand_pose, atol=1e-12)
+    moved = np.abs(found.joint_positions - grasp.joint_positions).max(axis=1) > 0.01
+    retreated = np.linalg.norm((found.hand_pose - grasp.hand_pose)[:, :3], axis=1) > 0
+    assert moved.sum() > 0
+    assert 0 < retreated.sum() < len(grasp)
+
+
+def test_forces_balance_as_in_numpy(case: tuple[HandModel, Probe, Posture]) -> None:
+    hand, probe, grasp = case
+    held = hold_forces(hand, OBJ, grasp, total_normal_force=20.0, friction=0.3)
+    wanted = reference.balanced(probe, grasp, total_normal_force=20.0, friction=0.3)
+    # Both least squares are exact but for rounding: see test_balance.
+    np.testing.assert_allclose(held.residual, [residual for residual, _ in wanted], atol=1e-8)
+    np.testing.assert_allclose(held.torque, [torque for _, torque in wanted], atol=1e-7)
+    assert 0 < np.count_nonzero(held.residual < 1.0) < len(grasp)
+
+
+def test_fingers_that_stand_off_close_as_in_numpy(case: tuple[HandModel, Probe, Posture]) -> None:
+    hand, probe, grasp = case
+    wanted = reference.balanced(probe, grasp, total_normal_force=20.0, friction=0.3, closing=CLOSING_M)
+    near = reference.balanced(probe, grasp, total_normal_force=20.0, friction=0.3)
+    command = squeeze(hand, OBJ, grasp, total_normal_force=20.0, friction=0.3)
+    pressed = (hand.reduce(command.joint_positions) - hand.reduce(grasp.joint_positions)) * hand.stiffness
+    np.testing.assert_allclose(pressed, [torque for _, torque in wanted], atol=1e-7)
+    assert any(np.abs(a - b).max() > 1e-3 for (_, a), (_, b) in zip(near, wanted, strict=True))
+
+
+def test_links_in_contact_are_counted_as_in_numpy(case: tuple[HandModel, Probe, Posture]) -> None:
+    hand, probe, grasp = case
+    near = probe.touch(grasp, reach=LINK_CONTACT_M).distance < LINK_CONTACT_M
+    wanted = [len(np.unique(probe.points.body[one])) for one in near]
+    assert touching_links(hand, OBJ, grasp).tolist() == wanted
+    assert len(set(wanted)) > 2
+
+
+BALL = object_from_mesh(trimesh.creation.icosphere(4, 0.02))
+#: The pads stand 0.5 mm off each side of the ball, as a planner leaves them. Housing below, ball between the fingers.
+GAP = 5e-4
+AT = np.array([[0, 0, -0.09, 1, 0, 0, 0]])
+
+
+def grasp_of(hand: HandModel) -> Posture:
+    return Posture(AT, hand.expand(np.full((1, hand.dofs), 0.02 + GAP)))
+
+
+def pad_forces(hand: HandModel, obj: ObjectModel, grasp: Posture) -> list[float]:
+    """Normal force at each pad [N] after the hand has pressed for three seconds."""
+    scene = build(hand, obj, decompose(obj), MujocoOptions())
+    data = mujoco.MjData(scene.model)
+    scene.place(data, grasp.hand_pose[0], grasp.joint_positions[0])
+    pressed = squeeze(hand, obj, grasp)
+    scene.command(data, pressed.hand_pose[0], pressed.joint_positions[0])
+    mujoco.mj_step(scene.model, data, nstep=round(3.0 / scene.physics.timestep))
+    forces, out = {1: 0.0, 2: 0.0}, np.zeros(6)
+    for i in range(data.ncon):
+        bodies = {scene.model.body(scene.model.geom_bodyid[geom]).name for geom in data.contact[i].geom}
+        mujoco.mj_contactForce(scene.model, data, i, out)
+        for body in forces:
+            forces[body] += out[0] if f"body{body}" in bodies else 0.0
+    return list(forces.values())
+
+
+@pytest.mark.parametrize(
+    ("coupled", "effort", "each"),
+    [(True, 20.0, 10.0), (False, 20.0, 20.0), (False, 100.0, 25.0)],
+    ids=["one drive shares its limit", "two drives", "no more than is asked for"],
+)
+def test_pads_press_with_the_limit_of_their_drive(coupled: bool, effort: float, each: float) -> None:
+    hand = gripper(coupled=coupled, effort=effort)
+    # A drive that stalls presses with its limit, to within a hundredth when contacts have come to rest. Drives that
+    # follow a position lose what contacts give way: up to 2 mm under 25 N, at a gain of 2 N/mm.
+    low = 0.98 * each if coupled else each - 4.0
+    for force in pad_forces(hand, BALL, grasp_of(hand)):
+        assert low <= force <= 1.02 * each
+
+
+def test_gripper_opens_for_way_in_and_squeezes_within_its_stroke() -> None:
+    for coupled in (True, False):
+        hand = gripper(coupled=coupled)
+        opened = pregrasp(hand, BALL, grasp_of(hand)).joint_positions[0]
+        # At least 3 mm clear of the object, as seen by points on the pads, in steps of 2 mm.
+        assert opened.min() >= 0.0225
+        assert opened.max() <= 0.026
+    hand = gripper()
+    thin = object_from_mesh(trimesh.creation.box((0.004, 0.02, 0.03)))
+    grasp = Posture(AT, hand.expand(np.full((1, 1), 0.002 + GAP)))
+    assert squeeze(hand, thin, grasp).joint_positions.min() >= 0.0
+
+
+def test_a_flat_pad_touches_a_flat_side_at_several_points() -> None:
+    """At one point each a box turns about the line between them: what a flat pad is made to prevent."""
+    box = object_from_mesh(trimesh.creation.box((0.04, 0.05, 0.03)))
+    hand = gripper()
+    scene = build(hand, box, decompose(box), MujocoOptions())
+    data = mujoco.MjData(scene.model)
+    scene.place(data, AT[0], hand.expand(np.full((1, 1), 0.02 - 1e-4))[0])
+    mujoco.mj_forward(scene.model, data)
+    touching = [sorted(data.contact[i].geom) for i in range(data.ncon) if data.contact[i].dist < 0]
+    assert all(touching.count(pair) >= 3 for pair in touching) and len({tuple(pair) for pair in touching}) == 2
+
+
+TARGET = np.zeros(23)
+TARGET[6] = 10.0
+
+
+def nonnegative_weights(matrix: np.ndarray, count: np.ndarray) -> np.ndarray:
+    """`solved` of systems (B, K, 23) for `TARGET` with a ridge of 0.1."""
+    given = [wp.array(a, dtype=kind, device="cpu") for a, kind in ((matrix, wp.float64), (count, wp.int32))]
+    return np.array(solved(given[0], TARGET, 0.1, given[1]).numpy())
+
+
+def systems(count: int, columns: int, seed: int) -> np.ndarray:
+    """(B, K, 23) like those of forces: a wrench of order one, a heavy row of the sum, light torques."""
+    rng = np.random.default_rng(seed)
+    made = rng.normal(size=(count, columns, 23))
+    made[..., :6] += rng.normal(size=(count, 1, 6))
+    made[..., 6] = 10.0
+    made[..., 7:] *= 0.05
+    return made
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("columns", [8, 32, 128])
+def test_weights_are_scipy_s(columns: int, seed: int) -> None:
+    made = systems(16, columns, seed)
+    count = np.random.default_rng(seed).integers(1, columns + 1, 16)
+    found = nonnegative_weights(made, count)
+    wanted = [squeezing._plain(made[b], TARGET, 0.1, int(count[b])) for b in range(16)]
+    # Both are exact but for rounding; the normal equations square the condition, some 1e5 here.
+    np.testing.assert_allclose(found, wanted, atol=1e-9)
+
+
+def test_the_kernel_needs_no_second_way(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(squeezing, "_plain", None)
+    nonnegative_weights(systems(64, 96, 9), np.full(64, 96))
+
+
+def test_weights_keep_to_their_columns_and_leave_out_the_worse() -> None:
+    made = np.zeros((1, 2, 23))
+    made[0, 0, 6], made[0, 1, 6] = 10.0, -10.0
+    found = nonnegative_weights(made, np.array([2]))
+    # min (10 x - 10)^2 + 0.01 x^2
+    np.testing.assert_allclose(found, [[100 / 100.01, 0.0]], rtol=1e-12)
+    made = systems(3, 40, 1)
+    made[:, 20:] = np.nan
+    found = nonnegative_weights(made, np.full(3, 20))
+    assert np.isfinite(found).all()
+    assert not found[:, 20:].any()

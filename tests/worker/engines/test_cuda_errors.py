@@ -86,21 +86,18 @@ def test_a_launch_that_does_not_fit_is_halved_until_it_does(room: int, caplog: p
     assert room == 32 or caplog.messages[0].startswith("too little memory on the GPU for 32 grasps in one launch")
 
 
-def test_a_single_grasp_that_does_not_fit_is_an_error() -> None:
+def test_one_grasp_without_room_and_other_errors_end_the_work() -> None:
     _, launch = work(0)
     with pytest.raises(RuntimeError, match="Failed to allocate"):
         run_parts([range(4)], launch)  # type: ignore[arg-type]
-
-
-def test_other_errors_are_not_tried_again() -> None:
     tried = []
 
-    def launch(part: range) -> None:
+    def lost(part: range) -> None:
         tried.append(part)
         raise RuntimeError("CUDA error 700 detected on device cuda:0: an illegal memory access was encountered")
 
     with pytest.raises(RuntimeError, match="700"):
-        run_parts([range(32)], launch)
+        run_parts([range(32)], lost)
     assert tried == [range(32)]
 
 

@@ -28,13 +28,13 @@ def own_locks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]
         lock.close()
 
 
-def test_each_process_takes_a_gpu_of_its_own_then_they_share_evenly(tmp_path: Path) -> None:
+def test_each_process_takes_its_own_gpu_then_they_share_evenly(tmp_path: Path) -> None:
     taken = [take(FOUR, tmp_path).name for _ in range(10)]
     assert taken[:4] == [gpu.name for gpu in FOUR]
     assert sorted(Counter(taken).values()) == [2, 2, 3, 3]
 
 
-def test_a_process_that_sees_some_of_them_leaves_the_taken_ones_alone(tmp_path: Path) -> None:
+def test_process_that_sees_some_of_them_leaves_taken_ones_alone(tmp_path: Path) -> None:
     """Names count what a process sees, as CUDA_VISIBLE_DEVICES has it; ids are the machine's."""
     assert take(FOUR[:1], tmp_path).id == "GPU-0000"
     seen = [Gpu("cuda:0", "GPU-0000"), Gpu("cuda:1", "GPU-0002")]
@@ -70,16 +70,13 @@ def test_without_a_place_for_locks_it_is_the_first(tmp_path: Path, caplog: pytes
     assert "not told apart" in caplog.text
 
 
-def test_auto_takes_what_is_free_and_a_worker_what_its_number_says(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_number_decides_and_without_a_gpu_auto_is_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(devices, "visible_gpus", lambda: FOUR)
     assert [Device("auto").resolve() for _ in range(2)] == ["cuda:0", "cuda:1"]
     assert Device("auto", number=3).resolve() == "cuda:3"
     named = Device("cuda:2", number=0)
     assert (named.resolve(), named.name) == ("cuda:2", "H200")
     assert Device("auto").resolve() == "cuda:0", "each of the four has one by then"
-
-
-def test_without_a_gpu_auto_is_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(devices, "visible_gpus", list)
     assert Device("auto", number=1).resolve() == "cpu"
     with pytest.raises(InputError, match=r"no device 'cuda:1'; there are: cpu"):

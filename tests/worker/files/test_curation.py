@@ -1,4 +1,4 @@
-"""Parts of datasets: chosen by an expression, balanced, and compared."""
+"""Parts of datasets: chosen by an expression or by kind, balanced, and compared."""
 
 from __future__ import annotations
 
@@ -14,8 +14,10 @@ from graspd.commands.curate import app
 from graspd.exchange.inputs import expand
 from graspd.service.model.errors import InputError
 from graspd.service.readers import Grasps, open_shards
-from graspd.service.store.shards import read_shard, write_shard
+from graspd.service.store.shards import Shard, read_shard, write_shard
 from graspd.worker.files.curation import Balance, faces
+from graspd.worker.files.subsets import choose
+from tests.worker.models import quality_columns
 
 COUNT = 40
 
@@ -24,21 +26,11 @@ def columns(seed: int) -> dict[str, Any]:
     """40 valid grasps, three in four of type power."""
     rng = np.random.default_rng(seed)
     pose = np.concatenate([rng.normal(0, 0.1, (COUNT, 3)), np.tile([1.0, 0, 0, 0], (COUNT, 1))], axis=1)
-    found: dict[str, Any] = {"quality/thresholds_m": np.array([0.005])}
+    found: dict[str, Any] = quality_columns(COUNT) | {"quality/epsilon": np.repeat(rng.random((COUNT, 1)), 2, axis=1)}
     for posture in ("grasp", "pregrasp", "squeeze"):
         found |= {f"{posture}/hand_pose": pose, f"{posture}/joint_positions": rng.random((COUNT, 2))}
-    found |= {f"quality/{name}": rng.random((COUNT, 1)) for name in ("epsilon", "wrench_volume", "contact_area_cm2")}
-    found |= {
-        f"quality/{name}": rng.random(COUNT)
-        for name in ("intersection_volume_cm3", "penetration_depth_mm", "self_penetration_depth_mm", "stability_loss")
-    }
-    return found | {
-        "quality/contact_links": np.full(COUNT, 3, np.int32),
-        "quality/valid": np.ones(COUNT, np.uint8),
-        "quality/success": np.ones(COUNT, np.int8),
-        "quality/grasp_type": np.where(np.arange(COUNT) % 4 < 3, 1, 2).astype(np.int32),
-        "quality/approach_cell": rng.integers(0, 2, COUNT).astype(np.int32),
-    }
+    found["quality/grasp_type"] = np.where(np.arange(COUNT) % 4 < 3, 1, 2).astype(np.int32)
+    return found | {"quality/approach_cell": rng.integers(0, 2, COUNT).astype(np.int32)}
 
 
 def shard(path: Path, number: int, obj: str = "mug", batch: int = 0, **changes: Any) -> Path:
@@ -61,7 +53,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path / "all"
 
 
-def test_a_subset_holds_what_the_expression_chooses_and_nothing_else(folder: Path, tmp_path: Path) -> None:
+def test_subset_holds_what_expression_chooses_and_nothing_else(folder: Path, tmp_path: Path) -> None:
     out = tmp_path / "subset"
     told = json.loads(
         run("grasps", "where", "type = precision and epsilon >= 0.2", "--from", folder, "-o", out, "--json").stdout
@@ -76,7 +68,7 @@ def test_a_subset_holds_what_the_expression_chooses_and_nothing_else(folder: Pat
     assert names <= {"base-00000.h5", "base-00001.h5"}, "what tells of the subset is no file of grasps"
 
 
-def test_a_subset_of_nothing_and_one_over_a_folder_that_is_there_are_refused(folder: Path, tmp_path: Path) -> None:
+def test_a_subset_of_nothing_or_over_a_folder_is_refused(folder: Path, tmp_path: Path) -> None:
     out = tmp_path / "none"
     nothing = run("grasps", "where", "epsilon > 1e6", "--from", folder, "-o", out)
     assert nothing.exit_code == 2 and "none of 120 grasps" in nothing.stderr and not out.exists()
@@ -100,14 +92,11 @@ def test_no_kind_is_more_frequent_than_the_median_one(folder: Path, tmp_path: Pa
 
 
 def test_faces_are_told_by_what_lies_below() -> None:
+    for by in (["beauty"], []):
+        with pytest.raises(InputError, match="type, direction, face"):
+            Balance(by)
     tilted = [np.sin(0.1), 0.0, -np.cos(0.1)]
     assert faces(np.array([[0, 0, -1.0], [0, 1.0, 0], tilted, [0.0, 0, 0], [0, 0, 1.0]])).tolist() == [0, 1, 0, -1, 2]
-
-
-@pytest.mark.parametrize("by", ["beauty", ""])
-def test_a_kind_that_there_is_not_is_refused(by: str) -> None:
-    with pytest.raises(InputError, match="type, direction, face"):
-        Balance([by] if by else [])
 
 
 def test_a_difference_names_cells_counts_and_settings(folder: Path, tmp_path: Path) -> None:
@@ -121,3 +110,36 @@ def test_a_difference_names_cells_counts_and_settings(folder: Path, tmp_path: Pa
     assert cells == {"mug": (2 * COUNT, COUNT, COUNT), "block": (0, COUNT, 0)}
     assert found["settings"] == {"seed": {"first": ["0"], "second": ["0", "9"]}}
     assert "the same grasps in 2 cells" in run("diff", folder, folder).stdout
+    assert "write the digest of a snapshot after @" in run("diff", "kitchen@", folder).stderr
+
+
+def base_of(valid: list[int], feasible: list[int], success: list[int] | None) -> Shard:
+    arrays = {"quality/valid": np.array(valid, np.uint8), "quality/feasible": np.array(feasible, np.uint8)}
+    return Shard("base", {}, arrays | ({} if success is None else {"quality/success": np.array(success, np.int8)}))
+
+
+VALIDATED = base_of([1, 0, 0], [1, 1, 0], [1, 0, 1])
+UNVALIDATED = base_of([0, 0], [1, 0], None)
+
+
+def test_valid_grasps_are_taken_unless_others_are_asked_for() -> None:
+    assert choose(VALIDATED)[0].tolist() == [True, False, False]
+    assert choose(VALIDATED, every=True)[0].all()
+    assert choose(UNVALIDATED, unvalidated=True)[0].tolist() == [True, False]
+    words = [choose(VALIDATED)[1], choose(UNVALIDATED, unvalidated=True)[1], choose(VALIDATED, every=True)[1]]
+    assert words == ["valid grasps", "feasible grasps that are not validated", "grasps of any kind"]
+
+
+@pytest.mark.parametrize(
+    "base, wish, fix",
+    [
+        (UNVALIDATED, {}, "take them with --unvalidated"),
+        (VALIDATED, {"unvalidated": True}, "leave out --unvalidated"),
+        (base_of([0], [1], [0]), {}, "take them with --all"),
+        (base_of([], [], []), {"every": True}, "no grasp at all"),
+        (VALIDATED, {"unvalidated": True, "every": True}, "exclude each other"),
+    ],
+)
+def test_none_of_that_kind_is_told_with_the_mend(base: Shard, wish: dict[str, bool], fix: str) -> None:
+    with pytest.raises(InputError, match=fix):
+        choose(base, **wish)

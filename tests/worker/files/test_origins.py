@@ -8,9 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-from typer.testing import CliRunner
 
-from graspd.cli import build
 from graspd.exchange.inputs import load_case
 from graspd.service.model.domain import JobOptions
 from graspd.service.model.fidelity import FIDELITIES
@@ -22,6 +20,7 @@ from graspd.worker.files.synthesis import SynthesisResult, synthesized
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.rendering.pictures import grasp_pictures
 from graspd.worker.stages.models import object_glb
+from tests.worker.commands_run import graspd
 
 PLACES = {"origin": (0.0, 0.0, 0.0), "6 m": (5.0, -3.0, 2.0), "UTM": (500_000.0, 4_500_000.0, 300.0)}
 AWAY = pytest.mark.parametrize("place", ["6 m", "UTM"])
@@ -113,16 +112,14 @@ def test_views_of_scenes_are_the_same(made: Any, tmp_path: Path, place: str) -> 
     seen = []
     for at in ("origin", place):
         shard, views = file_of(made[at, "table"], tmp_path / f"{at}.h5"), tmp_path / f"{at}-views.h5"
-        words = ["render", shard, "--views", "1", "--width", "48", "--height", "36", "--device", "cpu", "-o", views]
-        done = CliRunner().invoke(build(), [str(word) for word in words])
-        assert done.exit_code == 0, done.output
+        graspd("render --views 1 --width 48 --height 36 --device cpu -o", views, shard)
         seen.append(read_shard(views, kind="views").arrays)
     for name in seen[0]:
         np.testing.assert_array_equal(seen[1][name], seen[0][name], err_msg=name)
 
 
 @AWAY
-def test_a_model_stands_where_its_file_says_in_numbers_about_its_middle(boxes: dict[str, Path], place: str) -> None:
+def test_a_model_stands_where_its_file_says(boxes: dict[str, Path], place: str) -> None:
     import io
 
     scene = trimesh.load(io.BytesIO(object_glb(object_from_path(boxes[place]))), file_type="glb")

@@ -9,7 +9,7 @@ import pytest
 
 from graspd.service.model.states import AssetKind
 from graspd.service.model.transforms import IDENTITY_POSE, compose, invert
-from graspd.service.store.assets import builtin_asset, builtin_files, builtin_names
+from graspd.service.store.assets import builtin_asset, builtin_files
 from graspd.worker.hands.builtins import HANDS, files_of
 from graspd.worker.hands.collisions import touching_bodies
 from graspd.worker.hands.kinematics import body_poses
@@ -22,43 +22,25 @@ ALLEGRO += ["thumb_rotation", "thumb_proximal", "thumb_middle", "thumb_distal"]
 FRAME_TOLERANCE_M = 2e-5
 
 
-def test_all_hands_are_there() -> None:
-    assert set(builtin_names(AssetKind.HAND)) >= set(HANDS) == {"allegro", "barrett", "shadow"}
-
-
-@pytest.mark.parametrize("name", sorted(HANDS))
-def test_the_committed_files_are_what_the_generator_writes(name: str) -> None:
-    assert builtin_files(AssetKind.HAND, name) == files_of(name)
-
-
 @pytest.mark.parametrize(("name", "joints", "dofs"), [("allegro", 16, 16), ("barrett", 8, 4), ("shadow", 22, 22)])
-def test_degrees_of_freedom(name: str, joints: int, dofs: int) -> None:
+def test_files_are_what_the_generator_writes_and_have_their_dofs(name: str, joints: int, dofs: int) -> None:
+    assert builtin_files(AssetKind.HAND, name) == files_of(name)
     hand = hand_from_path(name)
     assert (len(hand.joint_names), hand.dofs) == (joints, dofs)
     assert builtin_asset(AssetKind.HAND, name)[0].digest == hand.digest
 
 
 @pytest.mark.parametrize("name", sorted(HANDS))
-def test_no_two_fingers_touch_in_the_pre_shape(name: str) -> None:
+def test_fingers_stand_out_from_the_palm_and_do_not_touch(name: str) -> None:
     hand = hand_from_path(name)
+    tips = body_poses(hand, IDENTITY_POSE, hand.expand(hand.preshape))[0, list(hand.fingertips), :3]
+    assert ((tips - hand.palm.centre) @ hand.palm.approach).mean() > 0.01
     assert not touching_bodies(hand, hand.preshape, 0.0) - hand.neighbours
-
-
-@pytest.mark.parametrize("name", sorted(HANDS))
-def test_the_palm_centre_lies_on_the_palm(name: str) -> None:
-    hand = hand_from_path(name)
     palm = [piece for piece in hand.pieces if piece.body == 0]
     just_out = hand.palm.centre + 1e-3 * hand.palm.approach
     just_in = hand.palm.centre - 2e-3 * hand.palm.approach
     assert min(float(piece_distance(p, just_out[None])[0]) for p in palm) > 0
     assert min(float(piece_distance(p, just_in[None])[0]) for p in palm) < 0
-
-
-@pytest.mark.parametrize("name", sorted(HANDS))
-def test_fingers_stand_out_on_the_side_of_the_approach(name: str) -> None:
-    hand = hand_from_path(name)
-    tips = body_poses(hand, IDENTITY_POSE, hand.expand(hand.preshape))[0, list(hand.fingertips), :3]
-    assert ((tips - hand.palm.centre) @ hand.palm.approach).mean() > 0.01
 
 
 def frames_of(name: str | Path, joints: dict[str, float]) -> dict[str, np.ndarray]:

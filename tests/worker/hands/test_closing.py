@@ -1,17 +1,23 @@
-"""Which way joints close a hand: where its fingertips go, whatever its limits say."""
+"""Which way joints close a hand, and where its palm faces, whatever limits and rounding say."""
 
 from __future__ import annotations
 
-import json
+from dataclasses import replace
 from pathlib import Path
 
-from typer.testing import CliRunner
+import numpy as np
+import pytest
 
-from graspd.cli import build
+from graspd.service.model.states import AssetKind
+from graspd.service.model.transforms import Floats, quat_from_axis_angle, quat_multiply, quat_rotate
+from graspd.service.store.asset_summary import summary
+from graspd.service.store.assets import builtin_files
 from graspd.worker.hands.check import check_hand
+from graspd.worker.hands.jaws import fingertip_pad, sign_of
 from graspd.worker.hands.load import load_hand
 from graspd.worker.hands.model import HandModel
-from tests.worker.hands.urdfs import joint, link, robot
+from tests.worker.commands_run import graspd
+from tests.worker.hands.urdfs import joint, link, load, report, robot
 
 _PALM = '<collision><geometry><box size="0.09 0.02 0.09"/></geometry></collision>'
 _PHALANX = '<collision><origin xyz="0 0 0.02"/><geometry><box size="0.014 0.014 0.04"/></geometry></collision>'
@@ -58,39 +64,219 @@ def closing_of(hand: HandModel) -> dict[str, int]:
     return dict(zip(hand.dof_names, (int(one) for one in hand.closing), strict=True))
 
 
-def test_a_thumb_closes_to_the_fingers_against_its_limits() -> None:
-    found = closing_of(hand_of(urdf(*opposing_thumb(limit(-1.5, 0.2)))))
+def test_thumbs_close_to_the_fingers_whatever_their_limits() -> None:
+    text = urdf(*opposing_thumb(limit(-1.5, 0.2)))
+    found = closing_of(hand_of(text))
     assert (found["thumb_bend"], found["thumb_tip"]) == (1, 1)
+    stated = closing_of(hand_of(text, closing={"thumb_bend": -1}))
+    assert stated == {**found, "thumb_bend": -1}, "what is stated of one joint counts for it alone"
     assert closing_of(hand_of(urdf(*opposing_thumb(limit(-1.2, 0.8)))))["thumb_bend"] == 1
-
-
-def test_a_joint_that_goes_as_far_both_ways_is_left_straight() -> None:
     assert closing_of(hand_of(urdf(*opposing_thumb(limit(-1.2, 1.2)))))["thumb_bend"] == 0
-
-
-def test_a_joint_in_line_with_its_finger_closes_nothing() -> None:
     assert closing_of(hand_of(urdf(*opposing_thumb(limit(-0.2, 1.5)))))["thumb_axial"] == 0
-
-
-def test_a_joint_about_the_approach_spreads_and_flexion_closes_whatever_the_limits() -> None:
     found = closing_of(hand_of(urdf(*opposing_thumb(limit(-0.2, 1.5)), bends=limit(-1.0, 1.5))))
     assert [found[f"{name}_spread"] for name in ("index", "ring")] == [0, 0]
     assert [found[f"{name}_{part}"] for name in ("index", "ring") for part in ("bend", "tip")] == [1, 1, 1, 1]
 
 
-def test_what_is_stated_of_one_joint_counts_for_it_alone() -> None:
-    text = urdf(*opposing_thumb(limit(-1.5, 0.2)))
-    stated = closing_of(hand_of(text, closing={"thumb_bend": -1}))
-    assert stated == {**closing_of(hand_of(text)), "thumb_bend": -1}
-
-
-def test_a_finger_that_no_joint_closes_is_told_and_the_closing_is_in_the_json(tmp_path: Path) -> None:
+def test_a_finger_that_no_joint_closes_is_told(tmp_path: Path) -> None:
     text = urdf(*opposing_thumb(limit(-0.2, 1.5)))
     closed = check_hand({"r.urdf": text}, "r", {"approach": [0, 1, 0]})
     assert "no joint closes" not in closed["message"]
     still = {"approach": [0, 1, 0], "closing": dict.fromkeys(("thumb_axial", "thumb_bend", "thumb_tip"), 0)}
     assert "no joint closes the finger of thumb2:" in check_hand({"r.urdf": text}, "r", still)["message"]
     (tmp_path / "r.urdf").write_bytes(text)
-    command = ["hands", "check", str(tmp_path / "r.urdf"), "--approach", "0,1,0", "--no-self-test", "--json"]
-    told = CliRunner().invoke(build(), command)
-    assert json.loads(told.stdout)["closing"] == closing_of(hand_of(text))
+    told = graspd("hands check --approach 0,1,0 --no-self-test", tmp_path / "r.urdf")
+    assert told["closing"] == closing_of(hand_of(text))
+
+
+_PLATE_PALM = '<collision><geometry><box size="0.09 0.09 0.02"/></geometry></collision>'
+#: A finger that leans in by 30 degrees.
+_LEANING = (
+    '<collision><origin xyz="{x} {y} 0.04" rpy="{roll} {pitch} 0"/>'
+    '<geometry><box size="0.012 0.012 0.09"/></geometry></collision>'
+)
+
+
+def three_fingers(outwards: float, **options: object) -> HandModel:
+    """Fingers at 0 .. 1.2 rad that meet ahead of the palm at 0; `outwards` 1: and part from there; -1: they cross."""
+    parts: list[str] = []
+    for number, angle in enumerate(2 * np.pi * np.arange(3) / 3):
+        c, s = np.cos(angle), np.sin(angle)
+        shape = _LEANING.format(x=-0.02 * c, y=-0.02 * s, roll=0.5 * s, pitch=-0.5 * c)
+        axis = f"{-outwards * s} {outwards * c} 0"
+        parts += [
+            link(f"finger{number}", shape),
+            joint(
+                f"bend{number}",
+                "palm",
+                f"finger{number}",
+                origin=f"{0.05 * c} {0.05 * s} 0.01",
+                axis=axis,
+                limit='<limit lower="0" upper="1.2" effort="1" velocity="1"/>',
+            ),
+        ]
+    urdf = robot(link("palm", _PLATE_PALM), *parts)
+    return load_hand({"r.urdf": urdf}, name="r", digest="0" * 32, options={"approach": [0, 0, 1], **options})
+
+
+def test_fingers_that_meet_at_zero_close_to_it_unless_stated() -> None:
+    hand = three_fingers(1.0)
+    assert hand.closing.tolist() == [-1, -1, -1]
+    assert hand.preshape == pytest.approx(0.75 * hand.upper)
+    hand = three_fingers(1.0, closing={"bend0": 1})
+    assert hand.closing.tolist() == [1, -1, -1]
+
+
+def test_a_wrist_that_stands_ahead_of_the_palm_is_not_the_palm() -> None:
+    """A plate of 10 mm whose fingers bend over it, on a wrist that stands 60 mm ahead of it."""
+    plate = '<collision><origin xyz="0 0 0.05"/><geometry><box size="0.01 0.08 0.1"/></geometry></collision>'
+    wrist = '<collision><origin xyz="0 0 -0.03"/><geometry><box size="0.13 0.08 0.06"/></geometry></collision>'
+    finger = '<collision><origin xyz="0 0 0.04"/><geometry><box size="0.01 0.01 0.08"/></geometry></collision>'
+    thumb = '<collision><origin xyz="0.04 0 0"/><geometry><box size="0.08 0.01 0.01"/></geometry></collision>'
+    fingers = [
+        part
+        for number, y in enumerate((-0.03, 0.0, 0.03))
+        for part in (link(f"f{number}", finger), joint(f"j{number}", "palm", f"f{number}", origin=f"0 {y} 0.1"))
+    ]
+    fingers += [link("thumb", thumb), joint("t", "palm", "thumb", origin="0.005 0 0.01", axis="0 -1 0")]
+    hand = load_hand({"r.urdf": robot(link("palm", plate + wrist), *fingers)}, name="r", digest="0" * 32)
+    assert hand.palm.approach == pytest.approx([1, 0, 0])
+    assert hand.palm.centre[0] == pytest.approx(0.005) and 0.05 < hand.palm.centre[2] < 0.1
+
+
+RADIUS = 0.045
+_PLATE_SHAPE = '<geometry><box size="0.16 0.1 0.02"/></geometry>'
+
+
+def rpy(matrix: Floats) -> str:
+    pitch = np.arcsin(-np.clip(matrix[2, 0], -1, 1))
+    return f"{np.arctan2(matrix[2, 1], matrix[2, 2]):.17g} {pitch:.17g} {np.arctan2(matrix[1, 0], matrix[0, 0]):.17g}"
+
+
+def claw(fingers: int, turn: Floats, *, noise: float = 0.0, lower: float = -0.4) -> bytes:
+    """Fingers of two links around the z axis, bending inwards; `turn` (4,) is where the axis goes in the root frame."""
+    random = np.random.default_rng(fingers)
+    matrix = np.stack([quat_rotate(turn, axis) for axis in np.eye(3)], axis=1)
+    place = f'<origin xyz="{_at(matrix @ [0, 0, -0.015])}" rpy="{rpy(matrix)}"/>'
+    palm = f'<collision>{place}<geometry><box size="0.09 0.09 0.03"/></geometry></collision>'
+    parts = [link("palm", palm)]
+    for k in range(fingers):
+        about = quat_from_axis_angle(np.array([0, 0, 1.0]), np.asarray(2 * np.pi * k / fingers))
+        frame = np.stack([quat_rotate(quat_multiply(turn, about), axis) for axis in np.eye(3)], axis=1)
+        at = frame @ (np.array([RADIUS, 0, 0]) + noise * random.normal(size=3))
+        parts += [link(f"a{k}", _bar(0.06)), link(f"b{k}", _bar(0.045))]
+        bend = {"axis": "0 -1 0", "limit": f'<limit lower="{lower}" upper="1.4" effort="10"/>'}
+        base = joint(f"ja{k}", "palm", f"a{k}", origin=_at(at), **bend)
+        parts.append(base.replace("<origin xyz", f'<origin rpy="{rpy(frame)}" xyz'))
+        parts.append(
+            joint(
+                f"jb{k}", f"a{k}", f"b{k}", origin="0 0 0.06", extra=f'<mimic joint="ja{k}" multiplier="0.7"/>', **bend
+            )
+        )
+    return robot(*parts)
+
+
+def _at(point: Floats) -> str:
+    return " ".join(f"{value:.17g}" for value in point)
+
+
+def _bar(length: float) -> str:
+    place = f'<origin xyz="0 0 {length / 2}"/>'
+    return f'<collision>{place}<geometry><box size="0.016 0.018 {length}"/></geometry></collision>'
+
+
+TURNS = {
+    "upright": np.array([1.0, 0, 0, 0]),
+    "on its side": quat_from_axis_angle(np.array([1.0, 0, 0]), np.asarray(np.pi / 2)),
+    "upside down": quat_from_axis_angle(np.array([0, 1.0, 0]), np.asarray(np.pi)),
+    "tilted": quat_from_axis_angle(np.array([0.6, 0.8, 0]), np.asarray(0.5)),
+}
+
+
+@pytest.mark.parametrize("fingers", [3, 4, 5, 6])
+@pytest.mark.parametrize("turn", TURNS)
+def test_the_palm_faces_along_the_fingers_and_all_of_them_close(fingers: int, turn: str) -> None:
+    model = load(claw(fingers, TURNS[turn]))
+    axis = quat_rotate(TURNS[turn], np.array([0, 0, 1.0]))
+    # Rounding of nine digits in the file; a direction within five degrees of a root axis is that axis.
+    np.testing.assert_allclose(model.palm.approach, axis, atol=1e-6)
+    assert (model.closing == 1).all()
+    assert np.linalg.norm(model.palm.centre - (model.palm.centre @ axis) * axis) < 1e-6
+
+
+def test_a_tie_is_told_and_one_that_is_settled_is_not() -> None:
+    # Fingers that lie in the plane in which they begin, half closed: nothing tells its upper side.
+    flat = claw(3, TURNS["upright"], lower=-np.pi)
+    told = "the palm may face either way along its axis, a tie: say which with --approach"
+    lying = flat.replace(b'lower="-3.141592653589793" upper="1.4"', b'lower="1.0707963" upper="2.0707963"').replace(
+        b'multiplier="0.7"', b'multiplier="0"'
+    )
+    facts = report(lying)["facts"]
+    assert told in facts["notes"] and "approach (a tie)" in facts["guessed"]
+    assert any("approach (a tie)" in line for line in summary(AssetKind.HAND, facts))
+    assert told not in report(lying, approach=(0, 0, 1))["facts"]["notes"]
+    assert told not in report(claw(3, TURNS["upright"]))["facts"]["notes"]
+
+
+@pytest.mark.parametrize("degrees", [7.0, 20.0, 35.0, 100.0])
+def test_a_turned_root_frame_turns_the_palm_with_it(degrees: float) -> None:
+    turn = quat_from_axis_angle(np.array([1.0, 2, 3]) / np.sqrt(14), np.asarray(np.deg2rad(degrees)))
+    for fingers in (2, 3):
+        model = load(claw(fingers, turn))
+        np.testing.assert_allclose(model.palm.approach, quat_rotate(turn, np.array([0, 0, 1.0])), atol=1e-6)
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_two_fingers_that_oppose_one_take_hold_between_them(mirrored: bool) -> None:
+    """What the tips do as such a hand closes points half to the side."""
+    side = -1 if mirrored else 1
+    places = ((side * 0.05, 0.0, 0.0), (-side * 0.05, 0.03, np.pi), (-side * 0.05, -0.03, np.pi))
+    parts = [link("palm", f'<collision><origin xyz="{side * 0.03} 0 -0.02"/>{_PLATE_SHAPE}</collision>')]
+    for k, (x, y, yaw) in enumerate(places):
+        about = yaw if not mirrored else np.pi - yaw
+        bend = {"axis": "0 -1 0", "limit": '<limit lower="0" upper="1.4" effort="10"/>'}
+        base = joint(f"j{k}", "palm", f"f{k}", origin=f"{x} {y} 0", **bend)
+        parts += [
+            link(f"f{k}", _bar(0.05)),
+            base.replace("<origin xyz", f'<origin rpy="0 0 {about}" xyz'),
+            link(f"t{k}", _bar(0.04)),
+            joint(f"k{k}", f"f{k}", f"t{k}", origin="0 0 0.05", **bend),
+        ]
+    np.testing.assert_allclose(load(robot(*parts)).palm.approach, [0, 0, 1], atol=1e-9)
+
+
+def test_a_published_hand_in_a_turned_root_frame_faces_as_it_did() -> None:
+    urdf, turn = builtin_files(AssetKind.HAND, "barrett"), "0.3 -0.5 1.1"
+    name = next(name for name in urdf if name.endswith(".urdf"))
+    above = f'{link("world", "")}<joint name="mount" type="fixed"><parent link="world"/><child link="palm"/>'
+    mounted = urdf[name].replace(b"</robot>", f'{above}<origin rpy="{turn}"/></joint></robot>'.encode())
+    options = {"root": "world"}
+    as_it_is = load_hand({name: urdf[name]}, name="h", digest="0" * 32)
+    turned = load_hand({name: mounted}, name="h", digest="0" * 32, options=options)
+    pose = turned.frames["palm"][1]
+    np.testing.assert_allclose(turned.palm.approach, quat_rotate(pose[3:], as_it_is.palm.approach), atol=1e-4)
+    assert turned.closing.tolist() == as_it_is.closing.tolist()
+
+
+def test_rounding_turns_neither_palm_nor_jaws_nor_closing() -> None:
+    for noise in (1e-12, 1e-9, 1e-6, 1e-4):
+        np.testing.assert_allclose(load(claw(3, TURNS["upright"], noise=noise)).palm.approach, [0, 0, 1], atol=1e-9)
+    for noise in (1e-17, -1e-17):
+        line = np.array([noise, 1.0, -noise])
+        assert sign_of(line) == 1 and sign_of(-line) == -1
+        assert sign_of(np.array([1.0, -1.0 - noise, 0])) == 1
+    for lower in ("-0.7", "-0.7000001", "-0.6999999"):
+        assert (load(claw(3, TURNS["upright"]).replace(b'"-0.4"', f'"{lower}"'.encode())).closing == 1).all()
+
+
+def test_a_tip_that_turns_in_place_presses_by_the_joint_before() -> None:
+    roll = joint("roll{0}", "b{0}", "c{0}", origin="0 0 0.045", axis="0 0 1")
+    ball = (
+        '<collision><origin xyz="0 0 0.01"/><geometry><cylinder radius="0.008" length="0.02"/></geometry></collision>'
+    )
+    tips = "".join(link(f"c{k}", ball) + roll.format(k) for k in range(3))
+    model = load(claw(3, TURNS["upright"]).replace(b"</robot>", tips.encode() + b"</robot>"))
+    still = replace(model, preshape=np.zeros(model.dofs))
+    for tip in still.fingertips:
+        # Inwards: -x of the finger's frame, as even as the points of its surface are.
+        assert fingertip_pad(still, tip).normal[0] < -0.9

@@ -7,9 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from graspd.cli import build
 from graspd.service.model.states import AssetKind
 from graspd.service.store.assets import builtin_names
 from graspd.service.store.descriptions import HandCorrections, corrected, facts_of
@@ -17,6 +15,7 @@ from graspd.worker.hands.jaws import pads_of
 from graspd.worker.hands.load import files_from_path, hand_from_path, load_hand
 from graspd.worker.hands.model import HandModel
 from graspd.worker.stages.models import hand_glb
+from tests.worker.commands_run import graspd
 from tests.worker.hands.grippers import gripper
 from tests.worker.hands.urdfs import BOX, joint, link, robot
 
@@ -61,23 +60,15 @@ def test_corrections_and_options_make_the_same_hand(
     there = corrected({"file": "claw.urdf"}, facts, HandCorrections.model_validate(said))
     named = load_hand({"claw.urdf": CLAW, "asset.json": json.dumps(there).encode()}, name="claw", digest="")
 
-    command = [
-        "hands",
-        "check",
-        str(tmp_path / "claw.urdf"),
-        *options,
-        "--no-self-test",
-        "--write",
-        str(tmp_path / "asset.json"),
-    ]
-    assert CliRunner().invoke(build(), command).exit_code == 0
+    written = tmp_path / "asset.json"
+    graspd("hands check --no-self-test --write", written, tmp_path / "claw.urdf", *options)
     here = hand_from_path(tmp_path / "claw.urdf")
     # The page keeps the palm that one sees on it; the command guesses it anew from what else it is told.
     assert same(named, here, palm=palm)
     assert set(there) >= {"root", "palm", "preshape", "closing", "fingertips", "file"}
 
 
-def test_a_corrected_approach_is_a_direction_and_leaves_the_rest_as_it_was() -> None:
+def test_a_corrected_approach_is_a_direction_and_no_more() -> None:
     hand = load_hand({"claw.urdf": CLAW}, name="claw", digest="")
     said = HandCorrections.model_validate({"palm": {"link": "palm", "approach": [0, 2, 0]}})
     there = corrected({"file": "claw.urdf", "approach": [1, 0, 0]}, facts_of(hand_glb(hand)), said)
@@ -86,15 +77,12 @@ def test_a_corrected_approach_is_a_direction_and_leaves_the_rest_as_it_was() -> 
     assert np.allclose(made.palm.centre, hand.palm.centre, atol=2e-6)
 
 
-def test_the_model_tells_every_link_and_where_it_is() -> None:
+def test_the_model_tells_every_link_and_pads_are_where_jaws_meet() -> None:
     hand = load_hand({"claw.urdf": CLAW}, name="claw", digest="")
     facts = facts_of(hand_glb(hand))
     assert set(facts.links) == {"palm", "a", "b", "c", "mount", "tip"} and facts.bodies == ["palm", "a", "b", "c"]
     body, pose = hand.frames["tip"]
     assert hand.body_names[body] == "a" and np.allclose(pose[:3], [0, 0, 0.04])
-
-
-def test_the_pads_of_a_gripper_are_where_its_jaws_meet() -> None:
     one, two = pads_of(gripper())
     assert one.body != two.body and len(one.points) > 3 and len(two.points) > 3
     assert one.normal @ two.normal < -0.95

@@ -71,7 +71,7 @@ def test_the_page_has_its_commands_and_all_of_them_are_run() -> None:
     assert [line for line in LINES if line not in COMMANDS and not line.startswith(with_a_service)] == []
 
 
-def test_what_is_written_and_the_example_of_asset_json_have_the_same_keys(
+def test_what_is_written_has_the_keys_of_the_asset_json_example(
     folder: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.chdir(folder)

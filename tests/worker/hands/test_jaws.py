@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
+from pathlib import Path
+
 import mujoco
 import numpy as np
 import pytest
@@ -34,8 +37,11 @@ def test_what_brings_the_pads_together_closes(zero_is_open: bool, closes: float,
     assert sorted(hand.body_names[body] for body in hand.fingertips) == ["left", "right"]
 
 
-def test_a_stated_closing_goes_over_what_is_seen() -> None:
+def test_what_is_stated_of_closing_gains_and_limits_stays() -> None:
     assert gripper({"closing": {"right_slide": 1}}).closing.tolist() == [1.0]
+    hand = gripper({"stiffness": 300.0}, effort=12.0)
+    assert hand.effort.tolist() == [12.0]
+    assert hand.stiffness.tolist() == [300.0]
 
 
 @pytest.mark.parametrize("zero_is_open", [False, True])
@@ -69,12 +75,6 @@ def test_without_effort_each_pad_gets_newtons(coupled: bool, each: float) -> Non
     assert hand.stiffness == pytest.approx(2000.0 * each / 25.0)
 
 
-def test_stated_gains_and_limits_stay() -> None:
-    hand = gripper({"stiffness": 300.0}, effort=12.0)
-    assert hand.effort.tolist() == [12.0]
-    assert hand.stiffness.tolist() == [300.0]
-
-
 def test_a_gripper_without_fingers_is_refused() -> None:
     slide = joint("slide", "palm", "mount", kind="prismatic", limit='<limit lower="0" upper="0.04" effort="10"/>')
     bare = robot(link("palm"), link("mount", ""), slide)
@@ -83,20 +83,30 @@ def test_a_gripper_without_fingers_is_refused() -> None:
 
 
 @pytest.mark.parametrize("name", ["allegro", "barrett", "shadow"])
-def test_a_hand_of_several_fingers_is_no_gripper(name: str) -> None:
-    """So it starts, steps, opens and squeezes as a hand does: its grasps are what they were without jaws."""
+def test_hands_of_several_fingers_are_no_grippers(name: str) -> None:
+    """So they start, step, open and squeeze as hands do: their grasps are what they were without jaws."""
     hand = hand_from_path(name)
-    assert jaws_of(hand) is None
-    assert (joint_units(hand) == 1.0).all()
-
-
-@pytest.mark.parametrize("fingers", [3, 4, 6])
-def test_digits_that_close_around_a_place_are_no_jaws(fingers: int) -> None:
+    assert jaws_of(hand) is None and (joint_units(hand) == 1.0).all()
+    fingers = {"allegro": 3, "barrett": 4, "shadow": 6}[name]
     hand = ring_hand(fingers, coupling="one drive")
     assert jaws_of(hand) is None
     assert sorted(hand.body_names[tip] for tip in hand.fingertips) == [f"finger_{k}_2" for k in range(fingers)]
     assert hand.closing.tolist() == [1.0]
-
-
-def test_two_digits_of_one_drive_are_jaws() -> None:
     assert jaws_of(ring_hand(2, coupling="one drive")) is not None
+
+
+def grippers() -> Path:
+    """The folder of `airo-models` with its grippers; nothing of the package is run."""
+    found = find_spec("airo_models")
+    if found is None or found.origin is None:
+        pytest.skip("airo-models is not installed: pip install '.[strangers]'")
+    return Path(found.origin).parent / "grippers"
+
+
+def test_a_robotiq_2f_85_opens_as_far_as_its_maker_says() -> None:
+    hand = hand_from_path(str(grippers() / "robotiq_2f_85"))
+    jaws = jaws_of(hand)
+    assert jaws is not None
+    assert hand.dofs == 1
+    # Its data sheet: 85 mm between the pads; the file's meshes are off by a millimetre.
+    assert jaws.opening == pytest.approx(0.085, abs=0.002)

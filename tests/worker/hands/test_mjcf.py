@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass, field, fields
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,8 @@ from graspd.worker.hands.check import check_hand
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import files_from_path, hand_from_path, load_hand
 from graspd.worker.hands.model import HandModel
+from graspd.worker.hands.tendons import Tendon, actuators
+from graspd.worker.objects.disk_cache import TOLD_IF_SET, content_of
 from tests.worker.hands.mjcfs import CLAW, FOUR_BAR, TENDON_CLAW
 
 #: Both sides compute in float64; what is left is rounding over a chain of a dozen rotations [m, and entries of R].
@@ -95,14 +98,11 @@ def package_file(package: str, path: str) -> Path:
     return Path(spec.submodule_search_locations[0]) / path
 
 
-def test_the_arm_above_is_left_out_and_kept_for_export() -> None:
+def test_the_arm_is_kept_apart_and_what_is_no_hand_left_out() -> None:
     hand = load()
     assert hand.root_link == "palm"
     assert [joint.name for joint in hand.arm] == ["wrist"]
     assert "wrist" not in hand.joint_names
-
-
-def test_what_is_no_hand_is_left_out() -> None:
     hand = load(root="mount")
     assert not {"ball", "world"} & set(hand.body_names)
 
@@ -116,17 +116,13 @@ def test_an_equality_couples_joints() -> None:
     assert q["right_curl"] == pytest.approx(0.1 - 0.5 * values["left_spread"])
 
 
-def test_two_joints_on_a_tendon_of_fixed_length_go_together_as_far_as_their_limits_let_them() -> None:
+def test_joints_on_tendons_and_servos_go_as_far_as_limits_let() -> None:
     hand = load(TENDON_CLAW)
     assert hand.dof_names == ("left", "right")
     q = dict(zip(hand.joint_names, hand.expand(np.array([0.6, 0.4])), strict=True))
     # left - 2 left_end keeps its length; the right end would have to bend to -0.4, and its range begins at 0.
     assert q["left_end"] == pytest.approx(0.3)
     assert "right_end" not in q and "right_tip" not in q
-
-
-def test_a_servo_goes_no_farther_than_it_can_be_told() -> None:
-    hand = load(TENDON_CLAW)
     # 20 (u - q) with u to 0.7; and 0.2 u - 20 q with u to 70. The joints alone would go to 1.4.
     assert hand.upper.tolist() == pytest.approx([0.7, 0.7])
 
@@ -151,15 +147,12 @@ def test_servos_give_force_limits_and_gains() -> None:
     assert hand.effort[at["left_spread"]] == pytest.approx(0.3)
 
 
-def test_shapes_that_touch_are_told_from_those_that_are_seen() -> None:
+def test_shapes_that_touch_are_told_from_seen_ones_meshes_placed() -> None:
     hand = load()
     palm = [piece for piece in hand.pieces if piece.link == "palm"]
     assert [piece.size for piece in palm] == [(0.08, 0.06, 0.02)]
     (seen,) = [mesh for mesh in hand.visuals.meshes if mesh.body == 0]
     assert np.ptp(seen.vertices[:, 0]) == pytest.approx(0.1) and seen.colour == pytest.approx((0.2, 0.4, 0.6))
-
-
-def test_a_mesh_is_where_mujoco_puts_it() -> None:
     (piece,) = [p for p in load().pieces if p.link == "left_end" and p.kind == "hull"]
     # 8 x 8 x 16 mm about 30 mm above the body; MuJoCo keeps mesh vertices in single precision.
     np.testing.assert_allclose(piece.vertices.min(axis=0), [-0.004, -0.004, 0.022], atol=1e-6)
@@ -207,16 +200,10 @@ def with_inside(text: str) -> str:
         (CLAW.replace(' range="0 0.025"', ""), "slides without a range"),
     ],
 )
-def test_a_bad_model_is_refused_in_one_line_that_names_the_defect(text: str, named: str) -> None:
+def test_bad_model_is_refused_in_one_line_that_names_the_defect(text: str, named: str) -> None:
     report = report_of(text)
     assert report["verdict"] == "refuse" and named in report["message"]
     assert "\n" not in report["message"] and len(report["message"]) < 400
-
-
-def test_an_include_in_the_folder_is_put_in() -> None:
-    part = b'<mujocoinclude><body name="extra"><geom type="sphere" size="0.01"/></body></mujocoinclude>'
-    text = with_inside('<include file="parts/extra.xml"/>')
-    assert report_of(text, **{"parts/extra.xml": part})["verdict"] == "accept"
 
 
 def test_nothing_but_the_upload_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -230,7 +217,7 @@ def test_nothing_but_the_upload_is_read(tmp_path: Path, monkeypatch: pytest.Monk
             load(text)
 
 
-def test_a_model_brings_what_it_includes_and_names(tmp_path: Path) -> None:
+def test_a_model_brings_what_it_includes_and_reads_nothing_else(tmp_path: Path) -> None:
     (tmp_path / "meshes").mkdir()
     (tmp_path / "meshes" / "tip.stl").write_bytes(tip())
     (tmp_path / "meshes" / "other.stl").write_bytes(tip())
@@ -240,3 +227,88 @@ def test_a_model_brings_what_it_includes_and_names(tmp_path: Path) -> None:
     assert set(found) == {"claw.xml", "extra.xml", "meshes/tip.stl"}
     assert (name, stated) == ("claw", {"file": "claw.xml"})
     assert report_hand(str(tmp_path))["verdict"] == "accept"
+    part = b'<mujocoinclude><body name="extra"><geom type="sphere" size="0.01"/></body></mujocoinclude>'
+    text = with_inside('<include file="parts/extra.xml"/>')
+    assert report_of(text, **{"parts/extra.xml": part})["verdict"] == "accept"
+
+
+FINGERS = ("FF", "MF", "RF", "LF")
+
+
+def pulls(hand: HandModel) -> dict[str, dict[str, float]]:
+    return {t.name: {hand.dof_names[d]: c for d, c in zip(t.dofs, t.coefficients, strict=True)} for t in hand.tendons}
+
+
+def test_joints_on_one_actuated_tendon_are_free_and_share_it() -> None:
+    hand = load()
+    ((name, pulled),) = pulls(hand).items()
+    assert pulled == {"left_bend": 1.0, "left_curl": 0.5}
+    assert name.startswith("tendon")
+    # The model's servo: 4 N m/rad of length, 2 N m at most; joints get the pull times their coefficients.
+    assert hand.tendons[0].gain(hand.stiffness) == pytest.approx(4.0)
+    assert hand.tendons[0].limit(hand.effort) == pytest.approx(2.0)
+
+
+def test_a_command_of_torques_pulls_jaws_keep_their_ratio() -> None:
+    tendon, stiffness = Tendon("t", (0, 2), (1.0, 0.4)), np.array([5.0, 9.0, 2.0])
+    pull = 0.7
+    told = pull * np.array([1.0, 0.0, 0.4]) / stiffness
+    length = actuators((tendon,), 3) @ told
+    assert length.tolist() == pytest.approx([told[0] + 0.4 * told[2], told[1]])
+    assert tendon.gain(stiffness) * length[0] == pytest.approx(pull)
+    text = re.sub('<joint joint="left_curl" coef="0.5"/>', '<joint joint="right_slide" coef="0.5"/>', CLAW)
+    hand = load(re.sub('<position joint="right_slide"[^>]*>', "", text))
+    assert not hand.tendons
+    assert "right_slide" not in hand.dof_names
+
+
+def test_asset_json_puts_joints_on_a_tendon_and_takes_it_away() -> None:
+    barrett = hand_from_path("barrett")
+    assert "finger_1_distal" not in barrett.dof_names
+    said = {"cord": {"finger_1_medial": 1.0, "finger_1_distal": 0.3}}
+    hand = hand_from_path("barrett", {"tendons": said})
+    assert pulls(hand) == said
+    assert set(hand.dof_names) - set(barrett.dof_names) == {"finger_1_distal"}
+    assert not load(tendons={}).tendons
+
+
+@pytest.mark.parametrize(
+    ("tendons", "says"),
+    [
+        ({"t": {"left_bend": 1, "nothing": 1}}, "'nothing', which is no moving joint"),
+        ({"t": {"left_bend": 1, "left_curl": 0}}, "fewer than two joints"),
+        ({"t": {"left_bend": 1, "left_curl": 1}, "u": {"left_curl": 1, "left_spread": 1}}, "'left_curl' is on two"),
+    ],
+)
+def test_a_tendon_that_cannot_be_is_refused_in_one_line(tendons: dict[str, Any], says: str) -> None:
+    with pytest.raises(HandError, match=says) as error:
+        load(tendons=tendons)
+    assert "\n" not in str(error.value)
+
+
+def test_what_a_hand_does_not_have_does_not_change_its_content() -> None:
+    @dataclass
+    class Before:
+        upper: float = 1.0
+
+    @dataclass
+    class After(Before):
+        tendons: tuple[str, ...] = field(default=(), metadata=TOLD_IF_SET)
+
+    # What is known of a hand is kept under it.
+    assert content_of(After()) == content_of(Before())
+    assert content_of(After(tendons=("t",))) != content_of(Before())
+    assert {f.name for f in fields(HandModel) if "told_if_set" in f.metadata} == {"tendons", "drag", "mounting"}
+
+
+def test_a_shadow_urdf_has_the_tendons_that_urdf_cannot_say(shared_data: Path) -> None:
+    path = shared_data / "hands/shadow/shadow_hand_right.urdf"
+    hand = hand_from_path(path)
+    assert pulls(hand) == {f"{f}J0": {f"{f}J2": 1.0, f"{f}J1": 1.0} for f in FINGERS}
+    assert hand.dofs == 22
+    assert not hand_from_path(path, {"tendons": {}}).tendons
+    name, given, stated = files_from_path(path)
+    assert (
+        "FFJ2 and FFJ1, MFJ2 and MFJ1, RFJ2 and RFJ1, LFJ2 and LFJ1 on one tendon each"
+        in check_hand(given, name, stated)["message"]
+    )

@@ -1,4 +1,4 @@
-"""Postures in which fingers oppose one another: they do so by the hand's kinematics, over most of its span."""
+"""Postures in which fingers oppose one another: at pads, on a plane, beside pads; who has none is refused."""
 
 from __future__ import annotations
 
@@ -7,11 +7,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
+from graspd.service.model.domain import JobOptions
+from graspd.service.model.errors import HandError
+from graspd.service.model.transforms import IDENTITY_POSE, apply, quat_rotate
+from graspd.worker.generation import validated_grasps
 from graspd.worker.hands import pinch_postures as oppositions
+from graspd.worker.hands.flat_pinches import HEIGHTS_M, OVER_M, pinches_of
+from graspd.worker.hands.grasp_widths import TURNED_M, Size, _Look, spans_of
 from graspd.worker.hands.kinematics import body_poses
-from graspd.worker.hands.load import hand_from_path
-from graspd.worker.hands.pinch_postures import oppositions_of
+from graspd.worker.hands.load import hand_from_path, load_hand
+from graspd.worker.hands.model import HandModel
+from graspd.worker.hands.pinch_postures import oppositions_of, require_opposing
+from graspd.worker.hands.surface import sample_surface
+from tests.worker.hands.grippers import gripper
+from tests.worker.models import object_from_mesh
 
 
 @pytest.mark.parametrize("name", ["allegro", "barrett", "shadow"])
@@ -31,21 +42,16 @@ def test_fingertips_lie_on_both_sides_of_the_middle(name: str) -> None:
     assert (others - along.min(axis=1) > 0.25 * found.width).all()
 
 
-def test_a_wide_hand_opposes_its_fingers_over_a_range_of_widths() -> None:
+def test_a_wide_hand_opposes_over_a_range_one_finger_nothing() -> None:
     widths = oppositions_of(hand_from_path("barrett")).width
     assert widths[0] < 0.08 < 0.12 < widths[-1]
-
-
-def test_a_hand_of_one_finger_opposes_nothing() -> None:
     hand = hand_from_path("barrett")
     alone = oppositions_of(replace(hand, name="alone", fingertips=hand.fingertips[:1]))
     assert len(alone) == 0
     assert alone.widest == 0.0
 
 
-def test_postures_that_the_machine_keeps_are_those_that_were_found(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_postures_that_machine_keeps_are_those_that_were_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     hand = hand_from_path("barrett")
     found = []
@@ -54,3 +60,132 @@ def test_postures_that_the_machine_keeps_are_those_that_were_found(
         monkeypatch.setattr(oppositions, "_known", {})
         found.append(vars(oppositions_of(hand)))
     assert all(np.array_equal(found[0][name], array) for name, array in found[1].items())
+
+
+HEIGHT_M = 0.012
+
+
+@pytest.mark.parametrize("name", ["allegro", "barrett", "shadow"])
+def test_opposed_fingertips_end_on_one_plane_and_none_is_as_low(name: str) -> None:
+    hand, found = hand_from_path(name), pinches_of(hand_from_path(name), HEIGHT_M)
+    assert len(found) >= 20
+    assert (np.diff(found.width) >= 0).all()
+    down = hand.palm.approach - (found.axis @ hand.palm.approach)[:, None] * found.axis
+    down /= np.linalg.norm(down, axis=1, keepdims=True)
+    bodies = body_poses(hand, np.tile(IDENTITY_POSE, (len(found), 1)), hand.expand(found.q))
+    # How far each piece reaches beyond the middle, which is half the height above the plane.
+    reach = [
+        np.einsum("nvi,ni->nv", apply(bodies[:, p.body, None], p.vertices) - found.middle[:, None], down).max(axis=1)
+        for p in hand.pieces
+    ]
+    tips = {
+        tip: np.max([r for r, p in zip(reach, hand.pieces, strict=True) if p.body == tip], axis=0)
+        for tip in hand.fingertips
+    }
+    lowest = np.max(list(tips.values()), axis=0)
+    assert lowest == pytest.approx(HEIGHT_M / 2, abs=2e-3)  # the surface is sampled
+    low = np.sum([lowest - tip < HEIGHT_M for tip in tips.values()], axis=0)
+    assert (low >= 2).all()
+    others = np.max([r for r, p in zip(reach, hand.pieces, strict=True) if p.body not in hand.fingertips], axis=0)
+    assert (lowest - others > 0.5 * OVER_M).all()
+
+
+def test_what_reaches_the_pads_has_no_such_postures() -> None:
+    hand = hand_from_path("barrett")
+    assert len(pinches_of(hand, HEIGHTS_M[-1] + 1e-4)) == 0
+    assert len(pinches_of(replace(hand, name="alone", fingertips=hand.fingertips[:1]), HEIGHT_M)) == 0
+
+
+@pytest.mark.parametrize("size", ["small", "wide"])
+def test_hand_looks_at_thing_from_both_sides_and_leaves_it_room(size: Size) -> None:
+    hand = hand_from_path("allegro")
+    found, points = spans_of(hand, size), sample_surface(hand, 3000)
+    assert len(found) >= 10
+    assert ((found.q >= hand.lower) & (found.q <= hand.upper)).all()
+    pose = body_poses(hand, np.tile(IDENTITY_POSE, (len(found), 1)), hand.expand(found.q))[:, points.body]
+    place = quat_rotate(pose[..., 3:], points.position) + pose[..., :3]
+    look = quat_rotate(pose[..., 3:], points.normal)
+    for side in (-1, 1):
+        end = found.middle + side * 0.5 * found.width[:, None] * found.axis
+        near = np.linalg.norm(place - end[:, None], axis=2).argmin(axis=1)
+        row = np.arange(len(found))
+        # Points lie 4 mm apart.
+        assert np.linalg.norm(place[row, near] - end, axis=1).max() < 0.006
+        assert np.median(-side * np.einsum("ni,ni->n", look[row, near], found.axis)) > 0.7
+    # A ball at the middle; what is wide may be held at its rim, so that its middle lies ahead. The search sees fewer
+    # points of the hand than are looked at here.
+    if size == "small":
+        clear = np.linalg.norm(place - found.middle[:, None], axis=2).min(axis=1) > 0.2 * found.width
+        assert clear.mean() > 0.9
+
+
+def test_spans_begin_where_pads_end() -> None:
+    hand = hand_from_path("allegro")
+    pads = oppositions_of(hand).width
+    assert spans_of(hand, "small").width[0] < pads[0] - 0.005
+    assert spans_of(hand, "wide").width[-1] > pads[-1] + 0.005
+
+
+def test_pairs_taken_together_cost_what_each_of_them_costs() -> None:
+    look, rng = _Look(hand_from_path("barrett"), "small"), np.random.default_rng(0)
+    count = len(look.holding)
+    held, normal = rng.normal(0, 0.05, (2, count, 3)), rng.normal(size=(2, count, 3))
+    wanted = np.array([0.01, 0.03])
+    found = look._costs(held, normal, wanted)
+    for one, other, its in list(zip(look.one, look.other, found.T, strict=True))[::997]:
+        way = held[:, other] - held[:, one]
+        width = np.linalg.norm(way, axis=1)
+        facing = np.minimum((way * normal[:, one]).sum(axis=1), -(way * normal[:, other]).sum(axis=1)) / width
+        cost = TURNED_M * np.maximum(0, look.facing - facing) + np.abs(width - wanted) + look.round[one, other]
+        # Distances come from squares, so rounding of 1e-17 m² counts most where points nearly meet.
+        np.testing.assert_allclose(its, cost, atol=1e-10)
+    body = look.points.body[look.holding]
+    assert (body[look.one] != body[look.other]).all()
+    assert len(look.one) == (body[:, None] != body).sum() / 2
+
+
+_LINK = (
+    '<link name="{name}"><collision><origin xyz="0 0 0.02"/><geometry><box size="0.01 0.01 0.04"/></geometry>'
+    "</collision></link>"
+)
+_JOINT = (
+    '<joint name="{name}" type="revolute"><parent link="{parent}"/><child link="{child}"/><origin xyz="0 0 0.04"/>'
+    '<axis xyz="0 1 0"/><limit lower="0" upper="0.3" effort="1" velocity="1"/></joint>'
+)
+
+
+def pointer() -> HandModel:
+    """A stick of three links that bends a little: none of them ever faces another."""
+    links = "".join(_LINK.format(name=name) for name in "abc")
+    joints = _JOINT.format(name="one", parent="a", child="b") + _JOINT.format(name="two", parent="b", child="c")
+    files = {"pointer.urdf": f'<robot name="pointer">{links}{joints}</robot>'.encode()}
+    return load_hand(files, name="pointer", digest="0" * 32)
+
+
+def test_without_opposing_digits_grasps_are_not_even_planned() -> None:
+    ball = object_from_mesh(trimesh.creation.icosphere(2, 0.02))
+    with pytest.raises(HandError, match=r"pointer: no two opposing digits.*--root"):
+        validated_grasps(pointer(), ball, JobOptions(want="candidates", grasps=1), count=1)
+
+
+def test_what_a_hand_can_hold_is_asked_once_on_a_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[str] = []
+    answer = oppositions.opposes
+
+    def opposes(hand: HandModel) -> bool:
+        asked.append(hand.name)
+        return answer(hand)
+
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(oppositions, "opposes", opposes)
+    for _ in range(2):
+        oppositions._holding.clear()  # as a process that begins
+        require_opposing(gripper())
+        with pytest.raises(HandError, match="no two opposing digits"):
+            require_opposing(pointer())
+    assert sorted(asked) == sorted([gripper().name, "pointer"])
+    for file in (tmp_path / "graspd" / "opposing").iterdir():
+        file.write_bytes(file.read_bytes()[:-1])
+    oppositions._holding.clear()
+    require_opposing(gripper())
+    assert len(asked) == 3, "an entry that was cut off is none"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 from pathlib import Path
 from typing import Any
@@ -48,23 +49,15 @@ def test_forward_kinematics_agrees_with_yourdfpy(real: tuple[str, Path, HandMode
             np.testing.assert_allclose(poses[body], expected, atol=FRAME_TOLERANCE, err_msg=link)
 
 
-def test_every_real_hand_has_a_surface_and_a_palm(real: tuple[str, Path, HandModel]) -> None:
+def test_every_real_hand_has_surface_palm_and_closes_to_a_point(real: tuple[str, Path, HandModel]) -> None:
     _, _, hand = real
     assert np.linalg.norm(hand.palm.approach) == pytest.approx(1.0)
     assert (hand.lower < hand.upper).all() and (hand.effort > 0).all() and (hand.masses > 0).all()
     assert ((hand.preshape >= hand.lower) & (hand.preshape <= hand.upper)).all()
-
-
-def test_closing_brings_the_fingertips_together(real: tuple[str, Path, HandModel]) -> None:
-    _, _, hand = real
     q = np.stack([hand.preshape, np.clip(hand.preshape + 0.15 * hand.closing, hand.lower, hand.upper)])
     tips = body_poses(hand, np.tile(IDENTITY_POSE, (2, 1)), hand.expand(q))[:, list(hand.fingertips), :3]
     spread = np.linalg.norm(tips - tips.mean(axis=1, keepdims=True), axis=2).mean(axis=1)
     assert spread[1] < spread[0]
-
-
-def test_hulls_are_small_enough_for_fast_queries(real: tuple[str, Path, HandModel]) -> None:
-    _, _, hand = real
     assert max((len(p.faces) for p in hand.pieces if p.kind == "hull"), default=0) <= 100
 
 
@@ -85,15 +78,22 @@ def test_root_and_palm_normal_are_guessed_from_the_urdf_alone(
     np.testing.assert_allclose(hand.palm.approach, normal, atol=1e-9)
 
 
+@functools.cache
 def load(shared_data: Path, name: str) -> HandModel:
     return hand_from_path(shared_data / "hands" / URDFS[name])
 
 
 def bare(shared_data: Path, name: str, **options: object) -> HandModel:
     """The hand from its URDF and meshes alone, without the notes beside them."""
-    return load_hand(bare_files(shared_data, name), name=name, digest="0" * 32, options=options)
+    return _bare(shared_data, name, json.dumps(options))
 
 
+@functools.cache
+def _bare(shared_data: Path, name: str, options: str) -> HandModel:
+    return load_hand(bare_files(shared_data, name), name=name, digest="0" * 32, options=json.loads(options))
+
+
+@functools.cache
 def bare_files(shared_data: Path, name: str) -> dict[str, bytes]:
     _, files, _ = files_from_path(shared_data / "hands" / URDFS[name])
     return {file: content for file, content in files.items() if file != "hand.json"}
@@ -114,72 +114,42 @@ def test_every_real_hand_is_accepted_as_it_is(shared_data: Path) -> None:
         assert len(found["facts"]["dofs"]) == said["dof"] - above
 
 
-def test_allegro_frames_without_inertia_weigh_next_to_nothing(shared_data: Path) -> None:
+def test_allegros_quirks_frames_tips_and_limits_without_zero(shared_data: Path) -> None:
     hand, said = load(shared_data, "allegro"), facts(shared_data, "allegro")
     assert said["inertial_missing"] == ["palm", "wrist"]
     assert hand.masses.sum() == pytest.approx(said["total_mass_kg"], abs=2e-3)
     assert (hand.masses > 0).all()
-
-
-def test_allegro_fingertips_of_one_mesh_file_are_four_equal_pieces(shared_data: Path) -> None:
     tips = [p for p in load(shared_data, "allegro").pieces if p.kind == "hull"]
     assert len(tips) == 4 and len({p.body for p in tips}) == 4
     own = [piece.vertices - piece.vertices.mean(axis=0) for piece in tips]
     spans = [np.sort(np.linalg.norm(vertices, axis=1)) for vertices in own]
     for span in spans[1:]:
         np.testing.assert_allclose(span, spans[0], atol=1e-9)
-
-
-def test_allegro_posture_respects_limits_that_exclude_zero(shared_data: Path) -> None:
     hand = load(shared_data, "allegro")
     thumb = hand.dof_names.index("joint_12.0")
     assert hand.lower[thumb] > 0 and hand.preshape[thumb] >= hand.lower[thumb]
-
-
-def test_the_torque_limit_of_the_notes_goes_over_that_of_the_urdf(shared_data: Path) -> None:
     np.testing.assert_allclose(load(shared_data, "allegro").effort, 0.7)
     np.testing.assert_allclose(bare(shared_data, "allegro").effort, 10.0)
 
 
-def test_shadows_thumb_keeps_its_real_effort(shared_data: Path) -> None:
-    hand = load(shared_data, "shadow")
-    assert hand.effort[hand.dof_names.index("THJ5")] == 5.0
-
-
-def test_barrett_zero_effort_does_not_switch_the_hand_off(shared_data: Path) -> None:
+def test_barretts_quirks_efforts_signs_masses_and_tips(shared_data: Path) -> None:
     assert (load(shared_data, "barrett").effort > 0).all()
-
-
-def test_barrett_closes_in_the_negative_direction(shared_data: Path) -> None:
     hand = load(shared_data, "barrett")
     bending = [i for i, name in enumerate(hand.dof_names) if "prox" not in name]
     assert (hand.closing[bending] == -1).all()
-
-
-def test_barrett_spread_joints_close_nothing(shared_data: Path) -> None:
-    hand = load(shared_data, "barrett")
     assert (hand.closing[[i for i, name in enumerate(hand.dof_names) if "prox" in name]] == 0).all()
-
-
-def test_barrett_masses_are_those_of_the_urdf_however_wrong(shared_data: Path) -> None:
     # 3 kg for a hand of 1 kg: nothing that is static needs them, so they are kept and shown, not corrected.
     hand, said = load(shared_data, "barrett"), facts(shared_data, "barrett")
     assert hand.masses.sum() == pytest.approx(said["total_mass_kg"], rel=1e-4)
-
-
-def test_barrett_link_with_a_typo_in_its_name_is_a_link_like_others(shared_data: Path) -> None:
     hand = load(shared_data, "barrett")
     assert "finger_1_med_liink" in hand.body_names
     assert hand_from_path(shared_data / "hands" / URDFS["barrett"], {"drop": ["finger_1_med_liink"]}).dofs == 6
-
-
-def test_barrett_without_tip_frames_has_its_last_links_as_fingertips(shared_data: Path) -> None:
     hand = bare(shared_data, "barrett")
     named = [hand.body_names[body] for body in hand.fingertips]
     assert sorted(named) == sorted(facts(shared_data, "barrett")["fingertips"].values())
 
 
-def test_bh280_fingers_are_open_and_side_by_side_at_zero(shared_data: Path) -> None:
+def test_bh280_couples_by_mimics_and_stands_open_at_zero(shared_data: Path) -> None:
     hand = load(shared_data, "bh280")
     poses = body_poses(hand, IDENTITY_POSE, hand.expand(np.zeros(4)))[0]
     first, second = (poses[hand.body_names.index(f"bh_finger_{k}3"), :3] for k in (1, 2))
@@ -189,6 +159,9 @@ def test_bh280_fingers_are_open_and_side_by_side_at_zero(shared_data: Path) -> N
     axis = int(np.argmax(np.abs(across)))
     assert np.delete(across, axis) == pytest.approx([0.0, 0.0], abs=1e-6) and abs(across[axis]) < 0.06
     assert np.linalg.norm(third - first) > 0.1
+    assert hand.dofs == 4 and len(hand.joint_names) == 8
+    joints = dict(zip(hand.joint_names, hand.expand(np.array([0.0, 0.0, 1.0, 0.0])), strict=True))
+    assert joints["bh_j13_joint"] == pytest.approx(0.3442622950819672)
 
 
 def test_bh280_transmissions_and_foreign_tags_do_not_matter(shared_data: Path) -> None:
@@ -198,13 +171,6 @@ def test_bh280_transmissions_and_foreign_tags_do_not_matter(shared_data: Path) -
     hand = bare(shared_data, "bh280")
     assert not [name for name in hand.body_names if "FROGGER" in name]
     assert len(hand.pieces) >= sum(facts(shared_data, "bh280")["collision_elements"].values())
-
-
-def test_bh280_mimic_tags_leave_four_degrees_of_freedom(shared_data: Path) -> None:
-    hand = load(shared_data, "bh280")
-    assert hand.dofs == 4 and len(hand.joint_names) == 8
-    joints = dict(zip(hand.joint_names, hand.expand(np.array([0.0, 0.0, 1.0, 0.0])), strict=True))
-    assert joints["bh_j13_joint"] == pytest.approx(0.3442622950819672)
 
 
 def test_barrett_with_couplings_is_the_same_hand_as_bh280(shared_data: Path) -> None:
@@ -226,12 +192,16 @@ def test_barrett_with_couplings_is_the_same_hand_as_bh280(shared_data: Path) -> 
         assert np.linalg.norm(a - b) < 0.5e-3
 
 
-def test_shadow_meshes_of_two_units_come_out_alike(shared_data: Path) -> None:
+def test_shadows_meshes_of_two_units_are_closed_hulls(shared_data: Path) -> None:
     hand = load(shared_data, "shadow")
     extents = {p.link: float(np.ptp(p.vertices, axis=0).max()) for p in hand.pieces if p.kind == "hull"}
     # The knuckle is in metres, the distal link in millimetres with a scale: 16 mm and 27 mm parts.
     assert extents["ffknuckle"] == pytest.approx(0.016, abs=2e-3)
     assert extents["ffdistal"] == pytest.approx(0.027, abs=2e-3)
+    assert not facts(shared_data, "shadow")["collision_mesh_files"]["th_distal_pst_full.obj"]["watertight"]
+    (tip,) = (p for p in load(shared_data, "shadow").pieces if p.link == "thdistal" and p.kind == "hull")
+    assert trimesh.Trimesh(tip.vertices, tip.faces).is_watertight
+    assert hand.effort[hand.dof_names.index("THJ5")] == 5.0
 
 
 def test_shadow_has_the_tendon_coupling_that_a_user_adds(shared_data: Path) -> None:
@@ -244,39 +214,24 @@ def test_shadow_has_the_tendon_coupling_that_a_user_adds(shared_data: Path) -> N
     assert all(joints[f"{finger}J1"] == joints[f"{finger}J2"] for finger in fingers)
 
 
-def test_shadow_distal_mesh_that_is_not_watertight_becomes_a_closed_hull(shared_data: Path) -> None:
-    assert not facts(shared_data, "shadow")["collision_mesh_files"]["th_distal_pst_full.obj"]["watertight"]
-    (tip,) = (p for p in load(shared_data, "shadow").pieces if p.link == "thdistal" and p.kind == "hull")
-    assert trimesh.Trimesh(tip.vertices, tip.faces).is_watertight
-
-
-def test_shadow_root_link_without_shape_is_no_obstacle(shared_data: Path) -> None:
+def test_shadows_arm_is_left_out_told_or_kept(shared_data: Path) -> None:
     whole = bare(shared_data, "shadow", root="world")
     assert whole.root_link == "world" and whole.dofs == 24
     assert "forearm" in {piece.link for piece in whole.pieces}
-
-
-def test_the_check_says_which_joints_are_left_out_and_how_to_keep_them(shared_data: Path) -> None:
     files = bare_files(shared_data, "shadow")
     note = "WRJ2, WRJ1 above the palm left out, poses are those of 'palm' (--root world)"
     assert note in check_hand(files, "shadow")["facts"]["notes"]
     assert not any("left out" in one for one in check_hand(files, "shadow", {"root": "world"})["facts"]["notes"])
+    hand = bare(shared_data, "shadow")
+    assert hand.root_link == "palm" and hand.dofs == 22
+    assert not {"forearm", "wrist"} & {piece.link for piece in hand.pieces}
+    path = shared_data / "hands" / URDFS["shadow"]
+    hand = hand_from_path(path, {"root": "world", "fix": {"WRJ1": 0.0, "WRJ2": 0.0}})
+    assert hand.dofs == 22 and hand.root_link == "world"
 
 
-def test_on_its_forearm_a_palm_faces_where_its_fingers_close_and_the_wrist_closes_nothing(shared_data: Path) -> None:
+def test_on_its_forearm_a_palm_faces_where_its_fingers_close(shared_data: Path) -> None:
     hand = hand_from_path(shared_data / "hands/shadow/shadow_hand_right.urdf", {"root": "world"})
     # Noted in the frame of the palm link, (0, -1, 0); the forearm turns that by a quarter about z.
     np.testing.assert_allclose(hand.palm.approach, [1, 0, 0], atol=1e-4)
     assert [hand.closing[hand.dof_names.index(name)] for name in ("WRJ1", "WRJ2", "FFJ3")] == [0, 0, 1]
-
-
-def test_shadow_forearm_and_wrist_are_left_out(shared_data: Path) -> None:
-    hand = bare(shared_data, "shadow")
-    assert hand.root_link == "palm" and hand.dofs == 22
-    assert not {"forearm", "wrist"} & {piece.link for piece in hand.pieces}
-
-
-def test_shadow_wrist_can_be_frozen_instead(shared_data: Path) -> None:
-    path = shared_data / "hands" / URDFS["shadow"]
-    hand = hand_from_path(path, {"root": "world", "fix": {"WRJ1": 0.0, "WRJ2": 0.0}})
-    assert hand.dofs == 22 and hand.root_link == "world"

@@ -34,20 +34,23 @@ def named(hand: HandModel, names: list[str]) -> HandModel:
     return dataclasses.replace(hand, joint_names=tuple(names))
 
 
-def test_the_other_base_is_found() -> None:
+def test_another_base_is_found_another_hand_is_refused() -> None:
     found = same_hand(HAND, other_base(HAND))
     # Double precision, and a least-squares fit that ends at steps of 1e-15.
     assert found.base[:3] == pytest.approx(BASE[:3], abs=1e-8)
     assert abs(float(found.base[3:] @ BASE[3:])) == pytest.approx(1.0, abs=1e-12)
     assert found.fingertips_m < 1e-8
+    axis = HAND.axis.copy()
+    bend = HAND.joint_body[HAND.joint_names.index("MFJ3")]
+    axis[bend] *= -1
+    with pytest.raises(InputError, match=r"fingertip 'MF_distal' is up to \d+\.\d+ mm .* 1 mm are allowed") as error:
+        same_hand(HAND, dataclasses.replace(HAND, name="mirrored", axis=axis))
+    assert "\n" not in str(error.value)
 
 
-def test_names_count_without_what_all_begin_with_and_without_case() -> None:
+def test_neither_order_nor_case_nor_prefix_of_names_counts() -> None:
     other = named(HAND, [f"robot0:{name.lower()}" for name in HAND.joint_names])
     assert same_hand(HAND, other).joints.tolist() == list(range(len(HAND.joint_names)))
-
-
-def test_order_does_not_count() -> None:
     order = np.arange(len(HAND.joint_names))[::-1]
     names, body = [HAND.joint_names[k] for k in order], HAND.joint_body[order]
     other = dataclasses.replace(named(HAND, names), joint_body=body)
@@ -61,15 +64,6 @@ def test_a_joint_of_another_name_is_named_and_can_be_said() -> None:
     assert same_hand(HAND, named(HAND, names), {"FFJ3": "bend"}).fingertips_m < 1e-8
     with pytest.raises(InputError, match="joint 'curl', which shadow does not have"):
         same_hand(HAND, named(HAND, names), {"FFJ3": "curl"})
-
-
-def test_another_hand_of_the_same_joints_is_refused_with_its_farthest_fingertip() -> None:
-    axis = HAND.axis.copy()
-    bend = HAND.joint_body[HAND.joint_names.index("MFJ3")]
-    axis[bend] *= -1
-    with pytest.raises(InputError, match=r"fingertip 'MF_distal' is up to \d+\.\d+ mm .* 1 mm are allowed") as error:
-        same_hand(HAND, dataclasses.replace(HAND, name="mirrored", axis=axis))
-    assert "\n" not in str(error.value)
 
 
 def test_a_urdf_and_the_mjcf_that_is_written_of_it_are_one_hand(tmp_path: Path) -> None:

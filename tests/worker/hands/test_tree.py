@@ -10,14 +10,7 @@ import pytest
 from graspd.service.model.errors import HandError
 from graspd.service.model.transforms import IDENTITY_POSE
 from graspd.worker.hands.kinematics import body_poses
-from graspd.worker.hands.load import load_hand
-from graspd.worker.hands.model import HandModel
-from tests.worker.hands.urdfs import chain, joint, link, robot
-
-
-def load(urdf: bytes, **options: Any) -> HandModel:
-    return load_hand({"h.urdf": urdf}, name="h", digest="0" * 32, options=options)
-
+from tests.worker.hands.urdfs import chain, joint, link, load, robot
 
 THREE = (joint("j1", "palm", "a"), joint("j2", "a", "b"), joint("j3", "b", "c"))
 
@@ -25,6 +18,8 @@ THREE = (joint("j1", "palm", "a"), joint("j2", "a", "b"), joint("j3", "b", "c"))
 def test_a_fixed_joint_merges_its_links_into_one_body() -> None:
     hand = load(chain(joint("j1", "palm", "a"), joint("j2", "a", "b", kind="fixed"), joint("j3", "b", "c")))
     assert hand.body_names == ("palm", "a", "c")
+    whole = load(chain(*THREE)).neighbours
+    assert {(0, 1), (1, 2), (2, 3), (0, 2), (1, 3)} <= whole and (0, 3) not in whole, "parents and grandparents"
     assert [piece.body for piece in hand.pieces if piece.link == "b"] == [1]
     # Link b sits 40 mm up on a, and so does the frame of joint j3, another 40 mm up.
     np.testing.assert_allclose(hand.origin[2, :3], [0, 0, 0.08], atol=1e-12)
@@ -47,45 +42,30 @@ def test_expand_and_reduce_are_inverse() -> None:
     np.testing.assert_allclose(hand.reduce(hand.expand(q)), q, atol=1e-12)
 
 
-def test_the_limits_of_a_follower_bound_the_joint_it_follows() -> None:
+def test_couplings_bound_what_they_follow_and_must_leave_it_room() -> None:
     hand = load(chain(*THREE), couplings={"j3": {"of": "j2", "multiplier": 3.0}})
     assert hand.upper[hand.dof_names.index("j2")] == pytest.approx(0.5)
-
-
-def test_couplings_that_leave_no_room_are_refused() -> None:
     with pytest.raises(HandError, match="no room"):
         load(chain(*THREE), couplings={"j3": {"of": "j2", "multiplier": 1.0, "offset": 5.0}})
 
 
-def test_a_frozen_joint_keeps_its_value_in_the_frames() -> None:
+def test_a_frozen_joint_keeps_its_value_and_freezes_what_follows() -> None:
     frozen = load(chain(*THREE), fix={"j2": 0.7})
     free = load(chain(*THREE))
     assert frozen.joint_names == ("j1", "j3")
     tip = body_poses(free, IDENTITY_POSE, np.array([0.2, 0.7, 0.4]))[0, -1]
     np.testing.assert_allclose(body_poses(frozen, IDENTITY_POSE, np.array([0.2, 0.4]))[0, -1], tip, atol=1e-12)
-
-
-def test_a_joint_that_follows_a_frozen_one_is_frozen_too() -> None:
     hand = load(chain(*THREE), fix={"j1": 0.5}, couplings={"j2": {"of": "j1", "multiplier": 2.0}})
     assert hand.joint_names == ("j3",)
 
 
-def test_a_new_root_drops_what_lies_above_it() -> None:
+def test_roots_and_dropped_links_take_what_hangs_on_them() -> None:
     hand = load(chain(*THREE), root="a")
     assert hand.root_link == "a" and hand.joint_names == ("j2", "j3")
     assert {piece.link for piece in hand.pieces} == {"a", "b", "c"}
-
-
-def test_a_dropped_link_takes_what_hangs_on_it() -> None:
     hand = load(chain(*THREE), drop=["c"])
     assert hand.joint_names == ("j1", "j2")
-
-
-def test_dropping_the_root_moves_it_down() -> None:
     assert load(chain(*THREE), drop=["palm"]).root_link == "a"
-
-
-def test_following_a_dropped_joint_is_refused_with_the_mend() -> None:
     with pytest.raises(HandError, match="--fix j2=0"):
         load(chain(*THREE), root="a", couplings={"j2": {"of": "j1"}})
 
@@ -121,18 +101,9 @@ def test_an_effort_is_assumed_only_where_the_urdf_gives_none() -> None:
     np.testing.assert_allclose(load(chain(*joints, links="abcd")).effort, [0.7, 0.7, 5.0, 100.0])
 
 
-def test_a_continuous_joint_turns_one_way_round() -> None:
+def test_a_continuous_joint_turns_and_a_prismatic_one_slides() -> None:
     hand = load(chain(joint("j1", "palm", "a", kind="continuous", limit="<limit effort='1' velocity='1'/>"), links="a"))
     np.testing.assert_allclose([hand.lower[0], hand.upper[0]], [-np.pi, np.pi])
-
-
-def test_a_prismatic_joint_slides_along_its_axis() -> None:
     hand = load(robot(link("palm"), link("a"), joint("j1", "palm", "a", kind="prismatic")))
     pose = body_poses(hand, IDENTITY_POSE, np.array([0.3]))[0, 1]
     np.testing.assert_allclose(pose[:3], [0, 0.3, 0.04], atol=1e-12)
-
-
-def test_neighbours_are_parents_and_grandparents() -> None:
-    hand = load(chain(*THREE))
-    assert {(0, 1), (1, 2), (2, 3), (0, 2), (1, 3)} <= hand.neighbours
-    assert (0, 3) not in hand.neighbours

@@ -69,12 +69,9 @@ def test_includes_macros_arguments_and_yaml_are_expanded(package: Path) -> None:
     assert {piece.size for piece in hand.pieces if piece.link != "palm"} == {(0.01, 0.02, 0.06)}
 
 
-def test_an_argument_is_said_on_the_command_line(package: Path) -> None:
+def test_an_upload_of_the_package_is_the_same_hand(package: Path) -> None:
     report = report_hand(str(package), {"xacro": {"stroke": "0.03"}})
     assert report["verdict"] == "accept" and report["facts"]["upper"]["left_joint"] == 0.03
-
-
-def test_an_upload_of_the_package_is_the_same_hand(package: Path) -> None:
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:
         for name, data in FILES.items():
@@ -119,12 +116,9 @@ def test_what_reaches_out_or_is_wrong_is_refused_in_one_line(body: str, named: s
     assert named in refusal(body, **{"package.xml": b"<package><name>other</name></package>"})
 
 
-def test_entities_are_refused() -> None:
+def test_entities_are_refused_and_expansion_without_end_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(HandError, match="entities"):
         expand({"x.xacro": b'<!DOCTYPE robot [<!ENTITY a "b">]><robot name="${1}">&a;</robot>'}, "x.xacro", {})
-
-
-def test_an_expansion_without_end_is_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("graspd.worker.hands.xacro.CPU_LIMIT_S", 1)
     assert "takes more than" in refusal('<a b="${9**9**9}"/>')
 
@@ -155,7 +149,7 @@ def test_an_expansion_that_the_machine_ended_refuses_no_hand(code: str, monkeypa
         "import_module('ctypes')",
     ],
 )
-def test_code_that_climbs_out_of_an_expression_finds_the_doors_closed(attempt: str) -> None:
+def test_code_that_climbs_out_of_expression_finds_doors_closed(attempt: str) -> None:
     code = (
         "import os, socket; from importlib import import_module; from graspd.worker.hands import xacro_child as child;"
         f"child._close_doors(5, 2**30)\ntry:\n    {attempt}\nexcept BaseException as error:\n"
@@ -192,17 +186,17 @@ def test_what_a_file_prints_without_end_is_not_kept(monkeypatch: pytest.MonkeyPa
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100 * 1024
 
 
-def test_the_working_directory_does_not_show_in_an_expansion(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    text = CLAW.replace("<robot", '<robot note="$(cwd)"', 1).encode()
-    monkeypatch.chdir(tmp_path)
-    assert tmp_path.name.encode() not in expand({**FILES, "urdf/claw.urdf.xacro": text}, "urdf/claw.urdf.xacro", {})
-
-
 @pytest.mark.parametrize("value", ["str(map(str, [1]))", "(x for x in [1])", "lambda: 1", "xacro.load_yaml", "xacro"])
-def test_what_differs_from_expansion_to_expansion_is_refused(value: str) -> None:
+def test_what_differs_from_expansion_to_expansion_is_refused(
+    value: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    main = "urdf/claw.urdf.xacro"
     text = CLAW.replace("<robot", f'<robot note="${{{value}}}"', 1).encode()
     with pytest.raises(HandError, match="another one each time"):
-        expand({**FILES, "urdf/claw.urdf.xacro": text}, "urdf/claw.urdf.xacro", {})
+        expand({**FILES, main: text}, main, {})
+    monkeypatch.chdir(tmp_path)
+    text = CLAW.replace("<robot", '<robot note="$(cwd)"', 1).encode()
+    assert tmp_path.name.encode() not in expand({**FILES, main: text}, main, {})
 
 
 def test_a_hand_in_the_store_is_expanded_once(monkeypatch: pytest.MonkeyPatch) -> None:

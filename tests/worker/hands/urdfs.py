@@ -2,6 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+from graspd.worker.hands.check import check_hand
+from graspd.worker.hands.load import load_hand
+from graspd.worker.hands.model import HandModel
+
 BOX = '<collision><origin xyz="0 0 0.02"/><geometry><box size="0.02 0.02 0.04"/></geometry></collision>'
 
 
@@ -29,6 +35,15 @@ def joint(
 
 def robot(*parts: str) -> bytes:
     return ('<robot name="test">' + "".join(parts) + "</robot>").encode()
+
+
+def load(urdf: bytes, **options: Any) -> HandModel:
+    return load_hand({"h.urdf": urdf}, name="h", digest="0" * 32, options=options)
+
+
+def report(urdf: bytes, **options: Any) -> dict[str, Any]:
+    """What the check tells of a hand."""
+    return check_hand({"h.urdf": urdf}, "h", options)
 
 
 def chain(*joints: str, links: str = "abc") -> bytes:

@@ -36,7 +36,7 @@ def grasps(name: str, count: int, *, threads: int = 1, seed: int = 0, hand: str 
 
 
 @EACH
-def test_a_grasp_depends_on_seed_and_index_but_not_on_batch_or_threads(name: str) -> None:
+def test_a_grasp_depends_on_seed_and_index_alone(name: str) -> None:
     small, large, other = grasps(name, 2), grasps(name, 5, threads=2), grasps(name, 2, seed=1)
     assert np.array_equal(small.grasp.hand_pose, large.grasp.hand_pose[:2])
     assert np.array_equal(small.grasp.joint_positions, large.grasp.joint_positions[:2])

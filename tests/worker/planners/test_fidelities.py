@@ -87,7 +87,7 @@ def in_a_fresh_process(wanted: list[str]) -> dict[str, dict[str, str]]:
 
 
 @pytest.mark.slow
-def test_every_method_at_two_fidelities_in_one_process_is_as_in_fresh_ones() -> None:
+def test_every_method_in_one_process_is_as_in_fresh_ones() -> None:
     apart = [[f"{name}:{level}" for name in METHODS] for level in PAIR]
     # The other way round in methods, so that what methods share is met in another order, too.
     mixed = [f"{name}:{level}" for name in reversed(METHODS) for level in PAIR]

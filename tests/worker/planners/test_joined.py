@@ -47,16 +47,14 @@ def assert_same(one: GraspSet | Exception, other: GraspSet) -> None:
 
 
 @pytest.mark.parametrize("threads", [1, 2])
-def test_joined_batches_are_those_of_separate_launches_bit_for_bit(pair, threads: int) -> None:
+def test_joined_batches_are_those_of_separate_launches(pair, threads: int) -> None:
     wanted = [PlanRequest(5, QUICK, 1, 0), PlanRequest(3, QUICK, 1, 1), PlanRequest(4, QUICK, 7, 1 << 20)]
     joined = made(pair, [BatchRequest(one, ExecutionContext(threads=threads)) for one in wanted])
     for one, alone in zip(joined, wanted, strict=True):
         assert_same(one, synthesize(*pair, alone, ExecutionContext(threads=1)))
 
 
-def test_a_launch_for_which_memory_does_not_suffice_is_halved_across_batches(
-    pair, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_launch_without_memory_is_halved_across_batches(pair, monkeypatch: pytest.MonkeyPatch) -> None:
     wanted = [PlanRequest(3, QUICK, 1, 0), PlanRequest(3, QUICK, 1, 1)]
     alone = [synthesize(*pair, one, ExecutionContext(threads=1)) for one in wanted]
 
@@ -84,7 +82,7 @@ def good_enough(grasps: GraspSet, *_: object) -> np.ndarray:
     return np.zeros(len(grasps))
 
 
-def test_what_is_the_matter_with_one_batch_leaves_the_others_as_they_are(pair) -> None:
+def test_what_is_matter_with_one_batch_leaves_others_as_they_are(pair) -> None:
     hand, obj = pair
     below = on_table(obj, 2, 3)
     below = replace(below, object_pose=below.object_pose - np.array([0, 0, 1.0, 0, 0, 0, 0]))
@@ -110,7 +108,7 @@ def test_what_is_the_matter_with_one_batch_leaves_the_others_as_they_are(pair) -
         assert_same(joined, synthesize(hand, obj, alone, ExecutionContext(threads=1)))
 
 
-def test_a_batch_that_is_cancelled_on_the_way_leaves_the_others_as_they_are(pair) -> None:
+def test_a_batch_that_is_cancelled_leaves_the_others_alone(pair) -> None:
     wanted = [PlanRequest(2, QUICK, 1, 0), PlanRequest(2, QUICK, 1, 1)]
     told: list[str] = []
     stopping = ExecutionContext(
@@ -124,14 +122,10 @@ def test_a_batch_that_is_cancelled_on_the_way_leaves_the_others_as_they_are(pair
     assert isinstance(stopped, TaskCancelled)
     assert told == ["starts", "coarse optimization"]
     assert_same(kept, synthesize(*pair, wanted[1], ExecutionContext(threads=1)))
-
-
-def test_where_all_are_cancelled_the_launch_ends(pair) -> None:
-    wanted, told = PlanRequest(2, QUICK), list[str]()
+    # Where all are cancelled the launch ends.
+    told.clear()
     run = ExecutionContext(
         threads=1, progress=lambda done, total, message: told.append(message), cancelled=lambda: bool(told)
     )
-    assert all(
-        isinstance(one, TaskCancelled) for one in made(pair, [BatchRequest(wanted, run), BatchRequest(wanted, run)])
-    )
+    assert all(isinstance(one, TaskCancelled) for one in made(pair, [BatchRequest(one, run) for one in wanted]))
     assert told == ["starts"]

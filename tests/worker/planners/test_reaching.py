@@ -1,4 +1,4 @@
-"""Starts that reach across a free object: fingers on both sides of it, clear of it, whatever is drawn beside them."""
+"""Starts of free hands: draws, those that reach across an object, and hands that open until they have a place."""
 
 from __future__ import annotations
 
@@ -11,13 +11,27 @@ import trimesh
 import graspd
 from graspd.service.model.fidelity import FIDELITIES
 from graspd.service.model.transforms import quat_rotate
+from graspd.studies.stability.assets import ring_hand
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.hands.jaws import fingertip_pad
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.objects.prepare import object_from_path
+from graspd.worker.planners import PlanRequest, synthesize
+from graspd.worker.planners.fast_graspd import starts
 from graspd.worker.planners.fast_graspd.candidates import posture_of
 from graspd.worker.planners.fast_graspd.pairs import pair_of
 from graspd.worker.planners.fast_graspd.reaching import ReachSampling
-from graspd.worker.planners.fast_graspd.starts import CLEAR, RETREATS, clear_starts, start_generator
+from graspd.worker.planners.fast_graspd.starts import (
+    CLEAR,
+    NO_PLACE,
+    RETREATS,
+    clear_starts,
+    open_further,
+    start_generator,
+)
 from graspd.worker.simulation.data import HandState
 from graspd.worker.simulation.model import Model
 from tests.worker.simulation.rigs import object_of
@@ -51,7 +65,7 @@ def spans(model: Model, state: HandState) -> np.ndarray:
     return (x.min(axis=1) < -HALF) & (x.max(axis=1) > HALF)
 
 
-def test_every_second_start_has_fingers_on_both_sides_of_a_wide_box(model: Model) -> None:
+def test_every_second_start_has_fingers_on_both_sides_of_a_box(model: Model) -> None:
     state, _ = starts_of(model, 24, 4)
     looking, reaching = spans(model, state).reshape(24, 2, 2).mean(axis=(0, 1))
     # 0.71 against 0.33: a palm that looks at a random place stands at an edge by chance.
@@ -95,7 +109,7 @@ def test_what_is_too_wide_all_over_is_looked_at_only() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("side", [0.01, 0.2])
-def test_cubes_too_small_or_too_wide_for_pads_are_held_by_other_parts(side: float, tmp_path: Path) -> None:
+def test_cubes_too_small_or_wide_for_pads_are_held_by_others(side: float, tmp_path: Path) -> None:
     file = tmp_path / "cube.stl"
     trimesh.creation.box((side,) * 3).export(file)
     grasps = graspd.synthesize("allegro", file, count=64, want="candidates", seed=23)
@@ -111,3 +125,84 @@ def test_all_starts_reach_around_what_pads_cannot_hold(side: float) -> None:
     assert reaching.only
     _, depth = starts_of(model, 16, 2)
     assert (depth <= CLEAR).mean() > 0.9
+
+
+def drawn_alone(pair: starts._Pair, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Pivot, approach and posture of one draw, as the docstring of the module tells it."""
+    hand = pair.hand
+    face = int(pair.share.searchsorted(rng.random(), side="right"))
+    u, v = rng.random(2)
+    if u + v > 1:
+        u, v = 1 - u, 1 - v
+    a, b, c = pair.corners[face]
+    point = a + u * (b - a) + v * (c - a)
+    normal = np.cross(b - a, c - a)
+    normal /= np.linalg.norm(normal)
+    tilt = starts._frame(normal)[:, :2] @ rng.normal(size=2)
+    angle = np.linalg.norm(tilt) * starts.TILT
+    axis = tilt / np.linalg.norm(tilt)
+    approach = -(normal * np.cos(angle) + np.cross(axis, normal) * np.sin(angle))
+    rng.uniform(0, 2 * np.pi)
+    noise = starts.POSTURE_NOISE * (hand.upper - hand.lower) * rng.normal(size=hand.dofs)
+    pivot = point - pair.centre - approach * rng.uniform(*starts.GAP)
+    return pivot, approach, np.clip(hand.preshape + noise, hand.lower, hand.upper)
+
+
+def test_draws_at_once_are_those_of_each_generator_alone() -> None:
+    hand, obj = hand_from_path("allegro"), object_from_path("mug")
+    pair = starts._Pair.of(hand, obj)
+    state, approach = starts.draw(pair, [starts.start_generator(7, 0, i, 0) for i in range(64)])
+    for i in range(64):
+        pivot, way, q = drawn_alone(pair, starts.start_generator(7, 0, i, 0))
+        # The same numbers in float64, in another order of sums.
+        np.testing.assert_allclose(state.pivot[i], pivot, atol=1e-14)
+        np.testing.assert_allclose(approach[i], way, atol=1e-13)
+        np.testing.assert_allclose(state.q[i], q, atol=1e-14)
+        np.testing.assert_allclose(quat_rotate(state.rotation[i], hand.palm.approach), way, atol=1e-12)
+
+
+DRAFT = FIDELITIES["draft"]
+
+
+@pytest.fixture(scope="module")
+def cube() -> ObjectModel:
+    return object_of(trimesh.creation.box((0.06, 0.06, 0.06)))
+
+
+@pytest.fixture(scope="module")
+def ring() -> HandModel:
+    """Its six fingers stand side by side."""
+    return ring_hand(6)
+
+
+def draft_model(hand: HandModel, obj: ObjectModel) -> Model:
+    pair = pair_of(hand, obj, DRAFT, "cpu")
+    return pair.model(pair.coarse)
+
+
+def test_a_ring_of_six_has_a_place_only_when_it_opens(ring: HandModel, cube: ObjectModel) -> None:
+    model, generators = draft_model(ring, cube), [start_generator(5, 0, i, 0) for i in range(4)]
+    state, depth = clear_starts(model, generators)
+    assert (depth > NO_PLACE).all()
+    assert open_further(model, generators, state, depth, np.array([True, True, True, False])).tolist() == [1, 1, 1, 0]
+    assert (depth[:3] <= CLEAR).all() and depth[3] > NO_PLACE
+    closed = ring.closing > 0
+    assert (state.q[:3, closed].mean(axis=1) < ring.preshape[closed].mean()).all()
+
+
+def test_a_hand_that_has_a_place_keeps_it(cube: ObjectModel) -> None:
+    model, generators = draft_model(hand_from_path("barrett"), cube), [start_generator(5, 0, i, 0) for i in range(4)]
+    state, depth = clear_starts(model, generators)
+    before = state.pivot.copy(), state.rotation.copy(), state.q.copy()
+    assert not open_further(model, generators, state, depth, np.ones(4, bool)).any()
+    for was, now in zip(before, (state.pivot, state.rotation, state.q), strict=True):
+        np.testing.assert_array_equal(was, now)
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_a_grasp_that_opened_does_not_depend_on_its_batch(ring: HandModel, cube: ObjectModel, threads: int) -> None:
+    run = ExecutionContext(threads=threads)
+    many = synthesize(ring, cube, PlanRequest(5, DRAFT, seed=3), run).grasp
+    few = synthesize(ring, cube, PlanRequest(2, DRAFT, seed=3), run).grasp
+    np.testing.assert_array_equal(many.hand_pose[:2], few.hand_pose)
+    np.testing.assert_array_equal(many.joint_positions[:2], few.joint_positions)

@@ -2,40 +2,60 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial.transform import Rotation
 
+from graspd.exchange.inputs import load_case
 from graspd.service.model.errors import InputError, TaskCancelled
-from graspd.service.model.metrics import GRASP_METRICS
-from graspd.service.model.transforms import compose
+from graspd.service.model.metrics import DIRECTION_CELLS, GRASP_METRICS, GraspType, entropy_bits, evenness
+from graspd.service.model.transforms import apply, compose, quat_from_axis_angle
 from graspd.service.store.columns import SCHEMAS
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.grasps import Posture
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path
+from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.surface import sample_surface
+from graspd.worker.objects import disk_cache
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.quality import diversity, probe
 from graspd.worker.quality.contact import (
     choose_contacts,
     contact_distance_consistency_mm,
     finger_of_body,
     spread_contacts,
 )
-from graspd.worker.quality.diversity import explained_variance
+from graspd.worker.quality.diversity import (
+    POINTS,
+    approach_cells,
+    cells_of,
+    distances,
+    distinct,
+    explained_variance,
+    hand_points,
+    nearest,
+)
+from graspd.worker.quality.gate import MAX_PENETRATION_MM, MAX_SELF_PENETRATION_MM, MIN_CONTACT_LINKS, passes
+from graspd.worker.quality.intervals import wilson, wilson_of_mean
+from graspd.worker.quality.overlap import Overlap
 from graspd.worker.quality.probe import HAND_POINTS, REACH_M, Probe
 from graspd.worker.quality.table import MEASURES, measure
 from graspd.worker.quality.volume import SharedVolume, VoxelVolume
 from tests.worker.models import object_from_mesh, two_finger_hand
-from tests.worker.quality.helpers import grasp_set, plate_hand, posture
+from tests.worker.quality.helpers import grasp_set, pad_hand, plate_hand, posture
+from tests.worker.simulation.rigs import ball
 
 #: Single precision of coordinates around 0.1 m.
 SINGLE = 1e-6
 #: Area is a sum over points: one point more or less at each edge of the zone.
 ONE_ROW = 0.03
-#: Volume of the tessellated round pieces against the ideal ones.
-TESSELLATION = 0.01
 
 BOX = object_from_mesh(trimesh.creation.box((0.06, 0.04, 0.05)))
 
@@ -62,13 +82,6 @@ def test_area_of_a_sphere_on_a_plane_is_that_of_the_cap() -> None:
     assert probe.points.area[near].sum() == pytest.approx(2 * 2 * math.pi * 0.011 * 0.004, rel=0.1)
 
 
-def test_area_grows_with_the_threshold() -> None:
-    area = measure(
-        two_finger_hand(), BOX, grasp_set(posture(((0, 0, -0.09), (0.3, 0.3)))), thresholds_m=[0.001, 0.005, 0.01]
-    )
-    assert (np.diff(area["quality/contact_area_cm2"][0]) >= 0).all()
-
-
 @pytest.mark.parametrize("press", [0.001, 0.004])
 def test_volume_and_depth_of_pressed_plates(press: float) -> None:
     row = measure(plate_hand((0.03, 0.03, 0.01)), BOX, grasp_set(closed_on_box(press)))
@@ -87,15 +100,6 @@ def test_volume_of_overlapping_balls_is_the_lens() -> None:
     assert found == pytest.approx(lens * 1e6, rel=0.03)
 
 
-def test_overlapping_pieces_are_counted_once() -> None:
-    hand = plate_hand((0.03, 0.03, 0.01))
-    twice = type(hand)(**{**vars(hand), "pieces": (*hand.pieces, hand.pieces[1])})
-    pose = closed_on_box(0.002)
-    bodies = Probe(hand, BOX).measure(pose).bodies
-    once = SharedVolume(hand, BOX).of(bodies, np.ones((1, 3), bool))
-    assert SharedVolume(twice, BOX).of(bodies, np.ones((1, 4), bool)) == pytest.approx(once, rel=SINGLE)
-
-
 def test_voxels_agree_with_the_exact_volume() -> None:
     hand = plate_hand((0.03, 0.03, 0.01))
     bodies = Probe(hand, BOX).measure(closed_on_box(0.004)).bodies[0]
@@ -103,6 +107,10 @@ def test_voxels_agree_with_the_exact_volume() -> None:
     surface_cm2 = 2 * (2 * 9 + 4 * 3 * 0.4)
     bound = surface_cm2 * voxels.edge * 100 / 2
     assert voxels.volume_cm3(bodies, np.array([1, 2])) == pytest.approx(7.2, abs=bound)
+    # Pieces that overlap are counted once.
+    twice = dataclasses.replace(hand, pieces=(*hand.pieces, hand.pieces[1]))
+    once = SharedVolume(hand, BOX).of(bodies[None], np.ones((1, 3), bool))
+    assert SharedVolume(twice, BOX).of(bodies[None], np.ones((1, 4), bool)) == pytest.approx(once, rel=SINGLE)
 
 
 def test_thin_wall_between_hand_points_is_noticed() -> None:
@@ -133,7 +141,7 @@ def test_hand_far_away_has_zero_in_every_column() -> None:
             assert not row[name].any(), name
 
 
-def test_moving_hand_and_object_together_changes_nothing_but_rounding() -> None:
+def test_moving_hand_and_object_together_changes_nothing() -> None:
     mesh = trimesh.creation.box((0.06, 0.04, 0.05))
     moved = mesh.copy().apply_translation([0.3, -0.2, 0.1])
     here = closed_on_box(0.001)
@@ -144,7 +152,7 @@ def test_moving_hand_and_object_together_changes_nothing_but_rounding() -> None:
         assert a[name] == pytest.approx(b[name], rel=1e-3, abs=1e-3), name
 
 
-def test_columns_are_the_schema_and_the_same_for_any_number_of_threads() -> None:
+def test_columns_are_schema_and_same_for_any_number_of_threads() -> None:
     poses = posture(*(((0, 0, -0.09), (a, a)) for a in np.linspace(0.1, 0.5, 20)))
     one, two = (measure(two_finger_hand(), BOX, grasp_set(poses), run=ExecutionContext(threads=n)) for n in (1, 2))
     # What is optional comes from the validator, or older shards lack it; `valid` comes from the gate.
@@ -154,12 +162,9 @@ def test_columns_are_the_schema_and_the_same_for_any_number_of_threads() -> None
         assert np.array_equal(one[name], two[name], equal_nan=True), name
 
 
-def test_cancelled_table_stops() -> None:
+def test_a_cancelled_table_stops_and_wide_thresholds_are_refused() -> None:
     with pytest.raises(TaskCancelled):
         measure(two_finger_hand(), BOX, grasp_set(closed_on_box(0)), run=ExecutionContext(cancelled=lambda: True))
-
-
-def test_threshold_beyond_reach_is_refused() -> None:
     with pytest.raises(InputError, match="at most 12 mm"):
         measure(two_finger_hand(), BOX, grasp_set(closed_on_box(0)), thresholds_m=[0.05])
 
@@ -191,7 +196,7 @@ def test_held_out_points_differ_from_the_planner_s() -> None:
     assert not (ours[:, None] == theirs[None]).all(axis=-1).any()
 
 
-def test_a_function_that_is_added_to_the_measures_is_measured_of_every_grasp(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_function_added_to_the_measures_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(MEASURES, "least_distance_m", lambda chunk: chunk.found.distance.min(axis=1))
     hand = plate_hand((0.03, 0.03, 0.01))
     table = measure(hand, BOX, grasp_set(closed_on_box(0.0)), thresholds_m=[0.002])
@@ -205,7 +210,7 @@ def test_every_measure_has_its_row_in_the_table_of_metrics() -> None:
     assert set(MEASURES) <= {metric.name for metric in GRASP_METRICS}
 
 
-def test_the_volume_is_measured_where_the_index_tells_it_and_everywhere_if_asked() -> None:
+def test_the_volume_is_measured_where_the_index_tells_it() -> None:
     grasps = grasp_set(closed_on_box(0.0))
     told, every = measure(plate_hand(), BOX, grasps), measure(plate_hand(), BOX, grasps, every_volume=True)
     assert np.isfinite(told["quality/wrench_volume"][0]).tolist() == [False, True, False]
@@ -214,7 +219,7 @@ def test_the_volume_is_measured_where_the_index_tells_it_and_everywhere_if_asked
     np.testing.assert_allclose(told["quality/epsilon"], every["quality/epsilon"], atol=1e-9)
 
 
-def test_points_beyond_reach_are_told_apart_without_being_looked_up() -> None:
+def test_points_beyond_reach_are_told_apart_and_not_looked_up() -> None:
     ball = object_from_mesh(trimesh.creation.icosphere(subdivisions=4, radius=0.03))
     probe = Probe(two_finger_hand(), ball)
     points = np.random.default_rng(0).uniform(-0.05, 0.05, (4000, 3))
@@ -240,7 +245,7 @@ def test_bodies_of_many_postures_are_as_far_as_their_points_say(reach: float) ->
     np.testing.assert_allclose(probe.body_gaps(pose, joints, reach=reach), wanted, atol=1e-7)
 
 
-def test_contacts_of_many_sets_are_those_chosen_one_set_at_a_time() -> None:
+def test_contacts_of_many_sets_are_those_chosen_one_set_at_time() -> None:
     rng = np.random.default_rng(5)
     place, normal = rng.normal(size=(3, 300, 3)), rng.normal(size=(3, 300, 3))
     near = rng.uniform(size=(3, 4, 300)) < np.array([0.0, 0.02, 0.3, 1.0])[:, None]
@@ -250,3 +255,255 @@ def test_contacts_of_many_sets_are_those_chosen_one_set_at_a_time() -> None:
             alone = choose_contacts(near[b, t], place[b], normal[b], scale=0.5, limit=12)
             assert index[b, t, : count[b, t]].tolist() == alone.tolist()
     assert (count[:, 0] == 0).all() and (count[:, 1] > 0).all() and (count[:, 1] <= 12).all()
+
+
+GOOD = {"penetration_depth_mm": 0.5, "self_penetration_depth_mm": 0.0, "contact_links": 3.0}
+
+
+def gate(**changes: float) -> bool:
+    return bool(passes({f"quality/{name}": np.array([value]) for name, value in (GOOD | changes).items()})[0])
+
+
+def test_a_good_grasp_passes_and_an_unmeasured_one_does_not() -> None:
+    assert gate()
+    assert not any(gate(**{name: math.nan}) for name in ("penetration_depth_mm", "self_penetration_depth_mm"))
+
+
+@pytest.mark.parametrize(
+    ("name", "bound", "worse"),
+    [
+        ("penetration_depth_mm", MAX_PENETRATION_MM, 1e-9),
+        ("self_penetration_depth_mm", MAX_SELF_PENETRATION_MM, 1e-9),
+        ("contact_links", MIN_CONTACT_LINKS, -1),
+    ],
+)
+def test_each_bound_is_inclusive_and_decides_alone(name: str, bound: float, worse: float) -> None:
+    assert gate(**{name: bound})
+    assert not gate(**{name: bound + worse})
+
+
+def test_bars_of_shares_and_means_cover_the_truth() -> None:
+    counts = np.random.default_rng(2).binomial(20, 0.2, size=4000)
+    bounds = np.array([wilson(k, 20) for k in range(21)])[counts]
+    assert np.mean((bounds[:, 0] <= 0.2) & (bounds[:, 1] >= 0.2)) == pytest.approx(0.95, abs=0.025)
+    assert wilson(0, 16)[1] > 0.1
+    assert wilson(16, 16)[0] < 0.9
+    for part, whole in ((0, 5), (3, 8), (8, 8), (41, 120)):
+        assert wilson_of_mean(float(part), whole) == pytest.approx(wilson(part, whole), abs=1e-12)
+    assert wilson(2, 8)[0] < wilson_of_mean(2.5, 8)[0] < wilson(3, 8)[0]
+
+
+HAND = plate_hand((0.05, 0.04, 0.01))
+EVERY = np.ones((1, len(HAND.pieces)), bool)
+
+
+def kept_and_shared(obj: ObjectModel, postures: Posture) -> tuple[np.ndarray, np.ndarray]:
+    """(B, P) what the test keeps, and the volume that each piece shares with the object by the boolean [cm^3]."""
+    probe, volume = Probe(HAND, obj, hand_points=300, object_points=500), SharedVolume(HAND, obj)
+    found, overlap = probe.measure(postures), Overlap(HAND, probe)
+    kept = overlap.of(found, np.repeat(EVERY, len(found.bodies), axis=0))
+    alone = [volume.of(found.bodies, np.arange(len(HAND.pieces)) == np.full((len(kept), 1), p)) for p in range(3)]
+    return kept, np.stack(alone, axis=1)
+
+
+def test_no_piece_that_shares_volume_is_left_out_many_others_are() -> None:
+    rng = np.random.default_rng(4)
+    turn = Rotation.random(200, rng=rng).as_quat(scalar_first=True)
+    # Plates that slide by 0 to 0.1 m around a ball of 0.04 m: in it, at it, beside it.
+    postures = Posture(np.hstack([rng.uniform(-0.05, 0.05, (200, 3)), turn]), rng.uniform(0.0, 0.1, (200, 2)))
+    ball = object_from_mesh(trimesh.creation.icosphere(subdivisions=3, radius=0.04))
+    kept, shared = kept_and_shared(ball, postures)
+    assert not (shared[~kept] > 0).any()
+    assert (shared > 0).sum() > 100 and (~kept).sum() > 100
+    assert (shared[kept] > 0).mean() > 0.9, "only edges beside edges are kept for nothing"
+
+
+def test_a_piece_in_the_object_and_an_object_in_a_piece_are_kept() -> None:
+    at_rest = Posture(np.array([[0, 0, 0, 1.0, 0, 0, 0]]), np.zeros((1, 2)))
+    around = object_from_mesh(trimesh.creation.box((0.6, 0.6, 0.6)))
+    kept, shared = kept_and_shared(around, at_rest)
+    assert kept.all() and (shared > 0).all()
+    crumb = trimesh.creation.box((0.004, 0.004, 0.004))
+    crumb.apply_translation([-0.1, 0, 0])  # in the middle of the left plate
+    kept, shared = kept_and_shared(object_from_mesh(crumb), at_rest)
+    assert kept.tolist() == [[False, True, False]] and shared[0, 1] > 0
+
+
+FINGERS, BALL = two_finger_hand(), ball(subdivisions=2)
+
+
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    return tmp_path / "graspd" / "coarse_grids"
+
+
+def distances_of(found: Probe) -> tuple[np.ndarray, ...]:
+    points = np.random.default_rng(0).uniform(-0.05, 0.05, (500, 3))
+    return (found.skin.coarse.numpy(), *found.signed_distance(points))
+
+
+def same(one: tuple[np.ndarray, ...], other: tuple[np.ndarray, ...]) -> bool:
+    return all(np.array_equal(a, b) and a.dtype == b.dtype for a, b in zip(one, other, strict=True))
+
+
+def test_later_process_measures_with_what_the_first_one_computed(
+    own_cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = distances_of(Probe(FINGERS, BALL, hand_points=100, object_points=64))
+    assert len(list(own_cache.iterdir())) == 1
+
+    def never(self: Any, points: Any, reach: float = 0.0) -> Any:
+        raise AssertionError("it is there already")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Probe, "_query", never)
+        again = Probe(FINGERS, BALL, hand_points=200, object_points=64)
+    assert same(distances_of(again), first)
+
+
+@pytest.mark.parametrize("harm", ["cut", "shape", "kind", "name"])
+def test_an_entry_that_is_not_sound_is_made_again(own_cache: Path, harm: str) -> None:
+    first = distances_of(Probe(FINGERS, BALL, hand_points=100, object_points=64))
+    (file,) = own_cache.iterdir()
+    whole, grid = file.read_bytes(), first[0]
+    harms = {"shape": {"coarse": grid[1:]}, "kind": {"coarse": grid.astype(float)}, "name": {"other": grid}}
+    if harm == "cut":
+        file.write_bytes(whole[:-1])
+    else:
+        disk_cache._write(file, harms[harm])
+    assert same(distances_of(Probe(FINGERS, BALL, hand_points=100, object_points=64)), first)
+    assert file.read_bytes() == whole
+
+
+def test_kernels_of_another_processor_are_another_entry(own_cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    Probe(FINGERS, BALL, hand_points=100, object_points=64)
+    monkeypatch.setattr(probe, "binary_name", lambda module: "that of another processor")
+    Probe(FINGERS, BALL, hand_points=100, object_points=64)
+    assert len(list(own_cache.iterdir())) == 2
+
+
+FIRST, SECOND = np.array([0]), np.array([1])
+
+
+def moved(hand: HandModel, by: float) -> np.ndarray:
+    """Points of a hand at rest and of the same shifted by `by` [m]."""
+    joints = np.zeros((2, len(hand.joint_names)))
+    pose = np.array([[0, 0, 0, 1, 0, 0, 0], [0.6 * by, 0, 0.8 * by, 1, 0, 0, 0]], float)
+    return hand_points(hand, Posture(pose, joints))
+
+
+@pytest.mark.parametrize("by", [0.0, 0.003, 0.05])
+def test_distance_of_a_shifted_hand_is_the_shift(by: float) -> None:
+    # To rounding: every point moves by the same.
+    assert distances(moved(pad_hand(), by), FIRST, SECOND) == pytest.approx([by], abs=1e-12)
+
+
+def test_shifted_hand_is_off_by_the_shift_a_joint_by_its_points() -> None:
+    hand = plate_hand()
+    points = hand_points(hand, posture(((0, 0, 0), (0.02, 0.02)), ((0, 0, 0), (0.03, 0.02))))
+    slid = np.linalg.norm(points[0] - points[1], axis=1) > 1e-9
+    assert 0 < slid.sum() < POINTS
+    assert distances(points, FIRST, SECOND) == pytest.approx([0.010 * slid.mean()], abs=1e-12)
+
+
+def test_distance_does_not_depend_on_where_the_object_lies() -> None:
+    hand = pad_hand()
+    rng = np.random.default_rng(5)
+    two = posture(((0.01, 0, 0), (0.02, 0.03)), ((0, 0.02, 0), (0.01, 0.02)))
+    points = hand_points(hand, two)
+    turn = np.array([*rng.normal(size=3), *quat_from_axis_angle(np.array([0.6, 0, 0.8]), 1.1)])
+    there = apply(np.tile(turn, (2, POINTS, 1)), points)
+    assert distances(there, FIRST, SECOND) == pytest.approx(distances(points, FIRST, SECOND), rel=1e-9)
+
+
+@pytest.mark.parametrize("few", [0, 1000])
+def test_of_grasps_that_are_near_the_first_is_kept(few: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(diversity, "FEW", few)
+    rng = np.random.default_rng(11)
+    points = rng.normal(0, 0.02, (200, 1, 3)) + rng.normal(0, 0.002, (200, 8, 3))
+    kept = distinct(points, 0.01)
+    apart = np.linalg.norm(points[:, None] - points[None], axis=3).mean(axis=2)
+    among = apart[np.ix_(kept, kept)] + np.eye(int(kept.sum()))
+    assert among.min() >= 0.01 and kept[0]
+    for row in np.flatnonzero(~kept):
+        assert apart[row, :row][kept[:row]].min() < 0.01  # nobody is dropped for one that is dropped itself
+
+
+def test_distinct_grasps_keep_the_given_nearest_sees_all_pairs() -> None:
+    points = np.zeros((3, 4, 3))
+    assert distinct(points, 0.0).all()
+    assert distinct(points, 0.005).tolist() == [True, False, False]
+    assert distinct(points, 0.005, given=2).tolist() == [True, True, False]
+    rng = np.random.default_rng(17)
+    # Turned about their middles too, so that near middles are no near grasps.
+    points = rng.normal(0, 0.05, (60, 1, 3)) + rng.normal(0, 0.03, (60, 8, 3))
+    rows, others = np.triu_indices(len(points), 1)
+    assert nearest(points) == pytest.approx(distances(points, rows, others).min(), rel=1e-12)
+    assert nearest(points[:1]) is None and nearest(np.zeros((3, 8, 3))) == 0
+
+
+def test_entropy_of_even_kinds_is_the_logarithm_of_their_number() -> None:
+    assert entropy_bits([7] * 48) == pytest.approx(math.log2(48)) and evenness(
+        [7] * 48, DIRECTION_CELLS
+    ) == pytest.approx(1)
+    assert entropy_bits([9, 0]) == 0 and entropy_bits([]) == 0 and evenness([], 3) == 0
+    assert entropy_bits([1, 1, 2]) == pytest.approx(1.5)
+
+
+def test_cell_of_approach_is_that_of_where_the_palm_comes_from() -> None:
+    hand = pad_hand()  # its palm looks along z
+    upright, upside_down = [1.0, 0, 0, 0], [0.0, 1, 0, 0]
+    low, high = approach_cells(hand, np.array([upright, upside_down]))
+    assert low // 12 == 0 and high // 12 == 3
+    assert cells_of(np.array([[-1.0, -1e-9, -0.9], [1.0, 0, 0.1]])).tolist() == [0, 2 * 12 + 6]
+
+
+def hand_on(radius: float, at: float, q: np.ndarray) -> int:
+    """Type of a grasp of an Allegro hand with dofs q (16,) of a ball that lies before its palm, `at` [m] from it."""
+    hand = hand_from_path("allegro")
+    centre = hand.palm.centre + hand.palm.approach * (at + radius)
+    ball = object_from_mesh(trimesh.creation.icosphere(subdivisions=3, radius=radius))
+    pose = np.array([[*-centre, 1, 0, 0, 0]])
+    grasp = grasp_set(Posture(pose, hand.expand(q[None])))
+    return int(measure(hand, ball, grasp)["quality/grasp_type"][0])
+
+
+def test_a_ball_is_held_in_a_power_grasp_in_the_palm_or_by_pads() -> None:
+    hand = hand_from_path("allegro")
+    closed = np.where(hand.closing != 0, hand.lower + 0.7 * hand.span, hand.preshape)
+    assert hand_on(0.03, 0.0, closed) == GraspType.POWER
+    assert hand_on(0.01, 0.5, hand.preshape) == GraspType.NONE
+    ball = object_from_mesh(trimesh.creation.icosphere(subdivisions=3, radius=0.03))
+    # Pads stand 65 mm from the middle and slide inwards by 65 - 30 - 5 mm.
+    found = measure(pad_hand(), ball, grasp_set(posture(((0, 0, 0), (0.065, 0.065)))))
+    assert found["quality/grasp_type"].tolist() == [GraspType.PRECISION]
+
+
+def test_fingers_that_touch_by_their_sides_are_a_lateral_grasp() -> None:
+    """A thin card between two straight fingers: what they touch it with looks along their axes of flexion."""
+    hand = hand_from_path("allegro")
+    from graspd.worker.hands.kinematics import body_poses
+
+    straight = np.clip(np.zeros(hand.dofs), hand.lower, hand.upper)
+    poses = body_poses(hand, np.array([[0.0, 0, 0, 1, 0, 0, 0]]), hand.expand(straight[None]))[0]
+    first, second = (poses[body, :3] for body in hand.fingertips[:2])
+    middle, across = (first + second) / 2, second - first
+    gap = float(np.linalg.norm(across))
+    width = gap - 2 * 0.0135
+    side = np.argmax(np.abs(across))
+    size = np.full(3, 0.02)
+    size[side] = width
+    card = object_from_mesh(trimesh.creation.box(size))
+    pose = np.array([[*-middle, 1, 0, 0, 0]])
+    found = measure(hand, card, grasp_set(Posture(pose, hand.expand(straight[None]))))
+    assert found["quality/contact_links"][0] >= 2
+    assert found["quality/grasp_type"].tolist() == [GraspType.LATERAL]
+
+
+def test_published_fingertip_grasps_are_precision_grasps(shared_data: Path) -> None:
+    """FRoGGeR plans with four fixed points on the fingertips, so whoever plans nothing else holds nothing else."""
+    case = load_case(shared_data / "reference_grasps" / "frogger_allegro" / "056_tennis_ball.json")
+    some = case.grasps.take(np.arange(6))
+    types = measure(case.hand, case.obj, some, thresholds_m=[0.005])["quality/grasp_type"]
+    assert (types == GraspType.PRECISION).all()

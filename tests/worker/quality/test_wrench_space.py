@@ -1,10 +1,12 @@
-"""The wrench space against closed forms and published values."""
+"""The wrench space and its hull against closed forms, qhull and published values."""
 
 from __future__ import annotations
 
 import json
 import math
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +15,16 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import spearmanr
 
 from graspd.service.model.errors import InputError
-from graspd.worker.quality.wrench_space import cone_edges, measure_space, tangents, wrenches
+from graspd.worker.quality import wrench_space
+from graspd.worker.quality.wrench_space import (
+    MAX_POINTS,
+    Norm,
+    cone_edges,
+    measure_hulls,
+    measure_spaces,
+    tangents,
+    wrenches,
+)
 
 #: The table of reference values is printed with six digits.
 PRINTED = 1e-5
@@ -21,6 +32,18 @@ PRINTED = 1e-5
 JOGGLE = 1e-6
 ORIGIN = np.zeros(3)
 OCTAHEDRON = np.vstack([np.eye(3), -np.eye(3)])
+
+
+def measure_space(edge_wrenches: np.ndarray, norm: Norm = "l1") -> tuple[float, float]:
+    """Epsilon and volume of one space."""
+    one = measure_spaces(edge_wrenches[None], np.array([len(edge_wrenches)]), np.ones(1, bool), norm=norm)
+    return float(one[0][0]), float(one[1][0])
+
+
+def hull_of(points: np.ndarray, whole: bool = True) -> tuple[float, float]:
+    """Radius and volume of one hull; nan where it has none."""
+    one = measure_hulls(points[None], np.array([len(points)]), np.array([whole]))
+    return float(one[0][0]), float(one[1][0])
 
 
 def sphere_space(points: np.ndarray, friction: float, *, radius: float = 1.0, edges: int = 8) -> tuple[float, float]:
@@ -35,49 +58,19 @@ def test_tangents_form_a_right_handed_orthonormal_frame() -> None:
     assert np.allclose(frames.transpose(0, 2, 1) @ frames, np.eye(3), atol=1e-12)
 
 
-@pytest.mark.parametrize(("dimension", "volume"), [(6, 64 / 720), (3, 4 / 3)])
-def test_cross_polytope_has_radius_one_over_root_dimension(dimension: int, volume: float) -> None:
-    points = np.vstack([np.eye(dimension), -np.eye(dimension)])[:, None, :]
-    assert measure_space(points) == pytest.approx((1 / math.sqrt(dimension), volume), abs=PRINTED)
-
-
-def test_antipodal_forces_reach_the_apothem_of_the_friction_pyramid() -> None:
-    forces = cone_edges(np.array([[1.0, 0, 0], [-1.0, 0, 0]]), 0.5)
-    assert measure_space(forces) == pytest.approx(
+def test_spaces_of_closed_form() -> None:
+    for dimension, volume in ((6, 64 / 720), (3, 4 / 3)):
+        points = np.vstack([np.eye(dimension), -np.eye(dimension)])[:, None, :]
+        assert measure_space(points) == pytest.approx((1 / math.sqrt(dimension), volume), abs=PRINTED)
+    # The apothem of the friction pyramid of antipodal forces, which resist no torsion.
+    opposed = np.array([[1.0, 0, 0], [-1.0, 0, 0]])
+    assert measure_space(cone_edges(opposed, 0.5)) == pytest.approx(
         (0.5 * math.cos(math.pi / 8), 8 * 0.25 * math.sin(math.pi / 4)), abs=PRINTED
     )
-
-
-def test_antipodal_hard_fingers_cannot_resist_torsion() -> None:
-    assert sphere_space(np.array([[1.0, 0, 0], [-1.0, 0, 0]]), 0.5) == (0.0, 0.0)
-
-
-@pytest.mark.parametrize(
-    ("friction", "epsilon", "volume"),
-    [(0.2, 0.163299, 0.024992), (0.5, 0.408248, 0.598634), (1.0, 0.816497, 10.615952)],
-)
-def test_octahedral_contacts_on_the_unit_sphere(friction: float, epsilon: float, volume: float) -> None:
-    assert epsilon == pytest.approx(friction * math.sqrt(2 / 3), abs=PRINTED)
-    assert sphere_space(OCTAHEDRON, friction) == pytest.approx((epsilon, volume), abs=PRINTED)
-
-
-@pytest.mark.parametrize(("friction", "volume"), [(0.2, 0.014643), (0.5, 0.3125), (1.0, 4.088889)])
-def test_octahedral_contacts_with_four_edges(friction: float, volume: float) -> None:
-    found = sphere_space(OCTAHEDRON, friction, edges=4)
-    assert found == pytest.approx((friction / math.sqrt(3), volume), abs=PRINTED)
-
-
-def test_torque_scale_divides_the_volume_by_its_cube() -> None:
-    assert sphere_space(OCTAHEDRON, 0.5, radius=2.0) == pytest.approx((0.204124, 0.598634 / 8), abs=PRINTED)
-
-
-def test_six_face_centres_of_a_cube() -> None:
-    points = 0.05 * OCTAHEDRON
-    edges = wrenches(points, -OCTAHEDRON, friction=0.5, centre=ORIGIN, radius=0.05 * math.sqrt(3))
+    assert sphere_space(opposed, 0.5) == (0.0, 0.0)
+    # Face centres of a cube; and forces of unit length along the edges of the cone.
+    edges = wrenches(0.05 * OCTAHEDRON, -OCTAHEDRON, friction=0.5, centre=ORIGIN, radius=0.05 * math.sqrt(3))
     assert measure_space(edges) == pytest.approx((0.235702, 0.115207), abs=PRINTED)
-
-
-def test_unit_force_convention_shrinks_the_octahedral_space() -> None:
     force = cone_edges(-OCTAHEDRON, 0.5, unit="force")
     edges = np.concatenate([force, np.cross(OCTAHEDRON[:, None], force)], axis=-1)
     assert measure_space(edges) == pytest.approx((0.365148, 0.306500), abs=PRINTED)
@@ -88,15 +81,19 @@ TRIPOD = np.array([[math.cos(a), math.sin(a), 0.0] for a in 2 * np.pi * np.arang
 
 
 @pytest.mark.parametrize(
-    ("points", "friction", "epsilon", "volume"),
-    [(TETRAHEDRON, 0.2, 0.137258, 0.009218), (TETRAHEDRON, 0.5, 0.343027, 0.269793),
-     (TETRAHEDRON, 1.0, 0.689186, 5.588981), (TRIPOD, 0.2, 0.103717, 0.001378), (TRIPOD, 0.5, 0.275925, 0.078880),
-     (TRIPOD, 1.0, 0.554694, 2.211303)],
+    ("points", "options", "friction", "epsilon", "volume"),
+    [(OCTAHEDRON, {}, 0.2, 0.2 * math.sqrt(2 / 3), 0.024992), (OCTAHEDRON, {}, 0.5, 0.5 * math.sqrt(2 / 3), 0.598634),
+     (OCTAHEDRON, {}, 1.0, math.sqrt(2 / 3), 10.615952), (OCTAHEDRON, {"edges": 4}, 0.2, 0.2 / math.sqrt(3), 0.014643),
+     (OCTAHEDRON, {"edges": 4}, 0.5, 0.5 / math.sqrt(3), 0.3125), (OCTAHEDRON, {"radius": 2}, 0.5, 0.204124, 0.074829),
+     (OCTAHEDRON, {"edges": 4}, 1.0, 1 / math.sqrt(3), 4.088889),
+     (TETRAHEDRON, {}, 0.2, 0.137258, 0.009218), (TETRAHEDRON, {}, 0.5, 0.343027, 0.269793),
+     (TETRAHEDRON, {}, 1.0, 0.689186, 5.588981), (TRIPOD, {}, 0.2, 0.103717, 0.001378),
+     (TRIPOD, {}, 0.5, 0.275925, 0.078880), (TRIPOD, {}, 1.0, 0.554694, 2.211303)],
 )  # fmt: skip
-def test_four_and_three_contacts_on_the_unit_sphere(
-    points: np.ndarray, friction: float, epsilon: float, volume: float
+def test_contacts_on_the_unit_sphere(
+    points: np.ndarray, options: dict[str, Any], friction: float, epsilon: float, volume: float
 ) -> None:
-    assert sphere_space(points, friction) == pytest.approx((epsilon, volume), abs=PRINTED)
+    assert sphere_space(points, friction, **options) == pytest.approx((epsilon, volume), abs=PRINTED)
 
 
 @pytest.mark.parametrize(("friction", "epsilon", "volume"), [(0.5, 0.469, 1.485), (1.0, 0.939, 23.9)])
@@ -121,7 +118,7 @@ def test_more_edges_approach_the_cone_limit_from_below(points: np.ndarray, frict
     assert eight >= 0.9 * math.cos(math.pi / 8) * bound
 
 
-def test_rotation_and_order_of_contacts_do_not_matter() -> None:
+def test_size_order_and_rotation_of_contacts_do_not_matter() -> None:
     rng = np.random.default_rng(3)
     points = Rotation.random(7, rng=rng).apply([0, 0, 1.0])
     force = cone_edges(-points, 0.7)
@@ -129,9 +126,6 @@ def test_rotation_and_order_of_contacts_do_not_matter() -> None:
     turn = Rotation.random(rng=rng).as_matrix()
     turned = np.einsum("ab,neb->nea", np.kron(np.eye(2), turn), edges)[rng.permutation(7)]
     assert measure_space(turned) == pytest.approx(measure_space(edges), abs=JOGGLE)
-
-
-def test_size_of_the_object_does_not_matter() -> None:
     points = Rotation.random(6, rng=4).apply([0, 0, 1.0])
     small = wrenches(0.03 * points, -points, friction=0.5, centre=ORIGIN, radius=0.04)
     large = wrenches(3.0 * points, -points, friction=0.5, centre=ORIGIN, radius=4.0)
@@ -145,13 +139,10 @@ def test_origin_outside_the_space_has_no_ball() -> None:
     assert volume > 0.0
 
 
-def test_l_infinity_space_is_the_minkowski_sum() -> None:
+def test_the_l_infinity_space_is_a_minkowski_sum_of_few_contacts() -> None:
     contacts = np.array([[[1.0, 0]], [[-1.0, 0]], [[0, 1.0]], [[0, -1.0]]])
     assert measure_space(contacts, norm="linf") == pytest.approx((1.0, 4.0), abs=JOGGLE)
     assert measure_space(contacts, norm="l1") == pytest.approx((math.sqrt(0.5), 2.0), abs=JOGGLE)
-
-
-def test_l_infinity_space_of_many_contacts_is_refused() -> None:
     contacts = np.random.default_rng(0).normal(size=(12, 8, 6))
     with pytest.raises(InputError, match="take at most 4, or L1"):
         measure_space(contacts, norm="linf")
@@ -171,7 +162,7 @@ def frogger_edges(grasp: dict[str, list[list[float]]]) -> np.ndarray:
     return np.concatenate([force, np.cross(np.array(grasp["contact_points_object"])[:, None], force)], axis=-1)
 
 
-def test_published_frogger_grasps_have_their_ferrari_canny_recomputed(shared_data: Path) -> None:
+def test_published_frogger_grasps_have_their_ferrari_canny(shared_data: Path) -> None:
     files = sorted((shared_data / "reference_grasps" / "frogger_allegro").glob("*.json"))
     worst, count = 0.0, 0
     for file in files:
@@ -207,3 +198,103 @@ def test_hull_of_a_published_grasp_agrees_with_exact_merging(shared_data: Path) 
     edges = frogger_edges(json.loads(file.read_text())["grasps"][0])
     exact = ConvexHull(edges.reshape(-1, 6), qhull_options="Qt Qx")
     assert measure_space(edges)[1] == pytest.approx(exact.volume, rel=JOGGLE)
+
+
+#: Both hulls joggle their points, ours by 1e-8; slivers between nearly coplanar points multiply that.
+JOGGLED = 1e-6
+
+
+def contacts(count: int, friction: float = 1.0, seed: int = 0) -> np.ndarray:
+    """(8 count, 6) edge wrenches of contacts on an ellipsoid: eight at a time are coplanar."""
+    normals = Rotation.random(count, rng=seed).apply([0, 0, 1.0])
+    points = -normals * np.array([1.0, 0.7, 0.4])
+    return wrenches(points, normals, friction=friction, centre=np.zeros(3), radius=1.0).reshape(-1, 6)
+
+
+def test_radius_and_volume_are_qhull_s() -> None:
+    clouds = [contacts(count, friction) for count, friction in ((4, 0.5), (8, 1.0), (20, 0.2), (20, 1.0))]
+    clouds += [np.random.default_rng(seed).normal(size=(120, 6)) + 0.3 for seed in range(5)]
+    for points in clouds:
+        theirs = ConvexHull(points, qhull_options="QJ")
+        wanted = (-theirs.equations[:, -1].max(), theirs.volume)
+        assert hull_of(points) == pytest.approx(wanted, rel=JOGGLED, abs=JOGGLED)
+
+
+def test_hulls_of_closed_form() -> None:
+    corners = np.array(np.meshgrid(*[[-1.0, 1.0]] * 6)).reshape(6, -1).T
+    assert hull_of(corners) == pytest.approx((1.0, 64.0), rel=JOGGLED)
+    inner = 0.16 * np.random.default_rng(0).uniform(-1, 1, (40, 6))
+    points = np.vstack([np.eye(6), -np.eye(6), inner])
+    assert hull_of(points) == pytest.approx((1 / math.sqrt(6), 64 / 720), rel=JOGGLED)
+    points = np.random.default_rng(1).normal(size=(60, 6)) + np.array([10.0, 0, 0, 0, 0, 0])
+    theirs = ConvexHull(points)
+    assert hull_of(points)[0] == pytest.approx(-theirs.equations[:, -1].max(), rel=JOGGLED)
+
+
+def test_threads_do_not_disturb_one_another() -> None:
+    sets = [contacts(12, seed=seed) for seed in range(8)]
+    alone = [hull_of(points) for points in sets]
+    with ThreadPoolExecutor(4) as pool:
+        assert list(pool.map(hull_of, sets)) == alone
+
+
+def test_stamps_begin_anew_before_they_run_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    points = contacts(6)
+    before = hull_of(points)
+    monkeypatch.setattr(wrench_space._workspace, "next_stamp", wrench_space._LAST_STAMP - 1)
+    assert hull_of(points) == before
+    assert wrench_space._workspace.next_stamp < 1000
+
+
+def test_too_many_facets_are_no_hull(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(wrench_space, "CAPACITY", 200)
+    monkeypatch.setattr(wrench_space, "_workspace", wrench_space._Workspace())
+    assert np.isnan(hull_of(contacts(12))[0])
+
+
+def test_wrench_space_takes_qhull_where_ours_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    edges = contacts(12).reshape(12, 8, 6)
+    wanted = measure_space(edges)
+    monkeypatch.setattr(
+        "graspd.worker.quality.wrench_space.measure_hulls", lambda clouds, *_: np.full((2, len(clouds)), np.nan)
+    )
+    assert measure_space(edges) == pytest.approx(wanted, rel=JOGGLED)
+
+
+def test_more_points_than_the_workspace_holds_go_to_qhull() -> None:
+    points = np.random.default_rng(2).normal(size=(MAX_POINTS + 8, 6))
+    points /= 1 + np.linalg.norm(points, axis=1, keepdims=True) ** 4
+    theirs = ConvexHull(points)
+    assert measure_space(points[:, None])[1] == pytest.approx(theirs.volume, rel=JOGGLED)
+
+
+@pytest.mark.parametrize(("count", "friction"), [(4, 0.5), (8, 1.0), (20, 0.2), (20, 1.0)])
+@pytest.mark.parametrize("seed", range(4))
+def test_the_radius_alone_is_that_of_the_whole_hull(count: int, friction: float, seed: int) -> None:
+    points = contacts(count, friction, seed)
+    # Where the origin is outside only that is known: how far the nearest facet is from it then says nothing of ε.
+    found, whole = (max(0.0, hull_of(points, one)[0]) for one in (False, True))
+    assert found == pytest.approx(whole, abs=1e-12)  # the same planes, made in another order
+
+
+def test_radius_alone_of_a_cube_and_of_a_cloud_beside_the_origin() -> None:
+    corners = np.array(np.meshgrid(*[[-1.0, 1.0]] * 6)).reshape(6, -1).T
+    inner = np.random.default_rng(0).uniform(-0.9, 0.9, (60, 6))
+    assert hull_of(np.vstack([inner, corners]), False)[0] == pytest.approx(1.0, rel=JOGGLED)
+    beside = [np.random.default_rng(seed).normal(size=(120, 6)) + 5.0 for seed in range(3)]
+    assert all(hull_of(points, False)[0] <= 0 for points in beside)
+
+
+def test_many_hulls_at_once_are_those_of_each_alone() -> None:
+    """Clouds of different sizes, a flat one and one too small among them; a volume only where it is asked for."""
+    sets = [contacts(count, seed=count) for count in (4, 20, 9)]
+    sets += [np.hstack([np.random.default_rng(3).normal(size=(40, 5)), np.zeros((40, 1))]), sets[0][:6]]
+    clouds = np.full((5, 160, 6), 7.0)  # what lies behind a cloud is none of its points
+    for row, points in enumerate(sets):
+        clouds[row, : len(points)] = points
+    whole = np.array([True, False, True, True, True])
+    radii, volumes = measure_hulls(clouds, np.array([len(points) for points in sets]), whole)
+    for row in (0, 2):
+        assert (radii[row], volumes[row]) == hull_of(sets[row])
+    assert radii[1] == hull_of(sets[1], False)[0] and np.isnan(volumes[1])
+    assert np.isnan(radii[3:]).all() and np.isnan(volumes[3:]).all()

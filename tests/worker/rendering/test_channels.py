@@ -55,7 +55,7 @@ def points(views: dict[str, np.ndarray], view: int) -> np.ndarray:
     return (local - e[:3, 3]) @ e[:3, :3]
 
 
-def test_ray_distance_is_the_way_from_the_optical_centre_to_the_point(views):
+def test_ray_distance_is_way_from_optical_centre_to_the_point(views):
     for view, e in enumerate(views["camera/extrinsics"]):
         centre = -e[:3, :3].T @ e[:3, 3]
         expected = np.linalg.norm(points(views, view) - centre, axis=-1)
@@ -64,7 +64,7 @@ def test_ray_distance_is_the_way_from_the_optical_centre_to_the_point(views):
         np.testing.assert_allclose(views["image/distance"][view][seen], expected[seen], atol=1e-6)
 
 
-def test_normals_of_a_ball_point_away_from_its_centre_and_those_of_the_table_up(views):
+def test_normals_of_a_ball_point_outward_those_of_the_table_up(views):
     for view, scene in enumerate(views["camera/scene_index"]):
         normals = views["image/normals"][view].astype(float)
         segmentation = views["image/segmentation"][view]
@@ -83,13 +83,10 @@ def test_extra_channels_change_no_other_dataset(ball, views):
     for name, values in plain.items():
         np.testing.assert_array_equal(values, views[name])
     assert check_columns("views", views)["V"] == 4
+    assert views["box/occlusion_ratio"].tolist() == [0.0] * 4, "alone on its table it is not occluded"
 
 
-def test_an_object_alone_on_its_table_is_not_occluded(views):
-    assert views["box/occlusion_ratio"].tolist() == [0.0] * 4
-
-
-def test_a_ball_behind_another_is_hidden_as_far_as_their_discs_overlap(ball):
+def test_a_ball_behind_another_is_hidden_as_far_as_discs_overlap(ball):
     """Two equal balls on one line of sight: the nearer covers the farther one, whose disc is smaller."""
     eye, target = np.array([0.5, 0, RADIUS]), np.array([0.0, 0, RADIUS])
     given = GivenCameras(extrinsics=np.stack([look_at(eye, target), look_at(-eye * [1, 1, -1], target)]))
@@ -111,12 +108,9 @@ def test_half_a_ball_behind_a_wall_is_half_occluded(ball):
     seen = shoot(ball, np.array([[0, 0, RADIUS, 1.0, 0, 0, 0]]), extras=extras)
     # One column of pixels more or less of the disc's eleven across.
     assert seen["box/occlusion_ratio"][0] == pytest.approx(0.5, abs=0.06)
-
-
-def test_an_object_out_of_the_picture_has_no_occlusion_ratio(ball):
     given = GivenCameras(extrinsics=look_at(np.array([0.5, 0, 0.2]), np.array([1.0, 0, 0.2]))[None])
-    seen = shoot(ball, extras=Extras(channels=("occlusion",), cameras=given))
-    assert np.isnan(seen["box/occlusion_ratio"]).all()
+    outside = shoot(ball, extras=Extras(channels=("occlusion",), cameras=given))
+    assert np.isnan(outside["box/occlusion_ratio"]).all(), "an object out of the picture has none"
 
 
 def test_given_cameras_are_those_of_every_scene(ball):
@@ -132,15 +126,12 @@ def test_given_cameras_are_those_of_every_scene(ball):
         assert np.abs(away - RADIUS).max() < DEPTH_M
 
 
-def test_sampled_cameras_keep_the_object_in_a_given_narrow_field(ball):
+def test_cameras_keep_object_in_a_narrow_field_or_are_refused(ball) -> None:
     k = intrinsics(*SIZE, field_of_view=np.radians(20))
     seen = shoot(ball, extras=Extras(cameras=GivenCameras(k)))
     boxes = seen["box/bounding_box_2d_loose"]
     assert np.all(boxes[:, :2] > -8) and np.all(boxes[:, 2:] < np.array(SIZE) + 8)
     assert np.all(boxes[:, 3] - boxes[:, 1] > 0.5 * SIZE[1])
-
-
-def test_a_camera_that_cannot_be_aimed_is_refused(ball):
     k = np.array([[90.0, 0, -5], [0, 90, 36], [0, 0, 1]])
     with pytest.raises(InputError, match="principal point"):
         shoot(ball, extras=Extras(cameras=GivenCameras(k)))
@@ -204,15 +195,13 @@ def test_the_drawn_hand_is_in_its_own_pictures_and_in_no_other(ball):
     assert not changed[2:].any()
 
 
-def test_channels_are_named_in_any_order_and_kept_in_one():
+def test_channels_are_named_in_any_order_and_move_pictures_alone() -> None:
     assert parse_channels(["occlusion", " distance"]) == ("distance", "occlusion")
     assert parse_channels(["all"]) == ("distance", "normals", "occlusion")
     assert parse_channels([""]) == ()
     with pytest.raises(InputError, match="unknown channel 'flow'"):
         parse_channels(["flow"])
 
-
-def test_a_jobs_channels_move_its_pictures_and_nothing_else():
     def address(stage: Stage, *channels: str) -> str:
         request = JobRequest(hand="h", object="o", scenes=1, views=1, channels=channels)
         return shard_id(stage, request=request, hand_digest="a", object_digest="b", batch=0, count=1, revision=1)

@@ -1,4 +1,4 @@
-"""Image files of views, read back by other readers than the writers."""
+"""Image files of views, read back by other readers, and clouds of them against the mesh."""
 
 from __future__ import annotations
 
@@ -8,11 +8,18 @@ from pathlib import Path
 import numpy as np
 import OpenEXR
 import pytest
+import trimesh
 from PIL import Image
 
+from graspd.readers import hand_surface
 from graspd.service.model.errors import InputError
-from graspd.service.store.shards import Shard
+from graspd.service.model.transforms import apply
+from graspd.service.readers import Pictures, open_shards
+from graspd.service.store.shards import Shard, write_shard
+from graspd.worker.rendering import render
 from graspd.worker.rendering.export import PNG_STEP_M, export_images
+from tests.service.readers import box_scenes
+from tests.worker.models import object_from_mesh
 
 H, W = 6, 8
 
@@ -53,16 +60,12 @@ def plane(path: Path, channel: str) -> np.ndarray:
         return np.array(file.channels()[channel].pixels)
 
 
-def test_colours_and_labels_come_back_exactly(views, tmp_path):
+def test_colours_labels_depth_and_normals_come_back_exactly(views, tmp_path) -> None:
     export_images(views, tmp_path)
     for view in range(2):
         np.testing.assert_array_equal(pixels(tmp_path / f"rgb_{view:04}.png"), views["image/rgb"][view])
         labels = pixels(tmp_path / f"semantic_segmentation_{view:04}.png")
         np.testing.assert_array_equal(labels, views["image/segmentation"][view])
-
-
-def test_exr_depth_and_normals_come_back_bit_for_bit(views, tmp_path):
-    export_images(views, tmp_path)
     for view in range(2):
         depth = plane(tmp_path / f"distance_to_image_plane_{view:04}.exr", "Z")
         np.testing.assert_array_equal(depth, views["image/depth"][view])
@@ -75,7 +78,7 @@ def test_exr_depth_and_normals_come_back_bit_for_bit(views, tmp_path):
             np.testing.assert_array_equal(half, views["image/normals"][view][..., k])
 
 
-def test_png_depth_is_right_to_half_a_step_and_zero_for_nothing(views, tmp_path):
+def test_png_depth_is_right_to_half_a_step(views, tmp_path) -> None:
     export_images(views, tmp_path, depth="png")
     steps = pixels(tmp_path / "distance_to_image_plane_0000.png")
     assert steps.dtype in (np.uint16, np.int32)
@@ -84,15 +87,11 @@ def test_png_depth_is_right_to_half_a_step_and_zero_for_nothing(views, tmp_path)
     # Half a step, and the rounding of float32.
     assert np.abs(error).max() <= 0.5 * PNG_STEP_M + 1e-7
     assert steps[0, 0] == 0
+    assert pixels(tmp_path / "distance_to_image_plane_0001.png")[0, 0] == 65535
     assert not list(tmp_path.glob("distance*.exr"))
 
 
-def test_what_is_too_far_for_sixteen_bits_is_the_largest_value(views, tmp_path):
-    export_images(views, tmp_path, depth="png")
-    assert pixels(tmp_path / "distance_to_image_plane_0001.png")[0, 0] == 65535
-
-
-def test_the_sidecar_tells_the_camera_and_what_is_not_seen_is_null(views, tmp_path):
+def test_sidecar_tells_the_camera_and_what_is_not_seen_is_null(views, tmp_path):
     export_images(views, tmp_path)
     left, right = (json.loads((tmp_path / f"view_{view:04}.json").read_text()) for view in range(2))
     assert (left["eye"], right["eye"], right["scene"], left["width"], left["height"]) == ("left", "right", 1, W, H)
@@ -109,3 +108,48 @@ def test_a_second_export_does_not_mix_with_the_first(views, tmp_path):
     export_images(views, tmp_path)
     with pytest.raises(InputError, match="exported views already"):
         export_images(views, tmp_path)
+
+
+#: What a view promises of its depth [m]: tests/worker/rendering/test_views.py.
+DEPTH_M = 1e-4
+
+
+def test_points_of_a_rendered_object_lie_on_its_mesh(tmp_path: Path) -> None:
+    mesh = trimesh.creation.capsule(height=0.05, radius=0.03, count=[24, 24])
+    views = render(
+        object_from_mesh(mesh, "box"), box_scenes.POSES, views=2, stereo=False, width=96, height=72, seed=1, samples=2
+    )
+    folder = box_scenes.write(tmp_path / "set")
+    said = {"hand": "claw", "object": "box", "batch": 0, "shard_id": "c" * 32, "base_shard": "b" * 32}
+    (folder / "views.h5").write_bytes(write_shard("views", views, said))
+    pictures = Pictures(open_shards(folder))
+    fused = pictures.clouds(300, fuse=True, frame="object")
+    for sample in [*pictures.clouds(300, frame="object"), *fused]:
+        _, distance, face = trimesh.proximity.closest_point(mesh, sample["cloud/points"].astype(float))
+        assert distance.max() < DEPTH_M
+        cosine = np.einsum("pc,pc->p", mesh.face_normals[face], sample["cloud/normals"])
+        # Faces turn by 7.5 degrees each, and a pixel's neighbours may lie on the next one.
+        assert np.quantile(cosine, 0.1) > np.cos(np.radians(12))
+        assert np.median(cosine) > np.cos(np.radians(4))
+
+
+def test_surface_of_the_hand_of_a_shard_follows_its_kinematics() -> None:
+    """All of a hand moves with its root; the points of a body that no joint carries move with nothing else."""
+    from graspd.worker.hands.load import hand_from_path
+    from graspd.worker.hands.surface import sample_surface
+
+    hand = hand_from_path("barrett")
+    joints = np.zeros((2, len(hand.joint_names)))
+    joints[1] = 0.3
+    pose = np.array([[0.1, 0.2, 0.3, 1, 0, 0, 0], [0, 0, 0, np.sqrt(0.5), 0, 0, np.sqrt(0.5)]])
+    said = {"hand": "barrett", "hand_digest": hand.digest}
+    shard = Shard("base", said, {"grasp/hand_pose": pose, "grasp/joint_positions": joints})
+    found = hand_surface(shard, np.array([0, 1]))
+    points = sample_surface(hand, found.shape[1])
+    palm = points.body == 0
+    for row in range(2):
+        np.testing.assert_allclose(found[row, palm], apply(pose[row], points.position[palm]), atol=1e-12)
+    at_rest = hand_surface(
+        Shard("base", said, {**shard.arrays, "grasp/joint_positions": joints[[0, 0]]}), np.array([1])
+    )
+    assert np.abs(at_rest[0, ~palm] - found[1, ~palm]).max() > 0.01

@@ -1,16 +1,27 @@
-"""Pictures for people: what must be in them; how they look is for people to validate."""
+"""Pictures for people, of grasps, of their ways and as films: what must be in them."""
 
 from __future__ import annotations
 
 import io
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import trimesh
-from PIL import Image
+from PIL import Image, ImageSequence, features
 
-from graspd.worker.rendering import render
+from graspd.commands.grasp_sheet import waypoints
+from graspd.exchange.robots.execution import POSTURES, Executions, ToolFrame, straight_paths, timed
+from graspd.service.model.errors import InputError
+from graspd.service.model.scene_spec import Box, HalfSpace, SceneSpec, supports_in
+from graspd.service.model.transforms import apply, compose, invert, quat_rotate
+from graspd.service.readers.trajectories import Waypoint
+from graspd.worker.grasps import Posture
+from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.rendering import Extras, render, sheets
+from graspd.worker.rendering.hands import DrawnHand, drawn_bodies
 from graspd.worker.rendering.pictures import THREE_SIDES, grasp_pictures
+from graspd.worker.rendering.scenery import TABLE, TABLE_SIZE, seen_share, slab_poses, slabs
 from graspd.worker.rendering.sheets import (
     GAP,
     MARGIN,
@@ -22,6 +33,7 @@ from graspd.worker.rendering.sheets import (
     three_sides_sheet,
     views_page,
 )
+from graspd.worker.rendering.trajectory_pictures import KINDS, PictureScenes, animation, way_pictures
 from tests.worker.models import object_from_mesh, two_finger_hand
 
 HAND = two_finger_hand()
@@ -44,12 +56,9 @@ def hues(picture: np.ndarray) -> np.ndarray:
     return hsv[(hsv[:, 1] > 90) & (hsv[:, 2] > 30)][:, 0]
 
 
-def test_every_grasp_is_shown_from_every_side(pictures):
+def test_every_side_shows_object_and_fingertips_in_their_colours(pictures) -> None:
     assert pictures.shape == (2, 3, 64, 80, 3)
     assert len({picture.tobytes() for picture in pictures.reshape(6, -1)}) == 6
-
-
-def test_a_picture_shows_the_object_and_the_fingertips_in_their_colours(pictures):
     for picture in pictures.reshape(6, 64, 80, 3):
         hue = hues(picture)
         # Orange object, teal fingertips, hue in 256 steps.
@@ -57,14 +66,11 @@ def test_a_picture_shows_the_object_and_the_fingertips_in_their_colours(pictures
         assert np.sum((hue > 115) & (hue < 135)) > 5
 
 
-def test_a_grasp_looks_the_same_whatever_grasps_are_drawn_with_it(block, pictures):
+def test_grasp_looks_the_same_whatever_grasps_are_drawn_with_it(block, pictures):
     alone = grasp_pictures(HAND, block, POSES[1:], JOINTS[1:], (80, 64), THREE_SIDES, samples=4)
     np.testing.assert_array_equal(alone[0], pictures[1])
-
-
-def test_no_grasps_give_no_pictures(block):
-    drawn = grasp_pictures(HAND, block, np.zeros((0, 7)), np.zeros((0, 2)), (80, 64), THREE_SIDES)
-    assert drawn.shape == (0, 3, 64, 80, 3)
+    none = grasp_pictures(HAND, block, np.zeros((0, 7)), np.zeros((0, 2)), (80, 64), THREE_SIDES)
+    assert none.shape == (0, 3, 64, 80, 3)
 
 
 def quality(count: int) -> dict[str, np.ndarray]:
@@ -77,13 +83,10 @@ def quality(count: int) -> dict[str, np.ndarray]:
     }
 
 
-def test_the_best_grasps_are_those_with_the_largest_epsilon_among_the_chosen():
+def test_best_have_the_largest_epsilon_and_captions_quote_5_mm() -> None:
     chosen = np.array([True, True, True, True, False])
     assert best(quality(5), 3, chosen).tolist() == [3, 2, 1]
     assert best(quality(5), 9, chosen).tolist() == [3, 2, 1, 0]
-
-
-def test_captions_quote_the_metrics_at_five_millimetres():
     assert figures(quality(5), np.array([3])) == [
         [("epsilon", "30.000"), ("contact", "30.0 cm^2"), ("depth", "0.25 mm")]
     ]
@@ -99,11 +102,7 @@ def test_a_contact_sheet_holds_every_picture_unchanged(pictures):
         windows = np.lib.stride_tricks.sliding_window_view(sheet[..., 0], (4, 80))
         assert (windows == picture[30:34, :, 0]).all(axis=(2, 3)).any()
     assert tuple(sheet[0, 0]) == PAPER
-
-
-def test_a_three_sides_sheet_is_wide_enough_for_three(pictures):
-    sheet = opened(three_sides_sheet(pictures, title="block", columns=1))
-    assert sheet.shape[1] >= 3 * 80
+    assert opened(three_sides_sheet(pictures, title="block", columns=1)).shape[1] >= 3 * 80
 
 
 @pytest.mark.parametrize(("stereo", "cells"), [(True, 5), (False, 4)])
@@ -115,7 +114,7 @@ def test_a_views_page_has_a_row_per_placement(block, stereo, cells):
     assert page.shape[0] > 2 * 48
 
 
-def test_a_views_page_shows_the_pictures_with_a_hand_where_there_are_any(block):
+def test_views_page_shows_pictures_with_hand_where_there_are_any(block):
     pose = np.array([[0, 0, 0.03, 1.0, 0, 0, 0]])
     views = render(block, pose, views=1, stereo=False, width=64, height=48, seed=0, samples=2)
     without = opened(views_page(views, title="block"))
@@ -126,8 +125,209 @@ def test_a_views_page_shows_the_pictures_with_a_hand_where_there_are_any(block):
     assert shown.sum() == 48 * 64 and not shown[:, : without.shape[1] - MARGIN].any()
 
 
+def test_boxes_are_drawn_the_loose_ones_with_the_wider_line() -> None:
+    views = {
+        "image/rgb": np.zeros((1, 60, 80, 3)),
+        "image/segmentation": np.zeros((1, 60, 80)),
+        "box/bounding_box_3d": np.tile([-10.0, -10, 1], (1, 8, 1)),
+        "camera/intrinsics": np.eye(3)[None],
+        "box/bounding_box_2d_loose": np.array([[10.0, 10, 70, 50]]),
+        "box/bounding_box_2d_tight": np.array([[30.0, 20, 60, 40]]),
+    }
+    row = np.asarray(sheets._boxes(views, 0).convert("L"), float)[30]
+    assert row[5:20].sum() > 1.5 * row[25:35].sum() > 0
+
+
 def test_depth_colours_darken_with_distance_and_grey_is_nothing():
     colours = depth_colours(np.array([0.2, 0.3, 0.4, 0.5, np.inf], np.float32), 0.2, 0.5).astype(int)
     lightness = colours[:4] @ [0.2126, 0.7152, 0.0722]
     assert np.all(np.diff(lightness) < -20)
     assert colours[4].tolist() == [214, 214, 214]
+
+
+REST = np.array([[0, 0, 0.03, 1.0, 0, 0, 0]])
+DOWN = np.array([0, 0, 0.06, 0, 1.0, 0, 0])
+
+
+def at(name: str, height: float = 0.0) -> Waypoint:
+    """The hand over the block, both raised."""
+    rise = np.array([0, 0, height])
+    return Waypoint(name, DOWN + np.append(rise, np.zeros(4)), np.full(2, 0.1), rise)
+
+
+def orange(picture: np.ndarray) -> np.ndarray:
+    """Mask of the pixels that show the object: hues between red and yellow."""
+    hue, saturation, value = np.moveaxis(np.asarray(Image.fromarray(picture).convert("HSV")).astype(int), -1, 0)
+    return (hue > 8) & (hue < 30) & (saturation > 90) & (value > 30)
+
+
+def test_every_posture_of_every_grasp_is_drawn_from_every_side(block):
+    frames = [[at("grasp"), at("lift", 0.1)]] * 2
+    drawn = way_pictures(HAND, block, frames, PictureScenes((HalfSpace(),), REST), (48, 36), sides=3, samples=2)
+    assert drawn.shape == (2, 3, 2, 36, 48, 3)
+    assert all(orange(picture).sum() > 10 for picture in drawn.reshape(-1, 36, 48, 3))
+
+
+def test_the_lifted_object_is_higher_in_the_picture(block):
+    frames = [[at("grasp"), at("lift", 0.1)]]
+    (low, high) = way_pictures(HAND, block, frames, PictureScenes((HalfSpace(),), REST), (64, 64), samples=2)[0, 0]
+    assert np.argwhere(orange(high))[:, 0].mean() < np.argwhere(orange(low))[:, 0].mean() - 10
+    (floating,) = way_pictures(HAND, block, [[at("grasp")]], PictureScenes(), (48, 48), samples=2)[0, 0]
+    assert orange(floating).sum() > 20, "a free grasp floats over a floor"
+
+
+def test_whole_hand_is_in_the_picture_where_that_is_asked_for(block):
+    frames = [[replace(at("", 0.5), carried=np.zeros(3)), at("grasp")]]
+    around = PictureScenes((HalfSpace(),), REST)
+    near, whole = (way_pictures(HAND, block, frames, around, (48, 48), whole=w, samples=2)[0, 0] for w in (False, True))
+    # The camera steps back for the hand that is far above: the block is smaller, and what is drawn ends above the rim.
+    assert 0 < orange(whole[1]).sum() < 0.5 * orange(near[1]).sum()
+    empty = way_pictures(HAND, block, [frames[0][1:]], around, (48, 48), samples=2)[0, 0, 0]
+    assert np.abs(whole[0][:2].astype(int) - empty[0, 0]).max() < 40
+
+
+@pytest.mark.parametrize("side", [0, 1, 2, 3])
+def test_no_wall_stands_between_the_object_and_the_camera(block, side):
+    x, y = np.array([(0.1, 0), (0, 0.1), (-0.1, 0), (0, -0.1)])[side]
+    size = (0.02, 0.5, 0.5) if x else (0.5, 0.02, 0.5)
+    wall = Box(size=size, pose=(x, y, 0.25, 1, 0, 0, 0))
+    around = PictureScenes((HalfSpace(), wall), REST)
+    free = way_pictures(HAND, block, [[at("grasp")]], PictureScenes((HalfSpace(),), REST), (48, 48), samples=2)[0, 0, 0]
+    walled = way_pictures(HAND, block, [[at("grasp")]], around, (48, 48), samples=2)[0, 0, 0]
+    assert orange(walled).sum() > 0.5 * orange(free).sum()
+
+
+def test_each_grasp_stands_in_its_own_scene(block):
+    turned = np.array([[0, 0, 0.02, np.sqrt(0.5), np.sqrt(0.5), 0, 0]])
+    around = PictureScenes((HalfSpace(),), np.concatenate([REST, turned]), np.array([0, 1]))
+    first, second = way_pictures(HAND, block, [[at("grasp")]] * 2, around, (48, 48), samples=2)[:, 0, 0]
+    alone = way_pictures(HAND, block, [[at("grasp")]], PictureScenes((HalfSpace(),), turned), (48, 48), samples=2)[
+        0, 0, 0
+    ]
+    np.testing.assert_array_equal(second, alone)
+    assert (first != second).any()
+
+
+def test_links_above_root_are_drawn_at_the_angles_of_the_wrist(block):
+    # A copy of the hand behind its root serves as a forearm with two wrist joints.
+    back = np.array([0, 0, -0.12])
+    forearm = replace(HAND, pieces=tuple(replace(p, vertices=p.vertices + back) for p in HAND.pieces))
+    mounted, around = replace(HAND, mounting=forearm), PictureScenes((HalfSpace(),), REST)
+
+    def picture(hand, wrist) -> np.ndarray:
+        where = replace(around, wrist=wrist if wrist is None else np.array([wrist]))
+        return way_pictures(hand, block, [[at("grasp")]], where, (48, 48), whole=True, samples=2)[0, 0, 0].astype(int)
+
+    bare, straight, bent = picture(mounted, None), picture(mounted, [0.0, 0.0]), picture(mounted, [0.9, 0.9])
+    assert np.array_equal(bare, picture(HAND, None))
+    assert (np.abs(straight - bare).max(axis=-1) > 40).sum() > 30
+    assert (np.abs(straight - bent).max(axis=-1) > 40).sum() > 5
+    drawn = DrawnHand(mounted, np.array([0, -1]), np.stack([DOWN] * 2), np.zeros((2, 2)), np.array([[0.9, 0.9]] * 2))
+    own, above = drawn.body_poses(), body_poses(forearm, DOWN[None], np.array([[0.9, 0.9]]))[0]
+    assert len(drawn.parts) == own.shape[1] == 2 * len(drawn_bodies(HAND))
+    assert own[0, len(drawn_bodies(HAND)) :] == pytest.approx(above[drawn_bodies(forearm)])
+    assert (own[1, :, 2] < -10).all()
+
+
+SECONDS = [0.5, 0.05, 1.2]
+
+
+def colours() -> np.ndarray:
+    """Three plain pictures: red, green, blue."""
+    return np.repeat(np.repeat(200 * np.eye(3, dtype=np.uint8)[:, None, None], 24, 1), 32, 2)
+
+
+@pytest.mark.parametrize("suffix", sorted(KINDS))
+def test_every_picture_is_shown_for_its_time_and_again(suffix):
+    if suffix == ".webp" and not features.check("webp"):
+        pytest.skip("this Pillow writes no WebP")
+    with Image.open(io.BytesIO(animation(colours(), SECONDS, suffix))) as film:
+        assert film.n_frames == 3
+        assert film.info.get("loop") == 0
+        shown = []
+        for frame, wanted in zip(ImageSequence.Iterator(film), colours(), strict=True):
+            # WebP is lossy: a plain colour comes back within a few of 256 steps.
+            assert np.abs(np.asarray(frame.convert("RGB")).astype(int) - wanted).max() <= 6
+            shown.append(frame.info["duration"])
+    assert shown == [500, 50, 1200]
+
+
+def test_a_file_that_holds_no_animation_is_refused():
+    with pytest.raises(InputError, match="not as a file without suffix"):
+        animation(colours(), SECONDS, "")
+
+
+def test_the_object_is_carried_with_the_hand_from_where_it_rests():
+    rest = np.array([[0.3, -0.2, 0.05, np.sqrt(0.5), 0, 0, np.sqrt(0.5)]])
+    heights = dict(zip(POSTURES, (0.2, 0.1, 0.1, 0.1, 0.1, 0.35), strict=True))
+    poses = {name: rest + np.array([0, 0, height, 0, 0, 0, 0]) for name, height in heights.items()}
+    closing = dict(zip(POSTURES, (0.0, 0.0, 0.5, 1.0, 1.2, 1.2), strict=True))
+    found = Executions(
+        None,
+        None,
+        ToolFrame("palm", rest[0]),
+        "scene",
+        np.zeros(1, np.intp),
+        rest,
+        {name: Posture(poses[name], np.full((1, 1), closing[name])) for name in POSTURES},
+        None,
+        {},
+    )
+    way = timed(straight_paths(found, 0), ["joint"], np.ones(1), speed=1.0)
+    points = waypoints(found, way)
+    assert len(points) == len(way.time)
+    (closed,) = [k for k, point in enumerate(points) if point.name == "grasp"]
+    assert points[closed].joint_positions == pytest.approx(closing["grasp"])
+    for k, point in enumerate(points):
+        np.testing.assert_allclose(compose(rest[0], point.hand_pose), way.hand_pose[k], atol=1e-12)
+        if way.phase[k] == "lift":
+            # In the hand's frame the object stays where it was grasped.
+            held = apply(invert(point.hand_pose), point.carried)
+            np.testing.assert_allclose(held, apply(invert(points[closed].hand_pose), np.zeros(3)), atol=1e-12)
+        else:
+            assert not point.carried.any()
+    np.testing.assert_allclose(points[-1].carried, [0, 0, 0.25], atol=1e-12)
+
+
+SPECS = {kind: supports_in(SceneSpec(kind=kind)) for kind in ("table", "bin", "shelf")}
+POSE = np.array([[0, 0, 0.03, 1.0, 0, 0, 0]])
+
+
+@pytest.mark.parametrize("normal", [(0, 0, 1), (1, 0, 0), (0, -2, 0), (1, 2, 3), (0, 0, -1)])
+def test_the_top_of_a_half_spaces_slab_is_its_plane(normal):
+    plane = HalfSpace(normal=normal, offset=0.12)
+    (pose,) = slab_poses([plane], np.array([0.1, 0.05, 0.2]), 0.7)
+    unit = np.asarray(normal, float) / np.linalg.norm(normal)
+    top = pose[:3] + quat_rotate(pose[3:], np.array([0.2, -0.3, TABLE_SIZE[2] / 2]))
+    # Rounding of a handful of products near 1.
+    assert unit @ top == pytest.approx(0.12 / np.linalg.norm(normal), abs=1e-12)
+    np.testing.assert_allclose(quat_rotate(pose[3:], np.array([0, 0, 1.0])), unit, atol=1e-12)
+
+
+def test_a_box_keeps_its_size_and_hides_what_is_behind_it() -> None:
+    box = Box(size=(0.02, 0.4, 0.2), pose=(0.12, 0, 0.1, 1, 0, 0, 0))
+    assert slabs([box])[0].size == (0.02, 0.4, 0.2)
+    np.testing.assert_array_equal(slab_poses([box], np.zeros(3), 0.7)[0], box.pose)
+    wall = [Box(size=(0.02, 0.4, 0.2), pose=(0.12, 0, 0.1, 1, 0, 0, 0))]
+    points = np.array([[0, 0, 0.05], [0, 0, 0.5]])
+    assert seen_share(wall, np.array([0.5, 0, 0.1]), points) == 0.5
+    assert seen_share(wall, np.array([-0.5, 0, 0.1]), points) == 1.0
+    assert seen_share(TABLE, np.array([0.5, 0, -0.1]), points) == 0.0
+    board = [Box(size=(0.4, 0.4, 0.02), pose=(0, 0, -0.01, 1, 0, 0, 0))]
+    assert seen_share(board, np.array([0.5, 0, 0.4]), np.zeros((1, 3))) == 1.0
+
+
+@pytest.mark.parametrize("kind", ["bin", "shelf"])
+def test_every_camera_sees_the_object_past_walls_and_boards(block, kind):
+    extras = Extras(supports=SPECS[kind], channels=("occlusion",))
+    views = render(block, POSE, views=4, stereo=False, width=48, height=36, seed=3, samples=2, extras=extras)
+    labels = np.asarray(views["image/segmentation"])
+    assert ((labels == 2).sum(axis=(1, 2)) > 20).all()
+    assert set(np.unique(labels)) <= {0, 1, 2}, "all supports are labelled as the table"
+    assert (labels == 1).mean() > 0.2 and np.isfinite(views["box/occlusion_ratio"]).all()
+
+
+def test_a_table_looks_the_same_named_or_not(block):
+    options = {"views": 1, "stereo": False, "width": 48, "height": 36, "seed": 3, "samples": 2}
+    named = render(block, POSE, **options, extras=Extras(supports=SPECS["table"]))
+    np.testing.assert_array_equal(named["image/rgb"], render(block, POSE, **options)["image/rgb"])

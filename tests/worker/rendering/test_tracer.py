@@ -220,7 +220,7 @@ def test_open_faces_look_as_if_every_ray_were_traced(poses: np.ndarray) -> None:
     assert np.mean(levels > 1) < 1e-4
 
 
-def test_worlds_that_turn_under_the_lamp_keep_their_shapes_and_get_other_shadows(poses: np.ndarray) -> None:
+def test_worlds_that_turn_keep_their_shapes_not_their_shadows(poses: np.ndarray) -> None:
     still = traced(SOLIDS, poses, shot(samples=4))
     turned = traced(SOLIDS, poses, shot(samples=4, turn=np.full(WORLDS, 2.0)))
     np.testing.assert_array_equal(still.shape, turned.shape)
@@ -267,7 +267,7 @@ def test_a_mesh_is_not_seen_from_inside() -> None:
     assert set(np.unique(seen.shape)) == {-1, 0}
 
 
-def test_lines_of_tiles_that_are_thinner_than_a_pixel_darken_it_a_little() -> None:
+def test_lines_of_tiles_thinner_than_a_pixel_darken_it_a_little() -> None:
     tracer = Tracer([FLOOR], "cpu")
     tracer.place(np.array([[[0, 0, -0.05, 1, 0, 0, 0.0]]]), [[Appearance((0.8,) * 3, (0.0,) * 3, shading.TILES, 2.0)]])
     camera = look_at(np.array([1.5, -1.0, 2.0]), np.zeros(3))

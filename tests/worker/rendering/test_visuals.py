@@ -9,13 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from typer.testing import CliRunner
 
-from graspd.cli import build
 from graspd.worker.hands.load import hand_from_path, load_hand
 from graspd.worker.hands.model import HandModel
 from graspd.worker.rendering.hands import drawn_bodies, hand_parts, without_visuals
 from graspd.worker.stages.models import hand_glb
+from tests.worker.commands_run import graspd, refused
 from tests.worker.hands.urdfs import joint, link, robot
 
 BOX = '<collision><geometry><box size="0.02 0.02 0.04"/></geometry></collision>'
@@ -35,27 +34,20 @@ def hand() -> HandModel:
     return load_hand({"h.urdf": urdf, "part.stl": part}, name="h", digest="0" * 32)
 
 
-def test_visual_meshes_have_their_colours_and_missing_ones_are_left_out(hand: HandModel) -> None:
+def test_what_is_seen_has_its_colours_else_collision_shapes(hand: HandModel) -> None:
     palm = [part for part in hand_parts(hand) if part.body == 0]
     assert sorted((part.look.base, len(part.solid.faces)) for part in palm) == [((0, 0, 1), 80), ((1, 0, 0), 12)]
-
-
-def test_a_body_without_visuals_is_drawn_by_its_collision_shapes(hand: HandModel) -> None:
     (finger,) = [part for part in hand_parts(hand) if part.body == 1]
     assert np.ptp(finger.solid.vertices, axis=0) == pytest.approx([0.02, 0.02, 0.04])
 
 
 def test_collision_shapes_are_drawn_on_a_toggle(hand: HandModel) -> None:
     bare = without_visuals(hand)
+    assert bare.pieces is hand.pieces and bare.content != hand.content
     assert drawn_bodies(bare) == [0, 1] and drawn_bodies(hand) == [0, 0, 1]
     assert np.ptp(hand_parts(bare)[0].solid.vertices, axis=0) == pytest.approx([0.02, 0.02, 0.04])
     above = without_visuals(replace(hand, mounting=hand)).mounting
     assert above is not None and drawn_bodies(above) == [0, 1]
-
-
-def test_looks_change_nothing_that_is_computed(hand: HandModel) -> None:
-    bare = without_visuals(hand)
-    assert bare.pieces is hand.pieces and bare.content != hand.content
 
 
 def test_a_model_for_viewers_has_the_colours(hand: HandModel) -> None:
@@ -77,25 +69,19 @@ def test_what_check_writes_leaves_nothing_to_guess(tmp_path: Path) -> None:
     ]
     urdf = tmp_path / "claw.urdf"
     urdf.write_bytes(robot(link("palm", BOX), *fingers, *joints))
-    said = ["--palm", "palm", "--approach", "0,0,1", "--pre-shape", "ja=0.2", "--closing", "ja=-1", "--fingertips", "a"]
+    said = "--palm palm --approach 0,0,1 --pre-shape ja=0.2 --closing ja=-1 --fingertips a"
     target = tmp_path / "asset.json"
-    told = CliRunner().invoke(
-        build(), ["hands", "check", str(urdf), *said, "--no-self-test", "--write", str(target), "--json"]
-    )
-    facts = json.loads(told.stdout.splitlines()[-1])["facts"]
+    facts = graspd(f"hands check --no-self-test {said} --write", target, urdf)["facts"]
     assert json.loads(target.read_text())["file"] == "claw.urdf"
     hand = hand_from_path(urdf)
     assert hand.closing.tolist() == [-1, 1] and hand.preshape[0] == pytest.approx(0.2)
     assert [hand.body_names[tip] for tip in hand.fingertips] == ["a"]
-    again = CliRunner().invoke(build(), ["hands", "check", str(urdf), "--no-self-test", "--json"])
-    found = json.loads(again.stdout.splitlines()[-1])["facts"]
-    assert {
-        key: found[key] for key in ("palm_centre", "palm_approach", "closing", "preshape", "fingertips", "root")
-    } == {key: facts[key] for key in ("palm_centre", "palm_approach", "closing", "preshape", "fingertips", "root")}
+    found = graspd("hands check --no-self-test", urdf)["facts"]
+    for key in ("palm_centre", "palm_approach", "closing", "preshape", "fingertips", "root"):
+        assert found[key] == facts[key]
     assert "palm" not in found["guessed"] and "closing" not in found["guessed"]
 
 
-@pytest.mark.parametrize("said", [("--closing", "ja=2"), ("--closing", "ja"), ("--xacro", "x")])
-def test_an_option_that_cannot_be_read_is_the_callers_mistake(said: tuple[str, str]) -> None:
-    told = CliRunner().invoke(build(), ["hands", "check", "allegro", "--no-self-test", *said])
-    assert told.exit_code == 2 and said[0] in told.stderr
+@pytest.mark.parametrize("said", ["--closing ja=2", "--closing ja", "--xacro x"])
+def test_an_option_that_cannot_be_read_is_the_callers_mistake(said: str) -> None:
+    assert said.split()[0] in refused(f"hands check allegro --no-self-test {said}")

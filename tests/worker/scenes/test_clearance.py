@@ -1,17 +1,19 @@
-"""Grasps moved onto a table: poses, clearances, the way in."""
+"""Grasps moved onto a table beside other objects: poses, clearances, the way in."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+import trimesh
 
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import apply, compose, invert, quat_from_axis_angle
 from graspd.worker.grasps import Posture
 from graspd.worker.hands.kinematics import body_poses
-from graspd.worker.scenes import transfer
+from graspd.worker.scenes import Neighbours, drop_together, transfer
 from graspd.worker.scenes.clearance import MARGIN_M, Rejection, approach
-from tests.worker.models import two_finger_hand
+from graspd.worker.scenes.neighbours import FARTHEST_M, neighbour_clearance
+from tests.worker.models import object_from_mesh, two_finger_hand
 
 HAND = two_finger_hand()
 #: Tessellations lie inside round pieces by r (1 - cos(pi / 48)), and a sphere of 642 corners by 0.4 % of r.
@@ -33,7 +35,7 @@ def lowest_vertex(posture: Posture, object_pose: np.ndarray) -> np.ndarray:
     return np.min([apply(bodies[:, p.body][:, None], p.vertices)[..., 2].min(axis=1) for p in HAND.pieces], axis=0)
 
 
-def test_clearance_agrees_with_all_corners_of_all_pieces_on_the_way():
+def test_clearance_agrees_with_all_corners_of_all_pieces_on_way():
     rng = np.random.default_rng(0)
     grasp, pregrasp = postures(rng, 5), postures(rng, 5)
     scenes = postures(rng, 3).hand_pose
@@ -44,7 +46,7 @@ def test_clearance_agrees_with_all_corners_of_all_pieces_on_the_way():
     np.testing.assert_allclose(found, expected, atol=TESSELLATION_M)
 
 
-def test_transferred_poses_are_the_base_poses_seen_from_the_table():
+def test_transferred_poses_are_base_poses_seen_from_the_table():
     rng = np.random.default_rng(1)
     grasp, scenes = postures(rng, 4), postures(rng, 2).hand_pose
     result = transfer(HAND, grasp, grasp, scenes)
@@ -72,7 +74,7 @@ def test_a_grasp_is_valid_from_the_stated_margin_on(gap, valid):
     assert transfer(HAND, posture, posture, IDENTITY)["grasp/valid"].tolist() == [valid]
 
 
-def test_a_hand_that_sweeps_through_the_table_between_its_two_postures_is_caught():
+def test_a_hand_that_sweeps_through_the_table_is_caught():
     """Fingers point sideways at both ends and straight down half-way."""
     y = np.array([0.0, 1, 0])
     start, end = (np.concatenate([[0, 0, 0.075], quat_from_axis_angle(y, np.asarray(np.pi + a))]) for a in (-1.4, 1.4))
@@ -102,14 +104,108 @@ def test_many_grasps_give_what_each_gives_alone():
     np.testing.assert_allclose(together[[0, 64, 129]], alone, atol=1e-12)
 
 
-def test_no_grasps_give_empty_arrays():
+def test_no_grasps_are_empty_too_many_are_refused() -> None:
     none = Posture(np.zeros((0, 7)), np.zeros((0, 2)))
     result = transfer(HAND, none, none, IDENTITY)
     assert result["grasp/hand_pose"].shape == (0, 7)
     assert result["grasp/valid"].shape == (0,)
-
-
-def test_grasps_without_their_pregrasps_are_refused():
     rng = np.random.default_rng(3)
     with pytest.raises(InputError, match="2 grasps come with 1 pregrasps"):
         transfer(HAND, postures(rng, 2), postures(rng, 1), IDENTITY)
+    with pytest.raises(InputError, match="1 to 8"):
+        drop_together(box(0.05, 0.05, 0.05), [box(0.02, 0.02, 0.02)] * 9, count=1, seed=0)
+
+
+#: MuJoCo stores meshes in float32 and its GJK stops at 1e-6 of the size.
+ENGINE_M = 5e-6
+DOWN = np.concatenate([[0, 0, 0.25], quat_from_axis_angle(np.array([1.0, 0, 0]), np.asarray(np.pi))])
+LEVEL = np.array([[0.0, 0, 0, 1, 0, 0, 0]])
+
+
+def box(*size: float):
+    return object_from_mesh(trimesh.creation.box(size), "box" + "x".join(map(str, size)))
+
+
+def hulls(objects, poses) -> list[np.ndarray]:
+    return [apply(pose, obj.hull_vertices) for obj, pose in zip(objects, poses, strict=True)]
+
+
+def separated(a: np.ndarray, b: np.ndarray, normals: np.ndarray) -> bool:
+    """Whether one of the directions parts the two point sets (separating axis theorem)."""
+    return bool(np.any((a @ normals.T).max(axis=0) <= (b @ normals.T).min(axis=0) + 1e-6))
+
+
+def test_objects_rest_on_the_table_and_apart():
+    objects = [box(0.05, 0.06, 0.07), box(0.04, 0.04, 0.12), box(0.03, 0.08, 0.05)]
+    result = drop_together(objects[0], objects[1:], count=4, seed=1)
+    for s in range(4):
+        poses = [result["scene/object_pose"][s], *result["scene/neighbour_pose"][s]]
+        placed = hulls(objects, poses)
+        for points in placed:
+            assert points[:, 2].min() == pytest.approx(0, abs=1e-9)
+        for a in range(3):
+            for b in range(3):
+                if a < b:
+                    # Boxes flat on a table are parted by one of their upright faces or not at all.
+                    axes = np.concatenate([_axes(poses[a]), _axes(poses[b])])
+                    assert separated(placed[a], placed[b], np.concatenate([axes, -axes]))
+
+
+def _axes(pose: np.ndarray) -> np.ndarray:
+    return apply(np.concatenate([np.zeros(3), pose[3:]]), np.eye(3))
+
+
+def test_same_seed_gives_same_scenes_and_more_scenes_keep_first():
+    objects = [box(0.05, 0.06, 0.07), box(0.04, 0.04, 0.12)]
+    first, more = (drop_together(objects[0], objects[1:], count=n, seed=3) for n in (2, 3))
+    for name, values in first.items():
+        np.testing.assert_array_equal(values, more[name][:2])
+
+
+@pytest.mark.parametrize("height", [0.1, 0.18])
+def test_clearance_from_a_box_is_the_gap_or_the_depth(height):
+    # Tips end 0.25 - 0.079 above the table, over the box below them or in it.
+    neighbours = Neighbours([box(0.3, 0.3, height)], np.array([[[0, 0, height / 2, 1.0, 0, 0, 0]]]))
+    found = neighbour_clearance(HAND, Posture(DOWN[None], np.zeros((1, 2))), LEVEL, neighbours)
+    assert found[0, 0] == pytest.approx(0.25 - 0.079 - height, abs=ENGINE_M)
+
+
+def test_clearance_is_a_capped_lower_bound_of_corner_distances():
+    rng = np.random.default_rng(0)
+    block = box(0.04, 0.05, 0.06)
+    posture, poses = postures(rng, 12), np.array([[[0.15, 0.1, 0.03, 1.0, 0, 0, 0]]])
+    found = neighbour_clearance(HAND, posture, LEVEL, Neighbours([block], poses))[0]
+    surface = apply(
+        poses[0, 0], trimesh.sample.sample_surface_even(trimesh.Trimesh(block.vertices, block.faces), 800, seed=0)[0]
+    )
+    bodies = compose(LEVEL, body_poses(HAND, posture.hand_pose, posture.joint_positions))
+    for k in range(12):
+        corners = np.concatenate([apply(bodies[k, p.body], p.vertices) for p in HAND.pieces])
+        nearest = np.linalg.norm(corners[:, None] - surface, axis=-1).min()
+        assert found[k] <= min(nearest, FARTHEST_M) + ENGINE_M
+    assert (found == FARTHEST_M).any() and (found < FARTHEST_M).any()
+
+
+def test_grasp_that_neighbour_blocks_is_rejected_with_the_reason():
+    low = np.array([[0, 0, 0.2, *DOWN[3:]]])
+    high = np.array([[0, 0, 0.3, *DOWN[3:]]])
+    still = np.zeros((1, 2))
+    tower = box(0.02, 0.02, 0.15)
+
+    def reason(grasp: np.ndarray, pregrasp: np.ndarray, place: list[float]) -> tuple[int, int]:
+        neighbours = Neighbours([tower], np.array([[[*place, 1.0, 0, 0, 0]]]))
+        result = transfer(HAND, Posture(grasp, still), Posture(pregrasp, still), LEVEL, neighbours)
+        return int(result["grasp/rejection"][0]), int(result["grasp/valid"][0])
+
+    assert reason(low, high, [0.3, 0, 0.075]) == (Rejection.NONE, 1)
+    assert reason(low, high, [0.04, 0, 0.075]) == (Rejection.NEIGHBOUR_AT_CONTACT, 0)
+    # The hand comes from the side, through the tower.
+    aside = low + np.array([0.2, 0, 0, 0, 0, 0, 0])
+    assert reason(low, aside, [0.12, 0, 0.075]) == (Rejection.NEIGHBOUR_ON_APPROACH, 0)
+
+
+def test_the_table_comes_before_the_neighbours_among_the_reasons():
+    into_table = np.array([[0, 0, 0.05, *DOWN[3:]]])
+    tower = Neighbours([box(0.02, 0.02, 0.15)], np.array([[[0.04, 0, 0.075, 1.0, 0, 0, 0]]]))
+    posture = Posture(into_table, np.zeros((1, 2)))
+    assert transfer(HAND, posture, posture, LEVEL, tower)["grasp/rejection"][0] == Rejection.TABLE_AT_CONTACT

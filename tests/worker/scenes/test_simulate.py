@@ -1,6 +1,9 @@
-"""Drops: rest poses are statically stable, repeatable, and move with the true inertia."""
+"""Rest poses: drops, faces that carry, scenes of every kind, and neighbours laid in them."""
 
 from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -8,11 +11,15 @@ import trimesh
 from scipy.spatial import ConvexHull
 from scipy.stats import chisquare
 
-from graspd.service.model.errors import InputError, MeshError
-from graspd.service.model.transforms import apply, quat_rotate
+from graspd.service.model.errors import InputError, MeshError, SceneError
+from graspd.service.model.scene_spec import SceneSpec
+from graspd.service.model.transforms import apply, quat_conjugate, quat_rotate
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.scenes import drop, simulate
-from graspd.worker.scenes.rest import resting_faces
+from graspd.worker.scenes.kinds import GAP, rest_poses, room_in, supports_of
+from graspd.worker.scenes.neighbours import BETWEEN, drop_together
+from graspd.worker.scenes.placement import gaps_between, neighbour_of, scenes_of
+from graspd.worker.scenes.rest import RestingFaces, resting_faces, rolling_note, rolling_poses
 from graspd.worker.scenes.simulate import REACH, _build
 from tests.worker.models import object_from_mesh
 
@@ -55,24 +62,19 @@ def test_the_simulated_inertia_is_the_meshs_and_not_the_hulls():
 
 
 @pytest.mark.parametrize("name", ["025_mug", "037_scissors", "006_mustard_bottle"])
-def test_scanned_objects_rest_with_their_centre_of_mass_over_their_support(shared_data, name):
+def test_scanned_objects_rest_with_their_centre_over_the_support(shared_data, name):
     obj = scan(shared_data, name)
     for pose in drop(obj, count=6, seed=3)["scene/object_pose"]:
         assert overhang(obj, pose) < 0
 
 
-def test_a_concave_object_rests_stably():
-    obj = bracket()
-    for pose in drop(obj, count=8, seed=0)["scene/object_pose"]:
-        assert overhang(obj, pose) < 0
-
-
-def test_the_lowest_point_touches_the_table_and_the_object_stays_near_the_middle():
+def test_lowest_point_touches_table_and_object_stays_near_middle():
     obj = bracket()
     poses = drop(obj, count=8, seed=1)["scene/object_pose"]
     heights = apply(poses[:, None], obj.hull_vertices)[..., 2].min(axis=1)
     np.testing.assert_allclose(heights, 0.0, atol=ROUNDING_M)
     np.testing.assert_allclose(np.linalg.norm(poses[:, 3:], axis=1), 1.0, atol=1e-12)
+    assert all(overhang(obj, pose) < 0 for pose in poses)
     centres = apply(poses, obj.centre_of_mass)
     assert np.hypot(centres[:, 0], centres[:, 1]).max() < REACH
 
@@ -96,13 +98,15 @@ def test_a_thin_slab_almost_never_stands_on_an_edge():
     assert np.all(np.abs(result["scene/rest_probability"] - 0.5) < 4 * 0.0625)
 
 
-def test_the_same_seed_gives_the_same_scenes_and_more_scenes_keep_the_first():
+def test_same_seed_gives_same_scenes_and_more_scenes_keep_first():
     obj = bracket()
     first, again, more = drop(obj, count=3, seed=7), drop(obj, count=3, seed=7), drop(obj, count=5, seed=7)
     for name, values in first.items():
         np.testing.assert_array_equal(values, again[name])
         np.testing.assert_array_equal(values, more[name][:3])
     assert not np.array_equal(first["scene/object_pose"], drop(obj, count=3, seed=8)["scene/object_pose"])
+    binned = [rest_poses(SceneSpec(kind="bin"), BLOCK, count=3, seed=5)["scene/object_pose"] for _ in range(2)]
+    assert np.array_equal(*binned)
 
 
 def test_stable_faces_agree_with_trimeshs():
@@ -119,7 +123,7 @@ def test_stable_faces_agree_with_trimeshs():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("size", [(0.04, 0.06, 0.09), (0.05, 0.06, 0.07)])
-def test_bricks_rest_on_each_pair_of_faces_as_often_as_the_quasi_static_theory_says(size):
+def test_bricks_rest_on_faces_as_often_as_theory_says(size):
     """Chi-square of 300 drops against Goldberg et al. (1999), which knows no bouncing: contacts here hardly bounce."""
     mesh = trimesh.creation.box(size)
     poses = drop(object_from_mesh(mesh), count=300, seed=0)["scene/object_pose"]
@@ -147,7 +151,7 @@ CONVEX = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CONVEX)
-def test_convex_objects_rest_on_each_face_as_often_as_the_quasi_static_theory_says(name):
+def test_convex_objects_rest_on_faces_as_often_as_theory_says(name):
     mesh = CONVEX[name]
     poses = drop(object_from_mesh(mesh, name), count=300, seed=0)["scene/object_pose"]
     down = quat_rotate(poses[:, 3:] * np.array([1, -1, -1, -1]), np.array([0.0, 0, -1]))
@@ -160,8 +164,9 @@ def test_convex_objects_rest_on_each_face_as_often_as_the_quasi_static_theory_sa
 
 
 @pytest.fixture
-def dropped(monkeypatch, tmp_path) -> list[tuple[int, int]]:
+def dropped(monkeypatch, tmp_path) -> Iterator[list[tuple[int, int]]]:
     """Keys of the drops that are simulated, in a cache of their own."""
+    monkeypatch.setattr(simulate, "REFERENCE_DROPS", 8)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     keys: list[tuple[int, int]] = []
     whole = simulate._redo_until_rest
@@ -171,7 +176,8 @@ def dropped(monkeypatch, tmp_path) -> list[tuple[int, int]]:
         return whole(table, name, key)
 
     monkeypatch.setattr(simulate, "_redo_until_rest", counted)
-    return keys
+    yield keys
+    next_process()
 
 
 def next_process() -> None:
@@ -188,47 +194,200 @@ def test_reference_drops_are_simulated_once_on_a_machine(dropped):
     np.testing.assert_array_equal(first["scene/rest_probability"], again["scene/rest_probability"])
 
 
-@pytest.mark.parametrize(
-    "harm",
-    [{"face": np.full(64, 99)}, {"face": np.zeros(3, np.int64)}, {"face": np.zeros(64)}, {"other": np.zeros(64)}],
-)
-def test_kept_drops_that_cannot_be_those_of_the_object_are_simulated_again(dropped, tmp_path, harm):
+def test_kept_drops_of_another_object_are_simulated_again(dropped, tmp_path):
     next_process()
     first = drop(bracket(), count=1, seed=5)
     (file,) = tmp_path.rglob("drops/*.npz")
-    np.savez(file, **harm)
-    next_process()
-    again = drop(bracket(), count=1, seed=5)
-    assert len(dropped) == 2 * (1 + simulate.REFERENCE_DROPS)
-    np.testing.assert_array_equal(first["scene/rest_probability"], again["scene/rest_probability"])
+    for harm in (np.full(8, 99), np.zeros(3, np.int64), np.zeros(8), None):
+        np.savez(file, **({"other": np.zeros(8)} if harm is None else {"face": harm}))
+        next_process()
+        dropped.clear()
+        again = drop(bracket(), count=1, seed=5)
+        assert len(dropped) == 1 + simulate.REFERENCE_DROPS
+        np.testing.assert_array_equal(first["scene/rest_probability"], again["scene/rest_probability"])
 
 
-def test_no_scenes_give_empty_arrays():
+def test_no_scenes_are_empty_and_negative_counts_refused() -> None:
     result = drop(bracket(), count=0, seed=0)
     assert result["scene/object_pose"].shape == (0, 7)
     assert result["scene/rest_probability"].shape == result["scene/drop_seconds"].shape == (0,)
-
-
-def test_a_negative_count_is_refused():
     with pytest.raises(InputError, match="must not be negative"):
         drop(bracket(), count=-1, seed=0)
 
 
 def test_a_flat_object_is_refused_by_name():
-    flat = trimesh.Trimesh([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]], [[0, 1, 2], [0, 2, 1]], process=False)
-    box = bracket()
-    obj = ObjectModel(
-        name="sheet",
-        digest="f" * 32,
-        vertices=flat.vertices,
-        faces=np.asarray(flat.faces, np.int32),
-        corner_normals=np.zeros((2, 3, 3)),
-        volume=1e-9,
-        centre_of_mass=np.array([0.03, 0.03, 0]),
-        inertia=box.inertia,
-        radius=0.1,
-        hull_vertices=np.asarray(flat.vertices),
-        hull_faces=np.asarray(flat.faces, np.int32),
-    )
+    corners, sheet = np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]], float), np.array([[0, 1, 2], [0, 2, 1]], np.int32)
+    flat = {"vertices": corners, "hull_vertices": corners, "faces": sheet, "hull_faces": sheet}
+    thin = dataclasses.replace(bracket(), name="sheet", digest="f" * 32, volume=1e-9, **flat)
     with pytest.raises(MeshError, match="sheet"):
-        drop(obj, count=1, seed=0)
+        drop(thin, count=1, seed=0)
+
+
+UP = np.array([0.0, 0, 1])
+
+
+def plate(thickness: float) -> ObjectModel:
+    return object_from_mesh(trimesh.creation.box([0.06, 0.06, thickness]))
+
+
+def rolling_can() -> ObjectModel:
+    return object_from_mesh(trimesh.creation.cylinder(radius=0.03, height=0.1, sections=60))
+
+
+def face_along(faces: RestingFaces, normal: tuple[float, float, float]) -> int:
+    return int((faces.normal @ np.array(normal)).argmax())
+
+
+def test_plate_topples_from_an_edge_whose_tilt_passes_its_middle() -> None:
+    # Height 30 mm, half the thickness t / 2 inside: 1 mm of change tilts by 1 / t, so t t / 2 must pass 30 mm^2.
+    for thickness, falls in ((0.0074, True), (0.0080, False)):
+        faces = resting_faces(plate(thickness))
+        assert faces.topples(face_along(faces, (1, 0, 0))) is falls
+        assert not faces.topples(face_along(faces, (0, 0, 1)))
+
+
+def test_a_can_rolls_on_its_side_and_stands_on_its_bottom() -> None:
+    obj, faces = rolling_can(), resting_faces(rolling_can())
+    angle, sinks = faces.looseness(face_along(faces, (1, 0, 0)))
+    assert angle > np.radians(170)
+    assert sinks == pytest.approx(0.0, abs=1e-6)
+    assert faces.looseness(face_along(faces, (0, 0, 1)))[0] < np.radians(1)
+    lying, standing = [0.0, 0, 0.03, np.sqrt(0.5), 0, np.sqrt(0.5), 0], [0.0, 0, 0.05, 1, 0, 0, 0]
+    assert rolling_poses(obj, np.array([lying, standing, lying])) == 2
+    assert "in 2 of 3 scenes" in str(rolling_note(2, 3))
+    assert rolling_note(0, 3) is None
+
+
+def test_a_can_is_put_on_its_ends_and_a_ball_stays_as_it_lies() -> None:
+    # Half as high as wide: about a half of the drops end on its side.
+    stout = object_from_mesh(trimesh.creation.cylinder(radius=0.03, height=0.05, sections=60))
+    free = [
+        drop(stout, count=12, seed=1)["scene/object_pose"],
+        rest_poses(SceneSpec(kind="table", faces="all"), stout, count=1, seed=0)["scene/object_pose"],
+        drop_together(plate(0.05), [stout], count=8, seed=3)["scene/neighbour_pose"][:, 0],
+    ]
+    for pose in np.concatenate(free):
+        assert abs(quat_rotate(quat_conjugate(pose[3:]), UP)[2]) == pytest.approx(1.0, abs=1e-6)
+        assert pose[2] == pytest.approx(0.025, abs=1e-6)
+    ball = object_from_mesh(trimesh.creation.icosphere(2, 0.03))
+    assert rolling_poses(ball, drop(ball, count=3, seed=1)["scene/object_pose"]) == 3
+
+
+def test_drops_and_faces_leave_out_what_topples() -> None:
+    thin = plate(0.007)
+    poses = [
+        drop(thin, count=12, seed=8)["scene/object_pose"],
+        rest_poses(SceneSpec(kind="table", faces="all"), thin, count=1, seed=0)["scene/object_pose"],
+        drop_together(plate(0.05), [thin], count=8, seed=35)["scene/neighbour_pose"][:, 0],
+    ]
+    for pose in np.concatenate(poses):
+        assert abs(quat_rotate(quat_conjugate(pose[3:]), UP)[2]) == pytest.approx(1.0, abs=1e-6)
+
+
+BLOCK = object_from_mesh(trimesh.creation.box((0.05, 0.07, 0.11)), "block")
+
+
+def corners(pose: np.ndarray) -> np.ndarray:
+    return quat_rotate(pose[3:], BLOCK.hull_vertices) + pose[:3]
+
+
+@pytest.mark.parametrize("kind", ["table", "bin", "shelf"])
+def test_the_object_stands_on_its_support_and_in_nothing_else(kind: str) -> None:
+    spec = SceneSpec(kind=kind)
+    for pose in rest_poses(spec, BLOCK, count=6, seed=3)["scene/object_pose"]:
+        distances = [support.distance(corners(pose)).min() for support in supports_of(spec)]
+        assert min(distances) == pytest.approx(0.0, abs=1e-6), "rest poses are exact"
+        assert sorted(distances)[1:] == sorted(d for d in distances if d > 1e-4)[-len(distances) + 1 :]
+
+
+def test_all_faces_are_those_that_enough_drops_end_on() -> None:
+    found = rest_poses(SceneSpec(kind="table", faces="all"), BLOCK, count=1, seed=0)
+    heights = sorted(np.round(2 * found["scene/object_pose"][:, 2], 6).tolist())
+    # The block's frame stands in its middle. A narrow end is a face that few drops end on.
+    assert set(heights) <= {0.05, 0.07, 0.11}
+    assert {0.05, 0.07} <= set(heights)
+    assert len(heights) == len({tuple(np.round(p[3:], 6)) for p in found["scene/object_pose"]})
+    ball = object_from_mesh(trimesh.creation.icosphere(subdivisions=2, radius=0.03), "ball")
+    found = rest_poses(SceneSpec(kind="table", faces="all"), ball, count=1, seed=0)
+    # Of 320 alike faces 64 drops meet most once, which is no more than 1.6 %.
+    assert 1 <= len(found["scene/object_pose"]) <= 20
+
+
+def test_object_too_large_for_a_bin_is_refused_with_both_sizes() -> None:
+    plank = object_from_mesh(trimesh.creation.box((0.5, 0.05, 0.05)), "plank")
+    with pytest.raises(InputError, match=r"plank lies .* mm and there is room for 380 x 280 mm"):
+        rest_poses(SceneSpec(kind="bin"), plank, count=2, seed=0)
+
+
+def test_a_target_stands_where_told_and_not_under_its_support() -> None:
+    spec = SceneSpec(kind="file", supports=({"kind": "half_space"},), target=(0.1, 0, 0.055, 1, 0, 0, 0))
+    found = rest_poses(spec, BLOCK, count=2, seed=0)["scene/object_pose"]
+    assert np.array_equal(found, np.tile([0.1, 0, 0.055, 1, 0, 0, 0], (2, 1)))
+    spec = SceneSpec(kind="file", supports=({"kind": "half_space"},), target=(0, 0, 0, 1, 0, 0, 0))
+    with pytest.raises(InputError, match="deep in support 0"):
+        rest_poses(spec, BLOCK, count=1, seed=0)
+
+
+def box(*size: float, name: str = "box"):
+    return object_from_mesh(trimesh.creation.box(size), name)
+
+
+THING, LOW, TALL = box(0.05, 0.05, 0.05), box(0.08, 0.06, 0.03, name="low"), box(0.03, 0.04, 0.12, name="tall")
+
+
+def laid(kind: str, others, *, count: int, faces: str = "drawn", thing=THING):
+    spec = SceneSpec(kind=kind, faces=faces, neighbours=tuple({"object": one.name} for one in others))
+    return spec, *scenes_of(spec, thing, others, count=count, seed=5)
+
+
+def corners_of(obj, poses: np.ndarray) -> np.ndarray:
+    return np.stack([quat_rotate(pose[3:], obj.hull_vertices) + pose[:3] for pose in poses])
+
+
+@pytest.mark.parametrize("kind", ["bin", "shelf"])
+def test_neighbours_stand_within_walls_apart_and_on_the_floor(kind: str) -> None:
+    others = [LOW, TALL, LOW]
+    spec, scenes, poses = laid(kind, others, count=4)
+    room = np.asarray(room_in(spec)) / 2 - GAP
+    together = np.concatenate([poses["scene/object_pose"][:, None], poses["scene/neighbour_pose"]], axis=1)
+    for number, one in enumerate([THING, *others]):
+        found = corners_of(one, together[:, number])
+        assert (np.abs(found[..., :2]) <= room + 1e-9).all()
+        np.testing.assert_allclose(found[..., 2].min(axis=1), 0.0, atol=1e-9)
+        # The supports' own planes, the boards above and below among them.
+        for support in scenes.supports:
+            assert min(support.distance(one_scene).min() for one_scene in found) > -1e-9
+    gaps = gaps_between([neighbour_of(one) for one in (THING, *others)], together)
+    assert min(gap.min() for gap in gaps.values()) >= BETWEEN - 1e-6  # MuJoCo's meshes are float32
+    assert len(scenes.placed(np.zeros(1, int)).scenes[0].obstacles) == len(scenes.supports) + len(others)
+    assert not np.allclose(poses["scene/neighbour_pose"][:, 0], poses["scene/neighbour_pose"][:, 2]), "two lie apart"
+
+
+def test_more_scenes_keep_the_first_and_where_the_object_lies() -> None:
+    _, _, few = laid("bin", [LOW], count=2)
+    _, _, more = laid("bin", [LOW], count=3)
+    np.testing.assert_array_equal(more["scene/neighbour_pose"][:2], few["scene/neighbour_pose"])
+    _, _, alone = laid("bin", [], count=2)
+    np.testing.assert_array_equal(few["scene/object_pose"], alone["scene/object_pose"])
+
+
+def test_on_a_table_each_face_has_its_neighbours() -> None:
+    thing = box(0.04, 0.06, 0.09)
+    _, _, poses = laid("table", [LOW, TALL], count=1, faces="all", thing=thing)
+    ups = [quat_rotate(pose[3:] * [1, -1, -1, -1], np.array([0, 0, 1.0])) for pose in poses["scene/object_pose"]]
+    assert len(np.unique(np.round(ups, 6), axis=0)) == len(ups) >= 4
+    assert poses["scene/neighbour_pose"].shape == (len(ups), 2, 7)
+
+
+def test_as_many_as_may_be_find_room_around_one_like_them() -> None:
+    """Dropped together their bounding balls would never fit on one ring."""
+    _, _, poses = laid("table", [THING] * 8, count=1)
+    together = np.concatenate([poses["scene/object_pose"][:, None], poses["scene/neighbour_pose"]], axis=1)
+    gaps = gaps_between([neighbour_of(THING)] * 9, together)
+    assert min(gap.min() for gap in gaps.values()) > 0
+
+
+def test_a_bin_without_room_says_so_in_a_line() -> None:
+    with pytest.raises(SceneError, match=r"no room for 2 neighbours beside box in scene 0: .* wider scene") as told:
+        laid("bin", [box(0.3, 0.2, 0.05, name="tray")] * 2, count=1)
+    assert "\n" not in str(told.value)

@@ -14,8 +14,7 @@ from graspd.worker.validation.lifting import KnownLifts, validate_lifts
 from graspd.worker.validation.prescreening import SLIPS, LiftRollouts
 from graspd.worker.validation.protocol import Test
 from graspd.worker.validation.validator import KnownRollouts, validate
-from tests.worker.validation.test_lift import BOX, HAND, PLACED, WHOLE, grasp
-from tests.worker.validation.test_prescreening import LEAST
+from tests.worker.validation.test_lift import BOX, HAND, LEAST, PLACED, WHOLE, grasp
 
 SQUEEZES = (-0.005, 1.3 * LEAST, 4 * LEAST)
 MANY = joined([grasp(squeeze) for squeeze in SQUEEZES])
@@ -36,13 +35,23 @@ def lifts(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return done
 
 
-def test_a_lift_that_is_known_is_not_simulated_again(lifts: list[int]) -> None:
+def test_what_was_validated_once_is_not_simulated_again(lifts: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
     known: KnownLifts = {}
     first = validate_lifts(HAND, BOX, MANY, WHERE, pieces=WHOLE, known=known)
     again = validate_lifts(HAND, BOX, MANY, WHERE, pieces=WHOLE, known=known)
     assert len(lifts) == 3
     assert np.array_equal(first.outcome, again.outcome)
     assert np.array_equal(first.margin, again.margin)
+    rows: list[int] = []
+    standard = Test.standard
+    monkeypatch.setattr(Test, "standard", lambda self, given, row: rows.append(row) or standard(self, given, row))
+    known: KnownRollouts = {}
+    first = validate(HAND, BOX, MANY, pieces=WHOLE, known=known)
+    again = validate(HAND, BOX, MANY.take(np.array([2, 0])), pieces=WHOLE, known=known)
+    assert sorted(rows) == [0, 1, 2]
+    assert np.array_equal(again.outcome, first.outcome[[2, 0]])
+    validate(HAND, BOX, MANY, pieces=WHOLE, hard=True, known=known)
+    assert len(rows) == 6
 
 
 @pytest.mark.parametrize("other", ["friction", "squeeze", "scene"])
@@ -100,31 +109,16 @@ def test_a_score_is_that_of_the_lift(monkeypatch: pytest.MonkeyPatch) -> None:
     assert found[0] <= BEST
 
 
-def test_a_hand_that_must_lift_at_half_the_friction_to_be_better_and_does_not_is_no_better(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_lifting_at_half_the_friction_is_asked_to_be_better(monkeypatch: pytest.MonkeyPatch) -> None:
     outcomes = {True: [LIFTED, FELL], False: [LIFTED, LIFTED]}
     found = rollout_of(monkeypatch, [0.2, 0.3], outcomes, np.array([1.5, 1.5]))
     assert found == pytest.approx([0.2, 1.5])
 
 
 @pytest.mark.parametrize(("verdict", "score"), [(1, 0.2), (0, SLIPS + 1.0 + FALLS * 0.2)])
-def test_a_free_grasp_that_the_validator_drops_is_no_good_candidate(
+def test_free_grasp_that_the_validator_drops_is_no_good_candidate(
     monkeypatch: pytest.MonkeyPatch, verdict: int, score: float
 ) -> None:
     monkeypatch.setattr(rollouts, "push_rollout", lambda *_: lambda grasps, *_: np.array([0.2, 4.0, 4.0]))
     monkeypatch.setattr(rollouts, "validate", lambda *_, **__: type("Verdicts", (), {"success": np.array([verdict])}))
     assert hold_rollout(HAND, BOX, lambda: WHOLE)(MANY, None).tolist() == pytest.approx([score, 4.0, 4.0])
-
-
-def test_a_verdict_that_is_known_is_not_found_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    rows: list[int] = []
-    standard = Test.standard
-    monkeypatch.setattr(Test, "standard", lambda self, given, row: rows.append(row) or standard(self, given, row))
-    known: KnownRollouts = {}
-    first = validate(HAND, BOX, MANY, pieces=WHOLE, known=known)
-    again = validate(HAND, BOX, MANY.take(np.array([2, 0])), pieces=WHOLE, known=known)
-    assert sorted(rows) == [0, 1, 2]
-    assert np.array_equal(again.outcome, first.outcome[[2, 0]])
-    validate(HAND, BOX, MANY, pieces=WHOLE, hard=True, known=known)
-    assert len(rows) == 6

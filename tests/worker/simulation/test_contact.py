@@ -123,7 +123,7 @@ def test_the_step_ends_where_the_float64_reference_ends(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", SOLVERS)
-def test_the_gradient_agrees_with_central_differences_of_the_reference(name: str) -> None:
+def test_gradient_agrees_with_central_differences_of_reference(name: str) -> None:
     kernel, solver = SOLVERS[name]
     rng = np.random.default_rng(2)
     cosines = []
@@ -155,7 +155,7 @@ def test_a_free_object_keeps_its_motion() -> None:
 
 
 @pytest.mark.parametrize("name", ["gauss_seidel"])
-def test_friction_never_leaves_the_cone_and_both_stick_and_slip_occur(name: str) -> None:
+def test_friction_never_leaves_the_cone_sticks_and_slips(name: str) -> None:
     rng = np.random.default_rng(3)
     stuck = slid = 0
     for friction in (0.1, 0.8, 3.0):
@@ -170,7 +170,7 @@ def test_friction_never_leaves_the_cone_and_both_stick_and_slip_occur(name: str)
     assert stuck > 0 and slid > 0
 
 
-def test_an_object_between_two_fingers_sticks_with_friction_and_slides_without() -> None:
+def test_an_object_between_fingers_sticks_or_slides_by_friction() -> None:
     points = np.array([[0.03, 0, 0], [-0.03, 0, 0]])
     squeeze = Contacts(points, points / 0.03, np.full(2, -1e-3), np.full(2, 50.0))
     for kernel, _ in SOLVERS.values():
@@ -182,7 +182,7 @@ def test_an_object_between_two_fingers_sticks_with_friction_and_slides_without()
         assert abs(run(kernel, squeeze, smooth)[0][along_y, 1]) > 0.9 * WORLD.step
 
 
-def test_one_contact_gives_the_object_the_momentum_of_its_impulse() -> None:
+def test_one_contact_gives_object_the_momentum_of_its_impulse() -> None:
     """Off-centre and without friction: M s = lambda (n, p x n) with lambda = -C / w, in closed form."""
     point, normal, depth = np.array([0.04, 0.01, -0.02]), np.array([0.0, 0.6, 0.8]), 1e-3
     single = Contacts(point[None], normal[None], np.array([-depth]), np.ones(1))
@@ -195,15 +195,19 @@ def test_one_contact_gives_the_object_the_momentum_of_its_impulse() -> None:
     np.testing.assert_allclose(end, expected, rtol=1e-5, atol=1e-9)
 
 
-def test_a_balanced_grasp_leaves_the_object_at_rest() -> None:
+def test_a_balanced_grasp_leaves_the_object_at_rest_without_nan() -> None:
     axes = np.concatenate([np.eye(3), -np.eye(3)])
     balanced = Contacts(0.04 * axes, axes, np.full(6, -5e-4), np.ones(6))
     for kernel in (contact.direct, contact.jacobi):
         end, _, _ = run(kernel, balanced, WORLD)
         np.testing.assert_allclose(end[0], 0, atol=1e-8)
+    touching = Contacts(np.zeros((3, 3)), np.eye(3), np.zeros(3), np.ones(3))
+    for kernel, _ in SOLVERS.values():
+        for part in run(kernel, touching, WORLD, leak=0.1):
+            assert np.all(np.isfinite(part))
 
 
-def test_the_direct_solve_does_not_depend_on_the_order_of_contacts() -> None:
+def test_direct_solve_does_not_depend_on_the_order_of_contacts() -> None:
     rng = np.random.default_rng(4)
     contacts = ring(rng)
     order = rng.permutation(len(contacts.points))
@@ -224,10 +228,3 @@ def test_the_one_sided_leak_only_draws_free_points_nearer(name: str) -> None:
     # Descending a positive dL/drho shortens the distance.
     assert np.all(one >= 0) and one.max() > 0
     assert np.abs(two).max() < 0.1 * one.max(), "two-sided: opposite velocities cancel where nothing touches"
-
-
-def test_contact_at_zero_distance_and_zero_motion_gives_no_nan() -> None:
-    touching = Contacts(np.zeros((3, 3)), np.eye(3), np.zeros(3), np.ones(3))
-    for kernel, _ in SOLVERS.values():
-        for part in run(kernel, touching, WORLD, leak=0.1):
-            assert np.all(np.isfinite(part))

@@ -59,9 +59,7 @@ def test_a_later_process_reads_what_the_first_one_computed(computed: list[Any], 
     assert len(computed) == 1 and len(list(own_cache.iterdir())) == 1
 
 
-def test_another_cell_other_faces_of_light_or_another_binary_is_another_grid(
-    computed: list[Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_another_cell_faces_or_binary_is_another_grid(computed: list[Any], monkeypatch: pytest.MonkeyPatch) -> None:
     grid()
     coarse = grid(cell=0.01)
     grid(alpha=1.0)

@@ -96,7 +96,7 @@ def test_float64_kinematics_agrees_with_mujoco(shared_data: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["allegro", "barrett", "shadow"])
-def test_the_transpose_is_the_derivative_of_the_map_it_belongs_to(name: str) -> None:
+def test_transpose_is_the_derivative_of_the_map_it_belongs_to(name: str) -> None:
     """Random forces at random points: their work by the transpose equals central differences in float64."""
     hand = hand_from_path(name)
     rng = np.random.default_rng(3)

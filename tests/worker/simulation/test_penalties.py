@@ -1,24 +1,37 @@
-"""Gradients of the penetration penalties against central differences of a float64 energy."""
+"""Gradients of the penalties, of penetration and of obstacles, against central differences of a float64 energy."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import get_args
 
 import numpy as np
 import pytest
 
 from graspd.service.model.errors import InputError
-from graspd.service.model.transforms import apply, invert, quat_from_axis_angle, quat_multiply
+from graspd.service.model.fidelity import Fidelity
+from graspd.service.model.transforms import apply, compose, invert, quat_from_axis_angle, quat_multiply, quat_rotate
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.surface import piece_distance, sample_surface
-from graspd.worker.simulation.data import HandState, Schedule
-from graspd.worker.simulation.model import REFERENCE_POINTS, REFERENCE_SAMPLES, REFERENCE_SELF_POINTS, LossOptions
-from graspd.worker.simulation.record import record_evaluation, record_iteration
+from graspd.worker.scenes.placement import outer_solid
+from graspd.worker.simulation.data import Data, HandState, Schedule
+from graspd.worker.simulation.environment import Environment, Obstacle
+from graspd.worker.simulation.model import (
+    REFERENCE_POINTS,
+    REFERENCE_SAMPLES,
+    REFERENCE_SELF_POINTS,
+    LossOptions,
+    Model,
+)
+from graspd.worker.simulation.obstacles import DeviceObstacles
+from graspd.worker.simulation.projection import Projection, ProjectionOptions
+from graspd.worker.simulation.record import OPTIMIZERS, record_evaluation, record_iteration, record_placement
 from graspd.worker.simulation.sampling import object_samples
 from tests.worker.simulation.rigs import ball, rig, still
+from tests.worker.simulation.solids import nearest_edges
 from tests.worker.simulation.test_kinematics import root_poses
 
 #: float32 depths of 1e-3 m from coordinates of 0.1 m are good to 1e-5 relative; points that enter or leave within the
@@ -54,8 +67,19 @@ def fist_in_ball(hand: HandModel) -> HandState:
     return HandState(np.array([[0.03, 0.002, -0.001]]), np.array([[0.0, 0.0, 0.0, 1.0]]), q[None])
 
 
+def gradient_of(model: Model, data: Data, state: HandState, **weights: float) -> np.ndarray:
+    """The gradient at a state with these weights of the schedule, all others 0."""
+    schedule = still()
+    for name, value in weights.items():
+        getattr(schedule, name)[:] = value
+    data.set_schedule(schedule)
+    data.set_state(state)
+    record_evaluation(model, data).run()
+    return np.array(data.gradient.numpy()[0])
+
+
 @pytest.mark.parametrize("name", ["allegro", "shadow"])
-def test_object_points_inside_links_push_the_hand_along_the_true_gradient(name: str) -> None:
+def test_object_points_inside_links_push_along_the_gradient(name: str) -> None:
     hand, obj = hand_from_path(name), ball()
     state = fist_in_ball(hand)
     samples = object_samples(obj, 1000) - obj.centre_of_mass
@@ -69,12 +93,7 @@ def test_object_points_inside_links_push_the_hand_along_the_true_gradient(name: 
         return total * REFERENCE_SAMPLES / len(samples)
 
     model, data = rig(hand, obj, capacity=1, options=LossOptions(simulate=False, leak=0.0, range_weight=0.0))
-    schedule = still()
-    schedule.object_penetration[:] = 1.0
-    data.set_schedule(schedule)
-    data.set_state(state)
-    record_evaluation(model, data).run()
-    found = data.gradient.numpy()[0]
+    found = gradient_of(model, data, state, object_penetration=1.0)
     expected = differences(energy, state, len(found))
     assert np.linalg.norm(expected) > 0.01, "the state penetrates"
     np.testing.assert_allclose(found, expected, atol=RELATIVE * np.abs(expected).max())
@@ -104,12 +123,7 @@ def test_links_inside_links_are_parted_along_the_true_gradient(name: str) -> Non
 
     options = LossOptions(simulate=False, leak=0.0, range_weight=0.0, self_margin=0.0)
     model, data = rig(hand, ball(), capacity=1, options=options)
-    schedule = still()
-    schedule.self_penetration[:] = 1.0
-    data.set_schedule(schedule)
-    data.set_state(state)
-    record_evaluation(model, data).run()
-    found = data.gradient.numpy()[0]
+    found = gradient_of(model, data, state, self_penetration=1.0)
     expected = differences(energy, state, len(found))
     assert np.linalg.norm(expected) > 1e-4, "the links touch"
     np.testing.assert_allclose(found, expected, atol=RELATIVE * np.abs(expected).max())
@@ -121,7 +135,7 @@ def beside_a_ball(hand: HandModel, gap: float) -> HandState:
 
 
 @pytest.mark.parametrize("name", ["allegro", "barrett"])
-def test_points_that_touch_nothing_are_pulled_along_the_true_gradient(name: str) -> None:
+def test_points_that_touch_nothing_are_pulled_by_the_gradient(name: str) -> None:
     """Against the energy -2 w d l sum w_i exp(-rho_i / l) over points beyond the surface of a ball in closed form."""
     hand, radius = hand_from_path(name), 0.035
     points, weight, pull, length, band = sample_surface(hand, 300), 40.0, 3e-4, 0.013, 0.2
@@ -138,18 +152,13 @@ def test_points_that_touch_nothing_are_pulled_along_the_true_gradient(name: str)
     )
     # A fine ball, faces as they are: its distances are those of a sphere to 0.02 mm.
     model, data = rig(hand, ball(radius, subdivisions=5), capacity=1, options=options, alpha=0.0)
-    schedule = still()
-    schedule.penetration[:] = weight
-    data.set_schedule(schedule)
-    data.set_state(state)
-    record_evaluation(model, data).run()
-    found = data.gradient.numpy()[0]
+    found = gradient_of(model, data, state, penetration=weight)
     expected = differences(energy, state, len(found))
     # Normals of faces are off by 0.3 degrees.
     np.testing.assert_allclose(found, expected, atol=1e-2 * np.abs(expected).max())
 
 
-def test_the_share_of_a_hand_that_is_near_is_its_area_over_the_whole() -> None:
+def test_share_of_a_hand_that_is_near_is_its_area_over_the_whole() -> None:
     hand, radius, reach = hand_from_path("allegro"), 0.035, 0.02
     points = sample_surface(hand, 300)
     states = [beside_a_ball(hand, gap) for gap in (0.012, 0.03, 1.0)]
@@ -164,7 +173,7 @@ def test_the_share_of_a_hand_that_is_near_is_its_area_over_the_whole() -> None:
     np.testing.assert_allclose(data.near_share(reach, 3), expected, atol=1 / 200)
 
 
-def test_the_range_and_limit_penalties_have_their_closed_form_gradient() -> None:
+def test_range_and_limit_penalties_have_closed_form_gradients() -> None:
     hand = hand_from_path("barrett")
     q = hand.upper + 0.1
     state = HandState(np.array([[0.5, 0.0, 0.0]]), np.array([[1.0, 0.0, 0.0, 0.0]]), q[None])
@@ -184,9 +193,14 @@ PLACES = {
 }
 
 
-def test_an_unknown_contact_solver_is_refused_in_a_line() -> None:
+def test_unknown_solvers_and_optimizers_are_refused_in_a_line() -> None:
     with pytest.raises(InputError, match="unknown contact solver 'newton'; choose one of direct"):
         rig(hand_from_path("allegro"), ball(), capacity=1, options=LossOptions(contact_solver="newton"))
+    model, data = rig(hand_from_path("barrett"), ball(), capacity=1, options=LossOptions())
+    for name in ("lbfgs", "Adam", ""):
+        with pytest.raises(InputError, match=r"unknown optimizer '.*'; choose one of adam, gd$"):
+            record_iteration(model, data, name)
+    assert get_args(Fidelity.model_fields["optimizer"].annotation) == OPTIMIZERS
 
 
 @pytest.mark.parametrize("place", PLACES)
@@ -232,3 +246,176 @@ def test_small_descent_steps_never_raise_the_loss() -> None:
     assert losses[-1] < losses[0]
     # float32 sums of losses of size 1.
     assert max(np.diff(losses)) < 1e-5
+
+
+@pytest.mark.parametrize("optimizer", OPTIMIZERS)
+def test_a_step_moves_and_turns_a_hand_against_its_gradient(optimizer: str) -> None:
+    """The first step of Adam is as long as its rate; that of plain descent is the rate times the gradient."""
+    hand, one = hand_from_path("allegro"), np.ones(1)
+    state = fist_in_ball(hand)
+    model, data = rig(hand, ball(), capacity=1, options=LossOptions(leak=0.0, range_weight=0.0))
+    rates = np.array([1e-3, 2e-3, 3e-3] if optimizer == "adam" else [1e-6, 1e-4, 1e-5])
+    data.set_schedule(Schedule(0.004 * one, one, one, one, rates[None]))
+    data.set_state(state)
+    record_iteration(model, data, optimizer).run()
+    gradient = data.gradient.numpy()[0].astype(float)
+    step = -np.repeat(rates, [3, 3, hand.dofs]) * (np.sign(gradient) if optimizer == "adam" else gradient)
+    angle = np.linalg.norm(step[3:6])
+    assert angle > 1e-4 and np.abs(step[:3]).max() > 1e-5
+    found = data.state(1)
+    np.testing.assert_allclose(found.pivot[0], state.pivot[0] + step[:3], atol=1e-6)
+    turned = quat_multiply(quat_from_axis_angle(step[3:6] / angle, np.asarray(angle)), state.rotation[0])
+    np.testing.assert_allclose(found.rotation[0], turned, atol=1e-6)
+    np.testing.assert_allclose(found.q[0], np.clip(state.q[0] + step[6:], hand.lower, hand.upper), atol=1e-6)
+
+
+MARGIN = 0.004
+
+
+def sphere_points(count: int, seed: int) -> np.ndarray:
+    """(N, 3) on the unit sphere."""
+    points = np.random.default_rng(seed).normal(size=(count, 3))
+    return points / np.linalg.norm(points, axis=1, keepdims=True)
+
+
+BALL = sphere_points(300, seed=5) * 0.04 + [0.33, 0.02, 0.02]
+SCENES = {
+    "table": (Obstacle.half_space([0.1, -0.2, 1.0], -0.02),),
+    "a table to press into": (replace(Obstacle.half_space([0.1, -0.2, 1.0], -0.02), tips_m=-0.001),),
+    "corner of two walls": (
+        Obstacle.half_space([0, 0, 1], -0.03),
+        Obstacle.box([0.327, 0.013, 0.011, 0.9, 0.1, 0.2, 0.3], [0.11, 0.6, 0.4]),
+    ),
+    "a stick and a board": (
+        Obstacle.box([0.30, 0.02, 0.02, 0.9, 0.1, 0.2, 0.3], [0.012, 0.3, 0.011]),
+        Obstacle.box([0.33, 0.03, 0.05, 0.6, 0.5, -0.2, 0.3], [0.4, 0.5, 0.006]),
+    ),
+    "a round neighbour": (outer_solid(BALL)[0],),
+}
+
+
+def distances(hand: HandModel, state: HandState, obstacle: Obstacle) -> np.ndarray:
+    """(F,) signed distance of each feature from an obstacle in float64, the object's centre being the origin."""
+    features, poses = hand.features, bodies_of(hand, state)[hand.features.body]
+    centre = quat_rotate(poses[:, 3:], features.centre) + poses[:, :3]
+    axis = quat_rotate(poses[:, 3:], features.axis)
+    rim = np.linalg.norm(axis, axis=1) > 0.5
+    per_plane = []
+    for plane in obstacle.planes:
+        sine = np.sqrt(np.maximum(0, 1 - (axis @ plane[:3]) ** 2))
+        per_plane.append(centre @ plane[:3] - plane[3] - features.radius * np.where(rim, sine, 1.0))
+    return np.max(per_plane, axis=0)
+
+
+def kept(hand: HandModel, obstacle: Obstacle) -> np.ndarray:
+    """(F,) distance that features keep."""
+    tip = np.isin(hand.features.body, hand.fingertips)
+    return np.where(tip & (obstacle.tips_m is not None), obstacle.tips_m or 0.0, MARGIN)
+
+
+def simulation_in(hand: HandModel, obstacles: tuple[Obstacle, ...]) -> tuple[Model, Data]:
+    obj = ball()
+    model, data = rig(hand, obj, capacity=1, options=LossOptions(simulate=False, leak=0.0, range_weight=0.0))
+    up = np.array([0.0, 0, 1])
+    solids = DeviceObstacles.create(hand, [Environment(obstacles, up)], obj.centre_of_mass, "cpu", margin=MARGIN)
+    data.set_scenes(np.zeros(1, int))
+    return replace(model, obstacles=solids), data
+
+
+def reaching(hand: HandModel) -> HandState:
+    """A hand beside the ball whose fingers reach into the obstacles; it does not touch the ball."""
+    q = hand.lower + 0.45 * (hand.upper - hand.lower)
+    rotation = np.array([0.4, 0.5, -0.3, 0.7])
+    return HandState(np.array([[0.3, 0.02, 0.0]]), (rotation / np.linalg.norm(rotation))[None], q[None])
+
+
+@pytest.mark.parametrize(
+    ("name", "scene"),
+    [
+        *((name, "table") for name in ("allegro", "barrett", "shadow")),
+        ("barrett", "a table to press into"),
+        ("barrett", "a stick and a board"),
+        pytest.param("allegro", "corner of two walls", marks=pytest.mark.slow),
+        pytest.param("shadow", "corner of two walls", marks=pytest.mark.slow),
+        pytest.param("allegro", "a stick and a board", marks=pytest.mark.slow),
+        pytest.param("shadow", "a round neighbour", marks=pytest.mark.slow),
+    ],
+)
+def test_obstacles_push_the_hand_along_the_true_gradient(name: str, scene: str) -> None:
+    hand, obstacles = hand_from_path(name), SCENES[scene]
+    state = reaching(hand)
+
+    def energy(at: HandState) -> float:
+        short = [np.minimum(distances(hand, at, o) - kept(hand, o), 0.0) for o in obstacles]
+        solids = [o for o in obstacles if len(o.corners)]
+        short += [nearest_edges(hand, bodies_of(hand, at), o, MARGIN) - MARGIN for o in solids]
+        return float(sum((s**2).sum() for s in short))
+
+    model, data = simulation_in(hand, obstacles)
+    found = gradient_of(model, data, state, penetration=1.0)
+    assert data.depths.points.numpy()[0] == 0.0, "the object pushes nothing here"
+    expected = differences(energy, state, len(found))
+    assert np.linalg.norm(expected) > 1e-3, "the state is too near"
+    np.testing.assert_allclose(found, expected, atol=RELATIVE * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("name", ["allegro", "barrett", "shadow"])
+def test_depth_is_what_the_nearest_feature_lacks_of_its_margin(name: str) -> None:
+    hand, obstacles = hand_from_path(name), SCENES["table"]
+    model, data = simulation_in(hand, obstacles)
+    data.set_state(reaching(hand))
+    record_placement(model, data).run()
+    expected = max(0.0, MARGIN - distances(hand, reaching(hand), obstacles[0]).min())
+    # float32 coordinates of 0.1 m.
+    np.testing.assert_allclose(data.deepest(1)[0], expected, atol=1e-6)
+
+
+def test_a_start_keeps_a_quarter_of_its_room_under_fingertips() -> None:
+    hand, (table,) = hand_from_path("barrett"), SCENES["a table to press into"]
+    model, data = simulation_in(hand, (table,))
+    data.set_state(reaching(hand))
+    record_placement(model, data, room=0.006).run()
+    tip = np.isin(hand.features.body, hand.fingertips)
+    lack = kept(hand, table) + np.where(tip, 0.0015, 0.006) - distances(hand, reaching(hand), table)
+    np.testing.assert_allclose(data.deepest(1)[0], max(0.0, float(lack.max())), atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["allegro", "barrett", "shadow"])
+def test_the_projection_brings_a_hand_out_of_an_obstacle(name: str) -> None:
+    hand, obstacles = hand_from_path(name), SCENES["table"]
+    state = reaching(hand)
+    state.pivot += (-0.003 - distances(hand, state, obstacles[0]).min()) * obstacles[0].planes[0, :3]
+    model, data = simulation_in(hand, obstacles)
+    found, _ = Projection(model, data, ProjectionOptions()).run(state, 40)
+    assert distances(hand, found, obstacles[0]).min() > MARGIN
+
+
+def test_a_hand_without_a_scene_feels_no_obstacle() -> None:
+    hand = hand_from_path("allegro")
+    model, data = simulation_in(hand, SCENES["table"])
+    data.set_scenes(np.full(1, -1))
+    data.set_state(reaching(hand))
+    record_placement(model, data).run()
+    assert data.depths.obstacles.numpy()[0] == 0.0
+
+
+@pytest.mark.parametrize("name", ["allegro", "barrett", "shadow"])
+def test_projection_brings_hand_out_of_stick_between_its_corners(name: str) -> None:
+    """The stick is pushed into the largest face of the palm: no corner of the hand is near it."""
+    hand = hand_from_path(name)
+    state = reaching(hand)
+    bodies = bodies_of(hand, state)
+    palm = max((p for p in hand.pieces if p.kind == "box"), key=lambda p: sorted(p.size)[1])
+    frame = compose(bodies[palm.body], palm.pose)
+    thin = int(np.argmin(palm.size))
+    middle = np.zeros(3)
+    middle[thin] = 0.5 * palm.size[thin] + 0.004
+    size = np.full(3, 0.01)
+    size[(thin + 1) % 3] = 0.5
+    pose = compose(frame, np.concatenate([middle, [np.cos(0.2), *(np.sin(0.2) * np.eye(3)[thin])]]))
+    stick = Obstacle.box(pose, size)
+    assert nearest_edges(hand, bodies, stick, MARGIN).min() < -5e-4
+    model, data = simulation_in(hand, (stick,))
+    found, _ = Projection(model, data, ProjectionOptions()).run(state, 60)
+    posed = bodies_of(hand, found)
+    assert min(nearest_edges(hand, posed, stick, 0.1).min(), distances(hand, found, stick).min()) > MARGIN - 1e-4

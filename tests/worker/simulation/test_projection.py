@@ -1,20 +1,34 @@
-"""The projection's steps against NumPy, from the very residuals that the kernels found."""
+"""The projection's steps against NumPy; the order of threads and CUDA graphs move no bit."""
 
 from __future__ import annotations
 
+from functools import partial
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pytest
 import trimesh
 import warp as wp
 
+from graspd.service.model.fidelity import FIDELITIES
 from graspd.service.model.transforms import quat_from_axis_angle, quat_multiply
+from graspd.worker.control.opening import OPENING_STEPS
+from graspd.worker.control.postures import pregrasp
+from graspd.worker.execution_context import ExecutionContext
+from graspd.worker.grasps import Posture
 from graspd.worker.hands.kinematics import body_poses, generalized_forces
 from graspd.worker.hands.surface import sample_surface
+from graspd.worker.planners import PlanRequest
+from graspd.worker.planners.fast_graspd import planner
 from graspd.worker.planners.fast_graspd.candidates import posture_of
+from graspd.worker.simulation import launches
 from graspd.worker.simulation.data import Data, HandState, still_schedule
 from graspd.worker.simulation.device import DeviceHand, DeviceObject
+from graspd.worker.simulation.kernels import packing, wrenches
 from graspd.worker.simulation.kernels import projection as kernels
+from graspd.worker.simulation.kernels.wrenches import Wrenches, add_wrench
+from graspd.worker.simulation.launches import Launches
 from graspd.worker.simulation.model import LossOptions, Model
 from graspd.worker.simulation.projection import Projection, ProjectionOptions
 from graspd.worker.simulation.sampling import object_samples
@@ -138,3 +152,189 @@ def test_hands_without_penetration_stay_where_they_are() -> None:
     assert not depth.any()
     np.testing.assert_array_equal(moved.pivot, state.pivot)
     np.testing.assert_array_equal(moved.q, state.q)
+
+
+FIDELITY = FIDELITIES["draft"].model_copy(update={"coarse_iterations": 20, "fine_iterations": 20})
+
+
+@wp.kernel
+def add_all(force_in: wp.array(dtype=wp.vec3), wrench_inout: Wrenches):
+    i = wp.tid()
+    add_wrench(wrench_inout, 0, 0, force_in[i], 0.1 * force_in[i])
+
+
+def summed(forces: np.ndarray) -> np.ndarray:
+    """Counts (6,) of all forces (n, 3) and a tenth of them as torques."""
+    wrench = wp.zeros((1, 1, 6), dtype=wp.int64, device="cpu")
+    given = wp.array(forces.astype(np.float32), dtype=wp.vec3, device="cpu")
+    wp.launch(add_all, len(forces), inputs=[given], outputs=[wrench], device="cpu")
+    return wrench.numpy()[0, 0]
+
+
+def test_wrenches_add_up_with_the_same_bits_in_any_order() -> None:
+    # Sizes from 1e-3 to 1e4, as in a batch: float32 sums of them differ in their last digits.
+    rng = np.random.default_rng(5)
+    forces = rng.normal(size=(500, 3)) * 10.0 ** rng.uniform(-3, 4, (500, 1))
+    shuffled = forces[rng.permutation(500)]
+    assert (
+        np.add.accumulate(forces.astype(np.float32))[-1] != np.add.accumulate(shuffled.astype(np.float32))[-1]
+    ).any()
+    assert (summed(forces) == summed(shuffled)).all()
+    forces = np.random.default_rng(6).normal(size=(300, 3)).astype(np.float32)
+    found = summed(forces) * wrenches.UNIT
+    # Each addend loses less than one count, and the tenth is rounded to float32.
+    np.testing.assert_allclose(found[:3], forces.astype(float).sum(axis=0), atol=300 * wrenches.UNIT)
+    np.testing.assert_allclose(found[3:], 0.1 * forces.astype(float).sum(axis=0), atol=1e-5)
+    assert (summed(np.array([[np.nan, np.inf, -np.inf]])) == 0).all()
+
+
+@pytest.mark.parametrize("count", [1, 31, 32, 33, 95])
+def test_marked_points_get_the_slots_of_a_counter(count: int) -> None:
+    rng = np.random.default_rng(count)
+    mark = rng.integers(0, 3, (4, count)).astype(np.int32)
+    active = wp.array([1, 1, 0, 1], dtype=wp.int32)
+    counts = [wp.zeros((4, -(-count // packing.CHUNK)), dtype=wp.int32) for _ in range(2)]
+    marked = wp.array(mark)
+    wp.launch(packing.count_marks, counts[0].shape, inputs=[active, marked], outputs=counts, device="cpu")
+    index = wp.array(np.tile(np.arange(count, dtype=np.int32), (4, 1)))
+    point, real = wp.zeros((4, count), dtype=wp.vec3), wp.zeros((4, count), dtype=wp.float32)
+    body, near = (wp.full((4, count), -1, dtype=wp.int32) for _ in range(2))
+    totals = [wp.full(4, -1, dtype=wp.int32) for _ in range(2)]
+    wp.launch(
+        packing.pack,
+        (4, count),
+        inputs=[active, marked, *counts, index, point, point, real, real],
+        outputs=[totals[0], body, point, point, real, real, real, totals[1], near],
+        device="cpu",
+    )
+    for b in (0, 1, 3):
+        kept, close = np.flatnonzero(mark[b]), np.flatnonzero(mark[b] == packing.NEAR)
+        assert totals[0].numpy()[b] == len(kept)
+        assert totals[1].numpy()[b] == len(close)
+        assert (body.numpy()[b, : len(kept)] == kept).all()
+        assert (kept[near.numpy()[b, : len(close)]] == close).all()
+    assert totals[0].numpy()[2] == -1
+
+
+def test_batch_has_the_same_bits_where_threads_come_in_any_order(monkeypatch: pytest.MonkeyPatch) -> None:
+    box = object_from_mesh(trimesh.creation.box((0.05, 0.05, 0.08)))
+    states = []
+    for serial in (True, False):
+        monkeypatch.setattr(planner, "Data", partial(Data, serial=serial))
+        (part,) = planner.optimise_batch(
+            two_finger_hand(), box, PlanRequest(2, FIDELITY, seed=3), ExecutionContext("cpu", threads=1)
+        )
+        assert part.state is not None
+        states.append(part.state)
+    for name in ("pivot", "rotation", "q"):
+        assert (getattr(states[0], name) == getattr(states[1], name)).all()
+
+
+class Graphs:
+    """Warp as `Launches` sees it, with a device that is said to be CUDA; counts captures and their replays."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.captured, self.replayed = 0, 0
+        names = {name: getattr(wp, name) for name in ("launch",)}
+        monkeypatch.setattr(
+            launches,
+            "wp",
+            SimpleNamespace(
+                **names,
+                get_device=lambda _: SimpleNamespace(is_cuda=True),
+                ScopedCapture=self.capture,
+                capture_launch=self.replay,
+            ),
+        )
+
+    def capture(self, device: str) -> Any:
+        self.captured += 1
+        return wp.ScopedCapture(device=device)
+
+    def replay(self, graph: Any) -> None:
+        self.replayed += 1
+        wp.capture_launch(graph)
+
+
+def forbid_the_host(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Inside `Launches.run` nothing is read, written, allocated or loaded; names of what was."""
+    broken: list[str] = []
+    within = [False]
+    plain = Launches.run
+
+    def run(self: Launches, times: int = 1) -> None:
+        within[0] = True
+        try:
+            plain(self, times)
+        finally:
+            within[0] = False
+
+    def guarded(name: str, real: Any) -> Any:
+        def call(*given: Any, **named: Any) -> Any:
+            if within[0]:
+                broken.append(name)
+            return real(*given, **named)
+
+        return call
+
+    monkeypatch.setattr(Launches, "run", run)
+    for name in ("numpy", "assign", "fill_", "zero_"):
+        monkeypatch.setattr(wp.array, name, guarded(name, getattr(wp.array, name)))
+    for name in ("zeros", "empty", "full", "copy", "load_module", "synchronize", "synchronize_device"):
+        monkeypatch.setattr(wp, name, guarded(name, getattr(wp, name)))
+    return broken
+
+
+def planned() -> planner.LaunchPart:
+    box = object_from_mesh(trimesh.creation.box((0.05, 0.05, 0.08)))
+    (part,) = planner.optimise_batch(
+        two_finger_hand(), box, PlanRequest(2, FIDELITY, seed=3), ExecutionContext("cpu", threads=1)
+    )
+    return part
+
+
+def test_replayed_graphs_give_the_very_hands_of_plain_launches(monkeypatch: pytest.MonkeyPatch) -> None:
+    plain = planned()
+    graphs = Graphs(monkeypatch)
+    replayed = planned()
+    assert graphs.captured == 3  # the coarse and the fine phase, and the projection
+    steps = FIDELITY.coarse_iterations + FIDELITY.fine_iterations + FIDELITY.polish_iterations
+    assert graphs.replayed == steps
+    assert plain.state is not None
+    assert replayed.state is not None
+    for name in ("pivot", "rotation", "q"):
+        np.testing.assert_array_equal(getattr(plain.state, name), getattr(replayed.state, name))
+
+
+def opened() -> Posture:
+    """Pregrasps of hands in touch: one that opens along its normals, one that has to open plainly."""
+    hand, box = two_finger_hand(), object_from_mesh(trimesh.creation.box((0.06, 0.04, 0.05)))
+    grasp = Posture(np.tile([0, 0, -0.095, 1.0, 0, 0, 0], (2, 1)), np.array([[0.4, 0.4], [0.1, 0.8]]))
+    return pregrasp(hand, box, grasp)
+
+
+def test_replayed_graphs_open_hands_as_plain_launches_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    plain = opened()
+    graphs = Graphs(monkeypatch)
+    replayed = opened()
+    assert graphs.captured == 2  # along the normals, and plainly
+    assert graphs.replayed == 2 * (OPENING_STEPS + 1)
+    np.testing.assert_array_equal(plain.joint_positions, replayed.joint_positions)
+    np.testing.assert_array_equal(plain.hand_pose, replayed.hand_pose)
+
+
+def test_nothing_on_the_host_is_touched_between_two_launches(monkeypatch: pytest.MonkeyPatch) -> None:
+    Graphs(monkeypatch)
+    broken = forbid_the_host(monkeypatch)
+    planned()
+    opened()
+    assert broken == []
+
+
+def test_the_guard_notices_a_read_between_launches(monkeypatch: pytest.MonkeyPatch) -> None:
+    Graphs(monkeypatch)
+    broken = forbid_the_host(monkeypatch)
+    some = wp.zeros(1, dtype=wp.float32, device="cpu")
+    monkeypatch.setattr(Launches, "_launch_all", lambda self: some.numpy())
+    Launches("cpu").run()
+    assert broken == ["numpy"]

@@ -7,6 +7,7 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 import pytest
+import trimesh
 
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import apply, quat_rotate
@@ -14,31 +15,21 @@ from graspd.worker.grasps import Posture
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
+from graspd.worker.scenes.placement import MOST_PLANES, outer_solid
 from graspd.worker.simulation.environment import CLEAR_M, Environment, Obstacle, PlacedGrasps
-from graspd.worker.simulation.obstacles import (
-    PosedFeatures,
-    body_distances,
-    body_room,
-    obstacle_distances,
-    obstacle_room,
-)
+from graspd.worker.simulation.obstacles import FAR_M, PosedFeatures, body_room, obstacle_room
+from tests.worker.models import piece, two_finger_hand
 
 TILTED = np.array([0.1, -0.2, 0.3, 0.8, 0.2, -0.4, 0.4]) / [1, 1, 1, 1, 1, 1, 1]
 TILTED[3:] /= np.linalg.norm(TILTED[3:])
 
 
-def test_the_distance_from_a_half_space_is_the_height_above_it() -> None:
+def test_distances_are_closed_forms_and_a_bound_beyond_edges() -> None:
     plane = Obstacle.half_space([0, 0, 2], 0.5)
     np.testing.assert_allclose(plane.distance(np.array([[1, 2, 3], [0, 0, 0.1]])), [2.75, -0.15], atol=1e-12)
-
-
-def test_the_distance_from_a_box_is_exact_inside_and_over_its_faces() -> None:
     box = Obstacle.box([0, 0, 0, 1, 0, 0, 0], [0.2, 0.4, 0.6])
     points = np.array([[0.15, 0, 0], [0, -0.3, 0.1], [0, 0, 0.25], [0.09, 0, 0]])
     np.testing.assert_allclose(box.distance(points), [0.05, 0.1, -0.05, -0.01], atol=1e-12)
-
-
-def test_beyond_an_edge_the_distance_is_never_more_than_the_true_one() -> None:
     box = Obstacle.box([0, 0, 0, 1, 0, 0, 0], [0.2, 0.2, 0.2])
     points = np.random.default_rng(0).uniform(-0.5, 0.5, (500, 3))
     outside = np.maximum(np.abs(points) - 0.1, 0.0)
@@ -46,15 +37,12 @@ def test_beyond_an_edge_the_distance_is_never_more_than_the_true_one() -> None:
     assert (box.distance(points)[true > 0] <= true[true > 0] + 1e-12).all()
 
 
-def test_an_obstacle_seen_from_a_frame_has_the_same_distances_there() -> None:
+def test_frames_keep_distances_and_up_is_against_gravity() -> None:
     points = np.random.default_rng(1).normal(size=(50, 3))
     for obstacle in (Obstacle.half_space([1, 2, 3], 0.4), Obstacle.box(TILTED, [0.3, 0.5, 0.7])):
         np.testing.assert_allclose(
             obstacle.seen_from(TILTED).distance(points), obstacle.distance(apply(TILTED, points)), atol=1e-12
         )
-
-
-def test_up_is_against_gravity_in_the_object_frame() -> None:
     placed = PlacedGrasps((Obstacle.half_space([0, 0, 1], 0),), TILTED[None], np.zeros(1, int))
     np.testing.assert_allclose(quat_rotate(TILTED[3:], placed.scenes[0].up), [0, 0, 1], atol=1e-12)
 
@@ -85,17 +73,17 @@ def test_the_distance_of_a_hand_from_a_plane_is_mujocos(name: str) -> None:
     )
     postures = Posture(pose, hand.expand(q))
     plane = Obstacle.half_space([0.3, -0.5, 0.8], -0.2)
-    found = obstacle_distances(hand, postures, Environment((plane,), plane.planes[0, :3]))
+    found = obstacle_room(hand, postures, [Environment((plane,), plane.planes[0, :3])])
     np.testing.assert_allclose(found, mujoco_distances(hand, postures, plane), atol=1e-5)
 
 
-def test_fingertips_have_more_room_over_what_they_may_touch_and_nothing_else_has() -> None:
+def test_only_fingertips_have_more_room_over_what_they_may_touch() -> None:
     hand = hand_from_path("barrett")
     posture = Posture(np.array([[0, 0, 0, 1.0, 0, 0, 0]]), hand.expand(hand.preshape[None]))
     table, wall = Obstacle.half_space([0, 0, 1], -0.3), Obstacle.half_space([1, 0, 0], -0.4)
     up = np.array([0.0, 0, 1])
     tips = np.isin(np.arange(hand.bodies), hand.fingertips)
-    alone, beside = (body_distances(hand, posture, Environment((one,), up))[0] for one in (table, wall))
+    alone, beside = (body_room(hand, posture, [Environment((one,), up)])[0] for one in (table, wall))
     to_touch = replace(table, tips_m=-0.0005)
     found = body_room(hand, posture, [Environment((to_touch, wall), up)])[0]
     np.testing.assert_array_equal(found, np.minimum(alone + np.where(tips, 0.0025, 0.0), beside))
@@ -141,11 +129,13 @@ def mujoco_room(hand, postures: Posture, obstacle: Obstacle) -> np.ndarray:
 
 
 def mujoco_distances(hand, postures: Posture, obstacle: Obstacle) -> np.ndarray:
+    """(P,) least distance of a hand from an obstacle, by MuJoCo; at most 10 m."""
     from graspd.worker.scenes.neighbours import _add_piece
 
     spec = mujoco.MjSpec()
     if len(obstacle.corners):
-        spec.add_mesh(name="obstacle", uservert=obstacle.corners.ravel())
+        convex = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
+        spec.add_mesh(name="obstacle", inertia=convex, uservert=np.asarray(obstacle.corners, np.float32).ravel())
         spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="obstacle")
     else:
         geom = spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.1])
@@ -164,3 +154,111 @@ def mujoco_distances(hand, postures: Posture, obstacle: Obstacle) -> np.ndarray:
         mujoco.mj_kinematics(model, data)
         least.append(min(mujoco.mj_geomDistance(model, data, 0, k + 1, 10.0, None) for k in range(len(hand.pieces))))
     return np.array(least)
+
+
+UP = np.array([0.0, 0.0, 1.0])
+BOX = Obstacle.box([0, 0, 0, 1, 0, 0, 0], [0.1, 0.1, 0.1])
+R, L = 0.01, 0.06
+#: float32 coordinates of 0.1 m, and the end of the search along an edge.
+EXACT = 2e-6
+
+
+def link(kind: str) -> HandModel:
+    """A hand of one piece about the origin of its root."""
+    base = two_finger_hand()
+    made = {
+        "sphere": (trimesh.creation.icosphere(radius=R), (R,)),
+        "capsule": (trimesh.creation.capsule(height=L, radius=R), (R, L)),
+        "box": (trimesh.creation.box((L, 2 * R, 2 * R)), (L, 2 * R, 2 * R)),
+        "hull": (trimesh.creation.box((L, 2 * R, 2 * R)), ()),
+    }
+    mesh, size = made[kind]
+    fields = {name: getattr(base, name) for name in base.__dataclass_fields__}
+    return HandModel(
+        **{**fields, "digest": f"{hash(kind) & 0xFFFF:032x}", "pieces": (piece(0, mesh, kind, size, (0, 0, 0)),)}
+    )
+
+
+def distance(kind: str, at: tuple[float, ...], obstacle: Obstacle, turn: tuple[float, ...] = (1, 0, 0, 0)) -> float:
+    quaternion = np.array(turn, float) / np.linalg.norm(turn)
+    posture = Posture(np.array([[*at, *quaternion]]), np.zeros((1, 2)))
+    return float(obstacle_room(link(kind), posture, [Environment((obstacle,), UP)])[0])
+
+
+EDGE, CORNER = np.sqrt(2), np.sqrt(3)
+#: Turned by 45 degrees about y: a capsule points away from the edge at (0.05, y, 0.05), a box lies across it.
+ACROSS = (np.cos(np.pi / 8), 0, np.sin(np.pi / 8), 0)
+
+
+@pytest.mark.parametrize(
+    ("kind", "at", "turn", "expected"),
+    [
+        ("sphere", (0, 0, 0.08), (1, 0, 0, 0), 0.03 - R),
+        ("sphere", (0.08, 0, 0.08), (1, 0, 0, 0), 0.03 * EDGE - R),
+        ("sphere", (0.08, 0.08, 0.08), (1, 0, 0, 0), 0.03 * CORNER - R),
+        ("sphere", (0, 0, 0.055), (1, 0, 0, 0), 0.005 - R),
+        ("capsule", (0, 0, 0.11), (1, 0, 0, 0), 0.06 - L / 2 - R),
+        ("capsule", (0.07, 0, 0.1), (1, 0, 0, 0), np.hypot(0.02, 0.05 - L / 2) - R),
+        ("capsule", (0.09, 0, 0.09), ACROSS, 0.04 * EDGE - L / 2 - R),
+        ("box", (0, 0, 0.08), (1, 0, 0, 0), 0.03 - R),
+        ("box", (0.1, 0, 0.08), (1, 0, 0, 0), np.hypot(0.05 - L / 2, 0.03 - R)),
+        ("box", (0.1, 0.08, 0.08), (1, 0, 0, 0), np.sqrt((0.05 - L / 2) ** 2 + 2 * (0.03 - R) ** 2)),
+        ("box", (0.07, 0, 0.07), ACROSS, 0.02 * EDGE - R),
+        ("hull", (0, 0, 0.08), (1, 0, 0, 0), 0.03 - R),
+        ("hull", (0.07, 0, 0.07), ACROSS, 0.02 * EDGE - R),
+    ],
+)
+def test_a_link_is_as_far_from_a_box_as_closed_forms_say(kind: str, at, turn, expected: float) -> None:
+    assert distance(kind, at, BOX, turn) == pytest.approx(expected, abs=EXACT)
+
+
+@pytest.mark.parametrize(("kind", "reach"), [("sphere", R), ("capsule", L / 2 + R), ("box", R), ("hull", R)])
+def test_a_link_is_as_far_from_a_half_space_as_closed_forms_say(kind: str, reach: float) -> None:
+    assert distance(kind, (0.3, 0.2, 0.07), Obstacle.half_space(UP, 0.01)) == pytest.approx(0.06 - reach, abs=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["capsule", "box", "hull"])
+def test_a_link_through_a_board_is_in_it(kind: str) -> None:
+    """Neither the link's corners nor the board's edges are near; the link stands upright in the board's middle."""
+    board = Obstacle.box([0, 0, 0, 1, 0, 0, 0], [1.0, 1.0, 0.01])
+    turn = (1, 0, 0, 0) if kind == "capsule" else (np.sqrt(0.5), 0, np.sqrt(0.5), 0)
+    depth = 0.005 + (R if kind == "capsule" else 0.0)
+    assert distance(kind, (0, 0, 0), board, turn) == pytest.approx(-depth, abs=EXACT)
+    assert distance(kind, (0, 0, 1.0), BOX) == pytest.approx(FAR_M), "what is far counts as far"
+
+
+@pytest.mark.parametrize("name", ["allegro", "barrett", "shadow"])
+def test_no_hand_is_nearer_to_a_solid_than_it_says_by_mujoco(name: str) -> None:
+    """Exact for links that are boxes or round (1e-5 m: MuJoCo's meshes are float32 and converge to 1e-6); for hulls a
+    lower bound."""
+    hand, rng = hand_from_path(name), np.random.default_rng(2)
+    corners = rng.normal(size=(40, 3)) * [0.03, 0.05, 0.04]
+    solid, _ = outer_solid(corners)
+    q = hand.lower + rng.random((60, hand.dofs)) * (hand.upper - hand.lower)
+    quaternion = rng.normal(size=(60, 4))
+    quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
+    postures = Posture(np.concatenate([rng.normal(size=(60, 3)) * 0.12, quaternion], axis=1), hand.expand(q))
+    found = obstacle_room(hand, postures, [Environment((solid,), UP)])
+    true = mujoco_distances(hand, postures, solid)
+    apart = true > 0
+    assert (found[apart] <= true[apart] + 1e-5).all()
+    assert (found[~apart] < 1e-5).all()
+    assert 10 < apart.sum() < 55
+    if not any(one.kind == "hull" for one in hand.pieces):
+        np.testing.assert_allclose(found[apart], np.minimum(true[apart], FAR_M), atol=1e-5)
+
+
+def test_an_outer_solid_holds_its_points_and_is_a_box_of_a_box() -> None:
+    points = np.random.default_rng(0).normal(size=(400, 3))
+    points *= 0.03 / np.linalg.norm(points, axis=1, keepdims=True)
+    solid, error = outer_solid(points)
+    assert len(solid.planes) <= MOST_PLANES
+    assert solid.distance(points).max() <= 1e-9
+    radius = np.linalg.norm(solid.corners, axis=1).max()
+    assert radius - 0.03 <= error < radius - 0.03 + 5e-4, "the ball's points are up to half a millimetre apart from it"
+    # Euler: every edge of the solid is there.
+    faces = sum((np.abs(solid.corners @ p[:3] - p[3]) < 1e-6).sum() >= 3 for p in solid.planes)
+    assert len(solid.corners) - len(solid.edges) + faces == 2
+    solid, error = outer_solid(np.asarray(trimesh.creation.box((0.1, 0.2, 0.3)).vertices))
+    assert (len(solid.planes), len(solid.corners), len(solid.edges)) == (6, 8, 12)
+    assert error == pytest.approx(0, abs=1e-9)

@@ -1,20 +1,34 @@
-"""Prepared objects are kept in the store: made once, bit for bit the same, and never trusted when damaged."""
+"""Prepared objects and models in the store: made once, those of the engine; and what batches draw."""
 
 from __future__ import annotations
 
+import io
 from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 
+from graspd.service.model import names
 from graspd.service.model.digests import digest_files
-from graspd.service.model.states import AssetKind
+from graspd.service.model.messages import TaskMessage
+from graspd.service.model.states import AssetKind, Stage
+from graspd.service.model.transforms import IDENTITY_POSE, apply
+from graspd.service.store.assets import builtin_files, builtin_model, builtin_names
+from graspd.service.store.integrity import sealed
 from graspd.service.store.library import publish_asset
 from graspd.service.store.store import Store, open_store
+from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.load import hand_from_path
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.objects.prepare import from_bytes, load_object, to_bytes
+from graspd.worker.objects.prepare import from_bytes, load_object, object_from_path, to_bytes
 from graspd.worker.stages import assets
 from graspd.worker.stages.assets import prepared_object
+from graspd.worker.stages.context import batch_seed
+from graspd.worker.stages.models import hand_glb, model_of, object_glb, publish_model
+from tests.fakes import request
 from tests.worker.objects.shapes import box, join, sphere, stl
 
 #: Two balls in one another: a repair to remember.
@@ -49,13 +63,9 @@ def test_the_second_worker_finds_what_the_first_has_made(store: Store, monkeypat
 
 def test_another_bound_is_another_object(store: Store) -> None:
     fine, coarse = (prepared_object(store, DIGEST, name="balls", face_error_m=bound) for bound in (1e-4, 3e-3))
+    assert prepared_object(store, DIGEST, name="other", face_error_m=1e-4).name == "other"
     assert len(fine.faces) > len(coarse.faces)
     assert len(list(store.list(f"assets/object/{DIGEST}/prepared"))) == 2
-
-
-def test_the_name_is_that_of_the_task(store: Store) -> None:
-    prepared_object(store, DIGEST, name="balls", face_error_m=3e-4)
-    assert prepared_object(store, DIGEST, name="other", face_error_m=3e-4).name == "other"
 
 
 @pytest.mark.parametrize("data", [b"", b"noise" * 100, b"PK\x03\x04" + bytes(60)])
@@ -73,3 +83,83 @@ def test_every_field_survives() -> None:
     obj = load_object(stl(box()), name="box", digest="d" * 32, face_error_m=0.0)
     odd = replace(obj, watertight=False, deviation_m=1.5e-5, repairs=("a", "b"), volume=1 / 3)
     same(from_bytes(to_bytes(odd), name="box", digest="d" * 32), odd)
+
+
+#: Positions are single precision: half a micrometre at half a metre.
+TOLERANCE_M = 5e-7
+
+
+def scene_of(data: bytes) -> trimesh.Scene:
+    return trimesh.load(io.BytesIO(data), file_type="glb", force="scene")
+
+
+@pytest.mark.parametrize("name", builtin_names(AssetKind.HAND))
+def test_a_hands_nodes_stand_where_kinematics_puts_its_bodies(name: str) -> None:
+    hand = hand_from_path(name)
+    scene = scene_of(hand_glb(hand))
+    poses = body_poses(hand, IDENTITY_POSE, np.zeros(len(hand.joint_names)))[0]
+    expected = np.concatenate([apply(poses[piece.body], piece.vertices) for piece in hand.pieces])
+    solid = [geometry for geometry in scene.dump() if isinstance(geometry, trimesh.Trimesh)]
+    found = np.concatenate([mesh.bounds for mesh in solid])
+    np.testing.assert_allclose(
+        [found.min(axis=0), found.max(axis=0)], [expected.min(axis=0), expected.max(axis=0)], atol=TOLERANCE_M
+    )
+
+
+def test_an_objects_model_is_its_prepared_mesh() -> None:
+    obj = object_from_path("mug")
+    (mesh,) = scene_of(object_glb(obj)).dump()
+    assert len(mesh.faces) == len(obj.faces)
+    assert mesh.volume == pytest.approx(obj.volume, rel=1e-5)  # single precision
+
+
+@pytest.mark.parametrize("kind", list(AssetKind))
+def test_models_that_come_with_graspd_are_those_of_its_assets(kind: AssetKind) -> None:
+    for name in builtin_names(kind):
+        assert model_of(kind, name, builtin_files(kind, name)) == builtin_model(kind, name), (
+            "python -m graspd.worker.stages.models"
+        )
+
+
+def test_a_model_is_published_once(tmp_path: Path) -> None:
+    store = open_store(tmp_path.as_uri())
+    obj = object_from_path("block")
+    publish_model(store, AssetKind.OBJECT, obj)
+    key = names.asset_model(AssetKind.OBJECT, obj.digest)
+    assert store.get(key)[:4] == b"glTF"
+    publish_model(store, AssetKind.OBJECT, obj)
+    assert store.get(key) == sealed(key, object_glb(obj))
+
+
+def message(**changes: Any) -> TaskMessage:
+    fields = {
+        "schema_": 1,
+        "task_id": "t",
+        "job_id": "j",
+        "stage": Stage.RENDER,
+        "batch": 0,
+        "count": 32,
+        "request": request(),
+        "hand_digest": "a" * 32,
+        "object_digest": "b" * 32,
+        "output": "c" * 32,
+    }
+    return TaskMessage(**fields | changes)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"batch": 1},
+        {"stage": Stage.SCENE},
+        {"hand_digest": "d" * 32},
+        {"object_digest": "d" * 32},
+        {"request": request(seed=7)},
+    ],
+)
+def test_batches_stages_hands_objects_and_seeds_draw_anew(changes: dict[str, Any]) -> None:
+    assert batch_seed(message(**changes)) != batch_seed(message())
+
+
+def test_two_methods_show_their_grasps_in_the_same_pictures() -> None:
+    assert batch_seed(message(request=request(method="graspit"), output="e" * 32)) == batch_seed(message())

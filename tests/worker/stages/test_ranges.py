@@ -7,30 +7,22 @@ from typing import Any
 import numpy as np
 import pytest
 
-from graspd.service.model import names
-from graspd.service.model.clock import timestamp
-from graspd.service.model.digests import job_id
-from graspd.service.model.domain import JobRequest
 from graspd.service.model.errors import DamagedShard, TaskCancelled
 from graspd.service.model.planning import message_of, plan
 from graspd.service.model.records import JobRecord
-from graspd.service.model.states import AssetKind, Priority, Stage
+from graspd.service.model.states import Stage
 from graspd.service.queue.port import EventKind
-from graspd.service.store.assets import builtin_files
-from graspd.service.store.library import publish_asset
 from graspd.service.store.manifests import load_manifest, load_shard
-from graspd.service.store.records import put_record
 from graspd.service.store.shards import Shard
 from graspd.service.store.store import Store, open_store
 from graspd.worker import generation
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.planners import NoStartFound
-from graspd.worker.process.runner import Runner
-from graspd.worker.stages import scene, synthesize
+from graspd.worker.stages import synthesize
 from graspd.worker.stages.context import StopReason, TaskContext
 from graspd.worker.stages.ranges import base_rows, batches_of
+from tests.worker.stages.jobs import end_of, job_of
 
-STAGES = {Stage.SCENE: scene.run, Stage.SYNTHESIZE: synthesize.run}
 #: Batches as small as they can be, so that several take a few seconds.
 SIZE = 3
 
@@ -43,31 +35,11 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def made(store: Store, span: int, **request: Any) -> tuple[JobRecord, list[tuple[Stage, Shard, Any]]]:
     """What a job makes whose tasks have so many batches: stage, shard and manifest of each task."""
-    hand = publish_asset(store, AssetKind.HAND, "barrett", builtin_files(AssetKind.HAND, "barrett"))
-    obj = publish_asset(store, AssetKind.OBJECT, "block", builtin_files(AssetKind.OBJECT, "block"))
-    wanted = JobRequest(hand="barrett", object="block", fidelity="draft", seed=3, **request)
-    job = JobRecord(
-        id=job_id(wanted, hand.digest, obj.digest),
-        request=wanted,
-        hand_digest=hand.digest,
-        object_digest=obj.digest,
-        priority=Priority.BULK,
-        span=span,
-        created=timestamp(),
-    )
-    put_record(store, names.job_record(job.id), job)
-    runner = Runner(STAGES, worker="w", publish=lambda event: None)  # type: ignore[arg-type]
-    found = []
-    for task in plan(job):
-        message = message_of(job, task, attempt=1, max_attempt=3)
-        event = runner.run(
-            message.model_dump(mode="json", by_alias=True), TaskContext(store, ExecutionContext(threads=2))
-        )
-        assert event is not None and event.kind is EventKind.FINISHED, event
-        found.append(
-            (task.stage, load_shard(store, task.stage, task.output), load_manifest(store, task.stage, task.output))
-        )
-    return job, found
+    job = job_of(store, span, fidelity="draft", seed=3, **request)
+    end = end_of(store, job)
+    assert end.kind is EventKind.FINISHED, end
+    tasks = [(task.stage, task.output) for task in plan(job)]
+    return job, [(stage, load_shard(store, stage, out), load_manifest(store, stage, out)) for stage, out in tasks]
 
 
 @pytest.mark.parametrize(
@@ -125,7 +97,7 @@ def test_a_base_shard_of_other_batches_is_refused() -> None:
         base_rows(base, message.model_copy(update={"count": 3 * SIZE}))
 
 
-def test_a_range_tells_how_far_it_is_and_stops_where_it_is_told_to(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_range_tells_how_far_it_is_and_stops_where_it_is_told_to(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("graspd.worker.stages.context.REPORT_EVERY_S", 0.0)
     store = open_store("memory://")
     job, _ = made(store, 2, grasps=2 * SIZE, want="candidates")
@@ -151,7 +123,7 @@ def test_a_range_tells_how_far_it_is_and_stops_where_it_is_told_to(monkeypatch: 
 
 
 @pytest.mark.parametrize(("refused", "rows"), [({1}, f"[{SIZE}, 0, 1]"), ({0}, ""), ({0, 1, 2}, "")])
-def test_a_batch_whose_scenes_leave_no_place_has_no_grasps_but_for_the_first_of_a_job(
+def test_a_batch_without_a_place_has_no_grasps_but_for_the_first(
     monkeypatch: pytest.MonkeyPatch, refused: set[int], rows: str
 ) -> None:
     """As where none is found within the budget: the grasps of the other batches stay."""

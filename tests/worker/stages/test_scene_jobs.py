@@ -12,44 +12,30 @@ import numpy as np
 import pytest
 
 from graspd.service.model import names
-from graspd.service.model.clock import timestamp
-from graspd.service.model.digests import job_id
-from graspd.service.model.domain import JobRequest
 from graspd.service.model.errors import TaskRefused
 from graspd.service.model.planning import message_of, plan
 from graspd.service.model.records import AttemptRecord, JobRecord
 from graspd.service.model.scene_spec import supports_in
-from graspd.service.model.states import AssetKind, Priority, Stage
+from graspd.service.model.states import AssetKind, Stage
 from graspd.service.queue.port import EventKind
 from graspd.service.readers import Grasps, Pictures, open_shards
 from graspd.service.store.assets import builtin_files
 from graspd.service.store.library import publish_asset
 from graspd.service.store.manifests import load_manifest, load_shard
-from graspd.service.store.records import put_record, read_record
+from graspd.service.store.records import read_record
 from graspd.service.store.shards import Shard
 from graspd.service.store.store import Store, open_store
-from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.files.provenance import placed_of_shard
 from graspd.worker.files.synthesis import synthesized
 from graspd.worker.process.runner import Runner
 from graspd.worker.rendering import Extras
 from graspd.worker.rendering import render as pictures
-from graspd.worker.stages import render, scene, synthesize
 from graspd.worker.stages.assets import object_of
 from graspd.worker.stages.context import TaskContext, batch_seed
+from tests.worker.stages.jobs import STAGES, end_of, job_of
 
-TABLE = {
-    "grasps": 6,
-    "fidelity": "draft",
-    "seed": 3,
-    "rechecks": 0,
-    "scene": "table",
-    "scenes": 2,
-    "views": 1,
-    "width": 48,
-    "height": 36,
-}
-STAGES = {Stage.SCENE: scene.run, Stage.SYNTHESIZE: synthesize.run, Stage.RENDER: render.run}
+TABLE = {"grasps": 6, "fidelity": "draft", "seed": 3, "rechecks": 0, "scene": "table", "scenes": 2}
+TABLE |= {"views": 1, "width": 48, "height": 36}
 
 
 @dataclass
@@ -61,29 +47,12 @@ class Bench:
 
     def run(self, **request: Any) -> tuple[EventKind, str]:
         """Kind and words of the end of a job's first batch."""
-        hand = publish_asset(self.store, AssetKind.HAND, "barrett", builtin_files(AssetKind.HAND, "barrett"))
-        obj = publish_asset(self.store, AssetKind.OBJECT, "block", builtin_files(AssetKind.OBJECT, "block"))
         for one in request.get("neighbours", ()):
             files = builtin_files(AssetKind.OBJECT, one["object"])
             one["digest"] = publish_asset(self.store, AssetKind.OBJECT, one["object"], files).digest
-        wanted = JobRequest(hand="barrett", object="block", **request)
-        self.job = JobRecord(
-            id=job_id(wanted, hand.digest, obj.digest),
-            request=wanted,
-            hand_digest=hand.digest,
-            object_digest=obj.digest,
-            priority=Priority.BULK,
-            created=timestamp(),
-        )
-        put_record(self.store, names.job_record(self.job.id), self.job)
-        runner = Runner(STAGES, worker="w", publish=lambda event: None)  # type: ignore[arg-type]
-        for task in plan(self.job):
-            message = message_of(self.job, task, attempt=1, max_attempt=3).model_dump(mode="json", by_alias=True)
-            event = runner.run(message, TaskContext(self.store, ExecutionContext(threads=2)))
-            assert event is not None
-            if event.kind is not EventKind.FINISHED:
-                break
-        return event.kind, event.message
+        self.job = job_of(self.store, **request)
+        end = end_of(self.store, self.job)
+        return end.kind, end.message
 
     def made(self, stage: Stage) -> Shard:
         return load_shard(self.store, stage, next(task for task in plan(self.job) if task.stage is stage).output)
@@ -126,7 +95,7 @@ def test_pictures_show_the_scene_with_and_without_the_best_hand(table: Bench) ->
     assert set(np.unique(views["image/segmentation"])) <= {0, 1, 2}
 
 
-def test_readers_give_the_way_of_a_grasp_and_the_grasps_of_a_picture(table: Bench) -> None:
+def test_readers_give_way_of_a_grasp_and_the_grasps_of_a_picture(table: Bench) -> None:
     shards = open_shards(table.store, job=table.job.id)
     columns = ("grasp/approach", "grasp/lift", "grasp/scene_index", "quality/lift_hard", "quality/clearance_m")
     grasps = Grasps(shards, columns)
@@ -199,7 +168,7 @@ def test_a_scene_without_a_way_in_fails_the_job_and_says_so(table: Bench) -> Non
 
 
 @pytest.mark.parametrize("scene", ["table", "free"])
-def test_a_payload_out_of_reach_fails_the_job_with_what_the_hand_lifts(table: Bench, scene: str) -> None:
+def test_payload_out_of_reach_fails_job_with_what_the_hand_lifts(table: Bench, scene: str) -> None:
     bench = Bench(table.store)
     wanted = {"scene": scene, "scenes": 0, "views": 0, "grasps": 8, "budget": 4, "min_payload": 90}
     kind, words = bench.run(**TABLE | wanted)

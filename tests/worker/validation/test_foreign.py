@@ -21,7 +21,7 @@ from graspd.worker.validation.model import MujocoOptions, Scene, build
 from graspd.worker.validation.prefilter.prefilter import first_terms
 from tests.studies.test_evaluation import BOX, HAND, plates_case
 from tests.worker.hands.mjcfs import CLAW
-from tests.worker.hands.test_tendons import load
+from tests.worker.hands.test_mjcf import load
 
 FAR = np.array([0, 0, -0.5, 1.0, 0, 0, 0])
 
@@ -50,7 +50,7 @@ def test_a_tendon_moves_the_sum_and_pulls_by_its_coefficients(tmp_path: Path) ->
     assert q[bend] + 0.5 * q[curl] == pytest.approx(0.5 + 0.5 * 0.4, abs=1e-3)
 
 
-def test_one_joint_of_a_tendon_takes_what_the_limit_of_the_other_leaves(tmp_path: Path) -> None:
+def test_one_joint_of_tendon_takes_what_limit_of_other_leaves(tmp_path: Path) -> None:
     hand = load(root="palm")
     bend, curl, spread = (hand.dof_names.index(f"left_{name}") for name in ("bend", "curl", "spread"))
     upper = hand.upper.copy()
@@ -69,7 +69,7 @@ def test_one_joint_of_a_tendon_takes_what_the_limit_of_the_other_leaves(tmp_path
     assert q[bend] == pytest.approx(0.5 + 0.5 * (0.8 - q[curl]), abs=1e-3)
 
 
-def test_the_key_of_a_hand_without_tendons_is_the_one_it_had(tmp_path: Path) -> None:
+def test_the_first_judge_and_the_key_know_of_tendons(tmp_path: Path) -> None:
     hand = load(root="palm")
     pieces = decompose(BOX, cache=tmp_path)
     separate = dataclasses.replace(hand, tendons=())
@@ -77,9 +77,10 @@ def test_the_key_of_a_hand_without_tendons_is_the_one_it_had(tmp_path: Path) -> 
     assert len(keys) == 2
     dragged = dataclasses.replace(separate, drag=Drag(np.zeros(hand.bodies), np.zeros(hand.bodies)))
     assert verdict_key(dragged, BOX, "standard", False, pieces=pieces) not in keys
+    assert first_terms(load(root="palm"), "standard", ExecutionContext(prefilter="on")) == []
 
 
-def test_a_drive_stays_what_it_is_whether_joints_follow_it_or_hang_on_a_tendon() -> None:
+def test_a_drive_stays_what_it_is_with_followers_or_on_a_tendon() -> None:
     text = CLAW.replace('joint="left_curl" coef="0.5"', 'joint="left_curl" coef="1"')
     tendon = load(text, root="palm")
     ratio = load(text, root="palm", tendons={}, couplings={"left_curl": {"of": "left_bend"}})
@@ -92,10 +93,6 @@ def test_a_drive_stays_what_it_is_whether_joints_follow_it_or_hang_on_a_tendon()
     assert 2 * cord.limit(back.effort) == pytest.approx(ratio.effort[dof])
 
 
-def test_the_first_judge_leaves_hands_with_tendons_to_the_cpu() -> None:
-    assert first_terms(load(root="palm"), "standard", ExecutionContext(prefilter="on")) == []
-
-
 def test_the_same_model_gives_the_same_verdicts(tmp_path: Path) -> None:
     row = evaluate(plates_case(), validation_hand=same_hand(HAND, HAND), cache=tmp_path)
     assert row["foreign_held"] == {"both": 2, "nominal": 0, "foreign": 0, "neither": 1}
@@ -104,7 +101,7 @@ def test_the_same_model_gives_the_same_verdicts(tmp_path: Path) -> None:
     json.dumps(row, allow_nan=False)
 
 
-def test_a_model_with_other_pads_says_otherwise_and_shapes_are_told_to_be_why(tmp_path: Path) -> None:
+def test_a_model_with_other_pads_says_otherwise(tmp_path: Path) -> None:
     # The other model's pads do not reach the object: they are 40 mm nearer to their joints.
     back = {body: np.array([0, 0, -0.04 if body else 0.0]) for body in range(HAND.bodies)}
     shorter = tuple(
@@ -133,7 +130,7 @@ def test_rows_add_up_by_their_grasps(tmp_path: Path) -> None:
     assert whole["fingertips_mm"] == 0.4
 
 
-def test_joints_take_the_order_and_the_couplings_of_the_other_model() -> None:
+def test_joints_take_order_and_the_couplings_of_the_other_model() -> None:
     grasps = plates_case().grasps
     other = dataclasses.replace(HAND, joint_names=HAND.joint_names[::-1], joint_body=HAND.joint_body[::-1].copy())
     moved = in_other_model(same_hand(HAND, other), grasps)

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import json
+import math
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
-from typer.testing import CliRunner
 
-from graspd.cli import build
 from graspd.service.model.domain import JobOptions
 from graspd.service.model.errors import MeshError
 from graspd.service.model.matter import ACCELERATION, FRICTION, MASS_KG
@@ -19,11 +17,25 @@ from graspd.service.store.shards import read_shard
 from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.objects.options import as_asked
 from graspd.worker.objects.prepare import object_from_path
+from graspd.worker.quality.wrench_space import EDGES
 from graspd.worker.simulation.environment import Obstacle, PlacedGrasps
 from graspd.worker.validation.decomposition import ConvexPieces
 from graspd.worker.validation.key import verdict_key
 from graspd.worker.validation.lifting import validate_lifts
-from graspd.worker.validation.payload import AMPLITUDE_M, FREQUENCY_HZ, payloads, shake_margins
+from graspd.worker.validation.payload import (
+    AMPLITUDE_M,
+    AT_STOP,
+    ENOUGH,
+    FREQUENCY_HZ,
+    HOPELESS,
+    LEAST,
+    Limit,
+    capacities,
+    limit_of,
+    payloads,
+    shake_margins,
+)
+from tests.worker.commands_run import graspd
 from tests.worker.models import object_from_mesh, two_finger_hand
 
 #: A box between the fingertips of the two-finger hand, whose pads are 58 mm apart and 68 mm above its joints.
@@ -60,12 +72,16 @@ def test_the_payload_of_a_pinch_is_what_its_friction_bears(friction: float) -> N
     assert 0.95 * bears < payload(friction) < bears
 
 
-def test_what_is_slippery_is_not_lifted() -> None:
+def test_what_is_slippery_or_out_of_touch_bears_nothing_stop_all() -> None:
     assert np.isnan(payload(0.01))
+    away = Posture(pinch().grasp.hand_pose - np.eye(7)[2], pinch().grasp.joint_positions)
+    assert capacities(HAND, BOX, away, UP).tolist() == [0.0]
+    at_stop = replace(HAND, lower=np.full(2, -AT_STOP * 1e-3))
+    assert not np.isfinite(capacities(at_stop, BOX, pinch().grasp, UP)).any()
 
 
 @pytest.mark.parametrize("friction", [0.3, FRICTION, 1.0])
-def test_what_friction_bears_with_the_accelerations_of_the_shake_survives_it(friction: float) -> None:
+def test_what_friction_bears_of_the_shake_survives_it(friction: float) -> None:
     # Along the line of the fingers an acceleration takes from the forces that press: mg <= friction (2 F - ma).
     accelerated = AMPLITUDE_M * (2 * np.pi * FREQUENCY_HZ) ** 2
     bears = 2 * friction * TORQUE / LEVER_M / (ACCELERATION + friction * accelerated)
@@ -115,28 +131,14 @@ def test_what_is_said_with_a_job_goes_over_what_the_file_says() -> None:
         BOX.weighing(density=1e7)
 
 
-def test_whoever_says_what_the_object_weighs_is_told_what_the_grasps_lift(tmp_path: Path) -> None:
-    words = [
-        "synth",
-        "--hand",
-        "barrett",
-        "--object",
-        "block",
-        "--scene",
-        "table",
-        "-n",
-        "1",
-        "--fidelity",
-        "draft",
-        "--seed",
-        "3",
-        "--json",
-        "-o",
-        str(tmp_path / "g.h5"),
-    ]
+BARRETT = "synth --hand barrett --object block --scene table --fidelity draft --seed 3"
+
+
+def test_whoever_says_the_weight_is_told_what_the_grasps_lift(tmp_path: Path) -> None:
     keys = {"mass_kg", "lift_share", "lift_hard_share", "payload_kg"}
-    for more, told in ((["--mass", "0.37"], keys), (["--mass", "0.37", "--no-payload"], keys - {"payload_kg"})):
-        said = json.loads(CliRunner().invoke(build(), words + more).stdout.splitlines()[-1])
+    words = f"{BARRETT} -n 1 --mass 0.37 -o"
+    for more, told in (((), keys), (("--no-payload",), keys - {"payload_kg"})):
+        said = graspd(words, tmp_path / "g.h5", *more)
         assert keys & said.keys() == told
         assert said["mass_kg"] == 0.37 and said.get("payload_kg", 1.0) >= 0.37
 
@@ -145,35 +147,65 @@ def test_whoever_says_what_the_object_weighs_is_told_what_the_grasps_lift(tmp_pa
 def test_a_job_counts_grasps_that_lift_the_wanted_payload(
     tmp_path: Path, least: float, kept: int, outcomes: dict[str, int]
 ) -> None:
-    words = [
-        "synth",
-        "--hand",
-        "barrett",
-        "--object",
-        "block",
-        "--mass",
-        "0.2",
-        "--scene",
-        "table",
-        "-n",
-        "2",
-        "--budget",
-        "1",
-        "--fidelity",
-        "draft",
-        "--seed",
-        "3",
-        "--min-payload",
-        str(least),
-        "--shake",
-        "--json",
-        "-o",
-        str(tmp_path / "g.h5"),
-    ]
-    told = json.loads(CliRunner().invoke(build(), words).stdout.splitlines()[-1])
+    words = f"{BARRETT} -n 2 --budget 1 --mass 0.2 --min-payload {least} --shake -o"
+    told = graspd(words, tmp_path / "g.h5", code=0 if kept else 3)
     shard = read_shard(tmp_path / "g.h5")
     assert (told["grasps"], told["mass_kg"], shard.attributes["object_mass_kg"]) == (kept, 0.2, 0.2)
     assert {name: told["outcomes"].get(name) for name in outcomes} == outcomes
     assert (shard["quality/payload_kg"] >= least).all()
     survive = shard["quality/shake_margin"] < 1
     assert told["shake_share"] == (survive.mean() if kept else None)
+
+
+UP = np.array([[[0.0, 1.0, 0.0]]])
+
+
+def bears(friction: float) -> float:
+    return 2 * friction * TORQUE / LEVER_M / ACCELERATION
+
+
+@pytest.mark.parametrize("friction", [0.01, 0.3, FRICTION, 1.0])
+def test_pinch_could_bear_what_pyramids_around_its_cones_bear(friction: float) -> None:
+    found = capacities(HAND, BOX.weighing(friction=friction), pinch().grasp, UP)
+    assert found == pytest.approx(bears(friction) / math.cos(math.pi / EDGES), rel=2e-3)
+
+
+def test_of_several_directions_the_worst_counts() -> None:
+    # Along the line of the fingers one of them presses with all its effort, the other not at all.
+    along = np.array([[[0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]])
+    assert capacities(HAND, BOX, pinch().grasp, along) == pytest.approx(TORQUE / LEVER_M / ACCELERATION, rel=0.01)
+
+
+def test_what_is_wanted_is_told_with_what_the_best_grasp_lifts() -> None:
+    grasps = pinch().take(np.zeros(ENOUGH, int))
+    placed = TABLE.take(np.zeros(ENOUGH, int))
+
+    def limit(wanted: float, count: int = ENOUGH) -> Limit | None:
+        rows = np.arange(count)
+        return limit_of(HAND, BOX, grasps.take(rows), pieces=PIECES, placed=placed.take(rows), wanted=wanted)
+
+    lifts = bears(FRICTION)
+    found = limit(3 * lifts)
+    assert found is not None and found.hopeless
+    assert 0.95 * lifts < found.lifts_kg < lifts < found.bound_kg < 1.1 * lifts
+    assert found.line == (
+        "two_finger lifts 0.34 kg at friction 0.6 in the best of 8 grasps, and at most 0.38 kg by actuator effort; "
+        "1.06 kg are wanted"
+    )
+    near = limit(0.9 * HOPELESS * lifts)
+    assert near is not None and not near.hopeless
+    assert limit(0.9 * lifts) is None, "they lift it"
+    few = limit(3 * lifts, ENOUGH - 1)
+    assert few is not None and not few.hopeless, "it may be their shape"
+    assert limit(3 * lifts, LEAST - 1) is None, "too few to tell"
+
+
+@pytest.mark.parametrize("wanted", [ENOUGH // 2, ENOUGH])
+def test_weight_out_of_reach_ends_work_with_what_the_hand_lifts(tmp_path: Path, wanted: int) -> None:
+    words = f"synth --hand allegro --object block --mass 20 --scene table -n {wanted} --fidelity draft --seed 3 -o"
+    told = graspd(words, tmp_path / "g.h5", code=3)
+    assert (told["grasps"], told["tried"]) == (0, wanted), "the budget would be four times as many"
+    assert 0.3 < told["limit"]["lifts_kg"] <= told["limit"]["bound_kg"] < 10
+    tries = wanted + told["outcomes"]["repeated"]
+    assert told["reason"].startswith(f"found 0 of {wanted} valid grasps in {tries} tries: ")
+    assert told["reason"].endswith(told["limit"]["says"]) and "20 kg are wanted" in told["reason"]

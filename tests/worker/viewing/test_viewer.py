@@ -10,7 +10,6 @@ import sys
 import urllib.request
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -25,7 +24,7 @@ from graspd.worker.hands.load import hand_from_path, load_hand
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.rendering.hands import drawn_bodies
 from tests.worker.hands.urdfs import BOX, joint, link, robot
-from tests.worker.models import object_from_mesh, two_finger_hand
+from tests.worker.models import attributes_of, object_from_mesh, quality_columns, two_finger_hand
 
 viser = pytest.importorskip("viser", reason="needs the extra: pip install graspd[view]")
 
@@ -49,12 +48,7 @@ def arrays(joints: int) -> dict[str, np.ndarray]:
     made |= {"grasp/lift": lift, "grasp/scene_index": np.array([0, 0, 1])}
     made["scene/object_pose"] = np.array([[0.05, 0, 0.03, 1, 0, 0, 0], [-0.05, 0, 0.03, 1, 0, 0, 0]])
     made["scene/rest_probability"] = np.ones(2)
-    per_grasp = np.linspace(0.1, 0.3, GRASPS)
-    swept = ("contact_area_cm2", "epsilon", "wrench_volume")
-    plain = ("intersection_volume_cm3", "penetration_depth_mm", "self_penetration_depth_mm", "stability_loss")
-    made |= {f"quality/{name}": np.repeat(per_grasp[:, None], 2, axis=1) for name in swept}
-    made |= {f"quality/{name}": per_grasp for name in plain}
-    made |= {"quality/thresholds_m": np.array([0.002, 0.005]), "quality/contact_links": np.full(GRASPS, 4)}
+    made |= quality_columns(GRASPS)
     return made | {"quality/valid": np.array([0, 1, 0], np.uint8), "quality/success": np.array([0, 1, 0], np.int8)}
 
 
@@ -84,14 +78,8 @@ def first(request) -> None:
         made.choose("all")
 
 
-def test_the_page_is_answered_on_the_loopback(viewer):
-    assert viewer.url.startswith("http://127.0.0.1:")
-    with urllib.request.urlopen(viewer.url, timeout=60) as answer:
-        assert b"<html" in answer.read().lower()
-
-
 @pytest.mark.parametrize(("place", "height", "joint"), [(0, 0.16, -0.1), (1, 0.06, 0), (2, 0.06, 0.1), (4, 0.16, 0.2)])
-def test_the_slider_moves_the_bodies_of_the_hand_where_its_kinematics_say(viewer, place, height, joint):
+def test_slider_moves_bodies_of_hand_where_its_kinematics_say(viewer, place, height, joint):
     viewer.slider.value = place
     viewer.show()
     root = np.concatenate([[0, 0, height], arrays(2)["grasp/hand_pose"][0, 3:]])
@@ -102,14 +90,17 @@ def test_the_slider_moves_the_bodies_of_the_hand_where_its_kinematics_say(viewer
         assert abs(node.wxyz @ bodies[body, 3:]) == pytest.approx(1, abs=1e-6)
 
 
-def test_the_object_is_carried_up_with_the_hand_and_not_before(viewer):
+def test_page_is_on_loopback_and_object_goes_up_with_the_hand(viewer):
+    assert viewer.url.startswith("http://127.0.0.1:")
+    with urllib.request.urlopen(viewer.url, timeout=60) as answer:
+        assert b"<html" in answer.read().lower()
     for place, height in ((0, 0.0), (3, 0.0), (3.5, LIFT_M / 2), (4, LIFT_M)):
         viewer.slider.value = place
         viewer.show()
         np.testing.assert_allclose(viewer.models.thing.position, [0, 0, height], atol=1e-9)
 
 
-def test_the_next_grasp_stands_in_its_own_scene_and_after_the_last_comes_the_first(viewer):
+def test_grasps_follow_one_another_each_in_its_own_scene(viewer) -> None:
     assert viewer.row == 0
     viewer.step(2)
     assert viewer.row == 2
@@ -117,9 +108,6 @@ def test_the_next_grasp_stands_in_its_own_scene_and_after_the_last_comes_the_fir
     viewer.step(1)
     assert viewer.row == 0
     np.testing.assert_allclose(viewer.models.rest.position, [0.05, 0, 0.03])
-
-
-def test_only_valid_grasps_are_shown_where_that_is_chosen(viewer):
     assert viewer.filters == ("valid only", "all")
     viewer.choose("valid only")
     assert viewer.row == 1
@@ -127,7 +115,7 @@ def test_only_valid_grasps_are_shown_where_that_is_chosen(viewer):
     assert viewer.row == 1
 
 
-def test_what_a_grasp_lifts_and_whether_it_survives_the_shake_is_told() -> None:
+def test_what_grasp_lifts_and_whether_it_survives_shake_is_told() -> None:
     from graspd.worker.viewing import _figures
 
     found = {"quality/payload_kg": np.array([np.nan, 0.8, 1.5]), "quality/shake_margin": np.array([np.nan, 0.2, 1.0])}
@@ -148,40 +136,31 @@ def test_dots_are_where_the_hand_is_near_the_object(viewer):
     assert len(points) and ((points > low) & (points < high)).all()
 
 
-def test_a_grasp_in_a_bin_has_five_supports_around_it_and_they_can_be_hidden(viewer):
+def test_a_grasp_in_a_bin_has_five_supports_that_can_be_hidden(viewer):
     nodes = [viewer.server.scene.get_handle_by_name(f"/scene/support{k}") for k in range(6)]
     assert sum(node is not None for node in nodes) == 5
     viewer.models.show_scene(False)
     assert not any(node.visible for node in nodes if node is not None)
 
 
-def test_without_viser_one_line_says_how_to_install_it(tmp_path, monkeypatch):
+def test_without_viser_or_a_shard_one_line_says_so(tmp_path, monkeypatch):
     from graspd.commands.render import app
 
+    file = tmp_path / "grasps.h5"
+    file.write_text("nothing")
+    result = CliRunner().invoke(app, ["view", str(file)])
+    assert result.exit_code == 2 and "grasps.h5 is not a readable HDF5 file" in result.output
     monkeypatch.setitem(sys.modules, "viser", None)
-    result = CliRunner().invoke(app, ["view", str(tmp_path / "grasps.h5")])
-    assert result.exit_code == 2
-    assert "pip install 'graspd[view]'" in result.output
+    result = CliRunner().invoke(app, ["view", str(file)])
+    assert result.exit_code == 2 and "pip install 'graspd[view]'" in result.output
     assert len(result.output.strip().splitlines()) == 1
 
 
 @pytest.mark.timeout(180)
 def test_the_command_tells_its_address_and_ends_with_ctrl_c(tmp_path):
     hand, block = hand_from_path("barrett"), object_from_path("block")
-    said = {
-        "hand": "barrett",
-        "hand_digest": hand.digest,
-        "object": "block",
-        "object_digest": block.digest,
-        "method": "none",
-        "fidelity": json_attribute({"face_error_m": 3e-4}),
-        "seed": 0,
-        "batch": 0,
-        "joint_names": list(hand.joint_names),
-        "scene": SCENE,
-    }
     file = tmp_path / "grasps.h5"
-    file.write_bytes(write_shard("base", arrays(len(hand.joint_names)), said))
+    file.write_bytes(write_shard("base", arrays(len(hand.joint_names)), attributes_of(hand, block, scene=SCENE)))
     command = [sys.executable, "-m", "graspd", "view", str(file), "--port", "0"]
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, text=True, env=os.environ | {"SSH_CONNECTION": ""}
@@ -197,17 +176,7 @@ def test_the_command_tells_its_address_and_ends_with_ctrl_c(tmp_path):
         assert process.wait(60) == 0
 
 
-def test_the_file_that_is_no_shard_is_one_line(tmp_path: Path):
-    from graspd.commands.render import app
-
-    file = tmp_path / "grasps.h5"
-    file.write_text("nothing")
-    result = CliRunner().invoke(app, ["view", str(file)])
-    assert result.exit_code == 2
-    assert "grasps.h5 is not a readable HDF5 file" in result.output
-
-
-def test_links_above_the_root_are_drawn_at_the_angles_of_the_wrist_of_each_grasp(block) -> None:
+def test_links_above_the_root_are_drawn_at_each_grasps_wrist(block) -> None:
     from graspd.worker.viewing import Viewer, ViewerContent
 
     # A copy of the hand behind its root serves as a forearm with two wrist joints.
@@ -233,7 +202,7 @@ def test_links_above_the_root_are_drawn_at_the_angles_of_the_wrist_of_each_grasp
         made.close()
 
 
-def test_collision_shapes_take_the_place_of_what_the_hand_looks_like(block) -> None:
+def test_collision_shapes_take_place_of_what_the_hand_looks_like(block) -> None:
     from graspd.worker.viewing import Viewer, ViewerContent
 
     seen = '<visual><geometry><sphere radius="0.03"/></geometry></visual>'

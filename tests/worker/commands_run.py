@@ -1,0 +1,24 @@
+"""Commands of graspd as a test runs them."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from typer.testing import CliRunner
+
+from graspd.cli import build
+
+
+def graspd(words: str, *more: object, code: int = 0) -> dict[str, Any]:
+    """What a command tells with --json; `words` are cut at spaces, `more` are whole arguments."""
+    result = CliRunner().invoke(build(), [*words.split(), *(str(word) for word in more), "--json"])
+    assert result.exit_code == code, result.output
+    return dict(json.loads(result.stdout.splitlines()[-1]))
+
+
+def refused(words: str, *more: object) -> str:
+    """What a command says that ends with 2, as one line."""
+    result = CliRunner().invoke(build(), [*words.split(), *(str(word) for word in more)])
+    assert result.exit_code == 2, result.output
+    return " ".join(result.output.split())
