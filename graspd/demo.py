@@ -1,4 +1,4 @@
-"""`graspd demo`: run the whole service on this machine, send one real job over HTTP, and write a page of results."""
+"""`graspd demo`: run the whole service here, send it one job over HTTP, and write a page of results."""
 
 from __future__ import annotations
 
@@ -140,7 +140,7 @@ def print_results(console: Console, best: list[GraspView], job: JobDetail, paths
 
 
 def write_pages(out: Path, job: JobDetail, shards: list[Path]) -> Results:
-    """Write the contact sheet of the best grasps, the views of the first batch, and an index.html with both."""
+    """Write the contact sheet of the best grasps, views of the first batch, and an index.html with both."""
     from graspd.worker.rendering.sheets import views_page
 
     pictures = []

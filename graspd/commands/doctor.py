@@ -1,4 +1,4 @@
-"""Checks of GPUs and kernels for `graspd doctor`. Each runs in its own process, because a driver may crash it."""
+"""Checks of GPUs and kernels for `graspd doctor`, each in its own process: a driver may crash it."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def gpu(settings: Settings, *, child: Child = run_child, has_driver: Callable[[]
 
 
 def kernels(settings: Settings, *, child: Child = run_child) -> Finding:
-    """Check that the engine loads, compiles and gives plausible results: the test of a worker before its first task."""
+    """Check that the engine gives plausible results, as a worker does before its first task."""
     name = "kernels"
     found, wrong = _answer(child, ["kernels", settings.device])
     if wrong:

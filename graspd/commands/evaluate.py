@@ -242,7 +242,7 @@ def _cell(value: float | None, digits: int) -> str:
 
 
 def copy_paths(source: Path, files: list[Path], out: Path) -> list[Path]:
-    """Return paths of copies: for a file, `out`; for a folder, the same subpaths in `out`, which must be new or empty.
+    """Return `out` for a file; for a folder, the same subpaths in `out`, which must be new or empty.
 
     Raises:
         InputError: a file is no shard, would be overwritten, or lies in no folder.

@@ -1,4 +1,4 @@
-"""Sheets and films of the grasps of a base shard: in their scene, without it, or along their trajectory."""
+"""Sheets and films of the grasps of a base shard: at the grasp, in the scene, or along the trajectory."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ class GraspSheet:
 
 
 def around_of(shard: Shard, rows: NDArray[np.intp]) -> PictureScenes:
-    """Return the surroundings of grasps of a base shard: the scenes they were planned in, or a free object."""
+    """Return the surroundings of grasps of a base shard: the scenes they were planned in, or none."""
     if (spec := _scene_of(shard)) is None:
         return PictureScenes()
     poses = np.asarray(shard["scene/object_pose"], float)

@@ -49,7 +49,7 @@ def check(
     ] = True,
     json: JsonFlag = False,
 ) -> None:
-    """Check whether a hand can be used, report what was guessed, and try it on plain objects. Needs no server."""
+    """Check whether a hand can be used, report guesses, and try it on plain objects. Needs no server."""
     options = hand_options(**options)
     with _bar("reading     ", quiet=json) as run:
         report = report_hand(file, options, run)
@@ -102,7 +102,7 @@ def _draw(hand: HandModel, picture: Path, *, collision: bool) -> None:
 
 
 def _write(file: str, options: dict[str, Any], report: dict[str, Any], target: Path) -> None:
-    """Write an asset.json with the settings from files, options and guesses, so that a reader guesses none."""
+    """Write an asset.json with the settings from files, options and guesses; it leaves nothing to guess."""
     _, files, stated = files_from_path(file)
     settings = parse_options(files, {**stated, **options})
     said = settings.model_dump(mode="json", exclude_unset=True)

@@ -155,7 +155,7 @@ def pictures(
     output: Annotated[Path, typer.Option("--output", "-o", help="The PNG or film to write.")] = Path("grasps.png"),
     json: JsonFlag = False,
 ) -> None:
-    """Draw the best valid grasps by epsilon with their metrics on one sheet, in their scenes if they have any."""
+    """Draw the best valid grasps by epsilon with their metrics on one sheet, in their scenes if any."""
     if way + three + animate > 1:
         raise InputError("--way, --three-sides and --animate exclude one another")
     if animate:
@@ -203,7 +203,7 @@ def _scenes(path: Path) -> Shard:
 
 
 def _drawn_in(base: Shard, hand: str | None) -> DrawnHand | None:
-    """Return the best valid grasp of each scene of a base shard; without validation, the best feasible one."""
+    """Return the best valid grasp of each scene of a base shard; if not validated, the best feasible."""
     validated = validity.valid(base.arrays).any()
     rows = best_in_scenes(base.arrays, validity.chosen(base.arrays, unvalidated=not validated))
     if not len(base["grasp/hand_pose"]):
@@ -261,7 +261,7 @@ def view(
     hand: Annotated[str | None, typer.Option(help="The hand's file; default: found by its digest.")] = None,
     object: Annotated[str | None, typer.Option(help="The object's file; default: found by its digest.")] = None,
 ) -> None:
-    """Show grasps in 3D in the browser: hand, object, scene, contacts, trajectory on a slider. Ends with Ctrl-C."""
+    """Show grasps in 3D in the browser: hand, object, scene, contacts, trajectory. Ends with Ctrl-C."""
     from graspd.worker.viewing import Viewer, ViewerContent, missing
 
     if said := missing():

@@ -232,7 +232,7 @@ def chart(
     data_dir: Annotated[Path | None, typer.Option(help="Folder of the store; GRASPD_DATA_DIR.")] = None,
     json: JsonFlag = False,
 ) -> None:
-    """Compare speed and accuracy: every method and fidelity on the same hands and objects, validated by MuJoCo."""
+    """Compare speed and accuracy: methods and fidelities on the same hands and objects, in MuJoCo."""
     from graspd.studies.chart.chart import settings_of
     from graspd.studies.chart.sweeps import sweep as turn
     from graspd.studies.chart.sweeps import turns
