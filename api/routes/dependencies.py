@@ -1,4 +1,4 @@
-"""Dependencies of routes: services, permissions, page links, threads, conditional requests (RFC 9110 §13)."""
+"""Dependencies of routes: services, permissions, page links, threads, conditions (RFC 9110 §13)."""
 
 from __future__ import annotations
 
