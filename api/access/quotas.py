@@ -57,7 +57,7 @@ end
 return {'', '0'}
 """
 
-#: Settles a claim once the job is in the index; an unsuccessful claim of the same job may have dropped the entry.
+#: Settles a claim once the job is in the index; a claim of the same job that created nothing may have dropped it.
 _SETTLE: Final = """
 local known = redis.call('HGET', KEYS[1], ARGV[1])
 if not known then redis.call('HINCRBY', KEYS[1], 'grasps', ARGV[2]) end

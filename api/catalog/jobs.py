@@ -67,7 +67,7 @@ class Jobs:
         return self._detail(job).model_copy(update={"choice": record.choice or job.choice})
 
     def cancel(self, job_id: str) -> JobDetail:
-        """Stop a job.
+        """Cancel a job.
 
         Raises:
             NotYours: another key submitted it.

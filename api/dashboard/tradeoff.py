@@ -242,7 +242,7 @@ def _point(runs: list[Run], axis: str, scale: float, names: list[str]) -> Point 
 
 
 def _speed(runs: Sequence[Run]) -> float:
-    """Return all grasps found per second, end to end; 0 if there are none.
+    """Return the number of grasps found per second of total time; 0 if there are none.
 
     Charts of graspd 0.1 contain only speeds. These differ by a factor between objects, so their mean is geometric.
     """

@@ -1,4 +1,4 @@
-"""`/v1/jobs`: submit, list, watch, cancel, retry."""
+"""`/v1/jobs`: submit, list, watch, cancel, retry, delete."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Commands of workers."""
+"""Command line: `graspd worker`."""
 
 from __future__ import annotations
 
