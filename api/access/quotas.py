@@ -30,8 +30,8 @@ _AT_ONCE: Final = 1000
 #: A submission still pending after this time belongs to a dead process [s].
 _PENDING_S: Final = 60
 
-# KEYS[1] holds the sum under `grasps`; under each job its grasps, the last claim that counted them, and the time until
-# which this claim is pending (0 once the job is in the index).
+# KEYS[1] holds the sum under `grasps`, and an entry under each job: its grasps, the last claim that counted them, and
+# the time until which this claim is pending. The time is 0 once the job is in the index.
 _CLAIM: Final = """
 local job, grasps, number = ARGV[1], tonumber(ARGV[2]), ARGV[7]
 local most_grasps, most_today, amount = tonumber(ARGV[3]), tonumber(ARGV[4]), tonumber(ARGV[6])

@@ -28,7 +28,7 @@ from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.recording import recording
 
 POLL_S: Final = 0.5
-#: Delay before a client reconnects.
+#: Delay before a client reconnects [ms].
 RETRY_MS: Final = 2000
 _ENDS_AT_ONCE: Final = 100
 

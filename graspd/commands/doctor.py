@@ -17,7 +17,7 @@ from graspd.service.settings import Settings
 
 _MODULE: Final = "graspd.commands.doctor"
 _GPU_S: Final = 120.0
-#: Time to compile all kernels from scratch on a slow machine [s].
+#: Time limit for compiling all kernels from scratch, on a slow machine [s].
 _KERNELS_S: Final = 900.0
 _GIB: Final = 2**30
 _MEMORY_LOW: Final = 2 * _GIB
