@@ -95,7 +95,7 @@ def create_app(settings: Settings, services: Services | None = None) -> FastAPI:
     problems.install(app, problem_page)
     pages.install(app, opened)
     for router in (*_ROUTERS, *map(asset_router, AssetKind), *datasets.routers, *pages.routers):
-        # Add the routes built at import: `include_router` would rebuild them at the first request, and meanwhile
+        # Add the routes built at import: `include_router` would rebuild them at the first request. It would also
         # silence warnings for the whole process, which is unsafe if two applications are built at once.
         app.router.routes.extend(router.routes)
     app.mount("/static", StaticFiles(directory=STATIC), name="static")
