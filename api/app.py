@@ -1,4 +1,4 @@
-"""The HTTP application. It keeps nothing between requests that another process would need."""
+"""HTTP application. It keeps no state between requests that another process would need."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from graspd.service.queue.connection import redis_url
 from graspd.service.settings import Settings
 
 _log = logging.getLogger("graspd.api")
-#: Those of all documents but of assets and datasets, in the order of the OpenAPI document.
+#: Routers of all documents except assets and datasets, in the order of the OpenAPI document.
 _ROUTERS: Final = (
     jobs.router,
     grasps.router,
@@ -50,13 +50,13 @@ _LOOPBACK_NAMES = frozenset({"127.0.0.1", "localhost", "::1"})
 
 
 def create_app(settings: Settings, services: Services | None = None) -> FastAPI:
-    """The application over given services, or over those it opens from the settings and closes at its end.
+    """Create the application with given services, or with its own, which it opens and closes.
 
     Raises:
-        InputError: the address to bind is reachable from elsewhere and no key exists; or what the settings say of a
-            proxy cannot be read.
+        InputError: the address to bind is reachable from other machines and no key exists; or the settings of a
+            proxy are invalid.
         BusyError: store, index or Redis belong to another service.
-        StoreUnavailable, IndexUnavailable: where the parts cannot be opened.
+        StoreUnavailable, IndexUnavailable: store or index cannot be opened.
     """
     proxy = Proxy(settings)
     keys = KeyFile(settings.resolved_keys_file, closed=proxy.is_on)
@@ -83,7 +83,7 @@ def create_app(settings: Settings, services: Services | None = None) -> FastAPI:
         docs_url=None,
         redoc_url=None,
         lifespan=lifespan,
-        # A redirect would go where the Host header says.
+        # A redirect would follow the Host header.
         redirect_slashes=False,
     )
     app.state.settings = settings
@@ -95,8 +95,8 @@ def create_app(settings: Settings, services: Services | None = None) -> FastAPI:
     problems.install(app, problem_page)
     pages.install(app, opened)
     for router in (*_ROUTERS, *map(asset_router, AssetKind), *datasets.routers, *pages.routers):
-        # As they were built when imported: `include_router` would build each of them again, at the first request, and
-        # silence warnings meanwhile, for the whole process and so not safely where two applications build at once.
+        # Add the routes built at import: `include_router` would rebuild them at the first request. It would also
+        # silence warnings for the whole process, which is unsafe if two applications are built at once.
         app.router.routes.extend(router.routes)
     app.mount("/static", StaticFiles(directory=STATIC), name="static")
     _add_middleware(app, settings, keys, proxy, rates)
@@ -105,7 +105,7 @@ def create_app(settings: Settings, services: Services | None = None) -> FastAPI:
 
 
 def check_exposure(host: str, keys: KeyFile) -> None:
-    """InputError if strangers could reach a service that has no key to ask for."""
+    """Raise InputError if other machines could reach a service that has no live key."""
     if not keys.has_live_key and not is_loopback(host):
         raise InputError(
             f"{host} is reachable from other machines and there is no live key; "
@@ -114,7 +114,7 @@ def check_exposure(host: str, keys: KeyFile) -> None:
 
 
 def _add_middleware(app: FastAPI, settings: Settings, keys: KeyFile, proxy: Proxy, rates: Rates) -> None:
-    """Innermost first: limits on bodies, who asks and how often, foreign web pages, request ids around everything."""
+    """Add, from the inside out: body limits, authentication and rates, same-origin check, request ids."""
     app.add_middleware(Head)
     uploads = frozenset({*(f"/v1/{kind.value}s" for kind in AssetKind), "/submit"})
     app.add_middleware(BodyLimit, upload_paths=uploads, upload_bytes=settings.max_upload_bytes)
@@ -130,7 +130,7 @@ def _add_middleware(app: FastAPI, settings: Settings, keys: KeyFile, proxy: Prox
 
 
 def _openapi(app: FastAPI) -> dict[str, Any]:
-    """The OpenAPI document, with problem documents where FastAPI would declare its own error form."""
+    """Return the OpenAPI document, with problem documents in place of FastAPI's own error schema."""
     if app.openapi_schema is None:
         document = get_openapi(title=app.title, version=app.version, description=app.description, routes=app.routes)
         schemas = document.setdefault("components", {}).setdefault("schemas", {})
@@ -153,7 +153,7 @@ def _openapi(app: FastAPI) -> dict[str, Any]:
 
 
 def _of_everybody(path: str, method: str) -> list[int]:
-    """Statuses with which the middleware answers before a route is asked."""
+    """Return the statuses that middleware may send before a route runs."""
     statuses = [421]
     if path.startswith(("/v1/", "/metrics")):
         statuses += [401, 403, 429, 503]

@@ -1,4 +1,4 @@
-"""Numbers, times, sizes and names of machines as pages and terminals show them."""
+"""Format numbers, times, sizes and host names for pages and terminals."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ NONE: Final = "–"
 
 
 def metric(value: float | None) -> str:
-    """Three significant digits, without a tail of zeros that says nothing."""
+    """Format with three significant digits, without trailing zeros."""
     if value is None or value != value:
         return NONE
     if value == 0:
@@ -26,26 +26,26 @@ def metric(value: float | None) -> str:
 
 
 def count(value: float | None) -> str:
-    """A whole number with thousands apart."""
+    """Format a whole number with separated thousands."""
     return NONE if value is None else f"{value:,.0f}"
 
 
 def percent(value: float | None) -> str:
-    """Share [0, 1] as per cent; 100 only when it is all."""
+    """Format a share [0, 1] as per cent; 100 only if it is exactly 1."""
     if value is None:
         return NONE
     return f"{int(100 * value + 1e-9)} %" if value > 0.1 else f"{100 * value:.1f} %".replace(".0 %", " %")
 
 
 def valid_yield(made: Any) -> str:
-    """Share of the validated grasps that are valid, of whatever counts them; words where not validated."""
+    """Format the share of validated candidates that are valid; "not validated" without validation."""
     if made.valid_yield is None:
         return "not validated" if made.candidates else NONE
     return percent(made.valid_yield)
 
 
 def worker_time(stage: Any) -> str:
-    """Time that workers spent on a stage for its job; what another job had made before is said and not counted."""
+    """Format the time workers spent on a stage for its job; reused results are counted separately."""
     if not stage.reused:
         return duration(stage.seconds) if stage.seconds else NONE
     if stage.reused == stage.succeeded:
@@ -54,7 +54,7 @@ def worker_time(stage: Any) -> str:
 
 
 def duration(seconds: float | None) -> str:
-    """The two largest units of a time span."""
+    """Format a time span in its two largest units."""
     if seconds is None:
         return NONE
     if seconds < 10:
@@ -71,7 +71,7 @@ def duration(seconds: float | None) -> str:
 
 
 def size(value: float | None) -> str:
-    """Bytes in decimal units."""
+    """Format bytes in decimal units."""
     if value is None:
         return NONE
     for unit in ("B", "kB", "MB", "GB"):
@@ -82,21 +82,21 @@ def size(value: float | None) -> str:
 
 
 def minute(value: str | None) -> str:
-    """An RFC 3339 time as a table of the command line shows it: `2026-11-26 03:14`, UTC; empty for none."""
+    """Format an RFC 3339 time for a table of the command line: `2026-11-26 03:14`, UTC; empty for none."""
     return (value or "")[:16].replace("T", " ")
 
 
 def stamp(value: str) -> str:
-    """What a reader without JavaScript sees of an RFC 3339 time; the script says it relative to now."""
+    """Format an RFC 3339 time for readers without JavaScript; the script shows it relative to now."""
     return datetime.fromisoformat(value).strftime("%Y-%m-%d %H:%M UTC")
 
 
-#: The names that templates call them by.
+#: Kind of scene, and its name in templates.
 _PLACES: Final = {"table": "on a table", "bin": "in a bin", "shelf": "on a shelf", "file": "in a scene of their own"}
 
 
 def place(kind: str) -> str:
-    """Where grasps of a kind of scene are used; empty: a free object."""
+    """Describe where grasps of a kind of scene are used; empty: a free object."""
     return _PLACES.get(kind, "")
 
 
@@ -115,14 +115,14 @@ FILTERS: Final[Mapping[str, Callable[..., str]]] = {
 
 
 def host_name(host: str) -> str:
-    """Name in a Host header, without port and brackets."""
+    """Return the name in a Host header, without port and brackets."""
     if host.startswith("["):
         return host[1:].partition("]")[0]
     return host.rpartition(":")[0] if host.count(":") == 1 else host
 
 
 def is_loopback(host: str) -> bool:
-    """Whether an address to bind is reachable from this machine alone."""
+    """Check whether an address to bind is reachable only from this machine."""
     if host == "localhost":
         return True
     try:

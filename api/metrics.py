@@ -1,4 +1,4 @@
-"""Prometheus text of one API process: its own requests, and the service as queue, index and controller see it."""
+"""Prometheus text of one API process: its own requests, and the state of queue, index and controller."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Values = dict[str, dict[tuple[str, ...], float]]
 
 
 class Metrics:
-    """Counts and times what this process answered; renders that together with a snapshot of the service."""
+    """Counts and times the requests of this process; renders them together with a snapshot of the service."""
 
     def __init__(self) -> None:
         self.registry = CollectorRegistry()
@@ -37,21 +37,21 @@ class Metrics:
         self._seconds.labels(method, route).observe(seconds)
 
     def render(self, service: Snapshot) -> bytes:
-        """Text exposition format."""
+        """Render the text exposition format."""
         snapshot = CollectorRegistry()
         snapshot.register(service)
         return generate_latest(self.registry) + generate_latest(snapshot)
 
 
 class Snapshot:
-    """The service at the moment of a scrape. A part that does not answer leaves its series out."""
+    """State of the service at a scrape. Series of a part that does not answer are omitted."""
 
     def __init__(self) -> None:
         self._values: Values = defaultdict(dict)
         self._sums: Mapping[str, float] = {}
 
     def add_parts(self, latencies_s: Mapping[str, float | None]) -> None:
-        """Time each part took to answer [s]; None: it does not answer."""
+        """Set the latency of each part [s]; None: it does not answer."""
         for part, seconds in latencies_s.items():
             self._set("graspd_part_up", part, value=float(seconds is not None))
             if seconds is not None:
@@ -79,11 +79,11 @@ class Snapshot:
         self._set("graspd_grasps_per_second", "valid", value=index.valid_per_s)
 
     def add_sums(self, sums: Mapping[str, float]) -> None:
-        """What the controller counted."""
+        """Set the sums that the controller counted."""
         self._sums = sums
 
     def collect(self) -> Iterator[Metric]:
-        """What prometheus_client asks for."""
+        """Yield all metrics; part of the collector interface of prometheus_client."""
         for name, samples in self._values.items():
             family = GaugeMetricFamily(name, SERIES[name].meaning, labels=SERIES[name].labels)
             for labels, value in samples.items():
@@ -96,7 +96,7 @@ class Snapshot:
 
 
 def _families(sums: Mapping[str, float]) -> Iterable[Metric]:
-    """Counters and histograms of the controller; what does not fit the list of series is left out."""
+    """Yield counters and histograms of the controller; fields without a known series are omitted."""
     found: Values = defaultdict(dict)
     for text, amount in sums.items():
         if (parsed := parse_field(text)) is not None:

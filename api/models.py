@@ -1,4 +1,4 @@
-"""What the HTTP API answers where it says more than the index. Times are RFC 3339 in UTC, units stand in the names."""
+"""Documents that extend those of the index. Times are RFC 3339 in UTC; field names contain units."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from graspd.service.model.where import LONGEST
 
 
 class StageStatus(StageProgress):
-    """How far one stage of a job is, and when it will end."""
+    """Progress of one stage of a job, and its expected end."""
 
     state: State
     progress: float = Field(ge=0, le=1, description="share done; running tasks count by their own progress")
@@ -28,7 +28,7 @@ class StageStatus(StageProgress):
 
 
 class Job(Validated):
-    """A job as the list shows it."""
+    """Job as shown in lists."""
 
     id: str
     state: State
@@ -61,7 +61,7 @@ class MeanMetrics(BaseModel):
 
 
 class Diversity(BaseModel):
-    """How different the valid grasps of a job are, all that it kept where not validated."""
+    """Diversity of a job's valid grasps, or of all its stored grasps if not validated."""
 
     grasps: int = Field(description="grasps looked at")
     types: dict[str, int] = Field(description="how many are power, precision or lateral; none: not told")
@@ -73,13 +73,13 @@ class Diversity(BaseModel):
 
 
 class Shard(ShardView):
-    """A shard and where to download it."""
+    """Shard and its download address."""
 
     file: str
 
 
 class JobDetail(Job):
-    """A job with its request, failed attempts and results."""
+    """Job with its request, failed attempts and results."""
 
     request: JobRequest
     hand_digest: str
@@ -99,7 +99,7 @@ class JobDetail(Job):
 
 @with_fields(sort=filters())
 class GraspQuery(BaseModel):
-    """Filters and order of a list of grasps. A range leaves out grasps whose metric is unknown."""
+    """Filters and order of a list of grasps. A range excludes grasps whose metric is unknown."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -128,14 +128,14 @@ class GraspQuery(BaseModel):
 
 
 class Posture(BaseModel):
-    """A hand posture in the object's frame."""
+    """Hand posture in the object frame."""
 
     hand_pose: list[float] = Field(description="root link: x y z [m], quaternion w x y z")
     joint_positions: list[float] = Field(description="order of joint_names [rad or m]")
 
 
 class Waypoint(BaseModel):
-    """One posture of the way of a grasp, in the frame of the object at rest."""
+    """One posture on the trajectory of a grasp, in the frame of the object at rest."""
 
     name: str = Field(description="standoff, pregrasp, grasp, squeeze, lift; empty: between two of them")
     place: float = Field(description="on a slider: named ones at 0, 1, 2, ..., others evenly between")
@@ -145,7 +145,7 @@ class Waypoint(BaseModel):
 
 
 class Neighbour(BaseModel):
-    """Another object of a scene."""
+    """Neighbour of the target in a scene."""
 
     name: str
     digest: str
@@ -153,7 +153,7 @@ class Neighbour(BaseModel):
 
 
 class GraspScene(BaseModel):
-    """The scene that a grasp was planned in; its frame has z up."""
+    """Scene that a grasp was planned in; its frame has z up."""
 
     kind: SceneKind
     number: int = Field(description="row of the scene in its shard")
@@ -166,14 +166,14 @@ class GraspScene(BaseModel):
 
 
 class Push(BaseModel):
-    """What one push of the validator did to a grasp."""
+    """Outcome of one push by the validator."""
 
     direction: str
     outcome: str
 
 
 class GraspDetail(GraspView):
-    """One grasp with its postures and all that its shard says of it."""
+    """One grasp with its postures and all data of its shard."""
 
     hand_digest: str
     object_digest: str
@@ -202,13 +202,13 @@ class GraspPageQuery(GraspQuery):
 
 
 class GraspExportQuery(GraspQuery):
-    """Which grasps to take home, and how."""
+    """Selection of grasps to export, and the format."""
 
     format: Literal["csv", "json", "zip"] = Field("csv", description="zip: base shards of these grasps alone")
 
 
 class GraspName(BaseModel):
-    """A grasp by its place."""
+    """Identifier of a grasp: its shard and row."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -217,7 +217,7 @@ class GraspName(BaseModel):
 
 
 class Selection(BaseModel):
-    """Grasps: those that are named, or all that pass a filter."""
+    """Selection of grasps: listed by name, or all that pass a filter."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -232,20 +232,20 @@ class Selection(BaseModel):
 
 
 class TagRequest(Selection):
-    """Grasps that shall have a tag."""
+    """Request to give grasps a tag."""
 
     name: TagName
 
 
 class TagChange(BaseModel):
-    """What became of a tag."""
+    """Result of giving or removing a tag."""
 
     tag: TagView
     changed: int = Field(description="grasps that have it and had not, or the other way round")
 
 
 class Part(BaseModel):
-    """One part the API needs."""
+    """State of one part that the API needs."""
 
     ok: bool
     latency_ms: float | None = Field(None, description="absent where it does not answer")
@@ -253,7 +253,7 @@ class Part(BaseModel):
 
 
 class Health(BaseModel):
-    """Readiness, part by part."""
+    """Readiness, for each part."""
 
     ok: bool = Field(description="redis, index and store answer")
     parts: dict[str, Part]
@@ -264,14 +264,14 @@ class Health(BaseModel):
 
 
 class Worker(WorkerView):
-    """A worker and what it does now."""
+    """Worker and its present task."""
 
     stage: Stage | None = Field(None, description="stage of the task in hand")
     lease_age_s: float | None = Field(None, description="time since its last beat [s]; absent once it is gone")
 
 
 class LossCurve(BaseModel):
-    """The planner's loss as it went down."""
+    """Planner's loss over its iterations."""
 
     iterations: list[int]
     losses: list[float]
@@ -289,13 +289,13 @@ class Histogram(BaseModel):
 
     @property
     def bars(self) -> list[float]:
-        """Heights as shares of the highest bin."""
+        """Heights of the bars as shares of the highest bin."""
         top = max(self.counts) or 1
         return [count / top for count in self.counts]
 
 
 def stage_state(stage: StageProgress) -> State:
-    """State of a stage, from the states of its tasks."""
+    """Return the state of a stage from the states of its tasks."""
     if stage.succeeded == stage.tasks:
         return State.SUCCEEDED
     if stage.running:

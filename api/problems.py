@@ -1,4 +1,4 @@
-"""Every error as `application/problem+json` (RFC 9457): domain errors by their slug, HTTP errors by their status."""
+"""Errors as `application/problem+json` (RFC 9457): domain errors by slug, HTTP errors by status."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ MEDIA_TYPE: Final = "application/problem+json"
 RETRY_AFTER_S: Final = 2
 _FULL_SAID: Final = "no space is left on the disk of this service; the same request succeeds when there is room"
 _LONGEST_POINTER: Final = 200
-#: Of the mistakes in one request, those that are told.
+#: Largest number of errors reported for one request.
 _MOST_ERRORS: Final = 100
 
 _log = logging.getLogger("graspd.api")
 
-#: Problem types of answers that HTTP itself defines.
+#: Problem types of statuses defined by HTTP.
 HTTP_SLUGS: Final[dict[int, str]] = {
     400: "bad-request",
     401: "unauthorized",
@@ -47,7 +47,7 @@ HTTP_SLUGS: Final[dict[int, str]] = {
 
 
 class FieldError(BaseModel):
-    """One mistake in a request."""
+    """One error in a request."""
 
     pointer: str = Field(description="JSON pointer into the body, or the name of the parameter")
     detail: str
@@ -69,7 +69,7 @@ class Problem(BaseModel):
 
 
 class ApiError(Exception):
-    """An HTTP answer that is no domain error: authentication, limits, a browser's foreign form."""
+    """HTTP error outside the domain errors: authentication, limits, a cross-site form."""
 
     def __init__(self, status: int, detail: str, *, headers: dict[str, str] | None = None) -> None:
         super().__init__(detail)
@@ -87,7 +87,7 @@ def problem_response(
     errors: list[FieldError] | None = None,
     headers: dict[str, str] | None = None,
 ) -> JSONResponse:
-    """The answer to a request that failed."""
+    """Return the problem document of a failed request."""
     problem = Problem(
         type=f"{_root_path(request)}/problems/{slug}",
         title=title,
@@ -111,7 +111,7 @@ def _root_path(request: Request) -> str:
 
 
 def describe(error: Exception) -> tuple[str, str, int, str]:
-    """(slug, title, status, detail) of an exception; an unforeseen one tells nothing of its inside."""
+    """Return (slug, title, status, detail) of an exception; unexpected errors reveal no internals."""
     if isinstance(error, GraspdError):
         return error.slug, error.title, error.status, plain(str(error)) or error.title
     if _is_full(error) or _is_full(error.__cause__):
@@ -126,31 +126,31 @@ def describe(error: Exception) -> tuple[str, str, int, str]:
 
 
 def _is_full(error: BaseException | None) -> bool:
-    """Whether there was no room on the disk. FastAPI answers what breaks while it reads a body as a bad request."""
+    """Check whether the disk was full. FastAPI turns an error while it reads a body into a bad request."""
     return isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
 
 
 def plain(text: str) -> str:
-    """Text that an answer can carry: JSON may name half a letter (a lone surrogate), UTF-8 cannot."""
+    """Replace lone surrogates: JSON may contain them, UTF-8 cannot encode them."""
     return text.encode(errors="replace").decode()
 
 
 def answer(request: Request, error: Exception) -> JSONResponse:
-    """Problem document of any exception."""
+    """Return the problem document of any exception."""
     slug, title, status, detail = describe(error)
     if isinstance(error, HTTPException) and status == 404:
         detail = f"there is no {request.url.path}"
     if isinstance(error, HTTPException) and status == 405:
         detail = f"{request.method} is not possible on {request.url.path}"
     headers = dict(getattr(error, "headers", None) or {})
-    # The router names the methods of the first route that it met at this path; our own word on it stands.
+    # The router lists only the methods of the first matching route; an ApiError has its own header.
     if status == 405 and not isinstance(error, ApiError) and (allowed := _allowed_methods(request)):
         headers["Allow"] = ", ".join(allowed)
     return problem_response(request, slug=slug, title=title, status=status, detail=detail, headers=headers)
 
 
 def _allowed_methods(request: Request) -> list[str]:
-    """Methods that some route takes at this path (RFC 9110 §15.5.6); one route alone knows only its own."""
+    """Return the methods of all routes at this path (RFC 9110 §15.5.6); one route has only its own."""
     routes = request.app.routes if "app" in request.scope else []
     return [
         method
@@ -163,7 +163,7 @@ def _allowed_methods(request: Request) -> list[str]:
 
 
 def validation_answer(request: Request, error: RequestValidationError) -> JSONResponse:
-    """Problem document that names every field in error."""
+    """Return a problem document that lists every invalid field."""
     errors = [_field_error(entry) for entry in error.errors()]
     is_syntax = any(entry.type == "json_invalid" for entry in errors)
     first = errors[0]
@@ -192,15 +192,15 @@ def _field_error(entry: dict[str, Any]) -> FieldError:
 
 
 def request_id_of(request: Request) -> str | None:
-    """The request id that the outermost middleware gave."""
+    """Return the request id set by the outermost middleware."""
     return request.scope.get("state", {}).get("request_id")
 
 
 def install(app: FastAPI, page: Callable[[Request, dict[str, Any]], Response] | None = None) -> None:
-    """Answer every exception of the application with a problem document.
+    """Convert every exception of the application to a problem document.
 
     Args:
-        page: makes a page of the problem, for addresses of the dashboard opened in a browser.
+        page: renders the problem as a page, for dashboard addresses opened in a browser.
     """
 
     def answer_any(request: Request, error: Exception) -> Response:
@@ -217,7 +217,7 @@ def install(app: FastAPI, page: Callable[[Request, dict[str, Any]], Response] | 
         assert isinstance(error, RequestValidationError)
         return validation_answer(request, error)
 
-    #: What the outermost middleware gives where no handler was reached.
+    #: Used by the outermost middleware if no handler was reached.
     app.state.answer_error = answer_any
     app.add_exception_handler(GraspdError, any_error)
     app.add_exception_handler(ApiError, any_error)
@@ -231,7 +231,7 @@ def _is_page(request: Request) -> bool:
 
 
 def responses(*statuses: int, others: dict[int | str, dict[str, Any]] | None = None) -> dict[int | str, dict[str, Any]]:
-    """OpenAPI entries of the problem answers a route may give, beside its `others`."""
+    """Return OpenAPI entries of a route's problem documents, added to its `others`."""
     return (others or {}) | {
         status: {
             "description": HTTPStatus(status).phrase,
@@ -242,5 +242,5 @@ def responses(*statuses: int, others: dict[int | str, dict[str, Any]] | None = N
 
 
 def log_unforeseen(path: str, request_id: str, error: Exception) -> None:
-    """Keep the stack trace where the operator finds it."""
+    """Log the stack trace for the operator."""
     _log.error("request %s on %s failed", request_id, path, exc_info=error)

@@ -1,8 +1,8 @@
-"""Runs the application: one uvicorn in this process, on a socket that was bound before anything else was done.
+"""Server of the application: one uvicorn in this process, on a socket that is bound first of all.
 
-uvicorn counts the time between requests, and `BodyLimit` that between the pieces of a body; without `TimedProtocol` a
-connection that sends half of its headers, or none, is kept for ever. So is one that goes on with a body after its
-answer: nobody reads that body any more, and each byte of it begins the time between requests anew.
+uvicorn limits the time between requests, `BodyLimit` that between pieces of a body. Without `TimedProtocol` a
+connection with partial or no headers stays open forever. So does one whose body continues after its answer: nothing
+reads this body, and each byte restarts the time between requests.
 """
 
 from __future__ import annotations
@@ -24,24 +24,24 @@ from graspd.api.app import create_app
 from graspd.service.model.errors import BusyError, InputError
 from graspd.service.settings import Settings
 
-#: Open event streams end with their clients; a stop does not wait longer than this.
+#: A stop waits at most this long for open event streams, which end only with their clients [s].
 _GRACE_S = 3
-#: From the start of a connection, or the first byte of a later request, to the end of its headers [s].
+#: Limit from the start of a connection, or the first byte of a later request, to the end of its headers [s].
 HEADERS_S: Final = 20.0
-#: For what is left of a body after its answer [s]: who is still sending it may read the answer first.
+#: Limit for the rest of a body after its answer [s]: a client that still sends may read the answer first.
 REST_S: Final = 5.0
 _TOO_SLOW: Final = b"HTTP/1.1 408 Request Timeout\r\nConnection: close\r\nContent-Length: 0\r\n\r\n"
 
 
 def bind(host: str, port: int) -> socket.socket:
-    """A listening socket.
+    """Return a listening socket.
 
     Raises:
         BusyError: the port is taken.
-        InputError: the address is none of this machine, or the port needs other rights.
+        InputError: the address does not belong to this machine, or the port needs other privileges.
     """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    # asyncio sends without delay only on sockets that name their protocol; else each answer waits 40 ms for its body.
+    # asyncio disables Nagle's delay only on sockets with an explicit protocol; else each body arrives 40 ms late.
     listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
@@ -60,12 +60,12 @@ def serve(settings: Settings) -> None:
 
     Raises:
         BusyError: the port is taken.
-        InputError: strangers could reach the service without a key.
-        StoreUnavailable, IndexUnavailable: where they cannot be opened.
+        InputError: other machines could reach the service without a key.
+        StoreUnavailable, IndexUnavailable: store or index cannot be opened.
     """
     listener = bind(settings.host, settings.port)
     with listener:
-        # Uploads wait here, not in /tmp, which may be memory.
+        # Spool uploads here, not in /tmp, which may be in memory.
         spool = settings.data_dir / "uploads"
         spool.mkdir(parents=True, exist_ok=True)
         tempfile.tempdir = str(spool)
@@ -77,13 +77,13 @@ def serve(settings: Settings) -> None:
 
 
 def configuration(app: ASGIApp, settings: Settings) -> uvicorn.Config:
-    """How uvicorn serves the application."""
+    """Return uvicorn's configuration for the application."""
     return uvicorn.Config(
         app,
         http=TimedProtocol,
         ws="none",
-        # Whoever is believed may name any address as its client's, and so evade what is counted by address: nobody is,
-        # loopback included, unless the variable says so.
+        # A trusted proxy may claim any client address and so evade limits per address. None is trusted, including
+        # loopback, unless the variable lists it.
         proxy_headers=bool(os.environ.get("FORWARDED_ALLOW_IPS")),
         log_config=None,
         access_log=False,
@@ -94,7 +94,7 @@ def configuration(app: ASGIApp, settings: Settings) -> uvicorn.Config:
 
 
 class TimedProtocol(H11Protocol):
-    """One connection. Bytes that trickle in win no time."""
+    """HTTP/1.1 connection with time limits that trickling bytes do not extend."""
 
     headers_s = HEADERS_S
     rest_s = REST_S
@@ -112,7 +112,7 @@ class TimedProtocol(H11Protocol):
         super().on_response_complete()
         if self.conn.their_state is h11.SEND_BODY:
             self.loop.call_later(self.rest_s, self._drop_rest, self.cycle)
-        # What was sent behind the request is read now.
+        # uvicorn now reads pipelined data.
         self._look()
 
     def connection_lost(self, exc: Exception | None) -> None:

@@ -1,4 +1,4 @@
-"""`graspd api`: the HTTP API and the dashboard, until it is told to stop."""
+"""`graspd api`: run the HTTP API and the dashboard until stopped."""
 
 from __future__ import annotations
 

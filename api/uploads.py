@@ -1,5 +1,4 @@
-"""What a stranger uploads as a hand, an object or a network: one file, or but for a network a ZIP of a folder, turned
-into the files of an asset."""
+"""Files of an asset from an upload: one file, or a ZIP of a folder (hands and objects only)."""
 
 from __future__ import annotations
 
@@ -29,21 +28,20 @@ _NAME: Final = re.compile(r"[^A-Za-z0-9._-]+")
 def files_of_upload(
     kind: AssetKind, filename: str, data: bytes | IO[bytes], *, limit_bytes: int, options: str = ""
 ) -> MutableMapping[str, bytes]:
-    """Files of an asset, `asset.json` among them, from an uploaded file or ZIP.
+    """Return the files of an asset, including `asset.json`, from an uploaded file or ZIP.
 
-    Those of a ZIP are read from it when they are asked for.
+    Files of a ZIP are read on access.
 
     Args:
         kind: hand, object or network.
-        filename: as the user called it.
-        data: its bytes, or the open file that holds them.
+        filename: name given by the user.
+        data: content, or an open file with it.
         limit_bytes: largest upload [bytes].
-        options: a JSON object; its keys go over those of `asset.json`.
+        options: a JSON object; its keys override those of `asset.json`.
 
     Raises:
-        InputError: empty, an unknown suffix, options that are no JSON object, or a ZIP in which the main file cannot be
-            told.
-        LimitError: it is larger than the limit; the ZIP unpacks to more than `UNPACK_FACTOR` times that, or holds too
+        InputError: empty upload, unknown suffix, options that are no JSON object, or a ZIP without a clear main file.
+        LimitError: it exceeds the limit; or its ZIP unpacks to more than `UNPACK_FACTOR` times that, or holds too
             many files.
     """
     leaf = PurePosixPath(filename.replace("\\", "/")).name
@@ -73,14 +71,14 @@ def files_of_upload(
 
 
 def name_of_upload(filename: str) -> str:
-    """A name a user may give, made of a file's name: `My mug (2).stl` is `My-mug-2`; InputError for a long one."""
+    """Derive a valid asset name: `My mug (2).stl` becomes `My-mug-2`; raise InputError if it is too long."""
     leaf = PurePosixPath(filename.replace("\\", "/")).name
     stem = hand_name(leaf) if leaf.lower().endswith(SUFFIXES) else PurePosixPath(leaf).stem
     return refuse_long(_NAME.sub("-", stem).strip("-._") or "unnamed")
 
 
 def _network(leaf: str, file: IO[bytes], size: int) -> bytes:
-    """The bytes of a file that may be a network's: it is a ZIP itself, and none of other files."""
+    """Return the content of a network's file: .npz is a ZIP itself, so it is not unpacked."""
     if PurePosixPath(leaf).suffix.lower() not in MAIN_SUFFIXES[AssetKind.NETWORK]:
         raise InputError(f"{leaf} is no network; upload its .npz file as it is")
     check_size(size, leaf)

@@ -1,4 +1,4 @@
-"""graspd in Python: grasps of a hand on an object, made here or by a service, and those of files.
+"""graspd in Python: grasps of a hand on an object, from this process, a service or files.
 
     import graspd
 
@@ -8,7 +8,7 @@
     graspd.open("grasps.h5")
     graspd.Client("http://127.0.0.1:8000").submit("allegro", "mug", grasps=64).wait().grasps()
 
-Everything is imported when it is first used. Every error that graspd raises on purpose is a `graspd.GraspdError`.
+Modules are imported on first use. Every error that graspd raises on purpose is a `graspd.GraspdError`.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     __version__: str
 
 _ERRORS: Final = "graspd.service.model.errors"
-#: Name, the module it lives in.
+#: Public name, and the module that defines it.
 _LIVES_IN: Final = {
     "synthesize": "graspd.synthesis",
     "open": "graspd.grasps",

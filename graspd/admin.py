@@ -1,4 +1,4 @@
-"""Command line: `graspd admin`, whose commands `graspd.cli.JOINED` lists."""
+"""Command line: `graspd admin`. `graspd.cli.JOINED` lists its commands."""
 
 import typer
 

@@ -1,4 +1,4 @@
-"""The command line: mounts the command groups of the three packages and imports each only when it is used."""
+"""Root of the command line: mounts the command groups of three packages and imports each on first use."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ COMMANDS: Final[tuple[tuple[str, str, str, str], ...]] = (
     ("admin", "graspd.admin", "Administration", "Rare tasks: kernels, index, store, pictures."),
 )
 
-#: Group, command in it, module that has it, help.
+#: Group, its command, module of the command, help.
 JOINED: Final[tuple[tuple[str, str, str, str], ...]] = (
     ("admin", "kernels", "graspd.commands.admin", "Compile all kernels ahead of time."),
     ("admin", "index", "graspd.service.run.commands", "Rebuild the index from the store, or export its tables."),
@@ -73,7 +73,7 @@ JOINED: Final[tuple[tuple[str, str, str, str], ...]] = (
     ("datasets", "card", "graspd.commands.exchange", "Write a dataset's card: contents, quality, biases, plots."),
 )
 
-#: What a package cannot work without, and the extra that brings it: an image has only the packages it needs.
+#: Module that each package needs, and the extra that installs it: an image has only the packages it needs.
 PACKAGES: Final[dict[str, tuple[str, str]]] = {
     "graspd.api": ("fastapi", "api"),
     "graspd.client": ("fastapi", "api"),
@@ -82,20 +82,20 @@ PACKAGES: Final[dict[str, tuple[str, str]]] = {
 }
 
 
-#: Of typer's own, or of the click that an older one stands on.
+#: Class of typer, or of click in an older typer.
 UsageError: Final[Any] = typer.BadParameter.__base__
 
 
 class LazyGroup(TyperGroup):
-    """A group whose overview needs no import: a command's package is imported when the command is called."""
+    """Group whose overview needs no import: calling a command imports its package."""
 
     def main(self, *args: Any, **extra: Any) -> Any:
-        """Run it; what cannot be understood is one line and exit code 2, as any other mistake of a caller."""
+        """Run the command; a usage error prints one line and exits with code 2, as any other invalid input."""
         try:
             code = super().main(*args, **extra | {"standalone_mode": False})
         except UsageError as error:
             code = error.exit_code
-            if said := usage_line(error):  # else it is help, and printed
+            if said := usage_line(error):  # else it is help, already printed
                 typer.echo(f"graspd: {said}", err=True)
         except typer.Abort:
             code = 1
@@ -105,10 +105,10 @@ class LazyGroup(TyperGroup):
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
         name, command, rest = super().resolve_command(ctx, args)
         module = next((module for known, module, _, _ in COMMANDS if known == name), None)
-        # Completion says nothing of what is not installed.
+        # Completion omits commands whose package is not installed.
         if module is None or name is None or (ctx.resilient_parsing and missing_extra(module)):
             return name, command, rest
-        # A worker's image has no API, but checks hands and objects.
+        # A worker's image has no API, but still offers `hands check` and `objects check`.
         package = next((package for parent, child, package, _ in JOINED if [parent, child] == [name, *rest[:1]]), None)
         if package and missing_extra(module):
             return f"{name} {rest[0]}", load(package, rest[0], ctx), rest[1:]
@@ -116,41 +116,41 @@ class LazyGroup(TyperGroup):
 
 
 class Deferred(TyperCommand):
-    """Stands for a command of another package in a group; that package is imported when the command is called."""
+    """Placeholder in a group for a command of another package; calling it imports that package."""
 
     def __init__(self, name: str, module: str, help: str) -> None:
         super().__init__(name, help=help)
         self.module = module
 
     def make_context(self, info_name: Any, args: Any, parent: Any = None, **extra: Any) -> Any:
-        # Completion says nothing of what is not installed.
+        # Completion omits commands whose package is not installed.
         if extra.get("resilient_parsing") and missing_extra(self.module):
             return super().make_context(info_name, args, parent, **extra)
         return load(self.module, str(self.name), parent).make_context(info_name, args, parent, **extra)
 
 
 def load(module: str, name: str, ctx: Any = None) -> Any:
-    """The command of a package, imported now; one line and exit code 1 where that package is not installed."""
+    """Import a command of a package; print one line and exit with code 1 if the package is not installed."""
     if missing := missing_extra(module):
         path = f"{ctx.command_path} {name}" if ctx else f"graspd {name}"
         typer.echo(f"graspd: `{path}` is not part of this install; run pip install 'graspd[{missing}]'", err=True)
         raise typer.Exit(1)
     with imports():
         group: Any = typer.main.get_command(import_module(module).app)
-    # A Typer with a single command is that command itself, not a group.
+    # typer turns an app with one command into that command, not into a group.
     command: Any = group.get_command(ctx, name) if isinstance(group, TyperGroup) else group
     if isinstance(command, TyperGroup):
         for parent, child, package, text in JOINED:
             if parent == name:
                 command.add_command(Deferred(child, package, text))
-    # A Typer of one command offers completion of its own, which would install that of `graspd`.
+    # typer adds completion options to a single command; they would install completion for `graspd` itself.
     command.params = [one for one in command.params if not str(one.name).endswith("_completion")]
     escape_help(command)
     return command
 
 
 def usage_line(error: Any) -> str:
-    """What is wrong with the words of a command line, and where it says which are right."""
+    """Return one line with the usage error and a pointer to the valid input."""
     said = re.sub(r"\.?\s*Did you mean (.*)\?", r"; did you mean \1?", error.format_message()).rstrip(".")
     if hasattr(error, "possibilities"):
         said = f"there is no option {error.option_name}{did_you_mean(error.option_name, error.possibilities or ())}"
@@ -163,9 +163,9 @@ def usage_line(error: Any) -> str:
 
 
 def escape_help(command: Any) -> None:
-    """Keep the brackets of a command and of all below it: typer reads help as Rich markup, and `[mm]` as a style.
+    """Escape brackets in the help of a command and its subcommands: typer reads `[mm]` as Rich markup.
 
-    `rich.markup.escape` does the same, and takes longer to import than most commands to start.
+    `rich.markup.escape` does the same, but its import takes longer than most commands need to start.
     """
     for one in (command, *command.params):
         for name in ("help", "short_help", "epilog"):
@@ -176,13 +176,13 @@ def escape_help(command: Any) -> None:
 
 
 def missing_extra(module: str) -> str | None:
-    """The extra to install before a module can be used; None if it can be used now."""
+    """Return the extra that a module needs installed; None if the module can be imported now."""
     needed, extra = next((PACKAGES[name] for name in PACKAGES if f"{module}.".startswith(f"{name}.")), ("", ""))
     return extra if needed and find_spec(needed) is None else None
 
 
 def build() -> typer.Typer:
-    """The root command with a light entry for every command."""
+    """Build the root command with a lightweight entry for every command."""
     app = typer.Typer(
         cls=LazyGroup,
         help="A grasp-dataset factory: stable, contact-rich multi-finger grasps by differentiable simulation.",
@@ -205,14 +205,14 @@ def build() -> typer.Typer:
 
 
 def _entry() -> None:
-    """Stands for a command in the overview; `LazyGroup` calls the real one."""
+    """Represent a command in the overview; `LazyGroup` loads the real one."""
 
 
 def main() -> None:
-    """Entry point of the `graspd` command."""
+    """Run the `graspd` command (entry point)."""
     own_process()
-    # No command draws with MuJoCo; at import it would look for GLFW with a process of its own.
+    # No command draws with MuJoCo; its import would otherwise start a process to search for GLFW.
     os.environ.setdefault("MUJOCO_GL", "disable")
-    # Pydantic would look through all installed packages for plugins of its own. Whoever wants them sets it to nothing.
+    # Otherwise pydantic searches all installed packages for plugins. To enable plugins, set the variable to "".
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     at_the_door(build())

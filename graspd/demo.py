@@ -1,4 +1,4 @@
-"""`graspd demo`: the whole service on this machine, one real job through it over HTTP, and a page of what came out."""
+"""`graspd demo`: run the whole service here, send it one job over HTTP, and write a page of results."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ app = typer.Typer()
 
 @dataclass(frozen=True)
 class Results:
-    """Paths of what the demo leaves behind."""
+    """Paths of the files that the demo writes."""
 
     shards: list[Path]
     pictures: list[Path]
@@ -47,7 +47,7 @@ class Results:
 
 
 _SHOWN_GRASPS: Final = 12
-#: Rays per pixel of a small picture; twice as many cost twice the time and are hard to tell apart.
+#: Rays per pixel of a small picture; twice as many take twice the time and look almost the same.
 _SAMPLES: Final = 8
 
 
@@ -97,10 +97,10 @@ def demo(
 def run(
     client: Client, request: JobRequest, out: Path, console: Console
 ) -> tuple[JobDetail, list[GraspView], list[Path]]:
-    """Submit, watch, and fetch the files.
+    """Submit the job, watch it, and fetch its files.
 
     Returns:
-        the job, its ten best grasps by epsilon, and the shards' paths.
+        the job, its ten best grasps by epsilon, and the paths of its shards.
 
     Raises:
         TaskError: the job did not succeed.
@@ -119,7 +119,7 @@ def run(
 
 
 def print_results(console: Console, best: list[GraspView], job: JobDetail, paths: Results) -> None:
-    """The quality table and where everything is."""
+    """Print the quality table and the paths of all files."""
     table = Table(title="Best grasps by ε", title_justify="left", header_style="bold", box=None)
     for name in ("rank", "ε", "contact (cm²)", "intersection (cm³)", "penetration (mm)", "shard:row"):
         table.add_column(name, justify="right")
@@ -140,7 +140,7 @@ def print_results(console: Console, best: list[GraspView], job: JobDetail, paths
 
 
 def write_pages(out: Path, job: JobDetail, shards: list[Path]) -> Results:
-    """The contact sheet of the best grasps, the views of the first batch, and an index.html that shows both."""
+    """Write the contact sheet of the best grasps, views of the first batch, and an index.html with both."""
     from graspd.worker.rendering.sheets import views_page
 
     pictures = []
@@ -158,8 +158,8 @@ def write_pages(out: Path, job: JobDetail, shards: list[Path]) -> Results:
 
 
 def draw_grasps(job: JobDetail, base: Shard) -> bytes:
-    """PNG of the best grasps of a shard, ranked by ε."""
-    # Warp takes seconds to import; a mistake in an option must not wait for it.
+    """Return a PNG of the best grasps of a shard, ranked by ε."""
+    # Importing Warp takes seconds; check the options first.
     from graspd.worker.engines import backend
     from graspd.worker.hands.load import load_hand
     from graspd.worker.objects.prepare import load_object
@@ -176,14 +176,14 @@ def draw_grasps(job: JobDetail, base: Shard) -> bytes:
     rows = best(base.arrays, _SHOWN_GRASPS, validity.valid(base.arrays))
     poses, joints = (np.asarray(base[f"grasp/{name}"], float)[rows] for name in ("hand_pose", "joint_positions"))
     pictures = grasp_pictures(hand, obj, poses, joints, samples=_SAMPLES)[:, 0]
-    # The sheet's typeface has neither Greek letters nor a multiplication sign.
+    # The font of the sheet has neither Greek letters nor a multiplication sign.
     title = f"{job.hand} on {job.object}"
     subtitle = f"the best {len(rows)} of {job.grasps} valid grasps by epsilon, of {job.candidates} candidates"
     return contact_sheet(pictures, figures(base.arrays, rows), title=title, subtitle=subtitle)
 
 
 def html_page(job: JobDetail, pictures: list[Path], shards: list[Path], out: Path) -> str:
-    """A page that needs no server and no script."""
+    """Return an HTML page that works without server or script."""
     title = f"{escape(job.hand)} × {escape(job.object)}"
     images = "".join(
         f'<figure><a href="{p.name}"><img src="{p.name}" alt="{_ALT[p.stem]}"></a></figure>' for p in pictures

@@ -1,4 +1,4 @@
-"""Grasps shown: as a table of pandas, as HTML of a notebook, and in the viewer of `graspd view`."""
+"""Display of grasps: as a pandas table, as HTML in a notebook, and in the viewer of `graspd view`."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ if TYPE_CHECKING:
     from graspd.grasps import Grasps
     from graspd.worker.viewing import Viewer
 
-#: Grasps of a notebook's picture, edge of each [px], and the time after which tracing stops [s].
+#: Number of grasps in a notebook's picture, edge of each [px], and time limit of path tracing [s].
 PICTURED: Final = 4
 EDGE: Final = 220
 PICTURE_S: Final = 10.0
-#: Largest picture that a notebook is given [bytes].
+#: Largest picture that a notebook receives [bytes].
 PICTURE_BYTES: Final = 300_000
-#: Columns of the table where no picture can be drawn.
+#: Columns of the table shown if no picture can be drawn.
 _FIGURES: Final = ("epsilon", "contact_area_cm2", "penetration_depth_mm")
-#: Postures besides that at contact: what stands before their names, and their columns.
+#: Postures other than the grasp: prefix of their names, and their columns.
 _MORE: Final = {
     "pregrasp.": ("pregrasp/hand_pose", "pregrasp/joint_positions"),
     "squeeze.": ("squeeze/hand_pose", "squeeze/joint_positions"),
@@ -33,7 +33,7 @@ _MORE: Final = {
 
 
 def frame_of(grasps: Grasps) -> Any:
-    """A `pandas.DataFrame`; see `Grasps.to_pandas`."""
+    """Return a `pandas.DataFrame`; see `Grasps.to_pandas`."""
     try:
         import pandas
     except ModuleNotFoundError:
@@ -45,7 +45,7 @@ def frame_of(grasps: Grasps) -> Any:
         if pose in columns:
             found.update({before + part: columns[pose][:, k] for k, part in enumerate(POSE_PARTS)})
         for k, joint in enumerate(grasps.joint_names if joints in columns else ()):
-            # A joint of a gantry may be called x.
+            # A joint of a gantry may be named x, like a column of the pose.
             found[before + (joint if before + joint not in found else f"joint.{joint}")] = columns[joints][:, k]
 
     add("", "grasp/hand_pose", "grasp/joint_positions")
@@ -60,11 +60,11 @@ def frame_of(grasps: Grasps) -> Any:
 
 
 def html_of(grasps: Grasps) -> str:
-    """The line of `repr` with a picture of the best grasps; where none can be drawn, with a table of their figures."""
+    """Return `repr` and a picture of the best grasps as HTML; without a picture, a table of their metrics."""
     head = f"<p>{escape(repr(grasps))}</p>"
     try:
         png = _picture(grasps)
-    # A notebook must show its grasps whatever a missing file, engine or driver says.
+    # A notebook must display its grasps even if a file, engine or driver is missing.
     except Exception:
         return head + _table(grasps)
     if len(png) > PICTURE_BYTES:
@@ -74,7 +74,7 @@ def html_of(grasps: Grasps) -> str:
 
 
 def viewer_of(grasps: Grasps, *, host: str, port: int) -> Viewer:
-    """A viewer that serves; see `Grasps.view`."""
+    """Start a viewer of the grasps; see `Grasps.view`."""
     try:
         from graspd.worker.files.provenance import hand_of_shard, neighbours_of_shard, object_of_shard
         from graspd.worker.viewing import Viewer, ViewerContent, missing
@@ -119,6 +119,6 @@ def _table(grasps: Grasps) -> str:
 
 
 def _best(grasps: Grasps) -> np.ndarray:
-    """Rows of the best by epsilon, the valid ones first."""
+    """Return rows of the best grasps by epsilon, valid ones first."""
     epsilon = np.nan_to_num(np.asarray(grasps.metric("epsilon"), float), nan=-1.0)
     return np.lexsort((-epsilon, ~grasps.is_valid))[:PICTURED]

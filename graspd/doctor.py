@@ -1,4 +1,4 @@
-"""`graspd doctor`: checks of everything an installation stands on, in one command, with the fix for each fault."""
+"""`graspd doctor`: check everything an installation depends on, and print a fix for each fault."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def doctor(
 
 
 def _end(code: int) -> None:
-    """End, also where a check still hangs that nobody waits for."""
+    """Exit with a code, even while the thread of a timed-out check still hangs."""
     sys.stdout.flush()
     sys.stderr.flush()
     if any(thread.name.startswith(THREADS) for thread in threading.enumerate()):
@@ -71,7 +71,7 @@ def _end(code: int) -> None:
 
 
 def all_checks(settings: Settings, *, full: bool = False) -> list[Check]:
-    """The checks of all packages; those of a package that is not installed say so."""
+    """Return the checks of all packages; those of a missing package report that it is not installed."""
     return [*checks_of(settings, full=full), *_of_api(settings), *_of_worker(settings)]
 
 
@@ -112,12 +112,12 @@ def _show(finding: Finding) -> None:
         typer.echo(f"{'':26} fix: {finding.fix}")
 
 
-#: A whole comparison reads every record of the store.
+#: Time limit of a full comparison, which reads every record of the store [s].
 _FULL_S: Final = 24 * 3600.0
 
 
 def checks_of(settings: Settings, *, full: bool = False) -> list[Check]:
-    """What can be looked at without engine and API. `full`: compare all of the index with the store."""
+    """Return the checks that need neither engine nor API. `full`: compare the whole index with the store."""
     return [
         Check("disk", partial(machine.disk, settings)),
         Check("data-folder", partial(machine.data_folder, settings)),

@@ -1,4 +1,4 @@
-"""Grasps of one hand as arrays: with their postures, metrics and verdicts, chosen and sorted."""
+"""Grasps of one hand as arrays, with postures, metrics and verdicts; selection and sorting."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from graspd.worker.viewing import Viewer
 
 Array = NDArray[Any]
-#: Rows to keep: a mask (N,), row numbers, or a function that makes either from the grasps.
+#: Rows to select: a mask (N,), row numbers, or a function that makes either from the grasps.
 Rows = NDArray[Any] | Sequence[int] | Sequence[bool]
 
 _METRICS: Final = {metric.name: metric for metric in GRASP_METRICS}
@@ -59,7 +59,7 @@ class Grasp:
     valid: bool
     """Whether it is valid, see `Grasps.is_valid`."""
     metrics: dict[str, float]
-    """Value of each metric, swept ones at a contact threshold of 5 mm."""
+    """Value of each metric; metrics per contact threshold at 5 mm."""
 
     def __repr__(self) -> str:
         x, y, z = self.hand_pose[:3]
@@ -78,7 +78,7 @@ class Grasps:
         self, columns: Mapping[str, Array], attributes: Mapping[str, Attribute], path: Path | None = None
     ) -> None:
         self._columns = dict(columns)
-        #: The file, in whose folder meshes are looked for.
+        #: Path of the file; meshes are searched for in its folder.
         self._path = path
         self._attributes = dict(attributes)
         if "object" not in self._columns:
@@ -115,7 +115,7 @@ class Grasps:
         kept = {path: data[chosen] if self._per_grasp(path) else data for path, data in self._columns.items()}
         return Grasps(kept, self._attributes, self._path)
 
-    # What they are of.
+    # Identity.
 
     @property
     def hand(self) -> str:
@@ -140,13 +140,13 @@ class Grasps:
 
     @property
     def reason(self) -> str | None:
-        """Why there are fewer than asked for, in a sentence; None if there are not."""
+        """Reason why there are fewer grasps than requested, as a sentence; None otherwise."""
         said = self._attributes.get("reason")
         return None if said is None else str(said)
 
     @property
     def outcomes(self) -> dict[str, int]:
-        """Counts of the candidates that were dropped, by outcome (docs/explanation/quality.md)."""
+        """Numbers of dropped candidates by outcome (docs/explanation/quality.md)."""
         return {name: int(count) for name, count in json.loads(str(self._attributes.get("outcomes", "{}"))).items()}
 
     # Postures.
@@ -173,24 +173,24 @@ class Grasps:
 
     @property
     def approach(self) -> Floats:
-        """(N, W, 7) root poses from the standoff to the pregrasp; only of grasps planned in a scene."""
+        """(N, W, 7) root poses from the standoff to the pregrasp; only for grasps planned in a scene."""
         return self.column("grasp/approach")
 
     @property
     def lift(self) -> Postures:
-        """Squeeze postures raised by 10 cm; only of grasps planned in a scene."""
+        """Squeeze postures raised by 10 cm; only for grasps planned in a scene."""
         return Postures(self.column("grasp/lift"), self.column("squeeze/joint_positions"))
 
-    # Where they are used.
+    # Poses in the scene.
 
     @property
     def object_pose(self) -> Floats:
-        """(N, 7) object in each grasp's scene, z up; only of grasps planned in a scene."""
+        """(N, 7) object in each grasp's scene, z up; only for grasps planned in a scene."""
         return self.column("scene/object_pose")[self.column(_INDEX)]
 
     @property
     def hand_pose_in_scene(self) -> Floats:
-        """(N, 7) `hand_pose` in each grasp's scene, z up; only of grasps planned in a scene."""
+        """(N, 7) `hand_pose` in each grasp's scene, z up; only for grasps planned in a scene."""
         return compose(self.object_pose, self.hand_pose)
 
     # Quality.
@@ -207,7 +207,7 @@ class Grasps:
 
     @property
     def metrics(self) -> list[str]:
-        """Names that `metric` and `top` take."""
+        """Names accepted by `metric` and `top`."""
         return [metric.name for metric in GRASP_METRICS if metric.path in self._columns]
 
     def metric(self, name: str, *, threshold_m: float = INDEX_THRESHOLD_M) -> Array:
@@ -215,8 +215,7 @@ class Grasps:
 
         Args:
             name: one of `metrics`, such as epsilon or contact_area_cm2.
-            threshold_m: contact threshold [m]; the nearest one of the file is taken.
-
+            threshold_m: contact threshold [m]; the nearest threshold in the file is used.
         Raises:
             InputError: the file has no such metric.
         """
@@ -241,21 +240,21 @@ class Grasps:
             raise InputError(f"these grasps have no column {path!r}; they have {', '.join(sorted(self._columns))}")
         return self._columns[path]
 
-    # Choosing.
+    # Selection.
 
     def valid(self) -> Grasps:
         """Select the valid grasps."""
         return self[self.is_valid]
 
     def where(self, rows: Rows | Callable[[Grasps], Rows]) -> Grasps:
-        """Select by a mask (N,) or row numbers, or a function that makes them.
+        """Select by a mask (N,), by row numbers, or by a function that makes either.
 
         Example: `grasps.where(lambda g: g.metric("epsilon") > 0.3)`.
         """
         return self[np.asarray(rows(self) if callable(rows) else rows)]
 
     def top(self, metric: str, count: int) -> Grasps:
-        """Select the best by a metric, best first; grasps without a value are left out.
+        """Select the best grasps by a metric, best first; grasps without a value are omitted.
 
         Raises:
             InputError: the file has no such metric, or `count` is negative.
@@ -266,15 +265,15 @@ class Grasps:
         order = np.argsort(values if self._known(metric).less_is_better else -values, kind="stable")
         return self[order[np.isfinite(values[order])][:count]]
 
-    # Shown.
+    # Display.
 
     def to_pandas(self) -> Any:
-        """Return a `pandas.DataFrame` with a row for each grasp.
+        """Return a `pandas.DataFrame` with one row per grasp.
 
         Columns: `object`, `valid`; `x y z` [m] and the unit quaternion `qw qx qy qz` of `hand_pose` in the object
-        frame; each joint by its name [rad or m]; each metric by its name, swept ones at a contact threshold of 5 mm;
-        other numbers of a grasp by the last part of their column's name. `pregrasp.`, `squeeze.` and `lift.` stand
-        before the same names of these postures. A joint with the name of another column has `joint.` before it.
+        frame; each joint by its name [rad or m]; each metric by its name, per-threshold metrics at 5 mm; other numbers
+        by the last part of their column's name. The same names with the prefix `pregrasp.`, `squeeze.` or `lift.`
+        describe these postures. A joint whose name is already taken gets the prefix `joint.`.
 
         Raises:
             InputError: pandas is not installed.
@@ -287,11 +286,11 @@ class Grasps:
         """Serve the grasps in 3D to a browser until `close()` of the result; `url` is its address.
 
         Args:
-            host: address to serve on; whoever reaches it sees the grasps.
-            port: the first port tried; 0: any free one.
+            host: address to serve on; anyone who can reach it can view the grasps.
+            port: the first port to try; 0: any free port.
 
         Raises:
-            InputError: viser is not installed (`graspd[view]`), there are no grasps, they are of several objects, or
+            InputError: viser is not installed (`graspd[view]`), there are no grasps, they are on several objects, or
                 the address cannot be used.
             NotFoundError: the file of the hand or the object is not found.
         """
@@ -302,14 +301,14 @@ class Grasps:
     # Files.
 
     def shard(self) -> Shard:
-        """Return the grasps as a base shard, as `save` writes it.
+        """Return the grasps as a base shard, with the content that `save` writes.
 
         Raises:
-            InputError: they are of several objects.
+            InputError: they are on several objects.
         """
         if len(self.objects) > 1:
             raise InputError(f"a file holds grasps on one object; these are on {', '.join(self.objects)}")
-        # Attributes of several files are those of the first: they are not true of another object.
+        # For several files, the attributes are those of the first file: they do not describe another object.
         if self.objects and self.objects != [str(self._attributes.get("object", ""))]:
             raise InputError(
                 f"these were chosen among grasps on several objects; open the file of {self.objects[0]} alone"
@@ -322,7 +321,7 @@ class Grasps:
         """Write one file that every command and `graspd.open` reads.
 
         Raises:
-            InputError: they are of several objects, or the file cannot be written.
+            InputError: they are on several objects, or the file cannot be written.
         """
         shard = self.shard()
         try:
@@ -357,8 +356,8 @@ def open(
     """Read the grasps of files, of a folder with its subfolders, or of a job or dataset in a store.
 
     Args:
-        source: a path, several, or the URL of a store (`file://`, `s3://`, `gs://`, `az://`).
-        hand: name of the hand, where there are several; one `Grasps` holds one hand.
+        source: one or several paths, or the URL of a store (`file://`, `s3://`, `gs://`, `az://`).
+        hand: name of the hand, needed if there are several; one `Grasps` holds one hand.
         job: id of a job in the store.
         dataset: name of a dataset in the store; its newest snapshot is read.
 
@@ -372,10 +371,10 @@ def open(
 
 
 def joined(shards: Sequence[Shard]) -> Grasps:
-    """The grasps of base shards of one hand as one; columns that some lack are left out.
+    """Concatenate the grasps of base shards of one hand; columns missing from some shards are omitted.
 
     Raises:
-        InputError: there is none, or joints or contact thresholds differ.
+        InputError: there are no shards, or their joints or contact thresholds differ.
     """
     if not shards:
         raise InputError("there is no file of grasps here")

@@ -1,4 +1,4 @@
-"""Datasets as samples for training: `Shards`, `Grasps`, `Pictures`, `Clouds` (docs/how-to/exchange.md)."""
+"""Datasets as training samples: `Shards`, `Grasps`, `Pictures`, `Clouds` (docs/how-to/exchange.md)."""
 
 from typing import Any
 
@@ -31,11 +31,11 @@ __all__ = [
 def hand_surface(shard: Any, rows: Any) -> Any:
     """Return points (K, H, 3) on the hand's surface in grasps of a base shard, in the object's frame [m].
 
-    Used as `hand_surface` of `Pictures.clouds` for graspness.
+    Pass it as `hand_surface` to `Pictures.clouds` to compute graspness.
 
     Raises:
         NotFoundError: the shard's hand is not found.
     """
-    from graspd.worker.files.clouds import hand_surface as found  # loads the hands' reader
+    from graspd.worker.files.clouds import hand_surface as found  # imports the reader of hands
 
     return found(shard, rows)

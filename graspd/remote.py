@@ -1,4 +1,4 @@
-"""Jobs of a service: submitted, awaited, their grasps fetched."""
+"""Client of a graspd service: submit jobs, wait for them, and fetch their grasps."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ class Client:
     """A graspd service. Usable as a context manager.
 
     Args:
-        url: where its API answers; None: GRASPD_API_URL, or the service that runs on this machine's data folder.
-        key: Bearer key, if the service asks for one; None: GRASPD_API_KEY.
+        url: address of its API; None: GRASPD_API_URL, or the service that runs on this machine's data folder.
+        key: Bearer key, if the service requires one; None: GRASPD_API_KEY.
     """
 
     def __init__(self, url: str | None = None, *, key: str | None = None) -> None:
@@ -50,11 +50,11 @@ class Client:
 
     @with_keywords(JobOptions, "job")
     def submit(self, hand: str, object: str, **options: Unpack[JobKeywords]) -> Job:
-        """Submit a job; the same request is the same job.
+        """Submit a job; an identical request returns the same job.
 
         Args:
-            hand: name of a hand that the service knows.
-            object: name of an object that it knows.
+            hand: name of a hand in the service.
+            object: name of an object in the service.
             options: fields of POST /v1/jobs; docs/reference/options.md lists them, with units, bounds and defaults.
 
         Raises:
@@ -69,15 +69,15 @@ class Client:
         """Return a job by its id.
 
         Raises:
-            NotFoundError: there is none.
+            NotFoundError: there is no such job.
         """
         return Job(self._http, self._http.job(job_id))
 
     def shard(self, shard_id: str) -> Grasps:
-        """Return the grasps of a base shard by its id.
+        """Return the grasps of a base shard by the shard's id.
 
         Raises:
-            NotFoundError: there is none.
+            NotFoundError: there is no such shard.
         """
         file = b"".join(self._http.fetch(path_of("shards", shard_id, "file")))
         return joined([read_shard(file, kind="base", name=shard_id[:12])])
@@ -109,14 +109,14 @@ class Job:
 
     @property
     def state(self) -> str:
-        """queued, running, succeeded, failed or cancelled, as of the last request."""
+        """State at the last request: queued, running, succeeded, failed or cancelled."""
         return str(self._said.state)
 
     def wait(self, progress: Callable[[float], None] | None = None) -> Self:
         """Wait until the job has ended.
 
         Args:
-            progress: called with the share that is done, 0 to 1.
+            progress: called with the finished share, 0 to 1.
 
         Raises:
             TaskError: it failed or was cancelled; finished grasps can still be fetched.
@@ -143,6 +143,6 @@ class Job:
         return joined([read_shard(b"".join(self._http.fetch(one.file)), name=one.id[:12]) for one in ordered])
 
     def cancel(self) -> Self:
-        """Cancel the job; finished shards stay."""
+        """Cancel the job; finished shards remain."""
         self._said = self._http.cancel(self.id)
         return self

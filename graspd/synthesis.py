@@ -1,4 +1,4 @@
-"""Grasps made in this process."""
+"""Grasp synthesis in this process."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ def synthesize(
         hand: a URDF, a ZIP with one, or the name of a built-in hand.
         object: a mesh (STL, OBJ, PLY, GLB, OFF) or the name of a built-in object.
         progress: called with the finished share, 0 to 1.
-        options: docs/reference/options.md lists them, with units, bounds and defaults. `count` grasps are wanted; there
-            are fewer if the budget ends first.
+        options: docs/reference/options.md lists them, with units, bounds and defaults. `count` is the number of
+            grasps wanted; there are fewer if the budget ends first.
 
     Returns:
-        Grasps: at most `count`; poses in the object frame [m], joints [rad or m]. `reason` says why there are fewer.
+        Grasps: at most `count`; poses in the object frame [m], joints [rad or m]. `reason` explains a shortfall.
 
     Raises:
-        InputError: an argument cannot be used (MeshError, HandError: a file), with the fix.
+        InputError: an argument is invalid (MeshError, HandError: a file); the message contains the fix.
         ImportError: the engine is not installed (`graspd[worker]`).
     """
     try:
@@ -55,14 +55,14 @@ def synthesize(
         from graspd.worker.files.synthesis import synthesized_as
     except ModuleNotFoundError as error:
         raise ImportError(f"synthesize needs {error.name}; run pip install 'graspd[worker]'") from error
-    # None: as if it were not given.
+    # None means that the option was not given.
     given = {_NAMES[keyword]: value for keyword, value in options.items() if value is not None}
     asked = accepted(LocalOptions, given, names={name: keyword for keyword, name in _NAMES.items()})
     told = (lambda done, total, _message: progress(done / total)) if progress else None
     try:
         made = synthesized_as(str(hand), str(object), asked, progress=told)
     except InputError as error:
-        # The engine names fixes as the command line spells them.
+        # The engine's messages spell options as on the command line.
         error.args = (_FLAG.sub(lambda flag: _KEYWORDS.get(flag[0], flag[0]), str(error)),)
         raise
     return Grasps(made.arrays, made.attributes)

@@ -1,1 +1,1 @@
-"""Who asks, and how much of the service is theirs: keys, quotas."""
+"""Access to the service: authentication, keys and quotas."""

@@ -1,14 +1,13 @@
-"""Authentication of a request: a key in a header, the cookie of a browser session, or a proxy that signed a person in;
-and what the caller may do.
+"""Authentication of a request by key, session cookie or proxy; permissions of the caller.
 
-The service is open while no key was ever made and it binds to this machine only. Once there is a key it stays closed,
-also when the last one is revoked or expired.
+The service is open while no key was ever made and it binds to this machine only. After the first key it stays closed,
+even if the last key is revoked or expired.
 
-Who asks, where a proxy in front has signed people in (OIDC): believed only from its address and with its secret.
+A proxy in front may sign people in (OIDC); it is trusted only from its address and with its secret.
 
-The proxy sends `Authorization: Basic user:secret`, which oauth2-proxy makes of `--basic-auth-password`, and the groups
-of the person in X-Forwarded-Groups. Anybody may write such headers; so both the address of the connection and the
-secret must be the proxy's, and headers that came twice are refused.
+It sends `Authorization: Basic user:secret`, which oauth2-proxy builds from `--basic-auth-password`, and the person's
+groups in X-Forwarded-Groups. Any client can send such headers, so both the connection's address and the secret must
+be the proxy's, and duplicate headers are refused.
 """
 
 from __future__ import annotations
@@ -33,34 +32,34 @@ from graspd.service.model.projects import EVERYTHING, PATTERN, ProjectScope
 from graspd.service.settings import Settings
 
 SESSION_COOKIE: Final = "graspd_session"
-#: Headers that a proxy adds: while the service is open they mean that somebody else's requests arrive here.
+#: Headers added by proxies: in an open service they reveal that requests of others arrive here.
 _OF_PROXIES: Final = ("x-forwarded-for", "x-forwarded-host", "forwarded", "via", "x-real-ip")
 
-#: Key of the request that is being answered; None while the service is open.
+#: Key of the present request; None while the service is open.
 caller: ContextVar[Key | None] = ContextVar("caller", default=None)
 
 
 def caller_id() -> str:
-    """Id of the caller's key; empty while the service is open."""
+    """Return the id of the caller's key; empty while the service is open."""
     key = caller.get()
     return key.id if key else ""
 
 
 def project_scope() -> ProjectScope:
-    """What the key of the present request may see: its project; with `admin`, and while the service is open, all."""
+    """Return what the present caller may see: its key's project; all with `admin` or in an open service."""
     key = caller.get()
     return EVERYTHING if key is None else ProjectScope(key.project, everything=key.scope.includes(Scope.ADMIN))
 
 
 class ForeignResource(ApiError):
-    """A thing that another key submitted."""
+    """Refusal to change a resource that another key submitted."""
 
 
 def authorize(request: HTTPConnection, scope: Scope) -> Key | None:
-    """The key of a request; None while the service is open.
+    """Return the key of a request; None while the service is open.
 
     Raises:
-        ApiError: 401 without a live key, 403 with one of a smaller scope.
+        ApiError: 401 without a live key, 403 if the key's scope is insufficient.
     """
     keys: KeyFile = request.app.state.keys
     if keys.is_open:
@@ -79,7 +78,7 @@ def authorize(request: HTTPConnection, scope: Scope) -> Key | None:
 
 
 def may_still(request: HTTPConnection, scope: Scope) -> bool:
-    """Whether a long answer may go on: its key may have been revoked, or have expired, since the request came."""
+    """Check whether a long answer may continue: its key may have been revoked or expired meanwhile."""
     keys: KeyFile = request.app.state.keys
     if keys.is_open:
         return True
@@ -88,13 +87,12 @@ def may_still(request: HTTPConnection, scope: Scope) -> bool:
 
 
 def may_change(owner: str, project: str = "") -> bool:
-    """Whether the key of the present request may cancel, retry or delete a thing: its own or its project's, or with
-    `admin` any.
+    """Check whether the present key may cancel, retry or delete a resource.
 
     Args:
-        owner: id of the key that the thing was submitted with; empty where it was submitted without one, or before
-            ids were recorded: then it takes `admin`.
-        project: what the thing belongs to. Keys of a project act for each other; those of none, for themselves.
+        owner: id of the key that submitted the resource; empty if it was submitted without a key, or before ids
+            were recorded: then only `admin` may change it.
+        project: project of the resource. Its keys may change each other's resources; without one, only the owner may.
     """
     key = caller.get()
     if key is None or key.scope.includes(Scope.ADMIN):
@@ -104,14 +102,14 @@ def may_change(owner: str, project: str = "") -> bool:
 
 
 def must_own(owner: str, what: str, project: str = "") -> None:
-    """Refuse to change somebody else's thing. The route has asked for `submit` before.
+    """Refuse to change a resource of another owner. The route has already required `submit`.
 
     Args:
         owner, project: as in `may_change`.
-        what: names the thing in the refusal, such as "job 1a2b".
+        what: name of the resource in the message, such as "job 1a2b".
 
     Raises:
-        NotYours: it is not the caller's, and the key is no `admin` key.
+        NotYours: the caller does not own it, and the key has no `admin` scope.
     """
     if not may_change(owner, project):
         key = caller.get()
@@ -124,7 +122,7 @@ def must_own(owner: str, what: str, project: str = "") -> None:
 
 
 def is_allowed(request: HTTPConnection, scope: Scope) -> bool:
-    """Whether `authorize` would let the request pass."""
+    """Check whether `authorize` would accept the request."""
     try:
         authorize(request, scope)
     except ApiError:
@@ -133,10 +131,10 @@ def is_allowed(request: HTTPConnection, scope: Scope) -> bool:
 
 
 def refuse_strangers(request: HTTPConnection) -> None:
-    """While the service is open, only this machine may use it.
+    """Restrict an open service to this machine.
 
     Raises:
-        ApiError: 403, the request comes from elsewhere, or through a proxy that may serve anybody.
+        ApiError: 403, the request comes from another machine, or through a proxy that may serve anyone.
     """
     passed_on = next((name for name in _OF_PROXIES if name in request.headers), None)
     address = request.client.host if request.client else ""
@@ -151,7 +149,7 @@ def refuse_strangers(request: HTTPConnection) -> None:
 
 
 def identify(scope: AsgiScope, keys: KeyFile, proxy: Proxy) -> Key | None:
-    """The live key that a header or a session cookie names, or the person that the proxy vouches for."""
+    """Return the live key of a header or session cookie, or the person authenticated by the proxy."""
     scheme, _, token = Headers(scope=scope).get("authorization", "").partition(" ")
     if scheme.lower() == "bearer" and token:
         return keys.find(token.strip())
@@ -165,12 +163,12 @@ def _is_elsewhere(address: str) -> bool:
     try:
         return not ipaddress.ip_address(address).is_loopback
     except ValueError:
-        # A unix socket has no address, a test client has a made-up one.
+        # A unix socket has no address; a test client has an invented one.
         return False
 
 
 GROUPS: Final = "x-forwarded-groups"
-#: In the place of a group: whoever is signed in.
+#: Placeholder for a group: any person who is signed in.
 ANYBODY: Final = "*"
 _LEAST_SECRET: Final = 16
 _LONGEST_USER: Final = 200
@@ -178,11 +176,10 @@ _USER: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._@+-]*")
 
 
 class Proxy:
-    """The proxy that the settings name, if any.
+    """Authenticating proxy from the settings, if any.
 
     Raises:
-        InputError: only one of addresses and secret is set, the secret is short, or an address or a group cannot be
-            read.
+        InputError: only one of addresses and secret is set, the secret is short, or an address or a group is invalid.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -197,12 +194,14 @@ class Proxy:
 
     @property
     def is_on(self) -> bool:
-        """Whether people come through a proxy: then the service is closed to everybody without a key."""
+        """Whether a proxy authenticates people: then the service is closed to requests without a key."""
         return bool(self._secret)
 
     def find(self, scope: AsgiScope) -> Key | None:
-        """The person that the proxy vouches for, as a key with the rights of the first of their groups in the
-        settings; None where nobody is vouched for, or no group of theirs has any rights."""
+        """Return the authenticated person as a key with the rights of their first group in the settings.
+
+        None if nobody is authenticated, or if none of their groups has rights.
+        """
         if not self.is_on or not self._is_from_proxy(scope):
             return None
         headers = Headers(scope=scope)
@@ -225,7 +224,7 @@ class Proxy:
         return any((mapped or address) in network for network in self._networks)
 
     def _user(self, authorization: str) -> str:
-        """The user of Basic credentials (RFC 7617) with the proxy's secret; empty for any others."""
+        """Return the user of Basic credentials (RFC 7617) with the proxy's secret; empty for all others."""
         scheme, _, credentials = authorization.partition(" ")
         if scheme.lower() != "basic":
             return ""
@@ -241,7 +240,7 @@ class Proxy:
 
 def _key_of(user: str, project: str, scope: Scope) -> Key:
     digest = hashlib.sha256(f"proxy {user}".encode()).hexdigest()
-    # No key of the file holds an @, so nobody's counters are another's.
+    # Names of stored keys contain no @, so no counters are shared.
     name = user[:48] if "@" in user else f"{user[:48]}@proxy"
     return Key(id=digest[:16], name=name, scope=scope, project=project, sha256=digest, created="")
 

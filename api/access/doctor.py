@@ -1,4 +1,4 @@
-"""Keys, as `graspd doctor` sees them: whether the service is closed where it must be, and opens tomorrow."""
+"""Checks of API keys for `graspd doctor`: whether an exposed service is closed, and when keys expire."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _ADD: Final = "graspd keys add admin --scope admin"
 
 
 def keys(settings: Settings) -> Finding:
-    """The file of the API keys."""
+    """Check the file of API keys."""
     name, path = "keys", settings.resolved_keys_file
     try:
         found = KeyFile(path).list()

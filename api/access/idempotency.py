@@ -1,7 +1,7 @@
-"""Idempotency-Key (IETF draft): the same key with another body is a mistake of the caller's.
+"""Idempotency-Key (IETF draft): the same key with a different body is an input error.
 
-The same request is the same job without any key, because its id follows from its content; so no answer needs to be
-kept, only which content a key stood for. That lies in Redis for a day: losing it loses a check, never a job.
+Identical requests give the same job even without a key, because its id depends on its content. So no answer is stored,
+only the content of each key, in Redis for a day: its loss loses a check, never a job.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ _FREE: Final = "if redis.call('GET', KEYS[1]) == ARGV[1] then redis.call('DEL', 
 
 
 class Idempotency:
-    """Which request a key stood for; in Redis, so that all API processes know."""
+    """Requests bound to idempotency keys; stored in Redis, shared by all API processes."""
 
     def __init__(self, connection: Any) -> None:
         self._connection = connection
 
     @contextmanager
     def claim(self, owner: str, key: str, request: JobRequest) -> Iterator[None]:
-        """Bind a key to a request that is recorded within; one that fails leaves the key free.
+        """Bind a key to a request recorded in this context; a failure releases the key.
 
         Args:
-            owner: name of the API key that the request showed: others may use the same words.
+            owner: name of the request's API key: idempotency keys of others are independent.
 
         Raises:
             InputError: the key is bound to another request.
@@ -48,12 +48,12 @@ class Idempotency:
                     self._connection.eval(_FREE, 1, name, content)
             raise
         if not is_ours:
-            # The request that had bound it may have failed meanwhile.
+            # The request that bound the key may have failed and released it meanwhile.
             with suppress(RedisError):
                 self._connection.set(name, content, ex=KEPT_S, nx=True)
 
     def _bind(self, name: str, content: bytes) -> bool:
-        """Whether the key was free."""
+        """Bind the key to content; return whether it was free."""
         try:
             if self._connection.set(name, content, ex=KEPT_S, nx=True):
                 return True

@@ -1,7 +1,7 @@
-"""Bearer keys with scopes. A key is shown once when it is made; what is kept is its SHA-256.
+"""Bearer keys with scopes. A key is shown once, when it is made; only its SHA-256 is stored.
 
-The keys lie in one JSON file (mode 600) that every API process reads, so a key made, rotated or revoked on the command
-line counts at the next request.
+All API processes read the keys from one JSON file (mode 600). A key made, rotated or revoked on the command line takes
+effect at the next request.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ SESSION_S: Final = 12 * 3600
 
 
 class Scope(StrEnum):
-    """What a key may do; each includes the one before it.
+    """Permission of a key; each scope includes the one before it.
 
-    `submit` acts on what was submitted with the same key, `admin` on everybody's.
+    `submit` covers resources submitted with the same key, `admin` those of all keys.
     """
 
     READ = "read"
@@ -47,7 +47,7 @@ class Scope(StrEnum):
 
 
 class KeyLimits(BaseModel):
-    """What one key may use. None: what the settings say for all keys; 0: no limit."""
+    """Limits of one key. None: as in the settings; 0: no limit."""
 
     requests_per_minute: int | None = Field(None, ge=0)
     concurrency: int | None = Field(None, ge=0, description="requests being answered at once")
@@ -56,7 +56,7 @@ class KeyLimits(BaseModel):
 
 
 class ProjectLimits(BaseModel):
-    """What the keys of one project may use together. None or 0: no limit."""
+    """Shared limits of the keys of one project. None or 0: no limit."""
 
     grasps_in_flight: int | None = Field(None, ge=0, description="grasps of its jobs that have not ended")
     grasps_per_day: int | None = Field(None, ge=0, description="grasps asked for from midnight to midnight UTC")
@@ -66,7 +66,7 @@ class ProjectLimits(BaseModel):
 
 
 class Key(BaseModel):
-    """A key as it is kept. Its id lasts through rotation, and no later key of the same name has it."""
+    """Key as stored. Rotation retains its id; no later key with the same name has this id."""
 
     id: str = ""
     name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._@+-]{0,63}$")
@@ -80,13 +80,13 @@ class Key(BaseModel):
 
     @model_validator(mode="after")
     def _has_an_id(self) -> Self:
-        # Keys made before there were ids: the old and the new secret of one that is being rotated share its name.
+        # Keys older than ids: during a rotation, the old and the new secret share their name and so this id.
         self.id = self.id or _sha256(f"name {self.name}")[:16]
         return self
 
     @property
     def is_live(self) -> bool:
-        """Whether it opens anything now."""
+        """Whether the key is valid now."""
         return self.revoked is None and (self.expires is None or _now() < self.expires)
 
 
@@ -99,10 +99,10 @@ class _Document(BaseModel):
 
 
 class KeyFile:
-    """The file of keys.
+    """File of the keys.
 
     Args:
-        closed: whether there are other ways in than a key: then the service is not open without one either.
+        closed: whether callers can authenticate without a key: then the service is closed even before the first key.
     """
 
     def __init__(self, path: Path, *, closed: bool = False) -> None:
@@ -112,12 +112,12 @@ class KeyFile:
         self._document = _Document(session_secret="")
 
     def list(self) -> list[Key]:
-        """All keys, the revoked ones too."""
+        """Return all keys, including revoked ones."""
         return list(self._read().keys)
 
     @property
     def is_open(self) -> bool:
-        """Whether no key was ever made, so that anybody on this machine may use the service."""
+        """Whether no key was ever made, so that anyone on this machine may use the service."""
         return not self._closed and not self._read().keys
 
     @property
@@ -136,7 +136,7 @@ class KeyFile:
         """Make a key and return it; it cannot be shown again.
 
         Args:
-            project: what it submits belongs to this project; empty: to the one without a name.
+            project: project of what the key submits; empty: the one without a name.
 
         Raises:
             ConflictError: a live key has this name.
@@ -167,7 +167,7 @@ class KeyFile:
         return token
 
     def rotate(self, name: str, *, grace: timedelta = timedelta(0), lifetime: timedelta | None = None) -> str:
-        """A new secret for a key; the old one still opens for `grace`. Scope, project and limits stay.
+        """Return a new secret for a key; the old one stays valid for `grace`. Scope, project, limits stay.
 
         Raises:
             NotFoundError: no live key has this name.
@@ -191,7 +191,7 @@ class KeyFile:
         return token
 
     def limit(self, name: str, limits: KeyLimits) -> KeyLimits:
-        """Change those limits of a key that are given; returns all of them.
+        """Change the given limits of a key; return all of its limits.
 
         Raises:
             NotFoundError: no live key has this name.
@@ -202,17 +202,17 @@ class KeyFile:
         return found[-1].limits
 
     def projects(self) -> dict[str, ProjectLimits]:
-        """Projects that a key belongs to or that have limits, by name."""
+        """Return projects that have keys or limits, by name."""
         document = self._read()
         named = {key.project: ProjectLimits() for key in document.keys if key.project}
         return dict(sorted((named | document.projects).items()))
 
     def limits_of(self, project: str) -> ProjectLimits:
-        """What a project may use."""
+        """Return the limits of a project."""
         return self._read().projects.get(project, ProjectLimits())
 
     def limit_project(self, project: str, limits: ProjectLimits) -> ProjectLimits:
-        """Change those limits of a project that are given; returns all of them.
+        """Change the given limits of a project; return all of its limits.
 
         Raises:
             InputError: it is no name of a project.
@@ -225,7 +225,7 @@ class KeyFile:
         return document.projects[project]
 
     def revoke(self, name: str) -> None:
-        """End a key's life; it stays in the list.
+        """Revoke a key; it remains in the list.
 
         Raises:
             NotFoundError: no live key has this name.
@@ -235,15 +235,15 @@ class KeyFile:
                 key.revoked = _now()
 
     def find(self, token: str) -> Key | None:
-        """The live key behind a token."""
+        """Return the live key of a token."""
         digest = _sha256(token)
         return self._first(lambda key: hmac.compare_digest(key.sha256, digest))
 
     def open_session(self, key: Key) -> str:
-        """Signed cookie value for a browser that showed a key.
+        """Return a signed cookie for a browser that presented a key.
 
         Raises:
-            UnavailableError: the file of keys has no secret to sign with.
+            UnavailableError: the file of keys has no secret for signatures.
         """
         if not self._read().session_secret:
             raise UnavailableError(f"the key file {self.path} has no session_secret; `graspd keys add` gives it one")
@@ -251,7 +251,7 @@ class KeyFile:
         return f"{claim}.{self._sign(claim)}"
 
     def find_session(self, cookie: str) -> Key | None:
-        """The live key behind a session; revoking the key ends its sessions. Without a secret there is none."""
+        """Return the live key of a session; revoking the key ends its sessions. None without a signing secret."""
         claim, _, signature = cookie.partition(".")
         if not self._read().session_secret or not hmac.compare_digest(signature.encode(), self._sign(claim).encode()):
             return None
@@ -271,7 +271,7 @@ class KeyFile:
             status = self.path.stat()
         except FileNotFoundError:
             return _Document(session_secret="")
-        # File clocks tick slowly and file numbers are used again: the size tells two quick changes apart.
+        # File timestamps are coarse and inodes are reused: the size distinguishes two quick changes.
         stamp = (status.st_mtime_ns, status.st_ino, status.st_size)
         if stamp != self._stamp:
             try:
@@ -285,7 +285,7 @@ class KeyFile:
 
     @contextmanager
     def _changing(self) -> Iterator[_Document]:
-        """A copy of the document that replaces the file at the end; two commands at once take turns."""
+        """Yield a copy of the document that replaces the file at the end; a lock serializes commands."""
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
             with self.path.with_name(f".{self.path.name}.lock").open("w") as lock:
@@ -322,5 +322,5 @@ def _sha256(token: str) -> str:
 
 
 def _now(ahead: timedelta = timedelta(0)) -> str:
-    """RFC 3339 in UTC to the microsecond; such texts sort by time."""
+    """Return the time in RFC 3339, UTC, with microseconds; such texts sort by time."""
     return (datetime.now(UTC) + ahead).isoformat(timespec="microseconds").replace("+00:00", "Z")

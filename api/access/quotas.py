@@ -1,8 +1,8 @@
-"""Quotas of a key, and of the keys of a project together: grasps in unfinished jobs, and requests of a day.
+"""Quotas of a key, and of a project's keys together: grasps in unfinished jobs, and requests per day.
 
-Redis counts, in one step for all API processes. What it holds may be lost: then a quota is forgotten, never a job.
-A job counts with the grasps that were asked for, from its submission until it ends. Whether it has ended is asked of
-the index only when the quota would be passed, so a submission costs one round trip.
+Redis counts them in one atomic step for all API processes. Its loss resets quotas, but loses no job. From submission to
+end, a job counts with its requested grasps. The index is asked for ended jobs only if the quota would be exceeded, so a
+submission needs one round trip.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from graspd.service.model.errors import QuotaError
 from graspd.service.settings import Settings
 
 log = logging.getLogger(__name__)
-#: A key that submits nothing for this long is forgotten [s].
+#: Counters of a key expire after this time without a submission [s].
 _KEPT_S: Final = 30 * 86400
 _AT_ONCE: Final = 1000
 
-#: A submission that has not ended after this long died with its process [s].
+#: A submission still pending after this time belongs to a dead process [s].
 _PENDING_S: Final = 60
 
-# KEYS[1] holds the sum under `grasps`, and under each job: its grasps, the claim that counted them last, and until when
-# that claim counts as being entered; 0 once the job is in the index.
+# KEYS[1] holds the sum under `grasps`, and an entry under each job: its grasps, the last claim that counted them, and
+# the time until which this claim is pending. The time is 0 once the job is in the index.
 _CLAIM: Final = """
 local job, grasps, number = ARGV[1], tonumber(ARGV[2]), ARGV[7]
 local most_grasps, most_today, amount = tonumber(ARGV[3]), tonumber(ARGV[4]), tonumber(ARGV[6])
@@ -57,14 +57,14 @@ end
 return {'', '0'}
 """
 
-#: The job is in the index; a claim of the same job that made nothing new may have dropped it meanwhile.
+#: Settles a claim once the job is in the index; a claim of the same job that created nothing may have dropped it.
 _SETTLE: Final = """
 local known = redis.call('HGET', KEYS[1], ARGV[1])
 if not known then redis.call('HINCRBY', KEYS[1], 'grasps', ARGV[2]) end
 redis.call('HSET', KEYS[1], ARGV[1], string.match(known or ARGV[2], '^%d+') .. ' ' .. ARGV[3] .. ' 0')
 """
 
-#: Jobs whose entry is still what it was when somebody looked: `job`, `entry`, ...
+#: Drops jobs whose entries are unchanged since they were read: `job`, `entry`, ...
 _DROP: Final = """
 for i = 1, #ARGV, 2 do
   local known = redis.call('HGET', KEYS[1], ARGV[i])
@@ -75,7 +75,7 @@ for i = 1, #ARGV, 2 do
 end
 """
 
-#: Entries of all jobs that no submission is entering now.
+#: Entries of all jobs without a pending submission.
 _ENTERED: Final = """
 local now, found = tonumber(redis.call('TIME')[1]), {}
 local all = redis.call('HGETALL', KEYS[1])
@@ -101,14 +101,14 @@ end
 
 @dataclass
 class SubmissionClaim:
-    """What a submission may say of itself: False, if it found a job that was there already."""
+    """Result that a submission sets: `counts` is False if the job existed already."""
 
     counts: bool = True
 
 
 @dataclass(frozen=True)
 class _Holder:
-    """Whose counters they are: a key's, which counts the jobs of a day, or a project's, which counts their grasps."""
+    """Owner of counters: a key, which counts jobs per day, or a project, which counts their grasps."""
 
     name: str
     words: str
@@ -143,13 +143,13 @@ class _Holder:
 
 
 class Quotas:
-    """The counters of all keys and projects.
+    """Counters of all keys and projects.
 
     Args:
         connection: Redis.
-        unfinished: of these job ids, those whose job has not ended.
-        limits_of: what a project may use.
-        gpu_seconds: time of GPU workers on a project's tasks on a day [s].
+        unfinished: returns those of the given job ids whose job has not ended.
+        limits_of: returns the limits of a project.
+        gpu_seconds: returns the time of GPU workers on a project's tasks on a day [s].
     """
 
     def __init__(
@@ -169,14 +169,14 @@ class Quotas:
 
     @contextmanager
     def claim(self, key: Key | None, job: str, grasps: int, *, is_new: bool = True) -> Iterator[SubmissionClaim]:
-        """Count a job that is submitted or retried within; it is not counted if that fails or made nothing new.
+        """Count a job submitted or retried in this context, unless that fails or makes nothing new.
 
         Args:
-            key: whose it is; None while the service is open, which knows no quotas.
-            is_new: whether it counts as one of today's jobs; one that is retried does not.
+            key: the submitting key; None while the service is open, without quotas.
+            is_new: whether the job counts as one of today; a retried job does not.
 
         Raises:
-            QuotaError: the key, or its project, has all it may have.
+            QuotaError: the quota of the key or of its project is used up.
         """
         claim = SubmissionClaim()
         if key is None:
@@ -189,7 +189,7 @@ class Quotas:
             yield claim
 
     def _refuse_spent(self, project: str) -> None:
-        """QuotaError where a project used up its GPU seconds of today. What it submitted before goes on."""
+        """Raise QuotaError if a project's GPU seconds of today are used up. Its earlier jobs continue."""
         most = self._limits_of(project).gpu_seconds_per_day if project else None
         if most and (used := self._gpu_seconds(project, f"{datetime.now(UTC):%Y-%m-%d}")) >= most:
             raise QuotaError(
@@ -198,7 +198,7 @@ class Quotas:
             )
 
     def _holders(self, key: Key) -> list[_Holder]:
-        """Whose counters a submission adds to: those that have a limit."""
+        """Return the owners of counters that a submission increases: those with a limit."""
         own, all_ = key.limits, self._settings
         grasps = all_.quota_grasps_in_flight if own.grasps_in_flight is None else own.grasps_in_flight
         jobs = all_.quota_jobs_per_day if own.jobs_per_day is None else own.jobs_per_day
@@ -206,7 +206,7 @@ class Quotas:
         if key.project:
             limits = self._limits_of(key.project)
             most = limits.grasps_in_flight or 0, limits.grasps_per_day or 0
-            # No name of a key holds a colon.
+            # Names of keys contain no colon.
             words = f"the project {key.project!r}"
             found.append(_Holder(f"project:{key.project}", words, *most, counts_jobs=False))
         return [holder for holder in found if holder.is_limited]
@@ -227,8 +227,9 @@ class Quotas:
                 self._end(holder, job, grasps, number, met, counts=claim.counts, is_new=is_new)
 
     def _claim(self, holder: _Holder, job: str, grasps: int, number: str, *, is_new: bool) -> str:
-        """How a job is counted: empty where this claim counts it, `shared` where another claim that has not ended did,
-        `known` where it was counted before, `unknown` without Redis."""
+        """Return how a job is counted.
+
+        Empty: by this claim. `shared`: by another pending claim. `known`: by an earlier one. `unknown`: no Redis."""
         met, amount = self._ask(holder, job, grasps, number, is_new=is_new)
         if met == "grasps":
             with self._forgiving(holder):
@@ -247,8 +248,10 @@ class Quotas:
         return met.decode(), int(amount)
 
     def _forget_ended(self, holder: _Holder) -> None:
-        """Drop the jobs that have ended. One that is being entered is not in the index yet, so it is not asked for; one
-        that is claimed again meanwhile has another entry, and stays."""
+        """Drop ended jobs. Pending ones are excluded, because the index does not contain them yet.
+
+        The entry of a job that is claimed again meanwhile changes, and so it remains.
+        """
         found = [word.decode(errors="replace") for word in self._connection.eval(_ENTERED, 1, holder.held)]
         entries = dict(zip(found[::2], found[1::2], strict=True))
         ended = sorted(entries.keys() - set(self._unfinished(list(entries))))
@@ -263,7 +266,7 @@ class Quotas:
             self._connection.eval(_SETTLE, 1, holder.held, job, grasps, number)
         else:
             self._connection.eval(_UNDO, 1, holder.held, job, number)
-        # Of two claims of one job the one that made it counts as one of today's.
+        # Of two claims of one job, the one that created it counts as one of today.
         if is_new and met == "shared" and counts:
             self._connection.incrby(holder.day, _amount(holder, grasps))
         if is_new and met == "" and not counts:
@@ -278,7 +281,7 @@ class Quotas:
 
 
 def _amount(holder: _Holder, grasps: int) -> int:
-    """What a new job adds to the counter of the day."""
+    """Return the amount that a new job adds to the counter of the day."""
     return 1 if holder.counts_jobs else grasps
 
 
@@ -292,7 +295,7 @@ DATASET_PREFIX: Final = "dataset:"
 
 
 def unfinished(index: Index, ids: Collection[str]) -> set[str]:
-    """Of these jobs and datasets, as quotas name them, those that have not ended."""
+    """Return those of the jobs and datasets, named as in quotas, that have not ended."""
     names = {one.removeprefix(DATASET_PREFIX) for one in ids if one.startswith(DATASET_PREFIX)}
     found = index.jobs.unfinished([one for one in ids if not one.startswith(DATASET_PREFIX)])
     return found | {DATASET_PREFIX + name for name in index.datasets.unfinished(names)}

@@ -1,5 +1,5 @@
-"""What routes and pages read and do, as documents: index, store, queue and pipeline stand behind them.
+"""Operations of routes and pages, as documents; they use index, store, queue and pipeline.
 
-Nothing is kept here between two requests but what may be lost, so any number of API processes answer alike. Methods
-raise the errors of `service.model.errors`.
+State between requests is only a cache, so any number of API processes give the same answers. Methods raise the errors
+of `service.model.errors`.
 """

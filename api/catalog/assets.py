@@ -1,4 +1,4 @@
-"""Hands, objects and networks: uploaded under a name, taken away again."""
+"""Hands, objects and networks: upload, correction and deletion."""
 
 from __future__ import annotations
 
@@ -32,8 +32,7 @@ _NAMES_TRIED: Final = 100
 
 
 class Assets:
-    """Hands, objects and networks in the caller's scope; what takes one away asks whose it is. A `name` may be a
-    digest."""
+    """Assets in the caller's scope; deletion requires ownership. A `name` may be a digest."""
 
     def __init__(self, services: Services) -> None:
         self._services = services
@@ -41,7 +40,7 @@ class Assets:
     def page(
         self, kind: AssetKind, *, limit: int = 50, cursor: str | None = None, refused: bool = False
     ) -> Page[AssetView]:
-        """All of a kind, newest first; those that the check refused only where asked for."""
+        """Return assets of a kind, newest first; refused ones only on request."""
         return self._services.index.assets.page(
             kind, limit=limit, cursor=cursor, refused=refused, scope=project_scope()
         )
@@ -50,15 +49,15 @@ class Assets:
         return self._services.index.assets.get(kind, name, scope=project_scope())
 
     def files(self, asset: AssetView) -> Mapping[str, bytes]:
-        """Its files as they were uploaded, `asset.json` among them."""
+        """Return the uploaded files, including `asset.json`."""
         return library.load_asset_files(self._services.store, asset.kind, asset.digest)
 
     def model(self, asset: AssetView) -> bytes:
-        """The prepared hand or object as binary glTF.
+        """Return the prepared hand or object as binary glTF.
 
         Raises:
             NotFoundError: it has not been checked yet, or was refused.
-            DamagedError: its bytes are not those that were made.
+            DamagedError: its content does not match its checksum.
         """
         return get_sealed(self._services.store, names.asset_model(asset.kind, asset.digest))
 
@@ -72,17 +71,17 @@ class Assets:
         shared: bool = False,
         rename: bool = False,
     ) -> AssetView:
-        """Keep what was uploaded. The controller queues the check of a hand or an object, which ends with grasps if
-        `self_test` says so; a network is checked here.
+        """Store an upload. The controller queues the check of a hand or an object; a network is checked here.
+
+        With `self_test` the check of a hand ends with grasps.
 
         Args:
             shared: whether every project may use it.
-            rename: where the name stands for other content, give the next free one; what is known keeps its own.
+            rename: use the next free name if the name is taken; known content retains its own name.
 
         Raises:
-            ConflictError: the name stands for other content, or the content has another name or belongs to another
-                project.
-            InputError: no network.
+            ConflictError: the name is taken, or the content has another name or belongs to another project.
+            InputError: the file is no network.
         """
         found = network_report(files, name) if kind is AssetKind.NETWORK else None
         project = project_scope().project
@@ -90,7 +89,7 @@ class Assets:
         self._refuse_hidden(kind, digest)
         with contextlib.suppress(NotFoundError):
             known = self.one(kind, digest)
-            # A refused upload holds no name, so it does not matter under which it was sent.
+            # A refused upload does not occupy its name.
             if rename or known.verdict == "refuse":
                 return known
         if rename:
@@ -100,9 +99,9 @@ class Assets:
         said = {"owner": caller_id(), "project": project, "shared": shared, "self_test": self_test}
         asset = library.store_files(store, kind, name, files, said=said)
         if found is not None:
-            # Before the record: from then on it counts, and no worker is asked about it.
+            # Write the check before the record: the record makes it effective, and no worker checks a network.
             put_document(store, names.asset_check(kind, asset.digest), found)
-        # Of two uploads at once that want one name, the later one must see the earlier one's record.
+        # With two simultaneous uploads of one name, the later one must see the record of the earlier one.
         with recording(self._services) as (connection, put):
             self._refuse_taken(kind, name, asset.digest)
             asset = library.record_asset(store, asset, put)
@@ -110,7 +109,7 @@ class Assets:
         return self.one(kind, asset.digest)
 
     def hand_facts(self, asset: AssetView) -> HandFacts:
-        """What was found and guessed of a hand.
+        """Return the facts and guesses about a hand.
 
         Raises:
             NotFoundError: it has not been checked yet, or was refused.
@@ -119,17 +118,17 @@ class Assets:
         return facts_of(self.model(asset))
 
     def correct(self, name: str, corrections: HandCorrections, new_name: str = "") -> AssetView:
-        """A hand of the same files whose `asset.json` says what was found, with corrections; its check is queued.
+        """Create a hand from the same files with corrected facts in `asset.json`; its check is queued.
 
         Args:
-            name: the hand that was guessed wrongly, or its digest.
-            corrections: what to say instead.
-            new_name: of the corrected hand; empty: the name with the next free number.
+            name: the hand with wrong guesses, or its digest.
+            corrections: corrected values.
+            new_name: name of the corrected hand; empty: the name with the next free number.
 
         Raises:
             NotFoundError: there is no such hand, or no model of it yet.
-            ConflictError: the new name stands for another hand, or these corrections are known under another name.
-            InputError: a link or a joint that it does not have, or a value out of its limits.
+            ConflictError: the new name is taken, or these corrections exist under another name.
+            InputError: a link or joint that the hand does not have, or a value out of range.
         """
         hand = self.one(AssetKind.HAND, name)
         facts = self.hand_facts(hand)
@@ -143,7 +142,7 @@ class Assets:
             raise LimitError(f"what is said of the hand takes more than {MAX_BYTES} bytes; correct less")
         files["asset.json"] = text
         if not new_name:
-            # The same corrections are the same hand.
+            # The same corrections give the same hand.
             for mark in ({}, marks_of(files, project_scope().project)):
                 files.update(mark)
                 with contextlib.suppress(NotFoundError):
@@ -163,7 +162,7 @@ class Assets:
         raise ConflictError(f"there are many {kind.value}s named {stem}-...; choose a name")
 
     def delete(self, kind: AssetKind, name: str) -> None:
-        """Take a hand, object or network away that nothing needs.
+        """Delete a hand, object or network that nothing needs.
 
         Raises:
             NotYours: another key uploaded it.
@@ -175,13 +174,13 @@ class Assets:
         log.info("%s %s deleted", kind, asset.name)
 
     def _mark(self, kind: AssetKind, name: str, files: MutableMapping[str, bytes], project: str) -> str:
-        """Put the mark of the project among the files, which keeps them to itself; their digest."""
+        """Add the project's mark to the files, which makes them private to it; return their digest."""
         files.update(marks_of(files, ""))
         digest = digest_files(kind, files)
         if not project:
             return digest
         with contextlib.suppress(NotFoundError):
-            # The very files are shared already: they stay one hand or object.
+            # The identical files are shared already: do not create a second asset.
             known = self.one(kind, digest)
             if known.name == name and (known.shared or known.builtin):
                 return digest
@@ -199,11 +198,11 @@ class Assets:
             raise ConflictError(f"another project keeps this {kind.value} to itself; upload it without sharing it")
 
     def _holder(self, kind: AssetKind, name: str) -> str:
-        """Digest of what a name stands for; empty: it is free."""
+        """Return the digest that a name refers to; empty: the name is free."""
         with contextlib.suppress(NotFoundError):
-            # Another project's names take none from this one, an admin's neither.
+            # Names of other projects do not count here, not even for an admin.
             known = self._services.index.assets.get(kind, name, scope=replace(project_scope(), everything=False))
-            # A refused upload holds no name: the same file with the fix must get in.
+            # A refused upload does not occupy its name: a fixed file may use it.
             return known.digest if known.verdict != "refuse" else ""
         return ""
 

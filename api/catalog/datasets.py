@@ -1,6 +1,6 @@
-"""Datasets, named sets of objects, and the comparison of two datasets.
+"""Datasets, named sets of objects, and comparison of two datasets.
 
-A dataset counts against its key's quota as one job with all its grasps until it ends, and only its owner changes it.
+Until it ends, a dataset counts against its key's quota as one job with all its grasps. Only its owner changes it.
 """
 
 from __future__ import annotations
@@ -31,17 +31,17 @@ log = logging.getLogger(__name__)
 
 
 class Datasets:
-    """Datasets in the caller's scope; what changes one asks whose it is."""
+    """Datasets in the caller's scope; changes require ownership."""
 
     def __init__(self, services: Services, quotas: Quotas) -> None:
         self._services = services
         self._quotas = quotas
 
     def create(self, request: DatasetRequest) -> DatasetView:
-        """`actions.create` within the caller's quota.
+        """Run `actions.create` within the caller's quota.
 
         Raises:
-            QuotaError: the caller's key has all it may have.
+            QuotaError: the quota of the caller's key is used up.
         """
         hands, objects = actions.members(self._services, request, project_scope())
         asked = len(hands) * len(objects) * request.grasps
@@ -50,7 +50,7 @@ class Datasets:
         return dataset
 
     def cancel(self, name: str) -> DatasetView:
-        """`actions.cancel` of the caller's own dataset.
+        """Run `actions.cancel` on the caller's own dataset.
 
         Raises:
             NotYours: another key submitted it.
@@ -59,11 +59,11 @@ class Datasets:
         return actions.cancel(self._services, name)
 
     def retry(self, name: str) -> DatasetView:
-        """`actions.retry` of the caller's own dataset within his quota: it counts the cells that are started again.
+        """Run `actions.retry` on the caller's own dataset; restarted cells count against the quota.
 
         Raises:
             NotYours: another key submitted it.
-            QuotaError: the caller's key has all it may have.
+            QuotaError: the quota of the caller's key is used up.
         """
         dataset = self._owned(name)
         again = dataset.states[State.FAILED] + dataset.states[State.CANCELLED]
@@ -72,7 +72,7 @@ class Datasets:
             return actions.retry(self._services, name)
 
     def delete(self, name: str, *, with_snapshots: bool = False) -> None:
-        """Take a dataset away that has ended; one with snapshots only where they may go too.
+        """Delete an ended dataset; one with snapshots requires `with_snapshots`.
 
         Raises:
             NotYours: another key submitted it.
@@ -82,11 +82,11 @@ class Datasets:
         log.info("dataset %s deleted", name)
 
     def estimate(self, matrix: Matrix) -> Estimate:
-        """What a matrix will cost. Nothing is recorded."""
+        """Estimate the cost of a matrix. Nothing is recorded."""
         return estimate(self._services.index, matrix, Resolver(self._services.store), scope=project_scope())
 
     def page(self, *, limit: int = 50, cursor: str | None = None) -> Page[DatasetView]:
-        """Datasets, the newest first."""
+        """Return datasets, newest first."""
         return self._services.index.datasets.page(limit=limit, cursor=cursor, scope=project_scope())
 
     def one(self, name: str) -> DatasetView:
@@ -95,29 +95,29 @@ class Datasets:
     def cells(
         self, name: str, *, state: State | None = None, limit: int = 50, cursor: str | None = None
     ) -> Page[CellView]:
-        """Each hand x object of a dataset with its job, hand by hand."""
+        """Return each cell (hand x object) of a dataset with its job, ordered by hand."""
         return self._services.index.datasets.cells(name, state=state, limit=limit, cursor=cursor, scope=project_scope())
 
     def matrix(self) -> list[MatrixCell]:
-        """Each hand x object of which there is a job, of a dataset or not."""
+        """Return each pair of hand and object that has a job, with or without a dataset."""
         return self._services.index.overview.matrix(scope=project_scope())
 
     def take_snapshot(self, name: str) -> tuple[Snapshot, bool]:
-        """Write down which shards a dataset holds now; and whether that made a new snapshot."""
+        """Record the dataset's present shards; return the snapshot and whether it is new."""
         self.one(name)
         return actions.snapshot(self._services, name)
 
     def snapshots(self, name: str, *, limit: int = 50, cursor: str | None = None) -> Page[SnapshotView]:
-        """Snapshots of a dataset, the newest first."""
+        """Return snapshots of a dataset, newest first."""
         return self._services.index.datasets.snapshots(name, limit=limit, cursor=cursor, scope=project_scope())
 
     def snapshot(self, name: str, digest: str) -> Snapshot:
-        """A snapshot with its list of shards."""
+        """Return a snapshot with its list of shards."""
         self.one(name)
         return load_snapshot(self._services.store, name, digest)
 
     def add_object_set(self, name: str, objects: tuple[str, ...]) -> ObjectSetView:
-        """Give objects a name together; others under the same name are its next version.
+        """Name a set of objects; other objects under the same name are its next version.
 
         Raises:
             NotYours: another key made the set.
@@ -132,7 +132,7 @@ class Datasets:
         )
 
     def object_sets(self) -> list[ObjectSetView]:
-        """The newest version of each set, by name."""
+        """Return the newest version of each set, by name."""
         return self._services.index.object_sets.newest(scope=project_scope())
 
     def object_set(self, name: str) -> ObjectSetView:
@@ -144,14 +144,14 @@ class Datasets:
         return dataset
 
 
-#: Cells of a dataset that are compared one by one: nobody reads more rows.
+#: Most cells compared one by one; a longer table would be unreadable.
 MOST_CELLS: Final = 1000
 _AT_ONCE: Final = 200
 
 
 @dataclass(frozen=True)
 class Setting:
-    """An option in which they differ, as each has it."""
+    """Option that differs, with both values."""
 
     name: str
     one: str
@@ -160,7 +160,7 @@ class Setting:
 
 @dataclass(frozen=True)
 class Pair:
-    """A hand on an object, and its cell in each; None: that dataset has none."""
+    """Hand and object with its cell in both datasets; None: the dataset has no such cell."""
 
     hand: str
     object: str
@@ -169,7 +169,7 @@ class Pair:
 
     @property
     def gain(self) -> float | None:
-        """By how much the other's yield is higher, where both have tried."""
+        """Difference of the yields, the other's minus this one's, if both have candidates."""
         if self.one is None or self.other is None or None in (self.one.valid_yield, self.other.valid_yield):
             return None
         return (self.other.valid_yield or 0.0) - (self.one.valid_yield or 0.0)
@@ -177,26 +177,26 @@ class Pair:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Everything that the page says."""
+    """Content of the comparison page."""
 
     one: DatasetView
     other: DatasetView
     settings: list[Setting]
     pairs: list[Pair]
-    """Hand by hand; none where a dataset has more than `MOST_CELLS` cells."""
+    """Ordered by hand; empty if a dataset has more than `MOST_CELLS` cells."""
     metrics: dict[Metric, list[Distribution | None]]
-    """Of the grasps that each counts, in the same bins."""
+    """Distributions over each dataset's counted grasps, in the same bins."""
 
 
 class Comparisons:
-    """Compares datasets in the caller's scope."""
+    """Comparison of datasets in the caller's scope."""
 
     def __init__(self, services: Services, datasets: Datasets) -> None:
         self._services = services
         self._datasets = datasets
 
     def of(self, one: str, other: str) -> Comparison:
-        """Two datasets by name.
+        """Compare two datasets by name.
 
         Raises:
             NotFoundError: there is no such dataset in scope.
@@ -224,7 +224,7 @@ class Comparisons:
 
 
 def _settings(one: DatasetView, other: DatasetView) -> Iterator[Setting]:
-    """Options that differ; then hands and objects that one has and the other has not."""
+    """Yield options that differ; then hands and objects that only one dataset has."""
     said = [each.options.model_dump(mode="json") for each in (one, other)]
     for name in said[0]:
         if said[0][name] != said[1][name]:

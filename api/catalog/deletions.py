@@ -1,4 +1,4 @@
-"""What was deleted and can still be brought back."""
+"""Deletions that can still be undone."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ log = logging.getLogger(__name__)
 
 
 class DeletionView(View):
-    """A thing that was deleted within the grace time."""
+    """Resource that was deleted within the grace time."""
 
     what: What
     id: str = Field(description="of the job, tag, hand, object or network; name of the dataset")
@@ -29,22 +29,22 @@ class DeletionView(View):
 
 
 class Deletions:
-    """Deletions in the caller's scope; who may delete a thing may restore it."""
+    """Deletions in the caller's scope; permission to delete includes permission to restore."""
 
     def __init__(self, services: Services) -> None:
         self._services = services
 
     def recent(self) -> list[DeletionView]:
-        """What can be restored, the newest first."""
+        """Return what can be restored, newest first."""
         return [self._view(one) for one in deletions(self._services.store) if self._is_seen(one)]
 
     def restore(self, what: What, name: str) -> DeletionView:
-        """Bring a thing back, by its name or id.
+        """Restore a resource by its name or id.
 
         Raises:
             NotFoundError: nothing of that name was deleted within the grace time.
             NotYours: another key submitted it.
-            ConflictError: there is one of that name again, or what it needs is deleted too.
+            ConflictError: the name is in use again, or a resource it needs is deleted too.
         """
 
         def permit(one: Deletion) -> None:

@@ -1,5 +1,4 @@
-"""Events: server-sent streams of changes, which end with their key; the feed of ends, and the webhooks that are told of
-them."""
+"""Server-sent events, ended when their key ends; the feed of ended jobs and datasets; webhooks."""
 
 from __future__ import annotations
 
@@ -29,13 +28,13 @@ from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.recording import recording
 
 POLL_S: Final = 0.5
-#: A client that reconnects waits this long.
+#: Delay before a client reconnects [ms].
 RETRY_MS: Final = 2000
 _ENDS_AT_ONCE: Final = 100
 
 
 async def job_events(jobs: Jobs, job_id: str, request: Request) -> AsyncIterator[ServerSentEvent]:
-    """`progress` with the job whenever it changed; `end` when its state is final."""
+    """Send `progress` with the job at each change; `end` when its state is final."""
     last = ""
     while not await request.is_disconnected() and may_still(request, Scope.READ):
         try:
@@ -56,7 +55,7 @@ async def job_events(jobs: Jobs, job_id: str, request: Request) -> AsyncIterator
 
 
 async def ends(webhooks: Webhooks, since: int, request: Request) -> AsyncIterator[ServerSentEvent]:
-    """`end` with each job and dataset that ended, in this order."""
+    """Send `end` with each ended job and dataset, in order."""
     while not await request.is_disconnected() and may_still(request, Scope.READ):
         try:
             found = await run_sync(partial(webhooks.ends, since, limit=_ENDS_AT_ONCE))
@@ -72,7 +71,7 @@ async def ends(webhooks: Webhooks, since: int, request: Request) -> AsyncIterato
 
 
 async def service_events(overview: Overview, request: Request) -> AsyncIterator[ServerSentEvent]:
-    """`progress` without content whenever a job, a task or a worker changed: the home page looks again."""
+    """Send `progress` without content when a job, task or worker changed: the home page then reloads."""
     last = ""
     while not await request.is_disconnected() and may_still(request, Scope.READ):
         try:
@@ -89,22 +88,22 @@ log = logging.getLogger(__name__)
 
 
 class Webhooks:
-    """Webhooks of the caller's project, and what was delivered to them."""
+    """Webhooks of the caller's project, and their deliveries."""
 
     def __init__(self, services: Services) -> None:
         self._services = services
 
     def ends(self, since: int, *, limit: int) -> list[EndView]:
-        """The next ends of jobs and datasets in scope, behind a number."""
+        """Return the next ends of jobs and datasets in scope, after a given number."""
         return self._services.index.outbox.ends(since, limit=limit, scope=project_scope())
 
     def add(self, url: str, states: tuple[End, ...]) -> tuple[WebhookView, str]:
-        """A webhook and its secret, which is told this once.
+        """Add a webhook; return it with its secret, which cannot be shown again.
 
         Raises:
-            InputError: the address is none that can be asked.
-            LimitError: the project has `MOST_HOOKS` of them.
-            ConflictError: the operator has not switched webhooks on.
+            InputError: the address cannot receive requests.
+            LimitError: the project already has `MOST_HOOKS` webhooks.
+            ConflictError: the operator has not enabled webhooks.
         """
         master = self._services.settings.webhook_secret
         if master is None:
@@ -130,11 +129,11 @@ class Webhooks:
         return self._services.index.outbox.hook(hook.id), secret_of(master.get_secret_value(), hook.id)
 
     def all(self) -> list[WebhookView]:
-        """Webhooks that the caller may change: the addresses of others may hold words that let somebody in."""
+        """Return webhooks that the caller may change: addresses of others may contain credentials."""
         return [hook for hook in self._services.index.outbox.hooks(scope=project_scope()) if self._is_theirs(hook)]
 
     def log(self, webhook: str, *, limit: int = 50) -> list[DeliveryView]:
-        """Deliveries of a webhook, the newest first.
+        """Return deliveries of a webhook, newest first.
 
         Raises:
             NotYours: another key made it.
@@ -142,13 +141,13 @@ class Webhooks:
         return self._services.index.outbox.log(self._owned(webhook).id, limit=limit)
 
     def delete(self, webhook: str) -> None:
-        """Take a webhook away; what waits for it is not sent.
+        """Delete a webhook; its pending deliveries are dropped.
 
         Raises:
             NotYours: another key made it.
         """
         hook = self._owned(webhook)
-        # The record first: what is left of a broken-off deletion is a row that a rebuild drops.
+        # Delete the record first: an interrupted deletion then leaves only a row that a rebuild drops.
         self._services.store.delete(names.webhook(hook.id))
         self._services.index.outbox.remove(hook.id)
         log.info("webhook %s deleted", hook.id)

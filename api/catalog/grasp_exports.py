@@ -1,4 +1,4 @@
-"""Chosen grasps to take home: their rows as CSV or JSON, or the grasps themselves as base shards in a ZIP."""
+"""Export of selected grasps: rows as CSV or JSON, or base shards in a ZIP."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from graspd.service.store.shards import part_of_shard, place_of, read_shard
 
 Format = Literal["csv", "json", "zip"]
 MEDIA_TYPES: Final[dict[Format, str]] = {"csv": "text/csv", "json": "application/json", "zip": "application/zip"}
-#: Shards that one ZIP takes grasps of: some ten seconds of work.
+#: Most shards per ZIP: about ten seconds of work.
 MOST_SHARDS: Final = 2000
 _CHUNK: Final = 1 << 20
 _COLUMNS: Final = (*GraspView.model_fields, "tags")
@@ -35,7 +35,7 @@ _COLUMNS: Final = (*GraspView.model_fields, "tags")
 
 @dataclass(frozen=True)
 class Export:
-    """A file that is ready."""
+    """File ready to be sent."""
 
     media_type: str
     filename: str
@@ -44,7 +44,7 @@ class Export:
 
 
 class GraspExports:
-    """Writes chosen grasps into files, each on the disk of the service until it is sent."""
+    """Writes selected grasps into files, which stay on the service's disk until they are sent."""
 
     def __init__(self, services: Services, grasps: Grasps, tags: Tags) -> None:
         self._services = services
@@ -52,15 +52,15 @@ class GraspExports:
         self._tags = tags
 
     def made(self, places: Sequence[Grasp], format: Format, said: Mapping[str, Any]) -> Export:
-        """The file of these grasps, which the caller may see.
+        """Write a file of these grasps, which must be visible to the caller.
 
         Args:
-            said: how they were chosen; it stands in JSON and in the ZIP's `subset.json`.
+            said: description of the selection, written into JSON and the ZIP's `subset.json`.
 
         Raises:
-            InputError: a ZIP of no grasp.
-            LimitError: a ZIP of grasps of more than `MOST_SHARDS` shards.
-            DamagedShard: a shard is not what its checksum says.
+            InputError: a ZIP without grasps.
+            LimitError: a ZIP of grasps from more than `MOST_SHARDS` shards.
+            DamagedShard: a shard does not match its checksum.
         """
         file = TemporaryFile()  # noqa: SIM115 (it is closed once it is sent)
         try:
@@ -112,7 +112,7 @@ class GraspExports:
                 mask[list(rows)] = True
                 looked_at += len(mask)
                 names.append(place_of(shard, names))
-                # Names come with a date of their own, so that the same grasps are the same file.
+                # ZipInfo has a fixed date, so that the same grasps give an identical file.
                 packed.writestr(zipfile.ZipInfo(str(names[-1])), part_of_shard(shard, mask))
             told = {**said, "looked_at": looked_at, "kept": len(set(places)), "shards": [str(name) for name in names]}
             packed.writestr(zipfile.ZipInfo("subset.json"), json.dumps(told, indent=1) + "\n")

@@ -1,7 +1,7 @@
-"""Grasps: found by their metrics, counted into the distributions of a job, and shown whole from their base shard.
+"""Grasps: search by metrics, distributions of a job, and details of one grasp from its base shard.
 
-What a base shard says of one grasp: postures, quality at every threshold, the validator's verdict push by push; of its
-scene, and of its way there: approach, grasp, lift.
+Details: postures, metrics at every threshold, the validator's verdict for each push, the scene, and the trajectory
+(approach, grasp, lift).
 """
 
 from __future__ import annotations
@@ -62,15 +62,15 @@ class Grasps:
         self._diversities: dict[tuple[str, int], Diversity | None] = {}
 
     def page(self, query: GraspQuery, *, limit: int = 50, cursor: str | None = None) -> Page[GraspView]:
-        """Grasps that pass every filter."""
+        """Return the grasps that pass every filter."""
         sort = GraspSort(by=query.sort, descending=query.order == "desc")
         return self._index.grasps.page(self._filter(query), sort=sort, limit=limit, cursor=cursor)
 
     def members(self, query: GraspQuery) -> list[Grasp]:
-        """All grasps that pass every filter, by their places.
+        """Return identifiers of all grasps that pass every filter.
 
         Raises:
-            LimitError: they are more than are chosen at once.
+            LimitError: there are more than one selection may hold.
         """
         found = self._index.grasps.members(self._filter(query), limit=MOST_TAGGED + 1)
         if len(found) > MOST_TAGGED:
@@ -78,14 +78,14 @@ class Grasps:
         return found
 
     def listed(self, places: Sequence[Grasp]) -> Iterator[GraspView]:
-        """Grasps by their places, which the caller may see; those that are gone are left out."""
+        """Yield grasps by identifier, which must be visible to the caller; deleted ones are omitted."""
         return self._index.grasps.listed(places)
 
     def _filter(self, query: GraspQuery) -> GraspFilter:
-        """The index's filter behind a request's parameters, in the caller's scope.
+        """Convert a request's parameters to the index's filter, in the caller's scope.
 
         Raises:
-            NotFoundError: there is no such tag, or dataset.
+            NotFoundError: there is no such tag or dataset.
         """
         seen = project_scope()
         if query.dataset is not None:
@@ -98,14 +98,14 @@ class Grasps:
         return _bounded(query).model_copy(update=named)
 
     def one(self, shard_id: str, row: int) -> GraspDetail:
-        """One grasp with all that its shard says of it."""
+        """Return one grasp with all data of its shard."""
         grasp, shard = self._index.grasps.get(shard_id, row, scope=project_scope()), self._index.shards.get(shard_id)
         return self._files.detail(grasp, shard)
 
     def histograms(self, job: JobView | JobDetail, *, bins: int = 20) -> list[Histogram]:
-        """Distribution of each metric over a job's valid grasps, or over all that it kept where not validated.
+        """Return each metric's distribution over a job's valid grasps, or all stored ones if not validated.
 
-        While their number stays, the answer does.
+        The result is cached while the number of grasps is unchanged.
         """
         validated = job.request.validation != "none"
         key = (job.id, count := job.valid if validated else job.grasps)
@@ -127,7 +127,7 @@ class Grasps:
         return found
 
     def diversity(self, job: JobView | JobDetail) -> Diversity | None:
-        """Types and directions of the grasps whose distributions `histograms` gives."""
+        """Return types and directions of the same grasps as `histograms`."""
         validated = job.request.validation != "none"
         key = (job.id, count := job.valid if validated else job.grasps)
         if not count:
@@ -154,7 +154,7 @@ def _told(kinds: GraspKinds) -> Diversity | None:
 
 
 def _bounded(query: GraspQuery) -> GraspFilter:
-    """What a request's parameters say of the grasps themselves."""
+    """Convert the parameters that restrict the grasps themselves."""
     bounds: dict[str, dict[Metric, float]] = {"min": {}, "max": {}}
     if query.type is not None:
         kind = float(GraspType[query.type.upper()])
@@ -181,35 +181,35 @@ def _bounded(query: GraspQuery) -> GraspFilter:
     )
 
 
-#: A base shard of 32 grasps is some 60 kB; a page of grasps reads as many as it has rows, at worst.
+#: Cached base shards. One of 32 grasps takes about 60 kB; a page needs at most one shard per row.
 _KEPT_SHARDS: Final = 64
 _POSTURES: Final = ("pregrasp", "grasp", "squeeze")
 _OUTCOME: Final = "quality/verdict_outcome"
-#: What the numbers of the column mean, as its description in the schema says.
+#: Meaning of the column's numbers, from its description in the schema.
 OUTCOMES: Final = {
     int(code): words for code, words in re.findall(r"(\d) ([a-z ]+)", SCHEMAS["base"][_OUTCOME].description)
 }
 DIRECTIONS: Final = ("+x", "−x", "+y", "−y", "+z", "−z")
 _LIFT: Final = "quality/lift_outcome"
-#: What the numbers of the column mean, as its description in the schema says.
+#: Meaning of the column's numbers, from its description in the schema.
 LIFT_OUTCOMES: Final = {
     int(code): words for code, words in re.findall(r"(\d) ([a-z ]+)", SCHEMAS["base"][_LIFT].description)
 }
 
 
 class GraspFiles:
-    """Reads base shards; keeps the ones it read last, which is memory that may be lost."""
+    """Reads base shards, with a cache of the most recent ones."""
 
     def __init__(self, store: Store) -> None:
         self._store = store
         self._read = lru_cache(maxsize=_KEPT_SHARDS)(self._fetch)
 
     def detail(self, grasp: GraspView, shard: ShardView) -> GraspDetail:
-        """The grasp of the index with what stands in its shard.
+        """Return a grasp of the index with the data of its shard.
 
         Raises:
             NotFoundError: the shard holds no grasps.
-            DamagedShard: its file is gone, or not what its checksum says.
+            DamagedShard: its file is missing, or does not match its checksum.
         """
         file = self._read(shard.key, shard.sha256)
         row = grasp.row
@@ -248,7 +248,7 @@ def _posture(file: Shard, name: str, row: int) -> Posture:
 
 
 def validated_by(file: Shard, row: int) -> Literal["mujoco", "mujoco_warp"] | None:
-    """Whose verdict a grasp of a base shard has; None: not validated."""
+    """Return the validator of a grasp in a base shard; None: not validated."""
     if "quality/success" not in file.arrays:
         return None
     validated = file.arrays.get("quality/validated_by")
@@ -289,7 +289,7 @@ def _texts(value: Any) -> list[str]:
 
 
 def way(file: Shard, row: int) -> list[Waypoint]:
-    """The postures of a grasp in turn."""
+    """Return the postures of a grasp in order."""
     points = way_of(file, row)
     return [
         Waypoint(
@@ -304,10 +304,10 @@ def way(file: Shard, row: int) -> list[Waypoint]:
 
 
 def scene(file: Shard, row: int) -> GraspScene | None:
-    """The scene of a grasp; None if it was planned around a free object.
+    """Return the scene of a grasp; None if it was planned around a free object.
 
     Raises:
-        InputError: what the shard says of its scene is no scene.
+        InputError: the shard's scene is invalid.
     """
     spec = scene_spec_of(file)
     if spec is None or spec.kind == "free" or "grasp/scene_index" not in file.arrays:

@@ -1,4 +1,4 @@
-"""Jobs: submitted within the caller's quota, shown with progress, rate and expected end, changed by their owners."""
+"""Jobs: submission within quotas, progress, rate and expected end, and changes by their owners."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from graspd.service.telemetry import bind
 
 log = logging.getLogger(__name__)
 _PAGE: Final = 200
-#: Waiting tasks among which one is sought that says why it waits.
+#: Waiting tasks that are searched for a reason to wait.
 _LOOKED_AT: Final = 20
 _ORDER: Final = {stage: place for place, stage in enumerate(Stage)}
 _KEPT_LOSSES: Final = 256
@@ -33,7 +33,7 @@ _LOSS_BATCHES: Final = 8
 
 
 class Jobs:
-    """Jobs in the caller's scope; what changes one asks whose it is."""
+    """Jobs in the caller's scope; changes require ownership."""
 
     def __init__(
         self, services: Services, quotas: Quotas, idempotency: Idempotency, grasps: Grasps, shards: Shards
@@ -47,11 +47,11 @@ class Jobs:
         self._losses: dict[str, tuple[int, list[float]] | None] = {}
 
     def submit(self, request: JobRequest, *, idempotency_key: str | None = None) -> JobDetail:
-        """Record a job, or find the same one.
+        """Record a job, or return the existing identical one.
 
         Raises:
-            InputError: the idempotency key came with another request before.
-            QuotaError: the caller's key has all it may have.
+            InputError: the idempotency key belongs to another request.
+            QuotaError: the quota of the caller's key is used up.
         """
         key = caller.get()
         bound: contextlib.AbstractContextManager[None] = contextlib.nullcontext()
@@ -63,11 +63,11 @@ class Jobs:
                 job, is_new = job_actions.enter(self._services, record)
                 claim.counts = is_new
                 log.info("job submitted" if is_new else "job was there already")
-        # The same job may be there by its fidelity's name: whoever asked with a target is told what it came to.
+        # An identical job may exist by fidelity name; a request with a target still gets the choice made for it.
         return self._detail(job).model_copy(update={"choice": record.choice or job.choice})
 
     def cancel(self, job_id: str) -> JobDetail:
-        """Stop a job.
+        """Cancel a job.
 
         Raises:
             NotYours: another key submitted it.
@@ -79,11 +79,11 @@ class Jobs:
         return self._detail(job)
 
     def retry(self, job_id: str) -> JobDetail:
-        """Run again what failed or was cancelled.
+        """Run failed and cancelled tasks again.
 
         Raises:
             NotYours: another key submitted it.
-            QuotaError: the caller's key has all it may have.
+            QuotaError: the quota of the caller's key is used up.
         """
         grasps = self._owned(job_id).request.grasps
         with bind(job=job_id), self._quotas.claim(caller.get(), job_id, grasps, is_new=False):
@@ -92,7 +92,7 @@ class Jobs:
         return self._detail(job)
 
     def delete(self, job_id: str) -> None:
-        """Take a job away that has ended.
+        """Delete an ended job.
 
         Raises:
             NotYours: another key submitted it.
@@ -111,22 +111,22 @@ class Jobs:
         limit: int = 50,
         cursor: str | None = None,
     ) -> Page[Job]:
-        """Jobs, newest first."""
+        """Return jobs, newest first."""
         page = self._services.index.jobs.page(
             state=state, hand=hand, object=object, limit=limit, cursor=cursor, scope=project_scope()
         )
         return Page[Job](items=[self._job(job, ()) for job in page.items], next=page.next)
 
     def one(self, job_id: str) -> JobDetail:
-        """A job with its attempts, mean metrics and shards."""
+        """Return a job with its attempts, mean metrics and shards."""
         return self._detail(self._services.index.jobs.get(job_id, scope=project_scope()))
 
     def moving(self, job_id: str) -> Job:
-        """A job with the progress of its stages and nothing else: what a stream of events repeats."""
+        """Return a job with only the progress of its stages, for event streams."""
         return self._job(self._services.index.jobs.get(job_id, scope=project_scope()), self._running(job_id))
 
     def loss_curve(self, job: JobDetail) -> LossCurve | None:
-        """Mean loss of the planner over the first batches of a job; None where the planner keeps none."""
+        """Return the planner's mean loss over a job's first batches; None if the planner records none."""
         batches = [shard.id for shard in job.shards if shard.kind == "base"][:_LOSS_BATCHES]
         kept = [self._loss(shard) for shard in batches]
         curves = [curve for curve in kept if curve is not None]
@@ -137,7 +137,7 @@ class Jobs:
         return LossCurve(iterations=[(i + 1) * curves[0][0] for i in range(length)], losses=means)
 
     def _loss(self, shard_id: str) -> tuple[int, list[float]] | None:
-        """Iterations between two values, and the values; a shard never changes, so its answer is kept."""
+        """Return iterations between two values, and the values; cached, because a shard never changes."""
         if shard_id not in self._losses:
             info = self._services.index.shards.get(shard_id).manifest.get("info", {})
             curve = [value for value in info.get("loss_curve") or [] if value is not None]
@@ -197,24 +197,24 @@ class Jobs:
         )
 
     def _running(self, job_id: str) -> list[TaskView]:
-        """Running tasks, then the first of those that say why they wait."""
+        """Return running tasks, then the first waiting ones that give a reason."""
         tasks = self._services.index.jobs.tasks
         running = tasks(job=job_id, state=State.RUNNING, limit=_PAGE).items
         waiting = tasks(job=job_id, state=State.QUEUED, limit=_LOOKED_AT).items
         return [*running, *(task for task in waiting if task.message)]
 
 
-#: A shorter look at a task says more about when its progress was reported than about its speed.
+#: Shortest time between two observations [s]: below it, report times dominate the measured rate.
 _LEAST_SPAN_S: Final = 1.0
-#: A task that has only begun spent its time on loading, not on its work.
+#: Least share done: before it, a task spent its time on loading.
 _LEAST_SHARE: Final = 0.03
 _KEPT_TASKS: Final = 4096
 
 
 class TaskRates:
-    """How fast running tasks move, from the first and the latest sight of each.
+    """Rates of running tasks, from the first and the latest observation of each.
 
-    This is memory of one process that may be lost: then the paces are unknown for a second.
+    The observations are a cache of one process; after its loss the rates are unknown for a second.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -223,7 +223,7 @@ class TaskRates:
         self._lock = threading.Lock()
 
     def of(self, task: TaskView) -> float | None:
-        """Share of the task done per second; None while that cannot be told."""
+        """Return the share of the task done per second; None while unknown."""
         share = task.done / task.total if task.total else 0.0
         now = self._clock()
         with self._lock:
@@ -236,22 +236,22 @@ class TaskRates:
 
 
 def stage_statuses(job: JobView, tasks: Sequence[TaskView], paces: TaskRates) -> list[StageStatus]:
-    """The stages of a job in their order, each with its state and, where it can be told, its rate and end.
+    """Return the stages of a job in order, each with its state and, if known, its rate and end.
 
     Args:
-        tasks: those that run, and of those that wait any that say why.
+        tasks: running tasks, and waiting ones that give a reason.
     """
     return [_status(stage, [task for task in tasks if task.stage is stage.stage], paces) for stage in job.stages]
 
 
 def progress_of_job(job: JobView) -> float:
-    """Share of a job's tasks that are done [0, 1]; running ones count by their own progress."""
+    """Return the share of a job's tasks that are done [0, 1]; running tasks count by their progress."""
     tasks = sum(stage.tasks for stage in job.stages)
     return min(1.0, sum(stage.done for stage in job.stages) / tasks) if tasks else 0.0
 
 
 def eta_of_job(job: JobView, stages: Sequence[StageStatus]) -> float | None:
-    """Expected time until the job ends [s]: its stages follow one another; None until each one's pace is known."""
+    """Return the expected time until the job ends [s], summed over stages; None if a rate is unknown."""
     if job.state is not State.RUNNING:
         return None
     remaining = [stage for stage in stages if stage.progress < 1]
@@ -276,7 +276,7 @@ def _status(stage: StageProgress, tasks: list[TaskView], paces: TaskRates) -> St
 
 
 def _rate(stage: StageProgress, running: list[TaskView], paces: TaskRates) -> float | None:
-    """Batches per second: of the running tasks by their own progress, else from the time the finished ones took."""
+    """Return batches per second, from the progress of running tasks, else from finished ones."""
     known = [pace for task in running if (pace := paces.of(task)) is not None]
     if known:
         return sum(known) * len(running) / len(known)

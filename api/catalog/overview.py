@@ -1,4 +1,4 @@
-"""The service as a whole: workers, queue, numbers, usage of projects, and the health of its parts."""
+"""Overview of the service: workers, queue, statistics, usage of projects, and health of its parts."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ from graspd.service.queue.port import QueueStatus
 
 _DAMAGE_SHOWN: Final = 5
 _JOBS_WATCHED: Final = 20
-#: The fingerprint is made anew at most this often, however many pages watch it [s].
+#: Least time between two computations of the fingerprint, for any number of watching pages [s].
 FINGERPRINT_S: Final = 1.0
 
 
 class Overview:
-    """What the home page, probes and Prometheus ask for; it changes nothing.
+    """Read-only data of the home page, probes and Prometheus.
 
-    Workers, queue and health are everybody's; what the jobs are and made is told in the caller's scope.
+    Workers, queue and health are visible to all; data of jobs is limited to the caller's scope.
     """
 
     def __init__(self, services: Services, jobs: Jobs) -> None:
@@ -55,7 +55,7 @@ class Overview:
         self._lock = threading.Lock()
 
     def workers(self) -> list[Worker]:
-        """Workers, the living first, each with the stage it does and the age of its lease."""
+        """Return workers, live ones first, each with its present stage and the age of its lease."""
         known = self._services.index.overview.workers()
         doing = self._services.index.feed.outputs([worker.task_id for worker in known if worker.task_id])
         seen = self._seen(worker.task_id for worker in known if worker.task_id)
@@ -73,7 +73,7 @@ class Overview:
         ]
 
     def task_of(self, worker: Worker) -> TaskView | None:
-        """What a worker does; a check of an upload is no task of the index."""
+        """Return a worker's task; None for a check of an upload, which is no task of the index."""
         if worker.state != "busy" or not worker.task_id:
             return None
         try:
@@ -85,7 +85,7 @@ class Overview:
         return self._services.index.overview.stats(scope=project_scope())
 
     def valid_per_minute(self, *, minutes: int = 60) -> list[int]:
-        """Valid grasps made in each of the last minutes, the oldest first."""
+        """Return the numbers of valid grasps made in each of the last minutes, oldest first."""
         start = datetime.now(UTC).replace(second=0, microsecond=0) - timedelta(minutes=minutes - 1)
         made = [0] * minutes
         for bucket in self._services.index.overview.throughput(
@@ -99,21 +99,21 @@ class Overview:
         return self._services.index.overview.failures(limit=limit, scope=project_scope())
 
     def depths(self) -> dict[tuple[Priority, Stage], int]:
-        """Waiting tasks by lane and stage."""
+        """Return the numbers of waiting tasks by priority and stage."""
         return self._services.queue.depths()
 
     def health(self) -> Health:
-        """State of the three parts; asked anew at most every two seconds."""
+        """Return the state of the three parts; probed at most every two seconds."""
         return self._probes.health()
 
     def damage(self) -> tuple[int, list[Damage]]:
-        """Number of objects of the store known to be damaged or missing, and the first of them, if all is in scope."""
+        """Return the number of damaged or missing objects in the store, and the first of them if in scope."""
         if not project_scope().everything:
             return 0, []
         return self._services.index.damage.known(limit=_DAMAGE_SHOWN)
 
     def snapshot(self) -> Snapshot:
-        """The service as Prometheus sees it; a part that is away leaves its numbers out."""
+        """Return the metrics for Prometheus, without those of a part that does not answer."""
         found = Snapshot()
         parts = self.health().parts
         found.add_parts({name: _seconds(part) for name, part in parts.items()})
@@ -126,7 +126,7 @@ class Overview:
         return found
 
     def fingerprint(self) -> str:
-        """Another text whenever a job or a task in scope, or a worker, changed."""
+        """Return a text that changes whenever a job or task in scope, or a worker, changes."""
         with self._lock:
             at, digest = self._fingerprints.get(project_scope(), (0.0, ""))
             now = time.monotonic()
@@ -142,7 +142,7 @@ class Overview:
         return digest_json({"stats": self.stats().model_dump(mode="json"), "workers": workers, "jobs": moving})
 
     def _seen(self, tasks: Iterable[str]) -> set[str]:
-        """Of these tasks, those in scope, and those that no job owns, such as the check of an upload."""
+        """Return those tasks that are in scope or belong to no job, such as the check of an upload."""
         wanted = set(tasks)
         return (
             wanted
@@ -151,7 +151,7 @@ class Overview:
         )
 
     def _queue_now(self) -> QueueStatus:
-        # A worker's registration lives for whole seconds: see `worker.process.heartbeat`.
+        # A worker's registration expires in whole seconds: see `worker.process.heartbeat`.
         return self._services.queue.now(lease_s=max(2, round(self._services.settings.lease_s)))
 
 
@@ -159,15 +159,15 @@ def _seconds(part: Part) -> float | None:
     return None if part.latency_ms is None else part.latency_ms / 1000
 
 
-#: The parts are asked anew at most this often [s].
+#: Least time between two probes of the parts [s].
 KEPT_S: Final = 2.0
-#: A part that has not answered by then counts as away [s].
+#: A part that does not answer within this time counts as unavailable [s].
 PATIENCE_S: Final = 2.0
 _INCOMPLETE: Final = "the controller makes it from the store now; until it has, jobs are missing from it"
 
 
 class Probes:
-    """Asks Redis, index and store at the same time, each in a thread of its own; one that hangs is not asked again."""
+    """Probes of Redis, index and store, in parallel threads; a hanging probe is not started again."""
 
     def __init__(self, services: Services, *, patience_s: float = PATIENCE_S) -> None:
         self._services = services
@@ -175,11 +175,11 @@ class Probes:
         self._known: tuple[float, Health] | None = None
         self._hanging: dict[str, _Probe] = {}
         self._service: str | None = None
-        """Whose Redis it was when it was last asked."""
+        """Service that Redis belonged to at the last probe."""
         self._lock = threading.Lock()
 
     def health(self) -> Health:
-        """State of the parts; ready while all three answer. Controller and workers are told, and not waited for."""
+        """Return the state of the parts; ready if all three answer. Controller and workers do not count."""
         with self._lock:
             now = time.monotonic()
             if self._known is None or now - self._known[0] > KEPT_S:
@@ -200,7 +200,7 @@ class Probes:
         return Health(ok=all(part.ok for part in parts.values()), parts=parts, controller=controller, workers=workers)
 
     def _redis(self) -> Part:
-        """A Redis of another service is not ready: its controller and workers know nothing of this one's jobs."""
+        """Probe Redis; one of another service is not ready: its controller ignores the jobs of this one."""
         part, service = _answering(self._services.queue.ping()), self._services.queue.service()
         if service != self._service:
             try:
@@ -208,12 +208,12 @@ class Probes:
             except BusyError as error:
                 return part.model_copy(update={"ok": False, "detail": str(error)})
             except StoreUnavailable:
-                return part  # the store's own part tells that
+                return part  # the probe of the store reports this
             self._service = service
         return part
 
     def _index(self) -> Part:
-        """An index that may lack what the store has is not ready: jobs would seem to be gone."""
+        """Probe the index; an incomplete one is not ready, because jobs would appear to be missing."""
         part, made = _answering(self._services.index.database.ping()), self._services.index.notes.completeness()
         if made is None:
             return part.model_copy(update={"ok": False, "detail": _INCOMPLETE})
@@ -236,7 +236,7 @@ def _answering(seconds: float) -> Part:
 
 
 class _Probe:
-    """One question to one part."""
+    """One probe of one part."""
 
     def __init__(self, name: str, question: Callable[[], Part]) -> None:
         self._question = question
@@ -245,7 +245,7 @@ class _Probe:
         self.thread.start()
 
     def part(self, deadline: float) -> Part:
-        """The answer, if it came by then."""
+        """Return the result, if it arrives before the deadline."""
         start = time.monotonic()
         self.thread.join(max(0.0, deadline - start))
         return self._part or Part(ok=False, detail="it has not answered in time; see the log of the part itself")
@@ -259,24 +259,24 @@ class _Probe:
             self._part = Part(ok=False, detail=f"{type(error).__name__}: {error}")
 
 
-#: Days that are told where nobody asks for others.
+#: Default number of days reported.
 DAYS: Final = 31
 MOST_DAYS: Final = 366
 _COLUMNS: Final = tuple(UsageDay.model_fields)
 
 
 class Usage:
-    """Use in the caller's scope: of the project of the key, and with `admin` of all."""
+    """Usage in the caller's scope: the key's project, or all with `admin`."""
 
     def __init__(self, services: Services, keys: KeyFile) -> None:
         self._services = services
         self._keys = keys
 
     def days(self, since: date | None = None, until: date | None = None) -> list[UsageDay]:
-        """Each project's use of each day, the newest first; by default of the last month.
+        """Return the usage of each project on each day, newest first; by default of the last month.
 
         Raises:
-            InputError: the days are in no order, or more than a year.
+            InputError: the days are out of order, or span more than a year.
         """
         last = until or datetime.now(UTC).date()
         first = since or last - timedelta(days=min(DAYS - 1, last.toordinal() - 1))
@@ -287,7 +287,7 @@ class Usage:
         return self._services.index.usage.days(first.isoformat(), last.isoformat(), scope=project_scope())
 
     def limits(self) -> dict[str, ProjectLimits]:
-        """What each project in scope may use together."""
+        """Return the shared limits of each project in scope."""
         key = caller.get()
         if key is None:
             return {}
@@ -295,7 +295,7 @@ class Usage:
 
 
 def as_csv(days: list[UsageDay]) -> str:
-    """A table with a line of names (RFC 4180)."""
+    """Format a table with a header line (RFC 4180)."""
     text = io.StringIO()
     table = csv.writer(text)
     table.writerow(_COLUMNS)

@@ -1,4 +1,4 @@
-"""Shards: the files that jobs make, and what their manifests say."""
+"""Shards: the files of jobs, and the content of their manifests."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Shards:
         limit: int = 50,
         cursor: str | None = None,
     ) -> Page[Shard]:
-        """Shards, all or those of a job."""
+        """Return shards, all or those of a job."""
         page = self._services.index.shards.page(job=job, kind=kind, limit=limit, cursor=cursor, scope=project_scope())
         return Page[Shard](items=[_shard(shard) for shard in page.items], next=page.next)
 
@@ -35,37 +35,37 @@ class Shards:
         return _shard(self._services.index.shards.get(shard_id, scope=project_scope()))
 
     def intact(self, shard_id: str) -> Shard:
-        """A shard whose file is what its checksum says; read through once, then again only where it was changed.
+        """Return a shard whose file matches its checksum; a file is read again only after it changed.
 
         Raises:
-            DamagedShard: its file is gone, or has another checksum.
+            DamagedShard: its file is missing, or does not match its checksum.
         """
         shard = self.one(shard_id)
         self._checked.check(shard.key, shard.sha256)
         return shard
 
     def address(self, shard: Shard) -> str | None:
-        """Where the store itself hands the file out to a GET; None where it does not."""
+        """Return the address at which the store itself serves the file to GET; None if it does not."""
         return self._services.store.sign(shard.key)
 
     def size(self, shard: Shard) -> int:
-        """Bytes of the file as it lies in the store."""
+        """Return the size of the file in the store [bytes]."""
         return self._services.store.size(shard.key)
 
     def stream(self, shard: Shard, start: int, length: int) -> Iterator[bytes]:
-        """Bytes of the file, in chunks that are what they were when it was found intact.
+        """Yield bytes of the file in chunks, unchanged since the file was found intact.
 
         Raises:
-            DamagedShard: they are not; from the iterator as well, which then ends before its end.
+            DamagedShard: they changed; raised by the iterator too, which then stops early.
         """
         return self._checked.stream(shard.key, shard.sha256, start, length)
 
     def job_of(self, shard_id: str) -> str | None:
-        """A job that a shard belongs to; None where it is gone."""
+        """Return a job that a shard belongs to; None if it is deleted."""
         return self._services.index.shards.job_of(shard_id, scope=project_scope())
 
     def assets_of(self, ids: Collection[str]) -> dict[str, tuple[str, str]]:
-        """Digests of the hand and the object of each shard."""
+        """Return the digests of the hand and the object of each shard."""
         return self._services.index.shards.assets_of(ids)
 
 

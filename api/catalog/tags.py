@@ -26,23 +26,23 @@ class Tags:
         self._grasps = grasps
 
     def all(self) -> list[TagView]:
-        """Tags in scope, by name."""
+        """Return tags in scope, by name."""
         return self._services.index.tags.all(scope=project_scope())
 
     def one(self, name: str) -> TagView:
-        """A tag by its name or id."""
+        """Return a tag by its name or id."""
         wanted = self._services.index.tags.named(name, scope=project_scope())
         return next(tag for tag in self.all() if tag.id == wanted)
 
     def of(self, grasps: Collection[Grasp]) -> dict[Grasp, list[str]]:
-        """Names of the tags of each of these grasps that has one."""
+        """Return the tag names of each of these grasps that has tags."""
         return self._services.index.tags.of(grasps, scope=project_scope())
 
     def chosen(self, selection: Selection) -> list[Grasp]:
-        """The grasps of a selection, each once, in order.
+        """Return the grasps of a selection, each once, in order.
 
         Raises:
-            NotFoundError: one that is named is not there, or not in scope.
+            NotFoundError: a listed grasp does not exist or is out of scope.
         """
         if selection.filter is not None:
             return self._grasps.members(selection.filter)
@@ -54,12 +54,12 @@ class Tags:
         return named
 
     def give(self, name: str, selection: Selection) -> TagChange:
-        """Give a tag of the caller's project to grasps; it is made if it is not there.
+        """Give a tag of the caller's project to grasps; a new tag is created.
 
         Raises:
-            InputError: no grasp is chosen.
-            NotYours: another key made it.
-            LimitError: there are `MOST_TAGS` of them, or too many grasps would have it.
+            InputError: the selection is empty.
+            NotYours: another key made the tag.
+            LimitError: there are already `MOST_TAGS` tags, or too many grasps would have it.
         """
         if not (grasps := self.chosen(selection)):
             raise InputError("no grasp passes this filter, so none gets the tag")
@@ -75,27 +75,27 @@ class Tags:
         return TagChange(tag=self.one(tag_id(name, project)), changed=changed)
 
     def take_off(self, name: str, selection: Selection) -> TagChange:
-        """Take a tag off grasps.
+        """Remove a tag from grasps.
 
         Raises:
-            NotYours: another key made it.
+            NotYours: another key made the tag.
         """
         tag = self._services.index.tags.named(name, scope=project_scope())
         changed = tagging.take_off(self._services, tag, self.chosen(selection), permit=_permit)
         return TagChange(tag=self.one(tag), changed=changed)
 
     def remove(self, name: str) -> None:
-        """Take a tag away; its grasps stay.
+        """Delete a tag; its grasps remain.
 
         Raises:
-            NotYours: another key made it.
+            NotYours: another key made the tag.
         """
         tag = self._services.index.tags.named(name, scope=project_scope())
         tagging.remove(self._services, tag, permit=_permit, owner=caller_id())
         log.info("tag %s removed", name)
 
     def _mine(self, project: str) -> int:
-        """Tags of the project; where it has no name, those of the caller's key."""
+        """Return the number of tags of the project; without a project name, of the caller's key."""
         found = self._services.index.tags.all(scope=ProjectScope(project, everything=False))
         return sum(bool(project) or may_change(tag.owner, tag.project) for tag in found)
 

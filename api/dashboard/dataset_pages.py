@@ -1,5 +1,4 @@
-"""Pages of datasets: the hand x object matrix of all work and of each dataset, actions on its cells, and the comparison
-of two."""
+"""Pages of datasets: hand x object matrix of all jobs and of each dataset, actions, and comparison."""
 
 from __future__ import annotations
 
@@ -32,13 +31,13 @@ from graspd.service.model.states import AssetKind, State
 from graspd.service.pipeline.datasets.spec import DatasetRequest
 
 PAGE_SIZE: Final = 20
-#: A matrix of more cells is shown as a list, a page at a time: nobody reads a table of ten thousand fields.
+#: Largest matrix shown as a table; larger ones are shown as a paginated list, which is easier to read.
 MATRIX_CELLS: Final = 1000
 _CELLS_AT_ONCE: Final = 200
 _MAX_FIELDS: Final = 4000
 _DONE: Final = {"submit": "submitted", "retry": "retried", "cancel": "cancelled", "snapshot": "taken as a snapshot"}
 
-#: Fields of the form of a dataset, and what stands there at first.
+#: Fields of a dataset's form, and their initial values.
 _MAKE: Final = {"name": "", "grasps": "320", "fidelity": "standard"} | {
     one.name: one.default for one in inputs_of(cells=True)
 }
@@ -53,13 +52,13 @@ def datasets_page(
     assets: AssetsOf,
     cursor: Annotated[str | None, Query(max_length=512)] = None,
 ) -> HTMLResponse:
-    """All datasets, and every hand on every object that the service knows."""
+    """Show all datasets, and all hands and objects of the service as a matrix."""
     return _overview(request, datasets, assets, cursor=cursor)
 
 
 @router.post("", dependencies=[Depends(may_submit)], response_model=None)
 async def create(request: Request, datasets: DatasetsOf, assets: AssetsOf) -> HTMLResponse | RedirectResponse:
-    """Make a dataset of the form."""
+    """Make a dataset from the form."""
     async with request.form(max_fields=_MAX_FIELDS) as fields:
         return await run_in_threadpool(_create, request, datasets, assets, fields)
 
@@ -68,7 +67,7 @@ async def create(request: Request, datasets: DatasetsOf, assets: AssetsOf) -> HT
 async def act_on_pairs(
     request: Request, jobs: JobsOf, datasets: DatasetsOf, assets: AssetsOf
 ) -> HTMLResponse | RedirectResponse:
-    """Submit, retry or cancel the jobs of chosen pairs."""
+    """Submit, retry or cancel the jobs of selected pairs."""
     async with request.form(max_fields=_MAX_FIELDS) as fields:
         return await run_in_threadpool(_act_on_pairs, request, jobs, datasets, assets, fields)
 
@@ -81,7 +80,7 @@ def dataset_page(
     state: str = "",
     cursor: Annotated[str | None, Query(max_length=512)] = None,
 ) -> HTMLResponse:
-    """One dataset: its matrix, its progress, its snapshots."""
+    """Show one dataset: matrix, progress and snapshots."""
     dataset = datasets.one(name)
     chosen = State(state) if state in set(State) else None
     as_matrix = dataset.cells <= MATRIX_CELLS and chosen is None
@@ -105,7 +104,7 @@ def dataset_page(
 
 @router.post("/{name}/cells", dependencies=[Depends(may_submit)])
 async def act_on_cells(request: Request, name: str, jobs: JobsOf) -> RedirectResponse:
-    """Retry or cancel the jobs of chosen cells of a dataset."""
+    """Retry or cancel the jobs of selected cells of a dataset."""
     async with request.form(max_fields=_MAX_FIELDS) as fields:
         return await run_in_threadpool(_act_on_cells, jobs, name, fields)
 
@@ -179,7 +178,7 @@ def _jobs_of(jobs: Jobs, pairs: Iterable[tuple[str, str]], action: str) -> list[
 
 
 def _each(do: Callable[[Any], Any], wanted: Iterable[Any]) -> tuple[int, int]:
-    """How many took the action, and how many were another key's, or in a state that has no use for it."""
+    """Apply an action; return how often it succeeded, and how often owner or state did not allow it."""
     done = left = 0
     for one in wanted:
         try:
@@ -195,7 +194,7 @@ def _redirect(address: str, action: str, *, done: int, left: int = 0) -> Redirec
 
 
 def _did(request: Request) -> str:
-    """What the last action did, in words."""
+    """Describe the result of the last action."""
     given = request.query_params
     done, left = given.get("done", ""), given.get("left", "0")
     if given.get("did") not in _DONE or not done.isdigit() or not left.isdigit():
@@ -254,7 +253,7 @@ def _overview(
     )
 
 
-#: Datasets that the fields of the page offer, the newest first.
+#: Datasets offered for comparison, newest first.
 _OFFERED: Final = 200
 
 comparison_router = APIRouter(include_in_schema=False)
@@ -266,7 +265,7 @@ Named = Annotated[str, Query(max_length=64)]
 def compare_page(
     request: Request, datasets: DatasetsOf, comparisons: ComparisonsOf, one: Named = "", other: Named = ""
 ) -> HTMLResponse:
-    """What two datasets asked for, what each cell came to, how good their grasps are; the address can be shared."""
+    """Compare two datasets: options, yields of cells, metrics of grasps. The URL can be shared."""
     found = comparisons.of(one, other) if one and other else None
     shown = {key: (label, unit) for key, label, unit in COLUMNS}
     return render(

@@ -1,5 +1,4 @@
-"""Figures of the pages: charts as SVG without scripts, the hand x object matrix, and maps of failure as coloured
-cells."""
+"""Figures of the pages: charts as SVG without scripts, the hand x object matrix, and maps of failure."""
 
 from __future__ import annotations
 
@@ -29,14 +28,14 @@ from graspd.service.model.studies import (
 from graspd.service.store.records import STABILITY, latest
 from graspd.service.store.store import Store
 
-#: Coordinates of a chart's inside; the SVG stretches it to the page.
+#: Size of a chart's plot area; the SVG stretches it to the page.
 WIDTH: Final = 600.0
 HEIGHT: Final = 160.0
 
 
 @dataclass(frozen=True)
 class Plot:
-    """A line or bars: SVG points for readers without a script, the numbers for the script."""
+    """Line or bars: SVG points for browsers without scripts, and numbers for the script."""
 
     label: str
     points: str
@@ -46,7 +45,7 @@ class Plot:
 
 @dataclass(frozen=True)
 class Bar:
-    """One bar of a histogram and the address of the grasps in it."""
+    """Bar of a histogram, and the address of its grasps."""
 
     x: float
     y: float
@@ -59,10 +58,10 @@ class Bar:
 
 
 def line(xs: Sequence[float], ys: Sequence[float], *, x: str, y: str, unit: str = "", log: bool = False) -> Plot:
-    """A line through points; on a logarithmic axis values at or below zero are left out.
+    """Draw a line through points; a logarithmic axis omits values at or below zero.
 
     Args:
-        x: name of the horizontal axis with its unit.
+        x: name of the horizontal axis, with its unit.
         y: name of the values.
         unit: of the values.
     """
@@ -82,7 +81,7 @@ def line(xs: Sequence[float], ys: Sequence[float], *, x: str, y: str, unit: str 
 
 
 def minutes(values: Sequence[int], start: float, *, step_s: int = 60) -> Plot:
-    """Bars of what was made in each interval from `start` [s since 1970] on."""
+    """Draw bars of the grasps made in each interval from `start` [s since 1970]."""
     top = max([*values, 1])
     width = WIDTH / max(len(values), 1)
     points = " ".join(
@@ -105,10 +104,10 @@ def minutes(values: Sequence[int], start: float, *, step_s: int = 60) -> Plot:
 
 
 def bars(histogram: Histogram, path: str, where: dict[str, str]) -> list[Bar]:
-    """The bars of a histogram; each leads to the grasps whose metric lies in it.
+    """Return the bars of a histogram; each links to the grasps whose metric is in its range.
 
     Args:
-        path: the page of the list.
+        path: page of the list.
         where: its other filters.
     """
     count = len(histogram.counts)
@@ -124,19 +123,19 @@ def bars(histogram: Histogram, path: str, where: dict[str, str]) -> list[Bar]:
 
 @dataclass(frozen=True)
 class TwinBar:
-    """Shares of two sets of grasps in one bin, side by side."""
+    """Shares of two sets of grasps in one bin."""
 
     x: float
     one: float
     other: float
-    """Heights."""
+    """Heights of both bars."""
     low: float
     high: float
     shares: tuple[float, float]
 
 
 def twins(both: Sequence[Distribution | None]) -> list[TwinBar]:
-    """The bins of two distributions over the same range, each a share of its own grasps."""
+    """Return the bins of two distributions over the same range, as shares of their own grasps."""
     first = next(each for each in both if each is not None)
     bins = len(first.counts)
     shares = [[n / each.count for n in each.counts] if each is not None else [0.0] * bins for each in both]
@@ -153,14 +152,16 @@ def _share(value: float, low: float, high: float) -> float:
 
 #: Steps of the colour scale; the style sheet has a class for each.
 STEPS: Final = 10
-#: More objects than this are too long a page; those with work come first.
+#: Most objects on a page; those with jobs come first.
 _ROWS: Final = 60
 
 
 @dataclass(frozen=True)
 class Tile:
-    """One hand on one object. `made` counts grasps of its `standing`; `share` is the valid part of the validated;
-    `value` is what its checkbox sends, `href` where it leads."""
+    """One hand on one object.
+
+    `made` counts grasps of its `standing`; `share` is the valid share of the validated ones. The checkbox sends
+    `value`; the link is `href`."""
 
     hand: str
     object: str
@@ -175,17 +176,17 @@ class Tile:
     progress: float | None = None
     note: str = ""
     scene: str = "free"
-    """Kind of the scene in which its grasps are valid."""
+    """Kind of scene in which its grasps are valid."""
 
     @property
     def shade(self) -> str:
-        """Class of the cell's colour: by yield, or none while there is nothing to validate."""
+        """CSS class of the cell's colour: by yield; `none` without validated grasps."""
         return "none" if self.share is None else f"y{min(STEPS, int(STEPS * self.share + 0.5))}"
 
 
 @dataclass(frozen=True)
 class Grid:
-    """Rows are objects, columns are hands."""
+    """Matrix with objects as rows and hands as columns."""
 
     hands: list[str]
     rows: list[tuple[str, list[Tile | None]]]
@@ -193,7 +194,7 @@ class Grid:
 
 
 def of_dataset(dataset: DatasetView, cells: Sequence[CellView]) -> Grid:
-    """The matrix of a dataset."""
+    """Return the matrix of a dataset."""
     found = {
         (cell.hand, cell.object): Tile(
             hand=cell.hand,
@@ -215,7 +216,7 @@ def of_dataset(dataset: DatasetView, cells: Sequence[CellView]) -> Grid:
 
 
 def of_service(cells: Iterable[MatrixCell], hands: Sequence[str], objects: Sequence[str]) -> Grid:
-    """The matrix of everything: all known hands and objects, with what their jobs came to."""
+    """Return the matrix of the service: all known hands and objects, with the results of their jobs."""
     found = {
         (cell.hand, cell.object): Tile(
             hand=cell.hand,
@@ -253,24 +254,24 @@ def _state(cell: MatrixCell) -> str:
     return State.FAILED.value if cell.failed else State.SUCCEEDED.value
 
 
-#: Width and height of a cell with its gap, as the style sheet has them [px]: lines are drawn over the cells.
+#: Width and height of a cell with its gap [px], as in the style sheet: lines are drawn over the cells.
 PITCH: Final = (40, 30)
 
 
 @dataclass(frozen=True)
 class CellSquare:
-    """A cell as it is drawn."""
+    """Cell of a map, ready to draw."""
 
     outcome: Outcome
     text: str
     said: str
-    """All about it in one line, for whoever points at it."""
+    """Description in one line, for the tooltip."""
     ringed: bool
 
 
 @dataclass(frozen=True)
 class Panel:
-    """One method or family: rows from the top down, columns from the left."""
+    """Panel of one method or family: rows from the top, columns from the left."""
 
     name: str
     x: str
@@ -278,7 +279,7 @@ class Panel:
     columns: list[str]
     rows: list[tuple[str, list[CellSquare | None]]]
     line: str
-    """Points of the boundary that theory gives, over the cells."""
+    """Points of the theoretical boundary, over the cells."""
 
     @property
     def width(self) -> int:
@@ -291,7 +292,7 @@ class Panel:
 
 @dataclass(frozen=True)
 class Share:
-    """A part of a bar that is 100 wide."""
+    """Part of a bar of width 100."""
 
     outcome: Outcome
     count: int
@@ -301,7 +302,7 @@ class Share:
 
 @dataclass(frozen=True)
 class MapDrawing:
-    """One map with what is said beneath it."""
+    """One map with the numbers below it."""
 
     map: StabilityMap
     panels: list[Panel]
@@ -311,7 +312,7 @@ class MapDrawing:
 
 
 def load(store: Store) -> Stability | None:
-    """The maps that were published last; None where there are none that can be read."""
+    """Load the last published maps; None if there are none, or if they cannot be read."""
     try:
         found = latest(store, STABILITY)
         return None if found is None else from_json(found)
@@ -320,7 +321,7 @@ def load(store: Store) -> Stability | None:
 
 
 def draw(one: StabilityMap) -> MapDrawing:
-    """A map as panels and numbers."""
+    """Convert a map to panels and numbers."""
     return MapDrawing(
         map=one,
         panels=[_panel(one, name) for name in one.panels],
@@ -336,7 +337,7 @@ def _panel(one: StabilityMap, name: str) -> Panel:
     squares = {(cell.x, cell.y): _square(one, cell, ringed=one.is_divided and cell.reached) for cell in cells}
     line = one.lines.get(name, [])
     if any(isinstance(x, str) for x in xs):
-        # Words stand better before a row than under a narrow column.
+        # Words fit better before a row than under a narrow column.
         rows = [(tick(x), [squares.get((x, y)) for y in ys]) for x in xs]
         return Panel(name, one.y, one.x, [tick(y) for y in ys], rows, "")
     upward = ys if all(isinstance(y, str) for y in ys) else ys[::-1]

@@ -1,8 +1,8 @@
-"""The hand and the object of the form of a job: a known one, or a file of the user's.
+"""Hand and object of a job's form: a known one, or a file from the user.
 
-What a form shows is what it runs. A file that was refused is neither forgotten nor replaced by a known object: it lies
-in the store, the form names it, and the next press checks it again under the options that the form then has. What a
-refusal suggests are buttons of the form: a visitor need not know the options of a command line.
+The form shows exactly what the job will use. A refused file is neither dropped nor replaced by a known object: it stays
+in the store, the form refers to it, and the next submission checks it again with the form's options. Fixes suggested by
+a refusal are buttons of the form: users need not know options of the command line.
 """
 
 from __future__ import annotations
@@ -26,37 +26,37 @@ from graspd.service.store.descriptions import json_object
 
 _CHECK_WAIT_S: Final = 15.0
 UNITS: Final = (("m", "metres"), ("mm", "millimetres"), ("cm", "centimetres"), ("in", "inches"))
-#: What a button says of the option that it sets.
+#: Text of a button, by the option that it sets.
 _FIXES: Final = {
     "keep_largest": "Keep the largest part alone",
     "compound": "Take the parts as one rigid body",
     "allow_open": "Take it as it is, open",
 }
-#: Options whose value a visitor chooses: label of the field, its attributes, what the button says.
+#: Options with a value from the user: label of the field, its attributes, text of the button.
 _ASKED: Final = {
     "scale_to": ("Longest side [mm]", 'type="number" min="1" max="3000" step="any"', "Scale it to this size"),
     "root": ("Link", 'type="text" maxlength="200"', "Begin the hand there"),
 }
-#: The field of a kind's file.
+#: Form field of each kind's file.
 FILE_FIELDS: Final = {AssetKind.HAND: "hand_file", AssetKind.OBJECT: "file"}
 
 
 @dataclass(frozen=True)
 class Fix:
-    """A button that checks a refused file again."""
+    """Button that checks a refused file again."""
 
     value: str
-    """Keys of `asset.json` that it sets, as JSON; a value of null stands for the field beside the button."""
+    """Keys of `asset.json` that it sets, as JSON; null stands for the value of the field beside the button."""
     words: str
     asks: str = ""
-    """The key whose value is in a field beside the button; empty: none."""
+    """Key whose value is in a field beside the button; empty: none."""
     label: str = ""
     attributes: str = ""
 
 
 @dataclass(frozen=True)
 class Refusal:
-    """Why a file cannot be used, in words for a page."""
+    """Reason why a file cannot be used, as text for a page."""
 
     problem: str
     fixes: tuple[Fix, ...] = ()
@@ -64,24 +64,24 @@ class Refusal:
 
 @dataclass(frozen=True)
 class AssetChoice:
-    """What a form says of its hand or its object."""
+    """Hand or object of a form."""
 
     name: str = ""
-    """Of the asset that the job gets; empty: there is none yet."""
+    """Name of the job's asset; empty: none yet."""
     refused: Refusal | None = None
-    """Why there is none."""
+    """Reason why there is none."""
     file: str = ""
-    """How a file that cannot be used is called."""
+    """Name of the file that cannot be used."""
     held: str = ""
-    """Digest under which that file lies in the store; empty: it has to be chosen again."""
+    """Digest of that file in the store; empty: it must be chosen again."""
 
     def place(self, kind: AssetKind) -> str:
-        """The field of the form that a refusal belongs to."""
+        """Return the form field that a refusal belongs to."""
         return FILE_FIELDS[kind] if self.file else kind.value
 
 
 def chosen(request: Request, assets: Assets, fields: FormData, kind: AssetKind) -> AssetChoice:
-    """The hand or object that a submitted form means: its file, else the file that it holds, else the known one."""
+    """Return the hand or object of a submitted form: its file, a known one, or its refused file."""
     file, known = fields.get(FILE_FIELDS[kind]), _text(fields, kind.value)
     if isinstance(file, UploadFile) and file.filename:
         try:
@@ -100,9 +100,9 @@ def chosen(request: Request, assets: Assets, fields: FormData, kind: AssetKind) 
 
 
 def refusal_of(asset: AssetView) -> Refusal:
-    """What the check of an asset says, with the options that it suggests as buttons.
+    """Return an asset's refusal, with suggested options as buttons.
 
-    What an upload says of itself stands beside what its check found, so facts may be of any type.
+    Facts mix data from the upload with findings of the check, so they may be of any type.
     """
     facts = asset.facts
     lengths = facts.get("lengths_m")
@@ -129,7 +129,7 @@ def _length(lengths: Any, unit: str) -> str:
 
 
 def _fix(options: dict[str, Any]) -> Fix | None:
-    """The button of suggested options; None: this form has no words for them."""
+    """Return the button of suggested options; None if this form cannot express them."""
     ((key, value),) = options.items() if len(options) == 1 else (("", None),)
     if key in _ASKED and value is None:
         label, attributes, words = _ASKED[key]
@@ -152,7 +152,7 @@ def _store(request: Request, assets: Assets, kind: AssetKind, file: UploadFile, 
 
 
 def _again(assets: Assets, kind: AssetKind, digest: str, fields: FormData) -> AssetView:
-    """The same file under the units that the form has now, or what the pressed button suggests."""
+    """Store the file again with the units of the form, or with the options of the pressed button."""
     before, said = assets.one(kind, digest), pressed(fields, kind)
     if not said and kind is AssetKind.OBJECT and (units := _units(fields)) != _text(fields, "held_units"):
         said = {"units": units}
@@ -167,10 +167,10 @@ def _again(assets: Assets, kind: AssetKind, digest: str, fields: FormData) -> As
 
 
 def pressed(fields: FormData, kind: AssetKind) -> dict[str, Any]:
-    """Options of the button that was pressed instead of the form's own, each value of null from its field.
+    """Return the options of the pressed button; values of null come from its field.
 
     Raises:
-        InputError: its field is empty, or holds no number where one is asked for.
+        InputError: its field is empty, or is not a number where one is required.
     """
     said = json_object(text, "the option") if (text := _text(fields, f"{kind.value}_fix")) else {}
     for key in [key for key, value in said.items() if value is None and key in _ASKED]:
@@ -185,7 +185,7 @@ def pressed(fields: FormData, kind: AssetKind) -> dict[str, Any]:
 
 
 def _checked(assets: Assets, asset: AssetView) -> AssetChoice:
-    """Give a worker a moment to check an upload, so that one press of the button is enough."""
+    """Wait briefly for the check of an upload, so that one press of the button is enough."""
     deadline = time.monotonic() + _CHECK_WAIT_S
     while asset.verdict is None and time.monotonic() < deadline:
         time.sleep(0.2)
@@ -196,7 +196,7 @@ def _checked(assets: Assets, asset: AssetView) -> AssetChoice:
 
 
 def choices(assets: Assets, kind: AssetKind, shown: str, one: AssetChoice) -> list[tuple[str, str]]:
-    """Names to choose from, the one that the form shows always among them."""
+    """Return the names to choose from, always including the one that the form shows."""
     known = asset_choices(assets, kind)
     if one.refused:
         return [("", f"your file {one.file} (refused)" if one.file else f"choose a {kind.value}"), *known]
@@ -206,12 +206,12 @@ def choices(assets: Assets, kind: AssetKind, shown: str, one: AssetChoice) -> li
 
 
 def asset_choices(assets: Assets, kind: AssetKind) -> list[tuple[str, str]]:
-    """Names to choose from, with a word on those that cannot be used now."""
+    """Return the names to choose from; those still being checked are marked."""
     try:
         known = assets.page(kind, limit=200).items
     except GraspdError:
         return []
-    # Of several versions of a name the newest is meant.
+    # Of several versions of a name, use the newest.
     newest = {asset.name: asset for asset in reversed(known)}
     return [
         (name, name if one.builtin or one.verdict else f"{name} (being checked)")

@@ -1,5 +1,4 @@
-"""The form of a job, its expected cost for each fidelity, and its buttons: submit, cancel, retry. They work without
-JavaScript."""
+"""Form of a job: estimated cost for each fidelity; submit, cancel and retry. Needs no JavaScript."""
 
 from __future__ import annotations
 
@@ -38,7 +37,7 @@ router = APIRouter(include_in_schema=False)
 
 @dataclass(frozen=True)
 class FormInput:
-    """An option of a job as a form shows it."""
+    """Form field of a job's option."""
 
     name: str
     label: str
@@ -51,7 +50,7 @@ class FormInput:
 
     @classmethod
     def of(cls, row: Row, form: Form) -> FormInput:
-        """The field of a row of the options' table."""
+        """Create the field of a row of the options' table."""
         kind = "checkbox" if row.kind is bool else "select" if form.choices else "text"
         limits: dict[str, Any] = {}
         if row.kind in (int, float):
@@ -67,7 +66,7 @@ class FormInput:
 
 
 def inputs_of(section: str = "", *, cells: bool = False) -> list[FormInput]:
-    """Options that the form of a job shows, in one section or all; with `cells`, those that a dataset's form shows."""
+    """Return fields of a job's form, in one section or all; with `cells`, those of a dataset's form."""
     shown = [(row, row.form) for row in rows(JobOptions, "job") if row.form is not None]
     return [
         FormInput.of(row, form) for row, form in shown if section in ("", form.section) and (form.cells or not cells)
@@ -79,24 +78,24 @@ DEFAULTS: Final = {"hand": "allegro", "object": "mug"} | {one.name: one.default 
 
 @router.get("/submit", dependencies=[Depends(may_read)])
 def submit_page(request: Request, assets: AssetsOf) -> HTMLResponse:
-    """The form; parameters of the address fill it in."""
+    """Show the form; URL parameters fill it in."""
     given = {key: value for key, value in request.query_params.items() if key in DEFAULTS}
     return _form(request, assets, DEFAULTS | given)
 
 
 @router.get("/submit/refusals/{kind}/{digest}", dependencies=[Depends(may_read)])
 def refused(request: Request, kind: AssetKind, digest: str, assets: AssetsOf) -> HTMLResponse:
-    """Why an upload was refused and what may be done, as a part of the form."""
+    """Show why an upload was refused and how to fix it, as a part of the form."""
     found = refusal_of(assets.one(kind, digest))
     return render(request, "refusal.html", kind=kind.value, problem=found.problem, fixes=found.fixes)
 
 
 @router.post("/submit", dependencies=[Depends(may_submit)], response_model=None)
 async def submit(request: Request, jobs: JobsOf, assets: AssetsOf) -> HTMLResponse | RedirectResponse:
-    """Submit what the form says, after the upload of a hand or a mesh if there is one."""
+    """Submit the form, after the upload of a hand or a mesh if there is one."""
     async with request.form(max_files=2, max_fields=32) as fields:
         sent = any(isinstance(value, UploadFile) and value.filename for value in fields.values())
-        # A file that the form holds is read and awaited like one that was sent.
+        # A refused file that the form refers to is read and checked like an uploaded one.
         has_upload = sent or any(fields.get(f"{kind.value}_held") for kind in FILE_FIELDS)
         run = request.app.state.forms.run if has_upload else run_in_threadpool
         return await run(_submit, request, jobs, assets, fields)
@@ -117,7 +116,7 @@ def retry(job_id: str, jobs: JobsOf) -> RedirectResponse:
 
 
 def first_message(error: ValueError) -> str:
-    """The first mistake of a validation, in one line."""
+    """Return the first error of a validation, in one line."""
     return refusal(error) if isinstance(error, ValidationError) else str(error)
 
 
@@ -129,12 +128,12 @@ def _submit(request: Request, jobs: Jobs, assets: Assets, fields: FormData) -> H
     }
     form |= {one.name: fields.get(one.name) == "true" for one in inputs_of() if one.kind == "checkbox"}
     things = {kind: chosen(request, assets, fields, kind) for kind in FILE_FIELDS}
-    # Without a default: a form that names no object gets none.
+    # No default: a form that names no object gets none.
     form |= {kind.value: one.name for kind, one in things.items()}
     shown = DEFAULTS | form | {"units": fields.get("units") or "m"}
     refused = {one.place(kind): one.refused.problem for kind, one in things.items() if one.refused}
     if any(fields.get(f"{kind.value}_fix") for kind in FILE_FIELDS):
-        # The button of a suggestion shows what came of it; the next one submits.
+        # The button of a suggestion only shows its result; the next press submits.
         return _form(request, assets, shown, things=things, errors=refused, status=422 if refused else 200)
     try:
         named = {kind.value: one.name or "unnamed" for kind, one in things.items()}
@@ -155,7 +154,7 @@ def _by_field(error: ValidationError) -> dict[str, str]:
     errors: dict[str, str] = {}
     for entry in error.errors():
         said = words(entry)
-        # A rule over several fields has no place of its own, and mostly begins with the word of one.
+        # A rule over several fields has no field of its own; its message mostly starts with the name of one.
         word = said.partition(" ")[0]
         whole = next((name for name in DEFAULTS if word in (name, name.rpartition("_")[2])), "scenes")
         errors.setdefault(str(entry["loc"][0]) if entry["loc"] else whole, said)
@@ -192,7 +191,7 @@ def _form(
     )
 
 
-#: Costs of batches change slowly, and reading two thousand of them takes as long as a page may.
+#: Cache time [s]: costs of batches change slowly, and reading two thousand takes as long as a page may.
 KEPT_S: Final = 60.0
 WORDS: Final = {
     "draft": "Fewest points and starts. For a first look.",
@@ -203,34 +202,34 @@ WORDS: Final = {
 
 @dataclass(frozen=True)
 class FidelityPrice:
-    """A fidelity and its price."""
+    """Fidelity and its estimated cost."""
 
     name: str
     words: str
     seconds: float | None
-    """One worker's time for the whole job [s]; None: not known."""
+    """Time of one worker for the whole job [s]; None: unknown."""
     low: float | None
     high: float | None
-    """Interval of the seconds [s]."""
+    """Interval of the time [s]."""
     valid_yield: float | None
     origin: str
 
 
 def listed(text: str) -> list[str]:
-    """Names that a field of a form holds, between commas or spaces."""
+    """Split names of a form field at commas or spaces."""
     return text.replace(",", " ").split()
 
 
 class Expectations:
-    """Estimates for the form of a job; what it remembers between two requests may be lost."""
+    """Estimates for the form of a job; its state is only a cache."""
 
     def __init__(self, index: Index) -> None:
         self._index = index
         self._costs = _RememberedCosts(index.costs)
 
     def of(self, form: Mapping[str, Any]) -> list[FidelityPrice]:
-        """Every offered fidelity for what a form says; without numbers where it cannot be estimated."""
-        # An empty field says nothing.
+        """Estimate every offered fidelity for a form; without numbers if that is not possible."""
+        # An empty field counts as not given.
         wanted = {
             key: value for key, value in form.items() if key not in ("hand", "object", "fidelity") and value != ""
         }
@@ -249,7 +248,7 @@ class Expectations:
 
 
 class _RememberedCosts:
-    """Costs of batches, read at most once in a while."""
+    """Cache of the costs of batches."""
 
     def __init__(self, costs: Costs) -> None:
         self._costs = costs

@@ -1,4 +1,4 @@
-"""Pages of grasps: the list with its filters, one grasp in 3D, and forms for chosen grasps: tag, remove tag, export."""
+"""Pages of grasps: filtered list, one grasp in 3D, and forms to tag, untag and export grasps."""
 
 from __future__ import annotations
 
@@ -38,14 +38,14 @@ from graspd.service.model.metrics import AXIS_MEANINGS, GRASP_METRICS, GraspType
 from graspd.service.model.states import AssetKind
 
 PAGE_SIZES: Final = {"cards": 24, "table": 50}
-#: Sort key, label, unit of the metrics that lists of grasps show.
+#: Sort key, label and unit of the metrics shown in lists of grasps.
 COLUMNS: Final = tuple((metric.name, metric.column_title, metric.unit) for metric in indexed(IndexLevel.OFFERED))
-#: Metrics of which less is better: a first click sorts them upwards.
+#: Metrics of which less is better: the first click sorts them in ascending order.
 _LESS_IS_BETTER: Final = frozenset(metric.name for metric in indexed() if metric.less_is_better)
-#: Metrics that stand beside the verdict of a grasp.
+#: Metrics shown beside the verdict of a grasp.
 _BESIDE_VERDICT: Final = frozenset({"contact_links", "robustness", "robust_share", "grasp_type", "approach_cell"})
 
-#: What differs along the axes of models around the nominal one.
+#: Difference along each axis of the models around the nominal one.
 _WEAKEST: Final = {axis.word: words for axis, words in AXIS_MEANINGS.items()}
 
 router = APIRouter(include_in_schema=False)
@@ -55,10 +55,10 @@ router = APIRouter(include_in_schema=False)
 def grasps_page(
     request: Request, grasps: GraspsOf, shards: ShardsOf, assets: AssetsOf, tags: TagsOf
 ) -> HTMLResponse | RedirectResponse:
-    """Every grasp of the index: filters, order, pages. The address holds all of it, and no empty field."""
+    """List all grasps with filters, order and pages. The URL contains them all, without empty fields."""
     given = {key: value for key, value in request.query_params.items() if value}
     if len(given) < len(request.query_params):
-        # Forms send every field; what is shown in the browser and shared should be short.
+        # Forms send every field; the URL that is shown and shared should be short.
         return RedirectResponse(f"/grasps?{urlencode(given)}" if given else "/grasps", status_code=303)
     said = did(given)
     cursor, view = given.pop("cursor", None), given.pop("view", "cards")
@@ -95,7 +95,7 @@ def grasps_page(
         weakest=list(_WEAKEST.items()),
         limits={metric.name: metric.limits for metric in indexed(IndexLevel.OFFERED)},
         sort=query.sort,
-        # The default is no part of an address.
+        # The URL omits the default.
         sorts=[("" if key == GraspQuery().sort else key, label) for key, label, _ in COLUMNS],
         descending=query.order == "desc",
         links={key: _sort_link(request, query, key) for key, _, _ in COLUMNS},
@@ -111,7 +111,7 @@ def grasps_page(
 def grasp_page(
     request: Request, shard_id: str, row: int, grasps: GraspsOf, shards: ShardsOf, tags: TagsOf
 ) -> HTMLResponse:
-    """One grasp: 3D, verdict, quality, tags, and where it is kept."""
+    """Show one grasp: 3D view, verdict, metrics, tags, and its shard."""
     grasp, shard = grasps.one(shard_id, row), shards.one(shard_id)
     return render(
         request,
@@ -135,7 +135,7 @@ def grasp_page(
 def choice_of(
     tags: Tags, rows: Sequence[GraspView], known: Sequence[TagView], where: Mapping[str, str]
 ) -> dict[str, Any]:
-    """What a form that chooses grasps of a list shows: their tags, all tags, and the query of the list."""
+    """Return data of the form that selects grasps: their tags, all tags, and the query of the list."""
     return {
         "tagged": tags.of([(grasp.shard_id, grasp.row) for grasp in rows]),
         "tags": known,
@@ -172,7 +172,7 @@ def _view_link(request: Request, view: str) -> str:
 
 
 _MAX_FIELDS: Final = 400
-#: Longest query of a list that a form gives back.
+#: Longest query that a form returns.
 _LONGEST_FILTER: Final = 40_000
 _PAGES: Final = re.compile(r"/grasps(/[0-9a-f]{32}/[0-9]{1,10})?|/jobs/[0-9a-f]{32}")
 _NAME: Final[TypeAdapter[str]] = TypeAdapter(TagName)
@@ -186,28 +186,28 @@ T = TypeVar("T")
 
 @router.post("/grasps/tag", dependencies=[Depends(may_submit)])
 async def tag(request: Request, tags: TagsOf) -> RedirectResponse:
-    """Give a tag to the chosen grasps and show the list again."""
+    """Give a tag to the selected grasps and show the list again."""
     async with request.form(max_fields=_MAX_FIELDS) as fields:
         return await run_in_threadpool(_tag, tags, fields, on=True)
 
 
 @router.post("/grasps/untag", dependencies=[Depends(may_submit)])
 async def untag(request: Request, tags: TagsOf) -> RedirectResponse:
-    """Take a tag off the chosen grasps and show the list again."""
+    """Remove a tag from the selected grasps and show the list again."""
     async with request.form(max_fields=_MAX_FIELDS) as fields:
         return await run_in_threadpool(_tag, tags, fields, on=False)
 
 
 @router.post("/grasps/export", dependencies=[Depends(may_read)])
 async def export(request: Request, tags: TagsOf, exports: ExportsOf) -> StreamingResponse:
-    """The chosen grasps as a file."""
+    """Send the selected grasps as a file."""
     async with request.form(max_fields=_MAX_FIELDS) as fields:
         wanted = _checked(_FORMAT, fields.get("format") or "zip", "format")
         return await exported(request, tags, exports, _selection(fields), wanted)
 
 
 def did(given: dict[str, str]) -> str:
-    """What the last action did, in words; takes its parameters out of those of the address."""
+    """Describe the result of the last action; remove its parameters from those of the URL."""
     what, done, name = (given.pop(key, "") for key in ("did", "done", "named"))
     if what not in _DONE or not (done.isascii() and done.isdigit()) or len(done) > 9:
         return ""
@@ -232,10 +232,10 @@ def _tag(tags: Tags, fields: FormData, *, on: bool) -> RedirectResponse:
 
 
 def _selection(fields: FormData) -> Selection:
-    """The grasps whose boxes are ticked, or all of the list.
+    """Return the ticked grasps, or all of the list.
 
     Raises:
-        InputError: there are none, or they cannot be read.
+        InputError: no grasp is selected, or the selection is invalid.
     """
     try:
         if fields.get("all"):
@@ -252,7 +252,7 @@ def _selection(fields: FormData) -> Selection:
 def _filter(fields: FormData) -> list[tuple[str, str]]:
     text = str(fields.get("filter", ""))
     try:
-        # One that is cut off would choose more than the list shows.
+        # A truncated filter would select more than the list shows.
         if len(text) > _LONGEST_FILTER:
             raise ValueError
         return parse_qsl(text, max_num_fields=100)

@@ -1,4 +1,4 @@
-"""The pages of hands: the list, and one hand in 3D with what was guessed of it, to be corrected there."""
+"""Pages of hands: the list, and one hand in 3D with a form to correct its guesses."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from graspd.service.store.asset_summary import hand_line, limit_line, self_test_
 from graspd.service.store.descriptions import MAX_ENTRIES, HandFacts
 
 PAGE_SIZE: Final = 50
-#: A check takes seconds.
+#: Polling interval [s]; a check takes seconds.
 _CHECK_S: Final = 2
 _MAX_FIELDS: Final = 16 + 3 * MAX_ENTRIES
 _CENTRE_DIGITS_MM: Final = 3
@@ -34,9 +34,9 @@ router = APIRouter(prefix="/hands", include_in_schema=False)
 def hands_page(
     request: Request, assets: AssetsOf, cursor: Annotated[str | None, Query(max_length=512)] = None
 ) -> HTMLResponse:
-    """All hands, newest first, and the newest networks. Refused hands are among them: their page says why."""
+    """List all hands, newest first, and the newest networks. Includes refused hands: their page says why."""
     page = assets.page(AssetKind.HAND, limit=PAGE_SIZE, cursor=cursor, refused=True)
-    # What an upload says of itself stands beside what a check found: of any type.
+    # Facts mix data from the upload with findings of the check, so they may be of any type.
     numbers = {
         hand.digest: [
             len(told) if isinstance(told, list) else 0 for told in map(hand.facts.get, ("dofs", "fingertips"))
@@ -60,7 +60,7 @@ def hands_page(
 
 @router.get("/{name}", dependencies=[Depends(may_read)])
 def hand_page(request: Request, name: str, assets: AssetsOf) -> HTMLResponse:
-    """One hand in 3D, and the form that corrects it."""
+    """Show one hand in 3D, and the form to correct it."""
     hand = assets.one(AssetKind.HAND, name)
     facts, trouble = _facts(assets, hand)
     return _page(request, hand, facts, problem=trouble, form=_form_of(facts) if facts else {})
@@ -68,7 +68,7 @@ def hand_page(request: Request, name: str, assets: AssetsOf) -> HTMLResponse:
 
 @router.post("/{name}", dependencies=[Depends(may_submit)], response_model=None)
 async def correct(request: Request, name: str, assets: AssetsOf) -> HTMLResponse | RedirectResponse:
-    """Keep what the form says as another hand, and show that."""
+    """Store the corrections as another hand, and show it."""
     async with request.form(max_files=0, max_fields=_MAX_FIELDS) as fields:
         return await request.app.state.uploads.run(_correct, request, assets, name, fields)
 
@@ -122,7 +122,7 @@ _APPROACHES: Final = (
 
 
 def _facts(assets: Assets, hand: AssetView) -> tuple[HandFacts | None, str]:
-    """What was found of a hand, or why it cannot be shown; neither while it is being checked."""
+    """Return the facts of a hand, or why it cannot be shown; neither during its check."""
     try:
         return assets.hand_facts(hand), ""
     except NotFoundError:
@@ -132,7 +132,7 @@ def _facts(assets: Assets, hand: AssetView) -> tuple[HandFacts | None, str]:
 
 
 def _form_of(facts: HandFacts) -> dict[str, Any]:
-    """The form as it stands before anybody corrects."""
+    """Return the form before any correction."""
     form: dict[str, Any] = {"palm_link": facts.root, "name": "", "fingertips": facts.fingertips}
     for axis, centre, approach in zip("xyz", facts.palm_centre, facts.palm_approach, strict=True):
         form[f"centre_{axis}"] = f"{round(1e3 * centre, _CENTRE_DIGITS_MM):g}"
@@ -144,7 +144,7 @@ def _form_of(facts: HandFacts) -> dict[str, Any]:
 
 
 def _said(facts: HandFacts, form: dict[str, Any]) -> Iterator[tuple[str, Any]]:
-    """What of a form differs from what was found, as fields of a request."""
+    """Yield differences between form and facts, as fields of a request."""
     before = _form_of(facts)
     if name := form["name"].strip():
         yield "name", name

@@ -1,5 +1,4 @@
-"""The page of one job: stages, loss, quality, best grasps, attempts, files; and its pictures as PNG, whole or as
-thumbnails."""
+"""Page of a job: stages, loss, metrics, best grasps, attempts, files; pictures as PNG or thumbnail."""
 
 from __future__ import annotations
 
@@ -31,7 +30,7 @@ router = APIRouter(include_in_schema=False)
 
 @router.get("/jobs/{job_id}", dependencies=[Depends(may_read)])
 def job_page(request: Request, job_id: str, jobs: JobsOf, grasps: GraspsOf, tags: TagsOf) -> HTMLResponse:
-    """All of one job."""
+    """Show one job."""
     job = jobs.one(job_id)
     pictures = _pictures(job)
     shown = {key: (label, unit) for key, label, unit in COLUMNS}
@@ -78,7 +77,7 @@ def picture(
     channel: Channel = "rgb",
     width: Annotated[int | None, Query(ge=16, le=4096)] = None,
 ) -> Response:
-    """One rendered view as a PNG: colour, depth or segmentation, whole or no wider than `width` pixels."""
+    """Return one rendered view as PNG: colour, depth or segmentation, at most `width` pixels wide."""
     shard = shards.one(shard_id)
     data = request.app.state.pictures.png(shard.key, shard.sha256, index, channel, width)
     return Response(data, media_type="image/png", headers={"Cache-Control": "private, max-age=86400, immutable"})
@@ -91,7 +90,7 @@ def _loss(curve: LossCurve | None) -> figures.Plot | None:
 
 
 def _pictures(job: JobDetail) -> list[dict[str, Any]]:
-    """Every rendered picture; of a stereo pair the left one comes first."""
+    """List all rendered pictures; the left one of a stereo pair comes first."""
     eyes = ("left", "right") if job.request.stereo else ("",)
     return [
         {
@@ -105,9 +104,9 @@ def _pictures(job: JobDetail) -> list[dict[str, Any]]:
     ]
 
 
-#: A views shard of 48 pictures is a few megabytes; a page asks for several pictures of the same one.
+#: Cached shards. One of 48 pictures takes a few megabytes; a page requests several pictures of it.
 _KEPT_SHARDS: Final = 2
-#: Near to far: light and warm to dark and cool, with lightness falling all the way.
+#: From near to far: light and warm to dark and cool, with monotonically falling lightness.
 _DEPTH_COLOURS: Final = np.array(
     [(252, 244, 190), (250, 203, 116), (240, 148, 87), (205, 92, 103), (142, 58, 121), (78, 38, 108), (24, 18, 56)],
     np.float64,
@@ -121,17 +120,17 @@ _CLASSES: Final = np.array(
 
 
 class Pictures:
-    """Decodes pictures of views shards; keeps the shards it read last."""
+    """Decodes pictures of views shards, with a cache of recent shards."""
 
     def __init__(self, store: Store) -> None:
         self._fetch = lru_cache(maxsize=_KEPT_SHARDS)(partial(read_checked, store))
 
     def png(self, key: str, sha256: str, index: int, channel: Channel = "rgb", width: int | None = None) -> bytes:
-        """PNG of the picture at row `index` of a channel, no wider than `width` pixels.
+        """Return the picture at row `index` of a channel as PNG, at most `width` pixels wide.
 
         Raises:
             NotFoundError: the shard holds fewer pictures, or none of this channel.
-            DamagedShard: its file is gone, or not what its checksum says.
+            DamagedShard: its file is missing, or does not match its checksum.
         """
         with open_shard(self._fetch(key, sha256), name=key) as file:
             path = f"image/{channel}"
@@ -151,7 +150,7 @@ class Pictures:
 
 
 def paint_depth(depth: NDArray[Any]) -> NDArray[np.uint8]:
-    """Depth (H, W) [m] as colours (H, W, 3) over the range that this picture has; dark where there is nothing."""
+    """Colour depth (H, W) [m] as (H, W, 3) over the range of this picture; dark where nothing was hit."""
     seen = np.isfinite(depth)
     painted = np.empty((*depth.shape, 3), np.uint8)
     painted[:] = _NOTHING
@@ -165,7 +164,7 @@ def paint_depth(depth: NDArray[Any]) -> NDArray[np.uint8]:
 
 
 def paint_segmentation(labels: NDArray[Any]) -> NDArray[np.uint8]:
-    """Labels (H, W) as colours (H, W, 3); neighbours beyond the palette share its last colours."""
+    """Colour labels (H, W) as (H, W, 3); neighbours beyond the palette share its last colour."""
     return _CLASSES[np.minimum(labels, len(_CLASSES) - 1)]
 
 

@@ -1,6 +1,6 @@
-"""The dashboard as a whole: its pages, the stream that moves them, the meaning of problem types, the session.
+"""Dashboard: its pages, the event stream that updates them, problem types, and the session.
 
-Sign in with a key: the browser gets a signed cookie that ends with the key.
+Sign-in with a key sets a signed cookie, which is valid as long as the key.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from graspd.service.pipeline.backends import Services
 
 router = APIRouter(include_in_schema=False)
 
-#: Those of all pages, in the order in which they are asked.
+#: Routers of all pages, in matching order.
 routers: Final = (
     service_pages.router,
     job_pages.router,
@@ -39,7 +39,7 @@ routers: Final = (
 
 
 def install(app: FastAPI, services: Services) -> None:
-    """What the pages need of the application, besides their routes."""
+    """Set up what the pages need from the application, besides their routes."""
     app.state.templates = environment()
     app.state.pictures = Pictures(services.store)
     app.state.expectations = Expectations(services.index)
@@ -47,21 +47,21 @@ def install(app: FastAPI, services: Services) -> None:
 
 @router.get("/events", dependencies=[Depends(may_read)], response_class=EventSourceResponse)
 async def watch(request: Request, overview: OverviewOf) -> AsyncIterable[ServerSentEvent]:
-    """Says that something on the home page has changed."""
+    """Stream an event whenever something on the home page has changed."""
     async for event in events.service_events(overview, request):
         yield event
 
 
 @router.get("/docs", dependencies=[Depends(may_read)])
 def explorer(request: Request) -> HTMLResponse:
-    """Every route, to look at and to try."""
+    """Show every route, with a form to try it."""
     return render(request, "explorer.html")
 
 
 @router.get("/problems")
 @router.get("/problems/{slug}")
 def problem_types(request: Request, slug: str = "") -> HTMLResponse:
-    """What the types of problem documents mean."""
+    """Explain the types of problem documents."""
     types = [(name, error.status, (error.__doc__ or "").splitlines()[0]) for name, error in ERRORS.items()]
     types += [(name, status, text) for name, (status, text) in _HTTP_PROBLEMS.items()]
     return render(request, "problems.html", types=sorted(types, key=lambda row: (row[1], row[0])))
@@ -80,14 +80,14 @@ _HTTP_PROBLEMS: Final = {
 
 @router.get("/login")
 def login_page(request: Request) -> HTMLResponse:
-    """The form for the key; with a session, whose it is and the way out of it."""
+    """Show the form for the key; in a session, its key and the button to sign out."""
     key = request.scope["state"].get("key") if SESSION_COOKIE in request.cookies else None
     return render(request, "login.html", problem="", health=None, session=key.name if key else "")
 
 
 @router.post("/logout")
 def logout(request: Request) -> RedirectResponse:
-    """End the session of this browser. Others of the same key go on; revoking the key ends all of them."""
+    """End the session of this browser. Other sessions of the key continue; revoking it ends all of them."""
     response = RedirectResponse("/login", status_code=303)
     response.delete_cookie(SESSION_COOKIE, httponly=True, samesite="strict", secure=request.url.scheme == "https")
     return response
@@ -95,7 +95,7 @@ def logout(request: Request) -> RedirectResponse:
 
 @router.post("/login", response_model=None)
 def login(request: Request, key: Annotated[str, Form(max_length=200)]) -> HTMLResponse | RedirectResponse:
-    """Change a key for a cookie."""
+    """Exchange a key for a cookie."""
     keys: KeyFile = request.app.state.keys
     found = keys.find(key.strip())
     if found is None:

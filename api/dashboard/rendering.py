@@ -1,4 +1,4 @@
-"""Templates to pages, and snippets of code that load a job's files."""
+"""Rendering of templates, and code snippets that load a job's files."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ NAVIGATION: Final = (
     ("/chart", "Chart"),
     ("/stability", "Stability"),
 )
-#: Where there are keys, somebody may ask who used what.
+#: Pages shown only if there are keys: then usage can be attributed.
 _WITH_KEYS: Final = (("/usage", "Usage"),)
 
 
 def environment() -> Environment:
-    """Templates that escape everything and stop at an unknown name."""
+    """Create the template environment: it escapes everything and rejects unknown names."""
     made = Environment(
         loader=FileSystemLoader(_HERE / "templates"),
         autoescape=select_autoescape(),
@@ -45,8 +45,9 @@ def environment() -> Environment:
 
 
 def render(request: Request, template: str, *, status: int = 200, **context: Any) -> HTMLResponse:
-    """A page. `page` marks the place in the navigation, `events` the stream that moves it, `poll_s`
-    how often it looks again where no stream tells."""
+    """Render a page. `page` is its place in the navigation, `events` the stream that updates it.
+
+    `poll_s` is the interval of updates without a stream [s]."""
     context = {
         "page": "",
         "events": "",
@@ -58,7 +59,7 @@ def render(request: Request, template: str, *, status: int = 200, **context: Any
         "navigation": NAVIGATION if request.app.state.keys.is_open else NAVIGATION + _WITH_KEYS,
         "version": PACKAGE_VERSION,
         "signed_in": not request.app.state.keys.is_open,
-        # What the key may not do has no button; the routes refuse it all the same.
+        # Actions that the key does not permit have no button; the routes refuse them too.
         "may_submit": is_allowed(request, Scope.SUBMIT),
         "may_change": may_change,
         "grace_s": request.app.state.settings.shard_grace_s,
@@ -69,19 +70,19 @@ def render(request: Request, template: str, *, status: int = 200, **context: Any
 
 
 def base_url(request: Request) -> str:
-    """Where the visitor sees the service, without a slash at the end."""
+    """Return the address of the service as the visitor sees it, without a trailing slash."""
     return f"{str(request.base_url).rstrip('/')}{request.app.state.settings.api_root_path or ''}"
 
 
 def problem_page(request: Request, problem: dict[str, Any]) -> Response:
-    """What a visitor sees of an error; without a key, the way to sign in."""
+    """Show an error; without a key, redirect to the sign-in."""
     if problem["status"] == 401:
         return RedirectResponse("/login", status_code=303)
     return render(request, "problem.html", status=problem["status"], problem=problem, health=None)
 
 
 def loader(job: JobDetail, base_url: str) -> str:
-    """Python that fetches the job's grasps; empty while there are none."""
+    """Return Python code that fetches the job's grasps; empty while there are none."""
     if not any(shard.kind == "base" for shard in job.shards):
         return ""
     return f"""import graspd  # pip install 'graspd[api]'
@@ -95,14 +96,14 @@ print(grasps)"""
 
 
 def curl(job: JobDetail, base_url: str) -> str:
-    """Shell lines that download every shard of the job shown on its page."""
+    """Return shell commands that download every shard on the job's page."""
     base = base_url.rstrip("/")
     lines = [f"curl -fL -o {shard.kind}-{shard.batch:04}.h5 {base}{shard.file}" for shard in job.shards]
     return "\n".join(lines)
 
 
 def grasp_loader(grasp: GraspDetail, base_url: str) -> str:
-    """Python that fetches one grasp of a shard."""
+    """Return Python code that fetches one grasp of a shard."""
     return f"""import graspd  # pip install 'graspd[api]'
 
 with graspd.Client("{base_url.rstrip("/")}") as client:  # key="..." where the service asks for one

@@ -1,4 +1,4 @@
-"""Pages of the service as a whole: home, workers, speed against accuracy, maps of failure, usage, deletions."""
+"""Pages of the whole service: home, workers, speed against accuracy, failure maps, usage, deletions."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ PAGE_SIZE: Final = 25
 _LOST_SHOWN: Final = timedelta(minutes=10)
 _MINUTES: Final = 60
 _DATASETS: Final = 6
-#: A study takes minutes, and nothing tells when it is published.
+#: Polling interval [s]: a study takes minutes, and no event announces its publication.
 _STUDY_S: Final = 10
 
 router = APIRouter(include_in_schema=False)
@@ -51,7 +51,7 @@ def home(
     state: str = "",
     cursor: Annotated[str | None, Query(max_length=512)] = None,
 ) -> HTMLResponse:
-    """Health, throughput, jobs, queue, workers, failures."""
+    """Show health, throughput, jobs, queue, workers and failures."""
     chosen = State(state) if state in set(State) else None
     minutes = overview.valid_per_minute(minutes=_MINUTES)
     start = time.time() // 60 * 60 - 60 * (_MINUTES - 1)
@@ -76,7 +76,7 @@ def home(
 
 @router.get("/workers", dependencies=[Depends(may_read)])
 def workers_page(request: Request, overview: OverviewOf) -> HTMLResponse:
-    """Who works on what, on which device, and since when."""
+    """Show each worker with its device, its present task and the task's start."""
     workers = [worker for worker in overview.workers() if is_recent(worker)]
     return render(
         request,
@@ -97,7 +97,7 @@ def workers_page(request: Request, overview: OverviewOf) -> HTMLResponse:
 def chart_page(
     request: Request, store: StoreOf, y: str = "gsr", lifts: str = "lift", hand: str = "", object: str = ""
 ) -> HTMLResponse:
-    """Speed against accuracy of methods and fidelities, free and in scenes, as `graspd chart` measured them last."""
+    """Show speed against accuracy of methods and fidelities, from the last `graspd chart` of each kind."""
     measured = tradeoff.load(store)
     axis = {
         False: y if y in tradeoff.FREE else "gsr",
@@ -110,7 +110,7 @@ def chart_page(
         page="/chart",
         poll_s=_STUDY_S,
         charts=list(zip(measured, drawn, strict=True)),
-        # Title, name in the address, accuracies and the one chosen, of each kind of chart that there is.
+        # For each kind of chart: title, name in the URL, accuracies, and the selected one.
         choices=[
             (title, field, axes, axis[in_scene])
             for title, field, axes, in_scene in (
@@ -128,7 +128,7 @@ def chart_page(
 
 @router.get("/stability", dependencies=[Depends(may_read)])
 def stability_page(request: Request, store: StoreOf) -> HTMLResponse:
-    """Maps of where integrators and the planner fail, as `graspd stability` measured them last."""
+    """Show maps of where integrators and the planner fail, from the last `graspd stability`."""
     measured = figures.load(store)
     return render(
         request,
@@ -141,13 +141,13 @@ def stability_page(request: Request, store: StoreOf) -> HTMLResponse:
 
 
 def is_recent(worker: WorkerView) -> bool:
-    """A worker that is lost stays on the page for a while, so that somebody sees it."""
+    """Check whether to show a worker; a lost one remains for a while, so that its loss is noticed."""
     age = datetime.now(UTC) - datetime.fromisoformat(worker.seen)
     return worker.state != "lost" or age < _LOST_SHOWN
 
 
 def stage_depths(overview: Overview) -> list[tuple[str, int]]:
-    """Waiting tasks by stage; empty where Redis does not answer, which the page says elsewhere."""
+    """Return waiting tasks by stage; empty if Redis does not answer, which the page reports elsewhere."""
     try:
         depths = overview.depths()
     except UnavailableError:
@@ -159,7 +159,7 @@ def stage_depths(overview: Overview) -> list[tuple[str, int]]:
 
 
 def _latest_datasets(datasets: Datasets) -> list[DatasetView]:
-    """The newest datasets, those still at work first."""
+    """Return the newest datasets, unfinished ones first."""
     newest = datasets.page(limit=_DATASETS).items
     return sorted(newest, key=lambda dataset: dataset.state.is_final)[:4]
 
@@ -174,7 +174,7 @@ def usage_page(
     since: Since = None,
     until: Until = None,
 ) -> HTMLResponse:
-    """Use of each project: in sum, against its quotas, and day by day."""
+    """Show the usage of each project: in total, against its quotas, and per day."""
     days = usage.days(since, until)
     limits = usage.limits()
     today = datetime.now(UTC).date().isoformat()
@@ -200,21 +200,21 @@ def usage_page(
     )
 
 
-#: Letters of a job's id that its page shows, and that its deletion is confirmed by.
+#: Characters of a job's id that its page shows, and that confirm its deletion.
 SHORT_ID = 12
 Typed = Annotated[str, Form(max_length=64)]
 
 
 @router.get("/deleted", dependencies=[Depends(may_read)])
 def deleted_page(request: Request, deletions: DeletionsOf, done: str = "") -> HTMLResponse:
-    """All that can be restored; `done` names what was deleted just now."""
+    """Show what can be restored; `done` is the id of the latest deletion."""
     found = deletions.recent()
     return render(request, "deleted.html", found=found, just_now=next((one for one in found if one.id == done), None))
 
 
 @router.post("/deleted/{what}/{name}/restore", dependencies=[Depends(may_submit)])
 def restore(what: What, name: str, deletions: DeletionsOf) -> RedirectResponse:
-    """Bring a thing back and show it."""
+    """Restore a resource and show it."""
     found = deletions.restore(what, name)
     pages = {"job": f"/jobs/{found.id}", "dataset": f"/datasets/{found.id}", "hand": f"/hands/{found.name}"}
     return RedirectResponse(pages.get(what, "/grasps" if what == "tag" else "/deleted"), status_code=303)
@@ -224,7 +224,7 @@ def restore(what: What, name: str, deletions: DeletionsOf) -> RedirectResponse:
 def delete_dataset(
     name: str, datasets: DatasetsOf, typed: Typed = "", with_snapshots: Annotated[bool, Form()] = False
 ) -> RedirectResponse:
-    """Take a dataset away that has ended."""
+    """Delete an ended dataset."""
     _confirmed(typed, name)
     datasets.delete(name, with_snapshots=with_snapshots)
     return _deleted(name)
@@ -232,7 +232,7 @@ def delete_dataset(
 
 @router.post("/jobs/{job_id}/delete", dependencies=[Depends(may_submit)])
 def delete_job(job_id: str, jobs: JobsOf, typed: Typed = "") -> RedirectResponse:
-    """Take a job away that has ended."""
+    """Delete an ended job."""
     _confirmed(typed, job_id, job_id[:SHORT_ID])
     jobs.delete(job_id)
     return _deleted(job_id)
@@ -240,7 +240,7 @@ def delete_job(job_id: str, jobs: JobsOf, typed: Typed = "") -> RedirectResponse
 
 @router.post("/tags/{name}/delete", dependencies=[Depends(may_submit)])
 def delete_tag(name: str, tags: TagsOf, typed: Typed = "") -> RedirectResponse:
-    """Take a tag away; its grasps stay."""
+    """Delete a tag; its grasps remain."""
     _confirmed(typed, name)
     tag = tags.one(name)
     tags.remove(name)

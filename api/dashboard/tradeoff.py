@@ -1,6 +1,6 @@
-"""The charts of speed against accuracy that `graspd chart` leaves in the store: read, summed up, drawn as SVG.
+"""Charts of speed against accuracy, published by `graspd chart`: read, aggregated, drawn as SVG.
 
-One of free objects, and one for each kind of scene: they ask different questions, so none has points of another.
+There is one for free objects and one for each kind of scene. They measure different tasks, so they share no points.
 """
 
 from __future__ import annotations
@@ -21,26 +21,26 @@ from graspd.service.store.store import Store
 WIDTH: Final = 860
 HEIGHT: Final = 420
 _LEFT, _RIGHT, _TOP, _BOTTOM = 64, 24, 16, 46
-#: A letter of a label, and a line of it; from a point to its label, and the point itself [px].
+#: Width of a character, height of a line, distance from point to label, radius of the point [px].
 _LETTER, _LINE, _AWAY, _DOT = 6.9, 15.0, 12.0, 7.0
-#: How far a label may move up or down from its point, the wanted places first [px].
+#: Vertical offsets of a label from its point, in order of preference [px].
 _MOVES: Final = (0.0, 15.0, -15.0, 30.0, -30.0, 45.0, -45.0, 60.0, -60.0)
-#: Of methods that know no fidelities; their label is their name.
+#: Fidelity of methods that have none; their label is their name.
 _NO_FIDELITY: Final = "as published"
 
 
 @dataclass(frozen=True)
 class Axis:
-    """An accuracy to choose."""
+    """Accuracy that can be selected."""
 
     label: str
     unit: str = "%"
     more_is_better: bool = True
     factor: float = 100.0
-    """From the stored number."""
+    """Factor from the stored number."""
 
 
-#: Accuracies of grasps around free objects, and of grasps in scenes; the first one is drawn where none is chosen.
+#: Accuracies of grasps around free objects, and of grasps in scenes; the first one is the default.
 FREE: Final[dict[str, Axis]] = {
     "gsr": Axis("Success in MuJoCo"),
     "dexgraspbench": Axis("Success under the DexGraspBench protocol"),
@@ -58,7 +58,7 @@ IN_SCENES: Final[dict[str, Axis]] = {
 
 
 class Run(BaseModel):
-    """One method at one fidelity on one hand and object; in scenes planned there, or filtered."""
+    """One method at one fidelity on one hand and object; in scenes, planned there or filtered afterwards."""
 
     model_config = ConfigDict(extra="ignore")
 
@@ -85,32 +85,32 @@ class Run(BaseModel):
 
     @property
     def name(self) -> str:
-        """The method, and whether its grasps were put into the scene afterwards."""
+        """Method, and whether its grasps were filtered in the scene afterwards."""
         return f"{self.method}, filtered" if self.way == FILTERED else self.method
 
     @property
     def label(self) -> str:
-        """That, with the fidelity where the method knows any."""
+        """Name with the fidelity, if the method has any."""
         return self.name if self.fidelity == _NO_FIDELITY else f"{self.name} {self.fidelity}"
 
     @property
     def found(self) -> int | None:
-        """Grasps that are valid, in a scene lifted; None in charts of graspd 0.1."""
+        """Number of valid grasps, in a scene lifted ones; None in charts of graspd 0.1."""
         return self.kept if self.lift_count is None else self.lift_count
 
     @property
     def seconds(self) -> float:
-        """What they took end to end."""
+        """Their time, end to end."""
         return sum(self.end_seconds) if isinstance(self.end_seconds, list) else self.end_seconds or 0.0
 
     @property
     def first_s(self) -> float | None:
-        """Seconds to the first of them."""
+        """Time until the first of them [s]."""
         return self.seconds_to_first_valid if self.seconds_to_first is None else self.seconds_to_first
 
 
 class Measured(BaseModel):
-    """What the command left."""
+    """Results of one `graspd chart`."""
 
     model_config = ConfigDict(extra="ignore")
 
@@ -121,18 +121,18 @@ class Measured(BaseModel):
 
     @property
     def axes(self) -> dict[str, Axis]:
-        """The accuracies that it may hold."""
+        """Accuracies that it may contain."""
         return IN_SCENES if self.scene else FREE
 
     @property
     def counted(self) -> str:
-        """What its speeds count."""
+        """Grasps that its speeds count."""
         return "lifted" if self.scene else "valid"
 
 
 @dataclass(frozen=True)
 class Point:
-    """A method and fidelity, over the hands and objects chosen."""
+    """Method and fidelity, over the selected hands and objects."""
 
     method: str
     fidelity: str
@@ -145,16 +145,16 @@ class Point:
     y: float = 0.0
     label_y: float = 0.0
     is_left: bool = False
-    """Whether its label stands on its left."""
+    """Whether its label is on the left."""
     series: int = 0
 
     @property
     def label(self) -> tuple[str, str]:
-        """Method and fidelity as they are written beside it."""
+        """Method and fidelity as text of the label."""
         return self.method, "" if self.fidelity == _NO_FIDELITY else self.fidelity
 
     def label_box(self, move: float, *, is_left: bool) -> tuple[float, float, float, float]:
-        """Left, top, right, bottom of its label."""
+        """Left, top, right and bottom of its label."""
         width = _LETTER * len(" ".join(self.label))
         start = self.x - _AWAY - width if is_left else self.x + _AWAY
         return start, self.y + move - _LINE / 2, start + width, self.y + move + _LINE / 2
@@ -162,7 +162,7 @@ class Point:
 
 @dataclass(frozen=True)
 class Drawing:
-    """The chart: points, front, ticks in SVG coordinates."""
+    """Chart: points, front and ticks in SVG coordinates."""
 
     points: list[Point]
     front: str
@@ -170,11 +170,11 @@ class Drawing:
     y_ticks: list[tuple[float, str]]
     axis: Axis
     nothing: list[str]
-    """Methods and fidelities that found nothing: they have no place on an axis of speeds."""
+    """Methods and fidelities without a grasp: they have no place on an axis of speeds."""
 
 
 def load(store: Store) -> list[Measured]:
-    """The charts that were published last, that of free objects first; those that cannot be read are left out."""
+    """Load the last published charts, free objects first; unreadable ones are omitted."""
     found = []
     for kind in (CHARTS, *scene_kinds(store)):
         try:
@@ -186,7 +186,7 @@ def load(store: Store) -> list[Measured]:
 
 
 def draw(measured: Measured, *, axis: str, hand: str = "", object: str = "") -> Drawing:
-    """Points of every method and fidelity over the runs of a hand and an object (empty: all of them)."""
+    """Draw points of every method and fidelity over the runs of a hand and an object (empty: all)."""
     shown = measured.axes[axis]
     chosen = [run for run in measured.runs if hand in ("", run.hand) and object in ("", run.object)]
     names = sorted({run.name for run in measured.runs})
@@ -208,7 +208,7 @@ def draw(measured: Measured, *, axis: str, hand: str = "", object: str = "") -> 
 
 
 def pareto(points: Sequence[tuple[float, float]]) -> set[int]:
-    """Indices of points (more, more) that no other point beats in both."""
+    """Return indices of points (more, more) that no other point beats in both."""
     return {
         index
         for index, (x, y) in enumerate(points)
@@ -234,7 +234,7 @@ def _point(runs: list[Run], axis: str, scale: float, names: list[str]) -> Point 
         fidelity=runs[0].fidelity,
         pairs=len(runs),
         speed=speed,
-        # Of pairs on which nothing was found nobody knows how long it takes: a mean without them would flatter.
+        # For pairs without a grasp this time is unknown: a mean without them would be too favourable.
         first_valid_s=sum(firsts) / len(firsts) if len(firsts) == len(runs) else None,
         accuracy=scale * sum(values) / len(values),
         series=names.index(runs[0].name) % 6,
@@ -242,9 +242,9 @@ def _point(runs: list[Run], axis: str, scale: float, names: list[str]) -> Point 
 
 
 def _speed(runs: Sequence[Run]) -> float:
-    """All that was found over all seconds that it took, end to end; 0 where nothing was found.
+    """Return the number of grasps found per second of total time; 0 if there are none.
 
-    Charts of graspd 0.1 have speeds alone. Those of easy and hard objects differ by a factor: their mean is geometric.
+    Charts of graspd 0.1 contain only speeds. These differ by a factor between objects, so their mean is geometric.
     """
     if all(run.found is not None for run in runs) and (seconds := sum(run.seconds for run in runs)):
         return sum(run.found or 0 for run in runs) / seconds
@@ -253,14 +253,14 @@ def _speed(runs: Sequence[Run]) -> float:
 
 
 def _labelled(points: list[Point]) -> list[Point]:
-    """Labels beside their points: on the left or the right, up or down, where they cover the least."""
+    """Place labels beside their points, left or right, up or down, where they overlap the least."""
     taken = [(p.x - _DOT, p.y - _DOT, p.x + _DOT, p.y + _DOT) for p in points]
     placed: list[Point] = []
     for point in sorted(points, key=lambda point: point.y):
         offers = [(move, is_left) for move in _MOVES for is_left in (False, True)]
         boxes = [point.label_box(move, is_left=is_left) for move, is_left in offers]
         costs = [sum(_covered(box, other) for other in taken) + _outside(box) for box in boxes]
-        # Of places that cover as little the first one, which is the nearest.
+        # Of equal places the first one, which is the nearest.
         best = costs.index(min(costs))
         move, is_left = offers[best]
         taken.append(boxes[best])
@@ -274,7 +274,7 @@ def _covered(one: tuple[float, ...], other: tuple[float, ...]) -> float:
 
 
 def _outside(box: tuple[float, float, float, float]) -> float:
-    """How far a label would leave the chart, or stand on its ticks: worse than any cover."""
+    """Return a cost for a label outside the chart or on its ticks, larger than any overlap."""
     left, top, right, bottom = box
     over = (_LEFT - left, right - (WIDTH - 4), -top, bottom - (HEIGHT - _BOTTOM))
     return 1e4 * sum(max(0.0, part) for part in over)

@@ -1,1 +1,1 @@
-"""What a request passes before a route is asked."""
+"""Middleware that a request passes before its route."""

@@ -1,4 +1,4 @@
-"""Limits on what a stranger may send: who may send a body at all, its bytes while they arrive, and their time."""
+"""Limits on request bodies: permission to send one, its size on arrival, and its duration."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from graspd.api.middleware.request_context import SAFE_METHODS
 from graspd.api.problems import ApiError, answer
 from graspd.service.model.errors import LimitError
 
-#: A JSON body or a form without a file: job requests are a few hundred bytes.
+#: Limit of a JSON body or a form without a file: job requests take a few hundred bytes.
 MAX_BODY_BYTES: Final = 1 << 20
 #: Longest wait for the next piece of a body [s].
 PIECE_S: Final = 30.0
-#: A body that comes slower is given up: a byte now and then would hold a connection for ever [bytes/s].
+#: Least rate of a body; without it, single bytes would hold a connection forever [bytes/s].
 LEAST_BYTES_S: Final = 16 << 10
-#: Multipart framing and the other fields of an upload.
+#: Allowance for multipart framing and the other fields of an upload.
 _FORM_SLACK_BYTES: Final = 64 << 10
-#: Of a Content-Length: Python takes long to read a number of thousands, or refuses it.
+#: Most digits of a Content-Length: Python parses thousands of digits slowly, or refuses them.
 _MOST_DIGITS: Final = 18
 
 
 class BodyLimit:
-    """Refuses a body over the limit by its Content-Length, and stops reading one that turns out longer or too slow.
+    """Refuses bodies whose Content-Length exceeds the limit; aborts those that become too long or slow.
 
     Args:
         upload_paths: paths that take files.
@@ -52,7 +52,7 @@ class BodyLimit:
         limit = self.upload_bytes + _FORM_SLACK_BYTES if is_upload else MAX_BODY_BYTES
         given = dict(scope["headers"])
         if b"transfer-encoding" in given and b"content-length" in given:
-            # Two lengths: a proxy may have taken the other one, and what is left would be read as the next request.
+            # Two lengths: a proxy may have used the other one, and the remainder would be read as the next request.
             await _refuse(
                 ApiError(400, "Transfer-Encoding and Content-Length exclude each other"), scope, receive, send
             )
@@ -75,7 +75,7 @@ class BodyLimit:
 
     @staticmethod
     def _authorize(scope: Scope, is_upload: bool) -> None:
-        """Nothing is read, and nothing kept, of a body that somebody sends who may not; routes ask for more."""
+        """Refuse a body before reading it if the caller lacks permission; routes check further."""
         if is_upload:
             authorize(Request(scope), KeyScope.SUBMIT)
         elif scope["path"].startswith("/v1/"):
@@ -89,7 +89,7 @@ class BodyLimit:
         async def counted() -> Message:
             nonlocal received, is_whole, refusal
             try:
-                # After the body only the end of the connection is awaited, for as long as the answer takes.
+                # After the body, only a disconnect can arrive, and the answer may take any time.
                 async with asyncio.timeout(None if is_whole else self.piece_s):
                     message = await receive()
             except TimeoutError:
@@ -103,7 +103,7 @@ class BodyLimit:
                 return {"type": "http.disconnect"}
             if received > limit:
                 refusal = _too_large(limit)
-                # The application sees a client that went away and stops; its answer is replaced below.
+                # Simulate a disconnect, so that the application stops; its answer is replaced below.
                 return {"type": "http.disconnect"}
             return message
 

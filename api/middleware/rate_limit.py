@@ -1,8 +1,8 @@
-"""Rate-limit middleware: identifies the caller and enforces limits before anything of the request is read.
+"""Rate-limit middleware: identifies the caller and enforces limits before the request is read.
 
-Rates follow GCRA (ITU-T I.371 annex A), a leaky bucket that keeps one number a caller: the time at which the bucket is
-empty again. Requests being answered are a sorted set by the time until which each is believed to run, so that those of
-a killed process count no longer than that. Redis's own clock is asked, so the clocks of the API machines do not matter.
+Rates follow GCRA (ITU-T I.371 annex A): a leaky bucket stored as one number per caller, the time at which the bucket is
+empty again. Requests in progress form a sorted set with an expiry time each, so that requests of a killed process
+expire. Times come from Redis's clock, so clocks of the API machines do not matter.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from graspd.api.problems import ApiError, answer
 from graspd.service.settings import Settings
 from graspd.service.telemetry import bind
 
-#: What costs nothing and is asked often, by browsers and by whatever watches the service.
+#: Paths that cost nothing and are polled often, by browsers and monitoring.
 _FREE: Final = ("/static/", "/healthz", "/readyz")
 
 
 class RateLimit:
-    """Finds the key of a request (`scope["state"]["key"]`) and counts the request against the limits of that key.
+    """Finds the key of a request (`scope["state"]["key"]`) and enforces the limits of that key.
 
     A request without a key counts against its address. An open service serves one machine and counts nothing.
 
@@ -86,7 +86,7 @@ class RateLimit:
 
 
 class _Told:
-    """Sends on, with the headers at the start; while a long answer flows it goes on counting as being answered."""
+    """Sends messages on, adds the rate headers, and renews the request's entry during a long answer."""
 
     def __init__(self, rates: Rates, name: str, number: str, headers: dict[str, str], send: Send) -> None:
         self.rates = rates
@@ -106,7 +106,7 @@ class _Told:
 
 
 def allowance_of(key: Key | None, settings: Settings) -> Allowance:
-    """Limits of a key, or of an address that shows none."""
+    """Return the limits of a key, or of an address without a key."""
     if key is None:
         return Allowance(settings.address_requests_per_minute, settings.concurrency)
     own = key.limits
@@ -137,10 +137,10 @@ def _refusal(admission: Admission, allowance: Allowance, headers: dict[str, str]
 
 log = logging.getLogger(__name__)
 WINDOW_S: Final = 60
-#: A request that gives no sign for this long is no longer counted as being answered [s].
+#: A request without renewal for this long no longer counts as in progress [s].
 HELD_S: Final = 60.0
 _ANSWER_S: Final = 0.5
-#: After a failure Redis is left alone for this long [s]: a limit is not worth making every request wait.
+#: Pause after a failure of Redis [s]: limits do not justify a delay of every request.
 _PAUSE_S: Final = 1.0
 
 _ENTER: Final = """
@@ -182,7 +182,7 @@ redis.call('PEXPIRE', KEYS[1], math.ceil(tonumber(ARGV[2]) * 1000))
 
 @dataclass(frozen=True)
 class Allowance:
-    """What a caller may use; 0: no limit."""
+    """Limits of a caller; 0: no limit."""
 
     per_minute: int
     concurrency: int
@@ -190,16 +190,16 @@ class Allowance:
 
 @dataclass(frozen=True)
 class Admission:
-    """Whether a request may be answered. `refused` names the limit it met: rate, concurrency, or nothing."""
+    """Decision on a request. `refused` names the exceeded limit: rate, concurrency, or empty."""
 
     refused: str
     remaining: int
     seconds: float
-    """Until the full allowance is there again, or if refused, until another try makes sense."""
+    """Time until the full allowance is available again, or if refused, until a retry makes sense."""
 
 
 class Rates:
-    """The counters of all callers. Where Redis is away everybody may enter: the limits guard, they do not decide."""
+    """Counters of all callers. Without Redis every request is admitted: limits are not access control."""
 
     def __init__(self, url: str) -> None:
         self._url = url
@@ -208,7 +208,7 @@ class Rates:
         self._silent_until = 0.0
 
     async def enter(self, caller: str, allowance: Allowance, request: str) -> Admission | None:
-        """Count a request in; None where nothing is limited or Redis does not answer."""
+        """Count a new request; None if nothing is limited or Redis does not answer."""
         if allowance.per_minute <= 0 and allowance.concurrency <= 0:
             return None
         arguments = (allowance.per_minute, WINDOW_S, allowance.concurrency, request, HELD_S)
@@ -219,11 +219,11 @@ class Rates:
         return Admission(refused, int(remaining), float(seconds))
 
     async def keep(self, caller: str, request: str) -> None:
-        """Say that a long request is still being answered."""
+        """Renew a long request that is still in progress."""
         await self._run(_KEEP, _keys(caller)[1:], (request, HELD_S))
 
     async def leave(self, caller: str, request: str) -> None:
-        """Count a request out."""
+        """Remove a finished request from the count."""
         await self._run("redis.call('ZREM', KEYS[1], ARGV[1])", _keys(caller)[1:], (request,))
 
     async def close(self) -> None:
@@ -250,7 +250,7 @@ class Rates:
 
 
 def seconds_up(seconds: float) -> int:
-    """Whole seconds, at least one: what Retry-After takes."""
+    """Round up to whole seconds, at least one, for Retry-After."""
     return max(1, math.ceil(seconds))
 
 

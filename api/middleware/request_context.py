@@ -1,8 +1,7 @@
-"""Middleware before every route: request ids, security headers, HEAD (RFC 9110 §9.3.2), the path of a proxy, and the
-check that keeps foreign web pages out.
+"""Middleware of all routes: request ids, security headers, HEAD (RFC 9110 §9.3.2), prefix, origin.
 
-Inside, all paths are as without it. What comes in with the prefix loses it here, where the proxy has not taken it away
-already; addresses that leave in headers get it. Those in pages get it where they are rendered (`with_prefix`).
+Inside, paths have no prefix. It is removed from incoming paths here, unless the proxy already did so, and added to
+addresses in response headers. Addresses in pages get it at rendering (`with_prefix`).
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ from graspd.service.model.errors import GraspdError
 from graspd.service.telemetry import bind
 
 _access = logging.getLogger("graspd.access")
-#: Asked every few seconds by whatever watches the service.
+#: Paths that monitoring requests every few seconds.
 _QUIET: Final = ("/static/", "/healthz", "/readyz", "/metrics")
 
 SAFE_METHODS: Final = frozenset({"GET", "HEAD", "OPTIONS"})
@@ -52,7 +51,7 @@ _SECURITY_HEADERS: Final = {
 
 
 class RequestContext:
-    """Outermost: gives the request its id, times it, and turns an unforeseen exception into a problem document."""
+    """Outermost middleware: sets the request id, times the request, reports unexpected errors as problems."""
 
     def __init__(self, app: ASGIApp, *, metrics: Metrics) -> None:
         self.app = app
@@ -101,7 +100,7 @@ class RequestContext:
             self._note(scope, status, time.perf_counter() - started)
 
     def _note(self, scope: Scope, status: int, seconds: float) -> None:
-        """Count the answer and write its line."""
+        """Count the answer and write its log line."""
         route = _route(scope)
         self.metrics.observe(_method(scope), route, status, seconds)
         level = logging.DEBUG if scope["path"].startswith(_QUIET) else logging.INFO
@@ -112,7 +111,7 @@ class RequestContext:
 
 
 def _method(scope: Scope) -> str:
-    """Clients may write any word for the method; only those that HTTP knows become names of series."""
+    """Return the method if HTTP defines it, else "other": arbitrary words must not become series names."""
     return scope["method"] if scope["method"] in _METHODS else "other"
 
 
@@ -125,7 +124,7 @@ def _request_id(given: str | None) -> str:
 
 
 class Head:
-    """Answers HEAD as GET where no route takes HEAD itself."""
+    """Answers HEAD as GET if no route handles HEAD itself."""
 
     def __init__(self, app: ASGIApp) -> None:
         self.app = app
@@ -141,7 +140,7 @@ class Head:
             nonlocal is_over
             if message["type"] == "http.response.start":
                 await send(message)
-                # A stream that may never end hears that its client is gone; what has a length closes its files itself.
+                # An endless stream needs the disconnect; an answer with a length closes its files itself.
                 is_last = all(name.lower() != b"content-length" for name, _ in message["headers"])
             else:
                 is_last = not message.get("more_body", False)
@@ -161,13 +160,13 @@ def _is_taken(scope: Scope) -> bool:
     return any(route.matches(dict(scope))[0] is Match.FULL for route in scope["app"].routes)
 
 
-#: An attribute whose value is an address on this host. What a user wrote holds no quotes in a page.
+#: Attribute whose value is an address on this host. Text from users contains no quotes in a page.
 _ADDRESS: Final = re.compile(r'(?<=\s)((?:href|src|action|formaction|hx-[a-z-]+|data-[a-z-]+)=")(?=/(?!/))')
 _COOKIE_PATH: Final = re.compile(r";\s*Path=/(?=;|$)", re.IGNORECASE)
 
 
 class RootPath:
-    """Takes the prefix off paths and puts it on `Location` and on the path of cookies.
+    """Removes the prefix from paths and adds it to `Location` and to cookie paths.
 
     Args:
         prefix: such as `/graspd`.
@@ -203,23 +202,23 @@ class RootPath:
     def _below(self, where: str, host: str) -> str:
         parts = urlsplit(where)
         if parts.netloc not in ("", host) or not parts.path.startswith("/"):
-            return where  # a signed address of the store, say
+            return where  # for example a signed address of the store
         return parts._replace(path=f"{self.prefix}{parts.path}").geturl()
 
 
 def with_prefix(page: str, prefix: str) -> str:
-    """A page whose addresses on this host begin with the prefix."""
+    """Add the prefix to a page's addresses on this host."""
     return _ADDRESS.sub(rf"\g<1>{prefix}", page) if prefix else page
 
 
 class SameOrigin:
-    """Refuses what a foreign web page could make a visitor's browser do.
+    """Refuses requests that a page of another site triggers in a visitor's browser.
 
-    A browser names the page a request comes from (Sec-Fetch-Site, Origin); other clients send neither. While no keys
-    exist the service answers only to names of this machine, so that a rebound DNS name reaches nothing.
+    A browser sends the page that a request comes from (Sec-Fetch-Site, Origin); other clients do not. While no keys
+    exist, only names of this machine are accepted as host, which prevents DNS rebinding.
 
     Args:
-        allowed_hosts: host names the service answers to; None: any.
+        allowed_hosts: host names that the service answers to; None: any.
     """
 
     def __init__(self, app: ASGIApp, *, allowed_hosts: frozenset[str] | None) -> None:
@@ -249,7 +248,7 @@ class SameOrigin:
 
 
 def _place(origin: str) -> str | None:
-    """Host and port of an origin; None where it is no address at all."""
+    """Return host and port of an origin; None if it is no valid address."""
     try:
         return urlsplit(origin).netloc
     except ValueError:

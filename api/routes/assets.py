@@ -1,4 +1,4 @@
-"""`/v1/hands`, `/v1/objects` and `/v1/networks`, and corrections of hands: a corrected hand is another hand."""
+"""`/v1/hands`, `/v1/objects` and `/v1/networks`; a correction of a hand creates another hand."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ from graspd.service.model.states import AssetKind
 from graspd.service.store.descriptions import HandCorrections
 
 _GLB: Final = "model/gltf-binary"
-#: Uploads being unpacked and packed in this process; each may hold one file of its size in memory.
+#: Uploads unpacked and packed at once in this process; each may hold one file of its size in memory.
 _AT_ONCE: Final = BoundedSemaphore(UPLOADS)
 _TURN_S: Final = 20.0
 
 _ZIPPED: Final = "Upload a file, or a ZIP of its folder. It is checked by a worker before the first job uses it."
-#: What the document says of an upload.
+#: OpenAPI responses of an upload.
 _ADDED: Final = {
     AssetKind.HAND: _ZIPPED,
     AssetKind.OBJECT: _ZIPPED,
@@ -49,7 +49,7 @@ _ADDED: Final = {
 
 @cache
 def asset_router(kind: AssetKind) -> APIRouter:
-    """The routes of one kind of asset."""
+    """Create the routes of one kind of asset."""
     router = APIRouter(prefix=f"/v1/{kind.value}s", tags=[f"{kind.value}s"])
 
     @router.get("", dependencies=[Depends(may_read)], responses=responses(401, 403, 422, 503), name=f"list_{kind}s")
@@ -61,7 +61,7 @@ def asset_router(kind: AssetKind) -> APIRouter:
         cursor: Cursor = None,
         refused: Annotated[bool, Query(description="also those that the check refused")] = False,
     ) -> Page[AssetView]:
-        """All of them, newest first; those that the check refused only where asked for."""
+        """List all of them, newest first; refused ones only on request."""
         page = assets.page(kind, limit=limit, cursor=cursor, refused=refused)
         link_next(request, response, page.next)
         return page
@@ -70,7 +70,7 @@ def asset_router(kind: AssetKind) -> APIRouter:
         "/{name}", dependencies=[Depends(may_read)], responses=responses(401, 403, 404, 503), name=f"get_{kind}"
     )
     def get_asset(name: str, assets: AssetsOf) -> AssetView:
-        """One of them, with what the check found."""
+        """Return one of them, with the findings of its check."""
         return assets.one(kind, name)
 
     if kind is not AssetKind.NETWORK:
@@ -131,14 +131,14 @@ def asset_router(kind: AssetKind) -> APIRouter:
         name=f"delete_{kind}",
     )
     def delete_asset(name: str, assets: AssetsOf) -> None:
-        """Take it away; refused while a job, a dataset or a set of objects needs it. `name` may be a digest."""
+        """Delete it; refused while a job, a dataset or a set of objects needs it. `name` may be a digest."""
         assets.delete(kind, name)
 
     return router
 
 
 def _add_model_routes(router: APIRouter, kind: AssetKind) -> None:
-    """What viewers show of a hand or an object; a network has no shape."""
+    """Add routes of models for viewers; networks have no shape."""
 
     @router.get(
         "/{name}/model",
@@ -157,9 +157,9 @@ def _add_model_routes(router: APIRouter, kind: AssetKind) -> None:
         name=f"get_{kind}_model",
     )
     def get_model(name: str, request: Request, assets: AssetsOf) -> Response:
-        """The prepared hand (with its joint tree) or object, in metres; `name` may be a digest."""
+        """Return the prepared hand (with its joint tree) or object, in metres; `name` may be a digest."""
         asset = assets.one(kind, name)
-        # Under a digest it never changes; a name may come to stand for something else.
+        # Content under a digest never changes; a name may later refer to another asset.
         lasting = "private, max-age=31536000, immutable" if name == asset.digest else "no-cache"
         data = assets.model(asset)
         headers = {"ETag": f'"{hashlib.sha256(data).hexdigest()}"', "Cache-Control": lasting}
@@ -180,10 +180,10 @@ def store_upload(
     shared: bool = False,
     rename: bool = False,
 ) -> AssetView:
-    """An asset of immutable bytes, and the task that checks it. The upload lies in a file of its own until then.
+    """Store an asset of immutable content and its check task. Until then the upload is a temporary file.
 
     Raises:
-        RateError: too many others are being taken; their number bounds the memory that uploads use.
+        RateError: too many uploads are in progress; their number bounds the memory they use.
     """
     filename = file.filename or ""
     with _one_of_few():
@@ -193,10 +193,10 @@ def store_upload(
 
 
 def store_correction(assets: Assets, name: str, corrections: HandCorrections, new_name: str | None) -> AssetView:
-    """A corrected hand, and the task that checks it; it counts as an upload.
+    """Store a corrected hand and its check task; it counts as an upload.
 
     Raises:
-        RateError: too many others are being taken.
+        RateError: too many uploads are in progress.
     """
     with _one_of_few():
         return assets.correct(name, corrections, new_name or "")
@@ -216,7 +216,7 @@ correction_router = APIRouter(prefix="/v1/hands", tags=["hands"])
 
 
 class CorrectionRequest(HandCorrections):
-    """Corrections, and the name of the hand that has them."""
+    """Corrections, and the name of the corrected hand."""
 
     name: Name | None = Field(None, description="of the corrected hand; default: the hand's name with the next number")
 
@@ -230,7 +230,7 @@ class CorrectionRequest(HandCorrections):
 async def correct_hand(
     name: str, body: CorrectionRequest, request: Request, response: Response, assets: AssetsOf
 ) -> AssetView:
-    """A hand of the same files with these corrections; a worker checks it. `name` may be a digest."""
+    """Create a hand from the same files with corrections; a worker checks it. `name` may be a digest."""
     uploads: RequestLimiter = request.app.state.uploads
     asset = await uploads.run(store_correction, assets, name, body, body.name)
     response.headers["Location"] = f"/v1/hands/{asset.name}"

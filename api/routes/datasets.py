@@ -1,4 +1,4 @@
-"""`/v1/datasets` and `/v1/object-sets`: matrices of jobs, and objects that go by one name."""
+"""`/v1/datasets` and `/v1/object-sets`: matrices of jobs, and named sets of objects."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _ENDED: dict[int | str, dict[str, Any]] = {200: {"model": DatasetView, "descript
 
 
 class ObjectSetRequest(BaseModel):
-    """Objects that shall go by one name."""
+    """Objects of a named set."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -43,7 +43,7 @@ class ObjectSetRequest(BaseModel):
     responses=responses(400, 401, 403, 404, 409, 413, 422, 503, others=_ENDED),
 )
 def create_dataset(body: DatasetRequest, response: Response, datasets: DatasetsOf) -> DatasetView:
-    """Create a dataset. The same name with the same content is the same dataset: what is made is not made again."""
+    """Create a dataset. The same name and content give the same dataset; existing results are reused."""
     dataset = datasets.create(body)
     if dataset.state.is_final:
         response.status_code = 200
@@ -52,18 +52,18 @@ def create_dataset(body: DatasetRequest, response: Response, datasets: DatasetsO
 
 @router.post("/estimate", dependencies=[Depends(may_read)], responses=responses(400, 401, 403, 404, 413, 422, 503))
 def estimate_dataset(body: Matrix, datasets: DatasetsOf) -> Estimate:
-    """What a dataset will cost: time for 1, 8 and 64 workers, storage, network. Nothing is recorded."""
+    """Estimate a dataset's time for 1, 8 and 64 workers, storage and network. Nothing is recorded."""
     return datasets.estimate(body)
 
 
 class _NoDataset:
-    """`estimate` is the name of no dataset, so only POST has a meaning there."""
+    """Reserved path: no dataset may be named `estimate`, so only POST is valid there."""
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         raise ApiError(405, "an estimate is asked for with POST", headers={"Allow": "POST"})
 
 
-# A class takes every method; a function would have to name those that there are.
+# A class accepts every method; a function would have to list them.
 router.routes.append(Route("/v1/datasets/estimate", _NoDataset(), include_in_schema=False))
 
 
@@ -71,7 +71,7 @@ router.routes.append(Route("/v1/datasets/estimate", _NoDataset(), include_in_sch
 def list_datasets(
     request: Request, response: Response, datasets: DatasetsOf, limit: Limit = 50, cursor: Cursor = None
 ) -> Page[DatasetView]:
-    """Datasets, the newest first."""
+    """List datasets, newest first."""
     page = datasets.page(limit=limit, cursor=cursor)
     link_next(request, response, page.next)
     return page
@@ -79,7 +79,7 @@ def list_datasets(
 
 @router.get("/{name}", dependencies=[Depends(may_read)], responses=responses(401, 403, 404, 503))
 def get_dataset(name: DatasetName, datasets: DatasetsOf) -> DatasetView:
-    """A dataset in numbers: cells by state, grasps, progress, time, bytes."""
+    """Return a dataset's numbers: cells by state, grasps, progress, time, bytes."""
     return datasets.one(name)
 
 
@@ -93,7 +93,7 @@ def list_cells(
     limit: Limit = 50,
     cursor: Cursor = None,
 ) -> Page[CellView]:
-    """Each hand x object with its job, state, yield and failures, hand by hand."""
+    """List each cell (hand x object) with its job, state, yield and failures, ordered by hand."""
     page = datasets.cells(name, state=state, limit=limit, cursor=cursor)
     link_next(request, response, page.next)
     return page
@@ -106,7 +106,7 @@ def list_cells(
     responses=responses(401, 403, 404, 409, 503),
 )
 def cancel_dataset(name: DatasetName, response: Response, datasets: DatasetsOf) -> DatasetView:
-    """Stop a dataset and its unfinished jobs; what is written stays, and jobs that another dataset wants go on."""
+    """Cancel a dataset and its unfinished jobs; results remain, and jobs of other datasets continue."""
     return _placed(datasets.cancel(name), response)
 
 
@@ -117,7 +117,7 @@ def cancel_dataset(name: DatasetName, response: Response, datasets: DatasetsOf) 
     responses=responses(401, 403, 404, 409, 503),
 )
 def retry_dataset(name: DatasetName, response: Response, datasets: DatasetsOf) -> DatasetView:
-    """Start the cells again that failed or were cancelled; what is written is not made twice."""
+    """Restart failed and cancelled cells; existing results are not made again."""
     return _placed(datasets.retry(name), response)
 
 
@@ -134,8 +134,10 @@ def delete_dataset(
         bool, Query(description="whether its snapshots may go too; else they protect it")
     ] = False,
 ) -> None:
-    """Take away a dataset that has ended, and those of its jobs that were planned for it alone. `POST .../restore`
-    brings all of it back within the grace time."""
+    """Delete an ended dataset, and those of its jobs that belong to it alone.
+
+    `POST .../restore` restores them within the grace time.
+    """
     datasets.delete(name, with_snapshots=with_snapshots)
 
 
@@ -148,7 +150,7 @@ def delete_dataset(
     ),
 )
 def take_snapshot(name: DatasetName, response: Response, datasets: DatasetsOf) -> SnapshotView:
-    """Write down which shards the dataset holds now. The same shards again are the same snapshot."""
+    """Record the dataset's present shards as a snapshot. The same shards give the same snapshot."""
     taken, new = datasets.take_snapshot(name)
     response.headers["Location"] = f"/v1/datasets/{name}/snapshots/{taken.digest}"
     if not new:
@@ -165,7 +167,7 @@ def list_snapshots(
     limit: Limit = 50,
     cursor: Cursor = None,
 ) -> Page[SnapshotView]:
-    """Snapshots of a dataset, the newest first."""
+    """List snapshots of a dataset, newest first."""
     page = datasets.snapshots(name, limit=limit, cursor=cursor)
     link_next(request, response, page.next)
     return page
@@ -175,7 +177,7 @@ def list_snapshots(
     "/{name}/snapshots/{digest}", dependencies=[Depends(may_read)], responses=responses(401, 403, 404, 422, 503)
 )
 def get_snapshot(name: DatasetName, digest: SnapshotDigest, datasets: DatasetsOf) -> Snapshot:
-    """A snapshot with its list of shards and their checksums."""
+    """Return a snapshot with its list of shards and their checksums."""
     return datasets.snapshot(name, digest)
 
 
@@ -186,7 +188,7 @@ def get_snapshot(name: DatasetName, digest: SnapshotDigest, datasets: DatasetsOf
     responses=responses(400, 401, 403, 404, 409, 413, 422, 503),
 )
 def add_object_set(body: ObjectSetRequest, response: Response, datasets: DatasetsOf) -> ObjectSetView:
-    """Give objects a name together. Others under the same name are its next version: for its owner, or an admin."""
+    """Name a set of objects. Its owner or an admin may store other objects as the set's next version."""
     found = datasets.add_object_set(body.name, body.objects)
     response.headers["Location"] = f"/v1/object-sets/{found.name}"
     return found
@@ -194,13 +196,13 @@ def add_object_set(body: ObjectSetRequest, response: Response, datasets: Dataset
 
 @sets_router.get("", dependencies=[Depends(may_read)], responses=responses(401, 403, 503))
 def list_object_sets(datasets: DatasetsOf) -> list[ObjectSetView]:
-    """The newest version of each set, by name."""
+    """List the newest version of each set, by name."""
     return datasets.object_sets()
 
 
 @sets_router.get("/{name}", dependencies=[Depends(may_read)], responses=responses(401, 403, 404, 503))
 def get_object_set(name: DatasetName, datasets: DatasetsOf) -> ObjectSetView:
-    """The newest version of a set."""
+    """Return the newest version of a set."""
     return datasets.object_set(name)
 
 

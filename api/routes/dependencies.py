@@ -1,5 +1,4 @@
-"""Dependencies of routes: parts of the application, permissions, links between pages, threads for long requests,
-conditional requests (RFC 9110 §13)."""
+"""Dependencies of routes: services, permissions, page links, threads, conditions (RFC 9110 §13)."""
 
 from __future__ import annotations
 
@@ -36,7 +35,7 @@ MAX_LIMIT = 200
 
 
 def provide(app: FastAPI, services: Services) -> None:
-    """Put what routes ask for over these services."""
+    """Create the objects that routes depend on, from these services."""
     redis = connect(redis_url(services.settings), patience=1)
     state = app.state
     quotas = Quotas(
@@ -66,13 +65,13 @@ def may_submit(request: Request) -> None:
 
 
 def may_scrape(request: Request) -> None:
-    """Whoever may read; or anybody, where the settings say so."""
+    """Allow callers that may read; or everyone, if the settings say so."""
     if request.app.state.settings.metrics_need_key:
         authorize(request, Scope.READ)
 
 
 def _provided(name: str) -> Callable[[Request], Coroutine[Any, Any, Any]]:
-    # A coroutine, because FastAPI would take a thread for a plain function.
+    # A coroutine, because FastAPI would run a plain function in a thread.
     async def found(request: Request) -> Any:
         return getattr(request.app.state, name)
 
@@ -97,35 +96,35 @@ Cursor = Annotated[str | None, Query(max_length=512, description="`next` of the 
 
 
 def link_next(request: Request, response: Response, cursor: str | None) -> None:
-    """Name the next page in the Link header (RFC 8288), with the filters of this one."""
+    """Set the Link header (RFC 8288) to the next page, with the same filters."""
     if cursor is not None:
         response.headers["Link"] = f'<{next_address(request, cursor)}>; rel="next"'
 
 
 def next_address(request: Request, cursor: str) -> str:
-    """Path and query of the page behind a cursor."""
+    """Return path and query of the page at a cursor."""
     url = request.url.include_query_params(cursor=cursor)
     return f"{url.path}?{url.query}"
 
 
 T = TypeVar("T")
-#: Uploads that are unpacked and packed at once; each may hold one file of its size in memory.
+#: Uploads unpacked and packed at once; each may hold one file of its size in memory.
 UPLOADS: Final = 4
-#: Forms with an upload: they wait for its check too.
+#: Forms with an upload at once: they also wait for its check.
 FORMS: Final = 8
-#: Files of chosen grasps that are written at once.
+#: Files of selected grasps written at once.
 EXPORTS: Final = 2
 _WAITING: Final = 32
 _PATIENCE_S: Final = 20.0
 
 
 class RequestLimiter:
-    """A bounded number of threads, and of requests that wait for one.
+    """Pool with limits on its threads and on the requests that wait for one.
 
     Args:
-        at_once: threads.
-        waiting: requests that may wait.
-        patience_s: how long each of these waits [s].
+        at_once: number of threads.
+        waiting: number of requests that may wait.
+        patience_s: longest wait of a request [s].
     """
 
     def __init__(self, at_once: int, *, waiting: int = _WAITING, patience_s: float = _PATIENCE_S) -> None:
@@ -136,10 +135,10 @@ class RequestLimiter:
         self._patience_s = patience_s
 
     async def run(self, function: Callable[..., T], *args: Any, **options: Any) -> T:
-        """What the function answers, in a thread of these.
+        """Run a function in a thread of this pool and return its result.
 
         Raises:
-            UnavailableError: too many wait already, or no turn came in time.
+            UnavailableError: too many requests wait already, or no thread became free in time.
         """
         await self._take()
         try:
@@ -165,7 +164,7 @@ _TAGS: Final = re.compile(r'\s*((?:W/)?"[^"]*")\s*(?:,|$)')
 
 
 def is_known(headers: Headers, etag: str) -> bool:
-    """Whether If-None-Match names this file, so that 304 is the answer.
+    """Check whether If-None-Match names this file, so that the answer is 304.
 
     Args:
         etag: strong entity tag, with its quotes.
@@ -177,6 +176,6 @@ def is_known(headers: Headers, etag: str) -> bool:
 
 
 def range_applies(headers: Headers, etag: str) -> bool:
-    """Whether Range counts: If-Range is absent, or names this very file. Dates name none, for none is ever sent."""
+    """Check whether Range applies: If-Range is absent or names this file. No dates are sent or matched."""
     given = headers.get("if-range")
     return given is None or given.strip() == etag

@@ -1,4 +1,4 @@
-"""`/v1/grasps`: the index of every grasp; `/v1/tags`: names that users give to them."""
+"""`/v1/grasps`: index of all grasps; `/v1/tags`: names that users give to grasps."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ router = APIRouter(prefix="/v1/grasps", tags=["grasps"])
 
 @router.get("/{shard_id}/{row}", dependencies=[Depends(may_read)], responses=responses(401, 403, 404, 422, 503))
 def get_grasp(shard_id: str, row: int, response: Response, grasps: GraspsOf) -> GraspDetail:
-    """One grasp whole: its postures, and its quality at every contact threshold."""
+    """Return one grasp with its postures, and its metrics at every contact threshold."""
     response.headers["Cache-Control"] = "private, max-age=86400"
     return grasps.one(shard_id, row)
 
@@ -50,7 +50,7 @@ def get_grasp(shard_id: str, row: int, response: Response, grasps: GraspsOf) -> 
 async def export_grasps(
     request: Request, tags: TagsOf, exports: ExportsOf, query: Annotated[GraspExportQuery, Query()]
 ) -> StreamingResponse:
-    """All grasps that pass every filter: their rows as CSV or JSON, or base shards of them alone in a ZIP."""
+    """Export all grasps that pass every filter: rows as CSV or JSON, or base shards in a ZIP."""
     chosen = GraspQuery.model_validate(query.model_dump(exclude={"format"}))
     return await exported(request, tags, exports, Selection(filter=chosen), query.format)
 
@@ -58,7 +58,7 @@ async def export_grasps(
 async def exported(
     request: Request, tags: Tags, exports: GraspExports, selection: Selection, format: Format
 ) -> StreamingResponse:
-    """The file of a selection, as an answer."""
+    """Return the file of a selection as a response."""
     said = selection.model_dump(mode="json", exclude_none=True)
     made = await request.app.state.exports.run(lambda: exports.made(tags.chosen(selection), format, said))
     headers = {
@@ -76,7 +76,7 @@ def list_grasps(
     grasps: GraspsOf,
     query: Annotated[GraspPageQuery, Query()],
 ) -> Page[GraspView]:
-    """Grasps that pass every filter, in the order asked for."""
+    """List grasps that pass every filter, in the requested order."""
     page = grasps.page(query, limit=query.limit, cursor=query.cursor)
     link_next(request, response, page.next)
     return page
@@ -89,19 +89,19 @@ TagName = Annotated[str, Path(max_length=64, description="name of the tag, or it
 
 @tag_router.get("", dependencies=[Depends(may_read)], responses=responses(401, 403, 503))
 def list_tags(tags: TagsOf) -> list[TagView]:
-    """Tags of the key's project by name, with how many grasps have each."""
+    """List tags of the key's project by name, with their numbers of grasps."""
     return tags.all()
 
 
 @tag_router.post("", dependencies=[Depends(may_submit)], responses=responses(400, 401, 403, 404, 409, 413, 422, 503))
 def give_tag(body: TagRequest, tags: TagsOf) -> TagChange:
-    """Give a tag to grasps, named or all that pass a filter; it is made if it is not there."""
+    """Give a tag to grasps, listed by name or by a filter; a new tag is created."""
     return tags.give(body.name, body)
 
 
 @tag_router.get("/{name}", dependencies=[Depends(may_read)], responses=responses(401, 403, 404, 422, 503))
 def get_tag(name: TagName, tags: TagsOf) -> TagView:
-    """A tag; `GET /v1/grasps?tag=NAME` lists its grasps."""
+    """Return a tag; `GET /v1/grasps?tag=NAME` lists its grasps."""
     return tags.one(name)
 
 
@@ -109,7 +109,7 @@ def get_tag(name: TagName, tags: TagsOf) -> TagView:
     "/{name}/remove", dependencies=[Depends(may_submit)], responses=responses(400, 401, 403, 404, 409, 413, 422, 503)
 )
 def take_tag_off(name: TagName, body: Selection, tags: TagsOf) -> TagChange:
-    """Take a tag off grasps, named or all that pass a filter."""
+    """Remove a tag from grasps, listed by name or by a filter."""
     return tags.take_off(name, body)
 
 
@@ -117,5 +117,5 @@ def take_tag_off(name: TagName, body: Selection, tags: TagsOf) -> TagChange:
     "/{name}", status_code=204, dependencies=[Depends(may_submit)], responses=responses(401, 403, 404, 409, 422, 503)
 )
 def delete_tag(name: TagName, tags: TagsOf) -> None:
-    """Take a tag away; its grasps stay."""
+    """Delete a tag; its grasps remain."""
     tags.remove(name)

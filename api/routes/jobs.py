@@ -1,4 +1,4 @@
-"""`/v1/jobs`: submit, list, watch, cancel, retry."""
+"""`/v1/jobs`: submit, list, watch, cancel, retry, delete."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ IdempotencyKey = Annotated[
     ),
 )
 def submit(body: JobRequest, response: Response, jobs: JobsOf, idempotency_key: IdempotencyKey = None) -> JobDetail:
-    """Submit a job. The same content is the same job: its id follows from the request, the hand and the object."""
+    """Submit a job. Identical content gives the same job: its id follows from request, hand and object."""
     job = jobs.submit(body, idempotency_key=idempotency_key)
     response.headers["Location"] = f"/v1/jobs/{job.id}"
     if job.state.is_final:
@@ -62,7 +62,7 @@ def list_jobs(
     limit: Limit = 50,
     cursor: Cursor = None,
 ) -> Page[Job]:
-    """Jobs, the newest first."""
+    """List jobs, newest first."""
     page = jobs.page(state=state, hand=hand, object=object, limit=limit, cursor=cursor)
     link_next(request, response, page.next)
     return page
@@ -70,7 +70,7 @@ def list_jobs(
 
 @router.get("/{job_id}", dependencies=[Depends(may_read)], responses=responses(401, 403, 404, 503))
 def get_job(job_id: str, jobs: JobsOf) -> JobDetail:
-    """A job with the progress of its stages, failed attempts, mean metrics and shards."""
+    """Return a job with the progress of its stages, failed attempts, mean metrics and shards."""
     return jobs.one(job_id)
 
 
@@ -81,7 +81,7 @@ def get_job(job_id: str, jobs: JobsOf) -> JobDetail:
     responses=responses(401, 403, 404, 409, 503),
 )
 def cancel(job_id: str, jobs: JobsOf) -> JobDetail:
-    """Stop a job's waiting and running tasks; what is written stays."""
+    """Cancel a job's waiting and running tasks; results remain."""
     return jobs.cancel(job_id)
 
 
@@ -89,7 +89,7 @@ def cancel(job_id: str, jobs: JobsOf) -> JobDetail:
     "/{job_id}/retry", status_code=202, dependencies=[Depends(may_submit)], responses=responses(401, 403, 404, 409, 503)
 )
 def retry(job_id: str, jobs: JobsOf) -> JobDetail:
-    """Run again what failed or was cancelled; what is written is not made twice."""
+    """Run failed and cancelled tasks again; existing results are not made again."""
     return jobs.retry(job_id)
 
 
@@ -100,13 +100,13 @@ def retry(job_id: str, jobs: JobsOf) -> JobDetail:
     responses=responses(401, 403, 404, 409, 503),
 )
 def delete(job_id: str, jobs: JobsOf) -> None:
-    """Take away a job that has ended. Its shards, where no other job needs them, follow after a grace time; until then
-    `POST .../restore` brings it back."""
+    """Delete an ended job. After a grace time its shards follow, unless another job needs them; until then
+    `POST .../restore` restores the job."""
     jobs.delete(job_id)
 
 
 def known_job(job_id: str, jobs: JobsOf) -> None:
-    """A stream has begun before its first event: what can be refused is refused before that."""
+    """Refuse an unknown job before its event stream starts: afterwards the status cannot change."""
     jobs.moving(job_id)
 
 
@@ -117,6 +117,6 @@ def known_job(job_id: str, jobs: JobsOf) -> None:
     responses=responses(401, 403, 404, 503),
 )
 async def watch(job_id: str, request: Request, jobs: JobsOf) -> AsyncIterable[ServerSentEvent]:
-    """Progress of a job: `progress` with the job at each change, `end` with its last state."""
+    """Stream a job's progress: `progress` with the job at each change, `end` with its last state."""
     async for event in events.job_events(jobs, job_id, request):
         yield event

@@ -1,4 +1,4 @@
-"""`/v1/shards`: the HDF5 files, with byte ranges."""
+"""`/v1/shards`: HDF5 files, with byte ranges."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from graspd.service.index.views import Page
 router = APIRouter(prefix="/v1/shards", tags=["shards"])
 
 _MEDIA_TYPE = "application/x-hdf5"
-#: No file has more bytes than such a number tells; a longer one is no range, and the whole file is sent.
+#: No file size has more than 18 digits; a longer number is no valid range, and the whole file is sent.
 _RANGE = re.compile(r"bytes=([0-9]{0,18})-([0-9]{0,18})")
 
 
@@ -30,7 +30,7 @@ def list_shards(
     limit: Limit = 50,
     cursor: Cursor = None,
 ) -> Page[Shard]:
-    """Shards, all or those of a job."""
+    """List shards, all or those of a job."""
     page = shards.page(job=job, kind=kind, limit=limit, cursor=cursor)
     link_next(request, response, page.next)
     return page
@@ -38,7 +38,7 @@ def list_shards(
 
 @router.get("/{shard_id}", dependencies=[Depends(may_read)], responses=responses(401, 403, 404, 503))
 def get_shard(shard_id: str, shards: ShardsOf) -> Shard:
-    """A shard with its whole manifest."""
+    """Return a shard with its whole manifest."""
     return shards.one(shard_id)
 
 
@@ -62,17 +62,17 @@ def get_shard(shard_id: str, shards: ShardsOf) -> Shard:
     ),
 )
 def get_file(shard_id: str, request: Request, shards: ShardsOf) -> Response:
-    """The HDF5 file: from the store itself where it signs addresses, else through the API, by Range if asked.
+    """Send the HDF5 file: from the store if it signs addresses, else through the API; Range is supported.
 
-    If-None-Match and If-Range are heeded. One that is not what its checksum says is refused.
+    If-None-Match and If-Range are supported. A file that does not match its checksum is refused.
     """
     shard = shards.intact(shard_id)
-    # The name says the content: what was fetched once never changes.
+    # The id depends on the content, so cached copies never become stale.
     headers = {"ETag": f'"{shard.sha256}"', "Cache-Control": "private, max-age=31536000, immutable"}
     if is_known(request.headers, headers["ETag"]):
         return Response(status_code=304, headers=headers)
     only_head = request.method == "HEAD"
-    # A signed address is for GET alone.
+    # A signed address is valid for GET only.
     if not only_head and (address := shards.address(shard)) is not None:
         return RedirectResponse(address, status_code=307)
     size = shards.size(shard)
@@ -94,10 +94,10 @@ def get_file(shard_id: str, request: Request, shards: ShardsOf) -> Response:
 
 
 def parse_range(header: str | None, size: int) -> tuple[int, int] | None:
-    """(start, end) of a single byte range; None where the whole file is to be sent (RFC 9110 §14.2).
+    """Return (start, end) of a single byte range; None to send the whole file (RFC 9110 §14.2).
 
     Raises:
-        ApiError: 416, the range lies behind the end of the file.
+        ApiError: 416, the range starts beyond the end of the file.
     """
     match = _RANGE.fullmatch(header.strip()) if header else None
     if match is None or match.groups() == ("", ""):

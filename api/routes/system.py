@@ -25,27 +25,27 @@ router = APIRouter(tags=["system"])
 
 @router.get("/v1/workers", dependencies=[Depends(may_read)], responses=responses(401, 403, 503))
 def list_workers(overview: OverviewOf) -> list[Worker]:
-    """Workers that gave a sign of life lately: device, stage in hand, age of the lease."""
+    """List workers with a recent heartbeat: device, present stage, age of the lease."""
     return overview.workers()
 
 
 @router.get("/v1/stats", dependencies=[Depends(may_read)], responses=responses(401, 403, 503))
 def get_stats(overview: OverviewOf) -> Stats:
-    """The whole service in a few numbers, from the index."""
+    """Return statistics of the whole service, from the index."""
     return overview.stats()
 
 
 @router.get("/healthz")
 async def healthz() -> dict[str, bool]:
-    """This process answers. No thread is needed for that."""
+    """Confirm that this process answers; needs no thread."""
     return {"ok": True}
 
 
 @router.get("/readyz", responses={503: {"model": Health, "description": "A part does not answer"}})
 def readyz(request: Request, overview: OverviewOf, response: Response) -> Health:
-    """Redis, index and store, each with the time it took to answer; whether a controller lives, and how many workers.
+    """Return the latency of Redis, index and store, whether a controller is alive, and live workers.
 
-    What is wrong with a part is told to those who may read.
+    Details of a fault are included only for callers that may read.
     """
     health = overview.health()
     if not health.ok:
@@ -64,7 +64,7 @@ def readyz(request: Request, overview: OverviewOf, response: Response) -> Health
     responses=responses(401, 403, others={200: {"content": {"text/plain": {}}}}),
 )
 def metrics(request: Request, overview: OverviewOf) -> Response:
-    """Prometheus text format. A scrape must show which part is down, so it succeeds without what that part knows."""
+    """Return metrics as Prometheus text. A scrape succeeds even if a part is down, without its series."""
     values: Metrics = request.app.state.metrics
     return Response(values.render(overview.snapshot()), media_type=CONTENT_TYPE)
 
@@ -73,7 +73,7 @@ usage_router = APIRouter(tags=["usage"])
 
 
 def _day(said: object) -> object:
-    """A number would be read as seconds since 1970, and of a time its day would be taken."""
+    """Reject numbers, which would be seconds since 1970, and times, which would be cut to their day."""
     if isinstance(said, str) and not re.fullmatch(r"[0-9]{4}-[0-9]{2}-[0-9]{2}", said):
         raise ValueError("a day is written as 2026-01-31")
     return said
@@ -86,7 +86,7 @@ Until = Annotated[Day | None, Query(description="last day (UTC); default: today"
 
 @usage_router.get("/v1/usage", dependencies=[Depends(may_read)], responses=responses(400, 401, 403, 422, 503))
 def get_usage(usage: UsageOf, since: Since = None, until: Until = None) -> list[UsageDay]:
-    """Grasps and seconds of each project on each day, the newest first: of the key's project, with `admin` of all."""
+    """Return each project's grasps and seconds per day, newest first; all projects with `admin`."""
     return usage.days(since, until)
 
 
@@ -104,7 +104,7 @@ def get_usage(usage: UsageOf, since: Since = None, until: Until = None) -> list[
     ),
 )
 def get_usage_csv(usage: UsageOf, since: Since = None, until: Until = None) -> Response:
-    """The same as a table."""
+    """Return the same as a table."""
     headers = {"Content-Disposition": 'attachment; filename="usage.csv"'}
     return Response(as_csv(usage.days(since, until)), media_type="text/csv", headers=headers)
 
@@ -117,7 +117,7 @@ KINDS: Final[tuple[What, ...]] = get_args(What)
 
 @deletion_router.get("/v1/deletions", dependencies=[Depends(may_read)], responses=responses(401, 403, 503))
 def list_deletions(deletions: DeletionsOf) -> list[DeletionView]:
-    """What can be restored, the newest first."""
+    """List what can be restored, newest first."""
     return deletions.recent()
 
 
@@ -129,7 +129,7 @@ def _add_restore(what: What) -> None:
         name=f"restore_{what}",
     )
     def restore(name: Name, deletions: DeletionsOf) -> DeletionView:
-        """Bring back what was deleted within the grace time (`GRASPD_SHARD_GRACE_S`), as it was."""
+        """Restore a resource deleted within the grace time (`GRASPD_SHARD_GRACE_S`), unchanged."""
         return deletions.restore(what, name)
 
 

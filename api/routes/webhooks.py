@@ -1,4 +1,4 @@
-"""`/v1/events` and `/v1/webhooks`: what ended, asked for or told."""
+"""`/v1/events` and `/v1/webhooks`: ends of jobs and datasets, by polling, stream or webhook."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ Since = Annotated[int, Query(ge=0, lt=2**62, description="`seq` of the last end 
 
 
 class DeliveryPage(BaseModel):
-    """The next ends, and where to go on."""
+    """Page of ends, and the number to continue from."""
 
     items: list[EndView]
     next: int = Field(description="`since` of the next request")
 
 
 class WebhookRequest(BaseModel):
-    """An address that shall be told of ends."""
+    """Address to notify of ends."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -38,14 +38,14 @@ class WebhookRequest(BaseModel):
 
 
 class CreatedWebhook(WebhookView):
-    """A webhook, and what its bodies are signed with."""
+    """Webhook and the secret that signs its bodies."""
 
     secret: str = Field(description="told this once")
 
 
 @router.get("/v1/events", dependencies=[Depends(may_read)], responses=responses(401, 403, 422, 503))
 def list_ends(webhooks: WebhooksOf, since: Since = 0, limit: Limit = 50) -> DeliveryPage:
-    """Jobs and datasets that ended, in this order. Ends are kept for 30 days; none is left out, one may come twice."""
+    """List ended jobs and datasets in order. Ends are stored for 30 days; each appears at least once."""
     items = webhooks.ends(since, limit=limit)
     return DeliveryPage(items=items, next=items[-1].seq if items else since)
 
@@ -62,7 +62,7 @@ async def stream_ends(
     since: Since = 0,
     last_event_id: Annotated[str | None, Header(max_length=20, description="goes over `since`")] = None,
 ) -> AsyncIterable[ServerSentEvent]:
-    """The same as a stream: `end` with each. A client that reconnects goes on where it was."""
+    """Stream the same: one `end` event each. A client that reconnects continues where it stopped."""
     start = int(last_event_id) if last_event_id and last_event_id.isascii() and last_event_id.isdigit() else since
     async for event in events.ends(webhooks, min(start, 2**62), request):
         yield event
@@ -75,7 +75,7 @@ async def stream_ends(
     responses=responses(400, 401, 403, 409, 413, 422, 503),
 )
 def add_webhook(body: WebhookRequest, response: Response, webhooks: WebhooksOf) -> CreatedWebhook:
-    """Tell an address when jobs and datasets of the key's project end. The answer holds its secret, this once."""
+    """Add a webhook for ended jobs and datasets of the key's project. The secret is shown only once."""
     hook, secret = webhooks.add(body.url, body.states)
     response.headers["Location"] = f"/v1/webhooks/{hook.id}/deliveries"
     return CreatedWebhook(**hook.model_dump(), secret=secret)
@@ -83,7 +83,7 @@ def add_webhook(body: WebhookRequest, response: Response, webhooks: WebhooksOf) 
 
 @router.get("/v1/webhooks", dependencies=[Depends(may_submit)], responses=responses(401, 403, 503))
 def list_webhooks(webhooks: WebhooksOf) -> list[WebhookView]:
-    """Webhooks that the key may change, without their secrets."""
+    """List webhooks that the key may change, without their secrets."""
     return webhooks.all()
 
 
@@ -93,7 +93,7 @@ def list_webhooks(webhooks: WebhooksOf) -> list[WebhookView]:
     responses=responses(401, 403, 404, 422, 503),
 )
 def list_deliveries(webhook_id: WebhookId, webhooks: WebhooksOf, limit: Limit = 50) -> list[DeliveryView]:
-    """What became of telling it, the newest first; kept for 30 days."""
+    """List deliveries of a webhook, newest first; stored for 30 days."""
     return webhooks.log(webhook_id, limit=limit)
 
 
@@ -104,5 +104,5 @@ def list_deliveries(webhook_id: WebhookId, webhooks: WebhooksOf, limit: Limit = 
     responses=responses(401, 403, 404, 503),
 )
 def delete_webhook(webhook_id: WebhookId, webhooks: WebhooksOf) -> None:
-    """Tell it nothing any more."""
+    """Delete a webhook."""
     webhooks.delete(webhook_id)

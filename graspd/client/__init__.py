@@ -1,1 +1,1 @@
-"""The service over HTTP: the client, and the commands that talk through it."""
+"""Client of the service over HTTP, and the commands that use it."""

@@ -1,5 +1,4 @@
-"""`graspd keys`, `graspd projects` and `graspd webhooks`: who may use the service, how much, and who is told of
-ends."""
+"""`graspd keys`, `graspd projects` and `graspd webhooks`: access, limits and notifications."""
 
 from __future__ import annotations
 
@@ -46,7 +45,7 @@ def add_key(
     jobs_per_day: JobsOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """Make a key and show it, this once. Limits that are not given are those of the settings."""
+    """Make a key and show it once. Limits that are not given are those of the settings."""
     limits = _limits(requests_per_minute, concurrency, grasps_in_flight, jobs_per_day)
     lifetime = duration(expires) if expires else None
     token = _key_file().add(name, scope, lifetime=lifetime, limits=limits, project=project)
@@ -61,7 +60,7 @@ def rotate_key(
     expires: LifetimeOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """Give a key a new secret and show it, this once. Scope and limits stay."""
+    """Give a key a new secret and show it once. Scope and limits stay."""
     keys = _key_file()
     token = keys.rotate(name, grace=duration(grace), lifetime=duration(expires) if expires else None)
     _show_token(name, next(key.scope for key in reversed(keys.list()) if key.name == name), token, json=json)
@@ -77,7 +76,7 @@ def limit_key(
     jobs_per_day: JobsOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """Change what a key may use; it counts from the next request on."""
+    """Change the limits of a key, from the next request on."""
     wanted = _limits(requests_per_minute, concurrency, grasps_in_flight, jobs_per_day)
     if not wanted.model_fields_set:
         raise InputError("give at least one limit, such as --jobs-per-day 100")
@@ -91,7 +90,7 @@ def limit_key(
 @keys_app.command("list", epilog="graspd keys list --json")
 @reporting_errors
 def list_keys(json: JsonFlag = False) -> None:
-    """All keys, without their secrets."""
+    """List all keys, without their secrets."""
     found = _key_file().list()
     if json:
         emit({"keys": [key.model_dump(mode="json", exclude={"sha256"}) for key in found]})
@@ -109,7 +108,7 @@ def list_keys(json: JsonFlag = False) -> None:
 @keys_app.command("revoke", epilog="graspd keys revoke alice")
 @reporting_errors
 def revoke_key(name: NameArgument, json: JsonFlag = False) -> None:
-    """End a key's life; it is refused from the next request on."""
+    """Revoke a key; it is refused from the next request on."""
     _key_file().revoke(name)
     if json:
         emit({"name": name, "revoked": True})
@@ -118,7 +117,7 @@ def revoke_key(name: NameArgument, json: JsonFlag = False) -> None:
 
 
 def duration(text: str) -> timedelta:
-    """A time such as 90d, 12h, 30m or 45s; InputError for anything else."""
+    """Parse a time such as 90d, 12h, 30m or 45s; raise InputError for anything else."""
     match = re.fullmatch(r"(\d{1,6})([smhd])", text.strip())
     if match is None:
         raise InputError(f"{text!r} is no length of time; write 90d, 12h, 30m or 45s")
@@ -164,7 +163,7 @@ projects_app = typer.Typer(no_args_is_help=True, help="List projects of keys, an
 @projects_app.command("list", epilog="graspd projects list --json")
 @reporting_errors
 def list_projects(json: JsonFlag = False) -> None:
-    """Projects that keys belong to, and their limits. `graspd keys add NAME --project PROJECT` makes one."""
+    """List projects of keys, and their limits. `graspd keys add NAME --project PROJECT` makes one."""
     file = KeyFile(load_settings().resolved_keys_file)
     live: dict[str, list[str]] = {}
     for key in file.list():
@@ -197,7 +196,7 @@ def limit_project(
     ] = None,
     json: JsonFlag = False,
 ) -> None:
-    """Change what the keys of a project may use together; it counts from the next submission on."""
+    """Change the shared limits of a project's keys, from the next submission on."""
     given = {
         "grasps_in_flight": grasps_in_flight,
         "grasps_per_day": grasps_per_day,
@@ -231,7 +230,7 @@ def add_webhook(
     url: UrlOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """Tell an address of ends from now on, and show the secret that signs what is sent, this once."""
+    """Notify an address when jobs and datasets end; show the secret that signs the notifications once."""
     states = [one.strip() for one in on.split(",") if one.strip()]
     with open_client(url) as client:
         made = client.send("POST", "/v1/webhooks", json={"url": address, "states": states}).json()
@@ -245,7 +244,7 @@ def add_webhook(
 @webhooks_app.command("list", epilog="graspd webhooks list")
 @reporting_errors
 def list_webhooks(url: UrlOption = None, json: JsonFlag = False) -> None:
-    """Webhooks that the key may change."""
+    """List webhooks that the key may change."""
     with open_client(url) as client:
         found = client.send("GET", "/v1/webhooks").json()
     if json:
@@ -260,7 +259,7 @@ def list_webhooks(url: UrlOption = None, json: JsonFlag = False) -> None:
 @webhooks_app.command("log", epilog="graspd webhooks log 1a2b3c")
 @reporting_errors
 def show_log(webhook: IdArgument, url: UrlOption = None, json: JsonFlag = False) -> None:
-    """What became of telling it, the newest first."""
+    """List deliveries of a webhook, newest first."""
     with open_client(url) as client:
         found = client.send("GET", path_of("webhooks", webhook, "deliveries")).json()
     if json:
@@ -277,7 +276,7 @@ def show_log(webhook: IdArgument, url: UrlOption = None, json: JsonFlag = False)
 @webhooks_app.command("delete", epilog="graspd webhooks delete 1a2b3c")
 @reporting_errors
 def delete_webhook(webhook: IdArgument, yes: YesOption = False, url: UrlOption = None, json: JsonFlag = False) -> None:
-    """Tell it nothing any more. Its secret is gone for good."""
+    """Delete a webhook and its secret."""
     with open_client(url) as client:
         confirm(f"Delete the webhook {webhook} and its secret for good?", f"the webhook {webhook}", yes=yes)
         client.delete(path_of("webhooks", webhook))

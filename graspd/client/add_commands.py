@@ -1,5 +1,6 @@
-"""`graspd hands add`, `objects add` and `networks add`: upload one, or every object of a folder, and wait for the
-check. A hand on the user's disk is a folder, or a description with what belongs to it: it becomes one ZIP."""
+"""`graspd hands add`, `objects add`, `networks add`: upload an asset or a set, and wait for its check.
+
+A hand is a folder, or a description with the files it needs, which are packed into one ZIP."""
 
 from __future__ import annotations
 
@@ -40,7 +41,7 @@ from graspd.service.store.object_sets import Objects, files_of_set
 NameOption = Annotated[str | None, typer.Option("--name", help="Name to give it; default: the file's.")]
 SharedOption = Annotated[bool, typer.Option("--shared", help="Let every project use it, not only that of the key.")]
 WaitOption = Annotated[bool, typer.Option("--wait/--no-wait", help="Wait until a worker has checked it.")]
-#: How long a check is waited for, without and with a self-test [s].
+#: Longest wait for a check, without and with a self-test [s].
 _CHECK_S: Final = 120.0
 _SELF_TEST_S: Final = 900.0
 
@@ -62,7 +63,7 @@ def add_hand(
     url: UrlOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """Upload a hand, wait for its check, say what was guessed and what it holds of plain objects."""
+    """Upload a hand, wait for its check, and report guesses and the self-test on plain objects."""
     options = hand_options(**options) | provenance(licence, source)
     with upload_of(file) as (upload, main):
         said = ({"file": main} if main else {}) | options
@@ -83,7 +84,7 @@ def add_object(
     url: UrlOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """Upload an object or a whole set of them, wait for the check, and say what was repaired."""
+    """Upload an object or a set of objects, wait for the check, and report repairs."""
     sizes = sizes_of(options.pop("scale_to", None))
     options |= provenance(licence, source) | ({"scale_to": sizes[0]} if len(sizes) == 1 else {})
     if len(sizes) > 1:
@@ -106,7 +107,7 @@ def add_network(
     url: UrlOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """Upload a network that proposes grasps of a hand: jobs with `--method learned` set out from them."""
+    """Upload a network that proposes grasps of a hand: jobs with `--method learned` start from them."""
     _add(AssetKind.NETWORK, file, name, provenance(licence, source), shared=shared, wait=False, url=url, json=json)
 
 
@@ -134,9 +135,9 @@ def _add(
 
 @contextmanager
 def upload_of(path: Path) -> Iterator[tuple[Path, str]]:
-    """The file to send, and the name of the hand's description in it (empty: told from the file).
+    """Yield the file to send, and the name of the hand's description in it (empty: chosen by the service).
 
-    The file is the path itself, or a ZIP of what belongs to it, removed afterwards.
+    The file is the path itself, or a temporary ZIP of the files it needs.
 
     Raises:
         InputError, LimitError: see `files_of_hand`.
@@ -147,21 +148,21 @@ def upload_of(path: Path) -> Iterator[tuple[Path, str]]:
         yield path, ""
         return
     with TemporaryDirectory(prefix="graspd-hand-") as folder:
-        # The file's name is the hand's, unless the user says another.
+        # The file is named after the hand, unless the user gives another name.
         archive = Path(folder) / f"{hand_name(path.resolve().name)}.zip"
         archive.write_bytes(pack({name: file.read_bytes() for name, file in files.items()}))
         yield archive, main
 
 
 def one_of_set(path: Path, name: str | None) -> Objects:
-    """A mesh file as a set of one object; InputError for anything else."""
+    """Return a mesh file as a set of one object; raise InputError for anything else."""
     if path.suffix.lower() not in MESHES or not path.is_file():
         raise InputError(f"several sizes are made of a mesh file or a folder of them, not of {path}")
     return {name or name_of_upload(path.name): {path.name: path.read_bytes()}}
 
 
 def sweep(objects: Objects, sizes: Sequence[float]) -> Objects:
-    """Each object in each size [m]: `mug` at 0.08 is `mug-80mm`."""
+    """Return each object in each size [m]: `mug` at 0.08 becomes `mug-80mm`."""
     made: Objects = {}
     for name, files in objects.items():
         mesh = next(file for file in files if file != "asset.json")
@@ -173,7 +174,7 @@ def sweep(objects: Objects, sizes: Sequence[float]) -> Objects:
 
 
 def name_of_set(path: Path) -> str:
-    """Name of the set that a folder or ZIP becomes."""
+    """Return the name of the set made from a folder or ZIP."""
     place = path.resolve()
     return name_of_upload(f"{place.name}.zip" if place.is_dir() else place.name)
 
@@ -189,10 +190,10 @@ def add_set(
     url: str | None,
     json: bool,
 ) -> None:
-    """Upload all, wait for all checks, give them a name together; what is refused does not stop the others.
+    """Upload objects, wait for all checks, and make a set; a refused object does not stop the others.
 
     Raises:
-        InputError: some were refused; each is listed before.
+        InputError: some were refused; each is listed first.
     """
     with open_client(url) as client:
         say = None if json else typer.echo
@@ -219,10 +220,10 @@ def upload_set(
     wait: bool = True,
     say: Callable[[str], None] | None = None,
 ) -> list[dict[str, Any]]:
-    """Upload objects and wait for their checks: name, verdict, message and repairs of each.
+    """Upload objects and wait for their checks; return name, verdict, message and repairs of each.
 
     Args:
-        say: told of each as soon as its check is done.
+        say: called with a line for each object as soon as its check is done.
     """
     told = [
         _upload(client, f"{prefix}-{name}" if prefix else name, files, options or {}, shared=shared)
@@ -240,7 +241,7 @@ def upload_set(
 def _upload(
     client: Client, name: str, files: dict[str, bytes], options: dict[str, Any], *, shared: bool
 ) -> dict[str, Any]:
-    """One object of a set: its name and what is known of it yet."""
+    """Upload one object of a set; return its name and present state."""
     try:
         with tempfile.TemporaryDirectory(prefix="graspd-set-") as folder:
             archive = Path(folder) / "object.zip"

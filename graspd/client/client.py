@@ -1,4 +1,4 @@
-"""A thin HTTP client: the documents of `api.models` in, problem documents back as the exceptions they came from."""
+"""Thin HTTP client: exchanges documents of `api.models`; raises problem documents as exceptions."""
 
 from __future__ import annotations
 
@@ -27,24 +27,24 @@ from graspd.service.pipeline.datasets.spec import DatasetRequest, Matrix
 _PATIENCE_S: Final = 30.0
 _CONNECT_S: Final = 5.0
 _TIMEOUT: Final = httpx.Timeout(_PATIENCE_S, connect=_CONNECT_S)
-#: The server sends a sign of life every 15 s.
+#: The server sends a keep-alive every 15 s.
 _STREAM_TIMEOUT: Final = httpx.Timeout(40.0, connect=5.0)
 _POLL_S: Final = 0.3
 _DATASET_POLL_S: Final = 1.0
-#: Rows of a page.
+#: Rows per page.
 _PAGE: Final = 200
-#: Longest waits before another try when the service says that requests come too fast [s].
+#: Waits before retries if the service reports too many requests [s].
 _WAITS_S: Final = (2.0, 5.0, 10.0, 20.0)
 
 View = TypeVar("View", bound=BaseModel)
 
 
 class Client:
-    """Talks to one graspd API. Usable as a context manager.
+    """Connection to one graspd API. Usable as a context manager.
 
     Args:
-        url: where the API answers, e.g. http://127.0.0.1:8000.
-        key: Bearer key, if the service asks for one.
+        url: address of the API, e.g. http://127.0.0.1:8000.
+        key: Bearer key, if the service requires one.
         transport: replaces the network in tests.
 
     Raises:
@@ -54,7 +54,7 @@ class Client:
     def __init__(self, url: str, *, key: str | None = None, transport: httpx.BaseTransport | None = None) -> None:
         address = _address(url.strip().rstrip("/"))
         self.url = without_secrets(str(address)).rstrip("/")
-        # A proxy of the environment cannot reach this machine's own addresses.
+        # A proxy from the environment cannot reach loopback addresses of this machine.
         is_local = is_loopback(address.host)
         self._http = httpx.Client(
             base_url=address,
@@ -77,7 +77,7 @@ class Client:
         self._http.close()
 
     def submit(self, request: JobRequest, *, idempotency_key: str | None = None) -> JobDetail:
-        """Submit a job; the same request gives the same job."""
+        """Submit a job; an identical request returns the same job."""
         headers = {"Idempotency-Key": idempotency_key} if idempotency_key else {}
         answer = self.send("POST", "/v1/jobs", json=request.model_dump(mode="json"), headers=headers)
         return JobDetail.model_validate_json(answer.content)
@@ -86,7 +86,7 @@ class Client:
         return JobDetail.model_validate_json(self.send("GET", path_of("jobs", job_id)).content)
 
     def jobs(self, *, state: State | None = None, limit: int = 50, cursor: str | None = None) -> Page[Job]:
-        """Jobs, newest first."""
+        """Return jobs, newest first."""
         params = {"state": state, "limit": limit, "cursor": cursor}
         return Page[Job].model_validate_json(self.send("GET", "/v1/jobs", params=params).content)
 
@@ -94,7 +94,7 @@ class Client:
         return JobDetail.model_validate_json(self.send("POST", path_of("jobs", job_id, "cancel")).content)
 
     def delete(self, path: str, **params: Any) -> None:
-        """Take away what stands under an address: `/v1/jobs/ID`, `/v1/objects/NAME`."""
+        """Delete the resource at an address: `/v1/jobs/ID`, `/v1/objects/NAME`."""
         self.send("DELETE", path, params=params)
 
     def retry(self, job_id: str) -> JobDetail:
@@ -105,7 +105,7 @@ class Client:
         return Page[GraspView].model_validate_json(self.send("GET", "/v1/grasps", params=params).content)
 
     def assets(self, kind: AssetKind, *, refused: bool = False) -> Iterator[AssetView]:
-        """All hands, objects or networks; those that the check refused only where asked for."""
+        """Yield all hands, objects or networks; refused ones only on request."""
         return self._pages(AssetView, f"/v1/{kind.value}s", refused=refused)
 
     def asset(self, kind: AssetKind, name: str) -> AssetView:
@@ -121,9 +121,9 @@ class Client:
         self_test: bool = False,
         shared: bool = False,
     ) -> AssetView:
-        """Send a file or a ZIP, with keys that go over its `asset.json`; InputError if it cannot be opened.
+        """Upload a file or a ZIP; `options` override its `asset.json`. Raise InputError if it is unreadable.
 
-        The check of a hand ends with the self-test if wanted; what is shared may be used by every project.
+        With `self_test` the check of a hand includes the self-test; a `shared` asset is usable by every project.
         """
         fields = ({"name": name} if name else {}) | ({"options": json.dumps(options)} if options else {})
         fields |= {name: "true" for name, wanted in {"self_test": self_test, "shared": shared}.items() if wanted}
@@ -140,10 +140,10 @@ class Client:
         return AssetView.model_validate_json(answer.content)
 
     def wait_checked(self, kind: AssetKind, digest: str, *, timeout_s: float = 120.0) -> AssetView:
-        """An uploaded asset once a worker has checked it; UnavailableError if none did in time.
+        """Return an uploaded asset after its check; raise UnavailableError if no worker checked it in time.
 
         Args:
-            digest: of its files: a name stands for another asset as soon as this one is refused.
+            digest: digest of its files: after a refusal, the name may refer to another asset.
         """
         deadline = time.monotonic() + timeout_s
         while (asset := self.asset(kind, digest)).verdict is None:
@@ -156,20 +156,20 @@ class Client:
     def fetch(
         self, path: str, *, params: dict[str, str] | None = None, patience_s: float = _PATIENCE_S
     ) -> Iterator[bytes]:
-        """Chunks of a file of the API, none of which may take longer than `patience_s` [s]."""
+        """Yield chunks of a file from the API; each may take at most `patience_s` [s]."""
         timeout = httpx.Timeout(patience_s, connect=_CONNECT_S)
         with _Translated(self.url), self._http.stream("GET", path, params=params, timeout=timeout) as answer:
             _raise_for(answer)
             yield from answer.iter_bytes()
 
     def download(self, shard: Shard, path: Path) -> Path:
-        """Fetch a shard's file; the name appears once it is whole."""
+        """Download the file of a shard; `path` appears once it is complete."""
         return self.save(shard.file, path)
 
     def save(
         self, address: str, path: Path, *, params: dict[str, str] | None = None, patience_s: float = _PATIENCE_S
     ) -> Path:
-        """Fetch a file of the API; the name appears once it is whole. `patience_s` as for `fetch`."""
+        """Download a file from the API; `path` appears once it is complete. `patience_s`: see `fetch`."""
         draft = path.with_name(f".{path.name}.part")
         try:
             with draft.open("wb") as file:
@@ -181,12 +181,12 @@ class Client:
         return path
 
     def health(self) -> Health:
-        """State of the parts, also when one of them is down."""
+        """Return the state of the parts, even if one of them is down."""
         with _Translated(self.url):
             return Health.model_validate_json(self._http.get("/readyz").content)
 
     def watch(self, job_id: str) -> Iterator[Job]:
-        """A job at each change until it ends; survives a restart of the API."""
+        """Yield a job at each change until it ends; reconnects after a restart of the API."""
         while True:
             try:
                 for event, data in self._events(path_of("jobs", job_id, "events")):
@@ -200,7 +200,7 @@ class Client:
             time.sleep(_POLL_S)
 
     def wait(self, job_id: str, on_progress: Callable[[Job], None] | None = None) -> JobDetail:
-        """The job in its final state."""
+        """Return the job in its final state."""
         for job in self.watch(job_id):
             if on_progress is not None:
                 on_progress(job)
@@ -211,12 +211,12 @@ class Client:
         return DatasetView.model_validate_json(answer.content)
 
     def estimate(self, matrix: Matrix) -> Estimate:
-        """What the datasets of a matrix would take."""
+        """Estimate the cost of a matrix of datasets."""
         body = {name: value for name, value in _matrix_body(matrix).items() if name in Matrix.model_fields}
         return Estimate.model_validate_json(self.send("POST", "/v1/datasets/estimate", json=body).content)
 
     def datasets(self, *, limit: int = 50, cursor: str | None = None) -> Page[DatasetView]:
-        """Datasets, newest first."""
+        """Return datasets, newest first."""
         answer = self.send("GET", "/v1/datasets", params={"limit": limit, "cursor": cursor})
         return Page[DatasetView].model_validate_json(answer.content)
 
@@ -224,7 +224,7 @@ class Client:
         return DatasetView.model_validate_json(self.send("GET", path_of("datasets", name)).content)
 
     def cells(self, name: str, *, state: State | None = None) -> Iterator[CellView]:
-        """All cells of a dataset, or those in a state."""
+        """Yield all cells of a dataset, or those in a state."""
         return self._pages(CellView, path_of("datasets", name, "cells"), state=state)
 
     def cancel_dataset(self, name: str) -> DatasetView:
@@ -237,11 +237,11 @@ class Client:
         return SnapshotView.model_validate_json(self.send("POST", path_of("datasets", name, "snapshots")).content)
 
     def snapshot(self, name: str, digest: str) -> Snapshot:
-        """A snapshot with its list of shards."""
+        """Return a snapshot with its list of shards."""
         return Snapshot.model_validate_json(self.send("GET", path_of("datasets", name, "snapshots", digest)).content)
 
     def watch_dataset(self, name: str) -> Iterator[DatasetView]:
-        """A dataset every second until it ends."""
+        """Yield a dataset every second until it ends."""
         while True:
             dataset = self.dataset(name)
             yield dataset
@@ -257,7 +257,7 @@ class Client:
         return TypeAdapter(list[ObjectSetView]).validate_json(self.send("GET", "/v1/object-sets").content)
 
     def _pages(self, kind: type[View], path: str, **params: Any) -> Iterator[View]:
-        """What a list of the API holds, page after page."""
+        """Yield all items of a paginated list."""
         cursor: str | None = None
         while True:
             answer = self.send("GET", path, params={"limit": _PAGE, "cursor": cursor, **params})
@@ -284,7 +284,7 @@ class Client:
             yield from events_of(answer)
 
     def send(self, method: str, path: str, *, params: dict[str, Any] | None = None, **options: Any) -> httpx.Response:
-        """The answer to a request; the error behind a problem document is raised."""
+        """Send a request and return the response; raise the error of a problem document."""
         given = {name: value for name, value in (params or {}).items() if value is not None}
         for wait in (*_WAITS_S, None):
             with _Translated(self.url):
@@ -297,12 +297,12 @@ class Client:
 
 
 def path_of(*parts: str) -> str:
-    """Address of a thing of the API by its parts, whatever characters a name holds: `/v1/tags/good%20ones/remove`."""
+    """Build an address of the API from its parts, with escaped names: `/v1/tags/good%20ones/remove`."""
     return "/v1/" + "/".join(quote(part, safe="") for part in parts)
 
 
 def _matrix_body(matrix: Matrix) -> dict[str, Any]:
-    """The body of a request; what is empty is left out, as an older service does not know all of it."""
+    """Build the body of a matrix; empty fields are omitted, because an older service may not know them."""
     return {name: value for name, value in matrix.model_dump(mode="json").items() if value not in ({}, "")}
 
 
@@ -326,19 +326,19 @@ def _authorization(key: str) -> dict[str, str]:
 
 
 def _is_too_fast(answer: httpx.Response) -> bool:
-    """A quota is used up for longer than anybody waits: only the rate of requests is worth another try."""
+    """Check whether the rate of requests is exceeded; other quotas recover too slowly for a retry."""
     return answer.status_code == 429 and RateError.slug in answer.text
 
 
 def events_of(answer: httpx.Response) -> Iterator[tuple[str, Any]]:
-    """(event, decoded data) of a text/event-stream."""
+    """Yield (event, decoded data) of a text/event-stream."""
     for event in EventSource(answer).iter_sse():
         if event.data:
             yield event.event, event.json()
 
 
 class _Translated:
-    """Errors of the network as UnavailableError."""
+    """Context that converts network errors to UnavailableError."""
 
     def __init__(self, url: str) -> None:
         self.url = url

@@ -1,4 +1,4 @@
-"""Commands that talk to the API over HTTP, and the ones that run it."""
+"""Commands that use the API over HTTP: jobs, hands, objects and networks."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def jobs(
     url: UrlOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """List jobs, the newest first."""
+    """List jobs, newest first."""
     with open_client(url) as client:
         page = client.jobs(state=state, limit=limit)
     if json:
@@ -94,7 +94,7 @@ def jobs(
 @app.command(epilog="graspd status 3f2a --json")
 @reporting_errors
 def status(job_id: JobArgument, url: UrlOption = None, json: JsonFlag = False) -> None:
-    """Stages, progress and quality of a job."""
+    """Show stages, progress and quality of a job."""
     with open_client(url) as client:
         show_job(client.job(_full_id(client, job_id)), json=json, url=client.url, must_succeed=False)
 
@@ -102,7 +102,7 @@ def status(job_id: JobArgument, url: UrlOption = None, json: JsonFlag = False) -
 @app.command(epilog="graspd cancel 3f2a")
 @reporting_errors
 def cancel(job_id: JobArgument, url: UrlOption = None, json: JsonFlag = False) -> None:
-    """Stop a job; what is written stays."""
+    """Cancel a job; its results remain."""
     with open_client(url) as client:
         show_job(client.cancel(_full_id(client, job_id)), json=json, url=client.url, must_succeed=False)
 
@@ -110,7 +110,7 @@ def cancel(job_id: JobArgument, url: UrlOption = None, json: JsonFlag = False) -
 @app.command(epilog="graspd delete 3f2a")
 @reporting_errors
 def delete(job_id: JobArgument, yes: YesOption = False, url: UrlOption = None, json: JsonFlag = False) -> None:
-    """Take away a job that has ended; its shards follow after a grace time, unless another job needs them."""
+    """Delete an ended job; its shards follow after a grace time, unless another job needs them."""
     with open_client(url) as client:
         job = client.job(_full_id(client, job_id))
         asked = f"Delete job {job.id[:12]}, {job.hand} on {job.object}, with its {count(job.grasps)} grasps?"
@@ -126,7 +126,7 @@ def restore_job(
     url: UrlOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """Bring back a job that was deleted, within the grace time."""
+    """Restore a deleted job, within the grace time."""
     with open_client(url) as client:
         gone = [one["id"] for one in client.send("GET", "/v1/deletions").json() if one["what"] == "job"]
     restore(url, "job", _only_one(gone, job_id), json=json)
@@ -140,7 +140,7 @@ def retry(
     url: UrlOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """Run again what failed or was cancelled; what is written is not made twice."""
+    """Run failed and cancelled tasks of a job again; results are not made twice."""
     with open_client(url) as client:
         job = client.retry(_full_id(client, job_id))
         if wait:
@@ -151,7 +151,7 @@ def retry(
 @app.command(epilog="graspd logs 3f2a")
 @reporting_errors
 def logs(job_id: JobArgument, url: UrlOption = None, json: JsonFlag = False) -> None:
-    """Failed attempts of a job, with their reasons."""
+    """Show failed attempts of a job, with their reasons."""
     with open_client(url) as client:
         job = client.job(_full_id(client, job_id))
     if json:
@@ -168,7 +168,7 @@ def logs(job_id: JobArgument, url: UrlOption = None, json: JsonFlag = False) -> 
 
 
 def asset_commands(kind: AssetKind) -> typer.Typer:
-    """`graspd hands ...`, `graspd objects ...` or `graspd networks ...`."""
+    """Create `graspd hands ...`, `graspd objects ...` or `graspd networks ...`."""
     verbs = "Add, list, show and delete" if kind is AssetKind.NETWORK else "Check, add, list, show and delete"
     group = typer.Typer(no_args_is_help=True, help=f"{verbs} {kind.value}s.")
 
@@ -179,13 +179,13 @@ def asset_commands(kind: AssetKind) -> typer.Typer:
         url: UrlOption = None,
         json: JsonFlag = False,
     ) -> None:
-        """All of them."""
+        """List all of them."""
         with open_client(url) as client:
             assets = list(client.assets(kind, refused=refused))
         if json:
             emit({f"{kind.value}s": [asset.model_dump(mode="json") for asset in assets]})
             return
-        # Files of networks have one name.
+        # All networks have the same file name, so their hand is shown instead.
         second = "hand" if kind is AssetKind.NETWORK else "file"
         table = plain_table("name", second, "size", "check", "digest", whole=("size", "digest"))
         for asset in assets:
@@ -203,7 +203,7 @@ def asset_commands(kind: AssetKind) -> typer.Typer:
         url: UrlOption = None,
         json: JsonFlag = False,
     ) -> None:
-        """One of them, with what the check found."""
+        """Show one of them, with the findings of its check."""
         with open_client(url) as client:
             asset = client.asset(kind, name)
         show_asset(asset.model_dump(mode="json"), json=json)
@@ -216,7 +216,7 @@ def asset_commands(kind: AssetKind) -> typer.Typer:
         url: UrlOption = None,
         json: JsonFlag = False,
     ) -> None:
-        """Take one away that no job, dataset or set of objects needs."""
+        """Delete one that no job, dataset or set of objects needs."""
         with open_client(url) as client:
             client.asset(kind, name)
             confirm(f"Delete the {kind.value} {name}?", f"the {kind.value} {name}", yes=yes)
@@ -230,7 +230,7 @@ def asset_commands(kind: AssetKind) -> typer.Typer:
         url: UrlOption = None,
         json: JsonFlag = False,
     ) -> None:
-        """Bring back one that was deleted, within the grace time."""
+        """Restore a deleted one, within the grace time."""
         restore(url, kind.value, name, json=json)
 
     return group
@@ -245,7 +245,7 @@ networks_app.command("add", epilog="graspd networks add barrett.npz")(add_networ
 @objects_app.command("sets", epilog="graspd objects sets")
 @reporting_errors
 def sets(url: UrlOption = None, json: JsonFlag = False) -> None:
-    """Sets of objects; `graspd objects add FOLDER` makes one."""
+    """List sets of objects; `graspd objects add FOLDER` makes one."""
     with open_client(url) as client:
         found = client.object_sets()
     if json:
@@ -269,7 +269,7 @@ app.add_typer(tag_commands.app, name="tags")
 
 
 def _uploaded(client: Client, kind: AssetKind, value: str) -> str:
-    """The name of a hand, object or network; a path that exists is uploaded and checked first."""
+    """Return the name of a hand, object or network; an existing path is uploaded and checked first."""
     path = Path(value)
     is_file_name = "/" in value or path.suffix.lower() in (*MAIN_SUFFIXES[kind], ".zip")
     if not is_file_name:
@@ -283,7 +283,7 @@ def _uploaded(client: Client, kind: AssetKind, value: str) -> str:
 
 
 def _full_id(client: Client, prefix: str) -> str:
-    """The id of the one job that begins so, among the latest."""
+    """Return the id of the one recent job with this prefix."""
     if len(prefix) >= 32:
         return prefix
     return _only_one([job.id for job in client.jobs(limit=200).items], prefix)

@@ -1,4 +1,4 @@
-"""`graspd datasets`: hands x objects as one dataset, from its cost to its files."""
+"""`graspd datasets`: datasets of hands x objects, from cost estimate to export."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def create(
     *,
     options: dict[str, Any],
 ) -> None:
-    """Make a dataset: a job for each hand and object. The same command again goes on where it was."""
+    """Make a dataset: a job for each hand and object. The same command again continues it."""
     console = plain_console(stderr=json)
     asked = wanted(spec, name=name, hands=hands, objects=objects, options=options)
     if not asked.name:
@@ -110,7 +110,7 @@ def estimate(
     *,
     options: dict[str, Any],
 ) -> None:
-    """What a dataset would cost: time for 1, 8 and 64 workers, storage, network."""
+    """Estimate the cost of a dataset: time for 1, 8 and 64 workers, storage, network."""
     asked = wanted(spec, name=None, hands=hands, objects=objects, options=options)
     with open_client(url) as client:
         files, matrix = _matrix(client, asked)
@@ -128,7 +128,7 @@ def list_datasets(
     url: UrlOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """Datasets, the newest first."""
+    """List datasets, newest first."""
     with open_client(url) as client:
         page = client.datasets(limit=limit)
     if json:
@@ -161,7 +161,7 @@ def status(
     url: UrlOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """The matrix: each hand and object with its state, yield and failures."""
+    """Show the matrix: state, yield and failures of each hand and object."""
     with open_client(url) as client:
         dataset, cells = client.dataset(name), list(client.cells(name, state=state))
     if json:
@@ -174,7 +174,7 @@ def status(
 @group.command(epilog="graspd datasets cancel kitchen")
 @reporting_errors
 def cancel(name: NameArgument, url: UrlOption = None, json: JsonFlag = False) -> None:
-    """Stop a dataset; what is written stays."""
+    """Cancel a dataset; its results remain."""
     with open_client(url) as client:
         _show(client.cancel_dataset(name), json=json)
 
@@ -190,7 +190,7 @@ def delete(
     url: UrlOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """Take away a dataset that has ended, and the jobs that were planned for it alone."""
+    """Delete an ended dataset, and the jobs that belong to it alone."""
     with open_client(url) as client:
         found = client.dataset(name)
         goes = f"{count(found.cells)} cell{'s' * (found.cells != 1)}, {count(found.grasps)} grasps"
@@ -203,14 +203,14 @@ def delete(
 @group.command("restore", epilog="graspd datasets restore kitchen")
 @reporting_errors
 def restore_dataset(name: NameArgument, url: UrlOption = None, json: JsonFlag = False) -> None:
-    """Bring back a dataset that was deleted, with its jobs and snapshots, within the grace time."""
+    """Restore a deleted dataset with its jobs and snapshots, within the grace time."""
     restore(url, "dataset", name, json=json)
 
 
 @group.command(epilog="graspd datasets retry kitchen --wait")
 @reporting_errors
 def retry(name: NameArgument, wait: WaitOption = False, url: UrlOption = None, json: JsonFlag = False) -> None:
-    """Start again what failed or was cancelled; what is written is not made twice."""
+    """Restart failed and cancelled jobs; results are not made twice."""
     with open_client(url) as client:
         dataset = client.retry_dataset(name)
         if wait:
@@ -222,7 +222,7 @@ def retry(name: NameArgument, wait: WaitOption = False, url: UrlOption = None, j
 @group.command(epilog="graspd datasets snapshot kitchen")
 @reporting_errors
 def snapshot(name: NameArgument, url: UrlOption = None, json: JsonFlag = False) -> None:
-    """Write down which shards the dataset holds now; that list never changes."""
+    """Record the present shards of a dataset as an immutable list."""
     with open_client(url) as client:
         taken = client.take_snapshot(name)
     if json:
@@ -245,7 +245,7 @@ def export(
     url: UrlOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """Write a snapshot's files into a folder, each checked against its checksum."""
+    """Write a snapshot's files into a folder; each is verified against its checksum."""
     if format not in FORMATS:
         raise InputError(f"there is no format {format!r}; there are: {one_of(format, FORMATS)}")
     columns = (
@@ -274,13 +274,13 @@ def export(
 
 
 def _matrix(client: Client, asked: PlanRequest) -> tuple[Objects | None, dict[str, Any]]:
-    """Files of a set that is still to be uploaded, and the matrix that was asked for."""
+    """Return the files of a set that must still be uploaded, and the requested matrix."""
     objects = asked.objects
     names = [word.strip() for word in objects.split(",") if word.strip()]
     matrix: dict[str, Any] = {"hands": [w.strip() for w in asked.hands.split(",") if w.strip()], **asked.options}
     known = {found.name: found.objects for found in client.object_sets()}
     path = Path(objects)
-    # A set goes by its name also where the folder lies that it was added from; ./NAME is the folder.
+    # A bare name means the known set, even if a folder of that name exists; ./NAME is the folder.
     if objects not in known and (files := files_of_set(path)):
         matrix |= {"objects": sorted(files), "sets": [name_of_set(path)]}
         return files, asked.shared_out(matrix, len(files))
@@ -295,7 +295,7 @@ def _matrix(client: Client, asked: PlanRequest) -> tuple[Objects | None, dict[st
 
 
 def _estimate(client: Client, matrix: dict[str, Any], files: Objects | None) -> Estimate:
-    """The cost; InputError for a name that nobody knows and that is not about to be uploaded."""
+    """Return the cost; raise InputError for a name that is unknown and not about to be uploaded."""
     asked = matrix | {"sets": []} if files is not None else matrix
     found = client.estimate(parsed_options(Matrix, asked))
     unknown = [name for name in found.unknown if name not in (files or {})]
@@ -309,7 +309,7 @@ def _estimate(client: Client, matrix: dict[str, Any], files: Objects | None) -> 
 
 
 def _upload(client: Client, files: Objects, set_name: str, console: Console) -> list[str]:
-    """Send the objects of a folder and make them a set; returns those that are refused and so left out."""
+    """Upload the objects of a folder and make them a set; return the refused ones, which are excluded."""
     told = upload_set(client, files, say=lambda line: console.print(line, soft_wrap=True))
     taken = [one["name"] for one in told if one["verdict"] != "refuse"]
     if not taken:

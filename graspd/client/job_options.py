@@ -1,4 +1,4 @@
-"""A dataset's spec: its hands, objects and job options by options of a command, and as a TOML or JSON file."""
+"""Spec of a dataset: hands, objects and job options, from command options and a TOML or JSON file."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SpecOption = Annotated[
 
 
 class Spec(JobOptions):
-    """The keys of a spec: those of a job's options, and these."""
+    """Keys of a spec: those of a job's options, and these."""
 
     SUBMITTED = True
 
@@ -45,7 +45,7 @@ class Spec(JobOptions):
 
 @dataclass(frozen=True)
 class PlanRequest:
-    """What a command was told, by a spec and by options."""
+    """Request of a command, from a spec and options."""
 
     name: str
     hands: str
@@ -54,7 +54,7 @@ class PlanRequest:
     total: int | None = None
 
     def shared_out(self, matrix: dict[str, Any], objects: int) -> dict[str, Any]:
-        """The matrix with the grasps of each cell, where a number over all cells is wanted: rounded up."""
+        """Return the matrix with grasps per cell; a total over all cells is divided and rounded up."""
         if self.total is None or not objects:
             return matrix
         return matrix | {"grasps": math.ceil(self.total / (len(matrix["hands"]) * objects))}
@@ -63,17 +63,17 @@ class PlanRequest:
 def wanted(
     spec: Path | None, *, name: str | None, hands: str | None, objects: str | None, options: dict[str, Any]
 ) -> PlanRequest:
-    """Spec and options together; what an option says goes before.
+    """Combine spec and options; options take precedence.
 
     Args:
         spec: file, if one was given.
-        name: of the dataset; stays empty where neither names it.
+        name: name of the dataset; empty if neither contains it.
         hands: comma-separated, as `--hands`.
         objects: as `--objects`.
-        options: of `with_options`.
+        options: result of `with_options`.
 
     Raises:
-        InputError: no hands or no objects, no such file, or it holds a key or a value that is not known.
+        InputError: no hands or no objects, no such file, or an unknown key or invalid value in it.
     """
     given = dict(options)
     if "options" in given:
@@ -96,7 +96,7 @@ def wanted(
 
 
 def read_spec(file: Path) -> dict[str, Any]:
-    """The keys that a spec says; InputError for a file that is none."""
+    """Return the keys of a spec; raise InputError if the file is none."""
     try:
         text = file.read_text()
     except (OSError, UnicodeDecodeError) as error:

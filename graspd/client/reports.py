@@ -1,6 +1,6 @@
-"""Reports of the commands: the client of the settings, progress, jobs, assets, estimates and datasets on a terminal.
+"""Terminal output of the commands: progress, jobs, assets, estimates and datasets.
 
-Progress of a job: in a terminal one bar a stage with its rate and the time left, elsewhere plain lines.
+Progress of a job is one bar per stage with rate and time left on a terminal, and plain lines elsewhere.
 """
 
 from __future__ import annotations
@@ -35,8 +35,9 @@ UrlOption = Annotated[
 
 
 def open_client(url: str | None, *, key: str | None = None) -> Client:
-    """A client of the API that the option or the settings name, or else that serves the data folder; with their key,
-    unless one is given."""
+    """Return a client of the API from the option, the settings or the data folder.
+
+    The key is that of the settings, unless one is given."""
     settings = load_settings()
     if key is None and settings.api_key:
         key = settings.api_key.get_secret_value()
@@ -49,7 +50,7 @@ YesOption = Annotated[bool, typer.Option("--yes", "-y", help="Delete it without 
 
 
 def confirm(question: str, what: str, *, yes: bool) -> None:
-    """Ask before something is destroyed; InputError where the answer is no, or nobody is there to answer."""
+    """Ask before a deletion; raise InputError if the answer is no, or without a terminal."""
     if yes:
         return
     if not sys.stdin.isatty():
@@ -59,7 +60,7 @@ def confirm(question: str, what: str, *, yes: bool) -> None:
 
 
 def say_deleted(what: str, name: str, *, json: bool, undo: str = "") -> None:
-    """Tell that a thing is gone, and the command that brings it back."""
+    """Report a deletion, and the command that undoes it."""
     if json:
         emit({"deleted": name, "kind": what})
         return
@@ -69,7 +70,7 @@ def say_deleted(what: str, name: str, *, json: bool, undo: str = "") -> None:
 
 
 def restore(url: str | None, what: str, name: str, *, json: bool) -> None:
-    """Bring back what was deleted, and say so."""
+    """Restore a deleted resource and report it."""
     with open_client(url) as client:
         found = client.send("POST", path_of(f"{what}s", name, "restore")).json()
     if json:
@@ -79,13 +80,13 @@ def restore(url: str | None, what: str, name: str, *, json: bool) -> None:
 
 
 def watch(client: Client, job_id: str) -> JobDetail:
-    """The job in its final state, with progress on standard error meanwhile."""
+    """Return the job in its final state; show its progress on standard error meanwhile."""
     with JobDisplay(plain_console(stderr=True)) as display:
         return client.wait(job_id, display.update)
 
 
 def show_job(job: JobDetail, *, json: bool, url: str, must_succeed: bool = True) -> None:
-    """Say what became of a job; TaskError if it failed or was cancelled and should not have been."""
+    """Report the result of a job; raise TaskError if it failed or was cancelled and `must_succeed`."""
     if json:
         emit(job_summary(job))
     else:
@@ -96,7 +97,7 @@ def show_job(job: JobDetail, *, json: bool, url: str, must_succeed: bool = True)
 
 
 def job_summary(job: JobDetail) -> dict[str, Any]:
-    """The keys that scripts rely on (DESIGN.md §5): job, state, grasps, valid, stages, mean, shards; and more."""
+    """Return keys for scripts (DESIGN.md §5): job, state, grasps, valid, stages, mean, shards; and more."""
     return {
         "job": job.id,
         "state": job.state.value,
@@ -126,12 +127,12 @@ def job_summary(job: JobDetail) -> dict[str, Any]:
 
 
 def show_asset(asset: dict[str, Any], *, json: bool) -> None:
-    """Say what is known of a hand or object."""
+    """Print the facts of a hand or object."""
     if json:
         emit(asset)
         return
     console = plain_console()
-    # A built-in one came with the service: its time is that of the release.
+    # The time of a built-in asset is that of the release, so it is omitted.
     times = () if asset.get("builtin") else ("created",)
     for name in ("name", "kind", "filename", "size_bytes", "digest", *times, "verdict", "message"):
         if asset.get(name) is not None:
@@ -144,7 +145,7 @@ def show_asset(asset: dict[str, Any], *, json: bool) -> None:
 
 
 def yield_of(job: JobDetail) -> str:
-    """What was found among how many candidates, and what the recheck says, in a line."""
+    """Format the valid grasps per candidate, and the result of the recheck, in one line."""
     level = job.request.validation
     if level == "none":
         return f"{count(job.grasps)} grasps kept of {count(job.candidates)} candidates; not validated"
@@ -157,7 +158,7 @@ def yield_of(job: JobDetail) -> str:
 
 
 def means_of(job: JobDetail) -> str:
-    """Means over the valid grasps, in a line."""
+    """Format the means over the valid grasps in one line."""
     mean = job.mean
     return (
         f"mean ε {metric(mean.epsilon)}, contact {metric(mean.contact_area_cm2)} cm², "
@@ -166,7 +167,7 @@ def means_of(job: JobDetail) -> str:
 
 
 def diversity_of(found: Diversity) -> str:
-    """Types and directions, in a line."""
+    """Format types and directions in one line."""
     types = ", ".join(f"{count(number)} {name}" for name, number in found.types.items())
     return (
         f"{types} ({found.type_entropy_bits:.2f} bit); {found.directions_used} of {found.directions} directions "
@@ -200,7 +201,7 @@ _LINE_EVERY_S: Final = 2.0
 
 
 class _Rate(ProgressColumn):
-    """Speed in the unit of the stage."""
+    """Column with the rate in the unit of the stage."""
 
     def render(self, task: Task) -> Text:
         speed = task.finished_speed or task.speed
@@ -210,7 +211,7 @@ class _Rate(ProgressColumn):
 
 
 class JobDisplay:
-    """Shows each new state of one job. Usable as a context manager."""
+    """Display of one job's progress. Usable as a context manager."""
 
     def __init__(self, console: Console) -> None:
         self._console = console
@@ -238,7 +239,7 @@ class JobDisplay:
         self._progress.stop()
 
     def update(self, job: Job) -> None:
-        """Show a state of the job."""
+        """Show a new state of the job."""
         for stage in job.stages:
             if stage.state is not State.QUEUED:
                 self._started.setdefault(stage.stage, time.monotonic())
@@ -280,13 +281,13 @@ class JobDisplay:
 
 
 def _rate_words(stage: StageStatus, job: Job, pace: float) -> str:
-    """Speed in the unit of the stage; `pace` is the share of the stage per second."""
+    """Format the rate in the unit of the stage; `pace` is the share of the stage per second."""
     if stage.stage is Stage.SYNTHESIZE:
         return f"{metric(job.requested * pace)} grasps/s"
     return f"{metric(stage.tasks * pace)} tasks/s"
 
 
-#: A table with more hands does not fit a terminal: then each cell has a line.
+#: A table with more hands does not fit a terminal: each cell then has a line.
 _MOST_COLUMNS: Final = 6
 _SHOWN_RATES: Final = 8
 _STYLES: Final = {
@@ -299,7 +300,7 @@ _STYLES: Final = {
 
 
 def print_estimate(found: Estimate, console: Console) -> None:
-    """Time for some numbers of workers, storage, network, and what the rates are known from."""
+    """Print time for several numbers of workers, storage, network, and the source of the rates."""
     console.print(
         f"{count(found.cells)} cells, {count(found.asked)} grasps: about {count(found.candidates)} candidates, "
         f"{count(found.valid)} {found.counted}, {count(found.tasks)} tasks",
@@ -327,7 +328,7 @@ def print_estimate(found: Estimate, console: Console) -> None:
 
 
 def print_dataset(dataset: DatasetView, console: Console) -> None:
-    """A dataset in three lines."""
+    """Print a dataset in three lines."""
     states = ", ".join(f"{count(n)} {state.value}" for state, n in dataset.states.items() if n)
     left = f", {duration(dataset.eta_s)} left" if dataset.eta_s is not None else ""
     console.print(f"{dataset.name}  {dataset.state.value}  {percent(dataset.progress)}{left}")
@@ -343,7 +344,7 @@ def print_dataset(dataset: DatasetView, console: Console) -> None:
 
 
 def print_cells(dataset: DatasetView, cells: Sequence[CellView], console: Console) -> None:
-    """Objects as rows and hands as columns, each cell with its state, yield and failures."""
+    """Print objects as rows and hands as columns, each cell with its state, yield and failures."""
     if len(dataset.hands) > _MOST_COLUMNS:
         table = plain_table("hand", "object", "job", "", whole=("job",))
         for cell in cells:
@@ -362,7 +363,7 @@ def print_cells(dataset: DatasetView, cells: Sequence[CellView], console: Consol
 
 
 def watch_dataset(client: Client, name: str, console: Console) -> DatasetView:
-    """The dataset in its final state, with a bar of its tasks meanwhile."""
+    """Return the dataset in its final state; show a bar of its tasks meanwhile."""
     columns = (
         TextColumn("{task.description}", markup=False),
         BarColumn(bar_width=32),
@@ -385,7 +386,7 @@ def watch_dataset(client: Client, name: str, console: Console) -> DatasetView:
 
 
 def _yield(made: Validated) -> str:
-    """`at 94 % of the validated`, in short."""
+    """Format the yield in short form: `at 94 % of the validated`."""
     return f"at {valid_yield(made)}" if made.validated else "not validated"
 
 

@@ -1,4 +1,4 @@
-"""`graspd tags`: names for grasps of the service, and what has them as a file."""
+"""`graspd tags`: name grasps of the service, and export them by name."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from graspd.service.model.errors import InputError
 
 app = typer.Typer(no_args_is_help=True, help="Names for grasps of the service, to find them and take them home.")
 
-#: How long the service may write a file before its first byte comes [s].
+#: Longest wait for the first byte while the service writes the file [s].
 _PATIENCE_S: Final = 600.0
 
 NameArgument = Annotated[str, typer.Argument(metavar="TAG", help="Name of the tag: `graspd tags list`.")]
@@ -34,7 +34,7 @@ DatasetOption = Annotated[str | None, typer.Option(help="Of these only those of 
 @app.command("list", epilog="graspd tags list")
 @reporting_errors
 def list_tags(url: UrlOption = None, json: JsonFlag = False) -> None:
-    """Tags by name, with how many grasps have each."""
+    """List tags by name, with their numbers of grasps."""
     with open_client(url) as client:
         found = client.send("GET", "/v1/tags").json()
     if json:
@@ -59,7 +59,7 @@ def add_tag(
     url: UrlOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """Give a tag to grasps; it is made if it is not there."""
+    """Give a tag to grasps; a new tag is created."""
     body = {"name": tag, **_selection(grasps, where=where, job=job, dataset=dataset)}
     with open_client(url) as client:
         _tell(client.send("POST", "/v1/tags", json=body).json(), "more with", json=json)
@@ -76,7 +76,7 @@ def remove_tag(
     url: UrlOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """Take a tag off grasps."""
+    """Remove a tag from grasps."""
     body = _selection(grasps, where=where, job=job, dataset=dataset)
     if "filter" in body:
         body["filter"]["tag"] = tag
@@ -87,7 +87,7 @@ def remove_tag(
 @app.command("delete", epilog="graspd tags delete good")
 @reporting_errors
 def delete_tag(tag: NameArgument, yes: YesOption = False, url: UrlOption = None, json: JsonFlag = False) -> None:
-    """Take a tag away; its grasps stay."""
+    """Delete a tag; its grasps remain."""
     path = path_of("tags", tag)
     with open_client(url) as client:
         has = client.send("GET", path).json()["grasps"]
@@ -99,7 +99,7 @@ def delete_tag(tag: NameArgument, yes: YesOption = False, url: UrlOption = None,
 @app.command("restore", epilog="graspd tags restore good")
 @reporting_errors
 def restore_tag(tag: NameArgument, url: UrlOption = None, json: JsonFlag = False) -> None:
-    """Bring back a tag that was deleted, on its grasps, within the grace time."""
+    """Restore a deleted tag on its grasps, within the grace time."""
     restore(url, "tag", tag, json=json)
 
 
@@ -111,7 +111,7 @@ def export_tag(
     url: UrlOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """The grasps that have a tag, as a file."""
+    """Export the grasps that have a tag as a file."""
     format = out.suffix.removeprefix(".").lower()
     if format not in ("zip", "csv", "json"):
         raise InputError(f"{out}: the name of the file says its format; end it in .zip, .csv or .json")
@@ -124,7 +124,7 @@ def export_tag(
 
 
 def _selection(grasps: list[str] | None, **filters: str | None) -> dict[str, Any]:
-    """Body of a request: named grasps, or a filter."""
+    """Return the body of a request: grasps by name, or a filter."""
     given = {name: value for name, value in filters.items() if value is not None}
     if grasps and given:
         raise InputError("name grasps, or say which by --where, --job and --dataset: one of both")

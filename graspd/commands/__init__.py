@@ -1,1 +1,1 @@
-"""The commands of the engine, one module each."""
+"""Commands of the engine, one module each."""

@@ -29,7 +29,7 @@ def kernels(
     cpu: Annotated[bool, typer.Option(help="Objects for CPUs with the instructions of this one.")] = True,
     json: JsonFlag = False,
 ) -> None:
-    """Compile all kernels ahead of time, so that a fresh machine compiles none. No GPU is needed."""
+    """Compile all kernels ahead of time, so that a new machine compiles none. No GPU is needed."""
     folder.mkdir(parents=True, exist_ok=True)
     os.environ["WARP_CACHE_PATH"] = str(folder.resolve())
     from graspd.worker.engines import backend
@@ -63,7 +63,7 @@ def bench_render(
     repeats: Annotated[int, typer.Option(min=1, help="Timed runs; the median counts.")] = 3,
     json: JsonFlag = False,
 ) -> None:
-    """Images per second with all channels, per core or GPU, and where the time goes."""
+    """Measure images per second with all channels, per core or GPU, and the time of each step."""
     from graspd.studies.rendering_bench import bench_render as measure
     from graspd.studies.rendering_bench import tables
     from graspd.worker.objects.prepare import object_from_path
@@ -91,7 +91,7 @@ def gallery(
     output: Annotated[Path, typer.Option("--output", "-o", help="The folder to write.")] = Path("gallery"),
     json: JsonFlag = False,
 ) -> None:
-    """Pages of what the cameras see, of hands in grasps that fit on the table, and of crowded tables."""
+    """Write pages of camera pictures, of hands in grasps that fit on a table, and of crowded tables."""
     from graspd.studies.gallery import paint
     from graspd.worker.hands.load import hand_from_path
 

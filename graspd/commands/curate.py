@@ -29,7 +29,7 @@ OutOption = Annotated[Path, typer.Option("--out", "-o", help="The folder to writ
 
 @group.callback()
 def grasps() -> None:
-    """Grasps of files and datasets, chosen by their numbers."""
+    """Select grasps of files and datasets by their metrics."""
 
 
 @group.command(epilog='graspd grasps where "epsilon > 0.3 and lift and robust >= 0.75" --from kitchen -o subset')
@@ -42,7 +42,7 @@ def where(
     ] = ".",
     json: JsonFlag = False,
 ) -> None:
-    """Write the grasps for which an expression is true as base shards of their own."""
+    """Write the grasps that satisfy an expression as new base shards."""
     test = parse(expression)
     shards = shards_of(source)
     said = {"where": expression, "from": source}
@@ -71,7 +71,7 @@ def balance(
     seed: Annotated[int, typer.Option(min=0, help="Which of a kind are drawn.")] = 0,
     json: JsonFlag = False,
 ) -> None:
-    """Write a part of a dataset in which no kind of valid grasps is more frequent than others."""
+    """Write a subset of a dataset in which no kind of valid grasps is more frequent than others."""
     kinds = [one.strip() for one in by.split(",") if one.strip()]
     chooser = Balance(kinds, at_most, min_distance, seed, hand)
     said = {"balance": kinds, "from": source, "at_most": at_most, "min_distance": min_distance, "seed": seed}
@@ -85,7 +85,7 @@ def diff(
     second: SourceArgument,
     json: JsonFlag = False,
 ) -> None:
-    """What two datasets, or two versions of one, do not have in common: NAME@SNAPSHOT is a version."""
+    """Compare two datasets, or two versions of one: NAME@SNAPSHOT is a version."""
     found = difference(*(shards_of(*_version(one)) for one in (first, second)))
     if json:
         emit({"a": first, "b": second, **found})
@@ -153,7 +153,7 @@ def clouds(
 ) -> None:
     """Write the pictures of a dataset as point clouds with their grasps: docs/how-to/clouds.md.
 
-    Who reads with graspd needs no files: `Pictures(shards).clouds()` makes the same when it is asked for.
+    Python code needs no such files: `Pictures(shards).clouds()` computes the same clouds on demand.
     """
     pictures = Pictures(shards_of(source), unvalidated=unvalidated)
     if not len(pictures):

@@ -1,4 +1,4 @@
-"""GPUs and kernels, as `graspd doctor` sees them. Each is tried in a process of its own, which a driver may crash."""
+"""Checks of GPUs and kernels for `graspd doctor`, each in its own process: a driver may crash it."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from graspd.service.settings import Settings
 
 _MODULE: Final = "graspd.commands.doctor"
 _GPU_S: Final = 120.0
-#: All kernels compiled from nothing on a slow machine.
+#: Time limit for compiling all kernels from scratch, on a slow machine [s].
 _KERNELS_S: Final = 900.0
 _GIB: Final = 2**30
 _MEMORY_LOW: Final = 2 * _GIB
-#: Where the driver of a machine that has a GPU shows.
+#: Paths that exist on a machine with a GPU driver.
 _TRACES: Final = (Path("/proc/driver/nvidia/version"), Path("/dev/nvidiactl"))
 Child = Callable[[Sequence[str]], "subprocess.CompletedProcess[str]"]
 
 
 def checks_of(settings: Settings) -> list[Check]:
-    """What the engine runs on."""
+    """Return the checks of the engine's GPUs and kernels."""
     return [
         Check(
             "gpu", lambda: gpu(settings), limit_s=_GPU_S + 5, mend_hang="restart the driver, or the machine; see dmesg"
@@ -37,7 +37,7 @@ def checks_of(settings: Settings) -> list[Check]:
 
 
 def run_child(arguments: Sequence[str]) -> subprocess.CompletedProcess[str]:
-    """This module as a process. Raises subprocess.TimeoutExpired."""
+    """Run this module as a process. Raises subprocess.TimeoutExpired."""
     limit_s = _GPU_S if arguments[0] == "gpus" else _KERNELS_S
     command = [sys.executable, "-m", _MODULE, *arguments]
     return subprocess.run(
@@ -46,11 +46,11 @@ def run_child(arguments: Sequence[str]) -> subprocess.CompletedProcess[str]:
 
 
 def gpu(settings: Settings, *, child: Child = run_child, has_driver: Callable[[], bool] | None = None) -> Finding:
-    """Which GPUs Warp finds, and whether their memory is free.
+    """Check which GPUs Warp finds, and whether their memory is free.
 
     Args:
         child: runs this module.
-        has_driver: whether the machine looks as if it had a GPU.
+        has_driver: whether the machine appears to have a GPU.
     """
     name = "gpu"
     found, wrong = _answer(child, ["gpus"])
@@ -82,7 +82,7 @@ def gpu(settings: Settings, *, child: Child = run_child, has_driver: Callable[[]
 
 
 def kernels(settings: Settings, *, child: Child = run_child) -> Finding:
-    """Whether the engine loads, compiles and gives results that make sense, as a worker tries before its first task."""
+    """Check that the engine gives plausible results, as a worker does before its first task."""
     name = "kernels"
     found, wrong = _answer(child, ["kernels", settings.device])
     if wrong:
@@ -101,7 +101,7 @@ def kernels(settings: Settings, *, child: Child = run_child) -> Finding:
 
 
 def _answer(child: Child, arguments: Sequence[str]) -> tuple[dict[str, Any], str]:
-    """What a child says, and what went wrong with it ("" if nothing)."""
+    """Return the answer of a child process, and its error ("" if none)."""
     try:
         done = child(arguments)
     except subprocess.TimeoutExpired as error:
@@ -151,11 +151,11 @@ def _tell_kernels(wanted: str) -> dict[str, Any]:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """One line of JSON on stdout."""
+    """Print one line of JSON on stdout."""
     told = _tell_gpus() if arguments[0] == "gpus" else _tell_kernels(arguments[1])
     sys.stdout.write(f"{json.dumps(told)}\n")
     sys.stdout.flush()
-    # Taking Warp apart takes seconds, and nothing is left to be saved.
+    # A regular exit of Warp takes seconds, and there is nothing to save.
     os._exit(0)
 
 

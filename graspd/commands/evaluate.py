@@ -99,7 +99,7 @@ def evaluate_command(
     threads: Annotated[int, typer.Option(min=0, help="CPU threads, 0: one per core.")] = 0,
     json: JsonFlag = False,
 ) -> None:
-    """Measure grasps and let an independent engine validate them. Numbers are medians, ε and areas at 5 mm."""
+    """Measure grasps and validate them in an independent engine. Numbers are medians, ε and areas at 5 mm."""
     level = _checked_level(protocol, level)
     if robust and protocol == "displacement":
         raise InputError("--robust validates pushes or lifts in other models: choose --protocol dexgraspbench or lift")
@@ -143,7 +143,7 @@ def evaluate_command(
 
 
 def _checked_level(protocol: str, level: str) -> str:
-    """The level of a protocol, its own default where none is said; InputError for what is neither's."""
+    """Return the level, or the protocol's default if empty; raise InputError for an invalid one."""
     if protocol not in get_args(Protocol):
         raise InputError(f"unknown protocol {protocol!r}; choose {one_of(protocol, get_args(Protocol))}")
     levels = get_args(LiftLevel if protocol == "lift" else Level)
@@ -154,7 +154,7 @@ def _checked_level(protocol: str, level: str) -> str:
 
 
 def _tell(rows: list[dict[str, Any]], foreign: str, *, json: bool) -> None:
-    """The rows of all files and what they are together, for people or for machines."""
+    """Print the rows of all files and their totals, as a table or as JSON."""
     whole = combine([{key: value for key, value in row.items() if key != "file"} for row in rows])
     if json:
         verdicts = [{"file": row["file"], **one} for row in rows for one in row.pop("verdicts", [])]
@@ -171,7 +171,7 @@ def _tell(rows: list[dict[str, Any]], foreign: str, *, json: bool) -> None:
 
 
 def _copies(paths: list[Path], files: list[Path], out: Path | None, *, robust: int, hard: bool) -> dict[Path, Path]:
-    """Where the copy of each file goes; nowhere without --out."""
+    """Return the path of each file's copy; empty without --out."""
     if out is None:
         return {}
     if not robust or hard or len(paths) != 1:
@@ -180,7 +180,7 @@ def _copies(paths: list[Path], files: list[Path], out: Path | None, *, robust: i
 
 
 def _said_of_models(whole: dict[str, Any]) -> str:
-    """How far the verdicts can be trusted, the axis that costs most first."""
+    """Describe the robustness of the verdicts, with the most harmful axis first."""
     words = {axis.word: name for axis, name in AXIS_MEANINGS.items()}
     axes = sorted(whole["robust_axes"].items(), key=lambda pair: pair[1]["share"])
     each = ", ".join(f"{words[axis]} {one['share']:.2f}" for axis, one in axes)
@@ -242,10 +242,10 @@ def _cell(value: float | None, digits: int) -> str:
 
 
 def copy_paths(source: Path, files: list[Path], out: Path) -> list[Path]:
-    """Where the copies go: of a file, `out`; of a folder's, the same places in `out`, which must be new or empty.
+    """Return `out` for a file; for a folder, the same subpaths in `out`, which must be new or empty.
 
     Raises:
-        InputError: a file is no shard, would be written over, or lies in no folder.
+        InputError: a file is no shard, would be overwritten, or lies in no folder.
     """
     if other := next((file for file in files if file.suffix != ".h5"), None):
         raise InputError(f"{other} is no shard of graspd: only these have columns for the shares")
@@ -259,10 +259,10 @@ def copy_paths(source: Path, files: list[Path], out: Path) -> list[Path]:
 
 
 def write_copy(source: Path, out: Path, found: Robustness) -> None:
-    """A base shard with the shares of its grasps; all else, its id too, is as it was.
+    """Write a base shard with the robust shares of its grasps; all else, including its id, is unchanged.
 
     Raises:
-        InputError: it is no base shard, or cannot be written there.
+        InputError: it is no base shard, or the copy cannot be written.
     """
     shard = read_shard(source, kind="base")
     said = json_attribute({"models": found.held.shape[1], "wanted": found.wanted})

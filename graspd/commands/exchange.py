@@ -21,12 +21,12 @@ from graspd.worker.files.subsets import EveryOption, UnvalidatedOption, choose
 
 app = typer.Typer(no_args_is_help=True)
 
-#: Formats of robots and their simulators; the first of them goes by two names.
+#: Formats of robots and their simulators; the first has two names.
 ROBOTS: Final = ("moveit", "urdf+yaml", "mujoco", "usd", "glb", "isaac", "csv")
-#: Formats that a network is trained on: they take a folder of shards.
+#: Training formats: they take a folder of shards.
 TRAINING: Final = ("dexlearn", "dexgraspnet2", "graspgen", "huggingface", "lerobot")
 EXPORTS: Final = ("images", "replicator", "webdataset", "dexgraspbench", *TRAINING, *ROBOTS)
-#: Imports of one object, which `--name` names in the file.
+#: Imports that take one object, selected by `--name`.
 NAMED: Final = ("graspgen", "huggingface", "lerobot")
 IMPORTS: Final = ("dexgraspbench", "dexlearn", *NAMED, "dexgraspnet", "dexgraspnet2", "multidex", "ddgc", "reference")
 
@@ -64,7 +64,7 @@ def export(
     output: Annotated[Path, typer.Option("--output", "-o", help="The folder to write.")] = Path("export"),
     json: JsonFlag = False,
 ) -> None:
-    """Write grasps or pictures as others read them."""
+    """Write grasps or pictures in other formats."""
     if format_ not in EXPORTS:
         raise InputError(f"there is no export format {format_!r}; choose one of {one_of(format_, EXPORTS)}")
     if depth not in ("exr", "png"):
@@ -119,9 +119,9 @@ def import_(
     output: Annotated[Path, typer.Option("--output", "-o", help="The folder to write.")] = Path("imported"),
     json: JsonFlag = False,
 ) -> None:
-    """Read grasps of others, let the validator validate them, measure them, and write base shards.
+    """Read grasps from other formats, validate and measure them, and write base shards.
 
-    Nothing in the files is executed. The meshes go beside the shards, at the scale the grasps were made for.
+    Nothing in the files is executed. The meshes are written beside the shards, at the scale of the grasps.
     """
     from graspd.worker.engines import backend
 
@@ -155,10 +155,10 @@ def import_(
 
 
 def read_sets(format_: str, source: Path, hand: str | None, obj: str | None, options: dict[str, Any]) -> list[Any]:
-    """The sets of grasps in a file of that format.
+    """Return the sets of grasps in a file of that format.
 
     Raises:
-        InputError: unknown format, something that it needs is not given, or not such a file.
+        InputError: unknown format, a missing option, or a file in another format.
     """
     from graspd.exchange import dexgraspbench, dexgraspnet2, published
 
@@ -229,7 +229,7 @@ def _bench(
 
 
 def _compared(one: dict[str, Any]) -> str:
-    """How the verdicts that came with imported grasps agree with ours."""
+    """Describe how published verdicts of imported grasps agree with ours."""
     if not one["published"]:
         return ""
     words = f"; {one['published']} came with a verdict"
@@ -269,7 +269,7 @@ def card(
     data_dir: Annotated[Path | None, typer.Option("--data-dir", help="Folder of graspd; GRASPD_DATA_DIR.")] = None,
     json: JsonFlag = False,
 ) -> None:
-    """Write a dataset's card: what it holds, how it was made, how good and biased it is; with plots and checksums."""
+    """Write a dataset's card: contents, origin, quality and biases; with plots and checksums."""
     from graspd.studies.cards.card import write_card
     from graspd.studies.cards.contents import contents_of_folder, contents_of_store, with_provenance
 

@@ -1,4 +1,4 @@
-"""Sheets and films of the grasps of a base shard: hand and object, in their scene, alone or along their trajectory."""
+"""Sheets and films of the grasps of a base shard: at the grasp, in the scene, or along the trajectory."""
 
 from __future__ import annotations
 
@@ -41,13 +41,13 @@ from graspd.worker.rendering.trajectory_pictures import (
 )
 
 Kind = Literal["one side", "three sides", "way"]
-#: Edge of a grasp's picture [px] and rays a pixel. Tracing costs what goes with both: three sides half of one alone.
+#: Edge of a grasp's picture [px] and rays per pixel. Path tracing time grows with both: three sides cost half of one.
 LOOKS: Final[dict[Kind, tuple[int, int]]] = {"one side": (300, SAMPLES), "three sides": (160, 8), "way": (300, SAMPLES)}
 
 
 @dataclass(frozen=True)
 class GraspSheet:
-    """Some rows of a shard, drawn."""
+    """Contact sheet of some rows of a shard."""
 
     shard: Shard
     hand: HandModel
@@ -56,7 +56,7 @@ class GraspSheet:
     kind: Kind
     run: ExecutionContext
     edge: int | None = None
-    """Of one picture [px]; None: as `LOOKS` says."""
+    """Edge of one picture [px]; None: as in `LOOKS`."""
 
     @property
     def size(self) -> tuple[int, int]:
@@ -66,12 +66,12 @@ class GraspSheet:
 
     @property
     def scene(self) -> str:
-        """Kind of the scenes that the grasps were planned in; empty: none."""
+        """Kind of scene that the grasps were planned in; empty: none."""
         spec = _scene_of(self.shard)
         return "" if spec is None else spec.kind
 
     def png(self, *, subtitle: str) -> bytes:
-        """The sheet."""
+        """Draw the sheet as a PNG."""
         said = self.shard.attributes
         title = f"{said.get('hand', self.hand.name)} on {said.get('object', self.obj.name)}"
         title += f", {self.scene}" if self.scene else ""
@@ -87,14 +87,14 @@ class GraspSheet:
         return contact_sheet(drawn[:, 0], captions, title=title, subtitle=subtitle)
 
     def _ways(self) -> tuple[tuple[str, ...], NDArray[np.uint8]]:
-        """Names of the postures, and the pictures (N, F, H, W, 3)."""
+        """Return the names of the postures, and their pictures (N, F, H, W, 3)."""
         ways = [way_of(self.shard, int(row)) for row in self.rows]
         names = STRIP if any(point.name == "lift" for point in ways[0]) else FREE_STRIP
         drawn = self._drawn([[_named(way, name) for name in names] for way in ways], 1)
         return names, drawn[:, 0]
 
     def _alone(self) -> NDArray[np.uint8]:
-        """Pictures at the grasp (N, A, H, W, 3)."""
+        """Return pictures at the grasp (N, A, H, W, 3)."""
         sides = 3 if self.kind == "three sides" else 1
         if self.scene:
             return self._drawn([[_named(way_of(self.shard, int(row)), "grasp")] for row in self.rows], sides)[:, :, 0]
@@ -124,7 +124,7 @@ class GraspSheet:
 
 
 def around_of(shard: Shard, rows: NDArray[np.intp]) -> PictureScenes:
-    """Where grasps of a base shard are: in the scenes that they were planned in, or around a free object."""
+    """Return the surroundings of grasps of a base shard: the scenes they were planned in, or none."""
     if (spec := _scene_of(shard)) is None:
         return PictureScenes()
     poses = np.asarray(shard["scene/object_pose"], float)
@@ -141,22 +141,22 @@ def _named(way: list[Waypoint], name: str) -> Waypoint:
     return next(point for point in way if point.name == name)
 
 
-#: Width of the film [px], and its height as a share of that.
+#: Width of the film [px], and its height as a share of the width.
 WIDTH: Final = 480
 HIGH: Final = 0.75
 
-#: Rays a pixel: shadows that move show what is coarse in them.
+#: Rays per pixel: noise is more visible in moving shadows.
 FILM_SAMPLES: Final = 24
-#: Share of the velocity limits of joints and hand that is used.
+#: Used share of the velocity limits of joints and hand.
 SPEED: Final = 0.5
-#: The open hand is shown for so long before it sets out, and the lifted object before all begins anew [s].
+#: Time for which the open hand is shown before its motion, and the lifted object before the film repeats [s].
 BEFORE_S: Final = 0.4
 AFTER_S: Final = 1.4
 
 
 @dataclass(frozen=True)
 class GraspAnimation:
-    """Grasps of a shard on their way, one after the other."""
+    """Film of the trajectories of grasps of a shard, one after the other."""
 
     shard: Shard
     hand: HandModel
@@ -164,14 +164,14 @@ class GraspAnimation:
     rows: NDArray[np.intp]
     run: ExecutionContext
     width: int | None = None
-    """[px]; None: `WIDTH`."""
+    """Width [px]; None: `WIDTH`."""
     samples: int = FILM_SAMPLES
 
     def file(self, suffix: str) -> bytes:
-        """The film as GIF, WebP or animated PNG.
+        """Return the film as GIF, WebP or animated PNG.
 
         Raises:
-            InputError: another suffix, or a grasp has no way that is free of the object.
+            InputError: another suffix, or a grasp has no trajectory that is free of the object.
         """
         animation_kind(suffix)
         pictures: list[NDArray[np.uint8]] = []
@@ -207,7 +207,7 @@ class GraspAnimation:
 
 
 def waypoints(found: Executions, way: RobotTrajectory) -> list[Waypoint]:
-    """The points of the trajectory of the first grasp, in the frame of the object at rest."""
+    """Return the points of the first grasp's trajectory, in the frame of the object at rest."""
     rest = found.object_pose[0]
     poses = compose(invert(rest), way.hand_pose)
     held = way.phase.index("lift")

@@ -49,7 +49,7 @@ def check(
     ] = True,
     json: JsonFlag = False,
 ) -> None:
-    """Say whether a hand can be used, what was guessed, and what it holds of plain objects. Needs no server."""
+    """Check whether a hand can be used, report guesses, and try it on plain objects. Needs no server."""
     options = hand_options(**options)
     with _bar("reading     ", quiet=json) as run:
         report = report_hand(file, options, run)
@@ -71,7 +71,7 @@ def check(
 
 
 def _tried(file: str, options: dict[str, Any], *, quiet: bool) -> dict[str, Any]:
-    """The facts of the self-test; a terminal sees how far it is."""
+    """Return the facts of the self-test, with progress on a terminal."""
     from graspd.worker.stages.hand_self_test import tried_softly
 
     with _bar("self-test   ", "starting; the first one on a machine compiles its kernels", quiet=quiet) as run:
@@ -80,10 +80,10 @@ def _tried(file: str, options: dict[str, Any], *, quiet: bool) -> dict[str, Any]
 
 @contextmanager
 def _bar(what: str, first: str = "", *, quiet: bool) -> Iterator[ExecutionContext]:
-    """A run that tells a terminal how far it is."""
+    """Yield a context whose progress is shown on a terminal."""
     columns = (TextColumn(f"  {what}       {{task.description}}", markup=False), BarColumn(), TimeElapsedColumn())
     console = plain_console(stderr=True)
-    # Elsewhere than on a terminal its end would be an empty line.
+    # Outside a terminal its end would print an empty line.
     with Progress(*columns, console=console, disable=quiet or not console.is_terminal, transient=True) as bar:
         task = bar.add_task(first, total=1.0)
 
@@ -102,7 +102,7 @@ def _draw(hand: HandModel, picture: Path, *, collision: bool) -> None:
 
 
 def _write(file: str, options: dict[str, Any], report: dict[str, Any], target: Path) -> None:
-    """An asset.json that says what files, options and guesses say, so that nothing is left to guess."""
+    """Write an asset.json with the settings from files, options and guesses; it leaves nothing to guess."""
     _, files, stated = files_from_path(file)
     settings = parse_options(files, {**stated, **options})
     said = settings.model_dump(mode="json", exclude_unset=True)
@@ -117,7 +117,7 @@ def _write(file: str, options: dict[str, Any], report: dict[str, Any], target: P
 def report_hand(
     file: str, options: dict[str, Any] | None = None, run: ExecutionContext = DEFAULT_CONTEXT
 ) -> dict[str, Any]:
-    """`check_hand` of a path; what cannot even be read is refused in the same form."""
+    """Run `check_hand` on a path; report an unreadable file in the same form."""
     try:
         name, files, stated = files_from_path(file)
     except GraspdError as error:

@@ -32,7 +32,7 @@ def check(
     picture: Annotated[Path | None, typer.Option(help="Draw the prepared mesh: a PNG.")] = None,
     json: JsonFlag = False,
 ) -> None:
-    """Say whether a mesh can be used, what was repaired, and how large it is. Needs no server."""
+    """Check whether a mesh can be used; report its repairs and its size. Needs no server."""
     if several := _several(file):
         if picture:
             raise InputError(f"--picture draws one object; {file} holds {len(several)}")
@@ -52,7 +52,7 @@ def check(
 
 
 def _several(file: str) -> Objects | None:
-    """The objects of a folder or of a ZIP of several; None for one object, readable or not."""
+    """Return the objects of a folder, or of a ZIP of several; None for one object, readable or not."""
     if file in builtin_names(AssetKind.OBJECT) and not Path(file).is_file():
         return None
     try:
@@ -64,7 +64,7 @@ def _several(file: str) -> Objects | None:
 
 
 def _check_set(objects: Objects, options: dict[str, Any], *, json: bool) -> None:
-    """A line for each object; what is refused does not stop the others."""
+    """Print one line per object; a refused object does not stop the others."""
     reports = []
     for name, files in objects.items():
         reports.append({"name": name, **check_object(files, name, **options)})
@@ -78,7 +78,7 @@ def _check_set(objects: Objects, options: dict[str, Any], *, json: bool) -> None
 
 
 def report_object(file: str, options: dict[str, Any] | None = None) -> dict[str, Any]:
-    """`check_object` of a path; what cannot even be read is refused in the same form."""
+    """Run `check_object` on a path; report an unreadable file in the same form."""
     try:
         name, files, stated = files_from_path(file)
     except GraspdError as error:

@@ -80,7 +80,7 @@ def render(
     page: Annotated[Path | None, typer.Option(help="Also write a page that shows the views (PNG).")] = None,
     json: JsonFlag = False,
 ) -> None:
-    """Take pictures of scenes: colour, depth, segmentation, boxes, and what `--channels` asks for."""
+    """Render pictures of scenes: colour, depth, segmentation, boxes, and the `--channels` requested."""
     started = perf_counter()
     scene = _scenes(scenes)
     obj = object_of_shard(scene, object)
@@ -155,7 +155,7 @@ def pictures(
     output: Annotated[Path, typer.Option("--output", "-o", help="The PNG or film to write.")] = Path("grasps.png"),
     json: JsonFlag = False,
 ) -> None:
-    """Draw the best valid grasps by epsilon with their figures on one sheet, in their scenes where they have any."""
+    """Draw the best valid grasps by epsilon with their metrics on one sheet, in their scenes if any."""
     if way + three + animate > 1:
         raise InputError("--way, --three-sides and --animate exclude one another")
     if animate:
@@ -191,7 +191,7 @@ def _named_rows(base: Shard, rows: list[int], chosen: NDArray[np.bool_], word: s
 
 
 def _scenes(path: Path) -> Shard:
-    """A scene shard, or a base shard whose grasps were planned in scenes."""
+    """Read a scene shard, or a base shard whose grasps were planned in scenes."""
     shard = read_shard(path)
     if shard.kind == "base" and "scene/object_pose" not in shard.arrays:
         raise InputError(
@@ -203,7 +203,7 @@ def _scenes(path: Path) -> Shard:
 
 
 def _drawn_in(base: Shard, hand: str | None) -> DrawnHand | None:
-    """The best valid grasp of each scene that grasps were planned in; where not validated, the best feasible one."""
+    """Return the best valid grasp of each scene of a base shard; if not validated, the best feasible."""
     validated = validity.valid(base.arrays).any()
     rows = best_in_scenes(base.arrays, validity.chosen(base.arrays, unvalidated=not validated))
     if not len(base["grasp/hand_pose"]):
@@ -219,7 +219,7 @@ def _drawn_in(base: Shard, hand: str | None) -> DrawnHand | None:
 
 
 def _drawn(scene: Shard, base_file: Path | None, hand: str | None) -> DrawnHand | None:
-    """The best grasp that each scene kept, by epsilon, for `--with-hand`."""
+    """Return the best grasp by epsilon that each scene kept, for `--with-hand`."""
     if base_file is None:
         return None
     base = read_shard(base_file, kind="base")
@@ -261,7 +261,7 @@ def view(
     hand: Annotated[str | None, typer.Option(help="The hand's file; default: found by its digest.")] = None,
     object: Annotated[str | None, typer.Option(help="The object's file; default: found by its digest.")] = None,
 ) -> None:
-    """Show grasps in 3D in the browser: hand, object, scene, contacts, and the way as a slider. Ends with Ctrl-C."""
+    """Show grasps in 3D in the browser: hand, object, scene, contacts, trajectory. Ends with Ctrl-C."""
     from graspd.worker.viewing import Viewer, ViewerContent, missing
 
     if said := missing():
@@ -285,8 +285,8 @@ def view(
 
 
 def forwarding(port: int) -> str:
-    """The command that brings a port of this machine's loopback to the machine that one sits at."""
-    # sshd says the address under which it was reached.
+    """Return the ssh command that forwards a port of this machine's loopback to the user's machine."""
+    # sshd sets the address at which this machine was reached.
     reached = os.environ.get("SSH_CONNECTION", "").split()
     host = reached[2] if len(reached) == 4 else socket.gethostname()
     return f"ssh -L {port}:127.0.0.1:{port} {getpass.getuser()}@{host}"

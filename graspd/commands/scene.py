@@ -45,7 +45,7 @@ def scene(
     output: Annotated[Path, typer.Option("--output", "-o", help="The scene shard to write.")] = Path("scenes.h5"),
     json: JsonFlag = False,
 ) -> None:
-    """Drop the object onto a table and keep the grasps that the hand can reach there."""
+    """Drop the object onto a table and select the grasps that the hand can reach there."""
     started = perf_counter()
     base = read_shard(grasps, kind="base")
     model, obj = hand_of_shard(base, hand), object_of_shard(base, object)

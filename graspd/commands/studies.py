@@ -47,7 +47,7 @@ def bench(
     out: Annotated[Path | None, typer.Option(help="Folder for bench.json, bench.md and bench.png.")] = None,
     json: JsonFlag = False,
 ) -> None:
-    """Grasps per second of the planner, without the quality table, and where the time goes."""
+    """Measure grasps per second of the planner, without quality metrics, and the time of each step."""
     from graspd.studies.bench import bench as measure
     from graspd.studies.bench import table, write
     from graspd.worker.hands.load import hand_from_path
@@ -74,7 +74,7 @@ def bench(
 
 
 def _fidelities(names: list[str] | None, points: list[int] | None, errors: list[float] | None) -> list[Fidelity]:
-    """The named fidelities, then the first of them with one knob changed at a time."""
+    """Return the named fidelities, then variants of the first one with one setting changed at a time."""
     chosen = names or list(OFFERED)
     if unknown := [name for name in chosen if name not in FIDELITIES]:
         raise InputError(f"unknown fidelity {unknown[0]!r}; choose one of {one_of(unknown[0], FIDELITIES)}")
@@ -121,7 +121,7 @@ def stability(
     data_dir: Annotated[Path | None, typer.Option(help="Folder of the store; GRASPD_DATA_DIR.")] = None,
     json: JsonFlag = False,
 ) -> None:
-    """Drive integrators and the planner to where they fail, and draw the maps."""
+    """Drive integrators and the planner to failure, and draw the maps."""
     from graspd.studies.stability.report import markdown, write
 
     if unknown := [name for name in only or [] if name not in STUDIES]:
@@ -166,7 +166,7 @@ def _read_maps(path: Path) -> Stability:
 
 
 def _joined(parts: list[Stability]) -> Stability:
-    """Several runs as one: the later one's map where both have it."""
+    """Merge several runs; of maps with the same name, the later one counts."""
     maps = {one.name: one for part in parts for one in part.maps}
     commands = "; ".join(dict.fromkeys(part.command for part in parts))
     return replace(parts[-1], command=commands, maps=list(maps.values()))
@@ -186,7 +186,7 @@ def _say(line: str) -> None:
     typer.echo(line, err=True)
 
 
-#: What is compared where nothing is named.
+#: Default methods of the comparison.
 PEERS = ("fast_graspd", "graspit", "graspd2022", "dfc", "autograsp")
 
 
@@ -232,7 +232,7 @@ def chart(
     data_dir: Annotated[Path | None, typer.Option(help="Folder of the store; GRASPD_DATA_DIR.")] = None,
     json: JsonFlag = False,
 ) -> None:
-    """Speed against accuracy: every method and fidelity on the same hands and objects, validated by MuJoCo."""
+    """Compare speed and accuracy: methods and fidelities on the same hands and objects, in MuJoCo."""
     from graspd.studies.chart.chart import settings_of
     from graspd.studies.chart.sweeps import sweep as turn
     from graspd.studies.chart.sweeps import turns
@@ -241,7 +241,7 @@ def chart(
     if source is not None:
         _finish(_read_chart(source), out, data_dir, publish=publish, json=json)
         return
-    turns(knobs=knob or ())  # a wrong name is told before an hour of work
+    turns(knobs=knob or ())  # report a wrong name before an hour of work
     if scene != "free" and sweep:
         raise InputError("--sweep is of free objects' charts; leave out --scene")
     place = _place(scene)
@@ -293,7 +293,7 @@ def _finish(result: dict[str, Any], out: Path | None, data_dir: Path | None, *, 
 
 
 def _report(chart: dict[str, Any]) -> ModuleType:
-    """The module that writes it: a chart in scenes has other columns."""
+    """Return the module that writes the chart: a chart in scenes has other columns."""
     return import_module(f"graspd.studies.chart.{'scene_report' if 'scene' in chart else 'report'}")
 
 
@@ -316,18 +316,18 @@ def _read_chart(path: Path) -> dict[str, Any]:
 
 
 def _place(scene: str) -> SceneSpec | None:
-    """The scene of a chart; None: around free objects."""
+    """Return the scene of a chart; None: around free objects."""
     if scene == "free":
         return None
     spec = parse_scene(scene)
     if spec.neighbours:
         raise InputError(f"{scene} has neighbours; the chart compares methods among supports alone: leave them out")
-    # Every stable face of an object, where it is dropped.
+    # The object is dropped onto each of its stable faces.
     return spec if spec.target is not None else parse_scene(scene, faces="all")
 
 
 def _short(word: str) -> str:
-    """A word of the command line without the folders of this machine that everybody else calls otherwise."""
+    """Remove local folders from a word of the command line, because they differ between machines."""
 
     def one(part: str) -> str:
         if "/data/" in part:
@@ -355,7 +355,7 @@ def _number(text: str) -> int:
 
 
 def known_fidelities(names: Sequence[str]) -> list[str]:
-    """The names, if all are known; raises InputError."""
+    """Return the names if all are known; else raise InputError."""
     if unknown := [name for name in names if name not in FIDELITIES]:
         raise InputError(f"unknown fidelity {unknown[0]!r}; choose of {one_of(unknown[0], FIDELITIES)}")
     return list(names)
@@ -369,7 +369,7 @@ def _things(objects: Sequence[str]) -> list[Any]:
         return object_from_path(text, face_error_m=error)
 
     for text in objects:
-        load(text, 1e-3)  # a wrong file is told before an hour of work
+        load(text, 1e-3)  # report a wrong file before an hour of work
     return [ChartObject(name_of(Path(text)), partial(load, text)) for text in objects]
 
 

@@ -1,4 +1,4 @@
-"""`graspd synth`: the grasps of a job in one process, without a queue or a server."""
+"""`graspd synth`: make the grasps of a job in one process, without queue or server."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from graspd.worker.execution_context import Progress as Report
 
 app = typer.Typer()
-#: Exit code of a run that found fewer grasps than it was asked for.
+#: Exit code of a run that found fewer grasps than requested.
 FEWER: Final = 3
 
 
@@ -47,8 +47,8 @@ def synth(
 ) -> None:
     """Make grasps of one hand on one object as a job does, validated and measured, into an HDF5 file.
 
-    In a scene a grasp is valid if it comes, closes and lifts without touching anything else and holds what it lifts.
-    Exit code 3: fewer grasps were found than asked. Ctrl-C keeps those that are validated.
+    In a scene a grasp is valid if approach, closing and lift touch nothing else, and the lifted object is held.
+    Exit code 3: fewer grasps were found than requested. Ctrl-C saves the validated ones.
     """
     from graspd.worker.files.provenance import id_of_columns  # help and completion need no engine
     from graspd.worker.files.synthesis import synthesized_as
@@ -91,11 +91,11 @@ def synth(
 
 @contextmanager
 def _bar(*, quiet: bool) -> Iterator[Report]:
-    """A progress bar on a terminal; gives what is told of the grasps that are done."""
+    """Show a progress bar on a terminal; yield the callback that updates it."""
     if quiet or not sys.stderr.isatty():
         yield lambda done, total, message: None
         return
-    # Where nobody looks at a bar, what draws it need not be loaded.
+    # Without a bar, its library need not be loaded.
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
     began = time.perf_counter()
@@ -117,7 +117,7 @@ def _bar(*, quiet: bool) -> Iterator[Report]:
 
 
 def _said_of_models(found: dict[str, Any]) -> str:
-    """How far the verdicts can be trusted, in a line."""
+    """Describe the robustness of the verdicts in one line."""
     share, not_robust = found["robust_share"], found["not_robust"]
     if share is None:
         return (
@@ -130,7 +130,7 @@ def _said_of_models(found: dict[str, Any]) -> str:
 
 
 def _said(found: dict[str, Any]) -> str:
-    """The summary as a line; the second one tells what is missing."""
+    """Return the summary as one line, and further lines for details and the reason of a shortfall."""
     validated, mean = found["validation"] != "none", found["mean"]
     word = "valid" if validated else "feasible"
     lines = [

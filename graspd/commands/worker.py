@@ -1,4 +1,4 @@
-"""Commands of workers."""
+"""Command line: `graspd worker`."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def worker(
     ] = False,
     data_dir: Annotated[Path | None, typer.Option(help="Folder of everything graspd keeps; GRASPD_DATA_DIR.")] = None,
 ) -> None:
-    """A worker on one device, or several: takes tasks from the queue until it is told to stop."""
+    """Run one or several workers, each on one device: they take tasks from the queue until stopped."""
     settings = load_settings(device=device, threads=threads, join=join, processes=processes, data_dir=data_dir)
     log_to_stderr(settings, "worker")
     keep_private(settings)
@@ -86,12 +86,12 @@ def run_workers(
     *,
     program: Sequence[str] = (sys.executable, "-m", "graspd"),
 ) -> None:
-    """Keep `count` processes alive until told to stop; number k of them takes the k-th GPU (`worker.engines.devices`).
+    """Keep `count` processes alive until `stop`; process k takes the k-th GPU (`worker.engines.devices`).
 
     Args:
         arguments: command line of each; their settings come from the environment as well.
         settings: how long a worker may take to stop.
-        stop: set by whoever ends it all.
+        stop: event that ends all processes.
     """
     from graspd.service.run.children import Child, keep_alive, stop_children
 
@@ -104,7 +104,7 @@ def run_workers(
 
 
 def check_worker(settings: Settings) -> None:
-    """UnavailableError if no worker of this host gave a sign of life within its lease."""
+    """Raise UnavailableError if no worker of this host sent a heartbeat within its lease."""
     from graspd.service.queue.rq_queue import open_queue
 
     host = socket.gethostname()
