@@ -123,7 +123,7 @@ def write_output(path: Path, content: bytes) -> None:
 
 @contextlib.contextmanager
 def told_to_stop() -> Iterator[list[int]]:
-    """Yield a list that receives the first signal to stop (Ctrl-C, SIGTERM); a second one ends the process."""
+    """Yield a list that receives the first stop signal (Ctrl-C, SIGTERM); a second one ends the process."""
     asked: list[int] = []
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
 

@@ -66,7 +66,7 @@ SHAKE_NEEDS_A_SCENE: Final = "shake moves what was lifted out of a scene: choose
 
 
 def _sparse(default: Any, **facts: Any) -> Any:
-    """Field that documents omit at its default, so that ids and records of jobs without it do not change."""
+    """Return a field that documents omit at its default, so that ids and records of other jobs do not change."""
     return Field(default, exclude_if=lambda value: value == default, **facts)
 
 

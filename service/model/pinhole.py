@@ -79,7 +79,7 @@ def fitted_normals(
         gap_m: (P,) neighbours are ignored if their depth differs by more than this [m].
 
     Returns:
-        Direction of least variance of each window; the viewing direction if fewer than three points count.
+        Direction of least variance of each window; the direction to the camera if fewer than three points count.
     """
     offset = np.arange(-radius, radius + 1)
     height, width = points.shape[:2]

@@ -313,7 +313,7 @@ def shortfall(
         found: number of grasps that count.
         wanted: number of grasps requested.
         counted: which grasps count: valid or feasible.
-        tried: number of planned candidates.
+        candidates: number of planned candidates.
         budget: candidates allowed for each grasp wanted: candidates and repeated attempts.
         outcomes: rejected candidates by `OUTCOMES`, and the repeated attempts.
         limit: the hand's lifting limit, if that ended the search instead of the budget.

@@ -314,7 +314,7 @@ class Tag(Record):
 
     @property
     def members(self) -> set[Grasp]:
-        """Return the grasps of the tag."""
+        """Grasps of the tag."""
         return {(shard, row) for shard, rows in self.grasps.items() for row in rows}
 
 

@@ -86,7 +86,7 @@ class StabilityMap:
 
     @property
     def is_divided(self) -> bool:
-        """Check whether a job can reach some cells but not all."""
+        """Whether a job can reach some cells but not all."""
         return 0 < len(self.reached()) < len(self.cells)
 
     def still_breaks(self) -> list[str]:

@@ -242,7 +242,7 @@ class RqQueue:
             return bool(self.connection.exists(_part_key(part)))
 
     def service(self) -> str | None:
-        """Identity of the service that owns this queue; None if unset, or Redis was lost."""
+        """Return the identity of the service that owns this queue; None if unset, or Redis was lost."""
         with _mapped():
             found = self.connection.get(_SERVICE)
         return None if found is None else entries.text(found)

@@ -1,6 +1,7 @@
-"""Runs a program that ends with its parent: `python -m graspd.service.run.launch PARENT_PID PROGRAM ARGUMENTS...`.
+"""Launcher of a program that ends with its parent.
 
-On Linux the kernel signals the child (prctl survives exec). Elsewhere the next `graspd up` kills by pid files.
+Usage: `python -m graspd.service.run.launch PARENT_PID PROGRAM ARGUMENTS...`. On Linux the kernel signals the child
+(prctl survives exec). Elsewhere the next `graspd up` kills by pid files.
 """
 
 from __future__ import annotations

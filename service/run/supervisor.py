@@ -306,8 +306,8 @@ def _as_variable(value: object) -> str:
 
 
 def _reserve(host: str, port: int) -> socket.socket:
-    """Bind a socket to the port, or to a free one for 0. While it is open, the API can listen there and the
-    system assigns the port to no other process.
+    """Bind a socket to the port, or to a free one for 0. While it is open, the API can listen there
+    and the system assigns the port to no other process.
     """
     reserved = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)
     reserved.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

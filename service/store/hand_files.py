@@ -206,7 +206,7 @@ def format_of(name: str, data: bytes) -> Format | None:
     found = _FORMATS_OF.get(_root_element(text[:_HEAD_BYTES]))
     if found == "urdf" and any(sign in _COMMENT.sub("", text) for sign in _MACROS):
         return "xacro"
-    # The suffix .urdf decides, so that the reader reports the error in the file.
+    # Otherwise the suffix decides, so that the reader reports the error in the file.
     return found or {".urdf": "urdf", ".xacro": "xacro", ".mjcf": "mjcf"}.get(suffix)  # type: ignore[return-value]
 
 

@@ -1,4 +1,4 @@
-"""Conversion of packs of graspd 0.2 (objects with several shards) to files; no other module reads packs.
+"""Conversion of packs of graspd 0.2 (many shards in one object) to files; no other module uses packs.
 
 A pack has a head (magic bytes and the length of the directory), the directory, the manifests and the files. Its name is
 the digest of its directory, which has the SHA-256 of each manifest and file. Records beside it list its deleted shards.
