@@ -30,7 +30,7 @@ def arrow() -> Any:
 
 
 def type_of(name: str) -> Any:
-    """Return the Arrow type of a name: `image`, `text`, NumPy type; [n]: list of n, []: list of any length."""
+    """Return the Arrow type of a name: `image`, `text`, NumPy type; [n]: list of n, []: of any length."""
     pa = arrow()
     if name.endswith("]"):
         inner, _, size = name[:-1].rpartition("[")

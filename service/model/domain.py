@@ -66,7 +66,7 @@ SHAKE_NEEDS_A_SCENE: Final = "shake moves what was lifted out of a scene: choose
 
 
 def _sparse(default: Any, **facts: Any) -> Any:
-    """Return a field that documents omit at its default, so that ids and records of other jobs do not change."""
+    """Return a field omitted from documents at its default, so that other jobs keep their ids and records."""
     return Field(default, exclude_if=lambda value: value == default, **facts)
 
 

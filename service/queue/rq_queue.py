@@ -115,7 +115,7 @@ class RqQueue:
         return added
 
     def discard(self, task_ids: Collection[str]) -> None:
-        """Remove waiting tasks; request their running workers to stop at the next launch."""
+        """Remove waiting tasks; ask workers that run one of them to stop at the next launch."""
         wanted = set(task_ids)
         with _mapped(), self.connection.pipeline(transaction=False) as pipe:
             for task in wanted:

@@ -277,7 +277,7 @@ def refuse_pending(store: Store, what: str, name: str) -> None:
 
 
 def removed_folder(deletion: Deletion) -> str:
-    """Return the folder of a deleted thing's objects for the grace time; unique per deletion."""
+    """Return the folder of a deleted thing's objects for the grace time; the same if a deletion is repeated."""
     return f"{names.REMOVED}/{_DIGITS.sub('', deletion.at)}-{deletion.what}-{deletion.id}"
 
 
