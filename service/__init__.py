@@ -1,1 +1,1 @@
-"""What the API and the engine share: settings, domain model, queue, object store, index, pipeline."""
+"""Code shared by API and engine: settings, domain model, queue, object store, index, pipeline."""

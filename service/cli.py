@@ -1,4 +1,4 @@
-"""What the commands of all packages share: one-line errors with exit codes, JSON on the last line, logs."""
+"""Common parts of all commands: one-line errors with exit codes, JSON on the last line, logs."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ JsonFlag = Annotated[bool, typer.Option("--json", help="Print one JSON object on
 
 
 def reporting_errors(command: Callable[P, R]) -> Callable[P, R]:
-    """Turn errors into one line on stderr and an exit code: 2 for the caller's mistake, 1 for anything else."""
+    """Convert errors to one line on stderr and an exit code: 2 for the caller's mistake, 1 for all others."""
 
     @functools.wraps(command)
     def wrapper(*args: P.args, **kwargs: P.kwargs) -> R:
@@ -46,7 +46,7 @@ def reporting_errors(command: Callable[P, R]) -> Callable[P, R]:
         except ValidationError as error:
             fail(refusal(error), InputError.exit_code)
         except BrokenPipeError:
-            _silence(sys.stdout)  # the reader (head, less) has enough
+            _silence(sys.stdout)  # the reader (head, less) has closed the pipe
             raise typer.Exit(0) from None
         except KeyboardInterrupt:
             fail("interrupted", 130)
@@ -55,15 +55,15 @@ def reporting_errors(command: Callable[P, R]) -> Callable[P, R]:
 
 
 def at_the_door(command: Callable[[], object]) -> None:
-    """Run the whole command line: what the system refuses (no room, no right, no reader) is one line, too.
+    """Run the whole command line; report system errors (no space, no permission, closed pipe) in one line.
 
-    What is no such thing is a fault of graspd, and keeps its trace.
+    Other exceptions are bugs of graspd and keep their trace.
     """
     for descriptor in range(3):
         try:
             os.fstat(descriptor)
         except OSError:
-            # The next file that is opened would take its place, and get what is printed.
+            # Otherwise the next opened file would get this descriptor, and the printed output.
             os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
@@ -100,14 +100,14 @@ def _refusal(error: OSError | MemoryError) -> str:
 
 
 def _silence(stream: TextIO | None) -> None:
-    """Have Python complain about it no more at exit."""
+    """Prevent Python's error message about a closed stream at exit."""
     with contextlib.suppress(OSError, ValueError):
         if stream is not None:
             os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def write_output(path: Path, content: bytes) -> None:
-    """Write a file that a user named: whole or not at all, unless it is a device, a pipe or a link."""
+    """Write a user's output file: atomically, unless it is a device, a pipe or a link."""
     if path.is_symlink() or (path.exists() and not path.is_file()):
         path.write_bytes(content)
         return
@@ -123,7 +123,7 @@ def write_output(path: Path, content: bytes) -> None:
 
 @contextlib.contextmanager
 def told_to_stop() -> Iterator[list[int]]:
-    """A list that holds the signal, once somebody asks the process to end (Ctrl-C, SIGTERM); a second one ends it."""
+    """Yield a list that receives the first stop signal (Ctrl-C, SIGTERM); a second one ends the process."""
     asked: list[int] = []
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
 
@@ -135,7 +135,7 @@ def told_to_stop() -> Iterator[list[int]]:
     try:
         for number in before:
             signal.signal(number, note)
-    except ValueError:  # not in the main thread: signals are somebody else's
+    except ValueError:  # not in the main thread: signals belong to another owner
         before = {}
     try:
         yield asked
@@ -145,23 +145,23 @@ def told_to_stop() -> Iterator[list[int]]:
 
 
 def fail(message: str, code: int) -> NoReturn:
-    """Say what is wrong on stderr and end with that exit code."""
+    """Print an error on stderr and exit with this code."""
     typer.echo(f"graspd: {' '.join(message.split())}", err=True)
     raise typer.Exit(code)
 
 
 def plain_console(*, stderr: bool = False) -> Console:
-    """A terminal that prints names, paths and messages as they are; Rich reads `[red]` as a style, `:x:` as a sign."""
-    from rich.console import Console  # what draws need not be loaded where nothing is drawn
+    """Return a terminal that prints verbatim; Rich would read `[red]` as a style and `:x:` as a sign."""
+    from rich.console import Console  # imported only when something is drawn
 
     return Console(stderr=stderr, markup=False, emoji=False, highlight=False)
 
 
 def plain_table(*headings: str, whole: Collection[str] = ()) -> Table:
-    """A table that cuts nothing at 80 columns: long names break.
+    """Return a table that truncates nothing at 80 columns: long names wrap.
 
     Args:
-        whole: columns that keep their cells on one line, such as ids and times.
+        whole: columns whose cells stay on one line, such as ids and times.
     """
     from rich.table import Table
 
@@ -172,13 +172,13 @@ def plain_table(*headings: str, whole: Collection[str] = ()) -> Table:
 
 
 def emit(value: BaseModel | dict[str, Any]) -> None:
-    """One JSON object on one line of stdout."""
+    """Print one JSON object on one line of stdout."""
     plain = value.model_dump(mode="json") if isinstance(value, BaseModel) else value
     typer.echo(json.dumps(plain, allow_nan=False, default=str))
 
 
 def load_settings(**overrides: Any) -> Settings:
-    """Settings of the environment, with those options of a command that were given; InputError for a bad value."""
+    """Load the settings of the environment and the given command options; InputError for a bad value."""
     from graspd.service.settings import GONE, Settings
 
     if gone := [f"{name} is gone: {GONE[name]}" for name in sorted(GONE) if os.environ.get(name)]:
@@ -192,15 +192,16 @@ def load_settings(**overrides: Any) -> Settings:
 
 @dataclass(frozen=True)
 class EngineSettings:
-    """The settings that a command follows which plans and validates itself, and their defaults."""
+    """Settings of a command that plans and validates in its own process, with defaults."""
 
     prefilter: Literal["auto", "on", "off"] = "auto"
     processes: int = 0
 
 
 def engine_settings() -> EngineSettings:
-    """Those of the environment; InputError for a bad value. What reads settings is loaded only where one is set: it
-    takes as long as the hand and the object together."""
+    """Load them from the environment; InputError for a bad value. The module of settings is imported only
+    if one is set: that takes as long as loading hand and object together.
+    """
     if not any(name.upper().startswith("GRASPD_") for name in os.environ):
         return EngineSettings()
     found = load_settings()
@@ -208,16 +209,16 @@ def engine_settings() -> EngineSettings:
 
 
 def log_to_stderr(settings: Settings, process: str = "graspd") -> None:
-    """Log lines of this process: JSON, or text on a terminal."""
+    """Configure this process's log lines: JSON, or text on a terminal."""
     from graspd.service import telemetry
 
     telemetry.set_up_logs(settings, process)
 
 
 def keep_private(settings: Settings) -> None:
-    """What this process and its children write is for their user alone; so is the data folder, if it was open before.
+    """Restrict files of this process and its children to their user, and an open data folder too.
 
-    Its files hold requests, results and hashes of keys, and those of an older graspd could be read by everybody.
+    They contain requests, results and hashes of keys; those of an older graspd were readable by all users.
     """
     os.umask(0o077)
     with contextlib.suppress(OSError):

@@ -1,4 +1,4 @@
-"""Options of commands from the one table: each row of `service.model.options.rows` with its type, default and words."""
+"""Command-line options from `service.model.options.rows`: each row has type, default and help text."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from graspd.service.model.options import EVERYWHERE, ModelT, Place, Row, accepte
 
 
 def with_options(model: type[BaseModel], place: Place) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Give a command an option for each row, where its parameter `options` stands: it gets those that were given."""
+    """Replace a command's parameter `options` by one option per row; the command receives the given ones."""
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
         @functools.wraps(command)
@@ -29,7 +29,7 @@ def with_options(model: type[BaseModel], place: Place) -> Callable[[Callable[...
         at = [parameter.name for parameter in own].index("options")
         parameters = [*own[:at], *map(_parameter, added), *own[at + 1 :]]
         parameters = [one.replace(kind=inspect.Parameter.KEYWORD_ONLY) for one in parameters]
-        del wrapper.__wrapped__  # its signature is not this one's
+        del wrapper.__wrapped__  # its signature differs
         wrapper.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
         wrapper.__annotations__ = {one.name: one.annotation for one in parameters}
         return wrapper
@@ -50,7 +50,7 @@ def _parameter(row: Row) -> inspect.Parameter:
 
 
 def parsed_options(model: type[ModelT], values: dict[str, Any]) -> ModelT:
-    """A model of what was given; InputError names the first option that cannot be used, as it is typed."""
+    """Validate the given options; InputError names the first invalid option as typed."""
     options = {row.name: row.flags[0].partition("/")[0] for place in EVERYWHERE for row in rows(model, place)}
     names = {name: f"--{name.replace('_', '-')}" for name in model.model_fields}
     # The name of a dataset is an argument.
@@ -58,7 +58,7 @@ def parsed_options(model: type[ModelT], values: dict[str, Any]) -> ModelT:
 
 
 def pairs(texts: Iterable[str]) -> dict[str, str | int | float]:
-    """`name=value` of each `--option`, numbers as numbers: the same job as by HTTP. InputError for another form."""
+    """Parse `name=value` of each `--option`, numbers as numbers, as in HTTP. InputError for another form."""
     split = [text.partition("=") for text in texts]
     for name, equals, value in split:
         if not equals:
@@ -72,6 +72,6 @@ def _number(text: str) -> str | int | float:
             number = kind(text)
         except ValueError:
             continue
-        # Only what is written as a number is: 007 and nan stay what they are.
+        # Only canonical numbers are converted: 007 and nan stay text.
         return number if str(number) == text and math.isfinite(number) else text
     return text

@@ -1,4 +1,4 @@
-"""Parquet files through pyarrow, which is there where a user put it."""
+"""Parquet files by pyarrow, an optional dependency."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from typing import Any, Final
 
 from graspd.service.model.errors import InputError
 
-#: Most that a file of others may unpack to, by its own account [bytes].
+#: Limit of the unpacked size that a foreign file states [bytes].
 LARGEST: Final = 2**31
-#: What Hugging Face's readers make pictures of: bytes of a file, and where it was.
+#: Type of pictures for Hugging Face's readers: bytes and path of a file.
 IMAGE: Final = "image"
 
 
 def arrow() -> Any:
-    """The package pyarrow.
+    """Import pyarrow.
 
     Raises:
         InputError: it is not installed.
@@ -30,7 +30,7 @@ def arrow() -> Any:
 
 
 def type_of(name: str) -> Any:
-    """Arrow's type of a word: `image`, `text`, a NumPy type; with [n] behind it a list of n, with [] of any number."""
+    """Return the Arrow type of a name: `image`, `text`, NumPy type; [n]: list of n, []: of any length."""
     pa = arrow()
     if name.endswith("]"):
         inner, _, size = name[:-1].rpartition("[")
@@ -41,7 +41,7 @@ def type_of(name: str) -> Any:
 
 
 def schema_of(columns: Mapping[str, str], also: Mapping[str, str] | None = None) -> Any:
-    """A schema of columns by the words of `type_of`, which tells Hugging Face's readers which of them are pictures."""
+    """Return the schema of columns by the names of `type_of`, marking pictures for Hugging Face's readers."""
     pa = arrow()
     pictures = {name: {"_type": "Image"} for name, word in columns.items() if word == IMAGE}
     told = {"huggingface": json.dumps({"info": {"features": pictures}})} if pictures else {}
@@ -52,7 +52,7 @@ def write(file: Path, schema: Any, groups: Iterable[Sequence[Mapping[str, Any]]]
     """Write rows, each group of them as one row group.
 
     Returns:
-        number of rows.
+        Number of rows.
     """
     pa = arrow()
     file.parent.mkdir(parents=True, exist_ok=True)
@@ -65,10 +65,10 @@ def write(file: Path, schema: Any, groups: Iterable[Sequence[Mapping[str, Any]]]
 
 
 def read(file: Path, wanted: Iterable[str]) -> dict[str, list[Any]]:
-    """Columns of a file, those of the wanted ones that it has.
+    """Read the wanted columns that a file has.
 
     Raises:
-        InputError: pyarrow is absent, no Parquet file, or these columns unpack to more than `LARGEST`.
+        InputError: pyarrow is absent, it is not a Parquet file, or these columns unpack to more than `LARGEST`.
     """
     pa = arrow()
     try:

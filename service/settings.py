@@ -1,4 +1,4 @@
-"""One model of every setting. Each is an environment variable: `GRASPD_` and the field's name in capitals."""
+"""Model of all settings. Each is an environment variable: `GRASPD_` and the field's name in capitals."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from sqlalchemy import URL
 
 
-#: Variables that no setting follows any more, with what to do instead.
+#: Obsolete variables, with their replacements.
 GONE: Final = {
     "GRASPD_SHARD_PACK": "a task makes one shard of all its batches; unset it, and see GRASPD_TASK_S",
     "GRASPD_KEEPER_SHARDS": "one controller leads and the others stand by; unset it",
@@ -28,7 +28,7 @@ GONE: Final = {
 class Settings(BaseSettings):
     """Settings of all processes of one graspd. Defaults run everything on one machine inside `data_dir`."""
 
-    # Compose and Kubernetes hand on variables that nobody set as empty ones.
+    # Compose and Kubernetes pass unset variables as empty ones.
     model_config = SettingsConfigDict(
         env_prefix="GRASPD_", env_ignore_empty=True, frozen=True, hide_input_in_errors=True
     )
@@ -167,7 +167,7 @@ class Settings(BaseSettings):
 
 
 def sqlite_url(path: Path) -> URL:
-    """SQLAlchemy's URL of a file, whatever its path holds: as a text, it would end at a question mark."""
-    from sqlalchemy import URL  # only API and controller need it, and it takes long to import
+    """Return SQLAlchemy's URL of a file with any path: in a text URL it would end at a question mark."""
+    from sqlalchemy import URL  # only API and controller need it, and its import is slow
 
     return URL.create("sqlite", database=str(path))

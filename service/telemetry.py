@@ -1,7 +1,7 @@
-"""Telemetry of every process: log lines (JSON for machines, text on a terminal), OpenTelemetry spans, and a heartbeat
-file for health checks.
+"""Telemetry of every process: log lines, OpenTelemetry spans, heartbeat file for health checks.
 
-`bind` says what a piece of work is about; every line written within carries that, whichever module writes it.
+Log lines are JSON for machines, and text on a terminal. `bind` sets the context of a piece of work; every line logged
+within contains it, from any module.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ from graspd.service.model.errors import without_secrets
 if TYPE_CHECKING:
     from graspd.service.settings import Settings
 
-#: What a line can be about, in the order in which it is shown.
+#: Subjects of a log line, in the order of display.
 SUBJECTS: Final = ("request", "key", "job", "task", "attempt", "worker")
 _bound: ContextVar[Mapping[str, Any]] = ContextVar("bound", default=MappingProxyType({}))
 _ORDINARY: Final = frozenset(vars(logging.makeLogRecord({}))) | {"message", "asctime", "about", "taskName"}
-#: RQ tells of every idle poll, httpx of every request.
+#: RQ logs every idle poll, httpx every request.
 _TALKATIVE: Final = ("rq.worker", "rq.job", "rq.queue", "httpx")
 
 
 @contextmanager
 def bind(**subjects: Any) -> Iterator[None]:
-    """Lines written within are about these; empty values are left out. Threads begun within do not inherit it."""
+    """Bind subjects to log lines within, except empty values. Threads started within do not inherit them."""
     token = _bound.set({**_bound.get(), **{name: value for name, value in subjects.items() if value}})
     try:
         yield
@@ -44,12 +44,12 @@ def bind(**subjects: Any) -> Iterator[None]:
 
 
 def bound(subject: str) -> str:
-    """What the present work is about, e.g. `bound("request")`; empty if it was not said."""
+    """Return a bound subject, e.g. `bound("request")`; empty if not bound."""
     return str(_bound.get().get(subject, ""))
 
 
 def set_up_logs(settings: Settings, process: str = "graspd") -> None:
-    """Send the lines of this process to stderr.
+    """Log the lines of this process to stderr.
 
     Args:
         process: its name in every JSON line, e.g. api, controller, worker.
@@ -64,7 +64,7 @@ def set_up_logs(settings: Settings, process: str = "graspd") -> None:
 
 
 class JsonLines(logging.Formatter):
-    """One JSON object a line: time, level, process, pid, logger, message, subjects, what was given as `extra`."""
+    """One JSON object per line: time, level, process, pid, logger, message, subjects, fields of `extra`."""
 
     def __init__(self, process: str) -> None:
         super().__init__()
@@ -87,7 +87,7 @@ class JsonLines(logging.Formatter):
 
 
 class _TextLines(logging.Formatter):
-    """Time, level, module, message, and in brackets what it is about."""
+    """Time, level, module, message, and the subjects in brackets."""
 
     def format(self, record: logging.LogRecord) -> str:
         record = _plain(record)
@@ -97,7 +97,7 @@ class _TextLines(logging.Formatter):
         return without_secrets(f"{text} [{about}]{trace}" if about else f"{text}{trace}")
 
 
-#: What ends a line, or what a terminal obeys.
+#: Characters that end a line or control a terminal.
 _OBEYED: Final = {
     code: repr(chr(code))[1:-1]
     for code in (*range(0x20), *range(0x7F, 0xA0), 0x2028, 0x2029, *range(0x202A, 0x202F), *range(0x2066, 0x206A))
@@ -105,14 +105,14 @@ _OBEYED: Final = {
 
 
 def _plain(record: logging.LogRecord) -> logging.LogRecord:
-    """The same record with a message of one line: a path or a name of a stranger writes no line of its own."""
+    """Return the record with a one-line message, so that foreign paths and names cannot forge lines."""
     made = copy.copy(record)
     made.msg, made.args = record.getMessage().translate(_OBEYED), ()
     return made
 
 
 def _subjects(record: logging.LogRecord) -> dict[str, Any]:
-    """Those bound where the line was written, and those given with the line itself."""
+    """Return the subjects bound to the record's context, and those given with the line."""
     found = dict(_bound.get())
     found.update((name, vars(record)[name]) for name in SUBJECTS if name in vars(record))
     return {name: found[name] for name in SUBJECTS if found.get(name)}
@@ -129,11 +129,11 @@ _tracer: Any = None
 
 
 def set_up_tracing(process: str, *, exporter: Any = None) -> None:
-    """Send the spans of this process where the environment says; do nothing if it says nothing.
+    """Send the spans of this process to the exporter configured in the environment, if any.
 
     Args:
-        process: its name: api or worker; the spans' service is `graspd-{process}`.
-        exporter: where to send them instead.
+        process: name of the process: api or worker; the spans' service is `graspd-{process}`.
+        exporter: replaces the configured one.
     """
     global _tracer
     if exporter is None and not any(os.environ.get(name) for name in _ASKED_BY):
@@ -155,21 +155,21 @@ def set_up_tracing(process: str, *, exporter: Any = None) -> None:
 
 
 def stop() -> None:
-    """Make no more spans."""
+    """Stop making spans."""
     global _tracer
     _tracer = None
 
 
 @contextmanager
 def span(name: str, *, parent: str = "", **attributes: Any) -> Iterator[dict[str, Any]]:
-    """A span around what is done within; an exception marks it as failed.
+    """Open a span around the work within; an exception marks it as failed.
 
     Args:
-        parent: `traceparent` of the span that caused this one (W3C trace context), in whatever process.
-        attributes: what it is about, as `graspd.{name}`.
+        parent: `traceparent` of the causing span (W3C trace context), from any process.
+        attributes: span attributes, named `graspd.{name}`.
 
     Yields:
-        a dictionary; what is put there becomes attributes at the end.
+        Dictionary whose entries become attributes at the end.
     """
     later: dict[str, Any] = {}
     if _tracer is None:
@@ -185,7 +185,7 @@ def span(name: str, *, parent: str = "", **attributes: Any) -> Iterator[dict[str
 
 
 def traceparent() -> str:
-    """W3C trace context of the present span; empty without one."""
+    """Return the W3C trace context of the current span; empty without one."""
     if _tracer is None:
         return ""
     from opentelemetry.trace.propagation.tracecontext import TraceContextTextMapPropagator
@@ -195,20 +195,20 @@ def traceparent() -> str:
     return carrier.get("traceparent", "")
 
 
-#: Far below the minute after which a check calls the process dead.
+#: Well below the minute after which a health check declares the process dead.
 _EVERY_S: Final = 5.0
 
 
 class HeartbeatFile:
-    """Touched at most every few seconds, however often it is asked to."""
+    """File touched at most every few seconds, regardless of the number of calls."""
 
     def __init__(self, path: Path | None) -> None:
-        """`path` is None where nobody looks."""
+        """`path` is None if no check reads it."""
         self._path = path
         self._again = 0.0
 
     def touch(self) -> None:
-        """Say that this process lives. A disk without room is said once, and ends nothing."""
+        """Update the heartbeat. A full disk is logged once and otherwise ignored."""
         now = time.monotonic()
         if self._path is None or now < self._again:
             return

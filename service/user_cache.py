@@ -1,7 +1,7 @@
-"""The user's cache: files that this machine computed and can compute again, each whole, intact and its user's own.
+"""The user's cache of reproducible files, each complete, verified and private.
 
-Processes share a folder without locks: an entry appears by renaming, and two that make the same one make it alike.
-What is damaged, or belongs to somebody else, counts as absent; what cannot be written only costs time.
+Processes share a folder without locks: entries appear by renaming, and two writers of one entry write equal content.
+Damaged or foreign entries count as absent; a failed write only costs time.
 """
 
 from __future__ import annotations
@@ -20,21 +20,21 @@ from typing import Final
 
 log = logging.getLogger(__name__)
 
-#: An entry begins with the SHA-256 of the rest.
+#: An entry starts with the SHA-256 of the rest.
 _DIGEST_BYTES: Final = 32
 _LIMIT_BYTES: Final = 2 << 30
 
 
 def folder(name: str) -> Path:
-    """Where things of one kind are kept: `$XDG_CACHE_HOME/graspd/NAME`, by default in `~/.cache`.
+    """Return the folder of one kind of entries: `$XDG_CACHE_HOME/graspd/NAME`, by default in `~/.cache`.
 
-    Where that cannot be written it is a folder of the user's own among the temporary files; a log line says so once.
+    If that is not writable, use a private folder among the temporary files and log it once.
     """
     return _root(os.environ.get("XDG_CACHE_HOME", ""), os.environ.get("HOME", ""), tempfile.gettempdir()) / name
 
 
 def load(file: Path) -> bytes | None:
-    """Content of an entry; None where there is none, it is damaged, or another user wrote it."""
+    """Load the content of an entry; None if it is absent, damaged, or written by another user."""
     try:
         with file.open("rb") as opened:
             if os.fstat(opened.fileno()).st_uid != os.geteuid():
@@ -47,14 +47,14 @@ def load(file: Path) -> bytes | None:
 
 
 def keep(file: Path, content: bytes, *, limit_bytes: int = _LIMIT_BYTES) -> None:
-    """Make or replace an entry; the longest unused of its folder go once that holds more than `limit_bytes`."""
+    """Write an entry; remove the least recently used ones of its folder above `limit_bytes`."""
     with suppress(OSError):
         write_whole(file, hashlib.sha256(content).digest() + content)
         make_room(file.parent, file.suffix, limit_bytes, keep=file)
 
 
 def write_whole(file: Path, content: bytes) -> None:
-    """Write a file that others see whole or not at all, and its folder if there is none. Raises OSError."""
+    """Write a file atomically, and create its folder if necessary. Raises OSError."""
     file.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(dir=file.parent, suffix=".part")
     partial = Path(name)
@@ -67,7 +67,7 @@ def write_whole(file: Path, content: bytes) -> None:
 
 
 def make_room(folder: Path, suffix: str, limit_bytes: int, *, keep: Path) -> None:
-    """Remove the longest unused files of a folder but `keep`, until the others hold no more than `limit_bytes`."""
+    """Remove the least recently used files of a folder except `keep`, down to `limit_bytes` for others."""
     found = []
     for file in folder.glob(f"*{suffix}"):
         with suppress(FileNotFoundError):
@@ -77,15 +77,15 @@ def make_room(folder: Path, suffix: str, limit_bytes: int, *, keep: Path) -> Non
     for _, size, file in sorted(found, reverse=True):
         used += size
         if used > limit_bytes and file != keep:
-            # A process that has it open goes on reading.
+            # A process that has it open can still read it.
             file.unlink(missing_ok=True)
 
 
 @lru_cache(maxsize=8)
 def _root(xdg: str, home: str, temporary: str) -> Path:
-    """The folder of all caches; kept by what it follows from, so that its trouble is told once."""
+    """Return the root of all caches; cached by its inputs, so that problems are logged once."""
     try:
-        # A relative $XDG_CACHE_HOME counts as unset, as its specification says.
+        # A relative $XDG_CACHE_HOME counts as unset, as its specification requires.
         base = Path(xdg) if Path(xdg).is_absolute() else (Path(home) if home else Path.home()) / ".cache"
         root = base / "graspd"
         root.mkdir(parents=True, exist_ok=True)
@@ -100,7 +100,7 @@ def _root(xdg: str, home: str, temporary: str) -> Path:
 
 
 def _private(temporary: Path) -> Path:
-    """A folder that this user alone can write; one that somebody else put in its place is left alone."""
+    """Create a folder writable by this user only; reject one that another user has put there."""
     mine = temporary / f"graspd-cache-{os.geteuid()}"
     with suppress(OSError):
         mine.mkdir(mode=0o700, exist_ok=True)
@@ -110,7 +110,7 @@ def _private(temporary: Path) -> Path:
     try:
         own = tempfile.mkdtemp(prefix="graspd-cache-", dir=temporary)
     except OSError:
-        # Nothing is found there, and nothing is kept.
+        # This path stores nothing and finds nothing.
         return Path(os.devnull)
     atexit.register(shutil.rmtree, own, ignore_errors=True)
     return Path(own)

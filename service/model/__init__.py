@@ -1,1 +1,1 @@
-"""What everything may import: the words of graspd as types, errors, names, digests, records, pure rules."""
+"""Domain model for all layers: types, errors, names, digests, records and pure rules."""

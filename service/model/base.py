@@ -1,4 +1,4 @@
-"""Common parts of the domain models: their base, patterns of names, and refusals in this project's words."""
+"""Common parts of the domain models: base class, patterns of names, messages for validation errors."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from graspd.service.model.errors import one_of
 
 
 class Model(BaseModel):
-    """Base of the domain models: frozen, and strict about unknown fields."""
+    """Base class of the domain models: frozen, unknown fields are errors."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
-#: A name a user gives: used in file names and URLs, so letters, digits, dot, dash and underscore only.
+#: A name given by a user. File names and URLs contain it: letters, digits, dot, dash and underscore only.
 NAME: Final = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
 Name = Annotated[str, Field(pattern=NAME)]
-#: A name a user gives to grasps: words of such characters with one space between.
+#: Name of a tag: words of such characters, separated by single spaces.
 TagName = Annotated[
     str,
     StringConstraints(strip_whitespace=True, max_length=64, pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*( [A-Za-z0-9._-]+)*$"),
@@ -29,7 +29,7 @@ TagName = Annotated[
 #: Lower-case hexadecimal SHA-256, shortened to 32 digits (128 bits).
 DIGEST: Final = r"^[0-9a-f]{32}$"
 Digest = Annotated[str, Field(pattern=DIGEST)]
-#: An id or nothing. Whoever writes to Redis may say anything, so what is read from there is bounded like this.
+#: An id or nothing. Any client can write to Redis, so values read from there are bounded by this pattern.
 Word = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{0,64}$")]
 
 _WORDS: Final = {
@@ -44,26 +44,26 @@ _WORDS: Final = {
     **dict.fromkeys(("float_type", "float_parsing"), "must be a number"),
     **dict.fromkeys(("bool_type", "bool_parsing"), "must be true or false"),
 }
-#: Kinds of errors about a bound, and how pydantic names it.
+#: Types of pydantic errors about bounds, with the name of the bound.
 _BOUNDS: Final = {"greater_than_equal": "ge", "greater_than": "gt", "less_than_equal": "le", "less_than": "lt"}
 _NAMES: Final = "must begin with a letter or digit and hold at most 64 letters, digits, dots, dashes and underscores"
-#: How pydantic begins: of what, not of which field.
+#: Beginning of pydantic's messages, which names the subject instead of the field.
 _SUBJECT: Final = re.compile(r"^(Value error, )|^\w+ should ")
 _CLASS: Final = re.compile(r"_[A-Z]\w*$|constrained-\w+$")
-#: How typer names the choices of an option; pydantic gives them as `expected`.
+#: Typer's message about choices; pydantic has them as `expected`.
 _CHOICES: Final = re.compile(r"'(?P<word>.*?)' is not one of (?P<expected>'.*')")
 
 
 def refusal(
     error: ValidationError, model: type[BaseModel] | None = None, names: Mapping[str, str] | None = None
 ) -> str:
-    """The first thing that is wrong, after its place: `scene.touch: must be at least -1`.
+    """Return the first error after its location: `scene.touch: must be at least -1`.
 
-    With the model that refused, a number's whole range is named: `share: must be more than 0 and at most 1; got 3`.
-    `names` gives fields as the caller spells them: `--share: must be ...`.
+    With the model, the message states the whole range: `share: must be more than 0 and at most 1; got 3`. `names` maps
+    fields to the caller's spelling: `--share: must be ...`.
     """
     first = error.errors(include_url=False)[0]
-    # Of several models that would do, pydantic names the one that it tried.
+    # For a union of models, pydantic adds the name of the one it validated.
     place = [str(part) for part in first["loc"] if not _CLASS.match(str(part))]
     if place and names:
         named = names.get(place[0], place[0])
@@ -75,7 +75,7 @@ def refusal(
 
 
 def bounds_of(field: FieldInfo) -> dict[str, float]:
-    """The bounds of a number, also of one that may be absent, by their names in pydantic: ge, gt, le, lt."""
+    """Return the bounds of a number, optional or not, by their names in pydantic: ge, gt, le, lt."""
     found: dict[str, float] = {}
     for one in [*(part for kind in get_args(field.annotation) for part in _metadata(kind)), *field.metadata]:
         found |= {key: value for key in _BOUNDS.values() if (value := getattr(one, key, None)) is not None}
@@ -83,19 +83,19 @@ def bounds_of(field: FieldInfo) -> dict[str, float]:
 
 
 def _metadata(annotation: object) -> list[object]:
-    """What stands beside the type in an Annotated."""
+    """Return the metadata of an Annotated."""
     inner = get_args(annotation)[1:] if get_origin(annotation) is Annotated else ()
     return [part for one in inner for part in (one.metadata if isinstance(one, FieldInfo) else (one,))]
 
 
 def range_words(bounds: Mapping[str, float]) -> str:
-    """Bounds as a sentence: `must be at least 0 and at most 3`."""
+    """Format bounds as a phrase: `must be at least 0 and at most 3`."""
     said = [_WORDS[name].format(**{key: f"{bounds[key]:.12g}"}) for name, key in _BOUNDS.items() if key in bounds]
     return " and ".join([*said[:1], *(words.removeprefix("must be ") for words in said[1:])])
 
 
 def words(entry: Mapping[str, Any]) -> str:
-    """What is wrong by one entry of `ValidationError.errors()`, without its place."""
+    """Format one entry of `ValidationError.errors()` without its location."""
     facts = entry.get("ctx", {})
     message = _SUBJECT.sub(lambda found: "" if found[1] else "must ", entry["msg"])
     if facts.get("pattern") == NAME:
@@ -112,5 +112,5 @@ def words(entry: Mapping[str, Any]) -> str:
 
 
 def why(error: Exception) -> str:
-    """What a library says of a file, the system's words without their number and the path once more."""
+    """Return a library's message about a file; of a system error the text without number and path."""
     return getattr(error, "strerror", None) or str(error)

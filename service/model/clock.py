@@ -1,4 +1,4 @@
-"""Wall-clock time as text. Durations and leases never use it: they use `time.monotonic`."""
+"""Wall-clock time as text. Durations and leases use `time.monotonic` instead."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ from datetime import UTC, datetime, timedelta
 
 
 def timestamp(ago_s: float = 0.0) -> str:
-    """Now, or some seconds ago, RFC 3339 in UTC with milliseconds; such texts sort by time."""
+    """Return the time now, or some seconds ago: RFC 3339 in UTC with milliseconds, sortable as text."""
     when = datetime.now(UTC) - timedelta(seconds=ago_s)
     return when.isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
 
 def age_of(when: str) -> float | None:
-    """Seconds since a time in RFC 3339, for showing; None if it cannot be read."""
+    """Return the seconds since an RFC 3339 time, for display; None if it cannot be parsed."""
     try:
         return max(0.0, (datetime.now(UTC) - datetime.fromisoformat(when)).total_seconds())
     except (ValueError, TypeError):

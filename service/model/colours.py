@@ -1,4 +1,4 @@
-"""Colours as light: linear RGB of how screens and files write them."""
+"""Conversion of sRGB and hexadecimal colours to linear RGB."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ Colour = tuple[float, float, float]
 
 
 def linear(red: float, green: float, blue: float) -> Colour:
-    """Linear RGB of an sRGB colour with components in 0..1 (IEC 61966-2-1)."""
+    """Convert sRGB components in 0..1 to linear RGB (IEC 61966-2-1)."""
 
     def one(c: float) -> float:
         return c / 12.92 if c <= 0.04045 else float(((c + 0.055) / 1.055) ** 2.4)
@@ -15,6 +15,6 @@ def linear(red: float, green: float, blue: float) -> Colour:
 
 
 def hexadecimal(code: str) -> Colour:
-    """Linear RGB of a colour such as `#c8553d`."""
+    """Convert a colour such as `#c8553d` to linear RGB."""
     digits = code.lstrip("#")
     return linear(*(int(digits[i : i + 2], 16) / 255 for i in (0, 2, 4)))

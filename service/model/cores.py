@@ -1,4 +1,4 @@
-"""How many cores and how much memory this process may use: not what the machine has, but what it is given of it."""
+"""CPU cores and memory of this process: limits of affinity and control groups, not of the machine."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from pathlib import Path, PurePosixPath
 from typing import Final
 
 ROOT: Final = Path("/")
-#: A quota that was read is that of so long [s].
+#: Cache lifetime of a quota [s].
 _LATELY_S: Final = 2.0
-#: Where systems mount the CPU controller of cgroup v1.
+#: Mount points of the CPU controller of cgroup v1.
 _V1: Final = ("cpu", "cpu,cpuacct")
 
 
 def available_cores(root: Path = ROOT) -> int:
-    """Cores for threads of this process: its affinity, or the CPU quota of its control group where that is less.
+    """Return the cores for this process: its affinity, or its control group's CPU quota if less.
 
-    A quota of one and a half cores gives 2: a thread that waits for its share costs less than half a core unused. It is
-    asked for before each piece of work, and a quota that is changed meanwhile is heard of within seconds.
+    Quotas round up: 1.5 cores give 2, because a throttled thread costs less than half a core unused. Call it before
+    each piece of work: a changed quota takes effect within seconds.
 
     Args:
-        root: the folder that holds `proc` and `sys`.
+        root: folder that contains `proc` and `sys`.
     """
     given = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return max(1, min([given, *(math.ceil(quota) for quota in _lately(root, int(time.monotonic() / _LATELY_S)))]))
@@ -32,12 +32,12 @@ def available_cores(root: Path = ROOT) -> int:
 
 @lru_cache(maxsize=1)
 def _lately(root: Path, moment: int) -> list[float]:
-    """The quotas as they were when somebody first asked in a moment; the files are read in milliseconds."""
+    """Return the quotas, cached per time slot; reading the files takes milliseconds."""
     return list(_quotas(root))
 
 
 def _quotas(root: Path) -> Iterator[float]:
-    """Quotas [cores] of this process's control group and of those it is in."""
+    """Yield the quotas [cores] of this process's control group and its ancestors."""
     mount = root / "sys/fs/cgroup"
     for controllers, path in _groups(root / "proc/self/cgroup"):
         inside = (PurePosixPath(path), *PurePosixPath(path).parents)
@@ -51,16 +51,16 @@ def _quotas(root: Path) -> Iterator[float]:
 
 
 def available_memory(root: Path = ROOT) -> int:
-    """Memory for this process [bytes]: the machine's, or the limit of its control group where that is less.
+    """Return the memory for this process [bytes]: the machine's, or its control group's limit if less.
 
     Args:
-        root: the folder that holds `proc` and `sys`.
+        root: folder that contains `proc` and `sys`.
     """
     return min([os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"), *_memory_limits(root)])
 
 
 def _memory_limits(root: Path) -> Iterator[int]:
-    """Limits of memory [bytes] of this process's control group and of those it is in; none where there is none."""
+    """Yield the memory limits [bytes] of this process's control group and its ancestors, where set."""
     mount = root / "sys/fs/cgroup"
     for controllers, path in _groups(root / "proc/self/cgroup"):
         for group in (str(one).lstrip("/") for one in (PurePosixPath(path), *PurePosixPath(path).parents)):
@@ -73,7 +73,7 @@ def _memory_limits(root: Path) -> Iterator[int]:
 
 
 def _groups(file: Path) -> Iterator[tuple[str, str]]:
-    """Controllers and path of each hierarchy that the process is in; no controllers: cgroup v2."""
+    """Yield controllers and path of each hierarchy of the process; no controllers: cgroup v2."""
     try:
         lines = file.read_text().splitlines()
     except OSError:
@@ -91,7 +91,7 @@ def _words(file: Path) -> list[str]:
 
 
 def _ratio(words: list[str]) -> Iterator[float]:
-    """Quota over period; none where there is no limit (`max`, -1)."""
+    """Yield quota over period; nothing if unlimited (`max`, -1)."""
     try:
         quota, period = map(int, words)
     except ValueError:

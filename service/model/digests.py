@@ -1,4 +1,4 @@
-"""Content addresses: the digest of a result follows from its inputs alone, so a task run twice names one object."""
+"""Content addresses: digests of a result's inputs, so repeated runs of a task name one object."""
 
 from __future__ import annotations
 
@@ -14,39 +14,39 @@ from graspd.service.model.metrics import MIN_DISTANCE_M
 from graspd.service.model.states import AssetKind, Stage
 from graspd.service.model.version import STAGE_REVISIONS
 
-#: Raise when payloads come out otherwise and the grasps do not.
+#: Increment if payloads change while the grasps do not.
 _PAYLOAD_REVISION: Final = 2
 
 
 def digest_bytes(data: bytes) -> str:
-    """First 32 hexadecimal digits of the SHA-256 of `data`."""
+    """Return the first 32 hexadecimal digits of the SHA-256 of `data`."""
     return hashlib.sha256(data).hexdigest()[:32]
 
 
 def digest_json(value: object) -> str:
-    """Digest of a JSON value in canonical form: sorted keys, no spaces, shortest round-trip floats."""
+    """Return the digest of canonical JSON: sorted keys, no spaces, shortest round-trip floats."""
     text = json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False, ensure_ascii=True)
     return digest_bytes(text.encode())
 
 
 class StreamedFiles(MutableMapping[str, bytes]):
-    """Named files that are not in memory, and whose digests are known."""
+    """Named files outside memory, with known digests."""
 
     @abstractmethod
     def digest(self, name: str) -> str:
-        """`digest_bytes` of a file."""
+        """Return `digest_bytes` of a file."""
 
     @abstractmethod
     def size(self, name: str) -> int:
-        """Its bytes."""
+        """Return the size of a file [bytes]."""
 
     @abstractmethod
     def open(self, name: str) -> AbstractContextManager[IO[bytes]]:
-        """It, to be read piece by piece."""
+        """Open a file for reading in pieces."""
 
 
 def digest_files(kind: AssetKind, files: Mapping[str, bytes]) -> str:
-    """Digest of a set of named files; independent of their order."""
+    """Return the digest of a set of named files, independent of their order."""
     if isinstance(files, StreamedFiles):
         digests = {name: files.digest(name) for name in files}
     else:
@@ -55,7 +55,7 @@ def digest_files(kind: AssetKind, files: Mapping[str, bytes]) -> str:
 
 
 def digest_variant(digest: str, options: Mapping[str, object] | None) -> str:
-    """Digest of a hand or object whose files are read with options besides those in them; without any, its own."""
+    """Return the digest of a hand or object read with extra options; without options, `digest` itself."""
     return digest_json({"files": digest, "options": dict(options)}) if options else digest
 
 
@@ -70,9 +70,9 @@ def shard_id(
     revision: int,
     inputs: Iterable[str] = (),
 ) -> str:
-    """Address of the shard that a stage makes of its inputs.
+    """Return the id of the shard that a stage makes from its inputs.
 
-    Only what moves the result enters: scenes after the grasps do not change them, views do not change the scenes.
+    Only inputs that affect the result count: scenes after the grasps do not change them, views do not change scenes.
     """
     inputs_of: dict[str, object] = {
         "stage": stage,
@@ -97,7 +97,7 @@ def shard_id(
     elif stage is Stage.SCENE:
         inputs_of |= {"scenes": request.scenes}
         if request.in_scene:
-            # Made before the grasps, of the object as they meet it.
+            # Scenes made before the grasps need the object as the planner sees it.
             inputs_of |= {"scene": request.place.model_dump(mode="json"), "face_error_m": request.knobs.face_error_m}
     elif stage is Stage.RENDER:
         inputs_of |= {k: getattr(request, k) for k in ("views", "stereo", "width", "height", "channels")}
@@ -105,11 +105,11 @@ def shard_id(
 
 
 def _verdict_text(request: JobRequest, batches: range) -> dict[str, object]:
-    """What decides which grasps of some batches are kept, and what is known of them."""
+    """Return the inputs that decide the selection of grasps in some batches and their measurements."""
     found: dict[str, object] = {}
     if request.want == "valid":
         found |= {"want": request.want, "budget": request.budget}
-        # Its default is part of the stage's revision.
+        # The default is covered by the stage's revision.
         found |= {} if request.min_distance == MIN_DISTANCE_M else {"min_distance": request.min_distance}
     if request.validation != "none":
         found |= {
@@ -127,7 +127,7 @@ def _verdict_text(request: JobRequest, batches: range) -> dict[str, object]:
 
 
 def job_id(request: JobRequest, hand_digest: str, object_digest: str, project: str = "") -> str:
-    """Address of a job: the same request on the same hand and object in the same project is the same job."""
+    """Return the id of a job: equal requests on equal hand and object in one project are one job."""
     return digest_json(
         {
             "request": request.model_dump(mode="json"),

@@ -1,4 +1,4 @@
-"""The words of graspd as types: jobs with all their options, and hands, objects and networks as they are kept.
+"""Core domain types: jobs with their options, and stored hands, objects and networks.
 
 Units are SI (metres, radians, kilograms, seconds). A pose is 7 numbers: position x y z, then unit quaternion w x y z.
 """
@@ -35,23 +35,23 @@ from graspd.service.model.scene_spec import (
 )
 from graspd.service.model.states import AssetKind
 
-#: Grasps of a batch: the unit of seeds and of the planner's launches.
+#: Number of grasps of a batch: the unit of seeds and of kernel launches.
 BATCH_SIZE: Final = 32
-#: What pictures can show besides colour, depth and segmentation, in the order in which shards and digests name them.
+#: Optional channels besides colour, depth and segmentation, in the order of shards and digests.
 EXTRA_CHANNELS: Final = ("distance", "normals", "occlusion")
 
-#: Rechecks of a job that wants no other number of them, and batches for each: the DexGraspBench protocol takes as long
-#: over a grasp as planning, validating and measuring two or three valid ones.
+#: Default rechecks per job and batches per recheck: the DexGraspBench protocol takes as long for one grasp as planning,
+#: validating and measuring two or three valid ones.
 RECHECKS: Final = 8
 _RECHECK_EVERY: Final = 2
 
-#: Methods of graspd's own that know no scene; what those of other packages know, a worker tells.
+#: graspd's own methods without support for scenes; workers report those of other packages.
 FREE_ONLY_METHODS: Final = ("autograsp", "dfc", "graspd2022", "graspit")
-#: Methods that set out from what a network proposes for a thing on a table: their option `network` names it.
+#: Methods that start from network proposals for an object on a table; their option `network` names the network.
 NETWORK_METHODS: Final = ("learned",)
-#: graspd's own methods; other packages offer more.
+#: graspd's own methods; other packages add more.
 METHODS: Final = ("fast_graspd", "graspit", "graspd2022", "dfc", *NETWORK_METHODS, "autograsp")
-#: Scenes of a batch that is planned in scenes, where the request does not say how many.
+#: Default number of scenes of a batch planned in scenes.
 SCENES: Final = 4
 _REFEREES_IN_WORDS: Final = {
     "standard": "standard",
@@ -66,15 +66,15 @@ SHAKE_NEEDS_A_SCENE: Final = "shake moves what was lifted out of a scene: choose
 
 
 def _sparse(default: Any, **facts: Any) -> Any:
-    """A field that stays out of documents at its default: ids and records of jobs without it stay what they are."""
+    """Return a field omitted from documents at its default, so that other jobs keep their ids and records."""
     return Field(default, exclude_if=lambda value: value == default, **facts)
 
 
 class JobOptions(Model):
-    """What a job says besides its hand and object: how many grasps, how made, with which scenes and views."""
+    """Options of a job besides hand and object: number of grasps, planning, scenes and views."""
 
     SUBMITTED: ClassVar[bool] = False
-    """Whether it goes to a service, or is work of this process."""
+    """True for jobs of a service; False for work in this process."""
 
     grasps: Annotated[
         int,
@@ -282,7 +282,7 @@ class JobOptions(Model):
     @field_validator("channels")
     @classmethod
     def _in_order(cls, value: tuple[str, ...]) -> tuple[str, ...]:
-        # The same wish in another order is the same job.
+        # Sorted: the order of channels must not make another job.
         return tuple(name for name in EXTRA_CHANNELS if name in value)
 
     @model_validator(mode="after")
@@ -361,18 +361,18 @@ class JobOptions(Model):
 
     @property
     def measures_payload(self) -> bool:
-        """Whether the payload of each valid grasp is measured."""
+        """Whether to measure the payload of each valid grasp."""
         return self.payload or self.min_payload > 0
 
     @property
     def matter(self) -> dict[str, float]:
-        """What it says of the object's mass, density and friction; empty: nothing."""
+        """The given mass, density and friction of the object; empty: none given."""
         said = {"mass": self.mass, "density": self.density, "object_friction": self.object_friction}
         return {name: value for name, value in said.items() if value is not None}
 
     @property
     def models(self) -> int:
-        """Models around the nominal one in which each valid grasp is validated; 0: none."""
+        """Perturbed models for validation of each valid grasp, besides the nominal one; 0: none."""
         return self.robust_models or (ROBUST_MODELS if self.robust else 0)
 
     @property
@@ -382,17 +382,17 @@ class JobOptions(Model):
 
     @property
     def _dropped(self) -> tuple[NamedNeighbour, ...]:
-        # A name alone was made one of these when it was read.
+        # Plain names became `NamedNeighbour` when the field was parsed.
         return tuple(one for one in self.neighbours if isinstance(one, NamedNeighbour))
 
     @property
     def beside(self) -> tuple[NamedNeighbour, ...]:
-        """The neighbours of the document, then those that are dropped."""
+        """Neighbours of the scene document, then dropped neighbours."""
         placed = self.scene.neighbours if isinstance(self.scene, SceneDocument) else ()
         return (*placed, *self._dropped)
 
     def with_beside(self, found: Sequence[NamedNeighbour]) -> Self:
-        """The same with other words for its neighbours, in the order of `beside`."""
+        """Return a copy with other neighbours, in the order of `beside`."""
         if not found:
             return self
         first = len(self.beside) - len(self.neighbours)
@@ -403,37 +403,37 @@ class JobOptions(Model):
 
     @property
     def network(self) -> str:
-        """Name or digest of the network that its method sets out from; empty: it takes none."""
+        """Name or digest of the network that proposes starts; empty: none."""
         return str(self.options.get("network", "")) if self.method in NETWORK_METHODS else ""
 
     @property
     def in_scene(self) -> bool:
-        """Whether grasps are planned in the scene they are for; else they may be put into scenes afterwards."""
+        """Whether grasps are planned in their scene; otherwise they can be put into scenes afterwards."""
         return self.scene != "free"
 
     @property
     def knobs(self) -> Fidelity:
-        """What the fidelity's name stands for; ValueError for `auto`, which a chart has to resolve first."""
+        """Settings of the fidelity; ValueError for `auto`, which a chart must resolve first."""
         return resolve_fidelity(self.fidelity)
 
     @property
     def counted(self) -> Literal["valid", "feasible"]:
-        """What the kept grasps are of a job that wants valid ones: valid, or feasible where nothing is
-        validated."""
+        """Grasps that count towards the wanted number: valid, or feasible without validation."""
         return "feasible" if self.validation == "none" else "valid"
 
     @property
     def standing(self) -> Literal["valid", "feasible", "kept"]:
-        """What tables and pages count of what was made: valid grasps; where nothing is validated all that were kept,
-        which are feasible unless candidates were wanted."""
+        """Grasps counted in tables: valid ones, or without validation all stored ones.
+
+        Those are feasible unless candidates were wanted.
+        """
         return "kept" if self.counted == "feasible" and self.want == "candidates" else self.counted
 
     def rechecks_of(self, batch: int) -> int:
-        """Grasps of a batch that are rechecked: the first batches share the job's rechecks, so that a longer job has
-        the same first batches as a shorter one.
+        """Return the number of rechecks of a batch; longer and shorter jobs share their first batches.
 
-        The default is spread: every other batch has one, and every other job begins with the first batch, so that a
-        dataset of short jobs is rechecked as well.
+        A given number goes to the first batches. The default is spread over every other batch; every other job begins
+        with its first batch, so that datasets of short jobs are rechecked as well.
         """
         if self.validation in ("none", "dexgraspbench"):
             return 0
@@ -444,13 +444,13 @@ class JobOptions(Model):
 
     @property
     def _first_turn(self) -> int:
-        """Where a job stands in the turns of rechecks."""
+        """Offset of a job in the cycle of rechecks."""
         named = [getattr(self, name, "") for name in ("hand", "object")]
         return zlib.crc32("/".join([*named, str(self.seed)]).encode()) % _RECHECK_EVERY
 
 
 class JobRequest(JobOptions):
-    """One hand x one object x a number of grasps x a method and fidelity, with the scenes and views to make of them."""
+    """Request for grasps of one hand on one object, with method, fidelity, scenes and views."""
 
     SUBMITTED = True
 
@@ -459,13 +459,12 @@ class JobRequest(JobOptions):
 
 
 def batches_of(grasps: int) -> int:
-    """How many batches so many grasps take."""
+    """Return the number of batches for a number of grasps."""
     return -(-grasps // BATCH_SIZE)
 
 
 def check_known(options: JobOptions) -> None:
-    """Raises ValueError where a neighbour or the network is not said by the digest of its files: a name may stand for
-    other files later."""
+    """Raise ValueError if a neighbour or the network has no digest: a name may refer to other files later."""
     if any(one.digest is None for one in options.beside):
         raise ValueError("each neighbour of a stored job has the digest of its files")
     if options.network and not re.fullmatch(DIGEST, options.network):
@@ -473,7 +472,7 @@ def check_known(options: JobOptions) -> None:
 
 
 class Asset(Model):
-    """A hand, an object or a network as the service keeps it: immutable bytes under the digest of their content."""
+    """A stored hand, object or network: immutable bytes under the digest of their content."""
 
     kind: AssetKind
     name: Name
@@ -489,5 +488,5 @@ class Asset(Model):
     facts: dict[str, object] = Field(default_factory=dict, description="what ingest measured")
     self_test: bool = Field(False, description="of a hand: whether the check ends with grasps of plain objects")
 
-    # A newer graspd may have written more.
+    # A newer graspd may have written further fields.
     model_config = ConfigDict(frozen=True, extra="ignore")

@@ -1,4 +1,4 @@
-"""Every error graspd raises on purpose.
+"""Errors that graspd raises on purpose.
 
     GraspdError
     ├── InputError                the caller's mistake: exit 2, HTTP 422
@@ -6,29 +6,27 @@
     │   ├── ConflictError         the request clashes with what is there: exit 2, HTTP 409
     │   ├── MeshError             an object mesh that cannot be used
     │   ├── HandError             a hand description that cannot be used
-    │   ├── SceneError            a scene without room, or in which no grasp can be found
-    │   ├── LoadError             a mass that is beyond what the hand lifts
+    │   ├── SceneError            a scene without space for the object, or without any grasp
+    │   ├── LoadError             a mass beyond the hand's limit
     │   ├── LimitError            too large, too many: exit 2, HTTP 413
-    │   └── QuotaError            the key has all it may have: exit 2, HTTP 429
+    │   └── QuotaError            the key has reached its quota: exit 2, HTTP 429
     ├── UnavailableError          a part of the service does not answer: exit 1, HTTP 503
     │   ├── QueueUnavailable
     │   ├── StoreUnavailable
     │   ├── IndexUnavailable
-    │   │   └── IndexDamaged      its file is damaged: a new one takes its place
+    │   │   └── IndexDamaged      its file is damaged: a new one replaces it
     │   └── RateError             too many requests: exit 1, HTTP 429
     ├── BusyError                 another graspd owns the data folder, or a port is taken: exit 1, HTTP 409
-    ├── DamagedError              a record in the store is not what its name says: exit 1, HTTP 500
-    │   └── DamagedShard          a shard's file is not what its checksum says, or is gone: exit 1, HTTP 500
+    ├── DamagedError              a record in the store does not match its name: exit 1, HTTP 500
+    │   └── DamagedShard          a shard's file does not match its checksum, or is missing: exit 1, HTTP 500
     └── TaskError                 a task ended without a result: exit 1, HTTP 500
         ├── TaskCancelled
         └── TaskRefused           unknown schema or function: never retried
 
-A message is one line that names what is wrong and the fix. `exit_code` and `status` are the one table from errors to
-exit codes and HTTP statuses; `slug` names the problem type (RFC 9457).
+A message is one line that states the problem and the fix. `exit_code` and `status` map errors to exit codes and HTTP
+statuses; `slug` names the problem type (RFC 9457).
 
-Secrets do not leave in messages: neither in errors nor in log lines, whatever these quote.
-
-What somebody may have meant by a word that is not known.
+Messages and log lines never contain secrets, whatever they quote. Functions for "did you mean" hints are here too.
 """
 
 from __future__ import annotations
@@ -38,13 +36,13 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, ClassVar, Final, Self
 
-#: Line breaks with the space around them, all that `str.splitlines` knows; control characters.
+#: Line breaks with surrounding space (all those of `str.splitlines`) and control characters.
 _BREAK: Final = re.compile(r"\s*[\n\r\v\f\x1c-\x1e\x85\u2028\u2029]\s*")
 _CONTROL: Final = re.compile(r"[\x00-\x1f\x7f-\x9f]")
 
 
 class GraspdError(Exception):
-    """Base of all errors that graspd raises on purpose; its text is one line without secrets."""
+    """Base class of graspd's own errors; the text is one line without secrets."""
 
     slug: ClassVar[str] = "internal"
     status: ClassVar[int] = 500
@@ -52,8 +50,8 @@ class GraspdError(Exception):
     title: ClassVar[str] = "Something went wrong"
 
     def __str__(self) -> str:
-        # A quoted key, file name or message of a library may carry line breaks and escapes: they would forge lines in
-        # logs and terminals. What a printable text holds stays as it is.
+        # Quoted keys, file names or library messages may contain line breaks and escapes, which would forge lines in
+        # logs and terminals. Printable text does not change.
         text = without_secrets(super().__str__())
         if text.isprintable():
             return text
@@ -61,7 +59,7 @@ class GraspdError(Exception):
 
 
 class InputError(GraspdError):
-    """The caller's mistake."""
+    """The caller made a mistake."""
 
     slug, status, exit_code, title = "invalid-input", 422, 2, "The request cannot be used"
 
@@ -73,17 +71,17 @@ class NotFoundError(InputError):
 
 
 class ConflictError(InputError):
-    """The request clashes with the present state."""
+    """The request conflicts with the present state."""
 
     slug, status, title = "conflict", 409, "Conflict"
 
 
 class AssetError(InputError):
-    """A hand or an object that cannot be used.
+    """A hand or an object cannot be used.
 
     Args:
-        message: what is wrong, and the fix in options of the command line.
-        facts: what was found out before the refusal, as the report of a check has it.
+        message: the problem, and the fix as options of the command line.
+        facts: findings before the error, for the report of a check.
     """
 
     def __init__(self, message: str = "", *, facts: Mapping[str, Any] | None = None) -> None:
@@ -92,11 +90,11 @@ class AssetError(InputError):
 
     @classmethod
     def with_fixes(cls, problem: str, hint: str, *fixes: Mapping[str, Any], **facts: Any) -> Self:
-        """An error whose fixes are options: `problem` and `options_suggested` tell them without a command line.
+        """Make an error with fixes as options; `problem` and `options_suggested` suit any front end.
 
         Args:
-            problem: what is wrong.
-            hint: the fixes in options of the command line.
+            problem: the problem.
+            hint: the fixes as options of the command line.
             fixes: keys of `asset.json` with their values; None: the user chooses the value.
             facts: further facts.
         """
@@ -104,37 +102,37 @@ class AssetError(InputError):
 
 
 class MeshError(AssetError):
-    """An object mesh that cannot be read or used."""
+    """An object mesh cannot be read or used."""
 
     slug, title = "bad-mesh", "The mesh cannot be used"
 
 
 class HandError(AssetError):
-    """A hand description that cannot be read or used."""
+    """A hand description cannot be read or used."""
 
     slug, title = "bad-hand", "The hand cannot be used"
 
 
 class SceneError(InputError):
-    """A scene that the object does not fit in, or in which no grasp is found."""
+    """The object does not fit into the scene, or no grasp is found in it."""
 
     slug, title = "bad-scene", "The scene cannot be used"
 
 
 class LoadError(InputError):
-    """An object, or a wanted payload, that is heavier than anything the hand lifts."""
+    """An object or a wanted payload exceeds what the hand can lift."""
 
     slug, title = "too-heavy", "The object is too heavy for the hand"
 
 
 class LimitError(InputError):
-    """Larger or more than the service takes."""
+    """The size or number exceeds a limit of the service."""
 
     slug, status, title = "too-large", 413, "Over the limit"
 
 
 class QuotaError(InputError):
-    """The key has as much in work as it may have."""
+    """The key has reached its quota of unfinished work."""
 
     slug, status, title = "quota-exceeded", 429, "The quota of the key is used up"
 
@@ -168,13 +166,13 @@ class IndexUnavailable(UnavailableError):
 
 
 class IndexDamaged(IndexUnavailable):
-    """The file of the index is damaged; a new one takes its place and is filled from the store."""
+    """The file of the index is damaged; a new one replaces it and is rebuilt from the store."""
 
     slug, title = "index-damaged", "The index is damaged"
 
 
 class RateError(UnavailableError):
-    """More requests than the service answers."""
+    """The request exceeds the rate limit of the service."""
 
     slug, status, title = "too-many-requests", 429, "Too many requests"
 
@@ -186,13 +184,13 @@ class BusyError(GraspdError):
 
 
 class DamagedError(GraspdError):
-    """A record in the store is not what its name says; to try again does not help."""
+    """A record in the store does not match its name; retrying does not help."""
 
     slug, title = "damaged", "A record in the store is damaged"
 
 
 class DamagedShard(DamagedError):
-    """A shard whose file is not what its checksum says, or is gone."""
+    """A shard's file does not match its checksum, or is missing."""
 
     slug, title = "damaged-shard", "A shard is damaged"
 
@@ -210,12 +208,12 @@ class TaskCancelled(TaskError):
 
 
 class TaskRefused(TaskError):
-    """The task must not run here: unknown schema, unknown function. Never retried."""
+    """The task has an unknown schema or function and must not run here; it is never retried."""
 
     slug, title = "task-refused", "The task was refused"
 
 
-#: Domain errors by problem type, for the client and the reference page.
+#: Errors by problem type, for the client and the reference page.
 ERRORS: Final[dict[str, type[GraspdError]]] = {
     error.slug: error
     for error in (
@@ -244,7 +242,7 @@ ERRORS: Final[dict[str, type[GraspdError]]] = {
     )
 }
 
-#: User and password of a URL, up to the last @: a password that nobody quoted may hold one, and a slash.
+#: User and password of a URL, up to the last @: an unquoted password may contain an @ or a slash.
 _LOGIN: Final = re.compile(r"(?<=://)[^/\s\"'<>][^\s\"'<>]*@")
 _PARAMETER: Final = re.compile(
     r"([?&][\w.%-]*(?:password|passwd|token|secret|signature|credential|sig|key)=)[^&\s\"'<>]+", re.IGNORECASE
@@ -253,31 +251,31 @@ _API_KEY: Final = re.compile(r"\bgd_[A-Za-z0-9_-]{8,}")
 
 
 def without_secrets(text: str) -> str:
-    """The text with stars for passwords in URLs and for API keys."""
+    """Replace passwords in URLs and API keys by stars."""
     if "://" in text:
         text = _PARAMETER.sub(r"\1***", _LOGIN.sub("***@", text))
     return _API_KEY.sub("gd_***", text) if "gd_" in text else text
 
 
-#: Names among which a similar one is sought, and those that a message lists.
+#: Limits on the names searched for a similar one, and on the names listed in a message.
 SEARCHED: Final = 1000
 _LISTED: Final = 20
 
 
 def known_names(word: str, names: Sequence[str]) -> str:
-    """`; there are: A, B` with the first of at most `SEARCHED` names, and the one that is like the word."""
+    """Return `; there are: A, B` for the first of at most `SEARCHED` names, and the most similar one."""
     listed = ", ".join(names[:_LISTED]) + (", ..." if len(names) > _LISTED else "")
     return f"; there are: {listed or 'none yet'}{did_you_mean(word, names)}"
 
 
 def did_you_mean(word: str, choices: Iterable[str]) -> str:
-    """`; did you mean X?` for the choice that is like the word, else nothing."""
+    """Return `; did you mean X?` for the most similar choice, or an empty text."""
     known = {choice.lower(): choice for choice in choices}
     like = difflib.get_close_matches(word.lower(), known, n=1)
     return f"; did you mean {known[like[0]]}?" if like else ""
 
 
 def one_of(word: str, choices: Iterable[str]) -> str:
-    """`A, B, C`, and which of them was meant."""
+    """Return `A, B, C` and the most similar choice."""
     known = list(choices)
     return f"{', '.join(known)}{did_you_mean(word, known)}"

@@ -1,4 +1,4 @@
-"""Fidelities: how much of a grasp is modelled, and the names of what is offered."""
+"""Fidelities: named sets of a planner's settings."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from graspd.service.model.errors import did_you_mean
 
 
 class Fidelity(Model):
-    """How much is modelled, and so what a grasp costs. Each knob is priced by `graspd chart`."""
+    """Settings of the planner that decide accuracy and cost. `graspd chart` measures the cost of each."""
 
     name: str = Field("custom", max_length=64)
     starts: int = Field(4, ge=1, le=64, description="hands that set out for each grasp; half where they are tried")
@@ -68,7 +68,7 @@ FIDELITIES: Final[dict[str, Fidelity]] = {
         fine_iterations=60,
         polish_iterations=15,
     ),
-    # As the paper writes it: plain descent with one rate, one sweep of contacts, no penetration penalty, no selection.
+    # As in the paper: plain descent with one rate, one contact sweep, no penetration penalty, no selection.
     "paper": Fidelity(
         name="paper",
         starts=1,
@@ -87,19 +87,19 @@ FIDELITIES: Final[dict[str, Fidelity]] = {
 }
 
 
-#: Stands in a request for the cheapest fidelity that meets its target; a stored job has that fidelity instead.
+#: Requests the cheapest fidelity that meets the target; a stored job has that fidelity instead.
 AUTO: Final = "auto"
 
 
-#: Fidelities offered to users; the others are for comparison.
+#: Fidelities offered to users; the others are for comparisons.
 OFFERED: Final = ("draft", "standard", "fine")
 
 
 def resolve_fidelity(value: str | Fidelity) -> Fidelity:
-    """The knobs behind a fidelity's name.
+    """Return the settings of a named fidelity.
 
     Raises:
-        ValueError: if the name is not one of `FIDELITIES`.
+        ValueError: the name is not in `FIDELITIES`.
     """
     if isinstance(value, Fidelity):
         return value

@@ -9,5 +9,5 @@ from numpy.typing import NDArray
 
 
 def distinct_values(values: NDArray[np.integer[Any]]) -> list[int]:
-    """The values of an array of any shape, ascending, each once; NumPy's own `unique` would load its masked arrays."""
+    """Return the distinct values, ascending; NumPy's own `unique` would import its masked arrays."""
     return sorted(set(values.ravel().tolist()))

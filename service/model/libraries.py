@@ -1,7 +1,7 @@
-"""Installed libraries: their versions, each looked up once, and imports without the garbage collector.
+"""Installed libraries: cached versions, and imports without garbage collection.
 
-A room's modules are half a million objects. Each collection while they come looks at all that are there already, and so
-does each full one afterwards, the last of them when the process ends: half of what a start and an end take.
+The modules of one process hold half a million objects. Each garbage collection during imports scans all of them, and so
+does each full one later, the last at exit: half of the time of start and exit.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from pathlib import Path
 
 @lru_cache(maxsize=64)
 def version_of(library: str) -> str:
-    """The version of an installed distribution.
+    """Return the version of an installed distribution.
 
-    Its folder is named after it; to ask `importlib.metadata` is to load it, which takes longer than a hand.
+    It is read from the folder's name: importing `importlib.metadata` takes longer than loading a hand.
 
     Raises:
         importlib.metadata.PackageNotFoundError: it is not installed.
@@ -38,7 +38,7 @@ def version_of(library: str) -> str:
 
 @lru_cache(maxsize=16)
 def _distributions(place: str) -> list[tuple[str, str]]:
-    """Names, as folders write them, and versions of the distributions in a place of `sys.path`."""
+    """Return folder names and versions of the distributions in an entry of `sys.path`."""
     try:
         names = [found.name for found in Path(place or ".").iterdir()]
     except OSError:
@@ -52,9 +52,9 @@ _ours = False
 
 
 def own_process() -> None:
-    """This process is graspd's own: what was imported stays until it ends, and collections leave it out.
+    """Declare this process as graspd's own: collections exclude imported objects, which stay until exit.
 
-    In somebody else's process their garbage would stay as well.
+    In a foreign process this would also retain its garbage.
     """
     global _ours
     _ours = True
@@ -62,7 +62,7 @@ def own_process() -> None:
 
 @contextmanager
 def imports() -> Iterator[None]:
-    """Import in here."""
+    """Context for imports without garbage collection."""
     collects = gc.isenabled()
     gc.disable()
     try:

@@ -1,4 +1,4 @@
-"""Options of grasps that are made in this process: those of a job, with files for names, and those of a run."""
+"""Options for grasps made in this process: those of a job, with files for names, and of the run."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from graspd.service.model.scene_spec import MOST_NEIGHBOURS, MOST_SCENES, SceneS
 
 _LOCAL: Final[tuple[Place, ...]] = ("synth", "python")
 _COMMAND: Final[tuple[Place, ...]] = ("synth",)
-#: Fields of a job that say where its grasps are used; in this process a `SceneSpec` does.
+#: Fields of a job that describe the place of its grasps; in this process `SceneSpec` replaces them.
 _OF_PLACE: Final = {"scene", "faces", "neighbours", "touch", "scenes"}
 
 
 class LocalOptions(MeshOptions, JobOptions):
-    """What `graspd synth` and `graspd.synthesize` are told besides hand and object."""
+    """Options of `graspd synth` and `graspd.synthesize` besides hand and object."""
 
     fidelity: Annotated[str, Option("basic", _LOCAL)] = Field("standard", description=f"one of {', '.join(FIDELITIES)}")
     contact_solver: Annotated[Literal["direct", "jacobi", "gauss_seidel"] | None, Option(places=_COMMAND)] = Field(
@@ -47,7 +47,7 @@ class LocalOptions(MeshOptions, JobOptions):
         description="measure the heaviest mass that each valid grasp lifts; graspd synth does by default in scenes "
         "where a mass is said",
     )
-    # A value may be a file, whose digest a job has.
+    # A value may be a file path; a job has its digest instead.
     options: Annotated[dict[str, Any], Option("advanced", _LOCAL, "--option")] = Field(
         default_factory=dict, description="an option of the planner, such as steps=20000 or network=net.npz"
     )
@@ -80,7 +80,7 @@ class LocalOptions(MeshOptions, JobOptions):
 
     @property
     def knobs(self) -> Fidelity:
-        """The knobs of the fidelity, with another contact solver where one is given."""
+        """Settings of the fidelity, with another contact solver if given."""
         knobs, solver = FIDELITIES[self.fidelity], self.contact_solver
         if solver is None:
             return knobs
@@ -88,26 +88,25 @@ class LocalOptions(MeshOptions, JobOptions):
 
     @property
     def place(self) -> SceneSpec:
-        """The scene; InputError for a file that cannot be used."""
+        """The scene; InputError if a file cannot be used."""
         beside = [str(one) for one in self.neighbours]
         return parse_scene(str(self.scene), faces=self.faces, touch=self.touch, beside=beside)
 
     @property
     def mesh(self) -> dict[str, Any]:
-        """How the object's file is read, as keys of its `asset.json`."""
+        """Options for reading the object's mesh, as keys of its `asset.json`."""
         given = self.model_fields_set & MeshOptions.model_fields.keys()
         return {name: value for name in sorted(given) if (value := getattr(self, name))}
 
     def request(self, options: dict[str, Any]) -> JobOptions:
-        """The job without its place, of which a file holds no sample of second opinions.
+        """Return the job without its place and without rechecks.
 
         Args:
-            options: of the method, with digests for files.
+            options: options of the method, with digests for files.
 
         Raises:
-            InputError: one of them is no number or short text.
+            InputError: an option is neither a number nor a short text.
         """
         shared = {name: getattr(self, name) for name in JobOptions.model_fields.keys() - _OF_PLACE}
-        # A recheck is a sample that watches over many jobs; a file can be validated under the DexGraspBench protocol
-        # whole.
+        # Rechecks sample many jobs; a single file can be validated under the DexGraspBench protocol completely.
         return accepted(JobOptions, shared | {"fidelity": self.knobs, "options": options, "rechecks": 0})

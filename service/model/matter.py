@@ -1,4 +1,4 @@
-"""Mass and friction of objects: bounds and what an object has of which nobody says more."""
+"""Mass and friction of objects: bounds and defaults."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ from typing import Annotated, Final
 
 from pydantic import Field
 
-#: Of an object of which nobody says what it weighs [kg], and its coefficient of sliding friction: DexGraspBench's.
+#: Default mass [kg] and coefficient of sliding friction: DexGraspBench's.
 MASS_KG: Final = 0.1
 FRICTION: Final = 0.6
-#: Weight of a kilogram, and a push on it, in the protocol [m/s^2].
+#: Gravity, and the acceleration of pushes, in the protocol [m/s^2].
 ACCELERATION: Final = 10.0
-#: A hand lifts nothing heavier [kg].
+#: Upper bound of the mass that a hand lifts [kg].
 MOST_KG: Final = 100.0
 
 Mass = Annotated[float, Field(gt=0, le=MOST_KG, allow_inf_nan=False)]

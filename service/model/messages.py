@@ -1,4 +1,4 @@
-"""What travels through the queue: tasks, and where they came from."""
+"""Messages of the queue: tasks and their origin."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from graspd.service.model.states import AssetKind, Stage
 
 
 class Origin(Model):
-    """Where a job came from, for the logs and traces of its tasks; keys share the queue evenly."""
+    """Origin of a job, for logs and traces of its tasks; the queue is shared fairly between keys."""
 
     request: str = Field("", max_length=64, description="id of the HTTP request")
     key: str = Field("", max_length=64, description="name of the API key")
     traceparent: str = Field("", max_length=64, description="W3C trace context")
 
-    # A newer API may say more.
+    # A newer API may have written further fields.
     model_config = ConfigDict(frozen=True, extra="ignore")
 
 
 class TaskMessage(Model):
-    """What travels through the queue: enough for a worker with the store alone to do the task."""
+    """Message for a task: a worker needs only this and the store."""
 
-    # `schema` is a field name in the message, an attribute of BaseModel in Python: hence the alias.
+    # The message has the field `schema`, which is an attribute of BaseModel in Python: hence the alias.
     schema_: int = Field(alias="schema", description="oldest schema that can say this")
     newest_schema: int = Field(0, ge=0, description="newest schema whose meaning the writer knew; 0: the same")
     task_id: Word
@@ -53,7 +53,7 @@ class TaskMessage(Model):
 
 
 class IngestMessage(Model):
-    """A task that checks an uploaded hand, object or network in a child process."""
+    """Message for a task that checks an uploaded hand, object or network in a child process."""
 
     schema_: int = Field(alias="schema")
     newest_schema: int = Field(0, ge=0)
@@ -69,5 +69,5 @@ class IngestMessage(Model):
 
 
 def message_type(raw: Mapping[str, Any]) -> type[TaskMessage | IngestMessage]:
-    """The type of a message by its stage."""
+    """Return the type of a message from its stage."""
     return IngestMessage if raw.get("stage") == Stage.INGEST else TaskMessage

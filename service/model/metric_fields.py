@@ -1,4 +1,4 @@
-"""Fields of models, and names, that follow from the table of metrics."""
+"""Fields of models derived from the table of metrics."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ else:
 
 
 def values(*, optional: bool, default: Any = ...) -> dict[str, Any]:
-    """Fields of a model that tells an indexed metric each: those that every shard has, or those that it may lack."""
-    # Those by which grasps are sorted come first: so manifests have it.
+    """Return model fields for the indexed metrics: those that every shard has, or the optional ones."""
+    # Manifests list the sorted metrics first.
     chosen = sorted(indexed(), key=lambda metric: metric.indexed < IndexLevel.SORTED)
     return {
         metric.name: (int | None if metric.whole else float | None, Field(default, description=metric.meaning))
@@ -31,12 +31,12 @@ def values(*, optional: bool, default: Any = ...) -> dict[str, Any]:
 
 
 def means() -> dict[str, Any]:
-    """Fields of a model that tells the mean of each metric that is offered; absent: None."""
+    """Return model fields for the means of the offered metrics; None if absent."""
     return {metric.name: (float | None, None) for metric in indexed(IndexLevel.OFFERED)}
 
 
 def filters() -> dict[str, Any]:
-    """Fields `min_...` and `max_...` of a query, for each metric that is offered."""
+    """Return query fields `min_...` and `max_...` for the offered metrics."""
     fields: dict[str, Any] = {}
     for metric in indexed(IndexLevel.OFFERED):
         low, high = metric.limits
@@ -46,7 +46,7 @@ def filters() -> dict[str, Any]:
 
 
 def with_fields(**parts: Mapping[str, Any]) -> Callable[[type[M]], type[M]]:
-    """Decorator of a model of fields alone: each part stands before the field it is named after, `last` at the end."""
+    """Decorate a model of fields: insert each part before the field of its name, `last` at the end."""
 
     def made(model: type[M]) -> type[M]:
         base: type[BaseModel] = next(base for base in model.__bases__ if issubclass(base, BaseModel))

@@ -1,10 +1,9 @@
-"""The metrics of a grasp: one table, from which all follows that stores, indexes, filters, shows and documents them;
-and the axes of robustness, grasp types and directions.
+"""Table of all grasp metrics; axes of robustness, grasp types and approach directions.
 
-Shards (`service.store.columns`), manifests, the index, the API, the dashboard, a dataset's card and the docs read this
-table. A new metric is a row here and the function that computes it (`MEASURES` in `worker.quality.table`); make it
-`optional`, since older shards lack it. The index gets its column when it is opened next
-(`service.index.database`). What says yes or no of a grasp is a verdict and no metric.
+Storage (`service.store.columns`), manifests, index, API, dashboard, dataset cards and docs derive from this table. A
+new metric needs a row here and a function that computes it (`MEASURES` in `worker.quality.table`); make it `optional`,
+since older shards lack it. The index adds its column when it is next opened (`service.index.database`). A yes or no
+about a grasp is a verdict, not a metric.
 """
 
 from __future__ import annotations
@@ -15,65 +14,65 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final, Literal
 
-#: Shorter names than this are symbols: they keep their case.
+#: Shorter names are symbols and keep their case.
 _SYMBOL: Final = 4
 
 
 class IndexLevel(IntEnum):
-    """What the index knows of a metric; each includes those before it."""
+    """How the index stores a metric; each level includes those before it."""
 
     NO = 0
     KEPT = 1
-    """A column: it is told with the grasp."""
+    """A column, returned with the grasp."""
     SORTED = 2
-    """A database index as well: grasps can be bounded and sorted by it."""
+    """Also a database index, for ranges and sorting."""
     OFFERED = 3
-    """The API and the dashboard offer that, and means and distributions of a job's grasps."""
+    """Also filters, means and distributions of a job's grasps in API and dashboard."""
 
 
 @dataclass(frozen=True)
 class GraspMetric:
-    """One number of each grasp."""
+    """Definition of one number per grasp."""
 
     name: str
-    """Its dataset in a base shard is `quality/{name}`; everywhere else it is called by this name."""
+    """Its dataset in a base shard is `quality/{name}`; this name is used everywhere else."""
     units: str
-    """As the shard says it: `cm^2`; `1`: none."""
+    """As stated in the shard: `cm^2`; `1`: none."""
     meaning: str
     title: str
     short: str = ""
-    """Heading where there is little room; the title, if not given."""
+    """Short heading; by default the title."""
     swept: bool = False
-    """A value at each contact threshold; the index holds the one at `INDEX_THRESHOLD_M`."""
+    """One value per contact threshold; the index has the value at `INDEX_THRESHOLD_M`."""
     whole: bool = False
     """A count."""
     code: bool = False
-    """A number that stands for a kind: sums and means of it say nothing."""
+    """A number that encodes a category; its sums and means are meaningless."""
     optional: bool = False
     """A shard may lack it."""
     indexed: IndexLevel = IndexLevel.NO
     bounds: tuple[float, float] = (0, math.inf)
-    """Least and largest value that a filter may name."""
+    """Least and largest value of a filter."""
     less_is_better: bool = False
     digits: int | None = None
-    """After the point, in a card's table; None: not in the table."""
+    """Decimal places in the table of a card; None: not in the table."""
     plot: Literal["no", "whole", "cut"] = "no"
-    """Whether a card draws its distribution, and whether a long tail is cut."""
+    """Whether a card shows its distribution, and whether it cuts a long tail."""
 
     @property
     def path(self) -> str:
-        """Dataset of a base shard."""
+        """Path of the dataset in a base shard."""
         return f"quality/{self.name}"
 
     @property
     def limits(self) -> tuple[float | None, float | None]:
-        """The bounds; None: there is none."""
+        """The bounds; None: unbounded."""
         low, high = (bound if math.isfinite(bound) else None for bound in self.bounds)
         return low, high
 
     @property
     def unit(self) -> str:
-        """As people read it; empty: none."""
+        """Unit for display; empty: none."""
         return "" if self.units == "1" else self.units.replace("^2", "²").replace("^3", "³")
 
     @property
@@ -83,7 +82,7 @@ class GraspMetric:
 
     @property
     def heading(self) -> str:
-        """The same within a text, with the unit."""
+        """Heading within a text, with the unit."""
         words = self.column_title if len(self.column_title) < _SYMBOL else self.column_title.lower()
         return f"{words}, {self.unit}" if self.unit else words
 
@@ -267,18 +266,18 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
 
 
 def indexed(least: IndexLevel = IndexLevel.KEPT) -> tuple[GraspMetric, ...]:
-    """Metrics of which the index knows that much."""
+    """Return the metrics at or above a level of the index."""
     return tuple(metric for metric in GRASP_METRICS if metric.indexed >= least)
 
 
-#: Models around the nominal one in which a grasp is validated, where nobody says how many.
+#: Default number of perturbed models for validation.
 ROBUST_MODELS: Final = 8
 
 MOST_ROBUST_MODELS: Final = 64
 
 
 class Axis(IntEnum):
-    """What differs from the nominal model. Numbers stand in shards: new axes come last."""
+    """Parameter perturbed from the nominal model. Shards contain the numbers: append new axes at the end."""
 
     NONE = 0
     SHAPES = 1
@@ -293,11 +292,11 @@ class Axis(IntEnum):
 
     @property
     def word(self) -> str:
-        """As documents and pages say it."""
+        """Name of the axis in documents and pages."""
         return self.name.lower()
 
 
-#: What differs on each axis, for people.
+#: Description of each axis for users.
 AXIS_MEANINGS: Final[dict[Axis, str]] = {
     Axis.SHAPES: "collision shapes",
     Axis.JOINTS: "joint drives",
@@ -310,20 +309,20 @@ AXIS_MEANINGS: Final[dict[Axis, str]] = {
     Axis.ORDER: "order of closing",
 }
 
-#: Words of the axes.
+#: Names of the axes.
 AXIS_WORDS: Final = tuple(axis.word for axis in AXIS_MEANINGS)
 
 
 def axis_word(number: int) -> str | None:
-    """The word of an axis as a shard has it; None: none, or one that this version does not know."""
+    """Return the name of an axis from its number in a shard; None: none, or unknown to this version."""
     return Axis(number).word if number in AXIS_MEANINGS else None
 
 
 class GraspType(IntEnum):
-    """What a hand does in a grasp, by the opposition in it; `worker.quality.table` has the rule."""
+    """Grasp type by the opposition of the contacts; `worker.quality.table` defines the rule."""
 
     NONE = 0
-    """Not told: one digit alone touches, or nothing does."""
+    """Undefined: at most one digit touches."""
     POWER = 1
     PRECISION = 2
     LATERAL = 3
@@ -335,22 +334,22 @@ SECTORS: Final = 12
 
 DIRECTION_CELLS: Final = BANDS * SECTORS
 
-#: Two grasps of a job are nearer than this only by accident [m]: mean distance between the same points of the hand's
-#: surface. Twice as much is hard to tell apart in a picture; of 100 pairs of batches less than one has such a pair.
+#: Distance below which two grasps of a job are near-duplicates [m]: mean over corresponding points of the hand's
+#: surface. Twice as much is hardly visible in a picture; less than 1 of 100 pairs of batches has such a pair.
 MIN_DISTANCE_M: Final = 0.005
 
 
 def entropy_bits(counts: Iterable[int]) -> float:
-    """Shannon entropy [bit] of how grasps are shared out to kinds; 0: all are of one, or there are none."""
+    """Return the Shannon entropy [bit] of the distribution over categories; 0: one category or no grasps."""
     known = [count for count in counts if count > 0]
     total = sum(known)
     return -sum(count / total * math.log2(count / total) for count in known) + 0.0
 
 
 def evenness(counts: Iterable[int], kinds: int) -> float:
-    """Kinds that would be needed to spread as widely if each were used alike, over all kinds: 2^entropy / kinds.
+    """Return 2^entropy / kinds: the effective number of equally used categories, relative to all of them.
 
-    1 is even; 1 / kinds is all of one kind; 0 if there is none.
+    1: uniform; 1 / kinds: a single category; 0: no grasps.
     """
     counts = list(counts)
     return float(2 ** entropy_bits(counts) / kinds) if any(counts) else 0.0

@@ -1,4 +1,4 @@
-"""Names of things in the object store: every key graspd writes is made here (table in ARCHITECTURE.md)."""
+"""Keys of the object store: every key graspd writes is built here (table in ARCHITECTURE.md)."""
 
 from __future__ import annotations
 
@@ -24,137 +24,137 @@ TAGS: Final = "tags"
 SERVICE: Final = "service"
 MARKS: Final = "marks"
 
-#: Folder under `shards/` and HDF5 kind of what each stage makes.
+#: Folder under `shards/`, and HDF5 kind, of each stage's result.
 SHARD_KINDS: Final[dict[Stage, str]] = {Stage.SYNTHESIZE: "base", Stage.SCENE: "scene", Stage.RENDER: "views"}
 
 
 def asset_files(kind: AssetKind, digest: str) -> str:
-    """ZIP of all files of a hand or object."""
+    """Return the key of the ZIP of all files of a hand or object."""
     return f"{ASSETS}/{kind.value}/{digest}/files.zip"
 
 
 def asset_record(kind: AssetKind, digest: str) -> str:
-    """`Asset` as JSON, put after the files."""
+    """Return the key of `Asset` as JSON, written after the files."""
     return f"{ASSETS}/{kind.value}/{digest}/asset.json"
 
 
 def asset_check(kind: AssetKind, digest: str) -> str:
-    """What ingest found."""
+    """Return the key of the report of ingest."""
     return f"{ASSETS}/{kind.value}/{digest}/check.json"
 
 
 def hand_expanded(digest: str) -> str:
-    """The URDF that a hand's xacro file expanded to when it was first read."""
+    """Return the key of the URDF expanded from a hand's xacro file at first reading."""
     return f"{ASSETS}/{AssetKind.HAND.value}/{digest}/expanded.json"
 
 
 def asset_model(kind: AssetKind, digest: str) -> str:
-    """The prepared hand or object as binary glTF, for viewers."""
+    """Return the key of the prepared hand or object as binary glTF, for viewers."""
     return f"{ASSETS}/{kind.value}/{digest}/model.glb"
 
 
 def object_prepared(digest: str, key: str) -> str:
-    """An object repaired and simplified; `key` is a digest of how."""
+    """Return the key of a repaired and simplified object; `key` is a digest of the parameters."""
     return f"{ASSETS}/{AssetKind.OBJECT.value}/{digest}/prepared/{key}.npz"
 
 
 def object_pieces(digest: str, key: str) -> str:
-    """Convex pieces of an object as the validator knows it; `key` is a digest of how they were made."""
+    """Return the key of an object's convex pieces for the validator; `key` is a digest of the parameters."""
     return f"{ASSETS}/{AssetKind.OBJECT.value}/{digest}/pieces/{key}.npz"
 
 
 def job_record(job: str) -> str:
-    """The request with the digests of hand and object."""
+    """Return the key of the request with the digests of hand and object."""
     return f"{JOBS}/{job}/job.json"
 
 
 def job_events(job: str) -> str:
-    """Prefix of what a user did to the job later."""
+    """Return the prefix of the later user actions on a job."""
     return f"{JOBS}/{job}/events"
 
 
 def job_event(job: str, number: int, what: str) -> str:
-    """One of `job_events`; numbers start at 1."""
+    """Return the key of one of `job_events`; numbers start at 1."""
     return f"{job_events(job)}/{number:06}-{what}.json"
 
 
 def attempts(task: str) -> str:
-    """Prefix of a task's failed attempts."""
+    """Return the prefix of a task's failed attempts."""
     return f"{TASKS}/{task}/attempts"
 
 
 def attempt(task: str, number: int) -> str:
-    """A failed attempt; numbers start at 1."""
+    """Return the key of a failed attempt; numbers start at 1."""
     return f"{attempts(task)}/{number}.json"
 
 
 def shard_file(stage: Stage, shard: str) -> str:
-    """HDF5 bytes of a shard."""
+    """Return the key of the HDF5 file of a shard."""
     return f"{SHARDS}/{SHARD_KINDS[stage]}/{shard}.h5"
 
 
 def shard_manifest(stage: Stage, shard: str) -> str:
-    """Manifest of a shard: the shard exists for its readers once this does."""
+    """Return the key of the manifest of a shard: readers see the shard once this exists."""
     return f"{SHARDS}/{SHARD_KINDS[stage]}/{shard}.json"
 
 
 def dataset_record(dataset: str) -> str:
-    """Hands, objects and options of a dataset with the jobs that follow from them."""
+    """Return the key of the record with a dataset's hands, objects, options and resulting jobs."""
     return f"{DATASETS}/{dataset}/dataset.json"
 
 
 def dataset_events(dataset: str) -> str:
-    """Prefix of what a user did to the dataset later."""
+    """Return the prefix of the later user actions on a dataset."""
     return f"{DATASETS}/{dataset}/events"
 
 
 def dataset_event(dataset: str, number: int, what: str) -> str:
-    """One of `dataset_events`; numbers start at 1."""
+    """Return the key of one of `dataset_events`; numbers start at 1."""
     return f"{dataset_events(dataset)}/{number:06}-{what}.json"
 
 
 def dataset_snapshots(dataset: str) -> str:
-    """Prefix of a dataset's snapshots."""
+    """Return the prefix of a dataset's snapshots."""
     return f"{DATASETS}/{dataset}/snapshots"
 
 
 def dataset_snapshot(dataset: str, digest: str) -> str:
-    """An immutable list of shards."""
+    """Return the key of an immutable list of shards."""
     return f"{dataset_snapshots(dataset)}/{digest}.json"
 
 
 def object_set(name: str, digest: str) -> str:
-    """One version of a named set of objects."""
+    """Return the key of one version of a named set of objects."""
     return f"{OBJECT_SETS}/{name}/{digest}.json"
 
 
 def webhook(webhook: str) -> str:
-    """An address that is told of ends; removed when its owner takes it away."""
+    """Return the key of a webhook; removed when its owner deletes it."""
     return f"{WEBHOOKS}/{webhook}.json"
 
 
 def tag_versions(tag: str) -> str:
-    """Prefix of what became of a tag with each change."""
+    """Return the prefix of the versions of a tag."""
     return f"{TAGS}/{tag}"
 
 
 def tag_version(tag: str, number: int) -> str:
-    """One of `tag_versions`; numbers start at 1, the last one counts, and those before it go."""
+    """Return the key of one of `tag_versions`; numbers start at 1; the last one is current, older ones go."""
     return f"{tag_versions(tag)}/{number:06}.json"
 
 
 def service(number: int) -> str:
-    """Identity of the service that works on the store; numbers start at 1, and the last one counts."""
+    """Return the key of the identity of the store's service; numbers start at 1, the last one is current."""
     return f"{SERVICE}/{number:06}.json"
 
 
 def mark(mark: str) -> str:
-    """What tells whether the index is as old as the store."""
+    """Return the key of a mark that shows whether the index is as old as the store."""
     return f"{MARKS}/{mark}.json"
 
 
 def deletion(what: str, name: str) -> str:
-    """What a user took away, until nothing of it is left: a hand or object by its digest, a job, a dataset."""
+    """Return the key of an unfinished deletion: of a hand or object by its digest, a job, a dataset."""
     return f"{DELETIONS}/{what}/{name}.json"
 
 
@@ -163,7 +163,7 @@ log = logging.getLogger(__name__)
 
 
 def refuse_long(name: str) -> str:
-    """The name; InputError if it is too long for a thing that a user can name otherwise."""
+    """Return the name; InputError if it is too long and a user can choose another."""
     if len(name) > MOST:
         raise InputError(f"the name {name} has {len(name)} characters, at most {MOST} are taken; give a shorter one")
     return name
@@ -171,7 +171,7 @@ def refuse_long(name: str) -> str:
 
 @lru_cache(maxsize=4096)
 def fitted(name: str, most: int = MOST) -> str:
-    """The name; of one that is too long the beginning and a digest, so that no two become one, told once in the log."""
+    """Return the name, shortened if too long: its beginning and a digest keep it unique; logged once."""
     if len(name) <= most:
         return name
     short = f"{name[: most - 9]}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"

@@ -18,7 +18,7 @@ Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
 class MeshOptions(Model):
-    """How a mesh file is read."""
+    """Options for reading a mesh file."""
 
     units: Annotated[Literal["m", "mm", "cm", "in"], _SIZE] = Field("m", description="unit of the mesh")
     scale_to: Annotated[Positive | None, _SIZE] = Field(None, description="longest extent after scaling [m]")
@@ -28,7 +28,7 @@ class MeshOptions(Model):
 
 
 class ObjectOptions(MeshOptions):
-    """The keys of an object's `asset.json`; units are SI."""
+    """Keys of an object's `asset.json`; units are SI."""
 
     file: str = ""
     description: str = ""

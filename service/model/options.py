@@ -1,7 +1,7 @@
-"""What an option of a job says of itself besides type, default, bounds and description; and the views that follow.
+"""Metadata of job options besides type, default, bounds and description; tables derived from it.
 
-A field with an `Option` among its metadata is offered to people. The command line, the forms of the dashboard, the
-Python signatures and the tables of the documentation are made from `rows`; nothing else declares an option.
+A field with an `Option` in its metadata is offered to users. `rows` is the only source for the command line, the
+dashboard's forms, the Python signatures and the documentation tables.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from graspd.service.model.errors import InputError
 
 ModelT = TypeVar("ModelT", bound=BaseModel)
 FunctionT = TypeVar("FunctionT", bound=Callable[..., Any])
-#: Who takes an option: a job of the service, the command `graspd synth`, `graspd.synthesize`; the file of an asset.
+#: Users of an option: a job of the service, the command `graspd synth`, `graspd.synthesize`, an asset's file.
 Place = Literal["job", "synth", "python", "asset"]
 EVERYWHERE: Final[tuple[Place, ...]] = ("job", "synth", "python")
 JOB: Final[tuple[Place, ...]] = ("job",)
@@ -31,37 +31,37 @@ _UNIT: Final = re.compile(r"\[([^\]]+)\]")
 
 @dataclass(frozen=True)
 class Form:
-    """How a form of the dashboard shows an option."""
+    """Presentation of an option in a form of the dashboard."""
 
     section: Literal["grasps", "scenes"]
     label: str
     hint: str = ""
     choices: Mapping[str, str] = field(default_factory=dict)
-    """Values with their words; none: a field to type in."""
+    """Values with their labels; empty: a text field."""
     placeholder: str = ""
     cells: bool = False
-    """Whether the form of a dataset has it, too."""
+    """Whether a dataset's form has it too."""
 
 
 @dataclass(frozen=True)
 class Option:
-    """Metadata of a field that people set."""
+    """Metadata of a user option."""
 
     group: Literal["basic", "advanced"] = "advanced"
     places: tuple[Place, ...] = EVERYWHERE
     flags: str = ""
-    """Spelling on the command line, several separated by spaces; empty: `--` and the name."""
+    """Flags on the command line, separated by spaces; empty: `--` and the name."""
     keyword: str = ""
-    """Spelling in `graspd.synthesize`; empty: the name."""
+    """Keyword of `graspd.synthesize`; empty: the name."""
     typed: str = ""
-    """The description where a person types the value, if it differs from that of the HTTP document."""
+    """Description for values typed by a user, if it differs from the HTTP document."""
     schema: int = 0
-    """First schema of task messages with the field; 0: all have it."""
+    """First schema of task messages with the field; 0: all."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """An option of the table."""
+    """One row of the table of options."""
 
     name: str
     field: FieldInfo
@@ -69,33 +69,33 @@ class Row:
 
     @property
     def form(self) -> Form | None:
-        """How forms show it, if they do."""
+        """Presentation in forms; None: not in forms."""
         return next((one for one in self.field.metadata if isinstance(one, Form)), None)
 
     @property
     def flags(self) -> list[str]:
-        """Spellings on the command line, as Typer takes them."""
+        """Flags on the command line, as Typer expects them."""
         return self.option.flags.split() or [f"--{self.name.replace('_', '-')}"]
 
     @property
     def keyword(self) -> str:
-        """Spelling in `graspd.synthesize`."""
+        """Keyword of `graspd.synthesize`."""
         return self.option.keyword or self.name
 
     @property
     def meaning(self) -> str:
-        """What a person types there."""
+        """Description for values typed by a user."""
         return self.option.typed or self.field.description or ""
 
     @property
     def unit(self) -> str:
-        """Unit of the value; empty: it has none."""
+        """Unit of the value; empty: none."""
         found = _UNIT.search(self.meaning)
         return found[1] if found else ""
 
     @property
     def default(self) -> Any:
-        """The value of an option that is not given."""
+        """Default value."""
         return self.field.get_default(call_default_factory=True)
 
     @property
@@ -105,17 +105,17 @@ class Row:
 
     @property
     def range(self) -> str:
-        """The bounds in words, such as `at least 0 and at most 3`; empty: there are none."""
+        """Bounds as a phrase, such as `at least 0 and at most 3`; empty: none."""
         return range_words(self.bounds).removeprefix("must be ")
 
     @property
     def kind(self) -> Any:
-        """bool, int, float, str, a Literal of words, or list[str]: what a command line or a form reads."""
+        """Type read by a command line or form: bool, int, float, str, a Literal of strings, or list[str]."""
         return _kind(self.field.annotation)
 
 
 def rows(model: type[BaseModel], place: Place) -> list[Row]:
-    """The options of a model that a place takes, basic ones first."""
+    """Return the options of a model for one kind of user, basic ones first."""
     found = [
         Row(name, one, option)
         for name, one in model.model_fields.items()
@@ -126,15 +126,15 @@ def rows(model: type[BaseModel], place: Place) -> list[Row]:
 
 
 def accepted(model: type[ModelT], values: Mapping[str, Any], *, names: Mapping[str, str] | None = None) -> ModelT:
-    """A model of what was given.
+    """Validate values and return a model.
 
     Args:
         model: the model.
-        values: by names of fields.
-        names: fields as the caller spells them, for messages; those left out by their own names.
+        values: values by names of fields.
+        names: fields in the caller's spelling, for messages; others keep their own names.
 
     Raises:
-        InputError: names the first value that cannot be used.
+        InputError: states the first invalid value.
     """
     try:
         return model.model_validate(values)
@@ -143,7 +143,7 @@ def accepted(model: type[ModelT], values: Mapping[str, Any], *, names: Mapping[s
 
 
 def with_keywords(model: type[BaseModel], place: Place) -> Callable[[FunctionT], FunctionT]:
-    """Show each option as a keyword in the signature of a function that takes them as `**options`."""
+    """Decorate a function that takes `**options`: show each option as a keyword in its signature."""
 
     def decorate(function: FunctionT) -> FunctionT:
         written = inspect.signature(function)
@@ -159,13 +159,13 @@ def with_keywords(model: type[BaseModel], place: Place) -> Callable[[FunctionT],
 
 
 def keywords_of(model: type[BaseModel], place: Place) -> list[tuple[str, Row, str]]:
-    """Each option with its spelling as a keyword, and its type as a text."""
+    """Return each option with its keyword and its type as text."""
     found = rows(model, place)
     return [(row.keyword if place == "python" else row.name, row, type_text(row.field.annotation)) for row in found]
 
 
 def type_text(annotation: Any) -> str:
-    """An annotation as a caller reads it: without bounds, a model as the mapping that makes it."""
+    """Format an annotation for callers: without bounds; a model as the mapping from which it is made."""
     origin, inner = get_origin(annotation), get_args(annotation)
     if origin is Annotated:
         return type_text(inner[0])

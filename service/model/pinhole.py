@@ -1,4 +1,4 @@
-"""The pinhole camera: pixels, rays and points. x right, y down, z forward; pixel centres at +0.5."""
+"""Pinhole camera: pixels, rays and points. x right, y down, z forward; pixel centres at +0.5."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from numpy.typing import NDArray
 
 from graspd.service.model.transforms import Floats
 
-#: Depths of neighbouring pixels that differ by more than this share are of two surfaces.
+#: Neighbouring pixels whose depths differ by more than this share belong to two surfaces.
 EDGE: Final = 0.02
-#: Cost of a side of which only one pixel is seen: that of an edge between faces.
+#: Cost of a side with a single pixel: that of an edge between faces.
 _BEND_UNKNOWN: Final = 0.5
 
 
 def pixel_rays(k: Floats, width: int, height: int, shift: tuple[float, float] = (0.0, 0.0)) -> Floats:
-    """Directions (H, W, 3) with z = 1 in the camera frame through points `shift` [px] off the pixel centres."""
+    """Return rays (H, W, 3) with z = 1 in the camera frame, `shift` [px] off the pixel centres."""
     columns = (np.arange(width) + 0.5 + shift[0] - k[0, 2]) / k[0, 0]
     rows = (np.arange(height) + 0.5 + shift[1] - k[1, 2]) / k[1, 1]
     x, y = np.meshgrid(columns, rows)
@@ -24,16 +24,16 @@ def pixel_rays(k: Floats, width: int, height: int, shift: tuple[float, float] = 
 
 
 def back_project(k: Floats, depth: NDArray[Any]) -> Floats:
-    """(H, W, 3) points in the camera frame [m] of depth along the optical axis (H, W); nan where it is not finite."""
+    """Back-project axial depth (H, W) to points (H, W, 3) in the camera frame [m]; nan if not finite."""
     seen = np.where(np.isfinite(depth), np.asarray(depth, float), np.nan)
     return pixel_rays(k, depth.shape[1], depth.shape[0]) * seen[..., None]
 
 
 def surface_normals(points: Floats) -> Floats:
-    """(H, W, 3) unit normals toward the camera of back-projected points (H, W, 3); nan where none can be told.
+    """Compute unit normals (H, W, 3) toward the camera of points (H, W, 3); nan where undefined.
 
-    The tangents are one-sided differences, to the side on which the surface goes on more nearly as a plane,
-    on which 1 / z is linear in pixels, and does not jump, so that a normal is that of the face on which its pixel lies.
+    The tangents are one-sided differences, on the side with less bend and no jump; on a plane, 1 / z is linear in
+    pixels. A normal is thus that of the face on which its pixel lies.
     """
     along, down = _tangent(points, 1), _tangent(points, 0)
     normal = np.cross(down, along)
@@ -58,7 +58,7 @@ def _tangent(points: Floats, axis: int) -> Floats:
 
 
 def _cost(step: Floats, bend: Floats, points: Floats) -> Floats:
-    """How badly a step stands for its surface: by its bend, worse across an edge, worst where there is nothing."""
+    """Return the cost of a one-sided difference: its bend, higher across an edge, highest without a point."""
     with np.errstate(invalid="ignore"):
         jump = np.abs(step[..., 2]) / points[..., 2]
     cost = np.where(np.isnan(bend), _BEND_UNKNOWN, np.minimum(bend, _BEND_UNKNOWN)) + np.where(
@@ -70,16 +70,16 @@ def _cost(step: Floats, bend: Floats, points: Floats) -> Floats:
 def fitted_normals(
     points: Floats, row: NDArray[np.intp], column: NDArray[np.intp], *, radius: int, gap_m: Floats
 ) -> Floats:
-    """(P, 3) unit normals toward the camera of the planes that fit the windows around some pixels best.
+    """Fit planes to the windows around pixels; return their unit normals (P, 3) toward the camera.
 
     Args:
         points: (H, W, 3) in the camera frame [m]; nan: a hole.
         row, column: (P,) the pixels.
         radius: the window is 2 radius + 1 pixels wide.
-        gap_m: (P,) neighbours whose depth differs by more than this do not count [m].
+        gap_m: (P,) neighbours are ignored if their depth differs by more than this [m].
 
     Returns:
-        The direction of least variance of each window; toward the camera, too, where fewer than three points count.
+        Direction of least variance of each window; the direction to the camera if fewer than three points count.
     """
     offset = np.arange(-radius, radius + 1)
     height, width = points.shape[:2]

@@ -1,9 +1,8 @@
-"""From a job to its tasks, from facts about tasks to their states, fair scheduling, outcomes of candidates. Pure
-functions: no store, no clock.
+"""Planning of jobs in pure functions: tasks and their states, fair scheduling, outcomes of candidates.
 
-A job is cut into batches of `BATCH_SIZE` grasps, the unit of seeds and launches, and its batches into ranges of
-`JobRecord.span`. Each range is a chain of tasks, one a stage as far as asked: synthesize -> scene -> render, or where
-grasps are planned in scenes, scene -> synthesize -> render.
+A job is split into batches of `BATCH_SIZE` grasps, the unit of seeds and launches, and its batches into ranges of
+`JobRecord.span`. Each range is a chain of tasks, one per requested stage: synthesize -> scene -> render, or for grasps
+planned in scenes: scene -> synthesize -> render.
 """
 
 from __future__ import annotations
@@ -27,17 +26,16 @@ from graspd.service.model.version import (
     TASK_SCHEMA,
 )
 
-#: A job this small is somebody waiting at a screen; anything larger runs in bulk.
+#: Largest interactive job: a user waits for it. Larger jobs run in bulk.
 INTERACTIVE_GRASPS: Final = 4 * BATCH_SIZE
 
-#: Longest wait between two attempts of a task [s].
+#: Longest delay between two attempts of a task [s].
 MAX_BACKOFF_S: Final = 300.0
 
 
 @dataclass(frozen=True)
 class PlannedTask:
-    """A task as it follows from its job: batches from `batch` on, as many as `count` grasps take. `inputs` and `output`
-    are shard ids."""
+    """Task of a job: batches from `batch` on, for `count` grasps. `inputs` and `output` are shard ids."""
 
     id: str
     stage: Stage
@@ -49,27 +47,27 @@ class PlannedTask:
 
 @dataclass
 class TaskFacts:
-    """What decides a task's state."""
+    """Facts that determine a task's state."""
 
     stage: Stage
     done: bool = False
-    """Its shard's manifest is in the store."""
+    """Whether the manifest of its shard is in the store."""
     last_attempt: int = 0
     """Number of the last failed attempt."""
     exhausted: bool = False
-    """That attempt was the last."""
+    """Whether that attempt was the last."""
     retried_upto: int = 0
-    """Attempts up to this number no longer count: a user retried the job."""
+    """Attempts up to this number are ignored: a user retried the job."""
     running: bool = False
 
 
 def priority_of(request: JobRequest) -> Priority:
-    """Lane of a job submitted by itself; the jobs of a dataset always go in bulk."""
+    """Return the priority of a single job; jobs of a dataset always run in bulk."""
     return Priority.INTERACTIVE if request.grasps <= INTERACTIVE_GRASPS else Priority.BULK
 
 
 def stages_of(request: JobOptions) -> tuple[Stage, ...]:
-    """The stages each batch of the job passes through, in their order."""
+    """Return the stages of each batch of the job, in order."""
     render = (Stage.RENDER,) if request.views else ()
     if request.in_scene:
         return (Stage.SCENE, Stage.SYNTHESIZE, *render)
@@ -77,17 +75,17 @@ def stages_of(request: JobOptions) -> tuple[Stage, ...]:
 
 
 def task_id(job: str, stage: Stage, batch: int) -> str:
-    """Address of a task: the same job has the same tasks."""
+    """Return the id of a task; it depends only on job, stage and batch."""
     return digest_json({"job": job, "stage": stage, "batch": batch})
 
 
 def ranges_of(grasps: int, span: int) -> int:
-    """How many ranges of `span` batches they take."""
+    """Return the number of ranges of `span` batches for a number of grasps."""
     return -(-batches_of(grasps) // span)
 
 
 def plan(job: JobRecord, ranges: range | None = None) -> Iterator[PlannedTask]:
-    """The tasks of a job, of all ranges or some, each range in the order of its stages."""
+    """Yield the tasks of a job, for all ranges or some, each range in the order of its stages."""
     request = job.request
     for number in ranges if ranges is not None else range(ranges_of(request.grasps, job.span)):
         batch = number * job.span
@@ -109,7 +107,7 @@ def plan(job: JobRecord, ranges: range | None = None) -> Iterator[PlannedTask]:
 
 
 def message_of(job: JobRecord, task: PlannedTask, *, attempt: int, max_attempt: int) -> TaskMessage:
-    """What a worker is told."""
+    """Return the message of a task for the worker."""
     return TaskMessage(
         schema_=max(needed_schema(job.request), SCHEMA_OF_RANGES if batches_of(task.count) > 1 else 0),
         newest_schema=TASK_SCHEMA,
@@ -130,16 +128,16 @@ def message_of(job: JobRecord, task: PlannedTask, *, attempt: int, max_attempt: 
     )
 
 
-#: Options by the schema that first had them. A job that uses one needs a worker that knows it; all other jobs go to
-#: older workers too.
+#: First schema of each newer option. A job that uses one needs a worker with that schema; all other jobs also go to
+#: older workers.
 _SCHEMAS: Final = {row.name: row.option.schema for row in rows(JobOptions, "job") if row.option.schema}
 
 
 def needed_schema(request: JobRequest, since: Mapping[str, int] = _SCHEMAS) -> int:
-    """The oldest schema in which a request can be said: that of the newest option that it uses.
+    """Return the oldest schema that can express a request: that of its newest option in use.
 
     Args:
-        since: options by the schema that first had them.
+        since: first schema of each option.
     """
     fields = JobRequest.model_fields
     used = [schema for name, schema in since.items() if getattr(request, name) != fields[name].get_default()]
@@ -148,17 +146,17 @@ def needed_schema(request: JobRequest, since: Mapping[str, int] = _SCHEMAS) -> i
 
 
 def backoff(first_s: float, failures: int) -> float:
-    """Wait before the next attempt [s]: doubles with each failure, up to `MAX_BACKOFF_S`."""
+    """Return the delay before the next attempt [s]: doubled with each failure, up to `MAX_BACKOFF_S`."""
     return min(MAX_BACKOFF_S, first_s * 2.0 ** max(0, failures - 1))
 
 
 def ingest_id(kind: AssetKind, digest: str) -> str:
-    """Address of the task that checks what was uploaded."""
+    """Return the id of the task that checks an upload."""
     return digest_json({"ingest": kind, "digest": digest})
 
 
 def ingest_message(kind: AssetKind, name: str, digest: str, *, attempt: int, max_attempt: int) -> IngestMessage:
-    """What a worker is told to check."""
+    """Return the message of a task that checks an upload."""
     return IngestMessage(
         schema_=OLDEST_TASK_SCHEMA,
         newest_schema=TASK_SCHEMA,
@@ -172,9 +170,9 @@ def ingest_message(kind: AssetKind, name: str, digest: str, *, attempt: int, max
 
 
 def batch_states(chain: Sequence[TaskFacts], *, job_cancelled: bool) -> list[State]:
-    """States of the tasks of one range, given in the order of their stages.
+    """Return the states of the tasks of one range, in the order of their stages.
 
-    A task behind one that failed or was cancelled can never start, so it is cancelled.
+    A task behind a failed or cancelled one can never start, so it is cancelled.
     """
     states: list[State] = []
     blocked = False
@@ -188,14 +186,14 @@ def batch_states(chain: Sequence[TaskFacts], *, job_cancelled: bool) -> list[Sta
 
 
 def batch_ready(states: Sequence[State]) -> list[bool]:
-    """Which tasks of a range may start now: unfinished, and everything before them succeeded."""
+    """Return which tasks of a range can start now: unfinished, with all earlier ones succeeded."""
     return [
         not state.is_final and all(before is State.SUCCEEDED for before in states[:i]) for i, state in enumerate(states)
     ]
 
 
 def job_state(tasks: Iterable[State]) -> State:
-    """State of a job from the set of its tasks' states."""
+    """Return the state of a job from the states of its tasks."""
     states = set(tasks)
     if states & {State.QUEUED, State.RUNNING}:
         return State.QUEUED if states == {State.QUEUED} else State.RUNNING
@@ -215,35 +213,35 @@ def _own_state(facts: TaskFacts, *, job_cancelled: bool) -> State:
 
 
 T = TypeVar("T")
-#: Jobs fed in one round; the others have their turn in the next ones.
+#: Jobs served in one scheduling round; the others follow in the next rounds.
 JOBS_A_ROUND: Final = 64
-#: Turns remembered: more than there are jobs with waiting tasks, or a forgotten one would come first again.
+#: Number of remembered turns: more than jobs with waiting tasks, or a forgotten job would come first again.
 _REMEMBERED: Final = 100_000
 
 
 @dataclass(frozen=True)
 class WaitingJob:
-    """A job with tasks that may be queued, and whose share of the queue it takes (see `share_of`)."""
+    """A job with tasks ready for the queue, and the owner of its share (see `share_of`)."""
 
     id: str
     key: str
 
 
 def share_of(project: str, key: str) -> str:
-    """Whose share of the queue a job takes: its project's, or without one its key's ("" where there are no keys)."""
-    # No name of a key holds a space.
+    """Return the owner of a job's share of the queue: its project, or else its key ("" without keys)."""
+    # Names of keys contain no space.
     return f"project {project}" if project else key
 
 
 class RoundRobin:
-    """Remembers who was served last. Lost with its process, which costs nobody more than one turn."""
+    """Fair scheduling state: who was served last. Losing it with the process costs at most one turn."""
 
     def __init__(self) -> None:
         self._served: dict[str, int] = {}
         self._count = 0
 
     def order(self, jobs: Iterable[WaitingJob], limit: int) -> list[tuple[WaitingJob, int]]:
-        """The jobs whose turn it is, and how many of their tasks may be queued, `limit` or somewhat more in all."""
+        """Return the next jobs and how many of their tasks to queue, about `limit` tasks in all."""
         of_key: dict[str, list[WaitingJob]] = defaultdict(list)
         for job in sorted(jobs, key=lambda job: self._served.get(f"job {job.id}", 0)):
             of_key[job.key].append(job)
@@ -255,7 +253,7 @@ class RoundRobin:
         return [(job, -(-limit // (len(number) * number[job.key]))) for job in chosen]
 
     def served(self, jobs: Sequence[WaitingJob]) -> None:
-        """These jobs had their turn, in this order."""
+        """Record that these jobs were served, in this order."""
         for job in jobs:
             self._count += 1
             self._served[f"job {job.id}"] = self._served[f"key {job.key}"] = self._count
@@ -264,12 +262,12 @@ class RoundRobin:
 
 
 def interleave(lists: Sequence[Sequence[T]]) -> list[T]:
-    """One of each list, then the second of each, and so on."""
+    """Interleave lists: the first items of all, then the second ones, and so on."""
     longest = max(map(len, lists), default=0)
     return [some[place] for place in range(longest) for some in lists if place < len(some)]
 
 
-#: Outcomes of candidates that are not kept, in the order in which they are tested, with their words.
+#: Outcomes of rejected candidates, in the order of the tests, with descriptions.
 OUTCOMES: Final = {
     "diverged": "without a finite posture",
     "no_place": "without a clear place or way in the scene",
@@ -292,7 +290,7 @@ OUTCOMES: Final = {
 
 
 def totals(parts: Iterable[Mapping[str, int]]) -> dict[str, int]:
-    """Sums by outcome over several counts, those above zero, in the order of `OUTCOMES`."""
+    """Sum several counts by outcome; positive ones, in the order of `OUTCOMES`."""
     found: dict[str, int] = dict.fromkeys(OUTCOMES, 0)
     for part in parts:
         for name, count in part.items():
@@ -301,7 +299,7 @@ def totals(parts: Iterable[Mapping[str, int]]) -> dict[str, int]:
 
 
 def told(outcomes: Mapping[str, int]) -> str:
-    """The counts in words, the most frequent first."""
+    """Format counts as text, most frequent first."""
     order = sorted(outcomes.items(), key=lambda pair: -pair[1])
     return ", ".join(f"{count:,} {OUTCOMES.get(name, name.replace('_', ' '))}" for name, count in order if count)
 
@@ -309,16 +307,16 @@ def told(outcomes: Mapping[str, int]) -> str:
 def shortfall(
     found: int, wanted: int, counted: str, candidates: int, budget: float, outcomes: Mapping[str, int], limit: str = ""
 ) -> str | None:
-    """Why fewer grasps were found than wanted, in a sentence; None where all were.
+    """Explain in a sentence why fewer grasps were found than wanted; None if all were found.
 
     Args:
-        found: grasps that count.
-        wanted: grasps asked for.
+        found: number of grasps that count.
+        wanted: number of grasps requested.
         counted: which grasps count: valid or feasible.
-        tried: candidates planned.
-        budget: candidates for each grasp wanted, at most: candidates and repeated attempts.
-        outcomes: candidates that were not kept, by `OUTCOMES`, and the repeated attempts.
-        limit: what the hand lifts at best, in place of the budget that ended.
+        candidates: number of planned candidates.
+        budget: candidates allowed for each grasp wanted: candidates and repeated attempts.
+        outcomes: rejected candidates by `OUTCOMES`, and the repeated attempts.
+        limit: the hand's lifting limit, if that ended the search instead of the budget.
     """
     if found >= wanted:
         return None
@@ -330,15 +328,15 @@ def shortfall(
 
 
 def limit_told(hand: str, friction: float, grasps: int, lifts: float, bound: float, wanted: float | None = None) -> str:
-    """What a hand lifts at best, in a sentence.
+    """Describe a hand's lifting limit in a sentence.
 
     Args:
         hand: its name.
         friction: Coulomb coefficient.
-        grasps: that were measured.
+        grasps: number of measured grasps.
         lifts: payload of the best of them [kg].
-        bound: that none exceeds by actuator effort and friction [kg]; inf: there is none.
-        wanted: mass that it should lift [kg]; None: nobody asked for one.
+        bound: upper bound from actuator effort and friction [kg]; inf: none.
+        wanted: mass to lift [kg]; None: not specified.
     """
     most = f", and at most {bound:.2g} kg by actuator effort" if math.isfinite(bound) else ""
     less = "" if wanted is None else f"; {wanted:.3g} kg are wanted"

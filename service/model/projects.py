@@ -1,6 +1,6 @@
-"""Projects: groups of keys that share jobs, datasets, hands and objects, and see nothing of each other's.
+"""Projects: groups of keys that share jobs, datasets, hands and objects, isolated from each other.
 
-Where nobody names a project, all belongs to the one without a name.
+Without project names everything belongs to the unnamed project.
 """
 
 from __future__ import annotations
@@ -11,36 +11,36 @@ from typing import Annotated, Final
 
 from pydantic import Field
 
-#: Lower case, so that no two names differ where a person does not look.
+#: Lower case, so that no two names differ only in case.
 PATTERN: Final = r"^[a-z0-9][a-z0-9-]{0,31}$"
-#: What a key, a job or a dataset belongs to; empty: the project without a name.
+#: Project of a key, job or dataset; empty: the unnamed project.
 Project = Annotated[str, Field(pattern=rf"^$|{PATTERN}")]
-#: File that an upload has besides its own where only its project may see it. So the same mesh of two projects is two
-#: objects, whose digests say nothing of each other.
+#: Extra file of an upload that only its project may see. It makes the same mesh in two projects two objects, so digests
+#: reveal nothing about other projects.
 MARK: Final = "graspd-project.txt"
 
 
 @dataclass(frozen=True)
 class ProjectScope:
-    """What somebody may see: the things of a project, and the hands and objects that are shared; or everything."""
+    """Visibility: the things of one project and shared hands and objects, or everything."""
 
     project: str = ""
-    """Whose names come first, where two projects use the same one."""
+    """Project whose names take precedence if two projects use the same one."""
     everything: bool = True
 
     def sees(self, project: str) -> bool:
-        """Whether the jobs and datasets of a project are in scope."""
+        """Check whether the jobs and datasets of a project are visible."""
         return self.everything or project == self.project
 
 
-#: The scope of an admin, of the controller, and of everybody while the service is open.
+#: Scope of admins, of the controller, and of all users of a service without keys.
 EVERYTHING: Final = ProjectScope()
 
 
 def marks_of(files: Mapping[str, bytes], project: str) -> dict[str, bytes]:
-    """The file that marks an upload as one project's own; for what is shared an empty one over a mark that it brings.
+    """Return the mark of a private upload; of a shared one, an empty file over any existing mark.
 
     Args:
-        project: empty for what is shared, and for the project without a name.
+        project: empty for shared uploads, and for the unnamed project.
     """
     return {MARK: project.encode()} if project or MARK in files else {}

@@ -1,7 +1,7 @@
-"""JSON records that the store keeps besides shards: jobs, datasets, tags, what users did to them, failed attempts.
+"""JSON records of the store besides shards: jobs, datasets, tags, user actions, failed attempts.
 
-`datasets/{name}/dataset.json` names the jobs of its cells, so that a dataset stays what it was when graspd's
-algorithms, or the meaning of a name, change later.
+`datasets/{name}/dataset.json` lists the jobs of its cells, so that a dataset does not change when algorithms, or the
+meaning of a name, change later.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ from graspd.service.model.projects import Project
 from graspd.service.model.states import AssetKind, Priority, Stage
 from graspd.service.model.version import STAGE_REVISIONS
 
-#: Most batches of a task.
+#: Largest number of batches of a task.
 MOST_BATCHES: Final = 64
 
 
 class Record(BaseModel):
-    """Base of the records. Unknown fields are ignored: a newer graspd may have written them."""
+    """Base class of the records. Unknown fields are ignored: a newer graspd may have written them."""
 
     model_config = ConfigDict(frozen=True, extra="ignore")
 
 
 class Choice(Record):
-    """How a chart put a fidelity in the place of `auto`."""
+    """How a chart resolved the fidelity `auto`."""
 
     target: str = Field(description="the accuracy wanted")
     chart: str = Field(description="key of the chart in the store")
@@ -49,8 +49,7 @@ class Choice(Record):
 
 
 class JobRecord(Record):
-    """`job.json`: a request on the very hand and object it was made for, and the revision of each stage that its tasks
-    are planned for."""
+    """`job.json`: a request with the exact versions of hand and object, and the revision of each stage."""
 
     version: Literal[1, 2] = 2
     id: Digest
@@ -73,7 +72,7 @@ class JobRecord(Record):
     @model_validator(mode="before")
     @classmethod
     def _as_it_was_meant(cls, data: Any) -> Any:
-        # Records of version 1 knew neither a validator nor revisions.
+        # Records of version 1 had neither validator nor revisions.
         if isinstance(data, dict) and data.get("version") == 1:
             request = {"want": "candidates", "validation": "none", **data.get("request", {})}
             return {**data, "request": request, "revisions": dict.fromkeys(STAGE_REVISIONS, 1)}
@@ -88,14 +87,14 @@ class JobRecord(Record):
 
     @property
     def assets(self) -> tuple[tuple[AssetKind, str], ...]:
-        """Kind and digest of all that it is made of."""
+        """Kind and digest of each asset that the job uses."""
         further = [(AssetKind.OBJECT, one.digest or "") for one in self.request.beside]
         further += [(AssetKind.NETWORK, network)] if (network := self.request.network) else []
         return ((AssetKind.HAND, self.hand_digest), (AssetKind.OBJECT, self.object_digest), *further)
 
 
 class JobEvent(Record):
-    """What a user did to a job later. `retried` maps each failed task to its last attempt that no longer counts."""
+    """A later user action on a job. `retried` maps each failed task to its last attempt to ignore."""
 
     number: int = Field(ge=1)
     what: Literal["cancelled", "retried"]
@@ -105,7 +104,7 @@ class JobEvent(Record):
 
 
 class AttemptRecord(Record):
-    """A failed attempt of a task. `last`: no further attempt follows unless a user retries the job."""
+    """A failed attempt of a task. `last`: no further attempt unless a user retries the job."""
 
     task_id: str
     job_id: str
@@ -121,7 +120,7 @@ class AttemptRecord(Record):
 
     @classmethod
     def of(cls, message: TaskMessage | IngestMessage, **facts: Any) -> Self:
-        """A failure of what was asked for, as of now."""
+        """Make a record of a failure at the current time."""
         job = message.job_id if isinstance(message, TaskMessage) else ""
         return cls(
             task_id=message.task_id, job_id=job, stage=message.stage, number=message.attempt, ended=timestamp(), **facts
@@ -129,7 +128,7 @@ class AttemptRecord(Record):
 
 
 class Member(Record):
-    """A hand or object of a dataset: the very version that it was created with."""
+    """A hand or object of a dataset, pinned to the version at creation."""
 
     name: Name
     digest: Digest
@@ -144,15 +143,17 @@ class Cell:
     object: Member
     job_id: str
     fidelity: str = ""
-    """What the chart promised for this cell, where the dataset's fidelity is `auto`."""
+    """Fidelity chosen by the chart for this cell, if the dataset's fidelity is `auto`."""
     choice: Choice | None = None
-    """How that was chosen; None also of datasets from before it was written down."""
+    """Reason of that choice; None also for datasets from before it was recorded."""
 
 
 class DatasetRecord(Record):
-    """`dataset.json`. `jobs` are those of the cells, hand by hand, and in each hand object by object; with fidelity
-    `auto`, `fidelities` are what the chart promised for them when the dataset was created, and `chosen` the places in
-    `choices` of how each was chosen."""
+    """`dataset.json`: a dataset.
+
+    `jobs` has one id per cell, hand by hand, then object by object. With fidelity `auto`, `fidelities` has the chart's
+    choice per cell at creation, and `chosen` the index of its reason in `choices`.
+    """
 
     version: Literal[1] = 1
     name: Name
@@ -180,7 +181,7 @@ class DatasetRecord(Record):
         return self
 
     def cells(self) -> Iterator[Cell]:
-        """The cells in their order."""
+        """Yield the cells in order."""
         pairs = ((hand, obj) for hand in self.hands for obj in self.objects)
         for position, ((hand, obj), job) in enumerate(zip(pairs, self.jobs, strict=True)):
             fidelity = self.fidelities[position] if self.fidelities else ""
@@ -189,7 +190,7 @@ class DatasetRecord(Record):
 
 
 class DatasetEvent(Record):
-    """What a user did to a dataset later. The last one decides whether it is cancelled."""
+    """A later user action on a dataset. The last one decides whether it is cancelled."""
 
     number: int = Field(ge=1)
     what: Literal["cancelled", "retried"]
@@ -213,13 +214,13 @@ class SnapshotShard(Record):
     @field_validator("key")
     @classmethod
     def _taken_apart(cls, key: str, info: ValidationInfo) -> str:
-        # A snapshot of 0.2 may name a stretch of a pack; its shards have files of their own since.
+        # A snapshot of 0.2 may refer to a part of a pack; its shards have had files of their own since.
         stages = {kind: stage for stage, kind in names.SHARD_KINDS.items()}
         return names.shard_file(stages[info.data["kind"]], info.data["id"]) if "@" in key else key
 
 
 class Snapshot(Record):
-    """An immutable list of shards: what a dataset held at one moment."""
+    """An immutable list of the shards of a dataset at one moment."""
 
     version: Literal[1] = 1
     dataset: Name
@@ -234,7 +235,7 @@ class Snapshot(Record):
 
 
 class ObjectSet(Record):
-    """A version of a named set of objects; the newest counts."""
+    """A version of a named set of objects; the newest is current."""
 
     version: Literal[1] = 1
     name: Name
@@ -242,22 +243,22 @@ class ObjectSet(Record):
     objects: tuple[Name, ...]
     created: str
     owner: str = ""
-    """Id of the key that made the set; empty: none, or not known."""
+    """Id of the key that created the set; empty: none or unknown."""
     project: Project = ""
-    """Project of that key; empty: the one without a name."""
+    """Project of that key; empty: the unnamed project."""
 
 
 def request_of(options: JobOptions, hand: str, obj: str, fidelity: str = "") -> JobRequest:
-    """The request of one cell; with a fidelity in the place of `auto`, if one is given."""
+    """Return the request of one cell, with a fidelity in place of `auto` if given."""
     shared = {name: getattr(options, name) for name in JobOptions.model_fields}
     return JobRequest(hand=hand, object=obj, **shared | ({"fidelity": fidelity, "target": ""} if fidelity else {}))
 
 
 def job_of(cell: Cell, options: JobOptions, revisions: dict[str, int], owner: str = "", project: str = "") -> JobRecord:
-    """The job of a cell as it was planned when the dataset was created. Jobs of datasets go in bulk.
+    """Return the job of a cell as planned at the creation of the dataset. Jobs of datasets run in bulk.
 
     Args:
-        owner: whose dataset it is.
+        owner: owner of the dataset.
         project: project of the dataset.
     """
     return JobRecord(
@@ -277,7 +278,7 @@ def job_of(cell: Cell, options: JobOptions, revisions: dict[str, int], owner: st
 def object_set_of(
     name: str, objects: Iterable[str], *, after: str = "", owner: str = "", project: str = ""
 ) -> ObjectSet:
-    """The version of a set that follows the one with digest `after`; the order of the objects does not matter."""
+    """Return the version of a set after the one with digest `after`; the objects' order does not matter."""
     members = tuple(sorted(set(objects)))
     return ObjectSet(
         name=name,
@@ -289,16 +290,16 @@ def object_set_of(
     )
 
 
-#: Tags of one project (of one key, where it belongs to none), and grasps of one tag.
+#: Limits: tags of one project (of one key without a project), and grasps of one tag.
 MOST_TAGS: Final = 100
 MOST_TAGGED: Final = 20_000
-#: A grasp: its shard, and its row there.
+#: A grasp: shard id and row.
 Grasp = tuple[str, int]
 Row = Annotated[int, Field(ge=0, lt=2**31)]
 
 
 class Tag(Record):
-    """`tags/{id}/{number:06}.json`: a tag after a change of a user's. The last one counts; `gone` is the end."""
+    """`tags/{id}/{number:06}.json`: a tag after a user's change. The last one is current; `gone`: deleted."""
 
     version: Literal[1] = 1
     id: Digest
@@ -313,17 +314,17 @@ class Tag(Record):
 
     @property
     def members(self) -> set[Grasp]:
-        """The grasps that have it."""
+        """Grasps of the tag."""
         return {(shard, row) for shard, rows in self.grasps.items() for row in rows}
 
 
 def tag_id(name: str, project: str) -> str:
-    """What a project's tag of a name is called in the store."""
+    """Return the id of a project's tag in the store."""
     return digest_json(["tag", project, name])
 
 
 def by_shard(grasps: Iterable[Grasp]) -> Mapping[str, tuple[int, ...]]:
-    """Rows of each shard, in order."""
+    """Group rows by shard, sorted."""
     found: dict[str, list[int]] = {}
     for shard, row in sorted(set(grasps)):
         found.setdefault(shard, []).append(row)

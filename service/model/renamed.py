@@ -1,6 +1,6 @@
-"""Names of graspd 0.2 in stores, shards and queues, and their names since.
+"""Names of graspd 0.2 in stores, shards and queues, with their present names.
 
-Old names are read everywhere. They are written only in tasks that a worker of 0.2 does.
+Old names are read everywhere, but written only into tasks for workers of 0.2.
 """
 
 from __future__ import annotations
@@ -20,30 +20,30 @@ KEYS: Final = {
     "fragile": "not_robust",
 }
 _LEVELS: Final = {"letter": "dexgraspbench", "certificate": "standard", "screen": "fast"}
-#: Values of keys, by today's name of the key.
+#: Values of keys, by present name of the key.
 VALUES: Final = {
     "validation": _LEVELS,
     "verdict_level": _LEVELS,
     "want": {"raw": "candidates"},
 }
-#: Columns of base shards: today's path, and that of schema graspd/base@1.
+#: Columns of base shards: present path, and path in schema graspd/base@1.
 COLUMNS: Final = {
     "quality/feasible": "quality/sound",
     "quality/recheck": "quality/audit",
     "quality/validated_by": "quality/judged_by",
 }
-#: Revision that graspd 0.2 makes of each stage.
+#: Revision of each stage in graspd 0.2.
 _REVISIONS: Final = {"synthesize": 23, "scene": 2, "render": 4}
 _OLD: Final = re.compile(rb'"(?:' + b"|".join([*map(str.encode, KEYS), *map(str.encode, _LEVELS), b"raw"]) + rb')"')
 
 
 def has_old_names(document: bytes) -> bool:
-    """Whether a JSON text may hold names of graspd 0.2."""
+    """Check whether a JSON text may contain names of graspd 0.2."""
     return _OLD.search(document) is not None
 
 
 def renamed(value: Any) -> Any:
-    """A JSON document, or a part of one, with today's names."""
+    """Convert a JSON document, or a part of one, to present names."""
     if isinstance(value, dict):
         found = {KEYS.get(key, key): renamed(inner) for key, inner in value.items()}
         for key, names in VALUES.items():
@@ -56,7 +56,7 @@ def renamed(value: Any) -> Any:
 
 
 def for_worker_of(revision: int, stage: str, message: dict[str, Any]) -> dict[str, Any]:
-    """A task message with the names that workers of its revision read: in a rolling upgrade some are of 0.2."""
+    """Convert a task message to the names of its revision: rolling upgrades also have workers of 0.2."""
     request = message.get("request")
     if not isinstance(request, dict) or not 0 < revision <= _REVISIONS.get(stage, 0):
         return message

@@ -1,4 +1,4 @@
-"""The scene that grasps are for: a kind, or a document of supports, neighbours and the target's pose.
+"""Scenes: a kind, or a document of supports, neighbours and the target's pose.
 
 The scene frame has z up. A support is a half-space (everything below a plane) or a box.
 """
@@ -16,19 +16,19 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Discriminator, Field
 from graspd.service.model.base import Digest, Name, refusal, why
 from graspd.service.model.errors import InputError, did_you_mean
 
-#: Kinds of scenes; `free` is an object that floats, `file` one whose supports are given.
+#: Kinds of scenes; `free`: a floating object, `file`: supports from a file.
 SceneKind = Literal["free", "table", "bin", "shelf", "file"]
 KINDS: Final = ("free", "table", "bin", "shelf")
 MOST_SUPPORTS: Final = 32
-#: Distance that fingertips keep from supports [mm]: least, that of the whole hand, and unless a user says otherwise.
+#: Clearance of fingertips to supports [mm]: lower limit, that of the whole hand, default.
 LEAST_TOUCH: Final = -1.0
 MOST_TOUCH: Final = 2.0
 TOUCH: Final = 0.0
 SCENE_FILES: Final = (".json", ".yaml", ".yml")
 MOST_NEIGHBOURS: Final = 8
-#: Scenes that the grasps of one call are shared out to, at most.
+#: Largest number of scenes over which one call distributes its grasps.
 MOST_SCENES: Final = 4096
-#: A scene is no larger than this [m].
+#: Largest extent of a scene [m].
 FARTHEST_M: Final = 10.0
 #: Largest scene file [bytes].
 MAX_FILE_BYTES: Final = 64 * 1024
@@ -42,17 +42,17 @@ Pose = tuple[_Metres, _Metres, _Metres, _Number, _Number, _Number, _Number]
 
 
 class Part(BaseModel):
-    """Base of what a scene is said with."""
+    """Base class of the parts of a scene."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
 class HalfSpace(Part):
-    """Everything below a plane."""
+    """A half-space: everything below a plane."""
 
     kind: Literal["half_space"] = "half_space"
     normal: Vector = (0.0, 0.0, 1.0)
-    """Points out of the support; need not have unit length."""
+    """Outward normal of the support, of any length."""
     offset: _Metres = 0.0
     """n.x on the plane [m]."""
 
@@ -64,7 +64,7 @@ class HalfSpace(Part):
 
 
 class Box(Part):
-    """A box about the origin of its pose."""
+    """A box centred at its pose."""
 
     kind: Literal["box"] = "box"
     size: tuple[_Extent, _Extent, _Extent]
@@ -82,7 +82,7 @@ class NeighbourSpec(Part):
     """Another object in the scene."""
 
     object: str = Field(min_length=1, max_length=1024)
-    """A built-in object, or a mesh; in a scene file a relative path starts at the file's folder."""
+    """A built-in object or a mesh; in a scene file, relative paths start at the file's folder."""
     pose: Pose | None = Field(
         None, description="its frame in the scene: x y z [m], unit quaternion w x y z; absent: it is dropped"
     )
@@ -101,20 +101,21 @@ Supports = tuple[Annotated[HalfSpace | Box, Field(discriminator="kind")], ...]
 
 
 class SceneSpec(Part):
-    """What stands around the object."""
+    """Surroundings of the object: supports and neighbours."""
 
     kind: SceneKind = "free"
     supports: Supports = Field((), max_length=MOST_SUPPORTS)
     """Only with kind `file`."""
     target: Pose | None = None
-    """Frame of the object in the scene; None: it is dropped onto the support under it."""
+    """Pose of the object in the scene; None: it is dropped onto the support below."""
     faces: Literal["drawn", "all"] = "drawn"
-    """drawn: resting faces come as often as drops end on them; all: one scene for each stable face."""
+    """drawn: resting faces as frequent as after drops; all: one scene for each stable face."""
 
     touch: Touch = TOUCH
-    """Distance that fingertips keep from supports [mm]: 2, as the rest of the hand; 0: they may touch; below: press."""
+    """Clearance of fingertips to supports [mm]: 2, as for the rest of the hand; 0: contact allowed; below: they press.
+    """
     neighbours: tuple[NeighbourSpec, ...] = Field((), max_length=MOST_NEIGHBOURS)
-    """Others than the object."""
+    """Objects besides the target."""
 
     @model_validator(mode="after")
     def _whole(self) -> Self:
@@ -134,7 +135,7 @@ class SceneSpec(Part):
         return self
 
     def told(self) -> dict[str, Any]:
-        """The scene as a shard's attribute says it; digests of neighbours stand in one of their own."""
+        """Return the scene for a shard's attribute; digests of neighbours have their own attribute."""
         return self.model_dump(mode="json", exclude={"neighbours": {"__all__": {"digest"}}})
 
     def _check_neighbours(self) -> None:
@@ -154,11 +155,11 @@ class SceneSpec(Part):
 def parse_scene(
     text: str, *, faces: str = "drawn", touch: float | None = None, beside: Sequence[str] = ()
 ) -> SceneSpec:
-    """The scene that a user names: one of `KINDS`, or a JSON or YAML file; `faces` and `touch` as in `SceneSpec` (None:
-    as the file says), and `beside` objects that are dropped around the target.
+    """Parse a user's scene: one of `KINDS`, or a JSON or YAML file. `beside` are dropped neighbours.
+    For `faces` and `touch` see `SceneSpec` (None: as in the file).
 
     Raises:
-        InputError: unknown kind, unreadable file, or nonsense in it, in one line.
+        InputError: unknown kind, or unreadable or invalid file, in one line.
     """
     if faces not in ("drawn", "all"):
         raise InputError(f"unknown faces {faces!r}; choose drawn or all")
@@ -182,7 +183,7 @@ def parse_scene(
 
 
 def read_scene(path: Path) -> SceneSpec:
-    """A scene file; see `parse_scene`."""
+    """Read a scene file; see `parse_scene`."""
     try:
         if path.stat().st_size > MAX_FILE_BYTES:
             raise InputError(f"the scene file {path} is larger than {MAX_FILE_BYTES // 1024} KiB")
@@ -199,7 +200,7 @@ def read_scene(path: Path) -> SceneSpec:
 
 
 def _found_from(folder: Path, spec: SceneSpec) -> SceneSpec:
-    """The scene with the neighbours' files as seen from here."""
+    """Resolve the neighbours' file paths relative to the scene file."""
     beside = tuple(
         one.model_copy(update={"object": str(folder / one.object)}) if (folder / one.object).is_file() else one
         for one in spec.neighbours
@@ -221,31 +222,31 @@ def _loaded(text: str, path: Path) -> object:
 
 
 def first_mistake(error: ValidationError | TypeError) -> str:
-    """What is wrong first, in one line that names the place."""
+    """Return the first error in one line with its location."""
     if isinstance(error, TypeError):
         return str(error)
     return refusal(error)
 
 
 def check_quaternion(pose: tuple[float, ...]) -> None:
-    """Raises ValueError for a pose whose quaternion is no rotation."""
+    """Raise ValueError if the quaternion of a pose is not a rotation."""
     if abs(math.hypot(*pose[3:]) - 1.0) > 1e-3:
         raise ValueError("the quaternion w x y z of a pose must have unit length")
 
 
-#: Inner size of a bin, height of its walls and their thickness [m].
+#: Inner size of a bin, height and thickness of its walls [m].
 BIN_SIZE: Final = (0.40, 0.30)
 BIN_HEIGHT: Final = 0.15
 WALL: Final = 0.02
 #: Width and depth of a shelf's boards, and the height between them [m]; it is open towards -x.
 SHELF_SIZE: Final = (0.80, 0.35)
 SHELF_HEIGHT: Final = 0.35
-#: A half-space whose normal is so upright (cosine) is a table.
+#: Least cosine between the vertical and the normal of a table.
 UPRIGHT: Final = 1 - 1e-6
 
 
 def supports_in(spec: SceneSpec) -> tuple[HalfSpace | Box, ...]:
-    """Supports of a scene in the scene frame; none for a free object."""
+    """Return the supports of a scene in the scene frame; none for a free object."""
     if spec.kind == "free":
         return ()
     if spec.kind == "file":
@@ -256,7 +257,7 @@ def supports_in(spec: SceneSpec) -> tuple[HalfSpace | Box, ...]:
 
 
 def has_table(spec: SceneSpec) -> bool:
-    """Whether a scene has a level half-space."""
+    """Check whether a scene has a level half-space."""
     flat = (one for one in supports_in(spec) if isinstance(one, HalfSpace))
     return any(one.normal[2] / math.hypot(*one.normal) > UPRIGHT for one in flat)
 
@@ -284,7 +285,7 @@ def _shelf() -> tuple[HalfSpace | Box, ...]:
 
 
 class NamedNeighbour(NeighbourSpec):
-    """Another object in the scene, known to the service."""
+    """Another object in the scene, by its name in the service."""
 
     object: Name = Field(description="name of an object known to the service")
 
@@ -297,7 +298,7 @@ def _whole(value: str | NamedNeighbour) -> NamedNeighbour:
     return NamedNeighbour(object=value) if isinstance(value, str) else value
 
 
-#: A neighbour as a request says it: a name, or the name with a pose.
+#: A neighbour in a request: a name, or a name with a pose.
 BesideOption = Annotated[
     Annotated[Name, Tag("name")] | Annotated[NamedNeighbour, Tag("neighbour")],
     Discriminator(_beside_form),
@@ -306,7 +307,7 @@ BesideOption = Annotated[
 
 
 class SceneDocument(Part):
-    """A scene that a request holds whole."""
+    """A complete scene within a request."""
 
     supports: Supports = Field(
         min_length=1, max_length=MOST_SUPPORTS, description="what the object stands on and among, scene frame, z up [m]"
@@ -337,7 +338,7 @@ def _form(value: object) -> str:
     return "document" if isinstance(value, dict | SceneDocument) else "kind"
 
 
-#: A scene as a request says it: a kind, or a document. One of two forms, so that a mistake is told of the one meant.
+#: A scene in a request: a kind or a document, discriminated so that errors refer to the intended form.
 SceneOption = Annotated[
     Annotated[Literal["free", "table", "bin", "shelf"], Tag("kind")] | Annotated[SceneDocument, Tag("document")],
     Discriminator(_form),
@@ -351,10 +352,10 @@ def scene_of(
     touch: float = TOUCH,
     beside: Sequence[NeighbourSpec] = (),
 ) -> SceneSpec:
-    """The scene that a request means, with more neighbours than its document has.
+    """Return the scene of a request, with more neighbours than its document has.
 
     Raises:
-        ValueError: the faces, the touch or the neighbours do not go with it, in one line.
+        ValueError: faces, touch or neighbours do not fit the scene, in one line.
     """
     try:
         if isinstance(option, SceneDocument):
@@ -373,7 +374,7 @@ def scene_of(
 
 
 def known_name(text: str) -> str:
-    """The name of an object; InputError for a file, which the service does not know yet."""
+    """Return the name of an object; InputError for a file, which the service does not have."""
     if "/" in text or Path(text).is_file():
         raise InputError(f"the neighbour {text} is a file: `graspd objects add {text}` first, then give its name")
     return text
@@ -382,12 +383,12 @@ def known_name(text: str) -> str:
 def scene_option(
     text: str, *, beside: Path | None = None, named: Callable[[str], str] = known_name
 ) -> str | dict[str, Any]:
-    """What a request says for a scene that a user names: the kind, or the document in a file.
+    """Return the scene for a request from a user's text: the kind, or the document in a file.
 
     Args:
         text: one of `KINDS`, or a JSON or YAML file.
-        beside: folder in which the file lies; None: this one.
-        named: from a neighbour as the file says it, a name or a path, to a name that the service knows.
+        beside: folder of the file; None: the current one.
+        named: maps a neighbour in the file, a name or path, to a name of the service.
 
     Raises:
         InputError: as `parse_scene`.

@@ -1,6 +1,6 @@
-"""Every series of `/metrics`, and the names under which sums of them are kept.
+"""Definitions of every series of `/metrics`, and the names under which their sums are stored.
 
-`docs/reference/metrics.md` has a table of them.
+`docs/reference/metrics.md` has the table.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ from pydantic_core import from_json
 
 #: Upper bounds of the histogram of stage times [s].
 STAGE_BUCKETS_S: Final = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0)
-#: Upper bounds of the histogram of answers [s].
+#: Upper bounds of the histogram of response times [s].
 HTTP_BUCKETS_S: Final = (0.002, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 1.0, 5.0)
 
 
 @dataclass(frozen=True)
 class Series:
-    """One name of Prometheus."""
+    """A Prometheus series."""
 
     name: str
     kind: Literal["gauge", "counter", "histogram"]
@@ -72,7 +72,7 @@ SERIES: Final[dict[str, Series]] = {series.name: series for series in _ALL}
 
 
 def series_table() -> str:
-    """Markdown table of all series."""
+    """Return the Markdown table of all series."""
     lines = ["| series | type | labels | meaning | from |", "| --- | --- | --- | --- | --- |"]
     for series in SERIES.values():
         labels = ", ".join(f"`{label}`" for label in series.labels)
@@ -81,12 +81,12 @@ def series_table() -> str:
 
 
 def field(name: str, *labels: str) -> str:
-    """Name of a sum: the series and the values of its labels."""
+    """Return the name of a sum: the series and its label values."""
     return json.dumps([name, *labels])
 
 
 def parse_field(text: str) -> tuple[str, tuple[str, ...]] | None:
-    """Series and label values of a sum; None if it is not one of ours."""
+    """Return series and label values of a sum; None if the name is unknown."""
     try:
         name, *labels = from_json(text)
     except (ValueError, TypeError):

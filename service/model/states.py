@@ -1,4 +1,4 @@
-"""States and kinds of what graspd works on."""
+"""States, stages, asset kinds and priorities."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from enum import StrEnum
 
 
 class State(StrEnum):
-    """State of a job or a task. A task that lost its worker goes from `running` back to `queued`."""
+    """State of a job or task. A task that lost its worker returns from `running` to `queued`."""
 
     QUEUED = "queued"
     RUNNING = "running"
@@ -20,7 +20,7 @@ class State(StrEnum):
 
 
 class Stage(StrEnum):
-    """What a task does. `ingest` checks what was uploaded; the others make shards."""
+    """Stage of a task. `ingest` checks uploads; the others make shards."""
 
     INGEST = "ingest"
     SYNTHESIZE = "synthesize"
@@ -29,7 +29,7 @@ class Stage(StrEnum):
 
 
 class AssetKind(StrEnum):
-    """The kinds of things a user brings. A network proposes grasps of one hand (`service.store.network_file`)."""
+    """Kinds of uploaded assets. A network proposes grasps of one hand (`service.store.network_file`)."""
 
     HAND = "hand"
     OBJECT = "object"
@@ -37,7 +37,7 @@ class AssetKind(StrEnum):
 
 
 class Priority(StrEnum):
-    """Priority of a task: `interactive` goes first, but for every fourth task that a worker takes."""
+    """Priority of a task: `interactive` goes first, except for every fourth task of a worker."""
 
     INTERACTIVE = "interactive"
     BULK = "bulk"

@@ -1,6 +1,6 @@
-"""Records of studies: maps of failure, and the words of charts of speed against accuracy.
+"""Records of studies: stability maps, and terms of charts of speed against accuracy.
 
-`graspd stability` makes the maps and publishes them; the report and the dashboard draw them from the same record.
+`graspd stability` makes and publishes the maps; report and dashboard draw the same record.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from pydantic import BeforeValidator, TypeAdapter
 
 Outcome = Literal["good", "weak", "broken", "refused"]
 
-#: From best to worst; refused stands apart: the guard spoke before anything was computed.
+#: From best to worst; `refused` is separate: a guard rejected the input before any computation.
 OUTCOMES: Final[tuple[Outcome, ...]] = ("good", "weak", "broken", "refused")
-#: JSON knows no nan.
+#: JSON has no nan.
 _Number = Annotated[float, BeforeValidator(lambda value: math.nan if value is None else value)]
 
 
@@ -29,14 +29,14 @@ class MapCell:
     x: float | str
     y: float | str
     value: _Number
-    """The measure, in the map's unit; nan where there is none."""
+    """The measured value, in the map's unit; nan: none."""
     outcome: Outcome
     note: str = ""
-    """The value in words, or why there is none."""
+    """The value in words, or the reason for its absence."""
     label: str = ""
-    """What to write on it, where it is not the value: a few letters."""
+    """Short label if it differs from the value."""
     reached: bool = False
-    """Whether a job can come here, whatever it asks for."""
+    """Whether any job can reach this point."""
 
     @property
     def text(self) -> str:
@@ -45,31 +45,31 @@ class MapCell:
 
 @dataclass(frozen=True)
 class StabilityMap:
-    """One study."""
+    """One stability map."""
 
     name: str
     title: str
     x: str
-    """Name of the horizontal axis with its unit."""
+    """Label of the horizontal axis with its unit."""
     y: str
     measure: str
-    """What stands on a cell, with its unit."""
+    """Quantity shown in a cell, with its unit."""
     bounds: str
-    """From which value on a cell is weak, and broken."""
+    """Thresholds of weak and broken cells."""
     cells: list[MapCell]
     shows: str
-    """How a user would notice the failure."""
+    """Symptoms of the failure for a user."""
     guard: str
-    """What catches it, or that nothing does."""
+    """Guard that catches the failure, or a note that none exists."""
     guard_test: str = ""
-    """The test of the guard."""
+    """Test of the guard."""
     lines: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
-    """Boundaries that theory gives, to be drawn over the panel of that name."""
+    """Theoretical boundaries to draw over the panel of that name."""
     reach: str = ""
-    """Which cells a job can come to, and why no others."""
+    """Which cells a job can reach, and why no others."""
 
     def share(self, panel: str) -> float:
-        """Share of a panel's cells that are good."""
+        """Return the share of good cells of a panel."""
         cells = self.of(panel)
         return sum(cell.outcome == "good" for cell in cells) / max(1, len(cells))
 
@@ -81,16 +81,16 @@ class StabilityMap:
         return [cell for cell in self.cells if cell.panel == panel]
 
     def reached(self) -> list[MapCell]:
-        """Cells that a job can come to."""
+        """Return the cells that a job can reach."""
         return [cell for cell in self.cells if cell.reached]
 
     @property
     def is_divided(self) -> bool:
-        """Whether some cells are within reach of a job and some are not."""
+        """Whether a job can reach some cells but not all."""
         return 0 < len(self.reached()) < len(self.cells)
 
     def still_breaks(self) -> list[str]:
-        """Broken cells that a job can come to, a line for each panel: no guard keeps jobs from there."""
+        """Return broken cells that a job can reach, one line per panel: no guard covers them."""
         lines = []
         for panel in self.panels:
             by_x: dict[float | str, list[str]] = {}
@@ -115,39 +115,39 @@ class Stability:
     maps: list[StabilityMap]
 
     def as_json(self) -> dict[str, Any]:
-        """Numbers that JSON does not know become None; `from_json` reads them as nan."""
+        """Return a JSON object with None for numbers that JSON lacks; `from_json` reads them as nan."""
         return dict(_plain(asdict(self)))
 
 
 def from_json(record: Mapping[str, Any]) -> Stability:
-    """What `as_json` gave.
+    """Read a record of `as_json`.
 
     Raises:
-        ValueError: it is no such record.
+        ValueError: not such a record.
     """
     return _RECORD.validate_python(record)
 
 
 def counts(cells: Iterable[MapCell]) -> dict[Outcome, int]:
-    """How many cells came out how."""
+    """Count the cells by outcome."""
     outcomes = [cell.outcome for cell in cells]
     return {outcome: outcomes.count(outcome) for outcome in OUTCOMES}
 
 
 def graded(value: float, weak: float, broken: float) -> Outcome:
-    """good below `weak`, broken from `broken` on and where the value is no number."""
-    if not value < broken:  # nan too
+    """Grade a value: good below `weak`, broken from `broken` on and for nan."""
+    if not value < broken:  # also for nan
         return "broken"
     return "good" if value < weak else "weak"
 
 
 def reachable(cells: Iterable[MapCell], where: Callable[[MapCell], bool]) -> list[MapCell]:
-    """The cells, marked where a job can come."""
+    """Return the cells, marked where a job can reach them."""
     return [replace(cell, reached=where(cell)) for cell in cells]
 
 
 def short(value: float) -> str:
-    """A number in at most five letters: it has to stand in a small square."""
+    """Format a number in at most five characters, to fit a small square."""
     size = abs(value)
     if not math.isfinite(value):
         return "" if math.isnan(value) else "∞"
@@ -157,14 +157,14 @@ def short(value: float) -> str:
 
 
 def tick(value: float | str) -> str:
-    """A value of an axis, as short as it goes without loss."""
+    """Format an axis value as short as possible without loss."""
     if isinstance(value, str):
         return value
     return f"{value:g}" if value == 0 or 1e-3 <= abs(value) < 1e4 else _exponent(f"{value:g}")
 
 
 def between(ticks: Sequence[Any], value: float) -> float:
-    """Where a value lies among logarithmic ticks, in steps from the first; beyond their ends too."""
+    """Return the position of a value on logarithmic ticks, in steps from the first; extrapolates."""
     logs, at = [math.log(tick) for tick in ticks], math.log(value)
     if len(logs) < 2:
         return 0.0
@@ -173,7 +173,7 @@ def between(ticks: Sequence[Any], value: float) -> float:
 
 
 def _exponent(text: str) -> str:
-    """1e-05 as 1e-5; numbers that `:g` writes without an exponent are given one where it is shorter."""
+    """Shorten an exponent (1e-05 to 1e-5), or use one where that is shorter."""
     if "e" not in text:
         digits = f"{float(text):e}".split("e")
         shorter = f"{digits[0].rstrip('0').rstrip('.')}e{int(digits[1])}"
@@ -192,13 +192,13 @@ def _plain(value: Any) -> Any:
 
 _RECORD: Final = TypeAdapter(Stability)
 
-#: Ways of a row of a chart in scenes: planned for the scene, or around a free object and put there afterwards.
+#: Modes of a row of a chart in scenes: planned in the scene, or for a free object and filtered afterwards.
 IN_SCENE: Final = "in the scene"
 FILTERED: Final = "free, filtered"
 
-#: Accuracies that a target may name, and whether more is better: of grasps around a free object, and in scenes.
+#: Accuracies of a target and whether more is better: for free objects, and in scenes.
 FREE: Final = {"gsr": True, "dexgraspbench": True, "hard": True, "robust": True, "epsilon": True, "pd_mm": False}
 IN_SCENES: Final = {"lift": True, "lift_dexgraspbench": True, "lift_hard": True, "robust": True}
 
-#: Speeds, end to end before the planner's own, which is all that charts of graspd 0.1 have.
+#: Speeds: end to end, then the planner's own, the only one in charts of graspd 0.1.
 SPEEDS: Final = ("end_to_end_per_second", "valid_per_second")

@@ -1,4 +1,4 @@
-"""Webhooks: what is told to an address of a user's when a job or a dataset ends, and how it is signed."""
+"""Webhooks: notifications to a user's URL when a job or dataset ends, and their signatures."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from graspd.service.model.records import Record
 
 End = Literal["succeeded", "failed", "cancelled"]
 MAX_URL: Final = 500
-#: Webhooks of one project, and deliveries of one webhook that wait at once.
+#: Limits: webhooks of one project, and waiting deliveries of one webhook.
 MOST_HOOKS: Final = 20
 MOST_WAITING: Final = 1000
 SIGNATURE: Final = "X-Graspd-Signature"
-#: Waits before the second and later attempts [s]; after the last one the delivery has failed.
+#: Delays before the second and later attempts [s]; after the last one the delivery has failed.
 WAITS_S: Final = (5.0, 30.0, 120.0, 600.0, 3600.0, 6 * 3600.0)
 
 
 class Webhook(Record):
-    """`webhooks/{id}.json`: an address, and which ends it is told of. Its secret follows from its id."""
+    """`webhooks/{id}.json`: a URL and its events. The secret is derived from the id."""
 
     version: Literal[1] = 1
     id: Digest
@@ -37,10 +37,10 @@ class Webhook(Record):
 
 
 def check_url(url: str) -> str:
-    """The address itself, if it is one that can be asked; which machine it names is looked at when it is asked.
+    """Return the URL if requests to it are possible; the host it resolves to is checked at each delivery.
 
     Raises:
-        InputError: it is none of http or https, names no host, or holds a user.
+        InputError: not http or https, no host, or with a user.
     """
     try:
         parts = urlsplit(url)
@@ -55,15 +55,15 @@ def check_url(url: str) -> str:
 
 
 def secret_of(master: str, webhook: str) -> str:
-    """The secret that a webhook's bodies are signed with; it lies nowhere."""
+    """Return the secret that signs a webhook's bodies; it is derived, never stored."""
     return "whsec_" + hmac.new(master.encode(), f"webhook {webhook}".encode(), hashlib.sha256).hexdigest()
 
 
 def signature(secret: str, at: int, body: bytes) -> str:
-    """Value of `X-Graspd-Signature`: `t=TIME,v1=HEX`, the HMAC-SHA256 of `TIME.BODY` under the secret.
+    """Return the value of `X-Graspd-Signature`: `t=TIME,v1=HEX`, the HMAC-SHA256 of `TIME.BODY`.
 
     Args:
-        at: seconds since 1970. Who receives it refuses one that is minutes old, so that no copy of it counts later.
+        at: seconds since 1970. Receivers reject a signature that is minutes old, to prevent replay.
     """
     mac = hmac.new(secret.encode(), b"%d." % at + body, hashlib.sha256)
     return f"t={at},v1={mac.hexdigest()}"

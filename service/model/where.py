@@ -1,14 +1,14 @@
-"""The language that chooses grasps by their numbers: `epsilon > 0.3 and lift and robust >= 0.75`.
+"""Filter language for grasps: `epsilon > 0.3 and lift and robust >= 0.75`.
 
     expression   term { or term }
     term         factor { and factor }
     factor       not factor | ( expression ) | NAME | NAME op VALUE
     op           < <= > >= = == !=
 
-A metric is called by its name in `service.model.metrics`, a swept one has its value at the threshold that the index
-tells. A metric is compared with a number, `hand`, `object` and `type` with a word; a flag stands alone. A grasp that
-lacks the number fails each comparison with it. The text becomes a tree here; nothing of it is evaluated.
-`service.readers.where` asks it of base shards, `service.index.queries.grasps` of the index.
+Metrics have their names in `service.model.metrics`; a swept one has its value at the index's threshold. Metrics are
+compared with numbers, `hand`, `object` and `type` with words; flags stand alone. Comparisons with a missing number are
+false. The text is parsed to a tree here and never evaluated as code. `service.readers.where` applies it to base shards,
+`service.index.queries.grasps` to the index.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from typing import Final
 from graspd.service.model.errors import InputError, one_of
 from graspd.service.model.metrics import GRASP_METRICS, GraspType
 
-#: Longest expression, and deepest nesting of one.
+#: Largest length and nesting depth of an expression.
 LONGEST: Final = 1000
 _DEEPEST: Final = 40
 _METRICS: Final = {metric.name: metric for metric in GRASP_METRICS if not metric.code}
 _SHORT: Final = {"robust": "robust_share"}
 _WORDS: Final = ("hand", "object", "type")
 _TYPES: Final = tuple(kind.name.lower() for kind in GraspType)
-#: What stands alone: true or not.
+#: Boolean names.
 FLAGS: Final = ("validated", "valid", "feasible", "held", "lift", "lift_hard")
 _COMPARISONS: Final = {"<": "<", "<=": "<=", ">": ">", ">=": ">=", "=": "=", "==": "=", "!=": "!="}
 _TOKEN: Final = re.compile(
@@ -46,7 +46,7 @@ class Flag:
 
 @dataclass(frozen=True)
 class MetricComparison:
-    """A metric that is not a code, compared with a number."""
+    """Comparison of a metric that is not a code with a number."""
 
     name: str
     op: str
@@ -56,7 +56,7 @@ class MetricComparison:
 
 @dataclass(frozen=True)
 class WordComparison:
-    """`hand` or `object`, = or != a word."""
+    """Comparison of `hand` or `object` with a word by = or !=."""
 
     name: str
     op: str
@@ -65,7 +65,7 @@ class WordComparison:
 
 @dataclass(frozen=True)
 class TypeComparison:
-    """The type of a grasp, = or != one; a grasp that tells none fails both."""
+    """Comparison of the grasp type by = or !=; both are false for a grasp without type."""
 
     op: str
     kind: GraspType
@@ -73,14 +73,14 @@ class TypeComparison:
 
 @dataclass(frozen=True)
 class Negation:
-    """What is not so."""
+    """Negation of a node."""
 
     part: Node
 
 
 @dataclass(frozen=True)
 class Connective:
-    """All of its parts, or any of them."""
+    """Conjunction or disjunction of its parts."""
 
     word: str
     """and, or."""
@@ -91,10 +91,10 @@ Node = Flag | MetricComparison | WordComparison | TypeComparison | Negation | Co
 
 
 def parsed(text: str) -> Node:
-    """The tree of an expression.
+    """Parse an expression to its tree.
 
     Raises:
-        InputError: it is no such expression; says where, or what the names are.
+        InputError: not an expression; states the position, or the known names.
     """
     if len(text) > LONGEST:
         raise InputError(f"the expression is {len(text)} characters long; at most {LONGEST} are read")
@@ -124,7 +124,7 @@ def _tokens(text: str) -> list[_Token]:
 
 
 class _Parser:
-    """Recursive descent over the tokens; `at` is the next one."""
+    """Recursive-descent parser over the tokens; `at` is the next one."""
 
     def __init__(self, tokens: list[_Token]) -> None:
         self.tokens, self.at = tokens, 0

@@ -1,7 +1,7 @@
-"""Reports of living workers, their capabilities, and the requirements of tasks: versions that work side by side.
+"""Reports and capabilities of workers, requirements of tasks: several versions run in parallel.
 
-A message carries a range of schemas: from the oldest that can say what it says to the newest whose meaning its writer
-knew. A worker reads a range too, and makes one revision of each stage.
+A message carries a range of schemas: the oldest that can express it, and the newest known to its writer. A worker reads
+a range too, and has one revision of each stage.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from graspd.service.model.messages import IngestMessage, TaskMessage
 from graspd.service.model.states import Stage
 from graspd.service.model.version import OLDEST_TASK_SCHEMA, PACKAGE_VERSION, STAGE_REVISIONS, TASK_SCHEMA
 
-#: Anybody who writes to Redis may say anything: what is read from there is as long and as large as ours can be.
+#: Any client can write to Redis: values read from there are bounded in length and size.
 HostWord = Annotated[str, Field(max_length=300)]
 Count = Annotated[int, Field(ge=0, lt=2**31)]
 Amount = Annotated[float, Field(ge=0, le=1e15, allow_inf_nan=False)]
@@ -28,7 +28,7 @@ Amount = Annotated[float, Field(ge=0, le=1e15, allow_inf_nan=False)]
 
 @dataclass(frozen=True)
 class WorkerBeat:
-    """What a living worker says about itself."""
+    """Status report of a living worker."""
 
     name: HostWord
     host: HostWord
@@ -43,19 +43,19 @@ class WorkerBeat:
     started: Annotated[str, Field(max_length=32)]
     seen: Annotated[str, Field(max_length=32)]
     reason: Annotated[str, Field(max_length=300)] = ""
-    """Why it is in quarantine."""
+    """Reason of the quarantine."""
     schemas: tuple[Count, Count] = (0, 0)
-    """Oldest and newest task message that it reads; graspd 0.1 does not say it, and its workers are given no task."""
+    """Oldest and newest readable task message; workers of graspd 0.1 report none and get no tasks."""
     revisions: Annotated[dict[HostWord, Count], Field(max_length=16)] = field(default_factory=dict)
-    """Revision that it makes of each stage."""
+    """Revision of each stage in this worker."""
     done: Amount = 0.0
     total: Amount = 0.0
-    """How far its task is; 0 where the end is not known."""
+    """Total work of its task, of which `done` is finished; 0: unknown."""
     message: Annotated[str, Field(max_length=300)] = ""
 
     @classmethod
     def of_this_process(cls, name: str, device: str, stages: Iterable[Stage]) -> Self:
-        """What a worker says before its first check."""
+        """Return the report of a worker before its first check."""
         now, own = timestamp(), own_ability()
         facts = (
             socket.gethostname(),
@@ -73,38 +73,38 @@ class WorkerBeat:
 
     @property
     def ability(self) -> Capabilities:
-        """What it can do."""
+        """Capabilities of the worker."""
         return Capabilities(self.schemas, self.revisions)
 
 
-#: The first schema with which messages carry a range.
+#: First schema of messages with a range.
 FIRST_SCHEMA: Final = 2
 
 
 @dataclass(frozen=True)
 class Requirements:
-    """What a task asks of its worker."""
+    """Requirements of a task on its worker."""
 
     stage: Stage
     schema: int
-    """Oldest schema that can say it."""
+    """Oldest schema that can express it."""
     newest: int
-    """Newest schema whose meaning its writer knew."""
+    """Newest schema known to its writer."""
     revision: int
     """Revision of the stage; 0 for the check of an asset, which has none."""
 
 
 @dataclass(frozen=True)
 class Capabilities:
-    """What a worker reads and makes."""
+    """Schemas and revisions that a worker supports."""
 
     schemas: tuple[int, int]
-    """Oldest and newest schema that it reads."""
+    """Oldest and newest readable schema."""
     revisions: Mapping[str, int]
     """Revision of each stage."""
 
     def lacks(self, need: Requirements) -> str:
-        """Why such a worker cannot do a task; "" if it can."""
+        """Return why such a worker cannot do a task; "" if it can."""
         oldest, newest = self.schemas
         if need.schema > newest:
             return f"schema {need.schema} of tasks is needed, and {newest} is the newest known"
@@ -117,11 +117,11 @@ class Capabilities:
 
 
 def own_ability() -> Capabilities:
-    """What this version of graspd reads and makes."""
+    """Return the capabilities of this version of graspd."""
     return Capabilities((OLDEST_TASK_SCHEMA, TASK_SCHEMA), STAGE_REVISIONS)
 
 
 def need_of(message: TaskMessage | IngestMessage) -> Requirements:
-    """What a message asks."""
+    """Return the requirements of a message."""
     revision = message.revision if isinstance(message, TaskMessage) else 0
     return Requirements(message.stage, message.schema_, message.newest_schema or message.schema_, revision)

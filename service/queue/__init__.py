@@ -1,1 +1,1 @@
-"""The queue: tasks to workers, leases and events back."""
+"""Queue: tasks to workers; leases and events back."""

@@ -1,8 +1,8 @@
-"""What a worker runs of a job in the queue: graspd's own task, whatever a Redis writer puts there.
+"""Restriction of queued jobs to graspd's own task, whatever a Redis client writes there.
 
-RQ imports and calls any function that a job's hash names, JSON serializer or not; it does the same with callbacks, and
-it posts to any webhook URL. A worker therefore makes a job anew of two facts, its id and its message, and calls nothing
-of it: the message goes to its engine.
+RQ imports and calls any function named in a job's hash, even with the JSON serializer. It does the same with callbacks,
+and posts to any webhook URL. A worker therefore rebuilds each job from its id and message only, and passes the message
+to its engine without calling anything named in the job.
 """
 
 from __future__ import annotations
@@ -18,15 +18,16 @@ from rq.serializers import JSONSerializer
 from graspd.service.model.errors import TaskRefused
 from graspd.service.queue.entries import is_wrong_type
 
-#: The one function name a job may carry.
+#: Only function name allowed in a job.
 TASK_FUNCTION: Final = "graspd.task"
-#: How long Redis keeps what is left of a broken job [s]. Results are not kept: events tell them.
+#: Lifetime of the data of a broken job in Redis [s]. Results are not stored: events report them.
 FAILURE_TTL_S: Final = 3600
 
 
 def new_job(message: dict[str, Any], **options: Any) -> Job:
-    """A job without end by time, results, retries, callbacks or webhooks: `worker.process.main` and the controller see
-    to what is needed of these."""
+    """Make a job without timeout, results, retries, callbacks or webhooks: `worker.process.main` and the
+    controller provide the necessary ones.
+    """
     return Job.create(
         TASK_FUNCTION,
         args=(message,),
@@ -39,7 +40,7 @@ def new_job(message: dict[str, Any], **options: Any) -> Job:
 
 
 def allowed_job(job: Job, queue: Queue) -> Job:
-    """The job that a worker may run in place of one from Redis; TaskRefused if that is no task of graspd."""
+    """Return a safe job for one from Redis; TaskRefused if that is not a task of graspd."""
     try:
         name, message = str(job.func_name), job.args[0]
     except (DeserializationError, LookupError, TypeError):
@@ -50,7 +51,7 @@ def allowed_job(job: Job, queue: Queue) -> Job:
 
 
 def is_of_an_entry(error: Exception) -> bool:
-    """Whether RQ failed to read what it took from a queue, and not to take it: then the entry is nobody's."""
-    if not hasattr(error, "job_id"):  # RQ puts it on what reading the entry's job raises
+    """Check whether RQ failed to read an entry rather than to take it: such an entry is discarded."""
+    if not hasattr(error, "job_id"):  # RQ sets it on errors of reading an entry's job
         return isinstance(error, UnicodeDecodeError)
     return not isinstance(error, RedisError) or is_wrong_type(error)

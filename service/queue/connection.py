@@ -1,4 +1,4 @@
-"""Where Redis answers, the one of the settings or the embedded one of the data folder, and a connection to it."""
+"""Connections to Redis: its address, configured or of the data folder's embedded server, and a client."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ _NETWORK: Final = {"socket_connect_timeout": 3.0, "socket_keepalive": True}
 
 
 def connect(url: str, *, patience: int = 3, timeout_s: float = _SOCKET_TIMEOUT_S) -> Redis:
-    """A client that reconnects by itself.
+    """Return a client that reconnects automatically.
 
     Args:
-        patience: how often it tries before it gives up.
-        timeout_s: longest wait for one answer [s].
+        patience: number of attempts before it gives up.
+        timeout_s: timeout of one response [s].
     """
     over_network: dict[str, Any] = {} if url.startswith("unix:") else _NETWORK
     try:
@@ -37,19 +37,19 @@ def connect(url: str, *, patience: int = 3, timeout_s: float = _SOCKET_TIMEOUT_S
             retry=Retry(ExponentialBackoff(cap=1.0, base=0.05), patience),
         )
     except (ValueError, TypeError):
-        # What the library says may hold a part of the password.
+        # The library's message may contain part of the password.
         raise QueueUnavailable(
             "the Redis URL (GRASPD_REDIS_URL) cannot be used; give redis://, rediss:// or unix://, and in a password "
             "%2F for /, %23 for #, %3F for ? and %40 for @"
         ) from None
 
 
-#: Longest path of a unix socket that Linux (108 bytes with the final zero) and macOS (104) both take.
+#: Longest path of a unix socket on both Linux (108 bytes with the final zero) and macOS (104).
 _MAX_SOCKET_PATH: Final = 100
 
 
 def redis_url(settings: Settings) -> str:
-    """The Redis of these settings: GRASPD_REDIS_URL, or else the one that `graspd up` starts for the data folder."""
+    """Return the URL of Redis: GRASPD_REDIS_URL, or the server of `graspd up` for the data folder."""
     if settings.redis_url is not None:
         return settings.redis_url.get_secret_value()
     secret = password(settings.data_dir)
@@ -57,7 +57,7 @@ def redis_url(settings: Settings) -> str:
 
 
 def password(data_dir: Path) -> str:
-    """What the embedded Redis of a data folder asks for; "" if it listens on its private socket alone."""
+    """Return the password of a data folder's embedded Redis; "" if it has only its private socket."""
     try:
         return password_file(data_dir).read_text().strip()
     except OSError:
@@ -65,13 +65,14 @@ def password(data_dir: Path) -> str:
 
 
 def password_file(data_dir: Path) -> Path:
-    """Where the password of an embedded Redis is kept, readable by its user alone."""
+    """Return the path of an embedded Redis's password, readable by its user only."""
     return data_dir.resolve() / "redis" / "password"
 
 
 def socket_path(data_dir: Path) -> Path:
-    """Where the embedded Redis of a data folder listens: inside it, or where that path is too long, in a private
-    folder that follows from it."""
+    """Return the socket of a data folder's embedded Redis: inside the folder, or if that path is too long,
+    in a private folder derived from it.
+    """
     path = data_dir.resolve() / "redis" / "redis.sock"
     if len(os.fsencode(path)) <= _MAX_SOCKET_PATH:
         return path

@@ -1,7 +1,7 @@
-"""What lies in Redis under graspd's names, read as what anybody may have written there.
+"""Parsing of graspd's entries in Redis, which any Redis client may have written.
 
-Whoever writes to Redis may put anything under any name. What cannot be read is nobody's: it is left out, and `sweep`
-takes away what would stand in the way for good.
+Any client can write any value under any name. Unreadable entries are skipped; `sweep` removes those that would block
+graspd permanently.
 """
 
 from __future__ import annotations
@@ -22,41 +22,41 @@ from graspd.service.queue.port import Event, Message
 Entry = TypeVar("Entry", WorkerBeat, Event)
 _ADAPTERS: Final[dict[type, TypeAdapter[Any]]] = {kind: TypeAdapter(kind) for kind in (WorkerBeat, Event)}
 _ATTEMPT: Final = re.compile(r"(.+)-([0-9]{1,9})")
-#: A message has a few kilobytes, whatever its few compressed bytes would unpack to.
+#: Limit of the unpacked message; a real one has a few kilobytes.
 _MESSAGE_BYTES: Final = 1 << 20
-#: A stream takes no entry older than its newest: one so far in the future would shut it for good.
+#: A stream rejects entries older than its newest: one this far in the future would block it permanently.
 _FUTURE_MS: Final = 24 * 3600 * 1000
 
 
 def text(raw: bytes | None) -> str:
-    """Text that every database takes; what is no UTF-8 turns into text that names nothing."""
+    """Decode text that every database accepts; invalid UTF-8 becomes text that matches no name."""
     return (raw or b"").decode(errors="replace")
 
 
 def task_of(job: str) -> tuple[str, int]:
-    """Task id and attempt of an RQ job id; a forged one is a task of its own."""
+    """Return task id and attempt of an RQ job id; a forged id counts as a separate task."""
     match = _ATTEMPT.fullmatch(job)
     return (match[1], int(match[2])) if match else (job, 0)
 
 
 def is_wrong_type(error: Exception) -> bool:
-    """Whether Redis refused because another kind of value lies there."""
+    """Check whether Redis reports a value of another type under the name."""
     return str(error).startswith("WRONGTYPE")
 
 
 def message(data: bytes | None) -> Message | None:
-    """What an RQ job asks of a worker."""
+    """Parse the message of an RQ job."""
     if data is None:
         return None
     try:
         raw = renamed(json.loads(zlib.decompressobj().decompress(data, _MESSAGE_BYTES))[2][0])
         return message_type(raw).model_validate(raw)
-    except Exception:  # forged data may fail anywhere
+    except Exception:  # forged data may raise any error
         return None
 
 
 def read(kind: type[Entry], data: bytes | None) -> Entry | None:
-    """What a worker says of itself, or an event; None if it is forged, or of a version much newer or older."""
+    """Parse a worker's report or an event; None if forged, or of a much newer or older version."""
     try:
         found: Entry = _ADAPTERS[kind].validate_json(data or b"")
         return found
@@ -65,7 +65,7 @@ def read(kind: type[Entry], data: bytes | None) -> Entry | None:
 
 
 def events(reply: Any) -> list[tuple[str, Event | None]]:
-    """Id and event of each entry of a reply; an entry that was trimmed has no fields."""
+    """Return id and event of each entry of a reply; trimmed entries have no fields."""
     streams = reply.items() if isinstance(reply, dict) else reply or []
     return [
         (event_id.decode(), read(Event, fields.get(b"e")) if fields else None)
@@ -76,11 +76,11 @@ def events(reply: Any) -> list[tuple[str, Event | None]]:
 
 
 def sweep(connection: Any, kinds: Mapping[str, str], stream: str) -> None:
-    """Remove what is not of the kind that its name says, and the stream of events where it takes no more entries.
+    """Remove entries of a wrong type, and the event stream if it accepts no entries.
 
     Args:
-        kinds: names with the type that Redis should tell of each.
-        stream: one of them.
+        kinds: names with their expected Redis types.
+        stream: name of the event stream.
     """
     with connection.pipeline(transaction=False) as pipe:
         for name in kinds:

@@ -1,9 +1,9 @@
-"""The lists in Redis that tasks wait in: one a priority and stage, so that a worker may serve some stages only.
+"""Redis lists of waiting tasks: one per priority and stage, so that workers can serve selected stages.
 
-While workers of two versions are there, a task that only some of them can do waits apart: in a list whose name ends in
-what it asks of a worker, `bulk-synthesize.2.10` for schema 2 and revision 10. Who cannot do it never looks there.
+While workers of two versions are present, a task that only some can do waits in a separate list. Its name ends in the
+requirements, `bulk-synthesize.2.10` for schema 2 and revision 10; other workers never read it.
 
-Where RQ keeps what, RQ itself says. Its own readers clean up as they read, so what only looks reads keys.
+Names of RQ's keys come from RQ itself. Its own readers clean up as they read, so read-only code uses keys.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from graspd.service.model.workers import FIRST_SCHEMA, Capabilities, Requirement
 from graspd.service.queue import entries
 from graspd.service.queue.port import priority_order
 
-#: Names of all lists that a task was ever put into, and of all workers.
+#: Sets of all lists ever used, and of all workers.
 LISTS: Final[str] = Queue.redis_queues_keys
 RQ_WORKERS: Final[str] = Worker.redis_workers_keys
-#: Later stages first: a batch that was begun is finished before the next begins.
+#: Later stages first: started batches are finished before the next one starts.
 _STAGE_ORDER: Final = (Stage.INGEST, Stage.RENDER, Stage.SCENE, Stage.SYNTHESIZE)
-#: Versions that can be told apart at once; a name beyond them is nobody's.
+#: Limit of separate lists by version; further names are ignored.
 _MOST_APART: Final = 64
 _APART: Final = re.compile(r"(.+)\.([0-9]{1,4})\.([0-9]{1,4})")
 _COMMON: Final = tuple(f"{priority.value}-{stage.value}" for priority, stage in product(Priority, Stage))
@@ -38,15 +38,15 @@ _PLACES: Final = dict(zip(_COMMON, product(Priority, Stage), strict=True))
 
 
 def queue_name(priority: Priority, stage: Stage, need: Requirements | None = None) -> str:
-    """Name of the RQ queue of a priority and stage; of what waits apart, if there is a need."""
+    """Return the name of the RQ queue of a priority and stage, or of a separate list for a requirement."""
     common = f"{priority.value}-{stage.value}"
     return common if need is None else f"{common}.{need.schema}.{need.revision}"
 
 
 def queue_names(stages: Collection[Stage], taken: int = 0, *, ability: Capabilities | None = None) -> list[str]:
-    """Queues of a worker that serves these stages, in the order in which it takes its next task after `taken`.
+    """Return the queues of a worker for these stages, in the order of its next task after `taken` tasks.
 
-    What waits apart comes first: others cannot do it.
+    Separate lists come first, because other workers cannot serve them.
     """
     return [
         queue_name(priority, stage, need)
@@ -58,7 +58,7 @@ def queue_names(stages: Collection[Stage], taken: int = 0, *, ability: Capabilit
 
 
 def known_lists(connection: Any) -> list[str]:
-    """Names of the lists that may hold tasks: the common ones, and those apart that were ever used."""
+    """Return the names of lists that may contain tasks: the common ones, and all separate ones ever used."""
     try:
         found = connection.smembers(LISTS)
     except ResponseError as error:
@@ -70,17 +70,17 @@ def known_lists(connection: Any) -> list[str]:
 
 
 def place_of(name: str) -> tuple[Priority, Stage]:
-    """Lane and stage of a list of `known_lists`."""
+    """Return priority and stage of a list of `known_lists`."""
     return _PLACES[_common(name)]
 
 
 def is_apart(name: str) -> bool:
-    """Whether a list is for some workers of its stage only."""
+    """Check whether only some workers of its stage can serve a list."""
     return name not in _PLACES and _common(name) in _PLACES
 
 
 def without_takers(names: Iterable[str], abilities: Collection[tuple[Stage, Capabilities]]) -> list[str]:
-    """Lists apart that no worker looks into: none with such an ability serves their stage."""
+    """Return the separate lists that no capable worker of their stage reads."""
     served = {name for stage, ability in abilities for name in queue_names([stage], ability=ability)}
     return [name for name in names if is_apart(name) and name not in served]
 
@@ -91,7 +91,7 @@ def _common(name: str) -> str:
 
 
 def _needs(stage: Stage, ability: Capabilities | None) -> list[Requirements]:
-    """What a worker can do of what may wait apart."""
+    """Return the requirements of separate lists that a worker can serve."""
     if ability is None:
         return []
     revision = ability.revisions.get(stage.value, 0)
@@ -99,37 +99,37 @@ def _needs(stage: Stage, ability: Capabilities | None) -> list[Requirements]:
 
 
 def list_key(name: str) -> str:
-    """List of waiting tasks."""
+    """Return the key of the list of waiting tasks."""
     return f"{Queue.redis_queue_namespace_prefix}{name}"
 
 
 def held_key(name: str) -> str:
-    """Leases of the tasks that were taken from a list."""
+    """Return the key of the leases of tasks taken from a list."""
     return str(StartedJobRegistry.key_template.format(name))
 
 
 def job_key(job: str) -> str:
-    """What is known of a task and attempt."""
+    """Return the key of the data of a task and attempt."""
     return f"{Job.redis_job_namespace_prefix}{job}"
 
 
 def rq_worker_key(name: str) -> str:
-    """What RQ knows of a worker."""
+    """Return the key of RQ's data of a worker."""
     return f"{Worker.redis_worker_namespace_prefix}{name}"
 
 
 def workers_key(name: str) -> str:
-    """Workers that look into a list."""
+    """Return the key of the workers that read a list."""
     return str(WORKERS_BY_QUEUE_KEY % name)
 
 
 def execution_keys(entry: str) -> tuple[str, str]:
-    """Of a lease: the execution that it is of, and all executions of its task."""
+    """Return the keys of a lease's execution, and of all executions of its task."""
     job, _, execution = entry.partition(":")
     return Execution(execution, job, connection=None).key, str(ExecutionRegistry.key_template.format(job))
 
 
 def kinds(lists: list[str]) -> dict[str, str]:
-    """Keys of lists, each with its type in Redis."""
+    """Return the keys of lists with their Redis types."""
     of_each = ((list_key, "list"), (held_key, "zset"), (workers_key, "set"))
     return {key(name): kind for name in lists for key, kind in of_each}

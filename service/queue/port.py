@@ -1,4 +1,4 @@
-"""What goes into the queue and comes out of it: tasks, leases, events. `rq_queue` carries them."""
+"""Queue interface: tasks, leases, events. `rq_queue` implements it."""
 
 from __future__ import annotations
 
@@ -18,30 +18,30 @@ from graspd.service.model.workers import Amount, Count, HostWord, WorkerBeat
 Message = TaskMessage | IngestMessage
 
 
-#: Of so many tasks a worker looks for one in bulk first: a steady flow of interactive work must not end all other.
+#: Every n-th task of a worker is bulk first: steady interactive work must not block the rest.
 BULK_EVERY: Final = 4
 
 
 def priority_order(taken: int) -> tuple[Priority, ...]:
-    """In which order a worker that took so many tasks before looks for the next one."""
+    """Return the order of priorities for the next task of a worker that has taken this many."""
     priorities = (Priority.INTERACTIVE, Priority.BULK)
     return priorities[::-1] if taken % BULK_EVERY == BULK_EVERY - 1 else priorities
 
 
 class EventKind(StrEnum):
-    """What happened. Events of a task come from its worker, `job` events from the controller and the API."""
+    """Type of an event. Events of a task come from its worker, `job` events from controller and API."""
 
     STARTED = "started"
     FINISHED = "finished"
     FAILED = "failed"
-    """An attempt ended in an error and is recorded in the store."""
+    """An attempt failed and is recorded in the store."""
     DEFERRED = "deferred"
     """A part of the service did not answer; the attempt does not count."""
     RETURNED = "returned"
-    """The worker was told to stop and handed the task back; the attempt does not count."""
+    """A stopping worker returned the task; the attempt does not count."""
     CANCELLED = "cancelled"
     LEFT = "left"
-    """A worker ended as it should; it is not lost."""
+    """A worker ended regularly; it is not lost."""
     JOB = "job"
     """The job's state changed; `message` is the new state."""
 
@@ -54,7 +54,7 @@ _LONGEST_MESSAGE: Final = 2000
 
 
 class Event(Model):
-    """One thing that happened to a task or a job."""
+    """One event of a task or job."""
 
     kind: EventKind
     at: Annotated[str, Field(max_length=32)]
@@ -70,20 +70,20 @@ class Event(Model):
     output: Annotated[str, Field(pattern=r"^([a-z]{1,10}/)?[A-Za-z0-9_-]{0,64}$")] = ""
     """Shard id of a finished stage; kind and digest (`hand/...`) of a finished check."""
 
-    # A newer worker may say more than an older controller knows.
+    # A newer worker may send more fields than an older controller has.
     model_config = ConfigDict(frozen=True, extra="ignore")
 
 
 @dataclass(frozen=True)
 class Lease:
-    """A worker's hold on a task."""
+    """Lease of a worker on a task."""
 
     task_id: str
     attempt: int
     key: Any
-    """Where the queue keeps it."""
+    """Key of the lease in the queue."""
     beat: str
-    """Another one with every sign of life; only its change has a meaning."""
+    """Value that changes with every heartbeat; only the change has a meaning."""
 
 
 Place = tuple[Priority, Stage]
@@ -91,8 +91,9 @@ Place = tuple[Priority, Stage]
 
 @dataclass(frozen=True)
 class QueueStatus:
-    """Waiting and running tasks; the living workers by name, each with the time since its last beat by Redis's clock
-    [s]. Places without a task may be left out."""
+    """Numbers of waiting and running tasks (some zeros omitted); living workers by name, with the time
+    since their last heartbeat by Redis's clock [s].
+    """
 
     depth: Mapping[Place, int] = field(default_factory=dict)
     oldest_s: Mapping[Place, float] = field(default_factory=dict)

@@ -1,7 +1,7 @@
-"""The queue on Redis: RQ for tasks and leases, a bounded stream for events.
+"""Queue on Redis: RQ for tasks and leases, a bounded stream for events.
 
-One RQ queue for each priority and stage: a worker may serve some stages only. RQ's own retries, scheduler, maintenance
-and result storage are not used: each of them loses or repeats work in ways the controller does not.
+Each priority and stage has an RQ queue, so that workers can serve selected stages. RQ's own retries, scheduler,
+maintenance and result storage are unused: each loses or repeats work in ways the controller does not.
 """
 
 from __future__ import annotations
@@ -49,13 +49,13 @@ from graspd.service.queue.port import Event, Lease, Message, Place, QueueStatus
 from graspd.service.settings import Settings
 
 EVENTS: Final = "graspd:events"
-#: Events kept, 20 MB at most: a minute of a controller that is away and four hundred tasks a second. Lost ones are
-#: made good from the store.
+#: Event limit, 20 MB at most: a minute of controller downtime at four hundred tasks per second. Lost events are
+#: restored from the store.
 EVENTS_KEPT: Final = 50_000
-#: Group of readers, by the name that graspd 0.2 gave it: a controller goes on where one of 0.2 ended.
+#: Consumer group, named as in graspd 0.2: a controller continues where one of 0.2 ended.
 _GROUP: Final = "keeper"
 WORKERS: Final = "graspd:workers"
-#: Lease of the controller that leads. A graspd of 0.2 takes and keeps the same one: so the two give way to each other.
+#: Lease of the leading controller. graspd 0.2 uses the same one, so both versions exclude each other.
 LEAD: Final = "graspd:lead:keeper"
 #: Sums for Prometheus, a few hundred fields.
 METRICS: Final = "graspd:metrics"
@@ -65,22 +65,22 @@ _WORKER: Final = b"graspd:worker:"
 
 
 class RqQueue:
-    """Tasks to workers and who holds which, events, who is there, and sums.
+    """Tasks and their leases, events, living workers, and sums.
 
-    Every method raises QueueUnavailable when Redis is away. Nothing here is the truth: whatever is lost is queued again
-    from the index.
+    Every method raises QueueUnavailable if Redis does not answer. The queue is not authoritative: lost tasks are queued
+    again from the index.
     """
 
     def __init__(self, connection: Redis) -> None:
         self.connection: Any = connection
         self._queues: dict[str, Queue] = {}
         self._unread = "0"
-        """Up to where what an earlier controller took was read; ">": all of it."""
+        """Position up to which an earlier controller's pending events were read; ">": all of them."""
         self._leases: dict[str, Any] = {}
-        """Locks of those who lead, or want to, through this connection."""
+        """Leadership locks of the candidates on this connection."""
 
     def ping(self) -> float:
-        """Seconds a round trip takes."""
+        """Return the round-trip time [s]."""
         start = time.perf_counter()
         with _mapped():
             self.connection.ping()
@@ -89,14 +89,14 @@ class RqQueue:
     def enqueue(
         self, messages: Sequence[Message], priority: Priority, *, again: bool = False, apart: bool = False
     ) -> int:
-        """Append tasks to a priority. A task (by id and attempt) that already waits or runs is not queued twice.
+        """Append tasks to a priority. A task (id and attempt) that already waits or runs is not queued twice.
 
         Args:
-            again: the caller has seen that the queue lost these tasks; what it still remembers of them is replaced.
-            apart: only some workers of the stage can do them, and only those see them.
+            again: the caller found these tasks missing in the queue; remaining data of them is replaced.
+            apart: only some workers of the stage can do them; the tasks go to separate lists.
 
         Returns:
-            number of tasks added.
+            Number of tasks added.
         """
         stale = [cancel_key(message.task_id) for message in messages]
         if again:
@@ -115,7 +115,7 @@ class RqQueue:
         return added
 
     def discard(self, task_ids: Collection[str]) -> None:
-        """Take waiting tasks off the queue and tell the workers that run one of them to stop at the next launch."""
+        """Remove waiting tasks; ask workers that run one of them to stop at the next launch."""
         wanted = set(task_ids)
         with _mapped(), self.connection.pipeline(transaction=False) as pipe:
             for task in wanted:
@@ -129,14 +129,14 @@ class RqQueue:
             pipe.execute()
 
     def waiting(self) -> set[str]:
-        """Ids of the tasks in the queue."""
+        """Return the ids of the tasks in the queue."""
         with _mapped(), self.connection.pipeline(transaction=True) as pipe:
             for key in self._list_keys():
                 pipe.lrange(key, 0, -1)
             return {entries.task_of(entries.text(job))[0] for jobs in pipe.execute() for job in jobs}
 
     def depths(self) -> dict[tuple[Priority, Stage], int]:
-        """Number of waiting tasks of each priority and stage."""
+        """Return the number of waiting tasks of each priority and stage."""
         with _mapped(), self.connection.pipeline(transaction=False) as pipe:
             lists = known_lists(self.connection)
             for name in lists:
@@ -147,7 +147,7 @@ class RqQueue:
             return dict(depths)
 
     def clear_untaken(self, present: Collection[WorkerBeat]) -> None:
-        """Forget tasks that wait apart for workers of a kind that is gone. The controller then finds them missing."""
+        """Remove separate lists without capable workers. The controller then finds their tasks missing."""
         abilities = [(stage, beat.ability) for beat in present for stage in beat.stages]
         with _mapped(), self.connection.pipeline(transaction=False) as pipe:
             for name in without_takers(known_lists(self.connection), abilities):
@@ -155,20 +155,20 @@ class RqQueue:
                 for job in self.connection.lrange(key, 0, -1):
                     pipe.delete(job_key(entries.text(job)))
                 pipe.delete(key)
-                # Where one of them is still held, its lease is read under the list's name.
+                # Leases of tasks still held are read under the list's name.
                 if not self.connection.exists(held_key(name)):
                     pipe.srem(LISTS, key)
             pipe.execute()
 
     def leases(self) -> list[Lease]:
-        """Tasks held by workers, living or dead. Reading changes nothing."""
-        # RQ's own readers clean up as they read, which moves lost tasks aside and runs callbacks; so the keys are read.
+        """Return the leases of all workers, living or dead. Reading changes nothing."""
+        # RQ's own readers also clean up, which moves lost tasks and runs callbacks: so read the keys directly.
         with _mapped(), self.connection.pipeline(transaction=False) as pipe:
             keys = [held_key(name) for name in known_lists(self.connection)]
             for key in keys:
                 pipe.zrange(key, 0, -1, withscores=True)
             found = pipe.execute()
-        # Every sign of life moves the score, and an entry is of one execution only.
+        # Every heartbeat changes the score, and an entry belongs to one execution only.
         return [
             Lease(*entries.task_of(entries.text(entry.partition(b":")[0])), key=(key, entry), beat=str(score))
             for key, held in zip(keys, found, strict=True)
@@ -176,18 +176,18 @@ class RqQueue:
         ]
 
     def holder(self, lease: Lease) -> tuple[str, Message | None]:
-        """Which worker holds a lease, and what was asked of it; None if Redis no longer knows.
+        """Return worker and message of a lease; None for data that Redis has lost.
 
-        Only of one that is lost is this asked: reading all leases stays one round trip.
+        Call it for lost leases only: reading all leases remains one round trip.
         """
         with _mapped(), self.connection.pipeline(transaction=False) as pipe:
             pipe.hmget(job_key(entries.text(lease.key[1].partition(b":")[0])), "worker_name", "data")
-            (found,) = pipe.execute(raise_on_error=False)  # something else may stand under its name
+            (found,) = pipe.execute(raise_on_error=False)  # the name may have a value of another type
         worker, data = (None, None) if isinstance(found, Exception) else found
         return entries.text(worker), entries.message(data)
 
     def release(self, lease: Lease) -> None:
-        """Forget a lease whose worker is lost; if it lives after all, it notices and stops."""
+        """Remove the lease of a lost worker; a worker that still lives detects this and stops."""
         key, entry = lease.key
         name = entries.text(entry)
         with _mapped(), self.connection.pipeline(transaction=True) as pipe:
@@ -196,7 +196,7 @@ class RqQueue:
             pipe.execute()
 
     def workers(self) -> list[WorkerBeat]:
-        """Workers that gave a sign of life within the last lease."""
+        """Return the workers with a heartbeat within the last lease time."""
         with _mapped():
             names = sorted(self.connection.smembers(WORKERS))
             found = self.connection.mget([_WORKER + name for name in names]) if names else []
@@ -210,7 +210,7 @@ class RqQueue:
             pipe.execute()
 
     def consume(self, *, limit: int, wait_s: float) -> list[tuple[str, Event]]:
-        """Next events for the controller, the oldest first; those never acknowledged come again to the next one."""
+        """Return the next events for the controller, oldest first; unacknowledged ones are delivered again."""
         with _mapped():
             while self._unread != ">":
                 pending = self._of_group(self._unread, limit, 0.0)
@@ -220,40 +220,40 @@ class RqQueue:
             return self._known(self._of_group(">", limit, wait_s))
 
     def acknowledge(self, event_ids: Sequence[str]) -> None:
-        """Say that the events are in the index."""
+        """Acknowledge events that are in the index."""
         if event_ids:
             with _mapped():
                 self.connection.xack(EVENTS, _GROUP, *event_ids)
 
     def tail(self, after: str, *, limit: int, wait_s: float) -> list[tuple[str, Event]]:
-        """Events after an id, for any number of readers. `"$"`: only what comes from now on; `"0"`: all kept."""
+        """Return events after an id, for any number of readers. `"$"`: only future ones; `"0"`: all stored."""
         with _mapped():
             found = self.connection.xread({EVENTS: after}, count=limit, block=int(wait_s * 1000) or None)
         return [(event_id, event) for event_id, event in entries.events(found) if event is not None]
 
     def announce(self, part: str, seconds: float) -> None:
-        """Say that a part of the service (the controller) lives, for that long."""
+        """Announce that a part of the service (the controller) lives, for some seconds."""
         with _mapped():
             self.connection.set(_part_key(part), "1", px=int(seconds * 1000))
 
     def announced(self, part: str) -> bool:
-        """Whether a part said so."""
+        """Check whether such an announcement is valid."""
         with _mapped():
             return bool(self.connection.exists(_part_key(part)))
 
     def service(self) -> str | None:
-        """Identity of the service that this queue belongs to; None if none has it yet, or Redis was lost."""
+        """Return the identity of the service that owns this queue; None if unset, or Redis was lost."""
         with _mapped():
             found = self.connection.get(_SERVICE)
         return None if found is None else entries.text(found)
 
     def set_service(self, identity: str, *, instead: bool = False) -> None:
-        """Say which service the queue belongs to, where nobody said it before or `instead` of that."""
+        """Set the identity of the owning service, if it is unset or `instead` is given."""
         with _mapped():
             self.connection.set(_SERVICE, identity, nx=not instead)
 
     def lead(self, holder: str, seconds: float) -> bool:
-        """Lead the controllers for that long, or go on to; False: another one does."""
+        """Acquire or renew the leadership of the controllers for some seconds; False if another one leads."""
         with _mapped():
             new = self.connection.lock(LEAD, timeout=seconds, thread_local=False)
             lease = self._leases.setdefault(holder, new)
@@ -261,10 +261,10 @@ class RqQueue:
             try:
                 if lease.owned():
                     return bool(lease.reacquire())
-                self.resign(holder)  # what a process of the same name left when it ended
+                self.resign(holder)  # lease of an ended process of the same name
                 if lease.acquire(blocking=False, token=holder):
                     return True
-                if self.connection.ttl(LEAD) == -1:  # nobody's: a lease has an end
+                if self.connection.ttl(LEAD) == -1:  # leases always expire, so this is none
                     self.connection.delete(LEAD)
             except LockError:
                 pass
@@ -275,15 +275,15 @@ class RqQueue:
             return False
 
     def resign(self, holder: str) -> None:
-        """Lead no longer; nothing happens where this one does not."""
+        """Release the leadership, if held."""
         with _mapped(), suppress(LockError):
             self.connection.lock(LEAD).do_release(holder)
 
     def now(self, *, lease_s: float) -> QueueStatus:
-        """Lengths, ages and workers for the metrics, at a cost that does not grow with the queue.
+        """Return queue lengths, ages and workers for the metrics, at a cost independent of the queue's length.
 
         Args:
-            lease_s: how long a worker's registration outlives its beat [s].
+            lease_s: lifetime of a worker's registration after its heartbeat [s].
         """
         beats = self.workers()
         with _mapped(), self.connection.pipeline(transaction=False) as pipe:
@@ -297,7 +297,7 @@ class RqQueue:
                 pipe.hget(job_key(entries.text(head)), "enqueued_at")
             for beat in beats:
                 pipe.pttl(worker_key(beat.name))
-            # Under a name that anybody may have put there lies anything: that hides no other.
+            # A name may have a forged value of any type, which must not hide the others.
             since = [None if isinstance(one, Exception) else one for one in pipe.execute(raise_on_error=False)]
         depth, running, oldest = Counter[Place](), Counter[Place](), dict[Place, float]()
         for place, waiting, held, when in zip(map(place_of, lists), found[0::3], found[2::3], since, strict=False):
@@ -312,14 +312,14 @@ class RqQueue:
         return QueueStatus(depth, oldest, running, workers)
 
     def count(self, amounts: Mapping[str, float]) -> None:
-        """Add to sums that outlive this process."""
+        """Add to the persistent sums."""
         with _mapped(), self.connection.pipeline(transaction=False) as pipe:
             for name, amount in amounts.items():
                 pipe.hincrbyfloat(METRICS, name, amount)
             pipe.execute()
 
     def counted(self) -> dict[str, float]:
-        """All those sums."""
+        """Return all persistent sums."""
         with _mapped():
             found = self.connection.hgetall(METRICS)
         sums: dict[str, float] = {}
@@ -329,8 +329,8 @@ class RqQueue:
         return sums
 
     def tidy(self) -> None:
-        """Throw away what dead workers and refused entries left behind."""
-        # RQ's registries of workers are emptied by its own maintenance, which is off.
+        """Remove data of dead workers and refused entries."""
+        # RQ cleans its registries of workers in its own maintenance, which is off.
         with _mapped(), self.connection.pipeline(transaction=False) as pipe:
             lists = known_lists(self.connection)
             entries.sweep(self.connection, {**_KINDS, **kinds(lists)}, EVENTS)
@@ -347,11 +347,11 @@ class RqQueue:
             pipe.execute()
 
     def close(self) -> None:
-        """Give the connections back."""
+        """Close the connections."""
         self.connection.close()
 
     def _of_group(self, after: str, limit: int, wait_s: float) -> list[tuple[str, Event | None]]:
-        """Events of the group of controllers, which is made where there is none."""
+        """Read events of the controllers' consumer group; create it if necessary."""
         read = partial(
             self.connection.xreadgroup, _GROUP, _GROUP, {EVENTS: after}, count=limit, block=int(wait_s * 1000) or None
         )
@@ -360,12 +360,12 @@ class RqQueue:
         except ResponseError as error:
             if not str(error).startswith("NOGROUP"):
                 raise
-        with suppress(ResponseError):  # another one made it
+        with suppress(ResponseError):  # created concurrently
             self.connection.xgroup_create(EVENTS, _GROUP, id="0", mkstream=True)
         return entries.events(read())
 
     def _known(self, found: Sequence[tuple[str, Event | None]]) -> list[tuple[str, Event]]:
-        """Events that can be read. What cannot be is acknowledged: it is nobody's."""
+        """Return the readable events; acknowledge the unreadable ones, which are discarded."""
         self.acknowledge([event_id for event_id, event in found if event is None])
         return [(event_id, event) for event_id, event in found if event is not None]
 
@@ -384,7 +384,7 @@ class RqQueue:
 
 
 def open_queue(settings: Settings, *, patience: int = 3) -> RqQueue:
-    """The queue that the settings name; it need not answer yet."""
+    """Return the queue of the settings, without connecting yet."""
     return RqQueue(connect(redis_url(settings), patience=patience))
 
 
@@ -394,17 +394,17 @@ def put_event(pipe: Any, event: Event) -> None:
 
 
 def rq_id(task_id: str, attempt: int) -> str:
-    """RQ's job id: one a task and attempt, so that a slow worker's end cannot touch the attempt that replaced it."""
+    """Return RQ's job id: one per task and attempt, so that a slow worker cannot affect a later attempt."""
     return f"{task_id}-{attempt}"
 
 
 def cancel_key(task_id: str) -> str:
-    """Key that tells a worker to stop a task."""
+    """Return the key that requests a worker to stop a task."""
     return f"graspd:cancel:{task_id}"
 
 
 def lease_state(connection: Any, job: Job, execution: Execution) -> tuple[bool, bool]:
-    """Whether a task in hand is still its worker's, and whether it is cancelled. Reading changes nothing."""
+    """Return whether the worker still holds a task, and whether it is cancelled. Reading changes nothing."""
     with connection.pipeline(transaction=False) as pipe:
         pipe.zscore(job.started_job_registry.key, execution.composite_key)
         pipe.exists(cancel_key(entries.task_of(job.id)[0]))
@@ -413,14 +413,14 @@ def lease_state(connection: Any, job: Job, execution: Execution) -> tuple[bool, 
 
 
 def renew_lease(pipe: Any, job: Job, execution: Execution, ttl: int) -> None:
-    """A sign of life for a task in hand. RQ notes whole seconds, and a lease may be as short."""
+    """Renew the lease of a task. RQ stores whole seconds, and a lease may be as short as one."""
     registry = job.started_job_registry
     execution.heartbeat(registry, ttl, pipe)
     pipe.zadd(registry.key, {execution.composite_key: time.time() + ttl}, xx=True)
 
 
 def list_worker(connection: Any, beat: Mapping[str, Any], lease_s: float) -> None:
-    """Register a worker for the length of a lease [s]."""
+    """Register a worker for the duration of a lease [s]."""
     with connection.pipeline() as pipe:
         pipe.set(worker_key(beat["name"]), json.dumps(beat), ex=max(2, round(lease_s)))
         pipe.sadd(WORKERS, beat["name"])
@@ -428,7 +428,7 @@ def list_worker(connection: Any, beat: Mapping[str, Any], lease_s: float) -> Non
 
 
 def unlist_worker(connection: Any, left: Event) -> None:
-    """End a worker's registration with the event that says so."""
+    """End a worker's registration and append the event of its end."""
     with connection.pipeline() as pipe:
         pipe.delete(worker_key(left.worker))
         pipe.srem(WORKERS, left.worker)
@@ -437,7 +437,7 @@ def unlist_worker(connection: Any, left: Event) -> None:
 
 
 def worker_key(name: str) -> str:
-    """Key that a living worker keeps alive."""
+    """Return the key that a living worker renews."""
     return f"{_WORKER.decode()}{name}"
 
 
@@ -445,7 +445,7 @@ def _part_key(part: str) -> str:
     return f"graspd:part:{part}"
 
 
-#: Names of a fixed number, each with its type in Redis.
+#: Fixed names with their Redis types.
 _KINDS: Final = {
     **dict.fromkeys((LEAD, _SERVICE), "string"),
     **dict.fromkeys((WORKERS, RQ_WORKERS, LISTS), "set"),

@@ -1,4 +1,4 @@
-"""Reading datasets: shards from files, a folder or any store, as arrays or as samples for training.
+"""Readers of datasets: shards from files, a folder or a store, as arrays or as training samples.
 
     from graspd.service.readers import Grasps, Pictures, open_shards
 
@@ -9,8 +9,8 @@
     pictures = Pictures(shards)                                            # a picture with the grasps of its scene
     clouds = pictures.clouds(points=1024, noise="stereo")                  # as a depth camera sees it, in points
 
-`service.readers.torch_data` wraps them for PyTorch; nothing here imports it. What is named here is imported when it is
-first used: most of those who look at a single shard need little of it.
+`service.readers.torch_data` wraps them for PyTorch; no other module here imports torch. Names are imported on first
+use, because reading a single shard needs few of them.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from graspd.service.readers.grasps import Grasps
     from graspd.service.readers.pictures import Pictures
 
-#: Name, the module it lives in.
+#: Module of each name.
 _LIVES_IN: Final = {
     "Clouds": "clouds",
     "DepthNoise": "depth_noise",

@@ -1,4 +1,4 @@
-"""Local copies of remote shards, checked on arrival and bounded in size; and samples read ahead by threads."""
+"""Cache of remote shards, verified on download and bounded in size; prefetching of samples by threads."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ DEFAULT_BYTES: Final = 20 << 30
 
 
 class ShardCache:
-    """Files of a store by their SHA-256. Several processes may share a folder: files appear whole or not at all."""
+    """Files of a store, named by their SHA-256. Processes may share a folder: writes are atomic."""
 
     def __init__(self, folder: Path, *, limit_bytes: int = DEFAULT_BYTES) -> None:
-        """Raises InputError if the folder cannot be made."""
+        """Create the folder. Raises InputError if that fails."""
         self.folder, self.limit_bytes, self._process = folder, limit_bytes, os.getpid()
         try:
             folder.mkdir(parents=True, exist_ok=True)
@@ -35,10 +35,10 @@ class ShardCache:
         self.__dict__.update(state, _process=os.getpid())
 
     def fetch(self, store: Store, key: str, sha256: str) -> Path:
-        """A file of the store on this machine.
+        """Return the local path of a file of the store; download it if necessary.
 
         Raises:
-            DamagedShard: the store has no such file, or its content is not what the checksum says.
+            DamagedShard: the store has no such file, or its content does not match the checksum.
             InputError: this process was forked, see `check_not_forked`.
             StoreUnavailable: the store does not answer.
         """
@@ -51,11 +51,11 @@ class ShardCache:
 
     @staticmethod
     def _is_intact(path: Path, sha256: str) -> bool:
-        """Whether a file was fetched before and is still what it was; one that is not is fetched again."""
+        """Check whether a cached file exists and is unchanged; a changed file is downloaded again."""
         try:
             check_content(path, sha256)
             facts = path.stat()
-            # Used now: others go first. The time of change stays, which says that it was checked.
+            # Marks the file as recently used for eviction. The modification time stays: it marks the file as verified.
             os.utime(path, ns=(time.time_ns(), facts.st_mtime_ns))
         except (FileNotFoundError, DamagedShard):
             return False
@@ -79,10 +79,10 @@ class ShardCache:
 
 
 def check_not_forked(store: Store, process: int) -> None:
-    """Refuse to ask a remote store in a fork of the process that asked it first: there it would never answer.
+    """Refuse a remote store in a fork of the process that opened it: its requests would never return.
 
     Raises:
-        InputError: this is another process than the one of that number.
+        InputError: the current process is not the one with this number.
     """
     if os.getpid() != process and not store.url.startswith(("file:", "memory:")):
         raise InputError(
@@ -94,20 +94,20 @@ def check_not_forked(store: Store, process: int) -> None:
 def prefetched(
     source: Sequence[dict[str, Any]], order: Iterable[int] | None = None, *, workers: int = 2, ahead: int = 8
 ) -> Iterator[dict[str, Any]]:
-    """Samples of `Pictures`, `Clouds` or `Grasps`, in the stated order, each the same as `source[i]`.
+    """Yield samples of `Pictures`, `Clouds` or `Grasps` in the given order, each equal to `source[i]`.
 
-    Reading and unpacking pictures leaves the interpreter to others, so that threads share the work; from a store they
-    wait for the network at the same time.
+    Reading and unpacking pictures releases the GIL, so threads share the work; with a remote store they also overlap
+    the network latency.
 
     Args:
         source: the samples.
-        order: their indices; by default all in turn.
+        order: their indices; by default all in order.
         workers: threads.
-        ahead: how many samples are held that nobody took yet: so much memory.
+        ahead: samples read in advance and not yet consumed; bounds the memory.
 
     Raises:
         InputError: a number is less than one.
-        and what reading a sample raises, when it is its turn.
+        Exception: errors of reading a sample are raised when that sample is due.
     """
     if workers < 1 or ahead < 1:
         raise InputError(f"reading ahead takes at least one thread and one sample; got {workers} and {ahead}")

@@ -1,4 +1,4 @@
-"""Pictures as labelled point clouds, view by view, perfect or as a depth camera sees them; nothing is stored."""
+"""Labelled point clouds from pictures, with perfect or simulated camera depth; nothing is stored."""
 
 from __future__ import annotations
 
@@ -23,35 +23,34 @@ Array = NDArray[Any]
 
 
 Ints = NDArray[np.intp]
-#: From a base shard and K of its rows to points (K, H, 3) on the hand's surface in the object's frame [m].
+#: Maps a base shard and K of its rows to points (K, H, 3) on the hand's surface in the object's frame [m].
 HandSurface = Callable[[Shard, Ints], Floats]
 Frame = Literal["camera", "table", "object"]
 FRAMES: Final[tuple[Frame, ...]] = ("camera", "table", "object")
 POSTURES: Final = ("pregrasp", "grasp", "squeeze")
-#: Beginnings of the keys that have a row for each grasp.
+#: Prefixes of the keys with one row per grasp.
 OF_GRASPS: Final = ("pregrasp/", "grasp/", "squeeze/", "quality/")
 _NOWHERE: Final = np.array([0.0, 0, 0, 1, 0, 0, 0])
-#: The hand touches a point when its surface is at most this far from it [m]: the middle contact threshold of shards.
+#: Largest distance of a contact between the hand's surface and a point [m]: the middle contact threshold of shards.
 TOUCH_M: Final = 0.005
 
 
 class Clouds(Sequence[dict[str, Any]]):
-    """Point clouds of views, or of all views of a scene together. `clouds[i]` is a dictionary:
+    """Point clouds of single views, or of all views of a scene fused. `clouds[i]` is a dictionary:
 
         cloud/points (P, 3) [m]; cloud/normals (P, 3), unit, toward the camera that saw the point
         cloud/object (P,) 1 where the pixel shows the object; cloud/pixel (P, 3): view, row, column
-        cloud/seen: how many points there were to draw from; where fewer than P, some stand several times, and where
-            none, all is zero
-        cloud/graspness (P,), if asked for: share of the scene's K grasps whose hand touches the point
-        camera/intrinsics (3, 3) K [px], camera/extrinsics (4, 4) E, table to camera; of several views (V, ...)
+        cloud/seen: number of points to draw from; if fewer than P, some points repeat; if none, all values are zero
+        cloud/graspness (P,), optional: share of the scene's K grasps whose hand touches the point
+        camera/intrinsics (3, 3) K [px], camera/extrinsics (4, 4) E, table to camera; for fused views (V, ...)
         table/plane (4,) n and d of n.x = d, the table's top; table/height [m] of the top along n in the table's frame
-        object/pose (7,) of the object's frame
-        grasp/hand_pose (K, 7), likewise of other `postures`; and grasp/hand_pose_camera (not of several views),
-            grasp/hand_pose_table, grasp/hand_pose_object in each of the frames; grasp/joint_positions (K, J)
+        object/pose (7,): pose of the object's frame
+        grasp/hand_pose (K, 7), likewise for other `postures`; also grasp/hand_pose_camera (not for fused views),
+            grasp/hand_pose_table, grasp/hand_pose_object in these frames; grasp/joint_positions (K, J)
         grasp/base_row (K,), base_id, and the columns of `grasp_quality` of the pictures
 
-    Points, plane and poses are in `frame`. Grasps are those that the pictures keep: by default the valid ones
-    that are clear in the scene.
+    Points, plane and poses are in `frame`. The grasps are those that `pictures` selects: by default the valid ones that
+    are clear in the scene.
     """
 
     def __init__(
@@ -71,17 +70,17 @@ class Clouds(Sequence[dict[str, Any]]):
     ) -> None:
         """
         Args:
-            pictures: which pictures, and which grasps of their scenes.
-            points: P, how many points a cloud has.
-            noise: a depth camera, by name (`depth_noise.NOISES`) or as it is; None: perfect depth.
-            frame: camera, table or object; by default the camera's, of several views the table's.
-            fuse: one cloud of all views of a scene.
-            scene: of all that is seen, table and neighbours too; by default of the object alone.
-            voxel_m: keep one point of each cube of this edge [m]; 0: all.
-            postures: of pregrasp, grasp and squeeze, those to tell of each grasp.
-            hand_surface: asks for graspness; `graspd.readers.hand_surface` is one.
-            touch_m: how near the hand must be to touch [m].
-            seed: of the points that are drawn and of the noise; the same seed and `epoch` give the same clouds.
+            pictures: the pictures and the selection of grasps in their scenes.
+            points: P, number of points of a cloud.
+            noise: a depth camera by name (`depth_noise.NOISES`) or a `DepthNoise`; None: perfect depth.
+            frame: camera, table or object; by default camera, for fused views table.
+            fuse: return one cloud for all views of a scene.
+            scene: include table and neighbours; by default only the object.
+            voxel_m: keep one point per cube of this edge [m]; 0: all.
+            postures: postures to return for each grasp, among pregrasp, grasp and squeeze.
+            hand_surface: enables graspness; `graspd.readers.hand_surface` is one.
+            touch_m: largest distance of a contact [m].
+            seed: of the sampled points and the noise; the same seed and `epoch` give the same clouds.
 
         Raises:
             InputError: an unknown noise, frame or posture, or a number out of range.
@@ -128,7 +127,7 @@ class Clouds(Sequence[dict[str, Any]]):
         return sample | self._labels(scenes, first.scene, views[0].extrinsics, into) | first.names
 
     def _cloud(self, views: Sequence[CloudView], draw: np.random.Generator, into: Floats) -> dict[str, Any]:
-        """P of the points that the views see, in the sample's frame."""
+        """Draw P of the points that the views see, in the sample's frame."""
         found = [view.pixels(whole=self._whole) for view in views]
         pixel = np.concatenate([np.stack([np.full(len(row), v), row, col], 1) for v, (row, col) in enumerate(found)])
         if self._voxel:
@@ -136,7 +135,7 @@ class Clouds(Sequence[dict[str, Any]]):
         seen = len(pixel)
         if seen >= self.points:
             pixel = pixel[draw.choice(seen, self.points, replace=False)]
-        elif seen:  # each stands at least once
+        elif seen:  # each point appears at least once
             pixel = np.concatenate([pixel, pixel[draw.integers(seen, size=self.points - seen)]])
         else:
             empty = np.zeros((self.points, 3), np.float32)
@@ -158,7 +157,7 @@ class Clouds(Sequence[dict[str, Any]]):
         }
 
     def _graspness(self, views: Sequence[CloudView], pixel: Ints, scenes: Scenes, scene: int) -> Floats:
-        """Of the true points of pixels: noise moves what is seen, not where hands touch."""
+        """Compute graspness at the true points: noise changes the measured points, not the contacts."""
         assert self._surface is not None
         points = _of(views, pixel, CloudView.true_points)
         on_object = transforms.apply(transforms.invert(scenes.object_pose(scene)), points)
@@ -167,7 +166,7 @@ class Clouds(Sequence[dict[str, Any]]):
         return graspness(on_object, hands, touch_m=self._touch)
 
     def _labels(self, scenes: Scenes, scene: int, extrinsics: Floats, into: Floats) -> dict[str, Any]:
-        """The grasps in every frame."""
+        """Return the poses of the grasps in every frame."""
         found = scenes.grasps(scene, extrinsics)
         rows, pose = scenes.base_rows(scene), scenes.object_pose(scene)
         labels = {name: value for name, value in found.items() if name not in ("grasp/hand_pose", "object/pose")}
@@ -183,7 +182,7 @@ class Clouds(Sequence[dict[str, Any]]):
         return labels
 
     def _into(self, extrinsics: Floats, object_pose: Floats) -> Floats:
-        """(7,) from the table's frame into that of the sample."""
+        """Return the transform (7,) from the table's frame to the sample's frame."""
         if self.frame == "camera":
             return transforms.pose_from_matrix(extrinsics)
         if self.frame == "object":
@@ -199,7 +198,7 @@ def _by_scene(places: Sequence[PictureAddress]) -> list[list[PictureAddress]]:
 
 
 def _of(views: Sequence[CloudView], pixel: Ints, what: Callable[[CloudView, Ints, Ints], Array]) -> Array:
-    """What views tell of pixels (P, 3): view, row, column."""
+    """Evaluate a function of the views at pixels (P, 3): view, row, column."""
     parts = [what(view, *pixel[pixel[:, 0] == number, 1:].T) for number, view in enumerate(views)]
     found = np.empty((len(pixel), *parts[0].shape[1:]), parts[0].dtype)
     for number, part in enumerate(parts):
@@ -208,32 +207,32 @@ def _of(views: Sequence[CloudView], pixel: Ints, what: Callable[[CloudView, Ints
 
 
 def _voxels(points: Floats, edge: float, draw: np.random.Generator) -> Ints:
-    """One point of each cube, drawn evenly."""
+    """Select one point of each cube, uniformly at random."""
     order = draw.permutation(len(points))
     cubes = np.floor(points[order] / edge).astype(np.int64)
     return order[np.unique(cubes, axis=0, return_index=True)[1]]
 
 
 def _words(place: PictureAddress) -> tuple[int, int]:
-    """Numbers that follow from what a picture is of, whatever its file is called."""
+    """Return seed words that depend on the content of a picture, not on its file name."""
     name = f"{place.file.hand}/{place.file.object}/{place.file.batch}"
     return int.from_bytes(hashlib.sha256(name.encode()).digest()[:8]), place.row
 
 
 def graspness(points: NDArray[Any], hands: NDArray[Any], *, touch_m: float = TOUCH_M) -> Floats:
-    """Share of the grasps whose hand touches a point.
+    """Compute the share of the grasps whose hand touches each point.
 
-    Wang et al. 2021 (Graspness Discovery in Clutters, eq. 1) count, of a parallel gripper's poses laid out around each
-    point, those that hold and are clear. A hand with fingers touches in several places, and its grasps are found, not
-    laid out: of the valid grasps of a scene, those count for a point that touch it.
+    Wang et al. 2021 (Graspness Discovery in Clutters, eq. 1) sample poses of a parallel gripper around each point and
+    count those that hold and are clear. A hand with fingers touches several places and its grasps are optimised, not
+    sampled. Here each point counts the valid grasps of its scene that touch it.
 
     Args:
         points: (P, 3) in the object's frame [m].
         hands: (K, H, 3) points on the surface of the hand in each grasp, in the same frame [m].
-        touch_m: largest distance of a touch [m]. It should be more than half the distance of the hand's points.
+        touch_m: largest distance of a contact [m]. It should exceed half the spacing of the hand's points.
 
     Returns:
-        (P,) between 0 and 1; 0 where there are no grasps.
+        (P,) values between 0 and 1; 0 if there are no grasps.
 
     Raises:
         InputError: SciPy is absent.
@@ -257,27 +256,27 @@ def graspness(points: NDArray[Any], hands: NDArray[Any], *, touch_m: float = TOU
 
 COLUMNS: Final = ("image/depth", "image/segmentation", "camera/intrinsics", "camera/extrinsics")
 _OBJECT: Final = 2
-#: Planes are fitted to noisy points in windows of 7 x 7 pixels, which are let reach this many deviations in depth.
+#: Planes are fitted to noisy points in windows of 7 x 7 pixels; the depth may differ by this many deviations.
 _RADIUS: Final = 3
 _DEVIATIONS: Final = 4.0
-#: Steepest surface within such a window: its depth grows by this many times the way across.
+#: Steepest surface in such a window: depth grows by at most this factor of the lateral distance.
 _SLOPE: Final = 3.0
 
 
 @dataclass(frozen=True)
 class CloudView:
-    """The columns `COLUMNS` of one picture, and what a camera makes of its depth."""
+    """Columns `COLUMNS` of one picture, and its depth as measured by a camera."""
 
     columns: Mapping[str, Array]
     noise: DepthNoise | None
     seen: Floats
-    """(H, W) depth as it is told [m]; not finite: nothing."""
+    """(H, W) measured depth [m]; not finite: no measurement."""
     angle: Floats | None
-    """(H, W) of incidence [rad]; None: without noise nobody asks."""
+    """(H, W) angle of incidence [rad]; None without noise, which alone needs it."""
 
     @classmethod
     def of(cls, columns: Mapping[str, Array], noise: DepthNoise | None, draw: np.random.Generator) -> CloudView:
-        """A picture; `draw` decides the noise."""
+        """Build a view of a picture; `draw` generates the noise."""
         depth = np.asarray(columns["image/depth"], float)
         k = np.asarray(columns["camera/intrinsics"], float)
         if noise is None:
@@ -286,7 +285,7 @@ class CloudView:
         return cls(columns, noise, noise.apply(depth, k, draw, angle=angle), angle)
 
     def pixels(self, *, whole: bool) -> tuple[Ints, Ints]:
-        """Rows and columns of what is seen of the object, or of the whole scene."""
+        """Return rows and columns of the pixels with depth of the object, or of the whole scene."""
         labels = self.columns["image/segmentation"]
         wanted = np.isfinite(self.seen) & ((labels > 0) if whole else (labels == _OBJECT))
         if self.noise is None:  # a pixel without neighbours has no normal
@@ -295,15 +294,15 @@ class CloudView:
         return row, column
 
     def points(self, row: Ints, column: Ints) -> Floats:
-        """(P, 3) of some pixels, in the frame of the table [m]."""
+        """Back-project pixels to measured points (P, 3) in the frame of the table [m]."""
         return transforms.apply(self._back, self._points[row, column])
 
     def true_points(self, row: Ints, column: Ints) -> Floats:
-        """The same without noise."""
+        """Back-project pixels to points (P, 3) without noise [m]."""
         return transforms.apply(self._back, self._true[row, column])
 
     def normals(self, row: Ints, column: Ints) -> Floats:
-        """(P, 3) unit normals of some pixels, toward the camera, in the frame of the table."""
+        """Return unit normals (P, 3) of pixels, toward the camera, in the frame of the table."""
         if self.noise is None or self.angle is None:
             return transforms.quat_rotate(self._back[3:], self._normals[row, column])
         z = self._points[row, column, 2]
@@ -312,12 +311,12 @@ class CloudView:
         return transforms.quat_rotate(self._back[3:], fitted)
 
     def is_object(self, row: Ints, column: Ints) -> NDArray[np.bool_]:
-        """(P,) whether pixels show the object."""
+        """Return (P,) whether pixels show the object."""
         return np.asarray(self.columns["image/segmentation"][row, column] == _OBJECT)
 
     @property
     def extrinsics(self) -> Floats:
-        """(4, 4) table to camera."""
+        """Extrinsics (4, 4), table to camera."""
         return np.asarray(self.columns["camera/extrinsics"], float)
 
     @property

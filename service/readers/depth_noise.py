@@ -1,17 +1,17 @@
-"""What a real depth camera makes of a perfect depth picture: noise, steps, bleeding edges, shadows and holes.
+"""Noise models of depth cameras: axial noise, quantisation, edge bleeding, shadows and holes.
 
-| effect | how | of |
+| effect | model | source |
 | --- | --- | --- |
-| noise along the axis | s(z, t) = a + b (z - c)^2 + e t^2 / (sqrt(z) (pi/2 - t)^2), t the angle of incidence | Nguyen |
-| noise of the disparity | d = f B / z + N(0, p), so that the depth's grows as z^2 p / (f B) | Intel |
-| steps | the disparity, or the depth, is a multiple of its step | Intel, Khoshelham, Microsoft |
-| bleeding edges | depth comes from a pixel N(0, l + m t / (pi/2 - t)) beside | Handa, Nguyen |
+| axial noise | s(z, t) = a + b (z - c)^2 + e t^2 / (sqrt(z) (pi/2 - t)^2), t the angle of incidence | Nguyen |
+| disparity noise | d = f B / z + N(0, p); the depth error grows as z^2 p / (f B) | Intel |
+| quantisation | disparity or depth is a multiple of its step | Intel, Khoshelham, Microsoft |
+| edge bleeding | depth comes from a pixel shifted by N(0, l + m t / (pi/2 - t)) | Handa, Nguyen |
 | flying points | a pixel on an edge mixes both depths | Toelgyessy |
-| shadows | what the second eye, or the projector, does not see | geometry; left-right check |
-| holes | angles past 80 degrees; nearer than the largest disparity searched; a share at random | Nguyen, Intel |
+| shadows | regions hidden from the second eye or the projector | geometry; left-right check |
+| holes | angles beyond 80 degrees; disparity beyond the search range; a random share | Nguyen, Intel |
 
-Not modelled: materials (glass, mirrors, black), interference of several cameras, multiple paths of light, a warped
-calibration, and that errors of neighbouring pixels resemble each other.
+Not modelled: materials (glass, mirrors, black), interference between cameras, multipath light, distorted calibration,
+and correlated errors of neighbouring pixels.
 
 Sources: Nguyen, Izadi, Lovell 2012, Modeling Kinect Sensor Noise (3DIMPVT), eq. 1-4; Khoshelham, Elberink 2012,
 Accuracy and Resolution of Kinect Depth Data (Sensors 12); Handa et al. 2014, A Benchmark for RGB-D Visual Odometry
@@ -39,21 +39,21 @@ Bools = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class DepthNoise:
-    """A depth camera. Lengths in pixels are those of its own sensor; they are carried over to the picture's."""
+    """Model of a depth camera. Lengths in pixels refer to its own sensor and are scaled to the picture."""
 
     focal_px: float
-    """Focal length of its own picture [px]."""
+    """Focal length of the sensor [px]."""
     baseline_m: float = 0.0
-    """From the eye to the second eye or the projector, along x; 0: it has none."""
+    """Distance from the eye to the second eye or the projector, along x; 0: none."""
     axial_m: float = 0.0
-    """Noise along the axis at the distance `axial_from_m` and nearer [m]."""
+    """Axial noise at distances up to `axial_from_m` [m]."""
     axial_square: float = 0.0
-    """Its growth with the square of the distance beyond [1/m]."""
+    """Growth of the axial noise with the square of the distance beyond [1/m]."""
     axial_slope: float = 0.0
-    """Its growth with the distance beyond."""
+    """Linear growth of the axial noise with the distance beyond."""
     axial_from_m: float = 0.0
     axial_angle: float = 0.0
-    """Its growth with the angle of incidence [m^1.5]."""
+    """Growth of the axial noise with the angle of incidence [m^1.5]."""
     disparity_px: float = 0.0
     disparity_step_px: float = 0.0
     depth_step_m: float = 0.0
@@ -63,18 +63,18 @@ class DepthNoise:
     mixed: bool = False
     """Pixels on an edge mix the depths on both of its sides."""
     steepest_deg: float = 80.0
-    """Past this angle of incidence nothing comes back."""
+    """Largest angle of incidence with a measurement."""
     most_disparity_px: float = np.inf
-    """Largest disparity it looks for."""
+    """Largest disparity of the search range."""
     dropout: float = 0.0
-    """Share of the pixels that are holes for no other reason."""
+    """Share of pixels that are holes at random."""
 
     def sigma(self, depth: Floats, angle: Floats) -> Floats:
-        """Standard deviation of the depth on a plane [m], steps included (as evenly spread: step^2 / 12).
+        """Return the standard deviation of depth on a plane [m]; quantisation adds variance step^2 / 12.
 
         Args:
             depth: along the axis [m].
-            angle: of incidence [rad].
+            angle: angle of incidence [rad].
         """
         total = self.axial(depth, angle) ** 2 + self.depth_step_m**2 / 12
         if self.baseline_m:
@@ -83,7 +83,7 @@ class DepthNoise:
         return np.sqrt(total)
 
     def axial(self, depth: Floats, angle: Floats) -> Floats:
-        """Noise along the axis without that of the disparity and without steps [m]."""
+        """Return the axial noise without disparity noise and quantisation [m]."""
         beyond = np.maximum(depth - self.axial_from_m, 0.0)
         found = self.axial_m + self.axial_slope * beyond + self.axial_square * beyond**2
         if self.axial_angle:
@@ -93,13 +93,13 @@ class DepthNoise:
     def apply(
         self, depth: NDArray[Any], k: Floats, draw: np.random.Generator, *, angle: Floats | None = None
     ) -> Floats:
-        """What the camera tells of a picture.
+        """Simulate the camera's measurement of a depth picture.
 
         Args:
-            depth: (H, W) true depth along the axis [m]; not finite: nothing there.
+            depth: (H, W) true depth along the axis [m]; not finite: no surface.
             k: (3, 3) intrinsics of the picture [px].
-            draw: of all that is random; the same generator gives the same picture.
-            angle: (H, W) of incidence [rad], where it is known already.
+            draw: random generator; the same generator gives the same picture.
+            angle: (H, W) angle of incidence [rad], if already computed.
 
         Returns:
             (H, W) depth [m]; nan: a hole.
@@ -134,7 +134,7 @@ class DepthNoise:
 
 
 def incidence(depth: Floats, k: Floats) -> Floats:
-    """(H, W) angle between the surface's normal and the ray to it [rad]; 0 where no normal can be told."""
+    """Compute the angle (H, W) between surface normal and ray [rad]; 0 where the normal is undefined."""
     points = back_project(k, depth)
     with np.errstate(invalid="ignore"):
         cosine = np.abs(np.einsum("hwc,hwc->hw", surface_normals(points), points)) / np.linalg.norm(points, axis=-1)
@@ -142,10 +142,10 @@ def incidence(depth: Floats, k: Floats) -> Floats:
 
 
 def shadows(depth: Floats, focal_baseline: float) -> Bools:
-    """(H, W) what an eye to the right, `focal_baseline` [px m] / depth [px] away in its picture, does not see.
+    """Find the pixels (H, W) hidden from a right eye; disparity [px] is `focal_baseline` [px m] / depth.
 
-    Each pixel is carried into the other picture, where the nearest surface stays. What is farther there than the
-    surface by more than a pixel of disparity was hidden, as a left-right check finds; so is what falls off its side.
+    Each pixel is projected into the other picture, where the nearest surface remains. Pixels more than one pixel of
+    disparity behind that surface are hidden, as a left-right check finds; so are pixels outside the picture.
     """
     height, width = depth.shape
     with np.errstate(divide="ignore"):
@@ -154,7 +154,7 @@ def shadows(depth: Floats, focal_baseline: float) -> Bools:
     left = np.floor(at - 0.5).astype(int)
     rows = np.broadcast_to(np.arange(height)[:, None], left.shape)
     other = np.zeros((height, width))
-    for column in (left, left + 1):  # a surface leaves no gap between pixels that lie next to each other
+    for column in (left, left + 1):  # a surface leaves no gap between adjacent pixels
         inside = (column >= 0) & (column < width)
         np.maximum.at(other, (rows[inside], column[inside]), disparity[inside])
     nearest = np.clip(np.floor(at).astype(int), 0, width - 1)
@@ -162,7 +162,7 @@ def shadows(depth: Floats, focal_baseline: float) -> Bools:
 
 
 def _steepness(angle: Floats) -> Floats:
-    """t / (pi/2 - t), the form in which Nguyen et al. found angles to matter; as at 89 degrees beyond."""
+    """Return t / (pi/2 - t), the angular term of Nguyen et al., constant beyond 89 degrees."""
     bounded = np.minimum(angle, np.radians(89.0))
     return np.asarray(bounded / (np.pi / 2 - bounded))
 
@@ -176,7 +176,7 @@ def _beside(depth: Floats, sigma_px: Floats, draw: np.random.Generator) -> Float
 
 
 def _mixed(depth: Floats, draw: np.random.Generator) -> Floats:
-    """Where the next pixel to the right or below lies past an edge, its light falls into this one, in any share."""
+    """Mix a random share of the right or lower neighbour's depth into each pixel on an edge."""
     found = depth
     for axis in (1, 0):
         after = np.concatenate(
@@ -221,7 +221,7 @@ NOISES: Final[Mapping[str, DepthNoise]] = MappingProxyType(
 
 
 def noise_of(given: str | DepthNoise | None) -> DepthNoise | None:
-    """The noise of that name; InputError if there is none."""
+    """Look up a noise model by name; InputError if there is none."""
     if given is None or isinstance(given, DepthNoise):
         return given
     if given not in NOISES:

@@ -1,4 +1,4 @@
-"""Which shards there are, and where: files on this machine, or a job or snapshot in a store."""
+"""Location of shards: local files, or a job or snapshot in a store."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _STAGES: Final = {kind: stage for stage, kind in names.SHARD_KINDS.items()}
 
 @dataclass(frozen=True)
 class ShardFile:
-    """A shard: on this machine under `path`, or in a store under `key`."""
+    """A shard: a local file under `path`, or an object of a store under `key`."""
 
     id: str
     kind: ShardKind
@@ -45,13 +45,13 @@ class ShardFile:
 
 @dataclass(frozen=True)
 class Shards:
-    """The shards of a dataset, in a stated order: by hand, object, batch, id."""
+    """The shards of a dataset, ordered by hand, object, batch and id."""
 
     files: tuple[ShardFile, ...]
     store: Store | None = None
     cache: ShardCache | None = None
     stream: bool = False
-    """Pictures of the store are read by ranges, and not kept here."""
+    """Pictures of the store are read by byte ranges and not cached."""
     _by_id: dict[str, ShardFile] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
@@ -64,17 +64,17 @@ class Shards:
         return iter(self.files)
 
     def of(self, kind: str) -> tuple[ShardFile, ...]:
-        """Shards of one kind."""
+        """Return the shards of one kind."""
         return tuple(file for file in self.files if file.kind == kind)
 
     def by_id(self, shard: str) -> ShardFile:
-        """A shard by its id; NotFoundError if it is not among these."""
+        """Return a shard by its id; NotFoundError if it is not among these."""
         if shard not in self._by_id:
             raise NotFoundError(f"shard {shard[:12]} is not among the {len(self)} shards given")
         return self._by_id[shard]
 
     def only(self, *, hands: Iterable[str] = (), objects: Iterable[str] = ()) -> Shards:
-        """Those of some hands and objects; by default of all."""
+        """Select the shards of some hands and objects; by default all."""
         of_hands, of_objects = set(hands), set(objects)
         kept = (
             file
@@ -84,21 +84,21 @@ class Shards:
         return Shards(tuple(kept), self.store, self.cache, self.stream)
 
     def streamed(self, file: ShardFile) -> bool:
-        """Whether a shard is read by ranges."""
+        """Check whether a shard is read by byte ranges."""
         return self.stream and file.path is None and file.kind == "views"
 
     @cached_property
     def ranges(self) -> RangeReader:
-        """What reads the shards that are `streamed`."""
+        """Reader of the shards that are `streamed`."""
         assert self.store is not None, "a shard without a path comes from a store"
         return RangeReader(self.store)
 
     @contextmanager
     def opened(self, file: ShardFile, *, whole: bool = False) -> Iterator[h5py.File]:
-        """The HDF5 file of a shard; `whole`: of one that is streamed, pictures will be wanted too.
+        """Open the HDF5 file of a shard; `whole`: pictures of a streamed shard are needed too.
 
         Raises:
-            what `path`, `open_shard` and `RangeReader.open` raise.
+            Exception: see `path`, `open_shard` and `RangeReader.open`.
         """
         if self.streamed(file):
             with self.ranges.open(file.key, whole=whole) as found:
@@ -108,11 +108,11 @@ class Shards:
                 yield found
 
     def path(self, file: ShardFile) -> Path:
-        """The file on this machine, fetched where it is not there yet, and checked.
+        """Return the local file, downloaded if necessary, and verified.
 
         Raises:
-            DamagedShard: it is not what its checksum says.
-            and what `ShardCache.fetch` raises.
+            DamagedShard: it does not match its checksum.
+            Exception: see `ShardCache.fetch`.
         """
         if file.path is not None:
             check_file(file.path)
@@ -131,22 +131,22 @@ def open_shards(
     cache_bytes: int = DEFAULT_BYTES,
     stream: bool = False,
 ) -> Shards:
-    """The shards of a folder (searched whole), of files, or of a job or dataset in a store.
+    """Find the shards of a folder (searched recursively), of files, or of a job or dataset in a store.
 
     Args:
         source: a folder, a file, several of them, or a store or its URL (`file://`, `s3://`, `gs://`, `az://`).
-        job: id of a job in the store: its finished shards.
-        dataset: name of a dataset in the store: the shards of its newest snapshot.
+        job: id of a job in the store; selects its finished shards.
+        dataset: name of a dataset in the store; selects the shards of its newest snapshot.
         snapshot: digest of another snapshot of that dataset.
         cache: folder for files of a store; by default `$XDG_CACHE_HOME/graspd/shards`.
-        cache_bytes: how much of them to keep [bytes].
-        stream: read pictures from the store by ranges of bytes, as they are wanted, and keep none here. Their bytes
-            are checked as they are unpacked, not against the SHA-256 of the shard.
+        cache_bytes: size limit of the cache [bytes].
+        stream: read pictures from the store by byte ranges on demand, without a cache. Their bytes are checked when
+            they are unpacked, not against the SHA-256 of the shard.
 
     Raises:
         NotFoundError: no such file, job, dataset or snapshot.
-        InputError: neither job nor dataset is named for a store, or a file is no shard.
-        DamagedShard: a file of a folder is not what its checksum says.
+        InputError: a store needs a job or dataset, or a file is not a shard.
+        DamagedShard: a file of a folder does not match its checksum.
         StoreUnavailable: the store does not answer.
     """
     if isinstance(source, Store) or (isinstance(source, str) and "://" in source):

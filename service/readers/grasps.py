@@ -1,4 +1,4 @@
-"""Grasps one by one or as arrays, from base shards."""
+"""Grasps of base shards, one by one or as arrays."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from graspd.service.store.columns import SCHEMAS
 from graspd.service.store.shards import open_shard, read_column
 
 Array = NDArray[Any]
-#: From the columns of one base shard to a mask (N,) of the grasps to keep.
+#: Maps the columns of one base shard to a mask (N,) of the selected grasps.
 Where = Callable[[Mapping[str, Array]], Array]
 
 #: Columns of a grasp sample.
@@ -32,14 +32,14 @@ DEFAULT_COLUMNS: Final = (
     "quality/penetration_depth_mm",
     "quality/valid",
 )
-#: Shards kept in memory: about 0.1 MB each.
+#: Number of shards cached in memory: about 0.1 MB each.
 _KEPT: Final = 256
 
 
 class Grasps(Sequence[dict[str, Any]]):
-    """Grasps of base shards. `grasps[i]` is a dictionary of the columns' rows with `hand`, `object`, `shard_id`, `row`.
+    """Grasps of base shards. `grasps[i]` holds column rows and `hand`, `object`, `shard_id`, `row`.
 
-    Columns have the names, units and frames of docs/reference/dataset.md. Swept metrics have one value for each contact
+    Names, units and frames of columns are those of docs/reference/dataset.md. Swept metrics have one value per contact
     threshold of the shard.
     """
 
@@ -52,17 +52,17 @@ class Grasps(Sequence[dict[str, Any]]):
         unvalidated: bool = False,
         where: Where | None = None,
     ) -> None:
-        """Looks into every base shard once, for the rows to keep.
+        """Read every base shard once to select the rows.
 
         Args:
-            shards: see `open_shards`; scene and views shards among them are passed over.
-            columns: what a sample holds.
-            valid: only valid grasps: feasible ones of which a validator said that they hold.
-            unvalidated: instead of them only those that are feasible and that are not validated.
-            where: keeps those of them for which it answers True.
+            shards: see `open_shards`; scene and views shards are ignored.
+            columns: columns of a sample.
+            valid: select only valid grasps: feasible and held by a validator.
+            unvalidated: select instead only feasible grasps without validation.
+            where: further selection: a function of the columns that returns a mask.
 
         Raises:
-            InputError: an unknown column, or a mask of another length.
+            InputError: unknown column, or a mask of wrong length.
         """
         if unknown := set(columns) - set(SCHEMAS["base"]):
             raise InputError(f"base shards have no column {sorted(unknown)[0]!r}; docs/reference/dataset.md lists them")
@@ -89,11 +89,11 @@ class Grasps(Sequence[dict[str, Any]]):
 
     @property
     def ends(self) -> NDArray[np.int64]:
-        """(shards,) index after each base shard's last grasp, for readers that keep a shard's grasps together."""
+        """Index (shards,) after the last grasp of each base shard, for readers that group grasps by shard."""
         return self._ends
 
     def joint_names(self, hand: str) -> list[str]:
-        """Joints of a hand in the order of `joint_positions`; InputError if no shard is of this hand."""
+        """Return joint names in the order of `joint_positions`; InputError if no shard has the hand."""
         for file in self._files:
             if file.hand == hand:
                 with open_shard(self.shards.path(file)) as opened:
@@ -101,10 +101,10 @@ class Grasps(Sequence[dict[str, Any]]):
         raise InputError(f"none of the shards is of the hand {hand!r}")
 
     def arrays(self, *columns: str) -> dict[str, Array]:
-        """Columns of all grasps, by default those of the samples; `hand` and `object` name each row's.
+        """Return columns of all grasps, by default those of the samples; `hand` and `object` name each row's.
 
         Raises:
-            InputError: hands of different numbers of joints, or different thresholds, do not fit into one array.
+            InputError: numbers of joints or thresholds differ, so the values do not fit into one array.
         """
         wanted = columns or self.columns
         parts: dict[str, list[Array]] = {name: [] for name in (*wanted, "hand", "object")}

@@ -1,4 +1,4 @@
-"""Pictures with the grasps that fit their scene, from views, scene and base shards."""
+"""Pictures with the grasps of their scene, from views, scene and base shards."""
 
 from __future__ import annotations
 
@@ -33,23 +33,23 @@ DEFAULT_COLUMNS: Final = (
     "box/bounding_box_2d_tight",
 )
 _KEPT: Final = 64
-#: Shards of which it is remembered where their pictures lie: about 1 kB each.
+#: Number of cached row tables of shards: about 1 kB each.
 _TABLES: Final = 4096
 
 
 @dataclass(frozen=True)
 class PictureAddress:
-    """Where a picture lies."""
+    """Location of a picture."""
 
     file: ShardFile
     scene_shard: str
-    """Id of the scene or base shard with its scenes."""
+    """Id of the scene shard, or of the base shard with its scenes."""
     scene: int
     row: int
 
     @property
     def names(self) -> dict[str, Any]:
-        """What samples say of where they come from."""
+        """Columns of a sample that identify its source."""
         return {
             "hand": self.file.hand,
             "object": self.file.object,
@@ -60,18 +60,18 @@ class PictureAddress:
 
 
 class Pictures(Sequence[dict[str, Any]]):
-    """Pictures of views shards. `pictures[i]` is a dictionary of the columns' rows and of the grasps of its scene.
+    """Pictures of views shards. `pictures[i]` is a dictionary of column rows and the grasps of its scene.
 
-    The grasps of the picture's scene stand in arrays of K rows; K differs from scene to scene and may be 0:
+    The grasps are arrays of K rows; K differs between scenes and may be 0:
 
         grasp/hand_pose (K, 7) in the camera frame [m], quaternion w x y z
         grasp/joint_positions (K, J) [rad or m]
         grasp/base_row (K,) row in the base shard `base_id`
         quality/epsilon and other `grasp_quality` columns (K, ...)
 
-    `object/pose` (7,) is the object's frame in the camera's.
+    `object/pose` (7,) is the pose of the object's frame in the camera frame.
 
-    The left eye of a stereo pair stands before its right eye.
+    In a stereo pair the left eye comes before the right.
     """
 
     def __init__(
@@ -87,16 +87,16 @@ class Pictures(Sequence[dict[str, Any]]):
     ) -> None:
         """
         Args:
-            shards: views shards, and the scene and base shards they were made of.
-            columns: what a sample holds of its picture.
-            grasp_quality: base columns of its grasps.
-            clear: only grasps that are clear of the table, and of neighbours, in this scene.
-            valid: only valid grasps; False: all that the base shards hold.
-            unvalidated: instead of valid ones only those that are feasible and that are not validated.
+            shards: views shards, and the scene and base shards they were made from.
+            columns: columns of the picture in a sample.
+            grasp_quality: base columns of the grasps.
+            clear: only grasps that are clear of table and neighbours in this scene.
+            valid: only valid grasps; False: all grasps of the base shards.
+            unvalidated: select instead only feasible grasps without validation.
             with_grasps_only: leave out pictures of scenes without a grasp.
 
         Raises:
-            InputError: an unknown column.
+            InputError: unknown column.
             NotFoundError: the scene or base shard of a views shard is not among the shards.
         """
         if unknown := set(columns) - set(SCHEMAS["views"]):
@@ -127,14 +127,14 @@ class Pictures(Sequence[dict[str, Any]]):
 
     @property
     def places(self) -> Sequence[PictureAddress]:
-        """Where each picture lies."""
+        """Locations of the pictures."""
         return self._places
 
     def columns_of(self, place: PictureAddress, columns: Iterable[str]) -> dict[str, Array]:
-        """Some columns of one picture.
+        """Read columns of one picture.
 
         Raises:
-            DamagedShard: they are not what was written.
+            DamagedShard: the stored data does not match its checksum.
         """
         file, row, wanted = place.file, place.row, list(columns)
         if not self.shards.streamed(file):
@@ -146,11 +146,11 @@ class Pictures(Sequence[dict[str, Any]]):
         )
 
     def scenes_of(self, place: PictureAddress) -> Scenes:
-        """The scenes of the picture's shard with the grasps that this reader keeps."""
+        """Return the scenes of the picture's shard with the selected grasps."""
         return self._scenes_of(place.scene_shard)
 
     def clouds(self, points: int = 1024, **options: Any) -> Clouds:
-        """The pictures as point clouds with the labels of their scenes; for the options see `Clouds`."""
+        """Return the pictures as labelled point clouds; see `Clouds` for the options."""
         from graspd.service.readers.clouds import Clouds
 
         return Clouds(self, points, **options)
@@ -158,7 +158,7 @@ class Pictures(Sequence[dict[str, Any]]):
     def _add(self, file: ShardFile, *, with_grasps_only: bool) -> None:
         with self.shards.opened(file) as opened:
             scenes = np.asarray(opened["camera/scene_index"])
-            # Grasps that were planned in their scenes bring these along in their base shard.
+            # Grasps planned in scenes have these in their base shard.
             scene_shard = str(opened.attrs.get("base_shard") or opened.attrs.get("scene_shard") or "")
             if not scene_shard:
                 raise InputError(
@@ -184,7 +184,7 @@ class Pictures(Sequence[dict[str, Any]]):
 
     def _scenes_of(self, shard: str) -> Scenes:
         found = self._scenes.get(shard)
-        if found is None:  # threads that meet here make it twice, and both have it
+        if found is None:  # concurrent threads may both build it; either result is right
             found = self._scenes[shard] = Scenes(self.shards, shard, self._quality, **self._which)
             if len(self._scenes) > _KEPT:
                 self._scenes.popitem(last=False)
@@ -192,7 +192,7 @@ class Pictures(Sequence[dict[str, Any]]):
 
 
 class Scenes:
-    """The scenes of one shard with their grasps: of a scene shard, or of a base shard with grasps planned in scenes.
+    """Scenes of one shard with their grasps: a scene shard, or a base shard with grasps planned in scenes.
 
     `base` is the base shard of the grasps, `base_id` its id.
     """
@@ -227,18 +227,18 @@ class Scenes:
         return len(self._of(scene))
 
     def object_pose(self, scene: int) -> NDArray[np.float64]:
-        """(7,) the object at rest, in the frame of the table."""
+        """Return the rest pose (7,) of the object in the frame of the table."""
         return self._object[scene]
 
     def base_rows(self, scene: int) -> NDArray[np.intp]:
-        """(K,) rows in the base shard of the grasps kept in one scene."""
+        """Return the base-shard rows (K,) of the grasps selected in one scene."""
         return self._row[self._of(scene)]
 
     def _of(self, scene: int) -> NDArray[np.intp]:
         return np.flatnonzero(self._scene == scene)
 
     def grasps(self, scene: int, extrinsics: NDArray[np.float64]) -> dict[str, Any]:
-        """Of one scene, in the frame of the camera with these extrinsics (4, 4)."""
+        """Return the grasps of one scene in the frame of the camera with these extrinsics (4, 4)."""
         rows, camera = self._of(scene), transforms.pose_from_matrix(extrinsics)
         pose = transforms.compose(camera, self._pose[rows])
         found: dict[str, Any] = {"grasp/hand_pose": pose, "grasp/base_row": self._row[rows], "base_id": self.base_id}

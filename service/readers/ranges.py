@@ -1,9 +1,8 @@
-"""Pictures of a store by ranges of bytes: rows of columns without the HDF5 library, read ahead, nothing put on the
-disk.
+"""Reader of pictures in a store by byte ranges: read-ahead, no HDF5 library, no disk cache.
 
-A picture is one chunk of its column, packed by zlib. Opening a file and its datasets costs as much as unpacking a
-picture does, and the library lets one thread work at a time; bytes are read and unpacked by any number of threads.
-What was packed says by its checksum (Adler-32) whether it is what was written.
+A picture is one zlib-compressed chunk of its column. Opening a file and its datasets costs as much as unpacking a
+picture, and the HDF5 library runs one thread at a time. Byte ranges can be read and unpacked by any number of threads.
+The checksum of the compressed data (Adler-32) shows damage.
 """
 
 from __future__ import annotations
@@ -35,23 +34,23 @@ Range = tuple[int, int]
 
 Span = tuple[int, memoryview]
 
-"""Offset, and the bytes from there on."""
+"""Offset and the bytes from there."""
 
-#: Bytes of one request, at most, where pictures are read in turn; a shard no larger than this is read whole.
+#: Largest request when pictures are read in sequence [bytes]; a smaller shard is read whole.
 AHEAD_BYTES: Final = 4 << 20
-#: Bytes that are held of all shards together.
+#: Memory limit for the bytes of all shards [bytes].
 HELD_BYTES: Final = 64 << 20
 _OBJECTS: Final = 256
-#: Ranges with no more than this between them are one request [bytes]: that much costs less than a request.
+#: Ranges at most this far apart are merged into one request [bytes]: reading the gap costs less than a request.
 GAP_BYTES: Final = 1 << 16
-#: Of what HDF5 says of itself, so much is read at once [bytes]; it lies at the beginning and here and there.
+#: Block size for HDF5 metadata [bytes], which lies at the beginning and scattered in the file.
 _BLOCK_BYTES: Final = 1 << 14
-#: Threads ask for neighbouring pictures in nearly the order in which these are wanted.
+#: Threads request neighbouring pictures nearly in order; this is the tolerance in rows.
 _NEARLY: Final = 16
 
 
 class RangeReader:
-    """Ranges of the objects of a store. Safe between threads; a copy in another process begins with nothing held."""
+    """Byte ranges of the objects of a store. Thread-safe; a copy in another process starts empty."""
 
     def __init__(self, store: Store) -> None:
         self._store, self._process = store, os.getpid()
@@ -63,14 +62,14 @@ class RangeReader:
 
     @contextmanager
     def open(self, key: str, *, whole: bool) -> Iterator[h5py.File]:
-        """The HDF5 file of a shard.
+        """Open the HDF5 file of a shard.
 
         Args:
-            whole: pictures will be wanted as well: a small shard is read whole.
+            whole: pictures are needed as well; a small shard is read whole.
 
         Raises:
             InputError: not HDF5, or this process was forked, see `check_not_forked`.
-            DamagedShard: it is gone, or cannot be read, here or in the body.
+            DamagedShard: it is missing or unreadable, here or in the body.
             StoreUnavailable: the store does not answer.
         """
         held = self._of(key)
@@ -89,8 +88,8 @@ class RangeReader:
         except GraspdError as error:
             if opened and source.failed is None:
                 raise
-            # HDF5 only says that it could not read; why, the store said. The error is a new one: who kept the old one
-            # would keep what HDF5 could not open, which crashes when the process ends (h5py 3.16).
+            # HDF5 reports only a failed read; the store's error has the reason. A new error is raised, because a
+            # reference to the old one keeps objects that HDF5 could not open, which crashes at exit (h5py 3.16).
             told = source.failed or error
             problem = type(told)(*told.args)
             del told
@@ -98,14 +97,14 @@ class RangeReader:
             raise problem
 
     def read(self, key: str, wanted: Sequence[Range], row: int, further: Callable[[int], Sequence[Range]]) -> list[Any]:
-        """The bytes of some ranges, in their order.
+        """Return the bytes of some ranges, in their order.
 
         Args:
-            row: which of the object's rows they are of.
-            further: from the number of another row to its ranges; none past the last.
+            row: row of the object to which the ranges belong.
+            further: maps another row number to its ranges; empty after the last row.
 
         Raises:
-            DamagedShard: the object is gone.
+            DamagedShard: the object is missing.
             InputError: this process was forked, see `check_not_forked`.
             StoreUnavailable: the store does not answer.
         """
@@ -125,7 +124,7 @@ class RangeReader:
         return found
 
     def forget(self) -> None:
-        """Hold nothing any more."""
+        """Release all cached bytes."""
         with self._lock:
             self._objects.clear()
 
@@ -164,13 +163,13 @@ class RangeReader:
 
 @dataclass
 class _Object:
-    """What is held of an object."""
+    """Cached bytes of an object."""
 
     lock: threading.Lock = field(default_factory=threading.Lock)
     size: int = 0
     spans: list[Span] = field(default_factory=list)
     row: int | None = None
-    """Which was asked for last."""
+    """Last requested row."""
 
     @property
     def bytes(self) -> int:
@@ -178,7 +177,7 @@ class _Object:
 
 
 class _Source(io.RawIOBase):
-    """An object as a file that HDF5 reads here and there, in part held already."""
+    """File object for HDF5 over an object of the store, partly cached."""
 
     def __init__(self, size: int, spans: Sequence[Span], get: Callable[[Range], Span]) -> None:
         super().__init__()
@@ -207,7 +206,7 @@ class _Source(io.RawIOBase):
             try:
                 self._spans.append(self._get((first, last - first)))
             except GraspdError as error:
-                # HDF5 would print an error of this function and go on: it gets zeros, which it cannot read.
+                # HDF5 would print an exception of this function and continue: return zeros, which it cannot parse.
                 self.failed = error.with_traceback(None)
                 self._spans.append((first, memoryview(bytes(last - first))))
         data = _cut(self._spans, wanted)
@@ -217,7 +216,7 @@ class _Source(io.RawIOBase):
 
 
 def joined(ranges: Sequence[Range]) -> list[Range]:
-    """Ranges in order, those with little between them as one."""
+    """Sort ranges and merge those with small gaps."""
     found: list[Range] = []
     for start, length in sorted(ranges):
         if found and start - sum(found[-1]) <= GAP_BYTES:
@@ -233,13 +232,13 @@ def _covers(spans: Sequence[Span], one: Range) -> bool:
 
 
 def _cut(spans: Sequence[Span], one: Range) -> memoryview:
-    """The bytes of a range from the span with most of them; fewer than asked for where the object ends too early."""
+    """Return the bytes of a range from the span that covers most of it; fewer if the object ends early."""
     parts = [data[one[0] - start : sum(one) - start] for start, data in spans if start <= one[0]]
     return max(parts, key=len, default=memoryview(b""))
 
 
 Array = NDArray[Any]
-#: (offset, length) pairs [bytes] to their bytes.
+#: Maps (offset, length) pairs [bytes] to their bytes.
 ReadRanges = Callable[[list[tuple[int, int]]], Sequence[bytes | memoryview]]
 
 _SHUFFLE: Final = h5py.h5z.FILTER_SHUFFLE
@@ -248,42 +247,42 @@ _DEFLATE: Final = h5py.h5z.FILTER_DEFLATE
 
 @dataclass(frozen=True)
 class _Packed:
-    """A column of which each row is a chunk of its own."""
+    """A column with one chunk per row."""
 
     shape: tuple[int, ...]
-    """Of a row."""
+    """Shape of a row."""
     dtype: np.dtype[Any]
     shuffled: bool
     places: NDArray[np.int64]
     """(rows, 2) offset and length in the file [bytes]."""
 
     def unpack(self, data: bytes | memoryview) -> Array:
-        """The row that these bytes are; zlib.error, ValueError: they are none."""
+        """Decompress a row; zlib.error or ValueError if the bytes are not one."""
         raw = np.frombuffer(zlib.decompress(data), np.uint8)
         size = self.dtype.itemsize
         if not self.shuffled or size == 1:
             return raw.copy().view(self.dtype).reshape(self.shape)
         turned = np.empty((len(raw) // size, size), np.uint8)
-        for byte, column in enumerate(raw.reshape(size, -1)):  # one by one: twice as fast as transposing
+        for byte, column in enumerate(raw.reshape(size, -1)):  # byte by byte: twice as fast as transposing
             turned[:, byte] = column
         return turned.reshape(-1).view(self.dtype).reshape(self.shape)
 
 
 @dataclass(frozen=True)
 class RowTable:
-    """Some columns of a shard: where the rows of the packed ones lie, and the values of all others."""
+    """Columns of a shard: file positions of the rows of packed columns, values of all others."""
 
     name: str
-    """What errors call the shard."""
+    """Name of the shard in error messages."""
     packed: dict[str, _Packed]
     held: dict[str, Array]
 
     @classmethod
     def of(cls, file: h5py.File, columns: Iterable[str], name: str) -> RowTable:
-        """The columns of an open shard; of others than packed pictures the values are read and checked.
+        """Read the table of an open shard; values of columns that are not packed are read and checked.
 
         Raises:
-            DamagedShard: values are not those that were written.
+            DamagedShard: values do not match their checksum.
         """
         packed, held = {}, {}
         for column in columns:
@@ -296,23 +295,23 @@ class RowTable:
 
     @property
     def columns(self) -> set[str]:
-        """What it knows of."""
+        """Names of the known columns."""
         return {*self.packed, *self.held}
 
     def has(self, columns: Iterable[str]) -> bool:
-        """Whether it knows of all of these."""
+        """Check whether all these columns are known."""
         return all(name in self.packed or name in self.held for name in columns)
 
     def ranges(self, row: int, columns: Iterable[str]) -> list[tuple[int, int]]:
-        """Offset and length [bytes] in the file of a row of those columns that are packed; none past the last row."""
+        """Return offset and length [bytes] of a row in each packed column; empty after the last row."""
         found = (self.packed[name].places for name in columns if name in self.packed)
         return [(int(places[row, 0]), int(places[row, 1])) for places in found if row < len(places)]
 
     def row(self, row: int, columns: Iterable[str], read: ReadRanges) -> dict[str, Array]:
-        """One row of some columns, for the caller to keep.
+        """Return one row of some columns; the caller owns the arrays.
 
         Raises:
-            DamagedShard: bytes are missing, or are not those that were written.
+            DamagedShard: bytes are missing or do not match their checksum.
         """
         wanted = list(columns)
         packed = [name for name in wanted if name in self.packed]
@@ -327,7 +326,7 @@ class RowTable:
 
 
 def read_file(path: Path, ranges: list[tuple[int, int]]) -> list[bytes]:
-    """Bytes of a file."""
+    """Read byte ranges of a file."""
     handle = os.open(path, os.O_RDONLY)
     try:
         return [os.pread(handle, length, start) for start, length in ranges]
@@ -336,7 +335,7 @@ def read_file(path: Path, ranges: list[tuple[int, int]]) -> list[bytes]:
 
 
 def _packed(dataset: h5py.Dataset) -> _Packed | None:
-    """A column as `write_shard` packs pictures; None: it lies in the file in another way."""
+    """Return a column packed as `write_shard` packs pictures; None if its layout differs."""
     if dataset.chunks is None or dataset.chunks != (1, *dataset.shape[1:]):
         return None
     facts = dataset.id.get_create_plist()
@@ -348,7 +347,7 @@ def _packed(dataset: h5py.Dataset) -> _Packed | None:
     rest = (0,) * (dataset.ndim - 1)
     for row in range(rows):
         found = dataset.id.get_chunk_info_by_coord((row, *rest))
-        if found.filter_mask:  # a filter was left out for this chunk
+        if found.filter_mask:  # a filter was skipped for this chunk
             return None
         places[row] = found.byte_offset, found.size
     return _Packed(dataset.shape[1:], dataset.dtype, filters[0] == _SHUFFLE, places)

@@ -1,4 +1,4 @@
-"""Shards as PyTorch datasets. Importing this module imports torch: `pip install torch`, in whatever build you need.
+"""PyTorch datasets of shards. Importing this module imports torch; install any build of it.
 
 from torch.utils.data import DataLoader
 from graspd.service.readers import Pictures, open_shards
@@ -27,24 +27,24 @@ Sample = dict[str, Any]
 
 
 def tensors(sample: Sample) -> Sample:
-    """The sample with arrays as tensors: float64 as float32, for networks; words stay words."""
+    """Convert the arrays of a sample to tensors: float64 to float32 for networks; strings stay strings."""
     return {name: _tensor(value) for name, value in sample.items()}
 
 
 def collate(samples: Sequence[Sample]) -> Sample:
-    """One batch: values are stacked, but the grasps of each picture's or cloud's scene stay a list of tensors."""
+    """Collate one batch by stacking; grasps of a picture's or cloud's scene stay a list of tensors."""
     pictures = "grasp/base_row" in samples[0]
     batch: Sample = {}
     for name in samples[0]:
         values = [sample[name] for sample in samples]
-        # Scenes may have equally many grasps by chance; the batch must not change its kind for that.
+        # Scenes may have equal numbers of grasps by chance; the type of the batch must not depend on that.
         listed = pictures and name.startswith(OF_GRASPS)
         batch[name] = values if listed else default_collate(values)
     return batch
 
 
 class Samples(Dataset[Sample]):
-    """`Grasps`, `Pictures` or `Clouds` as a map-style dataset; a `DataLoader` may shuffle it and read in processes."""
+    """Map-style dataset of `Grasps`, `Pictures` or `Clouds` for a `DataLoader`, also with processes."""
 
     def __init__(self, source: Sequence[Sample], transform: Callable[[Sample], Sample] = tensors) -> None:
         self._source, self._transform = source, transform
@@ -57,10 +57,10 @@ class Samples(Dataset[Sample]):
 
 
 class ShuffledShards(IterableDataset[Sample]):
-    """Grasps of any number of shards, in random order, read shard by shard.
+    """Grasps of any number of shards in random order, read shard by shard.
 
-    The order of the shards is drawn anew each epoch, shards are dealt to the processes of a `DataLoader` and to the
-    ranks of a distributed run, and a buffer mixes what comes from several shards.
+    Each epoch shuffles the shards anew and distributes them over the processes of a `DataLoader` and the ranks of a
+    distributed run. A buffer mixes grasps of several shards.
     """
 
     def __init__(
@@ -80,15 +80,15 @@ class ShuffledShards(IterableDataset[Sample]):
         """
         Args:
             shards: see `open_shards`.
-            columns: what a sample holds.
-            valid: only valid grasps.
-            unvalidated: instead of them only those that are feasible and that are not validated.
-            where: keeps those of them for which it answers True.
-            buffer: grasps among which the next one is drawn.
-            seed: of the order; `epoch` changes it.
-            rank: this process's number in a distributed run.
-            ranks: processes of the distributed run.
-            transform: from a sample of arrays to what the loader should collate.
+            columns: columns of a sample.
+            valid: select only valid grasps.
+            unvalidated: select instead only feasible grasps without validation.
+            where: further selection: a function of the columns that returns a mask.
+            buffer: number of grasps among which the next one is drawn.
+            seed: seed of the order; `epoch` changes it.
+            rank: rank of this process in a distributed run.
+            ranks: number of processes of the distributed run.
+            transform: maps a sample of arrays to the value that the loader collates.
         """
         self.epoch = 0
         self._shards, self._columns, self._where = shards, tuple(columns), where

@@ -1,4 +1,4 @@
-"""The way of a grasp as a base shard tells it: from the standoff, or the pregrasp, to the lift, as postures in turn."""
+"""Trajectory of a grasp from a base shard: postures from the standoff, or the pregrasp, to the lift."""
 
 from __future__ import annotations
 
@@ -15,28 +15,28 @@ from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.model.transforms import Floats, slerp
 from graspd.service.store.shards import Shard
 
-#: Names of the postures at which something begins or ends. What lies between them has none.
+#: Names of the stops: postures where a phase begins or ends. Waypoints between them have no name.
 STOPS: Final = ("standoff", "pregrasp", "grasp", "squeeze", "lift")
 
 
 @dataclass(frozen=True)
 class Waypoint:
-    """One posture of the way, in the frame in which the object rested."""
+    """One posture of the trajectory, in the frame of the object's rest pose."""
 
     name: str
-    """One of `STOPS`, or nothing."""
+    """One of `STOPS`, or empty."""
     hand_pose: Floats
     """(7,) root link: x y z [m], unit quaternion w x y z."""
     joint_positions: Floats
     """(J,) [rad or m]"""
     carried: Floats
-    """(3,) how far the object was carried from its rest [m]."""
+    """(3,) displacement of the carried object from rest [m]."""
 
 
 def way_of(shard: Shard, row: int) -> list[Waypoint]:
-    """The way of a grasp: pregrasp, grasp, squeeze, and what the shard says of the approach and the lift.
+    """Return the trajectory of a grasp: pregrasp, grasp, squeeze; approach and lift if present.
 
-    The last waypoint of an approach and the pregrasp have one hand pose: there the open fingers take the pregrasp.
+    The last waypoint of an approach and the pregrasp share a hand pose; there the open fingers move to the pregrasp.
     """
     rest = np.zeros(3)
 
@@ -56,13 +56,13 @@ def way_of(shard: Shard, row: int) -> list[Waypoint]:
 
 
 def stop_places(way: Sequence[Waypoint]) -> Floats:
-    """(W,) where each waypoint stands on a slider: stops at 0, 1, 2, ..., others evenly between two of them."""
+    """Return the slider position (W,) of each waypoint: stops at 0, 1, 2, ..., others evenly between."""
     stops = [k for k, point in enumerate(way) if point.name]
     return np.interp(np.arange(len(way)), stops, np.arange(len(stops)))
 
 
 def point_at(way: Sequence[Waypoint], place: float) -> Waypoint:
-    """The posture at a place of the slider: straight for positions and joints, by the shorter arc for the rotation."""
+    """Interpolate a posture at a slider position: linear for positions and joints, slerp for rotation."""
     places = stop_places(way)
     place = float(np.clip(place, places[0], places[-1]))
     k = min(int(np.searchsorted(places, place, side="right")) - 1, len(way) - 2)
@@ -79,17 +79,17 @@ def point_at(way: Sequence[Waypoint], place: float) -> Waypoint:
 
 
 def wrists_of(shard: Shard, rows: NDArray[np.integer[Any]]) -> Floats | None:
-    """(N, U) angles of the wrist above the hand's root at grasps in scenes; None: the shard has none."""
+    """Return wrist angles (N, U) above the hand's root for grasps in scenes; None if the shard has none."""
     if "grasp/wrist_positions" not in shard.arrays:
         return None
     return np.asarray(shard["grasp/wrist_positions"], float)[rows]
 
 
 def scene_spec_of(shard: Shard) -> SceneSpec | None:
-    """The scene that a shard says its grasps, poses or pictures are of; None: it says nothing.
+    """Return the scene of a shard's grasps, poses or pictures; None if it states none.
 
     Raises:
-        InputError: what it says is no scene.
+        InputError: the attribute is not a scene.
     """
     said = shard.attributes.get("scene")
     if said is None:

@@ -1,4 +1,4 @@
-"""The language that chooses grasps (`service.model.where`), asked of base shards."""
+"""Filter expressions (`service.model.where`) evaluated on base shards."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from graspd.service.store.manifests import INDEX_THRESHOLD_M
 
 Array = NDArray[Any]
 Mask = NDArray[np.bool_]
-#: From the columns of a base shard and what it says of itself (hand, object) to a mask (N,).
+#: Maps the columns and attributes (hand, object) of a base shard to a mask (N,).
 Test = Callable[[Mapping[str, Array], Mapping[str, Any]], Mask]
 
 _METRICS: Final = {metric.name: metric for metric in GRASP_METRICS}
@@ -29,7 +29,7 @@ _OPERATORS: Final[dict[str, Callable[[Any, Any], Any]]] = {
     "=": operator.eq,
     "!=": operator.ne,
 }
-#: Columns of flags, which are 1 where it is so.
+#: Columns of flags; 1 means true.
 _FLAGS: Final = {
     "held": "quality/success",
     "lift": "quality/lift_outcome",
@@ -38,10 +38,10 @@ _FLAGS: Final = {
 
 
 def parse(text: str) -> Test:
-    """The test that an expression states. A metric that the shard lacks, or where it says nan, fails each comparison.
+    """Compile an expression to a test. Comparisons with a missing metric or nan are false.
 
     Raises:
-        InputError: it is no such expression; says where, or what the names are.
+        InputError: not an expression; states the position, or the known names.
     """
     tree = parsed(text)
     return lambda columns, said: _mask(tree, columns, said)
@@ -79,7 +79,7 @@ def _flag(name: str, columns: Mapping[str, Array]) -> Mask:
 
 
 def value_of(metric: GraspMetric, columns: Mapping[str, Array]) -> NDArray[np.float64]:
-    """(N,) a metric of the grasps of a base shard; nan where the shard lacks it."""
+    """Return a metric (N,) of the grasps of a base shard; nan if the shard lacks it."""
     if metric.path not in columns:
         return np.full(len(columns["quality/valid"]), np.nan)
     values = np.asarray(columns[metric.path], float)

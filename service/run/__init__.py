@@ -1,1 +1,1 @@
-"""Runs the service on one machine: `graspd up`, `controller` and `index`."""
+"""Operation of the service on one machine: `graspd up`, `controller` and `index`."""

@@ -1,10 +1,10 @@
-"""Addresses of a running service: where it answers, and how workers of other machines join it.
+"""Addresses of a running service: its URL, and access for workers on other machines.
 
-The record says which process wrote it. One whose process is gone is of a service that ended without a word: it is not
-believed, and the next start replaces it.
+The record contains the process that wrote it. If that process is gone, the service crashed: the record is ignored and
+replaced at the next start.
 
-The file is its user's alone, and meant for a folder that the machines of a cluster share. It appears whole, is written
-anew by every start, and goes with the service that wrote it.
+The file for other machines is readable by its user only, and meant for a shared folder of a cluster. It is written
+atomically at every start, and removed with the service.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _FILE: Final = "api.json"
 
 
 def record_address(folder: Path, url: str) -> None:
-    """Write down, for this user alone, that the service of this process answers at `url`; the file appears whole."""
+    """Record atomically, readable by this user only, that this process's service has the address `url`."""
     handle, name = tempfile.mkstemp(dir=folder, prefix=f".{_FILE}.")
     try:
         with os.fdopen(handle, "w") as file:
@@ -40,7 +40,7 @@ def record_address(folder: Path, url: str) -> None:
 
 
 def forget_address(folder: Path) -> None:
-    """Take the record away if this process wrote it."""
+    """Remove the record if this process wrote it."""
     record = _read(folder)
     if record is not None and record[1] == os.getpid():
         with contextlib.suppress(OSError):
@@ -48,7 +48,7 @@ def forget_address(folder: Path) -> None:
 
 
 def recorded_address(folder: Path) -> str | None:
-    """Where the service of a data folder answers; None if none was recorded, or the process that did so is gone."""
+    """Return the URL of a data folder's service; None if not recorded, or the recording process is gone."""
     record = _read(folder)
     return record[0] if record is not None and _lives(*record[1:]) else None
 
@@ -56,7 +56,7 @@ def recorded_address(folder: Path) -> str | None:
 def _read(folder: Path) -> tuple[str, int, str] | None:
     try:
         file = folder / _FILE
-        # A file of another user might send this one's key to a stranger.
+        # A file of another user could send this user's key to a foreign server.
         if file.stat().st_uid not in (os.getuid(), 0):
             return None
         record = json.loads(file.read_text())
@@ -68,7 +68,7 @@ def _read(folder: Path) -> tuple[str, int, str] | None:
 
 
 def _lives(pid: int, started: str) -> bool:
-    """Whether the process is there. A record of an older graspd does not say when it started."""
+    """Check whether the process lives. Records of an older graspd have no start time."""
     if started:
         return start_of(pid) == started
     try:
@@ -82,13 +82,13 @@ def _lives(pid: int, started: str) -> bool:
 
 @dataclass(frozen=True)
 class ListenAddress:
-    """Where the embedded Redis listens besides its socket."""
+    """Address of the embedded Redis besides its socket."""
 
     file: Path
     host: str
-    """Name or address by which the other machines reach this one."""
+    """Host name or address for the other machines."""
     address: str
-    """Address of this machine that the name stands for: Redis listens there alone."""
+    """Address of this machine to which the name resolves: Redis listens only there."""
     port: int
     password: str = field(repr=False)
 
@@ -97,10 +97,10 @@ class ListenAddress:
         return f"redis://:{self.password}@{self.host}:{self.port}/0"
 
     def write(self, settings: Settings, api_url: str) -> None:
-        """Say what workers need, as lines that a shell and `--env-file` read.
+        """Write the settings for workers, as lines for a shell and for `--env-file`.
 
         Raises:
-            UnavailableError: the folder cannot be written.
+            UnavailableError: the folder is not writable.
         """
         said = {
             "GRASPD_REDIS_URL": self.redis_url,
@@ -120,7 +120,7 @@ class ListenAddress:
             raise UnavailableError(f"{self.file} cannot be written: {error.strerror}") from None
 
     def forget(self) -> None:
-        """Remove the file, unless another service wrote it meanwhile."""
+        """Remove the file, unless another service has overwritten it."""
         try:
             if self.redis_url in self.file.read_text():
                 self.file.unlink(missing_ok=True)
@@ -129,13 +129,13 @@ class ListenAddress:
 
 
 def joining(settings: Settings, file: Path, *, host: str | None = None, port: int = 0) -> ListenAddress:
-    """An address, a free port (or `port`) and a fresh password.
+    """Return an address, a free port (or `port`) and a new password.
 
     Args:
-        host: how other machines call this one; its own name by default.
+        host: host name for other machines; by default this machine's name.
 
     Raises:
-        InputError: Redis or the store are not ones that other machines can share through this file.
+        InputError: other machines cannot share the configured Redis or store through this file.
     """
     if settings.redis_url is not None:
         raise InputError("GRASPD_REDIS_URL names a Redis already: give that to the workers, and leave --share away")

@@ -1,4 +1,4 @@
-"""One child process of a supervisor: started, watched, started again with a growing pause, stopped."""
+"""A child process of a supervisor: start, watch, restart with back-off, stop."""
 
 from __future__ import annotations
 
@@ -19,27 +19,27 @@ from pathlib import Path
 from typing import IO, Final
 
 log = logging.getLogger(__name__)
-#: Variable of a child by which a later `graspd up` knows it.
+#: Environment variable by which a later `graspd up` identifies a child.
 _TOKEN: Final = "GRASPD_CHILD_TOKEN"
-#: Pause between two looks at whether a child ended [s].
+#: Interval between checks for ended children [s].
 _WATCH_S: Final = 0.1
 _FIRST_PAUSE_S: Final = 0.2
 _LONGEST_PAUSE_S: Final = 10.0
-#: A child that lived this long was well: the next restart is quick again [s].
+#: After this uptime a child counts as healthy, and its next restart is immediate again [s].
 _WELL_AFTER_S: Final = 20.0
 
 
 @dataclass
 class Child:
-    """A process by its name and command. All calls come from one thread: the kernel ties a child to that thread."""
+    """A named process. All calls come from one thread, because the kernel ties the child to it."""
 
     name: str
     command: Sequence[str]
     environment: Mapping[str, str]
     folder: Path | None
-    """Data folder: pid files go to `run/`, output to `logs/`. None: no such files, and the output is the parent's."""
+    """Data folder: pid files go to `run/`, output to `logs/`. None: no such files; the parent's output is used."""
     fix: Callable[[Path], None] | None = None
-    """Called with its log after it failed, before it is started again."""
+    """Called with its log after a failure, before the restart."""
     process: subprocess.Popen[bytes] | None = None
     starts: int = 0
     _started: float = 0.0
@@ -55,7 +55,7 @@ class Child:
         return self.folder / "logs" / f"{self.name}.log" if self.folder is not None else None
 
     def start(self) -> None:
-        """Start the process in a session of its own: Ctrl-C in the terminal is for the parent alone."""
+        """Start the process in its own session: Ctrl-C in the terminal reaches only the parent."""
         token = secrets.token_hex(16)
         with self._output() as output:
             self.process = subprocess.Popen(
@@ -73,7 +73,7 @@ class Child:
         self._started = time.monotonic()
 
     def watch(self) -> None:
-        """Start the process again if it ended; each time in a row after a longer pause."""
+        """Restart the process if it ended, with a longer pause after each consecutive failure."""
         now = time.monotonic()
         if self.process is not None:
             code = self.process.poll()
@@ -81,7 +81,7 @@ class Child:
                 return
             if code == 0 or now - self._started > _WELL_AFTER_S:
                 self._pause = _FIRST_PAUSE_S
-            # A worker that has done enough ends by itself, with code 0.
+            # A worker ends by itself with code 0 after enough work.
             level = logging.WARNING if code else logging.INFO
             log.log(level, "%s ended (%s); it is started again in %.2g s", self.name, _ended(code), self._pause)
             if code > 0 and self.fix is not None and self._log_file is not None:
@@ -93,12 +93,12 @@ class Child:
             self.start()
 
     def ask_to_stop(self) -> None:
-        """SIGTERM, if it runs."""
+        """Send SIGTERM, if it runs."""
         if self.process is not None and self.process.poll() is None:
             self.process.send_signal(signal.SIGTERM)
 
     def join(self, deadline: float) -> None:
-        """Wait until `time.monotonic` reaches the deadline, then kill."""
+        """Wait until the deadline of `time.monotonic`, then kill."""
         if self.process is not None:
             try:
                 self.process.wait(timeout=max(0.05, deadline - time.monotonic()))
@@ -118,7 +118,7 @@ class Child:
 
 
 def keep_alive(children: Sequence[Child], stop: threading.Event) -> None:
-    """Start children, and again those that end, until told to stop."""
+    """Start children and restart ended ones until stopped."""
     for child in children:
         child.start()
     while not stop.wait(_WATCH_S):
@@ -127,7 +127,7 @@ def keep_alive(children: Sequence[Child], stop: threading.Event) -> None:
 
 
 def stop_children(children: Sequence[Child], grace_s: float) -> None:
-    """Stop children all at once; those that have not ended after so long are killed [s]."""
+    """Stop all children at once; kill those that still run after the grace time [s]."""
     for child in children:
         child.ask_to_stop()
     deadline = time.monotonic() + grace_s
@@ -136,7 +136,7 @@ def stop_children(children: Sequence[Child], grace_s: float) -> None:
 
 
 def end_leftovers(folder: Path) -> list[int]:
-    """Kill what the pid files of an earlier `graspd up` name, if it is still that; returns the pids."""
+    """Kill processes in the pid files of an earlier `graspd up`, if still its own; return the pids."""
     ended = []
     for file in (folder / "run").glob("*.pid"):
         try:
@@ -151,7 +151,7 @@ def end_leftovers(folder: Path) -> list[int]:
 
 
 def _has_token(pid: int, token: str) -> bool:
-    """Whether a process was started with this token in its environment."""
+    """Check whether a process was started with this token in its environment."""
     wanted = f"{_TOKEN}={token}".encode()
     try:
         return wanted in Path(f"/proc/{pid}/environ").read_bytes().split(b"\0")
@@ -165,14 +165,14 @@ def _ended(code: int) -> str:
 
 
 _BOOT: Final = Path("/proc/sys/kernel/random/boot_id")
-#: Place of the start time among the words after the name of a program in /proc/PID/stat.
+#: Index of the start time among the fields after the program's name in /proc/PID/stat.
 _STARTED: Final = 19
 
 
 def start_of(pid: int) -> str:
-    """When a process started: no two with one pid give the same text. "" if there is no such process."""
+    """Return the start time of a process, unique per pid; "" if there is no such process."""
     with contextlib.suppress(OSError, IndexError):
-        # A name of a program may hold blanks and brackets.
+        # A program's name may contain blanks and brackets.
         words = Path(f"/proc/{pid}/stat").read_text(errors="replace").rpartition(")")[2].split()
         return f"{words[_STARTED]} {_BOOT.read_text().strip()}"
     if _BOOT.exists():

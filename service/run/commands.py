@@ -1,4 +1,4 @@
-"""Commands that run the service itself: up, controller, index."""
+"""Commands of the service: up, controller, index."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def up(
     data_dir: DataDir = None,
     json: JsonFlag = False,
 ) -> None:
-    """The whole service on this machine, until Ctrl-C."""
+    """Run the whole service on this machine until Ctrl-C."""
     _check_extras(workers)
     from graspd.service.run.address import joining
     from graspd.service.run.supervisor import Supervisor
@@ -86,7 +86,7 @@ def controller(
     check: Annotated[bool, typer.Option("--check", help="Start none; exit code 1 says that none lives.")] = False,
     data_dir: DataDir = None,
 ) -> None:
-    """Lease reaper, delayed retries and indexer. One leads and the others stand by; `graspd up` starts one."""
+    """Run lease reaper, delayed retries and indexer. One leads, others stand by; `graspd up` starts one."""
     settings = load_settings(data_dir=data_dir)
     log_to_stderr(settings, "controller")
     keep_private(settings)
@@ -97,7 +97,7 @@ def controller(
 
 
 def _run_controller(settings: Settings, stop: threading.Event) -> None:
-    """Lead, or stand by; from the start again where another led meanwhile."""
+    """Lead or stand by; start from the beginning after another one has led."""
     from graspd.service.pipeline.backends import Services
     from graspd.service.pipeline.controller import Controller
     from graspd.service.pipeline.leading import Leadership
@@ -107,11 +107,11 @@ def _run_controller(settings: Settings, stop: threading.Event) -> None:
     queue = open_queue(settings, patience=0)
     leadership = Leadership(queue, lease_s=settings.lease_s, alive=alive, name=settings.controller_name)
     try:
-        # A controller of another service must not even wait: it would be a standby that all take for their own.
+        # A controller of another service must not stand by here: all would take it for their own.
         _identify(settings, stop, alive)
         while leadership.wait(stop):
             with leadership.held(stop) as over:
-                # What an earlier controller took in and did not finish comes again to a fresh one.
+                # A fresh controller receives the events again that an earlier one did not finish.
                 services = Services.open(settings)
                 try:
                     Controller(services).run(over)
@@ -122,10 +122,10 @@ def _run_controller(settings: Settings, stop: threading.Event) -> None:
 
 
 def _identify(settings: Settings, stop: threading.Event, alive: HeartbeatFile) -> None:
-    """Find out that store, index and Redis are of one service, as soon as Redis answers.
+    """Check that store, index and Redis belong to one service, once Redis answers.
 
     Raises:
-        BusyError: one of them is another service's.
+        BusyError: one of them belongs to another service.
     """
     from graspd.service.pipeline.backends import Services
     from graspd.service.pipeline.identity import identify
@@ -151,9 +151,9 @@ def rebuild(
     data_dir: DataDir = None,
     json: JsonFlag = False,
 ) -> None:
-    """Make the rows of the index anew from the store, and be the service that works on it from now on.
+    """Rebuild the index from the store, and make this service its owner.
 
-    An index of another version of graspd gets the tables of this one.
+    An index of another version of graspd gets the tables of this version.
 
     With --check exit code 1: they differ, or a shard is damaged.
     """
@@ -201,7 +201,7 @@ def export(
     data_dir: DataDir = None,
     json: JsonFlag = False,
 ) -> None:
-    """Write grasps, shards, jobs, tasks, assets, datasets and usage as Parquet files, for DuckDB or pandas."""
+    """Write grasps, shards, jobs, tasks, assets, datasets and usage as Parquet for DuckDB or pandas."""
     from graspd.service.index.export import export as write
     from graspd.service.index.index import Index
 
@@ -220,7 +220,7 @@ def export(
 @index_app.command(epilog="graspd admin index path")
 @reporting_errors
 def path(data_dir: DataDir = None) -> None:
-    """Print where the index is; a password in the URL is left out."""
+    """Print the location of the index, without the password of its URL."""
     from sqlalchemy import make_url
 
     url = make_url(load_settings(data_dir=data_dir).resolved_index_url)
@@ -228,14 +228,14 @@ def path(data_dir: DataDir = None) -> None:
 
 
 def _check_extras(workers: int) -> None:
-    """UnavailableError if libraries that the children need are not installed."""
+    """Raise UnavailableError if libraries of the children are not installed."""
     needed = ("httpx", "fastapi", "warp") if workers else ("httpx", "fastapi")
     if any(find_spec(library) is None for library in needed):
         raise UnavailableError("`graspd up` is not part of this install; run pip install 'graspd[all]'")
 
 
 def check_controller(settings: Settings) -> None:
-    """UnavailableError if no controller gave a sign of life lately."""
+    """Raise UnavailableError without a recent heartbeat of a controller."""
     from graspd.service.pipeline.leading import PART
     from graspd.service.queue.rq_queue import open_queue
 
@@ -248,9 +248,9 @@ def check_controller(settings: Settings) -> None:
 
 
 def stop_on_signals() -> threading.Event:
-    """An event that SIGINT and SIGTERM set."""
+    """Return an event that SIGINT and SIGTERM set."""
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
-        # Not set in the handler itself: it may interrupt the very `wait` whose lock `set` needs.
+        # A thread sets it: the handler may interrupt the very `wait` whose lock `set` needs.
         signal.signal(number, lambda *_: threading.Thread(target=stop.set, daemon=True).start())
     return stop

@@ -1,4 +1,4 @@
-"""The Redis that `graspd up` brings along: found by a ladder, run on a private unix socket with its log on disk."""
+"""Embedded Redis of `graspd up`: search for a server, private unix socket, append-only log on disk."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from graspd.service.run.address import ListenAddress
 from graspd.service.settings import Settings
 
 log = logging.getLogger(__name__)
-#: What an append-only Redis keeps, of version 7 on and before.
+#: Files of an append-only Redis, from version 7 on and before.
 _LOGS: Final = ("appendonlydir", "appendonly.aof")
 _TAIL_BYTES: Final = 1 << 16
 _READY: Final = "Ready to accept connections"
@@ -30,10 +30,10 @@ _OF_DISK: Final = re.compile(r"No space left|Permission denied|Read-only file sy
 
 
 def find_server() -> tuple[Path, str]:
-    """A Redis server program, and which rung of the ladder it stands on.
+    """Find a Redis server program; return it with the step of the search that found it.
 
     Raises:
-        QueueUnavailable: there is none; the three ways out are named.
+        QueueUnavailable: none found; the message lists three solutions.
     """
     for rung, find in _LADDER:
         path = find()
@@ -46,10 +46,10 @@ def find_server() -> tuple[Path, str]:
 
 
 def server_command(settings: Settings, joining: ListenAddress | None = None) -> list[str]:
-    """The command that runs the embedded Redis in the foreground. Makes its folders; call `own_redis` first.
+    """Return the foreground command of the embedded Redis; create its folders. Call `own_redis` first.
 
     Args:
-        joining: where it listens for other machines; None: on its private socket alone.
+        joining: address for other machines; None: private socket only.
     """
     server, _ = find_server()
     folder = settings.data_dir.resolve() / "redis"
@@ -61,17 +61,17 @@ def server_command(settings: Settings, joining: ListenAddress | None = None) -> 
         "unixsocket": str(socket),
         "unixsocketperm": "700",
         "dir": str(folder),
-        # The log of writes survives a kill of the process; one second of it may go with the machine's power.
+        # The append-only log survives a kill of the process; a power failure may lose its last second.
         "appendonly": "yes",
         "appendfsync": "everysec",
         "save": "",
-        # An evicting policy would throw tasks away without a word.
+        # An evicting policy would drop tasks silently.
         "maxmemory-policy": "noeviction",
         "daemonize": "no",
     }
     secret = password_file(settings.data_dir)
     secret.unlink(missing_ok=True)
-    # A password among the arguments would be read by every user of the machine.
+    # Every user of the machine could read a password among the arguments.
     configuration = []
     if joining is not None:
         options |= {"port": str(joining.port), "bind": joining.address, "protected-mode": "yes"}
@@ -88,7 +88,7 @@ def _write_private(file: Path, text: str) -> None:
 
 
 def own_redis(settings: Settings) -> IO[str]:
-    """Lock the Redis folder of a data folder for this process, until the file that is returned is closed.
+    """Lock a data folder's Redis folder for this process, until the returned file is closed.
 
     Raises:
         BusyError: another process runs it.
@@ -99,9 +99,9 @@ def own_redis(settings: Settings) -> IO[str]:
 
 
 def give_up_log(settings: Settings, output: Path) -> None:
-    """After a start that failed: move the log of writes aside if Redis says in its `output` that it cannot read it.
+    """After a failed start: move the append-only log aside if Redis reports in `output` that it is broken.
 
-    What is in Redis is queued again from the index, so an empty one is better than none.
+    All content of Redis is queued again from the index, so an empty one is better than none.
     """
     with contextlib.suppress(OSError), output.open("rb") as file:
         file.seek(max(0, output.stat().st_size - _TAIL_BYTES))
@@ -112,7 +112,7 @@ def give_up_log(settings: Settings, output: Path) -> None:
 
 
 def set_log_aside(settings: Settings, why: str) -> None:
-    """Have Redis start empty: move its log of writes into a folder `redis/aside-TIME`, and say so."""
+    """Make Redis start empty: move its append-only log to a folder `redis/aside-TIME`, and log it."""
     folder = settings.data_dir.resolve() / "redis"
     aside = folder / f"aside-{datetime.now(UTC):%Y%m%dT%H%M%S%f}"
     if found := [one for name in _LOGS if (one := folder / name).exists()]:
@@ -125,7 +125,7 @@ def set_log_aside(settings: Settings, why: str) -> None:
 
 
 def lock_file(path: Path, what: str) -> IO[str]:
-    """Hold an exclusive lock on a file that names its holder's pid; BusyError names that of another holder."""
+    """Hold an exclusive lock on a file with the holder's pid; BusyError names the pid of another holder."""
     file = path.open("a+")
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

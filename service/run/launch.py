@@ -1,6 +1,7 @@
-"""Runs a program that ends when its parent does: `python -m graspd.service.run.launch PARENT_PID PROGRAM ARGUMENTS...`.
+"""Launcher of a program that ends with its parent.
 
-Linux tells the child itself (prctl survives the exec). Elsewhere the next `graspd up` ends what the pid files name.
+Usage: `python -m graspd.service.run.launch PARENT_PID PROGRAM ARGUMENTS...`. On Linux the kernel signals the child
+(prctl survives exec). Elsewhere the next `graspd up` kills by pid files.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ _PR_SET_PDEATHSIG: Final = 1
 
 
 def die_with_parent(parent: int) -> None:
-    """Have the kernel kill this process when its parent ends; exit if that has happened already."""
+    """Request the kernel to kill this process when its parent ends; exit if it has ended already."""
     if sys.platform == "linux":
         ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
     if os.getppid() != parent:
@@ -23,7 +24,7 @@ def die_with_parent(parent: int) -> None:
 
 
 def main(arguments: list[str]) -> None:
-    """Become the program."""
+    """Replace this process by the program."""
     die_with_parent(int(arguments[0]))
     os.execvp(arguments[1], arguments[1:])
 

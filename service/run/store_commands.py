@@ -1,4 +1,4 @@
-"""`graspd admin store`: whether the store still holds what was put into it."""
+"""`graspd admin store`: checks and conversion of the store."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ app.add_typer(store_app, name="store")
 
 @store_app.callback()
 def store() -> None:
-    """Check the store, and fix it."""
+    """Check and repair the store."""
 
 
 @store_app.command(epilog="graspd admin store verify --repair")
@@ -30,7 +30,7 @@ def verify(
     data_dir: Annotated[Path | None, typer.Option("--data-dir", help="Folder of everything graspd keeps.")] = None,
     json: JsonFlag = False,
 ) -> None:
-    """Read everything that the store keeps and say what is damaged or missing. Exit code 1 says that something is.
+    """Verify all objects of the store and report damaged or missing ones; exit code 1 if there are any.
 
     The controller's integrity scan pauses meanwhile; a second call is refused.
     """
@@ -86,7 +86,7 @@ def upgrade(
     data_dir: Annotated[Path | None, typer.Option("--data-dir", help="Folder of everything graspd keeps.")] = None,
     json: JsonFlag = False,
 ) -> None:
-    """Give every shard that graspd 0.2 put into a pack a file of its own; a controller does the same when it starts."""
+    """Replace packs of graspd 0.2 by one file per shard; a controller does the same at its start."""
     from graspd.service.store.packs import take_apart
     from graspd.service.store.store import open_store
 

@@ -32,18 +32,18 @@ from graspd.service.store.store import open_store
 
 log = logging.getLogger(__name__)
 _PROBE_S: Final = 0.1
-#: Longest wait for a service to be ready: kernels compile at their first use, on a machine with much else to do [s].
+#: Timeout for readiness: kernels compile at first use, perhaps on a busy machine [s].
 READY_S: Final = 1800.0
 _TOLD_EVERY_S: Final = 15.0
-#: A process that was started again so often will not get ready.
+#: After this many restarts a process will not become ready.
 _ENDS: Final = 5
-#: How long a Redis that is not of this machine's `graspd up` may be silent at the start [s].
+#: Timeout of an external Redis at the start [s].
 _REDIS_S: Final = 60.0
 _PROGRAM: Final = (sys.executable, "-m", "graspd")
 
 
 class Supervisor:
-    """Starts the whole service on this machine, keeps it alive, stops it cleanly. Usable as a context manager."""
+    """Context manager that starts the service on this machine, restarts failed parts and stops it cleanly."""
 
     def __init__(
         self,
@@ -54,7 +54,7 @@ class Supervisor:
         worker_command: Sequence[str] = (*_PROGRAM, "worker"),
         joining: ListenAddress | None = None,
     ) -> None:
-        """`settings.port` 0 picks a free port; `joining` lets workers of other machines in."""
+        """`settings.port` 0 selects a free port; `joining` admits workers of other machines."""
         if workers < 0:
             raise InputError("the number of workers cannot be negative")
         self._wanted = settings
@@ -67,7 +67,7 @@ class Supervisor:
         self._thread: threading.Thread | None = None
         self._stopping = threading.Event()
         self.settings = settings
-        """Those of the children: data folder absolute, Redis and port known."""
+        """Settings of the children: absolute data folder, resolved Redis and port."""
 
     def __enter__(self) -> Self:
         self.start()
@@ -78,22 +78,22 @@ class Supervisor:
 
     @property
     def api_url(self) -> str:
-        """Where the API answers, e.g. http://127.0.0.1:8000."""
+        """URL of the API, e.g. http://127.0.0.1:8000."""
         host = self.settings.host
         shown = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}.get(host, f"[{host}]" if ":" in host else host)
         return f"http://{shown}:{self.settings.port}"
 
     @property
     def pids(self) -> dict[str, int]:
-        """The children that run, by name."""
+        """Pids of running children by name."""
         return {child.name: child.process.pid for child in list(self._children) if child.process is not None}
 
     def start(self) -> None:
-        """Take the data folder and start the children; does not wait for them.
+        """Lock the data folder and start the children without waiting for them.
 
         Raises:
-            BusyError: another graspd owns the data folder (its pid is named), or the port is taken.
-            StoreUnavailable, QueueUnavailable: the folders cannot be written; there is no Redis server.
+            BusyError: another graspd owns the data folder (the message has its pid), or the port is taken.
+            StoreUnavailable, QueueUnavailable: the folders are not writable; there is no Redis server.
         """
         self._stopping.clear()
         folder = self._wanted.data_dir.resolve()
@@ -112,7 +112,7 @@ class Supervisor:
         except GraspdError:
             self._release()
             raise
-        # The kernel ends a child with the thread that started it, so one thread starts them all and outlives them.
+        # The kernel kills a child when the thread that started it ends, so one long-lived thread starts them all.
         self._thread = threading.Thread(target=self._run, name="supervisor", daemon=True)
         self._thread.start()
 
@@ -123,18 +123,17 @@ class Supervisor:
         say: Callable[[str], object] | None = None,
         stop: threading.Event | None = None,
     ) -> bool:
-        """Until Redis, controller, a worker and the API answer; False: `stop` was set before.
+        """Wait until Redis, controller, a worker and the API answer; False: `stop` was set before.
 
-        A busy machine takes as long as it takes: what ends the wait early is a process that ends again and again, or a
-        Redis of somebody else that does not answer.
+        Two things end the wait early: a process that ends repeatedly, or an external Redis that is silent.
 
         Args:
-            timeout: longest wait where nothing else ends it [s].
-            say: told every 15 s what is waited for.
+            timeout: longest wait otherwise [s].
+            say: called every 15 s with the missing parts.
             stop: ends the wait.
 
         Raises:
-            UnavailableError: it names what did not answer, and the logs.
+            UnavailableError: the message lists the parts that do not answer, and the logs.
         """
         began = told = time.monotonic()
         starts, logs = self._starts(), self.settings.data_dir / "logs"
@@ -143,7 +142,7 @@ class Supervisor:
             while missing := self._missing(queue):
                 if stop is not None and stop.is_set():
                     return False
-                if "redis" in missing:  # the others may end for want of it
+                if "redis" in missing:  # the others may have ended because of it
                     starts = {**self._starts(), "redis": starts.get("redis", 0)}
                 now = time.monotonic()
                 patience = min(timeout, _REDIS_S) if "redis" in missing and self._wanted.redis_url else timeout
@@ -161,7 +160,7 @@ class Supervisor:
         return True
 
     def stop(self) -> None:
-        """Stop all children, the workers first and Redis last. Idempotent."""
+        """Stop all children, workers first and Redis last. Idempotent."""
         self._stopping.set()
         if self._thread is not None and self._thread is not threading.current_thread():
             self._thread.join()
@@ -192,7 +191,7 @@ class Supervisor:
             return False
 
     def _settle(self) -> None:
-        """What the children must agree on, found out once."""
+        """Fix the settings that all children share."""
         folder = self._wanted.data_dir.resolve()
         update: dict[str, object] = {"data_dir": folder}
         if self._api:
@@ -200,12 +199,12 @@ class Supervisor:
             update["port"] = reserved.getsockname()[1]
             if sys.platform == "linux":
                 self._locks.append(reserved)
-            else:  # a second socket of one address is refused there
+            else:  # there a second socket of one address is refused
                 reserved.close()
         self.settings = self._wanted.model_copy(update=update)
 
     def _identify(self, folder: Path) -> None:
-        """Find out that store, index and Redis are of one service, or that it is told by the children later."""
+        """Check that store, index and Redis belong to one service; without Redis the children check it later."""
         open_store(self.settings.resolved_store_url)
         before = recorded(folder)
         try:
@@ -240,7 +239,7 @@ class Supervisor:
             redis = child("redis", *server_command(self.settings, self._joining))
             redis.fix = lambda output: give_up_log(self.settings, output)
             children.append(redis)
-        # One that is started again need not wait until its predecessor's lease has run out.
+        # A restarted controller need not wait for the end of its predecessor's lease.
         name = self._wanted.controller_name or f"{socket.gethostname()}-up-{secrets.token_hex(8)}"
         children.append(child("controller", *_PROGRAM, "controller", GRASPD_CONTROLLER_NAME=name))
         if self._api:
@@ -262,7 +261,7 @@ class Supervisor:
         except Exception:
             log.exception("the supervisor stops because of an error")
         finally:
-            # Workers hand their tasks back while Redis and controller still take them.
+            # Workers return their tasks while Redis and controller still accept them.
             for some in ("worker", ("api", "controller"), "redis"):
                 named = [child for child in self._children if child.name.startswith(some)]
                 stop_children(named, self.settings.stop_grace_s)
@@ -287,18 +286,18 @@ class Supervisor:
         self._locks = []
 
 
-#: Those that `start` finds out for the children itself.
+#: Settings that `start` determines for the children.
 _SETTLED: Final = frozenset({"data_dir", "redis_url", "host", "port", "api_url"})
 
 
 def _stated(settings: Settings) -> dict[str, str]:
-    """Settings that were given, in Python or otherwise, for the environment of the children."""
+    """Return the explicitly given settings, for the environment of the children."""
     given = settings.model_fields_set - _SETTLED
     return {f"GRASPD_{name.upper()}": _as_variable(getattr(settings, name)) for name in given}
 
 
 def _as_variable(value: object) -> str:
-    """A setting as the environment spells it; an empty variable is one that nobody set."""
+    """Format a setting for the environment; an empty variable counts as unset."""
     if value is None:
         return ""
     if isinstance(value, SecretStr):
@@ -307,8 +306,9 @@ def _as_variable(value: object) -> str:
 
 
 def _reserve(host: str, port: int) -> socket.socket:
-    """A socket at the port, or at a free one for 0. While it is open the API may listen there, and the system gives the
-    port to nobody else who asks for any."""
+    """Bind a socket to the port, or to a free one for 0. While it is open, the API can listen there
+    and the system assigns the port to no other process.
+    """
     reserved = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)
     reserved.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:

@@ -1,1 +1,1 @@
-"""The object store and what is kept in it: assets, records, shards and their manifests."""
+"""Object store and its contents: assets, records, shards and their manifests."""

@@ -1,4 +1,4 @@
-"""What a user says about a hand or an object on the command line, as keys of its `asset.json`."""
+"""Command-line options of a hand or an object, as keys of its `asset.json`."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _TYPED: Final = Option(places=ASSET)
 
 
 class HandWords(Model):
-    """What of a hand's `asset.json` can be typed; see `hand_options`."""
+    """Keys of a hand's `asset.json` with command-line options; see `hand_options`."""
 
     urdf: Annotated[str | None, _TYPED] = Field(
         None, description="which URDF, xacro or MJCF of the folder or ZIP is the hand: NAME"
@@ -42,7 +42,7 @@ class HandWords(Model):
 
 
 class SweptOptions(ObjectOptions):
-    """Those of an object, of which one of several sizes may be made."""
+    """Options of an object, including several sizes to make it in."""
 
     scale_to: Annotated[str | None, _TYPED] = Field(  # type: ignore[assignment]
         None, description="longest extent after scaling [m]; 0.06,0.08,0.1: an object of each size"
@@ -56,7 +56,7 @@ SourceOption = Annotated[str | None, typer.Option("--source", help="Where it com
 
 
 def provenance(licence: str | None, source: str | None) -> dict[str, Any]:
-    """Keys of `asset.json` that say whose it is; those not given are left out."""
+    """Return the keys of `asset.json` for licence and source; absent ones are omitted."""
     return {key: value for key, value in (("licence", licence), ("source", source)) if value}
 
 
@@ -73,10 +73,10 @@ def hand_options(
     fix: list[str] | None = None,
     drop: list[str] | None = None,
 ) -> dict[str, Any]:
-    """Keys of a hand's `asset.json`; those not given are left out.
+    """Return the keys of a hand's `asset.json`; absent ones are omitted.
 
     Raises:
-        InputError: a text is no vector or no JOINT=VALUE.
+        InputError: a text is neither a vector nor JOINT=VALUE.
     """
     options: dict[str, Any] = {
         "file": urdf,
@@ -94,7 +94,7 @@ def hand_options(
 
 
 def sizes_of(text: str | None) -> tuple[float, ...]:
-    """Sizes of `--scale-to` [m]; InputError if one is no positive number."""
+    """Parse the sizes of `--scale-to` [m]; InputError unless all are positive numbers."""
     try:
         sizes = tuple(dict.fromkeys(float(part) for part in text.split(","))) if text else ()
     except ValueError:

@@ -1,4 +1,4 @@
-"""What a check found, in lines for people: sizes, what was guessed. Messages tell the repairs."""
+"""Summary of an asset's check for users: sizes and guesses. The check's messages list the repairs."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import typer
 
 from graspd.service.model.states import AssetKind
 
-#: Rounding moves a surface so far; it is no news [m].
+#: Surface displacement from rounding that is not reported [m].
 _NOTHING_M = 1e-7
 _OVERRIDES = {
     "palm": "--palm LINK --approach x,y,z",
@@ -29,37 +29,37 @@ def say_check(kind: AssetKind, report: Mapping[str, Any]) -> None:
 
 
 def verdict_line(asset: Mapping[str, Any]) -> str:
-    """An asset of a list in one line."""
+    """Format an asset as one line of a list."""
     return f"{asset['verdict'] or 'waiting':<8} {asset['message'] or asset['name']}"
 
 
 def summary(kind: AssetKind, facts: Mapping[str, Any]) -> list[str]:
-    """Lines of a label and what it holds; a fact that is not there is left out."""
+    """Return lines of label and value; missing facts are omitted."""
     pairs = {AssetKind.HAND: _hand, AssetKind.OBJECT: _object, AssetKind.NETWORK: _network}[kind](facts)
     return [f"{label:<18} {text}" for label, text in pairs]
 
 
 def self_test_line(facts: Mapping[str, Any]) -> str:
-    """What a hand's self-test says, `ready: 91 % hold, ...` or what is suspicious; empty: it was not tried."""
+    """Return the self-test's result, `ready: 91 % hold, ...` or a warning; empty if it was not run."""
     tried = facts.get("self_test")
     return str(tried.get("says", "")) if isinstance(tried, Mapping) else ""
 
 
 def limit_line(facts: Mapping[str, Any]) -> str:
-    """What a hand lifted at best in its self-test; empty: it was not tried, or lifted nothing."""
+    """Return the best payload of a hand's self-test; empty if not run, or nothing was lifted."""
     tried = facts.get("self_test")
     limit = tried.get("limit") if isinstance(tried, Mapping) else None
     return str(limit.get("says", "")) if isinstance(limit, Mapping) else ""
 
 
 def self_test_lines(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Both with their labels, as far as they are known."""
+    """Return the available ones of both lines, with labels."""
     lines = [("self-test", self_test_line(facts)), ("payload", limit_line(facts))]
     return [(label, says) for label, says in lines if says]
 
 
 def hand_line(facts: Mapping[str, Any]) -> str:
-    """Whose grasps a network proposes: name and digest of the hand."""
+    """Return name and digest of the hand of a network."""
     return f"{facts.get('hand', '')} ({str(facts.get('hand_digest', ''))[:12]})"
 
 

@@ -1,6 +1,6 @@
-"""Hands and objects as the service keeps them: immutable archives in the store, and the built-in ones on disk.
+"""Stored hands and objects: immutable archives in the store, and the built-in ones on disk.
 
-An archive is a ZIP made reproducibly: names sorted, fixed time stamps, no compression of attributes that vary.
+An archive is a reproducible ZIP: sorted names, fixed time stamps, no variable attributes.
 """
 
 from __future__ import annotations
@@ -23,29 +23,29 @@ from graspd.service.model.states import AssetKind
 from graspd.service.store.descriptions import MAX_BYTES, parse_description
 
 _EPOCH: Final = (1980, 1, 1, 0, 0, 0)
-#: The built-in assets carry the release's date, so that publishing them twice writes the same manifest.
+#: Built-in assets have the date of the release, so that repeated publication writes the same manifest.
 _BUILTIN_CREATED: Final = "2026-11-21T00:00:00Z"
 MAX_FILES: Final = 2000
-#: How zlib says that it has no memory, which is no damage.
+#: zlib's message for lack of memory, which is not damage.
 _NO_MEMORY: Final = "Error -4 "
-#: Of one name, and of all together: they stand in every list of hands or objects.
+#: Limits of one name and of all names together: every list of hands or objects contains them.
 MAX_NAME: Final = 255
 MAX_NAMES: Final = 128 << 10
-#: A small archive may unpack to much more: robot meshes compress about four to one, so this refuses only bombs.
+#: Limit on unpacked size over packed size: robot meshes compress about 4:1, so only ZIP bombs exceed it.
 UNPACK_FACTOR: Final = 8
 _PIECE_BYTES: Final = 1 << 16
 _T = TypeVar("_T")
 
 
 def pack(files: Mapping[str, bytes]) -> bytes:
-    """ZIP of named files; equal files give equal bytes."""
+    """Pack named files into a ZIP; equal files give equal bytes."""
     buffer = io.BytesIO()
     pack_into(files, buffer)
     return buffer.getvalue()
 
 
 def pack_into(files: Mapping[str, bytes], target: IO[bytes]) -> None:
-    """Write that ZIP into a file, piece by piece where the files are not in memory."""
+    """Write that ZIP to a file, in pieces for files outside memory."""
     with zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED, compresslevel=6) as archive:
         for name in sorted(files):
             entry = zipfile.ZipInfo(check_path(name), _EPOCH)
@@ -58,10 +58,10 @@ def pack_into(files: Mapping[str, bytes], target: IO[bytes]) -> None:
 
 
 def unpack(data: bytes, *, limit_bytes: int) -> dict[str, bytes]:
-    """Files of a ZIP in memory; nothing is ever written where a name in the archive says.
+    """Unpack a ZIP in memory; no file is written under a name from the archive.
 
     Raises:
-        InputError: not a ZIP, encrypted, or a name that leaves the archive.
+        InputError: not a ZIP, encrypted, or a name outside the archive.
         LimitError: more than `limit_bytes` unpacked, or more than `MAX_FILES` files.
     """
     archive = _open_zip(io.BytesIO(data))
@@ -77,7 +77,7 @@ def unpack(data: bytes, *, limit_bytes: int) -> dict[str, bytes]:
 
 
 def unpack_file(path: Path) -> dict[str, bytes]:
-    """`unpack` of a file, as large as an upload may be; its errors name the file."""
+    """Unpack a file, up to the limit of uploads; errors name the file."""
     from graspd.service.settings import Settings
 
     try:
@@ -87,7 +87,7 @@ def unpack_file(path: Path) -> dict[str, bytes]:
 
 
 def without_common_folder(files: dict[str, _T]) -> dict[str, _T]:
-    """A folder zipped whole has its own name before every file: take it off."""
+    """Remove the folder's name from all names if the archive is of one whole folder."""
     tops = {name.partition("/")[0] for name in files}
     if len(tops) == 1 and all("/" in name for name in files):
         return {name.partition("/")[2]: entry for name, entry in files.items()}
@@ -95,12 +95,12 @@ def without_common_folder(files: dict[str, _T]) -> dict[str, _T]:
 
 
 class ZipFiles(StreamedFiles):
-    """Files of a ZIP that lies in a file, unpacked piece by piece when they are asked for; others may be added.
+    """Files of a ZIP on disk, unpacked in pieces on demand; files can be added.
 
-    It was unpacked once before, to count and to digest what is really in it.
+    The constructor unpacks it once to measure and to digest the true contents.
 
     Raises:
-        InputError: not a ZIP, encrypted, damaged, or a name that leaves the archive.
+        InputError: not a ZIP, encrypted, damaged, or a name outside the archive.
         LimitError: more than `limit_bytes` unpacked, or more than `MAX_FILES` files.
     """
 
@@ -118,7 +118,7 @@ class ZipFiles(StreamedFiles):
             self._known[name] = (size, digest)
 
     def without_common_folder(self) -> Self:
-        """See the function of this name."""
+        """See the function of the same name."""
         self._found = without_common_folder(self._found)
         self._known = without_common_folder(self._known)
         return self
@@ -162,7 +162,7 @@ def _open_zip(file: IO[bytes]) -> zipfile.ZipFile:
 
 
 def _entries(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
-    """The files of an archive by their plain names, once all of them can be taken."""
+    """Return the files of an archive by plain names after checking all entries."""
     entries = [entry for entry in archive.infolist() if not entry.is_dir()]
     if len(entries) > MAX_FILES:
         raise LimitError(f"the archive holds {len(entries)} files; at most {MAX_FILES} are taken")
@@ -174,7 +174,7 @@ def _entries(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
         if entry.flag_bits & 1:
             raise InputError(f"the archive entry {name!r} is encrypted; pack it without a password")
         if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-            # Others may ask for gigabytes of memory before the first byte.
+            # Other methods can request gigabytes of memory before the first byte.
             raise InputError(f"the archive entry {name!r} is compressed in an unusual way; use plain deflate")
         found[name] = entry
     if sum(map(len, found)) > MAX_NAMES:
@@ -183,13 +183,13 @@ def _entries(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
 
 
 def _read_entry(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, limit: int) -> bytes:
-    """At most `limit` bytes of an entry, whatever its header says."""
+    """Read at most `limit` bytes of an entry, regardless of its header."""
     with _damage_said(entry), archive.open(entry) as stream:
         return stream.read(limit)
 
 
 def _measure_entry(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, limit: int) -> tuple[int, str]:
-    """Bytes of an entry, counted up to `limit`, and their digest; holds a piece of it at a time."""
+    """Return size (up to `limit`) and digest of an entry, read in pieces."""
     count, digest = 0, hashlib.sha256()
     with _damage_said(entry), archive.open(entry) as stream:
         while count < limit and (piece := stream.read(min(_PIECE_BYTES, limit - count))):
@@ -209,7 +209,7 @@ def _damage_said(entry: zipfile.ZipInfo) -> Iterator[None]:
 
 
 def check_path(name: str) -> str:
-    """The name itself, if it stays inside its folder; InputError otherwise."""
+    """Return the name if it stays inside its folder; InputError otherwise."""
     path = PurePosixPath(name.replace("\\", "/"))
     if len(name) > MAX_NAME:
         raise InputError(f"the file name {name[:40]!r}... is longer than {MAX_NAME} characters; take a shorter one")
@@ -219,10 +219,10 @@ def check_path(name: str) -> str:
 
 
 def builtin_files(kind: AssetKind, name: str) -> dict[str, bytes]:
-    """Files of a built-in hand (`asset.json`, URDF) or object (`asset.json`, mesh).
+    """Load the files of a built-in hand (`asset.json`, URDF) or object (`asset.json`, mesh).
 
     Raises:
-        NotFoundError: no such built-in.
+        NotFoundError: no such built-in asset.
     """
     folder = Path(str(resources.files("graspd.service"))) / "builtin" / f"{kind.value}s" / name
     if not (folder / "asset.json").is_file():
@@ -234,22 +234,22 @@ def builtin_files(kind: AssetKind, name: str) -> dict[str, bytes]:
 
 
 def builtin_model(kind: AssetKind, name: str) -> bytes:
-    """Binary glTF of a built-in hand or object, as `python -m graspd.worker.stages.models` wrote it."""
+    """Load the binary glTF of a built-in hand or object, made by `python -m graspd.worker.stages.models`."""
     return (
         Path(str(resources.files("graspd.service"))) / "builtin" / "models" / f"{kind.value}-{name}.glb"
     ).read_bytes()
 
 
 def builtin_names(kind: AssetKind) -> tuple[str, ...]:
-    """Names of the built-in hands or objects."""
+    """Return the names of the built-in hands or objects."""
     root = Path(str(resources.files("graspd.service"))) / "builtin" / f"{kind.value}s"
     return tuple(sorted(path.parent.name for path in root.glob("*/asset.json")))
 
 
 def describe(kind: AssetKind, name: str, files: Mapping[str, bytes], *, created: str, builtin: bool = False) -> Asset:
-    """The asset record of a set of files with an `asset.json` that names the main file under `file`.
+    """Make the asset record of files with an `asset.json` whose key `file` is the main file.
 
-    `asset.json` of a hand may also hold palm, approach, preshape, couplings, ...; of an object units and density.
+    A hand's `asset.json` may also contain palm, approach, preshape, couplings, ...; an object's units and density.
     """
     described = parse_description(asset_json(files), f"{kind.value} {name!r}")
     main = described.file
@@ -269,7 +269,7 @@ def describe(kind: AssetKind, name: str, files: Mapping[str, bytes], *, created:
 
 
 def asset_json(files: Mapping[str, bytes]) -> bytes:
-    """`asset.json` among the files; InputError if it is not there, or too large to be read at all."""
+    """Return the bytes of `asset.json`; InputError if it is missing or too large."""
     if "asset.json" not in files:
         raise InputError("asset.json, a JSON object that names the main file, is not among the files")
     if isinstance(files, StreamedFiles) and files.size("asset.json") > MAX_BYTES:
@@ -278,6 +278,6 @@ def asset_json(files: Mapping[str, bytes]) -> bytes:
 
 
 def builtin_asset(kind: AssetKind, name: str) -> tuple[Asset, dict[str, bytes]]:
-    """A built-in hand or object with its files."""
+    """Load a built-in hand or object with its files."""
     files = builtin_files(kind, name)
     return describe(kind, name, files, created=_BUILTIN_CREATED, builtin=True), files

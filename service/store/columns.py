@@ -1,4 +1,4 @@
-"""The HDF5 schema of shards: shape, unit and meaning of each dataset, type and meaning of each root attribute."""
+"""HDF5 schema of shards: shape, unit and meaning of datasets, type and meaning of root attributes."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ _VERSIONS: Final[dict[str, int]] = {"base": 2, "scene": 1, "views": 1}
 
 
 def schema_of(kind: str) -> str:
-    """What a shard of a kind says of its columns, such as `graspd/base@2`."""
+    """Return the schema name of a kind of shard, such as `graspd/base@2`."""
     return f"graspd/{kind}@{_VERSIONS[kind]}"
 
 
 @dataclass(frozen=True)
 class Column:
-    """One dataset of a shard. Letters of `shape` that repeat must have one length throughout the shard."""
+    """One dataset of a shard. Equal letters in `shape` mean equal lengths throughout the shard."""
 
     shape: str
     dtype: str
@@ -135,7 +135,7 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
             + ", ".join(f"{axis:d} {words}" for axis, words in AXIS_MEANINGS.items()),
             optional=True,
         ),
-        # Grasps that were planned for a scene say which, and how they are reached and lifted there.
+        # Grasps planned for a scene state the scene, the approach and the lift.
         "scene/object_pose": Column(
             "S 7", "f8", "m, 1", "scene", "object frame at rest in each scene; z is up", optional=True
         ),
@@ -369,7 +369,7 @@ ATTRIBUTES: Final[dict[str, RootAttribute]] = {
 
 
 def check_attributes(kind: str, said: Mapping[str, Attribute]) -> None:
-    """Raises InputError for an attribute that a shard of this kind does not have, or whose type is another."""
+    """Raise InputError for an unknown attribute or a wrong type."""
     for name, value in said.items():
         known = ATTRIBUTES.get(name)
         if known is None or kind not in known.kinds:

@@ -1,5 +1,7 @@
-"""`asset.json`: a small, flat JSON object, and corrections of what was guessed of a hand. The worker checks what its
-keys mean (`worker.hands.options`, `worker.objects.options`)."""
+"""`asset.json`, a small, flat JSON object, and corrections of guesses about a hand.
+
+Workers check the meaning of its keys (`worker.hands.options`, `worker.objects.options`).
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,7 @@ from pydantic_core import from_json, to_json
 from graspd.service.model.base import refusal
 from graspd.service.model.errors import ConflictError, InputError
 
-#: The built-in hands need 2 KB; the facts stand in every list of hands or objects.
+#: The built-in hands need 2 KB; every list of hands or objects contains these facts.
 MAX_BYTES: Final = 64 << 10
 MAX_FACTS_BYTES: Final = 8 << 10
 _MAX_DEPTH: Final = 6
@@ -30,7 +32,7 @@ def _small(facts: dict[str, Any]) -> dict[str, Any]:
 
 
 class Description(BaseModel):
-    """The keys that the service itself reads; the others are kept for the worker."""
+    """The keys that the service reads; the others are stored for the worker."""
 
     model_config = ConfigDict(extra="allow", frozen=True)
 
@@ -44,7 +46,7 @@ class Description(BaseModel):
 
 
 def parse_description(data: bytes, what: str) -> Description:
-    """An `asset.json`; InputError, which begins with `what`, if it is none."""
+    """Parse an `asset.json`; InputError, which begins with `what`, if it is invalid."""
     given = json_object(data, f"{what}: asset.json")
     try:
         return Description.model_validate(given)
@@ -53,7 +55,7 @@ def parse_description(data: bytes, what: str) -> Description:
 
 
 def json_object(text: bytes | str, what: str) -> dict[str, Any]:
-    """A JSON object of bounded size and depth from its text; InputError if it is none."""
+    """Parse a JSON object of bounded size and depth; InputError if it is invalid."""
     data = text.encode(errors="replace") if isinstance(text, str) else text
     if len(data) > MAX_BYTES:
         raise InputError(f"{what} has more than {MAX_BYTES} bytes; leave out what is not needed")
@@ -75,11 +77,11 @@ def _is_plain(value: Any, depth: int) -> bool:
     return not isinstance(value, int) or abs(value) <= _MAX_NUMBER
 
 
-#: Far more than any hand has; the largest in use have some sixty joints.
+#: Far above any hand: the largest in use have about sixty joints.
 MAX_ENTRIES: Final = 256
-#: No palm lies farther from its link's frame [m].
+#: Largest distance of the palm from its link's frame [m].
 MAX_CENTRE_M: Final = 2.0
-#: Numbers in messages and in glTF are rounded.
+#: Tolerance: numbers in messages and glTF are rounded.
 _ROUNDING: Final = 1e-6
 
 Text = Annotated[str, StringConstraints(min_length=1, max_length=255)]
@@ -94,7 +96,7 @@ class _Said(BaseModel):
 
 
 class PalmCorrection(_Said):
-    """The palm in the frame of a link, the hand in its pre-shape. What is left out is guessed again."""
+    """The palm in the frame of a link, with the hand in its pre-shape. Missing values are guessed again."""
 
     link: Text
     centre: tuple[Length, Length, Length] | None = Field(None, description="where it takes hold [m]")
@@ -102,7 +104,7 @@ class PalmCorrection(_Said):
 
 
 class HandCorrections(_Said):
-    """What a user says of a hand where graspd guessed wrongly. What is left out stays as it was found."""
+    """A user's corrections of wrong guesses about a hand. Missing values stay as found."""
 
     palm: PalmCorrection | None = None
     closing: dict[Text, Direction] = Field(
@@ -115,7 +117,7 @@ class HandCorrections(_Said):
 
 
 class HandFacts(BaseModel):
-    """What the model of a hand tells of it (`worker.stages.models`)."""
+    """Facts about a hand in its model (`worker.stages.models`)."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -129,16 +131,16 @@ class HandFacts(BaseModel):
     closing: dict[str, int]
     fingertips: list[str]
     links: list[str]
-    """Those at and below the root."""
+    """Links at and below the root."""
     bodies: list[str]
-    """Of these, the root and those that a joint moves."""
+    """Those of them that are the root or moved by a joint."""
 
 
 def facts_of(model: bytes) -> HandFacts:
-    """What the binary glTF of a hand says of it.
+    """Read the facts in the binary glTF of a hand.
 
     Raises:
-        ConflictError: it says too little: it was made by an older version.
+        ConflictError: facts are missing, because an older version made the model.
     """
     try:
         (length,) = struct.unpack("<I", model[12:16])
@@ -154,7 +156,7 @@ def facts_of(model: bytes) -> HandFacts:
 
 
 def described(facts: Mapping[str, Any]) -> dict[str, Any]:
-    """Keys of an `asset.json` that say what was found or guessed: root, palm, pre-shape, closing, fingertips."""
+    """Return found or guessed values as keys of `asset.json`: root, palm, pre-shape, closing, fingertips."""
     root = facts["root"]
     return {
         "root": root,
@@ -166,12 +168,12 @@ def described(facts: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def corrected(said: Mapping[str, Any], facts: HandFacts, corrections: HandCorrections) -> dict[str, Any]:
-    """An `asset.json` that says all that was said, found and corrected, so that nothing is left to guess.
+    """Return an `asset.json` with all given, found and corrected values, so that no guess remains.
 
-    The pre-shape of a joint that closes another way is guessed anew unless it is given.
+    A joint whose closing direction changes gets a new guess of its pre-shape unless one is given.
 
     Raises:
-        InputError: a link or a joint that the hand does not have, a value out of its limits, or no direction.
+        InputError: unknown link or joint, a value outside its limits, or an invalid direction.
     """
     _check(facts, corrections)
     found = described(facts.model_dump())

@@ -1,4 +1,4 @@
-"""Files of a hand on the user's disk: which belong to it, which one describes it, and in which format."""
+"""Files of a hand on the user's disk: selection, main file and format."""
 
 from __future__ import annotations
 
@@ -15,29 +15,29 @@ from graspd.service.model.errors import InputError, LimitError
 from graspd.service.store.assets import MAX_FILES
 from graspd.service.store.mesh_files import HEAD_BYTES, MESHES, beside, named_by, one_like, read_reference
 
-#: What says more of a hand than its URDF does; the first goes over the second.
+#: Descriptions that supplement a hand's URDF; the first takes precedence.
 DESCRIPTIONS: Final = ("asset.json", "hand.json")
 
-#: What the name of a description may end with; which of them it is, its root element tells.
+#: Suffixes of descriptions; the root element decides the format.
 SUFFIXES: Final = (".urdf", ".xacro", ".xml", ".mjcf")
-#: Of a folder only these are taken, beside its descriptions.
+#: Suffixes of the files taken from a folder besides its descriptions.
 _TAKEN: Final = (*SUFFIXES, ".yaml", ".yml", ".stl", ".obj", ".ply", ".off", ".glb", ".dae", ".msh")
 _REFERENCE: Final = re.compile(r"""file(?:name)?\s*=\s*["']([^"']+)["']""")
 _FOLDER: Final = re.compile(r"""(?:mesh|asset)dir\s*=\s*["']([^"']*)["']""")
 _MAX_INCLUDED: Final = 32
-#: Folders of a ROS package in which descriptions lie: their meshes lie beside them, not below.
+#: Folders of descriptions in a ROS package: the meshes are in sibling folders, not below.
 _OF_PACKAGES: Final = ("urdf", "robots", "xacro", "mjcf")
 _ABOVE: Final = 4
 
 
 def files_of_hand(path: Path) -> tuple[dict[str, Path], str]:
-    """Relative names and places of a hand's files, and the name of its description; empty for a folder.
+    """Find a hand's files with relative names, and the name of its description (empty for a folder).
 
-    Links that lead out of the hand's folder are left alone.
+    Links that lead out of the hand's folder are ignored.
 
     Args:
-        path: the folder of a hand, or its description: then the files that it names, and notes on it. Their folder is
-            that of the ROS package around it, else that of the description.
+        path: the folder of a hand, or its description. With a description: the files that it names, and `DESCRIPTIONS`;
+            names are relative to the ROS package around it, or else to its own folder.
 
     Raises:
         InputError: a folder without a description.
@@ -48,7 +48,7 @@ def files_of_hand(path: Path) -> tuple[dict[str, Path], str]:
 
 
 def _looks(files: Mapping[str, Path], root: Path) -> dict[str, Path]:
-    """Material libraries and pictures that meshes name, where they lie inside the root."""
+    """Find material libraries and pictures of meshes, inside the root."""
     found: dict[str, Path] = {}
     waiting = [name for name in files if name.lower().endswith(MESHES)]
     while waiting and len(files) + len(found) < MAX_FILES:
@@ -89,7 +89,7 @@ def _of_description(path: Path) -> tuple[dict[str, Path], str]:
     root = _package(path)
     main = path.relative_to(root).as_posix()
     if path.is_file() and format_of(path.name, path.read_bytes()) == "xacro":
-        # What it includes is only known when it is expanded.
+        # Includes are only known after expansion.
         files = _below(root if (root / "package.xml").is_file() else path.parent, root)
     else:
         files = {name: root / name for name in sorted(_named_by(path, root))}
@@ -101,7 +101,7 @@ def _of_description(path: Path) -> tuple[dict[str, Path], str]:
 
 
 def _package(path: Path) -> Path:
-    """Folder of the ROS package around a description, else the description's own."""
+    """Return the folder of the ROS package around a description, or else its own folder."""
     for folder in list(path.parents)[:_ABOVE]:
         if (folder / "package.xml").is_file():
             return folder
@@ -109,9 +109,9 @@ def _package(path: Path) -> Path:
 
 
 def _named_by(path: Path, root: Path) -> set[str]:
-    """Names of the files below the root that a description, and what it includes, may mean.
+    """Return names of files below the root to which a description and its includes may refer.
 
-    `worker.hands.visuals.find_mesh` and `worker.hands.mjcf_source` choose among them.
+    `worker.hands.visuals.find_mesh` and `worker.hands.mjcf_source` select among them.
     """
     seen, waiting = {path}, [path]
     bases, folders, references = set(), {""}, set()
@@ -122,7 +122,7 @@ def _named_by(path: Path, root: Path) -> set[str]:
         bases.add(file.parent.relative_to(root).as_posix())
         folders |= {unescape(folder) for folder in _FOLDER.findall(text)}
         references |= {unescape(reference) for reference in _REFERENCE.findall(text)}
-        # Names in an included file count from its folder or from that of the description, as the reader pleases.
+        # Names in an included file are relative to its folder or to that of the description, depending on the reader.
         found = {
             name
             for reference in references
@@ -139,7 +139,7 @@ def _named_by(path: Path, root: Path) -> set[str]:
 
 
 def _names(written: str, base: str, folder: str, root: Path) -> Iterator[str]:
-    """Names of files below the root that a reference may mean."""
+    """Yield the names of files below the root to which a reference may resolve."""
     with suppress(InputError):
         reference = read_reference(posixpath.join(folder, written), base)
         if not reference.scheme or not folder:
@@ -149,7 +149,7 @@ def _names(written: str, base: str, folder: str, root: Path) -> Iterator[str]:
 
 
 def _on_disk(name: str, root: Path) -> str:
-    """The name of a file below the root, in its own capitals; empty where there is none."""
+    """Return the name of a file below the root in its actual capitals; empty if there is none."""
     if _inside(root / name, root):
         return posixpath.normpath(name)
     at = root
@@ -173,14 +173,14 @@ def _inside(file: Path, root: Path) -> bool:
 
 
 Format = Literal["urdf", "xacro", "mjcf"]
-#: A root element that begins later than this is none that a tool wrote [bytes].
+#: Size of the head searched for a root element [bytes]; no tool writes one later.
 _HEAD_BYTES: Final = 1 << 16
 _PROLOG: Final = re.compile(r"\s*(?:<\?.*?\?>|<!--.*?-->|<!DOCTYPE(?:[^\[>]|\[.*?\])*>)", re.DOTALL)
 _ROOT: Final = re.compile(r"\s*<([A-Za-z_][\w:.-]*)")
 _COMMENT: Final = re.compile(r"<!--.*?-->", re.DOTALL)
 _MACROS: Final = ("<xacro:", "${", "$(")
 _FORMATS_OF: Final[dict[str, Format]] = {"robot": "urdf", "mujoco": "mjcf"}
-#: What a file in an encoding begins with, its mark of byte order or that of `<`; a longer one goes first.
+#: Beginnings of files by encoding: byte order mark, or encoded `<`; longer ones first.
 _MARKS: Final = (
     (b"\xff\xfe\0\0", "utf-32"),
     (b"\0\0\xfe\xff", "utf-32"),
@@ -193,12 +193,12 @@ _MARKS: Final = (
 )
 _DECLARED: Final = re.compile(rb"""\s*<\?xml[^>]{0,100}encoding\s*=\s*["']([\w.:-]{1,40})""")
 _DECLARATION: Final = re.compile(r"<\?xml\s[^>]{0,200}\?>")
-#: Encodings that a file may name; all else is UTF-8, whatever it says.
+#: Encodings accepted from a declaration; all other files are read as UTF-8.
 _NAMED: Final = re.compile(r"iso-?8859|latin|windows-12|cp12|gb|big5|shift|euc|koi8", re.IGNORECASE)
 
 
 def format_of(name: str, data: bytes) -> Format | None:
-    """Format of a file; None: it describes no robot."""
+    """Detect the format of a file; None if it does not describe a robot."""
     suffix = PurePosixPath(name).suffix.lower()
     if suffix not in SUFFIXES:
         return None
@@ -206,13 +206,12 @@ def format_of(name: str, data: bytes) -> Format | None:
     found = _FORMATS_OF.get(_root_element(text[:_HEAD_BYTES]))
     if found == "urdf" and any(sign in _COMMENT.sub("", text) for sign in _MACROS):
         return "xacro"
-    # A file that calls itself a URDF is taken at its word, so that its reader says what is wrong with it.
+    # Otherwise the suffix decides, so that the reader reports the error in the file.
     return found or {".urdf": "urdf", ".xacro": "xacro", ".mjcf": "mjcf"}.get(suffix)  # type: ignore[return-value]
 
 
 def text_of(data: bytes) -> str:
-    """The text of an XML or YAML file in the encoding that its byte order or its declaration says, without the
-    declaration and white space around it; what claims to be UTF-8 and is not, is read as Latin 1."""
+    """Decode XML or YAML by byte order mark or declaration, and strip both. Invalid UTF-8 is Latin 1."""
     coding = next((name for mark, name in _MARKS if data.startswith(mark)), "")
     if not coding:
         declared = _DECLARED.match(data)
@@ -222,25 +221,25 @@ def text_of(data: bytes) -> str:
         text = data.decode(coding)
     except (UnicodeError, LookupError):
         text = data.decode("latin-1")
-    # It may only stand at the very beginning, and a licence often does.
+    # A declaration is only valid at the very beginning, but licences often precede it.
     return _DECLARATION.sub("", text, count=1).strip("\ufeff\0 \t\r\n")
 
 
 def main_of(files: Mapping[str, bytes], wanted: str = "", *, where: str = "the hand") -> str:
-    """Name of the file that describes the hand.
+    """Return the name of the file that describes the hand.
 
     Args:
         files: all files of the hand.
-        wanted: the file as the user calls it: its name, the end of its path, or its name without suffix.
-        where: what holds the files, for messages.
+        wanted: the user's name for the file: its name, the end of its path, or its name without suffix.
+        where: description of the source, for messages.
 
     Raises:
-        InputError: there is none, several and none is wanted, or what is wanted is not there or fits several.
+        InputError: no file, several without `wanted`, or `wanted` matches none or several.
     """
     known = {name: kind for name in sorted(files) if (kind := format_of(name, _described_head(files, name)))}
     if wanted:
         return _named(wanted, [name for name in sorted(files) if name in known or name == wanted], where)
-    # A part of a xacro file may hold no macro itself.
+    # A part of a xacro description may contain no macros.
     kinds_of = {name: "xacro" if name.lower().endswith(".xacro") else kind for name, kind in known.items()}
     for chosen in ("urdf", "xacro", "mjcf"):
         found = [name for name, kind in kinds_of.items() if kind == chosen]
@@ -275,7 +274,7 @@ def _named(wanted: str, known: list[str], where: str) -> str:
 
 
 def _outermost(files: Mapping[str, bytes], found: list[str]) -> list[str]:
-    """Those that no other includes."""
+    """Return the files that no other file includes."""
     contents = {name: text_of(files[name]).lower() for name in found}
     return [
         name
@@ -285,7 +284,7 @@ def _outermost(files: Mapping[str, bytes], found: list[str]) -> list[str]:
 
 
 def _short(names: list[str]) -> str:
-    """The first name, as short as it can be said."""
+    """Return the first name in its shortest unique form."""
     leaves = [PurePosixPath(name).name for name in names]
     return leaves[0] if leaves.count(leaves[0]) == 1 else names[0]
 
@@ -295,7 +294,7 @@ def _stem(name: str) -> str:
 
 
 def hand_name(leaf: str) -> str:
-    """A file's name without what says its format: `claw.urdf.xacro` is `claw`."""
+    """Strip the suffixes of the format from a file name: `claw.urdf.xacro` becomes `claw`."""
     path = PurePosixPath(leaf)
     while path.suffix.lower() in (*SUFFIXES, ".zip"):
         path = path.with_suffix("")
@@ -303,7 +302,7 @@ def hand_name(leaf: str) -> str:
 
 
 def _described_head(files: Mapping[str, bytes], name: str) -> bytes:
-    """Enough of a file to tell its format; all of a robot's, whose macros may stand anywhere."""
+    """Return the part of a file that decides its format; all of a robot's, which may have macros anywhere."""
     if PurePosixPath(name).suffix.lower() not in SUFFIXES:
         return b""
     if isinstance(files, StreamedFiles) and files.size(name) > 1 << 23:

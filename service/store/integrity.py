@@ -1,8 +1,8 @@
-"""Checksums: of objects in a store, of shards in a folder, and seals that objects carry in themselves.
+"""Checksums of stored objects and of shards in folders; seals inside objects.
 
-A seal is the digest of the object with the 64 digits of the seal as zeros. A JSON record has it as its first field
-`checksum`, a ZIP (`.npz` too) in its comment, a binary glTF in the `extras` of its document. Objects of graspd 0.2 have
-none, and are read as before.
+A seal is the digest of the object with the 64 digits of the seal as zeros. It is the first field `checksum` of a JSON
+record, the comment of a ZIP (also `.npz`), or in the `extras` of a binary glTF's document. Objects of graspd 0.2 have
+no seal and are read as before.
 """
 
 from __future__ import annotations
@@ -25,21 +25,21 @@ from typing import Any, Final
 from graspd.service.model.errors import DamagedError, DamagedShard, NotFoundError
 from graspd.service.store.store import STREAM_BYTES, Stamp, Store
 
-#: Lists of checksums that exports and cards write, looked for in the folder of a shard and in the two above it.
+#: Checksum lists of exports and cards, searched in the folder of a shard and the two above it.
 CHECKSUM_LISTS: Final = ("SHA256SUMS", "checksums.sha256")
 _DIGEST: Final = re.compile(r"[0-9a-f]{64}")
 _LEVELS: Final = 3
 FIX: Final = "`graspd admin store verify --repair` makes it again where that is possible"
-#: Bits may rot without a new time of change, so that what was found intact is not believed for ever [s].
+#: Lifetime of a successful check [s]: bits can rot without a new modification time.
 _BELIEVED_S: Final = 3600.0
 _REMEMBERED: Final = 100_000
 
 
 def read_checked(store: Store, key: str, sha256: str) -> bytes:
-    """All bytes of an object that was put with this checksum.
+    """Read an object completely and verify its checksum.
 
     Raises:
-        DamagedShard: it is gone, or has another checksum.
+        DamagedShard: it is missing or does not match the checksum.
         StoreUnavailable: the store does not answer.
     """
     try:
@@ -51,29 +51,29 @@ def read_checked(store: Store, key: str, sha256: str) -> bytes:
 
 
 def check_digest(name: str, found: str, expected: str) -> None:
-    """DamagedShard, with the shard's name, where the checksums differ."""
+    """Raise DamagedShard with the shard's name if the checksums differ."""
     if found != expected:
         raise DamagedShard(f"{name} is damaged: its SHA-256 is {found[:12]}..., expected {expected[:12]}...; {FIX}")
 
 
 def gone(key: str) -> DamagedShard:
-    """The error of a shard with a manifest and no file."""
+    """Make the error for a shard with a manifest but without a file."""
     return DamagedShard(f"{key} is gone from the store, and its manifest is there; {FIX}")
 
 
 @dataclass(frozen=True)
 class _Intact:
-    """What is known of an object that was read through."""
+    """Facts about a verified object."""
 
     stamp: Stamp
     until: float
     size: int
     blocks: tuple[bytes, ...]
-    """A digest of each `STREAM_BYTES` of it."""
+    """Digest of each block of `STREAM_BYTES`."""
 
 
 class CheckedObjects:
-    """Remembers which objects were found intact while their size, tag and time of change stay. Safe between threads."""
+    """Cache of verified objects, valid while size, tag and modification time do not change. Thread-safe."""
 
     def __init__(self, store: Store) -> None:
         self._store = store
@@ -81,21 +81,21 @@ class CheckedObjects:
         self._lock = threading.Lock()
 
     def check(self, key: str, sha256: str) -> None:
-        """Read an object through, unless that was done lately.
+        """Verify an object by reading it, unless that was done recently.
 
         Raises:
-            DamagedShard: it is gone, or has another checksum.
+            DamagedShard: it is missing or does not match the checksum.
             StoreUnavailable: the store does not answer.
         """
         self._intact(key, sha256)
 
     def stream(self, key: str, sha256: str, start: int, length: int) -> Iterator[bytes]:
-        """Bytes of an object, each block read anew and held against what it was before any of it is given.
+        """Yield bytes of an object; each block is read again and verified before any of it is returned.
 
-        The time of change does not tell of bytes that rotted. The first block is looked at when this is called.
+        The modification time does not reveal bit rot. The first block is verified at the call.
 
         Raises:
-            DamagedShard: it is not what its checksum says; from the iterator as well, which then ends before its end.
+            DamagedShard: it does not match its checksum; also raised by the iterator, which then ends early.
             StoreUnavailable: the store does not answer.
         """
         known = self._intact(key, sha256)
@@ -141,19 +141,19 @@ def _of_block(data: bytes) -> bytes:
 
 
 def check_file(path: Path) -> None:
-    """Check a shard in a folder against the manifest or the list of checksums that lies there, if one does.
+    """Check a shard in a folder against the manifest or checksum list there, if any.
 
-    What was found intact is not read again by this process while its size and time of change stay.
+    A verified file is not read again by this process while size and modification time do not change.
 
     Raises:
-        DamagedShard: it is not what the checksum says.
+        DamagedShard: it does not match the checksum.
     """
     if _known.get(path) != _file_stamp(path):
         check_content(path, _expected(path))
 
 
 def check_content(path: Path, sha256: str | None) -> None:
-    """The same with a checksum that the caller knows; None: nothing says what the file should be."""
+    """Check a file against a known checksum; None: there is none."""
     stamp = _file_stamp(path)
     if _known.get(path) == stamp:
         return
@@ -186,7 +186,7 @@ def _expected(path: Path) -> str | None:
 
 
 def _of_manifest(path: Path) -> str | None:
-    """What the manifest beside a file says, as in the store's own folder."""
+    """Return the checksum in the manifest beside a file, as in the store's own folder."""
     try:
         said = json.loads(path.with_suffix(".json").read_bytes())
         digest = said["sha256"] if str(said["key"]).endswith(f"/{path.name}") else None
@@ -197,7 +197,7 @@ def _of_manifest(path: Path) -> str | None:
 
 @lru_cache(maxsize=8)
 def _listed(sums: Path, _changed: int) -> dict[str, str]:
-    """Digests by name of a list as `sha256sum` writes it."""
+    """Read a list written by `sha256sum`: digests by name."""
     lines = (line.split(maxsplit=1) for line in sums.read_text(errors="replace").splitlines())
     return {parts[1].removeprefix("*"): parts[0] for parts in lines if len(parts) == 2 and _DIGEST.fullmatch(parts[0])}
 
@@ -207,25 +207,25 @@ _DIGITS: Final = re.compile(rb"[0-9a-f]{64}")
 _JSON: Final = b'{"checksum":"'
 _GLB: Final = b'{"extras":{"checksum":"'
 _ZIP: Final = b"sha256:"
-#: A document's header and the header of its first chunk [bytes].
+#: Size of a document's header and the header of its first chunk [bytes].
 _GLB_AT: Final = 20
-#: Head of an object in which digits would stand if some bytes before them were lost or added [bytes].
+#: Head of an object that may contain the digits if preceding bytes were lost or added [bytes].
 _SLACK: Final = 4
 _END: Final = struct.Struct("<4s4H2LH")
 _END_MARK: Final = b"PK\x05\x06"
 
 
 def put_sealed(store: Store, key: str, data: bytes) -> bool:
-    """Write an object with its seal, if there is none of this name; False if there was."""
+    """Write an object with its seal if absent; False if the name exists."""
     return store.put(key, sealed(key, data))
 
 
 def get_sealed(store: Store, key: str) -> bytes:
-    """An object that is what its seal says, or has none.
+    """Read an object and verify its seal, if it has one.
 
     Raises:
         NotFoundError: there is no such object.
-        DamagedError: its bytes are not those that were sealed.
+        DamagedError: its bytes do not match the seal.
     """
     data = store.get(key)
     is_sealed(key, [data], len(data))
@@ -233,12 +233,12 @@ def get_sealed(store: Store, key: str) -> bytes:
 
 
 def put_document(store: Store, key: str, document: Mapping[str, Any]) -> bool:
-    """Write JSON with its seal, if there is none of this name."""
+    """Write JSON with its seal if absent."""
     return put_sealed(store, key, json.dumps(dict(document)).encode())
 
 
 def get_document(store: Store, key: str) -> dict[str, Any]:
-    """The JSON of `put_document`; errors as of `get_sealed`, DamagedError also where it is no JSON object."""
+    """Read the JSON of `put_document`; errors of `get_sealed`, DamagedError also if not a JSON object."""
     try:
         found = json.loads(get_sealed(store, key))
     except ValueError:
@@ -250,7 +250,7 @@ def get_document(store: Store, key: str) -> dict[str, Any]:
 
 
 def sealed(key: str, data: bytes) -> bytes:
-    """The object with its seal. What is no JSON object, ZIP or glTF stays as it is."""
+    """Return the object with its seal. Other formats than JSON object, ZIP and glTF do not change."""
     if key.endswith(".json") and data[:1] == b"{":
         data, at = _JSON + _ZEROS + b'",' + data[1:], len(_JSON)
     elif key.endswith(".glb") and data[:4] == b"glTF" and data[_GLB_AT : _GLB_AT + 1] == b"{":
@@ -265,7 +265,7 @@ def sealed(key: str, data: bytes) -> bytes:
 
 
 def seal_archive(file: BufferedRandom) -> None:
-    """Seal a ZIP in a file that is open for reading and writing."""
+    """Seal a ZIP in a file open for reading and writing."""
     comment = _ZIP + _ZEROS
     file.seek(-2, 2)
     file.write(struct.pack("<H", len(comment)) + comment)
@@ -276,15 +276,15 @@ def seal_archive(file: BufferedRandom) -> None:
 
 
 def is_sealed(key: str, chunks: Iterable[bytes], size: int) -> bool:
-    """Whether an object has a seal, which then holds; False where graspd 0.2 wrote it without one.
+    """Check whether an object has a valid seal; False if graspd 0.2 wrote it without one.
 
     Args:
-        key: its name, whose ending tells its format.
+        key: its name, whose suffix gives the format.
         chunks: its bytes.
-        size: their number.
+        size: number of bytes.
 
     Raises:
-        DamagedError: its bytes are not those that were sealed.
+        DamagedError: its bytes do not match the seal.
     """
     is_zip = key.endswith((".zip", ".npz"))
     before, start = (_GLB, _GLB_AT) if key.endswith(".glb") else (_JSON, 0)
@@ -318,13 +318,13 @@ def _damaged(key: str) -> DamagedError:
 
 
 def _without_digits(chunk: bytes, at: int) -> bytes:
-    """A chunk with the digits, which begin `at` its start, as zeros."""
+    """Replace the digits in a chunk by zeros; they begin at offset `at`."""
     first, last = max(0, at), min(len(chunk), at + len(_ZEROS))
     return chunk if first >= last else chunk[:first] + b"0" * (last - first) + chunk[last:]
 
 
 def _with_extras(data: bytes) -> bytes:
-    """A binary glTF whose document begins with room for the seal."""
+    """Add space for the seal at the beginning of a binary glTF's document."""
     length = int.from_bytes(data[12:16], "little")
     document = _GLB + _ZEROS + b'"},' + data[_GLB_AT + 1 : _GLB_AT + length]
     document += b" " * (-len(document) % 4)

@@ -1,4 +1,4 @@
-"""Hands and objects in the store: publish, load, and the names they go by."""
+"""Library of hands and objects in the store: publishing, loading, names."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from graspd.service.store.records import Put, put_record, read_record
 from graspd.service.store.store import Store
 
 log = logging.getLogger(__name__)
-#: An archive the service packed itself is bounded by the upload limit; this only stops a store that was tampered with.
+#: The upload limit bounds archives packed by the service; this only stops a manipulated store.
 UNPACKED_LIMIT_BYTES: Final = 2 * 2**30
 
 
@@ -34,15 +34,15 @@ def publish_asset(
     created: str = "",
     owner: str = "",
 ) -> Asset:
-    """Put a hand or object into the store: the archive first, its record last. Doing it twice changes nothing.
+    """Publish a hand or object: the archive first, its record last. Idempotent.
 
     Args:
-        files: `asset.json` (names the main file) and all files it needs.
-        owner: id of the API key that uploads it.
+        files: `asset.json` (names the main file) and all required files.
+        owner: id of the uploading API key.
 
     Raises:
-        InputError: `asset.json` is missing or wrong.
-        ConflictError: the same content is known under another name.
+        InputError: `asset.json` is missing or invalid.
+        ConflictError: the same content exists under another name.
     """
     asset = store_files(store, kind, name, files, builtin=builtin, created=created, said={"owner": owner})
     return record_asset(store, asset)
@@ -58,14 +58,14 @@ def store_files(
     created: str = "",
     said: Mapping[str, object] | None = None,
 ) -> Asset:
-    """The first half of `publish_asset`: the archive is there, and nothing counts it yet.
+    """Store the archive, the first half of `publish_asset`; the asset does not exist for readers yet.
 
     Args:
-        said: further fields of the record: `owner`, `project`, `shared`, `self_test`. Files that their project keeps
-            to itself hold its mark (`service.model.projects.marks_of`).
+        said: further fields of the record: `owner`, `project`, `shared`, `self_test`. Private files contain their
+            project's mark (`service.model.projects.marks_of`).
 
     Raises:
-        InputError: `asset.json` is missing or wrong.
+        InputError: `asset.json` is missing or invalid.
     """
     asset = describe(kind, name, files, created=created or timestamp(), builtin=builtin)
     asset = asset.model_copy(update=dict(said or {}))
@@ -88,13 +88,13 @@ def _is_damaged(store: Store, key: str) -> bool:
 
 
 def record_asset(store: Store, asset: Asset, put: Put | None = None) -> Asset:
-    """The second half of `publish_asset`: the record, from which on the asset counts.
+    """Write the record, the second half of `publish_asset`; from now on the asset exists.
 
     Args:
-        put: writes the record; None: into this store.
+        put: function that writes the record; None: write to this store.
 
     Raises:
-        ConflictError: the same content is known under another name, or is being removed.
+        ConflictError: the same content exists under another name, or is being removed.
     """
     record = names.asset_record(asset.kind, asset.digest)
     new = put(record, asset) if put is not None else put_record(store, record, asset)
@@ -111,12 +111,12 @@ def record_asset(store: Store, asset: Asset, put: Put | None = None) -> Asset:
 
 
 def builtin_assets() -> list[Asset]:
-    """The hands and objects that come with graspd."""
+    """Return the built-in hands and objects."""
     return [builtin_asset(kind, name)[0] for kind in AssetKind for name in builtin_names(kind)]
 
 
 def publish_builtins(store: Store) -> list[Asset]:
-    """Put the hands and objects that come with graspd into the store."""
+    """Publish the built-in hands and objects."""
     published = []
     for kind in AssetKind:
         for name in builtin_names(kind):
@@ -130,7 +130,7 @@ def publish_builtins(store: Store) -> list[Asset]:
 
 
 def _put_model(store: Store, key: str, model: bytes) -> None:
-    """A picture follows from the program as well as from the asset: one of an older version is replaced."""
+    """Write a model file; it depends on program and asset, so one of an older version is replaced."""
     model = sealed(key, model)
     if not store.put(key, model) and store.get(key) != model:
         store.delete(key)
@@ -138,25 +138,25 @@ def _put_model(store: Store, key: str, model: bytes) -> None:
 
 
 def stored_assets(store: Store) -> list[tuple[AssetKind, str]]:
-    """Kind and digest of every hand and object in the store, but for those that were deleted."""
+    """Return kind and digest of every hand and object in the store that is not deleted."""
     records = [entry.key.split("/") for entry in store.list(names.ASSETS)]
     gone = {entry.key for entry in store.list(names.DELETIONS)}
-    # Other files of an asset may lie deeper, such as an object's convex pieces.
+    # Other files of an asset may have deeper keys, such as an object's convex pieces.
     found = [key for key in records if len(key) == 4 and key[1] in set(AssetKind) and key[3] == "asset.json"]
     return [(AssetKind(key[1]), key[2]) for key in found if names.deletion(key[1], key[2]) not in gone]
 
 
 def load_asset(store: Store, kind: AssetKind, digest: str) -> Asset:
-    """The record of a hand or object; NotFoundError if there is none, DamagedError if it is not what its name says."""
+    """Load the record of a hand or object; NotFoundError if absent, DamagedError if damaged."""
     return read_record(Asset, store, names.asset_record(kind, digest))
 
 
 def load_asset_files(store: Store, kind: AssetKind, digest: str) -> dict[str, bytes]:
-    """All files of a hand or object, checked against its digest.
+    """Load all files of a hand or object and verify its digest.
 
     Raises:
         NotFoundError: no such asset.
-        InputError: the archive in the store is not what its name says.
+        InputError: the archive in the store does not match its name.
     """
     files = unpack(store.get(names.asset_files(kind, digest)), limit_bytes=UNPACKED_LIMIT_BYTES)
     if digest_files(kind, files) != digest:
@@ -165,10 +165,10 @@ def load_asset_files(store: Store, kind: AssetKind, digest: str) -> dict[str, by
 
 
 def load_check(store: Store, kind: AssetKind, digest: str) -> dict[str, object] | None:
-    """What ingest found (`verdict`, `message`, `repairs`, `facts`); None while it has not run.
+    """Load the report of ingest (`verdict`, `message`, `repairs`, `facts`); None before it has run.
 
     Raises:
-        DamagedError: the record is not what its name says.
+        DamagedError: the record does not match its name.
     """
     key = names.asset_check(kind, digest)
     if not store.exists(key):

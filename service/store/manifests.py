@@ -1,4 +1,4 @@
-"""The manifest of a shard: put last, create-only, and all the index needs to know of it."""
+"""Manifest of a shard: written last and create-only; all data that the index needs."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from graspd.service.store.records import put_record, read_record
 from graspd.service.store.shards import Shard, read_shard
 from graspd.service.store.store import Store
 
-#: Contact threshold at which the sweep's metrics enter the index [m]: the widest that the literature reports.
+#: Contact threshold of the metrics in the index [m]: the widest in the literature.
 INDEX_THRESHOLD_M: Final = 0.005
 
 
 @with_fields(valid=values(optional=False, default=None), last=values(optional=True, default=None))
 class GraspSummary(BaseModel):
-    """The quality of one grasp, in the units of the shard's columns; None where the shard says nan."""
+    """Quality of one grasp, in the units of the shard's columns; None for nan."""
 
     model_config = ConfigDict(frozen=True, extra="ignore")
 
@@ -46,7 +46,7 @@ class GraspSummary(BaseModel):
 
 
 class ShardManifest(BaseModel):
-    """What a shard is made of and what is in it."""
+    """Inputs and contents of a shard."""
 
     model_config = ConfigDict(frozen=True, extra="ignore")
 
@@ -87,7 +87,7 @@ class ShardManifest(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _tried_what_it_holds(cls, data: Any) -> Any:
-        # Before a shard could hold valid grasps alone, it held every grasp that was tried.
+        # Early shards always contained every candidate.
         if isinstance(data, dict) and "candidates" not in data and data.get("kind") == "base":
             return {**data, "candidates": data.get("counts", {}).get("N", 0)}
         return data
@@ -100,14 +100,13 @@ class ShardManifest(BaseModel):
 
     @property
     def validated(self) -> int:
-        """Tries that were validated, by the geometric gate and the validator: those of a base shard with a validator,
-        or none. What is valid is a share of these; of what is not validated it is not known."""
+        """Candidates tested by geometric gate and validator, the base of the valid share; 0 without validator."""
         has_verdicts = any(grasp.success is not None for grasp in self.grasps)
         return self.candidates if has_verdicts or (not self.grasps and self.request.validation != "none") else 0
 
     @property
     def count(self) -> int:
-        """Rows that matter to a reader: grasps; transferred grasps, or scenes to plan grasps in; pictures."""
+        """Number of main rows: grasps; transferred grasps or scenes to plan in; pictures."""
         scenes = "S" if self.request.in_scene else "K"
         return self.counts.get({"base": "N", "scene": scenes, "views": "V"}[self.kind], 0)
 
@@ -124,8 +123,7 @@ def manifest_of(
     worker: str,
     info: Mapping[str, Any] | None = None,
 ) -> ShardManifest:
-    """The manifest of a shard that a task made; `arrays`, `attributes` and `counts` are the shard's columns, root
-    attributes and axis lengths."""
+    """Make the manifest of a task's shard from its columns, root attributes and axis lengths."""
     kind = names.SHARD_KINDS[message.stage]
     return ShardManifest(
         shard_id=message.output,
@@ -157,7 +155,7 @@ def manifest_of(
 
 
 def _contents(kind: str, arrays: Mapping[str, NDArray[Any]], attributes: Mapping[str, Any]) -> dict[str, Any]:
-    """The manifest's fields that follow from the shard's own columns and attributes."""
+    """Return the fields of the manifest that follow from the shard's columns and attributes."""
     valid = validity.valid(arrays) if kind == "base" else arrays.get("grasp/valid")
     fields: dict[str, Any] = {"valid": 0 if valid is None else int(np.count_nonzero(valid))}
     if kind == "base":
@@ -174,7 +172,7 @@ def _contents(kind: str, arrays: Mapping[str, NDArray[Any]], attributes: Mapping
 def summarise(
     arrays: Mapping[str, NDArray[Any]], attributes: Mapping[str, Any] | None = None
 ) -> tuple[float, tuple[GraspSummary, ...]]:
-    """The contact threshold nearest to `INDEX_THRESHOLD_M` [m], and each grasp's quality at it."""
+    """Return the contact threshold nearest to `INDEX_THRESHOLD_M` [m], and each grasp's quality at it."""
     thresholds = np.asarray(arrays["quality/thresholds_m"], float)
     at = int(np.argmin(np.abs(thresholds - INDEX_THRESHOLD_M)))
     count = len(arrays["quality/valid"])
@@ -194,10 +192,10 @@ def summarise(
 
 
 def publish_shard(store: Store, manifest: ShardManifest, data: bytes) -> bool:
-    """Put a shard, its manifest last. False if the shard was there already: that is success too.
+    """Store a shard, manifest last. Returns False if it exists, which is success too.
 
-    Where two workers raced, or one died between the two puts, the file is another run's: the manifest then describes
-    the bytes that are in the store, not those at hand.
+    If two workers raced, or one died between the two writes, the file may be of another run. The manifest then
+    describes the bytes in the store.
     """
     if not store.put(manifest.key, data):
         manifest = described_again(manifest.model_dump(mode="json"), store.get(manifest.key))
@@ -205,16 +203,16 @@ def publish_shard(store: Store, manifest: ShardManifest, data: bytes) -> bool:
 
 
 def load_manifest(store: Store, stage: Stage, shard: str) -> ShardManifest:
-    """The manifest of a shard; NotFoundError while there is no such shard."""
+    """Load the manifest of a shard; NotFoundError if the shard does not exist."""
     return read_record(ShardManifest, store, names.shard_manifest(stage, shard))
 
 
 def load_shard(store: Store, stage: Stage, shard: str) -> Shard:
-    """A finished shard, checked against its manifest.
+    """Load a finished shard and verify it against its manifest.
 
     Raises:
         NotFoundError: there is no such shard.
-        DamagedShard: its file is gone, or not what the manifest says.
+        DamagedShard: its file is missing or does not match the manifest.
     """
     manifest = load_manifest(store, stage, shard)
     return read_shard(read_checked(store, manifest.key, manifest.sha256), kind=manifest.kind, name=manifest.key)
@@ -225,10 +223,10 @@ def shard_exists(store: Store, stage: Stage, shard: str) -> bool:
 
 
 def described_again(said: Mapping[str, Any], data: bytes) -> ShardManifest:
-    """The manifest of a file's bytes; what they do not tell is taken from a manifest of the same shard.
+    """Rebuild the manifest of a file; other fields come from an existing manifest of the shard.
 
     Args:
-        said: that manifest as JSON has it; its grasps are not needed.
+        said: that manifest as JSON; its grasps are not needed.
         data: HDF5 bytes of the shard.
     """
     pictures = tuple(path for path in SCHEMAS["views"] if path.startswith("image/"))

@@ -1,4 +1,4 @@
-"""Names of mesh files as descriptions write them, and of the files beside a mesh that colour it."""
+"""Resolution of mesh file names in descriptions, and of the texture and material files of meshes."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ from graspd.service.model.errors import InputError
 from graspd.service.store.assets import check_path
 
 _SCHEME: Final = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):(/*)")
-#: Of them the rest is a path; what comes first in it, a package or folders of another machine, may be left out.
+#: Schemes with a path; its first part, a package or foreign folders, is optional.
 _OURS: Final = frozenset({"package", "model", "file"})
 
 
 @dataclass(frozen=True)
 class Reference:
-    """What a description means by a name."""
+    """Possible targets of a file name in a description."""
 
     names: tuple[str, ...]
-    """Names in the upload that it may be, the first one goes first."""
+    """Candidate names in the upload, in order of preference."""
     scheme: str = ""
-    """Of `package://...`, `model://...` and `file://...`."""
+    """Scheme of `package://...`, `model://...` and `file://...`."""
     tails: tuple[str, ...] = ()
-    """With a scheme, what may lie below any folder: all of them but a bare file name."""
+    """With a scheme: path tails that may be below any folder; all but the bare file name."""
 
 
 def read_reference(written: str, base: str) -> Reference:
-    """What a name may mean, in either spelling of slashes, with spaces or `%20`.
+    """Resolve a name, with either kind of slashes, and spaces or `%20`.
 
-    The folder of a ROS package may be packed with or without its name and those above it, and beside other packages:
+    A ROS package may be packed with or without its folder and those above, and next to other packages.
     `package://NAME/a/b.stl` is NAME/a/b.stl, a/b.stl or b.stl, from the description's folder or from the top.
 
     Args:
@@ -42,7 +42,7 @@ def read_reference(written: str, base: str) -> Reference:
         base: folder of the description.
 
     Raises:
-        InputError: it leads out of the upload, or names no file; the message goes on from the name.
+        InputError: it leads out of the upload, or is not a file name; the message continues after the name.
     """
     text = written.strip().replace("\\", "/")
     found = _SCHEME.match(text)
@@ -50,7 +50,7 @@ def read_reference(written: str, base: str) -> Reference:
     if found and scheme not in _OURS:
         raise InputError("is no file of this hand; put it beside the URDF")
     rest = text[found.end() :] if found else text
-    # A package is no folder of the description's: dots in its path count from the package.
+    # A package is not below the description's folder: dots in its path are relative to the package.
     paths = [_inside(rest, "" if scheme else base)]
     with suppress(InputError):
         paths += [_inside(unquote(rest), "" if scheme else base)]
@@ -60,7 +60,7 @@ def read_reference(written: str, base: str) -> Reference:
 
 
 def one_like(name: str, files: Iterable[str]) -> str:
-    """The only file that is called so but for capitals, else nothing."""
+    """Return the only file with this name, ignoring capitals; empty if none."""
     wanted = name.lower()
     like = [file for file in files if file.lower() == wanted]
     return like[0] if len(like) == 1 else ""
@@ -72,7 +72,7 @@ def _tails(path: str) -> list[str]:
 
 
 def _inside(path: str, base: str) -> str:
-    """`../meshes/x` resolved against a folder, if that stays inside the upload."""
+    """Resolve `../meshes/x` against a folder if the result stays inside the upload."""
     dots = ".." in path and not path.startswith("/")
     try:
         return check_path(posixpath.normpath(posixpath.join(base, path)) if dots else path)
@@ -80,9 +80,9 @@ def _inside(path: str, base: str) -> str:
         raise InputError("lies outside the hand's folder; put it inside") from None
 
 
-#: Names that one file may give: more is no material library.
+#: Largest number of names in a file; a material library has fewer.
 MAX_NAMES: Final = 64
-#: How much of a file is looked at for such names, which stand at its top [bytes].
+#: Size of the head searched for such names [bytes].
 HEAD_BYTES: Final = 2**20
 _SPACES: Final = rb"[ \t]+"
 _NAMED_BY: Final = {
@@ -90,14 +90,14 @@ _NAMED_BY: Final = {
     ".mtl": re.compile(rb"^[ \t]*map_Kd" + _SPACES + rb"([^\r\n]+)", re.MULTILINE | re.IGNORECASE),
     ".dae": re.compile(rb"<init_from>\s*(?:<ref>)?\s*([^<>\r\n]+?)\s*<"),
 }
-#: Meshes that may name such files.
+#: Suffixes of meshes that may refer to such files.
 MESHES: Final = (".obj", ".dae")
 _PICTURES: Final = (".png", ".jpg", ".jpeg")
 _TAKEN: Final = (".mtl", *_PICTURES)
 
 
 def named_by(name: str, data: bytes) -> list[str]:
-    """What a mesh or a material library calls the files of its looks, as it writes them; a few at most."""
+    """Return the texture and material files named in a mesh or library, as written; limited in number."""
     pattern = _NAMED_BY.get(PurePosixPath(name).suffix.lower())
     if pattern is None:
         return []
@@ -106,19 +106,18 @@ def named_by(name: str, data: bytes) -> list[str]:
 
 
 def reference_of(text: bytes) -> str:
-    """The file that a line names: options such as `-s 1 1 1` stand before it."""
+    """Return the file name in a line, after options such as `-s 1 1 1`."""
     words = text.decode(errors="replace").strip()
     return words.split()[-1] if words.startswith("-") else words
 
 
 def beside(name: str, reference: str, there: Callable[[str], bool]) -> str | None:
-    """The file that a mesh means: seen from its folder, or of that name in its folder. None: it is not there, or is
-    neither picture nor library.
+    """Resolve a mesh's reference, by path or name in its folder; None if not a picture or library there.
 
     Args:
-        name: of the mesh or library, among a hand's files.
-        reference: as it names the other one; a place on somebody's disk counts by its last part.
-        there: whether the hand's files have that name.
+        name: name of the mesh or library among a hand's files.
+        reference: name of the other file as written; of an absolute path only the last part counts.
+        there: checks whether the hand has a file of that name.
     """
     folder = posixpath.dirname(name)
     said = reference.replace("\\", "/").partition("://")[2] or reference.replace("\\", "/")
@@ -130,7 +129,7 @@ def beside(name: str, reference: str, there: Callable[[str], bool]) -> str | Non
 
 
 def looks_of(name: str, files: Mapping[str, bytes]) -> list[str]:
-    """Names of the files that a mesh's looks follow from, libraries before their pictures."""
+    """Return the names of the files that define a mesh's appearance, libraries before pictures."""
     found: list[str] = []
     for reference in named_by(name, files[name]):
         one = beside(name, reference, files.__contains__)

@@ -1,7 +1,7 @@
-"""Files of proposal networks: `.npz` of the schema `graspd/proposals@1`, arrays and one JSON text, nothing that runs.
+"""Files of proposal networks: `.npz` of schema `graspd/proposals@1`, arrays and a JSON text, no code.
 
-The architecture is fixed, so a file is checked whole against the shapes that its joints imply; what a network computes
-is in `baselines.learned.network`.
+The architecture is fixed, so every array is checked against the shape implied by the joints.
+`baselines.learned.network` evaluates the network.
 """
 
 from __future__ import annotations
@@ -27,28 +27,28 @@ from graspd.service.store.assets import asset_json
 from graspd.service.store.descriptions import json_object, parse_description
 
 SCHEMA: Final = "graspd/proposals@1"
-#: Most that a file may hold, packed or not; a network of 22 joints takes 5.4 MB [bytes].
+#: Size limit of a file, packed or unpacked; a network of 22 joints takes 5.4 MB [bytes].
 MAX_BYTES: Final = 64 << 20
-#: Numbers of a point, as the encoder takes them; widths of its layers, the last one before the maximum over points.
+#: Point features of the encoder, and widths of its layers, the last before the maximum over points.
 ENCODER: Final = (7, 64, 128, 256)
 FEATURE: Final = 256
-#: The feature of the cloud, its height above the table, and the label.
+#: Feature of the cloud, its height above the table, and the label.
 CONDITION: Final = FEATURE + 2
-#: Sines and cosines of time.
+#: Sines and cosines of the time.
 TIME_FEATURES: Final = 8
 HIDDEN: Final = 512
 BLOCKS: Final = 2
-#: Numbers of a grasp besides its joints: position, two columns of the rotation, way in.
+#: Numbers of a grasp besides its joints: position, two columns of the rotation, approach direction.
 POSE: Final = 12
 _META: Final = "meta"
-#: A text array keeps four bytes a letter; a header of its own comes before each array.
+#: A text array takes four bytes per character; each array has a header.
 _MOST_META: Final = 4 * (64 << 10)
 _HEADER: Final = 4096
 Floats32 = NDArray[np.float32]
 
 
 class _Meta(BaseModel):
-    """The JSON text of a file."""
+    """JSON text of a file."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", protected_namespaces=())
 
@@ -72,39 +72,39 @@ class _Meta(BaseModel):
 
 @dataclass(frozen=True)
 class ProposalNetwork:
-    """A conditional flow that proposes grasps of one hand from a cloud; J joints, D = 12 + 3 J numbers a grasp."""
+    """Conditional flow that proposes grasps of a hand from a cloud; J joints, D = 12 + 3 J values a grasp."""
 
     hand: str
     hand_digest: str
-    """Of the hand's files: `HandModel.digest`."""
+    """Digest of the hand's files: `HandModel.digest`."""
     joint_names: tuple[str, ...]
     """(J,) all moving joints, as in `HandModel.joint_names`."""
     weights: Mapping[str, Floats32]
-    """As `weight_shapes` names them; `.weight` (out, in) and `.bias` (out,), as torch's `Linear` has them."""
+    """Named by `weight_shapes`; `.weight` (out, in) and `.bias` (out,), as in torch's `Linear`."""
     mean: Floats32
-    """(D,) of the grasps that it learned; numbers are standardised by it and `std`."""
+    """(D,) mean of the training grasps; numbers are standardised by it and `std`."""
     std: Floats32
-    """(D,) positive."""
+    """(D,) standard deviation, positive."""
     points: int = 512
-    """P, points of a cloud."""
+    """P, number of points of a cloud."""
     steps: int = 16
-    """Euler steps of the flow."""
+    """Number of Euler steps of the flow."""
     about: str = field(default="", kw_only=True)
-    """What it learned from, in words."""
+    """Training data, in words."""
 
     @property
     def numbers(self) -> int:
-        """D."""
+        """D, numbers per grasp."""
         return numbers(len(self.joint_names))
 
 
 def numbers(joints: int) -> int:
-    """D, numbers of a grasp of a hand with so many moving joints."""
+    """Return D, the numbers per grasp of a hand with this many moving joints."""
     return POSE + 3 * joints
 
 
 def sizes(joints: int) -> dict[str, tuple[int, ...]]:
-    """Widths of the architecture, as a file repeats them for its reader."""
+    """Return the widths of the architecture, which a file repeats for its reader."""
     return {
         "encoder": (*ENCODER, FEATURE),
         "condition": (CONDITION,),
@@ -113,7 +113,7 @@ def sizes(joints: int) -> dict[str, tuple[int, ...]]:
 
 
 def weight_shapes(joints: int) -> dict[str, tuple[int, ...]]:
-    """Name of each weight array with its shape, for a hand with so many moving joints."""
+    """Return name and shape of each weight array for a hand with this many moving joints."""
     count = numbers(joints)
     layers = {f"encoder.{i}": (out, into) for i, (into, out) in enumerate(pairwise(ENCODER))}
     layers["encoder.out"] = (FEATURE, ENCODER[-1])
@@ -127,10 +127,10 @@ def weight_shapes(joints: int) -> dict[str, tuple[int, ...]]:
 
 
 def to_bytes(network: ProposalNetwork) -> bytes:
-    """A network's file.
+    """Serialise a network.
 
     Raises:
-        InputError: it is none that `from_bytes` would take.
+        InputError: `from_bytes` would reject it.
     """
     joints = len(network.joint_names)
     try:
@@ -155,7 +155,7 @@ def to_bytes(network: ProposalNetwork) -> bytes:
 
 
 def read_file(path: Path) -> bytes:
-    """The bytes of a file that may be a network's.
+    """Read the bytes of a possible network file.
 
     Raises:
         LimitError: it has more than `MAX_BYTES`.
@@ -171,15 +171,15 @@ def read_file(path: Path) -> bytes:
 
 
 def from_bytes(data: bytes, what: str) -> ProposalNetwork:
-    """The network of a file.
+    """Parse a network file.
 
     Args:
         data: the file.
-        what: what errors call it.
+        what: name of the file in messages.
 
     Raises:
         LimitError: more than `MAX_BYTES`, packed or unpacked.
-        InputError: not a file of this schema, whole and finite.
+        InputError: not a complete, finite file of this schema.
     """
     check_size(len(data), what)
     try:
@@ -221,7 +221,7 @@ def from_bytes(data: bytes, what: str) -> ProposalNetwork:
 
 
 def check_size(size: int, what: str) -> None:
-    """LimitError for more bytes than any network has."""
+    """Raise LimitError for more bytes than any network has."""
     if size > MAX_BYTES:
         raise LimitError(f"{what} has more than {MAX_BYTES >> 20} MiB; no proposal network needs as much")
 
@@ -247,7 +247,7 @@ def _read_meta(archive: zipfile.ZipFile, what: str) -> _Meta:
 
 
 def _read(archive: zipfile.ZipFile, name: str, shape: tuple[int, ...], what: str) -> Floats32:
-    """An array that is what the schema says before any of it is unpacked."""
+    """Read an array; its header is checked against the schema before unpacking."""
     data = _member(archive, name, 4 * int(np.prod(shape)) + _HEADER)
     stands, dtype = _header(data)
     if stands != shape or dtype != np.dtype("<f4"):
@@ -256,7 +256,7 @@ def _read(archive: zipfile.ZipFile, name: str, shape: tuple[int, ...], what: str
 
 
 def _member(archive: zipfile.ZipFile, name: str, limit: int) -> bytes:
-    """A member's bytes, of which there are no more than the archive's directory says."""
+    """Read a member's bytes, at most as many as the archive's directory states."""
     member = archive.getinfo(f"{name}.npy")
     if member.file_size > limit:
         raise ValueError(f"{name} unpacks to {member.file_size} bytes")
@@ -286,26 +286,26 @@ def _check(arrays: Mapping[str, Floats32], joints: int, what: str) -> None:
 
 
 def _difference(found: list[str], expected: Mapping[str, object]) -> str:
-    """Arrays that are missing, and files that are no arrays of the schema."""
+    """Describe missing arrays and unknown files."""
     wanted = {f"{name}.npy" for name in [_META, *expected]}
     missing, foreign = sorted(wanted - {*found, f"{_META}.npy"}), sorted(set(found) - wanted)
     parts = [f"{word} {', '.join(names[:4])}" for word, names in (("without", missing), ("besides", foreign)) if names]
     return "; ".join(parts) or "a name stands twice"
 
 
-#: Name of the file in its archive, whatever the user called it: the same network is the same asset.
+#: Name of the file in its archive, independent of the upload: equal networks are equal assets.
 NETWORK_FILE: Final = "network.npz"
 
 
 def network_bytes(files: Mapping[str, bytes], what: str) -> bytes:
-    """The network's file among those of an asset; that it is one is for `from_bytes` to say.
+    """Return the network's file of an asset; `from_bytes` validates it.
 
     Args:
         files: the file and `asset.json`.
-        what: what errors call it.
+        what: name of the asset in messages.
 
     Raises:
-        InputError: it is not there, or `asset.json` says what a network does not have.
+        InputError: it is missing, or `asset.json` has keys that a network does not have.
     """
     described = parse_description(asset_json(files), what)
     if described.file not in files:
@@ -316,11 +316,11 @@ def network_bytes(files: Mapping[str, bytes], what: str) -> bytes:
 
 
 def network_report(files: Mapping[str, bytes], name: str) -> dict[str, Any]:
-    """What is found of a network that can be used, as a check says it.
+    """Return the check's report of a usable network.
 
     Raises:
         LimitError: larger than any network.
-        InputError: no network.
+        InputError: not a network.
     """
     data = network_bytes(files, name)
     network = from_bytes(data, name)
@@ -332,7 +332,7 @@ def network_report(files: Mapping[str, bytes], name: str) -> dict[str, Any]:
         "points": network.points,
         "steps": network.steps,
         "about": "".join(letter for letter in " ".join(network.about.split()) if letter.isprintable()),
-        # What shards of `graspd synth` name, which knows the file alone.
+        # Digest in the shards of `graspd synth`, which has only the file.
         "file_digest": digest_bytes(data),
     }
     message = f"{name}: proposes grasps of {network.hand} ({network.hand_digest[:12]}), {joints} joints"
@@ -340,7 +340,7 @@ def network_report(files: Mapping[str, bytes], name: str) -> dict[str, Any]:
 
 
 def check_network(files: Mapping[str, bytes], name: str) -> dict[str, Any]:
-    """The same, or a refusal."""
+    """Return `network_report`, or a refusal."""
     try:
         return network_report(files, name)
     except InputError as error:

@@ -1,4 +1,4 @@
-"""A folder or an archive of meshes as a named set of objects; the layouts of YCB and EGAD are recognised."""
+"""Sets of objects from a folder or archive of meshes; detects the layouts of YCB and EGAD."""
 
 from __future__ import annotations
 
@@ -12,29 +12,29 @@ from graspd.service.model.errors import InputError, LimitError
 from graspd.service.model.names import fitted
 from graspd.service.store.assets import MAX_FILES, UNPACK_FACTOR, unpack
 
-#: Meshes by their file names.
+#: Suffixes of meshes.
 SUFFIXES: Final = (".stl", ".obj", ".ply", ".off", ".glb")
-#: Of several meshes of one object the first of these stems is taken: what closed and cleaned scans are called.
+#: Preferred stems if an object has several meshes: names of closed and cleaned scans first.
 PREFERRED: Final = ("clean", "nontextured", "textured_simple", "textured", "collision", "visual", "raw")
-#: Folders inside an object's folder that say how the mesh was made, not what it shows.
+#: Inner folders of an object that name the processing of the mesh, not the object.
 _INNER: Final = ("google_16k", "google_64k", "google_512k", "poisson", "tsdf", "clouds", "meshes", "mesh", "visual")
 
 
-#: Name -> files of each object.
+#: Files of each object by its name.
 Objects = dict[str, dict[str, bytes]]
 
 
 def files_of_set(path: Path) -> Objects | None:
-    """Names and files of the objects in a folder, or in a ZIP of several; None if the path is one object.
+    """Find names and files of objects in a folder or ZIP; None if the path is a single object.
 
     Raises:
         InputError: no mesh in the folder, or no readable ZIP.
-        LimitError: more than the service would take in one ZIP.
+        LimitError: more than the service accepts in one ZIP.
     """
     if not path.is_dir() and not (path.suffix.lower() == ".zip" and path.is_file()):
         return None
     files = read_set(path, limit_bytes=UNPACK_FACTOR * load_settings().max_upload_bytes)
-    # A description at the top speaks of one object, however many meshes lie around it.
+    # A description at the top means one object, regardless of the number of meshes.
     if path.is_file() and "asset.json" in files:
         return None
     found = object_set(files)
@@ -42,19 +42,19 @@ def files_of_set(path: Path) -> Objects | None:
 
 
 def object_set(files: Mapping[str, bytes]) -> dict[str, dict[str, bytes]]:
-    """Files of each object of a set.
+    """Group files by the objects of a set.
 
-    EGAD and the like are one folder of meshes: each is an object. YCB and the like have a folder an object, perhaps
-    with folders of variants inside: the best of its meshes is taken.
+    In the layout of EGAD each mesh of one folder is an object. In the layout of YCB each object has a folder, perhaps
+    with inner folders of variants: the best mesh is taken.
 
     Args:
         files: relative names and contents.
 
     Returns:
-        names of objects, sorted, each with its mesh and, if it lies beside, `asset.json`.
+        Names of objects, sorted, each with its mesh and an `asset.json` beside it, if any.
 
     Raises:
-        InputError: there is no mesh.
+        InputError: no mesh.
     """
     meshes = sorted(name for name in files if PurePosixPath(name).suffix.lower() in SUFFIXES)
     if not meshes:
@@ -73,7 +73,7 @@ def object_set(files: Mapping[str, bytes]) -> dict[str, dict[str, bytes]]:
 
 
 def read_set(path: Path, *, limit_bytes: int) -> dict[str, bytes]:
-    """Files of a folder or a ZIP; links that lead out of the folder are left alone.
+    """Read the files of a folder or ZIP; links that lead out of the folder are ignored.
 
     Raises:
         InputError: neither a folder nor a readable ZIP.
@@ -96,7 +96,7 @@ def read_set(path: Path, *, limit_bytes: int) -> dict[str, bytes]:
 
 
 def _owner(mesh: str) -> tuple[str, ...]:
-    """Folders of a mesh without those that only name a variant."""
+    """Return the folders of a mesh without those that only name a variant."""
     parts = PurePosixPath(mesh).parts[:-1]
     while len(parts) > 1 and parts[-1].lower() in _INNER:
         parts = parts[:-1]
@@ -104,7 +104,7 @@ def _owner(mesh: str) -> tuple[str, ...]:
 
 
 def _common(owners: Mapping[tuple[str, ...], list[str]]) -> tuple[str, ...]:
-    """Leading folders that all share; of the single folder of one object the one above it, which can name it."""
+    """Return the common leading folders; for a single object the parent, so that its folder names it."""
     folders = list(owners)
     if len(folders) == 1:
         return folders[0][:-1] if _variants(owners[folders[0]]) else folders[0]
@@ -115,7 +115,7 @@ def _common(owners: Mapping[tuple[str, ...], list[str]]) -> tuple[str, ...]:
 
 
 def _variants(names: list[str]) -> bool:
-    """Whether the meshes of a folder are one object: a single one, or names that only tell how it was made."""
+    """Check whether the meshes of a folder show one object: a single mesh, or names of processing steps."""
     stems = [PurePosixPath(name).stem.lower() for name in names]
     return len(stems) == 1 or any(stem in PREFERRED for stem in stems)
 
@@ -126,7 +126,7 @@ def _rank(name: str) -> tuple[int, str]:
 
 
 def _name(text: str, taken: Mapping[str, str]) -> str:
-    """A name the service takes, not given yet; a long one is cut, which the log tells."""
+    """Return an unused name that the service accepts; a shortened name is logged."""
     name = fitted(re.sub(r"[^A-Za-z0-9._-]+", "_", text).lstrip("._-") or "object", 60)
     number = 2
     while name in taken:

@@ -1,8 +1,7 @@
-"""Packs of graspd 0.2, shards that ended together in one object of the store, are taken apart: nothing else reads them.
+"""Conversion of packs of graspd 0.2 (many shards in one object) to files; no other module uses packs.
 
-A pack is a head (magic bytes and the length of the directory), the directory, the manifests, the files. Its name is the
-digest of its directory, which has the SHA-256 of each manifest and file. Records beside it say which of its shards were
-gone.
+A pack has a head (magic bytes and the length of the directory), the directory, the manifests and the files. Its name is
+the digest of its directory, which has the SHA-256 of each manifest and file. Records beside it list its deleted shards.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ from graspd.service.store.records import parse_record, put_record
 from graspd.service.store.store import Store
 
 log = logging.getLogger(__name__)
-#: What is told of a store that has some.
+#: Message for a store with packs.
 PACKED: Final = "packs of graspd 0.2; take them apart with `graspd admin store upgrade`"
 _FOLDER: Final = "packs"
 _MAGIC: Final = b"graspd\x00\x01"
@@ -34,7 +33,7 @@ _HEAD: Final = struct.Struct("<8sQ")
 
 
 class _Packed(BaseModel):
-    """Where a shard's manifest and file begin behind the directory [bytes], and what they must be."""
+    """Positions of a shard's manifest and file behind the directory [bytes], with their checksums."""
 
     model_config = ConfigDict(frozen=True, extra="ignore")
 
@@ -49,18 +48,18 @@ class _Packed(BaseModel):
 
 
 def has_packs(store: Store) -> bool:
-    """Whether graspd 0.2 left packs in a store."""
+    """Check whether a store has packs of graspd 0.2."""
     return next(iter(store.list(_FOLDER)), None) is not None
 
 
 def take_apart(store: Store) -> Iterator[ShardManifest]:
-    """Give each shard of each pack a file and a manifest of its own, and remove the pack; the manifests, one by one.
+    """Replace each pack by a file and a manifest per shard; yield the manifests.
 
-    A pack goes once its shards are there: killed at any moment, the next call goes on. A pack that is damaged is moved
-    below `damaged/`. Of a harmed file the manifest alone is put, so that what is made again must have its checksum.
+    A pack is removed after its shards are stored, so an interrupted call can be repeated. Damaged packs are moved to
+    `damaged/`. For a damaged file only the manifest is stored, so that its replacement must match the checksum.
 
     Raises:
-        StoreUnavailable: the store does not answer; call it again.
+        StoreUnavailable: the store does not answer; repeat the call.
     """
     keys = sorted(entry.key for entry in store.list(_FOLDER))
     for key in keys:
@@ -78,7 +77,7 @@ def _take_apart(store: Store, key: str, dead: list[str]) -> Iterator[ShardManife
         gone = {shard for record in dead for shard in json.loads(store.get(record))["shards"]}
         body, shards = _directory(key, data)
     except NotFoundError:
-        return  # somebody else has taken it apart
+        return  # another process has converted it
     except (DamagedError, ValueError, LookupError, TypeError) as error:
         log.error("the pack %s is damaged, and moved aside: %s", key, error)
         store.set_aside(key)
@@ -107,7 +106,7 @@ def _take_apart(store: Store, key: str, dead: list[str]) -> Iterator[ShardManife
 
 
 def _directory(key: str, data: bytes) -> tuple[int, list[_Packed]]:
-    """Where the pieces begin, and which there are."""
+    """Return the start of the pieces, and the directory."""
     head, rest = data[: _HEAD.size], data[_HEAD.size :]
     magic, length = _HEAD.unpack(head) if len(head) == _HEAD.size else (b"", 0)
     directory = rest[:length]
@@ -120,6 +119,6 @@ def _directory(key: str, data: bytes) -> tuple[int, list[_Packed]]:
 
 
 def _piece(data: bytes, start: int, length: int, sha256: str) -> bytes | None:
-    """Bytes of a pack; None where they are not what the directory says."""
+    """Return bytes of a pack; None if they do not match the directory."""
     piece = data[start : start + length]
     return piece if hashlib.sha256(piece).hexdigest() == sha256 else None

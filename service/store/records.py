@@ -38,17 +38,17 @@ from graspd.service.store.integrity import get_document, is_sealed, put_document
 from graspd.service.store.store import Store
 
 RecordT = TypeVar("RecordT", bound=BaseModel)
-#: Writes a record under a key if there is none; whether there was none.
+#: Writes a record under a key if absent; returns whether it was written.
 Put = Callable[[str, BaseModel], bool]
 
 
 def read_record(model: type[RecordT], store: Store, key: str) -> RecordT:
-    """A record by its key; NotFoundError if there is none, DamagedError if it is not what its name says."""
+    """Load a record by its key; NotFoundError if absent, DamagedError if damaged."""
     return parse_record(model, store.get(key), key)
 
 
 def parse_record(model: type[RecordT], data: bytes, key: str) -> RecordT:
-    """A record from its bytes; DamagedError if they are not those that were sealed, or hold no such record."""
+    """Parse a record; DamagedError if the seal does not match or the content is no such record."""
     is_sealed(key, [data], len(data))
     try:
         if has_old_names(data):
@@ -62,12 +62,12 @@ def parse_record(model: type[RecordT], data: bytes, key: str) -> RecordT:
 
 
 def put_record(store: Store, key: str, record: BaseModel) -> bool:
-    """Write a record if there is none yet; False if there was."""
+    """Write a record if absent; False if the key exists."""
     return put_sealed(store, key, record.model_dump_json().encode())
 
 
 def job_events(store: Store, job: str) -> list[JobEvent]:
-    """What users did to a job, in order."""
+    """Load the user actions on a job, in order."""
     keys = sorted(entry.key for entry in store.list(names.job_events(job)))
     return [read_record(JobEvent, store, key) for key in keys]
 
@@ -81,7 +81,7 @@ def add_job_event(
     cause: str = "",
     put: Put | None = None,
 ) -> JobEvent:
-    """Append an event after those there are; the state of a job follows from reading them all again, in order."""
+    """Append an event to a job; its state follows from all events in order."""
     put = put or partial(put_record, store)
     while True:
         taken = [int(entry.key.rsplit("/", 1)[1].partition("-")[0]) for entry in store.list(names.job_events(job))]
@@ -92,18 +92,18 @@ def add_job_event(
 
 
 def task_attempts(store: Store, task: str) -> list[AttemptRecord]:
-    """Failed attempts of a task, in order."""
+    """Load the failed attempts of a task, in order."""
     entries = [entry.key for entry in store.list(names.attempts(task))]
     return sorted((read_record(AttemptRecord, store, key) for key in entries), key=lambda attempt: attempt.number)
 
 
 def load_dataset(store: Store, name: str) -> DatasetRecord:
-    """The record of a dataset; NotFoundError if there is none."""
+    """Load the record of a dataset; NotFoundError if there is none."""
     return read_record(DatasetRecord, store, names.dataset_record(name))
 
 
 def dataset_events(store: Store, name: str) -> list[DatasetEvent]:
-    """What users did to a dataset, in order."""
+    """Load the user actions on a dataset, in order."""
     keys = sorted(entry.key for entry in store.list(names.dataset_events(name)))
     return [read_record(DatasetEvent, store, key) for key in keys]
 
@@ -111,7 +111,7 @@ def dataset_events(store: Store, name: str) -> list[DatasetEvent]:
 def add_dataset_event(
     store: Store, name: str, what: Literal["cancelled", "retried"], *, put: Put | None = None
 ) -> DatasetEvent:
-    """Append an event after those there are."""
+    """Append an event to a dataset."""
     put = put or partial(put_record, store)
     while True:
         taken = [event.number for event in dataset_events(store, name)]
@@ -121,12 +121,12 @@ def add_dataset_event(
 
 
 def load_snapshot(store: Store, dataset: str, digest: str) -> Snapshot:
-    """A snapshot; NotFoundError if there is none."""
+    """Load a snapshot; NotFoundError if there is none."""
     return read_record(Snapshot, store, names.dataset_snapshot(dataset, digest))
 
 
 def newest_snapshot(store: Store, dataset: str, digest: str | None = None) -> Snapshot:
-    """The newest snapshot of a dataset, or the one with a digest; NotFoundError if there is none."""
+    """Load the newest snapshot of a dataset, or the one with a digest; NotFoundError if there is none."""
     if digest is not None:
         return load_snapshot(store, dataset, digest)
     taken = [read_record(Snapshot, store, entry.key) for entry in store.list(names.dataset_snapshots(dataset))]
@@ -136,10 +136,10 @@ def newest_snapshot(store: Store, dataset: str, digest: str | None = None) -> Sn
 
 
 def newest_version(store: Store, tag: str) -> Tag | None:
-    """A tag as it is; None: there is none.
+    """Load the current version of a tag; None if there is none.
 
     Raises:
-        DamagedError: its record is not what its name says.
+        DamagedError: its record does not match its name.
     """
     keys = sorted(entry.key for entry in store.list(names.tag_versions(tag)))
     return read_record(Tag, store, keys[-1]) if keys else None
@@ -149,14 +149,14 @@ def put_version(put: Put, tag: Tag) -> None:
     """Write a tag after a change.
 
     Raises:
-        ConflictError: another change came first.
+        ConflictError: another change was written first.
     """
     if not put(names.tag_version(tag.id, tag.number), tag):
         raise ConflictError(f"the tag {tag.name!r} was changed a moment ago; try again")
 
 
 def drop_older(store: Store, tag: Tag) -> None:
-    """Remove the versions that no longer count; of a tag that is gone the last one too, which goes last."""
+    """Remove outdated versions of a tag; of a deleted tag also the last one, in the end."""
     last = names.tag_version(tag.id, tag.number)
     for key in sorted(entry.key for entry in store.list(names.tag_versions(tag.id))):
         if key < last or (key == last and tag.gone):
@@ -164,18 +164,18 @@ def drop_older(store: Store, tag: Tag) -> None:
 
 
 def newest_mark(store: Store) -> str:
-    """The mark of a store; empty where it has none yet."""
+    """Return the mark of a store; empty if it has none."""
     return max((entry.key.rpartition("/")[2].removesuffix(".json") for entry in store.list(names.MARKS)), default="")
 
 
 def next_mark(mark: str) -> str:
-    """One that sorts behind a mark, and that no other store or index has."""
+    """Return a new mark that sorts after another and is unique among stores and indexes."""
     number = int(mark.partition("-")[0] or 0) + 1
     return f"{number:012}-{secrets.token_hex(4)}"
 
 
 def set_mark(store: Store, mark: str) -> None:
-    """Give a store another mark."""
+    """Replace the mark of a store."""
     put_document(store, names.mark(mark), {"at": timestamp()})
     for key in [entry.key for entry in store.list(names.MARKS)]:
         if key != names.mark(mark):
@@ -188,8 +188,10 @@ STABILITY: Final = "stability"
 
 
 def charts_of(place: SceneSpec) -> str:
-    """The kind of the charts that hold for a scene: one for each kind of scene, and one for each scene file, by its
-    supports and the target's pose. Neighbours, faces and `touch` do not count."""
+    """Return the kind of charts for a scene: one per kind of scene, and one per scene file.
+
+    A scene file counts by its supports and the target's pose, not by neighbours, faces and `touch`.
+    """
     if place.kind == "free":
         return CHARTS
     if place.kind != "file":
@@ -199,21 +201,20 @@ def charts_of(place: SceneSpec) -> str:
 
 
 def kind_of(chart: Mapping[str, Any]) -> str:
-    """The kind of a chart as `graspd chart` made it."""
+    """Return the kind of a chart made by `graspd chart`."""
     return charts_of(SceneSpec.model_validate(chart["scene"])) if "scene" in chart else CHARTS
 
 
 def scene_kinds(store: Store) -> list[str]:
-    """The kinds of charts in scenes of which there is one, by name."""
+    """Return the kinds of stored charts in scenes, by name."""
     return sorted({entry.key.rpartition("/")[0] for entry in store.list(IN_SCENES) if entry.key.endswith(".json")})
 
 
 def publish(store: Store, kind: str, record: Mapping[str, Any]) -> str:
-    """Put a record beside the earlier ones of its kind; its key follows from its `created`, and those of one moment
-    are numbered.
+    """Append a record to those of its kind; return its key, which is its `created`, numbered if taken.
 
     Raises:
-        ValueError: a number in it that JSON does not know.
+        ValueError: it contains a number that JSON lacks.
     """
     stem = f"{kind}/{re.sub(r'[^0-9A-Za-z]', '', str(record['created']))}"
     keys = (f"{stem}{number:03}.json" if number else f"{stem}.json" for number in itertools.count())
@@ -222,17 +223,17 @@ def publish(store: Store, kind: str, record: Mapping[str, Any]) -> str:
 
 
 def latest(store: Store, kind: str) -> dict[str, Any] | None:
-    """The record of a kind that was published last; None where there is none.
+    """Load the record of a kind that was published last; None if there is none.
 
     Raises:
-        DamagedError: its bytes are not those that were published.
+        DamagedError: its bytes do not match the seal.
     """
     key = latest_key(store, kind)
     return get_document(store, key) if key else None
 
 
 def latest_key(store: Store, kind: str) -> str:
-    """The key of that record; empty where there is none."""
+    """Return the key of that record; empty if there is none."""
     return max((entry.key for entry in store.list(kind) if entry.key.endswith(".json")), default="")
 
 
@@ -241,7 +242,7 @@ What = Literal["hand", "object", "network", "job", "dataset", "tag"]
 
 
 class Deletion(Record):
-    """One thing that is gone, and what its removal needs to know once its own record is gone too."""
+    """A deleted thing, with the facts that its removal needs after its own record is removed."""
 
     version: Literal[1] = 1
     what: What
@@ -256,7 +257,7 @@ class Deletion(Record):
 
 
 class DeletedJob(Record):
-    """A job that was deleted: its shards go when nobody has needed them for the grace time."""
+    """A deleted job: its shards are removed once unused for the grace time."""
 
     version: Literal[1] = 1
     at: str
@@ -264,29 +265,29 @@ class DeletedJob(Record):
 
 
 def pending(store: Store) -> set[tuple[str, str]]:
-    """Kind and id of all that is gone but still has objects in the store."""
+    """Return kind and id of all deleted things with objects left in the store."""
     keys = [entry.key.split("/") for entry in store.list(names.DELETIONS)]
     return {(key[1], key[2].removesuffix(".json")) for key in keys if len(key) == 3}
 
 
 def refuse_pending(store: Store, what: str, name: str) -> None:
-    """ConflictError while a thing of this id is being removed: what is new would be removed with it."""
+    """Raise ConflictError while a thing of this id is being removed: a new one would be removed with it."""
     if store.exists(names.deletion(what, name)):
         raise ConflictError(f"the {what} {name} of before is still being removed; try again in a moment")
 
 
 def removed_folder(deletion: Deletion) -> str:
-    """Where the objects of a deleted thing lie until the grace time ends; the same deletion has the same."""
+    """Return the folder of a deleted thing's objects for the grace time; the same if a deletion is repeated."""
     return f"{names.REMOVED}/{_DIGITS.sub('', deletion.at)}-{deletion.what}-{deletion.id}"
 
 
 def removed_before(key: str, at: str) -> bool:
-    """Whether an object below `removed/` belongs to a deletion from before a time."""
+    """Check whether an object below `removed/` belongs to a deletion before a time."""
     return key.split("/")[1].partition("-")[0] < _DIGITS.sub("", at)
 
 
 def deletions(store: Store, what: str = "") -> list[Deletion]:
-    """Deletions that can be taken back, the newest first; of one kind of thing or of all."""
+    """Return the deletions that can be undone, newest first, of one kind of thing or of all."""
     found: dict[str, Deletion] = {}
 
     def read(keys: Iterable[str]) -> None:
@@ -295,7 +296,7 @@ def deletions(store: Store, what: str = "") -> list[Deletion]:
                 deletion = read_record(Deletion, store, key)
                 found[removed_folder(deletion)] = deletion
 
-    # What the controller moves meanwhile is in the second folder before it leaves the first.
+    # Objects being moved by the controller are in the second folder before they leave the first.
     waiting = [entry.key for entry in store.list(names.DELETIONS) if entry.key.count("/") == 2]
     read(key for key in waiting if not what or key.split("/")[1] == what)
     removed = [entry.key for entry in store.list(names.REMOVED) if entry.key.count("/") == 2]
@@ -304,5 +305,5 @@ def deletions(store: Store, what: str = "") -> list[Deletion]:
 
 
 def released_key(deletion: Deletion) -> str:
-    """Where a deleted job's shards are remembered; the same deletion, carried out again, has the same."""
+    """Return the key that lists a deleted job's shards; the same when a deletion is repeated."""
     return f"{names.RELEASED}/{_DIGITS.sub('', deletion.at)}-{deletion.id}.json"

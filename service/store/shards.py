@@ -1,5 +1,4 @@
-"""Shards as HDF5 files, whole or the part of chosen grasps; only here are they written and read (`columns` is their
-schema)."""
+"""Reading and writing of shards as HDF5 files, whole or a selection of grasps; schema in `columns`."""
 
 from __future__ import annotations
 
@@ -25,48 +24,48 @@ from graspd.service.store.columns import SCHEMAS, Attribute, ShardKind, check_at
 from graspd.service.store.integrity import check_file
 
 Arrays = Mapping[str, NDArray[np.generic]]
-#: Attribute of each dataset: SHA-256 of its values, so that a file that left the store still shows damage.
+#: Attribute of each dataset: SHA-256 of its values, which reveals damage outside the store too.
 _DIGEST: Final = "sha256"
-#: A shard has some fifty datasets and groups.
+#: Limit; a shard has about fifty datasets and groups.
 _MOST_ITEMS: Final = 1000
-#: No byte of deflate becomes more than so many; and what a dataset may claim without having been written [bytes].
+#: Largest expansion of a byte by deflate; and size that a dataset may claim without stored data [bytes].
 _MOST_DEFLATED: Final = 1032
 _FREE_BYTES: Final = 1 << 16
-#: What a whole file may unpack to, whatever its size, and how often its size beyond that [bytes]: masks shrink a
-#: thousandfold, and no shard is made of them alone.
+#: Limit of a file's unpacked size: this constant [bytes] plus a multiple of the file's size. Masks shrink a
+#: thousandfold, but no shard consists of masks alone.
 _FREE_IN_ALL: Final = 1 << 28
 _MOST_IN_ALL: Final = 64
-#: What h5py and the filters of HDF5 raise where they meet bytes that make no sense.
+#: Exceptions of h5py and HDF5's filters for invalid bytes.
 _UNREADABLE: Final = (OSError, KeyError, ValueError, TypeError, RuntimeError, OverflowError, MemoryError)
 
 
 def write_shard(kind: ShardKind, arrays: Arrays, attributes: Mapping[str, Attribute]) -> bytes:
-    """HDF5 bytes of a shard.
+    """Write a shard; return its HDF5 bytes.
 
     Args:
         kind: base, scene or views.
         arrays: one array for each column of `SCHEMAS[kind]`; optional columns may be absent.
-        attributes: root attributes besides `schema`; `created` and `code_version` where they are not those of now;
-            `joint_names` also goes to the joint datasets.
+        attributes: root attributes besides `schema`; `created` and `code_version` replace the current values;
+            `joint_names` is also an attribute of the joint datasets.
 
     Raises:
-        InputError: a column is missing, unknown, of the wrong rank, or lengths clash; or an attribute is unknown.
+        InputError: a column is missing, unknown or of wrong rank, lengths differ, or an attribute is unknown.
     """
     check_columns(kind, arrays)
     check_attributes(kind, attributes)
     buffer = io.BytesIO()
     with h5py.File(buffer, "w", libver="v110") as file:
-        # Each is written once: HDF5 keeps the bytes of a text that was written over.
+        # Write each attribute once: HDF5 keeps the bytes of overwritten text.
         said = {"schema": schema_of(kind), "code_version": PACKAGE_VERSION, "created": timestamp(), **attributes}
         for name, value in said.items():
             file.attrs[name] = value
         for path, array in arrays.items():
             column = SCHEMAS[kind][path]
             data = np.ascontiguousarray(array, dtype=column.dtype)
-            # Pictures compress well; shuffling bytes first makes float depth compress at all.
+            # Pictures compress well; float depth only after byte shuffling.
             options: dict[str, Any] = {}
             if data.ndim >= 3 and data.nbytes > 65536:
-                # One row is one picture: a reader that wants it unpacks nothing else.
+                # One chunk per row, that is per picture: readers unpack no other rows.
                 options = {
                     "compression": "gzip",
                     "compression_opts": 1,
@@ -84,7 +83,7 @@ def write_shard(kind: ShardKind, arrays: Arrays, attributes: Mapping[str, Attrib
 
 
 def check_columns(kind: ShardKind, arrays: Arrays) -> dict[str, int]:
-    """Lengths of the shape letters (N, T, S, ...); raises InputError where the arrays do not fit the schema."""
+    """Return the lengths of the shape letters (N, T, S, ...); InputError if arrays do not fit the schema."""
     schema = SCHEMAS[kind]
     if unknown := set(arrays) - set(schema):
         raise InputError(f"a {kind} shard has no dataset {sorted(unknown)[0]!r}")
@@ -110,7 +109,7 @@ class Shard:
     attributes: dict[str, Attribute]
     arrays: dict[str, NDArray[np.generic]]
     path: Path | None = None
-    """The file it was read from."""
+    """File that it was read from."""
 
     def __getitem__(self, path: str) -> NDArray[np.generic]:
         return self.arrays[path]
@@ -119,14 +118,14 @@ class Shard:
 def read_shard(
     source: bytes | Path, *, kind: ShardKind | None = None, without: tuple[str, ...] = (), name: str = ""
 ) -> Shard:
-    """Read a shard whole, except the datasets named in `without`.
+    """Read a shard completely, except the datasets in `without`.
 
     Args:
-        name: what errors call a shard that is given as bytes.
+        name: name in error messages for a shard given as bytes.
 
     Raises:
-        InputError: not HDF5, not a graspd shard, or not of the wanted kind.
-        DamagedShard: it is not what its checksums say, or cannot be read to its end.
+        InputError: not HDF5, not a graspd shard, or not of the expected kind.
+        DamagedShard: it does not match its checksums, or is truncated.
     """
     name = name or ("shard" if isinstance(source, bytes) else str(source))
     with open_shard(source, name=name) as file:
@@ -139,7 +138,7 @@ def read_shard(
 
 
 class ShardH5(h5py.File):  # type: ignore[misc]
-    """The HDF5 file of a shard, where columns and attributes of graspd 0.2 have today's names."""
+    """HDF5 file of a shard; columns and attributes of graspd 0.2 appear under their present names."""
 
     def __contains__(self, path: object) -> bool:
         return super().__contains__(path) or (path in COLUMNS and super().__contains__(COLUMNS[str(path)]))
@@ -154,11 +153,11 @@ class ShardH5(h5py.File):  # type: ignore[misc]
 
 @contextmanager
 def open_shard(source: bytes | Path | io.RawIOBase, *, name: str = "") -> Iterator[h5py.File]:
-    """The HDF5 file of a shard, for reading what is needed of it; one in a folder is checked first: `check_file`.
+    """Open the HDF5 file of a shard for partial reading; files in folders are verified by `check_file`.
 
     Raises:
         InputError: not HDF5.
-        DamagedShard: it is not what its checksum says, or cannot be read, here or in the body.
+        DamagedShard: it does not match its checksum, or is unreadable, here or in the body.
     """
     name = name or (str(source) if isinstance(source, Path) else "shard")
     if isinstance(source, Path) and source.is_file():
@@ -178,9 +177,9 @@ def open_shard(source: bytes | Path | io.RawIOBase, *, name: str = "") -> Iterat
 
 
 def _check_contents(file: h5py.File, name: str) -> None:
-    """InputError where a file has its values from elsewhere, or says that it has more than can lie in it.
+    """Raise InputError if a file has external data or claims more data than it can contain.
 
-    HDF5 follows links into other files, reads raw bytes of any file as values, and makes up what was never written.
+    HDF5 follows links into other files, reads raw bytes of any file as values, and invents values never written.
     """
     claimed = held = 0
     seen, waiting = {h5py.h5o.get_info(file["/"].id).addr}, [(file, "")]
@@ -210,7 +209,7 @@ def _check_contents(file: h5py.File, name: str) -> None:
 
 
 def kind_of(file: h5py.File, name: str) -> ShardKind:
-    """Kind of an open shard; InputError if it is none of graspd's."""
+    """Return the kind of an open shard; InputError if it is not a graspd shard."""
     schema = str(file.attrs.get("schema", ""))
     found = schema.removeprefix("graspd/").partition("@")[0]
     if not schema.startswith("graspd/") or found not in SCHEMAS:
@@ -219,7 +218,7 @@ def kind_of(file: h5py.File, name: str) -> ShardKind:
 
 
 def read_column(file: h5py.File, path: str, name: str) -> NDArray[Any]:
-    """A dataset whole; DamagedShard if its values are not those that were written."""
+    """Read a complete dataset; DamagedShard if the values do not match their checksum."""
     dataset = file[path]
     data = np.asarray(dataset)
     if (expected := dataset.attrs.get(_DIGEST)) is not None and _digest(data) != expected:
@@ -244,17 +243,17 @@ def _attribute(value: object) -> Attribute:
 
 
 def json_attribute(value: object) -> str:
-    """A JSON text fit for an HDF5 attribute."""
+    """Convert a value to JSON text for an HDF5 attribute."""
     return json.dumps(value, sort_keys=True)
 
 
 def carried(shard: Shard) -> dict[str, Attribute]:
-    """What a copy of a shard says at its root: all but what `write_shard` says itself."""
+    """Return the root attributes for a copy of a shard: all that `write_shard` does not set itself."""
     return {name: value for name, value in shard.attributes.items() if name != "schema"}
 
 
 def part_of_shard(shard: Shard, mask: NDArray[np.bool_]) -> bytes:
-    """A base shard of the rows of a mask (N,): what each grasp says, its scene too, is as it was."""
+    """Write a base shard of the rows in a mask (N,); their values, scenes included, do not change."""
     schema = SCHEMAS["base"]
     arrays = {
         path: array[mask] if schema[path].shape.split()[0] == "N" else array for path, array in shard.arrays.items()
@@ -266,7 +265,7 @@ def part_of_shard(shard: Shard, mask: NDArray[np.bool_]) -> bytes:
 
 
 def place_of(shard: Shard, taken: Collection[PurePosixPath]) -> PurePosixPath:
-    """`HAND/OBJECT/base-BATCH.h5`, or a name beside it: two jobs may have a batch of one number."""
+    """Return `HAND/OBJECT/base-BATCH.h5`, numbered if taken: two jobs may have equal batch numbers."""
     said = shard.attributes
     names = [str(said.get(name, "")).replace("/", "-").strip(".") or "unnamed" for name in ("hand", "object")]
     path = PurePosixPath(*names) / f"base-{int(said.get('batch', 0)):05}.h5"  # type: ignore[arg-type]

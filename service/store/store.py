@@ -1,6 +1,6 @@
-"""The object store: create-only puts of immutable objects, on a local folder, S3, Google Cloud, Azure, or memory.
+"""Object store: create-only writes of immutable objects; folder, S3, Google Cloud, Azure or memory.
 
-Only what every back end offers is used: put if absent, get, range, list, delete; no overwrite, no compare-and-swap.
+It uses only operations of every back end: put if absent, get, range, list, delete; no overwrite, no compare-and-swap.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from graspd.service.model.errors import InputError, NotFoundError, StoreUnavaila
 
 _KEY: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._=-]*(/[A-Za-z0-9][A-Za-z0-9._=-]*)*")
 _PROBE: Final = "health/probe"
-#: Of one piece of a stream.
+#: Size of one chunk of a stream.
 STREAM_BYTES: Final = 1 << 20
-#: A request that fails is tried again this often by the client; the task's own back-off takes over after that.
+#: Retries of a failed request by the client; after that the task's own back-off applies.
 _REMOTE: Final[dict[str, Any]] = {
     "client_options": {"timeout": timedelta(seconds=120), "connect_timeout": timedelta(seconds=5)},
     "retry_config": {"max_retries": 3, "retry_timeout": timedelta(seconds=30)},
@@ -45,30 +45,30 @@ class Entry:
     size: int
 
 
-#: Size, time of the last change and, where the store has one, tag of an object: it stays while the object does.
+#: Size, modification time and tag (if any) of an object; constant while the object does not change.
 Stamp = tuple[int, str, str]
 
 
 class Store:
-    """Objects by key. Every method raises StoreUnavailable where the store does not answer."""
+    """Objects by key. Every method raises StoreUnavailable if the store does not answer."""
 
     def __init__(self, backend: Any, url: str, *, signer: Any = None) -> None:
-        """`signer` is the same store as clients reach it; None where they do not."""
+        """`signer` is the same store under the address for clients; None if they have no access."""
         self._backend = backend
         self._signer = signer
         self.url = url
         self._root = Path(backend.prefix) if isinstance(backend, LocalStore) and backend.prefix is not None else None
 
     def put(self, key: str, data: bytes) -> bool:
-        """Write an object if there is none of this name; all of it is there, or nothing.
+        """Write an object atomically if the name is free.
 
         Returns:
-            True if it was written, False if the name was taken (for content-addressed names: the same bytes).
+            True if written, False if the name exists (for content-addressed names: with the same bytes).
         """
         return self.put_file(key, io.BytesIO(data))
 
     def put_file(self, key: str, file: IO[bytes]) -> bool:
-        """The same from an open file, which a local store copies piece by piece."""
+        """Write an object from an open file; a local store copies it in pieces."""
         check_key(key)
         file.seek(0)
         with _mapped(key, self.url):
@@ -81,7 +81,7 @@ class Store:
             return True
 
     def delete(self, key: str) -> None:
-        """Remove an object; nothing happens if there is none. Only the controller does this, to what a user deleted."""
+        """Remove an object, if it exists. Only the controller calls this, for deletions by users."""
         try:
             with _mapped(key, self.url):
                 obstore.delete(self._backend, check_key(key))
@@ -89,17 +89,17 @@ class Store:
             return
 
     def get(self, key: str) -> bytes:
-        """All bytes of an object; NotFoundError if there is none."""
+        """Read an object; NotFoundError if there is none."""
         with _mapped(key, self.url):
             return bytes(obstore.get(self._backend, check_key(key)).bytes())
 
     def get_range(self, key: str, start: int, length: int) -> bytes:
-        """`length` bytes from offset `start`; NotFoundError if there is no such object."""
+        """Read `length` bytes from offset `start`; NotFoundError if there is no such object."""
         with _mapped(key, self.url):
             return bytes(obstore.get_range(self._backend, check_key(key), start=start, length=length))
 
     def stream(self, key: str, start: int = 0, length: int | None = None) -> Iterator[bytes]:
-        """Chunks of an object from `start` on; never holds more than one chunk."""
+        """Yield chunks of an object from `start` on; at most one chunk is in memory."""
         end = self.size(key) if length is None else start + length
         while start < end:
             if not (chunk := self.get_range(key, start, min(STREAM_BYTES, end - start))):
@@ -108,16 +108,16 @@ class Store:
             yield chunk
 
     def size(self, key: str) -> int:
-        """Bytes of an object; NotFoundError if there is none."""
+        """Return the size of an object [bytes]; NotFoundError if there is none."""
         with _mapped(key, self.url):
             return int(obstore.head(self._backend, check_key(key))["size"])
 
     def set_aside(self, key: str) -> None:
-        """Move a damaged object below `damaged/`, so that its name is free; one that is gone is no error."""
+        """Move a damaged object below `damaged/` to free its name; a missing one is not an error."""
         self.move(key, f"damaged/{key}")
 
     def move(self, key: str, to: str) -> None:
-        """Give an object another name; nothing happens if there is none."""
+        """Rename an object, if it exists."""
         try:
             with _mapped(key, self.url):
                 obstore.rename(self._backend, check_key(key), check_key(to), overwrite=True)
@@ -125,7 +125,7 @@ class Store:
             return
 
     def stamp(self, key: str) -> Stamp:
-        """What tells whether an object was exchanged or written over; NotFoundError if there is none."""
+        """Return a stamp that changes when an object is replaced; NotFoundError if there is none."""
         with _mapped(key, self.url):
             meta = obstore.head(self._backend, check_key(key))
             return int(meta["size"]), meta["last_modified"].isoformat(), str(meta.get("e_tag") or "")
@@ -138,13 +138,13 @@ class Store:
         return True
 
     def list(self, prefix: str, *, offset: str | None = None) -> Iterator[Entry]:
-        """Objects below a folder, in no stated order; with `offset` only those whose key sorts after it."""
+        """Yield objects below a folder in arbitrary order; with `offset` only those whose key sorts after it."""
         with _mapped(prefix, self.url):
             for batch in obstore.list(self._backend, check_key(prefix), offset=offset):
                 yield from (Entry(str(meta["path"]), int(meta["size"])) for meta in batch)
 
     def sign(self, key: str, *, seconds: int = 3600) -> str | None:
-        """URL from which anybody may read the object for a while; None where the store makes none."""
+        """Return a temporary URL for reading the object without credentials; None if unsupported."""
         check_key(key)
         try:
             return (
@@ -153,11 +153,11 @@ class Store:
                 else str(obstore.sign(self._signer, "GET", key, timedelta(seconds=seconds)))
             )
         except (BaseError, ValueError, TypeError, NotImplementedError, OSError):
-            # Credentials that may read but not sign: the API hands the file out itself.
+            # The credentials may read but not sign: the API serves the file itself.
             return None
 
     def probe(self) -> float:
-        """Seconds a small write takes; StoreUnavailable if the store cannot be written."""
+        """Return the duration of a small write [s]; StoreUnavailable if the store is not writable."""
         start = time.perf_counter()
         with _mapped(_PROBE, self.url):
             obstore.put(self._backend, _PROBE, b"1", mode="overwrite")
@@ -165,20 +165,19 @@ class Store:
 
 
 def open_store(url: str, *, public_endpoint: str | None = None, make: bool = True) -> Store:
-    """The store behind a URL: `file:///folder`, `memory://`, `s3://`, `gs://`, `az://`.
+    """Open the store of a URL: `file:///folder`, `memory://`, `s3://`, `gs://`, `az://`.
 
-    Credentials and endpoints of the remote ones come from the usual variables (AWS_ACCESS_KEY_ID, ...).
+    Remote stores take credentials and endpoints from the usual variables (AWS_ACCESS_KEY_ID, ...).
 
     Args:
-        public_endpoint: S3 endpoint as clients reach it. Without it, one given by AWS_ENDPOINT_URL is taken for an
-            address of the service's own network: then no download is signed, and files go through the API.
-        make: whether a folder that is absent is made. What only reads finds nothing in an empty one, and a mistyped
-            path would pass for a feasible store.
+        public_endpoint: S3 endpoint for clients. Without it, AWS_ENDPOINT_URL is taken as internal to the service's
+            network: then downloads are not signed, and files go through the API.
+        make: create a missing folder. For readers an empty folder is useless, and it would hide a mistyped path.
 
     Raises:
-        NotFoundError: the folder is absent, and not to be made.
-        InputError: the URL names no known store.
-        StoreUnavailable: the folder cannot be made or written.
+        NotFoundError: the folder is missing, and `make` is False.
+        InputError: unknown kind of URL.
+        StoreUnavailable: the folder cannot be created or written.
     """
     parts = urlsplit(url)
     if parts.scheme == "memory":
@@ -201,10 +200,10 @@ def open_store(url: str, *, public_endpoint: str | None = None, make: bool = Tru
 
 
 def local_folder(url: str) -> Path | None:
-    """The folder of a store that is one; None for a bucket.
+    """Return the folder of a local store; None for other stores.
 
     Raises:
-        InputError: the URL holds no absolute path, or characters that end a path in a URL.
+        InputError: the path in the URL is not absolute, or has characters that end a path.
     """
     parts = urlsplit(url)
     if parts.scheme != "file":
@@ -219,14 +218,14 @@ def local_folder(url: str) -> Path | None:
 
 
 def check_key(key: str) -> str:
-    """The key itself if it is a plain relative name; InputError otherwise."""
+    """Return the key if it is a plain relative name; InputError otherwise."""
     if not _KEY.fullmatch(key) or ".." in key:
         raise InputError(f"{key!r} is no name of an object in the store")
     return key
 
 
 def _endpoint() -> str | None:
-    """An S3 endpoint other than Amazon's own."""
+    """Return a custom S3 endpoint, if any."""
     return os.environ.get("AWS_ENDPOINT_URL") or os.environ.get("AWS_ENDPOINT") or None
 
 
@@ -248,13 +247,13 @@ def _open_local(folder: Path, url: str) -> Store:
 
 
 def _put_local(root: Path, key: str, data: IO[bytes]) -> bool:
-    """Write, flush to the disk, then link under the final name: a power cut leaves all of the object or nothing."""
+    """Write, flush to disk, then link to the final name: atomic even if the power fails."""
     path = root / key
     if path.exists():
         return False
     made = [folder for folder in path.parents if root in folder.parents and not folder.exists()]
     path.parent.mkdir(parents=True, exist_ok=True)
-    # obstore's listing skips names that end in `#` and digits: they are its own unfinished writes too.
+    # obstore's listing skips names that end in `#` and digits, its own unfinished writes.
     staged = path.with_name(f"{path.name}#{random.SystemRandom().randrange(10**12)}")
     try:
         with staged.open("wb") as file:
@@ -290,7 +289,7 @@ def _mapped(key: str, url: str) -> Iterator[None]:
 
 
 def _line(error: Exception) -> str:
-    """First line of an error: obstore appends a dump of its internals."""
+    """Return the first line of an error: obstore appends a dump of its internals."""
     if isinstance(error, OSError) and error.strerror:
         return error.strerror
     return (str(error).strip().splitlines() or [type(error).__name__])[0]

@@ -1,5 +1,5 @@
-"""What `graspd doctor` looks at in the shared room. Each check opens what it needs and gives one finding.
+"""Checks of `graspd doctor` for the service. Each check opens what it needs and returns one finding.
 
-Nothing is changed: writes are probes under names of their own, which are removed again, and an index is never made,
-moved aside or filled.
+Checks change nothing: test writes have names of their own and are removed; an index is never created, moved aside or
+filled.
 """

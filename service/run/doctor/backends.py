@@ -1,4 +1,4 @@
-"""Redis, the index and the store: whether each answers, may be written and keeps what it is given."""
+"""Checks of Redis, index and store: availability, writing and persistence."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from graspd.service.run.embedded import find_server
 from graspd.service.settings import Settings
 from graspd.service.store.store import Store, open_store
 
-#: The oldest that graspd was tried on.
+#: Oldest tested version.
 _OLDEST: Final = (6, 2)
 
 _SLOW_REDIS_S: Final = 0.02
@@ -47,13 +47,13 @@ _START: Final = "start it, or set GRASPD_REDIS_URL=redis://:PASSWORD@HOST:6379/0
 
 
 def is_there(settings: Settings) -> bool:
-    """Whether a Redis is named, or the one of `graspd up` may run: False on a machine where nothing was started."""
+    """Check whether a Redis is configured or may be running; False on a machine where nothing was started."""
     return settings.redis_url is not None or socket_path(settings.data_dir).exists()
 
 
 @contextmanager
 def redis_connection(settings: Settings) -> Iterator[Redis]:
-    """A client that gives up soon."""
+    """Yield a client with a short timeout."""
     client = connect(redis_url(settings), patience=0, timeout_s=_TIMEOUT_S)
     try:
         yield client
@@ -62,7 +62,7 @@ def redis_connection(settings: Settings) -> Iterator[Redis]:
 
 
 def redis(settings: Settings) -> Finding:
-    """The server that `GRASPD_REDIS_URL` or the data folder names."""
+    """Check the Redis of `GRASPD_REDIS_URL` or of the data folder."""
     name = "redis"
     if not is_there(settings):
         try:
@@ -113,7 +113,7 @@ def _check_redis(name: str, settings: Settings, client: Redis, info: Mapping[str
 
 
 def _write(client: Redis) -> float:
-    """Seconds of a write and its reading. Raises RedisError where writes are refused."""
+    """Return the duration of a write and a read [s]. Raises RedisError if writes are refused."""
     key, value = f"graspd:doctor:{secrets.token_hex(8)}", secrets.token_bytes(8)
     start = time.perf_counter()
     client.set(key, value, ex=60)
@@ -126,7 +126,7 @@ def _write(client: Redis) -> float:
 
 
 def persistence(settings: Settings) -> Finding:
-    """Whether a Redis that crashes comes back with its tasks."""
+    """Check whether Redis restores its tasks after a crash."""
     name = "redis-persistence"
     if not is_there(settings):
         return skipped(name, "no service runs on this data folder; the Redis of `graspd up` keeps a log of writes")
@@ -164,7 +164,7 @@ def _shown(settings: Settings) -> str:
 
 
 def _is_open(settings: Settings) -> bool:
-    """Whether it was reached over a network without a secret."""
+    """Check whether Redis accepts network connections without a password."""
     parts = urlsplit(redis_url(settings))
     return parts.scheme != "unix" and parts.hostname not in _LOCAL and not parts.password
 
@@ -191,14 +191,14 @@ _REBUILD: Final = (
     "graspd admin index rebuild --check shows all of it; graspd admin index rebuild fixes it while the service runs"
 )
 _CROWDED: Final = 0.8
-#: With more shards than this only a sample is compared.
+#: Above this number of shards only a sample is compared.
 _ALL_SHARDS: Final = 2000
-#: What a controller has to take up between two looks [s].
+#: Time for the controller to process events between two comparisons [s].
 _SETTLES_S: Final = 3.0
 
 
 def index(settings: Settings) -> Finding:
-    """Connection, integrity and schema; changes nothing."""
+    """Check connection, integrity and schema of the index; changes nothing."""
     name = "index"
     try:
         found = look(settings.resolved_index_url)
@@ -250,7 +250,7 @@ def _check_index(name: str, settings: Settings, found: IndexCondition) -> Findin
 
 
 def _openable(settings: Settings) -> str:
-    """Why the index should not be opened; "" if opening it changes nothing."""
+    """Return why the index should not be opened; "" if opening it changes nothing."""
     try:
         found = look(settings.resolved_index_url)
     except (InputError, UnavailableError):
@@ -264,7 +264,7 @@ def _openable(settings: Settings) -> str:
 
 
 def index_identity(settings: Settings) -> Finding:
-    """Whether store, index and Redis belong to one service; changes nothing."""
+    """Check whether store, index and Redis belong to one service; changes nothing."""
     name, folder = "identity", local_store(settings)
     if folder is not None and not folder.exists():
         return skipped(name, "there is no store yet")
@@ -291,11 +291,11 @@ def index_identity(settings: Settings) -> Finding:
 
 
 def index_is_store(settings: Settings, *, full: bool = False, settles_s: float = _SETTLES_S) -> Finding:
-    """Whether the rows are those that follow from the store. What only one of two looks finds is on its way in.
+    """Compare the rows with the store. Differences in only one of two comparisons are still being indexed.
 
     Args:
-        full: compare all rows, however many there are.
-        settles_s: pause before the second look [s].
+        full: compare all rows, regardless of their number.
+        settles_s: pause before the second comparison [s].
     """
     name = "index-is-store"
     if why := _openable(settings):
@@ -317,7 +317,7 @@ def index_is_store(settings: Settings, *, full: bool = False, settles_s: float =
             again = set(differences(opened, store) if chosen is None else compare(opened, store, chosen))
             found = [line for line in found if line in again]
     if found:
-        # A shard that is missing changes rows of tasks and jobs: the cause goes first.
+        # A missing shard changes rows of tasks and jobs: list the cause first.
         found.sort(key=lambda line: not line.startswith("shards "))
         more = f", and {len(found) - 3} more" if len(found) > 3 else ""
         return bad(name, f"{'; '.join(found[:3])}{more}", _REBUILD)
@@ -326,7 +326,7 @@ def index_is_store(settings: Settings, *, full: bool = False, settles_s: float =
 
 
 def store_damage(settings: Settings) -> Finding:
-    """Findings of the controller's integrity scan, or of `graspd admin store verify`."""
+    """Report the findings of the controller's integrity scan, or of `graspd admin store verify`."""
     name = "damage"
     if why := _openable(settings):
         return skipped(name, why)
@@ -358,9 +358,9 @@ def store_damage(settings: Settings) -> Finding:
 
 _FOLDER: Final = "health"
 
-#: For a dozen requests.
+#: Limit for a dozen requests.
 _SLOW_STORE_S: Final = 5.0
-#: Who put the same name at once; one may win.
+#: Number of concurrent writers of one name; only one may succeed.
 _RIVALS: Final = 4
 _CREDENTIALS: Final = (
     "see bucket, region and credentials (AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY, AWS_REGION, AWS_ENDPOINT_URL; "
@@ -369,7 +369,7 @@ _CREDENTIALS: Final = (
 
 
 def store(settings: Settings) -> Finding:
-    """Every operation that graspd uses, on an object of a name of its own."""
+    """Try every operation that graspd uses on an object with a name of its own."""
     name, folder = "store", local_store(settings)
     if folder is not None and not folder.exists():
         return good(name, f"{folder} is made at the first start, below {existing(folder)}")
@@ -382,7 +382,7 @@ def store(settings: Settings) -> Finding:
 
 
 def check_store(name: str, opened: Store) -> Finding:
-    """The finding on an open store. Raises GraspdError where an operation fails."""
+    """Return the finding on an open store. Raises GraspdError if an operation fails."""
     key = f"{_FOLDER}/doctor-{secrets.token_hex(8)}"
     start = time.perf_counter()
     try:
@@ -406,7 +406,7 @@ def check_store(name: str, opened: Store) -> Finding:
 
 
 def _try(opened: Store, key: str) -> str:
-    """What the store does not keep to, "" if nothing."""
+    """Return a guarantee that the store violates; "" if none."""
     contents = [secrets.token_bytes(1000) for _ in range(_RIVALS)]
     with ThreadPoolExecutor(_RIVALS) as pool:
         won = list(pool.map(lambda content: opened.put(key, content), contents))

@@ -1,5 +1,7 @@
-"""Checks of an installation: findings with their fixes, run side by side, each with a limit of time: one part that
-hangs must not hide how the others stand."""
+"""Checks of an installation: findings with fixes.
+
+They run in parallel with timeouts, so that one hanging part does not hide the state of the others.
+"""
 
 from __future__ import annotations
 
@@ -12,41 +14,41 @@ from typing import Final
 
 from graspd.service.model.errors import GraspdError
 
-#: How the names of the threads of checks begin.
+#: Prefix of the names of check threads.
 THREADS: Final = "doctor-"
 
 
 class Condition(StrEnum):
-    """How a thing stands."""
+    """Condition of a checked part."""
 
     GOOD = "good"
     WARNING = "warning"
-    """It works, and will cost something."""
+    """It works, at some cost."""
     BAD = "bad"
-    """Something does not work, or will lose what it should keep."""
+    """It does not work, or will lose data."""
     SKIPPED = "skipped"
-    """It was not looked at; the message says why."""
+    """It was not checked; the message has the reason."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """What was found about one thing."""
+    """Result of one check."""
 
     name: str
     condition: Condition
     message: str
     fix: str = ""
-    """What to do; "" where nothing is to be done."""
+    """Fix for the user; "" if none is necessary."""
 
     @property
     def ok(self) -> bool:
-        """Whether nothing has to be fixed."""
+        """Whether no fix is necessary."""
         return self.condition is not Condition.BAD
 
 
 @dataclass(frozen=True)
 class Check:
-    """A thing to look at."""
+    """A check with its timeout."""
 
     name: str
     look: Callable[[], Finding]
@@ -55,7 +57,7 @@ class Check:
 
 
 def run_checks(checks: Sequence[Check]) -> Iterator[Finding]:
-    """Findings in the order of the checks, each as soon as it and those before it are there."""
+    """Yield findings in the order of the checks, each as soon as it and all before it are complete."""
     started = time.monotonic()
     runs = [_Run(check) for check in checks]
     for run in runs:
@@ -63,7 +65,7 @@ def run_checks(checks: Sequence[Check]) -> Iterator[Finding]:
 
 
 class _Run:
-    """One check in a thread that the process does not wait for when it ends."""
+    """One check in a daemon thread, which does not delay the end of the process."""
 
     def __init__(self, check: Check) -> None:
         self.check = check

@@ -1,7 +1,7 @@
-"""Checks of the fleet: controller, workers that fit, the port of the API, and clocks.
+"""Checks of the fleet: controller, capable workers, the API's port, and clocks.
 
-Leases go by each process's own monotonic clock, so work goes on whatever the clocks say. What suffers: times that users
-see and sort by, keys that expire, the grace of shards, and requests to S3, which are refused beyond fifteen minutes.
+Leases use each process's own monotonic clock, so work continues with wrong clocks. They affect displayed and sorted
+times, expiry of keys, the grace time of shards, and S3, which refuses requests off by fifteen minutes.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _AWAY: Final = "Redis does not answer"
 
 
 def controller(settings: Settings) -> Finding:
-    """Whether one gave a sign of life lately."""
+    """Check for a recent heartbeat of a controller."""
     name = "controller"
     if not is_there(settings):
         return skipped(name, _IDLE)
@@ -60,7 +60,7 @@ def controller(settings: Settings) -> Finding:
 
 
 def workers(settings: Settings) -> Finding:
-    """Whether every stage has a worker, of this version, that is fit."""
+    """Check whether every stage has a healthy worker of this version."""
     name = "workers"
     if not is_there(settings):
         return skipped(name, _IDLE)
@@ -105,7 +105,7 @@ def _check_workers(name: str, beats: list[WorkerBeat], waiting: Counter[Stage]) 
 
 
 def port(settings: Settings) -> Finding:
-    """The API of this service: it answers, or its port is free."""
+    """Check whether this service's API answers, or its port is free."""
     name = "port"
     url = recorded_address(settings.data_dir)
     if url is None and "api_url" in settings.model_fields_set:
@@ -139,7 +139,7 @@ def _check_api(name: str, url: str) -> Finding:
 
 
 def _readyz(url: str) -> dict[str, Any] | None:
-    """The answer of an API; {} if it is not one of graspd's, None if nothing answers."""
+    """Return an API's answer; {} if it is not graspd's, None if there is no answer."""
     opener = (
         urllib.request.build_opener(urllib.request.ProxyHandler({}))
         if "//127.0.0.1" in url
@@ -151,7 +151,7 @@ def _readyz(url: str) -> dict[str, Any] | None:
     except urllib.error.HTTPError as error:
         body = error.read(65536)
     except (OSError, ValueError) as error:
-        # A server of another protocol closes or babbles; a port without one refuses.
+        # A server of another protocol closes the connection or sends garbage; a free port refuses it.
         refused = isinstance(getattr(error, "reason", error), ConnectionRefusedError | socket.gaierror | TimeoutError)
         return None if refused else {}
     except Exception:
@@ -182,7 +182,7 @@ _FIX: Final = "timedatectl set-ntp true, or chronyd, on the machine that is wron
 
 
 def clocks(settings: Settings) -> Finding:
-    """How far the others' clocks are from this one."""
+    """Compare the clocks of the other machines with this one."""
     name = "clocks"
     offsets = dict(_offsets(settings))
     if not offsets:
@@ -201,7 +201,7 @@ def clocks(settings: Settings) -> Finding:
 
 
 def _offsets(settings: Settings) -> Iterator[tuple[str, float]]:
-    """Who, and how far ahead of this machine [s]; what is away is told by its own check."""
+    """Yield name and clock offset to this machine [s]; other checks report missing parts."""
     if is_there(settings):
         with suppress(RedisError, OSError), redis_connection(settings) as client:
             before = _now()
@@ -209,7 +209,7 @@ def _offsets(settings: Settings) -> Iterator[tuple[str, float]]:
             yield "Redis", seconds + micros / 1e6 - (before + _now()) / 2
         with suppress(GraspdError), closing(open_queue(settings, patience=0)) as queue:
             beats = queue.workers()
-            # A beat that was given just now and one that is due are as good: what lies outside is the clock.
+            # Any age up to the next due heartbeat is normal; only the excess is clock offset.
             due = 4 / 3 * settings.lease_s
             ages = {beat.host: _now() - _seconds(beat.seen) for beat in beats}
             yield from ((host, -age if age < 0 else min(0.0, due - age)) for host, age in ages.items())
@@ -233,7 +233,7 @@ def _of_postgres(url: str | URL) -> float:
 
 
 def _of_store(settings: Settings) -> float:
-    """What the store says of an object made just now; whole seconds are all that some tell."""
+    """Return the store's time of a new object; some stores have whole seconds only."""
     store, key = open_store(settings.resolved_store_url), f"health/clock-{secrets.token_hex(8)}"
     before = _now()
     try:

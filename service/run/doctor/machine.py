@@ -1,4 +1,4 @@
-"""The machine: room on its disks, the data folder, versions, limits of the process."""
+"""Checks of the machine: disk space, data folder, versions, limits of the process."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from graspd.service.settings import Settings
 from graspd.service.store.store import local_folder
 
 _GIB: Final = 2**30
-#: Below this a worker's scratch files, a shard and the log of Redis do not fit together with certainty.
+#: Below this, a worker's scratch files, a shard and the log of Redis may not fit together.
 _DISK_BAD: Final = 1 * _GIB
 _DISK_LOW: Final = 5 * _GIB
 _FEW_INODES: Final = 10_000
 _MEMORY_LOW: Final = 2 * _GIB
 _FILES_LOW: Final = 1024
-#: File systems of a network: locks of SQLite and sockets do not work there, or only at times.
+#: Network file systems: locks of SQLite and sockets are unreliable or fail there.
 _NETWORK: Final = {
     "nfs",
     "nfs4",
@@ -53,20 +53,20 @@ _NETWORK: Final = {
     "fuse.glusterfs",
     "fuse.ceph-fuse",
 }
-#: Extras whose libraries the running service imports; the others are tools.
+#: Extras with libraries of the running service; the others are tools.
 _EXTRAS: Final = ("api", "worker", "embedded", "postgres", "otel", "usd", "arm", "view")
 
 
 def local_store(settings: Settings) -> Path | None:
-    """The folder of a store that is one; None for a bucket."""
+    """Return the folder of a local store; None for a bucket."""
     return local_folder(settings.resolved_store_url)
 
 
 def disk(settings: Settings, *, usage: Callable[[Path], tuple[int, int, int]] = shutil.disk_usage) -> Finding:
-    """Room where data, results, caches and scratch files go.
+    """Check the disk space for data, results, caches and scratch files.
 
     Args:
-        usage: total, used and free bytes of the file system of a folder.
+        usage: returns total, used and free bytes of a folder's file system.
     """
     found = []
     for what, folder in _folders(settings):
@@ -105,12 +105,12 @@ def _mover(what: str) -> str:
 
 
 def existing(folder: Path) -> Path:
-    """The folder, or the nearest one above it that exists."""
+    """Return the folder, or its nearest existing ancestor."""
     return next(one for one in (folder, *folder.parents) if one.exists())
 
 
 def data_folder(settings: Settings, *, mounts: Path = Path("/proc/self/mounts")) -> Finding:
-    """Whether the data folder can be written, is its user's alone, and lies on a disk of this machine."""
+    """Check whether the data folder is writable, private to its user, and on a local disk."""
     name, folder = "data-folder", settings.data_dir.resolve()
     there = existing(folder)
     if not os.access(there, os.W_OK | os.X_OK):
@@ -138,12 +138,12 @@ def data_folder(settings: Settings, *, mounts: Path = Path("/proc/self/mounts"))
 
 
 def filesystem(folder: Path, mounts: Path = Path("/proc/self/mounts")) -> str:
-    """Type of the file system that a folder is on; "" where nothing tells."""
+    """Return the file system type of a folder; "" if unknown."""
     try:
         lines = [line.split() for line in mounts.read_text().splitlines()]
     except OSError:
         return ""
-    # The last one mounted over the longest path is the one that is seen. Blanks are written as \040.
+    # The last mount over the longest path is the visible one. Blanks are written as \040.
     found = [
         (len(at.parts), number, kind)
         for number, (_, where, kind, *_) in enumerate(lines)
@@ -153,10 +153,10 @@ def filesystem(folder: Path, mounts: Path = Path("/proc/self/mounts")) -> str:
 
 
 def versions(requirements: Iterable[str] | None = None) -> Finding:
-    """Whether Python and the libraries are those that this graspd was made for.
+    """Check Python and library versions against the requirements of this graspd.
 
     Args:
-        requirements: as a package states them; those of the installed graspd by default.
+        requirements: requirement strings of a package; by default those of the installed graspd.
     """
     name = "versions"
     try:
@@ -181,7 +181,7 @@ def versions(requirements: Iterable[str] | None = None) -> Finding:
 
 
 def _unmet(text: str) -> str:
-    """What is wanted and found, where a requirement is not met; an extra that nobody installed is no fault."""
+    """Return required and found version of an unmet requirement; missing extras are not an error."""
     wanted = Requirement(text)
     extra = next((extra for extra in _EXTRAS if wanted.marker and wanted.marker.evaluate({"extra": extra})), "")
     if wanted.marker and not extra and not wanted.marker.evaluate({"extra": ""}):
@@ -197,10 +197,10 @@ def _unmet(text: str) -> str:
 
 
 def limits(*, files: int | None = None, memory: int | None = None) -> Finding:
-    """Cores, memory and open files that this process is given.
+    """Report cores, memory and open files available to this process.
 
     Args:
-        files, memory: instead of what the system says.
+        files, memory: replace the system's values.
     """
     name = "limits"
     files = resource.getrlimit(resource.RLIMIT_NOFILE)[0] if files is None else files
