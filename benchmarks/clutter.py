@@ -106,7 +106,7 @@ def main() -> None:
             row = {"target": target, "scene": scene, **row}
             rows.append(row)
             sys.stdout.write(
-                f"| {target} | {scene} | {len(others)} | {row['gap']:.0f} | {row['certified']} | {row['candidates']} | "
+                f"| {target} | {scene} | {len(others)} | {row['gap']:.0f} | {row['valid']} | {row['candidates']} | "
                 f"{row['clear']:.2f} | {row['lift']:.2f} | {row['seconds']:.0f} |\n"
             )
             sys.stdout.flush()

@@ -122,11 +122,15 @@ def _carried(
     why = ", ".join(f"{count} {reason}" for reason, count in reached.refused.most_common(3))
     if not reached.rows:
         raise InputError(
-            f"the arm {arm.model.name} carries out none of {reached.tried} grasps ({why}); place it elsewhere: --base"
+            f"the arm {arm.model.name} carries out none of {reached.candidates} grasps ({why}); place it elsewhere: --base"
         )
-    written.counts |= {"tried": reached.tried, "reach_share": round(reached.share, 4), "refused": dict(reached.refused)}
+    written.counts |= {
+        "candidates": reached.candidates,
+        "reach_share": round(reached.share, 4),
+        "refused": dict(reached.refused),
+    }
     if reached.refused:
-        written.notes.append(f"the arm carries out {len(reached.rows)} of {reached.tried} grasps; left out: {why}")
+        written.notes.append(f"the arm carries out {len(reached.rows)} of {reached.candidates} grasps; left out: {why}")
     of_arm = hand_limits(arm.model)
     written.notes += _assumptions(of_arm)
     names = (*arm.model.joint_names, *found.hand.joint_names)

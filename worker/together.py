@@ -44,16 +44,16 @@ def validated_batches(
     checked: Callable[[int, ValidatedBatch], None] | None = None,
     empty_on: tuple[type[Exception], ...] = (),
 ) -> list[ValidatedBatch]:
-    """Batches of a job that follow each other; see `certified_grasps`, which makes the same of each.
+    """Batches of a job that follow each other; see `validated_grasps`, which makes the same of each.
 
     Args:
         hand: the hand.
         obj: the object.
-        request: see `certified_grasps`.
+        request: see `validated_grasps`.
         sizes: grasps wanted of each batch.
         first: number of the first batch within its job.
         join: batches whose grasps are planned in one launch; 1: one batch after the other.
-        scenes: see `certified_grasps`; those of all batches, or of each.
+        scenes: see `validated_grasps`; those of all batches, or of each.
         pieces: gives the object's convex pieces; asked once.
         run: told of the grasps that are done.
         partial: if it is stopped, the batches that were validated before are the result, the last one maybe in part.

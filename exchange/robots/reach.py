@@ -52,12 +52,12 @@ class ReachResult:
     """Their motions; joints are the arm's, then the hand's."""
     refused: Counter[str] = field(default_factory=Counter)
     """How many of the others for which reason."""
-    tried: int = 0
+    candidates: int = 0
 
     @property
     def share(self) -> float:
-        """Of those that were tried."""
-        return len(self.rows) / max(1, self.tried)
+        """Share of the candidates that the arm reaches."""
+        return len(self.rows) / max(1, self.candidates)
 
 
 class ReachSearch:
@@ -84,7 +84,7 @@ class ReachSearch:
         reached = ReachResult()
         for row in range(len(self.found)):
             run.check("the search of an arm's ways")
-            reached.tried += 1
+            reached.candidates += 1
             paths, reason = self.one(row)
             if paths is None:
                 reached.refused[reason] += 1

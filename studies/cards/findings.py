@@ -52,7 +52,7 @@ def _gaps(card: Row) -> list[str]:
     short = [c for c in card["cells"] if wanted and not c["missing_tasks"] and c["valid"] < c["asked"]]
     if short:
         short.sort(key=lambda cell: cell["valid"] / cell["asked"])
-        each = _listed([f"{_pair(c)} ({c['valid']} of {c['asked']} of {c['candidates']} candidates)" for c in short])
+        each = _listed([f"{_pair(c)} ({c['valid']} of {c['asked']} after {c['candidates']} candidates)" for c in short])
         told.append(
             f"**{len(short)} of {len(card['cells'])} cells ran out of budget** before all valid grasps were found: "
             f"{each}."

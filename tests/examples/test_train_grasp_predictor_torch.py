@@ -212,6 +212,6 @@ def test_practice_lifts_what_is_known_to_lift(hand: HandModel) -> None:
     given = TrainedModel([sight.scene] * 4, rows, np.ones(4), np.ones(4, bool), np.ones(4))
     far = dataclasses.replace(held, hand_pose=held.hand_pose + np.array([0.5, 0, 0, 0, 0, 0, 0]))
     practice = TrainingRun(hand, {"block": block}, [given], [sight], lambda *_: far)
-    tries = practice.tried(practice.beginning, 1, np.random.default_rng(0))
+    tries = practice.candidates(practice.beginning, 1, np.random.default_rng(0))
     assert not tries.lifted[:4].any()  # what the source proposed
     assert tries.lifted[4:].mean() >= 0.25  # grasps of the data, moved or not

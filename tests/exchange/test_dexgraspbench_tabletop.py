@@ -36,7 +36,8 @@ def shard(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Candidates in two scenes: most lift, the first `LIMP` do not, for they squeeze no more than the open hand."""
     out = tmp_path_factory.mktemp("scenes") / "g.h5"
     graspd(
-        f"synth --hand barrett --object block --scene table --scenes 2 -n {COUNT} --want candidates --fidelity draft -o",
+        f"synth --hand barrett --object block --scene table --scenes 2 -n {COUNT} --want candidates "
+        "--fidelity draft -o",
         out,
     )
     made = read_shard(out, kind="base")

@@ -132,7 +132,7 @@ def test_an_object_among_several_is_named(data: Path) -> None:
 
 
 def test_what_nobody_validated_has_no_label(on_tables: Path, tmp_path: Path) -> None:
-    assert "whether it holds" in refused("export --format graspgen --unvalidated -o", tmp_path / "out", on_tables)
+    assert "needs a verdict" in refused("export --format graspgen --unvalidated -o", tmp_path / "out", on_tables)
 
 
 @pytest.mark.parametrize(

@@ -134,7 +134,7 @@ def test_seconds_are_those_of_the_clock_of_the_settings_device(monkeypatch: pyte
 
     monkeypatch.setattr(scenes, "clock_of", clock)
     monkeypatch.setattr(scenes, "_planned", lambda *_, **__: None)
-    monkeypatch.setattr(scenes, "Validated", Verdict)
+    monkeypatch.setattr(scenes, "ValidatedGrasps", Verdict)
     (setting,) = settings_of(
         ["fast_graspd"], ["draft"], batches=[2], peer_batch=2, options=[], quick=True, run=ExecutionContext("cuda:0", 1)
     )

@@ -111,7 +111,7 @@ def test_a_job_whose_every_grasp_is_bad_ends_with_none(hand: HandModel) -> None:
     crumb = assets.prepared(assets.cube(1), {"units": "m"}, 1e-5)
     request = JobRequest(hand="hand", object="crumb", grasps=2, fidelity="draft", budget=2, rechecks=0)
     found = validated_grasps(hand, crumb, request, count=2)
-    assert found.tried == len(found.grasps) + sum(found.rejected.values())
+    assert found.candidates == len(found.grasps) + sum(found.rejected.values())
     assert (found.columns["quality/valid"] == 1).all()
 
 
@@ -332,7 +332,7 @@ def test_a_plate_flat_on_a_table_ends_with_fewer_and_says_so(tmp_path: Path) -> 
     result = CliRunner().invoke(build(), [*words.split(" "), "--object", str(plate), "-o", str(tmp_path / "g.h5")])
     assert result.exit_code == 3, result.output
     assert "the budget of 2 candidates for each ended first" in result.output
-    assert "of the candidates are clear of what stands there" in result.output
+    assert "of the candidates are clear" in result.output
 
 
 @pytest.mark.parametrize("gap", [5, 30])

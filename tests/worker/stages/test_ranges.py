@@ -134,7 +134,7 @@ def test_a_batch_without_a_place_has_no_grasps_but_for_the_first(
             raise NoStartFound("no hand finds a way in")
         return whole(*given, batch=batch, **options)
 
-    monkeypatch.setattr("graspd.worker.together.certified_grasps", some)
+    monkeypatch.setattr("graspd.worker.together.validated_grasps", some)
     asked = {"grasps": 2 * SIZE + 1, "scene": "table", "scenes": 2, "budget": 20}
     if not rows:
         with pytest.raises(AssertionError, match="no hand finds a way in"):

@@ -118,7 +118,7 @@ def test_the_letter_has_the_mass_of_the_protocol() -> None:
     assert as_asked(obj, JobOptions()).mass == 0.7
     asked = as_asked(obj, JobOptions(density=500.0, object_friction=0.8))
     assert (asked.mass, asked.friction) == (pytest.approx(500 * BOX.volume), 0.8)
-    with pytest.raises(ValueError, match="letter is DexGraspBench's protocol"):
+    with pytest.raises(ValueError, match="dexgraspbench gives all objects"):
         JobOptions(validation="dexgraspbench", mass=0.5)
 
 
