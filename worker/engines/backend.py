@@ -33,9 +33,9 @@ log = logging.getLogger(__name__)
 
 
 def _default_of_each_thread() -> None:
-    """Give every thread its own default device. Warp has one for the process: a `ScopedDevice` of one thread would move
-    arrays of another thread to its device and leave its device as the default. Until every array names its device, this
-    is the only place that accesses Warp's internals."""
+    """Give every thread its own default device, since Warp has one for the process.
+    A `ScopedDevice` would move another thread's arrays to its device and leave it as the default. Until every array
+    names its device, this is the only place that accesses Warp's internals."""
     from warp._src.context import Runtime, runtime  # noqa: TID251
 
     first, own = runtime.default_device, threading.local()
@@ -80,7 +80,7 @@ def start() -> None:
 
 
 def kernel_cache() -> Path | None:
-    """Return a cache folder for Warp; None if Warp's choice (`$WARP_CACHE_PATH`, or the home folder) is writable.
+    """Return a cache folder for Warp; None if Warp's own (`$WARP_CACHE_PATH`, or in the home) is writable.
 
     Containers run as any user, possibly on a read-only root file system.
     """
@@ -118,7 +118,7 @@ def _has_kernels(name: str) -> bool:
 
 
 def bake(names: Iterable[str], *, architectures: Sequence[int] = ARCHITECTURES, cpu: bool = True) -> list[Path]:
-    """Compile modules into Warp's cache: binaries for GPUs of these architectures, and objects for this CPU.
+    """Compile modules into Warp's cache: binaries for these GPU architectures, and objects for this CPU.
 
     No GPU is needed. Returns all files of the cache.
     """
@@ -165,8 +165,8 @@ def _copied(source: Path, target: Path) -> bool:
 
 
 def binary_name(module: ModuleType) -> str:
-    """Return the identity of a module's compiled kernels on this CPU: a digest of sources, callees and compile options,
-    and Warp's file name, which contains the CPU's instruction set.
+    """Return the identity of a module's compiled kernels on this CPU.
+    A digest of sources, callees and compile options, and Warp's file name with the CPU's instruction set.
 
     Two processes with the same value run the same instructions.
     """

@@ -32,7 +32,7 @@ _held: list[IO[bytes]] = []
 
 
 class Device:
-    """A device by its Warp name, or `auto`, resolved in the background: importing Warp takes most of a second."""
+    """Device by Warp name, or `auto`, resolved in the background: Warp takes most of a second to import."""
 
     def __init__(self, wanted: str, *, number: int | None = None) -> None:
         """`number`: index of a worker on its machine, see `take`.

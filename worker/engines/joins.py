@@ -23,8 +23,8 @@ PROCESS_SHARE: Final = 0.25
 
 
 def batches_at_once(device: str, join: int | None) -> int:
-    """Return the batches per launch on a Warp device: `join` if given; 1 on the CPU, where larger launches gain
-    nothing; on a GPU as many as fill it and fit its free memory."""
+    """Return the batches per launch on a Warp device: `join` if given, else 1 on the CPU.
+    On a GPU as many as fill it and fit its free memory; on the CPU larger launches gain nothing."""
     if join is not None or not device.startswith("cuda"):
         return join or 1
     import warp as wp

@@ -1,4 +1,4 @@
-"""Curation of datasets: balanced subsets (types, approaches, resting faces), and the difference of two datasets."""
+"""Curation of datasets: balanced subsets (types, approaches, resting faces), and differences."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _SAME_FACE: Final = float(np.cos(np.radians(20)))
 
 @dataclass(frozen=True)
 class Balance:
-    """Balanced selection; a `Chooser` of `worker.files.subsets`, called with the shards of one hand on one object."""
+    """Balanced selection; a `Chooser` of `worker.files.subsets` for the shards of one hand and object."""
 
     by: Sequence[str]
     at_most: int = 0
@@ -48,7 +48,7 @@ class Balance:
             raise InputError(f"say what to balance by: {', '.join(KINDS)}")
 
     def __call__(self, shards: list[Shard]) -> list[NDArray[np.bool_]]:
-        """Return masks of selected grasps: valid ones, drawn at random by the seed, within the limit of each category.
+        """Return masks of selected grasps: valid, drawn at random by the seed, limited per category.
 
         Raises:
             InputError: a shard lacks the category.
@@ -97,7 +97,7 @@ def _down(shard: Shard) -> NDArray[np.float64]:
 
 
 def faces(down: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Number the bottom faces (N,) of down directions (N, 3): directions within 20 degrees of the first share one."""
+    """Number the bottom faces (N,) of down directions (N, 3), one for all within 20 degrees of the first."""
     seen = np.zeros((0, 3))
     found = np.full(len(down), -1, np.int64)
     for row in np.flatnonzero(np.linalg.norm(down, axis=1) > 0):

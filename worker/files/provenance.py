@@ -1,4 +1,4 @@
-"""Provenance of a shard: the attributes that identify its hand, object and grasps, and the search for their files.
+"""Provenance of a shard: attributes that identify hand, object and grasps; search for their files.
 
 Files are identified by digest, so a modified or different file is never used instead.
 """
@@ -83,7 +83,7 @@ def remembered(hand: str, obj: str, options: Mapping[str, Any]) -> dict[str, Att
 
 
 def find(sought: AssetReference) -> AssetFiles:
-    """Find the files of a hand or object: built in, at the path in the shard, in the store, or in the shard's folder.
+    """Find the files of a hand or object: built in, at the shard's path, in the store or shard's folder.
 
     Raises:
         NotFoundError: in none of these; the message lists the places.
@@ -255,7 +255,7 @@ def neighbours_of_shard(shard: Shard, given: Sequence[str]) -> Neighbours | None
 
 
 def beside_attributes(others: Sequence[ObjectModel], given: Sequence[str]) -> dict[str, Attribute]:
-    """Return a shard's attributes for the objects beside its own, given as files or names; empty if there are none."""
+    """Return a shard's attributes for other objects, given as files or names; empty if there are none."""
     if not others:
         return {}
     return {
@@ -299,7 +299,7 @@ def _check(shard: Shard, kind: str, digest: str, given: str | None) -> None:
 
 
 def id_of_columns(columns: Columns) -> str:
-    """Return the id of a shard that no job made: a digest of its columns, so that later shards can name it."""
+    """Return the id of a shard that no job made, by which later shards name it: a digest of its columns."""
     found = hashlib.sha256()
     for name in sorted(columns):
         array = np.ascontiguousarray(columns[name])
@@ -338,7 +338,7 @@ def base_attributes(
     verdict_key: str | None,
     outcomes: Mapping[str, int] = MappingProxyType({}),
 ) -> dict[str, Attribute]:
-    """Return the attributes of a base shard: joints, request, scene, number of candidates, and terms of validation.
+    """Return the attributes of a base shard: joints, request, scene, candidates, terms of validation.
 
     Args:
         hand: the hand.
@@ -369,6 +369,6 @@ def base_attributes(
 
 
 def wrist_attributes(hand: HandModel) -> dict[str, Attribute]:
-    """Return the attributes that name the columns of `grasp/wrist_positions`, present for grasps in scenes."""
+    """Return the attributes that name the columns of `grasp/wrist_positions`, for grasps in scenes."""
     wrist = () if hand.mounting is None else hand.mounting.joint_names
     return {"wrist_joint_names": list(wrist)} if wrist else {}

@@ -63,7 +63,7 @@ def base_shards(shards: Shards) -> Iterator[list[Shard]]:
 
 
 def write_subset(shards: Shards, choose: Chooser, out: Path, *, said: Mapping[str, Any]) -> Subset:
-    """Write base shards of the selected grasps, `HAND/OBJECT/base-BATCH.h5`, and `subset.json` with the selection.
+    """Write base shards of selected grasps, `HAND/OBJECT/base-BATCH.h5`, and the selection, `subset.json`.
 
     Shards without selected grasps are left out. All columns of a grasp, including its scene, are unchanged.
 

@@ -85,7 +85,7 @@ MEDIAL_MAX = 2.44
 
 
 def barrett() -> tuple[str, dict[str, Any]]:
-    """BarrettHand BH8-280: palm normal +z, closing negative; 8 joints on 4 motors, fingers 1 and 2 spread together."""
+    """BarrettHand BH8-280: palm normal +z, closing negative; 8 joints, 4 motors, one to spread fingers."""
     hand = UrdfWriter("barrett")
     hand.link(
         "palm", 1.0,

@@ -1,4 +1,4 @@
-"""Direction in which each joint closes a hand, from the motion of its fingertips; joint limits break ties."""
+"""Closing direction of each joint from the motion of its fingertips; joint limits break ties."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _TIE: Final = 0.2
 
 
 def closing_by_limits(hand: HandModel) -> Floats:
-    """Return closing (D,): fingers bend far one way and little the other, symmetric joints spread, wrists are 0."""
+    """Return closing (D,) from limits: asymmetric joints close, symmetric ones spread, wrists are 0."""
     up, down = np.maximum(hand.upper, 0), np.maximum(-hand.lower, 0)
     closing = np.where(up > FAR * down, 1.0, np.where(down > FAR * up, -1.0, 0.0))
     carrying = set(carriers(hand))
@@ -99,7 +99,7 @@ def _apart(tip: Floats) -> Floats:
 
 
 def chains_of(hand: HandModel) -> list[list[int]]:
-    """Return for each fingertip the bodies whose joints move it, the last one first, without those above the palm."""
+    """Return the bodies whose joints move each fingertip, the last one first, up to the palm."""
     carrying, chains = set(carriers(hand)), []
     for tip in hand.fingertips:
         chain, body = [], tip
@@ -117,7 +117,7 @@ def _axes(hand: HandModel, q: Floats) -> Floats:
 
 
 def carriers(hand: HandModel) -> list[int]:
-    """Return the bodies that carry all fingertips, from root to palm; between them are a forearm and a wrist."""
+    """Return the bodies that carry all fingertips: root, forearm and wrist, palm."""
     if len(hand.fingertips) < 2:
         return [0]
     chains = []

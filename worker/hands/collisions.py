@@ -16,7 +16,7 @@ TOUCH_M = 1e-4
 
 
 def resting_neighbours(hand: HandModel) -> frozenset[tuple[int, int]]:
-    """Return pairs of bodies (a < b): parent and child, grandparent and grandchild, and those that touch at rest.
+    """Return pairs of bodies (a < b): parent or grandparent and child, and those that touch at rest.
 
     Rest means both the pre-shape and the middle of the limits: bodies that touch in both cannot be separated.
     """

@@ -1,4 +1,4 @@
-"""Pinch postures for flat objects on a support: the ends of opposed fingertips rest on a plane and face each other.
+"""Pinch postures for flat objects on a support: ends of opposed fingertips on a plane, face to face.
 
 The pads of `worker.hands.pinch_postures` are farther from the fingertips' ends than a flat object is high. The same
 search uses here the surface within the object's height above the plane.
@@ -50,8 +50,8 @@ SQUARE: Final = 0.7
 
 
 def pinches_of(hand: HandModel, height: float) -> Oppositions:
-    """Return postures for an object of this height [m], cached in memory and on this machine; none if it reaches the
-    pads or the hand has one finger.
+    """Return postures for an object of this height [m], cached in memory and on this machine.
+    There are none if it reaches the pads or the hand has one finger.
 
     The palm's approach without its part along `axis` points at the plane. `middle` is half the height above it.
     """
@@ -99,7 +99,7 @@ class _Seen:
     middle: Floats
     width: Floats
     short: Floats
-    """(N,) height of the opposing finger's end, or the others' mean, above the plane, over what reaches the object."""
+    """(N,) height above the plane of the opposing end, or the others' mean, over what reaches the object."""
     facing: Floats
     """(N,) cosine between the surface within the height and the line between the ends, for the worse side."""
     square: Floats

@@ -1,5 +1,5 @@
-"""Postures in which any two parts of a hand face each other, for objects below the least gap between pads or above the
-widest.
+"""Postures in which any two parts of a hand face each other.
+They serve objects narrower than the least gap between pads, or wider than the widest.
 
 An object of 10 mm is held between the sides of two fingers or a finger and the palm; one as wide as the hand's span,
 between the sides of fingertips. Both are pairs of surface points with normals along the line between them and space for
@@ -166,8 +166,8 @@ class _Look:
         return axis[row, best], middle[row, best], width[row, best], cost[row, best]
 
     def _costs(self, held: Floats, normal: Floats, wanted: Floats) -> Floats:
-        """Compute the cost (n, pairs) of each pair, except for clearance, by matrix products: the square of a width is
-        rounded to 1e-17 m²."""
+        """Compute the cost (n, pairs) of each pair, except for clearance, by matrix products.
+        The square of a width is rounded to 1e-17 m²."""
         square = np.einsum("npi,npi->np", held, held)
         own = np.einsum("npi,npi->np", held, normal)
         parts = []

@@ -1,4 +1,4 @@
-"""Guesses of values that a URDF lacks: fingertips, closing directions, palm and pre-shape. Each can be overridden."""
+"""Guesses of values that a URDF lacks: fingertips, closing, palm and pre-shape; options override them."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def _gripper(hand: HandModel, jaws: Jaws, tree: Tree, options: HandOptions) -> H
 
 
 def _approach_of_jaws(hand: HandModel, jaws: Jaws) -> Floats:
-    """Return the approach of a gripper: perpendicular to the closing line and, if there are hinges, their axes."""
+    """Return the approach of a gripper: perpendicular to the closing line and the axes of hinges."""
     ahead, axis = _unit(_ahead(hand, jaws)), jaws.axis[len(jaws.q) // 2]
     if (line := _line_of_joints(hand, ahead, ROUGH, 2, axis)) is not None:
         return line
@@ -115,7 +115,7 @@ def _ahead(hand: HandModel, jaws: Jaws) -> Floats:
 
 
 def _closing_seen(hand: HandModel, stated: Mapping[int, float]) -> Floats:
-    """Return closing of a possible gripper: as stated, else by surfaces that come together, else by its limits.
+    """Return closing of a possible gripper: as stated, else from facing surfaces, else from limits.
 
     Raises:
         HandError: fingers slide, and nothing opposes them.
@@ -182,16 +182,16 @@ def _tips_ahead(hand: HandModel) -> Floats:
 
 
 def _cancelling(ways: Floats, ahead: Floats) -> float:
-    """Return the length of the sum of tip motions across `ahead` over the sum of lengths: 0 if fingers close around an
-    axis, 1 if all move the same way."""
+    """Return the length of the sum of tip motions across `ahead` over the sum of their lengths.
+    It is 0 if fingers close around an axis, 1 if all move the same way."""
     axis = _unit(ahead)
     across = ways - np.outer(ways @ axis, axis)
     return float(np.linalg.norm(across.sum(axis=0)) / max(np.linalg.norm(across, axis=1).sum(), 1e-12))
 
 
 def _between_fingers(hand: HandModel) -> tuple[Floats, bool]:
-    """Return the direction out of the palm of a hand with opposed fingers: from the finger bases to the half-closed
-    tips, perpendicular to a common closing line; and whether it is a tie, with the tips in the plane of the bases."""
+    """Return the direction out of the palm of a hand with opposed fingers, and whether it is a tie.
+    It runs from finger bases to half-closed tips, perpendicular to a common closing line; coplanar points are a tie."""
     body = carriers(hand)[-1]
     q = posture(hand, 0.5)
     poses = body_poses(hand, IDENTITY_POSE, hand.expand(q))[0]
@@ -217,7 +217,7 @@ def _between_fingers(hand: HandModel) -> tuple[Floats, bool]:
 def _line_of_joints(
     hand: HandModel, rough: Floats, within: float, least: int, beside: Floats | None = None
 ) -> Floats | None:
-    """Return the direction near a rough one on which most joint axes, and perpendiculars of two of them, agree.
+    """Return the direction near a rough one that most joint axes, and perpendiculars of two, share.
 
     It is independent of the orientation of the hand's root frame.
 
@@ -316,8 +316,8 @@ def _palm(hand: HandModel, tree: Tree, options: HandOptions, approach: Floats) -
 
 
 def _leaves(parts: Sequence[Floats], point: Floats, direction: Floats) -> float | None:
-    """Return the distance along `direction` at which a line through `point` leaves the last convex part (V, 3); None
-    if it meets none."""
+    """Return the distance along `direction` at which a line through `point` leaves the last convex part.
+    Parts are (V, 3); None if it meets none."""
     ends = []
     for corners in parts:
         planes = recalled("planes", [corners], partial(_planes, corners))["0"]

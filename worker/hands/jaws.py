@@ -1,4 +1,4 @@
-"""Jaws of a gripper and pads of a hand: the surfaces that meet on closing, their opening and their closing line.
+"""Jaws of a gripper and pads of a hand: surfaces that meet on closing, their opening and closing line.
 
 A gripper is a hand whose closing is one motion of at most two degrees of freedom that brings opposing surfaces, the
 pads, together. Everything follows from geometry, so a joint at 0 may be open or closed.
@@ -52,7 +52,7 @@ _IN_SPACE: Final = 0.2
 
 @dataclass(frozen=True)
 class Jaws:
-    """Closing motion of a gripper: K postures from open to contact of the pads, or as near as limits allow."""
+    """Closing motion of a gripper: K postures from open to contact of the pads, or to the limits."""
 
     q: Floats
     """(K, D) dof values."""
@@ -84,7 +84,7 @@ class Jaws:
         return self.speed[np.argmin(apart, axis=1)]
 
     def at(self, width: Floats) -> tuple[Floats, Floats, Floats]:
-        """Return dof values (n, D), middles (n, 3) and axes (n, 3) at the nearest available clear widths to (n,)."""
+        """Return dof values (n, D), middles (n, 3) and axes (n, 3) at the available widths nearest to (n,)."""
         order = np.argsort(self.width, kind="stable")
         q, middle, axis = (
             np.column_stack([np.interp(width, self.width[order], column[order]) for column in array.T])
@@ -129,8 +129,8 @@ _lock = threading.Lock()
 
 
 def find_jaws(hand: HandModel, approach: Floats | None = None) -> Jaws | None:
-    """Find the jaws of a hand with known `closing`. Return None if more dofs close it, nothing opposes, or more than
-    two digits close from more than two sides: those are planned as hands."""
+    """Find the jaws of a hand with known `closing`; None if it is planned as a hand.
+    That is: more dofs close it, nothing opposes, or more than two digits close from more than two sides."""
     closing = np.flatnonzero(hand.closing)
     if not 1 <= len(closing) <= MAX_DOFS or hand.dofs > MAX_DOFS:
         return None
@@ -183,7 +183,7 @@ def _ahead(motion: Floats, normal: Floats) -> Floats:
 
 
 def _facing(place: Floats, normal: Floats, points: SurfacePoints, among: Ints) -> tuple[Ints, Ints, Floats]:
-    """Return the points of `among` that face another body, the nearest such point of each, and the gap [m]."""
+    """Return the points of `among` that face another body, the nearest one of each, and the gap [m]."""
     aside = _ASIDE * np.sqrt(points.area.sum() / len(points))
     first, second, gaps = [], [], []
     for i in among:
@@ -201,8 +201,8 @@ def _facing(place: Floats, normal: Floats, points: SurfacePoints, among: Ints) -
 
 
 def _is_centric(hand: HandModel, points: SurfacePoints, path: Floats) -> bool:
-    """Check whether three or more digits close around a place, as in a centric gripper. Jaws and the links of their
-    mechanisms move in the plane of jaws and approach; digits around a place move in space."""
+    """Check whether three or more digits close around a place, as in a centric gripper.
+    Jaws and their linkages move in the plane of jaws and approach; digits around a place move in space."""
     ends = [body for body in set(points.body.tolist()) if body not in hand.parent]
     if len(ends) < 3:
         return False
@@ -214,8 +214,8 @@ def _is_centric(hand: HandModel, points: SurfacePoints, path: Floats) -> bool:
 
 
 def _meeting(hand: HandModel, points: SurfacePoints, path: Floats) -> tuple[Floats, Ints, Ints, Floats] | None:
-    """Return the posture in which the pads meet, or the last of the path; the pairs of points that meet first; and the
-    area (L,) of each body that faced another before contact, summed over postures."""
+    """Return the posture in which the pads meet, or the last of the path, and the first pairs of contact.
+    Also return the area (L,) of each body that faced another before contact, summed over postures."""
     best: tuple[Floats, Ints, Ints, Floats] | None = None
     step, faced = path[-1] - path[0], np.zeros(hand.bodies)
     for k in range(len(path)):
@@ -266,7 +266,7 @@ def sign_of(line: Floats) -> float:
 
 
 def _on_pads(side: Ints, points: SurfacePoints, faced: Floats) -> Ints:
-    """Select points of a side on the bodies that faced the other most, not on links that come near only at the end."""
+    """Select points of a side on bodies that faced the other most, not on links near only at the end."""
     most = float(faced[points.body[side]].max(initial=0.0))
     return side[faced[points.body[side]] >= _PAD_SHARE * most]
 

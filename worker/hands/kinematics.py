@@ -1,4 +1,4 @@
-"""Forward kinematics and the transposed Jacobian of a hand in float64 NumPy: the reference of the kernels."""
+"""Forward kinematics and transposed Jacobian of a hand in float64 NumPy: reference of the kernels."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def ancestors(hand: HandModel) -> NDArray[np.bool_]:
 def generalized_forces(
     hand: HandModel, bodies: Floats, body: NDArray[np.integer], points: Floats, forces: Floats
 ) -> Floats:
-    """Compute the generalized forces on the hand's dofs, mimic joints folded in, from forces on its bodies.
+    """Compute generalized forces on a hand's dofs, mimic joints folded in, from forces on its bodies.
 
     By virtual work the torque on a dof is the sum over its joints of multiplier times joint torque.
 

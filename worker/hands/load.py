@@ -99,8 +99,8 @@ def mounting_of(
     hand: HandModel,
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> tuple[HandModel | None, str]:
-    """Return the links above the hand's root, None if there are none, and the reason if their shapes cannot be read:
-    faults above a hand do not refuse it."""
+    """Return the links above the hand's root, None if there are none, and why their shapes are unreadable.
+    Faults above a hand do not refuse it."""
     tree = mounting_tree(robot, hand.root_link, options)
     if tree is None:
         return None, ""
@@ -263,7 +263,7 @@ def _masses(robot: Robot, tree: Tree, pieces: tuple[ConvexPiece, ...]) -> Floats
 
 
 def hand_from_path(path: str | Path, options: Mapping[str, Any] | None = None, *, drag: bool = False) -> HandModel:
-    """Load a hand for the command line: a built-in's name, a URDF, its folder, or a ZIP of it; `drag`: `load_hand`.
+    """Load a hand for the command line: a built-in's name, URDF, its folder, or a ZIP; `drag`: `load_hand`.
 
     Raises:
         NotFoundError: neither a file nor a built-in hand.
@@ -280,7 +280,7 @@ def hand_from_path(path: str | Path, options: Mapping[str, Any] | None = None, *
 
 
 def files_from_path(path: str | Path) -> tuple[str, dict[str, bytes], dict[str, Any]]:
-    """Return name, files and further options of a hand: a URDF, its folder, a ZIP of it, or a built-in's name."""
+    """Return name, files and options of a hand: a URDF, its folder, a ZIP of it, or a built-in's name."""
     path = Path(path)
     if not path.is_file() and str(path) in builtin_names(AssetKind.HAND):
         return str(path), builtin_files(AssetKind.HAND, str(path)), {}

@@ -1,4 +1,4 @@
-"""Couplings of an MJCF model: joint equalities, fixed tendons, and closed loops as linear functions of their drivers.
+"""Couplings of an MJCF model, linear in their drivers: joint equalities, fixed tendons, closed loops.
 
 A four-bar linkage is a tree with ends connected by `connect` constraints. The loops are solved over the drivers'
 ranges, and each passive joint is fitted by a line in its driver, with the resulting error.
@@ -80,7 +80,7 @@ def _note(notes: list[str], text: str) -> None:
 def _couple(
     model: Any, first: int, second: int, polynomial: Any, found: dict[int, Mimic | float], name: Callable[[int], str]
 ) -> str:
-    """Couple by first - first0 = p(second - second0), p of degree 4; a nonlinear p is replaced by its best line."""
+    """Couple by first - first0 = p(second - second0); p of degree 4 is replaced by its best line."""
     rest = [float(model.qpos0[model.jnt_qposadr[joint]]) if joint >= 0 else 0.0 for joint in (first, second)]
     if second < 0:
         found[first] = rest[0] + float(polynomial[0])
@@ -129,7 +129,7 @@ def _couple_on_tendon(
     found: dict[int, Mimic | float],
     name: Callable[[int], str],
 ) -> str:
-    """Couple two joints on a tendon of fixed length: c1 (q1 - q1_0) + c2 (q2 - q2_0) = p0. The unactuated one follows.
+    """Couple two joints on a fixed tendon: c1 (q1 - q1_0) + c2 (q2 - q2_0) = p0; the unactuated follows.
 
     Limits take precedence over the tendon: where they stop the follower it stays, as in a finger with a compliant end.
     """
@@ -348,7 +348,7 @@ def _solve(
 def _close(
     model: Any, data: Any, loops: list[int], driver: int, value: float, passive: list[int], guess: Floats
 ) -> tuple[Floats, float]:
-    """Solve for passive joint values that close the loops at a driver value (Gauss-Newton); also return the gap [m]."""
+    """Solve for passive joint values at a driver value (Gauss-Newton); also return the loops' gap [m]."""
     address, dofs = [int(model.jnt_qposadr[j]) for j in passive], [int(model.jnt_dofadr[j]) for j in passive]
     q = guess.copy()
     gap = np.inf

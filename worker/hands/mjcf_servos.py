@@ -53,7 +53,7 @@ def servos(model: Any, mimics: Mapping[int, Mimic | float], shared: Collection[i
 
 
 def commanded(model: Any) -> dict[int, tuple[float, float]]:
-    """Return the range of commands to a joint's own position servo: g k (u - q) with u within its control range."""
+    """Return the command range of a joint's position servo: g k (u - q) with u in its control range."""
     found = {}
     for actuator in range(model.nu):
         kind, gain = int(model.actuator_trntype[actuator]), _gain(model, actuator)

@@ -114,8 +114,8 @@ def _is_read(actuator: Element) -> bool:
 
 
 def _means_radians(root: Element) -> bool:
-    """Check whether a model without an angle unit, which defaults to degrees, was written for one in radians: no joint
-    would turn by more than 2 pi degrees, and no angle is larger."""
+    """Check whether a model without an angle unit, so in degrees, was written for one in radians.
+    Then no joint would turn by more than 2 pi degrees, and no angle is larger."""
     if any("angle" in compiler.attrib for compiler in root.findall("compiler")):
         return False
     hinges = [e for e in root.iter("joint") if "range" in e.attrib and e.get("type", "hinge") != "slide"]

@@ -1,4 +1,4 @@
-"""Model of a hand for the engine: a tree of rigid bodies, the map from degrees of freedom to joints, convex pieces.
+"""Model of a hand for the engine: tree of rigid bodies, map from dofs to joints, convex pieces.
 
 Links joined by fixed joints are merged into one body, so every body except the root has one moving joint.
 Frames: body frame = frame of the link that the moving joint carries; root frame = frame of the named root link.
@@ -37,7 +37,7 @@ class ConvexPiece:
     body: int
     kind: str  # box, sphere, cylinder, capsule or hull
     size: tuple[float, ...]
-    """Box: full extents x y z. Sphere: radius. Cylinder and capsule: radius, length along z without caps. Hull: ()."""
+    """Box: full extents. Sphere: radius. Cylinder, capsule: radius, length along z without caps. Hull: ()."""
     pose: Floats
     """(7,) pose of the primitive's frame in the body frame; identity for hulls."""
     vertices: Floats
@@ -60,7 +60,7 @@ class PalmFrame:
 
 @dataclass(frozen=True)
 class SurfacePoints:
-    """A fixed sample of the hand's surface, N points. Interior parts (inside another piece) have no points."""
+    """Fixed sample of the hand's surface, N points; parts inside another piece have no points."""
 
     body: Ints
     """(N,) body of each point."""
@@ -129,7 +129,7 @@ class HandModel:
     """Bodies at the end of each finger."""
     pieces: tuple[ConvexPiece, ...]
     neighbours: frozenset[tuple[int, int]]
-    """Pairs of bodies (a < b) whose contact does not count: adjacent ones and those that touch in every posture."""
+    """Pairs of bodies (a < b) whose contact is ignored: adjacent, or touching in every posture."""
     masses: Floats
     """(L,) [kg] of each body, from the URDF or, if it gives none, from volume at 1000 kg/m^3."""
     velocity: Floats = field(default_factory=lambda: np.zeros(0))
@@ -145,8 +145,8 @@ class HandModel:
     drag: Drag | None = field(default=None, metadata=TOLD_IF_SET)
     """None: no drag in the validator, as in the protocol."""
     mounting: HandModel | None = field(default=None, metadata=TOLD_IF_SET)
-    """Links above the root that stay clear in scenes, as a tree of bodies and wrist joints that starts at the root; see
-    `worker.hands.mounting`."""
+    """Links above the root that stay clear in scenes, see `worker.hands.mounting`.
+    A tree of bodies and wrist joints that starts at the root."""
 
     @cached_property
     def content(self) -> str:

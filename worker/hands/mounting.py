@@ -1,4 +1,4 @@
-"""Mounting of a hand: the links above its root with poses fixed by a grasp, up to the angles of a wrist.
+"""Mounting of a hand: the links above its root that a grasp places, up to the angles of a wrist.
 
 The mounting is its own kinematic tree that starts at the hand's root and runs up the robot. It passes fixed joints,
 joints with one value, and at most `MAX_WRIST_JOINTS` joints of a wrist: revolute ones of limited range near the root.
@@ -30,7 +30,7 @@ WRIST_SHARES: Final = (0.5, 1.0)
 
 
 def mounting_tree(robot: Robot, root: str, options: HandOptions) -> Tree | None:
-    """Build the tree of links above the root, poses in the frame of the root link; None if none has a shape."""
+    """Build the tree of links above the root, poses in the root link's frame; None if none has a shape."""
     names, parents, origins = [root], [-1], [IDENTITY_POSE.copy()]
     joints: list[Joint | None] = [None]
     links: dict[str, tuple[int, Floats]] = {}
@@ -90,7 +90,7 @@ def _of_wrist(joint: Joint) -> bool:
 
 
 def _rigid(robot: Robot, joint: Joint, pose: Floats, options: HandOptions) -> dict[str, Floats]:
-    """Return the poses of a joint's parent, as given, and of all links fixed to it except the joint's child."""
+    """Return the poses of a joint's parent, as given, and of links fixed to it except the joint's child."""
     found, stack = {joint.parent: pose}, [joint.parent]
     while stack:
         at = stack.pop()
@@ -102,7 +102,7 @@ def _rigid(robot: Robot, joint: Joint, pose: Floats, options: HandOptions) -> di
 
 
 def wrist_positions(mounting: HandModel) -> Floats:
-    """Return sampled angles (W, K) of the wrist's K joints, the rest position first, then the nearest to it."""
+    """Return sampled angles (W, K) of the wrist's K joints, the rest position first, then by distance."""
     angles = [
         [rest, *(rest + share * (end - rest) for share in WRIST_SHARES for end in (low, high) if end != rest)]
         for rest, low, high in zip(mounting.preshape, mounting.lower, mounting.upper, strict=True)

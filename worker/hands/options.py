@@ -79,7 +79,7 @@ class HandOptions(_Options):
 
 
 def parse_options(files: Mapping[str, bytes], extra: Mapping[str, Any] | None = None) -> HandOptions:
-    """Return options of the hand in `files`: `extra` overrides its `asset.json`, which overrides its `hand.json`.
+    """Return options of the hand in `files`: `extra` overrides `asset.json`, which overrides `hand.json`.
 
     Raises:
         HandError: one of them is not JSON, or a key is unknown or wrong; the message names it.
@@ -103,7 +103,7 @@ def _asset_json(files: Mapping[str, bytes]) -> dict[str, Any]:
 
 
 def _hand_json(files: Mapping[str, bytes], urdf: object) -> dict[str, Any]:
-    """Return options from the notes of a collection of hands: palm link and normal, fingertip links, torque limit.
+    """Return options from a hand collection's notes: palm link and normal, fingertip links, torque limit.
 
     Args:
         urdf: name of the hand's URDF if known; notes on another one are ignored.

@@ -1,4 +1,4 @@
-"""Pinch postures: whether a hand's surfaces oppose one another, and postures in which its fingers do, by width.
+"""Pinch postures: whether a hand's surfaces oppose one another, and opposed postures by width.
 
 A hand holds between one finger, usually the thumb, and others with pads that face it. Sampling and random steps find
 such postures for all feasible widths.
@@ -88,7 +88,7 @@ _lock = threading.Lock()
 
 
 def oppositions_of(hand: HandModel) -> Oppositions:
-    """Return the opposed postures of a hand, cached in memory and on this machine; none if it has one finger."""
+    """Return the opposed postures of a hand, cached in memory and on this machine; one finger has none."""
     with _lock:
         if hand.content not in _known:
             made = arrays_kept_or_made("oppositions", (hand.content,), _code(), lambda: vars(_oppositions(hand)))
@@ -203,8 +203,8 @@ def random_postures(hand: HandModel, one: int, count: int) -> Floats:
 
 
 def _ranks(hand: HandModel) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return (D,) the finger of each dof, -1 if several share it, -2 if it drives none; and the number of joints of
-    that finger between the dof and the tip."""
+    """Return (D,) the finger of each dof, -1 if several share it, -2 if it drives none.
+    Also return the number of joints of that finger between the dof and the tip."""
     finger, rank = np.full(hand.dofs, -2, np.intp), np.zeros(hand.dofs, np.intp)
     for number, tip in enumerate(hand.fingertips):
         seen, body = 0, tip
@@ -217,7 +217,7 @@ def _ranks(hand: HandModel) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
 
 
 def require_opposing(hand: HandModel) -> None:
-    """Refuse a hand that can hold nothing before planning; the result is cached in memory and on this machine.
+    """Refuse a hand that can hold nothing, before planning; cached in memory and on this machine.
 
     Raises:
         HandError: no two of its surfaces face each other and close; the message states the fix.
@@ -256,7 +256,7 @@ def _why_not(hand: HandModel) -> HandError:
 
 
 def opposes(hand: HandModel) -> bool:
-    """Check whether points on different bodies face each other in some posture, with a gap that the joints change."""
+    """Check whether points on different bodies face each other in some posture over an adjustable gap."""
     points = sample_surface(hand, _CHECKED_POINTS)
     rng = np.random.default_rng(0)
     shares = [posture(hand, share) for share in np.linspace(0, 1, 5)]

@@ -1,4 +1,4 @@
-"""Convex solids: tessellation, area, surface samples, signed distance, and their features (balls, rims, edges).
+"""Convex solids: tessellation, area, surface samples, signed distance, features (balls, rims, edges).
 
 All functions work in the solid's own frame; cylinders and capsules have their axis along z and are centred.
 """
@@ -253,7 +253,7 @@ def _edges(piece: ConvexPiece) -> tuple[Floats, float]:
 
 
 def convex_edges(vertices: Floats, faces: NDArray[np.integer[Any]]) -> NDArray[np.intp]:
-    """Return the edges (E, 2) of a convex solid of outward triangles at which its surface bends, not within faces."""
+    """Return edges (E, 2) at which a convex solid of outward triangles bends, not those within faces."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     normal = np.cross(b - a, c - a)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)

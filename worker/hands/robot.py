@@ -1,4 +1,4 @@
-"""Common result of the readers of URDF and MJCF: links with shapes and masses, and joints that form one tree.
+"""Common result of the URDF and MJCF readers: links with shapes and masses, and a tree of joints.
 
 The readers check every value, so later code does not.
 """
@@ -79,7 +79,7 @@ class Joint:
     effort: float
     """[N m or N]; 0: not stated."""
     mimic: Mimic | None
-    """Mimic relation. A URDF follower's own limits are ignored, as in ROS: in most published grippers they are junk."""
+    """Mimic relation; a URDF follower's own limits are ignored, as in ROS: most published ones are junk."""
     velocity: float = 0.0
     """Limit [rad/s or m/s]; 0: not stated."""
     stiffness: float = 0.0

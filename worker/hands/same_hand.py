@@ -1,4 +1,4 @@
-"""Comparison of two models of one hand: matching joints, relative pose of the bases, and agreement of fingertips."""
+"""Comparison of two models of one hand: matching joints, relative pose of bases, fingertip agreement."""
 
 from __future__ import annotations
 
@@ -158,7 +158,7 @@ def _middle(hand: HandModel, body: int) -> Floats:
 
 
 def _fit(where: Floats, poses: Floats, guess: Floats) -> tuple[Floats, Floats]:
-    """Fit the pose (7,) of the other base and the positions (T, 3) of fingertips in the frames of their bodies there.
+    """Fit the pose (7,) of the other base, and positions (T, 3) of fingertips in their body frames there.
 
     Least squares over both.
 

@@ -1,5 +1,5 @@
-"""Collision shapes of a robot as convex pieces: primitives stay exact; a mesh becomes one hull, or several where one
-would cover surface that can touch.
+"""Collision shapes of a robot as convex pieces.
+Primitives stay exact; a mesh becomes one hull, or several where one would cover surface that can touch.
 
 The error of a mesh's pieces is the depth of its surface beneath them, along the shortest free direction out, at the
 ninth decile of the surface visible from outside. Interiors of housings do not count.
@@ -123,7 +123,7 @@ def _reduced(points: Floats, limit: int) -> tuple[Floats, Ints]:
 
 
 def _outside(points: Floats, corners: Floats) -> Floats:
-    """Return the distance (N,) of points (N, 3) outside the hull of a few; from the nearest corner while it is flat."""
+    """Return the distance (N,) of points (N, 3) outside a small hull; from its nearest corner if flat."""
     spread = np.linalg.svd(corners - corners.mean(axis=0), compute_uv=False)
     if len(corners) < 4 or spread[2] < 1e-6 * spread[0]:
         return np.linalg.norm(points[:, None] - corners[None], axis=2).min(axis=1)
@@ -256,7 +256,7 @@ class _OpenSurface:
 
 
 def _hits(points: Floats, direction: Floats, corners: Floats) -> NDArray[np.bool_]:
-    """Check (P,) whether a ray from a point meets one of the triangles (F, 3, 3) (Moeller and Trumbore 1997)."""
+    """Check (P,) whether rays from points hit one of the triangles (F, 3, 3) (Moeller and Trumbore 1997)."""
     a, first, second = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     across = np.cross(direction, second)
     determinant = np.einsum("ij,ij->i", first, across)
@@ -281,7 +281,7 @@ def _hits(points: Floats, direction: Floats, corners: Floats) -> NDArray[np.bool
 
 
 def _ways_out(part: Floats, points: Floats) -> Floats:
-    """Return the distance (D, P) from each point along each direction out of a part's hull; 0 outside of it."""
+    """Return the distance (D, P) from points along directions out of a part's hull; 0 outside of it."""
     normals, offsets = _planes(part)
     inside = offsets - points @ normals.T
     rates = _DIRECTIONS @ normals.T

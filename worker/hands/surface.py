@@ -156,7 +156,7 @@ def _buried(hand: HandModel, own: int, position: Floats, normal: Floats, rest: F
 
 
 def apportion(weights: Floats, count: int, available: NDArray[np.intp]) -> NDArray[np.int64]:
-    """Distribute `count` by largest remainder in proportion to weights (L,), within what is available (L,)."""
+    """Distribute `count` by largest remainder in proportion to weights (L,), within the available (L,)."""
     seats = np.zeros(len(weights), dtype=np.int64)
     while (left := count - int(seats.sum())) > 0:
         open_weights = np.where(seats < available, weights, 0.0)

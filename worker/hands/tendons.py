@@ -1,4 +1,4 @@
-"""Tendons: one drive that pulls several joints. It commands their sum; contact determines how they share it."""
+"""Tendons: one drive pulls several joints. It commands their sum; contact determines the shares."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Tendon:
     coefficients: tuple[float, ...]
 
     def gain(self, stiffness: Floats) -> float:
-        """Compute the gain of the drive [N m/rad of length] from the dofs' (D,), springs in series: 1 / sum(c^2 / k).
+        """Compute the drive's gain [N m/rad of length] from its dofs' (D,), in series: 1 / sum(c^2 / k).
 
         Commanding each joint by q + c F / k, for a torque c F, then commands the pull F of the tendon.
         """
@@ -64,7 +64,7 @@ def actuators(tendons: tuple[Tendon, ...], dofs: int) -> Floats:
 def tendons_of(
     robot: Robot, stated: Mapping[str, Mapping[str, float]] | None, dof_names: tuple[str, ...]
 ) -> tuple[Tendon, ...]:
-    """Return the tendons of a hand: those stated, else the description's, else those known for its kind of hand.
+    """Return the tendons of a hand: those stated, else the description's, else those of its kind of hand.
 
     Only joints that are degrees of freedom of the hand count; fewer than two make no tendon.
     """
@@ -78,7 +78,7 @@ def tendons_of(
 
 
 def known_tendons(robot: Robot) -> dict[str, dict[str, float]]:
-    """Return the tendons of a Shadow hand, found by joint names and order: J1 + J2 of each finger but the thumb."""
+    """Return a Shadow hand's tendons by joint names and order: J1 + J2 of each finger but the thumb."""
     found: dict[str, dict[str, float]] = {}
     fingers = set()
     for name, joint in robot.joints.items():
@@ -94,8 +94,9 @@ def known_tendons(robot: Robot) -> dict[str, dict[str, float]]:
 
 
 def check_tendons(robot: Robot, stated: Mapping[str, Mapping[str, float]]) -> None:
-    """Raises:
-    HandError: a stated tendon names an unknown joint, pulls fewer than two, or shares one with another tendon.
+    """Check stated tendons.
+    Raises:
+        HandError: one names an unknown joint, pulls fewer than two, or shares one with another tendon.
     """
     seen: set[str] = set()
     for name, pulls in stated.items():

@@ -1,4 +1,4 @@
-"""Convert a robot's joints to a hand's tree of bodies: choose the root, merge fixed joints, resolve mimics."""
+"""Convert a robot's joints to a hand's tree of bodies: root, merged fixed joints, resolved mimics."""
 
 from __future__ import annotations
 
@@ -150,7 +150,7 @@ def _still(kept: Iterable[Joint], mimics: Mapping[str, Mimic | None]) -> list[st
 
 
 def _resolve(name: str, mimics: Mapping[str, Mimic | None], fixed: Mapping[str, float]) -> Drive | float:
-    """Return the drive of a joint through a chain of mimics, or its constant value if the chain ends at a fixed joint.
+    """Return the drive of a joint through a chain of mimics, or its value if a fixed joint ends the chain.
 
     q = m1 (m2 (... ) + o2) + o1, so the multipliers multiply and each offset is scaled by those before it.
     """
@@ -214,7 +214,7 @@ def _check_travel(dof: str, lower: float, upper: float, moving: dict[str, Drive]
 
 
 def _binds(joint: Joint, drive: Drive, robot: Robot, options: HandOptions) -> bool:
-    """Check whether a joint's own limits bind it. Those of a URDF follower do not, as in ROS: most are junk."""
+    """Check whether a joint's own limits bind it; a URDF follower's do not, as in ROS: most are junk."""
     return joint.name == drive.dof or robot.format != "URDF" or joint.name in options.couplings
 
 
@@ -256,7 +256,7 @@ def _walk(
 ) -> tuple[
     tuple[str, ...], tuple[int, ...], tuple[Joint | None, ...], tuple[Floats, ...], dict[str, tuple[int, Floats]]
 ]:
-    """Collect bodies by depth-first descent; a link behind a fixed or frozen joint joins its parent's body."""
+    """Collect bodies depth first; a link behind a fixed or frozen joint joins its parent's body."""
     names, parents = [root], [-1]
     joints: list[Joint | None] = [None]
     origins = [IDENTITY_POSE.copy()]
@@ -305,7 +305,7 @@ MAX_HAND_M = 0.5
 
 
 def pick_root(robot: Robot, options: HandOptions) -> str:
-    """Return the chosen root, else the robot's, moved down past dropped links and joints of an arm or wrist.
+    """Return the chosen root, else the robot's, moved past dropped links and joints of an arm or wrist.
 
     Raises:
         HandError: it is a whole robot, or an arm without a hand; the message names the hands in it.
@@ -342,7 +342,7 @@ def pick_root(robot: Robot, options: HandOptions) -> str:
 
 
 def hand_links(tree: _Moving, root: str) -> list[str]:
-    """Return links, from the root down, at which a hand begins: two or more fingers branch, none of them long."""
+    """Return links, from the root down, at which a hand begins: two or more short fingers branch."""
     found: list[str] = []
     queue = deque([root])
     while queue:
@@ -400,7 +400,7 @@ class _Moving:
         return sum(self._has_shape(joint.child) for joint in self.onward(link)) > 1
 
     def stiff_digits(self) -> list[str]:
-        """Return fixed joints of the first link at which shapes branch, below a moving joint and with none below."""
+        """Return fixed joints of the first link at which shapes branch, between a moving joint and the ends."""
         for joint in self.robot.joints.values():
             ends = deque([joint.child] if self.free(joint) and not self._moves[joint.child] else [])
             while ends:
@@ -421,7 +421,7 @@ class _Moving:
 
 
 def _below_arm(tree: _Moving, root: str, options: HandOptions) -> str:
-    """Return the link where a hand on an arm begins: below the last moving joint before the fingers, else the root."""
+    """Return the link where a hand on an arm begins: below the last joint before the fingers, or the root."""
     start, at = root, root
     palm = options.palm.link if options.palm else None
     while at != palm:

@@ -163,8 +163,8 @@ def _file_of(item: PlacedShape, files: Mapping[str, bytes], base: str) -> str:
 
 
 def find_mesh(filename: str, files: Mapping[str, bytes], base: str, link: str) -> str:
-    """Return the name in `files` of a URDF's mesh: see `read_reference`; else the only file of that name in any folder,
-    ignoring case.
+    """Return the name in `files` of a URDF's mesh, see `read_reference`.
+    Else the only file of that name in any folder, ignoring case.
 
     Raises:
         HandError: it is missing, or lies outside the upload.

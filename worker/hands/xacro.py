@@ -1,7 +1,7 @@
-"""Robot from its description in any format; xacro is expanded in a child process without files, network or commands.
+"""Robot from its description in any format; xacro is expanded in an isolated child process.
 
-Xacro's expressions are Python. The child receives all files of the hand in memory, then drops its privileges: see
-`worker.hands.xacro_child`.
+Xacro's expressions are Python. The child receives all files of the hand in memory, then gives up files, network and
+commands: see `worker.hands.xacro_child`.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Xacro in its own process: `python -m graspd.worker.hands.xacro_child` reads a JSON object and writes one.
+"""Isolated expansion of xacro: `python -m graspd.worker.hands.xacro_child`, JSON object in and out.
 
 Expressions in xacro are Python and the library's guards can be bypassed, so there are three barriers. Names that lead
 out of an expression are refused. An audit hook refuses access to files, processes and the network. The kernel gives
@@ -161,7 +161,7 @@ def _checked(expression: str) -> Any:
 
 
 def _package(package: str, names: list[str], texts: dict[str, str]) -> str | None:
-    """Return the folder of a ROS package among the files, relative to the top: by its manifest, else by its name."""
+    """Return the folder of a ROS package, relative to the top: by its manifest, else by its name."""
     for name, text in texts.items():
         if posixpath.basename(name) == "package.xml" and f"<name>{package}</name>" in "".join(text.split()):
             return posixpath.dirname(name)

@@ -1,4 +1,4 @@
-"""CoACD in its own process: `python -m graspd.worker.objects.coacd_child SECONDS` reads an npz and writes one.
+"""CoACD in its own process: `python -m graspd.worker.objects.coacd_child SECONDS`, npz in and out.
 
 A signal ends it after so many seconds of CPU time. In: arrays `vertices`, `faces`, and `options` (JSON). Out: one array
 of corners per piece.

@@ -58,7 +58,7 @@ def arrays_kept_or_made(
 
 @contextmanager
 def recalling(kind: str, terms: tuple[str | int, ...], code: tuple[ModuleType, ...]) -> Iterator[None]:
-    """Cache the results of `recalled` inside this context in one entry, and load them from it the next time.
+    """Cache the results of `recalled` inside this context in one entry, and load them the next time.
 
     For small steps of a large computation, if loading their library is the most expensive part.
 
@@ -78,7 +78,7 @@ def recalling(kind: str, terms: tuple[str | int, ...], code: tuple[ModuleType, .
 
 
 def recalled(what: str, given: Sequence[NDArray[Any]], make: Callable[[], Sequence[NDArray[Any]]]) -> Arrays:
-    """Return arrays that depend on others only, as "0", "1", ...: from the current `recalling`, or computed."""
+    """Return arrays that depend on others only, as "0", "1", ...: from `recalling`, or computed."""
     known = _recalled.get()
     if known is None:
         return {str(number): array for number, array in enumerate(make())}
@@ -131,7 +131,7 @@ TOLD_IF_SET: Final = MappingProxyType({"told_if_set": True})
 
 
 def content_of(model: Any) -> str:
-    """Compute a digest of all fields of a dataclass except its name and the digest of its files: arrays bit for bit.
+    """Compute a digest of a dataclass without its name and its files' digest: arrays bit for bit.
 
     Raises:
         TypeError: a field contains neither numbers, strings, arrays, tuples and sets of these, nor a dataclass.

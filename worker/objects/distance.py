@@ -35,7 +35,7 @@ class MeshDistance:
         self._tree = cKDTree(centres)
 
     def __call__(self, points: Floats, enough: float = 0.0) -> Floats:
-        """Return the distance (N,) of points (N, 3) to the surface [m]; below `enough` only an upper bound up to it."""
+        """Return the distance (N,) of points (N, 3) to the surface [m]; below `enough` an upper bound."""
         found = np.full(len(points), np.inf)
         todo, k = np.arange(len(points)), min(_CANDIDATES, len(self._face))
         while len(todo):
@@ -65,7 +65,7 @@ class MeshDistance:
 
 
 def cut(corners: Floats, length: float) -> tuple[Floats, NDArray[np.int64]]:
-    """Halve triangles (F, 3, 3) across their longest side to at most `length`; also return their original indices."""
+    """Halve triangles (F, 3, 3) across their longest side to at most `length`; return their origin too."""
     done: list[Floats] = []
     owners: list[NDArray[np.int64]] = []
     face = np.arange(len(corners), dtype=np.int64)
@@ -84,7 +84,7 @@ def cut(corners: Floats, length: float) -> tuple[Floats, NDArray[np.int64]]:
 
 
 def deviation(one: tuple[Floats, Indices], two: tuple[Floats, Indices], samples: int = 8000) -> float:
-    """Compute the largest distance [m] between two surfaces, both ways, over their vertices and even samples."""
+    """Compute the largest distance [m] of two surfaces, both ways, over vertices and even samples."""
     furthest = 0.0
     for source, target in ((one, two), (two, one)):
         points = surface_points(*source, samples)

@@ -65,8 +65,8 @@ def crossings(vertices: Floats, faces: Indices) -> Indices | None:
 
 
 def _distinct(pairs: NDArray[np.int64], count: int) -> NDArray[np.int64]:
-    """Return unordered pairs (P, 2) of numbers below `count` once each, in ascending order. Encoded as one number per
-    pair, they sort many times faster than as rows."""
+    """Return unordered pairs (P, 2) of numbers below `count` once each, in ascending order.
+    Encoded as one number per pair, they sort many times faster than as rows."""
     keys = np.unique(pairs.min(axis=1) * np.int64(count) + pairs.max(axis=1))
     return np.stack(np.divmod(keys, count), axis=1)
 
@@ -83,7 +83,7 @@ def _boxes_meet(corners: Floats, pairs: Indices) -> NDArray[np.bool_]:
 
 
 def _pass(edges_of: Floats, triangles: Floats, depth: float) -> NDArray[np.bool_]:
-    """Check (P,) whether an edge of a triangle (P, 3, 3) passes through the other's interior, `depth` [m] deep."""
+    """Check (P,) whether an edge of one triangle (P, 3, 3) passes through the other, `depth` [m] deep."""
     a, b, c = np.moveaxis(triangles, 1, 0)
     normal = np.cross(b - a, c - a)
     square = np.maximum(np.einsum("ij,ij->i", normal, normal), 1e-300)

@@ -1,4 +1,4 @@
-"""Geometry of closed meshes: exact mass properties, corner normals, and booleans through manifold3d in float64.
+"""Geometry of closed meshes: exact mass properties, corner normals, float64 booleans by manifold3d.
 
 An object has two frames with the same axes: the file's, in which poses are stored, and the centred one, in which the
 engine works. The centred frame is in the middle of the mesh's bounding box, so results have the same bits wherever the
@@ -217,8 +217,8 @@ def carried(pose: ArrayLike, by: ArrayLike) -> Floats:
 
 
 def to_centre(pose: ArrayLike, centre: ArrayLike) -> Floats:
-    """Convert poses (..., 7) of the file's frame to the centred frame, at `centre` (3,) in it; on a grid, so that the
-    round trip gives the same bits."""
+    """Convert poses (..., 7) of the file's frame to the centred frame, at `centre` (3,) in it.
+    They are on a grid, so that the round trip gives the same bits."""
     return moved(carried(pose, centre), np.zeros(3))
 
 

@@ -1,4 +1,4 @@
-"""Model of an object for the engine: one closed, outward, simplified triangle mesh with its mass properties.
+"""Model of an object for the engine: a closed, outward, simplified triangle mesh with mass properties.
 
 All data are in the object frame: the frame of the uploaded mesh, in metres. `ObjectModel.centred` is the same object
 relative to its middle, which the engine uses; see `worker.objects.mesh_geometry`.
@@ -31,7 +31,7 @@ class ObjectModel:
     faces: Ints
     """(F, 3) counter-clockwise from outside."""
     corner_normals: Floats
-    """(F, 3, 3) unit normal per face corner, averaged only over faces that meet at less than the crease angle."""
+    """(F, 3, 3) unit normals per face corner, averaged over faces that meet below the crease angle."""
     volume: float
     """[m^3]"""
     centre_of_mass: Floats

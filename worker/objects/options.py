@@ -22,7 +22,7 @@ UNITS: Final = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "in": 0.0254}
 
 
 def parse_options(files: Mapping[str, bytes], extra: Mapping[str, Any] | None = None) -> ObjectOptions:
-    """Parse the options of the object in `files`; `extra` (without None values) overrides its `asset.json`.
+    """Parse options of the object in `files`; `extra` (without None values) overrides its `asset.json`.
 
     Raises:
         MeshError: `asset.json` is not JSON, or a key is unknown or wrong; the message names it.
@@ -43,7 +43,7 @@ def parse_options(files: Mapping[str, bytes], extra: Mapping[str, Any] | None = 
 
 
 def as_asked(obj: ObjectModel, request: JobOptions) -> ObjectModel:
-    """Return the object with mass and friction of the job, else its own; under level dexgraspbench the protocol's.
+    """Return the object with mass and friction of the job, of its own, or of level dexgraspbench.
 
     Raises:
         MeshError: the mass would exceed 100 kg.

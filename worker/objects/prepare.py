@@ -1,5 +1,5 @@
-"""Prepare an object from its files: read, repair, simplify, add normals, hull and mass properties; and serialise it
-bit for bit.
+"""Prepare an object from its files: read, repair, simplify, add normals, hull and mass properties.
+Objects are serialised bit for bit.
 
 Objects prepared by one command on this machine load in milliseconds in every later one.
 """
@@ -217,8 +217,8 @@ def kept_or_made(terms: tuple[str, ...], data: bytes, make: Callable[[], ObjectM
 
 @lru_cache(maxsize=1)
 def revision() -> str:
-    """Compute a digest of this package's source, its libraries, and the processor type, which may change the last
-    bits. A change of the preparation thus invalidates cached objects without a version number."""
+    """Compute a digest of this package's source, its libraries, and the processor type.
+    The processor may change the last bits. A change of the preparation thus invalidates cached objects."""
     whole = hashlib.sha256()
     for file in sorted(Path(__file__).parent.rglob("*.py")):
         whole.update(file.read_bytes())
@@ -383,7 +383,7 @@ def to_bytes(obj: ObjectModel) -> bytes:
 
 
 def from_bytes(data: bytes, *, name: str, digest: str) -> ObjectModel:
-    """Load an object from `to_bytes`; invalid data raise ValueError, KeyError, OSError, EOFError or BadZipFile."""
+    """Load an object from `to_bytes`; else ValueError, KeyError, OSError, EOFError or BadZipFile."""
     with np.load(io.BytesIO(data), allow_pickle=False) as stored:
         plain = json.loads(stored["plain"].tobytes())
         arrays = {field: stored[field] for field in _ARRAYS}

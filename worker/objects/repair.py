@@ -1,4 +1,4 @@
-"""Repair the triangles of a file to one closed, outward solid, or raise an error with the reason and the fix.
+"""Repair the triangles of a file to one closed, outward solid, or raise an error with the fix.
 
 Every change is reported: silent repairs would make a dataset inexplicable later.
 """
@@ -262,7 +262,7 @@ def _areas(vertices: Floats, faces: Indices) -> Floats:
 
 
 def _resolve_components(mesh: RepairedMesh, options: ObjectOptions) -> RepairedMesh:
-    """Drop debris, orient components outward, unite overlapping ones; the user must choose if several remain."""
+    """Drop debris, orient components outward, unite overlapping ones; the user chooses among several."""
     shells = topology.components(mesh.faces)
     parts = [topology.compact(mesh.vertices, mesh.faces[shells == k]) for k in range(shells.max() + 1)]
     volumes = np.array([signed_volume(*part) for part in parts])
@@ -293,7 +293,7 @@ def _unite(
     turned: bool,
     options: ObjectOptions,
 ) -> RepairedMesh:
-    """Unite several shells to one solid: shells wound against the largest are cavities if they lie inside it."""
+    """Unite shells to one solid: shells wound against the largest are cavities if they lie inside it."""
     if turned:
         mesh = mesh.but(mesh.vertices, mesh.faces[:, ::-1], "winding turned outward")
     boxes = [(p[0].min(axis=0), p[0].max(axis=0)) for p in parts]

@@ -1,4 +1,4 @@
-"""Topology of a triangle mesh: merging, degenerate and duplicate faces, winding, manifold edges, components.
+"""Topology of a triangle mesh: merging, degenerate and duplicate faces, winding, edges, components.
 
 All functions are pure: vertices (V, 3) and faces (F, 3) in, new arrays out.
 """
@@ -37,7 +37,7 @@ def compact(vertices: Floats, faces: Indices) -> tuple[Floats, Indices]:
 
 
 def degenerate(vertices: Floats, faces: Indices) -> Mask:
-    """Return a mask (F,) of faces that repeat a vertex or are thinner than a millionth of their longest side."""
+    """Return a mask (F,) of faces that repeat a vertex or are thinner than 1e-6 of their longest side."""
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
     sides = np.stack([b - a, c - b, a - c])
     longest = np.linalg.norm(sides, axis=2).max(axis=0)
@@ -82,7 +82,7 @@ def _edge_counts(faces: Indices) -> dict[tuple[int, int], int]:
 
 
 def _edge_keys(faces: Indices, *, directed: bool = False) -> Indices:
-    """Encode each edge (3F,) as one number, in the order of `directed_edges`: far faster to sort than pairs."""
+    """Encode each edge (3F,) as a number, in the order of `directed_edges`: far faster to sort than pairs."""
     edges = directed_edges(faces)
     edges = edges if directed else np.sort(edges, axis=1)
     return (edges[:, 0] << 32) | edges[:, 1]
@@ -112,7 +112,7 @@ def open_edges(faces: Indices) -> int:
 
 
 def pair_faces(faces: Indices) -> tuple[Indices, Indices, Mask]:
-    """Return the faces on the two sides of each manifold edge, (M,) and (M,), and (M,) whether their windings agree."""
+    """Return the two faces at each manifold edge, (M,) and (M,), and (M,) whether their windings agree."""
     index, counts = edge_faces(faces)
     order = np.argsort(index, kind="stable")
     starts = np.cumsum(counts) - counts

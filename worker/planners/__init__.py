@@ -69,7 +69,7 @@ def synthesize_batches(
     method: str = "fast_graspd",
     options: Mapping[str, Any] | None = None,
 ) -> list[GraspSet | Exception]:
-    """Plan batches of one job: in one launch if the method supports it, else one by one; see `BatchPlanner`."""
+    """Plan batches of one job, in one launch if the method supports it; see `BatchPlanner`."""
     if (together := joined(method, options)) is not None:
         return together(hand, obj, asked)
     found: list[GraspSet | Exception] = []

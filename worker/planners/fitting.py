@@ -110,8 +110,8 @@ def _pairs(obj: ObjectModel) -> Pairs:
 
 
 def _exits(start: Floats, way: Floats, corners: Floats, normal: Floats) -> tuple[NDArray[np.intp], Floats]:
-    """Intersect rays (n, 3), (n, 3) with triangles (F, 3, 3); return ray index and distance [m] of the exits, at faces
-    whose normal points along the ray (Moeller and Trumbore 1997)."""
+    """Intersect rays (n, 3), (n, 3) with triangles (F, 3, 3); return ray index and distance [m] of exits.
+    An exit is at a face whose normal points along the ray (Moeller and Trumbore 1997)."""
     edge1, edge2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     p = np.cross(way[:, None], edge2[None])
     determinant = np.einsum("nfj,fj->nf", p, edge1)

@@ -45,8 +45,8 @@ class PlanRequest:
     first: int = 0
     """Number of the first grasp within its batch; above 0 only for methods that plan batches `in_parts`."""
     others_have_place: bool = False
-    """Whether grasps of the batch that are planned elsewhere have starts in their scenes. These grasps are then planned
-    even if none has a start, and end blocked."""
+    """Whether grasps of the batch that are planned elsewhere have starts in their scenes.
+    These grasps are then planned even if none has a start, and end blocked."""
 
 
 class Planner(Protocol):
@@ -74,8 +74,8 @@ class BatchRequest:
 
 
 class BatchPlanner(Protocol):
-    """Plans several batches of a hand on an object in one launch: of one fidelity, on one device, all around a free
-    object or all in scenes with the same supports and neighbours (`PlacedGrasps.fixed`).
+    """Plans several batches of a hand on an object in one launch, of one fidelity and on one device.
+    All are around a free object, or all in scenes with the same supports and neighbours (`PlacedGrasps.fixed`).
 
     Each batch equals the result of the `Planner` alone; on the CPU bit for bit. A batch that fails is replaced by its
     error, TaskCancelled if its own `run.cancelled()` returned True; the others continue.
@@ -115,8 +115,8 @@ class Method:
     joined: Callable[[Any], BatchPlanner] | None = None
     """Factory of the planner of several batches in one launch; None: it plans them one by one."""
     files: Mapping[str, Callable[[Path], str]] = field(default_factory=dict)
-    """Options that users give as files: each with a function that caches the file in this process and returns its
-    digest, the option's value."""
+    """Options that users give as files, each with a function that caches the file in this process.
+    The function returns the file's digest, the option's value."""
     quick: Mapping[str, Any] = field(default_factory=dict)
     """Options for a short call, for warm-up and quick checks; its grasps need not be good."""
 

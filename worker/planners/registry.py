@@ -1,4 +1,4 @@
-"""Registered methods: graspd's own, and those of installed packages with `graspd.planners` entry points."""
+"""Registered methods: graspd's own, and `graspd.planners` entry points of installed packages."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Parts of a batch of grasps, one per CPU thread: Warp releases the interpreter lock while a kernel runs.
+"""Parts of a batch, one per CPU thread: Warp releases the interpreter lock while a kernel runs.
 
 Warp's CPU backend runs a launch on the calling thread, so threads use all cores. On a GPU a batch is one part, halved
 while memory does not suffice. A grasp's result does not depend on its part.

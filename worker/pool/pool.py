@@ -200,8 +200,8 @@ class _Place:
         return made
 
     def _is_gone(self) -> bool:
-        """Check whether there is no process, or it ended while idle. An idle process sends only the end of its
-        connection, which arrives before the system reports its exit."""
+        """Check whether there is no process, or it ended while idle.
+        An idle process sends only the end of its connection, which arrives before the system reports its exit."""
         if self.process is None or self._connection is None or self.process.poll() is not None:
             return True
         return self._connection.poll()

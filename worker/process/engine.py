@@ -172,7 +172,7 @@ class Engine:
 
 
 class TaskResources:
-    """Resources of a task besides its message. Engines and drivers leak: a worker that grew too large is replaced."""
+    """Resources of a task besides its message; a worker that grew too large, by leaks, is replaced."""
 
     def __init__(self, settings: Settings, store: Store, device: Device) -> None:
         self.settings = settings
@@ -194,7 +194,7 @@ class TaskResources:
         return batches_at_once(self._device.resolve(), None if join == "auto" else int(join))
 
     def pool(self, stage: str) -> Pool | None:
-        """Return the pool that validates and measures, if this stage uses one; waits until its size is determined."""
+        """Return the pool that validates and measures, if this stage uses one; waits for its size."""
         if stage != Stage.SYNTHESIZE:
             return None
         if self._pool is not None:
@@ -225,8 +225,8 @@ class TaskResources:
 
 
 def resident_mb(pid: int | None = None) -> float:
-    """Return the resident memory of this process or another [MiB]. If the system does not report it: this process's
-    peak, or 0 for another process."""
+    """Return the resident memory of this process or another [MiB].
+    If the system does not report it: this process's peak, or 0 for another process."""
     try:
         pages = int(Path(f"/proc/{pid or 'self'}/statm").read_text().split()[1])
     except (OSError, ValueError, IndexError):

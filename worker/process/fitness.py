@@ -1,4 +1,4 @@
-"""Fitness of a worker: an unfit one must not use up attempts of tasks, so it returns them and goes into quarantine.
+"""Fitness of a worker: an unfit one returns tasks, to save their attempts, and goes into quarantine.
 
 A worker is unfit if
 
@@ -42,8 +42,8 @@ _OF_THE_TASK: Final = (InputError, TaskRefused, DamagedError)
 
 
 def first_loss(task: str) -> bool:
-    """Check whether this is the first loss of a GPU, or of a pool process, over a task on this machine. A first loss is
-    not attributed to the task; a task that causes each loss must use up its attempts, or it would loop forever."""
+    """Check whether this is the first loss of a GPU or pool process over a task on this machine.
+    It does not count against the task; later ones do, or a task that causes each loss would loop forever."""
     file = user_cache.folder("gpus") / f"{hashlib.sha256(task.encode()).hexdigest()[:32]}.lost"
     if user_cache.load(file) is not None:
         return False

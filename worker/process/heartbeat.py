@@ -66,7 +66,7 @@ class Heartbeat:
         self._changed.set()
 
     def stop(self) -> None:
-        """End the registration and record that this worker is not lost; does nothing before the first heartbeat."""
+        """End the registration and record that this worker is not lost; no-op before the first heartbeat."""
         if self._thread.ident is None:
             return
         self._over.set()

@@ -85,7 +85,7 @@ Condition = Literal["fit", "unfit", "outgrown"]
 
 
 def start_engine(setup: Setup, program: Sequence[str] = (sys.executable, "-m", "graspd.worker.process.engine")) -> Link:
-    """Start an engine in a fresh process, which ends with this one; CUDA contexts and threads do not survive a fork.
+    """Start an engine in a fresh process, which ends with this one; CUDA contexts do not survive a fork.
 
     Call it from the main thread: the kernel ties a child to the thread that starts it.
     """

@@ -1,4 +1,4 @@
-"""Worker process: RQ's worker, which holds a task and renews its lease while a separate engine executes it.
+"""Worker process: RQ's worker, which renews the lease of a task while a separate engine runs it.
 
 The engine (`worker.process.engine`) is its own process and lives as long as the worker: a CUDA context does not survive
 a fork, and a new process for each task would load kernels and meshes every time. The worker shares no interpreter lock
@@ -56,7 +56,7 @@ STUCK_AFTER_S: Final = 60.0
 
 
 class GraspWorker(SimpleWorker):  # type: ignore[misc]
-    """RQ's in-process worker with tasks executed by an engine. Unused parts of RQ are explained in docs/adr."""
+    """RQ's in-process worker with tasks run by an engine; docs/adr explains the unused parts of RQ."""
 
     execution: Any
 
@@ -86,12 +86,12 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
         """State of the engine after the last task."""
 
     def check_service(self) -> None:
-        """Raise BusyError if Redis belongs to another service than the store, InputError if the device is unknown."""
+        """Raise BusyError if Redis belongs to another service, InputError if the device is unknown."""
         self._engine.say("service", self._queue.service())
         self._await("service")
 
     def admit(self) -> bool:
-        """Wait until the engine passes its check before the first task; False if it must end. Raises EngineLost."""
+        """Wait for the engine's check before the first task; False if it must end. Raises EngineLost."""
         self._engine.say("check")
         return bool(self._await("ready"))
 

@@ -1,5 +1,5 @@
-"""Inputs of tasks from the store: hands, objects, networks, convex pieces and shards, cached while a worker uses one
-pair. The first worker that needs an object repairs and simplifies it, and stores the result."""
+"""Inputs of tasks from the store: hands, objects, networks, convex pieces and shards, cached.
+The first worker that needs an object repairs and simplifies it, and stores the result."""
 
 from __future__ import annotations
 

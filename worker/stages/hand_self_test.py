@@ -1,5 +1,5 @@
-"""Self-test of a hand: grasps of three plain objects of suitable size, validated free at level standard and lifted off
-a table."""
+"""Self-test of a hand: grasps of three plain objects of suitable size.
+They are validated free at level standard and lifted off a table."""
 
 from __future__ import annotations
 
@@ -65,8 +65,8 @@ class BestGrasp:
 
 @dataclass(frozen=True)
 class SelfTest:
-    """Result of the test; `gsr` is the share of candidates that hold at level standard, `table` the share of the
-    `table_n` grasps on a table that lift the object."""
+    """Result of the test; `gsr` is the share of candidates that hold at level standard.
+    `table` is the share of the `table_n` grasps on a table that lift the object."""
 
     gsr: float
     n: int
@@ -132,7 +132,7 @@ def failed(reason: str, says: str = "suspicious") -> dict[str, Any]:
 
 
 def tried_softly(hand: Callable[[], HandModel], run: ExecutionContext = DEFAULT_CONTEXT) -> dict[str, Any]:
-    """Return the facts of a self-test. If a hand finds no grasp or the test fails, that is reported, not raised.
+    """Return the facts of a self-test; no grasp, or a failed test, is reported and not raised.
 
     Raises:
         TaskCancelled: `run.cancelled()` returned True.
@@ -154,8 +154,8 @@ def self_test(
     on_table: int = TABLE_GRASPS,
     seed: int = 0,
 ) -> SelfTest:
-    """Test candidates of a sphere, a box and a cylinder with the defaults of `JobOptions`, in equal numbers; then of
-    the same objects on a table.
+    """Test grasps of a sphere, a box and a cylinder with the defaults of `JobOptions`, in equal numbers.
+    Then test grasps of the same objects on a table.
 
     There is no time limit: on a busy machine it would change the verdict.
 
@@ -234,8 +234,8 @@ def _batches(hand: HandModel, obj: ObjectModel, count: int, seed: int, run: Exec
 def _lifted(
     hand: HandModel, obj: ObjectModel, count: int, seed: int, run: ExecutionContext
 ) -> tuple[int, float, Limit | None]:
-    """Return the number of planned grasps of an object on a table, the share that lifts, and the payload at full
-    actuator force."""
+    """Test grasps of an object on a table.
+    Return the number of planned grasps, the share that lifts, and the payload at full actuator force."""
     scenes, _ = scenes_of(TABLE, obj, count=TABLE_SCENES, seed=seed)
     request = JobOptions(want="candidates", grasps=count, seed=seed, validation="standard")
     found = validated_grasps(hand, obj, request, count=count, scenes=scenes, run=run)
@@ -279,7 +279,7 @@ def fitting_width(hand: HandModel) -> float:
 
 
 def _tip(hand: HandModel, body: int, pose: Floats) -> Floats:
-    """Return a finger's end [m]: the origin of its last joint, or its pad if a single joint at its base closes it."""
+    """Return a finger's end [m]: its last joint, or its pad if a single joint at the base closes it."""
     closing, at = 0, body
     while at > 0:
         closing += int(hand.closing[hand.dof[at]] != 0)

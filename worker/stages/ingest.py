@@ -131,7 +131,7 @@ def check_in_child(
 
 
 def _environment() -> dict[str, str]:
-    """Return the child's environment: no credentials, and one thread, since each takes address space of the limit."""
+    """Return the child's environment: no credentials; one thread, since each takes address space."""
     passed_on = {name: os.environ[name] for name in _PASSED_ON if name in os.environ}
     return passed_on | {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 

@@ -1,4 +1,4 @@
-"""Models for viewers: hands and objects as binary glTF, made with the check of an upload or at first use.
+"""Models for viewers: hands and objects as binary glTF, made with an upload's check or at first use.
 
 ``python -m graspd.worker.stages.models`` writes those of the built-in hands and objects into `service/builtin/models/`.
 
@@ -103,8 +103,8 @@ def hand_glb(hand: HandModel) -> bytes:
 
 
 def object_glb(obj: ObjectModel) -> bytes:
-    """Return the prepared mesh in the object's own frame; metres. The node's translation is the middle of the mesh,
-    since glTF coordinates have 32 bits."""
+    """Return the prepared mesh in the object's own frame; metres.
+    The node's translation is the middle of the mesh, since glTF coordinates have 32 bits."""
     document = Document()
     primitive = document.triangles(obj.centred.vertices, obj.faces, obj.corner_normals)
     extras = {"kind": "object", "name": obj.name, "centre_of_mass": plain(obj.centre_of_mass)}

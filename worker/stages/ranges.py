@@ -1,4 +1,4 @@
-"""Tasks of several batches: each batch is made as if alone, and their rows are concatenated in one shard."""
+"""Tasks of several batches: each batch is made as if alone; their rows are concatenated in a shard."""
 
 from __future__ import annotations
 
@@ -85,8 +85,8 @@ def _without(path: str, part: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
 
 
 def _summed(told: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Combine the records of several batches: sums of counts and seconds, means of shares weighted by planned grasps,
-    and the first batch's other planner records."""
+    """Combine the records of several batches; other planner records are those of the first batch.
+    Counts and seconds are summed, shares averaged with the numbers of planned grasps as weights."""
     found = dict(told[0])
     planned = [one.get("planned", 0) for one in told]
     for name, value in told[0].items():

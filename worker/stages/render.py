@@ -21,7 +21,7 @@ from graspd.worker.stages.context import Output, TaskContext, batch_seed
 
 
 def run(message: TaskMessage, context: TaskContext) -> Output:
-    """Render `request.views` camera placements of each scene, with the hand if grasps were planned in the scenes."""
+    """Render `request.views` camera placements of each scene, with the hand for grasps planned in scenes."""
     request = message.request
     stage = Stage.SYNTHESIZE if request.in_scene else Stage.SCENE
     shard = input_of(message, context, stage)

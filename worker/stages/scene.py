@@ -1,4 +1,4 @@
-"""Stage scene: before grasps that are planned in scenes, else after the grasps, with their clearance in the scenes."""
+"""Stage scene: before grasps that are planned in scenes, else after them, with their clearance."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def _before_grasps(message: TaskMessage, context: TaskContext) -> Output:
 
 
 def _after_grasps(message: TaskMessage, context: TaskContext, base: Shard, rows: range) -> Output:
-    """Drop the object `request.scenes` times and transfer the base shard's grasps; they are numbered within `rows`."""
+    """Drop the object `request.scenes` times; transfer the base shard's grasps, numbered within `rows`."""
     hand, obj = hand_of(context.store, message), object_of(context.store, message)
     context.check()
     scenes = drop(obj, count=message.request.scenes, seed=batch_seed(message))

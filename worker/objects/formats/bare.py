@@ -1,5 +1,5 @@
-"""Formats of bare geometry: PLY (ASCII, binary of both byte orders), STL (binary, ASCII), OFF. Colours and normals are
-ignored."""
+"""Formats of bare geometry: PLY (ASCII, binary of both byte orders), STL (binary, ASCII), OFF.
+Colours and normals are ignored."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""COLLADA: triangles of all meshes of the scene in metres, with the diffuse colours of their materials or the mean
-colours of their pictures.
+"""COLLADA: triangles of all meshes of the scene in metres, and their colours.
+A colour is the diffuse colour of the material or the mean of its picture.
 
 The file's unit is applied, its up axis is not, as in the viewers of ROS, for which such meshes are made.
 """

@@ -1,5 +1,5 @@
-"""Wavefront OBJ: positions, polygons, and colours of vertices, of materials or of the mean of their pictures; normals
-and groups are ignored."""
+"""Wavefront OBJ: positions, polygons, and colours of vertices, materials or the mean of their pictures.
+Normals and groups are ignored."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ def nothing_nearby(reference: str) -> bytes | None:
 
 
 def read(data: bytes, nearby: Nearby = nothing_nearby) -> Soup:
-    """Read triangles of the polygons; negative indices count from the latest vertex. A face has its corners' mean
-    colour, or else that of its material."""
+    """Read triangles of the polygons; negative indices count from the latest vertex.
+    A face has its corners' mean colour, or else that of its material."""
     vertices: list[list[bytes]] = []
     shades: list[list[bytes]] = []
     corners: list[int] = []
@@ -86,7 +86,7 @@ def _material_colours(
 
 
 def _face_colours(shades: list[list[bytes]], faces: np.ndarray) -> np.ndarray | None:
-    """Return (F, 3), NaN if a corner has no colour; quantised coarsely, since each colour is drawn as its own part."""
+    """Return (F, 3), NaN without a colour; quantised coarsely, since each colour is drawn as a part."""
     if all(shade is _NO_COLOUR for shade in shades) or (faces >= len(shades)).any() or (faces < 0).any():
         return None
     known = np.array(shades, dtype="S40").astype(float).reshape(-1, 3)
@@ -126,7 +126,7 @@ Nearby = Callable[[str], bytes | None]
 
 
 def read_materials(data: bytes, nearby: Nearby) -> dict[bytes, Floats]:
-    """Read the sRGB colour (3,) of each material, 0 .. 1. Pictures override numbers; unreadable ones are left out."""
+    """Read each material's sRGB colour (3,), 0 .. 1. Pictures override numbers; unreadable: skipped."""
     found: dict[bytes, Floats] = {}
     name: bytes | None = None
     pictures = 0

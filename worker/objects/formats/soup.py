@@ -1,4 +1,4 @@
-"""Triangles of a file, checked for data that later steps cannot handle; polygons are cut into triangles."""
+"""Triangles of a file, checked for data that later steps cannot handle; polygons are triangulated."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Antipodal starts: opposed fingers around a pair of surface points, opened slightly wider than the pair.
+"""Antipodal starts: opposed fingers around a pair of surface points, opened slightly wider than it.
 
 The two surface points face away from each other (antipodal points: Nguyen, "Constructing force-closure grasps", 1988).
 Pairs are found by comparing samples of the surface with one another.
@@ -132,14 +132,14 @@ class Openings:
     upright: bool
     """Whether the hand comes from above and grasps level pairs only."""
     within_reach: bool
-    """Whether a pair lies nearly level, clear of the obstacles, and is no wider than the hand opens: the geometric
-    condition for a grasp between opposed fingers from above or from the side."""
+    """Whether a pair is nearly level, clear of obstacles, and no wider than the hand opens.
+    This is the geometric condition for a grasp between opposed fingers from above or from the side."""
 
     @classmethod
     def of(
         cls, known: Oppositions, obj: ObjectModel, scene: Environment, *, tip: float = 0.0, upright: bool = False
     ) -> Openings:
-        """Select pairs; `tip` is the thickness of fingertips that must fit beside a pair [m], `upright` the field."""
+        """Select pairs; `tip`: thickness of fingertips that must fit beside them [m]; `upright`: the field."""
         pairs = crossings_of(obj)
         level = np.abs(pairs.axis @ scene.up) < STEEP
         fits = pairs.width + 2 * ROOM_M[0] <= known.widest
@@ -171,8 +171,8 @@ class Openings:
 
 
 def room_beside(pairs: Crossings, scene: Environment, width: float) -> Floats:
-    """Return the least distance (P,) of balls of diameter `width` beside the ends of pairs from walls and neighbours;
-    the object's own support is ignored [m]."""
+    """Return the least clearance (P,) of balls of diameter `width` beside the ends of pairs [m].
+    Walls and neighbours count; the object's own support is ignored."""
     out = np.full(len(pairs), np.inf)
     for obstacle in scene.obstacles:
         if not len(obstacle.corners) and float(obstacle.planes[0, :3] @ scene.up) > STEEP:
@@ -204,7 +204,7 @@ class AntipodalHands:
         return np.clip(known + NOISE * hand.span * normal, hand.lower, hand.upper)
 
     def beside(self, moved: Floats) -> Floats:
-        """Return the distance (n, ...) of the pair beside or in front of the pads of hands moved by (n, ..., 3) [m].
+        """Return the distance (n, ...) of the pair beside or in front of pads moved by (n, ..., 3) [m].
         A pair nearer to the palm also lies between the fingers."""
         away = self.away.reshape(len(self.deep), *(1,) * (moved.ndim - 2), 3)
         off = moved - self.deep.reshape((*away.shape[:-1], 1)) * away
@@ -256,8 +256,8 @@ def promising(
     room: float,
     keep: int,
 ) -> tuple[NDArray[np.intp], Floats]:
-    """Select the `keep` of C draws per hand that need the least rise to clear the obstacles, (n, keep). Also return
-    the distance of the pair from between the pads (n, keep) [m]. Draws that are near enough keep their order.
+    """Select the `keep` of C draws per hand that need the least rise to clear the obstacles, (n, keep).
+    Also return the distance of the pair from between the pads (n, keep) [m]. Near enough draws keep their order.
 
     Args:
         hand: the hand.
@@ -280,7 +280,7 @@ def promising(
 
 
 def frames(first: Floats, second: Floats) -> Floats:
-    """Return rotations (n, 3, 3) with first column `first` (n, 3) and the second as near `second` as possible."""
+    """Return rotations (n, 3, 3) with first column `first` (n, 3) and second column nearest to `second`."""
     y = second - np.einsum("ni,ni->n", first, second)[:, None] * first
     helper = np.eye(3)[np.argmin(np.abs(first), axis=1)]
     other = helper - np.einsum("ni,ni->n", first, helper)[:, None] * first
@@ -302,14 +302,14 @@ class PostureOutlines:
     tips: NDArray[np.bool_]
     """(P,) mask of the fingertips' points."""
     mounting: Floats
-    """(W, M, 3) outermost points of the mounting at each of its wrist positions, relative to the palm's centre [m]; W
-    is 0 without a mounting."""
+    """(W, M, 3) outermost points of the mounting at each wrist position, from the palm's centre [m].
+    W is 0 without a mounting."""
 
     def lacks(
         self, posture: NDArray[np.intp], turn: Floats, centre: Floats, scene: Environment, *, room: float
     ) -> Floats:
-        """Return the distance (n,) that hands and mountings lack to keep the margin and `room` from obstacles [m], at
-        least 0.
+        """Return the clearance (n,) from obstacles that hands and mountings lack [m], at least 0.
+        Required are the margin and `room`.
 
         Args:
             posture: (n,) indices into the K postures.
@@ -326,7 +326,7 @@ class PostureOutlines:
         return np.maximum(lack, self._mounting_lacks(turn, centre, scene, MARGIN_M + room))
 
     def _mounting_lacks(self, turn: Floats, centre: Floats, scene: Environment, wanted: float) -> Floats:
-        """Return the distance (n,) that mountings lack to `wanted` from obstacles at their best wrist position [m]."""
+        """Return the clearance (n,) that mountings lack to `wanted` at their best wrist position [m]."""
         least = np.full(len(turn), np.inf if len(self.mounting) else 0.0)
         for points in self.mounting:
             rows = np.flatnonzero(least > 0.0)
@@ -372,7 +372,7 @@ EXACT_M: Final = 0.0005
 
 
 def why_narrow(hand: HandModel, obj: ObjectModel, scenes: Sequence[Environment]) -> str | None:
-    """Explain why no fingertips of a hand can hold an object in any of the scenes; None if no reason is found."""
+    """Explain why no fingertips of a hand can hold an object in any scene; None if no reason is found."""
     known, pairs = oppositions_of(hand), crossings_of(obj)
     if not len(known) or not len(pairs):
         return None
@@ -399,7 +399,7 @@ def why_narrow(hand: HandModel, obj: ObjectModel, scenes: Sequence[Environment])
 
 
 def _widest_gap(pairs: Crossings, fits: NDArray[np.bool_], scene: Environment, thin: float) -> float:
-    """Return the diameter of the widest ball beside both ends of a fitting pair [m]; steep pairs need space below."""
+    """Return the diameter of the widest ball beside both ends of a pair [m]; steep pairs need space below."""
     level, above = np.abs(pairs.axis @ scene.up) < STEEP, np.ones(len(pairs), bool)
     for obstacle in scene.obstacles:
         above &= np.minimum(*(obstacle.distance(end) for end in pairs.ends())) >= thin

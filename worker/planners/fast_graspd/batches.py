@@ -30,8 +30,8 @@ class Batches:
     """Grasps of several batches, one batch after the other; a row is a grasp."""
 
     def __init__(self, asked: Sequence[BatchRequest], obj: ObjectModel, warm: WarmStart | None = None) -> None:
-        """All batches have one fidelity; all or none are in scenes with the same fixed surroundings. In scenes, `warm`
-        proposes the starts of hands; None: `scene_starts` finds them."""
+        """All batches have one fidelity; all or none are in scenes with the same fixed surroundings.
+        In scenes, `warm` proposes the starts of hands; None: `scene_starts` finds them."""
         self.asked, self.warm = asked, warm
         wanted = [one.wanted for one in asked]
         in_scenes = wanted[0].placed is not None
@@ -117,8 +117,8 @@ class Batches:
         ]
 
     def rollout(self, grasps: GraspSet, rows: Rows, beat: Floats) -> Floats:
-        """Score (n,) grasps of these rows by their own batches' rollouts, against the scores `beat` (n,) so far. All
-        grasps of a batch that stopped count as good enough."""
+        """Score (n,) grasps of these rows by their batches' rollouts, against the scores `beat` (n,).
+        All grasps of a batch that stopped count as good enough."""
         owners, scores = self.owner[rows], np.zeros(len(grasps))
         placed = self.placed.take(rows) if self.placed is not None else None
         for owner in distinct_values(owners):

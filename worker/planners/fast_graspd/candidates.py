@@ -1,4 +1,4 @@
-"""Candidates of a grasp, ranked by the balance of their contacts and simulated in turn until one is good enough."""
+"""Candidates of a grasp, ranked by contact balance and simulated in turn until one is good enough."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class Refinements:
     merit: Floats
     """Smaller is better."""
     infeasible: NDArray[np.bool_]
-    """Whether it penetrates too deeply for the geometric gate or touches with too few links: it has no rollout."""
+    """Whether its depth or number of touching links fails the geometric gate: then it has no rollout."""
 
 
 Seat = Callable[[NDArray[np.intp], NDArray[np.intp]], Refinements]
@@ -98,7 +98,7 @@ def tried(
     together: int = TOGETHER,
     device: str = "cpu",
 ) -> Selection:
-    """Return for each grasp the first candidate that its rollout finds good enough, or else the one with least score.
+    """Return each grasp's first candidate with a good enough rollout, or else the one with least score.
     `together` candidates of each grasp are seated and simulated in order of merit, then as many again for grasps
     without a good one. Unbalanced or infeasible hands have no rollout, but each grasp's first candidate is taken.
 
@@ -155,8 +155,8 @@ def _gentler(
     rollout: RolloutOf,
     device: str,
 ) -> None:
-    """Give hands (k,) that nearly lift a gentler squeeze where it improves the score. Soft fingers act as springs: the
-    harder they press, the more they turn the object out of the hand."""
+    """Give hands (k,) that nearly lift a gentler squeeze where it improves the score.
+    Soft fingers act as springs: the harder they press, the more they turn the object out of the hand."""
     poor = np.flatnonzero((score >= 1.0) & (score < NEARLY))
     if not len(poor):
         return
@@ -218,8 +218,8 @@ def merits(
     friction: float = FRICTION,
     device: str = "cpu",
 ) -> Floats:
-    """Compute merits (n,), smaller is better: the residual of contact forces balanced with `friction`, a small share of
-    L_stable (n,), and the penetration `depths` (n,) [m] above the tolerance."""
+    """Compute merits (n,); smaller is better.
+    Residual of contact forces balanced with `friction`, a share of L_stable (n,), and excess `depths` (n,) [m]."""
     holds = hold_forces(hand, obj, posture_of(hand, obj, state), friction=friction, device=device)
     merit = holds.residual + STABILITY * losses
     if depths is not None:

@@ -55,8 +55,8 @@ class Pair:
     hand: DeviceHand
 
     def model(self, side: PhaseGeometry, obstacles: DeviceObstacles | None = None, *, pulled: bool = True) -> Model:
-        """Return the model of hand and object for a phase. Among obstacles the attraction term is off: fingers that
-        could enclose the object are kept away from the table."""
+        """Return the model of hand and object for a phase; the attraction term is off among obstacles.
+        There, fingers that could enclose the object are kept away from the table."""
         options = self.options if obstacles is None and pulled else replace(self.options, pull=0.0)
         return Model.create(self.hand, side.obj, side.points, side.own, options, obstacles)
 

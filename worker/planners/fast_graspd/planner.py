@@ -1,4 +1,4 @@
-"""The planner: starts, coarse phase, fine phase and projection of one or several batches in one launch.
+"""The planner: starts, coarse phase, fine phase and projection of batches in one launch.
 
 A launch is divided into one part per CPU thread. A grasp does not depend on the other grasps of its launch.
 """
@@ -171,8 +171,8 @@ def optimise_pair(pair: Pair, wanted: PlanRequest, run: ExecutionContext) -> lis
 
 
 def optimise(pair: Pair, batches: Batches, run: ExecutionContext, *, postures: bool = False) -> list[LaunchPart]:
-    """Do the same for several batches; return the parts of those that did not stop, and possibly of others. `postures`
-    adds the postures around the grasps.
+    """Do the same for several batches; return the parts of those that did not stop, and perhaps others.
+    `postures` adds the postures around the grasps.
 
     Raises:
         Exception: error of the first batch, if all have stopped.
@@ -222,7 +222,7 @@ class _Launch:
         return merits(hand, obj, state, losses, depths, friction=friction, device=device)
 
     def infeasible(self, state: HandState, depths: Floats) -> NDArray[np.bool_]:
-        """Check (n,) whether hands of these depths [m] fail the geometric gate; for hands about to have a rollout."""
+        """Check (n,) whether hands of these depths [m] fail the geometric gate; used before rollouts."""
         if not self.batches.has_rollout:
             return np.zeros(len(depths), bool)
         hand, obj, device = self.pair.hand.model, self.pair.fine.obj.model, self.pair.hand.device
@@ -265,7 +265,7 @@ def _begun(launch: _Launch, rows: Rows, run: ExecutionContext) -> _Begun:
 
 
 def _set_out(launch: _Launch, rows: Rows, attempt: Rows) -> _Begun:
-    """Sample starts at the given attempts (n,), 0 being the first; a grasp may appear with several attempts."""
+    """Sample starts at attempts (n,), 0 being the first; a grasp may appear with several attempts."""
     batches, coarse = launch.batches, launch.coarse
     fidelity, placed, generators = batches.fidelity, launch.placed(rows), batches.generators(rows, attempt)
     if placed is None:
@@ -336,7 +336,7 @@ def _work(launch: _Launch, begun: _Begun) -> LaunchPart:
 
 
 def _tried_again(launch: _Launch, part: LaunchPart, run: ExecutionContext) -> LaunchPart:
-    """Retry grasps that fail their rollout or, for free objects, balance poorly; keep the first good or best attempt.
+    """Retry grasps that fail their rollout or, if free, balance poorly; keep the first good one or the best.
 
     The last few grasps would leave cores idle, and a hand costs a third more in a small launch. They make some attempts
     ahead; attempts after a good one are dropped, so the result equals that of sequential attempts."""
@@ -361,8 +361,8 @@ def _tried_again(launch: _Launch, part: LaunchPart, run: ExecutionContext) -> La
 
 
 def _set_out_again(launch: _Launch, rows: Rows, attempt: Rows, run: ExecutionContext) -> LaunchPart:
-    """Run later attempts (n,) of grasps; the merit of those without a start is inf. The attraction term is off: with it
-    half as many hold on a bowl's wall."""
+    """Run later attempts (n,) of grasps; the merit of those without a start is inf.
+    The attraction term is off: with it half as many hold on a bowl's wall."""
     launch = replace(launch, pulled=False)
 
     def work(which: range) -> LaunchPart:
@@ -437,7 +437,7 @@ def _losses(data: Data, n: int) -> Floats:
 def _descend(
     launches: Launches, data: Data, batches: Batches, rows: Rows, iterations: int, name: str, curve: list[Floats]
 ) -> HandState:
-    """Optimise all hands of the grasps `rows` for so many iterations; batches that stop meanwhile are left as is."""
+    """Optimise the hands of grasps `rows` for so many iterations, except batches that stop meanwhile."""
     done, out = 0, len(batches.errors)
     each = data.capacity // len(rows)
     while done < iterations:

@@ -51,8 +51,8 @@ class ReachSampling:
     model: Model
     grips: Any
     only: bool
-    """Whether all starts reach across: the object is too small or too wide for the pads, so starts that face a random
-    point rarely succeed."""
+    """Whether all starts reach across, because the object is too small or too wide for the pads.
+    Starts that face a random point then rarely succeed."""
 
     @classmethod
     def of(cls, model: Model) -> ReachSampling | None:
@@ -71,8 +71,8 @@ class ReachSampling:
             return cls(model, _known[key], size is not None)
 
     def starts(self, seeds: NDArray[np.int32], first: NDArray[np.int32], retreats: Floats) -> tuple[HandState, Any]:
-        """Return the first draws from numbers `first` (n,) on that are clear by the ball test, as hands (n,), and their
-        numbers (n,), -1 if there is none. `retreats` are ascending steps away from the object [m]."""
+        """Return hands (n,) of the first draws, from numbers `first` (n,) on, that pass the ball test.
+        Also return the draws' numbers (n,), -1 if there is none. `retreats`: ascending steps from the object [m]."""
         m, count = self.model, len(seeds)
         with wp.ScopedDevice(m.device):
             number = wp.empty(count, dtype=wp.int32)
@@ -102,7 +102,7 @@ _lock = threading.Lock()
 
 
 def size_to_pads(hand: HandModel, width: Floats) -> Size | None:
-    """Classify an object with pair widths (P,) as too small or too wide for the pads; None if they hold a pair."""
+    """Classify an object with pair widths (P,) as too small or wide for the pads; None if a pair fits."""
     known = oppositions_of(hand)
     if not len(known) or not len(width):
         return None

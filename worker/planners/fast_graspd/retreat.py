@@ -1,4 +1,4 @@
-"""Test whether a hand can leave its grasp: with open fingers back along the approach, and closed by the lift.
+"""Test whether a hand can leave its grasp: open, back along the approach, and closed, by the lift.
 
 A hand hooked around an edge holds well but cannot get there; one close below a board cannot lift. The test runs for
 every hand before the expensive phases.
@@ -33,8 +33,8 @@ UP: Final = (0.5, 1.0)
 
 
 def hindrance(model: Model, state: HandState, placed: PlacedGrasps) -> Floats:
-    """Compute the merit (n,) that hands lose for a blocked retreat or lift in their scenes: the depth of the hand in
-    the object or obstacles along it, or of its mounting in obstacles at the grasp."""
+    """Compute the merit (n,) that hands lose for a blocked retreat or lift in their scenes.
+    It grows with the depth of the hand in object or obstacles on the way, or of its mounting at the grasp."""
     hand, obj = model.hand.model, model.obj.model
     mounted = mounting_lack(hand, posture_of(hand, obj, state).hand_pose, placed.scenes, placed.index)
     deep = np.maximum(_back(model, state, placed.index), mounted)

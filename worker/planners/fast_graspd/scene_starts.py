@@ -1,5 +1,5 @@
-"""Sampling of approaches in scenes from the directions that are free, for all hands at once. Most starts are antipodal;
-the others face a random point of the object, as in `starts`.
+"""Sampling of approaches in scenes from the free directions, for all hands at once.
+Most starts are antipodal; the others face a random point of the object, as in `starts`.
 A start keeps `ROOM` from obstacles besides the later margin, so that the optimisation can turn the hand.
 """
 
@@ -73,8 +73,8 @@ class _Surface:
 
 
 def free_ways(scene: Environment, obj: ObjectModel) -> Floats:
-    """Return free approach directions (K, 3), unit vectors in the object frame: along them a ball as wide as a palm
-    leaves the object without touching an obstacle on `STANDOFF_M`.
+    """Return free approach directions (K, 3), unit vectors in the object frame.
+    Along them a ball as wide as a palm leaves the object without touching an obstacle on `STANDOFF_M`.
 
     Raises:
         InputError: there is none.
@@ -103,8 +103,8 @@ def no_place(model: Model) -> NoStartFound:
 def clear_scene_starts(
     model: Model, generators: list[np.random.Generator], *, each: int, placed: PlacedGrasps, ways: Sequence[Floats]
 ) -> tuple[HandState, Floats]:
-    """Return a start for each generator, `each` per grasp, and its depth (n,) [m]: the first clear draw, or else the
-    least deep. Of antipodal draws, select the clear one with the pair best placed between the pads.
+    """Return a start for each generator, `each` per grasp, and its depth (n,) [m].
+    That is the first clear draw, or the least deep; of antipodal ones the clear draw with the best placed pair.
 
     In a narrow scene some grasps find no clear start: they end blocked, and the batch consists of the others.
 
@@ -173,8 +173,8 @@ def _normal(generators: list[np.random.Generator], rows: NDArray[np.intp], dofs:
 def _depths(
     probe: Probe, states: HandState, placed: PlacedGrasps, scene: NDArray[np.intp], worth: NDArray[np.bool_]
 ) -> Floats:
-    """Return depths (n, len(RETREATS)) [m] of hands and mountings in scenes (n,), from the farthest distance with
-    `worth` (n, len(RETREATS)) inwards while clear; inf elsewhere.
+    """Return depths (n, len(RETREATS)) [m] of hands and mountings in scenes (n,); inf if not computed.
+    They run from the farthest distance with `worth` (n, len(RETREATS)) inwards while clear.
 
     Most draws fail for reasons that no retreat fixes, and hardly any is clear nearer than where it is not.
     """
@@ -204,7 +204,7 @@ def _mounting_lack(
 def _raise(
     drawn: _Drawn, rows: NDArray[np.intp], placed: PlacedGrasps, scene: NDArray[np.intp], probe: Probe
 ) -> Floats:
-    """Lift draws `rows` in scenes (n,), at all distances, by the clearance that the nearest hand and its mounting lack.
+    """Lift draws `rows` in scenes (n,), at all distances, by the clearance of the nearest that is lacking.
     Return the distance (n, len(RETREATS)) of their pairs from between the pads [m], 0 for other draws.
 
     Steps of retreat are too coarse for low objects: fingers would end above the object, not beside it.
@@ -268,8 +268,8 @@ class _Around:
         return order, least
 
     def draws(self, uniform: Floats, normal: Floats, scene: NDArray[np.intp], reach: NDArray[np.bool_]) -> _Drawn:
-        """Return draws at each distance in scenes (n,), from random numbers (n, 7) and (n, 2 + D); `reach` (n,) marks
-        antipodal ones."""
+        """Return draws at each distance in scenes (n,); `reach` (n,) marks antipodal ones.
+        They depend on uniform (n, 7) and normal (n, 2 + D) random numbers."""
         n, dofs = len(uniform), self.hand.dofs
         pivot, rotation, q, away = np.zeros((n, 3)), np.zeros((n, 4)), np.zeros((n, dofs)), np.zeros((n, 3))
         reaching = []
@@ -309,7 +309,7 @@ class _Around:
 
 
 def _turned(away: Floats, ways: Floats, random: Floats) -> Floats:
-    """Return a direction (3,) if it is near a free one, else turn it towards a random free one until it is."""
+    """Return a direction (3,) near a free one, else turn it towards a random free one until it is."""
     if (ways @ away).max() >= NEAR_WAY:
         return away
     goal = ways[int(random[1] * len(ways))]
@@ -330,7 +330,7 @@ def _tilted(normals: Floats, angles: Floats) -> Floats:
 
 
 def _frames(z: Floats) -> Floats:
-    """Return rotation matrices (n, 3, 3) with third columns z (n, 3) and arbitrary but fixed first columns."""
+    """Return rotations (n, 3, 3) with third columns z (n, 3) and arbitrary but fixed first columns."""
     helper = np.eye(3)[np.argmin(np.abs(z), axis=1)]
     x = np.cross(helper, z)
     x /= np.linalg.norm(x, axis=1, keepdims=True)

@@ -1,5 +1,5 @@
-"""Weights per iteration (the coarse phase shrinks the dilation, the fine phase seats the hand), and the interface of
-starts that another method proposes."""
+"""Weights per iteration, and the interface of starts that another method proposes.
+The coarse phase shrinks the dilation, the fine phase seats the hand."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ AROUND: Final = ProjectionOptions(hold=5e-3)
 
 
 def loss_options(fidelity: Fidelity, *, friction: float = 0.8) -> LossOptions:
-    """Return the simulation options of a fidelity. Plain gradient descent has limits as a penalty, as in the paper."""
+    """Return the simulation options of a fidelity; plain descent has limits as a penalty, as in the paper."""
     paper = fidelity.optimizer == "gd"
     return LossOptions(
         contact_solver=fidelity.contact_solver,
@@ -50,7 +50,7 @@ def loss_options(fidelity: Fidelity, *, friction: float = 0.8) -> LossOptions:
 
 
 def in_scene(fidelity: Fidelity) -> Fidelity:
-    """Return the fidelity for scenes: obstacles leave fewer good approaches, so more hands start and more are refined.
+    """Return the fidelity for scenes: obstacles leave fewer good approaches, so more hands are needed.
     They start with the object between their fingers, so few iterations suffice."""
     return fidelity.model_copy(
         update={
@@ -64,7 +64,7 @@ def in_scene(fidelity: Fidelity) -> Fidelity:
 
 
 def with_rollout(fidelity: Fidelity) -> Fidelity:
-    """Return the fidelity for free objects with rollouts: failed hands are replaced, so half as many start at first."""
+    """Return the fidelity for free objects with rollouts: retries replace half of the first starts."""
     return fidelity.model_copy(update={"starts": -(-fidelity.starts // 2)})
 
 

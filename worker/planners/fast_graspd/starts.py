@@ -1,5 +1,5 @@
-"""Starts of hands. In every second start of a grasp the palm faces a random surface point from a small distance. The
-others reach across the object between opposed fingers (`reaching`), as do all if it is too small or wide for the pads.
+"""Starts of hands: in every second one of a grasp the palm faces a random surface point nearby.
+The others reach across the object (`reaching`), as do all if it is too small or too wide for the pads.
 
 A start must be free of contact: hands that start inside a thin wall never leave it.
 
@@ -60,7 +60,7 @@ def start_generator(seed: int, batch: int, index: int, start: int) -> np.random.
 
 
 def _frame(z: Floats) -> Floats:
-    """Return rotation matrices (..., 3, 3) with third columns z (..., 3) and arbitrary but fixed first columns."""
+    """Return rotations (..., 3, 3) with third columns z (..., 3) and arbitrary but fixed first columns."""
     helper = np.eye(3)[np.argmin(np.abs(z), axis=-1)]
     x = cross(helper, z)
     x /= np.linalg.norm(x, axis=-1, keepdims=True)
@@ -152,7 +152,7 @@ def _retreated(state: HandState, approach: Floats) -> HandState:
 
 
 class Probe:
-    """Places hands and measures their depth and distance from the object; for `room` see `record_placement`."""
+    """Places hands and measures depth and distance from the object; for `room` see `record_placement`."""
 
     def __init__(self, model: Model, capacity: int, *, room: float = 0.0) -> None:
         self.model, self.data = model, Data(model, capacity)
@@ -161,8 +161,8 @@ class Probe:
         self._placement = record_placement(model, self.data, room=room)
 
     def depths(self, states: HandState) -> Floats:
-        """Return the deepest penetration of each hand (n,) [m]: into the object, of the object into links, between
-        links, and the lacking clearance from obstacles."""
+        """Return the deepest penetration of each hand (n,) [m].
+        It covers hand in object, object in links, links in links, and lacking clearance from obstacles."""
         self.data.set_state(states)
         self._touching.run()
         return self.data.deepest(len(states.pivot)).astype(float)
@@ -179,7 +179,7 @@ class Probe:
 
 
 def sample_starts(model: Model, *, seed: int, batch: int, indices: range, each: int) -> HandState:
-    """Sample collision-free starts of the grasps `indices` of a batch, `each` per grasp, those of a grasp side by side.
+    """Sample collision-free starts of the grasps `indices` of a batch, `each` per grasp side by side.
 
     Raises:
         InputError: no draw of some grasp came within 10 mm of being clear.
@@ -202,7 +202,7 @@ def no_place(model: Model) -> InputError:
 
 
 def clear_starts(model: Model, generators: list[np.random.Generator], *, each: int = 1) -> tuple[HandState, Floats]:
-    """Return a start for each generator, the least deep of its draws, and its depth (n,) [m]; most are clear.
+    """Return a start per generator, the least deep of its draws, and its depth (n,) [m]; most are clear.
 
     Of the `each` starts of a grasp every second one, not the first, reaches across the object where possible. All do
     if the object is too small or too wide for the hand's pads.
@@ -230,8 +230,8 @@ def clear_starts(model: Model, generators: list[np.random.Generator], *, each: i
 def open_further(
     model: Model, generators: list[np.random.Generator], state: HandState, depth: Floats, wanted: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
-    """Retry with more open hands where `clear_starts` found no clear start: the pre-shape of some hands leaves no gap
-    as wide as the object.
+    """Retry with more open hands where `clear_starts` found no clear start.
+    The pre-shape of some hands leaves no gap as wide as the object.
 
     Args:
         model: of the starts.
@@ -268,8 +268,8 @@ def _draw_until_clear(
     best: HandState,
     deepest: Floats,
 ) -> None:
-    """Store the nearest clear start of each of `rows`, or else the least deep, in `best` and `deepest`. `drawn` draws
-    the given rows at each distance of retreat."""
+    """Store the nearest clear start of each of `rows`, or the least deep, in `best` and `deepest`.
+    `drawn` draws the given rows at each distance of retreat."""
     for _ in range(draws):
         if not len(rows):
             return
@@ -361,7 +361,7 @@ class JawStarts:
         return cls(hand, obj, jaws, pairs, np.cumsum(weight) / weight.sum())
 
     def draw(self, uniform: Floats) -> HandState:
-        """Return hands for random numbers (n, `UNIFORM`) in [0, 1), at each retreat: n * len(RETREATS) of them."""
+        """Return hands for random numbers (n, `UNIFORM`) in [0, 1) at each retreat, n * len(RETREATS)."""
         pick = np.minimum(np.searchsorted(self.sums, uniform[:, 0]), len(self.sums) - 1)
         start, end = self.pairs.start[pick], self.pairs.end[pick]
         swap = (uniform[:, 1] < 0.5)[:, None]
@@ -390,7 +390,7 @@ def _across(line: Floats, turn: Floats) -> Floats:
 
 
 def _frames(x: Floats, z: Floats) -> Floats:
-    """Return rotation matrices (n, 3, 3) with first columns x (n, 3) and third columns as near z (n, 3) as possible."""
+    """Return rotations (n, 3, 3) with first columns x (n, 3) and third columns nearest to z (n, 3)."""
     z = z - np.einsum("ni,ni->n", z, x)[:, None] * x
     z = z / np.linalg.norm(z, axis=1, keepdims=True)
     return np.stack([x, np.cross(z, x), z], axis=-1)
