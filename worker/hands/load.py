@@ -263,7 +263,7 @@ def _masses(robot: Robot, tree: Tree, pieces: tuple[ConvexPiece, ...]) -> Floats
 
 
 def hand_from_path(path: str | Path, options: Mapping[str, Any] | None = None, *, drag: bool = False) -> HandModel:
-    """Load a hand for the command line: a built-in's name, URDF, its folder, or a ZIP; `drag`: `load_hand`.
+    """Load a hand for the command line: a built-in's name, URDF, folder, or ZIP; `drag`: see `load_hand`.
 
     Raises:
         NotFoundError: neither a file nor a built-in hand.

@@ -44,7 +44,7 @@ def serve(connection: Connection, modules: Sequence[str]) -> None:
             while True:
                 orders.put(connection.recv_bytes())
         except (EOFError, OSError):
-            os._exit(0)  # nobody waits for what is being done
+            os._exit(0)  # no caller waits for the current item
 
     # Imports and work may take seconds: a separate thread detects that the peer is gone.
     threading.Thread(target=read, daemon=True).start()

@@ -88,7 +88,7 @@ class Pool(AbstractContextManager["Pool"]):
         """Start the processes if they are not running."""
         with self._changing:
             for place in self._places if not (self._started or self._closed) else ():
-                with suppress(OSError):  # it is told to whoever needs the process
+                with suppress(OSError):  # reported on use of the process
                     place.start()
                 self._idle.put(place)
             self._started = True

@@ -153,7 +153,7 @@ class Engine:
             try:
                 word, about = self._connection.recv()
             except (EOFError, OSError):
-                word, about = "end", StopReason.LEASE_LOST  # nobody waits for what is being done
+                word, about = "end", StopReason.LEASE_LOST  # no caller waits for the current task
             with self._changing:
                 if word in ("stop", "end"):
                     self._reason = about

@@ -271,7 +271,7 @@ def run_worker(
         signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
         if not worker.admit():
             return False
-        worker.check_service()  # an empty Redis may have become somebody's meanwhile
+        worker.check_service()  # an empty Redis may belong to another service by now
         patient = burst and idle_s > 0
         worker.work(
             burst=burst and not patient,

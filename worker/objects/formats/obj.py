@@ -1,4 +1,4 @@
-"""Wavefront OBJ: positions, polygons, and colours of vertices, materials or the mean of their pictures.
+"""Wavefront OBJ: positions, polygons, and colours of vertices, materials or their pictures' mean.
 Normals and groups are ignored."""
 
 from __future__ import annotations

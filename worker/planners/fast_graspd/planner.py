@@ -336,7 +336,7 @@ def _work(launch: _Launch, begun: _Begun) -> LaunchPart:
 
 
 def _tried_again(launch: _Launch, part: LaunchPart, run: ExecutionContext) -> LaunchPart:
-    """Retry grasps that fail their rollout or, if free, balance poorly; keep the first good one or the best.
+    """Retry grasps that fail their rollout or, if free, balance poorly; keep the first good or the best.
 
     The last few grasps would leave cores idle, and a hand costs a third more in a small launch. They make some attempts
     ahead; attempts after a good one are dropped, so the result equals that of sequential attempts."""
