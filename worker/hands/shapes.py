@@ -309,7 +309,7 @@ def _simplified(vertices: Floats, faces: Ints) -> tuple[Floats, Ints]:
     merged = trimesh.Trimesh(vertices, faces, process=True)
     points, triangles = np.asarray(merged.vertices, float), np.asarray(merged.faces, np.int32)
     if len(triangles) > _FACES:
-        import fast_simplification  # where something is new on the machine
+        import fast_simplification  # slow to load, not needed for cached results
 
         light, kept = fast_simplification.simplify(
             points.astype(np.float32), triangles, target_reduction=1 - _FACES / len(triangles)

@@ -94,7 +94,7 @@ def lighter(mesh: VisualMesh, times: float) -> VisualMesh:
     import trimesh
 
     merged = trimesh.Trimesh(mesh.vertices, mesh.faces, process=True)
-    import fast_simplification  # where something is new on the machine
+    import fast_simplification  # slow to load, not needed for cached results
 
     points, triangles = fast_simplification.simplify(
         np.asarray(merged.vertices, np.float32), np.asarray(merged.faces, np.int32), target_reduction=1 - 1 / times

@@ -333,7 +333,7 @@ def _collapse(vertices: Floats, faces: Indices, target: int) -> Mesh | None:
         return None
     # The library uses single precision: centring and scaling minimise the loss.
     middle, scale = vertices.mean(axis=0), float(np.ptp(vertices, axis=0).max())
-    import fast_simplification  # where something is new on the machine
+    import fast_simplification  # slow to load, not needed for cached results
 
     points, triangles = fast_simplification.simplify(
         ((vertices - middle) / scale).astype(np.float32), faces.astype(np.int32), target_count=target, agg=PATIENCE

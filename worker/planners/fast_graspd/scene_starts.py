@@ -45,8 +45,7 @@ DRAWN: Final = 8
 PALM_RADIUS: Final = 0.04
 DIRECTIONS: Final = 256
 NEAR_WAY: Final = 0.98
-#: `REACHING` of `EVERY` starts of a grasp are antipodal. Each has `REACHES` draws: the most promising ones of several
-#: times as many.
+#: `REACHING` of `EVERY` starts of a grasp are antipodal, each with the `REACHES` most promising of `CANDIDATES` draws.
 EVERY: Final = 8
 REACHING: Final = 7
 REACHES: Final = 8
