@@ -40,10 +40,10 @@ def closing_by_limits(hand: HandModel) -> Floats:
 def closing_by_tips(hand: HandModel) -> Floats:
     """Return closing (D,) in -1, 0, +1 for a hand with fingertips, palm and a first guess of its closing.
 
-    Joints of a finger that are parallel to its last one flex it, all in the sense that brings the tip to the other tips
-    and to the palm; joints with symmetric limits do not. Another joint closes if it brings the tip to the other tips
-    and away from the palm. It spreads if it turns about the approach or has symmetric limits. A joint in line with its
-    finger does neither.
+    Joints of a finger that are parallel to its last one flex it, unless their limits are symmetric. All flex in the
+    sense that brings the tip to the other tips and to the palm. Another joint closes if it brings the tip to the other
+    tips and away from the palm. It spreads if it turns about the approach or has symmetric limits. A joint in line with
+    its finger does neither.
     """
     limits, (flexing, opposing, ways) = closing_by_limits(hand), _gains(hand)
     opened, half = (_axes(hand, posture(hand, share)) for share in (0.0, 0.5))

@@ -1,8 +1,8 @@
 """Collision shapes of a robot as convex pieces.
 Primitives stay exact; a mesh becomes one hull, or several where one would cover surface that can touch.
 
-The error of a mesh's pieces is the depth of its surface beneath them, along the shortest free direction out, at the
-ninth decile of the surface visible from outside. Interiors of housings do not count.
+The error of a mesh's pieces is the depth of its surface beneath them, along the shortest free direction out. It is the
+ninth decile over the surface visible from outside; interiors of housings do not count.
 """
 
 from __future__ import annotations

@@ -65,8 +65,8 @@ CREASE_DEG = 40.0
 def corner_normals(vertices: Floats, faces: Ints, crease_deg: float = CREASE_DEG) -> Floats:
     """Compute unit normals (F, 3, 3).
 
-    The normal of a corner is the mean of the normals of the faces at its vertex, weighted by their angle there, over
-    those faces that are inclined to the corner's own face by less than the crease angle.
+    The normal of a corner is the mean normal of the faces at its vertex, weighted by their angle there. Only faces
+    inclined to the corner's own face by less than the crease angle count.
     """
     from scipy.sparse import csr_matrix
 

@@ -41,8 +41,8 @@ ACROSS: Final = 0.96
 THINNEST_M: Final = 0.002
 #: Clearance between pad and object, on each side [m].
 ROOM_M: Final = (0.003, 0.015)
-#: The chance of a pair falls by a factor of e at this horizontal distance from the centre of mass [m], down to `FAR` of
-#: the best pair's chance. Steep pairs and pairs that are hard to reach are rarer still. With 30 mm and 0.02 Allegro
+#: At this horizontal distance from the centre of mass [m] the chance of a pair falls by a factor of e. It is at least
+#: `FAR` of the best pair's. Steep pairs and pairs that are hard to reach are rarer still. With 30 mm and 0.02 Allegro
 #: holds 0.28 of six objects at half friction, with these values 0.38.
 BESIDE_M: Final = 0.02
 FAR: Final = 0.005
@@ -54,8 +54,8 @@ NEAR_M: Final = 0.008
 AT_ONCE: Final = 256
 #: Least cosine between an approach from above and the vertical, for flat objects.
 UPRIGHT: Final = 0.9
-#: Noise of the posture as a share of each joint's range, number of directions compared per draw, and the range of
-#: widths below and above the drawn width from which postures are selected [m].
+#: Noise of the posture as a share of each joint's range; number of directions compared per draw; tolerance of postures
+#: below and above the drawn width [m].
 NOISE: Final = 0.03
 WAYS: Final = 4
 ALIKE_M: Final = (0.002, 0.006)

@@ -64,7 +64,7 @@ SET_OUT_AGAIN: Final = 0.05
 #: The same for scores of a rollout, see `worker.planners.port.Rollout`: a tenth to a quarter of such grasps hold.
 FAILED: Final = 2.0
 #: Largest number of retries of grasps with rollouts. A further attempt is as productive as the first ones, so the yield
-#: per second hardly depends on it, and fewer grasps of a hard pair fail.
+#: per second hardly depends on it. Fewer grasps of a hard pair fail.
 ATTEMPTS: Final = 20
 #: Score of a free grasp that holds while a finger does not touch: it is retried up to `CLOSER` times, then the best
 #: attempt is selected.
