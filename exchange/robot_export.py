@@ -122,7 +122,7 @@ def _carried(
     why = ", ".join(f"{count} {reason}" for reason, count in reached.refused.most_common(3))
     if not reached.rows:
         raise InputError(
-            f"the arm {arm.model.name} carries out none of {reached.candidates} grasps ({why}); place it elsewhere: --base"
+            f"the arm {arm.model.name} reaches none of {reached.candidates} grasps ({why}); place it elsewhere: --base"
         )
     written.counts |= {
         "candidates": reached.candidates,

@@ -1,1 +1,1 @@
-"""Warp and MuJoCo, started quietly, on the wanted device."""
+"""Warp and MuJoCo, initialised without console output on a device."""

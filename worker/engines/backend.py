@@ -1,10 +1,10 @@
-"""Warp started quietly, its kernel cache, and kernels compiled ahead of time.
+"""Quiet initialisation of Warp, its kernel cache, and ahead-of-time compilation of kernels.
 
-Compiled kernels are kept where Warp would, or where this user can write.
+Compiled kernels are cached in Warp's default folder, or in one that this user can write.
 
-A folder of such kernels is laid out as Warp's cache is, VERSION/MODULE/FILE. Names of files hold what they are good
-for: the digest of the module's source and options, the GPU's architecture, or the instructions of the CPU that they
-were compiled on. What does not fit a machine is not found there and compiled as ever.
+A folder of precompiled kernels has the layout of Warp's cache, VERSION/MODULE/FILE. File names contain the digest of
+the module's source and options, and the GPU's architecture or the compiling CPU's instruction set. Kernels that do not
+match a machine are not found and are compiled as usual.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ log = logging.getLogger(__name__)
 
 
 def _default_of_each_thread() -> None:
-    """Let every thread have a default device of its own. Warp has one for all: a `ScopedDevice` of one thread would put
-    the arrays that another makes meanwhile onto its device, and leave its own behind as the default. Until every
-    array is made with its device named, this is the one place that touches Warp's internals."""
+    """Give every thread its own default device, since Warp has one for the process.
+    A `ScopedDevice` would move another thread's arrays to its device and leave it as the default. Until every array
+    names its device, this is the only place that accesses Warp's internals."""
     from warp._src.context import Runtime, runtime  # noqa: TID251
 
     first, own = runtime.default_device, threading.local()
@@ -53,7 +53,7 @@ def _default_of_each_thread() -> None:
 
 
 def start() -> None:
-    """Initialise Warp once, warnings only; anything but the remark on the missing driver still reaches stderr."""
+    """Initialise Warp once, with warnings only; stderr receives all but the note on the missing driver."""
     global _started
     with _lock:
         if _started:
@@ -80,9 +80,9 @@ def start() -> None:
 
 
 def kernel_cache() -> Path | None:
-    """Folder to tell Warp of; None where its own choice (`$WARP_CACHE_PATH`, or the home folder) can be written.
+    """Return a cache folder for Warp; None if Warp's own (`$WARP_CACHE_PATH`, or in the home) is writable.
 
-    Containers run as any user, and on a root file system that may be read-only.
+    Containers run as any user, possibly on a read-only root file system.
     """
     named = os.environ.get("WARP_CACHE_PATH", "")
     cache = os.environ.get("XDG_CACHE_HOME") or Path(os.environ.get("HOME") or "/") / ".cache"
@@ -99,14 +99,14 @@ def kernel_cache() -> Path | None:
     return folder
 
 
-#: Names the folder of kernels that were compiled ahead.
+#: Environment variable with the folder of precompiled kernels.
 VARIABLE: Final = "GRASPD_KERNELS"
 #: A100, H100 and H200, B200.
 ARCHITECTURES: Final = (80, 90, 100)
 
 
 def modules() -> list[str]:
-    """Names of all modules of ours with Warp kernels."""
+    """Return the names of all graspd modules with Warp kernels."""
     worker = import_module("worker")
     infos = pkgutil.walk_packages(worker.__path__, "worker.")
     names = [info.name for info in infos if not info.ispkg]
@@ -118,7 +118,7 @@ def _has_kernels(name: str) -> bool:
 
 
 def bake(names: Iterable[str], *, architectures: Sequence[int] = ARCHITECTURES, cpu: bool = True) -> list[Path]:
-    """Compile modules into Warp's cache: binaries for GPUs of these architectures, and objects for this CPU.
+    """Compile modules into Warp's cache: binaries for these GPU architectures, and objects for this CPU.
 
     No GPU is needed. Returns all files of the cache.
     """
@@ -127,15 +127,15 @@ def bake(names: Iterable[str], *, architectures: Sequence[int] = ARCHITECTURES, 
         if architectures:
             wp.compile_aot_module(module, arch=list(architectures), use_ptx=False)
         if cpu:
-            # What is compiled ahead for a CPU has another block size, and digest, than what a launch asks for.
+            # Ahead-of-time compilation for a CPU has another block size, and digest, than a launch requests.
             wp.load_module(module, device="cpu")
     return sorted(file for file in Path(wp.config.kernel_cache_dir).glob("*/*") if file.is_file())
 
 
 def lay_out(cache: Path) -> int:
-    """Copy what `$GRASPD_KERNELS` has for this version of Warp, and the cache has not, into the cache.
+    """Copy kernels in `$GRASPD_KERNELS` for this version of Warp that are missing from the cache into it.
 
-    A folder that is missing or cannot be read is none: kernels are compiled then.
+    A missing or unreadable folder is ignored: kernels are then compiled.
 
     Returns:
         Number of files copied.
@@ -153,7 +153,7 @@ def lay_out(cache: Path) -> int:
 
 
 def _copied(source: Path, target: Path) -> bool:
-    """Whether the file was not there; others see it whole or not at all."""
+    """Copy a file atomically; return whether it was missing."""
     if target.exists():
         return False
     target.parent.mkdir(parents=True, exist_ok=True)
@@ -165,10 +165,10 @@ def _copied(source: Path, target: Path) -> bool:
 
 
 def binary_name(module: ModuleType) -> str:
-    """What the kernels of a module are compiled to on this CPU: a digest of their sources, of all they call and of how
-    they are compiled, and the name that Warp gives the file, which tells the instructions that the CPU has.
+    """Return the identity of a module's compiled kernels on this CPU.
+    A digest of sources, callees and compile options, and Warp's file name with the CPU's instruction set.
 
-    Two processes in which it is the same run the same instructions.
+    Two processes with the same value run the same instructions.
     """
     known = wp.get_module(module.__name__)
     # A launch on the CPU has blocks of one thread.

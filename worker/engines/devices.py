@@ -1,12 +1,12 @@
-"""Warp devices: their names, the GPU that a process takes where nobody names one, and errors of a GPU.
+"""Warp devices: their names, the default GPU of a process, and GPU errors.
 
-`CUDA_VISIBLE_DEVICES` says which there are: the driver shows no others. Of these, worker number k takes the k-th, round
-and round; who has no number takes the one with the fewest processes. That is told by locks that the kernel drops with
-the process, however it ends: lock n of a GPU is held by the n-th process on it. They lie in the user's cache, which the
-containers of one machine share.
+`CUDA_VISIBLE_DEVICES` determines the available GPUs: the driver shows no others. Worker number k takes the k-th,
+cyclically; a process without a number takes the one with the fewest processes. Processes are counted by file locks,
+which the kernel releases with the process: lock n of a GPU is held by the n-th process on it. The locks are in the
+user's cache, which the containers of one machine share.
 
-After an illegal access, a reset or a bus error nothing runs any more in the CUDA context of a process. Warp only writes
-a line to stderr and goes on with whatever lies in memory, so the device is waited for before results leave the process.
+After an illegal access, a reset or a bus error nothing runs in the process's CUDA context any more. Warp only writes a
+line to stderr and continues with undefined memory, so results leave the process only after the device is synchronised.
 """
 
 from __future__ import annotations
@@ -25,19 +25,19 @@ from graspd.service import user_cache
 from graspd.service.model.errors import GraspdError, InputError
 
 log = logging.getLogger(__name__)
-#: Processes on one GPU that are counted; more make no difference.
+#: Largest number of processes counted per GPU; more make no difference.
 _MOST: Final = 64
-#: Locks of this process, until it ends.
+#: Locks of this process, held until it ends.
 _held: list[IO[bytes]] = []
 
 
 class Device:
-    """A device by its Warp name, or `auto`, which is found out on the side: Warp takes most of a second to import."""
+    """Device by Warp name, or `auto`, resolved in the background: Warp takes most of a second to import."""
 
     def __init__(self, wanted: str, *, number: int | None = None) -> None:
-        """`number` is that of a worker among those of its machine, see `take`.
+        """`number`: index of a worker on its machine, see `take`.
 
-        Raises InputError for a name that is none, or a CUDA device that is not there.
+        Raises InputError for an invalid name, or a CUDA device that does not exist.
         """
         if not re.fullmatch(r"auto|cpu|cuda:\d+", wanted):
             raise InputError(f"there is no device {wanted!r}; use cpu, cuda:0 (or another number), or auto")
@@ -49,7 +49,7 @@ class Device:
             self.resolve()
 
     def find_out(self, then: Callable[[], None]) -> None:
-        """Resolve in a thread, then call back."""
+        """Resolve in a thread, then call `then`."""
 
         def work() -> None:
             self.resolve()
@@ -58,7 +58,7 @@ class Device:
         threading.Thread(target=work, name="device", daemon=True).start()
 
     def resolve(self) -> str:
-        """cpu, cuda:0, ... Waits until it is known."""
+        """Return cpu, cuda:0, ...; waits until it is resolved."""
         with self._lock:
             if not self._resolved:
                 self._resolved, self.name = _ask_warp(self.wanted, self._number)
@@ -66,7 +66,7 @@ class Device:
 
 
 def cpu_name() -> str:
-    """Model name of the processor."""
+    """Return the model name of the processor."""
     try:
         text = Path("/proc/cpuinfo").read_text()
     except OSError:
@@ -89,7 +89,7 @@ def _ask_warp(wanted: str, number: int | None) -> tuple[str, str]:
 
 
 def visible_gpus() -> list[Gpu]:
-    """The GPUs that CUDA shows to this process."""
+    """Return the GPUs that CUDA shows to this process."""
     import warp as wp
 
     from graspd.worker.engines import backend
@@ -100,19 +100,19 @@ def visible_gpus() -> list[Gpu]:
 
 @dataclass(frozen=True)
 class Gpu:
-    """A GPU that this process can see."""
+    """A GPU visible to this process."""
 
     name: str
-    """Of Warp: cuda:0, ..."""
+    """Warp name: cuda:0, ..."""
     id: str
-    """The same for every process and container of the machine."""
+    """Identifier common to all processes and containers of the machine."""
     model: str = ""
 
 
 def take(gpus: Sequence[Gpu], folder: Path, *, number: int | None = None) -> Gpu:
-    """One of the GPUs, at least one of which is given: that of worker `number`, else one with the fewest processes.
+    """Select one of the GPUs (at least one): that of worker `number`, else one with the fewest processes.
 
-    It counts as taken until this process ends. Without a folder that can be written it is the first.
+    It counts as taken until this process ends. Without a writable folder the first is selected.
     """
     eligible = [gpus[number % len(gpus)]] if number is not None else list(gpus)
     try:
@@ -129,7 +129,7 @@ def take(gpus: Sequence[Gpu], folder: Path, *, number: int | None = None) -> Gpu
 
 
 def _lock(file: Path) -> bool:
-    """Whether this process got the lock of a file. Raises OSError where locks cannot be had at all."""
+    """Try to lock a file; return success. Raises OSError if locks are unavailable."""
     opened = file.open("ab")
     try:
         fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -143,31 +143,31 @@ def _lock(file: Path) -> bool:
     return True
 
 
-#: How Warp and the driver say that memory is short on a GPU.
+#: Messages of Warp and the driver about insufficient GPU memory.
 _NO_MEMORY: Final = re.compile(r"Failed to allocate \d+ bytes.*'cuda:\d+'|CUDA error 2\b|out of memory", re.DOTALL)
 
 
-#: Held by whoever launches on a GPU that another thread may use too: a graph that one captures must not have launches
-#: of another.
+#: Held during a launch on a GPU that another thread may use too: a graph under capture must not contain launches of
+#: other threads.
 exclusive: Final = threading.RLock()
 
 
 class DeviceLost(GraspdError):
-    """A GPU does not work in this process any more; a fresh process may find it well."""
+    """A GPU no longer works in this process; a fresh process may be able to use it."""
 
     slug, title = "device-lost", "A GPU does not work in this process any more"
 
 
 def is_out_of_memory(error: BaseException) -> bool:
-    """Whether work failed because the memory of a GPU did not suffice."""
+    """Check whether an error is due to insufficient GPU memory."""
     return isinstance(error, RuntimeError) and _NO_MEMORY.search(str(error)) is not None
 
 
 def check_device(device: str) -> None:
-    """Wait for what was launched on a device.
+    """Wait for all launches on a device.
 
     Raises:
-        DeviceLost: CUDA reports an error that its context does not outlive.
+        DeviceLost: CUDA reports an error from which its context cannot recover.
     """
     if not device.startswith("cuda"):
         return

@@ -1,6 +1,6 @@
-"""MuJoCo's warnings: read where they void a result, kept out of the folder that a user happens to stand in.
+"""MuJoCo's warnings: detected if they invalidate a result, and kept out of the user's working folder.
 
-When numbers blow up MuJoCo resets the state and goes on: an object that is back where it began looks held. And by
+After a numerical divergence MuJoCo resets the state and continues: an object back at its initial pose looks held. By
 default each warning is appended to MUJOCO_LOG.TXT in the working folder.
 """
 
@@ -13,7 +13,7 @@ import mujoco
 
 log = logging.getLogger(__name__)
 
-#: A state that was reset, or contacts and constraints that were left out for want of memory.
+#: Warnings of a state reset, or of contacts and constraints dropped for lack of memory.
 _VOIDING: Final = [
     int(kind)
     for kind in (
@@ -24,12 +24,12 @@ _VOIDING: Final = [
         mujoco.mjtWarning.mjWARN_CNSTRFULL,
     )
 ]
-#: Room for the constraints of a hand that is deep in an object; it is taken from the system only as it is used [bytes].
+#: Memory for the constraints of a hand deep in an object; the system allocates it only on use [bytes].
 ARENA: Final = 64 * 2**20
 
 
 def void(data: Any) -> bool:
-    """Whether a simulation since its last `mj_resetData` says nothing about its object."""
+    """Check whether a simulation since its last `mj_resetData` is invalid."""
     return bool(data.warning.number[_VOIDING].any())
 
 

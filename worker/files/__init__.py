@@ -1,1 +1,1 @@
-"""Everything that reads or writes files of grasps: ours and those of others."""
+"""Reading and writing of grasp files: graspd's own and foreign ones."""

@@ -1,4 +1,4 @@
-"""Point clouds as files, one npz for each shard of pictures, and the hand of each grasp as points."""
+"""Point clouds as files, one npz for each views shard, and the hand of each grasp as points."""
 
 from __future__ import annotations
 
@@ -22,24 +22,24 @@ from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.surface import sample_surface
 
-#: What of a sample says where it comes from.
+#: Keys of a sample that state its origin.
 _WORDS = ("hand", "object", "shard_id", "base_id")
 
 
 def write_clouds(clouds: Clouds, folder: Path, said: Mapping[str, Any]) -> dict[str, int]:
-    """Write all clouds: `clouds-NNNNN.npz`, and `clouds.json`, which says how they were made.
+    """Write all clouds: `clouds-NNNNN.npz`, and `clouds.json` with their settings.
 
-    An npz has the keys of a sample (docs/how-to/clouds.md) stacked over its C clouds. What has a row for each grasp
-    stands in one array for all of them, cloud by cloud; `grasp/count` (C,) says how many rows each cloud has.
+    An npz has the keys of a sample (docs/how-to/clouds.md) stacked over its C clouds. Arrays with a row per grasp are
+    concatenated cloud by cloud; `grasp/count` (C,) is the number of rows of each cloud.
 
     Args:
-        said: what `clouds.json` says besides the numbers.
+        said: entries of `clouds.json` besides the numbers.
 
     Returns:
-        numbers of files, clouds and of clouds that are empty.
+        numbers of files, clouds and empty clouds.
 
     Raises:
-        ConflictError: the folder is there and not empty.
+        ConflictError: the folder exists and is not empty.
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise ConflictError(f"{folder} is there already; name another folder")
@@ -56,7 +56,7 @@ def write_clouds(clouds: Clouds, folder: Path, said: Mapping[str, Any]) -> dict[
 
 
 def stacked(samples: list[dict[str, Any]]) -> dict[str, Any]:
-    """Samples of one shard as arrays."""
+    """Stack the samples of one shard into arrays."""
     found: dict[str, NDArray[Any]] = {name: np.array(str(samples[0][name])) for name in _WORDS}
     found["grasp/count"] = np.array([len(sample["grasp/base_row"]) for sample in samples], np.int32)
     for name in samples[0]:
@@ -66,20 +66,20 @@ def stacked(samples: list[dict[str, Any]]) -> dict[str, Any]:
     return found
 
 
-#: Points on a hand: some 5 mm apart on one as large as a man's.
+#: Number of points on a hand: about 5 mm apart on one of human size.
 POINTS: Final = 2048
 _hands: LRUCache[Any, HandModel] = LRUCache(8)
 
 
 def hand_surface(shard: Shard, rows: NDArray[np.intp]) -> Floats:
-    """(K, H, 3) points on the hand's surface at contact in the object's frame [m].
+    """Return points (K, H, 3) on the hand's surface at contact in the object's frame [m].
 
     Args:
         shard: a base shard.
         rows: (K,) its grasps.
 
     Raises:
-        NotFoundError: the hand that the shard was made with is not here.
+        NotFoundError: the hand of the shard is not available here.
     """
     hand = _hand(shard)
     points = sample_surface(hand, POINTS)

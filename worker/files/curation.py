@@ -1,4 +1,4 @@
-"""Curation of datasets: balanced parts (types, approaches, resting faces), and the differences of two datasets."""
+"""Curation of datasets: balanced subsets (types, approaches, resting faces), and differences."""
 
 from __future__ import annotations
 
@@ -21,25 +21,25 @@ from graspd.worker.files.subsets import base_shards
 from graspd.worker.grasps import Posture
 from graspd.worker.quality.diversity import distinct, hand_points
 
-#: What grasps can be shared out by.
+#: Categories over which grasps can be balanced.
 KINDS: Final = ("type", "direction", "face")
 _COLUMNS: Final = {"type": "quality/grasp_type", "direction": "quality/approach_cell"}
-#: Two scenes have the object on one face where their down, in its frame, differ by less than this [cosine of 20 deg].
+#: Two scenes have the object on one face if their down directions in its frame differ by less [cosine of 20 deg].
 _SAME_FACE: Final = float(np.cos(np.radians(20)))
 
 
 @dataclass(frozen=True)
 class Balance:
-    """How to choose; a chooser of `worker.files.subsets`, called with the shards of one hand on one object."""
+    """Balanced selection; a `Chooser` of `worker.files.subsets` for the shards of one hand and object."""
 
     by: Sequence[str]
     at_most: int = 0
-    """Of each kind; 0: as many as the median kind has."""
+    """Largest number per category; 0: that of the median category."""
     min_distance: float = 0.0
-    """No two of those chosen are nearer [m], see `worker.quality.diversity`; 0: any."""
+    """Least distance of two selected grasps [m], see `worker.quality.diversity`; 0: any."""
     seed: int = 0
     hand: str | None = None
-    """The hand's file, where the shards do not lead to it; only distances need it."""
+    """The hand's file if the shards do not lead to it; only distances need it."""
 
     def __post_init__(self) -> None:
         if unknown := [one for one in self.by if one not in KINDS]:
@@ -48,10 +48,10 @@ class Balance:
             raise InputError(f"say what to balance by: {', '.join(KINDS)}")
 
     def __call__(self, shards: list[Shard]) -> list[NDArray[np.bool_]]:
-        """Masks of the chosen grasps: valid ones, drawn at random by the seed, none of a kind more often than allowed.
+        """Return masks of selected grasps: valid, drawn at random by the seed, limited per category.
 
         Raises:
-            InputError: a shard does not tell the kind.
+            InputError: a shard lacks the category.
         """
         kinds = self._kinds(shards)
         wanted = np.concatenate([validity.valid(shard.arrays) for shard in shards])
@@ -68,7 +68,7 @@ class Balance:
         return np.split(chosen, np.cumsum([len(shard["quality/valid"]) for shard in shards])[:-1])
 
     def _kinds(self, shards: list[Shard]) -> NDArray[np.int64]:
-        """(N, len(by)) what kind each grasp is of."""
+        """Return the categories (N, len(by)) of each grasp."""
         columns = []
         for name in self.by:
             if name == "face":
@@ -88,7 +88,7 @@ class Balance:
 
 
 def _down(shard: Shard) -> NDArray[np.float64]:
-    """(N, 3) what is down in the scene of each grasp, in the object's frame; zero: it floats."""
+    """Return the down direction (N, 3) in the scene of each grasp, object frame; zero for free objects."""
     if "grasp/scene_index" not in shard.arrays:
         return np.zeros((len(shard["quality/valid"]), 3))
     poses = np.asarray(shard["scene/object_pose"], float)
@@ -97,7 +97,7 @@ def _down(shard: Shard) -> NDArray[np.float64]:
 
 
 def faces(down: NDArray[np.float64]) -> NDArray[np.int64]:
-    """(N,) number of the face that lies below, for what is down (N, 3): the first seen within 20 degrees."""
+    """Number the bottom faces (N,) of down directions (N, 3), one for all within 20 degrees of the first."""
     seen = np.zeros((0, 3))
     found = np.full(len(down), -1, np.int64)
     for row in np.flatnonzero(np.linalg.norm(down, axis=1) > 0):
@@ -123,13 +123,13 @@ _SETTINGS: Final = (
     "hand_digest",
     "object_digest",
 )
-#: Grasps that agree in pose and joints to so many digits (metres, radians) are one.
+#: Grasps with equal pose and joints to this many digits (metres, radians) are identical.
 _DIGITS: Final = 6
 
 
 @dataclass
 class _Side:
-    """One of the two."""
+    """One of the two datasets."""
 
     grasps: dict[tuple[str, str], Counter[bytes]] = field(default_factory=dict)
     valid: Counter[tuple[str, str]] = field(default_factory=Counter)
@@ -165,11 +165,11 @@ def _short(name: str, value: object) -> str:
 
 
 def difference(first: Shards, second: Shards) -> Row:
-    """What differs, as JSON values.
+    """Return the difference of two datasets as JSON values.
 
     Keys: shards {first, second, common}; cells[] {hand, object, first, second: grasps, valid_first, valid_second,
-    common: grasps that both have}, of those that differ; same_cells, how many do not; settings {name: {first, second}}
-    of those that differ.
+    common: grasps in both}, of those that differ; same_cells, the number of equal ones; settings
+    {name: {first, second}} of those that differ.
     """
     a, b = _Side.of(first), _Side.of(second)
     ids = [{file.id for file in shards} for shards in (first, second)]

@@ -1,6 +1,6 @@
-"""The hand and the object of a shard: what it notes of them and of its grasps, and how their files are found again.
+"""Provenance of a shard: attributes that identify hand, object and grasps; search for their files.
 
-They are known by their digests, so a file that was changed or is another one is never taken for them.
+Files are identified by digest, so a modified or different file is never used instead.
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ from graspd.worker.scenes.neighbours import Neighbours
 from graspd.worker.scenes.placement import neighbour_of
 from graspd.worker.simulation.environment import PlacedGrasps, Scenes
 
-#: What a file may be called that describes a hand or an object.
+#: File suffixes of hands and objects.
 SUFFIXES: Final = {AssetKind.HAND: (".urdf", ".xml", ".zip"), AssetKind.OBJECT: (*READERS, ".zip")}
-#: Files of the shard's folder, and of the folders in it, that are looked at.
+#: Largest number of files searched in the shard's folder and its subfolders.
 LOOKED_AT: Final = 200
 _FILES: Final[dict[AssetKind, Callable[[Path], tuple[str, dict[str, bytes], dict[str, Any]]]]] = {
     AssetKind.HAND: hand_files,
@@ -52,29 +52,29 @@ _FILES: Final[dict[AssetKind, Callable[[Path], tuple[str, dict[str, bytes], dict
 
 @dataclass(frozen=True)
 class AssetReference:
-    """A hand or an object as a shard knows it."""
+    """Reference to a hand or an object in a shard."""
 
     kind: AssetKind
     name: str
     digest: str
     source: str = ""
-    """The path it was read from."""
+    """Path of the original file."""
     options: Mapping[str, Any] | None = None
-    """What was said of it besides, such as `keep_largest`."""
+    """Further options, such as `keep_largest`."""
     folder: Path | None = None
-    """The shard's."""
+    """Folder of the shard."""
 
 
 @dataclass(frozen=True)
 class AssetFiles:
-    """Its files, and the options to read them with."""
+    """Files of a hand or object, and the options to load them with."""
 
     files: dict[str, bytes]
     options: dict[str, Any]
 
 
 def remembered(hand: str, obj: str, options: Mapping[str, Any]) -> dict[str, Attribute]:
-    """Root attributes that tell where hand and object were read; built-in ones need none."""
+    """Return root attributes with the paths of hand and object; built-in ones need none."""
     found: dict[str, Attribute] = {}
     for kind, path in (("hand", Path(hand)), ("object", Path(obj))):
         if path.is_file():
@@ -83,10 +83,10 @@ def remembered(hand: str, obj: str, options: Mapping[str, Any]) -> dict[str, Att
 
 
 def find(sought: AssetReference) -> AssetFiles:
-    """The files of a hand or object: built in, at the path the shard notes, in the store, or in the shard's folder.
+    """Find the files of a hand or object: built in, at the shard's path, in the store or shard's folder.
 
     Raises:
-        NotFoundError: in none of these; says where it looked.
+        NotFoundError: in none of these; the message lists the places.
     """
     if sought.name in builtin_names(sought.kind):
         files = builtin_files(sought.kind, sought.name)
@@ -134,7 +134,7 @@ def _beside(sought: AssetReference, looked: list[str]) -> Iterator[Path]:
 
 
 def at(sought: AssetReference, path: Path) -> AssetFiles | None:
-    """The files at a path, if they are what is sought."""
+    """Return the files at a path if they match the reference."""
     try:
         if not path.is_file():
             return None
@@ -149,7 +149,7 @@ def at(sought: AssetReference, path: Path) -> AssetFiles | None:
 
 
 def options_of(attribute: object) -> dict[str, Any]:
-    """Options from a shard's attribute; none where it has none."""
+    """Return options from a shard's attribute; empty if it has none."""
     try:
         said = from_json(str(attribute or "{}"))
     except ValueError:
@@ -157,17 +157,17 @@ def options_of(attribute: object) -> dict[str, Any]:
     return said if isinstance(said, dict) else {}
 
 
-#: Neighbours are looked at and kept clear of, not grasped.
+#: Neighbours are only displayed and kept clear of, not grasped.
 NEIGHBOUR_FACE_ERROR_M: Final = 3e-4
 _MATTER: Final = {"object_mass_kg": MASS_KG, "object_friction": FRICTION}
 
 
 def hand_of_shard(shard: Shard, given: str | None) -> HandModel:
-    """The hand named by `given` (a file or a built-in); by default the one the shard was made with, see `origin.find`.
+    """Load the hand `given` (a file or a built-in); by default the shard's own, see `find`.
 
     Raises:
-        NotFoundError: there is no such file or built-in, or it is in none of the places where it may be.
-        ConflictError: it is not the hand the shard was made with.
+        NotFoundError: there is no such file or built-in, or the hand is in none of the places.
+        ConflictError: it is not the hand of the shard.
     """
     if given:
         hand = hand_from_path(given)
@@ -179,7 +179,7 @@ def hand_of_shard(shard: Shard, given: str | None) -> HandModel:
 
 
 def hand_files_of_shard(shard: Shard, given: str | None) -> AssetFiles:
-    """The files of `hand_of_shard`, with the options to read them with."""
+    """Return the files of `hand_of_shard`, with the options to load them with."""
     if given:
         _, files, stated = files_from_path(given)
         return AssetFiles(files, stated)
@@ -187,9 +187,9 @@ def hand_files_of_shard(shard: Shard, given: str | None) -> AssetFiles:
 
 
 def object_of_shard(shard: Shard, given: str | None) -> ObjectModel:
-    """The object named by `given`, simplified and as heavy as in the shard; see `hand_of_shard`."""
+    """Load the object `given`, with the shard's simplification, mass and friction; see `hand_of_shard`."""
     said = shard.attributes
-    # What older shards do not say was the same for all objects.
+    # Older shards lack these attributes: the values were the same for all objects.
     mass, friction = (float(said.get(key, default)) for key, default in _MATTER.items())  # type: ignore[arg-type]
     return _object_of_shard(shard, given).weighing(mass=mass, friction=friction)
 
@@ -227,11 +227,11 @@ def _wanted(shard: Shard, kind: AssetKind) -> AssetReference:
 
 
 def neighbours_of_shard(shard: Shard, given: Sequence[str]) -> Neighbours | None:
-    """The other objects of a scene shard with their poses; None if the object is alone.
+    """Load the other objects of a scene shard with their poses; None if the object is alone.
 
     Raises:
-        NotFoundError: one is in none of the places where it may be.
-        ConflictError: they are not the objects the shard was made with.
+        NotFoundError: one is in none of the places.
+        ConflictError: they are not the objects of the shard.
     """
     names, digests = (shard.attributes.get(key, []) for key in ("neighbours", "neighbour_digests"))
     if "scene/neighbour_pose" not in shard.arrays or not isinstance(names, list) or not isinstance(digests, list):
@@ -255,7 +255,7 @@ def neighbours_of_shard(shard: Shard, given: Sequence[str]) -> Neighbours | None
 
 
 def beside_attributes(others: Sequence[ObjectModel], given: Sequence[str]) -> dict[str, Attribute]:
-    """What a shard says of the objects beside its own, given as files or names; nothing if there are none."""
+    """Return a shard's attributes for other objects, given as files or names; empty if there are none."""
     if not others:
         return {}
     return {
@@ -272,10 +272,10 @@ def _neighbour(shard: Shard, name: str, digest: str, source: str) -> ObjectModel
 
 
 def placed_of_shard(shard: Shard) -> PlacedGrasps | None:
-    """The scenes that the grasps of a base shard were planned in; None: they were planned around a free object.
+    """Return the scenes of a base shard's grasps; None if they were planned around a free object.
 
     Raises:
-        InputError: what the shard says of its scene is no scene.
+        InputError: the shard's scene attribute is invalid.
     """
     if "scene/object_pose" not in shard.arrays or "grasp/scene_index" not in shard.arrays:
         return None
@@ -299,7 +299,7 @@ def _check(shard: Shard, kind: str, digest: str, given: str | None) -> None:
 
 
 def id_of_columns(columns: Columns) -> str:
-    """Id of a shard that no job made: a digest of its columns, so that later shards can name it."""
+    """Return the id of a shard that no job made, by which later shards name it: a digest of its columns."""
     found = hashlib.sha256()
     for name in sorted(columns):
         array = np.ascontiguousarray(columns[name])
@@ -309,11 +309,11 @@ def id_of_columns(columns: Columns) -> str:
 
 
 def made_of(source: Shard) -> dict[str, Attribute]:
-    """What a later shard says of the shard whose scenes or grasps it is made of."""
+    """Return the attributes of a shard that name the shard of its scenes or grasps."""
     return {f"{source.kind}_shard": str(source.attributes.get("shard_id") or id_of_columns(source.arrays))}
 
 
-#: What every later shard says about the job it comes from.
+#: Attributes of the job that every later shard inherits.
 INHERITED: Final = (
     "hand",
     "hand_digest",
@@ -338,15 +338,15 @@ def base_attributes(
     verdict_key: str | None,
     outcomes: Mapping[str, int] = MappingProxyType({}),
 ) -> dict[str, Attribute]:
-    """The hand's joints, what was asked for, in which scene, how many grasps were tried, and who validated them.
+    """Return the attributes of a base shard: joints, request, scene, candidates, terms of validation.
 
     Args:
         hand: the hand.
-        obj: the object as it was validated.
+        obj: the object as validated.
         request: friction, want, validator and scene.
-        tried: candidates until the last one kept.
+        candidates: number of candidates up to the last selected one.
         verdict_key: digest of the terms of the verdicts; None: not validated.
-        outcomes: tries that were not kept, by what became of them.
+        outcomes: numbers of rejected candidates by outcome.
     """
     said: dict[str, Attribute] = {
         "joint_names": list(hand.joint_names),
@@ -369,6 +369,6 @@ def base_attributes(
 
 
 def wrist_attributes(hand: HandModel) -> dict[str, Attribute]:
-    """What names the columns of `grasp/wrist_positions`, which grasps in scenes have."""
+    """Return the attributes that name the columns of `grasp/wrist_positions`, for grasps in scenes."""
     wrist = () if hand.mounting is None else hand.mounting.joint_names
     return {"wrist_joint_names": list(wrist)} if wrist else {}

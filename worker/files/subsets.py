@@ -1,4 +1,4 @@
-"""Parts of a dataset as base shards of their own, and the choice of grasps that a command takes."""
+"""Subsets of a dataset as their own base shards, and the selection of grasps by a command."""
 
 from __future__ import annotations
 
@@ -19,26 +19,26 @@ from graspd.service.store import validity
 from graspd.service.store.shards import Shard, part_of_shard, place_of, read_shard
 from graspd.service.store.store import open_store
 
-#: From the base shards of one hand on one object to the mask (N,) of each.
+#: Function from the base shards of one hand on one object to the mask (N,) of each.
 Chooser = Callable[[list[Shard]], list[NDArray[np.bool_]]]
 
 
 @dataclass(frozen=True)
 class Subset:
-    """What was written."""
+    """Result of writing a subset."""
 
     looked_at: int
     kept: int
     files: list[Path]
     passed_over: int
-    """Scene and views shards, whose rows name grasps by number and are not carried over."""
+    """Scene and views shards, whose rows refer to grasps by number and are not transferred."""
 
 
 def shards_of(source: str, snapshot: str | None = None) -> Shards:
-    """The shards of a file or folder, or of a dataset of this machine's store by its name.
+    """Return the shards of a file or folder, or of a dataset in this machine's store by name.
 
     Raises:
-        NotFoundError: there is no such thing.
+        NotFoundError: none of these exists.
     """
     if "/" in source or source in (".", "..") or Path(source).exists():
         return open_shards(Path(source))
@@ -50,7 +50,7 @@ def shards_of(source: str, snapshot: str | None = None) -> Shards:
 
 
 def base_shards(shards: Shards) -> Iterator[list[Shard]]:
-    """The base shards of each hand and object, a list each."""
+    """Group base shards by hand and object."""
     pair, together = ("", ""), list[Shard]()
     for file in shards.of("base"):
         if (file.hand, file.object) != pair and together:
@@ -63,12 +63,12 @@ def base_shards(shards: Shards) -> Iterator[list[Shard]]:
 
 
 def write_subset(shards: Shards, choose: Chooser, out: Path, *, said: Mapping[str, Any]) -> Subset:
-    """Base shards of the chosen grasps, `HAND/OBJECT/base-BATCH.h5`, and `subset.json`: how they were chosen.
+    """Write base shards of selected grasps, `HAND/OBJECT/base-BATCH.h5`, and the selection, `subset.json`.
 
-    A shard of which nothing is chosen is left out. What each grasp says, its scene too, is as it was.
+    Shards without selected grasps are left out. All columns of a grasp, including its scene, are unchanged.
 
     Raises:
-        InputError: the folder holds files already, or cannot be made; or nothing is chosen.
+        InputError: the folder contains files already or cannot be made; or nothing is selected.
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"{out} is there already; choose a folder that is not")
@@ -98,10 +98,10 @@ EveryOption = Annotated[bool, typer.Option("--all", help="All grasps, also those
 
 
 def choose(base: Shard, *, unvalidated: bool = False, every: bool = False) -> tuple[NDArray[np.bool_], str]:
-    """(N,) the grasps that are taken, and what they are called.
+    """Select grasps (N,), and return a name for the selection.
 
     Raises:
-        InputError: both wishes at once, or there is no such grasp; tells what there is.
+        InputError: both options at once, or no such grasp; the message states what the shard contains.
     """
     if unvalidated and every:
         raise InputError("--unvalidated and --all exclude each other")

@@ -1,4 +1,4 @@
-"""Grasps of a hand file on an object file as a job makes them, in this process: a base shard in memory."""
+"""Grasps of a hand file on an object file as in a job, in this process: a base shard in memory."""
 
 from __future__ import annotations
 
@@ -45,16 +45,16 @@ from graspd.worker.together import validated_batches
 from graspd.worker.validation.payload import Limit
 
 Arrays = dict[str, NDArray[Any]]
-#: Threshold of the metrics that a summary tells [m].
+#: Threshold of the metrics in a summary [m].
 _TOLD_M: Final = 0.005
 FREE: Final = SceneSpec()
-#: Columns of the scenes that a shard has.
+#: Scene columns that a shard contains.
 _KEPT: Final = ("scene/object_pose", "scene/rest_probability", "scene/neighbour_pose")
 
 
 @dataclass(frozen=True)
 class SynthesisResult:
-    """A base shard in memory, and what became of all candidates."""
+    """Base shard in memory, and the outcomes of all candidates."""
 
     arrays: Arrays
     attributes: dict[str, Attribute]
@@ -62,15 +62,15 @@ class SynthesisResult:
     request: JobOptions
     place: SceneSpec
     interrupted: bool
-    """Whether it was stopped before the end."""
+    """Whether it was stopped early."""
     seconds: float
-    """Wall time, without the reading of the files [s]."""
+    """Wall time without loading of the files [s]."""
     rolling: int = 0
     """Scenes in which the object may roll, see `rolling_poses`."""
 
     @property
     def reason(self) -> str | None:
-        """Why there are fewer grasps than were asked for; None where there are not."""
+        """Explain why there are fewer grasps than requested; None if there are enough."""
         request = self.request
         if self.interrupted:
             return f"interrupted: {len(self.arrays['quality/valid'])} of {request.grasps} grasps were there"
@@ -90,16 +90,16 @@ class SynthesisResult:
 
     @property
     def narrow(self) -> str | None:
-        """The geometric reason where nothing is valid, candidates or none; None: there is none."""
+        """Return the geometric reason for no valid grasp, with or without candidates; None if there is none."""
         return None if self.arrays["quality/valid"].any() else self.batches[0].narrow
 
     @property
     def limit(self) -> Limit | None:
-        """What the hand lifts at best, where it is told: no grasp was found, for the weight."""
+        """Return the payload if it explains why no grasp was found."""
         return None if len(self.arrays["quality/valid"]) else self.batches[0].limit
 
     def summary(self) -> dict[str, Any]:
-        """What a user wants to know first, for JSON."""
+        """Return a summary for users, as JSON values."""
         count, request = len(self.arrays["quality/valid"]), self.request
         told: dict[str, Any] = {
             "grasps": count,
@@ -142,7 +142,7 @@ class SynthesisResult:
         return told
 
     def _diversity(self) -> dict[str, Any]:
-        """Types of the grasps, and the entropies of types and of directions of approach."""
+        """Return types of the grasps, and entropies of types and approach directions."""
         types = np.bincount(np.asarray(self.arrays["quality/grasp_type"], int), minlength=len(GraspType))
         cells = np.bincount(np.asarray(self.arrays["quality/approach_cell"], int), minlength=DIRECTION_CELLS)
         return {
@@ -158,7 +158,7 @@ class SynthesisResult:
         return round(float(np.median(known)), 4) if len(known) else None
 
     def _shake_share(self) -> float | None:
-        """Of the grasps that were shaken, the share that survives."""
+        """Return the share of shaken grasps that survive."""
         values = np.asarray(self.arrays["quality/shake_margin"], float)
         known = values[np.isfinite(values)]
         return round(float((known < 1).mean()), 4) if len(known) else None
@@ -171,7 +171,7 @@ class SynthesisResult:
         return round(float(known.mean()), digits) if len(known) else None
 
     def _shares(self) -> dict[str, float]:
-        """Of all grasps that were planned: clear, lifted, lifted at half the friction."""
+        """Return shares of all planned grasps: clear, lifted, lifted at half friction."""
         planned = sum(batch.planned for batch in self.batches)
         return {
             name: round(sum(batch.shares[name] * batch.planned for batch in self.batches) / max(1, planned), 4)
@@ -180,12 +180,12 @@ class SynthesisResult:
 
 
 def synthesized_as(hand: str, obj: str, options: LocalOptions, **run: Any) -> SynthesisResult:
-    """The grasps that a user of this process asks for; see `synthesized`.
+    """Run `synthesized` with a local user's options.
 
     Args:
         hand: see `synthesized`.
         obj: see `synthesized`.
-        options: what is asked.
+        options: options of the user.
         run: prefilter, processes, progress, cancelled and partial of `synthesized`.
     """
     return synthesized(
@@ -219,27 +219,27 @@ def synthesized(
     cancelled: Callable[[], bool] | None = None,
     partial: bool = False,
 ) -> SynthesisResult:
-    """The grasps of a job in one process, without a queue or a server.
+    """Make the grasps of a job in one process, without a queue or a server.
 
     Args:
         hand: a URDF, a ZIP with one, or the name of a built-in hand.
         obj: a mesh or the name of a built-in object.
-        request: how many grasps, how made and validated.
-        place: where they are used.
-        scenes: scenes that the grasps are shared out to.
-        mesh: how the object's file is read: units, scale_to, keep_largest, allow_open.
+        request: number of grasps, planner and validation.
+        place: scene of the grasps.
+        scenes: number of scenes over which the grasps are distributed.
+        mesh: options for the object's file: units, scale_to, keep_largest, allow_open.
         device: cpu, cuda:0 or auto.
         threads: CPU threads; 0: one per core.
-        prefilter: whether MuJoCo Warp gives the clear verdicts; auto: on a GPU, where it is installed.
-        join: batches of 32 whose grasps are planned in one launch; None: what fills a GPU. The grasps are the same.
-        processes: that validate and measure; 1: this one; 0: on a GPU one for each core less one, else 1.
-        progress: told of the grasps that are done, and of how many.
-        cancelled: asked often; True: the work stops.
-        partial: if it is stopped, what was validated before is the result.
+        prefilter: whether MuJoCo Warp rejects clear failures; auto: on a GPU, if installed.
+        join: batches of 32 planned in one launch; None: as many as fill a GPU. The grasps are the same.
+        processes: number that validate and measure; 1: this one; 0: on a GPU one per core less one, else 1.
+        progress: receives the number of finished grasps and the total.
+        cancelled: polled often; True: the work stops.
+        partial: whether grasps validated before a stop are returned.
 
     Raises:
-        InputError: unknown method, option, hand, object or device, or a scene without room.
-        TaskCancelled: `cancelled` answered True; with `partial`, before anything was validated.
+        InputError: unknown method, option, hand, object or device, or a scene without space.
+        TaskCancelled: `cancelled` returned True; with `partial`, before any validation.
     """
     planner(request.method, request.options, in_scenes=place.kind != "free")  # before the files are read
     if request.shake and place.kind == "free":
@@ -282,7 +282,7 @@ def synthesized(
 
 @contextmanager
 def _pool(processes: int) -> Iterator[Pool | None]:
-    """So many processes beside this one, which start while the first grasps are planned; None for one."""
+    """Start a pool of processes while the first grasps are planned; None for one process."""
     if processes == 1:
         yield None
         return
@@ -292,7 +292,7 @@ def _pool(processes: int) -> Iterator[Pool | None]:
 
 
 def _as_stored(place: SceneSpec, others: Sequence[ObjectModel]) -> dict[str, Any]:
-    """The scene as a shard tells it: neighbours by their names, not by files of this machine."""
+    """Return the scene as stored in a shard: neighbours by name, not by local file."""
     said = place.told()
     for one, other in zip(said["neighbours"], others, strict=True):
         one["object"] = other.name

@@ -79,13 +79,13 @@ def _allegro_thumb(hand: UrdfWriter) -> None:
     hand.joint("thumb_tip_joint", "thumb_distal_link", "thumb_tip", (0, 0, 0.0543))
 
 
-#: The distal joint turns one third as far as the medial one: both hang on one motor.
+#: The distal joint turns one third as far as the medial one: one motor drives both.
 DISTAL_RATIO = 1 / 3
 MEDIAL_MAX = 2.44
 
 
 def barrett() -> tuple[str, dict[str, Any]]:
-    """BarrettHand BH8-280: palm normal +z, closing negative; 8 joints on 4 motors, fingers 1 and 2 spread together."""
+    """BarrettHand BH8-280: palm normal +z, closing negative; 8 joints, 4 motors, one to spread fingers."""
     hand = UrdfWriter("barrett")
     hand.link(
         "palm", 1.0,
@@ -141,7 +141,7 @@ def _outer_finger(hand: UrdfWriter, finger: int, parent: str, xyz: Vector, rpy: 
         box((0.018, 0.022, 0.02), (-0.002, 0.002, 0), (0, 0, 0.777)),
         box((0.012, 0.012, 0.02), (-0.038, 0.034, 0), (0, 0, 1.614)),
     )  # fmt: skip
-    # Fingers 1 and 2 end at y = 3.0 and 3.4 mm in the maker's data; one value serves all three.
+    # Fingers 1 and 2 end at y = 3.0 and 3.4 mm in the manufacturer's data; one value serves all three.
     hand.joint(f"finger_{finger}_medial", parent, medial, xyz, z, (-MEDIAL_MAX, 0), rpy=rpy, effort=2.0)
     hand.joint(
         f"finger_{finger}_distal",
@@ -169,7 +169,7 @@ METACARPAL_TURN: Final = 0.959931089
 def shadow() -> tuple[str, dict[str, Any]]:
     """Shadow Dexterous Hand E: palm normal -y, fingers +z, thumb toward +x; 22 joints, 18 drives.
 
-    One tendon drives the two outer joints of each finger, J1 + J2; on approach they are bent alike, as a free finger's.
+    One tendon drives the two outer joints of each finger, J1 + J2; on approach both bend equally, as in a free finger.
     """
     hand = UrdfWriter("shadow")
     hand.link(
@@ -237,13 +237,13 @@ ZERO: Final[Vector] = (0.0, 0.0, 0.0)
 
 
 class UrdfWriter:
-    """Lines of a URDF, link by link."""
+    """Writer of a URDF, link by link."""
 
     def __init__(self, name: str) -> None:
         self._lines = ['<?xml version="1.0"?>', f"<robot name={quoteattr(name)}>"]
 
     def link(self, name: str, mass: float, *shapes: str) -> None:
-        """A link of `mass` [kg] with collision shapes made by `box`, `cylinder`, `sphere` or `capsule`."""
+        """Add a link of `mass` [kg] with collision shapes made by `box`, `cylinder`, `sphere` or `capsule`."""
         self._lines.append(f"  <link name={quoteattr(name)}>")
         if mass:
             self._lines.append(
@@ -266,7 +266,7 @@ class UrdfWriter:
         effort: float = 0.7,
         mimic: tuple[str, float] | None = None,
     ) -> None:
-        """A revolute joint, or a fixed one where no axis is given."""
+        """Add a revolute joint, or a fixed one if no axis is given."""
         kind = "revolute" if any(axis) else "fixed"
         self._lines.append(f'  <joint name={quoteattr(name)} type="{kind}">')
         self._lines.append(f"    <parent link={quoteattr(parent)}/><child link={quoteattr(child)}/>{origin(xyz, rpy)}")
@@ -280,27 +280,27 @@ class UrdfWriter:
         self._lines.append("  </joint>")
 
     def text(self) -> str:
-        """The whole file."""
+        """Return the whole file."""
         return "\n".join([*self._lines, "</robot>", ""])
 
 
 def box(size: Vector, xyz: Vector, rpy: Vector = ZERO) -> str:
-    """Collision box of full extents `size` [m]."""
+    """Return a collision box of full extents `size` [m]."""
     return f'{origin(xyz, rpy)}<geometry><box size="{numbers(size)}"/></geometry>'
 
 
 def cylinder(radius: float, length: float, xyz: Vector, rpy: Vector = ZERO) -> str:
-    """Collision cylinder along its z [m]."""
+    """Return a collision cylinder along its z [m]."""
     return f'{origin(xyz, rpy)}<geometry><cylinder radius="{radius:g}" length="{length:g}"/></geometry>'
 
 
 def capsule(radius: float, length: float, xyz: Vector, rpy: Vector = ZERO) -> str:
-    """Collision capsule along its z; `length` [m] is without the caps."""
+    """Return a collision capsule along its z; `length` [m] excludes the caps."""
     return f'{origin(xyz, rpy)}<geometry><capsule radius="{radius:g}" length="{length:g}"/></geometry>'
 
 
 def sphere(radius: float, xyz: Vector) -> str:
-    """Collision sphere [m]."""
+    """Return a collision sphere [m]."""
     return f'{origin(xyz, ZERO)}<geometry><sphere radius="{radius:g}"/></geometry>'
 
 
@@ -321,7 +321,7 @@ HANDS: Final[dict[str, Callable[[], tuple[str, dict[str, Any]]]]] = {
 
 
 def files_of(name: str) -> dict[str, bytes]:
-    """The files of a built-in hand as they stand in `service/builtin/hands/NAME/`."""
+    """Return the files of a built-in hand as in `service/builtin/hands/NAME/`."""
     urdf, options = HANDS[name]()
     asset = {"file": f"{name}.urdf", **options}
     return {f"{name}.urdf": urdf.encode(), "asset.json": (json.dumps(asset, indent=2) + "\n").encode()}

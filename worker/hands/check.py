@@ -1,4 +1,4 @@
-"""Tell a user what became of a hand: taken, taken with repairs, or refused and why."""
+"""Check of an uploaded hand: accepted, accepted with repairs, or refused with the reason."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from graspd.worker.hands.surface import sample_surface
 from graspd.worker.hands.tree import build_tree, cut_drives, joints_above, passed_limits
 from graspd.worker.hands.xacro import read_robot
 
-#: Points with which the outer surface is measured.
+#: Number of points that measure the outer surface.
 _SURFACE_POINTS = 512
-#: Among what was guessed: the direction out of the palm could as well be its opposite.
+#: Entry of the guessed values: the palm's approach direction could equally be the opposite one.
 TIED = "approach (a tie)"
 
 
@@ -33,11 +33,11 @@ def check_hand(
     options: Mapping[str, Any] | None = None,
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> dict[str, Any]:
-    """What `load_hand` makes of these files; `run` is told of which link the shapes are made.
+    """Check these files with `load_hand`; `run` receives the link whose shapes are being made.
 
     Returns:
-        verdict: accept, repair or refuse; message: one line; repairs: what was changed; facts: what was measured or
-        guessed, in SI units; of a refusal that options fix `problem` and `options_suggested`, keys of `HandOptions`.
+        verdict: accept, repair or refuse; message: one line; repairs: changes; facts: measured or guessed values in SI
+        units; for a refusal that options fix, `problem` and `options_suggested`, keys of `HandOptions`.
     """
     try:
         settings = parse_options(files, options)
@@ -82,7 +82,7 @@ def check_hand(
 
 
 def _tendons(hand: HandModel) -> list[str]:
-    """What a user must know of drives that pull several joints."""
+    """Return notes on drives that pull several joints."""
     pairs = [" and ".join(hand.dof_names[d] for d in tendon.dofs) for tendon in hand.tendons]
     return (
         [f"{', '.join(pairs)} on one tendon each" if len(pairs) > 1 else f"{pairs[0]} on one tendon"] if pairs else []
@@ -90,14 +90,14 @@ def _tendons(hand: HandModel) -> list[str]:
 
 
 def _open(hand: HandModel) -> list[str]:
-    """What a user must know of fingers that no joint closes."""
+    """Return notes on fingers that no joint closes."""
     chains = zip(hand.fingertips, chains_of(hand), strict=True)
     still = [hand.body_names[tip] for tip, chain in chains if not hand.closing[hand.dof[chain]].any()]
     return [f"no joint closes the finger of {', '.join(still)}: say which does with --closing JOINT=1"] if still else []
 
 
 def _tie(hand: HandModel, settings: HandOptions) -> list[str]:
-    """What a user must know of a guess that could have gone either way."""
+    """Return a note on a guess that was a tie."""
     stated = settings.approach or (settings.palm and settings.palm.approach)
     if stated or jaws_of(hand) is not None or not approach_is_tied(hand):
         return []
@@ -105,7 +105,7 @@ def _tie(hand: HandModel, settings: HandOptions) -> list[str]:
 
 
 def _limits(robot: Robot, settings: HandOptions) -> list[str]:
-    """What a user must know of joints that their limits do not hold, or hold in one place."""
+    """Return notes on joints whose limits do not bind them, or leave them one value."""
     tree = build_tree(robot, settings)
     passed = passed_limits(robot, tree, settings)
     notes = [f"limits of {', '.join(passed)} are not used, as in ROS: they follow other joints"] if passed else []
@@ -114,7 +114,7 @@ def _limits(robot: Robot, settings: HandOptions) -> list[str]:
 
 
 def _left_out(robot: Robot, hand: HandModel, settings: HandOptions) -> list[str]:
-    """What a user must know of a hand that was cut off its arm without having said so."""
+    """Return a note on links left out when a hand was separated from its arm without an option."""
     above = joints_above(robot, hand.root_link)
     if settings.root:
         faulty = [joint for joint in chain_to(robot, hand.root_link) if joint.fault]
@@ -125,7 +125,7 @@ def _left_out(robot: Robot, hand: HandModel, settings: HandOptions) -> list[str]
 
 
 def _mounting(hand: HandModel, fault: str) -> list[str]:
-    """What a user must know of links above the hand's root; `fault`: why they cannot be read."""
+    """Return notes on links above the hand's root; `fault`: the reason why they cannot be read."""
     if fault:
         return [fault]
     links = () if hand.mounting is None else dict.fromkeys(piece.link for piece in hand.mounting.pieces)
@@ -133,7 +133,7 @@ def _mounting(hand: HandModel, fault: str) -> list[str]:
 
 
 def hand_facts(hand: HandModel, robot: Robot) -> dict[str, Any]:
-    """What a user should look at before trusting a hand; numbers in SI units."""
+    """Return facts that a user should review before using a hand; numbers in SI units."""
     return {
         "links": len(robot.links),
         **model_facts(hand),
@@ -144,7 +144,7 @@ def hand_facts(hand: HandModel, robot: Robot) -> dict[str, Any]:
 
 
 def model_facts(hand: HandModel) -> dict[str, Any]:
-    """Those of them that follow from the model alone."""
+    """Return the facts that follow from the model alone."""
     return {
         "bodies": hand.bodies,
         "joints": list(hand.joint_names),

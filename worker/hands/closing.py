@@ -1,4 +1,4 @@
-"""Which way each joint closes a hand: where its fingertips go; its limits break ties."""
+"""Closing direction of each joint from the motion of its fingertips; joint limits break ties."""
 
 from __future__ import annotations
 
@@ -10,24 +10,24 @@ from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply, quat_r
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
 
-#: A finger bends so many times as far one way as the other: twice, whatever the last digits of its limits are.
+#: Ratio from which a finger bends further one way than the other: twice, with tolerance for the last digits of limits.
 FAR: Final = 1.99
-#: Shares of the way from open to closed at which fingertips are looked at.
+#: Shares of the range from open to closed at which fingertips are evaluated.
 _SHARES: Final = (0.25, 0.5, 0.75)
-#: Cosine from which on two axes of joints, or an axis and the approach, are parallel: within 45 degrees, and 37.
+#: Least cosine at which two joint axes, or an axis and the approach, are parallel: within 45 degrees, and 37.
 _PARALLEL: Final = 0.707
 _ABOUT: Final = 0.8
-#: A joint moves a tip if it does with this share of the most that a joint of its finger does.
+#: Least share of the largest tip motion by a joint of the finger at which a joint counts as moving the tip.
 _MOVING: Final = 0.05
-#: Limits go as far both ways if their middle is nearer to 0 than this share of the range. Such a joint is left
-#: straight: hands whose middle joints closed (Shadow's thumb, D'Claw) lifted less.
+#: Limits are symmetric if their middle is within this share of the range from 0. Such a joint stays straight: hands
+#: whose middle joints closed (Shadow's thumb, D'Claw) lifted less.
 _EVEN: Final = 0.02
-#: Gains below this share of the tip's way are a tie. Joints that oppose a thumb have .35 and more.
+#: Gains below this share of the tip's path length are a tie. Joints that oppose a thumb have .35 and more.
 _TIE: Final = 0.2
 
 
 def closing_by_limits(hand: HandModel) -> Floats:
-    """(D,) fingers bend far one way and little the other; what moves as far both ways spreads; wrists close nothing."""
+    """Return closing (D,) from limits: asymmetric joints close, symmetric ones spread, wrists are 0."""
     up, down = np.maximum(hand.upper, 0), np.maximum(-hand.lower, 0)
     closing = np.where(up > FAR * down, 1.0, np.where(down > FAR * up, -1.0, 0.0))
     carrying = set(carriers(hand))
@@ -38,12 +38,12 @@ def closing_by_limits(hand: HandModel) -> Floats:
 
 
 def closing_by_tips(hand: HandModel) -> Floats:
-    """(D,) -1, 0, +1 of a hand with fingertips, palm and a first guess of its closing.
+    """Return closing (D,) in -1, 0, +1 for a hand with fingertips, palm and a first guess of its closing.
 
-    Joints of a finger that are parallel to its last one flex it, all in one sense: that which brings the tip to the
-    other tips and to the palm; not those whose limits go as far both ways. Another joint closes if it brings the tip to
-    the other tips and out of the palm; one that turns about the approach, or as far both ways, spreads; one in line
-    with its finger does neither.
+    Joints of a finger that are parallel to its last one flex it, unless their limits are symmetric. All flex in the
+    sense that brings the tip to the other tips and to the palm. Another joint closes if it brings the tip to the other
+    tips and away from the palm. It spreads if it turns about the approach or has symmetric limits. A joint in line with
+    its finger does neither.
     """
     limits, (flexing, opposing, ways) = closing_by_limits(hand), _gains(hand)
     opened, half = (_axes(hand, posture(hand, share)) for share in (0.0, 0.5))
@@ -67,16 +67,16 @@ def closing_by_tips(hand: HandModel) -> Floats:
     bends = np.where(np.abs(flexed) > _TIE * flexed_way, np.sign(flexed), limits)
     opposes = np.where((np.abs(crossed) > _TIE * crossed_way) & (limits != 0), np.sign(crossed), 0.0)
     bends[np.abs(hand.lower + hand.upper) < 2 * _EVEN * hand.span] = 0.0
-    # Of a joint that leads to no fingertip the limits alone tell.
+    # For a joint that leads to no fingertip only the limits decide.
     return np.where(seen, np.where(flexed_way > 0, bends, opposes), limits)
 
 
 def _gains(hand: HandModel) -> tuple[Floats, Floats, Floats]:
-    """Of each dof and fingertip, as the dof goes from its lower to its upper limit.
+    """Measure the effect of each dof on each fingertip over the dof's range from lower to upper limit.
 
     Returns:
-        Three arrays (D, T) [m], summed over postures of the other dofs: how much nearer the tip comes to the other tips
-        and to the palm; how much nearer to the other tips and farther out of the palm; and the length of its way.
+        Three arrays (D, T) [m], summed over postures of the other dofs: decrease of the distance to the other tips and
+        to the palm; decrease to the other tips plus increase from the palm; and the length of the tip's path.
     """
     flexing, opposing, ways = np.zeros((3, hand.dofs, len(hand.fingertips)))
     for share in _SHARES:
@@ -93,13 +93,13 @@ def _gains(hand: HandModel) -> tuple[Floats, Floats, Floats]:
 
 
 def _apart(tip: Floats) -> Floats:
-    """(T,) distance of each of the tips (T, 3) from the middle of the others [m]."""
+    """Return the distance (T,) of each of the tips (T, 3) from the mean of the others [m]."""
     others = (tip.sum(axis=0) - tip) / max(len(tip) - 1, 1)
     return np.asarray(np.linalg.norm(tip - others, axis=1)) if len(tip) > 1 else np.zeros(1)
 
 
 def chains_of(hand: HandModel) -> list[list[int]]:
-    """Of each fingertip: the bodies whose joints move it, the last one first, without those that carry the palm."""
+    """Return the bodies whose joints move each fingertip, the last one first, up to the palm."""
     carrying, chains = set(carriers(hand)), []
     for tip in hand.fingertips:
         chain, body = [], tip
@@ -112,12 +112,12 @@ def chains_of(hand: HandModel) -> list[list[int]]:
 
 
 def _axes(hand: HandModel, q: Floats) -> Floats:
-    """(B, 3) axes of all joints in the root frame."""
+    """Return the axes (B, 3) of all joints in the root frame."""
     return np.asarray(quat_rotate(body_poses(hand, IDENTITY_POSE, hand.expand(q))[0, :, 3:], hand.axis))
 
 
 def carriers(hand: HandModel) -> list[int]:
-    """Bodies that carry all fingertips, the root first and the palm last: between them are a forearm and a wrist."""
+    """Return the bodies that carry all fingertips: root, forearm and wrist, palm."""
     if len(hand.fingertips) < 2:
         return [0]
     chains = []
@@ -130,7 +130,7 @@ def carriers(hand: HandModel) -> list[int]:
 
 
 def posture(hand: HandModel, share: float) -> Floats:
-    """(D,) posture at a share of the way from open (0) to closed (1); dofs that close nothing stay near 0."""
+    """Return the posture (D,) at a share from open (0) to closed (1); dofs that close nothing stay near 0."""
     start = np.where(hand.closing < 0, hand.upper, hand.lower)
     end = np.where(hand.closing < 0, hand.lower, hand.upper)
     rest = np.clip(0.0, hand.lower, hand.upper)
@@ -138,7 +138,7 @@ def posture(hand: HandModel, share: float) -> Floats:
 
 
 def tips(hand: HandModel, q: Floats) -> Floats:
-    """(..., T, 3) centres of the fingertip bodies in the root frame [m] of postures (..., D)."""
+    """Return the centres (..., T, 3) of the fingertip bodies in the root frame [m] for postures (..., D)."""
     many = q.reshape(-1, hand.dofs)
     poses = body_poses(hand, np.tile(IDENTITY_POSE, (len(many), 1)), hand.expand(many))
     centre = {p.body: p.vertices.mean(axis=0) for p in hand.pieces}

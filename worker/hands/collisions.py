@@ -1,4 +1,4 @@
-"""Which bodies of a hand touch each other at rest, and so are not to be kept apart."""
+"""Bodies of a hand that touch at rest, and are therefore exempt from self-collision."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ TOUCH_M = 1e-4
 
 
 def resting_neighbours(hand: HandModel) -> frozenset[tuple[int, int]]:
-    """Pairs of bodies (a < b): parent and child, grandparent and grandchild, and those that touch at rest.
+    """Return pairs of bodies (a < b): parent or grandparent and child, and those that touch at rest.
 
-    Rest is the pre-shape and the middle of the limits: what touches in both has no room to be apart.
+    Rest means both the pre-shape and the middle of the limits: bodies that touch in both cannot be separated.
     """
     pairs: set[tuple[int, int]] = set()
     for body in range(1, hand.bodies):
@@ -32,7 +32,7 @@ def resting_neighbours(hand: HandModel) -> frozenset[tuple[int, int]]:
 
 
 def touching_bodies(hand: HandModel, q: Floats, margin: float) -> set[tuple[int, int]]:
-    """Pairs of bodies (a < b) with pieces closer than `margin` [m] at posture q (D,)."""
+    """Return pairs of bodies (a < b) with pieces closer than `margin` [m] at posture q (D,)."""
     poses = body_poses(hand, IDENTITY_POSE, hand.expand(q))[0]
     corners = [apply(poses[piece.body], piece.vertices) for piece in hand.pieces]
     boxes = [(c.min(axis=0) - margin, c.max(axis=0) + margin) for c in corners]
@@ -47,7 +47,7 @@ def touching_bodies(hand: HandModel, q: Floats, margin: float) -> set[tuple[int,
 
 
 def hull_distance(a: Floats, b: Floats) -> float:
-    """Distance [m] of the convex hulls of two point sets (N, 3) and (M, 3); 0 where they overlap.
+    """Compute the distance [m] of the convex hulls of two point sets (N, 3) and (M, 3); 0 if they overlap.
 
     Least squares over convex weights x, y: min |a'x - b'y| with sum x = sum y = 1, the sums as heavy extra rows.
     """

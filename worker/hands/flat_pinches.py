@@ -1,7 +1,7 @@
-"""Postures for what lies flat on a support: the ends of opposed fingertips rest on a plane and face each other.
+"""Pinch postures for flat objects on a support: ends of opposed fingertips on a plane, face to face.
 
-The pads of `worker.hands.pinch_postures` are farther from the ends of the fingertips than a flat object is high. These
-postures are found in the same way, from the surface within the object's height of the plane.
+The pads of `worker.hands.pinch_postures` are farther from the fingertips' ends than a flat object is high. The same
+search uses here the surface within the object's height above the plane.
 """
 
 from __future__ import annotations
@@ -25,33 +25,33 @@ from graspd.worker.hands.pinch_postures import Oppositions, climbed, opposed_fin
 from graspd.worker.hands.surface import farthest_points, sample_surface
 from graspd.worker.objects.disk_cache import arrays_kept_or_made
 
-#: Heights of objects that have postures of their own [m]; what is higher reaches the pads.
+#: Object heights with their own postures [m]; higher objects reach the pads.
 HEIGHTS_M: Final = (0.005, 0.008, 0.012, 0.018)
-#: Postures that are wanted, from so many times as many, and random steps that make them better.
+#: Number of postures, candidates per posture, and random steps that improve them.
 POSTURES: Final = 120
 CROWD: Final = 20
-#: Fewer postures of a height than these are none.
+#: Least number of valid postures of a height; fewer are discarded.
 FEW: Final = 8
-#: Widths [m].
+#: Range of widths [m].
 WIDTHS_M: Final = (0.004, 0.12)
-#: Points of each fingertip and of each other body, of so many of the hand.
+#: Points of each fingertip and of each other body, and the size of the sample of the hand from which they come.
 _TIP_POINTS: Final = 120
 _OTHER_POINTS: Final = 20
 _DENSE: Final = 8000
-#: A fingertip that ends farther above the plane than this share of the height misses the object; a difference of width
-#: is counted in these lengths [m].
+#: A fingertip that ends above the plane by more than this share of the height misses the object; and the length that
+#: scales differences of width in the cost [m].
 REACHES: Final = 0.4
 WIDTH_M: Final = 0.02
 #: Least height of the rest of the hand above the plane [m].
 OVER_M: Final = 0.008
-#: How well the ends face each other (cosine), and how little the palm looks along the line between them (cosine).
+#: Least cosine of the ends' facing, and the limit on the palm's cosine with the line between them.
 FACING: Final = 0.8
 SQUARE: Final = 0.7
 
 
 def pinches_of(hand: HandModel, height: float) -> Oppositions:
-    """Postures for an object of this height [m], from memory or this machine's cache where they are known; none where
-    it reaches the pads, or the hand has one finger.
+    """Return postures for an object of this height [m], cached in memory and on this machine.
+    There are none if it reaches the pads or the hand has one finger.
 
     The palm's approach without its part along `axis` points at the plane. `middle` is half the height above it.
     """
@@ -93,21 +93,21 @@ def _pinches(hand: HandModel, height: float) -> Oppositions:
 
 @dataclass(frozen=True)
 class _Seen:
-    """Where the ends of the fingertips of N postures are."""
+    """Poses of the fingertips' ends in N postures."""
 
     axis: Floats
     middle: Floats
     width: Floats
     short: Floats
-    """(N,) how far above the plane the one finger ends, or the others do in the mean, over what reaches the object."""
+    """(N,) height above the plane of the opposing end, or the others' mean, over what reaches the object."""
     facing: Floats
-    """(N,) cosine of the surface within the height against the line between the ends, the worse side's."""
+    """(N,) cosine between the surface within the height and the line between the ends, for the worse side."""
     square: Floats
     over: Floats
     """(N,) height of the rest of the hand above the plane [m]."""
 
     def cost(self, wanted: Floats) -> Floats:
-        """(N,) how far from a pinch of the widths `wanted` (N,)."""
+        """Return the cost (N,) of postures relative to pinches of the widths `wanted` (N,)."""
         short = np.maximum(0.0, self.short - 0.5)
         low = np.maximum(0.0, OVER_M + 0.005 - self.over) / WIDTH_M
         aside = 2 * np.maximum(0.0, self.square - 0.9 * SQUARE)
@@ -118,7 +118,7 @@ class _Seen:
 
 @dataclass(frozen=True)
 class _Look:
-    """The surface of a hand as points of its fingertips and of the rest."""
+    """Surface of a hand as points of its fingertips and of the rest."""
 
     hand: HandModel
     height: float
@@ -129,7 +129,7 @@ class _Look:
     others: Floats
     """(V, 3)"""
     body: NDArray[np.intp]
-    """(V,) of the others."""
+    """(V,) bodies of the other points."""
 
     @classmethod
     def of(cls, hand: HandModel, height: float) -> _Look:
@@ -148,14 +148,14 @@ class _Look:
         )
 
     def at(self, q: Floats, one: int) -> _Seen:
-        """What postures (N, D) pinch between the finger `one` and the others."""
+        """Evaluate the pinch between the finger `one` and the others in postures (N, D)."""
         hand, others = self.hand, [f for f in range(len(self.tips)) if f != one]
         bodies = body_poses(hand, np.tile(IDENTITY_POSE, (len(q), 1)), hand.expand(q))
         tips = bodies[:, list(hand.fingertips), None]
         place = quat_rotate(tips[..., 3:], self.tips) + tips[..., :3]
         normal = quat_rotate(tips[..., 3:], self.normals)
         down, axis, ends = np.tile(hand.palm.approach, (len(q), 1)), np.zeros((len(q), 3)), np.zeros((len(q), 0))
-        # The plane depends on which points are lowest, and these on the plane.
+        # The plane depends on the lowest points, and these depend on the plane.
         for _ in range(3):
             low = np.einsum("nfvi,ni->nfv", place, down).argmax(axis=2)
             end = np.take_along_axis(place, low[..., None, None], axis=2)[:, :, 0]
@@ -189,7 +189,7 @@ class _Look:
 
 
 def _spread(points: SurfacePoints, body: int, count: int) -> NDArray[np.intp]:
-    """Rows of at most `count` points of a body that lie far from one another."""
+    """Select rows of at most `count` points of a body that are far from one another."""
     mine = np.flatnonzero(points.body == body)
     return mine[farthest_points(points.position[mine], min(count, len(mine)))]
 

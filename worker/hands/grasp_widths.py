@@ -1,9 +1,9 @@
-"""Postures in which any two parts of a hand look at each other, at widths that pads do not oppose: for what is smaller
-than the least gap between pads, or wider than the widest.
+"""Postures in which any two parts of a hand face each other.
+They serve objects narrower than the least gap between pads, or wider than the widest.
 
-A thing of 10 mm is held between the sides of two fingers, or a finger and the palm; one as wide as the hand spans, by
-tips that press with their sides. Both are pairs of points of the hand's surface whose normals look along the line
-between them, with room for a cube of that width; they are found by sampling and random steps.
+An object of 10 mm is held between the sides of two fingers or a finger and the palm; one as wide as the hand's span,
+between the sides of fingertips. Both are pairs of surface points with normals along the line between them and space for
+a cube of that width. They are found by sampling and random steps.
 """
 
 from __future__ import annotations
@@ -30,40 +30,40 @@ from graspd.worker.objects.disk_cache import arrays_kept_or_made
 Ints = NDArray[np.intp]
 Size = Literal["small", "wide"]
 
-#: Gaps between the parts that hold what is small [m], and how much wider than the widest opposition of pads others are.
+#: Gaps for small objects [m], and the factor by which gaps for wide objects exceed the widest opposition of pads.
 SMALL_M: Final = (0.006, 0.042)
 WIDER: Final = 1.06
-#: Points of the surface.
+#: Number of surface points.
 POINTS: Final = {"small": 256, "wide": 640}
-#: Postures that are wanted, from so many times as many, and random steps that make them better.
+#: Number of postures, candidates per posture, and random steps that improve them.
 POSTURES: Final = 120
 CROWD: Final = 8
 CLIMBS: Final = 80
-#: How well both surfaces face along the line between them (cosine); a fall short of it weighs like a difference of
-#: width of so much [m], and so does a part of the hand that stands so deep in the cube between them.
+#: Least cosine of both surfaces with the line between them. A smaller cosine costs as much as this difference of width
+#: [m], and so does penetration of the hand into the cube between them.
 FACING: Final = {"small": 0.9, "wide": 0.8}
 TURNED_M: Final = 0.2
 DEEP: Final = 2.0
-#: How far the hand must be able to close on what it holds, by joints whose axes are so far from it at least [m].
+#: Least closing motion of the hand on the object, by joints at least the lever away from it [m].
 CLOSES_M: Final = 0.04
 LEVER_M: Final = 0.02
-#: Radius within which flat parts cover the tangent plane [m], and what it weighs if they do not [m].
+#: Radius within which flat parts cover the tangent plane [m], and the cost of parts that do not [m].
 FLAT_M: Final = 0.006
 ROUND_M: Final = 0.003
 _DENSE: Final = 4000
-#: A posture that costs more is none [m].
+#: Largest cost of a usable posture [m].
 GOOD_M: Final = 0.006
-#: What is wide may reach this far towards the fingertips beyond the places that hold it [m].
+#: Distance by which wide objects may extend towards the fingertips beyond the contacts [m].
 BEYOND_M: Final = 0.012
-#: Pairs of a posture that are looked at closely, and postures that are compared at once.
+#: Pairs per posture that are evaluated in detail, and postures that are compared at once.
 CLOSELY: Final = 8
 AT_ONCE: Final = 16
-#: Points that are nearer to each other are at one place [m].
+#: Points nearer than this coincide [m].
 _NEXT_TO: Final = 1e-9
 
 
 def spans_of(hand: HandModel, size: Size) -> Oppositions:
-    """Postures for small or wide things, from memory or this machine's cache where they are known."""
+    """Return postures for small or wide objects, cached in memory and on this machine."""
     key = (hand.content, size)
     with _lock:
         if key not in _known:
@@ -78,7 +78,7 @@ _lock = threading.Lock()
 
 
 def widest_span(hand: HandModel) -> float:
-    """No posture of `spans_of` is for a wider thing [m]; told without looking for one."""
+    """Return an upper bound of the widths in `spans_of` [m], without a search for postures."""
     return WIDER * oppositions_of(hand).widest + GOOD_M
 
 
@@ -105,7 +105,7 @@ def _spans(hand: HandModel, size: Size) -> Oppositions:
 
 @dataclass
 class _Found:
-    """The best pairs of N postures: as `Oppositions` has them, and what they lack [m]."""
+    """Best pairs of N postures in the form of `Oppositions`, with their costs [m]."""
 
     axis: Floats
     middle: Floats
@@ -113,20 +113,20 @@ class _Found:
     cost: Floats
 
     def take(self, rows: NDArray[np.bool_], other: _Found) -> None:
-        """Exchange these rows for another's."""
+        """Replace these rows by those of another."""
         for mine, its in zip(vars(self).values(), vars(other).values(), strict=True):
             mine[rows] = its[rows]
 
 
 class _Look:
-    """What pairs of surface points of postures hold, and how well."""
+    """Evaluates pairs of surface points of postures as grips."""
 
     def __init__(self, hand: HandModel, size: Size) -> None:
         self.hand, self.facing = hand, FACING[size]
         self.points = sample_surface(hand, POINTS[size])
         body = self.points.body
         holds = np.ones(len(body), bool) if size == "small" else np.isin(body, hand.fingertips)
-        # Body by body, so that the pairs of a body's points with those of later bodies are one product of matrices.
+        # Sorted by body, so that the pairs of a body's points with those of later bodies are one matrix product.
         self.holding = np.flatnonzero(holds)[np.argsort(body[holds], kind="stable")]
         flat = _flatness(hand, self.points)[self.holding] if size == "small" else np.ones(len(self.holding))
         self.round = ROUND_M * (1 - np.minimum(flat[:, None], flat))
@@ -137,7 +137,7 @@ class _Look:
         self.one, self.other = np.concatenate(pairs, axis=1)
 
     def at(self, q: Floats, wanted: Floats) -> _Found:
-        """The best pair of each posture (n, D) for the widths `wanted` (n,)."""
+        """Return the best pair of each posture (n, D) for the widths `wanted` (n,)."""
         rows = np.array_split(np.arange(len(q)), 1 + len(q) // AT_ONCE)
         parts = [self._at(q[some], wanted[some]) for some in rows]
         return _Found(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
@@ -166,8 +166,8 @@ class _Look:
         return axis[row, best], middle[row, best], width[row, best], cost[row, best]
 
     def _costs(self, held: Floats, normal: Floats, wanted: Floats) -> Floats:
-        """(n, pairs) what each pair lacks, but for room, by products of matrices: the square of a width is rounded to
-        1e-17 m²."""
+        """Compute the cost (n, pairs) of each pair, except for clearance, by matrix products.
+        The square of a width is rounded to 1e-17 m²."""
         square = np.einsum("npi,npi->np", held, held)
         own = np.einsum("npi,npi->np", held, normal)
         parts = []
@@ -189,7 +189,7 @@ class _Look:
     def _closes(
         self, q: Floats, bodies: Floats, axis: Floats, parts: tuple[Ints, Ints], ends: tuple[Floats, Floats]
     ) -> Floats:
-        """(n, K) how much nearer to each other two points can come, as far as their first motion tells [m]."""
+        """Return the distance (n, K) by which two points can approach each other, to first order [m]."""
         hand, rate = self.hand, np.zeros((*axis.shape[:2], self.hand.dofs))
         for part, end, sign in zip(parts, ends, (-1.0, 1.0), strict=True):
             moves = generalized_forces(hand, bodies, self.points.body[part], end, axis[:, :, None])[:, :, 0]
@@ -199,7 +199,7 @@ class _Look:
         return nearer
 
     def _stands_in(self, place: Floats, axis: Floats, one: Floats, other: Floats, width: Floats) -> Floats:
-        """(n, K) how deep the hand stands in cubes between two of its points [m]."""
+        """Return the penetration (n, K) of the hand into cubes between two of its points [m]."""
         ahead = self.hand.palm.approach
         up = ahead - np.einsum("nki,i->nk", axis, ahead)[..., None] * axis
         length = np.linalg.norm(up, axis=2, keepdims=True)
@@ -207,7 +207,7 @@ class _Look:
         half = 0.5 * width
         start = np.minimum(np.einsum("nki,nki->nk", one, up), np.einsum("nki,nki->nk", other, up))
         start = start - np.minimum(half, BEYOND_M)
-        # (n, K, points), along the line between both ends, across it and upwards.
+        # (n, K, points), along the line between both ends, perpendicular to it and upwards.
         middle, points, across = 0.5 * (one + other), place.swapaxes(1, 2), np.cross(axis, up)
         along, aside, above = axis @ points, across @ points, up @ points
         along -= np.einsum("nki,nki->nk", axis, middle)[..., None]
@@ -220,7 +220,7 @@ class _Look:
 
 
 def _flatness(hand: HandModel, points: SurfacePoints) -> Floats:
-    """(N,) share of a small disc around each point, on its tangent plane, that its body covers."""
+    """Return the share (N,) of a small disc around each point, on its tangent plane, that its body covers."""
     dense = sample_surface(hand, _DENSE)
     flat = np.zeros(len(points))
     for body in np.unique(points.body):
@@ -233,7 +233,7 @@ def _flatness(hand: HandModel, points: SurfacePoints) -> Floats:
 
 
 def _any_across(axis: Floats) -> Floats:
-    """(..., 3) unit vectors across others."""
+    """Return unit vectors (..., 3) perpendicular to others."""
     helper = np.eye(3)[np.argmin(np.abs(axis), axis=-1)]
     across = np.cross(axis, helper)
     unit: Floats = across / np.linalg.norm(across, axis=-1, keepdims=True)

@@ -1,4 +1,4 @@
-"""Guesses for what a URDF does not say: fingertips, closing directions, palm and pre-shape. Each can be overridden."""
+"""Guesses of values that a URDF lacks: fingertips, closing, palm and pre-shape; options override them."""
 
 from __future__ import annotations
 
@@ -18,31 +18,31 @@ from graspd.worker.hands.options import HandOptions
 from graspd.worker.hands.tree import Tree
 from graspd.worker.objects.disk_cache import recalled
 
-#: Share of the way from open to closed at which the hand approaches.
+#: Share of the range from open to closed in the approach posture.
 PRESHAPE_SHARE = 0.25
-#: How often closing and palm, which follow from each other, are looked at.
+#: Iterations over closing and palm, which depend on each other.
 LOOKS = 2
-#: Fingertips whose ways across the hand sum to less than this share of their lengths close on one another: 0 of like
-#: fingers around an axis, .3 to .55 where two oppose one, .75 and more of hands with a thumb.
+#: Opposed fingers: the sum of tip motions across the hand is below this share of their lengths. It is 0 for equal
+#: fingers around an axis, .3 to .55 where two oppose one, .75 and more for hands with a thumb.
 OPPOSED = 0.65
-#: Tips that are no farther ahead of where their fingers begin than this share of these places' spread are beside them.
+#: Tips are beside their fingers' bases if they are ahead by no more than this share of the bases' spread.
 LEAST_AHEAD = 0.1
-#: A sum of two unit witnesses that is shorter than this tells no direction: they contradict each other.
+#: Two unit estimates contradict each other if their sum is shorter than this; then there is no direction.
 CONTRADICTING = 0.2
-#: Tips whose ways across their strongest line are less than this share of it close along that line.
+#: Tips close along their dominant line if the motion across it is below this share of the motion along it.
 SIDEWAYS = 0.3
-#: Lines this near to each other are one line, and a root axis so near to it is it [degrees].
+#: Angle below which two lines coincide, and below which a line is the root axis [degrees].
 SAME_LINE = 1.0
-#: Lines and root axes this near to a rough direction may be what it stands for [degrees]; and to a good one.
+#: Angle within which lines and root axes may refine a rough direction, and a good one [degrees].
 ROUGH, GOOD = 40.0, 10.0
-#: Joints whose axes are looked at.
+#: Largest number of joints whose axes are considered.
 _JOINTS = 64
-#: A wrist or a rim that stands so far above the palm between the fingers is not the palm [m].
+#: A wrist or rim higher than this above the palm between the fingers is not the palm [m].
 RIM_M = 0.02
 
 
 def complete(hand: HandModel, tree: Tree, options: HandOptions) -> HandModel:
-    """The hand with fingertips, closing, palm and preshape filled in: as stated, else as guessed."""
+    """Fill in fingertips, closing, palm and preshape of the hand: as stated, else as guessed."""
     hand = replace(hand, fingertips=_fingertips(hand, tree, options))
     stated = dict(_by_dof(hand, tree, options.closing))
     hand = replace(hand, closing=closing_by_limits(hand))
@@ -51,17 +51,17 @@ def complete(hand: HandModel, tree: Tree, options: HandOptions) -> HandModel:
         seen = replace(hand, closing=_closing_seen(hand, stated))
         if (jaws := find_jaws(seen)) is not None:
             return _gripper(seen, jaws, tree, options)
-        # Fingertips that slide are known by the surfaces that come together.
+        # Sliding fingertips are identified by the surfaces that come together.
         hand = replace(hand, closing=np.where(slide, seen.closing, hand.closing))
     for _ in range(LOOKS):
         hand = _with_palm(hand, tree, options)
         hand = replace(hand, closing=np.where(slide, hand.closing, closing_by_tips(hand)))
-    # What is stated of one joint changes no guess of another.
+    # A stated joint does not change the guess of another.
     return _with_palm(replace(hand, closing=_with(hand.closing, stated)), tree, options)
 
 
 def _with(closing: Floats, stated: Mapping[int, float]) -> Floats:
-    """(D,) the closing, as stated where it is."""
+    """Return closing (D,) with the stated values."""
     closing = closing.copy()
     for dof, direction in stated.items():
         closing[dof] = np.sign(direction)
@@ -69,7 +69,7 @@ def _with(closing: Floats, stated: Mapping[int, float]) -> Floats:
 
 
 def _with_palm(hand: HandModel, tree: Tree, options: HandOptions) -> HandModel:
-    """The hand with the preshape and the palm that follow from its closing."""
+    """Add the preshape and palm that follow from the hand's closing."""
     approach = _stated_approach(hand, tree, options)
     if approach is None:
         approach = _guess_approach(hand)
@@ -78,7 +78,7 @@ def _with_palm(hand: HandModel, tree: Tree, options: HandOptions) -> HandModel:
 
 
 def _gripper(hand: HandModel, jaws: Jaws, tree: Tree, options: HandOptions) -> HandModel:
-    """The hand with what its jaws tell: it comes open, the pads ahead, and takes hold between them."""
+    """Set up a gripper from its jaws: approach open, pads ahead, grasp between them."""
     approach = _stated_approach(hand, tree, options)
     if approach is None:
         approach = _approach_of_jaws(hand, jaws)
@@ -89,23 +89,23 @@ def _gripper(hand: HandModel, jaws: Jaws, tree: Tree, options: HandOptions) -> H
         between = jaws.middle[len(jaws.middle) // 2]
         corners = [piece.vertices for piece in hand.pieces if piece.body == 0]
         height = float((np.concatenate(corners) @ approach).max()) if corners else 0.0
-        # A jaw that is part of the palm reaches as far as the pads do.
+        # If one jaw is part of the palm, the palm ends at the pads.
         centre = between + min(height - float(between @ approach), 0.0) * approach
         return replace(hand, palm=PalmFrame(centre, approach))
     return replace(hand, palm=_palm(hand, tree, options, approach))
 
 
 def _approach_of_jaws(hand: HandModel, jaws: Jaws) -> Floats:
-    """Direction ahead of a gripper: across its joints' axes and the line on which it closes, where it has hinges."""
+    """Return the approach of a gripper: perpendicular to the closing line and the axes of hinges."""
     ahead, axis = _unit(_ahead(hand, jaws)), jaws.axis[len(jaws.q) // 2]
     if (line := _line_of_joints(hand, ahead, ROUGH, 2, axis)) is not None:
         return line
-    # A root frame that the jaws do not close along says nothing.
+    # A root frame that is not aligned with the closing line gives no information.
     return _snapped(ahead) if _angle(axis, _root_axis(axis)) < GOOD else ahead
 
 
 def _ahead(hand: HandModel, jaws: Jaws) -> Floats:
-    """Direction from the palm to between the pads, across the line on which they close."""
+    """Return the direction from the palm to between the pads, perpendicular to the closing line."""
     half = len(jaws.q) // 2
     poses = body_poses(hand, IDENTITY_POSE, hand.expand(jaws.q[half]))[0]
     palm = [piece.vertices.mean(axis=0) for piece in hand.pieces if piece.body == 0]
@@ -115,7 +115,7 @@ def _ahead(hand: HandModel, jaws: Jaws) -> Floats:
 
 
 def _closing_seen(hand: HandModel, stated: Mapping[int, float]) -> Floats:
-    """Closing of a hand that may be a gripper: as stated, else as its surfaces come together, else by its limits.
+    """Return closing of a possible gripper: as stated, else from facing surfaces, else from limits.
 
     Raises:
         HandError: fingers slide, and nothing opposes them.
@@ -130,7 +130,7 @@ def _closing_seen(hand: HandModel, stated: Mapping[int, float]) -> Floats:
 
 
 def _fingertips(hand: HandModel, tree: Tree, options: HandOptions) -> tuple[int, ...]:
-    """Bodies of the stated links, else the leaves of the tree."""
+    """Return the bodies of the stated links, else the leaves of the tree."""
     for name in options.fingertips:
         if name not in tree.known:
             raise HandError(f"the hand has no link {name!r} to be a fingertip{did_you_mean(name, tree.links)}")
@@ -141,22 +141,22 @@ def _fingertips(hand: HandModel, tree: Tree, options: HandOptions) -> tuple[int,
 
 
 def _guess_approach(hand: HandModel) -> Floats:
-    """Direction out of the palm: see `_witnessed`."""
+    """Return the direction out of the palm, see `_witnessed`."""
     return _witnessed(hand)[0]
 
 
 def approach_is_tied(hand: HandModel) -> bool:
-    """Whether nothing tells on which side of its fingers a hand takes hold."""
+    """Check whether the side of the fingers on which the hand grasps is undetermined."""
     return _witnessed(hand)[1]
 
 
 def _witnessed(hand: HandModel) -> tuple[Floats, bool]:
-    """Direction out of the palm, and whether that is a tie.
+    """Return the direction out of the palm, and whether it is a tie.
 
-    Two witnesses: the mean way of the fingertips as the hand closes, which points out of a human-like palm; and where
-    the tips of the half-closed hand are, which is ahead of the palm on a gripper but also far along the fingers of a
-    human-like hand. Their sum errs least. Where fingers oppose each other the ways of their tips cancel, and what is
-    left of them is sideways or rounding noise: see `_between_fingers`.
+    There are two estimates. The mean motion of the fingertips during closing points out of a human-like palm. The
+    position of the tips of the half-closed hand is ahead of a gripper's palm, but also far along the fingers of a
+    human-like hand. Their sum errs least. If fingers oppose each other, the tip motions cancel to a sideways residual
+    or rounding noise: see `_between_fingers`.
     """
     ways, ahead = _ways(hand), _unit(_tips_ahead(hand))
     if _cancelling(ways, ahead) < OPPOSED:
@@ -169,12 +169,12 @@ def _witnessed(hand: HandModel) -> tuple[Floats, bool]:
 
 
 def _ways(hand: HandModel) -> Floats:
-    """(T, 3) ways of the fingertips as the hand closes."""
+    """Return the displacements (T, 3) of the fingertips during closing."""
     return tips(hand, posture(hand, 0.4)) - tips(hand, posture(hand, 0.05))
 
 
 def _tips_ahead(hand: HandModel) -> Floats:
-    """(3,) from the middle of the palm to that of the tips of the half-closed hand."""
+    """Return the vector (3,) from the middle of the palm to that of the tips of the half-closed hand."""
     body = carriers(hand)[-1]
     pose = body_poses(hand, IDENTITY_POSE, hand.expand(posture(hand, 0.6)))[0, body]
     palm = [apply(pose, piece.vertices.mean(axis=0)) for piece in hand.pieces if piece.body == body]
@@ -182,17 +182,16 @@ def _tips_ahead(hand: HandModel) -> Floats:
 
 
 def _cancelling(ways: Floats, ahead: Floats) -> float:
-    """Share of the tips' ways across `ahead` that their sum keeps: 0 where fingers close around an axis, 1 where all go
-    the same way."""
+    """Return the length of the sum of tip motions across `ahead` over the sum of their lengths.
+    It is 0 if fingers close around an axis, 1 if all move the same way."""
     axis = _unit(ahead)
     across = ways - np.outer(ways @ axis, axis)
     return float(np.linalg.norm(across.sum(axis=0)) / max(np.linalg.norm(across, axis=1).sum(), 1e-12))
 
 
 def _between_fingers(hand: HandModel) -> tuple[Floats, bool]:
-    """Direction out of the palm of a hand whose fingers oppose each other: from where they begin to their half-closed
-    tips, across the line on which they close if they do so on one; and whether that is a tie, since they lie in the
-    plane in which they begin."""
+    """Return the direction out of the palm of a hand with opposed fingers, and whether it is a tie.
+    It runs from finger bases to half-closed tips, perpendicular to a common closing line; coplanar points are a tie."""
     body = carriers(hand)[-1]
     q = posture(hand, 0.5)
     poses = body_poses(hand, IDENTITY_POSE, hand.expand(q))[0]
@@ -201,14 +200,14 @@ def _between_fingers(hand: HandModel) -> tuple[Floats, bool]:
     spread = float(np.linalg.norm(bases - bases.mean(axis=0), axis=1).max())
     tied = bool(np.linalg.norm(along) < LEAST_AHEAD * max(spread, 1e-6))
     if tied:
-        # The plane's normal is known, its side is not: one is taken, and told.
+        # The plane's normal has no preferred side: one is chosen and reported as a tie.
         normal = np.linalg.svd(np.vstack([bases, ends]) - bases.mean(axis=0))[2][-1]
         along = normal * sign_of(normal)
     else:
         ways = _ways(hand)
         _, strength, lines = np.linalg.svd(ways - ways.mean(axis=0))
         if len(ways) > 1 and strength[1] < SIDEWAYS * strength[0]:
-            # More fingers on one side than on the other shift the middle of their tips.
+            # Unequal numbers of fingers on the two sides shift the mean of their tips.
             along = along - (along @ lines[0]) * lines[0]
     along = _unit(along)
     line = _line_of_joints(hand, along, GOOD, 2)
@@ -218,16 +217,16 @@ def _between_fingers(hand: HandModel) -> tuple[Floats, bool]:
 def _line_of_joints(
     hand: HandModel, rough: Floats, within: float, least: int, beside: Floats | None = None
 ) -> Floats | None:
-    """The direction that most axes of joints, and lines across two of them, agree on near a rough one.
+    """Return the direction near a rough one that most joint axes, and perpendiculars of two, share.
 
-    The hand tells its own directions, however its root frame is turned.
+    It is independent of the orientation of the hand's root frame.
 
     Args:
         hand: the hand.
         rough: (3,) unit.
-        within: how near to it [degrees].
-        least: how many must agree; else None.
-        beside: (3,) another line, such as that on which jaws close.
+        within: largest angle to it [degrees].
+        least: required number of agreeing directions; else None.
+        beside: (3,) another line, such as the closing line of jaws.
     """
     body = hand.joint_body[:_JOINTS]
     pose = body_poses(hand, IDENTITY_POSE, hand.expand(np.clip(0.0, hand.lower, hand.upper)))[0, body]
@@ -247,19 +246,19 @@ def _line_of_joints(
 
 
 def _snapped(mean: Floats, within: float = ROUGH) -> Floats:
-    """The direction as a unit vector, on a root axis where it is `within` so many degrees of one."""
+    """Normalise a direction; replace it by a root axis `within` so many degrees of it."""
     axis = _root_axis(mean)
     return axis if _angle(mean, axis) < within else _unit(mean)
 
 
 def _root_axis(direction: Floats) -> Floats:
-    """The root axis, either way, that is nearest to a direction."""
+    """Return the root axis, of either sign, nearest to a direction."""
     axis = int(np.argmax(np.abs(direction)))
     return np.asarray(np.sign(direction[axis]) * np.eye(3)[axis])
 
 
 def _angle(one: Floats, other: Floats) -> float:
-    """Between two directions [degrees]."""
+    """Return the angle between two directions [degrees]."""
     return float(np.rad2deg(np.arctan2(np.linalg.norm(np.cross(one, other)), one @ other)))
 
 
@@ -268,7 +267,7 @@ def _unit(vector: Floats) -> Floats:
 
 
 def _stated_approach(hand: HandModel, tree: Tree, options: HandOptions) -> Floats | None:
-    """In the root frame, the joints between root and palm at rest."""
+    """Return the stated approach in the root frame, with the joints between root and palm at rest."""
     stated = options.palm.approach if options.palm and options.palm.approach else options.approach
     if stated is None:
         return None
@@ -291,7 +290,7 @@ def _palm_link(tree: Tree, options: HandOptions) -> tuple[int, Floats]:
 
 
 def _palm(hand: HandModel, tree: Tree, options: HandOptions, approach: Floats) -> PalmFrame:
-    """The stated palm; else the point where a ray between the finger bases leaves the palm along the approach."""
+    """Return the stated palm; else the point where a ray between the finger bases leaves the palm."""
     body, link_pose = _palm_link(tree, options)
     poses = body_poses(hand, IDENTITY_POSE, hand.expand(hand.preshape))[0]
     pose = compose(poses[body], link_pose)
@@ -308,7 +307,7 @@ def _palm(hand: HandModel, tree: Tree, options: HandOptions, approach: Floats) -
     height = float((corners @ approach).max())
     centre = through + (height - through @ approach) * approach
     if len(bases):
-        # Beneath what the half-closed fingers reach over.
+        # Below the region that the half-closed fingers cover.
         beneath = (bases.mean(axis=0) + tips(hand, posture(hand, 0.5)).mean(axis=0)) / 2
         surface = _leaves(parts, beneath, approach)
         if surface is not None and surface < height - RIM_M:
@@ -317,13 +316,13 @@ def _palm(hand: HandModel, tree: Tree, options: HandOptions, approach: Floats) -
 
 
 def _leaves(parts: Sequence[Floats], point: Floats, direction: Floats) -> float | None:
-    """How far along `direction` a line through `point` leaves the last of some convex parts (V, 3); None: it meets
-    none."""
+    """Return the distance along `direction` at which a line through `point` leaves the last convex part.
+    Parts are (V, 3); None if it meets none."""
     ends = []
     for corners in parts:
         planes = recalled("planes", [corners], partial(_planes, corners))["0"]
         rate, room = planes[:, :3] @ direction, -(planes[:, :3] @ point + planes[:, 3])
-        # Planes along the line bound nothing; those that the point lies outside of are not met at all.
+        # Planes parallel to the line bound nothing; a part whose parallel plane excludes the point is not met.
         across = np.abs(rate) > 1e-9
         first = np.max(room[across & (rate < 0)] / rate[across & (rate < 0)], initial=-np.inf)
         last = np.min(room[across & (rate > 0)] / rate[across & (rate > 0)], initial=np.inf)
@@ -333,7 +332,7 @@ def _leaves(parts: Sequence[Floats], point: Floats, direction: Floats) -> float 
 
 
 def _planes(corners: Floats) -> list[Floats]:
-    """One array (F, 4): planes n x + d <= 0 of the hull of corners (V, 3)."""
+    """Return one array (F, 4): planes n x + d <= 0 of the hull of corners (V, 3)."""
     from scipy.spatial import ConvexHull  # slow to load
 
     return [np.asarray(ConvexHull(corners).equations)]
@@ -352,7 +351,7 @@ def _preshape(hand: HandModel, tree: Tree, options: HandOptions, share: float = 
 
 
 def _by_dof(hand: HandModel, tree: Tree, values: Mapping[str, float]) -> list[tuple[int, float]]:
-    """(dof, value) of named joints; those that were frozen, coupled or dropped have no say any more."""
+    """Return (dof, value) of named joints, without those that were frozen, coupled or dropped."""
     for name in values:
         if name not in tree.known:
             known = ", ".join(hand.dof_names[:8]) + (", ..." if hand.dofs > 8 else "")

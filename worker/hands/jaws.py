@@ -1,8 +1,7 @@
-"""The jaws of a gripper and the pads of a hand: which surfaces meet when it closes, how far they open, along which
-line.
+"""Jaws of a gripper and pads of a hand: surfaces that meet on closing, their opening and closing line.
 
 A gripper is a hand whose closing is one motion of at most two degrees of freedom that brings opposing surfaces, the
-pads, together. Everything is found from geometry, so a joint at 0 may as well be open as closed.
+pads, together. Everything follows from geometry, so a joint at 0 may be open or closed.
 """
 
 from __future__ import annotations
@@ -25,35 +24,35 @@ Ints = NDArray[np.intp]
 
 #: Most degrees of freedom of a gripper's closing.
 MAX_DOFS: Final = 2
-#: Points that stand for the hand's surface.
+#: Number of points that represent the hand's surface.
 _POINTS: Final = 1600
-#: Two surfaces face each other where their normals are opposite to within 37 degrees ...
+#: Two surfaces face each other if their normals are opposite to within 37 degrees ...
 _FACING_COS: Final = 0.8
-#: ... and one lies before the other, no farther to the side than so many distances between sample points.
+#: ... and one is in front of the other, with a lateral offset of at most so many distances between sample points.
 _ASIDE: Final = 1.5
-#: Of facing surfaces the ones that come together count: those with this share of the fastest approach.
+#: Facing surfaces count if they approach each other with at least this share of the fastest speed.
 _FAST: Final = 0.5
-#: A pad is what of a jaw lies within this of the place that touches first [m].
+#: A pad is the part of a jaw within this distance of the first contact [m].
 _PAD_DEPTH_M: Final = 0.003
-#: Shares of the limits at which the hand is looked at for surfaces that others hide.
+#: Shares of the limits at which the hand is checked for hidden surfaces.
 _LOOKS: Final = (0.5, 0.02, 0.98)
-#: Surfaces look where they go if they move along their normals with this share of the fastest point's speed.
+#: Surfaces lead if they move along their normals with at least this share of the fastest point's speed.
 _LEADING: Final = 0.3
-#: A body carries a pad if it faced the other jaw with this share of the area of the one that faced it most.
+#: A body carries a pad if the area that faced the other jaw is at least this share of the largest such area.
 _PAD_SHARE: Final = 0.4
-#: Postures between open and closed that are looked at.
+#: Number of postures between open and closed.
 _STEPS: Final = 17
-#: Pads face each other where the difference of their mean normals is longer than this: up to 120 degrees between them.
+#: Pads face each other if the difference of their mean normals is longer than this: up to 120 degrees between them.
 _TOWARDS: Final = 1.0
-#: Pads that are this near touch [m].
+#: Pads nearer than this touch [m].
 _TOUCH_M: Final = 2e-4
-#: Least over greatest singular value of the ends' motions from which on they are in no plane.
+#: Least ratio of smallest to largest singular value of the ends' motions at which these are not planar.
 _IN_SPACE: Final = 0.2
 
 
 @dataclass(frozen=True)
 class Jaws:
-    """What closes in a gripper. K postures from open to where the pads meet, or as near as the limits let them."""
+    """Closing motion of a gripper: K postures from open to contact of the pads, or to the limits."""
 
     q: Floats
     """(K, D) dof values."""
@@ -64,28 +63,28 @@ class Jaws:
     axis: Floats
     """(K, 3) unit vector from the first pad to the second, root frame."""
     speed: Floats
-    """(K, D, 2) way of each pad towards the other one with each dof [m/rad or 1]."""
+    """(K, D, 2) motion of each pad towards the other per dof [m/rad or 1]."""
     bodies: tuple[tuple[int, ...], tuple[int, ...]]
-    """Bodies that carry the first and the second pad; 0 is the root, a jaw that stands still."""
+    """Bodies that carry the first and the second pad; 0 is the root, a jaw that does not move."""
     points: SurfacePoints
     """Points on both pads."""
     first: NDArray[np.bool_]
-    """(P,) which of them are on the first."""
+    """(P,) mask of those on the first pad."""
     length: float
-    """Extent of the pads along the approach that they were found with [m]."""
+    """Extent of the pads along the approach that was given [m]."""
 
     @cached_property
     def opening(self) -> float:
-        """Widest clear width [m]."""
+        """Return the largest clear width [m]."""
         return float(self.width.max())
 
     def speeds(self, q: Floats) -> Floats:
-        """(n, D, 2) `speed` at dof values (n, D)."""
+        """Return `speed` (n, D, 2) at dof values (n, D)."""
         apart = np.linalg.norm((q[:, None] - self.q) / np.maximum(np.ptp(self.q, axis=0), 1e-9), axis=2)
         return self.speed[np.argmin(apart, axis=1)]
 
     def at(self, width: Floats) -> tuple[Floats, Floats, Floats]:
-        """Dof values (n, D), middles (n, 3) and axes (n, 3) at clear widths (n,), or at the nearest there is."""
+        """Return dof values (n, D), middles (n, 3) and axes (n, 3) at the available widths nearest to (n,)."""
         order = np.argsort(self.width, kind="stable")
         q, middle, axis = (
             np.column_stack([np.interp(width, self.width[order], column[order]) for column in array.T])
@@ -95,10 +94,10 @@ class Jaws:
 
 
 def closing_by_geometry(hand: HandModel) -> Floats:
-    """(D,) +1, -1: the direction in which each dof brings opposing surfaces together; 0: it moves none together.
+    """Return (D,) +1, -1: the direction in which each dof brings opposing surfaces together; 0: none.
 
-    Summed over postures from all dofs at their lower limits to all at their upper ones, the area of facing surfaces
-    times the speed at which they part; what is left after both signs have cancelled decides.
+    The sign is that of a sum over postures from all dofs at their lower to all at their upper limits: the area of
+    facing surfaces times the speed at which they separate.
     """
     points = _points(hand)
     balance, total = np.zeros(hand.dofs), np.zeros(hand.dofs)
@@ -110,7 +109,7 @@ def closing_by_geometry(hand: HandModel) -> Floats:
         first, second, _ = _facing(place, normal, points, np.flatnonzero(moved))
         for dof, motion in enumerate(motions):
             rate = np.einsum("ni,ni->n", motion[second] - motion[first], normal[first])
-            # What slides along has rounding for a rate.
+            # The rate of surfaces that slide along each other is rounding noise.
             rate[np.abs(rate) < 1e-3 * np.abs(motion).max(initial=1e-12)] = 0.0
             balance[dof] += points.area[first] @ rate
             total[dof] += points.area[first] @ np.abs(rate)
@@ -118,7 +117,7 @@ def closing_by_geometry(hand: HandModel) -> Floats:
 
 
 def jaws_of(hand: HandModel) -> Jaws | None:
-    """The jaws of a complete hand, or None where it is no gripper; from memory where they were asked for before."""
+    """Return the jaws of a complete hand, cached; None if it is no gripper."""
     with _lock:
         if hand.content not in _found:
             _found[hand.content] = find_jaws(hand, hand.palm.approach)
@@ -130,8 +129,8 @@ _lock = threading.Lock()
 
 
 def find_jaws(hand: HandModel, approach: Floats | None = None) -> Jaws | None:
-    """The jaws of a hand whose `closing` is known; None where more dofs close it, nothing opposes, or more than two
-    digits close from more than two sides: those hold as a hand does."""
+    """Find the jaws of a hand with known `closing`; None if it is planned as a hand.
+    That is: more dofs close it, nothing opposes, or more than two digits close from more than two sides."""
     closing = np.flatnonzero(hand.closing)
     if not 1 <= len(closing) <= MAX_DOFS or hand.dofs > MAX_DOFS:
         return None
@@ -152,13 +151,13 @@ def find_jaws(hand: HandModel, approach: Floats | None = None) -> Jaws | None:
 
 
 def _points(hand: HandModel) -> SurfacePoints:
-    """The hand's surface, seen in the posture that hides least of it: in closed jaws the pads may lie in each other."""
+    """Sample the hand's surface in the posture that hides least of it: pads of closed jaws may overlap."""
     seen = [sample_surface(replace(hand, preshape=hand.lower + share * hand.span), _POINTS) for share in _LOOKS]
     return seen[int(np.argmax([points.area.sum() for points in seen]))]
 
 
 def _path(hand: HandModel, shares: Floats) -> Floats:
-    """(K, D) from open (0) to closed (1); a dof that closes nothing stays."""
+    """Return postures (K, D) from open (0) to closed (1); a dof that closes nothing is constant."""
     opened = np.where(hand.closing < 0, hand.upper, hand.lower)
     closed = np.where(hand.closing < 0, hand.lower, hand.upper)
     rest = np.clip(0.0, hand.lower, hand.upper)
@@ -172,19 +171,19 @@ def _posed(hand: HandModel, points: SurfacePoints, q: Floats) -> tuple[Floats, F
 
 
 def _motion(hand: HandModel, points: SurfacePoints, q: Floats, dof: int) -> Floats:
-    """(N, 3) derivative of the points by a dof [m/rad or 1]."""
+    """Return the derivative (N, 3) of the points by a dof [m/rad or 1]."""
     step = np.zeros(hand.dofs)
     step[dof] = 1e-4 * max(float(hand.span[dof]), 1e-3)
     return (_posed(hand, points, q + step)[0] - _posed(hand, points, q - step)[0]) / (2 * step[dof])
 
 
 def _ahead(motion: Floats, normal: Floats) -> Floats:
-    """(N,) speed of points along their normals, either way, over that of the fastest point."""
+    """Return the speed (N,) of points along their normals, of either sign, over that of the fastest point."""
     return np.asarray(np.abs(np.einsum("ni,ni->n", motion, normal)) / np.abs(motion).max(initial=1e-12))
 
 
 def _facing(place: Floats, normal: Floats, points: SurfacePoints, among: Ints) -> tuple[Ints, Ints, Floats]:
-    """Those of the points `among`, for each the nearest one of another body that faces it, and the gap [m]."""
+    """Return the points of `among` that face another body, the nearest one of each, and the gap [m]."""
     aside = _ASIDE * np.sqrt(points.area.sum() / len(points))
     first, second, gaps = [], [], []
     for i in among:
@@ -202,8 +201,8 @@ def _facing(place: Floats, normal: Floats, points: SurfacePoints, among: Ints) -
 
 
 def _is_centric(hand: HandModel, points: SurfacePoints, path: Floats) -> bool:
-    """Whether three digits or more close around a place, as those of a centric gripper do. Jaws, and the links of their
-    mechanisms, move in one plane, that of the jaws and the approach; digits around a place move in space."""
+    """Check whether three or more digits close around a place, as in a centric gripper.
+    Jaws and their linkages move in the plane of jaws and approach; digits around a place move in space."""
     ends = [body for body in set(points.body.tolist()) if body not in hand.parent]
     if len(ends) < 3:
         return False
@@ -215,8 +214,8 @@ def _is_centric(hand: HandModel, points: SurfacePoints, path: Floats) -> bool:
 
 
 def _meeting(hand: HandModel, points: SurfacePoints, path: Floats) -> tuple[Floats, Ints, Ints, Floats] | None:
-    """The posture in which the pads meet, or the last of the path; the pairs of points that meet first; and (L,) the
-    area of each body that faced another one while they were apart, summed over postures."""
+    """Return the posture in which the pads meet, or the last of the path, and the first pairs of contact.
+    Also return the area (L,) of each body that faced another before contact, summed over postures."""
     best: tuple[Floats, Ints, Ints, Floats] | None = None
     step, faced = path[-1] - path[0], np.zeros(hand.bodies)
     for k in range(len(path)):
@@ -236,7 +235,7 @@ def _meeting(hand: HandModel, points: SurfacePoints, path: Floats) -> tuple[Floa
         best = path[k], first[soonest], second[soonest], faced
         left = float(np.quantile(when, 0.02))
         if left < 1.0 / (_STEPS - 1):
-            # They meet before the next posture.
+            # Contact is before the next posture.
             return np.clip(path[k] + left * step, hand.lower, hand.upper), first[soonest], second[soonest], faced
     return best
 
@@ -244,8 +243,8 @@ def _meeting(hand: HandModel, points: SurfacePoints, path: Floats) -> tuple[Floa
 def _sides(
     place: Floats, normal: Floats, points: SurfacePoints, every: Ints, faced: Floats
 ) -> tuple[Ints, Ints] | None:
-    """Points of the two pads, or None where they are not on different bodies."""
-    # The line along which most of the pads' area looks.
+    """Return the points of the two pads, or None if they are not on different bodies."""
+    # The line of the normals of most of the pads' area.
     values, vectors = np.linalg.eigh((points.area[every, None] * normal[every]).T @ normal[every])
     line = vectors[:, int(np.argmax(values))]
     line = -sign_of(line) * line
@@ -253,21 +252,21 @@ def _sides(
     one, two = (_on_pads(side, points, faced) for side in (every[along > _FACING_COS], every[along < -_FACING_COS]))
     if not len(one) or not len(two) or set(points.body[one]) & set(points.body[two]):
         return None
-    # The first pad looks at the second one: it lies on the lower side of the line, that of the larger coordinate.
+    # The first pad faces the second: it has the lower coordinate along the line.
     return (one, two) if (place[one].mean(axis=0) @ line) <= place[every].mean(axis=0) @ line else (two, one)
 
 
 def sign_of(line: Floats) -> float:
-    """1, or -1 where a line's largest component is negative; of equally large ones the first counts.
+    """Return -1 if a line's largest component is negative, else 1; the first of equally large ones counts.
 
-    The sign that a decomposition gives to a vector is rounding noise.
+    The sign of a vector from a decomposition is rounding noise.
     """
     size = np.abs(line)
     return float(np.sign(line[int(np.argmax(size > (1 - 1e-6) * size.max()))]))
 
 
 def _on_pads(side: Ints, points: SurfacePoints, faced: Floats) -> Ints:
-    """Points of a side on the bodies that faced the other one most: not on a link that only comes near in the end."""
+    """Select points of a side on bodies that faced the other most, not on links near only at the end."""
     most = float(faced[points.body[side]].max(initial=0.0))
     return side[faced[points.body[side]] >= _PAD_SHARE * most]
 
@@ -275,14 +274,14 @@ def _on_pads(side: Ints, points: SurfacePoints, faced: Floats) -> Ints:
 def _measured(
     hand: HandModel, points: SurfacePoints, sides: tuple[Ints, Ints], path: Floats, approach: Floats | None
 ) -> Jaws | None:
-    """Widths, middles and axes of the pads on a path; None where they never look at each other."""
+    """Measure widths, middles and axes of the pads on a path; None if they never face each other."""
     one, two = sides
     width, middle, axes = np.zeros(len(path)), np.zeros((len(path), 3)), np.zeros((len(path), 3))
     speed, facing = np.zeros((len(path), hand.dofs, 2)), np.zeros(len(path), bool)
     for k, q in enumerate(path):
         place, normal = _posed(hand, points, q)
         axis = normal[one].mean(axis=0) - normal[two].mean(axis=0)
-        # Pads that look past each other hold nothing: jaws are not opened that far.
+        # Pads that do not face each other hold nothing: jaws are not opened that far.
         facing[k] = float(np.linalg.norm(axis)) > _TOWARDS
         axis /= max(float(np.linalg.norm(axis)), 1e-9)
         low, high = place[one] @ axis, place[two] @ axis
@@ -313,36 +312,36 @@ def _measured(
 
 
 def slides(hand: HandModel) -> NDArray[np.bool_]:
-    """(D,) whether a dof drives a prismatic joint: its unit is the metre."""
+    """Return a mask (D,) of the dofs that drive prismatic joints: their unit is the metre."""
     return np.array([JointType.PRISMATIC in hand.joint_type[hand.dof == d] for d in range(hand.dofs)])
 
 
-#: Share of a fingertip's speed, and so of its length, within which its points are its pad.
+#: The pad of a fingertip is the part within this share of the tip's largest speed, and so of its length.
 PAD: Final = 0.5
 #: Least cosine of a pad's normals with its motion.
 _AHEAD: Final = 0.7
-#: Directions in which a fingertip is measured.
+#: Number of directions in which a fingertip is measured.
 _DIRECTIONS: Final = 256
 
-#: Points of the hand's surface that pads are made of.
+#: Number of surface points for the pads.
 _PAD_POINTS: Final = 1000
 
 
 @dataclass(frozen=True)
 class Pad:
-    """A part of a body's surface that presses; in the body's frame."""
+    """Part of a body's surface that presses, in the body's frame."""
 
     body: int
     centre: Floats
     """(3,) [m]"""
     normal: Floats
-    """(3,) unit: where it presses."""
+    """(3,) unit: pressing direction."""
     points: Floats
-    """(P, 3) of the surface [m]; none where the body has no shape."""
+    """(P, 3) surface points [m]; empty if the body has no shape."""
 
 
 def pads_of(hand: HandModel) -> tuple[Pad, ...]:
-    """The surfaces of a gripper that meet; of another hand the inner sides of its fingertips."""
+    """Return the pads of a gripper, or the inner sides of a hand's fingertips."""
     jaws = jaws_of(hand)
     if jaws is None:
         return tuple(fingertip_pad(hand, tip) for tip in hand.fingertips)
@@ -356,7 +355,7 @@ def pads_of(hand: HandModel) -> tuple[Pad, ...]:
 
 
 def fingertip_pad(hand: HandModel, tip: int) -> Pad:
-    """Where and whereto a fingertip presses: the end of the side that its last joint moves ahead."""
+    """Return the pad of a fingertip: the end of the side that its last joint moves forward."""
     points = sample_surface(hand, _PAD_POINTS)
     mine = points.body == tip
     place, normal = points.position[mine], points.normal[mine]
@@ -367,10 +366,10 @@ def fingertip_pad(hand: HandModel, tip: int) -> Pad:
     driven = [b for b in chain if hand.closing[hand.dof[b]] != 0] or chain
     if not len(place) or not driven:
         return Pad(tip, np.zeros(3), np.array([0.0, 0, 1]), np.zeros((0, 3)))
-    # A joint that turns the tip about itself moves no side of it ahead: then one nearer to the palm tells.
+    # A joint that turns the tip about itself moves no side forward: then a joint nearer to the palm decides.
     chosen = next((part for body in driven if (part := _moved_ahead(hand, tip, body, place, normal)).any()), None)
     if chosen is None:
-        # Nothing tells; normals of a whole tip would cancel to rounding noise. The palm looks at what is held.
+        # No joint decides, and normals of a whole tip cancel to rounding noise: use the side that the palm faces.
         ahead = quat_rotate(quat_conjugate(_pose(hand, tip)[3:]), hand.palm.approach)
         chosen = normal @ ahead > _AHEAD
         if not chosen.any():
@@ -380,7 +379,7 @@ def fingertip_pad(hand: HandModel, tip: int) -> Pad:
 
 
 def thinnest_fingertip(hand: HandModel) -> float:
-    """Least width of a fingertip in any direction [m]; 0 where one has no shape."""
+    """Return the least width of a fingertip in any direction [m]; 0 if one has no shape."""
     ways, tips = spread_directions(_DIRECTIONS), []
     for tip in hand.fingertips:
         corners = [piece.vertices for piece in hand.pieces if piece.body == tip]
@@ -389,7 +388,7 @@ def thinnest_fingertip(hand: HandModel) -> float:
 
 
 def _moved_ahead(hand: HandModel, tip: int, driven: int, place: Floats, normal: Floats) -> NDArray[np.bool_]:
-    """(P,) points of a tip that the joint of a body moves along their normals, and of those the fastest."""
+    """Return a mask (P,) of the fastest points of a tip that a body's joint moves along their normals."""
     dof = int(hand.dof[driven])
     step = np.zeros(hand.dofs)
     step[dof] = 1e-4 * (hand.closing[dof] or 1.0)

@@ -1,4 +1,4 @@
-"""Forward kinematics and the transposed Jacobian of a hand in float64 NumPy: the reference of the kernels."""
+"""Forward kinematics and transposed Jacobian of a hand in float64 NumPy: reference of the kernels."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from graspd.worker.hands.model import HandModel, JointType
 
 
 def body_poses(hand: HandModel, hand_pose: Floats, joint_positions: Floats) -> Floats:
-    """Poses of all bodies.
+    """Compute the poses of all bodies.
 
     Args:
         hand: the hand.
@@ -39,7 +39,7 @@ def body_poses(hand: HandModel, hand_pose: Floats, joint_positions: Floats) -> F
 
 @lru_cache(maxsize=64)
 def _levels(parents: bytes) -> tuple[NDArray[np.intp], ...]:
-    """Bodies in the order of their distance from the root, those of one distance together; the root left out."""
+    """Group bodies by their distance from the root, in ascending order and without the root."""
     parent = np.frombuffer(parents, np.int32)
     depth = np.zeros(len(parent), int)
     for body in range(1, len(parent)):
@@ -48,7 +48,7 @@ def _levels(parents: bytes) -> tuple[NDArray[np.intp], ...]:
 
 
 def ancestors(hand: HandModel) -> NDArray[np.bool_]:
-    """(L, L): [a, b] whether the joint of body b moves body a (b itself included, the root not)."""
+    """Return (L, L): [a, b] whether the joint of body b moves body a (b itself included, the root not)."""
     moves = np.zeros((hand.bodies, hand.bodies), dtype=bool)
     for body in range(1, hand.bodies):
         moves[body] = moves[hand.parent[body]]
@@ -59,14 +59,14 @@ def ancestors(hand: HandModel) -> NDArray[np.bool_]:
 def generalized_forces(
     hand: HandModel, bodies: Floats, body: NDArray[np.integer], points: Floats, forces: Floats
 ) -> Floats:
-    """Generalized forces that forces on the hand exert on its dofs, mimicking joints folded in.
+    """Compute generalized forces on a hand's dofs, mimic joints folded in, from forces on its bodies.
 
-    By virtual work: the torque on a dof is the sum over the joints it drives of multiplier times joint torque.
+    By virtual work the torque on a dof is the sum over its joints of multiplier times joint torque.
 
     Args:
         hand: the hand.
         bodies: (..., L, 7) body poses.
-        body: (..., C) the body that each point belongs to.
+        body: (..., C) the body of each point.
         points: (..., C, 3) points in the frame of the poses [m].
         forces: (..., C, E, 3) E forces at each point [N].
 

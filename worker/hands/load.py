@@ -1,4 +1,4 @@
-"""A hand from its files: description, meshes, `asset.json` or `hand.json`, and gains where nobody states any."""
+"""Load a hand from its files: description, meshes, `asset.json` or `hand.json`, and default gains."""
 
 from __future__ import annotations
 
@@ -42,24 +42,24 @@ from graspd.worker.objects.disk_cache import recalling
 
 log = logging.getLogger(__name__)
 
-#: Mass of a link whose URDF gives none, per volume of its pieces [kg/m^3].
+#: Density for the mass of a link whose URDF gives none, from the volume of its pieces [kg/m^3].
 DENSITY = 1000.0
 
 
 def load_hand(
     files: Mapping[str, bytes], *, name: str, digest: str, options: Mapping[str, Any] | None = None, drag: bool = False
 ) -> HandModel:
-    """The hand that `files` describe.
+    """Load the hand in `files`.
 
     Args:
-        files: the URDF, its meshes and, if there is more to say, `asset.json` or `hand.json` (see `parse_options`).
+        files: the URDF, its meshes and optionally `asset.json` or `hand.json` (see `parse_options`).
         name: name of the hand.
         digest: digest of its files.
-        options: keys that go over those in the files.
-        drag: whether its joints have the armature and the dry friction that the files state.
+        options: keys that override those in the files.
+        drag: whether its joints have the armature and dry friction in the files.
 
     Raises:
-        HandError: the files describe no usable hand; the message names what is wrong and the fix.
+        HandError: the files describe no usable hand; the message names the fault and the fix.
     """
     settings = parse_options(files, options)
     main = main_file(files, settings)
@@ -79,7 +79,7 @@ def assemble(
     digest: str,
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> HandModel:
-    """The model of a checked robot and options. Raises TaskCancelled where `run` is cancelled."""
+    """Build the model of a checked robot and options. Raises TaskCancelled if `run` is cancelled."""
     tree = build_tree(robot, options)
     hand = complete(body_model(robot, tree, options, files, main, name=name, digest=digest, run=run), tree, options)
     hand = with_drive(
@@ -99,8 +99,8 @@ def mounting_of(
     hand: HandModel,
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> tuple[HandModel | None, str]:
-    """The links above the hand's root, None where there are none; and why their shapes cannot be read, in words:
-    faults above a hand do not refuse it."""
+    """Return the links above the hand's root, None if there are none, and why their shapes are unreadable.
+    Faults above a hand do not refuse it."""
     tree = mounting_tree(robot, hand.root_link, options)
     if tree is None:
         return None, ""
@@ -129,10 +129,10 @@ def body_model(
     digest: str,
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> HandModel:
-    """Bodies, joints and pieces of a tree, without what makes them a hand: palm, fingers, closing, neighbours.
+    """Build bodies, joints and pieces of a tree, without palm, fingers, closing and neighbours.
 
     Raises:
-        HandError: nothing of it can touch, or a mesh or a number cannot be used.
+        HandError: no part can touch, or a mesh or a number cannot be used.
     """
     base = str(PurePosixPath(main).parent).removeprefix(".")
     pieces = _pieces(robot, tree, files, base, options.shapes == "visual", run)
@@ -179,7 +179,7 @@ def body_model(
 
 
 def main_file(files: Mapping[str, bytes], options: HandOptions) -> str:
-    """Name of the file that describes the hand: as the options say, else the only one."""
+    """Return the name of the file that describes the hand: from the options, else the only one."""
     try:
         return main_of(files, options.file)
     except InputError as error:
@@ -189,7 +189,7 @@ def main_file(files: Mapping[str, bytes], options: HandOptions) -> str:
 def _pieces(
     robot: Robot, tree: Tree, files: Mapping[str, bytes], base: str, as_it_looks: bool, run: ExecutionContext
 ) -> tuple[ConvexPiece, ...]:
-    """Of the collision elements; or, as it looks, of a link's visual ones, where it has both."""
+    """Make the pieces of collision elements; `as_it_looks` uses a link's visual elements if it has both."""
     pieces, hulls = [], Hulls()
     for number, (link, (body, pose)) in enumerate(tree.links.items()):
         run.check("reading the hand")
@@ -214,14 +214,14 @@ def _body_of(tree: Tree, joint: str) -> int:
 
 
 def assumed_efforts(robot: Robot, dofs: Sequence[str], options: HandOptions) -> list[str]:
-    """Degrees of freedom whose limit of torque or force nobody states: neither the robot nor the options."""
+    """Return the dofs whose torque or force limit is stated neither by the robot nor by the options."""
     if isinstance(options.effort, float):
         return []
     return [dof for dof in dofs if dof not in (options.effort or {}) and robot.joints[dof].effort <= 0]
 
 
 def _effort(robot: Robot, tree: Tree, options: HandOptions) -> Floats:
-    """(D,) stated, else the robot's own, else assumed."""
+    """Return effort limits (D,): stated, else the robot's own, else assumed."""
     assumed = assumed_efforts(robot, tree.dof_names, options)
     values = []
     for dof in tree.dof_names:
@@ -234,7 +234,7 @@ def _effort(robot: Robot, tree: Tree, options: HandOptions) -> Floats:
 
 
 def stated_gains(robot: Robot, dofs: Sequence[str], options: HandOptions) -> dict[str, float]:
-    """Position gains that somebody states: the options, else the robot's servos."""
+    """Return stated position gains: those of the options, else of the robot's servos."""
     if isinstance(options.stiffness, float):
         return dict.fromkeys(dofs, options.stiffness)
     said = {dof: robot.joints[dof].stiffness for dof in dofs if robot.joints[dof].stiffness}
@@ -242,7 +242,7 @@ def stated_gains(robot: Robot, dofs: Sequence[str], options: HandOptions) -> dic
 
 
 def _stiffness(robot: Robot, tree: Tree, options: HandOptions) -> Floats:
-    """(D,) stated, else assumed."""
+    """Return stiffness (D,): stated, else assumed."""
     stated = stated_gains(robot, tree.dof_names, options)
     values = [stated.get(dof, DEFAULT_STIFFNESS) for dof in tree.dof_names]
     if min(values, default=1.0) <= 0:
@@ -263,7 +263,7 @@ def _masses(robot: Robot, tree: Tree, pieces: tuple[ConvexPiece, ...]) -> Floats
 
 
 def hand_from_path(path: str | Path, options: Mapping[str, Any] | None = None, *, drag: bool = False) -> HandModel:
-    """A hand for the command line: name of a built-in, a URDF, its folder, or a ZIP of that; `drag`: see `load_hand`.
+    """Load a hand for the command line: a built-in's name, URDF, folder, or ZIP; `drag`: see `load_hand`.
 
     Raises:
         NotFoundError: neither a file nor a built-in hand.
@@ -280,7 +280,7 @@ def hand_from_path(path: str | Path, options: Mapping[str, Any] | None = None, *
 
 
 def files_from_path(path: str | Path) -> tuple[str, dict[str, bytes], dict[str, Any]]:
-    """Name, files and further options of a hand: of a URDF, its folder, a ZIP of that, or a built-in's name."""
+    """Return name, files and options of a hand: a URDF, its folder, a ZIP of it, or a built-in's name."""
     path = Path(path)
     if not path.is_file() and str(path) in builtin_names(AssetKind.HAND):
         return str(path), builtin_files(AssetKind.HAND, str(path)), {}
@@ -299,15 +299,15 @@ __all__ = ["files_from_path", "hand_from_path", "load_hand"]
 
 
 def with_drive(hand: HandModel, stated: Collection[str], assumed: Sequence[str]) -> HandModel:
-    """The hand with the defaults of sliding joints and of jaws instead of those of revolute joints.
+    """Replace the defaults of revolute joints by those of sliding joints and jaws.
 
     A dof that moves pads by v [m/rad or 1] along their line gets the gain k v^2, summed over the pads, and the limit
-    f v: at each pad that is k [N/m] and f [N], however the dof is geared to it.
+    f v: at each pad that is k [N/m] and f [N], independent of the gearing.
 
     Args:
         hand: the hand with its palm and closing.
-        stated: dofs whose position gain somebody states: it stays.
-        assumed: dofs whose limit of torque or force nobody states.
+        stated: dofs with a stated position gain, which is retained.
+        assumed: dofs without a stated torque or force limit.
     """
     slide, jaws = slides(hand), jaws_of(hand)
     if jaws is None and not slide.any():

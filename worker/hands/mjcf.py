@@ -1,7 +1,7 @@
-"""Read a hand from MJCF, by MuJoCo itself: its defaults, classes, angles and inertias are what MuJoCo makes of them.
+"""Read a hand from MJCF with MuJoCo, which resolves defaults, classes, angles and inertias.
 
-Bodies become links and their joints a chain of joints, one link between each two. What a hand does not need, and every
-file outside the upload, never reaches MuJoCo: see `worker.hands.mjcf_source`.
+Bodies become links; several joints of a body become a chain of joints with a link between each two. Elements that a
+hand does not need, and files outside the upload, never reach MuJoCo: see `worker.hands.mjcf_source`.
 """
 
 from __future__ import annotations
@@ -25,20 +25,20 @@ from graspd.worker.hands.robot import UNLIMITED_M, Joint, Link, Robot, Shape, bu
 _FREE, _HINGE, _SLIDE = (
     int(kind) for kind in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 )
-#: The colour of a geom that states none: then its material's counts.
+#: Colour of a geom that states none: then its material's colour counts.
 _NAMED_COLOUR: Final = np.array([0.5, 0.5, 0.5, 1.0])
-#: Groups from this on are not drawn by MuJoCo's viewer.
+#: First group that MuJoCo's viewer does not draw.
 _HIDDEN_GROUP: Final = 3
-#: A joint's anchor closer than this to its body's origin is at it [m].
+#: Distance below which a joint's anchor is at its body's origin [m].
 _AT_ORIGIN_M: Final = 1e-12
 
 
 def read_mjcf(files: Mapping[str, bytes], main: str) -> Robot:
-    """Checked contents of an MJCF model.
+    """Read and check an MJCF model.
 
     Raises:
-        HandError: MuJoCo does not take it, or it is no hand; the message names what is wrong.
-        LimitError: larger than a hand is.
+        HandError: MuJoCo rejects it, or it is no hand; the message names the fault.
+        LimitError: larger than a hand.
     """
     text, assets, notes = self_contained(files, main)
     model = _compile(text, assets, main)
@@ -63,7 +63,7 @@ def _compile(text: str, assets: dict[str, bytes], main: str) -> Any:
 
 @dataclass
 class _Reader:
-    """Links and joints of a compiled model, body by body."""
+    """Reader of links and joints of a compiled model, body by body."""
 
     model: Any
     main: str
@@ -87,7 +87,7 @@ class _Reader:
         self.notes += coupled.notes
 
     def roots(self) -> list[int]:
-        """Bodies on the world below which something moves: the others are furniture or objects."""
+        """Return bodies on the world with moving parts below: the others are furniture or objects."""
         model = self.model
         moving = {
             self._top(int(model.jnt_bodyid[j])) for j in range(model.njnt) if int(model.jnt_type[j]) in (_HINGE, _SLIDE)
@@ -107,7 +107,7 @@ class _Reader:
         return body
 
     def joints_of(self, body: int) -> list[int]:
-        """Joints of a body but for the free one of a hand that floats."""
+        """Return the joints of a body without the free joint of a floating hand."""
         first, count = int(self.model.body_jntadr[body]), int(self.model.body_jntnum[body])
         return [j for j in range(first, first + count) if int(self.model.jnt_type[j]) != _FREE]
 
@@ -118,7 +118,7 @@ class _Reader:
         return str(self.model.joint(joint).name) or f"{self.body_name(int(self.model.jnt_bodyid[joint]))}_joint_{joint}"
 
     def body(self, body: int, parent: str, pose: Floats) -> None:
-        """Add a body that hangs on link `parent` at a (7,) pose, and all bodies below it.
+        """Add a body at a (7,) pose on link `parent`, and all bodies below it.
 
         MuJoCo moves a body by its joints one after another, each about its own anchor in the body's frame.
         """
@@ -153,7 +153,7 @@ class _Reader:
             return replace(still, type="ball", fault=fault)
         slides = kind == _SLIDE
         axis = np.asarray(model.jnt_axis[joint], float)
-        # A joint value counts from `ref`, at which the body stands as it is written.
+        # A joint value counts from `ref`, the value in the pose of the file.
         reference = -float(model.qpos0[model.jnt_qposadr[joint]])
         origin = compose(origin, _motion(axis, reference, slides))
         follows = self._mimics.get(joint)
@@ -192,7 +192,7 @@ class _Reader:
         first, count = int(model.body_geomadr[body]), int(model.body_geomnum[body])
         geoms = range(first, first + count) if count else range(0)
         touching = [g for g in geoms if model.geom_contype[g] or model.geom_conaffinity[g]]
-        # Some models leave contacts to pairs: then whatever is in the groups of collision shapes counts.
+        # Some models define contacts by pairs only: then all geoms in the collision groups count.
         touching = touching or [g for g in geoms if self._bare and model.geom_group[g] >= _HIDDEN_GROUP]
         shown = [g for g in geoms if g not in touching and model.geom_group[g] < _HIDDEN_GROUP]
         shown = shown or [g for g in touching if model.geom_group[g] < _HIDDEN_GROUP]
@@ -250,7 +250,7 @@ def _fixed(name: str, parent: str, child: str, origin: Floats) -> Joint:
 
 
 def _ellipsoid(half: Floats) -> tuple[Floats, Any]:
-    """A hull of 162 points on the surface."""
+    """Return a hull of 162 points on the surface."""
     count = 162
     z = 1 - (2 * np.arange(count) + 1) / count
     turn = np.arange(count) * np.pi * (3 - np.sqrt(5))

@@ -1,7 +1,7 @@
-"""Couplings of an MJCF model: joint equalities, fixed tendons, and closed loops as lines of the driving joints.
+"""Couplings of an MJCF model, linear in their drivers: joint equalities, fixed tendons, closed loops.
 
-A four-bar linkage is a tree whose ends `connect` constraints hold together. The loops are solved at values over the
-drivers' ranges, and each passive joint becomes a line of its driver, with the error that this leaves.
+A four-bar linkage is a tree with ends connected by `connect` constraints. The loops are solved over the drivers'
+ranges, and each passive joint is fitted by a line in its driver, with the resulting error.
 """
 
 from __future__ import annotations
@@ -26,19 +26,19 @@ Tendons = dict[str, dict[int, float]]
 
 @dataclass(frozen=True)
 class Couplings:
-    """How the joints of a model hang together."""
+    """Couplings between the joints of a model."""
 
     follows: dict[int, Mimic | float]
-    """What each dependent joint follows, or the value at which an equality holds it."""
+    """Mimic of each dependent joint, or the value at which an equality fixes it."""
     notes: list[str]
-    """What a user must know."""
+    """Notes for the user."""
     tendons: Tendons
     faults: dict[int, str]
-    """Joints whose loop is not solved, and why."""
+    """Joints with an unsolved loop, and the reason."""
 
 
 def couplings(model: Any, name: Callable[[int], str]) -> Couplings:
-    """Those of a compiled model; `name` tells the name of a joint."""
+    """Find the couplings of a compiled model; `name` returns the name of a joint."""
     found: dict[int, Mimic | float] = {}
     notes: list[str] = []
     for equality in range(model.neq):
@@ -64,7 +64,7 @@ def couplings(model: Any, name: Callable[[int], str]) -> Couplings:
 
 
 def _hold_followers(model: Any, found: dict[int, Mimic | float], name: Callable[[int], str]) -> None:
-    """What follows a joint that stands still, stands still."""
+    """Fix the joints that follow a fixed joint."""
     held = {name(joint): value for joint, value in found.items() if isinstance(value, float)}
     while moved := [(j, f) for j, f in found.items() if isinstance(f, Mimic) and f.joint in held]:
         for joint, follows in moved:
@@ -80,7 +80,7 @@ def _note(notes: list[str], text: str) -> None:
 def _couple(
     model: Any, first: int, second: int, polynomial: Any, found: dict[int, Mimic | float], name: Callable[[int], str]
 ) -> str:
-    """first - first0 = p(second - second0), p of degree 4; bent ones are replaced by the line that fits best."""
+    """Couple by first - first0 = p(second - second0); p of degree 4 is replaced by its best line."""
     rest = [float(model.qpos0[model.jnt_qposadr[joint]]) if joint >= 0 else 0.0 for joint in (first, second)]
     if second < 0:
         found[first] = rest[0] + float(polynomial[0])
@@ -100,7 +100,7 @@ def _couple(
 
 
 def _leads_to(joint: int, first: int, found: dict[int, Mimic | float], name: Callable[[int], str]) -> bool:
-    """Whether a joint follows another one, at the end of whatever chain."""
+    """Check whether a joint follows another one through any chain."""
     number = {name(j): j for j in found}
     while isinstance(follows := found.get(joint), Mimic):
         if follows.joint == name(first):
@@ -117,7 +117,7 @@ def _couple_tendons(
     found: dict[int, Mimic | float],
     name: Callable[[int], str],
 ) -> str:
-    """The same for tendons of one joint each: c1 (q1 - q1_0) = p(c2 (q2 - q2_0))."""
+    """Do the same for tendons of one joint each: c1 (q1 - q1_0) = p(c2 (q2 - q2_0))."""
     scaled = np.asarray(model.eq_data[equality, :5]) * other[1] ** np.arange(5) / one[1]
     return _couple(model, one[0], other[0], scaled, found, name)
 
@@ -129,9 +129,9 @@ def _couple_on_tendon(
     found: dict[int, Mimic | float],
     name: Callable[[int], str],
 ) -> str:
-    """Two joints on a tendon of fixed length: c1 (q1 - q1_0) + c2 (q2 - q2_0) = p0. What no actuator moves, follows.
+    """Couple two joints on a fixed tendon: c1 (q1 - q1_0) + c2 (q2 - q2_0) = p0; the unactuated follows.
 
-    Limits go before the tendon: where they stop the follower it stays, as in a finger whose end gives way.
+    Limits take precedence over the tendon: where they stop the follower it stays, as in a finger with a compliant end.
     """
     actuated = {joint for actuator in range(model.nu) for joint, _ in driven(model, actuator)}
     free = [pair for pair in pulled if pair[0] not in found and pair[0] not in actuated]
@@ -155,10 +155,10 @@ def _couple_on_tendon(
 def _couple_by_tendons(
     model: Any, found: dict[int, Mimic | float], name: Callable[[int], str]
 ) -> tuple[list[str], Tendons]:
-    """Joints that share one actuated tendon, unless something else moves them: notes, and tendons.
+    """Couple joints that share one actuated tendon and have no other drive; return notes and tendons.
 
-    Joints of one finger, each on the one before, share it as what they touch says. Joints side by side, the jaws of a
-    gripper, bend in the ratio of its pull on them: free to share it they would let the object run from side to side.
+    Serial joints of one finger share the tendon according to contact. Parallel joints, the jaws of a gripper, bend in
+    the ratio of its pull on them: if they shared it freely, the object could move from side to side.
     """
     alone = {
         pulled[0][0] for actuator in range(model.nu) if len(pulled := driven(model, actuator)) == 1
@@ -179,7 +179,7 @@ def _couple_by_tendons(
 
 
 def _in_a_row(model: Any, joints: list[int]) -> bool:
-    """Whether each joint moves the next, or the next moves it, all the way."""
+    """Check whether the joints form one chain."""
     chains = []
     for joint in joints:
         chain, body = [], int(model.jnt_bodyid[joint])
@@ -200,10 +200,10 @@ def _range(model: Any, joint: int) -> tuple[float, float]:
 
 _STEPS: Final = 33
 _ROUNDS: Final = 60
-#: Ends of a loop that stay further apart than this do not meet [m].
+#: Gap above which the ends of a loop do not meet [m].
 _OPEN_M: Final = 2e-4
 _ONE_VALUE: Final = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
-#: A passive joint that leaves its line by more than this does not follow it [rad].
+#: Largest deviation of a passive joint from its line [rad].
 MAX_ERROR_RAD: Final = 0.08
 
 
@@ -213,7 +213,7 @@ def follow_loops(
     """Add to `found` the joints that close the loops of a model.
 
     Returns:
-        notes for the user; and joints whose loop is not solved, with the refusal of a hand that moves by them.
+        notes for the user; and joints with an unsolved loop, with the error for a hand that moves by them.
     """
     loops = [e for e in range(model.neq) if model.eq_type[e] == int(mujoco.mjtEq.mjEQ_CONNECT) and model.eq_active0[e]]
     actuated = {joint for actuator in range(model.nu) for joint, _ in driven(model, actuator)}
@@ -227,7 +227,7 @@ def follow_loops(
         try:
             notes.append(_follow(model, group, joints, passive, actuated, found, name))
         except HandError as error:
-            # It only matters where the hand moves by it.
+            # The fault only matters if the hand moves by this joint.
             faults |= dict.fromkeys(passive, str(error))
     return notes, faults
 
@@ -241,11 +241,10 @@ def _follow(
     found: dict[int, Mimic | float],
     name: Callable[[int], str],
 ) -> str:
-    """Add to `found` what the passive joints of a group of loops follow; a note.
+    """Add to `found` the mimics of the passive joints in a group of loops; return a note.
 
     Raises:
-        HandError: it has no driver or several, does not close over the range of its driver, or its joints follow no
-            line.
+        HandError: it has no driver or several, does not close over its driver's range, or its joints are not linear.
     """
     held = ", ".join(map(name, joints))
     if round_ones := [j for j in joints if int(model.jnt_type[j]) not in _ONE_VALUE]:
@@ -255,7 +254,7 @@ def _follow(
         )
     drivers = [j for j in joints if j in actuated and j not in found]
     if not drivers:
-        # Those that follow others move as these do.
+        # Joints that follow others move with these.
         drivers = [j for j in joints if j in found and not isinstance(found[j], float)]
     if not drivers:
         raise HandError(f"the loop of {held} has no driver; give one of its joints an actuator")
@@ -283,7 +282,7 @@ def _follow(
 
 
 def _groups(model: Any, loops: list[int]) -> list[list[int]]:
-    """Loops that share joints belong together."""
+    """Group loops that share joints."""
     groups: list[tuple[set[int], list[int]]] = []
     for loop in loops:
         joints = set(_on_loop(model, loop))
@@ -294,7 +293,7 @@ def _groups(model: Any, loops: list[int]) -> list[list[int]]:
 
 
 def _ends(model: Any, loop: int) -> tuple[int, int]:
-    """Bodies that a connect constraint holds together."""
+    """Return the bodies that a connect constraint joins."""
     first, second = int(model.eq_obj1id[loop]), int(model.eq_obj2id[loop])
     if model.eq_objtype[loop] == int(mujoco.mjtObj.mjOBJ_SITE):
         return int(model.site_bodyid[first]), int(model.site_bodyid[second])
@@ -302,7 +301,7 @@ def _ends(model: Any, loop: int) -> tuple[int, int]:
 
 
 def _on_loop(model: Any, loop: int) -> list[int]:
-    """Joints between the ends and the body at which their chains part."""
+    """Return the joints between the ends and the body at which their chains branch."""
     chains = [_chain(model, body) for body in _ends(model, loop)]
     common = set(chains[0]) & set(chains[1])
     return [
@@ -325,12 +324,12 @@ def _chain(model: Any, body: int) -> list[int]:
 def _solve(
     model: Any, loops: list[int], driver: int, passive: list[int], name: Callable[[int], str]
 ) -> tuple[Floats, Floats]:
-    """(S,) values of the driver and (S, P) values of the passive joints at which the loops are closed."""
+    """Return the values of the driver (S,) and of the passive joints (S, P) at which the loops are closed."""
     data = mujoco.MjData(model)
     lower, upper = map(float, model.jnt_range[driver]) if model.jnt_limited[driver] else (-np.pi, np.pi)
     start = float(np.clip(model.qpos0[model.jnt_qposadr[driver]], lower, upper))
     values = np.linspace(lower, upper, _STEPS)
-    # From where the model is written to both ends, each step from the solution of the last.
+    # From the model's initial value to both ends, each step starting from the last solution.
     order = np.concatenate([np.flatnonzero(values >= start), np.flatnonzero(values < start)[::-1]])
     solved = np.full((_STEPS, len(passive)), np.nan)
     rest = np.array([model.qpos0[model.jnt_qposadr[j]] for j in passive])
@@ -349,7 +348,7 @@ def _solve(
 def _close(
     model: Any, data: Any, loops: list[int], driver: int, value: float, passive: list[int], guess: Floats
 ) -> tuple[Floats, float]:
-    """Passive joint values that close the loops at a value of the driver (Gauss-Newton), and the gap left [m]."""
+    """Solve for passive joint values at a driver value (Gauss-Newton); also return the loops' gap [m]."""
     address, dofs = [int(model.jnt_qposadr[j]) for j in passive], [int(model.jnt_dofadr[j]) for j in passive]
     q = guess.copy()
     gap = np.inf
@@ -377,7 +376,7 @@ def _close(
 
 
 def _anchors(model: Any, data: Any, loop: int) -> tuple[Floats, Floats]:
-    """The two points, in the world, that a connect constraint holds together."""
+    """Return the two points, in the world frame, that a connect constraint joins."""
     if model.eq_objtype[loop] == int(mujoco.mjtObj.mjOBJ_SITE):
         return data.site_xpos[int(model.eq_obj1id[loop])], data.site_xpos[int(model.eq_obj2id[loop])]
     points = []

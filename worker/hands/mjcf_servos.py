@@ -14,7 +14,7 @@ from graspd.worker.hands.robot import Mimic
 
 @dataclass(frozen=True)
 class Servo:
-    """What drives a joint; 0: not stated."""
+    """Drive of a joint; 0: not stated."""
 
     effort: float = 0.0
     """[N m or N]"""
@@ -23,12 +23,12 @@ class Servo:
 
 
 def servos(model: Any, mimics: Mapping[int, Mimic | float], shared: Collection[int] = ()) -> dict[int, Servo]:
-    """Servo of each joint that an actuator drives.
+    """Return the servo of each joint that an actuator drives.
 
-    An actuator of gear g on a length l pulls with g F dl/dq at joint q, and a position servo of gain k holds it with
-    k (g dl/dq)^2: on a joint dl/dq is 1; on a fixed tendon it is the joint's coefficient, and the joints that follow
-    this one add theirs, times how fast they follow. Of n joints that `shared` says share a tendon each is as stiff as n
-    of them in a row must be for the tendon's gain.
+    An actuator of gear g on a length l pulls with g F dl/dq at joint q. A position servo of gain k holds the joint with
+    k (g dl/dq)^2. On a joint dl/dq is 1. On a fixed tendon it is the joint's coefficient plus those of its followers
+    times their rates. Each of n joints that share a tendon (`shared`) is as stiff as n such joints in series must be
+    for the tendon's gain.
     """
     found: dict[int, Servo] = {}
     joint_of = {str(model.joint(j).name): j for j in range(model.njnt)}
@@ -53,7 +53,7 @@ def servos(model: Any, mimics: Mapping[int, Mimic | float], shared: Collection[i
 
 
 def commanded(model: Any) -> dict[int, tuple[float, float]]:
-    """Values that a joint's own position servo can be told to go to: g k (u - q) with u within its range of control."""
+    """Return the command range of a joint's position servo: g k (u - q) with u in its control range."""
     found = {}
     for actuator in range(model.nu):
         kind, gain = int(model.actuator_trntype[actuator]), _gain(model, actuator)
@@ -68,7 +68,7 @@ def commanded(model: Any) -> dict[int, tuple[float, float]]:
 
 
 def driven(model: Any, actuator: int) -> list[tuple[int, float]]:
-    """Joints that an actuator moves, with the rate at which its length changes with each."""
+    """Return the joints that an actuator moves, with the rate at which its length changes with each."""
     kind, target = int(model.actuator_trntype[actuator]), int(model.actuator_trnid[actuator, 0])
     if kind in (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)):
         return [(target, 1.0)]
@@ -76,7 +76,7 @@ def driven(model: Any, actuator: int) -> list[tuple[int, float]]:
 
 
 def joints_on_tendon(model: Any, tendon: int) -> list[tuple[int, float]]:
-    """Joints of a fixed tendon with their coefficients."""
+    """Return the joints of a fixed tendon with their coefficients."""
     first, count = int(model.tendon_adr[tendon]), int(model.tendon_num[tendon])
     return [
         (int(model.wrap_objid[w]), float(model.wrap_prm[w]))
@@ -86,7 +86,7 @@ def joints_on_tendon(model: Any, tendon: int) -> list[tuple[int, float]]:
 
 
 def _driver(joint: int, mimics: Mapping[int, Mimic | float], joint_of: Mapping[str, int]) -> tuple[int | None, float]:
-    """The joint that a joint follows in the end, and how fast."""
+    """Return the joint at the end of a chain of mimics, and the total rate."""
     rate = 1.0
     for _ in range(len(mimics) + 1):
         follows = mimics.get(joint)
@@ -100,7 +100,7 @@ def _driver(joint: int, mimics: Mapping[int, Mimic | float], joint_of: Mapping[s
 
 
 def _force(model: Any, actuator: int) -> float:
-    """Largest force; 0 where none follows from the model."""
+    """Return the largest force; 0 if the model states none."""
     if model.actuator_forcelimited[actuator]:
         return float(np.abs(model.actuator_forcerange[actuator]).max())
     if model.actuator_ctrllimited[actuator] and model.actuator_biastype[actuator] == int(mujoco.mjtBias.mjBIAS_NONE):
@@ -109,7 +109,7 @@ def _force(model: Any, actuator: int) -> float:
 
 
 def _gain(model: Any, actuator: int) -> float:
-    """Gain of a position servo; 0 for other actuators."""
+    """Return the gain of a position servo; 0 for other actuators."""
     if model.actuator_biastype[actuator] != int(mujoco.mjtBias.mjBIAS_AFFINE):
         return 0.0
     return max(0.0, -float(model.actuator_biasprm[actuator, 1]))

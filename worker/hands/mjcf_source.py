@@ -1,7 +1,7 @@
-"""MJCF made safe for MuJoCo's own reader: one text that names no file, and the meshes it needs beside it.
+"""Sanitise MJCF for MuJoCo's own reader: one text that names no file, and the meshes that it needs.
 
-MuJoCo reads what a model names from the disk, wherever that is. So includes are put in here, meshes are looked up among
-the hand's files and renamed, and every part that a hand does not need is left out: only what is listed here reaches it.
+MuJoCo reads any file on disk that a model names. So this module inserts includes, looks up meshes among the hand's
+files and renames them, and removes all parts that a hand does not need: only what is listed here reaches MuJoCo.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ MAX_BYTES: Final = 8 * 2**20
 _MAX_INCLUDES: Final = 64
 _MAX_ELEMENTS: Final = 50_000
 Element = ElementTree.Element
-#: Sections of a model that say something of a hand.
+#: Sections of a model that describe a hand.
 _SECTIONS: Final = ("compiler", "default", "asset", "worldbody", "contact", "tendon", "equality", "actuator")
-#: Elements that would load files or plugins, or multiply what is written; none of them is needed for a hand.
+#: Elements that would load files or plugins, or multiply elements; a hand needs none of them.
 _REFUSED: Final = ("attach", "composite", "flexcomp", "model", "replicate")
 _LEFT_OUT: Final = frozenset(
     {"texture", "layer", "hfield", "skin", "plugin", "camera", "light", "spatial", "weld", "flex", "flexvert", "pair"}
 )
 _ACTUATORS: Final = ("general", "motor", "position", "velocity", "intvelocity")
-#: Attributes that name files, or what was left out.
+#: Attributes that name files or removed parts.
 _DROPPED: Final = frozenset(
     {"file", "content_type", "texture", "hfield", "meshdir", "texturedir", "assetdir", "strippath", "plugin"}
 )
@@ -38,11 +38,11 @@ _MESHES: Final = (".stl", ".obj", ".msh")
 
 
 def self_contained(files: Mapping[str, bytes], main: str) -> tuple[str, dict[str, bytes], list[str]]:
-    """The model as one text, the mesh files it names, and notes for the user.
+    """Return the model as one text, the mesh files it names, and notes for the user.
 
     Raises:
-        HandError: not XML, not MJCF, an include or a mesh is not there or lies outside the upload, or an element that
-            would load another model; the message names it.
+        HandError: not XML, not MJCF, an include or a mesh is missing or outside the upload, or an element would load
+            another model; the message names it.
         LimitError: larger than the limits of this module.
     """
     root = parse_xml(files[main], main, "an MJCF model", "mujoco", limit_bytes=MAX_BYTES)
@@ -61,7 +61,7 @@ def self_contained(files: Mapping[str, bytes], main: str) -> tuple[str, dict[str
         for name in _DROPPED & element.attrib.keys():
             del element.attrib[name]
         if element.tag == "default":
-            # MuJoCo refuses what else stands there; others pass over it.
+            # MuJoCo refuses other attributes here; other readers ignore them.
             element.attrib = {name: value for name, value in element.attrib.items() if name == "class"}
     notes = _passed_over(root)
     _prune(root)
@@ -69,7 +69,7 @@ def self_contained(files: Mapping[str, bytes], main: str) -> tuple[str, dict[str
     compiler = root.find("compiler")
     if compiler is None:
         compiler = ElementTree.SubElement(root, "compiler")
-    # Frames without mass are common in hands and stop MuJoCo's reader.
+    # Frames without mass are common in hands and make MuJoCo's reader fail.
     compiler.set("boundmass", compiler.get("boundmass", "1e-9"))
     compiler.set("boundinertia", compiler.get("boundinertia", "1e-12"))
     if _means_radians(root):
@@ -79,7 +79,7 @@ def self_contained(files: Mapping[str, bytes], main: str) -> tuple[str, dict[str
 
 
 def _passed_over(root: Element) -> list[str]:
-    """What a user must know of drives and constraints that are left out; call it before they are."""
+    """Return notes on drives and constraints that are left out; call it before their removal."""
     spatial = {tendon.get("name") for tendon in root.iter("spatial")}
     drives = list(root.iterfind("actuator/*"))
     pulled = [one for one in drives if one.get("tendon") in spatial]
@@ -109,13 +109,13 @@ def _shown(elements: list[Element]) -> str:
 
 
 def _is_read(actuator: Element) -> bool:
-    """Whether it drives joints or tendons in a way that is modelled."""
+    """Check whether it drives joints or tendons in a supported form."""
     return actuator.tag in _ACTUATORS and bool(actuator.attrib.keys() & {"joint", "jointinparent", "tendon"})
 
 
 def _means_radians(root: Element) -> bool:
-    """Whether a model that states no unit of angles, so that they are degrees, belongs to one that says radians:
-    none of its joints would turn by more than 2 pi degrees, and no angle is larger."""
+    """Check whether a model without an angle unit, so in degrees, was written for one in radians.
+    Then no joint would turn by more than 2 pi degrees, and no angle is larger."""
     if any("angle" in compiler.attrib for compiler in root.findall("compiler")):
         return False
     hinges = [e for e in root.iter("joint") if "range" in e.attrib and e.get("type", "hinge") != "slide"]
@@ -134,7 +134,7 @@ def _numbers(text: str) -> list[float]:
 
 
 def _put_in_includes(root: Element, files: Mapping[str, bytes], main: str, here: str, counts: list[int]) -> None:
-    """Replace each include by what stands in its file; `counts` are the includes and elements so far."""
+    """Replace each include by the contents of its file; `counts` are the includes and elements so far."""
     counts[1] += sum(1 for _ in root.iter())
     if counts[1] > _MAX_ELEMENTS:
         raise LimitError(f"{main}: more than {_MAX_ELEMENTS} elements")
@@ -154,7 +154,7 @@ def _put_in_includes(root: Element, files: Mapping[str, bytes], main: str, here:
 
 
 def _find(wanted: str, files: Mapping[str, bytes], folders: list[str], main: str, does: str) -> str:
-    """Name of a file that a model names, sought from several folders."""
+    """Return the name of a file that a model names, searched from several folders."""
     path = wanted.replace("\\", "/")
     inside, like = False, []
     for folder in dict.fromkeys(folders):
@@ -176,7 +176,7 @@ def _find(wanted: str, files: Mapping[str, bytes], folders: list[str], main: str
 
 
 def _mesh_folder(root: Element) -> tuple[str, bool]:
-    """Where meshes lie, as the compiler elements say, and whether folders in their names are to be left out."""
+    """Return the mesh folder of the compiler elements, and whether they strip folders from mesh names."""
     folder, strip = "", False
     for compiler in root.findall("compiler"):
         folder = compiler.get("meshdir", compiler.get("assetdir", folder))
@@ -199,7 +199,7 @@ def _take_mesh(
     suffix = PurePosixPath(name).suffix.lower()
     if suffix not in _MESHES:
         raise HandError(f"{main}: the mesh {name!r} is none of {', '.join(_MESHES)}, which MJCF takes; convert it")
-    # MuJoCo calls a mesh by its file where the model does not name it.
+    # MuJoCo names a mesh after its file if the model does not name it.
     element.set("name", element.get("name", PurePosixPath(file.replace("\\", "/")).stem))
     refuse_stand_in(name, files[name], HandError)
     given = f"{len(assets)}{suffix}"
@@ -218,7 +218,7 @@ def _prune(element: Element) -> None:
 
 
 def _prune_actuators(root: Element) -> None:
-    """Leave actuators of joints and of tendons that are still there."""
+    """Remove actuators of joints and tendons that no longer exist."""
     tendons = {tendon.get("name") for section in root.findall("tendon") for tendon in section.findall("fixed")}
     for section in root.findall("actuator"):
         for actuator in list(section):

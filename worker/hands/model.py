@@ -1,4 +1,4 @@
-"""A hand as the engine sees it: a tree of rigid bodies, the map from degrees of freedom to joints, convex pieces.
+"""Model of a hand for the engine: tree of rigid bodies, map from dofs to joints, convex pieces.
 
 Links joined by fixed joints are merged into one body, so every body except the root has one moving joint.
 Frames: body frame = frame of the link that the moving joint carries; root frame = frame of the named root link.
@@ -37,7 +37,7 @@ class ConvexPiece:
     body: int
     kind: str  # box, sphere, cylinder, capsule or hull
     size: tuple[float, ...]
-    """Box: full extents x y z. Sphere: radius. Cylinder and capsule: radius, length along z without caps. Hull: ()."""
+    """Box: full extents. Sphere: radius. Cylinder, capsule: radius, length along z without caps. Hull: ()."""
     pose: Floats
     """(7,) pose of the primitive's frame in the body frame; identity for hulls."""
     vertices: Floats
@@ -50,7 +50,7 @@ class ConvexPiece:
 
 @dataclass(frozen=True)
 class PalmFrame:
-    """Where the hand takes hold: a point on the palm's surface and the direction in which it approaches."""
+    """Point on the palm's surface and the direction in which the hand approaches."""
 
     centre: Floats
     """(3,) point on the palm surface in the root frame [m]."""
@@ -60,16 +60,16 @@ class PalmFrame:
 
 @dataclass(frozen=True)
 class SurfacePoints:
-    """A fixed sample of the hand's surface, N points. Interior parts (inside another piece) carry no points."""
+    """Fixed sample of the hand's surface, N points; parts inside another piece have no points."""
 
     body: Ints
-    """(N,)"""
+    """(N,) body of each point."""
     position: Floats
     """(N, 3) in the body frame [m]."""
     normal: Floats
     """(N, 3) unit, outward, body frame."""
     area: Floats
-    """(N,) surface area that the point stands for [m^2]."""
+    """(N,) surface area that the point represents [m^2]."""
 
     def __len__(self) -> int:
         return len(self.body)
@@ -77,7 +77,7 @@ class SurfacePoints:
 
 @dataclass(frozen=True)
 class Drag:
-    """What a joint's mechanism adds to its motion, for each body (L,); 0 where nothing is stated."""
+    """Inertia and friction of joint mechanisms, for each body (L,); 0 if not stated."""
 
     armature: Floats
     """Inertia of the drive [kg m^2 or kg]."""
@@ -117,45 +117,45 @@ class HandModel:
     stiffness: Floats
     """(D,) position gain of the controller, Kp [N m/rad or N/m]."""
     preshape: Floats
-    """(D,) posture in which the hand approaches."""
+    """(D,) posture of the approach."""
     closing: Floats
     """(D,) -1, 0 or +1: the direction in which the dof closes the hand; 0 for spreads."""
     joint_names: tuple[str, ...]
     """(J,) all moving joints of the URDF, mimicking ones included, in URDF order."""
     joint_body: Ints
-    """(J,) the body each joint carries."""
+    """(J,) the body that each joint carries."""
     palm: PalmFrame
     fingertips: tuple[int, ...]
     """Bodies at the end of each finger."""
     pieces: tuple[ConvexPiece, ...]
     neighbours: frozenset[tuple[int, int]]
-    """Pairs of bodies (a < b) whose contact does not count: adjacent ones and those that touch in every posture."""
+    """Pairs of bodies (a < b) whose contact is ignored: adjacent, or touching in every posture."""
     masses: Floats
-    """(L,) [kg] of each body, from the URDF or, where it gives none, from volume at 1000 kg/m^3."""
+    """(L,) [kg] of each body, from the URDF or, if it gives none, from volume at 1000 kg/m^3."""
     velocity: Floats = field(default_factory=lambda: np.zeros(0))
-    """(D,) limit of speed [rad/s or m/s], with those of mimicking joints folded in; 0 where none is stated."""
+    """(D,) limit of speed [rad/s or m/s], with those of mimicking joints folded in; 0 if not stated."""
     arm: tuple[Joint, ...] = ()
-    """Joints, fixed ones too, from the root of the robot that the hand came on to `root_link`, for export."""
+    """Joints, fixed ones too, from the root of the original robot to `root_link`, for export."""
     visuals: Visuals = NO_VISUALS
-    """What the hand looks like."""
+    """Visual meshes."""
     frames: Mapping[str, tuple[int, Floats]] = field(default_factory=dict)
-    """Each link: its body, and its pose (7,) in the body's frame."""
+    """Body of each link, and the link's pose (7,) in the body's frame."""
     tendons: tuple[Tendon, ...] = field(default=(), metadata=TOLD_IF_SET)
-    """Drives of several dofs, none on two; the other dofs have a drive each."""
+    """Drives of several dofs, each dof on at most one; the other dofs have their own drives."""
     drag: Drag | None = field(default=None, metadata=TOLD_IF_SET)
-    """None: the validator's joints have none, as the protocol says."""
+    """None: no drag in the validator, as in the protocol."""
     mounting: HandModel | None = field(default=None, metadata=TOLD_IF_SET)
-    """Links above the root that stay clear in scenes, as a tree of bodies and wrist joints that starts at the root; see
-    `worker.hands.mounting`."""
+    """Links above the root that stay clear in scenes, see `worker.hands.mounting`.
+    A tree of bodies and wrist joints that starts at the root."""
 
     @cached_property
     def content(self) -> str:
-        """Digest of the tree, the pieces and the numbers. `digest` is that of the files they were read from."""
+        """Digest of the tree, the pieces and the numbers; `digest` is that of the source files."""
         return content_of(self)
 
     @cached_property
     def features(self) -> HandFeatures:
-        """What of the pieces can touch a plane first."""
+        """Features of the pieces that can touch a plane first."""
         return HandFeatures.of(self.pieces)
 
     @property
@@ -172,18 +172,18 @@ class HandModel:
         return len(self.dof_names)
 
     def expand(self, q: Floats) -> Floats:
-        """Joint positions (..., J) in `joint_names` order from dof values (..., D)."""
+        """Compute joint positions (..., J) in `joint_names` order from dof values (..., D)."""
         body = self.joint_body
         return np.asarray(q)[..., self.dof[body]] * self.multiplier[body] + self.offset[body]
 
     def reduce(self, joints: Floats) -> Floats:
-        """Dof values (..., D) from joint positions (..., J): each dof read off the first joint it drives."""
+        """Compute dof values (..., D) from joint positions (..., J): each dof from the first joint it drives."""
         first = self._first_joint
         body = self.joint_body[first]
         return (np.asarray(joints)[..., first] - self.offset[body]) / self.multiplier[body]
 
     @cached_property
     def _first_joint(self) -> NDArray[np.intp]:
-        """(D,) the first joint that each dof drives."""
+        """Return the first joint (D,) that each dof drives."""
         drives = self.dof[self.joint_body]
         return np.array([int(np.flatnonzero(drives == d)[0]) for d in range(self.dofs)], np.intp)

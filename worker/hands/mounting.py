@@ -1,8 +1,8 @@
-"""The mounting of a hand: the links above its root whose poses a grasp fixes, up to the angles of a wrist.
+"""Mounting of a hand: the links above its root that a grasp places, up to the angles of a wrist.
 
-The mounting is a kinematic tree of its own that starts at the hand's root and runs up the robot. It goes up through
-fixed joints, joints that stand still, and at most `MAX_WRIST_JOINTS` joints of a wrist: revolute ones of a limited
-range near the root. The first other joint belongs to an arm, whose links a grasp does not place.
+The mounting is its own kinematic tree that starts at the hand's root and runs up the robot. It passes fixed joints,
+joints with one value, and at most `MAX_WRIST_JOINTS` joints of a wrist: revolute ones of limited range near the root.
+The first other joint belongs to an arm, whose links a grasp does not place.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from graspd.worker.hands.robot import Joint, Robot, chain_to
 from graspd.worker.hands.tree import LEAST_RANGE, Drive, Tree, joint_motion
 
 #: Most joints of a wrist, largest range of one [rad], and its largest distance from the root along the joints [m]. The
-#: last joint of an arm usually turns farther.
+#: last joint of an arm usually has a larger range.
 MAX_WRIST_JOINTS: Final = 2
 MAX_WRIST_RANGE: Final = math.pi
 MAX_WRIST_M: Final = 0.1
-#: Candidates for a wrist joint: shares of the way from its rest angle to either limit.
+#: Sampled angles of a wrist joint: shares of the range from its rest angle to either limit.
 WRIST_SHARES: Final = (0.5, 1.0)
 
 
 def mounting_tree(robot: Robot, root: str, options: HandOptions) -> Tree | None:
-    """The links above the root as a tree, poses in the frame of the root link; None: none of them has a shape."""
+    """Build the tree of links above the root, poses in the root link's frame; None if none has a shape."""
     names, parents, origins = [root], [-1], [IDENTITY_POSE.copy()]
     joints: list[Joint | None] = [None]
     links: dict[str, tuple[int, Floats]] = {}
@@ -42,7 +42,7 @@ def mounting_tree(robot: Robot, root: str, options: HandOptions) -> Tree | None:
         if value is None:
             if len(names) > MAX_WRIST_JOINTS or way > MAX_WRIST_M or not _of_wrist(joint):
                 break
-            # Seen from the child, the parent turns the other way about the same axis, then stands off.
+            # Relative to the child, the parent turns in reverse about the same axis, then has its offset.
             names.append(joint.parent)
             parents.append(len(parents) - 1)
             joints.append(replace(joint, axis=-joint.axis))
@@ -76,7 +76,7 @@ def mounting_tree(robot: Robot, root: str, options: HandOptions) -> Tree | None:
 
 
 def _value(joint: Joint, options: HandOptions) -> float | None:
-    """Value of a joint that stands still [rad or m]; None: it moves."""
+    """Return the value of a joint that does not move [rad or m]; None if it moves."""
     if joint.type == "fixed":
         return 0.0
     if joint.name in options.fix:
@@ -90,7 +90,7 @@ def _of_wrist(joint: Joint) -> bool:
 
 
 def _rigid(robot: Robot, joint: Joint, pose: Floats, options: HandOptions) -> dict[str, Floats]:
-    """Pose of the parent of a joint, which is given, and of what fixed joints hold on it, but for the joint's child."""
+    """Return the poses of a joint's parent, as given, and of links fixed to it except the joint's child."""
     found, stack = {joint.parent: pose}, [joint.parent]
     while stack:
         at = stack.pop()
@@ -102,7 +102,7 @@ def _rigid(robot: Robot, joint: Joint, pose: Floats, options: HandOptions) -> di
 
 
 def wrist_positions(mounting: HandModel) -> Floats:
-    """(W, K) candidates for the angles of the wrist's K joints, the one at rest first, then those nearest to it."""
+    """Return sampled angles (W, K) of the wrist's K joints, the rest position first, then by distance."""
     angles = [
         [rest, *(rest + share * (end - rest) for share in WRIST_SHARES for end in (low, high) if end != rest)]
         for rest, low, high in zip(mounting.preshape, mounting.lower, mounting.upper, strict=True)

@@ -1,4 +1,4 @@
-"""What may be said of a hand beside its URDF: the facts that a URDF cannot hold or often holds wrongly."""
+"""Options of a hand in addition to its URDF: facts that a URDF cannot contain or often states wrongly."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from graspd.service.model.errors import HandError
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Vector = tuple[Finite, Finite, Finite]
 
-#: Position gain of the joints, Kp [N m/rad], where nothing is said: the value of the DexGraspBench protocol.
+#: Default position gain of joints, Kp [N m/rad]: the value of the DexGraspBench protocol.
 DEFAULT_STIFFNESS: Final = 5.0
-#: The same of sliding joints [N/m], and of each pad of a gripper however it is driven: that gain at a lever of 5 cm.
-#: Stiffer drives lose their force in the gap of half a millimetre that a grasp leaves, and in soft contacts.
+#: Default for sliding joints [N/m] and each pad of any gripper: the same gain at a lever of 5 cm. Stiffer drives lose
+#: their force in the gap of half a millimetre that a grasp leaves, and in soft contacts.
 DEFAULT_LINEAR_STIFFNESS: Final = 2_000.0
-#: Torque limit [N m] where the URDF gives none or 0: what FRoGGeR uses for the Allegro hand.
+#: Default torque limit [N m] if the URDF gives none or 0: FRoGGeR's value for the Allegro hand.
 DEFAULT_EFFORT: Final = 0.7
-#: Force limit [N] of sliding joints and of each pad of a gripper: two such pads press with what a squeeze asks for.
+#: Default force limit [N] of sliding joints and each pad of a gripper: two such pads reach the force of a squeeze.
 DEFAULT_FORCE: Final = 25.0
 
 
@@ -31,7 +31,7 @@ class _Options(BaseModel):
 
 
 class PalmOptions(_Options):
-    """Where the hand takes hold, in the frame of `link`."""
+    """Point and direction of the palm in the frame of `link`."""
 
     link: str
     centre: Vector | None = None
@@ -51,7 +51,7 @@ def _palm(value: Any) -> Any:
 
 
 class HandOptions(_Options):
-    """The keys of a hand's `asset.json`. Joints and links go by their URDF names; units are SI."""
+    """Keys of a hand's `asset.json`. Joints and links have their URDF names; units are SI."""
 
     file: str = ""
     description: str = ""
@@ -79,7 +79,7 @@ class HandOptions(_Options):
 
 
 def parse_options(files: Mapping[str, bytes], extra: Mapping[str, Any] | None = None) -> HandOptions:
-    """Options of the hand in `files`: what its `hand.json` notes, over it its `asset.json`, over both `extra`.
+    """Return options of the hand in `files`: `extra` overrides `asset.json`, which overrides `hand.json`.
 
     Raises:
         HandError: one of them is not JSON, or a key is unknown or wrong; the message names it.
@@ -103,10 +103,10 @@ def _asset_json(files: Mapping[str, bytes]) -> dict[str, Any]:
 
 
 def _hand_json(files: Mapping[str, bytes], urdf: object) -> dict[str, Any]:
-    """Options from the notes of a collection of hands: palm link and normal, fingertip links, torque limit.
+    """Return options from a hand collection's notes: palm link and normal, fingertip links, torque limit.
 
     Args:
-        urdf: name of the hand's URDF where it is known; notes on another one say nothing.
+        urdf: name of the hand's URDF if known; notes on another one are ignored.
     """
     if "hand.json" not in files:
         return {}
@@ -118,7 +118,7 @@ def _hand_json(files: Mapping[str, bytes], urdf: object) -> dict[str, Any]:
             return {}
         if "palm_link" in notes:
             options["palm"] = {"link": notes["palm_link"], "approach": notes.get("palm_normal_in_palm_link")}
-            # Forearm and wrist carry no grasp: what lies above the palm is left out.
+            # Forearm and wrist do not grasp: links above the palm are left out.
             options["root"] = notes["palm_link"]
         if notes.get("fingertips"):
             options["fingertips"] = list(dict(notes["fingertips"]).values())
@@ -131,6 +131,6 @@ def _hand_json(files: Mapping[str, bytes], urdf: object) -> dict[str, Any]:
 
 
 def _is_among(noted: str, files: Mapping[str, bytes], urdf: object) -> bool:
-    """Whether notes are on the URDF that is meant; beside it they call it by its name alone."""
+    """Check whether notes refer to this URDF; in the same folder they use its bare name."""
     named = [name for name in files if PurePosixPath(name).name == PurePosixPath(noted).name]
     return bool(named) and PurePosixPath(str(urdf or noted)).name == PurePosixPath(noted).name

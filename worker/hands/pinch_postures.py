@@ -1,8 +1,7 @@
-"""Whether a hand's surfaces oppose one another, and postures in which its fingers do: between how wide a thing they
-can take hold of.
+"""Pinch postures: whether a hand's surfaces oppose one another, and opposed postures by width.
 
-A hand holds between one finger, as a rule the thumb, and others whose pads look at it. Such postures are found by
-sampling and random steps, for as many widths as there are.
+A hand holds between one finger, usually the thumb, and others with pads that face it. Sampling and random steps find
+such postures for all feasible widths.
 """
 
 from __future__ import annotations
@@ -30,57 +29,57 @@ from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.surface import sample_surface
 from graspd.worker.objects.disk_cache import arrays_kept_or_made
 
-#: Postures that are wanted, from so many times as many, and random steps that make them better.
+#: Number of postures, candidates per posture, and random steps that improve them.
 POSTURES: Final = 160
 CROWD: Final = 25
 CLIMBS: Final = 100
-#: How well pads face along the line between them (cosine), how little the palm looks along it (cosine), and how far
-#: before the palm it lies [m].
+#: Least cosine of pads with the line between them, limit on the palm's cosine with it, and its least distance in front
+#: of the palm [m].
 FACING: Final = 0.75
 SQUARE: Final = 0.7
 AHEAD_M: Final = 0.02
 #: Least distance of opposed pads [m].
 THINNEST_M: Final = 0.002
-#: Differences of width that weigh like a radian of facing [m].
+#: Difference of width that costs as much as one radian of facing [m].
 WIDTH_M: Final = 0.02
-#: Spread of dofs that do not close the hand about the pre-shape, and of fingers that close together: shares of a range.
+#: Spread about the pre-shape of dofs that do not close, and of fingers that close together: shares of a range.
 SIDEWAYS: Final = 0.15
 UNEVEN: Final = 0.06
-#: Points of the surface, and postures at random, with which it is told whether a hand can hold anything.
+#: Number of surface points, and of random postures, in the test whether a hand can hold anything.
 _CHECKED_POINTS: Final = 512
 _CHECKED_AT_RANDOM: Final = 11
-#: Surfaces farther apart than this hold nothing that a hand can lift, nearer than this nothing at all [m].
+#: Gap below which two surfaces hold nothing, and above which they hold nothing that a hand can lift [m].
 _GAP_M: Final = (0.004, 0.3)
-#: Least cosine between a normal and the way to the other surface: within 60 degrees.
+#: Least cosine between a normal and the direction to the other surface: within 60 degrees.
 _TOWARD: Final = 0.5
-#: A gap that changes less than this is that of a rigid fork [m].
+#: Least change of a gap; a smaller one belongs to a rigid fork [m].
 _CLOSING_M: Final = 0.003
 
 
 @dataclass(frozen=True)
 class Oppositions:
-    """K postures of a hand whose pads face one another, in the order of their widths; root frame."""
+    """K postures of a hand whose pads face one another, sorted by width; root frame."""
 
     q: Floats
     """(K, D)"""
     axis: Floats
-    """(K, 3) unit, from the one finger's pad to the others'."""
+    """(K, 3) unit, from the opposing finger's pad to the others'."""
     middle: Floats
-    """(K, 3) between them [m]."""
+    """(K, 3) midpoint [m]."""
     width: Floats
-    """(K,) between them, ascending [m]."""
+    """(K,) gap, ascending [m]."""
 
     def __len__(self) -> int:
         return len(self.q)
 
     @property
     def widest(self) -> float:
-        """The greatest width [m]; 0 for a hand that cannot oppose its fingers."""
+        """Return the largest width [m]; 0 for a hand that cannot oppose its fingers."""
         return float(self.width[-1]) if len(self) else 0.0
 
     @classmethod
     def of_none(cls, hand: HandModel) -> Oppositions:
-        """No posture of a hand."""
+        """Return an empty set of postures."""
         return cls(np.zeros((0, hand.dofs)), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
 
 
@@ -89,8 +88,7 @@ _lock = threading.Lock()
 
 
 def oppositions_of(hand: HandModel) -> Oppositions:
-    """The opposed postures of a hand, from memory or this machine's cache where they are known; none of a hand with one
-    finger."""
+    """Return the opposed postures of a hand, cached in memory and on this machine; one finger has none."""
     with _lock:
         if hand.content not in _known:
             made = arrays_kept_or_made("oppositions", (hand.content,), _code(), lambda: vars(_oppositions(hand)))
@@ -99,7 +97,7 @@ def oppositions_of(hand: HandModel) -> Oppositions:
 
 
 def _code() -> tuple[ModuleType, ...]:
-    """Whose change would change what is kept of a hand."""
+    """Return the modules on which the cached data of a hand depend."""
     return (sys.modules[__name__], closing, guess, jaws, kinematics, pads_code, primitives, surface, transforms)
 
 
@@ -110,7 +108,7 @@ def _oppositions(hand: HandModel) -> Oppositions:
     pads = [fingertip_pad(hand, body) for body in hand.fingertips]
     q = random_postures(hand, one, CROWD * POSTURES)
     seen = _Seen.of(hand, pads, one, q)
-    # Of postures about as wide the best, which then climbs.
+    # Select the best of postures with similar widths, then improve it.
     order = np.argsort(seen.width, kind="stable").reshape(POSTURES, CROWD)
     q = q[order[np.arange(POSTURES), seen.cost(seen.width)[order].argmin(axis=1)]]
     wanted = np.linspace(THINNEST_M, np.quantile(seen.width, 0.98), POSTURES)
@@ -124,7 +122,7 @@ def _oppositions(hand: HandModel) -> Oppositions:
 
 
 def opposed_finger(hand: HandModel) -> int:
-    """The fingertip that opposes the others best, as a rule the thumb's."""
+    """Return the fingertip that opposes the others best, usually the thumb's."""
     pads = [fingertip_pad(hand, body) for body in hand.fingertips]
     tried = []
     for one in range(len(pads)):
@@ -135,17 +133,17 @@ def opposed_finger(hand: HandModel) -> int:
 
 @dataclass(frozen=True)
 class _Seen:
-    """Where the pads of N postures are."""
+    """Poses of the pads in N postures."""
 
     axis: Floats
     middle: Floats
     width: Floats
     facing: Floats
-    """(N,) cosine of the pads against the line between them, the worse side's."""
+    """(N,) cosine of the pads with the line between them, for the worse side."""
     square: Floats
-    """(N,) how much the palm looks along that line: 0 not at all."""
+    """(N,) cosine of the palm's approach with that line; 0: perpendicular."""
     ahead: Floats
-    """(N,) how far the middle lies before the palm [m]."""
+    """(N,) distance of the middle in front of the palm [m]."""
 
     @classmethod
     def of(cls, hand: HandModel, pads: list[Pad], one: int, q: Floats) -> _Seen:
@@ -168,14 +166,14 @@ class _Seen:
         )
 
     def cost(self, wanted: Floats) -> Floats:
-        """(N,) how far from an opposition of the widths `wanted` (N,)."""
+        """Return the cost (N,) of postures relative to oppositions of the widths `wanted` (N,)."""
         near = np.maximum(0.0, AHEAD_M + 0.01 - self.ahead) / WIDTH_M
         aside = 2 * np.maximum(0.0, self.square - 0.9 * SQUARE)
         return np.asarray(-3 * np.minimum(self.facing, 0.95) + np.abs(self.width - wanted) / WIDTH_M + near + aside)
 
 
 def climbed(hand: HandModel, one: int, q: Floats, cost: Callable[[Floats], Floats]) -> Floats:
-    """Postures (N, D) that random steps, ever smaller, made better by their `cost` (N,)."""
+    """Improve postures (N, D) by random steps of decreasing size with respect to their `cost` (N,)."""
     rng = np.random.default_rng(one)
     finger, rank = _ranks(hand)
     best = cost(q)
@@ -191,7 +189,7 @@ def climbed(hand: HandModel, one: int, q: Floats, cost: Callable[[Floats], Float
 
 
 def random_postures(hand: HandModel, one: int, count: int) -> Floats:
-    """(count, D): all dofs of one finger by themselves; the joints of the others close alike, rank by rank."""
+    """Return (count, D): dofs of one finger at random; joints of equal rank in the others close together."""
     rng = np.random.default_rng(one)
     finger, rank = _ranks(hand)
     opened = np.where(hand.closing >= 0, hand.lower, hand.upper)
@@ -205,8 +203,8 @@ def random_postures(hand: HandModel, one: int, count: int) -> Floats:
 
 
 def _ranks(hand: HandModel) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """(D,) the finger of each dof, -1 where several share it, -2 where it drives none; and how many joints of that
-    finger lie between the dof and the tip."""
+    """Return (D,) the finger of each dof, -1 if several share it, -2 if it drives none.
+    Also return the number of joints of that finger between the dof and the tip."""
     finger, rank = np.full(hand.dofs, -2, np.intp), np.zeros(hand.dofs, np.intp)
     for number, tip in enumerate(hand.fingertips):
         seen, body = 0, tip
@@ -219,10 +217,10 @@ def _ranks(hand: HandModel) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
 
 
 def require_opposing(hand: HandModel) -> None:
-    """Refuse a hand that can hold nothing, before any work; from memory or this machine's cache where it is known.
+    """Refuse a hand that can hold nothing, before planning; cached in memory and on this machine.
 
     Raises:
-        HandError: no two of its surfaces face each other and close; the message says the fix.
+        HandError: no two of its surfaces face each other and close; the message states the fix.
     """
     with _lock:
         if hand.content not in _holding:
@@ -242,7 +240,7 @@ def _is_one_answer(kept: Mapping[str, NDArray[Any]]) -> bool:
 
 
 def _why_not(hand: HandModel) -> HandError:
-    """What is missing of a hand that can hold nothing, and the fix."""
+    """Return the error for a hand that can hold nothing, with the reason and the fix."""
     shaped = {piece.body for piece in hand.pieces}
     bare = [hand.body_names[tip] for tip in hand.fingertips if tip not in shaped]
     if bare:
@@ -258,7 +256,7 @@ def _why_not(hand: HandModel) -> HandError:
 
 
 def opposes(hand: HandModel) -> bool:
-    """Whether two points on different bodies face each other in some posture, with a gap that the joints change."""
+    """Check whether points on different bodies face each other in some posture over an adjustable gap."""
     points = sample_surface(hand, _CHECKED_POINTS)
     rng = np.random.default_rng(0)
     shares = [posture(hand, share) for share in np.linspace(0, 1, 5)]
@@ -281,7 +279,7 @@ def opposes(hand: HandModel) -> bool:
 
 
 def _face_to_face(position: Floats, normal: Floats) -> tuple[np.ndarray, Floats]:
-    """(N, N) whether two points look at each other over a gap, and the gap [m]."""
+    """Return (N, N) whether two points face each other over a gap, and the gap [m]."""
     way = position[None] - position[:, None]
     gap = np.linalg.norm(way, axis=2)
     toward = np.einsum("ijk,ik->ij", way, normal) > _TOWARD * gap

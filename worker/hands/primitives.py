@@ -1,6 +1,6 @@
-"""Convex solids: tessellation, area, surface samples, signed distance, and their features (balls, rims, edges).
+"""Convex solids: tessellation, area, surface samples, signed distance, features (balls, rims, edges).
 
-All functions work in the solid's own frame; cylinders and capsules stand along z, centred.
+All functions work in the solid's own frame; cylinders and capsules have their axis along z and are centred.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ SEGMENTS = 32
 
 
 def hull(points: Floats) -> tuple[Floats, Ints]:
-    """Corners (V, 3) and outward triangles (F, 3) of the convex hull of points (N, 3).
+    """Compute corners (V, 3) and outward triangles (F, 3) of the convex hull of points (N, 3).
 
     Raises:
         HandError: the points lie in a plane.
@@ -35,7 +35,7 @@ def hull(points: Floats) -> tuple[Floats, Ints]:
 
 
 def new_hull(points: Floats) -> tuple[Floats, Ints]:
-    """The same, of points that are asked about once."""
+    """Compute the same without caching, for points that occur once."""
     from scipy.spatial import ConvexHull, QhullError  # slow to load
 
     scale = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
@@ -55,7 +55,7 @@ def new_hull(points: Floats) -> tuple[Floats, Ints]:
 
 
 def tessellate(kind: str, size: tuple[float, ...]) -> tuple[Floats, Ints]:
-    """Corners and outward triangles of a primitive; corners of round kinds lie on the true surface."""
+    """Return corners and outward triangles of a primitive; corners of round kinds lie on the true surface."""
     if kind == "box":
         corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
         return hull(corners * np.asarray(size))
@@ -72,7 +72,7 @@ def tessellate(kind: str, size: tuple[float, ...]) -> tuple[Floats, Ints]:
 
 
 def area(kind: str, size: tuple[float, ...], vertices: Floats, faces: Ints) -> float:
-    """Surface area [m^2]; closed form for primitives, sum of triangles for hulls."""
+    """Compute the surface area [m^2]; closed form for primitives, sum of triangles for hulls."""
     match kind:
         case "box":
             x, y, z = size
@@ -88,7 +88,7 @@ def area(kind: str, size: tuple[float, ...], vertices: Floats, faces: Ints) -> f
 
 
 def volume(kind: str, size: tuple[float, ...], vertices: Floats, faces: Ints) -> float:
-    """Volume [m^3]; closed form for primitives."""
+    """Compute the volume [m^3]; closed form for primitives."""
     match kind:
         case "box":
             return float(np.prod(size))
@@ -104,7 +104,7 @@ def volume(kind: str, size: tuple[float, ...], vertices: Floats, faces: Ints) ->
 
 
 def triangle_areas(vertices: Floats, faces: Ints) -> Floats:
-    """(F,) areas."""
+    """Compute the areas (F,) of triangles."""
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
     return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
 
@@ -112,7 +112,7 @@ def triangle_areas(vertices: Floats, faces: Ints) -> Floats:
 def sample(
     kind: str, size: tuple[float, ...], vertices: Floats, faces: Ints, count: int, rng: np.random.Generator
 ) -> tuple[Floats, Floats]:
-    """Area-uniform points (count, 3) on the surface with outward normals (count, 3)."""
+    """Sample area-uniform points (count, 3) on the surface with outward normals (count, 3)."""
     if kind in ("sphere", "cylinder", "capsule"):
         return _sample_round(kind, size, count, rng)
     areas = triangle_areas(vertices, faces)
@@ -148,7 +148,7 @@ def _sample_round(kind: str, size: tuple[float, ...], count: int, rng: np.random
 
 
 def signed_distance(kind: str, size: tuple[float, ...], vertices: Floats, faces: Ints, points: Floats) -> Floats:
-    """(N,) distance of points (N, 3), negative inside.
+    """Compute the distance (N,) of points (N, 3), negative inside.
 
     Exact inside every kind and everywhere for spheres and capsules; outside boxes, cylinders and hulls it is a lower
     bound with the right sign.
@@ -168,13 +168,13 @@ def signed_distance(kind: str, size: tuple[float, ...], vertices: Floats, faces:
             a, b, c = np.moveaxis(vertices[faces], 1, 0)
             normals = np.cross(b - a, c - a)
             lengths = np.linalg.norm(normals, axis=1)
-            # A sliver of the triangulation has no direction of its own.
+            # A sliver of the triangulation has no defined normal.
             feasible = lengths > 1e-9 * lengths.max()
             normals, a = normals[feasible] / lengths[feasible, None], a[feasible]
             return (points @ normals.T - np.einsum("ij,ij->i", normals, a)).max(axis=1)
 
 
-#: Two triangles whose normals have at least this cosine are one flat face: 0.1 degrees.
+#: Cosine of normals from which on two triangles are one flat face: 0.1 degrees.
 COPLANAR: Final = 1 - 1.5e-6
 
 
@@ -182,7 +182,7 @@ COPLANAR: Final = 1 - 1.5e-6
 class HandFeatures:
     """F balls and rims and E edges of P convex pieces, fixed to the bodies of a hand.
 
-    A plane meets balls and rims first; a convex solid that a piece runs into meets one of them or an edge.
+    A plane meets balls and rims first; a convex solid that penetrates a piece meets one of them or an edge.
     """
 
     body: NDArray[np.int32]
@@ -198,7 +198,7 @@ class HandFeatures:
     edges: Floats
     """(E, 2, 3) ends, body frame."""
     thickness: Floats
-    """(E,) radius about an edge: 0 but for capsules and spheres."""
+    """(E,) radius about an edge: 0 except for capsules and spheres."""
     first_edge: NDArray[np.int32]
     """(P + 1,)"""
 
@@ -207,7 +207,7 @@ class HandFeatures:
 
     @classmethod
     def of(cls, pieces: tuple[ConvexPiece, ...]) -> HandFeatures:
-        """Corners and edges of boxes and hulls, spheres, ends and axes of capsules, rims and axes of cylinders."""
+        """Collect corners and edges of boxes and hulls; spheres; ends and axes of capsules, rims of cylinders."""
         rows: list[tuple[int, Floats, Floats, float]] = []
         edges: list[Floats] = [np.zeros((0, 2, 3))]
         thickness: list[float] = []
@@ -241,7 +241,7 @@ class HandFeatures:
 
 
 def _edges(piece: ConvexPiece) -> tuple[Floats, float]:
-    """Ends (E, 2, 3) of a piece's edges, and their radius; round pieces have their axis."""
+    """Return the ends (E, 2, 3) of a piece's edges and their radius; round pieces have their axis."""
     middle, axis = piece.pose[:3], quat_rotate(piece.pose[3:], np.array([0.0, 0.0, 1.0]))
     if piece.kind == "sphere":
         return np.array([[middle, middle]]), piece.size[0]
@@ -253,7 +253,7 @@ def _edges(piece: ConvexPiece) -> tuple[Floats, float]:
 
 
 def convex_edges(vertices: Floats, faces: NDArray[np.integer[Any]]) -> NDArray[np.intp]:
-    """(E, 2) edges of a convex solid of outward triangles where its surface bends; those within flat faces are none."""
+    """Return edges (E, 2) at which a convex solid of outward triangles bends, not those within faces."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     normal = np.cross(b - a, c - a)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)

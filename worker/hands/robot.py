@@ -1,6 +1,6 @@
-"""What the readers of URDF and MJCF agree on: links with shapes and masses, and the joints that make one tree of them.
+"""Common result of the URDF and MJCF readers: links with shapes and masses, and a tree of joints.
 
-Every value was checked by the reader, so that nothing behind it has to.
+The readers check every value, so later code does not.
 """
 
 from __future__ import annotations
@@ -20,33 +20,33 @@ Ints = NDArray[np.int32]
 
 MAX_LINKS: Final = 256
 MAX_SHAPES: Final = 1024
-#: No part of a robot hand lies farther than this from its parent [m]; larger numbers are a unit mistake.
+#: Largest distance of a part from its parent [m]; larger numbers are a unit mistake.
 MAX_LENGTH_M: Final = 10.0
-#: Limit of a prismatic joint that has none, to either side [m]: such a joint may stand in a scene, not in a hand.
+#: Limit in each direction of a prismatic joint without limits [m]: such a joint may be in a scene, not in a hand.
 UNLIMITED_M: Final = 10.0
 MOVING: Final = ("revolute", "continuous", "prismatic")
-#: Joints of a URDF that let a base float.
+#: URDF joint types of a floating base.
 FREE: Final = ("floating", "planar")
 
 
 @dataclass(frozen=True)
 class Shape:
-    """One element of a link. Size: box x y z; sphere r; cylinder and capsule r, length [m]; mesh: its scale."""
+    """Shape of a link. Size: box x y z; sphere r; cylinder and capsule r, length [m]; mesh: its scale."""
 
     kind: str
     size: tuple[float, ...]
     pose: Floats
     filename: str = ""
-    """Of a mesh that lies in a file."""
+    """File of a mesh."""
     mesh: tuple[Floats, Ints] | None = None
-    """Vertices (V, 3) and triangles (F, 3) of a mesh whose file the reader of the robot has read itself."""
+    """Vertices (V, 3) and triangles (F, 3) of a mesh that the robot's reader has loaded itself."""
     colour: tuple[float, float, float] | None = None
-    """sRGB, 0 .. 1, of a visual element; None: not stated, or in the file of its mesh."""
+    """sRGB, 0 .. 1, of a visual element; None: not stated, or in the mesh file."""
 
 
 @dataclass(frozen=True)
 class Link:
-    """A link; mass is None where the robot's description gives none."""
+    """A link; mass is None if the robot's description gives none."""
 
     name: str
     shapes: tuple[Shape, ...]
@@ -66,7 +66,7 @@ class Mimic:
 
 @dataclass(frozen=True)
 class Joint:
-    """A joint; the axis has length 1, limits are finite and ordered for joints that move."""
+    """A joint; the axis has length 1, limits of moving joints are finite and ordered."""
 
     name: str
     type: str
@@ -79,8 +79,7 @@ class Joint:
     effort: float
     """[N m or N]; 0: not stated."""
     mimic: Mimic | None
-    """What it follows. The limits of a URDF's follower do not count, as in ROS: in most published grippers they are
-    junk."""
+    """Mimic relation; a URDF follower's own limits are ignored, as in ROS: most published ones are junk."""
     velocity: float = 0.0
     """Limit [rad/s or m/s]; 0: not stated."""
     stiffness: float = 0.0
@@ -90,24 +89,24 @@ class Joint:
     dry_friction: float = field(default=0.0, metadata=TOLD_IF_SET)
     """[N m or N]; 0: not stated."""
     fault: str = field(default="", metadata=TOLD_IF_SET)
-    """Refusal of a hand that moves by this joint; above a hand it stands still, and does not matter."""
+    """Error for a hand that moves by this joint; above a hand the joint is fixed and the fault is ignored."""
 
     @property
     def moves(self) -> bool:
-        """Whether it is a joint that a hand can have, and none that is fixed."""
+        """Check whether it is a movable joint of a supported type."""
         return self.type in MOVING and not self.fault
 
 
 @dataclass(frozen=True)
 class Robot:
-    """A checked description: links and joints form one tree."""
+    """Checked description: links and joints form one tree."""
 
     name: str
     links: dict[str, Link]
     joints: dict[str, Joint]
     root: str
     notes: tuple[str, ...] = field(default=())
-    """Oddities that were taken but should be told to the user."""
+    """Accepted anomalies to report to the user."""
     format: str = "URDF"
     tendons: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     """Drives that pull several joints: the coefficient of each joint."""
@@ -122,10 +121,10 @@ def build_robot(
     fmt: str = "URDF",
     tendons: Mapping[str, Mapping[str, float]] | None = None,
 ) -> Robot:
-    """A robot of links and joints whose own values were checked.
+    """Build a robot from links and joints with checked values.
 
     Raises:
-        HandError: a name comes twice, the joints form no tree, mimics no chain, or nothing moves or can touch.
+        HandError: duplicate names, joints that form no tree, mimics that form no chain, or nothing moves or can touch.
         LimitError: more links or shapes than a hand has.
     """
     link_of: dict[str, Link] = {}
@@ -154,7 +153,7 @@ def build_robot(
 
 
 def chain_to(robot: Robot, link: str) -> tuple[Joint, ...]:
-    """All joints, fixed ones too, from the root to a link, in this order."""
+    """Return all joints, fixed ones too, from the root to a link, in this order."""
     carrier = {joint.child: joint for joint in robot.joints.values()}
     found: list[Joint] = []
     while link in carrier:
@@ -164,7 +163,7 @@ def chain_to(robot: Robot, link: str) -> tuple[Joint, ...]:
 
 
 def _check_tree(links: dict[str, Link], joints: dict[str, Joint], filename: str) -> str:
-    """Name of the one root link; every other link hangs on it by exactly one joint."""
+    """Return the name of the only root link; check that every other link has exactly one parent joint."""
     parent_of: dict[str, str] = {}
     for joint in joints.values():
         for end, link in (("parent", joint.parent), ("child", joint.child)):
@@ -195,7 +194,7 @@ def _check_tree(links: dict[str, Link], joints: dict[str, Joint], filename: str)
 
 
 def _check_limits(joints: Iterable[Joint], filename: str) -> None:
-    """Exporters of CAD programs leave limits at zero where nobody states them."""
+    """Check joint limits: CAD exporters write zero for unstated limits."""
     limited = [joint for joint in joints if joint.moves and joint.type != "continuous" and joint.mimic is None]
     if limited and all(joint.lower == joint.upper == 0 for joint in limited):
         many = f"all {len(limited)} joints have" if len(limited) > 1 else f"joint {limited[0].name!r} has"
@@ -203,7 +202,7 @@ def _check_limits(joints: Iterable[Joint], filename: str) -> None:
 
 
 def _checked_mimic(joint: Joint, joints: dict[str, Joint], filename: str) -> Joint:
-    """The joint; one that follows nothing that moves has that as its fault."""
+    """Return the joint, with a fault if it follows no moving joint."""
     seen, at = {joint.name}, joint
     while at.mimic is not None:
         target = joints.get(at.mimic.joint)

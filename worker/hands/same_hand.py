@@ -1,4 +1,4 @@
-"""Two models of one hand: which joints are the same, how their bases stand to each other, how far they agree."""
+"""Comparison of two models of one hand: matching joints, relative pose of bases, fingertip agreement."""
 
 from __future__ import annotations
 
@@ -23,22 +23,22 @@ from graspd.service.model.transforms import (
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
 
-#: Random postures in which two models are compared.
+#: Number of random postures in the comparison.
 POSTURES: Final = 200
-#: To the first of them the bases are fitted.
+#: Number of these postures for the fit of the bases.
 _FITTED: Final = 40
-#: Fingertips that are farther apart than this [m] belong to different hands.
+#: Largest distance of corresponding fingertips in models of one hand [m].
 TOLERANCE_M: Final = 1e-3
-#: Weight of where a fingertip's middle is in the other model, for hands whose motion does not tell: the jaws of a
-#: gripper only shift. Over all postures it moves no fingertip by a nanometre.
+#: Weight of a prior on fingertip positions in the other model, for hands with insufficient motion: jaws of a gripper
+#: only translate. Over all postures it moves no fingertip by a nanometre.
 _PRIOR: Final = 1e-3
-#: What a fit of another hand takes at most; one of the same hand ends by itself or is as good by then.
+#: Most evaluations of a fit to another hand; a fit to the same hand converges earlier or is as good by then.
 _LOOKS: Final = 15
 
 
 @dataclass(frozen=True)
 class SameHand:
-    """How the joints and the base of `theirs` stand to those of `ours`."""
+    """Mapping of the joints and base of `theirs` to those of `ours`."""
 
     ours: HandModel
     theirs: HandModel
@@ -47,7 +47,7 @@ class SameHand:
     base: Floats
     """(7,) pose of their root in our root's frame."""
     fingertips_m: float
-    """Largest distance of a fingertip in one model from the same in the other, over random postures."""
+    """Largest distance of corresponding fingertips over random postures."""
 
     @cached_property
     def bodies(self) -> NDArray[np.intp]:
@@ -76,19 +76,19 @@ def same_hand(
 ) -> SameHand:
     """Match two models of a hand.
 
-    A joint is the one of the same name; where the names of either hand all begin alike (`rh_`, `robot0:`), what they
-    begin with does not count, nor does upper or lower case. The bases are put where the fingertips of random postures
-    agree best; a fingertip is the middle of the corners of a finger's last body.
+    Joints are matched by name, ignoring case. A common prefix of all names of a hand (`rh_`, `robot0:`) is ignored too.
+    The bases are fitted for the best agreement of fingertips over random postures. A fingertip is the mean of the
+    corners of a finger's last body.
 
     Args:
-        ours: the hand that grasps were planned with.
+        ours: the hand for which grasps were planned.
         theirs: another model of it.
-        joint_map: joints of ours to joints of theirs, where names do not tell.
-        tolerance_m: fingertips that differ by more are those of another hand [m].
+        joint_map: joints of ours to joints of theirs, if names do not match.
+        tolerance_m: largest difference of fingertips of the same hand [m].
         seed: of the postures.
 
     Raises:
-        InputError: a joint of one has no other in the other model, or the fingertips do not agree.
+        InputError: a joint has no match in the other model, or the fingertips do not agree.
     """
     joints = _matched(ours, theirs, joint_map or {})
     tips = [body for body in ours.fingertips if body]
@@ -139,7 +139,7 @@ def _matched(ours: HandModel, theirs: HandModel, joint_map: Mapping[str, str]) -
 
 
 def _plain(name: str, names: Sequence[str]) -> str:
-    """A name without what all of them begin with, up to the last sign that is no letter and no number."""
+    """Strip the common prefix of all names, up to its last non-alphanumeric character."""
     alike = 0
     while len(names) > 1 and alike < len(name) and all(other[: alike + 1] == name[: alike + 1] for other in names):
         alike += 1
@@ -152,20 +152,20 @@ def _body_of_the_same_joint(ours: HandModel, theirs: HandModel, joints: NDArray[
 
 
 def _middle(hand: HandModel, body: int) -> Floats:
-    """(3,) mean of the corners of a body's pieces; of a body without any, its origin."""
+    """Return the mean (3,) of the corners of a body's pieces; the origin of a body without any."""
     corners = [piece.vertices for piece in hand.pieces if piece.body == body]
     return np.concatenate(corners).mean(axis=0) if corners else np.zeros(3)
 
 
 def _fit(where: Floats, poses: Floats, guess: Floats) -> tuple[Floats, Floats]:
-    """Pose (7,) of the other base, and places (T, 3) of the fingertips in the frames of their bodies there.
+    """Fit the pose (7,) of the other base, and positions (T, 3) of fingertips in their body frames there.
 
-    Least squares over that pose and the place of each fingertip in the frame of its body in the other model.
+    Least squares over both.
 
     Args:
         where: (N, T, 3) fingertips in our base frame.
         poses: (N, T, 7) bodies of fingertips in the other base frame.
-        guess: (T, 3) where fingertips are in the frames of these bodies, roughly.
+        guess: (T, 3) approximate positions of fingertips in the frames of these bodies.
     """
     from scipy.optimize import least_squares  # slow to load
 
@@ -190,7 +190,7 @@ def _fit(where: Floats, poses: Floats, guess: Floats) -> tuple[Floats, Floats]:
 
 
 def _placed(points: Floats, where: Floats) -> Floats:
-    """The pose that brings points (..., 3) nearest to others (Kabsch)."""
+    """Return the pose that best aligns points (..., 3) with others (Kabsch)."""
     a, b = points.reshape(-1, 3), where.reshape(-1, 3)
     left, _, right = np.linalg.svd((a - a.mean(axis=0)).T @ (b - b.mean(axis=0)))
     sign = np.diag([1.0, 1.0, float(np.sign(np.linalg.det(right.T @ left.T)))])

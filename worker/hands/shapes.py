@@ -1,8 +1,8 @@
-"""Collision shapes of a robot as convex pieces: primitives stay exact, meshes become hulls, or several where one would
-hide what touches.
+"""Collision shapes of a robot as convex pieces.
+Primitives stay exact; a mesh becomes one hull, or several where one would cover surface that can touch.
 
-The error of a mesh's pieces is how far its surface lies beneath them, along the shortest free way out: nine tenths of
-what can be seen from outside lie no deeper. Insides of housings do not count.
+The error of a mesh's pieces is the depth of its surface beneath them, along the shortest free direction out. It is the
+ninth decile over the surface visible from outside; interiors of housings do not count.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ Hulls = dict[tuple[str, tuple[float, ...]], list[tuple[Floats, Ints]]]
 def make_pieces(
     shape: Shape, *, body: int, pose: Floats, link: str, files: Mapping[str, bytes], base: str, hulls: Hulls
 ) -> list[ConvexPiece]:
-    """The convex pieces of a collision element: one, but of a mesh with hollows several.
+    """Make the convex pieces of a collision element: one, or several for a mesh with hollows.
 
     Args:
         shape: the element.
@@ -46,7 +46,7 @@ def make_pieces(
         link: link it comes from.
         files: all files of the hand.
         base: folder of the robot's description inside `files`.
-        hulls: hulls of this hand's meshes so far, by name and scale: a fingertip is often used for every finger.
+        hulls: hulls of this hand's meshes so far, by name and scale: fingers often share a fingertip mesh.
 
     Raises:
         HandError: a mesh is missing, outside the upload, unreadable, flat or far too large.
@@ -90,15 +90,15 @@ def _mesh_hulls(name: str, scale: tuple[float, ...], data: bytes, link: str) -> 
 
 def _hulls(points: Floats, faces: Ints) -> list[tuple[Floats, Ints]]:
     parts = parts_of(points, faces)
-    # A hull is that of all points of a file; some have points that no face names.
+    # A hull includes all points of a file; some files have points that no face uses.
     return [reduce_hull(part) for part in (parts if len(parts) > 1 else (points,))]
 
 
 def reduce_hull(points: Floats, limit: int = MAX_HULL_VERTICES) -> tuple[Floats, Ints]:
-    """Convex hull of points (N, 3) with at most `limit` corners and the volume of the full hull.
+    """Compute a convex hull of points (N, 3) with at most `limit` corners and the volume of the full hull.
 
-    The corners are chosen one by one where the hull so far is farthest from the full one, then grown about their
-    centroid until the volumes agree: the surface errs to both sides by half of what an inscribed hull would.
+    Corners are added one by one at the largest distance to the full hull, then scaled about their centroid until the
+    volumes agree. The surface error has both signs, with half the size of an inscribed hull's error.
     """
     made = recalled("reduced hull", [points, np.array(limit)], lambda: _reduced(points, limit))
     return made["0"], made["1"]
@@ -123,16 +123,16 @@ def _reduced(points: Floats, limit: int) -> tuple[Floats, Ints]:
 
 
 def _outside(points: Floats, corners: Floats) -> Floats:
-    """(N,) how far points (N, 3) lie outside the hull of a few of them; from the nearest corner while that is flat."""
+    """Return the distance (N,) of points (N, 3) outside a small hull; from its nearest corner if flat."""
     spread = np.linalg.svd(corners - corners.mean(axis=0), compute_uv=False)
     if len(corners) < 4 or spread[2] < 1e-6 * spread[0]:
         return np.linalg.norm(points[:, None] - corners[None], axis=2).min(axis=1)
     return signed_distance("hull", (), *new_hull(corners), points)
 
 
-#: A hull whose error is larger than this [m] is taken apart: an object would rest that far off the finger.
+#: Error of a hull above which it is decomposed [m]: an object would rest that far off the finger.
 MAX_ERROR_M: Final = 4e-3
-#: Pieces of a link at most: each costs time in every distance query.
+#: Most pieces of a link: each costs time in every distance query.
 MAX_PIECES: Final = 8
 _THRESHOLDS: Final = (0.1, 0.05)
 _COACD: Final = {
@@ -144,34 +144,34 @@ _COACD: Final = {
     "max_convex_hull": MAX_PIECES,
     "seed": 1,
 }
-#: A mesh is simplified to so many faces before it is taken apart.
+#: Number of faces to which a mesh is simplified before its decomposition.
 _FACES: Final = 1200
-#: Computing that a run of CoACD may take [s]: twice what the most tangled of 1200 faces took (58 s).
+#: CPU time limit of a CoACD run [s]: twice the time of the slowest mesh of 1200 faces (58 s).
 _CPU_S: Final = 120
 _POINTS: Final = 200
 _SHARE: Final = 0.9
-#: What lies no deeper beneath the hull makes no hollow [m].
+#: Largest depth beneath the hull that is no hollow [m].
 _FLAT_M: Final = 5e-4
-#: The six axes and the eight diagonals, a little turned: meshes have many faces along the axes.
+#: The six axes and the eight diagonals, slightly rotated: meshes have many faces along the axes.
 _TURN: Final = quat_to_matrix(np.array([0.9974, 0.0312, 0.0417, 0.0503]))
 _WAYS: Final = np.array([d for d in np.ndindex(3, 3, 3) if sum(k != 1 for k in d) in (1, 3)]) - 1.0
 _DIRECTIONS: Final = (_WAYS / np.linalg.norm(_WAYS, axis=1, keepdims=True)) @ _TURN.T
-#: A ray begins this far off its point [m].
+#: Offset of a ray's origin from its point [m].
 _START_M: Final = 1e-5
 _BLOCK: Final = 64
-#: Pieces thinner than this are splinters [m].
+#: Thickness below which pieces are splinters [m].
 _MIN_EXTENT_M: Final = 1e-3
 
 
 def parts_of(vertices: Floats, faces: Ints) -> tuple[Floats, ...]:
-    """Corners of the convex pieces that stand for a mesh: the mesh's own vertices where its hull is near enough.
+    """Return corners of the convex pieces of a mesh: the mesh's own vertices if its hull is near enough.
 
     Args:
         vertices: (V, 3) in metres.
         faces: (F, 3) triangles; they need not be closed.
 
     Raises:
-        HandError: taking it apart needs more computing than a mesh may.
+        HandError: the decomposition exceeds its CPU time limit.
     """
     whole: tuple[Floats, ...] = (vertices,)
     if _is_convex(vertices, faces):
@@ -189,7 +189,7 @@ def parts_of(vertices: Floats, faces: Ints) -> tuple[Floats, ...]:
 
 
 def _decomposed(vertices: Floats, faces: Ints) -> tuple[tuple[Floats, ...], bool]:
-    """The pieces, and whether CoACD has answered: what failed may succeed another time."""
+    """Return the pieces, and whether CoACD finished: a failed run may succeed later."""
     light = _simplified(vertices, faces)
     surface = _OpenSurface(*light)
     best: tuple[Floats, ...] = (vertices,)
@@ -200,7 +200,7 @@ def _decomposed(vertices: Floats, faces: Ints) -> tuple[tuple[Floats, ...], bool
         try:
             made = coacd_parts(*light, {"threshold": threshold, **_COACD}, _CPU_S)
         except WorkLimitExceeded as limit:
-            # Other shapes than those of a faster machine would be another hand.
+            # Other shapes than on a faster machine would be another hand.
             raise HandError(f"taking the mesh apart into convex pieces needs {limit}; simplify it") from None
         sure &= bool(made)
         parts = tuple(part for part in made if len(part) > 3 and np.ptp(part, axis=0).min() > _MIN_EXTENT_M)
@@ -213,14 +213,14 @@ def _decomposed(vertices: Floats, faces: Ints) -> tuple[tuple[Floats, ...], bool
 
 
 def _is_convex(vertices: Floats, faces: Ints) -> bool:
-    """Whether nearly all of the surface lies on the hull: then there is nothing to look for."""
+    """Check whether nearly all of the surface lies on the hull, so that no decomposition is needed."""
     normals, offsets = _planes(vertices[np.unique(faces)])
     depth = (offsets - _sample(vertices, faces) @ normals.T).min(axis=1)
     return float(np.quantile(depth, _SHARE)) < _FLAT_M
 
 
 def _sample(vertices: Floats, faces: Ints) -> Floats:
-    """Area-uniform points (N, 3), the same every time."""
+    """Return area-uniform points (N, 3), reproducibly."""
     areas = triangle_areas(vertices, faces)
     ladder = (np.arange(_POINTS) + 0.5) / _POINTS * areas.sum()
     face = np.minimum(np.searchsorted(np.cumsum(areas), ladder), len(faces) - 1)
@@ -231,15 +231,15 @@ def _sample(vertices: Floats, faces: Ints) -> Floats:
 
 
 class _OpenSurface:
-    """Points on a mesh with the directions in which each is seen from outside."""
+    """Points on a mesh with the directions in which each is visible from outside."""
 
     def __init__(self, vertices: Floats, faces: Ints) -> None:
         corners, self._points = vertices[faces], _sample(vertices, faces)
-        # (D, P) whether nothing of the mesh lies in a direction from a point; along its own face a point sees nothing.
+        # (D, P) whether a direction from a point is free of the mesh; along its own face a point sees nothing.
         self._sees = np.array([~_hits(self._points, direction, corners) for direction in _DIRECTIONS])
 
     def error(self, parts: tuple[Floats, ...]) -> float:
-        """Way [m] out of the union of the parts that nine tenths of the open surface keep."""
+        """Return the ninth decile of the open surface's distance [m] to the outside of the union of the parts."""
         reached = self._sees.any(axis=0)
         if not reached.any():
             return 0.0
@@ -251,7 +251,7 @@ class _OpenSurface:
 
 
 def _hits(points: Floats, direction: Floats, corners: Floats) -> NDArray[np.bool_]:
-    """(P,) whether a ray from a point meets one of the triangles (F, 3, 3) (Moeller and Trumbore 1997)."""
+    """Check (P,) whether rays from points hit one of the triangles (F, 3, 3) (Moeller and Trumbore 1997)."""
     a, first, second = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     across = np.cross(direction, second)
     determinant = np.einsum("ij,ij->i", first, across)
@@ -259,7 +259,7 @@ def _hits(points: Floats, direction: Floats, corners: Floats) -> NDArray[np.bool
     a, first, second, across = a[usable], first[usable], second[usable], across[usable]
     inverse = 1 / determinant[usable]
     hit = np.zeros(len(points), dtype=bool)
-    # Seen along the ray a point must lie in a triangle's box: most pairs end there.
+    # In projection along the ray a point must lie in a triangle's box, which excludes most pairs.
     plane = np.linalg.svd(direction[None])[2][1:].T
     seen, flat = points @ plane, corners[usable] @ plane
     low, high = flat.min(axis=1) - _START_M, flat.max(axis=1) + _START_M
@@ -276,7 +276,7 @@ def _hits(points: Floats, direction: Floats, corners: Floats) -> NDArray[np.bool
 
 
 def _ways_out(part: Floats, points: Floats) -> Floats:
-    """(D, P) way from each point along each direction until it leaves the hull of a part; 0 outside of it."""
+    """Return the distance (D, P) from points along directions out of a part's hull; 0 outside of it."""
     normals, offsets = _planes(part)
     inside = offsets - points @ normals.T
     rates = _DIRECTIONS @ normals.T
@@ -288,7 +288,7 @@ def _ways_out(part: Floats, points: Floats) -> Floats:
 
 
 def _planes(points: Floats) -> tuple[Floats, Floats]:
-    """Outward unit normals (P, 3) and offsets (P,) of the faces of a hull."""
+    """Return outward unit normals (P, 3) and offsets (P,) of the faces of a hull."""
     corners, faces = hull(points)
     a, b, c = np.moveaxis(corners[faces], 1, 0)
     normals = np.cross(b - a, c - a)
@@ -304,7 +304,7 @@ def _simplified(vertices: Floats, faces: Ints) -> tuple[Floats, Ints]:
     merged = trimesh.Trimesh(vertices, faces, process=True)
     points, triangles = np.asarray(merged.vertices, float), np.asarray(merged.faces, np.int32)
     if len(triangles) > _FACES:
-        import fast_simplification  # where something is new on the machine
+        import fast_simplification  # slow to load, not needed for cached results
 
         light, kept = fast_simplification.simplify(
             points.astype(np.float32), triangles, target_reduction=1 - _FACES / len(triangles)

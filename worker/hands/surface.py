@@ -1,4 +1,4 @@
-"""A fixed sample of the hand's outer surface: even, with normals and the area each point stands for."""
+"""Fixed, even sample of the hand's outer surface, with normals and the area of each point."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import ConvexPiece, HandModel, SurfacePoints
 from graspd.worker.objects.disk_cache import arrays_kept_or_made, content_of
 
-#: Candidates per wanted point; thinning keeps the one in five that spreads most evenly.
+#: Candidates per point; thinning keeps the one in five that spreads most evenly.
 OVERSAMPLING: Final = 5
-#: Candidates on the whole hand at least: what the exterior area is measured with.
+#: Least number of candidates on the whole hand, which determine the exterior area.
 MIN_CANDIDATES: Final = 30_000
 #: A point this deep inside another body at rest can never touch an object [m].
 BURIED_M: Final = 5e-4
@@ -30,7 +30,7 @@ COINCIDENT_M: Final = 1e-6
 
 
 def sample_surface(hand: HandModel, count: int, *, seed: int = 0) -> SurfacePoints:
-    """Exactly `count` points on the union of the hand's pieces.
+    """Sample exactly `count` points on the union of the hand's pieces.
 
     Area-uniform candidates are thinned to a blue-noise subset, body by body, by farthest-point selection; each point
     then gets the area of its Voronoi cell among the candidates, so the areas sum to the exterior area. Parts inside
@@ -39,7 +39,7 @@ def sample_surface(hand: HandModel, count: int, *, seed: int = 0) -> SurfacePoin
     Raises:
         HandError: the hand has no outer surface.
     """
-    # Of a hand that is read one knows the shapes long before one knows how it closes.
+    # The shapes of a hand are available long before its closing.
     key = (content_of(_Shapes(hand.pieces, _rest(hand))), count, seed)
     with _lock:
         if key not in _samples:
@@ -51,7 +51,7 @@ def sample_surface(hand: HandModel, count: int, *, seed: int = 0) -> SurfacePoin
 
 @dataclass(frozen=True)
 class _Shapes:
-    """All of a hand that its surface depends on."""
+    """All parts of a hand that determine its surface."""
 
     pieces: tuple[ConvexPiece, ...]
     rest: Floats
@@ -59,7 +59,7 @@ class _Shapes:
 
 
 def _rest(hand: HandModel) -> Floats:
-    """(L, 7) poses of a hand's bodies in its pre-shape."""
+    """Return the poses (L, 7) of a hand's bodies in its pre-shape."""
     return body_poses(hand, IDENTITY_POSE, hand.expand(hand.preshape))[0]
 
 
@@ -72,7 +72,7 @@ def _sample(hand: HandModel, count: int, seed: int) -> SurfacePoints:
 
     candidates = _candidates(hand, max(OVERSAMPLING * count, MIN_CANDIDATES), seed)
     if len(candidates) < count:
-        # Most of the surface is hidden inside other pieces: look harder once, in proportion.
+        # Most of the surface is hidden inside other pieces: sample once more, in proportion.
         more = max(OVERSAMPLING * count, MIN_CANDIDATES) * count * OVERSAMPLING // max(len(candidates), 1)
         candidates = _candidates(hand, min(more, 5_000_000), seed)
     if len(candidates) < count:
@@ -101,7 +101,7 @@ def _sample(hand: HandModel, count: int, seed: int) -> SurfacePoints:
 
 
 def _candidates(hand: HandModel, count: int, seed: int) -> SurfacePoints:
-    """About `count` area-uniform points on the pieces, without those that are buried."""
+    """Return about `count` area-uniform points on the pieces, without buried ones."""
     rng = np.random.default_rng([seed, 0x5EED])
     shares = np.array([primitives.area(p.kind, p.size, p.vertices, p.faces) for p in hand.pieces])
     numbers = np.maximum(np.ceil(count * shares / shares.sum()).astype(int), 8)
@@ -126,13 +126,13 @@ def _local_vertices(piece: ConvexPiece) -> Floats:
 
 
 def piece_distance(piece: ConvexPiece, points: Floats) -> Floats:
-    """(N,) signed distance of points (N, 3) in the body frame to a piece, negative inside [m]."""
+    """Return the signed distance (N,) of points (N, 3) in the body frame to a piece, negative inside [m]."""
     local = apply(invert(piece.pose), points)
     return primitives.signed_distance(piece.kind, piece.size, _local_vertices(piece), piece.faces, local)
 
 
 def _buried(hand: HandModel, own: int, position: Floats, normal: Floats, rest: Floats) -> NDArray[np.bool_]:
-    """(N,) whether points of piece `own` lie inside another piece, or on a face that an earlier piece already has."""
+    """Check (N,) whether points of piece `own` lie inside another piece or on a face of an earlier piece."""
     mine = hand.pieces[own]
     above = position + COINCIDENT_M * normal
     below = position - COINCIDENT_M * normal
@@ -156,7 +156,7 @@ def _buried(hand: HandModel, own: int, position: Floats, normal: Floats, rest: F
 
 
 def apportion(weights: Floats, count: int, available: NDArray[np.intp]) -> NDArray[np.int64]:
-    """`count` seats by largest remainder in proportion to weights (L,), none above what is available (L,)."""
+    """Distribute `count` by largest remainder in proportion to weights (L,), within the available (L,)."""
     seats = np.zeros(len(weights), dtype=np.int64)
     while (left := count - int(seats.sum())) > 0:
         open_weights = np.where(seats < available, weights, 0.0)
@@ -171,7 +171,7 @@ def apportion(weights: Floats, count: int, available: NDArray[np.intp]) -> NDArr
 
 
 def farthest_points(points: Floats, count: int) -> NDArray[np.intp]:
-    """Indices of `count` points of (N, K), each chosen farthest from those before it (Gonzalez 1985)."""
+    """Return indices of `count` points of (N, K), each farthest from those before it (Gonzalez 1985)."""
     chosen = np.empty(count, dtype=np.intp)
     chosen[0] = int(np.argmax(((points - points.mean(axis=0)) ** 2).sum(axis=1)))
     nearest = np.full(len(points), np.inf)
@@ -179,7 +179,7 @@ def farthest_points(points: Floats, count: int) -> NDArray[np.intp]:
     for i in range(1, count):
         last = points[chosen[i - 1]]
         np.minimum(nearest, squares - 2 * (points @ last) + last @ last, out=nearest)
-        # Rounding may leave the point itself a hair above another: it must not come twice.
+        # Rounding may place the point itself slightly above another: it must not be chosen twice.
         nearest[chosen[i - 1]] = -1.0
         chosen[i] = int(np.argmax(nearest))
     return chosen

@@ -1,4 +1,4 @@
-"""Tendons: one drive that pulls several joints. It is told their sum; how they share it is up to what they touch."""
+"""Tendons: one drive pulls several joints. It commands their sum; contact determines the shares."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from graspd.service.model.errors import HandError
 from graspd.service.model.transforms import Floats
 from graspd.worker.hands.robot import Robot
 
-#: Coefficients smaller than this pull nothing.
+#: Coefficients below this count as zero.
 LEAST_PULL: Final = 1e-6
-#: The outer joints of a Shadow finger: J1 hangs on J2, and one tendon pulls both. Its URDFs cannot say so.
+#: The outer joints of a Shadow finger: one tendon pulls J1 and J2. Its URDFs cannot state this.
 _SHADOW: Final = re.compile(r"(?P<prefix>.*?)(?P<finger>FF|MF|RF|LF)J1")
 _SHADOW_FINGERS: Final = frozenset({"FF", "MF", "RF"})
 
@@ -24,7 +24,7 @@ _SHADOW_FINGERS: Final = frozenset({"FF", "MF", "RF"})
 class Tendon:
     """A drive of several dofs: its length is the sum of coefficient times joint value.
 
-    At a pull F each joint gets the torque c F, whatever its value: the drive moves the sum alone.
+    At a pull F each joint gets the torque c F at any value: the drive moves the sum only.
     """
 
     name: str
@@ -32,20 +32,20 @@ class Tendon:
     coefficients: tuple[float, ...]
 
     def gain(self, stiffness: Floats) -> float:
-        """Gain of the drive [N m/rad of length] from those of the dofs (D,), as of springs in a row: 1 / sum(c^2 / k).
+        """Compute the drive's gain [N m/rad of length] from its dofs' (D,), in series: 1 / sum(c^2 / k).
 
-        Then what commands c F of each joint by q + c F / k commands the pull F of the tendon.
+        Commanding each joint by q + c F / k, for a torque c F, then commands the pull F of the tendon.
         """
         parts = zip(self.dofs, self.coefficients, strict=True)
         return 1.0 / sum(c * c / float(stiffness[d]) for d, c in parts)
 
     def limit(self, effort: Floats) -> float:
-        """Largest pull that exceeds no dof's limit (D,)."""
+        """Return the largest pull within every dof's limit (D,)."""
         return min(float(effort[d]) / abs(c) for d, c in zip(self.dofs, self.coefficients, strict=True))
 
 
 def actuators(tendons: tuple[Tendon, ...], dofs: int) -> Floats:
-    """(A, D) length of each drive from the dofs' values: the dofs in their order, a tendon where its first dof is."""
+    """Return (A, D) length of each drive from the dofs' values, in dof order, a tendon at its first dof."""
     rows: list[Floats] = []
     pulled = {d: tendon for tendon in tendons for d in tendon.dofs}
     for d in range(dofs):
@@ -64,9 +64,9 @@ def actuators(tendons: tuple[Tendon, ...], dofs: int) -> Floats:
 def tendons_of(
     robot: Robot, stated: Mapping[str, Mapping[str, float]] | None, dof_names: tuple[str, ...]
 ) -> tuple[Tendon, ...]:
-    """Tendons of a hand: those stated, else the description's, else those that its kind of hand is known to have.
+    """Return the tendons of a hand: those stated, else the description's, else those of its kind of hand.
 
-    Of each count the joints that are degrees of freedom of the hand; fewer than two make no tendon.
+    Only joints that are degrees of freedom of the hand count; fewer than two make no tendon.
     """
     said = stated if stated is not None else robot.tendons or known_tendons(robot)
     found = []
@@ -78,7 +78,7 @@ def tendons_of(
 
 
 def known_tendons(robot: Robot) -> dict[str, dict[str, float]]:
-    """Those of a Shadow hand, told by the names and the order of its joints: J1 + J2 of each finger but the thumb."""
+    """Return a Shadow hand's tendons by joint names and order: J1 + J2 of each finger but the thumb."""
     found: dict[str, dict[str, float]] = {}
     fingers = set()
     for name, joint in robot.joints.items():
@@ -89,13 +89,14 @@ def known_tendons(robot: Robot) -> dict[str, dict[str, float]]:
         if inner is not None and inner.type == "revolute" and inner.mimic is None and inner.child == joint.parent:
             found[f"{name[:-1]}0"] = {inner.name: 1.0, name: 1.0}
             fingers.add(outer["finger"])
-    # MJCF says what its tendons are.
+    # MJCF defines its tendons itself.
     return found if fingers >= _SHADOW_FINGERS and robot.format == "URDF" else {}
 
 
 def check_tendons(robot: Robot, stated: Mapping[str, Mapping[str, float]]) -> None:
-    """Raises:
-    HandError: a stated tendon names what is no joint, pulls fewer than two, or shares one with another tendon.
+    """Check stated tendons.
+    Raises:
+        HandError: one names an unknown joint, pulls fewer than two, or shares one with another tendon.
     """
     seen: set[str] = set()
     for name, pulls in stated.items():

@@ -1,5 +1,4 @@
-"""From a robot's joints to a hand's tree of bodies: its root, fixed joints merged, mimic chains resolved, links
-dropped."""
+"""Convert a robot's joints to a hand's tree of bodies: root, merged fixed joints, resolved mimics."""
 
 from __future__ import annotations
 
@@ -18,17 +17,17 @@ from graspd.worker.hands.options import HandOptions
 from graspd.worker.hands.robot import MAX_LENGTH_M, UNLIMITED_M, Joint, Mimic, Robot, chain_to
 from graspd.worker.hands.tendons import check_tendons
 
-#: Share of its range that a drive may lose without a word.
+#: Share of its range that a drive may lose without a note.
 _TOLD_CUT: Final = 0.01
-#: A follower does not go farther [rad], [m].
+#: Largest position of a follower [rad], [m].
 _MOST: Final = (200 * math.pi, MAX_LENGTH_M)
-#: A joint with a smaller range stands still [rad or m].
+#: A joint with a smaller range is fixed [rad or m].
 LEAST_RANGE: Final = 1e-5
 
 
 @dataclass(frozen=True)
 class Drive:
-    """How a moving joint follows a degree of freedom: multiplier * value of joint `dof` + offset."""
+    """Coupling of a moving joint to a degree of freedom: multiplier * value of joint `dof` + offset."""
 
     dof: str
     multiplier: float
@@ -37,7 +36,7 @@ class Drive:
 
 @dataclass(frozen=True)
 class Tree:
-    """Bodies in an order in which parents come first; body 0 is the root."""
+    """Bodies with parents first; body 0 is the root."""
 
     body_names: tuple[str, ...]
     parent: tuple[int, ...]
@@ -46,9 +45,9 @@ class Tree:
     origin: tuple[Floats, ...]
     """(7,) pose of the joint frame in the parent's body frame."""
     links: dict[str, tuple[int, Floats]]
-    """Each kept link: its body and its pose in the body's frame."""
+    """Body of each retained link, and its pose in the body's frame."""
     drives: dict[str, Drive]
-    """Each moving joint."""
+    """Drive of each moving joint."""
     joint_names: tuple[str, ...]
     """Moving joints in the robot's order."""
     dof_names: tuple[str, ...]
@@ -57,17 +56,17 @@ class Tree:
     upper: Floats
     velocity: Floats
     still: tuple[str, ...]
-    """Joints that their limits leave one value, in which they stand."""
+    """Joints fixed because their limits leave one value."""
     known: frozenset[str]
     """Names of all joints and links of the robot, dropped and frozen ones too."""
 
 
 def build_tree(robot: Robot, options: HandOptions) -> Tree:
-    """The body tree of a hand.
+    """Build the body tree of a hand.
 
     Raises:
-        HandError: an option names a joint or link that is not there, nothing is left to move, or couplings leave a
-            degree of freedom no room.
+        HandError: an option names an unknown joint or link, nothing moves, or couplings leave a degree of freedom no
+            range.
     """
     _check_names(robot, options)
     # A joint on a tendon follows nothing: it is free within its limits.
@@ -122,12 +121,12 @@ def _check_names(robot: Robot, options: HandOptions) -> None:
 
 
 def joints_above(robot: Robot, link: str) -> tuple[str, ...]:
-    """Moving joints between the robot's root and a link, from the root on."""
+    """Return the moving joints from the robot's root to a link, in this order."""
     return tuple(joint.name for joint in chain_to(robot, link) if joint.type != "fixed")
 
 
 def _kept_joints(robot: Robot, root: str, drop: set[str]) -> list[Joint]:
-    """Joints below the root and not below a dropped link, in the robot's order."""
+    """Return joints below the root and not below a dropped link, in the robot's order."""
     children: dict[str, list[Joint]] = {}
     for joint in robot.joints.values():
         children.setdefault(joint.parent, []).append(joint)
@@ -142,7 +141,7 @@ def _kept_joints(robot: Robot, root: str, drop: set[str]) -> list[Joint]:
 
 
 def _still(kept: Iterable[Joint], mimics: Mapping[str, Mimic | None]) -> list[str]:
-    """Joints that follow nothing and whose limits leave them one value."""
+    """Return joints that follow nothing and whose limits leave one value."""
     return [
         joint.name
         for joint in kept
@@ -151,7 +150,7 @@ def _still(kept: Iterable[Joint], mimics: Mapping[str, Mimic | None]) -> list[st
 
 
 def _resolve(name: str, mimics: Mapping[str, Mimic | None], fixed: Mapping[str, float]) -> Drive | float:
-    """The drive of a joint through a chain of mimics, or its constant value if the chain ends at a fixed joint.
+    """Return the drive of a joint through a chain of mimics, or its value if a fixed joint ends the chain.
 
     q = m1 (m2 (... ) + o2) + o1, so the multipliers multiply and each offset is scaled by those before it.
     """
@@ -173,7 +172,7 @@ def _resolve(name: str, mimics: Mapping[str, Mimic | None], fixed: Mapping[str, 
 
 
 def _fold_limits(dof: str, moving: dict[str, Drive], robot: Robot, options: HandOptions) -> tuple[float, float]:
-    """Range of a dof in which every joint that follows it stays inside its own limits; see `_binds`."""
+    """Return the range of a dof in which all its followers stay within their own limits; see `_binds`."""
     lower, upper = -math.inf, math.inf
     narrowest = dof
     for name, drive in moving.items():
@@ -203,7 +202,7 @@ def _fold_limits(dof: str, moving: dict[str, Drive], robot: Robot, options: Hand
 
 
 def _check_travel(dof: str, lower: float, upper: float, moving: dict[str, Drive], robot: Robot) -> None:
-    """A follower whose own limits do not bind it goes where its drive takes it, but not to the moon."""
+    """Check that a follower without binding limits stays within a plausible range."""
     for name, drive in moving.items():
         way, most = abs(drive.multiplier) * (upper - lower), _MOST[robot.joints[name].type == "prismatic"]
         if drive.dof == dof and name != dof and (way > most or abs(drive.offset) > most):
@@ -215,12 +214,12 @@ def _check_travel(dof: str, lower: float, upper: float, moving: dict[str, Drive]
 
 
 def _binds(joint: Joint, drive: Drive, robot: Robot, options: HandOptions) -> bool:
-    """Whether a joint's own limits hold it. Those of a URDF's follower do not, as in ROS: most of them are junk."""
+    """Check whether a joint's own limits bind it; a URDF follower's do not, as in ROS: most are junk."""
     return joint.name == drive.dof or robot.format != "URDF" or joint.name in options.couplings
 
 
 def passed_limits(robot: Robot, tree: Tree, options: HandOptions) -> list[str]:
-    """Joints that follow another farther than their own limits, which do not bind them."""
+    """Return notes on joints that follow another beyond their own limits, which do not bind them."""
     found = []
     for name in tree.joint_names:
         joint, drive = robot.joints[name], tree.drives[name]
@@ -233,7 +232,7 @@ def passed_limits(robot: Robot, tree: Tree, options: HandOptions) -> list[str]:
 
 
 def cut_drives(robot: Robot, tree: Tree) -> list[str]:
-    """What followers' limits leave of a dof's own range, where that is less."""
+    """Return notes on dofs whose range is reduced by their followers' limits."""
     found = []
     for dof, lower, upper in zip(tree.dof_names, tree.lower, tree.upper, strict=True):
         own = robot.joints[dof]
@@ -243,7 +242,7 @@ def cut_drives(robot: Robot, tree: Tree) -> list[str]:
 
 
 def _fold_velocity(dof: str, moving: dict[str, Drive], robot: Robot) -> float:
-    """Speed of a dof at which no joint that follows it exceeds its own limit; 0 where none is stated."""
+    """Return the speed of a dof at which no follower exceeds its own limit; 0 if not stated."""
     stated = [
         robot.joints[name].velocity / abs(drive.multiplier)
         for name, drive in moving.items()
@@ -257,7 +256,7 @@ def _walk(
 ) -> tuple[
     tuple[str, ...], tuple[int, ...], tuple[Joint | None, ...], tuple[Floats, ...], dict[str, tuple[int, Floats]]
 ]:
-    """Bodies by depth-first descent; a link behind a fixed or frozen joint joins its parent's body."""
+    """Collect bodies depth first; a link behind a fixed or frozen joint joins its parent's body."""
     names, parents = [root], [-1]
     joints: list[Joint | None] = [None]
     origins = [IDENTITY_POSE.copy()]
@@ -283,7 +282,7 @@ def _walk(
 
 
 def joint_motion(joint: Joint, value: float) -> Floats:
-    """(7,) pose of the child's frame in the joint frame at a joint value [rad or m]."""
+    """Return the pose (7,) of the child's frame in the joint frame at a joint value [rad or m]."""
     motion = IDENTITY_POSE.copy()
     if joint.type == "prismatic":
         motion[:3] = joint.axis * value
@@ -293,23 +292,23 @@ def joint_motion(joint: Joint, value: float) -> Floats:
 
 
 def joint_type(joint: Joint | None) -> JointType:
-    """Type in the model: a continuous joint is a revolute one."""
+    """Return the type in the model: a continuous joint is revolute."""
     if joint is None:
         return JointType.FIXED
     return JointType.PRISMATIC if joint.type == "prismatic" else JointType.REVOLUTE
 
 
-#: No finger reaches farther than this from where the fingers of its hand part [m]; legs and arms do.
+#: Largest reach of a finger from where the fingers of its hand branch [m]; legs and arms exceed it.
 MAX_FINGER_M = 0.35
-#: What reaches farther than this from its first joint is no hand by itself [m].
+#: Largest reach of a hand from its first joint [m].
 MAX_HAND_M = 0.5
 
 
 def pick_root(robot: Robot, options: HandOptions) -> str:
-    """The chosen root; else the robot's, moved down past dropped links, and past the joints of an arm or a wrist.
+    """Return the chosen root, else the robot's, moved past dropped links and joints of an arm or wrist.
 
     Raises:
-        HandError: it is a whole robot, or an arm without a hand; the message names the hands that it has.
+        HandError: it is a whole robot, or an arm without a hand; the message names the hands in it.
     """
     if options.root:
         return options.root
@@ -343,7 +342,7 @@ def pick_root(robot: Robot, options: HandOptions) -> str:
 
 
 def hand_links(tree: _Moving, root: str) -> list[str]:
-    """Links, from the root down, at which a hand begins: where two fingers or more part, none of them long."""
+    """Return links, from the root down, at which a hand begins: two or more short fingers branch."""
     found: list[str] = []
     queue = deque([root])
     while queue:
@@ -357,7 +356,7 @@ def hand_links(tree: _Moving, root: str) -> list[str]:
 
 
 class _Moving:
-    """The joints of a robot behind which something moves."""
+    """The joints of a robot with moving joints at or below them."""
 
     def __init__(self, robot: Robot, options: HandOptions) -> None:
         self.robot, self.options = robot, options
@@ -381,27 +380,27 @@ class _Moving:
         return order[::-1]
 
     def free(self, joint: Joint) -> bool:
-        """Whether the joint itself moves."""
+        """Check whether the joint itself moves."""
         return joint.type != "fixed" and joint.name not in self.options.fix
 
     def free_below(self, joint: Joint) -> bool:
-        """Whether the joint, or one behind it, moves."""
+        """Check whether the joint, or one below it, moves."""
         return self.free(joint) or self._moves[joint.child]
 
     def onward(self, link: str) -> list[Joint]:
-        """Joints of a link behind which something moves."""
+        """Return the joints of a link that lead to moving joints."""
         return [joint for joint in self._children.get(link, []) if self.free_below(joint)]
 
     def reach(self, link: str) -> float:
-        """Longest way from a link along its joints to the last one that moves [m]."""
+        """Return the longest path from a link along its joints to the last moving one [m]."""
         return self._reach[link]
 
     def touches(self, link: str) -> bool:
-        """Whether two of the branches below a link have collision shapes."""
+        """Check whether two of the branches below a link have collision shapes."""
         return sum(self._has_shape(joint.child) for joint in self.onward(link)) > 1
 
     def stiff_digits(self) -> list[str]:
-        """Fixed joints of the first link, behind a moving joint and with none behind it, at which shapes part."""
+        """Return fixed joints of the first link at which shapes branch, between a moving joint and the ends."""
         for joint in self.robot.joints.values():
             ends = deque([joint.child] if self.free(joint) and not self._moves[joint.child] else [])
             while ends:
@@ -422,13 +421,13 @@ class _Moving:
 
 
 def _below_arm(tree: _Moving, root: str, options: HandOptions) -> str:
-    """Where a hand on an arm begins: behind the last moving joint before the fingers part; else the root itself."""
+    """Return the link where a hand on an arm begins: below the last joint before the fingers, or the root."""
     start, at = root, root
     palm = options.palm.link if options.palm else None
     while at != palm:
         onward = tree.onward(at)
         if len(onward) != 1:
-            # A tree that never parts is a single finger: nothing above it is an arm.
+            # A tree that never branches is a single finger: nothing above it is an arm.
             return start if onward else root
         (joint,) = onward
         at = joint.child

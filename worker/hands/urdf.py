@@ -1,7 +1,7 @@
-"""URDF and XML from strangers, read with every value checked here, so that nothing behind this module has to.
+"""Reader of URDF and XML from untrusted sources. It checks every value, so later code does not.
 
 The common URDF libraries accept reversed limits, NaN, unknown mimics and several roots, and resolve mimic chains
-wrongly; this reader refuses each by name. It knows only what a hand needs: links with shapes and masses, and joints.
+wrongly; this reader refuses each with a message. It reads only links with shapes and masses, and joints.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from graspd.service.store.hand_files import text_of
 from graspd.worker.hands.robot import MAX_LENGTH_M, MOVING, UNLIMITED_M, Joint, Link, Mimic, Robot, Shape, build_robot
 
 MAX_BYTES: Final = 4 * 2**20
-#: Visual elements beyond this many are not drawn.
+#: Largest number of visual elements that are drawn.
 MAX_VISUALS: Final = 1024
 Colour = tuple[float, float, float]
 
 
 def read_urdf(data: bytes, filename: str = "the URDF") -> Robot:
-    """Checked contents of a URDF.
+    """Read and check a URDF.
 
     Raises:
         HandError: not XML, not a robot, or a value that no hand can have; the message names it.
@@ -54,7 +54,7 @@ def _read_link(element: ElementTree.Element, materials: dict[str, Colour | None]
 
 
 def _read_visuals(element: ElementTree.Element, link: str, materials: dict[str, Colour | None]) -> tuple[Shape, ...]:
-    """Visual elements with their colours. What cannot be used is left out: nothing but pictures needs them."""
+    """Read visual elements with their colours. Unusable ones are left out: only pictures need them."""
     found = []
     for visual in element.findall("visual")[:MAX_VISUALS]:
         try:
@@ -119,12 +119,12 @@ def _read_joint(element: ElementTree.Element, notes: list[str]) -> Joint:
     try:
         return _moving(element, still, what, notes)
     except HandError as error:
-        # It only matters where the hand moves by it.
+        # The fault only matters if the hand moves by this joint.
         return replace(still, fault=str(error))
 
 
 def _moving(element: ElementTree.Element, still: Joint, what: str, notes: list[str]) -> Joint:
-    """The joint with its axis and limits; HandError where no hand can have it."""
+    """Return the joint with its axis and limits; raise HandError if no hand can have it."""
     if still.type not in MOVING:
         raise HandError(
             f"{what}: type {still.type[:40]!r} cannot be used; a hand has revolute, prismatic and fixed joints"
@@ -146,7 +146,7 @@ def _moving(element: ElementTree.Element, still: Joint, what: str, notes: list[s
 
 
 def _velocity(element: ElementTree.Element) -> float:
-    """Limit of speed [rad/s or m/s]; 0 where none that makes sense is stated: grasps do not need it."""
+    """Return the speed limit [rad/s or m/s]; 0 if no plausible one is stated: grasps do not need it."""
     limit = element.find("limit")
     try:
         value = abs(float(limit.get("velocity", "0"))) if limit is not None else 0.0
@@ -167,7 +167,7 @@ def _axis(element: ElementTree.Element, what: str, notes: list[str]) -> Floats:
 
 
 def _limits(element: ElementTree.Element, kind: str, what: str) -> tuple[float, float, float]:
-    """Lower and upper limit [rad or m] and effort [N m or N]; a continuous joint gets one turn."""
+    """Return lower and upper limit [rad or m] and effort [N m or N]; a continuous joint gets one turn."""
     limit = element.find("limit")
     if kind == "continuous":
         effort = 0.0 if limit is None else _number(limit, "effort", f"limit of {what}", default=0.0)
@@ -185,7 +185,7 @@ def _limits(element: ElementTree.Element, kind: str, what: str) -> tuple[float, 
 
 
 def _follower_limits(element: ElementTree.Element, kind: str, what: str) -> tuple[float, float, float]:
-    """The limits of a joint that follows another, which do not bind it: where they are junk, none."""
+    """Return the limits of a follower, which do not bind it; none if they are junk."""
     try:
         return _limits(element, kind, what)
     except HandError:
@@ -249,7 +249,7 @@ def _origin(element: ElementTree.Element, what: str) -> Floats:
 
 
 def quat_from_rpy(roll: float, pitch: float, yaw: float) -> Floats:
-    """Unit quaternion w x y z of rotations about the fixed axes x, then y, then z [rad]."""
+    """Return the unit quaternion w x y z of rotations about the fixed axes x, then y, then z [rad]."""
     x, y, z = (
         quat_from_axis_angle(axis, np.asarray(angle)) for axis, angle in zip(np.eye(3), (roll, pitch, yaw), strict=True)
     )
@@ -262,17 +262,17 @@ _MAX_PREFIXES: Final = 100
 
 
 def parse_xml(data: bytes, name: str, what: str = "", root: str = "", *, limit_bytes: int) -> Element:
-    """The root element, its namespace taken off.
+    """Return the root element without its namespace.
 
     Args:
         data: the file.
-        name: what it is called, for messages.
+        name: its name in messages.
         what: the kind of file, with its article.
         root: name of its root element; empty: any.
         limit_bytes: its largest size.
 
     Raises:
-        HandError: it is empty, no XML, or has another root element.
+        HandError: it is empty, not XML, or has another root element.
         LimitError: larger than the limit.
     """
     if len(data) > limit_bytes:
@@ -296,7 +296,7 @@ def parse_xml(data: bytes, name: str, what: str = "", root: str = "", *, limit_b
 
 
 def _with_prefixes(text: str) -> Element:
-    """The tree of an XML text; prefixes of foreign elements (`drake:...`) that nobody declared are declared here."""
+    """Parse an XML text; undeclared prefixes of foreign elements (`drake:...`) are declared here."""
     try:
         tree: Element = SafeTree.fromstring(text)
     except ParseError as error:

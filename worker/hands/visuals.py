@@ -1,6 +1,6 @@
-"""Visual elements of a hand's links with their colours and mesh files, read when somebody draws them.
+"""Visual elements of a hand's links with their colours and mesh files, loaded at the first use.
 
-Nothing but pictures needs them, so none of them can make a hand unusable: what cannot be read is left out.
+Only pictures need them, so a faulty one cannot make a hand unusable: unreadable files are left out.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from graspd.worker.hands.primitives import tessellate
 from graspd.worker.hands.robot import Ints, Shape
 from graspd.worker.objects.formats import Nearby, Soup, read_mesh
 
-#: A hand's visual meshes together [faces]: beyond that a picture shows no more.
+#: Largest total of a hand's visual meshes [faces]: more would not change a picture.
 MAX_FACES: Final = 400_000
 
 
 @dataclass(frozen=True)
 class VisualMesh:
-    """A triangle mesh of one colour on a body."""
+    """Triangle mesh of one colour on a body."""
 
     body: int
     vertices: Floats
@@ -39,7 +39,7 @@ class VisualMesh:
 
 @dataclass(frozen=True)
 class PlacedShape:
-    """A visual element, the body it moves with, its (7,) pose in the body's frame, and the link it comes from."""
+    """Visual element, the body it moves with, its (7,) pose in the body's frame, and its link."""
 
     shape: Shape
     body: int
@@ -49,7 +49,7 @@ class PlacedShape:
 
 @dataclass(frozen=True)
 class Visuals:
-    """The visual elements of a hand; `meshes` reads their files at the first use."""
+    """Visual elements of a hand; `meshes` loads their files at the first use."""
 
     placed: Sequence[PlacedShape] = ()
     files: Mapping[str, bytes] = field(default_factory=dict, repr=False)
@@ -58,7 +58,7 @@ class Visuals:
 
     @cached_property
     def content(self) -> str:
-        """Digest of all that the meshes follow from."""
+        """Digest of all data that determine the meshes."""
         whole = hashlib.sha256()
         for item in self.placed:
             shape = item.shape
@@ -73,7 +73,7 @@ class Visuals:
 
     @cached_property
     def meshes(self) -> tuple[VisualMesh, ...]:
-        """All that can be read, up to `MAX_FACES` triangles."""
+        """Return all readable meshes, up to `MAX_FACES` triangles."""
         found: list[VisualMesh] = []
         soups: dict[str, Soup] = {}
         left = MAX_FACES
@@ -89,12 +89,12 @@ NO_VISUALS: Final = Visuals()
 
 
 def lighter(mesh: VisualMesh, times: float) -> VisualMesh:
-    """The mesh with so many times fewer triangles."""
-    # Slow to load, and the meshes that come here are few.
+    """Reduce the number of triangles by a factor."""
+    # Slow to load, and few meshes come here.
     import trimesh
 
     merged = trimesh.Trimesh(mesh.vertices, mesh.faces, process=True)
-    import fast_simplification  # where something is new on the machine
+    import fast_simplification  # slow to load, not needed for cached results
 
     points, triangles = fast_simplification.simplify(
         np.asarray(merged.vertices, np.float32), np.asarray(merged.faces, np.int32), target_reduction=1 - 1 / times
@@ -129,7 +129,7 @@ def _meshes(item: PlacedShape, files: Mapping[str, bytes], base: str, soups: dic
 
 
 def _nearby(mesh: str, files: Mapping[str, bytes]) -> Nearby:
-    """What a mesh names of a hand's files, and what its libraries name; so many and no more."""
+    """Return the hand's files that a mesh and its libraries name, up to a limit."""
     naming = [mesh]
     asked = 0
 
@@ -150,7 +150,7 @@ def _nearby(mesh: str, files: Mapping[str, bytes]) -> Nearby:
 
 
 def _used(vertices: Floats, faces: Ints) -> tuple[Floats, Ints]:
-    """The vertices that some faces name, and those faces."""
+    """Return the vertices that some faces use, and those faces."""
     keep, index = np.unique(faces, return_inverse=True)
     return vertices[keep], index.reshape(-1, 3).astype(np.int32)
 
@@ -163,11 +163,11 @@ def _file_of(item: PlacedShape, files: Mapping[str, bytes], base: str) -> str:
 
 
 def find_mesh(filename: str, files: Mapping[str, bytes], base: str, link: str) -> str:
-    """Name in `files` of a mesh as the URDF writes it: see `read_reference`; last, where only one file is called so,
-    below any folder, or in other capitals.
+    """Return the name in `files` of a URDF's mesh, see `read_reference`.
+    Else the only file of that name in any folder, ignoring case.
 
     Raises:
-        HandError: it is not there, or lies outside the upload.
+        HandError: it is missing, or lies outside the upload.
     """
     try:
         reference = read_reference(filename, base)

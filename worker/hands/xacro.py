@@ -1,7 +1,7 @@
-"""A robot from its description in any format; xacro is expanded in a child process without files, network or commands.
+"""Robot from its description in any format; xacro is expanded in an isolated child process.
 
-Xacro's expressions are Python. The child is given all files of the hand in memory, and then gives up what it could do
-harm with: see `worker.hands.xacro_child`.
+Xacro's expressions are Python. The child receives all files of the hand in memory, then gives up files, network and
+commands: see `worker.hands.xacro_child`.
 """
 
 from __future__ import annotations
@@ -22,26 +22,26 @@ from graspd.worker.hands.robot import Robot
 from graspd.worker.hands.urdf import MAX_BYTES, read_urdf
 from graspd.worker.objects.stand_ins import refuse_stand_in
 
-#: Largest hands on arms take a tenth of it [s].
+#: CPU time limit; the largest hands on arms take a tenth of it [s].
 CPU_LIMIT_S: Final = 10
 MEMORY_LIMIT_BYTES: Final = 2**30
-#: The limit above ends what computes; this one a child that waits, on however busy a machine [s].
+#: The limit above ends computation; this one ends a child that waits, on any busy machine [s].
 _WALL_LIMIT_S: Final = 1800.0
-#: What an expansion may read; meshes are only named.
+#: Files that an expansion may read; meshes are only named.
 _READ: Final = (".xacro", ".urdf", ".xml", ".yaml", ".yml")
 
 
 def expand(files: Mapping[str, bytes], main: str, arguments: Mapping[str, str]) -> bytes:
-    """The URDF that a xacro file expands to.
+    """Expand a xacro file to a URDF.
 
     Args:
-        files: all files of the hand; includes and `$(find PACKAGE)` are sought among them only.
+        files: all files of the hand; includes and `$(find PACKAGE)` are searched among them only.
         main: the file to expand.
         arguments: values of `<xacro:arg>` by name.
 
     Raises:
-        HandError: it cannot be expanded, or reaches for what lies outside the hand's folder; the message says why.
-        OSError: the machine killed the child, or it neither computed nor ended: that says nothing about the file.
+        HandError: it cannot be expanded, or refers to files outside the hand's folder; the message states the reason.
+        OSError: the machine killed the child, or it neither computed nor ended: the file is not at fault.
     """
     if find_spec("xacro") is None:
         raise HandError(f"{main}: the package xacro is not installed: pip install 'graspd[worker]', or expand it first")
@@ -84,7 +84,7 @@ def expand(files: Mapping[str, bytes], main: str, arguments: Mapping[str, str]) 
 
 
 def read_robot(files: Mapping[str, bytes], main: str, arguments: Mapping[str, str] | None = None) -> Robot:
-    """Checked contents of the description called `main` among a hand's files; its root element tells the format.
+    """Read and check the description `main` among a hand's files; its root element determines the format.
 
     Args:
         files: all files of the hand.

@@ -1,8 +1,8 @@
-"""Xacro in a process of its own: `python -m graspd.worker.hands.xacro_child` reads a JSON object and writes one.
+"""Isolated expansion of xacro: `python -m graspd.worker.hands.xacro_child`, JSON object in and out.
 
-Three fences, because expressions in xacro are Python and what guards them in the library can be climbed: names that
-lead out of an expression are refused; a recheck hook refuses whatever would touch files, processes or the network; and
-the kernel gives this process no new file descriptor, without which neither a file nor a socket nor a program opens.
+Expressions in xacro are Python and the library's guards can be bypassed, so there are three barriers. Names that lead
+out of an expression are refused. An audit hook refuses access to files, processes and the network. The kernel gives
+this process no new file descriptor, without which no file, socket or program opens.
 """
 
 from __future__ import annotations
@@ -20,29 +20,29 @@ from types import SimpleNamespace
 from typing import Any, Final
 from xml.dom import minidom
 
-#: Folder in which the hand's files seem to lie.
+#: Apparent folder of the hand's files.
 _TOP: Final = "/hand"
 _MAX_NODES: Final = 100_000
-#: What the interpreter does of itself when it evaluates an expression.
+#: Audit events that the interpreter raises itself when it evaluates an expression.
 _HARMLESS: Final = frozenset({"compile", "exec", "builtins.id", "object.__getattr__"})
-#: What Python calls an object that has no text of its own: its place in memory.
+#: Part of Python's default text of an object: its address in memory.
 _ADDRESS: Final = re.compile(r" at 0x[0-9a-f]{6,}")
 #: Attributes that lead from a generator, a coroutine or a traceback to the frames around it.
 _FRAMES: Final = ("gi_", "cr_", "ag_", "f_", "tb_", "co_", "func_")
 
 
 class Refused(Exception):
-    """The file reaches for what it may not have."""
+    """The file requests something forbidden."""
 
 
 def main() -> None:
     """Expand the given xacro file on standard output."""
     given = json.loads(sys.stdin.buffer.read())
-    # The library prints what a file tells it to print, without end; only the answer is of interest.
+    # A file can make the library print without end; only the answer is needed.
     answers, nowhere = os.dup(1), os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 1)
     os.dup2(nowhere, 2)
-    # `$(cwd)` tells nothing of this machine.
+    # `$(cwd)` must not reveal anything of this machine.
     os.chdir("/")
     try:
         answer = {"urdf": _expand(given), "error": ""}
@@ -55,7 +55,7 @@ def main() -> None:
 
 
 def _expand(given: dict[str, Any]) -> str:
-    # All that an expansion needs is there before the doors are closed.
+    # Load all that an expansion needs before access is closed.
     import encodings.idna
     import encodings.utf_8
 
@@ -70,7 +70,7 @@ def _expand(given: dict[str, Any]) -> str:
     names: list[str] = given["names"]
 
     def named(path: str) -> str:
-        """Name of a file of the hand; Refused where the path leads out of its folder."""
+        """Return the name of a file of the hand; raise Refused if the path leads out of its folder."""
         inside = posixpath.normpath(posixpath.join(_TOP, path.replace("\\", "/")))
         if not inside.startswith(_TOP + "/"):
             said = path.removeprefix(_TOP + "/")
@@ -99,7 +99,7 @@ def _expand(given: dict[str, Any]) -> str:
         raise Refused(f"asks for the environment variable {name!r}; write its value out")
 
     def evaluate(expression: str, symbols: dict[str, Any], scope: Any = None) -> Any:
-        # The table itself, which knows the scopes around it; a copy would not.
+        # The table itself, which has the enclosing scopes; a copy would not.
         symbols.update(__builtins__={})
         return eval(_checked(expression), symbols, scope)
 
@@ -124,7 +124,7 @@ def _expand(given: dict[str, Any]) -> str:
     )
     for mesh in document.getElementsByTagName("mesh"):
         if (filename := mesh.getAttribute("filename")).startswith(_TOP + "/"):
-            # As `$(find PACKAGE)` makes it: a place of this process, and no file of anybody's.
+            # From `$(find PACKAGE)`: a path in this process, not a file on this machine.
             mesh.setAttribute("filename", f"file://{filename.removeprefix(_TOP)}")
     text = document.toxml()
     if len(text) > given["limit"]:
@@ -149,7 +149,7 @@ _PLAIN: Final[dict[str, Any]] = {
 
 
 def _checked(expression: str) -> Any:
-    """Code of an expression that names nothing from which one climbs out of it."""
+    """Compile an expression after checking that none of its names leads out of it."""
     tree = ast.parse(expression.strip(), "<expression>", "eval")
     for count, node in enumerate(ast.walk(tree)):
         name = getattr(node, "attr", None) or getattr(node, "id", None) or ""
@@ -161,7 +161,7 @@ def _checked(expression: str) -> Any:
 
 
 def _package(package: str, names: list[str], texts: dict[str, str]) -> str | None:
-    """Folder of a ROS package among the files, relative to the top: by its manifest, else by its name."""
+    """Return the folder of a ROS package, relative to the top: by its manifest, else by its name."""
     for name, text in texts.items():
         if posixpath.basename(name) == "package.xml" and f"<name>{package}</name>" in "".join(text.split()):
             return posixpath.dirname(name)
@@ -170,7 +170,7 @@ def _package(package: str, names: list[str], texts: dict[str, str]) -> str | Non
     if below:
         return below[0]
     manifests = [name for name in names if posixpath.basename(name) == "package.xml"]
-    # A package may have been packed without the folder that bears its name.
+    # A package may have been packed without the folder of its name.
     return "" if not manifests else None
 
 
@@ -180,9 +180,9 @@ def _parents(name: str) -> list[str]:
 
 
 def _close_doors(cpu_s: int, memory_bytes: int) -> None:
-    """From here on the process computes, and nothing else."""
+    """Restrict the process to computation from here on."""
     os.environ.clear()
-    # The soft limit's signal tells from that of a machine without memory.
+    # The soft limit's signal differs from that of a machine out of memory.
     resource.setrlimit(resource.RLIMIT_CPU, (cpu_s, cpu_s + 1))
     limits = {"AS": memory_bytes, "CORE": 0, "FSIZE": 0, "NOFILE": 3}
     for what, value in limits.items():
@@ -196,7 +196,7 @@ def _refuse(event: str, _arguments: tuple[Any, ...]) -> None:
 
 
 def _told(error: BaseException) -> str:
-    """One line; of errors that wrap others the refusal within."""
+    """Return a one-line message; for wrapped errors that of the inner refusal."""
     at: BaseException | None = error
     while at is not None:
         if isinstance(at, Refused):

@@ -24,7 +24,7 @@ SEGMENTS: Final = 64
 
 
 def mug() -> Manifold:
-    """A mug of 80 mm diameter and 95 mm height with 4.5 mm walls and a handle toward +x."""
+    """Return a mug of 80 mm diameter and 95 mm height with 4.5 mm walls and a handle toward +x."""
     radius, height, wall, floor = 0.040, 0.095, 0.0045, 0.006
     profile = rounded([(0.0, 0.0), (radius - 0.002, 0.0), (radius, 0.003), (radius, height), (0.0, height)])
     body = Manifold.revolve(profile, SEGMENTS)
@@ -32,7 +32,7 @@ def mug() -> Manifold:
     top = height + 0.01
     inner = [(0.0, floor), (inside - 0.004, floor), (inside, floor + 0.004), (inside, top), (0.0, top)]
     cavity = Manifold.revolve(rounded(inner), SEGMENTS)
-    # The handle is a flattened ring whose centre lies on the wall; the part inside the cup is cut away.
+    # The handle is a flattened ring with its centre on the wall; the part inside the cup is cut away.
     ring = Manifold.revolve(CrossSection.circle(0.0055, 24).translate((0.024, 0.0)), 64)
     ring = ring.scale((1.0, 1.25, 1.15)).rotate((90.0, 0.0, 0.0)).translate((radius, 0.0, height * 0.5))
     outside = ring - Manifold.cylinder(2 * height, radius - wall / 2, -1.0, SEGMENTS, True)
@@ -40,7 +40,7 @@ def mug() -> Manifold:
 
 
 def bottle() -> Manifold:
-    """A closed bottle of 64 mm diameter and 180 mm height with a neck."""
+    """Return a closed bottle of 64 mm diameter and 180 mm height with a neck."""
     profile = [(0.0, 0.0), (0.029, 0.0), (0.032, 0.004)]
     profile += [(0.032, 0.02 + 0.09 * t) for t in np.linspace(0, 1, 4)]
     for t in np.linspace(0, 1, 17)[1:]:
@@ -51,7 +51,7 @@ def bottle() -> Manifold:
 
 
 def block() -> Manifold:
-    """A box of 60 x 45 x 90 mm with its twelve edges chamfered by 3 mm."""
+    """Return a box of 60 x 45 x 90 mm with its twelve edges chamfered by 3 mm."""
     x, y, z, chamfer = 0.060, 0.045, 0.090, 0.003
     boxes = [(x, y - 2 * chamfer, z - 2 * chamfer), (x - 2 * chamfer, y, z - 2 * chamfer)]
     boxes += [(x - 2 * chamfer, y - 2 * chamfer, z)]
@@ -59,7 +59,7 @@ def block() -> Manifold:
 
 
 def rounded(points: list[tuple[float, float]]) -> CrossSection:
-    """The polygon of a half profile (radius, height) [m], counter-clockwise."""
+    """Return the polygon of a half profile (radius, height) [m], counter-clockwise."""
     return CrossSection([np.array(points, dtype=np.float64)], manifold3d.FillRule.NonZero)
 
 
@@ -71,7 +71,7 @@ OBJECTS: Final[dict[str, tuple[Callable[[], Manifold], str, float]]] = {
 
 
 def files_of(name: str) -> dict[str, bytes]:
-    """The files of a built-in object as they stand in `service/builtin/objects/NAME/`."""
+    """Return the files of a built-in object as in `service/builtin/objects/NAME/`."""
     make, description, density = OBJECTS[name]
     vertices, faces = tidy(*from_manifold(make()))
     asset: dict[str, Any] = {"file": f"{name}.stl", "units": "m", "description": description, "density": density}
@@ -79,13 +79,13 @@ def files_of(name: str) -> dict[str, bytes]:
 
 
 def tidy(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Without the faces along a seam whose vertices are one once they are written in single precision."""
+    """Remove the faces along a seam whose vertices coincide in single precision."""
     vertices, faces = merge_vertices(vertices.astype(np.float32).astype(float), faces, 2e-6)
     return vertices, faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
 
 
 def stl_bytes(vertices: np.ndarray, faces: np.ndarray) -> bytes:
-    """Binary STL."""
+    """Return a binary STL."""
     corners = vertices[faces].astype("<f4")
     a, b, c = np.moveaxis(corners.astype(float), 1, 0)
     normals = np.cross(b - a, c - a)

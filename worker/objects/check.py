@@ -1,4 +1,4 @@
-"""Tell a user what became of an object: taken, taken with repairs, or refused and why."""
+"""Check of an uploaded object: accepted, accepted with repairs, or refused with the reason."""
 
 from __future__ import annotations
 
@@ -13,28 +13,28 @@ from graspd.worker.objects.options import parse_options
 from graspd.worker.objects.prepare import build, main_file, repaired_mesh, weighed
 from graspd.worker.objects.repair import RepairedMesh
 
-#: Bound with which the prepared mesh of the report is simplified [m]: that of the standard fidelity.
+#: Simplification bound of the prepared mesh in the report [m]: that of the standard fidelity.
 REPORT_ERROR_M = 3e-4
-#: Times its size that an object may lie from its origin without a note.
+#: Distance of an object from its origin, in multiples of its size, above which there is a note.
 FAR = 10
 
 
 def check_object(
     files: Mapping[str, bytes], name: str, *, face_error_m: float = REPORT_ERROR_M, **options: Any
 ) -> dict[str, Any]:
-    """What `load_object` makes of these files.
+    """Check these files with `load_object`.
 
     Args:
-        files: the mesh and perhaps `asset.json`.
+        files: the mesh and optionally `asset.json`.
         name: name of the object.
         face_error_m: simplification bound [m].
-        options: keys of `ObjectOptions` that go over `asset.json`; None is as not given.
+        options: keys of `ObjectOptions` that override `asset.json`; None counts as not given.
 
     Returns:
-        verdict: accept, repair or refuse; message: one line; repairs: what was changed; facts: what was measured, in
-        SI units. Of a refusal that options fix: `problem`, what is wrong, and `options_suggested`, keys of
-        `ObjectOptions` (None: a value to choose); for its size also `units_suggested`, the likeliest first, with
-        `lengths_m`, its longest extent in each [m].
+        verdict: accept, repair or refuse; message: one line; repairs: changes; facts: measurements in SI units. For a
+        refusal that options fix: `problem`, the fault, and `options_suggested`, keys of `ObjectOptions` (None: a value
+        to choose); for its size also `units_suggested`, the likeliest first, with `lengths_m`, its longest extent in
+        each [m].
     """
     try:
         settings = parse_options(files, options)

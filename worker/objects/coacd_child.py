@@ -1,7 +1,7 @@
-"""CoACD in a process of its own: `python -m graspd.worker.objects.coacd_child SECONDS` reads an npz and writes one.
+"""CoACD in its own process: `python -m graspd.worker.objects.coacd_child SECONDS`, npz in and out.
 
-It ends by a signal where it computes for longer than so many seconds. In: arrays `vertices`, `faces`, and `options`
-(JSON). Out: one array of corners per piece.
+A signal ends it after so many seconds of CPU time. In: arrays `vertices`, `faces`, and `options` (JSON). Out: one array
+of corners per piece.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ def main(cpu_s: int) -> None:
     """Decompose the mesh on standard input onto standard output."""
     hard = resource.getrlimit(resource.RLIMIT_CPU)[1]
     resource.setrlimit(resource.RLIMIT_CPU, (cpu_s if hard == resource.RLIM_INFINITY else min(cpu_s, hard), hard))
-    # The library prints to standard output, which carries the result: send its words elsewhere first.
+    # The library prints to standard output, which carries the result: redirect its output first.
     result = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
     import coacd

@@ -1,4 +1,4 @@
-"""Convex pieces of a mesh by CoACD (Wei et al. 2022), in a process of its own."""
+"""Convex pieces of a mesh by CoACD (Wei et al. 2022), in a separate process."""
 
 from __future__ import annotations
 
@@ -25,23 +25,23 @@ log = logging.getLogger(__name__)
 
 
 class WorkLimitExceeded(Exception):
-    """A decomposition needs more computing than it is given."""
+    """A decomposition exceeds its CPU time limit."""
 
 
 def coacd_parts(vertices: Floats, faces: NDArray[Any], options: Mapping[str, Any], cpu_s: int) -> tuple[Floats, ...]:
-    """Corners (V, 3) of each convex piece; none where CoACD fails.
+    """Compute the corners (V, 3) of each convex piece; none if CoACD fails.
 
-    CoACD holds the interpreter lock, so it runs in a child and stops no heartbeat. Its limit is one of computing: a
+    CoACD holds the interpreter lock, so it runs in a child and delays no heartbeat. The limit is one of CPU time: a
     busy machine gives the same pieces as an idle one.
 
     Args:
         vertices: (V, 3) of the mesh.
         faces: (F, 3) triangles.
-        options: arguments of `coacd.run_coacd`, the threshold among them.
-        cpu_s: computing that it may take [s].
+        options: arguments of `coacd.run_coacd`, including the threshold.
+        cpu_s: CPU time limit [s].
 
     Raises:
-        TooMuchWork: it takes more.
+        WorkLimitExceeded: it needs more.
         OSError: the machine did not let it start or end; pieces made without it would be another shape.
     """
     given = io.BytesIO()
@@ -61,18 +61,18 @@ def coacd_parts(vertices: Floats, faces: NDArray[Any], options: Mapping[str, Any
 
 
 def union_volume(parts: tuple[Floats, ...]) -> float:
-    """Volume of the union of the hulls of the parts [m^3]."""
+    """Compute the volume of the union of the hulls of the parts [m^3]."""
     solids = [m3d.Manifold.hull_points(np.ascontiguousarray(part * 1e3, np.float32)) for part in parts]
     return float(m3d.Manifold.batch_boolean(solids, m3d.OpType.Add).volume()) * 1e-9 if solids else 0.0
 
 
 def default_cache() -> Path:
-    """Folder for pieces that can be made again."""
+    """Return the folder for pieces that can be recomputed."""
     return user_cache.folder("convex")
 
 
 def load_parts(file: Path) -> tuple[Floats, ...] | None:
-    """Parts kept in a file; None where there is none that can be read."""
+    """Load parts from a file; None if it is missing or unreadable."""
     try:
         with np.load(file) as stored:
             return tuple(stored[name] for name in sorted(stored.files))
@@ -81,7 +81,7 @@ def load_parts(file: Path) -> tuple[Floats, ...] | None:
 
 
 def keep_parts(file: Path, parts: tuple[Floats, ...]) -> None:
-    """Keep parts in a file; a folder that cannot be written only costs time."""
+    """Save parts in a file; a folder that is not writable only costs time."""
     whole = io.BytesIO()
     arrays: dict[str, Any] = {f"{i:04}": part for i, part in enumerate(parts)}
     np.savez(whole, **arrays)

@@ -1,4 +1,4 @@
-"""Disk cache of arrays that take long to compute and follow from little, and the content of models as keys."""
+"""Disk cache of arrays that are expensive to compute from a few inputs, and digests of models as keys."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from graspd.service import user_cache
 from graspd.service.model.digests import digest_json
 from graspd.service.model.libraries import version_of
 
-#: Libraries that go into the arrays.
+#: Libraries that affect the arrays.
 _LIBRARIES: Final = ("numpy", "scipy")
-#: All entries of a kind together; one has some 100 kB.
+#: Size limit of all entries of a kind; one has about 100 kB.
 _LIMIT_BYTES: Final = 256 << 20
 
 Arrays = Mapping[str, NDArray[Any]]
@@ -39,14 +39,14 @@ def arrays_kept_or_made(
     *,
     fits: Callable[[Arrays], bool] = lambda _: True,
 ) -> Arrays:
-    """Arrays from the user's cache, else made and kept there; the same bit for bit.
+    """Load arrays from the user's cache, or compute and cache them; the same bit for bit.
 
     Args:
         kind: folder of the cache.
-        terms: all that they follow from, besides the code.
+        terms: all inputs that determine the arrays, besides the code.
         code: modules whose change would change them.
-        make: computes them; what it raises is not kept.
-        fits: whether arrays that were read can be what is wanted; those that cannot are made again.
+        make: computes them; its errors are not cached.
+        fits: whether loaded arrays are plausible; others are recomputed.
     """
     file = _file(kind, terms, code)
     if (held := _read(file)) is not None and fits(held):
@@ -58,12 +58,12 @@ def arrays_kept_or_made(
 
 @contextmanager
 def recalling(kind: str, terms: tuple[str | int, ...], code: tuple[ModuleType, ...]) -> Iterator[None]:
-    """What `recalled` gives inside is kept in one entry, and read from there the next time.
+    """Cache the results of `recalled` inside this context in one entry, and load them the next time.
 
-    For small steps of something large, the dearest of which is to load the library that they need.
+    For small steps of a large computation, if loading their library is the most expensive part.
 
     Args:
-        kind, terms, code: see `arrays_kept_or_made`; the terms only tell entries apart.
+        kind, terms, code: see `arrays_kept_or_made`; the terms only distinguish entries.
     """
     file = _file(kind, terms, code)
     known = _read(file) or {}
@@ -78,7 +78,7 @@ def recalling(kind: str, terms: tuple[str | int, ...], code: tuple[ModuleType, .
 
 
 def recalled(what: str, given: Sequence[NDArray[Any]], make: Callable[[], Sequence[NDArray[Any]]]) -> Arrays:
-    """Arrays that follow from others alone, by their numbers "0", "1", ...: from the present `recalling`, or made."""
+    """Return arrays that depend on others only, as "0", "1", ...: from `recalling`, or computed."""
     known = _recalled.get()
     if known is None:
         return {str(number): array for number, array in enumerate(make())}
@@ -117,24 +117,24 @@ def _write(file: Path, arrays: Arrays) -> None:
 
 @lru_cache(maxsize=16)
 def _revision(files: tuple[str, ...]) -> str:
-    """Digest of source files, of libraries, and of the kind of processor, whose last bits may differ."""
+    """Compute a digest of source files, libraries, and the processor type, which may change the last bits."""
     whole = hashlib.sha256()
     for file in files:
         whole.update(Path(file).read_bytes())
     return digest_json([whole.hexdigest(), *map(version_of, _LIBRARIES), platform.machine()])
 
 
-#: How a model is called says nothing of what it is.
+#: A model's name does not affect its content.
 _NAMES: Final = frozenset({"name", "digest"})
-#: Metadata of a field that says nothing while it has its default.
+#: Metadata of a field that is ignored while it has its default.
 TOLD_IF_SET: Final = MappingProxyType({"told_if_set": True})
 
 
 def content_of(model: Any) -> str:
-    """Digest of all fields of a dataclass but its name and the digest of its files: arrays bit for bit.
+    """Compute a digest of a dataclass without its name and its files' digest: arrays bit for bit.
 
     Raises:
-        TypeError: a field that holds neither numbers, texts, arrays, tuples and sets of these, nor a dataclass.
+        TypeError: a field contains neither numbers, strings, arrays, tuples and sets of these, nor a dataclass.
     """
     whole = hashlib.sha256()
     for part in _parts({name: value for name, value in _told(model).items() if name not in _NAMES}):
@@ -144,7 +144,7 @@ def content_of(model: Any) -> str:
 
 
 def _told(model: Any) -> dict[str, Any]:
-    """Fields of a dataclass that say something."""
+    """Return the fields of a dataclass that affect its digest."""
     values = {f: getattr(model, f.name) for f in fields(model)}
     return {
         f.name: value

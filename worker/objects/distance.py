@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 from graspd.service.model.transforms import Floats
 from graspd.worker.objects.topology import Indices
 
-#: Pieces into which a mesh is cut at least, so that a piece is small against the mesh.
+#: Least number of pieces of a mesh, so that a piece is small relative to the mesh.
 _PIECES = 10_000
-#: Pieces looked at first; twice as many again where that does not prove the answer.
+#: Number of nearest pieces checked first; doubled until the answer is proven.
 _CANDIDATES = 12
 _CHUNK = 256
 _MAX_VERTICES = 30_000
@@ -20,7 +20,7 @@ class MeshDistance:
     """Exact distances to one mesh.
 
     Its triangles are cut into pieces no longer than a fixed length. A point's distance to the best triangle of its
-    nearest pieces is proven when the next piece's centre is farther than that distance plus a piece's radius.
+    nearest pieces is proven if the next piece's centre is farther than that distance plus a piece's radius.
     """
 
     def __init__(self, vertices: Floats, faces: Indices) -> None:
@@ -35,7 +35,7 @@ class MeshDistance:
         self._tree = cKDTree(centres)
 
     def __call__(self, points: Floats, enough: float = 0.0) -> Floats:
-        """(N,) distance of points (N, 3) to the surface [m]; below `enough` it may come out larger, up to `enough`."""
+        """Return the distance (N,) of points (N, 3) to the surface [m]; below `enough` an upper bound."""
         found = np.full(len(points), np.inf)
         todo, k = np.arange(len(points)), min(_CANDIDATES, len(self._face))
         while len(todo):
@@ -49,9 +49,9 @@ class MeshDistance:
         return found
 
     def furthest(self, points: Floats) -> float:
-        """Largest distance of any of the points (N, 3) to the surface [m].
+        """Return the largest distance of any of the points (N, 3) to the surface [m].
 
-        Only points whose first, perhaps too large answer exceeds the largest proven one need a proof of their own.
+        Only points whose first upper bound exceeds the largest proven distance need their own proof.
         """
         bounds = self(points, np.inf)
         order = np.argsort(-bounds)
@@ -65,7 +65,7 @@ class MeshDistance:
 
 
 def cut(corners: Floats, length: float) -> tuple[Floats, NDArray[np.int64]]:
-    """Triangles (F, 3, 3) halved across their longest side until none is longer than `length`; and whose each is."""
+    """Halve triangles (F, 3, 3) across their longest side to at most `length`; return their origin too."""
     done: list[Floats] = []
     owners: list[NDArray[np.int64]] = []
     face = np.arange(len(corners), dtype=np.int64)
@@ -84,7 +84,7 @@ def cut(corners: Floats, length: float) -> tuple[Floats, NDArray[np.int64]]:
 
 
 def deviation(one: tuple[Floats, Indices], two: tuple[Floats, Indices], samples: int = 8000) -> float:
-    """Largest distance [m] between two surfaces, both ways, over their vertices and even samples."""
+    """Compute the largest distance [m] of two surfaces, both ways, over vertices and even samples."""
     furthest = 0.0
     for source, target in ((one, two), (two, one)):
         points = surface_points(*source, samples)
@@ -93,14 +93,14 @@ def deviation(one: tuple[Floats, Indices], two: tuple[Floats, Indices], samples:
 
 
 def surface_points(vertices: Floats, faces: Indices, samples: int) -> Floats:
-    """Vertices, every n-th where there are very many, and even samples: where two surfaces are compared."""
+    """Return points for the comparison of surfaces: vertices, every n-th of very many, and even samples."""
     return np.concatenate(
         [vertices[:: max(1, len(vertices) // _MAX_VERTICES)], sample_faces(vertices, faces, samples)[0]]
     )
 
 
 def sample_faces(vertices: Floats, faces: Indices, count: int, seed: int = 0) -> tuple[Floats, NDArray[np.int64]]:
-    """Area-uniform points (count, 3) and their faces (count,), stratified; the same for the same mesh."""
+    """Sample area-uniform points (count, 3) and their faces (count,), stratified and reproducible."""
     corners = vertices[faces]
     a, b, c = np.moveaxis(corners, 1, 0)
     areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
@@ -114,7 +114,7 @@ def sample_faces(vertices: Floats, faces: Indices, count: int, seed: int = 0) ->
 
 
 def point_triangle_distance(points: Floats, triangles: Floats) -> Floats:
-    """Distance of points (..., 3) to triangles (..., 3, 3); leading axes broadcast.
+    """Compute the distance of points (..., 3) to triangles (..., 3, 3); leading axes broadcast.
 
     The foot of the perpendicular if it falls inside, else the nearest point of the three sides.
     """

@@ -33,11 +33,11 @@ class Document:
         colour: tuple[float, float, float] | None = None,
         face_colours: NDArray[Any] | None = None,
     ) -> dict[str, Any]:
-        """A primitive of vertices (V, 3), faces (F, 3) and unit normals per face corner (F, 3, 3).
+        """Add a primitive of vertices (V, 3), faces (F, 3) and unit normals per face corner (F, 3, 3).
 
-        Colours are linear RGB: one of the whole, or one of each face (F, 3).
+        Colours are linear RGB: one for all, or one for each face (F, 3).
         """
-        # A vertex on a crease becomes as many as it has normals; 127 steps a half axis are under half a degree.
+        # A vertex on a crease is repeated for each of its normals; 127 steps per half axis are under half a degree.
         small = np.round(127 * normals.reshape(-1, 3)).astype(np.int8)
         corners = np.concatenate([faces.reshape(-1, 1), small], axis=1)
         if face_colours is not None:
@@ -61,7 +61,7 @@ class Document:
         return primitive if colour is None else primitive | {"material": self._material(colour)}
 
     def points(self, values: NDArray[Any]) -> dict[str, Any]:
-        """A primitive of points (N, 3)."""
+        """Add a primitive of points (N, 3)."""
         return {"attributes": {"POSITION": self.vectors(values)}, "mode": _POINTS}
 
     def _material(self, colour: tuple[float, float, float]) -> int:
@@ -72,7 +72,7 @@ class Document:
         return self._materials.index(material)
 
     def vectors(self, values: NDArray[Any]) -> int:
-        """An accessor of points (N, 3)."""
+        """Add an accessor of points (N, 3)."""
         data = np.ascontiguousarray(values, np.float32)
         bounds = {"min": data.min(axis=0).tolist(), "max": data.max(axis=0).tolist()}
         return self._accessor(data, _FLOAT, "VEC3", _ARRAY, {}, bounds)
@@ -82,7 +82,7 @@ class Document:
         return len(self._meshes) - 1
 
     def bytes(self, nodes: list[dict[str, Any]], extras: dict[str, Any]) -> bytes:
-        """The file; node 0 is the root of the scene."""
+        """Return the file; node 0 is the root of the scene."""
         document = {
             "asset": {"version": "2.0", "generator": "graspd", "extras": extras},
             "extensionsUsed": ["KHR_mesh_quantization"],
@@ -118,5 +118,5 @@ class Document:
 
 
 def plain(values: Any) -> list[float]:
-    """Rounded numbers for a node."""
+    """Return rounded numbers for a node."""
     return [round(float(value), 7) for value in values]

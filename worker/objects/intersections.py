@@ -1,4 +1,4 @@
-"""Where a surface passes through itself, and the solid that remains when the overlap counts once."""
+"""Self-intersections of a surface, and their removal such that the overlap counts once."""
 
 from __future__ import annotations
 
@@ -16,27 +16,27 @@ from graspd.worker.objects.topology import Indices
 
 Mesh = tuple[Floats, Indices]
 
-#: Larger meshes are not looked through: it would cost more than everything else.
+#: Largest mesh that is searched: beyond, the search would cost more than all other steps.
 MAX_FACES: Final = 120_000
-#: Pairs of near pieces looked at in all; bounds memory and time.
+#: Largest number of pairs of near pieces; bounds memory and time.
 MAX_PAIRS: Final = 6_000_000
-#: An edge crosses a face if it stands out on both sides by this share of the mesh's extent: touching is no crossing.
+#: An edge crosses a face if it extends beyond both sides by this share of the mesh's extent: touching is no crossing.
 DEPTH: Final = 1e-6
-#: ... and does so off the rim of that face by this share of its height: edges that meet do not cross.
+#: ... at this least distance from the face's rim, as a share of its height: edges that meet do not cross.
 _RIM: Final = 1e-6
-#: Halvings of a piece that crosses itself before it is given up.
+#: Halvings of a self-intersecting piece before the attempt ends.
 _HALVINGS: Final = 7
-#: The new surface lies on the old one within this share of the extent, or the repair is not safe.
+#: A repair is safe if the new surface lies on the old one within this share of the extent.
 _SAME: Final = 1e-5
 _SAMPLES: Final = 4000
 _CHUNK: Final = 200_000
 
 
 def crossings(vertices: Floats, faces: Indices) -> Indices | None:
-    """(P, 2) pairs of faces without a common vertex that pass through each other; None: too many faces to look.
+    """Find pairs (P, 2) of intersecting faces without a common vertex; None: too many faces.
 
-    Broad phase: faces cut into pieces of one size, pieces whose balls meet, and faces whose boxes do. Narrow phase: an
-    edge of one face through the inside of the other.
+    Broad phase: faces cut into pieces of equal size, pieces with overlapping balls, then faces with overlapping boxes.
+    Narrow phase: an edge of one face through the interior of the other.
     """
     from scipy.spatial import cKDTree
 
@@ -45,7 +45,7 @@ def crossings(vertices: Floats, faces: Indices) -> Indices | None:
     corners = vertices[faces]
     a, b, c = np.moveaxis(corners, 1, 0)
     area = float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
-    # Well above the side of an even mesh of so many faces: only long faces are cut.
+    # Well above the edge length of an even mesh of so many faces: only long faces are cut.
     pieces, owner = cut(corners, 4 * np.sqrt(area / max(len(faces), 2000)))
     centres = pieces.mean(axis=1)
     radius = float(np.linalg.norm(pieces - centres[:, None], axis=2).max())
@@ -65,14 +65,14 @@ def crossings(vertices: Floats, faces: Indices) -> Indices | None:
 
 
 def _distinct(pairs: NDArray[np.int64], count: int) -> NDArray[np.int64]:
-    """Unordered pairs (P, 2) of numbers below `count`, each once, in ascending order: as one number each they sort
-    many times faster than as rows."""
+    """Return unordered pairs (P, 2) of numbers below `count` once each, in ascending order.
+    Encoded as one number per pair, they sort many times faster than as rows."""
     keys = np.unique(pairs.min(axis=1) * np.int64(count) + pairs.max(axis=1))
     return np.stack(np.divmod(keys, count), axis=1)
 
 
 def _boxes_meet(corners: Floats, pairs: Indices) -> NDArray[np.bool_]:
-    """(P,) whether the boxes along the axes of two faces (P, 2) have a point in common."""
+    """Check (P,) whether the axis-aligned boxes of two faces (P, 2) overlap."""
     low, high = corners.min(axis=1), corners.max(axis=1)
     one, other = pairs.T
     meet = np.ones(len(pairs), dtype=bool)
@@ -83,7 +83,7 @@ def _boxes_meet(corners: Floats, pairs: Indices) -> NDArray[np.bool_]:
 
 
 def _pass(edges_of: Floats, triangles: Floats, depth: float) -> NDArray[np.bool_]:
-    """(P,) whether an edge of the one triangle (P, 3, 3) goes through the inside of the other, `depth` [m] deep."""
+    """Check (P,) whether an edge of one triangle (P, 3, 3) passes through the other, `depth` [m] deep."""
     a, b, c = np.moveaxis(triangles, 1, 0)
     normal = np.cross(b - a, c - a)
     square = np.maximum(np.einsum("ij,ij->i", normal, normal), 1e-300)
@@ -103,9 +103,9 @@ def _pass(edges_of: Floats, triangles: Floats, depth: float) -> NDArray[np.bool_
 
 
 def untangle(vertices: Floats, faces: Indices) -> Mesh | None:
-    """The solid in which what the surface encloses twice counts once; None where that is not safe.
+    """Return the solid in which doubly enclosed volume counts once; None if that is not safe.
 
-    The mesh is halved until no piece crosses itself, and the pieces are united: no vertex moves. It is safe if the
+    The mesh is halved until no piece intersects itself, and the pieces are united: no vertex moves. It is safe if the
     result is closed, free of crossings and every point of its surface lies on the old surface.
     """
     whole = mesh_geometry.to_manifold(vertices, faces)
@@ -123,7 +123,7 @@ def untangle(vertices: Floats, faces: Indices) -> Mesh | None:
 
 
 def _halved(piece: Any, halvings: int) -> list[Any] | None:
-    """Parts of a solid that do not cross themselves and fill the same space; None if that takes too many cuts."""
+    """Cut a solid into parts that do not intersect themselves; None if that takes too many cuts."""
     parts: list[Any] = []
     for part in piece.decompose():
         mesh = mesh_geometry.from_manifold(part)

@@ -1,9 +1,8 @@
-"""Geometry of closed meshes: exact mass properties, corner normals, and booleans through manifold3d in float64.
+"""Geometry of closed meshes: exact mass properties, corner normals, float64 booleans by manifold3d.
 
-Two frames of an object: the file's, in which poses are told, and the centred one, in which the engine works.
-
-Both have the same axes. The centred one lies in the middle of the mesh's bounding box, so results have the same bits
-wherever the origin of the file lies.
+An object has two frames with the same axes: the file's, in which poses are stored, and the centred one, in which the
+engine works. The centred frame is in the middle of the mesh's bounding box, so results have the same bits wherever the
+file's origin is.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ class MassProperties:
 
 
 def mass_properties(vertices: Floats, faces: FaceIndices) -> MassProperties:
-    """Volume integrals summed over the tetrahedra between the faces and one point (Tonon 2004).
+    """Integrate over the tetrahedra between the faces and one point (Tonon 2004).
 
     The point is the mean vertex, so that a mesh far from its origin loses no digits.
     """
@@ -53,7 +52,7 @@ def mass_properties(vertices: Floats, faces: FaceIndices) -> MassProperties:
 
 
 def signed_volume(vertices: Floats, faces: FaceIndices) -> float:
-    """Volume [m^3]; negative for a closed mesh that is wound inwards."""
+    """Compute the volume [m^3]; negative for a closed mesh that is wound inwards."""
     a, b, c = np.moveaxis(vertices[faces] - vertices[faces[0, 0]], 1, 0)
     return float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6)
 
@@ -64,10 +63,10 @@ CREASE_DEG = 40.0
 
 
 def corner_normals(vertices: Floats, faces: Ints, crease_deg: float = CREASE_DEG) -> Floats:
-    """(F, 3, 3) unit normals.
+    """Compute unit normals (F, 3, 3).
 
-    The normal of a corner is the mean of the normals of the faces at its vertex, weighted by their angle there, over
-    those faces that are inclined to the corner's own face by less than the crease angle.
+    The normal of a corner is the mean normal of the faces at its vertex, weighted by their angle there. Only faces
+    inclined to the corner's own face by less than the crease angle count.
     """
     from scipy.sparse import csr_matrix
 
@@ -90,7 +89,7 @@ def corner_normals(vertices: Floats, faces: Ints, crease_deg: float = CREASE_DEG
 
 
 def _corner_angles(corners: Floats) -> Floats:
-    """(F, 3) angle of each triangle (F, 3, 3) at each corner [rad]."""
+    """Compute the angle (F, 3) of each triangle (F, 3, 3) at each corner [rad]."""
     out = np.roll(corners, -1, axis=1) - corners
     back = np.roll(corners, 1, axis=1) - corners
     cosine = np.einsum("ijk,ijk->ij", out, back) / np.maximum(
@@ -99,12 +98,12 @@ def _corner_angles(corners: Floats) -> Floats:
     return np.arccos(np.clip(cosine, -1, 1))
 
 
-#: A gap exceeds its bound by more than this share of it: coordinates of files are rounded.
+#: Tolerance of a gap's bound as a share of it: coordinates of files are rounded.
 _ROUNDING: Final = 1e-3
 
 
 def to_manifold(vertices: Floats, faces: Indices) -> Any | None:
-    """The mesh as a manifold3d solid, or None if it is no oriented 2-manifold."""
+    """Convert the mesh to a manifold3d solid; None if it is no oriented 2-manifold."""
     mesh = manifold3d.Mesh64(
         np.array(vertices, dtype=np.float64, order="C"), np.array(faces, dtype=np.uint64, order="C")
     )
@@ -115,15 +114,15 @@ def to_manifold(vertices: Floats, faces: Indices) -> Any | None:
 
 
 def from_manifold(solid: Any) -> tuple[Floats, Indices]:
-    """Vertices and faces of a solid."""
+    """Return vertices and faces of a solid."""
     mesh = solid.to_mesh64()
     return np.array(mesh.vert_properties, dtype=np.float64)[:, :3], np.array(mesh.tri_verts, dtype=np.int64)
 
 
 def unite(parts: list[tuple[Floats, Indices]], holes: list[tuple[Floats, Indices]]) -> Any | None:
-    """Union of outward meshes less the holes (outward too); None if one of them is no solid.
+    """Unite outward meshes and subtract the holes (outward too); None if one of them is no solid.
 
-    A part that lies within a hole is no part of what the hole is in: it stays.
+    A part inside a hole does not belong to the solid around the hole: it stays.
     """
     solids: list[Any] = [to_manifold(*part) for part in parts]
     cuts: list[Any] = [to_manifold(*hole) for hole in holes]
@@ -137,12 +136,12 @@ def unite(parts: list[tuple[Floats, Indices]], holes: list[tuple[Floats, Indices
 
 
 def union(solids: list[Any]) -> Any:
-    """All that one of the solids holds."""
+    """Return the union of all solids."""
     return manifold3d.Manifold.batch_boolean(solids, manifold3d.OpType.Add)
 
 
 def groups(pieces: list[Any], gap: float) -> list[list[Any]]:
-    """Solids that hang together over gaps of at most `gap`, the group of the largest volume first."""
+    """Group solids connected over gaps of at most `gap`, the group of the largest volume first."""
     low, high = np.moveaxis(np.reshape([piece.bounding_box() for piece in pieces], (-1, 2, 3)), 1, 0)
     pairs = [
         (i, j)
@@ -157,43 +156,43 @@ def groups(pieces: list[Any], gap: float) -> list[list[Any]]:
 
 
 def _nested(a: Any, b: Any) -> bool:
-    """Whether one of two outer shells holds the other: that one lies loose in a cavity."""
+    """Check whether one of two outer shells contains the other, which is then loose in a cavity."""
     small, large = sorted((a, b), key=lambda one: float(one.volume()))
     return bool((small - large).is_empty())
 
 
 def _apart(low: Floats, high: Floats, i: int) -> Floats:
-    """Gaps between box `i` and those after it."""
+    """Return the gaps between box `i` and those after it."""
     return np.asarray(np.linalg.norm(np.maximum(0, np.maximum(low[i] - high[i + 1 :], low[i + 1 :] - high[i])), axis=1))
 
 
-#: Digits of the longest extent to which coordinates are rounded, so that no sliver collapses; and the fewest of them in
-#: which a mesh of decimals is looked for.
+#: Digits of the longest extent to which coordinates are rounded, so that no sliver collapses; and the fewest digits
+#: considered for a mesh of decimals.
 DIGITS: Final = 9
 LEAST_DIGITS: Final = 5
 
 
 @dataclass(frozen=True)
 class CentredMesh:
-    """The points of a mesh about the middle of their bounding box, in the units of its file."""
+    """Points of a mesh relative to the middle of their bounding box, in the units of its file."""
 
     points: Floats
     """(V, 3)"""
     centre: Floats
-    """(3,) the middle in the frame of the file."""
+    """(3,) the middle in the file's frame."""
     resolution: float
-    """Distance of two neighbouring numbers of the file where the mesh lies."""
+    """Spacing of the file's numbers at the mesh's position."""
 
 
 def centred(points: Floats) -> CentredMesh:
-    """Points (V, 3) about their middle, rounded so that they do not depend on where the origin lies.
+    """Centre points (V, 3), rounded so that they do not depend on the origin.
 
-    Where all coordinates are decimals as far as the file's numbers tell, they become these decimals: a mesh of decimals
-    is the same one at every distance that the numbers resolve.
+    If all coordinates are decimals within the precision of the file's numbers, they become these decimals: a mesh of
+    decimals is identical at every distance that the numbers resolve.
     """
     low, extent = points.min(axis=0), float(np.ptp(points, axis=0).max())
     farthest = np.abs(points).max()
-    # Files of 32-bit numbers are told by the numbers: theirs survive the conversion.
+    # Files of 32-bit numbers are recognised by numbers that survive the conversion.
     with np.errstate(over="ignore"):
         single = bool((points == points.astype(np.float32)).all())
     resolution = float(np.spacing(np.float32(farthest) if single else farthest))
@@ -205,12 +204,12 @@ def centred(points: Floats) -> CentredMesh:
         steps, scale = (points - low) * finest, finest
     steps = np.rint(steps)
     ends = steps.min(axis=0) + steps.max(axis=0)
-    # Twice the distance from the middle in whole steps: one division rounds, so it gives the same for every scale.
+    # Twice the distance from the middle in whole steps: only one division rounds, equally for every scale.
     return CentredMesh((2 * steps - ends) / (2 * scale), low + ends / (2 * scale), resolution)
 
 
 def carried(pose: ArrayLike, by: ArrayLike) -> Floats:
-    """Poses (..., 7) of a frame of which the origin is moved by a vector (3,) of its own [m]."""
+    """Return poses (..., 7) of a frame with its origin moved by a vector (3,) in that frame [m]."""
     pose, by = np.array(pose, float), np.asarray(by, float)
     if by.any():
         pose[..., :3] += quat_rotate(pose[..., 3:], by)
@@ -218,11 +217,11 @@ def carried(pose: ArrayLike, by: ArrayLike) -> Floats:
 
 
 def to_centre(pose: ArrayLike, centre: ArrayLike) -> Floats:
-    """Poses (..., 7) of a centred frame from those of the file's frame, which has it at `centre` (3,); on the grid, so
-    that there and back gives the same bits."""
+    """Convert poses (..., 7) of the file's frame to the centred frame, at `centre` (3,) in it.
+    They are on a grid, so that the round trip gives the same bits."""
     return moved(carried(pose, centre), np.zeros(3))
 
 
 def to_file(pose: ArrayLike, centre: ArrayLike) -> Floats:
-    """Poses (..., 7) of the file's frame from those of the centred one."""
+    """Convert poses (..., 7) of the centred frame to the file's frame."""
     return carried(pose, -np.asarray(centre, float))

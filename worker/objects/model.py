@@ -1,7 +1,7 @@
-"""An object as the engine sees it: one closed, outward, simplified triangle mesh with its mass properties.
+"""Model of an object for the engine: a closed, outward, simplified triangle mesh with mass properties.
 
-Everything is in the object frame: the frame of the mesh as uploaded, in metres. `ObjectModel.centred` is the same
-object about its middle, which is what the engine works on; see `worker.objects.mesh_geometry`.
+All data are in the object frame: the frame of the uploaded mesh, in metres. `ObjectModel.centred` is the same object
+relative to its middle, which the engine uses; see `worker.objects.mesh_geometry`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ Ints = NDArray[np.int32]
 
 @dataclass(frozen=True)
 class ObjectModel:
-    """A prepared object: its shape, its mass and its friction."""
+    """Prepared object: its shape, mass and friction."""
 
     name: str
     digest: str
@@ -31,7 +31,7 @@ class ObjectModel:
     faces: Ints
     """(F, 3) counter-clockwise from outside."""
     corner_normals: Floats
-    """(F, 3, 3) unit normal per face corner, averaged only over faces that meet at less than the crease angle."""
+    """(F, 3, 3) unit normals per face corner, averaged over faces that meet below the crease angle."""
     volume: float
     """[m^3]"""
     centre_of_mass: Floats
@@ -55,16 +55,16 @@ class ObjectModel:
     friction: float = field(default=FRICTION, metadata=TOLD_IF_SET)
     """Coulomb coefficient of its contacts in simulation."""
     about_centre: Floats | None = field(default=None, repr=False)
-    """(V + H + 1, 3) vertices, hull and centre of mass about the middle [m]; None: they are that already."""
+    """(V + H + 1, 3) vertices, hull and centre of mass relative to the middle [m]; None: they are already."""
 
     @cached_property
     def content(self) -> str:
-        """Digest of what was prepared. `digest` is the file's: the same for every fidelity."""
+        """Digest of the prepared model; `digest` is the file's, the same for every fidelity."""
         return content_of(self)
 
     @property
     def centred(self) -> ObjectModel:
-        """The object in the frame of its middle: the same bits wherever the file's origin lies."""
+        """The object in the frame of its middle: the same bits for any origin of the file."""
         if self.about_centre is None:
             return self
         count = len(self.vertices)
@@ -72,7 +72,7 @@ class ObjectModel:
         return self._in_frame(vertices, hull, mass, (0.0, 0.0, 0.0), None)
 
     def at(self, centre: tuple[float, float, float]) -> ObjectModel:
-        """An object that is centred, in a frame in which its middle lies at `centre` [m]."""
+        """Place a centred object in a frame with its middle at `centre` [m]."""
         if not any(centre):
             return self
         held = np.concatenate([self.vertices, self.hull_vertices, self.centre_of_mass[None]])
@@ -90,10 +90,10 @@ class ObjectModel:
     def weighing(
         self, *, mass: float | None = None, density: float | None = None, friction: float | None = None
     ) -> ObjectModel:
-        """The same with another mass [kg], or density [kg/m^3], and another friction; None: as it is.
+        """Return the object with another mass [kg], or density [kg/m^3], and friction; None: unchanged.
 
         Raises:
-            MeshError: it would weigh more than `MOST_KG`.
+            MeshError: the mass would exceed `MOST_KG`.
         """
         if mass is None:
             mass = self.mass if density is None else density * self.volume
@@ -104,7 +104,7 @@ class ObjectModel:
 
     @property
     def published(self) -> ObjectModel:
-        """The same with mass and friction of DexGraspBench's protocol, which are the same for all objects."""
+        """Return the object with mass and friction of DexGraspBench's protocol, equal for all objects."""
         return self.weighing(mass=MASS_KG, friction=FRICTION)
 
     @property

@@ -14,7 +14,7 @@ from graspd.service.model.errors import MeshError
 from graspd.service.model.object_options import ObjectOptions
 from graspd.worker.objects.model import ObjectModel
 
-#: Keys that decide how heavy and how slippery the object is, and not its shape.
+#: Keys for mass and friction, which do not affect the shape.
 OF_MATTER: Final = ("density", "mass", "friction")
 
 #: Metres per unit.
@@ -22,7 +22,7 @@ UNITS: Final = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "in": 0.0254}
 
 
 def parse_options(files: Mapping[str, bytes], extra: Mapping[str, Any] | None = None) -> ObjectOptions:
-    """Options of the object in `files`, with `extra` (None values left out) over what its `asset.json` says.
+    """Parse options of the object in `files`; `extra` (without None values) overrides its `asset.json`.
 
     Raises:
         MeshError: `asset.json` is not JSON, or a key is unknown or wrong; the message names it.
@@ -43,10 +43,10 @@ def parse_options(files: Mapping[str, bytes], extra: Mapping[str, Any] | None = 
 
 
 def as_asked(obj: ObjectModel, request: JobOptions) -> ObjectModel:
-    """The object with the mass and friction that a job says, else its own; under level dexgraspbench, the protocol's.
+    """Return the object with mass and friction of the job, of its own, or of level dexgraspbench.
 
     Raises:
-        MeshError: it would weigh more than 100 kg.
+        MeshError: the mass would exceed 100 kg.
     """
     if request.validation == "dexgraspbench":
         return obj.published

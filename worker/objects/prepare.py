@@ -1,7 +1,7 @@
-"""An object from its files: read, repaired, simplified, with normals, hull and mass properties; as bytes and back, bit
-for bit.
+"""Prepare an object from its files: read, repair, simplify, add normals, hull and mass properties.
+Objects are serialised bit for bit.
 
-What one command has prepared on this machine, every later one reads in milliseconds.
+Objects prepared by one command on this machine load in milliseconds in every later one.
 """
 
 from __future__ import annotations
@@ -37,26 +37,26 @@ from graspd.worker.objects.options import OF_MATTER, parse_options
 from graspd.worker.objects.repair import RepairedMesh, repair
 from graspd.worker.objects.topology import Indices
 
-#: Names of files that say nothing of what is in them: the objects of such a set differ by their folders.
+#: Generic file names: objects of such a set differ by their folders.
 PLAIN_STEMS: Final = ("clean", "mesh", "model", "textured", "nontextured", "simplified")
-#: Libraries whose results go into a prepared object.
+#: Libraries that affect a prepared object.
 _LIBRARIES: Final = ("numpy", "scipy", "manifold3d", "fast-simplification")
 
 
 def load_object(
     files: Mapping[str, bytes], *, name: str, digest: str, face_error_m: float, options: Mapping[str, Any] | None = None
 ) -> ObjectModel:
-    """The object that `files` describe.
+    """Load the object in `files`.
 
     Args:
-        files: the mesh (STL, OBJ, PLY, OFF or GLB) and, if there is more to say, `asset.json` (see `ObjectOptions`).
+        files: the mesh (STL, OBJ, PLY, OFF or GLB) and optionally `asset.json` (see `ObjectOptions`).
         name: name of the object.
         digest: digest of its files.
         face_error_m: the prepared surface lies within this distance of the uploaded one [m]; 0: no simplification.
-        options: keys that go over those of `asset.json`.
+        options: keys that override those of `asset.json`.
 
     Raises:
-        MeshError: the mesh cannot be used; the message names what is wrong and the fix.
+        MeshError: the mesh cannot be used; the message names the fault and the fix.
     """
     settings = parse_options(files, options)
     main = main_file(files, settings)
@@ -66,12 +66,12 @@ def load_object(
 
 
 def weighed(model: ObjectModel, options: ObjectOptions) -> ObjectModel:
-    """The model with the mass and friction that its options say."""
+    """Return the model with the mass and friction of its options."""
     return model.weighing(mass=options.mass, density=options.density, friction=options.friction)
 
 
 def main_file(files: Mapping[str, bytes], options: ObjectOptions) -> str:
-    """Name of the mesh: as `asset.json` says, else the only one."""
+    """Return the name of the mesh: from `asset.json`, else the only one."""
     if options.file:
         if options.file not in files:
             raise MeshError(f"asset.json names the file {options.file!r}, which is not there")
@@ -87,7 +87,7 @@ def main_file(files: Mapping[str, bytes], options: ObjectOptions) -> str:
 
 @lru_cache(maxsize=8)
 def _prepared(main: str, data: bytes, options_json: str, face_error_m: float) -> ObjectModel:
-    """Cached by content: every batch of a job asks for the same object, and every command for the same few."""
+    """Prepare with a cache by content: batches of a job use the same object, and commands the same few."""
     return kept_or_made(
         (Path(main).suffix.lower(), options_json, repr(face_error_m)),
         data,
@@ -96,13 +96,13 @@ def _prepared(main: str, data: bytes, options_json: str, face_error_m: float) ->
 
 
 def repaired_mesh(main: str, data: bytes, options: ObjectOptions) -> RepairedMesh:
-    """The mesh of a file as a solid in metres; errors name the file."""
+    """Return the mesh of a file as a solid in metres; errors name the file."""
     return _repaired(main, data, options.model_dump_json())
 
 
 @lru_cache(maxsize=2)
 def _repaired(main: str, data: bytes, options_json: str) -> RepairedMesh:
-    """Kept for a while: it is the same for every bound of the simplification."""
+    """Repair with a cache: the result is the same for every bound of the simplification."""
     soup = read_mesh(main, data)
     try:
         return repair(soup, ObjectOptions.model_validate_json(options_json))
@@ -111,7 +111,7 @@ def _repaired(main: str, data: bytes, options_json: str) -> RepairedMesh:
 
 
 def build(mesh: RepairedMesh, face_error_m: float) -> ObjectModel:
-    """The model of a repaired mesh."""
+    """Build the model of a repaired mesh."""
     vertices, faces, error = simplify(mesh.vertices, mesh.faces, face_error_m, closed=mesh.watertight)
     hull_vertices, hull_faces = convex_hull(vertices)
     solid = (vertices, faces.astype(np.int32)) if mesh.watertight else (hull_vertices, hull_faces)
@@ -136,7 +136,7 @@ def build(mesh: RepairedMesh, face_error_m: float) -> ObjectModel:
 
 
 def convex_hull(points: Floats) -> tuple[Floats, Ints]:
-    """Corners (H, 3) and outward triangles (G, 3)."""
+    """Compute corners (H, 3) and outward triangles (G, 3)."""
     from scipy.spatial import ConvexHull, QhullError
 
     try:
@@ -155,7 +155,7 @@ def convex_hull(points: Floats) -> tuple[Floats, Ints]:
 def object_from_path(
     path: str | Path, face_error_m: float = 3e-4, options: Mapping[str, Any] | None = None
 ) -> ObjectModel:
-    """An object for the command line: name of a built-in, a mesh file, or a ZIP.
+    """Load an object for the command line: name of a built-in, a mesh file, or a ZIP.
 
     Raises:
         NotFoundError: neither a file nor a built-in object.
@@ -172,7 +172,7 @@ def object_from_path(
 
 
 def files_from_path(path: str | Path) -> tuple[str, dict[str, bytes], dict[str, Any]]:
-    """Name, files and further options of the object at `path`."""
+    """Return name, files and further options of the object at `path`."""
     path = Path(path)
     if not path.is_file():
         if str(path) in builtin_names(AssetKind.OBJECT):
@@ -191,17 +191,17 @@ def files_from_path(path: str | Path) -> tuple[str, dict[str, bytes], dict[str, 
 
 
 def name_of(path: Path) -> str:
-    """Name of the object in a mesh file: the file's, or its folder's where files of all objects are called the same."""
+    """Return the object's name: that of its mesh file, or of the folder if the file name is generic."""
     return path.resolve().parent.name if path.stem.lower() in PLAIN_STEMS else path.stem
 
 
 def kept_or_made(terms: tuple[str, ...], data: bytes, make: Callable[[], ObjectModel]) -> ObjectModel:
-    """A prepared object from the user's cache, else made and kept there.
+    """Load a prepared object from the user's cache, or prepare and cache it.
 
     Args:
-        terms: all that the object follows from, besides the bytes of its mesh and the code that prepares it.
-        data: the mesh as it was given.
-        make: prepares it; what it raises is not kept.
+        terms: all inputs that determine the object, besides the bytes of its mesh and the code that prepares it.
+        data: the mesh as given.
+        make: prepares it; its errors are not cached.
     """
     address = digest_json([*terms, hashlib.sha256(data).hexdigest(), revision()])
     file = user_cache.folder("objects") / f"{address}.npz"
@@ -217,8 +217,8 @@ def kept_or_made(terms: tuple[str, ...], data: bytes, make: Callable[[], ObjectM
 
 @lru_cache(maxsize=1)
 def revision() -> str:
-    """Digest of what prepares: this package's source, its libraries, and the kind of processor, whose last bits may
-    differ. So a change to how objects are prepared leaves no old one in use, and nobody has to remember a number."""
+    """Compute a digest of this package's source, its libraries, and the processor type.
+    The processor may change the last bits. A change of the preparation thus invalidates cached objects."""
     whole = hashlib.sha256()
     for file in sorted(Path(__file__).parent.rglob("*.py")):
         whole.update(file.read_bytes())
@@ -227,27 +227,27 @@ def revision() -> str:
 
 Mesh = tuple[Floats, Indices]
 
-#: Meshes with no more faces are left as they are: fewer would not make a query faster.
+#: Number of faces up to which meshes are not simplified: fewer would not make a query faster.
 FEW_FACES: Final = 64
-#: Meshes with more faces are first brought near this number.
+#: Meshes with more faces are first reduced to about this number.
 MANY_FACES: Final = 40_000
-#: The search stops when two targets differ by less than this factor.
+#: The search ends when two targets differ by less than this factor.
 STEP: Final = 1.12
-#: Surface samples, besides the vertices, at which trials are held to a little less than the bound ...
+#: Surface samples, besides the vertices, at which trials must stay within this share of the bound ...
 SAMPLES: Final = 4000
 MARGIN: Final = 0.9
-#: ... and those at which the mesh that is returned is measured.
+#: ... and samples at which the returned mesh is measured.
 DENSE_SAMPLES: Final = 30_000
-#: Aggressiveness of the collapse: the slowest that still reaches its target; it errs least and breaks least.
+#: Aggressiveness of the collapse: the slowest that reaches its target, with the least error and fewest broken meshes.
 PATIENCE: Final = 3
 
 
 def simplify(vertices: Floats, faces: Indices, error_m: float, *, closed: bool = True) -> tuple[Floats, Indices, float]:
-    """The coarsest mesh found whose surface lies within `error_m` of the given one, both ways.
+    """Find the coarsest mesh whose surface lies within `error_m` of the given one, both ways.
 
     Quadric edge collapse (Garland & Heckbert 1997) to a bisected number of faces; each trial is measured and, for
-    closed meshes, must be an oriented 2-manifold with as many shells as the original. Where no trial passes, the mesh
-    is thinned by manifold3d's edge collapse, and where that gains nothing it stays as it is.
+    closed meshes, must be an oriented 2-manifold with as many shells as the original. If no trial passes, manifold3d's
+    edge collapse is used; if that gains nothing, the mesh stays unchanged.
 
     Returns:
         vertices, faces and the measured deviation [m].
@@ -257,7 +257,7 @@ def simplify(vertices: Floats, faces: Indices, error_m: float, *, closed: bool =
     limit = MARGIN * error_m
     original = ReferenceMesh(vertices, faces, closed)
     if len(faces) > MANY_FACES:
-        # A fifth of the error buys a mesh that is quick to compare with; by the triangle inequality the rest remains.
+        # A fifth of the error gives a mesh that is quick to compare with; the triangle inequality leaves the rest.
         start = _rollout(original, MANY_FACES, limit / 5)
         if start is not None:
             original, limit = ReferenceMesh(*start, closed), limit * 4 / 5
@@ -281,7 +281,7 @@ def simplify(vertices: Floats, faces: Indices, error_m: float, *, closed: bool =
 
 
 class ReferenceMesh:
-    """The mesh that trials are held against; what is asked of it many times is computed once."""
+    """Reference for the comparison of trials; repeated queries are cached."""
 
     def __init__(self, vertices: Floats, faces: Indices, closed: bool) -> None:
         self.vertices, self.faces, self.closed = vertices, faces, closed
@@ -290,7 +290,7 @@ class ReferenceMesh:
         self._points = self._points_of((vertices, faces))
 
     def accepts(self, mesh: Mesh) -> bool:
-        """Whether a mesh is closed, outward and in as many shells as the original, if that is closed."""
+        """Check whether a mesh is closed, outward and in as many shells as the original, if that is closed."""
         if not self.closed:
             return True
         return (
@@ -301,9 +301,9 @@ class ReferenceMesh:
         )
 
     def within(self, mesh: Mesh, limit: float) -> bool:
-        """Whether the two surfaces lie within `limit` [m] of each other, both ways, over vertices and even samples."""
+        """Check whether two surfaces lie within `limit` [m], both ways, over vertices and even samples."""
         back, own = MeshDistance(*mesh), self._points_of(mesh)
-        # A few points tell of most meshes that are too coarse; all of them are only asked when it may be accepted.
+        # A few points reject most meshes that are too coarse; all points are checked only if these pass.
         return all(
             float(distance(points[::step], limit).max()) <= limit
             for step in (16, 1)
@@ -316,9 +316,9 @@ class ReferenceMesh:
 
 
 def _rollout(original: ReferenceMesh, target: int, error_m: float) -> Mesh | None:
-    """A mesh of about `target` faces if it is feasible and within the bound.
+    """Return a mesh of about `target` faces if it is valid and within the bound.
 
-    A collapse that broke the surface at one count often does not at the next, so a few are tried.
+    A collapse that broke the surface at one count often does not at the next, so a few counts are used.
     """
     for count in (target, int(target * 1.02) + 2, int(target * 1.05) + 4):
         mesh = _collapse(original.vertices, original.faces, count)
@@ -331,9 +331,9 @@ def _rollout(original: ReferenceMesh, target: int, error_m: float) -> Mesh | Non
 def _collapse(vertices: Floats, faces: Indices, target: int) -> Mesh | None:
     if target >= len(faces):
         return None
-    # Single precision inside: centred and scaled, so that it costs the least.
+    # The library uses single precision: centring and scaling minimise the loss.
     middle, scale = vertices.mean(axis=0), float(np.ptp(vertices, axis=0).max())
-    import fast_simplification  # where something is new on the machine
+    import fast_simplification  # slow to load, not needed for cached results
 
     points, triangles = fast_simplification.simplify(
         ((vertices - middle) / scale).astype(np.float32), faces.astype(np.int32), target_count=target, agg=PATIENCE
@@ -345,7 +345,7 @@ def _collapse(vertices: Floats, faces: Indices, target: int) -> Mesh | None:
         return None
     mesh = topology.compact(np.asarray(points, dtype=float) * scale + middle, triangles)
     if (topology.edge_faces(mesh[1])[1] > 2).any():
-        # A tunnel that collapsed to an edge: taking the edge apart closes the tunnel.
+        # A tunnel that collapsed to an edge: splitting the edge closes the tunnel.
         mesh = topology.part_double_edges(*topology.split_edges(*mesh))
     return mesh
 
@@ -374,7 +374,7 @@ _NAMES: Final = ("name", "digest", "about_centre")
 
 
 def to_bytes(obj: ObjectModel) -> bytes:
-    """All of an object but its name and digest, bit for bit."""
+    """Serialise an object without its name and digest, bit for bit."""
     plain = {f.name: getattr(obj, f.name) for f in fields(obj) if f.name not in (*_ARRAYS, *_NAMES)}
     arrays: dict[str, Any] = {name: getattr(obj.centred, name) for name in _ARRAYS}
     buffer = io.BytesIO()
@@ -383,7 +383,7 @@ def to_bytes(obj: ObjectModel) -> bytes:
 
 
 def from_bytes(data: bytes, *, name: str, digest: str) -> ObjectModel:
-    """An object from `to_bytes`; ValueError, KeyError, OSError, EOFError or BadZipFile if they are none."""
+    """Load an object from `to_bytes`; else ValueError, KeyError, OSError, EOFError or BadZipFile."""
     with np.load(io.BytesIO(data), allow_pickle=False) as stored:
         plain = json.loads(stored["plain"].tobytes())
         arrays = {field: stored[field] for field in _ARRAYS}

@@ -1,6 +1,6 @@
-"""From the triangles of a file to one closed, outward solid, or an error that says why not and what to do.
+"""Repair the triangles of a file to one closed, outward solid, or raise an error with the fix.
 
-Every change is named: what is repaired silently today is a mystery in a dataset tomorrow.
+Every change is reported: silent repairs would make a dataset inexplicable later.
 """
 
 from __future__ import annotations
@@ -25,42 +25,42 @@ from graspd.worker.objects.topology import Indices
 
 MAX_EXTENT_M: Final = 3.0
 MIN_EXTENT_M: Final = 1e-3
-#: Extents of objects that hands are asked to grasp, and of the middle one of YCB's [m]: a hint of units follows them.
+#: Range of extents of graspable objects, and the median extent of YCB's [m], for hints on units.
 HAND_SIZES_M: Final = (0.02, 0.6)
 TYPICAL_SIZE_M: Final = 0.12
-#: Parts with at most this gap between them are one rigid body [m]: assemblies leave such between parts that are joined.
+#: Largest gap between parts of one rigid body [m]: assemblies leave such gaps between joined parts.
 JOINED_M: Final = 1e-3
-#: Vertices closer than this share of the longest extent are one vertex.
+#: Vertices closer than this share of the longest extent are merged.
 MERGE: Final = 1e-8
-#: A seam that did not close is welded at this share of the longest extent.
+#: Tolerance for welding open seams, as a share of the longest extent.
 WELD: Final = 1e-5
-#: Holes with a rim no wider than this share of the longest extent are filled.
+#: Largest rim of a hole that is filled, as a share of the longest extent.
 HOLE: Final = 0.03
-#: Components with less than this share of the largest one's volume are dropped as scan debris.
+#: Volume below which components are dropped as scan debris, as a share of the largest one's.
 DEBRIS: Final = 1e-6
-#: Coordinates that are farther apart than this where the mesh lies are worth a warning [m].
+#: Spacing of coordinates at the mesh's position above which there is a warning [m].
 COARSE_M: Final = 1e-4
-#: A mean wall below this [m] is worth a warning: it can pass between hand points.
+#: Mean wall thickness [m] below which there is a warning: a wall can pass between hand points.
 THIN_M: Final = 2.5e-3
-#: Points, besides the vertices, at which the repaired surface is held against the one that was given.
+#: Points, besides the vertices, at which the repaired surface is compared with the original.
 _SAMPLES: Final = 4000
 
 
 @dataclass(frozen=True)
 class RepairedMesh:
-    """A mesh in metres with the names of what was changed and of what is odd but right."""
+    """Mesh in metres with a list of changes and of anomalies that are valid."""
 
     vertices: Floats
-    """(V, 3) about the middle of the mesh."""
+    """(V, 3) relative to the middle of the mesh."""
     faces: Indices
     watertight: bool = True
     repairs: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     components: int = field(default=1)
     self_intersections: int | None = None
-    """Pairs of faces that still pass through each other; None: not looked for."""
+    """Pairs of faces that still intersect; None: not checked."""
     moved_m: float = 0.0
-    """Largest distance of the repaired surface from the one that was given [m]."""
+    """Largest distance of the repaired surface from the original [m]."""
     centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """The middle in the file's frame [m]."""
 
@@ -69,10 +69,10 @@ class RepairedMesh:
 
 
 def repair(soup: Soup, options: ObjectOptions) -> RepairedMesh:
-    """The soup as a solid in metres.
+    """Convert the soup to a solid in metres.
 
     Raises:
-        MeshError: wrong units, no volume, holes, several components; the message says the fix.
+        MeshError: wrong units, no volume, holes, several components; the message states the fix.
     """
     try:
         given = _to_metres(soup, options)
@@ -137,7 +137,7 @@ def _coarse(given: CentredMesh, unit: float) -> str:
 
 
 def _fitting_units(extent: float) -> dict[str, float]:
-    """Units that make a length of the file one of an object for a hand, and that length [m]; the likeliest first."""
+    """Return units in which a length of the file suits a hand, and that length [m]; the likeliest first."""
     sizes = {unit: extent * metres for unit, metres in UNITS.items()}
     low, high = HAND_SIZES_M
     fitting = {unit: size for unit, size in sizes.items() if low <= size <= high}
@@ -150,7 +150,7 @@ def _length(metres: float) -> str:
 
 
 def _clean(mesh: RepairedMesh) -> RepairedMesh:
-    """Vertices merged; faces without area and duplicates dropped."""
+    """Merge vertices; drop duplicates and faces without area."""
     extent = float(np.ptp(mesh.vertices, axis=0).max())
     vertices, faces = topology.merge_vertices(mesh.vertices, mesh.faces, MERGE * extent)
     collapsed = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
@@ -158,7 +158,7 @@ def _clean(mesh: RepairedMesh) -> RepairedMesh:
     doubled = topology.repeated(faces) if len(faces) else np.zeros(0, dtype=bool)
     faces = faces[~doubled]
     slivers = topology.degenerate(vertices, faces) if len(faces) else np.zeros(0, dtype=bool)
-    # A face without area may still be the seam between a long edge and two short ones: it goes only if none opens.
+    # A face without area may join a long edge with two short ones: it is dropped only if no edge opens.
     if slivers.any() and topology.open_edges(faces[~slivers]) <= topology.open_edges(faces):
         faces = faces[~slivers]
     else:
@@ -172,7 +172,7 @@ def _clean(mesh: RepairedMesh) -> RepairedMesh:
 
 
 def _close(mesh: RepairedMesh) -> RepairedMesh:
-    """Winding made consistent, crowded edges taken apart, seams welded, pinholes filled."""
+    """Unify the winding, split crowded edges, weld seams, fill pinholes."""
     if topology.open_edges(mesh.faces):
         mesh = _weld(mesh)
     faces, orientable = topology.unify_winding(mesh.faces)
@@ -211,7 +211,7 @@ def _weld(mesh: RepairedMesh) -> RepairedMesh:
 
 
 def _fill_pinholes(mesh: RepairedMesh) -> RepairedMesh:
-    """A fan over each small hole; the whole mesh stays open if one is large."""
+    """Fill each small hole with a fan; the whole mesh stays open if one is large."""
     extent = float(np.ptp(mesh.vertices, axis=0).max())
     loops = [loop for loop in _rims(mesh.faces) or [] if len(loop) > 2]
     if not loops:
@@ -224,7 +224,7 @@ def _fill_pinholes(mesh: RepairedMesh) -> RepairedMesh:
 
 
 def _rims(faces: Indices) -> list[list[int]] | None:
-    """Closed loops of open edges in the direction of their faces; None if they cross."""
+    """Return closed loops of open edges in the direction of their faces; None if they cross."""
     index, counts = topology.edge_faces(faces)
     rim = topology.directed_edges(faces)[counts[index] == 1]
     after = {int(a): int(b) for a, b in rim}
@@ -262,7 +262,7 @@ def _areas(vertices: Floats, faces: Indices) -> Floats:
 
 
 def _resolve_components(mesh: RepairedMesh, options: ObjectOptions) -> RepairedMesh:
-    """Debris dropped, every component outward, overlapping ones united; more than one left is the user's choice."""
+    """Drop debris, orient components outward, unite overlapping ones; the user chooses among several."""
     shells = topology.components(mesh.faces)
     parts = [topology.compact(mesh.vertices, mesh.faces[shells == k]) for k in range(shells.max() + 1)]
     volumes = np.array([signed_volume(*part) for part in parts])
@@ -293,7 +293,7 @@ def _unite(
     turned: bool,
     options: ObjectOptions,
 ) -> RepairedMesh:
-    """One solid of several shells: those wound against the largest are cavities if they lie inside it."""
+    """Unite shells to one solid: shells wound against the largest are cavities if they lie inside it."""
     if turned:
         mesh = mesh.but(mesh.vertices, mesh.faces[:, ::-1], "winding turned outward")
     boxes = [(p[0].min(axis=0), p[0].max(axis=0)) for p in parts]
@@ -314,7 +314,7 @@ def _unite(
         )
     if turned_parts:
         mesh = replace(mesh, repairs=(*mesh.repairs, f"winding of {turned_parts} components turned outward"))
-    # A cavity is a shell of its own, of negative volume.
+    # A cavity is its own shell, of negative volume.
     pieces = [piece for piece in united.decompose() if piece.volume() > 0]
     groups = mesh_geometry.groups(pieces, JOINED_M)
     if len(groups) > 1 and not options.compound:
@@ -331,7 +331,7 @@ def _unite(
         how = "lie apart" if len(groups) > 1 else f"touch or lie within {1e3 * JOINED_M:g} mm"
         mesh = replace(mesh, notes=(*mesh.notes, f"{len(pieces)} parts that {how} are one rigid body"))
     before = sum(signed_volume(*p) for p in positives) - sum(signed_volume(*p) for p in holes)
-    # Parts that share a face have the same volume apart and united: their faces within the solid go.
+    # Parts that share a face have the same volume apart and united: their faces within the solid are removed.
     if abs(united.volume() - before) > 1e-6 * before or len(pieces) < len(positives):
         return mesh.but(
             *mesh_geometry.from_manifold(united), f"united {len(parts)} touching or intersecting components"
@@ -340,7 +340,7 @@ def _unite(
 
 
 def _resolve_self_intersections(mesh: RepairedMesh) -> RepairedMesh:
-    """What a shell encloses twice counts once, where that leaves the outer surface as it is; else a note."""
+    """Count doubly enclosed volume once if that leaves the outer surface unchanged; else add a note."""
     found = crossings(mesh.vertices, mesh.faces)
     if found is None or not len(found):
         return replace(mesh, self_intersections=None if found is None else 0)

@@ -1,4 +1,4 @@
-"""Files that stand where another should be: pointers, pages of errors, archives under a mesh's name."""
+"""Files in place of the expected ones: pointers, error pages, archives with the suffix of a mesh."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _SERVER: Final = (
     rb"bad gateway|service unavailable|internal server error)\b"
 )
 _GLTF: Final = rb'\{\s*"(asset|accessors|buffers|bufferViews|scenes?|nodes|meshes|extensions\w*)"'
-#: What a text begins with, what it is, and the fix. White space and byte order marks before it are passed over.
+#: Beginning of a text, its kind, and the fix. White space and byte order marks before it are skipped.
 _TEXTS: Final = (
     (rb"version https://(git-lfs|hawser)\.github\.com/", "a Git LFS pointer", "git lfs pull"),
     (rb"(\.\./|/)*\.git/annex/objects/|/annex/objects/", "a git-annex pointer", "git annex get"),
@@ -31,7 +31,7 @@ _TEXTS: Final = (
     (rb"#VRML", "a VRML file", _MESH),
     (rb"#usda", "a USD file", _MESH),
 )
-#: The same of files that are no text.
+#: The same for binary files.
 _BINARIES: Final = (
     (rb"\x1f\x8b|BZh|\xfd7zXZ|7z\xbc\xaf|Rar!|\x28\xb5\x2f\xfd|.{257}ustar", "a compressed archive", "unpack it"),
     (rb"%PDF-", "a PDF document", "give the file itself"),
@@ -40,9 +40,9 @@ _BINARIES: Final = (
     (rb"BLENDER[-_v]", "a Blender file", _MESH),
     (rb"PXR-USDC", "a USD file", _MESH),
 )
-#: What Git writes for a link where the file system has none: a path, without a line's end.
+#: Git's text for a link on a file system without links: a path without a line end.
 _LINK: Final = re.compile(rb"[\w.~ /\\-]*[/\\][\w.~ -]+\.\w{1,5}")
-#: How meshes begin, by their suffix.
+#: Beginning of meshes, by suffix.
 _MESHES: Final = {
     ".ply": re.compile(rb"ply\s"),
     ".glb": re.compile(rb"glTF"),
@@ -54,9 +54,9 @@ _MESHES: Final = {
 
 
 def refuse_stand_in(name: str, data: bytes, error: type[InputError]) -> None:
-    """Raise `error` where a file is known not to be what its name says: the message tells what it is, and the fix."""
+    """Raise `error` if a file is known not to match its suffix: the message names its kind and the fix."""
     head = data[:1024].removeprefix(b"\xef\xbb\xbf").lstrip()
-    # The 80 bytes that a binary STL begins with may be any words.
+    # The 80 bytes at the beginning of a binary STL may be any text.
     for pattern, what, fix in _BINARIES if b"\0" in head else _TEXTS + _BINARIES:
         if re.match(pattern, head, re.IGNORECASE | re.DOTALL):
             raise error(f"{name} is {what}, not the file itself: {fix}")
@@ -69,7 +69,7 @@ def refuse_stand_in(name: str, data: bytes, error: type[InputError]) -> None:
 
 
 def other_format(name: str, data: bytes) -> str | None:
-    """What a file that its reader refuses is instead: a mesh of another format, and the fix."""
+    """Return the other mesh format of a file that its reader refuses, and the fix."""
     own, head = PurePosixPath(name).suffix.lower(), data[:4096].lstrip()
     for suffix, pattern in _MESHES.items():
         if suffix != own and pattern.match(head):

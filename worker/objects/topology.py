@@ -1,4 +1,4 @@
-"""Topology of a triangle mesh: merging, degenerate and duplicate faces, winding, manifold edges, components.
+"""Topology of a triangle mesh: merging, degenerate and duplicate faces, winding, edges, components.
 
 All functions are pure: vertices (V, 3) and faces (F, 3) in, new arrays out.
 """
@@ -18,12 +18,12 @@ _SAME_ANGLE = 1e-9
 
 
 def merge_vertices(vertices: Floats, faces: Indices, tolerance: float) -> tuple[Floats, Indices]:
-    """Vertices that round to the same point of a grid of `tolerance` become one; unused ones go."""
+    """Merge vertices that round to the same point of a grid of `tolerance`; drop unused ones."""
     used, faces = np.unique(faces, return_inverse=True)
     vertices, faces = vertices[used], faces.reshape(-1, 3)
     cells = np.round((vertices - vertices.min(axis=0)) / tolerance).astype(np.int64)
     _, first, inverse = np.unique(cells, axis=0, return_index=True, return_inverse=True)
-    # Keep the file's order: sorted cells would shuffle vertices for no reason.
+    # Keep the file's order: sorted cells would shuffle vertices needlessly.
     order = np.argsort(first, kind="stable")
     rank = np.empty(len(first), dtype=np.int64)
     rank[order] = np.arange(len(first))
@@ -31,13 +31,13 @@ def merge_vertices(vertices: Floats, faces: Indices, tolerance: float) -> tuple[
 
 
 def compact(vertices: Floats, faces: Indices) -> tuple[Floats, Indices]:
-    """Without the vertices that no face uses."""
+    """Drop the vertices that no face uses."""
     used, inverse = np.unique(faces, return_inverse=True)
     return vertices[used], inverse.reshape(-1, 3)
 
 
 def degenerate(vertices: Floats, faces: Indices) -> Mask:
-    """(F,) faces that repeat a vertex or are thinner than a millionth of their longest side."""
+    """Return a mask (F,) of faces that repeat a vertex or are thinner than 1e-6 of their longest side."""
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
     sides = np.stack([b - a, c - b, a - c])
     longest = np.linalg.norm(sides, axis=2).max(axis=0)
@@ -47,9 +47,9 @@ def degenerate(vertices: Floats, faces: Indices) -> Mask:
 
 
 def repeated(faces: Indices) -> Mask:
-    """(F,) faces to drop so that each set of three vertices is used at most once.
+    """Return a mask (F,) of faces to drop so that each set of three vertices is used at most once.
 
-    Two coincident faces of opposite winding enclose nothing: both go where the surface stays closed without them.
+    Two coincident faces of opposite winding enclose nothing: both are dropped if the surface stays closed.
     """
     key = np.sort(faces, axis=1)
     _, group, size = np.unique(key, axis=0, return_inverse=True, return_counts=True)
@@ -82,37 +82,37 @@ def _edge_counts(faces: Indices) -> dict[tuple[int, int], int]:
 
 
 def _edge_keys(faces: Indices, *, directed: bool = False) -> Indices:
-    """(3F,) one number for each edge, in the order of `directed_edges`: far faster to sort than pairs."""
+    """Encode each edge (3F,) as a number, in the order of `directed_edges`: far faster to sort than pairs."""
     edges = directed_edges(faces)
     edges = edges if directed else np.sort(edges, axis=1)
     return (edges[:, 0] << 32) | edges[:, 1]
 
 
 def directed_edges(faces: Indices) -> Indices:
-    """(3F, 2) edges in the direction of each face: first all 0-1 edges, then all 1-2, then all 2-0."""
+    """Return edges (3F, 2) in the direction of each face: first all 0-1 edges, then all 1-2, then all 2-0."""
     return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
 
 
 def edge_faces(faces: Indices) -> tuple[Indices, Indices]:
-    """(3F,) number of each directed edge's undirected edge, and (E,) how many faces meet there."""
+    """Return the undirected edge (3F,) of each directed edge, and the number of faces (E,) at each."""
     _, index, counts = np.unique(_edge_keys(faces), return_inverse=True, return_counts=True)
     return index.reshape(-1), counts
 
 
 def is_closed(faces: Indices) -> bool:
-    """Whether every edge has exactly two faces that run along it in opposite directions."""
+    """Check whether every edge has exactly two faces that run along it in opposite directions."""
     _, counts = np.unique(_edge_keys(faces, directed=True), return_counts=True)
     _, both = np.unique(_edge_keys(faces), return_counts=True)
     return bool(len(faces) and (counts == 1).all() and (both == 2).all())
 
 
 def open_edges(faces: Indices) -> int:
-    """Number of edges with an odd number of faces: the rims of holes."""
+    """Return the number of edges with an odd number of faces: the rims of holes."""
     return int((edge_faces(faces)[1] % 2 == 1).sum())
 
 
 def pair_faces(faces: Indices) -> tuple[Indices, Indices, Mask]:
-    """Faces on the two sides of each manifold edge: (M,) and (M,), and (M,) whether their windings agree."""
+    """Return the two faces at each manifold edge, (M,) and (M,), and (M,) whether their windings agree."""
     index, counts = edge_faces(faces)
     order = np.argsort(index, kind="stable")
     starts = np.cumsum(counts) - counts
@@ -124,7 +124,7 @@ def pair_faces(faces: Indices) -> tuple[Indices, Indices, Mask]:
 
 
 def parts_of_graph(one: Indices, other: Indices, count: int) -> NDArray[np.int32]:
-    """(N,) number of the connected part of each of `count` nodes; edges join nodes `one` (E,) with `other` (E,)."""
+    """Number the connected parts (N,) of `count` nodes; edges join nodes `one` (E,) with `other` (E,)."""
     from scipy.sparse import coo_matrix  # slow to load, and a prepared object needs none
     from scipy.sparse.csgraph import connected_components
 
@@ -134,7 +134,7 @@ def parts_of_graph(one: Indices, other: Indices, count: int) -> NDArray[np.int32
 
 
 def components(faces: Indices) -> Indices:
-    """(F,) number of the connected component (by shared vertices) of each face."""
+    """Return the number (F,) of each face's connected component (by shared vertices)."""
     n = int(faces.max()) + 1
     rows = np.concatenate([faces[:, 0], faces[:, 1]])
     columns = np.concatenate([faces[:, 1], faces[:, 2]])
@@ -144,10 +144,10 @@ def components(faces: Indices) -> Indices:
 
 
 def unify_winding(faces: Indices) -> tuple[Indices, bool]:
-    """Faces turned so that neighbours agree, and whether that was possible (not on a Moebius strip).
+    """Flip faces so that neighbours agree; return whether that was possible (not on a Moebius strip).
 
-    Each face is two nodes, as it is and turned; an edge joins the nodes that agree. A component of this graph is one
-    consistent choice, and a face that meets its own turned copy shows a surface without sides.
+    Each face is two nodes, as it is and flipped; an edge joins the nodes that agree. A component of this graph is one
+    consistent choice; a face connected with its own flipped copy belongs to a non-orientable surface.
     """
     count = len(faces)
     one, two, agree = pair_faces(faces)
@@ -156,7 +156,7 @@ def unify_winding(faces: Indices) -> tuple[Indices, bool]:
     columns = np.concatenate([two + cross, two + count - cross])
     label = parts_of_graph(rows, columns, 2 * count)
     orientable = bool((label[:count] != label[count:]).all())
-    # Of a patch's two choices take the one that turns fewer faces: the majority of the file is usually right.
+    # Choose the option of a patch that flips fewer faces: the majority of the file is usually right.
     low = np.minimum(label[:count], label[count:])
     as_is = label[:count] == low
     share = np.bincount(low, as_is, minlength=2 * count) * 2 >= np.bincount(low, minlength=2 * count)
@@ -165,7 +165,7 @@ def unify_winding(faces: Indices) -> tuple[Indices, bool]:
 
 
 def split_edges(vertices: Floats, faces: Indices) -> tuple[Floats, Indices]:
-    """Edges with more than two faces taken apart: vertices there are doubled, one for each fan of faces.
+    """Split edges with more than two faces: vertices there are duplicated, one for each fan of faces.
 
     Faces at a crowded edge are paired as neighbours around the edge that enclose material between them.
     """
@@ -192,9 +192,9 @@ def split_edges(vertices: Floats, faces: Indices) -> tuple[Floats, Indices]:
 
 
 def part_double_edges(vertices: Floats, faces: Indices) -> tuple[Floats, Indices]:
-    """Two edges between the same two vertices made distinct: all but one get a vertex in the middle.
+    """Separate edges between the same two vertices: all but one get a vertex in the middle.
 
-    Such edges are feasible on a surface with a tunnel, but in a list of faces they look like one edge with four faces.
+    Such edges are valid on a surface with a tunnel, but in a list of faces they look like one edge with four faces.
     """
     index, counts = edge_faces(faces)
     crowded = np.flatnonzero(counts > 2)
@@ -221,12 +221,12 @@ def part_double_edges(vertices: Floats, faces: Indices) -> tuple[Floats, Indices
 
 
 def _corner(half: Indices, count: int, step: int = 0) -> Indices:
-    """Number 3 f + k of the corner at which a half-edge starts, or ends with step 1."""
+    """Return the number 3 f + k of the corner at which a half-edge starts, or ends with step 1."""
     return 3 * (half % count) + (half // count + step) % 3
 
 
 def _pairs_around(vertices: Floats, faces: Indices, edges: Indices, half: Indices) -> list[tuple[int, int]]:
-    """Pairs of half-edges at one edge: sorted by angle, each face joined to the next one behind its back."""
+    """Pair half-edges at one edge: sorted by angle, each face is joined to the next one behind its back."""
     a, b = np.sort(edges[half[0]])
     axis = vertices[b] - vertices[a]
     axis /= max(float(np.linalg.norm(axis)), 1e-300)
@@ -235,7 +235,7 @@ def _pairs_around(vertices: Floats, faces: Indices, edges: Indices, half: Indice
     flat = apex - (apex @ axis)[:, None] * axis
     x = flat[0] / max(float(np.linalg.norm(flat[0])), 1e-300)
     angle = np.arctan2(flat @ np.cross(axis, x), flat @ x)
-    # Parts that touch have coincident faces: the one whose material lies before it comes first.
+    # Parts that touch have coincident faces: the one with its material before it comes first.
     angle = np.round(np.where(angle <= -np.pi + _SAME_ANGLE, np.pi, angle) / _SAME_ANGLE)
     order = np.lexsort((edges[half, 0] != a, angle))
     forward = edges[half[order], 0] == a

@@ -1,4 +1,4 @@
-"""Grasp planners behind one interface: see `port` for what a planner is and `registry` for those there are."""
+"""Grasp planners behind one interface: `port` defines the interface, `registry` lists the planners."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def synthesize(
     method: str = "fast_graspd",
     options: Mapping[str, Any] | None = None,
 ) -> GraspSet:
-    """Grasps by the named method with its own `options`; see `Planner`.
+    """Plan grasps with the named method and its `options`; see `Planner`.
 
     Raises:
         InputError: the object does not fit into the gripper; see `fitting_pairs`.
@@ -69,7 +69,7 @@ def synthesize_batches(
     method: str = "fast_graspd",
     options: Mapping[str, Any] | None = None,
 ) -> list[GraspSet | Exception]:
-    """Batches of one job in one launch, if the method knows how, else one after the other; see `BatchPlanner`."""
+    """Plan batches of one job, in one launch if the method supports it; see `BatchPlanner`."""
     if (together := joined(method, options)) is not None:
         return together(hand, obj, asked)
     found: list[GraspSet | Exception] = []

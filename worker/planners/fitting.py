@@ -1,6 +1,6 @@
-"""Whether an object fits between the jaws of a gripper: told before any work.
+"""Check before planning whether an object fits between the jaws of a gripper.
 
-Places where two opposite fingers can take an object: pairs of surface points that look away from each other.
+Two opposite fingers can hold an object at pairs of surface points that face away from each other.
 """
 
 from __future__ import annotations
@@ -19,15 +19,14 @@ from graspd.worker.hands.jaws import jaws_of
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 
-#: What must be left of the opening on each side of the object [m].
+#: Clearance between the opening and the object on each side [m].
 FIT_M: Final = 0.001
 
 
 def fitting_pairs(hand: HandModel, obj: ObjectModel) -> Pairs | None:
-    """Pairs of opposite places of an object that fit between the jaws of a hand; None where the hand is no gripper.
-
+    """Return pairs of opposite points that fit between the jaws of a hand; None if the hand is no gripper.
     Raises:
-        InputError: no pair fits; the message says what opens how far.
+        InputError: no pair fits; the message names the joint and its opening.
     """
     jaws = jaws_of(hand)
     if jaws is None:
@@ -44,19 +43,19 @@ def fitting_pairs(hand: HandModel, obj: ObjectModel) -> Pairs | None:
     )
 
 
-#: Points from which lines go into the object, and the standard deviation of their tilt from the normal [rad].
+#: Number of points from which lines enter the object, and the standard deviation of their tilt from the normal [rad].
 _POINTS: Final = 768
 _TILT: Final = 0.08
-#: Where a line leaves, its surface looks along it to within 20 degrees.
+#: Cosine of the angle between a line and the surface normal at its exit: 20 degrees.
 _OPPOSITE_COS: Final = 0.94
-#: Thinner than this nothing is held [m].
+#: Least thickness that can be held [m].
 _THINNEST_M: Final = 5e-4
 _CHUNK: Final = 64
 
 
 @dataclass(frozen=True)
 class Pairs:
-    """P pairs, object frame. What lies between the points of a pair may be hollow: two fingers go around it."""
+    """P pairs, object frame. The space between the points may be hollow: two fingers go around it."""
 
     start: Floats
     """(P, 3) [m]"""
@@ -69,13 +68,13 @@ class Pairs:
         return np.asarray(np.linalg.norm(self.end - self.start, axis=1))
 
     def narrower(self, width: float) -> Pairs:
-        """Those that fit into a width [m]."""
+        """Select the pairs that fit into a width [m]."""
         fits = self.width <= width
         return Pairs(self.start[fits], self.end[fits])
 
 
 def antipodal_pairs(obj: ObjectModel) -> Pairs:
-    """Pairs of an object; from memory where they were asked for before. The same object gives the same pairs."""
+    """Return the pairs of an object, cached; the same object gives the same pairs."""
     with _lock:
         if obj.content not in _found:
             _found[obj.content] = _pairs(obj)
@@ -87,7 +86,7 @@ _lock = threading.Lock()
 
 
 def _pairs(obj: ObjectModel) -> Pairs:
-    """Lines from points spread evenly over the area, inwards; each exit from the solid behind a point makes a pair."""
+    """Cast lines inwards from points spread evenly over the area; each exit from the solid gives a pair."""
     corners = obj.vertices[obj.faces]
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(cross, axis=1)
@@ -111,8 +110,8 @@ def _pairs(obj: ObjectModel) -> Pairs:
 
 
 def _exits(start: Floats, way: Floats, corners: Floats, normal: Floats) -> tuple[NDArray[np.intp], Floats]:
-    """Rays (n, 3) and (n, 3) against triangles (F, 3, 3): which ray, and how far along it [m], where it leaves through
-    a face that looks along it (Moeller and Trumbore 1997)."""
+    """Intersect rays (n, 3), (n, 3) with triangles (F, 3, 3); return ray index and distance [m] of exits.
+    An exit is at a face whose normal points along the ray (Moeller and Trumbore 1997)."""
     edge1, edge2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     p = np.cross(way[:, None], edge2[None])
     determinant = np.einsum("nfj,fj->nf", p, edge1)

@@ -1,5 +1,5 @@
-"""Networks of this process by a digest: an option of a method names one without naming a file. A file's digest is its
-own, that of the service is of the asset."""
+"""Networks of this process by digest, so that a method's option names a network without a file.
+A file has its own digest; a network of the service has the digest of its asset."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ _lock: Final = threading.Lock()
 
 
 def keep_file(path: Path) -> str:
-    """Read a network's file and keep it; its digest.
+    """Load a network's file, cache it and return its digest.
 
     Raises:
-        InputError: no network.
+        InputError: the file is no network.
     """
     data = read_file(path)
     digest = digest_bytes(data)
@@ -30,16 +30,16 @@ def keep_file(path: Path) -> str:
 
 
 def keep(digest: str, network: ProposalNetwork) -> None:
-    """Know a network by a digest from now on; of many the last ones used are."""
+    """Cache a network under a digest; the most recently used ones stay."""
     with _lock:
         _known[digest] = network
 
 
 def kept(digest: str) -> ProposalNetwork:
-    """The network of a digest.
+    """Return the network of a digest.
 
     Raises:
-        InputError: none is kept under it.
+        InputError: none is cached under it.
     """
     with _lock:
         found = _known.get(digest)

@@ -1,4 +1,4 @@
-"""What a grasp planner is: the one interface that `fast_graspd`, its peers and planners of third parties fill."""
+"""Interface of a grasp planner, implemented by `fast_graspd`, its peers and planners of third parties."""
 
 from __future__ import annotations
 
@@ -19,20 +19,19 @@ from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.simulation.environment import PlacedGrasps
 
-#: Scores (N,) of N grasps, in their scenes or around a free object (None): the smaller the better, below 1 good enough
-#: to look at no other candidate, from 2 on so bad that others are worth their time. The third argument has the score of
-#: what each would replace, inf where there is nothing: a trial may end as soon as it is not better by a class (0, 1).
-#: Called by several threads at once.
+#: Scores (N,) of N grasps, in their scenes or around a free object (None). Smaller is better: below 1 no further
+#: candidate is needed, from 2 on further ones pay. The third argument has the score to beat for each, inf if there is
+#: none: a rollout may end once it is not better by a class (0, 1). Called by several threads at once.
 Rollout = Callable[[GraspSet, PlacedGrasps | None, NDArray[np.float64]], NDArray[np.float64]]
 
 
 class NoStartFound(InputError):
-    """No grasp of a batch finds where to start in its scenes."""
+    """No grasp of a batch finds a start in its scenes."""
 
 
 @dataclass(frozen=True)
 class PlanRequest:
-    """Which grasps of a hand on an object."""
+    """Request for grasps of a hand on an object."""
 
     count: int
     fidelity: Fidelity
@@ -40,27 +39,27 @@ class PlanRequest:
     batch: int = 0
     """Number of the batch among those of one seed."""
     placed: PlacedGrasps | None = None
-    """Their scenes: grasp i in scene `placed.index[i]`; None: around a free object."""
+    """Scenes: grasp i is in scene `placed.index[i]`; None: around a free object."""
     rollout: Rollout | None = None
-    """What several candidates of a grasp go through before one is chosen; None: the planner's own merit chooses."""
+    """Rollout that chooses among the candidates of a grasp; None: the planner's own merit chooses."""
     first: int = 0
-    """Number of the first grasp within its batch; above 0 for methods that make batches `in_parts` only."""
+    """Number of the first grasp within its batch; above 0 only for methods that plan batches `in_parts`."""
     others_have_place: bool = False
-    """Whether grasps of the batch that are made elsewhere find where to start in their scenes: then these are made even
-    if none of them does, and end blocked."""
+    """Whether grasps of the batch that are planned elsewhere have starts in their scenes.
+    These grasps are then planned even if none has a start, and end blocked."""
 
 
 class Planner(Protocol):
-    """Makes `wanted.count` grasps of a hand on an object.
+    """Plans `wanted.count` grasps of a hand on an object.
 
-    The same seed, batch and index of a grasp within its batch give the same grasp, whatever the other grasps are; on
-    the CPU bit for bit. `run.progress(done, total, message)` may be called often; `run.cancelled()` is polled between
-    launches. `wanted.placed` is None but for methods that plan `in_scenes`.
+    A grasp depends on seed, batch and index within the batch only, not on the other grasps; on the CPU bit for bit.
+    `run.progress(done, total, message)` may be called often; `run.cancelled()` is polled between launches.
+    `wanted.placed` is None except for methods that plan `in_scenes`.
 
     Raises:
-        TaskCancelled: when `run.cancelled()` answers True.
-        InputError: when the pair cannot be grasped at all, with the reason.
-        NoPlace: in scenes, when nowhere is a place to start, though `wanted.others_have_place` is not told.
+        TaskCancelled: `run.cancelled()` returned True.
+        InputError: the pair cannot be grasped at all, with the reason.
+        NoStartFound: in scenes, no grasp has a start and `wanted.others_have_place` is false.
     """
 
     def __call__(self, hand: HandModel, obj: ObjectModel, wanted: PlanRequest, run: ExecutionContext) -> GraspSet: ...
@@ -68,18 +67,18 @@ class Planner(Protocol):
 
 @dataclass(frozen=True)
 class BatchRequest:
-    """One of several batches that are asked for at once."""
+    """One of several batches requested at once."""
 
     wanted: PlanRequest
     run: ExecutionContext
 
 
 class BatchPlanner(Protocol):
-    """Makes several batches of a hand on an object in one launch: of one fidelity, on one device, all around a free
-    object or all in scenes with the same supports and neighbours (`Placed.fixed`).
+    """Plans several batches of a hand on an object in one launch, of one fidelity and on one device.
+    All are around a free object, or all in scenes with the same supports and neighbours (`PlacedGrasps.fixed`).
 
-    Each is as the `Planner` makes it alone; on the CPU bit for bit. What is the matter with one batch is given in its
-    place, a TaskCancelled where its own `run.cancelled()` answers True; the others go on.
+    Each batch equals the result of the `Planner` alone; on the CPU bit for bit. A batch that fails is replaced by its
+    error, TaskCancelled if its own `run.cancelled()` returned True; the others continue.
     """
 
     def __call__(
@@ -88,40 +87,40 @@ class BatchPlanner(Protocol):
 
 
 class Options(BaseModel):
-    """Base of a method's own options: those that the fidelity, which all methods share, does not have."""
+    """Base of a method's own options, in addition to the fidelity that all methods share."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
 @dataclass(frozen=True)
 class Method:
-    """A planner with what people should know of it."""
+    """A planner and its description."""
 
     summary: str
     """One line for lists."""
     source: str
-    """Where the method is published."""
+    """Publication of the method."""
     planner: Callable[[Any], Planner]
-    """From the options to the planner."""
+    """Factory of the planner from the options."""
     in_scenes: bool = False
-    """Whether it plans grasps for the scenes they are in, or around free objects only."""
+    """Whether it plans grasps in scenes, not only around free objects."""
     free: bool = True
     """Whether it plans around free objects."""
     in_parts: bool = False
-    """Whether it makes the grasps of a batch from `Wanted.first` on without those before it."""
+    """Whether it plans the grasps of a batch from `PlanRequest.first` on without those before it."""
     options: type[Options] = Options
-    """The options it takes."""
+    """Class of its options."""
     uses: tuple[str, ...] = ()
-    """Knobs of `Fidelity` that move its grasps; the others are ignored."""
+    """Settings of `Fidelity` that affect its grasps; the others are ignored."""
     joined: Callable[[Any], BatchPlanner] | None = None
-    """From the options to what makes several batches in one launch; None: it makes them one after the other."""
+    """Factory of the planner of several batches in one launch; None: it plans them one by one."""
     files: Mapping[str, Callable[[Path], str]] = field(default_factory=dict)
-    """Options that are files to who has them: each with what keeps such a file in this process and gives its digest,
-    which is the option's value."""
+    """Options that users give as files, each with a function that caches the file in this process.
+    The function returns the file's digest, the option's value."""
     quick: Mapping[str, Any] = field(default_factory=dict)
-    """Options with which a call is short: to warm up, and to try things out. Its grasps need not be good."""
+    """Options for a short call, for warm-up and quick checks; its grasps need not be good."""
 
     @property
     def has_fidelities(self) -> bool:
-        """Whether a fidelity changes more than how closely the object's mesh is followed."""
+        """Whether the fidelity changes more than the accuracy of the object's mesh."""
         return bool(set(self.uses) - {"face_error_m"})

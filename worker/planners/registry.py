@@ -1,4 +1,4 @@
-"""The methods graspd knows: its own, and those that installed packages offer as `graspd.planners` entry points."""
+"""Registered methods: graspd's own, and `graspd.planners` entry points of installed packages."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ PLANNERS: Final[dict[str, tuple[str, str]]] = {
 
 
 def method_names() -> list[str]:
-    """All known methods: graspd's own, then those of other packages."""
+    """Return all methods: graspd's own, then those of other packages."""
     return [*PLANNERS, *sorted(set(_offered()) - set(PLANNERS))]
 
 
 def method(name: str) -> Method:
-    """The method of a name. graspd's own names cannot be taken by another package.
+    """Return the method of a name; other packages cannot replace graspd's own names.
 
     Raises:
         InputError: unknown method, or a package's entry point that cannot be loaded or is no `Method`.
@@ -60,10 +60,10 @@ def method(name: str) -> Method:
 
 
 def planner(name: str, options: Mapping[str, Any] | None = None, *, in_scenes: bool = False) -> Planner:
-    """The planner of a method with its options; texts are read as the option's type.
+    """Return the planner of a method with its options; strings are parsed as the option's type.
 
     Raises:
-        InputError: unknown method, unknown option, a value out of its range; or it is to plan in scenes and cannot.
+        InputError: unknown method, unknown option or value out of range; or it cannot plan in scenes as requested.
     """
     known = method(name)
     if in_scenes and not known.in_scenes:
@@ -75,7 +75,7 @@ def planner(name: str, options: Mapping[str, Any] | None = None, *, in_scenes: b
 
 
 def joined(name: str, options: Mapping[str, Any] | None = None) -> BatchPlanner | None:
-    """What makes several batches of a method in one launch; None: the method makes them one after the other."""
+    """Return a method's planner of several batches in one launch; None: it plans them one by one."""
     make = method(name).joined
     return make(_options(name, options)) if make is not None else None
 
@@ -90,7 +90,7 @@ def _options(name: str, options: Mapping[str, Any] | None) -> Options:
 
 
 def of_this_machine(name: str, options: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Options as a user of this machine gives them, with digests in the place of files, which this process keeps.
+    """Replace files in a local user's options by digests and cache the files in this process.
 
     Raises:
         InputError: unknown method, or a file that cannot be used.
@@ -100,7 +100,7 @@ def of_this_machine(name: str, options: Mapping[str, Any] | None) -> dict[str, A
 
 
 def entry_points(group: str) -> EntryPoints:
-    """Entry points of the packages that are installed; the library that finds them is loaded for it."""
+    """Return entry points of installed packages; imports the library that finds them."""
     from importlib.metadata import entry_points as found
 
     return found(group=group)

@@ -1,7 +1,7 @@
-"""A batch of grasps cut into parts, one per CPU thread: Warp releases the interpreter lock while a kernel runs.
+"""Parts of a batch, one per CPU thread: Warp releases the interpreter lock while a kernel runs.
 
-Warp's CPU backend runs a launch on the thread that asks for it, so threads use all cores. On a GPU a batch is one part,
-and is halved where its memory does not suffice. A grasp's result does not depend on the part it is in.
+Warp's CPU backend runs a launch on the calling thread, so threads use all cores. On a GPU a batch is one part, halved
+while memory does not suffice. A grasp's result does not depend on its part.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ T = TypeVar("T")
 
 
 class StepCounter:
-    """Counts work done by all threads; looks at cancellation."""
+    """Counter of the work of all threads; checks for cancellation."""
 
     def __init__(self, total: float, run: ExecutionContext) -> None:
         self._total, self._run = total, run
@@ -33,21 +33,21 @@ class StepCounter:
         self._lock = threading.Lock()
 
     def __call__(self, work: float, message: str) -> None:
-        """Add done work; raises TaskCancelled."""
+        """Add finished work; raise TaskCancelled on cancellation."""
         self._run.check("the synthesis")
         with self._lock:
             self._done += work
-            # What is done again in halves counts twice.
+            # Work that is repeated in halves counts twice.
             self._run.progress(min(self._done, self._total), self._total, message)
 
 
 def cut(count: int, run: ExecutionContext, *, least: int = 1) -> list[range]:
-    """Contiguous, nearly equal parts of a batch: one on a GPU, at most one per thread on a CPU.
+    """Cut a batch into contiguous, nearly equal parts: one on a GPU, at most one per thread on a CPU.
 
     Args:
         count: grasps.
         run: its device and threads.
-        least: fewest grasps worth a thread of their own.
+        least: fewest grasps for which a thread pays.
     """
     if wp.get_device(run.device).is_cuda:
         return [range(count)]
@@ -57,10 +57,10 @@ def cut(count: int, run: ExecutionContext, *, least: int = 1) -> list[range]:
 
 
 def run_parts(parts: list[range], work: Callable[[range], T]) -> list[T]:
-    """`work` of every part, each in a thread of its own, in order.
+    """Run `work` on every part, each in its own thread, in order.
 
-    A part for which a GPU has too little memory becomes two, one after the other, and so on down to single grasps: then
-    there are more results than parts.
+    A part that exceeds a GPU's memory is split in two, one after the other, down to single grasps: there may be more
+    results than parts.
     """
     if len(parts) == 1:
         return _fitted(parts[0], work)
@@ -69,7 +69,7 @@ def run_parts(parts: list[range], work: Callable[[range], T]) -> list[T]:
 
 
 def _fitted(part: range, work: Callable[[range], T]) -> list[T]:
-    """The work of a part, in as many launches as the memory of its GPU needs."""
+    """Run the work of a part, in as many launches as its GPU's memory requires."""
     try:
         return [work(part)]
     except RuntimeError as error:
@@ -80,7 +80,7 @@ def _fitted(part: range, work: Callable[[range], T]) -> list[T]:
             len(part),
             error,
         )
-    # The error is gone by here, and with it the frames that held what was allocated already.
+    # The error is freed by now, with the frames that held earlier allocations.
     gc.collect()
     middle = part.start + len(part) // 2
     return [*_fitted(range(part.start, middle), work), *_fitted(range(middle, part.stop), work)]

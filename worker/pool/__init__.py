@@ -1,1 +1,1 @@
-"""Processes beside this one, for work that threads of one process cannot share out to many cores."""
+"""Pool of processes, for work that threads of one process cannot distribute over many cores."""

@@ -1,7 +1,7 @@
-"""A process of a `worker.pool.pool.Pool`: `python -m graspd.worker.pool.child [MODULE ...] FD`.
+"""Process of a `worker.pool.pool.Pool`: `python -m graspd.worker.pool.child [MODULE ...] FD`.
 
-It takes work from the socket with that file descriptor until the other side is gone. What several pieces of work share
-is kept by its key; the pool tells which of it to forget. The modules are imported before the first piece comes.
+It takes work from the socket with that file descriptor until the peer closes it. Data shared by several work items are
+cached by key; the pool names the keys to evict. The modules are imported before the first item.
 """
 
 from __future__ import annotations
@@ -23,20 +23,20 @@ from graspd.service.model.libraries import imports, own_process
 
 @dataclass(frozen=True)
 class WorkItem:
-    """A piece of work: `work(shared, part)`."""
+    """Work item: `work(shared, part)`."""
 
     work: Callable[[Any, Any], Any]
     key: str
-    """Of what is shared with other pieces."""
+    """Key of the data shared with other items."""
     shared: bytes | None
-    """It, pickled; None: it was sent before."""
+    """Pickled shared data; None: sent before."""
     forget: tuple[str, ...]
-    """Keys that are not needed any more."""
+    """Keys to evict."""
     part: Any
 
 
 def serve(connection: Connection, modules: Sequence[str]) -> None:
-    """Do what is asked for, one piece after the other, once the modules are imported."""
+    """Process requests one by one, once the modules are imported."""
     orders: queue.SimpleQueue[bytes] = queue.SimpleQueue()
 
     def read() -> None:
@@ -44,9 +44,9 @@ def serve(connection: Connection, modules: Sequence[str]) -> None:
             while True:
                 orders.put(connection.recv_bytes())
         except (EOFError, OSError):
-            os._exit(0)  # nobody waits for what is being done
+            os._exit(0)  # no caller waits for the current item
 
-    # Imports and work may take seconds: whether somebody still wants them is told by a thread of its own.
+    # Imports and work may take seconds: a separate thread detects that the peer is gone.
     threading.Thread(target=read, daemon=True).start()
     own_process()
     with imports():
@@ -62,7 +62,7 @@ def serve(connection: Connection, modules: Sequence[str]) -> None:
 
 
 def _answer(order: bytes, kept: dict[str, Any]) -> bytes:
-    """Pickled: whether it was done, and the result or the error."""
+    """Return pickled success and the result or error."""
     try:
         wanted: WorkItem = pickle.loads(order)
         for key in wanted.forget:
@@ -75,7 +75,7 @@ def _answer(order: bytes, kept: dict[str, Any]) -> bytes:
 
 
 def _portable(error: Exception) -> Exception:
-    """The error as the other side can read it, with where it came up."""
+    """Return the error in a form that the peer can unpickle, with its traceback."""
     error.add_note("in a process beside: " + "".join(traceback.format_tb(error.__traceback__)))
     try:
         pickle.loads(pickle.dumps(error))
@@ -85,5 +85,5 @@ def _portable(error: Exception) -> Exception:
 
 
 if __name__ == "__main__":
-    # By its full name: what is pickled names its module, and `__main__` is another one.
+    # By its full name: pickles name their module, and `__main__` is another one.
     import_module("graspd.worker.pool.child").serve(Connection(int(sys.argv[-1])), sys.argv[1:-1])

@@ -1,9 +1,9 @@
-"""Work for several processes of this machine, each with a core of its own; see `worker.pool.child` for the other side.
+"""Pool of processes on this machine, one core each; `worker.pool.child` is their side.
 
-Threads share Python's lock: what holds it for a tenth of its time does not fill 16 cores. Processes are fresh ones and
-not forks: a CUDA context and the threads of an engine outlive no fork. They end with the process that started them,
-however it ends, for their pipe closes with it. The library's `ProcessPoolExecutor` would import the program of whoever
-calls `graspd.synthesize` once more in each of them.
+Threads share Python's lock: work that holds it for a tenth of its time does not fill 16 cores. Processes are started
+fresh, since a CUDA context and the threads of an engine do not survive a fork. They end with their parent, however it
+ends, because their pipe closes. The library's `ProcessPoolExecutor` would import the program that calls
+`graspd.synthesize` once more in each of them.
 """
 
 from __future__ import annotations
@@ -30,34 +30,34 @@ from graspd.service.model.errors import GraspdError, TaskCancelled
 from graspd.worker.pool.child import WorkItem
 
 log = logging.getLogger(__name__)
-#: Modules whose work the processes do for a worker; named and not imported: a worker is there before its engine is.
+#: Modules for the work of a worker; not imported here, so that a worker starts before its engine.
 MODULES: Final = ("graspd.worker.validation.validator", "graspd.worker.quality.table")
-#: What each process keeps of things that pieces of work share: two for a pair that is validated and measured.
+#: Number of shared data cached per process: two for a pair that is validated and measured.
 KEPT: Final = 8
-#: Pause between two looks at whether to stop [s].
+#: Interval of checks for a stop [s].
 _LOOK_S: Final = 0.1
-#: A process that goes on for so long with what nobody wants any more is ended [s].
+#: Time after which a process that still works on an abandoned item is ended [s].
 _PATIENCE_S: Final = 20.0
-#: No process takes memory of a GPU: what it does is for the CPU.
+#: Processes compute on the CPU and take no GPU memory.
 _NO_GPU: Final = {"CUDA_VISIBLE_DEVICES": ""}
 
 
 class ProcessLost(GraspdError):
-    """A process of a pool ended in the middle of its work; a fresh one has taken its place."""
+    """A process of the pool ended during an item; a fresh one has replaced it."""
 
     slug, title = "process-lost", "A process beside the worker ended in the middle of its work"
 
 
 @dataclass(eq=False)
 class _Request:
-    """What one caller waits for."""
+    """Request of one caller."""
 
     work: Callable[[Any, Any], Any]
     key: str
     shared: Any
     done: Callable[[int], None]
     dropped_at: float | None = None
-    """When nobody waited for it any more."""
+    """Time at which the last caller stopped waiting."""
 
     @cached_property
     def pickled(self) -> bytes:
@@ -65,10 +65,10 @@ class _Request:
 
 
 class Pool(AbstractContextManager["Pool"]):
-    """So many processes, started when they are first needed. Any thread may ask for work; a context manager."""
+    """Processes started at first use. Thread-safe; a context manager."""
 
     def __init__(self, processes: int, modules: Sequence[str] = ()) -> None:
-        """`modules` are imported by each process while it waits for its first piece of work."""
+        """`modules` are imported by each process before its first item."""
         self.processes = processes
         self._places = [_Place(modules) for _ in range(processes)]
         self._idle: queue.SimpleQueue[_Place] = queue.SimpleQueue()
@@ -81,14 +81,14 @@ class Pool(AbstractContextManager["Pool"]):
 
     @property
     def pids(self) -> list[int]:
-        """Of the processes that run."""
+        """Return the ids of running processes."""
         return [place.process.pid for place in self._places if place.process is not None]
 
     def start(self) -> None:
-        """Start the processes, if that was not done."""
+        """Start the processes if they are not running."""
         with self._changing:
             for place in self._places if not (self._started or self._closed) else ():
-                with suppress(OSError):  # it is told to whoever needs the process
+                with suppress(OSError):  # reported on use of the process
                     place.start()
                 self._idle.put(place)
             self._started = True
@@ -103,20 +103,20 @@ class Pool(AbstractContextManager["Pool"]):
         cancelled: Callable[[], bool] = lambda: False,
         done: Callable[[int], None] = lambda number: None,
     ) -> list[Any]:
-        """The results of `work(shared, part)` for all parts, in their order.
+        """Compute `work(shared, part)` for all parts, in their order.
 
         Args:
-            work: a function that a process can import, without effects but its result.
-            key: the same for what is the same as `shared`, so that a process gets it once.
-            shared: what all parts need; it is pickled.
-            parts: each is done by one process; the first of those who ask are served first.
-            cancelled: asked often. True: nothing more is done.
-            done: told the number of each part that is done, by another thread.
+            work: an importable function without side effects.
+            key: identifies `shared`, so that each process receives it once.
+            shared: data for all parts; pickled.
+            parts: each is processed by one process; callers are served in order.
+            cancelled: polled often; True: stop.
+            done: receives the number of each finished part, in another thread.
 
         Raises:
-            ProcessLost: a process ended over a part.
-            TaskCancelled: `cancelled` answered True, or the pool was closed.
-            Exception: what a part raised; the others are given up.
+            ProcessLost: a process ended during a part.
+            TaskCancelled: `cancelled` returned True, or the pool was closed.
+            Exception: error of a part; the other parts are abandoned.
         """
         self.start()
         request = _Request(work, key, shared, done)
@@ -139,7 +139,7 @@ class Pool(AbstractContextManager["Pool"]):
                 future.cancel()
 
     def close(self) -> None:
-        """End all processes; who waits for work is told that it was cancelled."""
+        """End all processes; waiting callers get TaskCancelled."""
         with self._changing:
             self._closed = True
         self._threads.shutdown(wait=False, cancel_futures=True)
@@ -160,7 +160,7 @@ class Pool(AbstractContextManager["Pool"]):
 
 
 class _Place:
-    """Of one process at a time, and of what it keeps. `end` may be called by another thread."""
+    """One process at a time, and the keys in its cache. `end` may be called by another thread."""
 
     def __init__(self, modules: Sequence[str]) -> None:
         self._modules = tuple(modules)
@@ -169,7 +169,7 @@ class _Place:
         self._kept: OrderedDict[str, None] = OrderedDict()
 
     def start(self) -> None:
-        """A fresh process. Raises OSError."""
+        """Start a fresh process. Raises OSError."""
         self._kept.clear()
         self._connection, self.process = start_child(
             [sys.executable, "-m", "graspd.worker.pool.child", *self._modules],
@@ -178,7 +178,7 @@ class _Place:
         )
 
     def do(self, request: _Request, part: Any) -> Any:
-        """The result of a piece of work; raises ProcessLost, or what the work raised."""
+        """Return the result of an item; raise ProcessLost, or the error of the item."""
         try:
             if self._is_gone():
                 self._stop()
@@ -200,8 +200,8 @@ class _Place:
         return made
 
     def _is_gone(self) -> bool:
-        """Whether there is no process, or it ended while it waited: one that waits sends nothing but the end of its
-        connection, which is there before the system tells that it ended."""
+        """Check whether there is no process, or it ended while idle.
+        An idle process sends only the end of its connection, which arrives before the system reports its exit."""
         if self.process is None or self._connection is None or self.process.poll() is not None:
             return True
         return self._connection.poll()
@@ -216,20 +216,20 @@ class _Place:
         return WorkItem(request.work, request.key, None if known else request.pickled, tuple(forget), part)
 
     def _stop(self) -> str:
-        """End the process if it runs; how it ended."""
+        """End the process if it runs; return how it ended."""
         process, self.process = self.process, None
         if self._connection is not None:
             self._connection.close()
         return "it could not be started" if process is None else end_child(process, _LOOK_S)
 
     def end(self) -> None:
-        """Kill the process, if there is one: it holds nothing that could be lost."""
+        """Kill the process, if there is one: it has no state to save."""
         if (process := self.process) is not None:
             end_child(process, 0.0)
 
 
 def start_child(command: Sequence[str], **options: Any) -> tuple[Connection, subprocess.Popen[bytes]]:
-    """A fresh process and a pipe to it, whose other end is the last argument of its command line. Raises OSError."""
+    """Start a process with a pipe, whose other end is the last command-line argument. Raises OSError."""
     ours, theirs = Pipe()
     with theirs:
         process = subprocess.Popen(
@@ -243,7 +243,7 @@ def start_child(command: Sequence[str], **options: Any) -> tuple[Connection, sub
 
 
 def end_child(process: subprocess.Popen[bytes], patience_s: float) -> str:
-    """How a process ended; one that has not after so long is killed [s]."""
+    """Wait for a process, kill it after `patience_s` [s], and return how it ended."""
     with suppress(subprocess.TimeoutExpired):
         process.wait(patience_s)
     process.kill()

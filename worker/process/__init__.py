@@ -1,1 +1,1 @@
-"""One worker: takes tasks, renews leases, ends as it should."""
+"""Worker process: takes tasks, renews leases, shuts down."""

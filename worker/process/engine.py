@@ -1,9 +1,9 @@
-"""A worker's engine: the process that owns the device and does tasks, one after the other.
+"""Engine of a worker: the process that owns the device and runs tasks one by one.
 
-Its worker (`worker.process.main`) sends pairs of a word and what it is about over a pipe, after the `Setup`. Orders are
-`service` (does the store belong to it?), `check` (answer: `ready`), `task` (`done`, then `idle`), `end`; an error may
-come as `refused` in place of an answer. `stop` with a reason is heard at any time. On its own the engine sends `facts`
-for the list of workers (how far a task is, too) and `event`. It knows nothing of Redis.
+Its worker (`worker.process.main`) sends pairs of a word and its argument over a pipe, after the `Setup`. Orders are
+`service` (does the store belong to it?), `check` (answer: `ready`), `task` (`done`, then `idle`), `end`; the answer may
+be an error, `refused`. `stop` with a reason is accepted at any time. The engine also sends `facts` for the list of
+workers (including progress) and `event`. It does not access Redis.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ log = logging.getLogger(__name__)
 
 
 class Engine:
-    """Does what its worker tells it."""
+    """Executes the orders of its worker."""
 
     def __init__(
         self,
@@ -57,7 +57,7 @@ class Engine:
         table: Mapping[Stage, StageFunction] | None = None,
         check: Check | None = None,
     ) -> None:
-        """`table` is what each stage does, and `check` tries what they run on: the real ones by default."""
+        """`table`: function of each stage; `check`: test of their engines; the real ones by default."""
         self._connection, self._setup = connection, setup
         self._table, self._check = table, check
         self._speaking = threading.Lock()
@@ -67,7 +67,7 @@ class Engine:
         self._context: TaskContext | None = None
 
     def serve(self) -> None:
-        """Until told to end."""
+        """Process orders until `end`."""
         with self._connection:
             threading.Thread(target=self._listen, name="engine-orders", daemon=True).start()
             try:
@@ -90,7 +90,7 @@ class Engine:
             self._do(about)
 
     def update(self, **facts: str | float) -> None:
-        """Facts for the list of workers."""
+        """Send facts for the list of workers."""
         self._say("facts", facts)
 
     def _start(self) -> None:
@@ -109,8 +109,8 @@ class Engine:
         device.find_out(lambda: self.update(device=device.resolve(), device_name=device.name))
 
     def _admitted(self) -> bool:
-        """Check what tasks run on before the first of them; one that is patient waits in quarantine until it passes."""
-        # The dearest part of the engine; what the other stages add is loaded by their first task, and checked in doubt.
+        """Check the engine before the first task; a patient one waits in quarantine until it passes."""
+        # The most expensive part only: other stages load with their first task, and are checked after failures.
         stages = self._setup.stages
         first = (Stage.SYNTHESIZE,) if Stage.SYNTHESIZE in stages else stages
         fit = self._fitness.try_engine(first) or (self._setup.patient and self._sit_out(first))
@@ -137,7 +137,7 @@ class Engine:
         self._say("idle", self._look_after_itself())
 
     def _look_after_itself(self) -> Condition:
-        """Between two tasks: is it fit, and is it time to end?"""
+        """Check between two tasks whether the engine is fit, and whether it should end."""
         if self._runner.device_lost:
             log.error("this worker ends: %s", self._runner.device_lost)
             return "unfit"
@@ -153,7 +153,7 @@ class Engine:
             try:
                 word, about = self._connection.recv()
             except (EOFError, OSError):
-                word, about = "end", StopReason.LEASE_LOST  # nobody waits for what is being done
+                word, about = "end", StopReason.LEASE_LOST  # no caller waits for the current task
             with self._changing:
                 if word in ("stop", "end"):
                     self._reason = about
@@ -172,7 +172,7 @@ class Engine:
 
 
 class TaskResources:
-    """What a task gets besides its message. Engines and drivers leak: a worker that grew makes room for a new one."""
+    """Resources of a task besides its message; a worker that grew too large, by leaks, is replaced."""
 
     def __init__(self, settings: Settings, store: Store, device: Device) -> None:
         self.settings = settings
@@ -181,7 +181,7 @@ class TaskResources:
         self._memory_mb = settings.worker_max_memory_mb or available_memory() / 2 / 2**20
 
     def outgrown(self) -> str:
-        """Why this process should make room for a fresh one, "" if it need not."""
+        """Return the reason to replace this process by a fresh one, "" if there is none."""
         beside = sum(resident_mb(pid) for pid in pool.pids) if (pool := vars(self).get("_pool")) is not None else 0.0
         if (held := resident_mb() + beside) > self._memory_mb:
             return f"it holds {held:.0f} MiB, over {self._memory_mb:.0f} (GRASPD_WORKER_MAX_MEMORY_MB)"
@@ -189,13 +189,12 @@ class TaskResources:
 
     @cached_property
     def _join(self) -> int:
-        """Batches that one launch plans on the device; waits until that is known."""
+        """Return the batches per launch on the device; waits until it is resolved."""
         join = self.settings.join
         return batches_at_once(self._device.resolve(), None if join == "auto" else int(join))
 
     def pool(self, stage: str) -> Pool | None:
-        """The processes that validate and measure, if a task of this stage has work for them; waits until it is known
-        how many they are."""
+        """Return the pool that validates and measures, if this stage uses one; waits for its size."""
         if stage != Stage.SYNTHESIZE:
             return None
         if self._pool is not None:
@@ -209,12 +208,12 @@ class TaskResources:
         return Pool(count, MODULES) if count > 1 else None
 
     def close(self) -> None:
-        """End what was started for tasks."""
+        """End all resources started for tasks."""
         if (pool := vars(self).get("_pool")) is not None:
             pool.close()
 
     def context(self, raw: Mapping[str, Any], update: Callable[..., None]) -> TaskContext:
-        """The context of a task, whose progress goes to `update`."""
+        """Return the context of a task; `update` receives its progress."""
 
         def tell(done: float, total: float, message: str) -> None:
             update(done=done, total=total, message=message[:200])
@@ -226,8 +225,8 @@ class TaskResources:
 
 
 def resident_mb(pid: int | None = None) -> float:
-    """Resident memory of this process, or of another [MiB]; where the system does not tell, the most this one ever
-    had, or nothing of another."""
+    """Return the resident memory of this process or another [MiB].
+    If the system does not report it: this process's peak, or 0 for another process."""
     try:
         pages = int(Path(f"/proc/{pid or 'self'}/statm").read_text().split()[1])
     except (OSError, ValueError, IndexError):
@@ -239,7 +238,7 @@ def resident_mb(pid: int | None = None) -> float:
 
 
 def main(table: Mapping[Stage, StageFunction] | None = None, check: Check | None = None) -> None:
-    """The process. Signals to end are the worker's: this one ends with it."""
+    """Run the process. Signals to end are handled by the worker: this process ends with it."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     own_process()
@@ -252,7 +251,7 @@ def main(table: Mapping[Stage, StageFunction] | None = None, check: Check | None
 
 
 def end() -> None:
-    """At once: taking Warp and its kernels apart takes the interpreter seconds, and nothing is left to be saved."""
+    """Exit at once: finalising Warp and its kernels takes seconds, and nothing is left to save."""
     atexit._run_exitfuncs()
     sys.stderr.flush()
     os._exit(0)

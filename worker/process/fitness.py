@@ -1,13 +1,13 @@
-"""Is this worker fit for tasks? One that is not must not use up their attempts: it hands them back and steps aside.
+"""Fitness of a worker: an unfit one returns tasks, to save their attempts, and goes into quarantine.
 
 A worker is unfit if
 
-- its engine does not pass the check, before the first task or after a task failed for another reason than its input; or
-- tasks fail here in a row, each of them another one, and two of them were meanwhile done by other workers.
+- its engine fails the check, before the first task or after a task failed for another reason than its input; or
+- several different tasks fail here in a row, and two of them were meanwhile done by other workers.
 
-It is then in quarantine: listed with the reason, without tasks. It checks itself again after longer and longer pauses,
-and comes back when it passes. If it does not, or if the check cannot see what is wrong, its process ends, for a fresh
-one to start and check itself.
+In quarantine it is listed with the reason and gets no tasks. It repeats its check after increasing pauses and resumes
+when it passes. If it does not, or if the check cannot find the fault, its process ends, and a fresh one starts with a
+check.
 """
 
 from __future__ import annotations
@@ -32,19 +32,18 @@ log = logging.getLogger(__name__)
 Check = Callable[[Collection[Stage]], None]
 #: Pauses before the checks of a worker in quarantine [s].
 PAUSES_S: Final = (2.0, 5.0, 10.0, 20.0)
-#: So many tasks that failed here and were done elsewhere are no accident.
+#: This many tasks that failed here and succeeded elsewhere make a worker unfit.
 _DONE_ELSEWHERE: Final = 2
 _REMEMBERED: Final = 16
 _LOSSES_BYTES: Final = 2**16
 _LOOK_S: Final = 0.1
-#: Errors that say nothing about the worker: the input is bad, or a record in the store.
+#: Errors not due to the worker: invalid input, or a damaged record in the store.
 _OF_THE_TASK: Final = (InputError, TaskRefused, DamagedError)
 
 
 def first_loss(task: str) -> bool:
-    """Whether no GPU of this machine, nor a process beside a worker, was lost over a task before. The first time
-    nothing says that it is the task's fault; one that takes each down must use up its attempts, or it would go round
-    for ever."""
+    """Check whether this is the first loss of a GPU or pool process over a task on this machine.
+    It does not count against the task; later ones do, or a task that causes each loss would loop forever."""
     file = user_cache.folder("gpus") / f"{hashlib.sha256(task.encode()).hexdigest()[:32]}.lost"
     if user_cache.load(file) is not None:
         return False
@@ -53,16 +52,16 @@ def first_loss(task: str) -> bool:
 
 
 class Fitness:
-    """What a worker knows about itself."""
+    """State of a worker's fitness."""
 
     def __init__(self, store: Store, check: Check | None = None) -> None:
-        """Without `check` only what other workers can do tells."""
+        """Without `check` only results of other workers decide."""
         self._store = store
         self._check = check
         self._failed: dict[str, tuple[Stage, str]] = {}
         self._can_pass = True
         self.reason = ""
-        """Why the worker is unfit; "" while it is not."""
+        """Reason why the worker is unfit; "" while it is fit."""
 
     def try_engine(self, stages: Collection[Stage]) -> bool:
         """Check the engine for these stages."""
@@ -77,11 +76,11 @@ class Fitness:
         return True
 
     def passed(self) -> None:
-        """A task succeeded here."""
+        """Record that a task succeeded here."""
         self._failed.clear()
 
     def doubt(self, message: Message, error: Exception) -> str:
-        """Why this worker, and not the task, is to blame for a failure; "" if it is not known to be."""
+        """Return why a failure is due to this worker and not the task; "" if that is unknown."""
         if isinstance(error, _OF_THE_TASK):
             return ""
         if self.try_engine((message.stage,)):
@@ -95,10 +94,10 @@ class Fitness:
         return self.reason
 
     def sit_out(self, stages: Collection[Stage], update: Callable[..., None], told_to_stop: Callable[[], bool]) -> bool:
-        """Quarantine; returns whether the worker is fit again. It ends early when the worker is told to stop.
+        """Wait in quarantine; return whether the worker is fit again. Ends early if the worker must stop.
 
         Args:
-            update: takes facts for the list of workers.
+            update: receives facts for the list of workers.
         """
         log.warning("this worker takes no tasks: %s", self.reason)
         for pause in PAUSES_S:
@@ -115,7 +114,7 @@ class Fitness:
         return False
 
     def _done_elsewhere(self, *, except_for: str) -> list[str]:
-        """Tasks that failed here and whose result is there now: nothing succeeded here since."""
+        """Return the tasks that failed here since the last success and whose result now exists."""
         try:
             return [
                 task

@@ -1,4 +1,4 @@
-"""A worker's registration: that it lives, and what it is at."""
+"""Registration of a worker: heartbeats with its state."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from graspd.service.queue.rq_queue import list_worker, unlist_worker
 from graspd.service.telemetry import HeartbeatFile
 
 log = logging.getLogger(__name__)
-#: Time between two signs of life, where three of them fit a lease [s]: a cancelled task must stop within two seconds,
-#: and the key that says so is read with each.
+#: Interval of heartbeats if three fit a lease [s]: a cancelled task must stop within two seconds, and each heartbeat
+#: reads the key of cancellations.
 BEAT_S: Final = 0.8
-#: News is not told more often than this [s].
+#: Least interval between two updates [s].
 _SHORTEST_INTERVAL_S: Final = 0.1
-#: Longest wait for an answer of Redis [s].
+#: Longest wait for a response of Redis [s].
 _ANSWER_S: Final = 3.0
 
 
 class Heartbeat:
-    """Beats from a thread of its own, on a connection of its own: both are free while the worker waits for others."""
+    """Sends heartbeats from its own thread and connection, both free while the worker waits for others."""
 
     def __init__(
         self,
@@ -43,10 +43,10 @@ class Heartbeat:
         """
         Args:
             url: of Redis.
-            beat: what the list of workers shows at first.
-            lease_s: how long the registration outlives a beat [s].
-            alive: a file that is touched with each beat.
-            is_stopped: whether the worker does not go on, though this thread does: then there is no beat.
+            beat: initial entry in the list of workers.
+            lease_s: lifetime of the registration after a heartbeat [s].
+            alive: a file that is touched with each heartbeat.
+            is_stopped: whether the worker hangs although this thread runs: then there is no heartbeat.
         """
         self._connection: Any = connect(url, patience=0, timeout_s=_ANSWER_S)
         self._facts, self._lease_s = asdict(beat), lease_s
@@ -54,19 +54,19 @@ class Heartbeat:
         self._changed, self._over = threading.Event(), threading.Event()
         self._away = False
         self.interval_s = min(BEAT_S, lease_s / 3)
-        """Time between two signs of life [s]."""
+        """Interval of heartbeats [s]."""
         self._thread = threading.Thread(target=self._run, name="heartbeat", daemon=True)
 
     def start(self) -> None:
         self._thread.start()
 
     def update(self, **facts: str | float) -> None:
-        """Facts that changed, such as the state, the name of the device, or how far the task is."""
+        """Update facts such as the state, the name of the device, or the progress of the task."""
         self._facts.update(facts)
         self._changed.set()
 
     def stop(self) -> None:
-        """End the registration, and say that this worker is not lost. Nothing is said of one that never began."""
+        """End the registration and record that this worker is not lost; no-op before the first heartbeat."""
         if self._thread.ident is None:
             return
         self._over.set()

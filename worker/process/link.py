@@ -1,4 +1,4 @@
-"""A worker's end of the pipe to its engine (`worker.process.engine`), and what goes through it."""
+"""Worker's end of the pipe to its engine (`worker.process.engine`), and the messages on it."""
 
 from __future__ import annotations
 
@@ -20,40 +20,40 @@ from graspd.worker.stages.context import StopReason
 if TYPE_CHECKING:
     from graspd.service.settings import Settings
 
-#: What an engine may take to end by itself [s].
+#: Time for an engine to end by itself [s].
 _END_S: Final = 3.0
 
 
 class EngineLost(Exception):
-    """The engine of a worker ended by itself."""
+    """The engine of a worker ended unexpectedly."""
 
 
 @dataclass(frozen=True)
 class Setup:
-    """What an engine needs to know before its first task."""
+    """Configuration of an engine, sent before its first task."""
 
     settings: Settings
     stages: tuple[Stage, ...]
     worker: str
-    """Name of the worker that it belongs to."""
+    """Name of its worker."""
     patient: bool
     """Whether to wait in quarantine until the first check passes."""
 
 
 class Link:
-    """The engine as its worker sees it. One thread speaks and listens."""
+    """Connection of a worker to its engine, used by one thread."""
 
     def __init__(self, connection: Connection, process: subprocess.Popen[bytes] | None = None) -> None:
-        """`process` is None where the engine is none of its own."""
+        """`process` is None if the engine has no process of its own."""
         self._connection, self._process = connection, process
 
     def say(self, word: str, about: Any = None) -> None:
-        """Tell the engine; one that is lost does not hear."""
+        """Send an order; a lost engine does not receive it."""
         with suppress(OSError):
             self._connection.send((word, about))
 
     def hear(self, wait_s: float) -> tuple[str, Any] | None:
-        """What the engine says; None if it says nothing for that long. Raises EngineLost."""
+        """Receive a message; None after a timeout. Raises EngineLost."""
         try:
             return self._connection.recv() if self._connection.poll(wait_s) else None
         except (EOFError, OSError):
@@ -61,16 +61,16 @@ class Link:
 
     @property
     def is_stopped(self) -> bool:
-        """Whether a signal stopped the engine, as SIGSTOP does: then nothing goes on, though it is there."""
+        """Check whether a signal such as SIGSTOP stopped the engine: it exists but makes no progress."""
         return self._process is not None and is_stopped(self._process.pid)
 
     def kill(self) -> None:
-        """End the engine at once."""
+        """Kill the engine at once."""
         if self._process is not None:
             self._process.kill()
 
     def close(self) -> None:
-        """End the engine: in good order if it does so soon."""
+        """End the engine, gracefully if it responds in time."""
         self.say("end", StopReason.SHUTDOWN)
         self._end()
         self._connection.close()
@@ -80,25 +80,25 @@ class Link:
 
 
 StartEngine = Callable[[Setup], Link]
-#: How an engine is after a task: fit for the next one, unfit, or so large that a fresh one should take its place.
+#: State of an engine after a task: fit for the next one, unfit, or too large and due for replacement.
 Condition = Literal["fit", "unfit", "outgrown"]
 
 
 def start_engine(setup: Setup, program: Sequence[str] = (sys.executable, "-m", "graspd.worker.process.engine")) -> Link:
-    """An engine in a fresh process, which ends with this one: a CUDA context and an engine's threads outlive no fork.
+    """Start an engine in a fresh process, which ends with this one; CUDA contexts do not survive a fork.
 
     Call it from the main thread: the kernel ties a child to the thread that starts it.
     """
     ours, process = start_child([sys.executable, "-m", "graspd.service.run.launch", str(os.getpid()), *program])
     link = Link(ours, process)
-    # The values alone: the library that reads settings takes 8 MiB of a process.
+    # The values only: the library that reads settings takes 8 MiB per process.
     values: Any = SimpleNamespace(**dict(setup.settings), resolved_store_url=setup.settings.resolved_store_url)
     ours.send(replace(setup, settings=values))
     return link
 
 
 def is_stopped(pid: int) -> bool:
-    """Whether a process was stopped by a signal, or ended."""
+    """Check whether a process was stopped by a signal, or ended."""
     if sys.platform == "linux":
         try:
             state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]

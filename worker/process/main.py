@@ -1,8 +1,8 @@
-"""The worker process: RQ's worker, which holds a task and keeps its lease while an engine beside it does it.
+"""Worker process: RQ's worker, which renews the lease of a task while a separate engine runs it.
 
-The engine (`worker.process.engine`) is a process of its own and lives as long as the worker: a CUDA context does not
-survive a fork, and a new process for each task would load kernels and meshes anew each time. This one shares no
-interpreter lock with it, so no kernel that compiles and no busy machine can starve the lease.
+The engine (`worker.process.engine`) is its own process and lives as long as the worker: a CUDA context does not survive
+a fork, and a new process for each task would load kernels and meshes every time. The worker shares no interpreter lock
+with it, so neither a kernel compilation nor a busy machine can starve the lease.
 """
 
 from __future__ import annotations
@@ -40,30 +40,30 @@ from graspd.worker.process.link import Condition, EngineLost, Link, Setup, Start
 from graspd.worker.stages.context import StopReason
 
 log = logging.getLogger(__name__)
-#: Reconnection attempts of a worker, about a minute's worth: longer than a Redis takes to come back.
+#: Reconnection attempts of a worker, for about a minute: longer than a restart of Redis.
 _PATIENCE: Final = 60
-#: RQ waits this long for a task before it looks after itself [s]: its `worker_ttl` less 15.
+#: Time that RQ waits for a task before its maintenance [s]: its `worker_ttl` less 15.
 _WORKER_TTL_S: Final = 20
 #: RQ's maintenance is off: see docs/adr/0003-silence-is-judged-by-one-clock.md.
 _NEVER_S: Final = 10**9
 _REFUSED_PAUSE_S: Final = 0.5
 #: Longest wait between two attempts to reach Redis [s].
 _LONGEST_RETRY_S: Final = 2.0
-#: How long it may take until a worker that is told to stop hears it [s].
+#: Longest delay until a worker notices a request to stop [s].
 _LOOK_S: Final = 0.1
-#: Time an engine has to notice that it must stop before it is ended [s].
+#: Time for an engine to stop by itself before it is ended [s].
 STUCK_AFTER_S: Final = 60.0
 
 
 class GraspWorker(SimpleWorker):  # type: ignore[misc]
-    """RQ's in-process worker, whose tasks an engine does. What of RQ it does without, and why, is in docs/adr."""
+    """RQ's in-process worker with tasks run by an engine; docs/adr explains the unused parts of RQ."""
 
     execution: Any
 
     def __init__(
         self, queue: RqQueue, engine: Link, heart: Heartbeat, *, stages: Collection[Stage], name: str, limit_s: float
     ) -> None:
-        """`limit_s` is how long a task may take [s]."""
+        """`limit_s` is the time limit of a task [s]."""
         super().__init__(
             queues=queue_names(stages, ability=own_ability()),
             name=name,
@@ -79,25 +79,24 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
         self._stages, self._taken, self._limit_s = stages, 0, limit_s
         self.tasks_done = 0
         self.told_to_stop = False
-        """Whether a signal said so."""
+        """Whether a signal requested a stop."""
         self.found_none = False
-        """Whether it ended because no task waits."""
+        """Whether it ended because no task was waiting."""
         self.engine_is: Condition = "fit"
-        """How the engine was after the last task."""
+        """State of the engine after the last task."""
 
     def check_service(self) -> None:
-        """Raises BusyError if Redis belongs to another service than the store, and InputError if there is no such
-        device."""
+        """Raise BusyError if Redis belongs to another service, InputError if the device is unknown."""
         self._engine.say("service", self._queue.service())
         self._await("service")
 
     def admit(self) -> bool:
-        """Whether the engine passes its check before the first task, now or later. Raises EngineLost."""
+        """Wait for the engine's check before the first task; False if it must end. Raises EngineLost."""
         self._engine.say("check")
         return bool(self._await("ready"))
 
     def execute_job(self, job: Any, queue: Any) -> None:
-        """One task under a lease. Its outcome is told after the lease is given back."""
+        """Run one task under a lease. Its outcome is sent after the lease is released."""
         self.prepare_execution(job)
         self.prepare_job_execution(job)
         self._heartbeat.update(task_id=job.id.rpartition("-")[0], state="busy", done=0.0, total=0.0, message="")
@@ -108,7 +107,7 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
         except GraspdError as error:
             log.warning("the engine refuses a task: %s", error)
         except EngineLost as error:
-            # As if this process had been killed: the lease stays, and the controller finds that nobody keeps it.
+            # As after a kill of this process: the lease remains, and the controller detects that it expires.
             log.error("this worker ends: %s", error)
             os._exit(1)
         self._give_back(job)
@@ -123,7 +122,7 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
         self.set_state(WorkerStatus.IDLE)
 
     def _await(self, word: str, beat: Callable[[], None] = lambda: None) -> Any:
-        """What the engine answers, within the time that a task may take. What else it says is passed on meanwhile."""
+        """Return the engine's answer within the time limit of a task; pass on its other messages meanwhile."""
         began = time.monotonic()
         due = began + self._heartbeat.interval_s
         told: StopReason | None = None
@@ -147,7 +146,7 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
                 due = time.monotonic() + self._heartbeat.interval_s
 
     def _pass_on(self, word: str, about: Any) -> None:
-        """News of the engine."""
+        """Process facts and events from the engine."""
         if word == "refused":
             raise about
         if word == "facts":
@@ -162,7 +161,7 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
             log.warning("what became of task %s is for the controller to find: %s", event.task_id, error)
 
     def _keep_lease(self, job: Any) -> None:
-        """A sign of life for the task in hand, which hears if it is not wanted any more."""
+        """Renew the lease of the current task, and stop the task if it is cancelled."""
         if self._engine.is_stopped:
             return
         try:
@@ -179,7 +178,7 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
             self._engine.say("stop", StopReason.CANCELLED if is_cancelled else StopReason.LEASE_LOST)
 
     def _give_back(self, job: Any) -> None:
-        """Nothing is left of the task in Redis, which refuses writes while its disk is full: then this waits."""
+        """Remove the task from Redis; waits while Redis refuses writes because its disk is full."""
         if not job.exists(job.id, self.connection):
             log.info("task %s was taken from this worker meanwhile: it was slow", job.id.rpartition("-")[0])
         execution, told = self.execution, False
@@ -200,7 +199,7 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
                 time.sleep(_REFUSED_PAUSE_S)
 
     def dequeue_job_and_maintain_ttl(self, *args: Any, **options: Any) -> Any:
-        """The next task, or None where none waits. An entry of the queue that is no task is passed over."""
+        """Return the next task, or None if none waits. Invalid entries of the queue are skipped."""
         while True:
             try:
                 found = super().dequeue_job_and_maintain_ttl(*args, **options)
@@ -215,18 +214,18 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
                 log.warning("an entry of the queue cannot be read: %s", error)
 
     def reorder_queues(self, reference_queue: Any) -> None:
-        """RQ calls this after each task it took: which lane comes first for the next one."""
+        """Choose the lane for the next task; RQ calls this after each task it took."""
         self._taken += 1
         queues = {queue.name: queue for queue in self.queues}
         self._ordered_queues = [queues[name] for name in queue_names(self._stages, self._taken, ability=own_ability())]
 
     def handle_warm_shutdown_request(self) -> None:
-        """SIGTERM: the task in hand stops at its next launch and goes back to the queue."""
+        """On SIGTERM, stop the current task at its next launch and return it to the queue."""
         self.told_to_stop = True
         self._heartbeat.update(state="stopping")
 
     def subscribe(self) -> None:
-        """No command channel: it is deaf after a reconnect, and lets anybody in Redis stop workers."""
+        """Disable RQ's command channel: it fails after a reconnect, and lets any Redis client stop workers."""
 
 
 def run_worker(
@@ -238,14 +237,14 @@ def run_worker(
     max_tasks: int | None = None,
     start: StartEngine = start_engine,
 ) -> bool:
-    """Do tasks until told to stop; with `burst` until none waits, with `max_tasks` that many.
+    """Run tasks until a stop is requested; with `burst` until none waits, with `max_tasks` that many.
 
     Args:
-        idle_s: with `burst`: how long it waits for a task before none waits [s].
+        idle_s: with `burst`: time without a task after which none waits [s].
         start: starts the engine.
 
     Returns:
-        False if the worker ended because something broke.
+        False if the worker ended because of a failure.
 
     Raises:
         InputError: there is no such device.
@@ -268,11 +267,11 @@ def run_worker(
         worker = GraspWorker(queue, engine, heart, stages=stages, name=name, limit_s=settings.task_timeout_s)
         worker.check_service()
         heart.start()
-        # It holds no task yet: a signal ends it at once, in good order. RQ sets a handler of its own later.
+        # It holds no task yet: a signal ends it at once, gracefully. RQ sets a handler of its own later.
         signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
         if not worker.admit():
             return False
-        worker.check_service()  # an empty Redis may have become somebody's meanwhile
+        worker.check_service()  # an empty Redis may belong to another service by now
         patient = burst and idle_s > 0
         worker.work(
             burst=burst and not patient,
@@ -287,6 +286,6 @@ def run_worker(
         engine.close()
         heart.stop()
         queue.close()
-    # RQ's loop ends in the same way where an error that nobody foresaw broke it off.
+    # RQ's loop also ends this way after an unexpected error.
     is_done = not does_all and (worker.found_none or worker.tasks_done >= (max_tasks or math.inf))
     return worker.engine_is == "outgrown" or (worker.engine_is == "fit" and (is_done or worker.told_to_stop))

@@ -1,4 +1,4 @@
-"""From a message to an outcome: runs a task's stage and sorts what may go wrong."""
+"""Run a task's stage and convert its result or error to an outcome."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ _STOPPED: Final = {
 
 
 class Runner:
-    """Does tasks one after the other with a table of stages."""
+    """Runs tasks one by one with a table of stages."""
 
     def __init__(
         self,
@@ -61,20 +61,20 @@ class Runner:
         fitness: Fitness | None = None,
         check_device: Callable[[str], None] = check_device,
     ) -> None:
-        """`check_device` raises DeviceLost once nothing runs on a device any more."""
+        """`check_device` raises DeviceLost once a device no longer works."""
         self._stages = stages
         self._worker = worker
         self._publish = publish
         self._fitness = fitness
         self._check_device = check_device
         self.device_lost = ""
-        """Why this process can do no more tasks on its device; "" while it can."""
+        """Reason why this process can run no more tasks on its device; "" while it can."""
 
     def run(self, raw: Mapping[str, Any], context: TaskContext) -> Event | None:
-        """Do a task.
+        """Run a task.
 
         Returns:
-            what to tell the controller; None if the task is no longer this worker's.
+            event for the controller; None if the task no longer belongs to this worker.
 
         Raises:
             TaskRefused: the message cannot be read, so there is no task to fail.
@@ -91,7 +91,7 @@ class Runner:
         started, clock = timestamp(), time.monotonic()
         try:
             if lacking := own_ability().lacks(need_of(message)):
-                # For another worker: the controller sees who is there, and tells what none of them can do.
+                # For another worker: the controller reports tasks that no present worker can do.
                 return self._event(EventKind.DEFERRED, message, message=f"another version of worker does it: {lacking}")
             return self._do(message, context)
         except TaskCancelled:
@@ -142,7 +142,7 @@ class Runner:
         return self._event(EventKind.FINISHED, message, output=output, seconds=seconds)
 
     def _loss(self, error: Exception, context: TaskContext) -> str:
-        """What became of the device, or of a process beside this one, if that is what the error comes from; else ""."""
+        """Return the state of the device or pool process if it caused the error; else ""."""
         try:
             self._check_device(context.device)
         except DeviceLost as lost:
@@ -158,7 +158,7 @@ class Runner:
         return is_there and context.store.exists(names.shard_file(message.stage, message.output))
 
     def _lost(self, message: Message, context: TaskContext) -> ShardManifest | None:
-        """The manifest of a shard that was made before and whose file is gone."""
+        """Return the manifest of a shard that was made before but whose file is lost."""
         if isinstance(message, IngestMessage) or not shard_exists(context.store, message.stage, message.output):
             return None
         return load_manifest(context.store, message.stage, message.output)
@@ -173,7 +173,7 @@ class Runner:
 
     def _failed(self, message: Message, error: Exception, context: TaskContext, started: str) -> Event:
         log.warning("task failed: %s", error, exc_info=not isinstance(error, InputError))
-        # Bad input and a damaged store do not get better by trying again.
+        # Retries fix neither invalid input nor a damaged store.
         last = isinstance(error, InputError | DamagedError | TaskRefused) or message.attempt >= message.max_attempt
         attempt = AttemptRecord.of(
             message,
@@ -189,7 +189,7 @@ class Runner:
     def _recorded(self, message: Message, attempt: AttemptRecord, context: TaskContext) -> Event:
         try:
             if isinstance(message, TaskMessage) and _has_manifest(message, context):
-                # The task has succeeded already: another worker was faster, or a lost file could not be made again.
+                # The task has already succeeded: another worker was faster, or a lost file could not be made again.
                 return self._event(EventKind.CANCELLED, message, message=attempt.reason)
             put_record(context.store, names.attempt(attempt.task_id, attempt.number), attempt)
         except UnavailableError as error:
@@ -212,7 +212,7 @@ class Runner:
 
 
 def _has_manifest(message: TaskMessage, context: TaskContext) -> bool:
-    """Whether a readable manifest says that the task has succeeded; a damaged one says nothing."""
+    """Check whether a readable manifest shows that the task has succeeded; a damaged one is ignored."""
     try:
         return load_manifest(context.store, message.stage, message.output).shard_id == message.output
     except (NotFoundError, DamagedError):
@@ -220,10 +220,10 @@ def _has_manifest(message: TaskMessage, context: TaskContext) -> bool:
 
 
 def parse_message(raw: Mapping[str, Any]) -> Message:
-    """The message in a queue entry; TaskRefused if it is none."""
+    """Parse the message of a queue entry; raise TaskRefused if it is invalid."""
     try:
         model = message_type(raw)
-        # A newer schema may have more fields; what names the task must still be there, so that it can be refused.
+        # A newer schema may have more fields; those that identify the task must exist, so that it can be refused.
         known = {field.alias or name for name, field in model.model_fields.items()}
         return model.model_validate({key: value for key, value in renamed(dict(raw)).items() if key in known})
     except (ValidationError, AttributeError) as error:
@@ -231,7 +231,7 @@ def parse_message(raw: Mapping[str, Any]) -> Message:
 
 
 def _subjects(message: Message) -> dict[str, Any]:
-    """What every log line of a task says it is about."""
+    """Return the fields of every log line of a task."""
     found: dict[str, Any] = {"task": message.task_id, "attempt": message.attempt}
     if isinstance(message, TaskMessage):
         origin = message.origin or Origin()
@@ -240,12 +240,12 @@ def _subjects(message: Message) -> dict[str, Any]:
 
 
 def output_of(message: Message) -> str:
-    """What the task makes: a shard id, or kind and digest of the asset it checks."""
+    """Return the output of a task: a shard id, or kind and digest of the asset it checks."""
     return message.output if isinstance(message, TaskMessage) else f"{message.kind.value}/{message.digest}"
 
 
 def is_disk_full(error: BaseException | None) -> bool:
-    """Whether an error, or what it came from, is a disk (or a quota) without room."""
+    """Check whether an error or its cause is a full disk or quota."""
     while error is not None:
         if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
             return True

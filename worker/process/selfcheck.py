@@ -1,7 +1,7 @@
-"""A worker's check of itself: can it load its engine, and does that give a result that makes sense?
+"""Self-check of a worker: whether its engine loads and gives plausible results.
 
-What a stage runs on is made to work on a ball: a grasp that is validated and measured, a drop, a picture. This loads or
-compiles the kernels too, so the first task does not wait for them.
+Each stage's engine runs on a ball: a grasp is validated and measured, a drop simulated, a picture rendered. This also
+loads or compiles the kernels, so the first task does not wait for them.
 """
 
 from __future__ import annotations
@@ -30,20 +30,20 @@ _HAND: Final = "barrett"
 
 
 class EngineError(GraspdError):
-    """The engine of this worker does not work; its tasks are for others."""
+    """The engine of this worker does not work; other workers must do its tasks."""
 
     slug, title = "engine-broken", "The engine of a worker does not work"
 
 
 def check_engine(device: Callable[[], str], stages: Collection[Stage], *, threads: int = 0) -> None:
-    """Try what these stages run on.
+    """Check the engines of these stages.
 
     Args:
-        device: gives the name of the Warp device.
-        threads: of a task; 0: all cores.
+        device: returns the name of the Warp device.
+        threads: CPU threads of a task; 0: all cores.
 
     Raises:
-        EngineError: something does not load, compile, run, or gives nonsense; one line says what.
+        EngineError: a part fails to load, compile or run, or gives implausible results; the message names it.
     """
     started, name = time.monotonic(), "device"
     try:
@@ -74,7 +74,7 @@ def _check_scene(run: ExecutionContext) -> None:
     from graspd.worker.scenes import drop
 
     height = drop(_ball(), count=1, seed=0)["scene/object_pose"][0, 2]
-    # The pose is that of the ball's frame, whose origin is its centre: it lies on the table, facets aside.
+    # The pose is that of the ball's frame, with its centre as origin: the ball lies on the table, within its facets.
     _expect(abs(height - _RADIUS_M) < 0.1 * _RADIUS_M, f"a ball comes to rest at a height of {height:.3g} m")
 
 
@@ -94,7 +94,7 @@ _CHECKS: Final[Mapping[Stage, Callable[[ExecutionContext], None]]] = {
 
 
 def _ball() -> ObjectModel:
-    """Of flat faces, so that it comes to rest."""
+    """Return a ball with flat faces, so that it comes to rest."""
     from manifold3d import Manifold
 
     from graspd.worker.objects.builtin import stl_bytes

@@ -1,4 +1,4 @@
-"""From a task to a shard. Only here do store and queue meet the engine; each stage loads, calls, and hands back."""
+"""Stages turn a task into a shard. Only here do store and queue meet the engine."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _MODULES: Final = {
 
 
 def stage_table() -> Mapping[Stage, StageFunction]:
-    """The real stages. Their modules are imported on the first task, so that a worker is there at once."""
+    """Return the stages. Their modules are imported at the first task, so that a worker starts at once."""
     return {stage: _Lazy(module) for stage, module in _MODULES.items()}
 
 

@@ -1,6 +1,5 @@
-"""Inputs of tasks: hands, objects, networks, convex pieces and shards from the store, kept while a worker goes on with
-one pair. Objects are repaired and simplified once, by the worker that meets them first, and lie prepared in the
-store."""
+"""Inputs of tasks from the store: hands, objects, networks, convex pieces and shards, cached.
+The first worker that needs an object repairs and simplifies it, and stores the result."""
 
 from __future__ import annotations
 
@@ -43,13 +42,13 @@ from graspd.worker.stages.models import SHOWN_ERROR_M, publish_model
 from graspd.worker.validation.decomposition import ConvexPieces, decompose, piece_file
 
 T = TypeVar("T")
-#: Loaded assets kept: a worker in a hands x objects dataset alternates between a few.
+#: Number of cached assets: a worker in a hands x objects dataset alternates between a few.
 _cache: LRUCache[Hashable, object] = LRUCache(16)
 _lock = threading.RLock()
 
 
 def hand_of(store: Store, message: TaskMessage) -> HandModel:
-    """The hand of a task."""
+    """Load the hand of a task."""
     name, digest = message.request.hand, message.hand_digest
     key = (store.url, AssetKind.HAND, name, digest)
 
@@ -62,7 +61,7 @@ def hand_of(store: Store, message: TaskMessage) -> HandModel:
 
 
 def object_of(store: Store, message: TaskMessage) -> ObjectModel:
-    """The object of a task, simplified as far as its fidelity allows."""
+    """Load the object of a task, simplified within the tolerance of its fidelity."""
     request, digest = message.request, message.object_digest
     name, error = request.object, request.knobs.face_error_m
     key = (
@@ -78,7 +77,7 @@ def object_of(store: Store, message: TaskMessage) -> ObjectModel:
     def load() -> ObjectModel:
         obj = prepared_object(store, digest, name=name, face_error_m=error)
         if not store.exists(names.asset_model(AssetKind.OBJECT, digest)):
-            # The same for whichever fidelity comes first.
+            # The same model for any fidelity that comes first.
             shown = prepared_object(store, digest, name=name, face_error_m=SHOWN_ERROR_M)
             publish_model(store, AssetKind.OBJECT, shown)
         return as_asked(obj, request)
@@ -87,7 +86,7 @@ def object_of(store: Store, message: TaskMessage) -> ObjectModel:
 
 
 def neighbours_of(store: Store, message: TaskMessage) -> list[ObjectModel]:
-    """The other objects in the scenes of a task, in the order of its request."""
+    """Load the other objects in the scenes of a task, in the order of its request."""
     return [_neighbour(store, one.object, one.digest or "") for one in message.request.beside]
 
 
@@ -95,7 +94,7 @@ def _neighbour(store: Store, name: str, digest: str) -> ObjectModel:
     def load() -> ObjectModel:
         obj = prepared_object(store, digest, name=name, face_error_m=NEIGHBOUR_FACE_ERROR_M)
         publish_model(store, AssetKind.OBJECT, obj)
-        with suppress(MeshError):  # without pieces it is stayed clear of as its hull
+        with suppress(MeshError):  # without pieces its hull is the obstacle
             pieces_of(store, obj)
         return obj
 
@@ -103,10 +102,10 @@ def _neighbour(store: Store, name: str, digest: str) -> ObjectModel:
 
 
 def keep_network(store: Store, message: TaskMessage) -> None:
-    """Have this process know the network that a task's method asks for, if it takes one, by the digest in its options.
+    """Cache the network that a task's method takes, if any, under the digest in the method's options.
 
     Raises:
-        NotFoundError, InputError: it is not in the store, or not what its digest says.
+        NotFoundError, InputError: it is not in the store, or does not match its digest.
     """
     if not (digest := message.request.network):
         return
@@ -119,7 +118,7 @@ def keep_network(store: Store, message: TaskMessage) -> None:
 
 
 def beside_attributes(message: TaskMessage) -> dict[str, Attribute]:
-    """What a shard says of the objects beside its own; nothing if there are none."""
+    """Return a shard's attributes for the objects beside its own; empty if there are none."""
     beside = message.request.beside
     if not beside:
         return {}
@@ -130,7 +129,7 @@ def beside_attributes(message: TaskMessage) -> dict[str, Attribute]:
 
 
 def _cached(key: Hashable, load: Callable[[], T]) -> T:
-    # Tasks of one pair start at once: one of them loads.
+    # Tasks of one pair start at the same time: one of them loads.
     with _lock:
         if key not in _cache:
             _cache[key] = load()
@@ -138,11 +137,11 @@ def _cached(key: Hashable, load: Callable[[], T]) -> T:
 
 
 def prepared_object(store: Store, digest: str, *, name: str, face_error_m: float) -> ObjectModel:
-    """An object as `load_object` makes it, from the store if it was prepared to this bound before.
+    """Load an object as `load_object` does, from the store if it was prepared to this bound before.
 
     Raises:
         MeshError: the mesh cannot be used.
-        StoreUnavailable: the store does not answer.
+        StoreUnavailable: the store does not respond.
     """
     key = names.object_prepared(digest, _address(face_error_m))
     try:
@@ -150,7 +149,7 @@ def prepared_object(store: Store, digest: str, *, name: str, face_error_m: float
     except NotFoundError:
         pass
     except (DamagedError, ValueError, KeyError, OSError, EOFError, zipfile.BadZipFile):
-        # What cannot be read is made again; it cannot be replaced, and costs no more than it did without a store.
+        # An unreadable entry cannot be replaced. Preparing the object again costs as much as without a store.
         return _load(store, digest, name=name, face_error_m=face_error_m)
     obj = _load(store, digest, name=name, face_error_m=face_error_m)
     put_sealed(store, key, prepare.to_bytes(obj))
@@ -158,7 +157,7 @@ def prepared_object(store: Store, digest: str, *, name: str, face_error_m: float
 
 
 def _address(face_error_m: float) -> str:
-    # Whatever changes a prepared mesh changes the grasps on it, and with them the revision of their stage.
+    # A change of a prepared mesh changes its grasps, and with them the revision of their stage.
     return digest_json({"face_error_m": face_error_m, "revision": STAGE_REVISIONS["synthesize"]})
 
 
@@ -171,11 +170,11 @@ _pieces_lock = threading.Lock()
 
 
 def pieces_of(store: Store, obj: ObjectModel, *, cache: Path | None = None) -> ConvexPieces:
-    """The pieces of an object: this machine's, else those in the store, else made now and put there.
+    """Return an object's pieces from this machine's cache or the store, else compute and store them.
 
     Raises:
         MeshError: the object has no usable pieces.
-        StoreUnavailable: the store does not answer.
+        StoreUnavailable: the store does not respond.
     """
     file = piece_file(obj, cache)
     key = names.object_pieces(obj.digest, file.stem)
@@ -193,18 +192,18 @@ def _fetch(store: Store, key: str, file: Path) -> None:
         data = get_sealed(store, key)
     except (NotFoundError, DamagedError):
         return
-    # A folder that cannot be written only costs time.
+    # A folder that is not writable only costs time.
     with suppress(OSError):
         write_whole(file, data)
 
 
 def input_of(message: TaskMessage, context: TaskContext, stage: Stage) -> Shard:
-    """The shard that `stage` made for a task; raises what `load_shard` does."""
+    """Load the shard that `stage` made for a task; raises the errors of `load_shard`."""
     return load_shard(context.store, stage, message.inputs[0])
 
 
 def load_hand_files(store: Store, digest: str) -> dict[str, bytes]:
-    """All files of a hand; in place of a xacro file the URDF that it expanded to at its first use.
+    """Load all files of a hand; a xacro file is replaced by the URDF from its first expansion.
 
     Raises:
         HandError: the options or the xacro file cannot be used.

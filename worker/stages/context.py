@@ -1,4 +1,4 @@
-"""The context of a task (what to read, progress, cancellation), and its output as a shard with a manifest."""
+"""Context of a task (inputs, progress, cancellation), and its output as a shard with a manifest."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
 if TYPE_CHECKING:
     from graspd.service.store.store import Store
 
-#: Least time between two reports [s]: enough for a bar that moves.
+#: Least time between two progress reports [s]: enough for a moving progress bar.
 REPORT_EVERY_S: Final = 1.0
 
 
 class StopReason(StrEnum):
-    """Why a running task should stop."""
+    """Reason for which a running task should stop."""
 
     CANCELLED = "cancelled"
     LEASE_LOST = "lease lost"
@@ -40,7 +40,7 @@ class StopReason(StrEnum):
 
 
 class TaskContext:
-    """One task's surroundings. `progress` and `cancelled` may be called from any thread and are cheap."""
+    """Store, progress and cancellation of one task. `progress` and `cancelled` are thread-safe and cheap."""
 
     def __init__(
         self,
@@ -50,33 +50,33 @@ class TaskContext:
         join: int = 1,
         tell: Callable[[float, float, str], None] | None = None,
     ) -> None:
-        """`join` is how many batches one launch plans; `tell` takes done, total and a message."""
+        """`join`: number of batches planned in one launch; `tell`: receives done, total and a message."""
         self.store, self.device, self.join = store, run.device, join
         self.run = replace(run, progress=self.progress, cancelled=self.cancelled)
-        """What the engine needs to know of the task."""
+        """Execution context for the engine."""
         self._tell = tell
         self._tell_again = 0.0
         self._stop = threading.Event()
         self._reason: StopReason | None = None
 
     def progress(self, done: float, total: float, message: str) -> None:
-        """Say how far the task is; most calls are dropped so that few are sent."""
+        """Report progress; most calls are dropped to limit the number of messages."""
         now = time.monotonic()
         if self._tell is not None and now >= self._tell_again:
             self._tell_again = now + REPORT_EVERY_S
             self._tell(done, total, message)
 
     def cancelled(self) -> bool:
-        """Whether to stop at the next launch."""
+        """Check whether to stop at the next launch."""
         return self._stop.is_set()
 
     def check(self) -> None:
-        """Raises TaskCancelled if the task should stop."""
+        """Raise TaskCancelled if the task should stop."""
         if self._stop.is_set():
             raise TaskCancelled(f"stopped: {self._reason}")
 
     def stop(self, reason: StopReason) -> None:
-        """Ask the task to stop; the first reason stands."""
+        """Request the task to stop; the first reason is stored."""
         if self._reason is None:
             self._reason = reason
         self._stop.set()
@@ -88,7 +88,7 @@ class TaskContext:
 
 @dataclass(frozen=True)
 class Output:
-    """The columns of a shard, what is special about it, and what the manifest should keep besides."""
+    """Columns of a shard, its attributes, and further entries of the manifest."""
 
     arrays: Mapping[str, NDArray[np.generic]]
     attributes: Mapping[str, Attribute] = field(default_factory=dict)
@@ -104,10 +104,10 @@ def shard_of(
     worker: str,
     lost: ShardManifest | None = None,
 ) -> tuple[ShardManifest, bytes]:
-    """The shard that a stage made: its manifest and its HDF5 bytes.
+    """Build the shard of a stage: its manifest and its HDF5 bytes.
 
     Args:
-        lost: manifest of the file that this one takes the place of: what tells when and by whom is then as it was.
+        lost: manifest of the file that this one replaces; its time and worker are retained.
 
     Raises:
         InputError: the columns do not fit the schema.
@@ -148,14 +148,14 @@ def shard_of(
 
 
 def batch_seed(message: TaskMessage) -> int:
-    """Seed of this stage of this batch.
+    """Compute the seed of this stage for this batch.
 
-    Batches, hands and objects must not repeat each other's materials, lamps and cameras. Methods do: when grasps of two
-    of them stand in the same pictures, what a network learns of either can be compared.
+    Batches, hands and objects must not repeat each other's materials, lamps and cameras. Methods do: with identical
+    pictures, networks trained on grasps of two methods can be compared.
     """
     pair = [message.hand_digest, message.object_digest]
     return int(digest_json([message.request.seed, message.stage, message.batch, *pair])[:8], 16) % 2**31
 
 
-#: What a stage is: it makes the arrays of a shard, or, as ingest does, writes what it found itself.
+#: A stage makes the arrays of a shard or, like ingest, writes its result itself.
 StageFunction = Callable[[Any, TaskContext], Output | None]

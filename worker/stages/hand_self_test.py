@@ -1,5 +1,5 @@
-"""Does a hand hold anything: grasps of three plain objects of a size that suits it, validated free at level standard,
-and lifted off a table."""
+"""Self-test of a hand: grasps of three plain objects of suitable size.
+They are validated free at level standard and lifted off a table."""
 
 from __future__ import annotations
 
@@ -32,31 +32,31 @@ from graspd.worker.validation.decomposition import decompose
 from graspd.worker.validation.payload import Limit, limit_of
 from graspd.worker.validation.protocol import Outcome
 
-#: Free grasps in all, and the share that must hold of a hand that is ready.
+#: Total number of free grasps, and the share that must hold for the verdict ready.
 GRASPS: Final = 64
 READY: Final = 0.7
-#: Grasps in all of the objects on a table, and the share that must lift.
+#: Total number of grasps of objects on a table, and the share that must lift.
 TABLE_GRASPS: Final = 16
 TABLE_READY: Final = 0.6
 TABLE: Final = SceneSpec(kind="table")
 TABLE_SCENES: Final = 2
-#: Width of the objects as a share of a gripper's opening, or of the reach of a hand's fingers; and its bounds [m].
+#: Width of the objects as a share of a gripper's opening or of the reach of a hand's fingers, and its bounds [m].
 OF_OPENING: Final = 0.55
 OF_REACH: Final = 0.5
 WIDTH_M: Final = (0.012, 0.08)
-#: Sum of normal forces of a second squeeze, for the heaviest that it lifts: its actuators give what they can [N].
+#: Sum of normal forces of a second squeeze, for the payload: actuators reach their limits [N].
 STRONG_N: Final = 1000.0
 _IDENTITY: Final = np.array([0.0, 0, 0, 1, 0, 0, 0])
 
 
-#: Servos that go from nothing to their limit within less of a fingertip's way press by chance [m].
+#: Servos that go from zero to their limit within less fingertip motion than this press by chance [m].
 SOFT_M: Final = 0.0015
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class BestGrasp:
-    """Of the grasps that hold the one with the largest epsilon; of equal ones the one that moves least."""
+    """Valid grasp with the largest epsilon; ties are broken by displacement."""
 
     obj: ObjectModel
     grasp: Posture
@@ -65,8 +65,8 @@ class BestGrasp:
 
 @dataclass(frozen=True)
 class SelfTest:
-    """What came of it; `gsr` is the share of candidates that hold at level standard, `table` that of `table_n`
-    grasps that lift the objects off a table."""
+    """Result of the test; `gsr` is the share of candidates that hold at level standard.
+    `table` is the share of the `table_n` grasps on a table that lift the object."""
 
     gsr: float
     n: int
@@ -75,17 +75,17 @@ class SelfTest:
     table: float
     table_n: int
     best: BestGrasp | None = None
-    """None: nothing was held."""
+    """None: no grasp held."""
     lost: float = 0.0
-    """Share of the grasps that do not hold whose object was lost while the hand closed; others slip when pushed."""
+    """Share of failed grasps that lost the object during closing; the others slip under the pushes."""
     give_m: float = math.inf
-    """Way of a fingertip within which its stiffest servo goes from nothing to its limit [m]."""
+    """Fingertip motion within which its stiffest servo goes from zero to its limit [m]."""
     limit: Limit | None = None
-    """What it lifts off a table with all its force; None: nothing."""
+    """Payload on a table at full actuator force; None: it lifts nothing."""
 
     @property
     def line(self) -> str:
-        """One line for people."""
+        """Return a summary in one line."""
         share = f"{100 * self.gsr:.0f} % hold"
         lifts = f"{100 * self.table:.0f} % lift off a table"
         if self.gsr >= READY:
@@ -104,7 +104,7 @@ class SelfTest:
         return says + "most slip when pushed: look at effort, stiffness and pads"
 
     def facts(self) -> dict[str, Any]:
-        """As a check reports it."""
+        """Return the facts that a check reports."""
         return {
             "gsr": self.gsr,
             "n": self.n,
@@ -118,7 +118,7 @@ class SelfTest:
 
 
 def failed(reason: str, says: str = "suspicious") -> dict[str, Any]:
-    """The facts of a hand that could not be tried at all."""
+    """Return the facts of a hand that could not be tested."""
     return {
         "gsr": 0.0,
         "n": 0,
@@ -132,10 +132,10 @@ def failed(reason: str, says: str = "suspicious") -> dict[str, Any]:
 
 
 def tried_softly(hand: Callable[[], HandModel], run: ExecutionContext = DEFAULT_CONTEXT) -> dict[str, Any]:
-    """The facts of a self-test. A hand that finds no grasp, or a test that breaks, is told and stops nothing.
+    """Return the facts of a self-test; no grasp, or a failed test, is reported and not raised.
 
     Raises:
-        TaskCancelled: when `run.cancelled()` answers True.
+        TaskCancelled: `run.cancelled()` returned True.
     """
     try:
         return self_test(hand(), run).facts()
@@ -154,21 +154,21 @@ def self_test(
     on_table: int = TABLE_GRASPS,
     seed: int = 0,
 ) -> SelfTest:
-    """Candidates of a sphere, a box and a cylinder, as `JobOptions` has them by default, shared out evenly; and
-    of these as they stand on a table.
+    """Test grasps of a sphere, a box and a cylinder with the defaults of `JobOptions`, in equal numbers.
+    Then test grasps of the same objects on a table.
 
-    It has no limit of time: what a busy machine left out would be another verdict.
+    There is no time limit: on a busy machine it would change the verdict.
 
     Args:
         hand: the hand.
-        run: told of the share that is done; asked often whether to stop.
-        grasps: how many in all.
-        on_table: how many in all of the objects on a table.
-        seed: of what is drawn.
+        run: receives progress; polled often for cancellation.
+        grasps: total number of free grasps.
+        on_table: total number of grasps of objects on a table.
+        seed: seed of all random numbers.
 
     Raises:
-        InputError: a hand finds no place around one of them.
-        TaskCancelled: `run.cancelled()` answers True.
+        InputError: a hand finds no start around one of the objects.
+        TaskCancelled: `run.cancelled()` returned True.
     """
     width = fitting_width(hand)
     held: dict[str, list[bool]] = {}
@@ -195,7 +195,7 @@ def self_test(
 
 
 def _joined(limits: list[Limit]) -> Limit | None:
-    """What a hand lifts of several objects; None: nothing of any."""
+    """Combine the payloads of several objects; None: nothing was lifted."""
     if not limits:
         return None
     lifts, bound = (max(getattr(one, name) for one in limits) for name in ("lifts_kg", "bound_kg"))
@@ -203,14 +203,14 @@ def _joined(limits: list[Limit]) -> Limit | None:
 
 
 def _lost(batch: ValidatedBatch) -> NDArray[np.bool_]:
-    """Of the grasps that do not hold, whether the object was lost while the hand closed."""
+    """Return a mask of the grasps that do not hold because the object was lost during closing."""
     failed = batch.columns["quality/success"] != 1
     outcome = batch.columns["quality/verdict_outcome"][failed]
     return np.asarray((outcome == Outcome.LOST_WHILE_CLOSING).any(axis=1))
 
 
 def _give(hand: HandModel) -> float:
-    """Least way of a fingertip [m] within which a dof that closes goes from no torque to its limit."""
+    """Return the least fingertip motion [m] over which a closing dof goes from zero torque to its limit."""
     if jaws_of(hand) is not None:
         return math.inf
     step = 1e-4
@@ -234,8 +234,8 @@ def _batches(hand: HandModel, obj: ObjectModel, count: int, seed: int, run: Exec
 def _lifted(
     hand: HandModel, obj: ObjectModel, count: int, seed: int, run: ExecutionContext
 ) -> tuple[int, float, Limit | None]:
-    """How many grasps of an object on a table were planned, the share of them that lift it, and what they lift with all
-    their force."""
+    """Test grasps of an object on a table.
+    Return the number of planned grasps, the share that lifts, and the payload at full actuator force."""
     scenes, _ = scenes_of(TABLE, obj, count=TABLE_SCENES, seed=seed)
     request = JobOptions(want="candidates", grasps=count, seed=seed, validation="standard")
     found = validated_grasps(hand, obj, request, count=count, scenes=scenes, run=run)
@@ -260,27 +260,26 @@ def _best(obj: ObjectModel, found: ValidatedBatch) -> BestGrasp | None:
     rows = np.flatnonzero(columns["quality/success"] == 1)
     if not len(rows):
         return None
-    # Thin pads at two places give epsilon 0 at any threshold: then what moves least under the pushes is best.
+    # Thin pads at two places give epsilon 0 at any threshold: then the least motion under the pushes decides.
     ranks = [(float(columns["quality/epsilon"][k].max()), -float(columns["quality/verdict_margin"][k])) for k in rows]
     row = max(range(len(rows)), key=ranks.__getitem__)
     return BestGrasp(obj, found.grasps.grasp.take(rows[[row]]), ranks[row])
 
 
 def fitting_width(hand: HandModel) -> float:
-    """Width of the objects that suit a hand [m]."""
+    """Return the width of objects that suit a hand [m]."""
     if (jaws := jaws_of(hand)) is not None:
         return float(np.clip(OF_OPENING * jaws.opening, *WIDTH_M))
     poses = body_poses(hand, _IDENTITY, hand.expand(hand.preshape))[0]
     tips = np.array([_tip(hand, body, poses[body]) for body in hand.fingertips or (hand.bodies - 1,)])
     reach = float(np.median(np.linalg.norm(tips - hand.palm.centre, axis=1)))
-    # What is thinner than the gap that opposed pads leave at least does not suit a hand.
+    # Objects thinner than the least gap between opposed pads do not suit a hand.
     least = float(known.width[0]) if len(known := oppositions_of(hand)) else 0.0
     return float(np.clip(max(OF_REACH * reach, least), *WIDTH_M))
 
 
 def _tip(hand: HandModel, body: int, pose: Floats) -> Floats:
-    """Where a finger ends [m]: at its last joint; a finger that a single joint closes has that at its base, so at its
-    pad."""
+    """Return a finger's end [m]: its last joint, or its pad if a single joint at the base closes it."""
     closing, at = 0, body
     while at > 0:
         closing += int(hand.closing[hand.dof[at]] != 0)
@@ -289,7 +288,7 @@ def _tip(hand: HandModel, body: int, pose: Floats) -> Floats:
 
 
 def plain_objects(width: float) -> dict[str, ObjectModel]:
-    """Sphere, box and cylinder, the last two longer than they are wide."""
+    """Return a sphere, a box and a cylinder; the last two are longer than wide."""
     meshes = {
         "sphere": trimesh.creation.icosphere(3, width / 2),
         "box": trimesh.creation.box((width, 1.2 * width, 1.8 * width)),

@@ -1,4 +1,4 @@
-"""Checks an upload in a child process: hostile files may take the child down, not the worker."""
+"""Check of an upload in a child process: a hostile file may crash the child, not the worker."""
 
 from __future__ import annotations
 
@@ -25,22 +25,22 @@ from graspd.service.store.library import UNPACKED_LIMIT_BYTES, load_asset, load_
 from graspd.service.store.network_file import check_network
 from graspd.worker.stages.context import TaskContext
 
-#: Address space of the child [bytes]: the largest meshes that are taken need about a tenth of it.
+#: Address space of the child [bytes]: the largest accepted meshes need about a tenth of it.
 MEMORY_LIMIT_BYTES: Final = 4 * 2**30
-#: Time of computing [s]: on a busy machine the same file takes longer, and is no worse for it. A child that waits
-#: instead of computing is ended as every task is that takes too long, and the check is tried again.
+#: CPU time [s], since wall time of the same file grows on a busy machine. A child that waits instead of computing ends
+#: by the task's time limit, and the check is retried.
 CPU_LIMIT_S: Final = 25
 _PASSED_ON: Final = ("PATH", "HOME", "LANG", "TMPDIR", "PYTHONPATH", "LD_LIBRARY_PATH", "VIRTUAL_ENV")
 _OUT_OF_MEMORY: Final = ("MemoryError", "bad_alloc", "Cannot allocate", "failed to map")
 _FINDING_BYTES: Final = 2**20
 _MODEL: Final = "model.glb"
 _MODEL_BYTES: Final = 2**24
-#: A check that took longer leaves no time for the model within the limit; the first task that loads the asset makes it.
+#: A longer check leaves no CPU time for the model within the limit; the first task with the asset makes the model.
 _MODEL_CPU_S: Final = 8.0
 
 
 def run(message: IngestMessage, context: TaskContext) -> None:
-    """Check the asset and write `check.json`, whatever is found; a refusal is a finding too."""
+    """Check the asset and write `check.json`, for refusals too."""
     files = _files(message, context)
     found, model = check_in_child(message.kind, message.name, files, context)
     if found["verdict"] != "refuse" and load_asset(context.store, message.kind, message.digest).self_test:
@@ -54,14 +54,14 @@ def _files(message: IngestMessage, context: TaskContext) -> dict[str, bytes]:
     if message.kind is AssetKind.HAND:
         from graspd.worker.stages.assets import load_hand_files
 
-        # What cannot be expanded is refused by the check, which says why.
+        # If the expansion fails, the check refuses the hand with the reason.
         with contextlib.suppress(HandError):
             return load_hand_files(context.store, message.digest)
     return load_asset_files(context.store, message.kind, message.digest)
 
 
 def _self_test(message: IngestMessage, files: dict[str, bytes], context: TaskContext) -> dict[str, Any]:
-    """How many grasps of plain objects hold. A hand that finds none is no error: that is what it tells."""
+    """Test how many grasps of plain objects hold. A hand without any is a result, not an error."""
     from graspd.worker.hands.load import load_hand
     from graspd.worker.stages.hand_self_test import tried_softly
 
@@ -77,13 +77,13 @@ def check_in_child(
     memory_bytes: int = MEMORY_LIMIT_BYTES,
     cpu_s: int = CPU_LIMIT_S,
 ) -> tuple[dict[str, Any], bytes]:
-    """What the check of a hand or object says, or a refusal that says how the check itself ended.
+    """Check a hand or object; return the result, or a refusal that states how the check itself ended.
 
     Returns:
-        the finding, and the model for viewers (glTF); empty where it was refused or making it would take too long.
+        the result, and the model for viewers (glTF); empty after a refusal or if making it would take too long.
 
     Raises:
-        OSError: the machine ended the check, which says nothing about the file.
+        OSError: the machine ended the check; the file is not at fault.
         TaskCancelled: the task should stop.
     """
     with tempfile.TemporaryDirectory(prefix="graspd-ingest-") as folder:
@@ -100,7 +100,7 @@ def check_in_child(
             str(target),
             *limits,
         ]
-        # A file, whose size is limited: a pipe that nobody empties would stop the child, one that is read has no end.
+        # A file of limited size: a full pipe would block the child, and reading from one has no limit.
         with (
             errors.open("wb") as stderr,
             subprocess.Popen(
@@ -118,12 +118,12 @@ def check_in_child(
             why = f"the check finds more to say than {_FINDING_BYTES >> 20} MiB; simplify it, or shorten its names"
             return _refused(kind, name, why), b""
         if target.is_file():
-            # A finding stands whatever became of the model after it; one that was cut off is none.
+            # A complete result counts even if the model after it failed; a truncated one does not parse.
             with contextlib.suppress(ValueError):
                 found, model = dict(json.loads(target.read_bytes())), target.with_name(_MODEL)
                 return found, model.read_bytes() if code == 0 and model.is_file() else b""
         if os.strerror(errno.ENOSPC) in complaint:
-            # No word about the file: the check waits for room.
+            # No verdict on the file: the check is retried once there is disk space.
             raise OSError(errno.ENOSPC, f"{os.strerror(errno.ENOSPC)} to check {name}")
         if code == -signal.SIGKILL:
             raise OSError(f"the check of {name} was killed; the machine may lack memory")
@@ -131,13 +131,13 @@ def check_in_child(
 
 
 def _environment() -> dict[str, str]:
-    """What the child may know: no credentials; and one thread, because each takes address space from the limit."""
+    """Return the child's environment: no credentials; one thread, since each takes address space."""
     passed_on = {name: os.environ[name] for name in _PASSED_ON if name in os.environ}
     return passed_on | {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 
 
 def _wait(child: subprocess.Popen[bytes], context: TaskContext) -> int:
-    """Exit code of the child. Raises TaskCancelled when the task is, and ends the child."""
+    """Return the exit code of the child. If the task is cancelled, end the child and raise TaskCancelled."""
     try:
         while True:
             context.check()
@@ -167,7 +167,7 @@ def _refused(kind: AssetKind, name: str, why: str) -> dict[str, Any]:
 
 
 def _child(kind: str, name: str, source: str, target: str, memory_bytes: str, cpu_s: str) -> None:
-    # The hard limit stays: its signal is that of a machine without memory, and children have limits of their own.
+    # The hard limit stays: its signal equals that of a machine out of memory, and children have their own limits.
     resource.setrlimit(resource.RLIMIT_CPU, (int(cpu_s), resource.getrlimit(resource.RLIMIT_CPU)[1]))
     for limit, value in (
         (resource.RLIMIT_AS, int(memory_bytes)),
@@ -181,7 +181,7 @@ def _child(kind: str, name: str, source: str, target: str, memory_bytes: str, cp
 
         found = check_hand(files, name)
     elif AssetKind(kind) is AssetKind.NETWORK:
-        # The API checks networks; this one's finding was lost or damaged.
+        # The API checks networks; its result was lost or damaged.
         found = check_network(files, name)
     else:
         from graspd.worker.objects.check import check_object
@@ -191,7 +191,7 @@ def _child(kind: str, name: str, source: str, target: str, memory_bytes: str, cp
     if found["verdict"] != "refuse" and kind != AssetKind.NETWORK and time.process_time() < _MODEL_CPU_S:
         from graspd.worker.stages.models import model_of
 
-        # The finding stands whatever becomes of its picture.
+        # The result is kept even if its picture fails.
         with contextlib.suppress(Exception):
             model = model_of(AssetKind(kind), name, files)
             if len(model) <= _MODEL_BYTES:

@@ -1,11 +1,11 @@
-"""Models for viewers: hands and objects as binary glTF, made beside the check of an upload or at first use.
+"""Models for viewers: hands and objects as binary glTF, made with an upload's check or at first use.
 
 ``python -m graspd.worker.stages.models`` writes those of the built-in hands and objects into `service/builtin/models/`.
 
-The joint tree stands in the `extras` of the nodes, so a viewer poses the hand from the joint positions of a shard:
-a node's pose is parent * rest pose * motion about `axis`. Points of the hand's surface come as POINTS primitives.
-Of a body that is shown by visual meshes, `extras` name the mesh of its collision shapes, which no node draws. The
-document's `extras` say what was found of the hand: facts, frames of its links, what drives its joints, its pads.
+Node `extras` contain the joint tree, so a viewer can pose the hand from the joint positions of a shard: a node's pose
+is parent * rest pose * motion about `axis`. Points of the hand's surface are POINTS primitives. For a body drawn with
+visual meshes, `extras` name the mesh of its collision shapes, which no node draws. The document's `extras` contain
+facts, link frames, joint drives and pads of the hand.
 """
 
 from __future__ import annotations
@@ -35,20 +35,20 @@ from graspd.worker.objects.mesh_geometry import corner_normals
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import load_object
 
-#: Simplification of a shown object [m]: that of the standard fidelity, so that people see what is grasped.
+#: Tolerance of a displayed object [m]: that of the standard fidelity, so that the display shows the grasped mesh.
 SHOWN_ERROR_M: Final = Fidelity().face_error_m
 _BUILTIN: Final = Path(__file__).parents[2] / "service" / "builtin" / "models"
 
 
 def model_of(kind: AssetKind, name: str, files: dict[str, bytes]) -> bytes:
-    """Binary glTF of the hand or object that files describe; raises what loading it raises."""
+    """Return the hand or object in `files` as binary glTF; raises the errors of loading it."""
     if kind is AssetKind.HAND:
         return hand_glb(load_hand(files, name=name, digest=""))
     return object_glb(load_object(files, name=name, digest="", face_error_m=SHOWN_ERROR_M))
 
 
 def publish_model(store: Store, kind: AssetKind, model: HandModel | ObjectModel) -> None:
-    """Put the glTF of a loaded hand or object into the store if it is not there."""
+    """Store the glTF of a loaded hand or object unless it exists."""
     key = names.asset_model(kind, model.digest)
     if not store.exists(key):
         put_sealed(store, key, hand_glb(model) if isinstance(model, HandModel) else object_glb(model))
@@ -62,18 +62,18 @@ def write_builtins(folder: Path = _BUILTIN) -> None:
             (folder / f"{kind.value}-{name}.glb").write_bytes(model_of(kind, name, builtin_files(kind, name)))
 
 
-#: Points on the hand from which a viewer measures its distance to the object.
+#: Hand points from which a viewer measures the distance to the object.
 SURFACE_POINTS: Final = 3000
-#: Triangles of a hand's visual meshes together: a browser draws them at once.
+#: Most triangles of all visual meshes of a hand, so that a browser draws them at once.
 MAX_FACES: Final = 60_000
-#: Points of a pad at most.
+#: Most points of a pad.
 PAD_POINTS: Final = 60
-#: sRGB of parts without a colour beside parts with one.
+#: sRGB of parts without a colour, if other parts have one.
 _GREY: Final = (0.45, 0.5, 0.55)
 
 
 def hand_glb(hand: HandModel) -> bytes:
-    """The hand at joint positions zero, root link at the origin; metres."""
+    """Return the hand at joint positions zero with its root link at the origin; metres."""
     document = Document()
     points = sample_surface(hand, SURFACE_POINTS)
     nodes: list[dict[str, Any]] = []
@@ -103,8 +103,8 @@ def hand_glb(hand: HandModel) -> bytes:
 
 
 def object_glb(obj: ObjectModel) -> bytes:
-    """The prepared mesh in the object's own frame; metres. Its node has the middle of the mesh as its translation, for
-    the numbers of a mesh have 32 bits."""
+    """Return the prepared mesh in the object's own frame; metres.
+    The node's translation is the middle of the mesh, since glTF coordinates have 32 bits."""
     document = Document()
     primitive = document.triangles(obj.centred.vertices, obj.faces, obj.corner_normals)
     extras = {"kind": "object", "name": obj.name, "centre_of_mass": plain(obj.centre_of_mass)}
@@ -113,7 +113,7 @@ def object_glb(obj: ObjectModel) -> bytes:
 
 
 def _found(hand: HandModel) -> dict[str, Any]:
-    """What a user looks at and corrects."""
+    """Return the facts that a user reviews and corrects."""
     drives = {
         joint: {
             "dof": hand.dof_names[hand.dof[body]],
@@ -137,7 +137,7 @@ def _piece_primitive(document: Document, hand: HandModel, body: int) -> dict[str
 def _body_primitives(
     document: Document, hand: HandModel, body: int, visuals: tuple[VisualMesh, ...]
 ) -> list[dict[str, Any]]:
-    """The visual meshes in their colours; of a body without any, its pieces, which viewers colour themselves."""
+    """Return a body's coloured visual meshes, or else its pieces, which viewers colour."""
     meshes: list[tuple[Floats, Ints, Colour | None]] = [
         (mesh.vertices, mesh.faces, mesh.colour) for mesh in visuals if mesh.body == body
     ]
@@ -146,7 +146,7 @@ def _body_primitives(
 
 
 def _joined(document: Document, meshes: list[tuple[Floats, Ints, Colour | None]]) -> dict[str, Any] | None:
-    """One primitive of vertices, faces and sRGB colours."""
+    """Build one primitive from vertices, faces and sRGB colours."""
     if not meshes:
         return None
     starts = np.cumsum([0, *(len(vertices) for vertices, _, _ in meshes)])
@@ -162,7 +162,7 @@ def _joined(document: Document, meshes: list[tuple[Floats, Ints, Colour | None]]
 
 
 def _light_visuals(hand: HandModel) -> tuple[VisualMesh, ...]:
-    """The visual meshes, with `MAX_FACES` triangles together at most."""
+    """Return the visual meshes, simplified to at most `MAX_FACES` triangles in total."""
     meshes = hand.visuals.meshes
     excess = sum(len(mesh.faces) for mesh in meshes) / MAX_FACES
     return meshes if excess <= 1 else tuple(lighter(mesh, excess) for mesh in meshes)

@@ -1,4 +1,4 @@
-"""A task of several batches: each is made as if by itself, and their rows go into one shard, one after the other."""
+"""Tasks of several batches: each batch is made as if alone; their rows are concatenated in a shard."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from graspd.service.store.columns import SCHEMAS
 from graspd.service.store.shards import Shard, json_attribute
 from graspd.worker.stages.context import Output
 
-#: Axes whose rows are those of one batch after the other; what has another axis is common to all.
+#: Axes along which the rows of batches are concatenated; columns with another axis are common to all.
 _ROWS: Final = ("N", "S", "K")
-#: Columns that only some batches of a job have, with what stands in the rows of the others.
+#: Columns that only some batches of a job have, with the value in the rows of the others.
 _OF_SOME: Final = {"quality/recheck": np.int8(-1)}
 
 
 def sizes_of(message: TaskMessage) -> list[int]:
-    """Grasps wanted of each batch of a task."""
+    """Return the number of grasps of each batch of a task."""
     return [min(BATCH_SIZE, message.count - first) for first in range(0, message.count, BATCH_SIZE)]
 
 
 def batches_of(message: TaskMessage) -> list[TaskMessage]:
-    """The batches of a task, as tasks of one batch each."""
+    """Split a task into tasks of one batch each."""
     return [
         message.model_copy(update={"batch": message.batch + number, "count": size})
         for number, size in enumerate(sizes_of(message))
@@ -38,12 +38,12 @@ def batches_of(message: TaskMessage) -> list[TaskMessage]:
 
 
 def joined(message: TaskMessage, made: Sequence[Output], *, base_rows: Sequence[range] = ()) -> Output:
-    """What was made of each batch as one shard; of a single batch what was made of it.
+    """Join the outputs of batches into one shard; the output of a single batch is unchanged.
 
     Args:
         message: the task.
-        made: of each of its batches, with the same columns but for rechecks.
-        base_rows: rows of each batch in the base shard, where columns number these.
+        made: outputs of its batches, with equal columns except for rechecks.
+        base_rows: rows of each batch in the base shard, for columns that refer to them.
     """
     if len(made) == 1:
         return made[0]
@@ -68,7 +68,7 @@ def joined(message: TaskMessage, made: Sequence[Output], *, base_rows: Sequence[
 
 
 def base_rows(base: Shard, message: TaskMessage) -> list[range]:
-    """Rows of each batch of a task in its base shard.
+    """Return the rows of each batch of a task in its base shard.
 
     Raises:
         DamagedShard: it has other batches.
@@ -85,8 +85,8 @@ def _without(path: str, part: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
 
 
 def _summed(told: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Remarks on several batches as one: counts and seconds are sums, shares are means over what was planned, and of
-    the planner's own remarks those on the first batch stay."""
+    """Combine the records of several batches; other planner records are those of the first batch.
+    Counts and seconds are summed, shares averaged with the numbers of planned grasps as weights."""
     found = dict(told[0])
     planned = [one.get("planned", 0) for one in told]
     for name, value in told[0].items():

@@ -1,4 +1,4 @@
-"""From scenes to pictures of them: a views shard."""
+"""Stage render: pictures of scenes in a views shard."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from graspd.worker.stages.context import Output, TaskContext, batch_seed
 
 
 def run(message: TaskMessage, context: TaskContext) -> Output:
-    """Render `request.views` camera placements of each scene, with the hand too where grasps were planned in them."""
+    """Render `request.views` camera placements of each scene, with the hand for grasps planned in scenes."""
     request = message.request
     stage = Stage.SYNTHESIZE if request.in_scene else Stage.SCENE
     shard = input_of(message, context, stage)
@@ -53,13 +53,13 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
 
 
 def _beside(base: Shard, message: TaskMessage, context: TaskContext) -> Neighbours | None:
-    """The other objects of the scenes; None where the object is alone."""
+    """Load the other objects of the scenes; None if the object is alone."""
     others = neighbours_of(context.store, message)
     return Neighbours(others, np.asarray(base["scene/neighbour_pose"], float)) if others else None
 
 
 def _drawn(base: Shard, message: TaskMessage, context: TaskContext) -> DrawnHand | None:
-    """The best valid grasp of each scene; None where there is no grasp at all."""
+    """Select the best valid grasp of each scene; None if there is no grasp at all."""
     hand = hand_of(context.store, message)
     among = validity.chosen(base.arrays, unvalidated=message.request.validation == "none")
     rows = best_in_scenes(base.arrays, among)

@@ -1,4 +1,4 @@
-"""Scenes: before the grasps where these are planned in them, else after, with each grasp's clearance there."""
+"""Stage scene: before grasps that are planned in scenes, else after them, with their clearance."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from graspd.worker.stages.assets import beside_attributes, hand_of, input_of, ne
 from graspd.worker.stages.context import Output, TaskContext, batch_seed
 from graspd.worker.stages.ranges import base_rows, batches_of, joined
 
-#: Columns of carried-over grasps in a shard of scenes that grasps are yet to be planned in.
+#: Empty grasp columns of a scene shard in which grasps are yet to be planned.
 _NO_GRASPS: Final[dict[str, NDArray[Any]]] = {
     "grasp/base_index": np.zeros(0, np.int32),
     "grasp/scene_index": np.zeros(0, np.int32),
@@ -32,7 +32,7 @@ _NO_GRASPS: Final[dict[str, NDArray[Any]]] = {
 
 
 def run(message: TaskMessage, context: TaskContext) -> Output:
-    """The scenes of each batch."""
+    """Make the scenes of each batch."""
     parts = batches_of(message)
 
     def told(number: int) -> TaskContext:
@@ -49,14 +49,14 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
 
 
 def _before_grasps(message: TaskMessage, context: TaskContext) -> Output:
-    """Lay the object and its neighbours into `request.scenes` scenes.
+    """Place the object and its neighbours in `request.scenes` scenes.
 
     Raises:
-        SceneError: they do not fit in, stand in one another, or do not come to rest.
+        SceneError: they do not fit, penetrate each other, or do not come to rest.
     """
     hand, obj = hand_of(context.store, message), object_of(context.store, message)
     place = message.request.place
-    # The first batch has the scenes of `graspd synth` with the same seed.
+    # The first batch equals the scenes of `graspd synth` with the same seed.
     seed = batch_seed(message) if message.batch else message.request.seed
     others = neighbours_of(context.store, message)
     context.check()
@@ -73,7 +73,7 @@ def _before_grasps(message: TaskMessage, context: TaskContext) -> Output:
 
 
 def _after_grasps(message: TaskMessage, context: TaskContext, base: Shard, rows: range) -> Output:
-    """Drop the object `request.scenes` times and carry grasps of the base shard over, numbered within these rows."""
+    """Drop the object `request.scenes` times; transfer the base shard's grasps, numbered within `rows`."""
     hand, obj = hand_of(context.store, message), object_of(context.store, message)
     context.check()
     scenes = drop(obj, count=message.request.scenes, seed=batch_seed(message))

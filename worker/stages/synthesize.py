@@ -1,4 +1,4 @@
-"""From a hand and an object to grasps with their quality: a base shard."""
+"""Stage synthesize: grasps of a hand on an object with their quality, in a base shard."""
 
 from __future__ import annotations
 
@@ -35,16 +35,16 @@ from graspd.worker.stages.context import Output, TaskContext
 from graspd.worker.stages.ranges import joined, sizes_of
 from graspd.worker.together import validated_batches
 
-#: Columns of the scene shard that stand in the base shard as well: so it can be used by itself.
+#: Columns of the scene shard that the base shard repeats, so that it can be used alone.
 _OF_SCENES: Final = ("scene/object_pose", "scene/rest_probability", "scene/neighbour_pose")
 
 
 def run(message: TaskMessage, context: TaskContext) -> Output:
-    """Grasps with quality and verdict: `message.count` valid ones, as far as the job's budget goes.
+    """Plan and validate `message.count` valid grasps within the job's budget.
 
     Raises:
-        SceneError: no hand can reach into the scenes, a job's first batch finds no grasp, or its method knows none.
-        LoadError: a job's first batch finds none, since the hand lifts far less.
+        SceneError: no hand reaches into the scenes, the first batch finds no grasp, or the method cannot plan in them.
+        LoadError: a job's first batch finds none because the payload is far too small.
     """
     hand, obj = hand_of(context.store, message), object_of(context.store, message)
     keep_network(context.store, message)
@@ -66,7 +66,7 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
             empty_on=(NoStartFound,) if scenes else (),
         )
     except InputError as error:
-        # Of hand and object there are errors of their own; what is left is that no hand finds a way in.
+        # Errors of hand and object have their own classes; here no hand reaches into the scene.
         if scenes and type(error) in (InputError, NoStartFound):
             raise SceneError(str(error)) from None
         raise
@@ -85,7 +85,7 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
 
 
 def _output(found: ValidatedBatch, columns: Mapping[str, NDArray[Any]]) -> Output:
-    """The columns of one batch, and what is told of it."""
+    """Return the columns and records of one batch."""
     seconds = {f"{name}_seconds": round(value, 4) for name, value in found.seconds.items()}
     shares = {name: round(value, 4) for name, value in found.shares.items()}
     info = {
@@ -100,7 +100,7 @@ def _output(found: ValidatedBatch, columns: Mapping[str, NDArray[Any]]) -> Outpu
 
 
 def _scene_columns(message: TaskMessage, context: TaskContext) -> list[dict[str, NDArray[Any]]]:
-    """Where the object stands in the scenes of each batch; none where it floats."""
+    """Return the object poses in the scenes of each batch; empty for free objects."""
     request = message.request
     if not request.in_scene:
         return []
@@ -116,7 +116,7 @@ def _scene_columns(message: TaskMessage, context: TaskContext) -> list[dict[str,
 
 
 def _scenes(message: TaskMessage, columns: dict[str, NDArray[Any]], context: TaskContext) -> Scenes:
-    """The scenes of a batch, with what stands there."""
+    """Return the scenes of a batch with supports and neighbours."""
     scenes = Scenes(supports_of(message.request.place), columns["scene/object_pose"])
     others = neighbours_of(context.store, message)
     if not others:
@@ -126,7 +126,7 @@ def _scenes(message: TaskMessage, columns: dict[str, NDArray[Any]], context: Tas
 
 
 def _check_hope(message: TaskMessage, batch: int, found: ValidatedBatch, *, in_scenes: bool) -> None:
-    """What the first batch does not find at all, the others of its job are not made to look for."""
+    """Stop a job whose first batch finds nothing: the others would not either."""
     request, limit = message.request, found.limit
     if batch or request.want == "candidates" or len(found.grasps):
         return
@@ -142,7 +142,7 @@ def _check_hope(message: TaskMessage, batch: int, found: ValidatedBatch, *, in_s
 
 
 def _json(info: dict[str, object]) -> dict[str, object]:
-    """The planner's remarks without nan and infinity, which JSON does not know."""
+    """Convert the planner's records for JSON, with None for nan and infinity."""
 
     def plain(value: Any) -> Any:
         if isinstance(value, dict):

@@ -204,7 +204,7 @@ def test_what_is_wanted_is_told_with_what_the_best_grasp_lifts() -> None:
 def test_weight_out_of_reach_ends_work_with_what_the_hand_lifts(tmp_path: Path, wanted: int) -> None:
     words = f"synth --hand allegro --object block --mass 20 --scene table -n {wanted} --fidelity draft --seed 3 -o"
     told = graspd(words, tmp_path / "g.h5", code=3)
-    assert (told["grasps"], told["tried"]) == (0, wanted), "the budget would be four times as many"
+    assert (told["grasps"], told["candidates"]) == (0, wanted), "the budget would be four times as many"
     assert 0.3 < told["limit"]["lifts_kg"] <= told["limit"]["bound_kg"] < 10
     tries = wanted + told["outcomes"]["repeated"]
     assert told["reason"].startswith(f"found 0 of {wanted} valid grasps in {tries} tries: ")

@@ -234,9 +234,9 @@ def test_terms_depend_not_on_grasps_but_on_everything_else(monkeypatch: pytest.M
         verdict_key(heavier, BOX, "dexgraspbench", False, pieces=WHOLE),
         verdict_key(PADS, BOX, "dexgraspbench", False, pieces=dataclasses.replace(WHOLE, digest="other")),
     }
-    for constant in ("postures.TOTAL_NORMAL_FORCE", "validator.protocol.HOLD_S", "validator.model.FRICTION"):
+    for constant in ("control.postures.TOTAL_NORMAL_FORCE", "validation.protocol.HOLD_S", "validation.model.FRICTION"):
         with monkeypatch.context() as patch:
-            patch.setattr(f"graspd.worker.quality.{constant}", 1.5)
+            patch.setattr(f"graspd.worker.{constant}", 1.5)
             others.add(verdict_key(PADS, BOX, "dexgraspbench", False, pieces=WHOLE))
     assert len(others) == 8
 

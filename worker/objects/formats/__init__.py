@@ -1,4 +1,4 @@
-"""Mesh files from bytes: STL, OBJ, PLY, OFF, GLB, DAE. The input may be hostile: no header's word is trusted."""
+"""Mesh files from bytes: STL, OBJ, PLY, OFF, GLB, DAE. The input may be hostile: no header is trusted."""
 
 from __future__ import annotations
 
@@ -29,19 +29,19 @@ READERS: Final[dict[str, Callable[[bytes], Soup]]] = {
 }
 
 
-#: How Python quotes what it cannot read as a number.
+#: Python's quotation of text that it cannot parse as a number.
 _NO_NUMBER: Final = re.compile(r": (?:np\.bytes_\()?b?'(.{1,40}?)'")
-#: Those that look at files beside the mesh for its colours.
+#: Readers that use files beside the mesh for its colours.
 _WITH_LOOKS: Final[dict[str, Callable[[bytes, Nearby], Soup]]] = {".obj": obj.read, ".dae": dae.read}
 
 
 def read_mesh(filename: str, data: bytes, nearby: Nearby = nothing_nearby) -> Soup:
-    """Vertices and triangles of a mesh file; the extension names the format.
+    """Read vertices and triangles of a mesh file; the extension determines the format.
 
     Args:
         filename: its name.
         data: its bytes.
-        nearby: gives material libraries and pictures by the names that the file has for them.
+        nearby: returns material libraries and pictures by their names in the file.
 
     Raises:
         MeshError: unknown format, unreadable, no faces, a bad index or a coordinate that is not finite.
@@ -57,14 +57,14 @@ def read_mesh(filename: str, data: bytes, nearby: Nearby = nothing_nearby) -> So
     text = _marked_text(data)
     refuse_stand_in(filename, text, MeshError)
     try:
-        # Wild numbers are found by the check below, not by NumPy's warnings.
+        # The check below finds invalid numbers; NumPy's warnings are not needed.
         with np.errstate(all="ignore"):
             looks = _WITH_LOOKS.get(suffix)
             return check_soup(looks(text, nearby) if looks else reader(text))
     except GraspdError as error:
         raise type(error)(f"{filename}: {other_format(filename, text) or error}") from None
     except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError, struct.error) as error:
-        # Readers lean on NumPy and json for the odd cases: whatever they choke on is the file's fault.
+        # Readers rely on NumPy and json for malformed input: any error there is due to the file.
         kind = suffix[1:].upper()
         word = _NO_NUMBER.search(str(error))
         what = f"{word[1]!r} is no number" if word else f"a number or word in it is none that {kind} has there"
@@ -72,7 +72,7 @@ def read_mesh(filename: str, data: bytes, nearby: Nearby = nothing_nearby) -> So
 
 
 def _marked_text(data: bytes) -> bytes:
-    """Data without the byte order mark of a text: editors write it, and formats do not have it."""
+    """Return text data without its byte order mark, which editors write and formats exclude."""
     if data.startswith(codecs.BOM_UTF8):
         return data[len(codecs.BOM_UTF8) :]
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):

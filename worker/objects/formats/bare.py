@@ -1,5 +1,5 @@
-"""Formats of bare geometry: PLY (ASCII, binary of both byte orders), STL (binary, ASCII), OFF. Colours and normals are
-passed over."""
+"""Formats of bare geometry: PLY (ASCII, binary of both byte orders), STL (binary, ASCII), OFF.
+Colours and normals are ignored."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class _Element:
 
 
 def read_ply(data: bytes) -> Soup:
-    """Vertices x y z and the polygons of `vertex_indices`."""
+    """Read vertices x y z and the polygons of `vertex_indices`."""
     found = re.search(rb"[\r\n]end_header", data[:65536])
     if not data.startswith(b"ply") or found is None:
         raise MeshError("a PLY file begins with the word ply and a header of at most 64 KiB")
@@ -71,12 +71,12 @@ def read_ply(data: bytes) -> Soup:
 
 
 def _line_end(header: bytes) -> bytes:
-    """How lines of the header end: what follows it may be binary and begin with any byte."""
+    """Return the line end of the header: data after it may be binary and begin with any byte."""
     return next(end for end in (b"\r\n", b"\n", b"\r") if end in header)
 
 
 def _header(lines: list[str]) -> tuple[str | None, list[_Element]]:
-    """Byte order ("<", ">", None for ASCII) and the elements in the file's order."""
+    """Parse the byte order ("<", ">", None for ASCII) and the elements in the file's order."""
     order: str | None = ""
     elements: list[_Element] = []
     for line in lines:
@@ -89,7 +89,7 @@ def _header(lines: list[str]) -> tuple[str | None, list[_Element]]:
                 order = ">"
             case ["element", name, count]:
                 elements.append(_Element(name, int(count)))
-                # Of a closed mesh there are about half as many vertices as faces.
+                # A closed mesh has about half as many vertices as faces.
                 check_face_count(int(count) if name == "face" else int(count) // 4)
             case ["property", "list", count_type, type_, name]:
                 elements[-1].properties.append(_Property(name, _TYPES[type_], _TYPES[count_type]))
@@ -104,7 +104,7 @@ _Lists = dict[str, tuple[np.ndarray, np.ndarray]]
 
 
 class _Ascii:
-    """Reads one line per row."""
+    """Reader of one line per row."""
 
     def __init__(self, body: bytes) -> None:
         self._lines = [line for line in body.splitlines() if line.strip()]
@@ -134,7 +134,7 @@ class _Ascii:
 
 
 class _Binary:
-    """Reads rows of fixed width at once, rows with lists one by one."""
+    """Reader of all rows of fixed width at once, and of rows with lists one by one."""
 
     def __init__(self, body: bytes, order: str) -> None:
         self._body = body
@@ -150,7 +150,7 @@ class _Binary:
         return {}, uniform if uniform is not None else self._row_by_row(element)
 
     def _uniform(self, element: _Element) -> _Lists | None:
-        """All rows at once, if every list is as long as the first: the usual case of triangles only."""
+        """Read all rows at once if all lists have the first one's length: usually triangles only."""
         first = self._at
         (name,) = self._row_by_row(_Element(element.name, min(element.count, 1), element.properties)).items()
         self._at = first
@@ -201,7 +201,7 @@ _VERTEX = re.compile(rb"vertex\s+(\S+)\s+(\S+)\s+(\S+)", re.IGNORECASE)
 
 
 def read_stl(data: bytes) -> Soup:
-    """Triangles of an STL file; each has its own three vertices."""
+    """Read triangles of an STL file; each has its own three vertices."""
     if len(data) >= _HEADER and len(data) == _HEADER + _RECORD.itemsize * _promised(data):
         return _binary(data, _promised(data))
     if b"\0" not in data[:1024] and (_FACET.search(data) or b"endsolid" in data[-1024:].lower()):
@@ -213,7 +213,7 @@ def read_stl(data: bytes) -> Soup:
     held = (len(data) - _HEADER) / _RECORD.itemsize
     if _promised(data) > held:
         raise MeshError(f"truncated: the header promises {_promised(data)} faces, the file holds {int(held)}")
-    # Some exporters append their own data: what the header promises is all there.
+    # Some exporters append their own data: the length in the header is complete.
     return _binary(data, _promised(data))
 
 
@@ -241,12 +241,12 @@ def _soup(corners: np.ndarray) -> Soup:
     return Soup(corners, np.arange(len(corners), dtype=np.int64).reshape(-1, 3))
 
 
-#: The word may have the counts glued to it (ModelNet40), and letters before it for what vertices have besides.
+#: The keyword may be joined with the counts (ModelNet40), and letters before it name further vertex data.
 _HEAD: Final = re.compile(rb"(?:ST)?C?N?(4?n?)OFF(?![A-Z])(\s*BINARY)?", re.IGNORECASE)
 
 
 def read_off(data: bytes) -> Soup:
-    """Triangles of the polygons of an OFF file."""
+    """Read triangles of the polygons of an OFF file."""
     lines = [line for raw in data.splitlines() if (line := raw.partition(b"#")[0].strip())]
     head = _HEAD.match(lines[0]) if lines else None
     if head is None:

@@ -1,7 +1,7 @@
-"""COLLADA: triangles of all meshes of the scene in metres, with the diffuse colours of their materials or the means of
-their pictures.
+"""COLLADA: triangles of all meshes of the scene in metres, and their colours.
+A colour is the diffuse colour of the material or the mean of its picture.
 
-The file's unit is applied and its up axis is not: so do the viewers of ROS, for which such meshes are made.
+The file's unit is applied, its up axis is not, as in the viewers of ROS, for which such meshes are made.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _Primitive = tuple[np.ndarray, np.ndarray, str]
 
 
 def read(data: bytes, nearby: Nearby = nothing_nearby) -> Soup:
-    """Vertices and triangles; every instance of a mesh in the node tree is its own copy."""
+    """Read vertices and triangles; every instance of a mesh in the node tree is its own copy."""
     root = _parse(data)
     library = _Library(root, nearby)
     vertices: list[np.ndarray] = []
@@ -58,7 +58,7 @@ def _parse(data: bytes) -> Element:
     except (ElementTree.ParseError, ValueError, LookupError) as error:
         raise MeshError(f"not well-formed XML ({str(error)[:80]}); export the mesh again") from None
     for element in root.iter():
-        # Versions 1.4 and 1.5 differ in the namespace, which says nothing here.
+        # Versions 1.4 and 1.5 differ only in the namespace.
         if isinstance(element.tag, str):
             element.tag = element.tag.rpartition("}")[2]
     if root.tag != "COLLADA":
@@ -67,7 +67,7 @@ def _parse(data: bytes) -> Element:
 
 
 def _unit(root: Element) -> float:
-    """Metres of one unit of the file."""
+    """Return the unit of the file in metres."""
     unit = root.find("asset/unit")
     metres = float(unit.get("meter", "1")) if unit is not None else 1.0
     if not 1e-9 < metres < 1e9:
@@ -76,7 +76,7 @@ def _unit(root: Element) -> float:
 
 
 class _Library:
-    """What the parts of a file call each other by."""
+    """Parts of a file by their ids."""
 
     def __init__(self, root: Element, nearby: Nearby) -> None:
         self._nearby = nearby
@@ -131,13 +131,13 @@ class _Library:
         return values[start : start + count * stride].reshape(count, stride)[:, :3]
 
     def colour(self, material: str) -> np.ndarray:
-        """(3,) sRGB diffuse colour of a material; NaN where it has none."""
+        """Return the sRGB diffuse colour (3,) of a material; NaN if it has none."""
         if material not in self._colours:
             self._colours[material] = self._diffuse(material)
         return self._colours[material]
 
     def _picture(self, effect: Element, sampler: str) -> str:
-        """The file behind a sampler: it names a surface, and that an image."""
+        """Return the file of a sampler: it names a surface, and that an image."""
         name = sampler
         for _ in range(2):
             param = next((p for p in effect.iter("newparam") if p.get("sid") == name), None)
@@ -168,7 +168,7 @@ class _Library:
 
 
 def _polygons(primitive: Element, kind: str, stride: int) -> tuple[np.ndarray, np.ndarray]:
-    """Corners of each polygon, and the indices of all corners one after another."""
+    """Return the number of corners of each polygon, and the concatenated indices of all corners."""
     if kind == "polygons":
         parts = [_numbers(part).astype(np.int64) for part in primitive.findall("p")]
         counts = np.array([len(part) // stride for part in parts], dtype=np.int64)
@@ -184,7 +184,7 @@ def _numbers(element: Element | None) -> np.ndarray:
 
 
 def _instances(root: Element, library: _Library) -> Iterator[tuple[str, np.ndarray, dict[str, str]]]:
-    """Geometry, 4x4 matrix and material of each symbol, of every mesh that the scene shows."""
+    """Return geometry, 4x4 matrix and material of each symbol for every mesh in the scene."""
     shown = root.find("scene/instance_visual_scene")
     scene = library.named(shown.get("url")) if shown is not None else root.find("library_visual_scenes/visual_scene")
     stack = [(node, np.eye(4), 0) for node in (scene.findall("node") if scene is not None else [])]
@@ -208,7 +208,7 @@ def _instances(root: Element, library: _Library) -> Iterator[tuple[str, np.ndarr
 
 
 def _matrix(node: Element) -> np.ndarray:
-    """Product of a node's transforms, in their order."""
+    """Return the product of a node's transforms, in their order."""
     matrix = np.eye(4)
     for element in node:
         step = np.eye(4)
@@ -228,7 +228,7 @@ def _matrix(node: Element) -> np.ndarray:
 
 
 def _rotation(x: float, y: float, z: float, degrees: float) -> np.ndarray:
-    """Rodrigues' formula; a zero axis turns nothing."""
+    """Apply Rodrigues' formula; a zero axis gives no rotation."""
     length = math.sqrt(x * x + y * y + z * z)
     if length < 1e-12:
         return np.eye(3)

@@ -1,6 +1,6 @@
-"""GLB (binary glTF 2.0): triangles of all meshes of the scene, in the scene's frame and metres, and their colours.
+"""GLB (binary glTF 2.0): triangles of all meshes of the scene, in its frame and metres, with colours.
 
-A colour is the base colour of the material, times the mean of its texture where that lies in the file.
+A colour is the base colour of the material, times the mean of its texture if that is in the file.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ from graspd.worker.objects.formats.obj import UNREADABLE, mean_colour
 from graspd.worker.objects.formats.soup import Soup, check_face_count
 
 _INDEX_TYPES = {5121: "<u1", 5123: "<u2", 5125: "<u4"}
-#: Positions are floats, or with KHR_mesh_quantization whole numbers that nodes or `normalized` scale.
+#: Positions are floats, or with KHR_mesh_quantization integers that nodes or `normalized` scale.
 _POSITION_TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 _TRIANGLES, _MAX_DEPTH = 4, 32
-#: Extensions that hold or place vertices: refused by their names wherever they stand.
+#: Extensions that contain or place vertices: refused by name wherever they occur.
 _GEOMETRY = ("KHR_draco_", "EXT_meshopt_", "KHR_meshopt_", "EXT_mesh_gpu_instancing")
-#: Extensions that move no vertex; any other one that a file requires is refused by its name.
+#: Extensions that move no vertex; any other one that a file requires is refused by name.
 _HARMLESS = ("KHR_mesh_quantization", "KHR_materials_", "KHR_texture_", "EXT_texture_", "KHR_lights_", "KHR_xmp_")
 _MAX_INSTANCES = 10_000
 _UNKNOWN: Final = np.full(3, np.nan)
 
 
 def read(data: bytes) -> Soup:
-    """Vertices and triangles; every instance of a mesh in the node tree is its own copy."""
+    """Read vertices and triangles; every instance of a mesh in the node tree is its own copy."""
     document, binary = _chunks(data)
     for name in map(str, _list(document, "extensionsRequired")):
         if not name.startswith(_HARMLESS):
@@ -43,7 +43,7 @@ def read(data: bytes) -> Soup:
         shown = _item(document, "meshes", mesh)
         _refuse_morphs(shown)
         for part, primitive in enumerate(shown["primitives"]):
-            # Points and lines have no surface: exporters of CAD put the edges of faces beside them.
+            # Points and lines have no surface: CAD exporters add the edges of faces as lines.
             if 0 <= primitive.get("mode", _TRIANGLES) < _TRIANGLES:
                 continue
             points, triangles = _primitive(document, binary, primitive)
@@ -82,7 +82,7 @@ def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
 
 
 def _instances(document: dict[str, Any]) -> list[tuple[int, np.ndarray]]:
-    """(mesh, 4x4 matrix) of every node of the scene that shows a mesh."""
+    """Return (mesh, 4x4 matrix) of every node with a mesh in the scene."""
     nodes = _list(document, "nodes")
     scenes = _list(document, "scenes")
     if scenes:
@@ -172,7 +172,7 @@ def _accessor(document: dict[str, Any], binary: bytes, index: Any, shape: str) -
 
 
 def _refuse_extensions(part: dict[str, Any]) -> None:
-    """What a file does not require may be passed over, but for what stands in place of the vertices."""
+    """Refuse extensions that replace the vertices; others that a file does not require are ignored."""
     for name in part.get("extensions", {}):
         if name.startswith(_GEOMETRY):
             raise _refusal(name)
@@ -203,7 +203,7 @@ def _list(document: dict[str, Any], key: str) -> list[Any]:
 
 
 def material_colour(document: dict[str, Any], binary: bytes, primitive: dict[str, Any]) -> Floats:
-    """(3,) sRGB colour, 0 .. 1, of a primitive; NaN where none is stated or it cannot be read."""
+    """Return the sRGB colour (3,), 0 .. 1, of a primitive; NaN if it is not stated or unreadable."""
     try:
         material = document["materials"][int(primitive["material"])]["pbrMetallicRoughness"]
         factor = np.array(material.get("baseColorFactor", (1.0, 1.0, 1.0, 1.0)), float)[:3].reshape(3)
@@ -214,13 +214,13 @@ def material_colour(document: dict[str, Any], binary: bytes, primitive: dict[str
         else:
             return _UNKNOWN
     except (LookupError, TypeError, AttributeError, *UNREADABLE):
-        # A picture says nothing of the shape: what cannot be read of it is left out.
+        # A picture does not affect the shape: an unreadable one is left out.
         return _UNKNOWN
     return np.clip(colour, 0, 1) if np.isfinite(colour).all() else _UNKNOWN
 
 
 def _mean(document: dict[str, Any], binary: bytes, texture: dict[str, Any]) -> Floats:
-    """(3,) sRGB mean of an image in the file."""
+    """Return the sRGB mean (3,) of an image in the file."""
     image = document["images"][int(document["textures"][int(texture["index"])]["source"])]
     view = document["bufferViews"][int(image["bufferView"])]
     start = int(view.get("byteOffset", 0))

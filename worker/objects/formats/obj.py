@@ -1,5 +1,5 @@
-"""Wavefront OBJ: positions, polygons, colours of vertices, of materials or of the mean of their picture; normals and
-groups are passed over."""
+"""Wavefront OBJ: positions, polygons, and colours of vertices, materials or their pictures' mean.
+Normals and groups are ignored."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ _NO_COLOUR = [b"nan", b"nan", b"nan"]
 
 
 def nothing_nearby(reference: str) -> bytes | None:
-    """For a mesh that stands alone."""
+    """Return None: resolver for a mesh without other files."""
     return None
 
 
 def read(data: bytes, nearby: Nearby = nothing_nearby) -> Soup:
-    """Triangles of the polygons; negative indices count from the latest vertex. A face has its corners' mean colour, or
-    where they have none that of its material."""
+    """Read triangles of the polygons; negative indices count from the latest vertex.
+    A face has its corners' mean colour, or else that of its material."""
     vertices: list[list[bytes]] = []
     shades: list[list[bytes]] = []
     corners: list[int] = []
@@ -41,7 +41,7 @@ def read(data: bytes, nearby: Nearby = nothing_nearby) -> Soup:
             if len(numbers) < 3:
                 raise MeshError(f"vertex {len(vertices)} has fewer than three coordinates")
         elif line.startswith(b"f "):
-            # OBJ counts from 1, backwards from the end where the index is negative.
+            # OBJ counts from 1, backwards from the end for negative indices.
             face = [_index(part.partition(b"/")[0], len(vertices)) for part in line.split()[1:]]
             corners += face
             counts.append(len(face))
@@ -66,7 +66,7 @@ def _material_colours(
     counts: np.ndarray,
     shown: np.ndarray | None,
 ) -> np.ndarray | None:
-    """(F, 3) `shown`, and the colour of its material for each face without one; None where none has one."""
+    """Return `shown` (F, 3), with material colours for faces without a colour; None if no face has one."""
     known: dict[bytes, np.ndarray] = {}
     for name in libraries:
         data = nearby(name.decode(errors="replace"))
@@ -78,7 +78,7 @@ def _material_colours(
     row = {name: 1 + number for number, name in enumerate(names)}
     palette = np.array([unknown, *(known.get(name, unknown) for name in names)])
     starts = np.array([first for first, _ in used])
-    # Polygons before the first `usemtl` have no material; each becomes as many triangles as `triangulate` makes of it.
+    # Polygons before the first `usemtl` have no material; each becomes as many triangles as in `triangulate`.
     material = np.array([0, *(row[name] for _, name in used)])
     of_polygon = material[np.searchsorted(starts, np.arange(len(counts)), side="right")]
     colours = palette[np.repeat(of_polygon, np.maximum(counts - 2, 0))]
@@ -86,7 +86,7 @@ def _material_colours(
 
 
 def _face_colours(shades: list[list[bytes]], faces: np.ndarray) -> np.ndarray | None:
-    """(F, 3), NaN where a corner has none. In a few steps: each colour is a part to be drawn."""
+    """Return (F, 3), NaN without a colour; quantised coarsely, since each colour is drawn as a part."""
     if all(shade is _NO_COLOUR for shade in shades) or (faces >= len(shades)).any() or (faces < 0).any():
         return None
     known = np.array(shades, dtype="S40").astype(float).reshape(-1, 3)
@@ -106,7 +106,7 @@ def _lines(data: bytes) -> Iterable[bytes]:
     for raw in data.splitlines():
         line = raw.strip()
         if not line.startswith((b"usemtl", b"mtllib")):
-            # A comment may end in a backslash, a path say, and continues nothing.
+            # A comment may end in a backslash, such as a path, but does not continue.
             line = line.partition(b"#")[0].rstrip()
         line = pending + line
         if line.endswith(b"\\"):
@@ -118,15 +118,15 @@ def _lines(data: bytes) -> Iterable[bytes]:
         yield line.replace(b"\t", b" ")
 
 
-#: Materials that a library may have.
+#: Largest number of materials in a library.
 MAX_MATERIALS: Final = 1024
 Nearby = Callable[[str], bytes | None]
 
-"""Bytes of a file by the name that a mesh gives it; None: it is not among the hand's files."""
+"""Returns the bytes of a file by its name in a mesh; None: it is not among the hand's files."""
 
 
 def read_materials(data: bytes, nearby: Nearby) -> dict[bytes, Floats]:
-    """(3,) sRGB of each material, 0 .. 1. A picture goes over the number; what cannot be read is left out."""
+    """Read each material's sRGB colour (3,), 0 .. 1. Pictures override numbers; unreadable: skipped."""
     found: dict[bytes, Floats] = {}
     name: bytes | None = None
     pictures = 0
@@ -147,7 +147,7 @@ def read_materials(data: bytes, nearby: Nearby) -> dict[bytes, Floats]:
 
 
 def colour_of(reference: str, nearby: Nearby) -> Floats | None:
-    """Mean colour of a picture beside the mesh; None where it is not there or cannot be read."""
+    """Return the mean colour of a picture beside the mesh; None if it is missing or unreadable."""
     try:
         data = nearby(reference)
         return None if data is None else mean_colour(data)
@@ -163,17 +163,17 @@ def _numbers(text: bytes) -> Floats | None:
     return np.clip(values, 0, 1) if len(values) == 3 and np.isfinite(values).all() else None
 
 
-#: Larger textures are not looked at [pixels].
+#: Largest texture that is read [pixels].
 MAX_PIXELS: Final = 2**24
-#: What an unreadable picture may raise.
+#: Errors of unreadable pictures.
 UNREADABLE: Final = (ValueError, OSError, SyntaxError)
 
 
 def mean_colour(data: bytes) -> Floats:
-    """(3,) sRGB mean of a PNG or JPEG, 0 .. 1.
+    """Compute the sRGB mean (3,) of a PNG or JPEG, 0 .. 1.
 
     Raises:
-        ValueError, OSError, SyntaxError: it is too large, or no such picture (`UNREADABLE`).
+        ValueError, OSError, SyntaxError: too large, or not such a picture (`UNREADABLE`).
     """
     from PIL import Image  # few meshes have pictures, and every process reads meshes
 

@@ -1,4 +1,4 @@
-"""Triangles of a file, checked for what no later step could survive; polygons are cut into triangles."""
+"""Triangles of a file, checked for data that later steps cannot handle; polygons are triangulated."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from graspd.service.model.errors import LimitError, MeshError
 from graspd.service.model.transforms import Floats
 
 MAX_FACES: Final = 1_000_000
-#: Coordinates beyond this are no length in any unit.
+#: Largest plausible coordinate in any unit.
 MAX_COORDINATE: Final = 1e11
 
 
 @dataclass(frozen=True)
 class Soup:
-    """Vertices (V, 3) in the file's unit and triangles (F, 3) as indices; nothing is known of their topology."""
+    """Vertices (V, 3) in the file's unit and triangles (F, 3) as indices, with unknown topology."""
 
     vertices: NDArray[np.float64]
     faces: NDArray[np.int64]
     colours: NDArray[np.float64] | None = None
-    """(F, 3) sRGB colour of each face, 0 .. 1, NaN where none is stated; None: no face has one."""
+    """(F, 3) sRGB colour of each face, 0 .. 1, NaN if not stated; None: no face has one."""
 
     def by_colour(self) -> list[tuple[tuple[float, float, float] | None, NDArray[np.intp]]]:
-        """Each colour with the indices of its faces; None for those without."""
+        """Return each colour with the indices of its faces; None for those without."""
         if self.colours is None:
             return [(None, np.arange(len(self.faces)))]
         # NaN is not equal to itself; no colour is below 0.
@@ -39,7 +39,7 @@ class Soup:
 
 
 def check_soup(soup: Soup) -> Soup:
-    """The soup itself if it has faces, feasible indices and finite vertices."""
+    """Return the soup itself if it has faces, valid indices and finite vertices."""
     vertices, faces = soup.vertices, soup.faces
     if not len(faces):
         raise MeshError("the mesh has no faces; export the surface, not points alone")
@@ -57,23 +57,23 @@ def check_soup(soup: Soup) -> Soup:
 
 
 def check_face_count(count: int) -> None:
-    """LimitError for more faces than are taken."""
+    """Raise LimitError for too many faces."""
     if count > MAX_FACES:
         raise LimitError(f"{count} faces; at most {MAX_FACES} are taken: decimate the mesh first")
 
 
 Ints = NDArray[np.int64]
 
-#: The triangulator takes up to 2 ns times the square of the corners: the squares of a file's re-entrant polygons.
+#: Limit on the sum of squared corner numbers of a file's re-entrant polygons: the triangulator takes up to 2 ns each.
 MAX_SQUARES: Final = 10**9
-#: A triangle against the polygon's winding counts from this share of the polygon's area on.
+#: Least area, relative to the polygon's, of a triangle that counts as against the polygon's winding.
 _AGAINST: Final = 1e-9
 
 
 def triangulate(vertices: Floats, counts: Ints, corners: Ints) -> Ints:
-    """Triangles (F, 3) of polygons with `counts` corners each, laid out one after another in `corners`.
+    """Triangulate polygons with `counts` corners each, concatenated in `corners`; return triangles (F, 3).
 
-    A polygon is cut as a fan from its first corner, or by manifold3d's ear clipping where the fan would leave it. Faces
+    A polygon is cut as a fan from its first corner, or by manifold3d's ear clipping if the fan would leave it. Faces
     with fewer than three corners are dropped.
 
     Raises:
@@ -90,7 +90,7 @@ def triangulate(vertices: Floats, counts: Ints, corners: Ints) -> Ints:
     a, b, c = np.moveaxis(vertices[triangles], 1, 0)
     normals = np.cross(b - a, c - a)
     owner = np.repeat(np.arange(len(counts)), number)
-    # The sum over a fan is the polygon's vector area, whatever its corners do.
+    # The sum over a fan is the polygon's vector area for any position of its corners.
     whole = np.stack([np.bincount(owner, normals[:, k], len(counts)) for k in range(3)], axis=1)
     against = np.einsum("ij,ij->i", normals, whole[owner]) < -_AGAINST * np.einsum("ij,ij->i", whole, whole)[owner]
     wrong = np.unique(owner[against])
@@ -99,14 +99,14 @@ def triangulate(vertices: Floats, counts: Ints, corners: Ints) -> Ints:
     for one in wrong:
         ring = corners[starts[one] : starts[one] + counts[one]]
         inside = manifold3d.triangulate([_flat(vertices[ring], whole[one])])
-        # A polygon that crosses itself may come back with fewer: it stays a fan.
+        # A self-intersecting polygon may come back with fewer: it stays a fan.
         if len(inside) == number[one]:
             triangles[ends[one] - number[one] : ends[one]] = ring[inside]
     return triangles
 
 
 def _flat(points: Floats, normal: Floats) -> Floats:
-    """(n, 2) points as seen against `normal`, counter-clockwise."""
+    """Project points to (n, 2) as seen against `normal`, counter-clockwise."""
     axis = normal / np.linalg.norm(normal)
     across = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
     across /= np.linalg.norm(across)

@@ -1,1 +1,1 @@
-"""Fast-Grasp'D (Turpin et al., ICRA 2023): grasps by gradient descent through a differentiable contact simulation."""
+"""Fast-Grasp'D (Turpin et al., ICRA 2023): descent through a differentiable contact simulation."""

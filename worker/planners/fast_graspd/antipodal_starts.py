@@ -1,13 +1,13 @@
-"""Antipodal starts: a hand whose fingers oppose one another, opened a little wider than the object is there.
+"""Antipodal starts: opposed fingers around a pair of surface points, opened slightly wider than it.
 
-An object is held where two patches of its surface look away from each other (antipodal points: Nguyen, "Constructing
-force-closure grasps", 1988). They are found by comparing samples of the surface with one another.
+The two surface points face away from each other (antipodal points: Nguyen, "Constructing force-closure grasps", 1988).
+Pairs are found by comparing samples of the surface with one another.
 
-How far hands must rise until they are clear of what stands around, told by a few points of their outline: cheap
-enough for many more hands than are looked at exactly.
+A few outline points per posture give the distance by which a hand must rise to be clear of obstacles. The test is
+cheap enough for many more hands than the exact collision test.
 
-A fingertip is taken as a ball as wide as the thinnest fingertip of the hand, beside an end of a pair of points that the
-hand could hold between. This is necessary for a grasp between opposed fingertips and not sufficient.
+A fingertip is modelled as a ball as wide as the hand's thinnest fingertip, beside an end of a pair that the hand could
+hold. Space for this ball is necessary for a grasp between opposed fingertips, not sufficient.
 """
 
 from __future__ import annotations
@@ -32,30 +32,30 @@ from graspd.worker.simulation.environment import CLEAR_M, Environment
 from graspd.worker.simulation.mounting import OUTERMOST, points_of
 from graspd.worker.simulation.obstacles import MARGIN_M
 
-#: Points of the surface that pairs are made of, and how far their line may turn from their normals (cosine): within
-#: the cones of half the friction. With 0.9 Allegro lifts .39 of six objects at half of it and Shadow .30, with these
-#: .42 and .39.
+#: Number of surface samples that form pairs, and the least cosine between a pair's line and its normals: within the
+#: friction cones of half the friction. With 0.9 Allegro lifts .39 of six objects at half friction and Shadow .30; with
+#: 0.96 they lift .42 and .39.
 SAMPLES: Final = 500
 ACROSS: Final = 0.96
 #: Least distance of the two points [m].
 THINNEST_M: Final = 0.002
-#: Room between pad and object, each side [m].
+#: Clearance between pad and object, on each side [m].
 ROOM_M: Final = (0.003, 0.015)
-#: Pairs this far beside the centre of mass, as gravity sees it, are drawn e times less often [m]; any pair is drawn at
-#: `FAR` of the best one's chance, and what is steep or hard to get at still less. With 30 mm and 0.02 Allegro holds
-#: 0.28 of six objects at half the friction, with these 0.38.
+#: At this horizontal distance from the centre of mass [m] the chance of a pair falls by a factor of e. It is at least
+#: `FAR` of the best pair's. Steep pairs and pairs that are hard to reach are rarer still. With 30 mm and 0.02 Allegro
+#: holds 0.28 of six objects at half friction, with these values 0.38.
 BESIDE_M: Final = 0.02
 FAR: Final = 0.005
 STEEP: Final = 0.5
 SELDOM: Final = 0.1
-#: A hand whose pads are so near to either side of its pair reaches across it well enough [m].
+#: Largest distance of the pads from the ends of the pair at which a candidate counts as near enough [m].
 NEAR_M: Final = 0.008
-#: Hands whose draws are compared at once: more only take memory.
+#: Number of hands whose draws are compared at once; more would only take memory.
 AT_ONCE: Final = 256
-#: How upright hands come to what lies flat (cosine).
+#: Least cosine between an approach from above and the vertical, for flat objects.
 UPRIGHT: Final = 0.9
-#: Noise of the posture as a share of each joint's range, ways that are compared, and differences of width that postures
-#: are taken from [m].
+#: Noise of the posture as a share of each joint's range; number of directions compared per draw; tolerance of postures
+#: below and above the drawn width [m].
 NOISE: Final = 0.03
 WAYS: Final = 4
 ALIKE_M: Final = (0.002, 0.006)
@@ -63,7 +63,7 @@ ALIKE_M: Final = (0.002, 0.006)
 
 @dataclass(frozen=True)
 class Crossings:
-    """P pairs of surface points of an object that look away from each other, object frame."""
+    """P pairs of surface points of an object that face away from each other, object frame."""
 
     middle: Floats
     """(P, 3) [m]"""
@@ -76,7 +76,7 @@ class Crossings:
         return len(self.width)
 
     def ends(self) -> tuple[Floats, Floats]:
-        """The two points (P, 3) of each pair."""
+        """Return the two points (P, 3) of each pair."""
         half = 0.5 * self.width[:, None] * self.axis
         return self.middle - half, self.middle + half
 
@@ -86,7 +86,7 @@ _lock = threading.Lock()
 
 
 def crossings_of(obj: ObjectModel) -> Crossings:
-    """The pairs of an object, from memory where they are known."""
+    """Return the pairs of an object, cached."""
     with _lock:
         if obj.content not in _known:
             _known[obj.content] = _crossings(obj)
@@ -105,7 +105,7 @@ def _crossings(obj: ObjectModel) -> Crossings:
 
 
 def _surface(obj: ObjectModel) -> tuple[Floats, Floats]:
-    """(SAMPLES, 3) area-uniform points and the normals of their faces."""
+    """Return (SAMPLES, 3) area-uniform points and the normals of their faces."""
     rng = np.random.default_rng(0)
     corners = obj.vertices[obj.faces]
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -120,26 +120,26 @@ def _surface(obj: ObjectModel) -> tuple[Floats, Floats]:
 
 @dataclass(frozen=True)
 class Openings:
-    """What a hand may take hold of in one scene."""
+    """Pairs that a hand may grasp in one scene."""
 
     pairs: Crossings
     sums: Floats
-    """(P,) cumulative chance; empty: there is nothing."""
+    """(P,) cumulative chance; empty if there is no pair."""
     known: Oppositions
     """The hand's postures."""
     up: Floats
     """(3,) against gravity, object frame."""
     upright: bool
-    """Whether the hand comes from above and takes hold of level pairs alone."""
+    """Whether the hand comes from above and grasps level pairs only."""
     within_reach: bool
-    """Whether a pair lies nearly level, clear of the obstacles, and is no wider than the hand opens: the geometric
-    condition for a grasp between opposed fingers from above or from the side."""
+    """Whether a pair is nearly level, clear of obstacles, and no wider than the hand opens.
+    This is the geometric condition for a grasp between opposed fingers from above or from the side."""
 
     @classmethod
     def of(
         cls, known: Oppositions, obj: ObjectModel, scene: Environment, *, tip: float = 0.0, upright: bool = False
     ) -> Openings:
-        """`tip`: thickness of the fingertips that must fit beside a pair [m]; `upright` as the field."""
+        """Select pairs; `tip`: thickness of fingertips that must fit beside them [m]; `upright`: the field."""
         pairs = crossings_of(obj)
         level = np.abs(pairs.axis @ scene.up) < STEEP
         fits = pairs.width + 2 * ROOM_M[0] <= known.widest
@@ -163,7 +163,7 @@ class Openings:
 
     @classmethod
     def in_scene(cls, hand: HandModel, obj: ObjectModel, scene: Environment) -> Openings:
-        """The same between the pads, or of what lies flat between the ends of fingertips that rest beside it."""
+        """Select pairs for fingertips that rest beside a flat object, or else for the pads."""
         ends = pinches_of(hand, float(np.ptp(obj.hull_vertices @ scene.up)))
         tip = thinnest_fingertip(hand)
         flat = cls.of(ends, obj, scene, tip=tip, upright=True)
@@ -171,8 +171,8 @@ class Openings:
 
 
 def room_beside(pairs: Crossings, scene: Environment, width: float) -> Floats:
-    """(P,) least distance of balls of a diameter beside the ends of pairs from walls and neighbours, not from what the
-    object stands on [m]."""
+    """Return the least clearance (P,) of balls of diameter `width` beside the ends of pairs [m].
+    Walls and neighbours count; the object's own support is ignored."""
     out = np.full(len(pairs), np.inf)
     for obstacle in scene.obstacles:
         if not len(obstacle.corners) and float(obstacle.planes[0, :3] @ scene.up) > STEEP:
@@ -184,28 +184,28 @@ def room_beside(pairs: Crossings, scene: Environment, width: float) -> Floats:
 
 @dataclass(frozen=True)
 class AntipodalHands:
-    """n hands that reach across the object."""
+    """n hands that oppose their fingers across the object."""
 
     known: Oppositions
     posture: NDArray[np.intp]
-    """(n,) which of these."""
+    """(n,) indices into `known`."""
     pivot: Floats
-    """(n, 3) palm centres from the object's centre of mass [m]."""
+    """(n, 3) palm centres relative to the object's centre of mass [m]."""
     turn: Floats
     """(n, 3, 3) rotations."""
     away: Floats
     """(n, 3) directions of retreat."""
     deep: Floats
-    """(n,) how far beyond the pair the pads are, for the palm to be nearer to the object [m]."""
+    """(n,) distance of the pads beyond the pair, which brings the palm nearer to the object [m]."""
 
     def q(self, hand: HandModel, normal: Floats) -> Floats:
-        """Dofs (n, D) with the noise `normal` (n, D), normally distributed."""
+        """Return dofs (n, D) with normally distributed noise `normal` (n, D)."""
         known = self.known.q[self.posture]
         return np.clip(known + NOISE * hand.span * normal, hand.lower, hand.upper)
 
     def beside(self, moved: Floats) -> Floats:
-        """(n, ...) how far the pair lies beside or before the pads of hands that were moved by (n, ..., 3) [m]; what is
-        nearer to the palm lies between fingers as well."""
+        """Return the distance (n, ...) of the pair beside or in front of pads moved by (n, ..., 3) [m].
+        A pair nearer to the palm also lies between the fingers."""
         away = self.away.reshape(len(self.deep), *(1,) * (moved.ndim - 2), 3)
         off = moved - self.deep.reshape((*away.shape[:-1], 1)) * away
         along = np.einsum("n...i,ni->n...", off, self.away)
@@ -213,12 +213,12 @@ class AntipodalHands:
 
 
 def across(hand: HandModel, obj: ObjectModel, opening: Openings, uniform: Floats, ways: Floats) -> AntipodalHands:
-    """Hands that reach across the object.
+    """Place hands with opposed fingers across the object.
 
     Args:
         hand: the hand.
         obj: the object.
-        opening: pairs to take hold of, at least one.
+        opening: pairs to grasp, at least one.
         uniform: (n, 6) random numbers.
         ways: (K, 3) free directions away from the object.
     """
@@ -231,7 +231,7 @@ def across(hand: HandModel, obj: ObjectModel, opening: Openings, uniform: Floats
     low = np.searchsorted(known.width, width - ALIKE_M[0])
     high = np.maximum(np.searchsorted(known.width, width + ALIKE_M[1]), low + 1)
     posture = np.minimum(low + (uniform[:, 3] * (high - low)).astype(int), len(known) - 1)
-    # Of a few free ways the one that lies most across the line.
+    # Of a few free directions, choose the one most nearly perpendicular to the line.
     share = (uniform[:, 4:5] + np.arange(WAYS) * 0.6180339887) % 1.0
     tried = ways[(share * len(ways)).astype(int)]
     best = np.abs(np.einsum("nki,ni->nk", tried, axis)).argmin(axis=1)
@@ -239,7 +239,7 @@ def across(hand: HandModel, obj: ObjectModel, opening: Openings, uniform: Floats
     turn = frames(axis, -tried[np.arange(len(tried)), best]) @ np.swapaxes(frames(known.axis[posture], palm), -1, -2)
     away = -np.einsum("nij,nj->ni", turn, palm)
     reach = known.middle[posture] - hand.palm.centre
-    # Between holding with the fingertips and with the palm against the object.
+    # The depth ranges from a fingertip grasp to the palm against the object.
     deep = np.maximum(np.einsum("ni,ni->n", reach, palm), 0.0) * uniform[:, 5]
     pivot = opening.pairs.middle[pair] - np.einsum("nij,nj->ni", turn, reach) - deep[:, None] * away
     return AntipodalHands(known, posture, pivot - obj.centre_of_mass, turn, away, deep)
@@ -256,17 +256,17 @@ def promising(
     room: float,
     keep: int,
 ) -> tuple[NDArray[np.intp], Floats]:
-    """Of C draws of each of n hands those that need to rise least to be clear of obstacles, (n, keep), and how far the
-    pair is then from between their pads (n, keep) [m]. Those that are near enough keep their order.
+    """Select the `keep` of C draws per hand that need the least rise to clear the obstacles, (n, keep).
+    Also return the distance of the pair from between the pads (n, keep) [m]. Near enough draws keep their order.
 
     Args:
         hand: the hand.
         obj: the object.
-        opening: pairs to take hold of, at least one.
+        opening: pairs to grasp, at least one.
         uniform: (n, C, 6) random numbers.
         ways: (K, 3) free directions away from the object.
         scene: the obstacles.
-        room: to be kept from them besides the margin [m].
+        room: clearance to keep in addition to the margin [m].
         keep: at most C.
     """
     count, draws, _ = uniform.shape
@@ -280,7 +280,7 @@ def promising(
 
 
 def frames(first: Floats, second: Floats) -> Floats:
-    """(n, 3, 3) rotations whose first column is `first` (n, 3) and whose second lies as near `second` as it can."""
+    """Return rotations (n, 3, 3) with first column `first` (n, 3) and second column nearest to `second`."""
     y = second - np.einsum("ni,ni->n", first, second)[:, None] * first
     helper = np.eye(3)[np.argmin(np.abs(first), axis=1)]
     other = helper - np.einsum("ni,ni->n", first, helper)[:, None] * first
@@ -289,34 +289,34 @@ def frames(first: Floats, second: Floats) -> Floats:
     return np.stack([first, y, np.cross(first, y)], axis=-1)
 
 
-#: Directions in which a hand's outermost points are taken, of its fingertips and of the rest of it.
+#: Number of directions in which outermost points are taken, for the fingertips and for the rest of the hand.
 DIRECTIONS: Final = 20
 
 
 @dataclass(frozen=True)
 class PostureOutlines:
-    """Outermost points of a hand in each of its K opposed postures, from the palm's centre."""
+    """Outermost points of a hand in each of its K opposed postures, relative to the palm's centre."""
 
     points: Floats
     """(K, P, 3) [m]"""
     tips: NDArray[np.bool_]
-    """(P,) those of fingertips."""
+    """(P,) mask of the fingertips' points."""
     mounting: Floats
-    """(W, M, 3) outermost points of the mounting at each of its wrist positions, from the palm's centre [m]; W is 0
-    without one."""
+    """(W, M, 3) outermost points of the mounting at each wrist position, from the palm's centre [m].
+    W is 0 without a mounting."""
 
     def lacks(
         self, posture: NDArray[np.intp], turn: Floats, centre: Floats, scene: Environment, *, room: float
     ) -> Floats:
-        """(n,) what hands and their mountings lack of the distance from obstacles that they are to keep, and of `room`
-        besides [m]; 0 or more.
+        """Return the clearance (n,) from obstacles that hands and mountings lack [m], at least 0.
+        Required are the margin and `room`.
 
         Args:
-            posture: (n,) which of the K.
+            posture: (n,) indices into the K postures.
             turn: (n, 3, 3) rotations.
-            centre: (n, 3) centres of the palms, object frame [m].
+            centre: (n, 3) palm centres, object frame [m].
             scene: the obstacles.
-            room: [m]
+            room: clearance besides the margin [m].
         """
         place = np.matmul(self.points[posture], np.swapaxes(turn, -1, -2)) + centre[:, None]
         lack = np.zeros(len(posture))
@@ -326,7 +326,7 @@ class PostureOutlines:
         return np.maximum(lack, self._mounting_lacks(turn, centre, scene, MARGIN_M + room))
 
     def _mounting_lacks(self, turn: Floats, centre: Floats, scene: Environment, wanted: float) -> Floats:
-        """(n,) what mountings at the best of their wrist positions lack of the distance `wanted` from obstacles [m]."""
+        """Return the clearance (n,) that mountings lack to `wanted` at their best wrist position [m]."""
         least = np.full(len(turn), np.inf if len(self.mounting) else 0.0)
         for points in self.mounting:
             rows = np.flatnonzero(least > 0.0)
@@ -342,7 +342,7 @@ _outline_lock = threading.Lock()
 
 
 def outlines_of(hand: HandModel, postures: Oppositions) -> PostureOutlines:
-    """The outlines of opposed postures of a hand, from memory where they are known."""
+    """Return the outlines of opposed postures of a hand, cached."""
     key = (hand.content, postures.q.tobytes())
     with _outline_lock:
         if key not in _known_outlines:
@@ -366,13 +366,13 @@ def _outlines(hand: HandModel, q: Floats) -> PostureOutlines:
     return PostureOutlines(np.concatenate(points, axis=1) - hand.palm.centre, np.concatenate(tips), mounting)
 
 
-#: A gap that is wider is as good as this, and how exactly others are told [m].
+#: Gaps wider than this count as this wide, and the resolution of narrower ones [m].
 WIDEST_M: Final = 0.064
 EXACT_M: Final = 0.0005
 
 
 def why_narrow(hand: HandModel, obj: ObjectModel, scenes: Sequence[Environment]) -> str | None:
-    """Why no fingertips of a hand can hold an object between them in any of the scenes; None: nothing tells."""
+    """Explain why no fingertips of a hand can hold an object in any scene; None if no reason is found."""
     known, pairs = oppositions_of(hand), crossings_of(obj)
     if not len(known) or not len(pairs):
         return None
@@ -399,7 +399,7 @@ def why_narrow(hand: HandModel, obj: ObjectModel, scenes: Sequence[Environment])
 
 
 def _widest_gap(pairs: Crossings, fits: NDArray[np.bool_], scene: Environment, thin: float) -> float:
-    """The widest ball that fits beside both ends of one of the pairs that fit [m]; steep ones need room below them."""
+    """Return the diameter of the widest ball beside both ends of a pair [m]; steep pairs need space below."""
     level, above = np.abs(pairs.axis @ scene.up) < STEEP, np.ones(len(pairs), bool)
     for obstacle in scene.obstacles:
         above &= np.minimum(*(obstacle.distance(end) for end in pairs.ends())) >= thin

@@ -1,6 +1,6 @@
-"""Batches that are made in one launch: which grasp of it is whose, and which of them are out.
+"""Batches planned in one launch: the batch of each grasp, and the batches that stopped.
 
-A batch is out when it was cancelled or when something is the matter with it alone; the others go on without it.
+A batch stops when it is cancelled or fails; the other batches continue.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ Rows = NDArray[np.intp]
 
 
 class Batches:
-    """The grasps of several batches, one batch after the other; a row is a grasp."""
+    """Grasps of several batches, one batch after the other; a row is a grasp."""
 
     def __init__(self, asked: Sequence[BatchRequest], obj: ObjectModel, warm: WarmStart | None = None) -> None:
-        """All batches have one fidelity, and all or none of them are in scenes with the same fixed surroundings.
-        `warm`, in scenes: where their hands set out; None: where `scene_starts` finds."""
+        """All batches have one fidelity; all or none are in scenes with the same fixed surroundings.
+        In scenes, `warm` proposes the starts of hands; None: `scene_starts` finds them."""
         self.asked, self.warm = asked, warm
         wanted = [one.wanted for one in asked]
         in_scenes = wanted[0].placed is not None
@@ -40,24 +40,24 @@ class Batches:
             self.fidelity = warm.adapted(self.fidelity)
         counts = [one.count for one in wanted]
         self.owner = np.repeat(np.arange(len(asked)), counts)
-        """(n,) the batch of each row."""
+        """(n,) batch of each row."""
         self.index = np.concatenate([one.first + np.arange(one.count) for one in wanted])
         """(n,) number of each row within its batch."""
         self.opened = np.zeros(len(self.owner), bool)
-        """(n,) whether hands of a row set out more open than their pre-shape: in that they had no place."""
+        """(n,) whether hands of a row start more open than their pre-shape, in which no start was clear."""
         self.errors: dict[int, Exception] = {}
-        """What became of the batches that are out."""
+        """Errors of the batches that stopped."""
         self._steps = [StepCounter(one.wanted.count * (hands(self.fidelity) + 1), one.run) for one in asked]
         placed = [one.placed for one in wanted if one.placed is not None]
         self.placed: PlacedGrasps | None = placed_together(placed) if placed else None
         self.ways: list[Floats] = []
-        """Free ways of each scene."""
+        """Free directions of each scene."""
         for owner, scenes in enumerate(placed):
             self._find_ways(owner, scenes, obj)
 
     def _find_ways(self, owner: int, scenes: PlacedGrasps, obj: ObjectModel) -> None:
         try:
-            # Whole or not at all: those of a scene are found by its number.
+            # All scenes of a batch or none: a scene's directions are found by its number.
             self.ways += [free_ways(scene, obj) for scene in scenes.scenes]
         except InputError as error:
             self.ways += [np.zeros((0, 3))] * len(scenes.scenes)
@@ -65,24 +65,24 @@ class Batches:
 
     @property
     def has_rollout(self) -> bool:
-        """Whether candidates go through a trial. Around a free object they do where the fidelity seats several."""
+        """Whether candidates go through a rollout; around a free object only where the fidelity seats several."""
         first = self.asked[0].wanted
         several = first.placed is not None or first.fidelity.finalists > 1
         return several and all(one.wanted.rollout is not None for one in self.asked)
 
     def put_out(self, owner: int, error: Exception) -> None:
-        """The batch is made no further; what became of it first stands."""
+        """Stop a batch; its first error is stored."""
         self.errors.setdefault(owner, error)
 
     def going(self, rows: Rows) -> NDArray[np.bool_]:
-        """(n,) whether the batches of these rows are still made."""
+        """Return a mask (n,) of the rows whose batches are still planned."""
         return ~np.isin(self.owner[rows], list(self.errors))
 
     def left(self) -> Rows:
-        """Rows of the batches that are still made.
+        """Return the rows of the batches that are still planned.
 
         Raises:
-            Exception: what became of the first batch, if all of them are out.
+            Exception: error of the first batch, if all have stopped.
         """
         rows = np.flatnonzero(self.going(np.arange(len(self.owner))))
         if not len(rows):
@@ -90,10 +90,10 @@ class Batches:
         return rows
 
     def step(self, rows: Rows, work: float, message: str) -> None:
-        """So much work was done for each of the rows; batches that are cancelled are put out.
+        """Report so much work for each of the rows; stop batches that are cancelled.
 
         Raises:
-            Exception: what became of the first batch, if all of them are out.
+            Exception: error of the first batch, if all have stopped.
         """
         owners, counts = np.unique(self.owner[rows], return_counts=True)
         for owner, count in zip(owners.tolist(), counts.tolist(), strict=True):
@@ -106,7 +106,7 @@ class Batches:
             raise self.errors[min(self.errors)]
 
     def generators(self, rows: Rows, attempt: Rows) -> list[np.random.Generator]:
-        """Random numbers of the starts of these rows at an attempt (n,) each, those of one grasp side by side."""
+        """Return generators for the starts of these rows at attempts (n,), those of one grasp side by side."""
         starts = self.fidelity.starts
         wanted = [self.asked[owner].wanted for owner in self.owner[rows].tolist()]
         numbers = zip(wanted, self.index[rows].tolist(), attempt.tolist(), strict=True)
@@ -117,8 +117,8 @@ class Batches:
         ]
 
     def rollout(self, grasps: GraspSet, rows: Rows, beat: Floats) -> Floats:
-        """Scores (n,) of grasps for these rows that have scores `beat` (n,) so far, each by the trial of its own batch;
-        of a batch that is out every grasp is good enough."""
+        """Score (n,) grasps of these rows by their batches' rollouts, against the scores `beat` (n,).
+        All grasps of a batch that stopped count as good enough."""
         owners, scores = self.owner[rows], np.zeros(len(grasps))
         placed = self.placed.take(rows) if self.placed is not None else None
         for owner in distinct_values(owners):
@@ -140,10 +140,10 @@ def _adapted(fidelity: Fidelity, *, in_scenes: bool, tried: bool) -> Fidelity:
 
 
 def finalists(fidelity: Fidelity) -> int:
-    """Hands of a grasp that enter the fine phase: no more than set out."""
+    """Return the number of hands per grasp that enter the fine phase, at most the number of starts."""
     return min(fidelity.finalists, fidelity.starts)
 
 
 def hands(fidelity: Fidelity) -> int:
-    """Hand iterations that one grasp costs."""
+    """Return the number of hand iterations per grasp."""
     return fidelity.starts * fidelity.coarse_iterations + finalists(fidelity) * fidelity.fine_iterations

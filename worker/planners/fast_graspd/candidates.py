@@ -1,4 +1,4 @@
-"""Candidates of a grasp, ranked by the balance of their contacts and tried in turn until one is good enough."""
+"""Candidates of a grasp, ranked by contact balance and simulated in turn until one is good enough."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from graspd.worker.objects.model import ObjectModel
 from graspd.worker.simulation.data import HandState
 from graspd.worker.simulation.environment import PlacedGrasps
 
-#: Hands of each grasp that are seated and tried before the next are: seating costs half of a trial.
+#: Candidates of each grasp that are seated and simulated at once: seating costs half of a rollout.
 TOGETHER: Final = 2
-#: Merit beyond which a seated hand is not tried but where its grasp has nothing else: of 176 such hands of Allegro and
-#: Shadow 3 lifted at half the friction.
+#: Merit above which a seated hand has no rollout unless its grasp has no other candidate: of 176 such hands of Allegro
+#: and Shadow 3 lifted at half friction.
 HOPEFUL: Final = 0.3
-#: Score beyond which that of a grasp is as good as nothing: lost, or its way is blocked.
+#: Score above which a grasp counts as failed: the object is lost, or the trajectory is blocked.
 POOR: Final = 7.0
-#: A hand that does not hold at half the friction, but nearly, is tried once more with so much of the force.
-#: 144 hands of Shadow lift .80 with all of it, .83 with half, .92 with the best of six forces.
+#: Share of the force in a second rollout of a hand that nearly holds at half friction. Of 144 hands of Shadow .80 lift
+#: with the whole force, .83 with half, .92 with the best of six forces.
 GENTLER: Final = 0.5
 NEARLY: Final = 2.5
-#: Score of what has none.
+#: Score of candidates without a rollout.
 HOPELESS: Final = 1e9
 
 
@@ -41,7 +41,7 @@ def with_postures(
     *,
     device: str = "cpu",
 ) -> GraspSet:
-    """Hands (n) as grasps with the postures around them, found on a device."""
+    """Convert hands (n) to grasps and find the postures around them on a device."""
     grasp = posture_of(hand, obj, state)
     before = pregrasp(hand, obj, grasp, placed, device=device)
     return GraspSet(grasp, before, squeeze(hand, obj, grasp, device=device), losses)
@@ -55,24 +55,22 @@ class Refinements:
     losses: Floats
     """L_stable of each."""
     merit: Floats
-    """The smaller the better."""
+    """Smaller is better."""
     infeasible: NDArray[np.bool_]
-    """Whether it is too deep in the object for the geometric gate, or touches it with too few links: no trial can save
-    it."""
+    """Whether its depth or number of touching links fails the geometric gate: then it has no rollout."""
 
 
 Seat = Callable[[NDArray[np.intp], NDArray[np.intp]], Refinements]
 
-"""Seats the hands of some grasps (n,): rows (n, each) of the hands that set out."""
+"""Seats the hands of some grasps (n,), given the rows (n, each) of their starts."""
 
 RolloutOf = Callable[[GraspSet, NDArray[np.intp], Floats], Floats]
-
-"""Scores (k,) of grasps for those that are numbered (k,), with the scores to beat; see `worker.planners.Trial`."""
+"""Scores (k,) grasps with the numbers (k,) against the scores to beat; see `worker.planners.Rollout`."""
 
 
 @dataclass
 class Selection:
-    """What is taken of each of n grasps so far; nothing where `score` is inf."""
+    """Best candidate of each of n grasps so far; none where `score` is inf."""
 
     state: HandState
     losses: Floats
@@ -85,7 +83,7 @@ class Selection:
         return cls(empty, np.zeros(count), np.full(count, np.inf), {})
 
     def joined(self) -> GraspSet:
-        """The grasps in their order."""
+        """Return the grasps in their order."""
         return joined([self.grasps[k] for k in range(len(self.score))])
 
 
@@ -100,10 +98,9 @@ def tried(
     together: int = TOGETHER,
     device: str = "cpu",
 ) -> Selection:
-    """Of the hands of each grasp the first that the trial finds good enough, or else the one with the least score.
-
-    `together` of each grasp are seated and tried in the order of their merit, then, of grasps that have none yet, as
-    many again. Hands that balance too badly or are infeasible are not tried, but the first of each grasp is taken.
+    """Return each grasp's first candidate with a good enough rollout, or else the one with least score.
+    `together` candidates of each grasp are seated and simulated in order of merit, then as many again for grasps
+    without a good one. Unbalanced or infeasible hands have no rollout, but each grasp's first candidate is taken.
 
     Args:
         hand: the hand.
@@ -111,9 +108,9 @@ def tried(
         order: (n, each) rows of the hands of each grasp, the most promising first.
         seat: seats hands.
         placed: scenes of the n grasps; None: free.
-        trial: gives the scores.
+        rollout: computes the scores.
         together: hands of each grasp that are seated at once.
-        device: finds the postures that the trial needs.
+        device: finds the postures that the rollout needs.
     """
     taken, left = Selection.none(len(order), hand.dofs), np.arange(len(order))
     for wave in np.split(order, range(together, order.shape[1], together), axis=1):
@@ -140,7 +137,7 @@ def tried(
 def _scores(
     found: GraspSet, infeasible: NDArray[np.bool_], which: NDArray[np.intp], beat: Floats, rollout: RolloutOf
 ) -> Floats:
-    """(k,) what the trial says of one hand each of the grasps `which` (k,), which have scores `beat` (k,) so far."""
+    """Score (k,) one hand each of the grasps `which` (k,) by rollout; `beat` (k,) are their scores so far."""
     score, feasible = np.full(len(which), HOPELESS), np.flatnonzero(~infeasible)
     if len(feasible):
         score[feasible] = np.nan_to_num(
@@ -158,8 +155,8 @@ def _gentler(
     rollout: RolloutOf,
     device: str,
 ) -> None:
-    """Gives hands (k,) that nearly lift a gentler squeeze where they lift better with it: fingers are springs, and the
-    harder soft ones press, the more they turn the object out of the hand."""
+    """Give hands (k,) that nearly lift a gentler squeeze where it improves the score.
+    Soft fingers act as springs: the harder they press, the more they turn the object out of the hand."""
     poor = np.flatnonzero((score >= 1.0) & (score < NEARLY))
     if not len(poor):
         return
@@ -179,7 +176,7 @@ def _take(
     score: Floats,
     taken: Selection,
 ) -> None:
-    """Of one hand each (k,) of the grasps `which` (k,) those that are better than what is taken."""
+    """Replace selected candidates by better ones: one hand each (k,) for the grasps `which` (k,)."""
     state, losses = seated.state[rows], seated.losses[rows]
     for k in np.flatnonzero(score < taken.score[which]):
         grasp = int(which[k])
@@ -189,24 +186,24 @@ def _take(
             getattr(taken.state, name)[grasp] = getattr(state, name)[k]
 
 
-#: Coulomb coefficient with which contacts must balance: less than any test uses, so that what balances has a reserve.
+#: Coulomb coefficient for the balance of contacts: lower than in any test, so that balanced grasps have a reserve.
 FRICTION: Final = 0.3
-#: The same in scenes: what balances with so little most often lifts at half the friction (AUC .80 of seated hands of
-#: Allegro and Shadow whose merit is below .1; .74 with the other).
+#: The same in scenes: hands that balance with it mostly lift at half friction (AUC .80 of seated hands of Allegro and
+#: Shadow whose merit is below .1; .74 with `FRICTION`).
 SCENE_FRICTION: Final = 0.15
 #: Weight of L_stable against the residual of the balance.
 STABILITY: Final = 0.05
-#: Weight of penetration [1/m] above the tolerated [m]: a millimetre too deep outweighs most of an unbalanced grasp.
+#: Weight of penetration [1/m] above the tolerance [m]: one millimetre more outweighs most of an unbalanced grasp.
 DEPTH: Final = 200.0
 TOLERATED_M: Final = 5e-4
-#: Weight of the share of the hand's surface that is at a free object after the coarse phase, and how near that is [m]:
-#: of hands that balance alike the one that lies around more of the object goes on, or is tried first.
+#: Weight of the share of the hand's surface near a free object after the coarse phase, and the distance that counts as
+#: near [m]. Of equally balanced hands, the one that encloses more of the object is refined or simulated first.
 NEARNESS: Final = 2.0
 NEAR_M: Final = 0.005
 
 
 def posture_of(hand: HandModel, obj: ObjectModel, state: HandState) -> Posture:
-    """The hands of a state in the object frame."""
+    """Return the hands of a state in the object frame."""
     root = state.pivot + obj.centre_of_mass - quat_rotate(state.rotation, hand.palm.centre)
     return Posture(np.concatenate([root, state.rotation], axis=1), hand.expand(state.q))
 
@@ -221,8 +218,8 @@ def merits(
     friction: float = FRICTION,
     device: str = "cpu",
 ) -> Floats:
-    """(n,) the smaller the better: residual of contact forces balanced with a coefficient of `friction`, a little of
-    L_stable (n,), and what the penetration `depths` (n,) [m] have above the tolerated."""
+    """Compute merits (n,); smaller is better.
+    Residual of contact forces balanced with `friction`, a share of L_stable (n,), and excess `depths` (n,) [m]."""
     holds = hold_forces(hand, obj, posture_of(hand, obj, state), friction=friction, device=device)
     merit = holds.residual + STABILITY * losses
     if depths is not None:
@@ -231,12 +228,12 @@ def merits(
 
 
 def ranked(merit: Floats, grasps: int) -> NDArray[np.intp]:
-    """(grasps, each) rows of the hands of each grasp, the best first; the hands of a grasp lie side by side."""
+    """Return rows (grasps, each) of each grasp's hands, the best first; hands of a grasp lie side by side."""
     each = merit.reshape(grasps, -1)
-    # A stable sort: hands of equal merit are taken in the order in which they set out.
+    # The stable sort keeps hands of equal merit in the order of their starts.
     return np.argsort(each, axis=1, kind="stable") + np.arange(grasps)[:, None] * each.shape[1]
 
 
 def best_of_each(merit: Floats, grasps: int, keep: int) -> NDArray[np.intp]:
-    """Rows of the `keep` best hands of each grasp, in the order in which they set out."""
+    """Return rows of the `keep` best hands of each grasp, in the order of their starts."""
     return np.sort(ranked(merit, grasps)[:, :keep], axis=1).ravel()

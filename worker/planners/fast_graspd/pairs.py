@@ -1,4 +1,4 @@
-"""What the batches of one (hand, object, fidelity) share on a device: made once, kept for the next batch."""
+"""Device data shared by the batches of one (hand, object, fidelity), cached between batches."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ FIELD_CELL: Final = 0.005
 COARSE_SELF_POINTS: Final = 400
 FINE_SELF_POINTS: Final = 1000
 COARSE_SAMPLES: Final = 1500
-#: So many times the object samples of the fidelity, up to so many in all, are tested around a free object: what enters
-#: a link between two samples is not seen, and with as few as the fidelity says that is .2 mm at the median.
+#: Factor on the fidelity's object samples and their maximum, around a free object. Penetration between two samples is
+#: not detected; with the fidelity's own number it is .2 mm at the median.
 DENSER, DENSEST = 3, 12_000
-#: Pairs kept on the device.
+#: Number of pairs cached on the device.
 KEPT: Final = 4
 
 
 @dataclass(frozen=True)
 class PhaseGeometry:
-    """How finely a phase sees the hand and the object."""
+    """Resolution of hand and object in a phase."""
 
     points: SurfacePoints
     own: SurfacePoints
@@ -47,7 +47,7 @@ class PhaseGeometry:
 
 @dataclass(frozen=True)
 class Pair:
-    """A hand and an object on a device, as each phase sees them."""
+    """A hand and an object on a device, with the geometry of each phase."""
 
     coarse: PhaseGeometry
     fine: PhaseGeometry
@@ -55,8 +55,8 @@ class Pair:
     hand: DeviceHand
 
     def model(self, side: PhaseGeometry, obstacles: DeviceObstacles | None = None, *, pulled: bool = True) -> Model:
-        """The hand and the object as a phase sees them. Among obstacles points are not pulled: fingers that could be
-        drawn around the object are kept off the table."""
+        """Return the model of hand and object for a phase; the attraction term is off among obstacles.
+        There, fingers that could enclose the object are kept away from the table."""
         options = self.options if obstacles is None and pulled else replace(self.options, pull=0.0)
         return Model.create(self.hand, side.obj, side.points, side.own, options, obstacles)
 
@@ -70,8 +70,7 @@ _lock = threading.Lock()
 
 
 def pair_of(hand: HandModel, obj: ObjectModel, fidelity: Fidelity, device: str, *, in_scenes: bool = False) -> Pair:
-    """The pair, from memory where it was used lately. Where nothing projects hands out of a free object, it has the
-    samples of the fidelity, too."""
+    """Return the pair, cached. Without projection out of a free object it also has the fidelity's samples."""
     count = fidelity.object_points
     if fidelity.polish_iterations and not in_scenes:
         count = max(count, min(DENSER * count, DENSEST))

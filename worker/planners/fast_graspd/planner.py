@@ -1,6 +1,6 @@
-"""The planner: starts, coarse phase, fine phase, projection, of one batch or of several in one launch.
+"""The planner: starts, coarse phase, fine phase and projection of batches in one launch.
 
-A launch is cut into one part per CPU thread. Which grasps it holds besides does not matter to a grasp.
+A launch is divided into one part per CPU thread. A grasp does not depend on the other grasps of its launch.
 """
 
 from __future__ import annotations
@@ -55,59 +55,59 @@ from graspd.worker.simulation.projection import Projection, ProjectionOptions
 
 Rows = NDArray[np.intp]
 
-#: Iterations between two looks at cancellation.
+#: Iterations between two checks for cancellation.
 CHUNK: Final = 10
-#: Fewest grasps worth a thread of their own.
+#: Fewest grasps for which a thread pays.
 PART: Final = 4
-#: A grasp whose merit is above this sets out once more: of such grasps a fifth (Shadow) to a half hold, of others most.
+#: Merit above which a grasp is retried: a fifth (Shadow) to a half of such grasps hold, and most others.
 SET_OUT_AGAIN: Final = 0.05
-#: The same of scores in a trial, see `worker.planners.port.Trial`: a tenth to a quarter of such grasps hold.
+#: The same for scores of a rollout, see `worker.planners.port.Rollout`: a tenth to a quarter of such grasps hold.
 FAILED: Final = 2.0
-#: How often grasps whose hands are tried may set out again. One more attempt finds what the first ones found, so valid
-#: grasps a second hardly depend on it, and fewer grasps of a hard pair are left that hold nothing.
+#: Largest number of retries of grasps with rollouts. A further attempt is as productive as the first ones, so the yield
+#: per second hardly depends on it. Fewer grasps of a hard pair fail.
 ATTEMPTS: Final = 20
-#: Score of a free grasp that holds while a finger stands off: it sets out again up to `CLOSER` times, then the best
-#: stays.
+#: Score of a free grasp that holds while a finger does not touch: it is retried up to `CLOSER` times, then the best
+#: attempt is selected.
 STANDS: Final = 1.99
 CLOSER: Final = 2
-#: Scores beyond which grasps in scenes set out again, at each attempt: at the first also those that lift at the whole
-#: friction only. An attempt costs half of another grasp of the batch, and one in ten of these then lifts at half.
+#: Scores above which grasps in scenes are retried, per attempt. The first attempt includes grasps that lift at full
+#: friction only: an attempt costs half of another grasp, and one in ten of these then lifts at half friction.
 IN_SCENES: Final = (1.0, FAILED, FAILED, FAILED, FAILED)
-#: Attempts of one grasp that are made at once, at the most.
+#: Largest number of attempts of one grasp at once.
 AHEAD: Final = 4
 
 
 @dataclass
 class LaunchPart:
-    """Grasps of a launch, worked on by one thread."""
+    """Grasps of a launch that one thread works on."""
 
     rows: Rows
-    """(n,) which of the launch."""
+    """(n,) rows of the launch."""
     state: HandState
     loss: Floats
     """(n,) L_stable."""
     merit: Floats
-    """(n,) of the hand that was chosen, or its score in the trial; 0 where there was nothing to choose from."""
+    """(n,) merit of the chosen hand, or its rollout score; 0 where there was no choice."""
     curve: list[Floats] = field(default_factory=list)
-    """(n,) L_stable of each grasp's hands in the mean, every `CHUNK` iterations."""
+    """(n,) mean L_stable of each grasp's hands, every `CHUNK` iterations."""
     grasps: GraspSet | None = None
-    """With the postures around them, where they were wanted or a trial needed these."""
+    """Grasps with their postures, where these were requested or a rollout needed them."""
     attempts: Rows = field(default_factory=lambda: np.zeros(0, int))
-    """(n,) how often each set out."""
+    """(n,) number of attempts."""
 
     def __post_init__(self) -> None:
         if len(self.attempts) != len(self.rows):
             self.attempts = np.ones(len(self.rows), int)
 
     def take(self, which: NDArray[np.intp]) -> LaunchPart:
-        """Some of the grasps."""
+        """Select some of the grasps."""
         grasps = None if self.grasps is None else self.grasps.take(which)
         curve = [one[which] for one in self.curve]
         parts = (self.rows[which], self.state[which], self.loss[which], self.merit[which], curve, grasps)
         return LaunchPart(*parts, self.attempts[which])
 
     def followed_by(self, other: LaunchPart) -> LaunchPart:
-        """All grasps of both."""
+        """Concatenate the grasps of both."""
         curve = [np.concatenate(both) for both in zip(self.curve, other.curve, strict=True)]
         both = [part.grasps for part in (self, other) if part.grasps is not None]
         rows, loss, merit, attempts = (
@@ -121,7 +121,7 @@ class LaunchPart:
 def plan(
     hand: HandModel, obj: ObjectModel, wanted: PlanRequest, run: ExecutionContext, *, warm: WarmStart | None = None
 ) -> GraspSet:
-    """See `worker.planners.Planner`; `warm` as `Batches` has it."""
+    """See `worker.planners.Planner`; for `warm` see `Batches`."""
     (found,) = plan_joined(hand, obj, [BatchRequest(wanted, run)], warm=warm)
     if isinstance(found, Exception):
         raise found
@@ -131,7 +131,7 @@ def plan(
 def plan_joined(
     hand: HandModel, obj: ObjectModel, asked: Sequence[BatchRequest], *, warm: WarmStart | None = None
 ) -> list[GraspSet | Exception]:
-    """See `worker.planners.Joined`; `warm` as `Batches` has it."""
+    """See `worker.planners.BatchPlanner`; for `warm` see `Batches`."""
     began = time.perf_counter()
     batches = Batches(asked, obj, warm)
     run = asked[0].run
@@ -158,12 +158,12 @@ def _pair(hand: HandModel, obj: ObjectModel, wanted: PlanRequest, run: Execution
 
 
 def optimise_batch(hand: HandModel, obj: ObjectModel, wanted: PlanRequest, run: ExecutionContext) -> list[LaunchPart]:
-    """Starts, optimisation and projection of a batch, without the postures around each grasp."""
+    """Run starts, optimisation and projection of a batch, without the postures around each grasp."""
     return optimise_pair(_pair(hand, obj, wanted, run), wanted, run)
 
 
 def optimise_pair(pair: Pair, wanted: PlanRequest, run: ExecutionContext) -> list[LaunchPart]:
-    """The same for a pair that is on `run.device` already, and need not be as the fidelity would make it."""
+    """Do the same for a pair that is already on `run.device`; its geometry may differ from the fidelity's."""
     batches = Batches([BatchRequest(wanted, run)], pair.fine.obj.model)
     parts = optimise(pair, batches, run)
     batches.left()
@@ -171,11 +171,11 @@ def optimise_pair(pair: Pair, wanted: PlanRequest, run: ExecutionContext) -> lis
 
 
 def optimise(pair: Pair, batches: Batches, run: ExecutionContext, *, postures: bool = False) -> list[LaunchPart]:
-    """The same for several batches: the parts of those that are not out in the end, and perhaps of others; with the
-    `postures` around grasps, if they are wanted.
+    """Do the same for several batches; return the parts of those that did not stop, and perhaps others.
+    `postures` adds the postures around the grasps.
 
     Raises:
-        Exception: what became of the first batch, if all of them are out.
+        Exception: error of the first batch, if all have stopped.
     """
     launch = _Launch(pair, batches)
     begun = _begun(launch, batches.left(), run)
@@ -198,12 +198,12 @@ def optimise(pair: Pair, batches: Batches, run: ExecutionContext, *, postures: b
 
 @dataclass(frozen=True)
 class _Launch:
-    """A pair as each phase sees it, and the batches that are made of it; all threads share it."""
+    """Models of a pair for each phase and the batches planned with them, shared by all threads."""
 
     pair: Pair
     batches: Batches
     pulled: bool = True
-    """Whether points are drawn to a free object."""
+    """Whether the attraction term is on, for free objects."""
     coarse: Model = field(init=False)
     fine: Model = field(init=False)
 
@@ -216,13 +216,13 @@ class _Launch:
         return self.batches.placed.take(rows) if self.batches.placed is not None else None
 
     def merits(self, state: HandState, losses: Floats, depths: Floats | None = None) -> Floats:
-        """See `selection.merits`."""
+        """See `candidates.merits`."""
         hand, obj, device = self.pair.hand.model, self.pair.fine.obj.model, self.pair.hand.device
         friction = FRICTION if self.batches.placed is None else SCENE_FRICTION
         return merits(hand, obj, state, losses, depths, friction=friction, device=device)
 
     def infeasible(self, state: HandState, depths: Floats) -> NDArray[np.bool_]:
-        """(n,) whether hands of these depths [m] cannot pass the geometric gate; asked of those that will be tried."""
+        """Check (n,) whether hands of these depths [m] fail the geometric gate; used before rollouts."""
         if not self.batches.has_rollout:
             return np.zeros(len(depths), bool)
         hand, obj, device = self.pair.hand.model, self.pair.fine.obj.model, self.pair.hand.device
@@ -232,23 +232,23 @@ class _Launch:
 
 @dataclass(frozen=True)
 class _Begun:
-    """Where the hands of grasps start, those of one grasp side by side."""
+    """Starts of the hands of grasps, those of one grasp side by side."""
 
     rows: Rows
     state: HandState
     depth: Floats
     touch: Floats | None
-    """What of the dilation makes each hand touch; None: all of it."""
+    """Share of the dilation at which each hand touches; None: all of it."""
 
     def take(self, which: NDArray[np.intp], each: int) -> _Begun:
-        """Some of the grasps, `each` hands of each."""
+        """Select some of the grasps, `each` hands of each."""
         hands = (which[:, None] * each + np.arange(each)).ravel()
         touch = None if self.touch is None else self.touch[hands]
         return _Begun(self.rows[which], self.state[hands], self.depth[hands], touch)
 
 
 def _begun(launch: _Launch, rows: Rows, run: ExecutionContext) -> _Begun:
-    """The starts of grasps."""
+    """Sample the starts of grasps."""
 
     def work(which: range) -> _Begun:
         some = rows[which.start : which.stop]
@@ -265,12 +265,12 @@ def _begun(launch: _Launch, rows: Rows, run: ExecutionContext) -> _Begun:
 
 
 def _set_out(launch: _Launch, rows: Rows, attempt: Rows) -> _Begun:
-    """The starts of grasps at the first attempt or a later one (n,); a grasp may be there at several."""
+    """Sample starts at attempts (n,), 0 being the first; a grasp may appear with several attempts."""
     batches, coarse = launch.batches, launch.coarse
     fidelity, placed, generators = batches.fidelity, launch.placed(rows), batches.generators(rows, attempt)
     if placed is None:
         state, depth = starts.clear_starts(coarse, generators, each=fidelity.starts)
-        # At later attempts those that opened at the first: the others have starts already, and keep what they get.
+        # At later attempts only grasps that opened at the first may open: the others already have starts and keep them.
         may_open = np.repeat(batches.opened[rows] | (attempt == 0), fidelity.starts)
         opened = starts.open_further(coarse, generators, state, depth, may_open)
         batches.opened[rows] |= opened.reshape(len(rows), -1).any(axis=1)
@@ -282,9 +282,9 @@ def _set_out(launch: _Launch, rows: Rows, attempt: Rows) -> _Begun:
 
 
 def _with_place(launch: _Launch, begun: _Begun) -> Rows:
-    """Rows of the batches that found where to start.
+    """Return the rows of the batches that found starts.
 
-    Around a free object every grasp must, in scenes one of a batch; of its others somebody else may know."""
+    Around a free object every grasp must have one; in scenes one per batch suffices, made here or elsewhere."""
     batches = launch.batches
     deep = begun.depth.reshape(len(begun.rows), -1)
     owners = batches.owner[begun.rows]
@@ -304,7 +304,7 @@ def _work(launch: _Launch, begun: _Begun) -> LaunchPart:
     data = _in_scenes(Data(launch.coarse, n * fidelity.starts), placed, fidelity.starts)
     data.set_schedule(coarse_schedule(fidelity))
     data.set_state(begun.state, dilation=begun.touch)
-    # The coarse phase changes its own task as the dilation shrinks: nothing has converged before its end.
+    # The dilation shrinks during the coarse phase and changes its loss, so nothing converges before its end.
     launches = pair.iteration(launch.coarse, data, fidelity.optimizer, patience=0)
     curve: list[Floats] = []
     state = _descend(launches, data, batches, rows, fidelity.coarse_iterations, "coarse optimization", curve)
@@ -336,11 +336,10 @@ def _work(launch: _Launch, begun: _Begun) -> LaunchPart:
 
 
 def _tried_again(launch: _Launch, part: LaunchPart, run: ExecutionContext) -> LaunchPart:
-    """Grasps that fail their trial, or of free objects balance poorly, set out again; the first good one stays, or else
-    the best.
+    """Retry grasps that fail their rollout or, if free, balance poorly; keep the first good or the best.
 
-    The last few would leave cores idle, and a hand of a small launch costs a third more: they make some attempts ahead.
-    Those after a good one are forgotten, so a grasp is as if it had made one after the other."""
+    The last few grasps would leave cores idle, and a hand costs a third more in a small launch. They make some attempts
+    ahead; attempts after a good one are dropped, so the result equals that of sequential attempts."""
     closer = (STANDS,) * CLOSER + (FAILED,) * (ATTEMPTS - CLOSER)
     limits: tuple[float, ...] = closer if launch.batches.has_rollout else (SET_OUT_AGAIN,)
     if launch.batches.placed is not None:
@@ -362,15 +361,15 @@ def _tried_again(launch: _Launch, part: LaunchPart, run: ExecutionContext) -> La
 
 
 def _set_out_again(launch: _Launch, rows: Rows, attempt: Rows, run: ExecutionContext) -> LaunchPart:
-    """Later attempts (n,) of grasps; the merit of those without a place is inf. Their hands are not pulled: on a bowl's
-    wall half as many hold that are."""
+    """Run later attempts (n,) of grasps; the merit of those without a start is inf.
+    The attraction term is off: with it half as many hold on a bowl's wall."""
     launch = replace(launch, pulled=False)
 
     def work(which: range) -> LaunchPart:
         some = slice(which.start, which.stop)
         begun = _set_out(launch, rows[some], attempt[some])
         made = _work(launch, begun)
-        # As at the first attempt: around a free object every hand needs a place, in scenes one of a grasp's.
+        # As at the first attempt: every hand needs a start around a free object, one hand per grasp in scenes.
         deep = begun.depth.reshape(len(made.rows), -1)
         lost = (deep.max(axis=1) if launch.batches.placed is None else deep.min(axis=1)) > NO_PLACE
         return replace(made, merit=np.where(lost, np.inf, made.merit))
@@ -379,7 +378,7 @@ def _set_out_again(launch: _Launch, rows: Rows, attempt: Rows, run: ExecutionCon
 
 
 def _posed(launch: _Launch, part: LaunchPart) -> LaunchPart:
-    """The part with the postures around its grasps."""
+    """Add the postures around the grasps of a part."""
     hand, obj = launch.pair.hand.model, launch.pair.fine.obj.model
     placed, device = launch.placed(part.rows), launch.pair.hand.device
     return replace(part, grasps=with_postures(hand, obj, part.state, part.loss, placed, device=device))
@@ -387,17 +386,17 @@ def _posed(launch: _Launch, part: LaunchPart) -> LaunchPart:
 
 @dataclass
 class _Seats:
-    """The fine phase and the projection of hands that set out."""
+    """Fine phase and projection of hands after the coarse phase."""
 
     launch: _Launch
     rows: Rows
     state: HandState
     losses: Floats
     curve: list[Floats]
-    """Goes on with the loss of the first that are seated."""
+    """Loss curve, continued by the hands that are seated first."""
 
     def seated(self, rows: NDArray[np.intp], which: NDArray[np.intp]) -> Refinements:
-        """Hands `rows` (k, each) of the grasps `which` (k,) of this part."""
+        """Seat hands `rows` (k, each) of the grasps `which` (k,) of this part."""
         launch, flat = self.launch, rows.ravel()
         fidelity, mine = launch.batches.fidelity, self.rows[which]
         state, losses = self.state[flat], self.losses[flat]
@@ -409,7 +408,7 @@ class _Seats:
         state = _descend(launches, data, launch.batches, mine, fidelity.fine_iterations, "refinement", curve)
         if fidelity.fine_iterations:
             losses = _losses(data, len(flat))
-        # Without iterations this only tells how deep each hand is.
+        # Without iterations this only measures each hand's depth.
         options = AROUND if launch.batches.placed is None else ProjectionOptions()
         state, depths = Projection(launch.fine, data, options).run(state, fidelity.polish_iterations)
         merit = launch.merits(state, losses, depths) if rows.shape[1] > 1 else np.zeros(len(flat))
@@ -424,21 +423,21 @@ def _obstacles(pair: Pair, placed: PlacedGrasps | None) -> DeviceObstacles | Non
 
 
 def _in_scenes(data: Data, placed: PlacedGrasps | None, each: int) -> Data:
-    """The data with the scene of every hand, `each` hands a grasp."""
+    """Set the scene of every hand in the data, `each` hands per grasp."""
     if placed is not None:
         data.set_scenes(np.repeat(placed.index, each))
     return data
 
 
 def _losses(data: Data, n: int) -> Floats:
-    """L_stable (n,) of the last iteration."""
+    """Return L_stable (n,) of the last iteration."""
     return data.loss.numpy()[:n].mean(axis=1).astype(float)
 
 
 def _descend(
     launches: Launches, data: Data, batches: Batches, rows: Rows, iterations: int, name: str, curve: list[Floats]
 ) -> HandState:
-    """All hands of the grasps `rows` after so many iterations; those of batches that are out on the way stay behind."""
+    """Optimise the hands of grasps `rows` for so many iterations, except batches that stop meanwhile."""
     done, out = 0, len(batches.errors)
     each = data.capacity // len(rows)
     while done < iterations:
@@ -467,7 +466,7 @@ def grasps_of(
     *,
     device: str = "cpu",
 ) -> GraspSet:
-    """The parts of a batch as grasps with the postures around them."""
+    """Convert the parts of a batch to grasps with the postures around them."""
     curve = [np.concatenate(chunk).mean() for chunk in zip(*(part.curve for part in parts), strict=True)]
     known = [part.grasps for part in parts if part.grasps is not None]
     if len(known) == len(parts):

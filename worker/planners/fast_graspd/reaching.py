@@ -1,8 +1,8 @@
-"""Starts that reach across a free object: between opposed fingers, where it fits.
+"""Starts around a free object between opposed fingers, where it fits.
 
-A hand that looks at a random place of a large box mostly finds it too wide to hold. Here a pair of places that look
-away from each other and are no farther apart than the hand opens is drawn, and the hand is put around it. Most draws
-have a finger or the palm in the object: balls in the hand tell before the simulation looks at one.
+A hand that faces a random place of a large box mostly finds it too wide. Here the hand is placed around a drawn pair of
+points that face away from each other, no farther apart than the hand opens. In most draws a finger or the palm
+penetrates the object: balls in the hand reject these before the simulation checks a draw.
 """
 
 from __future__ import annotations
@@ -30,33 +30,33 @@ from graspd.worker.simulation.kernels import reaching as kernels
 from graspd.worker.simulation.launches import launch
 from graspd.worker.simulation.model import Model
 
-#: Draws of one start, and how often the simulation looks at one that is clear by its balls.
+#: Draws per start, and the number of draws clear by the ball test that the simulation checks.
 DRAWS: Final = 512
 LOOKS: Final = 8
-#: A pair far beside the centre of mass is drawn at this share of the chance of one through it.
+#: Chance of a pair far from the centre of mass, relative to a pair through it.
 FAR: Final = 0.05
-#: Balls in the hand, and their radius [m]: they touch its surface from within; where a link is thinner they stand out.
+#: Number of balls in the hand and their radius [m]: they touch its surface from within and protrude from thinner links.
 BALLS: Final = 96
 BALL_M: Final = 0.005
-#: An object is small if all its pairs of places are nearer to each other than this [m], and than the hand's pads come.
+#: An object is small if all its pairs are narrower than this and than the smallest gap of the hand's pads [m].
 SMALL_M: Final = 0.017
-#: The grid's distances are off by this [m].
+#: Error of the grid's distances [m].
 SLACK_M: Final = 0.001
 
 
 @dataclass(frozen=True)
 class ReachSampling:
-    """What draws of a hand around an object share."""
+    """Data shared by the draws of a hand around an object."""
 
     model: Model
     grips: Any
     only: bool
-    """Whether a palm that looks at a random place has little to hope for beside it: the object is too small or too wide
-    for the hand's pads."""
+    """Whether all starts reach across, because the object is too small or too wide for the pads.
+    Starts that face a random point then rarely succeed."""
 
     @classmethod
     def of(cls, model: Model) -> ReachSampling | None:
-        """None where the hand opposes no fingers, or where the object is too wide for it all over."""
+        """Return None if the hand opposes no fingers, or the object is too wide everywhere."""
         hand, obj = model.hand.model, model.obj.model
         width = crossings_of(obj).width
         size = size_to_pads(hand, width)
@@ -66,13 +66,13 @@ class ReachSampling:
         key = (hand.content, obj.content, model.device)
         with _lock:
             if key not in _known:
-                # What is too small or too wide is held where its room was found, and nowhere nearer to the palm.
+                # Objects that are too small or too wide are held where space was found, never nearer to the palm.
                 _known[key] = _grips(hand, obj, known, model.device, deep=0.0 if size else 1.0)
             return cls(model, _known[key], size is not None)
 
     def starts(self, seeds: NDArray[np.int32], first: NDArray[np.int32], retreats: Floats) -> tuple[HandState, Any]:
-        """Hands (n,) of the first draws from the numbers `first` (n,) on that are clear by their balls, and the numbers
-        (n,) of these draws; -1: there is none. `retreats` as steps away from the object, ascending [m]."""
+        """Return hands (n,) of the first draws, from numbers `first` (n,) on, that pass the ball test.
+        Also return the draws' numbers (n,), -1 if there is none. `retreats`: ascending steps from the object [m]."""
         m, count = self.model, len(seeds)
         with wp.ScopedDevice(m.device):
             number = wp.empty(count, dtype=wp.int32)
@@ -102,7 +102,7 @@ _lock = threading.Lock()
 
 
 def size_to_pads(hand: HandModel, width: Floats) -> Size | None:
-    """What an object whose pairs of places have the widths (P,) is to the hand's pads, if they hold none of them."""
+    """Classify an object with pair widths (P,) as too small or wide for the pads; None if a pair fits."""
     known = oppositions_of(hand)
     if not len(known) or not len(width):
         return None
@@ -112,7 +112,7 @@ def size_to_pads(hand: HandModel, width: Floats) -> Size | None:
 
 
 def _postures(hand: HandModel, width: Floats, size: Size | None) -> Oppositions:
-    """The postures for pairs of places of the widths (P,): none if none holds one."""
+    """Return the postures for pairs of the widths (P,), empty if none holds a pair."""
     if size == "wide" and width.min() + 2 * ROOM_M[0] > widest_span(hand):
         return Oppositions.of_none(hand)
     known = oppositions_of(hand) if size is None else spans_of(hand, size)

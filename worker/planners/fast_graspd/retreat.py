@@ -1,7 +1,7 @@
-"""Whether a hand gets out of its grasp again: fingers opened plainly, it moves back the way it came; closed, it rises.
+"""Test whether a hand can leave its grasp: open, back along the approach, and closed, by the lift.
 
-A hand that hooks around an edge holds well and cannot be got there, and one close below a board cannot lift what it
-holds. Asked before the dear phases, of every hand.
+A hand hooked around an edge holds well but cannot get there; one close below a board cannot lift. The test runs for
+every hand before the expensive phases.
 """
 
 from __future__ import annotations
@@ -20,21 +20,21 @@ from graspd.worker.simulation.environment import RISE_M, Environment, PlacedGras
 from graspd.worker.simulation.model import Model
 from graspd.worker.simulation.mounting import mounting_lack
 
-#: Shares of their range by which fingers have opened, and how far the hand has moved back [m].
+#: Shares of their range by which fingers have opened, and the distance that the hand has moved back [m].
 OUT: Final = ((0.2, 0.0), (0.3, 0.015), (0.4, 0.04))
-#: Depth that is no hindrance [m]: a hand can open a little otherwise than plainly.
+#: Tolerated depth [m]: a hand can open differently from this simple motion.
 TOLERATED_M: Final = 0.001
-#: Merit lost for each metre of depth: little, for hands that hold well reach around the object, and most of these get
-#: out again in some way.
+#: Merit lost per metre of depth. The weight is small: hands that hold well enclose the object, and most of them find
+#: another trajectory out.
 WEIGHT: Final = 25.0
 DEEPEST_M: Final = 0.01
-#: Shares of the lift at which what stands above is looked for.
+#: Shares of the lift at which obstacles above are checked.
 UP: Final = (0.5, 1.0)
 
 
 def hindrance(model: Model, state: HandState, placed: PlacedGrasps) -> Floats:
-    """(n,) merit that hands lose since they cannot move straight back, or rise, in their scenes: what of them is then
-    in the object or in an obstacle, or what of their mountings is in an obstacle already."""
+    """Compute the merit (n,) that hands lose for a blocked retreat or lift in their scenes.
+    It grows with the depth of the hand in object or obstacles on the way, or of its mounting at the grasp."""
     hand, obj = model.hand.model, model.obj.model
     mounted = mounting_lack(hand, posture_of(hand, obj, state).hand_pose, placed.scenes, placed.index)
     deep = np.maximum(_back(model, state, placed.index), mounted)
@@ -45,7 +45,7 @@ def hindrance(model: Model, state: HandState, placed: PlacedGrasps) -> Floats:
 
 
 def _back(model: Model, state: HandState, scenes: NDArray[np.integer]) -> Floats:
-    """(n,) depth of hands that open and move back [m]."""
+    """Return the depth (n,) of hands that open and move back [m]."""
     hand = model.hand.model
     finger = finger_of_body(hand)
     driven = np.zeros(hand.dofs, bool)
@@ -67,12 +67,12 @@ def _back(model: Model, state: HandState, scenes: NDArray[np.integer]) -> Floats
 
 
 def _open_above(scene: Environment) -> bool:
-    """Whether nothing but floors, of which a hand that rises comes free, stands around."""
+    """Check whether all obstacles are floors, which a rising hand always leaves."""
     return all(len(o.planes) == 1 and o.planes[0, :3] @ scene.up > 1 - 1e-6 for o in scene.obstacles)
 
 
 def _rising(model: Model, state: HandState, placed: PlacedGrasps) -> Floats:
-    """(n,) depth in obstacles of hands that rise as they are [m]."""
+    """Return the depth (n,) in obstacles of hands that rise in their grasp posture [m]."""
     n = len(state.pivot)
     up = np.array([scene.up for scene in placed.scenes])[placed.index]
     pivot = np.concatenate([state.pivot + share * RISE_M * up for share in UP])

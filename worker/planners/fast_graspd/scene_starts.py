@@ -1,7 +1,6 @@
-"""Approach sampling in scenes, from the directions that a scene leaves free, all hands drawn at once: most reach across
-the object with opposed fingers, the others look at a random point of it as `starts` do.
-
-A start keeps `ROOM` from obstacles besides the margin it has later, so that the descent can turn the hand.
+"""Sampling of approaches in scenes from the free directions, for all hands at once.
+Most starts are antipodal; the others face a random point of the object, as in `starts`.
+A start keeps `ROOM` from obstacles besides the later margin, so that the optimisation can turn the hand.
 """
 
 from __future__ import annotations
@@ -32,22 +31,21 @@ from graspd.worker.simulation.environment import STANDOFF_M, Environment, Placed
 from graspd.worker.simulation.model import Model
 from graspd.worker.simulation.mounting import mounting_lack
 
-#: Distance from obstacles that a start has besides the margin it keeps later [m].
+#: Clearance of a start from obstacles besides the margin it keeps later [m].
 ROOM: Final = 0.006
-#: Distance of a palm that looks at a random point from it, nearest and farthest [m].
+#: Nearest and farthest distance of a palm from the random point that it faces [m].
 GAP: Final = (0.004, 0.02)
-#: Steps of retreat while something touches [m]: farther than for a free object, for fingers must not reach the table.
+#: Steps of retreat on contact [m]: longer than for a free object, since fingers must not reach the table.
 RETREATS: Final = (0.0, 0.01, 0.02, 0.035, 0.055, 0.08, 0.11)
-#: Draws per start before the least penetrating one is taken.
+#: Draws per start before the least penetrating one is selected.
 DRAWS: Final = 96
 #: Draws whose random numbers are drawn together.
 DRAWN: Final = 8
-#: Half the width of a palm [m], directions along which a hand may come, and how near one of the free ones is (cosine).
+#: Half the width of a palm [m], number of approach directions, and the least cosine to the nearest free one.
 PALM_RADIUS: Final = 0.04
 DIRECTIONS: Final = 256
 NEAR_WAY: Final = 0.98
-#: Of `EVERY` starts of a grasp so many reach across the object: each in as many draws, the most promising ones of so
-#: many candidates.
+#: `REACHING` of `EVERY` starts of a grasp are antipodal, each with the `REACHES` most promising of `CANDIDATES` draws.
 EVERY: Final = 8
 REACHING: Final = 7
 REACHES: Final = 8
@@ -58,7 +56,7 @@ _UNIFORM: Final = 7
 
 @dataclass(frozen=True)
 class _Surface:
-    """The object's faces as draws need them."""
+    """Faces of the object, prepared for draws."""
 
     corners: Floats
     normals: Floats
@@ -74,8 +72,8 @@ class _Surface:
 
 
 def free_ways(scene: Environment, obj: ObjectModel) -> Floats:
-    """(K, 3) unit vectors, object frame, along which a ball as wide as a palm leaves the object without touching an
-    obstacle on `STANDOFF_M`.
+    """Return free approach directions (K, 3), unit vectors in the object frame.
+    Along them a ball as wide as a palm leaves the object without touching an obstacle on `STANDOFF_M`.
 
     Raises:
         InputError: there is none.
@@ -93,7 +91,7 @@ def free_ways(scene: Environment, obj: ObjectModel) -> Floats:
 
 
 def no_place(model: Model) -> NoStartFound:
-    """What to say of a batch none of whose starts is clear."""
+    """Return the error of a batch without a clear start."""
     hand, obj = model.hand.model, model.obj.model
     return NoStartFound(
         f"{hand.name} finds no free place around {obj.name} in this scene: the object is too large, or what stands "
@@ -104,17 +102,17 @@ def no_place(model: Model) -> NoStartFound:
 def clear_scene_starts(
     model: Model, generators: list[np.random.Generator], *, each: int, placed: PlacedGrasps, ways: Sequence[Floats]
 ) -> tuple[HandState, Floats]:
-    """A start of each generator, `each` per grasp, and how deep it is (n,) [m]: the first of its draws that is clear,
-    or else the least deep; of those that reach across the object the clear one between whose pads it lies best.
+    """Return a start for each generator, `each` per grasp, and its depth (n,) [m].
+    That is the first clear draw, or the least deep; of antipodal ones the clear draw with the best placed pair.
 
-    Some find a place in a narrow scene and some do not: these end blocked, and the others are what there is.
+    In a narrow scene some grasps find no clear start: they end blocked, and the batch consists of the others.
 
     Args:
         model: hand and object, with the scenes' obstacles.
         generators: of the starts, those of one grasp side by side.
-        each: starts of a grasp.
+        each: starts per grasp.
         placed: scenes of the grasps.
-        ways: what `free_ways` finds in each scene.
+        ways: result of `free_ways` for each scene.
     """
     hand, obj = model.hand.model, model.obj.model
     probe = Probe(model, len(generators), room=ROOM)
@@ -137,7 +135,7 @@ def clear_scene_starts(
         if not len(rows):
             break
         if number == normal.shape[1]:
-            # Most starts need a few draws: the numbers of later ones are drawn when they are needed.
+            # Most starts need a few draws: numbers of later draws are generated on demand.
             normal = np.concatenate([normal, _normal(generators, rows, hand.dofs)], axis=1)
         reach = reaching[rows] & (number < REACHES)
         numbers = np.where(reach, order[rows, min(number, REACHES - 1)], number)
@@ -146,7 +144,7 @@ def clear_scene_starts(
         worth = off < beside[rows, None]
         worth[~reach | (depth[rows] > CLEAR)] = True
         found = _depths(probe, drawn.states, placed, scene[rows], worth)
-        # The nearest clear distance, or else the least deep.
+        # Select the nearest clear distance, or else the least deep.
         clear = found <= CLEAR
         pick = np.where(clear.any(axis=1), clear.argmax(axis=1), found.argmin(axis=1))
         at = np.arange(len(rows)), pick
@@ -164,7 +162,7 @@ def clear_scene_starts(
 
 
 def _normal(generators: list[np.random.Generator], rows: NDArray[np.intp], dofs: int) -> Floats:
-    """(n, DRAWN, 2 + D) numbers of the next draws of starts `rows`; 0 of the others."""
+    """Return (n, DRAWN, 2 + D) random numbers for the next draws of starts `rows`; 0 for the others."""
     out = np.zeros((len(generators), DRAWN, 2 + dofs))
     for row in rows.tolist():
         out[row] = generators[row].standard_normal((DRAWN, 2 + dofs))
@@ -174,10 +172,10 @@ def _normal(generators: list[np.random.Generator], rows: NDArray[np.intp], dofs:
 def _depths(
     probe: Probe, states: HandState, placed: PlacedGrasps, scene: NDArray[np.intp], worth: NDArray[np.bool_]
 ) -> Floats:
-    """(n, len(RETREATS)) depths [m] of hands and their mountings in scenes (n,), from the farthest distance that is
-    `worth` it (n, len(RETREATS)) inwards for as long as it is clear; inf elsewhere.
+    """Return depths (n, len(RETREATS)) [m] of hands and mountings in scenes (n,); inf if not computed.
+    They run from the farthest distance with `worth` (n, len(RETREATS)) inwards while clear.
 
-    Most draws fail for what no retreat fixes, and hardly any can be clear nearer than where it is not.
+    Most draws fail for reasons that no retreat fixes, and hardly any is clear nearer than where it is not.
     """
     found, open_ = np.full((len(scene), len(RETREATS)), np.inf), np.ones(len(scene), bool)
     for k in reversed(range(len(RETREATS))):
@@ -196,7 +194,7 @@ def _depths(
 def _mounting_lack(
     probe: Probe, states: HandState, placed: PlacedGrasps, scene: NDArray[np.intp], *, exact: bool
 ) -> Floats:
-    """(n,) what the mountings of hands in scenes (n,) lack of their distance from obstacles and of `ROOM` [m]."""
+    """Return the clearance (n,) that mountings of hands in scenes (n,) lack to the margin plus `ROOM` [m]."""
     hand, obj = probe.model.hand.model, probe.model.obj.model
     poses = posture_of(hand, obj, states).hand_pose
     return mounting_lack(hand, poses, placed.scenes, scene, room=ROOM, exact=exact)
@@ -205,10 +203,10 @@ def _mounting_lack(
 def _raise(
     drawn: _Drawn, rows: NDArray[np.intp], placed: PlacedGrasps, scene: NDArray[np.intp], probe: Probe
 ) -> Floats:
-    """Lift draws `rows` at all their distances, scenes (n,), by what the nearest and its mounting lack of their room
-    from obstacles; how far their pairs are then from between their pads (n, len(RETREATS)) [m], 0 of others.
+    """Lift draws `rows` in scenes (n,), at all distances, by the clearance of the nearest that is lacking.
+    Return the distance (n, len(RETREATS)) of their pairs from between the pads [m], 0 for other draws.
 
-    Steps of retreat are too coarse for what lies low: fingers would end above it, not beside it.
+    Steps of retreat are too coarse for low objects: fingers would end above the object, not beside it.
     """
     off = np.zeros((len(scene), len(RETREATS)))
     if not len(rows):
@@ -229,17 +227,17 @@ def _raise(
 
 @dataclass(frozen=True)
 class _Drawn:
-    """Draws of n starts."""
+    """Draws for n starts."""
 
     states: HandState
     """(n * len(RETREATS)) hands, each at each distance."""
     reaching: list[tuple[NDArray[np.intp], AntipodalHands]]
-    """Those that reach across the object, and which of the n they are."""
+    """Antipodal hands, and their indices among the n."""
 
 
 @dataclass(frozen=True)
 class _Around:
-    """What draws of one hand around one object share."""
+    """Data shared by the draws of one hand around one object."""
 
     hand: HandModel
     obj: ObjectModel
@@ -247,12 +245,12 @@ class _Around:
     ways: Sequence[Floats]
     """Free directions of each scene."""
     openings: Mapping[int, Openings]
-    """Of each scene."""
+    """Openings of each scene."""
 
     def order(
         self, uniform: Floats, scene: NDArray[np.intp], reaching: NDArray[np.bool_], placed: PlacedGrasps
     ) -> tuple[NDArray[np.intp], Floats]:
-        """See `promising`: (n, REACHES) draws of hands that reach across the object; inf of others."""
+        """Return (n, REACHES) draws of antipodal hands, see `promising`; inf for others."""
         order, least = np.zeros((len(scene), REACHES), np.intp), np.full((len(scene), REACHES), np.inf)
         for s in np.unique(scene[reaching]):
             rows = np.flatnonzero(reaching & (scene == s))
@@ -269,8 +267,8 @@ class _Around:
         return order, least
 
     def draws(self, uniform: Floats, normal: Floats, scene: NDArray[np.intp], reach: NDArray[np.bool_]) -> _Drawn:
-        """Candidates, each at each distance, from random numbers (n, 7) and (n, 2 + D), in scenes (n,); `reach` (n,):
-        across the object."""
+        """Return draws at each distance in scenes (n,); `reach` (n,) marks antipodal ones.
+        They depend on uniform (n, 7) and normal (n, 2 + D) random numbers."""
         n, dofs = len(uniform), self.hand.dofs
         pivot, rotation, q, away = np.zeros((n, 3)), np.zeros((n, 4)), np.zeros((n, dofs)), np.zeros((n, 3))
         reaching = []
@@ -292,7 +290,7 @@ class _Around:
         return _Drawn(states, reaching)
 
     def _towards(self, uniform: Floats, normal: Floats, ways: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-        """Hands that look at random points of the surface, as `across` gives them, without a pair."""
+        """Place hands that face random points of the surface, in the form of `across` but without a pair."""
         hand, obj, surface = self.hand, self.obj, self.surface
         face = np.minimum(np.searchsorted(surface.sums, uniform[:, 0]), len(surface.sums) - 1)
         u, v = uniform[:, 1:2], uniform[:, 2:3]
@@ -310,7 +308,7 @@ class _Around:
 
 
 def _turned(away: Floats, ways: Floats, random: Floats) -> Floats:
-    """The direction (3,) itself where it is near a free way, or else turned towards a random free one until it is."""
+    """Return a direction (3,) near a free one, else turn it towards a random free one until it is."""
     if (ways @ away).max() >= NEAR_WAY:
         return away
     goal = ways[int(random[1] * len(ways))]
@@ -323,7 +321,7 @@ def _turned(away: Floats, ways: Floats, random: Floats) -> Floats:
 
 
 def _tilted(normals: Floats, angles: Floats) -> Floats:
-    """(n, 3) unit vectors turned about two axes across them by `angles` (n, 2) [rad]."""
+    """Return unit vectors (n, 3): normals turned about two perpendicular axes by `angles` (n, 2) [rad]."""
     axis = np.einsum("nij,nj->ni", _frames(normals)[..., :2], angles)
     angle = np.linalg.norm(axis, axis=1, keepdims=True)
     unit = axis / np.maximum(angle, 1e-12)
@@ -331,7 +329,7 @@ def _tilted(normals: Floats, angles: Floats) -> Floats:
 
 
 def _frames(z: Floats) -> Floats:
-    """(n, 3, 3) rotation matrices with third columns z (n, 3) and arbitrary but fixed first ones."""
+    """Return rotations (n, 3, 3) with third columns z (n, 3) and arbitrary but fixed first columns."""
     helper = np.eye(3)[np.argmin(np.abs(z), axis=1)]
     x = np.cross(helper, z)
     x /= np.linalg.norm(x, axis=1, keepdims=True)

@@ -1,5 +1,5 @@
-"""Weights of each iteration (the coarse phase shrinks the dilation, the fine phase seats the hand), and starts that
-another method proposes."""
+"""Weights per iteration, and the interface of starts that another method proposes.
+The coarse phase shrinks the dilation, the fine phase seats the hand."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ PAPER_RATES: Final = (1e-3, 1e-3, 1e-3)
 #: Largest dilation of the object [m].
 DILATION: Final = 0.01
 SELF_WEIGHT: Final = 2e4
-#: Pull on points that touch nothing, see `LossOptions` [m]: fingers lie around a free object instead of at it, and more
-#: of them hold at half the friction. With half as much a Barrett hand gains little, with twice as much the slender
-#: fingers of a Shadow hand are drawn into thin walls.
+#: Length of the attraction term, see `LossOptions` [m]: the planner prefers enclosing grasps, and more of them hold at
+#: half friction. Half of it gains a Barrett hand little; twice of it draws the slender fingers of a Shadow hand into
+#: thin walls.
 PULL: Final = 3e-4
-#: The projection of hands around a free object: it draws in what is farther off than among obstacles, so more of the
-#: hand comes to lie at the object. It costs about half of the depth that the samples of `pairs.DENSER` save.
+#: Projection around a free object: it attracts points from farther away than among obstacles, so more of the hand
+#: touches. It costs about half of the depth that the samples of `pairs.DENSER` save.
 AROUND: Final = ProjectionOptions(hold=5e-3)
 
 
 def loss_options(fidelity: Fidelity, *, friction: float = 0.8) -> LossOptions:
-    """The simulation of a fidelity. Plain gradient descent needs the limits as a penalty, as the paper has them."""
+    """Return the simulation options of a fidelity; plain descent has limits as a penalty, as in the paper."""
     paper = fidelity.optimizer == "gd"
     return LossOptions(
         contact_solver=fidelity.contact_solver,
@@ -50,8 +50,8 @@ def loss_options(fidelity: Fidelity, *, friction: float = 0.8) -> LossOptions:
 
 
 def in_scene(fidelity: Fidelity) -> Fidelity:
-    """The fidelity of grasps in scenes: obstacles leave fewer good approaches, so more hands set out and more go on.
-    They set out with the object between their fingers, so a short way does."""
+    """Return the fidelity for scenes: obstacles leave fewer good approaches, so more hands are needed.
+    They start with the object between their fingers, so few iterations suffice."""
     return fidelity.model_copy(
         update={
             "starts": min(5 * fidelity.starts // 2, 64),
@@ -64,8 +64,7 @@ def in_scene(fidelity: Fidelity) -> Fidelity:
 
 
 def with_rollout(fidelity: Fidelity) -> Fidelity:
-    """The fidelity of grasps of a free object whose hands are tried: those that fail are replaced by others, so half as
-    many set out at first."""
+    """Return the fidelity for free objects with rollouts: retries replace half of the first starts."""
     return fidelity.model_copy(update={"starts": -(-fidelity.starts // 2)})
 
 
@@ -78,7 +77,7 @@ def _decayed(rates: tuple[float, float, float], count: int, to: float) -> Floats
 
 
 def coarse_schedule(fidelity: Fidelity) -> Schedule:
-    """Dilation to 0 over the first four fifths; penetration weight times 10."""
+    """Return weights with dilation to 0 over the first four fifths and penetration weight times 10."""
     n = fidelity.coarse_iterations
     dilation = DILATION * np.clip(1.0 - np.arange(n) / max(0.8 * n, 1.0), 0.0, 1.0)
     if fidelity.optimizer == "gd":
@@ -88,7 +87,7 @@ def coarse_schedule(fidelity: Fidelity) -> Schedule:
 
 
 def fine_schedule(fidelity: Fidelity) -> Schedule:
-    """No dilation; penetration dear."""
+    """Return weights without dilation and with a high penetration weight."""
     n = fidelity.fine_iterations
     if fidelity.optimizer == "gd":
         return Schedule(np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n), np.tile(PAPER_RATES, (n, 1)))
@@ -102,8 +101,7 @@ class WarmStart(Protocol):
     """Starts of grasps in scenes."""
 
     def adapted(self, fidelity: Fidelity) -> Fidelity:
-        """The fidelity of grasps in scenes, as `schedule.in_scene` gives it, with as many starts and finalists as these
-        starts need."""
+        """Return the fidelity of `schedule.in_scene` with as many starts and finalists as these starts need."""
 
     def __call__(
         self,

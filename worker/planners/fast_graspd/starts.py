@@ -1,11 +1,10 @@
-"""Starts of hands. Every second start of a grasp has the palm look at a random point of the surface, from a little way
-off; the others reach across the object between opposed fingers (`reaching`), as all do where it is too small or too
-wide for the pads. Jaws of a gripper stand around two opposite places.
+"""Starts of hands: in every second one of a grasp the palm faces a random surface point nearby.
+The others reach across the object (`reaching`), as do all if it is too small or too wide for the pads.
 
-A start is taken only if nothing touches: hands that start inside a thin wall never leave it.
+A start must be free of contact: hands that start inside a thin wall never leave it.
 
-A pair of opposite surface points is drawn, the jaws are opened a little wider than it is and put around it, turned by a
-random angle about the line that joins the points.
+For a gripper a pair of opposite surface points is drawn. The jaws open slightly wider than the pair, are placed around
+it and turned by a random angle about the line that joins the points.
 """
 
 from __future__ import annotations
@@ -35,10 +34,10 @@ from graspd.worker.simulation.data import Data, HandState
 from graspd.worker.simulation.model import Model
 from graspd.worker.simulation.record import record_placement
 
-#: Distance of the palm from the surface [m]: nearest, farthest, then the steps of retreat while something touches.
+#: Distance of the palm from the surface [m]: nearest, farthest, then the steps of retreat on contact.
 GAP: Final = (0.002, 0.012)
 RETREATS: Final = (0.0, 0.01, 0.02, 0.03)
-#: Distance of the palms of hands that open further to have a place: their fingers stand about the object already.
+#: Palm distance of hands that open further to find a start: their fingers are around the object already.
 OPENED_GAP: Final = (0.004, 0.02)
 #: Tilt of the approach away from the surface normal, standard deviation [rad].
 TILT: Final = 0.25
@@ -46,22 +45,22 @@ TILT: Final = 0.25
 POSTURE_NOISE: Final = 0.08
 #: Deepest penetration of a start [m].
 CLEAR: Final = 0.001
-#: Draws per grasp before the least penetrating one is taken.
+#: Draws per grasp before the least penetrating one is selected.
 DRAWS: Final = 48
-#: How far hands that have no place in their pre-shape open, as shares of the way to their ends, and draws at each.
+#: Opening of hands without a start in their pre-shape, as shares of the remaining range, and draws at each.
 OPENED: Final = (0.5, 1.0)
 OPENED_DRAWS: Final = 24
-#: A start that is deeper than this is none [m].
+#: Depth above which a start is rejected [m].
 NO_PLACE: Final = 0.01
 
 
 def start_generator(seed: int, batch: int, index: int, start: int) -> np.random.Generator:
-    """Random numbers of one start of one grasp, independent of every other."""
+    """Return the generator of one start of one grasp, independent of every other."""
     return np.random.default_rng(np.random.SeedSequence([seed, batch, index, start]))
 
 
 def _frame(z: Floats) -> Floats:
-    """Rotation matrices (..., 3, 3) with third columns z (..., 3) and arbitrary but fixed first ones."""
+    """Return rotations (..., 3, 3) with third columns z (..., 3) and arbitrary but fixed first columns."""
     helper = np.eye(3)[np.argmin(np.abs(z), axis=-1)]
     x = cross(helper, z)
     x /= np.linalg.norm(x, axis=-1, keepdims=True)
@@ -70,7 +69,7 @@ def _frame(z: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class _Pair:
-    """What all draws of a hand around an object share."""
+    """Data shared by all draws of a hand around an object."""
 
     hand: HandModel
     centre: Floats
@@ -82,7 +81,7 @@ class _Pair:
     area: Floats
     """(F,) [m^2], doubled."""
     share: Floats
-    """(F,) the area of the faces up to each, over the whole."""
+    """(F,) cumulative share of the area."""
     palm: Floats
     """(3, 3) rotation to the frame of the palm's approach."""
     gap: tuple[float, float]
@@ -101,7 +100,7 @@ class _Pair:
 
 @dataclass(frozen=True)
 class _Numbers:
-    """What n draws take of their generators, in the order in which they take it."""
+    """Random numbers of n draws, in the order in which they are drawn."""
 
     uniform: Floats
     """(n, 5) face, two for the point, roll, gap."""
@@ -121,7 +120,7 @@ class _Numbers:
 
 
 def draw(pair: _Pair, generators: list[np.random.Generator]) -> tuple[HandState, Floats]:
-    """A candidate start of each generator at its nearest distance, and the directions (n, 3) in which palms look."""
+    """Draw one start per generator at its nearest distance; also return the palms' directions (n, 3)."""
     hand, number = pair.hand, _Numbers.of(generators, pair.hand.dofs)
     face = pair.share.searchsorted(number.uniform[:, 0], side="right")
     inside = number.uniform[:, 1:3]
@@ -143,7 +142,7 @@ def draw(pair: _Pair, generators: list[np.random.Generator]) -> tuple[HandState,
 
 
 def _retreated(state: HandState, approach: Floats) -> HandState:
-    """Each hand at each distance of retreat, (n * len(RETREATS)) hands."""
+    """Return each hand at each distance of retreat, (n * len(RETREATS)) hands."""
     back = np.array(RETREATS)[None, :, None]
     pivot = state.pivot[:, None] - back * approach[:, None]
     repeat = len(RETREATS)
@@ -153,7 +152,7 @@ def _retreated(state: HandState, approach: Floats) -> HandState:
 
 
 class Probe:
-    """Places hands and tells how deep they are, and how near the object; `room` as `record_placement` has it."""
+    """Places hands and measures depth and distance from the object; for `room` see `record_placement`."""
 
     def __init__(self, model: Model, capacity: int, *, room: float = 0.0) -> None:
         self.model, self.data = model, Data(model, capacity)
@@ -162,14 +161,14 @@ class Probe:
         self._placement = record_placement(model, self.data, room=room)
 
     def depths(self, states: HandState) -> Floats:
-        """Deepest penetration of each hand (n,) [m]: into the object, of the object into links, of links into links,
-        and what it lacks of its distance from obstacles."""
+        """Return the deepest penetration of each hand (n,) [m].
+        It covers hand in object, object in links, links in links, and lacking clearance from obstacles."""
         self.data.set_state(states)
         self._touching.run()
         return self.data.deepest(len(states.pivot)).astype(float)
 
     def nearest(self, states: HandState) -> Floats:
-        """Distance of each hand's nearest point from the object (n,) [m], at most the model's band."""
+        """Return the distance (n,) of each hand's nearest point from the object [m], at most the model's band."""
         self.data.set_state(states)
         self._placement.run()
         n = len(states.pivot)
@@ -180,10 +179,10 @@ class Probe:
 
 
 def sample_starts(model: Model, *, seed: int, batch: int, indices: range, each: int) -> HandState:
-    """Collision-free starts of the grasps `indices` of a batch, `each` per grasp, those of one grasp side by side.
+    """Sample collision-free starts of the grasps `indices` of a batch, `each` per grasp side by side.
 
     Raises:
-        InputError: not one draw of some grasp came within 10 mm of being clear.
+        InputError: no draw of some grasp came within 10 mm of being clear.
     """
     generators = [start_generator(seed, batch, i, k) for i in indices for k in range(each)]
     state, depth = clear_starts(model, generators, each=each)
@@ -194,7 +193,7 @@ def sample_starts(model: Model, *, seed: int, batch: int, indices: range, each: 
 
 
 def no_place(model: Model) -> InputError:
-    """What to say of a grasp none of whose starts is clear."""
+    """Return the error of a grasp without a clear start."""
     hand, obj = model.hand.model, model.obj.model
     return InputError(
         f"{hand.name} finds no free place around {obj.name}: the object is too large or encloses the hand; "
@@ -203,10 +202,10 @@ def no_place(model: Model) -> InputError:
 
 
 def clear_starts(model: Model, generators: list[np.random.Generator], *, each: int = 1) -> tuple[HandState, Floats]:
-    """A start of each generator, the least deep of its draws, and how deep it is (n,) [m]; most are clear.
+    """Return a start per generator, the least deep of its draws, and its depth (n,) [m]; most are clear.
 
-    Of the `each` starts of a grasp every second one, the first not among them, reaches across the object where it can;
-    all of them where the object is too small or too wide for the hand's pads.
+    Of the `each` starts of a grasp every second one, not the first, reaches across the object where possible. All do
+    if the object is too small or too wide for the hand's pads.
     """
     hand, obj = model.hand.model, model.obj.model
     count, jaws = len(generators), JawStarts.of(hand, obj)
@@ -231,17 +230,17 @@ def clear_starts(model: Model, generators: list[np.random.Generator], *, each: i
 def open_further(
     model: Model, generators: list[np.random.Generator], state: HandState, depth: Floats, wanted: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
-    """Draws again, with hands that are more open, where `clear_starts` found no place: in the pre-shape the fingers of
-    some hands leave no gap as wide as the object.
+    """Retry with more open hands where `clear_starts` found no clear start.
+    The pre-shape of some hands leaves no gap as wide as the object.
 
     Args:
         model: of the starts.
-        generators: of the n starts, as `clear_starts` left them.
-        state, depth: what it found; better ones take their place.
+        generators: of the n starts, in the state that `clear_starts` left.
+        state, depth: result of `clear_starts`; better starts replace it.
         wanted: (n,) which of them may be opened.
 
     Returns:
-        (n,) those that were.
+        (n,) which were opened.
     """
     hand, obj = model.hand.model, model.obj.model
     lost = wanted & (depth > NO_PLACE)
@@ -269,14 +268,14 @@ def _draw_until_clear(
     best: HandState,
     deepest: Floats,
 ) -> None:
-    """Put into `best` and `deepest` the nearest clear start of each of `rows`, or else the least deep. `drawn` gives a
-    draw of some rows at each distance of retreat."""
+    """Store the nearest clear start of each of `rows`, or the least deep, in `best` and `deepest`.
+    `drawn` draws the given rows at each distance of retreat."""
     for _ in range(draws):
         if not len(rows):
             return
         states = drawn(rows)
         depth = probe.depths(states).reshape(len(rows), -1)
-        # The nearest clear distance, or else the least deep.
+        # Select the nearest clear distance, or else the least deep.
         clear = depth <= CLEAR
         pick = np.where(clear.any(axis=1), clear.argmax(axis=1), depth.argmin(axis=1))
         found = states[np.arange(len(rows)) * depth.shape[1] + pick]
@@ -295,7 +294,7 @@ def _reach(
     best: HandState,
     deepest: Floats,
 ) -> None:
-    """Put into `best` and `deepest` those of the starts `rows` that reach across the object and are clear."""
+    """Store those of the starts `rows` that reach across the object and are clear in `best` and `deepest`."""
     seeds = np.array([generators[i].integers(2**31) for i in rows], np.int32)
     first = np.zeros(len(rows), np.int32)
     left = np.arange(len(rows))
@@ -316,39 +315,39 @@ def _reach(
 
 
 def _put(states: HandState, rows: NDArray[np.intp], others: HandState) -> None:
-    """Exchange these rows of the states."""
+    """Replace these rows of the states."""
     states.pivot[rows], states.rotation[rows], states.q[rows] = others.pivot, others.rotation, others.q
 
 
-#: Room between each pad and the object [m]: least and most.
+#: Clearance between each pad and the object [m]: least and most.
 ROOM_M: Final = (0.002, 0.005)
-#: How far ahead of the middle of the pads the object's place may lie, as a share of their length; then how much farther
-#: the hand stays back while something touches.
+#: Range of the pair's position ahead of the middle of the pads, as a share of their length; then the further distance
+#: that the hand stays back on contact.
 AHEAD: Final = (-0.25, 0.25)
 
 JAW_RETREATS: Final = (0.0, 0.25, 0.5, 0.75)
-#: Shortest and longest length of pads that this is a share of [m].
+#: Shortest and longest length of pads for that share [m].
 LENGTH_M: Final = (0.01, 0.05)
-#: Uniform numbers of one draw: pair, side, angle, room, place.
+#: Uniform numbers of one draw: pair, side, angle, clearance, place.
 UNIFORM: Final = 5
-#: A line farther from the centre of mass than this share of the object's radius is drawn exp(-1/2) times as often.
+#: Distance of a line from the centre of mass at which its chance falls to exp(-1/2), as a share of the object's radius.
 CENTRAL: Final = 0.35
 
 
 @dataclass(frozen=True)
 class JawStarts:
-    """What draws for a gripper and an object share."""
+    """Data shared by the draws for a gripper and an object."""
 
     hand: HandModel
     obj: ObjectModel
     jaws: Jaws
     pairs: Pairs
     sums: Floats
-    """(P,) cumulative shares with which pairs are drawn."""
+    """(P,) cumulative chance of pairs."""
 
     @classmethod
     def of(cls, hand: HandModel, obj: ObjectModel) -> JawStarts | None:
-        """None where the hand is no gripper.
+        """Return None if the hand is no gripper.
 
         Raises:
             InputError: the object does not fit between the jaws.
@@ -362,7 +361,7 @@ class JawStarts:
         return cls(hand, obj, jaws, pairs, np.cumsum(weight) / weight.sum())
 
     def draw(self, uniform: Floats) -> HandState:
-        """Hands of random numbers (n, `UNIFORM`) in [0, 1), each at each retreat: n * len(RETREATS) of them."""
+        """Return hands for random numbers (n, `UNIFORM`) in [0, 1) at each retreat, n * len(RETREATS)."""
         pick = np.minimum(np.searchsorted(self.sums, uniform[:, 0]), len(self.sums) - 1)
         start, end = self.pairs.start[pick], self.pairs.end[pick]
         swap = (uniform[:, 1] < 0.5)[:, None]
@@ -382,7 +381,7 @@ class JawStarts:
 
 
 def _across(line: Floats, turn: Floats) -> Floats:
-    """(n, 3) unit vectors across lines (n, 3), turned by shares (n,) of a full turn."""
+    """Return unit vectors (n, 3) perpendicular to lines (n, 3), turned by shares (n,) of a full turn."""
     helper = np.eye(3)[np.argmin(np.abs(line), axis=1)]
     x = np.cross(line, helper)
     x /= np.linalg.norm(x, axis=1, keepdims=True)
@@ -391,7 +390,7 @@ def _across(line: Floats, turn: Floats) -> Floats:
 
 
 def _frames(x: Floats, z: Floats) -> Floats:
-    """(n, 3, 3) rotation matrices with first columns x (n, 3) and third columns as near to z (n, 3) as can be."""
+    """Return rotations (n, 3, 3) with first columns x (n, 3) and third columns nearest to z (n, 3)."""
     z = z - np.einsum("ni,ni->n", z, x)[:, None] * x
     z = z / np.linalg.norm(z, axis=1, keepdims=True)
     return np.stack([x, np.cross(z, x), z], axis=-1)
