@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Services:
-    """Store, index and queue. Only API and controller open the index; a worker uses `open_store` and the queue."""
+    """Store, index and queue. API and controller open the index; workers use `open_store` and the queue."""
 
     settings: Settings
     store: Store

@@ -1,4 +1,4 @@
-"""The controller: one loop for all work that no worker may do. It can be killed at any time; its successor continues.
+"""The controller: one loop for all work that no worker may do. If killed, its successor continues.
 
 It reconciles: it writes events to the index, and queues unfinished tasks of the index that the queue lacks. One
 controller leads; the others stand by (`service.pipeline.leading`).
@@ -110,7 +110,7 @@ class Controller:
         ]
 
     def run(self, stop: threading.Event) -> None:
-        """Run rounds until `stop` is set. If a backend is unavailable, wait with growing pauses; nothing is lost."""
+        """Run rounds until `stop` is set. Wait with growing pauses for an unavailable backend."""
         with self._beside(stop):
             self._run(stop)
 
@@ -171,8 +171,9 @@ class Controller:
             raise away[0]
 
     def _mark(self) -> None:
-        """Give index and store a new mark after changes by users or workers. An older copy of the index then has
-        another mark than the store, and is rebuilt.
+        """Give index and store a new mark after changes by users or workers.
+
+        An older copy of the index then has another mark than the store, and is rebuilt.
         """
         notes = self._services.index.notes
         present, changes = notes.marked(), notes.changes()
@@ -196,7 +197,7 @@ class Controller:
         return self._has_plans
 
     def _enter_large_job(self) -> None:
-        """Enter the next tasks of a job that is too large for one transaction, so that others can write in between.
+        """Enter the next tasks of a job that is too large for one transaction; others can write in between.
 
         Such jobs alternate. After a kill, the successor continues from a note in the index.
         """
@@ -312,9 +313,10 @@ class Controller:
             self._has_news = False
 
     def _feed(self, present: set[str] | None = None, missing: Collection[str] = ()) -> None:
-        """Queue ready tasks. Without the queue's content (`present`), the marks of the index decide. The state in the
-        queue then prevents a second entry, also of a task that its job queues at this moment. Only the `missing` are
-        queued regardless of that state.
+        """Queue ready tasks; without the queue's content (`present`), the marks of the index decide.
+
+        The queue's own state then prevents a second entry, also of a task that its job queues at this moment. Only the
+        `missing` are queued regardless of that state.
         """
         depths = self._services.queue.depths()
         now = time.time()

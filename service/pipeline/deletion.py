@@ -1,4 +1,4 @@
-"""Deletion of assets, jobs and datasets by users. The record of the deletion decides; the rest follows.
+"""Deletion of assets, jobs and datasets by users. The deletion's record decides; the rest follows.
 
 `deletions/{what}/{id}.json` is written under the index's write lock, in the same step that removes the rows. From then
 on the thing is gone: a rebuild omits it, and nothing of that id is accepted. The garbage collector
@@ -114,8 +114,9 @@ def delete_dataset(services: Services, name: str, *, owner: str = "", with_snaps
 
 
 def put_away(services: Services, deletion: Deletion) -> None:
-    """Move the deleted objects below `removed/`, the own record last, then remove the deletion's record. Do nothing for
-    a thing that was restored meanwhile.
+    """Move the deleted objects below `removed/`, the own record last, then remove the deletion's record.
+
+    Do nothing for a thing that was restored meanwhile.
     """
     record = _record_of(deletion)
     with services.index.database.writing():

@@ -73,7 +73,7 @@ class Resolver:
         return self.choose(request)[0]
 
     def choose(self, request: JobRequest) -> tuple[JobRequest, Choice | None]:
-        """Return the request with `auto` replaced by a fidelity, and the reason; None if the request names one.
+        """Return the request with `auto` replaced by a fidelity, and the reason; None without `auto`.
 
         Raises:
             InputError: no chart exists for its scene, or no fidelity meets the target.
@@ -191,6 +191,6 @@ def _speed(runs: Sequence[Row], fidelity: str) -> float:
 
 
 def _mean(runs: Sequence[Row], fidelity: str, metric: str) -> float | None:
-    """Return the mean over a fidelity's runs with the accuracy; robustness is undefined where no grasp is held."""
+    """Return the mean over a fidelity's runs with the accuracy; robustness needs held grasps."""
     values = [float(run[metric]) for run in runs if run["fidelity"] == fidelity and run.get(metric) is not None]
     return sum(values) / len(values) if values else None

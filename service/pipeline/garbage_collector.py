@@ -55,7 +55,7 @@ class GarbageCollector:
         return False
 
     def collect(self, budget_s: float = BUDGET_S) -> bool:
-        """Remove objects deleted before the grace time, and shards unused since then. Return whether work is left."""
+        """Remove objects deleted before the grace time, and shards unused since. Return whether work is left."""
         deadline = self._clock() + budget_s
         before = timestamp(self._services.settings.shard_grace_s)
         # The record of the deletion sorts first and is removed last.
@@ -128,8 +128,9 @@ class GarbageCollector:
             yield from ((stage, shard) for stage, shard in some if shard in unneeded)
 
     def _remove_shard(self, stage: Stage, shard: str) -> None:
-        """Remove the manifest first: without it the shard does not exist. A job entered meanwhile waits for the lock,
-        and makes the shard again.
+        """Remove the manifest first, without which the shard does not exist.
+
+        A job entered meanwhile waits for the lock, and makes the shard again.
         """
         with self._services.index.database.writing() as connection:
             if self._services.index.removals.remove_shard(shard, within=connection):

@@ -1,4 +1,4 @@
-"""HTTP client of webhooks: POST to an address named by a user; public machines only, bounded time and bytes.
+"""HTTP client of webhooks: POST to a user's address; public machines only, bounded time and bytes.
 
 The name is resolved here, all its addresses are checked, and the connection uses one of them. A name that later
 resolves to another machine (DNS rebinding) has no effect. Redirects are not followed.
@@ -67,8 +67,9 @@ def networks(text: str) -> Networks:
 
 
 def is_public(address: Address) -> bool:
-    """Check whether an address is public: not loopback, private, link-local, shared, multicast or reserved, nor an IPv6
-    address that maps such an IPv4 one.
+    """Check whether an address is public, also the IPv4 address in an IPv6 one.
+
+    Loopback, private, link-local, shared, multicast and reserved addresses are not.
     """
     if any(address in network for network in _INSIDE):
         return False

@@ -1,4 +1,4 @@
-"""Apply events to the index. An event only names a place: the content of the index is read from the store."""
+"""Apply events to the index. An event only names a place: the index is filled from the store."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ class Indexer:
             yield from zip(some, self._readers.map(self._load, [events[place] for place in some]), strict=True)
 
     def _load(self, event: Event) -> ShardManifest | Exception:
-        """Read the manifest of a shard. Many are read at once, because most of the time is latency of the store."""
+        """Read the manifest of a shard. Many are read at once, because most of the time is latency."""
         try:
             assert event.stage is not None
             return load_manifest(self._services.store, event.stage, event.output)

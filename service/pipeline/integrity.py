@@ -1,4 +1,4 @@
-"""Integrity check of a store: compares shards, records and uploads with their checksums. Changes nothing."""
+"""Integrity check of a store: shards, records and uploads against their checksums. Changes nothing."""
 
 from __future__ import annotations
 
@@ -160,7 +160,7 @@ def _counted(chunks: Iterator[bytes], read: Read) -> Iterator[bytes]:
 
 
 def _check_upload(store: Store, key: str, kind: AssetKind, digest: str) -> None:
-    """Check an archive of graspd 0.2: the digest of its files, which names its folder, is the only evidence."""
+    """Check an archive of graspd 0.2 by the digest of its files, which names its folder."""
     with tempfile.TemporaryFile() as file:
         file.writelines(store.stream(key))
         try:

@@ -1,4 +1,4 @@
-"""Integrity scan of the store by the controller: repeated rounds at a bounded rate, resumed where it stopped."""
+"""Integrity scan of the store by the controller: repeated, rate-limited, resumed where it stopped."""
 
 from __future__ import annotations
 

@@ -173,7 +173,7 @@ def retry(services: Services, job_id: str, *, cause: str = "") -> JobView:
 
 
 def queue_tasks(services: Services, ready: Sequence[ReadyTask], *, routes: Routes, again: bool = False) -> set[str]:
-    """Queue tasks and mark them in the index; tasks that no worker can do wait, and their job contains the reason.
+    """Queue tasks and mark them in the index; tasks that no worker can do wait, with the reason in the job.
 
     The mark comes first: a marked task that is not queued is found missing and queued by the controller. A queued task
     without mark might run twice.
@@ -207,7 +207,7 @@ def queue_tasks(services: Services, ready: Sequence[ReadyTask], *, routes: Route
 
 
 def _start(services: Services, job_id: str) -> None:
-    """Queue the part of a job that fits the queue's window; the controller queues the rest, or all without Redis."""
+    """Queue the part of a job that fits the queue's window. The controller queues the rest."""
     try:
         room = services.settings.queue_window - sum(services.queue.depths().values())
         if room > 0:

@@ -36,17 +36,18 @@ class Leadership:
     """Lease of leadership of one process."""
 
     def __init__(self, queue: RqQueue, *, lease_s: float, alive: HeartbeatFile, name: str | None = None) -> None:
-        """Args:
-        queue: used by a separate thread while the lease is held.
-        lease_s: validity of the lease after its last renewal [s].
-        alive: touched while another leads.
-        name: name of the leader; a restarted process of the same name need not wait for its lease.
+        """
+        Args:
+            queue: used by a separate thread while the lease is held.
+            lease_s: validity of the lease after its last renewal [s].
+            alive: touched while another leads.
+            name: name of the leader; a restarted process of the same name need not wait for its lease.
         """
         self._queue, self._lease_s, self._alive = queue, lease_s, alive
         self.holder = name or f"{socket.gethostname()}-{os.getpid()}-{secrets.token_hex(4)}"
 
     def wait(self, stop: threading.Event) -> bool:
-        """Wait until this process leads; return False if it is stopped first. Redis may be unavailable meanwhile."""
+        """Wait until this process leads; return False if it is stopped first. Redis may be unavailable."""
         told = False
         while not stop.is_set():
             self._alive.touch()
@@ -61,10 +62,10 @@ class Leadership:
 
     @contextmanager
     def held(self, stop: threading.Event) -> Iterator[threading.Event]:
-        """Hold the lease; yield an event that is set when another process leads or `stop` is set. Release the lease at
-        the end.
+        """Hold the lease; yield an event that is set when another process leads or `stop` is set.
 
-        The lease is lost only if Redis reports another holder: while Redis is unavailable, no process can take it.
+        The lease is lost only if Redis reports another holder: while Redis is unavailable, no process can take it. The
+        lease is released at the end.
         """
         over, done = threading.Event(), threading.Event()
         thread = threading.Thread(target=self._renew, args=(stop, over, done), name="controller-lease", daemon=True)

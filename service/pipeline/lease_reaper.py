@@ -28,7 +28,7 @@ LOST_AFTER_S: Final = 3.0
 
 
 class LeaseReaper:
-    """Detects lost leases by the lack of change, on this process's monotonic clock: wall clocks do not matter."""
+    """Detects lost leases by the lack of change, on this process's monotonic clock, not on wall clocks."""
 
     def __init__(self, services: Services, indexer: Indexer, *, clock: Callable[[], float] = time.monotonic) -> None:
         self._services = services

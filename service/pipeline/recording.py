@@ -1,4 +1,4 @@
-"""Records and rows in one step: records that are put during a write transaction of the index count as a whole."""
+"""Records and rows in one step: records of one write transaction of the index count together."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ log = logging.getLogger(__name__)
 
 @contextmanager
 def recording(services: Services, made: Sequence[str] = ()) -> Iterator[tuple[Connection, Put]]:
-    """Yield a write transaction of the index and a function that puts records. They are removed if it fails.
+    """Yield a write transaction of the index and a function that puts records; undo them on failure.
 
     No other process writes meanwhile: checks before a record is put still hold when the rows are written.
 

@@ -1,4 +1,4 @@
-"""Repair of a store: damaged results are made again from intact inputs, since a shard is a function of its inputs."""
+"""Repair of a store: damaged shards are made again, since a shard is a function of its inputs."""
 
 from __future__ import annotations
 

@@ -74,7 +74,7 @@ def bring_back(services: Services, tag: Tag) -> None:
 def _change(
     services: Services, tag: str, change: Callable[[Tag], Tag], permit: Permit, *, fresh: Tag | None = None
 ) -> tuple[Tag, Tag]:
-    """Return the tag before and after. A writer has the lock of the index, so concurrent changes see each other."""
+    """Return the tag before and after. Writers hold the index's lock, so they see each other's changes."""
     with recording(services) as (connection, put):
         found = newest_version(services.store, tag)
         known = None if found is None or found.gone else found

@@ -1,4 +1,4 @@
-"""Hands, objects and networks that jobs may use: those of the request, and the neighbours in its scenes."""
+"""Hands, objects and networks that jobs may use, including the neighbours in their scenes."""
 
 from __future__ import annotations
 

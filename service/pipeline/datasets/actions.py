@@ -1,4 +1,4 @@
-"""Actions of a user on datasets: create, cancel, retry, snapshot. The controller carries them out job by job."""
+"""Actions of a user on datasets: create, cancel, retry, snapshot. The controller carries them out."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from graspd.service.store.records import (
 def create(
     services: Services, request: DatasetRequest, *, owner: str = "", scope: ProjectScope = EVERYTHING
 ) -> tuple[DatasetView, bool]:
-    """Record a dataset; the controller plans its jobs. Equal hands, objects and options give the same dataset.
+    """Record a dataset; the controller plans its jobs. Equal hands, objects and options give one dataset.
 
     Args:
         owner: id of the submitting API key, also for its jobs.
@@ -100,7 +100,7 @@ def cancel(services: Services, name: str) -> DatasetView:
 
 
 def retry(services: Services, name: str) -> DatasetView:
-    """Restart the failed and cancelled cells of a dataset with fresh attempts. Finished work is not repeated.
+    """Restart failed and cancelled cells of a dataset with fresh attempts. Finished work is not repeated.
 
     Raises:
         NotFoundError: unknown dataset.

@@ -1,4 +1,4 @@
-"""Export of a snapshot as files in a folder, with verified checksums. Existing files are not fetched again."""
+"""Export of a snapshot as files in a folder, with verified checksums. Existing files are skipped."""
 
 from __future__ import annotations
 

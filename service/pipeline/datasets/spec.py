@@ -69,7 +69,7 @@ def describe(
     owner: str = "",
     project: str = "",
 ) -> DatasetRecord:
-    """Return the record of a dataset. Equal hands, objects, options and chosen fidelities give one digest for any name.
+    """Return the record of a dataset. Its digest follows from hands, objects, options and fidelities only.
 
     Args:
         choose: replaces `auto` by a fidelity, and returns how it was chosen.
