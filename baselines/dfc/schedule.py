@@ -1,8 +1,8 @@
-"""DexGraspNet's annealing: energy weights, step sizes, temperatures, the chance of another contact.
+"""DexGraspNet's annealing: energy weights, step sizes, temperatures, probability of a new contact.
 
-E = E_fc + 100 E_dis + 100 E_pen + 10 E_spen + E_joints
-step 0.005 * 0.95^floor(t / 50), each gradient over its root mean square, v <- 0.98 g^2 + 0.02 v
-temperature 18 * 0.95^floor(t / 30): a proposal is accepted with probability min(1, exp((E - E') / T))
+E = E_fc + 100 E_dis + 100 E_pen + 10 E_spen + E_joints step 0.005 * 0.95^floor(t / 50), each gradient over its root
+mean square, v <- 0.98 g^2 + 0.02 v temperature 18 * 0.95^floor(t / 30): a proposal is accepted with probability min(1,
+exp((E - E') / T))
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ SWITCH: Final = 0.5
 
 
 def step_size(iteration: Floats) -> Floats:
-    """Length of a step in units of each gradient's root mean square [m or rad]."""
+    """Return the step length in units of each gradient's root mean square [m or rad]."""
     return STEP_SIZE * DECAY ** np.floor(np.asarray(iteration, float) / STEP_PERIOD)
 
 
 def temperature(iteration: Floats) -> Floats:
-    """Temperature of the acceptance test."""
+    """Return the temperature of the acceptance test."""
     return TEMPERATURE * DECAY ** np.floor(np.asarray(iteration, float) / TEMPERATURE_PERIOD)
