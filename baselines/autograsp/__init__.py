@@ -1,1 +1,1 @@
-"""Autograsp (Miller & Allen 2004): a random approach, then each joint closes until contact of its links."""
+"""Autograsp (Miller & Allen 2004): a random approach, then each joint closes until its links touch."""

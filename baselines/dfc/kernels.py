@@ -1,4 +1,4 @@
-"""DexGraspNet's energies with gradients on bodies, and its Metropolis-adjusted descent; see `schedule`."""
+"""DexGraspNet's energies, gradients on bodies, and Metropolis-adjusted descent. See `schedule`."""
 
 import warp as wp
 

@@ -25,7 +25,7 @@ LEAST_SHARE: Final = 0.5
 
 
 def write(bundle: Bundle, folder: Path, hand_files: Mapping[str, bytes]) -> list[Path]:
-    """Write `grasps.yaml`, `trajectories/GRASP.yaml`, the hand's files in `hand/`, the object in `object/`.
+    """Write `grasps.yaml`, `trajectories/GRASP.yaml`, the hand's files in `hand/`, the mesh in `object/`.
 
     Args:
         bundle: the grasps.

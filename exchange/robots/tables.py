@@ -1,4 +1,4 @@
-"""Grasps as text files: three CSV tables, and the grasp file of Isaac Sim (`isaac_grasp`, version 1.0).
+"""Grasps as text files: three CSV tables, and Isaac Sim's grasp file (`isaac_grasp`, version 1.0).
 
 In the tables, poses are those of the tool frame: x y z [m], unit quaternion qw qx qy qz. Joints are radians or metres,
 in columns of their names.
