@@ -1,4 +1,4 @@
-"""What studies read the time from."""
+"""Clock of the studies."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from collections.abc import Callable
 
 
 def clock_of(device: str) -> Callable[[], float]:
-    """On a CPU the seconds of all threads together, which hardly depend on what else the machine does; on a GPU those
-    that pass."""
+    """Return core-seconds of all threads on a CPU, wall-clock seconds on a GPU.
+
+    Core-seconds are nearly independent of other load on the machine.
+    """
     return time.process_time if device == "cpu" else time.perf_counter

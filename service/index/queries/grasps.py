@@ -421,7 +421,7 @@ def _unknown(name: str) -> InputError:
 
 
 class GraspFilter(Model):
-    """Conjunction of conditions. `at_least`, `at_most` bound metrics, inclusive; missing values never match."""
+    """All conditions hold together. `at_least`, `at_most` bound metrics, inclusive; missing values fail."""
 
     hand: str | None = None
     object: str | None = None
