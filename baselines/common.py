@@ -58,10 +58,7 @@ class PairCache(Generic[T]):
 
 
 def ground_of(hand: HandModel, obj: ObjectModel, device: str, *kernels: ModuleType) -> Pair:
-    """Return the pair on a device; load the kernel modules that the caller launches.
-
-    Only one thread may load a module.
-    """
+    """Return the pair on a device; load the caller's kernel modules, which only one thread may do."""
     pair = pair_of(hand, obj, GROUND, device)
     with _lock:
         for module in kernels:

@@ -136,10 +136,7 @@ def write(
 
 
 def models_of(hand: HandModel, folder: Path) -> list[HandMapping]:
-    """Return the mappings of all models that grasps are written for.
-
-    These are our own model, which is written below `folder`, and the benchmark's if it has one.
-    """
+    """Return mappings for our hand model, written below `folder`, and the benchmark's if it has one."""
     config = f"{NAME}_{plain_name(hand.name)}"
     model = write_hand(hand, config, folder)
     order = joint_order(folder / model)

@@ -178,10 +178,7 @@ def _rows_of(
 
 
 def _in_both(kind: int, parts: Sequence[_Part], out: frozenset[str]) -> bool:
-    """Check whether a type has grasps on objects of both splits.
-
-    DexLearn samples a type and then an object of it, and fails for a type without objects.
-    """
+    """Check whether a type has objects in both splits: DexLearn fails for a type without objects."""
     names = {lot.name for lot, _, other, _ in parts if other == kind}
     return not out or bool(names & out and names - out)
 

@@ -138,10 +138,7 @@ def signature(obj: ObjectModel) -> Floats:
 
 
 def families(objects: Mapping[str, ObjectModel]) -> dict[str, str]:
-    """Return the family of each object by name: the least digest of the files of similar objects.
-
-    Similarity is transitive: objects that are each similar to a third are of one family.
-    """
+    """Return each object's family: the least digest of files of transitively similar objects."""
     names = sorted(objects, key=lambda name: objects[name].digest)
     found = np.array([signature(objects[name]) for name in names]).reshape(len(names), len(QUANTILES))
     family: dict[str, str] = {}

@@ -7,8 +7,5 @@ from collections.abc import Callable
 
 
 def clock_of(device: str) -> Callable[[], float]:
-    """Return core-seconds of all threads on a CPU, wall-clock seconds on a GPU.
-
-    Core-seconds are nearly independent of other load on the machine.
-    """
+    """Return core-seconds of all threads on a CPU (nearly independent of load), wall clock on a GPU."""
     return time.process_time if device == "cpu" else time.perf_counter

@@ -1,4 +1,4 @@
-"""Cost of pictures: images per second, and shares of tracing, shading, annotation, compression, writing."""
+"""Cost of pictures: images per second, shares of tracing, shading, annotation, compression, writing."""
 
 from __future__ import annotations
 

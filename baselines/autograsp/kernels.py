@@ -82,10 +82,7 @@ def object_to_pieces(
     # Data out:
     near_inout: wp.array2d(dtype=wp.float32),
 ):
-    """Lower these distances by the object's samples, for edges between hand points.
-
-    Samples farther than `margin` do not count. Launch over (B, P).
-    """
+    """Lower these distances by object samples within `margin`, for edges between points. Over (B, P)."""
     b, piece = wp.tid()
     if active_in[b] == 0:
         return

@@ -136,10 +136,7 @@ INFINITE: Final = 1e30
 
 
 def key_points(hand: HandModel) -> tuple[Ints, Floats, Ints, Ints]:
-    """Return bodies (K,) and positions (K, 3) of the pieces' centres, and the pairs to separate.
-
-    Pieces that are close in the rest posture are no pair.
-    """
+    """Return bodies (K,), piece centres (K, 3), and the pairs to separate: those not close at rest."""
     body = np.array([piece.body for piece in hand.pieces], np.int32)
     place = np.array([piece.vertices.mean(axis=0) for piece in hand.pieces])
     rest = apply(body_poses(hand, IDENTITY_POSE, hand.expand(hand.preshape))[0][body], place)

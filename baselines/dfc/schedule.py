@@ -1,8 +1,8 @@
 """DexGraspNet's annealing: energy weights, step sizes, temperatures, probability of a new contact.
 
-E = E_fc + 100 E_dis + 100 E_pen + 10 E_spen + E_joints step 0.005 * 0.95^floor(t / 50), each gradient over its root
-mean square, v <- 0.98 g^2 + 0.02 v temperature 18 * 0.95^floor(t / 30): a proposal is accepted with probability min(1,
-exp((E - E') / T))
+E = E_fc + 100 E_dis + 100 E_pen + 10 E_spen + E_joints
+step 0.005 * 0.95^floor(t / 50), each gradient over its root mean square, v <- 0.98 g^2 + 0.02 v
+temperature 18 * 0.95^floor(t / 30): a proposal is accepted with probability min(1, exp((E - E') / T))
 """
 
 from __future__ import annotations

@@ -6,8 +6,8 @@ object's surface, dilated by r, exerts the force
     f = -k c n - min(kf |v_t|, mu k c) v_t / |v_t|,   c = max(r - d, 0).
 
 The relaxation gives every point and velocity its own force F. Two descents alternate: F moves to the nearest forces
-that stop the object (`relax`), and the hand moves so that the contact forces become F, by the gradient of sum |f -
-F|^2. Points without contact leak a share of that gradient, which attracts them.
+that stop the object (`relax`), and the hand moves so that contact forces become F, by the gradient of sum |f - F|^2.
+Points without contact leak a share of that gradient, which attracts them.
 """
 
 import warp as wp
@@ -54,8 +54,7 @@ def force_slope(physics: ForceModel, depth: wp.float32, n: wp.vec3, v: wp.vec3):
     tangential = v - wp.dot(v, n) * n
     speed = wp.length(tangential)
     if speed > 1.0e-12:
-        # Friction grows with depth only while it slides. It attracts free points: normal forces for opposite velocities
-        # cancel, friction forces do not.
+        # Only sliding friction grows with depth. It attracts free points, where opposite normal forces cancel.
         if physics.friction * physics.stiffness * depth < physics.viscous * speed:
             slope -= (physics.friction * physics.stiffness / speed) * tangential
     if depth <= 0.0:

@@ -124,10 +124,7 @@ class Seeds:
     def _proposed(
         self, model: Model, generators: list[np.random.Generator], each: int, placed: PlacedGrasps
     ) -> tuple[HandState, Floats]:
-        """Return proposed open hands (n * draws), grouped by start, and (n * draws, 3) directions out.
-
-        All are in the object frame.
-        """
+        """Return proposed open hands (n * draws) by start, and (n * draws, 3) directions out; object frame."""
         hand, obj, table = model.hand.model, model.obj.model, table_height(placed.supports)
         seen, draws = SurfaceView.of(obj), max(1, PROPOSALS // each)
         pivot, rotation, q, away = [], [], [], []
@@ -243,10 +240,7 @@ class SurfaceView:
         return np.asarray(self._middle(pose) + distance * toward)
 
     def cloud(self, pose: Floats, camera: Floats, count: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
-        """Return points and normals (count, 3) of the object at `pose` (7,) that a camera sees.
-
-        Each pixel yields one point; `count` of them are drawn.
-        """
+        """Return visible points and normals (count, 3) of the object at `pose` (7,), drawn from one per pixel."""
         points, normals = quat_rotate(pose[3:], self.points) + pose[:3], quat_rotate(pose[3:], self.normals)
         rays = points - camera
         facing = np.flatnonzero((normals * rays).sum(axis=1) < 0)

@@ -1,8 +1,7 @@
 """Grasps as `moveit_msgs/Grasp` and `RobotTrajectory` messages in YAML, with URDFs of hand and object.
 
-`grasp_pose` is that of the tool frame, which for MoveIt is the link of the end-effector. Directions are in the frame of
-the pose. ROS quaternions are x y z w. `effort` [N m or N] is the squeeze's: stiffness times the distance from grasp to
-squeeze.
+`grasp_pose` is the tool frame's, which for MoveIt is the end-effector's link. Directions are in the frame of the pose.
+ROS quaternions are x y z w. `effort` [N m or N] is the squeeze's: stiffness times distance from the grasp.
 """
 
 from __future__ import annotations

@@ -146,10 +146,7 @@ def _key(found: Executions, scene: Scene, posture: str, row: int) -> dict[str, s
 
 
 def _names(hand: HandModel) -> Mapping[str, str]:
-    """Return the hand's own names for those of the validator's model.
-
-    `object`, `supports`, `root` and `mocap` are reserved.
-    """
+    """Return the hand's own names for the validator's; `object`, `supports`, `root`, `mocap` are reserved."""
     taken = {"object", "supports", "root", "mocap", "world"}
     found: dict[str, str] = {}
     for prefix, names in (("body", enumerate(hand.body_names)), ("dof", enumerate(hand.dof_names))):

@@ -1,7 +1,6 @@
 """Grasps as posed meshes, one file each: binary glTF (+y up), and USD stages over time (extra `usd`).
 
-A stage is in metres and z up. Its default values show the grasp; time samples, 24 per second, lead from the standoff to
-the lift.
+A stage is in metres, z up. Defaults show the grasp; 24 time samples per second lead from the standoff to the lift.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """Grasps as text files: three CSV tables, and Isaac Sim's grasp file (`isaac_grasp`, version 1.0).
 
-In the tables, poses are those of the tool frame: x y z [m], unit quaternion qw qx qy qz. Joints are radians or metres,
-in columns of their names.
+In the tables, poses are the tool frame's: x y z [m], unit quaternion qw qx qy qz. Joint columns [rad or m] are named.
 
 In Isaac Sim's file, a grasp is the pose of the gripper's frame in the object's: position [m], quaternion w and xyz;
 `cspace_position` are the joints that hold, `pregrasp_cspace_position` those before. Joints that the URDF couples are

@@ -1,7 +1,6 @@
 """Condition of an index without opening it, and comparison of a random sample of a large one.
 
-The condition makes nothing and moves nothing aside, as opening the index would. The sample has shards and jobs from
-both index and store.
+The condition changes nothing, unlike opening the index. The sample has shards and jobs of both index and store.
 """
 
 from __future__ import annotations

@@ -171,10 +171,7 @@ class Controller:
             raise away[0]
 
     def _mark(self) -> None:
-        """Give index and store a new mark after changes by users or workers.
-
-        An older copy of the index then has another mark than the store, and is rebuilt.
-        """
+        """Renew the mark of index and store after changes: older copies of the index are then rebuilt."""
         notes = self._services.index.notes
         present, changes = notes.marked(), notes.changes()
         if changes != present.changes or self._made:

@@ -128,10 +128,7 @@ class GarbageCollector:
             yield from ((stage, shard) for stage, shard in some if shard in unneeded)
 
     def _remove_shard(self, stage: Stage, shard: str) -> None:
-        """Remove the manifest first, without which the shard does not exist.
-
-        A job entered meanwhile waits for the lock, and makes the shard again.
-        """
+        """Remove the manifest first, which ends the shard; a job entered meanwhile waits and makes it again."""
         with self._services.index.database.writing() as connection:
             if self._services.index.removals.remove_shard(shard, within=connection):
                 self._services.store.delete(names.shard_manifest(stage, shard))

@@ -1,9 +1,8 @@
 """Identity of the service of a store, an index and a Redis.
 
 Two services on one of them would undo each other's work. The store contains a chain of create-only records; the last
-one is the service that works on it. Index and Redis repeat its id. If one of the two is lost, the other still
-identifies the service. If both are empty they count as a second service, and `graspd admin index rebuild` must state
-that it replaces the first.
+one is the service that works on it. Index and Redis repeat its id. If one of them is lost, the other identifies the
+service. If both are empty they count as a second service; `graspd admin index rebuild` makes it the present one.
 """
 
 from __future__ import annotations

@@ -175,8 +175,7 @@ def retry(services: Services, job_id: str, *, cause: str = "") -> JobView:
 def queue_tasks(services: Services, ready: Sequence[ReadyTask], *, routes: Routes, again: bool = False) -> set[str]:
     """Queue tasks and mark them in the index; tasks that no worker can do wait, with a reason in the job.
 
-    The mark comes first: a marked task that is not queued is found missing and queued by the controller. A queued task
-    without mark might run twice.
+    The mark comes first: the controller queues marked tasks that are missing; unmarked ones might run twice.
 
     Args:
         routes: capabilities of the living workers.

@@ -1,8 +1,7 @@
 """Webhook dispatcher: signed reports of ends, one at a time to each address, retried with back-off.
 
 An address that does not accept a delivery pauses with all its deliveries. Projects take turns; within one, the least
-recently tried address comes first. Addresses that failed last share half of the slots, so that silent ones do not delay
-the others.
+recently tried address comes first. Addresses that failed last share half of the slots to not delay the others.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Plots of a chart: accuracy over speed with bars, labels and Pareto front, in total and per hand; knobs."""
+"""Plots of a chart: accuracy over speed with bars, labels and Pareto front, in total and per hand."""
 
 from __future__ import annotations
 

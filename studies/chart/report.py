@@ -61,10 +61,7 @@ ACCURACIES: Final = (("dexgraspbench", ".2f"), ("hard", ".2f"), ("robust", ".2f"
 
 
 def write(chart: Row, folder: Path) -> list[Path]:
-    """Write the chart's files to a folder; sweeps.png only if there are sweeps.
-
-    The others are chart.json, chart.csv, chart.md, chart.png, chart.svg and chart.hands.png.
-    """
+    """Write chart.{json,csv,md,png,svg}, chart.hands.png, and sweeps.png if there are sweeps, to a folder."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "chart.json").write_text(json.dumps(chart, indent=1, allow_nan=False) + "\n")
     with (folder / "chart.csv").open("w", newline="") as stream:
@@ -201,7 +198,7 @@ def runs_table(runs: Sequence[Row]) -> str:
 
 
 def best_table(runs: Sequence[Row]) -> str:
-    """Return the paper's table 2: contact area, intersection volume, ε, wrench volume, displacement per hand."""
+    """Return the paper's table 2: contact area, intersection volume, ε, wrench volume, displacement."""
     groups: dict[tuple[str, str, str], list[Row]] = {}
     for run in runs:
         groups.setdefault((run["hand"], run["method"], run["fidelity"]), []).append(run["best"])

@@ -266,8 +266,7 @@ class ValidatedGrasps:
 def figures(rows: Sequence[Mapping[str, Any]]) -> Row:
     """Return shares of all candidates with 95 % intervals (Wilson), and lifted grasps per second.
 
-    `robust` is the mean share of models over the lifted grasps. In sums of several cells, each grasp has equal weight.
-    A refused cell has no known time.
+    `robust` is the mean share of models over lifted grasps. All grasps weigh equally. A refused cell has no time.
     """
     grasps = sum(row["grasps"] for row in rows)
     found: Row = {"grasps": grasps}

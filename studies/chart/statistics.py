@@ -64,7 +64,7 @@ def widen_speed(row: dict[str, Any], key: str, valid: int, grasps: int, per_seco
 
 
 def _scrutinised(cell: Rollout) -> dict[str, Any]:
-    """Return success by DexGraspBench's protocol and at half friction, and the robust share of held grasps."""
+    """Return success by DexGraspBench's protocol and at half friction, and held grasps' share of models."""
     row: dict[str, Any] = {}
     for key, verdicts in (("dexgraspbench", cell.dexgraspbench), ("hard", cell.hard)):
         held = np.concatenate(verdicts) == 1

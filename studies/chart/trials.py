@@ -1,4 +1,4 @@
-"""One cell of the chart: a method at a fidelity on a hand and an object, run several times and validated."""
+"""One cell of a chart: a method at a fidelity on a hand and an object, run repeatedly and validated."""
 
 from __future__ import annotations
 
@@ -178,10 +178,7 @@ class Rollout:
             self.shares.append(shares)
 
     def time_first(self, grasps: int) -> None:
-        """Time a call of few grasps, the wait for a first valid one.
-
-        Above one second per grasp the time follows from the batch.
-        """
+        """Time a call of few grasps, the wait for a valid one; above 1 s per grasp, derive it from the batch."""
         self.first_grasps = grasps
         each = self.end_seconds[-1] / self.setting.batch
         if each > 1.0:

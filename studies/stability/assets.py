@@ -1,7 +1,6 @@
 """Hard objects and hands: thin, sharp, open, tiny, huge; few or many fingers, coupled drives.
 
-All go through ingest. The hands are a family: equal fingers of three joints in a ring around a palm, which lean outward
-while open.
+All go through ingest. The hands are a family: equal three-joint fingers in a ring, which lean outward while open.
 """
 
 from __future__ import annotations

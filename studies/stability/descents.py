@@ -44,8 +44,7 @@ class Descent:
 
     state: HandState
     depths: Floats
-    """Deepest penetration after the projection (n,) [m], as in a job: hands pulled around the object penetrate it by
-    millimetres before."""
+    """(n,) deepest penetration after the projection [m], as in a job: before, it is millimetres."""
     drift: float
     """Largest deviation of a quaternion's length from 1 before the projection, which normalises it."""
 

@@ -23,8 +23,7 @@ from graspd.worker.simulation.reference import Contacts, World
 Solver = Callable[[Contacts, Floats, World], Floats]
 
 RADIUS_M: Final = 0.035
-#: Gap between ball and cage at the start [m], or the ball's flight in this many steps if that is less, so that it
-#: arrives.
+#: Gap between ball and cage at the start [m], at most the ball's flight in this many steps, so that it arrives.
 GAP_M: Final = 2e-3
 FLIGHT_STEPS: Final = 10
 STEPS: Final = 60
