@@ -83,7 +83,7 @@ def write(
 
     Raises:
         InputError: the folder already exists, there are no pictures, there are more scenes than numbers in the
-        splits, or a joint has the name of another key.
+            splits, or a joint has the name of another key.
     """
     top = folder / "data"
     if top.exists():

@@ -129,7 +129,7 @@ def _fingertips(hand: HandModel, grasps: Posture) -> Floats:
 
 
 def pointed_at(palm: Floats, line: Floats, samples: Floats) -> NDArray[np.intp]:
-    """Return (K,) indices of the points (S, 3) on lines from `palm` (K, 3) along unit `line` (K, 3) [m]."""
+    """Return (K,) aim points' indices in `samples` (S, 3), seen from `palm` along unit `line` (K, 3) [m]."""
     found = np.empty(len(palm), np.intp)
     for first in range(0, len(palm), _AT_ONCE):
         some = slice(first, first + _AT_ONCE)

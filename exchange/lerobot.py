@@ -81,7 +81,7 @@ def write(lots: Sequence[ExportPart], pictures: Pictures, folder: Path, out: fro
 
     Raises:
         InputError: pyarrow is missing, the data set exists, grasps are of several hands or of free objects, or
-        pictures are missing or differ in size.
+            pictures are missing or differ in size.
     """
     parquet.arrow()
     if (folder / "meta").exists():

@@ -114,7 +114,7 @@ def read_dexgraspnet(path: Path, *, hand: str, obj: str, root_offset: np.ndarray
         hand: URDF or built-in hand.
         obj: the object's mesh at scale 1.
         root_offset: (7,) pose of the hand's root link in the frame that the source uses as root; identity by
-        default.
+            default.
 
     Raises:
         InputError: the file is invalid, or its joints are not the hand's.
@@ -166,8 +166,8 @@ def read_multidex(path: Path, *, hand: str, obj: str, robot: str, object_name: s
         path: `cmap_dataset.pt`. torch loads tensors and plain values only.
         hand: URDF or built-in hand: the robot.
         obj: mesh of the object.
-        robot: the robot's name in the file, `allegro` say.
-        object_name: the object's name in the file, `contactdb+mug` say.
+        robot: the robot's name in the file, such as `allegro`.
+        object_name: the object's name in the file, such as `contactdb+mug`.
 
     Raises:
         InputError: torch is missing, or the file is invalid or lacks that robot and object.

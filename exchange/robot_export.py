@@ -68,7 +68,7 @@ def export_grasps(
 
     Raises:
         InputError: the format is unknown, no grasps match or can be reached, a tool frame or mount is invalid, or
-        an extra package is missing.
+            an extra package is missing.
     """
     format_ = ALIASES.get(format_, format_)
     if format_ not in FORMATS:

@@ -34,7 +34,7 @@ def write_scored(
 ) -> Path:
     """Validate and measure a set of grasps and write it as a base shard, its object's mesh beside it.
 
-    Grasps in scenes are tested by a lift; the hand's trajectory is planned anew, as for our own grasps.
+    Grasps in scenes are tested by a lift; the hand's trajectory is replanned, as for our own grasps.
 
     Args:
         found: the grasps.

@@ -217,7 +217,7 @@ def advance(
     active_inout: wp.array(dtype=wp.int32),
     pivot_inout: wp.array(dtype=wp.vec3),
 ):
-    """Move the hand along its approach until its nearest body is `standoff` away. Launch over B."""
+    """Move the hand along its approach to `standoff` between its nearest body and the object. Over B."""
     b = wp.tid()
     if active_inout[b] == 0:
         return

@@ -75,7 +75,7 @@ def prepare(
     Raises:
         NotFoundError: unknown hand, object, neighbour or network.
         InputError: one of them failed its check; the network is of another hand; no chart contains a
-            fidelity that meets the target; the object or a neighbour stands in a support of its scene (SceneError).
+            fidelity that meets the target; the object or a neighbour penetrates a support of its scene (SceneError).
         ConflictError: the check of one of them is still running.
         QueueUnavailable, StoreUnavailable, IndexUnavailable: a backend is unavailable.
     """
@@ -279,7 +279,7 @@ def check_scene(options: JobOptions, obj: AssetView, beside: Sequence[AssetView]
         beside: the neighbours of the scene, in their order.
 
     Raises:
-        SceneError: the target or a neighbour stands in a support.
+        SceneError: the target or a neighbour penetrates a support.
     """
     place = options.place
     _check_pose(obj, "target", place.target, place.supports)

@@ -58,7 +58,7 @@ class TaskRanges:
         able = [worker for worker in self._workers if Stage.SYNTHESIZE in worker.stages]
         if any(worker.ability.schemas[1] < SCHEMA_OF_RANGES for worker in able):
             return job
-        # A user who watches a small job sees its grasps batch by batch; a GPU makes them all in one launch.
+        # A user of a small job sees its grasps batch by batch; a GPU makes them all in one launch.
         if job.priority is Priority.INTERACTIVE and not (able and all(one.device.startswith("cuda") for one in able)):
             return job
         rate = Rates(self._costs, job.request, {one.device for one in able}).of(job.request.hand, job.request.object)

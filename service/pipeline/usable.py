@@ -36,7 +36,7 @@ def usable(services: Services, kind: AssetKind, name: str, scope: ProjectScope =
 def with_neighbours(
     services: Services, options: Options, scope: ProjectScope = EVERYTHING
 ) -> tuple[Options, Sequence[AssetView]]:
-    """Return options whose neighbours have the present digests of their names, and these neighbours.
+    """Return options with the present digests of the neighbours' names, and these neighbours.
 
     A digest in the request itself, for example one copied from a job, stays.
 

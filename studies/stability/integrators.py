@@ -96,7 +96,7 @@ def position_based(solver: Solver, *, dt: float, speed: float, count: int = 24) 
 def force_based(
     *, dt: float, speed: float, stiffness: float, mass: float = 1.0, count: int = 24
 ) -> tuple[float, float]:
-    """Return the same for penalty forces -k c n and friction, semi-implicit Euler [N/m, kg]."""
+    """Return the same under penalty forces -k c n and friction; `stiffness` [N/m], `mass` [kg]."""
     points = _cage_around(count, dt, speed)
     inertia = 0.4 * mass * RADIUS_M**2
     centre, v, w = np.zeros(3), np.array([0.8, 0.36, 0.48]) * speed, np.zeros(3)

@@ -237,7 +237,7 @@ class DatasetFeed:
 
         Args:
             unshared: omit jobs that another, uncancelled dataset waits for too, and those that another key
-            submitted.
+                submitted.
         """
         query = (
             select(dataset_cells.c.position, dataset_cells.c.job_id)
