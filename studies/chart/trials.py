@@ -120,7 +120,7 @@ class Rollout:
 
     @cached_property
     def tried(self) -> Tried | None:
-        """Rollouts of candidates, as in production."""
+        """Rollouts of candidates, as in jobs."""
         return rollout_on(self.setting.run, self.hand, self.obj, self._pieces, in_scenes=False)
 
     def _pieces(self) -> ConvexPieces:
