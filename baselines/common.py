@@ -1,8 +1,7 @@
-"""Common parts of the baselines: hand and object on a device, free starts, inner surfaces, the way from hands to
-grasps.
+"""Common parts of the baselines: hand and object on a device, free starts, inner surfaces, grasp sets.
 
-Peers see the object as flat triangles (no Phong smoothing) and take their starts, postures around the grasp and
-quality from the same code as `fast_graspd`, so that what is compared is the search alone.
+Baselines use flat triangles of the object (no Phong smoothing). Starts, postures around the grasp and quality come from
+the same code as `fast_graspd`, so that only the search is compared.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ from graspd.worker.simulation.data import HandState
 
 T = TypeVar("T")
 
-#: How finely peers see hand and object where their source does not say.
+#: Resolution of hand and object for baselines whose source states none.
 GROUND: Final = Fidelity(
     name="peers", coarse_points=400, fine_points=1000, object_points=4000, polish_iterations=0, phong_alpha=0.0
 )
@@ -41,7 +40,7 @@ _lock = threading.Lock()
 
 
 class PairCache(Generic[T]):
-    """What a method makes once of a pair and its options, kept for the pairs used last."""
+    """Cache of values that a method computes once per pair and options, for the most recent pairs."""
 
     def __init__(self, make: Callable[..., T], size: int = 4) -> None:
         self._make = make
@@ -49,17 +48,17 @@ class PairCache(Generic[T]):
         self._lock = threading.Lock()
 
     def __call__(self, pair: Pair, *options: object) -> T:
-        """`make(pair, *options)`, from memory where it was used lately."""
+        """Return `make(pair, *options)`, cached if recently used."""
         key = (id(pair), *options)
         with self._lock:
             if key not in self._found:
-                # The pair is kept beside it: its id is not given to another one meanwhile.
+                # The cached reference to the pair prevents reuse of its id.
                 self._found[key] = (pair, self._make(pair, *options))
             return self._found[key][1]
 
 
 def ground_of(hand: HandModel, obj: ObjectModel, device: str, *kernels: ModuleType) -> Pair:
-    """The pair on a device, with the kernel modules that the caller will launch: only one thread may load a module."""
+    """Return the pair on a device; load the caller's kernel modules, which only one thread may do."""
     pair = pair_of(hand, obj, GROUND, device)
     with _lock:
         for module in kernels:
@@ -68,19 +67,19 @@ def ground_of(hand: HandModel, obj: ObjectModel, device: str, *kernels: ModuleTy
 
 
 def free_starts(pair: Pair, *, seed: int, batch: int, indices: range) -> HandState:
-    """A start for each grasp whose palm looks at a random place of the surface, touching nothing (Grasp'D, 2022)."""
+    """Sample a free start for each grasp, its palm towards a random surface point (Grasp'D, 2022)."""
     return sample_starts(pair.model(pair.coarse), seed=seed, batch=batch, indices=indices, each=1)
 
 
 def joined(states: list[HandState]) -> HandState:
-    """The hands of all parts of a batch, in order."""
+    """Concatenate the hands of all parts of a batch, in order."""
     return HandState(*(np.concatenate([getattr(s, name) for s in states]) for name in ("pivot", "rotation", "q")))
 
 
 def grasp_set(
     pair: Pair, state: HandState, began: float, info: dict[str, object], loss: Floats | None = None
 ) -> GraspSet:
-    """Hands as grasps with the postures around them; `began` is the planner's start by `time.perf_counter`."""
+    """Return hands as grasps with their postures; `began` is the planner's start by `time.perf_counter`."""
     hand, obj = pair.hand.model, pair.fine.obj.model
     seconds = time.perf_counter() - began
     grasp = posture_of(hand, obj, state)
@@ -94,14 +93,14 @@ def grasp_set(
     )
 
 
-#: Inside: the surface moves along its normal to within 45 degrees when the fingers close; the palm looks ahead.
+#: Inner side: when the fingers close, the surface moves within 45 degrees of its normal; on the palm it faces ahead.
 INSIDE_COS: Final = 0.7
 SAMPLES: Final = 1200
 STEP: Final = 1e-4
 
 
 def inside_points(hand: HandModel, *, each: int, on_palm: int) -> SurfacePoints:
-    """At most `each` points on every link that closes and `on_palm` on the palm, spread widely; none on other links."""
+    """Return well-spread points: at most `each` per closing link, `on_palm` on the palm, none elsewhere."""
     points = sample_surface(hand, SAMPLES)
     inside = _inside(hand, points)
     chosen: list[NDArray[np.intp]] = []
@@ -115,7 +114,7 @@ def inside_points(hand: HandModel, *, each: int, on_palm: int) -> SurfacePoints:
 
 
 def _inside(hand: HandModel, points: SurfacePoints) -> NDArray[np.bool_]:
-    """(N,) whether a point lies on the inside of its link."""
+    """Return (N,) whether a point lies on the inner side of its link."""
     before, after = (_posed(hand, points, hand.preshape + t * hand.closing) for t in (0.0, STEP))
     motion = after[0] - before[0]
     speed = np.linalg.norm(motion, axis=1)

@@ -1,1 +1,1 @@
-"""Grasps to and from the formats of others. An importer gives postures in our frames; an exporter writes our shards."""
+"""Conversion of grasps: importers return postures in our frames; exporters write our shards."""

@@ -1,8 +1,7 @@
-"""A hand as DexGraspBench keeps it: an MJCF model with position actuators, its configuration, and the map of its
-joints.
+"""Hands in DexGraspBench's layout: MJCF model with position actuators, configuration, map of joints.
 
 The model's world frame is the frame of our root link, so `qpos` begins with our pose of it. Bodies are named
-`root_<link>` and `f<number of the finger>_<link>`: the evaluator finds fingers by the beginning of a body's name.
+`root_<link>` and `f<number of the finger>_<link>`: the evaluator finds fingers by the prefix of a body's name.
 """
 
 from __future__ import annotations
@@ -24,16 +23,16 @@ from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, compose, invert
 from graspd.worker.hands.model import ConvexPiece, HandModel, JointType
 
-#: Joint damping over position gain [s]: that of DexGraspBench's Allegro hand.
+#: Joint damping over position gain [s], as in DexGraspBench's Allegro hand.
 _DAMPING_TIME: Final = 0.02
-#: A coupling is stiffer than a contact, or a pressed finger would stretch it.
+#: A coupling is stiffer than a contact; otherwise a pressed finger would stretch it.
 _COUPLING: Final = {"solref": "0.008 1", "solimp": "0.98 0.999 0.0001 0.5 2"}
 _BARE: Final = {"mass": 1e-3, "radius": 0.01}
 _COLOUR: Final = (0.87, 0.45, 0.2, 1.0)
 
 
 def write_hand(hand: HandModel, config: str, root: Path) -> Path:
-    """Write model and configuration of a hand below `root`, which stands for a checkout of DexGraspBench.
+    """Write model and configuration of a hand below `root`, laid out like a checkout of DexGraspBench.
 
     Args:
         hand: the hand.
@@ -56,25 +55,25 @@ def write_hand(hand: HandModel, config: str, root: Path) -> Path:
 
 
 def joint_order(file: Path) -> tuple[str, ...]:
-    """Joints of a model in the order of its `qpos`: MuJoCo's own, not the URDF's."""
+    """Return the joints of a model in the order of its `qpos`: MuJoCo's order, not the URDF's."""
     model = mujoco.MjModel.from_xml_path(str(file))
     return tuple(model.joint(number).name for number in range(model.njnt))
 
 
 def body_names(hand: HandModel) -> tuple[str, ...]:
-    """Name of each body in the model."""
+    """Return the name of each body in the model."""
     return tuple(f"{'root' if b == 0 else _finger(hand, b)}_{name}" for b, name in enumerate(hand.body_names))
 
 
 def _finger(hand: HandModel, body: int) -> str:
-    """The finger that a body belongs to: the root's child above it."""
+    """Return the finger of a body: the child of the root above it."""
     while hand.parent[body] > 0:
         body = int(hand.parent[body])
     return f"f{np.flatnonzero(hand.parent == 0).tolist().index(body)}"
 
 
 def _configuration(hand: HandModel, model: Path) -> str:
-    """JSON values are YAML as they are."""
+    """Return the configuration as JSON, which is valid YAML."""
     names = body_names(hand)
     fingers = [f"{_finger(hand, int(b))}_" for b in np.flatnonzero(hand.parent == 0)]
     values: dict[str, Any] = {
@@ -157,15 +156,14 @@ def _shape(piece: ConvexPiece, number: int) -> dict[str, str]:
 
 
 def _add_exclusions(contact: Element, hand: HandModel, names: tuple[str, ...]) -> None:
-    """Neighbours, and parents with their children: these touch by design."""
+    """Exclude neighbouring bodies, and parents with children, which touch by design."""
     pairs = set(hand.neighbours) | {(int(hand.parent[b]), b) for b in range(1, hand.bodies)}
     for a, b in sorted(pairs):
         SubElement(contact, "exclude", body1=names[a], body2=names[b])
 
 
 def _add_drives(equality: Element, actuators: Element, hand: HandModel) -> None:
-    """A position actuator on the first joint of each degree of freedom; the others are coupled to that joint. Dofs on a
-    tendon have one on it."""
+    """Add position actuators on the first joint of each dof and on tendons; couple the other joints."""
     pulled = {d: tendon for tendon in hand.tendons for d in tendon.dofs}
     for d, name in enumerate(hand.dof_names):
         if (tendon := pulled.get(d)) is not None:
@@ -209,38 +207,38 @@ def _text(values: Any) -> str:
     return " ".join(f"{float(value):.12g}" for value in values)
 
 
-#: Folder of the grasps of an experiment; the mapping lies beside it.
+#: Folder of the grasps of an experiment; the mapping is in its parent.
 GRASPS: Final = "graspdata"
 #: Folder of grasps that were collected for training.
 COLLECTED: Final = "succ_collect"
 FILE: Final = "hand_mapping.json"
-#: Folders of files with the same fields: grasps, and what the evaluator makes of them.
+#: Folders of files with the same fields: grasps, and results of the evaluator.
 _FOLDERS: Final = (GRASPS, COLLECTED, "evaluation", "succgrasp")
 
 
 @dataclass(frozen=True)
 class HandMapping:
-    """`qpos` = pose of the model's root (7,), then its joints in its own order."""
+    """Map between our joints and `qpos`: pose of the model's root (7,), then joints in its own order."""
 
     hand: str
     root_link: str
-    """Our root, a link of the URDF."""
+    """Our root link in the URDF."""
     config: str
     """Configuration of the benchmark that names the model: `hand=...`."""
     model: str
     root_in_model: tuple[float, ...]
-    """(7,) pose of our root link in the frame that `qpos` begins with the pose of; m, w x y z."""
+    """(7,) pose of our root link in the frame whose pose begins `qpos`; m, w x y z."""
     joints: tuple[tuple[str, str], ...]
     """(model's joint, URDF's joint) in the order of `qpos`; angles are the same."""
     links: tuple[tuple[str, str], ...] = ()
     """(model's body, URDF's link)"""
 
     def qpos(self, hand: HandModel, root: Floats, joints: Floats) -> Floats:
-        """(7 + J,) from our root's pose (7,) and our joints (J,)."""
+        """Return `qpos` (7 + J,) from our root's pose (7,) and our joints (J,)."""
         return np.concatenate([compose(root, invert(np.array(self.root_in_model))), joints[self._order(hand)]])
 
     def posture(self, hand: HandModel, qpos: Floats) -> tuple[Floats, Floats]:
-        """Our root's poses (N, 7) and our joints (N, J) from (N, 7 + J)."""
+        """Return our root's poses (N, 7) and our joints (N, J) from (N, 7 + J)."""
         joints = np.empty_like(qpos[:, 7:])
         joints[:, self._order(hand)] = qpos[:, 7:]
         return compose(qpos[:, :7], np.array(self.root_in_model)), joints
@@ -255,16 +253,16 @@ class HandMapping:
         return [hand.joint_names.index(name) for name in names]
 
     def write(self, folder: Path) -> None:
-        """As JSON for people and programs."""
+        """Write it as JSON."""
         said = asdict(self) | {"unit": "m, rad", "quaternion": "w x y z", "qpos": "root position, quaternion, joints"}
         (folder / FILE).write_text(json.dumps(said, indent=1) + "\n")
 
 
 def mapping_of(file: Path) -> HandMapping | None:
-    """The mapping that lies beside the folder of a grasp's file; None where there is none.
+    """Load the mapping in the parent of a grasp file's folder; None if there is none.
 
     Raises:
-        InputError: it is there and cannot be read.
+        InputError: it exists and cannot be read.
     """
     for above in file.resolve().parents:
         if above.name in _FOLDERS:
@@ -289,7 +287,7 @@ def _read(path: Path) -> HandMapping | None:
 
 
 def link_names(hand: HandModel) -> tuple[tuple[str, str], ...]:
-    """(body of our model, link of the URDF) of every body."""
+    """Return (body of our model, link of the URDF) of every body."""
     return tuple(zip(body_names(hand), hand.body_names, strict=True))
 
 
@@ -307,14 +305,14 @@ _ALLEGRO_URDFS: Final = (
         for part in ("rotation" if finger == "thumb" else "abduction", "proximal", "middle", "distal")
     ),
 )
-#: Their Allegro palm lies turned in the model's world frame: quaternion 0 1 0 1.
+#: Rotation of their Allegro palm in the model's world frame: quaternion 0 1 0 1.
 _ALLEGRO_ROOT: Final = (0.0, 0.0, 0.0, 0.0, 0.5**0.5, 0.0, 0.5**0.5)
-#: Their Shadow palm keeps the place that it has above the wrist, which is left out.
+#: Their Shadow palm keeps its position above the wrist, which is omitted.
 _SHADOW_ROOT: Final = (0.0, 0.0, 0.034, 1.0, 0.0, 0.0, 0.0)
 
 
 def of_the_benchmark(hand: HandModel) -> HandMapping | None:
-    """The mapping onto DexGraspBench's own model of the same hand; None where it has none."""
+    """Return the mapping to DexGraspBench's own model of the hand; None if it has none."""
     for names in _ALLEGRO_URDFS:
         if set(names) == set(hand.joint_names) and hand.root_link in ("base_link", "palm"):
             joints = tuple(zip(_ALLEGRO, names, strict=True))

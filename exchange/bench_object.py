@@ -1,4 +1,4 @@
-"""An object as DexGraspBench keeps it: mesh, convex pieces, facts, and scenes: afloat at scale 1, and on a table."""
+"""Objects in DexGraspBench's layout: mesh, pieces, facts, scenes (afloat at scale 1, on a table)."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from graspd.worker.hands.primitives import hull, volume
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.validation.decomposition import decompose
 
-#: Where a checkout of DexGraspBench keeps a set of objects.
+#: Folder of a set of objects in a checkout of DexGraspBench.
 SET: Final = Path("assets") / "object" / "graspd"
 SCALE: Final = "scale100"
 
 
 def write_object(obj: ObjectModel, name: str, root: Path) -> tuple[Path, Path]:
-    """Write an object and its scene below `root`, which stands for a checkout of DexGraspBench.
+    """Write an object and its scene below `root`, laid out like a checkout of DexGraspBench.
 
     Returns:
         its folder and its scene's file, both relative to `root`.
 
     Raises:
-        MeshError: its convex pieces are no picture of it.
+        MeshError: its convex pieces do not match its shape.
     """
     folder, scene = SET / "processed_data" / name, SET / "scene_cfg" / name / "floating" / f"{SCALE}.npy"
     for part in (folder / "mesh", folder / "info", folder / "urdf" / "meshes", scene.parent, SET / "valid_split"):
@@ -36,7 +36,7 @@ def write_object(obj: ObjectModel, name: str, root: Path) -> tuple[Path, Path]:
     mesh_file(obj, root / folder / "mesh" / "simplified.obj")
     pieces = [hull(corners) for corners in decompose(obj).vertices]
     meshes = root / folder / "urdf" / "meshes"
-    # The evaluator takes every file of this folder for a piece: none may be left of an earlier export.
+    # The evaluator reads every file of this folder as a piece: remove those of an earlier export.
     for old in meshes.iterdir():
         old.unlink()
     for number, (corners, faces) in enumerate(pieces):
@@ -50,7 +50,7 @@ def write_object(obj: ObjectModel, name: str, root: Path) -> tuple[Path, Path]:
 
 
 def _facts(obj: ObjectModel, solid: float) -> dict[str, Any]:
-    """What the evaluator sets the density by: at density 1 the pieces, which it weighs, have this mass."""
+    """Return facts with the scale of density: at density 1 the weighed pieces have this mass."""
     _, extents = trimesh.bounds.oriented_bounds(obj.hull_vertices)
     return {
         "gravity_center": obj.centre_of_mass.tolist(),
@@ -62,7 +62,7 @@ def _facts(obj: ObjectModel, solid: float) -> dict[str, Any]:
 
 
 def write_table(name: str, pose: Floats, number: int, root: Path) -> Path:
-    """Write the scene in which an object that is there already stands at `pose` (7,) on a table.
+    """Write the scene of an exported object at `pose` (7,) on a table.
 
     Returns:
         the scene's file, relative to `root`.

@@ -1,8 +1,8 @@
-"""Grasps on a table as DexGraspBench's tabletop test takes them, and back.
+"""Grasps on a table in the format of DexGraspBench's tabletop test: export and import.
 
-Frame of all poses in the files: the table's, z up, its top at z = 0; the evaluator has a floor there and nothing else.
-Besides the fields of every grasp: `approach_qpos` (W, 7 + J) from the standoff to the pregrasp with the hand open, and
-`lift_qpos` (7 + J,), the squeeze raised. The evaluator raises a flying hand itself; settings with an arm read them.
+All poses in the files are in the table's frame, z up, its top at z = 0; the evaluator has a floor there and nothing
+else. Fields besides those of every grasp: `approach_qpos` (W, 7 + J) from the standoff to the pregrasp with the hand
+open, and `lift_qpos` (7 + J,), the raised squeeze. The evaluator raises a flying hand itself; arms use these fields.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ Row = dict[str, Any]
 
 #: Folder of scenes with a table, and part of the name of an experiment.
 TABLETOP: Final = "tabletop"
-#: Poses that differ by less are one scene, and a floor that does lies at z = 0 [m, and in quaternions].
+#: Tolerance of equal poses, and of a floor's height at z = 0 [m, and in quaternions].
 SAME: Final = 1e-9
 
 
 def check_table(placed: PlacedGrasps) -> None:
-    """Raises InputError unless the scenes are a table with its top at z = 0 and nothing else."""
+    """Raise InputError unless the scenes are a table with its top at z = 0 and nothing else."""
     table = placed.supports[0].planes if len(placed.supports) == 1 else np.zeros((0, 4))
     if table.shape != (1, 4) or not np.allclose(table[0], [0, 0, 1, 0], rtol=0, atol=SAME):
         raise InputError(
@@ -42,7 +42,7 @@ def check_table(placed: PlacedGrasps) -> None:
 
 
 def tabletop_fields(mapping: HandMapping, hand: HandModel, grasps: GraspSet, row: int, pose: Floats) -> Row:
-    """`approach_qpos` and `lift_qpos` of a grasp whose object stands at `pose` (7,)."""
+    """Return `approach_qpos` and `lift_qpos` of a grasp whose object is at `pose` (7,)."""
     assert grasps.approach is not None, "grasps in scenes have their approach"
     assert grasps.coming is not None
     assert grasps.lift is not None
@@ -55,13 +55,12 @@ def tabletop_fields(mapping: HandMapping, hand: HandModel, grasps: GraspSet, row
 
 
 def is_tabletop(row: Row) -> bool:
-    """Whether a grasp's file says that its object stands on a table."""
+    """Check whether a grasp's file has its object on a table."""
     return any(part.startswith(TABLETOP) for part in str(row.get("scene_path", "")).split("/"))
 
 
 def placed_of(obj_pose: Floats) -> PlacedGrasps:
-    """The tables that N grasps are on, which fingertips may touch, from their objects' poses (N, 7): equal ones are one
-    scene."""
+    """Return tables, which fingertips may touch, for object poses (N, 7); equal poses share one."""
     _, first, index = np.unique(np.round(obj_pose / SAME), axis=0, return_index=True, return_inverse=True)
     order = np.argsort(first)
     number = np.empty(len(order), np.intp)
@@ -70,14 +69,14 @@ def placed_of(obj_pose: Floats) -> PlacedGrasps:
 
 
 def object_of_scene(file: Path, scene_path: str) -> Row:
-    """`obj_pose` and `obj_scale` of the object that a scene is about.
+    """Return `obj_pose` and `obj_scale` of a scene's object.
 
     Args:
         file: a grasp's file that names the scene.
         scene_path: relative to a folder above `file`, and below its `assets`.
 
     Raises:
-        InputError: it leads elsewhere, there is no such file, or it is no scene.
+        InputError: the path leads elsewhere, the file is missing, or it is no scene.
     """
     place = PurePosixPath(scene_path)
     if place.is_absolute() or ".." in place.parts or place.parts[:1] != ("assets",):
@@ -99,8 +98,10 @@ def object_of_scene(file: Path, scene_path: str) -> Row:
 def with_way(
     hand: HandModel, grasps: GraspSet, rows: Sequence[Row], obj_pose: Floats, mapping: HandMapping | None
 ) -> GraspSet:
-    """The grasps with the approach and the lift of their files, in the object frame, where all files have them alike:
-    as many waypoints, and joints that stand still on the way."""
+    """Add approach and lift from files, in the object frame, if all files agree.
+
+    They must have equal numbers of waypoints, and joints that do not move along the approach.
+    """
     if not all({"approach_qpos", "lift_qpos"} <= set(row) for row in rows):
         return grasps
     ways = [np.asarray(row["approach_qpos"], float) for row in rows]

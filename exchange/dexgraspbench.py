@@ -1,9 +1,9 @@
-"""DexGraspBench's layout: one pickled dictionary a grasp, and the files that its evaluator needs to validate it.
+"""DexGraspBench's layout: one pickled dictionary per grasp, and the files that its evaluator needs.
 
 Fields: `obj_path`, `obj_scale`, `obj_pose` (7,), and `pregrasp_qpos`, `grasp_qpos`, `squeeze_qpos` (7 + J,) each: root
-position, root quaternion w x y z, joints. Root and object stand in one world frame. Root and order of the joints are
-those of the model that a benchmark's configuration names; a mapping beside the grasps says how ours lie in it. Grasps
-on a table have more, see `bench_scene`.
+position, root quaternion w x y z, joints. Root and object share one world frame. Root and joint order are those of the
+model that a benchmark's configuration names; a mapping beside the grasps relates them to ours. Grasps on a table have
+more fields, see `bench_scene`.
 """
 
 from __future__ import annotations
@@ -47,20 +47,20 @@ from graspd.worker.simulation.environment import PlacedGrasps
 
 Row = dict[str, Any]
 POSTURES: Final = ("pregrasp", "grasp", "squeeze")
-#: Prefix of the configurations of our hands, and name of the experiment that the grasps are.
+#: Prefix of the configurations of our hands, and name of the experiment.
 NAME: Final = "graspd"
 
 
 def read(path: Path, *, hand: str, obj: str) -> list[ImportedGrasps]:
-    """Grasps of one hand on one object, a set for each scale of the object, those on tables apart from the others.
+    """Read grasps of one hand on one object: one set per scale, grasps on tables in separate sets.
 
     Args:
-        path: a file, or a folder searched whole.
-        hand: URDF or built-in hand; without a mapping beside the grasps, the one whose root and joints they have.
+        path: a file, or a folder that is searched recursively.
+        hand: URDF or built-in hand; without a mapping beside the grasps, the one that matches their root and joints.
         obj: mesh or built-in object at scale 1.
 
     Raises:
-        InputError: no such files, grasps for several models of a hand, or they do not fit the hand.
+        InputError: files are missing, are for several models of a hand, or do not fit the hand.
     """
     # Descriptions of scenes are pickled dictionaries too.
     files = [path] if path.is_file() else [f for f in sorted(path.rglob("*.npy")) if "scene_cfg" not in f.parts]
@@ -89,18 +89,18 @@ def write(
     folder: Path,
     placed: PlacedGrasps | None = None,
 ) -> list[Path]:
-    """Write grasps with all that DexGraspBench's evaluator reads: laid over its checkout, the folder is complete.
+    """Write grasps with all files of DexGraspBench's evaluator: the folder completes its checkout.
 
-    The object has scale 1. It stands in the origin, or, where the grasps are `placed`, on its table, as the tabletop
-    test wants it; both go to experiments of their own. The hand goes with it as a model of our own; where the benchmark
-    has a model of the same hand, the grasps are written for that one as well.
+    The object has scale 1. It is at the origin or, for `placed` grasps, on its table, as in the tabletop test; both are
+    separate experiments. The hand is written as a model of our own. If the benchmark has a model of the same hand, the
+    grasps are also written for that one.
 
     Returns:
         the files of the grasps, one each, for our model of the hand.
 
     Raises:
         InputError: the grasps' scenes are more than a table.
-        MeshError: the object's convex pieces are no picture of it.
+        MeshError: the object's convex pieces do not match its shape.
     """
     if placed is not None:
         check_table(placed)
@@ -136,8 +136,7 @@ def write(
 
 
 def models_of(hand: HandModel, folder: Path) -> list[HandMapping]:
-    """How the hand lies in each model that grasps are written for: our own, which is written below `folder`, and the
-    benchmark's where it has the hand."""
+    """Return mappings for our hand model, written below `folder`, and the benchmark's if it has one."""
     config = f"{NAME}_{plain_name(hand.name)}"
     model = write_hand(hand, config, folder)
     order = joint_order(folder / model)
@@ -154,12 +153,12 @@ def models_of(hand: HandModel, folder: Path) -> list[HandMapping]:
 
 
 def experiment(placed: PlacedGrasps | None) -> str:
-    """Name of the experiment: free grasps and grasps on tables are two."""
+    """Return the name of an experiment: free grasps and grasps on tables are separate."""
     return NAME if placed is None else f"{NAME}_{TABLETOP}"
 
 
 def postures(mapping: HandMapping, hand: HandModel, grasps: GraspSet, row: int, pose: Floats | None) -> Row:
-    """The `..._qpos` of a grasp: around the origin, or where the object stands at `pose` (7,) on a table."""
+    """Return the `..._qpos` of a grasp, at the origin or with the object at `pose` (7,) on a table."""
     record: Row = {}
     for name in POSTURES:
         found: Posture = getattr(grasps, name)
@@ -169,9 +168,9 @@ def postures(mapping: HandMapping, hand: HandModel, grasps: GraspSet, row: int, 
 
 
 def _rows(file: Path) -> list[Row]:
-    """The grasps of a file: one, or, where `..._qpos` have an axis more, as many as that is long.
+    """Return the grasps of a file: one, or several if `..._qpos` have one more axis.
 
-    A file that does not say where its object stands names a scene that does.
+    A file without the object's pose names a scene that contains it.
     """
     found = load_npy(file)
     if not isinstance(found, dict):
@@ -189,13 +188,13 @@ def _rows(file: Path) -> list[Row]:
 
 
 def _part(value: Any, k: int, count: set[int]) -> Any:
-    """Of what a file has for each of its grasps that of grasp k; of them all what it has once."""
+    """Return the value of grasp k; a value that a file contains once is shared."""
     each = isinstance(value, np.ndarray) and value.ndim > 0 and {len(value)} == count and value.dtype != object
     return value[k] if each else value
 
 
 def _scaled(row: Row) -> Row:
-    """With `scene_scale` put on the object's scale."""
+    """Apply `scene_scale` to the object's scale."""
     if "scene_scale" not in row:
         return row
     return row | {"obj_scale": _scale(row) * float(np.ravel(row["scene_scale"])[0])}

@@ -1,6 +1,6 @@
-"""DexGraspNet 2.0's folder: scenes as GraspNet-1Billion has them, and grasps of dexterous hands for each.
+"""DexGraspNet 2.0's folder: scenes as in GraspNet-1Billion, and dexterous grasps for each.
 
-Zhang et al., DexGraspNet 2.0, CoRL 2024. Below `data/`, NNNN a scene and VVVV a view of it:
+Zhang et al., DexGraspNet 2.0, CoRL 2024. Below `data/`, NNNN is a scene and VVVV a view of it:
 
     scenes/scene_NNNN/realsense/
         depth_gt/VVVV.png           16 bits, steps of one metre over `factor_depth`, 0: nothing
@@ -9,12 +9,12 @@ Zhang et al., DexGraspNet 2.0, CoRL 2024. Below `data/`, NNNN a scene and VVVV a
         camera_poses.npy            (256, 4, 4) camera of a view in that of view 0
         cam0_wrt_table.npy          (4, 4) camera of view 0 in the table's frame
     dex_grasps_new/scene_NNNN/HAND/OBJECT.npz
-        `translation` (N, 3), `rotation` (N, 3, 3): root link in the camera of view 0; `point` (N, 3): of the object's
-        surface, at which the grasp points, in the same frame; and each joint by its name (N,)
+        `translation` (N, 3), `rotation` (N, 3, 3): root link in the camera of view 0; `point` (N, 3): point of
+            the object's surface that the grasp aims at, in the same frame; and each joint by its name (N,)
     dex_graspness_new/scene_NNNN/realsense/VVVV.npy
-        (P, 1) f4 graspness of the P points that its loader makes of the view, in the order of the pixels
+        (P, 1) f4 graspness of the P points of its loader for the view, in pixel order
 
-Its loader takes pixel (u, v) for the place u, v; ours has pixel centres at +0.5. The intrinsics say so.
+Its loader puts pixel (u, v) at u, v; ours has pixel centres at +0.5. The intrinsics account for this.
 """
 
 from __future__ import annotations
@@ -46,23 +46,23 @@ from graspd.worker.rendering.annotate import OBJECT
 from graspd.worker.rendering.export import export_png
 
 CAMERA: Final = "realsense"
-#: Views of a scene, among which its loader draws.
+#: Views of a scene, from which its loader samples.
 VIEWS: Final = 256
-#: Steps of a metre in a depth picture: 16 bits reach 6.5 m.
+#: Steps per metre in a depth picture: 16 bits reach 6.5 m.
 FACTOR: Final = 10000
-#: Numbers of scenes: its split `train_1` with those of `part`; and `val` with the `test` ones.
+#: Numbers of scenes: its split `train_1` with those of `part`; and `val` with `test`.
 TRAIN: Final = (range(90), range(1000, 8500))
 HELD_OUT: Final = (range(90, 100), range(100, 190))
 #: Keys of a file of grasps that are no joints.
 _PLACE: Final = ("translation", "rotation", "point")
 _OURS: Final = ("pregrasp_qpos", "squeeze_qpos", "success", "row")
-#: What NumPy's writer takes for arguments of its own.
+#: Names that NumPy's writer uses for its own arguments.
 _NUMPYS: Final = ("file", "args", "kwds", "allow_pickle")
-#: A `meta` file takes two kilobytes; unpacked it is at most a thousand times as large [bytes].
+#: A `meta` file has two kilobytes; unpacked it is at most a thousand times as large [bytes].
 _LARGEST_META: Final = 64 * 2**10
-#: Most that the members of a file may unpack to [bytes]; no file of grasps of one object comes near.
+#: Largest unpacked size of a file's members [bytes]; files of grasps of one object are far smaller.
 LARGEST: Final = 2**30
-#: Most members.
+#: Largest number of members.
 _MEMBERS: Final = 1024
 
 
@@ -73,17 +73,17 @@ def write(
 
     Args:
         lots: grasps, planned in the scenes or carried over into them.
-        pictures: of the scenes.
-        folder: stands for a checkout; made if absent.
-        out: objects that are held out.
-        noise: depth camera whose depth is written; None: perfect depth.
+        pictures: pictures of the scenes.
+        folder: laid out like a checkout; created if missing.
+        out: held-out objects.
+        noise: depth camera whose noise is applied; None: perfect depth.
 
     Returns:
         numbers of grasps, scenes, views and files of grasps.
 
     Raises:
-        InputError: such a folder is there already, there are no pictures, more scenes than the splits have numbers, or
-            a joint has the name of another key.
+        InputError: the folder already exists, there are no pictures, there are more scenes than numbers in the
+            splits, or a joint has the name of another key.
     """
     top = folder / "data"
     if top.exists():
@@ -118,7 +118,7 @@ def write(
 def _numbers(
     held: bool, scenes: list[list[PictureReference]], known: dict[str, ExportPart], out: frozenset[str]
 ) -> Iterator[int]:
-    """Of the scenes of one side, as its splits have them."""
+    """Yield the scene numbers of one side, as in its splits."""
     count = sum((known[some[0].base].name in out) is held for some in scenes)
     room = [number for numbers in (HELD_OUT if held else TRAIN) for number in numbers]
     if count > len(room):
@@ -159,10 +159,10 @@ def _write_scene(
             "poses": pose_to_matrix(pose)[:3, :, None],
         }
         scipy.io.savemat(path / "meta" / f"{view:04}.mat", meta)
-        if labels.any():  # its loader passes over a view of nothing, which has no workspace
+        if labels.any():  # its loader skips empty views, which have no workspace
             found = graspness.of_view(steps / FACTOR, labels, intrinsics, first @ poses[view], pose)
             np.save(values / f"{view:04}.npy", found)
-    # It draws among 256 views: the rest are the same files again.
+    # It samples among 256 views: the rest repeat the same files.
     for view in range(len(some), VIEWS):
         for folder, suffix in kinds:
             _again(folder / f"{view % len(some):04}.{suffix}", folder / f"{view:04}.{suffix}")
@@ -178,7 +178,7 @@ def _again(file: Path, copy: Path) -> None:
 
 
 def _camera(look: PictureReference) -> Floats:
-    """(7,) where the camera stands on the table."""
+    """Return the pose (7,) of the camera in the table's frame."""
     return invert(pose_from_matrix(look.extrinsics))
 
 
@@ -193,7 +193,7 @@ def _write_grasps(look: PictureReference, lot: ExportPart, folder: Path, graspne
     point = apply(in_camera, graspness.samples[graspness.pointed])
     arrays: dict[str, Any] = {"translation": matrices[:, :3, 3], "rotation": matrices[:, :3, :3], "point": point}
     arrays |= {name: some["grasp"].joint_positions[:, k] for k, name in enumerate(names)}
-    # Its loader takes these along and does not look at them: what brings the grasps back as they were.
+    # Its loader ignores these arrays; they are needed to import the grasps unchanged.
     arrays |= {
         f"{name}_qpos": np.concatenate([placed[name], some[name].joint_positions], axis=1)
         for name in ("pregrasp", "squeeze")
@@ -204,16 +204,16 @@ def _write_grasps(look: PictureReference, lot: ExportPart, folder: Path, graspne
 
 
 def read(path: Path, *, hand: str, obj: str, number: int = 0) -> list[ImportedGrasps]:
-    """The grasps of one object in one scene, in the object's frame.
+    """Read the grasps of one object in one scene, in the object's frame.
 
     Args:
         path: `dex_grasps_new/SCENE/HAND/OBJECT.npz`, in its folder `data` with the scene's `meta`.
-        hand: URDF or built-in hand, whose root link and joints they have.
+        hand: URDF or built-in hand with their root link and joints.
         obj: mesh of the object.
-        number: which object of the scene, counted from 0.
+        number: index of the object in the scene, from 0.
 
     Raises:
-        InputError: not such a file, its scene is not there, or its joints are not the hand's.
+        InputError: the file is of another kind, its scene is missing, or its joints are not the hand's.
     """
     found = load_npz(path)
     try:
@@ -248,7 +248,7 @@ def read(path: Path, *, hand: str, obj: str, number: int = 0) -> list[ImportedGr
 def _with_ours(
     path: Path, hand: HandModel, found: dict[str, NDArray[Any]], grasp: Posture, away: Floats
 ) -> GraspSet | None:
-    """The grasps with the postures before and after contact that we write; None where there are none."""
+    """Return the grasps with our extra postures before and after contact; None if there are none."""
     if not {"pregrasp_qpos", "squeeze_qpos"} <= set(found):
         return None
     parts = []
@@ -261,7 +261,7 @@ def _with_ours(
 
 
 def _object_pose(path: Path, number: int) -> Floats:
-    """(7,) of the object in the camera of view 0, in which grasps are told."""
+    """Return the object's pose (7,) in the camera of view 0, the frame of the grasps."""
     try:
         scene, data = path.resolve().parents[1].name, path.resolve().parents[3]
     except IndexError:
@@ -275,7 +275,7 @@ def _object_pose(path: Path, number: int) -> Floats:
         poses = np.asarray(scipy.io.loadmat(file)["poses"], float)
         pose = np.concatenate([poses[:3, :, number], [[0, 0, 0, 1]]])
     except Exception as error:
-        # SciPy raises what its readers happen to raise; all of it means that the file is not what it should be.
+        # SciPy raises arbitrary exceptions; all of them mean an invalid file.
         raise InputError(f"{file} does not say where object {number} stands: {error}") from None
     if pose.shape != (4, 4) or not np.isfinite(pose).all():
         raise InputError(f"{file} does not say where object {number} stands")
@@ -283,15 +283,15 @@ def _object_pose(path: Path, number: int) -> Floats:
 
 
 def load_npz(path: Path) -> dict[str, NDArray[Any]]:
-    """The arrays of a `.npz` file.
+    """Load the arrays of a `.npz` file.
 
     Raises:
-        InputError: no such file, objects in it, or it unpacks to more than `LARGEST`.
+        InputError: the file is missing, contains objects, or unpacks to more than `LARGEST`.
     """
     try:
         with zipfile.ZipFile(path) as archive:
             members = archive.infolist()
-        # A member is never unpacked further than it says here.
+        # A member is never unpacked beyond this size.
         if len(members) > _MEMBERS or sum(member.file_size for member in members) > LARGEST:
             raise InputError(f"{path} unpacks to more than {LARGEST >> 20} MiB or to more than {_MEMBERS} arrays")
         with np.load(path, allow_pickle=False) as found:

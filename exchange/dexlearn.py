@@ -1,14 +1,14 @@
-"""DexLearn's folder: collected grasps with a list of them in each file, splits, scenes, and partial clouds.
+"""DexLearn's folder: collected grasps with a list per file, splits, scenes, and partial clouds.
 
-It is laid over a checkout of DexLearn (Chen et al., baselines of BODex and Dexonomy), all in one `assets/`:
+The folder overlays a checkout of DexLearn (Chen et al., baselines of BODex and Dexonomy), all in one `assets/`:
 
     grasp/NAME/succ_collect/TYPE/OBJECT/.../*.npy   `..._qpos` (K, 7 + J), `scene_path`, `scene_scale` (K,)
     object/graspd/valid_split/{train,test}.json     names of objects
     object/graspd/scene_cfg/OBJECT/...              as DexGraspBench has them, with a `scene_id`
     object/graspd/vision_data/azure_kinect_dk/SCENE_ID/partial_pc_NN.npy    (P, 3) points [m]
 
-Root poses and points stand in one frame: the table's, or, for grasps of a free object, the object's. Roots and joints
-are those of a model of the hand that DexGraspBench evaluates, see `bench_mapping`.
+Root poses and points share one frame: the table's or, for grasps of a free object, the object's. Roots and joints are
+those of a hand model that DexGraspBench evaluates, see `bench_mapping`.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply, invert
 from graspd.service.readers import DepthNoise, Pictures
 from graspd.worker.grasps import GraspSet
 
-#: Folder of each `quality/grasp_type`; the number before the line is what a network is told.
+#: Folder of each `quality/grasp_type`; the number before the underscore is a network's input.
 TYPES: Final = ("0_any", "1_power", "2_precision", "3_lateral")
 VISION: Final = SET / "vision_data" / "azure_kinect_dk"
-#: Points that a network gets, drawn from a cloud with repetition.
+#: Points of a network's input, sampled from a cloud with repetition.
 POINTS: Final = 1024
 _FREE: Final = -1
 
@@ -42,21 +42,21 @@ _FREE: Final = -1
 def write(
     lots: Sequence[ExportPart], pictures: Pictures, folder: Path, out: frozenset[str], noise: DepthNoise | None = None
 ) -> ExportSummary:
-    """Write grasps and what their cameras see.
+    """Write grasps and the clouds of their cameras.
 
     Args:
         lots: grasps, free or on tables.
-        pictures: of their scenes; may be none.
-        folder: stands for a checkout of DexLearn.
-        out: objects that are held out.
-        noise: depth camera whose clouds are written; None: perfect depth.
+        pictures: pictures of their scenes; may be none.
+        folder: laid out like a checkout of DexLearn.
+        out: held-out objects.
+        noise: depth camera whose noise is applied; None: perfect depth.
 
     Returns:
         numbers of grasps, scenes, clouds and files.
 
     Raises:
-        InputError: such a folder is there already, or scenes are more than a table.
-        MeshError: an object's convex pieces are no picture of it.
+        InputError: the folder already exists, or scenes are more than a table.
+        MeshError: an object's convex pieces do not match its shape.
     """
     if (folder / SET).exists():
         raise InputError(f"{folder} holds objects of an export already; give another folder as --output")
@@ -78,14 +78,14 @@ def write(
     return done
 
 
-#: The scene's file below the folder, by shard and scene; free grasps have the one of their object.
+#: Scene file below the folder, by shard and scene; free grasps have the one of their object.
 _Scenes = dict[tuple[str, int], Path]
-#: Rows of a lot that are of one scene and one type.
+#: Rows of a lot that share scene and type.
 _Part = tuple[ExportPart, Path, int, NDArray[np.intp]]
 
 
 def _scenes(lots: Sequence[ExportPart], folder: Path) -> _Scenes:
-    """Write objects and scenes; scenes of several shards of an object are numbered through."""
+    """Write objects and scenes; scenes of an object are numbered across its shards."""
     scenes: _Scenes = {}
     free: dict[str, Path] = {}
     count: dict[str, int] = {}
@@ -105,7 +105,7 @@ def _scenes(lots: Sequence[ExportPart], folder: Path) -> _Scenes:
 def _clouds(
     pictures: Pictures, lots: Sequence[ExportPart], scenes: _Scenes, folder: Path, noise: DepthNoise | None
 ) -> tuple[int, int]:
-    """Write what each picture shows of its object; the numbers of clouds, and of scenes that are left without."""
+    """Write the object's cloud of each picture; return the numbers of clouds and of scenes without one."""
     on_table = {lot.id: lot.placed is not None for lot in lots}
     written: dict[Path, int] = {}
     for look in looks(pictures):
@@ -118,13 +118,13 @@ def _clouds(
         np.save(place / f"partial_pc_{number:02}.npy", points.astype(np.float32))
     bare = set(scenes.values()) - set(written)
     for scene in bare if written else ():
-        # Its test draws a cloud of every scene that it finds.
+        # Its test samples a cloud of every scene in the folder.
         (folder / scene).unlink()
     return sum(number + 1 for number in written.values()), len(bare)
 
 
 def points_of(pictures: Pictures, look: PictureReference, noise: DepthNoise | None, *, on_table: bool) -> Floats:
-    """(P, 3) what a picture shows of its object, in the table's frame, or where it is none in the object's own [m]."""
+    """Return (P, 3) object points of a picture, in the table's frame, or the object's without a table [m]."""
     points = object_points(pictures[look.index], look.index, noise)
     return points if on_table else apply(invert(look.object_pose), points)
 
@@ -134,7 +134,7 @@ def _scene_id(scene: Path) -> Path:
 
 
 def _groups(lots: Sequence[ExportPart]) -> Iterable[list[ExportPart]]:
-    """Lots of one hand that are all free or all on tables: a data set of their own."""
+    """Yield lots of one hand that are all free or all on tables: each group is a data set."""
     groups: dict[tuple[str, bool], list[ExportPart]] = {}
     for lot in lots:
         groups.setdefault((lot.hand.digest, lot.placed is None), []).append(lot)
@@ -147,7 +147,7 @@ def _write_group(
     parts = [(lot, *part) for lot in lots for part in _rows_of(lot, scenes, folder, seen=seen)]
     listed = sorted({kind for _, _, kind, _ in parts if _in_both(kind, parts, out)})
     if not listed:
-        # No type has objects in both splits: all grasps are of one.
+        # No type has objects in both splits: all grasps get one type.
         parts, listed = [(lot, scene, 0, rows) for lot, scene, rows in _untyped(parts)], [0]
     done.counts["grasps"] += sum(len(rows) for *_, rows in parts)
     for mapping in models_of(lots[0].hand, folder):
@@ -165,8 +165,7 @@ def _write_group(
 def _rows_of(
     lot: ExportPart, scenes: _Scenes, folder: Path, *, seen: bool
 ) -> Iterator[tuple[Path, int, NDArray[np.intp]]]:
-    """The lot's rows by the file of their scene and their type; without those of scenes that nobody sees, where others
-    are seen."""
+    """Yield the lot's rows by scene file and type; skip scenes without a picture if others have one."""
     index = np.full(len(lot.grasps), _FREE) if lot.placed is None else np.asarray(lot.placed.index)
     types = np.asarray(lot.shard.arrays.get("quality/grasp_type", np.zeros(len(index))), np.intp)
     for scene in sorted({int(index[row]) for row in lot.rows}):
@@ -179,8 +178,7 @@ def _rows_of(
 
 
 def _in_both(kind: int, parts: Sequence[_Part], out: frozenset[str]) -> bool:
-    """Whether a type has grasps on objects of both splits. DexLearn draws a type and then an object of it, and fails on
-    one that has none."""
+    """Check whether a type has objects in both splits: DexLearn fails for a type without objects."""
     names = {lot.name for lot, _, other, _ in parts if other == kind}
     return not out or bool(names & out and names - out)
 
@@ -199,7 +197,7 @@ def _record(mapping: HandMapping, lot: ExportPart, rows: NDArray[np.intp], scene
     poses = [None if lot.placed is None else np.asarray(lot.placed.object_pose[lot.placed.index[row]]) for row in rows]
     each = [postures(mapping, lot.hand, grasps, int(row), pose) for row, pose in zip(rows, poses, strict=True)]
     record |= {f"{name}_qpos": np.array([one[f"{name}_qpos"] for one in each]) for name in POSTURES}
-    # Not read by DexLearn: what brings the grasps back as they were.
+    # DexLearn ignores it; it is needed to import the grasps unchanged.
     record["obj_pose"] = np.array([IDENTITY_POSE if pose is None else pose for pose in poses])
     return record | {"succ_flag": lot.verdict[rows], "row": np.asarray(rows)}
 
@@ -210,7 +208,7 @@ def _save(file: Path, record: dict[str, Any]) -> None:
 
 
 def _configure(folder: Path, name: str, lot: ExportPart, types: list[str]) -> None:
-    """DexLearn's configuration of the data."""
+    """Write DexLearn's configuration of the data."""
     values: dict[str, Any] = {
         "num_workers": 8,
         "num_points": POINTS,

@@ -1,15 +1,15 @@
-"""GraspGen's data: a JSON record for each object in tar files, with an index, lists of objects, and their meshes.
+"""GraspGen's data: a JSON record per object in tar files, with an index, object lists and meshes.
 
 Murali et al., GraspGen, ICRA 2026. Written and read:
 
     grasps/GRIPPER/shard_000.tar         members UUID.grasps.json; uuid_index.json: {UUID: number of the shard}
-    splits/GRIPPER/{train,valid}.txt     a UUID in each line
+    splits/GRIPPER/{train,valid}.txt     a UUID per line
     objects/UUID.obj                     and map_uuid_to_path.json: {UUID: file}
-    grippers/GRIPPER.yaml                width, depth, and where its convention's frame is: z approaches, x closes
+    grippers/GRIPPER.yaml                width, depth, and frame of its convention: z approaches, x closes
 
 A record: `object` {file, scale}, `grasps` {`transforms` (N, 4, 4): pose of the gripper's base link in the object's
-frame, the mesh multiplied by `scale`; `object_in_gripper` (N,) true or false}. Its readers leave out what else we write
-there: `joint_names`, and of pregrasp, grasp and squeeze root and joints, which bring a grasp of many fingers back.
+frame, the mesh multiplied by `scale`; `object_in_gripper` (N,) true or false}. Its readers ignore our other fields:
+`joint_names`, and root and joints of pregrasp, grasp and squeeze, which restore grasps of multi-fingered hands.
 """
 
 from __future__ import annotations
@@ -46,29 +46,29 @@ INDEX: Final = "uuid_index.json"
 POSTURES: Final = ("pregrasp", "grasp", "squeeze")
 #: Objects in a tar file.
 PER_SHARD: Final = 64
-#: A record that is larger is not read [bytes]; 2,000 grasps take half a megabyte.
+#: Largest size of a record that is read [bytes]; 2,000 grasps have half a megabyte.
 LARGEST: Final = 256 * 2**20
-#: Its generator leaves out objects with fewer good grasps.
+#: Its generator skips objects with fewer good grasps.
 FEWEST: Final = 5
-#: How far a published matrix may be from a rotation: they are printed with six digits and more.
+#: Tolerance of a published rotation matrix: they are printed with six digits or more.
 _ROTATION: Final = 1e-3
 #: Hands that are closed at once.
 _AT_ONCE: Final = 256
 
 
 def write(lots: Sequence[ExportPart], folder: Path, out: frozenset[str]) -> ExportSummary:
-    """Write all validated grasps of each hand, good ones and bad ones.
+    """Write all validated grasps of each hand, good and bad.
 
     Args:
-        lots: grasps; their `rows` are those that were validated.
-        folder: where to; made if absent.
-        out: objects that are held out: `valid.txt`.
+        lots: grasps; their `rows` are the validated ones.
+        folder: output folder; created if missing.
+        out: held-out objects: `valid.txt`.
 
     Returns:
         numbers of grasps, of good ones among them, of objects and of tar files.
 
     Raises:
-        InputError: the folder holds such files already.
+        InputError: the folder already contains such files.
     """
     if (folder / "grasps").exists():
         raise InputError(f"{folder} holds grasps already; give another folder as --output")
@@ -87,7 +87,7 @@ def write(lots: Sequence[ExportPart], folder: Path, out: frozenset[str]) -> Expo
 
 
 def uuid_of(lot: ExportPart) -> str:
-    """The object's name there. WebDataset ends a key at the first dot."""
+    """Return the object's name in the data. WebDataset ends a key at the first dot."""
     return lot.name.replace(".", "-")
 
 
@@ -146,11 +146,10 @@ def _record(hand: HandModel, lots: list[ExportPart]) -> dict[str, Any]:
 
 
 def convention(hand: HandModel) -> dict[str, Any]:
-    """What a gripper's YAML tells: clear width [m], reach along its approach [m], and the frame of GraspGen's
-    convention in the base link's, as [[x, y, z], [x, y, z, w]].
+    """Return the YAML of a gripper: clear width [m], reach along its approach [m], and frame.
 
-    Of a hand of more than two jaws x is the direction across the approach in which its open fingertips are farthest
-    apart.
+    The frame is that of GraspGen's convention in the base link's, as [[x, y, z], [x, y, z, w]]. For a hand with more
+    than two jaws, x is the direction across the approach with the largest distance of its open fingertips.
     """
     z, jaws = hand.palm.approach, jaws_of(hand)
     if jaws is not None:
@@ -177,16 +176,16 @@ def convention(hand: HandModel) -> dict[str, Any]:
 
 
 def read(path: Path, *, hand: str, obj: str, object_name: str = "") -> list[ImportedGrasps]:
-    """The grasps of one object. Where the record has no joints, fingers close until they touch.
+    """Read the grasps of one object. If the record has no joints, fingers close until contact.
 
     Args:
         path: a record, a tar file of them, or a folder of tar files.
         hand: URDF or built-in hand: the gripper, whose root link is the base link.
         obj: mesh of the object at scale 1.
-        object_name: the object's UUID; may be left out where there is one object.
+        object_name: the object's UUID; optional with a single object.
 
     Raises:
-        InputError: not such files, no such object, or it is larger than a record may be.
+        InputError: files or object are missing, or the record is too large.
     """
     file, record = _found(path, object_name)
     try:
@@ -211,7 +210,7 @@ def read(path: Path, *, hand: str, obj: str, object_name: str = "") -> list[Impo
 
 
 def _grasps(file: str, hand: HandModel, record: dict[str, Any], pose: Floats) -> GraspSet | None:
-    """The grasps with the joints that we write beside them; None where there are none."""
+    """Return the grasps with our additional joints; None if there are none."""
     grasps, names = record["grasps"], record.get("gripper", {}).get("joint_names")
     if not names or not all(f"{name}_joints" in grasps for name in POSTURES):
         return None
@@ -226,7 +225,7 @@ def _grasps(file: str, hand: HandModel, record: dict[str, Any], pose: Floats) ->
 
 
 def _found(path: Path, uuid: str) -> tuple[str, dict[str, Any]]:
-    """The record of an object, and what to call it in errors."""
+    """Return the record of an object, and its name for errors."""
     if path.suffix == ".json":
         with path.open("rb") as stream:
             return str(path), _parsed(str(path), stream.read(LARGEST + 1))
@@ -235,7 +234,7 @@ def _found(path: Path, uuid: str) -> tuple[str, dict[str, Any]]:
     found: tuple[str, dict[str, Any]] | None = None
     for file in files:
         try:
-            # Not compressed, so that a member is as large as it takes room in the file.
+            # Not compressed, so that a member is as large as its space in the file.
             with tarfile.open(file, "r:") as tar:
                 for member in tar:
                     key, _, what = Path(member.name).name.partition(".")
@@ -271,7 +270,7 @@ def _json(path: Path, value: Any) -> None:
 
 
 def closed_at(hand: HandModel, obj: ObjectModel, hand_pose: NDArray[np.float64]) -> Posture:
-    """The hand at poses (N, 7) in the object frame, its fingers closed from its preshape until they touch or end."""
+    """Return hands at poses (N, 7) in the object frame, closed from the preshape to contact or limits."""
     pair = ground_of(hand, obj, "cpu", kernels)
     joints = np.zeros((len(hand_pose), len(hand.joint_names)))
     for first in range(0, len(hand_pose), _AT_ONCE):

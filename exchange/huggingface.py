@@ -1,8 +1,8 @@
-"""A folder that `datasets.load_dataset` reads: a table of grasps, and one of pictures with the grasps of their scenes.
+"""A folder for `datasets.load_dataset`: a table of grasps, and one of pictures with their grasps.
 
-    grasps/{train,test}-00000.parquet     a grasp a row: postures in the object's frame, verdict, quality
-    pictures/{train,test}-00000.parquet   a picture a row: colour, depth, labels, camera, grasps in its frame
-    README.md                             says which files are which
+    grasps/{train,test}-00000.parquet     one grasp per row: postures in the object's frame, verdict, quality
+    pictures/{train,test}-00000.parquet   one picture per row: colour, depth, labels, camera, grasps in its frame
+    README.md                             description of the files
 
 Columns, units and frames are those of `GRASPS` and `PICTURES`; docs/how-to/exchange/huggingface.md is the reference.
 """
@@ -34,7 +34,7 @@ from graspd.worker.hands.load import hand_from_path
 from graspd.worker.rendering.export import PNG_STEP_M
 
 POSTURES: Final = ("pregrasp", "grasp", "squeeze")
-#: Kinds of scenes that a grasp may be planned in, as a row tells them.
+#: Kinds of scenes of planned grasps, as in the rows.
 FREE: Final = "free"
 TABLE: Final = "table"
 #: Columns of grasps, by the words of `parquet.type_of`.
@@ -55,7 +55,7 @@ GRASPS: Final = {
     "scene": "int32",
     "object_pose": "float64[7]",
 }
-#: And of pictures.
+#: Columns of pictures.
 PICTURES: Final = {
     "hand": "text",
     "object": "text",
@@ -84,13 +84,13 @@ def write(
 
     Args:
         lots: grasps.
-        pictures: of their scenes, with colour; may be none.
-        folder: where to; made if absent.
-        out: objects that are held out: split `test`.
-        noise: depth camera whose depth is written; None: perfect depth.
+        pictures: pictures of their scenes, with colour; may be none.
+        folder: output folder; created if missing.
+        out: held-out objects: split `test`.
+        noise: depth camera whose noise is applied; None: perfect depth.
 
     Raises:
-        InputError: pyarrow is absent, or the folder holds such a table already.
+        InputError: pyarrow is missing, or the folder already contains such a table.
     """
     parquet.arrow()
     if (folder / "grasps").exists():
@@ -152,7 +152,7 @@ def _grasps(lot: ExportPart) -> list[dict[str, Any]]:
 
 
 def _groups(pictures: Pictures, names: Mapping[str, str], noise: DepthNoise | None) -> Iterator[list[dict[str, Any]]]:
-    """The pictures of some base shards, given with the names of their objects."""
+    """Yield the pictures of some base shards; `names` are those of their objects."""
     group: list[dict[str, Any]] = []
     for index in range(len(pictures)):
         sample = pictures[index]
@@ -188,14 +188,14 @@ def _picture(sample: Mapping[str, Any], name: str, depth: Floats) -> dict[str, A
 
 
 def png(pixels: NDArray[Any]) -> dict[str, Any]:
-    """A picture as Hugging Face's readers take it."""
+    """Return a picture in the format of Hugging Face's readers."""
     data = io.BytesIO()
     Image.fromarray(np.ascontiguousarray(pixels)).save(data, format="PNG", compress_level=1)
     return {"bytes": data.getvalue(), "path": None}
 
 
 def _card(splits: list[str], *, seen: bool) -> str:
-    """The head of the data set's card: JSON is YAML."""
+    """Return the head of the data set's card: JSON is YAML."""
     tables = [
         {
             "config_name": table,
@@ -212,16 +212,16 @@ def _card(splits: list[str], *, seen: bool) -> str:
 
 
 def read(path: Path, *, hand: str, obj: str, object_name: str = "") -> list[ImportedGrasps]:
-    """The grasps of one object, those of free objects apart from those on tables.
+    """Read the grasps of one object; free grasps and those on tables are separate sets.
 
     Args:
         path: a file of grasps, or a folder with `grasps/*.parquet`.
         hand: URDF or built-in hand; joints are found by name.
         obj: mesh of the object.
-        object_name: the object's name in the file; may be left out where there is one.
+        object_name: the object's name in the file; optional with a single object.
 
     Raises:
-        InputError: pyarrow is absent, no such file or object, or grasps for another kind of scene than a table.
+        InputError: pyarrow, file or object is missing, or the scenes are other than tables.
     """
     files = [path] if path.is_file() else sorted((path / "grasps").glob("*.parquet"))
     columns: dict[str, list[Any]] = {}

@@ -1,8 +1,6 @@
-"""Grasps of others before our quality stage has seen them: objects at their scale, pickled NumPy files read without
-running them.
+"""Imported grasps before our quality stage: scaled objects, and NumPy pickles that are read safely.
 
-A pickle may name any function to be called while it is read. Only arrays, numbers, words and their containers are
-let through here.
+A pickle may call any function while it is loaded. Only arrays, numbers, strings and their containers are allowed here.
 """
 
 from __future__ import annotations
@@ -29,11 +27,11 @@ from graspd.worker.simulation.environment import PlacedGrasps
 
 @dataclass(frozen=True)
 class Origin:
-    """Where grasps come from, and on what terms."""
+    """Source of grasps, and their licence."""
 
     format: str
     source: str
-    """Where a reader finds them: an address or a citation."""
+    """Reference: an address or a citation."""
     licence: str
 
 
@@ -45,29 +43,29 @@ class ImportedGrasps:
     obj: ObjectModel
     grasps: GraspSet
     name: str
-    """Of the object, as the source calls it."""
+    """Name of the object in the source."""
     scale: float = 1.0
-    """Factor that the source puts on the object's mesh."""
+    """Scale factor of the object's mesh in the source."""
     published: NDArray[np.int8] | None = None
     """(N,) success as published: 1, 0, -1 unknown."""
     placed: PlacedGrasps | None = None
-    """The scenes that the grasps are for, if any."""
+    """Scenes of the grasps, if any."""
 
 
 def completed(hand: HandModel, obj: ObjectModel, grasp: Posture) -> GraspSet:
-    """Grasps with postures of ours before and after contact, for sources that have only the grasp."""
+    """Add our postures before and after contact to grasps, for sources without them."""
     return GraspSet(grasp, pregrasp(hand, obj, grasp), squeeze(hand, obj, grasp), np.full(len(grasp), np.nan))
 
 
 def verdicts(values: Sequence[Any] | NDArray[Any]) -> NDArray[np.int8]:
-    """(N,) what a file says of its grasps as 1 held, 0 dropped, -1: nothing that says so."""
+    """Return (N,) verdicts of a file: 1 held, 0 dropped, -1 unknown."""
     return np.array([int(value) if value in (0, 1) else -1 for value in np.ravel(values).tolist()], np.int8)
 
 
 def joints_by_name(hand: HandModel, names: Sequence[str], values: Any, *, what: str) -> Floats:
-    """(N, J) joint positions in the hand's order from (N, n) values in the order of `names`.
+    """Return (N, J) joint positions in the hand's order from (N, n) values in the order of `names`.
 
-    Joints that the source does not have are led by a mimic or stand at their middle.
+    Joints that the source lacks follow a mimic or stay at their middle.
 
     Raises:
         InputError: a name is not a joint of the hand, or the widths differ.
@@ -87,9 +85,9 @@ def joints_by_name(hand: HandModel, names: Sequence[str], values: Any, *, what: 
 
 
 def scaled_object(path: str | Path, scale: float = 1.0) -> ObjectModel:
-    """A mesh or built-in object, its size multiplied by `scale`.
+    """Load a mesh or built-in object, its size multiplied by `scale`.
 
-    Sources that scale their meshes mean the numbers in the file, so no unit is guessed.
+    Sources with scales use the numbers of the file, so no unit is guessed.
 
     Raises:
         NotFoundError, MeshError: see `object_from_path`.
@@ -102,7 +100,7 @@ def scaled_object(path: str | Path, scale: float = 1.0) -> ObjectModel:
 
 
 def mesh_file(obj: ObjectModel, path: Path) -> Path:
-    """The object's prepared mesh as an OBJ file, for readers that have no other."""
+    """Write the object's prepared mesh as an OBJ file, for readers that support no other format."""
     return write_obj(path, obj.vertices, obj.faces, f"{obj.name}, metres")
 
 
@@ -135,10 +133,10 @@ class _Reader(pickle.Unpickler):
 
 
 def load_npy(path: Path) -> Any:
-    """What a `.npy` file holds: an array, or the one object in it.
+    """Load a `.npy` file: an array, or the one object in it.
 
     Raises:
-        InputError: no NumPy file, or one that would run code.
+        InputError: it is no NumPy file, or it would run code.
     """
     try:
         with path.open("rb") as file:
@@ -147,13 +145,13 @@ def load_npy(path: Path) -> Any:
             found = _Reader(file).load()
     except pickle.UnpicklingError as error:
         raise InputError(f"{path} cannot be read safely: {error}") from None
-    except Exception as error:  # a pickle of a stranger may raise anything
+    except Exception as error:  # an untrusted pickle may raise anything
         raise InputError(f"{path} is no NumPy file: {why(error)}") from None
     return found.item() if isinstance(found, np.ndarray) and found.shape == () else found
 
 
 def _plain(file: BinaryIO) -> np.ndarray | None:
-    """The array, if it has no objects; else the file is left where its pickle begins."""
+    """Return the array if it contains no objects; else leave the file at the start of its pickle."""
     version = np.lib.format.read_magic(file)
     header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     _, _, dtype = header(file)

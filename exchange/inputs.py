@@ -18,7 +18,7 @@ from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.simulation.environment import PlacedGrasps
 
-#: JSON files beside shards that hold no grasps.
+#: JSON files beside shards that contain no grasps.
 BESIDE_SHARDS: Final = ("snapshot.json", "subset.json", "card.json")
 
 
@@ -31,19 +31,19 @@ class Case:
     obj: ObjectModel
     grasps: GraspSet
     friction: float | None = None
-    """Coulomb coefficient the file states for its metrics."""
+    """Coulomb coefficient of the file's metrics."""
     seconds: float | None = None
-    """What making the grasps took, where it is known."""
+    """Time to make the grasps, if known [s]."""
     validated: bool = False
-    """Whether those seconds hold the validator's work on them already."""
+    """Whether that time includes validation."""
     published: NDArray[np.int8] | None = None
     """(N,) success as published: 1, 0, -1 unknown."""
     placed: PlacedGrasps | None = None
-    """The scenes that the grasps were planned in, if any."""
+    """Scenes in which the grasps were planned, if any."""
 
     @property
     def centred(self) -> Case:
-        """The same about the middle of the object, where measurements do not depend on the file's origin."""
+        """The case centred at the object's middle, where measurements do not depend on the file's origin."""
         return replace(
             self,
             obj=self.obj.centred,
@@ -53,14 +53,14 @@ class Case:
 
 
 def expand(path: Path) -> list[Path]:
-    """What a path stands for: itself; of a folder without `.npy` files, base shards and reference grasps below it.
+    """Return a path itself, or the base shards and reference grasps of a folder without `.npy` files.
 
     Raises:
         InputError: a folder without any grasps.
     """
     if not path.is_dir() or any(path.rglob("*.npy")):
         return [path]
-    # Beside shards lie JSON files that tell of them: snapshot.json, subset.json, card.json.
+    # Shards have JSON files with metadata beside them: snapshot.json, subset.json, card.json.
     shards = (file for file in path.rglob("*.h5") if not _of_scenes(file))
     found = sorted([*shards, *(file for file in path.rglob("*.json") if file.name not in BESIDE_SHARDS)])
     if not found:
@@ -69,7 +69,7 @@ def expand(path: Path) -> list[Path]:
 
 
 def _of_scenes(path: Path) -> bool:
-    """Whether a file is a shard of scenes or of views, which has no grasps of its own."""
+    """Check whether a file is a scene or views shard, which has no grasps of its own."""
     with open_shard(path) as file:
         return kind_of(file, str(path)) != "base"
 
@@ -79,12 +79,12 @@ def load_case(path: Path, *, hand: str | None = None, obj: str | None = None) ->
 
     Args:
         path: a base shard (HDF5), a reference-grasps JSON, or a folder with DexGraspBench `.npy` files.
-        hand: URDF or built-in hand, over what the file says.
-        obj: mesh or built-in object, over what the file says.
+        hand: URDF or built-in hand; overrides the file's.
+        obj: mesh or built-in object; overrides the file's.
 
     Raises:
-        NotFoundError: no such file.
-        InputError: not one of these formats, or it does not fit the hand.
+        NotFoundError: the file is missing.
+        InputError: the format is unknown, or it does not fit the hand.
     """
     if path.is_dir():
         return _bench_folder(path, hand, obj)

@@ -1,15 +1,15 @@
-"""A LeRobot data set (v3.0): the way of a grasp as an episode, seen by one camera before the hand comes.
+"""A LeRobot data set (v3.0): the trajectory of a grasp as an episode, seen by one camera beforehand.
 
     meta/info.json, meta/stats.json                       features, numbers, statistics of each feature
-    meta/tasks.parquet, meta/episodes/chunk-000/...       words of the tasks; where each episode's frames are
-    data/chunk-CCC/file-FFF.parquet                       frames; pictures are in them as PNG
+    meta/tasks.parquet, meta/episodes/chunk-000/...       texts of the tasks; position of each episode's frames
+    data/chunk-CCC/file-FFF.parquet                       frames, with pictures as PNG
 
-A frame is a waypoint of the way, from the standoff to the squeeze: `observation.state` is where the hand is, `action`
-where it goes next, the last of an episode the lift: root position [m] and quaternion w x y z in the table's frame, then
-all moving joints [rad or m]. `observation.environment_state` is the object's pose at rest, in the same frame. Waypoints
-are places and not instants, so `fps` only numbers them.
+A frame is a waypoint of the trajectory, from the standoff to the squeeze. `observation.state` is the present posture,
+`action` the next one (for the last frame the lift): root position [m] and quaternion w x y z in the table's frame, then
+all moving joints [rad or m]. `observation.environment_state` is the object's rest pose in the same frame. Waypoints
+have no times, so `fps` only numbers them.
 
-Grasps back from a LeRobot data set of ours, see `lerobot`: the way of each episode, in its object's frame.
+The importer `lerobot` reads the trajectories of our own data sets, in the object's frame.
 """
 
 from __future__ import annotations
@@ -44,9 +44,9 @@ STATE, ACTION, OBJECT, PICTURE = (
     "observation.images.scene",
 )
 EPISODE: Final = "episode_index"
-#: What the list of episodes says besides.
+#: Additional columns in the list of episodes.
 VERDICT: Final = "graspd/verdict"
-#: Columns that each frame has, whatever the features.
+#: Columns of each frame, independent of the features.
 NUMBERS: Final = {
     "timestamp": "float32",
     "frame_index": "int64",
@@ -58,7 +58,7 @@ NUMBERS: Final = {
 _EPISODES: Final = 100
 _FILES: Final = 1000
 _QUANTILES: Final = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
-#: Tells pandas that the words of the tasks are the index of their table.
+#: Metadata for pandas: the texts of the tasks are the index of their table.
 _INDEXED: Final = {
     "index_columns": ["task"],
     "column_indexes": [],
@@ -71,17 +71,17 @@ _INDEXED: Final = {
 
 
 def write(lots: Sequence[ExportPart], pictures: Pictures, folder: Path, out: frozenset[str]) -> ExportSummary:
-    """Write an episode for each grasp whose scene has a picture; of several pictures each takes the next one.
+    """Write an episode for each grasp whose scene has a picture; several pictures are used in turn.
 
     Args:
         lots: grasps planned in scenes, of one hand.
-        pictures: of the scenes, with colour.
-        folder: the data set; made if absent.
-        out: objects that are held out: their episodes stand last, split `test`.
+        pictures: pictures of the scenes, with colour.
+        folder: the data set; created if missing.
+        out: held-out objects: their episodes come last, split `test`.
 
     Raises:
-        InputError: pyarrow is absent, there is such a data set, grasps of several hands or of free objects, no
-            pictures, or pictures of several sizes.
+        InputError: pyarrow is missing, the data set exists, grasps are of several hands or of free objects, or
+            pictures are missing or differ in size.
     """
     parquet.arrow()
     if (folder / "meta").exists():
@@ -109,7 +109,7 @@ def write(lots: Sequence[ExportPart], pictures: Pictures, folder: Path, out: fro
 def _seen(
     lot: ExportPart, seen: Mapping[tuple[str, int], list[PictureReference]]
 ) -> Iterator[tuple[int, PictureReference]]:
-    """The lot's rows with a picture of their scene."""
+    """Yield the lot's rows with a picture of their scene."""
     assert lot.placed is not None
     for k, row in enumerate(lot.rows.tolist()):
         if found := seen.get((lot.id, int(lot.placed.index[row]))):
@@ -117,7 +117,7 @@ def _seen(
 
 
 def postures_of(lot: ExportPart, row: int) -> Floats:
-    """(W, 7 + J) root and joints on the way of a grasp, in the frame of its table."""
+    """Return (W, 7 + J) root and joints along a grasp's trajectory, in the frame of its table."""
     assert lot.placed is not None
     rest = np.asarray(lot.placed.object_pose[lot.placed.index[row]], float)
     way = way_of(lot.shard, row)
@@ -125,7 +125,7 @@ def postures_of(lot: ExportPart, row: int) -> Floats:
 
 
 class _Writer:
-    """Files of frames, and what is told of all of them."""
+    """Files of frames, and metadata of all of them."""
 
     def __init__(self, folder: Path, lot: ExportPart, pictures: Pictures, tasks: dict[str, int]) -> None:
         self.folder, self.hand, self.pictures, self.tasks = folder, lot.hand, pictures, tasks
@@ -134,7 +134,7 @@ class _Writer:
         self._values: dict[str, list[NDArray[Any]]] = {}
 
     def file(self, episodes: Sequence[tuple[ExportPart, int, PictureReference]]) -> None:
-        """Write a file, each episode a row group."""
+        """Write a file, each episode as a row group."""
         number = len(self.episodes) // _EPISODES
         width = 7 + len(self.hand.joint_names)
         columns = {
@@ -200,11 +200,11 @@ class _Writer:
     def _keep(self, values: Mapping[str, NDArray[Any]], colour: NDArray[Any]) -> None:
         for name, some in values.items():
             self._values.setdefault(name, []).append(some.reshape(len(some), -1))
-        # A tenth of the pixels tells a picture's colours.
+        # A tenth of the pixels is enough for statistics of colours.
         self._values.setdefault(PICTURE, []).append(colour.reshape(-1, colour.shape[-1])[::10] / 255)
 
     def meta(self, train: int) -> None:
-        """Write what is told of all: the first `train` episodes are for training."""
+        """Write the metadata: the first `train` episodes are for training."""
         meta, total = self.folder / "meta", len(self.episodes)
         meta.mkdir(parents=True)
         splits = {"train": f"0:{train}"} | ({"test": f"{train}:{total}"} if train < total else {})
@@ -249,12 +249,12 @@ class _Writer:
 
 
 def task_of(name: str) -> str:
-    """What an episode does, in words."""
+    """Return the text of an episode's task."""
     return f"lift the {name}"
 
 
 def _statistics(values: NDArray[Any], *, picture: bool) -> dict[str, Any]:
-    """Over frames (F, n), of pictures over pixels (P, 3), as (n,) and (3, 1, 1)."""
+    """Compute statistics of frames (F, n), for pictures of pixels (P, 3), as (n,) and (3, 1, 1)."""
     values = np.asarray(values, float)
     found = {
         "min": values.min(axis=0),
@@ -267,23 +267,23 @@ def _statistics(values: NDArray[Any], *, picture: bool) -> dict[str, Any]:
     return shaped | {"count": [len(values)]}
 
 
-#: Postures that end a way: pregrasp, grasp, squeeze, lift.
+#: Postures at the end of a trajectory: pregrasp, grasp, squeeze, lift.
 _STOPS = 4
-#: What `info.json` may take [bytes].
+#: Largest size of `info.json` [bytes].
 _LARGEST = 2**22
 
 
 def read(path: Path, *, hand: str, obj: str, object_name: str = "") -> list[ImportedGrasps]:
-    """The grasps on one object, on tables, with their ways as far as all episodes have as many waypoints.
+    """Read the grasps on one object, on tables, with trajectories if all have equal numbers of waypoints.
 
     Args:
         path: the data set.
         hand: URDF or built-in hand; joints are found by name.
         obj: mesh of the object.
-        object_name: as the tasks name it; may be left out where there is one task.
+        object_name: its name in the tasks; optional with a single task.
 
     Raises:
-        InputError: pyarrow is absent, no such data set or object, or one that graspd did not write.
+        InputError: pyarrow, data set or object is missing, or the data set is not from graspd.
     """
     names = _names(path)
     task = _task(path, object_name)
@@ -294,7 +294,7 @@ def read(path: Path, *, hand: str, obj: str, object_name: str = "") -> list[Impo
 
     def posture(qpos: Floats) -> Posture:
         pose = qpos[:, :7].copy()
-        # float32 leaves quaternions a little off the unit sphere.
+        # float32 quaternions deviate slightly from the unit sphere.
         pose[:, 3:] /= np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)
         return Posture(compose(invert(rest), pose), joints_by_name(model, names, qpos[:, 7:], what=str(path)))
 
@@ -310,7 +310,7 @@ def read(path: Path, *, hand: str, obj: str, object_name: str = "") -> list[Impo
 
 
 def _names(path: Path) -> list[str]:
-    """The joints that states have, in their order."""
+    """Return the joints of the states, in order."""
     file = path / "meta" / "info.json"
     try:
         with file.open("rb") as stream:
@@ -333,7 +333,7 @@ def _task(path: Path, object_name: str) -> int:
 
 
 def _ways(path: Path, task: int) -> tuple[list[Floats], Floats, list[int]]:
-    """Of each episode of a task all postures (W, 7 + J), the object's pose, and its number."""
+    """Return all postures (W, 7 + J) of a task's episodes, the object's poses, and the episodes' numbers."""
     ways: list[Floats] = []
     rest: list[Floats] = []
     numbers: list[int] = []
@@ -357,7 +357,7 @@ def _ways(path: Path, task: int) -> tuple[list[Floats], Floats, list[int]]:
 
 
 def _verdicts(path: Path, episodes: list[int]) -> NDArray[np.int8] | None:
-    """(N,) as the list of episodes tells them."""
+    """Return (N,) verdicts of the list of episodes."""
     found: dict[Any, Any] = {}
     for file in sorted((path / "meta" / "episodes").glob("*/*.parquet")):
         columns = parquet.read(file, (EPISODE, VERDICT))

@@ -1,4 +1,4 @@
-"""Every file of an export is opened by a library of its target before the export says that it is done."""
+"""Check of an export before it completes: a library of the target opens every file."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from graspd.service.parquet import arrow
 
 @contextmanager
 def opened(folder: Path) -> Iterator[None]:
-    """Open what is written into a folder within this context, however the writer names its files.
+    """Open all files that are written into a folder within this context, regardless of their names.
 
     Raises:
-        GraspdError: a file that a library of its target does not read.
+        GraspdError: a library of the target cannot read a file.
     """
     before = _stamps(folder)
     yield
@@ -40,8 +40,8 @@ def _open(path: Path, library: str, read: Callable[[Path], Any]) -> None:
     try:
         read(path)
     except ImportError:
-        return  # The writer did without this library, so its user may have another.
-    except Exception as error:  # Each library has errors of its own.
+        return  # The writer did not need this library, so its user may use another.
+    except Exception as error:  # Each library raises its own errors.
         why = " ".join(str(error).split())[:300]
         raise GraspdError(
             f"{path} was written but {library} cannot read it ({why}); report this with the shard"
@@ -82,7 +82,7 @@ def _rows(path: Path) -> None:
 
 
 def _arrays(path: Path) -> None:
-    # Our own file of this moment: DexGraspBench's are pickled dictionaries.
+    # Our own file, just written: DexGraspBench's are pickled dictionaries.
     np.load(path, allow_pickle=True)
 
 
@@ -116,7 +116,7 @@ def _depth(path: Path) -> None:
         file.channels()
 
 
-#: By the end of a file's name: the library, and how it opens a file.
+#: By the suffix of a file's name: the library, and a function that opens a file.
 READERS: Final[dict[str, tuple[str, Callable[[Path], Any]]]] = {
     ".xml": ("mujoco", _mjcf),
     ".urdf": ("an XML parser", ElementTree.parse),

@@ -1,5 +1,4 @@
-"""The plan of an export for training: grasps of many shards, pictures of their scenes, splits, names, and the
-summary."""
+"""Plan of an export for training: grasps of many shards, pictures, splits, names, and the summary."""
 
 from __future__ import annotations
 
@@ -25,36 +24,36 @@ from graspd.worker.simulation.environment import PlacedGrasps
 
 @dataclass(frozen=True)
 class ExportPart:
-    """Grasps of one base shard that are exported."""
+    """Exported grasps of one base shard."""
 
     id: str
-    """Of the shard."""
+    """Id of the shard."""
     name: str
-    """The object's, fit for files; of two objects of one name the later one carries a piece of its digest."""
+    """Name of the object, fit for files; a repeated name gets a part of the later object's digest."""
     hand: HandModel
     obj: ObjectModel
     grasps: GraspSet
     rows: NDArray[np.intp]
-    """Rows that go into the export."""
+    """Exported rows."""
     verdict: NDArray[np.int8]
-    """(N,) of the validator on every grasp: 1 held, 0 dropped, -1 not validated."""
+    """(N,) verdicts: 1 held, 0 dropped, -1 not validated."""
     shard: Shard
     placed: PlacedGrasps | None = None
 
     @property
     def tag(self) -> str:
-        """Tells shards of one object apart in names of files."""
+        """Part of file names that distinguishes shards of one object."""
         return hashlib.sha256(self.id.encode()).hexdigest()[:8]
 
 
 def held_out(kinds: Mapping[str, str], share: float) -> frozenset[str]:
-    """Objects that a network is tested on: `share` of them, at least one and not all, by the order of a hash.
+    """Return the held-out objects: `share` of them, at least one and not all, by the order of a hash.
 
     Args:
-        kinds: of each object by name what kind it is, see `exchange.training_export`. One kind comes to one side.
+        kinds: kind of each object by name, see `exchange.training_export`. A kind is never split.
 
     Returns:
-        names; of a single kind none, for there is nothing to hold out.
+        their names; none if there is a single kind.
     """
     order = sorted(set(kinds.values()), key=lambda kind: hashlib.sha256(kind.encode()).digest())
     count = min(max(1, round(share * len(order))), len(order) - 1)
@@ -64,24 +63,24 @@ def held_out(kinds: Mapping[str, str], share: float) -> frozenset[str]:
 
 @dataclass(frozen=True)
 class PictureReference:
-    """One picture: where it is among the pictures, and of what."""
+    """One picture: its index among the pictures, and its scene."""
 
     index: int
     base: str
-    """Shard of the scene's grasps."""
+    """Id of the shard with the scene's grasps."""
     shard: str
-    """The views shard."""
+    """Id of the views shard."""
     scene: int
     extrinsics: Floats
     """(4, 4) table to camera."""
     object_pose: Floats
-    """(7,) in the table's frame."""
+    """(7,) object pose in the table's frame."""
     rows: NDArray[np.intp]
-    """Rows of the base shard whose grasps are taken in this scene."""
+    """Rows of the base shard whose grasps belong to this scene."""
 
 
 def looks(pictures: Pictures) -> Iterator[PictureReference]:
-    """The pictures, none of whose pixels is read. Of a pair the left one."""
+    """Yield the pictures without their pixels; only the left one of a stereo pair."""
     for index, place in enumerate(pictures.places):
         camera = pictures.columns_of(place, ("camera/extrinsics", "camera/eye"))
         if camera["camera/eye"] == RIGHT:
@@ -93,18 +92,18 @@ def looks(pictures: Pictures) -> Iterator[PictureReference]:
         yield PictureReference(index, found["base_id"], place.file.id, place.scene, extrinsics, pose, rows)
 
 
-#: The right eye of a pair, as `camera/eye` tells it.
+#: Value of `camera/eye` for the right picture of a stereo pair.
 RIGHT: Final = 2
 
 
 def object_points(sample: Mapping[str, Any], index: int, noise: DepthNoise | None) -> Floats:
-    """(P, 3) what a picture shows of the object, in the table's frame [m]; its number decides the noise."""
+    """Return (P, 3) object points of a picture in the table's frame [m]; its index seeds the noise."""
     view = CloudView.of(sample, noise, np.random.default_rng(index))
     return view.points(*view.pixels(whole=False))
 
 
 def by_scene(found: Sequence[PictureReference]) -> dict[tuple[str, int], list[PictureReference]]:
-    """Pictures of each scene of each views shard, in their order."""
+    """Group pictures by views shard and scene, in order."""
     scenes: dict[tuple[str, int], list[PictureReference]] = {}
     for look in found:
         scenes.setdefault((look.shard, look.scene), []).append(look)
@@ -113,26 +112,26 @@ def by_scene(found: Sequence[PictureReference]) -> dict[tuple[str, int], list[Pi
 
 @dataclass
 class ExportSummary:
-    """What came of an export."""
+    """Result of an export."""
 
     counts: dict[str, Any]
     notes: list[str] = field(default_factory=list)
-    """Lines for the user: what was assumed, what was left out and why."""
+    """Lines for the user: assumptions, omissions and their reasons."""
 
 
 def plain_name(name: str) -> str:
-    """A name fit for files and addresses; a long one is cut, which the log tells."""
+    """Return a name fit for files and addresses; long names are cut, with a log message."""
     return fitted(re.sub(r"[^A-Za-z0-9._-]+", "-", name).strip("-.") or "unnamed")
 
 
 def prim_name(name: str) -> str:
-    """A name that USD allows for a prim: ASCII letters, digits and underscores, no digit first."""
+    """Return a valid USD prim name: ASCII letters, digits and underscores, no leading digit."""
     plain = re.sub(r"[^A-Za-z0-9_]+", "_", name) or "_"
     return f"_{plain}" if plain[0].isdigit() else plain
 
 
 def prim_names(names: Sequence[str]) -> list[str]:
-    """Names of prims with one parent: no two are the same, later ones are numbered."""
+    """Return names of prims with one parent; repeated ones are numbered."""
     found: list[str] = []
     for name in map(prim_name, names):
         number = 1

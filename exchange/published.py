@@ -1,8 +1,8 @@
-"""Published grasp sets, read: DDGC, DexGraspNet, MultiDex (GenDexGrasp), and `reference-grasps/1`.
+"""Readers of published grasp sets: DDGC, DexGraspNet, MultiDex (GenDexGrasp), `reference-grasps/1`.
 
 Lundell et al., DDGC, RA-L 2021. For each object of the scene a list of grasps: position and quaternion x y z w of the
-hand in the object's frame; eight joint angles, spread, medial and distal of finger 1, of finger 2, then medial and
-distal of finger 3, closing positive.
+hand in the object's frame; eight joint angles: spread, medial and distal of finger 1, the same of finger 2, then medial
+and distal of finger 3, closing positive.
 
 DexGraspNet's layout: a `.npy` for each object, a list of dictionaries with `qpos` by joint name and `scale`.
 
@@ -12,11 +12,11 @@ numbers are one less than those of the URDF (FFJ4 ...). The object's mesh is mul
 
 MultiDex, the dataset of GenDexGrasp: a torch file with a list `metadata` of (..., q, object, robot) tuples.
 
-Li et al., GenDexGrasp, ICRA 2023. `q` has the root's translation [m], the first two columns of its rotation matrix,
-and the joints in the order of the robot's URDF. The original entries begin with a contact map; later versions of the
-file leave it out, and some give the rotation as three Euler angles (rotating axes x, y, z).
+Li et al., GenDexGrasp, ICRA 2023. `q` has the root's translation [m], the first two columns of its rotation matrix, and
+the joints in the order of the robot's URDF. The original entries begin with a contact map; later versions of the file
+omit it, and some give the rotation as three Euler angles (rotating axes x, y, z).
 
-Reference grasps as JSON (`reference-grasps/1`): poses as matrices, joints by name, published scores beside them.
+Reference grasps as JSON (`reference-grasps/1`): poses as matrices, joints by name, with published scores.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ from graspd.worker.grasps import Posture
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
 
-#: What the name of each joint matches, in the order of the file: finger and phalanx in words, or the maker's numbers.
+#: Patterns of the joints' names, in the order of the file: finger and phalanx in words, or the maker's numbers.
 ROLES: Final = tuple(
     rf"(?=.*{finger}).*({words})|j{finger}{number}"
     for finger, phalanges in (("1", "smd"), ("2", "smd"), ("3", "md"))
@@ -53,16 +53,16 @@ ROLES: Final = tuple(
 
 
 def read_ddgc(path: Path, *, hand: str, obj: str, number: int = 0) -> list[ImportedGrasps]:
-    """The grasps of one object of a scene.
+    """Read the grasps of one object of a scene.
 
     Args:
-        path: `barrett_translation_K.npy`; its `barrett_representation_K.npy` lies beside it.
+        path: `barrett_translation_K.npy`; its `barrett_representation_K.npy` is in the same folder.
         hand: URDF or built-in Barrett hand whose joints name finger (1, 2, 3) and phalanx (spread or prox, med, dist).
         obj: mesh of the object.
-        number: which object of the scene.
+        number: index of the object in the scene.
 
     Raises:
-        InputError: not such files, or no such object in the scene.
+        InputError: the files are invalid, or the scene lacks the object.
     """
     beside = path.with_name(path.name.replace("translation", "representation"))
     if beside == path or not beside.is_file():
@@ -80,7 +80,7 @@ def read_ddgc(path: Path, *, hand: str, obj: str, number: int = 0) -> list[Impor
 
 
 def _names(hand: HandModel) -> list[str]:
-    """The hand's joint for each role."""
+    """Return the hand's joint for each role."""
     names = []
     for role in ROLES:
         found = [name for name in hand.joint_names if re.search(role, name)]
@@ -91,7 +91,7 @@ def _names(hand: HandModel) -> list[str]:
 
 
 def _signs(hand: HandModel) -> np.ndarray:
-    """Where the hand's joint closes towards negative angles, the file's sign is turned."""
+    """Return signs: -1 where the hand's joint closes towards negative angles."""
     high, low = hand.expand(hand.upper[None])[0], hand.expand(hand.lower[None])[0]
     return np.array(
         [
@@ -107,17 +107,17 @@ _MUJOCO: Final = "robot0:"
 
 
 def read_dexgraspnet(path: Path, *, hand: str, obj: str, root_offset: np.ndarray | None = None) -> list[ImportedGrasps]:
-    """Grasps of one object, a set for each scale.
+    """Read the grasps of one object, one set for each scale.
 
     Args:
         path: the object's `.npy`.
         hand: URDF or built-in hand.
         obj: the object's mesh at scale 1.
-        root_offset: (7,) pose of the hand's root link in the frame that the source calls the root; by default they
-            are one frame.
+        root_offset: (7,) pose of the hand's root link in the frame that the source uses as root; identity by
+            default.
 
     Raises:
-        InputError: not such a file, or its joints are not the hand's.
+        InputError: the file is invalid, or its joints are not the hand's.
     """
     found = load_npy(path)
     rows = list(found) if isinstance(found, list | np.ndarray) else []
@@ -151,7 +151,7 @@ def _grasp(path: Path, hand: HandModel, rows: list[dict[str, Any]], root_offset:
 
 
 def _urdf_name(name: str, hand: HandModel) -> str:
-    """`robot0:FFJ3` is FFJ4 of the URDF, perhaps behind a prefix such as `rh_`; other names stand as they are."""
+    """Map `robot0:FFJ3` to the URDF's FFJ4, perhaps with a prefix such as `rh_`; keep other names."""
     if not name.startswith(_MUJOCO):
         return name
     plain = name.removeprefix(_MUJOCO)
@@ -160,17 +160,17 @@ def _urdf_name(name: str, hand: HandModel) -> str:
 
 
 def read_multidex(path: Path, *, hand: str, obj: str, robot: str, object_name: str) -> list[ImportedGrasps]:
-    """The grasps of one robot on one object.
+    """Read the grasps of one robot on one object.
 
     Args:
-        path: `cmap_dataset.pt`. Read by torch with nothing but tensors and plain values let through.
+        path: `cmap_dataset.pt`. torch loads tensors and plain values only.
         hand: URDF or built-in hand: the robot.
         obj: mesh of the object.
-        robot: the robot's name in the file, `allegro` say.
-        object_name: the object's name in the file, `contactdb+mug` say.
+        robot: the robot's name in the file, such as `allegro`.
+        object_name: the object's name in the file, such as `contactdb+mug`.
 
     Raises:
-        InputError: torch is missing, not such a file, or nothing of that robot and object in it.
+        InputError: torch is missing, or the file is invalid or lacks that robot and object.
     """
     rows = [row for row in _metadata(path) if len(row) >= 3 and row[-1] == robot and row[-2] == object_name]
     if not rows:
@@ -186,7 +186,7 @@ def read_multidex(path: Path, *, hand: str, obj: str, robot: str, object_name: s
 
 
 def rotation_of_columns(columns: Floats) -> Floats:
-    """(N, 4) quaternion of rotations given by their first two columns (N, 6), made orthogonal evenly."""
+    """Return quaternions (N, 4) of rotations by their first two columns (N, 6), orthogonalised evenly."""
     x, y = (_unit(part) for part in (columns[:, :3], columns[:, 3:]))
     middle, across = _unit(x + y), _unit(x - y)
     x, y = _unit(middle + across), _unit(middle - across)
@@ -194,7 +194,7 @@ def rotation_of_columns(columns: Floats) -> Floats:
 
 
 def rotation_of_angles(angles: Floats) -> Floats:
-    """(N, 4) quaternion of rotations about the rotating axes x, y, z in turn (N, 3) [rad]."""
+    """Return quaternions (N, 4) of rotations about the rotating axes x, y, z (N, 3) [rad]."""
     x, y, z = (quat_from_axis_angle(axis, angles[:, k]) for k, axis in enumerate(np.eye(3)))
     return quat_multiply(x, quat_multiply(y, z))
 
@@ -213,21 +213,21 @@ def _metadata(path: Path) -> list[Any]:
         found = torch.load(path, map_location="cpu", weights_only=True)
         return list(found["metadata"])
     except Exception as error:
-        # torch raises what its readers happen to raise; all of it means that the file is not what it should be.
+        # torch raises arbitrary exceptions; all of them mean an invalid file.
         reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
         raise InputError(f"{path} is no MultiDex file that can be read safely: {reason}") from None
 
 
 def read_reference(path: Path, *, hand: str | None = None, obj: str | None = None) -> list[ImportedGrasps]:
-    """The grasps of one file; hand and object by default those beside it that the file names.
+    """Read the grasps of one file; hand and object default to those that the file names.
 
     Raises:
-        InputError: not such a file.
+        InputError: the file is invalid.
     """
     stored = _stored(path)
     try:
         rows = stored["grasps"]
-        # The set's root has hands/, objects/ and reference_grasps/ in it.
+        # The set's root contains hands/, objects/ and reference_grasps/.
         root = path.resolve().parents[2]
         model = hand_from_path(hand or root / stored["hand"]["urdf"])
         thing = scaled_object(obj or root / "objects" / stored["object"] / "clean.stl")
@@ -242,7 +242,7 @@ def read_reference(path: Path, *, hand: str | None = None, obj: str | None = Non
 
 
 def friction(path: Path) -> float | None:
-    """Coulomb coefficient that the file states for its metrics."""
+    """Return the Coulomb coefficient of the file's metrics."""
     value = _stored(path).get("contact_model", {}).get("mu")
     return None if value is None else float(value)
 

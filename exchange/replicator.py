@@ -1,4 +1,4 @@
-"""Views in the layout of Omniverse Replicator's BasicWriter, so that its readers work on them.
+"""Views in the layout of Omniverse Replicator's BasicWriter, for its readers.
 
 Beside the image files of `worker.rendering.export`: `bounding_box_2d_tight_NNNN.npy`, `..._2d_loose_NNNN.npy` and
 `..._3d_NNNN.npy` as structured arrays with their `_labels_` and `_prim_paths_` JSON files,
@@ -44,21 +44,21 @@ _BOX_3D: Final = np.dtype(
         ("occlusionRatio", "<f4"),
     ]
 )
-#: Width of the sensor that the focal length is stated for, USD's default [mm].
+#: Width of the sensor for the focal length, USD's default [mm].
 APERTURE_MM: Final = 20.955
 NEAR_FAR_M: Final = (0.01, 100.0)
-#: From a camera that looks along +z with y down to one that looks along -z with y up.
+#: From a camera along +z with y down to one along -z with y up.
 _FLIP: Final = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def write(views: Shard, folder: Path) -> list[Path]:
-    """Every picture of a views shard with its annotations.
+    """Write every picture of a views shard with its annotations.
 
     Returns:
         the files.
 
     Raises:
-        InputError: the folder cannot be written, or has such files already.
+        InputError: the folder is not writable, or already contains such files.
     """
     written = export_images(views, folder, depth="exr")
     name = str(views.attributes.get("object", "object"))
@@ -68,7 +68,7 @@ def write(views: Shard, folder: Path) -> list[Path]:
 
 
 def box_3d(corners: Floats, extrinsics: Floats) -> tuple[Floats, Floats, Floats]:
-    """Lower and upper corner of an object-aligned box in its own frame, and its frame in the world.
+    """Return the corners of an object-aligned box in its own frame, and its frame in the world.
 
     Args:
         corners: (8, 3) in the camera frame; corner k takes the maximum of x, y, z where bit 0, 1, 2 of k is set.
@@ -87,7 +87,7 @@ def box_3d(corners: Floats, extrinsics: Floats) -> tuple[Floats, Floats, Floats]
 
 
 def camera_params(views: Shard, view: int) -> dict[str, Any]:
-    """The camera in USD's words."""
+    """Return the camera in USD's terms."""
     height, width = views["image/rgb"].shape[1:3]
     k, extrinsics = (np.asarray(views[f"camera/{name}"][view], float) for name in ("intrinsics", "extrinsics"))
     near, far = NEAR_FAR_M
@@ -116,7 +116,7 @@ def _annotations(views: Shard, view: int, name: str, folder: Path) -> list[Path]
     boxes: dict[str, NDArray[Any]] = {}
     for kind in ("tight", "loose"):
         corners = np.asarray(views[f"box/bounding_box_2d_{kind}"][view], float)
-        # A box that is not there is left out, as the writer does with objects that are not seen.
+        # A missing box is omitted, as the writer does for unseen objects.
         found = [(0, *np.rint(corners).astype(int), hidden)] if np.isfinite(corners).all() else []
         boxes[f"bounding_box_2d_{kind}"] = np.array(found, _BOX_2D)
     low, high, transform = box_3d(

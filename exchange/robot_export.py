@@ -1,4 +1,4 @@
-"""From a shard to the files of a robot: chosen grasps, their ways and trajectories, written in one format."""
+"""Export of a shard for robots: chosen grasps with their trajectories, written in one format."""
 
 from __future__ import annotations
 
@@ -43,19 +43,19 @@ ALIASES: Final = {"urdf+yaml": "moveit"}
 
 @dataclass(frozen=True)
 class RobotExportOptions:
-    """What a user asks for, as the command line has it."""
+    """Options of the user, as on the command line."""
 
     hand: str | None = None
     obj: str | None = None
     unvalidated: bool = False
     every: bool = False
     best: int = 0
-    """At most so many, the best by epsilon first; 0: all, in the order of the shard."""
+    """Largest number of grasps, best epsilon first; 0: all, in the order of the shard."""
     tool: str | None = None
     speed: float = 0.5
     """Share of the velocity limits that trajectories use."""
     arm: str | None = None
-    """The arm's description; the next three say how it stands and carries the hand."""
+    """Description of the arm; the next three place it and mount the hand."""
     mount: str | None = None
     base: str | None = None
     mount_pose: str | None = None
@@ -64,11 +64,11 @@ class RobotExportOptions:
 def export_grasps(
     source: Path, format_: str, wishes: RobotExportOptions, folder: Path, run: ExecutionContext = DEFAULT_CONTEXT
 ) -> ExportSummary:
-    """Write grasps of a base shard as a robot or its simulator reads them.
+    """Write grasps of a base shard in the format of a robot or its simulator.
 
     Raises:
-        InputError: unknown format, no such grasps, a tool frame or mount that is none, no grasp that can be reached, or
-            an extra package is absent.
+        InputError: the format is unknown, no grasps match or can be reached, a tool frame or mount is invalid, or
+            an extra package is missing.
     """
     format_ = ALIASES.get(format_, format_)
     if format_ not in FORMATS:
@@ -95,7 +95,7 @@ def export_grasps(
 
 
 def _check_arm(wishes: RobotExportOptions) -> None:
-    """Raises InputError where an arm lacks its mount or base, or they lack an arm."""
+    """Raise InputError for an arm without mount or base, or these without an arm."""
     if wishes.arm is None:
         if wishes.mount or wishes.base or wishes.mount_pose:
             raise InputError("--mount, --mount-pose and --base go with an arm; name its file: --arm ARM.urdf")
@@ -112,7 +112,7 @@ def _carried(
     written: ExportSummary,
     run: ExecutionContext,
 ) -> Bundle:
-    """The grasps that the arm carries out, with its trajectories."""
+    """Return the grasps that the arm can execute, with its trajectories."""
     assert wishes.arm is not None and wishes.mount is not None
     base = IDENTITY_POSE if wishes.base is None else parse_pose(wishes.base, "--base")
     mount_pose = IDENTITY_POSE if wishes.mount_pose is None else parse_pose(wishes.mount_pose, "--mount-pose")

@@ -1,4 +1,4 @@
-"""Grasps of others through our quality stage, as base shards that say where they come from."""
+"""Imported grasps through our quality stage, as base shards with their origin."""
 
 from __future__ import annotations
 
@@ -34,23 +34,23 @@ def write_scored(
 ) -> Path:
     """Validate and measure a set of grasps and write it as a base shard, its object's mesh beside it.
 
-    Grasps in scenes are lifted out of them; the way of the hand is planned anew, as for grasps of our own.
+    Grasps in scenes are tested by a lift; the hand's trajectory is replanned, as for our own grasps.
 
     Args:
         found: the grasps.
-        origin: goes into the shard's attributes.
-        folder: where to; made if absent.
+        origin: stored in the shard's attributes.
+        folder: output folder; created if missing.
         validator: level of the verdicts, or none.
         friction: Coulomb coefficient of the metrics.
-        ordinal: number of the set, part of the file's name.
-        run: told of the share that is done; asked often whether to stop.
+        ordinal: index of the set, part of the file's name.
+        run: receives the progress; polled for cancellation.
 
     Returns:
         the shard's path.
 
     Raises:
-        InputError: unknown level, or the file is there already.
-        MeshError: the object has no convex pieces that the validator could use.
+        InputError: the level is unknown, or the file already exists.
+        MeshError: the object has no convex pieces for the validator.
     """
     name = plain_name(found.name)
     path = folder / f"{plain_name(found.hand.name)}-{name}-{ordinal:03}.h5"
@@ -91,7 +91,7 @@ def write_scored(
     if found.published is not None and (found.published >= 0).any():
         arrays["quality/published"] = found.published
     if scenes is not None:
-        # A table is the only scene that other formats have.
+        # Other formats support no scene but a table.
         attributes["scene"] = json_attribute(SceneSpec(kind="table").model_dump(mode="json"))
         arrays["scene/object_pose"] = scenes.object_pose
         arrays["scene/rest_probability"] = np.full(len(scenes.object_pose), np.nan)

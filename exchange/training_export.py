@@ -1,7 +1,7 @@
-"""From a folder of shards to a training folder of another project: grasps, pictures, and splits by families of objects.
+"""Export of shards as training folders of other projects: grasps, pictures, splits by object family.
 
-What is compared is the distribution of distances between two random points of the surface (D2 of Osada et al., "Shape
-distributions", 2002) over their root mean square: turned, moved, mirrored, scaled and remeshed copies have the same.
+Families compare the distribution of distances between two random surface points (D2 of Osada et al., "Shape
+distributions", 2002) over their root mean square. Rotated, moved, mirrored, scaled and remeshed copies have the same.
 """
 
 from __future__ import annotations
@@ -27,29 +27,29 @@ from graspd.worker.objects.model import ObjectModel
 
 FORMATS: Final = ("dexlearn", "dexgraspnet2", "graspgen", "huggingface", "lerobot")
 
-#: Formats that tell good grasps from bad ones.
+#: Formats that distinguish good and bad grasps.
 LABELLED: Final = ("graspgen",)
 
 
 @dataclass(frozen=True)
 class TrainingExportOptions:
-    """What a user asks for, as the command line has it."""
+    """Options of the user, as on the command line."""
 
     hand: str | None = None
     obj: str | None = None
     unvalidated: bool = False
     every: bool = False
     held_out: float = 0.2
-    """Share of the objects that a network is tested on."""
+    """Share of held-out objects."""
     noise: str = ""
-    """Name of a depth camera; nothing: perfect depth."""
+    """Name of a depth camera; empty: perfect depth."""
 
 
 def export_training(source: Path, format_: str, wishes: TrainingExportOptions, folder: Path) -> ExportSummary:
-    """Write the grasps of a folder of shards as others train on them.
+    """Write the grasps of a folder of shards in a training format.
 
     Raises:
-        InputError: unknown format, no such grasps, a share that is none, or what the format's writer refuses.
+        InputError: the format is unknown, no grasps match, the share is invalid, or the format's writer refuses.
     """
     if format_ not in FORMATS:
         raise InputError(f"there is no training format {format_!r}; choose one of {one_of(format_, FORMATS)}")
@@ -82,7 +82,7 @@ def _write(
 
 
 def _lots(shards: Shards, format_: str, wishes: TrainingExportOptions) -> list[ExportPart]:
-    """Grasps of all base shards that have some of the kind that is asked for."""
+    """Return the requested grasps of all base shards that have some."""
     lots: list[ExportPart] = []
     digests: dict[str, str] = {}
     refused: InputError | None = None
@@ -107,7 +107,7 @@ def _lots(shards: Shards, format_: str, wishes: TrainingExportOptions) -> list[E
 
 
 def _chosen(shard: Shard, format_: str, wishes: TrainingExportOptions) -> np.ndarray:
-    """(N,) grasps that go into the export. A format that labels grasps gets good ones and bad ones."""
+    """Return (N,) exported grasps. A format with labels gets good and bad ones."""
     if format_ not in LABELLED:
         return choose(shard, unvalidated=wishes.unvalidated, every=wishes.every)[0]
     validated = validity.validated(shard.arrays)
@@ -116,17 +116,17 @@ def _chosen(shard: Shard, format_: str, wishes: TrainingExportOptions) -> np.nda
     return validated
 
 
-#: Pairs of points, and quantiles of their distances that are kept.
+#: Pairs of points, and stored quantiles of their distances.
 PAIRS: Final = 40_000
 QUANTILES: Final = np.linspace(0.01, 0.99, 50)
-#: Root mean square difference of the quantiles, distances being about 1, below which two shapes are one. Of 14 scanned
-#: objects copies that were turned, mirrored, scaled and simplified to 3 mm differ by 0.0043 at most, the two that are
-#: most alike by 0.0095. Too many alike cost a split little, too few make it leak.
+#: Root mean square difference of the quantiles, with distances of about 1, below which two shapes count as one. For 14
+#: scanned objects, copies that were turned, mirrored, scaled and simplified to 3 mm differ by at most 0.0043; the two
+#: most similar objects differ by 0.0095. Too large families cost a split little, too small ones leak.
 SAME: Final = 0.006
 
 
 def signature(obj: ObjectModel) -> Floats:
-    """(50,) quantiles of the distance between two points of the surface, over its root mean square."""
+    """Return (50,) quantiles of the distance between two surface points, over its root mean square."""
     corners = np.asarray(obj.vertices, float)[np.asarray(obj.faces)]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     rng = np.random.default_rng(0)
@@ -138,10 +138,7 @@ def signature(obj: ObjectModel) -> Floats:
 
 
 def families(objects: Mapping[str, ObjectModel]) -> dict[str, str]:
-    """Of each object by name, what its family is called: the least digest of the files of those like it.
-
-    Objects that are each like a third are of one family.
-    """
+    """Return each object's family: the least digest of files of transitively similar objects."""
     names = sorted(objects, key=lambda name: objects[name].digest)
     found = np.array([signature(objects[name]) for name in names]).reshape(len(names), len(QUANTILES))
     family: dict[str, str] = {}

@@ -31,16 +31,16 @@ def write(
 
     Args:
         shards: views shards with the scene and base shards they were made of.
-        folder: where to; made if absent.
+        folder: output folder; created if missing.
         pictures_a_file: samples in one tar file.
         valid: only valid grasps; False: all of them.
-        unvalidated: instead of valid ones those that are feasible and that are not validated.
+        unvalidated: write feasible grasps without validation instead of valid ones.
 
     Returns:
         the files.
 
     Raises:
-        InputError: no picture in the shards, or tar files in the folder already.
+        InputError: the shards contain no picture, or the folder already contains tar files.
     """
     pictures = Pictures(
         shards, _COLUMNS, grasp_quality=("quality/epsilon", "quality/success"), valid=valid, unvalidated=unvalidated
@@ -94,7 +94,7 @@ _SHOWN: dict[str, Shard] = {}
 
 
 def _views(shards: Shards, shard: str) -> Shard:
-    """The views shard without its pictures, kept while its samples are written."""
+    """Return the views shard without its pictures, cached while its samples are written."""
     if shard not in _SHOWN:
         _SHOWN.clear()
         _SHOWN[shard] = read_shard(shards.path(shards.by_id(shard)), kind="views", without=("image/depth",))

@@ -1,5 +1,7 @@
-"""Throughput of the planner over fidelities, batches, threads, hand points and object faces; as table, JSON and
-plot."""
+"""Throughput of the planner over fidelities, batches, threads, hand points and object faces.
+
+The results are a table, JSON and a plot.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,7 @@ from graspd.worker.planners.fast_graspd.batches import Batches
 from graspd.worker.planners.fast_graspd.planner import optimise, optimise_batch
 from graspd.worker.planners.port import BatchRequest, PlanRequest
 
-#: Grasps of a launch, at most, that the time of the host is told for.
+#: Largest number of grasps per launch for which host time is reported.
 LARGE: Final = 1024
 
 Load = Callable[[float], ObjectModel]
@@ -45,22 +47,22 @@ def bench(
     joins: Sequence[int] = (1,),
     say: Say = lambda line: None,
 ) -> dict[str, Any]:
-    """One run per fidelity x batch x joins x threads.
+    """Run each fidelity x batch x joins x threads once.
 
     Args:
         hand: the hand.
-        load: the object, given the simplification error bound of a fidelity [m].
-        fidelities: knobs to run.
+        load: function that loads the object at a fidelity's simplification error bound [m].
+        fidelities: fidelities to run.
         batches: grasps per call.
         threads: CPU threads per call; a GPU takes the whole batch at once.
         device: Warp device.
-        repeats: timed calls per run, after one that is not timed; the median is reported.
+        repeats: timed calls per run, after an untimed one; the median is reported.
         joins: batches in one launch.
-        say: told of each run as it ends.
+        say: receives a line per run.
 
     Returns:
         `device`, `runs[]` with the keys of the command line's contract, `start` with cold and warm seconds,
-        `host_ms_per_grasp` (None on a GPU, for which threads spin while they wait), `kernels`.
+        `host_ms_per_grasp` (None on a GPU, where waiting threads spin), `kernels`.
     """
     first = fidelities[0]
     start = _start_times(hand, load(first.face_error_m), first, device)
@@ -90,7 +92,7 @@ def bench(
 
 
 def _start_times(hand: HandModel, obj: ObjectModel, fidelity: Fidelity, device: str) -> dict[str, float]:
-    """Seconds to the first grasp of a fresh process (kernels from the disk cache, or compiled) and to the next one."""
+    """Return seconds to the first grasp of a fresh process (kernels cached or compiled) and to the next."""
     seconds = []
     for seed in (0, 1):
         began = time.perf_counter()
@@ -147,13 +149,13 @@ def _peak_memory_mb(device: str) -> float:
 
 
 def device_name(device: str) -> str:
-    """The device as people call it."""
+    """Return the common name of the device."""
     found = wp.get_device(device)
     return str(found.name) if found.is_cuda else f"cpu ({available_cores()} cores)"
 
 
 def table(result: dict[str, Any]) -> str:
-    """Markdown: runs, kernel shares, start times."""
+    """Return Markdown: runs, kernel shares, start times."""
     lines = [
         f"{result['hand']} on {result['object']}, {result['device']}, graspd {result['versions']['graspd']}, "
         f"Warp {result['versions']['warp']}",
@@ -181,12 +183,12 @@ def table(result: dict[str, Any]) -> str:
 
 
 def _batches(run: dict[str, Any]) -> str:
-    """The batch, and how many of it were joined in one launch."""
+    """Return the batch, and the number of batches per launch."""
     return str(run["batch"]) if run["join"] == 1 else f"{run['join']} × {run['batch']}"
 
 
 def write(result: dict[str, Any], folder: Path) -> None:
-    """bench.json, bench.md and bench.png in a folder."""
+    """Write bench.json, bench.md and bench.png to a folder."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "bench.json").write_text(json.dumps(result, indent=1) + "\n")
     (folder / "bench.md").write_text(table(result) + "\n")
@@ -194,7 +196,7 @@ def write(result: dict[str, Any], folder: Path) -> None:
 
 
 def _plot(result: dict[str, Any], path: Path) -> None:
-    """Grasps per second over the batch, a line per fidelity and thread count."""
+    """Plot grasps per second over the batch, one line per fidelity and thread count."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(7, 4.2), layout="constrained")

@@ -1,4 +1,4 @@
-"""What studies read the time from."""
+"""Clock of the studies."""
 
 from __future__ import annotations
 
@@ -7,6 +7,5 @@ from collections.abc import Callable
 
 
 def clock_of(device: str) -> Callable[[], float]:
-    """On a CPU the seconds of all threads together, which hardly depend on what else the machine does; on a GPU those
-    that pass."""
+    """Return core-seconds of all threads on a CPU (nearly independent of load), wall clock on a GPU."""
     return time.process_time if device == "cpu" else time.perf_counter

@@ -1,4 +1,4 @@
-"""The numbers of a set of grasps in one row: success by the validator, and medians of every metric."""
+"""Evaluation of a set of grasps as one row: success by the validator, and medians of all metrics."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ from graspd.worker.validation.robust import Robustness, robust
 from graspd.worker.validation.validator import Verdicts, validate
 
 Protocol = Literal["dexgraspbench", "displacement", "lift"]
-#: Judges grasps in models around the nominal one: `_in_others` but for its first argument.
+#: Validates grasps in models around the nominal one: `_in_others` without its first argument.
 InOthers = Callable[..., dict[str, Any]]
 
 #: Contact threshold of the row's area, epsilon and volume: the paper's [m].
 THRESHOLD_M: Final = 0.005
-#: Of the models around the nominal one. No job has this seed: what a job chose grasps by does not confirm them.
+#: Seed of the models around the nominal one, used by no job: so results do not confirm a job's own choice.
 MODELS_SEED: Final = 2**31
 
 
@@ -58,23 +58,21 @@ def evaluate(
     cache: Path | None = None,
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> dict[str, Any]:
-    """One row of numbers, None where a number does not exist: too thin an object has no verdict.
+    """Return one row of numbers; None for undefined ones: too thin an object has no verdict.
 
-    Level letter has the protocol's own mass and friction, the others the object's.
+    Level letter uses the protocol's own mass and friction, the others the object's.
 
     Keys: n, protocol, level, hard, mu, mass_kg, object_friction; gsr (share that holds), osr (1 if any holds), sgs
-    (holding grasps per second of making and validating them; of making them alone: sgs_without_validation), pd_mm and
-    spd_mm (penetration, self-penetration), ca_cm2, iv_cm3, epsilon, wrench_volume, cdc_mm, sd_cm: medians; diversity:
-    variance explained by the first principal component; nearest_mm: distance of the two grasps that are most alike.
-    verdicts, where somebody validated: see `told`. Validated in `models` models around the nominal one, by the same
-    protocol: robust_share, the mean of those that hold in it, robust_n, how many, robust_axes, the share by axis;
-    `tell` gets what became of each grasp.
-    With protocol lift also clear_share (free of what stands in the scene, coming, closing and lifting). With another
-    model of the hand as `validation_hand` also what `ForeignVerdicts.facts` tells, and in the verdicts held_foreign and
-    reason_foreign.
+    (held grasps per second of planning and validation; of planning alone: sgs_without_validation), pd_mm and spd_mm
+    (penetration, self-penetration), ca_cm2, iv_cm3, epsilon, wrench_volume, cdc_mm, sd_cm: medians; diversity: variance
+    explained by the first principal component; nearest_mm: distance of the two most similar grasps. verdicts, after
+    validation: see `told`. With `models` models around the nominal one, by the same protocol: robust_share, the mean
+    over held grasps, robust_n, their number, robust_axes, the share by axis; `tell` receives the result of each grasp.
+    With protocol lift also clear_share (no collision with the scene in approach, closing and lift). With another model
+    of the hand as `validation_hand` also `ForeignVerdicts.facts`, and in the verdicts held_foreign and reason_foreign.
 
     Raises:
-        InputError: protocol lift on grasps that were planned around a free object, or a level that it does not have.
+        InputError: protocol lift on grasps of a free object, or with a level that it lacks.
     """
     if protocol == "lift" and case.placed is None:
         raise InputError(f"{case.name} has grasps around a free object: `graspd synth --scene` makes some to lift")
@@ -120,7 +118,7 @@ def _pushed(
     pieces: ConvexPieces,
     run: ExecutionContext,
 ) -> dict[str, Any]:
-    """What six pushes say, in the nominal model and in others."""
+    """Return results of the six pushes, in the nominal model and in others."""
     verdicts = validate(case.hand, case.obj, case.grasps, level=level, hard=hard, pieces=pieces, run=run)
     row = _success(case, verdicts, verdicts.seconds)
     row |= in_others(case.grasps, row.get("verdicts", []), held=verdicts.success)
@@ -142,7 +140,7 @@ def _lifted_out(
     pieces: ConvexPieces,
     run: ExecutionContext,
 ) -> dict[str, Any]:
-    """What the lift out of their scenes says, in the nominal model and in others."""
+    """Return results of the lift in the scenes, in the nominal model and in others."""
     grasps, clear = _with_ways(case, placed)
     lifts = validate_lifts(case.hand, case.obj, grasps, placed, level=level, hard=hard, pieces=pieces, run=run)
     row = _lifted(lifts, clear)
@@ -158,7 +156,7 @@ def _in_others(
     tell: Callable[[Robustness], None],
     **given: Any,
 ) -> dict[str, Any]:
-    """What models around the nominal one say, if any are asked; each verdict gets its share."""
+    """Return results of models around the nominal one, if requested; add its share to each verdict."""
     if not models:
         return {}
     found = robust(case.hand, case.obj, grasps, models=models, seed=MODELS_SEED, **given)
@@ -192,10 +190,10 @@ def _success(case: Case, verdicts: Verdicts | None, seconds: float) -> dict[str,
 
 
 def _with_ways(case: Case, placed: PlacedGrasps) -> tuple[GraspSet, NDArray[np.bool_]]:
-    """The grasps with their way, and (N,) whether it is clear."""
+    """Return the grasps with trajectories, and (N,) whether they are clear."""
     way, grasps = plan_way(case.hand, case.obj, case.grasps, placed), case.grasps
     if grasps.approach is None or grasps.coming is None:
-        # Files of others say where a grasp is, seldom how the hand comes.
+        # Imported files have grasps, but rarely trajectories.
         grasps = replace(grasps, approach=way.approach, coming=way.open, lift=way.lift)
     return grasps, way.clear
 
@@ -226,7 +224,7 @@ def _lifted(verdicts: LiftVerdicts, clear: NDArray[np.bool_]) -> dict[str, Any]:
 
 
 def in_models(found: Robustness, verdicts: list[dict[str, Any]]) -> dict[str, Any]:
-    """Shares of a row; each of its verdicts gets its own and what it fails of first, None where it was not tried."""
+    """Return shares of a row; add each verdict's share and first failing axis, None if not tested."""
     tried = np.isfinite(found.share)
     for one, share, weakest in zip(verdicts, found.share, found.weakest, strict=True):
         known = math.isfinite(share)
@@ -242,7 +240,7 @@ def in_models(found: Robustness, verdicts: list[dict[str, Any]]) -> dict[str, An
 
 
 def told(verdicts: Verdicts) -> list[dict[str, Any]]:
-    """Of each grasp: row, held, outcomes of the six pushes, margin (None: it blew up), reason."""
+    """Return per grasp: row, held, outcomes of the six pushes, margin (None: diverged), reason."""
     rows = zip(verdicts.success, verdicts.outcome, verdicts.margin, verdicts.reasons, strict=True)
     return [
         {
@@ -286,17 +284,17 @@ def _plain(value: float) -> float:
     return round(float(value), 6)
 
 
-#: Numbers of a row that several rows have a median of.
+#: Numbers that are combined by medians over rows.
 _MEDIANS: Final = ("pd_mm", "spd_mm", "ca_cm2", "iv_cm3", "epsilon", "wrench_volume", "cdc_mm", "sd_cm", "diversity")
 
 
 def combine(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """One row for several objects: rates over all grasps, osr over objects, medians of the objects' medians."""
+    """Combine rows of several objects: rates over grasps, osr over objects, medians of medians."""
     if len(rows) == 1:
         return dict(rows[0])
     out: dict[str, Any] = {"n": sum(row["n"] for row in rows)}
     for key in ("protocol", "level", "hard", "mu"):
-        # What the rows do not agree on has no one value.
+        # Values that differ between rows have no common value.
         out[key] = rows[0][key] if all(row[key] == rows[0][key] for row in rows) else None
     validated = [row for row in rows if row["gsr"] is not None]
     out["gsr"] = _rate(validated, "gsr", "n")
@@ -324,7 +322,7 @@ def combine(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _models(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """Shares of several rows as those of all their grasps."""
+    """Return shares of several rows, weighted by their grasps."""
     axes: dict[str, list[tuple[float, int]]] = {}
     for row in rows:
         for axis, one in row["robust_axes"].items():
@@ -342,7 +340,7 @@ def _models(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _rate(rows: list[dict[str, Any]], key: str, weight: str) -> float | None:
-    """Mean of the rows that have the key, weighed by the number of grasps it is a rate of."""
+    """Return the mean of rows that have the key, weighted by the grasps of the rate."""
     known = [row for row in rows if row[key] is not None]
     total = sum(row[weight] for row in known)
     return _plain(sum(row[key] * row[weight] for row in known) / total) if total else None

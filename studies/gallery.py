@@ -1,4 +1,4 @@
-"""Pages for people: what cameras see of objects at rest, hands in grasps that fit there, and crowded tables."""
+"""Gallery pages: camera views of objects at rest, hands in grasps that fit there, and crowded tables."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ Say = Callable[[str], None]
 #: Size of one picture [px].
 
 SIZE: Final = (300, 225)
-#: Rays per pixel: pages are looked at.
+#: Rays per pixel, for pictures that people view.
 SAMPLES: Final = 32
-#: Grasps tried in each of so many scenes, in so many rounds, until one stays clear of the table.
+#: Grasps per scene, scenes, and rounds until one grasp is clear of the table.
 GRASPS: Final = 32
 SCENES: Final = 24
 ROUNDS: Final = 4
-#: Cosine of the elevation of the camera that looks past a neighbour.
+#: Cosine of the elevation of the camera beside a neighbour.
 _LEVEL: Final = 0.94
 _VIEW: Final[dict[str, Any]] = {"stereo": False, "width": SIZE[0], "height": SIZE[1], "samples": SAMPLES}
 
@@ -41,7 +41,7 @@ _VIEW: Final[dict[str, Any]] = {"stereo": False, "width": SIZE[0], "height": SIZ
 def paint(
     hands: Sequence[HandModel], objects: Sequence[ObjectModel], folder: Path, *, device: str, seed: int, say: Say
 ) -> list[Path]:
-    """Writes `views.png`, `hands.png` and, for three objects or more, `neighbours.png`. Returns the files."""
+    """Write `views.png`, `hands.png` and, for three or more objects, `neighbours.png`; return the files."""
     folder.mkdir(parents=True, exist_ok=True)
     pages: dict[str, Callable[[], bytes]] = {
         "views": lambda: _views(objects, device, seed),
@@ -114,7 +114,7 @@ def _hands(hands: Sequence[HandModel], objects: Sequence[ObjectModel], device: s
 
 
 def _fitting(hand: HandModel, obj: ObjectModel, device: str, seed: int) -> tuple[DrawnHand, Floats, int, int]:
-    """The grasp that stays farthest from the table, its scene's pose, and how many of how many were kept."""
+    """Return the grasp with the largest clearance, its scene's pose, and numbers of clear and all grasps."""
     scenes = drop(obj, count=SCENES, seed=seed)["scene/object_pose"]
     kept, tried, best = 0, 0, -np.inf
     for batch in range(ROUNDS):
@@ -138,7 +138,7 @@ def _fitting(hand: HandModel, obj: ObjectModel, device: str, seed: int) -> tuple
 
 
 def _camera(drawn: DrawnHand, obj: ObjectModel, pose: Floats) -> Floats:
-    """Extrinsics of a camera that sees object and fingers, across the direction in which the palm approaches."""
+    """Return extrinsics of a camera that sees object and fingers, across the approach direction."""
     hand = drawn.hand
     (bodies,) = body_poses(hand, drawn.hand_pose, drawn.joint_positions)
     points = np.concatenate([apply(bodies[p.body], p.vertices) for p in hand.pieces])
@@ -180,7 +180,7 @@ def _neighbours(objects: Sequence[ObjectModel], device: str, seed: int) -> bytes
 
 
 def _past(poses: Floats, obj: ObjectModel, beside: Neighbours) -> GivenCameras:
-    """A camera that looks past the nearest neighbour at the object, so that something is hidden."""
+    """Return a camera that sees the object past its nearest neighbour, which hides a part."""
     middles = np.stack([apply(pose, o.centre_of_mass) for o, pose in zip(beside.objects, beside.poses[0], strict=True)])
     middle = apply(poses[0], obj.centre_of_mass)
     nearest = int(np.argmin(np.linalg.norm(middles - middle, axis=1)))

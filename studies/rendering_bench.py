@@ -1,4 +1,4 @@
-"""What pictures cost: images per second, and the share of ray tracing, shading, annotation, compression and writing."""
+"""Cost of pictures: images per second, shares of tracing, shading, annotation, compression, writing."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from graspd.worker.scenes.simulate import drop
 
 SCENES: Final = 2
 VIEWS: Final = 4
-#: Ways to store pictures; the first is the one of `service.store.shards`.
+#: Storage options of pictures; the first is that of `service.store.shards`.
 COMPRESSIONS: Final[dict[str, dict[str, Any]]] = {
     "gzip 1 + shuffle": {"compression": "gzip", "compression_opts": 1, "shuffle": True},
     "lzf + shuffle": {"compression": "lzf", "shuffle": True},
@@ -35,22 +35,22 @@ COMPRESSIONS: Final[dict[str, dict[str, Any]]] = {
 
 @dataclass(frozen=True)
 class Timing:
-    """Seconds of repeated runs: core-seconds on a CPU, which neighbours on the machine move little; else wall clock."""
+    """Seconds of repeated runs: core-seconds on a CPU, nearly independent of other load; else wall clock."""
 
     median: float
     spread: float
-    """Half the distance between the fastest and the slowest run, as a share of the median."""
+    """Half the difference between the fastest and the slowest run, as a share of the median."""
 
 
 def bench_render(
     obj: ObjectModel, *, width: int, height: int, device: str, repeats: int = 3, seed: int = 0
 ) -> dict[str, Any]:
-    """Cost of `SCENES * VIEWS` pictures of an object with all channels, on one core or one GPU.
+    """Measure `SCENES * VIEWS` pictures of an object with all channels, on one core or one GPU.
 
     Returns:
         `images`, `images_per_second` (rendered, annotated, compressed and written), `rendered_per_second` (in memory),
         `bare_per_second` (the ray tracer alone with the same rays), their quotient `of_bare`, `share` of each part,
-        `spread` of the repeats, and `compression`: for each way to store, bytes and seconds.
+        `spread` of the repeats, and `compression`: bytes and seconds of each storage option.
     """
     poses = drop(obj, count=SCENES, seed=seed)["scene/object_pose"]
     setting = Setting([obj], poses[:, None], CameraPlan(VIEWS, width, height, None), seed=seed, samples=SAMPLES)
@@ -115,7 +115,7 @@ class _Timer:
         self._repeats = repeats
 
     def __call__(self, run: Callable[[], object]) -> Timing:
-        """Median over the repeats, after one run that warms up."""
+        """Return the median over the repeats, after a warm-up run."""
         run()
         seconds = []
         for _ in range(self._repeats):
@@ -127,7 +127,7 @@ class _Timer:
 
 
 def _store(arrays: Mapping[str, NDArray[np.generic]], options: dict[str, Any], timer: _Timer) -> dict[str, float]:
-    """Bytes, and seconds to write and to read, of the pictures of a shard stored in one way."""
+    """Return bytes, and seconds of writing and reading, for a shard's pictures with one storage option."""
     pictures = {path: array for path, array in arrays.items() if path.startswith("image/")}
 
     def write() -> bytes:
@@ -151,7 +151,7 @@ def _store(arrays: Mapping[str, NDArray[np.generic]], options: dict[str, Any], t
 
 
 def tables(results: list[dict[str, Any]]) -> str:
-    """The figures as two Markdown tables."""
+    """Return the figures as two Markdown tables."""
     unit = "core-second" if results[0]["device"] == "cpu" else "second"
     names = list(results[0]["share"])
     lines = [

@@ -1,4 +1,4 @@
-"""Where the time goes: of an iteration, launch by launch; of a batch, in kernels and on the host."""
+"""Timing of an iteration, launch by launch, and of a batch, in kernels and on the host."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ from graspd.worker.simulation.launches import kernel_seconds
 from graspd.worker.simulation.model import Model
 from graspd.worker.simulation.record import record_iteration
 
-#: Iterations timed, launch by launch, from the middle of a phase.
+#: Timed iterations, launch by launch, from the middle of a phase.
 SAMPLED: Final = 12
 
 
 def kernel_shares(pair: Pair, fidelity: Fidelity, count: int, *, seed: int = 0) -> dict[str, Any]:
-    """Milliseconds per iteration of both phases, the share of each kernel, and closest-point queries per second.
+    """Return ms per iteration of both phases, shares of kernels, and closest-point queries per second.
 
     Args:
         pair: hand and object on a device.
-        fidelity: the knobs.
-        count: grasps at a time, on one thread.
-        seed: of the starts.
+        fidelity: the fidelity.
+        count: grasps at once, on one thread.
+        seed: seed of the starts.
     """
     state = sample_starts(pair.model(pair.coarse), seed=seed, batch=0, indices=range(count), each=1)
     phases: dict[str, Any] = {}
@@ -61,7 +61,7 @@ def kernel_shares(pair: Pair, fidelity: Fidelity, count: int, *, seed: int = 0) 
 def _iterations_used(
     model: Model, data: Data, state: HandState, schedule: Schedule, fidelity: Fidelity, phase: str
 ) -> float:
-    """Mean iterations until a hand is switched off; the coarse phase always runs to its end."""
+    """Return the mean iterations until a hand is switched off; the coarse phase always runs to its end."""
     if phase == "coarse" or not fidelity.patience:
         return float(len(schedule))
     data.set_schedule(schedule)
@@ -77,7 +77,7 @@ def _iterations_used(
 def _timed(
     model: Model, data: Data, state: HandState, schedule: Schedule, fidelity: Fidelity
 ) -> tuple[dict[str, float], HandState]:
-    """Seconds per iteration of each kernel, medians over `SAMPLED` iterations in the middle of the schedule."""
+    """Return kernel seconds per iteration, medians over `SAMPLED` iterations mid-schedule."""
     data.set_schedule(schedule)
     data.set_state(state)
     launches = record_iteration(model, data, fidelity.optimizer)
@@ -97,14 +97,15 @@ def _timed(
 
 
 def host_ms(hand: HandModel, obj: ObjectModel, fidelity: Fidelity, count: int) -> float:
-    """Processor time of one thread outside the planner's kernels for a candidate on the CPU [ms]: starts, merits,
-    projection, the postures around the grasp, copies, launches.
+    """Return host time per candidate on the CPU [ms]: one thread outside the planner's kernels.
+
+    It includes starts, merits, projection, the postures around the grasp, copies and launches.
 
     Args:
         hand: the hand.
         obj: the object.
-        fidelity: the knobs.
-        count: grasps of the batch; another one before it warms caches up.
+        fidelity: the fidelity.
+        count: grasps of the batch; an earlier one warms up caches.
     """
     run = ExecutionContext("cpu", threads=1)
     plan(hand, obj, PlanRequest(count, fidelity, seed=1), run)

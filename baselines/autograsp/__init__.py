@@ -1,1 +1,1 @@
-"""Autograsp (Miller & Allen 2004): after a random approach each joint closes until a link it moves touches."""
+"""Autograsp (Miller & Allen 2004): a random approach, then each joint closes until its links touch."""

@@ -1,4 +1,4 @@
-"""How near each body is to the object and to other bodies, and how far joints may close before anything can touch."""
+"""Distances of bodies to the object and to other bodies, and steps of closing joints without contact."""
 
 import warp as wp
 
@@ -18,12 +18,12 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class Closing:
-    """What closing knows of a hand; D dofs, L bodies."""
+    """Closing motion of a hand; D dofs, L bodies."""
 
     direction: wp.array(dtype=wp.float32)  # (D,) -1, 0, +1
     moves: wp.array2d(dtype=wp.int32)  # (D, L): 1 where the dof moves the body
-    lever: wp.array2d(dtype=wp.float32)  # (D, L): farthest that a point of the body moves per unit of the dof
-    finger: wp.array(dtype=wp.int32)  # (D,) dofs with a common body have a common number
+    lever: wp.array2d(dtype=wp.float32)  # (D, L): upper bound on the motion of a body's points per unit of the dof
+    finger: wp.array(dtype=wp.int32)  # (D,) dofs with a common body share a number
     lower: wp.array(dtype=wp.float32)
     upper: wp.array(dtype=wp.float32)
 
@@ -36,7 +36,7 @@ def clear(
     near_out: wp.array2d(dtype=wp.float32),
     pair_out: wp.array3d(dtype=wp.float32),
 ):
-    """Nothing is nearer than `reach`. Launch over (B, L)."""
+    """Reset all distances to `reach`. Launch over (B, L)."""
     b, a = wp.tid()
     near_out[b, a] = reach_in
     for other in range(pair_out.shape[2]):
@@ -58,7 +58,7 @@ def points_to_object(
     # Data out:
     near_inout: wp.array2d(dtype=wp.float32),
 ):
-    """Least distance of each body's points from the object. Launch over (B, N)."""
+    """Compute the least distance of each body's points from the object. Launch over (B, N)."""
     b, i = wp.tid()
     if active_in[b] == 0:
         return
@@ -82,10 +82,7 @@ def object_to_pieces(
     # Data out:
     near_inout: wp.array2d(dtype=wp.float32),
 ):
-    """The same asked from the object's samples, for edges between hand points; farther than `margin` is left out.
-
-    Launch over (B, P).
-    """
+    """Lower these distances by object samples within `margin`, for edges between points. Over (B, P)."""
     b, piece = wp.tid()
     if active_in[b] == 0:
         return
@@ -116,7 +113,7 @@ def bodies_to_pieces(
     # Data out:
     pair_inout: wp.array3d(dtype=wp.float32),
 ):
-    """Least distance of each body's points from pieces of bodies that must stay clear of it. Launch over (B, P)."""
+    """Compute the distance of each body's points to the bodies it must not touch. Launch over (B, P)."""
     b, piece = wp.tid()
     if active_in[b] == 0:
         return
@@ -144,7 +141,7 @@ def nearest_of(
     near: wp.array2d(dtype=wp.float32),
     pair: wp.array3d(dtype=wp.float32),
 ):
-    """Distance of a body from what it may hit when dof d moves it; of two fingers each may take half the gap."""
+    """Return the distance of a body to obstacles of dof d; each of two fingers gets half their gap."""
     least = near[b, body]
     for other in range(near.shape[1]):
         if closing.moves[d, other] == 0:
@@ -168,10 +165,10 @@ def close(
     stopped_inout: wp.array2d(dtype=wp.int32),
     q_inout: wp.array2d(dtype=wp.float32),
 ):
-    """Stop every dof that moves a touching body; close the others by so little that no point passes its gap. Over B.
+    """Stop dofs that move a touching body; close the others less than any point's gap. Launch over B.
 
-    A point of body a moves by at most sum over the dofs d that still close of lever[d, a] |dq_d|: with one step for all
-    dofs of a finger, step = share * gap / sum lever, nothing can be passed through (conservative advancement).
+    The points of body a move by at most the sum of lever[d, a] |dq_d| over the closing dofs d. With one step for all
+    dofs of a finger, step = share * gap / sum lever, no contact is skipped (conservative advancement).
     """
     b = wp.tid()
     if active_inout[b] == 0:
@@ -188,7 +185,7 @@ def close(
         if stopped_inout[b, d] == 0:
             open_dofs += 1
             step = float(largest_in)
-            # The finger's slowest dof sets the pace of all of them: joints close at equal speed.
+            # The slowest dof of a finger limits all of them: joints close at equal speed.
             for e in range(dofs):
                 if stopped_inout[b, e] == 0 and closing_in.finger[e] == closing_in.finger[d]:
                     for body in range(near_in.shape[1]):
@@ -220,7 +217,7 @@ def advance(
     active_inout: wp.array(dtype=wp.int32),
     pivot_inout: wp.array(dtype=wp.vec3),
 ):
-    """Move the hand along its approach until its nearest body is `standoff` from the object. Launch over B."""
+    """Move the hand along its approach to `standoff` between its nearest body and the object. Over B."""
     b = wp.tid()
     if active_inout[b] == 0:
         return

@@ -1,8 +1,7 @@
-"""GraspIt!'s autograsp: a random free start, the palm advances until something is near, the fingers close until
-contact.
+"""GraspIt!'s autograsp: a random free start, an approach to the object, fingers close until contact.
 
-GraspIt! closes joints in small steps and goes back when something is hit; here steps follow from distances, which gives
-the same end, contact within `TOUCH_M`, without tunnelling.
+GraspIt! closes joints in small steps and goes back after a collision. Here the steps follow from distances, with the
+same result, contact within `TOUCH_M`, and no tunnelling.
 """
 
 from __future__ import annotations
@@ -79,21 +78,21 @@ METHOD: Final = Method(
 
 #: Contact: GraspIt!'s threshold layer [m].
 TOUCH_M: Final = 2e-4
-#: Distances beyond this are not asked for [m].
+#: Largest distance that is computed [m].
 REACH_M: Final = 0.03
-#: Gap between fingers beyond which they do not slow each other [m].
+#: Gap between fingers below which they slow each other [m].
 MARGIN_M: Final = 0.005
-#: Share of a gap crossed in one step: far distances come from a grid that may be off by a third.
+#: Share of a gap crossed in one step: large distances come from a grid with errors up to a third.
 SHARE: Final = 0.6
-#: Longest closing step [rad], and most steps.
+#: Longest closing step [rad], and largest number of steps.
 LARGEST: Final = 0.1
 STEPS: Final = 400
-#: Most advances of the root: each crosses more than half of what is left.
+#: Largest number of approach steps: each crosses more than half of the remaining distance.
 ADVANCES: Final = 40
 
 
 def levers(hand: HandModel, points: SurfacePoints) -> Floats:
-    """(D, L) bound on how far a point of body l moves per unit of dof d, by chain lengths [m/rad]."""
+    """Return (D, L) bounds on the motion of body l's points per unit of dof d, by chain lengths [m/rad]."""
     radius = np.zeros(hand.bodies)
     np.maximum.at(radius, points.body, np.linalg.norm(points.position, axis=1))
     length = np.linalg.norm(hand.origin[:, :3], axis=1)
@@ -109,7 +108,7 @@ def levers(hand: HandModel, points: SurfacePoints) -> Floats:
 
 
 def finger_groups(moves: NDArray[np.bool_]) -> NDArray[np.int32]:
-    """(D,) a common number for dofs that move a common body, from (D, L)."""
+    """Return (D,) numbers, equal for dofs that move a common body, from (D, L)."""
     group = np.arange(len(moves))
     for d in range(len(moves)):
         for e in range(d):
@@ -120,7 +119,7 @@ def finger_groups(moves: NDArray[np.bool_]) -> NDArray[np.int32]:
 
 @dataclass(frozen=True)
 class ClosedHands:
-    """Hands after closing, and what stopped each dof: (B, D) 0 nothing, 1 contact, 2 its limit."""
+    """Hands after closing, and the reason why each dof stopped: (B, D) 0 none, 1 contact, 2 its limit."""
 
     state: HandState
     stopped: NDArray[np.int32]
@@ -133,7 +132,7 @@ class HandCloser:
         self.pair, self.capacity = pair, capacity
         self.hand = pair.hand.model
         self.model = Model.create(pair.hand, pair.fine.obj, pair.fine.points, pair.coarse.own, pair.options)
-        # Only the kinematics is run.
+        # Only the kinematics runs.
         self.data = Data(self.model, capacity)
         self._poses = Launches(self.model.device)
         add_poses(self._poses, self.model, self.data)
@@ -158,7 +157,7 @@ class HandCloser:
         return out
 
     def approach(self, state: HandState, standoff: float) -> HandState:
-        """Hands moved along the palm's approach until their nearest body is `standoff` [m] from the object."""
+        """Move hands along their approach until the nearest body is `standoff` [m] from the object."""
         n = len(state.pivot)
         direction = np.zeros((self.capacity, 3))
         direction[:n] = quat_rotate(state.rotation, self.hand.palm.approach)
@@ -180,7 +179,7 @@ class HandCloser:
         return self.data.state(n)
 
     def close(self, state: HandState) -> ClosedHands:
-        """Fingers closed until contact or limits; the root and dofs that do not close (spreads) stay."""
+        """Close fingers until contact or limits; the root and dofs that do not close (spreads) stay."""
         n, data = len(state.pivot), self.data
         data.set_state(state)
         idle = np.tile((self.hand.closing == 0).astype(np.int32) * 2, (self.capacity, 1))
@@ -199,7 +198,7 @@ class HandCloser:
         return ClosedHands(data.state(n), self.stopped.numpy()[:n].astype(np.int32))
 
     def distances(self, state: HandState) -> Floats:
-        """(n, L) least distance of each body from the object, at most `REACH_M` [m]."""
+        """Return (n, L) least distances of the bodies from the object, at most `REACH_M` [m]."""
         self.data.set_state(state)
         self._measure()
         return self.near.numpy()[: len(state.pivot)].astype(float)

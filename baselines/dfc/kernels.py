@@ -1,4 +1,4 @@
-"""DexGraspNet's energies with their gradients on bodies, and its Metropolis-adjusted descent. See `schedule`."""
+"""DexGraspNet's energies, gradients on bodies, and Metropolis-adjusted descent. See `schedule`."""
 
 import warp as wp
 
@@ -44,7 +44,7 @@ T_EVERY = wp.constant(float(TEMPERATURE_PERIOD))
 COOL = wp.constant(DECAY)
 MU = wp.constant(MOMENT)
 SWAP = wp.constant(SWITCH)
-#: Farthest distance asked for [m].
+#: Largest distance that is computed [m].
 FAR = wp.constant(1.0)
 
 
@@ -78,10 +78,10 @@ def propose(
     contact_out: wp.array2d(dtype=wp.int32),
     energy_out: wp.array2d(dtype=wp.float32),
 ):
-    """A step down the gradient, each contact drawn anew with probability 1/2, energies set to zero. Over B.
+    """Step down the gradient, redraw each contact with probability 1/2, reset energies. Launch over B.
 
-    The source divides by the root mean square over its batch; here it is over translation, rotation and joints of the
-    grasp itself (columns 0 to 2 of `moment`), so that a grasp does not depend on the others of its batch.
+    The source divides by the root mean square over its batch. Here it is taken over translation, rotation and joints of
+    the grasp itself (columns 0 to 2 of `moment`), so that grasps of a batch are independent.
     """
     b = wp.tid()
     it = iteration_in[0]
@@ -130,7 +130,7 @@ def force_closure(
     energy_out: wp.array2d(dtype=wp.float32),
     wrench_inout: Wrenches,
 ):
-    """E_fc = |sum (n, x cross n)|^2 and E_dis = sum |d|; normals count as constant. Columns 0 and 1. Over B."""
+    """Compute E_fc = |sum (n, x cross n)|^2 and E_dis = sum |d|; constant normals. Columns 0, 1. Over B."""
     b = wp.tid()
     f = wp.vec3(0.0)
     t = wp.vec3(0.0)
@@ -166,7 +166,7 @@ def penetration(
     energy_inout: wp.array2d(dtype=wp.float32),
     wrench_inout: Wrenches,
 ):
-    """E_pen = sum of depths of object samples in pieces of the hand, column 2. Launch over (B, P)."""
+    """Compute E_pen, the depths of object samples in hand pieces, column 2. Launch over (B, P)."""
     b, piece = wp.tid()
     body = pieces_in.body[piece]
     q = piece_rotation(pieces_in, piece, b, body_q_in)
@@ -184,7 +184,7 @@ def penetration(
         if in_box(local, half):
             nd = piece_distance(pieces_in, piece, local)
             if nd[3] < 0.0:
-                # Moving the body along the face's normal deepens the sample.
+                # Motion of the body along the face's normal deepens the sample.
                 f = W_PENETRATION * wp.quat_rotate(q, wp.vec3(nd[0], nd[1], nd[2]))
                 total -= nd[3]
                 force += f
@@ -208,7 +208,7 @@ def self_penetration(
     energy_inout: wp.array2d(dtype=wp.float32),
     wrench_inout: Wrenches,
 ):
-    """E_spen = sum of max(0, gap - distance) over pairs of key points, column 3. Launch over (B, pairs)."""
+    """Compute E_spen = sum of max(0, gap - distance) over key point pairs, column 3. Over (B, pairs)."""
     b, pair = wp.tid()
     i = first_in[pair]
     j = second_in[pair]
@@ -233,7 +233,7 @@ def limits(
     energy_out: wp.array2d(dtype=wp.float32),
     gradient_inout: wp.array2d(dtype=wp.float32),
 ):
-    """E_joints = sum of violations of the limits, column 4. Launch over B."""
+    """Compute E_joints, the sum of violations of the limits, column 4. Launch over B."""
     b = wp.tid()
     total = float(0.0)
     for d in range(q_in.shape[1]):
@@ -261,7 +261,7 @@ def total_energy(terms: wp.array2d(dtype=wp.float32), b: wp.int32):
 
 @wp.func
 def accepted(rise: wp.float32, t: wp.float32, uniform: wp.float32):
-    """Metropolis: 1 where the energy falls, else with probability exp(-rise / t)."""
+    """Apply Metropolis: return 1 if the energy falls, else with probability exp(-rise / t)."""
     if rise < 0.0:
         return 1
     if uniform < wp.exp(-rise / t):
@@ -289,7 +289,7 @@ def accept(
     contact_inout: wp.array2d(dtype=wp.int32),
     taken_inout: wp.array(dtype=wp.int32),
 ):
-    """Take the proposal, or stay. The first one is always taken (its old energy is infinite). Launch over B."""
+    """Accept or reject the proposal. The first is always accepted (its old energy is infinite). Over B."""
     b = wp.tid()
     rng = rng_inout[b]
     uniform = wp.randf(rng)

@@ -1,5 +1,7 @@
-"""Differentiable force closure: DexGraspNet's starts around the convex hull, then annealed descent. All hands are
-given; info tells which would pass."""
+"""Differentiable force closure: DexGraspNet's starts around the convex hull, then annealed descent.
+
+All hands are returned; info contains which of them the source would accept.
+"""
 
 from __future__ import annotations
 
@@ -38,11 +40,11 @@ from graspd.worker.simulation.launches import Launches
 from graspd.worker.simulation.model import Model
 from graspd.worker.simulation.record import add_poses, add_root_gradient
 
-#: Force closure, distance and penetration that the source lets pass.
+#: Bounds of the source on force closure, distance and penetration.
 PASSES: Final = (0.3, 0.005, 0.001)
-#: Distance of the palm from the hull [m]: the source puts the root, which is a palm's length behind, at 0.2 to 0.3.
+#: Distance of the palm from the hull [m]: the source puts the root, a palm's length behind, at 0.2 to 0.3.
 DISTANCE: Final = (0.1, 0.2)
-#: Tilt of the approach away from the hull's normal [rad], at most.
+#: Largest tilt of the approach from the hull's normal [rad].
 TILT: Final = np.pi / 6
 #: Standard deviation of joints about the pre-shape, as a share of their range.
 POSTURE: Final = 0.1
@@ -93,7 +95,7 @@ METHOD: Final = Method(
 
 
 def sample_starts(hand: HandModel, obj: ObjectModel, *, seed: int, batch: int, indices: range) -> HandState:
-    """One start for each grasp; each depends on its own index only."""
+    """Sample one start per grasp; each depends on its own index only."""
     rows = [_start(hand, obj, np.random.default_rng([seed, batch, index])) for index in indices]
     return HandState(*(np.stack([row[k] for row in rows]) for k in range(3)))
 
@@ -122,10 +124,10 @@ def _frame(z: np.ndarray) -> np.ndarray:
 
 Ints = NDArray[np.int32]
 
-#: Places that may become contacts, on each link and on the palm.
+#: Contact candidates on each link and on the palm.
 EACH: Final = 12
 ON_PALM: Final = 24
-#: Object samples asked for penetration.
+#: Object samples used for penetration.
 SAMPLES: Final = 2000
 #: Energies: force closure, distance, penetration, self-penetration, joint limits.
 TERMS: Final = 5
@@ -134,10 +136,7 @@ INFINITE: Final = 1e30
 
 
 def key_points(hand: HandModel) -> tuple[Ints, Floats, Ints, Ints]:
-    """Bodies (K,) and places (K, 3) of the middle of each piece, and the pairs (first, second) to be kept apart.
-
-    Pieces that are near each other at rest by their shape are no pair.
-    """
+    """Return bodies (K,), piece centres (K, 3), and the pairs to separate: those not close at rest."""
     body = np.array([piece.body for piece in hand.pieces], np.int32)
     place = np.array([piece.vertices.mean(axis=0) for piece in hand.pieces])
     rest = apply(body_poses(hand, IDENTITY_POSE, hand.expand(hand.preshape))[0][body], place)
@@ -160,7 +159,7 @@ class Descent:
         hand = pair.hand.model
         self.obj = pair.fine.obj.thinned(SAMPLES)
         self.candidates = inside_points(hand, each=EACH, on_palm=ON_PALM)
-        # Holds the proposals; only its kinematics is run.
+        # Contains the proposals; only its kinematics runs.
         self.model = Model.create(pair.hand, self.obj, pair.coarse.points, pair.coarse.own, pair.options)
         self.proposal = Data(self.model, self.n)
         self.device = self.model.device
@@ -232,14 +231,14 @@ class Descent:
         return out
 
     def run(self, steps: int, tell: StepCounter) -> None:
-        """So many proposals; raises TaskCancelled through `tell`."""
+        """Make `steps` proposals; raises TaskCancelled through `tell`."""
         for first in range(0, steps, CHUNK):
             count = min(CHUNK, steps - first)
             self.launches.run(count)
             tell(self.n * count, "annealing")
 
     def hands(self) -> HandState:
-        """Where the hands are, joints inside their limits."""
+        """Return the present hands, joints inside their limits."""
         for mine, other in zip(self._proposed(), self.state, strict=True):
             wp.copy(mine, other)
         found = self.proposal.state(self.n)
@@ -247,5 +246,5 @@ class Descent:
         return HandState(found.pivot, found.rotation, np.clip(found.q, hand.lower, hand.upper))
 
     def energies(self) -> Floats:
-        """(n, 5) E_fc, E_dis, E_pen, E_spen, E_joints, unweighted."""
+        """Return (n, 5) E_fc, E_dis, E_pen, E_spen, E_joints, unweighted."""
         return self.terms.numpy().astype(float)

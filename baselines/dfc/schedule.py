@@ -1,4 +1,4 @@
-"""DexGraspNet's annealing: energy weights, step sizes, temperatures, the chance of another contact.
+"""DexGraspNet's annealing: energy weights, step sizes, temperatures, probability of a new contact.
 
 E = E_fc + 100 E_dis + 100 E_pen + 10 E_spen + E_joints
 step 0.005 * 0.95^floor(t / 50), each gradient over its root mean square, v <- 0.98 g^2 + 0.02 v

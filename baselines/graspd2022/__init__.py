@@ -1,1 +1,1 @@
-"""Grasp'D (Turpin et al., ECCV 2022): force-based contact on a distance grid, relaxed by contact-invariant forces."""
+"""Grasp'D (Turpin et al., ECCV 2022): force-based contact, relaxed by contact-invariant forces."""

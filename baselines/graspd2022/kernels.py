@@ -1,13 +1,13 @@
-"""Force-based contact and its relaxation by contact-invariant forces (Mordatch 2012, as Grasp'D uses it).
+"""Force-based contact, relaxed by contact-invariant forces (Mordatch 2012), as in Grasp'D.
 
-The hand stands still, the object (mass m) has one of a few small velocities v_j. A hand point at distance d from the
-object's surface, dilated by r, presses with
+The hand is fixed; the object (mass m) has one of several small velocities v_j. A hand point at distance d from the
+object's surface, dilated by r, exerts the force
 
     f = -k c n - min(kf |v_t|, mu k c) v_t / |v_t|,   c = max(r - d, 0).
 
-The relaxation gives every point and velocity a force of its own, F. Two descents alternate: F towards the nearest
-forces that stop the object (`relax`), and the hand towards a place where the contact forces are F, by the gradient of
-sum |f - F|^2. In that gradient points that do not touch leak a share of it, so that they are drawn in.
+The relaxation gives every point and velocity its own force F. Two descents alternate: F moves to the nearest forces
+that stop the object (`relax`), and the hand moves so that contact forces become F, by the gradient of sum |f - F|^2.
+Points without contact leak a share of that gradient, which attracts them.
 """
 
 import warp as wp
@@ -26,17 +26,17 @@ class ForceModel:
     viscous: wp.float32  # kf [N s/m]
     friction: wp.float32  # mu
     leak: wp.float32
-    mismatch: wp.float32  # weight of |F - f|^2 while F is moved
-    gyration: wp.float32  # length that weighs torques [m]
-    tolerance: wp.float32  # residual that counts as stopped [N]
+    mismatch: wp.float32  # weight of |F - f|^2 in the update of F
+    gyration: wp.float32  # length scale of torques [m]
+    tolerance: wp.float32  # residual below which the object counts as stopped [N]
     damping: wp.float32
     rate: wp.float32  # of forces and multipliers
-    warmup: wp.float32  # iterations over which rates grow to their value
+    warmup: wp.float32  # iterations over which rates grow to their final value
 
 
 @wp.func
 def contact_force(physics: ForceModel, depth: wp.float32, n: wp.vec3, v: wp.vec3):
-    """Force on the object at a point whose depth in the dilated object is `depth`."""
+    """Return the force on the object at a point whose depth in the dilated object is `depth`."""
     c = wp.max(depth, 0.0)
     normal = physics.stiffness * c
     tangential = v - wp.dot(v, n) * n
@@ -49,13 +49,12 @@ def contact_force(physics: ForceModel, depth: wp.float32, n: wp.vec3, v: wp.vec3
 
 @wp.func
 def force_slope(physics: ForceModel, depth: wp.float32, n: wp.vec3, v: wp.vec3):
-    """d f / d depth, a share `leak` of it where the point does not touch."""
+    """Return d f / d depth, or a share `leak` of it for a point without contact."""
     slope = -physics.stiffness * n
     tangential = v - wp.dot(v, n) * n
     speed = wp.length(tangential)
     if speed > 1.0e-12:
-        # Friction grows with the depth only where it slides. It is what draws free points in: the normal forces wanted
-        # for opposite velocities cancel, the friction forces do not.
+        # Only sliding friction grows with depth. It attracts free points, where opposite normal forces cancel.
         if physics.friction * physics.stiffness * depth < physics.viscous * speed:
             slope -= (physics.friction * physics.stiffness / speed) * tangential
     if depth <= 0.0:
@@ -76,9 +75,9 @@ def multipliers(
     pull_out: wp.array2d(dtype=vec6),
     residual_out: wp.array2d(dtype=wp.float32),
 ):
-    """Residual of each velocity's task, |wanted + sum F| in newtons; its multiplier; the pull on forces. Over (B, M).
+    """Compute the tasks' residuals |wanted + sum F| [N], multipliers, pull on forces. Over (B, M).
 
-    The constraint residual <= tolerance is kept by the modified differential method of multipliers (Platt & Barr 1988).
+    The modified differential method of multipliers (Platt & Barr 1988) enforces residual <= tolerance.
     """
     b, j = wp.tid()
     if active_in[b] == 0:
@@ -100,7 +99,7 @@ def multipliers(
 
 @wp.func
 def relaxed(physics: ForceModel, force: wp.vec3, wanted: wp.vec3, actual: wp.vec3):
-    """Gradient with respect to F of mismatch |F - f|^2 plus the task's pull."""
+    """Return the gradient with respect to F of mismatch |F - f|^2 plus the task's pull."""
     return 2.0 * physics.mismatch * (force - actual) + wanted
 
 
@@ -127,7 +126,7 @@ def relax(
     total_inout: wp.array2d(dtype=vec6),
     wrench_inout: Wrenches,
 ):
-    """A step of Adamax on every force, then the gradient of sum |f - F|^2 on the bodies. Launch over (B, N)."""
+    """Step every force by Adamax, then add the gradient of sum |f - F|^2 on the bodies. Over (B, N)."""
     b, i = wp.tid()
     if active_in[b] == 0:
         return
@@ -181,7 +180,7 @@ def nearest(
     # Data out:
     least_inout: wp.array(dtype=wp.float32),
 ):
-    """Least distance of each hand's points by the grid. Launch over (B, N)."""
+    """Compute the least distance of each hand's points by the grid. Launch over (B, N)."""
     b, i = wp.tid()
     body = point_body_in[i]
     x = body_p_in[b, body] + wp.quat_rotate(body_q_in[b, body], point_position_in[i])

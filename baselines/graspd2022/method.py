@@ -1,6 +1,6 @@
-"""Grasp'D: free starts, descent with relaxed forces, no selection and no repair, as the source has it.
+"""Grasp'D: free starts, descent with relaxed forces, no selection and no repair, as in the source.
 
-The object is a grid of signed distances, read by trilinear interpolation: an error of second order in the cell.
+The object is a grid of signed distances with trilinear interpolation: the error is of second order in the cell size.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Graspd2022Options(Options):
 
 
 class Search:
-    """One hand on one object as Grasp'D sees them; hands are given in batches."""
+    """Grasp'D's search for one hand and object; hands run in batches."""
 
     def __init__(self, pair: Pair, cells: int) -> None:
         self.pair, self.cells = pair, cells
@@ -51,7 +51,7 @@ class Search:
         self.points = sample_surface(pair.hand.model, POINTS)
 
     def run(self, starts: HandState, *, steps: int, tell: StepCounter) -> tuple[HandState, Floats]:
-        """The hands after `steps` iterations, and the residual of their forces against the task, (n,) of 1."""
+        """Return hands after `steps` iterations, and their force residuals of the task, (n,), relative to 1."""
         batch = _Batch(self, _retreated(self.pair, starts), steps)
         n = len(starts.pivot)
         for first in range(0, steps, CHUNK):
@@ -116,27 +116,27 @@ FORCE_RATE: Final = 1e-2
 RATES: Final = (1e-3, 2e-3, 3e-3)
 BETAS: Final = (0.9, 0.999)
 WARMUP: Final = 200
-#: The dilated object starts this far from the hand [m]; hands start this far behind the nearest free place [m].
+#: Initial distance of the dilated object from the hand [m], and of hands behind the nearest free place [m].
 APART_M: Final = 0.01
 BACKOFF_M: Final = 0.05
 CHUNK: Final = 25
-#: How far the grid reaches beyond the object's box [m].
+#: Margin of the grid around the object's box [m].
 PAD_M: Final = 0.10
 
 
 def schedule(steps: int) -> Schedule:
-    """Dilation to 0 over the first half; rates grow over the first `WARMUP` iterations."""
+    """Return the schedule: dilation falls to 0 over the first half; rates grow over `WARMUP` iterations."""
     at = np.arange(steps)
     dilation = MAX_DILATION * np.clip(1.0 - at / max(0.5 * steps, 1.0), 0.0, 1.0)
     rates = np.minimum(at / WARMUP, 1.0)[:, None] * np.array(RATES)
-    # Hands in hands press by the same stiffness, squared as the other forces are.
+    # Self-collisions use the same stiffness, squared like the other forces.
     own = np.full(steps, STIFFNESS**2)
     zero = np.zeros(steps)
     return Schedule(dilation, zero, zero, own, rates)
 
 
 def physics_of(gyration: float, *, mismatch: float = MISMATCH) -> Any:
-    """The constants as the kernels have them; `gyration` [m] weighs torques."""
+    """Return the constants for the kernels; `gyration` [m] weighs torques."""
     out = kernels.ForceModel()
     out.stiffness, out.viscous, out.friction, out.leak = STIFFNESS, VISCOUS, FRICTION, LEAK
     out.mismatch, out.gyration, out.tolerance = mismatch, gyration, TOLERANCE_N
@@ -175,7 +175,7 @@ class _Batch:
         self.launches = self._record()
 
     def _first_dilation(self) -> NDArray[np.float32]:
-        """(n,) share of `MAX_DILATION` at which the dilated object is `APART_M` from each hand."""
+        """Return (n,) shares of `MAX_DILATION` that put the dilated object `APART_M` from each hand."""
         m, d, poses = self.model, self.data, Launches(self.device)
         add_poses(poses, m, d)
         poses.run()
@@ -223,16 +223,16 @@ class _Batch:
         return out
 
     def run(self, iterations: int) -> None:
-        """Launch so many iterations."""
+        """Launch `iterations` iterations."""
         self.launches.run(iterations)
 
     def residual(self) -> Floats:
-        """(n,) largest residual of the moving tasks, 1: as if nothing touched."""
+        """Return (n,) largest residuals of the moving tasks; 1: no contact force."""
         return self.gap.numpy()[:, 1:].max(axis=1).astype(float) / float(np.linalg.norm(self.wanted[1]))
 
 
 def distance_grid(obj: DeviceObject, cells: int) -> Any:
-    """A `Surface` whose field has `cells` cells along the longest side of the padded box, sampled from the mesh.
+    """Return a `Surface` from the mesh with `cells` cells along the longest side of the padded box.
 
     Distances are exact at the corners; the array lies on the object's device.
     """

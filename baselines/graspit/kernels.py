@@ -1,4 +1,4 @@
-"""Simulated annealing over hand poses and eigengrasps, a chain per thread. See `schedule` for the formulas."""
+"""Simulated annealing over hand poses and eigengrasps, one chain per thread. Formulas: see `schedule`."""
 
 import warp as wp
 
@@ -22,16 +22,16 @@ C = wp.constant(COOLING)
 ROOT = wp.constant(1.0 / DIMENSIONS)
 SCALE = wp.constant(ENERGY_SCALE)
 TRIES = wp.constant(ATTEMPTS)
-#: Draws of one variable until it falls inside its bounds.
+#: Most draws of one variable until it is inside its bounds.
 REDRAWS = wp.constant(100)
-#: Farther than this no distance is asked for [m].
+#: Largest distance that is computed [m].
 FAR = wp.constant(1.0)
 vec8 = wp.types.vector(length=8, dtype=wp.float32)
 
 
 @wp.struct
 class Problem:
-    """What the chains of one hand and object share."""
+    """Data that the chains of one hand and object share."""
 
     tree: Tree
     surface: Surface
@@ -45,13 +45,13 @@ class Problem:
     low: vec8  # Tx Ty Tz [m], theta phi alpha [rad], amplitudes
     high: vec8
     jump: vec8
-    circular: wp.int32  # the variable that wraps around
+    circular: wp.int32  # the periodic variable
     palm: wp.quat  # from the approach frame (z ahead) to the root frame
     origin: wp.array(dtype=wp.float32)  # (D,)
     eigen: wp.array2d(dtype=wp.float32)  # (2, D)
     lower: wp.array(dtype=wp.float32)
     upper: wp.array(dtype=wp.float32)
-    clash: wp.array2d(dtype=wp.int32)  # over a grid of amplitudes: 1 where the hand hits itself
+    clash: wp.array2d(dtype=wp.int32)  # over a grid of amplitudes: 1 for self-collision
 
 
 @wp.func
@@ -74,7 +74,7 @@ def acceptance(rise: wp.float32, t: wp.float32):
 
 @wp.func
 def rotation_of(problem: Problem, x: vec8):
-    """Rotation of the root: by alpha about the axis (theta, phi), then from the approach frame to the root's."""
+    """Return the root's rotation: by alpha about the axis (theta, phi), then approach frame to root frame."""
     axis = wp.vec3(wp.sin(x[3]) * wp.cos(x[4]), wp.sin(x[3]) * wp.sin(x[4]), wp.cos(x[3]))
     return wp.quat_from_axis_angle(axis, x[5]) * wp.quat_inverse(problem.palm)
 
@@ -87,7 +87,7 @@ def joint_value(problem: Problem, x: vec8, d: wp.int32):
 
 @wp.func
 def place(problem: Problem, b: wp.int32, x: vec8, body_p: wp.array2d(dtype=wp.vec3), body_q: wp.array2d(dtype=wp.quat)):
-    """Poses of all bodies."""
+    """Compute the poses of all bodies."""
     rotation = rotation_of(problem, x)
     body_q[b, 0] = rotation
     body_p[b, 0] = wp.vec3(x[0], x[1], x[2]) - wp.quat_rotate(rotation, problem.tree.pivot)
@@ -110,7 +110,7 @@ def place(problem: Problem, b: wp.int32, x: vec8, body_p: wp.array2d(dtype=wp.ve
 
 @wp.func
 def clashes(problem: Problem, x: vec8):
-    """Whether the hand hits itself at the nearest posture of the grid."""
+    """Check whether the nearest posture of the grid has a self-collision."""
     rows = problem.clash.shape[0] - 1
     columns = problem.clash.shape[1] - 1
     i = int(float(rows) * (x[6] - problem.low[6]) / wp.max(problem.high[6] - problem.low[6], 1.0e-6) + 0.5)
@@ -120,7 +120,7 @@ def clashes(problem: Problem, x: vec8):
 
 @wp.func
 def inside(problem: Problem, point: wp.vec3):
-    """1 where a point is inside the object; the grid answers where it is sure."""
+    """Return 1 for a point inside the object; the grid decides where it is certain."""
     coarse = field_distance(problem.surface, point).distance
     if coarse > problem.surface.field_error:
         return 0
@@ -132,7 +132,7 @@ def inside(problem: Problem, point: wp.vec3):
 
 @wp.func
 def points_collide(problem: Problem, b: wp.int32, body_p: wp.array2d(dtype=wp.vec3), body_q: wp.array2d(dtype=wp.quat)):
-    """1 if a hand point is inside the object."""
+    """Return 1 if a hand point is inside the object."""
     for body in range(body_p.shape[1]):
         first = problem.points.first[body]
         last = problem.points.first[body + 1]
@@ -151,7 +151,7 @@ def points_collide(problem: Problem, b: wp.int32, body_p: wp.array2d(dtype=wp.ve
 def samples_collide(
     problem: Problem, b: wp.int32, body_p: wp.array2d(dtype=wp.vec3), body_q: wp.array2d(dtype=wp.quat)
 ):
-    """1 if a sample of the object is inside a piece of the hand."""
+    """Return 1 if a sample of the object is inside a piece of the hand."""
     for piece in range(problem.pieces.body.shape[0]):
         q = piece_rotation(problem.pieces, piece, b, body_q)
         p = piece_centre(problem.pieces, piece, b, body_p, body_q)
@@ -169,13 +169,13 @@ def samples_collide(
 
 @wp.func
 def virtual_contact_energy(gap: wp.float32, cosine: wp.float32):
-    """Energy of one virtual contact: distance in mm, and 100 for a normal that looks away from the object."""
+    """Return the energy of a virtual contact: distance in mm, plus up to 100 for an opposite normal."""
     return 1.0e3 * wp.abs(gap) + 50.0 * (1.0 - cosine)
 
 
 @wp.func
 def contact_energy(problem: Problem, b: wp.int32, body_p: wp.array2d(dtype=wp.vec3), body_q: wp.array2d(dtype=wp.quat)):
-    """Mean over the virtual contacts of their energy [mm]."""
+    """Return the mean energy of the virtual contacts [mm]."""
     total = float(0.0)
     for i in range(problem.contact_body.shape[0]):
         body = problem.contact_body[i]
@@ -203,7 +203,7 @@ def contact_energy(problem: Problem, b: wp.int32, body_p: wp.array2d(dtype=wp.ve
 
 @wp.func
 def legal(problem: Problem, b: wp.int32, x: vec8, body_p: wp.array2d(dtype=wp.vec3), body_q: wp.array2d(dtype=wp.quat)):
-    """1 if the hand of a state hits neither itself nor the object; leaves the poses of its bodies."""
+    """Return 1 if a state has no self-collision and no contact; its body poses stay in the arrays."""
     if clashes(problem, x) == 1:
         return 0
     place(problem, b, x, body_p, body_q)
@@ -216,7 +216,7 @@ def legal(problem: Problem, b: wp.int32, x: vec8, body_p: wp.array2d(dtype=wp.ve
 
 @wp.func
 def neighbour(problem: Problem, x: vec8, t: wp.float32, rng: wp.uint32):
-    """A neighbour at temperature t, every variable redrawn until it is inside its bounds; and the random state."""
+    """Return a neighbour state at temperature t with all variables in bounds, and the random state."""
     y = vec8()
     state = wp.uint32(rng)
     for i in range(VARIABLES):
@@ -249,7 +249,7 @@ def begin(
     body_p_out: wp.array2d(dtype=wp.vec3),
     body_q_out: wp.array2d(dtype=wp.quat),
 ):
-    """A uniformly random legal state; energy below 0 where none was found. Launch over the chains."""
+    """Draw a uniformly random legal state; energy < 0 if none is found. Launch over the chains."""
     b = wp.tid()
     rng = rng_inout[b]
     energy_out[b] = -1.0
@@ -269,7 +269,7 @@ def begin(
 
 @wp.func
 def unlikeness(problem: Problem, x: vec8, y: vec8):
-    """Mean difference of two states over their largest jumps."""
+    """Return the mean difference of two states over their largest jumps."""
     total = float(0.0)
     for i in range(VARIABLES):
         apart = wp.abs(x[i] - y[i])
@@ -289,7 +289,7 @@ def remember(
     best: wp.array2d(dtype=vec8),
     best_energy: wp.array2d(dtype=wp.float32),
 ):
-    """Put a state into the list of the best, in the place of one like it or else of the worst, if it is better."""
+    """Insert a better state into the list of the best; it replaces a near-duplicate, else the worst."""
     row = wp.int32(0)
     for k in range(best_energy.shape[1]):
         if best_energy[b, k] > best_energy[b, row]:
@@ -321,7 +321,7 @@ def anneal(
     body_p_out: wp.array2d(dtype=wp.vec3),
     body_q_out: wp.array2d(dtype=wp.quat),
 ):
-    """So many rounds of a chain, or until its counter reaches `last`. Launch over the chains."""
+    """Run rounds of a chain until their number or `last` is reached. Launch over the chains."""
     b = wp.tid()
     x = state_inout[b]
     e = energy_inout[b]
@@ -362,7 +362,7 @@ def unpack(
     rotation_out: wp.array(dtype=wp.quat),
     q_out: wp.array2d(dtype=wp.float32),
 ):
-    """States as hands. Launch over them."""
+    """Convert states to hands. Launch over the states."""
     b = wp.tid()
     x = state_in[b]
     pivot_out[b] = wp.vec3(x[0], x[1], x[2])

@@ -1,11 +1,11 @@
-"""GraspIt!'s annealing: a chain for each grasp over eigengrasps, then autograsp from the chain's best state.
+"""GraspIt!'s annealing: one chain per grasp over eigengrasps, then autograsp from its best state.
 
-Virtual contacts are few places of a hand: two on each link's inside, and on the palm. GraspIt! ships them as files for
-its own hands; here they are found for any hand.
+Virtual contacts are a few points of a hand: two on each link's inner side, and on the palm. GraspIt! ships them as
+files for its own hands; here they are computed for any hand.
 
 GraspIt! has eigengrasps for Barrett (spread; all fingers) and the human hand (flexion of the knuckles with a little of
-the joints beyond; the knuckles against the joints beyond), none for Allegro or Shadow. Here a hand whose fingers have
-one closing dof each gets Barrett's, any other the human hand's, by a joint's place along its finger.
+the distal joints; knuckles against distal joints), none for Allegro or Shadow. Here a hand with one closing dof per
+finger gets Barrett's, any other the human hand's, by the position of a joint along its finger.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from graspd.worker.simulation.record import record_placement
 
 
 class Search:
-    """Simulated annealing of one hand on one object; chains share all but their states."""
+    """Simulated annealing of one hand on one object; chains share everything but their states."""
 
     def __init__(self, pair: Pair) -> None:
         self.pair, self.hand = pair, pair.hand.model
@@ -71,16 +71,16 @@ class Search:
         return out
 
     def run(self, seeds: list[list[int]], *, steps: int, keep: int, tell: StepCounter) -> HandState:
-        """The `keep` best states of each chain, best first, those of a chain side by side.
+        """Return the `keep` best states of each chain, best first, grouped by chain.
 
         Args:
-            seeds: of the chains' random numbers.
+            seeds: of the chains.
             steps: counter of the schedule at which a chain ends.
             keep: length of the list of best states.
-            tell: told one unit of work per move.
+            tell: called with one unit of work per move.
 
         Raises:
-            InputError: no place for the hand around the object.
+            InputError: no free hand pose around the object.
             TaskCancelled: through `tell`.
         """
         chains = len(seeds)
@@ -167,22 +167,22 @@ METHOD: Final = Method(
     uses=("face_error_m",),
     quick={"steps": FIRST_STEP + 400},
 )
-#: Bounds of the palm's place about the object's centre of mass [m] and its largest jump (GraspIt!'s, in mm there).
+#: Bounds of the palm's position about the centre of mass [m], and its largest jump (GraspIt!'s, in mm there).
 PLACE: Final = ((-0.25, 0.25), (-0.25, 0.25), (-0.25, 0.35))
 PLACE_JUMP: Final = 0.15
-#: theta, phi, alpha: axis and angle of the rotation; phi wraps around.
+#: theta, phi, alpha: axis and angle of the rotation; phi is periodic.
 ANGLES: Final = ((0.0, np.pi), (-np.pi, np.pi), (0.0, np.pi))
 ANGLE_JUMPS: Final = (np.pi / 5, np.pi / 2, np.pi / 2)
 PHI: Final = 4
-#: Postures a side at which the hand is tested against itself, and the overlap real hand models have at rest [m].
+#: Postures per side of the self-collision test, and the overlap of real hand models at rest [m].
 CLASH_GRID: Final = 49
 CLASH_M: Final = 2e-3
-#: Uniform draws for a legal start, and rounds between two looks at cancellation.
+#: Uniform draws for a legal start, and rounds between two checks for cancellation.
 START_TRIES: Final = 5000
 ROUNDS: Final = 500
-#: Rounds without a free neighbour count too, up to so many times the moves.
+#: Rounds without a free neighbour also count, up to this multiple of the moves.
 PATIENCE: Final = 3
-#: Two states of the list are alike below this (GraspIt!).
+#: Two states of the list are near-duplicates below this (GraspIt!).
 ALIKE: Final = 0.2
 NOT_YET: Final = 1e9
 #: Contacts on each link that closes, and on the palm.
@@ -191,14 +191,14 @@ ON_PALM: Final = 3
 
 
 def clash_grid(pair: Pair, eigen: Eigengrasps) -> NDArray[np.int32]:
-    """(CLASH_GRID, CLASH_GRID): 1 where the posture of these amplitudes overlaps itself by more than `CLASH_M`."""
+    """Return (CLASH_GRID, CLASH_GRID): 1 for a posture whose self-overlap exceeds `CLASH_M`."""
     axes = [np.linspace(low, high, CLASH_GRID) for low, high in eigen.limits]
     amplitudes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
     q = eigen.posture(amplitudes, pair.hand.model)
     n = len(q)
     model = pair.model(pair.coarse)
     data = Data(model, n)
-    # Far from the object only the hand itself can be hit.
+    # Far from the object only self-collisions occur.
     data.set_state(HandState(np.tile([9.0, 0, 0], (n, 1)), np.tile([1.0, 0, 0, 0], (n, 1)), q))
     record_placement(model, data).run()
     depth = data.depths.links.numpy()[:n]
@@ -206,7 +206,7 @@ def clash_grid(pair: Pair, eigen: Eigengrasps) -> NDArray[np.int32]:
 
 
 def _approach_frame(hand: HandModel) -> Floats:
-    """Quaternion w x y z from the frame with z along the approach to the root frame."""
+    """Return the quaternion w x y z from the frame with z along the approach to the root frame."""
     z = hand.palm.approach
     x = np.cross(np.eye(3)[int(np.argmin(np.abs(z)))], z)
     x /= np.linalg.norm(x)
@@ -214,7 +214,7 @@ def _approach_frame(hand: HandModel) -> Floats:
 
 
 def _sorted(best: Floats, energy: Floats, begun: Floats) -> Floats:
-    """(chains * keep, 8) best states first; what a chain did not find is its best again, or where it began."""
+    """Return (chains * keep, 8) best states first; missing ones are the chain's best, or its start."""
     out = np.empty_like(best)
     for c, (states, energies) in enumerate(zip(best, energy, strict=True)):
         found = [k for k in np.argsort(energies, kind="stable") if energies[k] < NOT_YET / 2]
@@ -224,14 +224,14 @@ def _sorted(best: Floats, energy: Floats, begun: Floats) -> Floats:
 
 
 def virtual_contacts(hand: HandModel) -> SurfacePoints:
-    """Points with normals; none on links that neither close nor carry the palm."""
+    """Return points with normals; none on links that neither close nor carry the palm."""
     return inside_points(hand, each=EACH, on_palm=ON_PALM)
 
 
 #: Weights of a finger's first, second and later closing joints in the human hand's eigengrasps.
 FLEXION: Final = (1.0, 0.3, 0.15)
 SECOND: Final = (-1.0, 1.0, 0.3)
-#: Where closing joints stand in the mean posture, as a share of their range (Barrett's origin: 0.79 of 2.44 rad).
+#: Position of closing joints in the mean posture, as a share of their range (Barrett's origin: 0.79 of 2.44 rad).
 ORIGIN: Final = 0.33
 #: Largest amplitude.
 AMPLITUDE: Final = 4.0
@@ -246,15 +246,15 @@ class Eigengrasps:
     directions: Floats
     """(2, D)"""
     limits: Floats
-    """(2, 2) least and largest amplitude of each: beyond them no joint moves any more."""
+    """(2, 2) least and largest amplitude of each, beyond which no joint moves"""
 
     def posture(self, amplitudes: Floats, hand: HandModel) -> Floats:
-        """(n, D) for amplitudes (n, 2)."""
+        """Return joint positions (n, D) for amplitudes (n, 2)."""
         return np.clip(self.origin + np.asarray(amplitudes) @ self.directions, hand.lower, hand.upper)
 
 
 def places(hand: HandModel) -> NDArray[np.int32]:
-    """(D,) how many closing dofs stand between a closing dof and the palm; -1 for dofs that do not close."""
+    """Return (D,) numbers of closing dofs between each closing dof and the palm; -1 for other dofs."""
     moved = ancestors(hand)
     first = [int(np.flatnonzero(hand.dof == d)[0]) for d in range(hand.dofs)]
     out = np.full(hand.dofs, -1, np.int32)
@@ -266,7 +266,7 @@ def places(hand: HandModel) -> NDArray[np.int32]:
 
 
 def eigengrasps(hand: HandModel) -> Eigengrasps:
-    """The two eigengrasps of a hand."""
+    """Return the two eigengrasps of a hand."""
     place, closing = places(hand), np.asarray(hand.closing, float)
     closes = closing != 0
     if place.max() <= 0:

@@ -1,1 +1,1 @@
-"""Grasps that a network proposes from what a camera sees of the object, made better by fast_graspd's descent."""
+"""Grasps that a network proposes from a camera's view of the object, optimised by fast_graspd."""

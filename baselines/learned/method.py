@@ -1,5 +1,4 @@
-"""The method `learned`: a network sees the object's visible points, and its proposals are starts of fast_graspd's
-descent."""
+"""Method `learned`: a network proposes starts of fast_graspd from the object's visible points."""
 
 from __future__ import annotations
 
@@ -33,14 +32,14 @@ from graspd.worker.simulation.model import Model
 
 
 class LearnedOptions(Options):
-    """Which network, and how far it is followed."""
+    """Network and number of its proposals."""
 
     network: Digest = Field(description="digest of the network; on the command line its file, in a job its name")
     starts: int = Field(4, ge=1, le=32, description="proposals of each grasp that set out")
 
 
 class LearnedPlanner:
-    """fast_graspd from a network's proposals."""
+    """fast_graspd with starts from a network's proposals."""
 
     def __init__(self, options: LearnedOptions) -> None:
         self.options = options
@@ -76,22 +75,21 @@ METHOD: Final = Method(
     files={"network": keep_file},
 )
 
-#: Steps back along the way in while something touches [m].
+#: Steps back along the approach while the hand collides [m].
 RETREATS: Final = (0.0, 0.01, 0.02, 0.035, 0.055, 0.08)
-#: Proposals of a grasp, shared out to its starts: as many as are computed at once.
+#: Proposals of a grasp, divided among its starts: the number computed at once.
 PROPOSALS: Final = 32
-#: A palm that is farther from the object's bounding ball is no start [m].
+#: Largest distance of a start's palm from the object's bounding ball [m].
 FAR_M: Final = 0.15
 
 
 @dataclass(frozen=True)
 class Seeds:
-    """A `WarmStart` from the proposals of a network. A start none of whose proposals comes free is one that fast_graspd
-    finds itself."""
+    """A `WarmStart` from a network's proposals; fast_graspd replaces starts without a free proposal."""
 
     network: ProposalNetwork
     starts: int
-    """Hands of each grasp that set out."""
+    """Starts per grasp."""
 
     def adapted(self, fidelity: Fidelity) -> Fidelity:
         """See `WarmStart`."""
@@ -126,8 +124,7 @@ class Seeds:
     def _proposed(
         self, model: Model, generators: list[np.random.Generator], each: int, placed: PlacedGrasps
     ) -> tuple[HandState, Floats]:
-        """Hands (n * draws) as proposed, open, those of a start side by side, and (n * draws, 3) ways out; object
-        frame."""
+        """Return proposed open hands (n * draws) by start, and (n * draws, 3) directions out; object frame."""
         hand, obj, table = model.hand.model, model.obj.model, table_height(placed.supports)
         seen, draws = SurfaceView.of(obj), max(1, PROPOSALS // each)
         pivot, rotation, q, away = [], [], [], []
@@ -137,7 +134,7 @@ class Seeds:
             cloud = seen.cloud(pose, seen.camera(pose, mine[0]), self.network.points, mine[0])
             inputs, anchor = cloud_inputs(*cloud, table)
             condition = conditions(self.network, inputs[None], anchor[2:] - table)
-            # A grasp's proposals are computed apart from those of others, so that they cannot depend on these.
+            # Proposals of each grasp are computed separately, so that grasps are independent.
             noise = np.concatenate([g.standard_normal((draws, self.network.numbers)) for g in mine])
             rows = flow(self.network, noise.astype(np.float32), np.repeat(condition, len(noise), axis=0))
             found = decode(rows, anchor)
@@ -150,10 +147,10 @@ class Seeds:
 
 
 def table_height(supports: Sequence[Obstacle]) -> float:
-    """z of the table among the supports of a scene [m].
+    """Return z of the table among the supports of a scene [m].
 
     Raises:
-        SceneError: there is none: no half-space below a level plane.
+        SceneError: there is no table: no half-space below a level plane.
     """
     heights = [float(o.planes[0, 3]) for o in supports if len(o.planes) == 1 and o.planes[0, :3] @ UP > UPRIGHT]
     if not heights:
@@ -164,8 +161,10 @@ def table_height(supports: Sequence[Obstacle]) -> float:
 def _clear(
     model: Model, drawn: HandState, away: Floats, scene: NDArray[np.intp], placed: PlacedGrasps
 ) -> tuple[HandState, Floats]:
-    """Of the hands of each start (n) the one that is clear at the fewest steps back, and its depth (n,) [m]; inf where
-    there is none. What a hand lacks of its room from obstacles it is raised first."""
+    """Return per start (n) the free hand with fewest steps back, and its depth (n,) [m]; inf if none.
+
+    A hand without clearance from obstacles is raised first.
+    """
     count, probe = len(scene), Probe(model, len(scene), room=ROOM)
     draws = len(drawn.pivot) // count
     near = (np.linalg.norm(drawn.pivot, axis=1) < model.obj.model.radius + FAR_M).reshape(count, draws)
@@ -196,20 +195,20 @@ def _clear(
 
 
 #: Elevation of a camera above the table [rad]; share of its field of view (half of it [rad]) that the object's bounding
-#: ball fills; nearest distance of the ball [m]: as pictures of a job have them.
+#: ball fills; nearest distance of the ball [m]: as in the pictures of a job.
 ELEVATION: Final = (np.radians(18.0), np.radians(62.0))
 HALF_FIELD: Final = np.radians(20.0)
 FILL: Final = (0.7, 1.0)
 NEAREST_M: Final = 0.25
-#: Points of the surface, and pixels across the bounding ball, each of which shows the nearest point in it: about five
-#: visible ones fall into each, so that little shows through where a thing is hollow.
+#: Points of the surface, and pixels across the bounding ball; each pixel shows its nearest point. A pixel gets about
+#: five visible points, so that few hidden points show through hollow objects.
 DENSE: Final = 32768
 PIXELS: Final = 48
 
 
 @dataclass(frozen=True)
 class SurfaceView:
-    """The surface of an object as cameras look at it."""
+    """Surface of an object for simulated cameras."""
 
     obj: ObjectModel
     points: Floats
@@ -219,7 +218,7 @@ class SurfaceView:
 
     @classmethod
     def of(cls, obj: ObjectModel) -> SurfaceView:
-        """Points even over the area, the same for the same object."""
+        """Sample points uniformly over the area, equal for equal objects."""
         rng = np.random.default_rng(0)
         corners = obj.vertices[obj.faces]
         cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -232,17 +231,16 @@ class SurfaceView:
         return cls(obj, a + u * (b - a) + v * (c - a), cross[face] / np.maximum(area[face, None], 1e-20))
 
     def camera(self, pose: Floats, rng: np.random.Generator) -> Floats:
-        """(3,) where a camera that looks at the object at `pose` (7,), z up, stands [m]."""
+        """Sample a camera position (3,) that views the object at `pose` (7,), z up [m]."""
         azimuth, fill = rng.uniform(0, 2 * np.pi), rng.uniform(*FILL)
-        elevation = np.arcsin(rng.uniform(*np.sin(ELEVATION)))  # even over the sphere
+        elevation = np.arcsin(rng.uniform(*np.sin(ELEVATION)))  # uniform over the sphere
         level = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
         toward = np.cos(elevation) * level + np.sin(elevation) * np.array([0, 0, 1.0])
         distance = max(NEAREST_M + self.obj.radius, self.obj.radius / np.sin(fill * HALF_FIELD))
         return np.asarray(self._middle(pose) + distance * toward)
 
     def cloud(self, pose: Floats, camera: Floats, count: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
-        """Points and normals (count, 3) of the object at `pose` (7,) that a camera sees: one a pixel, of which `count`
-        are drawn."""
+        """Return visible points and normals (count, 3) of the object at `pose` (7,), drawn from one per pixel."""
         points, normals = quat_rotate(pose[3:], self.points) + pose[:3], quat_rotate(pose[3:], self.normals)
         rays = points - camera
         facing = np.flatnonzero((normals * rays).sum(axis=1) < 0)

@@ -1,13 +1,13 @@
-"""What a proposal network computes, in NumPy alone: a point cloud in, grasps out.
+"""Inference of a proposal network in NumPy alone: a point cloud in, grasps out.
 
-A cloud is of the visible points of an object on a table, in a frame with z up. A PointNet encoder (Qi et al., CVPR
-2017: one network for every point, then the maximum) gives a feature; conditional flow matching (Lipman et al., ICLR
-2023, with straight paths) carries normal noise to grasps. A grasp is a row of D = 12 + 3 J numbers, standardised by the
-network's `mean` and `std`:
+A cloud contains the visible points of an object on a table, in a frame with z up. A PointNet encoder (Qi et al., CVPR
+2017: one network for every point, then the maximum) computes a feature; conditional flow matching (Lipman et al., ICLR
+2023, with straight paths) transforms normal noise to grasps. A grasp is a row of D = 12 + 3 J numbers, standardised by
+the network's `mean` and `std`:
 
     0:3            position of the hand's root link minus the anchor, the mean of the cloud's points [m]
     3:9            first, then second column of the root link's rotation
-    9:12           unit direction of the way in, from the standoff to the pregrasp
+    9:12           unit direction of the approach, from the standoff to the pregrasp
     12:12+J        joint positions at the grasp [rad or m]
     12+J:12+2J     pregrasp minus grasp
     12+2J:12+3J    squeeze minus grasp
@@ -55,11 +55,11 @@ __all__ = [
     "save",
     "weight_shapes",
 ]
-#: Lengths of the encoder's input and of the condition are in units of this [m].
+#: Unit of lengths in the encoder's input and in the condition [m].
 LENGTH_M: Final = 0.1
-#: Products of matrices are cut into ones of 32 rows and so few multiplications that OpenBLAS, which shares larger ones
-#: out, makes each on one thread: a product of another size, or shared otherwise, rounds otherwise, and a proposal
-#: depends neither on how many others are asked for nor on the cores of the machine.
+#: Matrix products are cut into 32 rows and at most this many multiplications. OpenBLAS computes such products on one
+#: thread each; another size or another split would round differently. So a proposal depends neither on the number of
+#: others nor on the machine's cores.
 _ROWS: Final = 32
 _MULTIPLICATIONS: Final = 2**18
 _TINY: Final = 1e-6
@@ -67,12 +67,12 @@ _TINY: Final = 1e-6
 
 @dataclass(frozen=True)
 class Proposals:
-    """n grasps, in the frame of the cloud. Joint positions may lie beyond their limits: the network knows none."""
+    """n grasps in the frame of the cloud. Joint positions may exceed limits, which are no network input."""
 
     hand_pose: Floats
     """(n, 7) pose of the hand's root link at the grasp: x y z [m], quaternion w x y z."""
     approach: Floats
-    """(n, 3) unit direction of the way in, from the standoff to the pregrasp."""
+    """(n, 3) unit direction of the approach, from the standoff to the pregrasp."""
     joints: Floats
     """(n, J) joint positions at the grasp [rad or m]."""
     pregrasp: Floats
@@ -85,10 +85,10 @@ class Proposals:
 
 
 def load(path: Path) -> ProposalNetwork:
-    """A network from its file.
+    """Load a network from its file.
 
     Raises:
-        InputError: no such file, or no network; see `service.store.network_file.from_bytes`.
+        InputError: the file is missing or no network; see `service.store.network_file.from_bytes`.
     """
     return from_bytes(read_file(path), str(path))
 
@@ -113,20 +113,20 @@ def propose(
     label: float = 1.0,
     spread: float = 1.0,
 ) -> Proposals:
-    """Grasps that the network proposes for one cloud. The first of them do not depend on `count`.
+    """Propose grasps for one cloud. The first proposals do not depend on `count`.
 
     Args:
-        network: of the hand.
+        network: network of the hand.
         points: (P, 3) visible points of the object, in a frame with z up [m].
         normals: (P, 3) unit, toward the camera.
         table_height: z of the table [m].
         count: proposals.
-        rng: where the noise is drawn.
-        label: 1: grasps that hold; 0: such as failed.
-        spread: standard deviation of the noise. Less than that of training, 1, gives likelier grasps, and more alike.
+        rng: source of the noise.
+        label: 1: grasps that hold; 0: grasps that fail.
+        spread: standard deviation of the noise. Below 1, as in training, grasps are likelier and less diverse.
 
     Raises:
-        InputError: no cloud of finite numbers, or a network whose numbers run away.
+        InputError: the cloud or the network's output is not finite.
     """
     inputs, anchor = cloud_inputs(points, normals, table_height)
     condition = conditions(network, inputs[None], np.array([anchor[2] - table_height]), label)
@@ -135,7 +135,7 @@ def propose(
 
 
 def cloud_inputs(points: ArrayLike, normals: ArrayLike, table_height: float) -> tuple[Floats32, Floats]:
-    """The encoder's input (P, 7) of a cloud, and its anchor (3,) [m].
+    """Return the encoder's input (P, 7) of a cloud, and its anchor (3,) [m].
 
     A point's row: from the anchor / 0.1 m, normal, height above the table / 0.1 m.
 
@@ -153,7 +153,7 @@ def cloud_inputs(points: ArrayLike, normals: ArrayLike, table_height: float) -> 
 
 
 def conditions(network: ProposalNetwork, clouds: Floats32, height: Floats, label: float = 1.0) -> Floats32:
-    """Conditions (C, 258) of the flow for C clouds.
+    """Return conditions (C, 258) of the flow for C clouds.
 
     Args:
         network: the network.
@@ -163,7 +163,7 @@ def conditions(network: ProposalNetwork, clouds: Floats32, height: Floats, label
     """
     found = np.empty((len(clouds), CONDITION), np.float32)
     layers = _layers(network)
-    with np.errstate(all="ignore"):  # what runs away is told by `flow`
+    with np.errstate(all="ignore"):  # `flow` checks for overflow
         for row, cloud in zip(found, clouds, strict=True):
             h = np.asarray(cloud, np.float32)
             for i in range(len(ENCODER) - 1):
@@ -175,14 +175,14 @@ def conditions(network: ProposalNetwork, clouds: Floats32, height: Floats, label
 
 
 def flow(network: ProposalNetwork, noise: Floats32, condition: Floats32) -> Floats32:
-    """Rows (n, D) of grasps from normal noise (n, D), each under its condition (n, 258): Euler steps from t = 0 to 1.
+    """Integrate normal noise (n, D) under conditions (n, 258) to grasp rows: Euler steps, t = 0 to 1.
 
     Raises:
-        InputError: numbers that are not finite come out.
+        InputError: the result is not finite.
     """
     layers = _layers(network)
     x, c = np.asarray(noise, np.float32), np.asarray(condition, np.float32)
-    with np.errstate(all="ignore"):  # looked at below
+    with np.errstate(all="ignore"):  # checked below
         for step in range(network.steps):
             x = x + _velocity(layers, x, step / network.steps, c) / np.float32(network.steps)
         found = np.asarray(x * network.std + network.mean, np.float32)
@@ -192,7 +192,7 @@ def flow(network: ProposalNetwork, noise: Floats32, condition: Floats32) -> Floa
 
 
 def encode(proposals: Proposals, anchor: ArrayLike) -> Floats:
-    """Rows (n, D) of grasps, not standardised: what `decode` reads, and what a network learns."""
+    """Return grasp rows (n, D), not standardised: input of `decode`, and training target."""
     rotation = quat_to_matrix(proposals.hand_pose[:, 3:])
     return np.concatenate(
         [
@@ -209,12 +209,12 @@ def encode(proposals: Proposals, anchor: ArrayLike) -> Floats:
 
 
 def decode(rows: ArrayLike, anchor: ArrayLike) -> Proposals:
-    """Grasps of rows (n, D); the anchor is one (3,) or each row's own (n, 3). Rotations by Gram-Schmidt."""
+    """Return grasps of rows (n, D) with one anchor (3,) or one per row (n, 3). Rotations by Gram-Schmidt."""
     x = np.asarray(rows, float)
     joints, opened, pressed = np.split(x[:, POSE:], 3, axis=1)
     first = _unit(x[:, 3:6], np.array([1.0, 0, 0]))
     second = x[:, 6:9] - (x[:, 6:9] * first).sum(axis=1, keepdims=True) * first
-    # Two columns on one line leave the second open: any across the first will do.
+    # If both columns are parallel, any direction orthogonal to the first is valid.
     least = np.eye(3)[np.argmin(np.abs(first), axis=1)]
     second = _unit(second, least - (least * first).sum(axis=1, keepdims=True) * first)
     rotation = np.stack([first, second, cross(first, second)], axis=-1)
@@ -225,10 +225,10 @@ def decode(rows: ArrayLike, anchor: ArrayLike) -> Proposals:
 
 @dataclass(frozen=True)
 class _Layer:
-    """A linear layer, cut as `_MULTIPLICATIONS` says."""
+    """A linear layer, cut as in `_MULTIPLICATIONS`."""
 
     weight: Floats32
-    """(T, in, out of a part) the transposed weight in T parts, the last one filled with zeros."""
+    """(T, in, out of a part) the transposed weight in T parts, the last one padded with zeros."""
     bias: Floats32
 
     @classmethod
@@ -242,7 +242,7 @@ class _Layer:
         return cls(np.ascontiguousarray(filled.reshape(parts, width, into).transpose(0, 2, 1)), bias)
 
     def __call__(self, x: Floats32) -> Floats32:
-        """Rows (n, out) of rows (n, in)."""
+        """Return rows (n, out) for rows (n, in)."""
         n, into = x.shape
         blocks = -(-n // _ROWS)
         rows = np.zeros((blocks * _ROWS, into), np.float32)
@@ -253,7 +253,7 @@ class _Layer:
 
 
 def _layers(network: ProposalNetwork) -> Mapping[str, _Layer]:
-    """The layers by their names, cut once for a network."""
+    """Return the layers by name, cut once per network."""
     if "layers" not in vars(network):
         names = [name.removesuffix(".bias") for name in network.weights if name.endswith(".bias")]
         vars(network)["layers"] = {name: _Layer.of(network, name) for name in names}
@@ -272,12 +272,12 @@ def _velocity(layers: Mapping[str, _Layer], x: Floats32, t: float, condition: Fl
 
 
 def _silu(x: Floats32) -> Floats32:
-    """x times its logistic function, by a tangent that cannot overflow."""
+    """Return x times its logistic function, by a tangent that cannot overflow."""
     half = np.float32(0.5)
     return np.asarray(x * half * (1 + np.tanh(x * half)), np.float32)
 
 
 def _unit(vectors: Floats, otherwise: Floats) -> Floats:
-    """Vectors (n, 3) of length 1; `otherwise` in the place of such as have none."""
+    """Normalise vectors (n, 3); replace zero vectors by `otherwise`."""
     chosen = np.where(np.linalg.norm(vectors, axis=1, keepdims=True) > _TINY, vectors, otherwise)
     return np.asarray(chosen / np.linalg.norm(chosen, axis=1, keepdims=True))

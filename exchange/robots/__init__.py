@@ -1,1 +1,1 @@
-"""Grasps as robots and their simulators read them: MuJoCo, USD, glTF, MoveIt, Isaac Sim, CSV."""
+"""Grasps for robots and their simulators: MuJoCo, USD, glTF, MoveIt, Isaac Sim, CSV."""

@@ -1,4 +1,4 @@
-"""An arm that carries a hand: the joints up to the hand's mount, and the frames and couplings of its description."""
+"""An arm that carries a hand: its joints up to the hand's mount, frames and couplings."""
 
 from __future__ import annotations
 
@@ -24,28 +24,28 @@ from graspd.worker.hands.xacro import read_robot
 
 @dataclass(frozen=True)
 class Arm:
-    """The chain of an arm, with all that hangs on it but what its mount carried."""
+    """The chain of an arm with all its links but those below the mount."""
 
     model: HandModel
     """Bodies, joints, limits and convex pieces; it has no palm and no fingers."""
     mount: str
     mount_body: int
     mount_pose: Floats
-    """(7,) of the mount link in its body's frame."""
+    """(7,) mount link in its body's frame."""
     hand_pose: Floats
-    """(7,) of the hand's root link in the mount link."""
+    """(7,) hand's root link in the mount link."""
 
 
 def read_arm(path: str | Path, mount: str, hand_pose: Floats) -> Arm:
-    """The arm of a URDF, its folder or a ZIP.
+    """Read the arm of a URDF, its folder or a ZIP.
 
-    What hangs on the mount, such as a gripper, is left out; joints that do not lead to it stand still at zero, or at
-    the nearest value that they can have.
+    Links below the mount, such as a gripper, are omitted. Joints that do not lead to it are fixed at zero, or at the
+    nearest value inside their limits.
 
     Raises:
-        NotFoundError: no such file.
-        HandError: it is no usable description.
-        InputError: it has no such link, or no joint moves that link.
+        NotFoundError: the file is missing.
+        HandError: the description is unusable.
+        InputError: the mount link is missing, or no joint moves it.
     """
     name, files, stated = files_from_path(path)
     options = parse_options(files, stated)
@@ -73,7 +73,7 @@ def read_arm(path: str | Path, mount: str, hand_pose: Floats) -> Arm:
 
 
 def _others(robot: Robot, moving: list[str], mount: str) -> list[str]:
-    """Joints that stand still: those that do not lead to the mount, and one by which the base floats."""
+    """Return the fixed joints: those that do not lead to the mount, and a floating base's."""
     chain = {joint.name for joint in chain_to(robot, mount)}
     return [
         name
@@ -89,16 +89,16 @@ def _rest(robot: Robot, joint: str) -> float:
 
 @dataclass(frozen=True)
 class Description:
-    """Facts on a hand's links and joints."""
+    """Links and joints of a hand."""
 
     links: Mapping[str, tuple[int, Floats]]
     """Each link below the root: its body, and its pose (7,) in the body's frame."""
     mimics: frozenset[str]
-    """Joints that the description itself couples to others: whoever reads it moves them by itself."""
+    """Joints that the description couples to others: its readers move them by themselves."""
 
 
 def describe(files: Mapping[str, bytes], options: Mapping[str, Any] | None = None) -> Description:
-    """The description of a hand's files; see `load_hand`.
+    """Return the description of a hand's files; see `load_hand`.
 
     Raises:
         HandError: the files describe no usable hand.

@@ -1,4 +1,4 @@
-"""What the writers of robots' formats are given, and what they share."""
+"""Input of the writers of robots' formats, and their common functions."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from graspd.service.model.transforms import Floats, compose, invert
 
 @dataclass(frozen=True)
 class Carrier:
-    """The arm that carries the hand, where it stands, and its motions."""
+    """The arm that carries the hand, its base, and its motions."""
 
     arm: Arm
     base: Floats
-    """(7,) its base in the frame of the grasps."""
+    """(7,) base in the frame of the grasps."""
     world: ArmScene
     paths: list[list[Path]]
-    """Of each grasp; joints are the arm's, then the hand's."""
+    """Motions of each grasp; joints are the arm's, then the hand's."""
 
 
 @dataclass(frozen=True)
@@ -34,24 +34,24 @@ class Bundle:
 
     found: Executions
     trajectories: list[RobotTrajectory]
-    """One for each grasp; its joints are the arm's, if there is one, then the hand's."""
+    """One per grasp; joints are the arm's, if there is one, then the hand's."""
     description: Description
     carrier: Carrier | None = None
     """The arm, if there is one."""
 
     @property
     def frame(self) -> str:
-        """Name of the frame in which poses are written: the arm's base, the scene, or the object."""
+        """Name of the frame of written poses: the arm's base, the scene, or the object."""
         if self.carrier is not None:
             return self.carrier.arm.model.root_link
         return "scene" if self.found.placed is not None else plain_name(self.found.obj.name)
 
     def seen(self, pose: Floats) -> Floats:
-        """Poses (..., 7) in the frame `frame`."""
+        """Return poses (..., 7) in the frame `frame`."""
         return np.asarray(pose, float) if self.carrier is None else compose(invert(self.carrier.base), pose)
 
     def seen_tool(self, root_pose: Floats) -> Floats:
-        """Poses (..., 7) of the tool frame in the frame `frame`, from those of the hand's root link."""
+        """Return poses (..., 7) of the tool frame in the frame `frame`, from those of the hand's root link."""
         return self.seen(compose(root_pose, self.found.tool.pose))
 
     @property
@@ -61,18 +61,18 @@ class Bundle:
         return thing, hand
 
     def name(self, row: int) -> str:
-        """Name of a grasp, after its row in the shard."""
+        """Return the name of a grasp, after its row in the shard."""
         return f"grasp_{self.found.rows[row]:04}"
 
     @property
     def steered(self) -> list[int]:
-        """Columns of the hand's joints that are commanded: those that the URDF does not couple to others."""
+        """Columns of the hand's commanded joints: those that the URDF does not couple to others."""
         names = self.found.hand.joint_names
         return [k for k, name in enumerate(names) if name not in self.description.mimics]
 
 
 class _Plain(getattr(yaml, "CSafeDumper", yaml.SafeDumper)):  # type: ignore[misc]
-    """YAML without anchors, which not every reader of messages knows."""
+    """YAML without anchors, which some readers of messages do not support."""
 
     def ignore_aliases(self, data: Any) -> bool:
         return True
@@ -85,5 +85,5 @@ def dump_yaml(file: pathlib.Path, value: Any) -> pathlib.Path:
 
 
 def numbers(values: Any) -> list[float]:
-    """Plain rounded floats: a nanometre, a nanoradian; never a negative zero."""
+    """Return plain rounded floats: a nanometre, a nanoradian; never a negative zero."""
     return [round(float(value), 9) + 0.0 for value in np.ravel(values)]

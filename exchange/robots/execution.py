@@ -1,7 +1,6 @@
-"""Grasps ready to be carried out: six postures each, in a frame that the user names, and the timed trajectory between
-them.
+"""Executable grasps: six postures each, in a frame of the user's choice, and the timed trajectory.
 
-Each motion starts and ends at rest: its share s of the way follows 10 u^3 - 15 u^4 + 6 u^5 of the share u of its time
+Each motion starts and ends at rest: its share s of the path is 10 u^3 - 15 u^4 + 6 u^5 for the share u of its time
 (minimum jerk, Flash and Hogan 1985), whose steepest slope is 15/8.
 """
 
@@ -25,8 +24,8 @@ from graspd.worker.objects.model import ObjectModel
 from graspd.worker.scenes.trajectory import plan_free_way
 from graspd.worker.simulation.environment import STANDOFF_M, PlacedGrasps
 
-#: Postures of a grasp in their order. The hand comes from `standoff` to `arrival` with open fingers, takes the shape of
-#: `pregrasp`, closes to `grasp`, is commanded to `squeeze`, and rises to `lift`.
+#: Postures of a grasp in order. The open hand moves from `standoff` to `arrival`, takes the shape of `pregrasp`, closes
+#: to `grasp`, is commanded to `squeeze`, and rises to `lift`.
 POSTURES: Final = ("standoff", "arrival", "pregrasp", "grasp", "squeeze", "lift")
 #: Motions from one posture to the next.
 PHASES: Final = ("approach", "shape", "close", "squeeze", "lift")
@@ -34,7 +33,7 @@ PHASES: Final = ("approach", "shape", "close", "squeeze", "lift")
 
 @dataclass(frozen=True)
 class ToolFrame:
-    """A frame fixed to the hand's root link: what is steered to a pose."""
+    """A frame fixed to the hand's root link, whose pose is commanded."""
 
     name: str
     pose: Floats
@@ -45,7 +44,7 @@ class ToolFrame:
 class Executions:
     """N grasps of one hand on one object with all their postures.
 
-    Poses stand in the frame named `frame`: the object's own, or the scene's (z up) where they were planned in one.
+    Poses are in the frame named `frame`: the object's own, or the scene's (z up) for grasps planned in one.
     """
 
     hand: HandModel
@@ -57,9 +56,9 @@ class Executions:
     object_pose: Floats
     """(N, 7) the object at rest."""
     postures: dict[str, Posture]
-    """The N postures of each of `POSTURES`; hand poses are those of the root link."""
+    """The N postures of each of `POSTURES`; hand poses are of the root link."""
     placed: PlacedGrasps | None
-    """The scene of each grasp, if they have one."""
+    """Scene of each grasp, if there are scenes."""
     quality: dict[str, NDArray[Any]]
     """(N,) verdicts and metrics: valid, success, epsilon."""
 
@@ -68,21 +67,21 @@ class Executions:
 
     @property
     def scene_index(self) -> NDArray[np.intp]:
-        """(N,) number of each grasp's scene; 0 around a free object."""
+        """(N,) index of each grasp's scene; 0 for a free object."""
         return np.zeros(len(self), np.intp) if self.placed is None else self.placed.index
 
     def tool_pose(self, posture: str) -> Floats:
-        """(N, 7) of the tool frame in a posture."""
+        """Return (N, 7) tool frames in a posture."""
         return compose(self.postures[posture].hand_pose, self.tool.pose)
 
     @property
     def approach(self) -> Floats:
-        """(N, 3) unit vectors along which the hand comes."""
+        """(N, 3) unit vectors of the approach."""
         return self._direction("standoff", "arrival")
 
     @property
     def retreat(self) -> Floats:
-        """(N, 3) unit vectors along which the hand leaves with the object."""
+        """(N, 3) unit vectors of the retreat with the object."""
         return self._direction("squeeze", "lift")
 
     def _direction(self, start: str, end: str) -> Floats:
@@ -91,13 +90,13 @@ class Executions:
 
     @property
     def lifted_object_pose(self) -> Floats:
-        """(N, 7) the object after the lift, held as it was grasped."""
+        """(N, 7) object pose after the lift, fixed in the hand."""
         pose = np.array(self.object_pose, float)
         pose[:, :3] += self.postures["lift"].hand_pose[:, :3] - self.postures["squeeze"].hand_pose[:, :3]
         return pose
 
     def take(self, rows: NDArray[np.intp]) -> Executions:
-        """Some of the grasps, in the order of `rows`."""
+        """Return some of the grasps, in the order of `rows`."""
         return replace(
             self,
             rows=self.rows[rows],
@@ -118,22 +117,22 @@ def executions(
     tool: ToolFrame,
     quality: dict[str, NDArray[Any]],
 ) -> Executions:
-    """Grasps with their ways: those they were planned with in their scene, or around a free object planned here.
+    """Return grasps with trajectories, as planned in their scene or here for a free object.
 
     Args:
         hand: the hand.
         obj: the object.
         grasps: N grasps.
         rows: (N,) their rows in the shard.
-        placed: the scene of each, None around a free object.
+        placed: scene of each grasp; None for a free object.
         tool: the tool frame.
-        quality: (N,) columns that are handed on.
+        quality: (N,) columns that are passed on.
 
     Returns:
-        Those that have a way. Around a free object it may be that no straight retreat of 10 cm is free of it.
+        grasps with a trajectory. For a free object a straight retreat of 10 cm may be impossible.
 
     Raises:
-        InputError: none has a way.
+        InputError: no grasp has a trajectory.
     """
     frame, at = "object", np.tile(IDENTITY_POSE, (len(grasps), 1))
     free = np.ones(len(grasps), bool)
@@ -163,17 +162,17 @@ def executions(
 
 
 def posed_bodies(found: Executions, posture: str, row: int) -> Floats:
-    """(L, 7) poses of the hand's bodies in one posture of one grasp."""
+    """Return (L, 7) poses of the hand's bodies in one posture of one grasp."""
     part = found.postures[posture]
     return np.asarray(body_poses(found.hand, part.hand_pose[row], part.joint_positions[row])[0])
 
 
-#: How far a quaternion may be from length 1 before it is taken for a mistake.
+#: Tolerance of a quaternion's length around 1.
 _SLACK = 1e-2
 
 
 def parse_pose(text: str, what: str) -> Floats:
-    """(7,) from `x y z qw qx qy qz`, separated by spaces or commas [m, 1].
+    """Parse (7,) from `x y z qw qx qy qz`, separated by spaces or commas [m, 1].
 
     Raises:
         InputError: not seven finite numbers, or no unit quaternion.
@@ -192,7 +191,7 @@ def parse_pose(text: str, what: str) -> Floats:
 
 
 def tool_frame(text: str | None, root_link: str, links: Mapping[str, tuple[int, Floats]]) -> ToolFrame:
-    """The tool frame that a user names: a link that does not move with a finger, or a pose in the root link's frame.
+    """Return the user's tool frame: a link that no finger moves, or a pose in the root link's frame.
 
     Args:
         text: a link's name or seven numbers; None: the root link itself.
@@ -200,7 +199,7 @@ def tool_frame(text: str | None, root_link: str, links: Mapping[str, tuple[int, 
         links: body and pose of each link, see `Description`.
 
     Raises:
-        InputError: there is no such link, it moves with a finger, or the numbers are no pose.
+        InputError: the link is missing, it moves with a finger, or the numbers are no pose.
     """
     if not text or text == root_link:
         return ToolFrame(root_link, IDENTITY_POSE.copy())
@@ -228,10 +227,10 @@ def _is_pose(text: str) -> bool:
         return False
 
 
-#: Velocity of a joint whose description states none [rad/s, m/s].
+#: Velocity of a joint without a limit in its description [rad/s, m/s].
 ASSUMED_RAD_S: Final = 1.0
 ASSUMED_M_S: Final = 0.05
-#: The hand as a whole moves and turns no faster [m/s, rad/s].
+#: Velocity limit of the hand as a whole [m/s, rad/s].
 HAND_M_S: Final = 0.25
 HAND_RAD_S: Final = 1.0
 #: Shortest motion, and time between points [s].
@@ -247,12 +246,12 @@ class Limits:
     velocity: Floats
     """(J,) [rad/s or m/s]"""
     assumed: tuple[str, ...]
-    """Joints whose limit nobody states."""
+    """Joints without a stated limit."""
 
 
 @dataclass(frozen=True)
 class Path:
-    """A motion of hand and joints without times: M points at even shares of the way."""
+    """A motion of hand and joints without times: M points at equal shares of the path."""
 
     phase: str
     hand_pose: Floats
@@ -267,19 +266,19 @@ class RobotTrajectory:
 
     joint_names: tuple[str, ...]
     phase: tuple[str, ...]
-    """(K,) the motion that each point belongs to; the first point begins the first one."""
+    """(K,) motion of each point; the first point belongs to the first one."""
     time: Floats
-    """(K,) since the beginning [s]."""
+    """(K,) since the start [s]."""
     hand_pose: Floats
-    """(K, 7) of the root link."""
+    """(K, 7) root link."""
     joints: Floats
     """(K, J)"""
     velocity: Floats
-    """(K, J) of the joints, by differences."""
+    """(K, J) joint velocities, by differences."""
 
 
 def hand_limits(hand: HandModel) -> Limits:
-    """Velocity limits of a hand's joints: those of its description, else `ASSUMED_RAD_S` or `ASSUMED_M_S`."""
+    """Return velocity limits of a hand's joints: the description's, else `ASSUMED_RAD_S` or `ASSUMED_M_S`."""
     body = hand.joint_body
     stated = np.abs(hand.multiplier[body]) * hand.velocity[hand.dof[body]]
     default = np.where(hand.joint_type[body] == JointType.REVOLUTE, ASSUMED_RAD_S, ASSUMED_M_S)
@@ -288,7 +287,7 @@ def hand_limits(hand: HandModel) -> Limits:
 
 
 def straight_paths(found: Executions, row: int, points: int = 2) -> list[Path]:
-    """The motions of one grasp: root and joints evenly from posture to posture, the root's turn at an even rate."""
+    """Return the motions of one grasp: root, its rotation and joints move evenly between postures."""
     paths = []
     for phase, start, end in zip(PHASES, POSTURES[:-1], POSTURES[1:], strict=True):
         a, b = found.postures[start], found.postures[end]
@@ -299,13 +298,13 @@ def straight_paths(found: Executions, row: int, points: int = 2) -> list[Path]:
 
 
 def timed(paths: Sequence[Path], names: Sequence[str], velocity: Floats, *, speed: float) -> RobotTrajectory:
-    """Motions one after the other, each at rest at both ends.
+    """Time the motions in sequence, each at rest at both ends.
 
     Args:
-        paths: the motions; each begins where the one before ends.
+        paths: the motions; each starts at the end of the previous one.
         names: (J,) names of the joints.
         velocity: (J,) limits [rad/s or m/s].
-        speed: share of these limits, and of the hand's, that is used; above 0, at most 1.
+        speed: used share of these limits and of the hand's; above 0, at most 1.
     """
     phase, time, pose, joints = [paths[0].phase], [0.0], [paths[0].hand_pose[:1]], [paths[0].joints[:1]]
     for path in paths:
@@ -335,7 +334,7 @@ def timed(paths: Sequence[Path], names: Sequence[str], velocity: Floats, *, spee
 
 
 def _slowness(path: Path, velocity: Floats) -> float:
-    """Seconds that the motion takes at its limits if its share of the way grows evenly."""
+    """Return the seconds of the motion at its limits for a constant rate."""
     pieces = len(path.joints) - 1
     joints = np.abs(np.diff(path.joints, axis=0)) / velocity
     way = np.linalg.norm(np.diff(path.hand_pose[:, :3], axis=0), axis=1) / HAND_M_S
@@ -345,7 +344,7 @@ def _slowness(path: Path, velocity: Floats) -> float:
 
 
 def _poses(start: Floats, end: Floats, shares: NDArray[np.float64]) -> Floats:
-    """(M, 7) poses between two at shares (M,) of the way."""
+    """Return (M, 7) poses between two at shares (M,) of the path."""
     place = (1 - shares)[:, None] * start[:3] + shares[:, None] * end[:3]
     turn = np.array([slerp(start[3:], end[3:], float(share)) for share in shares])
     return np.concatenate([place, turn], axis=1)

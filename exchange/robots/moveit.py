@@ -1,8 +1,7 @@
-"""Grasps as `moveit_msgs/Grasp` and `moveit_msgs/RobotTrajectory` messages in YAML, with the URDF of hand and object.
+"""Grasps as `moveit_msgs/Grasp` and `RobotTrajectory` messages in YAML, with URDFs of hand and object.
 
-`grasp_pose` is that of the tool frame, which for MoveIt is the link that the end-effector hangs on. Directions stand
-in the frame of the pose. ROS quaternions are x y z w. `effort` [N m or N] is what the squeeze presses with: stiffness
-times the way from grasp to squeeze.
+`grasp_pose` is the tool frame's, which for MoveIt is the end-effector's link. Directions are in the frame of the pose.
+ROS quaternions are x y z w. `effort` [N m or N] is the squeeze's: stiffness times distance from the grasp.
 """
 
 from __future__ import annotations
@@ -20,16 +19,16 @@ from graspd.exchange.robots.execution import RobotTrajectory
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import Floats
 
-#: Share of a straight motion that must be possible for the grasp to be tried.
+#: Share of a straight motion that must be possible for a grasp to be attempted.
 LEAST_SHARE: Final = 0.5
 
 
 def write(bundle: Bundle, folder: Path, hand_files: Mapping[str, bytes]) -> list[Path]:
-    """Write `grasps.yaml`, `trajectories/GRASP.yaml`, the hand's own files into `hand/`, and the object into `object/`.
+    """Write `grasps.yaml`, `trajectories/GRASP.yaml`, the hand's files in `hand/`, the mesh in `object/`.
 
     Args:
         bundle: the grasps.
-        folder: where to write.
+        folder: output folder.
         hand_files: the hand's URDF and meshes.
 
     Raises:
@@ -53,7 +52,7 @@ def _grasp(bundle: Bundle, row: int) -> dict[str, Any]:
     def point(posture: str, seconds: float, effort: Floats | None = None) -> dict[str, Any]:
         return _point(postures[posture].joint_positions[row, bundle.steered], seconds, effort=effort)
 
-    # The end of each motion: the last time that bears its name.
+    # End of each motion: the last time with its name.
     times = dict(zip(bundle.trajectories[row].phase, bundle.trajectories[row].time, strict=True))
     stiffness = found.hand.stiffness[found.hand.dof[found.hand.joint_body]]
     press = stiffness * (postures["squeeze"].joint_positions[row] - postures["grasp"].joint_positions[row])
@@ -121,7 +120,7 @@ def _duration(seconds: float) -> dict[str, int]:
 
 
 def _trajectory(bundle: Bundle, path: RobotTrajectory) -> dict[str, Any]:
-    """A RobotTrajectory: the joints, and beside them the way of the tool frame as that of a floating joint."""
+    """Return a RobotTrajectory: the joints, and the tool frame's path as a floating joint."""
     kept = [k for k, name in enumerate(path.joint_names) if name not in bundle.description.mimics]
     names = [path.joint_names[k] for k in kept]
     points = [

@@ -1,8 +1,7 @@
-"""Grasps as MuJoCo scenes with a key frame for each posture: the hand alone with the validator's physics, or on its
-arm.
+"""Grasps as MuJoCo scenes with a key frame per posture: the validator's hand alone, or on its arm.
 
-The world is the frame of the grasps, z up in a scene. A mocap body leads the hand's root; position actuators bear the
-names of the degrees of freedom. In a scene gravity pulls the object alone; a free object floats.
+The world is the frame of the grasps, z up in a scene. A mocap body leads the hand's root; position actuators have the
+names of the degrees of freedom. In a scene gravity acts on the object alone; a free object floats.
 """
 
 from __future__ import annotations
@@ -25,9 +24,9 @@ from graspd.worker.hands.model import HandModel
 from graspd.worker.validation.decomposition import ConvexPieces
 from graspd.worker.validation.model import MujocoOptions, Scene, build, scene_spec
 
-#: Of the hand, the object, and all else.
+#: Colours of the hand, the object, and everything else.
 _COLOURS: Final = ("0.36 0.45 0.58 1", "0.87 0.45 0.2 1", "0.75 0.75 0.72 1")
-#: Attributes of MJCF that the specification knows by another name.
+#: Attributes of MJCF with another name in the specification.
 _SPEC_NAMES: Final = {"vertex": "uservert"}
 
 
@@ -36,8 +35,8 @@ def write_scene(bundle: Bundle, folder: Path, pieces: ConvexPieces) -> list[Path
 
     Args:
         bundle: the grasps.
-        folder: where to write.
-        pieces: the object's convex pieces, as the validator has them.
+        folder: output folder.
+        pieces: the object's convex pieces, as in the validator.
     """
     found = bundle.found
     folder.mkdir(parents=True, exist_ok=True)
@@ -65,7 +64,7 @@ def write_scene(bundle: Bundle, folder: Path, pieces: ConvexPieces) -> list[Path
 
 
 def _restore_digits(tree: Element, spec: Any) -> None:
-    """Numbers with all their digits: MuJoCo writes six, and contacts that decide a verdict are told apart by less."""
+    """Restore all digits of numbers: MuJoCo writes six, but smaller differences decide verdicts."""
     for tag in ("body", "joint", "geom", "mesh"):
         for element in tree.iter(tag):
             source = getattr(spec, tag)(element.get("name")) if element.get("name") else None
@@ -79,7 +78,7 @@ def _restore_digits(tree: Element, spec: Any) -> None:
 
 
 def _settle(tree: Element, found: Executions) -> None:
-    """Supports stand still in the world; gravity as in the lift test: on the object alone."""
+    """Fix supports in the world; set gravity as in the lift test, on the object alone."""
     option = one(tree, "option")
     support = tree.find(".//body[@name='supports']")
     if support is not None:
@@ -96,7 +95,7 @@ def _settle(tree: Element, found: Executions) -> None:
 
 
 def dress(tree: Element, found: Executions, names: tuple[str, ...]) -> None:
-    """Colours of hand, object and what stands around (bodies of these names), light and a camera: none moves a body."""
+    """Add colours of hand, object and neighbours (`names`), light and a camera; physics stays the same."""
     for name, colour in zip_longest(names, _COLOURS[: len(names)], fillvalue=_COLOURS[-1]):
         for body in tree.findall(f".//body[@name='{name}']"):
             for geom in body.iter("geom"):
@@ -124,7 +123,7 @@ def _add_keys(tree: Element, bundle: Bundle, scene: Scene) -> None:
 
 
 def _key(found: Executions, scene: Scene, posture: str, row: int) -> dict[str, str]:
-    """State and targets. A squeeze is only commanded: the fingers stand where the grasp has them."""
+    """Return state and targets. A squeeze is only commanded: the fingers are at the grasp."""
     command = found.postures[posture]
     stands = found.postures["grasp"] if posture in ("squeeze", "lift") else command
     pose = command.hand_pose[row]
@@ -147,7 +146,7 @@ def _key(found: Executions, scene: Scene, posture: str, row: int) -> dict[str, s
 
 
 def _names(hand: HandModel) -> Mapping[str, str]:
-    """The hand's own names for those of the validator's model; `object`, `supports`, `root` and `mocap` are taken."""
+    """Return the hand's own names for the validator's; `object`, `supports`, `root`, `mocap` are reserved."""
     taken = {"object", "supports", "root", "mocap", "world"}
     found: dict[str, str] = {}
     for prefix, names in (("body", enumerate(hand.body_names)), ("dof", enumerate(hand.dof_names))):
@@ -157,26 +156,26 @@ def _names(hand: HandModel) -> Mapping[str, str]:
 
 
 def rename(tree: Element, names: Mapping[str, str]) -> None:
-    """Give bodies, joints, tendons and actuators other names, wherever they are named."""
+    """Rename bodies, joints, tendons and actuators in all references."""
     for element in tree.iter():
         if element.tag not in ("mesh", "geom", "key", "site"):
             element.attrib.update({key: names[text] for key, text in element.attrib.items() if text in names})
 
 
 def one(tree: Element, path: str) -> Element:
-    """An element that is there."""
+    """Return an element that must exist."""
     found = tree.find(path)
     assert found is not None, path
     return found
 
 
 def element_text(values: Any) -> str:
-    """Numbers as MJCF has them."""
+    """Return numbers in MJCF's format."""
     return " ".join(f"{float(value):.17g}" for value in np.ravel(values))
 
 
 def write_arm(bundle: Bundle, folder: Path) -> list[Path]:
-    """Write `arm.xml`; nothing where there is no arm."""
+    """Write `arm.xml` if there is an arm."""
     if (carrier := bundle.carrier) is None:
         return []
     tree = ElementTree.fromstring(carrier.world.spec.to_xml())
@@ -215,7 +214,7 @@ def _add_arm_keys(tree: Element, bundle: Bundle, carrier: Carrier) -> None:
 
 
 def _arm_names(bundle: Bundle, carrier: Carrier) -> dict[str, str]:
-    """The arm's and the hand's own names; those of the hand that the arm has as well begin with `hand_`."""
+    """Return own names of arm and hand; repeated ones of the hand get the prefix `hand_`."""
     found: dict[str, str] = {}
     taken = {"object", "world", "flange"}
     for prefix, model in (("arm", carrier.arm.model), ("hand", bundle.found.hand)):

@@ -1,8 +1,6 @@
-"""Grasps as posed meshes, one file each: binary glTF (+y up), and USD stages with the trajectory over time (extra
-`usd`).
+"""Grasps as posed meshes, one file each: binary glTF (+y up), and USD stages over time (extra `usd`).
 
-A stage is in metres and z up. Its default values show the grasp; time samples, 24 a second, lead from the standoff to
-the lift.
+A stage is in metres, z up. Defaults show the grasp; 24 time samples per second lead from the standoff to the lift.
 """
 
 from __future__ import annotations
@@ -32,7 +30,7 @@ _UPRIGHT: Final = [-float(np.sqrt(0.5)), 0.0, 0.0, float(np.sqrt(0.5))]
 
 
 def write_glb(bundle: Bundle, folder: Path) -> list[Path]:
-    """Write `GRASP.glb`: nodes bear the names of the hand's links, of the object, of supports, and `tool_frame`."""
+    """Write `GRASP.glb`: nodes have the names of the hand's links, the object, supports, and `tool_frame`."""
     folder.mkdir(parents=True, exist_ok=True)
     found, written = bundle.found, []
     moving, thing, standing = hand_meshes(found), object_mesh(found), support_meshes(found)
@@ -67,13 +65,13 @@ def _placed(pose: Floats | None) -> dict[str, Any]:
 Colour = tuple[float, float, float]
 OBJECT_COLOUR: Final[Colour] = (0.72, 0.2, 0.04)
 SUPPORT_COLOUR: Final[Colour] = (0.5, 0.5, 0.47)
-#: A half-space is shown as a slab of this width and thickness [m].
+#: Width and thickness of the slab that shows a half-space [m].
 SLAB_M: Final = (1.0, 0.02)
 
 
 @dataclass(frozen=True)
 class Solid:
-    """A mesh in the frame of what carries it."""
+    """A mesh in the frame of its carrier."""
 
     name: str
     vertices: Floats
@@ -83,11 +81,11 @@ class Solid:
     colour: Colour
     """Linear RGB, 0 .. 1."""
     body: int | None = None
-    """The body of the hand that carries it; None: the object, or nothing."""
+    """Body of the hand that carries it; None: the object, or nothing."""
 
 
 def hand_meshes(found: Executions) -> list[Solid]:
-    """One for each body of the hand that is seen, in the body's frame."""
+    """Return one mesh for each visible body of the hand, in the body's frame."""
     hand = found.hand
     return [
         Solid(
@@ -103,14 +101,14 @@ def hand_meshes(found: Executions) -> list[Solid]:
 
 
 def object_mesh(found: Executions) -> Solid:
-    """The object in its own frame."""
+    """Return the object's mesh in its own frame."""
     return Solid(
         plain_name(found.obj.name), found.obj.vertices, found.obj.faces, found.obj.corner_normals, OBJECT_COLOUR
     )
 
 
 def support_meshes(found: Executions) -> list[Solid]:
-    """The supports in the frame of the scene; half-spaces as slabs about the objects."""
+    """Return the supports in the frame of the scene; half-spaces as slabs around the objects."""
     supports = () if found.placed is None else found.placed.supports
     middle = found.object_pose[:, :3].mean(axis=0)
     return [_support(f"support_{k}", _corners(one, middle)) for k, one in enumerate(supports)]
@@ -135,7 +133,7 @@ def _corners(support: Obstacle, middle: Floats) -> Floats:
 
 
 def _name_of(hand: HandModel, number: int) -> str:
-    """A body's name; its second solid and those after it are numbered."""
+    """Return a body's name; its second and later solids are numbered."""
     bodies = drawn_bodies(hand)
     before = bodies[:number].count(bodies[number])
     return hand.body_names[bodies[number]] + (f"_{before + 1}" if before else "")
@@ -183,13 +181,13 @@ def write_usd(bundle: Bundle, folder: Path) -> list[Path]:
 
 
 def _bodies(found: Executions, trajectory: RobotTrajectory) -> Floats:
-    """(K, L, 7) bodies of the hand at each point; the hand's joints are the last of the trajectory's."""
+    """Return (K, L, 7) hand bodies at each point; the hand's joints are the trajectory's last ones."""
     joints = trajectory.joints[:, -len(found.hand.joint_names) :]
     return body_poses(found.hand, trajectory.hand_pose, joints)
 
 
 def _object_poses(found: Executions, row: int, trajectory: RobotTrajectory) -> Floats:
-    """(K, 7) of the object: at rest, then carried by the lift."""
+    """Return (K, 7) object poses: at rest, then carried by the lift."""
     poses = np.tile(found.object_pose[row], (len(trajectory.time), 1))
     lifting = np.array([phase == "lift" for phase in trajectory.phase])
     start = found.postures["squeeze"].hand_pose[row, :3]

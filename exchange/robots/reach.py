@@ -1,7 +1,7 @@
-"""Grasps that an arm can carry out: inverse kinematics along the trajectory, joint limits, collisions in MuJoCo.
+"""Grasps that an arm can execute: inverse kinematics along the trajectory, limits, MuJoCo collisions.
 
-Differential inverse kinematics by mink: each step is a quadratic program in the joints' increments that holds their
-limits. From one pose of the way to the next the arm must move on without a jump.
+Differential inverse kinematics by mink: each step is a quadratic program in the joints' increments that respects their
+limits. Between consecutive poses of the trajectory the arm must not jump.
 """
 
 from __future__ import annotations
@@ -26,28 +26,28 @@ from graspd.worker.simulation.environment import Obstacle
 from graspd.worker.validation.decomposition import ConvexPieces
 from graspd.worker.validation.model import add_shape
 
-#: The hand is where it should be within this [m, rad].
+#: Tolerance of the hand's pose [m, rad].
 NEAR_M: Final = 1e-4
 NEAR_RAD: Final = 1e-3
-#: Postures from which the arm sets out to find the grasp, and steps of each search.
+#: Start postures of the arm in the search for the grasp, and steps of each search.
 STARTS: Final = 24
 STEPS: Final = 80
-#: Farthest that a joint moves from one point of the way to the next, 5 mm [rad or m].
+#: Largest motion of a joint between consecutive points of the trajectory, 5 mm apart [rad or m].
 JUMP: Final = 0.25
-#: Points of the two long motions, and of those in which mainly the fingers move.
+#: Points of the two long motions, and of those that mainly move the fingers.
 LONG: Final = 21
 SHORT: Final = 5
 _LONG_PHASES: Final = ("approach", "lift")
-#: Why an arm does not carry out a grasp.
+#: Reasons why an arm cannot execute a grasp.
 REASONS: Final = ("out of reach", "way not possible", "collision")
 
 
 @dataclass
 class ReachResult:
-    """What an arm can do of N grasps."""
+    """Executable grasps of N."""
 
     rows: list[int] = field(default_factory=list)
-    """Those that it carries out, of the N."""
+    """Indices of the executable grasps."""
     paths: list[list[Path]] = field(default_factory=list)
     """Their motions; joints are the arm's, then the hand's."""
     refused: Counter[str] = field(default_factory=Counter)
@@ -61,10 +61,10 @@ class ReachResult:
 
 
 class ReachSearch:
-    """Searches the ways of one arm with one hand around one object. Not for several threads at once."""
+    """Searches motions of one arm with one hand around one object. Not thread-safe."""
 
     def __init__(self, arm: Arm, base: Floats, found: Executions, pieces: ConvexPieces) -> None:
-        """Raises InputError where mink is not installed."""
+        """Raise InputError if mink is not installed."""
         try:
             import mink
         except ImportError:
@@ -80,7 +80,7 @@ class ReachSearch:
         self._order = np.array([int(self._model.joint(f"arm{b}").qposadr[0]) for b in arm.model.joint_body], np.intp)
 
     def all(self, wanted: int = 0, run: ExecutionContext = DEFAULT_CONTEXT) -> ReachResult:
-        """All grasps, or in their order until so many are found."""
+        """Search all grasps, or in order until `wanted` are found."""
         reached = ReachResult()
         for row in range(len(self.found)):
             run.check("the search of an arm's ways")
@@ -97,7 +97,7 @@ class ReachSearch:
         return reached
 
     def one(self, row: int) -> tuple[list[Path] | None, str]:
-        """The motions of one grasp, or why there are none: the reason of the start that got farthest."""
+        """Return the motions of one grasp, or the reason of the start that got farthest."""
         long, short = (straight_paths(self.found, row, points) for points in (LONG, SHORT))
         ways = [a if a.phase in _LONG_PHASES else b for a, b in zip(long, short, strict=True)]
         rng, farthest, reason = np.random.default_rng(row), -1, ""
@@ -114,7 +114,7 @@ class ReachSearch:
         return None, reason
 
     def _from(self, q: Floats, ways: list[Path], row: int) -> tuple[list[Path] | None, str]:
-        """The motions from one start, or why there are none."""
+        """Return the motions from one start, or the reason why there are none."""
         approach, *others = ways
         arrived = self._solve(q, approach.hand_pose[-1], STEPS)
         if arrived is None:
@@ -137,7 +137,7 @@ class ReachSearch:
         ], ""
 
     def _follow(self, q: Floats, poses: Floats) -> Floats | None:
-        """(M, A) dofs along root poses (M, 7) of the hand, the first of which q has; None: not without a jump."""
+        """Return (M, A) dofs along root poses (M, 7) of the hand, from q at the first; None after a jump."""
         rows = [q]
         for pose in poses[1:]:
             onward = self._solve(rows[-1], pose, STEPS // 4)
@@ -147,7 +147,7 @@ class ReachSearch:
         return np.array(rows)
 
     def _solve(self, q: Floats, root_pose: Floats, steps: int) -> Floats | None:
-        """Dofs (A,) that put the hand's root link at a pose (7,), within the limits; None: not found from q."""
+        """Return dofs (A,) within limits that reach a pose (7,) of the hand's root link; None if not found."""
         mink, configuration, task = self._mink, self._configuration, self._task
         full = np.zeros(self._model.nq)
         full[self._order] = self.arm.model.expand(q)
@@ -173,7 +173,7 @@ class ReachSearch:
         return bool((q >= arm.lower - 1e-6).all() and (q <= arm.upper + 1e-6).all())
 
     def _collision(self, joined: list[Floats], ways: list[Path], row: int) -> str:
-        """The first two bodies that meet on the way; empty: none do."""
+        """Return the first colliding pair of bodies on the trajectory; empty without collision."""
         rest = np.asarray(self.found.object_pose[row], float)
         for arm, path in zip(joined, ways, strict=True):
             for q, joints, pose in zip(arm, path.joints, path.hand_pose, strict=True):
@@ -185,18 +185,18 @@ class ReachSearch:
         return ""
 
 
-#: Pairs of bodies that touch in this share of random postures cannot be apart: their hulls are larger than they are.
+#: Pairs of bodies in contact in this share of random postures are excluded: their hulls exceed their meshes.
 ALWAYS: Final = 0.95
 SAMPLES: Final = 100
 #: Name of the frame that carries the hand.
 MOUNT: Final = "mount"
-#: The arm meets everything; the hand, the object and supports meet the arm alone: the rest was looked at before.
+#: The arm collides with everything; hand, object and supports with the arm alone, the rest was checked before.
 _ARM: Final = {"contype": 1, "conaffinity": 1}
 _OTHER: Final = {"contype": 0, "conaffinity": 1}
 
 
 def arm_spec(arm: Arm, base: Floats) -> Any:
-    """The arm alone, its base at a pose (7,), with a site `mount` where the hand's root link is."""
+    """Return the arm alone, its base at a pose (7,), with a site `mount` at the hand's root link."""
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
     spec.memory = ARENA
@@ -211,7 +211,7 @@ def arm_spec(arm: Arm, base: Floats) -> Any:
 
 
 class ArmScene:
-    """The arm with its hand among what stands around it. Not for several threads at once."""
+    """The arm with its hand in its environment. Not thread-safe."""
 
     def __init__(
         self, arm: Arm, base: Floats, hand: HandModel, pieces: ConvexPieces, supports: Sequence[Obstacle]
@@ -233,7 +233,7 @@ class ArmScene:
         self.hand_qpos = _addresses(self.model, hand, "hand")
 
     def touches(self, arm_joints: Floats, hand_joints: Floats, object_pose: Floats) -> str:
-        """What runs into what at arm dofs (A,), hand joints (J,) and an object pose (7,); empty: nothing."""
+        """Return the collision at arm dofs (A,), hand joints (J,) and an object pose (7,); empty if none."""
         self._put(self.model, self.data, arm_joints, hand_joints)
         self.data.mocap_pos[0], self.data.mocap_quat[0] = object_pose[:3], object_pose[3:]
         mujoco.mj_kinematics(self.model, self.data)
@@ -244,7 +244,7 @@ class ArmScene:
         return ""
 
     def qpos(self, arm_joints: Floats, hand_joints: Floats) -> Floats:
-        """The model's coordinates."""
+        """Return the model's coordinates."""
         found = np.zeros(self.model.nq)
         found[self.arm_qpos] = self.arm.model.expand(arm_joints)
         found[self.hand_qpos] = hand_joints
@@ -272,7 +272,7 @@ class ArmScene:
             mujoco.mju_quatZ2Vec(geom.quat, normal)
 
     def _exclude_what_always_touches(self) -> None:
-        """As MoveIt's setup does: pairs of bodies of arm and hand that touch in nearly all of many random postures."""
+        """Exclude body pairs in contact in nearly all random postures, as in MoveIt's setup."""
         model = self.spec.compile()
         data, rng = mujoco.MjData(model), np.random.default_rng(0)
         arm, hand = self.arm.model, self.hand
@@ -287,13 +287,13 @@ class ArmScene:
             for pair in pairs:
                 count[pair] = count.get(pair, 0) + 1
         for (a, b), times in sorted(count.items()):
-            # The first link turns where the base stands; any other that is always in a support says that the base is.
+            # The first link turns at the base; any other link that is always in a support means a wrong base.
             if times >= ALWAYS * SAMPLES and (a or model.body(b).name == "arm1"):
                 self.spec.add_exclude(bodyname1=model.body(a).name, bodyname2=model.body(b).name)
 
 
 def _add_tree(spec: Any, root: Any, model: HandModel, prefix: str, contact: dict[str, int]) -> list[Any]:
-    """Bodies with joints and shapes below `root`, which is body 0."""
+    """Add bodies with joints and shapes below `root`, which is body 0."""
     bodies = [root]
     for b in range(1, model.bodies):
         pose = model.origin[b]
@@ -308,7 +308,7 @@ def _add_tree(spec: Any, root: Any, model: HandModel, prefix: str, contact: dict
             range=ends,
             limited=mujoco.mjtLimited.mjLIMITED_TRUE,
         )
-        # Nothing is simulated: any mass will do.
+        # Nothing is simulated: any mass is valid.
         body.mass, body.inertia, body.ipos, body.explicitinertial = 1.0, np.full(3, 1e-2), np.zeros(3), True
         bodies.append(body)
     for k, piece in enumerate(model.pieces):

@@ -1,13 +1,13 @@
-"""Replay exported grasps in MuJoCo and validate them: a script that needs mujoco and numpy, and nothing of graspd.
+"""Replay exported grasps in MuJoCo and validate them; needs mujoco and numpy, but not graspd.
 
-    python replay.py scene.xml                 every grasp, a line each
+    python replay.py scene.xml                 every grasp, one line each
     python replay.py scene.xml --view [NAME]   watch one
     python replay.py scene.xml --json
 
-Each grasp has six key frames in the scene: standoff, arrival, pregrasp, grasp, squeeze, lift. The hand must touch
-nothing while it comes, closes in 0.8 s, and then: where gravity pulls, it rises within 0.4 s and holds for 2 s; else
-the object is pushed with ten times its mass in newton in six directions for 2 s each. The object may end 5 cm and 15
-degrees from where it should be. Without --full a hold ends as soon as the object's present rates keep it there for 2 s.
+Each grasp has six key frames in the scene: standoff, arrival, pregrasp, grasp, squeeze, lift. The hand must not touch
+anything during its approach, and closes in 0.8 s. With gravity it then rises within 0.4 s and holds for 2 s; else the
+object is pushed with ten times its mass in newton in six directions for 2 s each. The object may end 5 cm and 15
+degrees from its goal. Without --full a hold ends as soon as the object's present rates keep it there for 2 s.
 """
 
 import argparse
@@ -57,7 +57,7 @@ class Replay:
         mujoco.mj_resetDataKeyframe(self.model, self.data, self.key(grasp, posture).id)
 
     def validate(self, grasp: str) -> str:
-        """What becomes of a grasp: `held`, or what went wrong."""
+        """Return the result of a grasp: `held`, or the failure."""
         self.reset(grasp, "pregrasp")
         start = self.data.qpos[self.at : self.at + 7].copy()
         mujoco.mj_forward(self.model, self.data)
@@ -86,7 +86,7 @@ class Replay:
         return "held"
 
     def moved_neighbour(self, grasp: str) -> bool:
-        """Whether a neighbour is not where it stood, or has toppled; it may turn about the vertical."""
+        """Check whether a neighbour moved or toppled; it may turn about the vertical."""
         up = np.array([0.0, 0.0, 1.0])
         for at in self.neighbours:
             then, now = self.key(grasp, "pregrasp").qpos[at : at + 7], self.data.qpos[at : at + 7]
@@ -99,7 +99,7 @@ class Replay:
         return False
 
     def move(self, grasp: str, a: str, b: str) -> None:
-        """Command the way from one key frame's targets to another's."""
+        """Command the path from one key frame's targets to another's."""
         first, last = self.key(grasp, a), self.key(grasp, b)
         for stage in range(1, STAGES + 1):
             share = stage / STAGES
@@ -109,8 +109,7 @@ class Replay:
             self.run(STAGE_S)
 
     def hold(self, goal: Any) -> str:
-        """As the validator holds: over as soon as the present rates keep the object in half of its limits to the
-        end."""
+        """Hold as the validator does: end once the present rates keep the object in half of its limits."""
         self.run(FIRST_LOOK_S - LOOK_S)
         elapsed, before = FIRST_LOOK_S - LOOK_S, self.offset(goal)
         while elapsed < HOLD_S - 1e-9:
@@ -130,7 +129,7 @@ class Replay:
         return "held"
 
     def offset(self, goal: Any) -> tuple[Any, float]:
-        """(3,) from where the object's own frame, the mesh's, should be [m], and how far it is turned [rad]."""
+        """Return (3,) offset of the mesh frame from its goal [m], and its rotation [rad]."""
         origin = self.model.site("object_frame").pos
         now = self.data.qpos[self.at : self.at + 7]
         places = []
@@ -155,7 +154,7 @@ class Replay:
         return bool(self.of_hand[contact.geom].any())
 
     def touches(self, grasp: str) -> bool:
-        """Whether the open hand on its way reaches into the object or anything else."""
+        """Check whether the open hand penetrates the object or anything else during its approach."""
         for a, b, looks in (("standoff", "arrival", WAY_LOOKS), ("arrival", "pregrasp", CLOSING_LOOKS)):
             first, last = self.key(grasp, a), self.key(grasp, b)
             for look in range(looks):
@@ -179,7 +178,7 @@ class Replay:
         return False
 
     def allowed(self, pair: Any) -> float:
-        """How deep the coming hand may be in the other of two geoms [m]; fingertips may press into some supports."""
+        """Return the allowed depth of a pair of geoms in the approach [m]; some supports allow fingertips."""
         if self.of_object[pair].any():
             return OVERHANG_M
         tips, pressing = self.model.geom_user[pair].T
@@ -187,7 +186,7 @@ class Replay:
 
 
 def slerp(a: Any, b: Any, share: float) -> Any:
-    """Quaternion a share of the way from a to b."""
+    """Return the quaternion at a share of the path from a to b."""
     b = b if a @ b >= 0 else -b
     angle = math.acos(min(1.0, float(a @ b)))
     if angle < 1e-6:
@@ -198,7 +197,7 @@ def slerp(a: Any, b: Any, share: float) -> Any:
 
 
 def view(path: str, name: str) -> None:
-    """Play one grasp over and over in MuJoCo's own window."""
+    """Play one grasp repeatedly in MuJoCo's window."""
     import mujoco.viewer
 
     replay = Replay(path, full=True)

@@ -1,13 +1,11 @@
-"""Grasps as text files: three tables of comma-separated values, and the grasp file of Isaac Sim (`isaac_grasp`, version
-1.0).
+"""Grasps as text files: three CSV tables, and Isaac Sim's grasp file (`isaac_grasp`, version 1.0).
 
-Poses are those of the tool frame: x y z [m], unit quaternion qw qx qy qz. Joints are radians or metres, in columns that
-bear their names.
+In the tables, poses are the tool frame's: x y z [m], unit quaternion qw qx qy qz. Joint columns [rad or m] are named.
 
-A grasp is the pose of the gripper's frame in the object's: position [m], quaternion w and xyz; `cspace_position` are
-the joints that hold, `pregrasp_cspace_position` those before. Joints that the URDF couples are left out. The two frames
-are told to people only; Isaac Sim's page calls them `..._frame_link`, that of Isaac ROS `..._frame`: both stand there.
-Commanded joints that press, and the way, are under a key of our own, which readers pass over.
+In Isaac Sim's file, a grasp is the pose of the gripper's frame in the object's: position [m], quaternion w and xyz;
+`cspace_position` are the joints that hold, `pregrasp_cspace_position` those before. Joints that the URDF couples are
+omitted. Names of the two frames are informative; Isaac Sim uses `..._frame_link`, Isaac ROS `..._frame`, so both are
+written. Pressing joint commands and trajectories are under our own key, which readers ignore.
 """
 
 from __future__ import annotations

@@ -1,1 +1,1 @@
-"""The index: SQL rows derived from the store, made to answer the API fast."""
+"""The index: SQL rows derived from the store, for fast answers of the API."""

@@ -1,4 +1,4 @@
-"""Many rows in one statement: PostgreSQL takes them as one JSON document, SQLite one after the other in no time."""
+"""Bulk writes: PostgreSQL gets the rows as one JSON document, SQLite one by one, which is fast there."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from sqlalchemy import Connection, Table, TextClause, bindparam, text, update
 from sqlalchemy.dialects import sqlite
 
 Row = Mapping[str, Any]
-#: Rows of one statement: some megabytes of text.
+#: Rows per statement: some megabytes of text.
 _ROWS: Final = 10_000
 
 
 def upsert(connection: Connection, table: Table, rows: Sequence[Row], *, keep: Sequence[str] = ()) -> None:
-    """Insert rows; where the primary key is there, update all columns given but those in `keep`.
+    """Insert rows; for existing primary keys update all given columns except `keep`.
 
-    All rows name the same columns. Of two with one key the last counts.
+    All rows have the same columns. The last of two rows with one key counts.
     """
     if not rows:
         return
@@ -29,7 +29,7 @@ def upsert(connection: Connection, table: Table, rows: Sequence[Row], *, keep: S
         _in_parts(connection, statement, once)
         return
     keys = [column.name for column in table.primary_key]
-    # One statement run for many rows: a statement that spells out a thousand rows takes longer to build than to run.
+    # One statement run for many rows: to build a statement with a thousand rows takes longer than to run it.
     insert: Any = sqlite.insert(table)
     changed = {name: insert.excluded[name] for name in rows[0] if name not in keys and name not in keep}
     if changed:
@@ -40,7 +40,7 @@ def upsert(connection: Connection, table: Table, rows: Sequence[Row], *, keep: S
 
 
 def update_rows(connection: Connection, table: Table, rows: Sequence[Row], *, state: str) -> None:
-    """Set columns of the rows whose `id` is given, where their column `state` still is that one."""
+    """Update rows by `id`, if their column `state` still has that value."""
     if not rows:
         return
     if connection.dialect.name == "postgresql":
@@ -79,7 +79,7 @@ def _update_postgresql(table: Table, names: tuple[str, ...]) -> TextClause:
 
 
 def _given(table: Table) -> str:
-    """The document as rows of the table's own type, which checks each value."""
+    """Return the document as rows of the table's own type, which checks each value."""
     return f"json_populate_recordset(NULL::{_quoted(table.name)}, CAST(:rows AS json)) AS given"
 
 

@@ -1,8 +1,8 @@
-"""Connection to the index database: SQLite in WAL mode or PostgreSQL, whose tables are made when it is first opened.
+"""Connection to the index database, SQLite in WAL mode or PostgreSQL; makes tables at the first open.
 
-There are no migrations: the index follows from the store. `graspd admin index rebuild` makes one of another revision
-anew. Columns of metrics that the table of grasps lacks are added when it is opened, so a new metric needs no other
-revision. Grasps whose shards lack it hold NULL. A column whose metric is gone stays.
+There are no migrations, because the index follows from the store. `graspd admin index rebuild` replaces one of another
+revision. Missing columns of metrics are added at the open, so a new metric needs no new revision. Grasps whose shards
+lack it have NULL. The column of a removed metric stays.
 """
 
 from __future__ import annotations
@@ -27,19 +27,19 @@ from graspd.service.model.metrics import indexed
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")
-#: Revision of `service.index.tables`: another number for every change of them but for new metrics.
+#: Revision of `service.index.tables`: it changes with every change of the tables except for new metrics.
 REVISION: Final = "0021"
-#: Table that names the revision. A graspd of 0.2 reads it, and refuses an index of a revision that it does not know.
+#: Table with the revision. A graspd of 0.2 reads it, and refuses an index of an unknown revision.
 REVISION_TABLE: Final = "alembic_version"
-#: A job of a million grasps is one transaction of a few seconds; others wait for it.
+#: A job of a million grasps is one transaction of a few seconds, for which others wait.
 _BUSY_TIMEOUT_S: Final = 20.0
-#: Key of PostgreSQL's advisory lock that lets one process make tables at a time: the letters "grsp".
+#: Key of PostgreSQL's advisory lock for making tables, one process at a time: the letters "grsp".
 _TABLES_LOCK: Final = 0x67727370
-#: Of the one that lets one process write at a time; it ends with its transaction: the letters "grsq".
+#: Key of the lock for writing, one process at a time; it ends with its transaction: the letters "grsq".
 _TURN_LOCK: Final = 0x67727371
-#: What SQLAlchemy raises for a URL.
+#: Exceptions of SQLAlchemy for an unusable URL.
 UNUSABLE: Final = (ArgumentError, NoSuchModuleError, ModuleNotFoundError, ValueError)
-#: Codes of SQLite for a file whose content makes no sense.
+#: Codes of SQLite for a file with invalid content.
 _DAMAGED: Final = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 
 
@@ -51,16 +51,16 @@ class Database:
 
         Args:
             url: an SQLAlchemy URL.
-            anew: drop the tables of another revision and make those of this one; the rows are to follow.
+            anew: replace the tables of another revision; the caller adds the rows.
 
         Raises:
             InputError: the URL names no known database.
-            IndexUnavailable: the database does not answer, cannot be written, or is of another revision.
+            IndexUnavailable: the database is unavailable or read-only, or is of another revision.
         """
         self._url = url
         self._anew = anew
         self.was = ""
-        """Revision of the tables that were dropped, if any were."""
+        """Revision of the dropped tables, if any."""
         self._file = _file_of(url)
         self._write_lock = threading.Lock()
         self._opening = threading.Lock()
@@ -73,7 +73,7 @@ class Database:
 
     @contextmanager
     def reading(self) -> Iterator[Connection]:
-        """A connection for queries, which all see the same moment."""
+        """Yield a connection for queries, which all see the same snapshot."""
         with self._fixed(), self._present().connect() as connection:
             if connection.dialect.name == "sqlite":
                 connection.exec_driver_sql("BEGIN")
@@ -83,17 +83,17 @@ class Database:
 
     @contextmanager
     def writing(self, within: Connection | None = None) -> Iterator[Connection]:
-        """A transaction, or part of the one given: all of it is kept or nothing. Writers take turns, on every database.
+        """Yield a transaction, or the given one: all of it is committed or nothing. Writers take turns.
 
-        States are derived from facts that are read in the same transaction: two of these at once would each miss what
-        the other brings.
+        Writers take turns because states are derived from facts read in the same transaction: two concurrent ones would
+        each miss the other's facts.
         """
         if within is not None:
             yield within
             return
         with self._fixed(), self._write_lock, self._present().connect() as connection:
             if connection.dialect.name == "sqlite":
-                # A transaction that reads first and writes later fails at once when another one wrote in between.
+                # A transaction that reads before it writes fails at once if another one writes in between.
                 connection.exec_driver_sql("BEGIN IMMEDIATE")
             else:
                 connection.exec_driver_sql(f"SET LOCAL lock_timeout = '{_BUSY_TIMEOUT_S:g}s'")
@@ -102,24 +102,24 @@ class Database:
             connection.commit()
 
     def ping(self) -> float:
-        """Seconds a query takes."""
+        """Return the seconds that a query takes."""
         start = time.perf_counter()
         with self.reading() as connection:
             connection.execute(text("SELECT 1"))
         return time.perf_counter() - start
 
     def close(self) -> None:
-        """Give the connections back."""
+        """Close the connections."""
         self._engine.dispose()
 
     def set_aside(self) -> None:
-        """Begin with an empty index: the file of this one is moved away. Nothing happens where it is no file."""
+        """Move the file of the index away and start with an empty one; do nothing without a file."""
         if self._file is not None:
             self._put_aside()
             self._present()
 
     def _open(self) -> Engine:
-        """An engine on the present file, which is made if need be."""
+        """Return an engine on the present file, which is made if needed."""
         engine = _engine(self._url)
         try:
             with mapped(), self._file.opening() if self._file is not None else nullcontext():
@@ -135,7 +135,7 @@ class Database:
         self._identity = self._file.identity() if self._file is not None else None
 
     def _present(self) -> Engine:
-        """The engine; another one where the file was removed or exchanged meanwhile."""
+        """Return the engine; a new one if the file was removed or replaced meanwhile."""
         if self._file is not None and self._file.identity() != self._identity:
             with self._opening:
                 if self._file.identity() != self._identity:
@@ -146,7 +146,7 @@ class Database:
 
     @contextmanager
     def _fixed(self) -> Iterator[None]:
-        """Errors as ours; a damaged file is put aside, so that the next call finds a new one."""
+        """Convert errors; move a damaged file away, so that the next call makes a new one."""
         try:
             with mapped():
                 yield
@@ -161,12 +161,12 @@ class Database:
 
 
 def chunks(ids: Sequence[T], size: int = 1000) -> Iterable[Sequence[T]]:
-    """Ids in parts that a statement may name: databases bound the number of its parameters."""
+    """Yield ids in parts for one statement each: databases limit the number of parameters."""
     return (ids[start : start + size] for start in range(0, len(ids), size))
 
 
 def _file_of(url: str | URL) -> SqliteFile | None:
-    """The file of an SQLite index; None for another database, and for one in memory."""
+    """Return the file of an SQLite index; None for another database or one in memory."""
     try:
         parsed = make_url(url)
     except UNUSABLE:
@@ -186,8 +186,7 @@ def _engine(url: str | URL) -> Engine:
 
 
 def unusable(error: Exception) -> InputError:
-    """What is told of an index URL that cannot be used. What SQLAlchemy says of how it is written may hold a part of
-    the password."""
+    """Return the error for an unusable index URL, without SQLAlchemy's text, which may contain a password."""
     why = f" ({_line(error)})" if isinstance(error, NoSuchModuleError | ModuleNotFoundError) else ""
     return InputError(
         f"the index URL (GRASPD_INDEX_URL) cannot be used{why}; give sqlite:///PATH or "
@@ -196,13 +195,13 @@ def unusable(error: Exception) -> InputError:
 
 
 def connect_postgres(url: str | URL) -> Engine:
-    """An engine that refuses a database whose encoding is not UTF-8, and makes no tables."""
+    """Return an engine that refuses encodings other than UTF-8, and makes no tables."""
     engine = create_engine(url, pool_pre_ping=True, pool_size=5, max_overflow=10)
 
-    # Before SQLAlchemy looks at the connection: it cannot read what a database of SQL_ASCII says, which comes as bytes.
+    # Before SQLAlchemy inspects the connection: it fails on SQL_ASCII databases, which return bytes.
     @event.listens_for(engine, "connect", insert=True)
     def _is_utf8(connection: Any, _record: Any) -> None:
-        info = getattr(connection, "info", None)  # other drivers than psycopg have none
+        info = getattr(connection, "info", None)  # only psycopg has it
         if info is not None and (encoding := info.parameter_status("server_encoding")) != "UTF8":
             raise InputError(
                 f"the database of the index has encoding {encoding}, and names need UTF-8; make one by "
@@ -224,7 +223,7 @@ def _sqlite_engine(url: str | URL, database: str | None) -> Engine:
 
     @event.listens_for(engine, "connect")
     def _pragmas(connection: Any, _record: Any) -> None:
-        connection.isolation_level = None  # transactions begin where `writing` says
+        connection.isolation_level = None  # transactions start only in `writing`
         for pragma in ("journal_mode=WAL", "synchronous=NORMAL", "foreign_keys=ON", "temp_store=MEMORY"):
             connection.execute(f"PRAGMA {pragma}")
 
@@ -232,7 +231,7 @@ def _sqlite_engine(url: str | URL, database: str | None) -> Engine:
 
 
 def _make_tables(engine: Engine, *, anew: bool) -> str:
-    """Make what is not there; the revision of what was dropped for it, else ""."""
+    """Make missing tables; return the revision of dropped ones, else ""."""
     dropped = ""
     with _making(engine) as connection:
         found = revision_of(connection)
@@ -253,7 +252,7 @@ def _make_tables(engine: Engine, *, anew: bool) -> str:
 
 
 def revision_of(connection: Connection) -> str:
-    """Revision of the tables of a database; "" where it has none yet."""
+    """Return the revision of a database's tables; "" if it has none yet."""
     if not inspect(connection).has_table(REVISION_TABLE):
         return ""
     return str(connection.scalar(text(f"SELECT version_num FROM {REVISION_TABLE}")) or "")
@@ -269,7 +268,7 @@ def _of_another_revision(found: str) -> str:
 
 @contextmanager
 def _making(engine: Engine) -> Iterator[Connection]:
-    """A transaction while no other process makes tables; all of it is kept or nothing."""
+    """Yield a transaction while no other process makes tables; all of it is committed or nothing."""
     with engine.connect() as connection:
         if connection.dialect.name == "postgresql":
             connection.execute(text("SELECT pg_advisory_lock(:key)"), {"key": _TABLES_LOCK})
@@ -280,18 +279,18 @@ def _making(engine: Engine) -> Iterator[Connection]:
             connection.commit()
         finally:
             if connection.dialect.name == "postgresql":
-                connection.rollback()  # what broke off, or the lock could not be given back
+                connection.rollback()  # it failed, or the lock could not be released
                 connection.execute(text("SELECT pg_advisory_unlock(:key)"), {"key": _TABLES_LOCK})
                 connection.commit()
 
 
 @contextmanager
 def mapped() -> Iterator[None]:
-    """Errors of the database as ours: InputError, IndexDamaged, IndexUnavailable."""
+    """Convert errors of the database: InputError, IndexDamaged, IndexUnavailable."""
     try:
         yield
     except DataError as error:
-        # Not the database is at fault but what it was to hold: to try again would never end.
+        # The data is at fault, not the database: retries would never end.
         raise InputError(f"the index cannot hold this: {_line(error)}") from error
     except (OverflowError, UnicodeEncodeError):
         raise InputError("the index knows whole numbers below 2^63 and Unicode text; give such values") from None
@@ -309,7 +308,7 @@ def _line(error: Exception) -> str:
 
 
 def _add_missing_metrics(connection: Connection) -> list[str]:
-    """Add the columns and indexes that are missing, within the caller's transaction; the names of the columns added."""
+    """Add missing columns and indexes in the caller's transaction; return the names of the columns."""
     found = inspect(connection)
     there = {column["name"] for column in found.get_columns(grasps.name)}
     missing = [metric.name for metric in indexed() if metric.name not in there]
@@ -323,21 +322,21 @@ def _add_missing_metrics(connection: Connection) -> list[str]:
     return missing
 
 
-#: What SQLite keeps beside the file while it is open: the log of writes and its shared memory.
+#: Files that SQLite holds beside an open database: the write-ahead log and its shared memory.
 _COMPANIONS: Final = ("-wal", "-shm")
 Identity = tuple[int, int] | None
 
 
 class SqliteFile:
-    """Processes that open the file take turns, so that none meets what another is putting aside."""
+    """File of an SQLite index; a lock prevents that a process opens it while another moves it away."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
 
     def identity(self) -> Identity:
-        """Device and inode of the file that has the name now; None if there is none.
+        """Return device and inode of the file that has the name now; None if there is none.
 
-        A process that holds a file which was removed would read and write what nobody else sees.
+        A process with a removed file open would read and write data that no other process sees.
         """
         try:
             facts = self.path.stat()
@@ -347,7 +346,7 @@ class SqliteFile:
 
     @contextmanager
     def opening(self) -> Iterator[None]:
-        """Alone among processes. What a file that is gone left beside it is removed: it belongs to no other."""
+        """Hold the lock among processes. Files that belonged to a missing database are removed."""
         try:
             lock = self._beside(".lock").open("w")
         except OSError as error:
@@ -360,7 +359,7 @@ class SqliteFile:
             yield
 
     def set_aside(self, damaged: Identity) -> None:
-        """Move a damaged file out of the way, unless another process did; call it within `opening`."""
+        """Move a damaged file away, unless another process did; call it within `opening`."""
         if damaged is None or self.identity() != damaged:
             return
         suffix = f".damaged-{datetime.now(UTC):%Y%m%dT%H%M%S}"

@@ -1,4 +1,4 @@
-"""Tables of the index as Parquet files, for DuckDB, pandas and whatever else reads them."""
+"""Tables of the index as Parquet files, for DuckDB, pandas and others."""
 
 from __future__ import annotations
 
@@ -13,27 +13,27 @@ from graspd.service.index.database import Database
 from graspd.service.index.tables import assets, attempts, dataset_cells, datasets, grasps, jobs, shards, spent, tasks
 from graspd.service.parquet import schema_of, write
 
-#: What is exported. The rest is of the moment (workers, notes) or for the service alone.
+#: Exported tables. The others contain the present state (workers, notes) or internal data.
 TABLES: Final[Mapping[str, Table]] = {
     table.name: table for table in (grasps, shards, jobs, tasks, attempts, assets, datasets, dataset_cells, spent)
 }
-#: Rows of a row group, which is what one file has in memory.
+#: Rows of a row group, the part of a file in memory.
 GROUP: Final = 20_000
 
 
 def export(database: Database, folder: Path) -> dict[str, int]:
-    """Write each of `TABLES` as `folder/NAME.parquet`, all as they were at one moment; what is there is replaced.
+    """Write each of `TABLES` as `folder/NAME.parquet`, from one snapshot; replace existing files.
 
-    Whole numbers are int64, numbers float64, JSON is text; rows are in the order of their primary key.
+    Integers are int64, other numbers float64, JSON is text; rows are in the order of their primary key.
 
     Returns:
-        rows of each table.
+        number of rows of each table.
 
     Raises:
         InputError: pyarrow is not installed.
-        IndexUnavailable: the database does not answer.
+        IndexUnavailable: the database is unavailable.
     """
-    # Before the database is asked: whoever lacks the package is told at once.
+    # Before the query, so that a missing package is reported at once.
     schemas = {name: schema_of({c.name: _word(c) for c in table.columns}) for name, table in TABLES.items()}
     with database.reading() as connection:
         return {
@@ -53,6 +53,6 @@ def _groups(connection: Connection, table: Table) -> Iterator[list[dict[str, Any
 
 
 def _word(column: Column[Any]) -> str:
-    """The type of a column in the words of `service.parquet.type_of`."""
+    """Return the type of a column in the words of `service.parquet.type_of`."""
     kinds = {BigInteger: "int64", Integer: "int64", Float: "float64", Boolean: "bool_"}
     return next((word for kind, word in kinds.items() if isinstance(column.type, kind)), "text")

@@ -1,4 +1,4 @@
-"""The index as the API and the controller see it."""
+"""The index for API and controller."""
 
 from __future__ import annotations
 
@@ -23,15 +23,14 @@ from graspd.service.index.tags import Tags
 class Index:
     """SQL rows derived from the store; `url` is an SQLAlchemy URL.
 
-    Reads answer the API; writes come from the API and the controller only. Every method of every part raises
-    IndexUnavailable when the database is away. Cursors are opaque, `limit` is cut to 200; an unknown id is a
-    NotFoundError.
+    Reads answer the API; only API and controller write. Every method raises IndexUnavailable if the database is
+    unavailable. Cursors are opaque, `limit` is cut to 200; an unknown id is a NotFoundError.
     """
 
     def __init__(self, url: str | URL, *, anew: bool = False) -> None:
-        """Connect: see `Database`, also for errors."""
+        """Connect; errors as in `Database`."""
         self.database = database = Database(url, anew=anew)
-        # What is read.
+        # Read-only parts.
         self.jobs = Jobs(database)
         self.grasps = Grasps(database)
         self.shards = Shards(database)
@@ -44,17 +43,17 @@ class Index:
         self.usage = Usage(database)
         self.feed = Feed(database)
         self.dataset_feed = DatasetFeed(database)
-        # What is written.
+        # Write-only parts.
         self.write = Changes(database)
         self.write_dataset = DatasetChanges(database)
         self.live = Live(database)
         self.removals = Removals(database)
-        # What is both.
+        # Both.
         self.notes = Notes(database)
         self.damage = KnownDamage(database)
         self.outbox = Outbox(database)
         self.tags = Tags(database)
 
     def close(self) -> None:
-        """Give the connections back."""
+        """Close the connections."""
         self.database.close()

@@ -1,5 +1,4 @@
-"""What the index knows of itself and of the store: whether it is complete, how far the store was read, which objects
-are damaged."""
+"""Notes on the state of index and store: completeness, progress of the scan, damaged objects."""
 
 from __future__ import annotations
 
@@ -20,66 +19,66 @@ _CHANGES: Final = "changes"
 _MARK: Final = "mark"
 _SCAN_TURN: Final = "integrity scan turn"
 _SERVICE: Final = "service"
-#: Names of records that are kept; the count is of all.
+#: Stored names of records; the count includes all.
 _NAMED: Final = 50
 
 
 @dataclass(frozen=True)
 class IndexCompleteness:
-    """How an index came to hold all that the store says, or all but what could not be read."""
+    """How an index became complete, perhaps except for unreadable records."""
 
     at: str
     left_out: int = 0
     """Damaged records of the store that are not in the index."""
     names: tuple[str, ...] = ()
-    """The first of them."""
+    """The first of their names."""
 
 
 @dataclass(frozen=True)
 class StoreMark:
-    """What tells whether the index is as old as the store."""
+    """Mark by which index and store are compared in age."""
 
     mark: str = ""
-    """Mark that both have; empty: none yet."""
+    """Mark that both have; empty if there is none yet."""
     before: str = ""
-    """The store's mark while it gets that one; then the same."""
+    """Previous mark of the store during an update; otherwise the same."""
     changes: int = 0
-    """Changes that there were then."""
+    """Number of changes at that time."""
 
 
 @dataclass(frozen=True)
 class ScanNote:
-    """How far the controller has read through the store in this round."""
+    """Progress of the controller's scan of the store in this round."""
 
     started: str = ""
     ended: str = ""
-    """Empty while the round goes on."""
+    """End of the round; empty while it runs."""
     folder: int = 0
-    """Place in the list of folders."""
+    """Position in the list of folders."""
     after: str = ""
-    """Key up to which it has read that folder."""
+    """Last scanned key of that folder."""
 
 
 @dataclass(frozen=True)
 class Notes:
-    """Notes of the service to itself."""
+    """Notes of the service for itself."""
 
     database: Database
 
     def completeness(self) -> IndexCompleteness | None:
-        """None while the index may lack what the store has: it is new, and was not made from the store yet."""
+        """Return the completeness, None while a new index may lack records of the store."""
         with self.database.reading() as connection:
             value: Any = connection.scalar(select(notes.c.value).where(notes.c.name == _REBUILT))
         return None if value is None else IndexCompleteness(value["at"], value["left_out"], tuple(value["names"]))
 
     def set_complete(self, left_out: Sequence[str] = (), *, within: Connection | None = None) -> None:
-        """From now on the index holds all that the store says, but for these records."""
+        """Mark the index as complete, except for these records."""
         value = {"at": timestamp(), "left_out": len(left_out), "names": list(left_out[:_NAMED])}
         with self.database.writing(within) as connection:
             upsert(connection, notes, [{"name": _REBUILT, "value": value}])
 
     def service(self, *, within: Connection | None = None) -> str | None:
-        """Identity of the service that the index belongs to; None in a new one."""
+        """Return the id of the index's service; None for a new one."""
         query = select(notes.c.value).where(notes.c.name == _SERVICE)
         if within is not None:
             value: Any = within.scalar(query)
@@ -89,8 +88,7 @@ class Notes:
         return None if value is None else str(value["id"])
 
     def name_service(self, identity: str, *, instead: bool = False) -> str:
-        """Say which service the index belongs to, where nobody said it before or `instead` of that; the one that
-        counts now."""
+        """Set the id of the index's service if it has none, or `instead` of it; return the valid one."""
         with self.database.writing() as connection:
             known = None if instead else self.service(within=connection)
             if known is None:
@@ -98,23 +96,23 @@ class Notes:
         return known or identity
 
     def set_incomplete(self) -> None:
-        """The index may lack what the store has; the controller makes it anew."""
+        """Mark the index as incomplete; the controller rebuilds it."""
         with self.database.writing() as connection:
             connection.execute(delete(notes).where(notes.c.name == _REBUILT))
 
     def count_change(self, *, within: Connection) -> None:
-        """A user's record was put: the index is another one than before."""
+        """Count a change: a user's record was put."""
         number = int(within.scalar(select(notes.c.value).where(notes.c.name == _CHANGES)) or 0)
         upsert(within, notes, [{"name": _CHANGES, "value": number + 1}])
 
     def changes(self) -> int:
-        """How many of these there were."""
+        """Return the number of changes."""
         with self.database.reading() as connection:
             value: Any = connection.scalar(select(notes.c.value).where(notes.c.name == _CHANGES))
         return int(value or 0)
 
     def marked(self) -> StoreMark:
-        """The mark of the index."""
+        """Return the mark of the index."""
         with self.database.reading() as connection:
             value: Any = connection.scalar(select(notes.c.value).where(notes.c.name == _MARK))
         return StoreMark(**value) if value else StoreMark()
@@ -124,7 +122,7 @@ class Notes:
             upsert(connection, notes, [{"name": _MARK, "value": asdict(marked)}])
 
     def scan_note(self) -> ScanNote:
-        """How far the controller has read through the store; nothing read yet: a note of defaults."""
+        """Return the progress of the scan; defaults before the first one."""
         with self.database.reading() as connection:
             value: Any = connection.scalar(select(notes.c.value).where(notes.c.name == _SCAN))
         return ScanNote(**value) if value else ScanNote()
@@ -134,12 +132,12 @@ class Notes:
             upsert(connection, notes, [{"name": _SCAN, "value": asdict(note)}])
 
     def take_scan_turn(self, holder: str, *, is_controller: bool, lasts_s: float) -> bool:
-        """Take or keep the right to read through the whole store; False: somebody else has it.
+        """Take or renew the right to read through the whole store; return False if another holder has it.
 
         Args:
-            holder: who asks.
-            is_controller: a controller gives way to who is none.
-            lasts_s: after so long without a call the right is free again [s].
+            holder: name of the caller.
+            is_controller: a controller yields to other callers.
+            lasts_s: validity after the last call [s].
         """
         with self.database.writing() as connection:
             held: Any = connection.scalar(select(notes.c.value).where(notes.c.name == _SCAN_TURN))
@@ -155,7 +153,7 @@ class Notes:
         return True
 
     def end_scan_turn(self, holder: str) -> None:
-        """Free the right, if this one has it."""
+        """Release the right if the caller has it."""
         with self.database.writing() as connection:
             held: Any = connection.scalar(select(notes.c.value).where(notes.c.name == _SCAN_TURN))
             if held and held["holder"] == holder:
@@ -164,7 +162,7 @@ class Notes:
 
 @dataclass(frozen=True)
 class Damage:
-    """An object of the store that is not what it was."""
+    """An object of the store that is not as it was written."""
 
     key: str
     what: str
@@ -179,7 +177,7 @@ class KnownDamage:
     database: Database
 
     def known(self, *, limit: int = 100) -> tuple[int, list[Damage]]:
-        """Number of damaged objects found so far and not fixed, and the first of them."""
+        """Return the number of damaged objects that are not fixed, and the first of them."""
         query = select(damage).order_by(damage.c.found, damage.c.key).limit(limit)
         with self.database.reading() as connection:
             count = int(connection.scalar(select(func.count()).select_from(damage)) or 0)
@@ -187,7 +185,7 @@ class KnownDamage:
             return count, [Damage(row["key"], row["what"], row["shard"], row["found"]) for row in rows]
 
     def mark(self, found: Sequence[Damage], *, intact: Sequence[str] = ()) -> None:
-        """Objects found damaged, and others found intact."""
+        """Record damaged objects, and others that are intact."""
         rows = [{"key": one.key, "what": one.what, "shard": one.shard, "found": timestamp()} for one in found]
         with self.database.writing() as connection:
             upsert(connection, damage, rows, keep=("found",))
@@ -195,7 +193,7 @@ class KnownDamage:
                 connection.execute(delete(damage).where(damage.c.key.in_(list(intact))))
 
     def replace(self, found: Sequence[Damage]) -> None:
-        """All that is damaged, after the whole store was looked through."""
+        """Replace the list of damage after a full scan of the store."""
         with self.database.writing() as connection:
             connection.execute(delete(damage).where(damage.c.key.not_in([one.key for one in found])))
         self.mark(found)

@@ -1,4 +1,4 @@
-"""Outbox: ends of jobs and datasets in their order, webhooks, and their deliveries."""
+"""Outbox: ends of jobs and datasets in order, webhooks, and their deliveries."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ from graspd.service.model.errors import NotFoundError
 from graspd.service.model.projects import EVERYTHING, ProjectScope
 from graspd.service.model.webhooks import MOST_WAITING, WAITS_S, Webhook
 
-#: Ends and deliveries older than this are forgotten [s].
+#: Ends and deliveries older than this are deleted [s].
 KEPT_S: Final = 30 * 86400.0
 _AT_ONCE: Final = 500
-#: Live: an index that is rebuilt goes on with a feed of its own.
+#: Live: a rebuilt index starts a new feed.
 ends: Final = Table(
     "ends",
     metadata,
@@ -79,7 +79,7 @@ deliveries: Final = Table(
 
 @dataclass(frozen=True)
 class DueDelivery:
-    """A delivery that shall be tried now."""
+    """A delivery that is due."""
 
     hook: WebhookView
     end: EndView
@@ -87,10 +87,10 @@ class DueDelivery:
 
 
 def note_ends(connection: Connection, rows: Sequence[dict[str, Any]]) -> None:
-    """Append ends to the feed, within a transaction: who does so takes turns, so numbers are seen in their order.
+    """Append ends to the feed within a transaction; writers take turns, so numbers appear in order.
 
-    A number is the time in milliseconds, or the next one after the last: so those of an index that was lost and begun
-    anew are behind those that readers have seen.
+    A number is the time in milliseconds, or the last one plus 1. So the numbers of a new index follow those that
+    readers saw before the old one was lost.
     """
     if rows:
         last = connection.scalar(select(func.max(ends.c.seq))) or 0
@@ -106,7 +106,7 @@ class Outbox:
     database: Database
 
     def ends(self, since: int, *, limit: int, scope: ProjectScope = EVERYTHING) -> list[EndView]:
-        """The next ends behind a number."""
+        """Return the next ends after a number."""
         query = select(ends).where(ends.c.seq > since).order_by(ends.c.seq).limit(limit)
         if not scope.everything:
             query = query.where(ends.c.project == scope.project)
@@ -114,7 +114,7 @@ class Outbox:
             return [EndView(**row) for row in connection.execute(query).mappings()]
 
     def untold_datasets(self, *, limit: int = 200) -> list[tuple[str, int]]:
-        """Datasets whose end has not been told since their last event, with the number of their events."""
+        """Return datasets whose end is not reported since their last event, with their number of events."""
         query = select(datasets.c.name, datasets.c.events).where(
             datasets.c.planned.is_(True), datasets.c.applied >= datasets.c.events, datasets.c.told < datasets.c.events
         )
@@ -129,10 +129,10 @@ class Outbox:
                 note_ends(connection, [row])
 
     def add(self, hook: Webhook, *, seen: int | None = None, within: Connection | None = None) -> None:
-        """A webhook; it is told of what ends from now on.
+        """Add a webhook; it receives ends from now on.
 
         Args:
-            seen: ends up to here are told to nobody; None: all that there are.
+            seen: ends up to here are not delivered; None: all present ones.
         """
         with self.database.writing(within) as connection:
             last = seen if seen is not None else self.last(within=connection)
@@ -148,24 +148,24 @@ class Outbox:
             upsert(connection, webhooks, [row], keep=("seen",))
 
     def last(self, *, within: Connection) -> int:
-        """Number of the last end."""
+        """Return the number of the last end."""
         return int(within.scalar(select(func.max(ends.c.seq))) or 0)
 
     def seen(self, *, within: Connection) -> dict[str, int]:
-        """Up to which end each webhook has deliveries."""
+        """Return the last end of each webhook that has a delivery."""
         return {row.id: row.seen for row in within.execute(select(webhooks.c.id, webhooks.c.seen))}
 
     def told(self, *, within: Connection) -> dict[str, int]:
-        """Number of events for which the end of each dataset was told."""
+        """Return the number of events for which each dataset's end was reported."""
         return {row.name: row.told for row in within.execute(select(datasets.c.name, datasets.c.told))}
 
     def set_told(self, told: dict[str, int], *, within: Connection) -> None:
-        """Put back what `told` said."""
+        """Restore the result of `told`."""
         for name, events in told.items():
             within.execute(update(datasets).where(datasets.c.name == name).values(told=events))
 
     def hooks(self, *, scope: ProjectScope = EVERYTHING) -> list[WebhookView]:
-        """Webhooks, the oldest first."""
+        """Return the webhooks, the oldest first."""
         query = select(webhooks).order_by(webhooks.c.created, webhooks.c.id)
         if not scope.everything:
             query = query.where(webhooks.c.project == scope.project)
@@ -173,20 +173,20 @@ class Outbox:
             return [_hook(row) for row in connection.execute(query).mappings()]
 
     def hook(self, webhook: str, *, scope: ProjectScope = EVERYTHING) -> WebhookView:
-        """A webhook; NotFoundError if there is none."""
+        """Return a webhook; NotFoundError if there is none."""
         for one in self.hooks(scope=scope):
             if one.id == webhook:
                 return one
         raise NotFoundError(f"there is no webhook {webhook!r}")
 
     def remove(self, webhook: str) -> None:
-        """A webhook with its log."""
+        """Remove a webhook with its log."""
         with self.database.writing() as connection:
             connection.execute(delete(deliveries).where(deliveries.c.webhook == webhook))
             connection.execute(delete(webhooks).where(webhooks.c.id == webhook))
 
     def log(self, webhook: str, *, limit: int = 50) -> list[DeliveryView]:
-        """Deliveries of a webhook, the newest first."""
+        """Return deliveries of a webhook, the newest first."""
         query = (
             select(deliveries, ends.c.kind, ends.c.subject, ends.c.state.label("ended"))
             .join(ends, ends.c.seq == deliveries.c.seq)
@@ -201,7 +201,7 @@ class Outbox:
             ]
 
     def plan(self) -> None:
-        """Make deliveries of what ended since the last call; a webhook that is far behind misses the oldest."""
+        """Create deliveries of new ends; a webhook that is far behind misses the oldest."""
         for hook in self.hooks():
             mine = (ends.c.project == hook.project, ends.c.seq > hook.seen)
             query = select(ends.c.seq, ends.c.state).where(*mine).order_by(ends.c.seq).limit(_AT_ONCE)
@@ -235,7 +235,7 @@ class Outbox:
                 connection.execute(seen)
 
     def due(self, now: float) -> list[DueDelivery]:
-        """Deliveries to try now, the oldest of each webhook."""
+        """Return the due deliveries, the oldest of each webhook."""
         hooks = {hook.id: hook for hook in self.hooks()}
         first = (
             select(func.min(deliveries.c.seq).label("seq"), deliveries.c.webhook)
@@ -259,11 +259,10 @@ class Outbox:
         ]
 
     def settle(self, due: DueDelivery, *, status: int | None, detail: str, done: bool, final: bool = False) -> None:
-        """How an attempt ended. After a failure all that waits for the address rests as long as this delivery does;
-        after a success it is due.
+        """Record an attempt: a failure delays all deliveries of the address, a success makes them due.
 
         Args:
-            final: there is no other attempt, of whatever waits for the address.
+            final: no other attempt follows for any delivery of the address.
         """
         last = final or due.attempts >= len(WAITS_S)
         rest_until = 0.0 if done else time.time() + WAITS_S[min(due.attempts, len(WAITS_S) - 1)]
@@ -283,7 +282,7 @@ class Outbox:
             connection.execute(update(deliveries).where(*waiting).values(**others))
 
     def forget_old(self) -> None:
-        """Take away ends and deliveries that are older than `KEPT_S`."""
+        """Delete ends and deliveries older than `KEPT_S`."""
         oldest = int((time.time() - KEPT_S) * 1000)
         with self.database.writing() as connection:
             connection.execute(delete(deliveries).where(deliveries.c.seq < oldest))

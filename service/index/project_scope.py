@@ -17,7 +17,7 @@ Tests = tuple[ColumnElement[bool], ...]
 
 
 def seen_jobs(scope: ProjectScope) -> Tests:
-    """Of jobs, or of what is joined to them."""
+    """Return the conditions on jobs, or on tables joined to them."""
     return () if scope.everything else (jobs.c.project == scope.project,)
 
 
@@ -26,7 +26,7 @@ def seen_datasets(scope: ProjectScope) -> Tests:
 
 
 def seen_sets(scope: ProjectScope) -> Tests:
-    """Of sets of objects."""
+    """Return the conditions on sets of objects."""
     return () if scope.everything else (object_sets.c.project == scope.project,)
 
 
@@ -35,14 +35,14 @@ def seen_tags(scope: ProjectScope) -> Tests:
 
 
 def seen_assets(scope: ProjectScope) -> Tests:
-    """Of hands and objects: their own, what comes with graspd, and what its project shares."""
+    """Return the conditions on hands and objects: the project's own, built-in and shared ones."""
     if scope.everything:
         return ()
     return (or_(assets.c.project == scope.project, assets.c.builtin.is_(True), assets.c.shared.is_(True)),)
 
 
 def nearest_asset(scope: ProjectScope) -> ColumnElement[int]:
-    """Order of hands and objects of one name: the project's own come first, then what is shared."""
+    """Return the order of assets of one name: the project's own come first, then shared ones."""
     shared = or_(assets.c.builtin.is_(True), assets.c.shared.is_(True))
     return case((assets.c.project == scope.project, 0), (shared, 1), else_=2)
 
@@ -52,12 +52,12 @@ def seen_tasks(scope: ProjectScope) -> Tests:
 
 
 def seen_attempts(scope: ProjectScope) -> Tests:
-    """Of failed attempts."""
+    """Return the conditions on failed attempts."""
     return () if scope.everything else (attempts.c.job_id.in_(jobs_of(scope)),)
 
 
 def seen_shards(scope: ProjectScope, shard: ColumnElement[Any]) -> Tests:
-    """Of shards by a column that holds their id: those that a job of the project makes or has found made."""
+    """Return the conditions on shard ids: those that a job of the project makes or reuses."""
     if scope.everything:
         return ()
     wanted = (tasks.c.shard_id == shard, tasks.c.job_id == jobs.c.id, jobs.c.project == scope.project)
@@ -65,22 +65,22 @@ def seen_shards(scope: ProjectScope, shard: ColumnElement[Any]) -> Tests:
 
 
 def jobs_of(scope: ProjectScope) -> Select[tuple[str]]:
-    """Ids of the project's jobs."""
+    """Return the ids of the project's jobs."""
     return select(jobs.c.id).where(jobs.c.project == scope.project)
 
 
 MAX_LIMIT: Final = 200
-#: Every database holds whole numbers up to here.
+#: Upper bound of whole numbers in all databases.
 _MOST: Final = 2**63
 
 
 def encode(*key: Any) -> str:
-    """Text of a sort key, safe in a URL."""
+    """Encode a sort key as text, safe in a URL."""
     return base64.urlsafe_b64encode(json.dumps(key, separators=(",", ":")).encode()).decode().rstrip("=")
 
 
 def decode(cursor: str, *kinds: type | tuple[type, ...]) -> tuple[Any, ...]:
-    """The sort key of a cursor, checked against the types of its parts; InputError if it is none of ours."""
+    """Decode the sort key of a cursor and check its types; InputError for an invalid cursor."""
     try:
         key = from_json(base64.urlsafe_b64decode(cursor + "=" * (-len(cursor) % 4)), allow_inf_nan=False)
     except ValueError:
@@ -93,7 +93,7 @@ def decode(cursor: str, *kinds: type | tuple[type, ...]) -> tuple[Any, ...]:
 
 
 def page_size(limit: int) -> int:
-    """A limit between 1 and `MAX_LIMIT`."""
+    """Return a limit between 1 and `MAX_LIMIT`."""
     if limit < 1:
         raise InputError("the limit must be at least 1")
     return min(limit, MAX_LIMIT)

@@ -1,4 +1,4 @@
-"""The index from the store alone, and how a live index differs from that."""
+"""Rebuild of the index from the store, and differences between an index and the store."""
 
 from __future__ import annotations
 
@@ -40,23 +40,23 @@ from graspd.service.store.store import Store
 
 log = logging.getLogger(__name__)
 EventT = TypeVar("EventT", bound=Record)
-#: What a record that makes no sense raises, here or in the database; that a part is away is none of it.
+#: Exceptions for an invalid record, here or in the database; none of them means an unavailable backend.
 _OF_THE_RECORD: Final = (DamagedError, InputError, DataError, ValueError, TypeError, LookupError, ArithmeticError)
-#: Reads in flight: what hides the latency of a remote store.
+#: Concurrent reads, to hide the latency of a remote store.
 _READERS: Final = 16
 _SHOWN_DIFFERENCES: Final = 50
 
 
 def rebuild(index: Index, store: Store, *, progress: Callable[[str, int], None] | None = None) -> dict[str, int]:
-    """Replace all rows by what follows from the store. The old rows stay until all new ones are there.
+    """Replace all rows by those derived from the store. The old rows stay until all new ones exist.
 
-    A record that is damaged is left out, named in the log and in `index.notes.completeness()`; the others go on.
+    A damaged record is omitted and named in the log and in `index.notes.completeness()`; the others are read.
 
     Args:
-        progress: called with what is being read and how many of it there were so far.
+        progress: called with the kind of records and the number read so far.
 
     Returns:
-        number of jobs, attempts, shards, assets, datasets, snapshots and object sets read, and of records left out.
+        number of jobs, attempts, shards, assets, datasets, snapshots and object sets read, and of omitted records.
     """
     with index.database.writing() as connection:
         connection.execution_options(**{QUIET: True})
@@ -76,7 +76,7 @@ def rebuild(index: Index, store: Store, *, progress: Callable[[str, int], None] 
 
 
 class _Rebuild:
-    """One rebuild: each record in a savepoint of its own, so that one that does not fit leaves nothing behind."""
+    """One rebuild: each record has its own savepoint, so that an invalid one leaves no rows."""
 
     def __init__(
         self, index: Index, store: Store, connection: Connection, progress: Callable[[str, int], None] | None
@@ -97,7 +97,7 @@ class _Rebuild:
                     self._index.write.add_asset(load_asset(self._store, kind, digest), check, within=self._connection)
 
     def jobs(self) -> None:
-        """Jobs, then their failed attempts in order, then what users did to them."""
+        """Read jobs, then their failed attempts in order, then users' actions."""
         known = []
         for key, data in self._read(names.JOBS, lambda key: key.endswith("/job.json") and key.count("/") == 2):
             with self._each(key, "jobs"):
@@ -121,7 +121,7 @@ class _Rebuild:
                 self._index.write.add_manifests([parse_record(ShardManifest, data, key)], within=self._connection)
 
     def datasets(self) -> None:
-        """Datasets with what users did to them, snapshots, sets of objects."""
+        """Read datasets with users' actions, snapshots, sets of objects."""
         for key, data in self._read(names.DATASETS, lambda key: key.endswith("/dataset.json")):
             with self._each(key, "datasets"):
                 record = parse_record(DatasetRecord, data, key)
@@ -145,7 +145,7 @@ class _Rebuild:
                 self._index.outbox.add(hook, seen=seen, within=self._connection)
 
     def tags(self) -> None:
-        """The last version of each tag: those before it are left of a change that broke off."""
+        """Read the last version of each tag: earlier ones remain from interrupted changes."""
         found = sorted(self._read(names.TAGS, lambda key: key.endswith(".json")))
         last = {key.rpartition("/")[0]: (key, data) for key, data in found}
         for key, data in last.values():
@@ -160,7 +160,7 @@ class _Rebuild:
         return found
 
     def _read(self, prefix: str, wanted: Callable[[str], bool]) -> Iterator[tuple[str, bytes]]:
-        """Keys and bytes of records; one that was removed since it was listed is no record."""
+        """Yield keys and bytes of records; those removed since the listing are skipped."""
         keys = [entry.key for entry in self._store.list(prefix) if wanted(entry.key) and not self._is_gone(entry.key)]
         with ThreadPoolExecutor(_READERS) as pool:
             for key, data in zip(keys, pool.map(self._bytes, keys), strict=True):
@@ -168,7 +168,7 @@ class _Rebuild:
                     yield key, data
 
     def _is_gone(self, key: str) -> bool:
-        """Whether it belongs to a job or dataset that a user deleted."""
+        """Check whether it belongs to a job or dataset that a user deleted."""
         folder, _, rest = key.partition("/")
         what = {names.JOBS: "job", names.DATASETS: "dataset"}.get(folder, "")
         return (what, rest.partition("/")[0]) in self._gone
@@ -195,7 +195,7 @@ class _Rebuild:
 
 
 def complete_if_new(index: Index, store: Store) -> None:
-    """An index is whole, though nobody made it from the store, where the store holds no job yet."""
+    """Mark an index as complete if the store has no job yet."""
     if index.notes.completeness() is None and not any(
         True for prefix in (names.JOBS, names.DATASETS) for _ in store.list(prefix)
     ):
@@ -203,7 +203,7 @@ def complete_if_new(index: Index, store: Store) -> None:
 
 
 def differences(index: Index, store: Store) -> list[str]:
-    """Damaged records, then what `rebuild` would change, one line a row; empty if the index is what the store says."""
+    """Return damaged records, then the rows that `rebuild` would change, one line each; empty if equal."""
     with tempfile.TemporaryDirectory(prefix="graspd-index-") as folder:
         fresh = Index(sqlite_url(Path(folder) / "index.sqlite"))
         try:
@@ -243,12 +243,12 @@ def _rows(table: Table, connection: Connection) -> dict[tuple[Any, ...], dict[st
 
 
 def _lasting(row: dict[str, Any]) -> dict[str, Any]:
-    """A row without what only the present moment knows: that a task is running, and where it was when it stopped."""
+    """Return a row without present state: that a task is running, and its progress when it stopped."""
     if row.get("state") == State.RUNNING.value:
         row["state"] = State.QUEUED.value
     if row.get("state") in (State.QUEUED.value, State.CANCELLED.value) and "worker" in row:
         row["worker"] = None
-    if "verdict" in row:  # attempts of a check are not kept in the store: it either ends in a finding or is repeated
+    if "verdict" in row:  # attempts of a check are not in the store: it has a result or is repeated
         row["last_attempt"] = 0
         if row["verdict"] is None:
             row["message"] = None

@@ -1,5 +1,7 @@
-"""How an index stands, seen from outside (nothing is made or moved aside, as opening it would), and a sample of one
-that is too large to be compared whole: shards and jobs, from both sides."""
+"""Condition of an index without opening it, and comparison of a random sample of a large one.
+
+The condition changes nothing, unlike opening the index. The sample has shards and jobs of both index and store.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +36,7 @@ from graspd.service.store.manifests import load_manifest
 from graspd.service.store.records import pending, read_record
 from graspd.service.store.store import Store
 
-#: Rows of a kind from each side.
+#: Rows per kind from each side.
 _SIZE: Final = 100
 _READERS: Final = 16
 _TIMEOUT_S: Final = 5.0
@@ -42,14 +44,14 @@ _TIMEOUT_S: Final = 5.0
 
 @dataclass(frozen=True)
 class Sample:
-    """What was drawn."""
+    """The drawn ids."""
 
     shards: tuple[tuple[Stage, str], ...]
     jobs: tuple[str, ...]
 
 
 def draw(index: Index, store: Store, *, size: int = _SIZE) -> Sample:
-    """Shards of each kind and jobs from a random name on: `size` that the index has, as many that the store has."""
+    """Draw shards of each kind and jobs from a random name on: `size` of the index, `size` of the store."""
     chosen: set[tuple[Stage, str]] = set()
     for stage, kind in names.SHARD_KINDS.items():
         chosen |= {(stage, shard) for shard in _rows(index, shards, size, shards.c.kind == kind)}
@@ -61,7 +63,7 @@ def draw(index: Index, store: Store, *, size: int = _SIZE) -> Sample:
 
 
 def compare(index: Index, store: Store, sample: Sample) -> list[str]:
-    """How index and store differ in a sample, one line a shard or job; empty if they do not."""
+    """Return differences of index and store in a sample, one line per shard or job; empty if none."""
     gone = {name for what, name in pending(store) if what == "job"}
     with index.database.reading() as connection:
         ids = [shard for _, shard in sample.shards]
@@ -91,7 +93,7 @@ def _wrong(row: tuple[str, int, int] | None, said: tuple[str, int, int] | None) 
 
 
 def _rows(index: Index, table: Table, size: int, *conditions: Any) -> list[str]:
-    """Ids from a random one on, and from the first where there are too few behind it."""
+    """Return ids from a random one on, continued from the first if there are too few."""
     key: Column[Any] = table.c.id
     with index.database.reading() as connection:
         query = select(key).where(*conditions).order_by(key).limit(size)
@@ -100,7 +102,7 @@ def _rows(index: Index, table: Table, size: int, *conditions: Any) -> list[str]:
 
 
 def _keys(store: Store, prefix: str) -> Iterator[str]:
-    """Keys of a folder from a random one on, then those before it."""
+    """Yield keys of a folder from a random one on, then those before it."""
     start = f"{prefix}/{secrets.token_hex(8)}"
     for entry in store.list(prefix, offset=start):
         yield entry.key
@@ -113,7 +115,7 @@ def _manifest(store: Store, stage: Stage, shard: str) -> tuple[str, int, int] | 
     try:
         found = load_manifest(store, stage, shard)
     except (NotFoundError, DamagedError):
-        # A damaged one is for the integrity scan to report; the index leaves it out.
+        # The integrity scan reports damaged records; the index omits them.
         return None
     return found.sha256, found.count, found.valid
 
@@ -128,16 +130,16 @@ def _has_job(store: Store, job: str) -> bool:
 
 @dataclass(frozen=True)
 class IndexCondition:
-    """What the database says of itself."""
+    """State that the database reports."""
 
     kind: str
     """sqlite or postgresql, with its version."""
     revision: str
-    """Of its tables; "" where it has none yet."""
+    """Revision of its tables; "" if it has none yet."""
     newest: str
-    """Revision that this graspd knows."""
+    """Revision of this graspd."""
     connections: tuple[int, int] = (0, 0)
-    """Used, and the most there may be; zeros where nobody counts."""
+    """Used and allowed connections; zeros if unknown."""
     may_write: bool = True
 
     @property
@@ -147,12 +149,12 @@ class IndexCondition:
 
 
 def look(url: str | URL) -> IndexCondition | None:
-    """None where the file of an SQLite index does not exist yet.
+    """Return the condition of an index; None if the file of an SQLite index does not exist yet.
 
     Raises:
-        InputError: the URL names no known database, or one of another encoding than UTF-8.
-        IndexUnavailable: it does not answer.
-        IndexDamaged: the file makes no sense.
+        InputError: the URL names no known database, or one with another encoding than UTF-8.
+        IndexUnavailable: it is unavailable.
+        IndexDamaged: the file has invalid content.
     """
     try:
         parsed = make_url(url)

@@ -1,7 +1,7 @@
-"""Tables of the index. `LIVE_COLUMNS` hold the present moment (progress, queue marks); the rest follows from the store.
+"""Tables of the index. `LIVE_COLUMNS` are present state (progress, queue marks); the rest is derived.
 
-A change here needs another `REVISION` in `database`; a test holds the two together. Metrics of grasps need none: see
-`database`. Of datasets `applied` and `planned` say how far the planner is; tags are names that users give to grasps.
+A change here needs another `REVISION` in `database`, which a test enforces. Metrics of grasps need none: see
+`database`. `applied` and `planned` of datasets are the planner's progress; tags are names that users give to grasps.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ jobs: Final = Table(
     Column("created", String(32), nullable=False),
     Column("finished", String(32)),
     Column("reason", Text),
-    # Digests of its neighbours, with a space between; a list would need a table.
+    # Digests of its neighbours, separated by spaces; a list would need a table.
     Column("neighbours", String(300), nullable=False, server_default=""),
     Column("choice", JSON(none_as_null=True)),
     Column("network_digest", String(32), nullable=False, server_default=""),
@@ -138,17 +138,17 @@ shards: Final = Table(
     Column("seconds", Float, nullable=False),
     Column("created", String(32), nullable=False),
     Column("manifest", JSON, nullable=False),
-    # Project whose job it was made for first.
+    # Project of the job that requested it first.
     Column("charged", String(32), nullable=False, server_default=""),
     Index("shards_newest", "created", "id"),
     Index("shards_by_kind", "kind", "created", "id"),
-    # These hold all that sums over shards need: a row itself is as long as its manifest.
+    # They contain all columns of sums over shards: a row itself is as long as its manifest.
     Index("shards_sums", "kind", "hand", "object", "count", "valid", "candidates", "size_bytes", "validated"),
     Index("shards_of_task", "id", "count", "valid", "candidates", "rechecked", "recheck_held", "validated"),
     Index("shards_made", "created", "kind", "count", "valid", "seconds"),
     Index("shards_charged", "created", "charged", "kind", "device", "count", "valid", "seconds", "size_bytes"),
 )
-#: Metrics by which grasps are bounded and sorted.
+#: Metrics for bounds and sorting.
 METRICS: Final = tuple(metric.name for metric in indexed(IndexLevel.SORTED))
 grasps: Final = Table(
     "grasps",
@@ -211,7 +211,7 @@ workers: Final = Table(
     Column("seen", String(32), nullable=False),
     Column("reason", String(300), nullable=False, server_default=""),
 )
-#: What shards that are gone had cost, a row for each project, day and device: what is deleted was used all the same.
+#: Costs of deleted shards, a row per project, day and device: deleted results count as usage.
 spent: Final = Table(
     "spent",
     metadata,
@@ -234,7 +234,7 @@ damage: Final = Table(
     Column("shard", String(64), nullable=False),
     Column("found", String(32), nullable=False),
 )
-#: Columns of the present moment, and tables that hold nothing else: a rebuild starts them afresh.
+#: Columns of present state, and tables that contain nothing else: a rebuild resets them.
 LIVE_COLUMNS: Final = frozenset(
     {
         "queued",
@@ -267,7 +267,7 @@ datasets: Final = Table(
     Column("events", Integer, nullable=False),
     Column("applied", Integer, nullable=False, default=0),
     Column("planned", Boolean, nullable=False, default=False),
-    # Number of events for which its end was told; -1: it was not.
+    # Number of events for which its end was reported; -1: not reported.
     Column("told", Integer, nullable=False, server_default="-1"),
     Column("neighbours", String(300), nullable=False, server_default=""),
     Column("network_digest", String(32), nullable=False, server_default=""),
@@ -319,7 +319,7 @@ tags: Final = Table(
     Column("project", String(32), nullable=False, server_default=""),
     Index("tags_by_name", "name", "project"),
 )
-#: Grasps that a tag names. Some may be gone: their shards left with the last job that needed them.
+#: Grasps of a tag. Some may be missing: their shards were deleted with the last job that needed them.
 tagged: Final = Table(
     "tagged",
     metadata,

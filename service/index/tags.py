@@ -1,4 +1,4 @@
-"""Tags: what users named, as the store's records say it."""
+"""Tags: users' names, from the records of the store."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from graspd.service.model.errors import NotFoundError
 from graspd.service.model.projects import EVERYTHING, ProjectScope
 from graspd.service.model.records import Grasp, Tag
 
-#: Grasps that one statement names: two parameters each.
+#: Grasps named in one statement: two parameters each.
 _AT_ONCE: Final = 400
 
 
 @dataclass(frozen=True)
 class Tags:
-    """Reads and writes of tags and of what has them."""
+    """Reads and writes of tags and of their grasps."""
 
     database: Database
 
     def all(self, *, scope: ProjectScope = EVERYTHING) -> list[TagView]:
-        """Tags by name, with how many grasps of each are there."""
+        """Return tags by name, with the number of existing grasps of each."""
         there = (grasps.c.shard_id == tagged.c.shard_id) & (grasps.c.row == tagged.c.row)
         number = select(func.count()).select_from(tagged.join(grasps, there)).where(tagged.c.tag == tags.c.id)
         query = select(tags, number.scalar_subquery().label("grasps")).where(*seen_tags(scope))
@@ -37,10 +37,10 @@ class Tags:
             return [TagView(**row) for row in rows]
 
     def named(self, name: str, *, scope: ProjectScope = EVERYTHING) -> str:
-        """Id of a tag by its name, or by its id; of several of a name the one of the scope's own project.
+        """Return the id of a tag by name or id; of equal names the scope's own project's.
 
         Raises:
-            NotFoundError: there is none in scope.
+            NotFoundError: no such tag is in scope.
         """
         own_first = case((tags.c.id == name, 0), (tags.c.project == scope.project, 1), else_=2)
         query = select(tags.c.id).where((tags.c.name == name) | (tags.c.id == name), *seen_tags(scope))
@@ -51,7 +51,7 @@ class Tags:
         return found
 
     def of(self, wanted: Collection[Grasp], *, scope: ProjectScope = EVERYTHING) -> dict[Grasp, list[str]]:
-        """Names of the tags of each of these grasps that has one."""
+        """Return the names of the tags of each of these grasps that has one."""
         found: dict[Grasp, list[str]] = {}
         query = select(tagged.c.shard_id, tagged.c.row, tags.c.name).where(tags.c.id == tagged.c.tag, *seen_tags(scope))
         with self.database.reading() as connection:
@@ -62,7 +62,7 @@ class Tags:
         return found
 
     def there(self, wanted: Sequence[Grasp], *, scope: ProjectScope = EVERYTHING) -> set[Grasp]:
-        """Those of these grasps that are there, and in scope."""
+        """Return those of the grasps that exist in scope."""
         query = select(grasps.c.shard_id, grasps.c.row).where(*seen_shards(scope, grasps.c.shard_id))
         found: set[Grasp] = set()
         with self.database.reading() as connection:
@@ -72,7 +72,7 @@ class Tags:
         return found
 
     def put(self, tag: Tag, *, within: Connection | None = None) -> None:
-        """A tag as a record says it; one that is gone is taken away."""
+        """Write a tag from its record; remove a deleted one."""
         row = {name: getattr(tag, name) for name in ("id", "name", "created", "changed", "owner", "project")}
         members = [{"tag": tag.id, "shard_id": shard, "row": number} for shard, number in sorted(tag.members)]
         with self.database.writing(within) as connection:

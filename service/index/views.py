@@ -22,14 +22,14 @@ class View(BaseModel):
 
 
 class Page(View, Generic[T]):
-    """Part of a list. `next` is the cursor of what follows, None at the end."""
+    """Part of a list. `next` is the cursor of the next part, None at the end."""
 
     items: list[T]
     next: str | None = None
 
 
 class Validated(View):
-    """What was made, and how much of it is valid. Grasps that are not validated are no failures: they are left out."""
+    """Number of grasps, and how many are valid. Those without validation are no failures and omitted."""
 
     grasps: int = Field(0, description="grasps kept so far")
     valid: int = Field(
@@ -43,12 +43,12 @@ class Validated(View):
     @computed_field(description="valid grasps per grasp validated; null: not validated")  # type: ignore[prop-decorator]
     @property
     def valid_yield(self) -> float | None:
-        """Share of the validated ones that are valid."""
+        """Share of valid grasps among the validated ones."""
         return self.valid / self.validated if self.validated else None
 
 
 class StageProgress(View):
-    """Tasks of one stage of a job, by state. `done` counts finished tasks plus the shares of the running ones."""
+    """Tasks of one stage of a job, by state. `done` counts finished tasks plus shares of running ones."""
 
     stage: Stage
     tasks: int
@@ -83,7 +83,7 @@ class JobView(Validated):
     @computed_field(description="what a reader of the numbers should know")  # type: ignore[prop-decorator]
     @property
     def note(self) -> str | None:
-        """Says so where a job ended with fewer valid (unvalidated: feasible) grasps than it was asked for."""
+        """Note on a job that ended with fewer valid (unvalidated: feasible) grasps than requested."""
         request = self.request
         found = self.valid if request.counted == "valid" else self.grasps
         if self.state is not State.SUCCEEDED or request.want != "valid":
@@ -151,7 +151,7 @@ class ShardView(View):
 
 @with_fields(valid=values(optional=False), created=values(optional=True))
 class GraspView(View):
-    """One grasp with the quality that the index holds; the contact thresholds are those of the manifest (5 mm)."""
+    """One grasp with its quality in the index; the contact thresholds are those of the manifest (5 mm)."""
 
     shard_id: str
     row: int
@@ -219,7 +219,7 @@ class FailureGroup(View):
 
 
 class Stats(Validated):
-    """The whole service in a few numbers."""
+    """Totals of the whole service."""
 
     jobs: dict[State, int]
     tasks: dict[State, int]
@@ -229,7 +229,7 @@ class Stats(Validated):
 
 
 class Throughput(View):
-    """What was made in one interval."""
+    """Production of one interval."""
 
     start: str
     grasps: int
@@ -251,7 +251,7 @@ class EndView(View):
 
 
 class WebhookView(View):
-    """An address that is told of ends."""
+    """An address that receives ends."""
 
     id: str
     url: str
@@ -263,7 +263,7 @@ class WebhookView(View):
 
 
 class TagView(View):
-    """A name that somebody gave to grasps."""
+    """A name that a user gave to grasps."""
 
     id: str
     name: str
@@ -275,7 +275,7 @@ class TagView(View):
 
 
 class DeliveryView(View):
-    """What became of telling an address of an end."""
+    """Result of a delivery of an end to an address."""
 
     seq: int
     kind: str
@@ -289,7 +289,7 @@ class DeliveryView(View):
 
 
 class UsageDay(View):
-    """What a project used on a day: the tasks that ended then, counted for the project that asked for them first."""
+    """Usage of a project on a day: the tasks that ended then, counted for their first requester."""
 
     project: str = Field(description="empty: the one without a name")
     day: str = Field(description="from midnight to midnight UTC")
@@ -312,7 +312,7 @@ class MatrixCell(Validated):
 
 
 class DatasetView(Validated):
-    """A dataset in numbers. `grasps`, `valid` and `candidates` count what base shards hold so far."""
+    """Totals of a dataset. `grasps`, `valid` and `candidates` count base shards made so far."""
 
     name: str
     digest: str = Field(description="equal hands, objects and options have the same digest")
@@ -341,7 +341,7 @@ class DatasetView(Validated):
     @computed_field(description="why it ended with fewer grasps than asked for")  # type: ignore[prop-decorator]
     @property
     def reason(self) -> str | None:
-        """Says so where a dataset ended with fewer grasps than it was asked for."""
+        """Note on a dataset that ended with fewer grasps than requested."""
         if not self.state.is_final or self.options.want != "valid":
             return None
         options = self.options
@@ -349,12 +349,12 @@ class DatasetView(Validated):
 
     @property
     def counted(self) -> int:
-        """Grasps of the standing that its options can give."""
+        """Grasps that count under its options: valid ones, else all."""
         return self.valid if self.options.standing == "valid" else self.grasps
 
 
 class CellView(Validated):
-    """One hand x object of a dataset: an ordinary job, or one that is still to be planned."""
+    """One hand x object of a dataset: an ordinary job, or one to be planned."""
 
     position: int = Field(description="hand by hand, and in each hand object by object, from 0")
     hand: str
@@ -374,7 +374,7 @@ class CellView(Validated):
     reason: str | None = Field(description="why it failed, or found fewer grasps than asked for")
 
     def counted(self, options: JobOptions) -> int:
-        """Grasps of the standing that its dataset's options can give."""
+        """Return the grasps that count under its dataset's options: valid ones, else all."""
         return self.valid if options.standing == "valid" else self.grasps
 
 
@@ -391,7 +391,7 @@ class SnapshotView(View):
     size_bytes: int
 
     def counted(self, options: JobOptions) -> int:
-        """Grasps of the standing that its dataset's options can give."""
+        """Return the grasps that count under its dataset's options: valid ones, else all."""
         return self.valid if options.standing == "valid" else self.grasps
 
 

@@ -1,1 +1,1 @@
-"""What becomes of jobs and datasets: actions of users, and the controller that carries them out."""
+"""Actions of users on jobs and datasets, and the controller that carries them out."""

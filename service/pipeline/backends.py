@@ -1,4 +1,4 @@
-"""Store, index and queue, which every process of graspd talks to, opened from the settings."""
+"""Store, index and queue of a process, opened from the settings."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Services:
-    """Store, index and queue. Only API and controller open the index; a worker uses `open_store` and the queue."""
+    """Store, index and queue. API and controller open the index; workers use `open_store` and the queue."""
 
     settings: Settings
     store: Store
@@ -24,16 +24,16 @@ class Services:
 
     @classmethod
     def open(cls, settings: Settings, *, patience: int = 3, make: bool = True, anew: bool = False) -> Self:
-        """Open all three: makes the data folder and an index; does not need Redis to answer yet.
+        """Open all three; create the data folder and the index. Redis need not answer yet.
 
         Args:
-            patience: how often Redis is tried before it counts as away.
-            make: whether the folder of a store is made where it is absent.
-            anew: whether an index of another revision is emptied; see `Database`.
+            patience: attempts to reach Redis before it counts as unavailable.
+            make: whether to create a missing store folder.
+            anew: whether to empty an index of another revision; see `Database`.
 
         Raises:
-            NotFoundError: there is no store, and none is to be made.
-            StoreUnavailable, IndexUnavailable: where they cannot be opened.
+            NotFoundError: the store does not exist and `make` is False.
+            StoreUnavailable, IndexUnavailable: one of them cannot be opened.
         """
         from graspd.service.index.index import Index
         from graspd.service.queue.rq_queue import open_queue
@@ -43,6 +43,6 @@ class Services:
         return cls(settings, store, index, open_queue(settings, patience=patience))
 
     def close(self) -> None:
-        """Give all connections back."""
+        """Close all connections."""
         self.index.close()
         self.queue.close()

@@ -1,7 +1,7 @@
-"""The controller: one loop that runs what must not run in a worker. Killed at any moment, its successor goes on.
+"""The controller: one loop for all work that no worker may do. If killed, its successor continues.
 
-It reconciles: events become rows, and what the index calls unfinished and the queue does not know is queued again. Of
-several controllers one leads, and the others stand by (`service.pipeline.leading`).
+It reconciles: it writes events to the index, and queues unfinished tasks of the index that the queue lacks. One
+controller leads; the others stand by (`service.pipeline.leading`).
 """
 
 from __future__ import annotations
@@ -41,28 +41,28 @@ from graspd.service.store.records import newest_mark, next_mark, read_record, se
 from graspd.service.telemetry import HeartbeatFile
 
 log = logging.getLogger(__name__)
-#: Events of one round: a second's work. Those behind them wait for the next round, which follows at once.
+#: Most events of one round: about one second of work. The next round follows at once.
 _EVENTS_A_ROUND: Final = 2000
-#: Events that wait for the store; while there are more, no further ones are taken from the stream.
+#: Most events that may wait for the store; above this, no more are read from the stream.
 _LONGEST_BACKLOG: Final = 10_000
 _FORGET_WORKERS_AFTER_S: Final = 3600.0
 _WORKERS_EVERY_S: Final = 2.0
-#: How long what a worker can do counts after it was last seen.
+#: How long the capabilities of a worker count after its last registration.
 _REMEMBERED_S: Final = 60.0
-#: How often the progress of tasks is passed on: as often as pages ask for it.
+#: Interval at which progress of tasks is published: the interval at which pages poll it.
 _PROGRESS_EVERY_S: Final = 0.5
 _LONGEST_PAUSE_S: Final = 5.0
 _COLLECT_EVERY_S: Final = 5.0
-#: How often it looks whether store and index are still its service's.
+#: Interval of the check that store and index still belong to this service.
 _IDENTIFY_EVERY_S: Final = 30.0
-#: What a read of the store that is under way has to end, once the controller stops [s].
+#: Time that a running read of the store has to end after the controller stops [s].
 _LAST_READ_S: Final = 3.0
-#: Least wait between two pieces of large jobs [s]: longer than SQLite lets a waiting writer sleep.
+#: Least wait between two parts of large jobs [s]: longer than the sleep of a writer that waits for SQLite.
 _ENTERING_GAP_S: Final = 0.15
 
 
 class Controller:
-    """Indexes events, queues what is ready, takes tasks from lost workers, keeps the list of workers."""
+    """Index events, queue ready tasks, recover tasks of lost workers, keep the list of workers."""
 
     def __init__(self, services: Services, *, clock: Callable[[], float] = time.monotonic) -> None:
         self._services = services
@@ -71,52 +71,52 @@ class Controller:
         self._planner = DatasetRounds(services, clock=clock)
         self._garbage = GarbageCollector(services, clock=clock)
         self._known: str | None = None
-        """Mark that the index had when it was last compared with the store's."""
+        """Mark of the index at its last comparison with the store's."""
         self._has_plans = False
         self._turns = RoundRobin()
         self._backlog: list[tuple[str, Event]] = []
         self._routes = Routes()
         self._seen: dict[str, tuple[float, WorkerBeat]] = {}
         self._held: set[str] = set()
-        """Why tasks were held back when the queue was last filled."""
+        """Reasons why tasks were held back when the queue was last filled."""
         self._has_news = False
-        """Whether anything came in since the queue was filled."""
+        """Whether events arrived since the queue was filled."""
         self._made = False
-        """Whether anything came in since store and index got their mark."""
+        """Whether events arrived since store and index got their mark."""
         self._started = False
         self._alive = HeartbeatFile(services.settings.heartbeat_file)
         self._workers = 0
-        """Workers that were there when they were last counted."""
+        """Number of workers at the last count."""
         self._clock = clock
         self._progress: dict[str, tuple[float, float, str]] = {}
-        """How far tasks were when it was last passed on."""
+        """Progress of tasks at its last publication."""
         interval_s = services.settings.controller_interval_s
         self._entered = ""
-        """The large job whose next tasks were entered last."""
+        """The large job whose tasks were entered last."""
         self._identify = PeriodicDuty(clock, lambda: identify(services, holds_redis=True), _IDENTIFY_EVERY_S)
         self._duties = [
             PeriodicDuty(clock, services.queue.tidy, _WORKERS_EVERY_S),
             PeriodicDuty(clock, self._mark, _WORKERS_EVERY_S),
             PeriodicDuty(clock, self._indexer.flush, _WORKERS_EVERY_S),
             PeriodicDuty(clock, self._look_after_workers, _WORKERS_EVERY_S, share=0.1),
-            # Each lease is seen three times before it can be called lost.
+            # Each lease is checked three times before it can count as lost.
             PeriodicDuty(clock, self._look_after_queue, interval_s, longest_s=services.settings.lease_s / 3),
             PeriodicDuty(clock, self._feed_new, 0.0),
             PeriodicDuty(clock, self._pass_on_progress, min(_PROGRESS_EVERY_S, interval_s), share=0.1),
-            # The index is free for at least as long as it was held.
+            # The index is free for at least as long as it was locked.
             PeriodicDuty(clock, self._enter_large_job, _ENTERING_GAP_S, share=0.5),
             PeriodicDuty(clock, self._plan, interval_s),
             PeriodicDuty(clock, lambda: self._garbage.advance() or self._garbage.collect(), _COLLECT_EVERY_S),
         ]
 
     def run(self, stop: threading.Event) -> None:
-        """Rounds until told to stop. Where a part is away, waits longer and longer, and loses nothing."""
+        """Run rounds until `stop` is set. Wait with growing pauses for an unavailable backend."""
         with self._beside(stop):
             self._run(stop)
 
     @contextmanager
     def _beside(self, stop: threading.Event) -> Iterator[None]:
-        """What goes on beside the rounds: webhooks are told what ended; where settings want it, the store is read."""
+        """Run webhooks beside the rounds, and the integrity scan if the settings enable it."""
         duties = {"webhooks": WebhookDispatcher(self._services, stop).run}
         if self._services.settings.integrity_scan_mb_per_s:
             duties["integrity scan"] = IntegrityScan(self._services, stop).run
@@ -133,13 +133,13 @@ class Controller:
     def _run(self, stop: threading.Event) -> None:
         pause = 0.0
         while not stop.is_set():
-            # Also while a part is away: a fresh controller would wait for it just as long.
+            # Also while a backend is unavailable: a restarted controller would wait just as long.
             self._alive.touch()
             try:
                 self.round(wait_s=self._services.settings.controller_interval_s)
                 pause = 0.0
             except BusyError:
-                raise  # another service works here: to go on would undo its work
+                raise  # another service works here: to continue would undo its work
             except UnavailableError as error:
                 pause = min(_LONGEST_PAUSE_S, max(0.25, 2 * pause))
                 log.warning("%s; the controller tries again in %.2g s", error, pause)
@@ -153,10 +153,10 @@ class Controller:
                 self._mark()
 
     def round(self, *, wait_s: float = 0.0) -> None:
-        """Index what came in, then look after queue, leases and workers.
+        """Index new events, then check queue, leases and workers.
 
         Raises:
-            UnavailableError: a part is away; the round can be run again.
+            UnavailableError: a backend is unavailable; the round can be run again.
             BusyError: another service has taken over the store.
         """
         self._identify()
@@ -171,8 +171,7 @@ class Controller:
             raise away[0]
 
     def _mark(self) -> None:
-        """Give index and store a new mark if users or workers changed anything: an index that was copied before has
-        another one than the store, and is made anew."""
+        """Renew the mark of index and store after changes: older copies of the index are then rebuilt."""
         notes = self._services.index.notes
         present, changes = notes.marked(), notes.changes()
         if changes != present.changes or self._made:
@@ -183,7 +182,7 @@ class Controller:
             self._known, self._made = fresh, False
 
     def _pass_on_progress(self) -> None:
-        """What changed in how far tasks are, as their workers say."""
+        """Publish the changed progress of tasks, as workers report it."""
         busy = (beat for beat in self._services.queue.workers() if beat.task_id)
         found = {beat.task_id: (beat.done, beat.total, beat.message) for beat in busy}
         if changed := {task: one for task, one in found.items() if self._progress.get(task) != one}:
@@ -195,9 +194,9 @@ class Controller:
         return self._has_plans
 
     def _enter_large_job(self) -> None:
-        """The next tasks of a job that has too many for one turn of the index's writers: others write in between.
+        """Enter the next tasks of a job that is too large for one transaction; others can write in between.
 
-        Such jobs alternate. Killed at any moment, the successor goes on where a note in the index says.
+        Such jobs alternate. After a kill, the successor continues from a note in the index.
         """
         if not (jobs := self._services.index.write.entering()):
             return
@@ -211,10 +210,10 @@ class Controller:
 
     def _look_after_workers(self) -> None:
         self._announce()
-        # One that ended as it should says so, but its registration is gone a moment before that is read.
+        # A worker that ends in order reports it, but its registration disappears a moment earlier.
         present = self._services.queue.workers()
         self._workers = len(present)
-        # One that is silent for a moment is still there for what it cannot do.
+        # A worker that is briefly silent still counts when tasks are held back.
         now = self._clock()
         self._seen |= {beat.name: (now, beat) for beat in present}
         self._seen = {name: one for name, one in self._seen.items() if now - one[0] < _REMEMBERED_S}
@@ -228,7 +227,7 @@ class Controller:
         )
 
     def _see_to_the_index(self) -> None:
-        """It must be whole before events are taken up, and may be lost at any time."""
+        """Ensure that the index is complete before events are applied. It may be lost at any time."""
         if not self._started:
             self._start()
         elif self._services.index.notes.completeness() is None or self._is_stale():
@@ -241,7 +240,7 @@ class Controller:
             self._indexer.made(manifest)
         complete_if_new(self._services.index, self._services.store)
         made = self._services.index.notes.completeness()
-        # What was left out may have been fixed since.
+        # Records that were left out may be fixed by now.
         if made is None or made.left_out or self._is_stale():
             self._make_whole()
         else:
@@ -249,9 +248,9 @@ class Controller:
         self._started = True
 
     def _is_stale(self) -> bool:
-        """Whether the index, or the store, was exchanged for an older copy."""
+        """Return whether index or store was replaced by an older copy."""
         present = self._services.index.notes.marked()
-        # Killed between the two, a controller leaves the store with the mark before.
+        # A controller that is killed between the two writes leaves the previous mark in the store.
         if present.mark == self._known or newest_mark(self._services.store) in (present.mark, present.before):
             self._known = present.mark
             return False
@@ -271,7 +270,7 @@ class Controller:
                 log.warning("%s", error)
 
     def _index_events(self, wait_s: float) -> None:
-        """Take up what came in; what the store is needed for waits while that is away."""
+        """Apply new events; those that need the store wait while it is unavailable."""
         if len(self._backlog) < _LONGEST_BACKLOG:
             wait_s = wait_s if not self._backlog else 0.0
             self._backlog += self._services.queue.consume(limit=_EVENTS_A_ROUND, wait_s=wait_s)
@@ -290,10 +289,10 @@ class Controller:
         self._services.queue.announce(PART, 5 * self._services.settings.controller_interval_s + 5)
 
     def _look_after_queue(self) -> None:
-        # While Redis can be read but not written, as on a full disk, no worker can give a sign of life: then this fails
-        # first, and nobody's silence is validated.
+        # If Redis can be read but not written, as on a full disk, no worker can send a heartbeat. Then this call fails
+        # first, and no worker counts as lost.
         self._announce()
-        # Waiting tasks are read before leases: one that a worker takes in between is then seen as held.
+        # Waiting tasks are read before leases, so that a task taken in between counts as held.
         waiting = self._services.queue.waiting()
         leases = self._services.queue.leases()
         lost = self._reaper.reap(leases)
@@ -305,18 +304,20 @@ class Controller:
         self._has_news = False
 
     def _feed_new(self) -> None:
-        """What became ready by what came in, without a wait."""
+        """Queue at once the tasks that became ready by new events."""
         if self._has_news:
             self._feed()
             self._has_news = False
 
     def _feed(self, present: set[str] | None = None, missing: Collection[str] = ()) -> None:
-        """Queue what is ready. Where nobody knows what is in the queue (`present`), the index's own marks say so, and
-        what the queue knows of a task keeps it from being queued twice: also one that its job queues at this moment.
-        Only those that are `missing` are queued whatever the queue knows of them."""
+        """Queue ready tasks; without the queue's content (`present`), the marks of the index decide.
+
+        The queue's own state then prevents a second entry, also of a task that its job queues at this moment. Only the
+        `missing` are queued regardless of that state.
+        """
         depths = self._services.queue.depths()
         now = time.time()
-        # Every worker finds a task waiting when it ends one.
+        # Every worker finds a waiting task when it ends one.
         window = max(self._services.settings.queue_window, 2 * self._workers)
         held: set[str] = set()
         for priority in Priority:
@@ -327,7 +328,7 @@ class Controller:
             if present is None:
                 held |= queue_tasks(self._services, ready, routes=self._routes)
                 continue
-            # After a rebuild the index does not know what is in the queue already.
+            # After a rebuild the index has no marks of queued tasks.
             self._services.index.live.set_queued([task.task.id for task in ready if task.task.id in present])
             left = [task for task in ready if task.task.id not in present]
             for again in (False, True):
@@ -362,7 +363,7 @@ class Controller:
 
 @contextmanager
 def _noted(away: list[UnavailableError]) -> Iterator[None]:
-    """A part that is away, or one damaged record, must not keep the controller from what does not need it."""
+    """Log an unavailable backend or a damaged record, so that independent work continues."""
     try:
         yield
     except UnavailableError as error:
@@ -372,10 +373,9 @@ def _noted(away: list[UnavailableError]) -> Iterator[None]:
 
 
 class PeriodicDuty:
-    """What need not be done in every round: once in `every_s`, and no more than `share` of the time.
+    """A duty that runs at most once in `every_s`, and for at most `share` of the time.
 
-    It is called in each, and where the work breaks off, or answers True for something left to do, also does it in the
-    next one.
+    It is called in each round. If the work fails, or returns True because some is left, it also runs in the next one.
     """
 
     def __init__(
@@ -387,13 +387,13 @@ class PeriodicDuty:
         share: float = 0.2,
         longest_s: float = math.inf,
     ) -> None:
-        """`longest_s` is the longest pause, whatever the share then is [s]."""
+        """`longest_s` is the longest pause, regardless of the share [s]."""
         self._clock, self._work = clock, work
         self._every_s, self._share, self._longest_s = every_s, share, longest_s
         self._again = -math.inf
 
     def __call__(self) -> None:
-        """Do it if it is due."""
+        """Run it if it is due."""
         begun = self._clock()
         if begun < self._again:
             return

@@ -1,9 +1,8 @@
-"""What a user takes away: assets, jobs, datasets. A record of the deletion is the fact; the rest follows.
+"""Deletion of assets, jobs and datasets by users. The deletion's record decides; the rest follows.
 
-`deletions/{what}/{id}.json` is written while nobody else writes the index, in the same step as the rows go. From then
-on the thing is gone: a rebuild leaves it out, and nothing of that id is taken in. The garbage collector
-(`service.pipeline.garbage_collector`) removes the objects behind it, then the record itself; killed at any moment, it
-begins again.
+`deletions/{what}/{id}.json` is written under the index's write lock, in the same step that removes the rows. From then
+on the thing is gone: a rebuild omits it, and nothing of that id is accepted. The garbage collector
+(`service.pipeline.garbage_collector`) removes its objects, then the record itself. If killed, it restarts.
 """
 
 from __future__ import annotations
@@ -44,14 +43,14 @@ from graspd.service.store.store import Store
 def delete_asset(
     services: Services, kind: AssetKind, name: str, *, owner: str = "", scope: ProjectScope = EVERYTHING
 ) -> None:
-    """Take a hand, object or network away.
+    """Delete a hand, object or network.
 
     Args:
         owner: id of the API key that deletes it.
-        scope: what a refusal may name.
+        scope: what an error message may name.
 
     Raises:
-        NotFoundError: there is none of that name or digest.
+        NotFoundError: no asset has that name or digest.
         ConflictError: it comes with graspd, or a job, a dataset or a set of objects needs it.
     """
     asset = services.index.assets.get(kind, name)
@@ -68,17 +67,17 @@ def delete_asset(
 
 
 def delete_job(services: Services, job_id: str, *, owner: str = "") -> None:
-    """Take a job away; its shards, where no other job needs them, follow after a grace time.
+    """Delete a job; its shards follow after a grace time unless another job needs them.
 
     Raises:
-        NotFoundError: there is no such job.
-        ConflictError: it has not ended, or a dataset holds it.
+        NotFoundError: the job does not exist.
+        ConflictError: it is unfinished, or a dataset contains it.
     """
     job = services.index.jobs.get(job_id)
     try:
         record = read_record(JobRecord, services.store, names.job_record(job_id))
     except (NotFoundError, DamagedError):
-        record = None  # then its shards cannot be told, and stay
+        record = None  # its shards are then unknown, and stay
     with recording(services) as (connection, put):
         if user := services.index.removals.user_of_job(job_id, within=connection):
             raise ConflictError(f"job {job_id} {user}")
@@ -90,14 +89,14 @@ def delete_job(services: Services, job_id: str, *, owner: str = "") -> None:
 
 
 def delete_dataset(services: Services, name: str, *, owner: str = "", with_snapshots: bool = False) -> None:
-    """Take a dataset away; those of its jobs follow that were planned for it alone.
+    """Delete a dataset; jobs that were planned for it alone follow.
 
     Args:
-        with_snapshots: whether its snapshots may go with it.
+        with_snapshots: whether to delete its snapshots too.
 
     Raises:
-        NotFoundError: there is no such dataset.
-        ConflictError: it has not ended, or has snapshots that are to stay.
+        NotFoundError: the dataset does not exist.
+        ConflictError: it is unfinished, or it has snapshots and `with_snapshots` is False.
     """
     dataset = services.index.datasets.get(name)
     if not dataset.state.is_final:
@@ -115,8 +114,10 @@ def delete_dataset(services: Services, name: str, *, owner: str = "", with_snaps
 
 
 def put_away(services: Services, deletion: Deletion) -> None:
-    """Move the objects of what is gone below `removed/`, its own record last; then the deletion's record goes. Nothing
-    happens to what was restored meanwhile."""
+    """Move the deleted objects below `removed/`, the own record last, then remove the deletion's record.
+
+    Do nothing for a thing that was restored meanwhile.
+    """
     record = _record_of(deletion)
     with services.index.database.writing():
         if not services.store.exists(names.deletion(deletion.what, deletion.id)):
@@ -139,16 +140,16 @@ def restore(
     permit: Callable[[Deletion], None],
     among: Callable[[Deletion], bool] = lambda _: True,
 ) -> Deletion:
-    """Bring back what a user took away, as it was; a dataset with the jobs that went with it.
+    """Restore what a user deleted, unchanged; a dataset with its deleted jobs.
 
     Args:
-        name: of the thing, or its id.
-        permit: asked with the deletion; raises where it must not be taken back.
+        name: name or id of the thing.
+        permit: called with the deletion; raises if it may not be restored.
         among: whether a deletion is in scope.
 
     Raises:
         NotFoundError: nothing of that name was deleted within the grace time.
-        ConflictError: there is one of that name again, or what it needs is deleted too.
+        ConflictError: the name is in use again, or a dependency is deleted too.
     """
     known = [one for one in deletions(services.store, what) if name in (one.id, one.name) and among(one)]
     if not known:
@@ -169,7 +170,7 @@ def restore(
 def _restore(
     services: Services, deletion: Deletion, connection: Connection, *, before: Callable[[], None] = lambda: None
 ) -> None:
-    """Objects, then rows, then the deletion is forgotten. Called in the turn of the index's writers."""
+    """Restore objects, then rows, then remove the deletion. Called under the index's write lock."""
     store, record, folder = services.store, _record_of(deletion), removed_folder(deletion)
     waiting = names.deletion(deletion.what, deletion.id)
     if not store.exists(waiting) and store.exists(record):
@@ -183,14 +184,14 @@ def _restore(
         _enter(services, deletion, connection)
     except ConflictError:
         if not store.exists(waiting):
-            put_record(store, waiting, deletion)  # the controller puts it away again
+            put_record(store, waiting, deletion)  # the controller removes it again
         raise
     store.delete(waiting)
     store.delete(f"{folder}/deletion.json")
 
 
 def _enter(services: Services, deletion: Deletion, connection: Connection) -> None:
-    """The rows that follow from the records of a job, a dataset, a hand, an object or a network."""
+    """Write the rows that follow from the records of a job, dataset, hand, object or network."""
     store, index = services.store, services.index
     if deletion.what == "job":
         record = read_record(JobRecord, store, names.job_record(deletion.id))
@@ -220,7 +221,7 @@ def _enter(services: Services, deletion: Deletion, connection: Connection) -> No
 
 
 def _restore_jobs(services: Services, deletion: Deletion, connection: Connection) -> None:
-    """The jobs of a dataset that were deleted with it, or after it."""
+    """Restore the jobs of a dataset that were deleted with it or later."""
     wanted = set(load_dataset(services.store, deletion.id).jobs)
     newest: dict[str, Deletion] = {}
     for one in deletions(services.store, "job"):
@@ -246,7 +247,7 @@ def _require(services: Services, wanted: Collection[tuple[AssetKind, str]], conn
 
 
 def _record_of(deletion: Deletion) -> str:
-    """The object that says that the thing is there."""
+    """Return the key of the record whose presence makes the thing exist."""
     if deletion.what == "job":
         return names.job_record(deletion.id)
     if deletion.what == "dataset":

@@ -1,4 +1,4 @@
-"""The cheapest setting that the stored charts of speed against accuracy promise for a wanted accuracy."""
+"""Choose the cheapest fidelity that reaches a wanted accuracy according to the stored charts."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Near = Literal["hand and object", "hand", "all"]
 
 _TARGET: Final = re.compile(r"\s*([a-z_]+)\s*(>=|<=)\s*([0-9]*\.?[0-9]+)\s*")
 _EXAMPLES: Final = {False: "gsr>=0.6, epsilon>=0.2 or pd_mm<=1", True: "lift>=0.9, lift_hard>=0.7 or robust>=0.95"}
-#: What runs of a chart have in common with a request, the nearest first.
+#: Properties that runs of a chart share with a request, the nearest first.
 _NEAR: Final[tuple[tuple[Near, tuple[str, ...]], ...]] = (
     ("hand and object", ("hand", "object")),
     ("hand", ("hand",)),
@@ -31,7 +31,7 @@ _NEAR: Final[tuple[tuple[Near, tuple[str, ...]], ...]] = (
 
 
 class ChosenFidelity(NamedTuple):
-    """A fidelity, and why it."""
+    """A fidelity, and the reason for it."""
 
     fidelity: str
     measured_on: Near
@@ -40,7 +40,7 @@ class ChosenFidelity(NamedTuple):
 
 @dataclass
 class _Chart:
-    """A stored chart, with what was measured in it."""
+    """A stored chart, with its measured hands and objects."""
 
     key: str
     content: Row
@@ -58,10 +58,10 @@ class _Chart:
 
 
 class Resolver:
-    """Puts fidelities in the place of `auto`. Each chart is read once, when the first request needs it.
+    """Replace `auto` by a fidelity. Each chart is read once, at the first request that needs it.
 
-    A request around a free object asks the newest chart of free objects, one with a scene the newest of its kind of
-    scene (`charts_of`), never the other: what holds against six pushes need not come out of a bin.
+    A request for a free object uses the newest chart of free objects; one with a scene uses the newest chart of that
+    kind of scene (`charts_of`). They are never mixed: a grasp that resists six pushes may fail to leave a bin.
     """
 
     def __init__(self, store: Store) -> None:
@@ -69,20 +69,20 @@ class Resolver:
         self._charts: dict[Any, _Chart] = {}
 
     def __call__(self, request: JobRequest) -> JobRequest:
-        """The request with a fidelity in the place of `auto`; errors as in `choose`."""
+        """Return the request with `auto` replaced by a fidelity; errors as in `choose`."""
         return self.choose(request)[0]
 
     def choose(self, request: JobRequest) -> tuple[JobRequest, Choice | None]:
-        """The request with a fidelity in the place of `auto`, and how that was chosen; None where it names one.
+        """Return the request with `auto` replaced by a fidelity, and the reason; None without `auto`.
 
         Raises:
-            InputError: no chart for its scene was published, or nothing in it meets the target.
+            InputError: no chart exists for its scene, or no fidelity meets the target.
         """
         if request.fidelity != AUTO:
             return request, None
         chart = self._chart(request)
         pair = (request.hand, request.object)
-        # What the chart does not know is alike to it.
+        # Hands that the chart lacks share one result.
         hand = request.hand if request.hand in chart.hands else ""
         key = (request.method, request.target, *(pair if pair in chart.pairs else (hand, "")))
         if key not in chart.found:
@@ -115,11 +115,10 @@ def _no_chart(request: JobRequest) -> str:
 
 
 def parse_target(text: str, *, in_scene: bool = False) -> tuple[str, float]:
-    """`gsr>=0.6` as its metric and bound; in a scene `lift>=0.9`.
+    """Parse `gsr>=0.6` into metric and bound; in a scene `lift>=0.9`.
 
     Raises:
-        InputError: another form, an accuracy that charts of such grasps do not hold, or a bound on the side where it
-            would ask for a worse grasp.
+        InputError: another form, an accuracy that such charts lack, or a bound that would ask for a worse grasp.
     """
     known, examples = IN_SCENES if in_scene else FREE, _EXAMPLES[in_scene]
     found = _TARGET.fullmatch(text)
@@ -137,10 +136,10 @@ def parse_target(text: str, *, in_scene: bool = False) -> tuple[str, float]:
 def cheapest(
     chart: Row, target: str, *, method: str, hand: str, object_: str, offered: Sequence[str] = OFFERED
 ) -> ChosenFidelity:
-    """The fidelity of a method with most valid grasps per second among those that meet a target.
+    """Return the fidelity of a method with most valid grasps per second among those that meet a target.
 
-    What was measured of this very hand and object counts; else of this hand; else everything. In a chart of scenes
-    only grasps that were planned for them count, by lifted grasps per second.
+    Runs of the same hand and object count; else runs of the hand; else all. In a chart of scenes only grasps planned
+    for them count, by lifted grasps per second.
 
     Args:
         chart: as `graspd chart` writes it.
@@ -151,7 +150,7 @@ def cheapest(
         offered: fidelities to choose from.
 
     Raises:
-        InputError: no such target, nothing measured of the method, or nothing that meets the target.
+        InputError: no such target, no run of the method, or no fidelity that meets the target.
     """
     in_scene = "scene" in chart
     metric, bound = parse_target(target, in_scene=in_scene)
@@ -177,7 +176,7 @@ def cheapest(
 
 
 def _nearest(runs: Sequence[Row], metric: str, wanted: Mapping[str, str]) -> tuple[Near, list[Row]] | None:
-    """The nearest runs of which one has the accuracy."""
+    """Return the nearest runs of which one has the accuracy."""
     for measured_on, same in _NEAR:
         near = [run for run in runs if all(run[name] == wanted[name] for name in same)]
         if any(run.get(metric) is not None for run in near):
@@ -186,12 +185,12 @@ def _nearest(runs: Sequence[Row], metric: str, wanted: Mapping[str, str]) -> tup
 
 
 def _speed(runs: Sequence[Row], fidelity: str) -> float:
-    """Mean over a fidelity's runs; one that found nothing, or was refused, is as slow as can be."""
+    """Return the mean over a fidelity's runs; a run without grasps, or a refused one, has speed 0."""
     own = [run for run in runs if run["fidelity"] == fidelity]
     return sum(float(next((run[key] for key in SPEEDS if key in run), None) or 0.0) for run in own) / len(own)
 
 
 def _mean(runs: Sequence[Row], fidelity: str, metric: str) -> float | None:
-    """Mean over a fidelity's runs that have the accuracy; where nothing holds nobody knows how robustly it would."""
+    """Return the mean over a fidelity's runs with the accuracy; robustness needs held grasps."""
     values = [float(run[metric]) for run in runs if run["fidelity"] == fidelity and run.get(metric) is not None]
     return sum(values) / len(values) if values else None

@@ -1,6 +1,6 @@
-"""Garbage collector of the store: moves what users deleted aside, a little in each round of the controller.
+"""Garbage collector of the store: moves deleted objects aside, a part in each round of the controller.
 
-After the grace time it goes for good, with the shards that no job needs any more.
+After the grace time they are removed for good, with the shards that no job needs.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ _AT_ONCE: Final = 200
 
 
 class GarbageCollector:
-    """Carries out deletions; killed at any moment, its successor does the rest."""
+    """Carry out deletions; if killed, the successor continues."""
 
     def __init__(self, services: Services, *, clock: Callable[[], float] = time.monotonic) -> None:
         self._services = services
         self._clock = clock
 
     def advance(self, budget_s: float = BUDGET_S) -> bool:
-        """Work for so long at most. Returns whether something is left to do.
+        """Work for at most `budget_s`. Return whether work is left.
 
         Raises:
-            UnavailableError: a part is away; call again later.
+            UnavailableError: a backend is unavailable; call again later.
         """
         deadline = self._clock() + budget_s
         for entry in list(self._services.store.list(names.DELETIONS)):
@@ -55,11 +55,10 @@ class GarbageCollector:
         return False
 
     def collect(self, budget_s: float = BUDGET_S) -> bool:
-        """Remove what was deleted before the grace time, and shards that have not been needed since. Returns whether
-        something is left to do."""
+        """Remove objects deleted before the grace time, and shards unused since. Return whether work is left."""
         deadline = self._clock() + budget_s
         before = timestamp(self._services.settings.shard_grace_s)
-        # What tells of the deletion sorts first and goes last.
+        # The record of the deletion sorts first and is removed last.
         for entry in sorted(
             self._services.store.list(names.REMOVED), key=lambda one: one.key.endswith("/deletion.json")
         ):
@@ -69,7 +68,7 @@ class GarbageCollector:
                 self._services.store.delete(entry.key)
         known = self._services.index.notes.completeness()
         if known is not None and known.left_out:
-            return False  # a job whose record cannot be read may need one of them
+            return False  # a job with an unreadable record may need one of them
         for entry in sorted(self._services.store.list(names.RELEASED), key=lambda one: one.key):
             try:
                 released = read_record(DeletedJob, self._services.store, entry.key)
@@ -77,7 +76,7 @@ class GarbageCollector:
                 log.warning("%s", error)
                 continue
             if released.at > before:
-                break  # those behind it are younger
+                break  # the following ones are younger
             for stage, shard in self._unneeded(released):
                 if self._clock() > deadline:
                     return True
@@ -86,7 +85,7 @@ class GarbageCollector:
         return False
 
     def _carry_out(self, deletion: Deletion, deadline: float) -> bool:
-        """Rows once more, in case the process ended between record and rows; then the objects. Whether all is done."""
+        """Remove rows again, if the process ended after the record, then objects. Return whether all is done."""
         with self._services.index.database.writing() as connection:
             if not self._services.store.exists(names.deletion(deletion.what, deletion.id)):
                 return True  # restored since it was listed
@@ -103,7 +102,7 @@ class GarbageCollector:
         return True
 
     def _remove_jobs_of(self, dataset: str, deadline: float) -> bool:
-        """Delete the jobs that the planner made for a dataset and that no other one holds; whether all are gone."""
+        """Delete the jobs planned for a dataset that no other dataset contains; return whether all are gone."""
         try:
             jobs = load_dataset(self._services.store, dataset).jobs
         except (NotFoundError, DamagedError):
@@ -113,7 +112,7 @@ class GarbageCollector:
                 if self._clock() > deadline:
                     return False
                 try:
-                    # The dataset was cancelled, perhaps too short a time ago for its jobs to be.
+                    # The dataset was cancelled, perhaps too recently for its jobs to be.
                     with contextlib.suppress(ConflictError):
                         job_actions.cancel(self._services, job)
                     delete_job(self._services, job)
@@ -129,8 +128,7 @@ class GarbageCollector:
             yield from ((stage, shard) for stage, shard in some if shard in unneeded)
 
     def _remove_shard(self, stage: Stage, shard: str) -> None:
-        """The manifest first: without it the shard does not exist. A job that is entered meanwhile waits for the lock,
-        and makes the shard anew."""
+        """Remove the manifest first, which ends the shard; a job entered meanwhile waits and makes it again."""
         with self._services.index.database.writing() as connection:
             if self._services.index.removals.remove_shard(shard, within=connection):
                 self._services.store.delete(names.shard_manifest(stage, shard))

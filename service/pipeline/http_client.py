@@ -1,7 +1,7 @@
-"""HTTP client of webhooks: POST to an address that a stranger named, public machines only, bounded time and bytes.
+"""HTTP client of webhooks: POST to a user's address; public machines only, bounded time and bytes.
 
-The name is resolved here, every address that it has is looked at, and the connection goes to one of these very
-addresses: a name that means another machine a moment later (DNS rebinding) changes nothing. Redirects are not followed.
+The name is resolved here, all its addresses are checked, and the connection uses one of them. A name that later
+resolves to another machine (DNS rebinding) has no effect. Redirects are not followed.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ from urllib.parse import urlsplit
 
 from graspd.service.model.errors import InputError
 
-#: For the whole exchange [s].
+#: Time limit of the whole exchange [s].
 PATIENCE_S: Final = 10.0
-#: For looking the host up [s].
+#: Time limit of name resolution [s].
 LOOK_UP_S: Final = 5.0
-#: Of the answer no more is read than its status line, its headers and so many bytes.
+#: Most bytes read of the answer after its status line and headers.
 _READ_BYTES: Final = 1024
-#: Prefixes under which IPv4 addresses are reached: the well-known one, and those of a network's own.
+#: Prefixes that map IPv4 addresses: the well-known one, and network-specific ones.
 _NAT64: Final = ipaddress.ip_network("64:ff9b::/96")
 _LOCAL_NAT64: Final = ipaddress.ip_network("64:ff9b:1::/48")
 Address = ipaddress.IPv4Address | ipaddress.IPv6Address
 Networks = tuple[ipaddress.IPv4Network | ipaddress.IPv6Network, ...]
-#: Addresses that the library takes for global and that only machines inside reach: of clouds (Azure's host, IBM's
-#: services), of protocols (RFC 6890, RFC 7526), of documentation (RFC 9637).
+#: Addresses that the library counts as global although only internal machines reach them: of clouds (Azure's host,
+#: IBM's services), of protocols (RFC 6890, RFC 7526), of documentation (RFC 9637).
 _INSIDE: Final = tuple(
     ipaddress.ip_network(one)
     for one in ("168.63.129.16/32", "161.26.0.0/16", "166.8.0.0/14", "192.0.0.0/24", "192.88.99.0/24", "3fff::/20")
@@ -40,26 +40,26 @@ _INSIDE: Final = tuple(
 
 
 class RefusedAddress(InputError):
-    """The address names a machine that webhooks may not reach."""
+    """The address belongs to a machine that webhooks may not reach."""
 
 
 @dataclass(frozen=True)
 class Response:
-    """What came back: a status, and in a few words why there is none."""
+    """Response to a delivery: a status, or a short reason why there is none."""
 
     status: int | None
     detail: str = ""
     is_final: bool = False
-    """Whether another attempt is of no use: the address is one that may not be reached."""
+    """Whether a retry is useless because the address is refused."""
 
     @property
     def is_taken(self) -> bool:
-        """Whether the other side took it: any 2xx."""
+        """Whether the receiver accepted it: any 2xx."""
         return self.status is not None and 200 <= self.status < 300
 
 
 def networks(text: str) -> Networks:
-    """Networks of a setting, with commas or spaces between; InputError if one cannot be read."""
+    """Parse networks of a setting, separated by commas or spaces; InputError for an invalid one."""
     try:
         return tuple(ipaddress.ip_network(one) for one in text.replace(",", " ").split())
     except ValueError as error:
@@ -67,8 +67,10 @@ def networks(text: str) -> Networks:
 
 
 def is_public(address: Address) -> bool:
-    """Whether an address is one of the internet: not loopback, private, link-local, shared, multicast or reserved, nor
-    an IPv6 address that stands for such an IPv4 one."""
+    """Check whether an address is public, also the IPv4 address in an IPv6 one.
+
+    Loopback, private, link-local, shared, multicast and reserved addresses are not.
+    """
     if any(address in network for network in _INSIDE):
         return False
     if isinstance(address, ipaddress.IPv6Address):
@@ -83,14 +85,14 @@ def is_public(address: Address) -> bool:
 
 
 def reachable(host: str, port: int, allowed: Networks) -> list[str]:
-    """The addresses of a host, once all of them may be reached.
+    """Return the addresses of a host if all of them may be reached.
 
     Args:
-        allowed: networks that the operator lets webhooks reach besides public addresses.
+        allowed: networks that the operator allows besides public addresses.
 
     Raises:
-        Refused: one of them may not.
-        OSError: it has none.
+        Refused: one of them may not be reached.
+        OSError: it has no address.
     """
     found = list(dict.fromkeys(str(info[4][0]) for info in _looked_up(host, port)))
     for one in found:
@@ -103,14 +105,14 @@ def reachable(host: str, port: int, allowed: Networks) -> list[str]:
 
 
 def _looked_up(host: str, port: int) -> list[Any]:
-    """Addresses of a host; OSError if there is none, or the look-up takes longer than `LOOK_UP_S`."""
+    """Return the addresses of a host; OSError if it has none, or after `LOOK_UP_S`."""
     found: list[Any] = []
 
     def look_up() -> None:
         with contextlib.suppress(OSError, ValueError):
             found.extend(socket.getaddrinfo(host, port, type=socket.SOCK_STREAM))
 
-    # The system's resolver takes no time limit: a thread that it holds is left to it.
+    # The system's resolver has no time limit: a blocked thread is abandoned.
     thread = threading.Thread(target=look_up, daemon=True, name="look-up")
     thread.start()
     thread.join(LOOK_UP_S)
@@ -122,7 +124,7 @@ def _looked_up(host: str, port: int) -> list[Any]:
 def post(
     url: str, body: bytes, headers: Mapping[str, str], *, allowed: Networks = (), patience_s: float = PATIENCE_S
 ) -> Response:
-    """Send a body and tell the status of the answer. Never raises for what the other side does."""
+    """Send a body and return the status of the answer. Never raises, whatever the receiver does."""
     parts = urlsplit(url)
     host = parts.hostname or ""
     port = parts.port or (443 if parts.scheme == "https" else 80)
@@ -134,7 +136,7 @@ def post(
         return Response(None, str(error), is_final=True)
     except (OSError, ValueError):
         return Response(None, "the host of the address cannot be looked up")
-    # The time-out of a socket begins anew with each byte; this ends the whole.
+    # A socket's time-out restarts with each byte; this one limits the whole exchange.
     end = threading.Timer(patience_s, connection.cut)
     end.daemon = True
     end.start()
@@ -152,10 +154,10 @@ def post(
 
 
 class _Connection(http.client.HTTPConnection):
-    """A connection to one of the addresses that were looked at, where the library would look the name up again.
+    """A connection to one of the checked addresses; the library would resolve the name again.
 
     Args:
-        patience_s: for all addresses together, and the handshake [s].
+        patience_s: time limit of all addresses together and the handshake [s].
     """
 
     def __init__(self, scheme: str, host: str, port: int, addresses: Sequence[str], patience_s: float) -> None:
@@ -170,7 +172,7 @@ class _Connection(http.client.HTTPConnection):
         self.sock = self._context.wrap_socket(dialled, server_hostname=self.host) if self._context else dialled
 
     def cut(self) -> None:
-        """End it from another thread, whatever it waits for."""
+        """Close it from another thread, in any state."""
         with contextlib.suppress(OSError):
             if self.sock is not None:
                 self.sock.shutdown(socket.SHUT_RDWR)

@@ -1,8 +1,8 @@
-"""Which service a store, an index and a Redis belong to: two services on one of them would undo each other's work.
+"""Identity of the service of a store, an index and a Redis.
 
-The store holds a chain of records, put create-only: the last one is the service that works on it. The index and Redis
-repeat its id. Where one of the two was lost, the other tells that the service is the same; an index and a Redis that
-both know nothing are of a second service, and `graspd admin index rebuild` says that it takes the first one's place.
+Two services on one of them would undo each other's work. The store contains a chain of create-only records; the last
+one is the service that works on it. Index and Redis repeat its id. If one of them is lost, the other identifies the
+service. If both are empty they count as a second service; `graspd admin index rebuild` makes it the present one.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _REDIS: Final = (
 
 
 class ServiceRecord(Record):
-    """A service that began to work on a store."""
+    """A service that started work on a store."""
 
     id: str
     at: str
@@ -42,7 +42,7 @@ class ServiceRecord(Record):
 
 @dataclass(frozen=True)
 class Identity:
-    """What store, index, Redis and data folder say of whom they belong to."""
+    """Service ids in store, index, Redis and data folder."""
 
     chain: Sequence[str]
     """Ids in the store; the last one counts."""
@@ -54,14 +54,14 @@ class Identity:
 
     @property
     def is_same(self) -> bool:
-        """Whether the last service of the store is the one of this index."""
+        """Whether the last service of the store is the index's."""
         if self.index is not None:
             return self.index == self.chain[-1]
         others = {self.redis, self.folder} - {None}
         return self.chain[-1] in others or (self.is_own_store and not others)
 
     def refusal(self, store: str, *, take_over: bool = False) -> str:
-        """Why a process must not work here, in one line; "" if it may."""
+        """Return why a process must not work here, in one line; "" if it may."""
         if self.redis is not None and self.redis not in (*self.chain, self.index):
             return _REDIS
         if not self.chain or self.is_same or take_over:
@@ -84,28 +84,28 @@ def identify(
     take_over: bool = False,
     holds_redis: bool = False,
 ) -> str:
-    """Find out that store, index and Redis belong to one service, and say so in those that know nothing.
+    """Check that store, index and Redis belong to one service, and write its id where it is missing.
 
     Args:
-        folder: data folder that remembers the service, too.
+        folder: data folder that also stores the id.
         ask_redis: False while Redis is not started.
-        take_over: be the service of the store from now on, whichever it was before.
-        holds_redis: this process has the lease of the controller, so Redis is its service's whatever it says.
+        take_over: become the service of the store, whichever it was before.
+        holds_redis: this process has the controller's lease, so Redis belongs to its service in any case.
 
     Returns:
         id of the service.
 
     Raises:
         BusyError: one of them belongs to another service.
-        StoreUnavailable, IndexUnavailable, QueueUnavailable: they cannot be asked.
+        StoreUnavailable, IndexUnavailable, QueueUnavailable: they are unavailable.
     """
-    # Redis first and the store last: of processes that begin a service at once, each finds what the others wrote.
+    # Redis is read first and the store last, so that concurrent new processes see each other's writes.
     redis = services.queue.service() if ask_redis else None
     left = _read(folder)
     chain = service_ids(services.store)
     index = services.index.notes.service()
     if not chain:
-        # An index that was never filled is left of a start that was killed here.
+        # An empty index remains from a start that was killed here.
         if index is not None and not take_over and services.index.notes.completeness() is not None:
             raise BusyError(_others_index(services.store.url))
         index = services.index.notes.name_service(index or secrets.token_hex(_BYTES))
@@ -132,7 +132,7 @@ def identify(
 
 
 def identify_if_redis_answers(services: Services, *, folder: Path | None = None, take_over: bool = False) -> str:
-    """`identify`, by what store, index and folder say where Redis is away."""
+    """Call `identify`; if Redis is unavailable, use store, index and folder only."""
     try:
         return identify(services, folder=folder, take_over=take_over)
     except QueueUnavailable:
@@ -140,16 +140,16 @@ def identify_if_redis_answers(services: Services, *, folder: Path | None = None,
 
 
 def check_queue(store: Store, queue: RqQueue) -> bool:
-    """For a process without an index: whether Redis says yet that it belongs to the service of the store.
+    """Check, for a process without an index, whether Redis already has the id of the store's service.
 
     Raises:
-        BusyError: it belongs to another one.
+        BusyError: it belongs to another service.
     """
     return check_service(store, queue.service())
 
 
 def check_service(store: Store, redis: str | None) -> bool:
-    """The same of what Redis says."""
+    """Check the id that Redis returned in the same way."""
     if redis is None:
         return False
     chain = service_ids(store)
@@ -159,13 +159,13 @@ def check_service(store: Store, redis: str | None) -> bool:
 
 
 def service_ids(store: Store) -> list[str]:
-    """Ids of the services that worked on a store; the last one does now."""
+    """Return the ids of all services of a store; the last one is the present one."""
     keys = sorted(entry.key for entry in store.list(names.SERVICE))
     return [read_record(ServiceRecord, store, key).id for key in keys]
 
 
 def recorded(folder: Path) -> str | None:
-    """Id of the service that last ran in a data folder."""
+    """Return the id of the service that last ran in a data folder."""
     return _read(folder)
 
 

@@ -1,4 +1,4 @@
-"""From events to the index. An event only says where to look: what enters the index is read from the store."""
+"""Apply events to the index. An event only names a place: the index is filled from the store."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ from graspd.service.store.records import read_record
 log = logging.getLogger(__name__)
 _REMEMBERED_JOBS: Final = 10_000
 _REMEMBERED_TASKS: Final = 100_000
-#: Batches indexed in one transaction: others who write wait for it, a fraction of a second.
+#: Most batches indexed in one transaction; other writers wait for a fraction of a second.
 _BATCHES_AT_ONCE: Final = 200
-#: Manifests in memory at once, of up to 64 batches each.
+#: Manifests in memory at once, each of up to 64 batches.
 _MANIFESTS_AT_ONCE: Final = 32
 _READERS: Final = 8
 
@@ -36,7 +36,7 @@ _NEEDS_STORE: Final = frozenset({EventKind.FINISHED, EventKind.FAILED})
 
 
 class Indexer:
-    """Applies events; tells listeners when a job's state changes."""
+    """Apply events; notify listeners when a job's state changes."""
 
     def __init__(self, services: Services) -> None:
         self._services = services
@@ -46,13 +46,13 @@ class Indexer:
         self._readers = ThreadPoolExecutor(_READERS, thread_name_prefix="manifests")
 
     def apply(self, events: Sequence[Event]) -> list[int]:
-        """Bring the index up to date. Applying an event twice changes nothing.
+        """Update the index. To apply an event twice changes nothing.
 
         Returns:
-            places of the events for which the store is needed and away; apply these again later.
+            positions of the events that need the unavailable store; apply these again later.
 
         Raises:
-            UnavailableError: another part is away; apply the same events again later.
+            UnavailableError: another backend is unavailable; apply the same events again later.
         """
         started: dict[str, str] = {}
         finished: list[int] = []
@@ -68,7 +68,7 @@ class Indexer:
                 left.append(event.worker)
             elif event.kind is not EventKind.JOB:
                 self._start(started)
-                # What a store that is away keeps from being known must not hide what does not need it.
+                # An unavailable store must not delay events that do not need it.
                 if not (waiting and event.kind in _NEEDS_STORE) and self._apply(event):
                     continue
                 waiting.append(place)
@@ -79,14 +79,14 @@ class Indexer:
         return sorted(waiting)
 
     def _start(self, started: dict[str, str]) -> None:
-        """Tasks that workers took; those are taken off the list."""
+        """Mark tasks as started by workers; remove them from the argument."""
         if started:
             with _left_out(f"the start of {len(started)} tasks"):
                 self.tell(self._services.index.live.set_running(started))
             started.clear()
 
     def _finish(self, events: Sequence[Event], places: Sequence[int]) -> list[int]:
-        """Index what was made; returns the places of the events whose manifests the store does not give."""
+        """Index finished shards; return the positions of events whose manifests cannot be read."""
         made, waiting = list[ShardManifest](), []
         for place, found in self._loaded(events, places):
             if isinstance(found, ShardManifest):
@@ -112,7 +112,7 @@ class Indexer:
             yield from zip(some, self._readers.map(self._load, [events[place] for place in some]), strict=True)
 
     def _load(self, event: Event) -> ShardManifest | Exception:
-        """The manifest of what was made. Many are read at once: most of the time the store is waited for."""
+        """Read the manifest of a shard. Many are read at once, because most of the time is latency."""
         try:
             assert event.stage is not None
             return load_manifest(self._services.store, event.stage, event.output)
@@ -120,7 +120,7 @@ class Indexer:
             return error
 
     def _index(self, made: list[ShardManifest]) -> None:
-        """Shards in one transaction; where the index cannot hold one of them, each by itself."""
+        """Index shards in one transaction; if the index rejects one of them, index each by itself."""
         try:
             states = self._services.index.write.add_manifests(made) if made else {}
         except InputError:
@@ -134,7 +134,7 @@ class Indexer:
         self._tally.made(made)
 
     def tell(self, states: Mapping[str, State]) -> None:
-        """Publish the states of jobs where they changed."""
+        """Publish the changed states of jobs."""
         changed = {job: state for job, state in states.items() if self._told.get(job) is not state}
         if changed:
             now = timestamp()
@@ -177,11 +177,11 @@ class Indexer:
             self.tell({attempt.job_id: state})
 
     def flush(self) -> None:
-        """Add what was counted since the last time to the sums that Prometheus reads."""
+        """Add the counts since the last call to the sums for Prometheus."""
         self._tally.flush()
 
     def _apply(self, event: Event) -> bool:
-        """Take up one event by itself; False if it must wait for the store."""
+        """Apply one event by itself; return False if it must wait for the store."""
         try:
             with _left_out(f"event {event.kind} of task {event.task_id}"):
                 self._take_up(event)
@@ -195,7 +195,7 @@ class Indexer:
             kind, _, digest = event.output.partition("/")
             self.checked(AssetKind(kind), digest)
         elif event.kind is EventKind.FAILED and event.stage is Stage.INGEST:
-            # Without a finding nobody knows whether the upload is good: its check is tried until it ends in one.
+            # Without a result the upload is undecided: its check is repeated until it has one.
             self._defer(event)
         elif event.kind is EventKind.FAILED:
             self.failed(read_record(AttemptRecord, self._services.store, attempt_key(event.task_id, event.attempt)))
@@ -223,7 +223,7 @@ class Indexer:
 
 @contextmanager
 def _left_out(what: str) -> Iterator[None]:
-    """Anybody who can write to Redis can put an event there: a bad one must not stop those behind it."""
+    """Skip a bad event: any process with access to Redis can write one, and it must not block others."""
     try:
         yield
     except UnavailableError:

@@ -1,4 +1,4 @@
-"""Integrity of a store: shards, records, uploads, all that is kept, against their checksums. Changes nothing."""
+"""Integrity check of a store: shards, records and uploads against their checksums. Changes nothing."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from graspd.service.store.manifests import ShardManifest
 from graspd.service.store.records import CHARTS, IN_SCENES, STABILITY, DeletedJob, Deletion, parse_record
 from graspd.service.store.store import Store
 
-#: What the key of a record looks like, and what it must hold.
+#: Key patterns of records, and the model of each.
 _RECORDS: Final[tuple[tuple[str, type[Any]], ...]] = (
     (r"assets/[^/]+/[^/]+/asset\.json", Asset),
     (r"jobs/[^/]+/job\.json", JobRecord),
@@ -48,7 +48,7 @@ _RECORDS: Final[tuple[tuple[str, type[Any]], ...]] = (
     (r"webhooks/[^/]+\.json", Webhook),
     (r"tags/[^/]+/[^/]+\.json", Tag),
 )
-#: In the order of the controller's rounds, which remember a place in it.
+#: In the order of the controller's rounds, which store a position in it.
 FOLDERS: Final = (
     names.SHARDS,
     names.ASSETS,
@@ -76,21 +76,21 @@ MISSING: Final = "its file is gone"
 NO_MANIFEST: Final = "it has no manifest"
 BAD_MANIFEST: Final = "its manifest is damaged"
 FOREIGN: Final = "nothing that graspd put there"
-#: How long a file may be without a manifest [s].
+#: Time for which a file may lack its manifest [s].
 _ON_ITS_WAY_S: Final = 60.0
-#: Told after each piece that was read: its bytes.
+#: Called after each read part with its bytes.
 Read = Callable[[int], None]
-#: Told of each object that was written without a checksum of its own: its key.
+#: Called with the key of each object that was written without a checksum.
 Unsealed = Callable[[str], None]
 
 
 def scan(
     store: Store, *folders: str, read: Read = lambda size: None, unsealed: Unsealed = lambda key: None
 ) -> Iterator[tuple[str, Damage | None]]:
-    """Every object that can be checked, of all folders or some, with what is wrong with it, None if nothing is.
+    """Yield every object that can be checked, of all folders or some, with its damage or None.
 
     Raises:
-        StoreUnavailable: the store does not answer.
+        StoreUnavailable: the store is unavailable.
     """
     for folder in folders or FOLDERS:
         for entry in store.list(folder):
@@ -99,7 +99,7 @@ def scan(
 
 
 def is_on_its_way(store: Store, one: Damage) -> bool:
-    """Whether a file may only wait for the manifest that its worker puts next."""
+    """Check whether a file may only wait for its manifest, which its worker puts next."""
     try:
         return one.what == NO_MANIFEST and (age_of(store.stamp(one.key)[1]) or 0.0) < _ON_ITS_WAY_S
     except NotFoundError:
@@ -107,14 +107,14 @@ def is_on_its_way(store: Store, one: Damage) -> bool:
 
 
 def is_checked(key: str) -> bool:
-    """Whether `examine` knows what an object of this name must hold."""
+    """Check whether `examine` supports an object of this name."""
     return key.startswith(f"{names.SHARDS}/") or key.endswith(_SEALED)
 
 
 def examine(
     store: Store, key: str, *, read: Read = lambda size: None, unsealed: Unsealed = lambda key: None
 ) -> Damage | None:
-    """What is wrong with one object; of a shard, its file is examined with its manifest."""
+    """Return the damage of one object or None; the file of a shard is checked with its manifest."""
     try:
         if not key.startswith(f"{names.SHARDS}/"):
             return _sealed(store, key, read, unsealed)
@@ -124,7 +124,7 @@ def examine(
         if ending == "json":
             return _manifest(store, key, STAGES[kind], shard, read, unsealed)
         manifest = names.shard_manifest(STAGES[kind], shard)
-        # A worker puts the manifest last; it may have come since the file was listed.
+        # A worker puts the manifest last; it may have arrived since the listing.
         orphan = not store.exists(manifest) and store.exists(key) and not store.exists(manifest)
         return Damage(key, NO_MANIFEST, shard) if orphan else None
     except NotFoundError:
@@ -132,12 +132,12 @@ def examine(
 
 
 def _model_of(key: str) -> type[Any] | None:
-    """What the record of this name must hold; None for what is no record."""
+    """Return the model of a record of this name; None if it is no record."""
     return next((model for pattern, model in _RECORDS if re.fullmatch(pattern, key)), None)
 
 
 def _sealed(store: Store, key: str, read: Read, unsealed: Unsealed) -> Damage | None:
-    """What carries its own checksum; what has none is looked at as far as its content tells."""
+    """Check an object with its own checksum; without one, check its content as far as possible."""
     match, model = _UPLOAD.fullmatch(key), _model_of(key)
     try:
         if not is_sealed(key, _counted(store.stream(key), read), store.size(key)):
@@ -160,7 +160,7 @@ def _counted(chunks: Iterator[bytes], read: Read) -> Iterator[bytes]:
 
 
 def _check_upload(store: Store, key: str, kind: AssetKind, digest: str) -> None:
-    """An archive of graspd 0.2: the digest of its files, of which its folder is named, is all that tells."""
+    """Check an archive of graspd 0.2 by the digest of its files, which names its folder."""
     with tempfile.TemporaryFile() as file:
         file.writelines(store.stream(key))
         try:

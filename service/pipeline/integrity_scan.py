@@ -1,4 +1,4 @@
-"""Integrity scan of the store by the controller: round after round, at a bounded rate, on from where it stopped."""
+"""Integrity scan of the store by the controller: repeated, rate-limited, resumed where it stopped."""
 
 from __future__ import annotations
 
@@ -19,28 +19,28 @@ from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.integrity import FOLDERS, examine, is_checked, is_on_its_way
 
 log = logging.getLogger(__name__)
-#: A small store is not read more often than this [s].
+#: Least interval of rounds over a small store [s].
 ROUND_S: Final = 3600.0
-#: What is known to be damaged is looked at again this often, so that the fixed is soon forgotten [s].
+#: Interval of checks of known damage, so that fixed objects are soon removed from the list [s].
 _AGAIN_S: Final = 60.0
 _KNOWN: Final = 1000
-#: Keys held at once; the folder is listed anew for the next ones.
+#: Keys in memory at once; the folder is listed again for the next ones.
 _KEYS: Final = 10_000
-#: An object costs at least this, or a million small ones would be read in one go [bytes].
+#: Least cost of an object, so that a million small ones are not read at once [bytes].
 _LEAST: Final = 16 * 2**10
-#: Work that is made up for at once after a pause [s].
+#: Most backlog that is caught up at once after a pause [s].
 _BURST_S: Final = 0.25
-#: Whoever reads through the store says so this often [s], and is believed for three times as long.
+#: Interval at which a reader of the store renews its turn [s]; the turn expires after three times as long.
 _TURN_S: Final = 5.0
 _PAUSE_S: Final = 5.0
 
 
 class Interrupted(Exception):
-    """The process is to stop, or somebody else reads through the store."""
+    """The process shall stop, or another process reads the store."""
 
 
 class ReadPermit:
-    """The right to read through the store: one has it at a time, a `store verify` before the controller."""
+    """Exclusive right to read through the store; `store verify` precedes the controller."""
 
     def __init__(self, services: Services, *, is_controller: bool, clock: Callable[[], float] = time.monotonic) -> None:
         self._services, self._is_controller, self._clock = services, is_controller, clock
@@ -48,7 +48,7 @@ class ReadPermit:
         self._said = -_TURN_S
 
     def is_mine(self) -> bool:
-        """Take the turn, or keep it; asks the index every few seconds."""
+        """Take or renew the turn; queries the index every few seconds."""
         now = self._clock()
         if now - self._said >= _TURN_S:
             if not self._services.index.notes.take_scan_turn(
@@ -59,7 +59,7 @@ class ReadPermit:
         return True
 
     def keep(self) -> None:
-        """Renew it, while there is much to read."""
+        """Renew it during long reads."""
         self.is_mine()
 
     def end(self) -> None:
@@ -68,7 +68,7 @@ class ReadPermit:
 
 
 class IntegrityScan:
-    """Reads through the store and notes in the index what is damaged, or no longer is."""
+    """Read through the store; record new and fixed damage in the index."""
 
     def __init__(
         self, services: Services, stop: threading.Event, *, clock: Callable[[], float] = time.monotonic
@@ -80,7 +80,7 @@ class IntegrityScan:
         self._looked = clock()
 
     def run(self) -> None:
-        """Until told to stop. A part that is away is waited for."""
+        """Run until `stop` is set. Wait for an unavailable backend."""
         while not self._stop.is_set():
             try:
                 if not self._turn.is_mine() or not self.advance():
@@ -97,15 +97,15 @@ class IntegrityScan:
             self.end()
 
     def end(self) -> None:
-        """Let others read through the store at once."""
+        """Release the turn at once."""
         self._turn.end()
 
     def advance(self) -> bool:
-        """Read some objects further. Returns whether there is more to read now.
+        """Read some more objects. Return whether more can be read now.
 
         Raises:
-            Interrupted: it is to stop, or `store verify` reads now.
-            UnavailableError: a part is away; call again.
+            Interrupted: it shall stop, or `store verify` reads now.
+            UnavailableError: a backend is unavailable; call again.
         """
         self._look_again_in_time(None)
         note = self._services.index.notes.scan_note()
@@ -133,7 +133,7 @@ class IntegrityScan:
             self.look_again()
 
     def look_again(self) -> None:
-        """Examine anew what is known to be damaged; forget what is well, and what was removed since."""
+        """Check known damage again; remove fixed and deleted objects from the list."""
         self._looked = self._clock()
         _, known = self._services.index.damage.known(limit=_KNOWN)
         well = [one.key for one in known if self._is_well(one)]
@@ -158,7 +158,7 @@ class IntegrityScan:
         return heapq.nsmallest(_KEYS, (entry.key for entry in listed))
 
     def _pace(self, size: int) -> None:
-        """Wait until so many bytes more are within the rate."""
+        """Wait until `size` more bytes are within the rate."""
         now = self._clock()
         self._paid = max(self._paid, now - _BURST_S) + size / self._rate
         if self._stop.wait(max(0.0, self._paid - now)) or not self._turn.is_mine():

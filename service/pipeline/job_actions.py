@@ -1,4 +1,4 @@
-"""What a user does to jobs: submit, cancel, retry. The planning behind it is in `planning`."""
+"""Actions of a user on jobs: submit, cancel, retry. `planning` contains the planning."""
 
 from __future__ import annotations
 
@@ -37,23 +37,23 @@ from graspd.service.store.records import add_job_event, job_events, put_record, 
 from graspd.service.telemetry import bound
 
 log = logging.getLogger(__name__)
-#: Wait before it is looked again whether a worker can do what was held back [s].
+#: Interval at which held-back tasks are checked for a capable worker [s].
 HELD_S: Final = 10.0
-#: A centre of mass may lie this deep in a support [m]: what is checked was measured on another mesh than is grasped.
+#: Allowed depth of a centre of mass in a support [m]: it was measured on another mesh than the grasped one.
 _SUNK_M: Final = 1e-3
 
 
 def submit(services: Services, request: JobRequest, *, priority: Priority | None = None) -> tuple[JobView, bool]:
-    """Record a job and queue its first tasks. The same request on the same hand and object is the same job.
+    """Record a job and queue its first tasks. Equal requests on equal hand and object give the same job.
 
     Args:
         lane: bulk for the jobs of a dataset; by default a small job is interactive.
 
     Returns:
-        the job, and whether it is new. A failed or cancelled job is returned as it is: `retry` starts it again.
+        the job, and whether it is new. A failed or cancelled job is returned unchanged: see `retry`.
 
     Raises:
-        what `prepare` raises; nothing was recorded then.
+        as in `prepare`; nothing was recorded then.
     """
     return enter(services, prepare(services, request, priority=priority))
 
@@ -66,18 +66,18 @@ def prepare(
     owner: str = "",
     scope: ProjectScope = EVERYTHING,
 ) -> JobRecord:
-    """The job that a request stands for, of a hand and an object that may be used.
+    """Return the job of a request whose hand and object may be used.
 
     Args:
-        owner: id of the API key that submits it.
-        scope: which hands, objects and networks it may name, and the project that it belongs to.
+        owner: id of the submitting API key.
+        scope: which hands, objects and networks it may name, and its project.
 
     Raises:
         NotFoundError: unknown hand, object, neighbour or network.
-        InputError: one of them was refused when it was checked; the network is of another hand; no chart tells which
-            fidelity meets the target; the object or a neighbour stands in a support of its scene (SceneError).
+        InputError: one of them failed its check; the network is of another hand; no chart contains a
+            fidelity that meets the target; the object or a neighbour penetrates a support of its scene (SceneError).
         ConflictError: the check of one of them is still running.
-        QueueUnavailable, StoreUnavailable, IndexUnavailable: a part is away.
+        QueueUnavailable, StoreUnavailable, IndexUnavailable: a backend is unavailable.
     """
     hand = usable(services, AssetKind.HAND, request.hand, scope)
     obj = usable(services, AssetKind.OBJECT, request.object, scope)
@@ -103,10 +103,10 @@ def prepare(
 
 
 def enter(services: Services, record: JobRecord, *, keeps_assets: bool = False) -> tuple[JobView, bool]:
-    """Keep a planned job and queue its first tasks. The controller enters those that are too many for one turn.
+    """Record a planned job and queue its first tasks. The controller enters the rest of large jobs.
 
     Args:
-        keeps_assets: a dataset keeps hand, object, neighbours and network from being deleted meanwhile.
+        keeps_assets: a dataset protects hand, object, neighbours and network from deletion meanwhile.
 
     Returns:
         the job, and whether it is new.
@@ -116,7 +116,7 @@ def enter(services: Services, record: JobRecord, *, keeps_assets: bool = False) 
         ConflictError: the same job was deleted, and its objects are still being removed.
     """
     key = names.job_record(record.id)
-    # The dataset wants its jobs whatever breaks off, and its planner holds the turn for no store.
+    # A dataset needs its jobs even after an interruption, and its planner must not hold the lock during store access.
     new = keeps_assets and put_record(services.store, key, record)
     with recording(services, [key] if new else []) as (connection, put):
         new = new or (not keeps_assets and put(key, record))
@@ -136,7 +136,7 @@ def cancel(services: Services, job_id: str, *, cause: str = "") -> JobView:
     """Stop a job: waiting tasks never start, running ones stop at the next launch. Finished shards stay.
 
     Args:
-        cause: event of a dataset that asks for it, kept with the job's event.
+        cause: causing event of a dataset, stored with the job's event.
 
     Raises:
         NotFoundError: unknown job.
@@ -158,7 +158,7 @@ def retry(services: Services, job_id: str, *, cause: str = "") -> JobView:
     """Queue the failed and cancelled tasks of a job again, with fresh attempts.
 
     Args:
-        cause: event of a dataset that asks for it, kept with the job's event.
+        cause: causing event of a dataset, stored with the job's event.
 
     Raises:
         NotFoundError: unknown job.
@@ -173,16 +173,15 @@ def retry(services: Services, job_id: str, *, cause: str = "") -> JobView:
 
 
 def queue_tasks(services: Services, ready: Sequence[ReadyTask], *, routes: Routes, again: bool = False) -> set[str]:
-    """Put tasks into the queue and mark them in the index; what no worker can do waits, and its job says why.
+    """Queue tasks and mark them in the index; tasks that no worker can do wait, with a reason in the job.
 
-    The mark comes first: a task marked but not queued is found missing and queued by the controller; one queued but not
-    marked might run twice.
+    The mark comes first: the controller queues marked tasks that are missing; unmarked ones might run twice.
 
     Args:
-        routes: who is there.
+        routes: capabilities of the living workers.
 
     Returns:
-        why tasks are held back.
+        reasons why tasks are held back.
     """
     to_queue: dict[tuple[Priority, bool], list[TaskMessage]] = defaultdict(list)
     held: dict[str, list[str]] = defaultdict(list)
@@ -207,7 +206,7 @@ def queue_tasks(services: Services, ready: Sequence[ReadyTask], *, routes: Route
 
 
 def _start(services: Services, job_id: str) -> None:
-    """Queue as much of a job as the queue's window holds; the controller feeds the rest, or all if Redis is away."""
+    """Queue the part of a job that fits the queue's window. The controller queues the rest."""
     try:
         room = services.settings.queue_window - sum(services.queue.depths().values())
         if room > 0:
@@ -220,9 +219,9 @@ def _start(services: Services, job_id: str) -> None:
 
 @contextmanager
 def _changing(services: Services, job_id: str) -> Iterator[Callable[..., None]]:
-    """A turn in which an event may be added to those of a job: of two at once the later one knows of both.
+    """Lock a job to append an event; of two concurrent changes the later one sees both.
 
-    What there was before is read beforehand: the store may be slow, and others wait for the turn.
+    Earlier events are read before the lock, because the store may be slow.
     """
     before = job_events(services.store, job_id)
     with recording(services) as (connection, put):
@@ -260,7 +259,7 @@ def _told(services: Services, job_id: str) -> JobView:
 
 
 def _present_origin() -> Origin | None:
-    """The request that is being answered now, if any."""
+    """Return the request that is being answered, if any."""
     origin = Origin(request=bound("request"), key=bound("key"), traceparent=bound("traceparent"))
     return origin if origin != Origin() else None
 
@@ -270,17 +269,17 @@ def _ended(state: State) -> str:
 
 
 def check_scene(options: JobOptions, obj: AssetView, beside: Sequence[AssetView] = ()) -> None:
-    """Refuse a thing whose centre of mass lies in a support: the centre is in the hull, so the hull stands there too.
+    """Refuse an object whose centre of mass lies in a support: its hull then penetrates the support.
 
-    Where the check of an object did not measure its centre, and for all that needs meshes, the first task tells.
+    Without a measured centre, and for checks that need meshes, the first task reports the error.
 
     Args:
-        options: with the scene.
-        obj: the object that is grasped.
+        options: options with the scene.
+        obj: the target.
         beside: the neighbours of the scene, in their order.
 
     Raises:
-        SceneError: the target or a neighbour stands in a support.
+        SceneError: the target or a neighbour penetrates a support.
     """
     place = options.place
     _check_pose(obj, "target", place.target, place.supports)

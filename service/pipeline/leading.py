@@ -1,8 +1,7 @@
-"""Of several controllers one leads, by a lease in Redis, and the others stand by.
+"""Leader election of controllers by a lease in Redis; the others stand by.
 
-Two that both believe to lead, one of them having been stopped for longer than its lease, do no harm for the moment that
-it lasts: what they write follows from facts in the store, a task is queued once for each attempt, and writers of the
-index take turns.
+Two processes may both lead briefly if one was suspended for longer than its lease. This does no harm: their writes
+follow from facts in the store, a task is queued once per attempt, and writers of the index take turns.
 """
 
 from __future__ import annotations
@@ -25,30 +24,30 @@ if TYPE_CHECKING:
     from graspd.service.queue.rq_queue import RqQueue
 
 log = logging.getLogger(__name__)
-#: As what the controller that leads announces itself; an API of graspd 0.2 looks for the same name.
+#: Part name of the leading controller's registration; an API of graspd 0.2 expects the same name.
 PART: Final = "keeper"
-#: So many renewals fit a lease.
+#: Renewals per lease.
 _RENEWALS: Final = 3.0
-#: How long it may take until a process that is told to stop hears it [s].
+#: Longest delay until a process notices that it shall stop [s].
 _LOOK_S: Final = 0.1
 
 
 class Leadership:
-    """The lease that one process wants and holds."""
+    """Lease of leadership of one process."""
 
     def __init__(self, queue: RqQueue, *, lease_s: float, alive: HeartbeatFile, name: str | None = None) -> None:
         """
         Args:
-            queue: used by a thread of its own while the lease is held.
-            lease_s: how long the lease outlives its last renewal [s].
+            queue: used by a separate thread while the lease is held.
+            lease_s: validity of the lease after its last renewal [s].
             alive: touched while another leads.
-            name: under which it leads; one that is started again under the same name need not wait for its lease.
+            name: name of the leader; a restarted process of the same name need not wait for its lease.
         """
         self._queue, self._lease_s, self._alive = queue, lease_s, alive
         self.holder = name or f"{socket.gethostname()}-{os.getpid()}-{secrets.token_hex(4)}"
 
     def wait(self, stop: threading.Event) -> bool:
-        """Until this process leads; False if it is told to stop first. Redis may be away meanwhile."""
+        """Wait until this process leads; return False if it is stopped first. Redis may be unavailable."""
         told = False
         while not stop.is_set():
             self._alive.touch()
@@ -63,9 +62,10 @@ class Leadership:
 
     @contextmanager
     def held(self, stop: threading.Event) -> Iterator[threading.Event]:
-        """Keep the lease; gives an event that is set once another leads, or `stop` is; stopped, gives it back.
+        """Hold the lease; yield an event that is set when another process leads or `stop` is set.
 
-        The lease is lost only where Redis says that another has it: while Redis is away nobody else can take it.
+        The lease is lost only if Redis reports another holder: while Redis is unavailable, no process can take it. The
+        lease is released at the end.
         """
         over, done = threading.Event(), threading.Event()
         thread = threading.Thread(target=self._renew, args=(stop, over, done), name="controller-lease", daemon=True)
@@ -77,11 +77,11 @@ class Leadership:
             done.set()
             thread.join(self._lease_s)
             if stop.is_set():
-                with suppress(QueueUnavailable):  # the lease runs out by itself
+                with suppress(QueueUnavailable):  # the lease expires by itself
                     self._queue.resign(self.holder)
 
     def _renew(self, stop: threading.Event, over: threading.Event, done: threading.Event) -> None:
-        due = -math.inf  # also while the work is laid down
+        due = -math.inf  # also while the work stops
         while not done.wait(_LOOK_S) and not stop.is_set():
             if time.monotonic() < due:
                 continue
@@ -93,7 +93,7 @@ class Leadership:
             over.set()
 
     def _leads(self) -> bool | None:
-        """Whether this process leads, for as long as a lease lasts; None: Redis is away."""
+        """Return whether this process leads for the next lease; None if Redis is unavailable."""
         try:
             return self._queue.lead(self.holder, self._lease_s)
         except QueueUnavailable as error:

@@ -1,4 +1,4 @@
-"""Finds tasks whose worker is lost, and tasks that the queue lost."""
+"""Recovery of tasks whose worker is lost, and of tasks that the queue lost."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from graspd.service.store.packs import take_apart
 from graspd.service.store.records import put_record, read_record, task_attempts
 
 log = logging.getLogger(__name__)
-#: A task on its way between queue, worker and stream is in none of them for a moment [s].
+#: Time for which a task may be in transit between queue, worker and stream [s].
 LOST_AFTER_S: Final = 3.0
 
 
 class LeaseReaper:
-    """Watches leases by whether they change, on this process's own monotonic clock: set clocks do not matter."""
+    """Detects lost leases by the lack of change, on this process's monotonic clock, not on wall clocks."""
 
     def __init__(self, services: Services, indexer: Indexer, *, clock: Callable[[], float] = time.monotonic) -> None:
         self._services = services
@@ -39,10 +39,10 @@ class LeaseReaper:
         self._missing: dict[str, float] = {}
 
     def reap(self, leases: Collection[Lease]) -> list[Lease]:
-        """Take the tasks from workers that gave no sign of life for a lease; returns those leases."""
+        """Take tasks from workers without a heartbeat for a lease; return those leases."""
         now = self._clock()
         lease_s = self._services.settings.lease_s
-        # Time in which nobody looked, because Redis was away or this process was stopped, is no worker's silence.
+        # Time without checks, because Redis was unavailable or this process suspended, does not count as silence.
         looked, self._looked = min(now - self._looked, lease_s / 3), now
         heartbeats: dict[Any, tuple[str, float]] = {}
         lost = []
@@ -58,7 +58,7 @@ class LeaseReaper:
         return lost
 
     def find_missing(self, present: Collection[str]) -> list[str]:
-        """Ids of tasks that the index believes in the queue, but that are neither there nor with a worker."""
+        """Return ids of tasks that the index counts as queued but that neither queue nor workers have."""
         tasks, checks = self._services.index.feed.believed_queued()
         believed = tasks | {ingest_id(kind, digest) for kind, digest in checks}
         now = self._clock()
@@ -71,9 +71,9 @@ class LeaseReaper:
         return missing
 
     def _recover(self, missing: list[str]) -> None:
-        """Make good a lost event from the store; what the store knows nothing of is queued again."""
+        """Recover lost events from the store; queue tasks again whose result the store lacks."""
         again = []
-        for made in take_apart(self._services.store) if missing else ():  # of a worker of 0.2, in a rolling upgrade
+        for made in take_apart(self._services.store) if missing else ():  # from a worker of 0.2, in a rolling upgrade
             self._indexer.made(made)
         for task, (stage, shard) in self._services.index.feed.outputs(missing).items():
             if self._find(task, Stage(stage), shard):
@@ -93,10 +93,10 @@ class LeaseReaper:
             self._indexer.tell(self._services.index.live.set_waiting(again))
 
     def _find(self, task_id: str, stage: Stage, shard: str) -> bool:
-        """Index a shard that is there; one whose manifest is damaged fails its task, since it cannot be made again.
+        """Index an existing shard; a damaged manifest fails its task, since it cannot be made again.
 
         Returns:
-            whether it is there.
+            whether it exists.
         """
         try:
             self._indexer.made(load_manifest(self._services.store, stage, shard))
@@ -107,7 +107,7 @@ class LeaseReaper:
         return True
 
     def _fail(self, task_id: str, stage: Stage, error: DamagedError) -> None:
-        """End a task that a damaged record stands in the way of."""
+        """Fail a task because of a damaged record."""
         task = self._services.index.jobs.task(task_id)
         about = {"task_id": task_id, "job_id": task.job_id, "stage": stage, "number": task.attempt}
         why = {"kind": type(error).__name__, "reason": str(error), "worker": "controller"}
@@ -134,9 +134,9 @@ class LeaseReaper:
                 self._lose_check(message)
         except UnavailableError:
             raise
-        except Exception:  # anybody who writes to Redis can forge a lease: it must not hold up the others
+        except Exception:  # any client of Redis can forge a lease: it must not block the others
             log.exception("the lease of task %s is left out", lease.task_id)
-        # Only now: if the store was away, the next round finds the lease again.
+        # Only now: if the store was unavailable, the next round finds the lease again.
         self._services.queue.release(lease)
 
     def _lose_task(self, worker: str, message: TaskMessage) -> None:
@@ -156,7 +156,7 @@ class LeaseReaper:
             except DamagedError as error:
                 self._fail(message.task_id, message.stage, error)
                 return
-        # A first loss is the machine's fault more often than the task's, so there is no wait.
+        # A first loss is more often caused by the machine than by the task, so there is no wait.
         self._indexer.failed(attempt, at_once=attempt.number == 1)
 
     def _lose_check(self, message: IngestMessage) -> None:

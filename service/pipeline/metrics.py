@@ -1,7 +1,7 @@
-"""What the controller counts of the series of `/metrics` as it indexes.
+"""Counters of the controller for `/metrics`.
 
-The sums lie in one hash in Redis, so every API process shows the same. They start from zero when Redis is lost, which
-Prometheus takes for a restart; an event that comes twice counts twice.
+The sums lie in one hash in Redis, so every API process shows the same values. They restart from zero when Redis is
+lost, which Prometheus counts as a restart. A repeated event counts twice.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ from typing import Final
 from graspd.service.model.series import SERIES, STAGE_BUCKETS_S, field
 from graspd.service.store.manifests import ShardManifest
 
-#: Names of errors that get a series of their own; more than an engine raises, and a bound if somebody forges them.
+#: Most names of errors with their own series: more than an engine raises, and a bound against forged names.
 MOST_KINDS: Final = 60
 OTHER_KIND: Final = "other"
 
 
 class Tally:
-    """Counts in memory; `flush` adds that to the sums in one go."""
+    """Counts in memory; `flush` adds them to the sums in one call."""
 
     def __init__(self, count: Callable[[Mapping[str, float]], None]) -> None:
         """`count` adds to the sums."""
@@ -28,7 +28,7 @@ class Tally:
         self._kinds: set[tuple[str, str]] = set()
 
     def made(self, manifests: Iterable[ShardManifest]) -> None:
-        """Shards that were indexed."""
+        """Count indexed shards."""
         for manifest in manifests:
             stage = manifest.stage.value
             self.add("graspd_shards_total", stage)
@@ -40,7 +40,7 @@ class Tally:
                 self.add("graspd_grasps_total", "validated", amount=manifest.validated)
 
     def failed(self, stage: str, kind: str) -> None:
-        """An attempt of a task failed."""
+        """Count a failed attempt of a task."""
         if (stage, kind) not in self._kinds:
             if len(self._kinds) >= MOST_KINDS:
                 kind = OTHER_KIND
@@ -48,7 +48,7 @@ class Tally:
         self.add("graspd_task_failures_total", stage, kind)
 
     def flush(self) -> None:
-        """Add what was counted to the sums; QueueUnavailable keeps it for the next time."""
+        """Add the counts to the sums; after QueueUnavailable they stay for the next call."""
         if self._amounts:
             self._count(self._amounts)
             self._amounts.clear()
@@ -59,6 +59,6 @@ class Tally:
         self._amounts[field(f"{name}_sum", *labels)] += seconds
 
     def add(self, name: str, *labels: str, amount: float = 1) -> None:
-        """Count in a series."""
+        """Add to a series."""
         assert len(SERIES[name].labels) == len(labels)
         self._amounts[field(name, *labels)] += amount

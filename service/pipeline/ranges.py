@@ -1,4 +1,4 @@
-"""How many batches a task of a job has: as many as keep a worker busy for a while, and no more than its fair share."""
+"""Number of batches per task of a job: long enough to keep a worker busy, at most a fair share."""
 
 from __future__ import annotations
 
@@ -17,38 +17,38 @@ from graspd.service.model.version import SCHEMA_OF_RANGES
 from graspd.service.model.workers import WorkerBeat
 from graspd.service.pipeline.backends import Services
 
-#: Finished tasks that tell how long a batch takes.
+#: Finished tasks that are used to measure the time of a batch.
 _LOOKED_AT: Final = 64
-#: Workers that are expected where none is there: a service may start them once a task waits.
+#: Workers assumed if none is present: a service may start them once a task waits.
 _EXPECTED: Final = 8
-#: How long what is known of workers and rates counts [s].
+#: How long measured workers and rates are cached [s].
 _KNOWN_S: Final = 10.0
 
 
 class TaskRanges:
-    """Chooses the ranges of jobs as they are planned."""
+    """Choose the ranges of jobs during planning."""
 
     def __init__(
         self, services: Services, *, scope: ProjectScope = EVERYTHING, clock: Callable[[], float] = time.monotonic
     ) -> None:
-        """`scope`: whose measurements count."""
+        """`scope` limits the measurements that count."""
         self._services, self._scope, self._clock = services, scope, clock
         self._read_again = -math.inf
         self._workers: list[WorkerBeat] = []
         self._costs: list[BatchCost] = []
 
     def sized(self, job: JobRecord, *, among: int = 1) -> JobRecord:
-        """A job with the number of batches of its tasks.
+        """Return a job with the number of batches per task.
 
         Args:
-            job: as it was planned.
-            among: jobs that are planned at once, and share the workers.
+            job: the planned job.
+            among: number of jobs that are planned together and share the workers.
 
         Raises:
-            QueueUnavailable, IndexUnavailable: a part is away.
+            QueueUnavailable, IndexUnavailable: a backend is unavailable.
         """
         batches, wanted_s = batches_of(job.request.grasps), self._services.settings.task_s
-        # Pictures of a batch are a file of megabytes already.
+        # Pictures of a batch are already a file of megabytes.
         if batches == 1 or job.request.views or not wanted_s:
             return job
         if self._clock() >= self._read_again:
@@ -58,7 +58,7 @@ class TaskRanges:
         able = [worker for worker in self._workers if Stage.SYNTHESIZE in worker.stages]
         if any(worker.ability.schemas[1] < SCHEMA_OF_RANGES for worker in able):
             return job
-        # Somebody who watches a small job sees its grasps batch by batch; a GPU makes them all in one launch.
+        # A user of a small job sees its grasps batch by batch; a GPU makes them all in one launch.
         if job.priority is Priority.INTERACTIVE and not (able and all(one.device.startswith("cuda") for one in able)):
             return job
         rate = Rates(self._costs, job.request, {one.device for one in able}).of(job.request.hand, job.request.object)
@@ -69,9 +69,9 @@ class TaskRanges:
 
 
 def span_of(batches: int, by_time: int, workers: int) -> int:
-    """Batches of each task of a job that has so many, where `by_time` last as long as a task should.
+    """Return the batches per task of a job; `by_time` batches last as long as a task should.
 
-    Tasks of a job are of one length, but for the last, and no worker has none while another has two.
+    All tasks of a job but the last have equal length, and no worker is idle while another has two tasks.
     """
     most = max(1, min(by_time, MOST_BATCHES, -(-batches // max(1, workers))))
     return -(-batches // -(-batches // most))

@@ -1,4 +1,4 @@
-"""Records and rows in one step: what is put into the store during a turn of the index's writers counts as a whole."""
+"""Records and rows in one step: records of one write transaction of the index count together."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ log = logging.getLogger(__name__)
 
 @contextmanager
 def recording(services: Services, made: Sequence[str] = ()) -> Iterator[tuple[Connection, Put]]:
-    """A turn of the index's writers, and how records are put in it. They go again where the turn breaks off.
+    """Yield a write transaction of the index and a function that puts records; undo them on failure.
 
-    Nobody else writes meanwhile: what was looked at before a record is put still holds when the rows are there.
+    No other process writes meanwhile: checks before a record is put still hold when the rows are written.
 
     Args:
-        made: keys of records that were put just before, and go as well.
+        made: keys of records that were put just before, and are also removed.
 
     Raises:
-        IndexUnavailable: the index is away; nothing is recorded.
+        IndexUnavailable: the index is unavailable; nothing is recorded.
     """
     keys = list(made)
 

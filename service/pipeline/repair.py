@@ -1,4 +1,4 @@
-"""Makes again what is damaged in a store and follows from what is not: a shard is a function of its inputs."""
+"""Repair of a store: damaged shards are made again, since a shard is a function of its inputs."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ _OF_ASSET: Final = re.compile(r"assets/(hand|object|network)/([0-9a-f]{32})/(.+)
 
 
 def repair(services: Services, found: Sequence[Damage]) -> tuple[list[Damage], list[Damage]]:
-    """Move what is damaged aside, below `damaged/`, and queue what can be made again.
+    """Move damaged objects below `damaged/`, and queue what can be made again.
 
-    A worker puts a shard that was made again only where it has the checksum that its manifest says.
+    A worker stores a repaired shard only if its checksum equals the manifest's.
 
     Returns:
-        what was queued or moved away, and what was left as it is; `what` of the latter says why.
+        damage that was queued or moved, and damage that was left; `what` of the latter contains the reason.
 
     Raises:
-        UnavailableError: a part is away; call it again.
+        UnavailableError: a backend is unavailable; call it again.
     """
     harmed = {one.shard for one in found if one.shard}
     repaired, left = [], []
@@ -46,7 +46,7 @@ def repair(services: Services, found: Sequence[Damage]) -> tuple[list[Damage], l
 
 
 def _fix(services: Services, one: Damage, harmed: set[str]) -> str:
-    """Repair one thing; why it cannot be, or nothing."""
+    """Repair one object; return the reason if that is impossible, else ""."""
     if one.what == FOREIGN:
         services.store.set_aside(one.key)
         return ""
@@ -73,9 +73,9 @@ def _fix(services: Services, one: Damage, harmed: set[str]) -> str:
 
 
 def _asset(services: Services, key: str, kind: AssetKind, digest: str, file: str) -> str:
-    """Make room for what follows from a hand or an object; a new check makes the rest, and the next task what it needs.
+    """Move derived files of a hand or an object away; a new check and the next task make them again.
 
-    What comes with graspd is put again from the program.
+    Assets of graspd itself are stored again from the program.
     """
     if (kind, digest) in {(one.kind, one.digest) for one in builtin_assets()}:
         services.store.set_aside(key)
@@ -101,7 +101,7 @@ def _queue(services: Services, job: JobRecord, task: PlannedTask) -> None:
 
 
 def _clear(services: Services, one: Damage, stage: Stage) -> None:
-    """Make room for what is made again; a file that only lacks a manifest stays if the index knows its checksum."""
+    """Move a damaged result away; a file without manifest stays if the index contains its checksum."""
     file, manifest = names.shard_file(stage, one.shard), names.shard_manifest(stage, one.shard)
     if one.what == BAD_MANIFEST:
         services.store.set_aside(manifest)
@@ -117,7 +117,7 @@ def _known_to_index(services: Services, shard: str, file: str) -> bool:
 
 
 def _planned(services: Services, stage: Stage, shard: str) -> tuple[JobRecord, PlannedTask] | str:
-    """The task that makes a shard; or why there is none."""
+    """Return the task that makes a shard, or the reason why there is none."""
     job = services.index.shards.job_of(shard)
     if job is None:
         return "no job makes it, so it cannot be made again; put a copy in its place"

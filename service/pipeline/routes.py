@@ -1,4 +1,4 @@
-"""Where a task waits, given the versions of the workers that are there."""
+"""Routing of tasks to lists, by the versions of the living workers."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from graspd.service.model.workers import Capabilities, Requirements, WorkerBeat,
 
 @dataclass(frozen=True)
 class Route:
-    """Where a task goes."""
+    """Destination of a task."""
 
     apart: bool = False
-    """Into a list that only some workers of its stage look into."""
+    """Whether it enters a list that only some workers of its stage read."""
     held: str = ""
     """Why it is held back; "" if it is not."""
 
 
 class Routes:
-    """What the living workers of each stage can do."""
+    """Capabilities of the living workers of each stage."""
 
     def __init__(self, present: Sequence[WorkerBeat] = ()) -> None:
         self._here: dict[Stage, list[Capabilities]] = defaultdict(list)
@@ -31,10 +31,10 @@ class Routes:
                     self._here[stage].append(beat.ability)
 
     def place(self, need: Requirements) -> Route:
-        """Of a task.
+        """Return the route of a task.
 
-        What every worker of its stage can do goes to all of them, and what some can do to those. What none can do is
-        held back. While there is no worker, those of this version are expected.
+        A task that all workers of its stage can do goes to all; one that some can do goes to those; one that none can
+        do is held back. Without workers, this version's are assumed.
         """
         here = self._here.get(need.stage) or [own_ability()]
         lacking = {one.lacks(need) for one in here} - {""}

@@ -1,4 +1,4 @@
-"""Giving tags to grasps and taking them off: the record, then the rows, in one turn of the index's writers."""
+"""Add tags to grasps and remove them: the record, then the rows, under one write lock of the index."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.recording import recording
 from graspd.service.store.records import Deletion, drop_older, newest_version, put_record, put_version, removed_folder
 
-#: Asked with what is to be changed, None if it is to be made; raises where that is not allowed.
+#: Called with the tag to change, None for a new one; raises if that is not allowed.
 Permit = Callable[[Tag | None], None]
 
 
 def give(services: Services, name: str, grasps: Collection[Grasp], *, project: str, owner: str, permit: Permit) -> int:
-    """Give a tag to grasps; it is made if it is not there. How many did not have it before.
+    """Give a tag to grasps and create it if needed. Return how many grasps did not have it.
 
     Raises:
-        LimitError: more than `MOST_TAGGED` would have it.
+        LimitError: more than `MOST_TAGGED` grasps would have it.
     """
 
     def added(tag: Tag) -> Tag:
@@ -36,7 +36,7 @@ def give(services: Services, name: str, grasps: Collection[Grasp], *, project: s
 
 
 def take_off(services: Services, tag: str, grasps: Collection[Grasp], *, permit: Permit) -> int:
-    """Take a tag, by its id, off grasps. How many had it."""
+    """Remove a tag, by its id, from grasps. Return how many had it."""
     before, after = _change(
         services, tag, lambda one: one.model_copy(update={"grasps": by_shard(one.members - set(grasps))}), permit
     )
@@ -44,7 +44,7 @@ def take_off(services: Services, tag: str, grasps: Collection[Grasp], *, permit:
 
 
 def remove(services: Services, tag: str, *, permit: Permit, owner: str = "") -> None:
-    """Take a tag away, by its id; the grasps stay, and which they were is kept for the grace time."""
+    """Delete a tag by its id; the grasps stay, and the list of them is stored for the grace time."""
 
     def gone(one: Tag) -> Tag:
         said = {"name": one.name, "submitter": one.owner, "project": one.project}
@@ -58,10 +58,10 @@ def remove(services: Services, tag: str, *, permit: Permit, owner: str = "") -> 
 
 
 def bring_back(services: Services, tag: Tag) -> None:
-    """A tag that was taken away, with its grasps.
+    """Restore a deleted tag with its grasps.
 
     Raises:
-        ConflictError: there is one of that name again.
+        ConflictError: the name is in use again.
     """
 
     def permit(known: Tag | None) -> None:
@@ -74,7 +74,7 @@ def bring_back(services: Services, tag: Tag) -> None:
 def _change(
     services: Services, tag: str, change: Callable[[Tag], Tag], permit: Permit, *, fresh: Tag | None = None
 ) -> tuple[Tag, Tag]:
-    """The tag before and after. Who writes has the index's turn, so that of two changes at once each sees the other."""
+    """Return the tag before and after. Writers hold the index's lock, so they see each other's changes."""
     with recording(services) as (connection, put):
         found = newest_version(services.store, tag)
         known = None if found is None or found.gone else found
@@ -89,7 +89,7 @@ def _change(
             put_version(put, after)
             services.index.tags.put(after, within=connection)
     if is_changed:
-        # Not before the rows are there for good, and not while another one reads the last version.
+        # Only after the rows are committed, and while no other process reads the last version.
         with services.index.database.writing():
             drop_older(services.store, after)
     return before, after

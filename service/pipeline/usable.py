@@ -1,4 +1,4 @@
-"""Which hands, objects and networks jobs may use: those of the request, and the neighbours in its scenes."""
+"""Hands, objects and networks that jobs may use, including the neighbours in their scenes."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ Options = TypeVar("Options", bound=JobOptions)
 
 
 def usable(services: Services, kind: AssetKind, name: str, scope: ProjectScope = EVERYTHING) -> AssetView:
-    """A hand, object or network by name or digest that jobs may use.
+    """Return a hand, object or network, by name or digest, that jobs may use.
 
     Raises:
-        NotFoundError: there is none in scope.
-        InputError: it was refused when it was checked.
+        NotFoundError: none is in scope.
+        InputError: it failed its check.
         ConflictError: its check is still running.
     """
     asset = services.index.assets.get(kind, name, scope=scope)
@@ -36,12 +36,12 @@ def usable(services: Services, kind: AssetKind, name: str, scope: ProjectScope =
 def with_neighbours(
     services: Services, options: Options, scope: ProjectScope = EVERYTHING
 ) -> tuple[Options, Sequence[AssetView]]:
-    """Options whose neighbours have the digests of the very files that the names stand for, and these neighbours.
+    """Return options with the present digests of the neighbours' names, and these neighbours.
 
-    A digest that the request says itself, as one that was read from a job does, is kept.
+    A digest in the request itself, for example one copied from a job, stays.
 
     Raises:
-        what `usable` raises; InputError where a name and a digest are of two objects.
+        as in `usable`; InputError if a name and a digest belong to two objects.
     """
     beside = [usable(services, AssetKind.OBJECT, one.digest or one.object, scope) for one in options.beside]
     for one, asset in zip(options.beside, beside, strict=True):
@@ -57,13 +57,13 @@ def with_neighbours(
 def with_network(
     services: Services, options: Options, hands: Sequence[AssetView | Member], scope: ProjectScope = EVERYTHING
 ) -> Options:
-    """Options that say by its digest which network they set out from; as they are where their method takes none.
+    """Return options with the digest of their network; unchanged if their method uses none.
 
     Args:
-        hands: whose grasps are wanted.
+        hands: hands of the wanted grasps.
 
     Raises:
-        what `usable` raises; InputError where it proposes grasps of another hand.
+        as in `usable`; InputError if it proposes grasps of another hand.
     """
     if not options.network:
         return options

@@ -1,8 +1,7 @@
-"""Webhook dispatcher: signed reports of what ended, one at a time to each address, tried again after longer waits.
+"""Webhook dispatcher: signed reports of ends, one at a time to each address, retried with back-off.
 
-An address that does not take a delivery rests, with all that waits for it. Projects take turns, and within one the
-address that was tried last comes last; addresses that failed last share half of the room, so that silent ones keep
-nobody else waiting.
+An address that does not accept a delivery pauses with all its deliveries. Projects take turns; within one, the least
+recently tried address comes first. Addresses that failed last share half of the slots to not delay the others.
 """
 
 from __future__ import annotations
@@ -25,18 +24,18 @@ from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.http_client import Networks, Response, networks, post
 
 log = logging.getLogger(__name__)
-#: Deliveries under way at once, and of them those to addresses that failed last.
+#: Most concurrent deliveries, and the share of those to addresses that failed last.
 AT_ONCE: Final = 32
 SLOW_AT_ONCE: Final = AT_ONCE // 2
 _PAUSE_S: Final = 1.0
-#: To sum up a large dataset takes a while.
+#: Interval: the summary of a large dataset takes a while.
 _DATASETS_EVERY_S: Final = 5.0
 _FORGET_EVERY_S: Final = 3600.0
 Post = Callable[..., Response]
 
 
 class WebhookDispatcher:
-    """Runs beside the rounds of the controller: an address that does not answer keeps nothing else waiting.
+    """Runs beside the rounds of the controller, so that a silent address delays nothing else.
 
     Args:
         send: sends a body to an address; as `http_client.post`.
@@ -53,15 +52,15 @@ class WebhookDispatcher:
         self._lock = threading.Lock()
         self._under_way: dict[str, DueDelivery] = {}
         self._ended = threading.Event()
-        #: Of each webhook: when it was tried last, and whether it took nothing then.
+        #: Time of the last attempt of each webhook, and whether it failed.
         self._last: dict[str, tuple[float, bool]] = {}
         self._pool = ThreadPoolExecutor(AT_ONCE, thread_name_prefix="webhooks")
 
     def run(self) -> None:
-        """Rounds until told to stop."""
+        """Run rounds until stopped."""
         look_again = -math.inf
         while not self._stop.is_set():
-            # To one address goes one at a time: the next one as soon as the last has ended.
+            # An address gets one delivery at a time: the next starts when the last has ended.
             self._ended.wait(_PAUSE_S)
             self._ended.clear()
             try:
@@ -76,7 +75,7 @@ class WebhookDispatcher:
         self._pool.shutdown(wait=False, cancel_futures=True)
 
     def start_deliveries(self, *, now: float | None = None) -> list[Future[None]]:
-        """Make deliveries of what is new, and begin those that are due and have room."""
+        """Create deliveries of new ends, and start those that are due and have a slot."""
         out = self._services.index.outbox
         if time.monotonic() > self._forget_again:
             out.forget_old()
@@ -96,7 +95,7 @@ class WebhookDispatcher:
         return started
 
     def _in_turn(self, found: list[DueDelivery]) -> list[DueDelivery]:
-        """Projects, and keys without one, in turn; in each first what was not tried for the longest time."""
+        """Sort by turns of projects, and of keys without one; in each, the least recently tried first."""
         of_project: dict[str, list[DueDelivery]] = {}
         for due in sorted(found, key=lambda one: self._last.get(one.hook.id, (0.0, False))):
             of_project.setdefault(due.hook.project or f"key {due.hook.owner}", []).append(due)
@@ -106,7 +105,7 @@ class WebhookDispatcher:
         return due.attempts > 0 or self._last.get(due.hook.id, (0.0, False))[1]
 
     def tell_datasets(self) -> None:
-        """Put datasets that ended into the feed."""
+        """Write ended datasets to the feed."""
         untold = dict(self._services.index.outbox.untold_datasets())
         for name in untold.keys() - self._services.index.datasets.unfinished(untold):
             dataset = self._services.index.datasets.get(name)
@@ -146,5 +145,5 @@ class WebhookDispatcher:
 
 
 def body_of(end: EndView) -> bytes:
-    """What a webhook is sent: the end as `/v1/events` tells it."""
+    """Return the body of a webhook: the end as in `/v1/events`."""
     return json.dumps(end.model_dump(mode="json"), sort_keys=True, separators=(",", ":")).encode()

@@ -1,5 +1,5 @@
-"""Dataset cards: what a dataset holds, how it was made, how good and how biased it is, all computed from its shards.
+"""Dataset cards: content, origin, quality and bias of a dataset, all computed from its shards.
 
-contents.py finds the dataset and opens its shards one by one, tally.py adds them up, numbers.py makes the
-figures of `card.json` of the sums, findings.py says what stands out, plots.py and page.py show it.
+contents.py finds the dataset and opens its shards one by one, tally.py sums them, numbers.py computes the figures of
+`card.json`, findings.py reports anomalies, plots.py and page.py show them.
 """

@@ -1,4 +1,4 @@
-"""A card in a folder: README.md, card.json, checksums.sha256, plots, and pictures of some pairs of hand and object."""
+"""A card in a folder: README.md, card.json, checksums.sha256, plots, and sample pictures."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from graspd.studies.cards.plots import draw
 from graspd.studies.cards.tally import tally_of
 from graspd.worker.rendering import sheets
 
-#: Pictures out of the dataset.
+#: Sample pictures of the dataset.
 SHEET: Final = "samples.jpg"
-#: Told after each shard: how many are done, of how many.
+#: Called after each shard: number done, total number.
 Progress = Callable[[int, int], None]
 MOST: Final = 12
 _COLUMNS: Final = 4
@@ -42,14 +42,14 @@ def write_card(
     source: str = "",
     progress: Progress = lambda done, total: None,
 ) -> dict[str, Any]:
-    """Read all shards and write the card; what an earlier card left there is written over.
+    """Read all shards and write the card; replace files of an earlier one.
 
     Returns:
         the figures, as in `card.json`, and under `plots` the names of the pictures.
 
     Raises:
-        InputError: the folder cannot be made, the dataset holds no grasp, or a shard is not what its checksum says.
-        StoreUnavailable: the store does not answer.
+        InputError: the folder cannot be created, the dataset has no grasp, or a checksum differs.
+        StoreUnavailable: the store is unavailable.
     """
     if not contents.shards.of("base"):
         raise InputError(f"{contents.name} holds no base shard: there is nothing to say of it yet")
@@ -70,7 +70,7 @@ def write_card(
 
 
 def checksums(contents: Contents) -> Iterator[str]:
-    """Lines as `sha256sum -c` reads them, in the folder of an export or in that of the shards."""
+    """Yield lines for `sha256sum -c`, run in the folder of an export or of the shards."""
     if contents.snapshot is not None:
         yield from (f"{shard.sha256}  {path_of(shard)}\n" for shard in contents.snapshot.shards)
         return
@@ -88,7 +88,7 @@ def _counted(found: Iterator[ShardContents], total: int, progress: Progress) -> 
 
 
 def write_samples(shards: Shards, file: Path) -> bool:
-    """Write a JPEG; False if the dataset has no pictures. Of each shard that is shown all is fetched."""
+    """Write a JPEG; return False for a dataset without pictures. Each shown shard is fetched completely."""
     chosen = choose(shards.of("views"))
     if not chosen:
         return False
@@ -108,7 +108,7 @@ def write_samples(shards: Shards, file: Path) -> bool:
 
 
 def choose(files: tuple[ShardFile, ...], most: int = MOST) -> list[ShardFile]:
-    """At most so many shards: of each object in turn one of another hand, spread over all objects."""
+    """Choose at most `most` shards over all objects, with a different hand each time."""
     cells: dict[tuple[str, str], list[ShardFile]] = {}
     for file in files:
         cells.setdefault((file.hand, file.object), []).append(file)
@@ -117,13 +117,13 @@ def choose(files: tuple[ShardFile, ...], most: int = MOST) -> list[ShardFile]:
     ranked = sorted(cells, key=lambda cell: (hands.index(cell[0]) - objects.index(cell[1])) % len(hands))
     some = ranked[: max(most, len(objects))]
     spread = some if len(some) <= most else [some[round(k)] for k in np.linspace(0, len(some) - 1, most)]
-    # Another batch of each: those of one number have materials and lamps in common.
+    # A different batch each: batches of one number share materials and lamps.
     chosen = (cells[cell] for cell in sorted(spread, key=lambda cell: objects.index(cell[1])))
     return [batches[number % len(batches)] for number, batches in enumerate(chosen)]
 
 
 def _picture(path: Path) -> NDArray[np.uint8]:
-    """(H, W, 3) the picture of a shard in which the object's box is largest."""
+    """Return the picture (H, W, 3) of a shard in which the object's box is largest."""
     with open_shard(path) as opened:
         box = np.asarray(opened["box/bounding_box_2d_tight"], float)
         area = np.nan_to_num((box[:, 2] - box[:, 0]) * (box[:, 3] - box[:, 1]), nan=-1.0)

@@ -1,5 +1,4 @@
-"""Contents of a card: a dataset's snapshot in a store or a folder of shards, read one after the other without
-pictures."""
+"""Contents of a card: snapshot or folder of shards, read one after the other without pictures."""
 
 from __future__ import annotations
 
@@ -38,7 +37,7 @@ _BUILTIN_LICENCE: Final = "Apache-2.0"
 
 @dataclass(frozen=True)
 class AssetFacts:
-    """A hand or an object as the store knows it; what it does not know is empty."""
+    """A hand or an object as in the store; unknown fields are empty."""
 
     name: str
     digest: str = ""
@@ -46,12 +45,12 @@ class AssetFacts:
     source: str = ""
     description: str = ""
     facts: Mapping[str, Any] = field(default_factory=dict)
-    """What its check measured, SI units."""
+    """Measurements of its check, SI units."""
 
 
 @dataclass(frozen=True)
 class MissingBatches:
-    """Batches of a cell that the snapshot lacks, and why."""
+    """Missing batches of a cell of the snapshot, and the reason."""
 
     tasks: int
     reason: str
@@ -59,7 +58,7 @@ class MissingBatches:
 
 @dataclass(frozen=True)
 class Contents:
-    """A dataset as a card sees it. `snapshot` and `record` are None where only files are there."""
+    """Input of a card. `snapshot` and `record` are None if there are only files."""
 
     name: str
     shards: Shards
@@ -69,15 +68,15 @@ class Contents:
     record: DatasetRecord | None = None
     gaps: Mapping[Pair, MissingBatches] = field(default_factory=dict)
     root: Path | None = None
-    """Folder of the shards, where they are files."""
+    """Folder of the shards, if they are files."""
 
 
 def contents_of_store(store: Store, dataset: str, snapshot: str | None = None, cache: Path | None = None) -> Contents:
-    """A snapshot of a dataset, by default the newest.
+    """Return a snapshot of a dataset, by default the newest.
 
     Raises:
-        NotFoundError: no such dataset or snapshot.
-        StoreUnavailable: the store does not answer.
+        NotFoundError: the dataset or the snapshot does not exist.
+        StoreUnavailable: the store is unavailable.
     """
     taken = newest_snapshot(store, dataset, snapshot)
     record = load_dataset(store, dataset)
@@ -93,11 +92,11 @@ def contents_of_store(store: Store, dataset: str, snapshot: str | None = None, c
 
 
 def contents_of_folder(folder: Path, name: str | None = None) -> Contents:
-    """The shards of a folder, such as an export. Of hands and objects only those that come with graspd are known.
+    """Return the shards of a folder, such as an export, with facts of built-in hands and objects only.
 
     Raises:
-        NotFoundError: no shard in the folder.
-        InputError: a file is no shard, or `snapshot.json` is damaged.
+        NotFoundError: the folder contains no shard.
+        InputError: a file is not a shard, or `snapshot.json` is damaged.
     """
     shards = open_shards(folder)
     listed = folder / "snapshot.json"
@@ -111,13 +110,13 @@ def contents_of_folder(folder: Path, name: str | None = None) -> Contents:
 
 
 def with_provenance(contents: Contents, file: Path) -> Contents:
-    """The same with licences and sources from a JSON file, for hands and objects that were added without.
+    """Add missing licences and sources of hands and objects from a JSON file.
 
     `{"hands": {"shadow": {"licence": "...", "source": "..."}}, "objects": {"*": {...}, "mug": {...}}}`; `*` stands for
-    all that are not named.
+    all others.
 
     Raises:
-        InputError: no such JSON, or it names what the dataset does not hold.
+        InputError: the JSON is invalid, or names assets that the dataset lacks.
     """
     try:
         said = from_json(file.read_bytes())
@@ -177,7 +176,7 @@ def _described(name: str, digest: str, files: Mapping[str, bytes], facts: Any, *
 
 @lru_cache
 def _checked(kind: AssetKind, name: str) -> dict[str, Any]:
-    """What is to be known of an asset that comes with graspd; it may be read in this process."""
+    """Return the facts of a built-in asset; it may be read in this process."""
     files = builtin_files(kind, name)
     if kind is AssetKind.HAND:
         from graspd.worker.hands.check import check_hand
@@ -192,7 +191,7 @@ def _checked(kind: AssetKind, name: str) -> dict[str, Any]:
 
 
 def _digests(shards: Shards, kind: AssetKind) -> dict[str, str]:
-    """Names and digests, as the first shard of each says."""
+    """Return names and digests, from the first shard of each."""
     found: dict[str, str] = {}
     for file in shards:
         name = file.hand if kind is AssetKind.HAND else file.object
@@ -203,7 +202,7 @@ def _digests(shards: Shards, kind: AssetKind) -> dict[str, str]:
 
 
 def _gaps(store: Store, record: DatasetRecord, taken: Snapshot) -> dict[Pair, MissingBatches]:
-    """What the record plans and the snapshot does not hold."""
+    """Return the planned batches that the snapshot lacks."""
     there = {shard.id for shard in taken.shards}
     gaps: dict[Pair, MissingBatches] = {}
     for cell in record.cells():
@@ -216,7 +215,7 @@ def _gaps(store: Store, record: DatasetRecord, taken: Snapshot) -> dict[Pair, Mi
     return gaps
 
 
-#: Columns of which a card is made; those that a shard lacks are left out.
+#: Columns used for a card; missing ones are skipped.
 COLUMNS: Final[dict[str, tuple[str, ...]]] = {
     "base": (
         "grasp/hand_pose",
@@ -237,22 +236,22 @@ _THREADS: Final = 8
 
 @dataclass(frozen=True)
 class ShardContents:
-    """One shard: its columns, and what its attributes and its manifest say of it."""
+    """One shard: its columns, and metadata of its attributes and manifest."""
 
     file: ShardFile
     columns: Mapping[str, NDArray[Any]]
     said: Mapping[str, Any]
-    """Root attributes; of a shard that was not opened, those fields of its manifest that have their names."""
+    """Root attributes; for an unopened shard the manifest's fields of the same names."""
     size_bytes: int
     rows: int
     """Grasps, pairs of grasp and scene, or pictures."""
     info: Mapping[str, Any]
-    """Remarks of the stage: seconds of its parts, tries that came to nothing."""
+    """Remarks of the stage: seconds of its parts, rejected candidates."""
     revision: int | None = None
 
 
 def pieces(contents: Contents) -> Iterator[ShardContents]:
-    """Every shard, in the order of `Shards`; the next ones are fetched meanwhile, a bounded number at a time."""
+    """Yield every shard in the order of `Shards`; prefetch a bounded number of the next ones."""
     sizes = {shard.id: shard.size_bytes for shard in contents.snapshot.shards} if contents.snapshot else {}
     with ThreadPoolExecutor(_THREADS, thread_name_prefix="card") as pool:
         files = iter(contents.shards)

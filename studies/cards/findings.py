@@ -1,4 +1,4 @@
-"""What stands out in a dataset's figures: biases, gaps and failures that somebody who trains on it must know."""
+"""Anomalies in a dataset's figures: biases, gaps and failures that matter for training."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ import numpy as np
 
 Row = Mapping[str, Any]
 
-#: A cell yields little below this part of the median of its hand's cells.
+#: Yield of a cell, relative to the median of its hand's cells, that counts as low.
 _LITTLE: Final = 0.5
-#: A joint that lies within this share of its range in 98 of 100 grasps hardly moves.
+#: Share of its range within which a joint hardly moves in 98 of 100 grasps.
 _STILL: Final = 0.05
-#: A joint is worth a word where more than this share of the grasps has it at a limit.
+#: Share of grasps with a joint at a limit that is reported.
 _AT_LIMIT: Final = 0.5
-#: Directions of an object are worth a word where more of them are empty.
+#: Share of an object's empty directions that is reported.
 _EMPTY: Final = 0.25
-#: Valid grasps per hand or object differ worth a word from this ratio on.
+#: Ratio of valid grasps per hand or object that is reported.
 _UNEVEN: Final = 1.2
-#: Directions are preferred where more palms come from there than so many times an even share.
+#: Multiple of an even share of palms that makes a direction preferred.
 _PEAKED: Final = 1.25
 _SHOWN: Final = 8
 
 
 def findings(card: Row) -> list[str]:
-    """Sentences in Markdown, each with the figures it rests on."""
+    """Return sentences in Markdown, each with its figures."""
     told = [_snapshot(card), *_gaps(card), _yields(card), _balance(card), _rechecks(card), *_table(card)]
     told += [_directions(card), *_joints(card), _qualities(card), _repeated(card), *_mixed(card), *_unknown(card)]
     return [line for line in told if line]
@@ -130,7 +130,7 @@ def _table(card: Row) -> list[str]:
 
 
 def _elevations(card: Row) -> list[str]:
-    """From how high the palms come over the table, against directions drawn evenly on the sphere."""
+    """Compare the palm's elevation over the table with directions drawn uniformly on the sphere."""
     every, clear = (
         np.sum([sums[name] for sums in card["elevation"].values()] or [[0]], axis=0) for name in ("all", "clear")
     )
@@ -256,5 +256,5 @@ def _listed(words: Sequence[str]) -> str:
 
 
 def _percent(value: float) -> str:
-    """A share with as many digits as it needs."""
+    """Return a share with as many digits as needed."""
     return f"{100 * value:.0f} %" if value >= 0.095 or value == 0 else f"{100 * value:.1f} %"

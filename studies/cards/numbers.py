@@ -1,4 +1,4 @@
-"""The figures of a card, computed from the shards: the content of `card.json`. None stands for what is not known."""
+"""Figures of a card, computed from the shards: the content of `card.json`. None means unknown."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from graspd.worker.quality.diversity import explained_variance
 from graspd.worker.quality.intervals import wilson
 
 Row = dict[str, Any]
-#: Codes of `grasp/rejection`: what the hand is too near to, and when.
+#: Codes of `grasp/rejection`: the obstacle, and the phase of the motion.
 REJECTIONS: Final = {
     1: "the table at contact",
     2: "the table on the way in",
@@ -33,7 +33,7 @@ _KINDS: Final = ("base", "scene", "views")
 
 
 def numbers(contents: Contents, tally: Tally, *, licence: str = "", source: str = "") -> Row:
-    """Everything a card says, as JSON values."""
+    """Return the whole content of a card as JSON values."""
     cells = list(tally.cells.values())
     taken = contents.snapshot
     return {
@@ -67,7 +67,7 @@ def numbers(contents: Contents, tally: Tally, *, licence: str = "", source: str 
 
 
 def share(part: int, whole: int) -> Row | None:
-    """A share with its 95 % interval (Wilson 1927); None of nothing."""
+    """Return a share with its 95 % interval (Wilson 1927); None if `whole` is 0."""
     if not whole:
         return None
     low, high = wilson(part, whole)
@@ -168,7 +168,7 @@ def _validity(cells: Iterable[CellTally]) -> Row:
 
 
 def _quality(cells: Sequence[CellTally]) -> dict[str, Row]:
-    """Distribution of each quality over the valid grasps of some cells; a quality that no shard has is left out."""
+    """Return the distribution of each quality over valid grasps of some cells; omit missing qualities."""
     found = {}
     for metric in GRASP_METRICS:
         values = np.concatenate([np.empty(0, np.float32), *(cell.column(metric.name) for cell in cells)])
@@ -203,7 +203,7 @@ def _table(cells: Iterable[CellTally]) -> Row:
 
 
 def _directions(cells: Iterable[CellTally]) -> Row | None:
-    """How widely the palms come from, object frame; None if the palms are not known."""
+    """Return the spread of approach directions in the object frame; None for unknown palms."""
     vectors = np.concatenate([np.empty((0, 3), np.float32), *(cell.directions() for cell in cells)])
     if not len(vectors):
         return None
@@ -217,7 +217,7 @@ def _directions(cells: Iterable[CellTally]) -> Row | None:
 
 
 def _types(cell: CellTally) -> Row | None:
-    """How many of each type; None if no shard tells."""
+    """Return the number of grasps of each type; None if no shard has types."""
     told = cell.column("grasp_type")
     if not len(told):
         return None
@@ -226,7 +226,7 @@ def _types(cell: CellTally) -> Row | None:
 
 
 def _cells(contents: Contents, tally: Tally) -> list[Row]:
-    """A row for each hand x object: those of the matrix, made or not, or else those that have shards."""
+    """Return a row for each hand x object: all cells of the matrix, or else those with shards."""
     asked = contents.record.options.grasps if contents.record else None
     pairs = [(hand, obj) for hand in contents.hands for obj in contents.objects] if contents.record else [*tally.cells]
     rows = []
@@ -250,7 +250,7 @@ def _cells(contents: Contents, tally: Tally) -> list[Row]:
 
 
 def _diversity(cell: CellTally) -> float | None:
-    """Variance that the first principal component explains; lower is more diverse."""
+    """Return the variance explained by the first principal component; lower is more diverse."""
     if not cell.sample:
         return None
     parts = [np.concatenate([getattr(part, name) for part in cell.sample]) for name in ("hand_pose", "joint_positions")]
@@ -259,7 +259,7 @@ def _diversity(cell: CellTally) -> float | None:
 
 
 def _repeated(cell: CellTally) -> int:
-    """Valid grasps that equal an earlier one of the same cell."""
+    """Return the number of valid grasps that equal an earlier one of the same cell."""
     prints = np.concatenate([np.empty(0, np.int64), *cell.prints])
     return len(prints) - len(np.unique(prints))
 
@@ -269,5 +269,5 @@ def _most(counts: Mapping[Any, int]) -> Any:
 
 
 def _six(value: float | np.floating[Any] | NDArray[Any]) -> float:
-    """Six significant digits, as JSON shows them."""
+    """Round to six significant digits for JSON."""
     return float(f"{float(value):.6g}")

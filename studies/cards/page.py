@@ -1,4 +1,4 @@
-"""A card as a page: `README.md` with the YAML head that dataset hubs read, and what to cite as BibTeX."""
+"""A card as a page: `README.md` with the YAML head for dataset hubs, and citations as BibTeX."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from graspd.studies.cards.tables import (
 from graspd.worker.quality import gate as gates
 
 Row = Mapping[str, Any]
-#: Sizes as hubs class them.
+#: Size classes of hubs.
 _SIZES: Final = (
     (1_000, "n<1K"),
     (10_000, "1K<n<10K"),
@@ -27,7 +27,7 @@ _SIZES: Final = (
     (1_000_000, "100K<n<1M"),
     (10_000_000, "1M<n<10M"),
 )
-#: A longer table of objects is folded.
+#: A longer table of objects is collapsed.
 _UNFOLDED: Final = 20
 _LEVELS: Final = {
     "dexgraspbench": "MuJoCo, DexGraspBench's protocol under the DexGraspBench protocol",
@@ -87,7 +87,7 @@ _ENTRIES: Final = {
 
 
 def front_matter(card: Row) -> str:
-    """YAML: every value is a JSON value, which YAML takes as it is."""
+    """Return the YAML head: every value is a JSON value, which is valid YAML."""
     made = card["composition"]
     known: dict[str, Any] = {"pretty_name": card["name"]}
     if card["licence"]:
@@ -101,7 +101,7 @@ def front_matter(card: Row) -> str:
 
 
 def page(card: Row, plots: Mapping[str, str]) -> str:
-    """The whole page; `plots` are file names and what they show."""
+    """Return the whole page; `plots` are file names and captions."""
     sections = (
         front_matter(card),
         f"# {card['name']}",
@@ -337,7 +337,7 @@ def _millimetres(value: float | None) -> str:
 
 
 def citations(methods: Iterable[str], name: str, version: str, year: str, snapshot: str) -> str:
-    """BibTeX of the methods' papers and of the dataset itself; `snapshot` may be empty."""
+    """Return BibTeX of the methods' papers and of the dataset itself; `snapshot` may be empty."""
     note = f",\n  note   = {{snapshot {snapshot}}}" if snapshot else ""
     key = "".join(dexgraspbench for dexgraspbench in name if dexgraspbench.isalnum()) or "dataset"
     own = f"""@misc{{{key}{year},

@@ -1,4 +1,4 @@
-"""The pictures of a card."""
+"""Plots of a card."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from graspd.studies.cards.tally import Tally, cell_counts
 Row = Mapping[str, Any]
 COLOURS: Final = ("#0f766e", "#b45309", "#4338ca", "#be123c", "#4d7c0f", "#6b7280", "#a21caf", "#0369a1")
 INK: Final = "#1f2937"
-#: A matrix with more objects is drawn without names and numbers.
+#: A matrix with more objects has no names and numbers.
 _NAMED: Final = 40
-#: Of more hands only the first get a panel of their own.
+#: Only the first hands get a panel.
 _PANELS: Final = 6
 #: Title, column, and whether a long tail is cut at its 99th percentile.
 _QUALITIES: Final = tuple(
@@ -26,10 +26,10 @@ _DPI: Final = 110
 
 
 def draw(card: Row, tally: Tally, folder: Path) -> dict[str, str]:
-    """Write the plots there is data for.
+    """Write the plots that have data.
 
     Returns:
-        file name -> what it shows, in the order of the card.
+        file name -> caption, in the order of the card.
     """
     plots: tuple[tuple[str, str, Callable[[Row, Tally], Any]], ...] = (
         ("yield.png", "Valid share of the validated grasps, by hand and object", _yields),
@@ -129,7 +129,7 @@ def _qualities(card: Row, tally: Tally) -> Any:
 
 
 def _directions(card: Row, tally: Tally) -> Any:
-    """Above, where palms come from in the object's frame; below, over the table."""
+    """Plot the palms' directions: above in the object's frame, below over the table."""
     hands = [hand for hand in _hands(card) if card["directions"]["by_hand"][hand]][:_PANELS]
     if not hands:
         return None
@@ -163,7 +163,7 @@ def _elevations(axes: Any, sums: Mapping[str, Sequence[int]], *, first: bool) ->
     edges = np.linspace(-90, 90, len(sums["all"]) + 1)
     for name, colour, label in (("all", "#cbd5e1", "all pairs"), ("clear", COLOURS[0], "clear of the table")):
         axes.stairs(sums[name], edges, fill=True, color=colour, label=label)
-    # Of directions drawn evenly on the sphere as many would fall into each bin:
+    # Expected counts per bin for directions drawn uniformly on the sphere:
     even = np.diff(np.sin(np.radians(edges))) / 2 * sum(sums["all"])
     axes.stairs(even, edges, color=INK, linestyle="--", linewidth=1, label="if even")
     axes.set_xticks([-90, -45, 0, 45, 90], ["below", "-45°", "side", "45°", "above"], fontsize=8)

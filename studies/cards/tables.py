@@ -1,4 +1,4 @@
-"""The tables of a card, in Markdown."""
+"""Tables of a card, in Markdown."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from graspd.service.model.metrics import GRASP_METRICS
 
 Row = Mapping[str, Any]
 
-#: Column, what it is called, digits.
+#: Column, name, digits.
 QUALITY_NAMES: Final = {
     metric.name: (metric.heading, metric.digits) for metric in GRASP_METRICS if metric.digits is not None
 }
@@ -17,7 +17,7 @@ _UNITS: Final = ("B", "kB", "MB", "GB", "TB")
 
 
 def markdown(head: Sequence[str], rows: Sequence[Sequence[str]], *, words: int = 1) -> str:
-    """A table; the first columns, `words` of them, are text and the others numbers."""
+    """Return a table; its first `words` columns are text, the others numbers."""
     rule = ["---"] * words + ["--:"] * (len(head) - words)
     lines = [head, rule, *([cell.replace("|", "\\|").replace("\n", " ") for cell in row] for row in rows)]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
@@ -58,7 +58,7 @@ def objects_table(card: Row) -> str:
 
 
 def validity_table(card: Row) -> str:
-    """By hand and in all: tries, valid ones, why the others are not, rechecks, cost."""
+    """Return a table by hand and in total: candidates, valid ones, rejections, rechecks, cost."""
     found = {**card["validity"]["by_hand"], "**all**": card["validity"]}
     rows = []
     for name, row in found.items():
@@ -92,7 +92,7 @@ def validity_table(card: Row) -> str:
 
 
 def quality_table(card: Row) -> str:
-    """Median and the span from the 5th to the 95th percentile, by hand."""
+    """Return the median and the range from the 5th to the 95th percentile, by hand."""
     hands = list(card["quality"])
     rows = []
     for name, (title, digits) in QUALITY_NAMES.items():
@@ -107,7 +107,7 @@ def quality_table(card: Row) -> str:
 
 
 def cells_table(card: Row) -> str:
-    """A row for each hand x object."""
+    """Return a row for each hand x object."""
     rows = []
     for cell in card["cells"]:
         median = cell["median"]
@@ -158,7 +158,7 @@ _SHOWN: Final = (
 
 
 def interval(found: Row | None) -> str:
-    """A share with its 95 % interval."""
+    """Return a share with its 95 % interval."""
     if found is None:
         return "not known"
     return f"{percent(found['share'])} ({percent(found['low'])} to {percent(found['high'])})"
@@ -172,7 +172,7 @@ def percent(value: float | None) -> str:
 
 
 def size(count: int) -> str:
-    """Bytes for people."""
+    """Return bytes as readable text."""
     value, unit = float(count), 0
     while value >= 1000 and unit < len(_UNITS) - 1:
         value, unit = value / 1000, unit + 1
@@ -186,7 +186,7 @@ def _spread(cell: Row | None, digits: int) -> str:
 
 
 def _rejected(rejected: Mapping[str, int] | None) -> str:
-    """In words: what the candidates came to that are not kept."""
+    """Return the outcomes of rejected candidates in words."""
     words = {
         "dropped": "dropped by the validator",
         "gate": "failed the gate",

@@ -1,5 +1,7 @@
-"""Sums over the shards of a dataset, and directions of approach in cells of equal area. Grasps become a few float32
-columns of a cell, so that millions fit in memory."""
+"""Sums over the shards of a dataset, and approach directions in cells of equal area.
+
+Grasps become a few float32 columns of a cell, so that millions fit in memory.
+"""
 
 from __future__ import annotations
 
@@ -22,13 +24,13 @@ from graspd.worker.quality.diversity import cells_of
 #: Bins between a joint's limits.
 BINS: Final = 200
 
-#: A joint is at a limit where it is nearer than this share of its range.
+#: Share of its range within which a joint counts as at its limit.
 _AT: Final = 0.01
 
 
 @dataclass
 class JointUse:
-    """Histograms of the joints of one hand between their limits; joints without known limits are left out."""
+    """Histograms of a hand's joints between their limits; joints without known limits are omitted."""
 
     names: tuple[str, ...]
     lower: Floats
@@ -38,7 +40,7 @@ class JointUse:
 
     @classmethod
     def of(cls, names: tuple[str, ...], facts: Mapping[str, Any]) -> JointUse:
-        """Nothing yet, for those joints that the facts of the hand give limits for."""
+        """Return empty histograms for the joints with limits in the hand's facts."""
         lower, upper = dict(facts.get("lower", {})), dict(facts.get("upper", {}))
         known = tuple(name for name in names if name in lower and upper[name] > lower[name])
         return cls(
@@ -49,7 +51,7 @@ class JointUse:
         )
 
     def add(self, names: tuple[str, ...], positions: Floats) -> None:
-        """Grasps (N, joints) of these names; a position outside the limits counts at the limit."""
+        """Count grasps (N, joints) of these names; positions outside the limits count at the limit."""
         for row, name in enumerate(self.names):
             if name not in names:
                 continue
@@ -58,8 +60,11 @@ class JointUse:
             self.counts[row] += np.bincount(places, minlength=BINS)
 
     def shares(self) -> dict[str, dict[str, float]]:
-        """Of each joint, as shares of its range: 5, 50 and 95 percentile, what lies between 1 and 99 percent of the
-        grasps (`used`); and the shares of grasps at its lower and upper limit."""
+        """Return statistics of each joint as shares of its range.
+
+        These are the 5, 50 and 95 percentile, the range from 1 to 99 percent of the grasps (`used`), and the shares of
+        grasps at the lower and upper limit.
+        """
         found = {}
         near = max(1, round(_AT * BINS))
         for name, counts in zip(self.names, self.counts, strict=True):
@@ -82,62 +87,62 @@ class JointUse:
 
 Array = NDArray[Any]
 Floats32 = NDArray[np.float32]
-#: Grasps of a cell on which its diversity is measured, the first ones.
+#: Grasps of a cell in the measure of its diversity, the first ones.
 SAMPLED: Final = 512
-#: So many arrays of a cell are packed into one.
+#: Arrays of a cell that are merged into one.
 _UNPACKED: Final = 16
-#: Grasps that agree in all numbers to so many digits (metres, radians) are counted as one.
+#: Grasps that agree in all numbers to this many digits (metres, radians) count as one.
 _DIGITS: Final = 6
 
 
 @dataclass
 class CellTally:
-    """Sums of one hand x object. Qualities and directions are of its valid grasps."""
+    """Sums of one hand x object. Qualities and directions are of valid grasps."""
 
     grasps: int = 0
     valid: int = 0
     candidates: int = 0
     validated: int = 0
-    """Tries of shards that a validator validated."""
+    """Candidates of validated shards."""
     rechecked: int = 0
     recheck_held: int = 0
     scenes: int = 0
     pairs: int = 0
     clear_pairs: int = 0
     placed: int = 0
-    """Valid grasps that were carried into scenes."""
+    """Valid grasps that were placed into scenes."""
     clear: int = 0
-    """Of these, grasps that are clear of what is around in one scene at least."""
+    """Those of them that are clear in at least one scene."""
     pictures: int = 0
     lift_tested: int = 0
-    """Valid grasps of scenes that were lifted at half the friction too."""
+    """Valid grasps of scenes that were also lifted at half the friction."""
     lift_hard: int = 0
-    """Of these, grasps that held."""
+    """Those of them that were held."""
     seconds: float = 0.0
-    """Of workers, over all stages."""
+    """Worker seconds over all stages."""
     rejected: Counter[str] = field(default_factory=Counter)
-    """Tries that came to nothing, by reason."""
+    """Rejected candidates by reason."""
     refused: Counter[int] = field(default_factory=Counter)
     """Pairs by the codes of `grasp/rejection`."""
     columns: dict[str, list[Floats32]] = field(default_factory=dict)
     towards: list[Floats32] = field(default_factory=list)
-    """Unit vectors from the object to where the palm comes from, object frame."""
+    """Unit vectors from the object to the palm before the approach, object frame."""
     prints: list[NDArray[np.int64]] = field(default_factory=list)
     sample: list[Posture] = field(default_factory=list)
 
     def pack(self) -> None:
-        """Make one array of those of all shards: thousands of small ones take ten times the memory."""
+        """Merge the arrays of all shards: thousands of small ones take ten times the memory."""
         every: list[list[Any]] = [*self.columns.values(), self.towards, self.prints]
         for parts in every:
             if len(parts) > _UNPACKED:
                 parts[:] = [np.concatenate(parts)]
 
     def column(self, name: str) -> Floats32:
-        """All values of a quality; empty if no shard has it."""
+        """Return all values of a quality; empty if no shard has it."""
         return np.concatenate(self.columns[name]) if self.columns.get(name) else np.empty(0, np.float32)
 
     def directions(self) -> Floats32:
-        """(valid, 3) see `towards`; empty if the hand's palm is not known."""
+        """Return (valid, 3) `towards`; empty if the hand's palm is unknown."""
         return np.concatenate(self.towards) if self.towards else np.empty((0, 3), np.float32)
 
 
@@ -148,14 +153,14 @@ class Tally:
     cells: dict[Pair, CellTally] = field(default_factory=dict)
     joints: dict[str, JointUse] = field(default_factory=dict)
     elevation: dict[str, dict[str, NDArray[np.int64]]] = field(default_factory=dict)
-    """Of each hand: pairs of all, and those that are clear, by elevation of the palm over the table."""
+    """Pairs of each hand, all and clear ones, by elevation of the palm over the table."""
     seconds: dict[str, float] = field(default_factory=dict)
     """Worker seconds of each kind of shard."""
     parts: Counter[str] = field(default_factory=Counter)
     bytes: Counter[str] = field(default_factory=Counter)
     shards: Counter[str] = field(default_factory=Counter)
     values: dict[str, Counter[Any]] = field(default_factory=dict)
-    """How many shards say what, of attributes such as method, device, seed."""
+    """Number of shards by values of attributes such as method, device, seed."""
     revisions: dict[str, Counter[int]] = field(default_factory=dict)
     created: list[str] = field(default_factory=list)
     """First and last time of a shard, RFC 3339."""
@@ -185,7 +190,7 @@ _ATTRIBUTES: Final = (
 
 
 def tally_of(contents: Contents, pieces: Iterable[ShardContents]) -> Tally:
-    """Add up all pieces; those of a batch must come in the order base, scene, views, as `pieces` gives them."""
+    """Sum all pieces; those of a batch must come in the order base, scene, views, as in `pieces`."""
     tally = Tally()
     valid: dict[str, Array] = {}
     batch_now: tuple[Pair, int] | None = None
@@ -206,7 +211,7 @@ def tally_of(contents: Contents, pieces: Iterable[ShardContents]) -> Tally:
 
 
 def _note(tally: Tally, cell: CellTally, piece: ShardContents) -> None:
-    """What does not depend on the kind of shard."""
+    """Add the sums that are independent of the kind of shard."""
     kind = piece.file.kind
     tally.shards[kind] += 1
     tally.bytes[kind] += piece.size_bytes
@@ -226,7 +231,7 @@ def _note(tally: Tally, cell: CellTally, piece: ShardContents) -> None:
 
 
 def _add_base(tally: Tally, cell: CellTally, piece: ShardContents, hand: AssetFacts) -> Array:
-    """Add a base shard; returns its mask (N,) of valid grasps."""
+    """Add a base shard; return its mask (N,) of valid grasps."""
     columns = piece.columns
     valid = validity.valid(columns)
     cell.grasps += piece.rows
@@ -259,7 +264,7 @@ def _add_postures(tally: Tally, cell: CellTally, piece: ShardContents, hand: Ass
     joints = np.asarray(piece.columns["grasp/joint_positions"], float)[valid]
     if (approach := hand.facts.get("palm_approach")) is not None:
         cell.towards.append(-quat_rotate(pose[:, 3:], np.asarray(approach, float)).astype(np.float32))
-    rounded = np.round(np.hstack([pose, joints]), _DIGITS) + 0.0  # no minus zero
+    rounded = np.round(np.hstack([pose, joints]), _DIGITS) + 0.0  # no negative zero
     cell.prints.append(np.fromiter((hash(row.tobytes()) for row in rounded), np.int64, len(rounded)))
     held = sum(len(part) for part in cell.sample)
     if held < SAMPLED and len(pose):
@@ -296,20 +301,22 @@ def _add_scene(
     sums["clear"] += elevations(towards[clear])
 
 
-#: Fewer grasps leave cells empty by chance: with this many uniform ones e^-5 of a cell, 0.3 of all 48.
+#: Fewer grasps leave cells empty by chance: with this many uniform ones, e^-5 of a cell, 0.3 of all 48.
 ENOUGH: Final = 5 * DIRECTION_CELLS
 #: Elevations from -90 to 90 degrees.
 ELEVATION_BINS: Final = 36
 
 
 def cell_counts(directions: NDArray[Any], bands: int = BANDS, sectors: int = SECTORS) -> NDArray[np.int64]:
-    """(bands, sectors) how many unit vectors (N, 3) point into each cell; band 0 is the lowest, sector 0 begins at
-    azimuth -180 degrees."""
+    """Return (bands, sectors) counts of unit vectors (N, 3) per cell.
+
+    Band 0 is the lowest; sector 0 begins at azimuth -180 degrees.
+    """
     cells = cells_of(np.asarray(directions).reshape(-1, 3), bands, sectors)
     return np.bincount(cells, minlength=bands * sectors).reshape(bands, sectors)
 
 
 def elevations(directions: NDArray[Any]) -> NDArray[np.int64]:
-    """(ELEVATION_BINS,) unit vectors (N, 3) by their angle over the horizontal."""
+    """Return (ELEVATION_BINS,) counts of unit vectors (N, 3) by their angle over the horizontal."""
     degrees = np.degrees(np.arcsin(np.clip(directions[:, 2], -1.0, 1.0)))
     return np.histogram(degrees, bins=ELEVATION_BINS, range=(-90, 90))[0].astype(np.int64)

@@ -1,1 +1,1 @@
-"""`graspd chart`: speed against accuracy of methods and fidelities, on the same hands and objects, in one run."""
+"""`graspd chart`: speed against accuracy of methods and fidelities on the same hands and objects."""

@@ -1,4 +1,4 @@
-"""The run of a chart: settings from names on the command line, each on every pair, repeats in turn."""
+"""Run of a chart: settings from names on the command line, each on every pair, repeats interleaved."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from graspd.worker.validation.decomposition import decompose
 
 Say = Callable[[str], None]
 
-#: Error bound of the object that all settings are measured and validated on [m]: what a coarser mesh costs is seen.
+#: Error bound of the object for measurement and validation of all settings [m]: it reveals the cost of coarser meshes.
 TRUE_ERROR_M: Final = FIDELITIES["standard"].face_error_m
 
 
 @dataclass(frozen=True)
 class ChartObject:
-    """An object to be loaded at the error bound [m] that a fidelity asks for."""
+    """An object, loaded at the error bound [m] of a fidelity."""
 
     name: str
     load: Callable[[float], ObjectModel]
@@ -46,16 +46,16 @@ def chart(
     say: Say = lambda line: None,
     keep: Callable[[dict[str, Any]], None] = lambda result: None,
 ) -> dict[str, Any]:
-    """Run everything.
+    """Run all settings on all pairs.
 
     Args:
         hands: the hands.
         things: the objects.
-        settings: what to compare.
+        settings: compared settings.
         repeats: timed calls of each setting on each pair.
-        models: around the nominal one, in which each grasp that holds is validated.
-        say: told of each cell as it ends.
-        keep: given the result so far after each pair.
+        models: models around the nominal one for each held grasp.
+        say: receives a line per cell.
+        keep: called with the partial result after each pair.
 
     Returns:
         `runs[]` with the keys of the command line's contract, `summary[]` over hands and objects, `by_hand` over each
@@ -122,7 +122,7 @@ def _line(run: dict[str, Any]) -> str:
     )
 
 
-#: Label of methods that know no fidelities: they run as their source has them.
+#: Label of methods without fidelities: they run with the settings of their source.
 LABEL: Final = "as published"
 
 _VARIANT: Final = re.compile(r"([^:@]+)(?::([\w.]+=[\w.]+(?:\+[\w.]+=[\w.]+)*))?(?:@([1-9]\d{0,3}))?")
@@ -138,12 +138,12 @@ def settings_of(
     quick: bool,
     run: ExecutionContext,
 ) -> list[Setting]:
-    """A setting for every method, fidelity and batch; methods without fidelities have one each.
+    """Return a setting for every method, fidelity and batch; methods without fidelities have one each.
 
-    Those with a budget of steps take seconds a grasp and get `peer_batch` grasps per call, the others the first batch.
+    Methods with a step budget take seconds per grasp and get `peer_batch` grasps per call, others the first batch.
 
     Raises:
-        InputError: unknown method, or an option that is not of one of them.
+        InputError: a method is unknown, or an option belongs to none of them.
     """
     variants = [_variant(text) for text in methods]
     given = _options_of(options, [name for name, _, _ in variants])
@@ -163,7 +163,7 @@ def settings_of(
 
 
 def _variant(text: str) -> tuple[str, dict[str, str], int | None]:
-    """`graspit:keep=20@40` as name, options and grasps per call; a plain name has neither of the last two."""
+    """Parse `graspit:keep=20@40` into name, options and grasps per call; the last two are optional."""
     found = _VARIANT.fullmatch(text)
     if found is None:
         raise InputError(f"{text!r} is no method; write NAME, NAME:OPTION=VALUE or NAME:OPTION=VALUE@GRASPS_PER_CALL")
@@ -173,7 +173,7 @@ def _variant(text: str) -> tuple[str, dict[str, str], int | None]:
 
 
 def _options_of(texts: Sequence[str], methods: Sequence[str]) -> Mapping[str, dict[str, str]]:
-    """`METHOD:NAME=VALUE` by method."""
+    """Group `METHOD:NAME=VALUE` by method."""
     found: dict[str, dict[str, str]] = {}
     for text in texts:
         name, colon, rest = text.partition(":")

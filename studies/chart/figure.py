@@ -1,4 +1,4 @@
-"""The chart's pictures: accuracy over speed with bars, labels and Pareto front, over all and for each hand; knobs."""
+"""Plots of a chart: accuracy over speed with bars, labels and Pareto front, in total and per hand."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ INK: Final = "#1f2937"
 
 
 def draw(rows: Sequence[Row], files: Sequence[Path]) -> None:
-    """Accuracies over valid grasps per second, and success over the seconds to the first valid grasp."""
+    """Plot accuracies over valid grasps per second, and success over seconds to the first valid grasp."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(15.5, 8.6), layout="constrained")
@@ -66,7 +66,7 @@ def draw_hands(
     words: tuple[str, str],
     label: Callable[[Row, Sequence[Row]], str] | None = None,
 ) -> None:
-    """A panel for each hand: one accuracy over speed, both in words; `label` gives a point's word."""
+    """Plot a panel per hand: one accuracy over speed, both in `words`; `label` returns a point's label."""
     from matplotlib.figure import Figure
 
     columns = min(3, len(by_hand))
@@ -100,7 +100,7 @@ def _over_speed(
     speed: str,
     label: Callable[[Row, Sequence[Row]], str] | None = None,
 ) -> list[Label]:
-    """One accuracy over a speed, with the front; the words that belong to it."""
+    """Plot one accuracy over a speed, with the front; return its labels."""
     known = [row for row in rows if row[key] is not None]
     labels = _panel(axes, known, styles, x=speed, y=key, label=label)
     _front(axes, known, key, speed)
@@ -112,10 +112,10 @@ def _over_speed(
 
 
 def draw_scenes(rows: Sequence[Row], files: Sequence[Path], *, second: str) -> None:
-    """Shares of candidates over lifted grasps per second, and what is lifted over the seconds to the first.
+    """Plot shares of candidates over lifted grasps per second, and lifts over seconds to the first.
 
     Args:
-        second: what a second is called.
+        second: name of a second.
     """
     from matplotlib.figure import Figure
 
@@ -138,7 +138,7 @@ def draw_scenes(rows: Sequence[Row], files: Sequence[Path], *, second: str) -> N
 
 
 def _styles(rows: Sequence[Row]) -> dict[str, tuple[str, str]]:
-    """Colour and marker of each method; its fidelities share them."""
+    """Return colour and marker of each method; its fidelities share them."""
     methods = list(dict.fromkeys(row["method"] for row in rows))
     return {m: (COLOURS[i % len(COLOURS)], MARKERS[i % len(MARKERS)]) for i, m in enumerate(methods)}
 
@@ -152,12 +152,12 @@ def _panel(
     y: str,
     label: Callable[[Row, Sequence[Row]], str] | None = None,
 ) -> list[Label]:
-    """The points; the words that belong to them."""
+    """Plot the points; return their labels."""
     shown: set[str] = set()
     labels = []
     for row in rows:
         colour, marker = styles[row["method"]]
-        # None valid: at the most there can be, hollow, with an arrow to where it may lie.
+        # Without valid grasps: at the upper bound, hollow, with an arrow to lower values.
         none = not row[x]
         at = most_valid(row) if none else row[x]
         bars: dict[str, Any] = {
@@ -198,14 +198,14 @@ def _ends(row: Row, key: str) -> tuple[float, float] | None:
 
 
 def _logarithmic(axes: Any, values: Sequence[float]) -> None:
-    """A logarithmic axis of at least a decade, with plain numbers, and room for a label on the right."""
+    """Set a logarithmic axis of at least a decade, with plain numbers, and space for labels on the right."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     axes.set_xscale("log")
     low, high = min(values, default=1.0), max(values, default=1.0)
     wider = max(1.0, (10 / (high / low)) ** 0.5)
     axes.set_xlim(low / wider / 1.4, high * wider * 2.2)
-    # Over four decades the numbers between would stand on each other.
+    # Over four decades the intermediate numbers would overlap.
     axes.xaxis.set_major_locator(LogLocator(subs=(1.0,) if high > 1e3 * low else (1.0, 2.0, 5.0)))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.xaxis.set_minor_formatter(NullFormatter())
@@ -216,7 +216,7 @@ def _error(row: Row, key: str) -> list[list[float]]:
 
 
 def _label(row: Row, rows: Sequence[Row]) -> str:
-    """The fidelity, with the batch where there are several; the method's own name where it has one setting."""
+    """Return the fidelity, with the batch if there are several; the method's name if it has one setting."""
     own = [r for r in rows if r["method"] == row["method"]]
     if len(own) == 1:
         return str(row["method"])
@@ -225,7 +225,7 @@ def _label(row: Row, rows: Sequence[Row]) -> str:
 
 
 def one_of_several(row: Row, rows: Sequence[Row]) -> str:
-    """The fidelity where a method has several; the legend names the others."""
+    """Return the fidelity if a method has several; the legend names the others."""
     return str(row["fidelity"]) if sum(r["method"] == row["method"] for r in rows) > 1 else ""
 
 
@@ -245,7 +245,7 @@ def _front(axes: Any, rows: Sequence[Row], key: str, speed: str) -> None:
 
 
 def draw_sweeps(rows: Sequence[Row], file: Path) -> None:
-    """A panel per knob: success over speed, a point per value."""
+    """Plot a panel per knob: success over speed, a point per value."""
     from matplotlib.figure import Figure
 
     knobs = list(dict.fromkeys(row["knob"] for row in rows))
@@ -276,7 +276,7 @@ def draw_sweeps(rows: Sequence[Row], file: Path) -> None:
         axes.spines[["top", "right"]].set_visible(False)
     for axes in panels.flat[len(knobs) :]:
         axes.set_visible(False)
-    # From zero, and alike in all panels: a difference looks as large as it is.
+    # All panels share an axis from zero, so that differences are to scale.
     panels.flat[0].set_xlim(0, 1.35 * max(row["speedup"] for row in rows))
     for axes in panels.flat[len(knobs) - columns : len(knobs)]:
         axes.tick_params(labelbottom=True)
@@ -288,23 +288,23 @@ def draw_sweeps(rows: Sequence[Row], file: Path) -> None:
 Boxes = NDArray[np.float64]
 
 SIZE_PT: Final = 8
-#: Distances of a word from its point [pt], the wanted one first: from the third on a line leads to it.
+#: Distances of a label from its point [pt], preferred ones first: from the third on a line connects them.
 _REACHES_PT: Final = (8.0, 15.0, 26.0, 38.0, 52.0)
-#: Directions from the point, the wanted ones first [degrees].
+#: Directions from the point, preferred ones first [degrees].
 _TURNS: Final = (30, -30, 150, -150, 90, -90, 0, 180, 60, -60, 120, -120)
-#: Half of a marker's width [pt], and half of a bar's.
+#: Half the width of a marker [pt], and of a bar.
 _MARKER_PT: Final = 5.5
 _BAR_PT: Final = 1.5
-#: What a covered share of a word costs: by another word or a point, by a bar, outside of the panel.
+#: Cost of a covered share of a label: by another label or a point, by a bar, outside of the panel.
 _COVERED, _CROSSED, _OUTSIDE = 100.0, 8.0, 200.0
-#: What it costs to be farther away by a reach, to be nearer to another point, and to take the next direction.
+#: Cost of one step in distance, of being nearer to another point, and of the next direction.
 _FARTHER, _TAKEN, _TURNED = 1.0, 2.5, 0.05
 _ROUNDS: Final = 6
 
 
 @dataclass(frozen=True)
 class Label:
-    """A word at a point of a panel."""
+    """A label at a point of a panel."""
 
     axes: Any
     x: float
@@ -317,7 +317,7 @@ class Label:
 
 
 def place(figure: Any, labels: Sequence[Label]) -> list[Any]:
-    """Put the words of all panels into a figure that has everything else; the annotations that it got."""
+    """Place the labels of all panels in an otherwise complete figure; return the new annotations."""
     figure.draw_without_rendering()
     made = []
     for axes in dict.fromkeys(label.axes for label in labels):
@@ -335,7 +335,7 @@ def _place(axes: Any, pixels: float, labels: Sequence[Label]) -> list[Any]:
     offered = {index: _candidates(points[index], _size(axes, labels[index].text), pixels) for index in worded}
     fixed = {index: _fixed_costs(offered[index], points, index, bars, inside) for index in worded}
     chosen = dict.fromkeys(worded, 0)
-    # Each in turn takes the best place beside the present ones of the others, until none moves.
+    # Each label in turn takes the best place given the others, until none moves.
     for _ in range(_ROUNDS):
         before = dict(chosen)
         for index in worded:
@@ -358,7 +358,7 @@ def _place(axes: Any, pixels: float, labels: Sequence[Label]) -> list[Any]:
 
 
 def _fixed_costs(boxes: Sequence[Boxes], points: Boxes, own: int, bars: Boxes, inside: Boxes) -> Boxes:
-    """What the places of a word cost wherever the other words stand."""
+    """Return the costs of a label's places that are independent of other labels."""
     return np.array(
         [
             _CROSSED * _share(box, bars)
@@ -377,7 +377,7 @@ def _is_nearer_to_another(box: Boxes, points: Boxes, own: int) -> bool:
 
 
 def _is_led(box: Boxes, points: Boxes, own: int, at: int) -> bool:
-    """Whether a line leads to a word: without it nobody would know whose it is."""
+    """Check whether a label needs a line to its point, without which it would be ambiguous."""
     return at // len(_TURNS) > 1 or _is_nearer_to_another(box, points, own)
 
 
@@ -400,13 +400,13 @@ def _write(axes: Any, label: Label, point: Boxes, box: Boxes, pixels: float, *, 
         annotation_clip=False,
         path_effects=[withStroke(linewidth=2, foreground="white")],
     )
-    # The layout was made without it: a word must not move the panels under the others.
+    # The layout was computed without it: a label must not move the panels below the others.
     note.set_in_layout(False)
     return note
 
 
 def _size(axes: Any, text: str) -> tuple[float, float]:
-    """Width and height of a word [px]."""
+    """Return width and height of a label [px]."""
     sample = axes.annotate(text, (0.5, 0.5), xycoords="axes fraction", fontsize=SIZE_PT)
     extent = sample.get_window_extent()
     sample.remove()
@@ -414,12 +414,12 @@ def _size(axes: Any, text: str) -> tuple[float, float]:
 
 
 def _candidates(point: Boxes, size: tuple[float, float], pixels: float) -> list[Boxes]:
-    """Boxes around the point, (4,) each: left, bottom, right, top [px]; the wanted ones first."""
+    """Return boxes around the point, (4,) each: left, bottom, right, top [px]; preferred ones first."""
     found = []
     for reach, turn in product(_REACHES_PT, _TURNS):
         across, up = math.cos(math.radians(turn)), math.sin(math.radians(turn))
         corner = point + reach * pixels * np.array([across, up])
-        # The word's nearest corner or side is at that place.
+        # The label's nearest corner or side is at that place.
         left = corner[0] - size[0] * (0.5 - 0.5 * _side(across))
         bottom = corner[1] - size[1] * (0.5 - 0.5 * _side(up))
         found.append(np.array([left, bottom, left + size[0], bottom + size[1]]))
@@ -431,7 +431,7 @@ def _side(part: float) -> float:
 
 
 def _bars(axes: Any, labels: Sequence[Label], half: float) -> Boxes:
-    """The bars of the points as boxes (N, 4) [px]."""
+    """Return the bars of the points as boxes (N, 4) [px]."""
     ends = [((low, label.y), (high, label.y)) for label in labels if label.x_bar for low, high in [label.x_bar]]
     ends += [((label.x, low), (label.x, high)) for label in labels if label.y_bar for low, high in [label.y_bar]]
     if not ends:
@@ -443,7 +443,7 @@ def _bars(axes: Any, labels: Sequence[Label], half: float) -> Boxes:
 
 
 def _share(box: Boxes, boxes: Boxes) -> float:
-    """How much of a box others cover; where they overlap it counts for each of them."""
+    """Return the covered area of a box; overlaps count for each covering box."""
     if not len(boxes):
         return 0.0
     across = np.minimum(box[2], boxes[:, 2]) - np.maximum(box[0], boxes[:, 0])

@@ -1,4 +1,4 @@
-"""What only a comparison needs of a device."""
+"""Kernels that only a comparison needs."""
 
 import warp as wp
 
@@ -13,7 +13,7 @@ def forget(
     count_out: wp.array(dtype=wp.int32),
     near_count_out: wp.array(dtype=wp.int32),
 ):
-    """No contacts yet. Launch over B."""
+    """Clear the contacts. Launch over B."""
     b = wp.tid()
     if active_in[b] == 1:
         count_out[b] = 0

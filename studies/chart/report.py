@@ -1,4 +1,4 @@
-"""A chart as JSON, CSV, Markdown and pictures."""
+"""A chart as JSON, CSV, Markdown and plots."""
 
 from __future__ import annotations
 
@@ -56,13 +56,12 @@ COLUMNS: Final = (
     "wrench_volume",
 )
 
-#: Accuracies of the summary, and how they are printed.
+#: Accuracies of the summary, and their formats.
 ACCURACIES: Final = (("dexgraspbench", ".2f"), ("hard", ".2f"), ("robust", ".2f"), ("epsilon", ".3f"), ("pd_mm", ".2f"))
 
 
 def write(chart: Row, folder: Path) -> list[Path]:
-    """chart.json, chart.csv, chart.md, chart.png, chart.svg and chart.hands.png in a folder; sweeps.png where knobs
-    were swept."""
+    """Write chart.{json,csv,md,png,svg}, chart.hands.png, and sweeps.png if there are sweeps, to a folder."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "chart.json").write_text(json.dumps(chart, indent=1, allow_nan=False) + "\n")
     with (folder / "chart.csv").open("w", newline="") as stream:
@@ -87,7 +86,7 @@ def write(chart: Row, folder: Path) -> list[Path]:
 
 
 def markdown(chart: Row) -> str:
-    """The chart as a page: what was run, one table per question."""
+    """Return the chart as a page: its settings, then one table per question."""
     parts = [_head(chart), summary_table(chart["summary"]), _ratios(chart["summary"])]
     if len(chart["by_hand"]) > 1:
         parts += ["## Each hand", "![Success under the DexGraspBench protocol over speed](chart.hands.png)"]
@@ -125,7 +124,7 @@ def _head(chart: Row) -> str:
 
 
 def summary_table(rows: Sequence[Row]) -> str:
-    """A row per method and fidelity, the fastest first; bold: on the Pareto front of that accuracy against speed."""
+    """Return a row per method and fidelity, the fastest first; bold: on the Pareto front."""
     lines = [
         "| method | fidelity | batch | valid/s | first valid s | planner's/s | dexgraspbench | hard | robust | ε | "
         "penetration mm | grasps |",
@@ -149,17 +148,17 @@ def _with_bar(row: Row, key: str, form: str) -> str:
 
 
 def share(value: float | None) -> str:
-    """A share, or a dash where there is none."""
+    """Return a share, or a dash if there is none."""
     return "–" if value is None else f"{value:.2f}"
 
 
 def first(value: float | None) -> str:
-    """Seconds to the first, or a dash where there was none."""
+    """Return seconds to the first, or a dash if there was none."""
     return "–" if value is None else f"{value:.2g}"
 
 
 def _ratios(rows: Sequence[Row]) -> str:
-    """How many times more valid grasps per second `fast_graspd`'s default makes than each other method."""
+    """Return the speed-up of `fast_graspd`'s default in valid grasps per second over each other method."""
     own = [r for r in rows if (r["method"], r["fidelity"]) == ("fast_graspd", "standard")]
     others = [r for r in rows if r["method"] != "fast_graspd"]
     if not own or not others:
@@ -183,7 +182,7 @@ def _ratios(rows: Sequence[Row]) -> str:
 
 
 def runs_table(runs: Sequence[Row]) -> str:
-    """A row per run."""
+    """Return a row per run."""
     lines = [
         "| hand | object | method | fidelity | valid/s | dexgraspbench | hard | robust | ε | penetration mm | "
         "self mm | contact cm² |",
@@ -199,7 +198,7 @@ def runs_table(runs: Sequence[Row]) -> str:
 
 
 def best_table(runs: Sequence[Row]) -> str:
-    """The layout of the paper's table 2: contact area, intersection volume, ε, wrench volume, displacement per hand."""
+    """Return the paper's table 2: contact area, intersection volume, ε, wrench volume, displacement."""
     groups: dict[tuple[str, str, str], list[Row]] = {}
     for run in runs:
         groups.setdefault((run["hand"], run["method"], run["fidelity"]), []).append(run["best"])
@@ -232,7 +231,7 @@ def _mean(values: Sequence[float | None]) -> float:
 
 
 def sweeps_table(sweeps: Sequence[Row]) -> str:
-    """A row per value of each knob: gain in speed and price in accuracy against the default's row."""
+    """Return a row per knob value: gain in speed and loss in accuracy against the default's row."""
     lines = [
         "| knob | value | s/grasp | speed | GSR | ε | penetration mm |",
         "| --- | --- | --: | --: | --: | --: | --: |",

@@ -1,4 +1,4 @@
-"""A chart of scenes as JSON, CSV, Markdown and pictures."""
+"""A chart of scenes as JSON, CSV, Markdown and plots."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ COLUMNS: Final = (
 
 
 def write(chart: Row, folder: Path) -> list[Path]:
-    """chart.json, chart.csv, chart.md, chart.png, chart.svg and chart.hands.png in a folder."""
+    """Write chart.json, chart.csv, chart.md, chart.png, chart.svg and chart.hands.png to a folder."""
     folder.mkdir(parents=True, exist_ok=True)
     files = [folder / name for name in ("chart.json", "chart.csv", "chart.md", "chart.png", "chart.svg")]
     files[0].write_text(json.dumps(chart, indent=1, allow_nan=False) + "\n")
@@ -73,17 +73,17 @@ def write(chart: Row, folder: Path) -> list[Path]:
 
 
 def second_of(chart: Row) -> str:
-    """What a second of it is called: on a CPU one of all cores together, on a GPU one that passes."""
+    """Return the name of its second: core-seconds on a CPU, wall-clock seconds on a GPU."""
     return "CPU second" if str(chart["device"]).startswith("cpu") else "second"
 
 
 def named(row: Row) -> dict[str, Any]:
-    """The row with its way in the method's name, as the picture has them apart."""
+    """Return the row with its planning mode in the method's name, as in the plot."""
     return {**row, "method": f"{row['method']}, {row['way']}"}
 
 
 def markdown(chart: Row) -> str:
-    """What was run, all pairs together, each pair."""
+    """Return the page: settings, all pairs together, each pair."""
     parts = [_head(chart), "![Speed against lifts](chart.png)", _summary(chart["summary"], second_of(chart))]
     if len(chart["by_hand"]) > 1:
         parts += ["## Each hand", "![Lifted over speed](chart.hands.png)"]

@@ -1,10 +1,10 @@
-"""Grasps planned in a scene against grasps planned around a free object, put into the same scene and filtered.
+"""Grasps planned in a scene against grasps of a free object, filtered in the same scene.
 
-A setting of a method that plans in scenes is run both ways, others only the second. Grasp i is tried in scene i of the
-object's stable faces in turn, whichever way it was planned, and validated alike: clear on its way, lifted, lifted by
-the letter, at half the friction, and in models around the nominal one. Speed is lifted grasps over seconds, on a CPU
-those of all cores together, which do not follow what else the machine does: of planner and postures alone, and end to
-end, with way, validator and the metrics of what is lifted.
+A setting of a method that plans in scenes runs in both modes, others only in the second. Grasp i uses scene i of the
+object's stable faces in turn, in both modes, with the same tests: clear trajectory, lifted, lifted by the letter, at
+half the friction, and in models around the nominal one. Speed is lifted grasps over seconds, on a CPU core-seconds,
+which are independent of other load: of planner and postures alone, and end to end, with trajectory, validator and the
+metrics of lifted grasps.
 """
 
 from __future__ import annotations
@@ -49,28 +49,28 @@ Say = Callable[[str], None]
 
 #: Shares of all candidates, by their column.
 SHARES: Final = ("clear", "lift", "lift_dexgraspbench", "lift_hard")
-#: Accuracies that have a front.
+#: Accuracies with a Pareto front.
 ACCURACIES: Final = ("lift", "lift_dexgraspbench", "lift_hard", "robust")
 SPEEDS: Final = (("valid_per_second", "seconds"), ("end_to_end_per_second", "end_seconds"))
-#: Raise when a row has other columns: what is kept then begins anew.
+#: Increase it when a row has other columns: cached results are then discarded.
 FORM: Final = 2
-#: Candidates per second, by the speed that counts those lifted.
+#: Candidates per second, by the speed that counts lifted ones.
 RAW: Final = {"valid_per_second": "grasps_per_second", "end_to_end_per_second": "candidates_end_to_end_per_second"}
-#: A grasp that takes longer is not made once more to time the first one [s].
+#: Above this time per grasp no extra run times the first one [s].
 _SHORT_S: Final = 1.0
 _NOTHING: Final = {**{f"{name}_count": 0 for name in SHARES}, "robust_sum": 0.0, "first_seconds": 0.0}
 
 
 @dataclass
 class ObjectScenes:
-    """An object in its scenes, which are made when the first setting that is not kept is tried."""
+    """An object in its scenes, which are made for the first setting without a cached result."""
 
     thing: ChartObject
     spec: SceneSpec
 
     @cached_property
     def true(self) -> ObjectModel:
-        """As the validator sees it: the same for all settings."""
+        """Object of the validator: the same for all settings."""
         return self.thing.load(TRUE_ERROR_M)
 
     @cached_property
@@ -94,17 +94,17 @@ def scene_chart(
     say: Say = lambda line: None,
     keep: Callable[[Row], None] = lambda result: None,
 ) -> Row:
-    """Run everything.
+    """Run all settings on all pairs.
 
     Args:
         hands: the hands.
         things: the objects.
-        settings: what to compare; a setting's `batch` is the number of its grasps on each pair.
+        settings: compared settings; a setting's `batch` is the number of its grasps on each pair.
         spec: the scene.
-        models: around the nominal one, in which each grasp that is lifted is lifted again.
-        work: folder that keeps what each setting found on each pair; a run that was stopped goes on there.
-        say: told of each cell as it ends.
-        keep: given the result so far after each pair.
+        models: models around the nominal one, in which each lifted grasp is lifted again.
+        work: folder with the result of each setting on each pair; an interrupted run resumes from it.
+        say: receives a line per cell.
+        keep: called with the partial result after each pair.
 
     Returns:
         `runs[]` of one setting on one pair each, `summary[]` over the pairs, `by_hand`, `device`, `created`.
@@ -121,7 +121,7 @@ def scene_chart(
 
 
 def _ways(settings: Sequence[Setting]) -> list[tuple[Setting, str]]:
-    """Each setting with the ways in which it plans."""
+    """Return each setting with its planning modes."""
     found = []
     for setting in settings:
         able = method(setting.method).in_scenes
@@ -130,7 +130,7 @@ def _ways(settings: Sequence[Setting]) -> list[tuple[Setting, str]]:
 
 
 def _kept(setting: Setting, way: str, hand: HandModel, place: ObjectScenes, models: int, work: Path | None) -> Row:
-    """What the setting finds on the pair, from its file where it was found before."""
+    """Return the setting's result on the pair, from its file if cached."""
     said = {
         "way": way,
         "method": setting.method,
@@ -144,7 +144,7 @@ def _kept(setting: Setting, way: str, hand: HandModel, place: ObjectScenes, mode
         return said | _tried(setting, way, hand, place, models)
     told = place.spec.model_dump(mode="json")
     terms = [FORM, models, said, setting.knobs.model_dump(mode="json"), told, hand.digest, place.true.digest]
-    # What is found follows from the code of planners too: another revision begins anew, and so does another device.
+    # Results depend on the planners' code too: another revision or device starts anew.
     device = [] if setting.run.device == "cpu" else [setting.run.device]
     file = work / f"{digest_json([*terms, STAGE_REVISIONS['synthesize'], *device])}.json"
     if not file.is_file():
@@ -159,7 +159,7 @@ def _kept(setting: Setting, way: str, hand: HandModel, place: ObjectScenes, mode
 
 
 def _tried(setting: Setting, way: str, hand: HandModel, place: ObjectScenes, models: int) -> Row:
-    """Counts, shares and speed of one setting on one pair."""
+    """Return counts, shares and speed of one setting on one pair."""
     obj = place.thing.load(setting.knobs.face_error_m)
     placed = place.scenes.placed(np.arange(setting.batch) % len(place.scenes.object_pose))
     row: Row = {"grasps": setting.batch, "seconds": 0.0, "end_seconds": 0.0, **_NOTHING}
@@ -182,7 +182,7 @@ def _tried(setting: Setting, way: str, hand: HandModel, place: ObjectScenes, mod
             row["first_seconds"] = clock() - began
         row |= validated.counts(models)
     except InputError as error:
-        # A scene that leaves no way in, or a pair that the method refuses.
+        # A scene without a free approach, or a pair that the method refuses.
         note = str(error)
     row["first_grasps"] = few
     told = figures([row])
@@ -203,7 +203,7 @@ def _planned(
     *,
     warm: bool = False,
 ) -> GraspSet:
-    """Grasps that are planned in the scenes with a trial, or around a free object without."""
+    """Plan grasps in the scenes with a rollout, or for a free object without one."""
     options = {**setting.options, **(setting.warm if warm else {})}
     wanted = PlanRequest(
         len(placed.index),
@@ -216,7 +216,7 @@ def _planned(
 
 
 class ValidatedGrasps:
-    """Grasps with their way and the verdict of the lift, and measured where that is one."""
+    """Grasps with trajectories and lift verdicts, measured if held."""
 
     def __init__(self, hand: HandModel, place: ObjectScenes, grasps: GraspSet, placed: PlacedGrasps) -> None:
         way = plan_way(hand, place.true, grasps, placed)
@@ -240,8 +240,10 @@ class ValidatedGrasps:
         return rows[success == 1]
 
     def counts(self, models: int) -> Row:
-        """How many are clear on their way, lifted besides, under the DexGraspBench protocol, at half the friction
-        besides; and of those lifted the sum of the shares of models in which they are."""
+        """Count clear grasps, also lifted ones, by DexGraspBench's protocol, and at half the friction.
+
+        For lifted grasps, it also sums the shares of models in which they are lifted.
+        """
         lifted = self.lifted
         shares = robust(
             self.hand,
@@ -262,10 +264,9 @@ class ValidatedGrasps:
 
 
 def figures(rows: Sequence[Mapping[str, Any]]) -> Row:
-    """Shares of all candidates with their 95 % (Wilson), and lifted grasps per second, over some cells.
+    """Return shares of all candidates with 95 % intervals (Wilson), and lifted grasps per second.
 
-    `robust` is the mean share of models over the grasps that are lifted. Where several cells are summed, each grasp
-    counts alike. A cell that was refused took no time that is known.
+    `robust` is the mean share of models over lifted grasps. All grasps weigh equally. A refused cell has no time.
     """
     grasps = sum(row["grasps"] for row in rows)
     found: Row = {"grasps": grasps}
@@ -287,8 +288,11 @@ def figures(rows: Sequence[Mapping[str, Any]]) -> Row:
 
 
 def summed(runs: Sequence[Row]) -> list[Row]:
-    """A row for each way, method and fidelity over all pairs; `gain` over the same fidelity filtered, the median of the
-    pairs in which that found any; `front` names the accuracies in which nobody faster, end to end, is better."""
+    """Return a row for each mode, method and fidelity over all pairs.
+
+    `gain` compares with the same fidelity, filtered: the median over pairs in which that found any. `front` names the
+    accuracies in which no method that is faster end to end is better.
+    """
     groups: dict[tuple[str, str, str, int], list[Row]] = {}
     for run in runs:
         groups.setdefault((run["way"], run["method"], run["fidelity"], run["batch"]), []).append(run)
@@ -297,7 +301,7 @@ def summed(runs: Sequence[Row]) -> list[Row]:
         row: Row = {"way": way, "method": name, "fidelity": fidelity, "batch": batch, "pairs": len(own)}
         row |= figures(own)
         firsts = [run["seconds_to_first"] for run in own]
-        # Of pairs without a lift nobody knows how long they take.
+        # The time of pairs without a lift is unknown.
         row["seconds_to_first"] = None if None in firsts else plain(float(np.mean(firsts)))
         row["pairs_with_one"] = sum(run["lift_count"] > 0 for run in own)
         row["gain"] = _gain(own, groups.get((FILTERED, name, fidelity, batch), [])) if way == IN_SCENE else None

@@ -14,16 +14,16 @@ from graspd.worker.quality.intervals import wilson, wilson_of_mean
 #: Bootstrap draws; error bars are their 2.5 and 97.5 percentiles.
 DRAWS: Final = 400
 BAR: Final = (2.5, 97.5)
-#: Accuracies: whether more is better. The first three are not of sweeps.
+#: Accuracies, and whether more is better. The first three are not in sweeps.
 METRICS: Final = {"dexgraspbench": True, "hard": True, "robust": True, "gsr": True, "epsilon": True, "pd_mm": False}
-#: What is drawn against accuracies.
+#: Speeds that are plotted against accuracies.
 SPEEDS: Final = ("valid_per_second", "end_to_end_per_second")
-#: Of these the median of a cell's grasps counts; of `gsr` the mean.
+#: Metrics for which a cell's median counts; for `gsr` the mean.
 MEDIANS: Final = ("epsilon", "pd_mm", "spd_mm", "ca_cm2", "iv_cm3", "wrench_volume")
 
 
 def figures(cell: Rollout) -> dict[str, Any]:
-    """The keys of a run: speed, accuracy, and `KEY_low`, `KEY_high` of each."""
+    """Return the keys of a run: speed, accuracy, and `KEY_low`, `KEY_high` of each."""
     held, kept = (np.concatenate(rows).astype(float) for rows in (cell.success, cell.kept))
     seconds, batch = np.array(cell.seconds), cell.setting.batch
     draws = _draws(cell)
@@ -51,21 +51,20 @@ def figures(cell: Rollout) -> dict[str, Any]:
 
 
 def widen(row: dict[str, Any], valid: int, grasps: int, per_second: float) -> None:
-    """Bars of success, and of speed where it depends on it, from the counts; speed keeps the wider of both its bars."""
+    """Widen bars of success and dependent speed by the counts; speed keeps the wider of its two bars."""
     row["gsr_low"], row["gsr_high"] = wilson(valid, grasps)
     widen_speed(row, "valid_per_second", valid, grasps, per_second)
 
 
 def widen_speed(row: dict[str, Any], key: str, valid: int, grasps: int, per_second: float) -> None:
-    """Bars of a speed, at least as wide as those of the share of grasps that count."""
+    """Widen bars of a speed to at least those of the share of counted grasps."""
     low, high = wilson(valid, grasps)
     row[f"{key}_low"] = min(row[f"{key}_low"], low * per_second)
     row[f"{key}_high"] = max(row[f"{key}_high"], high * per_second)
 
 
 def _scrutinised(cell: Rollout) -> dict[str, Any]:
-    """Success under the DexGraspBench protocol and at half the friction, and the mean share of other models that held
-    ones hold in."""
+    """Return success by DexGraspBench's protocol and at half friction, and held grasps' share of models."""
     row: dict[str, Any] = {}
     for key, verdicts in (("dexgraspbench", cell.dexgraspbench), ("hard", cell.hard)):
         held = np.concatenate(verdicts) == 1
@@ -80,9 +79,9 @@ def _scrutinised(cell: Rollout) -> dict[str, Any]:
 
 
 def first_valid(share: float, seconds: Sequence[float], grasps: int) -> float | None:
-    """Expected seconds until a call of so many grasps, made again and again, has a valid one; None: never seen one.
+    """Return expected seconds until repeated calls give a valid grasp; None if none was valid.
 
-    Of the calls' `seconds` the median counts.
+    The median of the calls' `seconds` counts.
     """
     if share <= 0 or not seconds:
         return None
@@ -90,7 +89,7 @@ def first_valid(share: float, seconds: Sequence[float], grasps: int) -> float | 
 
 
 def _draws(cell: Rollout) -> dict[str, Floats]:
-    """Bootstrap: repeats with replacement, then grasps within each."""
+    """Bootstrap: resample repeats, then grasps within each."""
     rng = np.random.default_rng(0)
     repeats = len(cell.seconds)
     out: dict[str, list[float]] = {key: [] for key in (*SPEEDS, "gsr", "epsilon", "pd_mm")}
@@ -109,10 +108,10 @@ def _draws(cell: Rollout) -> dict[str, Floats]:
 
 
 def summed(runs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """One row per method, fidelity and batch, over all hands and objects.
+    """Return one row per method, fidelity and batch, over all hands and objects.
 
-    Speed is all valid grasps over all seconds; accuracies are means over the pairs, whose bars shrink accordingly.
-    `front` names the accuracies in which nobody faster, end to end, is better.
+    Speed is all valid grasps over all seconds; accuracies are means over the pairs, with bars that shrink accordingly.
+    `front` names the accuracies in which no method that is faster end to end is better.
     """
     groups: dict[tuple[str, str, int], list[dict[str, Any]]] = {}
     for run in runs:
@@ -124,10 +123,10 @@ def summed(runs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         row: dict[str, Any] = {"method": method, "fidelity": fidelity, "batch": batch, "pairs": len(own)}
         row["grasps"] = sum(r["grasps"] for r in own)
         row["grasps_per_second"] = row["grasps"] / seconds
-        # Of pairs without a valid grasp nobody knows how long they take: a mean without them would flatter.
+        # The time of pairs without a valid grasp is unknown: a mean without them would be too good.
         row["seconds_to_first_valid"] = None if None in firsts else float(np.mean(firsts))
         for key in METRICS:
-            # Of a pair on which nothing holds nobody knows in which other models it would.
+            # Robustness is undefined for a pair without held grasps.
             known = [r for r in own if r[key] is not None]
             row[key] = float(np.mean([r[key] for r in known])) if known else None
             row[f"{key}_low"], row[f"{key}_high"] = _bar(known, key) if known else (None, None)
@@ -141,7 +140,7 @@ def summed(runs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         row["candidates_end_to_end_per_second"] = row["grasps"] / end
         rows.append({key: plain(value) for key, value in row.items()})
     for key, more in METRICS.items():
-        # Who makes no valid grasp is on no front: a hand that touches nothing does not penetrate either.
+        # Methods without valid grasps are on no front: a hand without contact has no penetration either.
         able = [row for row in rows if row["end_to_end_per_second"] and row[key] is not None]
         front = pareto([(row["end_to_end_per_second"], row[key] if more else -row[key]) for row in able])
         for row in rows:
@@ -152,7 +151,7 @@ def summed(runs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _bar(runs: Sequence[dict[str, Any]], key: str) -> tuple[float, float]:
-    """Bar of a mean of independent cells: their half-widths added in quadrature."""
+    """Return the bar of a mean of independent cells: half-widths added in quadrature."""
     mean = float(np.mean([r[key] for r in runs]))
     down = np.sqrt(np.sum([(r[key] - r[f"{key}_low"]) ** 2 for r in runs])) / len(runs)
     up = np.sqrt(np.sum([(r[f"{key}_high"] - r[key]) ** 2 for r in runs])) / len(runs)
@@ -160,7 +159,7 @@ def _bar(runs: Sequence[dict[str, Any]], key: str) -> tuple[float, float]:
 
 
 def _ratio_bar(runs: Sequence[dict[str, Any]], key: str, seconds: str, side: str) -> float:
-    """Bar of valid grasps over seconds, each cell's weighed by its seconds."""
+    """Return the bar of valid grasps over seconds, each cell weighted by its seconds."""
     weight = np.array([sum(r[seconds]) for r in runs])
     value = np.array([r[key] for r in runs])
     off = np.array([r[f"{key}_{side}"] for r in runs]) - value
@@ -169,14 +168,16 @@ def _ratio_bar(runs: Sequence[dict[str, Any]], key: str, seconds: str, side: str
 
 
 def most_valid(row: Mapping[str, Any]) -> float:
-    """Valid grasps per second, end to end, that a method has at most, with 95 %, of which none of n is: a share of
-    3 / n. In scenes, of those that are lifted."""
+    """Return the 95 % upper bound on valid grasps per second, end to end, if none of n is valid.
+
+    It is a share of 3 / n. In scenes it bounds the lifted grasps.
+    """
     raw = row.get("candidates_end_to_end_per_second", row["grasps_per_second"])
     return float(raw) * min(1.0, 3.0 / row["grasps"])
 
 
 def pareto(points: Sequence[tuple[float, float]]) -> set[int]:
-    """Indices of points (more, more) that no other point beats: as good in both and better in one."""
+    """Return indices of points (more, more) that no other point dominates: as good in both, better in one."""
     return {
         index
         for index, (x, y) in enumerate(points)
@@ -185,7 +186,7 @@ def pareto(points: Sequence[tuple[float, float]]) -> set[int]:
 
 
 def plain(value: Any) -> Any:
-    """A JSON value: six significant digits, None for what is no number."""
+    """Return a JSON value: six significant digits, None for a non-number."""
     if isinstance(value, np.generic):
         value = value.item()
     if isinstance(value, float):

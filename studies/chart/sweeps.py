@@ -1,7 +1,7 @@
-"""fast_graspd's knobs turned one at a time: what each costs in accuracy and gains in speed.
+"""One-at-a-time sweeps of fast_graspd's knobs: loss of accuracy and gain in speed.
 
 Some knobs are no part of a fidelity: passes of the contact solver, culling by grid and band, and whether the M
-simulations share one closest-point query per hand point (as they do) or ask M times (as the paper's code does).
+simulations share one closest-point query per hand point (the default) or make M queries (as in the paper's code).
 """
 
 from __future__ import annotations
@@ -64,10 +64,10 @@ def _options(**changes: Any) -> Change:
 
 
 def turns(quick: bool = False, knobs: Sequence[str] = ()) -> list[KnobValue]:
-    """All knobs, few of them, or the named ones; each has the default among its values.
+    """Return all knobs, few of them, or the named ones; each includes the default value.
 
     Raises:
-        InputError: a name that is no knob's.
+        InputError: a name is not a knob.
     """
 
     def knob(name: str, values: Sequence[tuple[str, dict[str, Any]]]) -> list[KnobValue]:
@@ -118,10 +118,10 @@ def sweep(
     knobs: Sequence[str] = (),
     say: Say = lambda line: None,
 ) -> list[dict[str, Any]]:
-    """One row per knob and value: `knob`, `value`, `default`, `speedup` and the figures of a run.
+    """Return one row per knob and value: `knob`, `value`, `default`, `speedup` and a run's figures.
 
-    Values are run in turn, repeat by repeat. `speedup` is what the default costs over what the value costs: in
-    processor seconds on a CPU, which do not depend on what else the machine does, in seconds on a GPU.
+    Values run in turn, repeat by repeat. `speedup` is the default's cost over the value's: in processor seconds on a
+    CPU, which are independent of other load, in seconds on a GPU.
     """
     wp.load_module(module=kernels, device=run.device)
     default = KnobValue("", "default")
@@ -135,7 +135,7 @@ def sweep(
             )
     for _ in range(repeats):
         for cell in cells.values():
-            # More settings than are kept ready on the device: each is made ready just before it is timed.
+            # More settings than the device caches: each is prepared just before it is timed.
             cell.warm_up()
             cell.repeat()
     base = figures(cells[default.knob, default.value])
@@ -166,7 +166,7 @@ def _make(
 
 
 class QueryPerVelocity(Pair):
-    """Every simulated velocity asks for the distances anew; the answers are the same."""
+    """Every simulated velocity makes its own distance queries; the results are equal."""
 
     def iteration(self, model: Model, data: Data, optimizer: str, patience: int) -> Launches:
         out = Launches(model.device)
@@ -184,5 +184,5 @@ class QueryPerVelocity(Pair):
 
 
 def asking_each(pair: Pair) -> Pair:
-    """The pair with a query for each velocity."""
+    """Return the pair with a query for each velocity."""
     return QueryPerVelocity(pair.coarse, pair.fine, pair.options, pair.hand)

@@ -1,4 +1,4 @@
-"""One cell of the chart: a method at a fidelity on a hand and an object, run several times and validated."""
+"""One cell of a chart: a method at a fidelity on a hand and an object, run repeatedly and validated."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ from graspd.worker.validation.validator import validate
 #: Contact threshold and Coulomb coefficient of area, epsilon and wrench volume: the paper's.
 THRESHOLD_M: Final = 0.005
 FRICTION: Final = 1.0
-#: A seed no setting was chosen with; repeats take the next ones.
+#: A seed that no setting was tuned with; repeats take the next ones.
 SEED: Final = 4711
 WARM_SEED: Final = 1
-#: Of the models around the nominal one: no job's, nor that of `graspd evaluate`.
+#: Seed of the models around the nominal one: used by no job and not by `graspd evaluate`.
 MODELS_SEED: Final = 2**31 + 1
 #: Grasps per object in the paper's table 2: the best by epsilon.
 BEST: Final = 10
-#: Columns kept of every grasp.
+#: Stored columns of every grasp.
 COLUMNS: Final = {
     "epsilon": "epsilon",
     "pd_mm": "penetration_depth_mm",
@@ -49,16 +49,16 @@ COLUMNS: Final = {
 
 
 Make = Callable[[HandModel, ObjectModel, int, int], GraspSet]
-"""From hand, object, grasps and seed to grasps."""
+"""Function from hand, object, grasps and seed to grasps."""
 
 
 @dataclass(frozen=True)
 class Setting:
-    """What is compared: a method with its options at a fidelity."""
+    """A compared setting: a method with its options at a fidelity."""
 
     method: str
     fidelity: str
-    """Its label."""
+    """Label of the fidelity."""
     knobs: Fidelity
     options: Mapping[str, Any] = field(default_factory=dict)
     batch: int = 32
@@ -67,7 +67,7 @@ class Setting:
     """Options of the call before the first timed one."""
     run: ExecutionContext = DEFAULT_CONTEXT
     make: Make | None = None
-    """Another way to make them than by method and fidelity: for sweeps of what no fidelity names."""
+    """Alternative planner for sweeps of settings that no fidelity contains."""
 
     def grasps(
         self,
@@ -79,7 +79,7 @@ class Setting:
         rollout: Tried | None = None,
         warm: bool = False,
     ) -> GraspSet:
-        """Make grasps; methods that try candidates do so by `trial`."""
+        """Make grasps; methods with rollouts run them by `rollout`."""
         if self.make is not None:
             return self.make(hand, obj, count, seed)
         options = {**self.options, **(self.warm if warm else {})}
@@ -89,38 +89,38 @@ class Setting:
 
 @dataclass
 class Rollout:
-    """Repeats of a setting on a pair, as they come in."""
+    """Accumulated repeats of a setting on a pair."""
 
     setting: Setting
     hand: HandModel
     obj: ObjectModel
-    """As the planner sees it."""
+    """Object of the planner."""
     true: ObjectModel
-    """As metrics and validator see it: the same for all settings."""
+    """Object of metrics and validator: the same for all settings."""
     pieces: ConvexPieces
-    """Of `true`."""
+    """Convex pieces of `true`."""
     seconds: list[float] = field(default_factory=list)
-    """On a CPU those of all threads together, which do not ask what else the machine does; on a GPU those that pass."""
+    """Core-seconds of all threads on a CPU, independent of other load; wall-clock seconds on a GPU."""
     end_seconds: list[float] = field(default_factory=list)
-    """End to end: planned, validated, and measured where they hold."""
+    """Seconds end to end: planning, validation, and metrics of held grasps."""
     made: list[GraspSet] = field(default_factory=list)
     success: list[NDArray[np.int8]] = field(default_factory=list)
     """Verdicts of the standard level."""
     kept: list[NDArray[np.int8]] = field(default_factory=list)
-    """1 valid: a grasp holds and is feasible."""
+    """1 valid: the grasp is held and feasible."""
     columns: list[dict[str, Floats]] = field(default_factory=list)
     first_calls: list[float] = field(default_factory=list)
     """Seconds of calls of `first_grasps` grasps, end to end."""
     first_grasps: int = 1
     dexgraspbench: list[NDArray[np.int8]] = field(default_factory=list)
-    """Verdicts of the unmodified DexGraspBench protocol; with `hard` and `shares` there only after `scrutinise`."""
+    """Verdicts of the unmodified DexGraspBench protocol; like `hard` and `shares` set by `scrutinise`."""
     hard: list[NDArray[np.int8]] = field(default_factory=list)
     shares: list[Floats] = field(default_factory=list)
-    """Of other models in which a grasp holds; nan where it does not in the nominal one."""
+    """Share of other models that hold a grasp; nan if the nominal one does not."""
 
     @cached_property
     def tried(self) -> Tried | None:
-        """What candidates go through, as where grasps are made for users."""
+        """Rollouts of candidates, as in jobs."""
         return rollout_on(self.setting.run, self.hand, self.obj, self._pieces, in_scenes=False)
 
     def _pieces(self) -> ConvexPieces:
@@ -131,11 +131,11 @@ class Rollout:
         return clock_of(self.setting.run.device)
 
     def warm_up(self) -> None:
-        """One call that is not counted: kernels, grids and samples are there afterwards."""
+        """Make one untimed call, which prepares kernels, grids and samples."""
         self.setting.grasps(self.hand, self.obj, 1, WARM_SEED, rollout=self.tried, warm=True)
 
     def repeat(self) -> None:
-        """One timed call, then quality and verdict of its grasps."""
+        """Make one timed call, then measure and validate its grasps."""
         batch = self.setting.batch
         began = self._clock()
         found = self.setting.grasps(self.hand, self.obj, batch, SEED + len(self.seconds), rollout=self.tried)
@@ -153,7 +153,7 @@ class Rollout:
         self.columns.append(columns)
 
     def _finished(self, found: GraspSet) -> tuple[NDArray[np.int8], NDArray[np.int8], dict[str, Floats]]:
-        """What a job does with planned grasps: verdicts, which are valid, and the columns of those that hold."""
+        """Process planned grasps like a job: return verdicts, valid ones, and columns of held ones."""
         success = validate(self.hand, self.true, found, pieces=self.pieces, run=self.setting.run).success
         held = np.flatnonzero(success == 1)
         table = self._measured(found.take(held))
@@ -169,8 +169,7 @@ class Rollout:
         return columns | {"feasible": np.asarray(passes(table), float)}
 
     def scrutinise(self, models: int) -> None:
-        """Validate what was made under the DexGraspBench protocol, at half the friction, and in so many models around
-        the nominal one."""
+        """Validate by DexGraspBench's protocol, at half the friction, and in models around the nominal one."""
         common: dict[str, Any] = {"pieces": self.pieces, "run": self.setting.run}
         for found, success in zip(self.made, self.success, strict=True):
             self.dexgraspbench.append(validate(self.hand, self.true, found, level="dexgraspbench", **common).success)
@@ -179,10 +178,7 @@ class Rollout:
             self.shares.append(shares)
 
     def time_first(self, grasps: int) -> None:
-        """Time a call of few grasps, as somebody would make who waits for the first valid one.
-
-        Where a grasp takes longer than a second the time follows from the batch.
-        """
+        """Time a call of few grasps, the wait for a valid one; above 1 s per grasp, derive it from the batch."""
         self.first_grasps = grasps
         each = self.end_seconds[-1] / self.setting.batch
         if each > 1.0:
@@ -193,11 +189,11 @@ class Rollout:
         self.first_calls.append(self._clock() - began)
 
     def values(self, key: str) -> Floats:
-        """A column of all repeats."""
+        """Return a column of all repeats."""
         return np.concatenate([columns[key] for columns in self.columns])
 
     def best(self) -> dict[str, float]:
-        """Means over the `BEST` grasps by epsilon, with their simulated displacement: a row of the paper's table 2."""
+        """Return means over the `BEST` grasps by epsilon, with simulated displacement: a row of table 2."""
         order = np.argsort(-self.values("epsilon"), kind="stable")[:BEST]
         pose, joints = (
             np.concatenate([getattr(found.grasp, name) for found in self.made])[order]

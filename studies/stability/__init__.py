@@ -1,1 +1,1 @@
-"""Integrators and methods driven to where they fail: `graspd stability`."""
+"""Stress tests of integrators and methods up to failure: `graspd stability`."""

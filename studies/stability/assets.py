@@ -1,8 +1,6 @@
-"""Objects and hands that are hard: thin, sharp, open, tiny, huge; few fingers and many, coupled drives. They go
-through ingest.
+"""Hard objects and hands: thin, sharp, open, tiny, huge; few or many fingers, coupled drives.
 
-A family of hands stands for them: like fingers of three joints in a ring around a palm, which lean outward while they
-are open.
+All go through ingest. The hands are a family: equal three-joint fingers in a ring, which lean outward while open.
 """
 
 from __future__ import annotations
@@ -27,19 +25,19 @@ from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import load_object
 
 MILLIMETRES: Final = 1e-3
-#: What maps of candidates tell of a cell, from where on it is bad, and how a user sees it.
+#: Text for maps of candidates: measure of a cell, bounds of bad values, and symptom for users.
 MEASURE: Final = "share of candidates that are valid: held by the validator, and past the geometric gate"
 BOUNDS: Final = "weak: under a half; broken: none, or a number that is none"
 SHOWS: Final = "few or no valid grasps: a job ends with a note that its budget found fewer than asked for"
 
 
 def sheet(thickness_mm: float) -> Any:
-    """A plate of 80 x 60 mm."""
+    """Return a plate of 80 x 60 mm."""
     return trimesh.creation.box((0.08, 0.06, thickness_mm * MILLIMETRES))
 
 
 def wedge(angle_deg: float) -> Any:
-    """A prism of 80 mm with one sharp edge."""
+    """Return a prism of 80 mm with one sharp edge."""
     half = 0.06 * np.tan(np.radians(angle_deg) / 2)
     section = np.array([[0.0, 0.0], [0.06, -half], [0.06, half]])
     ends = [np.column_stack([section, np.full(3, z)]) for z in (-0.04, 0.04)]
@@ -47,13 +45,13 @@ def wedge(angle_deg: float) -> Any:
 
 
 def tunnel(diameter_mm: float) -> Any:
-    """A block's worth of ring: 30 mm of wall around a hole."""
+    """Return a thick ring: 30 mm of wall around a hole."""
     inner = diameter_mm * MILLIMETRES / 2
     return trimesh.creation.annulus(inner, inner + 0.015, 0.05, sections=48)
 
 
 def corner(depth_mm: float) -> Any:
-    """A cross of two bars: four concave corners, as deep as given."""
+    """Return a cross of two bars: four concave corners of the given depth."""
     deep = depth_mm * MILLIMETRES
     arms = [trimesh.creation.box((0.03 + 2 * deep, 0.03, 0.05)), trimesh.creation.box((0.03, 0.03 + 2 * deep, 0.05))]
     return trimesh.boolean.union(arms, engine="manifold")
@@ -80,7 +78,7 @@ def _half_inverted() -> Any:
     return trimesh.Trimesh(mesh.vertices, faces, process=False)
 
 
-#: Family -> unit of its parameter, how to make it, parameters.
+#: Family -> unit of its parameter, constructor, parameters.
 FAMILIES: Final[dict[str, tuple[str, Callable[[float], Any], tuple[float, ...]]]] = {
     "plate": ("thickness [mm]", sheet, (0.2, 0.5, 1, 2, 5, 10)),
     "wedge": ("angle of the edge [deg]", wedge, (5, 10, 20, 40, 80)),
@@ -88,14 +86,14 @@ FAMILIES: Final[dict[str, tuple[str, Callable[[float], Any], tuple[float, ...]]]
     "cross": ("depth of the corners [mm]", corner, (2, 5, 10, 20)),
     "cube": ("side [mm]", cube, (1, 3, 10, 30, 60, 100, 200, 500, 1000)),
 }
-#: Meshes with a defect, and the options they are given with.
+#: Meshes with a defect, and their options.
 DEFECTS: Final[dict[str, tuple[Callable[[], Any], dict[str, Any]]]] = {
     "a side is missing": (_opened, {}),
     "a side is missing, --allow-open": (_opened, {"allow_open": True}),
     "inside out": (_inverted, {}),
     "every other face inside out": (_half_inverted, {}),
 }
-#: Those that ingest refuses or closes.
+#: Meshes that ingest refuses or closes.
 CLOSED: Final = tuple(name for name, (_, options) in DEFECTS.items() if not options)
 
 
@@ -109,7 +107,7 @@ def shape_map(
     defects: Sequence[str] = tuple(DEFECTS),
     say: Callable[[str], None] = lambda line: None,
 ) -> StabilityMap:
-    """Valid grasps on each shape at each fidelity, or the reason why it was refused."""
+    """Return valid grasps on each shape at each fidelity, or the reason of its refusal."""
     jobs: list[tuple[str, float | str, Any, dict[str, Any]]] = [
         (f"{family}: {FAMILIES[family][0]}", value, FAMILIES[family][1](value), {"units": "m"})
         for family in families
@@ -139,7 +137,7 @@ def shape_map(
 
 
 def prepared(mesh: Any, options: dict[str, Any], face_error_m: float) -> ObjectModel:
-    """The mesh through the same door as an upload; MeshError where it is refused."""
+    """Prepare the mesh like an upload; MeshError if it is refused."""
     files = {"shape.ply": bytes(mesh.export(file_type="ply"))}
     digest = digest_files(AssetKind.OBJECT, files)
     return load_object(files, name="shape", digest=digest, face_error_m=face_error_m, options=options)
@@ -154,16 +152,16 @@ def shape_cell(
     count: int,
     run: ExecutionContext,
 ) -> MapCell:
-    """Candidates of a hand on a mesh, planned and validated as a job does.
+    """Return candidates of a hand on a mesh, planned and validated as in a job.
 
     Args:
         hand: the hand.
         place: panel, x and y of the cell.
-        mesh: comes in through the same door as an upload.
-        options: of the object, as an upload states them.
-        asked: fidelity or method of the job, and what else it asks for.
+        mesh: is prepared like an upload.
+        options: options of the object, as in an upload.
+        asked: fidelity or method of the job, and further options.
         count: grasps.
-        run: its threads.
+        run: its execution context.
     """
     request = JobRequest(hand="hand", object="shape", grasps=count, want="candidates", rechecks=0, **asked)
     try:
@@ -179,7 +177,7 @@ def shape_cell(
 
 
 def refused(panel: str, x: float | str, y: float | str, error: GraspdError) -> MapCell:
-    """The cell of what is turned away with an error."""
+    """Return the cell of an asset that is refused with an error."""
     return MapCell(panel, x, y, float("nan"), "refused", str(error))
 
 
@@ -187,16 +185,16 @@ Coupling = Literal["each joint", "distal follows", "a drive a finger", "one driv
 
 FINGERS: Final = (1, 2, 3, 4, 5, 6, 8)
 COUPLINGS: Final[tuple[Coupling, ...]] = ("each joint", "distal follows", "a drive a finger", "one drive")
-#: Size over that of a human hand, whose fingers are about 10 cm long.
+#: Size relative to a human hand, whose fingers are about 10 cm long.
 SIZES: Final = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0)
-#: Turn of the distal joint over that of the one before it.
+#: Rotation of the distal joint over that of the previous one.
 RATIOS: Final = (-0.5, 0.0, 0.5, 1.0, 1.5, 2.0)
-#: What they hold [mm].
+#: Cube that they hold [mm].
 CUBE_MM: Final = 50.0
 
 #: Palm, links and their radius [m] of a hand of size 1, from the palm outward.
 _PALM_M, _LINKS_M, _RADIUS_M = (0.032, 0.02), (0.045, 0.035, 0.027), 0.009
-#: How far open fingers lean outward, and the ends of their joints [rad].
+#: Outward lean of open fingers, and limits of their joints [rad].
 _LEAN: Final = 0.45
 _ENDS: Final = (1.7, 1.6, 1.3)
 #: Torque of a joint of a hand of size 1 [N m].
@@ -204,16 +202,16 @@ _EFFORT: Final = 1.0
 
 
 def ring_hand(fingers: int, *, coupling: Coupling = "each joint", size: float = 1.0, ratio: float = 0.8) -> HandModel:
-    """A hand of like fingers around a palm.
+    """Return a hand of equal fingers around a palm.
 
     Args:
         fingers: their number.
-        coupling: what a drive moves.
-        size: of the hand, over that of a human one.
-        ratio: turn of the distal joint over that of the middle one, where it follows.
+        coupling: joints that a drive moves.
+        size: size relative to a human hand.
+        ratio: rotation of a coupled distal joint over the middle one's.
 
     Raises:
-        HandError: it is no usable hand.
+        HandError: the hand is unusable.
     """
     urdf = ring_urdf(fingers, coupling=coupling, size=size, ratio=ratio)
     files = {"ring.urdf": urdf.encode()}
@@ -221,7 +219,7 @@ def ring_hand(fingers: int, *, coupling: Coupling = "each joint", size: float = 
 
 
 def ring_urdf(fingers: int, *, coupling: Coupling, size: float, ratio: float) -> str:
-    """The URDF of `ring_hand`."""
+    """Return the URDF of `ring_hand`."""
     radius, height = (size * x for x in _PALM_M)
     parts = [f'<robot name="ring"><link name="palm">{_solid("cylinder", -height / 2, radius, height)}</link>']
     for k in range(fingers):
@@ -249,7 +247,7 @@ def _finger(k: int, base: str, coupling: Coupling, size: float, ratio: float) ->
 
 
 def _mimic(k: int, j: int, coupling: Coupling, ratio: float) -> str:
-    """What a joint follows, if it is no drive."""
+    """Return the joint that a joint follows, if it is no drive."""
     leads = {"each joint": (k, j), "distal follows": (k, min(j, 1)), "a drive a finger": (k, 0), "one drive": (0, 0)}
     lead = leads[coupling]
     if lead == (k, j):
@@ -275,7 +273,7 @@ def hand_map(
     run: ExecutionContext = DEFAULT_CONTEXT,
     say: Callable[[str], None] = lambda line: None,
 ) -> StabilityMap:
-    """Valid grasps of a cube in each hand, or why the hand is refused."""
+    """Return valid grasps of a cube by each hand, or the reason of its refusal."""
     makes: list[tuple[str, float, str, Callable[[], HandModel]]] = []
     for way in couplings:
         makes += [("fingers of a ring", n, way, partial(ring_hand, n, coupling=way)) for n in fingers]

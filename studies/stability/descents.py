@@ -1,4 +1,4 @@
-"""The descent itself: from starts too deep or too far, with rates and weights too small or too large, for too long."""
+"""Stress tests of the descent: bad starts, extreme rates and weights, and far too many iterations."""
 
 from __future__ import annotations
 
@@ -23,31 +23,30 @@ from graspd.worker.simulation.record import record_iteration
 
 Say = Callable[[str], None]
 
-#: How far the start is moved along the approach [m]: towards the object where negative is away from it.
+#: Displacements of the start along the approach [m]: towards the object; negative is away from it.
 MOVES_M: Final = (-0.5, -0.2, -0.1, -0.05, 0.0, 0.03, 0.06, 0.1)
-#: Factors on the optimiser's rates, and on the weights of penetration.
+#: Factors on the optimiser's rates, and on the penetration weights.
 RATES: Final = (0.01, 0.1, 0.3, 1.0, 3.0, 10.0, 100.0)
 WEIGHTS: Final = (0.0, 0.01, 0.1, 1.0, 10.0, 100.0)
-#: Names of the panels: plain descent is driven with rates made for Adam, which is not what `optimizer: gd` does.
+#: Names of the panels: plain descent uses rates tuned for Adam, unlike `optimizer: gd`.
 _OPTIMIZERS: Final = {"adam": "Adam", "gd": "plain descent, Adam's rates"}
 LENGTHS: Final = (100, 1_000, 10_000)
 LONG: Final = 100_000
-#: Median penetration that is weak and broken [mm].
+#: Median penetration that counts as weak and as broken [mm].
 DEPTH_MM: Final = (0.5, 2.0)
-#: Residual of the balance of contact forces that is weak and broken; 1: no balance at all.
+#: Residual of the contact force balance that counts as weak and as broken; 1: no balance.
 RESIDUAL: Final = (0.35, 0.9)
 
 
 @dataclass(frozen=True)
 class Descent:
-    """What became of n hands."""
+    """Result of n hands."""
 
     state: HandState
     depths: Floats
-    """Deepest penetration after the projection (n,) [m], as a job has it: hands that are pulled around the object stand
-    millimetres deep in it before."""
+    """(n,) deepest penetration after the projection [m], as in a job: before, it is millimetres."""
     drift: float
-    """Largest departure of a quaternion's length from 1 before the projection, which makes them whole again."""
+    """Largest deviation of a quaternion's length from 1 before the projection, which normalises it."""
 
 
 def descend(
@@ -60,15 +59,15 @@ def descend(
     iterations: int | None = None,
     optimizer: str = "adam",
 ) -> Descent:
-    """Coarse and fine phase and projection from given hands.
+    """Run coarse and fine phase and projection from given hands.
 
     Args:
         pair: hand and object.
         state: n hands.
-        fidelity: its schedules.
+        fidelity: fidelity with the schedules.
         rates: factor on the rates.
         weights: factor on the weights of penetration.
-        iterations: of the fine phase, whose last row is repeated; by default the fidelity's.
+        iterations: of the fine phase, with its last row repeated; default: the fidelity's.
         optimizer: adam or gd.
     """
     n = len(state.pivot)
@@ -82,14 +81,14 @@ def descend(
             len(schedule) if side is pair.coarse or iterations is None else iterations
         )
         state = data.state(n)
-    # The projection divides quaternions by their length: what the descent did to it is told before.
+    # The projection normalises quaternions: the drift of the descent is measured before.
     drift = float(np.abs(np.linalg.norm(state.rotation, axis=1) - 1.0).max())
     state, depths = Projection(model, data, AROUND).run(state, fidelity.polish_iterations)
     return Descent(state, depths, drift)
 
 
 def start_map(hand: HandModel, obj: ObjectModel, *, count: int = 8, say: Say = lambda line: None) -> StabilityMap:
-    """Starts moved along the approach, into the object and away from it."""
+    """Map starts that are moved along the approach, into the object and away from it."""
     fidelity = FIDELITIES["standard"]
     pair = pair_of(hand, obj, fidelity, "cpu")
     state = starts_of(pair, count)
@@ -124,7 +123,7 @@ def rate_map(
     count: int = 8,
     say: Say = lambda line: None,
 ) -> StabilityMap:
-    """Learning rate x weight of penetration, for Adam and for plain descent."""
+    """Map learning rate x penetration weight, for Adam and for plain descent."""
     fidelity = FIDELITIES["draft"]
     pair = pair_of(hand, obj, fidelity, "cpu")
     state = starts_of(pair, count)
@@ -153,7 +152,7 @@ def rate_map(
 def length_map(
     hand: HandModel, obj: ObjectModel, *, lengths: Sequence[int] = LENGTHS, count: int = 4, say: Say = lambda line: None
 ) -> StabilityMap:
-    """Fine phases far longer than any schedule: does anything drift?"""
+    """Map fine phases far longer than any schedule, to detect drift."""
     fidelity = FIDELITIES["draft"]
     pair = pair_of(hand, obj, fidelity, "cpu")
     state = starts_of(pair, count)
@@ -189,7 +188,7 @@ _BOUNDS: Final = (
 
 
 def starts_of(pair: Pair, count: int) -> HandState:
-    """Starts as the planner draws them."""
+    """Return starts sampled as in the planner."""
     return sample_starts(pair.model(pair.coarse), seed=11, batch=0, indices=range(count), each=1)
 
 
@@ -202,7 +201,7 @@ def _cells(pair: Pair, found: Descent, panel: str, x: float | str, y: float | st
     depth = float(np.median(found.depths)) * 1e3
     held, deep = graded(residual, *RESIDUAL), graded(depth, *DEPTH_MM)
     is_deep = _ORDER.index(deep) > _ORDER.index(held)
-    # What makes the cell bad is what stands on it.
+    # The label shows the cause of a bad cell.
     label = f"↓{short(depth)}" if is_deep else ""
     said = f"residual {residual:.2g}, {depth:.2g} mm deep"
     return [MapCell(panel, x, y, residual, deep if is_deep else held, said, label)]
@@ -218,7 +217,7 @@ def _scaled(schedule: Schedule, rates: float, weights: float) -> Schedule:
 
 
 def _lengthened(schedule: Schedule, iterations: int | None) -> Schedule:
-    """The schedule with its last row repeated."""
+    """Return the schedule with its last row repeated."""
     if iterations is None or iterations <= len(schedule):
         return schedule
     more = iterations - len(schedule)

@@ -1,4 +1,4 @@
-"""The kernels' gradients in float32 against central differences of the float64 reference, along each axis."""
+"""Kernel gradients in float32 against central differences of the float64 reference, per axis."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from graspd.worker.simulation.model import initial_motions
 from graspd.worker.simulation.reference import Contacts, World
 
 PASSES: Final = 12
-#: Sizes of the ball that is held [m], and how deep or far its contacts are at most, over the step of 1 mm.
+#: Sizes of the held ball [m], and largest depth or gap of its contacts, over the step of 1 mm.
 SIZES_M: Final = (0.0005, 0.002, 0.01, 0.04, 0.15, 0.5)
 GAPS: Final = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0)
 STEP_M: Final = 1e-3
-#: Sine of the angle between the two gradients, weak and broken.
+#: Sine of the angle between the two gradients that counts as weak and as broken.
 ANGLE: Final = (0.25, 0.7)
 _KERNELS: Final = {"direct": contact.direct, "gauss_seidel": contact.gauss_seidel, "jacobi": contact.jacobi}
 
 
 def solve64(name: str, contacts: Contacts, s0: Floats, world: World) -> Floats:
-    """The reference's step of a solver."""
+    """Return the reference's step of a solver."""
     if name == "direct":
         return reference.direct(contacts, s0, world, PASSES)
     if name == "gauss_seidel":
@@ -36,7 +36,7 @@ def solve64(name: str, contacts: Contacts, s0: Floats, world: World) -> Floats:
 
 
 def kernel_gradient(name: str, contacts: Contacts, world: World) -> Floats:
-    """dL/drho (N,) by a kernel, without leak, on the CPU."""
+    """Return dL/drho (N,) by a kernel, without leak, on the CPU."""
     motions = initial_motions(7, world.step, world.gyration)
     n, m = len(contacts.points), len(motions)
     with wp.ScopedDevice("cpu"):
@@ -69,7 +69,7 @@ def kernel_gradient(name: str, contacts: Contacts, world: World) -> Floats:
 
 
 def reference_gradient(name: str, contacts: Contacts, world: World) -> Floats:
-    """dL/drho (N,) by central differences in float64."""
+    """Return dL/drho (N,) by central differences in float64."""
     motions = initial_motions(7, world.step, world.gyration)
     step = 1e-6 * world.step
     steps = step * np.eye(len(contacts.points))[:, None]
@@ -84,7 +84,7 @@ def reference_gradient(name: str, contacts: Contacts, world: World) -> Floats:
 def gradient_map(
     sizes: Sequence[float] = SIZES_M, gaps: Sequence[float] = GAPS, *, repeats: int = 3, count: int = 8
 ) -> StabilityMap:
-    """Angle between the two gradients over the object's size and the spread of gaps."""
+    """Map the angle between the two gradients over the object's size and the spread of gaps."""
     cells = []
     for name in _KERNELS:
         for size in sizes:
@@ -132,5 +132,5 @@ def _angle(name: str, size: float, gap: float, count: int, seed: int) -> float:
     if lengths == 0.0:
         return 0.0 if np.linalg.norm(ours) == np.linalg.norm(expected) else 1.0
     cosine = float(ours @ expected) / lengths
-    # Opposite gradients are worse than ones at a right angle.
+    # Opposite gradients are worse than orthogonal ones.
     return float(np.sqrt(max(0.0, 1.0 - cosine**2))) if cosine > 0 else 1.0

@@ -1,8 +1,8 @@
-"""Integrators on their own: a ball thrown into a cage of contact points, one step after another, in float64.
+"""Integrators alone: a ball thrown into a cage of contact points, step by step, in float64.
 
-The cage stands still, the ball flies inside it. A feasible integrator gives it no more energy than it had, keeps it in
-the cage and lets nothing sink in. The position-based ones are those of `worker.simulation.reference`, which the
-kernels are tested against; the force-based one is the penalty force of Grasp'D (2022) under semi-implicit Euler.
+The cage is fixed, the ball flies inside it. A feasible integrator adds no energy, keeps the ball in the cage and
+prevents penetration. The position-based ones are those of `worker.simulation.reference`, the reference of the kernels'
+tests; the force-based one is the penalty force of Grasp'D (2022) under semi-implicit Euler.
 """
 
 from __future__ import annotations
@@ -19,24 +19,23 @@ from graspd.worker.simulation import reference
 from graspd.worker.simulation.model import LossOptions
 from graspd.worker.simulation.reference import Contacts, World
 
-#: From contacts (of which the distances are the present ones), free motion and world to the motion that is allowed.
+#: From contacts (with present distances), free motion and world to the permitted motion.
 Solver = Callable[[Contacts, Floats, World], Floats]
 
 RADIUS_M: Final = 0.035
-#: Gap between ball and cage at the start [m], or as far as the ball flies in so many steps if that is less: it has to
-#: arrive.
+#: Gap between ball and cage at the start [m], at most the ball's flight in this many steps, so that it arrives.
 GAP_M: Final = 2e-3
 FLIGHT_STEPS: Final = 10
 STEPS: Final = 60
-#: Most that a ball of 1 kg may sink in, weak and broken [m].
+#: Largest penetration of a ball of 1 kg that counts as weak and as broken [m].
 SINK_M: Final = (5e-4, 5e-3)
-#: Most energy over that at the start, weak and broken.
+#: Largest energy over the initial one that counts as weak and as broken.
 ENERGY: Final = (1.02, 2.0)
 #: Sliding friction of the cage, and the viscous coefficient of the force-based contact [N s/m].
 FRICTION: Final = 0.8
 VISCOUS: Final = 10.0
 
-#: On cells of balls stands the worse of the two.
+#: Cells of balls show the worse of the two values.
 _BALL_MEASURE: Final = "× largest kinetic energy over the first (∞: it blew up), else how deep it sank [mm]"
 
 TIME_STEPS: Final = (1e-5, 1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2)
@@ -47,7 +46,7 @@ COUNTS: Final = (1, 2, 4, 8, 16, 64, 256)
 
 
 def cage(count: int) -> Floats:
-    """(count, 3) unit directions, evenly spread (Fibonacci)."""
+    """Return (count, 3) unit directions, evenly spread (Fibonacci)."""
     k = np.arange(count) + 0.5
     polar, turn = np.arccos(1 - 2 * k / count), np.pi * (1 + 5**0.5) * k
     return np.stack([np.cos(turn) * np.sin(polar), np.sin(turn) * np.sin(polar), np.cos(polar)], axis=1)
@@ -58,7 +57,7 @@ def _cage_around(count: int, dt: float, speed: float) -> Floats:
 
 
 def contacts_of(points: Floats, centre: Floats) -> Contacts:
-    """Contacts of the ball at `centre` with the cage's points (N, 3) [m]."""
+    """Return contacts of the ball at `centre` with the cage's points (N, 3) [m]."""
     arms = points - centre
     length = np.linalg.norm(arms, axis=1)
     normals = arms / length[:, None]
@@ -77,7 +76,7 @@ def ball_world(dt: float, speed: float) -> World:
 
 
 def position_based(solver: Solver, *, dt: float, speed: float, count: int = 24) -> tuple[float, float]:
-    """Largest energy over the first, and deepest sink [m], of a ball under a position-based integrator."""
+    """Return largest energy over the first, and deepest sink [m], of a ball; position-based integrator."""
     points = _cage_around(count, dt, speed)
     world = ball_world(dt, speed)
     centre, velocity = np.zeros(3), np.array([0.8, 0.36, 0.48, 0, 0, 0]) * speed
@@ -97,7 +96,7 @@ def position_based(solver: Solver, *, dt: float, speed: float, count: int = 24) 
 def force_based(
     *, dt: float, speed: float, stiffness: float, mass: float = 1.0, count: int = 24
 ) -> tuple[float, float]:
-    """The same under penalty forces -k c n and friction, semi-implicit Euler; `stiffness` in N/m, `mass` in kg."""
+    """Return the same under penalty forces -k c n and friction; `stiffness` [N/m], `mass` [kg]."""
     points = _cage_around(count, dt, speed)
     inertia = 0.4 * mass * RADIUS_M**2
     centre, v, w = np.zeros(3), np.array([0.8, 0.36, 0.48]) * speed, np.zeros(3)
@@ -125,7 +124,7 @@ def _penalty(contacts: Contacts, v: Floats, w: Floats, stiffness: float) -> tupl
 
 
 def _sunk(points: Floats, centre: Floats) -> float:
-    """How deep the deepest cage point is in the ball; all of the ball's size once it has left the cage [m]."""
+    """Return the deepest cage point's depth in the ball; the ball's size once it has left the cage [m]."""
     if float(np.linalg.norm(centre)) > 2 * RADIUS_M:
         return 2 * RADIUS_M
     return max(0.0, RADIUS_M - float(np.linalg.norm(points - centre, axis=1).min()))
@@ -144,7 +143,7 @@ def _averaged(contacts: Contacts, s0: Floats, world: World) -> Floats:
 
 
 def summed_jacobi(contacts: Contacts, s0: Floats, world: World) -> Floats:
-    """All contacts' corrections at once, added and not averaged: the form that graspd does not offer."""
+    """Sum all contacts' corrections at once, without averaging: a form that graspd does not offer."""
     inverse = np.linalg.inv(world.mass)
     s = s0.copy()
     for _ in range(8):
@@ -164,12 +163,12 @@ SOLVERS: Final[dict[str, Solver]] = {
     "Jacobi, averaged": _averaged,
     "Jacobi, summed": summed_jacobi,
 }
-#: What `contact_solver` offers.
+#: Values of `contact_solver`.
 _OFFERED: Final = tuple(SOLVERS)[:3]
 
 
 def time_step_map(time_steps: Sequence[float] = TIME_STEPS, speeds: Sequence[float] = SPEEDS) -> StabilityMap:
-    """Every integrator over time step and speed."""
+    """Map every integrator over time step and speed."""
     grid = [(dt, speed) for dt in time_steps for speed in speeds]
     cells = [
         _ball_cell(name, dt, speed, position_based(solver, dt=dt, speed=speed))
@@ -182,7 +181,7 @@ def time_step_map(time_steps: Sequence[float] = TIME_STEPS, speeds: Sequence[flo
         for dt, speed in grid
     ]
     step = LossOptions().step
-    # The grid comes no nearer to the planner's step than a tenth of it.
+    # The grid approximates the planner's step to a tenth of it.
     cells = reachable(cells, lambda c: c.panel in _OFFERED and abs(float(c.x) * float(c.y) / step - 1) < 0.15)
     return StabilityMap(
         "time_step",
@@ -205,7 +204,7 @@ def _ball_cell(name: str, dt: float, speed: float, found: tuple[float, float]) -
     energy, deep = found
     worst = max(graded(energy, *ENERGY), graded(deep, *SINK_M), key=("good", "weak", "broken").index)
     said = f"energy × {energy:.3g}, {deep * 1e3:.2g} mm deep"
-    # What makes the cell bad is what stands on it.
+    # The label shows the cause of a bad cell.
     ratio = f"{energy:.2f}" if energy < 2 else short(energy)
     label = f"×{ratio}" if energy >= ENERGY[0] else short(round(deep * 1e3, 2))
     return MapCell(name, dt, speed, energy, worst, said, label)
@@ -216,7 +215,7 @@ def stiffness_map(
     masses: Sequence[float] = MASSES,
     time_steps: Sequence[float] = TIME_STEPS,
 ) -> StabilityMap:
-    """The force-based integrator over stiffness, mass and time step, with the bound that theory gives."""
+    """Map the force-based integrator over stiffness, mass and time step, with the theoretical bound."""
     cells = []
     lines = {}
     for mass in masses:
@@ -249,7 +248,7 @@ def stiffness_map(
 
 
 def contact_count_map(counts: Sequence[int] = COUNTS) -> StabilityMap:
-    """One step against a wall seen by ever more contact points: what is left of the motion into it."""
+    """Map one step against a wall of ever more contact points: the remaining motion into it."""
     cells = [
         _wall_cell(name, solver, count, depth, 1e-3)
         for name, solver in SOLVERS.items()
@@ -276,7 +275,7 @@ def _wall_cell(name: str, solver: Solver, count: int, depth: float, step: float)
     rng = np.random.default_rng(count)
     points = np.concatenate([0.005 * rng.normal(size=(count, 2)), np.full((count, 1), RADIUS_M)], axis=1)
     normals = np.tile([0.0, 0, 1], (count, 1))
-    # The compliant solver sees a finger of one stiffness, however many points it is sampled with.
+    # The compliant solver gets a finger of constant stiffness, independent of its number of points.
     contacts = Contacts(points, normals, np.full(count, -depth), np.full(count, 24.0 / count))
     world = ball_world(1.0, step)
     end = solver(contacts, np.array([0, 0, step, 0, 0, 0]), world)

@@ -1,7 +1,7 @@
-"""Models that are wrong: grasps that hold in the validator's model, validated in one of which a single thing is off.
+"""Model errors: grasps held in the validator's model, validated in models with a single error.
 
-Amounts go from what `--robust` draws (`worker.validation.variant`) to where little holds. Places and turns are off
-in a direction of each grasp's own.
+Amounts range from those of `--robust` (`worker.validation.variant`) to where few grasps are held. Displacements and
+rotations have an own direction for each grasp.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from graspd.worker.validation.varied import Models
 Direction = NDArray[np.float64]
 Make = Callable[[HandModel, float, Direction], Variant]
 
-#: Shares of grasps below which a cell is weak, and broken.
+#: Shares of grasps below which a cell counts as weak and as broken.
 WEAK: Final = 0.75
 BROKEN: Final = 0.25
 _MM: Final = 1e-3
@@ -49,11 +49,11 @@ _ROUNDING: Final = 1e-9
 
 @dataclass(frozen=True)
 class _Error:
-    """One thing that may be off."""
+    """One error of the model."""
 
     amounts: tuple[float, ...]
     drawn: tuple[float, float]
-    """Least and largest amount that `--robust` draws."""
+    """Least and largest amount in `--robust`."""
     variant: Make
 
 
@@ -113,7 +113,7 @@ def model_error_map(
     run: ExecutionContext = DEFAULT_CONTEXT,
     say: Callable[[str], None] = lambda line: None,
 ) -> StabilityMap:
-    """Share of valid grasps that still hold where one thing is off; of each amount's every so many-th."""
+    """Map the share of valid grasps that are held despite one error; `every` thins out the amounts."""
     cells = [cell for hand in hands for cell in _cells(hand, obj, errors, every, fidelity, count, run, say)]
     return StabilityMap(
         "model_errors",

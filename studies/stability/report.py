@@ -1,4 +1,4 @@
-"""Maps of failure as JSON, Markdown and pictures."""
+"""Maps of failure as JSON, Markdown and plots."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from typing import Any, Final
 
 from graspd.service.model.studies import OUTCOMES, MapCell, Stability, StabilityMap, between, counts, tick
 
-#: Told apart by lightness alone too, from calm to alarming: (fill, text).
+#: Distinguishable by lightness alone, from calm to alarming: (fill, text).
 COLOURS: Final = {
     "good": ("#bfe0dc", "#14403a"),
     "weak": ("#eeb544", "#3b2a00"),
     "broken": ("#96261c", "#ffffff"),
     "refused": ("#e7e9ec", "#4b565e"),
 }
-#: Widest row of panels.
+#: Most panels in a row.
 _COLUMNS: Final = 3
-#: Sizes of the numbers on cells [pt], largest first; where not even the last fits, the cell says nothing.
+#: Sizes of the numbers on cells [pt], largest first; if the last does not fit, the cell is blank.
 _FONT_SIZES: Final = (7.0, 6.0, 5.0)
 #: Longer names of ticks are broken into lines.
 _TICK_LETTERS: Final = 14
 
 
 def write(found: Stability, folder: Path) -> list[Path]:
-    """`stability.json`, `stability.md` and a picture for each map."""
+    """Write `stability.json`, `stability.md` and a plot for each map."""
     folder.mkdir(parents=True, exist_ok=True)
     written = [folder / "stability.json", folder / "stability.md"]
     written[0].write_text(json.dumps(found.as_json(), indent=1, allow_nan=False) + "\n")
@@ -39,7 +39,7 @@ def write(found: Stability, folder: Path) -> list[Path]:
 
 
 def markdown(found: Stability) -> str:
-    """What was driven where, where it broke, how that shows, what guards against it, and what still breaks."""
+    """Return the page: tests, failures, symptoms, guards, and remaining failures."""
     said = ", ".join(f"{name} {value}" for name, value in found.versions.items())
     lines = ["# Where it breaks", "", f"`{found.command}`; {said}.", "", *_still_breaks(found.maps)]
     for one in found.maps:
@@ -55,7 +55,7 @@ def markdown(found: Stability) -> str:
 
 
 def _still_breaks(maps: Sequence[StabilityMap]) -> list[str]:
-    """The cells that a job can come to, and what of them is broken: what no guard keeps a user from."""
+    """Return broken cells that a job can reach: failures that no guard prevents."""
     lines = ["## What still breaks", ""]
     lines += ["Only the cells that a job can come to, whatever it asks for. The other cells of the maps need settings"]
     lines += ["that no job has: there the guard is that they cannot be asked for.", ""]
@@ -73,7 +73,7 @@ def _row(cells: Sequence[MapCell]) -> str:
 
 
 def draw(one: StabilityMap, path: Path) -> None:
-    """A panel for each method or family, a square for each cell."""
+    """Plot a panel for each method or family, a square for each cell."""
     from matplotlib.figure import Figure
     from matplotlib.patches import Patch
 
@@ -124,7 +124,7 @@ def _panel(axes: Any, one: StabilityMap, panel: str) -> None:
 
 
 def _fit(axes: Any) -> None:
-    """Make the numbers as small as their cells want them, or leave them out."""
+    """Shrink the numbers to fit their cells, or omit them."""
     left, right = axes.get_xlim()
     room = 0.88 * axes.get_window_extent().width / max(1.0, right - left)
     for text in axes.texts:

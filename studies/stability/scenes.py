@@ -1,4 +1,4 @@
-"""Scenes that are hard: flat and tall things on a table, walls and neighbours nearby, things too small or too large."""
+"""Hard scenes: flat and tall objects on a table, walls and neighbours, too small and too large ones."""
 
 from __future__ import annotations
 
@@ -29,19 +29,19 @@ MILLIMETRES: Final = 1e-3
 #: Boxes on a table: heights, and sides of their square footprints [mm].
 HEIGHTS_MM: Final = (5, 10, 20, 40, 80, 140, 200)
 SIDES_MM: Final = (30, 60, 120)
-#: What stands beside walls and neighbours: sides and height [mm].
+#: Target beside walls and neighbours: sides and height [mm].
 TARGET_MM: Final = (50, 50, 80)
 GAPS_MM: Final = (5, 10, 20, 40, 80, 160)
-#: Walls by name: directions in which one stands, seen from the target.
+#: Walls by name: their directions from the target.
 WALLS: Final[dict[str, tuple[tuple[int, int], ...]]] = {
     "one": ((1, 0),),
     "corner": ((1, 0), (0, 1)),
     "two opposite": ((1, 0), (-1, 0)),
     "four": ((1, 0), (-1, 0), (0, 1), (0, -1)),
 }
-#: Height and thickness of a wall [mm]: higher than any hand reaches down.
+#: Height and thickness of a wall [mm]: higher than the reach of any hand.
 WALL_MM: Final = (300, 20)
-#: Neighbours as large as the target, on the four sides of it and at its four corners.
+#: Neighbours of the target's size, on its four sides and at its four corners.
 NEIGHBOURS: Final[dict[str, tuple[tuple[int, int], ...]]] = {
     "one": ((1, 0),),
     "four": ((1, 0), (-1, 0), (0, 1), (0, -1)),
@@ -74,7 +74,7 @@ def height_map(
     run: ExecutionContext = DEFAULT_CONTEXT,
     say: Say = lambda line: None,
 ) -> StabilityMap:
-    """Boxes from a plate to a tower on a table."""
+    """Map boxes from a plate to a tower on a table."""
     cells = [
         _cell(hand, hand.name, height, side, _standing((side, side, height), ()), fidelity, count, run, say)
         for hand in hands
@@ -106,7 +106,7 @@ def wall_map(
     run: ExecutionContext = DEFAULT_CONTEXT,
     say: Say = lambda line: None,
 ) -> StabilityMap:
-    """A box with walls at a distance from its sides."""
+    """Map a box with walls at a distance from its sides."""
     cells = [
         _cell(hand, hand.name, gap, name, _standing(TARGET_MM, _walls(WALLS[name], gap)), fidelity, count, run, say)
         for hand in hands
@@ -138,7 +138,7 @@ def neighbour_map(
     run: ExecutionContext = DEFAULT_CONTEXT,
     say: Say = lambda line: None,
 ) -> StabilityMap:
-    """A box among boxes as large as itself."""
+    """Map a box among boxes of its size."""
     cells = [
         _cell(
             hand,
@@ -180,7 +180,7 @@ def size_map(
     run: ExecutionContext = DEFAULT_CONTEXT,
     say: Say = lambda line: None,
 ) -> StabilityMap:
-    """Cubes from a crumb to as large as the hand, afloat and in scenes."""
+    """Map cubes from a crumb to the hand's size, afloat and in scenes."""
     cells = []
     for hand in hands:
         span = span_of(hand)
@@ -206,7 +206,7 @@ def size_map(
 
 
 def span_of(hand: HandModel) -> float:
-    """Largest distance between two fingertips' middles in the preshape [m]."""
+    """Return the largest distance between the centres of two fingertips in the preshape [m]."""
     root = np.array([[0.0, 0, 0, 1, 0, 0, 0]])
     poses = body_poses(hand, root, hand.expand(hand.preshape[None]))[0]
     tips = [piece for piece in hand.pieces if piece.body in hand.fingertips]
@@ -218,14 +218,14 @@ Placement = tuple[tuple[float, ...], SceneSpec]
 
 
 def _standing(sides_mm: tuple[float, ...], around: Iterable[Support]) -> Placement:
-    """A box of these sides [mm] upright on a table, with supports around it."""
+    """Return a box of these sides [mm] upright on a table, with supports around it."""
     height = sides_mm[2] * MILLIMETRES
     target = (0.0, 0.0, height / 2, 1.0, 0.0, 0.0, 0.0)
     return sides_mm, SceneSpec(kind="file", supports=(_TABLE, *around), target=target)
 
 
 def _walls(directions: Sequence[tuple[int, int]], gap_mm: float) -> list[Box]:
-    """Walls that end nowhere near: as long as three times their height."""
+    """Return walls that are three times as long as high, so that they end far away."""
     high, thick = (value * MILLIMETRES for value in WALL_MM)
     found = []
     for x, y in directions:
@@ -278,7 +278,7 @@ def planned(
     count: int,
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> ValidatedBatch:
-    """Candidates of a box of these sides [mm] in a scene, through the doors that a user's object and scene go through.
+    """Return candidates of a box of these sides [mm] in a scene, prepared like a user's.
 
     Raises:
         GraspdError: the box or the scene is refused.
@@ -293,7 +293,7 @@ def planned(
 
 
 def _told(found: ValidatedBatch) -> tuple[float, Outcome, str, str]:
-    """Value, outcome, note and label of a cell."""
+    """Return value, outcome, note and label of a cell."""
     valid = float(found.columns["quality/valid"].mean())
     clear = found.shares.get("clear_share", 1.0)
     outcome: Outcome = "broken" if valid == 0 else "weak" if valid < 0.5 else "good"

@@ -1,4 +1,4 @@
-"""The stability studies by name, whole or quick; and the baselines on shapes that are hard."""
+"""Stability studies by name, full or quick; and the baselines on hard shapes."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from graspd.worker.objects.prepare import object_from_path
 
 Say = Callable[[str], None]
 
-#: Hands beside the one that is named, for what depends on a hand's size and build.
+#: Further hands, for effects of a hand's size and build.
 OTHER_HANDS: Final = ("barrett",)
-#: And for what depends on its drives.
+#: Hands for effects of drives.
 ALL_HANDS: Final = ("allegro", "barrett", "shadow")
 
 
 def run(
     names: Sequence[str], hand: str, obj: str, *, quick: bool, long: bool, work: ExecutionContext, say: Say
 ) -> list[StabilityMap]:
-    """The maps of the named studies, in the order of the names."""
+    """Return the maps of the named studies, in the order of the names."""
     model, thing = hand_from_path(hand), object_from_path(obj)
 
     def few(values: Sequence[float]) -> Sequence[float]:
@@ -51,7 +51,7 @@ def run(
             fidelities=("draft",) if quick else ("draft", "standard", "fine"),
             count=4 if quick else 8,
             families=("plate", "cube") if quick else tuple(assets.FAMILIES),
-            # Grasps on an open mesh cost more than all else of a quick run.
+            # Grasps on an open mesh cost more than the rest of a quick run.
             defects=assets.CLOSED if quick else tuple(assets.DEFECTS),
             run=work,
             say=say,
@@ -108,7 +108,7 @@ def run(
     return found
 
 
-#: Methods around a free object; the first is graspd's own.
+#: Methods for a free object; the first is graspd's own.
 METHODS: Final = ("fast_graspd", "autograsp", "dfc", "graspit", "graspd2022")
 #: Parameters of each family: an easy one and hard ones.
 SHAPES: Final[dict[str, tuple[float, ...]]] = {
@@ -129,7 +129,7 @@ def peer_map(
     run: ExecutionContext = DEFAULT_CONTEXT,
     say: Callable[[str], None] = lambda line: None,
 ) -> StabilityMap:
-    """Valid grasps of each method on each shape, at the settings that it was published with."""
+    """Map valid grasps of each method on each shape, at its published settings."""
     cells = []
     for family, values in shapes.items():
         unit, make, _ = FAMILIES[family]

@@ -1,1 +1,1 @@
-"""Every change of the index, each inside one transaction."""
+"""Changes of the index, each inside one transaction."""

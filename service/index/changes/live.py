@@ -1,4 +1,4 @@
-"""Changes that say what goes on at present: what waits, what runs, and who is there. Each is idempotent."""
+"""Changes of the present state: waiting and running tasks, and workers. All are idempotent."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ _UNFINISHED = tasks.c.state.in_((State.QUEUED.value, State.RUNNING.value))
 
 @dataclass(frozen=True)
 class Live:
-    """Writes of what no store remembers."""
+    """Writes of data that the store does not contain."""
 
     database: Database
 
     def set_running(self, workers: Mapping[str, str]) -> dict[str, State]:
-        """Workers took tasks: the worker of each. Returns the states of the jobs to which it makes a difference."""
+        """Mark tasks as taken; `workers` maps tasks to workers. Return the changed states of jobs."""
         running = State.RUNNING.value
         with self.database.writing() as connection:
             jobs_of: dict[str, str] = {}
@@ -41,13 +41,13 @@ class Live:
             update_rows(connection, tasks, rows, state=State.QUEUED.value)
             touched = sorted(set(jobs_of.values()))
             for some in chunks(touched):
-                # A job that already runs stays so: no need to look at its other tasks.
+                # A running job stays running: its other tasks need no check.
                 waiting = jobs.c.id.in_(some) & (jobs.c.state == State.QUEUED.value)
                 connection.execute(update(jobs).where(waiting).values(state=running))
             return dict.fromkeys(touched, State.RUNNING)
 
     def set_progress(self, progress: Mapping[str, tuple[float, float, str]]) -> None:
-        """How far running tasks are: done, total, and what they do."""
+        """Set the progress of running tasks: done, total, and activity."""
         rows = [
             {"id": task, "progress_done": done, "progress_total": total, "progress_message": clean(message)}
             for task, (done, total, message) in progress.items()
@@ -56,7 +56,7 @@ class Live:
             update_rows(connection, tasks, rows, state=State.RUNNING.value)
 
     def set_queued(self, task_ids: Sequence[str]) -> None:
-        """Tasks that were put into the queue."""
+        """Mark tasks as queued."""
         with self.database.writing() as connection:
             for some in chunks(task_ids):
                 connection.execute(update(tasks).where(tasks.c.id.in_(some), _UNFINISHED).values(queued=True))
@@ -64,7 +64,7 @@ class Live:
     def set_waiting(
         self, task_ids: Sequence[str], *, not_before: float = 0.0, message: str | None = None
     ) -> dict[str, State]:
-        """Tasks that are neither in the queue nor with a worker: to be queued again after `not_before`.
+        """Mark tasks as neither queued nor with a worker, to be queued again after `not_before`.
 
         Returns:
             the states of the jobs concerned.
@@ -81,7 +81,7 @@ class Live:
     def set_asset_waiting(
         self, digests: Iterable[str], *, queued: bool, not_before: float = 0.0, message: str | None = None
     ) -> None:
-        """Checks that no worker holds, and what they wait for, where that is known."""
+        """Mark checks that no worker holds, with the reason if known."""
         values: dict[str, Any] = {"queued": queued, "not_before": not_before}
         if message is not None:
             values["message"] = clean(message)
@@ -89,7 +89,7 @@ class Live:
             connection.execute(update(assets).where(assets.c.digest.in_(list(digests))).values(**values))
 
     def set_workers(self, beats: Sequence[WorkerBeat], *, forget_before: str, lost_before: str = "9999") -> None:
-        """The living workers; others turn to lost when last seen before a time, and are forgotten before another."""
+        """Record living workers; mark others as lost and delete them by the time they were last seen."""
         rows = [
             {
                 "name": clean(beat.name, 128),
@@ -119,7 +119,7 @@ class Live:
             self._forget(connection, [row.name for row in gone if row.seen < forget_before])
 
     def forget_workers(self, names: Sequence[str]) -> None:
-        """Workers that ended as they should."""
+        """Delete workers that stopped in order."""
         with self.database.writing() as connection:
             self._forget(connection, names)
 
@@ -128,7 +128,7 @@ class Live:
             connection.execute(delete(workers).where(workers.c.name.in_(some)))
 
     def add_asset_attempt(self, digest: str, number: int, *, not_before: float) -> None:
-        """A check that ended without a finding."""
+        """Record a check without a result."""
         values = {"last_attempt": number, "queued": False, "not_before": not_before}
         with self.database.writing() as connection:
             connection.execute(

@@ -1,4 +1,4 @@
-"""What the store says of jobs and datasets, as rows. Only the API and the controller call these; each is idempotent."""
+"""Jobs and datasets of the store as rows; only API and controller call these. All are idempotent."""
 
 from __future__ import annotations
 
@@ -52,35 +52,35 @@ from graspd.service.model.records import (
 from graspd.service.model.states import State
 from graspd.service.store.manifests import ShardManifest
 
-#: Ranges that are entered in one turn: some tenths of a second, for which others wait.
+#: Ranges entered in one transaction: it takes some tenths of a second, for which other writers wait.
 RANGES_AT_ONCE: Final = 500
 
 
 @dataclass(frozen=True)
 class Changes:
-    """What the store says. `within` makes a write part of a larger transaction."""
+    """Records of the store. `within` makes a write part of a larger transaction."""
 
     database: Database
 
     def add_job(self, record: JobRecord, *, within: Connection | None = None) -> State:
-        """A job with all its tasks; those whose shard is there already have succeeded."""
+        """Add a job with all its tasks; tasks whose shard exists have succeeded."""
         with self.database.writing(within) as connection:
             return self._add_job(connection, record)
 
     def enter_job(self, record: JobRecord, *, within: Connection) -> None:
-        """A job with its first tasks; `enter_more` brings the others where they are too many for one turn."""
+        """Add a job with its first tasks; `enter_more` adds the others of large jobs."""
         is_new = within.scalar(select(jobs.c.id).where(jobs.c.id == record.id)) is None
         self._upsert_job(within, record)
         self._enter(within, record, 0, goes_on=is_new)
 
     def entering(self) -> list[str]:
-        """Jobs that have tasks yet to be entered."""
+        """Return the jobs with tasks that are not yet entered."""
         query = select(notes.c.name).where(notes.c.name.startswith(ENTERING)).order_by(notes.c.name)
         with self.database.reading() as connection:
             return [name.removeprefix(ENTERING) for name in connection.scalars(query)]
 
     def enter_more(self, job_id: str, record: JobRecord | None) -> None:
-        """The next tasks of such a job; None: its record is gone, and no more come."""
+        """Add the next tasks of such a job; None: its record is deleted, and no more follow."""
         with self.database.writing() as connection:
             is_there = connection.scalar(select(jobs.c.id).where(jobs.c.id == job_id)) is not None
             note: Any = connection.scalar(select(notes.c.value).where(notes.c.name == ENTERING + job_id))
@@ -92,7 +92,7 @@ class Changes:
     def add_manifests(
         self, manifests: Iterable[ShardManifest], *, within: Connection | None = None
     ) -> dict[str, State]:
-        """Shards, their grasps, and the success of every task, of whatever job, that was to make one of them.
+        """Add shards and their grasps, and mark all tasks of any job that make them as succeeded.
 
         Returns:
             the states of the jobs concerned.
@@ -101,13 +101,13 @@ class Changes:
             return self._add_manifests(connection, list(manifests))
 
     def add_manifest(self, manifest: ShardManifest) -> dict[str, State]:
-        """One shard."""
+        """Add one shard."""
         return self.add_manifests([manifest])
 
     def add_attempt(
         self, attempt: AttemptRecord, *, not_before: float = 0.0, within: Connection | None = None
     ) -> State | None:
-        """A failed attempt. Returns the job's state, None if the index knows no such task.
+        """Add a failed attempt. Return the job's state, or None for an unknown task.
 
         Args:
             not_before: `time.time` before which the next attempt must not be queued.
@@ -116,12 +116,12 @@ class Changes:
             return self._add_attempt(connection, attempt, not_before)
 
     def set_job_events(self, job_id: str, events: Sequence[JobEvent], *, within: Connection | None = None) -> State:
-        """What users did to a job: all its events so far, in order."""
+        """Set the actions of users on a job: all its events so far, in order."""
         with self.database.writing(within) as connection:
             return self._set_job_events(connection, job_id, events)
 
     def add_asset(self, asset: Asset, check: Mapping[str, Any] | None, *, within: Connection | None = None) -> None:
-        """A hand or object, with what ingest found, None while that is to come."""
+        """Add a hand or object with the result of its check, None while that is pending."""
         with self.database.writing(within) as connection:
             upsert(connection, assets, [asset_row(asset, check)], keep=("last_attempt", "queued", "not_before"))
 
@@ -140,7 +140,7 @@ class Changes:
         upsert(connection, tasks, rows, keep=[name for name in rows[0] if name != "priority"])
 
     def _enter(self, connection: Connection, record: JobRecord, first: int, *, goes_on: bool) -> None:
-        """Some ranges from one on. A note tells where the next ones begin, and that the job cannot have ended."""
+        """Add some ranges from `first`. A note contains the next range, and that the job cannot have ended."""
         number = ranges_of(record.request.grasps, record.span)
         some = range(first, min(number, first + RANGES_AT_ONCE))
         self._upsert_tasks(connection, list(task_rows(record, some)))
@@ -177,7 +177,7 @@ class Changes:
         return settle_batches(connection, touched)
 
     def _askers(self, connection: Connection, ids: Sequence[str]) -> dict[str, str]:
-        """Project of the first job that asked for each shard, where it has one."""
+        """Return the project of the first job that requested each shard, if it has one."""
         found: dict[str, str] = {}
         for some in chunks(ids):
             query = select(tasks.c.shard_id, jobs.c.project).join(jobs, jobs.c.id == tasks.c.job_id)
@@ -188,7 +188,7 @@ class Changes:
 
     def _add_attempt(self, connection: Connection, attempt: AttemptRecord, not_before: float) -> State | None:
         if connection.scalar(select(tasks.c.id).where(tasks.c.id == attempt.task_id)) is None:
-            return None  # of a job that was deleted, or that somebody made up
+            return None  # of a deleted job, or a forged one
         upsert(connection, attempts, [attempt_row(attempt)])
         values: dict[str, Any] = {
             "last_attempt": attempt.number,
@@ -225,7 +225,7 @@ _OUTCOME = (shards.c.worker, shards.c.device, shards.c.seconds, shards.c.created
 
 
 def _outcome(worker: Any, device: Any, seconds: Any, created: Any) -> dict[str, Any]:
-    """What a task row takes from its shard: values, or columns."""
+    """Return the columns that a task row takes from its shard: values, or columns."""
     return {
         "done": True,
         "worker": worker,
@@ -243,12 +243,12 @@ def _outcome(worker: Any, device: Any, seconds: Any, created: Any) -> dict[str, 
 
 @dataclass(frozen=True)
 class DatasetChanges:
-    """Writes on datasets. `within` makes a write part of a larger transaction."""
+    """Writes of datasets. `within` makes a write part of a larger transaction."""
 
     database: Database
 
     def add(self, record: DatasetRecord, *, within: Connection | None = None) -> None:
-        """A dataset with its cells; what users did to it later stays as it is."""
+        """Add a dataset with its cells; later actions of users stay unchanged."""
         row = {
             "name": record.name,
             "digest": record.digest,
@@ -286,7 +286,7 @@ class DatasetChanges:
             upsert(connection, dataset_cells, cells)
 
     def set_events(self, name: str, events: Sequence[DatasetEvent], *, within: Connection | None = None) -> None:
-        """What users did to a dataset: all its events so far, in order."""
+        """Set the actions of users on a dataset: all its events so far, in order."""
         cancelled = bool(events) and events[-1].what == "cancelled"
         number = max((event.number for event in events), default=0)
         values = {"cancelled": cancelled, "events": number, "planned": False}
@@ -294,7 +294,7 @@ class DatasetChanges:
             connection.execute(update(datasets).where(datasets.c.name == name).values(**values))
 
     def add_snapshot(self, snapshot: Snapshot, *, within: Connection | None = None) -> None:
-        """A snapshot, without its list of shards."""
+        """Add a snapshot, without its list of shards."""
         row = {
             "dataset": snapshot.dataset,
             "digest": snapshot.digest,
@@ -309,14 +309,14 @@ class DatasetChanges:
             upsert(connection, dataset_snapshots, [row])
 
     def add_object_set(self, found: ObjectSet, *, within: Connection | None = None) -> None:
-        """A version of a named set of objects."""
+        """Add a version of a named set of objects."""
         row = {"name": found.name, "digest": found.digest, "objects": list(found.objects), "created": found.created}
         row |= {"project": found.project}
         with self.database.writing(within) as connection:
             upsert(connection, object_sets, [row])
 
     def set_progress(self, name: str, *, applied: int | None = None, planned: bool | None = None) -> None:
-        """How far the planner is with a dataset."""
+        """Set the planner's progress on a dataset."""
         values = {k: v for k, v in {"applied": applied, "planned": planned}.items() if v is not None}
         with self.database.writing() as connection:
             connection.execute(update(datasets).where(datasets.c.name == name).values(**values))

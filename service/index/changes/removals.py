@@ -1,4 +1,4 @@
-"""Rows that go: what uses a thing, and what is removed with it. Each removal is idempotent."""
+"""Removal of rows: users of a thing, and the rows removed with it. All removals are idempotent."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ from graspd.service.model.states import AssetKind, Priority, State
 
 @dataclass(frozen=True)
 class Removals:
-    """`within` makes a read or a write part of a larger transaction: what was looked at must still hold."""
+    """`within` makes a read or write part of a larger transaction, so that checks still hold at the write."""
 
     database: Database
 
     def user_of_asset(self, asset: AssetView, *, within: Connection) -> str:
-        """What needs a hand, object or network, in a few words; empty if nothing does."""
+        """Return what needs a hand, object or network, in a few words; empty if nothing does."""
         kind, digest = asset.kind, asset.digest
         column = f"{kind.value}_digest"
         if job := within.scalar(select(jobs.c.id).where(jobs.c[column] == digest).limit(1)):
@@ -47,14 +47,14 @@ class Removals:
                 return user
             newest = select(object_sets).order_by(object_sets.c.name, object_sets.c.created, object_sets.c.digest)
             rows = {row["name"]: row for row in within.execute(newest).mappings()}
-            # By the same name another project's set means another object, unless this one is shared.
+            # In another project's set the name means another object, unless this one is shared.
             near = [row for row in rows.values() if asset.shared or row["project"] == asset.project]
             if found := next((row["name"] for row in near if asset.name in row["objects"]), None):
                 return f"the set of objects {found!r}"
         return ""
 
     def user_of_job(self, job_id: str, *, within: Connection) -> str:
-        """Why a job must stay, in a few words that follow its name; empty if it may go."""
+        """Return why a job must stay, as words that follow its name; empty if it may be deleted."""
         state = within.scalar(select(jobs.c.state).where(jobs.c.id == job_id))
         if state is None:
             raise NotFoundError(f"there is no job {job_id!r}")
@@ -64,17 +64,17 @@ class Removals:
         return f"belongs to dataset {dataset!r}; delete that first" if dataset else ""
 
     def attempts_of(self, job_id: str, *, within: Connection) -> tuple[tuple[str, int], ...]:
-        """Task and number of each failed attempt of a job."""
+        """Return task and number of each failed attempt of a job."""
         query = select(attempts.c.task_id, attempts.c.number).where(attempts.c.job_id == job_id)
         return tuple((task, number) for task, number in within.execute(query))
 
     def snapshots_of(self, dataset: str, *, within: Connection) -> int:
-        """How many snapshots a dataset has."""
+        """Return the number of snapshots of a dataset."""
         query = select(func.count()).where(dataset_snapshots.c.dataset == dataset)
         return int(within.scalar(query) or 0)
 
     def planned_only(self, ids: Sequence[str]) -> list[str]:
-        """Of these jobs, those that only a dataset's planner made, nobody by themselves, and that no dataset holds."""
+        """Return those of the jobs that only a dataset's planner made and that no dataset contains."""
         query = select(jobs.c.id).where(
             jobs.c.id.in_(ids), jobs.c.priority == Priority.BULK.value, jobs.c.origin.is_(None)
         )
@@ -83,18 +83,18 @@ class Removals:
             return list(connection.scalars(query))
 
     def unneeded_shards(self, ids: Sequence[str]) -> set[str]:
-        """Of these shards, those that are there and that no task of any job makes or reads."""
+        """Return those of the shards that exist and that no task of any job makes or reads."""
         query = select(shards.c.id).where(shards.c.id.in_(ids), ~exists().where(tasks.c.shard_id == shards.c.id))
         with self.database.reading() as connection:
             return set(connection.scalars(query))
 
     def remove_asset(self, kind: AssetKind, digest: str, *, within: Connection | None = None) -> None:
-        """A hand, object or network."""
+        """Remove a hand, object or network."""
         with self.database.writing(within) as connection:
             connection.execute(delete(assets).where(assets.c.kind == kind.value, assets.c.digest == digest))
 
     def remove_job(self, job_id: str, *, within: Connection | None = None) -> None:
-        """A job, its tasks and their attempts."""
+        """Remove a job, its tasks and their attempts."""
         with self.database.writing(within) as connection:
             of_job = select(tasks.c.id).where(tasks.c.job_id == job_id)
             gone = or_(attempts.c.job_id == job_id, attempts.c.task_id.in_(of_job))
@@ -103,14 +103,14 @@ class Removals:
             connection.execute(delete(jobs).where(jobs.c.id == job_id))
 
     def remove_dataset(self, name: str, *, within: Connection | None = None) -> None:
-        """A dataset with its cells and snapshots."""
+        """Remove a dataset with its cells and snapshots."""
         with self.database.writing(within) as connection:
             connection.execute(delete(dataset_snapshots).where(dataset_snapshots.c.dataset == name))
             connection.execute(delete(dataset_cells).where(dataset_cells.c.dataset == name))
             connection.execute(delete(datasets).where(datasets.c.name == name))
 
     def remove_shard(self, shard: str, *, within: Connection) -> bool:
-        """A shard with its grasps, unless a task needs it; whether it may go."""
+        """Remove a shard with its grasps unless a task needs it; return whether it may be deleted."""
         if within.scalar(select(tasks.c.id).where(tasks.c.shard_id == shard).limit(1)) is not None:
             return False
         _remember_cost(shard, within)
@@ -120,7 +120,7 @@ class Removals:
 
 
 def _remember_cost(shard: str, connection: Connection) -> None:
-    """Add what a shard that goes had cost to what its project spent on that day."""
+    """Add the cost of a deleted shard to its project's costs of that day."""
     row = connection.execute(select(shards).where(shards.c.id == shard)).mappings().first()
     if row is None:
         return
@@ -135,9 +135,9 @@ def _remember_cost(shard: str, connection: Connection) -> None:
 
 
 def _user_of_neighbour(digest: str, connection: Connection) -> str:
-    """What has an object in its scenes beside its own, in a few words; empty if nothing does."""
+    """Return which job has an object among its neighbours, in a few words; empty if none does."""
     among = f"%{digest}%"
-    # The first test leaves an index those that have any.
+    # The first test restricts an index to jobs with neighbours.
     of_job = select(jobs.c.id).where(jobs.c.neighbours > "", jobs.c.neighbours.like(among)).limit(1)
     if job := connection.scalar(of_job):
         return f"job {job}"

@@ -1,4 +1,4 @@
-"""From records of the store to rows of the index, and the states of tasks and jobs that follow, in one transaction."""
+"""Conversion of store records to rows, and the derived states of tasks and jobs, in one transaction."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from graspd.service.model.states import State
 from graspd.service.store.manifests import ShardManifest
 
 Row = dict[str, Any]
-#: Facts, repairs and message of a hand or object stand in every list, and follow from files of a stranger's.
+#: Limit for facts, repairs and message of a hand or object: they are in every list, and derive from untrusted files.
 _MOST_FACTS: Final = 64 << 10
 _MOST_REPAIRS: Final = 100
 _LONGEST_TEXT: Final = 2000
 
 
 def job_row(record: JobRecord) -> Row:
-    """A job as it was submitted."""
+    """Return the row of a job at submission."""
     return {
         "id": record.id,
         "state": State.QUEUED.value,
@@ -54,12 +54,12 @@ def job_row(record: JobRecord) -> Row:
 
 
 def beside(options: JobOptions) -> str:
-    """Digests of the neighbours, with a space between."""
+    """Return the digests of the neighbours, separated by spaces."""
     return " ".join(dict.fromkeys(one.digest or "" for one in options.beside))
 
 
 def task_rows(record: JobRecord, ranges: range | None = None) -> Iterator[Row]:
-    """The tasks of a job, of all ranges or some, before anything happened to them."""
+    """Yield the initial rows of a job's tasks, for all ranges or some."""
     order = stages_of(record.request)
     for task in plan(record, ranges):
         yield {
@@ -93,12 +93,12 @@ def task_rows(record: JobRecord, ranges: range | None = None) -> Iterator[Row]:
 
 
 def clean(text: str, length: int | None = None) -> str:
-    """Text that every database takes: PostgreSQL knows no character of code zero, and keeps columns to their length."""
+    """Return text that all databases accept: PostgreSQL rejects code zero and limits lengths."""
     return text.replace("\0", "")[:length]
 
 
 def attempt_row(attempt: AttemptRecord) -> Row:
-    """A failed attempt."""
+    """Return the row of a failed attempt."""
     return {
         "task_id": attempt.task_id,
         "number": attempt.number,
@@ -115,7 +115,7 @@ def attempt_row(attempt: AttemptRecord) -> Row:
 
 
 def shard_row(manifest: ShardManifest) -> Row:
-    """A shard; its grasps have rows of their own."""
+    """Return the row of a shard; its grasps have separate rows."""
     return {
         "id": manifest.shard_id,
         "kind": manifest.kind,
@@ -146,7 +146,7 @@ def shard_row(manifest: ShardManifest) -> Row:
 
 
 def grasp_rows(manifest: ShardManifest) -> list[Row]:
-    """The grasps of a base shard; none for other shards."""
+    """Return the rows of a base shard's grasps; none for other shards."""
     of_shard = {
         "shard_id": manifest.shard_id,
         "hand": manifest.hand,
@@ -159,7 +159,7 @@ def grasp_rows(manifest: ShardManifest) -> list[Row]:
 
 
 def asset_row(asset: Asset, check: Mapping[str, Any] | None) -> Row:
-    """A hand, object or network. What comes with graspd needs no check."""
+    """Return the row of a hand, object or network. Built-in assets need no check."""
     found = check or ({"verdict": "accept"} if asset.builtin else {})
     return {
         "kind": asset.kind.value,
@@ -184,13 +184,13 @@ def asset_row(asset: Asset, check: Mapping[str, Any] | None) -> Row:
 
 
 def _short(facts: dict[str, Any]) -> dict[str, Any]:
-    """Facts whole, or where they are too long, only the numbers among them; `check.json` has the rest."""
+    """Return all facts, or only the numbers if they are too long; `check.json` has the rest."""
     if len(json.dumps(facts)) <= _MOST_FACTS:
         return facts
     return {name[:100]: value for name, value in list(facts.items())[:100] if isinstance(value, int | float)}
 
 
-#: Jobs whose states are derived in one go.
+#: Jobs whose states are derived together.
 _JOBS_AT_ONCE: Final = 200
 _FACTS = (
     tasks.c.id,
@@ -204,15 +204,15 @@ _FACTS = (
     tasks.c.retried_upto,
 )
 
-#: Option of a connection on which nothing that ends is told.
+#: Option of a connection that suppresses reports of ends.
 QUIET: Final = "graspd_quiet"
-#: Beginning of the name of a note: tasks of the job whose id follows are yet to be entered.
+#: Prefix of a note's name, followed by a job's id: some of its tasks are not yet entered.
 ENTERING: Final = "entering "
 _WHOSE: Final = (jobs.c.project, jobs.c.owner)
 
 
 def settle(connection: Connection, job_id: str, batches: Collection[int] | None = None) -> State:
-    """Derive the states of a job's tasks, of some batches or all, then the job's own.
+    """Derive the states of a job's tasks, for some batches or all, then the job's own.
 
     Returns:
         the job's state.
@@ -221,9 +221,9 @@ def settle(connection: Connection, job_id: str, batches: Collection[int] | None 
 
 
 def settle_batches(connection: Connection, touched: Mapping[str, Collection[int] | None]) -> dict[str, State]:
-    """The same for some batches, or all (None), of many jobs at once.
+    """Derive the states for some batches, or all (None), of many jobs at once.
 
-    Where the first batch found no grasp in its scenes, the job's other batches are not made: they end as if cancelled.
+    If the first batch finds no grasp in its scenes, the job's other batches are skipped: they end as if cancelled.
 
     Returns:
         the states of these jobs.
@@ -260,7 +260,7 @@ def _settle_tasks(connection: Connection, touched: Mapping[str, Collection[int] 
 
 
 def _hopeless() -> ColumnElement[bool]:
-    """Whether the first batch of a job ended because of its scenes, or of the weight."""
+    """Return whether the first batch of a job ended because of its scenes or of the weight."""
     last = (attempts.c.task_id == tasks.c.id) & (attempts.c.number == tasks.c.last_attempt)
     failed = (tasks.c.done.is_(False), tasks.c.exhausted.is_(True), tasks.c.last_attempt > tasks.c.retried_upto)
     first = (tasks.c.job_id == jobs.c.id, tasks.c.batch == 0)
@@ -274,7 +274,7 @@ def _hopeless() -> ColumnElement[bool]:
 
 
 def _changes(chain: Sequence[Any], *, cancelled: bool) -> list[tuple[str, str, bool]]:
-    """Tasks of a batch whose state, or whether they may start, is not what follows from the facts; with both."""
+    """Return the tasks of a batch whose state or readiness differs from the facts, with the new values."""
     facts = [
         TaskFacts(
             stage=row["stage"],
@@ -295,7 +295,7 @@ def _changes(chain: Sequence[Any], *, cancelled: bool) -> list[tuple[str, str, b
 
 
 def _settle_jobs(connection: Connection, ids: Sequence[str]) -> dict[str, State]:
-    # Six probes of an index; to collect the distinct states would read every task of the job.
+    # Six index look-ups; collecting the distinct states would read every task of the job.
     of_job = tasks.c.job_id == jobs.c.id
     probes = [exists().where(of_job, tasks.c.state == state.value).label(state.value) for state in State]
     probes.append(exists().where(notes.c.name == literal(ENTERING) + jobs.c.id).label("entering"))
@@ -316,13 +316,13 @@ def _settle_jobs(connection: Connection, ids: Sequence[str]) -> dict[str, State]
         if State.FAILED in found:
             first = select(tasks.c.reason).where(tasks.c.job_id == job, tasks.c.state == State.FAILED.value)
             values["reason"] = connection.scalar(first.order_by(tasks.c.batch, tasks.c.position).limit(1))
-        # Most often a job goes on as it was: then its row is left alone.
+        # Most jobs stay unchanged: then the row is not written.
         if values != {"state": row["now"], "finished": row["finished"], "reason": row["reason"]}:
             connection.execute(update(jobs).where(jobs.c.id == job).values(**values))
             if state.is_final and state != row["now"]:
                 about = {"kind": "job", "subject": job, "state": state.value}
                 ended.append(about | {"project": row["project"], "owner": row["owner"]})
-    # A rebuild tells nobody of what ended long ago.
+    # A rebuild reports no earlier ends.
     if not connection.get_execution_options().get(QUIET):
         note_ends(connection, ended)
     return states

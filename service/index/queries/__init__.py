@@ -1,1 +1,1 @@
-"""What the API and the controller ask the index."""
+"""Queries of the API and the controller."""

@@ -1,4 +1,4 @@
-"""Queries on hands and objects, and on named sets of objects."""
+"""Queries of hands and objects, and of named sets of objects."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from graspd.service.model.states import AssetKind
 
 @dataclass(frozen=True)
 class Assets:
-    """Reads on hands and objects."""
+    """Reads of hands and objects."""
 
     database: Database
 
@@ -33,7 +33,7 @@ class Assets:
         refused: bool = False,
         scope: ProjectScope = EVERYTHING,
     ) -> Page[AssetView]:
-        """Hands or objects, all versions, newest first; those that the check refused only where asked for."""
+        """Return a page of hands or objects, all versions, newest first; refused ones only on request."""
         size = project_scope.page_size(limit)
         query = select(assets).where(assets.c.kind == kind.value, *seen_assets(scope))
         if not refused:
@@ -48,11 +48,10 @@ class Assets:
         return Page(items=views, next=last and project_scope.encode(last.created, last.digest))
 
     def get(self, kind: AssetKind, name_or_digest: str, *, scope: ProjectScope = EVERYTHING) -> AssetView:
-        """A hand or object by its digest, or the newest of its name that was not refused, those of the scope's own
-        project first.
+        """Return a hand or object by digest, or the newest usable one of a name, the project's own first.
 
         Raises:
-            NotFoundError: there is none; the names that there are follow.
+            NotFoundError: it does not exist; the message lists the existing names.
         """
         named = and_(assets.c.kind == kind.value, assets.c.name == name_or_digest)
         by_digest = and_(assets.c.kind == kind.value, assets.c.digest == name_or_digest)
@@ -75,7 +74,7 @@ class Assets:
         return _asset_view(row)
 
     def sizes(self, kind: AssetKind, wanted: Collection[str], *, scope: ProjectScope = EVERYTHING) -> dict[str, int]:
-        """Bytes of the named hands or objects; those that are not known are left out."""
+        """Return the bytes of the named hands or objects; unknown ones are omitted."""
         names = set(wanted)
         query = select(assets.c.name, assets.c.size_bytes).where(assets.c.kind == kind.value, *seen_assets(scope))
         query = query.order_by(assets.c.created)
@@ -83,7 +82,7 @@ class Assets:
             return {name: size for name, size in connection.execute(query) if name in names}
 
     def missing(self, wanted: Collection[tuple[AssetKind, str]], *, within: Connection) -> list[str]:
-        """Of these kinds and digests, those that the index does not know."""
+        """Return those of the kinds and digests that the index lacks."""
         digests = sorted({digest for _, digest in wanted})
         known = set()
         for some in chunks(digests):
@@ -93,7 +92,7 @@ class Assets:
 
 
 def _not_refused() -> ColumnElement[bool]:
-    """What can be used, or is still being checked."""
+    """Return the condition of a usable asset, or one in its check."""
     return or_(assets.c.verdict.is_(None), assets.c.verdict != "refuse")
 
 
@@ -103,12 +102,12 @@ def _asset_view(row: Any) -> AssetView:
 
 @dataclass(frozen=True)
 class ObjectSets:
-    """Reads on named sets of objects."""
+    """Reads of named sets of objects."""
 
     database: Database
 
     def newest(self, *, scope: ProjectScope = EVERYTHING) -> list[ObjectSetView]:
-        """The newest version of each set of objects, by name."""
+        """Return the newest version of each set of objects, by name."""
         query = select(object_sets).where(*seen_sets(scope))
         query = query.order_by(object_sets.c.name, object_sets.c.created, object_sets.c.digest)
         with self.database.reading() as connection:
@@ -116,7 +115,7 @@ class ObjectSets:
         return list(newest.values())
 
     def named(self, name: str) -> ObjectSetView | None:
-        """The newest version of a set, of whatever project; None if there is none of that name."""
+        """Return the newest version of a set of any project; None if there is none."""
         query = select(object_sets).where(object_sets.c.name == name)
         query = query.order_by(object_sets.c.created.desc(), object_sets.c.digest.desc()).limit(1)
         with self.database.reading() as connection:
@@ -124,7 +123,7 @@ class ObjectSets:
         return None if row is None else ObjectSetView(**row)
 
     def get(self, name: str, *, scope: ProjectScope = EVERYTHING) -> ObjectSetView:
-        """The newest version of a set of objects; NotFoundError if there is none of that name."""
+        """Return the newest version of a set of objects; NotFoundError if there is none."""
         found = {view.name: view for view in self.newest(scope=scope)}
         if name not in found:
             raise NotFoundError(f"there is no set of objects {name!r}{known_names(name, list(found)[:SEARCHED])}")

@@ -1,4 +1,4 @@
-"""Queries on datasets, their cells and snapshots."""
+"""Queries of datasets, their cells and snapshots."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ _IS_BASE: Final = shards.c.stage == Stage.SYNTHESIZE.value
 
 @dataclass(frozen=True)
 class Datasets:
-    """Reads on datasets."""
+    """Reads of datasets."""
 
     database: Database
 
     def page(
         self, *, limit: int = 50, cursor: str | None = None, scope: ProjectScope = EVERYTHING
     ) -> Page[DatasetView]:
-        """Datasets, newest first."""
+        """Return a page of datasets, newest first."""
         size = project_scope.page_size(limit)
         query = select(datasets).where(*seen_datasets(scope))
         query = query.order_by(datasets.c.created.desc(), datasets.c.name.desc()).limit(size + 1)
@@ -52,7 +52,7 @@ class Datasets:
         return Page(items=views, next=last and project_scope.encode(last.created, last.name))
 
     def get(self, name: str, *, scope: ProjectScope = EVERYTHING) -> DatasetView:
-        """A dataset; NotFoundError if there is none."""
+        """Return a dataset; NotFoundError if there is none."""
         with self.database.reading() as connection:
             view = _dataset_view(connection, _dataset_row(connection, name, scope))
             if view.reason is None:
@@ -61,14 +61,14 @@ class Datasets:
             return view.model_copy(update={"outcomes": outcomes_of(connection, tasks.c.job_id.in_(cells))})
 
     def unfinished(self, names: Collection[str]) -> set[str]:
-        """Of these names, those of a dataset that has not ended."""
+        """Return those of the names whose dataset has not ended."""
         query = select(datasets).where(datasets.c.name.in_(sorted(names)))
         with self.database.reading() as connection:
             rows = connection.execute(query).mappings().all()
             return {row["name"] for row in rows if not _state(row, _states(connection, row)).is_final}
 
     def ended(self, *, within: Connection) -> dict[str, int]:
-        """Datasets that have ended, with the number of their events."""
+        """Return the ended datasets, with their number of events."""
         rows = within.execute(select(datasets)).mappings().all()
         return {row["name"]: row["events"] for row in rows if _state(row, _states(within, row)).is_final}
 
@@ -81,7 +81,7 @@ class Datasets:
         cursor: str | None = None,
         scope: ProjectScope = EVERYTHING,
     ) -> Page[CellView]:
-        """Cells of a dataset by their position."""
+        """Return a page of a dataset's cells by position."""
         size = project_scope.page_size(limit)
         with self.database.reading() as connection:
             dataset = _dataset_row(connection, name, scope)
@@ -108,7 +108,7 @@ class Datasets:
         return Page(items=views, next=project_scope.encode(views[-1].position) if len(rows) > size else None)
 
     def shards(self, name: str) -> list[SnapshotShard]:
-        """All shards of a dataset: cell by cell, batch by batch, stage by stage."""
+        """Return all shards of a dataset: cell by cell, batch by batch, stage by stage."""
         query = (
             select(*(shards.c[field] for field in SnapshotShard.model_fields))
             .join(tasks, tasks.c.shard_id == shards.c.id)
@@ -124,7 +124,7 @@ class Datasets:
     def snapshots(
         self, name: str, *, limit: int = 50, cursor: str | None = None, scope: ProjectScope = EVERYTHING
     ) -> Page[SnapshotView]:
-        """Snapshots of a dataset, newest first."""
+        """Return a page of a dataset's snapshots, newest first."""
         size = project_scope.page_size(limit)
         key = (dataset_snapshots.c.created, dataset_snapshots.c.digest)
         query = select(dataset_snapshots).where(dataset_snapshots.c.dataset == name)
@@ -149,8 +149,8 @@ def _dataset_row(connection: Connection, name: str, scope: ProjectScope = EVERYT
 
 
 def _cell_state(cancelled: bool) -> ColumnElement[str]:
-    """State of a cell: its job's; while it has none, what became of the dataset."""
-    # Written out: PostgreSQL does not see that an expression with a parameter is the one it groups by.
+    """Return the state of a cell: its job's, or the dataset's if it has none."""
+    # As a literal: PostgreSQL does not match an expression with a parameter to its GROUP BY.
     unplanned = literal((State.CANCELLED if cancelled else State.QUEUED).value, literal_execute=True)
     return func.coalesce(jobs.c.state, unplanned)
 
@@ -185,9 +185,9 @@ def _dataset_view(connection: Connection, row: Any) -> DatasetView:
 def _state(row: Any, states: dict[State, int]) -> State:
     state = job_state(state for state, count in states.items() if count)
     if row["cancelled"]:
-        # It waits for nothing more, though its jobs stop a moment later, or go on for another dataset.
+        # Nothing is pending, though its jobs stop a moment later, or continue for another dataset.
         return state if state.is_final else State.CANCELLED
-    # An event that is not yet passed on to the jobs: a retry.
+    # An event that the jobs do not have yet: a retry.
     return State.QUEUED if state.is_final and row["applied"] < row["events"] else state
 
 
@@ -205,7 +205,7 @@ def _states(connection: Connection, row: Any) -> dict[State, int]:
 
 
 def _tasks_of_cell(options: JobOptions, span: int | None) -> int:
-    """Tasks of a cell whose job has so many batches a task; None: it is not planned yet, and may have one."""
+    """Return the tasks of a cell by its job's batches per task; None: unplanned, assume one."""
     return ranges_of(options.grasps, span or 1) * len(stages_of(options))
 
 
@@ -217,7 +217,7 @@ def _tasks_of_dataset(connection: Connection, name: str, options: JobOptions) ->
 
 
 def _work(connection: Connection, where: ColumnElement[bool]) -> dict[str, Any]:
-    """Tasks of the cells: how many there are, are done, failed, run; the sum of their shares; when the last ended."""
+    """Return totals of the cells' tasks: number, done, failed, running, shares, time of the last end."""
     query = (
         select(
             func.count().label("tasks"),
@@ -235,7 +235,7 @@ def _work(connection: Connection, where: ColumnElement[bool]) -> dict[str, Any]:
 
 
 def _made(connection: Connection, where: ColumnElement[bool]) -> dict[str, Any]:
-    """What the shards of the cells hold and cost."""
+    """Return content and cost of the cells' shards."""
     query = (
         select(*_MADE)
         .select_from(dataset_cells)

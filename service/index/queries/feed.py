@@ -1,4 +1,4 @@
-"""Queries of the controller: tasks to queue, tasks believed queued, and cells of datasets that are left to plan."""
+"""Queries of the controller: tasks to queue, tasks marked as queued, cells of datasets to plan."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from graspd.service.model.states import AssetKind, Priority, Stage, State
 
 @dataclass(frozen=True)
 class ReadyTask:
-    """A task that may start now, with what a message needs."""
+    """A task that may start now, with the content of its message."""
 
     job: JobRecord
     task: PlannedTask
@@ -45,7 +45,7 @@ class Feed:
     database: Database
 
     def waiting_jobs(self, priority: Priority, *, now: float) -> list[WaitingJob]:
-        """Jobs with tasks that may be queued, oldest first."""
+        """Return jobs with tasks that may be queued, oldest first."""
         due = _due(tasks.c.not_before, now)
         waiting = exists().where(tasks.c.job_id == jobs.c.id, *_WAITING, due)
         query = (
@@ -60,7 +60,7 @@ class Feed:
         return [WaitingJob(row.id, share_of(row.project, (row.origin or {}).get("key", ""))) for row in rows]
 
     def ready_tasks(self, priority: Priority, turns: RoundRobin, *, now: float, limit: int) -> list[ReadyTask]:
-        """At most `limit` tasks to be queued: in turn those of each project or key, and of each job of it."""
+        """Return at most `limit` tasks to queue: round-robin over projects or keys, then over their jobs."""
         of_key: dict[str, list[list[tuple[WaitingJob, ReadyTask]]]] = defaultdict(list)
         for job, share in turns.order(self.waiting_jobs(priority, now=now), limit):
             of_key[job.key].append([(job, task) for task in self.ready_of_job(job.id, limit=share, now=now)])
@@ -69,7 +69,7 @@ class Feed:
         return [task for _, task in chosen]
 
     def ready_of_job(self, job_id: str, *, limit: int, now: float | None = None) -> list[ReadyTask]:
-        """The first tasks of one job that may be queued; at a time, or none of them heeding its back-off."""
+        """Return the first tasks of one job that may be queued now; without `now`, ignore back-offs."""
         due = () if now is None else (_due(tasks.c.not_before, now),)
         query = (
             select(tasks, *(jobs.c[name] for name in _OF_THE_JOB))
@@ -84,7 +84,7 @@ class Feed:
         return [_ready(row, record) for row in rows if record is not None]
 
     def ready_checks(self, *, now: float, limit: int) -> list[ReadyCheck]:
-        """Uploads to be checked, oldest first."""
+        """Return uploads to be checked, oldest first."""
         open_ = (assets.c.verdict.is_(None), assets.c.queued.is_(False), _due(assets.c.not_before, now))
         query = select(assets).where(*open_).order_by(assets.c.created).limit(limit)
         with self.database.reading() as connection:
@@ -94,7 +94,7 @@ class Feed:
             ]
 
     def believed_queued(self) -> tuple[set[str], set[tuple[AssetKind, str]]]:
-        """Unfinished tasks, and checks of assets, that were given to the queue."""
+        """Return unfinished tasks, and checks of assets, that are marked as queued."""
         unfinished = tasks.c.state.in_((State.QUEUED.value, State.RUNNING.value))
         of_tasks = select(tasks.c.id).where(tasks.c.ready.is_(True), tasks.c.queued.is_(True), unfinished)
         of_checks = select(assets.c.kind, assets.c.digest).where(assets.c.queued.is_(True), assets.c.verdict.is_(None))
@@ -103,7 +103,7 @@ class Feed:
             return set(connection.scalars(of_tasks)), checks
 
     def outputs(self, task_ids: Collection[str]) -> dict[str, tuple[str, str]]:
-        """Stage and shard id of tasks."""
+        """Return stage and shard id of tasks."""
         query = select(tasks.c.id, tasks.c.stage, tasks.c.shard_id)
         with self.database.reading() as connection:
             return {
@@ -113,7 +113,7 @@ class Feed:
             }
 
     def cancelled(self, task_ids: Collection[str]) -> set[str]:
-        """Those of the tasks that are cancelled."""
+        """Return the cancelled ones of the tasks."""
         query = select(tasks.c.id).where(tasks.c.state == State.CANCELLED.value)
         with self.database.reading() as connection:
             return {
@@ -123,19 +123,19 @@ class Feed:
             }
 
     def has_jobs(self) -> bool:
-        """Whether the index knows any job."""
+        """Check whether the index has any job."""
         with self.database.reading() as connection:
             return connection.scalar(select(jobs.c.id).limit(1)) is not None
 
     def failed_tasks(self, job_id: str) -> dict[str, int]:
-        """Failed and cancelled tasks of a job with the number of their last attempt."""
+        """Return failed and cancelled tasks of a job with the number of their last attempt."""
         final = tasks.c.state.in_((State.FAILED.value, State.CANCELLED.value))
         query = select(tasks.c.id, tasks.c.last_attempt).where(tasks.c.job_id == job_id, final)
         with self.database.reading() as connection:
             return {row.id: row.last_attempt for row in connection.execute(query)}
 
     def unfinished_tasks(self, job_id: str) -> list[str]:
-        """Tasks of a job that are in the queue or with a worker."""
+        """Return tasks of a job that are queued or with a worker."""
         query = select(tasks.c.id).where(tasks.c.job_id == job_id, tasks.c.queued.is_(True))
         with self.database.reading() as connection:
             return list(connection.scalars(query))
@@ -146,7 +146,7 @@ _WAITING = (tasks.c.ready.is_(True), tasks.c.queued.is_(False))
 
 
 def _due(not_before: Column[float], now: float) -> ColumnElement[bool]:
-    # A wait longer than any back-off means that the clock was set back: then the task is due as well.
+    # A wait longer than any back-off means that the clock was set back: the task is due too.
     return or_(not_before <= now, not_before > now + 2 * MAX_BACKOFF_S)
 
 
@@ -168,7 +168,7 @@ def _ready(row: Any, record: JobRecord) -> ReadyTask:
 
 @dataclass(frozen=True)
 class DatasetWork:
-    """A dataset on which the planner has something left to do."""
+    """A dataset with pending work of the planner."""
 
     name: str
     options: JobOptions
@@ -187,7 +187,7 @@ class DatasetFeed:
     database: Database
 
     def in_work(self) -> list[DatasetWork]:
-        """Datasets with cells to plan or with events to pass on to their jobs, the oldest first."""
+        """Return datasets with cells to plan or with events for their jobs, the oldest first."""
         query = (
             select(datasets)
             .where(or_(datasets.c.planned.is_(False), datasets.c.applied < datasets.c.events))
@@ -209,7 +209,7 @@ class DatasetFeed:
             ]
 
     def cells_to_plan(self, name: str, *, after: int, limit: int) -> list[Cell]:
-        """The next cells whose job does not exist yet, behind a position."""
+        """Return the next cells without a job, after a position."""
         query = (
             select(dataset_cells)
             .outerjoin(jobs, jobs.c.id == dataset_cells.c.job_id)
@@ -233,11 +233,11 @@ class DatasetFeed:
     def cells_in_states(
         self, name: str, states: Collection[State], *, after: int, limit: int, unshared: bool
     ) -> list[tuple[int, str]]:
-        """Positions and jobs of the next cells in some states, behind a position.
+        """Return positions and jobs of the next cells in some states, after a position.
 
         Args:
-            unshared: leave out jobs that another dataset, which is not cancelled, waits for as well, and those that
-                another key submitted.
+            unshared: omit jobs that another, uncancelled dataset waits for too, and those that another key
+                submitted.
         """
         query = (
             select(dataset_cells.c.position, dataset_cells.c.job_id)

@@ -1,13 +1,13 @@
-"""Queries on grasps: their filters, and the search in the order of a metric, bounded in time at millions of rows.
+"""Queries of grasps: filters, and a search by metric, bounded in time at millions of rows.
 
-The choice of an index is made here and not left to the database: SQLite does not know how the values are spread, and
-takes an order's index to the end for a filter that almost nothing passes. There are three ways:
+The index is chosen here, not by the database: SQLite has no statistics of the values, and scans an order's index to the
+end for a filter that almost nothing passes. There are three plans:
 
-1. A condition leaves few rows: its index gives them, and they are sorted.
-2. Else the rows are looked at in the wanted order, a bounded number of them, until the page is full.
-3. A filter that hardly any row passes, though many pass each of its conditions: all rows are read, once.
+1. A condition leaves few rows: fetch them by its index, and sort them.
+2. Else a bounded number of rows is read in the wanted order until the page is full.
+3. A filter that hardly any row passes, though many pass each of its conditions: all rows are read once.
 
-The language that chooses grasps (`service.model.where`) is asked of the rows by `truth`.
+`truth` translates the language of grasp expressions (`service.model.where`) to SQL.
 """
 
 from __future__ import annotations
@@ -60,13 +60,13 @@ class GraspSort(Model):
 
 
 _BEST_FIRST = GraspSort()
-#: Grasps that one statement names: two parameters each.
+#: Grasps named in one statement: two parameters each.
 _AT_ONCE: Final = 400
 
 
 @dataclass(frozen=True)
 class Grasps:
-    """Reads on grasps."""
+    """Reads of grasps."""
 
     database: Database
 
@@ -78,7 +78,7 @@ class Grasps:
         limit: int = 50,
         cursor: str | None = None,
     ) -> Page[GraspView]:
-        """Grasps in the order of a metric; those without it come last."""
+        """Return a page of grasps in the order of a metric; those without it come last."""
         size = project_scope.page_size(limit)
         start = None if cursor is None else project_scope.decode(cursor, (float, int, str, type(None)), str, int)
         with self.database.reading() as connection:
@@ -88,7 +88,7 @@ class Grasps:
         return Page(items=views, next=last and project_scope.encode(last[sort.by], last["shard_id"], last["row"]))
 
     def get(self, shard_id: str, row: int, *, scope: ProjectScope = EVERYTHING) -> GraspView:
-        """One grasp by its shard and row; NotFoundError if there is none."""
+        """Return one grasp by its shard and row; NotFoundError if there is none."""
         query = select(grasps).where(grasps.c.shard_id == shard_id, grasps.c.row == row)
         query = query.where(*seen_shards(scope, grasps.c.shard_id))
         with self.database.reading() as connection:
@@ -98,13 +98,13 @@ class Grasps:
         return _view(found)
 
     def members(self, where: GraspFilter, *, limit: int) -> list[Grasp]:
-        """Shard and row of the grasps that pass, in this order; of more than `limit` only so many."""
+        """Return shard and row of at most `limit` grasps that pass, in this order."""
         query = select(grasps.c.shard_id, grasps.c.row).order_by(grasps.c.shard_id, grasps.c.row).limit(limit)
         with self.database.reading() as connection:
             return [(shard, row) for shard, row in connection.execute(query.where(*sql_conditions(where)))]
 
     def listed(self, wanted: Sequence[Grasp]) -> Iterator[GraspView]:
-        """Grasps by shard and row, in that order; those that are not there are left out."""
+        """Yield grasps by shard and row, in that order; missing ones are omitted."""
         for some in chunks(sorted(wanted), _AT_ONCE):
             query = select(grasps).where(tuple_(grasps.c.shard_id, grasps.c.row).in_(some))
             with self.database.reading() as connection:
@@ -116,11 +116,11 @@ def _view(row: Any) -> GraspView:
     return GraspView(**{name: row[name] for name in GraspView.model_fields})
 
 
-#: So many rows are fetched by an index and sorted in less time than all of a million are read.
+#: Most rows that are fetched by an index and sorted: faster than a scan of a million rows.
 SORTED_AT_ONCE: Final = 40_000
-#: Rows looked at in the wanted order: a few first, since most filters fill a page from them.
+#: Rows read in the wanted order: few at first, since most filters fill a page from them.
 LOOKED_AT: Final = (1000, 20_000)
-#: Columns by name, of the table of grasps or of rows drawn from it.
+#: Columns by name, of the table of grasps or of a subquery.
 Columns = Any
 _METRICS: Final = frozenset(metric.name for metric in indexed())
 _OPERATORS: Final[dict[str, Callable[[Any, Any], ColumnElement[bool]]]] = {
@@ -135,7 +135,7 @@ _FLAGS: Final[dict[str, Callable[[Columns], ColumnElement[bool]]]] = {
     "validated": lambda grasps: grasps.success.is_not(None),
     "valid": lambda grasps: grasps.valid.is_(True),
     "held": lambda grasps: grasps.success.is_(True),
-    # What validates a grasp that was planned in a scene is the lift.
+    # A grasp planned in a scene is validated by the lift.
     "lift": lambda grasps: and_(grasps.scene_kind != "free", grasps.success.is_(True)),
     "lift_hard": lambda grasps: grasps.lift_hard.is_(True),
 }
@@ -143,7 +143,7 @@ _FLAGS: Final[dict[str, Callable[[Columns], ColumnElement[bool]]]] = {
 
 @dataclass(frozen=True)
 class Condition:
-    """A test of one column. Conditions of one group are served by one index."""
+    """A test of one column. Conditions of one group share one index."""
 
     group: str
     column: ColumnElement[Any]
@@ -151,11 +151,11 @@ class Condition:
     value: Any
 
     def sql(self, groups: Sequence[str] | None) -> ColumnElement[bool]:
-        """The test; of a group that is not listed in a form that no index serves (None: all are)."""
+        """Return the test; outside the listed groups, in a form that no index serves (None: all are listed)."""
         return self._of(self.column if groups is None or self.group in groups else _plain(self.column))
 
     def on(self, rows: Subquery) -> ColumnElement[bool]:
-        """The same test of grasps that were drawn from the table."""
+        """Return the test for grasps of a subquery."""
         return self._of(rows.c[str(self.column.key)])
 
     def _of(self, column: ColumnElement[Any]) -> ColumnElement[bool]:
@@ -165,7 +165,7 @@ class Condition:
 
 @dataclass(frozen=True)
 class Tagged:
-    """Grasps that have a tag."""
+    """Grasps with a tag."""
 
     tag: str
     group: str = "tag"
@@ -186,7 +186,7 @@ class Tagged:
 
 @dataclass(frozen=True)
 class ExpressionCondition:
-    """Grasps of which an expression is true; it is served by no index."""
+    """Grasps that satisfy an expression; no index serves it."""
 
     node: Node
     group: str = "flag"
@@ -202,10 +202,10 @@ Test = Condition | Tagged | ExpressionCondition
 
 
 def conditions(where: GraspFilter | None) -> list[Test]:
-    """A filter as conditions that all must hold.
+    """Return a filter as a conjunction of conditions.
 
     Raises:
-        InputError: its expression is none, or asks for what the index does not hold.
+        InputError: its expression is invalid, or uses values that the index lacks.
     """
     where = where or GraspFilter()
     found: list[Test] = []
@@ -232,7 +232,7 @@ def conditions(where: GraspFilter | None) -> list[Test]:
             found.append(Condition("pair", grasps.c[name], operator.eq, wanted))
     flags = {name: getattr(where, name) for name in ("valid", "success", "lift_hard")}
     found += [Condition("flag", grasps.c[name], is_, flag) for name, flag in flags.items() if flag is not None]
-    # What is not validated was not rejected.
+    # Grasps without validation were not rejected.
     validated = True if where.valid is False else where.validated
     if validated is not None:
         found.append(Condition("flag", grasps.c.success, operator.ne if validated else operator.eq, None))
@@ -250,22 +250,22 @@ def conditions(where: GraspFilter | None) -> list[Test]:
 
 
 def sql_conditions(where: GraspFilter | None) -> list[ColumnElement[bool]]:
-    """A filter in SQL; the database chooses the index."""
+    """Return a filter in SQL; the database chooses the index."""
     return [condition.sql(None) for condition in conditions(where)]
 
 
 def search(
     connection: Connection, where: GraspFilter | None, sort: GraspSort, size: int, start: tuple[Any, ...] | None
 ) -> list[Any]:
-    """The first `size` rows behind a position; rows without the metric come last.
+    """Return the first `size` rows after a position; rows without the metric come last.
 
     Args:
-        start: metric, shard id and row of the last grasp before.
+        start: metric, shard id and row of the previous grasp.
     """
     wanted = conditions(where)
     few = _few(connection, where, wanted)
     rows: list[Any] = []
-    # Databases differ on where NULL sorts, so rows with the metric and rows without are two queries.
+    # Databases sort NULL differently, so rows with and without the metric are two queries.
     if start is None or start[0] is not None:
         rows = _with_metric(connection, wanted, few, sort, size, start)
     if len(rows) < size:
@@ -288,7 +288,7 @@ def _with_metric(
     by = grasps.c[sort.by]
     if few is not None and few != sort.by:
         return _sorted(connection, [c.sql([few]) for c in wanted], sort, size, start)
-    # An index of the order may serve some conditions besides: those of its own metric, or of hand and object.
+    # The order's index may serve other conditions too: those of its metric, or of hand and object.
     served = [sort.by, "pair"] if sort.by == "epsilon" else [sort.by]
     inside = [c.sql(served) for c in wanted if c.group in served]
     outside = [c for c in wanted if c.group not in served]
@@ -303,7 +303,7 @@ def _with_metric(
         rows = list(connection.execute(_slice(query, same_key, sort, size, None)).mappings())
         if len(rows) >= size or _count(connection, looked) < number:
             return rows
-    # PostgreSQL can join indexes; SQLite would follow one of them row by row, which takes longer than to read all.
+    # PostgreSQL can join indexes; SQLite would follow one of them row by row, which is slower than a full scan.
     groups: list[str] | None = None if connection.dialect.name == "postgresql" else []
     return _sorted(connection, [c.sql(groups) for c in wanted], sort, size, start)
 
@@ -315,14 +315,14 @@ def _sorted(
     size: int,
     start: tuple[Any, ...] | None,
 ) -> list[Any]:
-    """Rows that pass, sorted without the order's index."""
+    """Return the rows that pass, sorted without the order's index."""
     by = _plain(grasps.c[sort.by])
     query = select(grasps).where(by.is_not(None), *tests)
     return list(connection.execute(_slice(query, (by, grasps.c.shard_id, grasps.c.row), sort, size, start)).mappings())
 
 
 def _few(connection: Connection, where: GraspFilter | None, wanted: Sequence[Test]) -> str | None:
-    """The group of conditions that leaves the fewest rows, if these can be sorted at once."""
+    """Return the group of conditions that leaves the fewest rows, if these can be sorted at once."""
     numbers: dict[str, int] = {}
     for group in dict.fromkeys(condition.group for condition in wanted):
         if group == "shard":
@@ -334,7 +334,7 @@ def _few(connection: Connection, where: GraspFilter | None, wanted: Sequence[Tes
 
 
 def _number(connection: Connection, where: GraspFilter, group: str, wanted: Sequence[Test]) -> int:
-    """Rows that pass the conditions of a group; of a metric's no more are counted than matter."""
+    """Return the number of rows that pass a group; for metrics, counting stops at the relevant limit."""
     query: Select[Any]
     if group == "job":
         query = select(func.sum(tasks.c.count)).where(
@@ -357,13 +357,13 @@ def _number(connection: Connection, where: GraspFilter, group: str, wanted: Sequ
 
 
 def _of_project(project: str) -> Select[Any]:
-    """Tasks that make grasps for the jobs of a project."""
+    """Select tasks that make grasps for the jobs of a project."""
     joined = select(tasks.c.id).join(jobs, jobs.c.id == tasks.c.job_id)
     return joined.where(jobs.c.project == project, tasks.c.stage == Stage.SYNTHESIZE.value)
 
 
 def _of_dataset(dataset: str) -> Select[Any]:
-    """Tasks that make grasps for the cells of a dataset."""
+    """Select tasks that make grasps for the cells of a dataset."""
     joined = select(tasks.c.id).join(dataset_cells, dataset_cells.c.job_id == tasks.c.job_id)
     return joined.where(dataset_cells.c.dataset == dataset, tasks.c.stage == Stage.SYNTHESIZE.value)
 
@@ -382,17 +382,17 @@ def _slice(
 
 
 def _plain(column: ColumnElement[Any]) -> ColumnElement[Any]:
-    """The same value in a form that no index is on."""
+    """Return the same value in a form without an index."""
     if isinstance(column.type, Float):
         return column + 0.0
     return column.concat("") if isinstance(column.type, String) else column
 
 
 def truth(node: Node, grasps: Columns) -> ColumnElement[bool]:
-    """An expression in SQL: true or false of each row, never unknown, so that `not` is what is not so.
+    """Return an expression in SQL: true or false for each row, never unknown, so `not` is a complement.
 
     Raises:
-        InputError: it asks for what the index does not hold.
+        InputError: it uses values that the index lacks.
     """
     if isinstance(node, Connective):
         return (or_ if node.word == "or" else and_)(*(truth(part, grasps) for part in node.parts))
@@ -401,7 +401,7 @@ def truth(node: Node, grasps: Columns) -> ColumnElement[bool]:
     if isinstance(node, Flag):
         if node.name not in _FLAGS:
             raise _unknown(node.name)
-        # A test for truth is false of NULL.
+        # A test for truth is false for NULL.
         return _FLAGS[node.name](grasps)
     if isinstance(node, MetricComparison):
         if node.name not in _METRICS:
@@ -421,31 +421,31 @@ def _unknown(name: str) -> InputError:
 
 
 class GraspFilter(Model):
-    """All conditions hold at once. `at_least` and `at_most` bound metrics, inclusive; a missing value never matches."""
+    """All conditions hold together. `at_least`, `at_most` bound metrics, inclusive; missing values fail."""
 
     hand: str | None = None
     object: str | None = None
     job: str | None = None
     shard: str | None = None
     dataset: str | None = None
-    """Of its cells."""
+    """Grasps of its cells."""
     tag: str | None = None
-    """Id of a tag that they have."""
+    """Id of a tag of the grasps."""
     where: str | None = None
     """An expression of `service.model.where`."""
     project: str | None = None
-    """Of whose jobs; None: of everybody's."""
+    """Project of the jobs; None: all."""
     validated: bool | None = None
     """Whether the validator gave a verdict."""
     valid: bool | None = None
     """False: validated, and not valid."""
     success: bool | None = None
     scene: str | None = None
-    """Kind of the scene that it was planned in; any: whichever, but not free."""
+    """Kind of the scene in which it was planned; any: all but free."""
     neighbours: bool | None = None
-    """Whether other objects stood in that scene."""
+    """Whether that scene contained neighbours."""
     lift_hard: bool | None = None
     robust_weakest: str | None = None
-    """Axis of the first model in which it does not hold."""
+    """Axis of the first model in which the grasp fails."""
     at_least: dict[Metric, float] = Field(default_factory=dict)
     at_most: dict[Metric, float] = Field(default_factory=dict)

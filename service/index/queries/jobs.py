@@ -1,4 +1,4 @@
-"""Queries on jobs, tasks, attempts and shards, and the outcomes of a job's candidates."""
+"""Queries of jobs, tasks, attempts and shards, and the outcomes of a job's candidates."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from graspd.service.model.states import Stage, State
 
 @dataclass(frozen=True)
 class Jobs:
-    """Reads on jobs and what they consist of."""
+    """Reads of jobs and their parts."""
 
     database: Database
 
@@ -36,7 +36,7 @@ class Jobs:
         cursor: str | None = None,
         scope: ProjectScope = EVERYTHING,
     ) -> Page[JobView]:
-        """Jobs, newest first."""
+        """Return a page of jobs, newest first."""
         size = project_scope.page_size(limit)
         query = select(jobs).where(*seen_jobs(scope)).order_by(jobs.c.created.desc(), jobs.c.id.desc()).limit(size + 1)
         for column, wanted in ((jobs.c.state, state), (jobs.c.hand, hand), (jobs.c.object, object)):
@@ -51,7 +51,7 @@ class Jobs:
         return Page(items=views, next=last)
 
     def get(self, job_id: str, *, scope: ProjectScope = EVERYTHING) -> JobView:
-        """A job with its progress; NotFoundError if there is none."""
+        """Return a job with its progress; NotFoundError if there is none."""
         with self.database.reading() as connection:
             rows = connection.execute(select(jobs).where(jobs.c.id == job_id, *seen_jobs(scope))).mappings().all()
             if not rows:
@@ -62,7 +62,7 @@ class Jobs:
             return view.model_copy(update={"outcomes": outcomes_of(connection, tasks.c.job_id == job_id)})
 
     def unfinished(self, ids: Collection[str]) -> set[str]:
-        """Of these job ids, those whose job has not ended."""
+        """Return those of the job ids whose job has not ended."""
         wanted, found = sorted(ids), set[str]()
         with self.database.reading() as connection:
             for start in range(0, len(wanted), 500):
@@ -79,7 +79,7 @@ class Jobs:
         limit: int = 50,
         cursor: str | None = None,
     ) -> Page[TaskView]:
-        """Tasks by job, batch and stage."""
+        """Return a page of tasks by job, batch and stage."""
         size = project_scope.page_size(limit)
         key = (tasks.c.job_id, tasks.c.batch, tasks.c.position)
         query = select(tasks).order_by(*key).limit(size + 1)
@@ -95,7 +95,7 @@ class Jobs:
         return Page(items=views, next=last and project_scope.encode(last["job_id"], last["batch"], last["position"]))
 
     def task(self, task_id: str, *, scope: ProjectScope = EVERYTHING) -> TaskView:
-        """A task; NotFoundError if there is none."""
+        """Return a task; NotFoundError if there is none."""
         with self.database.reading() as connection:
             row = connection.execute(select(tasks).where(tasks.c.id == task_id, *seen_tasks(scope))).mappings().first()
         if row is None:
@@ -103,7 +103,7 @@ class Jobs:
         return _task_view(row)
 
     def out_of_scope(self, task_ids: Collection[str], scope: ProjectScope) -> set[str]:
-        """Of these tasks, those of jobs that are not in scope."""
+        """Return those of the tasks whose jobs are not in scope."""
         query = select(tasks.c.id).join(jobs, jobs.c.id == tasks.c.job_id).where(jobs.c.project != scope.project)
         with self.database.reading() as connection:
             return {
@@ -113,7 +113,7 @@ class Jobs:
             }
 
     def attempts(self, *, job: str | None = None, task: str | None = None, limit: int = 50) -> list[AttemptView]:
-        """Failed attempts of a job or a task, newest first."""
+        """Return failed attempts of a job or a task, newest first."""
         query = select(attempts).order_by(attempts.c.ended.desc(), attempts.c.number.desc())
         if job is not None:
             query = query.where(attempts.c.job_id == job)
@@ -144,7 +144,7 @@ def _job_views(connection: Connection, rows: Sequence[Any]) -> list[JobView]:
 
 
 def _whole(stage: StageProgress, tasks: int) -> StageProgress:
-    """With the tasks of a large job that are yet to be entered."""
+    """Add the tasks of a large job that are not yet entered."""
     more = max(0, tasks - stage.tasks)
     return stage.model_copy(update={"tasks": stage.tasks + more, "queued": stage.queued + more}) if more else stage
 
@@ -155,7 +155,7 @@ def _progress(connection: Connection, ids: Sequence[str]) -> dict[str, list[Stag
         (tasks.c.progress_total > 0, tasks.c.progress_done / tasks.c.progress_total),
         else_=0.0,
     )
-    # A task that succeeded ended when its shard was made; both times are texts of one form.
+    # A succeeded task ended when its shard was made; both times are texts of one format.
     reused = and_(tasks.c.done, tasks.c.finished < tasks.c.created)
     query = (
         select(
@@ -216,12 +216,12 @@ def _task_view(row: Any) -> TaskView:
     )
 
 
-#: Shards that are read at most: enough to say why, and a page stays quick.
+#: Most shards that are read: enough for the reasons, and the page stays fast.
 MOST_SHARDS: Final = 1000
 
 
 def outcomes_of(connection: Connection, of_jobs: ColumnElement[bool]) -> dict[str, int]:
-    """Candidates that were not kept, by outcome, in the first `MOST_SHARDS` shards of the jobs whose tasks fit."""
+    """Count rejected candidates by outcome, in the first `MOST_SHARDS` shards of the selected jobs."""
     query = (
         select(shards.c.manifest["info"]["outcomes"])
         .join(tasks, tasks.c.shard_id == shards.c.id)
@@ -233,7 +233,7 @@ def outcomes_of(connection: Connection, of_jobs: ColumnElement[bool]) -> dict[st
 
 @dataclass(frozen=True)
 class Shards:
-    """Reads on shards."""
+    """Reads of shards."""
 
     database: Database
 
@@ -248,7 +248,7 @@ class Shards:
         cursor: str | None = None,
         scope: ProjectScope = EVERYTHING,
     ) -> Page[ShardView]:
-        """Shards, newest first, without their manifests."""
+        """Return a page of shards, newest first, without their manifests."""
         size = project_scope.page_size(limit)
         query = (
             select(shards)
@@ -270,20 +270,20 @@ class Shards:
         return Page(items=views, next=last and project_scope.encode(last.created, last.id))
 
     def assets_of(self, ids: Collection[str]) -> dict[str, tuple[str, str]]:
-        """Digests of hand and object of each of these shards."""
+        """Return the digests of hand and object of each of these shards."""
         query = select(shards.c.id, shards.c.hand_digest, shards.c.object_digest).where(shards.c.id.in_(ids))
         with self.database.reading() as connection:
             return {shard: (hand, obj) for shard, hand, obj in connection.execute(query)}
 
     def job_of(self, shard_id: str, *, scope: ProjectScope = EVERYTHING) -> str | None:
-        """A job in scope that wanted this shard; several may, and a pruned index may know none."""
+        """Return a job in scope that requested this shard; None if a pruned index has none."""
         with self.database.reading() as connection:
             query = select(tasks.c.job_id).where(tasks.c.shard_id == shard_id, *seen_tasks(scope)).limit(1)
             found: str | None = connection.scalar(query)
         return found
 
     def get(self, shard_id: str, *, scope: ProjectScope = EVERYTHING) -> ShardView:
-        """A shard with its manifest; NotFoundError if there is none."""
+        """Return a shard with its manifest; NotFoundError if there is none."""
         with self.database.reading() as connection:
             seen = seen_shards(scope, shards.c.id)
             row = connection.execute(select(shards).where(shards.c.id == shard_id, *seen)).mappings().first()

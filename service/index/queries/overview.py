@@ -1,5 +1,4 @@
-"""Queries on workers, the service as a whole, usage and costs; those of a scrape have a bound that does not grow
-with the index."""
+"""Queries of workers, the whole service, usage and costs; those of a scrape have a constant bound."""
 
 from __future__ import annotations
 
@@ -25,19 +24,19 @@ from graspd.service.model.states import Stage, State
 
 @dataclass(frozen=True)
 class Overview:
-    """Reads on the service as a whole."""
+    """Reads of the whole service."""
 
     database: Database
 
     def workers(self) -> list[WorkerView]:
-        """Workers, the living first."""
+        """Return workers, the living first."""
         query = select(workers).order_by(case((workers.c.state == "lost", 1), else_=0), workers.c.name)
         with self.database.reading() as connection:
             rows = connection.execute(query).mappings().all()
         return [WorkerView(**row) for row in rows]
 
     def stats(self, *, scope: ProjectScope = EVERYTHING) -> Stats:
-        """All that is in scope in a few numbers."""
+        """Return totals over everything in scope."""
         alive = select(func.count()).select_from(workers).where(workers.c.state != "lost")
         sums = (func.count(), *_MADE, func.sum(shards.c.size_bytes))
         seen = seen_shards(scope, shards.c.id)
@@ -63,8 +62,8 @@ class Overview:
         )
 
     def throughput(self, *, since: str, bucket_s: int = 60, scope: ProjectScope = EVERYTHING) -> list[Throughput]:
-        """What was made since a time, in intervals of `bucket_s`; intervals without a shard are left out."""
-        # The database adds up by the finest unit of time that divides the interval; what is left is little.
+        """Return the production since a time, in intervals of `bucket_s`; empty intervals are omitted."""
+        # The database sums by the largest unit of time that divides the interval; few rows remain.
         unit = func.substr(shards.c.created, 1, next(n for s, n in _UNITS if bucket_s % s == 0)).label("unit")
         sums = (func.count(), func.sum(shards.c.count), func.sum(shards.c.valid), func.sum(shards.c.seconds))
         query = select(unit, shards.c.kind, *sums).where(shards.c.created >= since, *seen_shards(scope, shards.c.id))
@@ -81,7 +80,7 @@ class Overview:
         return [Throughput.model_validate({"start": start, **made[start]}) for start in sorted(made)]
 
     def failures(self, *, limit: int = 20, scope: ProjectScope = EVERYTHING) -> list[FailureGroup]:
-        """Failed attempts by stage and error, the most frequent first."""
+        """Return failed attempts by stage and error, the most frequent first."""
         newest = func.max(attempts.c.ended)
         seen = seen_attempts(scope)
         count = func.count()
@@ -119,7 +118,7 @@ class Overview:
         return groups
 
     def matrix(self, *, scope: ProjectScope = EVERYTHING) -> list[MatrixCell]:
-        """Jobs, task states and yield of each hand x object."""
+        """Return jobs, task states and yield of each hand x object."""
         of_tasks = select(tasks.c.job_id, tasks.c.state, func.count()).group_by(tasks.c.job_id, tasks.c.state)
         made = (
             select(shards.c.hand, shards.c.object, *_MADE)
@@ -144,7 +143,7 @@ class Overview:
 
 
 _CELL: Final = ("jobs", "queued", "running", "failed", "grasps", "valid", "candidates", "validated")
-#: Seconds of an interval, and how many characters of a time tell such intervals apart.
+#: Seconds of an interval, and the number of leading characters of a time that identify it.
 _UNITS: Final = ((3600, 13), (60, 16), (1, 19))
 _REST_OF_TIME: Final = "0000-00-00T00:00:00Z"
 _MADE = (
@@ -156,7 +155,7 @@ _MADE = (
 
 
 def _counted(column: ColumnElement[Any], *tests: ColumnElement[bool]) -> Select[Any]:
-    """Rows of each value of a column."""
+    """Count rows by value of a column."""
     return select(column, func.count()).where(*tests).group_by(column)
 
 
@@ -180,18 +179,18 @@ UNFINISHED: Final = (State.QUEUED, State.RUNNING)
 
 @dataclass(frozen=True)
 class IndexStatus:
-    """Unfinished jobs, and what was made in the last minute."""
+    """Unfinished jobs, and the production of the last minute."""
 
     jobs: Mapping[State, int]
     oldest_s: Mapping[State, float]
     grasps_per_s: float
     valid_per_s: float
     damaged: int
-    """Objects of the store that are known to be damaged or missing, counted up to `MOST_JOBS`."""
+    """Objects of the store with known damage, counted up to `MOST_JOBS`."""
 
 
 def read_index(database: Database) -> IndexStatus:
-    """Unfinished jobs up to `MOST_JOBS`, the oldest of each state, and the shards of the last minute."""
+    """Return unfinished jobs up to `MOST_JOBS`, the oldest of each state, and shards of the last minute."""
     since = datetime.now(UTC) - timedelta(seconds=RATE_WINDOW_S)
     counted, oldest = {}, {}
     with database.reading() as connection:
@@ -205,23 +204,23 @@ def read_index(database: Database) -> IndexStatus:
 
 
 def count_jobs(state: State) -> Select[Any]:
-    """Number of jobs in a state, up to `MOST_JOBS`."""
+    """Count jobs in a state, up to `MOST_JOBS`."""
     some = select(jobs.c.id).where(jobs.c.state == state.value).limit(MOST_JOBS).subquery()
     return select(func.count()).select_from(some)
 
 
 def count_damage() -> Select[Any]:
-    """Number of damaged objects, up to `MOST_JOBS`."""
+    """Count damaged objects, up to `MOST_JOBS`."""
     return select(func.count()).select_from(select(damage.c.key).limit(MOST_JOBS).subquery())
 
 
 def oldest_job(state: State) -> Select[Any]:
-    """When the oldest job in a state was submitted."""
+    """Select the time when the oldest job in a state was submitted."""
     return select(jobs.c.created).where(jobs.c.state == state.value).order_by(jobs.c.created).limit(1)
 
 
 def made_since(when: datetime) -> Select[Any]:
-    """Grasps and valid grasps of the base shards made since."""
+    """Sum grasps and valid grasps of the base shards made since a time."""
     text = when.isoformat(timespec="milliseconds").replace("+00:00", "Z")
     base = (shards.c.kind == "base", shards.c.created >= text)
     return select(func.sum(shards.c.count), func.sum(shards.c.valid)).where(*base)
@@ -229,12 +228,12 @@ def made_since(when: datetime) -> Select[Any]:
 
 @dataclass(frozen=True)
 class Usage:
-    """Reads on what was used."""
+    """Reads of usage."""
 
     database: Database
 
     def days(self, since: str, until: str, *, scope: ProjectScope = EVERYTHING) -> list[UsageDay]:
-        """Each project's use of each day on which it used anything, the newest first.
+        """Return the usage of each project by day, without empty days, the newest first.
 
         Args:
             since, until: first and last day, such as 2026-11-22.
@@ -276,7 +275,7 @@ class Usage:
         ]
 
     def gpu_seconds(self, project: str, day: str) -> float:
-        """Time that GPU workers spent on what the project asked for, on one day [s]."""
+        """Return the GPU workers' time for a project's requests on one day [s]."""
         return sum(one.gpu_seconds for one in self.days(day, day, scope=ProjectScope(project, everything=False)))
 
 
@@ -292,13 +291,13 @@ def _number(day: str) -> int:
     return int(day.replace("-", ""))
 
 
-#: Tasks looked at of each stage, the newest first: what a machine did long ago says less.
+#: Most tasks read per stage, the newest first: old measurements of a machine matter less.
 _NEWEST: Final = 2000
 
 
 @dataclass(frozen=True)
 class BatchCost:
-    """The finished batches of a task: what was asked, what they took, what came out."""
+    """Finished batches of a task: request, cost and result."""
 
     hand: str
     object: str
@@ -313,18 +312,18 @@ class BatchCost:
 
     @property
     def kept(self) -> int:
-        """Grasps that count towards those asked for: valid ones, or where not validated all that stayed."""
+        """Grasps that count towards the requested ones: valid ones, or all remaining ones without validation."""
         return self.valid if self.request.counted == "valid" else self.count
 
 
 @dataclass(frozen=True)
 class Costs:
-    """Reads on costs."""
+    """Reads of costs."""
 
     database: Database
 
     def of_batches(self, stage: Stage, *, limit: int = _NEWEST, scope: ProjectScope = EVERYTHING) -> list[BatchCost]:
-        """The newest finished batches of a stage, those of at most `limit` tasks."""
+        """Return the newest finished batches of a stage, from at most `limit` tasks."""
         columns = [shards.c[name] for name in BatchCost.__dataclass_fields__ if name != "request"]
         query = (
             select(*columns, shards.c.manifest["request"].label("request"))

@@ -1,11 +1,11 @@
-"""Seconds and bytes of a batch: measured on this service's finished batches where there are any, else stored.
+"""Seconds and bytes of a batch: measured on this service's finished batches if possible, else stored.
 
-The nearest measurement counts: the same hand on the same object, else the same hand, else any hand; each at the same
-method, fidelity and validator and on the same kind of device. What is stored stands in `STORED` and `STORED_METHODS`,
-with its origin; as soon as anything was measured here, one factor, this machine's seconds over the stored ones, scales
-all of it, so that two fidelities are never compared by two machines' clocks.
+The nearest measurement counts: the same hand on the same object, else the same hand, else any hand; always with the
+same method, fidelity and validator on the same kind of device. Stored values are in `STORED` and `STORED_METHODS`, with
+their origin. After the first measurement, one factor (this machine's seconds over the stored ones) scales all of them,
+so that two fidelities are never compared by clocks of two machines.
 
-Every rate has an interval: of a measured one, what its batches scatter; of a stored one, how far it was seen to be off.
+Every rate has an interval: for a measured one the scatter of its batches, for a stored one its observed error.
 """
 
 from __future__ import annotations
@@ -23,38 +23,38 @@ from graspd.service.model.scene_spec import TOUCH
 
 @dataclass(frozen=True)
 class Rate:
-    """What grasps of one recipe cost, and where that is known from."""
+    """Cost of grasps of one recipe, and its origin."""
 
     seconds_per_try: float
     valid_yield: float
-    """Valid grasps per grasp tried."""
+    """Valid grasps per candidate."""
     bytes_per_grasp: float
     origin: str
     batches: int
-    """Finished batches it was measured on; 0: stored."""
+    """Finished batches of the measurement; 0: stored."""
     spread: tuple[float, float]
-    """The interval of the seconds, as factors of them."""
+    """Interval of the seconds, as factors of them."""
 
 
 @dataclass(frozen=True)
 class Machine:
-    """How this machine compares with the one of the stored numbers."""
+    """Speed of this machine relative to that of the stored numbers."""
 
     factor: float = 1.0
-    """Its seconds over the stored ones: the median of its batches, of whatever fidelity and method."""
+    """Its seconds over the stored ones: the median of its batches of all fidelities and methods."""
     spread: tuple[float, float] = (1.0, 1.0)
-    """Of single batches, as factors of that."""
+    """Interval of single batches, as factors of that."""
     batches: int = 0
-    """Finished batches that say so; 0: nothing is known of it."""
+    """Finished batches of the comparison; 0: unknown."""
 
     @property
     def stored_spread(self) -> tuple[float, float]:
-        """The interval of a stored number on this machine, as factors of it."""
+        """Interval of a stored number on this machine, as factors of it."""
         low, high = SCALED_SPREAD if self.batches else STORED_SPREAD
         return low * self.spread[0], high * self.spread[1]
 
     def scaled(self, origin: str) -> str:
-        """The origin of a stored number with what was done to it."""
+        """Return the origin of a stored number with the applied factor."""
         if not self.batches:
             return origin
         return f"{origin}, x {self.factor:.2g} as {self.batches} batches took here"
@@ -62,34 +62,34 @@ class Machine:
 
 @dataclass(frozen=True)
 class StageRate:
-    """What a scene (per batch and scene) or a picture (per million pixels) costs."""
+    """Cost of a scene (per batch and scene) or a picture (per million pixels)."""
 
     seconds: float
     size_bytes: float
     origin: str
     batches: int
     spread: tuple[float, float] = (1.0, 1.0)
-    """The interval of the seconds, as factors of them."""
+    """Interval of the seconds, as factors of them."""
 
 
-#: Interval of a measured rate at least: what another run of the same batches differs by.
+#: Least interval of a measured rate: the difference between runs of the same batches.
 MEASURED_SPREAD: Final = (0.8, 1.25)
-#: Interval of a stored rate on a machine whose factor is known: fidelities and methods differ from machine to machine.
+#: Interval of a stored rate on a machine with a known factor: fidelities and methods scale differently.
 SCALED_SPREAD: Final = (0.5, 2.0)
-#: Interval of a stored rate on an unknown machine: ten times as long was seen on a small one that others used too.
+#: Interval of a stored rate on an unknown machine: a small shared one took ten times as long.
 STORED_SPREAD: Final = (1 / 3, 10.0)
-#: Where the stored numbers come from: CPU times and sizes of graspd 0.1, for a worker with two cores that is busy nine
-#: tenths of its time. docs/explanation/scaling.md has them.
+#: Origin of the stored numbers: CPU times and sizes of graspd 0.1, for a worker with two cores that is busy nine tenths
+#: of its time, see docs/explanation/scaling.md.
 ORIGIN: Final = "stored default: 2 CPU cores, docs/explanation/scaling.md"
-#: Seconds per grasp tried, with postures, quality and verdict; valid yield of standard (its first matrix: 1,785
-#: of 2,542 candidates), which stands for the others too.
+#: Seconds per candidate, with postures, quality and verdict; valid yield of standard (its first matrix: 1,785 of 2,542
+#: candidates), also used for the others.
 STORED: Final[dict[str, tuple[float, float]]] = {
     "draft": (0.13, 0.7),
     "standard": (0.16, 0.7),
     "fine": (0.24, 0.7),
 }
-#: The same of other methods at their source's budget: the planner's time and success in docs/results/chart.md, and what
-#: postures, quality and verdict cost besides.
+#: The same for other methods at their source's budget: the planner's time and success in docs/results/chart.md, and the
+#: cost of postures, quality and verdict.
 STORED_METHODS: Final[dict[str, tuple[float, float]]] = {
     "graspit": (1.5, 0.2),
     "graspd2022": (0.75, 0.4),
@@ -98,25 +98,25 @@ STORED_METHODS: Final[dict[str, tuple[float, float]]] = {
 }
 _BYTES_PER_GRASP: Final = 1338.0
 STORED_SCENE: Final = StageRate(0.5, 240.0, ORIGIN, 0)
-#: The same of a scene that grasps are yet to be planned in.
+#: The same for a scene of later grasps.
 STORED_PLACE: Final = StageRate(0.5, 2200.0, ORIGIN, 0)
-#: A try in a scene over one around a free object, and the share of candidates that is valid there: what built-in hands
-#: and objects have on tables, to within a factor of four.
+#: Cost of a candidate in a scene relative to a free object, and the valid share there: values of built-in hands and
+#: objects on tables, to within a factor of four.
 STORED_IN_SCENE: Final = (1.6, 0.5)
 #: Seconds of a valid grasp in each model around the nominal one, with as many cores: docs/results/robust.md, 25 to 70
-#: core-ms, and a lift 44 to 59. All of them count: a share that is missed ends sooner, and few are.
+#: core-ms, and a lift 44 to 59. All models count, although a missed share ends the test sooner: few are missed.
 STORED_MODEL_S: Final = 0.018
 STORED_PICTURE: Final = StageRate(2.1, 1.34e6, ORIGIN, 0)
 
 
 class Rates:
-    """The measurements of one moment."""
+    """Measurements of one time."""
 
     def __init__(self, batches: Iterable[BatchCost], options: JobOptions, devices: Collection[str]) -> None:
-        """Batches of `synthesize` that were made as the options ask.
+        """Group the batches of `synthesize` that were made with these options.
 
         Args:
-            devices: devices of the present workers; none: whatever was measured on counts.
+            devices: devices of the present workers; empty: all devices count.
         """
         self._options = options
         self._groups: dict[Hashable, list[BatchCost]] = defaultdict(list)
@@ -130,7 +130,7 @@ class Rates:
         self._known: dict[Hashable, Rate] = {}
 
     def of(self, hand: str, obj: str) -> Rate:
-        """The rate of a cell."""
+        """Return the rate of a cell."""
         levels: tuple[tuple[Hashable, str], ...] = (
             ((hand, obj), f"{hand} on {obj}"),
             (hand, f"{hand} on other objects"),
@@ -163,7 +163,7 @@ class Rates:
 
 
 def tries(rate: Rate, options: JobOptions) -> float:
-    """Grasps that are tried for a job."""
+    """Return the number of candidates for a job."""
     if options.want == "candidates":
         return float(options.grasps)
     most = options.grasps * options.budget
@@ -171,7 +171,7 @@ def tries(rate: Rate, options: JobOptions) -> float:
 
 
 def _stored_of(options: JobOptions) -> tuple[float, float, str]:
-    """Stored seconds per candidate, yield and origin."""
+    """Return the stored seconds per candidate, yield and origin."""
     if options.models:
         plain = options.model_copy(update={"robust": 0.0, "robust_models": 0})
         seconds, share, origin = _stored_of(plain)
@@ -192,9 +192,9 @@ def _stored_of(options: JobOptions) -> tuple[float, float, str]:
 
 
 def machine_of(batches: Iterable[BatchCost]) -> Machine:
-    """How the machine that made these batches of `synthesize` compares with the stored numbers.
+    """Compare the machine of these batches of `synthesize` with the stored numbers.
 
-    Only batches that have a stored number of their own count: as offered, without options.
+    Only batches with their own stored number count: as offered, without options.
     """
     comparable = [batch for batch in batches if batch.candidates and _is_stored(batch.request)]
     ratios = [
@@ -214,7 +214,7 @@ def _is_stored(request: JobOptions) -> bool:
 
 
 def _spread(values: list[float], least: tuple[float, float]) -> tuple[float, float]:
-    """Middle eight tenths of the values over their median, and no narrower than `least`."""
+    """Return the middle eight tenths of the values over their median, not narrower than `least`."""
     if len(values) < 2 or (middle := median(values)) <= 0:
         return least
     tenths = quantiles(values, n=10, method="inclusive")
@@ -222,12 +222,12 @@ def _spread(values: list[float], least: tuple[float, float]) -> tuple[float, flo
 
 
 def _whole(batches: list[BatchCost]) -> list[BatchCost]:
-    """Those of at least half a full batch, if there are any: a small one spends its time on loading."""
+    """Return those of at least half a full batch, if any: small ones are dominated by loading time."""
     return [batch for batch in batches if 2 * batch.candidates >= BATCH_SIZE] or batches
 
 
 def recipe_of(options: JobOptions) -> Hashable:
-    """What decides how long a grasp takes, besides hand, object and device."""
+    """Return the options that decide the time of a grasp, besides hand, object and device."""
     return (
         options.method,
         tuple(sorted((name, str(value)) for name, value in options.options.items())),
@@ -242,13 +242,13 @@ def recipe_of(options: JobOptions) -> Hashable:
 
 
 def _on(machine: Machine, stored: StageRate) -> StageRate:
-    """A stored rate as this machine takes it."""
+    """Scale a stored rate to this machine."""
     seconds = stored.seconds * machine.factor
     return replace(stored, seconds=seconds, origin=machine.scaled(stored.origin), spread=machine.stored_spread)
 
 
 def scene_rate(batches: Iterable[BatchCost], options: JobOptions, machine: Machine) -> StageRate:
-    """Seconds per batch and scene; bytes per grasp and scene, or where grasps are planned in them per scene."""
+    """Return seconds per batch and scene; bytes per grasp and scene, or per scene of grasps planned in it."""
     found = [batch for batch in batches if batch.request.scenes and batch.request.in_scene == options.in_scene]
     rows = sum(batch.count for batch in found)
     if not rows:
@@ -260,7 +260,7 @@ def scene_rate(batches: Iterable[BatchCost], options: JobOptions, machine: Machi
 
 
 def picture_rate(batches: Iterable[BatchCost], options: JobOptions, machine: Machine) -> StageRate:
-    """Seconds and bytes per million pixels, of pictures with the same channels where there are any."""
+    """Return seconds and bytes per million pixels, of pictures with the same channels if there are any."""
     found = [batch for batch in batches if batch.count]
     found = [batch for batch in found if batch.request.channels == options.channels] or found
     pixels = sum(batch.count * batch.request.width * batch.request.height for batch in found) / 1e6

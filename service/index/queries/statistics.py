@@ -1,4 +1,4 @@
-"""Sums over many grasps: means, ranges and distributions of their metrics, counted by the database."""
+"""Aggregates over many grasps: means, ranges and distributions of their metrics, in the database."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from graspd.service.index.tables import dataset_cells, grasps, shards, tasks
 
 @dataclass(frozen=True)
 class MetricSummary:
-    """One metric over the grasps that have it."""
+    """Summary of one metric over the grasps that have it."""
 
     count: int
     mean: float
@@ -27,7 +27,7 @@ class MetricSummary:
 
 @dataclass(frozen=True)
 class Distribution:
-    """One metric over the grasps that were looked at: bins of equal width from `low` to `high`, the ends inclusive."""
+    """Histogram of one metric over the sampled grasps: equal bins from `low` to `high`, inclusive."""
 
     count: int
     mean: float
@@ -42,28 +42,27 @@ class Distributions:
 
     looked_at: int
     share: float
-    """1.0 if every grasp was looked at; else the share of shards, drawn at random, whose grasps were."""
+    """Share of randomly drawn shards whose grasps were read; 1.0: all."""
     metrics: dict[Metric, Distribution]
 
 
 @dataclass(frozen=True)
 class GraspKinds:
-    """Of what types grasps are, and from which cells of the sphere the palm comes; grasps that tell neither are left
-    out."""
+    """Grasp types, and the cells of the sphere of approaches; grasps without either are omitted."""
 
     types: dict[int, int]
-    """How many are of each `GraspType`."""
+    """Number of grasps of each `GraspType`."""
     cells: dict[int, int]
 
 
 @dataclass(frozen=True)
 class Statistics:
-    """Reads on all grasps that pass a filter."""
+    """Reads of all grasps that pass a filter."""
 
     database: Database
 
     def summaries(self, where: GraspFilter, metrics: Sequence[Metric]) -> dict[Metric, MetricSummary]:
-        """Count, mean and range of each metric; those that no grasp has are left out."""
+        """Return count, mean and range of each metric; metrics without any grasp are omitted."""
         columns = [
             function(grasps.c[metric]) for metric in metrics for function in (func.count, func.avg, func.min, func.max)
         ]
@@ -77,14 +76,14 @@ class Statistics:
         }
 
     def histogram(self, where: GraspFilter, metric: Metric, low: float, high: float, bins: int) -> list[int]:
-        """Number of grasps in each of equal bins of [low, high]; the last one holds its upper end."""
+        """Count grasps in equal bins of [low, high]; the last bin includes its upper end."""
         counts = [0] * bins
         value = grasps.c[metric]
         width = (high - low) / bins
         with self.database.reading() as connection:
             place: ColumnElement[Any] = (value - low) / width if width > 0 else value * 0
             if connection.dialect.name == "postgresql":
-                # Its cast rounds where SQLite's cuts off, and not every SQLite knows floor().
+                # PostgreSQL's cast rounds, SQLite's truncates, and not every SQLite has floor().
                 place = func.floor(place)
             place = cast(place, Integer)
             query = select(place, func.count()).where(value.between(low, high), *sql_conditions(where)).group_by(place)
@@ -95,9 +94,9 @@ class Statistics:
     def distributions(
         self, where: GraspFilter, metrics: Sequence[Metric], *, bins: int = 20, at_most: int = 20_000
     ) -> Distributions:
-        """Distribution of each metric, from about `at_most` grasps where the filter's job, pair or all have more.
+        """Return the distribution of each metric from at most about `at_most` grasps of the job, pair or all.
 
-        The id of a shard is a digest, so those below a bound are a fair sample, and they lie side by side in the index.
+        The id of a shard is a digest, so ids below a bound are a fair sample, and they are adjacent in the index.
         """
         share, values = self._values(where, metrics, at_most)
         found = {metric: _distribution(values[:, at], bins) for at, metric in enumerate(metrics)}
@@ -106,8 +105,10 @@ class Statistics:
     def side_by_side(
         self, filters: Sequence[GraspFilter], metrics: Sequence[Metric], *, bins: int = 20, at_most: int = 20_000
     ) -> dict[Metric, list[Distribution | None]]:
-        """Of each metric that some grasp has, one distribution for each filter, all in the same bins; None: there no
-        grasp has it. Grasps are drawn as `distributions` draws them."""
+        """Return one distribution per metric and filter in common bins; None without grasps.
+
+        Grasps are sampled as in `distributions`.
+        """
         samples = [self._values(where, metrics, at_most)[1] for where in filters]
         found: dict[Metric, list[Distribution | None]] = {}
         for at, metric in enumerate(metrics):
@@ -119,7 +120,7 @@ class Statistics:
         return found
 
     def _values(self, where: GraspFilter, metrics: Sequence[Metric], at_most: int) -> tuple[float, NDArray[np.float64]]:
-        """The share of shards that were looked at, and the metrics (N, M) of their grasps; nan: not measured."""
+        """Return the sampled share of shards, and the metrics (N, M) of their grasps; nan: not measured."""
         with self.database.reading() as connection:
             share, tests = _sampled(connection, where, at_most)
             query = select(*(grasps.c[metric] for metric in metrics)).where(*tests)
@@ -127,7 +128,7 @@ class Statistics:
         return share, np.array(rows, float).reshape(-1, len(metrics))
 
     def kinds(self, where: GraspFilter, *, at_most: int = 20_000) -> GraspKinds:
-        """Types and directions, from about `at_most` grasps as `distributions` draws them."""
+        """Return types and directions, from about `at_most` grasps as sampled by `distributions`."""
         columns = grasps.c.grasp_type, grasps.c.approach_cell
         with self.database.reading() as connection:
             _, tests = _sampled(connection, where, at_most)
@@ -142,7 +143,7 @@ class Statistics:
 
 
 def _sampled(connection: Connection, where: GraspFilter, at_most: int) -> tuple[float, list[ColumnElement[bool]]]:
-    """The share of shards that about `at_most` grasps come from, and the filter with the choice of these."""
+    """Return the share of shards with about `at_most` grasps, and the filter restricted to these."""
     share = min(1.0, at_most / max(1, _size(connection, where)))
     tests = [c.sql(["shard", "job", "dataset"]) for c in conditions(where)]
     if share < 1.0:
@@ -151,7 +152,7 @@ def _sampled(connection: Connection, where: GraspFilter, at_most: int) -> tuple[
 
 
 def _size(connection: Connection, where: GraspFilter) -> int:
-    """Grasps of the filter's shard, job or pair, or all."""
+    """Return the number of grasps of the filter's shard, job or pair, or of all."""
     query = select(func.sum(shards.c.count)).where(shards.c.kind == "base")
     if where.shard is not None:
         query = query.where(shards.c.id == where.shard)

@@ -1,1 +1,1 @@
-"""Datasets: a matrix of hands x objects, each cell one ordinary job."""
+"""Datasets: a matrix of hands x objects; each cell is an ordinary job."""

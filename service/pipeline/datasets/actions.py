@@ -1,4 +1,4 @@
-"""What a user does to datasets: create, cancel, retry, snapshot. The planner carries it out, job by job."""
+"""Actions of a user on datasets: create, cancel, retry, snapshot. The controller carries them out."""
 
 from __future__ import annotations
 
@@ -36,20 +36,20 @@ from graspd.service.store.records import (
 def create(
     services: Services, request: DatasetRequest, *, owner: str = "", scope: ProjectScope = EVERYTHING
 ) -> tuple[DatasetView, bool]:
-    """Record a dataset; the controller plans its jobs. The same hands, objects and options again are the same dataset.
+    """Record a dataset; the controller plans its jobs. Equal hands, objects and options give one dataset.
 
     Args:
-        owner: id of the API key that submits it; its jobs get the same.
-        scope: which hands, objects and networks it may name, and the project that it and its jobs belong to.
+        owner: id of the submitting API key, also for its jobs.
+        scope: which hands, objects and networks it may name, and the project of it and its jobs.
 
     Returns:
-        the dataset, and whether it is new. A failed or cancelled one is returned as it is: `retry` starts it again.
+        the dataset, and whether it is new. A failed or cancelled one is returned unchanged: see `retry`.
 
     Raises:
         NotFoundError: unknown hand, object, neighbour, network or set.
-        InputError: one of them was refused when it was checked; the network is of another hand; no chart tells which
-            fidelity meets the target.
-        ConflictError: a check is still running, or the name stands for another dataset.
+        InputError: one of them failed its check; the network is of another hand; no chart contains a
+            fidelity that meets the target.
+        ConflictError: a check is still running, or another dataset has the name.
         LimitError: more than `MAX_CELLS` cells.
         QueueUnavailable, StoreUnavailable, IndexUnavailable: nothing was recorded.
     """
@@ -58,7 +58,7 @@ def create(
     shared = with_network(services, shared, hands, scope)
     services.queue.ping()
     key = names.dataset_record(request.name)
-    # One that is there stays what it is: a later chart changes none of its fidelities.
+    # An existing dataset stays unchanged: a later chart changes none of its fidelities.
     found = None
     if not services.store.exists(key):
         found = describe(request.name, hands, objects, shared, Resolver(services.store).choose, owner, scope.project)
@@ -70,9 +70,9 @@ def create(
         new = found is not None and put(key, found)
         record = found if found is not None and new else _present(services, request.name)
         if record.project != scope.project:
-            # Nothing else of it is said: names are of the whole service.
+            # The message reveals nothing else: names are unique in the whole service.
             raise ConflictError(f"the name {record.name!r} is taken; take another name")
-        # Not by the digest: a newer graspd knows more options, whose defaults an older one meant as well.
+        # Digests would differ: a newer graspd has more options, whose defaults an older one implied.
         if not new and (other := _difference(record, hands, objects, shared)):
             raise ConflictError(f"there is another dataset named {record.name!r} ({other}); take another name")
         refuse_pending(services.store, "dataset", record.name)
@@ -83,9 +83,9 @@ def create(
 
 
 def cancel(services: Services, name: str) -> DatasetView:
-    """Stop a dataset: what is not planned never is, and its unfinished jobs are cancelled. Finished shards stay.
+    """Stop a dataset: plan no more jobs and cancel its unfinished ones. Finished shards stay.
 
-    A job that another dataset waits for as well goes on, and so does one that another key submitted.
+    A job continues if another dataset waits for it or another key submitted it.
 
     Raises:
         NotFoundError: unknown dataset.
@@ -100,7 +100,7 @@ def cancel(services: Services, name: str) -> DatasetView:
 
 
 def retry(services: Services, name: str) -> DatasetView:
-    """Start the failed and cancelled cells of a dataset again, with fresh attempts; what is made is not made twice.
+    """Restart failed and cancelled cells of a dataset with fresh attempts. Finished work is not repeated.
 
     Raises:
         NotFoundError: unknown dataset.
@@ -115,7 +115,7 @@ def retry(services: Services, name: str) -> DatasetView:
 
 
 def snapshot(services: Services, name: str) -> tuple[Snapshot, bool]:
-    """Write down which shards a dataset holds now. The same shards again are the same snapshot.
+    """Record the present shards of a dataset. Equal shards give the same snapshot.
 
     Returns:
         the snapshot, and whether it is new.
@@ -159,23 +159,23 @@ def add_object_set(
     scope: ProjectScope = EVERYTHING,
     may_follow: Callable[[str, str], None] = lambda owner, project: None,
 ) -> ObjectSetView:
-    """Give objects a name together. The same objects again change nothing; others make a new version.
+    """Give objects a common name. Equal objects change nothing; others make a new version.
 
     Args:
-        owner: id of the API key that asks; a new version keeps the owner of the set.
+        owner: id of the requesting API key; a new version keeps the owner of the set.
         scope: which objects it may name, and the project that a new set belongs to.
-        may_follow: called with owner and project of the set before it gets a new version; raises where that is refused.
+        may_follow: called with owner and project of the set before a new version; raises if that is refused.
 
     Raises:
         NotFoundError: unknown object.
-        InputError: an object was refused when it was checked, or there is none.
+        InputError: an object failed its check, or none is given.
         ConflictError: a check is still running.
     """
     assets = [services.index.assets.get(AssetKind.OBJECT, one, scope=scope) for one in objects]
     wanted = tuple(asset.name for asset in assets)
     if not wanted:
         raise InputError(f"the set {name!r} holds no object; name some")
-    # Of two that want one name at once, the later one must see the earlier one's set.
+    # Of two concurrent requests for one name, the later must see the set of the earlier.
     with recording(services) as (connection, put):
         after, project = "", scope.project
         if (present := services.index.object_sets.named(name)) is not None:
@@ -193,7 +193,7 @@ def add_object_set(
             raise NotFoundError(f"there is no {missing[0]} any more; it was deleted just now")
         found = object_set_of(name, wanted, after=after, owner=owner, project=project)
         if not put(key := names.object_set(name, found.digest), found):
-            # It broke off before its row was there.
+            # An earlier request ended before it wrote the row.
             found = read_record(ObjectSet, services.store, key)
             if not scope.sees(found.project):
                 raise ConflictError(f"the name {name!r} is taken; take another name")
@@ -202,7 +202,7 @@ def add_object_set(
 
 
 def members(services: Services, matrix: Matrix, scope: ProjectScope = EVERYTHING) -> tuple[list[Member], list[Member]]:
-    """Hands and objects of a matrix as they are now, sets spelled out; errors as in `create`."""
+    """Return the present hands and objects of a matrix with sets expanded; errors as in `create`."""
     objects = dict.fromkeys(matrix.objects)
     for name in matrix.sets:
         objects |= dict.fromkeys(services.index.object_sets.get(name, scope=scope).objects)
@@ -233,12 +233,12 @@ def _add_event(
 
 
 def _difference(known: DatasetRecord, hands: list[Member], objects: list[Member], options: JobOptions) -> str:
-    """What another dataset of the same name has that this one has not, in a few words; empty if it is the same."""
+    """Describe how another dataset of the same name differs; empty if it is the same."""
     words = []
     for what, ours, theirs in (("hands", hands, known.hands), ("objects", objects, known.objects)):
         if tuple(ours) != theirs:
             words.append(f"its {what} are {_named(theirs)}")
-    # Not by their dumps: those leave out what is at its default.
+    # Dumps cannot be compared: they omit defaults.
     mine, other = ({name: getattr(one, name) for name in JobOptions.model_fields} for one in (options, known.options))
     words += [f"its {name} is {_said(other[name])}" for name in mine if mine[name] != other[name]]
     return "; ".join(words)

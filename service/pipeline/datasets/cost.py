@@ -1,12 +1,12 @@
-"""What a dataset will cost, before it starts: time for 1, 8 and 64 workers, storage, network.
+"""Estimate the cost of a dataset before it starts: time for 1, 8 and 64 workers, storage, network.
 
     candidates of a cell = grasps / yield, at most grasps x budget   (candidates: grasps)
     seconds of a cell  = candidates x seconds per candidate + batches x scenes x seconds per scene
                          + pictures x seconds per picture
     time of W workers  = the larger of seconds / W and rounds of batches x seconds of a batch
 
-The rates, each with an interval, come from `service.index.queries.rates`; intervals add, as if all were off
-together. A worker is one process of `graspd worker` on a device like those that were measured.
+The rates and their intervals come from `service.index.queries.rates`. Intervals add, as if all errors were correlated.
+A worker is one process of `graspd worker` on a device like the measured ones.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from graspd.service.pipeline.datasets.estimate import Estimate, RateUsed, Worker
 from graspd.service.pipeline.datasets.spec import MAX_CELLS, Matrix
 
 WORKERS: Final = (1, 8, 64)
-#: A task in the queue and the events it sends back, both ways (docs/explanation/scaling.md) [bytes].
+#: A task in the queue and its events, both directions (docs/explanation/scaling.md) [bytes].
 _MESSAGE_BYTES: Final = 19_500
 #: An object of unknown size: a scan of 5000 faces as STL [bytes].
 _ASSET_BYTES: Final = 250_000
@@ -64,16 +64,16 @@ def estimate(
     costs: Batches | None = None,
     scope: ProjectScope = EVERYTHING,
 ) -> Estimate:
-    """The cost of a matrix. Hands and objects need not be known yet.
+    """Estimate the cost of a matrix. Hands and objects need not exist yet.
 
     Args:
-        resolve: puts a fidelity in the place of `auto`; not needed where there is none.
-        costs: gives the finished batches of a stage; None: they are read.
+        resolve: replaces `auto` by a fidelity; not needed without `auto`.
+        costs: returns the finished batches of a stage; None: read from the index.
         scope: which sets of objects the matrix may name, and whose measurements count.
 
     Raises:
         NotFoundError: unknown set.
-        InputError: no chart tells which fidelity meets the target.
+        InputError: no chart contains a fidelity that meets the target.
         LimitError: more than `MAX_CELLS` cells.
     """
     objects = list(matrix.objects)
@@ -100,7 +100,7 @@ def estimate(
 
 
 def _once(objects: list[str], options: JobOptions) -> list[str]:
-    """The objects of all cells, neighbours too."""
+    """Return the objects of all cells, including neighbours."""
     return list(dict.fromkeys([*objects, *(one.object for one in options.beside)]))
 
 
@@ -171,10 +171,10 @@ def _ends(seconds: float, rate: StageRate) -> tuple[float, float]:
 def _plan(
     workers: int, totals: tuple[float, float, float], batches: int, cells: int, network: float, assets: float
 ) -> WorkersPlan:
-    """A batch is one worker's from its first stage to its last, so a round takes as long as a batch."""
+    """Compute the plan; one worker runs all stages of a batch, so a round takes as long as a batch."""
     share = max(1 / workers, math.ceil(batches / workers) / batches)
     seconds, low, high = (total * share for total in totals)
-    # Each worker that meets a cell reads its hand and object, and keeps them while it stays there.
+    # Each worker reads hand and object of a cell once, and caches them while it works on that cell.
     moved = network + assets * min(workers, max(1, batches // cells))
     return WorkersPlan(
         workers=workers,
@@ -196,7 +196,7 @@ def _pictures(options: JobOptions) -> int:
 
 
 def _assets(index: Index, hands: Sequence[str], objects: Sequence[str], scope: ProjectScope) -> tuple[float, list[str]]:
-    """Bytes of hand and object over all cells; names that are not known."""
+    """Return the bytes of hand and object over all cells, and the unknown names."""
     of_hands = index.assets.sizes(AssetKind.HAND, hands, scope=scope)
     of_objects = index.assets.sizes(AssetKind.OBJECT, objects, scope=scope)
     unknown = [name for name in hands if name not in of_hands] + [name for name in objects if name not in of_objects]

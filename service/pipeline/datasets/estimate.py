@@ -1,4 +1,4 @@
-"""What a dataset will cost, as a document: it imports no index, so that a client can read it."""
+"""Cost estimate of a dataset as a document; it imports no index, so clients can read it."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class WorkersPlan(View):
 
 
 class RateUsed(View):
-    """A rate of the estimate, and how many cells it stands for."""
+    """A rate of the estimate, and the number of cells that use it."""
 
     hand: str
     cells: int
@@ -34,7 +34,7 @@ class RateUsed(View):
 
 
 class Estimate(View):
-    """What a dataset will cost. Seconds are of one worker."""
+    """Estimated cost of a dataset. Seconds are of one worker."""
 
     cells: int
     asked: int = Field(description="grasps asked for, over all cells")

@@ -1,4 +1,4 @@
-"""A snapshot as files in a folder, each checked against its checksum. What is there already is not fetched again."""
+"""Export of a snapshot as files in a folder, with verified checksums. Existing files are skipped."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from graspd.service.store.integrity import check_digest
 
 #: Bytes of a shard, in chunks: from the API or from the store.
 Fetch = Callable[[SnapshotShard], Iterable[bytes]]
-#: Told after each file: files done, files in all, bytes fetched so far.
+#: Called after each file: files done, files in all, bytes fetched so far.
 Progress = Callable[[int, int, int], None]
 _CHUNK: Final = 1 << 20
 
 
 def export_shards(snapshot: Snapshot, folder: Path, fetch: Fetch, progress: Progress | None = None) -> int:
-    """The HDF5 files as they are: `HAND/OBJECT/KIND-BATCH.h5`, with `SHA256SUMS` and `snapshot.json` beside them.
+    """Export the HDF5 files as `HAND/OBJECT/KIND-BATCH.h5`, with `SHA256SUMS` and `snapshot.json`.
 
-    `snapshot.json` is written last: a folder that holds it is whole.
+    `snapshot.json` is written last: a folder that contains it is complete.
 
     Returns:
-        number of files that had to be fetched.
+        number of fetched files.
 
     Raises:
-        DamagedShard: a file came with another checksum than the snapshot says.
+        DamagedShard: the checksum of a file differs from the snapshot's.
         StoreUnavailable: a file could not be fetched.
     """
     _make(folder)
@@ -46,12 +46,12 @@ def export_shards(snapshot: Snapshot, folder: Path, fetch: Fetch, progress: Prog
     return fetched
 
 
-#: Formats of `graspd datasets export`: another one is another entry here.
+#: Formats of `graspd datasets export`; a new format is a new entry here.
 FORMATS: Final[dict[str, Callable[[Snapshot, Path, Fetch, Progress | None], int]]] = {"shards": export_shards}
 
 
 def path_of(shard: SnapshotShard) -> str:
-    """Place of a shard in the folder."""
+    """Return the path of a shard in the folder."""
     return f"{shard.hand}/{shard.object}/{shard.kind}-{shard.batch:05}.h5"
 
 
@@ -70,7 +70,7 @@ def _is_there(path: Path, shard: SnapshotShard) -> bool:
 
 
 def _fetch(shard: SnapshotShard, path: Path, fetch: Fetch) -> None:
-    """The name appears once the file is whole and its checksum is right."""
+    """Fetch a shard; the file gets its name once it is complete and its checksum is right."""
     draft = path.with_name(f".{path.name}.part")
     digest = hashlib.sha256()
     try:

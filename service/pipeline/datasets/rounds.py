@@ -1,7 +1,7 @@
-"""Carries out users' actions on datasets, a little in each round of the controller: plans, cancels and retries jobs.
+"""Users' actions on datasets, a part in each round of the controller: plan, cancel and retry jobs.
 
-Killed at any moment, its successor goes on: which cells have a job is in the index, and a job's event names the event
-of the dataset that caused it, so none is passed on twice.
+It can be killed at any time, and its successor continues: the index contains which cells have a job. A job's event
+names the causing event of the dataset, so no event is applied twice.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from graspd.service.pipeline.ranges import TaskRanges
 from graspd.service.store.records import job_events
 
 log = logging.getLogger(__name__)
-#: Time for datasets in one round of the controller [s]: the queue and lost workers must not wait for long.
+#: Time for datasets in one round of the controller [s]; queue and lost workers must not wait long.
 BUDGET_S: Final = 0.5
 _CELLS_AT_ONCE: Final = 20
 
 
 class DatasetRounds:
-    """Works through the datasets that have something to do, the oldest first."""
+    """Process the datasets with pending work, the oldest first."""
 
     def __init__(self, services: Services, *, clock: Callable[[], float] = time.monotonic) -> None:
         self._services = services
@@ -36,10 +36,10 @@ class DatasetRounds:
         self._positions: dict[tuple[str, int], int] = {}
 
     def advance(self, budget_s: float = BUDGET_S) -> bool:
-        """Work for so long at most. Returns whether something is left to do.
+        """Work for at most `budget_s`. Return whether work is left.
 
         Raises:
-            UnavailableError: a part is away; call again later.
+            UnavailableError: a backend is unavailable; call again later.
         """
         deadline = self._clock() + budget_s
         for work in self._services.index.dataset_feed.in_work():
@@ -48,7 +48,7 @@ class DatasetRounds:
         return False
 
     def _plan(self, work: DatasetWork, deadline: float) -> bool:
-        """Make jobs of the cells that have none; whether all are made."""
+        """Make jobs for the cells without one; return whether all are made."""
         after = -1
         while not work.cancelled:
             cells = self._services.index.dataset_feed.cells_to_plan(work.name, after=after, limit=_CELLS_AT_ONCE)
@@ -64,7 +64,7 @@ class DatasetRounds:
         return True
 
     def _pass_on(self, work: DatasetWork, deadline: float) -> bool:
-        """Cancel or retry the jobs, as the last event says; whether that is done."""
+        """Cancel or retry the jobs according to the last event; return whether all are done."""
         if work.applied >= work.events:
             return True
         key = (work.name, work.events)
@@ -92,5 +92,5 @@ class DatasetRounds:
         try:
             act(self._services, job, cause=cause)
         except ConflictError as error:
-            # It ended, or somebody started it, since the index was asked.
+            # It ended or was restarted since the query of the index.
             log.info("job %s of dataset %s is left as it is: %s", job, work.name, error)

@@ -1,4 +1,4 @@
-"""What a user asks for: hands x objects, the options of each cell; and the record that follows from it."""
+"""Request of a user: hands x objects and the options of each cell; and the record derived from it."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from graspd.service.model.fidelity import AUTO
 from graspd.service.model.records import Choice, DatasetRecord, Member, request_of
 from graspd.service.model.version import STAGE_REVISIONS
 
-#: Larger matrices are split by their user: the record of this many cells has 4 MB.
+#: Larger matrices must be split by the user: a record of this many cells has 4 MB.
 MAX_CELLS: Final = 100_000
 
 
 def _once(given: tuple[str, ...]) -> tuple[str, ...]:
-    """The same name twice is the same cell."""
+    """Remove repeated names: they are the same cell."""
     return tuple(dict.fromkeys(given))
 
 
@@ -27,7 +27,7 @@ Names = Annotated[tuple[Name, ...], AfterValidator(_once)]
 
 
 class Matrix(JobOptions):
-    """Hands x objects, and what is wanted of each cell: `grasps` is a number for each cell."""
+    """Hands x objects, and the options of each cell; `grasps` is a number for each cell."""
 
     SUBMITTED = True
 
@@ -43,7 +43,7 @@ class Matrix(JobOptions):
 
     @property
     def shared(self) -> JobOptions:
-        """What all cells share."""
+        """Options that all cells share."""
         return JobOptions(**{name: getattr(self, name) for name in JobOptions.model_fields})
 
 
@@ -69,19 +69,18 @@ def describe(
     owner: str = "",
     project: str = "",
 ) -> DatasetRecord:
-    """The record of a dataset. Equal hands, objects, options and chosen fidelities have the same digest, whatever the
-    name.
+    """Return the record of a dataset. Its digest follows from hands, objects, options and fidelities only.
 
     Args:
-        choose: puts a fidelity in the place of `auto`, and says how it was chosen.
-        owner: id of the API key that submits it; no part of the digest.
+        choose: replaces `auto` by a fidelity, and returns how it was chosen.
+        owner: id of the submitting API key; no part of the digest.
         project: project of that key; its jobs belong to it.
 
     Raises:
         InputError: no fidelity meets the target on one of the cells.
     """
     cells = [(hand, obj, *choose(request_of(options, hand.name, obj.name))) for hand in hands for obj in objects]
-    # A fidelity that is chosen has a name.
+    # A chosen fidelity has a name.
     fidelities = tuple(str(request.fidelity) for _, _, request, _ in cells) if options.fidelity == AUTO else ()
     found = [choice for *_, choice in cells if choice is not None]
     places = {choice: place for place, choice in enumerate(dict.fromkeys(found))}
@@ -109,5 +108,5 @@ def describe(
 
 
 def _unused(options: JobOptions) -> set[str]:
-    """Options that came later: where they are not used, digests stay what they were."""
+    """Return newer options that are unused: without them, digests stay unchanged."""
     return {name for name in ("options", "target") if not getattr(options, name)}

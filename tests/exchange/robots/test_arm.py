@@ -110,7 +110,7 @@ def test_moveit_is_told_poses_in_the_arms_base_and_all_joints(table_shard: Path,
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (["--mount", "flange", "--base", "-5 0 0 1 0 0 0"], "carries out none of 1 grasps (1 out of reach)"),
+        (["--mount", "flange", "--base", "-5 0 0 1 0 0 0"], "reaches none of 1 grasps (1 out of reach)"),
         (["--mount", "flage"], "no link 'flage'"),  # codespell:ignore flage
         (["--mount", "base"], "no joint of the arm six moves the link 'base'"),
         ([], "--mount LINK"),
