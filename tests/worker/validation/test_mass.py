@@ -207,5 +207,5 @@ def test_weight_out_of_reach_ends_work_with_what_the_hand_lifts(tmp_path: Path, 
     assert (told["grasps"], told["candidates"]) == (0, wanted), "the budget would be four times as many"
     assert 0.3 < told["limit"]["lifts_kg"] <= told["limit"]["bound_kg"] < 10
     tries = wanted + told["outcomes"]["repeated"]
-    assert told["reason"].startswith(f"found 0 of {wanted} valid grasps in {tries} tries: ")
+    assert told["reason"].startswith(f"found 0 of {wanted} valid grasps in {tries} candidates: ")
     assert told["reason"].endswith(told["limit"]["says"]) and "20 kg are wanted" in told["reason"]
