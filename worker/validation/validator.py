@@ -155,7 +155,9 @@ def prefiltered(
     """What `validate` asks of the GPU prefilter, for whoever has the device before."""
     prefilter_terms = first_terms(hand, level, run)
     terms = verdict_key(hand, obj, level, False, pieces=pieces, prefilter=prefilter_terms)
-    return _screened(_Case(hand, obj, pieces, "standard", False), terms, grasps, level, run if prefilter_terms else None)
+    return _screened(
+        _Case(hand, obj, pieces, "standard", False), terms, grasps, level, run if prefilter_terms else None
+    )
 
 
 def _screened(
