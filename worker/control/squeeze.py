@@ -34,7 +34,8 @@ class HoldForces:
     """Balanced forces of N grasps."""
 
     residual: Floats
-    """(N,) net wrench over the sum of normal forces, torques over the object's radius. 0: balanced;"""
+    """(N,) net wrench over the sum of normal forces, torques over the object's radius.
+    0: balanced; 1: nothing presses. It predicts whether a grasp holds."""
     torque: Floats
     """(N, D) torques of the dofs that exert the forces [N m or N]."""
 

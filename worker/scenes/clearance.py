@@ -104,7 +104,10 @@ def count_rejections(rejection: NDArray[np.uint8]) -> dict[str, int]:
 
 
 def approach(grasp: Posture, pregrasp: Posture, postures: int = PATH_POSTURES) -> Posture:
-    """Return (N * postures) postures on the straight trajectory from each pregrasp to its grasp."""
+    """Return (N * postures) postures on the straight trajectory from each pregrasp to its grasp.
+
+    Positions and joints move linearly, orientations along the shorter arc (normalised linear interpolation).
+    """
     t = np.linspace(0.0, 1.0, postures)[None, :, None]
     start, end = pregrasp.hand_pose[:, None], grasp.hand_pose[:, None]
     sign = np.where((start[..., 3:] * end[..., 3:]).sum(-1, keepdims=True) < 0, -1.0, 1.0)

@@ -89,7 +89,7 @@ class Obstacle:
         return self.moved(invert(pose))
 
     def distance(self, points: Floats) -> Floats:
-        """Return signed distances (...) of points (..., 3) [m]: exact inside and over faces; else lower bounds."""
+        """Return signed distances (...) of points (..., 3) [m]: exact in and over faces, else a lower bound."""
         return np.asarray((points @ self.planes[:, :3].T - self.planes[:, 3]).max(axis=-1))
 
 

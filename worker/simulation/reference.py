@@ -101,7 +101,7 @@ def jacobi(contacts: Contacts, s0: Floats, world: World, passes: int) -> Floats:
 
 
 def _pushed(p: Floats, n: Floats, rho: Floats, s: Floats, world: World) -> tuple[Floats, Floats]:
-    """Return normal impulses (...) that remove penetration at points (..., 3) moved by s, and their effect."""
+    """Return normal impulses (...) that end penetration at points (..., 3) moved by s, and their effect."""
     j = row(n, p)
     back = j @ np.linalg.inv(world.mass)
     impulse = np.maximum(world.dilation - rho + np.sum(j * s, axis=-1), 0.0) / np.sum(j * back, axis=-1)
