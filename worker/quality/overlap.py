@@ -23,8 +23,8 @@ class Overlap:
     """Conservative overlap test of a hand's pieces with a closed object.
 
     A piece is excluded only if it shares no volume: no face of the object reaches into it, none of its corners is in
-    the object, and nothing of the object is in it. A face also counts if only a plane through two edges would separate
-    it.
+    the object, and nothing of the object is in it. A face also counts if only a plane through
+    two edges would separate it.
     """
 
     def __init__(self, hand: HandModel, probe: Probe) -> None:

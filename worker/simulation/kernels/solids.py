@@ -337,7 +337,7 @@ def distances(
 ):
     """Compute the least distance (B, L) of each body from the solids of scene 0, at most `reach`.
 
-    A feature over no face of an obstacle is farther from it than one of the obstacle's edges from the link. Over (B, P).
+    A feature over no face of an obstacle is farther from it than an edge of the obstacle from the link. Over (B, P).
     """
     b, piece = wp.tid()
     body = pieces_in.body[piece]
