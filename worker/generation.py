@@ -133,8 +133,7 @@ def validated_grasps(
     Args:
         hand: the hand.
         obj: the object.
-        request: method, fidelity, seed, friction, level and budget; whether valid grasps or `count` of any kind are
-            wanted.
+        request: method, fidelity, seed, friction, level, budget; whether valid grasps or `count` of any kind.
         count: grasps wanted; feasible ones where nothing is validated.
         batch: number of the batch within its job.
         scenes: scenes of the grasps, in turn; valid then means lifted out of its scene. None: free object.
@@ -278,8 +277,7 @@ class Scoring:
         prefilter: PrefilterVerdicts | None = None,
     ) -> Round:
         """Validate and measure grasps, and select the wanted ones, near-duplicates included.
-        Grasps that are not finite are rejected. `known` are verdicts on candidates, `prefilter` those of the GPU
-        prefilter."""
+        Grasps that are not finite are rejected. `known` are verdicts on candidates, `prefilter` those of the GPU."""
         fates = np.where(planned.finite, "kept", "diverged").astype(object)
         seconds = {"planner": 0.0, "validation": 0.0, "quality": 0.0}
         finite = np.flatnonzero(fates == "kept")
@@ -461,7 +459,7 @@ class Batch:
     def __init__(
         self, scoring: Scoring, number: int, count: int, run: ExecutionContext, scenes: range | None = None
     ) -> None:
-        """`run` reports progress of this batch only; `scenes` are the job's scenes of this batch, None: all."""
+        """Begin a batch; `run` reports its progress, `scenes` are its part of the job's scenes, None: all."""
         self.scoring, self.number, self.count, self.run = scoring, number, count, run
         self.request = scoring.request
         self.rounds: list[Round] = []

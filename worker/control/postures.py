@@ -178,8 +178,7 @@ def _finger_room(hand: HandModel, hand_pose: Floats, paths: Floats, placed: Plac
     return out
 
 
-#: Clearance of the open hand, and of the closing hand [m]: slightly more than required, since trajectories are checked
-#: in steps.
+#: Clearance of the open, and of the closing hand [m]: above the required one, as trajectories are checked in steps.
 RAISE_OPEN_M: Final = CLEAR_M + 0.0025
 
 RAISE_CLOSING_M: Final = CLEAR_M + 0.0003

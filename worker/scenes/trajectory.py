@@ -1,10 +1,9 @@
 """Trajectories of the hand: from a standoff to the pregrasp, closing and lift, with their clearances.
 
-In a scene the lift goes against gravity. Around a free object it is the retreat along the approach. Distances are those
-of `body_room`: fingertips that may touch a support count as farther from it. The hand's mounting, at wrist angles
-constant over the trajectory, must stay clear as the hand does. Against half-spaces they are exact. Against boxes and
-neighbours' pieces they are distances of the hand's features from the obstacle's planes: exact where a corner is
-nearest, else a lower bound.
+In a scene the lift goes against gravity. Around a free object it is the retreat along the approach. The hand's mounting
+must stay clear as the hand does, at wrist angles constant over the trajectory. Clearances are those of `body_room`:
+fingertips that may touch a support count as farther from it. They are exact against half-spaces. Against boxes and
+neighbours' pieces they are distances of the hand's features from planes: exact at corners, else a lower bound.
 
 The approach in a scene has a direction and an opening of the hand that avoid contact with object and obstacles.
 """

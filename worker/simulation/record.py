@@ -1,7 +1,6 @@
 """Operations on hands as recorded launches: one iteration is the gradient of the loss, then a step.
 
-`record_*` records a whole list for the data's current schedule; `add_*` appends one part of it. No data leaves the
-device.
+`record_*` records a whole list for the data's current schedule; `add_*` appends one part. No data leaves the device.
 """
 
 from __future__ import annotations

@@ -33,8 +33,8 @@ class ForeignVerdicts:
     same: SameHand
 
     def facts(self) -> dict[str, Any]:
-        """validation_hand: name of the other model; fingertips_mm: distance of its fingertips from ours;
-        foreign_key: terms of its verdicts; and `share_counts`."""
+        """Return validation_hand, the other model's name; fingertips_mm, its fingertips' distance from ours;
+        foreign_key, terms of its verdicts; and `share_counts`."""
         a, b = self.nominal.success == 1, self.foreign.success == 1
         return {
             "validation_hand": self.same.theirs.name,

@@ -33,7 +33,7 @@ HAND_SOLREF: Final = (0.005, 1.0)
 #: Couplings are stiffer than contacts, or a pressed finger would stretch them; 2 steps is MuJoCo's floor.
 COUPLING_SOLREF: Final = (0.008, 1.0)
 COUPLING_SOLIMP: Final = (0.98, 0.999, 1e-4, 0.5, 2.0)
-#: Defaults of today's engine that 3.3.2, the version pinned by DexGraspBench, does not have: several contacts for a pair
+#: Defaults of today's engine that version 3.3.2, pinned by DexGraspBench, does not have: several contacts for a pair
 #: of convex pieces, and a solver for each island of contacts.
 NOT_IN_3_3_2: Final = int(mujoco.mjtDisableBit.mjDSBL_MULTICCD) | int(mujoco.mjtDisableBit.mjDSBL_ISLAND)
 #: Degrees of freedom from which sparse Jacobians cost less; the engine's own rule is 60. Lifts take .77 of the time
@@ -223,7 +223,7 @@ def scene_spec(
 
 
 def several_contacts(hand: HandModel) -> int:
-    """Flags of `NOT_IN_3_3_2` that a gripper needs, because a flat pad touches a flat side in an area.
+    """Return the flags of `NOT_IN_3_3_2` that a gripper needs: its flat pads touch flat sides in an area.
     On a single contact point the object would turn as no real one does. The protocol was made for rounded fingers."""
     return int(mujoco.mjtDisableBit.mjDSBL_MULTICCD) if jaws_of(hand) is not None else 0
 
@@ -267,7 +267,7 @@ def _add_joint(body: Any, hand: HandModel, b: int) -> None:
 
 
 def _mechanism(hand: HandModel, b: int, d: int) -> dict[str, Any]:
-    """Joint properties that the protocol lacks.
+    """Return joint properties that the protocol lacks.
     A tendon drives a joint permanently against its limit, which therefore is as stiff as a coupling."""
     found: dict[str, Any] = {}
     if hand.drag is not None:

@@ -229,7 +229,7 @@ class Limit:
         return limit_told(self.hand, self.friction, self.grasps, self.lifts_kg, self.bound_kg, self.wanted_kg)
 
     def facts(self) -> dict[str, Any]:
-        """Values for JSON; no bound: None."""
+        """Return the values for JSON; no bound: None."""
         bound = round(self.bound_kg, 3) if math.isfinite(self.bound_kg) else None
         return {"lifts_kg": round(self.lifts_kg, 3), "bound_kg": bound, "grasps": self.grasps, "says": self.line}
 

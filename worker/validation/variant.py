@@ -1,7 +1,6 @@
 """Variants of the validator's model: other plausible shapes, drives, tendons, masses and poses.
 
-A `Variant` describes how a model departs from the nominal one, `draw` draws one along an axis, and `varied.Models`
-validates in it.
+A `Variant` describes a model's departure from the nominal one; `draw` draws one, `varied.Models` validates in it.
 """
 
 from __future__ import annotations

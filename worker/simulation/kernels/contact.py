@@ -147,7 +147,7 @@ def direct(
     end_out: wp.array2d(dtype=vec6),
     adjoint_out: wp.array2d(dtype=vec6),
 ):
-    """Order-independent compliant contact: all contacts in one 6 x 6 system. Launch over (B, M).
+    """Solve order-independent compliant contact, in one 6 x 6 system. Launch over (B, M).
 
     Minimises 1/2 (s - s0)' M (s - s0) + k/2 sum w_i max(0, C_i)^2 with friction of magnitude at most mu k w_i C_i, by
     iteratively reweighted least squares: a sliding contact is a spring of stiffness k w_i mu C_i / |u_t|, a sticking
@@ -284,7 +284,7 @@ def gauss_seidel(
     end_out: wp.array2d(dtype=vec6),
     gradient_inout: wp.array2d(dtype=wp.float32),
 ):
-    """The paper's step: one sweep of position-based dynamics over the contacts, in order (Deul 2016).
+    """Take the paper's step: one sweep of position-based dynamics over the contacts (Deul 2016), in order.
 
     Contact i moves the object by -M^-1 j C / w along the normal, then against the slip of its point by at most mu times
     that impulse. `states` (B, M, N) stores the object's motion before each contact for the reverse sweep. `passes` is
@@ -374,7 +374,7 @@ def jacobi(
     end_out: wp.array2d(dtype=vec6),
     gradient_inout: wp.array2d(dtype=wp.float32),
 ):
-    """Averaged Jacobi: each pass applies the mean correction of all active contacts, in any order.
+    """Take averaged Jacobi passes, each with the mean correction of all active contacts, in any order.
 
     `states` (B, M, >= passes) stores the motion before each pass. The summed (not averaged) form diverges with the
     number of contacts. The count of active contacts is taken as constant by the adjoint. Launch over (B, M).

@@ -180,7 +180,7 @@ def penalty(
     wrench_inout: Wrenches,
     depth_inout: wp.array(dtype=wp.float32),
 ):
-    """Half-spaces: add the gradient of w sum w_i min(h_i - margin_i - room, 0)^2; deepest shortfalls.
+    """Add the gradient of w sum w_i min(h_i - margin_i - room, 0)^2 of half-spaces; deepest shortfalls.
     Launch over (B, P)."""
     b, piece = wp.tid()
     if active_in[b] == 0 or scene_in[b] < 0:

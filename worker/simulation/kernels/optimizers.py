@@ -52,7 +52,7 @@ def adam(
     rotation_inout: wp.array(dtype=wp.quat),
     q_inout: wp.array2d(dtype=wp.float32),
 ):
-    """Adam (Kingma & Ba 2015); columns of `rate`: translation, rotation and every dof. Over B."""
+    """Take a step of Adam (Kingma & Ba 2015); rates of translation, rotation, every dof. Over B."""
     b = wp.tid()
     if active_in[b] == 0:
         return
@@ -96,7 +96,7 @@ def gradient_descent(
     rotation_inout: wp.array(dtype=wp.quat),
     q_inout: wp.array2d(dtype=wp.float32),
 ):
-    """The paper's plain gradient descent. Launch over B."""
+    """Take a step of the paper's plain gradient descent. Launch over B."""
     b = wp.tid()
     if active_in[b] == 0:
         return

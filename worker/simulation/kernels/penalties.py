@@ -118,7 +118,7 @@ def attract(
     # Data out:
     gradient_out: wp.array2d(dtype=wp.float32),
 ):
-    """Control without a simulation: attract free points to the object, fading with distance. Over (B, N)."""
+    """Attract free points to the object, fading with distance: control without simulation. Over (B, N)."""
     b, i = wp.tid()
     if active_in[b] == 0 or i >= count_in[b]:
         return
