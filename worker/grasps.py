@@ -18,8 +18,8 @@ THRESHOLDS: Final = "quality/thresholds_m"
 _IN_SCENES = ("scene_index", "approach", "approach_joint_positions", "lift")
 
 
-#: Step of positions [m]. A double represents its multiples exactly up to 8,388 km, so grasps on the grid are moved into
-#: the frame of a file and back with identical bits.
+#: Step of positions [m]. Doubles hold its multiples exactly up to 8,388 km. Grasps on the grid therefore move into the
+#: frame of a file and back with identical bits.
 GRID_M: Final = 2.0**-30
 
 

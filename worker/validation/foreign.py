@@ -90,8 +90,8 @@ def driven_as(same: SameHand) -> HandModel:
     """Return the other model with the gains and limits of ours.
 
     A dof of gain k and limit e that moves n joints by m_i gives each of them the gain k / (n m_i^2) and the limit
-    e / (n |m_i|). It takes sum(m_i^2 k_i) and sum(|m_i| e_i) from joints. Along the joints' common motion the drive
-    stays the same where one model turns them as one and the other hangs them on a tendon of equal pulls.
+    e / (n |m_i|). It takes sum(m_i^2 k_i) and sum(|m_i| e_i) from joints. So the drive along the joints' common
+    motion stays the same, whether a model turns them as one or hangs them on a tendon of equal pulls.
     """
     ours, theirs = same.ours, same.theirs
     gain, limit = _of_joints(ours)

@@ -1,6 +1,6 @@
 """The closest point of a triangle mesh by lists: grid cells near the surface list their nearest faces.
 
-No tree is traversed. With D the distance of a cell's centre from the surface and h half the cell's diagonal, the
+No tree is traversed. Let D be the distance of a cell's centre from the surface, and h half the cell's diagonal. The
 nearest face to a point of the cell is at most D + 2 h from the centre. Faces are sorted by that distance k, so a point
 at e from the centre skips faces with k - e > its nearest so far. The sign is that of the angle-weighted normal of the
 feature with the closest point (Baerentzen & Aanaes 2005).
