@@ -1,1 +1,1 @@
-"""The engine: hands, objects, simulation, planners, quality, scenes, rendering, and the stages that run them."""
+"""The engine: hands, objects, simulation, planners, quality, scenes, rendering and worker stages."""

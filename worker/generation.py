@@ -1,9 +1,9 @@
-"""Grasps with their quality and verdict: planned in rounds until enough are valid or the budget ends.
+"""Generation of validated grasps: rounds of candidates until enough are valid or the budget ends.
 
-A grasp is feasible if it passes the geometric gate, and valid if the validator says besides that it holds. Where nobody
-validates, feasible ones are counted in their place and none is valid. Where a share of models is wanted, valid grasps
-that hold in so many count. The dear steps come last: a grasp that the validator drops is not measured, and one that is
-not valid is validated in no other model.
+A grasp is feasible if it passes the geometric gate, and valid if it is feasible and the validator holds it. Without
+validation, feasible grasps are counted instead and none is valid. Where a job wants a share of models, only valid
+grasps that hold in that share count. Expensive steps come last: grasps that the validator drops are not measured, and
+grasps that are not valid are not validated in further models.
 """
 
 from __future__ import annotations
@@ -48,11 +48,10 @@ from graspd.worker.validation.protocol import DIRECTIONS, Outcome
 from graspd.worker.validation.robust import reaches, robust, robustness
 from graspd.worker.validation.validator import prefiltered, validate
 
-#: Why a grasp is not kept: its hand is no number, something of its scene is in its way, the validator dropped it, it
-#: failed the geometric gate, holds in too few models around the nominal one, lifts too little, or is as good as the
-#: same as one kept.
+#: Reasons to reject a grasp: its numbers are not finite, an obstacle of its scene blocks it, the validator dropped it,
+#: it failed the geometric gate, held in too few models, lifts too little, or is a near-duplicate of a selected one.
 REJECTIONS: Final = ("diverged", "blocked", "dropped", "gate", "not_robust", "weak", "alike")
-#: Outcomes that are not told by the word of their rejection.
+#: Outcomes whose name differs from that of their rejection.
 _REJECTION_OF: Final = {
     "no_place": "blocked",
     "diverged": "diverged",
@@ -61,7 +60,7 @@ _REJECTION_OF: Final = {
     "alike": "alike",
     **{f"gate_{name}": "gate" for name in GATES},
 }
-#: Names of the outcomes of a push and of a lift that drops a grasp.
+#: Outcome names of pushes and of lifts that drop a grasp.
 _PUSHED: Final = {
     Outcome.PENETRATION: "penetration",
     Outcome.LOST_WHILE_CLOSING: "lost_while_closing",
@@ -78,41 +77,42 @@ _LIFTED: Final = {
     LiftOutcome.DIVERGED: "unstable",
     LiftOutcome.NEIGHBOUR_MOVED: "neighbour_moved",
 }
-#: Verdicts on candidates from the planner's trial, of lifts or of pushes.
+#: Verdicts on candidates from the planner's rollouts, of lifts or of pushes.
 Known = dict[str, Any]
-#: Shares of a round's progress: planned, validated, measured.
+#: Progress of a round after planning, validation and measurement.
 PARTS: Final = (0.6, 0.8, 1.0)
 
 
 @dataclass(frozen=True)
 class ValidatedBatch:
-    """What came of a batch."""
+    """Result of one batch."""
 
     grasps: GraspSet
     columns: Arrays
     """The `quality/...` columns of a base shard."""
     candidates: int
-    """Grasps planned up to the last one that is kept, or all where fewer were found than wanted."""
+    """Number of candidates up to the last selected grasp; all where fewer were found than wanted."""
     rejected: dict[str, int]
-    """Those of them that were not kept, by `REJECTIONS`."""
+    """Number of rejected candidates, by `REJECTIONS`."""
     outcomes: dict[str, int]
-    """The same, by `service.model.planning.OUTCOMES`: what the validator saw, which gate."""
+    """Rejected candidates, by `service.model.planning.OUTCOMES`: validator outcome or failed gate."""
     verdict_key: str | None
     """Digest of the terms of the verdicts; None: not validated."""
     planned: int
-    """Grasps planned in all."""
+    """Total number of planned candidates."""
     seconds: dict[str, float] = field(default_factory=dict)
     """Wall time of planning, validating and measuring [s]."""
     shares: dict[str, float] = field(default_factory=dict)
-    """In scenes, of all that were planned: clear_share (free of obstacles at contact, on the way and in the lift),
-    lift_share (and lifted), lift_hard_share (and lifted at half the friction)."""
+    """In scenes, shares of all candidates:
+    clear_share (free of obstacles at contact, on the approach and in the lift), lift_share (also lifted),
+    lift_hard_share (also lifted at half the friction)."""
     narrow: str | None = None
-    """In scenes where nothing is valid the geometric reason, see `why_narrow`."""
+    """In scenes without a valid grasp, the geometric reason, see `why_narrow`."""
     limit: Limit | None = None
-    """What the best of a round lifts, where none is kept and the weight is why."""
+    """Payload limit of the best grasps, where none is selected because of the weight."""
 
     def moved(self, by: Sequence[float]) -> ValidatedBatch:
-        """The same with the grasps moved by a vector (3,) [m]."""
+        """Return the batch with its grasps moved by a vector (3,) [m]."""
         return replace(self, grasps=self.grasps.moved(by))
 
 
@@ -128,25 +128,24 @@ def validated_grasps(
     run: ExecutionContext = DEFAULT_CONTEXT,
     partial: bool = False,
 ) -> ValidatedBatch:
-    """A batch of a job: `count` valid grasps (feasible ones where nothing is validated), or as many as the budget
-    finds; or `count` grasps of any kind.
+    """Plan one batch of a job: `count` valid grasps, or as many as the budget finds.
 
     Args:
         hand: the hand.
         obj: the object.
-        request: method, fidelity, seed, friction; whether valid grasps are wanted, at which level, and the budget.
-        count: grasps wanted.
+        request: method, fidelity, seed, friction, level, budget; whether valid grasps or `count` of any kind.
+        count: grasps wanted; feasible ones where nothing is validated.
         batch: number of the batch within its job.
-        scenes: where the grasps are to be used, in turn; valid then means lifted out of its scene. None: free.
-        pieces: gives the object's convex pieces; runs beside the first round's planning.
-        run: told of the share that is done; asked often whether to stop. Its device is the planner's.
-        partial: if it is stopped, what was validated before is the batch.
+        scenes: scenes of the grasps, in turn; valid then means lifted out of its scene. None: free object.
+        pieces: computes the object's convex pieces; runs in parallel with the planning of the first round.
+        run: receives progress and is polled for cancellation; its device is the planner's.
+        partial: when cancelled, return the grasps that were validated before.
 
     Raises:
         HandError: no two digits of the hand oppose each other.
         InputError: the object does not fit into the gripper.
         MeshError: the object has no usable convex pieces.
-        TaskCancelled: when `run.cancelled()` answers True; with `partial`, before anything was validated.
+        TaskCancelled: `run.cancelled()` returned True; with `partial`, before anything was validated.
     """
     require_graspable(hand, obj)
     with Scoring.begun(hand, obj, request, scenes=scenes, pieces=pieces, run=run) as scoring:
@@ -162,7 +161,8 @@ def validated_grasps(
 
 
 def require_graspable(hand: HandModel, obj: ObjectModel) -> None:
-    """
+    """Check that the hand can grasp the object.
+
     Raises:
         HandError: no two digits of the hand oppose each other.
         InputError: the object does not fit into the gripper.
@@ -181,13 +181,13 @@ def scored(
     pieces: Callable[[ObjectModel], ConvexPieces] = decompose,
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> ValidatedBatch:
-    """Grasps that are there already, validated and measured as `request` says; all of them are kept.
+    """Validate and measure existing grasps as `request` specifies; all of them are returned.
 
-    With `scenes` they are validated in these, `grasps.scene` saying in which.
+    With `scenes` they are validated in the scenes that `grasps.scene` numbers.
 
     Raises:
         MeshError: the object has no usable convex pieces.
-        TaskCancelled: when `run.cancelled()` answers True.
+        TaskCancelled: `run.cancelled()` returned True.
     """
     request = request.model_copy(update={"want": "candidates"})
     with Scoring.begun(hand, obj, request, scenes=scenes, pieces=pieces, run=run) as scoring:
@@ -197,8 +197,7 @@ def scored(
 
 
 class Scoring:
-    """Verdicts and metrics of grasps of one job, whichever of its batches they are of; a grasp's do not depend on what
-    is scored with it."""
+    """Verdicts and metrics of a job's grasps; those of one grasp do not depend on the others."""
 
     def __init__(
         self, hand: HandModel, obj: ObjectModel, request: JobOptions, scenes: Scenes | None, run: ExecutionContext
@@ -208,7 +207,7 @@ class Scoring:
         self.scenes = None if scenes is None else scenes.centred(obj)
         self.pieces: Future[ConvexPieces] | None = None
         self.beside: ThreadPoolExecutor
-        """A thread for what need not be waited for."""
+        """Thread for background work."""
 
     @classmethod
     @contextmanager
@@ -222,19 +221,19 @@ class Scoring:
         pieces: Callable[[ObjectModel], ConvexPieces],
         run: ExecutionContext,
     ) -> Iterator[Scoring]:
-        """With the object's convex pieces on their way, where somebody validates."""
+        """Create the scoring and start the decomposition of the object, where grasps are validated."""
         made = cls(hand, obj, request, scenes, run)
         with ThreadPoolExecutor(1, thread_name_prefix="beside") as made.beside:
             made.pieces = made.beside.submit(pieces, made.obj) if request.validation != "none" else None
             yield made
 
     def goes_on(self) -> None:
-        """From here on nobody stops it."""
+        """Ignore cancellation from here on."""
         self.run = replace(self.run, cancelled=DEFAULT_CONTEXT.cancelled)
 
     def rollout(self, known: Known) -> Rollout | None:
-        """What candidates go through, where there is a validator; verdicts of the validator's own level become
-        `known`."""
+        """Return the rollout of candidates, where there is a validator.
+        Verdicts at the validator's own level are added to `known`."""
         if self.pieces is None:
             return None
         return rollout_on(
@@ -248,7 +247,7 @@ class Scoring:
         )
 
     def key(self) -> str:
-        """Digest of the terms of the verdicts."""
+        """Return the digest of the terms of the verdicts."""
         assert self.pieces is not None
         pieces = self.pieces.result()
         if self.scenes is None:
@@ -262,7 +261,7 @@ class Scoring:
         return self.request.validation
 
     def prefiltered(self, planned: GraspSet) -> PrefilterVerdicts | None:
-        """What the GPU prefilter says of those of the grasps that are numbers; None: it has no part in this."""
+        """Return the GPU prefilter's verdicts on the finite grasps; None: it takes no part."""
         if self.pieces is None or self.scenes is not None or not first_terms(self.hand, self._level, self.run):
             return None
         finite = planned.take(np.flatnonzero(planned.finite))
@@ -277,8 +276,8 @@ class Scoring:
         known: Known | None = None,
         prefilter: PrefilterVerdicts | None = None,
     ) -> Round:
-        """Validate and measure grasps, and keep those that are wanted or like others; a hand that is no number is never
-        one of them. `known` are verdicts on candidates, `prefilter` what the GPU prefilter said of them before."""
+        """Validate and measure grasps, and select the wanted ones, near-duplicates included.
+        Grasps that are not finite are rejected. `known` are verdicts on candidates, `prefilter` those of the GPU."""
         fates = np.where(planned.finite, "kept", "diverged").astype(object)
         seconds = {"planner": 0.0, "validation": 0.0, "quality": 0.0}
         finite = np.flatnonzero(fates == "kept")
@@ -328,7 +327,7 @@ class Scoring:
     def _validated_in_scenes(
         self, grasps: GraspSet, scenes: Scenes, run: ExecutionContext, seconds: dict[str, float], known: Known | None
     ) -> tuple[GraspSet, Arrays]:
-        """The grasps with their ways, and their verdicts."""
+        """Return the grasps with their trajectories, and their verdicts."""
         began = time.perf_counter()
         found = scene_verdicts(
             self.hand,
@@ -376,7 +375,7 @@ class Scoring:
     def _in_models(
         self, grasps: GraspSet, held: NDArray[np.bool_], run: ExecutionContext, seconds: dict[str, float]
     ) -> Arrays:
-        """Share of the models in which those that hold do, told whole of candidates, and what they fail first of."""
+        """Return shares of models in which held grasps hold (exact for candidates) and first failed axes."""
         assert self.pieces is not None
         wish = self.request
         found = robust(
@@ -396,7 +395,7 @@ class Scoring:
         return found.columns
 
     def placed(self, grasps: GraspSet) -> PlacedGrasps | None:
-        """The grasps' scenes; None: the object is free."""
+        """Return the grasps with their scenes; None: the object is free."""
         if self.scenes is None:
             return None
         assert grasps.scene is not None
@@ -405,7 +404,7 @@ class Scoring:
     def _payloads(
         self, grasps: GraspSet, held: NDArray[np.bool_], run: ExecutionContext, seconds: dict[str, float]
     ) -> NDArray[np.float64]:
-        """(N,) payloads of those that are `held` [kg]: the object's own mass at least, which they were seen to lift."""
+        """Return payloads (N,) of `held` grasps [kg], at least the object's own mass, which they lifted."""
         assert self.pieces is not None
         began = time.perf_counter()
         found = payloads(
@@ -423,7 +422,7 @@ class Scoring:
     def _shaken(
         self, grasps: GraspSet, held: NDArray[np.bool_], run: ExecutionContext, seconds: dict[str, float]
     ) -> NDArray[np.float64]:
-        """(N,) margins of those that are `held`, shaken after the lift."""
+        """Return shake margins (N,) of `held` grasps, shaken after the lift."""
         assert self.pieces is not None
         began, placed = time.perf_counter(), self.placed(grasps)
         assert placed is not None, "shake goes with a scene"
@@ -442,25 +441,25 @@ class Scoring:
 
 @dataclass(frozen=True)
 class Needed:
-    """Grasps that a batch needs next."""
+    """Candidates that a batch needs next."""
 
     number: int
-    """Of the round."""
+    """Number of the round."""
     rows: range
-    """Of the round."""
+    """Rows of the round."""
     begun: int
-    """Grasps of the batch that were planned before the round."""
+    """Number of the batch's candidates planned before the round."""
     progress: tuple[float, float]
-    """Share of the batch before them, and as far as they bring it as the rate so far lets hope."""
+    """Progress of the batch before these rows, and expected progress after them at the rate so far."""
 
 
 class Batch:
-    """One batch in the making: what it needs next, and what came of it."""
+    """One batch in progress: the candidates it needs next and the rounds so far."""
 
     def __init__(
         self, scoring: Scoring, number: int, count: int, run: ExecutionContext, scenes: range | None = None
     ) -> None:
-        """`run` is told of the batch alone; `scenes` are those of the job that are the batch's, None: all of them."""
+        """Begin a batch; `run` reports its progress, `scenes` are its part of the job's scenes, None: all."""
         self.scoring, self.number, self.count, self.run = scoring, number, count, run
         self.request = scoring.request
         self.rounds: list[Round] = []
@@ -473,16 +472,16 @@ class Batch:
         self._kept = np.zeros((0, POINTS, 3))
         self._needs = self._all_needed()
         self.needed = next(self._needs, None)
-        """What is to be made and added next; None: the batch can be finished."""
+        """Candidates to make and add next; None: the batch can be finished."""
 
     def _all_needed(self) -> Iterator[Needed]:
-        """What is needed until `count` grasps are there or the budget is used up, one after the other is added."""
+        """Yield what is needed until `count` grasps are found or the budget is used up, one after each `add`."""
         wish, count = self.request, self.count
         if wish.want == "candidates":
             yield Needed(0, range(count), self.candidates, (0.0, 1.0))
             return
         budget, number, valid = math.ceil(wish.budget * count), 0, 0
-        # In scenes a grasp that sets out again costs as much as another grasp.
+        # In scenes a retry costs as much as another candidate.
         while size := next_round(count, valid, self.candidates, budget - self.repeated):
             first = 0
             while first < size and valid < count:
@@ -497,7 +496,7 @@ class Batch:
             number += 1
 
     def add(self, made: Round) -> None:
-        """Add what was needed, without grasps too near to one that is kept."""
+        """Add a round, without near-duplicates of selected grasps."""
         self.candidates += len(made.fates)
         self.repeated += made.repeated
         for name in self.seconds:
@@ -512,7 +511,7 @@ class Batch:
         self.needed = next(self._needs, None)
 
     def _hopeless(self) -> bool:
-        """Whether the latest grasps, none of which is kept, show that the hand lifts far less than is wanted."""
+        """Check whether the latest grasps, none selected, show that the hand lifts far less than is wanted."""
         scoring = self.scoring
         if scoring.pieces is None or (self.limit is not None and self.limit.grasps >= ENOUGH):
             return False
@@ -532,12 +531,12 @@ class Batch:
 
     @property
     def _in_parts(self) -> bool:
-        """Whether the grasps of a round may be made apart from each other: it ends as soon as enough are found, and has
-        several lanes. A GPU makes all of it at once, in the time of a few."""
+        """Whether a round may be made in parts, so that it ends as soon as enough grasps are found.
+        The CPU runs parts in several lanes; a GPU makes the whole round in the time of a few grasps."""
         return not self.scoring.run.device.startswith("cuda") and method(self.request.method).in_parts
 
     def made(self, asked: Needed) -> Round:
-        """What is needed, planned, validated and measured: on the CPU in lanes."""
+        """Plan, validate and measure what is needed; on the CPU in lanes."""
         known: Known = {}
         run = self.run.part(*asked.progress)
         rollout = self.scoring.rollout(known)  # one for all lanes
@@ -555,8 +554,7 @@ class Batch:
                 options=request.options,
             )
             told = self.told(wanted, found)
-            # Verdicts and metrics are many short pieces of work: all cores may take them, whatever other priorities are
-            # at.
+            # Verdicts and metrics are many short jobs: they may use all cores, whatever the other lanes do.
             made = self.scoring.scored(told, replace(own, lanes=None), known)
             return self.noted(replace(asked, rows=part), made, told)
 
@@ -578,7 +576,7 @@ class Batch:
         return whole
 
     def wanted(self, asked: Needed, rollout: Rollout | None, *, others_have_place: bool) -> PlanRequest:
-        """The grasps that are asked for, as a planner takes it."""
+        """Return the planner's request for the needed candidates."""
         number = self.number + asked.number * ROUND_STRIDE
         rows, scenes, placed = asked.rows, self.scoring.scenes, None
         if scenes is not None:
@@ -590,13 +588,12 @@ class Batch:
         return PlanRequest(len(rows), knobs, seed, number, placed, rollout, rows.start, others_have_place)
 
     def told(self, wanted: PlanRequest, planned: GraspSet) -> GraspSet:
-        """What is validated, which is what is told: positions are on the grid before; scenes are numbered as the
-        job's."""
+        """Return the grasps to validate and store: positions on the grid, scenes numbered as in the job."""
         index = None if wanted.placed is None else self._scenes.start + wanted.placed.index
         return replace(planned, scene=index).moved(np.zeros(3))
 
     def noted(self, asked: Needed, made: Round, told: GraspSet) -> Round:
-        """The round with what the planner said; the rechecks of the batch's first grasps begin."""
+        """Return the round with the planner's info, and start the rechecks of the batch's first grasps."""
         made.planned = [told]
         made.grasps = replace(made.grasps, info=told.info, seconds=told.seconds)
         made.seconds["planner"] += told.seconds
@@ -606,17 +603,18 @@ class Batch:
         return made
 
     def refused(self, error: NoStartFound) -> NoStartFound:
-        """The same with the geometric reason, where there is one."""
+        """Return the error with the geometric reason, where there is one."""
         why = self._narrow()
         return NoStartFound(f"{error}: {why}") if why else error
 
     def finish(self) -> ValidatedBatch:
-        """The rounds as one batch, cut to `count`, with rechecks and robustness."""
+        """Join the rounds to one batch of `count` grasps, with rechecks and robustness."""
         scoring, rounds, count = self.scoring, self.rounds, self.count
         grasps = joined([part.grasps for part in rounds])
         columns = joined_columns([part.columns for part in rounds])
         fates = np.concatenate([part.fates for part in rounds])
-        # The last round may find more than were missing: its tries count up to the last grasp that is kept, or else
+        # The last round may find more grasps than were missing. Only candidates up to the last selected grasp count,
+        # else
         # the share of valid ones would look worse than it is.
         places = np.flatnonzero(fates == "kept")
         candidates = int(places[count - 1]) + 1 if len(places) >= count else len(fates)
@@ -664,8 +662,8 @@ class Batch:
         }
 
     def _second_opinions(self, grasps: GraspSet, valid: NDArray[np.uint8]) -> Arrays:
-        """Displacement of all grasps; as far as wished rechecks of the first valid ones under the DexGraspBench
-        protocol, and robustness."""
+        """Return displacements of all grasps and, where wanted, robustness and rechecks.
+        Rechecks validate the first valid grasps at level `dexgraspbench`."""
         scoring = self.scoring
         assert scoring.pieces is not None
         columns: Arrays = {
@@ -697,8 +695,8 @@ class Batch:
         return columns
 
     def _begin_rechecks(self, first: Round) -> None:
-        """Rechecks of the first grasps of a batch, which are its first ones whatever comes after them: they take one
-        thread, and the others wait for them at its end."""
+        """Start rechecks of a batch's first grasps, which later rounds do not change.
+        They run in the background thread, and `finish` waits for them."""
         count = self.request.rechecks_of(self.number)
         if self.scoring.pieces is None or not count:
             return
@@ -710,7 +708,7 @@ class Batch:
             self._rechecks = self.scoring.beside.submit(self._rechecked, first.grasps.take(valid[:count]))
 
     def _rechecked(self, grasps: GraspSet) -> NDArray[np.int8]:
-        """What the DexGraspBench protocol says of grasps."""
+        """Return the verdicts of level `dexgraspbench` on grasps."""
         scoring = self.scoring
         assert scoring.pieces is not None
         run, pieces = scoring.run.quiet(), scoring.pieces.result()
@@ -722,7 +720,7 @@ class Batch:
 
 
 def _why(columns: Arrays, count: int) -> NDArray[np.object_]:
-    """(N,) what the validator saw of each grasp that it drops."""
+    """Return the validator's outcome (N,) of each grasp that it drops."""
     found = np.full(count, "not_lifted", object)
     if "quality/lift_outcome" in columns:
         for lift, name in _LIFTED.items():

@@ -1,4 +1,4 @@
-"""A set of grasps of one hand on one object: what planners make and what quality, scenes and shards read."""
+"""Sets of grasps of one hand on one object: output of planners, input of quality, scenes and shards."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ from numpy.typing import ArrayLike, NDArray
 from graspd.service.model.transforms import Floats
 
 Columns = Mapping[str, NDArray[Any]]
-#: The one column of a base shard that is no row for each grasp.
+#: The only column of a base shard without a row per grasp.
 THRESHOLDS: Final = "quality/thresholds_m"
-#: Columns of grasps in scenes; there are all of them or none.
+#: Columns of grasps in scenes; either all are present or none.
 _IN_SCENES = ("scene_index", "approach", "approach_joint_positions", "lift")
 
 
-#: Step of positions [m]. A double holds multiples of it up to 8,388 km, so grasps that are on the grid go into the
-#: frame of a file and come back with the same bits.
+#: Step of positions [m]. Doubles hold its multiples exactly up to 8,388 km. Grasps on the grid therefore move into the
+#: frame of a file and back with identical bits.
 GRID_M: Final = 2.0**-30
 
 
 def on_grid(positions: ArrayLike) -> Floats:
-    """Positions rounded to `GRID_M`."""
+    """Round positions to `GRID_M`."""
     return np.rint(np.asarray(positions, float) / GRID_M) * GRID_M
 
 
 def moved(pose: ArrayLike, by: ArrayLike) -> Floats:
-    """Poses (..., 7) moved by a vector (3,) of their parent's frame, on the grid."""
+    """Move poses (..., 7) by a vector (3,) of their parent's frame, on the grid."""
     pose = np.array(pose, float)
     pose[..., :3] = on_grid(pose[..., :3] + np.asarray(by, float))
     return pose
@@ -48,23 +48,23 @@ class Posture:
         return len(self.hand_pose)
 
     def take(self, rows: NDArray[np.intp] | slice) -> Posture:
-        """Some of the postures, in the order of `rows`."""
+        """Return some of the postures, in the order of `rows`."""
         return Posture(np.asarray(self.hand_pose, float)[rows], np.asarray(self.joint_positions, float)[rows])
 
     def moved(self, by: ArrayLike) -> Posture:
-        """The postures moved by a vector (3,) [m]."""
+        """Return the postures moved by a vector (3,) [m]."""
         return Posture(moved(self.hand_pose, by), self.joint_positions)
 
     @classmethod
     def from_columns(cls, columns: Columns, name: str = "grasp") -> Posture:
-        """The postures `name` (grasp, pregrasp or squeeze) of a base shard."""
+        """Return the postures `name` (grasp, pregrasp or squeeze) of a base shard."""
         pose, joints = (np.asarray(columns[f"{name}/{what}"], float) for what in ("hand_pose", "joint_positions"))
         return cls(pose, joints)
 
 
 @dataclass
 class GraspSet:
-    """N grasps with the postures before and after contact and the planner's own loss."""
+    """N grasps with the postures before and after contact and the planner's loss."""
 
     grasp: Posture
     pregrasp: Posture
@@ -73,20 +73,20 @@ class GraspSet:
     """(N,) L_stable of the planner; nan where the planner has none."""
     seconds: float = 0.0
     info: dict[str, object] = field(default_factory=dict)
-    """What the planner wants kept: loss curves, iteration counts. JSON values only."""
+    """The planner's records: loss curves, iteration counts. JSON values only."""
     approach: Floats | None = None
-    """(N, W, 7) hand poses from the standoff to the pregrasp, in the joint positions `coming`; only in scenes."""
+    """(N, W, 7) hand poses from standoff to pregrasp, with the joint positions `coming`; only in scenes."""
     coming: Floats | None = None
-    """(N, J) joint positions of the open hand that comes; only in scenes."""
+    """(N, J) joint positions of the open hand on its approach; only in scenes."""
     scene: NDArray[np.intp] | None = None
     """(N,) the scene of each grasp; only in scenes."""
     lift: Posture | None = None
     """N squeeze postures raised against gravity; only in scenes."""
     wrist: Floats | None = None
-    """(N, K) angles of the wrist above the hand's root, order of `HandModel.mounting.joint_names` [rad]; only in
-    scenes, of hands that have one."""
+    """(N, K) wrist angles above the hand's root, in the order of `HandModel.mounting.joint_names` [rad].
+    Only in scenes, for hands with a wrist."""
     attempts: int = 0
-    """How often the planner set out for the whole set; 0: it does not tell."""
+    """Number of starts for the whole set, retries included; 0: not reported."""
 
     def __len__(self) -> int:
         return len(self.grasp)
@@ -99,7 +99,7 @@ class GraspSet:
         return np.asarray(np.isfinite(rows).all(axis=1))
 
     def take(self, rows: NDArray[np.intp] | slice) -> GraspSet:
-        """Some of the grasps, in the order of `rows`; what the planner said of the whole set stays."""
+        """Return some of the grasps, in the order of `rows`; the planner's info on the whole set stays."""
         loss = np.asarray(self.stability_loss, float)[rows]
         grasp, pregrasp, squeeze = (part.take(rows) for part in (self.grasp, self.pregrasp, self.squeeze))
         approach = None if self.approach is None else np.asarray(self.approach, float)[rows]
@@ -110,7 +110,7 @@ class GraspSet:
         return GraspSet(grasp, pregrasp, squeeze, loss, self.seconds, self.info, approach, coming, scene, lift, wrist)
 
     def moved(self, by: ArrayLike) -> GraspSet:
-        """The grasps with their ways moved by a vector (3,) [m]: into a frame with its origin elsewhere."""
+        """Return the grasps and trajectories moved by a vector (3,) [m], into a frame with another origin."""
         return replace(
             self,
             grasp=self.grasp.moved(by),
@@ -121,7 +121,7 @@ class GraspSet:
         )
 
     def to_columns(self) -> dict[str, NDArray[Any]]:
-        """The posture columns of a base shard; the planner's loss is a column of the quality table."""
+        """Return the posture columns of a base shard; the planner's loss is a column of the quality table."""
         parts = {"grasp": self.grasp, "pregrasp": self.pregrasp, "squeeze": self.squeeze}
         columns: dict[str, NDArray[Any]] = {f"{name}/hand_pose": part.hand_pose for name, part in parts.items()}
         columns |= {f"{name}/joint_positions": part.joint_positions for name, part in parts.items()}
@@ -138,7 +138,7 @@ class GraspSet:
 
     @classmethod
     def from_columns(cls, columns: Columns) -> GraspSet:
-        """The grasps of a base shard, from its columns."""
+        """Load the grasps from the columns of a base shard."""
         grasp, pregrasp, squeeze = (Posture.from_columns(columns, name) for name in ("grasp", "pregrasp", "squeeze"))
         found = cls(grasp, pregrasp, squeeze, np.asarray(columns["quality/stability_loss"], float))
         if all(f"grasp/{name}" in columns for name in _IN_SCENES):
@@ -153,7 +153,7 @@ class GraspSet:
 
 
 def joined(sets: Sequence[GraspSet]) -> GraspSet:
-    """Several sets of one hand on one object as one; of the planner's remarks, those on the first set."""
+    """Join several sets of one hand on one object; the info is that of the first set."""
     grasp, pregrasp, squeeze = (
         _joined([getattr(part, name) for part in sets]) for name in ("grasp", "pregrasp", "squeeze")
     )
@@ -173,7 +173,7 @@ def joined(sets: Sequence[GraspSet]) -> GraspSet:
 
 
 def joined_columns(parts: Sequence[Columns]) -> dict[str, NDArray[Any]]:
-    """Base columns of several sets of grasps as one; the thresholds are common to all."""
+    """Join base columns of several sets; the thresholds are common to all."""
     return {
         path: parts[0][path] if path == THRESHOLDS else np.concatenate([part[path] for part in parts])
         for path in parts[0]

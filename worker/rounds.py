@@ -1,4 +1,4 @@
-"""Rounds of a batch: how many grasps each plans, and what came of it."""
+"""Rounds of a batch: their sizes and results."""
 
 from __future__ import annotations
 
@@ -16,37 +16,37 @@ from graspd.worker.grasps import THRESHOLDS, GraspSet, joined, joined_columns
 
 Arrays = dict[str, NDArray[Any]]
 
-#: Rounds of one batch draw their grasps where no batch of a job does: a job has at most 31,250 batches.
+#: Seed stride of a batch's rounds, beyond the batch numbers of any job: a job has at most 31,250 batches.
 ROUND_STRIDE: Final = 1 << 20
-#: Fewest grasps worth a round, and a priority.
+#: Fewest grasps of a round, and of a lane.
 SMALLEST_ROUND: Final = 8
 LANE: Final = 8
-#: What a round expects to be valid at least, however bad the rounds before were: rounds stay finite and few.
+#: Least share of valid grasps that a round expects, however bad the rounds before: rounds stay finite and few.
 _LEAST_RATE: Final = 0.1
 
 
 @dataclass
 class Round:
-    """Grasps of one round that are worth keeping."""
+    """Selected grasps of one round."""
 
     grasps: GraspSet
     columns: Arrays
     rows: NDArray[np.intp]
-    """Which of those that were planned they are."""
+    """Rows of the selected grasps among the planned ones."""
     fates: NDArray[np.object_]
-    """What became of each grasp that was planned: kept, or one of `service.model.planning.OUTCOMES`."""
+    """Result of each planned grasp: kept, or one of `service.model.planning.OUTCOMES`."""
     in_scene: dict[str, NDArray[np.bool_]]
-    """In scenes: which of those that were planned were clear, lifted, lifted hard."""
+    """In scenes: which planned grasps were clear, lifted, lifted at half friction."""
     seconds: dict[str, float]
     """Wall time of planning, validating and measuring [s]."""
     repeated: int = 0
-    """In scenes: how often its grasps set out again."""
+    """In scenes: number of retries."""
     planned: list[GraspSet] = field(default_factory=list)
-    """All of its grasps."""
+    """All planned grasps."""
 
     @classmethod
     def joined(cls, parts: Sequence[Round]) -> Round:
-        """All grasps of several."""
+        """Join several rounds."""
         in_scene = {name: np.concatenate([part.in_scene[name] for part in parts]) for name in parts[0].in_scene}
         firsts = accumulate((len(part.fates) for part in parts), initial=0)
         seconds = {name: sum(part.seconds[name] for part in parts) for name in parts[0].seconds}
@@ -62,7 +62,7 @@ class Round:
         )
 
     def split(self, sizes: Sequence[int]) -> list[Round]:
-        """The parts of so many planned grasps each; of the seconds each has its share."""
+        """Split into parts of `sizes` planned grasps; each part gets its share of the seconds."""
         found, ends = [], list(accumulate(sizes, initial=0))
         for first, end in pairwise(ends):
             mine = np.flatnonzero((first <= self.rows) & (self.rows < end))
@@ -74,12 +74,12 @@ class Round:
 
 
 def next_round(wanted: int, valid: int, candidates: int, budget: int) -> int:
-    """Grasps to plan next: as many as the rate so far promises to be enough, and a tenth more.
+    """Return the number of grasps to plan next: those missing at the rate so far, and 10 % more.
 
     Args:
         wanted: valid grasps wanted in all.
-        valid: found so far.
-        tried: planned so far.
+        valid: valid grasps found so far.
+        candidates: planned so far.
         budget: planned at most.
 
     Returns:
@@ -93,18 +93,18 @@ def next_round(wanted: int, valid: int, candidates: int, budget: int) -> int:
 
 
 def enough(wanted: int, valid: int, candidates: int) -> int:
-    """Grasps that the rate so far promises to be enough, and a tenth more; see `next_round`."""
+    """Return the grasps expected to be enough at the rate so far, and 10 % more; see `next_round`."""
     if candidates == 0:
         return wanted
     return math.ceil(1.1 * (wanted - valid) / max(valid / candidates, _LEAST_RATE))
 
 
 def lanes_of(rows: range, cores: int) -> list[range]:
-    """Rows of a round in contiguous, nearly equal parts: as many as there are cores, and of `LANE` grasps at least."""
+    """Split rows into contiguous, nearly equal parts: one per core, each of at least `LANE` grasps."""
     bounds = np.linspace(rows.start, rows.stop, max(1, min(cores, len(rows) // LANE)) + 1).astype(int)
     return [range(int(low), int(high)) for low, high in pairwise(bounds)]
 
 
 def taken(grasps: GraspSet, columns: Arrays, rows: NDArray[np.intp]) -> tuple[GraspSet, Arrays]:
-    """Some of the grasps (K,) with their columns."""
+    """Return some of the grasps (K,) with their columns."""
     return grasps.take(rows), {path: array if path == THRESHOLDS else array[rows] for path, array in columns.items()}

@@ -1,4 +1,4 @@
-"""Parts of one piece of work side by side, each in a priority of its own."""
+"""Parts of one computation in parallel, each in its own lane."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ R = TypeVar("R")
 
 @dataclass
 class Shares:
-    """How far all parts of a piece of work are, told in the unit of their sizes."""
+    """Combined progress of all parts, in the unit of their sizes."""
 
     sizes: Sequence[int]
     told: Progress
@@ -24,7 +24,7 @@ class Shares:
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def of(self, part: int) -> Progress:
-        """What a part tells its progress to."""
+        """Return the progress callback of one part."""
 
         def tell(done: float, total: float, message: str) -> None:
             with self._lock:
@@ -37,11 +37,11 @@ class Shares:
 def side_by_side(
     parts: Sequence[T], work: Callable[[T, ExecutionContext], R], run: ExecutionContext, *, size: Callable[[T], int]
 ) -> list[R]:
-    """`work` of every part, in order. Each is given a run of its own: its share of the cores, and of the progress by
-    `size`; the first that fails stops the others.
+    """Run `work` on every part in parallel; return the results in order.
+    Each part has its own share of the cores, and of the progress by `size`. The first failure stops the others.
 
     Raises:
-        Exception: what became of the first part that failed, when all have ended.
+        Exception: the error of the first part that failed, once all have ended.
     """
     if len(parts) == 1:
         return [work(parts[0], run)]

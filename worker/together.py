@@ -44,24 +44,24 @@ def validated_batches(
     checked: Callable[[int, ValidatedBatch], None] | None = None,
     empty_on: tuple[type[Exception], ...] = (),
 ) -> list[ValidatedBatch]:
-    """Batches of a job that follow each other; see `validated_grasps`, which makes the same of each.
+    """Plan consecutive batches of a job; each has the same result as with `validated_grasps`.
 
     Args:
         hand: the hand.
         obj: the object.
         request: see `validated_grasps`.
-        sizes: grasps wanted of each batch.
+        sizes: grasps wanted for each batch.
         first: number of the first batch within its job.
         join: batches whose grasps are planned in one launch; 1: one batch after the other.
-        scenes: see `validated_grasps`; those of all batches, or of each.
-        pieces: gives the object's convex pieces; asked once.
-        run: told of the grasps that are done.
-        partial: if it is stopped, the batches that were validated before are the result, the last one maybe in part.
-        checked: called with the number of each batch as it is made, and with what came of it; may raise.
-        empty_on: where one of these becomes of a batch, it has no grasps; not of a job's first batch, nor of all.
+        scenes: see `validated_grasps`; common to all batches, or one per batch.
+        pieces: computes the object's convex pieces; called once.
+        run: receives the number of finished grasps.
+        partial: when cancelled, return the batches validated before; the last one may be incomplete.
+        checked: called with the number of each finished batch and its result; may raise.
+        empty_on: errors after which a batch has no grasps; not for a job's first batch, nor if all fail.
 
     Raises:
-        Exception: what became of the first batch that failed; the others are stopped.
+        Exception: the error of the first batch that failed; the others are stopped.
     """
     known: list[ConvexPieces] = []
 
@@ -95,13 +95,13 @@ def validated_batches(
     return [one or _nothing(like) for one in ordered]
 
 
-#: The number of a batch within its job, with what came of it.
+#: Number of a batch within its job, with its result.
 Made = tuple[int, ValidatedBatch | Exception]
 
 
 @dataclass(frozen=True)
 class _Job:
-    """Batches of a job, and both ways to make them."""
+    """Batches of a job, made one by one or in waves."""
 
     hand: HandModel
     obj: ObjectModel
@@ -114,7 +114,7 @@ class _Job:
     partial: bool
 
     def one_by_one(self) -> Generator[Made]:
-        """One batch after the other."""
+        """Make one batch after the other."""
         shares = Shares(self.sizes, self.run.progress)
         for k, (count, scenes) in enumerate(zip(self.sizes, self.scenes, strict=True)):
             own, number = replace(self.run, progress=shares.of(k)), self.first + k
@@ -128,8 +128,7 @@ class _Job:
                 own.progress(1.0, 1.0, "done")
 
     def in_waves(self, join: int) -> Generator[Made]:
-        """What `join` batches need next is planned in one launch; meanwhile the wave before is validated and
-        measured."""
+        """Plan what `join` batches need next in one launch; meanwhile validate and measure the wave before."""
         require_graspable(self.hand, self.obj)
         stop, shares = threading.Event(), Shares(self.sizes, self.run.progress)
         run = replace(self.run, cancelled=lambda: stop.is_set() or self.run.cancelled())
@@ -174,15 +173,15 @@ class _Wave:
 
     batches: Sequence[Batch]
     made: Sequence[GraspSet | Exception]
-    """Of each batch."""
+    """One entry per batch."""
     whole: GraspSet | None
-    """All of them."""
+    """The grasps of all batches."""
     known: Known
     prefilter: PrefilterVerdicts | None
 
 
 def _next_wave(waiting: deque[Batch], fresh: Iterator[Batch], most: int) -> list[Batch]:
-    """Batches that need as many grasps as one launch takes; those that have begun go first."""
+    """Return batches that together fill one launch; those already begun go first."""
     found, size = list[Batch](), 0
     while (batch := waiting.popleft() if waiting else next(fresh, None)) is not None:
         assert batch.needed is not None
@@ -195,10 +194,10 @@ def _next_wave(waiting: deque[Batch], fresh: Iterator[Batch], most: int) -> list
 
 
 def _planned(scoring: Scoring, batches: Sequence[Batch]) -> _Wave:
-    """Plan what the batches need; by the one thread that has the device.
+    """Plan what the batches need, in the single thread that owns the device.
 
     Raises:
-        TaskCancelled: it was stopped.
+        TaskCancelled: the planning was cancelled.
     """
     known: Known = {}
     rollout, request, asked = scoring.rollout(known), scoring.request, list[BatchRequest]()
@@ -220,7 +219,7 @@ def _planned(scoring: Scoring, batches: Sequence[Batch]) -> _Wave:
 
 
 def _scored(scoring: Scoring, wave: _Wave) -> Iterator[tuple[Batch, Exception | None]]:
-    """Validate and measure a wave at once; each of its batches, or why it could not be planned."""
+    """Validate and measure a wave at once; yield each batch with its planning error or None."""
     parts: Iterator[Round] = iter(())
     if wave.whole is not None:
         scored = scoring.scored(wave.whole, scoring.run.quiet(), wave.known, wave.prefilter)
@@ -235,7 +234,7 @@ def _scored(scoring: Scoring, wave: _Wave) -> Iterator[tuple[Batch, Exception | 
 
 
 def _nothing(like: ValidatedBatch) -> ValidatedBatch:
-    """A batch without grasps, and nothing tried."""
+    """Return a batch without grasps and without candidates."""
     grasps, columns = taken(like.grasps, like.columns, np.zeros(0, int))
     seconds, shares = (dict.fromkeys(counts, 0.0) for counts in (like.seconds, like.shares))
     return ValidatedBatch(grasps, columns, 0, dict.fromkeys(like.rejected, 0), {}, like.verdict_key, 0, seconds, shares)

@@ -1,5 +1,5 @@
-"""The viewer: viser's server with the grasps of one file, a slider for the trajectory, hand, object and scene as nodes.
-Metres; poses x y z, w x y z."""
+"""The viewer: a viser server that shows the grasps of one file, with a slider over the trajectory.
+Hand, object and scene are nodes. Metres; poses x y z, w x y z."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from graspd.worker.rendering.hands import drawn_parts, drawn_poses, without_visu
 from graspd.worker.rendering.scenery import seen_share
 from graspd.worker.scenes.neighbours import Neighbours
 
-#: Points of the hand whose distance from the object is shown, where it is less than this [m].
+#: Hand points whose distance from the object is shown, and the largest distance shown [m].
 POINTS: Final = 3000
 NEAR_M: Final = 0.005
 _OBJECT: Final = (232, 184, 120)
@@ -35,7 +35,7 @@ _NEIGHBOUR: Final = (180, 174, 191)
 _TABLE: Final = (207, 212, 214)
 _WALL: Final = (143, 163, 176)
 _DISC_M: Final = 0.32
-#: Signed distance [m] and colour: red inside, green touching, blue near; lightness changes too.
+#: Signed distance [m] and colour: red inside, green touching, blue near; lightness varies too.
 _STOPS: Final = (-0.001, -0.0002, 0.0003, 0.002, NEAR_M)
 _COLOURS: Final = np.array([(209, 38, 60), (240, 128, 60), (20, 184, 122), (53, 162, 240), (185, 212, 245)], np.float64)
 
@@ -46,7 +46,7 @@ class Models:
     """Nodes under `/grasp` (the frame of the object at rest) and `/scene`."""
 
     def __init__(self, scene: Any, hand: HandModel, obj: ObjectModel, *, mounted: bool = False) -> None:
-        """Build the nodes; with those of the links above the hand's root if it is `mounted`."""
+        """Build the nodes; `mounted` adds the links above the hand's root."""
         self._scene, self._hand, self._mounted = scene, hand, mounted
         self._probe: Probe = probe_of(hand, obj, hand_points=POINTS, object_points=64)
         scene.set_up_direction("+z")
@@ -54,7 +54,7 @@ class Models:
         self.thing = scene.add_frame("/grasp/object", show_axes=False)
         scene.add_mesh_simple("/grasp/object/mesh", obj.vertices, obj.faces, color=_OBJECT, flat_shading=True)
         self.bodies = self._nodes(hand, "hand")
-        #: The hand as the engine sees it, where it looks otherwise.
+        #: The hand's collision shapes, where its visual meshes differ from them.
         self._bare = without_visuals(hand) if hand.visuals.meshes else None
         self.collisions = self._nodes(self._bare, "collision") if self._bare else []
         self.show_collision(False)
@@ -72,14 +72,14 @@ class Models:
         return nodes
 
     def show_collision(self, on: bool) -> None:
-        """Whether the hand is drawn by its collision shapes, where it has other looks."""
+        """Draw the hand by its collision shapes or by its visual meshes, where it has these."""
         if self.collisions:
             for nodes, shown in ((self.bodies, not on), (self.collisions, on)):
                 for node in nodes:
                     node.visible = shown
 
     def surround(self, supports: Supports, object_pose: Floats, neighbours: Neighbours | None, number: int) -> None:
-        """Build the scene anew around an object at a pose (7,); `number` is the scene's, of the neighbours' poses."""
+        """Rebuild the scene around an object at a pose (7,); `number` selects the scene's neighbour poses."""
         for node in self._around:
             node.remove()
         self._around = []
@@ -104,20 +104,20 @@ class Models:
             self._around.append(node)
 
     def show_scene(self, on: bool) -> None:
-        """Whether supports and neighbours are drawn."""
+        """Show or hide supports and neighbours."""
         for node in self._around:
             node.visible = on
 
     def pose(self, point: Waypoint, *, wrist: Floats | None = None, contacts: bool) -> Floats:
-        """Take a posture, of a mounted hand at wrist angles (1, U); the distances (P,) of the hand's points from the
-        object [m], at most the probe's reach."""
+        """Show a posture with wrist angles (1, U) of a mounted hand.
+        Return distances (P,) of hand points from the object [m], at most the probe's reach."""
         posture = point.hand_pose[None], point.joint_positions[None]
         for hand, nodes in ((self._hand, self.bodies), (self._bare, self.collisions)):
             if hand is not None:
                 for node, pose in zip(nodes, drawn_poses(hand, *posture, wrist)[0], strict=True):
                     _place(node, pose)
         self.thing.position = point.carried
-        # The probe's object stays where it rests.
+        # The probe's object stays at its rest pose.
         points = self._probe.posed_points(body_poses(self._hand, *posture))[0] - point.carried
         distance = np.asarray(self._probe.signed_distance(points)[0])
         near = distance < NEAR_M
@@ -141,7 +141,7 @@ def _place(node: Any, pose: Floats) -> None:
 
 
 def _disc(plane: HalfSpace, middle: Floats, corners: int = 96) -> tuple[Floats, NDArray[np.int64]]:
-    """The plane of a half-space about the foot of a point, seen from outside only."""
+    """Return a disc in the plane of a half-space around the foot of a point, visible from outside only."""
     normal = np.asarray(plane.normal, float)
     length = float(np.linalg.norm(normal))
     normal = normal / length
@@ -163,18 +163,18 @@ def _srgb(linear: float) -> float:
     return 12.92 * linear if linear <= 0.0031308 else 1.055 * linear ** (1 / 2.4) - 0.055
 
 
-#: Seconds from one named posture to the next while the way is played, and from picture to picture.
+#: Playback: seconds between two named postures, and between two frames.
 STOP_S: Final = 1.2
 FRAME_S: Final = 0.04
 #: Contact threshold at which epsilon is quoted [m].
 _QUOTED_M: Final = 0.005
-#: How far the first view is from the object, and how far its sides are apart [m], [rad].
+#: Distance of the first view from the object [m], and the angle between candidate views [rad].
 _EYE_M: Final = 0.7
 _STEP: Final = np.pi / 8
 
 
 def missing() -> str:
-    """What to do before a viewer can be used; empty: nothing."""
+    """Return instructions to install the viewer; empty: nothing is missing."""
     try:
         import viser  # noqa: F401
     except ImportError:
@@ -184,7 +184,7 @@ def missing() -> str:
 
 @dataclass(frozen=True)
 class ViewerContent:
-    """What a viewer shows: a base shard with its hand, its object and what stands beside it."""
+    """Content of a viewer: a base shard with its hand, object and neighbours."""
 
     shard: Shard
     hand: HandModel
@@ -193,10 +193,10 @@ class ViewerContent:
 
 
 class Viewer:
-    """Serves one file until it is closed. `url` is where; `place` and `row` say what is shown."""
+    """Server of one file until it is closed. `url` is its address; `row` is the grasp shown."""
 
     def __init__(self, shown: ViewerContent, *, host: str = "127.0.0.1", port: int = 8080) -> None:
-        """Start to serve on a port (0: any free one; else the first free one from there on).
+        """Start the server on a port (0: any free one; else the first free one from there on).
 
         Raises:
             InputError: viser is not installed, the file holds no grasps, or the address cannot be used.
@@ -222,7 +222,7 @@ class Viewer:
 
     @property
     def _wrist(self) -> Floats | None:
-        """(1, U) angles of the wrist at the grasp that is shown; None: the file has none."""
+        """(1, U) wrist angles of the shown grasp; None: the file has none."""
         return wrists_of(self._shown.shard, np.array([self.row]))
 
     @property
@@ -232,11 +232,11 @@ class Viewer:
 
     @property
     def row(self) -> int:
-        """Row of the grasp that is shown."""
+        """Row of the shown grasp."""
         return int(self._rows[self._at])
 
     def close(self) -> None:
-        """Stop to serve."""
+        """Stop the server."""
         self._ended.set()
         if self._playing is not None:
             self._playing.join()
@@ -244,24 +244,24 @@ class Viewer:
             self.server.stop()
 
     def step(self, by: int) -> None:
-        """Go on by so many grasps, round the end."""
+        """Advance by `by` grasps, cyclically."""
         with self._lock:
             self._at = (self._at + by) % len(self._rows)
             self._load()
 
     def choose(self, name: str) -> None:
-        """Show only grasps of a kind: a word of `Viewer.filters`."""
+        """Show only one kind of grasps, named in `Viewer.filters`."""
         with self._lock:
             self._rows, self._at = self._choices[name], 0
             self._load()
 
     @property
     def filters(self) -> tuple[str, ...]:
-        """Kinds of grasps that the file has."""
+        """Kinds of grasps in the file."""
         return tuple(self._choices)
 
     def show(self) -> None:
-        """Draw the posture at which the slider stands."""
+        """Draw the posture at the slider's position."""
         with self._lock:
             place = float(self.slider.value)
             point, contacts = point_at(self._way, place), bool(self._contacts.value)
@@ -279,7 +279,7 @@ class Viewer:
             self.server.flush()
 
     def play(self) -> None:
-        """Run the slider over the way, once, in a thread of its own."""
+        """Run the slider once over the trajectory, in its own thread."""
         with self._lock:
             if self._playing is not None and self._playing.is_alive():
                 return
@@ -317,7 +317,7 @@ class Viewer:
             control.on_update(lambda _: self.show())
 
     def _load(self) -> None:
-        """The scene, the way and the figures of the present grasp."""
+        """Load scene, trajectory and figures of the current grasp."""
         shard, row = self._shown.shard, self.row
         self._way = way_of(shard, row)
         number = int(self._arrays["grasp/scene_index"][row]) if "grasp/scene_index" in self._arrays else 0
@@ -331,7 +331,7 @@ class Viewer:
         self.show()
 
     def _aim(self) -> None:
-        """Look at the object from a side that no support hides, across the palm's way if that goes."""
+        """Look at the object from a side that no support hides, if possible perpendicular to the approach."""
         pose = np.concatenate([self.models.rest.position, self.models.rest.wxyz])
         points = quat_rotate(pose[3:], self._shown.obj.hull_vertices) + pose[:3]
         middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
@@ -358,7 +358,7 @@ def _served(host: str, port: int) -> Any:
                 raise InputError(f"cannot serve on {host}: {error.strerror or error}") from None
             port = int(probe.getsockname()[1])
     try:
-        # It greets on standard output, where the address is told in our own words.
+        # viser prints a greeting with the address, which graspd prints itself.
         with contextlib.redirect_stdout(io.StringIO()):
             return viser.ViserServer(host=host, port=port, label="graspd view", verbose=False)
     except OSError as error:
@@ -366,7 +366,7 @@ def _served(host: str, port: int) -> Any:
 
 
 def _choices(shard: Shard) -> dict[str, NDArray[np.intp]]:
-    """Rows of each kind of grasps that the file has: valid, lifted at half the friction, feasible, all."""
+    """Return rows of each kind of grasps in the file: valid, lifted at half the friction, feasible, all."""
     found: dict[str, NDArray[np.intp]] = {}
     for name in ("valid", "lift_hard", "feasible"):
         column = shard.arrays.get(f"quality/{name}")

@@ -1,5 +1,5 @@
-"""How hands open around their grasps, on a device: see `worker.control.postures` for what is wanted, and
-`worker.simulation.kernels.opening` and `.jamming` for how it is found."""
+"""Opening of hands around their grasps, on a device.
+Purpose: see `worker.control.postures`; method: `worker.simulation.kernels.opening` and `.jamming`."""
 
 from __future__ import annotations
 
@@ -19,41 +19,41 @@ from graspd.worker.quality.posed import PostureData
 from graspd.worker.simulation.kernels import distance, jamming, opening, optimizers
 from graspd.worker.simulation.launches import Launches, launch
 
-#: Fingers open until this far from the object [m]: enough for the errors of a calibrated arm, and what opens farther
-#: comes back faster and kicks the object away more often.
+#: Fingers open up to this distance from the object [m]. It covers the errors of a calibrated arm; fingers that open
+#: farther return faster and kick the object away more often.
 CLEARANCE_M: Final = 0.003
-#: A finger that cannot get this far along its contact normals opens plainly [m].
+#: A finger that cannot move this far along its contact normals opens plainly [m].
 STUCK_M: Final = 0.003
-#: The root retreats only where the open hand is nearer than this [m]: a palm left in touch kicks the object, but so
-#: does one that comes back from afar while the fingers close.
+#: The root retreats only if the open hand is closer than this [m]: a palm in contact kicks the object, but so does a
+#: palm that returns from afar while the fingers close.
 PALM_CLEARANCE_M: Final = 0.0005
-#: Share of plain opening, against `HandModel.closing`, in the way a finger leaves; the rest is along the contact
-#: normals, so that the finger comes back without dragging the object along.
+#: Share of plain opening, against `HandModel.closing`, in a finger's opening direction; the rest follows the contact
+#: normals, so that the finger returns without dragging the object along.
 PLAIN_OPENING: Final = 0.3
 #: Opening steps of each finger [rad], of sliding ones [m], and their number.
 OPENING_STEP: Final = 0.05
 SLIDING_STEP_M: Final = 0.002
 OPENING_STEPS: Final = 24
-#: A finger may run into the rest of the hand by this much more than it does in the grasp [m]; it is looked at in these
-#: shares of its way, and one that jams opens half as far, at the last of so many looks not at all.
+#: A finger may penetrate the rest of the hand by this much more than in the grasp [m]. It is checked at these shares of
+#: its path. A finger that jams opens half as far; at the last of so many checks it does not open.
 JAM_M: Final = 5e-4
 WAY: Final = (1 / 3, 2 / 3, 1.0)
 JAM_LOOKS: Final = 4
 RETREATS_M: Final = (0.0, 0.0025, 0.005, 0.0075, 0.010, 0.015, 0.020)
 
-#: Of a hand (row) and each finger, whether something else is in its way, at dofs (n, K, D) on ways of hands `rows`.
+#: Returns for hands `rows` which fingers are blocked on paths of dofs (n, K, D).
 Blocked = Callable[[NDArray[np.intp], Floats], NDArray[np.bool_]]
 
 
 def fingers_of_dofs(hand: HandModel) -> NDArray[np.int32]:
-    """(D,) the first finger that each dof drives; -1: none, so it stays when fingers open."""
+    """Return the first finger (D,) that each dof drives; -1: none, so it does not open."""
     finger = fingers_of_bodies(hand)
     driven = [finger[np.flatnonzero((hand.dof == d) & (finger >= 0))] for d in range(hand.dofs)]
     return np.array([f[0] if len(f) else -1 for f in driven], np.int32)
 
 
 def fingers_of_bodies(hand: HandModel) -> NDArray[np.int32]:
-    """(L,) what opens as one: a finger, as `finger_of_body` has them; of a gripper all that one dof moves."""
+    """Return the opening unit (L,) of each body: its finger, or for grippers the dof that moves it."""
     if jaws_of(hand) is None:
         return finger_of_body(hand)
     out = np.full(hand.bodies, -1, np.int32)
@@ -63,12 +63,12 @@ def fingers_of_bodies(hand: HandModel) -> NDArray[np.int32]:
 
 
 def count_fingers(hand: HandModel) -> int:
-    """Size of arrays by finger."""
+    """Return the size of arrays by finger."""
     return max(1, len(hand.fingertips), int(fingers_of_bodies(hand).max()) + 1)
 
 
 class Openings:
-    """N hands in their grasps, opened together: dofs `q` (N, D), and where fingers go, `wide`; None: to be found."""
+    """N hands opened together from their grasps: dofs `q` (N, D) and open dofs `wide`; None: to be found."""
 
     def __init__(self, posing: PostureData, hand_pose: Floats, q: Floats, wide: Floats | None = None) -> None:
         self.posing, self.hand_pose, self.q = posing, hand_pose, q
@@ -83,7 +83,7 @@ class Openings:
         self.bodies = posing.bodies(self.count)
 
     def open_from(self, grasp: Posture) -> None:
-        """Find where fingers have left the object as far as they get, each by itself; `grasp` is where they are."""
+        """Open each finger by itself as far from the object as possible; `grasp` is the start."""
         first, plain = self._sweep(), self._sweep()
         self._leave(grasp, first)
         self._step(first)
@@ -104,8 +104,7 @@ class Openings:
         )
 
     def without_jams(self, blocked: Blocked | None = None) -> Floats:
-        """(N, D) where fingers are to go, held back towards the grasp where they would run into one another or where
-        `blocked` says so.
+        """Return the open dofs (N, D), reduced towards the grasp where fingers jam or `blocked` applies.
 
         Fingers that jam never reach the grasp when they close again.
         """
@@ -131,7 +130,7 @@ class Openings:
         return found
 
     def retreated(self) -> Floats:
-        """(N, 7) poses of the roots of the open hands, back along the palm's approach where they are still in touch."""
+        """Return root poses (N, 7) of the open hands, moved back along the palm's approach while in contact."""
         posing, device = self.posing, self.posing.device
         with wp.ScopedDevice(device):
             back = jamming.Retreat()
@@ -172,7 +171,7 @@ class Openings:
         return out
 
     def _leave(self, grasp: Posture, sweep: Any) -> None:
-        """The way on which each finger leaves the object."""
+        """Compute the direction in which each finger leaves the object."""
         posing, hand = self.posing, self.posing.hand
         bodies, near = posing.touch(grasp, CLEARANCE_M)
         with wp.ScopedDevice(posing.device):
@@ -192,7 +191,7 @@ class Openings:
             )
 
     def _step(self, sweep: Any) -> None:
-        """Step by step along the way of a sweep, until all fingers are clear."""
+        """Step along a sweep's path until all fingers are clear."""
         posing, out = self.posing, Launches(self.posing.device)
         out.add(
             opening.place_opening,
@@ -229,7 +228,7 @@ class Openings:
         return out
 
     def _depths(self, jams: Any) -> list[Launches]:
-        """Launches that tell how deep fingers are in the grasp, then at each look on the way."""
+        """Return launches that compute fingers' depths in the grasp, then at each check on the path."""
         posing = self.posing
         shape = (self.count, len(posing.hand.pieces))
         with wp.ScopedDevice(posing.device):
@@ -254,7 +253,7 @@ class Openings:
         return found
 
     def _blocked(self, jams: Any, blocked: Blocked) -> NDArray[np.int32]:
-        """(N, F) what is in the way of hands that are still looked at."""
+        """Return the blocked fingers (N, F) of hands that are still checked."""
         rows = np.flatnonzero(jams.going.numpy())
         out = np.zeros((self.count, self.fingers_count), np.int32)
         if len(rows):

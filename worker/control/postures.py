@@ -1,9 +1,8 @@
-"""Postures around a grasp: the pregrasp, open, clear and raised where fingers would dip into a support; and the
-squeeze, which presses.
+"""Postures around a grasp: the pregrasp, open and clear, and the squeeze, which presses.
 
-They decide more of a grasp's success than the optimiser does (Dexonomy, table VI).
+They affect a grasp's success more than the optimiser does (Dexonomy, table VI).
 
-A finger that stands on the table swings through it when it opens: its hand comes from a little higher.
+A finger that rests on the table sweeps through it when it opens: such hands start from a slightly higher pregrasp.
 """
 
 from __future__ import annotations
@@ -26,39 +25,38 @@ from graspd.worker.quality.posed import posing_of
 from graspd.worker.simulation.environment import CLEAR_M, PlacedGrasps
 from graspd.worker.simulation.obstacles import body_room, obstacle_room
 
-#: Distance that opening fingers keep from obstacles [m].
+#: Clearance of opening fingers from obstacles [m].
 ROOM_M: Final = 0.0025
-#: Share of its range by which a joint opens beyond the pregrasp for the way in: fingers that reach around the object
+#: Share of its range by which a joint opens beyond the pregrasp for the approach: fingers that reach around the object
 #: would sweep it away.
 WIDE: Final = 0.4
 
-#: Hand points that postures are validated by; those within so much of the object press on it [m], as many at most.
+#: Hand points for checks of postures; those within this distance of the object press on it [m], at most so many.
 _POINTS: Final = 600
 PRESSING_M: Final = 0.003
 MAX_PRESSING: Final = 16
-#: A finger that stands off presses with its points within so much [m]: commanded to close, or the others push a free
-#: object past it.
+#: Points of a finger that stands off press within this distance [m]: its command closes it, else the other fingers push
+#: a free object past it.
 CLOSING_M: Final = 0.009
-#: A finger between the two stands off: it could touch and does not. One that is farther away is not of the grasp [m].
+#: A finger between these distances stands off: it could touch and does not. Farther ones are not part of the grasp [m].
 STANDS_OFF_M: Final = (0.005, 0.02)
-#: Sum of the contact forces' normal components [N], and the Coulomb coefficient they are balanced with: less than that
-#: of what is held, for forces at the edge of their cones slip as soon as a contact is not quite where it was thought.
+#: Sum of the contact forces' normal components [N] and the Coulomb coefficient that balances them. It is less than the
+#: object's, because forces at the edge of their cones slip as soon as a contact is slightly displaced.
 TOTAL_NORMAL_FORCE: Final = 50.0
 FRICTION: Final = 0.3
-#: The same over the object's weight, at least and at most: 50 N push what is light and flat from between fingertips,
-#: which bear against its upper edges. At 0.1 kg the most is 50 N.
+#: Least and largest sum over the object's weight: 50 N push a light flat object out from between fingertips, which bear
+#: against its upper edges. At 0.1 kg the most is 50 N.
 OF_WEIGHT: Final = (10.0, 50.0)
 
 
 def pregrasp(
     hand: HandModel, obj: ObjectModel, grasp: Posture, placed: PlacedGrasps | None = None, *, device: str = "cpu"
 ) -> Posture:
-    """N postures from which the hand closes.
+    """Compute N postures from which the hand closes.
 
-    Every finger leaves the object along its contact normals until its points are `CLEARANCE_M` away, or as far as it
-    can get without running into other fingers or, where the grasps are `placed`, an obstacle of their scene; then the
-    root moves back along the palm's approach if the hand is still in touch, and up where fingers would dip into what
-    they may touch.
+    Every finger leaves the object along its contact normals until its points are `CLEARANCE_M` away. It stops earlier
+    at other fingers or, where the grasps are `placed`, at an obstacle of their scene. Then the root retreats along the
+    palm's approach while the hand is in contact, and rises where fingers would dip into a support they may touch.
     """
     posing = posing_of(hand, obj, points=_POINTS, device=device)
     poses, joints = np.zeros((len(grasp), 7)), np.zeros((len(grasp), len(hand.joint_names)))
@@ -75,8 +73,8 @@ def pregrasp(
 def wide_open(
     hand: HandModel, obj: ObjectModel, pregrasp: Posture, placed: PlacedGrasps, *, device: str = "cpu"
 ) -> Floats:
-    """(N, J) joint positions in which a hand comes to its pregrasp: fingers plainly opened as far as `WIDE` of their
-    range, or until they would run into one another or into an obstacle."""
+    """Return joint positions (N, J) for the approach: fingers opened plainly by `WIDE` of their range.
+    They stop where they would run into one another or into an obstacle."""
     posing, joints = (
         posing_of(hand, obj, points=_POINTS, device=device),
         np.zeros((len(pregrasp), len(hand.joint_names))),
@@ -100,7 +98,7 @@ def squeeze(
     friction: float = FRICTION,
     device: str = "cpu",
 ) -> Posture:
-    """N commanded postures that press: q + Kp^-1 J^T f, the root unchanged; see `worker.control.squeeze`."""
+    """Compute N commanded postures that press, q + Kp^-1 J^T f; root fixed; see `worker.control.squeeze`."""
     force = normal_force(obj) if total_normal_force is None else total_normal_force
     if (jaws := jaws_of(hand)) is not None:
         probe = posing_of(hand, obj, points=_POINTS, device=device).probe
@@ -120,8 +118,8 @@ def hold_forces(
     closing: float = 0.0,
     device: str = "cpu",
 ) -> HoldForces:
-    """Balanced contact forces of N grasps; `Holds.residual` predicts whether a grasp will hold. Fingers that touch
-    nothing press with their points that are nearer than `closing` [m]."""
+    """Compute balanced contact forces of N grasps; `HoldForces.residual` predicts whether a grasp holds.
+    Fingers without contact press with their points within `closing` [m]."""
     posing = posing_of(hand, obj, points=_POINTS, device=device)
     return balanced(
         posing,
@@ -135,29 +133,29 @@ def hold_forces(
 
 
 def normal_force(obj: ObjectModel) -> float:
-    """Sum of the contact forces' normal components with which an object is held [N]."""
+    """Return the sum of the contact forces' normal components that hold an object [N]."""
     least, most = (times * ACCELERATION * obj.mass for times in OF_WEIGHT)
     return min(max(TOTAL_NORMAL_FORCE, least), most)
 
 
 def touching_links(hand: HandModel, obj: ObjectModel, grasp: Posture, *, device: str = "cpu") -> NDArray[np.int32]:
-    """(N,) bodies of the hand in contact, as the geometric gate counts them."""
+    """Return the number (N,) of the hand's bodies in contact, counted as in the geometric gate."""
     return posing_of(hand, obj, points=_POINTS, device=device).touching_links(grasp)
 
 
 def standing_off(hand: HandModel, obj: ObjectModel, grasp: Posture, *, device: str = "cpu") -> NDArray[np.bool_]:
-    """(N,) whether a finger stands off the object, see `STANDS_OFF_M`."""
+    """Check (N,) whether a finger stands off the object, see `STANDS_OFF_M`."""
     near, far = STANDS_OFF_M
     gap = posing_of(hand, obj, points=_POINTS, device=device).finger_gaps(grasp, 2 * far)
     return np.asarray(((gap > near) & (gap < far)).any(axis=1))
 
 
 def _in_the_way(hand: HandModel, opening: Openings, placed: PlacedGrasps | None) -> Blocked | None:
-    """What obstacles are in the way of opening fingers."""
+    """Return the check for obstacles of opening fingers."""
     if placed is None:
         return None
     pose = opening.hand_pose
-    # A finger may stand nearer to an obstacle in the grasp than it should: opening must not bring it nearer still.
+    # A finger may be closer to an obstacle in the grasp than allowed: opening must not bring it closer still.
     room = np.minimum(_finger_room(hand, pose, opening.q[:, None], placed), ROOM_M)
 
     def blocked(rows: NDArray[np.intp], way: Floats) -> NDArray[np.bool_]:
@@ -168,7 +166,7 @@ def _in_the_way(hand: HandModel, opening: Openings, placed: PlacedGrasps | None)
 
 
 def _finger_room(hand: HandModel, hand_pose: Floats, paths: Floats, placed: PlacedGrasps) -> Floats:
-    """(B, fingers) least room of each finger, as `body_room` has it, on paths (B, K, D); inf: no finger."""
+    """Return fingers' least clearance (B, fingers) on paths (B, K, D), by `body_room`; inf: no finger."""
     count, steps, _ = paths.shape
     finger = fingers_of_bodies(hand)
     out = np.full((count, count_fingers(hand)), np.inf)
@@ -180,27 +178,26 @@ def _finger_room(hand: HandModel, hand_pose: Floats, paths: Floats, placed: Plac
     return out
 
 
-#: Room that the open hand has, and that it has while it closes [m]: a little more than is asked for, since ways are
-#: looked at in steps.
+#: Clearance of the open, and of the closing hand [m]: above the required one, as trajectories are checked in steps.
 RAISE_OPEN_M: Final = CLEAR_M + 0.0025
 
 RAISE_CLOSING_M: Final = CLEAR_M + 0.0003
-#: Shares of the way to the grasp that are looked at: those of the sweep, but for the grasp itself.
+#: Checked shares of the trajectory to the grasp: those of the sweep, without the grasp itself.
 RAISE_LOOKS: Final = tuple(np.arange(8) / 8)
-#: A hand is raised by no more than this [m]: from higher it would come down on the object.
+#: Most that a hand is raised [m]: from higher it would come down on the object.
 HIGHEST_RAISE_M: Final = 0.008
 
 
 def raised(hand: HandModel, grasp: Posture, pregrasp: Posture, placed: PlacedGrasps) -> Posture:
-    """Pregrasps (N) whose root went against gravity by what the hand lacks of its room on the straight way from there
-    to the grasp; those that lack nothing, or too much, are as they were."""
+    """Return pregrasps (N) raised against gravity by the clearance lacking on the straight trajectory.
+    Pregrasps that lack none, or too much, are unchanged."""
     poses = np.array(pregrasp.hand_pose, float)
     near = np.array([any(one.tips_m is not None for one in scene.obstacles) for scene in placed.scenes], bool)
     rows = np.flatnonzero(near[placed.index])
     if not len(rows):
         return pregrasp
     lack = _lack(hand, grasp.take(rows), pregrasp.take(rows), placed.take(rows))
-    # What the root is raised by at first is less and less on the way.
+    # The initial raise diminishes along the trajectory.
     height = (lack / (1 - np.array(RAISE_LOOKS))).max(axis=1)
     height = np.where(height <= HIGHEST_RAISE_M, height, 0.0)
     up = np.array([scene.up for scene in placed.scenes])[placed.index[rows]]
@@ -209,10 +206,10 @@ def raised(hand: HandModel, grasp: Posture, pregrasp: Posture, placed: PlacedGra
 
 
 def _lack(hand: HandModel, grasp: Posture, pregrasp: Posture, placed: PlacedGrasps) -> Floats:
-    """(n, looks) what hands lack of their room at the shares `RAISE_LOOKS` of their way."""
+    """Return the lack of clearance (n, looks) of hands at the shares `RAISE_LOOKS` of their trajectory."""
     share = np.array(RAISE_LOOKS)[None, :, None]
     pose = (1 - share) * pregrasp.hand_pose[:, None] + share * grasp.hand_pose[:, None]
-    pose[..., 3:] = pregrasp.hand_pose[:, None, 3:]  # a pregrasp is never turned against its grasp
+    pose[..., 3:] = pregrasp.hand_pose[:, None, 3:]  # a pregrasp has the orientation of its grasp
     joints = (1 - share) * pregrasp.joint_positions[:, None] + share * grasp.joint_positions[:, None]
     postures = Posture(pose.reshape(-1, 7), joints.reshape(-1, joints.shape[-1]))
     room = obstacle_room(hand, postures, placed.scenes, np.repeat(placed.index, len(RAISE_LOOKS)))

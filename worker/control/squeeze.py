@@ -1,7 +1,7 @@
-"""Contact forces that balance and hold an object, and the torques with which a position-controlled hand exerts them.
+"""Contact forces that balance and hold an object, and the torques with which a hand exerts them.
 
-q_squeeze = q + Kp^-1 sum_i J_i^T f_i (Dexonomy), with f a non-negative combination of friction pyramid edges that
-leaves no net wrench and whose normal components sum to a given force.
+The hand is position-controlled: q_squeeze = q + Kp^-1 sum_i J_i^T f_i (Dexonomy). The forces f are non-negative
+combinations of friction pyramid edges without a net wrench, whose normal components sum to a given force.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from graspd.worker.simulation.kernels import balance as kernels
 from graspd.worker.simulation.kernels import touching
 from graspd.worker.simulation.launches import launch
 
-#: Weight of each edge's own size: spreads the load over contacts that would do equally well.
+#: Weight of each edge's own size: distributes the load over equally good contacts.
 SPREAD: Final = 0.1
-#: Weight of joint torques, the hardest one to exert being 1: prefers forces the hand is strong in.
+#: Weight of joint torques, relative to the hardest one to exert: prefers forces in which the hand is strong.
 TORQUE: Final = 0.05
-#: Weight of the sum of normal forces: it is met closely, then exactly by scaling, balance or not.
+#: Weight of the sum of normal forces: it is met closely, then exactly by scaling, balanced or not.
 SUM: Final = 10.0
 
 
@@ -33,8 +33,8 @@ class HoldForces:
     """Balanced forces of N grasps."""
 
     residual: Floats
-    """(N,) net wrench over the sum of normal forces, torques over the object's radius; 0: perfectly balanced, 1 where
-    nothing presses. It predicts whether a grasp will hold."""
+    """(N,) net wrench over the sum of normal forces, torques over the object's radius.
+    0: balanced; 1: nothing presses. It predicts whether a grasp holds."""
     torque: Floats
     """(N, D) torques of the dofs that exert the forces [N m or N]."""
 
@@ -49,18 +49,18 @@ def balanced(
     most: int,
     closing: float = 0.0,
 ) -> HoldForces:
-    """Balanced contact forces of N grasps within the hand's torque limits.
+    """Compute balanced contact forces of N grasps within the hand's torque limits.
 
-    Where the torques exceed a limit all forces shrink together, so the balance stays.
+    Where torques exceed a limit, all forces are scaled together, which keeps the balance.
 
     Args:
         posing: hand and object.
         grasp: the grasps.
         total_normal_force: wanted sum of normal forces [N].
         friction: Coulomb coefficient of the pyramids.
-        within: hand points that are nearer to the object press on it [m].
-        most: as many of them are taken, those that spread most widely.
-        closing: points of a finger that has none so near press where they are nearer than this [m].
+        within: hand points within this distance of the object press on it [m].
+        most: largest number of these points; the most spread out are used.
+        closing: distance within which points of a finger without contact press [m].
     """
     hand = posing.hand
     found = HoldForces(np.ones(len(grasp)), np.zeros((len(grasp), hand.dofs)))
@@ -121,13 +121,13 @@ def _balanced(
 
 
 def solved(matrix: Any, target: Floats, ridge: float, count: Any) -> Any:
-    """(B, K) the x >= 0 that minimise |M x - t|^2 + ridge^2 |x|^2 for each of B systems, on their device.
+    """Return the x >= 0 (B, K) that minimise |M x - t|^2 + ridge^2 |x|^2 for B systems, on their device.
 
     Args:
         matrix: (B, K, R) columns of M, a Warp array in double precision.
         target: (R,) t.
         ridge: weight of x itself, above 0.
-        count: (B,) columns of each system that are used, a Warp array; x is 0 for the others.
+        count: (B,) used columns of each system, a Warp array; x is 0 for the others.
     """
     (batch, columns, rows), device = matrix.shape, matrix.device
     with wp.ScopedDevice(device):
@@ -153,7 +153,7 @@ def solved(matrix: Any, target: Floats, ridge: float, count: Any) -> Any:
 
 
 def _plain(matrix: Floats, target: Floats, ridge: float, count: int) -> Floats:
-    """One system by SciPy, the ridge as rows of its own."""
+    """Solve one system by SciPy, with the ridge as additional rows."""
     from scipy.optimize import nnls
 
     system = np.vstack([matrix[:count].T, ridge * np.eye(count)])

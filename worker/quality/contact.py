@@ -1,4 +1,4 @@
-"""Contact between hand and object: area, contact points, links in touch, evenness over the fingers."""
+"""Contact between hand and object: area, contact points, links in contact, evenness over the fingers."""
 
 from __future__ import annotations
 
@@ -11,38 +11,38 @@ from graspd.service.model.transforms import Floats
 from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.surface import farthest_points
 
-#: A body nearer than this is in contact [m] (DexGraspBench).
+#: A body closer than this is in contact [m] (DexGraspBench).
 LINK_CONTACT_M: Final = 0.002
-#: Contact distances count as at most this in the contact distance consistency [m] (DexGraspBench's contact margin).
+#: Cap of contact distances in the contact distance consistency [m] (DexGraspBench's contact margin).
 CONSISTENCY_CAP_M: Final = 0.010
-#: Most contacts in a wrench space: what its hull costs grows with their number, its radius hardly does.
+#: Most contacts of a wrench space: the cost of its hull grows with their number, its radius hardly does.
 MAX_CONTACTS: Final = 20
 
 
 def contact_area_cm2(distance: Floats, area: Floats, thresholds_m: Floats) -> Floats:
-    """(B, T) hand surface within each threshold of the object, on either side of its surface [cm^2].
+    """Compute the hand area (B, T) within each threshold of the object's surface, on either side [cm^2].
 
     Args:
         distance: (B, N) signed distances of hand points [m].
-        area: (N,) area that each point stands for [m^2].
+        area: (N,) area represented by each point [m^2].
         thresholds_m: (T,) [m].
     """
     near = np.abs(distance)
-    # Row by row: the rounding of a product of matrices depends on how many rows there are.
+    # Row by row: the rounding of a matrix product depends on its number of rows.
     return np.stack([np.where(near < t, area, 0.0).sum(axis=-1) for t in thresholds_m], axis=-1) * 1e4
 
 
 def choose_contacts(
     near: NDArray[np.bool_], place: Floats, normal: Floats, *, scale: float, limit: int
 ) -> NDArray[np.intp]:
-    """At most `limit` indices of the points that are near, spread as widely as can be.
+    """Choose at most `limit` of the near points, spread as widely as possible; return their indices.
 
     Args:
         near: (N,) points to choose from.
         place: (N, 3) contact points [m].
-        normal: (N, 3) unit normals; two contacts count as apart by place over `scale` and by direction.
-        scale: length to weigh places against directions: the torque scale [m].
-        limit: most contacts wanted.
+        normal: (N, 3) unit normals; contacts differ by place over `scale` and by direction.
+        scale: length that weighs places against directions: the torque scale [m].
+        limit: most contacts.
     """
     index = np.flatnonzero(near)
     if len(index) <= limit:
@@ -53,17 +53,17 @@ def choose_contacts(
 def spread_contacts(
     near: NDArray[np.bool_], place: Floats, normal: Floats, *, scale: float, limit: int
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """`choose_contacts` of many sets at once.
+    """Run `choose_contacts` on many sets at once.
 
     Args:
         near: (B, T, N) points to choose from, of B grasps at T thresholds.
         place: (B, N, 3) contact points [m].
         normal: (B, N, 3) unit normals.
-        scale: length to weigh places against directions [m].
-        limit: most contacts wanted.
+        scale: length that weighs places against directions [m].
+        limit: most contacts.
 
     Returns:
-        (B, T, limit) indices, of which the first (B, T) count; the others mean nothing.
+        (B, T, limit) indices, and their number (B, T); further indices are undefined.
     """
     grasps, sets, _ = near.shape
     count = near.sum(axis=2)
@@ -83,7 +83,7 @@ def spread_contacts(
 
 
 def _farthest(points: Floats, inside: NDArray[np.bool_], count: int) -> NDArray[np.intp]:
-    """(S, count) of each set (S, W, K) the points `farthest_points` chooses among those that are `inside` (S, W)."""
+    """Return points (S, count) chosen by `farthest_points` from each set (S, W, K), if `inside` (S, W)."""
     rows = np.arange(len(points))
     mean = np.einsum("sw,swk->sk", inside.astype(float), points) / np.maximum(inside.sum(axis=1), 1)[:, None]
     start = np.where(inside, ((points - mean[:, None]) ** 2).sum(axis=2), -1.0)
@@ -101,12 +101,12 @@ def _farthest(points: Floats, inside: NDArray[np.bool_], count: int) -> NDArray[
 
 
 def contact_links(body_distance: Floats) -> NDArray[np.int32]:
-    """(B,) number of bodies nearer than `LINK_CONTACT_M`, from (B, L) distances [m]."""
+    """Count (B,) the bodies closer than `LINK_CONTACT_M`, from distances (B, L) [m]."""
     return (body_distance < LINK_CONTACT_M).sum(axis=1).astype(np.int32)
 
 
 def finger_of_body(hand: HandModel) -> NDArray[np.int32]:
-    """(L,) finger (index into `HandModel.fingertips`) that each body belongs to; -1 for the palm and shared bodies."""
+    """Return each body's finger (L,), an index into `HandModel.fingertips`; -1: palm and shared bodies."""
     finger = np.full(hand.bodies, -1, np.int32)
     members = np.zeros(hand.bodies, np.int32)
     for number, body in enumerate(hand.fingertips):
@@ -119,7 +119,7 @@ def finger_of_body(hand: HandModel) -> NDArray[np.int32]:
 
 
 def contact_distance_consistency_mm(hand: HandModel, body_distance: Floats) -> Floats:
-    """(B,) CDC: largest minus least finger distance, each within [0, 10 mm] (DexGraspBench) [mm]."""
+    """Compute CDC (B,): largest minus least finger distance, each within [0, 10 mm] (DexGraspBench) [mm]."""
     finger = finger_of_body(hand)
     least = [body_distance[:, finger == f].min(axis=1) for f in np.unique(finger[finger >= 0])]
     if not least:

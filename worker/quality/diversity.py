@@ -1,5 +1,4 @@
-"""Diversity of a set of grasps: variance (DexGraspBench), near-duplicates, and directions of approach in cells of
-equal area."""
+"""Diversity of a set of grasps: variance (DexGraspBench), near-duplicates, and approach cells."""
 
 from __future__ import annotations
 
@@ -15,19 +14,20 @@ from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.surface import sample_surface
 
-#: Points of the hand's surface by which two postures are compared, spread evenly over it.
+#: Points of the hand's surface that compare two postures, spread evenly over it.
 POINTS: Final = 64
-#: Pairs of grasps that are compared at a time.
+#: Pairs of grasps compared at a time.
 _PAIRS: Final = 4096
-#: Grasps of which all pairs are looked at: SciPy, whose tree finds the near ones of many, is slow to load.
+#: Largest set whose pairs are all compared: SciPy, whose tree finds the near pairs of many, is slow to load.
 FEW: Final = 256
 
 
 def explained_variance(posture: Posture) -> Floats:
-    """Share of variance along each principal component of (translation, rotation vector, joints), largest first.
+    """Compute the explained variance of (translation, rotation vector, joints), largest first.
 
-    Diversity D is the first entry: near 1 all grasps lie on a line of variants, lower is more diverse. Columns are
-    taken as they are (metres and radians), as DexGraspBench does. Empty for fewer than 2 grasps.
+    The entries are shares of variance along the principal components. Diversity D is the first entry: near 1 all grasps
+    lie on a line of variants, lower is more diverse. Units stay metres and radians, as in DexGraspBench. Empty for
+    fewer than 2 grasps.
     """
     if len(posture) < 2:
         return np.zeros(0)
@@ -41,10 +41,10 @@ def explained_variance(posture: Posture) -> Floats:
 
 
 def hand_points(hand: HandModel, posture: Posture) -> Floats:
-    """(N, P, 3) where the same `POINTS` points of the hand's surface are in N postures, object frame [m].
+    """Return the positions (N, P, 3) of the same `POINTS` surface points in N postures, object frame [m].
 
-    The distance of two grasps is the mean distance of these points: a metric over the hand's pose and joints together,
-    in metres, in which a joint counts by what it moves. What an object's symmetry makes alike is not alike here.
+    The distance of two grasps is the mean distance of these points [m]. This metric joins the hand's pose and joints
+    and weighs a joint by the motion it causes. It does not identify grasps that an object's symmetry makes equivalent.
     """
     points = sample_surface(hand, POINTS)
     poses = body_poses(hand, posture.hand_pose, posture.joint_positions)
@@ -52,14 +52,14 @@ def hand_points(hand: HandModel, posture: Posture) -> Floats:
 
 
 def distances(points: Floats, one: NDArray[np.intp], other: NDArray[np.intp]) -> Floats:
-    """(K,) distance of the grasps `one` from `other` (K,), rows of what `hand_points` gives [m]."""
+    """Compute distances (K,) of grasps `one` from `other` (K,), rows of the result of `hand_points` [m]."""
     parts = [slice(i, i + _PAIRS) for i in range(0, len(one), _PAIRS)]
     found = [np.linalg.norm(points[one[part]] - points[other[part]], axis=2).mean(axis=1) for part in parts]
     return np.concatenate([np.zeros(0), *found])
 
 
 def nearest(points: Floats) -> float | None:
-    """Distance of the two grasps that are nearest to each other, of N (N, P, 3) [m]; None of fewer than two."""
+    """Return the least distance between two of N grasps (N, P, 3) [m]; None for fewer than two."""
     if len(points) < 2:
         return None
     from scipy.spatial import cKDTree
@@ -67,7 +67,7 @@ def nearest(points: Floats) -> float | None:
     middles = cKDTree(points.mean(axis=1))
     near = np.asarray(middles.query(middles.data, k=2)[1])
     rows = np.arange(len(points))
-    # With twins of a middle the first neighbour need not be the point itself.
+    # With equal mean points the first neighbour need not be the point itself.
     bound = float(distances(points, rows, np.where(near[:, 0] == rows, near[:, 1], near[:, 0])).min())
     # The mean distance of points is at least the distance of their means.
     pairs = middles.query_pairs(bound, output_type="ndarray")
@@ -75,12 +75,12 @@ def nearest(points: Floats) -> float | None:
 
 
 def distinct(points: Floats, least: float, *, given: int = 0) -> NDArray[np.bool_]:
-    """(N,) grasps to keep so that no two are nearer than `least` [m]: each that is not near to one kept before it.
+    """Select grasps (N,) so that no two are closer than `least` [m], in order.
 
     Args:
         points: (N, P, 3) of `hand_points`.
-        least: least distance; 0 keeps all.
-        given: so many of the first are kept whatever is near them.
+        least: least distance; 0 selects all.
+        given: number of first grasps that are always selected.
     """
     kept = np.ones(len(points), bool)
     if least <= 0 or len(points) < 2:
@@ -96,7 +96,7 @@ def distinct(points: Floats, least: float, *, given: int = 0) -> NDArray[np.bool
 
 
 def _near(places: Floats, reach: float) -> NDArray[np.intp]:
-    """(K, 2) pairs of places (N, 3), the lower number first, that are no farther apart than `reach` [m]."""
+    """Return pairs (K, 2) of places (N, 3) within `reach` [m] of each other, the lower index first."""
     if len(places) > FEW:
         from scipy.spatial import cKDTree
 
@@ -114,13 +114,13 @@ def _rotation_vector(quaternion: Floats) -> Floats:
 
 
 def approach_cells(hand: HandModel, quaternions: NDArray[np.float64]) -> NDArray[np.int32]:
-    """(B,) cell from which the palm comes in B grasps, of which the root's quaternions (B, 4) are given."""
+    """Return the approach cells (B,) of B grasps from the root's quaternions (B, 4)."""
     return cells_of(-quat_rotate(quaternions, hand.palm.approach)).astype(np.int32)
 
 
 def cells_of(directions: NDArray[Any], bands: int = BANDS, sectors: int = SECTORS) -> NDArray[np.int64]:
-    """(N,) cell of unit vectors (N, 3): band times `sectors` plus sector; band 0 is the lowest, sector 0 begins at
-    azimuth -180 degrees."""
+    """Return the cells (N,) of unit vectors (N, 3): band times `sectors` plus sector.
+    Band 0 is the lowest; sector 0 begins at azimuth -180 degrees."""
     z = np.clip(directions[:, 2], -1.0, 1.0)
     azimuth = np.arctan2(directions[:, 1], directions[:, 0])
     band = np.minimum((bands * (z + 1) / 2).astype(np.int64), bands - 1)

@@ -1,4 +1,4 @@
-"""The geometric gate: grasps that no verdict can save, because the hand is inside the object or inside itself."""
+"""The geometric gate: rejects grasps whose hand penetrates the object or itself, whatever the verdict."""
 
 from __future__ import annotations
 
@@ -8,28 +8,28 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-#: Deepest hand-object penetration [mm]: about what a finger pad gives under load, and a fifth of what the protocols of
-#: the field refuse (10 mm).
+#: Deepest hand-object penetration [mm]: about the deformation of a finger pad under load, and a fifth of the limit of
+#: the field's protocols (10 mm).
 MAX_PENETRATION_MM: Final = 2.0
 #: Deepest hand-hand penetration [mm]: collision shapes of neighbouring links overlap by this much in real hand models.
 MAX_SELF_PENETRATION_MM: Final = 3.0
-#: Links in contact: one link cannot hold anything against gravity from every side.
+#: Links in contact: a single link cannot hold anything against gravity from every side.
 MIN_CONTACT_LINKS: Final = 2
 
 
-#: The gates by name, in their order.
+#: Names of the gates, in order.
 GATES: Final = ("penetration", "self_penetration", "contacts")
 
 
 def failed_gate(quality: Mapping[str, NDArray[Any]]) -> list[str]:
-    """Of each of N grasps the first gate that it does not pass; of one that passes all, the last."""
+    """Return the first gate that each of N grasps fails; the last for a grasp that passes all."""
     deep = ~(quality["quality/penetration_depth_mm"] <= MAX_PENETRATION_MM)
     itself = ~(quality["quality/self_penetration_depth_mm"] <= MAX_SELF_PENETRATION_MM)
     return [GATES[0 if one else 1 if two else 2] for one, two in zip(deep, itself, strict=True)]
 
 
 def passes(quality: Mapping[str, NDArray[Any]]) -> NDArray[np.uint8]:
-    """1 for each of the N grasps that passes, else 0; a grasp with a nan does not."""
+    """Return 1 for each of N grasps that passes, else 0; a grasp with a nan does not pass."""
     ok = (
         (quality["quality/penetration_depth_mm"] <= MAX_PENETRATION_MM)
         & (quality["quality/self_penetration_depth_mm"] <= MAX_SELF_PENETRATION_MM)

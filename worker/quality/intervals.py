@@ -1,4 +1,4 @@
-"""How far a measured share can be trusted."""
+"""Confidence intervals of measured shares."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _Z: Final = 1.959963984540054
 
 
 def wilson(part: int, whole: int) -> tuple[float, float]:
-    """95 % interval of a share (Wilson 1927): of none or all, where a bootstrap sees no spread, it is not empty.
+    """Return the 95 % interval of a share (Wilson 1927); not empty for 0 and 1, unlike a bootstrap's.
 
     Raises:
         ValueError: `whole` is 0, or less than `part`.
@@ -22,9 +22,9 @@ def wilson(part: int, whole: int) -> tuple[float, float]:
 
 
 def wilson_of_mean(total: float, count: int) -> tuple[float, float]:
-    """95 % interval of the mean of `count` values from 0 to 1 that sum up to `total`.
+    """Return the 95 % interval of the mean of `count` values from 0 to 1 that sum to `total`.
 
-    Wilson's for a share: no values from 0 to 1 spread more than zeros and ones do, so it is wide enough.
+    It is Wilson's for a share: wide enough, since zeros and ones spread most among values from 0 to 1.
     """
     mean, grown = total / count, 1 + _Z**2 / count
     middle = (mean + _Z**2 / (2 * count)) / grown

@@ -15,16 +15,16 @@ from graspd.worker.simulation.device import to_xyzw
 from graspd.worker.simulation.kernels import crossing as kernels
 from graspd.worker.simulation.launches import launch
 
-#: Planes are told apart by so many digits [m, and of unit normals].
+#: Planes are distinguished by so many digits [m, and of unit normals].
 _DIGITS: Final = 7
 
 
 class Overlap:
-    """The pieces of a hand against a closed object, by a feasible test: a piece that is left out shares nothing with
-    it.
+    """Conservative overlap test of a hand's pieces with a closed object.
 
-    No face of the object reaches into such a piece, no corner of it is in the object, and nothing of the object in it.
-    Faces that only a plane through two edges would part from a piece count as reaching into it.
+    A piece is excluded only if it shares no volume: no face of the object reaches into it, none of its corners is in
+    the object, and nothing of the object is in it. A face also counts if only a plane through
+    two edges would separate it.
     """
 
     def __init__(self, hand: HandModel, probe: Probe) -> None:
@@ -36,7 +36,7 @@ class Overlap:
         self._solids = _solids(hand.pieces)
 
     def of(self, found: Distances, near: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """(B, P) pieces that may share volume with the object, among those that are `near` (B, P)."""
+        """Return the pieces (B, P), among those that are `near` (B, P), that may share volume with the object."""
         row, piece = np.nonzero(near)
         if not len(row):
             return near
@@ -49,7 +49,7 @@ class Overlap:
         return out
 
     def _crossed(self, piece: NDArray[np.intp], poses: Floats) -> NDArray[np.bool_]:
-        """(K,) pieces that a face of the object may reach into, their bodies at poses (K, 7)."""
+        """Check (K,) whether a face of the object may reach into pieces, with their bodies at poses (K, 7)."""
         centre = self._probe.obj.centre_of_mass
         given = np.concatenate([poses[:, :3] - centre, to_xyzw(poses[:, 3:])], axis=1)
         with wp.ScopedDevice("cpu"):
@@ -80,21 +80,21 @@ def _solids(pieces: tuple[ConvexPiece, ...]) -> Any:
 
 
 def _planes(piece: ConvexPiece) -> Floats:
-    """(F, 4) planes n x <= d of a piece's faces, each once; every corner is below all of them."""
+    """Return the distinct planes (F, 4) n x <= d of a piece's faces; every corner is below all of them."""
     a, b, c = (piece.vertices[piece.faces[:, k]] for k in range(3))
     normal = np.cross(b - a, c - a)
     length = np.linalg.norm(normal, axis=1)
     normal = normal[length > 0] / length[length > 0, None]
     offset = (normal @ piece.vertices.T).max(axis=1)
-    # One of planes that are the same but for rounding, itself unrounded.
+    # One of the planes that are equal except for rounding, itself unrounded.
     _, first = np.unique(np.round(np.column_stack([normal, offset]), _DIGITS), axis=0, return_index=True)
     return np.column_stack([normal, offset])[first]
 
 
 def penetration_depth(found: Distances) -> Floats:
-    """(B,) deepest penetration, asked from both sides: hand points in the object, object points in the hand [m].
+    """Return the deepest penetration (B,), of hand points in the object and object points in the hand [m].
 
-    One side alone is blind: a thin wall passes between hand points, a small fingertip between object points.
+    One direction alone is blind: a thin wall passes between hand points, a small fingertip between object points.
     """
     hand_in_object = np.maximum(0.0, -found.distance).max(axis=1)
     object_in_hand = np.maximum(0.0, -found.piece_distance).max(axis=1)

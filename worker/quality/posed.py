@@ -1,4 +1,4 @@
-"""Hands posed on a device, in double precision, and what the kernels of postures know of a hand and an object."""
+"""Posed hands on a device, in double precision, and the kernels' data of a hand and an object."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from graspd.worker.simulation.device import PosedBodies, chain_of, room_for_bodi
 from graspd.worker.simulation.kernels import balance, jamming, opening, optimizers, touching
 from graspd.worker.simulation.launches import launch
 
-#: Points that one thread of the CPU works on, and hands that are worked on at a time: what they take fits the cache.
+#: Points per CPU thread, and hands at a time: their data fits the cache.
 CPU_LANE: Final = 64
 CPU_HANDS: Final = 128
 #: Hands at a time on a GPU.
@@ -31,7 +31,7 @@ GPU_HANDS: Final = 4096
 
 @dataclass(frozen=True)
 class PostureData:
-    """A hand and an object as the kernels of postures see them."""
+    """Device data of a hand and an object for the posture kernels."""
 
     probe: Probe
     chain: Any
@@ -39,7 +39,7 @@ class PostureData:
     effort: Any
     """(D,)"""
     finger: Any
-    """(L,) of each body, -1: none."""
+    """(L,) finger of each body, -1: none."""
     fingers: int
 
     @classmethod
@@ -71,36 +71,36 @@ class PostureData:
 
     @property
     def lane(self) -> int:
-        """Points of a hand that one thread works on."""
+        """Points of a hand per thread."""
         return 1 if self.is_cuda else CPU_LANE
 
     @property
     def lanes(self) -> int:
-        """Threads that the points of a hand take."""
+        """Threads per hand."""
         return -(-len(self.probe.points) // self.lane)
 
     @property
     def at_once(self) -> int:
-        """Hands that are worked on at a time."""
+        """Hands processed at a time."""
         return GPU_HANDS if self.is_cuda else CPU_HANDS
 
     def parts(self, count: int) -> list[slice]:
-        """Slices of so many hands that are worked on one after the other."""
+        """Return slices of `count` hands, to be processed one after the other."""
         return [slice(i, min(i + self.at_once, count)) for i in range(0, count, self.at_once)]
 
     def bodies(self, count: int) -> Any:
-        """Room for the bodies of so many hands."""
+        """Allocate the bodies of `count` hands."""
         with wp.ScopedDevice(self.device):
             return room_for_bodies(self.hand, count)
 
     def roots(self, hand_pose: Floats) -> tuple[Any, Any]:
-        """Positions about the object's centre of mass, and rotations, of hands' roots (n, 7)."""
+        """Return positions about the object's centre of mass, and rotations, of hands' roots (n, 7)."""
         with wp.ScopedDevice(self.device):
             position = wp.array(hand_pose[:, :3] - self.probe.obj.centre_of_mass, dtype=wp.vec3d)
             return position, wp.array(to_xyzw(hand_pose[:, 3:]), dtype=wp.quatd)
 
     def touch(self, posture: Posture, reach: float) -> tuple[Any, Any]:
-        """Bodies of posed hands, and what is near their points, within `reach` [m]."""
+        """Return the bodies of posed hands, and the object's surface within `reach` [m] of their points."""
         count = len(posture)
         root = np.array(posture.hand_pose, float)
         root[:, :3] -= self.probe.obj.centre_of_mass
@@ -118,16 +118,16 @@ class PostureData:
         return bodies, near
 
     def touching_links(self, posture: Posture) -> NDArray[np.int32]:
-        """(N,) bodies of posed hands with points nearer to the object than `LINK_CONTACT_M`; the quality table, which
-        looks from both sides, finds as many or more."""
+        """Count (N,) bodies of posed hands with points closer to the object than `LINK_CONTACT_M`.
+        The quality table, which also tests object points, finds at least as many."""
         return contact_links(self._gaps(posture, LINK_CONTACT_M, self.points.body.numpy()))
 
     def finger_gaps(self, posture: Posture, reach: float) -> Floats:
-        """(N, F) least distance of each finger's points from the object, at most `reach` [m]."""
+        """Return the least distance (N, F) of each finger's points from the object, at most `reach` [m]."""
         return self._gaps(posture, reach, self.finger.numpy()[self.points.body.numpy()])
 
     def _gaps(self, posture: Posture, reach: float, part: NDArray[np.int32]) -> Floats:
-        """(N, P) the same of points of each part that `part` (points,) tells; -1: of none."""
+        """Return the same (N, P) for points grouped by `part` (points,); -1: ignored."""
         parts = distinct_values(part[part >= 0])
         found = np.full((len(posture), len(parts)), reach)
         for rows in self.parts(len(posture)):
@@ -152,7 +152,7 @@ _lock = threading.Lock()
 
 
 def posing_of(hand: HandModel, obj: ObjectModel, *, points: int, device: str = "cpu") -> PostureData:
-    """The pair on a device, with so many hand points; from memory where it was used lately."""
+    """Return the pair on a device with `points` hand points, cached in memory."""
     key = (hand.content, obj.content, points, device)
     with _lock:
         if key not in _posings:

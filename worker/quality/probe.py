@@ -27,14 +27,14 @@ from graspd.worker.simulation.kernels import distance as kernels
 from graspd.worker.simulation.launches import launch
 from graspd.worker.simulation.sampling import object_samples
 
-#: Hand points that contact area and penetration are measured with; the optimiser's own points use other seeds.
+#: Hand points that measure contact area and penetration; the optimiser's own points use other seeds.
 HAND_POINTS: Final = 2000
 OBJECT_POINTS: Final = 3000
 #: Held-out sample: a metric must not be measured at the very points that were optimised.
 SEED: Final = 7919
-#: Distances beyond this are reported as this [m].
+#: Distances are capped at this [m].
 REACH_M: Final = 0.012
-#: Cells along the longest side of the grid that tells which points are beyond reach.
+#: Cells along the longest side of the grid that finds points beyond reach.
 COARSE_CELLS: Final = 32
 #: Hand and object normals of a contact are opposite to within 60 degrees.
 FACING_COS: Final = -0.5
@@ -42,7 +42,7 @@ FACING_COS: Final = -0.5
 
 @dataclass(frozen=True)
 class NearestPoints:
-    """Where the hand points of B grasps are and what of the object is near them; in the object frame, metres."""
+    """Hand points of B grasps and the object's surface near them; object frame, metres."""
 
     bodies: Floats
     """(B, L, 7) poses of the bodies."""
@@ -51,25 +51,25 @@ class NearestPoints:
     hand_normals: Floats
     """(B, N, 3) outward unit normals of the hand at its points."""
     distance: Floats
-    """(B, N) signed distance of hand points to the object, at most the reach asked for."""
+    """(B, N) signed distance of hand points to the object, at most the requested reach."""
     closest: Floats
     """(B, N, 3) closest points on the object."""
     normal: Floats
-    """(B, N, 3) gradient of the distance: the object's outward unit normal, seen from the point; 0 beyond reach."""
+    """(B, N, 3) gradient of the distance: the object's outward unit normal at the point; 0 beyond reach."""
 
 
 @dataclass(frozen=True)
 class Distances(NearestPoints):
-    """The same, and what else touches; P pieces."""
+    """Nearest points, and distances of P pieces and of the hand from itself."""
 
     piece_distance: Floats
-    """(B, P) least distance of an object point to each piece, at most `REACH_M`; negative: the point is inside."""
+    """(B, P) least distance of an object point to each piece, at most `REACH_M`; negative: inside."""
     self_depth: Floats
     """(B,) deepest hand point inside another, non-neighbouring body."""
 
 
 class Probe:
-    """A (hand, object) pair made ready once for distance queries. Safe to use from several threads."""
+    """A (hand, object) pair prepared for distance queries. Thread-safe."""
 
     def __init__(
         self,
@@ -87,7 +87,7 @@ class Probe:
         self._piece_body = np.array([p.body for p in hand.pieces], np.intp)
         self._piece_frame = np.array([_kernel_frame(p.kind, p.pose, p.vertices) for p in hand.pieces])
         with wp.ScopedDevice(device):
-            # Loading here keeps threads from compiling the same module at once.
+            # Loading here prevents threads from compiling the same module at once.
             wp.load_module(module=kernels, device=device)
             self._body = wp.array(self.points.body, dtype=wp.int32)
             self.body_points = _by_body(self.points, hand.bodies)
@@ -125,7 +125,7 @@ class Probe:
                 return {"coarse": self._query(points.reshape(-1, 3))[0].reshape(counts).astype(np.float32)}
 
             if wp.get_device().is_cpu:
-                # Every process asks for it first of all, and it follows from the object alone.
+                # Cached on disk: every process needs it first of all, and it depends on the object alone.
                 terms = (obj.content, binary_name(kernels))
                 kept = arrays_kept_or_made(
                     "coarse_grids", terms, (sys.modules[__name__],), make, fits=lambda kept: _is_grid(kept, counts)
@@ -143,8 +143,8 @@ class Probe:
         return float(np.sqrt(0.5 * np.linalg.norm(cross, axis=1).sum() / len(self.samples)))
 
     def signed_distance(self, points: Floats, *, reach: float = REACH_M) -> tuple[Floats, Floats, Floats]:
-        """Signed distance (P,), at most `reach`, closest point (P, 3), outward normal (P, 3) of points (P, 3) in the
-        object frame; those beyond reach are their own closest points or not, with normal 0 or not."""
+        """Return signed distance (P,), closest point (P, 3) and outward normal (P, 3) of points (P, 3).
+        Object frame; distances at most `reach`. Closest point and normal of points beyond reach are undefined."""
         distance, closest, normal = self._query(points, reach)
         return np.minimum(distance, reach), closest, normal
 
@@ -160,8 +160,9 @@ class Probe:
         return distance.numpy().astype(float), place, normal.numpy().astype(float)
 
     def body_gaps(self, hand_pose: Floats, joint_positions: Floats, *, reach: float = REACH_M) -> Floats:
-        """(P, L) least signed distance of each body's points from the object in P postures, at most `reach`; inf
-        where a body has none: as `signed_distance` of `posed_points` tells it, for many postures."""
+        """Return the least signed distance (P, L) of each body's points from the object in P postures.
+        At most `reach`; inf where a body has no points. Equals `signed_distance` of `posed_points`, for many
+        postures."""
         posed, shape = (
             PosedBodies.of(self.hand, hand_pose, joint_positions, self.device),
             (len(hand_pose), self.hand.bodies),
@@ -173,12 +174,12 @@ class Probe:
         return gap.numpy().astype(float)
 
     def posed_points(self, bodies: Floats) -> Floats:
-        """(B, N, 3) hand points in the object frame for body poses (B, L, 7)."""
+        """Return hand points (B, N, 3) in the object frame for body poses (B, L, 7)."""
         body, position = self.points.body, self.points.position
         return _turned(bodies, body, position) + bodies[:, body, :3]
 
     def touch(self, posture: Posture, *, reach: float = REACH_M) -> NearestPoints:
-        """What of the object is near the hand points of B postures, within `reach` [m]."""
+        """Return the object's surface near the hand points of B postures, within `reach` [m]."""
         bodies = body_poses(self.hand, posture.hand_pose, posture.joint_positions)
         points = self.posed_points(bodies)
         shape = points.shape[:2]
@@ -193,7 +194,7 @@ class Probe:
         )
 
     def measure(self, posture: Posture) -> Distances:
-        """All distances of B postures."""
+        """Measure all distances of B postures."""
         found = self.touch(posture)
         return Distances(
             **vars(found),
@@ -202,13 +203,13 @@ class Probe:
         )
 
     def facing(self, found: NearestPoints) -> NDArray[np.bool_]:
-        """(B, N) points whose hand surface looks at the object: only there can it press."""
+        """Return the points (B, N) whose hand surface faces the object: only there can it press."""
         cosine = np.einsum("bni,bni->bn", found.hand_normals, found.normal)
         facing: NDArray[np.bool_] = cosine < FACING_COS
         return facing
 
     def body_distance(self, found: Distances) -> Floats:
-        """(B, L) least distance between each body and the object, from both sides' points [m]."""
+        """Return the least distance (B, L) between each body and the object, from points of both [m]."""
         least = np.full((len(found.bodies), self.hand.bodies), REACH_M)
         for body in range(self.hand.bodies):
             mine = self.points.body == body
@@ -220,7 +221,7 @@ class Probe:
         return least
 
     def self_depth(self, bodies: Floats, points: Floats) -> Floats:
-        """(B, L) depth of each body in others whose contact counts, or of others in it [m]."""
+        """Return the depth (B, L) of each body in others with counted contact, or of others in it [m]."""
         with wp.ScopedDevice(self.device):
             own = wp.array(points - self.obj.centre_of_mass, dtype=wp.vec3)
             depth = wp.zeros((len(bodies), self.hand.bodies), dtype=wp.float32)
@@ -237,7 +238,7 @@ class Probe:
         return least.numpy().astype(float)
 
     def _posed_pieces(self, bodies: Floats) -> list[Any]:
-        """The pieces with their positions and rotations, as the kernels take them."""
+        """Return the pieces with positions and rotations in the kernels' layout."""
         frames = compose(bodies[:, self._piece_body], self._piece_frame[None])
         with wp.ScopedDevice(self.device):
             position: Any = wp.array(frames[..., :3] - self.obj.centre_of_mass, dtype=wp.vec3)
@@ -246,14 +247,14 @@ class Probe:
 
 
 def _turned(bodies: Floats, body: NDArray[np.integer[Any]], vectors: Floats) -> Floats:
-    """(B, N, 3) vectors (N, 3) of the bodies (N,), turned as the bodies are."""
+    """Rotate vectors (N, 3) of the bodies (N,) with them; return (B, N, 3)."""
     rotation = quat_to_matrix(bodies[..., 3:])
     turned: Floats = np.einsum("bnij,nj->bni", rotation[:, body], vectors)
     return turned
 
 
 def _by_body(points: SurfacePoints, bodies: int) -> Any:
-    """Points of a hand as `kernels.distance.BodyPoints`, on the present device."""
+    """Return points of a hand as `kernels.distance.BodyPoints`, on the current device."""
     order = np.argsort(points.body, kind="stable")
     first = np.searchsorted(points.body[order], np.arange(bodies + 1))
     position, middle, extent = points.position[order], np.zeros((bodies, 3)), np.zeros(bodies)
@@ -261,7 +262,7 @@ def _by_body(points: SurfacePoints, bodies: int) -> Any:
         mine = position[first[body] : first[body + 1]]
         if len(mine):
             middle[body] = (mine.min(axis=0) + mine.max(axis=0)) / 2
-            # A hair more than the farthest: kernels round.
+            # Slightly more than the farthest: kernels round.
             extent[body] = np.linalg.norm(mine - middle[body], axis=1).max() + 1e-6
     out = kernels.BodyPoints()
     out.first, out.position = wp.array(first, dtype=wp.int32), wp.array(position, dtype=wp.vec3d)
@@ -270,7 +271,7 @@ def _by_body(points: SurfacePoints, bodies: int) -> Any:
 
 
 def _kernel_frame(kind: str, pose: Floats, vertices: Floats) -> Floats:
-    """Pose of a piece's frame as the kernels have it: a hull's stands in the middle of its box."""
+    """Return the pose of a piece's frame in the kernels: a hull's is at the centre of its box."""
     if kind != "hull":
         return pose
     middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
@@ -278,7 +279,7 @@ def _kernel_frame(kind: str, pose: Floats, vertices: Floats) -> Floats:
 
 
 def _is_grid(kept: Mapping[str, NDArray[Any]], counts: Sequence[int]) -> bool:
-    """Whether what was kept can be the coarse grid of so many nodes a side."""
+    """Check whether a cached array can be the coarse grid with so many nodes per side."""
     return set(kept) == {"coarse"} and kept["coarse"].shape == tuple(counts) and kept["coarse"].dtype == np.float32
 
 
@@ -287,7 +288,7 @@ _lock = threading.Lock()
 
 
 def probe_of(hand: HandModel, obj: ObjectModel, *, hand_points: int, object_points: int, device: str = "cpu") -> Probe:
-    """The probe of a pair, from memory where it was used lately."""
+    """Return the probe of a pair, cached in memory."""
     key = (hand.content, obj.content, hand_points, object_points, device)
     with _lock:
         probe = _probes.get(key)

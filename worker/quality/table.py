@@ -1,17 +1,16 @@
-"""The quality table: every metric of every grasp of one hand on one object, and the type of each grasp.
+"""The quality table: every metric of every grasp of one hand on one object, and the grasp types.
 
-Types are those of Napier (1956) and of the GRASP taxonomy (Feix et al., IEEE THMS 2016), told by the opposition that
+Types are those of Napier (1956) and of the GRASP taxonomy (Feix et al., IEEE THMS 2016), decided by the opposition that
 Iberall (1987) found in them:
 
-    power      palm opposition: the palm touches, or two digits at least wrap: they touch with more than their last
-               links, and not by a side
-    lateral    side opposition: half at least of the digits that touch do so by a side
-    precision  pad opposition: all others in which two digits touch
+    power      palm opposition: the palm touches, or at least two digits wrap: they touch with more than their last
+    links, and not by a side lateral    side opposition: at least half of the touching digits do so by a side precision
+    pad opposition: all others in which two digits touch
 
-They are asked in this order. A *digit* is a chain of bodies that ends in a fingertip; all other bodies
-are palm. A digit touches *by a side* where more than half of its surface within 2 mm of the object looks along the axis
-of its flexion, to within 45 degrees. Robots have other hands than people: a jaw has no side, so a gripper's grasps are
-of precision, or of power where its palm touches.
+They are tested in this order. A *digit* is a chain of bodies that ends in a fingertip; all other bodies are palm. A
+digit touches *by a side* if more than half of its surface within 2 mm of the object faces along the axis of its
+flexion, within 45 degrees. A jaw has no side, so a gripper's grasps are of type precision, or power where its palm
+touches.
 """
 
 from __future__ import annotations
@@ -57,12 +56,12 @@ Columns = dict[str, NDArray[np.generic]]
 #: Contact thresholds [m]: the literature's tight one, the paper's (Table 2), and DDGC's.
 DEFAULT_THRESHOLDS_M: Final = (0.002, 0.005, 0.009)
 DEFAULT_FRICTION: Final = 1.0
-#: Grasps a thread works on at a time: small enough to cancel soon, large enough to fill a kernel launch.
+#: Grasps per thread at a time: small enough to cancel soon, large enough to fill a kernel launch.
 CHUNK: Final = 16
 
 
 class _Pair:
-    """What the chunks of tables of one pair share. Safe to use from several threads."""
+    """Data shared by the chunks of one pair's tables. Thread-safe."""
 
     def __init__(self, terms: _Terms) -> None:
         hand, obj = terms.hand, terms.obj
@@ -79,7 +78,7 @@ class _Pair:
         return {f"quality/{name}": measured(chunk) for name, measured in MEASURES.items()}
 
     def spaces(self, found: Distances) -> tuple[Floats, Floats]:
-        """(B, T) epsilon and volume of the wrench space of B grasps."""
+        """Return epsilon and volume (B, T) of the wrench spaces of B grasps."""
         near = self.probe.facing(found)[:, None] & (np.abs(found.distance)[:, None] < self.thresholds[:, None])
         chosen, count = spread_contacts(near, found.closest, found.normal, scale=self.obj.radius, limit=MAX_CONTACTS)
         rows = np.arange(len(chosen))[:, None, None]
@@ -101,7 +100,7 @@ class _Pair:
 
 _pairs: LRUCache[str, _Pair] = LRUCache(4)
 _lock = threading.Lock()
-# Solids that outlive the interpreter are told as leaks by their library.
+# Solids that outlive the interpreter are reported as leaks by their library.
 atexit.register(_pairs.clear)
 
 
@@ -116,7 +115,7 @@ def measure(
     every_volume: bool = False,
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> dict[str, NDArray[np.generic]]:
-    """Quality columns of a base shard for N grasps, at the posture of contact.
+    """Compute the quality columns of a base shard for N grasps, at the posture of contact.
 
     Args:
         hand: the hand.
@@ -125,16 +124,16 @@ def measure(
         friction: Coulomb coefficient of the wrench space.
         thresholds_m: T contact thresholds, at most `REACH_M` [m].
         norm: l1 (GraspIt!'s) or linf wrench space.
-        every_volume: the volume of the wrench space at all thresholds; else at the one that the index tells, and nan at
-            the others: a volume takes ten times as long as an epsilon.
-        run: told of grasps done; asked between chunks whether to stop.
+        every_volume: compute the volume at all thresholds; else only at the index's, nan at the others: a volume takes
+            ten times as long as an epsilon.
+        run: receives the number of finished grasps; polled for cancellation between chunks.
 
     Returns:
         `quality/...` datasets: those of `MEASURES`, the thresholds and the planner's stability loss.
 
     Raises:
         InputError: no thresholds, or one beyond `REACH_M`.
-        TaskCancelled: when `run.cancelled()` answers True.
+        TaskCancelled: `run.cancelled()` returned True.
     """
     thresholds = np.asarray(thresholds_m, float)
     if thresholds.ndim != 1 or not len(thresholds) or (thresholds <= 0).any() or (thresholds > REACH_M).any():
@@ -153,7 +152,7 @@ def measure(
 
 @dataclass(frozen=True)
 class _Terms:
-    """What is measured, and how."""
+    """Subject and terms of a measurement."""
 
     hand: HandModel
     obj: ObjectModel
@@ -164,7 +163,7 @@ class _Terms:
 
     @cached_property
     def pair(self) -> _Pair:
-        """Kept, since a batch is measured a few grasps at a time."""
+        """Cached, since a batch is measured a few grasps at a time."""
         content = content_of(self)
         with _lock:
             if content not in _pairs:
@@ -178,7 +177,7 @@ class _Terms:
 
 
 def _measured(terms: _Terms, postures: Sequence[Posture], done: Count, run: ExecutionContext) -> list[Columns]:
-    """The columns of each chunk, by threads or by the processes of a pool."""
+    """Measure the columns of each chunk, in threads or in the processes of a pool."""
     if run.pool is not None:
         return run.pool.map(
             _columns,
@@ -206,7 +205,7 @@ def _columns(terms: _Terms, posture: Posture) -> Columns:
 
 @dataclass(frozen=True)
 class _Chunk:
-    """Some grasps of a table, and what was found at them."""
+    """Some grasps of a table, and their distances."""
 
     pair: _Pair
     found: Distances
@@ -216,14 +215,14 @@ class _Chunk:
         return self.pair.spaces(self.found)
 
     def shared_volume(self) -> Floats:
-        # An object's face may enter a piece between two object points, half a diagonal of their grid away from either.
+        # A face of the object may enter a piece between two object points, half a diagonal of their grid from either.
         near = self.found.piece_distance < self.pair.probe.sample_spacing
         if self.pair.volume.exact:
             near = self.pair.overlap.of(self.found, near)
         return self.pair.volume.of(self.found.bodies, near)
 
 
-#: What is measured of B grasps: (B, T) if the metric is swept, else (B,). Rows of `GRASP_METRICS` tell their units.
+#: Metrics of B grasps: (B, T) if swept over thresholds, else (B,). `GRASP_METRICS` has their units.
 MEASURES: Final[dict[str, Callable[[_Chunk], NDArray[np.generic]]]] = {
     "contact_area_cm2": lambda chunk: contact_area_cm2(
         chunk.found.distance, chunk.pair.probe.points.area, chunk.pair.thresholds
@@ -240,12 +239,12 @@ MEASURES: Final[dict[str, Callable[[_Chunk], NDArray[np.generic]]]] = {
 
 #: Cosine between a digit's surface and its axis of flexion above which the surface is a side: 45 degrees.
 SIDE_COS: Final = float(np.sqrt(0.5))
-#: Digits that must touch with more than their last links where the palm is free.
+#: Digits that must touch with more than their last links where the palm does not touch.
 ENVELOPING: Final = 2
 
 
 def grasp_types(probe: Probe, found: Distances) -> NDArray[np.int32]:
-    """(B,) `GraspType` of B grasps."""
+    """Return the `GraspType` (B,) of B grasps."""
     hand = probe.hand
     finger = finger_of_body(hand)
     touching = probe.body_distance(found) < LINK_CONTACT_M
@@ -266,7 +265,7 @@ def grasp_types(probe: Probe, found: Distances) -> NDArray[np.int32]:
 def _by_sides(
     probe: Probe, found: Distances, finger: NDArray[np.int32], digits: NDArray[np.int32]
 ) -> NDArray[np.bool_]:
-    """(B, digits) whether more than half of what is near of a digit are its sides."""
+    """Check (B, digits) whether more than half of a digit's near points are on its sides."""
     points = probe.points
     near = np.where(np.abs(found.distance) < LINK_CONTACT_M, points.area, 0.0)
     side = np.abs(np.einsum("ni,ni->n", points.normal, _flexion(probe.hand)[points.body])) > SIDE_COS
@@ -275,8 +274,8 @@ def _by_sides(
 
 
 def _flexion(hand: HandModel) -> Floats:
-    """(L, 3) axis in the body's own frame about which a body closes; 0 where its joint does not close or turn."""
-    # A body turns about its joint's axis, which therefore stands still in it.
+    """Return the axis (L, 3) about which each body closes, in its own frame; 0: it does not close or turn."""
+    # A body turns about its joint's axis, which is therefore constant in its frame.
     bends = (hand.joint_type == JointType.REVOLUTE) & (hand.dof >= 0)
     bends &= np.where(hand.dof >= 0, hand.closing[hand.dof], 0.0) != 0
     return np.where(bends[:, None], hand.axis, 0.0)

@@ -15,14 +15,14 @@ from graspd.worker.hands.surface import piece_distance
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.quality.probe import Probe
 
-#: Edge of a voxel in the fallback [m]: the volume is off by at most half an edge times the shared volume's surface.
+#: Edge of a voxel in the fallback [m]: the error is at most half an edge times the shared volume's surface.
 VOXEL_M: Final = 5e-4
-#: Solids are built in millimetres: manifold3d keeps single precision, whose tolerance suits numbers around 100.
+#: Solids are built in millimetres: manifold3d uses single precision, whose tolerance suits numbers around 100.
 _UNIT: Final = 1e3
 
 
 class SharedVolume:
-    """Intersection volumes of one (hand, object) pair. Safe to use from several threads."""
+    """Intersection volumes of one (hand, object) pair. Thread-safe."""
 
     def __init__(self, hand: HandModel, obj: ObjectModel) -> None:
         self.hand, self.obj = hand, obj
@@ -36,11 +36,11 @@ class SharedVolume:
         return self._object is not None
 
     def of(self, bodies: Floats, near: NDArray[np.bool_]) -> Floats:
-        """Volume inside both the object and the union of the hand's pieces [cm^3].
+        """Compute the volume inside both the object and the union of the hand's pieces [cm^3].
 
         Args:
             bodies: (B, L, 7) body poses in the object frame.
-            near: (B, P) pieces that may intersect the object; the others are left out.
+            near: (B, P) pieces that may intersect the object; the others are ignored.
 
         Returns:
             (B,)
@@ -57,12 +57,12 @@ class SharedVolume:
         parts = [part for part in (self._object ^ solid for solid in posed) if not part.is_empty()]
         if not parts:
             return 0.0
-        # Parts rarely overlap, so their union is small work; the union of whole pieces would not be.
+        # Intersections rarely overlap, so their union is cheap; the union of whole pieces is not.
         whole = parts[0] if len(parts) == 1 else m3d.Manifold.batch_boolean(parts, m3d.OpType.Add)
         return float(whole.volume()) / _UNIT**3 * 1e6
 
     def _matrices(self, poses: Floats) -> Floats:
-        """(K, 3, 4) of body poses (K, 7), as manifold3d takes them."""
+        """Return the matrices (K, 3, 4) of body poses (K, 7) for manifold3d."""
         matrices = pose_to_matrix(poses)[:, :3]
         matrices[..., 3] = (matrices[..., 3] - self.obj.centre_of_mass) * _UNIT
         return matrices
@@ -81,7 +81,7 @@ class VoxelVolume:
         self._probe = Probe(hand, obj, hand_points=hand.bodies * 16, object_points=64)
 
     def volume_cm3(self, bodies: Floats, pieces: NDArray[np.intp]) -> float:
-        """Shared volume of the given pieces, posed by bodies (L, 7) [cm^3]."""
+        """Return the shared volume of the given pieces, posed by bodies (L, 7) [cm^3]."""
         low, high = self._box(bodies, pieces)
         if (high <= low).any():
             return 0.0

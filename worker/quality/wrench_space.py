@@ -1,12 +1,12 @@
-"""Grasp wrench space by the conventions of GraspIt! (Miller & Allen 2004): epsilon (Ferrari & Canny 1992) and volume.
+"""Grasp wrench space by the conventions of GraspIt! (Miller & Allen 2004): epsilon and volume.
 
-Each contact's friction cone is a pyramid of 8 edges with unit normal component, f = n + mu (cos a t1 + sin a t2); its
-torque about the centre of mass is divided by the object's largest radius. The L1 space is the convex hull of all edges
-(normal forces sum to at most 1), the L-infinity space the Minkowski sum of the contacts' pyramids with their apex
-(each at most 1).
+Epsilon follows Ferrari & Canny 1992. Each contact's friction cone is a pyramid of 8 edges with unit normal component, f
+= n + mu (cos a t1 + sin a t2); its torque about the centre of mass is divided by the object's largest radius. The L1
+space is the convex hull of all edges (normal forces sum to at most 1). The L-infinity space is the Minkowski sum of the
+contacts' pyramids with their apex (each at most 1).
 
-Epsilon is the radius of the largest ball around the origin inside the space, hence 0 where the origin is not inside
-(GraspIt! reports -1 there); flat spaces have epsilon 0 and volume 0.
+Epsilon is the radius of the largest ball around the origin inside the space: 0 where the origin is not inside (GraspIt!
+reports -1 there). Flat spaces have epsilon 0 and volume 0.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ from graspd.worker.simulation.launches import launch
 Norm = Literal["l1", "linf"]
 
 EDGES: Final = 8
-#: Least over largest singular value below which a set of wrenches is flat.
+#: Ratio of least to largest singular value below which a set of wrenches is flat.
 FLATNESS: Final = 1e-7
 #: Most contacts of an L-infinity space: its points grow ninefold with each.
 MAX_LINF_CONTACTS: Final = 4
-#: From this number of points on our own hull is the faster one.
+#: Number of points from which our own hull is faster.
 MANY: Final = 24
 
 
 def tangents(normals: Floats) -> tuple[Floats, Floats]:
-    """Two unit tangents (..., 3) each, t1 x t2 = n; along the coordinate axes where the normal is."""
+    """Return two unit tangents (..., 3), t1 x t2 = n; along the coordinate axes where the normal is."""
     n = np.asarray(normals, float)
     axis = np.eye(3)[np.argmin(np.abs(n), axis=-1)]
     t1 = cross(n, axis)
@@ -46,9 +46,9 @@ def tangents(normals: Floats) -> tuple[Floats, Floats]:
 def cone_edges(
     normals: Floats, friction: float, *, edges: int = EDGES, unit: Literal["normal", "force"] = "normal"
 ) -> Floats:
-    """(..., E, 3) edge forces of the friction pyramids about inward unit normals (..., 3).
+    """Return edge forces (..., E, 3) of the friction pyramids about inward unit normals (..., 3).
 
-    `unit` says what has length 1: the normal component (GraspIt!) or the force itself (FRoGGeR).
+    `unit` selects the part of length 1: the normal component (GraspIt!) or the force itself (FRoGGeR).
     """
     t1, t2 = tangents(normals)
     angle = 2 * np.pi * np.arange(edges) / edges
@@ -66,7 +66,7 @@ def wrenches(
     radius: float,
     edges: int = EDGES,
 ) -> Floats:
-    """(..., E, 6) edge wrenches: force, then torque about `centre` over `radius`.
+    """Return edge wrenches (..., E, 6): force, then torque about `centre` over `radius`.
 
     Args:
         points: (..., 3) contact points [m].
@@ -84,10 +84,10 @@ def wrenches(
 def measure_spaces(
     edge_wrenches: Floats, contacts: NDArray[np.integer], with_volume: NDArray[np.bool_], *, norm: Norm = "l1"
 ) -> tuple[Floats, Floats]:
-    """Epsilon and volume of many wrench spaces.
+    """Compute epsilon and volume of many wrench spaces.
 
     Args:
-        edge_wrenches: (S, N, E, D) edge wrenches; of each space the first `contacts` contacts are its own.
+        edge_wrenches: (S, N, E, D) edge wrenches; each space uses its first `contacts` contacts.
         contacts: (S,).
         with_volume: (S,) whether the volume is wanted: epsilon alone is as exact, in a tenth of the time.
         norm: l1 or linf.
@@ -113,7 +113,7 @@ def measure_spaces(
 
 
 def _measure_by_qhull(edge_wrenches: Floats, norm: Norm) -> tuple[float, float]:
-    """Epsilon and volume of contacts that our own hull does not take: few, flat ones, or too many."""
+    """Compute epsilon and volume where our own hull does not apply: few, flat, or too many contacts."""
     hull = _hull(_points(edge_wrenches, norm))
     if hull is None:
         return 0.0, 0.0
@@ -129,7 +129,7 @@ def _hull(points: Floats) -> Any:
 
     if len(points) <= points.shape[1] or _flat(points):
         return None
-    # Joggled input is fastest and simplicial; exact merging is for what defeats it.
+    # Joggled input is fastest and simplicial; exact merging is the fallback.
     for options in ("QJ", "Qt Qx"):
         try:
             return ConvexHull(points, qhull_options=options)
@@ -144,7 +144,7 @@ def _flat(points: Floats) -> bool:
 
 
 def _minkowski(edge_wrenches: Floats) -> Floats:
-    """Points whose hull is the Minkowski sum of the contacts' pyramids, each with its apex at the origin."""
+    """Return points whose hull is the Minkowski sum of the contacts' pyramids, with apexes at the origin."""
     contacts, _, dimension = edge_wrenches.shape
     if contacts > MAX_LINF_CONTACTS:
         raise InputError(
@@ -160,19 +160,19 @@ def _minkowski(edge_wrenches: Floats) -> Floats:
     return total
 
 
-#: Points are moved at random by this share of the largest coordinate, so that no 7 of them lie in one hyperplane. Less
-#: leaves slivers whose planes are rounding errors, more is an error itself; on cubes this one is off by 4e-8 in volume.
+#: Points are moved randomly by this share of the largest coordinate, so that no 7 of them lie in one hyperplane. Less
+#: leaves slivers whose planes are rounding errors, more is an error itself; on cubes the volume is off by 4e-8.
 JOGGLE: Final = 1e-8
-#: Facets that may live at once: 160 random points have some 13,000.
+#: Most facets alive at once: 160 random points have some 13,000.
 CAPACITY: Final = 40_000
 #: Entries of the hash table of ridges; one inserted point makes some thousands at most.
 _TABLE: Final = 1 << 16
 MAX_POINTS: Final = 512
 _DIMENSION: Final = 6
-#: A point that is above a plane by less than this share of the largest coordinate is on it: products of coordinates
-#: round by some 1e-15, and ε is off by no more than this.
+#: A point less than this share of the largest coordinate above a plane is on it: products of coordinates round by some
+#: 1e-15, and the error of ε is no larger than this.
 _ROUNDING: Final = 1e-13
-#: Least over greatest distance in a first simplex below which points count as flat.
+#: Ratio of least to greatest distance in a first simplex below which points count as flat.
 _FLAT: Final = 1e-6
 _LAST_STAMP: Final = 2**31 - 2 * MAX_POINTS
 
@@ -203,7 +203,7 @@ class _Workspace(threading.local):
         self.next_stamp = 1
 
     def stamps(self, count: int) -> int:
-        """First of `count` stamps that no entry of the table has."""
+        """Return the first of `count` stamps that no entry of the table has."""
         if self.next_stamp + count > _LAST_STAMP:
             self.hull.stamp.zero_()
             self.next_stamp = 1
@@ -216,18 +216,18 @@ _workspace = _Workspace()
 
 
 def measure_hulls(clouds: Floats, count: NDArray[np.integer], whole: NDArray[np.bool_]) -> tuple[Floats, Floats]:
-    """Inner radius and volume of many hulls, in one launch.
+    """Compute inner radius and volume of many hulls, in one launch.
 
     Args:
-        clouds: (H, P, 6) points, P at most `MAX_POINTS`; of each hull the first `count` are its own.
+        clouds: (H, P, 6) points, P at most `MAX_POINTS`; each hull uses its first `count`.
         count: (H,).
-        whole: (H,) whether the volume is wanted; where it is not, the hull is built only where it is nearest to the
-            origin, in a tenth of the time, and its radius is as exact.
+        whole: (H,) whether the volume is wanted; else the hull is built only where it is nearest to the origin, in a
+            tenth of the time, with an equally exact radius.
 
     Returns:
         (H,) distance of the nearest facet from the origin, at most 0 where the origin is outside; (H,) volume, nan
         where it is not wanted. Both nan where there is no closed hull: too few points, flat ones, or more facets than
-        `CAPACITY`; take another way.
+        `CAPACITY`; use another method.
     """
     radius, volume = np.full((2, len(clouds)), np.nan)
     some = np.flatnonzero(np.asarray(count) > _DIMENSION)
@@ -250,7 +250,7 @@ def measure_hulls(clouds: Floats, count: NDArray[np.integer], whole: NDArray[np.
 def _grown(
     points: Floats, count: NDArray[Any], whole: NDArray[np.bool_], corners: NDArray[np.intp], scale: Floats
 ) -> tuple[Floats, Floats]:
-    """(H,) radius and volume of hulls that begin with simplices (H, 7); nan where one is not feasible."""
+    """Grow hulls from simplices (H, 7); return radius and volume (H,), nan where a hull fails."""
     corner = np.take_along_axis(points, corners[..., None], axis=1)
     middle = corner.mean(axis=1)
     normal, offset = _planes(corner - middle[:, None])
@@ -283,7 +283,7 @@ def _grown(
 def _simplices(
     points: Floats, own: NDArray[np.bool_], count: NDArray[Any]
 ) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-    """(H, 7) points far apart, each the farthest from the flat through those before it; (H,) whether all are flat."""
+    """Return distant points (H, 7), each farthest from the flat through those before, and flat hulls (H,)."""
     rows = np.arange(len(points))
     mean = points.sum(axis=1) / count[:, None]
     far = np.where(own, ((points - mean[:, None]) ** 2).sum(axis=2), -1.0)
@@ -302,15 +302,15 @@ def _simplices(
 
 
 def _planes(corner: Floats) -> tuple[Floats, Floats]:
-    """(H, 7, 6) and (H, 7) planes of the facets of simplices (H, 7, 6) about the origin: facet i leaves out corner i.
+    """Return planes (H, 7, 6), (H, 7) of the facets of simplices (H, 7, 6) about the origin.
 
-    n x - d is minus 6! times the volume of the simplex that x makes with the facet: the barycentric coordinate of
-    corner i, times the determinant of the edges.
+    Facet i omits corner i. n x - d is minus 6! times the volume of the simplex of x and the facet: the barycentric
+    coordinate of corner i, times the determinant of the edges.
     """
     edges = corner[:, 1:] - corner[:, :1]
     size = np.abs(np.linalg.det(edges))[:, None, None]
     slope = np.swapaxes(np.linalg.inv(edges), 1, 2)
     normal = np.concatenate([slope.sum(axis=1, keepdims=True), -slope], axis=1) * size
-    # Facet 0 holds corner 1, every other facet corner 0.
+    # Facet 0 contains corner 1, every other facet corner 0.
     on = corner[:, [1, 0, 0, 0, 0, 0, 0]]
     return normal, np.einsum("hfi,hfi->hf", normal, on)

@@ -1,4 +1,4 @@
-"""What a camera sees of a scene, and pictures of grasps for people."""
+"""Camera views of scenes, and pictures of grasps for users."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ BACKGROUND, TABLE, OBJECT = 0, 1, 2
 
 
 def tight_boxes(segmentation: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """(V, 4) x_min y_min x_max y_max [px] around the visible object pixels of (V, H, W); nan where none is visible.
+    """Return boxes (V, 4) x_min y_min x_max y_max [px] of visible object pixels (V, H, W); nan: none.
 
     Edges are pixel edges: a single pixel (i, j) gives i, j, i + 1, j + 1.
     """
@@ -31,19 +31,20 @@ def tight_boxes(segmentation: NDArray[np.uint8]) -> NDArray[np.float32]:
 
 
 def loose_boxes(cameras: Cameras, points: Floats) -> NDArray[np.float32]:
-    """(V, 4) box around the projection of the object's vertices (V, P, 3), occluded or outside the picture or not."""
+    """Return boxes (V, 4) around the projections of the object's vertices (V, P, 3).
+    Occluded vertices and those outside the picture count too."""
     pixels, _ = cameras.project(points)
     return np.concatenate([pixels.min(axis=1), pixels.max(axis=1)], axis=1).astype(np.float32)
 
 
 def box_corners(vertices: Floats) -> Floats:
-    """(8, 3) corners of the object-aligned box; corner k takes the maximum of x, y, z where bit 0, 1, 2 of k is set."""
+    """Return the corners (8, 3) of the object-aligned box; bits 0, 1, 2 of k select maximum x, y, z."""
     bits = (np.arange(8)[:, None] >> np.arange(3)) & 1
     return np.where(bits, vertices.max(axis=0), vertices.min(axis=0))
 
 
 def in_camera(cameras: Cameras, points: Floats) -> Floats:
-    """Table-frame points (V, P, 3) in their camera frames (V, P, 3)."""
+    """Transform table-frame points (V, P, 3) to their camera frames (V, P, 3)."""
     return np.einsum("vij,vpj->vpi", cameras.extrinsics[:, :3, :3], points) + cameras.extrinsics[:, None, :3, 3]
 
 
@@ -51,7 +52,7 @@ ALL: Final = "all"
 
 
 def parse_channels(words: Iterable[str]) -> tuple[str, ...]:
-    """Channels in their fixed order, without repeats; `all` stands for every one.
+    """Return the channels in fixed order, without duplicates; `all` stands for every one.
 
     Raises:
         InputError: a channel is unknown.
@@ -64,17 +65,17 @@ def parse_channels(words: Iterable[str]) -> tuple[str, ...]:
 
 
 def ray_distance(depth: NDArray[np.float32], k: Floats) -> NDArray[np.float32]:
-    """(V, H, W) distance from the optical centre along the ray through each pixel's centre [m]; inf for nothing."""
+    """Return distances (V, H, W) from the optical centre along each pixel's ray [m]; inf: nothing."""
     stretch = np.linalg.norm(pixel_rays(k, depth.shape[2], depth.shape[1]), axis=-1)
     return (depth * stretch).astype(np.float32)
 
 
 def occlusion_ratio(segmentation: NDArray[np.uint8], alone: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """(V,) share of the object's pixels that something else hides; nan where the object is not in the picture.
+    """Return the occluded share (V,) of the object's pixels; nan: not in the picture.
 
     Args:
         segmentation: (V, H, W) labels of the whole scene.
-        alone: (V, H, W) where the object would be seen with nothing else in the scene.
+        alone: (V, H, W) pixels of the object with nothing else in the scene.
     """
     whole = alone.sum(axis=(1, 2)).astype(float)
     seen = (alone & (segmentation == OBJECT)).sum(axis=(1, 2))

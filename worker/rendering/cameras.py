@@ -1,7 +1,7 @@
-"""Pinhole cameras: where they stand, what they map to which pixel, and those of a caller's JSON file.
+"""Pinhole cameras: poses, projection, and cameras from a user's JSON file.
 
-Camera frame: x right, y down, z forward (OpenCV). Extrinsics E = [R | t] map table to camera: x_camera = R x + t.
-Pixel (column i, row j) covers [i, i + 1) x [j, j + 1): its centre is (i + 0.5, j + 0.5).
+Camera frame: x right, y down, z forward (OpenCV). Extrinsics E = [R | t] map table to camera: x_camera = R x + t. Pixel
+(column i, row j) covers [i, i + 1) x [j, j + 1): its centre is (i + 0.5, j + 0.5).
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ BASELINE_M: Final = 0.06
 ELEVATION: Final = (np.radians(18.0), np.radians(62.0))
 #: Share of the smaller field of view that the object's bounding ball fills.
 FILL: Final = (0.7, 1.0)
-#: Nearer than this a stereo pair no longer has the whole object in both pictures [m].
+#: Below this distance a stereo pair does not have the whole object in both pictures [m].
 NEAREST_M: Final = 0.25
-#: How far the optical axis passes from the object's middle, in bounding radii.
+#: Largest distance of the optical axis from the object's centre, in bounding radii.
 AIM_JITTER: Final = 0.15
 
 
 @dataclass(frozen=True)
 class Cameras:
-    """V cameras that share one picture size and one K."""
+    """V cameras with a common picture size and K."""
 
     width: int
     height: int
@@ -51,27 +51,28 @@ class Cameras:
         return -np.einsum("vji,vj->vi", rotation, translation)
 
     def project(self, points: Floats) -> tuple[Floats, Floats]:
-        """Pixel coordinates (V, P, 2) and depths (V, P) of table-frame points (P, 3) or (V, P, 3)."""
+        """Return pixel coordinates (V, P, 2) and depths (V, P) of table-frame points (P, 3) or (V, P, 3)."""
         points = np.broadcast_to(points, (len(self), *np.shape(points)[-2:]))
         camera = np.einsum("vij,vpj->vpi", self.extrinsics[:, :3, :3], points) + self.extrinsics[:, None, :3, 3]
         image = camera @ self.intrinsics.T
         return image[..., :2] / image[..., 2:], camera[..., 2]
 
     def unproject(self, depth: Floats) -> Floats:
-        """Table-frame points (V, H, W, 3) of forward depths (V, H, W) at pixel centres."""
+        """Return table-frame points (V, H, W, 3) of forward depths (V, H, W) at pixel centres."""
         camera = pixel_rays(self.intrinsics, self.width, self.height) * np.asarray(depth, float)[..., None]
         offset = camera - self.extrinsics[:, None, None, :3, 3]
         return np.einsum("vji,vhwj->vhwi", self.extrinsics[:, :3, :3], offset)
 
 
 def intrinsics(width: int, height: int, field_of_view: float = FIELD_OF_VIEW) -> Floats:
-    """K (3, 3) with square pixels and a centred principal point; `field_of_view` [rad] spans the picture's height."""
+    """Return K (3, 3) with square pixels and a centred principal point.
+    `field_of_view` [rad] spans the picture's height."""
     focal = 0.5 * height / np.tan(0.5 * field_of_view)
     return np.array([[focal, 0, 0.5 * width], [0, focal, 0.5 * height], [0, 0, 1.0]])
 
 
 def narrow_field(k: Floats, width: int, height: int) -> float:
-    """Opening angle of the widest cone around the optical axis that lies within the picture [rad].
+    """Return the opening angle of the widest cone around the optical axis within the picture [rad].
 
     Raises:
         InputError: the principal point lies outside the picture.
@@ -86,7 +87,7 @@ def narrow_field(k: Floats, width: int, height: int) -> float:
 
 
 def look_at(eye: Floats, target: Floats) -> Floats:
-    """Extrinsics (4, 4) of a camera at `eye` that looks at `target` with the table's z axis up in the picture."""
+    """Return extrinsics (4, 4) of a camera at `eye` that looks at `target`, the table's z axis up."""
     forward = np.asarray(target, float) - eye
     forward /= np.linalg.norm(forward)
     right = np.cross(forward, [0.0, 0.0, 1.0])
@@ -100,16 +101,17 @@ def look_at(eye: Floats, target: Floats) -> Floats:
 
 
 def distance_to_fill(radius: float, field_of_view: float, fill: float) -> float:
-    """Distance at which a ball of this radius fills the share `fill` of the field of view [m]."""
+    """Return the distance at which a ball of this radius fills the share `fill` of the field of view [m]."""
     return radius / float(np.sin(0.5 * fill * field_of_view))
 
 
 def sample_hemisphere(
     centre: Floats, radius: float, *, views: int, field_of_view: float, rng: np.random.Generator
 ) -> list[Floats]:
-    """Extrinsics of cameras on a hemisphere around a ball (centre [m], radius [m]) that fills the field of view [rad].
+    """Sample extrinsics of cameras around a ball (centre, radius [m]) that fills the field of view [rad].
 
-    Azimuths are stratified, one per sector of 360 / views degrees; elevations are uniform in area within `ELEVATION`.
+    They are on a hemisphere: azimuths are stratified, one per sector of 360 / views degrees; elevations are uniform in
+    area within `ELEVATION`.
     """
     turn = rng.uniform(0, 2 * np.pi)
     extrinsics = []
@@ -126,14 +128,14 @@ def sample_hemisphere(
 
 
 def stereo_pair(extrinsics: Floats, baseline: float) -> tuple[Floats, Floats]:
-    """Left and right eye of a rectified pair around a camera: the right one stands `baseline` [m] along camera +x."""
+    """Return left and right eye of a rectified pair; the right one is `baseline` [m] along camera +x."""
     left, right = extrinsics.copy(), extrinsics.copy()
     left[0, 3] += 0.5 * baseline
     right[0, 3] -= 0.5 * baseline
     return left, right
 
 
-#: Rotations of a file may be off by this: six digits are usual in JSON written by hand.
+#: Tolerance of rotations in a file: six digits are usual in JSON written by hand.
 ROTATION_ERROR: Final = 1e-5
 
 _Point = Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)]
@@ -143,17 +145,17 @@ _Row4 = Annotated[list[FiniteFloat], Field(min_length=4, max_length=4)]
 
 @dataclass(frozen=True)
 class GivenCameras:
-    """What is given; the rest is sampled or default."""
+    """Given cameras; missing values are sampled or default."""
 
     intrinsics: Floats | None = None
-    """(3, 3) K [px], one for all cameras."""
+    """(3, 3) K [px], common to all cameras."""
     extrinsics: Floats | None = None
     """(C, 4, 4) table to camera, the same in every scene."""
     width: int | None = None
     height: int | None = None
 
 
-#: Default intrinsics, sampled places.
+#: Default intrinsics, sampled poses.
 SAMPLED: Final = GivenCameras()
 
 
@@ -189,13 +191,13 @@ class _File(_Model):
 
 
 def read_cameras(path: Path) -> GivenCameras:
-    """Cameras of a JSON file.
+    """Load cameras from a JSON file.
 
-    All keys are optional: `width`, `height` [px]; `intrinsics`, a 3 x 3 matrix or `fx fy cx cy` [px]; `cameras`, a
-    list of `{"extrinsics": 4 x 4}` (table to camera) or `{"eye": [x, y, z], "target": [x, y, z]}` (table frame [m]).
+    All keys are optional: `width`, `height` [px]; `intrinsics`, a 3 x 3 matrix or `fx fy cx cy` [px]; `cameras`, a list
+    of `{"extrinsics": 4 x 4}` (table to camera) or `{"eye": [x, y, z], "target": [x, y, z]}` (table frame [m]).
 
     Raises:
-        InputError: the file cannot be read, or says something that no camera can be.
+        InputError: the file cannot be read, or describes no possible camera.
     """
     try:
         file = _File.model_validate_json(path.read_bytes())
@@ -235,6 +237,6 @@ def _place(path: Path, number: int, camera: _Camera) -> Floats:
         or e[3].tolist() != [0, 0, 0, 1]
     ):
         raise InputError(f"{path}: extrinsics of camera {number} are no rigid motion (rotation, translation; 0 0 0 1)")
-    # The nearest rotation: digits that the file lacks must not stretch what the camera sees.
+    # The nearest rotation: rounded digits in the file must not distort the picture.
     e[:3, :3] = rotation
     return e

@@ -1,4 +1,4 @@
-"""Views as image files: PNG, OpenEXR, and a JSON per picture with its camera and boxes."""
+"""Export of views as image files: PNG, OpenEXR, and a JSON per picture with its camera and boxes."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ DepthFormat = Literal["exr", "png"]
 #: One step of a 16-bit depth PNG [m]: reaches 6.5 m; 0 is nothing.
 PNG_STEP_M: Final = 1e-4
 _EYES: Final = ("mono", "left", "right")
-#: Dataset and the name its files have in Replicator's BasicWriter.
+#: Datasets and their file names in Replicator's BasicWriter.
 _DISTANCES: Final = {"image/depth": "distance_to_image_plane", "image/distance": "distance_to_camera"}
 
 
 def export_images(views: Shard, folder: Path, *, depth: DepthFormat = "exr") -> list[Path]:
-    """Writes every picture of a views shard as files named as Replicator's BasicWriter names them.
+    """Write every picture of a views shard, with the file names of Replicator's BasicWriter.
 
     Per picture: `rgb_NNNN.png` (8 bits), `distance_to_image_plane_NNNN.exr` (float32 [m], channel Z, inf: nothing) or
     `.png` (16 bits, steps of 0.1 mm, 0: nothing), `semantic_segmentation_NNNN.png` (8 bits, the labels themselves) and
@@ -34,7 +34,7 @@ def export_images(views: Shard, folder: Path, *, depth: DepthFormat = "exr") -> 
 
     Args:
         views: a views shard.
-        folder: where to; made if absent.
+        folder: destination; created if absent.
         depth: format of distances.
 
     Returns:
@@ -77,7 +77,7 @@ def _one(views: Shard, view: int, folder: Path, depth: DepthFormat) -> list[Path
 
 
 def describe(views: Shard, view: int) -> dict[str, Any]:
-    """Camera and boxes of one picture; null where the object is not seen."""
+    """Return camera and boxes of one picture; null where the object is not visible."""
     height, width = views["image/rgb"].shape[1:3]
     e = np.asarray(views["camera/extrinsics"][view], float)
     said: dict[str, Any] = {
@@ -108,14 +108,14 @@ def _labels(views: Shard) -> dict[str, dict[str, str]]:
 
 
 def export_png(path: Path, pixels: NDArray[Any]) -> Path:
-    """An image of 8 or 16 bits."""
+    """Write an image of 8 or 16 bits."""
     Image.fromarray(np.ascontiguousarray(pixels)).save(path, compress_level=1)
     return path
 
 
 def _png_metres(path: Path, metres: NDArray[np.float32]) -> Path:
     steps = np.where(np.isfinite(metres), np.asarray(metres, float) / PNG_STEP_M, 0.0)
-    # What is too far for 16 bits says so by the largest value, not by wrapping round.
+    # Distances beyond 16 bits are clipped to the largest value instead of wrapping round.
     return export_png(path, np.clip(np.rint(steps), 0, 65535).astype(np.uint16))
 
 
@@ -124,7 +124,7 @@ def _exr_z(path: Path, metres: NDArray[np.float32]) -> Path:
 
 
 def export_exr(path: Path, names: str, planes: Sequence[NDArray[Any]] | NDArray[Any]) -> Path:
-    """Channels of one letter each as OpenEXR, in the type of their planes (H, W)."""
+    """Write channels of one letter each as OpenEXR, in the type of their planes (H, W)."""
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     channels = {name: np.ascontiguousarray(plane) for name, plane in zip(names, planes, strict=True)}
     with OpenEXR.File(header, channels, 1) as file:

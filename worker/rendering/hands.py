@@ -1,4 +1,4 @@
-"""The hand before the cameras: its bodies as solids with the looks that people know them by."""
+"""The hand in pictures: its bodies as solids with their visual appearance."""
 
 from __future__ import annotations
 
@@ -23,26 +23,26 @@ from graspd.worker.rendering.scenery import Appearance, Solid
 _HAND: Final = Appearance(hexadecimal("#59636e"), roughness=0.42, metalness=0.35)
 _PALM: Final = Appearance(hexadecimal("#434b54"), roughness=0.48, metalness=0.35)
 _TIP: Final = Appearance(hexadecimal("#2fa7a0"), roughness=0.38)
-#: Where a hand waits that a scene does not show: under the floor, out of every picture [m].
+#: Depth of a hidden hand: under the floor, out of every picture [m].
 _AWAY_M: Final = -50.0
 
 
 @dataclass(frozen=True)
 class DrawnHand:
-    """The hand in its grasp pose, one grasp per scene, for pictures that people look at."""
+    """Hands in their grasp poses, one grasp per scene, for pictures."""
 
     hand: HandModel
     grasp: NDArray[np.int32]
-    """(S,) row of the grasp in the scene shard (in the base shard, where it was planned in its scene); -1: no hand."""
+    """(S,) row of the grasp in the scene shard (in the base shard if planned in its scene); -1: no hand."""
     hand_pose: Floats
     """(S, 7) root link in the table frame; ignored where there is no grasp."""
     joint_positions: Floats
     """(S, J)"""
     wrist: Floats | None = None
-    """(S, U) angles of the wrist with which the links above the hand's root are drawn; None: they are not."""
+    """(S, U) wrist angles for drawing the links above the hand's root; None: not drawn."""
 
     def body_poses(self) -> Floats:
-        """(S, B, 7) poses of the drawn bodies in the table frame."""
+        """Return poses (S, B, 7) of the drawn bodies in the table frame."""
         bodies = drawn_poses(self.hand, self.hand_pose, self.joint_positions, self.wrist)
         bodies[self.grasp < 0] = [0, 0, _AWAY_M, 1, 0, 0, 0]
         return bodies
@@ -55,7 +55,7 @@ class DrawnHand:
 
 @dataclass(frozen=True)
 class MovingSolid:
-    """A solid of one look that moves with a body."""
+    """A solid of one appearance that moves with a body."""
 
     body: int
     solid: Solid
@@ -63,9 +63,9 @@ class MovingSolid:
 
 
 def hand_parts(hand: HandModel) -> tuple[MovingSolid, ...]:
-    """What is drawn of a hand: its visual meshes in their colours; of bodies without any, the collision pieces.
+    """Return the visual meshes of a hand in their colours; for bodies without any, collision pieces.
 
-    Where no visual element states a colour, palm, fingers and fingertips have looks of their own.
+    Where no visual element states a colour, palm, fingers and fingertips have default appearances.
     """
     with _lock:
         if hand.content not in _parts:
@@ -74,13 +74,13 @@ def hand_parts(hand: HandModel) -> tuple[MovingSolid, ...]:
 
 
 def drawn_parts(hand: HandModel, *, mounted: bool) -> tuple[MovingSolid, ...]:
-    """What is drawn of a hand, and if it is `mounted` of the links above its root, whose bodies are numbered anew."""
+    """Return the drawn solids of a hand, if `mounted` with the links above its root (bodies renumbered)."""
     above = hand.mounting if mounted else None
     return hand_parts(hand) + (() if above is None else hand_parts(above))
 
 
 def drawn_poses(hand: HandModel, hand_pose: Floats, joint_positions: Floats, wrist: Floats | None) -> Floats:
-    """(N, P, 7) poses of `drawn_parts` of N hands, mounted at wrist angles (N, U) where they are given."""
+    """Return poses (N, P, 7) of `drawn_parts` of N hands, mounted at wrist angles (N, U) if given."""
     poses = [body_poses(hand, hand_pose, joint_positions)[:, drawn_bodies(hand)]]
     if wrist is not None and (above := hand.mounting) is not None:
         poses.append(body_poses(above, hand_pose, above.expand(wrist))[:, drawn_bodies(above)])
@@ -88,23 +88,23 @@ def drawn_poses(hand: HandModel, hand_pose: Floats, joint_positions: Floats, wri
 
 
 def without_visuals(hand: HandModel) -> HandModel:
-    """The same hand with its mounting, drawn as the engine sees it."""
+    """Return the hand with its mounting, drawn by its collision shapes."""
     above = None if hand.mounting is None else without_visuals(hand.mounting)
     return replace(hand, visuals=NO_VISUALS, mounting=above)
 
 
 def drawn_bodies(hand: HandModel) -> list[int]:
-    """The body of each drawn solid; a body of several colours comes several times."""
+    """Return the body of each drawn solid; a body of several colours is repeated."""
     return [part.body for part in hand_parts(hand)]
 
 
 def hand_solids(hand: HandModel) -> list[Solid]:
-    """The drawn meshes, each in the frame of its body."""
+    """Return the drawn meshes, each in the frame of its body."""
     return [part.solid for part in hand_parts(hand)]
 
 
 def hand_looks(hand: HandModel) -> list[Appearance]:
-    """The material of each drawn solid."""
+    """Return the material of each drawn solid."""
     return [part.look for part in hand_parts(hand)]
 
 
@@ -134,7 +134,7 @@ def _pieces(hand: HandModel, body: int) -> Iterator[MovingSolid]:
 
 
 def _own_look(hand: HandModel, body: int) -> Appearance:
-    """Material of a body without a colour: palm, finger or fingertip."""
+    """Return the material of a body without a colour: palm, finger or fingertip."""
     if body in hand.fingertips:
         return _TIP
     return _PALM if body == 0 else _HAND

@@ -1,4 +1,4 @@
-"""Pictures of grasps for people: hand and object alone before a quiet backdrop, from wanted sides."""
+"""Pictures of grasps: hand and object alone before a plain backdrop, from given sides."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ THREE_SIDES: Final = tuple(np.radians([-35.0, 85.0, 205.0]).tolist())
 ELEVATION: Final = np.radians(20.0)
 FIELD_OF_VIEW: Final = np.radians(24.0)
 SAMPLES: Final = 12
-#: Hand parts farther than this from the object's hull do not draw the camera back: a forearm may leave the picture [m].
+#: Hand parts farther than this from the object's hull are not framed: a forearm may leave the picture [m].
 _NEAR_M: Final = 0.14
 #: Grasps traced together: bounds the memory.
 _TOGETHER: Final = 16
@@ -59,7 +59,7 @@ def grasp_pictures(
     run: ExecutionContext = DEFAULT_CONTEXT,
     samples: int = SAMPLES,
 ) -> NDArray[np.uint8]:
-    """Pictures of N grasps from A sides.
+    """Render N grasps from A sides.
 
     Args:
         hand: the hand; its convex pieces are drawn.
@@ -68,14 +68,14 @@ def grasp_pictures(
         joint_positions: (N, J).
         size: width and height [px].
         azimuths: A sides [rad] about the vertical; 0 looks across the direction in which the palm approaches.
-        run: asked between passes whether to stop.
+        run: polled for cancellation between passes.
         samples: rays per pixel.
 
     Returns:
         (N, A, H, W, 3) sRGB.
 
     Raises:
-        TaskCancelled: `run.cancelled()` answered True.
+        TaskCancelled: `run.cancelled()` returned True.
     """
     hand_pose = moved(np.atleast_2d(np.asarray(hand_pose, float)), np.negative(obj.centre))
     obj = obj.centred
@@ -126,7 +126,7 @@ def _shoot(
             height=height,
             samples=samples,
             toward_lamp=TOWARD_LAMP,
-            # The lamp goes round with the camera, so no side lies in the dark.
+            # The lamp turns with the camera, so that no side is dark.
             turn=-angles,
             lamps=[STUDIO] * worlds,
         )
@@ -135,27 +135,27 @@ def _shoot(
 
 
 def side_of(hand: HandModel, bodies: Floats) -> float:
-    """Azimuth of a camera that looks across the direction in which the palm approaches [rad]."""
+    """Return the azimuth of a camera that looks across the palm's direction of approach [rad]."""
     towards = quat_rotate(bodies[0, 3:], hand.palm.approach)
-    # Where the palm comes from straight above or below, its own x axis serves.
+    # For a vertical approach of the palm, its own x axis is used.
     flat = towards[:2] if np.hypot(*towards[:2]) > 0.2 else quat_rotate(bodies[0, 3:], np.array([1.0, 0, 0]))[:2]
     return float(np.arctan2(flat[1], flat[0]) + 0.5 * np.pi)
 
 
 def _camera(obj: ObjectModel, points: Floats, angle: float, k: Floats, size: tuple[int, int]) -> Floats:
-    """Extrinsics of a camera from whose picture the near parts stand out by the share `_FILL`."""
+    """Return extrinsics of a camera that frames the near parts with the share `_FILL`."""
     middle = 0.5 * (obj.hull_vertices.min(axis=0) + obj.hull_vertices.max(axis=0))
     reach = np.linalg.norm(obj.hull_vertices - middle, axis=1).max()
     return fit_camera(points[np.linalg.norm(points - middle, axis=1) < reach + _NEAR_M], angle, k, size)
 
 
 def fit_camera(near: Floats, angle: float, k: Floats, size: tuple[int, int], *, elevation: float = ELEVATION) -> Floats:
-    """Extrinsics (4, 4) of a camera at azimuth `angle` [rad] from whose picture the points (P, 3) stand out."""
+    """Return extrinsics (4, 4) of a camera at azimuth `angle` [rad] that frames the points (P, 3)."""
     centre = 0.5 * (near.min(axis=0) + near.max(axis=0))
     flat = np.cos(elevation)
     direction = np.array([np.cos(angle) * flat, np.sin(angle) * flat, np.sin(elevation)])
     distance = 4.0 * float(np.linalg.norm(near - centre, axis=1).max())
-    # Perspective changes with the distance; three rounds settle it to a per cent.
+    # Perspective changes with the distance; three rounds converge to a per cent.
     for _ in range(3):
         camera = Cameras(*size, k, look_at(centre + distance * direction, centre)[None])
         (pixels,), _ = camera.project(near)
@@ -167,7 +167,7 @@ def fit_camera(near: Floats, angle: float, k: Floats, size: tuple[int, int], *, 
 
 
 def hand_points(hand: HandModel, bodies: Floats) -> Floats:
-    """(N, P, 3) corners of all pieces in the object frame."""
+    """Return the corners (N, P, 3) of all pieces in the object frame."""
     body = np.concatenate([np.full(len(piece.vertices), piece.body) for piece in hand.pieces])
     corners = np.concatenate([piece.vertices for piece in hand.pieces])
     return apply(bodies[:, body], corners)

@@ -1,4 +1,4 @@
-"""Pictures of a hand or an object alone: what the check understood, for a user to agree with."""
+"""Pictures of a hand or an object alone, for a user to check the model."""
 
 from __future__ import annotations
 
@@ -39,33 +39,33 @@ from graspd.worker.rendering.tracer import Tracer
 SIZE: Final = (340, 360)
 _SAMPLES: Final = 16
 _CAPTION: Final = 30
-#: Share of the way from open to closed at which a hand is shown closing.
+#: Share of the motion from open to closed at which a hand is shown closing.
 _CLOSING_SHARE: Final = 0.6
 _ARROW: Final = Appearance(hexadecimal("#dd7432"), roughness=0.5)
 _CLOSING: Final = Appearance(hexadecimal("#2fa7a0"), roughness=0.5)
 _PAD: Final = Appearance(hexadecimal("#d6409f"), roughness=0.5)
-#: Radius of a dot of a pad over the largest extent of the hand; dots of a pad at most.
+#: Radius of a pad's dots over the largest extent of the hand; most dots of a pad.
 _DOT_SHARE: Final = 0.008
 _DOTS: Final = 60
 #: Axes x, y, z of the palm's frame.
 _AXES: Final = tuple(Appearance(hexadecimal(code), roughness=0.5) for code in ("#c8343c", "#3c9a4a", "#3566c8"))
 _FRAME_SHARE: Final = 0.25
 _CLOSING_ARROW_SHARE: Final = 0.22
-#: Share of the housing in a picture through which one looks.
+#: Opacity of the transparent housing.
 _OPACITY: Final = 0.35
-#: Where what is not drawn waits [m].
+#: Position of parts that are not drawn [m].
 _AWAY_M: Final = -50.0
-#: Sides from which a hand is looked at, by the camera's azimuth [rad].
+#: Views of a hand, by the camera's azimuth [rad].
 _SIDES: Final = {"from the right": 0.0, "from behind": np.radians(-90.0), "from the front": np.radians(90.0)}
 #: Length of the arrow over the largest extent of the hand.
 _ARROW_SHARE: Final = 0.4
-#: Toward the palm from the side on which the approach points right [rad].
+#: View towards the palm from the side on which the approach points right [rad].
 _HAND_AZIMUTH: Final = np.radians(32.0)
 _OBJECT_AZIMUTHS: Final = tuple(np.radians([-50.0, 40.0, 130.0]).tolist())
 
 
 def hand_portrait(hand: HandModel, *, device: str = "cpu") -> Image.Image:
-    """The hand open, in its pre-shape and closing; an arrow stands on the palm's centre along the approach."""
+    """Draw the hand open, in its pre-shape and closing; an arrow on the palm's centre shows the approach."""
     shown = drawn_bodies(hand)
     upright = _upright(hand)
     named = {"open": posture(hand, 0.0), "pre-shape": hand.preshape, "closing": posture(hand, _CLOSING_SHARE)}
@@ -83,11 +83,11 @@ def hand_portrait(hand: HandModel, *, device: str = "cpu") -> Image.Image:
 
 
 def hand_sides(hand: HandModel, *, device: str = "cpu") -> Image.Image:
-    """The hand as the engine sees it, about to close, from three sides; the palm's body is half transparent.
+    """Draw the hand's collision shapes, about to close, from three sides; the palm is half transparent.
 
-    Three thin arrows are the palm's frame (x red, y green, z blue: the approach), the orange one is the approach, and
-    teal ones show where each fingertip goes as the hand closes. Pink dots are the pads: where jaws meet, or the inner
-    sides of fingertips.
+    Three thin arrows are the palm's frame (x red, y green, z blue: the approach). The orange arrow is the approach;
+    teal arrows show the motion of each fingertip as the hand closes. Pink dots are the pads: the contact sides of jaws,
+    or the inner sides of fingertips.
     """
     bare = without_visuals(hand)
     upright = _upright(bare)
@@ -129,7 +129,7 @@ def hand_sides(hand: HandModel, *, device: str = "cpu") -> Image.Image:
 
 
 def above(first: Image.Image, second: Image.Image) -> Image.Image:
-    """Two pictures, one over the other."""
+    """Stack two pictures vertically."""
     page = Image.new("RGB", (max(first.width, second.width), first.height + second.height), sheets.PAPER)
     page.paste(first.convert("RGB"), (0, 0))
     page.paste(second.convert("RGB"), (0, first.height))
@@ -137,7 +137,7 @@ def above(first: Image.Image, second: Image.Image) -> Image.Image:
 
 
 def object_portrait(obj: ObjectModel, *, device: str = "cpu") -> Image.Image:
-    """The prepared mesh from three sides, z up."""
+    """Draw the prepared mesh from three sides, z up."""
     obj = obj.centred
     solid = Solid(obj.vertices, obj.faces, obj.corner_normals)
     extents = " x ".join(f"{1e3 * extent:.0f}" for extent in np.ptp(obj.vertices, axis=0))
@@ -147,7 +147,7 @@ def object_portrait(obj: ObjectModel, *, device: str = "cpu") -> Image.Image:
 
 
 def write_png(image: Image.Image, path: Path) -> None:
-    """InputError if the file cannot be written."""
+    """Write a PNG; raise InputError if the file cannot be written."""
     try:
         path.write_bytes(sheets.png(image))
     except OSError as error:
@@ -162,7 +162,7 @@ def _shoot(
     azimuths: Sequence[float],
     device: str,
 ) -> NDArray[np.uint8]:
-    """(W, H, W, 3) pictures of W worlds, each from its azimuth; every camera takes in the same points."""
+    """Render W worlds (W, H, W, 3), each from its azimuth; every camera frames the same points."""
     worlds, (width, height) = len(poses), SIZE
     floor = IDENTITY_POSE.copy()
     floor[2] = points[:, 2].min() - 0.01 - 0.5 * FLOOR_SIZE[2]
@@ -184,7 +184,7 @@ def _shoot(
 
 
 def _row(pictures: NDArray[np.uint8], captions: Sequence[str]) -> Image.Image:
-    """Pictures side by side with a word under each, in few colours."""
+    """Join pictures in a row with a caption under each, in few colours."""
     return _page(pictures, captions).quantize(192, dither=Image.Dither.NONE)
 
 
@@ -199,14 +199,14 @@ def _page(pictures: NDArray[np.uint8], captions: Sequence[str]) -> Image.Image:
 
 
 def _upright(hand: HandModel) -> Floats:
-    """Pose of the root that turns the approach to +y, right of a camera on +x, and the open fingertips up."""
+    """Return the root pose with the approach along +y, right of a camera on +x, and fingertips up."""
     poses = body_poses(hand, IDENTITY_POSE, hand.expand(posture(hand, 0.0)))[0]
     centres = {piece.body: apply(poses[piece.body], piece.vertices).mean(axis=0) for piece in hand.pieces}
     tips = np.mean([centres.get(body, poses[body, :3]) for body in hand.fingertips], axis=0)
     forward, up = hand.palm.approach, tips - hand.palm.centre
     up = up - (up @ forward) * forward
     if np.linalg.norm(up) < 0.35 * np.linalg.norm(tips - hand.palm.centre):
-        # A gripper's fingers point along its approach: it hangs, as it would over a table.
+        # A gripper's fingers point along its approach: it hangs, as over a table.
         up, forward = -forward, np.eye(3)[int(np.argmin(np.abs(forward)))]
         forward = forward - (forward @ up) * up / (up @ up)
     rows = [np.cross(forward, up), forward, up]
@@ -215,14 +215,14 @@ def _upright(hand: HandModel) -> Floats:
 
 
 def _quat_of_z(direction: Floats) -> Floats:
-    """Quaternion w x y z of a rotation that takes z to `direction`."""
+    """Return the quaternion w x y z of a rotation that takes z to `direction`."""
     side = np.cross(np.eye(3)[int(np.argmin(np.abs(direction)))], direction)
     side /= np.linalg.norm(side)
     return quat_from_matrix(np.stack([side, np.cross(direction, side), direction], axis=1))
 
 
 def _dots(points: Floats, radius: float) -> Solid:
-    """Small balls at points (P, 3), thinned to `_DOTS`."""
+    """Return small balls at points (P, 3), thinned to `_DOTS`."""
     ball = manifold3d.Manifold.sphere(radius, 12)
     few = points[:: max(1, -(-len(points) // _DOTS))]
     vertices, faces = from_manifold(ball)
@@ -232,7 +232,7 @@ def _dots(points: Floats, radius: float) -> Solid:
 
 
 def _arrow(length: float) -> Solid:
-    """An arrow from the origin along z."""
+    """Return an arrow from the origin along z."""
     shaft = manifold3d.Manifold.cylinder(0.72 * length, 0.03 * length, 0.03 * length, 32)
     head = manifold3d.Manifold.cylinder(0.28 * length, 0.09 * length, 0.0, 32).translate((0, 0, 0.72 * length))
     vertices, faces = from_manifold(shaft + head)

@@ -1,4 +1,4 @@
-"""What a render has before its cameras: what the seed decides about each scene, and the stages it is traced on.
+"""Setup of a render before its cameras: random properties of each scene, and stages for tracing.
 
 Materials and lights are random but pleasing.
 """
@@ -44,10 +44,10 @@ from graspd.worker.rendering.scenery import (
 )
 from graspd.worker.rendering.tracer import Tracer
 
-#: Draws of cameras, of which the first is taken that sees this share of the object past the supports; else the best.
+#: Draws of a camera: the first that sees this share of the object past the supports is used, else the best.
 _DRAWS: Final = 32
 _SEEN: Final = 0.8
-#: Depth at which things wait that a pass does not show [m].
+#: Depth of things that a pass does not show [m].
 _AWAY_M: Final = -50.0
 _NOWHERE: Final = np.zeros((0, 3))
 _stages: LRUCache[tuple[object, ...], Tracer] = LRUCache(4)
@@ -58,13 +58,13 @@ _CLOTHS: Final = ["#cfd3d6", "#e4ded2", "#9fb0b8", "#6d7f86", "#b7bda5", "#494f5
 
 @dataclass(frozen=True)
 class CameraPlan:
-    """How the cameras of each scene are found."""
+    """Placement of the cameras of each scene."""
 
     views: int
     width: int
     height: int
     baseline_m: float | None
-    """Of stereo pairs; None: mono."""
+    """Baseline of stereo pairs; None: mono."""
     given: GivenCameras = SAMPLED
 
     @property
@@ -87,7 +87,8 @@ class CameraPlan:
         supports: Supports = (),
         points: Floats = _NOWHERE,
     ) -> Floats:
-        """(placements * eyes, 4, 4) around a ball, from where supports hide little of points; left before right."""
+        """Return extrinsics (placements * eyes, 4, 4) around a ball with a free view of the points.
+        Left comes before right."""
         middles: Sequence[Floats]
         if self.given.extrinsics is not None:
             middles = list(self.given.extrinsics)
@@ -104,7 +105,7 @@ class CameraPlan:
 
 
 class Setting:
-    """Scenes of one object, its neighbours and what they stand on, ready to be shot."""
+    """Scenes of one object, its neighbours and supports, ready for rendering."""
 
     def __init__(
         self,
@@ -116,7 +117,7 @@ class Setting:
         samples: int,
         supports: Supports = TABLE,
     ) -> None:
-        """`poses` (S, 1 + M, 7) of the object and its M neighbours in the scene frame; `supports` of all scenes."""
+        """`poses` (S, 1 + M, 7) of object and M neighbours in the scene frame; `supports` of all scenes."""
         self.objects, self.plan, self._slabs = objects, plan, slabs(supports)
         scenes = [
             _Scene(objects, pose, plan, supports, np.random.default_rng([seed, s])) for s, pose in enumerate(poses)
@@ -137,17 +138,17 @@ class Setting:
         )
 
     def shoot(self, run: ExecutionContext, *, normals: bool = False) -> Pictures:
-        """The pictures; `Pictures.shape` is 0 for supports, 1 for the object, 2 + m for neighbour m."""
+        """Render the pictures; `Pictures.shape` is 0 for supports, 1 for the object, 2 + m for neighbour m."""
         return self._named(self.stage(run.device).shoot(replace(self.shot, normals=normals), run))
 
     def shoot_alone(self, run: ExecutionContext) -> Pictures:
-        """One ray per pixel of the object with nothing around it; `Pictures.shape` is 1 where it is seen."""
+        """Trace one ray per pixel of the object alone; `Pictures.shape` is 1 where it is visible."""
         poses = self._poses.copy()
         poses[:, [k for k in range(poses.shape[1]) if k != len(self._slabs)], 2] = _AWAY_M
         return self._named(self.stage(run.device, poses).shoot(replace(self.shot, samples=1, shaded=False), run))
 
     def shoot_with(self, drawn: DrawnHand, run: ExecutionContext) -> Pictures:
-        """The same pictures with a hand in them."""
+        """Render the same pictures with a hand."""
         key = (*self._key(), drawn.hand.content, drawn.wrist is not None, run.device)
         stage = _kept(key, lambda: [*self._solids(), *(part.solid for part in drawn.parts)], run.device)
         shown = [part.look for part in drawn.parts]
@@ -157,13 +158,13 @@ class Setting:
         return self._named(stage.shoot(self.shot, run))
 
     def stage(self, device: str, poses: Floats | None = None) -> Tracer:
-        """The stage of these objects, kept for the next call with the same ones, with everything in its place."""
+        """Return the stage of these objects, cached for the next call, with everything placed."""
         stage = _kept((*self._key(), device), self._solids, device)
         stage.place(self._poses if poses is None else poses, self.looks)
         return stage
 
     def _named(self, pictures: Pictures) -> Pictures:
-        """All supports are one thing to those who read labels."""
+        """Merge all supports to one label."""
         extra = len(self._slabs) - 1
         return replace(pictures, shape=np.where(pictures.shape < 0, -1, np.maximum(pictures.shape - extra, 0)))
 
@@ -175,7 +176,7 @@ class Setting:
 
 
 class _Scene:
-    """What the seed decides about one scene."""
+    """Random properties of one scene."""
 
     def __init__(
         self,
@@ -194,7 +195,7 @@ class _Scene:
         self.turn = float(rng.uniform(0, 2 * np.pi))
         yaw = rng.uniform(0, 2 * np.pi)
         self.poses = np.concatenate([slab_poses(supports, centre, yaw), poses])
-        # Drawn last: neighbours and walls do not change how the rest of the scene looks.
+        # Drawn last: neighbours and walls do not change the appearance of the rest.
         others = [object_look(rng) for _ in objects[1:]]
         walls = table_look(rng) if len(supports) > 1 else table
         self.looks: list[Appearance] = [
@@ -205,7 +206,7 @@ class _Scene:
 
 
 def _unhidden(draw: Callable[[], Sequence[Floats]], supports: Supports, points: Floats) -> Sequence[Floats]:
-    """Cameras of which each sees the points past boxes; each is drawn again until it does."""
+    """Draw cameras that see the points past boxes; each is redrawn until it does."""
     drawn = list(draw())
     if not any(isinstance(s, BoxSupport) for s in supports):
         return drawn
@@ -236,12 +237,12 @@ def _kept(key: tuple[object, ...], solids: Callable[[], Sequence[Solid | Box]], 
 
 
 def hsv(hue: float, saturation: float, value: float) -> Colour:
-    """Linear RGB of hue, saturation, value in 0..1."""
+    """Convert hue, saturation, value in 0..1 to linear RGB."""
     return linear(*colorsys.hsv_to_rgb(hue % 1.0, saturation, value))
 
 
 def table_look(rng: np.random.Generator) -> Appearance:
-    """Wood, stone, tiles or a plain cloth."""
+    """Draw wood, stone, tiles or a plain cloth."""
     kind = int(rng.integers(4))
     scale = float(rng.uniform(0.7, 1.5))
     if kind == 0:
@@ -257,7 +258,7 @@ def table_look(rng: np.random.Generator) -> Appearance:
 
 
 def object_look(rng: np.random.Generator) -> Appearance:
-    """Glazed, painted, brushed or speckled, any hue."""
+    """Draw a glazed, painted, brushed or speckled material of any hue."""
     hue, kind = float(rng.uniform()), int(rng.integers(4))
     base = hsv(hue, float(rng.uniform(0.3, 0.75)), float(rng.uniform(0.5, 0.9)))
     if kind == 0:
@@ -271,7 +272,7 @@ def object_look(rng: np.random.Generator) -> Appearance:
 
 
 def lamp(rng: np.random.Generator) -> Lamp:
-    """Warm to cool light of changing strength before a soft backdrop."""
+    """Draw warm to cool light of random strength before a soft backdrop."""
     warmth, strength = float(rng.uniform(-1, 1)), float(rng.uniform(0.85, 1.15))
     tint = hsv(float(rng.uniform()), 0.12, float(rng.uniform(0.45, 0.8)))
     return Lamp(

@@ -1,4 +1,4 @@
-"""What stands before the cameras: solids, supports as boxes, materials, lights; and what a shot asks for and gives."""
+"""Data of renders: solids, supports as boxes, materials, lights; requests and results of a shot."""
 
 from __future__ import annotations
 
@@ -56,21 +56,21 @@ class Lamp:
 
 @dataclass(frozen=True)
 class Pictures:
-    """What V cameras see."""
+    """Pictures of V cameras."""
 
     rgb: NDArray[np.uint8]
     """(V, H, W, 3) sRGB"""
     depth: NDArray[np.float32]
     """(V, H, W) along the optical axis [m]; inf: nothing."""
     shape: NDArray[np.int64]
-    """(V, H, W) index of the solid seen through the pixel's centre; -1: nothing."""
+    """(V, H, W) index of the solid at the pixel's centre; -1: nothing."""
     normal: NDArray[np.float32] | None = None
-    """(V, H, W, 3) unit shading normal in the world's frame, zero where nothing is; only if the shot asks for it."""
+    """(V, H, W, 3) unit shading normal in the world's frame, zero for nothing; only if requested."""
 
 
 @dataclass(frozen=True)
 class CameraShot:
-    """Which world each camera looks into, and how the light falls."""
+    """Cameras with their worlds, and the light."""
 
     world: NDArray[np.int32]
     """(V,)"""
@@ -87,33 +87,33 @@ class CameraShot:
     lamps: Sequence[Lamp]
     """One per world."""
     normals: bool = False
-    """Whether the pictures come with normals."""
+    """Whether to compute normals."""
     shaded: bool = True
-    """False: rays are traced but no colour is made of them. What that costs is the price of the bare ray tracer."""
+    """False: trace rays without shading, to measure the cost of the bare ray tracer."""
 
 
 Supports = Sequence[HalfSpace | BoxSupport]
 
 #: A half-space is drawn as a slab whose top is its plane [m].
 TABLE_SIZE: Final = (1.2, 0.9, 0.04)
-#: What objects stand on where nothing else is said.
+#: Default support of objects.
 TABLE: Final = (HalfSpace(),)
-#: A slab lies below the origin; below the object where that lies farther off [m].
+#: A slab lies below the origin; below the object if that is farther away [m].
 _FAR_M: Final = 0.35
 
 
 def slabs(supports: Supports) -> list[Box]:
-    """A box for each support."""
+    """Return a box for each support."""
     return [Box(s.size if isinstance(s, BoxSupport) else TABLE_SIZE) for s in supports]
 
 
 def slab_poses(supports: Supports, middle: Floats, yaw: float) -> Floats:
-    """(P, 7) of the boxes of `slabs` in the scene frame.
+    """Return poses (P, 7) of the boxes of `slabs` in the scene frame.
 
     Args:
         supports: of the scene.
-        middle: (3,) where the object is.
-        yaw: by which slabs of half-spaces are turned about their normal [rad].
+        middle: (3,) position of the object.
+        yaw: turn of half-spaces' slabs about their normal [rad].
     """
     poses = [_box_pose(s) if isinstance(s, BoxSupport) else _slab_pose(s, middle, yaw) for s in supports]
     return np.array(poses).reshape(-1, 7)
@@ -140,11 +140,11 @@ def _slab_pose(plane: HalfSpace, middle: Floats, yaw: float) -> Floats:
 
 
 def seen_share(supports: Supports, eye: Floats, points: Floats) -> float:
-    """Share of the points (P, 3) that no support hides from an eye (3,): lines against half-spaces and boxes."""
+    """Return the share of points (P, 3) that no support hides from an eye (3,)."""
     hidden = np.zeros(len(points), bool)
     for support in supports:
         if isinstance(support, HalfSpace):
-            # What lies on the plane is seen; an eye below it sees nothing.
+            # Points on the plane are visible; an eye below it sees nothing.
             normal, length = np.asarray(support.normal), float(np.linalg.norm(support.normal))
             hidden |= bool(normal @ eye < support.offset - 1e-9 * length)
         else:
@@ -153,7 +153,7 @@ def seen_share(supports: Supports, eye: Floats, points: Floats) -> float:
 
 
 def _crosses(eye: Floats, points: Floats, pose: Floats, half: Floats) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-    """Whether the lines from the eye to points go through a box (slabs test of Kay and Kajiya 1986)."""
+    """Check whether lines from the eye to points cross a box (slabs test of Kay and Kajiya 1986)."""
     inside = invert(pose)
     start = quat_rotate(inside[3:], eye) + inside[:3]
     along = quat_rotate(inside[3:], points) + inside[:3] - start
@@ -161,5 +161,5 @@ def _crosses(eye: Floats, points: Floats, pose: Floats, half: Floats) -> np.ndar
     first, second = (-half - start) / step, (half - start) / step
     enter = np.minimum(first, second).max(axis=1)
     leave = np.maximum(first, second).min(axis=1)
-    # Points that touch a support are not behind it.
+    # Points on a support are not behind it.
     return np.asarray((enter < leave) & (leave > 0) & (enter < 1 - 1e-3))

@@ -1,5 +1,4 @@
-"""Pages of pictures with their text and colours: the best grasps with figures, grasps from three sides, views of a
-shard."""
+"""Pages of pictures with text: best grasps with figures, grasps from three sides, views of a shard."""
 
 from __future__ import annotations
 
@@ -34,13 +33,13 @@ Arrays = Mapping[str, NDArray[np.generic]]
 
 
 def best(quality: Arrays, count: int, among: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """Rows of the `count` best grasps by epsilon among those of a mask (N,)."""
+    """Return the `count` best rows by epsilon among those of a mask (N,)."""
     rows = np.flatnonzero(among)
     return rows[np.argsort(-_quoted(quality, "quality/epsilon")[rows], kind="stable")][:count]
 
 
 def best_kept(scene: Arrays, base: Arrays) -> NDArray[np.int32]:
-    """(S,) for each scene the row of its kept grasp with the largest epsilon; -1 where none was kept."""
+    """Return the row (S,) of each scene's valid grasp with the largest epsilon; -1: none."""
     epsilon = _quoted(base, "quality/epsilon")[np.asarray(scene["grasp/base_index"])]
     score = np.where(np.asarray(scene["grasp/valid"], bool), epsilon, -np.inf)
     rows = np.full(len(scene["scene/object_pose"]), -1, np.int32)
@@ -52,7 +51,7 @@ def best_kept(scene: Arrays, base: Arrays) -> NDArray[np.int32]:
 
 
 def best_in_scenes(base: Arrays, among: NDArray[np.bool_]) -> NDArray[np.int32]:
-    """(S,) row of the grasp with the largest epsilon that was planned in each scene, of those of a mask (N,); or -1."""
+    """Return the row (S,) with the largest epsilon planned in each scene, among a mask (N,); -1: none."""
     score = np.where(among, np.nan_to_num(_quoted(base, "quality/epsilon"), nan=-1.0), -np.inf)
     scene = np.asarray(base["grasp/scene_index"])
     rows = np.full(len(base["scene/object_pose"]), -1, np.int32)
@@ -64,7 +63,7 @@ def best_in_scenes(base: Arrays, among: NDArray[np.bool_]) -> NDArray[np.int32]:
 
 
 def figures(quality: Arrays, rows: NDArray[np.intp]) -> list[list[tuple[str, str]]]:
-    """For each row what a caption says: label and value, from the datasets of a base shard."""
+    """Return caption entries, label and value, for each row of a base shard."""
     epsilon, area = _quoted(quality, "quality/epsilon"), _quoted(quality, "quality/contact_area_cm2")
     depth = np.asarray(quality["quality/penetration_depth_mm"], float)
     return [
@@ -87,7 +86,7 @@ def contact_sheet(
     subtitle: str = "",
     columns: int = 4,
 ) -> bytes:
-    """PNG of N pictures (N, H, W, 3) in a grid, ranked 1..N, with label and value pairs below each."""
+    """Return a PNG of N pictures (N, H, W, 3) in a grid, ranked 1..N, with label and value pairs below."""
     rows = -(-max(1, len(pictures)) // columns)
     height, width = pictures.shape[1:3]
     page, draw, top = _page(columns, rows, width, height + _CAPTION, title, subtitle)
@@ -107,14 +106,14 @@ def three_sides_sheet(
     subtitle: str = "",
     columns: int = 2,
 ) -> bytes:
-    """PNG of N grasps from three sides (N, 3, H, W, 3): a strip of three per grasp, `columns` strips in a row."""
+    """Return a PNG of N grasps from three sides (N, 3, H, W, 3): one strip per grasp, `columns` per row."""
     seam = np.full((*pictures.shape[:1], pictures.shape[2], 4, 3), PAPER, np.uint8)
     strips = np.concatenate([part for side in np.moveaxis(pictures, 1, 0) for part in (seam, side)][1:], axis=2)
     return contact_sheet(strips, captions, title=title, subtitle=subtitle, columns=columns)
 
 
 def views_page(views: Arrays, *, title: str, subtitle: str = "") -> bytes:
-    """PNG of a views shard: per placement left and right picture, depth, segmentation, boxes and, if there, hand."""
+    """Return a PNG of a views shard: per placement both pictures, depth, segmentation, boxes, any hand."""
     eye = np.asarray(views["camera/eye"])
     stereo, first = bool((eye == 2).any()), np.flatnonzero(eye != 2)
     columns: dict[str, Callable[[int], Image.Image]] = {
@@ -137,7 +136,7 @@ def views_page(views: Arrays, *, title: str, subtitle: str = "") -> bytes:
 
 
 def scene_cells(views: Arrays) -> list[Image.Image]:
-    """Pictures of a shard's first stereo pair: left, right, depth, normals, segmentation, boxes."""
+    """Return pictures of a shard's first stereo pair: left, right, depth, normals, segmentation, boxes."""
     left, right = np.asarray(views["image/rgb"][:2], np.uint8)
     normals = np.asarray(views["image/normals"][0], float)
     coloured = np.where(normals.any(axis=-1, keepdims=True), 127.5 + 127.5 * normals, 214).round().astype(np.uint8)
@@ -153,7 +152,7 @@ def label_page(
     title: str,
     subtitle: str = "",
 ) -> bytes:
-    """PNG of a table of pictures: a head above each column, names below the first pictures of each row."""
+    """Return a PNG of a table of pictures: column heads, and names below the first pictures of each row."""
     width, height = rows[0][0].size
     page, draw, top = _page(len(heads), len(rows), width, height + _NAME, title, subtitle, head=_HEAD + 24)
     for column, head in enumerate(heads):
@@ -170,7 +169,7 @@ def label_page(
 def _page(
     columns: int, rows: int, width: int, height: int, title: str, subtitle: str, head: int = _HEAD
 ) -> tuple[Image.Image, ImageDraw.ImageDraw, int]:
-    """Empty page with its title, and the y at which the cells begin."""
+    """Return an empty page with its title, and the y at which the cells begin."""
     size = (2 * MARGIN + columns * (width + GAP) - GAP, MARGIN + head + rows * (height + GAP) - GAP + MARGIN)
     page = Image.new("RGB", size, PAPER)
     draw = ImageDraw.Draw(page)
@@ -202,7 +201,7 @@ def _depth(views: Arrays, view: int) -> Image.Image:
     finite = depth[np.isfinite(depth)]
     if finite.size == 0:
         return Image.fromarray(depth_colours(depth, 0.0, 1.0))
-    # The far table would eat the range; what matters is around the object.
+    # The far table would dominate the range; the object's surroundings matter.
     near, far = float(finite.min()), float(np.percentile(finite, 90))
     if solid.any():
         far = max(float(depth[solid].max()), min(far, float(depth[solid].max()) * 1.4))
@@ -229,14 +228,14 @@ def _segments(views: Arrays, view: int) -> Image.Image:
 
 
 def _segment_rows(views: Arrays, view: int) -> NDArray[np.intp]:
-    """Rows of `_SEGMENT`: neighbours take turns with the colours after the object's."""
+    """Return rows of `_SEGMENT`: neighbours cycle through the colours after the object's."""
     labels = np.asarray(views["image/segmentation"][view], np.intp)
     return np.where(labels > OBJECT, OBJECT + 1 + (labels - OBJECT - 1) % (len(_SEGMENT) - OBJECT - 1), labels)
 
 
 def _boxes(views: Arrays, view: int) -> Image.Image:
     rgb = np.asarray(views["image/rgb"][view], float)
-    # Dimmed, so that the lines stand out on any material.
+    # Dimmed, so that the lines are visible on any material.
     table = np.asarray(views["image/segmentation"][view])[..., None] <= TABLE
     image = Image.fromarray(np.where(table, 0.55 * rgb, 0.9 * rgb).astype(np.uint8))
     scale = 3
@@ -279,14 +278,14 @@ _DEPTH: Final = np.array(
 
 @lru_cache(maxsize=16)
 def font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
-    """Pillow's own scalable font."""
+    """Return Pillow's own scalable font."""
     return ImageFont.load_default(size)
 
 
 def text(
     draw: ImageDraw.ImageDraw, at: tuple[float, float], words: str, size: int, fill: tuple[int, int, int]
 ) -> float:
-    """Writes words with the baseline at `at`; `^2` is set as an exponent. Returns the x where they end."""
+    """Write words with the baseline at `at`; `^2` is set as an exponent. Return the x where they end."""
     x, y = at
     for k, part in enumerate(words.split("^")):
         if k and part:
@@ -300,7 +299,7 @@ def text(
 
 
 def depth_colours(depth: NDArray[np.float32], near: float, far: float) -> NDArray[np.uint8]:
-    """(..., 3) colours of depths: light is near, dark is far, grey is nothing."""
+    """Return colours (..., 3) of depths: light is near, dark is far, grey is nothing."""
     t = np.clip((np.where(np.isfinite(depth), depth, near) - near) / max(far - near, 1e-9), 0, 1) * (len(_DEPTH) - 1)
     low = np.minimum(t.astype(int), len(_DEPTH) - 2)
     mixed = _DEPTH[low] + (t - low)[..., None] * (_DEPTH[low + 1] - _DEPTH[low])
@@ -308,12 +307,12 @@ def depth_colours(depth: NDArray[np.float32], near: float, far: float) -> NDArra
 
 
 def png(image: Image.Image) -> bytes:
-    """PNG bytes."""
+    """Return PNG bytes."""
     buffer = io.BytesIO()
     image.save(buffer, "PNG", optimize=True)
     return buffer.getvalue()
 
 
 def with_palette(page: bytes) -> bytes:
-    """The same PNG in 256 colours: a third of the bytes, for pages of documents."""
+    """Return the PNG in 256 colours: a third of the bytes, for pages of documents."""
     return png(Image.open(io.BytesIO(page)).convert("RGB").quantize(256, method=Image.Quantize.MEDIANCUT))

@@ -1,8 +1,8 @@
-"""A tracer: the same few solids in many worlds, all passes of a picture in one launch.
+"""A ray tracer: the same few solids in many worlds, all passes of a picture in one launch.
 
-A picture is a sum of passes. Every pass sends one ray through each pixel with one directional light; rays move inside
-the pixel (anti-aliasing) and the light moves over the lamp's disc or over the sky (soft shadows). Pass 0 goes through
-the pixel centres: depth, normals and shape indices come from it alone.
+A picture is a sum of passes. Every pass sends one ray through each pixel with one directional light. Rays vary inside
+the pixel (anti-aliasing), and the light varies over the lamp's disc or over the sky (soft shadows). Pass 0 goes through
+the pixel centres; depth, normals and shape indices come from it alone.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ from graspd.worker.rendering.kernels import exposure, rays
 from graspd.worker.rendering.kernels.shading import Light, Material
 from graspd.worker.rendering.scenery import Appearance, Box, CameraShot, Pictures, Solid
 
-#: Pixels between two looks at whether to stop: what a core traces in a fifth of a second, and what a GPU holds at once.
+#: Pixels between two cancellation checks: a core traces them in a fifth of a second, and a GPU holds them at once.
 PIXELS_OF_A_CORE: Final = 100_000
 PIXELS_OF_A_GPU: Final = 4_000_000
-#: By which bounds are wider than their solid, so that rounding in float32 costs no ray [m].
+#: Margin of bounds around their solid, so that rounding in float32 loses no ray [m].
 _SLACK_M: Final = 1e-5
 _PLACED: Final[Any] = rays.PlacedSolid
-#: Radius of the lamp's disc seen from the table [rad].
+#: Radius of the lamp's disc as seen from the table [rad].
 LAMP_RADIUS: Final = np.radians(3.5)
 #: Sine of the elevation above which the sky shines.
 SKY_EDGE: Final = 0.35
@@ -48,7 +48,7 @@ _R2: Final = np.array([0.7548776662466927, 0.5698402909980532])
 
 @dataclass
 class Tracer:
-    """Solids in as many worlds as they are given places. Build once, then `place` and `shoot` as often as wanted.
+    """Solids in many worlds. Build once, then `place` and `shoot` repeatedly.
 
     Args:
         solids: the P solids of each world, same in every world.
@@ -58,12 +58,12 @@ class Tracer:
     solids: Sequence[Solid | Box]
     device: str
     _meshes: list[Any] = field(init=False, repr=False)
-    """Keeps alive the trees that the shapes name."""
+    """Keeps the trees that the shapes refer to alive."""
     _shapes: NDArray[Any] = field(init=False, repr=False)
-    """(P,) of `rays.Placed`, before they have a place."""
+    """(P,) of `rays.PlacedSolid`, before placement."""
     _corner_normals: Any = field(init=False, repr=False)
     _corners: Floats = field(init=False, repr=False)
-    """(P, 8, 3) of the solids' bounds."""
+    """(P, 8, 3) corners of the solids' bounds."""
     _placed: Any = field(init=False, repr=False)
     _materials: Any = field(init=False, repr=False)
 
@@ -83,7 +83,7 @@ class Tracer:
         self._corners = np.stack([_corners(solid) for solid in self.solids])
 
     def place(self, poses: Floats, looks: Sequence[Sequence[Appearance]]) -> None:
-        """Puts the solids where they belong.
+        """Place the solids in their worlds.
 
         Args:
             poses: (worlds, P, 7) of each solid in its world.
@@ -103,15 +103,15 @@ class Tracer:
         shot: CameraShot,
         run: ExecutionContext = DEFAULT_CONTEXT,
     ) -> Pictures:
-        """Traces all cameras.
+        """Trace all cameras.
 
         Args:
             shot: cameras and light.
-            run: its threads share the rows of each picture, a GPU takes many pictures at once; told of pictures done,
-                and asked before each launch whether to stop.
+            run: its threads share the rows of each picture, a GPU takes many pictures at once; receives finished
+                pictures and is polled before each launch.
 
         Raises:
-            TaskCancelled: `run.cancelled()` answered True.
+            TaskCancelled: `run.cancelled()` returned True.
         """
         cuda = wp.get_device(self.device).is_cuda
         threads = 1 if cuda else min(run.cores, shot.height)
@@ -128,13 +128,13 @@ class Tracer:
 
 
 class _Film:
-    """What all pictures of a shot have in common, on the device."""
+    """Device data common to all pictures of a shot."""
 
     def __init__(self, tracer: Tracer, shot: CameraShot) -> None:
         self._tracer, self._shot, device = tracer, shot, tracer.device
         passes = light_passes(shot.samples, shot.toward_lamp)
         self._passes = _structs(passes, exposure.LightPass, device)
-        # Worlds turn under the lamp: seen from them, lamp and sky turn the other way.
+        # Worlds turn under the lamp: in their frames, lamp and sky turn the other way.
         back = quat_from_axis_angle(np.array([0.0, 0.0, 1.0]), -np.asarray(shot.turn))
         toward = quat_rotate(back[:, None], np.array([one.toward for one in passes]))
         self._toward = wp.array(toward, dtype=wp.vec3f, device=device)
@@ -143,7 +143,7 @@ class _Film:
     def expose(
         self, views: NDArray[np.intp], threads: int, pool: ThreadPoolExecutor
     ) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]:
-        """Colour, depth, shapes and normals of some of the views; each thread takes rows from all over the pictures."""
+        """Return colour, depth, shapes and normals of some views; each thread takes rows of all pictures."""
         tracer, shot, device = self._tracer, self._shot, self._tracer.device
         size, world, k = (len(views), shot.height, shot.width), shot.world[views], shot.intrinsics
         rgb = wp.zeros((*size, 3), dtype=wp.uint8, device=device)
@@ -191,7 +191,7 @@ def _corners(solid: Solid | Box) -> Floats:
 
 
 def _structs(things: Sequence[Any], struct: Any, device: str) -> Any:
-    """An array of Warp structs with what each thing holds under the names of their fields."""
+    """Return an array of Warp structs, filled from each thing's attributes of the same names."""
     kind = np.dtype(struct.numpy_dtype())
     rows = [tuple(getattr(thing, name) for name in kind.names or ()) for thing in things]
     return wp.array(np.array(rows, kind), dtype=struct, device=device)
@@ -206,16 +206,16 @@ class LightPass:
     """One ray through every pixel, one directional light."""
 
     shift: tuple[float, float]
-    """Of the ray from the pixel's centre [px]."""
+    """Offset of the ray from the pixel's centre [px]."""
     toward: Floats
     """(3,) unit direction to the light."""
     lamp_weight: float
-    """Weights that make the mean over all passes one lamp and one sky."""
+    """Weights with which the mean over all passes is one lamp and one sky."""
     sky_weight: float
 
 
 def light_passes(samples: int, toward_lamp: Floats) -> list[LightPass]:
-    """Passes by turns from the lamp's disc and from the sky; pass 0 goes through the pixel centres."""
+    """Return passes alternating between the lamp's disc and the sky; pass 0 is at pixel centres."""
     lamp_passes, sky_passes = (samples + 1) // 2, samples // 2
     # An open horizontal surface receives 1 from the whole sky.
     sky = 2.0 / (1.0 + SKY_EDGE) * samples / max(1, sky_passes)
@@ -240,7 +240,7 @@ def _on_disc(axis: Floats, k: int, count: int) -> Floats:
 
 
 def _on_sky(k: int, count: int) -> Floats:
-    # Uniform over the sky above the horizon haze: low lights would draw long streaks.
+    # Uniform over the sky above the horizon haze: low lights would cast long streaks.
     height, angle = 1.0 - (1.0 - SKY_EDGE) * (k + 0.5) / count, _GOLDEN * k
     level = np.sqrt(1.0 - height**2)
     return np.array([level * np.cos(angle), level * np.sin(angle), height])

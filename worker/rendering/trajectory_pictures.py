@@ -1,4 +1,4 @@
-"""Pictures and films of grasps along their trajectories, for people: one camera a grasp, from a side that shows it."""
+"""Pictures and films of grasps along their trajectories, with one camera per grasp on a good side."""
 
 from __future__ import annotations
 
@@ -40,19 +40,19 @@ from graspd.worker.rendering.scenery import Appearance, Box, CameraShot, Solid, 
 from graspd.worker.rendering.tracer import Tracer
 from graspd.worker.scenes.neighbours import Neighbours
 
-#: Postures that a strip shows; those that a grasp has.
+#: Postures of a strip, where a grasp has them.
 STRIP: Final = ("standoff", "pregrasp", "grasp", "lift")
 FREE_STRIP: Final = ("pregrasp", "grasp", "squeeze")
-#: Sides that are tried: so many around, at these heights above the horizon [rad].
+#: Candidate sides: number around, and their heights above the horizon [rad].
 _AROUND: Final = 16
 _HEIGHTS: Final = tuple(np.radians([20.0, 35.0, 52.0]).tolist())
-#: Two sides of one grasp are this far apart at least [rad], if they can be.
+#: Least angle between two sides of one grasp, if possible [rad].
 _APART: Final = np.radians(50.0)
-#: Edge of the pictures that sides are validated by [px].
+#: Edge of the pictures that rate the sides [px].
 _GLANCE: Final = 48
-#: Towards the lamp where a board is above the object: from before it, as high as a room's window.
+#: Direction of the lamp under a board: from the front, as high as a window.
 _UNDER_A_BOARD: Final = np.array([0.85, -0.42, 0.32]) / np.linalg.norm([0.85, -0.42, 0.32])
-#: Hand parts farther than this from the object do not draw the camera back [m].
+#: Hand parts farther than this from the object are not framed [m].
 _NEAR_M: Final = 0.14
 _HIGH_M: Final = 3.0
 _TABLE: Final = Appearance(hexadecimal("#b9bfc2"), roughness=0.85)
@@ -62,7 +62,7 @@ _BESIDE: Final = Appearance(hexadecimal("#8d86a3"), roughness=0.6)
 
 @dataclass(frozen=True)
 class PictureScenes:
-    """Where N grasps are: S scenes of an object with the same supports, or one free object that floats."""
+    """Scenes of N grasps: S scenes of an object with common supports, or one free object."""
 
     supports: Supports = ()
     object_pose: Floats = field(default_factory=lambda: np.array(IDENTITY_POSE)[None])
@@ -71,17 +71,17 @@ class PictureScenes:
     """(N,) scene of each grasp; None: all in the first."""
     neighbours: Neighbours | None = None
     wrist: Floats | None = None
-    """(N, U) angles of the wrist with which the links above the hand's root are drawn; None: they are not."""
+    """(N, U) wrist angles for drawing the links above the hand's root; None: not drawn."""
 
     def centred(self, obj: ObjectModel) -> PictureScenes:
-        """The same with `obj`, which they are of, and the neighbours about their middles."""
+        """Return the scenes with the frames of their object `obj` and of the neighbours at their centres."""
         if not self.supports:
-            return self  # a free object floats wherever the tracer is most exact: about its origin
+            return self  # a free object is about the origin, where the tracer is most exact
         beside = None if self.neighbours is None else self.neighbours.centred
         return replace(self, object_pose=to_centre(self.object_pose, obj.centre), neighbours=beside)
 
     def scene(self, number: int) -> int:
-        """Scene of a grasp."""
+        """Return the scene of a grasp."""
         return 0 if self.index is None else int(self.index[number])
 
 
@@ -97,24 +97,24 @@ def way_pictures(
     run: ExecutionContext = DEFAULT_CONTEXT,
     samples: int = SAMPLES,
 ) -> NDArray[np.uint8]:
-    """Pictures of N grasps, F postures each, from A sides.
+    """Render N grasps, F postures each, from A sides.
 
     Args:
         hand: its bodies are drawn.
-        obj: what is grasped, carried as far as each posture says.
+        obj: the object, carried along by each posture.
         frames: for each grasp F postures in the frame of the object at rest.
         around: the scenes.
         size: width and height [px].
-        sides: A sides of each grasp, those first that show most of object and fingers.
-        whole: all of the hand is in each picture; else what is far from the object may leave it.
-        run: asked between passes whether to stop.
+        sides: A sides of each grasp, ordered by how much of object and fingers they show.
+        whole: frame the whole hand; else parts far from the object may leave the picture.
+        run: polled for cancellation between passes.
         samples: rays per pixel.
 
     Returns:
         (N, A, F, H, W, 3) sRGB.
 
     Raises:
-        TaskCancelled: `run.cancelled()` answered True.
+        TaskCancelled: `run.cancelled()` returned True.
     """
     if not frames:
         return np.zeros((0, sides, 0, size[1], size[0], 3), np.uint8)
@@ -150,7 +150,7 @@ class _Stage:
     def shoot(
         self, number: int, way: Sequence[Waypoint], size: tuple[int, int], sides: int, samples: int
     ) -> NDArray[np.uint8]:
-        """(A, F, H, W, 3)"""
+        """Render one grasp (A, F, H, W, 3)."""
         scene = self.around.scene(number)
         rest = np.asarray(self.around.object_pose[scene], float)
         roots = compose(rest, moved(np.stack([point.hand_pose for point in way]), -self.centre))
@@ -198,16 +198,16 @@ class _Stage:
             height=size[1],
             samples=samples,
             toward_lamp=self.lamp,
-            # The lamp goes round with the camera, so no side lies in the dark.
+            # The lamp turns with the camera, so that no side is dark.
             turn=np.full(self.frames, -angle),
             lamps=[STUDIO] * self.frames,
         )
 
     def _best_sides(self, world: int, near: Floats, first: float, count: int) -> list[tuple[float, float]]:
-        """Azimuth and height [rad] of the sides that show most, apart from one another.
+        """Return azimuth and height [rad] of the sides that show most, apart from one another.
 
-        What counts is how much is seen of the object and of the hand, each as a share of the most that any side shows,
-        from labels alone; between equals the side that looks across the palm's way.
+        The score is the visible part of object and hand, each as a share of the most that any side shows, from labels
+        alone. Ties go to the side that looks across the palm's approach.
         """
         sides = [(first + 2 * np.pi * a / _AROUND, h) for h in _HEIGHTS for a in range(_AROUND)]
         centre = 0.5 * (near.min(axis=0) + near.max(axis=0))
@@ -219,7 +219,7 @@ class _Stage:
         seen = self.tracer.shoot(replace(glance, shaded=False), self.run.quiet()).shape
         thing = len(self.boxes)
         first_of_hand = thing + 1 + len(self.others)
-        # A forearm may be out of sight.
+        # A forearm may be out of view.
         fingers = (seen >= first_of_hand) & (seen < first_of_hand + len(drawn_bodies(self.hand)))
         shares = [(seen == thing).sum(axis=(1, 2)), fingers.sum(axis=(1, 2))]
         score = sum(np.sqrt(share / max(1, share.max())) for share in shares)
@@ -234,7 +234,7 @@ class _Stage:
         return [sides[one] for one in chosen]
 
 
-#: How a file is written, by how its name ends. A GIF has 256 colours, and is many times as large as a WebP.
+#: File formats by suffix. A GIF has 256 colours and is many times as large as a WebP.
 KINDS: Final[dict[str, dict[str, Any]]] = {
     ".gif": {"format": "GIF", "optimize": False, "disposal": 1},
     ".webp": {"format": "WEBP", "quality": 82, "method": 4},
@@ -245,10 +245,10 @@ _PALETTE_OF: Final = 9
 
 
 def animation_kind(suffix: str) -> str:
-    """The suffix in small letters.
+    """Return the suffix in lower case.
 
     Raises:
-        InputError: no animation is written under it.
+        InputError: no animation format has this suffix.
     """
     if (small := suffix.lower()) not in KINDS:
         raise InputError(f"an animation is written as {', '.join(KINDS)}, not as {suffix or 'a file without suffix'}")
@@ -256,15 +256,15 @@ def animation_kind(suffix: str) -> str:
 
 
 def animation(pictures: NDArray[np.uint8], seconds: Sequence[float], suffix: str) -> bytes:
-    """A film that begins anew when it ends.
+    """Encode a looping film.
 
     Args:
         pictures: (F, H, W, 3) sRGB.
-        seconds: (F,) how long each is shown; files keep milliseconds, a GIF hundredths of a second.
+        seconds: (F,) duration of each; files store milliseconds, a GIF hundredths of a second.
         suffix: one of `KINDS`.
 
     Raises:
-        InputError: no animation is written under this suffix.
+        InputError: no animation format has this suffix.
     """
     kind = animation_kind(suffix)
     images = [Image.fromarray(picture) for picture in pictures]
@@ -277,7 +277,7 @@ def animation(pictures: NDArray[np.uint8], seconds: Sequence[float], suffix: str
 
 
 def _in_one_palette(pictures: NDArray[np.uint8]) -> list[Image.Image]:
-    """Without dither, so what stands still stays the same from picture to picture."""
+    """Quantise without dither, so that static parts stay identical between pictures."""
     some = np.unique(np.linspace(0, len(pictures) - 1, _PALETTE_OF).round().astype(int))
     palette = Image.fromarray(np.concatenate(pictures[some])).quantize(256, method=Image.Quantize.MEDIANCUT)
     return [Image.fromarray(picture).quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]

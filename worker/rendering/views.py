@@ -1,4 +1,4 @@
-"""Views of scenes: pictures of an object on a table with everything that a network is taught about them."""
+"""Views of scenes: pictures of an object on a table, with all labels for training networks."""
 
 from __future__ import annotations
 
@@ -38,17 +38,17 @@ Arrays = dict[str, NDArray[np.generic]]
 
 @dataclass(frozen=True)
 class Extras:
-    """What a render shows beyond an object alone from sampled cameras, in colour, depth and segmentation."""
+    """Options of a render beyond an object alone from sampled cameras, in colour, depth and segmentation."""
 
     channels: Sequence[str] = ()
     """Of `service.model.domain.EXTRA_CHANNELS`."""
     cameras: GivenCameras = SAMPLED
-    """Intrinsics and places that are given instead of sampled."""
+    """Given intrinsics and poses instead of sampled ones."""
     neighbours: Neighbours | None = None
     drawn: DrawnHand | None = None
-    """The hand of `image/rgb_hand`; it is in no other picture."""
+    """Hands of `image/rgb_hand`; they are in no other picture."""
     supports: Supports = TABLE
-    """What the object stands on and between; all are labelled as the table."""
+    """Supports of the object; all are labelled as the table."""
 
 
 NO_EXTRAS: Final = Extras()
@@ -68,28 +68,28 @@ def render(
     samples: int = SAMPLES,
     extras: Extras = NO_EXTRAS,
 ) -> Arrays:
-    """Pictures of every scene from sampled or given cameras, all in one launch per pass.
+    """Render every scene from sampled or given cameras, all in one launch per pass.
 
     Args:
         obj: the object.
         object_pose: (S, 7) rest poses in the table frame.
-        views: camera placements per scene; given places stand instead.
+        views: camera placements per scene, unless cameras are given.
         stereo: a rectified left and right picture per placement.
         width, height: picture size [px].
         seed: of cameras, materials and lights; same seed, same pixels. Scene s depends on (seed, s) alone.
-        run: told of pictures done; asked before each pass whether to stop. Pixels do not depend on its threads.
+        run: receives finished pictures; polled before each pass. Pixels do not depend on its threads.
         baseline_m: distance of the eyes.
         samples: rays per pixel.
         extras: further channels, given cameras, other objects, a hand.
 
     Returns:
         The datasets of a views shard, V = S * views * (2 if stereo else 1) pictures: scene by scene, placement by
-        placement, left before right. Labels come from the ray through the pixel's centre; the table is a surface
-        like any other in `image/depth`.
+        placement, left before right. Labels come from the ray through the pixel's centre; the table is a surface like
+        any other in `image/depth`.
 
     Raises:
         InputError: a count or size is out of range.
-        TaskCancelled: `run.cancelled()` answered True.
+        TaskCancelled: `run.cancelled()` returned True.
     """
     poses = np.asarray(object_pose, float).reshape(-1, 7)
     plan = CameraPlan(views, width, height, baseline_m if stereo else None, extras.cameras)
@@ -115,7 +115,7 @@ def render(
 
 
 def annotate(setting: Setting, pictures: Pictures, obj: ObjectModel, channels: Sequence[str] = ()) -> Arrays:
-    """The datasets of a views shard that follow from the cameras and what they saw."""
+    """Compute the datasets of a views shard that follow from cameras and pictures."""
     shot, plan = setting.shot, setting.plan
     cameras = Cameras(plan.width, plan.height, shot.intrinsics, shot.extrinsics)
     count, poses = len(shot.world), setting.object_pose[shot.world][:, None]

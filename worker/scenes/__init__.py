@@ -1,4 +1,4 @@
-"""Where grasps happen: an object at rest on a table, and the grasps that a hand can reach there."""
+"""Scenes: objects at rest on a table, and the grasps that a hand can reach there."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Grasps on a table: base grasps moved by the object's rest pose and checked against the table, exactly."""
+"""Grasps on a table: base grasps moved by the object's rest pose, checked exactly against the table."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from graspd.worker.simulation.environment import CLEAR_M, UP, Environment, Obsta
 from graspd.worker.simulation.mounting import mounting_room, wrist_room
 from graspd.worker.simulation.obstacles import PosedFeatures
 
-#: A grasp is kept if the hand stays at least this far above the table [m].
+#: Least clearance of the hand above the table [m].
 MARGIN_M: Final = CLEAR_M
-#: Postures checked on the straight way from pregrasp to grasp, both ends included.
+#: Postures checked on the straight trajectory from pregrasp to grasp, both ends included.
 PATH_POSTURES: Final = 9
 _CHUNK: Final = 64
 _TABLE: Final = Obstacle.half_space(UP, 0.0)
 
 
 class Rejection(IntEnum):
-    """Why a grasp is no grasp of a scene; of several reasons the first in this order."""
+    """Reason to reject a grasp in a scene; of several, the first in this order."""
 
     NONE = 0
     TABLE_AT_CONTACT = 1
@@ -43,7 +43,7 @@ def transfer(
     object_pose: Floats,
     neighbours: Neighbours | None = None,
 ) -> dict[str, NDArray[np.generic]]:
-    """Every grasp in every scene, with the clearance of the hand and its mounting above the table.
+    """Transfer every grasp to every scene and compute the clearance of the hand and its mounting.
 
     The wrist of a mounting has the first angles that keep it off the table; neighbours do not decide them.
 
@@ -52,14 +52,14 @@ def transfer(
         grasp: N postures at contact, object frame.
         pregrasp: N postures before contact, object frame; the hand moves straight from it to the grasp.
         object_pose: (S, 7) rest poses in the table frame.
-        neighbours: other objects on the table that the hand must stay clear of, too.
+        neighbours: other objects on the table, which the hand must also avoid.
 
     Returns:
         Datasets of the scene shard with K = S N rows, scene-major: `grasp/base_index`, `grasp/scene_index`,
         `grasp/hand_pose` (K, 7), `grasp/table_clearance_m` (K,): lowest point of the hand at the grasp, the pregrasp
         and between them; `grasp/contact_table_clearance_m` (K,): the same at the grasp alone; `grasp/valid` (K,): 1
-        where both are at least `MARGIN_M`; `grasp/rejection` (K,): a `Rejection`. With neighbours
-        also `grasp/neighbour_clearance_m` (K,), of hands on a wrist `grasp/wrist_positions` (K, U).
+        where both are at least `MARGIN_M`; `grasp/rejection` (K,): a `Rejection`. With neighbours also
+        `grasp/neighbour_clearance_m` (K,), of hands on a wrist `grasp/wrist_positions` (K, U).
 
     Raises:
         InputError: grasps and pregrasps differ in number.
@@ -99,12 +99,12 @@ def transfer(
 
 
 def count_rejections(rejection: NDArray[np.uint8]) -> dict[str, int]:
-    """How many grasps each reason refused."""
+    """Count the grasps rejected for each reason."""
     return {r.name.lower(): int((rejection == r).sum()) for r in Rejection if r is not Rejection.NONE}
 
 
 def approach(grasp: Posture, pregrasp: Posture, postures: int = PATH_POSTURES) -> Posture:
-    """(N * postures) postures on the straight way from each pregrasp (first) to its grasp (last).
+    """Return (N * postures) postures on the straight trajectory from each pregrasp to its grasp.
 
     Positions and joints move linearly, orientations along the shorter arc (normalised linear interpolation).
     """
@@ -121,8 +121,8 @@ def approach(grasp: Posture, pregrasp: Posture, postures: int = PATH_POSTURES) -
 def _beside(
     hand: HandModel, grasp: Posture, pregrasp: Posture, poses: Floats, neighbours: Neighbours, wrist: Floats
 ) -> Floats:
-    """(S, N, 2) distance of hands, and of their mountings at wrist angles (S, N, K), from the neighbours at contact,
-    and the smallest on the way."""
+    """Return clearances (S, N, 2) of hands and mountings from neighbours: at contact and on the approach.
+    Mountings are at wrist angles (S, N, K)."""
     path = approach(grasp, pregrasp)
     distance = neighbour_clearance(hand, path, poses, neighbours)
     if hand.mounting is not None:
@@ -136,7 +136,7 @@ def _beside(
 
 
 def _clearance(hand: HandModel, grasp: Posture, pregrasp: Posture, object_pose: Floats) -> Floats:
-    """(S, N, 2) lowest point of the hand at contact, and anywhere on its way, in the table frame [m]."""
+    """Return the lowest point (S, N, 2) of the hand at contact, and on its approach, table frame [m]."""
     features = PosedFeatures.of(hand, approach(grasp, pregrasp))
     on_path = np.array([features.distance(_TABLE.seen_from(pose)).min(axis=1) for pose in object_pose])
     on_path = on_path.reshape(len(object_pose), len(grasp), -1)
@@ -146,8 +146,8 @@ def _clearance(hand: HandModel, grasp: Posture, pregrasp: Posture, object_pose: 
 def _mounting_clearance(
     hand: HandModel, grasp: Posture, pregrasp: Posture, object_pose: Floats
 ) -> tuple[Floats, Floats]:
-    """(S, N, K) wrist angles and (S, N, 2) lowest point of the mounting at contact, and anywhere on its way [m]; inf
-    without one."""
+    """Return wrist angles (S, N, K) and the mounting's lowest points (S, N, 2) [m]; inf without one.
+    The points are at contact and anywhere on the approach."""
     path = approach(grasp, pregrasp).hand_pose.reshape(len(grasp), PATH_POSTURES, 7)
     angles, heights = [], []
     for pose in object_pose:

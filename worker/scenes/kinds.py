@@ -1,4 +1,4 @@
-"""From a scene as a user says it to supports and rest poses: tables, bins, shelves, and what a file says."""
+"""Supports and rest poses of the scenes that users specify: tables, bins, shelves, and files."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from graspd.worker.simulation.environment import Obstacle
 
 #: Least gap between an object and a wall [m].
 GAP: Final = 0.01
-#: A face that fewer drops end on is not looked at with `faces all`.
+#: With `faces all`, faces on which a smaller share of drops ends are skipped.
 LEAST_PROBABILITY: Final = 0.03
-#: An object may reach into its support by this much: rest poses are exact, a file's are rounded [m].
+#: Tolerated depth of an object in its support [m]: rest poses are exact, those of files are rounded.
 SUNK: Final = 5e-4
 
 
 def supports_of(spec: SceneSpec) -> tuple[Obstacle, ...]:
-    """Supports in the scene frame; none for a free object."""
+    """Return the supports in the scene frame; none for a free object."""
     found = (
         Obstacle.box(s.pose, s.size) if isinstance(s, Box) else Obstacle.half_space(s.normal, s.offset)
         for s in supports_in(spec)
@@ -34,12 +34,12 @@ def supports_of(spec: SceneSpec) -> tuple[Obstacle, ...]:
 
 
 def room_in(spec: SceneSpec) -> tuple[float, float] | None:
-    """x by y about the origin in which things stand between the walls or on the board [m]; None: no walls."""
+    """Return the rectangle, x by y about the origin, inside walls or on the board [m]; None: no walls."""
     return {"bin": BIN_SIZE, "shelf": (SHELF_SIZE[1], SHELF_SIZE[0])}.get(spec.kind)
 
 
 def rest_poses(spec: SceneSpec, obj: ObjectModel, *, count: int, seed: int) -> dict[str, Floats]:
-    """Where the object stands in `count` scenes (with `faces all`, in as many as it has stable faces).
+    """Compute the object's rest poses in `count` scenes (`faces all`: one for each stable face).
 
     Returns:
         `scene/object_pose` (S, 7) in the scene frame, `scene/rest_probability` (S,), `scene/drop_seconds` (S,).
@@ -69,8 +69,8 @@ def rest_poses(spec: SceneSpec, obj: ObjectModel, *, count: int, seed: int) -> d
 
 
 def _each_face(obj: ObjectModel, seed: int) -> dict[str, Floats]:
-    """One scene for each face that holds the object and that at least `LEAST_PROBABILITY` of drops end on; of faces on
-    which it rolls only where there is no other."""
+    """Return one scene per stable face on which at least `LEAST_PROBABILITY` of drops end.
+    Faces on which the object rolls are used only if there is no other."""
     faces = resting_faces(obj)
     stable = faces.stable
     share = reference_share(obj, stable.tolist())
@@ -94,7 +94,7 @@ def _each_face(obj: ObjectModel, seed: int) -> dict[str, Floats]:
 
 
 def inside(obj: ObjectModel, pose: Floats, size: tuple[float, float], rng: np.random.Generator) -> Floats:
-    """The pose moved to a random place within a rectangle of x by y [m] about the origin.
+    """Move the pose to a random place within a rectangle of x by y [m] about the origin.
 
     Raises:
         SceneError: the object is too large for it.
@@ -112,10 +112,10 @@ def inside(obj: ObjectModel, pose: Floats, size: tuple[float, float], rng: np.ra
 
 
 def check_free(obj: ObjectModel, poses: Floats, supports: tuple[Obstacle, ...]) -> None:
-    """Refuses poses (S, 7) in which an object stands deeper in a support than rounding brings it.
+    """Check that no pose (S, 7) puts the object deeper into a support than rounding does.
 
     Raises:
-        InputError: it does.
+        InputError: one does.
     """
     for pose in poses:
         corners = quat_rotate(pose[3:], obj.hull_vertices) + pose[:3]

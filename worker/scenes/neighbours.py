@@ -1,10 +1,10 @@
-"""Several objects in a scene: dropped together on a table, or laid beside one at rest; hands kept clear of the others.
+"""Several objects in a scene: dropped together on a table, or placed beside one at rest.
 
-Collision shapes are the convex hulls. That is exact against the table and careful among objects: nothing is ever put
-into another one's hollow.
+Also the clearance of hands from neighbours. Collision shapes are convex hulls: exact against the table and conservative
+among objects, since nothing is ever placed in another object's hollow.
 
-Each one rests as it fell by itself, so its pose is exact; the place and the turn about the vertical are drawn until its
-hull is clear of walls and of the others.
+An object placed beside another rests as it fell by itself, so its pose is exact. Position and turn about the vertical
+are drawn until its hull is clear of walls and of the others.
 """
 
 from __future__ import annotations
@@ -42,13 +42,13 @@ from graspd.worker.scenes.simulate import (
 from graspd.worker.simulation.environment import Obstacle
 
 TIMEOUT_S: Final = 6.0
-#: Neighbours fall at this distance from the object, as a multiple of the sum of both bounding radii.
+#: Distance of falling neighbours from the object, as a multiple of the sum of both bounding radii.
 RING: Final = (1.0, 1.25)
-#: Neighbours may come to rest this far from the middle of the table [m].
+#: Largest distance of resting neighbours from the middle of the table [m].
 NEIGHBOUR_REACH: Final = 0.4
-#: Laying an object flat lifts it by what MuJoCo's soft contacts let it sink; more means that it lay on something [m].
+#: Laying an object flat lifts it by the penetration of MuJoCo's soft contacts; more means that it lay on something [m].
 MAX_LIFT: Final = 0.003
-#: Clearances beyond this are not told apart [m].
+#: Clearances are capped at this [m].
 FARTHEST_M: Final = 0.1
 MOST_NEIGHBOURS: Final = 8
 _SHAPES: Final = {
@@ -69,7 +69,7 @@ class Neighbours:
 
     @property
     def centred(self) -> Neighbours:
-        """The same objects about their middles."""
+        """Return the objects with their frames at their centres."""
         poses = np.array(self.poses, float)
         for number, obj in enumerate(self.objects):
             poses[:, number] = to_centre(poses[:, number], obj.centre)
@@ -77,10 +77,10 @@ class Neighbours:
 
 
 def drop_together(obj: ObjectModel, neighbours: Sequence[ObjectModel], *, count: int, seed: int) -> dict[str, Floats]:
-    """Let an object and its neighbours fall onto a table until all rest, `count` times.
+    """Drop an object and its neighbours onto a table until all rest, `count` times.
 
-    The object falls in the middle, the neighbours around it. Drops in which something does not come to rest, rolls
-    away, or leans or lies on another object are redone. Scene i depends on the objects, the seed and i alone.
+    The object falls in the middle, the neighbours around it. Drops are redone if an object does not come to rest, rolls
+    away, or leans or lies on another. Scene i depends on the objects, the seed and i alone.
 
     Args:
         obj: the object that is grasped.
@@ -114,7 +114,7 @@ def drop_together(obj: ObjectModel, neighbours: Sequence[ObjectModel], *, count:
 
 
 class _Heap:
-    """The compiled simulation of some objects above a table."""
+    """Compiled simulation of some objects above a table."""
 
     def __init__(self, objects: Sequence[ObjectModel]) -> None:
         self.objects = objects
@@ -142,7 +142,7 @@ class _Heap:
         self.data = mujoco.MjData(self.model)
 
     def redo_until_rest(self, key: tuple[int, int]) -> tuple[Floats, int, float]:
-        """Poses (1 + M, 7), the face the object rests on, and seconds."""
+        """Drop until all rest; return poses (1 + M, 7), the face the object rests on, and seconds."""
         for attempt in range(MAX_ATTEMPTS):
             if (found := self._drop_once(np.random.default_rng([*key, attempt]))) is not None:
                 return found
@@ -159,7 +159,7 @@ class _Heap:
         return None if seconds is None or void(self.data) else self._at_rest(seconds, rng)
 
     def _sample(self, rng: np.random.Generator) -> Floats | None:
-        """(1 + M, 7) release poses whose bounding balls lie apart; None if the neighbours found no room."""
+        """Draw release poses (1 + M, 7) with disjoint bounding balls; None if a neighbour does not fit."""
         quaternions = rng.normal(size=(len(self.objects), 4))
         quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
         middles = [np.zeros(2)]
@@ -193,7 +193,7 @@ class _Heap:
         return None
 
     def _at_rest(self, seconds: float, rng: np.random.Generator) -> tuple[Floats, int, float] | None:
-        """The poses laid flat; None where something leans, lies on another, rolled away or would overlap."""
+        """Return the poses laid flat; None if something leans, lies on another, rolled away or would overlap."""
         flat, first = [], -1
         for k, (obj, pose) in enumerate(zip(self.objects, self.data.qpos.reshape(-1, 7).copy(), strict=True)):
             pose[3:] /= np.linalg.norm(pose[3:])
@@ -216,16 +216,16 @@ class _Heap:
 
 
 def neighbour_clearance(hand: HandModel, path: Posture, object_pose: Floats, neighbours: Neighbours) -> Floats:
-    """Signed distance of the hand from the neighbours' hulls [m], at most `FARTHEST_M`; negative: it reaches in.
+    """Compute signed distances of the hand from neighbours' hulls [m], at most `FARTHEST_M`.
 
     Args:
         hand: the hand; its convex pieces count.
         path: P postures in the object frame.
         object_pose: (S, 7) of the object in the table frame.
-        neighbours: what to stay clear of.
+        neighbours: objects to avoid.
 
     Returns:
-        (S, P).
+        (S, P); negative: the hand penetrates a hull.
     """
     spec = mujoco.MjSpec()
     for k, piece in enumerate(hand.pieces):
@@ -254,7 +254,7 @@ def neighbour_clearance(hand: HandModel, path: Posture, object_pose: Floats, nei
 
 
 def add_hull(spec: Any, body: Any, name: str, obj: ObjectModel, **options: Any) -> None:
-    """Give a body of a MuJoCo specification an object's convex hull as its shape, with options of the geom."""
+    """Add an object's convex hull to a body of a MuJoCo specification, with options of the geom."""
     mesh = spec.add_mesh(name=name, inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)
     mesh.uservert = np.asarray(obj.hull_vertices, np.float32).ravel()
     mesh.userface = np.asarray(obj.hull_faces, np.int32).ravel()
@@ -279,8 +279,8 @@ BETWEEN: Final = 0.005
 #: Draws of all neighbours of a scene, and of each of them.
 _DRAWS: Final = 32
 _PLACES: Final = 100
-#: A neighbour's middle is at most this far from the object's, as a multiple of the sum of both bounding radii, and that
-#: much farther with each draw that found no room.
+#: Largest distance of a neighbour's centre from the object's, as a multiple of the sum of both bounding radii; it grows
+#: by that much with each failed draw.
 _REACH: Final = 1.25
 _FARTHER: Final = 0.1
 
@@ -295,19 +295,20 @@ def lay_beside(
     count: int,
     seed: int,
 ) -> tuple[Floats, Floats]:
-    """Poses of an object (S, 7) and of its M neighbours (S, M, 7) that stand `BETWEEN` apart and clear of all supports.
+    """Place M neighbours beside an object; return poses (S, 7) of the object and (S, M, 7).
+    All are `BETWEEN` apart and clear of all supports.
 
     Args:
         obj: the object that is grasped.
-        again: its pose (7,) in scene i at try k.
+        again: its pose (7,) in scene i at attempt k.
         others: the neighbours; each rests on z = 0.
-        supports: what stands in the scene frame.
+        supports: in the scene frame.
         within: x by y about the origin that they must not leave [m].
         count: number of scenes S.
         seed: any non-negative integer. Scene i depends on the objects, the supports, the seed and i alone.
 
     Raises:
-        SceneError: there is no room for all of them.
+        SceneError: they do not all fit.
         MeshError: one never comes to rest, or is flat.
     """
     resting = [drop(one, count=count, seed=_seed_of(seed, k))["scene/object_pose"] for k, one in enumerate(others)]
@@ -330,14 +331,14 @@ def lay_beside(
 
 
 def _seed_of(seed: int, number: int) -> int:
-    """A seed of a neighbour's own: two of one object must not lie alike."""
+    """Return a seed of a neighbour's own: copies of one object must not rest identically."""
     return int(np.random.SeedSequence([seed, 1 + number]).generate_state(1)[0])
 
 
 def _drawn(
     hulls: _Hulls, target: Floats, resting: Sequence[Floats], reach: float, rng: np.random.Generator
 ) -> Floats | None:
-    """(1 + M, 7) poses of one scene; None where no place was found for one of the neighbours."""
+    """Draw poses (1 + M, 7) of one scene; None if a neighbour does not fit."""
     placed = [target]
     middle = hulls.middle(0, target)
     for number, rest in enumerate(resting, start=1):
@@ -359,13 +360,13 @@ def _drawn(
 
 
 def _turned(pose: Floats, angle: float) -> Floats:
-    """The pose turned about the vertical through the origin."""
+    """Return the pose turned about the vertical through the origin."""
     about = np.concatenate([np.zeros(3), quat_from_axis_angle(np.array([0.0, 0, 1]), np.asarray(angle))])
     return compose(about, pose)
 
 
 class _Hulls:
-    """The convex hulls of some objects, and how far they are from each other and from what stands around."""
+    """Convex hulls of some objects, with their distances from each other and from obstacles."""
 
     def __init__(
         self, objects: Sequence[ObjectModel], supports: Sequence[Obstacle], within: tuple[float, float] | None
@@ -380,16 +381,16 @@ class _Hulls:
         self._data = mujoco.MjData(self._model)
 
     def middle(self, number: int, pose: Floats) -> Floats:
-        """(2,) where an object's centre of mass stands."""
+        """Return the position (2,) of an object's centre of mass."""
         return np.asarray((quat_rotate(pose[3:], self.objects[number].centre_of_mass) + pose[:3])[:2])
 
     def room(self, number: int, pose: Floats) -> tuple[Floats, Floats]:
-        """(2,) and (2,) least and greatest shift along x and y that keeps an object within the walls."""
+        """Return the least and greatest shift (2,), (2,) along x and y that keeps an object within the walls."""
         corners = self._corners(number, pose)[:, :2]
         return -self._room - corners.min(axis=0), self._room - corners.max(axis=0)
 
     def clear(self, number: int, pose: Floats) -> bool:
-        """Whether an object is `GAP` away from every support that it does not stand on."""
+        """Check whether an object is `GAP` away from every support except the one it stands on."""
         corners = self._corners(number, pose)
         return all(_beyond(support, corners) for support in self._supports)
 
@@ -397,7 +398,7 @@ class _Hulls:
         return quat_rotate(pose[3:], self.objects[number].hull_vertices) + pose[:3]
 
     def apart(self, poses: Sequence[Floats]) -> bool:
-        """Whether the last of the poses, of the first objects, is `BETWEEN` away from the others."""
+        """Check whether the last of the poses, of the first objects, is `BETWEEN` away from the others."""
         last = len(poses) - 1
         self._data.mocap_pos[: last + 1] = [pose[:3] for pose in poses]
         self._data.mocap_quat[: last + 1] = [pose[3:] for pose in poses]
@@ -407,9 +408,9 @@ class _Hulls:
 
 
 def _beyond(support: Obstacle, corners: Floats) -> bool:
-    """Whether a hull lies beyond one plane of a support: on it where the plane looks up, else `GAP` away.
+    """Check whether a hull lies beyond one plane of a support: on an upward plane, `GAP` away from others.
 
-    A plane between two convex bodies parts them; where only an edge against an edge would, this says no.
+    A plane separates two convex bodies. Where only an edge against an edge would separate them, the result is False.
     """
     room = (corners @ support.planes[:, :3].T - support.planes[:, 3]).min(axis=0)
     least = np.where(support.planes[:, 2] > 1 - 1e-6, -SUNK, GAP)

@@ -1,4 +1,4 @@
-"""The other objects of a scene: as few convex pieces with few faces, and where they stand."""
+"""Neighbours of a scene: reduction to a few convex pieces with few faces, and placement."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from graspd.worker.scenes.neighbours import drop_together, lay_beside
 from graspd.worker.simulation.environment import Neighbour, Obstacle, Scenes
 from graspd.worker.validation.decomposition import decompose
 
-#: Convex pieces of a neighbour at most: no hand is put into a neighbour's hollow, so hollows may be filled.
+#: Most convex pieces of a neighbour: no hand reaches into a neighbour's hollow, so hollows may be filled.
 MOST_PIECES: Final = 8
 
 _made: LRUCache[str, Neighbour] = LRUCache(32)
 
 
 def neighbour_of(obj: ObjectModel) -> Neighbour:
-    """An object as a neighbour: its convex pieces, those joined that fill the least until `MOST_PIECES` are left.
+    """Return an object as a neighbour: convex pieces, merged by least added volume to `MOST_PIECES`.
 
     Raises:
         MeshError: the object is flat.
@@ -41,11 +41,11 @@ def neighbour_of(obj: ObjectModel) -> Neighbour:
         pieces = tuple(piece + by[:3] for piece in middle.pieces)
         return Neighbour(obj, pieces, tuple(solid.moved(by) for solid in middle.solids), middle.error_m, middle)
     if (found := _made.get(obj.content)) is not None:
-        return replace(found, obj=obj)  # the same mesh may go by another name
+        return replace(found, obj=obj)  # the same mesh may have another name
     try:
         pieces = decompose(obj).vertices
     except MeshError:
-        pieces = (obj.hull_vertices,)  # more than the object is no harm in a thing to stay clear of
+        pieces = (obj.hull_vertices,)  # an oversized shape is safe for an obstacle
     pieces = joined_pieces(pieces)
     solids = [outer_solid(piece) for piece in pieces]
     made = Neighbour(obj, pieces, tuple(solid for solid, _ in solids), max(error for _, error in solids))
@@ -54,7 +54,7 @@ def neighbour_of(obj: ObjectModel) -> Neighbour:
 
 
 def joined_pieces(pieces: Sequence[Floats], most: int = MOST_PIECES) -> tuple[Floats, ...]:
-    """At most `most` convex pieces: again and again the two become one whose common hull adds the least volume."""
+    """Merge pieces to at most `most`, each time the two whose common hull adds the least volume."""
     left = list(pieces)
     volume = [union_volume((piece,)) for piece in left]
 
@@ -77,10 +77,10 @@ def joined_pieces(pieces: Sequence[Floats], most: int = MOST_PIECES) -> tuple[Fl
 def scenes_of(
     spec: SceneSpec, obj: ObjectModel, others: Sequence[ObjectModel] = (), *, count: int, seed: int
 ) -> tuple[Scenes, dict[str, Floats]]:
-    """The scenes that a user names, `count` of them (with `faces all`, as many as the object has stable faces).
+    """Create `count` scenes from a specification (with `faces all`, one for each stable face).
 
     Args:
-        spec: what stands around the object; not free.
+        spec: the surroundings of the object; not free.
         obj: the object.
         others: the objects of `spec.neighbours`, in that order.
         count: number of scenes S.
@@ -91,7 +91,7 @@ def scenes_of(
         there are neighbours, `scene/neighbour_pose` (S, M, 7).
 
     Raises:
-        SceneError: something stands in something else, or there is no room.
+        SceneError: things overlap, or do not fit.
         MeshError: something never comes to rest, or is flat.
     """
     whole, poses = _scenes_of(
@@ -108,7 +108,7 @@ def scenes_of(
 
 
 def _centred_spec(spec: SceneSpec, obj: ObjectModel, others: Sequence[ObjectModel]) -> SceneSpec:
-    """The scene with the poses that it gives told of the middles of the things."""
+    """Return the specification with its poses given for the centres of the objects."""
 
     def told(pose: Any, thing: ObjectModel) -> Any:
         return None if pose is None else tuple(to_centre(pose, thing.centre).tolist())
@@ -123,7 +123,7 @@ def _centred_spec(spec: SceneSpec, obj: ObjectModel, others: Sequence[ObjectMode
 def _scenes_of(
     spec: SceneSpec, obj: ObjectModel, others: Sequence[ObjectModel], *, count: int, seed: int
 ) -> tuple[Scenes, dict[str, Floats]]:
-    """The scenes of things that are centred; see `scenes_of`."""
+    """Create scenes of centred objects; see `scenes_of`."""
     supports = supports_of(spec)
     given = [one.pose for one in spec.neighbours if one.pose is not None]
     if not others:
@@ -149,7 +149,7 @@ def _scenes_of(
 def _dropped(
     obj: ObjectModel, others: Sequence[ObjectModel], supports: Sequence[Obstacle], *, count: int, seed: int
 ) -> dict[str, Floats]:
-    """Dropped together, or where so many never come to rest apart, laid beside each other."""
+    """Drop objects together; where too many never come to rest apart, lay them beside each other."""
     try:
         return drop_together(obj, others, count=count, seed=seed)
     except MeshError:
@@ -165,7 +165,7 @@ def _laid(
     count: int,
     seed: int,
 ) -> dict[str, Floats]:
-    """The object as it stands alone, and the others beside it; where they find no room it moves elsewhere."""
+    """Place the object as it rests alone and the others beside it; move it elsewhere if they do not fit."""
     poses = rest_poses(spec, obj, count=count, seed=seed)
     alone, size = poses["scene/object_pose"], room_in(spec)
 
@@ -179,12 +179,12 @@ def _laid(
 
 
 def _all_poses(poses: dict[str, Floats]) -> Floats:
-    """(S, 1 + M, 7) of the object and its neighbours."""
+    """Return the poses (S, 1 + M, 7) of the object and its neighbours."""
     return np.concatenate([poses["scene/object_pose"][:, None], poses["scene/neighbour_pose"]], axis=1)
 
 
 def _check_apart(things: Sequence[Neighbour], poses: Floats) -> None:
-    """Refuses scenes in which two things are deeper in each other than rounded poses bring them."""
+    """Check that no two objects penetrate each other more than rounded poses explain."""
     gaps = gaps_between(things, poses)
     for (a, b), gap in gaps.items():
         if -gap.min() > SUNK:
@@ -196,7 +196,7 @@ def _check_apart(things: Sequence[Neighbour], poses: Floats) -> None:
 
 
 def gaps_between(things: Sequence[Neighbour], poses: Floats, farthest: float = 0.1) -> dict[tuple[int, int], Floats]:
-    """Signed distance (S,) of each two things in each scene, at most `farthest` [m]; poses (S, T, 7)."""
+    """Return signed distances (S,) of each pair of things at poses (S, T, 7), at most `farthest` [m]."""
     spec: Any = mujoco.MjSpec()
     first = [0]
     for number, thing in enumerate(things):
@@ -221,21 +221,21 @@ def gaps_between(things: Sequence[Neighbour], poses: Floats, farthest: float = 0
     return gaps
 
 
-#: Faces of a solid at most, and what it may stand out from its piece before it needs more [m].
+#: Most faces of a solid, and the excess over its piece below which it needs no more [m].
 MOST_PLANES: Final = 48
 ENOUGH_M: Final = 1e-3
-#: Corners nearer than this are one [m].
+#: Corners nearer than this are merged [m].
 _SAME_M: Final = 1e-7
 
 
 def outer_solid(corners: Floats, most: int = MOST_PLANES) -> tuple[Obstacle, float]:
-    """A convex solid of at most `most` faces around points (V, 3).
+    """Return a convex solid of at most `most` faces around points (V, 3).
 
-    It begins as their box; then, as long as it stands out by more than `ENOUGH_M`, its farthest corner is cut off by
-    the face of the points' hull which that corner lies farthest out of. It never cuts into the hull.
+    It begins as their box. While it exceeds the points' hull by more than `ENOUGH_M`, its farthest corner is cut off by
+    the face of the hull that it is farthest from. It never cuts into the hull.
 
     Returns:
-        The solid, and the farthest that it stands out from the points' hull [m].
+        The solid, and its largest excess over the points' hull [m].
 
     Raises:
         MeshError: the points lie in a plane.
@@ -269,12 +269,12 @@ def _box(corners: Floats) -> Floats:
 
 
 def _as_qhull(planes: Floats) -> Floats:
-    """Rows n, -d of n.x - d <= 0."""
+    """Return rows n, -d of n.x - d <= 0."""
     return np.column_stack([planes[:, :3], -planes[:, 3]])
 
 
 def _corners_and_edges(points: Floats) -> tuple[Floats, NDArray[np.intp]]:
-    """Distinct corners of a convex solid and the edges between them."""
+    """Return the distinct corners of a convex solid and the edges between them."""
     from scipy.spatial import ConvexHull
 
     _, first = np.unique(np.round(points / _SAME_M).astype(np.int64), axis=0, return_index=True)
@@ -288,7 +288,7 @@ def _corners_and_edges(points: Floats) -> tuple[Floats, NDArray[np.intp]]:
 
 
 def _outward(corners: Floats, triangles: NDArray[Any], normals: Floats) -> NDArray[Any]:
-    """The triangles, turned round where they look inwards."""
+    """Return the triangles, flipped where they face inwards."""
     a, b, c = (corners[triangles[:, k]] for k in range(3))
     inward = (np.cross(b - a, c - a) * normals).sum(axis=1) < 0
     triangles[inward] = triangles[inward][:, ::-1]
@@ -296,7 +296,7 @@ def _outward(corners: Floats, triangles: NDArray[Any], normals: Floats) -> NDArr
 
 
 def _stands_out(points: Floats, corners: Floats, hull: Any) -> float:
-    """Farthest of `points` from the hull of `corners` [m]; on a convex solid no point is farther than a corner."""
+    """Return the largest distance of `points` from the hull of `corners` [m], attained at a corner."""
     import trimesh  # slow to load, seldom needed
 
     mesh = trimesh.Trimesh(corners, hull.simplices, process=False)

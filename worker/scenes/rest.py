@@ -1,7 +1,7 @@
-"""Static rest of a convex hull on a plane: which faces it can stand on and which one it tips to.
+"""Static rest of a convex hull on a plane: its stable faces, and the face that it tips to.
 
-A rigid body on a plane touches it with its convex hull only, so a resting face of the object is a face of the hull
-whose polygon contains the projection of the centre of mass (Goldberg et al., "Part pose statistics", 1999).
+A rigid body touches a plane only with its convex hull. A resting face is therefore a face of the hull whose polygon
+contains the projection of the centre of mass (Goldberg et al., "Part pose statistics", 1999).
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ if TYPE_CHECKING:
 
 #: Hull triangles within this angle of each other are one flat face [rad].
 COPLANAR_ANGLE = np.radians(0.05)
-#: A face holds the object if the centre of mass projects at least this share of the hull's size inside its polygon.
+#: A face is stable if the centre of mass projects at least this share of the hull's size inside its polygon.
 STABILITY_MARGIN = 1e-4
 #: Resting faces whose normals differ by less than this count as one: scanned flat bottoms fall into many facets [rad].
 SAME_FACE_ANGLE = np.radians(2.0)
-#: By which the surface may be other than it is: that of convex pieces, a real thing's [m].
+#: Uncertainty of the surface [m]: that of convex pieces, or of a real object.
 CHANGE_M = 1e-3
 #: A pose that may turn farther than this under such a change rolls [rad].
 ROLLS = np.radians(20.0)
@@ -32,31 +32,31 @@ ROLLS = np.radians(20.0)
 
 @dataclass(frozen=True)
 class RestingFaces:
-    """Flat faces of the convex hull, C of them, in the object frame."""
+    """C flat faces of the convex hull, in the object frame."""
 
     normal: Floats
-    """(C, 3) unit, outward."""
+    """(C, 3) unit normals, outward."""
     offset: Floats
     """(C,) normal . x of the face's plane [m]."""
     successor: Ints
-    """(C,) the face the object tips to when put down on this one; the face itself where it is stable."""
+    """(C,) face the object tips to when placed on this one; the face itself where it is stable."""
     height: Floats
-    """(C,) of the centre of mass above each face [m]."""
+    """(C,) height of the centre of mass above each face [m]."""
     sides: Ints
     """(E, 2) a face, and the one across one of its edges."""
     margin: Floats
-    """(E,) distance of the centre of mass, seen from above, inside that edge [m]."""
+    """(E,) distance of the centre of mass inside that edge, in projection [m]."""
     width: Floats
-    """(E,) of the face, across that edge [m]."""
+    """(E,) width of the face across that edge [m]."""
 
     @property
     def stable(self) -> Ints:
-        """Indices of the faces the object can stand on."""
+        """Indices of the stable faces."""
         return np.flatnonzero(self.successor == np.arange(len(self.successor))).astype(np.int32)
 
     def looseness(self, face: int) -> tuple[float, float]:
-        """How far an object that stands on a face may turn [rad], and its centre of mass sink [m], when its surface
-        changes by `CHANGE_M`: over edges across which the tilt of a face by that much brings the centre of mass."""
+        """Return how far the object may turn [rad] and its centre of mass sink [m] if `CHANGE_M` tips it.
+        It crosses edges over which a tilt of the face by that change of the surface moves the centre of mass."""
         from scipy.sparse import csr_array  # slow to load
         from scipy.sparse.csgraph import breadth_first_order
 
@@ -69,23 +69,23 @@ class RestingFaces:
         return float(np.arccos(np.clip(cosine, -1.0, 1.0))), float(self.height[face] - self.height[reached].min())
 
     def topples(self, face: int) -> bool:
-        """Whether a change of the surface by `CHANGE_M` lets the object fall to a lower face."""
+        """Check whether a change of the surface by `CHANGE_M` lets the object fall to a lower face."""
         return self.looseness(face)[1] > CHANGE_M
 
     def rolls(self, face: int) -> bool:
-        """Whether such a change may turn the object farther than `ROLLS`: it is round there."""
+        """Check whether such a change may turn the object farther than `ROLLS`: it is round there."""
         return self.looseness(face)[0] > ROLLS
 
 
 def rolling_poses(obj: ObjectModel, poses: Floats) -> int:
-    """How many of the rest poses (S, 7) on a table a change of the object's surface by `CHANGE_M` may turn farther than
-    `ROLLS`: those of round things."""
+    """Count the rest poses (S, 7) on a table in which the object, round there, may roll.
+    A change of its surface by `CHANGE_M` may turn it farther than `ROLLS`."""
     faces = resting_faces(obj.centred)
     return sum(faces.rolls(settle(faces, pose[3:])[0]) for pose in np.asarray(poses, float))
 
 
 def rolling_note(rolling: int, scenes: int) -> str | None:
-    """What to say of scenes in which the object may roll; None where there are none."""
+    """Return a note on scenes in which the object may roll; None: there are none."""
     if not rolling:
         return None
     return (
@@ -95,7 +95,7 @@ def rolling_note(rolling: int, scenes: int) -> str | None:
 
 
 def resting_faces(obj: ObjectModel) -> RestingFaces:
-    """Faces of the object's convex hull with the way it tips over them.
+    """Compute the faces of the object's convex hull and how it tips over them.
 
     Raises:
         MeshError: the hull is flat.
@@ -127,7 +127,7 @@ def _support(normals: Floats, points: Floats) -> Floats:
 
 
 def _merge_coplanar(mesh: trimesh.Trimesh) -> Ints:
-    """(F,) index of the flat face that each hull triangle belongs to."""
+    """Return the index (F,) of the flat face that each hull triangle belongs to."""
     from trimesh.graph import connected_component_labels
 
     pairs = mesh.face_adjacency[mesh.face_adjacency_angles < COPLANAR_ANGLE]
@@ -136,8 +136,8 @@ def _merge_coplanar(mesh: trimesh.Trimesh) -> Ints:
 
 
 def _edges(mesh: trimesh.Trimesh, label: Ints, normal: Floats, centre: Floats) -> tuple[Ints, Floats, Floats]:
-    """Each edge of each flat face: the face and the one across it (E, 2), how far inside it a point projects (E,), and
-    the face's extent across it (E,) [m]."""
+    """Return each edge of each flat face: faces on both sides (E, 2), distances and extents (E,) [m].
+    The distance is that of the projected point inside the edge; the extent is the face's, across the edge."""
     edges, pairs = mesh.face_adjacency_edges, mesh.face_adjacency
     corners = [np.unique(mesh.faces[label == face]) for face in range(int(label.max()) + 1)]
     sides, margins, widths = [], [], []
@@ -157,9 +157,9 @@ def _edges(mesh: trimesh.Trimesh, label: Ints, normal: Floats, centre: Floats) -
 
 
 def settle(faces: RestingFaces, quaternion: Floats) -> tuple[int, float]:
-    """The stable face under an object of this orientation, and the angle by which it must turn to lie flat [rad].
+    """Return the stable face below the object, and the angle by which it turns to lie flat [rad].
 
-    Starts at the face that looks down most and tips over edges until the face holds.
+    Start at the most downward face and tip over edges until a face is stable.
     """
     down = quat_rotate(np.asarray(quaternion) * np.array([1.0, -1, -1, -1]), np.array([0.0, 0.0, -1.0]))
     face = int(np.argmax(faces.normal @ down))
@@ -174,7 +174,7 @@ def settle(faces: RestingFaces, quaternion: Floats) -> tuple[int, float]:
 
 
 def lay_flat(faces: RestingFaces, face: int, pose: Floats) -> Floats:
-    """The pose (7,) turned by the smallest rotation that puts the face onto z = 0; x and y stay."""
+    """Turn the pose (7,) by the smallest rotation that puts the face onto z = 0; x and y stay."""
     normal = quat_rotate(pose[3:], faces.normal[face])
     axis = np.cross(normal, [0.0, 0.0, -1.0])
     sine = float(np.linalg.norm(axis))
@@ -188,5 +188,5 @@ def lay_flat(faces: RestingFaces, face: int, pose: Floats) -> Floats:
 
 
 def same_face(faces: RestingFaces, face: int, others: Ints) -> Ints:
-    """Which of the `others` are the same resting face, up to `SAME_FACE_ANGLE`: booleans."""
+    """Check which of the `others` are the same resting face, within `SAME_FACE_ANGLE`."""
     return faces.normal[np.asarray(others, int)] @ faces.normal[face] > np.cos(SAME_FACE_ANGLE)

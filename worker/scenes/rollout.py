@@ -1,5 +1,5 @@
-"""Pre-screening of candidates: in a scene clearance and a short lift, around a free object short pushes
-(`worker.validation.prescreening`). What passes goes through the validator's own test."""
+"""Rollouts of candidates: in a scene clearance and a short lift, around a free object short pushes
+(`worker.validation.prescreening`). Candidates that pass get the validator's own test."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ from graspd.worker.validation.lifting import KnownLifts, LiftLevel, validate_lif
 from graspd.worker.validation.prescreening import SLIPS, LiftRollouts, push_rollout
 from graspd.worker.validation.validator import KnownRollouts, validate
 
-#: Added to the score of a hand that would lift but cannot come: worse than any that can and lets the object fall, since
-#: most of these come freely, better than what is lost.
+#: Added to the score of a candidate that would lift but whose approach is blocked. It is worse than any with a free
+#: approach that drops the object, since most of these have one; better than a lost object.
 BLOCKED: Final = 8.0
-#: Added where only the validator sees the hand touch on its way, for the object's convex pieces stand out from it:
-#: the DexGraspBench protocol does not ask for the way.
+#: Added where only the validator sees contact on the approach, because the object's convex pieces stand out from it:
+#: level `dexgraspbench` does not test the approach.
 TOUCHES: Final = 2.0
-#: What a hand that holds for the short time of a trial but does not lift is worse than one that lifts.
+#: Penalty of a candidate that holds in the short rollout but does not lift, relative to one that lifts.
 FALLS: Final = 0.4
-#: Highest score of what lifts at half the friction.
+#: Highest score of a candidate that lifts at half the friction.
 BEST: Final = 0.99
 
 
@@ -47,9 +47,9 @@ def rollout_on(
     known: dict[str, Any] | None = None,
     level: Level = "standard",
 ) -> Callable[[GraspSet, PlacedGrasps | None, Floats], Floats] | None:
-    """The trial for what `run` plans on; None: the planner's own merit chooses. `known` keeps the verdicts of `level`.
+    """Return the rollout for `run`; None: the planner's loss decides. `known` caches verdicts of `level`.
 
-    Around free objects a GPU plans faster than the processor tries; in scenes it waits, for all threads that there are.
+    Around free objects a GPU plans faster than the CPU simulates; in scenes it waits for the rollouts, on all threads.
     """
     on_gpu = run.device.startswith("cuda")
     if not in_scenes:
@@ -66,14 +66,14 @@ def hold_rollout(
     known: KnownRollouts | None = None,
     level: Level = "standard",
 ) -> Callable[[GraspSet, PlacedGrasps | None, Floats], Floats]:
-    """A trial of free grasps as `worker.planners.Wanted` takes it: (N,) scores of short pushes, below 2 for grasps that
-    hold the object against the six pushes as well.
+    """Return a `worker.planners.Rollout` that scores free grasps (N,) by short pushes.
+    Scores are below 2 for grasps that also hold against the six pushes.
 
     Args:
         hand: the hand.
         obj: the object.
-        pieces: gives the object's convex pieces when they are first needed.
-        known: keeps the verdicts, for the validator.
+        pieces: computes the object's convex pieces on first use.
+        known: cache of verdicts for the validator.
         level: of the verdicts.
     """
     short, run = push_rollout(hand, obj, pieces), ExecutionContext(threads=1)
@@ -100,18 +100,18 @@ def lift_rollout(
     known: KnownLifts | None = None,
     level: LiftLevel = "lift",
 ) -> Callable[[GraspSet, PlacedGrasps | None, Floats], Floats]:
-    """A trial as `worker.planners.Wanted` takes it: (N,) scores, below 1 for grasps that lift the object at half the
-    friction, and below 2 at the whole of it, and whose way is clear.
+    """Return a `worker.planners.Rollout` that scores grasps (N,) in scenes by short lifts.
+    Scores are below 1 for grasps with a clear trajectory that lift at half friction, below 2 at full friction.
 
-    What holds the hanging object for a short time is lifted as the validator does it: a squeeze may turn an object out
-    of the hand slowly at first.
+    Candidates that hold the hanging object briefly get the validator's lift: a squeeze may turn an object out of the
+    hand slowly at first.
 
     Args:
         hand: the hand.
         obj: the object.
-        pieces: gives the object's convex pieces when they are first needed.
-        threads: of one call; planners on the CPU call from as many threads as they may use.
-        known: keeps the lifts, for the validator.
+        pieces: computes the object's convex pieces on first use.
+        threads: per call; planners on the CPU already call from all their threads.
+        known: cache of lifts for the validator.
         level: of the lift test.
     """
     shorts, run = LiftRollouts(hand, obj, pieces, threads=threads), ExecutionContext(threads=threads)
@@ -121,7 +121,7 @@ def lift_rollout(
         beat = np.full(len(grasps), np.inf) if beat is None else beat
         grasps = grasps.moved(np.zeros(3))
         score = shorts.scores(grasps, placed, beat)
-        # What is as good as nothing new is not looked at.
+        # Candidates that cannot beat the previous score are skipped.
         held = np.flatnonzero((score < SLIPS + 1.0) & (score < beat))
         if not len(held):
             return score
@@ -134,7 +134,7 @@ def lift_rollout(
         return score
 
     def lifted(grasps: GraspSet, placed: PlacedGrasps, score: Floats, beat: Floats) -> Floats:
-        """(k,) scores of hands that hold for a short time and whose way is clear."""
+        """Return scores (k,) of candidates that hold briefly and whose trajectory is clear."""
         lift = partial(validate_lifts, hand, obj, level=level, pieces=pieces(), known=known, run=run)
         out, barely = np.maximum(score, SLIPS), score >= SLIPS
         some = np.flatnonzero(~barely)
@@ -155,13 +155,12 @@ def lift_rollout(
 
 Arrays = dict[str, NDArray[Any]]
 
-#: Clearances beyond this are not told apart [m].
+#: Clearances are capped at this [m].
 FARTHEST_M: Final = 1.0
 
 
 def lift_level(validation: str) -> LiftLevel:
-    """The level of the lift test at which a job's validator validates in scenes: the DexGraspBench protocol is the
-    DexGraspBench protocol there too."""
+    """Return the level of the lift test for a job's validation; `dexgraspbench` stays itself in scenes."""
     return "dexgraspbench" if validation == "dexgraspbench" else "lift"
 
 
@@ -176,9 +175,9 @@ def scene_verdicts(
     known: KnownLifts | None = None,
     run: ExecutionContext,
 ) -> tuple[GraspSet, Arrays]:
-    """Plan the way of grasps in their scenes, and validate those that are clear.
+    """Plan the trajectories of grasps in their scenes, and validate those that are clear.
 
-    A grasp that does not lift is not lifted at half the friction.
+    Grasps that do not lift are not tested at half the friction.
 
     Args:
         hand: the hand.
@@ -186,9 +185,9 @@ def scene_verdicts(
         grasps: N grasps with `scene`.
         scenes: the scenes.
         level: of the lift test.
-        pieces: the object's convex pieces; None: nothing is validated, and grasps are only told clear or not.
+        pieces: the object's convex pieces; None: grasps are only checked for clearance, not validated.
         known: see `validate_lifts`.
-        run: told of grasps validated; asked between grasps whether to stop.
+        run: receives the number of validated grasps; polled for cancellation between grasps.
 
     Returns:
         The grasps with `approach`, `coming`, `lift` and `wrist`; columns of the base shard, `quality/success` being the
@@ -221,7 +220,7 @@ def scene_verdicts(
 
 
 def outcomes_in_scenes(columns: Arrays) -> dict[str, NDArray[np.bool_]]:
-    """(N,) which grasps are clear, lift, and lift at half the friction, from the columns of `scene_verdicts`."""
+    """Return which grasps (N,) are clear, lift, and lift at half friction, from `scene_verdicts`' columns."""
     clear = np.asarray(columns["quality/success"] >= 0)
     if "quality/lift_outcome" not in columns:
         return {"clear": clear, "lift": np.zeros_like(clear), "lift_hard": np.zeros_like(clear)}

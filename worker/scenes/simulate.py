@@ -1,6 +1,6 @@
-"""Dropping an object onto a table: MuJoCo moves the convex hull until it comes to rest.
+"""Drops of an object onto a table: MuJoCo simulates the convex hull until it comes to rest.
 
-Only the hull can touch a plane, so the hull is the whole collision model; mass and inertia are those of the true mesh.
+Only the hull can touch a plane, so it is the whole collision model; mass and inertia are those of the true mesh.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ from graspd.worker.scenes.rest import RestingFaces, lay_flat, resting_faces, sam
 #: Any density will do: the motion of a free body on a plane does not depend on it [kg/m^3].
 DENSITY: Final = 500.0
 TIMESTEP_S: Final = 0.002
-#: At rest: no point of the object moves faster than this for a whole window.
+#: At rest, no point of the object moves faster than this for a whole window.
 REST_SPEED: Final = 0.01
 REST_WINDOW_S: Final = 0.1
 TIMEOUT_S: Final = 4.0
 #: Gap between table and object at release [m].
 DROP_HEIGHT: Final = (0.005, 0.05)
-#: An object that comes to rest farther from the middle of the table than this has rolled away [m].
+#: An object that rests farther from the middle of the table than this has rolled away [m].
 REACH: Final = 0.25
-#: Largest turn that laying the object flat on its face may need; beyond it the simulated rest was none [rad].
+#: Largest turn that may lay the object flat on its face; beyond it the object was not at rest [rad].
 MAX_SETTLE_ANGLE: Final = np.radians(5.0)
 MAX_ATTEMPTS: Final = 50
 #: Drops behind `scene/rest_probability`; a share of 64 is known to +-6 % (one standard deviation at one half).
@@ -62,7 +62,7 @@ _SCENE = """
 
 @dataclass(frozen=True)
 class RestPose:
-    """Where a drop ended."""
+    """Result of a drop."""
 
     pose: Floats
     """(7,) object frame in the table frame, laid flat on `face`."""
@@ -72,7 +72,7 @@ class RestPose:
 
 @dataclass(frozen=True)
 class _Table:
-    """The compiled simulation of one object."""
+    """Compiled simulation of one object."""
 
     model: mujoco.MjModel
     data: mujoco.MjData
@@ -83,11 +83,11 @@ class _Table:
 
 
 def drop(obj: ObjectModel, *, count: int, seed: int) -> dict[str, Floats]:
-    """Let an object fall onto a table until it rests, `count` times.
+    """Drop an object onto a table until it rests, `count` times.
 
-    Drops that time out, roll away or do not stand on a face that holds the centre of mass, were the surface other by
-    a millimetre, too, are redone with a new sample. One that rolls is laid on a steady face, see `steadied`. Scene i
-    depends on the object, the seed and i alone.
+    Drops are redone with a new sample if they time out, roll away or end on no face that stays stable if the surface
+    changes by a millimetre. An object that rolls is laid on a steady face, see `steadied`. Scene i depends on the
+    object, the seed and i alone.
 
     Args:
         obj: the object.
@@ -121,10 +121,10 @@ def drop(obj: ObjectModel, *, count: int, seed: int) -> dict[str, Floats]:
 def steadied(
     obj: ObjectModel, faces: RestingFaces, face: int, pose: Floats, rng: np.random.Generator
 ) -> tuple[int, Floats]:
-    """The face on which a centred object stays that came to rest on one, and its pose (7,).
+    """Return the face on which a centred object stays after coming to rest on `face`, and its pose (7,).
 
-    Where it may roll there, this is one of the faces of the reference drops on which it does not, as often as they end
-    on it. What is round on all of them stays as it lies.
+    Where it may roll there, draw one of the faces of the reference drops on which it does not, with their frequency. An
+    object that is round on all of them stays as it lies.
     """
     if not faces.rolls(face) or not (steady := _steady_faces(_ByContent(obj))):
         return face, pose
@@ -133,12 +133,12 @@ def steadied(
 
 
 def rest_probability(obj: ObjectModel, faces: Sequence[int]) -> Floats:
-    """(S,) share of `REFERENCE_DROPS` drops of the object alone, and the scene's own, that rest on each face."""
+    """Return the share (S,) of `REFERENCE_DROPS` drops, and the scene's own, that rest on each face."""
     return (reference_share(obj, faces) * REFERENCE_DROPS + 1.0) / (REFERENCE_DROPS + 1.0)
 
 
 def reference_share(obj: ObjectModel, faces: Sequence[int]) -> Floats:
-    """(S,) share of `REFERENCE_DROPS` drops of the object alone that rest on each face."""
+    """Return the share (S,) of `REFERENCE_DROPS` drops of the object alone that rest on each face."""
     if not faces:
         return np.zeros(0)
     obj = obj.centred
@@ -161,7 +161,7 @@ class _ByContent:
 
 @lru_cache(maxsize=64)
 def _reference_faces(of: _ByContent) -> tuple[int, ...]:
-    """Faces that the reference drops rest on: two seconds' work, kept on the machine."""
+    """Return the faces that the reference drops rest on: two seconds of computation, cached on disk."""
     obj, code = of.obj, (sys.modules[__name__], resting)
 
     def drops() -> dict[str, NDArray[Any]]:
@@ -180,7 +180,7 @@ def _reference_faces(of: _ByContent) -> tuple[int, ...]:
 
 @lru_cache(maxsize=64)
 def _steady_faces(of: _ByContent) -> tuple[int, ...]:
-    """Those of the same on which the object does not roll."""
+    """Return those of the reference faces on which the object does not roll."""
     faces = resting_faces(of.obj)
     return tuple(face for face in _reference_faces(of) if not faces.rolls(face))
 
@@ -215,7 +215,7 @@ def _redo_until_rest(table: _Table, name: str, key: tuple[int, int]) -> RestPose
 
 
 def _drop_once(table: _Table, rng: np.random.Generator) -> RestPose | None:
-    """One drop; None if it timed out, rolled away, or stands on no face or on one that it topples from."""
+    """Drop once; None if it timed out, rolled away, or ended on no face or on one that it topples from."""
     quaternion = rng.normal(size=4)
     quaternion /= np.linalg.norm(quaternion)
     lowest = float(quat_rotate(quaternion, table.hull)[:, 2].min())
@@ -237,13 +237,13 @@ def _drop_once(table: _Table, rng: np.random.Generator) -> RestPose | None:
 
 
 def _run(table: _Table) -> float | None:
-    """Steps the simulation until rest; simulated seconds, or None after `TIMEOUT_S`."""
+    """Simulate until rest; return simulated seconds, or None after `TIMEOUT_S`."""
     model, data = table.model, table.data
     window = round(REST_WINDOW_S / TIMESTEP_S)
     quiet = 0
     for step in range(round(TIMEOUT_S / TIMESTEP_S)):
         mujoco.mj_step(model, data)
-        # Velocity of the body frame's origin and spin in the body frame: the spin bounds how fast any point moves.
+        # Velocity of the body frame's origin and spin in the body frame: the spin bounds the speed of any point.
         spin = data.qvel[3:]
         centre_velocity = data.qvel[:3] + quat_rotate(data.qpos[3:], np.cross(spin, table.centre))
         speed = np.linalg.norm(centre_velocity) + table.radius * np.linalg.norm(spin)

@@ -1,13 +1,11 @@
-"""The hand's way: from a standoff to the pregrasp, closing, the lift; and what it stays clear of.
+"""Trajectories of the hand: from a standoff to the pregrasp, closing and lift, with their clearances.
 
-In a scene the lift goes against gravity. Around a free object it is the way back, as the hand came.
-Distances are those of `body_room`: fingertips that may touch a support count as farther from it.
-The mounting of the hand, at wrist angles that it keeps all the way, stays clear as the hand does.
-Against half-spaces they are exact. Against boxes and neighbours' pieces they are those of the hand's features from
-the obstacle's planes: exact where a corner is nearest, else a lower bound of the features' distance.
+In a scene the lift goes against gravity. Around a free object it is the retreat along the approach. The hand's mounting
+must stay clear as the hand does, at wrist angles constant over the trajectory. Clearances are those of `body_room`:
+fingertips that may touch a support count as farther from it. They are exact against half-spaces. Against boxes and
+neighbours' pieces they are distances of the hand's features from planes: exact at corners, else a lower bound.
 
-How a hand comes to its pregrasp in a scene: which way, and how far opened, so that it touches neither the object nor
-what stands around.
+The approach in a scene has a direction and an opening of the hand that avoid contact with object and obstacles.
 """
 
 from __future__ import annotations
@@ -35,50 +33,50 @@ _POINTS: Final = 600
 #: Around a free object: tilts of the retreat from the palm's own direction [rad], each to so many sides.
 TILTS: Final = (0.4, 0.8, 1.2)
 SIDES: Final = 8
-#: Points of hand and object with which a way around a free object is looked at.
+#: Points of hand and object in the check of a trajectory around a free object.
 _FREE_POINTS: Final = (2000, 3000)
 
 
 @dataclass(frozen=True)
 class Trajectory:
-    """How N grasps are reached and lifted, in the object frame."""
+    """Trajectories of N grasps to contact and lift, in the object frame."""
 
     approach: Floats
-    """(N, W, 7) hand poses from the standoff to the pregrasp, in the joint positions `open`."""
+    """(N, W, 7) hand poses from the standoff to the pregrasp, with the joint positions `open`."""
     open: Floats
-    """(N, J) joint positions of the hand that comes."""
+    """(N, J) joint positions of the open hand on its approach."""
     lift: Posture
     """N squeeze postures raised against gravity."""
     contact: Floats
-    """(N,) least distance from obstacles at the grasp [m]."""
+    """(N,) least clearance from obstacles at the grasp [m]."""
     closing: Floats
-    """(N,) from the pregrasp to the grasp."""
+    """(N,) least clearance from the pregrasp to the grasp [m]."""
     coming: Floats
-    """(N,) on the approach; the hand's points also stay clear of the object where `touching` is False."""
+    """(N,) least clearance on the approach [m]; where `touching` is False also free of the object."""
     lifting: Floats
-    """(N,) on the lift."""
+    """(N,) least clearance on the lift [m]."""
     touching: NDArray[np.bool_]
-    """(N,) whether the open hand touches the object on its way."""
+    """(N,) whether the open hand touches the object on its approach."""
     wrist: Floats
     """(N, K) angles of the wrist above the hand's root; K is 0 where it has none."""
     mounting: Floats
-    """(N,) of the hand's mounting at the grasp, while the hand closes and on the lift; on the approach it counts as the
-    hand does."""
+    """(N,) least clearance of the hand's mounting at the grasp, in closing and on the lift [m].
+    On the approach it is part of the hand."""
 
     @property
     def least(self) -> Floats:
-        """(N,) least distance from obstacles anywhere on the way [m]."""
+        """(N,) least clearance from obstacles on the whole trajectory [m]."""
         parts = (self.contact, self.closing, self.coming, self.lifting, self.mounting)
         return np.asarray(np.minimum.reduce(parts))
 
     @property
     def clear(self) -> NDArray[np.bool_]:
-        """(N,) whether the whole way is free."""
+        """(N,) whether the whole trajectory is clear."""
         return np.asarray((self.least >= MARGIN_M) & ~self.touching)
 
 
 def plan_way(hand: HandModel, obj: ObjectModel, grasps: GraspSet, placed: PlacedGrasps) -> Trajectory:
-    """The way of every grasp in its scene: the first direction of retreat that is free, or else the freest."""
+    """Plan each grasp's trajectory in its scene: the first free direction of retreat, else the freest."""
     probe = probe_of(hand, obj, hand_points=_POINTS, object_points=64)
     count, scenes, which = len(grasps), placed.scenes, np.asarray(placed.index, np.intp)
     rise = RISE_M * np.array([scene.up for scene in scenes])[which]
@@ -107,10 +105,10 @@ def plan_way(hand: HandModel, obj: ObjectModel, grasps: GraspSet, placed: Placed
 
 
 def plan_free_way(hand: HandModel, obj: ObjectModel, grasps: GraspSet) -> Trajectory:
-    """The way of grasps of an object that stands alone: a retreat of `STANDOFF_M` that is free of the object.
+    """Plan trajectories around an object that stands alone: a retreat of `STANDOFF_M` free of the object.
 
-    The palm's own direction of retreat is tried first, then others ever farther from it. `lift` is the squeeze posture
-    after that retreat, object in hand. Nothing stands around, so all distances from obstacles are infinite.
+    The palm's own direction of retreat comes first, then directions ever farther from it. `lift` is the squeeze posture
+    after that retreat, with the object in hand. There are no obstacles, so all clearances are infinite.
     """
     hand_points, object_points = _FREE_POINTS
     probe = probe_of(hand, obj, hand_points=hand_points, object_points=object_points)
@@ -128,7 +126,7 @@ def plan_free_way(hand: HandModel, obj: ObjectModel, grasps: GraspSet) -> Trajec
 
 
 def _opened(probe: Probe, pregrasp: Posture, joints: Floats) -> Posture:
-    """Pregrasps with fingers opened to `joints` (n, J), but where that would bring them nearer to the object."""
+    """Return pregrasps opened to `joints` (n, J), unless that moves the fingers closer to the object."""
     start = np.asarray(pregrasp.joint_positions, float)
     room = np.minimum(OBJECT_MARGIN_M, _gaps(probe, pregrasp)) - 5e-4
     nearer = np.zeros(len(start), bool)
@@ -138,13 +136,13 @@ def _opened(probe: Probe, pregrasp: Posture, joints: Floats) -> Posture:
 
 
 def _unit(ways: Floats, instead: Floats) -> Floats:
-    """(n, 3) directions of length 1; `instead` where there is none."""
+    """Return unit directions (n, 3); `instead` for zero vectors."""
     length = np.linalg.norm(ways, axis=1, keepdims=True)
     return np.where(length > 1e-6, ways / np.maximum(length, 1e-6), instead)
 
 
 def _tilted(axis: Floats, tilt: float, side: int) -> Floats:
-    """(n, 3) unit vectors turned by `tilt` [rad] away from axes (n, 3), towards one of `SIDES` sides."""
+    """Return unit vectors (n, 3) tilted by `tilt` [rad] from axes (n, 3), towards one of `SIDES` sides."""
     least = np.eye(3)[np.argmin(np.abs(axis), axis=1)]
     across = _unit(np.cross(axis, least), least)
     leaning = quat_rotate(quat_from_axis_angle(across, np.full(len(axis), tilt)), axis)
@@ -154,9 +152,8 @@ def _tilted(axis: Floats, tilt: float, side: int) -> Floats:
 def _coming(
     probe: Probe, pregrasp: Posture, scene: Environment, ways: Sequence[Floats]
 ) -> tuple[Floats, Floats, NDArray[np.bool_], Floats]:
-    """Waypoints (n, W, 7), least distance from obstacles (n,), whether the object is touched (n,), and the direction of
-    retreat (n, 3): the first of `ways`, (n, 3) each, that is free, or else the freest.
-    """
+    """Return approaches along the first of `ways`, (n, 3) each, that is free, or else the freest.
+    Waypoints (n, W, 7), least clearance (n,), contact with the object (n,), and direction of retreat (n, 3)."""
     count, looks = len(pregrasp), (WAYPOINTS - 1) * LOOKS + 1
     best = np.full(count, -np.inf)
     least = np.zeros(count)
@@ -171,7 +168,7 @@ def _coming(
         postures = Posture(poses.reshape(-1, 7), joints)
         room = obstacle_room(probe.hand, postures, [scene]).reshape(len(open_), looks).min(axis=1)
         gap = _gaps(probe, postures).reshape(len(open_), looks)
-        # The pregrasp itself may stand nearer than the margin: coming must not be nearer than it is.
+        # The pregrasp itself may be closer than the margin: the approach must not be closer than it.
         hits = gap[:, :-1].min(axis=1) < np.minimum(OBJECT_MARGIN_M, gap[:, -1]) - 5e-4
         score = np.minimum(room, MARGIN_M) - hits
         better = score > best[open_]
@@ -186,34 +183,34 @@ def _coming(
 
 
 def _gaps(probe: Probe, postures: Posture) -> Floats:
-    """(P,) least distance of the hand's points from the object, and of the object's from the hand [m]."""
+    """Return least distances (P,) of hand points from the object and of object points from the hand [m]."""
     found = probe.measure(postures)
     return np.minimum(found.distance.min(axis=1), found.piece_distance.min(axis=1))
 
 
-#: On its way the hand's points stay this far from the object [m], if they can at least so far: between points that are
-#: looked at, and where the object's convex pieces stand out, it is nearer.
+#: Least and wanted distance of hand points from the object on the approach [m]. Between checked points, and where the
+#: object's convex pieces stand out, it is less.
 OBJECT_MARGIN_M: Final = 0.001
 OBJECT_WANTED_M: Final = 0.004
-#: By this much the hand may come nearer to the object than its pregrasp is [m].
+#: The hand on its approach may be this much closer to the object than at its pregrasp [m].
 NEARER_M: Final = 5e-4
-#: Postures stored on the approach, the standoff first, the pregrasp last; so many are looked at between two, and
-#: while the hand then closes to the pregrasp.
+#: Postures stored on the approach, from standoff to pregrasp; number of checks between two of them, and while the hand
+#: closes to the pregrasp.
 WAYPOINTS: Final = 6
 LOOKS: Final = 4
 _CLOSING: Final = 4
-#: Directions of retreat that are tried: the palm's own, mixed with these shares of the direction against gravity.
+#: Directions of retreat to try: the palm's own, mixed with these shares of the direction against gravity.
 SHARES_UP: Final = (0.0, 0.25, 0.5, 0.75, 1.0)
-#: How wide the hand comes: shares of the way from the pregrasp to wide open. Each is tried with all directions.
+#: Openings of the hand, as shares from the pregrasp to wide open. Each is tried with all directions.
 OPENNESS: Final = (1.0, 0.5, 0.0)
 
 
 def come_open(
     probe: Probe, pregrasp: Posture, wide: Floats, wrist: Floats, placed: PlacedGrasps
 ) -> tuple[Floats, Floats, Floats, NDArray[np.bool_]]:
-    """Waypoints (n, W, 7), joints (n, J) of the hand that comes, the least distance of it and its mounting, at wrist
-    angles (n, K), from obstacles (n,) and whether it touches the object (n,): wide open if it can, its fingers far from
-    the object."""
+    """Return approaches with the hand as wide open as possible, its fingers away from the object.
+    Waypoints (n, W, 7), joints (n, J), least clearance of hand and mounting at wrist angles (n, K) from obstacles (n,),
+    and whether the hand touches the object (n,)."""
     count = len(pregrasp)
     up = np.array([scene.up for scene in placed.scenes])[placed.index]
     back = -quat_rotate(pregrasp.hand_pose[:, 3:], probe.hand.palm.approach)
@@ -246,8 +243,8 @@ def come_open(
 def _seen(
     probe: Probe, pregrasp: Posture, opened: Floats, wrist: Floats, way: Floats, placed: PlacedGrasps
 ) -> tuple[Floats, Floats]:
-    """Least distance (n,) from obstacles of hands that come open along directions `way` (n, 3) on their mountings, and
-    of hands from the object until they have closed to the pregrasp."""
+    """Return least clearances (n,) of open hands and mountings that retreat along `way` (n, 3).
+    Also the least distances (n,) of hands from the object until they have closed to the pregrasp."""
     count, looks = len(pregrasp), (WAYPOINTS - 1) * LOOKS + 1
     poses = np.repeat(pregrasp.hand_pose[:, None], looks + _CLOSING, axis=1)
     poses[:, :looks, :3] += np.linspace(STANDOFF_M, 0.0, looks)[:, None] * way[:, None]
@@ -260,10 +257,10 @@ def _seen(
     free = room.reshape(count, looks).min(axis=1)
     rows = np.flatnonzero(free >= MARGIN_M)
     if (mounting := probe.hand.mounting) is not None and len(rows):
-        # A mounting is thicker than a finger: it is looked at half as often, where the hand itself is clear.
+        # A mounting is thicker than a finger: it is checked half as often, where the hand itself is clear.
         mounted = wrist_room(mounting, poses[rows, :looks:2], wrist[rows], scenes, which[rows])
         free[rows] = np.minimum(free[rows], mounted)
-    # What is farther than this counts alike.
+    # Larger distances count equally.
     reach = OBJECT_WANTED_M + 2 * NEARER_M
     gap = probe.body_gaps(postures.hand_pose, postures.joint_positions, reach=reach).reshape(count, len(share), -1)
     fingers = finger_of_body(probe.hand) >= 0
@@ -271,7 +268,7 @@ def _seen(
     for part in (fingers, ~fingers):
         if part.any():
             near = gap[..., part].min(axis=2)
-            # The pregrasp itself may stand nearer than wanted: coming must not be nearer than it is.
+            # The pregrasp itself may be closer than wanted: the approach must not be closer than it.
             short = near[:, :-1].min(axis=1) - np.minimum(OBJECT_WANTED_M, near[:, -1] - NEARER_M)
             least = np.minimum(least, OBJECT_WANTED_M + short)
     return free, least

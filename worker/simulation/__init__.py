@@ -1,1 +1,1 @@
-"""Kernels and the batched simulation around them. Mechanics only: what to optimise and when to stop is a planner's."""
+"""Kernels and batched simulation. Mechanics only: objectives and stopping belong to planners."""

@@ -1,6 +1,6 @@
-"""The data of a simulation: hands to the device and back, arrays for a capacity of hands, tables of each iteration.
+"""Data of a simulation: hands to the device and back, arrays for a capacity of hands, schedule tables.
 
-All per-iteration values (dilation, weights, rates) lie in tables on the device, read at a counter on the device, so an
+All per-iteration values (dilation, weights, rates) are in tables on the device, read at a counter on the device, so an
 iteration is the same list of launches each time.
 """
 
@@ -20,7 +20,7 @@ from graspd.worker.simulation.model import MAX_DILATION, REFERENCE_POINTS, Model
 
 
 class Tables:
-    """A schedule on the device; its rate of joints times the `unit` (D,) of each dof."""
+    """A schedule on the device; its rate of joints is multiplied by the `unit` (D,) of each dof."""
 
     def __init__(self, schedule: Schedule, unit: Floats) -> None:
         self.dilation = wp.array(schedule.dilation, dtype=wp.float32)
@@ -32,8 +32,8 @@ class Tables:
 
 
 class Contacts:
-    """Candidate contacts (B, N), those of a hand packed at the front in the order of its points; `gradient` is dL/d
-    distance, `near` (B, N) the indices of those that the object may meet in its step."""
+    """Candidate contacts (B, N), packed at the front per hand in the order of its points.
+    `gradient` is dL/d distance, `near` (B, N) the indices of contacts that the object may reach in its step."""
 
     def __init__(self, capacity: int, points: int) -> None:
         shape = (capacity, points)
@@ -50,7 +50,7 @@ class Contacts:
 
 
 class MarkedContacts(Contacts):
-    """Contacts (B, N) at the places of their points, marked, and how many there are in each chunk (B, N / chunk)."""
+    """Contacts (B, N) at their points' indices, marked, with their counts per chunk (B, N / chunk)."""
 
     def __init__(self, capacity: int, points: int) -> None:
         super().__init__(capacity, points)
@@ -65,21 +65,21 @@ class Depths:
 
     def __init__(self, capacity: int) -> None:
         self.points = wp.zeros(capacity, dtype=wp.float32)
-        """Of hand points in the object."""
+        """Hand points in the object."""
         self.object = wp.zeros(capacity, dtype=wp.float32)
-        """Of the object in links."""
+        """The object in links."""
         self.links = wp.zeros(capacity, dtype=wp.float32)
-        """Of links in links."""
+        """Links in links."""
         self.obstacles = wp.zeros(capacity, dtype=wp.float32)
-        """What a hand lacks of its distance from obstacles."""
+        """Shortfall of the hand's distance from obstacles."""
 
 
 class Data:
-    """Up to `capacity` hands of a model; see `worker.simulation.record` for what is done with them."""
+    """Arrays for up to `capacity` hands of a model; `worker.simulation.record` has the operations."""
 
     def __init__(self, model: Model, capacity: int, *, serial: bool | None = None) -> None:
-        """`serial`: threads of a launch run in their order, as on a CPU; where they do not, contacts are put in order
-        before they are summed, which gives the same bits."""
+        """`serial`: threads of a launch run in order, as on a CPU; else contacts are sorted before they are
+        summed, which gives the same bits."""
         self.device, self.capacity = model.device, capacity
         self.serial = not wp.get_device(model.device).is_cuda if serial is None else serial
         self.unit = joint_units(model.hand.model)
@@ -115,9 +115,9 @@ class Data:
     def set_state(
         self, state: HandState, active: NDArray[np.bool_] | None = None, dilation: Floats | None = None
     ) -> None:
-        """Load up to `capacity` hands; the rest of the capacity is switched off. Optimiser moments are cleared.
+        """Load up to `capacity` hands; the rest is switched off. Optimiser moments are cleared.
 
-        `dilation` (n,) multiplies the schedule's dilation for each hand; 1 where it is not given.
+        `dilation` (n,) multiplies the schedule's dilation for each hand; by default 1.
         """
         n = len(state.pivot)
         scale = np.ones(self.capacity, dtype=np.float32)
@@ -137,19 +137,20 @@ class Data:
         self.waited.zero_()
 
     def switch_off(self, hands: NDArray[np.bool_]) -> None:
-        """Hands (n,) that cost nothing from the next iteration on."""
+        """Switch off hands (n,) from the next iteration on; they cost nothing more."""
         active = self.active.numpy()
         active[: len(hands)][hands] = 0
         self.active.assign(active)
 
     def set_scenes(self, index: NDArray[np.integer[Any]]) -> None:
-        """The scene (n,) of each hand, among those of the model's obstacles; -1: none. It stays when states change."""
+        """Set the scene (n,) of each hand, an index into the model's obstacles; -1: none.
+        States do not change it."""
         padded = np.full(self.capacity, -1, dtype=np.int32)
         padded[: len(index)] = index
         self.scene.assign(padded)
 
     def set_schedule(self, schedule: Schedule) -> None:
-        """Upload the per-iteration tables; what was recorded before goes on with those it was recorded with.
+        """Upload the per-iteration tables; earlier records keep the tables they were recorded with.
 
         Raises:
             ValueError: a dilation above `MAX_DILATION`.
@@ -160,12 +161,12 @@ class Data:
             self.schedule = Tables(schedule, self.unit)
 
     def deepest(self, n: int) -> Floats:
-        """(n,) deepest penetration of each hand at the last evaluation, of all kinds [m]."""
+        """Return the deepest penetration (n,) of each hand at the last evaluation, of all kinds [m]."""
         kinds = (self.depths.points, self.depths.object, self.depths.links, self.depths.obstacles)
         return np.max([kind.numpy()[:n] for kind in kinds], axis=0)
 
     def near_share(self, reach: float, n: int) -> Floats:
-        """(n,) share of each hand's surface that was nearer to the object than `reach` [m] at the last evaluation."""
+        """Return shares (n,) of hands' surface closer to the object than `reach` [m], at the last evaluation."""
         c = self.contacts
         with wp.ScopedDevice(self.device):
             share = wp.empty(n, dtype=wp.float32)
@@ -178,7 +179,7 @@ class Data:
         return share.numpy().astype(float)
 
     def state(self, n: int) -> HandState:
-        """The first n hands, in float64."""
+        """Return the first n hands, in float64."""
         return HandState(
             self.pivot.numpy()[:n].astype(float),
             to_wxyz(self.rotation.numpy()[:n].astype(float)),
@@ -192,7 +193,7 @@ class Data:
 
 
 def _solver_states(model: Model, capacity: int) -> Any:
-    """Motions that a contact solver keeps for its reverse sweep; None: it keeps none."""
+    """Allocate the motions that a contact solver stores for its reverse sweep; None: it stores none."""
     options = model.options
     if options.contact_solver == "direct":
         return None
@@ -202,8 +203,8 @@ def _solver_states(model: Model, capacity: int) -> Any:
 
 @dataclass
 class HandState:
-    """State of B hands: pivot (B, 3) = palm centre relative to the object's centre of mass, rotation (B, 4) w x y z,
-    q (B, D)."""
+    """State of B hands: pivot (B, 3), rotation (B, 4) w x y z, q (B, D).
+    The pivot is the palm centre relative to the object's centre of mass."""
 
     pivot: Floats
     rotation: Floats
@@ -228,6 +229,6 @@ class Schedule:
 
 
 def still_schedule() -> Schedule:
-    """Tables for telling distances and depths only: no dilation, no weights, no step."""
+    """Return tables for distances and depths only: no dilation, no weights, no step."""
     zero = np.zeros(1)
     return Schedule(zero, zero, zero, zero, np.zeros((1, 3)))

@@ -1,5 +1,4 @@
-"""A hand and an object as arrays on a Warp device, made once for a pair; and bodies of many hands, placed by a
-kernel."""
+"""Arrays of a hand and an object on a Warp device, made once per pair; and bodies of many posed hands."""
 
 from __future__ import annotations
 
@@ -22,24 +21,24 @@ from graspd.worker.simulation.kernels import kinematics, nearest, pieces, surfac
 
 #: Kernels' numbers for `ConvexPiece.kind`.
 _KINDS: Final = {"box": 0, "sphere": 1, "cylinder": 2, "capsule": 3, "hull": 4}
-#: Cells that samples of the object are sorted by [m].
+#: Cells that sort the object's samples [m].
 SAMPLE_CELL_M: Final = 0.008
-#: Way of a sliding joint that moves a fingertip as a revolute joint of a finger does by one radian [m].
+#: Travel of a sliding joint that moves a fingertip as much as one radian of a revolute joint [m].
 SLIDE_M: Final = 0.05
 
 
 def to_xyzw(quaternion: Floats) -> Floats:
-    """Warp's order x y z w from graspd's w x y z, (..., 4)."""
+    """Convert quaternions (..., 4) from graspd's order w x y z to Warp's x y z w."""
     return np.roll(quaternion, -1, axis=-1)
 
 
 def to_wxyz(quaternion: Floats) -> Floats:
-    """graspd's order w x y z from Warp's x y z w, (..., 4)."""
+    """Convert quaternions (..., 4) from Warp's order x y z w to graspd's w x y z."""
     return np.roll(quaternion, 1, axis=-1)
 
 
 def joint_units(hand: HandModel) -> Floats:
-    """(D,) by how much a step of each dof is that of a revolute joint: 1, or of a sliding one `SLIDE_M`."""
+    """Return the step of each dof (D,) relative to a revolute joint: 1, or `SLIDE_M` for a sliding one."""
     return np.where(slides(hand), SLIDE_M, 1.0)
 
 
@@ -98,7 +97,7 @@ def _device_pieces(hand: HandModel) -> Any:
 
 
 def _piece_row(piece: ConvexPiece) -> tuple[Floats, Floats, Floats, Floats, Floats]:
-    """Size, position, quaternion (w x y z), half extents and planes of a piece for the kernels."""
+    """Return size, position, quaternion (w x y z), half extents and planes of a piece for the kernels."""
     none = np.zeros((0, 4))
     position, rotation = piece.pose[:3], piece.pose[3:]
     if piece.kind == "box":
@@ -118,7 +117,8 @@ def _piece_row(piece: ConvexPiece) -> tuple[Floats, Floats, Floats, Floats, Floa
 
 
 def face_planes(vertices: Floats, faces: NDArray[np.integer[Any]]) -> Floats:
-    """Distinct face planes (K, 4) of a convex solid: outward unit normal and offset; coplanar faces merged."""
+    """Return distinct face planes (K, 4) of a convex solid: outward unit normal and offset.
+    Coplanar faces are merged."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     normal = np.cross(b - a, c - a)
     length = np.linalg.norm(normal, axis=1)
@@ -141,7 +141,7 @@ class DeviceObject:
     samples: Any
     bvh: Any
     sorted_samples: Any
-    """The samples by the cells of a grid."""
+    """The samples sorted by the cells of a grid."""
 
     @classmethod
     def create(cls, obj: ObjectModel, device: str, *, samples: Floats, phong_alpha: float, cell: float) -> DeviceObject:
@@ -172,7 +172,7 @@ class DeviceObject:
         return cls(model=obj, device=device, surface=skin, mesh=mesh, samples=centred, bvh=bvh, sorted_samples=cells)
 
     def thinned(self, count: int) -> DeviceObject:
-        """The same object with its first `count` samples: farthest-point samples are even at any length."""
+        """Return the object with its first `count` samples: farthest-point samples are even at any length."""
         if count >= len(self.samples):
             return self
         with wp.ScopedDevice(self.device):
@@ -182,7 +182,7 @@ class DeviceObject:
 
 
 def sorted_samples(samples: Floats, size: float = SAMPLE_CELL_M) -> Any:
-    """Points (S, 3) [m] sorted by the cells of a grid of this size [m], on the present Warp device."""
+    """Sort points (S, 3) [m] by the cells of a grid of this size [m], on the current Warp device."""
     low = samples.min(axis=0)
     # At most 64 cells a side: a large object has larger ones.
     size = max(size, float((samples.max(axis=0) - low).max()) / 64)
@@ -204,11 +204,11 @@ class PosedBodies:
     chain: Any
     """The hand, `kernels.chain.Chain`."""
     bodies: Any
-    """Their poses (P, L), `kernels.chain.Bodies`."""
+    """Poses (P, L) of the bodies, `kernels.chain.Bodies`."""
 
     @classmethod
     def of(cls, hand: HandModel, hand_pose: Floats, joint_positions: Floats, device: str = "cpu") -> PosedBodies:
-        """Hands with roots (P, 7) and joint positions (P, J), as `body_poses` takes them."""
+        """Place hands with roots (P, 7) and joint positions (P, J), as `body_poses` does."""
         chain, count = chain_of(hand, device), len(hand_pose)
         with wp.ScopedDevice(device):
             root, joints = (
@@ -231,7 +231,7 @@ class PosedBodies:
 
 
 def room_for_bodies(hand: HandModel, count: int) -> Any:
-    """Poses of so many hands, not filled in, on the present device."""
+    """Allocate poses of `count` hands on the current device, uninitialised."""
     out = kernels.Bodies()
     out.position = wp.empty((count, hand.bodies), dtype=wp.vec3d)
     out.rotation = wp.empty((count, hand.bodies), dtype=wp.quatd)
@@ -243,11 +243,11 @@ _lock = threading.Lock()
 
 
 def chain_of(hand: HandModel, device: str) -> Any:
-    """The hand on a device as `kernels.chain.Chain`, from memory where it was used lately."""
+    """Return the hand on a device as `kernels.chain.Chain`, cached in memory."""
     key = (hand.content, device)
     with _lock:
         if (found := _chains.get(key)) is None:
-            # Loading here keeps threads from compiling the same module at once.
+            # Loading here prevents threads from compiling the same module at once.
             wp.load_module(module=kernels, device=device)
             with wp.ScopedDevice(device):
                 found = _chains[key] = _chain(hand)
@@ -255,7 +255,7 @@ def chain_of(hand: HandModel, device: str) -> Any:
 
 
 def _chain(hand: HandModel) -> Any:
-    """The hand as `kernels.chain.Chain`, on the present device."""
+    """Upload the hand as `kernels.chain.Chain` to the current device."""
     out, features = kernels.Chain(), hand.features
     joint = np.zeros(hand.bodies, np.int32)
     joint[hand.joint_body] = np.arange(len(hand.joint_body))

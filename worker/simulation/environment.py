@@ -1,7 +1,7 @@
-"""What stands around an object: the convex obstacles of a scene that a hand must stay clear of.
+"""Environment of an object: the convex obstacles of a scene that a hand must avoid.
 
-An obstacle is an intersection of half-spaces: a table top is one, a board or a wall six, a neighbour's convex pieces as
-many as their hulls have faces. Frames: the object's, as everywhere in planning.
+An obstacle is an intersection of half-spaces: a table top has one, a board or a wall six, a neighbour's convex piece as
+many as its hull has faces. Frames are the object's, as everywhere in planning.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from graspd.worker.objects.model import ObjectModel
 
 #: Direction against gravity in the scene frame.
 UP: Final = np.array([0.0, 0.0, 1.0])
-#: Length of a hand's straight way to its pregrasp, and of the lift [m].
+#: Length of a hand's straight approach to its pregrasp, and of the lift [m].
 STANDOFF_M: Final = 0.10
 RISE_M: Final = 0.10
-#: A hand is clear of what it stays so far away from [m]; fingertips may be nearer to a support that says so.
+#: Least clearance of a hand from obstacles [m]; fingertips may be closer to a support that allows it.
 CLEAR_M: Final = 0.002
 
 
@@ -36,11 +36,11 @@ class Obstacle:
     planes: Floats
     """(K, 4) outward unit normal and offset [m]."""
     corners: Floats
-    """(V, 3) corners [m]; none where the body has no end, as a half-space."""
+    """(V, 3) corners [m]; none for unbounded bodies, as a half-space."""
     edges: NDArray[np.intp] = field(default_factory=lambda: np.zeros((0, 2), np.intp))
-    """(E, 2) corners that an edge joins."""
+    """(E, 2) corners joined by an edge."""
     tips_m: float | None = None
-    """Distance that fingertips keep from it, negative if they may press into it [m]; None: the rest of the hand's."""
+    """Clearance of fingertips, negative if they may press into it [m]; None: as for the rest of the hand."""
 
     def __post_init__(self) -> None:
         if self.planes.ndim != 2 or self.planes.shape[1] != 4 or not len(self.planes):
@@ -48,10 +48,10 @@ class Obstacle:
 
     @classmethod
     def half_space(cls, normal: Sequence[float] | Floats, offset: float) -> Obstacle:
-        """Everything below the plane n.x = offset; the normal need not have unit length.
+        """Return everything below the plane n.x = offset; the normal need not have unit length.
 
         Raises:
-            InputError: the normal is zero or no number.
+            InputError: the normal is zero or not finite.
         """
         n = np.asarray(normal, float)
         length = float(np.linalg.norm(n))
@@ -61,10 +61,10 @@ class Obstacle:
 
     @classmethod
     def box(cls, pose: Sequence[float] | Floats, size: Sequence[float] | Floats) -> Obstacle:
-        """A box of full extents `size` (3,) [m] about the origin of `pose` (7,).
+        """Return a box of full extents `size` (3,) [m] about the origin of `pose` (7,).
 
         Raises:
-            InputError: an extent is not positive, or a number is none.
+            InputError: an extent is not positive, or a number is not finite.
         """
         pose, half = np.asarray(pose, float), np.asarray(size, float) / 2
         if half.shape != (3,) or not np.isfinite(half).all() or (half <= 0).any():
@@ -79,23 +79,23 @@ class Obstacle:
         return cls(planes, pose[:3] + (signs * half) @ R.T, edges)
 
     def moved(self, pose: Floats) -> Obstacle:
-        """The obstacle carried along by `pose` (7,): its frame's coordinates in the outer frame."""
+        """Return the obstacle moved by `pose` (7,): from its frame's coordinates to the outer frame."""
         normals = quat_rotate(pose[3:], self.planes[:, :3])
         planes = np.column_stack([normals, self.planes[:, 3] + normals @ pose[:3]])
         return replace(self, planes=planes, corners=quat_rotate(pose[3:], self.corners) + pose[:3])
 
     def seen_from(self, pose: Floats) -> Obstacle:
-        """The obstacle, given in an outer frame, in the frame that stands at `pose` (7,) in it."""
+        """Return the obstacle, given in an outer frame, in the frame that is at `pose` (7,) in it."""
         return self.moved(invert(pose))
 
     def distance(self, points: Floats) -> Floats:
-        """(...) signed distance of points (..., 3): exact inside and over faces, beyond edges a lower bound [m]."""
+        """Return signed distances (...) of points (..., 3) [m]: exact in and over faces, else a lower bound."""
         return np.asarray((points @ self.planes[:, :3].T - self.planes[:, 3]).max(axis=-1))
 
 
 @dataclass(frozen=True)
 class Environment:
-    """One scene as a hand that reaches for the object sees it, in the object frame."""
+    """One scene in the object frame."""
 
     obstacles: tuple[Obstacle, ...]
     up: Floats
@@ -108,18 +108,18 @@ class Neighbour:
 
     obj: ObjectModel
     pieces: tuple[Floats, ...]
-    """Corners (V, 3) of each piece: what the validator simulates."""
+    """Corners (V, 3) of each piece, as the validator simulates them."""
     solids: tuple[Obstacle, ...]
-    """The same pieces, or a little more, with few faces: what a hand stays clear of."""
+    """Slightly enlarged pieces with few faces, as a hand avoids them."""
     error_m: float
-    """Farthest that a solid stands out from its piece [m]."""
+    """Largest excess of a solid over its piece [m]."""
     about_centre: Neighbour | None = None
-    """The neighbour about its middle; None: it is that already."""
+    """The neighbour about its centre; None: it already is."""
 
 
 @dataclass(frozen=True)
 class Scenes:
-    """S scenes of one object that have the same supports and neighbours."""
+    """S scenes of one object with common supports and neighbours."""
 
     supports: tuple[Obstacle, ...]
     """Tables, boards and walls in the scene frame, z up."""
@@ -130,18 +130,18 @@ class Scenes:
     """(S, M, 7) of the neighbours in the scene frame."""
 
     def centred(self, obj: ObjectModel) -> Scenes:
-        """The same scenes with `obj`, which they are of, and the neighbours about their middles."""
+        """Return the scenes with the frames of their object `obj` and of the neighbours at their centres."""
         return Scenes(self.supports, *_centred(obj, self.object_pose, self.neighbours, self.neighbour_pose))
 
     def placed(self, index: NDArray[np.intp]) -> PlacedGrasps:
-        """Grasps in these scenes, by the number of the scene (N,)."""
+        """Return grasps in these scenes, by scene number (N,)."""
         index = np.asarray(index, np.intp)
         return PlacedGrasps(self.supports, self.object_pose, index, self.neighbours, self.neighbour_pose)
 
 
 @dataclass(frozen=True)
 class PlacedGrasps:
-    """N grasps, each in one of S scenes that have the same supports and neighbours."""
+    """N grasps, each in one of S scenes with common supports and neighbours."""
 
     supports: tuple[Obstacle, ...]
     """Tables, boards and walls in the scene frame, z up."""
@@ -155,7 +155,7 @@ class PlacedGrasps:
 
     @cached_property
     def scenes(self) -> tuple[Environment, ...]:
-        """The S scenes, seen from the object."""
+        """The S scenes in the object frame."""
         return tuple(
             Environment(
                 tuple(o.seen_from(pose) for o in self.supports) + self._beside(number),
@@ -166,7 +166,7 @@ class PlacedGrasps:
 
     @cached_property
     def fixed(self) -> str:
-        """Digest of what all grasps have around them wherever the object stands: supports and neighbours."""
+        """Digest of the surroundings common to all grasps wherever the object rests: supports and neighbours."""
         told = hashlib.sha256()
         solids = [solid for one in self.neighbours for solid in one.solids]
         for body in (*self.supports, *solids):
@@ -181,11 +181,11 @@ class PlacedGrasps:
         return Scenes(self.supports, self.object_pose, self.neighbours, self.neighbour_pose)
 
     def centred(self, obj: ObjectModel) -> PlacedGrasps:
-        """The same grasps' scenes with `obj`, which they are of, and the neighbours about their middles."""
+        """Return the grasps' scenes with the frames of `obj` and of the neighbours at their centres."""
         return self.everywhere.centred(obj).placed(self.index)
 
     def neighbours_of(self, scene: int) -> Floats:
-        """(M, 7) poses of the neighbours in the object frame."""
+        """Return poses (M, 7) of the neighbours in the object frame."""
         if not self.neighbours:
             return np.zeros((0, 7))
         return np.asarray(compose(invert(self.object_pose[scene]), np.asarray(self.neighbour_pose[scene], float)))
@@ -197,9 +197,9 @@ class PlacedGrasps:
         )
 
     def take(self, rows: NDArray[np.intp] | slice) -> PlacedGrasps:
-        """Some of the grasps, in the order of `rows`."""
+        """Return some of the grasps, in the order of `rows`."""
         taken = replace(self, index=self.index[rows])
-        vars(taken)["scenes"] = self.scenes  # they are the same: not to be made anew
+        vars(taken)["scenes"] = self.scenes  # unchanged, so not recomputed
         return taken
 
 
@@ -213,7 +213,7 @@ def _centred(
 
 
 def placed_together(parts: Sequence[PlacedGrasps]) -> PlacedGrasps:
-    """Grasps of several sets, one after the other, each in its own scenes; supports and neighbours are the same."""
+    """Join grasps of several sets, each in its own scenes; supports and neighbours are common."""
     first = parts[0]
     if len(parts) == 1:
         return first
@@ -226,12 +226,12 @@ def placed_together(parts: Sequence[PlacedGrasps]) -> PlacedGrasps:
         if first.neighbours
         else first.neighbour_pose,
     )
-    vars(whole)["scenes"] = tuple(scene for part in parts for scene in part.scenes)  # not to be made anew
+    vars(whole)["scenes"] = tuple(scene for part in parts for scene in part.scenes)  # not recomputed
     return whole
 
 
 def scenes_together(parts: Sequence[Scenes]) -> Scenes:
-    """The scenes of several sets, one after the other; supports and neighbours are the same."""
+    """Join the scenes of several sets; supports and neighbours are common."""
     first = parts[0]
     beside = np.concatenate([part.neighbour_pose for part in parts]) if first.neighbours else first.neighbour_pose
     return replace(first, object_pose=np.concatenate([part.object_pose for part in parts]), neighbour_pose=beside)

@@ -1,7 +1,7 @@
-"""The distance grid of an object with the lists of near faces of its cells, kept on the machine.
+"""Distance grid of an object with the lists of near faces of its cells, cached on disk.
 
-Both follow from the object alone and are a fifth of what the first grasp of a process takes, so a CPU's are read by
-later processes. A GPU makes them sooner than a file is read.
+Both depend on the object alone and take a fifth of a process's first grasp, so later processes read a CPU's grid. A GPU
+computes them faster than a file is read.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ from graspd.worker.simulation.kernels import nearest, surface
 
 Arrays = Mapping[str, NDArray[Any]]
 
-#: Distances farther than this from the surface are never asked for [m].
+#: Largest distance from the surface that is looked up [m].
 FIELD_REACH: Final = 0.06
-#: Cells that come as near to the surface as this and the grid's error list their nearest faces [m].
+#: Cells within this distance plus the grid's error of the surface list their nearest faces [m].
 LISTED_M: Final = 0.004
-#: Cells a side at most: a large object has a coarser grid, whose larger error is accounted for.
+#: Most cells a side: a large object has a coarser grid, whose larger error is accounted for.
 _MOST_CELLS: Final = 96
 
 
 def add_grid(skin: Any, obj: ObjectModel, mesh: Any, cell: float) -> None:
-    """Give a surface its distance grid and the lists of its cells, on the present Warp device.
+    """Add the distance grid and the lists of its cells to a surface, on the current Warp device.
 
     Args:
         skin: a `surface.Surface` without them, its `cells.faces` filled; written to.
-        obj: the object it is of.
+        obj: its object.
         mesh: its `warp.Mesh`, vertices about the centre of mass.
         cell: cell size of the grid [m].
     """
@@ -67,12 +67,12 @@ def add_grid(skin: Any, obj: ObjectModel, mesh: Any, cell: float) -> None:
         setattr(skin.cells, name, wp.array(kept[name], dtype=kind))
 
 
-#: What the lists of cells consist of, see `nearest.Cells`.
+#: Arrays of the cells' lists, see `nearest.Cells`.
 _LISTS: Final = {"first": wp.int32, "face": wp.int32, "key": wp.float32}
 
 
 def _sampled(skin: Any, shape: tuple[int, ...]) -> Any:
-    """The distances at the corners of the grid."""
+    """Return the distances at the corners of the grid."""
     field = wp.empty(shape, dtype=wp.float32)
     wp.launch(
         surface.sample_field,
@@ -90,7 +90,7 @@ def _list(skin: Any, obj: ObjectModel, mesh: Any) -> None:
 
 
 def _fits(kept: Arrays, shape: tuple[int, ...], faces: int) -> bool:
-    """Whether arrays can be those of a grid of this shape over so many faces: kernels look nowhere else then."""
+    """Check whether arrays fit a grid of this shape over `faces` faces, so that kernels stay in bounds."""
     kinds = {"field": np.float32, "first": np.int32, "face": np.int32, "key": np.float32}
     if set(kept) != set(kinds) or any(kept[name].dtype != kind for name, kind in kinds.items()):
         return False
@@ -107,7 +107,7 @@ def _fits(kept: Arrays, shape: tuple[int, ...], faces: int) -> bool:
 
 
 def faces_of(obj: ObjectModel) -> Any:
-    """The object's faces about its centre of mass, on the present Warp device."""
+    """Return the object's faces about its centre of mass, on the current Warp device."""
     corners = (obj.vertices - obj.centre_of_mass)[obj.faces]
     ab, ac = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     square = np.stack([(ab * ab).sum(1), (ab * ac).sum(1), (ac * ac).sum(1)], axis=1)
@@ -122,9 +122,9 @@ def faces_of(obj: ObjectModel) -> Any:
 
 
 def feature_normals(vertices: Floats, faces: NDArray[np.integer[Any]]) -> Floats:
-    """(F, 7, 3) angle-weighted normals, of any length: inside, edges ab, bc, ca, corners a, b, c of each face.
+    """Return unnormalised angle-weighted normals (F, 7, 3): inside, edges ab, bc, ca, corners a, b, c.
 
-    Vertices at the same place count as one. Faces without an area have no say.
+    Vertices at the same place count as one. Faces without an area are ignored.
     """
     places, same = np.unique(vertices, axis=0, return_inverse=True)
     faces = same.reshape(-1)[faces]
@@ -146,15 +146,15 @@ def feature_normals(vertices: Floats, faces: NDArray[np.integer[Any]]) -> Floats
 
 
 def _summed(group: NDArray[np.integer[Any]], rows: Floats) -> Floats:
-    """Each row's sum over its group (R, 3)."""
+    """Return each row's sum over its group (R, 3)."""
     total = np.zeros((int(group.max(initial=0)) + 1, 3))
     np.add.at(total, group, rows)
     return total[group]
 
 
 def list_cells(faces: Any, mesh: Any, field: Any, low: Any, size: float, within: float) -> Any:
-    """Lists of the `faces` of `faces_of` for the cells of the grid `field`, whose first corner is `low`, that come
-    within so much of the surface."""
+    """List the `faces` of `faces_of` for grid cells within `within` of the surface.
+    `low` is the first corner of the grid `field`."""
     cells = nearest.Cells()
     cells.faces = faces
     shape = [n - 1 for n in field.shape]

@@ -1,4 +1,4 @@
-"""Kernel launches fixed once and run many times: nothing but counters on the device changes between two runs."""
+"""Kernel launches recorded once and run many times; only counters on the device change between runs."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import warp as wp
 
 
 class Launches:
-    """A list of launches in order; on CUDA it becomes a graph as soon as it is run often enough."""
+    """Ordered launches; on CUDA they become a graph once they have run often enough."""
 
     def __init__(self, device: str) -> None:
         self.device = device
@@ -32,11 +32,11 @@ class Launches:
         self._graph = None
 
     def named(self) -> list[tuple[str, Any]]:
-        """Name and launch of each kernel, in order."""
+        """Return name and launch of each kernel, in order."""
         return list(self._commands)
 
     def run(self, times: int = 1) -> None:
-        """Launch all, so many times, without waiting for the device."""
+        """Run all launches, `times` times, without waiting for the device."""
         if not wp.get_device(self.device).is_cuda:
             with _counted():
                 for _ in range(times):
@@ -60,18 +60,18 @@ class Launches:
 
 
 def launch(kernel: Any, dim: Any, *, device: Any = None, **given: Any) -> None:
-    """`warp.launch`, with the processor time of a kernel on the CPU counted where somebody wants to know it."""
+    """Run `warp.launch` and count the CPU time of its kernel while `kernel_seconds` is active."""
     with nullcontext() if wp.get_device(device).is_cuda else _counted():
         wp.launch(kernel, dim, device=device, **given)
 
 
-#: Processor seconds of kernels on the CPU, while somebody counts them.
+#: CPU seconds of kernels on the CPU while they are counted.
 _spent: ContextVar[list[float] | None] = ContextVar("spent", default=None)
 
 
 @contextmanager
 def kernel_seconds() -> Iterator[list[float]]:
-    """Processor seconds of the kernels that this thread runs on the CPU meanwhile."""
+    """Count the CPU seconds of the kernels that this thread runs on the CPU."""
     spent: list[float] = []
     token = _spent.set(spent)
     try:
@@ -94,10 +94,11 @@ def _counted() -> Iterator[None]:
 
 
 def _packed(command: Any) -> Callable[[], object]:
-    """What runs a recorded launch on the CPU.
+    """Return a function that runs a recorded launch on the CPU.
 
-    Warp packs the arguments anew each time, under the interpreter's lock: a twentieth of an iteration of a few hands,
-    for which other threads wait. They are packed here once, as Warp does it."""
+    Warp packs the arguments each time, under the interpreter's lock: a twentieth of an iteration of a few hands, for
+    which other threads wait. Here they are packed once, as Warp does it.
+    """
     if not command.device.is_cpu or command.adjoint or command.block_dim > 1:
         return partial(command.launch)
     bounds, *values = command.params

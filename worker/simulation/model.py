@@ -1,4 +1,4 @@
-"""The model of a simulation: all that does not change while hands move."""
+"""Model of a simulation: everything that stays constant while hands move."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ from graspd.worker.simulation.device import DeviceHand, DeviceObject
 from graspd.worker.simulation.kernels import contact, pieces
 from graspd.worker.simulation.obstacles import DeviceObstacles
 
-#: Weights of points are areas in units of 1/800 of the hand's surface: the loss does not depend on how many points.
+#: Weights of points are areas in units of 1/800 of the hand's surface: the loss does not depend on their number.
 REFERENCE_POINTS: Final = 800
-#: Weight of one object sample is 1 at this many samples.
+#: Number of object samples at which each has weight 1.
 REFERENCE_SAMPLES: Final = 2000
-#: Weight of one hand point against other links is 1 at this many.
+#: Number of hand points against other links at which each has weight 1.
 REFERENCE_SELF_POINTS: Final = 1000
 #: Kernels of the contact step by their names.
 SOLVERS: Final = {"direct": contact.direct, "jacobi": contact.jacobi, "gauss_seidel": contact.gauss_seidel}
-#: Contacts with a gap of at most this are listed for the direct solver: four steps of the object [m].
+#: Contacts with at most this gap are listed for the direct solver: four steps of the object [m].
 NEAR_GAP: Final = 4e-3
-#: Points that one thread works on: on the CPU a thread costs as much as a point; on CUDA every point has its own.
+#: Points per thread: on the CPU a thread costs as much as a point; on CUDA every point has its own.
 CPU_LANE: Final = 64
-#: Largest dilation a schedule may ask for [m].
+#: Largest dilation of a schedule [m].
 MAX_DILATION: Final = 0.1
 
 
 @dataclass(frozen=True)
 class LossOptions:
-    """What is simulated and penalised; see `worker.simulation.kernels.contact` for the symbols."""
+    """Options of simulation and penalties; see `worker.simulation.kernels.contact` for the symbols."""
 
     contact_solver: str = "direct"
     velocities: int = 7
@@ -46,30 +46,30 @@ class LossOptions:
     leak_length: float = 0.02
     one_sided: bool = True
     band: float = 0.03
-    """Points farther than dilation + band from the surface take no part [m]."""
+    """Points farther than dilation + band from the surface are ignored [m]."""
     exact_below: float = 0.004
-    """Nearer than this distances are asked of the mesh, farther of the grid [m]."""
+    """Distances below this are computed from the mesh, above from the grid [m]."""
     range_weight: float = 0.005
     limit_weight: float = 0.0
     self_margin: float = 1e-3
     pull: float = 0.0
-    """Points that touch nothing are drawn to the object as hard as the penetration would push those so deep in it,
-    less with their distance [m]."""
+    """Attraction of points without contact, as strong as the penetration term at this depth [m].
+    It fades with their distance."""
     pull_length: float = 0.013
-    """Distance over which that falls to 1/e [m]."""
+    """Distance over which the attraction falls to 1/e [m]."""
     simulate: bool = True
-    """False: no simulation; every point near the object is drawn to it. A control for benchmarks."""
+    """False: no simulation; every point near the object is attracted. A control for benchmarks."""
 
 
 @dataclass(frozen=True)
 class Model:
-    """A hand with one set of points and an object on a device, and how they are simulated."""
+    """A hand with one set of points, an object on a device, and the options of their simulation."""
 
     hand: DeviceHand
     obj: DeviceObject
     options: LossOptions
     obstacles: DeviceObstacles | None
-    """What the hands must stay clear of; None: nothing."""
+    """Obstacles that the hands must avoid; None: none."""
     count: int
     """Hand points."""
     point_body: Any
@@ -78,7 +78,7 @@ class Model:
     body_points: Any
     """Points tested against other links."""
     self_scale: float
-    """Weight of one of them."""
+    """Weight of one body point."""
     physics: Any
     motions: Any
     """(M,) free motions of the object."""
@@ -92,7 +92,7 @@ class Model:
         options: LossOptions,
         obstacles: DeviceObstacles | None = None,
     ) -> Model:
-        """Upload the points to the hand's device.
+        """Create the model and upload the points to the hand's device.
 
         Raises:
             InputError: unknown contact solver.
@@ -123,12 +123,12 @@ class Model:
 
     @property
     def lane(self) -> int:
-        """Points of a hand that one thread works on."""
+        """Points of a hand per thread."""
         return 1 if wp.get_device(self.device).is_cuda else CPU_LANE
 
     @property
     def lanes(self) -> int:
-        """Threads that the points of a hand take."""
+        """Threads per hand."""
         return -(-self.count // self.lane)
 
     @property
@@ -145,7 +145,7 @@ class Model:
 
 
 def initial_motions(velocities: int, step: float, gyration: float) -> Floats:
-    """(M, 6) free motions of the object: at rest, then +-x, +-y, +-z, then (13) the same for rotations."""
+    """Return free motions (M, 6) of the object: rest, +-x, +-y, +-z, then (13) the same for rotations."""
     rows = [np.zeros(6)]
     for axis in range(3 if velocities == 7 else 6):
         for sign in (1.0, -1.0):
@@ -156,7 +156,7 @@ def initial_motions(velocities: int, step: float, gyration: float) -> Floats:
 
 
 def body_points(points: SurfacePoints, bodies: int) -> Any:
-    """The points sorted by body, with bounding spheres."""
+    """Return the points sorted by body, with bounding spheres."""
     order = np.argsort(points.body, kind="stable")
     body, position = points.body[order], points.position[order]
     first = np.searchsorted(body, np.arange(bodies + 1))

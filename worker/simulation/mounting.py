@@ -1,5 +1,5 @@
-"""Distance of a hand's mounting from obstacles: of the wrist angles that it may take, those nearest to rest count that
-keep it clear. Planners ask for the distance of its points, which costs little; what is valid is asked for exactly."""
+"""Clearance of a hand's mounting from obstacles, at the clear wrist angles nearest to rest.
+Planners use the clearance of the mounting's points, which is cheap; validity uses the exact clearance."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from graspd.worker.simulation.obstacles import MARGIN_M, obstacle_room
 #: Points of a mounting: the outermost in so many directions, then so many corners spread over it.
 OUTERMOST: Final = 20
 SPREAD: Final = 40
-#: Wrist positions of a hand whose exact distances are asked for.
+#: Wrist positions of a hand whose exact clearances are computed.
 TRIES: Final = 4
 
 
@@ -35,19 +35,19 @@ def mounting_room(
     *,
     enough: float = CLEAR_M,
 ) -> tuple[Floats, Floats]:
-    """The angles of a wrist that keeps them while the hand moves, and the room of the mounting.
+    """Choose wrist angles that stay constant while the hand moves; return the mounting's clearance.
 
     Args:
         hand: the hand.
-        poses: (N, P, 7) poses that the root of each of N hands takes, object frame.
-        scenes: what stands around.
+        poses: (N, P, 7) poses of the root of each of N hands, object frame.
+        scenes: the environments.
         which: (N,) scene of each hand; by default the first.
-        enough: distance from obstacles with which the search of angles ends [m].
+        enough: clearance from obstacles at which the search ends [m].
 
     Returns:
-        (N, K) wrist angles: the first of `wrist_positions` with room enough, of those whose points have it, or else the
-        one whose points have the most; and (N,) the least distance of the mounting from obstacles at all poses [m].
-        Without a mounting K is 0 and the distance inf.
+        (N, K) wrist angles: the first of `wrist_positions` with enough clearance, among those whose points have it,
+        else the one whose points have the most; and (N,) least clearance of the mounting from obstacles at all poses
+        [m]. Without a mounting K is 0 and the clearance inf.
     """
     mounting, count = hand.mounting, len(poses)
     if mounting is None:
@@ -65,8 +65,8 @@ def mounting_lack(
     room: float = 0.0,
     exact: bool = True,
 ) -> Floats:
-    """(N,) what mountings lack of the distance that planners keep from obstacles, and of `room` besides, at root poses
-    (N, 7) and the best wrist angles [m]; 0 or more. What their points lack; `exact`: or what they lack themselves."""
+    """Return the mountings' lack (N,) of the planners' clearance plus `room` at root poses (N, 7) [m].
+    It is at least 0, at the best wrist angles. It is that of the points; `exact`: or of the mounting itself."""
     mounting, wanted = hand.mounting, MARGIN_M + room
     if mounting is None or not len(poses):
         return np.zeros(len(poses))
@@ -87,7 +87,7 @@ def _solved(
     points: Floats,
     enough: float,
 ) -> tuple[Floats, Floats]:
-    """Angles and room as `mounting_room` has them, from the room of points (N, W), which is used up."""
+    """Return angles and clearance as `mounting_room`; the clearance of points (N, W) is consumed."""
     wrists, count = wrist_positions(mounting), len(poses)
     number, room, rows = np.zeros(count, np.intp), np.full(count, -np.inf), np.arange(count)
     for _ in range(min(TRIES, len(wrists))):
@@ -104,15 +104,15 @@ def _solved(
 
 
 def point_room(mounting: HandModel, poses: Floats, scenes: Sequence[Environment], which: NDArray[np.intp]) -> Floats:
-    """(N, W) least distance of a mounting's points from obstacles of scenes `which` (N,) over root poses (N, P, 7), at
-    each wrist position [m]: no less than the mounting's own, but near edges and corners of solids."""
+    """Return the least clearance (N, W) of a mounting's points over root poses (N, P, 7) [m].
+    W wrist positions; scenes `which` (N,). At least the mounting's own, except near edges and corners of solids."""
     points = points_of(mounting)
     out = np.full((len(poses), len(points)), np.inf)
     for scene in np.unique(which):
         rows = np.flatnonzero(which == scene)
         place, flat = poses[rows][:, :, None], points.reshape(-1, 3).T
         for obstacle in scenes[scene].obstacles:
-            # Planes as the root sees them: points are many, planes few.
+            # Planes in the root frame: points are many, planes few.
             normals = quat_rotate(quat_conjugate(place[..., 3:]), obstacle.planes[:, :3])
             shift = place[..., :3] @ obstacle.planes[:, :3].T - obstacle.planes[:, 3]
             distance = (normals @ flat + shift[:, :, 0, :, None]).max(axis=2).min(axis=1)
@@ -125,7 +125,7 @@ _lock = threading.Lock()
 
 
 def points_of(mounting: HandModel) -> Floats:
-    """(W, M, 3) points of a mounting at each wrist position, the `OUTERMOST` first, frame of the root [m]."""
+    """Return points (W, M, 3) of a mounting at each wrist position, the `OUTERMOST` first, root frame [m]."""
     with _lock:
         if (found := _points.get(mounting.content)) is None:
             wrists = wrist_positions(mounting)
@@ -142,8 +142,8 @@ def points_of(mounting: HandModel) -> Floats:
 def wrist_room(
     mounting: HandModel, poses: Floats, wrist: Floats, scenes: Sequence[Environment], which: NDArray[np.integer[Any]]
 ) -> Floats:
-    """(N,) least distance of mountings from the obstacles of scenes `which` (N,) at root poses (N, P, 7) and wrist
-    angles (N, K) [m]."""
+    """Return the least clearance (N,) of mountings at root poses (N, P, 7) and wrist angles (N, K) [m].
+    Obstacles are those of scenes `which` (N,)."""
     steps = poses.shape[1]
     joints = np.repeat(mounting.expand(wrist), steps, axis=0)
     postures = Posture(poses.reshape(-1, 7), joints)

@@ -1,4 +1,4 @@
-"""The obstacles of scenes, and the hand's features that must stay clear of them, on a Warp device."""
+"""Obstacles of scenes, and the hand's features that must avoid them, on a Warp device."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from graspd.worker.simulation.kernels import obstacles as kernels
 from graspd.worker.simulation.kernels import solids as solid_kernels
 from graspd.worker.simulation.launches import launch
 
-#: Distance that a hand keeps from obstacles [m]: twice what a scene's certificate asks, for the way is swept in steps.
+#: Clearance of hands from obstacles in planning [m]: twice a scene's requirement, as trajectories are swept in steps.
 MARGIN_M: Final = 0.004
-#: Distances from solids are not told apart beyond this [m].
+#: Distances from solids are capped at this [m].
 FAR_M: Final = 0.1
 
 
@@ -45,7 +45,7 @@ class PosedFeatures:
 
     @classmethod
     def of(cls, hand: HandModel, postures: Posture) -> PosedFeatures:
-        """The features of a hand in these postures."""
+        """Place the features of a hand in these postures."""
         features = hand.features
         bodies = body_poses(hand, postures.hand_pose, postures.joint_positions)[:, features.body]
         centre = quat_rotate(bodies[..., 3:], features.centre) + bodies[..., :3]
@@ -53,7 +53,7 @@ class PosedFeatures:
         return cls(centre, axis, features.radius, (features.axis**2).sum(axis=1) > 0.5)
 
     def distance(self, obstacle: Obstacle) -> Floats:
-        """(P, F) signed distance from an obstacle [m]: exact over a half-space, beyond edges a lower bound."""
+        """Return signed distances (P, F) from an obstacle [m]: exact over a half-space, else a lower bound."""
         normal, offset = obstacle.planes[:, :3], obstacle.planes[:, 3]
         sine = np.sqrt(np.maximum(0.0, 1.0 - (self.axis @ normal.T) ** 2))
         reach = self.radius[:, None] * np.where(self.rim[:, None], sine, 1.0)
@@ -86,7 +86,7 @@ _lock = threading.Lock()
 def _device_hand(hand: HandModel) -> DeviceHand:
     with _lock:
         if (found := _hands.get(hand.content)) is None:
-            # Loading here keeps threads from compiling the same module at once.
+            # Loading here prevents threads from compiling the same module at once.
             wp.load_module(module=solid_kernels, device="cpu")
             found = _hands[hand.content] = DeviceHand.create(hand, "cpu")
         return found
@@ -116,14 +116,14 @@ def body_room(
 
 
 def _more(obstacle: Obstacle) -> float:
-    """By what fingertips count as farther from an obstacle [m]."""
+    """Return the distance added for fingertips at an obstacle [m]."""
     return 0.0 if obstacle.tips_m is None else CLEAR_M - obstacle.tips_m
 
 
 def _half_space_room(
     hand: HandModel, postures: Posture, scenes: Sequence[Environment], which: NDArray[np.integer[Any]]
 ) -> Floats:
-    """(P, L) as `body_room`, of the half-spaces alone."""
+    """Compute `body_room` (P, L) of the half-spaces alone."""
     every = [[o for o in scene.obstacles if not len(o.corners)] for scene in scenes]
     flat, count = [o for one in every for o in one], len(postures)
     posed, spaces = PosedBodies.of(hand, postures.hand_pose, postures.joint_positions), chain_kernels.HalfSpaces()
@@ -140,7 +140,7 @@ def _half_space_room(
 def obstacle_room(
     hand: HandModel, postures: Posture, scenes: Sequence[Environment], which: NDArray[np.integer[Any]] | None = None
 ) -> Floats:
-    """(P,) least of the `body_room` of each posture [m]."""
+    """Return the least of the `body_room` of each posture (P,) [m]."""
     return np.asarray(body_room(hand, postures, scenes, which).min(axis=1))
 
 
@@ -167,10 +167,10 @@ class DeviceObstacles:
 
         Args:
             hand: the hand.
-            scenes: what stands around the object in each scene, object frame.
+            scenes: the environments, object frame.
             centre: (3,) the object's centre of mass, object frame.
             device: Warp device.
-            margin: distance to keep [m], of all features or (L,) of each body.
+            margin: clearance [m], of all features or (L,) of each body.
         """
         found = hand.features
         kept = np.broadcast_to(np.asarray(margin, float), hand.bodies)[found.body]
@@ -217,15 +217,15 @@ def _starts(lengths: Sequence[int]) -> NDArray[np.int32]:
 
 
 def _feature_ball(features: HandFeatures, piece: int) -> tuple[Floats, float]:
-    """Middle, body frame, and radius [m] of a ball that the features of a piece do not leave."""
+    """Return centre (body frame) and radius [m] of a ball around the features of a piece."""
     rows = slice(features.first[piece], features.first[piece + 1])
     middle, radius = _sphere(features.centre[rows])
-    # A hair more: kernels round.
+    # Slightly larger: kernels round.
     return middle, radius + float(features.radius[rows].max(initial=0.0)) + 1e-6
 
 
 def _sphere(corners: Floats) -> tuple[Floats, float]:
-    """A bounding sphere; of a body without end none is asked for."""
+    """Return a bounding sphere; that of unbounded bodies is unused."""
     if not len(corners):
         return np.zeros(3), 0.0
     centre = (corners.min(axis=0) + corners.max(axis=0)) / 2

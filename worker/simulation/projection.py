@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt projection of hands out of penetration while contacts are held (kernels.projection)."""
+"""Levenberg-Marquardt projection of hands out of penetration, holding contacts (kernels.projection)."""
 
 from __future__ import annotations
 
@@ -17,38 +17,38 @@ from graspd.worker.simulation.launches import Launches
 from graspd.worker.simulation.model import Model
 from graspd.worker.simulation.record import record_placement
 
-#: Residuals kept per grasp and iteration.
+#: Residuals per grasp and iteration.
 CAPACITY: Final = 1024
-#: Residuals that one thread of a GPU adds to the equations.
+#: Residuals per GPU thread that are added to the equations.
 CUDA_LANE: Final = 16
-#: A state is better than another if it is less deep by more than this [m].
+#: A state is better than another if its penetration is less by more than this [m].
 BETTER_M: Final = 1e-5
 
 
 @dataclass(frozen=True)
 class ProjectionOptions:
-    """Clearances in metres."""
+    """Clearances of the projection, in metres."""
 
     near: float = 2e-4
-    """Hand points nearer to the object than this are moved ..."""
+    """Hand points closer to the object than this are moved ..."""
     target: float = 3.5e-4
     """... to this distance."""
     hold: float = 2e-3
-    """Points nearer than this are contacts, drawn to `hold_target` with weight `hold_weight`."""
+    """Points closer than this are contacts, drawn to `hold_target` with weight `hold_weight`."""
     hold_target: float = 5e-4
     hold_weight: float = 0.02
     sample_near: float = 2.5e-4
-    """Object samples nearer to a link than this are moved to `target`."""
+    """Object samples closer to a link than this are moved to `target`."""
     self_near: float = 2e-4
     self_target: float = 5e-4
     obstacle_near: float = 2e-4
-    """Hand features nearer to an obstacle than their margin and this are moved ..."""
+    """Hand features closer to an obstacle than their margin plus this are moved ..."""
     obstacle_target: float = 5e-4
-    """... to their margin and this."""
+    """... to their margin plus this."""
     damping: float = 1e-3
-    """Times the number of residuals."""
+    """Damping per residual."""
     scale: tuple[float, float, float] = (1.0, 12.5, 25.0)
-    """Translation [m], rotation and joints [rad] that move a hand's surface alike: levers of 8 and 4 cm."""
+    """Translation [m], rotation and joints [rad] that move a hand's surface equally: levers of 8 and 4 cm."""
     step: float = 3e-3
     """Largest step in units of the scaled variables [m]."""
 
@@ -66,8 +66,8 @@ def _residuals(capacity: int) -> Any:
 
 
 class Projection:
-    """Moves the hands of a model; keeps of each the least penetrating state it saw. Nothing leaves the device between
-    two steps."""
+    """Projection of a model's hands, which selects the least penetrating state of each.
+    No data leaves the device between two steps."""
 
     def __init__(self, model: Model, data: Data, options: ProjectionOptions) -> None:
         self.model, self.data, self.options = model, data, options
@@ -86,7 +86,7 @@ class Projection:
             self._depth = wp.empty(B, dtype=wp.float64)
 
     def run(self, state: HandState, iterations: int) -> tuple[HandState, Floats]:
-        """At most `iterations` steps from `state`.
+        """Run at most `iterations` steps from `state`.
 
         Returns:
             The best state of each hand, and its deepest penetration (n,) [m].
@@ -104,7 +104,7 @@ class Projection:
         return self._found(best, n), self._depth.numpy()[:n].copy()
 
     def _validated(self, now: Any, best: Any) -> Launches:
-        """Places the hands and keeps what is better than ever."""
+        """Place the hands and keep the states that are better than all before."""
         d, o = self.data, self.options
         out = record_placement(self.model, d, within=max(o.near, o.hold))
         out.add(
@@ -116,7 +116,7 @@ class Projection:
         return out
 
     def _states(self, state: HandState) -> Any:
-        """Hands on the device, in double precision; where the capacity is larger they stand still."""
+        """Upload hands in double precision; beyond the loaded ones the arrays are unused."""
         rest = self.data.capacity - len(state.pivot)
         out = kernels.States()
         with wp.ScopedDevice(self.model.device):

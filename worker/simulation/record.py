@@ -1,7 +1,6 @@
-"""What is done with hands, as launches: one iteration is the gradient of the loss, then a step.
+"""Operations on hands as recorded launches: one iteration is the gradient of the loss, then a step.
 
-`record_*` fixes a whole list for the data's present schedule; `add_*` appends one part of it. Nothing leaves
-the device.
+`record_*` records a whole list for the data's current schedule; `add_*` appends one part. No data leaves the device.
 """
 
 from __future__ import annotations
@@ -24,14 +23,14 @@ from graspd.worker.simulation.kernels import (
 from graspd.worker.simulation.launches import Launches
 from graspd.worker.simulation.model import NEAR_GAP, REFERENCE_SAMPLES, SOLVERS, Model
 
-#: Names that `record_iteration` knows.
+#: Optimisers of `record_iteration`.
 OPTIMIZERS: Final = ("adam", "gd")
 
 
 def record_placement(m: Model, d: Data, *, room: float = 0.0, within: float | None = None) -> Launches:
-    """Contacts and penetration depths only; `room` is the distance to keep besides each feature's margin [m].
+    """Record contacts and penetration depths only; `room` is added to each feature's margin [m].
 
-    `within`: only contacts nearer than this are wanted, exactly [m]; depths are the same whatever it is.
+    `within`: only contacts within this distance are needed, exactly [m]; it does not change the depths.
     """
     out = Launches(m.device)
     add_poses(out, m, d)
@@ -41,7 +40,7 @@ def record_placement(m: Model, d: Data, *, room: float = 0.0, within: float | No
 
 
 def record_evaluation(m: Model, d: Data) -> Launches:
-    """Loss and gradient of the state, without a step."""
+    """Record loss and gradient of the state, without a step."""
     out = Launches(m.device)
     add_poses(out, m, d)
     add_distances(out, m, d)
@@ -52,9 +51,9 @@ def record_evaluation(m: Model, d: Data) -> Launches:
 
 
 def record_iteration(m: Model, d: Data, optimizer: str, *, patience: int = 0) -> Launches:
-    """One iteration: gradient and step.
+    """Record one iteration: gradient and step.
 
-    With a `patience`, a grasp that has not improved for so many iterations is switched off and costs nothing more.
+    With a `patience`, a grasp without improvement for so many iterations is switched off and costs nothing more.
 
     Raises:
         InputError: unknown optimizer.
@@ -65,7 +64,7 @@ def record_iteration(m: Model, d: Data, optimizer: str, *, patience: int = 0) ->
 
 
 def add_poses(out: Launches, m: Model, d: Data) -> None:
-    """Poses of all bodies; what an iteration accumulates is set to zero."""
+    """Add poses of all bodies; accumulators of an iteration are set to zero."""
     out.add(
         kinematics.forward,
         d.capacity,
@@ -85,7 +84,7 @@ def add_poses(out: Launches, m: Model, d: Data) -> None:
 
 
 def add_distances(out: Launches, m: Model, d: Data, *, within: float | None = None) -> None:
-    """Candidate contacts: hand points near the object, their distances and normals."""
+    """Add candidate contacts: hand points near the object, their distances and normals."""
     found, o = d.marked or d.contacts, m.options
     nearness = [o.band, o.exact_below, o.band] if within is None else [o.band, within, within]
     out.add(
@@ -124,7 +123,7 @@ def add_distances(out: Launches, m: Model, d: Data, *, within: float | None = No
 
 
 def _add_packing(out: Launches, d: Data, marked: MarkedContacts) -> None:
-    """Marked contacts to their slots."""
+    """Add the packing of marked contacts."""
     c = d.contacts
     counts = [marked.kept_in, marked.near_in]
     out.add(packing.count_marks, marked.kept_in.shape, inputs=[d.active, marked.mark], outputs=counts)
@@ -146,7 +145,7 @@ def _add_packing(out: Launches, d: Data, marked: MarkedContacts) -> None:
 
 
 def add_contact(out: Launches, m: Model, d: Data) -> None:
-    """The contact step and its gradient with respect to distances, or what stands in for it."""
+    """Add the contact step and its gradient with respect to distances, or their substitute."""
     o, c = m.options, d.contacts
     if not o.simulate:
         out.add(
@@ -181,7 +180,7 @@ def add_contact(out: Launches, m: Model, d: Data) -> None:
 
 
 def _add_direct(out: Launches, m: Model, d: Data) -> None:
-    """The direct solver in two launches: over simulations, then over contacts."""
+    """Add the direct solver in two launches: over simulations, then over contacts."""
     c = d.contacts
     schedule = [d.active, d.iteration, d.schedule.dilation, d.dilation_scale]
     contacts = [c.count, c.point, c.normal, c.distance, c.weight]
@@ -200,7 +199,7 @@ def _add_direct(out: Launches, m: Model, d: Data) -> None:
 
 
 def add_penalties(out: Launches, m: Model, d: Data, *, room: float = 0.0) -> None:
-    """Penetrations, and the way of the gradient from points to bodies."""
+    """Add penetration terms, and the gradient's transfer from points to bodies."""
     add_object_penalty(out, m, d)
     add_self_penalty(out, m, d, m.options.self_margin)
     c = d.contacts
@@ -264,7 +263,7 @@ def add_penalties(out: Launches, m: Model, d: Data, *, room: float = 0.0) -> Non
 
 
 def add_object_penalty(out: Launches, m: Model, d: Data) -> None:
-    """The object's samples inside links."""
+    """Add the term of the object's samples inside links."""
     out.add(
         pieces.object_in_pieces,
         (d.capacity, m.pieces),
@@ -283,7 +282,7 @@ def add_object_penalty(out: Launches, m: Model, d: Data) -> None:
 
 
 def add_self_penalty(out: Launches, m: Model, d: Data, margin: float) -> None:
-    """Links inside links, or nearer than `margin` [m]."""
+    """Add the term of links inside links, or closer than `margin` [m]."""
     out.add(
         pieces.pieces_in_pieces,
         (d.capacity, m.pieces),
@@ -303,7 +302,7 @@ def add_self_penalty(out: Launches, m: Model, d: Data, margin: float) -> None:
 
 
 def add_root_gradient(out: Launches, m: Model, d: Data) -> None:
-    """The gradient with respect to root and joints, from what bodies accumulated."""
+    """Add the gradient with respect to root and joints, from the bodies' wrenches."""
     out.add(
         kinematics.backward,
         d.capacity,
@@ -313,7 +312,7 @@ def add_root_gradient(out: Launches, m: Model, d: Data) -> None:
 
 
 def add_gradient(out: Launches, m: Model, d: Data) -> None:
-    """The whole gradient: of what bodies accumulated, and of the joints' penalties."""
+    """Add the whole gradient: of the bodies' wrenches, and of the joints' penalties."""
     add_root_gradient(out, m, d)
     o = m.options
     out.add(
@@ -327,7 +326,7 @@ def add_gradient(out: Launches, m: Model, d: Data) -> None:
 def add_step(
     out: Launches, m: Model, d: Data, optimizer: str, *, betas: tuple[float, float] = (0.9, 0.99), patience: int = 0
 ) -> None:
-    """A step of the optimizer, and on to the next iteration; see `record_iteration`."""
+    """Add a step of the optimizer and advance the iteration; see `record_iteration`."""
     if optimizer not in OPTIMIZERS:
         raise InputError(f"unknown optimizer {optimizer!r}; choose one of {', '.join(OPTIMIZERS)}")
     inputs = [m.hand.lower, m.hand.upper, d.active, d.iteration, d.schedule.rates, d.gradient]

@@ -1,7 +1,6 @@
-"""The contact step in float64 NumPy, written for clarity: the oracle of the kernels, and of studies of them.
+"""The contact step in float64 NumPy, written for clarity: the reference of the kernels and of studies.
 
-Contacts (N, 3), motions (6) as linear and angular parts. Distances and free motions may have axes before theirs: many
-steps at once.
+Contacts (N, 3), motions (6) as linear and angular parts. Distances and free motions may have leading axes.
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ class World:
 
 
 def row(normal: Floats, point: Floats) -> Floats:
-    """(..., 6) of what a motion moves `point` along `normal`, both (..., 3)."""
+    """Return rows (..., 6): displacement of `point` along `normal`, both (..., 3), per motion."""
     return np.concatenate([normal, np.cross(point, normal)], axis=-1)
 
 
@@ -49,13 +48,13 @@ def motion_at(s: Floats, point: Floats) -> Floats:
 
 
 def loss(s: Floats, world: World) -> Floats:
-    """(...) of motions (..., 6)."""
+    """Return the loss (...) of motions (..., 6)."""
     lengths = [np.sqrt(np.sum(v * v, axis=-1) + SMOOTH**2) for v in (s[..., :3], world.gyration * s[..., 3:])]
     return np.asarray((lengths[0] + lengths[1]) / world.step)
 
 
 def direct(contacts: Contacts, s0: Floats, world: World, passes: int = 60) -> Floats:
-    """Compliant contact: fixed point of the reweighted least squares. (..., 6) from free motions (..., 6)."""
+    """Solve compliant contact by reweighted least squares: motions (..., 6) from free ones (..., 6)."""
     n, offset = contacts.normals, world.dilation - contacts.distances
     k = world.stiffness * contacts.weights
     j = row(n, contacts.points)
@@ -75,8 +74,8 @@ def direct(contacts: Contacts, s0: Floats, world: World, passes: int = 60) -> Fl
 
 
 def gauss_seidel(contacts: Contacts, s0: Floats, world: World) -> tuple[Floats, Floats]:
-    """One sweep of position-based dynamics with Coulomb friction: motions (..., 6) from free motions (..., 6), and the
-    impulses (..., N, 2) of each contact, normal and tangential."""
+    """Run one sweep of position-based dynamics with Coulomb friction: motions (..., 6) from free motions.
+    Also return the impulses (..., N, 2) of each contact, normal and tangential."""
     s = s0
     impulses = []
     for i, (p, n) in enumerate(zip(contacts.points, contacts.normals, strict=True)):
@@ -89,7 +88,7 @@ def gauss_seidel(contacts: Contacts, s0: Floats, world: World) -> tuple[Floats, 
 
 
 def jacobi(contacts: Contacts, s0: Floats, world: World, passes: int) -> Floats:
-    """Averaged corrections of all active contacts, `passes` times. (..., 6) from free motions (..., 6)."""
+    """Average the corrections of all active contacts, `passes` times: motions (..., 6) from free ones."""
     p, n = contacts.points, contacts.normals
     s = s0
     for _ in range(passes):
@@ -101,7 +100,7 @@ def jacobi(contacts: Contacts, s0: Floats, world: World, passes: int) -> Floats:
 
 
 def _pushed(p: Floats, n: Floats, rho: Floats, s: Floats, world: World) -> tuple[Floats, Floats]:
-    """Normal impulses (...) that leave no penetration at points (..., 3) that move by s (..., 6); what they change."""
+    """Return normal impulses (...) that end penetration at points (..., 3) moved by s, and their effect."""
     j = row(n, p)
     back = j @ np.linalg.inv(world.mass)
     impulse = np.maximum(world.dilation - rho + np.sum(j * s, axis=-1), 0.0) / np.sum(j * back, axis=-1)
@@ -109,7 +108,7 @@ def _pushed(p: Floats, n: Floats, rho: Floats, s: Floats, world: World) -> tuple
 
 
 def _slipped(p: Floats, n: Floats, impulse: Floats, s: Floats, world: World) -> tuple[Floats, Floats]:
-    """Tangential impulses (...) within the cone of the normal ones; what they change (..., 6)."""
+    """Return tangential impulses (...) within the friction cone, and the motion they cause (..., 6)."""
     u = motion_at(s, p)
     tangent = u - np.sum(n * u, axis=-1, keepdims=True) * n
     length = np.linalg.norm(tangent, axis=-1)

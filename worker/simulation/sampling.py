@@ -12,15 +12,14 @@ from graspd.worker.hands.surface import farthest_points
 from graspd.worker.objects.disk_cache import arrays_kept_or_made
 from graspd.worker.objects.model import ObjectModel
 
-#: Edges between faces that turn by more than this carry samples of their own: they enter links between surface samples.
+#: Edges between faces that turn by more than this have their own samples: they enter links between surface samples.
 SHARP_EDGE_COS = np.cos(np.radians(35.0))
-#: Random points for each sample that is chosen of them, and how many do for more than so many samples: what that takes
-#: grows with the product of both.
+#: Random points per selected sample, and fewer of them above so many samples: the cost grows with the product of both.
 CANDIDATES, FEWER_CANDIDATES, MANY = 6, 3, 8_000
 
 
 def object_samples(obj: ObjectModel, count: int, *, seed: int = 0) -> Floats:
-    """(count, 3) evenly spread points of the surface, its sharp edges included [m], the same for the same."""
+    """Return evenly spread points (count, 3) of the surface, its sharp edges included [m]; deterministic."""
     code = (sys.modules[__name__], surface)
     kept = arrays_kept_or_made(
         "object_samples", (obj.content, count, seed), code, lambda: {"points": _sampled(obj, count, seed)}
@@ -46,7 +45,7 @@ def _sampled(obj: ObjectModel, count: int, seed: int) -> Floats:
 
 
 def _edge_samples(obj: ObjectModel, normals: Floats, count: int, rng: np.random.Generator) -> Floats:
-    """Up to count / 2 random points on sharp edges, by length."""
+    """Return up to count / 2 random points on sharp edges, uniform in length."""
     edges = np.sort(np.concatenate([obj.faces[:, [0, 1]], obj.faces[:, [1, 2]], obj.faces[:, [2, 0]]]), axis=1)
     face = np.tile(np.arange(len(obj.faces)), 3)
     order = np.lexsort((edges[:, 1], edges[:, 0]))

@@ -1,5 +1,5 @@
-"""Compiled models of the engine, kept for pairs that meet again, and threads of simulated tests: a compilation costs
-as much as half a verdict."""
+"""Cache of compiled MuJoCo models, and threads that run simulated tests.
+Models are cached because a compilation costs as much as half a verdict."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from graspd.worker.simulation.environment import Neighbour, Obstacle
 from graspd.worker.validation.decomposition import ConvexPieces
 from graspd.worker.validation.model import MujocoOptions, Scene, build
 
-#: Models kept; one takes some megabytes.
+#: Number of cached models; one takes some megabytes.
 KEPT: Final = 8
 
 
 @dataclass(frozen=True)
 class _Asked:
-    """All that a model follows from."""
+    """Cache key: everything that determines a model."""
 
     test: str
     hand: HandModel
@@ -51,7 +51,7 @@ def scene_of(
     supports: Sequence[Obstacle] = (),
     neighbours: Sequence[Neighbour] = (),
 ) -> Scene:
-    """`build`, or what it gave for the same arguments lately. Threads share a scene: nobody may write to its model."""
+    """Return `build` of the arguments, cached. Threads share the scene: its model is read-only."""
     asked = _Asked("pushes", hand, obj, pieces, physics, tuple(supports), tuple(neighbours))
     scene: Scene = _kept(asked, lambda: build(hand, obj, pieces, physics, supports, neighbours))
     return scene
@@ -60,7 +60,7 @@ def scene_of(
 def slipping_model(
     hand: HandModel, obj: ObjectModel, pieces: ConvexPieces, make: Callable[[HandModel, ObjectModel, ConvexPieces], Any]
 ) -> Any:
-    """The model of the displacement test, made by `make` where it was not lately."""
+    """Return the model of the displacement test, from the cache or made by `make`."""
     return _kept(_Asked("slips", hand, obj, pieces, None, (), ()), lambda: make(hand, obj, pieces))
 
 
@@ -80,12 +80,12 @@ Answer = TypeVar("Answer")
 def answers(
     rows: Sequence[int], make: Callable[[], Test], ask: Callable[[Test, int], Answer], *, threads: int, name: str
 ) -> list[Answer]:
-    """What tests say of some grasps, in their order.
+    """Run tests on some grasps in parallel; return the results in their order.
 
     Args:
         rows: the grasps.
-        make: makes a test.
-        ask: asks a test of a grasp.
+        make: creates a test.
+        ask: runs a test on a grasp.
         threads: at most.
         name: of the threads.
     """
@@ -114,18 +114,18 @@ def measured(
     run: ExecutionContext,
     name: str,
 ) -> NDArray[np.float64]:
-    """(count,) what tests measure of the grasps that are `held` (count,), None: of all; nan of the others.
+    """Return measurements (count,) on grasps that are `held` (count,), None: all; nan for the others.
 
     Args:
         count: grasps.
         held: which of them are tested.
-        make: makes a test; not called where there is nothing to test.
-        ask: asks a test of a grasp.
-        run: asked between grasps whether to stop.
+        make: creates a test; not called where there is nothing to test.
+        ask: runs a test on a grasp.
+        run: polled for cancellation between grasps.
         name: of the threads.
 
     Raises:
-        TaskCancelled: when `run.cancelled()` answers True.
+        TaskCancelled: `run.cancelled()` returned True.
     """
 
     def asked(test: Test, row: int) -> float:

@@ -1,9 +1,8 @@
-"""Convex pieces of an object by CoACD (Wei et al. 2022), measured before use and kept on disk.
+"""Convex decomposition of objects by CoACD (Wei et al. 2022), measured before use, cached on disk.
 
-The pieces are the object as the validator's engine knows it, so a bad decomposition is a bad validator: pieces that
-fill a hollow make every grasp of it wrong. Count, volume ratio and excess go with every verdict; a large excess is
-refused. Excess is what the pieces' union has more of volume, over the object's surface: the mean height of what was
-filled in.
+The validator's engine sees only the pieces. Pieces that fill a hollow therefore falsify every grasp of it. Count,
+volume ratio and excess are stored with every verdict; a large excess is refused. The excess is the volume that the
+union of the pieces adds, divided by the object's surface area: the mean height of the added material.
 """
 
 from __future__ import annotations
@@ -34,11 +33,11 @@ from graspd.worker.objects.model import ObjectModel
 
 log = logging.getLogger(__name__)
 
-#: Pieces whose mean excess is at most this are good [m]: a grasp's verdict does not feel less than that.
+#: Pieces with at most this mean excess are good [m]: verdicts are insensitive to a smaller one.
 GOOD_EXCESS_M: Final = 8.5e-4
-#: Pieces that stand out more than this from the object are no picture of it [m].
+#: Largest accepted mean excess [m].
 MAX_EXCESS_M: Final = 2e-3
-#: CoACD's concavity thresholds from coarse to fine; the first with good pieces is taken.
+#: CoACD's concavity thresholds from coarse to fine; the first with good pieces is used.
 THRESHOLDS: Final = (0.1, 0.05, 0.03)
 MAX_PIECES: Final = 64
 #: Preprocessing inflates near-convex scans by 9 to 17 % and takes a minute; our meshes are closed already.
@@ -50,31 +49,31 @@ _COACD: Final = {
     "max_convex_hull": MAX_PIECES,
     "seed": 1,
 }
-#: Computing that one run of CoACD may take; without its result the coarser one stands, and a log line says so [s].
+#: CPU time limit of one CoACD run [s]; beyond it the coarser result is used and a warning is logged.
 CPU_S: Final = 300
-#: Pieces thinner than this are splinters that the engine cannot build [m^3].
+#: Pieces below this volume are splinters that the engine cannot build [m^3].
 _MIN_VOLUME: Final = 1e-9
 
 
 @dataclass(frozen=True)
 class ConvexPieces:
-    """An object as a union of convex solids."""
+    """Convex decomposition of an object."""
 
     vertices: tuple[Floats, ...]
     """One (V, 3) array of corners per piece, object frame [m]."""
     volume_ratio: float
-    """Volume of the union over the object's."""
+    """Volume of the union divided by the object's."""
     excess_m: float
     """Mean height of the union above the object's surface [m]."""
     digest: str
-    """Of the pieces' corners: part of a verdict's key."""
+    """Digest of the pieces' corners: part of a verdict's key."""
 
     def __len__(self) -> int:
         return len(self.vertices)
 
     @property
     def facts(self) -> dict[str, int | float | str]:
-        """What to keep beside verdicts on these pieces: count, volume ratio, mean excess [mm], digest."""
+        """Record stored with verdicts on these pieces: count, volume ratio, mean excess [mm], digest."""
         return {
             "pieces": len(self),
             "volume_ratio": round(self.volume_ratio, 6),
@@ -84,14 +83,14 @@ class ConvexPieces:
 
 
 def decompose(obj: ObjectModel, *, cache: Path | None = None) -> ConvexPieces:
-    """Convex pieces of an object, from the cache where they were made before.
+    """Return the convex pieces of an object, from the cache if possible.
 
     Args:
         obj: the object.
-        cache: folder to keep them in; by default `$XDG_CACHE_HOME/graspd/convex`.
+        cache: cache folder; by default `$XDG_CACHE_HOME/graspd/convex`.
 
     Raises:
-        MeshError: the best pieces stand out more than `MAX_EXCESS_M` from the object.
+        MeshError: the mean excess of the best pieces is above `MAX_EXCESS_M`.
     """
     pieces = _load_or_make(_Key(obj.centred), cache or default_cache())
     if pieces.excess_m > MAX_EXCESS_M:
@@ -105,12 +104,12 @@ def decompose(obj: ObjectModel, *, cache: Path | None = None) -> ConvexPieces:
 
 
 def piece_file(obj: ObjectModel, cache: Path | None = None) -> Path:
-    """Where `decompose` keeps the pieces of an object; its stem is a digest of all that they follow from."""
+    """Return the cache file of an object's pieces; its stem is a digest of all that determines them."""
     return _file(_Key(obj.centred), cache or default_cache())
 
 
 class _Key:
-    """An object with the digest of all that its pieces follow from."""
+    """An object with the digest of everything that determines its pieces."""
 
     def __init__(self, obj: ObjectModel) -> None:
         self.obj = obj

@@ -1,7 +1,7 @@
-"""Simulated displacement: how far an object slips in a rigid hand in 0.15 s of gravity (Hasson et al. 2019).
+"""Simulated displacement: slip of an object in a rigid hand in 0.15 s of gravity (Hasson et al. 2019).
 
-The hand stands still in its grasp posture; the object of 1 kg, friction 3, falls along -z of its frame for 35 steps of
-1/240 s. Free fall is 10.7 cm. The protocol was made for PyBullet, whose restitution of 0.5 MuJoCo does not have.
+The hand is fixed in its grasp posture. The object, of 1 kg and friction 3, falls along -z of its frame for 35 steps of
+1/240 s. Free fall is 10.7 cm. The protocol was made for PyBullet, with a restitution of 0.5 that MuJoCo does not have.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def simulated_displacement_cm(
     pieces: ConvexPieces | None = None,
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> Floats:
-    """(N,) way of the object's centre of mass in the displacement test, for N grasp postures [cm]; nan: it blew up.
+    """Return displacements (N,) of the centre of mass for N postures [cm]; nan: simulation diverged.
 
     Raises:
         MeshError: the object has no usable convex pieces.

@@ -1,8 +1,7 @@
-"""Verdicts on grasps in another model of their hand: what was planned with one is validated with the other.
+"""Verdicts in another model of the same hand: planned with one model, validated with the other.
 
-The mechanism is the other model's: shapes, masses, where the joints are, their limits, couplings, armature and dry
-friction. The controller belongs to the grasp and stays: the commanded postures, gains, torque limits and, with the
-gains, the damping.
+The mechanism comes from the other model: shapes, masses, joint frames, limits, couplings, armature and dry friction.
+The controller belongs to the grasp: commanded postures, gains, torque limits and, with the gains, the damping.
 """
 
 from __future__ import annotations
@@ -34,8 +33,8 @@ class ForeignVerdicts:
     same: SameHand
 
     def facts(self) -> dict[str, Any]:
-        """validation_hand: name of the other model; fingertips_mm: how far it is from ours; foreign_key: terms of its
-        verdicts; and `share_counts`."""
+        """Return validation_hand, the other model's name; fingertips_mm, its fingertips' distance from ours;
+        foreign_key, terms of its verdicts; and `share_counts`."""
         a, b = self.nominal.success == 1, self.foreign.success == 1
         return {
             "validation_hand": self.same.theirs.name,
@@ -53,10 +52,10 @@ class ForeignVerdicts:
 
 
 def share_counts(held: Mapping[str, int]) -> dict[str, Any]:
-    """What becomes of grasps of which so many hold in both models, in the nominal or the foreign one alone, in neither.
+    """Return shares from counts of grasps that hold in both models, in one alone, or in neither.
 
-    foreign_held: these counts; agreement: share with the same verdict in both; foreign_share: of those that hold
-    nominally, the share that holds in the other model; foreign_gsr: the share of all that does. None: of nothing.
+    foreign_held: the counts; agreement: share with the same verdict in both; foreign_share: of the grasps that hold
+    nominally, the share that holds in the other model; foreign_gsr: the share of all that does. None: no grasps.
     """
     n, nominal = sum(held.values()), held["both"] + held["nominal"]
 
@@ -88,11 +87,11 @@ def foreign_verdicts(
 
 
 def driven_as(same: SameHand) -> HandModel:
-    """Their model with the gains and limits of ours.
+    """Return the other model with the gains and limits of ours.
 
     A dof of gain k and limit e that moves n joints by m_i gives each of them the gain k / (n m_i^2) and the limit
-    e / (n |m_i|), and takes sum(m_i^2 k_i) and sum(|m_i| e_i) from joints: what a drive does along the joints' common
-    motion stays the same where they turn as one in the one model, and hang on a tendon of equal pulls in the other.
+    e / (n |m_i|). It takes sum(m_i^2 k_i) and sum(|m_i| e_i) from joints. So the drive along the joints' common
+    motion stays the same, whether a model turns them as one or hangs them on a tendon of equal pulls.
     """
     ours, theirs = same.ours, same.theirs
     gain, limit = _of_joints(ours)
@@ -105,16 +104,16 @@ def driven_as(same: SameHand) -> HandModel:
 
 
 def _of_joints(hand: HandModel) -> tuple[Floats, Floats]:
-    """(J,) gains and limits of joints."""
+    """Return gains and limits (J,) of joints."""
     dof, rate = hand.dof[hand.joint_body], hand.multiplier[hand.joint_body]
     joints = np.bincount(dof, minlength=hand.dofs)[dof]
     return hand.stiffness[dof] / (joints * rate**2), hand.effort[dof] / (joints * np.abs(rate))
 
 
 def in_other_model(same: SameHand, grasps: GraspSet) -> GraspSet:
-    """The grasps as postures of their model: their base put where it belongs, joints by their names.
+    """Return the grasps as postures of the other model: base transformed, joints matched by name.
 
-    Where joints follow one another in their model and not in ours, they take the nearest values that do.
+    Where joints are coupled in the other model but not in ours, they take the nearest feasible values.
     """
 
     def posture(part: Posture) -> Posture:
@@ -135,7 +134,7 @@ def _nearest(hand: HandModel, joints: Floats) -> Floats:
 
 
 def with_our_shapes(same: SameHand) -> HandModel:
-    """Their model with the pieces of ours, to tell what shapes have to do with a verdict."""
+    """Return the other model with our collision shapes, to isolate the effect of shapes on verdicts."""
     there = np.zeros(same.ours.bodies, np.intp)
     there[same.bodies] = np.arange(same.theirs.bodies)
     frames = invert(same.frames)[there]
@@ -143,7 +142,7 @@ def with_our_shapes(same: SameHand) -> HandModel:
 
 
 def with_their_shapes(same: SameHand) -> HandModel:
-    """Our model with the pieces of theirs."""
+    """Return our model with the collision shapes of the other."""
     pieces = tuple(_moved(p, int(same.bodies[p.body]), same.frames[p.body]) for p in same.theirs.pieces)
     return _dressed(same.ours, pieces)
 

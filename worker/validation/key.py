@@ -1,4 +1,5 @@
-"""The key of a verdict: a digest of everything that moves it. Rates of verdicts with different keys do not compare."""
+"""Key of a verdict: digest of everything that affects it.
+Rates of verdicts with different keys are not comparable."""
 
 from __future__ import annotations
 
@@ -22,12 +23,12 @@ from graspd.worker.validation.decomposition import ConvexPieces, decompose
 
 Level = Literal["dexgraspbench", "standard", "fast"]
 
-#: Raise when the code of the protocol or of the scene changes what it says, constants aside.
+#: Increase when the code of the protocol or of the scene changes verdicts, constants aside.
 REVISION: Final = 6
 
 _EARLY: Final = ("FIRST_LOOK_S", "INTERVAL_S", "SURE", "LOST_ROTATION")
-#: The constants that move a verdict, module by module, and those that only one level reads. A constant of these modules
-#: that stands in neither moves none.
+#: Constants that affect a verdict, by module, and those that only one level reads. Other constants of these modules
+#: affect none.
 MOVES: Final[dict[ModuleType, tuple[str, ...]]] = {
     protocol: ("DIRECTIONS", "MAX_DISPLACEMENT_M", "MAX_ROTATION", "MAX_PENETRATION_M", "STAGES", "STAGE_S", "HOLD_S"),
     matter: ("ACCELERATION",),
@@ -78,14 +79,14 @@ def verdict_key(
     cache: Path | None = None,
     prefilter: Sequence[Any] = (),
 ) -> str:
-    """Digest of the terms of a verdict: all that it follows from but the grasp's own postures.
+    """Return the digest of the terms of a verdict: all that determines it except the grasp's postures.
 
-    In it: level, friction, masses, gains and torque limits, the rules of pregrasp and squeeze, shapes of the hand,
+    It covers level, friction, masses, gains and torque limits, the rules of pregrasp and squeeze, shapes of the hand,
     convex pieces of the object, the constants of `MOVES` and of the level, version of the engine; and `prefilter`,
     the prefilter's terms where it takes part.
 
     Raises:
-        MeshError: `pieces` is not given and the object has none that are usable.
+        MeshError: `pieces` is not given and the object has no usable ones.
     """
     pieces = pieces or decompose(obj, cache=cache)
     shapes = b"".join(np.round(p.vertices, 9).tobytes() + np.round(p.pose, 9).tobytes() for p in hand.pieces)
@@ -102,9 +103,9 @@ def verdict_key(
             "pieces": pieces.digest,
             "physics": asdict(model.MujocoOptions().hardened() if hard else model.MujocoOptions()),
             "constants": [_values(MOVES), _values(LEVEL_MOVES[level])],
-            # Of grippers alone: the keys of hands stay what they are.
+            # Only for grippers: the keys of hands stay unchanged.
             **({"several_contacts": flag} if (flag := model.several_contacts(hand)) else {}),
-            # Of hands that have them alone, likewise.
+            # Only for hands with tendons, likewise.
             **({"tendons": [[*t.dofs, *t.coefficients] for t in hand.tendons]} if hand.tendons else {}),
             **({"drag": [hand.drag.armature.tolist(), hand.drag.dry_friction.tolist()]} if hand.drag else {}),
             **({"prefilter": list(prefilter)} if prefilter else {}),
@@ -113,14 +114,14 @@ def verdict_key(
 
 
 def postures_key(terms: str, grasps: GraspSet) -> str:
-    """Digest of the terms (`verdict_key`) together with the postures that were validated."""
+    """Return the digest of the terms (`verdict_key`) together with the validated postures."""
     parts = (grasps.pregrasp, grasps.grasp, grasps.squeeze)
     arrays = (array for part in parts for array in (part.hand_pose, part.joint_positions))
     return digest_json([terms, digest_bytes(b"".join(np.ascontiguousarray(a, float).tobytes() for a in arrays))])
 
 
 def _values(names: dict[ModuleType, tuple[str, ...]]) -> dict[str, Any]:
-    """Values of the named constants by the last word of their module's name; those of `opening` are of postures."""
+    """Return named constants by the last part of their module's name; those of `opening` are postures'."""
     out: dict[str, Any] = {}
     for part, there in names.items():
         group = out.setdefault((postures if part is opening else part).__name__.rpartition(".")[2], {})

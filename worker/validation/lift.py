@@ -1,11 +1,10 @@
-"""The lift test: the object stands in its scene, the hand closes, squeezes, lifts it and holds it.
+"""The lift test: the object rests in its scene; the hand closes, squeezes, lifts and holds it.
 
-letter: DexGraspBench's tabletop test as published: from the pregrasp, 1 N downwards, 10 cm up in 0.4 s, no hold.
-lift: the hand comes from its standoff and must touch nothing on the way, but that fingertips may touch supports, or
-press into them, as deep as the scene says; it rises smoothly in 0.8 s and holds for 2 s, cut short as the standard
-level's pushes are.
-Neighbours stand on the table as free bodies; at level lift they must not be moved 2 cm, nor toppled.
-The world of the simulation is the object frame: the scene lies under it as it stood when the object came to rest.
+dexgraspbench: DexGraspBench's tabletop test as published: from the pregrasp, 1 N down, 10 cm up in 0.4 s, no hold.
+lift: the hand comes from its standoff and must touch nothing on its approach. Fingertips may touch supports, or press
+into them as deep as the scene allows. It rises smoothly in 0.8 s and holds for 2 s, with level standard's early end.
+Neighbours are free bodies on the table; at level lift they must not move by 2 cm or topple.
+The world of the simulation is the object frame; the scene is placed under it as when the object came to rest.
 """
 
 from __future__ import annotations
@@ -34,26 +33,25 @@ from graspd.worker.validation.protocol import (
     Test,
 )
 
-#: A neighbour may be moved by this [m], and tilted by this [rad]: more is toppled. It may turn about the vertical.
+#: Largest displacement [m] and tilt [rad] of a neighbour; it may turn about the vertical.
 NEIGHBOUR_MOVED_M: Final = 0.02
 NEIGHBOUR_TILTED: Final = MAX_ROTATION
-#: Postures looked at between two waypoints of an approach.
+#: Postures checked between two waypoints of an approach.
 LOOKS: Final = 4
-#: The open hand may be this deep in the object's convex pieces on its way [m]: they stand out from its surface, where
-#: the hand is clear, by up to this much. Supports are exact.
+#: Largest penetration of the open hand into the object's convex pieces on its approach [m]: where the hand is clear of
+#: the object's surface, the pieces stand out by up to this much. Supports are exact.
 OVERHANG_M: Final = 0.002
-#: Steps of the rise and their length [s], and the shares of it that they end at: minimum jerk (Flash and Hogan, "The
-#: coordination of arm movements", 1985), at most 0.9 m/s2 for 10 cm in 0.8 s. A stage of a centimetre, as published,
-#: asks the hand for 25 m/s2.
+#: Steps of the rise, their length [s], and the share of the rise after each: minimum jerk (Flash and Hogan, "The
+#: coordination of arm movements", 1985), at most 0.9 m/s2 for 10 cm in 0.8 s. A published stage commands 25 m/s2.
 RISING: Final = 100
 RISING_S: Final = 0.008
-#: Steps of the rise between two looks for an object that is lost.
+#: Steps of the rise between two checks for a lost object.
 LOSSES: Final = 5
 SMOOTHLY: Final = np.asarray(np.polyval([6, -15, 10, 0, 0, 0], np.linspace(0, 1, RISING + 1)[1:]), float)
 
 
 class LiftOutcome(IntEnum):
-    """What became of a lift."""
+    """Outcome of a lift."""
 
     NOT_TRIED = 0
     LIFTED = 1
@@ -72,7 +70,7 @@ class LiftTest:
 
     outcome: LiftOutcome = LiftOutcome.NOT_TRIED
     margin: float = 0.0
-    """Worst displacement or rotation from where it should be over its limit, at the end of the lift and after."""
+    """Worst displacement or rotation from the commanded pose over its limit, from the lift's end on."""
     steps: int = 0
 
     @property
@@ -81,7 +79,7 @@ class LiftTest:
 
 
 class Lift(Test):
-    """Runs lifts of grasps in one scene with supports. Not for several threads at once."""
+    """Lift tests of grasps in one scene with supports. Not thread-safe."""
 
     def __init__(self, scene: Scene, placed: PlacedGrasps) -> None:
         super().__init__(scene)
@@ -91,7 +89,7 @@ class Lift(Test):
         self._beside = placed.neighbours_of(0)
 
     def dexgraspbench(self, grasps: GraspSet, row: int) -> LiftTest:  # type: ignore[override]
-        """As published: success is read once, when the root has risen, from where the object is in the world."""
+        """Run the published test: the object's world pose is checked once, after the rise."""
         self._in_hand = False
         if (rollout := self._begin(grasps, row)).outcome is not LiftOutcome.NOT_TRIED:
             return rollout
@@ -100,7 +98,7 @@ class Lift(Test):
         return self._ended(rollout, self._validate(Rollout()))
 
     def lift(self, grasps: GraspSet, row: int) -> LiftTest:
-        """From the standoff to the end of the hold; `grasps.approach` says how the hand comes."""
+        """Run the test from the standoff to the end of the hold, along `grasps.approach`."""
         self._in_hand = True
         if (rollout := self._begin(grasps, row)).outcome is not LiftOutcome.NOT_TRIED:
             return rollout
@@ -122,7 +120,7 @@ class Lift(Test):
         return rollout
 
     def _begin(self, grasps: GraspSet, row: int) -> LiftTest:
-        """The scene as this grasp has it; the object at rest; gravity on the object alone, as published."""
+        """Set up the grasp's scene, object at rest; gravity acts on the object alone, as published."""
         self._steps, number = 0, int(self.placed.index[row])
         self._scene_pose = invert(np.asarray(self.placed.object_pose[number], float))
         self._up = self.placed.scenes[number].up
@@ -145,7 +143,7 @@ class Lift(Test):
             self.data.xfrc_applied[free.body, :3] = -ACCELERATION * free.mass * self._up
 
     def _neighbours_moved(self) -> bool:
-        """Whether a neighbour is not where it stood, or has toppled."""
+        """Check whether a neighbour was displaced or toppled."""
         for free, pose in zip(self.scene.neighbours, self._beside, strict=True):
             now = self.data.qpos[free.qpos : free.qpos + 7]
             moved = float(np.linalg.norm(now[:3] - pose[:3] - quat_rotate(pose[3:], free.centre)))
@@ -155,7 +153,7 @@ class Lift(Test):
         return False
 
     def _depths_here(self) -> tuple[float, float]:
-        """Deepest penetration of the hand into the object, and into itself or a support [m]."""
+        """Return the deepest penetration of the hand into the object, and into itself or a support [m]."""
         contact = self.data.contact
         if not len(contact.dist):
             return 0.0, 0.0
@@ -165,7 +163,7 @@ class Lift(Test):
         return float(depth[hand & ~within].max(initial=0.0)), float(depth[hand & within].max(initial=0.0))
 
     def _touches(self, grasps: GraspSet, row: int) -> bool:
-        """Whether the open hand, on its way, reaches into the object or a support."""
+        """Check whether the open hand penetrates the object or a support on its approach."""
         assert grasps.approach is not None, "a lift needs the grasps' approach"
         assert grasps.coming is not None
         path, joints = grasps.approach[row], grasps.coming[row]
@@ -199,7 +197,7 @@ class Lift(Test):
         return bool((distance < -allowed)[on_support].any() or (distance[of_hand & ~on_support] < -OVERHANG_M).any())
 
     def _rise(self, grasps: GraspSet, row: int, path: Floats = SMOOTHLY, step_s: float = RISING_S) -> None:
-        """The root to the top, or, except at level dexgraspbench, to where the object is lost."""
+        """Raise the root to the top; except at level dexgraspbench, stop where the object is lost."""
         root = np.asarray(grasps.squeeze.hand_pose[row], float)
         self.scene.command(self.data, root, grasps.squeeze.joint_positions[row])
         for number, share in enumerate(path):
@@ -210,7 +208,7 @@ class Lift(Test):
                 break
 
     def _offset(self) -> Floats:
-        """(3,) of the object's frame from where it should be [m]."""
+        """Return the displacement (3,) of the object's frame from its commanded position [m]."""
         at, yielded = super()._offset(), self._yielded()
         if yielded is not None:
             root, turn = yielded
@@ -218,15 +216,15 @@ class Lift(Test):
         return np.asarray(at - self._goal)
 
     def _turned(self) -> Floats:
-        """(4,) rotation of the object since the start."""
+        """Return the rotation (4,) of the object since the start."""
         turned, yielded = super()._turned(), self._yielded()
         return turned if yielded is None else quat_multiply(quat_conjugate(yielded[1]), turned)
 
     def _yielded(self) -> tuple[Floats, Floats] | None:
-        """Where the root is (3,), and its rotation (4,) from what was commanded; None: it is fixed, or does not matter.
+        """Return the root's position (3,) and its rotation (4,) from the command; None: fixed or irrelevant.
 
-        The weld of the protocol gives way by 10 degrees under a hammer, as no arm does: an object that only follows its
-        hand has not moved in it."""
+        The protocol's weld yields by 10 degrees under a hammer, which no arm does: an object that only follows the hand
+        has not moved in it."""
         at = self.scene.root_qpos
         if at < 0 or not self._in_hand:
             return None

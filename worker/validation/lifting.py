@@ -1,4 +1,4 @@
-"""Verdicts of the lift test on many grasps in their scenes, all cores used."""
+"""Lift tests of many grasps in their scenes, on all cores."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ from graspd.worker.validation.lift import Lift, LiftOutcome, LiftTest
 from graspd.worker.validation.model import TOUCH_ROUNDING_M, MujocoOptions
 
 LiftLevel = Literal["dexgraspbench", "lift"]
-#: Lifts that were done, by `lift_of`.
+#: Finished lifts, by `lift_of`.
 KnownLifts = dict[str, LiftTest]
 LEVELS: Final[tuple[LiftLevel, ...]] = get_args(LiftLevel)
-#: Raise when the code of the lift test changes what it says, constants aside.
+#: Increase when the code of the lift test changes verdicts, constants aside.
 REVISION: Final = 4
 _MOVES: Final = {surroundings: ("RISE_M",), protocol: ("LOOKS", "OVERHANG_M", "LOSSES"), postures: ("ROOM_M", "WIDE")}
 
 
 @dataclass(frozen=True)
 class LiftVerdicts:
-    """What the lift test says of N grasps."""
+    """Verdicts of the lift test on N grasps."""
 
     success: NDArray[np.int8]
     """(N,) 1 lifted and held, 0 not."""
@@ -49,12 +49,12 @@ class LiftVerdicts:
     level: LiftLevel
     hard: bool
     terms: str
-    """Digest of all that moves a verdict but the grasp and its scene."""
+    """Digest of everything that affects a verdict except the grasp and its scene."""
     seconds: float
 
     @property
     def reasons(self) -> list[str]:
-        """Per grasp what became of it, in words."""
+        """Outcome of each grasp in words."""
         return [LiftOutcome(int(value)).name.lower().replace("_", " ") for value in self.outcome]
 
 
@@ -71,24 +71,24 @@ def validate_lifts(
     known: KnownLifts | None = None,
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> LiftVerdicts:
-    """Lift grasps out of their scenes; see `worker.validation.lift`.
+    """Validate grasps by lifts out of their scenes; see `worker.validation.lift`.
 
     Args:
         hand: the hand; its stiffness and effort are the actuators' gains and limits.
         obj: the object, with its mass and friction; `ObjectModel.published` has those of the protocol.
         grasps: N grasps with pregrasp, squeeze and, for level lift, approach.
-        placed: their scenes; `index` has a scene for each.
+        placed: their scenes; `index` has one for each grasp.
         level: dexgraspbench or lift.
         hard: sliding friction halved, torsional friction a tenth, of supports too.
         pieces: convex pieces of the object; by default its CoACD pieces.
         cache: folder of the pieces.
-        known: lifts of this hand, object and level that are not done again; others are added.
-        run: told of grasps done; asked between grasps whether to stop.
+        known: finished lifts of this hand, object and level, which are reused; new ones are added.
+        run: receives the number of finished grasps; polled for cancellation between grasps.
 
     Raises:
         InputError: unknown level, or no scene or approach to lift from.
         MeshError: the object has no usable convex pieces.
-        TaskCancelled: when `run.cancelled()` answers True.
+        TaskCancelled: `run.cancelled()` returned True.
     """
     require_ways(grasps, placed, level)
     began = time.perf_counter()
@@ -124,7 +124,7 @@ def validate_lifts(
 
 
 def lift_of(grasps: GraspSet, row: int, placed: PlacedGrasps, *, hard: bool) -> str:
-    """Digest of all that a lift of one grasp depends on besides hand, object, level and fixed surroundings."""
+    """Return the digest of everything a lift depends on besides hand, object, level and fixed obstacles."""
     number = int(placed.index[row])
     around = [array[row] for array in (grasps.approach, grasps.coming) if array is not None]
     around += [placed.object_pose[number], placed.scenes[number].up, *placed.neighbours_of(number)]
@@ -133,7 +133,8 @@ def lift_of(grasps: GraspSet, row: int, placed: PlacedGrasps, *, hard: bool) -> 
 
 
 def require_ways(grasps: GraspSet, placed: PlacedGrasps, level: LiftLevel) -> None:
-    """
+    """Check that each grasp has a scene and an approach.
+
     Raises:
         InputError: unknown level, or no scene or approach to lift from.
     """
@@ -146,7 +147,7 @@ def require_ways(grasps: GraspSet, placed: PlacedGrasps, level: LiftLevel) -> No
 def lift_key(
     hand: HandModel, obj: ObjectModel, placed: PlacedGrasps, level: LiftLevel, hard: bool, *, pieces: ConvexPieces
 ) -> str:
-    """Digest of the terms of a lift: those of the six pushes, the supports, and the constants of the lift."""
+    """Return the digest of a lift's terms: those of the six pushes, the supports, the lift's constants."""
     pushes = verdict_key(hand, obj, "dexgraspbench" if level == "dexgraspbench" else "standard", hard, pieces=pieces)
     supports = b"".join(np.round(s.planes, 9).tobytes() for s in placed.supports)
     constants = {name: getattr(module, name) for module, names in _MOVES.items() for name in names}

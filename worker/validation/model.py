@@ -1,5 +1,5 @@
-"""A hand with its drives and an object in MuJoCo, as DexGraspBench has them. The object's body frame stands in its
-centre of mass."""
+"""MuJoCo model of a hand with its drives and an object, as in DexGraspBench.
+The object's body frame is at its centre of mass."""
 
 from __future__ import annotations
 
@@ -33,56 +33,55 @@ HAND_SOLREF: Final = (0.005, 1.0)
 #: Couplings are stiffer than contacts, or a pressed finger would stretch them; 2 steps is MuJoCo's floor.
 COUPLING_SOLREF: Final = (0.008, 1.0)
 COUPLING_SOLIMP: Final = (0.98, 0.999, 1e-4, 0.5, 2.0)
-#: What the engine does by default today and did not in 3.3.2, the version that DexGraspBench pins: several contacts for
-#: a pair of convex pieces, and a solver for each island of contacts.
+#: Defaults of today's engine that version 3.3.2, pinned by DexGraspBench, does not have: several contacts for a pair
+#: of convex pieces, and a solver for each island of contacts.
 NOT_IN_3_3_2: Final = int(mujoco.mjtDisableBit.mjDSBL_MULTICCD) | int(mujoco.mjtDisableBit.mjDSBL_ISLAND)
-#: Degrees of freedom from which on sparse Jacobians cost less, though the engine's own rule has 60: lifts .77 of the
-#: time with 28 (Allegro), .73 with 34 (Shadow); 1.09 with 20 (Barrett). Verdicts are the same but for rounding.
+#: Degrees of freedom from which sparse Jacobians cost less; the engine's own rule is 60. Lifts take .77 of the time
+#: with 28 (Allegro), .73 with 34 (Shadow); 1.09 with 20 (Barrett). Verdicts are the same except for rounding.
 SPARSE: Final = 24
-#: Inertia of a body without geometry: that of a ball of this radius [m].
+#: A body without geometry has the inertia of a ball of this radius [m].
 _BARE_RADIUS: Final = 0.01
 _MIN_MASS: Final = 1e-3
-#: Fingertips that are told to touch a support are in it by as much at most, for the way is looked at in steps [m].
+#: Numerical tolerance of fingertips that may touch a support [m]: the trajectory is checked in steps.
 TOUCH_ROUNDING_M: Final = 1e-4
 
 
 @dataclass(frozen=True)
 class MujocoOptions:
-    """What may differ between the levels of a certificate."""
+    """Options of the engine that differ between validation levels."""
 
     timestep: float = 0.004
     noslip_iterations: int = 2
     root: str = "weld"
     """weld: free root held to a mocap body (the protocol); fixed: the root itself is the mocap body."""
     friction: tuple[float, float] = FRICTION
-    """Sliding and torsional coefficient of every contact with an object whose own is `FRICTION`; of others in
-    proportion."""
+    """Sliding and torsional friction with an object of `FRICTION`; scaled for other objects."""
 
     def hardened(self) -> MujocoOptions:
-        """The same at the friction of the hard protocol."""
+        """Return the options with the friction of the hard protocol."""
         slide, twist = self.friction
         return replace(self, friction=(slide * HARD[0], twist * HARD[1]))
 
 
-#: Coarse physics that decide the clear cases of a screen. At 6 ms a contact is as stiff as at 4 ms (two steps are less
-#: than the 12.5 ms that hand and object agree on), at 8 ms it is not.
+#: Coarse physics for the clear cases at level fast. At 6 ms a contact is as stiff as at 4 ms (two steps are less than
+#: the 12.5 ms of hand and object contacts), at 8 ms it is not.
 COARSE: Final = MujocoOptions(timestep=0.006, root="fixed")
 
 
 @dataclass(frozen=True)
 class FreeBody:
-    """Where a neighbour is in a compiled model; its body's frame stands in its centre of mass."""
+    """Addresses of a neighbour in a compiled model; its body frame is at its centre of mass."""
 
     body: int
     qpos: int
     centre: Floats
-    """(3,) of mass in its object frame."""
+    """(3,) centre of mass in its object frame."""
     mass: float
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A compiled model with the places of its parts. The model is read-only: threads share it, each with its data."""
+    """Compiled model with its addresses. It is read-only: threads share it, each with its own data."""
 
     model: Any
     hand: HandModel
@@ -92,7 +91,7 @@ class Scene:
     object_body: int
     object_qpos: int
     root_qpos: int
-    """-1 where the root is fixed."""
+    """-1: the root is fixed."""
     joint_qpos: NDArray[np.intp]
     """(J,) in `HandModel.joint_names` order."""
     dof_gain: Floats
@@ -103,7 +102,7 @@ class Scene:
     centre: Floats
     """(3,) the object's centre of mass in the object frame."""
     mass: float
-    """The object's [kg]."""
+    """Mass of the object [kg]."""
     support_geoms: NDArray[np.bool_]
     """(G,) geoms of the scene's supports and neighbours; the scene frame is the mocap body 1."""
     neighbours: tuple[FreeBody, ...]
@@ -111,11 +110,11 @@ class Scene:
     tip_geoms: NDArray[np.bool_]
     """(G,) geoms of fingertips."""
     pressing: Floats
-    """(G,) how deep fingertips that come may press into a geom [m]: above 0 of supports that say so."""
+    """(G,) how deep approaching fingertips may press into a geom [m]; above 0 where supports allow it."""
 
     @property
     def push(self) -> float:
-        """A push, and the weight [N]."""
+        """Force of a push, and weight of the object [N]."""
         return ACCELERATION * self.mass
 
     def place(self, data: Any, hand_pose: Floats, joints: Floats) -> None:
@@ -128,13 +127,13 @@ class Scene:
         self.command(data, hand_pose, joints)
 
     def command(self, data: Any, hand_pose: Floats, joints: Floats) -> None:
-        """Target posture of actuators and root."""
+        """Set the target posture of actuators and root."""
         data.mocap_pos[0] = hand_pose[:3]
         data.mocap_quat[0] = hand_pose[3:]
         data.ctrl[:] = self.controls(joints)
 
     def controls(self, joints: Floats) -> Floats:
-        """(..., A) targets of the actuators for joint positions (..., J)."""
+        """Return targets (..., A) of the actuators for joint positions (..., J)."""
         values: Floats = self.hand.reduce(joints) * self.dof_gain + self.dof_shift
         return values if self.pulls is None else values @ self.pulls.T
 
@@ -147,8 +146,7 @@ def build(
     supports: Sequence[Obstacle] = (),
     neighbours: Sequence[Neighbour] = (),
 ) -> Scene:
-    """Compile the scene of a hand and an object, with the supports that it stands on or between and what stands beside
-    it, if any."""
+    """Compile the scene of a hand and an object, with supports and neighbours, if any."""
     model = scene_spec(hand, obj, pieces, physics, supports, neighbours).compile()
     if model.nv >= SPARSE:
         model.opt.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
@@ -200,10 +198,10 @@ def scene_spec(
     supports: Sequence[Obstacle] = (),
     neighbours: Sequence[Neighbour] = (),
 ) -> Any:
-    """What `build` compiles: bodies `body0` ..., joints `joint1` ..., actuators `dof0` ..., object, supports,
-    `neighbour0` ..."""
+    """Return the spec that `build` compiles.
+    Names: `body0` ..., `joint1` ..., `dof0` ... (actuators), object, supports, `neighbour0` ..."""
     spec = mujoco.MjSpec()
-    # MJCF angles are degrees by default: radians there freeze every finger silently.
+    # MJCF angles are degrees by default: radians would freeze every finger silently.
     spec.compiler.degree = False
     option = spec.option
     option.timestep = physics.timestep
@@ -225,8 +223,8 @@ def scene_spec(
 
 
 def several_contacts(hand: HandModel) -> int:
-    """What a gripper needs of `NOT_IN_3_3_2`: a flat pad on a flat side touches in an area. At a single point of it,
-    wherever the engine puts that, an object turns as no real one does. The protocol was made for rounded fingers."""
+    """Return the flags of `NOT_IN_3_3_2` that a gripper needs: its flat pads touch flat sides in an area.
+    On a single contact point the object would turn as no real one does. The protocol was made for rounded fingers."""
     return int(mujoco.mjtDisableBit.mjDSBL_MULTICCD) if jaws_of(hand) is not None else 0
 
 
@@ -269,8 +267,8 @@ def _add_joint(body: Any, hand: HandModel, b: int) -> None:
 
 
 def _mechanism(hand: HandModel, b: int, d: int) -> dict[str, Any]:
-    """What the protocol's joints do not have. A tendon drives a joint against its limit for good, so that has to stop
-    it: as stiff as a coupling."""
+    """Return joint properties that the protocol lacks.
+    A tendon drives a joint permanently against its limit, which therefore is as stiff as a coupling."""
     found: dict[str, Any] = {}
     if hand.drag is not None:
         found |= {"armature": float(hand.drag.armature[b]), "frictionloss": float(hand.drag.dry_friction[b])}
@@ -301,7 +299,7 @@ def _add_mass_and_geoms(spec: Any, body: Any, hand: HandModel, b: int, friction:
 
 
 def add_shape(spec: Any, geom: Any, piece: ConvexPiece, name: str) -> None:
-    """Give a geom the shape of a convex piece, in its body's frame."""
+    """Set a geom to the shape of a convex piece, in its body's frame."""
     kinds = {
         "box": mujoco.mjtGeom.mjGEOM_BOX,
         "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
@@ -337,7 +335,7 @@ def _add_actuators(spec: Any, hand: HandModel) -> None:
             if d == min(tendon.dofs):
                 add_tendon(spec, hand, tendon, f"dof{d}", leading)
             continue
-        # The actuator sits on the joint: a dof's gain and limit are the joint's through its multiplier.
+        # The actuator acts on the joint: a dof's gain and limit are converted by the joint's multiplier.
         m = float(hand.multiplier[lead])
         actuator = spec.add_actuator(name=f"dof{d}", target=f"joint{lead}", trntype=mujoco.mjtTrn.mjTRN_JOINT)
         actuator.set_to_position(kp=float(hand.stiffness[d]) / m**2)
@@ -361,7 +359,7 @@ def _add_actuators(spec: Any, hand: HandModel) -> None:
 
 
 def _excluded(hand: HandModel) -> set[tuple[int, int]]:
-    """Pairs of bodies whose contact does not count: neighbours, parents and grandparents."""
+    """Return pairs of bodies without contact: adjacent ones, parents and grandparents."""
     pairs = set(hand.neighbours)
     for b in range(1, hand.bodies):
         parent = int(hand.parent[b])
@@ -374,10 +372,10 @@ def _excluded(hand: HandModel) -> set[tuple[int, int]]:
 def add_object(
     spec: Any, obj: ObjectModel, pieces: Sequence[Floats], friction: list[float], mass: float, name: str = "object"
 ) -> None:
-    """A free body of a given mass [kg], its frame in the object's centre of mass; corners (V, 3) of each piece."""
+    """Add a free body of a mass [kg], frame at the centre of mass, from corners (V, 3) of each piece."""
     body = spec.worldbody.add_body(name=name, pos=obj.centre_of_mass)
     body.add_freejoint(name=name)
-    # Where nothing is said, MuJoCo takes the place of the body in its parent for the place of the mass in the body.
+    # By default MuJoCo would use the body's position in its parent as the position of its mass.
     body.mass, body.ipos = mass, [0, 0, 0]
     inertia = mass * obj.inertia
     body.fullinertia = [inertia[0, 0], inertia[1, 1], inertia[2, 2], inertia[0, 1], inertia[0, 2], inertia[1, 2]]
@@ -388,7 +386,7 @@ def add_object(
 
 
 def _add_supports(spec: Any, supports: Sequence[Obstacle], friction: list[float]) -> None:
-    """Planes and convex solids on a mocap body, which is put where the scene is as seen from the object."""
+    """Add planes and convex solids to a mocap body, placed at the scene's pose in the object frame."""
     body = spec.worldbody.add_body(name="supports", mocap=True)
     for i, support in enumerate(supports):
         geom = body.add_geom(condim=4, friction=friction, name=f"support{i}")
@@ -403,26 +401,26 @@ def _add_supports(spec: Any, supports: Sequence[Obstacle], friction: list[float]
 
 
 def blend(a: Posture, b: Posture, row: int, share: float) -> tuple[Floats, Floats]:
-    """Posture `share` of the way from a to b: positions and joints linearly, the root's turn at an even rate."""
+    """Interpolate postures a and b at `share`: positions and joints linearly, orientations by slerp."""
     start, end = a.hand_pose[row], b.hand_pose[row]
     pose = np.concatenate([(1 - share) * start[:3] + share * end[:3], slerp(start[3:], end[3:], share)])
     return pose, (1 - share) * a.joint_positions[row] + share * b.joint_positions[row]
 
 
 def leading_joints(hand: HandModel) -> tuple[Floats, Floats]:
-    """Multiplier and offset of the first body that each dof drives."""
+    """Return multiplier and offset of the first body that each dof drives."""
     first = leading_bodies(hand)
     return hand.multiplier[first], hand.offset[first]
 
 
 def leading_bodies(hand: HandModel) -> NDArray[np.intp]:
-    """(D,) the body whose joint carries each dof's actuator: of the first joint it drives, as `HandModel.reduce`."""
+    """Return the body (D,) whose joint carries each dof's actuator: the first, as `HandModel.reduce`."""
     drives = hand.dof[hand.joint_body]
     return np.array([hand.joint_body[int(np.flatnonzero(drives == d)[0])] for d in range(hand.dofs)], np.intp)
 
 
 def add_tendon(spec: Any, hand: HandModel, tendon: Tendon, name: str, leading: NDArray[np.intp]) -> None:
-    """One actuator on the sum of joints; nothing else holds them to each other."""
+    """Add one actuator on the sum of joints; the joints are not coupled otherwise."""
     cord = spec.add_tendon(name=name)
     for d, pull in zip(tendon.dofs, tendon.coefficients, strict=True):
         cord.wrap_joint(f"joint{leading[d]}", pull)

@@ -1,20 +1,17 @@
-"""Payload of grasps: the heaviest mass that each lifts, holds under the six pushes, or keeps when shaken; the hand's
-limit and its actuators' capacity.
+"""Payload of grasps: heaviest mass that each lifts or holds; shake test; limit and load capacity.
 
-The hand closes once around the object with its own mass. Then the object hangs, or is pushed, with other masses until
-its motion tells how that ends: first what the forces of the closed hand and friction bear, then nearer and nearer, each
-from where the heaviest one so far hangs.
+The hand closes once around the object with its own mass. Then other masses hang or are pushed, until their motion shows
+the outcome: first the mass that the closed hand's forces and friction bear, then closer and closer masses. Each hangs
+from the state of the heaviest one so far.
 
-The shake: what was lifted is moved to and fro, first along x of the scene, then along y.
+The shake moves a lifted object to and fro, first along x of the scene, then along y. The hand stands still and the
+object feels the inertial force of the motion. Accelerations begin at zero; the constant velocity that this adds to the
+hand has no effect (Galilei).
 
-The hand stands still and the object feels the inertial force of the motion. Accelerations begin at zero: the velocity
-that this leaves the hand with is the same as none (Galilei).
-
-Load capacity of grasps: the heaviest object that contact forces could bear within actuator limits and friction.
-
-A linear program for each grasp: contact forces inside friction pyramids balance the weight and all torques about the
-centre of mass, and no drive exceeds its effort. A bound from above: it chooses the forces as no controller can, and its
-pyramids enclose the cones. What presses against the palm, across joints, or towards a joint's stop costs no effort.
+Load capacity: the heaviest object that contact forces could bear within actuator limits and friction. A linear program
+for each grasp: contact forces inside friction pyramids balance the weight and all torques about the centre of mass, and
+no drive exceeds its effort. It is an upper bound: it chooses forces that no controller can, and its pyramids enclose
+the cones. Forces against the palm, across joints, or towards a joint's stop cost no effort.
 """
 
 from __future__ import annotations
@@ -48,18 +45,17 @@ from graspd.worker.validation.model import Scene
 from graspd.worker.validation.prescreening import HANGING_CLOSING, LIFTING, FixedRootScene
 from graspd.worker.validation.protocol import DIRECTIONS, LOST, Outcome, Test
 
-#: The payload is told downwards, to this ratio.
+#: Resolution of payloads, a ratio; they are rounded down.
 TOLD: Final = 1.03
-#: Share of the friction bound that is tried first, its median over the grasps of `benchmarks.payload`; and the first
-#: step from there.
+#: First mass as a share of the friction bound (median over the grasps of `benchmarks.payload`), and first step.
 FIRST: Final = 0.75
 STEP: Final = math.sqrt(2)
-#: Stages that a load is watched at most.
+#: Most stages of simulation per load.
 WATCHED: Final = 10
 
 
 class _Weighed(Test):
-    """A test in which the object's mass changes. Not for several threads at once: the model is its own."""
+    """A test with a variable mass of the object. Not thread-safe: it owns its model."""
 
     def __init__(self, scene: Scene, *rest: Any) -> None:
         super().__init__(replace(scene, model=copy.copy(scene.model)), *rest)
@@ -71,13 +67,13 @@ class _Weighed(Test):
         self.scene = replace(self.scene, mass=mass)
         model.body_mass[body] = mass
         model.body_inertia[body] = self._inertia * (mass / self._own)
-        # Inverse inertias that follow from the mass set how stiff contacts are. What this leaves in the data is put
-        # right by what comes next: a state is restored, or a grasp begun.
+        # Contact stiffness depends on inverse inertias, which follow from the mass. The next restored state or start of
+        # a grasp overwrites what this leaves in the data.
         mujoco.mj_setConst(model, self.data)
 
     def _bound(self, against: Floats) -> float:
-        """Mass [kg] whose weight along -`against` (3,) the contacts of the closed hand bear by their present normal
-        forces and friction. An estimate: a load changes these forces."""
+        """Return the mass [kg] whose weight along -`against` (3,) the contacts of the closed hand bear.
+        An estimate from their present normal forces and friction, which a load changes."""
         contact, model = self.data.contact, self.scene.model
         at_object = model.geom_bodyid[contact.geom] == self.scene.object_body
         rows = np.flatnonzero(
@@ -89,8 +85,8 @@ class _Weighed(Test):
         return float(self.data.efc_force[contact.efc_address[rows]] @ (along + slide)) / ACCELERATION
 
     def _heaviest(self, bears: Callable[[float], bool], first: float) -> float:
-        """The heaviest mass [kg] that `bears` is true of, tried from `first` on, none below the object's own; nan: not
-        even that."""
+        """Return the heaviest mass [kg] for which `bears` is true, at least the object's; search from `first`.
+        nan: not even the object's own."""
         low, high, step, borne = self._own, math.inf, STEP, False
         mass = min(max(first, low), MOST_KG)
         while True:
@@ -110,10 +106,10 @@ class _Weighed(Test):
 
 
 class LiftPayload(_Weighed, FixedRootScene):
-    """Of grasps in one scene."""
+    """Payloads of grasps in one scene."""
 
     def payload(self, grasps: GraspSet, row: int) -> float:
-        """[kg]; nan: the grasp does not lift the object."""
+        """Return the payload [kg]; nan: the grasp does not lift the object."""
         self._weigh(self._own)
         if not self._closed(grasps, row):
             return math.nan
@@ -135,12 +131,12 @@ class LiftPayload(_Weighed, FixedRootScene):
 
 
 class PushPayload(_Weighed):
-    """Of grasps of a free object."""
+    """Payloads of grasps of a free object."""
 
     __test__ = False
 
     def payload(self, grasps: GraspSet, row: int) -> float:
-        """[kg]; nan: the grasp does not hold the object under the pushes."""
+        """Return the payload [kg]; nan: the grasp does not hold the object under the pushes."""
         self._weigh(self._own)
         if self._start(grasps, row).outcomes[0] is Outcome.PENETRATION:
             return math.nan
@@ -156,7 +152,7 @@ class PushPayload(_Weighed):
                 self._restore()
                 self._push(direction)
                 if self._ahead(WATCHED) >= 1.0:
-                    # Of the next masses, too, it is asked first.
+                    # Start with this direction for the next masses.
                     weakest_first.remove(direction)
                     weakest_first.insert(0, direction)
                     return False
@@ -175,19 +171,19 @@ def payloads(
     held: NDArray[np.bool_] | None = None,
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> Floats:
-    """(N,) heaviest mass that each grasp lifts [kg]; nan: not tried, or it does not lift the object itself.
+    """Compute payloads (N,) of grasps [kg]; nan: not tested, or the grasp does not lift the object.
 
     Args:
         hand: the hand.
-        obj: the object; masses below its own are not tried.
+        obj: the object; masses below its own are not tested.
         grasps: N grasps.
         pieces: the object's convex pieces.
-        placed: the scenes that they lift it out of; None: a free object is pushed six ways.
-        held: (N,) which grasps are tried; None: all.
-        run: asked between grasps whether to stop.
+        placed: the scenes of the lifts; None: a free object is pushed in six directions.
+        held: (N,) which grasps are tested; None: all.
+        run: polled for cancellation between grasps.
 
     Raises:
-        TaskCancelled: when `run.cancelled()` answers True.
+        TaskCancelled: `run.cancelled()` returned True.
     """
 
     def make() -> LiftPayload | PushPayload:
@@ -198,42 +194,42 @@ def payloads(
     return measured(len(grasps), held, make, lambda test, row: test.payload(grasps, row), run=run, name="payload")
 
 
-#: Grasps that must lift what weighs little, before what they lift is told as the hand's limit: else their shape may be
-#: why. It weighs as much as an object of which nothing is said, or this share of what is wanted.
+#: Grasps that must lift a light object before their payload counts as the hand's limit; else the grasps' shape may be
+#: the cause. It weighs as much as an object without a stated mass, or this share of the wanted mass.
 LEAST: Final = 2
 LIGHT: Final = 1 / 8
-#: So many grasps show that no further ones need be tried.
+#: Number of grasps after which no further ones need to be tested.
 ENOUGH: Final = 8
-#: What is wanted over what the best of them lifts, from which on no further ones are tried.
+#: Ratio of wanted mass to best payload from which on no further grasps are tested.
 HOPELESS: Final = 2.0
 
 
 @dataclass(frozen=True)
 class Limit:
-    """What some grasps of a hand lift."""
+    """Payload limit of some grasps of a hand."""
 
     hand: str
     friction: float
     grasps: int
     lifts_kg: float
-    """Payload of the best, by simulated lifts."""
+    """Payload of the best grasp, by simulated lifts."""
     bound_kg: float
-    """Largest load capacity of one (`worker.validation.payload`)."""
+    """Largest load capacity of a grasp (`worker.validation.payload`)."""
     wanted_kg: float | None = None
-    """What they should lift; None: nobody asked."""
+    """Wanted payload; None: none."""
 
     @property
     def hopeless(self) -> bool:
-        """Whether what is wanted is so much more that further grasps need not be tried."""
+        """Whether the wanted payload is so much larger that no further grasps need to be tested."""
         return self.grasps >= ENOUGH and self.wanted_kg is not None and self.wanted_kg > HOPELESS * self.lifts_kg
 
     @property
     def line(self) -> str:
-        """A sentence for people."""
+        """Sentence for the user."""
         return limit_told(self.hand, self.friction, self.grasps, self.lifts_kg, self.bound_kg, self.wanted_kg)
 
     def facts(self) -> dict[str, Any]:
-        """For JSON; no bound: None."""
+        """Return the values for JSON; no bound: None."""
         bound = round(self.bound_kg, 3) if math.isfinite(self.bound_kg) else None
         return {"lifts_kg": round(self.lifts_kg, 3), "bound_kg": bound, "grasps": self.grasps, "says": self.line}
 
@@ -249,7 +245,7 @@ def limit_of(
     least: int = LEAST,
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> Limit | None:
-    """What the best of N grasps lifts; None: it lifts as much as is wanted, or fewer than `least` lift anything.
+    """Return the payload limit of N grasps; None: the wanted mass is lifted, or fewer than `least` lift.
 
     Args:
         hand: the hand.
@@ -257,12 +253,12 @@ def limit_of(
         grasps: N grasps.
         pieces: the object's convex pieces.
         placed: their scenes; None: the object is free.
-        wanted: mass that should be lifted [kg]; None: nobody asked.
-        least: grasps that must lift what weighs little.
-        run: asked between grasps whether to stop.
+        wanted: mass that should be lifted [kg]; None: none.
+        least: grasps that must lift a light object.
+        run: polled for cancellation between grasps.
 
     Raises:
-        TaskCancelled: when `run.cancelled()` answers True.
+        TaskCancelled: `run.cancelled()` returned True.
     """
     if len(grasps) < least:
         return None
@@ -289,10 +285,10 @@ STEP_S: Final = 0.008
 
 
 class Shake(FixedRootScene):
-    """Shakes grasps in one scene. Not for several threads at once."""
+    """Shake tests of grasps in one scene. Not thread-safe."""
 
     def margin(self, grasps: GraspSet, row: int) -> float:
-        """Worst displacement or rotation of the object in the hand over its limit, until it is lost: 1 or more."""
+        """Return the worst displacement or rotation in the hand over its limit; 1 or more: the object is lost."""
         if not self._closed(grasps, row):
             return LOST
         self._hang(0.0, self.scene.mass)
@@ -321,8 +317,8 @@ def shake_margins(
     held: NDArray[np.bool_] | None = None,
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> Floats:
-    """(N,) worst displacement or rotation over its limit of each grasp that is shaken: below 1 it survives; nan: not
-    tried.
+    """Return shake margins (N,), the worst motion over its limit; nan: not tested.
+    The motion is displacement or rotation; below 1 the grasp holds.
 
     Args:
         hand: the hand.
@@ -330,11 +326,11 @@ def shake_margins(
         grasps: N grasps.
         placed: their scenes.
         pieces: the object's convex pieces.
-        held: (N,) which grasps are tried; None: all.
-        run: asked between grasps whether to stop.
+        held: (N,) which grasps are tested; None: all.
+        run: polled for cancellation between grasps.
 
     Raises:
-        TaskCancelled: when `run.cancelled()` answers True.
+        TaskCancelled: `run.cancelled()` returned True.
     """
 
     def make() -> Shake:
@@ -344,17 +340,17 @@ def shake_margins(
 
 
 _POINTS: Final = 600
-#: Hand points that are nearer may come to press while the hand closes [m]; as many at most, those that spread most.
+#: Hand points within this distance may make contact while the hand closes [m]; at most this many, the most spread out.
 WITHIN_M: Final = 0.01
 MOST: Final = 32
-#: A joint that is nearer to its limit, as a share of its range, rests on its stop.
+#: A joint within this share of its range from its limit rests on its stop.
 AT_STOP: Final = 0.02
 #: Result of `linprog`.
 _UNBOUNDED: Final = 3
 
 
 def capacities(hand: HandModel, obj: ObjectModel, grasp: Posture, against: Floats) -> Floats:
-    """(N,) heaviest mass [kg] that N grasps could bear; 0: nothing touches; inf: no drive and no friction limits it.
+    """Compute load capacities (N,) [kg]; 0: no contact; inf: no drive and no friction limits it.
 
     Args:
         hand: the hand.
@@ -385,14 +381,14 @@ def capacities(hand: HandModel, obj: ObjectModel, grasp: Posture, against: Float
 
 
 def _limits(hand: HandModel, q: Floats) -> Floats:
-    """(2 D,) what contacts may exert on each dof upwards, then downwards [N m or N]: beyond a stop anything."""
+    """Return limits (2 D,) of contacts' effort on each dof, up then down [N m or N]; unlimited at a stop."""
     near = AT_STOP * hand.span
     up = np.where(q > hand.upper - near, np.inf, hand.effort)
     return np.concatenate([up, np.where(q < hand.lower + near, np.inf, hand.effort)])
 
 
 def _load(forces: Floats, moments: Floats, torques: Floats, efforts: Floats, along: Floats) -> float:
-    """Largest weight [N] that edges of pyramids, of forces (E, 3), moments (E, 3) and torques (E, D), balance."""
+    """Return the largest weight [N] balanced by pyramid edges: forces, moments (E, 3), torques (E, D)."""
     from scipy.optimize import linprog
 
     count = len(forces)

@@ -1,10 +1,10 @@
 """Short tests in coarse physics: rollouts that rank a planner's candidates.
 
-The hand closes and squeezes around the object in a fraction of the time of the whole test. In a scene the support is
-then gone, and for a moment most of the object's weight pulls; a free object is pushed towards the corners of a
-tetrahedron, nearly twice as hard as it weighs. All this at half the friction: what slips is pulled once more, from the
-same closed hand, at the whole friction, and by a third more than the weight in a scene. Not a verdict: it ranks
-candidates for a fifth of a verdict's cost, and what it chooses the whole test validates all the same.
+The hand closes and squeezes around the object in a fraction of the time of the whole test. In a scene the support then
+vanishes, and most of the object's weight pulls for a moment. A free object is pushed towards the corners of a
+tetrahedron, with nearly twice its weight. All this happens at half the friction. Objects that slip are pulled once more
+from the same closed hand at full friction, in a scene with a third more than the weight. The result is not a verdict:
+it ranks candidates at a fifth of a verdict's cost, and the whole test still validates the selected ones.
 """
 
 from __future__ import annotations
@@ -34,55 +34,55 @@ from graspd.worker.validation.protocol import LOST, STAGE_S, Outcome, Test
 
 _T = TypeVar("_T")
 
-#: The root is fixed: a hand that hangs on a spring, as the protocol has it, costs twice as much. In so short a time
-#: nothing slips that would not slip without it: no iterations against slip.
+#: The root is fixed, because the protocol's root on a spring costs twice as much. In so short a time nothing slips for
+#: lack of iterations against slip.
 PHYSICS: Final = MujocoOptions(timestep=0.006, root="fixed", noslip_iterations=0)
-#: The same of a lift: under the weight of a real object coarser contacts creep.
+#: The same for a lift: under the weight of a real object coarser contacts creep.
 LIFTING: Final = MujocoOptions(root="fixed")
 #: Stages of closing and of squeezing, then of hanging.
 CLOSING: Final = 2
 HANGING: Final = 6
-#: The same of a free object, and of a push.
+#: The same for a free object and a push.
 FREE_CLOSING: Final = 3
 PUSHED: Final = 2
-#: Pull while the object hangs at half the friction, at the whole of it, and of a push, in its weights. A hand that is
-#: turned away costs more than one that the whole test then drops. Of 32 hands of Allegro that lift at half the friction
-#: 1.3 weights turn away 19, these 9; of 63 that hold a free object at half of it 14 were turned away with 2 weights and
-#: two stages of closing, now 9. What nothing holds must be gone when a push ends. At the whole friction the pull is
-#: more than the weight: of 25 hands that lift .8 of it another lift test drops 10, of 21 that lift 1.3 of it 3.
+#: Pull on the hanging object at half the friction, at full friction, and of a push, in object weights. Rejecting a good
+#: candidate costs more than one that the whole test then drops. Of 32 Allegro candidates that lift at half the
+#: friction, 1.3 weights reject 19, these 9. Of 63 that hold a free object at half friction, 2 weights and two stages of
+#: closing rejected 14, now 9. An object that is not held must be lost when a push ends. At full friction the pull
+#: exceeds the weight: of 25 candidates that lift .8 of it another lift test drops 10, of 21 that lift 1.3 of it 3.
 HANGS: Final = 0.8
 HANGS_WHOLE: Final = 1.3
 PULL: Final = 1.8
-#: What has passed a limit by so much is lost.
+#: Ratio to a limit from which on the object is lost.
 GONE: Final = 1.5
-#: Where a free object is pushed: no direction is farther from all of them than 71 degrees.
+#: Push directions of a free object: no direction is farther than 71 degrees from all of them.
 CORNERS: Final = np.array([(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)]) / np.sqrt(3.0)
-#: How far supports go away [m]: farther than any scene is high.
+#: Distance by which supports are removed [m]: more than the height of any scene.
 AWAY_M: Final = 10.0
-#: Added to the score of what holds at the whole friction only.
+#: Added to the score of grasps that hold at full friction only.
 SLIPS: Final = 1.0
-#: Score of what starts too deep.
+#: Score of grasps that start in too deep penetration.
 DEEP: Final = 20.0
 
 
 @dataclass(frozen=True)
 class Frictions:
-    """The scene built with `PHYSICS`, at half the friction and at the whole of it; all else is the same."""
+    """The scene built with `PHYSICS`, at half and at full friction; all else is the same."""
 
     half: Scene
     whole: Scene
 
 
 class LiftRollout(Lift):
-    """Runs short lifts of grasps in one scene. Not for several threads at once."""
+    """Short lifts of grasps in one scene. Not thread-safe."""
 
     def __init__(self, scenes: Frictions, placed: PlacedGrasps) -> None:
         super().__init__(scenes.half, placed)
         self._scenes = scenes
 
     def score(self, grasps: GraspSet, row: int, beat: float = np.inf) -> float:
-        """Displacement or rotation over its limit when the object has hung at half the friction: below 1 it would pass
-        for lifted. Else that at the whole friction, and `SLIPS`; `beat` where that is below 1 + `SLIPS` already."""
+        """Return displacement or rotation over its limit after hanging at half the friction; below 1: lifted.
+        Otherwise the same at full friction, plus `SLIPS`; or `beat`, where that is already below 1 + `SLIPS`."""
         self.scene = self._scenes.half
         if self._begin(grasps, row).outcome is not LiftOutcome.NOT_TRIED:
             return DEEP
@@ -99,23 +99,23 @@ class LiftRollout(Lift):
         return SLIPS + self._hung(HANGS_WHOLE)
 
     def _hung(self, weights: float, enough: float = GONE) -> float:
-        """Displacement or rotation over its limit, at its present rate `HOLD_S` after the support has gone; what it is
-        now if that is `enough`."""
+        """Return displacement or rotation over its limit, extrapolated to `HOLD_S` after support removal.
+        The present value once that reaches `enough`."""
         self.data.mocap_pos[1] = self._scene_pose[:3] - AWAY_M * self._up
         self.data.xfrc_applied[self.scene.object_body, :3] = -weights * self.scene.push * self._up
         return self._ahead(HANGING, enough)
 
 
 class PushRollout(Test):
-    """Runs short pushes of grasps of a free object. Not for several threads at once."""
+    """Short pushes of grasps of a free object. Not thread-safe."""
 
     def __init__(self, scenes: Frictions) -> None:
         super().__init__(scenes.half)
         self._scenes = scenes
 
     def score(self, grasps: GraspSet, row: int) -> float:
-        """Worst displacement or rotation over its limit when the object was pushed at half the friction: below 1 it
-        would pass for held. Else that at the whole friction, and `SLIPS`."""
+        """Return the worst displacement or rotation over its limit in pushes at half friction; below 1: held.
+        Otherwise the same at full friction, plus `SLIPS`."""
         self.scene = self._scenes.half
         if self._start(grasps, row).outcomes[0] is Outcome.PENETRATION:
             return DEEP
@@ -129,7 +129,7 @@ class PushRollout(Test):
         return SLIPS + self._pushed()
 
     def _pushed(self) -> float:
-        """Worst displacement or rotation over its limit, up to the first push that breaks it."""
+        """Return the worst displacement or rotation over its limit, up to the first push that breaks it."""
         worst = 0.0
         for corner in CORNERS:
             self._restore()
@@ -142,8 +142,8 @@ class PushRollout(Test):
 
 
 class _Shorts:
-    """Short tests of one hand and one object, for several threads at once; the scenes are compiled when they are first
-    needed. All that are asked about have the same supports and neighbours."""
+    """Short tests of one hand and one object, thread-safe; scenes are compiled on first use.
+    All grasps must have the same supports and neighbours."""
 
     def __init__(
         self, hand: HandModel, obj: ObjectModel, pieces: Callable[[], ConvexPieces], *, threads: int = 1
@@ -155,7 +155,7 @@ class _Shorts:
     def _each(
         self, test: Callable[[Frictions], Callable[[int], _T]], count: int, placed: PlacedGrasps | None
     ) -> list[_T]:
-        """What a test says of each of `count` grasps; `test` makes one for a thread."""
+        """Run a test on each of `count` grasps; `test` creates one per thread."""
         scenes = self._compiled(placed)
 
         def work(rows: NDArray[np.intp]) -> list[_T]:
@@ -184,7 +184,7 @@ class LiftRollouts(_Shorts):
     """Short lifts of grasps in their scenes."""
 
     def scores(self, grasps: GraspSet, placed: PlacedGrasps, beat: Floats | None = None) -> Floats:
-        """(N,) see `ShortLift.score`."""
+        """Return scores (N,), see `LiftRollout.score`."""
         least = np.full(len(grasps), np.inf) if beat is None else beat
 
         def test(scenes: Frictions) -> Callable[[int], float]:
@@ -198,21 +198,22 @@ class PushRollouts(_Shorts):
     """Short pushes of grasps of a free object."""
 
     def scores(self, grasps: GraspSet) -> Floats:
-        """(N,) see `ShortPush.score`."""
+        """Return scores (N,), see `PushRollout.score`."""
         return np.array(self._each(lambda s: partial(PushRollout(s).score, grasps), len(grasps), None), float)
 
 
 def push_rollout(
     hand: HandModel, obj: ObjectModel, pieces: Callable[[], ConvexPieces], *, threads: int = 1
 ) -> Callable[[GraspSet, PlacedGrasps | None, Floats], Floats]:
-    """A trial of free grasps as `worker.planners.Wanted` takes it: (N,) scores, below 1 for grasps that hold the object
-    under short pushes at half the friction, and below 2 at the whole of it.
+    """Return a `worker.planners.Rollout` that scores free grasps (N,) by short pushes.
+    Scores are below 1 for grasps
+    that hold at half the friction, and below 2 at full friction.
 
     Args:
         hand: the hand.
         obj: the object.
-        pieces: gives the object's convex pieces when they are first needed.
-        threads: of one call; planners on the CPU call from as many threads as they may use.
+        pieces: computes the object's convex pieces on first use.
+        threads: per call; planners on the CPU already call from all their threads.
     """
     pushes = PushRollouts(hand, obj, pieces, threads=threads)
 
@@ -224,24 +225,24 @@ def push_rollout(
 
 #: Stages of closing and of squeezing.
 HANGING_CLOSING: Final = 4
-#: Pull of an object that hangs, in its weights: the mean of a smooth rise while it speeds up (`lift.SMOOTHLY`).
+#: Pull of a hanging object, in its weights: mean of a smooth rise while it accelerates (`lift.SMOOTHLY`).
 RISING: Final = 1.06
-#: A change of the load comes over this time, in steps [s]: at once it would weigh up to twice.
+#: Duration of a load change, in steps [s]; a sudden change would weigh up to twice.
 LOADING_S: Final = 0.04
 LOADS: Final = 5
 
 
 class FixedRootScene(Lift):
-    """A scene whose root is fixed. Not for several threads at once."""
+    """A scene with a fixed root. Not thread-safe."""
 
     def _closed(self, grasps: GraspSet, row: int) -> bool:
-        """Whether the hand closes around the object and holds on to it."""
+        """Close the hand around the object; return whether it holds on to it."""
         if self._begin(grasps, row).outcome is not LiftOutcome.NOT_TRIED:
             return False
         return self._close(grasps, row, give_up=True, stages=HANGING_CLOSING) and not void(self.data)
 
     def _hang(self, before: float, mass: float) -> None:
-        """Let the object hang, and its weight change from that of `before` to that of `mass` [kg]."""
+        """Let the object hang while its weight changes from the mass `before` to `mass` [kg]."""
         self.data.mocap_pos[1] = self._scene_pose[:3] - AWAY_M * self._up
         for load in np.linspace(before, mass, LOADS + 1)[1:]:
             self.data.xfrc_applied[self.scene.object_body, :3] = -RISING * ACCELERATION * load * self._up

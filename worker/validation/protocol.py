@@ -1,8 +1,8 @@
-"""The DexGraspBench force-closure test of one grasp, at three levels of cost (research: what each shortcut changes).
+"""DexGraspBench's force-closure test of one grasp, at three levels of cost.
 
-letter: as published; each of the 6 pushes starts from the closed hand as if it had closed anew and is held for 2 s.
-certificate: the same physics; a push ends as soon as linear extrapolation to 2 s stays inside half of the limits.
-screen: coarser physics (fixed root, 6 ms); where the margin is not clear, the standard level decides.
+dexgraspbench: as published. Each of the 6 pushes starts from the closed hand, as if closed anew, and is held for 2 s.
+standard: the same physics; a push ends as soon as linear extrapolation to 2 s stays inside half of the limits.
+fast: coarser physics (fixed root, 6 ms); where the margin is not clear, level standard decides.
 """
 
 from __future__ import annotations
@@ -25,30 +25,30 @@ DIRECTIONS: Final = ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0
 MAX_DISPLACEMENT_M: Final = 0.05
 MAX_ROTATION: Final = math.radians(15.0)
 MAX_PENETRATION_M: Final = 0.010
-#: Each of the two motions is cut into stages of equal length; the push is watched at intervals.
+#: Each of the two motions consists of stages of equal length; a push is checked at intervals.
 STAGES: Final = 10
 STAGE_S: Final = 0.04
 HOLD_S: Final = 2.0
 DEXGRASPBENCH_INTERVAL_S: Final = 0.2
-#: Sequential test: first look and interval. Earlier looks miss slow creepers under a weak squeeze.
+#: Sequential test: first check and interval. Earlier checks miss slow creepers under a weak squeeze.
 FIRST_LOOK_S: Final = 0.08
 INTERVAL_S: Final = 0.04
-#: Share of the limits that extrapolation must stay inside: what creeps faster is watched until it slows, breaks a limit
-#: or 2 s are over. Of 250 grasps of Shadow that are held at the whole of them 11 creep out later, at half of them 4.
+#: Share of the limits for extrapolated motion. Faster motion is simulated until it slows, breaks a limit, or 2 s are
+#: over. Of 250 Shadow grasps accepted at the full limits 11 creep out later, at half of them 4.
 SURE: Final = 0.5
-#: Share of the limits within which a short test calls an object still that its present rate brings no farther.
+#: Share of the limits for motion extrapolated in a short test, below which the object counts as still.
 STILL: Final = 0.5
-#: Excess of what is no number any more.
+#: Excess of a state that is not finite.
 LOST: Final = 10.0
-#: The object is lost while closing or rising beyond this; no grasp that passes was ever seen past half of it.
+#: Rotation while closing or rising beyond which the object is lost; no passing grasp was observed beyond half of it.
 LOST_ROTATION: Final = math.radians(30.0)
-#: Coarse physics are trusted where their worst displacement or rotation over its limit is outside this band. What they
-#: wrongly accept moves little in them: a band that begins at 0.7 of the limit leaves nearly twice as many.
+#: Coarse physics are trusted where their worst displacement or rotation over its limit is outside this band. Their
+#: false accepts move little: a band that begins at 0.7 of the limit leaves nearly twice as many.
 FAST_BAND: Final = (0.3, 3.0)
 
 
 class Outcome(IntEnum):
-    """What became of one push."""
+    """Outcome of one push."""
 
     NOT_TRIED = 0
     HELD = 1
@@ -60,7 +60,7 @@ class Outcome(IntEnum):
 
 
 class ValidatedBy(IntEnum):
-    """Whose verdict it is. Only MuJoCo on the CPU gives certificates."""
+    """Engine of a verdict. Only MuJoCo on the CPU gives reference verdicts."""
 
     MUJOCO = 0
     MUJOCO_WARP = 1
@@ -88,7 +88,7 @@ class Rollout:
 
 
 class Test:
-    """Runs trials of grasps in one scene. Not for several threads at once: it owns the state of the simulation."""
+    """Tests of grasps in one scene. Not thread-safe: it owns the simulation state."""
 
     __test__ = False
 
@@ -100,7 +100,7 @@ class Test:
         self._saved = np.empty(size)
 
     def dexgraspbench(self, grasps: GraspSet, row: int) -> Rollout:
-        """The protocol as published, ending at the first push that fails."""
+        """Run the protocol as published, up to the first push that fails."""
         rollout = self._start(grasps, row)
         if rollout.outcomes[0] is Outcome.PENETRATION:
             return rollout
@@ -123,12 +123,12 @@ class Test:
         return rollout
 
     def standard(self, grasps: GraspSet, row: int) -> Rollout:
-        """Close once, branch the pushes, decide each as early as it is decided."""
+        """Close once, branch the pushes from there, and end each as soon as it is decided."""
         rollout = self._start(grasps, row)
         if rollout.outcomes[0] is Outcome.PENETRATION:
             return rollout
         if not self._close(grasps, row, give_up=True) or self._validate(rollout) is not Outcome.HELD:
-            # A push must bring the object back inside the limits for this to be wrong: not seen in 690 grasps.
+            # Wrong only if a push brings the object back inside the limits: not observed in 690 grasps.
             rollout.margin = max(rollout.margin, self._excess())
             rollout.steps = self._steps
             return rollout.fail(Outcome.DIVERGED if void(self.data) else Outcome.LOST_WHILE_CLOSING)
@@ -146,25 +146,25 @@ class Test:
         self._steps = 0
         rollout = Rollout()
         rollout.penetration_m, rollout.self_penetration_m = self._depths(grasps.grasp, row)
-        # As published: what counts is where the simulation starts. The depth at the grasp is only told.
+        # As published, the depth at the simulation's start decides. The depth at the grasp is only reported.
         if max(self._depths(grasps.pregrasp, row)) > MAX_PENETRATION_M:
             return rollout.fail(Outcome.PENETRATION)
         return rollout
 
     def _put(self, hand_pose: Floats, joints: Floats) -> None:
-        """The object at its start, the hand (7,), (J,) at rest."""
+        """Place the object at its start and the hand (7,), (J,) at rest."""
         self.scene.place(self.data, hand_pose, joints)
 
     def _depths(self, posture: Posture, row: int) -> tuple[float, float]:
         self._put(posture.hand_pose[row], posture.joint_positions[row])
-        # Contacts are all that is asked for: forces and accelerations would cost three times as much.
+        # Only contacts are needed: forces and accelerations would cost three times as much.
         mujoco.mj_kinematics(self.scene.model, self.data)
         mujoco.mj_comPos(self.scene.model, self.data)
         mujoco.mj_collision(self.scene.model, self.data)
         return self.penetration()
 
     def penetration(self) -> tuple[float, float]:
-        """Deepest hand-object and hand-hand penetration of the present state [m]."""
+        """Return the deepest hand-object and hand-hand penetration of the present state [m]."""
         contact = self.data.contact
         if not len(contact.dist):
             return 0.0, 0.0
@@ -174,8 +174,8 @@ class Test:
         return float(depth[~within].max(initial=0.0)), float(depth[within].max(initial=0.0))
 
     def _close(self, grasps: GraspSet, row: int, *, give_up: bool = False, stages: int = STAGES) -> bool:
-        """From pregrasp over grasp to squeeze, each in so many stages; False as soon as the object is lost, if told to
-        give up."""
+        """Move from pregrasp over grasp to squeeze, each in `stages` stages; return whether the object stayed.
+        With `give_up`, stop as soon as the object is lost; otherwise return True."""
         self._put(grasps.pregrasp.hand_pose[row], grasps.pregrasp.joint_positions[row])
         for hand_pose, joints in self._way(grasps, row, stages):
             self.scene.command(self.data, hand_pose, joints)
@@ -189,7 +189,7 @@ class Test:
         return moved > MAX_DISPLACEMENT_M or turned > LOST_ROTATION
 
     def _way(self, grasps: GraspSet, row: int, stages: int = STAGES) -> Iterator[tuple[Floats, Floats]]:
-        """Commanded postures (7,), (J,) from pregrasp over grasp to squeeze, one a stage."""
+        """Yield commanded postures (7,), (J,) from pregrasp over grasp to squeeze, one per stage."""
         for a, b in ((grasps.pregrasp, grasps.grasp), (grasps.grasp, grasps.squeeze)):
             for stage in range(1, stages + 1):
                 yield blend(a, b, row, stage / stages)
@@ -205,7 +205,7 @@ class Test:
         self.data.xfrc_applied[self.scene.object_body, :3] = self.scene.push * np.array(DIRECTIONS[direction])
 
     def _hold(self, rollout: Rollout) -> Outcome:
-        """Sequential test: reject on a broken limit, accept when the present rates keep well inside it for 2 s."""
+        """Sequential test: reject on a broken limit; accept when extrapolation to 2 s stays well inside it."""
         elapsed = FIRST_LOOK_S - INTERVAL_S
         self._run(elapsed)
         before, turned_before = self._offset(), self._motion()[1]
@@ -225,8 +225,8 @@ class Test:
         return Outcome.HELD
 
     def _ahead(self, stages: int, enough: float = 1.0) -> float:
-        """Displacement or rotation over its limit, at its present rate `HOLD_S` after now, watched for so many stages
-        at most; what it is as soon as that is `enough`."""
+        """Return displacement or rotation over its limit, extrapolated to `HOLD_S` from now.
+        Simulate at most `stages` stages; return the present value as soon as it reaches `enough`."""
         before = self._excess()
         for stage in range(1, stages + 1):
             self._run(STAGE_S)
@@ -243,19 +243,19 @@ class Test:
         self._steps += steps
 
     def _offset(self) -> Floats:
-        """(3,) displacement since the start of the object's own frame, the mesh's, as published [m]."""
+        """Return the displacement (3,) of the object's (mesh) frame since the start, as published [m]."""
         at = self.scene.object_qpos
         turned = np.empty(3)
         mujoco.mju_rotVecQuat(turned, self.scene.centre, self.data.qpos[at + 3 : at + 7])
         return np.asarray(self.data.qpos[at : at + 3] - turned)
 
     def _turned(self) -> Floats:
-        """(4,) rotation of the object since the start."""
+        """Return the rotation (4,) of the object since the start."""
         at = self.scene.object_qpos
         return np.asarray(self.data.qpos[at + 3 : at + 7])
 
     def _motion(self) -> tuple[float, float]:
-        """Displacement [m] and rotation [rad] of the object since the start."""
+        """Return displacement [m] and rotation [rad] of the object since the start."""
         q = self._turned()
         turned = 2 * math.atan2(math.sqrt(q[1] ** 2 + q[2] ** 2 + q[3] ** 2), abs(q[0]))
         return float(np.linalg.norm(self._offset())), turned

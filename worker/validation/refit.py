@@ -1,7 +1,7 @@
-"""The same hand with other collision shapes: what another author of its model might have drawn.
+"""The same hand with other collision shapes, as another author of its model might have drawn them.
 
-hull: one convex hull of all that a link has; primitive: the box, cylinder or capsule nearest to each hull;
-capsule: a capsule in place of each piece that is about as thick as wide; and all of it grown or shrunk.
+hull: one convex hull per link; primitive: the box, cylinder or capsule nearest to each hull; capsule: a capsule for
+each piece that is about as thick as wide. Any of these may also be grown or shrunk.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from graspd.worker.hands.primitives import hull, sample, signed_distance, tessel
 
 Fit = Literal["own", "hull", "primitive", "capsule"]
 
-#: A capsule stands for no piece that is wider than this over its thickness.
+#: A capsule replaces no piece whose width over thickness is larger.
 WIDE: Final = 1.5
 #: Shrinking leaves at least this share of a piece's half thickness.
 _LEFT: Final = 0.5
@@ -31,9 +31,9 @@ _PRIMITIVES: Final = ("box", "cylinder", "capsule")
 
 
 def refitted(hand: HandModel, fit: Fit, grown_m: float = 0.0) -> HandModel:
-    """The hand with its collision shapes replaced, then grown by `grown_m` [m], or shrunk where that is negative.
+    """Return the hand with its collision shapes replaced, then grown by `grown_m` [m] (negative: shrunk).
 
-    Bodies that touch at rest in their new shapes do not count as touching, as in the hand itself.
+    Contacts between bodies that touch at rest in their new shapes are ignored, as in the hand itself.
     """
     pieces = hand.pieces
     if fit == "hull":
@@ -49,7 +49,7 @@ def refitted(hand: HandModel, fit: Fit, grown_m: float = 0.0) -> HandModel:
 
 
 def fits_of(hand: HandModel) -> frozenset[Fit]:
-    """Fits that change something in this hand."""
+    """Return the fits that change something in this hand."""
     links = {(piece.body, piece.link) for piece in hand.pieces}
     found: set[Fit] = set()
     if len(links) < len(hand.pieces):
@@ -62,10 +62,10 @@ def fits_of(hand: HandModel) -> frozenset[Fit]:
 
 
 def grown(piece: ConvexPiece, by_m: float) -> ConvexPiece:
-    """A piece whose surface stands out by `by_m` [m] along every normal of its faces, or back where that is negative.
+    """Return a piece with its surface offset by `by_m` [m] along all face normals (negative: inwards).
 
-    Boxes and cylinders keep their edges, capsules and spheres are exact. Corners of a hull are cut where the offset
-    surface of Minkowski's sum with a ball is. A piece too thin to shrink keeps half of its thickness.
+    Boxes and cylinders keep their edges, capsules and spheres are exact. Corners of a hull are cut at the offset
+    surface of the Minkowski sum with a ball. A piece too thin to shrink keeps half of its thickness.
     """
     if piece.kind == "hull":
         vertices, faces = hull(_offset(piece.vertices, by_m))
@@ -112,7 +112,7 @@ def _fitted(piece: ConvexPiece, fit: Fit) -> ConvexPiece:
 
 
 def _moments(piece: ConvexPiece) -> tuple[float, Floats, Floats, Floats]:
-    """Volume, centre, variances (3,) of the solid along its principal axes, least first, and these as columns."""
+    """Return volume, centre, principal variances (3,) in ascending order, and the axes as columns."""
     import trimesh  # slow to load, as SciPy below
 
     solid = trimesh.Trimesh(piece.vertices, piece.faces, process=False)
@@ -124,15 +124,15 @@ def _moments(piece: ConvexPiece) -> tuple[float, Floats, Floats, Floats]:
 
 
 def _thickness(piece: ConvexPiece) -> tuple[float, bool]:
-    """Least half thickness [m] of a box of the same second moments, and whether its section is about as thick as
-    wide."""
+    """Return the least half thickness [m] of a box of the same second moments, and whether the
+    section is about as thick as wide."""
     _, _, spread, _ = _moments(piece)
     low, middle, _ = np.sqrt(3 * spread)
     return float(low), bool(middle <= WIDE * low)
 
 
 def _like(piece: ConvexPiece, kind: str) -> ConvexPiece:
-    """A primitive with the centre, the principal axes and the volume of a piece, proportioned by its second moments."""
+    """Return a primitive with a piece's centre, principal axes and volume, proportioned by second moments."""
     solid, centre, spread, axes = _moments(piece)
     long = 2
     if kind == "cylinder" and spread[2] - spread[1] < spread[1] - spread[0]:
@@ -153,10 +153,10 @@ def _like(piece: ConvexPiece, kind: str) -> ConvexPiece:
 
 
 def _capsule(solid: float, across: float) -> tuple[float, float]:
-    """Radius and length of a capsule of a volume [m^3] and a variance across its axis [m^2], the sphere's at least.
+    """Return radius and length of a capsule of a volume [m^3] and a variance across its axis [m^2].
 
-    A cylinder's variance is r^2 / 4, a ball's r^2 / 5: of a capsule whose caps are the share s of its volume it is
-    r^2 (1 / 4 - s / 20). Iterated, for s grows with r^3 and moves r little.
+    The variance is at least the sphere's. A cylinder's variance is r^2 / 4, a ball's r^2 / 5, a capsule's r^2 (1 / 4 -
+    s / 20) if its caps are the share s of its volume. Iterated: s grows with r^3 and moves r little.
     """
     radius = 2 * math.sqrt(across)
     for _ in range(20):
@@ -166,17 +166,17 @@ def _capsule(solid: float, across: float) -> tuple[float, float]:
 
 
 def _distance(one: ConvexPiece, piece: ConvexPiece) -> float:
-    """Mean distance of a piece's surface from a primitive's [m]."""
+    """Return the mean distance of a piece's surface from a primitive's [m]."""
     points, _ = sample("hull", (), piece.vertices, piece.faces, _SAMPLES, np.random.default_rng(0))
     local = apply(invert(one.pose), points)
     return float(np.abs(signed_distance(one.kind, one.size, one.vertices, one.faces, local)).mean())
 
 
 def _offset(vertices: Floats, by_m: float) -> Floats:
-    """Corners of a convex solid whose faces were moved outward by `by_m` [m].
+    """Return the corners of a convex solid with its faces moved outward by `by_m` [m].
 
-    Half-spaces of the faces and, where it grows, of the corners' mean normals: each at the distance at which the sum
-    with a ball has it. So what grows by 1 mm has its support 1 mm farther in all of these directions.
+    It intersects half-spaces of the faces and, if growing, of the corners' mean normals, each at the distance of the
+    sum with a ball. A solid that grows by 1 mm has its support 1 mm farther in all of these directions.
     """
     from scipy.spatial import ConvexHull, HalfspaceIntersection
 
@@ -201,7 +201,7 @@ def _offset(vertices: Floats, by_m: float) -> Floats:
 
 
 def _deepest(planes: Floats) -> tuple[Floats, float]:
-    """Centre and radius of the largest ball in a convex solid of unit planes (F, 4): n x + b <= 0."""
+    """Return centre and radius of the largest ball in a convex solid of unit planes (F, 4): n x + b <= 0."""
     from scipy.optimize import linprog
 
     found = linprog([0, 0, 0, -1], np.column_stack([planes[:, :3], np.ones(len(planes))]), -planes[:, 3],

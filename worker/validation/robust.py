@@ -1,8 +1,8 @@
-"""Robustness of grasps: verdicts in other models of the same hand and object, and with the object displaced.
+"""Robustness: verdicts in other models of the same hand and object, and with the object displaced.
 
-A grasp is validated in k models, each of which departs from the nominal one along one axis (`variant`). Axes take turns
-in an order at random; all is drawn from the seed and the grasp's own numbers, so a grasp meets the same models wherever
-it stands, and the first 8 of 16 are those of 8.
+A grasp is validated in k models, each of which departs from the nominal one along one axis (`variant`). Axes alternate
+in random order. All is drawn from the seed and the grasp's own numbers: a grasp gets the same models in any set, and
+the first 8 of 16 are those of 8.
 """
 
 from __future__ import annotations
@@ -35,16 +35,16 @@ from graspd.worker.validation.variant import Variant, dealt, draw
 from graspd.worker.validation.varied import Models
 
 NOT_VALIDATED: Final = -1
-#: Shares are wanted to this: 0.9 of 10 models is 9 of them.
+#: Tolerance of wanted shares: 0.9 of 10 models is 9 of them.
 _EXACT: Final = 1e-9
 
 
 @dataclass(frozen=True)
 class Robustness:
-    """What became of N grasps in k models."""
+    """Verdicts on N grasps in k models."""
 
     held: NDArray[np.int8]
-    """(N, k) 1 held, 0 not, -1 not validated: the grasp was not tried, or its share was decided."""
+    """(N, k) 1 held, 0 not, -1 not validated: the grasp was not tested, or its share was decided."""
     axis: NDArray[np.uint8]
     """(N, k) `Axis` of each model."""
     wanted: float
@@ -52,8 +52,8 @@ class Robustness:
 
     @property
     def share(self) -> Floats:
-        """(N,) share of the models in which a grasp holds; nan: not tried. Where validating ended early, what it is at
-        least if the wanted share was reached, at most if it was missed."""
+        """(N,) share of the models in which a grasp holds; nan: not tested.
+        After an early end it is a lower bound if the wanted share was reached, an upper bound if it was missed."""
         models = self.held.shape[1]
         held, failed = (self.held == 1).sum(axis=1), (self.held == 0).sum(axis=1)
         reached = held >= needed(self.wanted, models)
@@ -62,18 +62,18 @@ class Robustness:
 
     @property
     def weakest(self) -> NDArray[np.uint8]:
-        """(N,) `Axis` of the first model in which a grasp does not hold; 0: there is none."""
+        """(N,) `Axis` of the first model in which a grasp does not hold; 0: none."""
         failed = self.held == 0
         first = failed.argmax(axis=1)
         return np.where(failed.any(axis=1), self.axis[np.arange(len(first)), first], np.uint8(Axis.NONE))
 
     @property
     def columns(self) -> dict[str, NDArray[Any]]:
-        """The columns of a base shard."""
+        """Columns of a base shard."""
         return {"quality/robust_share": self.share, "quality/robust_weakest": self.weakest}
 
     def by_axis(self) -> dict[Axis, tuple[int, int]]:
-        """Of each axis that was validated: models in which a grasp held, and all of them."""
+        """Return for each validated axis the number of models in which a grasp held, and of all models."""
         counts = {}
         for axis in Axis:
             found = self.held[(self.axis == axis) & (self.held != NOT_VALIDATED)]
@@ -83,13 +83,12 @@ class Robustness:
 
 
 def needed(wanted: float, models: int) -> int:
-    """Models of `models` in which a grasp has to hold for the wanted share; none is wanted at 0, so all are
-    validated."""
+    """Return the number of models in which a grasp must hold for the wanted share; 0: all of them."""
     return math.ceil(wanted * models - _EXACT) if wanted > 0 else models
 
 
 def reaches(share: Floats, wanted: float) -> NDArray[np.bool_]:
-    """(N,) whether shares (N,) are as large as is wanted; one that is not known is not."""
+    """Check (N,) whether shares (N,) reach the wanted one; nan does not."""
     return np.asarray(np.nan_to_num(share, nan=-1.0) >= wanted - _EXACT)
 
 
@@ -109,27 +108,27 @@ def robust(
     cache: Path | None = None,
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> Robustness:
-    """Validate grasps in models around the nominal one: six pushes at the level of the standard level, or lifts.
+    """Validate grasps in models around the nominal one, by six pushes at level standard or by lifts.
 
     Args:
         hand: the hand.
         obj: the object.
         grasps: N grasps.
-        held: (N,) verdicts of the nominal model; only grasps with 1 are tried. By default all.
-        placed: their scenes; the lift test out of these then validates. None: the six pushes do.
+        held: (N,) verdicts of the nominal model; only grasps with 1 are tested. By default all.
+        placed: their scenes, for the lift test; None: six pushes.
         level: of the lift test.
         models: for each grasp.
-        wanted: share of them; validating a grasp ends when it is sure whether it is reached. 0: all are validated.
+        wanted: share of them; the validation of a grasp ends once the share is decided. 0: all are validated.
         seed: of the models, with the grasp's own numbers.
         hard: at the hard protocol's friction.
         pieces: convex pieces of the object; by default its CoACD pieces.
         cache: folder of the pieces, see `decompose`.
-        run: told of grasps done; asked between models whether to stop.
+        run: receives the number of finished grasps; polled for cancellation between models.
 
     Raises:
-        InputError: no scene or way of each grasp to lift it from.
+        InputError: no scene or approach of each grasp.
         MeshError: the object has no usable convex pieces.
-        TaskCancelled: when `run.cancelled()` answers True.
+        TaskCancelled: `run.cancelled()` returned True.
     """
     if placed is not None:
         require_ways(grasps, placed, level)
@@ -168,14 +167,14 @@ def robust(
 
 
 def models_of(hand: HandModel, grasps: GraspSet, row: int, models: int, seed: int) -> list[tuple[Axis, Variant]]:
-    """The models in which a grasp is validated, in their order."""
+    """Return the models in which a grasp is validated, in order."""
     words = (seed, *_words(grasps, row))
     axes = dealt(hand, models, words)
     return [(axis, draw(axis, hand, np.random.default_rng((*words, k)))) for k, axis in enumerate(axes)]
 
 
 def _words(grasps: GraspSet, row: int) -> tuple[int, ...]:
-    """A grasp's own numbers as a seed."""
+    """Return a grasp's own numbers as a seed."""
     whole = hashlib.sha256()
     for part in (grasps.pregrasp, grasps.grasp, grasps.squeeze):
         for array in (part.hand_pose, part.joint_positions):
@@ -203,25 +202,25 @@ def robustness(
     cache: Path | None = None,
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> Floats:
-    """(N,) share of `repeats` in which a grasp still holds with noise on the object's pose; nan: not tried.
+    """Return the share (N,) of `repeats` in which a grasp holds with noise on the object's pose.
 
     The object is moved by `noise_m` in a random direction and turned by `noise_rad` about a random axis through its
-    centre of mass; a grasp's noise follows from `seed`, the repeat and its place in the set.
+    centre of mass; a grasp's noise follows from `seed`, the repeat and its place in the set. nan: not tested.
 
     Args:
         hand: the hand.
         obj: the object.
         grasps: N grasps.
-        held: (N,) verdicts without noise; only grasps with 1 are tried. By default all.
+        held: (N,) verdicts without noise; only grasps with 1 are tested. By default all.
         repeats: noisy verdicts for each grasp.
         noise_m: size of the shift [m].
         noise_rad: size of the turn [rad].
         seed: of the noise.
-        level: what a noisy verdict costs; a share is no rate of success, so the cheap level does.
+        level: of noisy verdicts; the cheap level suffices, for a share is not a success rate.
         hard: the hard protocol's friction.
         pieces: convex pieces of the object; by default its CoACD pieces.
         cache: folder of the pieces, see `decompose`.
-        run: told of noisy verdicts done; asked between them whether to stop.
+        run: receives the number of finished verdicts; polled for cancellation between them.
 
     Raises:
         MeshError: the object has no usable convex pieces.
@@ -239,7 +238,7 @@ def robustness(
 
 
 def _noise(obj: ObjectModel, noise_m: float, noise_rad: float, seed: tuple[int, ...]) -> Floats:
-    """(7,) motion of the object."""
+    """Return a random motion (7,) of the object."""
     rng = np.random.default_rng(seed)
     shift, axis = rng.normal(size=(2, 3))
     rotation = quat_from_axis_angle(axis / np.linalg.norm(axis), np.array(noise_rad))
@@ -248,7 +247,7 @@ def _noise(obj: ObjectModel, noise_m: float, noise_rad: float, seed: tuple[int, 
 
 
 def _moved(grasps: GraspSet, rows: NDArray[np.intp], motion: Floats) -> GraspSet:
-    """The rows of the grasps with the hand moved by one motion (K, 7) each."""
+    """Return the rows of the grasps with the hand moved by one motion (K, 7) each."""
 
     def moved(part: Posture) -> Posture:
         pose, joints = np.asarray(part.hand_pose, float), np.asarray(part.joint_positions, float)

@@ -1,4 +1,4 @@
-"""Verdicts of the validator on many grasps, all cores used; the model of a (hand, object) pair is built once."""
+"""Validation of many grasps on all cores; the model of a (hand, object) pair is built once."""
 
 from __future__ import annotations
 
@@ -29,25 +29,25 @@ from graspd.worker.validation.prefilter.prefilter import PrefilterVerdicts, firs
 from graspd.worker.validation.protocol import DIRECTIONS, FAST_BAND, Outcome, Rollout, Test
 
 log = logging.getLogger(__name__)
-#: Grasps that a process of a pool validates at a time: few, so that those of one batch are shared by many processes.
+#: Grasps per task of a process pool: few, so that many processes share the grasps of one batch.
 _CHUNK: Final = 2
 LEVELS: Final = ("dexgraspbench", "standard", "fast")
-#: Trials that were done, by `postures_key` of one grasp.
+#: Finished rollouts, by `postures_key` of one grasp.
 KnownRollouts = dict[str, Rollout]
 
 
 @dataclass(frozen=True)
 class Verdicts:
-    """What the validator says of N grasps. Verdicts of different terms must not be mixed in one number."""
+    """Verdicts of the validator on N grasps. Rates of verdicts with different terms are not comparable."""
 
     success: NDArray[np.int8]
     """(N,) 1 held in all six directions, 0 not."""
     outcome: NDArray[np.uint8]
-    """(N, 6) `Outcome` of each push +x -x +y -y +z -z; pushes after the first failure are not tried."""
+    """(N, 6) `Outcome` of each push +x -x +y -y +z -z; pushes after the first failure are not simulated."""
     margin: Floats
     """(N,) worst displacement or rotation over its limit."""
     penetration_depth_mm: Floats
-    """(N,) hand-object, as the engine's convex pieces have it."""
+    """(N,) hand-object, with the engine's convex pieces."""
     self_penetration_depth_mm: Floats
     """(N,)"""
     level: str
@@ -58,23 +58,23 @@ class Verdicts:
     excess_m: float
     """Mean height of the pieces above the object's surface [m]."""
     terms: str
-    """`verdict_key`: digest of all that moves a verdict but the grasp. Rates of different terms do not compare."""
+    """`verdict_key`: digest of everything that affects a verdict except the grasp."""
     key: str
-    """Digest of the terms and of the postures that were validated."""
+    """Digest of the terms and of the validated postures."""
     validated_by: NDArray[np.uint8]
-    """(N,) `JudgedBy`: whose verdict it is. Only those of MuJoCo on the CPU are certificates."""
+    """(N,) `ValidatedBy`: engine of the verdict. Only MuJoCo on the CPU is the reference."""
     seconds: float
     """Wall time."""
     steps: int
-    """Simulation steps of all trials."""
+    """Simulation steps of all rollouts."""
     rechecked: int = 0
-    """Verdicts of the prefilter that the CPU was asked for as well; where they differ the CPU's stands."""
+    """Verdicts of the prefilter rechecked on the CPU; where they differ, the CPU's stands."""
     contradicted: int = 0
-    """How many of them differed."""
+    """Number of rechecked verdicts that differed."""
 
     @property
     def reasons(self) -> list[str]:
-        """Per grasp: `held`, or the first thing that went wrong and where."""
+        """`held` per grasp, or the first failure and its direction."""
         axes = ("+x", "-x", "+y", "-y", "+z", "-z")
         found: list[str] = []
         for row in self.outcome:
@@ -98,10 +98,10 @@ def validate(
     prefilter: PrefilterVerdicts | None = None,
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> Verdicts:
-    """Test grasps by the DexGraspBench force-closure protocol; see `worker.validation.protocol` for the levels.
+    """Validate grasps by DexGraspBench's force-closure protocol; levels: see `worker.validation.protocol`.
 
     MuJoCo releases the interpreter lock while it steps, so threads use a few cores; for many `run` has a pool. Where
-    `run` has a prefilter it gives the clear verdicts, see `worker.validation.prefilter.prefilter`.
+    `run` has a prefilter, it decides the clear cases, see `worker.validation.prefilter.prefilter`.
 
     Args:
         hand: the hand; its stiffness and effort are the actuators' gains and limits.
@@ -111,21 +111,21 @@ def validate(
         hard: sliding friction halved, torsional friction a tenth.
         pieces: convex pieces of the object; by default its CoACD pieces.
         cache: folder of the pieces, see `decompose`.
-        known: trials of the CPU on these terms that are not done again; others are added.
-        prefilter: what `prefiltered` says of these grasps on these terms; None: it is asked.
-        run: told of grasps done; asked between grasps whether to stop.
+        known: finished CPU rollouts on these terms, which are reused; new ones are added.
+        prefilter: result of `prefiltered` on these grasps and terms; None: it is computed.
+        run: receives the number of finished grasps; polled for cancellation between grasps.
 
     Raises:
         InputError: unknown level.
         MeshError: the object has no usable convex pieces.
-        TaskCancelled: when `run.cancelled()` answers True.
+        TaskCancelled: `run.cancelled()` returned True.
     """
     if level not in LEVELS:
         raise InputError(f"unknown level {level!r}; choose one of {', '.join(LEVELS)}")
     began = time.perf_counter()
     pieces = pieces or decompose(obj, cache=cache)
     prefilter_terms = first_terms(hand, level, run)
-    # What the prefilter leaves over is near a limit: coarse physics would ask the standard level as well.
+    # The prefilter leaves only cases near a limit, for which coarse physics would defer to level standard as well.
     of_the_cpu: Level = "standard" if prefilter_terms else level
     case = _Case(hand, obj, pieces, of_the_cpu, hard)
     terms = verdict_key(hand, obj, level, hard, pieces=pieces, prefilter=prefilter_terms)
@@ -152,7 +152,7 @@ def validate(
 def prefiltered(
     hand: HandModel, obj: ObjectModel, grasps: GraspSet, *, level: Level, pieces: ConvexPieces, run: ExecutionContext
 ) -> PrefilterVerdicts:
-    """What `validate` asks of the GPU prefilter, for whoever has the device before."""
+    """Run the GPU prefilter for `validate` beforehand, in the thread that has the device."""
     prefilter_terms = first_terms(hand, level, run)
     terms = verdict_key(hand, obj, level, False, pieces=pieces, prefilter=prefilter_terms)
     return _screened(
@@ -168,7 +168,7 @@ def _screened(
 
 @dataclass(frozen=True)
 class _Case:
-    """What is validated, and how."""
+    """Subject and terms of a validation."""
 
     hand: HandModel
     obj: ObjectModel
@@ -178,7 +178,7 @@ class _Case:
 
     @cached_property
     def scene(self) -> Scene:
-        """Of the standard level."""
+        """The scene of level standard."""
         return self._scene(MujocoOptions())
 
     @property
@@ -190,12 +190,12 @@ class _Case:
 
     @cached_property
     def bench(self) -> _Bench:
-        """Of a process of a pool, which keeps it with the case."""
+        """Tests in a process of a pool, cached with the case."""
         return _Bench(self, 1)
 
 
 def _try(case: _Case, grasps: GraspSet, rows: list[int], rollouts: dict[int, Rollout], run: ExecutionContext) -> None:
-    """Put the trials of some grasps among those that are there."""
+    """Add the rollouts of some grasps to `rollouts`."""
     if run.pool is None:
         _Bench(case, run.cores).validate(grasps, rows, rollouts, run)
         return
@@ -209,12 +209,12 @@ def _try(case: _Case, grasps: GraspSet, rows: list[int], rollouts: dict[int, Rol
 
 
 def _rollouts(case: _Case, grasps: GraspSet) -> list[Rollout]:
-    """Of some grasps, one after the other."""
+    """Return the rollouts of some grasps, run one after the other."""
     return [case.bench.rollout(grasps, row) for row in range(len(grasps))]
 
 
 class _Bench:
-    """A test for each thread."""
+    """One test per thread."""
 
     def __init__(self, case: _Case, threads: int) -> None:
         self.level, self.threads = case.level, threads
@@ -227,7 +227,7 @@ class _Bench:
                 self._coarse.put(Test(coarse))
 
     def validate(self, grasps: GraspSet, rows: list[int], rollouts: dict[int, Rollout], run: ExecutionContext) -> None:
-        """Put the trials of some grasps among those that are there."""
+        """Add the rollouts of some grasps to `rollouts`."""
         done = Count(len(grasps), run, "validation", len(grasps) - len(rows))
 
         def work(row: int) -> None:
@@ -242,7 +242,7 @@ class _Bench:
         if self.level == "fast":
             rollout = self._with(self._coarse, grasps, row)
             low, high = FAST_BAND
-            # A penetration has no margin: it is a fact of geometry, the same in either physics.
+            # A penetration has no margin: it is geometric, the same in either physics.
             clear = rollout.outcomes[0] is Outcome.PENETRATION or not low < rollout.margin < high
             if clear and Outcome.DIVERGED not in rollout.outcomes:
                 return rollout

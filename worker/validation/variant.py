@@ -1,8 +1,6 @@
-"""Variants of the validator's model: other shapes, drives, tendons, masses and places that a real hand might as well
-have.
+"""Variants of the validator's model: other plausible shapes, drives, tendons, masses and poses.
 
-A `Variant` says how a model departs from the nominal one, `draw` draws one along an axis, `varied.Models` validates in
-it.
+A `Variant` describes a model's departure from the nominal one; `draw` draws one, `varied.Models` validates in it.
 """
 
 from __future__ import annotations
@@ -20,19 +18,19 @@ from graspd.worker.validation.refit import Fit, fits_of
 
 Vector = tuple[float, float, float]
 
-#: How far each axis goes. Shapes stand out or back by this [m].
+#: Range of each axis. Shapes grow or shrink by this [m].
 GROWTH_M: Final = 1e-3
 #: Factors of drives and of the mass.
 FACTOR: Final = 2.0
-#: Armature [kg m^2] and dry friction [N m] of DexGraspBench's Shadow, which the protocol otherwise leaves out.
+#: Armature [kg m^2] and dry friction [N m] of DexGraspBench's Shadow, which the protocol otherwise omits.
 ARMATURE: Final = 2e-4
 DRY_FRICTION: Final = 0.01
-#: Sliding friction over the nominal 0.6; the torsional coefficient goes with it.
+#: Sliding friction over the nominal 0.6; the torsional coefficient scales with it.
 FRICTIONS: Final = (0.4 / 0.6, 0.8 / 0.6)
 CENTRE_M: Final = 5e-3
 SHIFT_M: Final = 2e-3
 TURN: Final = float(np.radians(2.0))
-#: The last finger begins so much later than the first, as a share of the time of closing (0.8 s).
+#: Latest start of a finger after the first, as a share of the time of closing (0.8 s).
 LATEST: Final = 0.25
 
 Coupling = Literal["own", "compliant", "separate", "ratio"]
@@ -40,64 +38,65 @@ Coupling = Literal["own", "compliant", "separate", "ratio"]
 
 @dataclass(frozen=True)
 class Variant:
-    """A model around the nominal one; by default that itself."""
+    """A model near the nominal one; by default the nominal one."""
 
     fit: Fit = "own"
-    """What the hand's collision shapes are replaced by, see `refit`."""
+    """Replacement of the hand's collision shapes, see `refit`."""
     grown_m: float = 0.0
-    """How far the hand's collision shapes stand out from where they were [m]."""
+    """Growth of the hand's collision shapes [m]."""
     armature: float | None = None
-    """Of every joint [kg m^2 or kg]; None: the model's own."""
+    """Armature of every joint [kg m^2 or kg]; None: the model's own."""
     dry_friction: float | None = None
-    """Of every joint [N m or N]; None: the model's own."""
+    """Dry friction of every joint [N m or N]; None: the model's own."""
     damping: float = 1.0
     """Joint damping over the model's own."""
     gain: float = 1.0
-    """Position gain over the model's own; limits of torque stay."""
+    """Position gain over the model's own; torque limits stay."""
     coupling: Coupling = "own"
-    """compliant: what couples joints gives way under load; separate, ratio: tendons read otherwise, see `recoupled`."""
+    """compliant: couplings yield under load; separate, ratio: other readings of tendons, see `recoupled`."""
     friction: float = 1.0
     """Sliding and torsional friction over the model's own."""
     mass: float = 1.0
-    """Mass of the object over the model's own; what pushes it is its weight and grows with it."""
+    """Mass of the object over the model's own; pushes equal its weight and grow with it."""
     centre_m: Vector = (0.0, 0.0, 0.0)
     """Shift of the object's centre of mass in its frame [m]."""
     object_shift_m: Vector = (0.0, 0.0, 0.0)
-    """The object stands off by this, in its frame [m]."""
+    """Shift of the object, in its frame [m]."""
     object_turn: Vector = (0.0, 0.0, 0.0)
-    """and turned by this rotation vector about its centre of mass [rad]."""
+    """Rotation vector of the object about its centre of mass [rad]."""
     hand_shift_m: Vector = (0.0, 0.0, 0.0)
-    """The hand's root is off by this all the time, in its own frame [m]."""
+    """Constant offset of the hand's root, in its own frame [m]."""
     lags: tuple[float, ...] = ()
-    """Of each fingertip: how much later than the first its finger begins, as a share of the time of closing."""
+    """Per fingertip, delay of its finger after the first, as a share of the time of closing."""
 
 
 NOMINAL: Final = Variant()
 
 
 def axes_of(hand: HandModel) -> tuple[Axis, ...]:
-    """Axes along which a model of this hand can differ: without coupled joints there is nothing to vary in them."""
+    """Return the axes along which models of this hand can differ; couplings only where joints are coupled."""
     missing = set() if couplings_of(hand) else {Axis.COUPLINGS}
     missing |= {Axis.ORDER} if len(hand.fingertips) < 2 else set()
     return tuple(axis for axis in Axis if axis is not Axis.NONE and axis not in missing)
 
 
 def couplings_of(hand: HandModel) -> tuple[Coupling, ...]:
-    """Readings of a hand's couplings that are not its own: of dofs that drive several joints, and of tendons."""
+    """Return other readings of a hand's couplings: dofs that drive several joints, and tendons."""
     rigid: tuple[Coupling, ...] = ("compliant",) if len(hand.joint_body) > hand.dofs else ()
     return (*rigid, "separate", "ratio") if hand.tendons else rigid
 
 
 def dealt(hand: HandModel, models: int, seed: tuple[int, ...]) -> list[Axis]:
-    """The axes of the first models of a grasp: all of the hand's in an order at random, then again."""
+    """Return the axes of a grasp's first models: all of the hand's in random order, then again."""
     axes = axes_of(hand)
     rounds = range(-(-models // len(axes)))
     return [axes[i] for k in rounds for i in np.random.default_rng((*seed, k)).permutation(len(axes))][:models]
 
 
 def draw(axis: Axis, hand: HandModel, rng: np.random.Generator) -> Variant:
-    """A variant of a hand along one axis. Directions are even over the sphere, sizes over their range, factors over
-    the logarithm of theirs.
+    """Draw a variant of a hand along one axis.
+
+    Directions are uniform on the sphere, sizes uniform in their range, factors log-uniform.
 
     Raises:
         ValueError: the axis is none, or the hand has no couplings.
@@ -132,14 +131,14 @@ def draw(axis: Axis, hand: HandModel, rng: np.random.Generator) -> Variant:
 
 
 def together(variants: Iterable[Variant]) -> Variant:
-    """One variant that departs along the axes of several; where two change the same, the later one counts."""
+    """Combine variants along several axes; where two change the same value, the later one counts."""
     own, changed = asdict(NOMINAL), dict[str, Any]()
     for one in variants:
         changed |= {name: value for name, value in asdict(one).items() if value != own[name]}
     return replace(NOMINAL, **changed)
 
 
-#: Ways in which collision shapes differ.
+#: Variants of collision shapes.
 SHAPES: Final[tuple[tuple[Fit, float], ...]] = (
     ("hull", 0.0),
     ("primitive", 0.0),
@@ -150,7 +149,7 @@ SHAPES: Final[tuple[tuple[Fit, float], ...]] = (
 
 
 def _shapes(hand: HandModel) -> list[int]:
-    """Rows of `SHAPES` that change something in this hand."""
+    """Return the rows of `SHAPES` that change something in this hand."""
     fits = fits_of(hand)
     return [i for i, (fit, _) in enumerate(SHAPES) if fit == "own" or fit in fits]
 
@@ -166,10 +165,10 @@ def _vector(rng: np.random.Generator, most: float) -> Vector:
 
 
 def recoupled(hand: HandModel, coupling: Coupling) -> HandModel:
-    """The hand in another reading of its tendons; itself where it has none, or where the reading is of other things.
+    """Return the hand with its tendons read otherwise; itself without tendons, or for other readings.
 
-    separate: each joint of a tendon has the drive that it would have without. ratio: joints of a tendon turn as one,
-    each by the same angle over its coefficient's sign, with the gain and the limit of all their drives together.
+    separate: each joint of a tendon gets the drive it would have without the tendon. ratio: joints of a tendon turn as
+    one, by equal angles with their coefficients' signs, with the sum of their drives' gains and limits.
     """
     if not hand.tendons or coupling not in ("separate", "ratio"):
         return hand
@@ -209,7 +208,7 @@ def recoupled(hand: HandModel, coupling: Coupling) -> HandModel:
 
 
 def nearest(hand: HandModel, joints: Floats) -> Floats:
-    """Joint positions (N, J) that a hand of fewer dofs can take, nearest to those given."""
+    """Return the joint positions (N, J) nearest to the given ones that a hand of fewer dofs can take."""
     dof, rate = hand.dof[hand.joint_body], hand.multiplier[hand.joint_body]
     drive = np.zeros((len(dof), hand.dofs))
     drive[np.arange(len(dof)), dof] = rate

@@ -1,4 +1,4 @@
-"""The validator's test of a grasp in a variant of the model: shapes are compiled anew, numbers changed in a copy."""
+"""Validation of a grasp in a variant of the model: shapes are recompiled, numbers changed in a copy."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ from graspd.worker.validation.protocol import STAGES, Rollout, Test
 from graspd.worker.validation.refit import Fit, refitted
 from graspd.worker.validation.variant import Coupling, Variant, nearest, recoupled
 
-#: What couples joints where it gives way: MuJoCo's default constraint, 2.5 times as slow as the protocol's and softer.
+#: Compliant couplings: MuJoCo's default constraint, 2.5 times as slow as the protocol's and softer.
 COMPLIANT_SOLREF: Final = (0.02, 1.0)
 COMPLIANT_SOLIMP: Final = (0.9, 0.95, 1e-3, 0.5, 2.0)
 
 
-#: What of a variant is compiled: shapes, by how much they stand out, drives.
+#: Compiled parts of a variant: shapes, their growth, drives.
 _Build = tuple[Fit, float, Coupling]
 
 
 class Models:
-    """The models around a nominal one, of one hand and object, and of what stands around it; threads share it."""
+    """Models around the nominal one of a hand, an object and its surroundings. Thread-safe."""
 
     def __init__(
         self,
@@ -54,22 +54,22 @@ class Models:
         self._fingers = _fingers(hand)
 
     def standard(self, grasps: GraspSet, row: int, variant: Variant) -> Rollout:
-        """The verdict on one grasp, at the level of the standard level, in a variant; the nominal one has the verdict
-        of `validate` bit for bit."""
+        """Return the verdict of level standard on one grasp in a variant.
+        The nominal variant reproduces the verdict of `validate` bit for bit."""
         test = VariantTest(self.scene(variant), variant, self._lags(variant))
         return test.standard(self._taken(test.scene, seen(self.obj, grasps, row, variant)), 0)
 
     def lift(
         self, grasps: GraspSet, row: int, placed: PlacedGrasps, variant: Variant, *, dexgraspbench: bool = False
     ) -> LiftTest:
-        """What the lift test says of a grasp in a variant; the nominal one has that of `validate_lifts` bit for bit.
+        """Lift a grasp in a variant; the nominal one reproduces `validate_lifts` bit for bit.
 
         Args:
-            grasps: with, except at level dexgraspbench, their way.
+            grasps: the grasps, with their approach except at level dexgraspbench.
             row: of the grasp.
             placed: the scenes of all grasps; their supports and neighbours are those of these models.
             variant: the model.
-            letter: the published test instead of the whole one.
+            dexgraspbench: run the published test instead of the whole one.
         """
         number = int(placed.index[row])
         variant = upright(variant, placed.scenes[number].up)
@@ -88,7 +88,7 @@ class Models:
         return test.dexgraspbench(one, 0) if dexgraspbench else test.lift(one, 0)
 
     def _taken(self, scene: Scene, one: GraspSet) -> GraspSet:
-        """The grasp as the hand of a scene can take it: one of fewer dofs cannot take all postures."""
+        """Project the grasp on a hand of fewer dofs, which cannot take all postures."""
         if scene.hand.dofs < self.hand.dofs:
             for part in (one.grasp, one.pregrasp, one.squeeze):
                 part.joint_positions = nearest(scene.hand, part.joint_positions)
@@ -97,7 +97,7 @@ class Models:
         return one
 
     def scene(self, variant: Variant) -> Scene:
-        """The compiled model of a variant; its places are those of `place` and `command`."""
+        """Return the compiled model of a variant, with the addresses for `place` and `command`."""
         built: _Build = (variant.fit, variant.grown_m, "own" if variant.coupling == "compliant" else variant.coupling)
         with self._lock:
             if built not in self._scenes:
@@ -105,13 +105,13 @@ class Models:
                 self._scenes[built] = build(self._hands[built], self.obj, self._pieces, self._physics, *self._around)
             scene = self._scenes[built]
         if any(variant.centre_m):
-            # The body's frame stands in the centre of mass.
+            # The body's frame is at the centre of mass.
             obj = replace(self.obj, centre_of_mass=self.obj.centre_of_mass + variant.centre_m)
             scene = build(self._hands[built], obj, self._pieces, self._physics, *self._around)
         return _with_numbers(scene, variant)
 
     def _lags(self, variant: Variant) -> Floats | None:
-        """(J,) when each joint begins, as a share of the time of closing; None: all at once."""
+        """Return delays (J,) of joints, as shares of the time of closing; None: all start at once."""
         if not any(variant.lags):
             return None
         lags = np.array([0.0, *variant.lags])
@@ -133,7 +133,7 @@ class _OneByOne(Test):
             even = stage / stages
             part = int(even >= 1)
             pose, _ = blend(parts[part], parts[part + 1], row, even - part)
-            # Who begins later moves faster: all are there at the end.
+            # Delayed joints move faster: all arrive at the same time.
             late = np.clip((even / 2 - self._lags) / (1 - self._lags.max()), 0, 1) * 2
             joints = [part.joint_positions[row] for part in parts]
             first, second = np.minimum(late, 1), np.maximum(late - 1, 0)
@@ -142,7 +142,7 @@ class _OneByOne(Test):
 
 
 class VariantTest(_OneByOne):
-    """The test of one grasp with another weight and order of closing."""
+    """Six pushes of one grasp with another weight and order of closing."""
 
     __test__ = False
 
@@ -170,7 +170,7 @@ class VariantLift(_OneByOne, Lift):
 
 
 def _with_numbers(scene: Scene, variant: Variant) -> Scene:
-    """The scene with the numbers of a variant, in a copy of its model; itself where there is none to change."""
+    """Return the scene with a variant's numbers in a copy of its model; itself if nothing changes."""
     compiled = "own" if variant.coupling == "compliant" else variant.coupling
     plain = replace(
         variant, armature=None, dry_friction=None, damping=1.0, gain=1.0, friction=1.0, mass=1.0, coupling=compiled
@@ -192,7 +192,7 @@ def _with_numbers(scene: Scene, variant: Variant) -> Scene:
     if variant.coupling == "compliant":
         of_joints = model.eq_type == int(mujoco.mjtEq.mjEQ_JOINT)
         model.eq_solref[of_joints], model.eq_solimp[of_joints] = COMPLIANT_SOLREF, COMPLIANT_SOLIMP
-    # Inverse inertias that follow from masses and armature set how stiff contacts are.
+    # Contact stiffness depends on inverse inertias, which follow from masses and armature.
     mujoco.mj_setConst(model, mujoco.MjData(model))
     return replace(scene, model=model)
 
@@ -202,7 +202,7 @@ def _joint_of(model: Any, qpos: int) -> int:
 
 
 def seen(obj: ObjectModel, grasps: GraspSet, row: int, variant: Variant) -> GraspSet:
-    """One grasp as the object meets it where that, or the hand, is not quite where it was thought to be."""
+    """Return one grasp relative to the object, for a variant with displaced object or hand."""
     one = grasps.take(np.array([row]))
     if not (moves_object(variant) or any(variant.hand_shift_m)):
         return one
@@ -218,12 +218,12 @@ def seen(obj: ObjectModel, grasps: GraspSet, row: int, variant: Variant) -> Gras
 
 
 def moves_object(variant: Variant) -> bool:
-    """Whether the object stands elsewhere than it was thought to."""
+    """Check whether the object is displaced in a variant."""
     return any((*variant.object_shift_m, *variant.object_turn))
 
 
 def motion_of(obj: ObjectModel, variant: Variant) -> Floats:
-    """(7,) from where the object was thought to be to where it stands, in its frame."""
+    """Return the motion (7,) from the nominal to the displaced object, in its frame."""
     turn = np.array(variant.object_turn)
     angle = float(np.linalg.norm(turn))
     turned = quat_from_axis_angle(turn / angle if angle else np.array([1.0, 0, 0]), np.array(angle))
@@ -232,8 +232,8 @@ def motion_of(obj: ObjectModel, variant: Variant) -> Floats:
 
 
 def upright(variant: Variant, up: Floats) -> Variant:
-    """The variant for an object that stands on something: of where it may be, what lies along its support, and of how
-    it may be turned, what leaves it standing. `up` (3,) is against gravity, in its frame."""
+    """Restrict a variant to an object on a support: shifts along the support, turns about the vertical.
+    `up` (3,) is against gravity, in the object frame."""
     if not moves_object(variant):
         return variant
     shift, turn = np.array(variant.object_shift_m), np.array(variant.object_turn)
@@ -242,14 +242,14 @@ def upright(variant: Variant, up: Floats) -> Variant:
 
 
 def _fingers(hand: HandModel) -> NDArray[np.intp]:
-    """(J,) the fingertip, as a place in `hand.fingertips`, that a joint moves; -1: several, or none."""
+    """Return the index (J,) in `hand.fingertips` of the fingertip that a joint moves; -1: several or none."""
     moved: list[set[int]] = [set() for _ in range(hand.bodies)]
     for place, tip in enumerate(hand.fingertips):
         body = tip
         while body >= 0:
             moved[body].add(place)
             body = int(hand.parent[body])
-    # Joints of one dof move together: what they move, all of them move.
+    # Joints of one dof move together, and so do the fingertips that any of them moves.
     of_dof: dict[int, set[int]] = {}
     for body in hand.joint_body.tolist():
         of_dof.setdefault(int(hand.dof[body]), set()).update(moved[body])

@@ -1,1 +1,1 @@
-"""Warp kernels and functions of the pictures: rays, what surfaces send back, and what a pixel makes of both."""
+"""Warp kernels and functions of pictures: rays, reflected light, and the passes of a pixel."""

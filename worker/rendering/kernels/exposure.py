@@ -1,4 +1,4 @@
-"""The Warp kernel that makes pictures: all passes of a pixel, one after the other."""
+"""The Warp kernel that renders pictures: all passes of a pixel, one after the other."""
 
 import warp as wp
 
@@ -12,7 +12,7 @@ class LightPass:
     """One directional light, one ray through every pixel."""
 
     shift: wp.vec2f
-    """Of the ray from the pixel's centre [px]."""
+    """Offset of the ray from the pixel's centre [px]."""
     lamp_weight: wp.float32
     sky_weight: wp.float32
 
@@ -65,7 +65,7 @@ def expose(
         if k == 0:
             near = rays.may_meet(placed_in, world, eye, direction, spread)
         if flat:
-            # Nothing changes from pass to pass but where the ray meets the plane.
+            # Only the point where the ray meets the plane changes between passes.
             hit.distance = offset / wp.dot(hit.normal, direction)
         else:
             hit = rays.first_hit(placed_in, corner_normal_in, world, near, eye, direction)
@@ -91,11 +91,11 @@ def expose(
             continue
         m = material_in[world, hit.shape]
         if m.pattern == shading.CATCHER:
-            # The studio floor shows the backdrop, darkened where the light does not arrive.
+            # The studio floor shows the backdrop, darkened in shadow.
             dark = (1.0 - visible) * wp.min(1.0, 2.0 * cosine) * (0.16 * one.lamp_weight + 0.14 * one.sky_weight)
             total += shading.backdrop(light, direction) * (1.0 - dark)
             continue
-        # Noise is most of the cost: it is drawn once per pixel and kept for the passes that hit the same shape.
+        # Noise is most of the cost: it is computed once per pixel and reused for passes that hit the same shape.
         colour = albedo
         if k == 0 or m.pattern == shading.TILES or seen != hit.shape:
             there = placed_in[world, hit.shape]

@@ -1,14 +1,14 @@
-"""Rays against solids, as Warp functions: what a ray meets first, and whether anything is in its way.
+"""Rays against solids, as Warp functions: the first hit, and occlusion.
 
-A world is a few solids in poses of their own: meshes in trees of their own, which all worlds share, and boxes in closed
-form. There are so few of them that a ray asks each whether it passes its bounds.
+A world is a few solids in poses of their own: meshes with trees that all worlds share, and boxes in closed form. They
+are so few that a ray tests the bounds of each.
 """
 
 import warp as wp
 
-#: Rays go no further [m].
+#: Maximum length of rays [m].
 FAR = wp.constant(100.0)
-#: From a surface to where its shadow rays begin, along its normal [m].
+#: Offset of shadow rays from their surface, along its normal [m].
 CLEAR = wp.constant(1.0e-4)
 _TINY = wp.constant(1.0e-15)
 
@@ -21,32 +21,32 @@ class PlacedSolid:
     """Bounds along the axes of the world [m]."""
     upper: wp.vec3f
     place: wp.vec3f
-    """Its origin [m]."""
+    """Origin of the solid [m]."""
     turn: wp.mat33f
-    """From the axes of the world to its own."""
+    """Rotation from the world's axes to the solid's."""
     mesh: wp.uint64
-    """Of a `wp.Mesh` in its own frame; 0: a box around its origin."""
+    """Id of a `wp.Mesh` in its own frame; 0: a box around its origin."""
     half: wp.vec3f
     """Half the extents of the box [m]."""
     first_corner: wp.int32
-    """Where the normals of the mesh's corners begin."""
+    """First index of the mesh's corner normals."""
 
 
 @wp.struct
 class RayHit:
-    """What a ray meets first."""
+    """First hit of a ray."""
 
     shape: wp.int32
     """-1: nothing."""
     distance: wp.float32
     """In lengths of the ray's direction."""
     normal: wp.vec3f
-    """Unit, in the world's frame; of meshes between the normals of the corners."""
+    """Unit normal in the world's frame; on meshes interpolated between corner normals."""
 
 
 @wp.func
 def inverse_of(direction: wp.vec3f):
-    """One over each component, finite."""
+    """Return one over each component, finite."""
     inverse = wp.vec3f()
     for k in range(3):
         d = direction[k]
@@ -61,7 +61,7 @@ def bit_of(k: wp.int32):
 
 @wp.func
 def goes_through(lower: wp.vec3f, upper: wp.vec3f, origin: wp.vec3f, inverse: wp.vec3f, far: wp.float32):
-    """Whether a ray goes through bounds before `far`."""
+    """Check whether a ray passes through bounds before `far`."""
     a = wp.cw_mul(lower - origin, inverse)
     b = wp.cw_mul(upper - origin, inverse)
     low = wp.min(a, b)
@@ -73,8 +73,8 @@ def goes_through(lower: wp.vec3f, upper: wp.vec3f, origin: wp.vec3f, inverse: wp
 
 @wp.func
 def box_distance(half: wp.vec3f, origin: wp.vec3f, direction: wp.vec3f):
-    """To the face of a box that a ray meets first, from inside to the one it leaves by, and the axis along which that
-    face looks; -1: none."""
+    """Return the distance to the first face of a box, or from inside to the exit face, and its axis.
+    The axis is that of the face's normal; -1: no hit."""
     inverse = inverse_of(direction)
     a = wp.cw_mul(-half - origin, inverse)
     b = wp.cw_mul(half - origin, inverse)
@@ -93,13 +93,13 @@ def box_distance(half: wp.vec3f, origin: wp.vec3f, direction: wp.vec3f):
 def may_meet(
     placed: wp.array2d[PlacedSolid], world: wp.int32, origin: wp.vec3f, direction: wp.vec3f, spread: wp.float32
 ):
-    """Bit k: whether a unit ray that is off another one by no more than `spread` may meet solid k. From the 64th on,
-    bits are of several."""
+    """Return a mask, bit k: a unit ray within `spread` of another one may hit solid k.
+    From the 64th on, bits are shared."""
     inverse = inverse_of(direction)
     near = wp.uint64(0)
     for k in range(placed.shape[1]):
         there = placed[world, k]
-        # A ray within the bounds is no further off than at their farthest corner.
+        # Within the bounds, the deviation of a ray is largest at their farthest corner.
         off = spread * wp.length(wp.max(wp.abs(there.lower - origin), wp.abs(there.upper - origin)))
         wide = wp.vec3f(off, off, off)
         if goes_through(there.lower - wide, there.upper + wide, origin, inverse, FAR):
@@ -109,8 +109,8 @@ def may_meet(
 
 @wp.func
 def on_one_face(there: PlacedSolid, hit: RayHit, point: wp.vec3f, direction: wp.vec3f, spread: wp.float32):
-    """Whether all rays that are off this one by no more than `spread`, and meet no other solid, meet the same plane:
-    the face of a box, away from its edges."""
+    """Check whether all rays within `spread` of this one hit the same plane, unless another solid is hit.
+    The plane is the face of a box, away from its edges."""
     if there.mesh != wp.uint64(0):
         return False
     reach = 2.0 * spread * hit.distance / wp.max(-wp.dot(hit.normal, direction), 0.01)
@@ -131,7 +131,7 @@ def first_hit(
     origin: wp.vec3f,
     direction: wp.vec3f,
 ):
-    """What a ray meets first of those that it `may_meet`. A mesh of which it meets the inside first is not seen."""
+    """Return the first hit of a ray among solids that it `may_meet`; meshes hit from inside are ignored."""
     hit = RayHit()
     hit.shape = wp.int32(-1)
     hit.distance = FAR
@@ -158,7 +158,7 @@ def first_hit(
                 if distance >= 0.0 and distance < hit.distance:
                     hit.shape = k
                     hit.distance = distance
-                    # Toward the ray's origin, also from inside.
+                    # Towards the ray's origin, also from inside.
                     smooth = wp.vec3f()
                     smooth[axis] = -wp.sign(along[axis])
     if hit.shape >= 0:
@@ -173,7 +173,7 @@ def first_hit(
 
 @wp.func
 def in_the_way(placed: wp.array2d[PlacedSolid], world: wp.int32, origin: wp.vec3f, direction: wp.vec3f):
-    """Whether a ray meets anything at all."""
+    """Check whether a ray hits anything."""
     inverse = inverse_of(direction)
     for k in range(placed.shape[1]):
         there = placed[world, k]

@@ -1,4 +1,4 @@
-"""Materials, light and the tone curve, as Warp functions: what comes back from a surface along a ray."""
+"""Materials, light and the tone curve, as Warp functions: the light reflected along a ray."""
 
 import warp as wp
 
@@ -76,7 +76,7 @@ def backdrop(light: Light, direction: wp.vec3f):
 
 @wp.func
 def surroundings(light: Light, direction: wp.vec3f, roughness: wp.float32):
-    # A room in one line: bright ceiling panel, dim floor, edge softened by the surface's roughness.
+    # A simple room: bright ceiling panel, dim floor, edge softened by the surface's roughness.
     soft = 0.12 + 0.6 * roughness
     room = mix(light.ground * 1.8, light.sky * 1.4, wp.smoothstep(-soft, soft, direction[2] - 0.05))
     panel = wp.smoothstep(0.82 - 0.5 * soft, 0.82 + 0.5 * soft, direction[2])
@@ -95,8 +95,8 @@ def radiance(
     lamp_weight: wp.float32,
     sky_weight: wp.float32,
 ):
-    """What a surface sends back along a ray: Blinn-Phong with the energy norm (n + 8) / 8, Schlick's Fresnel term."""
-    # A normal that is interpolated may turn away from the eye at silhouettes.
+    """Return the light reflected along a ray: Blinn-Phong, energy norm (n + 8) / 8, Schlick's Fresnel."""
+    # An interpolated normal may face away from the eye at silhouettes.
     facing = wp.max(-wp.dot(n, direction), 0.02)
     slant = 1.0 - wp.min(facing, 1.0)
     f0 = mix(wp.vec3f(0.04), albedo, m.metalness)

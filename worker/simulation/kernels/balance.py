@@ -1,16 +1,16 @@
 """Non-negative least squares with a ridge, for many small systems at once.
 
 Each system is min |M x - t|^2 + s^2 |x|^2 over x >= 0, with R rows and K columns, R much less than K. Its minimum has
-s^2 x = max(0, M^T r) with the residual r = t - M x, so r is where the convex, piecewise quadratic
-phi(r) = s^2 |r|^2 / 2 + |max(0, M^T r)|^2 / 2 - s^2 t r is least: R unknowns instead of K. Newton's method on it ends
-after finitely many steps, at the exact minimum, as soon as the set of columns with M^T r > 0 stays the same.
+s^2 x = max(0, M^T r) with the residual r = t - M x. So r minimises the convex, piecewise quadratic phi(r) = s^2 |r|^2 /
+2 + |max(0, M^T r)|^2 / 2 - s^2 t r: R unknowns instead of K. Newton's method ends at the exact minimum after finitely
+many steps, once the set of columns with M^T r > 0 stays the same.
 """
 
 import warp as wp
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
-#: Newton steps, and halvings of one, before a system counts as not solved: 4 to 9 steps and no halving are usual.
+#: Newton steps, and halvings of one, before a system counts as unsolved: 4 to 9 steps and no halving are usual.
 STEPS = wp.constant(60)
 HALVINGS = wp.constant(30)
 
@@ -28,7 +28,7 @@ class Workspace:
 
 @wp.func
 def slope(matrix: wp.array3d(dtype=wp.float64), b: int, k: int, r: wp.array2d(dtype=wp.float64)):
-    """Column k of system b times a vector."""
+    """Return the product of column k of system b and a vector."""
     total = wp.float64(0.0)
     for i in range(matrix.shape[2]):
         total = total + matrix[b, k, i] * r[b, i]
@@ -37,7 +37,7 @@ def slope(matrix: wp.array3d(dtype=wp.float64), b: int, k: int, r: wp.array2d(dt
 
 @wp.func
 def change(matrix: wp.array3d(dtype=wp.float64), b: int, k: int, sign: wp.float64, work: Workspace):
-    """Take column k into the normal matrix, or out of it."""
+    """Add column k to the normal matrix, or remove it."""
     for i in range(matrix.shape[2]):
         for j in range(i + 1):
             work.normal[b, i, j] = work.normal[b, i, j] + sign * matrix[b, k, i] * matrix[b, k, j]
@@ -45,7 +45,7 @@ def change(matrix: wp.array3d(dtype=wp.float64), b: int, k: int, sign: wp.float6
 
 @wp.func
 def solve(target: wp.array(dtype=wp.float64), scale: wp.float64, b: int, work: Workspace):
-    """`wanted` = normal^-1 scale target, by Cholesky."""
+    """Compute `wanted` = normal^-1 scale target, by Cholesky."""
     rows = target.shape[0]
     for i in range(rows):
         for j in range(i + 1):
@@ -78,7 +78,7 @@ def objective(
     b: int,
     r: wp.array2d(dtype=wp.float64),
 ):
-    """phi, see the module."""
+    """Return phi, see the module."""
     total = wp.float64(0.0)
     for i in range(target.shape[0]):
         total = total + square * r[b, i] * (wp.float64(0.5) * r[b, i] - target[i])
@@ -100,9 +100,10 @@ def nonnegative(
     x_out: wp.array2d(dtype=wp.float64),
     sound_out: wp.array(dtype=wp.int32),
 ):
-    """Solve B systems, launched over B. `matrix` (B, K, R) holds the columns of each, `count` (B,) how many are used.
+    """Solve B systems, launched over B.
 
-    `x` (B, K); `feasible` (B,) is 0 where the steps did not suffice.
+    `matrix` (B, K, R) holds their columns, `count` (B,) the number of used ones. `x` is (B, K); `feasible` (B,)
+    is 0 where the steps are not enough.
     """
     b = wp.tid()
     work = work_inout
@@ -117,7 +118,7 @@ def nonnegative(
     for k in range(count):
         work.used[b, k] = 0
     done = wp.int32(0)
-    # Where the last step was a whole one and changed no column's part, r is the minimum.
+    # After a whole step that changes no column's part, r is the minimum.
     whole = wp.int32(0)
     for _step in range(STEPS):
         if done == 0:
@@ -140,7 +141,7 @@ def nonnegative(
                 lower = wp.int32(0)
                 for _half in range(HALVINGS):
                     if lower == 0:
-                        # The factor has served: its first row keeps r for the case that the step is not taken.
+                        # The factor is no longer needed: its first row stores r in case the step is rejected.
                         for i in range(rows):
                             at = work.residual[b, i]
                             work.factor[b, 0, i] = at
@@ -153,7 +154,7 @@ def nonnegative(
                             share = wp.float64(0.5) * share
                             whole = wp.int32(0)
                 if lower == 0:
-                    # Nothing below but rounding errors.
+                    # Only rounding errors remain.
                     done = 1
     for k in range(x_out.shape[1]):
         x_out[b, k] = wp.float64(0.0)

@@ -1,4 +1,4 @@
-"""A hand's bodies from its root and joint positions on, in double precision, and how far they are from half-spaces."""
+"""Poses of a hand's bodies from root and joints, in double precision, and distances from half-spaces."""
 
 import warp as wp
 
@@ -7,7 +7,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class Chain:
-    """A hand's joint tree (L bodies), and its features in the order of their bodies."""
+    """A hand's joint tree (L bodies), and its features sorted by body."""
 
     parent: wp.array(dtype=wp.int32)
     turns: wp.array(dtype=wp.int32)  # 1: revolute
@@ -17,7 +17,7 @@ class Chain:
     axis: wp.array(dtype=wp.vec3d)
     dof: wp.array(dtype=wp.int32)
     multiplier: wp.array(dtype=wp.float64)  # the joint's value: this times that of the dof
-    offset: wp.array(dtype=wp.float64)  # and this
+    offset: wp.array(dtype=wp.float64)  # plus this
     tip: wp.array(dtype=wp.int32)  # 1: a fingertip
     first: wp.array(dtype=wp.int32)  # (L + 1,) features of a body
     centre: wp.array(dtype=wp.vec3d)  # (F,) body frame
@@ -35,7 +35,7 @@ class Bodies:
 
 @wp.func
 def place_body(chain: Chain, bodies: Bodies, p: wp.int32, body: wp.int32, value: wp.float64):
-    """Pose of a body whose parent stands already, and whose joint has this value [rad or m]."""
+    """Compute the pose of a body from its parent's and its joint's value [rad or m]."""
     turned = bodies.rotation[p, chain.parent[body]]
     place = bodies.position[p, chain.parent[body]] + wp.quat_rotate(turned, chain.origin_p[body])
     turned = turned * chain.origin_q[body]
@@ -49,13 +49,13 @@ def place_body(chain: Chain, bodies: Bodies, p: wp.int32, body: wp.int32, value:
 
 @wp.func
 def joint_value(chain: Chain, body: wp.int32, q: wp.float64):
-    """Value of a body's joint at a value of its dof."""
+    """Return the value of a body's joint at a value of its dof."""
     return chain.multiplier[body] * q + chain.offset[body]
 
 
 @wp.func
 def joint_axis(chain: Chain, bodies: Bodies, p: wp.int32, body: wp.int32):
-    """Axis of a body's joint in the frame of the poses: turning about it does not move it."""
+    """Return the axis of a body's joint in the frame of the poses, which its rotation does not change."""
     return wp.quat_rotate(bodies.rotation[p, body], chain.axis[body])
 
 
@@ -69,7 +69,7 @@ def pose(
     # Outputs:
     bodies_out: Bodies,
 ):
-    """Poses of the bodies (P, L) of hands with roots (P, 7), quaternions w x y z, and joints (P, J). Launch over P."""
+    """Compute poses (P, L) of bodies from roots (P, 7), w x y z, and joints (P, J). Launch over P."""
     p = wp.tid()
     bodies_out.position[p, 0] = wp.vec3d(root_in[p, 0], root_in[p, 1], root_in[p, 2])
     bodies_out.rotation[p, 0] = wp.quatd(root_in[p, 4], root_in[p, 5], root_in[p, 6], root_in[p, 3])
@@ -79,11 +79,11 @@ def pose(
 
 @wp.struct
 class HalfSpaces:
-    """Half-spaces n.x <= d of S scenes, one after the other."""
+    """Half-spaces n.x <= d of S scenes, in sequence."""
 
     first: wp.array(dtype=wp.int32)  # (S + 1,)
     planes: wp.array(dtype=wp.vec4d)
-    more: wp.array(dtype=wp.float64)  # by what fingertips count as farther [m]
+    more: wp.array(dtype=wp.float64)  # added distance of fingertips [m]
 
 
 @wp.kernel
@@ -98,7 +98,7 @@ def rooms(
     # Outputs:
     room_inout: wp.array2d(dtype=wp.float64),
 ):
-    """Lower `room_inout` (P, L) to the signed distance of each body from the half-spaces of its scene (P,).
+    """Lower `room_inout` (P, L) to the signed distance of bodies from the half-spaces of their scene (P,).
 
     Launch over (P, L).
     """

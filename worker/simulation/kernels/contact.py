@@ -1,14 +1,14 @@
-"""One step of the object against the static hand, M times per grasp, and how its end depends on every distance.
+"""One step of the object against the static hand, M times per grasp, and its gradient by distances.
 
 A simulation starts the object with velocity v_m; s0 = dt (v, omega) is its free motion. A hand point p at distance rho
-with outward object normal n sees, after the object's motion s = (x, theta) about its centre of mass, the gap
-rho - j.s with j = (n, p x n); it is violated by C = r - rho + j.s, where r is the dilation. Hand and object meet in
-frictional contact while C > 0 (paper, eq. 1 and section III-C). The loss of one simulation is
-(|x| + g |theta|) / |s0| with g the gyration radius; L_stable is the mean over m.
+with outward object normal n has, after the object's motion s = (x, theta) about its centre of mass, the gap rho - j.s
+with j = (n, p x n). The violation is C = r - rho + j.s, where r is the dilation. Hand and object are in frictional
+contact while C > 0 (paper, eq. 1 and section III-C). The loss of one simulation is (|x| + g |theta|) / |s0| with g the
+gyration radius; L_stable is the mean over m.
 
-Each kernel writes dL/drho: the exact adjoint of its solve on active points; on free points the leak, `leak` times what
-the point would feel if it touched, fading with its distance. `one_sided` keeps of the leak only what draws the point
-to the object: with the paper's two-sided leak, opposite velocities cancel wherever nothing touches.
+Each kernel writes dL/drho. On active points it is the exact adjoint of the solve. On free points it is the leak: `leak`
+times the gradient on contact, fading with distance. `one_sided` selects only the leak that attracts the point to the
+object: with the paper's two-sided leak, opposite velocities cancel wherever nothing touches.
 """
 
 import warp as wp
@@ -35,20 +35,20 @@ class Physics:
     leak_length: wp.float32  # [m]
     one_sided: wp.int32
     step: wp.float32  # |s0| of a moving simulation [m]
-    radius: wp.float32  # no point taking part is farther from the centre of mass [m]
+    radius: wp.float32  # no used point is farther from the centre of mass [m]
     near_gap: wp.float32  # direct solver: contacts with a larger gap are not in the list of near ones [m]
 
 
 @wp.func
 def row(n: wp.vec3, p: wp.vec3):
-    """(n, p x n): derivative of the gap's closing along n by the object's motion."""
+    """Return (n, p x n), the derivative of the gap's closing along n by the object's motion."""
     t = wp.cross(p, n)
     return vec6(n[0], n[1], n[2], t[0], t[1], t[2])
 
 
 @wp.func
 def point_motion(s: vec6, p: wp.vec3):
-    """Motion of the object's material at p."""
+    """Return the motion of the object's material at p."""
     return wp.vec3(s[0], s[1], s[2]) + wp.cross(wp.vec3(s[3], s[4], s[5]), p)
 
 
@@ -69,7 +69,7 @@ def add_isotropic(a: mat66, c0: wp.float32, c1: wp.vec3, c2: wp.mat33):
 
 @wp.func
 def solve_spd(a: mat66, b: vec6):
-    """x with a x = b for symmetric positive definite a: Cholesky."""
+    """Return x with a x = b for symmetric positive definite a, by Cholesky."""
     low = mat66(0.0)
     for i in range(6):
         for j in range(6):
@@ -118,7 +118,7 @@ def displacement_gradient(s: vec6, physics: Physics):
 
 @wp.func
 def leaked(pull: wp.float32, gap: wp.float32, physics: Physics):
-    """dL/drho of a free point at distance `gap` from the dilated surface, given what it would be on contact."""
+    """Return dL/drho of a free point at distance `gap` from the dilated surface, from that on contact."""
     if physics.one_sided == 1 and pull < 0.0:
         return float(0.0)
     return physics.leak * pull * wp.exp(-gap / physics.leak_length)
@@ -147,12 +147,12 @@ def direct(
     end_out: wp.array2d(dtype=vec6),
     adjoint_out: wp.array2d(dtype=vec6),
 ):
-    """Order-independent compliant contact: all contacts at once in one 6 x 6 system. Launch over (B, M).
+    """Solve order-independent compliant contact, in one 6 x 6 system. Launch over (B, M).
 
     Minimises 1/2 (s - s0)' M (s - s0) + k/2 sum w_i max(0, C_i)^2 with friction of magnitude at most mu k w_i C_i, by
     iteratively reweighted least squares: a sliding contact is a spring of stiffness k w_i mu C_i / |u_t|, a sticking
-    one a spring of stiffness k w_i. `near` (B, N) lists the contacts whose gap is at most `near_gap`: only those are
-    looked at unless the object moves farther. `adjoint` (B, M) is how the loss depends on forces on the object.
+    one a spring of stiffness k w_i. `near` (B, N) lists the contacts with a gap of at most `near_gap`: others are
+    ignored unless the object moves farther. `adjoint` (B, M) is the derivative of the loss by forces on the object.
     """
     b, m = wp.tid()
     if active_in[b] == 0:
@@ -169,7 +169,7 @@ def direct(
         c0 = float(0.0)
         c1 = wp.vec3(0.0)
         c2 = wp.mat33(0.0)
-        # No point moves farther than this, so points farther from the surface need no look.
+        # Bound on the motion of all points: points farther from the surface are skipped.
         motion = wp.length(wp.vec3(s[0], s[1], s[2])) + wp.length(wp.vec3(s[3], s[4], s[5])) * physics_in.radius
         all_near = motion <= physics_in.near_gap
         count = count_in[b]
@@ -223,7 +223,7 @@ def direct_gradient(
     # Data out:
     gradient_out: wp.array2d(dtype=wp.float32),
 ):
-    """dL/drho of each contact after `direct`, over all simulations in their order. Launch over (B, N / lane)."""
+    """Compute dL/drho of each contact after `direct`, over all simulations in order. Over (B, N / lane)."""
     b, part = wp.tid()
     if active_in[b] == 0:
         return
@@ -258,7 +258,7 @@ def direct_gradient(
 
 @wp.func
 def inverse_mass_along(physics: Physics, j: vec6):
-    """w = j M^-1 j': generalised inverse mass of the object along a row."""
+    """Return w = j M^-1 j', the generalised inverse mass of the object along a row."""
     return wp.dot(j, physics.inverse_mass * j)
 
 
@@ -284,11 +284,11 @@ def gauss_seidel(
     end_out: wp.array2d(dtype=vec6),
     gradient_inout: wp.array2d(dtype=wp.float32),
 ):
-    """The paper's step: one sweep of position-based dynamics over the contacts, in their order (Deul 2016).
+    """Take the paper's step: one sweep of position-based dynamics over the contacts (Deul 2016), in order.
 
     Contact i moves the object by -M^-1 j C / w along the normal, then against the slip of its point by at most mu times
-    that impulse. `states` (B, M, N) keeps the object's motion before each contact for the reverse sweep. `passes` is
-    ignored: a second sweep would need its states too. Launch over (B, M).
+    that impulse. `states` (B, M, N) stores the object's motion before each contact for the reverse sweep. `passes` is
+    ignored: a second sweep would need states as well. Launch over (B, M).
     """
     b, m = wp.tid()
     if active_in[b] == 0:
@@ -374,9 +374,9 @@ def jacobi(
     end_out: wp.array2d(dtype=vec6),
     gradient_inout: wp.array2d(dtype=wp.float32),
 ):
-    """Averaged Jacobi: every pass applies the mean of all active contacts' corrections, so their order does not matter.
+    """Take averaged Jacobi passes, each with the mean correction of all active contacts, in any order.
 
-    `states` (B, M, >= passes) keeps the motion before each pass. The summed (not averaged) form diverges with the
+    `states` (B, M, >= passes) stores the motion before each pass. The summed (not averaged) form diverges with the
     number of contacts. The count of active contacts is taken as constant by the adjoint. Launch over (B, M).
     """
     b, m = wp.tid()

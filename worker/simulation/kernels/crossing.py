@@ -1,10 +1,10 @@
-"""Whether faces of a mesh reach into convex pieces."""
+"""Intersection of mesh faces with convex pieces."""
 
 import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
-#: What is apart by less than this may as well overlap: positions of some decimetres round by a tenth of it [m].
+#: Separations below this may be overlaps: positions of some decimetres round by a tenth of it [m].
 SLACK = wp.constant(wp.float32(1.0e-7))
 
 
@@ -22,8 +22,8 @@ class Solids:
 
 @wp.func
 def is_apart(solids: Solids, s: int, a: wp.vec3, b: wp.vec3, c: wp.vec3):
-    """Whether one of the solid's planes, or the triangle's own, parts the triangle from the solid. Where only a plane
-    through an edge of each would, the answer is no."""
+    """Check whether a plane of the solid, or the triangle's own, separates the triangle from the solid.
+    False if only a plane through an edge of each would."""
     apart = wp.bool(False)
     i = solids.first_plane[s]
     while i < solids.first_plane[s + 1] and not apart:
@@ -54,7 +54,7 @@ def faces_in_solids(
     # Out:
     crossed_out: wp.array(dtype=wp.int32),
 ):
-    """1 where a face of the mesh may reach into the solid `solid_in`, whose body is at `pose_in`; 0 where none does."""
+    """Write 1 if a face of the mesh may reach into solid `solid_in` with its body at `pose_in`, else 0."""
     k = wp.tid()
     s = solid_in[k]
     pose = pose_in[k]

@@ -1,7 +1,7 @@
-"""Distances as metrics need them: exact in sign and value, no smoothing, no gradient.
+"""Distances for metrics: exact in sign and value, no smoothing, no gradient.
 
-`worker.simulation.kernels.surface` answers the optimiser's question (smoothed, cheap); this module answers the
-validator's: how far is a point from the mesh itself, and how deep is it in the hand's convex pieces.
+`worker.simulation.kernels.surface` serves the optimiser (smoothed, cheap). This module serves validation: the distance
+of a point from the mesh itself, and its depth in the hand's convex pieces.
 """
 
 import warp as wp
@@ -14,7 +14,7 @@ wp.set_module_options({"enable_backward": False})
 #: Gap over which the normal turns from the surface's own to the direction of the closest point [m].
 BLEND = wp.constant(2.0e-4)
 
-#: Distances between positions of some metres are off by less than this [m].
+#: Bound on the error of distances between positions of some metres [m].
 ROUNDING = wp.constant(1.0e-6)
 
 
@@ -34,7 +34,7 @@ class Skin:
 
 @wp.struct
 class NearestPoint:
-    """What is nearest to a point."""
+    """The nearest point of the surface."""
 
     distance: wp.float32
     closest: wp.vec3
@@ -43,12 +43,12 @@ class NearestPoint:
 
 @wp.func
 def nearest(skin: Skin, p: wp.vec3, reach: wp.float32):
-    """Signed distance, closest point and the distance's gradient, an outward unit normal.
+    """Return signed distance, closest point and gradient of the distance, an outward unit normal.
 
     Points outside the box [low, high] are only looked up within `reach`; farther ones get distance = reach, normal 0.
     The sign is ray parity, or the winding number for open meshes: both are right near creases. Between a node of
-    `coarse` and a point the distance changes at most by the way between them: what is beyond reach by that is looked up
-    no further, no face is looked for beyond it, and no sign where it cannot change.
+    `coarse` and a point the distance changes at most by their separation. Points thereby known to be beyond reach are
+    not looked up, faces beyond that bound are not searched, and a sign that cannot change is not computed.
     """
     out = NearestPoint()
     out.distance = reach
@@ -99,7 +99,7 @@ def nearest(skin: Skin, p: wp.vec3, reach: wp.float32):
             + v * skin.corner_normal[3 * face + 1]
             + (1.0 - u - v) * skin.corner_normal[3 * face + 2]
         )
-        # Beside an edge the face's normal says nothing about how a body touches it; the direction to the edge does.
+        # Beside an edge the face's normal is no contact direction; the direction to the edge is.
         share = wp.min(gap / BLEND, 1.0)
         direction = (1.0 - share) * smooth
         if gap > 1.0e-9:
@@ -120,7 +120,7 @@ def mesh_distance(
     closest_out: wp.array(dtype=wp.vec3),
     normal_out: wp.array(dtype=wp.vec3),
 ):
-    """`nearest` of points. Launch over them."""
+    """Run `nearest` on points. Launch over them."""
     i = wp.tid()
     found = nearest(skin_in, point_in[i], reach_in)
     distance_out[i] = found.distance
@@ -140,7 +140,7 @@ def pieces_distance(
     # Out:
     distance_inout: wp.array2d(dtype=wp.float32),
 ):
-    """Least distance of S points to each of P pieces for B grasps; what is farther than `reach` is left out.
+    """Compute the least distance of S points to each of P pieces for B grasps, within `reach`.
 
     Launch over (B, S); `distance_inout` (B, P) holds `reach` before.
     """
@@ -165,7 +165,8 @@ def self_distance(
     # Out:
     depth_inout: wp.array2d(dtype=wp.float32),
 ):
-    """Depth (B, L) of each body in others whose contact counts, or of others in it. Launch over points (B, N)."""
+    """Compute the depth (B, L) of each body in others with counted contact, or of others in it.
+    Launch over points (B, N)."""
     b, i = wp.tid()
     x = point_in[b, i]
     for piece in range(pieces_in.body.shape[0]):
@@ -181,7 +182,7 @@ def self_distance(
 
 @wp.func
 def known_beyond(skin: Skin, p: wp.vec3, reach: wp.float32):
-    """Whether the grid tells that p, a point within it, is farther than this from the surface [m]."""
+    """Check by the grid whether p, a point within it, is farther than this from the surface [m]."""
     at = (p - skin.low) / skin.spacing
     x = wp.min(int(at[0] + 0.5), skin.coarse.shape[0] - 1)
     y = wp.min(int(at[1] + 0.5), skin.coarse.shape[1] - 1)
@@ -192,17 +193,17 @@ def known_beyond(skin: Skin, p: wp.vec3, reach: wp.float32):
 
 @wp.struct
 class BodyPoints:
-    """Points of a hand in the order of its bodies."""
+    """Points of a hand, sorted by body."""
 
     first: wp.array(dtype=wp.int32)  # (L + 1,)
     position: wp.array(dtype=wp.vec3d)  # body frame
-    middle: wp.array(dtype=wp.vec3d)  # (L,) of a ball around a body's points
-    extent: wp.array(dtype=wp.float32)  # (L,) radius of it
+    middle: wp.array(dtype=wp.vec3d)  # (L,) centre of a ball around a body's points
+    extent: wp.array(dtype=wp.float32)  # (L,) its radius
 
 
 @wp.func
 def placed_at(origin: wp.vec3d, place: wp.vec3d, turned: wp.quatd, point: wp.vec3d):
-    """A body's point [m] from `origin`, as kernels have it."""
+    """Return a body's point [m] relative to `origin`, in the kernels' precision."""
     x = place + wp.quat_rotate(turned, point) - origin
     return wp.vec3(wp.float32(x[0]), wp.float32(x[1]), wp.float32(x[2]))
 
@@ -220,8 +221,8 @@ def body_gaps(
     # Out:
     gap_inout: wp.array2d(dtype=wp.float32),
 ):
-    """Lower `gap_inout` (P, L) to the least signed distance of each body's points from the object, of bodies that have
-    any at most `reach`. Launch over (P, L)."""
+    """Lower `gap_inout` (P, L) to the least distance of bodies' points from the object, within `reach`.
+    The distance is signed. Launch over (P, L)."""
     p, body = wp.tid()
     if points_in.first[body] == points_in.first[body + 1]:
         return
@@ -255,7 +256,7 @@ def place_pieces(
     piece_p_out: wp.array2d(dtype=wp.vec3),
     piece_q_out: wp.array2d(dtype=wp.quat),
 ):
-    """Frames of the pieces from those of the bodies. Launch over (B, pieces)."""
+    """Compute frames of the pieces from those of the bodies. Launch over (B, pieces)."""
     b, piece = wp.tid()
     body = pieces_in.body[piece]
     piece_p_out[b, piece] = placed_at(origin_in, body_p_in[b, body], body_q_in[b, body], frame_p_in[piece])

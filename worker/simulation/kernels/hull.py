@@ -1,11 +1,11 @@
 """Convex hulls in six dimensions, grown point by point (beneath-beyond), for wrench spaces.
 
 A facet is a simplex of 6 points with the 6 facets across its ridges: `neighbour[f, k]` shares all corners of f but
-`vertex[f, k]`. Its plane n x = d, n outward, has a scale that says its size: n x - d is 6! times the volume of the
-simplex of the facet and x, negative inside. A new point sees the facets whose plane it is above; they go, and every
-ridge between a seen and an unseen facet spans a new one with the point. Its plane is a positive combination of the two
-old planes, by the relation between the determinants of six points taken from eight (Grassmann, Pluecker), so no system
-of equations is solved and no root is drawn.
+`vertex[f, k]`. Its plane n x = d, n outward, is scaled by size: n x - d is 6! times the volume of the simplex of the
+facet and x, negative inside. A new point sees the facets whose plane it is above. They are removed, and every ridge
+between a seen and an unseen facet spans a new one with the point. The new plane is a positive combination of the two
+old planes, by the relation between the determinants of six points out of eight (Grassmann, Pluecker). So no system of
+equations is solved and no root is computed.
 """
 
 import warp as wp
@@ -22,7 +22,7 @@ HORIZON = wp.constant(3)
 
 @wp.struct
 class Hull:
-    """Working arrays of one hull: F facets at most, and a hash table of ridges."""
+    """Working arrays of one hull: at most F facets, and a hash table of ridges."""
 
     vertex: wp.array2d(dtype=wp.int32)
     neighbour: wp.array2d(dtype=wp.int32)
@@ -42,10 +42,10 @@ class Hull:
 
 @wp.func
 def climb(hull: Hull, start: int, x: vec6):
-    """A facet that x is above, or -1 if it is inside; the hull's inside holds the origin.
+    """Return a facet that x is above, or -1 if x is inside; the hull contains the origin.
 
-    Of all planes, scaled to 1 at the origin, the one that x is highest above is a corner of the polar polytope that a
-    linear function is greatest at: neighbour by neighbour upwards ends there, as the simplex method does.
+    Scale all planes to 1 at the origin. The plane that x is highest above is a corner of the polar polytope where a
+    linear function is greatest. Ascending from neighbour to neighbour ends there, as the simplex method does.
     """
     here = start
     best = wp.dot(hull.normal[here], x) / hull.offset[here]
@@ -66,7 +66,7 @@ def climb(hull: Hull, start: int, x: vec6):
 
 @wp.func
 def span(hull: Hull, e: int, f: int, k: int, p: int, point: wp.array(dtype=vec6)):
-    """Facet e from point p and the ridge that seen facet f shares with its unseen neighbour k."""
+    """Create facet e from point p and the ridge that seen facet f shares with its unseen neighbour k."""
     g = hull.neighbour[f, k]
     back = wp.int32(0)
     for j in range(6):
@@ -88,14 +88,14 @@ def span(hull: Hull, e: int, f: int, k: int, p: int, point: wp.array(dtype=vec6)
 
 @wp.func
 def link(hull: Hull, e: int, k: int, mark: wp.array(dtype=wp.int64), now: int, mask: wp.int64):
-    """Join facet e to the fresh facets it shares ridges with; change in the number of ridges without a partner."""
+    """Join facet e to the fresh facets with common ridges; return the change in unpaired ridges."""
     total = wp.int64(0)
     for j in range(6):
         total = total + mark[hull.vertex[e, j]]
     pending = wp.int32(0)
     for j in range(6):
         if j != k:
-            # The sum of random marks names a set of corners, whatever their order.
+            # The sum of random marks identifies a set of corners in any order.
             key = total - mark[hull.vertex[e, j]]
             at = int(key & mask)
             while hull.stamp[at] == now and hull.ridge[at] != key:
@@ -104,7 +104,7 @@ def link(hull: Hull, e: int, k: int, mark: wp.array(dtype=wp.int64), now: int, m
                 held = hull.holder[at]
                 other = held / 8
                 if held < 0:
-                    # A third facet at one ridge: never made up for, so the hull counts as failed.
+                    # A third facet at one ridge is never compensated, so the hull counts as failed.
                     pending = pending + 1000000
                 else:
                     pending = pending - 1
@@ -130,7 +130,7 @@ def insert(
     top: int,
     spares: int,
 ):
-    """Put point p, above facet `start`, into the hull; facets ever used, spare and fresh ones, and 1 if that failed."""
+    """Insert point p, above facet `start`; return numbers of used, spare, fresh facets, and 1 on failure."""
     capacity = hull.state.shape[0]
     failed = wp.int32(0)
     x = point[p]
@@ -168,7 +168,7 @@ def insert(
                 hull.fresh[born] = e
                 hull.side[born] = k
                 born = born + 1
-    # A table that is little larger than what goes in stays in the nearest cache.
+    # A table slightly larger than its content stays in the nearest cache.
     size = wp.int32(1024)
     while size < 6 * born and size < hull.stamp.shape[0]:
         size = 2 * size
@@ -193,7 +193,7 @@ def insert(
 
 @wp.func
 def distance_of(hull: Hull, f: int, origin: vec6):
-    """Signed distance of facet f's plane from a point, positive inside."""
+    """Return the signed distance of facet f's plane from a point, positive inside."""
     normal = hull.normal[f]
     return (hull.offset[f] - wp.dot(normal, origin)) / wp.length(normal)
 
@@ -217,15 +217,15 @@ def grow_whole(
     mark: wp.array(dtype=wp.int64),
     stamp: int,
 ):
-    """Insert all points but the corners of the first simplex; least distance of a facet from `origin`, volume, and 1
-    if that failed."""
+    """Insert all points except the corners of the first simplex.
+    Return the least distance of a facet from `origin`, the volume, and 1 on failure."""
     top = wp.int32(7)
     spares = wp.int32(0)
     failed = wp.int32(0)
     start = wp.int32(0)
     half = (count + 1) / 2
     for turn in range(count):
-        # Neighbours in a list are neighbours in space: every other one first leaves less to be replaced.
+        # Neighbours in a list are neighbours in space: taking every other one first leaves fewer facets to replace.
         p = 2 * turn
         if turn >= half:
             p = 2 * (turn - half) + 1
@@ -254,12 +254,12 @@ def grow_to_nearest(
     mark: wp.array(dtype=wp.int64),
     stamp: int,
 ):
-    """Grow where the hull is nearest to the origin, until its nearest facet is the whole hull's; its distance, and 1 if
-    that failed.
+    """Grow the hull where it is nearest to the origin, until its nearest facet is the whole hull's.
 
-    A facet with no point above it is a facet of the hull of all points; no facet of the part that is built is nearer,
-    and the whole contains the part. So its distance is that of the whole hull, of which little has to be built (Zheng,
-    "An efficient algorithm for a grasp quality measure", IEEE T-RO 2013). At most 0 where the origin is outside.
+    Return the facet's distance, and 1 on failure. A facet with no point above it is a facet of the hull of all points.
+    No facet of the built part is nearer, and the whole contains the part. So this is the distance of the whole hull, of
+    which little is built (Zheng, "An efficient algorithm for a grasp quality measure", IEEE T-RO 2013). At most 0
+    for an outside origin.
     """
     top = wp.int32(7)
     spares = wp.int32(0)
@@ -313,9 +313,9 @@ def measure_hulls(
     hull_inout: Hull,
     result_out: wp.array2d(dtype=wp.float64),
 ):
-    """One hull after the other, each from 7 facets: facet i leaves out corner i, and lies across it from all others.
+    """Build one hull after the other from 7 facets: facet i omits corner i and neighbours all others.
 
-    Points are about a point inside the first simplex; `origin_in` is where distances are taken from. `result_out`:
+    Points are about a point inside the first simplex; distances are from `origin_in`. `result_out`:
     least distance of a facet, at most 0 where the origin is outside; volume, nan where `whole_in` is 0; 1 if feasible.
     """
     hull = hull_inout

@@ -1,5 +1,5 @@
-"""Where fingers that open would jam, and how far an open hand goes back: fingers are held back where they run into
-others, hands that stay in touch retreat."""
+"""Jams of opening fingers, and the retreat of open hands.
+Fingers are held back where they run into others; hands still in contact retreat."""
 
 import warp as wp
 
@@ -17,17 +17,17 @@ class FingerJams:
     """Fingers held back where they would jam: B hands, F fingers."""
 
     going: wp.array(dtype=wp.int32)  # (B,)
-    share: wp.array2d(dtype=wp.float64)  # (B, F) of its way that each finger goes
-    limit: wp.array2d(dtype=wp.float32)  # (B, F) depth that it may have
-    depth: wp.array2d(dtype=wp.float32)  # (B, F) deepest on its way
-    blocked: wp.array2d(dtype=wp.int32)  # (B, F) 1: something else is in its way
+    share: wp.array2d(dtype=wp.float64)  # (B, F) share of the path of each finger
+    limit: wp.array2d(dtype=wp.float32)  # (B, F) allowed depth
+    depth: wp.array2d(dtype=wp.float32)  # (B, F) greatest depth on the path
+    blocked: wp.array2d(dtype=wp.int32)  # (B, F) 1: blocked by something else
 
 
 @wp.func
 def on_way(
     fingers: Fingers, hands: Hands, jams: FingerJams, open: wp.array2d(dtype=wp.float64), b: wp.int32, d: wp.int32
 ):
-    """How far a dof goes, as a difference to the grasp."""
+    """Return the displacement of a dof from the grasp."""
     move = open[b, d] - hands.q[b, d]
     finger = fingers.of_dof[d]
     if finger >= 0:
@@ -48,7 +48,7 @@ def place_on_way(
     # Out:
     bodies_out: Bodies,
 ):
-    """Bodies of hands that have come this share of their way. Launch over B."""
+    """Place bodies of hands at this share of their path. Launch over B."""
     b = wp.tid()
     if jams_in.going[b] == 0:
         return
@@ -62,7 +62,7 @@ def place_on_way(
 
 @wp.func
 def deepen(fingers: Fingers, depth: wp.array2d(dtype=wp.float32), b: wp.int32, body: wp.int32, deep: wp.float32):
-    """Note a depth of a body with its finger."""
+    """Record a depth of a body for its finger."""
     if fingers.of_body[body] >= 0:
         wp.atomic_max(depth, b, fingers.of_body[body], deep)
 
@@ -80,7 +80,7 @@ def finger_depth(
     # Out:
     jams_inout: FingerJams,
 ):
-    """Deepest that each finger is in the rest of the hand, or that in the finger. Launch over (B, L)."""
+    """Compute each finger's greatest depth in the rest of the hand, or of that in it. Over (B, L)."""
     b, body = wp.tid()
     if jams_inout.going[b] == 0 or points_in.first[body] == points_in.first[body + 1]:
         return
@@ -111,7 +111,7 @@ def limit_depth(
     # Out:
     jams_inout: FingerJams,
 ):
-    """What a finger has in the grasp and so much more is its limit; depths begin anew. Launch over B."""
+    """Set the limit to the depth in the grasp plus `more`; reset depths. Launch over B."""
     b = wp.tid()
     for f in range(jams_inout.share.shape[1]):
         jams_inout.limit[b, f] = jams_inout.depth[b, f] + more_in
@@ -125,7 +125,7 @@ def hold_back(
     # Out:
     jams_inout: FingerJams,
 ):
-    """Fingers that jam go a share `less` as far; hands of which none does are done. Depths begin anew. Over B."""
+    """Reduce the path of jammed fingers to a share `less`; finish hands without any. Reset depths. Over B."""
     b = wp.tid()
     if jams_inout.going[b] == 0:
         return
@@ -148,14 +148,14 @@ def take_way(
     # Out:
     open_inout: wp.array2d(dtype=wp.float64),
 ):
-    """The dofs where fingers that jam have been held back. Launch over (B, D)."""
+    """Write the dofs of fingers after jams are held back. Launch over (B, D)."""
     b, d = wp.tid()
     open_inout[b, d] = hands_in.q[b, d] + on_way(fingers_in, hands_in, jams_in, open_inout, b, d)
 
 
 @wp.struct
 class Retreat:
-    """How far B open hands go back along their palm's approach."""
+    """Retreat of B open hands along their palm's approach."""
 
     going: wp.array(dtype=wp.int32)  # (B,)
     clear: wp.array(dtype=wp.float32)
@@ -177,7 +177,7 @@ def hand_clearance(
     # Out:
     retreat_inout: Retreat,
 ):
-    """Least distance of whole hands that went `back` against their palm's approach. Launch over (B, N / lane)."""
+    """Compute the least distance of hands moved `back` against their palm's approach. Over (B, N / lane)."""
     b, part = wp.tid()
     if retreat_inout.going[b] == 0:
         return
@@ -196,7 +196,7 @@ def measure_retreat(
     # Out:
     retreat_inout: Retreat,
 ):
-    """Keep the first retreat that is enough, or the one that gets a hand farthest. Launch over B."""
+    """Select the first sufficient retreat, or the one with the largest distance. Launch over B."""
     b = wp.tid()
     if retreat_inout.going[b] == 0:
         return

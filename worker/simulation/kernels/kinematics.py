@@ -1,4 +1,4 @@
-"""Forward kinematics and its transpose: from joint values to body poses, from body wrenches back to joint gradients."""
+"""Forward kinematics and its transpose: joints to body poses, body wrenches to joint gradients."""
 
 import warp as wp
 
@@ -9,7 +9,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class Tree:
-    """The hand's joint tree on the device; arrays of length L (bodies). See `worker.hands.model.HandModel`."""
+    """The hand's joint tree; arrays of length L (bodies). See `worker.hands.model.HandModel`."""
 
     parent: wp.array(dtype=wp.int32)
     joint_type: wp.array(dtype=wp.int32)
@@ -42,7 +42,7 @@ def forward(
     object_depth_out: wp.array(dtype=wp.float32),
     self_depth_out: wp.array(dtype=wp.float32),
 ):
-    """Poses of all bodies (B, L), world axes of their joints; what the iteration accumulates is set to zero. Over B."""
+    """Compute poses of all bodies (B, L) and world axes of their joints; reset accumulators. Over B."""
     b = wp.tid()
     if active_in[b] == 0:
         return
@@ -84,9 +84,10 @@ def backward(
     wrench_inout: Wrenches,
     gradient_out: wp.array2d(dtype=wp.float32),
 ):
-    """Gradient (B, 6 + D) of a loss whose gradient at body l is the wrench (force, torque about the object's origin).
+    """Compute the gradient (B, 6 + D) of a loss from its gradient at bodies, wrenches.
 
-    Columns: root translation, root rotation about the pivot (world axes), dofs. Launch over B.
+    Wrenches are (force, torque about the object's origin). Columns: root translation, root rotation about the pivot
+    (world axes), dofs. Launch over B.
     """
     b = wp.tid()
     if active_in[b] == 0:

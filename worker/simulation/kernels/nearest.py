@@ -1,10 +1,9 @@
-"""The closest point of a triangle mesh, from lists: each cell of a grid near the surface knows the faces among which
-the nearest to any of its points is, so no tree is walked.
+"""The closest point of a triangle mesh by lists: grid cells near the surface list their nearest faces.
 
-With D the distance of a cell's centre from the surface and h half the cell's diagonal, the nearest face to a point of
-the cell is at most D + 2 h from the centre. Faces are listed by that distance k, so a point at e from the centre need
-not look beyond k - e > its nearest so far. The sign is that of the angle-weighted normal of the feature on which the
-closest point lies (Baerentzen & Aanaes 2005).
+No tree is traversed. Let D be the distance of a cell's centre from the surface, and h half the cell's diagonal. The
+nearest face to a point of the cell is at most D + 2 h from the centre. Faces are sorted by that distance k, so a point
+at e from the centre skips faces with k - e > its nearest so far. The sign is that of the angle-weighted normal of the
+feature with the closest point (Baerentzen & Aanaes 2005).
 """
 
 import warp as wp
@@ -17,7 +16,7 @@ FEATURES = wp.constant(7)
 
 @wp.struct
 class Face:
-    """A triangle a, b, c with what a distance to it takes, side by side in memory."""
+    """A triangle a, b, c with the data of its distance, contiguous in memory."""
 
     a: wp.vec3
     ab: wp.vec3
@@ -35,7 +34,7 @@ class Faces:
 
 @wp.struct
 class Cells:
-    """Faces listed by cells; `first` has one entry more than there are cells, all 0 in size where nothing is listed."""
+    """Faces listed by cells; `first` has one entry more than cells, all arrays are empty without lists."""
 
     faces: Faces
     first: wp.array(dtype=wp.int32)  # (cells + 1,)
@@ -57,7 +56,7 @@ class ClosestPoint:
 
 @wp.func
 def on_face(face: Face, p: wp.vec3):
-    """Weights v, w of the point of a face nearest to p, and the feature it lies on (Ericson 2005, section 5.1.5)."""
+    """Return weights v, w of a face's nearest point to p, and its feature (Ericson 2005, section 5.1.5)."""
     ab = face.ab
     ac = face.ac
     square = face.square
@@ -90,7 +89,7 @@ def on_face(face: Face, p: wp.vec3):
 
 @wp.func
 def closest_in_cell(cells: Cells, cell: wp.int32, centre: wp.vec3, p: wp.vec3):
-    """The closest point of the mesh to p, which lies in the cell with this centre; face -1 where nothing is listed."""
+    """Return the closest point of the mesh to p, in the cell with this centre; face -1: nothing is listed."""
     out = ClosestPoint()
     out.face = -1
     off = wp.length(p - centre)
@@ -124,14 +123,14 @@ def closest_in_cell(cells: Cells, cell: wp.int32, centre: wp.vec3, p: wp.vec3):
 
 @wp.func
 def face_key(face: Face, centre: wp.vec3):
-    """Distance of a face from a cell's centre."""
+    """Return the distance of a face from a cell's centre."""
     at = on_face(face, centre)
     return wp.length(face.a + at[0] * face.ab + at[1] * face.ac - centre)
 
 
 @wp.func
 def cell_of(cell: wp.int32, shape: wp.vec3i):
-    """A cell's place along the axes from its index."""
+    """Return a cell's indices along the axes from its linear index."""
     return wp.vec3i(cell // (shape[1] * shape[2]), (cell // shape[2]) % shape[1], cell % shape[2])
 
 
@@ -153,8 +152,8 @@ def count_faces(
     radius_out: wp.array(dtype=wp.float32),
     count_out: wp.array(dtype=wp.int32),
 ):
-    """Faces to list for each cell that has a corner with a distance of at most `within`, and how far they may be from
-    its centre. Launch over the cells, in the order of their index."""
+    """Count the faces to list per cell with a corner within `within`, and their range from its centre.
+    Launch over the cells, in the order of their index."""
     cell = wp.tid()
     place = cell_of(cell, wp.vec3i(field_in.shape[0] - 1, field_in.shape[1] - 1, field_in.shape[2] - 1))
     least = float(1.0e3)
@@ -172,7 +171,7 @@ def count_faces(
     query = wp.mesh_query_point_no_sign(mesh_in, centre, 1.0e3)
     if not query.result:
         return
-    # Half a diagonal is 0.866 of the cell's size; a little more for rounding.
+    # Half a diagonal is 0.866 of the cell's size; slightly more for rounding.
     radius = wp.length(wp.mesh_eval_position(mesh_in, query.face, query.u, query.v) - centre) + 1.74 * size_in
     radius_out[cell] = radius
     extent = wp.vec3(radius, radius, radius)
@@ -199,7 +198,7 @@ def list_faces(
     face_out: wp.array(dtype=wp.int32),
     key_out: wp.array(dtype=wp.float32),
 ):
-    """Fill the lists that `count_faces` counted, nearest faces first. Launch over the cells."""
+    """Fill the lists counted by `count_faces`, nearest faces first. Launch over the cells."""
     cell = wp.tid()
     start = first_in[cell]
     if first_in[cell + 1] == start:
@@ -214,7 +213,7 @@ def list_faces(
         key = face_key(faces_in.face[index], centre)
         if key <= radius and start + count < first_in[cell + 1]:
             place = start + count
-            # Equal keys stand in the order of their faces: what is nearest does not depend on the tree.
+            # Equal keys are ordered by face index: the nearest face does not depend on the tree.
             while place > start and (
                 key_out[place - 1] > key or (key_out[place - 1] == key and face_out[place - 1] > index)
             ):

@@ -1,7 +1,7 @@
 """Hands against the obstacles of their scene: distances, penalties, residuals.
 
-The hand stands in by its features: corners of boxes and hulls, spheres and ends of capsules (balls), rims of cylinders.
-Half-spaces need no more and are seen exactly; for solids see `solids`.
+The hand is represented by its features: corners of boxes and hulls, spheres and ends of capsules (balls), rims of
+cylinders. They are exact against half-spaces; for solids see `solids`.
 """
 
 import warp as wp
@@ -11,7 +11,7 @@ from graspd.worker.simulation.kernels.wrenches import Wrenches, add_wrench
 
 wp.set_module_options({"enable_backward": False})
 
-#: Share of a start's room that fingertips keep from supports which they may come near.
+#: Share of a start's clearance that fingertips keep from supports which they may approach.
 TIP_ROOM = wp.constant(wp.float32(0.25))
 
 
@@ -23,11 +23,11 @@ class Features:
     centre: wp.array(dtype=wp.vec3)  # body frame
     axis: wp.array(dtype=wp.vec3)  # body frame; zero: a ball
     radius: wp.array(dtype=wp.float32)
-    margin: wp.array(dtype=wp.float32)  # distance to keep [m]; negative: it may sink in
+    margin: wp.array(dtype=wp.float32)  # clearance [m]; negative: it may penetrate
     weight: wp.array(dtype=wp.float32)
     tip: wp.array(dtype=wp.int32)  # 1: of a fingertip
     first: wp.array(dtype=wp.int32)  # (P + 1,) features of a piece
-    middle: wp.array(dtype=wp.vec3)  # (P,) of a ball around what features of a piece reach, body frame
+    middle: wp.array(dtype=wp.vec3)  # (P,) centre of a ball around the features of a piece, body frame
     extent: wp.array(dtype=wp.float32)  # (P,) its radius [m]
     first_edge: wp.array(dtype=wp.int32)  # (P + 1,)
     start: wp.array(dtype=wp.vec3)  # (E,) ends of an edge, body frame
@@ -37,7 +37,7 @@ class Features:
 
 @wp.struct
 class Feature:
-    """One of them as it is placed."""
+    """A placed feature."""
 
     body: wp.int32
     centre: wp.vec3
@@ -47,13 +47,13 @@ class Feature:
 
 @wp.struct
 class Obstacles:
-    """Convex obstacles of all scenes, one after the other, those without end first; a scene -1 has none."""
+    """Convex obstacles of all scenes in sequence, unbounded ones first; a scene -1 has none."""
 
     first: wp.array(dtype=wp.int32)  # (S + 1,)
-    first_solid: wp.array(dtype=wp.int32)  # (S,) first that has corners
+    first_solid: wp.array(dtype=wp.int32)  # (S,) first one with corners
     first_plane: wp.array(dtype=wp.int32)  # (O + 1,)
     planes: wp.array(dtype=wp.vec4)  # outward unit normal and offset
-    tips: wp.array(dtype=wp.float32)  # (O,) distance that fingertips keep, where that is less than their margin [m]
+    tips: wp.array(dtype=wp.float32)  # (O,) clearance of fingertips, if less than their margin [m]
     centre: wp.array(dtype=wp.vec3)  # (O,) bounding sphere
     radius: wp.array(dtype=wp.float32)  # (O,)
     first_edge: wp.array(dtype=wp.int32)  # (O + 1,)
@@ -65,7 +65,7 @@ class Obstacles:
 def posed(
     features: Features, i: wp.int32, b: wp.int32, body_p: wp.array2d(dtype=wp.vec3), body_q: wp.array2d(dtype=wp.quat)
 ):
-    """Feature i of hand b."""
+    """Return feature i of hand b."""
     out = Feature()
     out.body = features.body[i]
     rotation = body_q[b, out.body]
@@ -77,7 +77,7 @@ def posed(
 
 @wp.func
 def reach_of(f: Feature, n: wp.vec3):
-    """How far a feature reaches from its centre towards -n."""
+    """Return the extent of a feature from its centre towards -n."""
     along = wp.dot(f.axis, n)
     if wp.dot(f.axis, f.axis) > 0.5:
         return f.radius * wp.sqrt(wp.max(0.0, 1.0 - along * along))
@@ -86,7 +86,7 @@ def reach_of(f: Feature, n: wp.vec3):
 
 @wp.func
 def lowest_point(f: Feature, n: wp.vec3):
-    """The feature's point that is farthest along -n."""
+    """Return the feature's point that is farthest along -n."""
     way = n
     if wp.dot(f.axis, f.axis) > 0.5:
         way = n - wp.dot(f.axis, n) * f.axis
@@ -99,7 +99,7 @@ def lowest_point(f: Feature, n: wp.vec3):
 
 @wp.func
 def obstacle_distance(obstacles: Obstacles, k: wp.int32, f: Feature):
-    """(normal, distance) of a feature from obstacle k: the largest of its planes' distances."""
+    """Return (normal, distance) of a feature from obstacle k: the largest of its planes' distances."""
     d = float(-1.0e9)
     n = wp.vec3(0.0, 0.0, 1.0)
     for i in range(obstacles.first_plane[k], obstacles.first_plane[k + 1]):
@@ -114,7 +114,7 @@ def obstacle_distance(obstacles: Obstacles, k: wp.int32, f: Feature):
 
 @wp.func
 def kept(features: Features, obstacles: Obstacles, i: wp.int32, k: wp.int32, room: wp.float32):
-    """Distance that feature i keeps from obstacle k [m], with `room` besides."""
+    """Return the clearance of feature i from obstacle k [m], plus `room`."""
     out = features.margin[i] + room
     if features.tip[i] != 0:
         out = wp.min(out, obstacles.tips[k] + TIP_ROOM * room)
@@ -133,7 +133,7 @@ def may_meet(
     body_p: wp.array2d(dtype=wp.vec3),
     body_q: wp.array2d(dtype=wp.quat),
 ):
-    """Whether a piece's ball is nearer to a half-space of its scene than what it keeps and `more`."""
+    """Check whether a piece's ball is closer to a half-space of its scene than its clearance plus `more`."""
     if features.first[piece] == features.first[piece + 1]:
         return False
     i = features.first[piece]
@@ -156,7 +156,7 @@ def clear(
     # Data out:
     depth_out: wp.array(dtype=wp.float32),
 ):
-    """No depth yet. Launch over B."""
+    """Reset depths. Launch over B."""
     b = wp.tid()
     if active_in[b] != 0:
         depth_out[b] = 0.0
@@ -180,7 +180,8 @@ def penalty(
     wrench_inout: Wrenches,
     depth_inout: wp.array(dtype=wp.float32),
 ):
-    """Half-spaces: gradient of w sum w_i min(h_i - margin_i - room, 0)^2; deepest shortfall per grasp. Over (B, P)."""
+    """Add the gradient of w sum w_i min(h_i - margin_i - room, 0)^2 of half-spaces; deepest shortfalls.
+    Launch over (B, P)."""
     b, piece = wp.tid()
     if active_in[b] == 0 or scene_in[b] < 0:
         return
@@ -216,7 +217,7 @@ def residuals(
     # Out:
     residuals_out: Residuals,
 ):
-    """Features nearer to a half-space than margin + near go to margin + target. Over (B, P)."""
+    """Emit residuals: features within margin + near of a half-space move to margin + target. Over (B, P)."""
     b, piece = wp.tid()
     if active_in[b] == 0 or scene_in[b] < 0:
         return

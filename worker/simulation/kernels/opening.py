@@ -1,6 +1,6 @@
-"""How fingers open around a grasp: the way each leaves the object, how far it goes, and where it would jam.
+"""Opening of fingers around a grasp: direction, distance, and jams.
 
-Fingers are validated each by itself, hands all at once; a hand or a finger that is done costs nothing more.
+Each finger is checked by itself, all hands at once; finished hands and fingers cost nothing more.
 """
 
 import warp as wp
@@ -14,10 +14,10 @@ wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
 @wp.struct
 class Fingers:
-    """What opens as one: F fingers of a hand with L bodies and D dofs."""
+    """Units that open as one: F fingers of a hand with L bodies and D dofs."""
 
     of_body: wp.array(dtype=wp.int32)  # (L,) -1: none
-    of_dof: wp.array(dtype=wp.int32)  # (D,) -1: stays
+    of_dof: wp.array(dtype=wp.int32)  # (D,) -1: does not open
     closing: wp.array(dtype=wp.float64)  # (D,)
     step: wp.array(dtype=wp.float64)  # (D,) [rad or m]
     lower: wp.array(dtype=wp.float64)
@@ -28,27 +28,27 @@ class Fingers:
 class Hands:
     """B hands in their grasps."""
 
-    position: wp.array(dtype=wp.vec3d)  # of the root, about the object's centre of mass
+    position: wp.array(dtype=wp.vec3d)  # root position, about the object's centre of mass
     rotation: wp.array(dtype=wp.quatd)
     q: wp.array2d(dtype=wp.float64)  # (B, D)
 
 
 @wp.struct
 class Sweep:
-    """How B hands open along `direction`, step by step."""
+    """Opening of B hands along `direction`, step by step."""
 
     going: wp.array(dtype=wp.int32)  # (B,)
     direction: wp.array2d(dtype=wp.float64)  # (B, D)
-    clear: wp.array2d(dtype=wp.float32)  # (B, F) distance at the present step, at most the one that is wanted
+    clear: wp.array2d(dtype=wp.float32)  # (B, F) distance at the present step, at most the wanted one
     best: wp.array2d(dtype=wp.float32)  # (B, F) greatest so far
-    chosen: wp.array2d(dtype=wp.int32)  # (B, F) the first step with that
+    chosen: wp.array2d(dtype=wp.int32)  # (B, F) first step with that
 
 
 @wp.func
 def opened(
     fingers: Fingers, hands: Hands, direction: wp.array2d(dtype=wp.float64), b: wp.int32, d: wp.int32, steps: wp.int32
 ):
-    """A dof so many steps along its way. A grasp may stand a hair outside its limits: that is no reason to jump."""
+    """Return a dof after `steps` steps. A grasp slightly outside its limits must not jump."""
     q = hands.q[b, d]
     value = q + wp.float64(steps) * fingers.step[d] * direction[b, d]
     return wp.clamp(value, wp.min(fingers.lower[d], q), wp.max(fingers.upper[d], q))
@@ -66,8 +66,8 @@ def body_wrenches(
     force_out: wp.array2d(dtype=wp.vec3d),
     torque_out: wp.array2d(dtype=wp.vec3d),
 ):
-    """Forces on bodies (B, L), and their torques about the origin, along the object's normals: of each point as much as
-    it is nearer than `reach`. Launch over (B, L)."""
+    """Compute forces on bodies (B, L) and torques about the origin, along the object's normals.
+    Each point's force is the part of `reach` by which it is closer. Launch over (B, L)."""
     b, body = wp.tid()
     force = wp.vec3d(wp.float64(0.0))
     torque = wp.vec3d(wp.float64(0.0))
@@ -95,8 +95,8 @@ def leave(
     away_out: wp.array2d(dtype=wp.float64),
     sweep_out: Sweep,
 ):
-    """Directions (B, D) in which fingers leave: a share `plain` against `closing`, the rest along the forces on them,
-    by 1 for the fastest dof of a finger. All hands set out. Launch over B."""
+    """Compute opening directions (B, D): a share `plain` against `closing`, the rest along the forces.
+    The fastest dof of a finger has 1. Start all hands. Launch over B."""
     b = wp.tid()
     dofs = away_out.shape[1]
     for d in range(dofs):
@@ -116,7 +116,7 @@ def leave(
         force_inout[b, parent] = force_inout[b, parent] + force
         torque_inout[b, parent] = torque_inout[b, parent] + torque
     for d in range(dofs):
-        # A finger that hooks around an edge would leave by closing further: it must open all the same.
+        # A finger that hooks around an edge would leave by closing further, but must open.
         if away_out[b, d] * fingers_in.closing[d] > wp.float64(0.0):
             away_out[b, d] = wp.float64(0.0)
         sweep_out.direction[b, d] = -fingers_in.closing[d]
@@ -148,7 +148,7 @@ def open_plainly(
     sweep_out: Sweep,
     step_out: wp.array(dtype=wp.int32),
 ):
-    """Hands of which a finger got less than `stuck` away set out again, against `closing`. Launch over B."""
+    """Restart hands with a finger that moved less than `stuck`, against `closing`. Launch over B."""
     b = wp.tid()
     step_out[0] = 0
     sweep_out.going[b] = 0
@@ -174,7 +174,7 @@ def place_opening(
     sweep_inout: Sweep,
     bodies_out: Bodies,
 ):
-    """Bodies of hands that open, at the present step. Launch over B."""
+    """Place bodies of opening hands at the present step. Launch over B."""
     b = wp.tid()
     if sweep_inout.going[b] == 0:
         return
@@ -200,7 +200,7 @@ def finger_clearance(
     # Out:
     sweep_inout: Sweep,
 ):
-    """Least distance of each finger that is not clear yet. Launch over (B, N / lane)."""
+    """Compute the least distance of each finger that is not clear yet. Launch over (B, N / lane)."""
     b, part = wp.tid()
     if sweep_inout.going[b] == 0:
         return
@@ -221,7 +221,7 @@ def measure_opening(
     # Out:
     sweep_inout: Sweep,
 ):
-    """Keep the first step at which each finger is clear, or farthest; hands with all fingers clear stop. Over B."""
+    """Select each finger's first clear step, or the farthest; stop hands with all fingers clear. Over B."""
     b = wp.tid()
     if sweep_inout.going[b] == 0:
         return
@@ -248,14 +248,14 @@ def take_opening(
     # Out:
     open_out: wp.array2d(dtype=wp.float64),
 ):
-    """Dofs (B, D) where each finger got: plainly opened where that got it farther than the other way, or than `stuck`.
+    """Write dofs (B, D) of each finger's best opening: plain if it beats the other, or `stuck`.
     Launch over (B, D)."""
     b, d = wp.tid()
     open_out[b, d] = hands_in.q[b, d]
     finger = fingers_in.of_dof[d]
     if finger < 0:
         return
-    # A hand that did not set out again got nowhere.
+    # A hand that was not restarted has no plain opening.
     if plain_in.best[b, finger] > wp.min(first_in.best[b, finger], stuck_in):
         open_out[b, d] = opened(fingers_in, hands_in, plain_in.direction, b, d, plain_in.chosen[b, finger])
     else:

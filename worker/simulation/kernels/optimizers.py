@@ -1,4 +1,4 @@
-"""One step of the optimiser per grasp. The root turns about the palm centre by the exponential of a world rotation."""
+"""One optimiser step per grasp; the root turns about the palm centre by exp of a world rotation."""
 
 import warp as wp
 
@@ -7,7 +7,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def turn(rotation: wp.quat, w: wp.vec3):
-    """exp(w) applied to a rotation, renormalised."""
+    """Apply exp(w) to a rotation, renormalised."""
     angle = wp.length(w)
     if angle < 1.0e-12:
         return rotation
@@ -52,7 +52,7 @@ def adam(
     rotation_inout: wp.array(dtype=wp.quat),
     q_inout: wp.array2d(dtype=wp.float32),
 ):
-    """Adam (Kingma & Ba 2015) with a rate each for translation, rotation and every dof (columns of `rate`). Over B."""
+    """Take a step of Adam (Kingma & Ba 2015); rates of translation, rotation, every dof. Over B."""
     b = wp.tid()
     if active_in[b] == 0:
         return
@@ -96,7 +96,7 @@ def gradient_descent(
     rotation_inout: wp.array(dtype=wp.quat),
     q_inout: wp.array2d(dtype=wp.float32),
 ):
-    """The paper's plain gradient descent. Launch over B."""
+    """Take a step of the paper's plain gradient descent. Launch over B."""
     b = wp.tid()
     if active_in[b] == 0:
         return
@@ -120,7 +120,7 @@ def advance(
     # Data out:
     iteration_inout: wp.array(dtype=wp.int32),
 ):
-    """Count an iteration on the device: schedules are read there, so a captured graph can be replayed. Over 1."""
+    """Count an iteration on the device: schedules are read there, so a captured graph is replayed. Over 1."""
     iteration_inout[0] = iteration_inout[0] + 1
 
 
@@ -140,8 +140,7 @@ def converge(
 ):
     """Switch off a grasp whose merit has not improved by 1 % for `patience` iterations. Launch over B.
 
-    The merit is L_stable plus the penetration depths in millimetres: the weights of a schedule, which change, are not
-    in it.
+    The merit is L_stable plus the penetration depths in millimetres, without the changing weights of a schedule.
     """
     b = wp.tid()
     if active_inout[b] == 0:

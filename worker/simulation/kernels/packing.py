@@ -1,18 +1,18 @@
-"""Contacts put side by side in the order of their points, whatever the order of the threads that found them.
+"""Packing of contacts in the order of their points, independent of thread order.
 
-On a CPU a launch runs its threads one after another, so a counter gives each contact its slot in the order of points.
-On a GPU each point writes to a place of its own, with a mark; slots follow from counts of marks.
+On a CPU a launch runs its threads one after another, so a counter assigns slots in the order of points. On a GPU each
+point writes to its own index, with a mark; slots follow from counts of marks.
 """
 
 import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
-#: Marks of points: no contact, a contact, a contact that the object may meet in its step.
+#: Marks of points: no contact, a contact, a contact that the object may reach in its step.
 NONE = wp.constant(0)
 KEPT = wp.constant(1)
 NEAR = wp.constant(2)
-#: Marks that one thread counts.
+#: Marks counted per thread.
 CHUNK = wp.constant(32)
 
 
@@ -25,7 +25,7 @@ def count_marks(
     kept_out: wp.array2d(dtype=wp.int32),
     near_out: wp.array2d(dtype=wp.int32),
 ):
-    """Contacts, and near ones, of every `CHUNK` points of a hand. Launch over (B, N / CHUNK)."""
+    """Count contacts, and near ones, of every `CHUNK` points of a hand. Launch over (B, N / CHUNK)."""
     b, chunk = wp.tid()
     if active_in[b] == 0:
         return
@@ -44,7 +44,7 @@ def count_marks(
 def before(
     counts: wp.array2d(dtype=wp.int32), mark: wp.array2d(dtype=wp.int32), least: wp.int32, b: wp.int32, i: wp.int32
 ):
-    """Points before the i-th whose mark is at least so much."""
+    """Return the number of points before the i-th whose mark is at least `least`."""
     chunk = i // CHUNK
     total = wp.int32(0)
     for c in range(chunk):
@@ -78,7 +78,7 @@ def pack(
     near_count_out: wp.array(dtype=wp.int32),
     near_out: wp.array2d(dtype=wp.int32),
 ):
-    """Marked points to their slots; `near` lists the slots of near ones. Launch over (B, N)."""
+    """Move marked points to their slots; `near` lists the slots of near ones. Launch over (B, N)."""
     b, i = wp.tid()
     if active_in[b] == 0:
         return

@@ -1,4 +1,4 @@
-"""Penalties on single points and joints, and the gradient's way from points to bodies."""
+"""Penalties on single points and joints, and the transfer of gradients from points to bodies."""
 
 import warp as wp
 
@@ -29,11 +29,12 @@ def points_to_bodies(
     wrench_inout: Wrenches,
     depth_inout: wp.array(dtype=wp.float32),
 ):
-    """Wrench gradient on bodies from dL/drho, with the penetration term w sum w_i min(rho - clearance, 0)^2 added, and
-    the pull -2 w d l sum w_i exp(-rho / l) of points beyond the clearance, d being `pull` and l `pull_length` [m].
+    """Compute the wrench gradient on bodies from dL/drho, penetration and attraction term.
 
-    The distance grows along the object's outward normal (normals are taken as constant). Launch over
-    (B, N / lane).
+    Penetration: w sum w_i min(rho - clearance, 0)^2. Attraction: -2 w d l sum w_i exp(-rho / l) of points beyond the
+    clearance, with d = `pull` and l = `pull_length` [m].
+
+    The distance grows along the object's outward normal (normals are taken as constant). Launch over (B, N / lane).
     """
     b, part = wp.tid()
     if active_in[b] == 0:
@@ -66,7 +67,7 @@ def joints(
     # Data out:
     gradient_inout: wp.array2d(dtype=wp.float32),
 ):
-    """Gradient of L_range + L_limit (paper, section III-D). Launch over (B, D).
+    """Add the gradient of L_range + L_limit (paper, section III-D). Launch over (B, D).
 
     L_range = w sum ((q - mid) / half)^2; L_limit = w sum max(lower - q, 0, q - upper)^2.
     """
@@ -94,8 +95,8 @@ def near_share(
     # Out:
     share_out: wp.array(dtype=wp.float32),
 ):
-    """What of the `whole` weight of a hand's points is nearer than `reach` [m], one point after the other so that the
-    sum is the same on every device. Launch over B."""
+    """Compute the share of the `whole` weight of a hand's points that is within `reach` [m].
+    Points are summed in order, so that the sum is the same on every device. Launch over B."""
     b = wp.tid()
     total = float(0.0)
     for i in range(count_in[b]):
@@ -117,7 +118,7 @@ def attract(
     # Data out:
     gradient_out: wp.array2d(dtype=wp.float32),
 ):
-    """The control without a simulation: free points are drawn to the object, fading with distance. Over (B, N)."""
+    """Attract free points to the object, fading with distance: control without simulation. Over (B, N)."""
     b, i = wp.tid()
     if active_in[b] == 0 or i >= count_in[b]:
         return

@@ -1,5 +1,5 @@
-"""Signed distance to the hand's convex pieces, and the penalties made of it: object points inside links, links inside
-links. Thin parts of an object pass between hand points; they do not pass between the pieces' faces."""
+"""Signed distance to the hand's convex pieces, and its penalties: object in links, links in links.
+Thin parts of an object pass between hand points; they do not pass between the pieces' faces."""
 
 import warp as wp
 
@@ -33,8 +33,8 @@ class Pieces:
 
 @wp.func
 def piece_distance(pieces: Pieces, piece: wp.int32, x: wp.vec3):
-    """Signed distance at x (piece frame) and its gradient, as (gradient, distance). Inside it is exact; outside a hull
-    it is the largest plane distance, a lower bound."""
+    """Return (gradient, signed distance) at x (piece frame).
+    Inside it is exact; outside a hull it is the largest plane distance, a lower bound."""
     kind = pieces.kind[piece]
     size = pieces.size[piece]
     n = wp.vec3(1.0, 0.0, 0.0)
@@ -96,7 +96,7 @@ def piece_distance(pieces: Pieces, piece: wp.int32, x: wp.vec3):
 
 @wp.func
 def piece_rotation(pieces: Pieces, piece: wp.int32, b: wp.int32, body_q: wp.array2d(dtype=wp.quat)):
-    """Rotation of a piece's frame in the object's."""
+    """Return the rotation of a piece's frame in the object's."""
     return body_q[b, pieces.body[piece]] * pieces.pose_q[piece]
 
 
@@ -104,20 +104,20 @@ def piece_rotation(pieces: Pieces, piece: wp.int32, b: wp.int32, body_q: wp.arra
 def piece_centre(
     pieces: Pieces, piece: wp.int32, b: wp.int32, body_p: wp.array2d(dtype=wp.vec3), body_q: wp.array2d(dtype=wp.quat)
 ):
-    """Origin of a piece's frame in the object's."""
+    """Return the origin of a piece's frame in the object's."""
     body = pieces.body[piece]
     return body_p[b, body] + wp.quat_rotate(body_q[b, body], pieces.pose_p[piece])
 
 
 @wp.func
 def in_box(x: wp.vec3, half: wp.vec3):
-    """Whether x lies strictly inside the box of these half extents about the origin."""
+    """Check whether x lies strictly inside the box of these half extents about the origin."""
     return wp.abs(x[0]) < half[0] and wp.abs(x[1]) < half[1] and wp.abs(x[2]) < half[2]
 
 
 @wp.func
 def world_extent(q: wp.quat, half: wp.vec3):
-    """Half extents along the world's axes of a box turned by q."""
+    """Return half extents along the world's axes of a box turned by q."""
     ex = wp.quat_rotate(q, wp.vec3(half[0], 0.0, 0.0))
     ey = wp.quat_rotate(q, wp.vec3(0.0, half[1], 0.0))
     ez = wp.quat_rotate(q, wp.vec3(0.0, 0.0, half[2]))
@@ -130,7 +130,7 @@ def world_extent(q: wp.quat, half: wp.vec3):
 
 @wp.struct
 class Samples:
-    """Points on the object's surface, sorted by the cells of a grid that they lie in, z changing fastest."""
+    """Points on the object's surface, sorted by the cells of a grid, z changing fastest."""
 
     position: wp.array(dtype=wp.vec3)
     first: wp.array(dtype=wp.int32)  # (cells + 1,)
@@ -141,7 +141,7 @@ class Samples:
 
 @wp.func
 def cell_range(low: wp.float32, high: wp.float32, origin: wp.float32, size: wp.float32, count: wp.int32):
-    """First and last of `count` cells along an axis that an interval meets; first > last: none."""
+    """Return first and last of `count` cells along an axis that an interval meets; first > last: none."""
     a = int(wp.floor((low - origin) / size))
     b = int(wp.floor((high - origin) / size))
     return wp.vec2i(wp.max(a, 0), wp.min(b, count - 1))
@@ -149,7 +149,8 @@ def cell_range(low: wp.float32, high: wp.float32, origin: wp.float32, size: wp.f
 
 @wp.func
 def cells_around(samples: Samples, p: wp.vec3, extent: wp.vec3):
-    """The cells that a box of these half extents about p meets: first and last along x, y, z; first > last: none."""
+    """Return the cells that a box of these half extents about p meets.
+    First and last along x, y, z; first > last: none."""
     low = samples.low
     size = samples.size
     shape = samples.shape
@@ -163,14 +164,14 @@ def cells_around(samples: Samples, p: wp.vec3, extent: wp.vec3):
 
 @wp.func
 def samples_of(samples: Samples, i: wp.int32, j: wp.int32, first: wp.int32, last: wp.int32):
-    """The first sample in a run of cells along z, and the first behind it."""
+    """Return the first sample in a run of cells along z, and the first behind it."""
     row = (i * samples.shape[1] + j) * samples.shape[2]
     return wp.vec2i(samples.first[row + first], samples.first[row + last + 1])
 
 
 @wp.func
 def clip_depth(pieces: Pieces, piece: wp.int32, x: wp.vec3, above: wp.float32):
-    """`piece_distance`, or some distance that is larger than `above` where the distance is."""
+    """Return `piece_distance`, or any distance larger than `above` where it is larger."""
     if pieces.kind[piece] != HULL:
         return piece_distance(pieces, piece, x)
     d = float(-1.0e9)
@@ -203,10 +204,9 @@ def object_in_pieces(
     wrench_inout: Wrenches,
     depth_inout: wp.array(dtype=wp.float32),
 ):
-    """Gradient of w sum depth^2 over object surface samples inside a piece; deepest depth per grasp. Over (B, P).
+    """Add the gradient of w sum depth^2 over object samples in a piece; deepest per grasp. Over (B, P).
 
-    Moving the body by +n deepens a sample that is nearest to the face with outward normal n, so the gradient at the
-    sample is 2 w depth n.
+    Moving the body by +n deepens a sample nearest to the face with outward normal n: its gradient is 2 w depth n.
     """
     b, piece = wp.tid()
     if active_in[b] == 0:
@@ -216,7 +216,7 @@ def object_in_pieces(
     p = piece_centre(pieces_in, piece, b, body_p_in, body_q_in)
     half = pieces_in.half[piece]
     turn = wp.quat_to_matrix(q)
-    # Along each axis of the world a box turned by `turn` reaches this far.
+    # Half extents along the world's axes of a box turned by `turn`.
     extent = wp.vec3(
         wp.abs(turn[0, 0]) * half[0] + wp.abs(turn[0, 1]) * half[1] + wp.abs(turn[0, 2]) * half[2],
         wp.abs(turn[1, 0]) * half[0] + wp.abs(turn[1, 1]) * half[1] + wp.abs(turn[1, 2]) * half[2],
@@ -275,7 +275,7 @@ def may_touch(
     body_p: wp.array2d(dtype=wp.vec3),
     body_q: wp.array2d(dtype=wp.quat),
 ):
-    """Whether the points of body `own` count against a piece of body `other` and come within `reach` of its centre."""
+    """Check whether body `own` has points within `reach` of a counted piece's centre of body `other`."""
     if pieces.apart[own, other] == 0 or points.first[own] == points.first[own + 1]:
         return False
     offset = body_p[b, own] - centre
@@ -304,7 +304,7 @@ def pieces_in_pieces(
     wrench_inout: Wrenches,
     depth_inout: wp.array(dtype=wp.float32),
 ):
-    """Gradient of w sum (depth + margin)^2 over hand points inside pieces of bodies they must stay clear of.
+    """Add the gradient of w sum (depth + margin)^2 over hand points inside pieces of other bodies.
 
     Launch over (B, P).
     """

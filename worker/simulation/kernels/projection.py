@@ -1,6 +1,6 @@
-"""Gauss-Newton projection out of penetration: residuals of violated clearances, their rows, the normal equations.
+"""Gauss-Newton projection out of penetration: residuals of clearances, rows, normal equations.
 
-A residual is w (d - target) where d is a signed distance; its row is the derivative of d by (root translation, root
+A residual is w (d - target) with a signed distance d; its row is the derivative of d by (root translation, root
 rotation about the pivot, dofs). d is the distance of a hand point to the object (normal n of the object), of an object
 sample to a link, or of a point of one link to another link.
 """
@@ -30,13 +30,13 @@ FIXED = wp.constant(2.0**44)
 
 @wp.struct
 class Residuals:
-    """Packed residuals per grasp, capacity R; what does not fit is left to the next iteration."""
+    """Packed residuals per grasp, capacity R; further ones are left to the next iteration."""
 
     count: wp.array(dtype=wp.int32)
     body: wp.array2d(dtype=wp.int32)
-    other: wp.array2d(dtype=wp.int32)  # body moved against, or -1: the object
+    other: wp.array2d(dtype=wp.int32)  # body that the motion is relative to, or -1: the object
     point: wp.array2d(dtype=wp.vec3)
-    direction: wp.array2d(dtype=wp.vec3)  # moving the body by it increases d
+    direction: wp.array2d(dtype=wp.vec3)  # direction of the body's motion that increases d
     value: wp.array2d(dtype=wp.float32)  # d - target [m]
     weight: wp.array2d(dtype=wp.float32)
 
@@ -82,7 +82,7 @@ def point_residuals(
     # Out:
     residuals_out: Residuals,
 ):
-    """Hand points nearer than `near` go to `target`; those nearer than `hold` are held near it, weakly.
+    """Emit residuals: points closer than `near` move to `target`, those within `hold` are weakly held.
 
     Launch over (B, N / lane).
     """
@@ -113,7 +113,7 @@ def sample_residuals(
     # Out:
     residuals_out: Residuals,
 ):
-    """Object samples nearer to a link than `near` go to `target`. Launch over (B, P)."""
+    """Emit residuals that move object samples within `near` of a link to `target`. Launch over (B, P)."""
     b, piece = wp.tid()
     if active_in[b] == 0:
         return
@@ -133,7 +133,7 @@ def sample_residuals(
                     nd = clip_depth(pieces_in, piece, local, near_in)
                     if nd[3] < near_in:
                         n = wp.quat_rotate(q, wp.vec3(nd[0], nd[1], nd[2]))
-                        # The link moving along its own outward normal comes nearer: d falls.
+                        # The link's motion along its own outward normal reduces d.
                         emit(residuals_out, b, body, -1, x, -n, nd[3] - target_in, 1.0)
 
 
@@ -152,7 +152,7 @@ def self_residuals(
     # Out:
     residuals_out: Residuals,
 ):
-    """Points of one link nearer than `near` to another link go to `target`. Launch over (B, P)."""
+    """Emit residuals that move points of a link within `near` of another to `target`. Launch over (B, P)."""
     b, piece = wp.tid()
     if active_in[b] == 0:
         return
@@ -189,7 +189,7 @@ def add_chain(
     axis: wp.array2d(dtype=wp.vec3),
     row: wp.array2d(dtype=wp.float32),
 ):
-    """Add the joints' part of a row: motion along `direction` of a point of `body`."""
+    """Add the joints' part of a row: motion of a point of `body` along `direction`."""
     k = body
     while k > 0:
         a = axis[b, k]
@@ -203,7 +203,7 @@ def add_chain(
 
 @wp.func
 def fixed(x: wp.float32):
-    """x as an integer: sums of those are the same in any order."""
+    """Return x as an integer: sums of integers are the same in any order."""
     return wp.int64(x * FIXED)
 
 
@@ -224,8 +224,8 @@ def normal_equations(
     matrix_inout: wp.array3d(dtype=wp.int64),
     vector_inout: wp.array2d(dtype=wp.int64),
 ):
-    """Add to J'WJ (B, n, n), lower half, and J'We (B, n), n = 6 + D, both `fixed`. Launch over (B, R / lane); `row`
-    has a row of scratch for each thread."""
+    """Add to J'WJ (B, n, n), lower half, and J'We (B, n), n = 6 + D, both `fixed`.
+    Launch over (B, R / lane); `row` has a scratch row per thread."""
     b, part = wp.tid()
     count = wp.min(residuals_in.count[b], residuals_in.body.shape[1])
     if active_in[b] == 0 or part * lane_in >= count:
@@ -241,7 +241,7 @@ def normal_equations(
         direction = residuals_in.direction[b, k]
         add_chain(tree_in, b, own, body, point, direction, 1.0, body_p_in, axis_in, row_out)
         if other >= 0:
-            # Both links move with the root: only the joints between them tell.
+            # Both links move with the root: only the joints between them count.
             add_chain(tree_in, b, own, other, point, direction, -1.0, body_p_in, axis_in, row_out)
         else:
             turn = wp.cross(point - pivot_in[b], direction)
@@ -286,8 +286,8 @@ def keep_best(
     best_inout: States,
     depth_inout: wp.array(dtype=wp.float64),
 ):
-    """Keep hands that stand less deep than ever by more than `better` [m]; those without penetration are done. Their
-    residuals begin anew. Launch over B."""
+    """Select hands with less penetration than ever by more than `better` [m]; finish those without any.
+    Their residuals are reset. Launch over B."""
     b = wp.tid()
     if active_inout[b] == 0:
         return
@@ -326,8 +326,9 @@ def step(
     rotation_out: wp.array(dtype=wp.quat),
     q_out: wp.array2d(dtype=wp.float32),
 ):
-    """A damped Gauss-Newton step, at most `longest` in units of `scale` (n,): (S H S + d I) x = -S g by Cholesky, moved
-    by S x; d is `damping` times the number of residuals. The equations begin anew. Launch over B."""
+    """Take a damped Gauss-Newton step, at most `longest` in units of `scale` (n,).
+    (S H S + d I) x = -S g by Cholesky, motion S x; d is `damping` times the number of residuals. The equations are
+    reset. Launch over B."""
     b = wp.tid()
     if active_in[b] == 0:
         return

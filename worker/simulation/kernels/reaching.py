@@ -1,7 +1,7 @@
-"""Hands drawn around an object, between opposed fingers, until one is clear of it as balls in a grid of distances tell.
+"""Random hands around an object, between opposed fingers, until one is clear in a grid of distances.
 
-One thread draws for one start. A draw's numbers follow from the start's seed and the draw's number: they are the same
-whatever is drawn beside it.
+One thread draws for one start. A draw's numbers follow from the start's seed and the draw's number, so they do not
+depend on other draws. Hands are tested as balls.
 """
 
 import warp as wp
@@ -10,26 +10,26 @@ from graspd.worker.simulation.kernels.surface import Surface, cube_around, cube_
 
 wp.set_module_options({"enable_backward": False})
 
-#: Random directions of which the one that lies most across the pair is taken.
+#: Random directions, of which the one most perpendicular to the pair is used.
 WAYS = wp.constant(4)
 
 
 @wp.struct
 class Grips:
-    """P pairs of places of an object, about its centre of mass, and K opposed postures of a hand, about its palm."""
+    """P pairs of places of an object, about its centre of mass, and K opposed postures, about the palm."""
 
     middle: wp.array(dtype=wp.vec3)  # (P,)
     axis: wp.array(dtype=wp.vec3)  # (P,) unit
     width: wp.array(dtype=wp.float32)  # (P,)
-    sums: wp.array(dtype=wp.float32)  # (P,) cumulative chance, the last is 1
+    sums: wp.array(dtype=wp.float32)  # (P,) cumulative probability, the last is 1
     posture: wp.array2d(dtype=wp.float32)  # (K, D)
-    between: wp.array(dtype=wp.vec3)  # (K,) middle of the pads
-    frame: wp.array(dtype=wp.quat)  # (K,) x: line of the pads, y: the palm's approach as near as can be
+    between: wp.array(dtype=wp.vec3)  # (K,) centre between the pads
+    frame: wp.array(dtype=wp.quat)  # (K,) x: line of the pads, y: as near as possible to the palm's approach
     opened: wp.array(dtype=wp.float32)  # (K,) width between the pads, ascending
     balls: wp.array2d(dtype=wp.vec3)  # (K, S) centres of balls in the hand
     radius: wp.float32
-    deep: wp.float32  # how much nearer than with their pads hands may hold, as a share of the way to the palm
-    palm: wp.vec3  # unit, where the palm looks
+    deep: wp.float32  # share of the distance to the palm by which hands may hold deeper than with their pads
+    palm: wp.vec3  # unit, direction that the palm faces
     noise: wp.array(dtype=wp.float32)  # (D,) standard deviation of dofs
     lower: wp.array(dtype=wp.float32)
     upper: wp.array(dtype=wp.float32)
@@ -37,7 +37,7 @@ class Grips:
 
 @wp.struct
 class HandSample:
-    """Where a drawn hand is."""
+    """A drawn hand."""
 
     found: wp.bool
     posture: wp.int32
@@ -47,7 +47,7 @@ class HandSample:
 
 @wp.func
 def first_above(sorted_in: wp.array(dtype=wp.float32), value: wp.float32):
-    """Index of the first number that is not below `value`; the length if there is none."""
+    """Return the index of the first number that is at least `value`; the length if there is none."""
     low = wp.int32(0)
     high = wp.int32(sorted_in.shape[0])
     while low < high:
@@ -61,7 +61,7 @@ def first_above(sorted_in: wp.array(dtype=wp.float32), value: wp.float32):
 
 @wp.func
 def clear_of(surface: Surface, grips: Grips, posture: wp.int32, pivot: wp.vec3, rotation: wp.quat):
-    """Whether no ball of a posed hand is nearer to the surface than its radius."""
+    """Check that no ball of a posed hand is closer to the surface than its radius."""
     for s in range(grips.balls.shape[1]):
         place = pivot + wp.quat_rotate(rotation, grips.balls[posture, s])
         if cube_distance(cube_around(surface, place)) < grips.radius:
@@ -78,7 +78,7 @@ def drawn(
     retreats: wp.array(dtype=wp.float32),
     state: wp.uint32,
 ):
-    """A hand around a pair of places, at the nearest distance at which it is clear."""
+    """Draw a hand around a pair of places, at the nearest clear distance."""
     out = HandSample()
     pair = wp.min(first_above(grips.sums, wp.randf(state)), grips.sums.shape[0] - 1)
     line = grips.axis[pair]
@@ -133,7 +133,7 @@ def reach(
     rotation_out: wp.array(dtype=wp.quat),
     q_out: wp.array2d(dtype=wp.float32),
 ):
-    """The first draw of each start from number `first` on that is clear, and its number; -1: none of `draws` is.
+    """Find the first clear draw of each start from number `first` on, and its number; -1: none of `draws`.
 
     Launch over B.
     """
@@ -146,7 +146,7 @@ def reach(
             number_out[b] = k
             pivot_out[b] = found.pivot
             rotation_out[b] = found.rotation
-            # Another sequence than the draw's, whose state stays with it.
+            # A different sequence from the draw's, whose state belongs to it.
             noise = wp.rand_init(seed_in[b] + 1, draws_in + k)
             for d in range(q_out.shape[1]):
                 q = grips_in.posture[found.posture, d] + grips_in.noise[d] * wp.randn(noise)

@@ -1,10 +1,10 @@
 """Links of a hand against solid obstacles: boxes, boards, neighbours' convex pieces.
 
-Of two convex bodies that are apart the nearest points lie on a corner and a face or on two edges; of two that meet a
-corner or an edge of one is in the other. So the link's features are looked for in the obstacle, the obstacle's edges in
-the link, and the link's edges in the obstacle.
-Along a straight edge the signed distance from a convex body is a convex function. Its least value is found between two
-tangents that meet below it: where they meet is a lower bound, so that edges which are far enough cost two looks.
+The nearest points of two separate convex bodies lie on a corner and a face or on two edges. If they overlap, a corner
+or an edge of one is in the other. So the link's features are tested against the obstacle, the obstacle's edges against
+the link, and the link's edges against the obstacle. Along a straight edge the signed distance from a convex body is a
+convex function. Its least value is found between two tangents below it: their intersection is a lower bound, so distant
+edges cost two evaluations.
 """
 
 import warp as wp
@@ -16,7 +16,7 @@ from graspd.worker.simulation.kernels.wrenches import Wrenches, add_wrench
 
 wp.set_module_options({"enable_backward": False})
 
-#: Looks between the tangents, and how near to their meeting point the value must be [m].
+#: Evaluations between the tangents, and tolerance of the value at their intersection [m].
 LOOKS = wp.constant(20)
 EXACT = wp.constant(wp.float32(1.0e-8))
 #: A point this far outside a plane's face counts as on it [m].
@@ -34,7 +34,7 @@ class EdgeMinimum:
 
 @wp.struct
 class NearestObstacle:
-    """Where a link is nearest to an obstacle; `direction` is the gradient of the distance as `point` moves with it."""
+    """The nearest point of a link to an obstacle; `direction` is the gradient of the distance by `point`."""
 
     distance: wp.float32
     point: wp.vec3
@@ -43,21 +43,21 @@ class NearestObstacle:
 
 @wp.func
 def meeting(t0: wp.float32, f0: wp.float32, g0: wp.float32, t1: wp.float32, f1: wp.float32, g1: wp.float32):
-    """Where two tangents of a convex function meet, g0 < 0 < g1; between t0 and t1."""
+    """Return the intersection of two tangents of a convex function, g0 < 0 < g1; between t0 and t1."""
     return wp.clamp((f1 - f0 + g0 * t0 - g1 * t1) / (g0 - g1), t0, t1)
 
 
 @wp.func
 def balanced(n0: wp.vec3, g0: wp.float32, n1: wp.vec3, g1: wp.float32):
-    """The gradient of the least value on an edge, g0 < 0 < g1 being the slopes beside it: at a bend neither side's own,
-    but the mixture that has no slope along the edge."""
+    """Return the gradient of the least value on an edge, with slopes g0 < 0 < g1 beside it.
+    At a bend it is neither side's own, but the mixture without a slope along the edge."""
     share = g1 / (g1 - g0)
     return share * n0 + (1.0 - share) * n1
 
 
 @wp.func
 def edge_in_piece(pieces: Pieces, piece: wp.int32, a: wp.vec3, b: wp.vec3, limit: wp.float32):
-    """Where on the edge a b (piece frame) the piece is nearest; a value of `limit` or more: it is not nearer."""
+    """Return the nearest place of edge a b (piece frame) to the piece; a value >= `limit`: not nearer."""
     along = b - a
     at0 = piece_distance(pieces, piece, a)
     at1 = piece_distance(pieces, piece, b)
@@ -106,7 +106,7 @@ def edge_in_piece(pieces: Pieces, piece: wp.int32, a: wp.vec3, b: wp.vec3, limit
 
 @wp.func
 def plane_over(obstacles: Obstacles, k: wp.int32, x: wp.vec3):
-    """(normal, value) of the plane of obstacle k that x lies farthest out of."""
+    """Return (normal, value) of the plane of obstacle k that x is farthest outside of."""
     out = wp.vec4(0.0, 0.0, 0.0, -1.0e9)
     for i in range(obstacles.first_plane[k], obstacles.first_plane[k + 1]):
         plane = obstacles.planes[i]
@@ -118,7 +118,7 @@ def plane_over(obstacles: Obstacles, k: wp.int32, x: wp.vec3):
 
 @wp.func
 def edge_in_obstacle(obstacles: Obstacles, k: wp.int32, a: wp.vec3, b: wp.vec3, limit: wp.float32):
-    """Where the edge a b lies deepest in obstacle k; a value of `limit` or more: it is not deeper."""
+    """Return the deepest place of edge a b in obstacle k; a value of `limit` or more: not deeper."""
     along = b - a
     at0 = plane_over(obstacles, k, a)
     at1 = plane_over(obstacles, k, b)
@@ -167,7 +167,7 @@ def edge_in_obstacle(obstacles: Obstacles, k: wp.int32, a: wp.vec3, b: wp.vec3, 
 
 @wp.func
 def over_face(obstacles: Obstacles, k: wp.int32, x: wp.vec3):
-    """Whether x lies on obstacle k, or in it."""
+    """Check whether x lies on obstacle k, or in it."""
     for i in range(obstacles.first_plane[k], obstacles.first_plane[k + 1]):
         plane = obstacles.planes[i]
         if wp.dot(wp.vec3(plane[0], plane[1], plane[2]), x) - plane[3] > ON_FACE:
@@ -187,7 +187,7 @@ def apart(
     body_p: wp.array2d(dtype=wp.vec3),
     body_q: wp.array2d(dtype=wp.quat),
 ):
-    """Whether the bounding spheres of a piece and an obstacle are farther than `reach` from each other."""
+    """Check whether the bounding spheres of a piece and an obstacle are farther than `reach` apart."""
     offset = piece_centre(pieces, piece, b, body_p, body_q) - obstacles.centre[k]
     r = obstacles.radius[k] + wp.length(pieces.half[piece]) + wp.max(reach, 0.0)
     return wp.dot(offset, offset) > r * r
@@ -205,7 +205,7 @@ def nearest_edge(
     body_p: wp.array2d(dtype=wp.vec3),
     body_q: wp.array2d(dtype=wp.quat),
 ):
-    """Where an edge of obstacle k is nearest to a piece, or an edge of the piece deepest in the obstacle."""
+    """Return the nearest edge of obstacle k to a piece, or the piece's deepest edge in the obstacle."""
     out = NearestObstacle()
     out.distance = limit
     q = piece_rotation(pieces, piece, b, body_q)
@@ -225,7 +225,7 @@ def nearest_edge(
         start = body_p[b, body] + wp.quat_rotate(body_q[b, body], features.start[e])
         end = body_p[b, body] + wp.quat_rotate(body_q[b, body], features.end[e])
         thickness = features.thickness[e]
-        # Apart, the obstacle's edges and the link's features tell the distance: here only what pierces counts.
+        # If separate, the obstacle's edges and the link's features give the distance: only penetration counts here.
         deepest = edge_in_obstacle(obstacles, k, start, end, wp.min(out.distance, 0.0) + thickness)
         if deepest.value - thickness < wp.min(out.distance, 0.0):
             out.distance = deepest.value - thickness
@@ -253,7 +253,7 @@ def penalty(
     wrench_inout: Wrenches,
     depth_inout: wp.array(dtype=wp.float32),
 ):
-    """Gradient of w sum min(d - margin - room, 0)^2 over features, and the nearest edge of each pair. Over (B, P)."""
+    """Add the gradient of w sum min(d - margin - room, 0)^2 over features and nearest edges. Over (B, P)."""
     b, piece = wp.tid()
     if active_in[b] == 0 or scene_in[b] < 0 or features_in.first[piece] == features_in.first[piece + 1]:
         return
@@ -298,7 +298,7 @@ def residuals(
     # Out:
     residuals_out: Residuals,
 ):
-    """What `penalty` sees nearer than margin + near goes to margin + target. Over (B, P)."""
+    """Emit residuals: terms of `penalty` within margin + near move to margin + target. Over (B, P)."""
     b, piece = wp.tid()
     if active_in[b] == 0 or scene_in[b] < 0 or features_in.first[piece] == features_in.first[piece + 1]:
         return
@@ -335,10 +335,9 @@ def distances(
     # Out:
     distance_inout: wp.array2d(dtype=wp.float32),
 ):
-    """Least distance (B, L) of each body from the solids of scene 0; what is farther than `reach` counts as that.
+    """Compute the least distance (B, L) of each body from the solids of scene 0, at most `reach`.
 
-    A feature over no face of an obstacle is farther from it than one of the obstacle's edges is from the link. Over
-    (B, P).
+    A feature over no face of an obstacle is farther from it than an edge of the obstacle from the link. Over (B, P).
     """
     b, piece = wp.tid()
     body = pieces_in.body[piece]

@@ -1,4 +1,4 @@
-"""Signed distance of hand points to the object's mesh, smoothed by Phong projection (paper, section III-B).
+"""Signed distance of hand points to the mesh, smoothed by Phong projection (paper, section III-B).
 
 With the closest point b on a face, barycentric weights w_k, and corner normals n_k, the projection onto the tangent
 plane of corner k is pi_k(b) = b - ((b - v_k).n_k) n_k and the smoothed surface point is
@@ -24,8 +24,8 @@ class Surface:
     field: wp.array3d(dtype=wp.float32)  # coarse grid of distances; empty: not used
     field_origin: wp.vec3
     field_cell: wp.float32
-    field_error: wp.float32  # a point whose grid distance is above `exact below` + this is never asked of the mesh
-    cells: Cells  # faces near each cell of the grid; without lists: the mesh's tree is asked
+    field_error: wp.float32  # points with a grid distance above `exact below` + this skip the mesh
+    cells: Cells  # faces near each cell of the grid; without lists the mesh's tree is used
 
 
 @wp.struct
@@ -40,7 +40,7 @@ class SurfaceSample:
 def smoothed(
     surface: Surface, point: wp.vec3, closest: wp.vec3, face: wp.int32, u: wp.float32, v: wp.float32, sign: wp.float32
 ):
-    """Distance and normal at a point whose closest point on the mesh has weights u, v, 1 - u - v of a face."""
+    """Return distance and normal at a point whose closest point has weights u, v, 1 - u - v of a face."""
     out = SurfaceSample()
     w = 1.0 - u - v
     n0 = surface.corner_normals[3 * face]
@@ -72,7 +72,7 @@ def smoothed(
 
 @wp.func
 def mesh_distance(surface: Surface, point: wp.vec3, reach: wp.float32):
-    """Smoothed signed distance and normal; distance = reach and normal 0 where the surface is farther than `reach`."""
+    """Return smoothed signed distance and normal; distance = reach and normal 0 beyond `reach`."""
     out = SurfaceSample()
     out.distance = reach
     out.normal = wp.vec3(0.0)
@@ -85,7 +85,7 @@ def mesh_distance(surface: Surface, point: wp.vec3, reach: wp.float32):
 
 @wp.func
 def near_distance(surface: Surface, point: wp.vec3, reach: wp.float32):
-    """The same, from the list of the cell that the point is in if that has one."""
+    """Return the same, from the list of the point's cell if it has one."""
     x = (point - surface.field_origin) / surface.field_cell
     i = int(wp.floor(x[0]))
     j = int(wp.floor(x[1]))
@@ -107,7 +107,7 @@ def near_distance(surface: Surface, point: wp.vec3, reach: wp.float32):
 
 @wp.struct
 class Cube:
-    """The grid's distances at the corners of the cell that a point is in, and where in it that is."""
+    """Distances at the corners of a point's cell of the grid, and the point's place in it."""
 
     inside: wp.bool
     at: wp.vec3  # 0 to 1 along each axis
@@ -123,7 +123,7 @@ class Cube:
 
 @wp.func
 def cube_around(surface: Surface, point: wp.vec3):
-    """The cell that a point is in; `inside` tells whether the grid has one."""
+    """Return the cell of a point; `inside` is whether the grid has one."""
     cube = Cube()
     x = (point - surface.field_origin) / surface.field_cell
     i = int(wp.floor(x[0]))
@@ -152,7 +152,7 @@ def cube_around(surface: Surface, point: wp.vec3):
 
 @wp.func
 def cube_distance(cube: Cube):
-    """Trilinear interpolation; 1e3 m outside the grid."""
+    """Interpolate trilinearly; 1e3 m outside the grid."""
     if not cube.inside:
         return float(1.0e3)
     a = cube.at[0]
@@ -168,7 +168,7 @@ def cube_distance(cube: Cube):
 
 @wp.func
 def cube_normal(cube: Cube):
-    """Direction of the exact gradient of the interpolation; 0 outside the grid."""
+    """Return the direction of the exact gradient of the interpolation; 0 outside the grid."""
     if not cube.inside:
         return wp.vec3(0.0)
     a = cube.at[0]
@@ -191,7 +191,7 @@ def cube_normal(cube: Cube):
 
 @wp.func
 def field_distance(surface: Surface, point: wp.vec3):
-    """Trilinear interpolation of the grid with its exact gradient; distance 1e3 m outside the grid."""
+    """Interpolate the grid trilinearly, with exact gradient; distance 1e3 m outside the grid."""
     cube = cube_around(surface, point)
     out = SurfaceSample()
     out.distance = cube_distance(cube)
@@ -201,8 +201,8 @@ def field_distance(surface: Surface, point: wp.vec3):
 
 @wp.func
 def distance(surface: Surface, point: wp.vec3, reach: wp.float32, exact_below: wp.float32, keep: wp.float32):
-    """The mesh's distance near the surface, the grid's where that is good enough; `reach` beyond that, and where the
-    grid says more than `keep`, which is at least `exact_below`."""
+    """Return the mesh's distance near the surface, else the grid's; `reach` beyond that.
+    Also `reach` where the grid's distance is above `keep`, which is at least `exact_below`."""
     if surface.field.shape[0] > 0:
         cube = cube_around(surface, point)
         coarse = cube_distance(cube)
@@ -247,7 +247,7 @@ def probe(
     distance_out: wp.array(dtype=wp.float32),
     normal_out: wp.array(dtype=wp.vec3),
 ):
-    """Distances and normals at given points. Launch over the points."""
+    """Compute distances and normals at given points. Launch over the points."""
     i = wp.tid()
     sample = distance(surface_in, point_in[i], reach_in, exact_below_in, reach_in)
     distance_out[i] = sample.distance
@@ -285,10 +285,10 @@ def gather(
     near_out: wp.array2d(dtype=wp.int32),
     mark_out: wp.array2d(dtype=wp.int32),
 ):
-    """Candidate contacts: hand points nearer than dilation + keep, packed per grasp; `near` lists those with a gap of
-    at most `near_gap`. Launch over (B, N / lane).
+    """Pack candidate contacts per grasp: hand points closer than dilation + keep.
 
-    With room for `mark` each point writes to its own place, marked, for `packing.pack` to put them side by side.
+    `near` lists those with a gap of at most `near_gap`. With space for `mark` each point writes to its own index,
+    marked, for `packing.pack` to pack them. Launch over (B, N / lane).
     """
     b, part = wp.tid()
     if active_in[b] == 0:

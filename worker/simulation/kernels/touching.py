@@ -1,5 +1,5 @@
-"""What of an object is near the points of posed hands, and which forces there hold it: points, contacts, columns of the
-balance. Poses are in double precision, distances to the mesh in single."""
+"""The object's surface near points of posed hands, and the forces that hold it there.
+Poses are in double precision, distances to the mesh in single."""
 
 import math
 
@@ -12,7 +12,7 @@ wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
 #: Edges of a friction pyramid.
 EDGES = wp.constant(8)
-#: Angle from one to the next.
+#: Angle between adjacent edges.
 TURN = wp.constant(wp.float64(math.tau / 8))
 #: Rows of a balance before those of the torques: the wrench and the sum of normal forces.
 FIRST_TORQUE = wp.constant(7)
@@ -30,7 +30,7 @@ class Points:
 
 @wp.struct
 class NearbySurface:
-    """What is near the points (B, N) of B hands, within a reach."""
+    """The object's surface near points (B, N) of B hands, within a reach."""
 
     distance: wp.array2d(dtype=wp.float32)  # at most the reach
     closest: wp.array2d(dtype=wp.vec3)
@@ -40,7 +40,7 @@ class NearbySurface:
 
 @wp.func
 def point_of(points: Points, bodies: Bodies, b: wp.int32, i: wp.int32):
-    """Where a point of a hand is."""
+    """Return the position of a point of a hand."""
     body = points.body[i]
     return bodies.position[b, body] + wp.quat_rotate(bodies.rotation[b, body], points.position[i])
 
@@ -57,7 +57,7 @@ def touch(
     # Out:
     touching_out: NearbySurface,
 ):
-    """What is near all points of hands. Launch over (B, N / lane)."""
+    """Find the surface near all points of hands. Launch over (B, N / lane)."""
     b, part = wp.tid()
     for i in range(part * lane_in, wp.min((part + 1) * lane_in, points_in.body.shape[0])):
         found = nearest(skin_in, wp.vec3(point_of(points_in, bodies_in, b, i)), reach_in)
@@ -70,7 +70,7 @@ def touch(
 
 @wp.func
 def apart(touching: NearbySurface, radius: wp.float64, b: wp.int32, i: wp.int32, j: wp.int32):
-    """Square of how far apart two contacts are: by place over `radius`, and by direction."""
+    """Return the squared separation of two contacts: by place over `radius`, and by direction."""
     place = (wp.vec3d(touching.closest[b, i]) - wp.vec3d(touching.closest[b, j])) / radius
     turn = wp.vec3d(touching.normal[b, i]) - wp.vec3d(touching.normal[b, j])
     return wp.dot(place, place) + wp.dot(turn, turn)
@@ -94,11 +94,11 @@ def choose(
     chosen_out: wp.array2d(dtype=wp.int32),
     count_out: wp.array(dtype=wp.int32),
 ):
-    """At most C points (B, C) of each hand that press: nearer than `near`, or than `far` on a finger (of each body, -1:
-    none) that has no such point, and faced with a cosine below `facing`; of more than C those that spread most widely,
-    each farthest from those before it (Gonzalez 1985). Launch over B.
+    """Choose at most C pressing points (B, C) of each hand, the most spread out. Launch over B.
 
-    `touches` (B, F), `list`, `least` (B, N) are scratch; `count` (B,) is how many there are.
+    Points press if closer than `near`, or than `far` on a finger (of each body, -1: none) without such points, and if
+    they face the object with a cosine below `facing`. Each chosen point is the farthest from those before it (Gonzalez
+    1985). `touches` (B, F), `list`, `least` (B, N) are scratch; `count` (B,) is their number.
     """
     b = wp.tid()
     limit = chosen_out.shape[1]
@@ -156,7 +156,7 @@ def choose(
 
 @wp.func
 def first_tangent(n: wp.vec3d):
-    """A unit vector across n, along a coordinate axis where n is along another."""
+    """Return a unit vector perpendicular to n; along a coordinate axis where n is along another."""
     axis = wp.vec3d(wp.float64(1.0), wp.float64(0.0), wp.float64(0.0))
     if wp.abs(n[1]) < wp.abs(n[0]) and wp.abs(n[1]) <= wp.abs(n[2]):
         axis = wp.vec3d(wp.float64(0.0), wp.float64(1.0), wp.float64(0.0))
@@ -182,8 +182,11 @@ def columns(
     # Out:
     matrix_out: wp.array3d(dtype=wp.float64),
 ):
-    """Columns (B, C * E, 7 + D) of the balance: the wrench of each edge of a contact's pyramid with unit normal force,
-    torque over `radius`; `sum`; the torques of the dofs that exert it over their limits. Launch over (B, C)."""
+    """Compute columns (B, C * E, 7 + D) of the balance. Launch over (B, C).
+
+    Rows: the wrench of each edge of a contact's pyramid with unit normal force, torque over `radius`; `sum`; the
+    torques of the dofs that exert it over their limits.
+    """
     b, c = wp.tid()
     if c >= count_in[b]:
         return
@@ -203,7 +206,7 @@ def columns(
         matrix_out[b, k, 6] = sum_in
         for d in range(effort_in.shape[0]):
             matrix_out[b, k, FIRST_TORQUE + d] = wp.float64(0.0)
-    # By virtual work: what an edge asks of a joint is the force along the way that the joint moves the contact.
+    # By virtual work: an edge's joint torque is its force along the contact's motion by the joint.
     body = points_in.body[i]
     while body > 0:
         way = joint_axis(chain_in, bodies_in, b, body)
@@ -227,8 +230,8 @@ def scale_torques(
     matrix_inout: wp.array3d(dtype=wp.float64),
     unit_out: wp.array(dtype=wp.float64),
 ):
-    """Torques of a balance over `unit` (B,), which gives the largest of them `weight`; `count` (B,) of contacts becomes
-    that of columns. Launch over B."""
+    """Divide torques of a balance by `unit` (B,), which gives the largest of them `weight`.
+    `count` (B,) of contacts becomes that of columns. Launch over B."""
     b = wp.tid()
     count = EDGES * count_inout[b]
     count_inout[b] = count
@@ -257,8 +260,8 @@ def hold(
     residual_out: wp.array(dtype=wp.float64),
     torque_out: wp.array2d(dtype=wp.float64),
 ):
-    """Net wrench of forces in these shares (B, C * E) over the sum of their normal components, and the torques (B, D)
-    that exert them when that sum is `total`, or less where a limit asks for it. Launch over B."""
+    """Compute the net wrench of forces in these shares (B, C * E) over the sum of their normal components.
+    Also the torques (B, D) that exert them at the sum `total`, or less within limits. Launch over B."""
     b = wp.tid()
     whole = wp.float64(0.0)
     for k in range(count_in[b]):

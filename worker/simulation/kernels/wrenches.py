@@ -1,14 +1,14 @@
-"""Wrenches on bodies, summed by many threads at once: in whole numbers, so that no order of the threads changes a bit.
+"""Wrenches on bodies, summed by many threads in integers, so that thread order changes no bit.
 
-A wrench is six counts of `UNIT`: force and torque about the object's origin. Float32 sums depend on their order, which
-on a GPU is another at each run.
+A wrench is six counts of `UNIT`: force and torque about the object's origin. Float32 sums depend on their order,
+which differs between runs on a GPU.
 """
 
 import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
-#: What one count stands for: 2^-36, below the rounding of any float32 above 1e-4. Sums may reach 1.3e8.
+#: Value of one count: 2^-36, below the rounding of any float32 above 1e-4. Sums may reach 1.3e8.
 UNIT = wp.constant(1.0 / 68719476736.0)
 PER_UNIT = wp.constant(68719476736.0)
 #: Largest component that one thread may add: hands far inside an object reach about 1e4.
@@ -20,7 +20,7 @@ Wrenches = wp.array3d(dtype=wp.int64)
 
 @wp.func
 def counts(x: wp.float32):
-    """A component in units; what is no finite number counts nothing: its hand shows that itself."""
+    """Return a component in counts; a non-finite one counts as nothing: its hand shows it otherwise."""
     if not wp.isfinite(x):
         return wp.int64(0)
     return wp.int64(wp.clamp(x, -MOST, MOST) * PER_UNIT)
@@ -47,5 +47,5 @@ def force_on(wrench: Wrenches, b: wp.int32, body: wp.int32):
 
 @wp.func
 def torque_on(wrench: Wrenches, b: wp.int32, body: wp.int32):
-    """About the object's origin."""
+    """Return the torque about the object's origin."""
     return UNIT * wp.vec3(float(wrench[b, body, 3]), float(wrench[b, body, 4]), float(wrench[b, body, 5]))

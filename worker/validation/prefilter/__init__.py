@@ -1,1 +1,1 @@
-"""The prefilter: the standard level's test in MuJoCo Warp, many grasps at once on one device."""
+"""The prefilter: the test of level standard in MuJoCo Warp, many grasps at once on one device."""

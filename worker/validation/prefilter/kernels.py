@@ -1,8 +1,8 @@
-"""The standard level's schedule for many worlds at once: close, push six ways, watch, and take the next grasp.
+"""Schedule of level standard for many worlds: close, push six ways, check, take the next grasp.
 
-A tick is what the engine simulates between two looks (`protocol.INTERVAL_S`). After each tick every world looks at its
-own object and goes its own way: worlds do not wait for each other, and one that has decided takes the next grasp of
-the queue. Quaternions are w x y z, kept in the order of `wp.quat`'s components as MuJoCo Warp has it.
+A tick is the simulation between two checks (`protocol.INTERVAL_S`). After each tick every world checks its own object.
+Worlds do not wait for each other; a world with a decided verdict takes the next grasp of the queue. Quaternions are w x
+y z, stored in the order of `wp.quat`'s components as in MuJoCo Warp.
 """
 
 import warp as wp
@@ -13,7 +13,7 @@ from graspd.worker.validation.protocol import Outcome
 
 wp.set_module_options({"enable_backward": False})
 
-#: Ticks of one stage of closing, of closing in all, until the first look at a push, and of a whole push.
+#: Ticks of one stage of closing, of closing in all, until the first check of a push, and of a whole push.
 STAGE = wp.constant(round(protocol.STAGE_S / protocol.INTERVAL_S))
 STAGES = wp.constant(protocol.STAGES)
 FIRST_LOOK = wp.constant(round(protocol.FIRST_LOOK_S / protocol.INTERVAL_S))
@@ -28,33 +28,33 @@ LOST = wp.constant(int(Outcome.LOST_WHILE_CLOSING))
 DISPLACED = wp.constant(int(Outcome.DISPLACED))
 ROTATED = wp.constant(int(Outcome.ROTATED))
 DIVERGED = wp.constant(int(Outcome.DIVERGED))
-#: A broken limit is clear at so many times itself, or given up after so many ticks; a grasp after so many.
+#: A broken limit is clear above this ratio, or final after this many ticks; a grasp ends after this many ticks.
 CLEAR = wp.constant(BAND[1])
 PATIENT = wp.constant(PATIENCE)
 MOST = wp.constant(MOST_TICKS)
-#: Where the object of a world without a grasp waits, out of reach of the hand [m].
+#: Position of the object in worlds without a grasp, out of reach of the hand [m].
 PARKED = wp.constant(10.0)
 
 
 @wp.struct
 class GraspCommands:
-    """What N grasps ask of their worlds."""
+    """Commands of N grasps."""
 
     queue: wp.array(dtype=wp.int32)
     """The grasps to validate, in turn."""
     start: wp.array2d(dtype=wp.float32)
     """(N, nq) state in the pregrasp."""
     position: wp.array2d(dtype=wp.vec3)
-    """(N, 3) of the root in pregrasp, grasp and squeeze [m]."""
+    """(N, 3) root positions in pregrasp, grasp and squeeze [m]."""
     turn: wp.array2d(dtype=wp.vec4)
-    """(N, 3) its quaternions."""
+    """(N, 3) root quaternions."""
     control: wp.array3d(dtype=wp.float32)
     """(N, 3, nu) commands of the actuators."""
 
 
 @wp.struct
 class Engine:
-    """The arrays of W simulations that are set and read."""
+    """Arrays of W simulations that are set and read."""
 
     qpos: wp.array2d(dtype=wp.float32)
     qvel: wp.array2d(dtype=wp.float32)
@@ -68,12 +68,12 @@ class Engine:
 
 @wp.struct
 class Worlds:
-    """How far each of W worlds is."""
+    """State of the schedule in each of W worlds."""
 
     grasp: wp.array(dtype=wp.int32)
-    """-1: none is left for it."""
+    """-1: no grasp is left for the world."""
     ticks: wp.array(dtype=wp.int32)
-    """Since its grasp began to close."""
+    """Ticks since the hand began to close."""
     push: wp.array(dtype=wp.int32)
     """-1 while closing."""
     looks: wp.array(dtype=wp.int32)
@@ -83,38 +83,38 @@ class Worlds:
     before: wp.array(dtype=wp.vec3)
     turned_before: wp.array(dtype=wp.float32)
     qpos: wp.array2d(dtype=wp.float32)
-    """The closed state, which every push starts from; so the next two."""
+    """Closed state from which every push starts; likewise the next two."""
     qvel: wp.array2d(dtype=wp.float32)
     warmstart: wp.array2d(dtype=wp.float32)
 
 
 @wp.struct
 class WorldVerdicts:
-    """What is said of N grasps."""
+    """Verdicts on N grasps."""
 
     outcome: wp.array2d(dtype=wp.int32)
     """(N, 6)"""
     margin: wp.array(dtype=wp.float32)
-    """Worst displacement or rotation over its limit that was seen."""
+    """Worst displacement or rotation over its limit so far."""
     ticks: wp.array(dtype=wp.int32)
     overflow: wp.array(dtype=wp.int32)
 
 
 @wp.struct
 class TestConstants:
-    """What is the same in all worlds."""
+    """Constants of all worlds."""
 
     object_qpos: wp.int32
     object_body: wp.int32
     push: wp.float32
     """[N]"""
     centre: wp.vec3
-    """Of the object's mass in its frame [m]."""
+    """Centre of mass of the object in its frame [m]."""
 
 
 @wp.func
 def blend(a: wp.vec4, b: wp.vec4, share: wp.float32):
-    """Unit quaternion `share` of the way from a to b at an even rate, along the shorter arc."""
+    """Interpolate unit quaternions a and b at `share`, by slerp along the shorter arc."""
     cosine = wp.dot(a, b)
     if cosine < 0.0:
         b = -b
@@ -128,7 +128,7 @@ def blend(a: wp.vec4, b: wp.vec4, share: wp.float32):
 
 @wp.func
 def command(w: wp.int32, g: wp.int32, ticks: wp.int32, grasps: GraspCommands, engine: Engine):
-    """Target posture of the stage that begins after so many ticks of closing."""
+    """Set the target posture of the stage that begins after `ticks` ticks of closing."""
     stage = wp.min(ticks / STAGE, 2 * STAGES - 1)
     part = stage / STAGES
     share = float(stage % STAGES + 1) / float(STAGES)
@@ -141,7 +141,7 @@ def command(w: wp.int32, g: wp.int32, ticks: wp.int32, grasps: GraspCommands, en
 
 @wp.func
 def offset(w: wp.int32, terms: TestConstants, engine: Engine):
-    """Displacement of the object's own frame since the start [m]."""
+    """Return the displacement of the object's frame since the start [m]."""
     at = terms.object_qpos
     position = wp.vec3(engine.qpos[w, at], engine.qpos[w, at + 1], engine.qpos[w, at + 2])
     turn = wp.quat(engine.qpos[w, at + 4], engine.qpos[w, at + 5], engine.qpos[w, at + 6], engine.qpos[w, at + 3])
@@ -150,7 +150,7 @@ def offset(w: wp.int32, terms: TestConstants, engine: Engine):
 
 @wp.func
 def turned(w: wp.int32, terms: TestConstants, engine: Engine):
-    """Rotation of the object since the start [rad]."""
+    """Return the rotation of the object since the start [rad]."""
     at = terms.object_qpos + 3
     axis = wp.vec3(engine.qpos[w, at + 1], engine.qpos[w, at + 2], engine.qpos[w, at + 3])
     return 2.0 * wp.atan2(wp.length(axis), wp.abs(engine.qpos[w, at]))
@@ -183,7 +183,7 @@ def take(
     engine: Engine,
     state: wp.array(dtype=wp.int32),
 ):
-    """Begin with the next grasp of the queue, or wait for good."""
+    """Begin with the next grasp of the queue, or stay idle."""
     place = wp.atomic_add(state, 0, 1)
     g = wp.int32(-1)
     if place < state[2]:
@@ -230,7 +230,8 @@ def look(
     found_out: WorldVerdicts,
     state_out: wp.array(dtype=wp.int32),
 ):
-    """What a tick has brought; `state_out`: places of the queue taken, worlds with a grasp, grasps in the queue."""
+    """Check the state after a tick.
+    `state_out`: places of the queue taken, worlds with a grasp, grasps in the queue."""
     w = wp.tid()
     g = worlds_out.grasp[w]
     if g < 0:
@@ -302,7 +303,7 @@ def place(
     # Data out:
     engine_out: Engine,
 ):
-    """The states from row `first_in` on, at rest."""
+    """Set the states from row `first_in` on, at rest."""
     w = wp.tid()
     row = wp.min(first_in + w, states_in.shape[0] - 1)
     for k in range(engine_out.qpos.shape[1]):
@@ -324,7 +325,7 @@ def depths(
     # Data out:
     depth_out: wp.array2d(dtype=wp.float32),
 ):
-    """Deepest penetration of hand and object, and of the hand and itself [m], of the states from row `first_in` on."""
+    """Compute the deepest penetration [m] of hand and object, and within the hand, from row `first_in` on."""
     i = wp.tid()
     if i >= contacts_in[0]:
         return

@@ -1,8 +1,8 @@
-"""The GPU prefilter in MuJoCo Warp: it gives the clear verdicts, and MuJoCo on the CPU all others and a sample of
-these.
+"""The GPU prefilter in MuJoCo Warp: it gives the clear verdicts.
 
-At level `standard` it only refuses: what clearly fails goes no further, and whatever may hold is certified on the
-CPU. At level `fast` its clear verdicts stand both ways. It has no part in the letter, and none in lifts.
+MuJoCo on the CPU gives all other verdicts, and rechecks a sample of the clear ones. At level `standard` the prefilter
+only rejects: clear failures end there, all others are validated on the CPU. At level `fast` its clear verdicts stand
+both ways. It has no part in level `dexgraspbench` or in lifts.
 
 The model is the validator's own, compiled once; what differs between grasps (postures, commands, pushes) is data. A
 pool of worlds takes grasps from a queue on the device, so a launch stays full until the queue is empty, and one graph
@@ -40,16 +40,16 @@ from graspd.worker.validation.protocol import INTERVAL_S, Outcome, Rollout, Vali
 
 log = logging.getLogger(__name__)
 
-#: Worlds of a pool, for few grasps and for many: pools of any size would be made anew for nearly every launch.
+#: Pool sizes, for few grasps and for many; with arbitrary sizes nearly every launch would build a new pool.
 WORLDS: Final = {"cuda": (256, 1024), "cpu": (8, 32)}
-#: Pools that are kept, each with its model, arrays and graph: those of the pairs that were validated last.
+#: Number of cached pools, each with its model, arrays and graph: those of the pairs validated last.
 _KEPT_POOLS: Final = 4
-#: Share of rechecked verdicts that the CPU may contradict, beyond one, before the prefilter is not believed.
+#: Largest share of rechecked verdicts that the CPU may contradict, beyond one, before the prefilter is not trusted.
 _MOST_CONTRADICTED: Final = 0.05
 
 
 class WorldPool:
-    """Worlds of one scene on one device. Not for several threads at once."""
+    """Worlds of one scene on one device. Not thread-safe."""
 
     def __init__(self, scene: Scene, device: str, worlds: int) -> None:
         self.scene, self.device, self.worlds = scene, device, worlds
@@ -68,10 +68,10 @@ class WorldPool:
             self._allocate()
 
     def validate(self, grasps: GraspSet, run: ExecutionContext = DEFAULT_CONTEXT) -> PrefilterOutcomes:
-        """The standard level's test of N grasps.
+        """Run the test of level standard on N grasps.
 
         Raises:
-            TaskCancelled: when `run.cancelled()` answers True.
+            TaskCancelled: `run.cancelled()` returned True.
         """
         with wp.ScopedDevice(self.device):
             found = self._validate(grasps, run)
@@ -92,7 +92,7 @@ class WorldPool:
         return terms
 
     def _allocate(self) -> None:
-        """Data of the simulations, with the room that is known to be needed."""
+        """Allocate the simulations' data, with the capacity known to be needed."""
         model, w, more = self.scene.model, self.worlds, 2**self._doublings
         self._data = data = self._engine.make_data(model, nworld=w, nconmax=CONTACTS * more, njmax=ROWS * more)
         self._graph: Any = None
@@ -134,7 +134,7 @@ class WorldPool:
         )
 
     def _room_for(self, n: int) -> None:
-        """Arrays for at least so many grasps. A graph holds on to its arrays, so they change as seldom as may be."""
+        """Allocate arrays for at least `n` grasps. They change rarely, because a graph refers to its arrays."""
         if n <= self._capacity:
             return
         rows, model, self._graph = max(self.worlds, 1 << (n - 1).bit_length()), self.scene.model, None
@@ -150,7 +150,7 @@ class WorldPool:
         self._capacity, self._asked, self._found = rows, asked, found
 
     def _states(self, posture: Posture) -> NDArray[np.float32]:
-        """(N, nq) the hand in postures, the object at its start."""
+        """Return the states (N, nq) with the hand in postures and the object at its start."""
         scene = self.scene
         out = np.tile(scene.model.qpos0, (len(posture), 1))
         out[:, scene.object_qpos : scene.object_qpos + 7] = [*scene.centre, 1, 0, 0, 0]
@@ -160,7 +160,7 @@ class WorldPool:
         return out.astype(np.float32)
 
     def _ask(self, grasps: GraspSet, starts: NDArray[np.float32], queue: NDArray[np.intp]) -> None:
-        """Put grasps on the device, with the order in which they are taken."""
+        """Copy grasps to the device, with the order in which they are taken."""
         scene, parts = self.scene, (grasps.pregrasp, grasps.grasp, grasps.squeeze)
         poses = np.stack([part.hand_pose for part in parts], axis=1)
         joints = np.stack([part.joint_positions for part in parts], axis=1)
@@ -178,7 +178,7 @@ class WorldPool:
             array.assign(whole)
 
     def _depths(self, states: NDArray[np.float32]) -> tuple[Floats, NDArray[np.bool_]]:
-        """(N, 2) deepest penetration of hand and object, and within the hand [m]; (N,) whether room was short."""
+        """Return the deepest penetration (N, 2) of hand and object, and in the hand [m], and overflows (N,)."""
         n, data = len(states), self._data
         out, rows, short = wp.zeros((n, 2), dtype=wp.float32), wp.array(states, dtype=wp.float32), np.zeros(n, bool)
         for first in range(0, n, self.worlds):
@@ -215,7 +215,7 @@ class WorldPool:
             self._tick()
 
     def _tick(self) -> None:
-        """One tick of all worlds; on CUDA a graph, once the first tick has loaded what it launches."""
+        """Run one tick of all worlds; on CUDA as a graph, once the first tick has loaded the kernels."""
         if self._graph is not None:
             wp.capture_launch(self._graph)
             return
@@ -241,30 +241,30 @@ _pools: OrderedDict[tuple[str, str, int], WorldPool] = OrderedDict()
 
 @dataclass(frozen=True)
 class PrefilterVerdicts:
-    """What the prefilter says of N grasps."""
+    """Verdicts of the prefilter on N grasps."""
 
     stands: dict[int, Rollout]
     """Verdicts that stand, by row. All other rows are for the CPU."""
     rechecked: dict[int, bool]
-    """Verdicts that would stand and are asked of the CPU as well: whether the prefilter said that the grasp holds."""
+    """Clear verdicts that the CPU rechecks, by row: whether the prefilter held the grasp."""
 
     def contradicted(self, rollouts: dict[int, Rollout]) -> int:
-        """How many rechecked verdicts the CPU's trials contradict."""
+        """Count the rechecked verdicts that the CPU's rollouts contradict."""
         return sum(rollouts[row].success != held for row, held in self.rechecked.items())
 
     def believed(self, contradicted: int) -> bool:
-        """Whether the verdicts that stand may stand."""
+        """Check whether few enough verdicts were contradicted to trust the rest."""
         return contradicted <= max(1, _MOST_CONTRADICTED * len(self.rechecked))
 
 
 def first_terms(hand: HandModel, level: str, run: ExecutionContext) -> list[Any]:
-    """The terms of the prefilter where it takes part in verdicts of a level, for `verdict_key`; else none.
+    """Return the prefilter's terms where it takes part in verdicts of a level, for `verdict_key`.
 
-    Grippers have none: their flat pads touch in an area, and how the engines spread contacts over it differs. Hands
-    with tendons have none: on a tenth of Shadow's grasps the engines differ (docs/explanation/quality.md).
+    Grippers have none: their flat pads touch in an area, over which the engines distribute contacts differently. Hands
+    with tendons have none: the engines differ on a tenth of Shadow's grasps (docs/explanation/quality.md).
 
     Raises:
-        InputError: it is insisted on, and not installed.
+        InputError: the prefilter is required but not installed.
     """
     if run.prefilter == "off" or level not in ("standard", "fast"):
         return []
@@ -276,17 +276,17 @@ def first_terms(hand: HandModel, level: str, run: ExecutionContext) -> list[Any]
 
 
 def screened(scene: Scene, terms: str, grasps: GraspSet, *, level: str, run: ExecutionContext) -> PrefilterVerdicts:
-    """What the prefilter says of grasps in a scene.
+    """Run the prefilter on grasps in a scene.
 
     Args:
         scene: the validator's own.
-        terms: digest of all that the scene follows from.
+        terms: digest of everything that determines the scene.
         grasps: N grasps.
         level: standard or fast.
-        run: its device is where the worlds are.
+        run: its device runs the worlds.
 
     Raises:
-        TaskCancelled: when `run.cancelled()` answers True.
+        TaskCancelled: `run.cancelled()` returned True.
     """
 
     postures = GraspSet(grasps.grasp, grasps.pregrasp, grasps.squeeze, grasps.stability_loss)
@@ -312,7 +312,7 @@ def screened(scene: Scene, terms: str, grasps: GraspSet, *, level: str, run: Exe
 
 
 def _pool(scene: Scene, terms: str, device: str, count: int) -> WorldPool:
-    """Worlds for so many grasps of a scene. The last ones are kept: a graph takes longer to make than to use once."""
+    """Return a pool for `count` grasps of a scene, cached: making a graph takes longer than one use."""
     few, many = WORLDS[device.partition(":")[0]]
     size = few if count <= few else many
     key = (terms, device, size)
@@ -326,7 +326,7 @@ def _pool(scene: Scene, terms: str, device: str, count: int) -> WorldPool:
 
 
 def _drawn(grasps: GraspSet) -> NDArray[np.bool_]:
-    """(N,) one grasp in so many, told by its own numbers: whatever batch it stands in."""
+    """Select (N,) one grasp in `RECHECK_ONE_IN` by the digest of its pose, independent of its batch."""
     pose = np.ascontiguousarray(grasps.grasp.hand_pose, float)
     digests = (hashlib.sha256(row.tobytes()).digest() for row in pose)
     return np.array([int.from_bytes(one[:8], "big") % RECHECK_ONE_IN == 0 for one in digests], bool)
@@ -343,25 +343,25 @@ def _rollout(found: PrefilterOutcomes, row: int, scene: Scene) -> Rollout:
     )
 
 
-#: Contacts and constraint rows that a world has room for at first: twice what grasps of three hands were seen to need.
+#: Initial capacity of contacts and constraint rows per world: twice the need observed for grasps of three hands.
 CONTACTS: Final = 96
 ROWS: Final = 256
-#: Room is doubled up to this many times where it did not do.
+#: Largest number of times that the capacity is doubled when it overflows.
 DOUBLINGS: Final = 3
-#: Overflows that leave contacts or constraints out. The others are limits of iterations, which MuJoCo has as well.
+#: Overflows that drop contacts or constraints. The others are iteration limits, which MuJoCo has as well.
 _VOIDING: Final = ("NEFC", "NJMAX_NNZ", "BROADPHASE", "NARROWPHASE", "CCD", "EPA_HORIZON")
 
 
 def has_mujoco_warp() -> bool:
-    """Whether it is installed; nothing is imported."""
+    """Check whether MuJoCo Warp is installed, without importing it."""
     return importlib.util.find_spec("mujoco_warp") is not None
 
 
 def mujoco_warp_version() -> str:
-    """Name and version.
+    """Return name and version.
 
     Raises:
-        InputError: it is not installed.
+        InputError: MuJoCo Warp is not installed.
     """
     if not has_mujoco_warp():
         raise InputError("the prefilter needs mujoco-warp; run pip install 'graspd[gpu]'")
@@ -370,10 +370,10 @@ def mujoco_warp_version() -> str:
 
 @cache
 def mujoco_warp() -> Any:
-    """The module, with Warp started.
+    """Return the module, with Warp initialised.
 
     Raises:
-        InputError: it is not installed.
+        InputError: MuJoCo Warp is not installed.
     """
     mujoco_warp_version()
     backend.start()
