@@ -29,15 +29,15 @@ def _never() -> bool:
     return False
 
 
-class Lanes:
-    """Number of lanes that share the cores; a lane that ends leaves its cores to the others."""
+class CoreSharing:
+    """Number of parallel parts that share the cores; a part that ends leaves its cores to the others."""
 
     def __init__(self, members: int) -> None:
         self.members = members
         self._lock = threading.Lock()
 
     def leave(self) -> None:
-        """Release the cores of one lane."""
+        """Release the cores of one part."""
         with self._lock:
             self.members -= 1
 
@@ -57,14 +57,14 @@ class ExecutionContext:
     """Whether MuJoCo Warp decides the clear verdicts; auto: on a GPU, where it is installed."""
     pool: Pool | None = None
     """Processes that validate and measure; None: threads of this process."""
-    lanes: Lanes | None = None
-    """Lanes that share the cores, this one included; None: all cores are available."""
+    sharing: CoreSharing | None = None
+    """Parallel parts that share the cores, this one included; None: all cores are available."""
 
     @property
     def cores(self) -> int:
-        """Number of CPU threads with the default resolved; an equal share of the cores where lanes share them."""
+        """Number of CPU threads with the default resolved; an equal share of the cores where parts share them."""
         every = self.threads or available_cores()
-        return every if self.lanes is None else max(1, every // max(1, self.lanes.members))
+        return every if self.sharing is None else max(1, every // max(1, self.sharing.members))
 
     def part(self, start: float, end: float) -> ExecutionContext:
         """Return the context of a part, whose progress runs from share `start` to `end` of the whole."""

@@ -28,14 +28,14 @@ from graspd.worker.grasps import GraspSet, joined, joined_columns
 from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.pinch_postures import require_opposing
 from graspd.worker.objects.model import ObjectModel
+from graspd.worker.parallel import parallel_map
 from graspd.worker.planners import NoStartFound, PlanRequest, Rollout, fitting_pairs, method, synthesize
 from graspd.worker.planners.fast_graspd.antipodal_starts import why_narrow
 from graspd.worker.quality.diversity import POINTS, distinct, hand_points
 from graspd.worker.quality.gate import GATES, failed_gate, passes
 from graspd.worker.quality.table import measure
-from graspd.worker.rounds import ROUND_STRIDE, Arrays, Round, enough, lanes_of, next_round, taken
+from graspd.worker.rounds import ROUND_STRIDE, Arrays, Round, enough, next_round, parts_of, taken
 from graspd.worker.scenes.rollout import lift_level, outcomes_in_scenes, rollout_on, scene_verdicts
-from graspd.worker.side_by_side import side_by_side
 from graspd.worker.simulation.environment import PlacedGrasps, Scenes
 from graspd.worker.validation.decomposition import ConvexPieces, decompose
 from graspd.worker.validation.displacement import simulated_displacement_cm
@@ -532,15 +532,15 @@ class Batch:
     @property
     def _in_parts(self) -> bool:
         """Whether a round may be made in parts, so that it ends as soon as enough grasps are found.
-        The CPU runs parts in several lanes; a GPU makes the whole round in the time of a few grasps."""
+        The CPU runs parts in parallel parts; a GPU makes the whole round in the time of a few grasps."""
         return not self.scoring.run.device.startswith("cuda") and method(self.request.method).in_parts
 
     def made(self, asked: Needed) -> Round:
-        """Plan, validate and measure what is needed; on the CPU in lanes."""
+        """Plan, validate and measure what is needed; on the CPU in parallel parts."""
         known: Known = {}
         run = self.run.part(*asked.progress)
-        rollout = self.scoring.rollout(known)  # one for all lanes
-        parts = lanes_of(asked.rows, run.cores if self._in_parts and run.pool is None else 1)
+        rollout = self.scoring.rollout(known)  # one for all parts
+        parts = parts_of(asked.rows, run.cores if self._in_parts and run.pool is None else 1)
 
         def planned(part: range, own: ExecutionContext, others: bool) -> Round:
             wanted = self.wanted(replace(asked, rows=part), rollout, others_have_place=others)
@@ -554,17 +554,17 @@ class Batch:
                 options=request.options,
             )
             told = self.told(wanted, found)
-            # Verdicts and metrics are many short jobs: they may use all cores, whatever the other lanes do.
-            made = self.scoring.scored(told, replace(own, lanes=None), known)
+            # Verdicts and metrics are many short jobs: they may use all cores, whatever the other parts do.
+            made = self.scoring.scored(told, replace(own, sharing=None), known)
             return self.noted(replace(asked, rows=part), made, told)
 
-        def lane(part: range, own: ExecutionContext) -> Round | NoStartFound:
+        def run_part(part: range, own: ExecutionContext) -> Round | NoStartFound:
             try:
                 return planned(part, own, self.candidates > 0)
             except NoStartFound as error:
                 return error
 
-        found = side_by_side(parts, lane, run, size=len)
+        found = parallel_map(parts, run_part, run, size=len)
         if len(refused := [one for one in found if isinstance(one, NoStartFound)]) == len(found):
             raise self.refused(refused[0])
         made = [

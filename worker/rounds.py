@@ -18,9 +18,9 @@ Arrays = dict[str, NDArray[Any]]
 
 #: Seed stride of a batch's rounds, beyond the batch numbers of any job: a job has at most 31,250 batches.
 ROUND_STRIDE: Final = 1 << 20
-#: Fewest grasps of a round, and of a lane.
+#: Fewest grasps of a round, and of a part of one.
 SMALLEST_ROUND: Final = 8
-LANE: Final = 8
+SMALLEST_PART: Final = 8
 #: Least share of valid grasps that a round expects, however bad the rounds before: rounds stay finite and few.
 _LEAST_RATE: Final = 0.1
 
@@ -99,9 +99,9 @@ def enough(wanted: int, valid: int, candidates: int) -> int:
     return math.ceil(1.1 * (wanted - valid) / max(valid / candidates, _LEAST_RATE))
 
 
-def lanes_of(rows: range, cores: int) -> list[range]:
-    """Split rows into contiguous, nearly equal parts: one per core, each of at least `LANE` grasps."""
-    bounds = np.linspace(rows.start, rows.stop, max(1, min(cores, len(rows) // LANE)) + 1).astype(int)
+def parts_of(rows: range, cores: int) -> list[range]:
+    """Split rows into contiguous, nearly equal parts: one per core, each of at least `SMALLEST_PART` grasps."""
+    bounds = np.linspace(rows.start, rows.stop, max(1, min(cores, len(rows) // SMALLEST_PART)) + 1).astype(int)
     return [range(int(low), int(high)) for low, high in pairwise(bounds)]
 
 

@@ -21,9 +21,9 @@ from graspd.worker.generation import PARTS, Batch, Known, Scoring, ValidatedBatc
 from graspd.worker.grasps import GraspSet, joined
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
+from graspd.worker.parallel import ProgressShares
 from graspd.worker.planners import BatchRequest, NoStartFound, synthesize_batches
 from graspd.worker.rounds import Round, taken
-from graspd.worker.side_by_side import Shares
 from graspd.worker.simulation.environment import Scenes, scenes_together
 from graspd.worker.validation.decomposition import ConvexPieces, decompose
 from graspd.worker.validation.prefilter.prefilter import PrefilterVerdicts
@@ -115,7 +115,7 @@ class _Job:
 
     def one_by_one(self) -> Generator[Made]:
         """Make one batch after the other."""
-        shares = Shares(self.sizes, self.run.progress)
+        shares = ProgressShares(self.sizes, self.run.progress)
         for k, (count, scenes) in enumerate(zip(self.sizes, self.scenes, strict=True)):
             own, number = replace(self.run, progress=shares.of(k)), self.first + k
             how: dict[str, Any] = {"scenes": scenes, "pieces": self.pieces, "run": own, "partial": self.partial}
@@ -130,7 +130,7 @@ class _Job:
     def in_waves(self, join: int) -> Generator[Made]:
         """Plan what `join` batches need next in one launch; meanwhile validate and measure the wave before."""
         require_graspable(self.hand, self.obj)
-        stop, shares = threading.Event(), Shares(self.sizes, self.run.progress)
+        stop, shares = threading.Event(), ProgressShares(self.sizes, self.run.progress)
         run = replace(self.run, cancelled=lambda: stop.is_set() or self.run.cancelled())
         several = [one for one in self.scenes if one is not None] if len({*map(id, self.scenes)}) > 1 else []
         ends = accumulate((len(one.object_pose) for one in several), initial=0)

@@ -47,7 +47,7 @@ def submit(services: Services, request: JobRequest, *, priority: Priority | None
     """Record a job and queue its first tasks. Equal requests on equal hand and object give the same job.
 
     Args:
-        lane: bulk for the jobs of a dataset; by default a small job is interactive.
+        priority: bulk for the jobs of a dataset; by default a small job is interactive.
 
     Returns:
         the job, and whether it is new. A failed or cancelled job is returned unchanged: see `retry`.

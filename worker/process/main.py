@@ -214,7 +214,7 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
                 log.warning("an entry of the queue cannot be read: %s", error)
 
     def reorder_queues(self, reference_queue: Any) -> None:
-        """Choose the lane for the next task; RQ calls this after each task it took."""
+        """Choose the queue of the next task; RQ calls this after each task it took."""
         self._taken += 1
         queues = {queue.name: queue for queue in self.queues}
         self._ordered_queues = [queues[name] for name in queue_names(self._stages, self._taken, ability=own_ability())]

@@ -1,4 +1,4 @@
-"""Parts of one computation in parallel, each in its own lane."""
+"""Parallel parts of one computation, each with its share of the cores."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
-from graspd.worker.execution_context import ExecutionContext, Lanes, Progress
+from graspd.worker.execution_context import CoreSharing, ExecutionContext, Progress
 
 T = TypeVar("T")
 R = TypeVar("R")
 
 
 @dataclass
-class Shares:
+class ProgressShares:
     """Combined progress of all parts, in the unit of their sizes."""
 
     sizes: Sequence[int]
@@ -34,7 +34,7 @@ class Shares:
         return tell
 
 
-def side_by_side(
+def parallel_map(
     parts: Sequence[T], work: Callable[[T, ExecutionContext], R], run: ExecutionContext, *, size: Callable[[T], int]
 ) -> list[R]:
     """Run `work` on every part in parallel; return the results in order.
@@ -45,17 +45,23 @@ def side_by_side(
     """
     if len(parts) == 1:
         return [work(parts[0], run)]
-    lanes, stop, shares = Lanes(len(parts)), threading.Event(), Shares([size(part) for part in parts], run.progress)
+    sharing, stop, shares = (
+        CoreSharing(len(parts)),
+        threading.Event(),
+        ProgressShares([size(part) for part in parts], run.progress),
+    )
 
-    def lane(number: int) -> R:
-        own = replace(run, lanes=lanes, progress=shares.of(number), cancelled=lambda: stop.is_set() or run.cancelled())
+    def run_part(number: int) -> R:
+        own = replace(
+            run, sharing=sharing, progress=shares.of(number), cancelled=lambda: stop.is_set() or run.cancelled()
+        )
         try:
             return work(parts[number], own)
         finally:
-            lanes.leave()
+            sharing.leave()
 
-    with ThreadPoolExecutor(len(parts), thread_name_prefix="lane") as pool:
-        futures = [pool.submit(lane, number) for number in range(len(parts))]
+    with ThreadPoolExecutor(len(parts), thread_name_prefix="part") as pool:
+        futures = [pool.submit(run_part, number) for number in range(len(parts))]
         try:
             done, _ = wait(futures, return_when=FIRST_EXCEPTION)
         finally:

@@ -1,4 +1,4 @@
-"""Lanes of a batch and parts of its rounds: faster, and the same grasps, verdicts and metrics to the last bit."""
+"""CoreSharing of a batch and parts of its rounds: faster, and the same grasps, verdicts and metrics to the last bit."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from graspd.service.model.errors import TaskCancelled
 from graspd.service.model.fidelity import resolve_fidelity
 from graspd.service.model.scene_spec import SceneSpec
 from graspd.worker import generation
-from graspd.worker.execution_context import ExecutionContext, Lanes
+from graspd.worker.execution_context import CoreSharing, ExecutionContext
 from graspd.worker.generation import ValidatedBatch, validated_grasps
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.objects.prepare import object_from_path
+from graspd.worker.parallel import parallel_map
 from graspd.worker.planners import NoStartFound, PlanRequest, synthesize
-from graspd.worker.rounds import LANE, lanes_of
+from graspd.worker.rounds import SMALLEST_PART, parts_of
 from graspd.worker.scenes.kinds import rest_poses, supports_of
-from graspd.worker.side_by_side import side_by_side
 from graspd.worker.simulation.environment import Scenes
 
 REQUEST = JobOptions(fidelity=resolve_fidelity("draft"), rechecks=2, seed=3)
-COUNT = 2 * LANE
+COUNT = 2 * SMALLEST_PART
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +73,7 @@ def noted(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int, int]]:
 def test_grasps_of_several_lanes_are_those_of_one(pair, one_lane, monkeypatch: pytest.MonkeyPatch) -> None:
     calls = noted(monkeypatch)
     found = validated_grasps(*pair, REQUEST, count=COUNT, run=ExecutionContext(threads=2))
-    assert sorted(calls)[:2] == [(0, 0, LANE), (0, LANE, LANE)]
+    assert sorted(calls)[:2] == [(0, 0, SMALLEST_PART), (0, SMALLEST_PART, SMALLEST_PART)]
     assert_same(found, one_lane)
 
 
@@ -83,7 +83,7 @@ def test_grasps_of_several_lanes_in_scenes_are_those_of_one(pair, scenes, monkey
     one, two = (
         validated_grasps(*pair, wish, count=COUNT, scenes=scenes, run=ExecutionContext(threads=n)) for n in (1, 2)
     )
-    assert (0, LANE, LANE) in calls
+    assert (0, SMALLEST_PART, SMALLEST_PART) in calls
     assert_same(two, one)
     np.testing.assert_array_equal(two.grasps.scene, one.grasps.scene)
 
@@ -123,11 +123,11 @@ def test_lane_without_a_place_ends_blocked_where_another_has_one(pair, scenes, m
     without: tuple[int, ...] = ()
     free = validated_grasps(*pair, wish, count=COUNT, scenes=scenes, run=ExecutionContext(threads=2))
     monkeypatch.setattr(generation, "synthesize", narrow)
-    without = (LANE,)
+    without = (SMALLEST_PART,)
     found = validated_grasps(*pair, wish, count=COUNT, scenes=scenes, run=ExecutionContext(threads=2))
-    assert refused == [LANE]
+    assert refused == [SMALLEST_PART]
     assert_same(found, free)
-    without = (0, LANE)
+    without = (0, SMALLEST_PART)
     with pytest.raises(NoStartFound):
         validated_grasps(*pair, wish, count=COUNT, scenes=scenes, run=ExecutionContext(threads=2))
 
@@ -166,16 +166,16 @@ def test_the_first_valid_grasps_are_audited_whoever_finds_them(pair, one_lane, m
     ("rows", "cores", "sizes"),
     [(range(32), 2, [16, 16]), (range(32), 16, [8] * 4), (range(5, 9), 4, [4]), (range(20), 2, [10, 10])],
 )
-def test_lanes_are_as_many_as_there_are_cores_and_none_is_small(rows: range, cores: int, sizes: list[int]) -> None:
-    lanes = lanes_of(rows, cores)
-    assert [len(lane) for lane in lanes] == sizes
-    assert [row for lane in lanes for row in lane] == list(rows)
+def test_parts_are_as_many_as_cores_and_none_is_small(rows: range, cores: int, sizes: list[int]) -> None:
+    parts = parts_of(rows, cores)
+    assert [len(part) for part in parts] == sizes
+    assert [row for part in parts for row in part] == list(rows)
 
 
 def test_a_lane_that_ends_leaves_its_cores_to_the_others() -> None:
     ended, both = threading.Event(), threading.Barrier(2, timeout=10)
 
-    class Watched(Lanes):
+    class Watched(CoreSharing):
         def leave(self) -> None:
             super().leave()
             ended.set()
@@ -188,8 +188,8 @@ def test_a_lane_that_ends_leaves_its_cores_to_the_others() -> None:
         return [shared, run.cores]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("graspd.worker.side_by_side.Lanes", Watched)
-        assert side_by_side([0, 1], work, ExecutionContext(threads=4), size=lambda _: 1)[1] == [2, 4]
+        patch.setattr("graspd.worker.parallel.CoreSharing", Watched)
+        assert parallel_map([0, 1], work, ExecutionContext(threads=4), size=lambda _: 1)[1] == [2, 4]
 
 
 def test_a_lane_that_fails_stops_the_others() -> None:
@@ -205,19 +205,19 @@ def test_a_lane_that_fails_stops_the_others() -> None:
             threading.Event().wait(0.01)
 
     with pytest.raises(ValueError, match="the first"):
-        side_by_side([0, 1], work, ExecutionContext(), size=lambda _: 1)
+        parallel_map([0, 1], work, ExecutionContext(), size=lambda _: 1)
 
 
-def test_lanes_tell_how_far_they_are_and_are_cancelled_as_one() -> None:
+def test_parts_report_progress_and_are_cancelled_as_one() -> None:
     told: list[float] = []
 
     def work(part: int, run: ExecutionContext) -> None:
         run.progress(1.0, 1.0, "done")
         run.check("a priority")
 
-    side_by_side(
+    parallel_map(
         [0, 1, 2], work, ExecutionContext(progress=lambda done, total, _: told.append(done / total)), size=lambda _: 2
     )
     assert told[-1] == max(told) == pytest.approx(1.0) and len(told) == 3
     with pytest.raises(TaskCancelled):
-        side_by_side([0, 1], work, ExecutionContext(cancelled=lambda: True), size=lambda _: 1)
+        parallel_map([0, 1], work, ExecutionContext(cancelled=lambda: True), size=lambda _: 1)
