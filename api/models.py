@@ -22,8 +22,8 @@ class StageStatus(StageProgress):
 
     state: State
     progress: float = Field(ge=0, le=1, description="share done; running tasks count by their own progress")
-    message: str = Field("", description="what a running task does now, or why one waits")
-    rate_per_s: float | None = Field(None, description="tasks per second over the present workers")
+    message: str = Field("", description="activity of a running task, or why a task waits")
+    rate_per_s: float | None = Field(None, description="tasks per second of all current workers")
     eta_s: float | None = Field(None, description="expected time until the stage ends [s]")
 
 
@@ -36,16 +36,16 @@ class Job(Validated):
     object: str
     method: str
     fidelity: str
-    requested: int = Field(description="grasps asked for")
+    requested: int = Field(description="grasps requested")
     standing: Literal["valid", "feasible", "kept"] = Field(
         "valid",
-        description="what its kept grasps are: valid, feasible where nothing is validated, or kept candidates",
+        description="kind of its stored grasps: valid; feasible if not validated; kept: candidates, feasible or not",
     )
     progress: float = Field(ge=0, le=1)
-    eta_s: float | None = Field(None, description="expected time until the job ends [s]; absent: not known yet")
+    eta_s: float | None = Field(None, description="expected time until the job ends [s]; absent: unknown")
     created: str
-    owner: str = Field("", description="id of the key that submitted it; empty: none, or not known")
-    project: str = Field("", description="project that it belongs to; empty: the one without a name")
+    owner: str = Field("", description="id of the key that submitted it; empty: none or unknown")
+    project: str = Field("", description="its project; empty: the unnamed project")
     finished: str | None = None
     reason: str | None = Field(None, description="why it failed")
     stages: list[StageStatus]
@@ -63,13 +63,15 @@ class MeanMetrics(BaseModel):
 class Diversity(BaseModel):
     """Diversity of a job's valid grasps, or of all its stored grasps if not validated."""
 
-    grasps: int = Field(description="grasps looked at")
-    types: dict[str, int] = Field(description="how many are power, precision or lateral; none: not told")
-    type_entropy_bits: float = Field(description="0: all of one type; 1.58: the three alike")
-    directions_used: int = Field(description="cells of the sphere, in the object's frame, from which a palm comes")
-    directions: int = Field(DIRECTION_CELLS, description="cells that there are, of equal area")
-    direction_entropy_bits: float = Field(description="0: all from one cell; 5.58: from all 48 alike")
-    evenness: float = Field(ge=0, le=1, description="2^entropy of the directions over their number")
+    grasps: int = Field(description="number of grasps analysed")
+    types: dict[str, int] = Field(description="number of power, precision and lateral grasps; none: undefined")
+    type_entropy_bits: float = Field(description="entropy of the types; 0: a single type; 1.58: three types equally")
+    directions_used: int = Field(description="approach cells in use, on the sphere of directions in the object's frame")
+    directions: int = Field(DIRECTION_CELLS, description="number of cells, all of equal area")
+    direction_entropy_bits: float = Field(
+        description="entropy of the directions; 0: a single cell; 5.58: all 48 equally"
+    )
+    evenness: float = Field(ge=0, le=1, description="2^entropy of the directions, divided by the number of cells")
 
 
 class Shard(ShardView):
@@ -84,16 +86,16 @@ class JobDetail(Job):
     request: JobRequest
     hand_digest: str
     object_digest: str
-    choice: Choice | None = Field(None, description="how a chart chose its fidelity, where the request said auto")
-    note: str | None = Field(None, description="what a reader of the numbers should know")
+    choice: Choice | None = Field(None, description="how a chart resolved the fidelity auto, if requested")
+    note: str | None = Field(None, description="note on the numbers; absent: none")
     outcomes: dict[str, int] = Field(
-        {}, description="of a job that found fewer grasps than asked: candidates not kept, by what became of them"
+        {}, description="rejected candidates by outcome, of a job that found fewer grasps than requested"
     )
     rechecked: int = Field(0, description="valid grasps validated again under the unmodified DexGraspBench protocol")
-    recheck_held: int = Field(0, description="of these, grasps that held")
+    recheck_held: int = Field(0, description="rechecked grasps that held")
     attempts: list[AttemptView]
     mean: MeanMetrics
-    diversity: Diversity | None = Field(None, description="absent while there is no such grasp")
+    diversity: Diversity | None = Field(None, description="absent without such grasps")
     shards: list[Shard]
 
 
@@ -104,24 +106,24 @@ class GraspQuery(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
     job: str | None = Field(None, max_length=64)
-    dataset: str | None = Field(None, max_length=64, description="of its cells")
-    tag: str | None = Field(None, max_length=64, description="that somebody gave to them")
+    dataset: str | None = Field(None, max_length=64, description="grasps of the cells of this dataset")
+    tag: str | None = Field(None, max_length=64, description="grasps with this tag")
     where: str | None = Field(
-        None, max_length=LONGEST, description="an expression, as in `epsilon > 0.3 and lift and robust >= 0.75`"
+        None, max_length=LONGEST, description="filter expression, such as `epsilon > 0.3 and lift and robust >= 0.75`"
     )
     hand: str | None = Field(None, max_length=64)
     object: str | None = Field(None, max_length=64)
     validated: bool | None = Field(None, description="whether the validator gave a verdict")
-    valid: bool | None = Field(None, description="false: validated, and not valid")
+    valid: bool | None = Field(None, description="false: validated, but not valid")
     success: bool | None = None
-    type: Literal["power", "precision", "lateral"] | None = Field(None, description="what the hand does")
+    type: Literal["power", "precision", "lateral"] | None = Field(None, description="grasp type")
     scene: Literal["free", "table", "bin", "shelf", "file", "any"] | None = Field(
-        None, description="kind of the scene it was planned in; any: whichever, but not free"
+        None, description="kind of scene in which it was planned; any: all except free"
     )
-    neighbours: bool | None = Field(None, description="whether other objects stood in that scene")
-    lift_hard: bool | None = Field(None, description="lifted at half the friction")
+    neighbours: bool | None = Field(None, description="whether the scene has neighbours")
+    lift_hard: bool | None = Field(None, description="lifted at half friction")
     robust_weakest: Literal[AXIS_WORDS] | None = Field(  # type: ignore[valid-type]
-        None, description="axis of the first model around the nominal one in which it does not hold"
+        None, description="perturbed parameter of the first model in which it fails"
     )
     sort: OfferedName = "epsilon"
     order: Literal["asc", "desc"] = "desc"
@@ -130,18 +132,18 @@ class GraspQuery(BaseModel):
 class Posture(BaseModel):
     """Hand posture in the object frame."""
 
-    hand_pose: list[float] = Field(description="root link: x y z [m], quaternion w x y z")
-    joint_positions: list[float] = Field(description="order of joint_names [rad or m]")
+    hand_pose: list[float] = Field(description="pose of the root link: x y z [m], quaternion w x y z")
+    joint_positions: list[float] = Field(description="joint positions in the order of joint_names [rad or m]")
 
 
 class Waypoint(BaseModel):
     """One posture on the trajectory of a grasp, in the frame of the object at rest."""
 
-    name: str = Field(description="standoff, pregrasp, grasp, squeeze, lift; empty: between two of them")
-    place: float = Field(description="on a slider: named ones at 0, 1, 2, ..., others evenly between")
-    hand_pose: list[float] = Field(description="root link: x y z [m], quaternion w x y z")
-    joint_positions: list[float] = Field(description="order of joint_names [rad or m]")
-    carried: list[float] = Field(description="how far the object was carried from its rest: x y z [m]")
+    name: str = Field(description="standoff, pregrasp, grasp, squeeze, lift; empty: an intermediate posture")
+    place: float = Field(description="position on a slider: named postures at 0, 1, 2, ..., others evenly between")
+    hand_pose: list[float] = Field(description="pose of the root link: x y z [m], quaternion w x y z")
+    joint_positions: list[float] = Field(description="joint positions in the order of joint_names [rad or m]")
+    carried: list[float] = Field(description="displacement of the object from rest: x y z [m]")
 
 
 class Neighbour(BaseModel):
@@ -149,7 +151,7 @@ class Neighbour(BaseModel):
 
     name: str
     digest: str
-    pose: list[float] = Field(description="in the scene: x y z [m], quaternion w x y z")
+    pose: list[float] = Field(description="pose in the scene: x y z [m], quaternion w x y z")
 
 
 class GraspScene(BaseModel):
@@ -157,12 +159,12 @@ class GraspScene(BaseModel):
 
     kind: SceneKind
     number: int = Field(description="row of the scene in its shard")
-    object_pose: list[float] = Field(description="of the object at rest: x y z [m], quaternion w x y z")
+    object_pose: list[float] = Field(description="pose of the object at rest: x y z [m], quaternion w x y z")
     supports: list[HalfSpace | Box]
     neighbours: list[Neighbour] = Field(default_factory=list)
-    clearance_m: float | None = Field(None, description="least distance of the hand from what stands there, on its way")
-    lift: str | None = Field(None, description="what the lift test came to; None: not tried")
-    lift_hard: bool | None = Field(None, description="whether it lifts at half the friction; None: not tested")
+    clearance_m: float | None = Field(None, description="least distance of the hand from supports and neighbours")
+    lift: str | None = Field(None, description="outcome of the lift test; None: not tested")
+    lift_hard: bool | None = Field(None, description="whether it lifts at half friction; None: not tested")
 
 
 class Push(BaseModel):
@@ -180,13 +182,13 @@ class GraspDetail(GraspView):
     joint_names: list[str]
     postures: dict[str, Posture] = Field(description="pregrasp, grasp, squeeze")
     thresholds_m: list[float] = Field(description="contact thresholds of the sweep")
-    sweep: dict[str, list[float | None]] = Field(description="metric at each of the thresholds")
-    way: list[Waypoint] = Field(description="from the standoff, where it has one, to the squeeze or the lift")
-    scene: GraspScene | None = Field(None, description="where it was planned; None: around a free object")
-    pushes: list[Push] = Field(description="verdict per direction of push; empty: the validator did not validate")
-    verdict_margin: float | None = Field(None, description="worst motion over its limit; below 1: held")
+    sweep: dict[str, list[float | None]] = Field(description="metrics at each threshold")
+    way: list[Waypoint] = Field(description="trajectory from the standoff, if any, to the squeeze or the lift")
+    scene: GraspScene | None = Field(None, description="scene in which it was planned; None: around a free object")
+    pushes: list[Push] = Field(description="verdict per direction of push; empty: not validated")
+    verdict_margin: float | None = Field(None, description="largest ratio of motion to its limit; below 1: held")
     validated_by: Literal["mujoco", "mujoco_warp"] | None = Field(
-        None, description="whose verdict it is: of MuJoCo on the CPU, which certifies, or of the prefilter"
+        None, description="engine of the verdict: MuJoCo on the CPU, which certifies, or MuJoCo Warp, the prefilter"
     )
     recheck: bool | None = Field(
         None, description="verdict under the unmodified DexGraspBench protocol; None: not rechecked"
@@ -198,13 +200,13 @@ class GraspPageQuery(GraspQuery):
     """One page of a list of grasps."""
 
     limit: int = Field(50, ge=1, le=200, description="items on a page")
-    cursor: str | None = Field(None, max_length=512, description="`next` of the page before")
+    cursor: str | None = Field(None, max_length=512, description="`next` of the previous page")
 
 
 class GraspExportQuery(GraspQuery):
     """Selection of grasps to export, and the format."""
 
-    format: Literal["csv", "json", "zip"] = Field("csv", description="zip: base shards of these grasps alone")
+    format: Literal["csv", "json", "zip"] = Field("csv", description="zip: base shards with these grasps only")
 
 
 class GraspName(BaseModel):
@@ -241,33 +243,33 @@ class TagChange(BaseModel):
     """Result of giving or removing a tag."""
 
     tag: TagView
-    changed: int = Field(description="grasps that have it and had not, or the other way round")
+    changed: int = Field(description="number of grasps that gained or lost the tag")
 
 
 class Part(BaseModel):
     """State of one part that the API needs."""
 
     ok: bool
-    latency_ms: float | None = Field(None, description="absent where it does not answer")
+    latency_ms: float | None = Field(None, description="absent if it does not respond")
     detail: str = ""
 
 
 class Health(BaseModel):
     """Readiness, for each part."""
 
-    ok: bool = Field(description="redis, index and store answer")
+    ok: bool = Field(description="whether redis, index and store respond")
     parts: dict[str, Part]
     controller: bool = Field(
-        False, description="a controller gave a sign of life lately: without one no task is queued anew"
+        False, description="whether a controller sent a heartbeat recently; without one no task is queued"
     )
-    workers: int = Field(0, ge=0, description="workers that hold their lease")
+    workers: int = Field(0, ge=0, description="number of workers with a valid lease")
 
 
 class Worker(WorkerView):
     """Worker and its present task."""
 
-    stage: Stage | None = Field(None, description="stage of the task in hand")
-    lease_age_s: float | None = Field(None, description="time since its last beat [s]; absent once it is gone")
+    stage: Stage | None = Field(None, description="stage of the current task")
+    lease_age_s: float | None = Field(None, description="time since its last heartbeat [s]; absent once it is gone")
 
 
 class LossCurve(BaseModel):
@@ -285,7 +287,7 @@ class Histogram(BaseModel):
     mean: float
     low: float
     high: float
-    counts: list[int] = Field(description="equal bins from low to high")
+    counts: list[int] = Field(description="counts in equal bins from low to high")
 
     @property
     def bars(self) -> list[float]:

@@ -18,10 +18,10 @@ if TYPE_CHECKING:
 GONE: Final = {
     "GRASPD_SHARD_PACK": "a task makes one shard of all its batches; unset it, and see GRASPD_TASK_S",
     "GRASPD_KEEPER_SHARDS": "one controller leads and the others stand by; unset it",
-    "GRASPD_KEEPER_INTERVAL_S": "it is GRASPD_CONTROLLER_INTERVAL_S now",
-    "GRASPD_FIRST_JUDGE": "it is GRASPD_PREFILTER now",
-    "GRASPD_KEEPER_NAME": "it is GRASPD_CONTROLLER_NAME now",
-    "GRASPD_SCRUB_MB_PER_S": "it is GRASPD_INTEGRITY_SCAN_MB_PER_S now",
+    "GRASPD_KEEPER_INTERVAL_S": "use GRASPD_CONTROLLER_INTERVAL_S",
+    "GRASPD_FIRST_JUDGE": "use GRASPD_PREFILTER",
+    "GRASPD_KEEPER_NAME": "use GRASPD_CONTROLLER_NAME",
+    "GRASPD_SCRUB_MB_PER_S": "use GRASPD_INTEGRITY_SCAN_MB_PER_S",
 }
 
 
@@ -33,112 +33,110 @@ class Settings(BaseSettings):
         env_prefix="GRASPD_", env_ignore_empty=True, frozen=True, hide_input_in_errors=True
     )
 
-    data_dir: Path = Field(Path("graspd-data"), description="folder of everything graspd keeps on this machine")
+    data_dir: Path = Field(Path("graspd-data"), description="folder of all local data of graspd")
     redis_url: SecretStr | None = Field(None, description="Redis of the queue; unset: `graspd up` starts one")
     store_url: str | None = Field(None, description="object store: file://, s3://, gs://, az://; unset: in data_dir")
     store_public_endpoint: str | None = Field(
-        None, description="S3 endpoint as users reach it: downloads then come from there; unset: through the API"
+        None, description="public S3 endpoint for direct downloads; unset: downloads go through the API"
     )
     index_url: SecretStr | None = Field(None, description="SQLAlchemy URL of the index; unset: SQLite in data_dir")
-    host: str = Field("127.0.0.1", description="address the API binds")
-    port: int = Field(8000, ge=0, le=65535, description="port the API binds; 0: any free one")
+    host: str = Field("127.0.0.1", description="address to which the API binds")
+    port: int = Field(8000, ge=0, le=65535, description="port to which the API binds; 0: any free one")
     api_root_path: str | None = Field(
-        None, description="path below which a proxy shows the API and the dashboard, such as /graspd; unset: the root"
+        None, description="path under which a proxy serves the API and the dashboard, such as /graspd; unset: the root"
     )
     api_url: str = Field(
         "http://127.0.0.1:8000",
-        description="where the client commands find the API; unset: the service of data_dir, if it runs",
+        description="address of the API for client commands; unset: the service of data_dir, if it runs",
     )
-    api_key: SecretStr | None = Field(None, description="key the client commands send")
+    api_key: SecretStr | None = Field(None, description="API key of the client commands")
     keys_file: Path | None = Field(None, description="file of the API keys; unset: keys.json in data_dir")
     proxy_addresses: str | None = Field(
-        None, description="addresses or networks of a proxy that signs people in, with commas; unset: there is none"
+        None, description="addresses or networks of an authenticating proxy, separated by commas; unset: none"
     )
-    proxy_secret: SecretStr | None = Field(None, description="what it proves itself with; at least 16 characters")
+    proxy_secret: SecretStr | None = Field(None, description="secret that the proxy sends; at least 16 characters")
     proxy_groups: dict[str, str] = Field(
-        {}, description='rights of its groups, the first that fits counts: {"lab": "vision:submit", "*": ":read"}'
+        {}, description='rights of proxy groups; the first match counts: {"lab": "vision:submit", "*": ":read"}'
     )
-    metrics_need_key: bool = Field(True, description="whether /metrics asks for a key once there are keys")
-    requests_per_minute: int = Field(1200, ge=0, description="requests of one key; 0: no limit")
+    metrics_need_key: bool = Field(True, description="whether /metrics requires a key once keys exist")
+    requests_per_minute: int = Field(1200, ge=0, description="requests of one key per minute; 0: no limit")
     address_requests_per_minute: int = Field(
-        120, ge=0, description="requests of one address without a key; 0: no limit"
+        120, ge=0, description="requests of one address without a key per minute; 0: no limit"
     )
-    concurrency: int = Field(
-        64, ge=0, description="requests of one key, or address, being answered at once; 0: no limit"
-    )
+    concurrency: int = Field(64, ge=0, description="concurrent requests of one key or address; 0: no limit")
     quota_grasps_in_flight: int = Field(0, ge=0, description="grasps in unfinished jobs of one key; 0: no limit")
-    quota_jobs_per_day: int = Field(0, ge=0, description="new jobs of one key from midnight UTC on; 0: no limit")
+    quota_jobs_per_day: int = Field(0, ge=0, description="new jobs of one key per day, from midnight UTC; 0: no limit")
     webhook_secret: SecretStr | None = Field(
         None,
         min_length=16,
-        description="what the secrets of webhooks follow from, of API and controller; unset: no webhooks",
+        description="secret of API and controller from which the secrets of webhooks are derived; unset: no webhooks",
     )
     webhook_networks: str | None = Field(
-        None, description="networks that webhooks may reach besides public addresses, with commas"
+        None, description="networks that webhooks may reach besides public addresses, separated by commas"
     )
     device: str = Field("auto", description="Warp device of a worker: cpu, cuda:0, or auto")
     worker_number: int | None = Field(
-        None, ge=0, description="of a worker among those of its machine: with device auto, number k takes the k-th GPU"
+        None, ge=0, description="number of a worker on its machine: with device auto, worker k uses the k-th GPU"
     )
     prefilter: Literal["auto", "on", "off"] = Field(
-        "auto", description="whether MuJoCo Warp gives the clear verdicts; auto: on a GPU, where it is installed"
+        "auto", description="whether MuJoCo Warp gives the clear verdicts; auto: on a GPU, if installed"
     )
     threads: int = Field(0, ge=0, description="CPU threads of a worker; 0: one per core")
     processes: int = Field(
         0,
         ge=0,
         le=1024,
-        description="processes for validation and metrics; 1: its own; 0: with a GPU one a core less one, else 1",
+        description="processes for validation and metrics. 1: the worker itself; 0: with a GPU one per core less "
+        "one, else 1",
     )
-    workers_here: int = Field(1, ge=1, description="workers of this machine that share its cores and memory")
+    workers_here: int = Field(1, ge=1, description="workers on this machine that share its cores and memory")
     join: str = Field(
         "auto",
         pattern=r"^(auto|[1-9][0-9]{0,3})$",
-        description="batches of a task that a worker plans in one launch; auto: what fills its GPU, on a CPU 1",
+        description="batches of a task that a worker plans in one launch; auto: as many as fill its GPU, 1 on a CPU",
     )
-    lease_s: float = Field(6.0, gt=0.5, description="a worker silent for this long has lost its task [s]")
+    lease_s: float = Field(6.0, gt=0.5, description="time without a heartbeat after which a worker loses its task [s]")
     controller_interval_s: float = Field(1.0, gt=0, description="pause between two rounds of the controller [s]")
     controller_name: str | None = Field(
         None,
         max_length=200,
-        description="of a controller: started again under the same name, it leads without a wait; unset: a fresh one",
+        description="name of a controller: restarted under the same name, it leads without a wait; unset: a new name",
     )
     task_attempts: int = Field(3, ge=1, le=20, description="attempts of a task before its job fails")
     task_s: float = Field(
-        60.0, ge=0, description="how long a task of a larger job should last by what was measured [s]; 0: one batch"
+        60.0, ge=0, description="target duration of tasks of larger jobs, from measured rates [s]; 0: one batch each"
     )
     task_timeout_s: float = Field(1800.0, gt=0, description="longest run of one task [s]")
     worker_max_memory_mb: int = Field(
         0,
         ge=0,
-        description="resident memory after which a worker makes room for a fresh one [MiB]; 0: half of the machine's",
+        description="resident memory of a worker above which a new one replaces it [MiB]; 0: half of the machine's",
     )
-    retry_backoff_s: float = Field(2.0, ge=0, description="wait before the second attempt; doubles with each [s]")
+    retry_backoff_s: float = Field(2.0, ge=0, description="wait before the second attempt [s]; doubles with each")
     max_upload_bytes: int = Field(
-        64 * 2**20, gt=0, description="largest hand, object or network taken over HTTP [bytes]"
+        64 * 2**20, gt=0, description="largest upload of a hand, object or network over HTTP [bytes]"
     )
     queue_window: int = Field(
-        1000, ge=1, description="tasks kept waiting in a priority, or two a worker; the rest waits in the index"
+        1000, ge=1, description="tasks in the queue per priority, at least two per worker; the rest waits in the index"
     )
     shard_grace_s: float = Field(
         7 * 86400.0,
         ge=0,
-        description="how long what was deleted can be restored, and its shards stay where no job needs them [s]",
+        description="time during which deletions can be restored, and shards that no job needs stay stored [s]",
     )
     integrity_scan_mb_per_s: float = Field(
         1.0, ge=0, description="rate at which the controller's integrity scan reads the store [MiB/s]; 0: off"
     )
-    stop_grace_s: float = Field(10.0, gt=0, description="time a process has to stop before it is killed [s]")
+    stop_grace_s: float = Field(10.0, gt=0, description="time for a process to stop before it is killed [s]")
     kernels: Path | None = Field(
-        None,
-        description="folder of `graspd admin kernels`: compiled kernels, copied to Warp's cache where it lacks them",
+        None, description="folder of `graspd admin kernels`: compiled kernels, copied to Warp's cache if missing there"
     )
     heartbeat_file: Path | None = Field(
-        None, description="file that a controller or worker touches while it lives, for health checks; unset: none"
+        None, description="file that a running controller or worker touches, for health checks; unset: none"
     )
     log_level: str = Field("INFO", description="DEBUG, INFO, WARNING or ERROR")
     log_format: Literal["auto", "json", "text"] = Field(
-        "auto", description="log lines; auto: text on a terminal, else json"
+        "auto", description="format of log lines; auto: text on a terminal, else json"
     )
 
     @field_validator("api_root_path")

@@ -31,16 +31,16 @@ class Page(View, Generic[T]):
 class Validated(View):
     """Number of grasps, and how many are valid. Those without validation are no failures and omitted."""
 
-    grasps: int = Field(0, description="grasps kept so far")
+    grasps: int = Field(0, description="grasps stored so far")
     valid: int = Field(
-        0, description="of these, valid: past the geometric gate and validated to hold; 0 where nothing is validated"
+        0, description="valid grasps: within the geometric limits and held in validation; 0 without validation"
     )
-    candidates: int = Field(0, description="grasps planned for them, kept or not")
+    candidates: int = Field(0, description="candidates planned for them, stored or not")
     validated: int = Field(
-        0, description="of these, validated by the geometric gate and a validator; 0 where nothing is validated"
+        0, description="candidates tested against the geometric limits and by a validator; 0 without validation"
     )
 
-    @computed_field(description="valid grasps per grasp validated; null: not validated")  # type: ignore[prop-decorator]
+    @computed_field(description="valid grasps per validated candidate; null: not validated")  # type: ignore[prop-decorator]
     @property
     def valid_yield(self) -> float | None:
         """Share of valid grasps among the validated ones."""
@@ -58,8 +58,8 @@ class StageProgress(View):
     failed: int = 0
     cancelled: int = 0
     done: float = 0.0
-    reused: int = Field(0, description="of the succeeded tasks, those whose shard another job had made before")
-    seconds: float = Field(0.0, description="sum over the finished tasks, without the reused ones [s]")
+    reused: int = Field(0, description="succeeded tasks whose shard another job had already made")
+    seconds: float = Field(0.0, description="total time of the finished tasks, without reused ones [s]")
 
 
 class JobView(Validated):
@@ -70,17 +70,17 @@ class JobView(Validated):
     hand_digest: str
     object_digest: str
     created: str
-    owner: str = Field("", description="id of the key that submitted it; empty: none, or not known")
-    project: str = Field("", description="project that it belongs to; empty: the one without a name")
+    owner: str = Field("", description="id of the key that submitted it; empty: none or unknown")
+    project: str = Field("", description="its project; empty: the unnamed project")
     finished: str | None
-    choice: Choice | None = Field(None, description="how a chart chose its fidelity, where the request said auto")
+    choice: Choice | None = Field(None, description="how a chart resolved the fidelity auto, if requested")
     reason: str | None = Field(None, description="why the job failed: the first failed task's last attempt")
     stages: list[StageProgress] = []
     rechecked: int = Field(0, description="valid grasps validated again under the unmodified DexGraspBench protocol")
-    recheck_held: int = Field(0, description="of these, grasps that held")
-    outcomes: dict[str, int] = Field({}, description="candidates that were not kept, by what became of them")
+    recheck_held: int = Field(0, description="rechecked grasps that held")
+    outcomes: dict[str, int] = Field({}, description="rejected candidates by outcome")
 
-    @computed_field(description="what a reader of the numbers should know")  # type: ignore[prop-decorator]
+    @computed_field(description="note on the numbers; null: none")  # type: ignore[prop-decorator]
     @property
     def note(self) -> str | None:
         """Note on a job that ended with fewer valid (unvalidated: feasible) grasps than requested."""
@@ -99,7 +99,7 @@ class TaskView(View):
     count: int
     state: State
     shard_id: str
-    attempt: int = Field(description="number of the present or next attempt, from 1")
+    attempt: int = Field(description="number of the current or next attempt, from 1")
     worker: str | None
     device: str | None
     done: float
@@ -132,8 +132,8 @@ class ShardView(View):
     sha256: str
     size_bytes: int
     count: int = Field(
-        description="grasps of a base shard; transferred grasps of a scene shard, or its scenes where these come "
-        "first; pictures of a view shard"
+        description="base shard: grasps; scene shard: transferred grasps, or its scenes if these come first; view "
+        "shard: pictures"
     )
     hand: str
     object: str
@@ -146,7 +146,7 @@ class ShardView(View):
     worker: str
     seconds: float
     created: str
-    manifest: dict[str, Any] = Field(default_factory=dict, description="whole, only in `get_shard`")
+    manifest: dict[str, Any] = Field(default_factory=dict, description="complete manifest, only in `get_shard`")
 
 
 @with_fields(valid=values(optional=False), created=values(optional=True))
@@ -159,12 +159,12 @@ class GraspView(View):
     object: str
     valid: bool
     success: bool | None = Field(description="verdict of the validator; None: not tested")
-    verdict_level: str | None = Field(description="level of the validator that gave it")
-    scene_kind: str = Field("free", description="kind of the scene it was planned in; free: around a floating object")
-    neighbours: int = Field(0, description="other objects that stood in that scene")
-    lift_hard: bool | None = Field(None, description="in a scene: lifted at half the friction; None: not tested")
+    verdict_level: str | None = Field(description="level of validation of that verdict")
+    scene_kind: str = Field("free", description="kind of scene in which it was planned; free: around a floating object")
+    neighbours: int = Field(0, description="number of neighbours in that scene")
+    lift_hard: bool | None = Field(None, description="in a scene: lifted at half friction; None: not tested")
     robust_weakest: str | None = Field(
-        None, description="axis of the first model in which it does not hold; None: held in all, or not validated there"
+        None, description="perturbed parameter of the first model in which it fails; None: held in all, or not tested"
     )
     created: str
 
@@ -182,10 +182,10 @@ class AssetView(View):
     size_bytes: int
     created: str
     builtin: bool
-    owner: str = Field("", description="id of the key that uploaded it; empty: none, or not known")
-    project: str = Field("", description="project that it belongs to; empty: the one without a name")
-    shared: bool = Field(False, description="whether every project may use it")
-    verdict: str | None = Field(description="accept, repair or refuse; None: the check is still to come")
+    owner: str = Field("", description="id of the key that uploaded it; empty: none or unknown")
+    project: str = Field("", description="its project; empty: the unnamed project")
+    shared: bool = Field(False, description="whether all projects may use it")
+    verdict: str | None = Field(description="accept, repair or refuse; None: not checked yet")
     message: str | None
     repairs: list[str]
     facts: dict[str, Any]
@@ -203,7 +203,7 @@ class WorkerView(View):
     task_id: str | None
     started: str
     seen: str
-    reason: str = Field("", description="why it is in quarantine")
+    reason: str = Field("", description="reason of the quarantine")
 
 
 class FailureGroup(View):
@@ -241,13 +241,13 @@ class Throughput(View):
 class EndView(View):
     """A job or a dataset that ended."""
 
-    seq: int = Field(description="later ends have larger numbers; `since` of the next request")
+    seq: int = Field(description="sequence number, larger for later ends; `since` of the next request")
     kind: Literal["job", "dataset"]
     subject: str = Field(description="id of the job, or name of the dataset")
     state: State = Field(description="succeeded, failed or cancelled")
     at: str
-    project: str = Field("", description="project that it belongs to; empty: the one without a name")
-    owner: str = Field("", description="id of the key that submitted it; empty: none, or not known")
+    project: str = Field("", description="its project; empty: the unnamed project")
+    owner: str = Field("", description="id of the key that submitted it; empty: none or unknown")
 
 
 class WebhookView(View):
@@ -255,11 +255,11 @@ class WebhookView(View):
 
     id: str
     url: str
-    states: list[str] = Field(description="ends that it is told of: succeeded, failed, cancelled")
+    states: list[str] = Field(description="states of the reported ends: succeeded, failed, cancelled")
     created: str
-    owner: str = Field("", description="id of the key that made it")
-    project: str = Field("", description="whose jobs and datasets it is told of")
-    seen: int = Field(0, description="ends up to this number have deliveries")
+    owner: str = Field("", description="id of the key that created it")
+    project: str = Field("", description="project whose jobs and datasets it reports")
+    seen: int = Field(0, description="ends up to this sequence number are processed")
 
 
 class TagView(View):
@@ -269,9 +269,9 @@ class TagView(View):
     name: str
     created: str
     changed: str
-    owner: str = Field("", description="id of the key that made it")
-    project: str = Field("", description="project that it belongs to; empty: the one without a name")
-    grasps: int = Field(0, description="grasps that have it and are there")
+    owner: str = Field("", description="id of the key that created it")
+    project: str = Field("", description="its project; empty: the unnamed project")
+    grasps: int = Field(0, description="existing grasps with this tag")
 
 
 class DeliveryView(View):
@@ -283,21 +283,21 @@ class DeliveryView(View):
     ended: str = Field(description="succeeded, failed or cancelled")
     state: str = Field(description="waiting, delivered or failed")
     attempts: int
-    tried: str | None = Field(description="when it was tried last")
-    status: int | None = Field(description="HTTP status of the last answer")
-    detail: str = Field(description="how the last attempt ended")
+    tried: str | None = Field(description="time of the last attempt")
+    status: int | None = Field(description="HTTP status of the last response")
+    detail: str = Field(description="result of the last attempt")
 
 
 class UsageDay(View):
     """Usage of a project on a day: the tasks that ended then, counted for their first requester."""
 
-    project: str = Field(description="empty: the one without a name")
-    day: str = Field(description="from midnight to midnight UTC")
+    project: str = Field(description="empty: the unnamed project")
+    day: str = Field(description="UTC day, from midnight to midnight")
     grasps: int
     valid: int
     tasks: int
-    gpu_seconds: float = Field(description="time that GPU workers spent on them [s]")
-    cpu_seconds: float = Field(description="time that CPU workers spent on them [s]")
+    gpu_seconds: float = Field(description="total time of GPU workers for these tasks [s]")
+    cpu_seconds: float = Field(description="total time of CPU workers for these tasks [s]")
 
 
 class MatrixCell(Validated):
@@ -315,30 +315,30 @@ class DatasetView(Validated):
     """Totals of a dataset. `grasps`, `valid` and `candidates` count base shards made so far."""
 
     name: str
-    digest: str = Field(description="equal hands, objects and options have the same digest")
+    digest: str = Field(description="digest of hands, objects and options")
     state: State
     hands: list[str]
     objects: list[str]
-    options: JobOptions = Field(description="what each cell asks for")
+    options: JobOptions = Field(description="options of each cell")
     cells: int
-    states: dict[State, int] = Field(description="cells by state; a cell whose job is not planned yet is queued")
-    asked: int = Field(description="grasps asked for, over all cells")
+    states: dict[State, int] = Field(description="cells by state; cells without a planned job count as queued")
+    asked: int = Field(description="grasps requested in all cells")
     tasks: int
     tasks_done: int
     tasks_failed: int
     progress: float = Field(ge=0, le=1)
-    seconds: float = Field(description="time that workers spent on it [s]")
-    eta_s: float | None = Field(description="expected time until it ends with as many tasks at work as now [s]")
+    seconds: float = Field(description="total time of workers for it [s]")
+    eta_s: float | None = Field(description="expected time until it ends, at the current number of running tasks [s]")
     shards: int
     size_bytes: int
     created: str
-    owner: str = Field("", description="id of the key that submitted it; empty: none, or not known")
-    project: str = Field("", description="project that it belongs to; empty: the one without a name")
+    owner: str = Field("", description="id of the key that submitted it; empty: none or unknown")
+    project: str = Field("", description="its project; empty: the unnamed project")
     finished: str | None
-    cancelled: bool = Field(description="cancelled by its user; `retry` lifts it")
-    outcomes: dict[str, int] = Field({}, description="candidates that were not kept, by what became of them")
+    cancelled: bool = Field(description="whether its user cancelled it; `retry` resumes it")
+    outcomes: dict[str, int] = Field({}, description="rejected candidates by outcome")
 
-    @computed_field(description="why it ended with fewer grasps than asked for")  # type: ignore[prop-decorator]
+    @computed_field(description="why it ended with fewer grasps than requested; null: it did not")  # type: ignore[prop-decorator]
     @property
     def reason(self) -> str | None:
         """Note on a dataset that ended with fewer grasps than requested."""
@@ -356,22 +356,22 @@ class DatasetView(Validated):
 class CellView(Validated):
     """One hand x object of a dataset: an ordinary job, or one to be planned."""
 
-    position: int = Field(description="hand by hand, and in each hand object by object, from 0")
+    position: int = Field(description="index of the cell, ordered by hand, then by object, from 0")
     hand: str
     object: str
     job_id: str
-    fidelity: str = Field("", description="its name; of a dataset with `auto`, what the chart promised for this cell")
-    choice: Choice | None = Field(None, description="how a chart chose that fidelity")
-    planned: bool = Field(description="whether the job exists yet")
+    fidelity: str = Field("", description="name of the fidelity; in a dataset with `auto`, the chart's choice")
+    choice: Choice | None = Field(None, description="how a chart chose the fidelity")
+    planned: bool = Field(description="whether the job exists")
     state: State
-    asked: int = Field(description="grasps asked for")
+    asked: int = Field(description="grasps requested")
     tasks: int
     tasks_done: int
     tasks_failed: int
-    attempts_failed: int = Field(description="attempts that failed, those that were repeated with success too")
+    attempts_failed: int = Field(description="failed attempts, including those followed by a successful one")
     progress: float = Field(ge=0, le=1)
-    seconds: float = Field(description="time that workers spent on it [s]")
-    reason: str | None = Field(description="why it failed, or found fewer grasps than asked for")
+    seconds: float = Field(description="total time of workers for it [s]")
+    reason: str | None = Field(description="why it failed, or found fewer grasps than requested")
 
     def counted(self, options: JobOptions) -> int:
         """Return the grasps that count under its dataset's options: valid ones, else all."""
@@ -384,7 +384,7 @@ class SnapshotView(View):
     dataset: str
     digest: str
     created: str
-    complete: bool = Field(description="every cell had succeeded")
+    complete: bool = Field(description="whether all cells had succeeded")
     shards: int
     grasps: int
     valid: int
@@ -402,4 +402,4 @@ class ObjectSetView(View):
     digest: str
     objects: list[str]
     created: str
-    project: str = Field("", description="project that it belongs to; empty: the one without a name")
+    project: str = Field("", description="its project; empty: the unnamed project")

@@ -55,13 +55,13 @@ METHODS: Final = ("fast_graspd", "graspit", "graspd2022", "dfc", *NETWORK_METHOD
 SCENES: Final = 4
 _REFEREES_IN_WORDS: Final = {
     "standard": "standard",
-    "fast": "screen, quicker",
-    "dexgraspbench": "under the DexGraspBench protocol, slower",
-    "none": "not at all",
+    "fast": "fast screening",
+    "dexgraspbench": "DexGraspBench protocol, slower",
+    "none": "no validation",
 }
-_FACES_IN_WORDS: Final = {"drawn": "as it falls", "all": "on each stable face"}
-_WANTS_IN_WORDS: Final = {"valid": "valid grasps", "candidates": "all that are tried"}
-_SCENES_IN_WORDS: Final = {"free": "the object alone", "table": "a table", "bin": "a bin", "shelf": "a shelf"}
+_FACES_IN_WORDS: Final = {"drawn": "as dropped", "all": "every stable face"}
+_WANTS_IN_WORDS: Final = {"valid": "valid grasps", "candidates": "all candidates"}
+_SCENES_IN_WORDS: Final = {"free": "free object", "table": "table", "bin": "bin", "shelf": "shelf"}
 SHAKE_NEEDS_A_SCENE: Final = "shake moves what was lifted out of a scene: choose one, such as table"
 
 
@@ -80,11 +80,9 @@ class JobOptions(Model):
         int,
         Option("basic", flags="--grasps -n", keyword="count"),
         Form("grasps", "Number of grasps", "in batches of 32"),
-    ] = Field(
-        32, ge=1, le=1_000_000, description="number of grasps to synthesize, in a dataset for each hand and object"
-    )
+    ] = Field(32, ge=1, le=1_000_000, description="number of grasps; in a dataset, for each pair of hand and object")
     method: Annotated[Name, Option("basic")] = Field(
-        "fast_graspd", description=f"planner: {', '.join(METHODS)}, or one that another package offers"
+        "fast_graspd", description=f"planner: {', '.join(METHODS)}, or one of another package"
     )
     fidelity: Annotated[str | Fidelity, Option("basic"), Form("grasps", "Fidelity")] = Field(
         "standard", description=f"{', '.join(OFFERED)}, or auto with a target"
@@ -94,57 +92,58 @@ class JobOptions(Model):
     )
     scene: Annotated[
         SceneOption,
-        Option("basic", typed="where the grasps are used: free, table, bin, shelf, or a JSON or YAML file"),
-        Form("scenes", "Grasps are for", choices=_SCENES_IN_WORDS, cells=True),
+        Option("basic", typed="scene of the grasps: free, table, bin, shelf, or a JSON or YAML file"),
+        Form("scenes", "Scene", choices=_SCENES_IN_WORDS, cells=True),
     ] = _sparse(
         "free",
-        description="where the grasps are used: free (around an object that floats), table, bin, shelf, or a document "
-        "with supports. If not free they are planned, validated and rendered there, and `grasps` counts those valid",
+        description="scene of the grasps: free (a floating object), table, bin, shelf, or a document with "
+        "supports. Grasps of a scene other than free are planned, validated, rendered and counted "
+        "there",
     )
     faces: Annotated[
-        Literal["drawn", "all"], Option(), Form("scenes", "It lies", choices=_FACES_IN_WORDS, cells=True)
+        Literal["drawn", "all"], Option(), Form("scenes", "Resting face", choices=_FACES_IN_WORDS, cells=True)
     ] = _sparse(
         "drawn",
-        description="faces that the object lies on in its scenes. drawn: as often as drops end on them; all: one scene "
-        "for each stable face, whatever `scenes` says",
+        description="resting faces of the object in its scenes. drawn: as frequent as after drops; all: one scene "
+        "for each stable face, regardless of `scenes`",
     )
     neighbours: Annotated[
         tuple[BesideOption, ...],
         Option(
             "basic",
             flags="--with",
-            typed="another object in each scene: a name, for submit also a mesh to upload; up to eight",
+            typed="neighbour in each scene: a name, or with submit a mesh to upload; up to eight",
         ),
         Form(
             "scenes",
-            "Beside it",
-            "names of up to eight other objects, with commas",
+            "Neighbours",
+            "names of up to eight objects, separated by commas",
             placeholder="block, bottle",
             cells=True,
         ),
     ] = _sparse(
         (),
         max_length=MOST_NEIGHBOURS,
-        description="names of up to eight other objects, which are dropped around this one in its scenes; a document "
+        description="names of up to eight neighbours, dropped around the object in its scenes; a scene document "
         "places its own",
     )
     touch: Annotated[
         Touch,
         Option(),
-        Form("scenes", "Fingertips keep", "from supports; 0: they may touch, 2: as the hand", cells=True),
+        Form("scenes", "Fingertip clearance", "to supports; 0: contact allowed, 2: as the hand", cells=True),
     ] = _sparse(
         TOUCH,
-        description="distance that fingertips keep from the supports of their scene [mm]. 2: as the rest of the hand; "
-        "0: they may touch; below: they may press into it, for what lies flat",
+        description="clearance of fingertips to the supports of their scene [mm]. 2: as the rest of the hand; 0: "
+        "contact allowed; negative: they may press into the support, for flat objects",
     )
     scenes: Annotated[
-        int, Option("basic"), Form("scenes", "Scenes", "for each batch; 0: none, or 4 where grasps are for a scene")
-    ] = Field(0, ge=0, le=64, description=f"scenes per batch of grasps; {SCENES} where a scene is named")
-    views: Annotated[int, Option("basic", places=JOB), Form("scenes", "Views", "camera placements for each scene")] = (
-        Field(0, ge=0, le=256, description="camera placements per scene")
+        int, Option("basic"), Form("scenes", "Scenes", "per batch; 0: none, or 4 unless the scene is free")
+    ] = Field(0, ge=0, le=64, description=f"scenes per batch of grasps; {SCENES} if a scene is named")
+    views: Annotated[int, Option("basic", places=JOB), Form("scenes", "Views", "camera placements per scene")] = Field(
+        0, ge=0, le=256, description="camera placements per scene"
     )
     stereo: Annotated[bool, Option(places=JOB), Form("scenes", "Cameras", "Stereo: left and right eye")] = Field(
-        False, description="a left and a right picture per placement instead of one"
+        False, description="left and right picture per placement instead of one"
     )
     width: Annotated[int, Option(places=JOB), Form("scenes", "Width")] = Field(
         320, ge=16, le=4096, description="picture width [px]"
@@ -153,7 +152,7 @@ class JobOptions(Model):
         240, ge=16, le=4096, description="picture height [px]"
     )
     channels: Annotated[tuple[Literal["distance", "normals", "occlusion"], ...], Option(places=JOB)] = Field(
-        (), description="what pictures show besides colour, depth and segmentation: distance, normals or occlusion"
+        (), description="image channels besides colour, depth and segmentation: distance, normals or occlusion"
     )
     friction: Annotated[float, Option(), Form("grasps", "Friction coefficient", "Coulomb, for the metrics")] = Field(
         1.0, gt=0, le=3, description="Coulomb coefficient of the quality metrics"
@@ -161,10 +160,10 @@ class JobOptions(Model):
     mass: Annotated[
         Mass | None,
         Option("basic", schema=5),
-        Form("grasps", "Mass of the object", "empty: its own, 0.1 kg where it has none"),
-    ] = _sparse(None, description=f"mass of the object [kg]; by default its own, {MASS_KG:g} kg where it has none")
+        Form("grasps", "Mass of the object", "empty: its own, else 0.1 kg"),
+    ] = _sparse(None, description=f"mass of the object [kg]; default: its own, else {MASS_KG:g} kg")
     density: Annotated[Density | None, Option(schema=5)] = _sparse(
-        None, description="density of the object [kg/m^3], in place of the mass"
+        None, description="density of the object [kg/m^3], instead of the mass"
     )
     object_friction: Annotated[
         Friction | None,
@@ -172,67 +171,67 @@ class JobOptions(Model):
         Form("grasps", "Friction in simulation", "Coulomb; empty: the object's own, else 0.6"),
     ] = _sparse(
         None,
-        description="Coulomb coefficient of contacts in simulation; by default the object's own, "
-        f"{FRICTION:g} where it has none",
+        description=f"Coulomb coefficient of contacts in simulation; default: the object's own, else {FRICTION:g}",
     )
     want: Annotated[
-        Literal["valid", "candidates"], Option("basic"), Form("grasps", "Counted", choices=_WANTS_IN_WORDS)
+        Literal["valid", "candidates"], Option("basic"), Form("grasps", "Counted grasps", choices=_WANTS_IN_WORDS)
     ] = Field(
         "valid",
-        description="what `grasps` counts. valid: valid grasps (feasible ones without validation); candidates: all",
+        description="grasps that count. valid: valid ones (feasible ones without validation); candidates: all",
     )
     budget: Annotated[float, Option()] = Field(
-        4.0, ge=1, le=100, description="candidates for each valid grasp wanted, at most"
+        4.0, ge=1, le=100, description="largest number of candidates for each valid grasp wanted"
     )
     min_distance: Annotated[
-        float, Option(), Form("grasps", "Least distance", "between two grasps of a batch; 0: any", cells=True)
+        float, Option(), Form("grasps", "Least distance", "between two grasps of a batch; 0: no limit", cells=True)
     ] = _sparse(
         MIN_DISTANCE_M,
         ge=0,
         le=0.1,
         allow_inf_nan=False,
-        description="a grasp that is nearer to an earlier one of its batch is not kept [m]: mean distance of the same "
-        "points of the hand, in the object's frame; 0: all are. Goes with want valid",
+        description="least distance to earlier grasps of the batch [m]: mean over corresponding points of the "
+        "hand, in the object's frame. Nearer grasps are rejected; 0: no limit. Only with want valid",
     )
     validation: Annotated[
         Literal["dexgraspbench", "standard", "fast", "none"],
         Option("basic"),
-        Form("grasps", "Validated by MuJoCo", choices=_REFEREES_IN_WORDS),
+        Form("grasps", "Validation in MuJoCo", choices=_REFEREES_IN_WORDS),
     ] = Field(
         "standard",
-        description="level of validation in MuJoCo (fast: on a GPU, MuJoCo Warp gives the clear verdicts); "
-        "none: grasps are feasible at best",
+        description="level of validation in MuJoCo. fast: MuJoCo Warp on a GPU gives the clear verdicts; none: "
+        "grasps are feasible at best",
     )
     rechecks: Annotated[int, Option(places=JOB)] = Field(
         RECHECKS,
         ge=0,
         le=10_000,
-        description=f"valid grasps that are validated at level dexgraspbench; the default, {RECHECKS}, are "
-        "spread over the job, one of 64, and take a twentieth of its time; of any other number the first ones",
+        description=f"valid grasps validated again at level dexgraspbench. The default, {RECHECKS}, is spread "
+        "over the job, one per 64 grasps, at a twentieth of its time; other numbers take the "
+        "first ones",
     )
     robustness: Annotated[int, Option(places=JOB)] = Field(
-        0, ge=0, le=20, description="verdicts under noise that each valid grasp gets"
+        0, ge=0, le=20, description="number of verdicts under noise for each valid grasp"
     )
     robust: Annotated[
         float,
         Option("basic"),
         Form(
-            "grasps", "Robust share", "of 8 models around the nominal one that a grasp must hold in; 0: any", cells=True
+            "grasps", "Robust share", "of 8 perturbed models in which a grasp must hold; 0: no requirement", cells=True
         ),
     ] = _sparse(
         0.0,
         ge=0,
         le=1,
         allow_inf_nan=False,
-        description="share of models around the nominal one in which a grasp must hold to count; 0: none is wanted. "
-        "Where candidates are wanted all are kept, whatever their share",
+        description="share of perturbed models in which a grasp must hold to count; 0: no requirement. With want "
+        "candidates, all are stored regardless of their share",
     )
     robust_models: Annotated[int, Option()] = _sparse(
         0,
         ge=0,
         le=MOST_ROBUST_MODELS,
-        description=f"models in which each valid grasp is validated too; 0: {ROBUST_MODELS} where a share is wanted, "
-        "else none",
+        description=f"number of perturbed models in which each valid grasp is validated; 0: {ROBUST_MODELS} if "
+        "`robust` is given, else none",
     )
     payload: Annotated[bool, Option(schema=5)] = _sparse(
         False, description="measure the heaviest mass that each valid grasp lifts"
@@ -240,13 +239,13 @@ class JobOptions(Model):
     min_payload: Annotated[
         float,
         Option(schema=5),
-        Form("grasps", "Least payload", "mass that a grasp must lift to count; 0: not asked", cells=True),
+        Form("grasps", "Least payload", "mass that a grasp must lift to count; 0: no requirement", cells=True),
     ] = _sparse(
         0.0,
         ge=0,
         le=MOST_KG,
         allow_inf_nan=False,
-        description="mass that a grasp must lift to count [kg]; 0: none is wanted. It is measured where one is",
+        description="mass that a grasp must lift to count [kg]; 0: no requirement. Any other value implies `payload`",
     )
     shake: Annotated[bool, Option(schema=5), Form("scenes", "After the lift", "Shake: 2 cm, 3 Hz", cells=True)] = (
         _sparse(False, description="shake each valid grasp after its lift: 2 cm, 3 Hz, along x and y of its scene")
@@ -258,18 +257,18 @@ class JobOptions(Model):
             | Annotated[float, Field(allow_inf_nan=False)]
             | Annotated[str, Field(max_length=80)],
         ],
-        Option(flags="--option", typed="an option of the planner, such as steps=20000"),
+        Option(flags="--option", typed="option of the planner, such as steps=20000"),
     ] = Field(
         default_factory=dict,
         max_length=16,
-        description="the method's own options, such as steps; see docs/how-to/planners.md",
+        description="options of the planner, such as steps; see docs/how-to/planners.md",
     )
     target: Annotated[str, Option(places=JOB)] = Field(
         "",
         max_length=40,
-        description="with fidelity `auto`: the accuracy wanted, such as gsr>=0.6, dexgraspbench>=0.9 or "
-        "pd_mm<=1, in a scene lift>=0.9, lift_hard or robust; the cheapest fidelity that meets it in "
-        "the stored chart of such grasps is taken when the job is submitted",
+        description="accuracy wanted with fidelity `auto`, such as gsr>=0.6, dexgraspbench>=0.9 or pd_mm<=1; in a "
+        "scene lift>=0.9, lift_hard or robust. Submission selects the cheapest fidelity that meets it "
+        "in the stored chart of such grasps",
     )
 
     @field_validator("fidelity")
@@ -477,16 +476,16 @@ class Asset(Model):
     kind: AssetKind
     name: Name
     digest: Digest
-    filename: str = Field(description="file inside the archive that describes the asset: URDF, mesh or network")
-    files: tuple[str, ...] = Field(description="all files of the archive, relative paths")
+    filename: str = Field(description="main file in the archive: URDF, mesh or network")
+    files: tuple[str, ...] = Field(description="relative paths of all files in the archive")
     size_bytes: int
     created: str = Field(description="RFC 3339, UTC")
     builtin: bool = False
-    owner: str = Field("", max_length=64, description="id of the API key that uploaded it; empty: none, or not known")
-    project: Project = Field("", description="project of that key; empty: the one without a name")
-    shared: bool = Field(False, description="whether every project may use it")
-    facts: dict[str, object] = Field(default_factory=dict, description="what ingest measured")
-    self_test: bool = Field(False, description="of a hand: whether the check ends with grasps of plain objects")
+    owner: str = Field("", max_length=64, description="id of the API key that uploaded it; empty: none or unknown")
+    project: Project = Field("", description="project of that key; empty: the unnamed project")
+    shared: bool = Field(False, description="whether all projects may use it")
+    facts: dict[str, object] = Field(default_factory=dict, description="measurements of ingest")
+    self_test: bool = Field(False, description="for a hand: whether the check ends with grasps of simple objects")
 
     # A newer graspd may have written further fields.
     model_config = ConfigDict(frozen=True, extra="ignore")

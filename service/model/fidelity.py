@@ -14,31 +14,32 @@ class Fidelity(Model):
     """Settings of the planner that decide accuracy and cost. `graspd chart` measures the cost of each."""
 
     name: str = Field("custom", max_length=64)
-    starts: int = Field(4, ge=1, le=64, description="hands that set out for each grasp; half where they are tried")
-    finalists: int = Field(2, ge=1, le=64, description="of these, hands that enter the fine phase")
+    starts: int = Field(4, ge=1, le=64, description="starts for each grasp; half as many with rollouts")
+    finalists: int = Field(2, ge=1, le=64, description="starts that enter the fine phase")
     coarse_points: int = Field(256, ge=16, le=8192, description="hand surface points in the first phase")
     fine_points: int = Field(2000, ge=16, le=32768, description="hand surface points in the second phase")
     object_points: int = Field(
         4000,
         ge=16,
         le=65536,
-        description="object surface points tested against the links; around a free object thrice as many, up to 12,000",
+        description="object surface points tested against the links; three times as many around a free object, up "
+        "to 12,000",
     )
     face_error_m: float = Field(3e-4, ge=0, le=0.01, description="simplification error bound of the object [m]")
     coarse_iterations: int = Field(100, ge=0, le=100_000)
     fine_iterations: int = Field(40, ge=0, le=100_000)
     polish_iterations: int = Field(10, ge=0, le=100, description="Gauss-Newton steps that resolve penetration")
     patience: int = Field(
-        10, ge=0, le=100_000, description="fine iterations without improvement after which a grasp is done; 0: never"
+        10, ge=0, le=100_000, description="fine iterations without improvement before a grasp stops; 0: never"
     )
     velocities: Literal[7, 13] = Field(7, description="initial object velocities per simulation (M)")
     contact_solver: Literal["direct", "jacobi", "gauss_seidel"] = "direct"
     optimizer: Literal["adam", "gd"] = "adam"
     leak: Literal["one_sided", "two_sided"] = "one_sided"
     dilation: Literal["fixed", "touch"] = Field(
-        "fixed", description="first dilation of the object: 10 mm, or so much that it just touches the hand"
+        "fixed", description="first dilation of the object. fixed: 10 mm; touch: until it touches the hand"
     )
-    simulate: bool = Field(True, description="False: hands are only drawn to the surface; a control, not a method")
+    simulate: bool = Field(True, description="False: hands are only attracted to the surface, as a control experiment")
     phong_alpha: float = Field(0.5, ge=0, le=1)
 
 

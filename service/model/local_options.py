@@ -26,36 +26,36 @@ class LocalOptions(MeshOptions, JobOptions):
 
     fidelity: Annotated[str, Option("basic", _LOCAL)] = Field("standard", description=f"one of {', '.join(FIDELITIES)}")
     contact_solver: Annotated[Literal["direct", "jacobi", "gauss_seidel"] | None, Option(places=_COMMAND)] = Field(
-        None, description="contact solver in place of the fidelity's"
+        None, description="contact solver instead of the fidelity's"
     )
     scene: Annotated[str | Path, Option("basic", _LOCAL)] = Field(  # type: ignore[assignment]
-        "free", description="where the grasps are used: free, table, bin, shelf, or a JSON or YAML file"
+        "free", description="scene of the grasps: free, table, bin, shelf, or a JSON or YAML file"
     )
     scenes: Annotated[int, Option("basic", _LOCAL)] = Field(
         SCENES, ge=1, le=MOST_SCENES, description="scenes over which the grasps are distributed"
     )
     neighbours: Annotated[tuple[str | Path, ...], Option("basic", _LOCAL, "--with", "beside")] = Field(  # type: ignore[assignment]
-        (), max_length=MOST_NEIGHBOURS, description="another object in the scene, a file or built-in; up to eight"
+        (), max_length=MOST_NEIGHBOURS, description="neighbour in the scene: a file or a built-in object; up to eight"
     )
     touch: Annotated[Touch | None, Option(places=_LOCAL)] = Field(  # type: ignore[assignment]
         None,
-        description="distance that fingertips keep from supports [mm], by default as the scene's file says, else 0. "
-        "2: as the rest of the hand; 0: they may touch; below: they may press into it",
+        description="clearance of fingertips to supports [mm]; default: that of the scene file, else 0. 2: as the "
+        "rest of the hand; 0: contact allowed; negative: they may press into the support",
     )
     payload: Annotated[bool, Option("advanced", _LOCAL, "--payload/--no-payload")] = Field(
         False,
-        description="measure the heaviest mass that each valid grasp lifts; graspd synth does by default in scenes "
-        "where a mass is said",
+        description="measure the heaviest mass that each valid grasp lifts; default of graspd synth in scenes "
+        "with a given mass",
     )
     # A value may be a file path; a job has its digest instead.
     options: Annotated[dict[str, Any], Option("advanced", _LOCAL, "--option")] = Field(
-        default_factory=dict, description="an option of the planner, such as steps=20000 or network=net.npz"
+        default_factory=dict, description="option of the planner, such as steps=20000 or network=net.npz"
     )
     device: Annotated[str, Option(places=_LOCAL)] = Field("auto", description="device: cpu, cuda:0 or auto")
     threads: Annotated[int, Option(places=_LOCAL)] = Field(0, ge=0, description="CPU threads; 0: one per core")
     join: Annotated[int | Literal["auto"], Option(places=_LOCAL)] = Field(
         "auto",
-        description="batches of 32 that are planned in one launch; auto: as many as fill a GPU, 1 on a CPU. Grasps do "
+        description="batches of 32 planned in one launch; auto: as many as fill a GPU, 1 on a CPU. The grasps do "
         "not depend on it",
     )
 

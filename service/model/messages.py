@@ -27,21 +27,21 @@ class TaskMessage(Model):
     """Message for a task: a worker needs only this and the store."""
 
     # The message has the field `schema`, which is an attribute of BaseModel in Python: hence the alias.
-    schema_: int = Field(alias="schema", description="oldest schema that can say this")
-    newest_schema: int = Field(0, ge=0, description="newest schema whose meaning the writer knew; 0: the same")
+    schema_: int = Field(alias="schema", description="oldest schema that can express the message")
+    newest_schema: int = Field(0, ge=0, description="newest schema known to the writer; 0: the same as `schema`")
     task_id: Word
     job_id: Word
     stage: Stage
-    batch: int = Field(ge=0, description="the first batch of its range")
-    count: int = Field(ge=1, description="grasps wanted of all of its batches; all but the last batch are full")
-    revision: int = Field(1, ge=1, description="revision of the stage's algorithm that the output's address stands for")
+    batch: int = Field(ge=0, description="first batch of the range")
+    count: int = Field(ge=1, description="grasps wanted from all batches of the range; all but the last batch are full")
+    revision: int = Field(1, ge=1, description="revision of the stage's algorithm, part of the id of the output")
     attempt: int = Field(1, ge=1)
-    max_attempt: int = Field(3, ge=1, description="number of the attempt that is the last")
+    max_attempt: int = Field(3, ge=1, description="number of the last attempt")
     request: JobRequest
     hand_digest: Digest
     object_digest: Digest
-    inputs: tuple[Word, ...] = Field((), description="shard ids this task reads")
-    output: Word = Field(description="shard id this task writes")
+    inputs: tuple[Word, ...] = Field((), description="ids of the shards that the task reads")
+    output: Word = Field(description="id of the shard that the task writes")
     origin: Origin | None = None
 
     model_config = ConfigDict(frozen=True, extra="forbid", populate_by_name=True)

@@ -152,7 +152,7 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
     GraspMetric(
         "simulated_displacement_cm",
         "cm",
-        "object's way in the displacement test; nan: not tested, or it blew up",
+        "displacement of the object in the displacement test; nan: not tested, or diverged",
         title="Simulated displacement",
         short="Displacement",
         optional=True,
@@ -163,7 +163,7 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
     GraspMetric(
         "robustness",
         "1",
-        "share of verdicts that survive 1 mm and 1 degree of noise on the object",
+        "share of positive verdicts under noise of 1 mm and 1 degree on the object",
         title="Verdicts that survive noise",
         short="Robustness",
         optional=True,
@@ -175,8 +175,8 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
     GraspMetric(
         "robust_share",
         "1",
-        "share of the models around the nominal one in which it holds too; where validating ended "
-        "early, what it is at least, or at most below the wanted one; nan: not validated there",
+        "share of perturbed models in which the grasp holds; nan: not tested. If the test ended "
+        "early: a lower bound, or an upper bound below the required share",
         title="Models survived",
         short="Robust",
         optional=True,
@@ -188,8 +188,8 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
     GraspMetric(
         "payload_kg",
         "kg",
-        "heaviest mass that it lifts out of its scene, or holds under the six pushes, from the "
-        "object's own on; nan: not measured",
+        "heaviest mass, from the object's own upwards, that the grasp lifts in its scene or holds "
+        "under the six pushes; nan: not measured",
         title="Payload",
         optional=True,
         indexed=IndexLevel.OFFERED,
@@ -200,8 +200,8 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
     GraspMetric(
         "shake_margin",
         "1",
-        "worst displacement or rotation in the hand over its limit, shaken after the lift: below "
-        "1 it survives; nan: not shaken",
+        "largest ratio of displacement or rotation in the hand to its limit, shaken after the lift; "
+        "below 1: held; nan: not shaken",
         title="Motion when shaken",
         short="Shaken",
         optional=True,
@@ -213,7 +213,7 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
     GraspMetric(
         "clearance_m",
         "m",
-        "least room of the hand among supports: coming, closing and lifting",
+        "least distance of the hand from supports and neighbours during approach, closing and lift",
         title="Clearance in its scene",
         short="Clearance",
         optional=True,
@@ -233,7 +233,7 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
     GraspMetric(
         "grasp_type",
         "enum",
-        "0 not told, 1 power, 2 precision, 3 lateral: by what of the hand touches",
+        "0 undefined, 1 power, 2 precision, 3 lateral; from the links in contact",
         title="Type",
         whole=True,
         code=True,
@@ -244,9 +244,9 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
     GraspMetric(
         "approach_cell",
         "1",
-        "cell of 48 equal ones on the sphere, from which the palm comes, in the object's frame: "
-        "band of height times 12 plus azimuth",
-        title="Cell of the approach",
+        "direction from which the palm approaches, in the object's frame: one of 48 cells of equal "
+        "area; number = 12 x band of height + azimuth sector",
+        title="Approach cell",
         whole=True,
         code=True,
         optional=True,
@@ -256,7 +256,7 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
     GraspMetric(
         "stability_loss",
         "1",
-        "planner's L_stable; nan: the planner has none",
+        "stability loss L_stable of the planner; nan: it has none",
         title="Stability loss",
         indexed=IndexLevel.SORTED,
         bounds=(-math.inf, math.inf),

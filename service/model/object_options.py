@@ -22,9 +22,9 @@ class MeshOptions(Model):
 
     units: Annotated[Literal["m", "mm", "cm", "in"], _SIZE] = Field("m", description="unit of the mesh")
     scale_to: Annotated[Positive | None, _SIZE] = Field(None, description="longest extent after scaling [m]")
-    keep_largest: Annotated[bool, _READ] = Field(False, description="of several components keep the largest")
-    compound: Annotated[bool, _READ] = Field(False, description="components that lie apart are one rigid body")
-    allow_open: Annotated[bool, _READ] = Field(False, description="take a mesh that is not watertight")
+    keep_largest: Annotated[bool, _READ] = Field(False, description="keep only the largest of several components")
+    compound: Annotated[bool, _READ] = Field(False, description="treat separate components as one rigid body")
+    allow_open: Annotated[bool, _READ] = Field(False, description="accept a mesh that is not watertight")
 
 
 class ObjectOptions(MeshOptions):
@@ -36,14 +36,12 @@ class ObjectOptions(MeshOptions):
     source: str = ""
     facts: dict[str, Any] = Field(default_factory=dict)
     density: Annotated[Density | None, _MATTER] = Field(
-        None, description="density of the object [kg/m^3], in place of the mass"
+        None, description="density of the object [kg/m^3], instead of the mass"
     )
-    mass: Annotated[Mass | None, _MATTER] = Field(
-        None, description=f"mass of the object [kg]; {MASS_KG:g} where nothing is said"
-    )
+    mass: Annotated[Mass | None, _MATTER] = Field(None, description=f"mass of the object [kg]; default: {MASS_KG:g}")
     friction: Annotated[Friction | None, _MATTER] = Field(
         None,
-        description=f"Coulomb coefficient of the object's contacts in simulation; {FRICTION:g} where none is given",
+        description=f"Coulomb coefficient of the object's contacts in simulation; default: {FRICTION:g}",
     )
 
     @model_validator(mode="after")

@@ -270,21 +270,21 @@ def interleave(lists: Sequence[Sequence[T]]) -> list[T]:
 #: Outcomes of rejected candidates, in the order of the tests, with descriptions.
 OUTCOMES: Final = {
     "diverged": "without a finite posture",
-    "no_place": "without a clear place or way in the scene",
-    "touched_on_the_way": "touched on the way",
-    "penetration": "inside the object when simulated",
+    "no_place": "without a collision-free place or approach in the scene",
+    "touched_on_the_way": "with contact on the approach",
+    "penetration": "with penetration in simulation",
     "lost_while_closing": "lost while closing",
     "not_lifted": "not lifted",
-    "turned": "turned in the hand",
+    "turned": "rotated in the hand",
     "slipped": "slipped",
     "neighbour_moved": "moved a neighbour",
     "unstable": "unstable in simulation",
-    "gate_penetration": "too deep in the object (gate)",
-    "gate_self_penetration": "hand too deep in itself (gate)",
-    "gate_contacts": "did not oppose: fewer than two links in contact (gate)",
-    "not_robust": "held in too few models",
-    "weak": "lifted less than the wanted payload",
-    "alike": "too similar to another",
+    "gate_penetration": "above the limit of object penetration",
+    "gate_self_penetration": "above the limit of self-penetration",
+    "gate_contacts": "without opposing contacts (fewer than two links touch)",
+    "not_robust": "held in too few perturbed models",
+    "weak": "below the required payload",
+    "alike": "near-duplicates",
     "repeated": "repeated attempts",
 }
 
@@ -321,7 +321,7 @@ def shortfall(
     if found >= wanted:
         return None
     lost, tries = told(outcomes), candidates + outcomes.get("repeated", 0)
-    ended = limit or f"the budget of {budget:g} candidates for each ended first"
+    ended = limit or f"the budget of {budget:g} candidates per grasp is exhausted"
     return (
         f"found {found:,} of {wanted:,} {counted} grasps in {tries:,} candidates{': ' if lost else ''}{lost}; {ended}"
     )

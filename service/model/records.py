@@ -36,12 +36,12 @@ class Record(BaseModel):
 class Choice(Record):
     """How a chart resolved the fidelity `auto`."""
 
-    target: str = Field(description="the accuracy wanted")
+    target: str = Field(description="accuracy wanted")
     chart: str = Field(description="key of the chart in the store")
     measured_on: Literal["hand and object", "hand", "all"] = Field(
-        description="runs of the chart that counted: those of the same hand and object, of the same hand, or all"
+        description="runs of the chart that count: those of the same hand and object, of the same hand, or all"
     )
-    reached: float = Field(description="the accuracy that the chosen fidelity had there")
+    reached: float = Field(description="accuracy of the chosen fidelity in these runs")
 
     def __str__(self) -> str:
         where = "all of its runs" if self.measured_on == "all" else f"the same {self.measured_on}"
@@ -58,15 +58,13 @@ class JobRecord(Record):
     hand_digest: Digest
     object_digest: Digest
     priority: Priority
-    span: int = Field(
-        1, ge=1, le=MOST_BATCHES, exclude_if=lambda value: value == 1, description="batches of each of its tasks"
-    )
+    span: int = Field(1, ge=1, le=MOST_BATCHES, exclude_if=lambda value: value == 1, description="batches per task")
     created: str
     origin: Origin | None = None
-    owner: str = Field("", max_length=64, description="id of the API key that submitted it; empty: none, or not known")
-    project: Project = Field("", description="project of that key; empty: the one without a name")
+    owner: str = Field("", max_length=64, description="id of the API key that submitted it; empty: none or unknown")
+    project: Project = Field("", description="project of that key; empty: the unnamed project")
     choice: Choice | None = Field(
-        None, exclude_if=lambda value: value is None, description="of a request with fidelity `auto`"
+        None, exclude_if=lambda value: value is None, description="resolution of fidelity `auto`"
     )
 
     @model_validator(mode="before")
@@ -100,7 +98,7 @@ class JobEvent(Record):
     what: Literal["cancelled", "retried"]
     at: str
     retried: dict[str, int] = Field(default_factory=dict)
-    cause: str = Field("", description="event of the dataset that asked for it: its name, a slash, its number")
+    cause: str = Field("", description="event of the dataset that caused it: name, slash, number")
 
 
 class AttemptRecord(Record):
@@ -167,8 +165,8 @@ class DatasetRecord(Record):
     choices: tuple[Choice, ...] = Field((), exclude_if=lambda value: not value)
     chosen: tuple[Annotated[int, Field(ge=0)], ...] = Field((), exclude_if=lambda value: not value)
     created: str
-    owner: str = Field("", max_length=64, description="id of the API key that submitted it; empty: none, or not known")
-    project: Project = Field("", description="project of that key; empty: the one without a name")
+    owner: str = Field("", max_length=64, description="id of the API key that submitted it; empty: none or unknown")
+    project: Project = Field("", description="project of that key; empty: the unnamed project")
 
     @model_validator(mode="after")
     def _a_job_a_cell(self) -> DatasetRecord:
@@ -225,8 +223,8 @@ class Snapshot(Record):
     version: Literal[1] = 1
     dataset: Name
     dataset_digest: Digest
-    digest: Digest = Field(description="follows from the shards: the same files are the same snapshot")
-    complete: bool = Field(description="every cell had succeeded")
+    digest: Digest = Field(description="digest of the shards: the same files give the same snapshot")
+    complete: bool = Field(description="whether all cells had succeeded")
     grasps: int
     valid: int
     size_bytes: int
@@ -307,8 +305,8 @@ class Tag(Record):
     number: int = Field(ge=1)
     created: str
     changed: str
-    owner: str = Field("", max_length=64, description="id of the API key that made it")
-    project: Project = Field("", description="whose grasps it is given to")
+    owner: str = Field("", max_length=64, description="id of the API key that created it")
+    project: Project = Field("", description="project of the tagged grasps")
     gone: bool = False
     grasps: dict[Digest, tuple[Row, ...]] = Field(default_factory=dict, description="rows of each base shard")
 

@@ -84,10 +84,10 @@ class NeighbourSpec(Part):
     object: str = Field(min_length=1, max_length=1024)
     """A built-in object or a mesh; in a scene file, relative paths start at the file's folder."""
     pose: Pose | None = Field(
-        None, description="its frame in the scene: x y z [m], unit quaternion w x y z; absent: it is dropped"
+        None, description="pose in the scene: x y z [m], unit quaternion w x y z; absent: dropped"
     )
     digest: Digest | None = Field(
-        None, exclude_if=lambda value: value is None, description="of the object's files; the service fills it in"
+        None, exclude_if=lambda value: value is None, description="digest of the object's files; set by the service"
     )
 
     @model_validator(mode="after")
@@ -310,21 +310,21 @@ class SceneDocument(Part):
     """A complete scene within a request."""
 
     supports: Supports = Field(
-        min_length=1, max_length=MOST_SUPPORTS, description="what the object stands on and among, scene frame, z up [m]"
+        min_length=1, max_length=MOST_SUPPORTS, description="supports around the object, in the scene frame, z up [m]"
     )
     target: Pose | None = Field(
-        None, description="frame of the object in the scene: x y z [m], unit quaternion w x y z; absent: it is dropped"
+        None, description="pose of the object in the scene: x y z [m], unit quaternion w x y z; absent: dropped"
     )
     neighbours: tuple[NamedNeighbour, ...] = Field(
         (),
         max_length=MOST_NEIGHBOURS,
         exclude_if=lambda value: not value,
-        description="other objects: all with their poses, or all without, to be dropped around the target",
+        description="neighbours: all with poses, or all without, to be dropped around the target",
     )
     touch: Touch = Field(
         TOUCH,
         exclude_if=lambda value: value == TOUCH,
-        description="distance that fingertips keep from the supports [mm], unless the request says so itself",
+        description="clearance of fingertips to the supports [mm], unless the request has its own",
     )
 
     @model_validator(mode="after")

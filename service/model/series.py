@@ -29,43 +29,39 @@ class Series:
 
 
 _ALL: Final = (
-    Series("graspd_queue_depth", "gauge", ("priority", "stage"), "tasks that wait in the queue", "queue"),
-    Series("graspd_queue_oldest_task_seconds", "gauge", ("priority", "stage"), "age of the oldest of them", "queue"),
-    Series("graspd_tasks_running", "gauge", ("priority", "stage"), "tasks in a worker's hands", "queue"),
+    Series("graspd_queue_depth", "gauge", ("priority", "stage"), "waiting tasks", "queue"),
+    Series("graspd_queue_oldest_task_seconds", "gauge", ("priority", "stage"), "age of the oldest one", "queue"),
+    Series("graspd_tasks_running", "gauge", ("priority", "stage"), "tasks that workers are running", "queue"),
     Series(
-        "graspd_workers",
-        "gauge",
-        ("state",),
-        "workers by what they do: checking, idle, busy, stopping, quarantined",
-        "queue",
+        "graspd_workers", "gauge", ("state",), "workers by state: checking, idle, busy, stopping, quarantined", "queue"
     ),
-    Series("graspd_worker_lease_age_seconds", "gauge", ("worker", "device"), "time since its last beat", "queue"),
-    Series("graspd_controller_up", "gauge", (), "1: a controller gave a sign of life lately", "queue"),
+    Series("graspd_worker_lease_age_seconds", "gauge", ("worker", "device"), "time since its last heartbeat", "queue"),
+    Series("graspd_controller_up", "gauge", (), "1: a controller sent a heartbeat recently", "queue"),
     Series("graspd_jobs_unfinished", "gauge", ("state",), "queued and running jobs, counted up to 10,000", "index"),
     Series("graspd_job_oldest_seconds", "gauge", ("state",), "age of the oldest queued and running job", "index"),
-    Series("graspd_grasps_per_second", "gauge", ("verdict",), "grasps kept in the last minute: all, valid", "index"),
+    Series("graspd_grasps_per_second", "gauge", ("verdict",), "grasps stored in the last minute: all, valid", "index"),
     Series("graspd_store_damaged", "gauge", (), "objects of the store known to be damaged or missing", "index"),
-    Series("graspd_part_up", "gauge", ("part",), "1: redis, index or store answers", "probe"),
-    Series("graspd_part_latency_seconds", "gauge", ("part",), "time of a ping, a read, a small write", "probe"),
+    Series("graspd_part_up", "gauge", ("part",), "1: the part (redis, index or store) responds", "probe"),
+    Series("graspd_part_latency_seconds", "gauge", ("part",), "duration of a ping, a read or a small write", "probe"),
     Series(
         "graspd_grasps_total",
         "counter",
         ("verdict",),
-        "grasps kept: all, valid; tried ones: validated",
+        "grasps stored: all, valid; candidates tested: validated",
         "controller",
     ),
     Series("graspd_shards_total", "counter", ("stage",), "shards written", "controller"),
-    Series("graspd_shard_bytes_total", "counter", ("stage",), "bytes of them", "controller"),
-    Series("graspd_stage_seconds", "histogram", ("stage",), "time a worker spent on one task", "controller"),
+    Series("graspd_shard_bytes_total", "counter", ("stage",), "bytes of the shards written", "controller"),
+    Series("graspd_stage_seconds", "histogram", ("stage",), "time of a worker for one task", "controller"),
     Series(
-        "graspd_task_failures_total", "counter", ("stage", "kind"), "failed attempts by the error's name", "controller"
+        "graspd_task_failures_total", "counter", ("stage", "kind"), "failed attempts by name of the error", "controller"
     ),
     Series("graspd_task_handbacks_total", "counter", ("stage", "kind"), "deferred, returned, cancelled", "controller"),
     Series(
         "graspd_jobs_ended_total", "counter", ("state",), "jobs that succeeded, failed or were cancelled", "controller"
     ),
-    Series("graspd_http_requests_total", "counter", ("method", "route", "status"), "requests answered", "process"),
-    Series("graspd_http_request_seconds", "histogram", ("method", "route"), "time to answer", "process"),
+    Series("graspd_http_requests_total", "counter", ("method", "route", "status"), "HTTP requests answered", "process"),
+    Series("graspd_http_request_seconds", "histogram", ("method", "route"), "response time", "process"),
 )
 
 SERIES: Final[dict[str, Series]] = {series.name: series for series in _ALL}

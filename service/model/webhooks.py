@@ -32,8 +32,8 @@ class Webhook(Record):
     url: str = Field(max_length=MAX_URL)
     states: tuple[End, ...]
     created: str
-    owner: str = Field("", max_length=64, description="id of the API key that made it")
-    project: Project = Field("", description="whose jobs and datasets it is told of")
+    owner: str = Field("", max_length=64, description="id of the API key that created it")
+    project: Project = Field("", description="project whose jobs and datasets it reports")
 
 
 def check_url(url: str) -> str:

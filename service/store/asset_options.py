@@ -20,39 +20,37 @@ class HandWords(Model):
     """Keys of a hand's `asset.json` with command-line options; see `hand_options`."""
 
     urdf: Annotated[str | None, _TYPED] = Field(
-        None, description="which URDF, xacro or MJCF of the folder or ZIP is the hand: NAME"
+        None, description="main file of the hand in the folder or ZIP (URDF, xacro or MJCF): NAME"
     )
     xacro: Annotated[tuple[str, ...], _TYPED] = Field((), description="arguments of a xacro file: NAME=VALUE")
-    palm: Annotated[str | None, _TYPED] = Field(None, description="link that is the palm")
+    palm: Annotated[str | None, _TYPED] = Field(None, description="link of the palm")
     approach: Annotated[str | None, _TYPED] = Field(
-        None, description="direction out of the palm, in the palm's frame: x,y,z"
+        None, description="approach direction out of the palm, in the palm's frame: x,y,z"
     )
     root: Annotated[str | None, _TYPED] = Field(
-        None, description="link to begin at; a forearm and wrist above it are left out"
+        None, description="root link; links above it, such as forearm and wrist, are omitted"
     )
     pre_shape: Annotated[tuple[str, ...], _TYPED] = Field(
         (), description="joint values on approach (rad, m): JOINT=VALUE,..."
     )
     closing: Annotated[tuple[str, ...], _TYPED] = Field(
-        (), description="how joints close the hand, -1, 0 (spreads) or 1: JOINT=-1,..."
+        (), description="closing direction of joints, -1, 0 (spreads) or 1: JOINT=-1,..."
     )
     fingertips: Annotated[str | None, _TYPED] = Field(None, description="links at the ends of the fingers: A,B,C")
     fix: Annotated[tuple[str, ...], _TYPED] = Field((), description="joints to freeze (rad, m): JOINT=VALUE,...")
-    drop: Annotated[tuple[str, ...], _TYPED] = Field((), description="a link to leave out with all that hangs on it")
+    drop: Annotated[tuple[str, ...], _TYPED] = Field((), description="link to remove, with all its descendants")
 
 
 class SweptOptions(ObjectOptions):
     """Options of an object, including several sizes to make it in."""
 
     scale_to: Annotated[str | None, _TYPED] = Field(  # type: ignore[assignment]
-        None, description="longest extent after scaling [m]; 0.06,0.08,0.1: an object of each size"
+        None, description="longest extent after scaling [m]; 0.06,0.08,0.1: one object per size"
     )
 
 
-LicenceOption = Annotated[
-    str | None, typer.Option("--licence", help="Terms it may be used on, for dataset cards: CC-BY-4.0.")
-]
-SourceOption = Annotated[str | None, typer.Option("--source", help="Where it comes from: an address or a citation.")]
+LicenceOption = Annotated[str | None, typer.Option("--licence", help="Terms of use, for dataset cards: CC-BY-4.0.")]
+SourceOption = Annotated[str | None, typer.Option("--source", help="Source: an address or a citation.")]
 
 
 def provenance(licence: str | None, source: str | None) -> dict[str, Any]:

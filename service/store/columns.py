@@ -49,8 +49,8 @@ def _wrist(rows: str) -> Column:
         "f8",
         "rad",
         "joint",
-        "angles of the wrist above the hand's root that keep the links above it clear, order in attribute "
-        "wrist_joint_names",
+        "wrist angles above the hand's root that keep the links above it free of collision, order in "
+        "attribute wrist_joint_names",
         optional=True,
     )
 
@@ -78,9 +78,11 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
         "quality/thresholds_m": Column("T", "f8", "m", "none", "contact thresholds of the sweep"),
         **_measured(optional=False),
         "quality/valid": Column(
-            "N", "u1", "bool", "none", "1: feasible, and the validator validated that it holds; 0 where not validated"
+            "N", "u1", "bool", "none", "1: feasible, and held by the validator; 0 also if not validated"
         ),
-        "quality/feasible": Column("N", "u1", "bool", "none", "1: passed the geometric gate", optional=True),
+        "quality/feasible": Column(
+            "N", "u1", "bool", "none", "1: within the geometric limits of penetration and contact", optional=True
+        ),
         "quality/success": Column(
             "N",
             "i1",
@@ -94,8 +96,8 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
             "u1",
             "enum",
             "none",
-            "of each push +x -x +y -y +z -z: 0 not tried, 1 held, 2 penetration, 3 lost while closing, 4 displaced, "
-            "5 rotated, 6 diverged",
+            "outcome per push +x -x +y -y +z -z: 0 not tested, 1 held, 2 penetration, 3 lost while "
+            "closing, 4 displaced, 5 rotated, 6 diverged",
             optional=True,
         ),
         "quality/verdict_margin": Column(
@@ -103,7 +105,7 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
             "f8",
             "1",
             "none",
-            "worst displacement or rotation of the pushes over its limit; below 1: held",
+            "largest ratio of displacement or rotation to its limit under the pushes; below 1: held",
             optional=True,
         ),
         "quality/validated_by": Column(
@@ -111,7 +113,7 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
             "u1",
             "enum",
             "none",
-            "whose verdict success is: 0 MuJoCo on the CPU, which alone certifies, 1 MuJoCo Warp, the prefilter",
+            "engine of the verdict `success`: 0 MuJoCo on the CPU, which alone certifies, 1 MuJoCo Warp, the prefilter",
             optional=True,
         ),
         "quality/recheck": Column(
@@ -123,7 +125,7 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
             optional=True,
         ),
         "quality/published": Column(
-            "N", "i1", "bool", "none", "imported grasps: verdict that came with them: 1 held, 0 dropped, -1 none", True
+            "N", "i1", "bool", "none", "imported grasps: published verdict: 1 held, 0 dropped, -1 none", True
         ),
         **_measured(optional=True),
         "quality/robust_weakest": Column(
@@ -131,7 +133,7 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
             "u1",
             "enum",
             "none",
-            "what differed in the first model around the nominal one in which it does not hold: 0 none, "
+            "perturbed parameter of the first model in which the grasp does not hold: 0 none, "
             + ", ".join(f"{axis:d} {words}" for axis, words in AXIS_MEANINGS.items()),
             optional=True,
         ),
@@ -152,7 +154,7 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
             "f8",
             "m, 1",
             "scene",
-            "frames of the other objects in each scene; names in attribute neighbours",
+            "poses of the neighbours in each scene; names in attribute neighbours",
             optional=True,
         ),
         "grasp/scene_index": Column("N", "i4", "1", "none", "row of the grasp's scene in /scene", optional=True),
@@ -161,11 +163,11 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
             "f8",
             "m, 1",
             "object",
-            f"way in from the standoff to the pregrasp, in the joints of approach_joint_positions: {_POSE}",
+            f"approach waypoints from standoff to pregrasp, joints in approach_joint_positions: {_POSE}",
             optional=True,
         ),
         "grasp/approach_joint_positions": Column(
-            "N J", "f8", "rad or m", "joint", "joints of the open hand that comes, order in joint_names", optional=True
+            "N J", "f8", "rad or m", "joint", "joints of the open hand on approach, order in joint_names", optional=True
         ),
         "grasp/lift": Column("N 7", "f8", "m, 1", "object", f"squeeze posture raised by 10 cm: {_POSE}", optional=True),
         "grasp/wrist_positions": _wrist("N"),
@@ -174,8 +176,8 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
             "u1",
             "enum",
             "none",
-            "lift test: 0 not tried, 1 lifted, 2 penetration, 3 touched on the way, 4 lost while closing, 5 not lifted,"
-            " 6 turned, 7 diverged, 8 neighbour moved",
+            "lift test: 0 not tested, 1 lifted, 2 penetration, 3 contact on the approach, 4 lost while "
+            "closing, 5 not lifted, 6 rotated, 7 diverged, 8 neighbour moved",
             optional=True,
         ),
         "quality/lift_hard": Column(
@@ -186,7 +188,7 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
             "i1",
             "bool",
             "none",
-            "of files of 0.2, six pushes without the scene: 1 held, 0 dropped, -1 not tested",
+            "only in files of graspd 0.2: six pushes without the scene: 1 held, 0 dropped, -1 not tested",
             optional=True,
         ),
     },
@@ -200,16 +202,16 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
         "grasp/scene_index": Column("K", "i4", "1", "none", "row of the scene in /scene"),
         "grasp/hand_pose": Column("K 7", "f8", "m, 1", "table", f"posture at contact: {_POSE}"),
         "grasp/table_clearance_m": Column(
-            "K", "f8", "m", "table", "lowest point of the hand above the table at contact and on the way in"
+            "K", "f8", "m", "table", "lowest point of the hand above the table, at contact and on the approach"
         ),
-        "grasp/valid": Column("K", "u1", "bool", "none", "1: hand clear of what is around, at contact and before"),
+        "grasp/valid": Column("K", "u1", "bool", "none", "1: hand clear at contact and on the approach"),
         "grasp/rejection": Column(
             "K",
             "u1",
             "enum",
             "none",
-            "0 kept; too near to: 1 the table at contact, 2 the table on approach, 3 a neighbour at contact, "
-            "4 a neighbour on approach",
+            "0 not rejected; insufficient clearance to: 1 the table at contact, 2 the table on the "
+            "approach, 3 a neighbour at contact, 4 a neighbour on the approach",
             optional=True,
         ),
         "grasp/contact_table_clearance_m": Column(
@@ -220,7 +222,7 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
             "f8",
             "m",
             "table",
-            "signed distance of the hand from the neighbours' convex hulls at contact and on the way in, at most 0.1",
+            "signed distance of the hand from the neighbours' convex hulls at contact and on approach, at most 0.1",
             optional=True,
         ),
         "grasp/wrist_positions": _wrist("K"),
@@ -229,18 +231,14 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
             "f8",
             "m, 1",
             "table",
-            "frames of the other objects at rest; names in attribute neighbours",
+            "poses of the neighbours at rest; names in attribute neighbours",
             optional=True,
         ),
     },
     "views": {
         "camera/intrinsics": Column("V 3 3", "f8", "px", "image", "pinhole K; pixel centres at +0.5"),
         "camera/extrinsics": Column(
-            "V 4 4",
-            "f8",
-            "m, 1",
-            "table -> camera",
-            "x_camera = E x_table; camera x right, y down, z forward",
+            "V 4 4", "f8", "m, 1", "table -> camera", "x_camera = E x_table; camera x right, y down, z forward"
         ),
         "camera/scene_index": Column("V", "i4", "1", "none", "row of the scene in the scene shard"),
         "camera/eye": Column("V", "u1", "enum", "none", "0 mono, 1 left, 2 right"),
@@ -248,32 +246,28 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
             "V", "f8", "m", "camera", "distance of the right eye from the left; 0: mono"
         ),
         "image/rgb": Column("V H W 3", "u1", "sRGB", "image", "colour"),
-        "image/depth": Column("V H W", "f4", "m", "camera", "distance along the optical axis; inf: nothing there"),
+        "image/depth": Column("V H W", "f4", "m", "camera", "distance along the optical axis; inf: no surface"),
         "image/segmentation": Column(
             "V H W", "u1", "enum", "image", "0 background, 1 table, 2 object, 3 + m: neighbour m"
         ),
         "box/bounding_box_2d_tight": Column(
-            "V 4",
-            "f4",
-            "px",
-            "image",
-            "x_min y_min x_max y_max of the visible object pixels; nan: not visible",
+            "V 4", "f4", "px", "image", "x_min y_min x_max y_max of the visible object pixels; nan: not visible"
         ),
         "box/bounding_box_2d_loose": Column(
             "V 4", "f4", "px", "image", "x_min y_min x_max y_max of the projected object, occluded or not"
         ),
         "box/bounding_box_3d": Column("V 8 3", "f4", "m", "camera", "corners of the object-aligned box"),
         "box/occlusion_ratio": Column(
-            "V", "f4", "1", "image", "share of the object's pixels that is hidden; nan: not in view", optional=True
+            "V", "f4", "1", "image", "occluded share of the object's pixels; nan: not in view", optional=True
         ),
         "image/distance": Column(
-            "V H W", "f4", "m", "camera", "distance from the optical centre; inf: nothing there", optional=True
+            "V H W", "f4", "m", "camera", "distance from the optical centre; inf: no surface", optional=True
         ),
         "image/normals": Column(
-            "V H W 3", "f2", "1", "table", "unit shading normal, outward; 0 0 0: nothing there", optional=True
+            "V H W 3", "f2", "1", "table", "unit shading normal, outward; 0 0 0: no surface", optional=True
         ),
         "image/rgb_hand": Column(
-            "V H W 3", "u1", "sRGB", "image", "colour with the hand in its grasp pose, for people", optional=True
+            "V H W 3", "u1", "sRGB", "image", "colour with the hand in its grasp pose, for display", optional=True
         ),
         "camera/hand_grasp": Column(
             "V", "i4", "1", "none", "row of the grasp that rgb_hand shows in the scene shard; -1: none", optional=True
@@ -305,66 +299,64 @@ _BASE: Final = ("base",)
 ATTRIBUTES: Final[dict[str, RootAttribute]] = {
     "schema": RootAttribute("text", "`graspd/base@2`, `graspd/scene@1` or `graspd/views@1`"),
     "hand": RootAttribute("text", "name of the hand"),
-    "hand_digest": RootAttribute("text", "digest of the files it came from"),
-    "hand_source": RootAttribute("text", "where a command of this machine read it, if it is not built in"),
+    "hand_digest": RootAttribute("text", "digest of its files"),
+    "hand_source": RootAttribute("text", "path from which a local command read it; absent: built in"),
     "object": RootAttribute("text", "name of the object"),
-    "object_digest": RootAttribute("text", "digest of the files it came from"),
-    "object_source": RootAttribute("text", "where a command of this machine read it, if it is not built in"),
-    "object_options": RootAttribute("text", "with which options the mesh was read, as JSON"),
-    "object_mass_kg": RootAttribute("number", "mass that the object has in simulation [kg]", _BASE),
-    "object_friction": RootAttribute("number", "Coulomb coefficient of its contacts in simulation", _BASE),
+    "object_digest": RootAttribute("text", "digest of its files"),
+    "object_source": RootAttribute("text", "path from which a local command read it; absent: built in"),
+    "object_options": RootAttribute("text", "options for reading the mesh, as JSON"),
+    "object_mass_kg": RootAttribute("number", "mass of the object in simulation [kg]", _BASE),
+    "object_friction": RootAttribute("number", "Coulomb coefficient of the object's contacts in simulation", _BASE),
     "object_scale": RootAttribute("number", "imported grasps: scale of the object's mesh", _BASE),
     "method": RootAttribute("text", "planner"),
-    "fidelity": RootAttribute("text", "its knobs, as JSON"),
-    "seed": RootAttribute("integer", "with the batch and the digests, all that decides the result"),
-    "batch": RootAttribute("integer", "number of the batch in its job, or of the first of several"),
-    "batch_rows": RootAttribute("text", "JSON: rows of each of several batches, in order; absent: there is one", _BASE),
-    "device": RootAttribute("text", "on what it was made"),
-    "seconds": RootAttribute("number", "in how long"),
-    "created": RootAttribute("text", "when, RFC 3339"),
-    "code_version": RootAttribute("text", "by which graspd"),
-    "shard_id": RootAttribute("text", "its name in the store"),
-    "inputs": RootAttribute("texts", "names of the shards it was made from"),
+    "fidelity": RootAttribute("text", "settings of the fidelity, as JSON"),
+    "seed": RootAttribute("integer", "seed; with batch and digests it determines the result"),
+    "batch": RootAttribute("integer", "number of the batch in its job; of several, the first"),
+    "batch_rows": RootAttribute("text", "JSON: rows of each batch, in order; absent: one batch", _BASE),
+    "device": RootAttribute("text", "device that made it"),
+    "seconds": RootAttribute("number", "computing time [s]"),
+    "created": RootAttribute("text", "time of creation, RFC 3339"),
+    "code_version": RootAttribute("text", "version of graspd that made it"),
+    "shard_id": RootAttribute("text", "name of the shard in the store"),
+    "inputs": RootAttribute("texts", "names of the shards from which it was made"),
     "joint_names": RootAttribute("texts", "order of the hand's joints", _BASE),
     "wrist_joint_names": RootAttribute(
         "texts",
         "joints of the wrist above the hand's root, order of `grasp/wrist_positions`; absent: none",
         ("base", "scene"),
     ),
-    "root_link": RootAttribute("text", "link of the hand whose pose is given"),
+    "root_link": RootAttribute("text", "link of the hand to which poses refer"),
     "mu": RootAttribute("number", "Coulomb coefficient of `quality/epsilon` and `quality/wrench_volume`", _BASE),
     "want": RootAttribute(
-        "text", "valid: valid grasps were asked for (feasible ones without validation); candidates: any", _BASE
+        "text", "valid: valid grasps were requested (feasible ones without validation); candidates: any", _BASE
     ),
-    "candidates": RootAttribute("integer", "candidates until the last one kept", _BASE),
-    "outcomes": RootAttribute("text", "JSON: candidates that were not kept, by what became of them", _BASE),
-    "reason": RootAttribute("text", "why a command found fewer grasps than asked for; absent: it did not", _BASE),
-    "grasps_wanted": RootAttribute("integer", "grasps asked for, where a command was interrupted before", _BASE),
+    "candidates": RootAttribute("integer", "candidates planned until the last stored grasp", _BASE),
+    "outcomes": RootAttribute("text", "JSON: rejected candidates by outcome", _BASE),
+    "reason": RootAttribute("text", "why a command found fewer grasps than requested; absent: it found all", _BASE),
+    "grasps_wanted": RootAttribute("integer", "number of grasps requested, if the command was interrupted", _BASE),
     "robust": RootAttribute(
         "text",
-        "JSON: models around the nominal one that validated each valid grasp, and the wanted share; absent: none",
+        "JSON: perturbed models in which each valid grasp was validated, and the required share; absent: none",
         _BASE,
     ),
-    "verdict_level": RootAttribute("text", "level of the validator, or `none` where not validated", _BASE),
+    "verdict_level": RootAttribute("text", "level of validation; `none`: not validated", _BASE),
     "verdict_key": RootAttribute(
         "text",
-        "digest of all that its verdicts follow from; verdicts of different keys must not be mixed in one number",
+        "digest of everything that decides the verdicts; verdicts of different keys must not be mixed in one number",
         _BASE,
     ),
     "scene": RootAttribute(
-        "text", "where the grasps were planned, if not around a free object, as JSON", ("base", "scene", "views")
+        "text", "scene of the grasps, as JSON; absent: planned around a free object", ("base", "scene", "views")
     ),
-    "source": RootAttribute("text", "imported grasps: an address or a citation", _BASE),
-    "licence": RootAttribute("text", "imported grasps: the terms on which they may be used", _BASE),
+    "source": RootAttribute("text", "imported grasps: address or citation of the source", _BASE),
+    "licence": RootAttribute("text", "imported grasps: terms of use", _BASE),
     "base_shard": RootAttribute(
-        "text",
-        "the shard whose grasps were carried over, or were planned in the scenes that are shown",
-        ("scene", "views"),
+        "text", "base shard whose grasps were transferred, or were planned in the scenes shown", ("scene", "views")
     ),
-    "scene_shard": RootAttribute("text", "the shard whose scenes are shown, or hold the grasps", ("base", "views")),
-    "neighbours": RootAttribute("texts", "names of the objects beside it"),
-    "neighbour_digests": RootAttribute("texts", "digests of their files"),
-    "neighbour_sources": RootAttribute("texts", "where a command of this machine read them; empty: built in"),
+    "scene_shard": RootAttribute("text", "scene shard that is shown, or contains the grasps", ("base", "views")),
+    "neighbours": RootAttribute("texts", "names of the neighbours"),
+    "neighbour_digests": RootAttribute("texts", "digests of the neighbours' files"),
+    "neighbour_sources": RootAttribute("texts", "paths from which a local command read them; empty: built in"),
 }
 
 

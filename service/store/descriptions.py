@@ -99,7 +99,7 @@ class PalmCorrection(_Said):
     """The palm in the frame of a link, with the hand in its pre-shape. Missing values are guessed again."""
 
     link: Text
-    centre: tuple[Length, Length, Length] | None = Field(None, description="where it takes hold [m]")
+    centre: tuple[Length, Length, Length] | None = Field(None, description="grasp centre of the palm [m]")
     approach: tuple[Share, Share, Share] | None = Field(None, description="direction out of the palm; any length")
 
 
@@ -108,12 +108,12 @@ class HandCorrections(_Said):
 
     palm: PalmCorrection | None = None
     closing: dict[Text, Direction] = Field(
-        default_factory=dict, max_length=MAX_ENTRIES, description="how a joint closes the hand; 0: it spreads"
+        default_factory=dict, max_length=MAX_ENTRIES, description="closing direction of a joint; 0: it spreads"
     )
     preshape: dict[Text, Finite] = Field(
         default_factory=dict, max_length=MAX_ENTRIES, description="joint values on approach [rad or m]"
     )
-    fingertips: list[Text] | None = Field(None, min_length=1, max_length=MAX_ENTRIES, description="links")
+    fingertips: list[Text] | None = Field(None, min_length=1, max_length=MAX_ENTRIES, description="fingertip links")
 
 
 class HandFacts(BaseModel):

@@ -39,9 +39,9 @@ class GraspSummary(BaseModel):
     valid: bool
     success: bool | None = None
     verdict_level: str | None = Field(None, description="level of the validator that gave `success`")
-    lift_hard: bool | None = Field(None, description="in a scene: lifted at half the friction")
+    lift_hard: bool | None = Field(None, description="in a scene: lifted at half friction")
     robust_weakest: str | None = Field(
-        None, description="axis of the first model in which it does not hold; None: held in all, or not validated there"
+        None, description="perturbed parameter of the first model in which it fails; None: held in all, or not tested"
     )
 
 
@@ -65,7 +65,7 @@ class ShardManifest(BaseModel):
     request: JobRequest
     seed: int
     batch: int
-    batches: int = Field(1, ge=1, description="batches from that one on")
+    batches: int = Field(1, ge=1, description="number of batches, starting with `batch`")
     inputs: tuple[str, ...]
     code_version: str
     stage_revision: int
@@ -75,11 +75,11 @@ class ShardManifest(BaseModel):
     seconds: float
     worker: str
     valid: int = Field(0, description="base: valid grasps; scene: pairs of grasp and scene in which the hand is clear")
-    candidates: int = Field(0, ge=0, description="grasps planned for this base shard, kept or not")
+    candidates: int = Field(0, ge=0, description="candidates planned for this base shard, stored or not")
     rechecked: int = Field(
-        0, ge=0, description="certified grasps that were tested again under the DexGraspBench protocol"
+        0, ge=0, description="valid grasps validated again under the unmodified DexGraspBench protocol"
     )
-    recheck_held: int = Field(0, ge=0, description="of these, grasps that held")
+    recheck_held: int = Field(0, ge=0, description="rechecked grasps that held")
     index_threshold_m: float | None = None
     grasps: tuple[GraspSummary, ...] = ()
     info: dict[str, Any] = Field(default_factory=dict)

@@ -26,7 +26,7 @@ from graspd.service.model import names
 from graspd.service.model.clock import timestamp
 from graspd.service.model.errors import ConflictError, IndexUnavailable, InputError, NotFoundError, StoreUnavailable
 from graspd.service.model.messages import Origin
-from graspd.service.model.planning import RoundRobin, message_of, plan
+from graspd.service.model.planning import OUTCOMES, RoundRobin, message_of, plan
 from graspd.service.model.records import JobRecord
 from graspd.service.model.states import AssetKind, Priority, Stage, State
 from graspd.service.pipeline import job_actions
@@ -116,7 +116,7 @@ def test_a_job_that_found_fewer_grasps_tells_the_outcomes(services: Services) ->
     done = services.index.jobs.get(job.id)
     assert done.valid < 64 and done.outcomes == {"turned": 1, "slipped": 7}
     assert done.note is not None and f"found {done.valid} of 64 valid grasps" in done.note
-    assert "7 slipped, 1 turned in the hand" in done.note
+    assert f"7 slipped, 1 {OUTCOMES['turned']}" in done.note
     (listed,) = services.index.jobs.page().items
     assert listed.note is not None and not listed.outcomes
 

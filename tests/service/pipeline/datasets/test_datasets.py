@@ -22,6 +22,7 @@ from graspd.service.model.errors import (
     NotFoundError,
     StoreUnavailable,
 )
+from graspd.service.model.planning import OUTCOMES
 from graspd.service.model.records import Snapshot, SnapshotShard
 from graspd.service.model.states import AssetKind, Priority, State
 from graspd.service.pipeline import job_actions
@@ -159,7 +160,7 @@ def test_a_dataset_that_found_fewer_grasps_tells_the_outcomes(either: Services) 
     assert whole.valid < 64 and whole.outcomes == {"turned": 2, "slipped": 4}
     assert whole.reason is not None and f"found {whole.valid} of 64 valid" in whole.reason
     reasons = [cell.reason or "" for cell in found.cells]
-    assert "3 slipped;" in reasons[0] and "2 turned in the hand, 1 slipped;" in reasons[1]
+    assert "3 slipped;" in reasons[0] and f"2 {OUTCOMES['turned']}, 1 slipped;" in reasons[1]
 
 
 def test_cells_come_in_pages_and_by_state(either: Services) -> None:
