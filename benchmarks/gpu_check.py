@@ -99,7 +99,9 @@ def _told(text: str, module: str, arch: int) -> Iterator[Kernel]:
         elif entry and (found := _USED.search(line)):
             # name_hash_cuda_kernel_forward
             name = re.sub(r"(_[0-9a-f]{8})?_cuda_kernel_(forward|backward)$", "", entry)
-            yield Kernel(module.removeprefix("worker."), name, arch, int(found[1]), stack, spilled)
+            yield Kernel(
+                module.removeprefix("graspd.").removeprefix("worker."), name, arch, int(found[1]), stack, spilled
+            )
             entry = ""
 
 

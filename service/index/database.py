@@ -28,7 +28,7 @@ from graspd.service.model.metrics import indexed
 log = logging.getLogger(__name__)
 T = TypeVar("T")
 #: Revision of `service.index.tables`: it changes with every change of the tables except for new metrics.
-REVISION: Final = "0021"
+REVISION: Final = "0022"
 #: Table with the revision. A graspd of 0.2 reads it, and refuses an index of an unknown revision.
 REVISION_TABLE: Final = "alembic_version"
 #: A job of a million grasps is one transaction of a few seconds, for which others wait.

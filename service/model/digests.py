@@ -11,6 +11,7 @@ from typing import IO, Final
 
 from graspd.service.model.domain import JobRequest, batches_of
 from graspd.service.model.metrics import MIN_DISTANCE_M
+from graspd.service.model.renamed import original
 from graspd.service.model.states import AssetKind, Stage
 from graspd.service.model.version import STAGE_REVISIONS
 
@@ -112,25 +113,22 @@ def _verdict_text(request: JobRequest, batches: range) -> dict[str, object]:
         # The default is covered by the stage's revision.
         found |= {} if request.min_distance == MIN_DISTANCE_M else {"min_distance": request.min_distance}
     if request.validation != "none":
-        found |= {
-            "validation": request.validation,
-            "rechecks": sum(map(request.rechecks_of, batches)),
-            "robustness": request.robustness,
-        }
+        rechecks = sum(map(request.rechecks_of, batches))
+        found |= {"validation": request.validation, "rechecks": rechecks, "robustness": request.robustness}
     if request.models:
         found |= {"robust": [request.models, request.robust]}
     if request.measures_payload:
         found |= {"payload": [_PAYLOAD_REVISION, request.min_payload]}
     if request.shake:
         found |= {"shake": True}
-    return found
+    return original(found)
 
 
 def job_id(request: JobRequest, hand_digest: str, object_digest: str, project: str = "") -> str:
     """Return the id of a job: equal requests on equal hand and object in one project are one job."""
     return digest_json(
         {
-            "request": request.model_dump(mode="json"),
+            "request": original(request.model_dump(mode="json")),
             "hand": hand_digest,
             "object": object_digest,
             "revisions": STAGE_REVISIONS,

@@ -55,12 +55,18 @@ def renamed(value: Any) -> Any:
     return value
 
 
+def original(request: dict[str, Any]) -> dict[str, Any]:
+    """Return a job's request with the names of graspd 0.2: addresses of jobs and shards are digests of these."""
+    values = {key: {new: old for old, new in names.items()} for key, names in VALUES.items()}
+    keys = {new: old for old, new in KEYS.items()}
+    return {
+        keys.get(key, key): values[key].get(value, value) if key in values else value for key, value in request.items()
+    }
+
+
 def for_worker_of(revision: int, stage: str, message: dict[str, Any]) -> dict[str, Any]:
     """Convert a task message to the names of its revision: rolling upgrades also have workers of 0.2."""
     request = message.get("request")
     if not isinstance(request, dict) or not 0 < revision <= _REVISIONS.get(stage, 0):
         return message
-    values = {key: {new: old for old, new in names.items()} for key, names in VALUES.items()}
-    request = {key: values[key].get(value, value) if key in values else value for key, value in request.items()}
-    keys = {new: old for old, new in KEYS.items()}
-    return message | {"request": {keys.get(key, key): value for key, value in request.items()}}
+    return message | {"request": original(request)}

@@ -107,9 +107,12 @@ ARCHITECTURES: Final = (80, 90, 100)
 
 def modules() -> list[str]:
     """Return the names of all graspd modules with Warp kernels."""
-    worker = import_module("worker")
-    infos = pkgutil.walk_packages(worker.__path__, "worker.")
-    names = [info.name for info in infos if not info.ispkg]
+    names = [
+        info.name
+        for package in map(import_module, ("graspd.worker", "graspd.baselines", "graspd.studies"))
+        for info in pkgutil.walk_packages(package.__path__, f"{package.__name__}.")
+        if not info.ispkg
+    ]
     return [name for name in names if (".kernels." in name or name.endswith(".kernels")) and _has_kernels(name)]
 
 

@@ -12,6 +12,7 @@ from graspd.service.model.digests import digest_json, job_id
 from graspd.service.model.domain import JobOptions, JobRequest, Name
 from graspd.service.model.fidelity import AUTO
 from graspd.service.model.records import Choice, DatasetRecord, Member, request_of
+from graspd.service.model.renamed import original
 from graspd.service.model.version import STAGE_REVISIONS
 
 #: Larger matrices must be split by the user: a record of this many cells has 4 MB.
@@ -87,7 +88,7 @@ def describe(
     content = {
         "hands": [[hand.name, hand.digest] for hand in hands],
         "objects": [[obj.name, obj.digest] for obj in objects],
-        "options": options.model_dump(mode="json", exclude=_unused(options)),
+        "options": original(options.model_dump(mode="json", exclude=_unused(options))),
         **({"fidelities": fidelities} if fidelities else {}),
     }
     return DatasetRecord(

@@ -24,7 +24,7 @@ from tests.servers import PostgresServer
 from tests.service.conftest import DATABASES
 
 #: Digest of the tables of each revision.
-TABLES = {"0021": "aab6ca92"}
+TABLES = {"0022": "432488c9"}
 
 
 @pytest.fixture(params=DATABASES)
