@@ -164,7 +164,7 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
         "robustness",
         "1",
         "share of verdicts that survive 1 mm and 1 degree of noise on the object",
-        title="Verdicts that survive noise",
+        title="Share held under noise",
         short="Robustness",
         optional=True,
         indexed=IndexLevel.KEPT,
@@ -177,7 +177,7 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
         "1",
         "share of the models around the nominal one in which it holds too; where validating ended "
         "early, what it is at least, or at most below the wanted one; nan: not validated there",
-        title="Models survived",
+        title="Robust share",
         short="Robust",
         optional=True,
         indexed=IndexLevel.OFFERED,
