@@ -172,7 +172,7 @@ def asset_commands(kind: AssetKind) -> typer.Typer:
     verbs = "Add, list, show and delete" if kind is AssetKind.NETWORK else "Check, add, list, show and delete"
     group = typer.Typer(no_args_is_help=True, help=f"{verbs} {kind.value}s.")
 
-    @group.command("list")
+    @group.command("list", help=f"List {kind.value}s, by default without refused ones.")
     @reporting_errors
     def list_assets(
         refused: Annotated[bool, typer.Option("--refused", help="Include refused ones.")] = False,
@@ -196,10 +196,10 @@ def asset_commands(kind: AssetKind) -> typer.Typer:
             table.add_row(asset.name, named, size(asset.size_bytes), origin, asset.digest[:12])
         plain_console().print(table)
 
-    @group.command("show")
+    @group.command("show", help=f"Show a {kind.value} with the findings of its check.")
     @reporting_errors
     def show(
-        name: Annotated[str, typer.Argument(help="Name.")],
+        name: Annotated[str, typer.Argument(help="Name of the asset.")],
         url: UrlOption = None,
         json: JsonFlag = False,
     ) -> None:
@@ -208,10 +208,14 @@ def asset_commands(kind: AssetKind) -> typer.Typer:
             asset = client.asset(kind, name)
         show_asset(asset.model_dump(mode="json"), json=json)
 
-    @group.command("delete", epilog=f"graspd {kind.value}s delete my_{kind.value}")
+    @group.command(
+        "delete",
+        help=f"Delete a {kind.value} that no job, dataset or set of objects uses.",
+        epilog=f"graspd {kind.value}s delete my_{kind.value}",
+    )
     @reporting_errors
     def delete_asset(
-        name: Annotated[str, typer.Argument(help="Name or digest.")],
+        name: Annotated[str, typer.Argument(help="Name or digest of the asset.")],
         yes: YesOption = False,
         url: UrlOption = None,
         json: JsonFlag = False,
@@ -223,10 +227,14 @@ def asset_commands(kind: AssetKind) -> typer.Typer:
             client.delete(path_of(f"{kind.value}s", name))
         say_deleted(kind.value, name, json=json, undo=f"graspd {kind.value}s restore {name}")
 
-    @group.command("restore", epilog=f"graspd {kind.value}s restore my_{kind.value}")
+    @group.command(
+        "restore",
+        help=f"Restore a deleted {kind.value} within the grace time.",
+        epilog=f"graspd {kind.value}s restore my_{kind.value}",
+    )
     @reporting_errors
     def restore_asset(
-        name: Annotated[str, typer.Argument(help="Name or digest.")],
+        name: Annotated[str, typer.Argument(help="Name or digest of the asset.")],
         url: UrlOption = None,
         json: JsonFlag = False,
     ) -> None:

@@ -148,7 +148,7 @@ def yield_of(job: JobDetail) -> str:
     """Format the valid grasps per candidate, and the result of the recheck, in one line."""
     level = job.request.validation
     if level == "none":
-        return f"{count(job.grasps)} grasps kept of {count(job.candidates)} candidates; not validated"
+        return f"{count(job.grasps)} stored grasps of {count(job.candidates)} candidates; not validated"
     recheck = (
         f"; {job.recheck_held} of {job.rechecked} rechecked hold under the DexGraspBench protocol"
         if job.rechecked

@@ -97,7 +97,7 @@ def delete_tag(tag: NameArgument, yes: YesOption = False, url: UrlOption = None,
 @app.command("restore", epilog="graspd tags restore good")
 @reporting_errors
 def restore_tag(tag: NameArgument, url: UrlOption = None, json: JsonFlag = False) -> None:
-    """Restore a deleted tag on its grasps, within the grace time."""
+    """Restore a deleted tag of grasps within the grace time."""
     restore(url, "tag", tag, json=json)
 
 
@@ -109,7 +109,7 @@ def export_tag(
     url: UrlOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """Export the grasps that have a tag as a file."""
+    """Export the grasps with a tag to a file."""
     format = out.suffix.removeprefix(".").lower()
     if format not in ("zip", "csv", "json"):
         raise InputError(f"{out}: the name of the file must end in .zip, .csv or .json")
