@@ -104,7 +104,7 @@ def list_keys(json: JsonFlag = False) -> None:
         of = [key.project or "-"] if has_projects else []
         times = minute(key.created), minute(key.expires)
         table.add_row(key.name, key.scope, *of, _state(key), *times, _key_limits(key.limits))
-    plain_console().print(table if found else "no key; the service is open and answers on this machine only")
+    plain_console().print(table if found else "no key; the service is open, but only to this machine")
 
 
 @keys_app.command("revoke", epilog="graspd keys revoke alice")

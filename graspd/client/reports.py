@@ -316,10 +316,11 @@ def print_estimate(found: Estimate, console: Console) -> None:
     console.print(f"storage {size(found.storage_bytes)} ({kinds})")
     width = max(len(used.hand) for used in found.rates[:_SHOWN_RATES])
     for used in found.rates[:_SHOWN_RATES]:
-        each = f"no {found.counted} grasp" if used.seconds_per_valid is None else f"{metric(used.seconds_per_valid)} s"
+        seconds = None if used.seconds_per_valid is None else metric(used.seconds_per_valid)
+        each = f"no {found.counted} grasp" if seconds is None else f"{seconds} s per {found.counted} grasp"
         batches = f", {count(used.batches)} batches" if used.batches else ""
         console.print(
-            f"  {used.hand:<{width}} {each} per {found.counted} grasp, yield {percent(used.valid_yield)} "
+            f"  {used.hand:<{width}} {each}, yield {percent(used.valid_yield)} "
             f"({used.origin}{batches}) for {count(used.cells)} cells",
             soft_wrap=True,
         )
