@@ -16,8 +16,8 @@ app = typer.Typer(add_completion=False)
 @app.command(epilog="graspd api --port 8000")
 @reporting_errors
 def api(
-    host: Annotated[str | None, typer.Option(help="Address to bind; default GRASPD_HOST.")] = None,
-    port: Annotated[int | None, typer.Option(min=0, max=65535, help="Port; 0: any free one.")] = None,
+    host: Annotated[str | None, typer.Option(help="Address to bind; default: GRASPD_HOST.")] = None,
+    port: Annotated[int | None, typer.Option(min=0, max=65535, help="Port; 0: any free port.")] = None,
 ) -> None:
     """Run the HTTP API and the dashboard."""
     with imports():

@@ -4,6 +4,8 @@ import typer
 
 app = typer.Typer()
 app.add_typer(
-    typer.Typer(no_args_is_help=True, help="Rare tasks: compile kernels, rebuild the index, repair the store, draw."),
+    typer.Typer(
+        no_args_is_help=True, help="Maintenance: compile kernels, rebuild the index, repair the store, render."
+    ),
     name="admin",
 )

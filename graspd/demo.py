@@ -54,17 +54,17 @@ _SAMPLES: Final = 8
 @app.command("demo", epilog="graspd demo --out demo-out --grasps 32 --scenes 2 --views 3")
 @reporting_errors
 def demo(
-    out: Annotated[Path, typer.Option(help="Folder for the service's data and the files it makes.")] = Path("demo-out"),
-    hand: Annotated[str, typer.Option(help="A built-in hand.")] = "allegro",
-    object: Annotated[str, typer.Option(help="A built-in object.")] = "mug",
+    out: Annotated[Path, typer.Option(help="Folder for the service's data and the results.")] = Path("demo-out"),
+    hand: Annotated[str, typer.Option(help="Built-in hand.")] = "allegro",
+    object: Annotated[str, typer.Option(help="Built-in object.")] = "mug",
     grasps: Annotated[int, typer.Option("--grasps", "-n", help="Number of grasps.")] = 32,
     scenes: Annotated[int, typer.Option(help="Scenes per batch of grasps.")] = 2,
     views: Annotated[int, typer.Option(help="Stereo pairs per scene.")] = 3,
-    fidelity: Annotated[str, typer.Option(help="draft, standard or fine.")] = "standard",
+    fidelity: Annotated[str, typer.Option(help="Fidelity: draft, standard or fine.")] = "standard",
     seed: Annotated[int, typer.Option(help="The same seed gives the same grasps.")] = 0,
     json: JsonFlag = False,
 ) -> None:
-    """Make grasps, scenes and pictures from built-in data, and a page that shows them."""
+    """Make grasps, scenes and pictures of built-in data, and a results page."""
     request = parsed_options(
         JobRequest,
         {
@@ -110,7 +110,7 @@ def run(
     with JobDisplay(console) as display:
         job = client.wait(job.id, display.update)
     if job.state is not State.SUCCEEDED:
-        raise TaskError(f"the job {job.state.value}: {job.reason or 'no reason was kept'}")
+        raise TaskError(f"the job {job.state.value}: {job.reason or 'no reason recorded'}")
     top = client.grasps(GraspQuery(job=job.id, valid=True), limit=10).items
     folder = out / "shards"
     folder.mkdir(exist_ok=True)

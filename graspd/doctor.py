@@ -32,16 +32,14 @@ _COLOURS: Final = {
 @app.command(epilog="graspd doctor --only redis,store,clocks")
 @reporting_errors
 def doctor(
-    only: Annotated[str | None, typer.Option(help="Checks to run, with commas between; default: all.")] = None,
-    full: Annotated[
-        bool, typer.Option("--full", help="Compare all of the index with the store, not a sample.")
-    ] = False,
-    data_dir: Annotated[Path | None, typer.Option(help="Folder of everything graspd keeps; GRASPD_DATA_DIR.")] = None,
+    only: Annotated[str | None, typer.Option(help="Checks to run, separated by commas; default: all.")] = None,
+    full: Annotated[bool, typer.Option("--full", help="Compare the whole index with the store, not a sample.")] = False,
+    data_dir: Annotated[Path | None, typer.Option(help="Data folder of graspd; GRASPD_DATA_DIR.")] = None,
     json: JsonFlag = False,
 ) -> None:
-    """Check disk, clocks, versions, Redis, store, index, GPU, kernels and ports; suggest fixes.
+    """Check disk, clocks, versions, Redis, store, index, GPU, kernels and ports, and suggest fixes.
 
-    Changes nothing, and may run beside the service. Exit code 1: something needs a fix.
+    Changes nothing, and may run next to the service. Exit code 1: something needs a fix.
     """
     settings = load_settings(data_dir=data_dir)
     logging.basicConfig(level=logging.ERROR)

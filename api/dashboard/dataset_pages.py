@@ -200,13 +200,11 @@ def _did(request: Request) -> str:
     if given.get("did") not in _DONE or not done.isdigit() or not left.isdigit():
         return ""
     if given["did"] == "snapshot":
-        return "The snapshot is taken; it lists every shard of now."
+        return "The snapshot is taken; it lists all present shards."
     what = "job" if done == "1" else "jobs"
     words = f"{done} {what} {_DONE[given['did']]}"
     return (
-        words
-        + (f"; {left} left as they are: of another key, or in a state that has no use for it" if left != "0" else "")
-        + "."
+        words + (f"; {left} unchanged: owned by another key, or not in a suitable state" if left != "0" else "") + "."
     )
 
 

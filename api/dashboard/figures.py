@@ -98,9 +98,7 @@ def minutes(values: Sequence[int], start: float, *, step_s: int = 60) -> Plot:
         "unit": "/min",
         "log": False,
     }
-    return Plot(
-        f"Valid grasps in each minute of the last hour; at most {max(values, default=0)}", points, json.dumps(data)
-    )
+    return Plot(f"Valid grasps per minute in the last hour; maximum {max(values, default=0)}", points, json.dumps(data))
 
 
 def bars(histogram: Histogram, path: str, where: dict[str, str]) -> list[Bar]:

@@ -28,14 +28,14 @@ _CHECK_WAIT_S: Final = 15.0
 UNITS: Final = (("m", "metres"), ("mm", "millimetres"), ("cm", "centimetres"), ("in", "inches"))
 #: Text of a button, by the option that it sets.
 _FIXES: Final = {
-    "keep_largest": "Keep the largest part alone",
-    "compound": "Take the parts as one rigid body",
-    "allow_open": "Take it as it is, open",
+    "keep_largest": "Keep only the largest part",
+    "compound": "Treat the parts as one rigid body",
+    "allow_open": "Accept the open mesh",
 }
 #: Options with a value from the user: label of the field, its attributes, text of the button.
 _ASKED: Final = {
-    "scale_to": ("Longest side [mm]", 'type="number" min="1" max="3000" step="any"', "Scale it to this size"),
-    "root": ("Link", 'type="text" maxlength="200"', "Begin the hand there"),
+    "scale_to": ("Longest side [mm]", 'type="number" min="1" max="3000" step="any"', "Scale to this size"),
+    "root": ("Link", 'type="text" maxlength="200"', "Use as root link"),
 }
 #: Form field of each kind's file.
 FILE_FIELDS: Final = {AssetKind.HAND: "hand_file", AssetKind.OBJECT: "file"}
@@ -96,7 +96,7 @@ def chosen(request: Request, assets: Assets, fields: FormData, kind: AssetKind) 
             return _checked(assets, _again(assets, kind, held, fields))
         except InputError as error:
             return AssetChoice(refused=Refusal(str(error)), file=held, held=held)
-    return AssetChoice(refused=Refusal(f"choose a known {kind.value}, or a file"))
+    return AssetChoice(refused=Refusal(f"select a known {kind.value}, or a file"))
 
 
 def refusal_of(asset: AssetView) -> Refusal:
@@ -107,7 +107,7 @@ def refusal_of(asset: AssetView) -> Refusal:
     facts = asset.facts
     lengths = facts.get("lengths_m")
     units = [
-        Fix(json.dumps({"units": unit}), f"Read it as {words}" + _length(lengths, unit))
+        Fix(json.dumps({"units": unit}), f"Read in {words}" + _length(lengths, unit))
         for unit in _entries(facts, "units_suggested")
         if isinstance(unit, str) and (words := dict(UNITS).get(unit))
     ]
@@ -115,7 +115,7 @@ def refusal_of(asset: AssetView) -> Refusal:
         fix for one in _entries(facts, "options_suggested") if isinstance(one, dict) and (fix := _fix(one)) is not None
     ]
     problem = facts.get("problem")
-    return Refusal(str(problem or asset.message or "it was refused"), (*units, *others))
+    return Refusal(str(problem or asset.message or "refused"), (*units, *others))
 
 
 def _entries(facts: Mapping[str, Any], key: str) -> list[Any]:
@@ -137,7 +137,7 @@ def _fix(options: dict[str, Any]) -> Fix | None:
     if key in _FIXES:
         words = _FIXES[key]
     elif key == "root":
-        words = f"Begin the hand at {value}"
+        words = f"Use {value} as root link"
     elif key == "fix" and isinstance(value, dict):
         words = "Fix " + ", ".join(f"{joint} at {at}" for joint, at in value.items())
     else:
@@ -180,7 +180,7 @@ def pressed(fields: FormData, kind: AssetKind) -> dict[str, Any]:
         except ValueError:
             raise InputError(f"{label}: {given[:20]!r} is no number") from None
         if not given:
-            raise InputError(f"{label}: fill it in first")
+            raise InputError(f"{label}: a value is missing")
     return said
 
 
@@ -199,9 +199,9 @@ def choices(assets: Assets, kind: AssetKind, shown: str, one: AssetChoice) -> li
     """Return the names to choose from, always including the one that the form shows."""
     known = asset_choices(assets, kind)
     if one.refused:
-        return [("", f"your file {one.file} (refused)" if one.file else f"choose a {kind.value}"), *known]
+        return [("", f"your file {one.file} (refused)" if one.file else f"select a {kind.value}"), *known]
     if shown not in dict(known):
-        return [(shown, f"{shown} (not known here)" if shown else f"choose a {kind.value}"), *known]
+        return [(shown, f"{shown} (unknown)" if shown else f"select a {kind.value}"), *known]
     return known
 
 

@@ -194,9 +194,9 @@ def _form(
 #: Cache time [s]: costs of batches change slowly, and reading two thousand takes as long as a page may.
 KEPT_S: Final = 60.0
 WORDS: Final = {
-    "draft": "Fewest points and starts. For a first look.",
-    "standard": "The balance that the docs measure.",
-    "fine": "More starts, more points. Contacts that hold up.",
+    "draft": "Fewest points and starts, for a first look.",
+    "standard": "Balance of speed and accuracy; default.",
+    "fine": "More points and starts, more accurate contacts.",
 }
 
 

@@ -83,7 +83,7 @@ def grasps_page(
         problem=problem,
         did=said,
         **choice_of(tags, rows, known, given),
-        all_said="all that pass this filter" if set(given) - {"sort", "order"} else "all grasps there are",
+        all_said="all that match the filters" if set(given) - {"sort", "order"} else "all grasps",
         here="/grasps",
         shown_tag=next((tag for tag in known if tag.name == query.tag), None),
         tag_choices=[(tag.name, tag.name) for tag in known],
@@ -178,8 +178,8 @@ _PAGES: Final = re.compile(r"/grasps(/[0-9a-f]{32}/[0-9]{1,10})?|/jobs/[0-9a-f]{
 _NAME: Final[TypeAdapter[str]] = TypeAdapter(TagName)
 _FORMAT: Final[TypeAdapter[Format]] = TypeAdapter(Format)
 _DONE: Final = {
-    "tagged": "{done} {grasps} given the tag {tag}.",
-    "untagged": "The tag {tag} taken off {done} {grasps}.",
+    "tagged": "{done} {grasps} tagged {tag}.",
+    "untagged": "Tag {tag} removed from {done} {grasps}.",
 }
 T = TypeVar("T")
 
@@ -242,7 +242,7 @@ def _selection(fields: FormData) -> Selection:
             return Selection(filter=GraspQuery.model_validate(dict(_filter(fields))))
         places = [str(one).partition(":") for one in fields.getlist("grasp")]
         if not places:
-            raise InputError("no grasp is chosen; tick some, or all that pass the filter")
+            raise InputError("no grasp is selected; select some, or all that match the filters")
         grasps = [{"shard_id": shard, "row": row} for shard, _, row in places]
         return Selection(grasps=TypeAdapter(list[GraspName]).validate_python(grasps))
     except ValidationError as error:

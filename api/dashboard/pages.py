@@ -68,13 +68,13 @@ def problem_types(request: Request, slug: str = "") -> HTMLResponse:
 
 
 _HTTP_PROBLEMS: Final = {
-    "bad-request": (400, "The body or the form cannot be read at all."),
-    "unauthorized": (401, "A live key is needed."),
-    "forbidden": (403, "The key's scope is too small, or the request comes from a foreign web page."),
-    "method-not-allowed": (405, "This address does not take this method."),
-    "unsupported-media-type": (415, "The body is compressed or otherwise encoded; only plain bodies are read."),
-    "range-not-satisfiable": (416, "The range of bytes lies behind the end of the file."),
-    "misdirected-request": (421, "The service does not answer to this host name while it is open."),
+    "bad-request": (400, "The body or form cannot be read."),
+    "unauthorized": (401, "A valid key is required."),
+    "forbidden": (403, "The scope of the key is insufficient, or the request comes from a foreign web page."),
+    "method-not-allowed": (405, "The address does not support this method."),
+    "unsupported-media-type": (415, "The body is compressed or otherwise encoded; only plain bodies are accepted."),
+    "range-not-satisfiable": (416, "The byte range starts after the end of the file."),
+    "misdirected-request": (421, "The service does not accept this host name while it has no keys."),
 }
 
 
@@ -99,9 +99,7 @@ def login(request: Request, key: Annotated[str, Form(max_length=200)]) -> HTMLRe
     keys: KeyFile = request.app.state.keys
     found = keys.find(key.strip())
     if found is None:
-        return render(
-            request, "login.html", session="", problem="No live key is like this one.", health=None, status=401
-        )
+        return render(request, "login.html", session="", problem="The key is not valid.", health=None, status=401)
     response = RedirectResponse("/", status_code=303)
     response.set_cookie(
         SESSION_COOKIE,

@@ -45,15 +45,15 @@ FREE: Final[dict[str, Axis]] = {
     "gsr": Axis("Success in MuJoCo"),
     "dexgraspbench": Axis("Success under the DexGraspBench protocol"),
     "hard": Axis("Success at half the friction"),
-    "robust": Axis("Robust share of those that hold"),
+    "robust": Axis("Robust share of held grasps"),
     "epsilon": Axis("ε", "", factor=1.0),
     "pd_mm": Axis("Penetration", "mm", more_is_better=False, factor=1.0),
 }
 IN_SCENES: Final[dict[str, Axis]] = {
-    "lift": Axis("Lifted, of all candidates"),
+    "lift": Axis("Lifted share of candidates"),
     "lift_dexgraspbench": Axis("Lifted under the DexGraspBench protocol"),
     "lift_hard": Axis("Lifted at half the friction"),
-    "robust": Axis("Robust share of those lifted"),
+    "robust": Axis("Robust share of lifted grasps"),
 }
 
 

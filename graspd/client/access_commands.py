@@ -19,24 +19,24 @@ keys_app = typer.Typer(no_args_is_help=True, help="Make, list, rotate, limit and
 
 _UNITS: Final = {"s": "seconds", "m": "minutes", "h": "hours", "d": "days"}
 
-NameArgument = Annotated[str, typer.Argument(help="Whose key it is.")]
+NameArgument = Annotated[str, typer.Argument(help="Name of the key.")]
 ProjectOption = Annotated[
-    str, typer.Option(help="Project that it belongs to; keys of other projects see nothing of it.", metavar="NAME")
+    str, typer.Option(help="Project of the key; keys of other projects cannot see its resources.", metavar="NAME")
 ]
 LifetimeOption = Annotated[
-    str | None, typer.Option("--expires", help="How long it lives: 90d, 12h; default: for ever.")
+    str | None, typer.Option("--expires", help="Lifetime, such as 90d or 12h; default: unlimited.")
 ]
-RequestsOption = Annotated[int | None, typer.Option(min=0, help="Requests a minute; 0: no limit.")]
-ConcurrencyOption = Annotated[int | None, typer.Option(min=0, help="Requests answered at once; 0: no limit.")]
+RequestsOption = Annotated[int | None, typer.Option(min=0, help="Requests per minute; 0: no limit.")]
+ConcurrencyOption = Annotated[int | None, typer.Option(min=0, help="Concurrent requests; 0: no limit.")]
 GraspsOption = Annotated[int | None, typer.Option(min=0, help="Grasps in unfinished jobs; 0: no limit.")]
-JobsOption = Annotated[int | None, typer.Option(min=0, help="New jobs a day (UTC); 0: no limit.")]
+JobsOption = Annotated[int | None, typer.Option(min=0, help="New jobs per day (UTC); 0: no limit.")]
 
 
 @keys_app.command("add", epilog="graspd keys add alice --scope submit --expires 90d --grasps-in-flight 100000")
 @reporting_errors
 def add_key(
     name: NameArgument,
-    scope: Annotated[Scope, typer.Option(help="What it may do.")] = Scope.SUBMIT,
+    scope: Annotated[Scope, typer.Option(help="Scope of the key.")] = Scope.SUBMIT,
     project: ProjectOption = "",
     expires: LifetimeOption = None,
     requests_per_minute: RequestsOption = None,
@@ -45,7 +45,7 @@ def add_key(
     jobs_per_day: JobsOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """Make a key and show it once. Limits that are not given are those of the settings."""
+    """Make a key and show it once. Limits default to those of the settings."""
     limits = _limits(requests_per_minute, concurrency, grasps_in_flight, jobs_per_day)
     lifetime = duration(expires) if expires else None
     token = _key_file().add(name, scope, lifetime=lifetime, limits=limits, project=project)
@@ -56,11 +56,13 @@ def add_key(
 @reporting_errors
 def rotate_key(
     name: NameArgument,
-    grace: Annotated[str, typer.Option(help="How long the old secret still opens: 24h, 7d; 0s: not at all.")] = "0s",
+    grace: Annotated[
+        str, typer.Option(help="Time for which the old secret remains valid, such as 24h or 7d; 0s: none.")
+    ] = "0s",
     expires: LifetimeOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """Give a key a new secret and show it once. Scope and limits stay."""
+    """Replace the secret of a key and show it once. Scope and limits remain."""
     keys = _key_file()
     token = keys.rotate(name, grace=duration(grace), lifetime=duration(expires) if expires else None)
     _show_token(name, next(key.scope for key in reversed(keys.list()) if key.name == name), token, json=json)
@@ -102,7 +104,7 @@ def list_keys(json: JsonFlag = False) -> None:
         of = [key.project or "-"] if has_projects else []
         times = minute(key.created), minute(key.expires)
         table.add_row(key.name, key.scope, *of, _state(key), *times, _key_limits(key.limits))
-    plain_console().print(table if found else "no key; the service is open and answers on this machine only")
+    plain_console().print(table if found else "no key; the service is open, but only to this machine")
 
 
 @keys_app.command("revoke", epilog="graspd keys revoke alice")
@@ -157,7 +159,7 @@ def _key_file() -> KeyFile:
     return KeyFile(load_settings().resolved_keys_file)
 
 
-projects_app = typer.Typer(no_args_is_help=True, help="List projects of keys, and limit what each may use.")
+projects_app = typer.Typer(no_args_is_help=True, help="List projects of keys and set their limits.")
 
 
 @projects_app.command("list", epilog="graspd projects list --json")
@@ -179,7 +181,7 @@ def list_projects(json: JsonFlag = False) -> None:
         return
     table = plain_table("project", "keys", "limits")
     for name, limits in found.items():
-        table.add_row(name, ", ".join(live.get(name, [])) or "none that opens", _project_limits(limits))
+        table.add_row(name, ", ".join(live.get(name, [])) or "no valid key", _project_limits(limits))
     plain_console().print(table if found else "no project yet; `graspd keys add NAME --project PROJECT` makes one")
 
 
@@ -188,11 +190,12 @@ def list_projects(json: JsonFlag = False) -> None:
 )
 @reporting_errors
 def limit_project(
-    name: Annotated[str, typer.Argument(help="The project.")],
+    name: Annotated[str, typer.Argument(help="Name of the project.")],
     grasps_in_flight: Annotated[int | None, typer.Option(min=0, help="Grasps in unfinished jobs; 0: no limit.")] = None,
-    grasps_per_day: Annotated[int | None, typer.Option(min=0, help="Grasps asked for a day; 0: no limit.")] = None,
+    grasps_per_day: Annotated[int | None, typer.Option(min=0, help="Requested grasps per day; 0: no limit.")] = None,
     gpu_seconds_per_day: Annotated[
-        int | None, typer.Option(min=0, help="Seconds of GPU workers a day (UTC), then no new job; 0: no limit.")
+        int | None,
+        typer.Option(min=0, help="GPU seconds per day (UTC), after which new jobs are refused; 0: no limit."),
     ] = None,
     json: JsonFlag = False,
 ) -> None:
@@ -217,20 +220,24 @@ def _project_limits(limits: ProjectLimits) -> str:
     return ", ".join(f"{value} {name.replace('_', ' ')}" for name, value in found.items()) or "none"
 
 
-webhooks_app = typer.Typer(no_args_is_help=True, help="Addresses that are told when jobs and datasets end.")
+webhooks_app = typer.Typer(
+    no_args_is_help=True, help="Webhooks that receive a notification when jobs and datasets end."
+)
 
-IdArgument = Annotated[str, typer.Argument(metavar="ID", help="Of the webhook: `graspd webhooks list`.")]
+IdArgument = Annotated[str, typer.Argument(metavar="ID", help="Id of the webhook, from `graspd webhooks list`.")]
 
 
 @webhooks_app.command("add", epilog="graspd webhooks add https://ci.example.org/graspd --on succeeded,failed")
 @reporting_errors
 def add_webhook(
-    address: Annotated[str, typer.Argument(help="Where to POST: https://host/path.")],
-    on: Annotated[str, typer.Option(help="Ends to tell, with commas.")] = "succeeded,failed,cancelled",
+    address: Annotated[str, typer.Argument(help="URL that receives the POST requests: https://host/path.")],
+    on: Annotated[
+        str, typer.Option(help="End states to notify of, separated by commas.")
+    ] = "succeeded,failed,cancelled",
     url: UrlOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """Notify an address when jobs and datasets end; show the secret that signs the notifications once."""
+    """Notify a URL when jobs and datasets end. The secret that signs notifications is shown once."""
     states = [one.strip() for one in on.split(",") if one.strip()]
     with open_client(url) as client:
         made = client.send("POST", "/v1/webhooks", json={"url": address, "states": states}).json()
@@ -270,7 +277,7 @@ def show_log(webhook: IdArgument, url: UrlOption = None, json: JsonFlag = False)
         what = f"{one['kind']} {one['subject'][:12] if one['kind'] == 'job' else one['subject']}"
         tried = (str(one["attempts"]), minute(one["tried"]))
         table.add_row(what, one["ended"], one["state"], *tried, one["detail"])
-    plain_console().print(table if found else "nothing was to be told yet")
+    plain_console().print(table if found else "no delivery yet")
 
 
 @webhooks_app.command("delete", epilog="graspd webhooks delete 1a2b3c")

@@ -38,9 +38,9 @@ from graspd.service.store.hand_files import SUFFIXES, files_of_hand, hand_name
 from graspd.service.store.object_sets import SUFFIXES as MESHES
 from graspd.service.store.object_sets import Objects, files_of_set
 
-NameOption = Annotated[str | None, typer.Option("--name", help="Name to give it; default: the file's.")]
-SharedOption = Annotated[bool, typer.Option("--shared", help="Let every project use it, not only that of the key.")]
-WaitOption = Annotated[bool, typer.Option("--wait/--no-wait", help="Wait until a worker has checked it.")]
+NameOption = Annotated[str | None, typer.Option("--name", help="Name of the asset; default: the file's name.")]
+SharedOption = Annotated[bool, typer.Option("--shared", help="Share it with all projects, not only the key's project.")]
+WaitOption = Annotated[bool, typer.Option("--wait/--no-wait", help="Wait for the check by a worker.")]
 #: Longest wait for a check, without and with a self-test [s].
 _CHECK_S: Final = 120.0
 _SELF_TEST_S: Final = 900.0
@@ -49,14 +49,14 @@ _SELF_TEST_S: Final = 900.0
 @with_options(HandWords, "asset")
 @reporting_errors
 def add_hand(
-    file: Annotated[Path, typer.Argument(help="A URDF, xacro or MJCF, with its meshes; its folder; or a ZIP of that.")],
+    file: Annotated[Path, typer.Argument(help="URDF, xacro or MJCF file with its meshes, its folder, or a ZIP of it.")],
     name: NameOption = None,
     *,
     options: dict[str, Any],
     licence: LicenceOption = None,
     source: SourceOption = None,
     self_test: Annotated[
-        bool, typer.Option("--self-test/--no-self-test", help="Record what it holds and lifts of plain objects.")
+        bool, typer.Option("--self-test/--no-self-test", help="Run the self-test: hold and lift plain objects.")
     ] = True,
     shared: SharedOption = False,
     wait: WaitOption = True,
@@ -73,7 +73,7 @@ def add_hand(
 @with_options(SweptOptions, "asset")
 @reporting_errors
 def add_object(
-    file: Annotated[Path, typer.Argument(help="A mesh, or a ZIP with one; or a folder or ZIP of many objects.")],
+    file: Annotated[Path, typer.Argument(help="Mesh, ZIP with one mesh, or folder or ZIP of many objects.")],
     name: NameOption = None,
     *,
     options: dict[str, Any],
@@ -99,7 +99,7 @@ def add_object(
 
 @reporting_errors
 def add_network(
-    file: Annotated[Path, typer.Argument(help="An .npz of the schema graspd/proposals@1.")],
+    file: Annotated[Path, typer.Argument(help="NPZ file of the schema graspd/proposals@1.")],
     name: NameOption = None,
     licence: LicenceOption = None,
     source: SourceOption = None,
@@ -107,7 +107,7 @@ def add_network(
     url: UrlOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """Upload a network that proposes grasps of a hand: jobs with `--method learned` start from them."""
+    """Upload a network that proposes grasps of a hand, as starts of jobs with `--method learned`."""
     _add(AssetKind.NETWORK, file, name, provenance(licence, source), shared=shared, wait=False, url=url, json=json)
 
 

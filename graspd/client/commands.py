@@ -35,7 +35,7 @@ from graspd.service.store.asset_summary import hand_line, self_test_line
 
 app = typer.Typer(no_args_is_help=True)
 
-JobArgument = Annotated[str, typer.Argument(help="Job id, or the beginning of one.")]
+JobArgument = Annotated[str, typer.Argument(help="Job id, or a prefix of it.")]
 
 
 @app.command(epilog="graspd submit --hand allegro --object mug.stl --grasps 320 --scenes 2 --views 3 --wait")
@@ -71,7 +71,7 @@ def submit(
 @reporting_errors
 def jobs(
     state: Annotated[State | None, typer.Option(help="Only jobs in this state.")] = None,
-    limit: Annotated[int, typer.Option(min=1, max=200, help="At most this many.")] = 20,
+    limit: Annotated[int, typer.Option(min=1, max=200, help="Maximum number of jobs.")] = 20,
     url: UrlOption = None,
     json: JsonFlag = False,
 ) -> None:
@@ -110,7 +110,7 @@ def cancel(job_id: JobArgument, url: UrlOption = None, json: JsonFlag = False) -
 @app.command(epilog="graspd delete 3f2a")
 @reporting_errors
 def delete(job_id: JobArgument, yes: YesOption = False, url: UrlOption = None, json: JsonFlag = False) -> None:
-    """Delete an ended job; its shards follow after a grace time, unless another job needs them."""
+    """Delete an ended job. After a grace time its shards are deleted, unless another job uses them."""
     with open_client(url) as client:
         job = client.job(_full_id(client, job_id))
         asked = f"Delete job {job.id[:12]}, {job.hand} on {job.object}, with its {count(job.grasps)} grasps?"
@@ -122,7 +122,7 @@ def delete(job_id: JobArgument, yes: YesOption = False, url: UrlOption = None, j
 @app.command("restore", epilog="graspd restore 3f2a")
 @reporting_errors
 def restore_job(
-    job_id: Annotated[str, typer.Argument(help="Id of a deleted job, or the beginning of one.")],
+    job_id: Annotated[str, typer.Argument(help="Id of a deleted job, or a prefix of it.")],
     url: UrlOption = None,
     json: JsonFlag = False,
 ) -> None:
@@ -140,7 +140,7 @@ def retry(
     url: UrlOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """Run failed and cancelled tasks of a job again; results are not made twice."""
+    """Run failed and cancelled tasks of a job again; existing results are reused."""
     with open_client(url) as client:
         job = client.retry(_full_id(client, job_id))
         if wait:
@@ -151,7 +151,7 @@ def retry(
 @app.command(epilog="graspd logs 3f2a")
 @reporting_errors
 def logs(job_id: JobArgument, url: UrlOption = None, json: JsonFlag = False) -> None:
-    """Show failed attempts of a job, with their reasons."""
+    """Show failed attempts of a job with their reasons."""
     with open_client(url) as client:
         job = client.job(_full_id(client, job_id))
     if json:
@@ -172,14 +172,14 @@ def asset_commands(kind: AssetKind) -> typer.Typer:
     verbs = "Add, list, show and delete" if kind is AssetKind.NETWORK else "Check, add, list, show and delete"
     group = typer.Typer(no_args_is_help=True, help=f"{verbs} {kind.value}s.")
 
-    @group.command("list")
+    @group.command("list", help=f"List {kind.value}s, by default without refused ones.")
     @reporting_errors
     def list_assets(
-        refused: Annotated[bool, typer.Option("--refused", help="Also those that the check refused.")] = False,
+        refused: Annotated[bool, typer.Option("--refused", help="Include refused ones.")] = False,
         url: UrlOption = None,
         json: JsonFlag = False,
     ) -> None:
-        """List all of them."""
+        """List all, by default without refused ones."""
         with open_client(url) as client:
             assets = list(client.assets(kind, refused=refused))
         if json:
@@ -196,37 +196,45 @@ def asset_commands(kind: AssetKind) -> typer.Typer:
             table.add_row(asset.name, named, size(asset.size_bytes), origin, asset.digest[:12])
         plain_console().print(table)
 
-    @group.command("show")
+    @group.command("show", help=f"Show a {kind.value} with the findings of its check.")
     @reporting_errors
     def show(
-        name: Annotated[str, typer.Argument(help="Its name.")],
+        name: Annotated[str, typer.Argument(help="Name of the asset.")],
         url: UrlOption = None,
         json: JsonFlag = False,
     ) -> None:
-        """Show one of them, with the findings of its check."""
+        """Show one with the findings of its check."""
         with open_client(url) as client:
             asset = client.asset(kind, name)
         show_asset(asset.model_dump(mode="json"), json=json)
 
-    @group.command("delete", epilog=f"graspd {kind.value}s delete my_{kind.value}")
+    @group.command(
+        "delete",
+        help=f"Delete a {kind.value} that no job, dataset or set of objects uses.",
+        epilog=f"graspd {kind.value}s delete my_{kind.value}",
+    )
     @reporting_errors
     def delete_asset(
-        name: Annotated[str, typer.Argument(help="Its name or digest.")],
+        name: Annotated[str, typer.Argument(help="Name or digest of the asset.")],
         yes: YesOption = False,
         url: UrlOption = None,
         json: JsonFlag = False,
     ) -> None:
-        """Delete one that no job, dataset or set of objects needs."""
+        """Delete one that no job, dataset or set of objects uses."""
         with open_client(url) as client:
             client.asset(kind, name)
             confirm(f"Delete the {kind.value} {name}?", f"the {kind.value} {name}", yes=yes)
             client.delete(path_of(f"{kind.value}s", name))
         say_deleted(kind.value, name, json=json, undo=f"graspd {kind.value}s restore {name}")
 
-    @group.command("restore", epilog=f"graspd {kind.value}s restore my_{kind.value}")
+    @group.command(
+        "restore",
+        help=f"Restore a deleted {kind.value} within the grace time.",
+        epilog=f"graspd {kind.value}s restore my_{kind.value}",
+    )
     @reporting_errors
     def restore_asset(
-        name: Annotated[str, typer.Argument(help="Its name or digest.")],
+        name: Annotated[str, typer.Argument(help="Name or digest of the asset.")],
         url: UrlOption = None,
         json: JsonFlag = False,
     ) -> None:

@@ -38,7 +38,7 @@ from graspd.service.pipeline.datasets.spec import DatasetRequest, Matrix
 from graspd.service.store.object_sets import Objects, files_of_set
 
 app = typer.Typer(no_args_is_help=True)
-group = typer.Typer(no_args_is_help=True, help="Hands x objects as one dataset: cost, status, snapshots, files.")
+group = typer.Typer(no_args_is_help=True, help="Datasets of hands x objects: cost, status, snapshots, files.")
 app.add_typer(group, name="datasets")
 
 NameArgument = Annotated[str, typer.Argument(help="Name of the dataset.")]
@@ -54,23 +54,23 @@ WaitOption = Annotated[bool, typer.Option("--wait", help="Show progress until th
 @with_options(JobOptions, "job")
 @reporting_errors
 def create(
-    name: Annotated[str | None, typer.Argument(help="Name of the dataset; a spec may say it.")] = None,
+    name: Annotated[str | None, typer.Argument(help="Name of the dataset; default: the name in the spec.")] = None,
     hands: HandsOption = None,
     objects: ObjectsOption = None,
     spec: SpecOption = None,
-    yes: Annotated[bool, typer.Option("--yes", "-y", help="Start without asking.")] = False,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what it would cost, and stop.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", "-y", help="Start without confirmation.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the estimated cost and exit.")] = False,
     wait: WaitOption = False,
     url: UrlOption = None,
     json: JsonFlag = False,
     *,
     options: dict[str, Any],
 ) -> None:
-    """Make a dataset: a job for each hand and object. The same command again continues it."""
+    """Make a dataset with a job for each hand and object. The same command continues it later."""
     console = plain_console(stderr=json)
     asked = wanted(spec, name=name, hands=hands, objects=objects, options=options)
     if not asked.name:
-        raise InputError("say a name: graspd datasets create NAME, or name in the file of --spec")
+        raise InputError("give a name: graspd datasets create NAME, or name in the file of --spec")
     with open_client(url) as client:
         files, matrix = _matrix(client, asked)
         request = parsed_options(DatasetRequest, {"name": asked.name, **matrix})
@@ -92,7 +92,7 @@ def create(
     _emit(json, estimate=found, dataset=dataset, refused=refused)
     if not json:
         if refused:
-            console.print(f"left out, because refused: {', '.join(refused)}", soft_wrap=True)
+            console.print(f"excluded, because refused: {', '.join(refused)}", soft_wrap=True)
         print_dataset(dataset, console)
         console.print(f"`graspd datasets status {asked.name}` shows each cell", style="dim")
     _must_succeed(dataset, asked=wait)
@@ -124,7 +124,7 @@ def estimate(
 @group.command("list", epilog="graspd datasets list")
 @reporting_errors
 def list_datasets(
-    limit: Annotated[int, typer.Option(min=1, max=200, help="At most this many.")] = 20,
+    limit: Annotated[int, typer.Option(min=1, max=200, help="Maximum number of datasets.")] = 20,
     url: UrlOption = None,
     json: JsonFlag = False,
 ) -> None:
@@ -185,7 +185,7 @@ def delete(
     name: NameArgument,
     yes: YesOption = False,
     with_snapshots: Annotated[
-        bool, typer.Option("--with-snapshots", help="Its snapshots may go too; else they protect it.")
+        bool, typer.Option("--with-snapshots", help="Delete its snapshots too; otherwise they prevent the deletion.")
     ] = False,
     url: UrlOption = None,
     json: JsonFlag = False,
@@ -210,7 +210,7 @@ def restore_dataset(name: NameArgument, url: UrlOption = None, json: JsonFlag = 
 @group.command(epilog="graspd datasets retry kitchen --wait")
 @reporting_errors
 def retry(name: NameArgument, wait: WaitOption = False, url: UrlOption = None, json: JsonFlag = False) -> None:
-    """Restart failed and cancelled jobs; results are not made twice."""
+    """Restart failed and cancelled jobs; existing results are reused."""
     with open_client(url) as client:
         dataset = client.retry_dataset(name)
         if wait:
@@ -239,9 +239,9 @@ def snapshot(name: NameArgument, url: UrlOption = None, json: JsonFlag = False) 
 @reporting_errors
 def export(
     name: NameArgument,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write; an earlier export there is gone on with.")],
-    snapshot: Annotated[str | None, typer.Option(help="Digest of a snapshot; default: what there is now.")] = None,
-    format: Annotated[str, typer.Option(help=f"{', '.join(FORMATS)}.")] = "shards",
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write; an interrupted export is continued.")],
+    snapshot: Annotated[str | None, typer.Option(help="Digest of a snapshot; default: all present shards.")] = None,
+    format: Annotated[str, typer.Option(help=f"Format: {', '.join(FORMATS)}.")] = "shards",
     url: UrlOption = None,
     json: JsonFlag = False,
 ) -> None:
@@ -313,14 +313,14 @@ def _upload(client: Client, files: Objects, set_name: str, console: Console) -> 
     told = upload_set(client, files, say=lambda line: console.print(line, soft_wrap=True))
     taken = [one["name"] for one in told if one["verdict"] != "refuse"]
     if not taken:
-        raise InputError(f"none of the {len(told)} objects can be used; see above why")
+        raise InputError(f"none of the {len(told)} objects can be used; reasons are above")
     client.add_object_set(set_name, taken)
     return [one["name"] for one in told if one["verdict"] == "refuse"]
 
 
 def _confirmed() -> bool:
     if not sys.stdin.isatty():
-        raise InputError("say --yes to start it, or --dry-run to see only what it would cost")
+        raise InputError("give --yes to start it, or --dry-run for the cost alone")
     return typer.confirm("Start it?")
 
 

@@ -20,7 +20,7 @@ from graspd.service.model.options import accepted
 from graspd.service.model.scene_spec import known_name, scene_option
 
 SpecOption = Annotated[
-    Path | None, typer.Option("--spec", help="TOML or JSON file that says it; options go over what it says.")
+    Path | None, typer.Option("--spec", help="TOML or JSON file of the dataset; options take precedence.")
 ]
 
 
@@ -31,15 +31,15 @@ class Spec(JobOptions):
 
     name: Name | None = None
     hands: tuple[Name, ...] = ()
-    objects: str | tuple[str, ...] = Field((), description="as `--objects`; a folder is looked for beside the spec")
+    objects: str | tuple[str, ...] = Field((), description="as `--objects`; folders are relative to the spec")
     total_grasps: int | None = Field(
-        None, ge=1, description="grasps over all hands and objects, shared evenly, in the place of `grasps`"
+        None, ge=1, description="grasps over all hands and objects, shared evenly; replaces `grasps`"
     )
 
     @model_validator(mode="after")
     def _one_number(self) -> Spec:
         if self.total_grasps is not None and "grasps" in self.model_fields_set:
-            raise ValueError("total_grasps stands in the place of grasps: say one of them")
+            raise ValueError("total_grasps replaces grasps: give one of them")
         return self
 
 
@@ -90,7 +90,7 @@ def wanted(
     found_objects = objects or _objects(spec, said.get("objects", ()))
     for what, found in (("hands", found_hands), ("objects", found_objects)):
         if not found:
-            raise InputError(f"say which {what}: --{what}, or {what} in the file of --spec")
+            raise InputError(f"give the {what}: --{what}, or {what} in the file of --spec")
     rest = {key: value for key, value in said.items() if key not in ("name", "hands", "objects")}
     return PlanRequest(found_name, found_hands, found_objects, {**rest, **given}, total)
 

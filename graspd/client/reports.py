@@ -30,7 +30,7 @@ from graspd.service.store.asset_summary import summary
 
 UrlOption = Annotated[
     str | None,
-    typer.Option("--url", help="Where the API answers; default GRASPD_API_URL, or the service of the data folder."),
+    typer.Option("--url", help="URL of the API; default: GRASPD_API_URL, or the service of the data folder."),
 ]
 
 
@@ -46,7 +46,7 @@ def open_client(url: str | None, *, key: str | None = None) -> Client:
     return Client(url or settings.api_url, key=key)
 
 
-YesOption = Annotated[bool, typer.Option("--yes", "-y", help="Delete it without asking.")]
+YesOption = Annotated[bool, typer.Option("--yes", "-y", help="Delete without confirmation.")]
 
 
 def confirm(question: str, what: str, *, yes: bool) -> None:
@@ -54,7 +54,7 @@ def confirm(question: str, what: str, *, yes: bool) -> None:
     if yes:
         return
     if not sys.stdin.isatty():
-        raise InputError(f"{what} is not deleted: there is no terminal to ask at; --yes deletes it without asking")
+        raise InputError(f"{what} is not deleted: there is no terminal for the confirmation; --yes deletes without it")
     if not typer.confirm(question):
         raise InputError("nothing was deleted")
 
@@ -66,7 +66,7 @@ def say_deleted(what: str, name: str, *, json: bool, undo: str = "") -> None:
         return
     typer.echo(f"{what} {name} is deleted")
     if undo:
-        typer.echo(f"`{undo}` brings it back for a while (GRASPD_SHARD_GRACE_S)", err=True)
+        typer.echo(f"`{undo}` restores it within the grace time (GRASPD_SHARD_GRACE_S)", err=True)
 
 
 def restore(url: str | None, what: str, name: str, *, json: bool) -> None:
@@ -148,7 +148,7 @@ def yield_of(job: JobDetail) -> str:
     """Format the valid grasps per candidate, and the result of the recheck, in one line."""
     level = job.request.validation
     if level == "none":
-        return f"{count(job.grasps)} grasps kept of {count(job.candidates)} candidates; not validated"
+        return f"{count(job.grasps)} stored grasps of {count(job.candidates)} candidates; not validated"
     recheck = (
         f"; {job.recheck_held} of {job.rechecked} rechecked hold under the DexGraspBench protocol"
         if job.rechecked
@@ -316,10 +316,11 @@ def print_estimate(found: Estimate, console: Console) -> None:
     console.print(f"storage {size(found.storage_bytes)} ({kinds})")
     width = max(len(used.hand) for used in found.rates[:_SHOWN_RATES])
     for used in found.rates[:_SHOWN_RATES]:
-        each = f"no {found.counted} grasp" if used.seconds_per_valid is None else f"{metric(used.seconds_per_valid)} s"
+        seconds = None if used.seconds_per_valid is None else metric(used.seconds_per_valid)
+        each = f"no {found.counted} grasp" if seconds is None else f"{seconds} s per {found.counted} grasp"
         batches = f", {count(used.batches)} batches" if used.batches else ""
         console.print(
-            f"  {used.hand:<{width}} {each} per {found.counted} grasp, yield {percent(used.valid_yield)} "
+            f"  {used.hand:<{width}} {each}, yield {percent(used.valid_yield)} "
             f"({used.origin}{batches}) for {count(used.cells)} cells",
             soft_wrap=True,
         )
@@ -335,7 +336,7 @@ def print_dataset(dataset: DatasetView, console: Console) -> None:
     console.print(f"cells: {states}")
     candidates = f" of {count(dataset.candidates)} candidates ({_yield(dataset)})" if dataset.candidates else ""
     console.print(
-        f"grasps: {count(dataset.counted)} {dataset.options.standing}{candidates}, {count(dataset.asked)} asked for; "
+        f"grasps: {count(dataset.counted)} {dataset.options.standing}{candidates}, {count(dataset.asked)} requested; "
         f"{count(dataset.shards)} shards, {size(dataset.size_bytes)}; worker time {duration(dataset.seconds)}",
         soft_wrap=True,
     )

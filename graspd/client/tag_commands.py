@@ -14,7 +14,7 @@ from graspd.client.reports import UrlOption, YesOption, confirm, open_client, re
 from graspd.service.cli import JsonFlag, emit, plain_console, plain_table, reporting_errors
 from graspd.service.model.errors import InputError
 
-app = typer.Typer(no_args_is_help=True, help="Names for grasps of the service, to find them and take them home.")
+app = typer.Typer(no_args_is_help=True, help="Tag grasps of the service; list and export tagged ones.")
 
 #: Longest wait for the first byte while the service writes the file [s].
 _PATIENCE_S: Final = 600.0
@@ -25,16 +25,16 @@ GraspsArgument = Annotated[
     typer.Argument(metavar="[SHARD:ROW]...", help="Grasps by shard and row."),
 ]
 WhereOption = Annotated[
-    str | None, typer.Option(help="All of which this is true: epsilon > 0.3 and lift and robust >= 0.75.")
+    str | None, typer.Option(help="Grasps that satisfy an expression: epsilon > 0.3 and lift and robust >= 0.75.")
 ]
-JobOption = Annotated[str | None, typer.Option(help="Of these only those of a job.")]
-DatasetOption = Annotated[str | None, typer.Option(help="Of these only those of a dataset.")]
+JobOption = Annotated[str | None, typer.Option(help="Only grasps of this job.")]
+DatasetOption = Annotated[str | None, typer.Option(help="Only grasps of this dataset.")]
 
 
 @app.command("list", epilog="graspd tags list")
 @reporting_errors
 def list_tags(url: UrlOption = None, json: JsonFlag = False) -> None:
-    """List tags by name, with their numbers of grasps."""
+    """List tags with their numbers of grasps."""
     with open_client(url) as client:
         found = client.send("GET", "/v1/tags").json()
     if json:
@@ -43,9 +43,7 @@ def list_tags(url: UrlOption = None, json: JsonFlag = False) -> None:
     table = plain_table("tag", "grasps", "changed", whole=("grasps", "changed"))
     for one in found:
         table.add_row(one["name"], count(one["grasps"]), minute(one["changed"]))
-    plain_console().print(
-        table if found else "no tag yet; `graspd tags add TAG --where EXPRESSION` gives one to grasps"
-    )
+    plain_console().print(table if found else "no tag yet; `graspd tags add TAG --where EXPRESSION` tags grasps")
 
 
 @app.command("add", epilog='graspd tags add good --dataset kitchen --where "epsilon > 0.3 and lift"')
@@ -59,10 +57,10 @@ def add_tag(
     url: UrlOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """Give a tag to grasps; a new tag is created."""
+    """Tag grasps; a new tag is created."""
     body = {"name": tag, **_selection(grasps, where=where, job=job, dataset=dataset)}
     with open_client(url) as client:
-        _tell(client.send("POST", "/v1/tags", json=body).json(), "more with", json=json)
+        _tell(client.send("POST", "/v1/tags", json=body).json(), "tagged with", json=json)
 
 
 @app.command("remove", epilog='graspd tags remove good --where "penetration_depth_mm > 1"')
@@ -81,7 +79,7 @@ def remove_tag(
     if "filter" in body:
         body["filter"]["tag"] = tag
     with open_client(url) as client:
-        _tell(client.send("POST", path_of("tags", tag, "remove"), json=body).json(), "fewer with", json=json)
+        _tell(client.send("POST", path_of("tags", tag, "remove"), json=body).json(), "removed from", json=json)
 
 
 @app.command("delete", epilog="graspd tags delete good")
@@ -91,7 +89,7 @@ def delete_tag(tag: NameArgument, yes: YesOption = False, url: UrlOption = None,
     path = path_of("tags", tag)
     with open_client(url) as client:
         has = client.send("GET", path).json()["grasps"]
-        confirm(f"Delete the tag {tag}, which {count(has)} grasps have?", f"the tag {tag}", yes=yes)
+        confirm(f"Delete the tag {tag} of {count(has)} grasps?", f"the tag {tag}", yes=yes)
         client.delete(path)
     say_deleted("tag", tag, json=json, undo=f"graspd tags restore {shlex.quote(tag)}")
 
@@ -99,7 +97,7 @@ def delete_tag(tag: NameArgument, yes: YesOption = False, url: UrlOption = None,
 @app.command("restore", epilog="graspd tags restore good")
 @reporting_errors
 def restore_tag(tag: NameArgument, url: UrlOption = None, json: JsonFlag = False) -> None:
-    """Restore a deleted tag on its grasps, within the grace time."""
+    """Restore a deleted tag of grasps within the grace time."""
     restore(url, "tag", tag, json=json)
 
 
@@ -111,10 +109,10 @@ def export_tag(
     url: UrlOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """Export the grasps that have a tag as a file."""
+    """Export the grasps with a tag to a file."""
     format = out.suffix.removeprefix(".").lower()
     if format not in ("zip", "csv", "json"):
-        raise InputError(f"{out}: the name of the file says its format; end it in .zip, .csv or .json")
+        raise InputError(f"{out}: the name of the file must end in .zip, .csv or .json")
     with open_client(url) as client:
         client.save("/v1/grasps/export", out, params={"tag": tag, "format": format}, patience_s=_PATIENCE_S)
     if json:
@@ -127,10 +125,10 @@ def _selection(grasps: list[str] | None, **filters: str | None) -> dict[str, Any
     """Return the body of a request: grasps by name, or a filter."""
     given = {name: value for name, value in filters.items() if value is not None}
     if grasps and given:
-        raise InputError("name grasps, or say which by --where, --job and --dataset: one of both")
+        raise InputError("give SHARD:ROW, or --where, --job and --dataset, not both")
     if not grasps:
         if not given:
-            raise InputError("say which grasps: SHARD:ROW, or --where, --job, --dataset")
+            raise InputError("select grasps: SHARD:ROW, or --where, --job, --dataset")
         return {"filter": given}
     places = [one.partition(":") for one in grasps]
     if wrong := next((one for one, (_, _, row) in zip(grasps, places, strict=True) if not row.isdigit()), None):
@@ -143,4 +141,4 @@ def _tell(change: dict[str, Any], words: str, *, json: bool) -> None:
         emit(change)
         return
     tag = change["tag"]
-    typer.echo(f"{count(change['changed'])} {words} the tag {tag['name']}, which {count(tag['grasps'])} grasps have")
+    typer.echo(f"{count(change['changed'])} grasps {words} {tag['name']}; {count(tag['grasps'])} grasps have the tag")

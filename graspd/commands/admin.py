@@ -23,13 +23,13 @@ app = typer.Typer(add_completion=False)
 @app.command(epilog="graspd admin kernels ./kernels --arch 90")
 @reporting_errors
 def kernels(
-    folder: Annotated[Path, typer.Argument(help="Where they go; name it in GRASPD_KERNELS.")],
-    arch: Annotated[list[int] | None, typer.Option(help="GPU architecture, such as 90; several times.")] = None,
-    cuda: Annotated[bool, typer.Option(help="Binaries for GPUs.")] = True,
-    cpu: Annotated[bool, typer.Option(help="Objects for CPUs with the instructions of this one.")] = True,
+    folder: Annotated[Path, typer.Argument(help="Folder of the kernels, to be set as GRASPD_KERNELS.")],
+    arch: Annotated[list[int] | None, typer.Option(help="GPU architecture, such as 90; repeatable.")] = None,
+    cuda: Annotated[bool, typer.Option(help="Compile binaries for GPUs.")] = True,
+    cpu: Annotated[bool, typer.Option(help="Compile objects for CPUs with this CPU's instruction set.")] = True,
     json: JsonFlag = False,
 ) -> None:
-    """Compile all kernels ahead of time, so that a new machine compiles none. No GPU is needed."""
+    """Compile all kernels ahead of time, so that new machines compile none. No GPU is needed."""
     folder.mkdir(parents=True, exist_ok=True)
     os.environ["WARP_CACHE_PATH"] = str(folder.resolve())
     from graspd.worker.engines import backend
@@ -49,21 +49,19 @@ def kernels(
             }
         )
     else:
-        typer.echo(
-            f"{len(files)} files of kernels, {size / 1e6:.1f} MB, in {folder}; GRASPD_KERNELS={folder.resolve()}"
-        )
+        typer.echo(f"{len(files)} kernel files, {size / 1e6:.1f} MB, in {folder}; GRASPD_KERNELS={folder.resolve()}")
 
 
 @app.command("bench-render", epilog="graspd admin bench-render --object mug --size 320x240 --size 640x480")
 @reporting_errors
 def bench_render(
-    object: Annotated[str, typer.Option(help="A mesh or a built-in object.")] = "mug",
-    size: Annotated[list[str] | None, typer.Option(help="Picture size, WIDTHxHEIGHT; several times.")] = None,
+    object: Annotated[str, typer.Option(help="Mesh or built-in object.")] = "mug",
+    size: Annotated[list[str] | None, typer.Option(help="Picture size, WIDTHxHEIGHT; repeatable.")] = None,
     device: Annotated[str, typer.Option(help="Warp device: cpu, cuda:0, or auto.")] = "auto",
-    repeats: Annotated[int, typer.Option(min=1, help="Timed runs; the median counts.")] = 3,
+    repeats: Annotated[int, typer.Option(min=1, help="Timed runs, of which the median is reported.")] = 3,
     json: JsonFlag = False,
 ) -> None:
-    """Measure images per second with all channels, per core or GPU, and the time of each step."""
+    """Measure pictures per second with all channels, per core or GPU, and the time of each step."""
     from graspd.studies.rendering_bench import bench_render as measure
     from graspd.studies.rendering_bench import tables
     from graspd.worker.objects.prepare import object_from_path
@@ -82,16 +80,14 @@ def bench_render(
 @app.command(epilog="graspd admin gallery --object mug --object banana.stl -o docs/images/scenes")
 @reporting_errors
 def gallery(
-    object: Annotated[
-        list[str] | None, typer.Option(help="A built-in object, a mesh, or NAME=MESH; several times.")
-    ] = None,
-    hand: Annotated[list[str] | None, typer.Option(help="A URDF or a built-in hand; several times.")] = None,
+    object: Annotated[list[str] | None, typer.Option(help="Built-in object, mesh, or NAME=MESH; repeatable.")] = None,
+    hand: Annotated[list[str] | None, typer.Option(help="URDF or built-in hand; repeatable.")] = None,
     device: Annotated[str, typer.Option(help="Warp device: cpu, cuda:0, or auto.")] = "auto",
     seed: Annotated[int, typer.Option(min=0, help="The same seed gives the same pictures.")] = 0,
-    output: Annotated[Path, typer.Option("--output", "-o", help="The folder to write.")] = Path("gallery"),
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write.")] = Path("gallery"),
     json: JsonFlag = False,
 ) -> None:
-    """Write pages of camera pictures, of hands in grasps that fit on a table, and of crowded tables."""
+    """Write pages of camera pictures: hands in clear grasps on a table, and cluttered tables."""
     from graspd.studies.gallery import paint
     from graspd.worker.hands.load import hand_from_path
 

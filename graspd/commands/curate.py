@@ -18,13 +18,11 @@ from graspd.worker.files.curation import KINDS, Balance, difference
 from graspd.worker.files.subsets import Subset, shards_of, write_subset
 
 app = typer.Typer(no_args_is_help=True, add_completion=False)
-group = typer.Typer(no_args_is_help=True, help="Grasps of files and datasets, chosen by their numbers.")
+group = typer.Typer(no_args_is_help=True, help="Select grasps of files and datasets by their metrics.")
 app.add_typer(group, name="grasps")
 
-SourceArgument = Annotated[
-    str, typer.Argument(help="A file, a folder of shards, or a dataset of the store by its name.")
-]
-OutOption = Annotated[Path, typer.Option("--out", "-o", help="The folder to write; it must not be there.")]
+SourceArgument = Annotated[str, typer.Argument(help="File, folder of shards, or name of a dataset in the store.")]
+OutOption = Annotated[Path, typer.Option("--out", "-o", help="Folder to write; it must not exist.")]
 
 
 @group.callback()
@@ -35,10 +33,12 @@ def grasps() -> None:
 @group.command(epilog='graspd grasps where "epsilon > 0.3 and lift and robust >= 0.75" --from kitchen -o subset')
 @reporting_errors
 def where(
-    expression: Annotated[str, typer.Argument(help="Metrics by name, valid, feasible, held, lift; and, or, not.")],
+    expression: Annotated[
+        str, typer.Argument(help="Expression of metrics, valid, feasible, held and lift with and, or, not.")
+    ],
     out: OutOption,
     source: Annotated[
-        str, typer.Option("--from", help="A file, a folder of shards, or a dataset of the store by its name.")
+        str, typer.Option("--from", help="File, folder of shards, or name of a dataset in the store.")
     ] = ".",
     json: JsonFlag = False,
 ) -> None:
@@ -57,18 +57,18 @@ def where(
 def balance(
     source: SourceArgument,
     out: OutOption,
-    by: Annotated[str, typer.Option(help=f"Of {', '.join(KINDS)}; several with commas.")] = "type,direction",
+    by: Annotated[str, typer.Option(help=f"Kinds, separated by commas: {', '.join(KINDS)}.")] = "type,direction",
     at_most: Annotated[
-        int, typer.Option(min=0, help="Grasps of each kind, for each hand and object; 0: as the median kind has.")
+        int, typer.Option(min=0, help="Maximum number of grasps per kind, hand and object; 0: that of the median kind.")
     ] = 0,
     min_distance: Annotated[
         float,
-        typer.Option(min=0, max=0.1, help="No two of a hand on an object are nearer [m], in all batches; 0: any."),
+        typer.Option(
+            min=0, max=0.1, help="Minimum distance between grasps of a hand on an object, over all batches [m]; 0: any."
+        ),
     ] = 0.0,
-    hand: Annotated[
-        str | None, typer.Option(help="The hand's file, where distances need it and it is not found.")
-    ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Which of a kind are drawn.")] = 0,
+    hand: Annotated[str | None, typer.Option(help="Hand file for distances, if it is not found by its digest.")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the random selection within a kind.")] = 0,
     json: JsonFlag = False,
 ) -> None:
     """Write a subset of a dataset in which no kind of valid grasps is more frequent than others."""
@@ -85,7 +85,7 @@ def diff(
     second: SourceArgument,
     json: JsonFlag = False,
 ) -> None:
-    """Compare two datasets, or two versions of one: NAME@SNAPSHOT is a version."""
+    """Compare two datasets, or two snapshots, given as NAME@SNAPSHOT."""
     found = difference(*(shards_of(*_version(one)) for one in (first, second)))
     if json:
         emit({"a": first, "b": second, **found})
@@ -126,27 +126,30 @@ def _tell(found: Subset, out: Path, *, json: bool) -> None:
         return
     typer.echo(f"{out}: {found.kept} of {found.looked_at} grasps in {len(found.files)} shards")
     if found.passed_over:
-        typer.echo(f"{found.passed_over} shards of scenes and pictures are not carried over", err=True)
+        typer.echo(f"{found.passed_over} shards of scenes and pictures are not copied", err=True)
 
 
 @app.command(epilog="graspd clouds kitchen --points 1024 --noise stereo -o clouds")
 @reporting_errors
 def clouds(
-    source: Annotated[str, typer.Argument(help="A folder of shards with pictures, or a dataset of the store.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="The folder to write; it must be new or empty.")],
-    points: Annotated[int, typer.Option(min=1, max=10_000_000, help="Points of each cloud.")] = 1024,
-    noise: Annotated[str, typer.Option(help=f"A depth camera: {', '.join(NOISES)}; none.")] = "none",
+    source: Annotated[str, typer.Argument(help="Folder of shards with pictures, or name of a dataset in the store.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write; it must be new or empty.")],
+    points: Annotated[int, typer.Option(min=1, max=10_000_000, help="Points per cloud.")] = 1024,
+    noise: Annotated[str, typer.Option(help=f"Noise model of a depth camera: {', '.join(NOISES)}; or none.")] = "none",
     frame: Annotated[
-        Frame | None, typer.Option(help="camera, table or object; default: the camera's, of fused views the table's.")
+        Frame | None,
+        typer.Option(help="Frame of the points: camera, table or object; default: camera, for fused views table."),
     ] = None,
-    fuse: Annotated[bool, typer.Option("--fuse", help="One cloud of all views of a scene.")] = False,
-    scene: Annotated[bool, typer.Option("--scene", help="Table and neighbours too.")] = False,
-    voxel: Annotated[float, typer.Option(min=0.0, help="One point of each cube with this edge [m]; 0: all.")] = 0.0,
+    fuse: Annotated[bool, typer.Option("--fuse", help="Fuse all views of a scene into one cloud.")] = False,
+    scene: Annotated[bool, typer.Option("--scene", help="Include table and neighbours.")] = False,
+    voxel: Annotated[
+        float, typer.Option(min=0.0, help="Voxel size with one point per voxel [m]; 0: all points.")
+    ] = 0.0,
     graspness: Annotated[
-        bool, typer.Option("--graspness", help="Of each point the share of grasps whose hand touches it.")
+        bool, typer.Option("--graspness", help="Add graspness: share of grasps whose hand touches the point.")
     ] = False,
     unvalidated: Annotated[
-        bool, typer.Option("--unvalidated", help="Grasps that are feasible and that are not validated.")
+        bool, typer.Option("--unvalidated", help="Select feasible grasps without validation instead of valid ones.")
     ] = False,
     seed: Annotated[int, typer.Option(min=0, help="The same seed gives the same clouds.")] = 0,
     json: JsonFlag = False,
@@ -157,7 +160,7 @@ def clouds(
     """
     pictures = Pictures(shards_of(source), unvalidated=unvalidated)
     if not len(pictures):
-        raise InputError(f"{source} has no pictures; take some: graspd render")
+        raise InputError(f"{source} has no pictures; make some: graspd render")
     camera = None if noise == "none" else noise
     surface = hand_surface if graspness else None
     found = pictures.clouds(

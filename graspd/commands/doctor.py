@@ -32,7 +32,7 @@ def checks_of(settings: Settings) -> list[Check]:
         Check(
             "gpu", lambda: gpu(settings), limit_s=_GPU_S + 5, mend_hang="restart the driver, or the machine; see dmesg"
         ),
-        Check("kernels", lambda: kernels(settings), limit_s=_KERNELS_S + 5, mend_hang="see `top`; then the same again"),
+        Check("kernels", lambda: kernels(settings), limit_s=_KERNELS_S + 5, mend_hang="see `top`, then retry"),
     ]
 
 
@@ -56,10 +56,10 @@ def gpu(settings: Settings, *, child: Child = run_child, has_driver: Callable[[]
     found, wrong = _answer(child, ["gpus"])
     if wrong:
         return bad(
-            name, f"the GPUs cannot be asked: {wrong}", "see nvidia-smi and dmesg; restart the driver or the machine"
+            name, f"the GPUs cannot be queried: {wrong}", "see nvidia-smi and dmesg; restart the driver or the machine"
         )
     gpus: list[dict[str, Any]] = found["gpus"]
-    needed = f"the driver says CUDA {_dotted(found['driver'])}, Warp is made for {_dotted(found['toolkit'])}"
+    needed = f"the driver has CUDA {_dotted(found['driver'])}, Warp is built for {_dotted(found['toolkit'])}"
     fix = "a driver of R580 or newer; in containers the NVIDIA container toolkit and --gpus all; CUDA_VISIBLE_DEVICES"
     if not gpus:
         if settings.device.startswith("cuda"):
@@ -77,7 +77,9 @@ def gpu(settings: Settings, *, child: Child = run_child, has_driver: Callable[[]
         f"{one['name']} {one['model']} {one['free'] / _GIB:.0f} of {one['total'] / _GIB:.0f} GiB free" for one in gpus
     )
     if full := [one["name"] for one in gpus if one["free"] < _MEMORY_LOW]:
-        return warning(name, line, f"see nvidia-smi: others fill {', '.join(full)}; launches are halved until they fit")
+        return warning(
+            name, line, f"see nvidia-smi: other processes fill {',  '.join(full)}; launches are halved until they fit"
+        )
     return good(name, f"{line}; {needed}")
 
 
@@ -89,14 +91,14 @@ def kernels(settings: Settings, *, child: Child = run_child) -> Finding:
         return bad(
             name,
             f"the engine does not run: {wrong}",
-            "pip install 'graspd[worker]'; see disk and memory; dmesg tells what was killed",
+            "pip install 'graspd[worker]'; see disk and memory; dmesg lists killed processes",
         )
     if found["error"]:
         fix = f"see the message; for a damaged cache remove {found['cache']}"
         return bad(name, f"on {found['device']}: {found['error']}", fix)
     return good(
         name,
-        f"grasps, scenes and pictures of a ball make sense on {found['device']}; kept in {found['cache']}",
+        f"plausible grasps, scenes and pictures of a ball on {found['device']}; kernel cache {found['cache']}",
     )
 
 
@@ -109,7 +111,7 @@ def _answer(child: Child, arguments: Sequence[str]) -> tuple[dict[str, Any], str
     try:
         return dict(json.loads(done.stdout.strip().splitlines()[-1])), ""
     except (ValueError, IndexError):
-        tail = (done.stderr.strip().splitlines() or ["it said nothing"])[-1][:300]
+        tail = (done.stderr.strip().splitlines() or ["it printed nothing"])[-1][:300]
         return {}, f"ended by signal {-done.returncode}" if done.returncode < 0 else tail
 
 

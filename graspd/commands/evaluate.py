@@ -52,59 +52,62 @@ def evaluate_command(
     protocol: Annotated[
         str,
         typer.Option(
-            help="dexgraspbench: six pushes; lift: out of the scene the grasps were planned in; displacement: only the "
+            help="dexgraspbench: six pushes; lift: out of the scene of the grasps; displacement: only the "
             "slip in 0.15 s."
         ),
     ] = "dexgraspbench",
     level: Annotated[
         str,
-        typer.Option(help="What a verdict costs: dexgraspbench, standard, or fast; of a lift: dexgraspbench or lift."),
+        typer.Option(help="Level of validation: dexgraspbench, standard or fast; of a lift: dexgraspbench or lift."),
     ] = "",
-    hard: Annotated[bool, typer.Option("--hard", help="Half the friction, a tenth of the torsional.")] = False,
+    hard: Annotated[
+        bool, typer.Option("--hard", help="Half the friction and a tenth of the torsional friction.")
+    ] = False,
     hand: Annotated[
-        str | None, typer.Option(help="The hand's file; default: what the file says, found by its digest.")
+        str | None, typer.Option(help="Hand file; default: the hand of the grasp file, found by its digest.")
     ] = None,
     object: Annotated[
-        str | None, typer.Option(help="The object's file; default: what the file says, found by its digest.")
+        str | None, typer.Option(help="Object file; default: the object of the grasp file, found by its digest.")
     ] = None,
     robust: Annotated[
         int,
         typer.Option(
             min=0,
             max=MOST_ROBUST_MODELS,
-            help="Models around the nominal one in which what holds is validated again, such as 8.",
+            help="Models around the nominal one in which held grasps are validated again, such as 8.",
         ),
     ] = 0,
     friction: Annotated[
-        float | None, typer.Option(min=0.01, max=3.0, help="Coulomb coefficient of ε; default: the file's.")
+        float | None,
+        typer.Option(min=0.01, max=3.0, help="Coulomb friction coefficient of ε; default: that of the file."),
     ] = None,
     validation_hand: Annotated[
         str | None,
-        typer.Option(help="Another model of the same hand, URDF or MJCF, that validates the grasps as well."),
+        typer.Option(help="Second model of the same hand, URDF or MJCF, for an additional validation."),
     ] = None,
     joint_map: Annotated[
-        str | None, typer.Option(help="OURS=THEIRS,...: joints of the same meaning, where their names do not tell.")
+        str | None, typer.Option(help="OURS=THEIRS,...: corresponding joints with different names.")
     ] = None,
     validation_tolerance: Annotated[
-        float, typer.Option(min=0.0, help="Fingertips of the two models that differ by more are refused [mm].")
+        float, typer.Option(min=0.0, help="Maximum distance between corresponding fingertips of the two models [mm].")
     ] = 1e3 * TOLERANCE_M,
     out: Annotated[
         Path | None,
         typer.Option(
             "-o",
             "--out",
-            help="With --robust: a copy of the shard, or folder of copies, with the shares of its grasps.",
+            help="With --robust: copy of the shard, or folder of copies, with robust shares.",
         ),
     ] = None,
-    threads: Annotated[int, typer.Option(min=0, help="CPU threads, 0: one per core.")] = 0,
+    threads: Annotated[int, typer.Option(min=0, help="CPU threads; 0: one per core.")] = 0,
     json: JsonFlag = False,
 ) -> None:
-    """Measure grasps and validate them in an independent engine. Numbers are medians, ε and areas at 5 mm."""
+    """Measure grasps and validate them in an independent engine. Metrics are medians, ε and areas at 5 mm."""
     level = _checked_level(protocol, level)
     if robust and protocol == "displacement":
         raise InputError("--robust validates pushes or lifts in other models: choose --protocol dexgraspbench or lift")
     if validation_hand is None and joint_map:
-        raise InputError("--joint-map says which joints of --validation-hand are ours; name that hand")
+        raise InputError("--joint-map needs --validation-hand")
     if validation_hand is not None and protocol != "dexgraspbench":
         raise InputError(f"--validation-hand validates by protocol dexgraspbench, not by {protocol}")
     other = None if validation_hand is None else hand_from_path(validation_hand, drag=True)
@@ -124,7 +127,7 @@ def evaluate_command(
         for file in listed:
             case = load_case(file, hand=hand, obj=object)
             if copies and (case.placed is None) == (protocol == "lift"):
-                raise InputError(f"{file} keeps shares of its own test: of a lift in scenes, else of six pushes")
+                raise InputError(f"{file} stores shares of its own protocol: a lift in scenes, else six pushes")
             row = evaluate(
                 case,
                 protocol=protocol,  # type: ignore[arg-type]
@@ -175,7 +178,7 @@ def _copies(paths: list[Path], files: list[Path], out: Path | None, *, robust: i
     if out is None:
         return {}
     if not robust or hard or len(paths) != 1:
-        raise InputError("-o keeps what --robust N finds, without --hard, of one file or folder")
+        raise InputError("-o needs --robust N, no --hard, and one file or folder")
     return dict(zip(files, copy_paths(paths[0], files, out), strict=True))
 
 
@@ -185,8 +188,8 @@ def _said_of_models(whole: dict[str, Any]) -> str:
     axes = sorted(whole["robust_axes"].items(), key=lambda pair: pair[1]["share"])
     each = ", ".join(f"{words[axis]} {one['share']:.2f}" for axis, one in axes)
     return (
-        f"robust: the {whole['robust_n']} that hold do so in {whole['robust_share']:.2f} of {whole['robust_models']} "
-        f"models around the nominal one\nby what differs: {each}"
+        f"robust: {whole['robust_n']} held grasps hold in {whole['robust_share']:.2f} of {whole['robust_models']} "
+        f"models around the nominal one\nby difference: {each}"
     )
 
 

@@ -34,34 +34,41 @@ IMPORTS: Final = ("dexgraspbench", "dexlearn", *NAMED, "dexgraspnet", "dexgraspn
 @app.command(epilog="graspd export grasps.h5 --format dexgraspbench -o bench")
 @reporting_errors
 def export(
-    source: Annotated[Path, typer.Argument(help="A shard, or for webdataset and training a folder of shards.")],
+    source: Annotated[Path, typer.Argument(help="Shard; for webdataset and training a folder of shards.")],
     format_: Annotated[str, typer.Option("--format", help=", ".join(EXPORTS) + ".")] = "images",
-    hand: Annotated[str | None, typer.Option(help="The shard's hand; default: found by its digest.")] = None,
-    object_: Annotated[
-        str | None, typer.Option("--object", help="The shard's object; default: found by its digest.")
-    ] = None,
+    hand: Annotated[str | None, typer.Option(help="Hand file; default: found by its digest.")] = None,
+    object_: Annotated[str | None, typer.Option("--object", help="Object file; default: found by its digest.")] = None,
     unvalidated: UnvalidatedOption = False,
     every: EveryOption = False,
-    depth: Annotated[str, typer.Option(help="exr: metres as floats; png: 16 bits, steps of 0.1 mm.")] = "exr",
-    best: Annotated[int, typer.Option(min=0, help="For robots: at most so many, the best by epsilon; 0: all.")] = 0,
+    depth: Annotated[
+        str, typer.Option(help="Depth format: exr (float, metres) or png (16 bit, steps of 0.1 mm).")
+    ] = "exr",
+    best: Annotated[
+        int, typer.Option(min=0, help="For robots: maximum number of grasps, the best by epsilon; 0: all.")
+    ] = 0,
     tool: Annotated[
         str | None,
-        typer.Option("--tool-frame", help="For robots: a link of the hand, or x y z qw qx qy qz in its root link."),
+        typer.Option(
+            "--tool-frame", help="For robots: tool frame, a link of the hand or x y z qw qx qy qz in its root link."
+        ),
     ] = None,
-    speed: Annotated[float, typer.Option(help="For robots: share of the velocity limits that is used.")] = 0.5,
+    speed: Annotated[float, typer.Option(help="For robots: share of the velocity limits.")] = 0.5,
     arm: Annotated[
-        str | None, typer.Option(help="For robots: an arm's URDF; only grasps it can carry out are written.")
+        str | None, typer.Option(help="For robots: URDF of an arm; only grasps that it can execute are written.")
     ] = None,
-    mount: Annotated[str | None, typer.Option(help="The arm's link that the hand is mounted on.")] = None,
+    mount: Annotated[str | None, typer.Option(help="Link of the arm on which the hand is mounted.")] = None,
     base: Annotated[
-        str | None, typer.Option(help="The arm's base in the scene, or seen from a free object: x y z qw qx qy qz.")
+        str | None,
+        typer.Option(help="Pose of the arm's base in the scene, or relative to a free object: x y z qw qx qy qz."),
     ] = None,
     mount_pose: Annotated[
-        str | None, typer.Option(help="The hand's root link in the mount: x y z qw qx qy qz.")
+        str | None, typer.Option(help="Pose of the hand's root link in the mount link: x y z qw qx qy qz.")
     ] = None,
-    held_out: Annotated[float, typer.Option(help="For training: share of the objects that are held out.")] = 0.2,
-    noise: Annotated[str, typer.Option(help="For training: a depth camera, stereo or structured_light.")] = "",
-    output: Annotated[Path, typer.Option("--output", "-o", help="The folder to write.")] = Path("export"),
+    held_out: Annotated[float, typer.Option(help="For training: share of held-out objects.")] = 0.2,
+    noise: Annotated[
+        str, typer.Option(help="For training: noise model of a depth camera, stereo or structured_light.")
+    ] = "",
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write.")] = Path("export"),
     json: JsonFlag = False,
 ) -> None:
     """Write grasps or pictures in other formats."""
@@ -104,24 +111,28 @@ def export(
 )
 @reporting_errors
 def import_(
-    source: Annotated[Path, typer.Argument(help="The file or folder of grasps.")],
+    source: Annotated[Path, typer.Argument(help="File or folder of grasps.")],
     format_: Annotated[str, typer.Option("--format", help=", ".join(IMPORTS) + ".")],
-    licence: Annotated[str, typer.Option(help="On which terms the grasps may be used; goes into every file.")],
-    origin: Annotated[str, typer.Option("--source", help="Where they come from: an address or a citation.")],
-    hand: Annotated[str | None, typer.Option(help="The hand: a URDF or a built-in.")] = None,
-    object_: Annotated[str | None, typer.Option("--object", help="The object's mesh, at the source's scale 1.")] = None,
+    licence: Annotated[str, typer.Option(help="Licence of the grasps, written into every file.")],
+    origin: Annotated[str, typer.Option("--source", help="Source of the grasps: a URL or a citation.")],
+    hand: Annotated[str | None, typer.Option(help="Hand: a URDF or a built-in.")] = None,
+    object_: Annotated[
+        str | None, typer.Option("--object", help="Mesh of the object at scale 1 of the source.")
+    ] = None,
     robot: Annotated[str, typer.Option(help="multidex: name of the robot in the file.")] = "",
     name: Annotated[str, typer.Option(help="multidex, graspgen, huggingface, lerobot: name of the object.")] = "",
-    number: Annotated[int, typer.Option(help="ddgc, dexgraspnet2: which object of the scene.")] = 0,
-    validation: Annotated[str, typer.Option(help="dexgraspbench, standard, fast or none.")] = "standard",
-    friction: Annotated[float, typer.Option(help="Coulomb coefficient of the metrics.")] = 1.0,
-    threads: Annotated[int, typer.Option(help="CPU threads; 0: all cores.")] = 0,
-    output: Annotated[Path, typer.Option("--output", "-o", help="The folder to write.")] = Path("imported"),
+    number: Annotated[int, typer.Option(help="ddgc, dexgraspnet2: object of the scene.")] = 0,
+    validation: Annotated[
+        str, typer.Option(help="Level of validation: dexgraspbench, standard, fast or none.")
+    ] = "standard",
+    friction: Annotated[float, typer.Option(help="Coulomb friction coefficient of the metrics.")] = 1.0,
+    threads: Annotated[int, typer.Option(help="CPU threads; 0: one per core.")] = 0,
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write.")] = Path("imported"),
     json: JsonFlag = False,
 ) -> None:
     """Read grasps from other formats, validate and measure them, and write base shards.
 
-    Nothing in the files is executed. The meshes are written beside the shards, at the scale of the grasps.
+    No code in the files is executed. Meshes are written next to the shards, at the scale of the grasps.
     """
     from graspd.worker.engines import backend
 
@@ -232,8 +243,12 @@ def _compared(one: dict[str, Any]) -> str:
     """Describe how published verdicts of imported grasps agree with ours."""
     if not one["published"]:
         return ""
-    words = f"; {one['published']} came with a verdict"
-    return words if one["agreement_published"] is None else f"{words}, {one['agreement_published']:.0%} of them as ours"
+    words = f"; {one['published']} have a published verdict"
+    return (
+        words
+        if one["agreement_published"] is None
+        else f"{words}, {one['agreement_published']:.0%} of them equal to ours"
+    )
 
 
 def _summary(file: Path) -> dict[str, Any]:
@@ -257,16 +272,16 @@ def _summary(file: Path) -> dict[str, Any]:
 @reporting_errors
 def card(
     source: Annotated[
-        str, typer.Argument(metavar="NAME", help="A dataset of the store; or a folder of shards: ./kitchen-v1.")
+        str, typer.Argument(metavar="NAME", help="Dataset of the store, or folder of shards, such as ./kitchen-v1.")
     ],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write the card into.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the card.")],
     snapshot: Annotated[str | None, typer.Option(help="Digest of a snapshot; default: the newest.")] = None,
-    licence: Annotated[str, typer.Option(help="Licence of the grasps and pictures, as SPDX names it: CC-BY-4.0.")] = "",
-    text: Annotated[str, typer.Option("--source", help="A sentence on where it comes from, or whom to ask.")] = "",
+    licence: Annotated[str, typer.Option(help="SPDX licence of grasps and pictures, such as CC-BY-4.0.")] = "",
+    text: Annotated[str, typer.Option("--source", help="Origin or contact, in one sentence.")] = "",
     assets: Annotated[
-        Path | None, typer.Option(help="JSON with licence and source of hands and objects that were added without.")
+        Path | None, typer.Option(help="JSON file with missing licences and sources of hands and objects.")
     ] = None,
-    data_dir: Annotated[Path | None, typer.Option("--data-dir", help="Folder of graspd; GRASPD_DATA_DIR.")] = None,
+    data_dir: Annotated[Path | None, typer.Option("--data-dir", help="Data folder of graspd; GRASPD_DATA_DIR.")] = None,
     json: JsonFlag = False,
 ) -> None:
     """Write a dataset's card: contents, origin, quality and biases; with plots and checksums."""

@@ -32,24 +32,27 @@ app = typer.Typer(add_completion=False)
 @reporting_errors
 def check(
     file: Annotated[
-        str, typer.Argument(help="A URDF, xacro or MJCF, its folder, a ZIP of that, or the name of a built-in hand.")
+        str, typer.Argument(help="URDF, xacro or MJCF file, its folder, a ZIP of it, or name of a built-in hand.")
     ],
     options: dict[str, Any],
     picture: Annotated[
-        Path | None, typer.Option(help="Draw the hand open, on approach, closing, and from three sides: a PNG.")
+        Path | None, typer.Option(help="PNG of the hand: open, on approach, closing, and from three sides.")
     ] = None,
     collision: Annotated[
-        bool, typer.Option("--collision", help="Draw collision shapes where the hand has visual meshes.")
+        bool, typer.Option("--collision", help="Draw collision shapes instead of visual meshes.")
     ] = False,
     write: Annotated[
-        Path | None, typer.Option(help="Write all that was said and guessed into a file: asset.json, to be corrected.")
+        Path | None, typer.Option(help="Write all settings and guesses to an asset.json, for correction.")
     ] = None,
     self_test: Annotated[
-        bool, typer.Option("--self-test/--no-self-test", help="Try 64 grasps of plain objects, and 16 off a table.")
+        bool,
+        typer.Option(
+            "--self-test/--no-self-test", help="Run the self-test: 64 grasps of plain objects, and 16 off a table."
+        ),
     ] = True,
     json: JsonFlag = False,
 ) -> None:
-    """Check whether a hand can be used, report guesses, and try it on plain objects. Needs no server."""
+    """Check whether a hand can be used, report guesses, and run the self-test. Needs no server."""
     options = hand_options(**options)
     with _bar("reading     ", quiet=json) as run:
         report = report_hand(file, options, run)
@@ -74,7 +77,7 @@ def _tried(file: str, options: dict[str, Any], *, quiet: bool) -> dict[str, Any]
     """Return the facts of the self-test, with progress on a terminal."""
     from graspd.worker.stages.hand_self_test import tried_softly
 
-    with _bar("self-test   ", "starting; the first one on a machine compiles its kernels", quiet=quiet) as run:
+    with _bar("self-test   ", "starting; the first run on a machine compiles its kernels", quiet=quiet) as run:
         return tried_softly(lambda: hand_from_path(file, options), run)
 
 

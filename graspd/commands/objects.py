@@ -26,10 +26,10 @@ app = typer.Typer(add_completion=False)
 @reporting_errors
 def check(
     file: Annotated[
-        str, typer.Argument(help="A mesh (STL, OBJ, PLY, OFF, GLB), a built-in; or a folder or ZIP of one or many.")
+        str, typer.Argument(help="Mesh (STL, OBJ, PLY, OFF, GLB), built-in object, or folder or ZIP of one or many.")
     ],
     options: dict[str, Any],
-    picture: Annotated[Path | None, typer.Option(help="Draw the prepared mesh: a PNG.")] = None,
+    picture: Annotated[Path | None, typer.Option(help="PNG of the prepared mesh.")] = None,
     json: JsonFlag = False,
 ) -> None:
     """Check whether a mesh can be used; report its repairs and its size. Needs no server."""

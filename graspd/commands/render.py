@@ -48,36 +48,38 @@ from graspd.worker.rendering.views import render as render_views
 app = typer.Typer(add_completion=False)
 
 _Device = Annotated[str, typer.Option(help="Warp device: cpu, cuda:0, or auto.")]
-_Object = Annotated[str | None, typer.Option(help="The object's file; default: found by its digest.")]
+_Object = Annotated[str | None, typer.Option(help="Object file; default: found by its digest.")]
 
 
 @app.command(epilog="graspd render scenes.h5 --views 3 --stereo -o views.h5 --page views.png")
 @reporting_errors
 def render(
-    scenes: Annotated[Path, typer.Argument(help="A scene shard, or a base shard of grasps in scenes.")],
+    scenes: Annotated[Path, typer.Argument(help="Scene shard, or base shard of grasps in scenes.")],
     views: Annotated[int, typer.Option(min=1, max=4096, help="Camera placements per scene.")] = 3,
-    stereo: Annotated[bool, typer.Option("--stereo", help="A left and a right picture per placement.")] = False,
-    baseline: Annotated[float, typer.Option(help="Distance of the eyes [m].")] = BASELINE_M,
-    width: Annotated[int | None, typer.Option(min=16, max=4096, help="Picture width [px]; 320.")] = None,
-    height: Annotated[int | None, typer.Option(min=16, max=4096, help="Picture height [px]; 240.")] = None,
+    stereo: Annotated[bool, typer.Option("--stereo", help="Render a left and a right picture per placement.")] = False,
+    baseline: Annotated[float, typer.Option(help="Stereo baseline [m].")] = BASELINE_M,
+    width: Annotated[int | None, typer.Option(min=16, max=4096, help="Picture width [px]; default: 320.")] = None,
+    height: Annotated[int | None, typer.Option(min=16, max=4096, help="Picture height [px]; default: 240.")] = None,
     channels: Annotated[
-        str, typer.Option(help="Besides rgb, depth and segmentation: distance, normals, occlusion, or all.")
+        str, typer.Option(help="Channels besides rgb, depth and segmentation: distance, normals, occlusion, or all.")
     ] = "",
     cameras: Annotated[
-        Path | None, typer.Option(help="JSON with intrinsics, places, or both, instead of sampled cameras.")
+        Path | None, typer.Option(help="JSON file with intrinsics, places, or both, instead of sampled cameras.")
     ] = None,
     with_hand: Annotated[
-        Path | None, typer.Option(help="The base shard: also pictures with each scene's best grasp.")
+        Path | None, typer.Option(help="Base shard, for additional pictures with the best grasp of each scene.")
     ] = None,
-    hand: Annotated[str | None, typer.Option(help="The hand's file; default: found by its digest.")] = None,
+    hand: Annotated[str | None, typer.Option(help="Hand file; default: found by its digest.")] = None,
     with_: Annotated[
-        list[str] | None, typer.Option("--with", help="A neighbour's file; default: the built-in of that name.")
+        list[str] | None, typer.Option("--with", help="File of a neighbour; default: the built-in object of that name.")
     ] = None,
     object: _Object = None,
-    seed: Annotated[int | None, typer.Option(min=0, help="Default: the seed of the scenes.")] = None,
+    seed: Annotated[
+        int | None, typer.Option(min=0, help="Seed of the cameras; default: the seed of the scenes.")
+    ] = None,
     device: _Device = "auto",
-    output: Annotated[Path, typer.Option("--output", "-o", help="The views shard to write.")] = Path("views.h5"),
-    page: Annotated[Path | None, typer.Option(help="Also write a page that shows the views (PNG).")] = None,
+    output: Annotated[Path, typer.Option("--output", "-o", help="Views shard to write.")] = Path("views.h5"),
+    page: Annotated[Path | None, typer.Option(help="Contact sheet of the views to write (PNG).")] = None,
     json: JsonFlag = False,
 ) -> None:
     """Render pictures of scenes: colour, depth, segmentation, boxes, and the `--channels` requested."""
@@ -129,30 +131,36 @@ def render(
 @app.command(epilog="graspd pictures grasps.h5 -o sheet.png --three-sides")
 @reporting_errors
 def pictures(
-    grasps: Annotated[Path, typer.Argument(help="A base shard, as `graspd synth` writes it.")],
+    grasps: Annotated[Path, typer.Argument(help="Base shard, as written by `graspd synth`.")],
     count: Annotated[
         int | None,
-        typer.Option("--count", "-n", min=1, max=400, help="How many of the best; 12, of ways 4, of a film 1."),
+        typer.Option(
+            "--count", "-n", min=1, max=400, help="Number of best grasps; default: 12, with --way 4, with --animate 1."
+        ),
     ] = None,
-    three: Annotated[bool, typer.Option("--three-sides", help="Each grasp from three sides.")] = False,
-    way: Annotated[bool, typer.Option("--way", help="Each grasp on its way: standoff, pregrasp, grasp, lift.")] = False,
+    three: Annotated[bool, typer.Option("--three-sides", help="Draw each grasp from three sides.")] = False,
+    way: Annotated[
+        bool, typer.Option("--way", help="Draw the trajectory of each grasp: standoff, pregrasp, grasp, lift.")
+    ] = False,
     animate: Annotated[
-        bool, typer.Option("--animate", help="A film as a robot runs it: come, close, lift; .gif, .webp or .png.")
+        bool, typer.Option("--animate", help="Animate approach, closing and lift: .gif, .webp or .png.")
     ] = False,
     row: Annotated[
-        list[int] | None, typer.Option("--row", min=0, help="This grasp, by its row in the file; several times.")
+        list[int] | None, typer.Option("--row", min=0, help="Row of a grasp in the file; repeatable.")
     ] = None,
-    palette: Annotated[bool, typer.Option("--palette", help="256 colours: a third of the bytes.")] = False,
+    palette: Annotated[bool, typer.Option("--palette", help="Use 256 colours, for a third of the file size.")] = False,
     size: Annotated[
         int | None,
-        typer.Option(min=32, max=2048, help="Edge of a picture [px]; 300, with --three-sides 160, a film 480."),
+        typer.Option(
+            min=32, max=2048, help="Edge of a picture [px]; default: 300, with --three-sides 160, with --animate 480."
+        ),
     ] = None,
-    hand: Annotated[str | None, typer.Option(help="The hand's file; default: found by its digest.")] = None,
+    hand: Annotated[str | None, typer.Option(help="Hand file; default: found by its digest.")] = None,
     object: _Object = None,
     unvalidated: UnvalidatedOption = False,
     every: EveryOption = False,
     device: _Device = "auto",
-    output: Annotated[Path, typer.Option("--output", "-o", help="The PNG or film to write.")] = Path("grasps.png"),
+    output: Annotated[Path, typer.Option("--output", "-o", help="PNG or animation to write.")] = Path("grasps.png"),
     json: JsonFlag = False,
 ) -> None:
     """Draw the best valid grasps by epsilon with their metrics on one sheet, in their scenes if any."""
@@ -255,11 +263,13 @@ def _progress(quiet: bool) -> Progress:
 @app.command(epilog="graspd view grasps.h5")
 @reporting_errors
 def view(
-    grasps: Annotated[Path, typer.Argument(help="A base shard, as `graspd synth` writes it.")],
-    host: Annotated[str, typer.Option(help="Address to serve on; whoever reaches it sees the grasps.")] = "127.0.0.1",
-    port: Annotated[int, typer.Option(min=0, max=65535, help="The first port tried; 0: any free one.")] = 8080,
-    hand: Annotated[str | None, typer.Option(help="The hand's file; default: found by its digest.")] = None,
-    object: Annotated[str | None, typer.Option(help="The object's file; default: found by its digest.")] = None,
+    grasps: Annotated[Path, typer.Argument(help="Base shard, as written by `graspd synth`.")],
+    host: Annotated[
+        str, typer.Option(help="Address to bind; everyone with access to it sees the grasps.")
+    ] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=0, max=65535, help="First port to try; 0: any free port.")] = 8080,
+    hand: Annotated[str | None, typer.Option(help="Hand file; default: found by its digest.")] = None,
+    object: Annotated[str | None, typer.Option(help="Object file; default: found by its digest.")] = None,
 ) -> None:
     """Show grasps in 3D in the browser: hand, object, scene, contacts, trajectory. Ends with Ctrl-C."""
     from graspd.worker.viewing import Viewer, ViewerContent, missing

@@ -34,18 +34,20 @@ app = typer.Typer(add_completion=False)
 @app.command(epilog="graspd scene grasps.h5 --scenes 4 -o scenes.h5")
 @reporting_errors
 def scene(
-    grasps: Annotated[Path, typer.Argument(help="A base shard, as `graspd synth` writes it.")],
+    grasps: Annotated[Path, typer.Argument(help="Base shard, as written by `graspd synth`.")],
     scenes: Annotated[int, typer.Option(min=1, max=4096, help="Number of scenes.")] = 2,
-    hand: Annotated[str | None, typer.Option(help="The hand's file; default: found by its digest.")] = None,
-    object: Annotated[str | None, typer.Option(help="The object's file; default: found by its digest.")] = None,
+    hand: Annotated[str | None, typer.Option(help="Hand file; default: found by its digest.")] = None,
+    object: Annotated[str | None, typer.Option(help="Object file; default: found by its digest.")] = None,
     with_: Annotated[
-        list[str] | None, typer.Option("--with", help="Another object on the table: file or built-in; several times.")
+        list[str] | None, typer.Option("--with", help="Neighbour on the table: file or built-in object; repeatable.")
     ] = None,
-    seed: Annotated[int | None, typer.Option(min=0, help="Default: the seed of the grasps.")] = None,
-    output: Annotated[Path, typer.Option("--output", "-o", help="The scene shard to write.")] = Path("scenes.h5"),
+    seed: Annotated[
+        int | None, typer.Option(min=0, help="Seed of the scenes; default: the seed of the grasps.")
+    ] = None,
+    output: Annotated[Path, typer.Option("--output", "-o", help="Scene shard to write.")] = Path("scenes.h5"),
     json: JsonFlag = False,
 ) -> None:
-    """Drop the object onto a table and select the grasps that the hand can reach there."""
+    """Drop the object on a table and select the grasps that the hand can reach there."""
     started = perf_counter()
     base = read_shard(grasps, kind="base")
     model, obj = hand_of_shard(base, hand), object_of_shard(base, object)
@@ -74,7 +76,7 @@ def scene(
             | {"seconds": round(seconds, 2)}
         )
         return
-    typer.echo(f"{output}: {scenes} scenes, {clear} of {total} grasps stay clear, {seconds:.1f} s")
+    typer.echo(f"{output}: {scenes} scenes, {clear} of {total} grasps are clear, {seconds:.1f} s")
     if any(reasons.values()):
         typer.echo("too near: " + ", ".join(f"{n} {reason.replace('_', ' ')}" for reason, n in reasons.items() if n))
     if (note := rolling_note(rolling, scenes)) is not None:

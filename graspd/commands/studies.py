@@ -34,16 +34,18 @@ app = typer.Typer()
 @app.command(epilog="graspd bench --hand allegro --object mug --batch 1 --batch 32 --out bench")
 @reporting_errors
 def bench(
-    hand: Annotated[str, typer.Option(help="A URDF, a ZIP with one, or a built-in hand.")] = "allegro",
-    object_: Annotated[str, typer.Option("--object", help="A mesh or a built-in object.")] = "mug",
-    fidelity: Annotated[list[str] | None, typer.Option(help="Fidelity; several times. Default: all offered.")] = None,
-    batch: Annotated[list[int] | None, typer.Option(min=1, help="Grasps per call; several times.")] = None,
-    join: Annotated[list[int] | None, typer.Option(min=1, help="Batches in one launch; several times.")] = None,
-    threads: Annotated[list[int] | None, typer.Option(min=1, help="CPU threads; several times.")] = None,
-    points: Annotated[list[int] | None, typer.Option(min=16, help="Also sweep the fine phase's hand points.")] = None,
-    face_error: Annotated[list[float] | None, typer.Option(min=0, help="Also sweep the face error bound [m].")] = None,
-    device: Annotated[str, typer.Option(help="cpu, cuda:0 or auto.")] = "auto",
-    repeats: Annotated[int, typer.Option(min=1, help="Timed calls per run; the median counts.")] = 3,
+    hand: Annotated[str, typer.Option(help="URDF, ZIP with a URDF, or built-in hand.")] = "allegro",
+    object_: Annotated[str, typer.Option("--object", help="Mesh or built-in object.")] = "mug",
+    fidelity: Annotated[list[str] | None, typer.Option(help="Fidelity; repeatable. Default: all offered.")] = None,
+    batch: Annotated[list[int] | None, typer.Option(min=1, help="Grasps per call; repeatable.")] = None,
+    join: Annotated[list[int] | None, typer.Option(min=1, help="Batches per launch; repeatable.")] = None,
+    threads: Annotated[list[int] | None, typer.Option(min=1, help="CPU threads; repeatable.")] = None,
+    points: Annotated[
+        list[int] | None, typer.Option(min=16, help="Sweep the hand points of the fine phase too.")
+    ] = None,
+    face_error: Annotated[list[float] | None, typer.Option(min=0, help="Sweep the face error bound too [m].")] = None,
+    device: Annotated[str, typer.Option(help="Device: cpu, cuda:0 or auto.")] = "auto",
+    repeats: Annotated[int, typer.Option(min=1, help="Timed calls per run, of which the median is reported.")] = 3,
     out: Annotated[Path | None, typer.Option(help="Folder for bench.json, bench.md and bench.png.")] = None,
     json: JsonFlag = False,
 ) -> None:
@@ -106,22 +108,22 @@ STUDIES: Final = (
 @app.command(epilog="graspd stability --only gradient --only starts --out stability --publish")
 @reporting_errors
 def stability(
-    only: Annotated[list[str] | None, typer.Option(help=f"One of {', '.join(STUDIES)}; several times.")] = None,
-    hand: Annotated[str, typer.Option(help="A URDF or a built-in hand.")] = "allegro",
-    object_: Annotated[str, typer.Option("--object", help="A mesh or a built-in object.")] = "block",
-    quick: Annotated[bool, typer.Option("--quick", help="Few cells of each map: under a minute of CPU time.")] = False,
-    long: Annotated[bool, typer.Option("--long", help="Runs of 100,000 iterations as well.")] = False,
-    threads: Annotated[int, typer.Option(help="CPU threads; 0: all cores.")] = 0,
+    only: Annotated[list[str] | None, typer.Option(help=f"Study: {', '.join(STUDIES)}; repeatable.")] = None,
+    hand: Annotated[str, typer.Option(help="URDF or built-in hand.")] = "allegro",
+    object_: Annotated[str, typer.Option("--object", help="Mesh or built-in object.")] = "block",
+    quick: Annotated[bool, typer.Option("--quick", help="Few cells per map: under a minute of CPU time.")] = False,
+    long: Annotated[bool, typer.Option("--long", help="Add runs of 100,000 iterations.")] = False,
+    threads: Annotated[int, typer.Option(help="CPU threads; 0: one per core.")] = 0,
     out: Annotated[Path | None, typer.Option(help="Folder for stability.json, stability.md and the maps.")] = None,
     source: Annotated[
         list[Path] | None,
-        typer.Option("--from", help="A stability.json: draw and publish its maps, measure nothing; several times."),
+        typer.Option("--from", help="Draw and publish the maps of a stability.json without measuring; repeatable."),
     ] = None,
-    publish: Annotated[bool, typer.Option("--publish", help="Also into the store, for the dashboard.")] = False,
-    data_dir: Annotated[Path | None, typer.Option(help="Folder of the store; GRASPD_DATA_DIR.")] = None,
+    publish: Annotated[bool, typer.Option("--publish", help="Publish to the store, for the dashboard.")] = False,
+    data_dir: Annotated[Path | None, typer.Option(help="Data folder of graspd; GRASPD_DATA_DIR.")] = None,
     json: JsonFlag = False,
 ) -> None:
-    """Drive integrators and the planner to failure, and draw the maps."""
+    """Map where integrators and the planner fail."""
     from graspd.studies.stability.report import markdown, write
 
     if unknown := [name for name in only or [] if name not in STUDIES]:
@@ -194,42 +196,43 @@ PEERS = ("fast_graspd", "graspit", "graspd2022", "dfc", "autograsp")
 @reporting_errors
 def chart(
     methods: Annotated[
-        str, typer.Option(help="Planners, with commas between; also as NAME:OPTION=VALUE@GRASPS_PER_CALL.")
+        str, typer.Option(help="Planners, separated by commas; also as NAME:OPTION=VALUE@GRASPS_PER_CALL.")
     ] = ",".join(PEERS),
-    hands: Annotated[str, typer.Option(help="URDFs or built-in hands, with commas between.")] = "allegro,barrett",
-    objects: Annotated[str, typer.Option(help="Meshes or built-in objects, with commas between.")] = "mug,bottle",
-    fidelities: Annotated[str, typer.Option(help="Of methods that have them, with commas between.")] = ",".join(
-        OFFERED
-    ),
-    batch: Annotated[str, typer.Option(help="Grasps per call, with commas between; each is run.")] = "32",
+    hands: Annotated[str, typer.Option(help="URDFs or built-in hands, separated by commas.")] = "allegro,barrett",
+    objects: Annotated[str, typer.Option(help="Meshes or built-in objects, separated by commas.")] = "mug,bottle",
+    fidelities: Annotated[
+        str, typer.Option(help="Fidelities of methods that have them, separated by commas.")
+    ] = ",".join(OFFERED),
+    batch: Annotated[str, typer.Option(help="Grasps per call, separated by commas; each is run.")] = "32",
     peer_batch: Annotated[int, typer.Option(min=1, help="Grasps per call of methods with a budget of steps.")] = 8,
-    repeats: Annotated[int, typer.Option(min=1, help="Timed calls of each setting on each hand and object.")] = 2,
+    repeats: Annotated[int, typer.Option(min=1, help="Timed calls per setting, hand and object.")] = 2,
     option: Annotated[
-        list[str] | None, typer.Option(help="METHOD:NAME=VALUE, such as graspit:steps=40000; several times.")
+        list[str] | None,
+        typer.Option(help="Option of a method as METHOD:NAME=VALUE, such as graspit:steps=40000; repeatable."),
     ] = None,
-    quick: Annotated[bool, typer.Option("--quick", help="Little of everything: seconds instead of an hour.")] = False,
-    sweep: Annotated[bool, typer.Option("--sweep", help="Also turn fast_graspd's knobs one at a time.")] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="Small run: seconds instead of an hour.")] = False,
+    sweep: Annotated[bool, typer.Option("--sweep", help="Sweep the knobs of fast_graspd, one at a time.")] = False,
     knob: Annotated[
-        list[str] | None, typer.Option(help="With --sweep: only this knob, such as 'contact solver'; several times.")
+        list[str] | None, typer.Option(help="With --sweep: only this knob, such as 'contact solver'; repeatable.")
     ] = None,
     threads: Annotated[int, typer.Option(min=0, help="CPU threads; 0: one per core.")] = 0,
-    device: Annotated[str, typer.Option(help="cpu, cuda:0 or auto.")] = "auto",
+    device: Annotated[str, typer.Option(help="Device: cpu, cuda:0 or auto.")] = "auto",
     out: Annotated[Path | None, typer.Option(help="Folder for chart.json, .csv, .md, .png and .svg.")] = None,
-    remark: Annotated[str, typer.Option(help="A sentence on the conditions, for the report.")] = "",
+    remark: Annotated[str, typer.Option(help="Note on the conditions, for the report.")] = "",
     scene: Annotated[
         str,
-        typer.Option(help="Other than free: planned in table, bin, shelf or a file, against free ones put there."),
+        typer.Option(help="free; or table, bin, shelf or a file: grasps planned there and free grasps placed there."),
     ] = "free",
     work: Annotated[
-        Path | None, typer.Option(help="With --scene: folder that keeps each result; a stopped run goes on there.")
+        Path | None, typer.Option(help="With --scene: folder of results, in which a stopped run continues.")
     ] = None,
     source: Annotated[
-        Path | None, typer.Option("--from", help="A chart.json: draw and publish it, measure nothing.")
+        Path | None, typer.Option("--from", help="Draw and publish a chart.json without measuring.")
     ] = None,
     publish: Annotated[
-        bool, typer.Option("--publish", help="Also into the store, for the dashboard and `fidelity: auto`.")
+        bool, typer.Option("--publish", help="Publish to the store, for the dashboard and `fidelity: auto`.")
     ] = False,
-    data_dir: Annotated[Path | None, typer.Option(help="Folder of the store; GRASPD_DATA_DIR.")] = None,
+    data_dir: Annotated[Path | None, typer.Option(help="Data folder of graspd; GRASPD_DATA_DIR.")] = None,
     json: JsonFlag = False,
 ) -> None:
     """Compare speed and accuracy: methods and fidelities on the same hands and objects, in MuJoCo."""
@@ -243,7 +246,7 @@ def chart(
         return
     turns(knobs=knob or ())  # report a wrong name before an hour of work
     if scene != "free" and sweep:
-        raise InputError("--sweep is of free objects' charts; leave out --scene")
+        raise InputError("--sweep is for charts of free objects; omit --scene")
     place = _place(scene)
     on = ExecutionContext(Device(device).resolve(), threads)
     batches, models_around = [_number(part) for part in _parts(batch)], ROBUST_MODELS

@@ -39,16 +39,16 @@ FEWER: Final = 3
 @with_options(LocalOptions, "synth")
 @reporting_errors
 def synth(
-    hand: Annotated[str, typer.Option(help="A URDF, a ZIP with one, or the name of a built-in hand.")],
-    object_: Annotated[str, typer.Option("--object", help="A mesh (STL, OBJ, PLY, GLB, OFF) or a built-in object.")],
+    hand: Annotated[str, typer.Option(help="URDF, ZIP with a URDF, or name of a built-in hand.")],
+    object_: Annotated[str, typer.Option("--object", help="Mesh (STL, OBJ, PLY, GLB, OFF) or built-in object.")],
     out: Annotated[Path, typer.Option("-o", "--out", help="HDF5 file to write.")],
     options: dict[str, Any],
     json: JsonFlag = False,
 ) -> None:
-    """Make grasps of one hand on one object as a job does, validated and measured, into an HDF5 file.
+    """Generate, validate and measure grasps of one hand on one object as a job does; write an HDF5 file.
 
-    In a scene a grasp is valid if approach, closing and lift touch nothing else, and the lifted object is held.
-    Exit code 3: fewer grasps were found than requested. Ctrl-C saves the validated ones.
+    A grasp in a scene is valid if approach, closing and lift touch nothing else and the lifted object is held.
+    Exit code 3: fewer grasps than requested. Ctrl-C saves the validated ones.
     """
     from graspd.worker.files.provenance import id_of_columns  # help and completion need no engine
     from graspd.worker.files.synthesis import synthesized_as
@@ -84,7 +84,7 @@ def synth(
     else:
         typer.echo(_said(found | ({"reason": None} if made.interrupted else {})))
     if made.interrupted:
-        fail(f"interrupted: {out} holds the {found['grasps']} of {asked.grasps} grasps that were there", 128 + stop[0])
+        fail(f"interrupted: {out} contains {found['grasps']} of {asked.grasps} grasps", 128 + stop[0])
     if made.reason is not None:
         raise typer.Exit(FEWER)
 
@@ -121,12 +121,12 @@ def _said_of_models(found: dict[str, Any]) -> str:
     share, not_robust = found["robust_share"], found["not_robust"]
     if share is None:
         return (
-            f"none is robust; {not_robust} hold in the nominal model, and in too few of {found['robust_models']} others"
+            f"none is robust; {not_robust} hold in the nominal model, but in too few of {found['robust_models']} others"
         )
     models = f"of {found['robust_models']} models around the nominal one"
     if not (wanted := found["robust_wanted"]) or found["want"] != "valid":
         return f"they hold in {share:.0%} {models}"
-    return f"each holds in {wanted:.0%} {models} or more; {not_robust} valid ones did not"
+    return f"each holds in {wanted:.0%} {models} or more; {not_robust} held grasps are not robust"
 
 
 def _said(found: dict[str, Any]) -> str:

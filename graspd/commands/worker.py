@@ -23,27 +23,31 @@ app = typer.Typer(no_args_is_help=True)
 @app.command(epilog="graspd worker --workers 4 --stages synthesize,render")
 @reporting_errors
 def worker(
-    device: Annotated[str | None, typer.Option(help="cpu, cuda:0, ... or auto; GRASPD_DEVICE.")] = None,
-    stages: Annotated[str | None, typer.Option(help="Stages to serve, with commas between; default: all.")] = None,
-    workers: Annotated[int, typer.Option(min=1, help="Processes; with device auto each takes the next GPU.")] = 1,
-    threads: Annotated[int | None, typer.Option(min=0, help="CPU threads, 0: one per core; GRASPD_THREADS.")] = None,
+    device: Annotated[str | None, typer.Option(help="Device: cpu, cuda:0, ... or auto; GRASPD_DEVICE.")] = None,
+    stages: Annotated[str | None, typer.Option(help="Stages to serve, separated by commas; default: all.")] = None,
+    workers: Annotated[
+        int, typer.Option(min=1, help="Worker processes; with device auto each takes the next GPU.")
+    ] = 1,
+    threads: Annotated[int | None, typer.Option(min=0, help="CPU threads; 0: one per core; GRASPD_THREADS.")] = None,
     join: Annotated[
-        str | None, typer.Option(help="Batches of one pair that are planned in one launch, or auto; GRASPD_JOIN.")
+        str | None, typer.Option(help="Batches of one pair per launch of the planner, or auto; GRASPD_JOIN.")
     ] = None,
     processes: Annotated[
         int | None,
-        typer.Option(min=0, help="Processes that validate and measure, 0: with a GPU one a core; GRASPD_PROCESSES."),
+        typer.Option(
+            min=0, help="Processes for validation and metrics; 0: with a GPU, one per core; GRASPD_PROCESSES."
+        ),
     ] = None,
-    burst: Annotated[bool, typer.Option("--burst", help="End when no task waits.")] = False,
-    idle: Annotated[int, typer.Option(min=0, help="With --burst: end when none came for so long [s].")] = 0,
-    once: Annotated[bool, typer.Option("--once", help="End after one task.")] = False,
-    max_tasks: Annotated[int | None, typer.Option(min=1, help="End after this many tasks.")] = None,
+    burst: Annotated[bool, typer.Option("--burst", help="Exit when no task waits.")] = False,
+    idle: Annotated[int, typer.Option(min=0, help="With --burst: exit after this time without a task [s].")] = 0,
+    once: Annotated[bool, typer.Option("--once", help="Exit after one task.")] = False,
+    max_tasks: Annotated[int | None, typer.Option(min=1, help="Exit after this many tasks.")] = None,
     check: Annotated[
-        bool, typer.Option("--check", help="Start none; exit code 1 says that none lives on this host.")
+        bool, typer.Option("--check", help="Only check for a live worker on this host; exit code 1 if there is none.")
     ] = False,
-    data_dir: Annotated[Path | None, typer.Option(help="Folder of everything graspd keeps; GRASPD_DATA_DIR.")] = None,
+    data_dir: Annotated[Path | None, typer.Option(help="Data folder of graspd; GRASPD_DATA_DIR.")] = None,
 ) -> None:
-    """Run one or several workers, each on one device: they take tasks from the queue until stopped."""
+    """Run one or several workers, each on one device, until stopped."""
     settings = load_settings(device=device, threads=threads, join=join, processes=processes, data_dir=data_dir)
     log_to_stderr(settings, "worker")
     keep_private(settings)
@@ -111,7 +115,7 @@ def check_worker(settings: Settings) -> None:
     queue = open_queue(settings, patience=0)
     try:
         if not any(beat.host == host for beat in queue.workers()):
-            raise UnavailableError(f"no worker on {host} gave a sign of life lately; start `graspd worker`")
+            raise UnavailableError(f"no worker on {host} sent a heartbeat lately; start `graspd worker`")
     finally:
         queue.close()
 

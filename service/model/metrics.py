@@ -164,7 +164,7 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
         "robustness",
         "1",
         "share of positive verdicts under noise of 1 mm and 1 degree on the object",
-        title="Verdicts that survive noise",
+        title="Share held under noise",
         short="Robustness",
         optional=True,
         indexed=IndexLevel.KEPT,
@@ -177,7 +177,7 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
         "1",
         "share of perturbed models in which the grasp holds; nan: not tested. If the test ended "
         "early: a lower bound, or an upper bound below the required share",
-        title="Models survived",
+        title="Robust share",
         short="Robust",
         optional=True,
         indexed=IndexLevel.OFFERED,

@@ -29,28 +29,31 @@ from graspd.service.telemetry import HeartbeatFile
 log = logging.getLogger(__name__)
 
 app = typer.Typer(no_args_is_help=True)
-index_app = typer.Typer(no_args_is_help=True, help="Rebuild the index from the store, or export its tables.")
+index_app = typer.Typer(no_args_is_help=True, help="Rebuild the index from the store or export its tables.")
 app.add_typer(index_app, name="index")
 
-DataDir = Annotated[Path | None, typer.Option("--data-dir", help="Folder of everything graspd keeps; GRASPD_DATA_DIR.")]
+DataDir = Annotated[Path | None, typer.Option("--data-dir", help="Data folder of graspd; GRASPD_DATA_DIR.")]
 
 
 @app.command(epilog="graspd up --workers 2 --port 8000")
 @reporting_errors
 def up(
     workers: Annotated[int, typer.Option(min=0, help="Worker processes on this machine.")] = 1,
-    host: Annotated[str | None, typer.Option(help="Address the API binds; GRASPD_HOST.")] = None,
-    port: Annotated[int | None, typer.Option(min=0, max=65535, help="Port of the API, 0: any; GRASPD_PORT.")] = None,
+    host: Annotated[str | None, typer.Option(help="Address of the API; GRASPD_HOST.")] = None,
+    port: Annotated[
+        int | None, typer.Option(min=0, max=65535, help="Port of the API; 0: any free port; GRASPD_PORT.")
+    ] = None,
     device: Annotated[str | None, typer.Option(help="Device of the workers: cpu, cuda:0, auto; GRASPD_DEVICE.")] = None,
     share: Annotated[
         Path | None,
-        typer.Option(help="Share the queue with other machines: write to this file what their workers need."),
+        typer.Option(help="Share the queue with other machines; write the settings of their workers to this file."),
     ] = None,
     share_host: Annotated[
-        str | None, typer.Option(help="With --share: how they call this machine; default: its name.")
+        str | None,
+        typer.Option(help="With --share: address of this machine for their workers; default: its host name."),
     ] = None,
     redis_port: Annotated[
-        int, typer.Option(min=0, max=65535, help="With --share: port of Redis for them; 0: any free one.")
+        int, typer.Option(min=0, max=65535, help="With --share: port of Redis for their workers; 0: any free port.")
     ] = 0,
     data_dir: DataDir = None,
     json: JsonFlag = False,
@@ -83,10 +86,12 @@ def up(
 @app.command(epilog="graspd controller")
 @reporting_errors
 def controller(
-    check: Annotated[bool, typer.Option("--check", help="Start none; exit code 1 says that none lives.")] = False,
+    check: Annotated[
+        bool, typer.Option("--check", help="Only check for a live controller; exit code 1 if there is none.")
+    ] = False,
     data_dir: DataDir = None,
 ) -> None:
-    """Run lease reaper, delayed retries and indexer. One leads, others stand by; `graspd up` starts one."""
+    """Run the controller: lost leases, retries, index. One leads, others stand by; `graspd up` starts one."""
     settings = load_settings(data_dir=data_dir)
     log_to_stderr(settings, "controller")
     keep_private(settings)
@@ -147,15 +152,15 @@ def _identify(settings: Settings, stop: threading.Event, alive: HeartbeatFile) -
 @index_app.command(epilog="graspd admin index rebuild --check")
 @reporting_errors
 def rebuild(
-    check: Annotated[bool, typer.Option("--check", help="Change nothing; print what would change.")] = False,
+    check: Annotated[bool, typer.Option("--check", help="Print differences without changing anything.")] = False,
     data_dir: DataDir = None,
     json: JsonFlag = False,
 ) -> None:
     """Rebuild the index from the store, and make this service its owner.
 
-    An index of another version of graspd gets the tables of this version.
+    An index of another graspd version is replaced by one with the tables of this version.
 
-    With --check exit code 1: they differ, or a shard is damaged.
+    With --check, exit code 1 means: index and store differ, or a shard is damaged.
     """
     from graspd.service.index.rebuild import differences
     from graspd.service.index.rebuild import rebuild as fill
@@ -175,20 +180,20 @@ def rebuild(
 
     try:
         was = index.database.was
-        found = [f"the index was of revision {was}; it has other tables now"] if was else differences(index, store)
+        found = [f"the index had revision {was}; its tables are replaced"] if was else differences(index, store)
         if check:
             found += [f"{wrong.key}: {wrong.what}" for _, wrong in scan(store, names.SHARDS) if wrong is not None]
         counts: dict[str, int] = {} if check else make()
     except IndexDamaged:
         if check:
             raise
-        found, counts = ["the file of the index was damaged; a new one took its place"], make()
+        found, counts = ["the index file was damaged and is replaced"], make()
     if json:
         emit({"differences": found, "changed": bool(found) and not check, **counts})
     else:
         for line in found:
             typer.echo(line)
-        typer.echo("the index is what the store says" if not found else f"{len(found)} differences", err=True)
+        typer.echo("the index matches the store" if not found else f"{len(found)} differences", err=True)
     services.close()
     if check and found:
         raise typer.Exit(1)
@@ -197,7 +202,7 @@ def rebuild(
 @index_app.command(epilog="graspd admin index export -o tables")
 @reporting_errors
 def export(
-    output: Annotated[Path, typer.Option("--output", "-o", help="Folder that gets a file for each table.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write, with a file for each table.")],
     data_dir: DataDir = None,
     json: JsonFlag = False,
 ) -> None:
@@ -242,7 +247,7 @@ def check_controller(settings: Settings) -> None:
     queue = open_queue(settings, patience=0)
     try:
         if not queue.announced(PART):
-            raise UnavailableError("no controller gave a sign of life lately; start `graspd controller`")
+            raise UnavailableError("no controller sent a heartbeat lately; start `graspd controller`")
     finally:
         queue.close()
 

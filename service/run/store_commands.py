@@ -12,27 +12,27 @@ from graspd.service.model import names
 from graspd.service.model.errors import ConflictError
 
 app = typer.Typer(no_args_is_help=True)
-store_app = typer.Typer(no_args_is_help=True, help="Check the store, and fix it.")
+store_app = typer.Typer(no_args_is_help=True, help="Verify and repair the store.")
 app.add_typer(store_app, name="store")
 
 
 @store_app.callback()
 def store() -> None:
-    """Check and repair the store."""
+    """Verify and repair the store."""
 
 
 @store_app.command(epilog="graspd admin store verify --repair")
 @reporting_errors
 def verify(
     repair: Annotated[
-        bool, typer.Option("--repair", help="Move what is damaged aside and queue what can be made again.")
+        bool, typer.Option("--repair", help="Move damaged objects aside and queue the tasks that make them again.")
     ] = False,
-    data_dir: Annotated[Path | None, typer.Option("--data-dir", help="Folder of everything graspd keeps.")] = None,
+    data_dir: Annotated[Path | None, typer.Option("--data-dir", help="Data folder of graspd; GRASPD_DATA_DIR.")] = None,
     json: JsonFlag = False,
 ) -> None:
-    """Verify all objects of the store and report damaged or missing ones; exit code 1 if there are any.
+    """Verify all objects of the store and report damaged or missing ones; exit code 1 if any remain.
 
-    The controller's integrity scan pauses meanwhile; a second call is refused.
+    The controller's integrity scan pauses meanwhile; a concurrent call is refused.
     """
     from graspd.service.pipeline.backends import Services
     from graspd.service.pipeline.identity import identify_if_redis_answers
@@ -71,7 +71,7 @@ def verify(
         )
     else:
         for one in repaired:
-            typer.echo(f"{one.key}: {one.what}; moved aside, and made again if a job needs it")
+            typer.echo(f"{one.key}: {one.what}; moved aside; made again if a job needs it")
         for one in left:
             typer.echo(f"{one.key}: {one.what}")
         more = f"; {len(unsealed)} objects that graspd 0.2 wrote have no checksum of their own" if unsealed else ""
@@ -83,7 +83,7 @@ def verify(
 @store_app.command(epilog="graspd admin store upgrade")
 @reporting_errors
 def upgrade(
-    data_dir: Annotated[Path | None, typer.Option("--data-dir", help="Folder of everything graspd keeps.")] = None,
+    data_dir: Annotated[Path | None, typer.Option("--data-dir", help="Data folder of graspd; GRASPD_DATA_DIR.")] = None,
     json: JsonFlag = False,
 ) -> None:
     """Replace packs of graspd 0.2 by one file per shard; a controller does the same at its start."""
@@ -95,4 +95,4 @@ def upgrade(
     if json:
         emit({"shards": shards})
     else:
-        typer.echo(f"{shards} shards were taken out of packs", err=True)
+        typer.echo(f"{shards} shards extracted from packs", err=True)

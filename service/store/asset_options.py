@@ -49,8 +49,8 @@ class SweptOptions(ObjectOptions):
     )
 
 
-LicenceOption = Annotated[str | None, typer.Option("--licence", help="Terms of use, for dataset cards: CC-BY-4.0.")]
-SourceOption = Annotated[str | None, typer.Option("--source", help="Source: an address or a citation.")]
+LicenceOption = Annotated[str | None, typer.Option("--licence", help="Licence for dataset cards, such as CC-BY-4.0.")]
+SourceOption = Annotated[str | None, typer.Option("--source", help="Source: a URL or a citation.")]
 
 
 def provenance(licence: str | None, source: str | None) -> dict[str, Any]:

@@ -20,7 +20,7 @@ Row = Mapping[str, Any]
 PANELS: Final = (
     ("Success under the DexGraspBench protocol", "dexgraspbench"),
     ("Success at half the friction", "hard"),
-    ("Robust share of those that hold", "robust"),
+    ("Robust share of held grasps", "robust"),
     ("ε (median)", "epsilon"),
     ("Penetration, mm (median; less is better)", "pd_mm"),
 )
@@ -28,7 +28,7 @@ IN_SCENES: Final = (
     ("Lifted, share of all candidates", "lift"),
     ("Lifted under the DexGraspBench protocol", "lift_dexgraspbench"),
     ("Lifted at half the friction", "lift_hard"),
-    ("Robust share of those lifted", "robust"),
+    ("Robust share of lifted grasps", "robust"),
 )
 SPEED: Final = "end_to_end_per_second"
 #: Shares.

@@ -147,7 +147,7 @@ def test_a_refused_file_stays_and_runs_once_its_units_are_right(real_page: Any, 
     assert page.input_value("#object") == ""
     assert page.get_attribute("[data-thing=object] figure", "data-state") == "none"
     assert "--" not in page.inner_text("[data-thing=object] [data-found]")
-    page.click("button:has-text('Read it as millimetres: 60 mm long')")
+    page.click("button:has-text('Read in millimetres: 60 mm long')")
     page.wait_for_selector("[data-thing=object] [data-found][data-state=good]")
     assert page.input_value("#units") == "mm"
     assert "60 x 40 x 50 mm" in page.inner_text("[data-thing=object] [data-found]")

@@ -63,7 +63,7 @@ def test_a_wrong_guess_is_corrected_and_kept_as_a_hand(page: Any, services: Serv
     page.set_viewport_size({"width": 700, "height": 700})
     page.goto("/hands")
     page.click("text=claw")
-    assert page.inner_text("#shown") == "A worker looks at it: what it finds is shown here."
+    assert page.inner_text("#shown") == "A worker checks the hand; its findings appear here."
     checked(services, "claw")
     page.wait_for_selector(".viewer[data-state=ready]")
     assert colours(page.locator(".viewer canvas")) > 50
@@ -98,7 +98,7 @@ def test_a_wrong_guess_is_corrected_and_kept_as_a_hand(page: Any, services: Serv
     page.click("[data-take]")
     page.uncheck("[name=fingertip][value=c]")
     page.fill("[name=name]", "claw-right")
-    page.click("text=Save as a hand of its own")
+    page.click("text=Save as a new hand")
     page.wait_for_url(lambda url: "/hands/" in url and not url.endswith("claw"))
     assert page.inner_text("h1") == "claw-right"
     checked(services, "claw-right")

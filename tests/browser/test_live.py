@@ -93,13 +93,13 @@ def test_chosen_cells_stay_chosen_while_the_matrix_moves(page: Any, services: Se
     finish_all(services, add_job(services))
     page.wait_for_selector("td.succeeded")
     assert page.is_checked("input[value='allegro|mug']")
-    assert page.inner_text("[data-chosen]") == "1 cell chosen"
+    assert page.inner_text("[data-chosen]") == "1 cell selected"
 
 
 def test_a_press_on_a_head_takes_and_submits_the_column(page: Any) -> None:
     page.goto("/datasets")
     page.click("thead button:has-text('allegro')")
-    assert page.inner_text("[data-chosen]") == "3 cells chosen"
+    assert page.inner_text("[data-chosen]") == "3 cells selected"
     page.click(".act button[value=submit]")
     page.wait_for_selector("text=3 jobs submitted")
     assert page.locator("td.queued").count() == 3
@@ -134,7 +134,7 @@ def a_look_later(page: Any) -> None:
 def test_a_chart_that_is_published_appears(page: Any, services: Services) -> None:
     page.clock.install()
     page.goto("/chart")
-    page.wait_for_selector("text=Nothing is measured yet")
+    page.wait_for_selector("text=No measurements yet")
     services.store.put("charts/20261121T120000Z.json", json.dumps(CHART).encode())
     a_look_later(page)
     page.wait_for_selector(".trade circle")
@@ -143,7 +143,7 @@ def test_a_chart_that_is_published_appears(page: Any, services: Services) -> Non
 def test_maps_that_are_published_appear_and_say_what_a_cell_is(page: Any, services: Services) -> None:
     page.clock.install()
     page.goto("/stability")
-    page.wait_for_selector("text=Nothing is measured yet")
+    page.wait_for_selector("text=No measurements yet")
     publish(services.store, "stability", a_record())
     a_look_later(page)
     page.wait_for_selector(".cells td.broken")
@@ -235,7 +235,7 @@ def test_every_page_reads_without_javascript(address: str, page: Any, places: li
     assert "Penetration" in of("/grasps/")
     assert "allegro × mug" in of("/grasps")
     assert "kitchen" in of("/datasets")
-    assert "Save as a hand of its own" in of("/hands/")
+    assert "Save as a new hand" in of("/hands/")
     assert "standard" in of("/chart")
     assert "hands sink in" in of("/stability")
 
@@ -250,7 +250,7 @@ def test_a_dataset_is_deleted_by_its_name_and_comes_back(page: Any, services: Se
     page.goto("/datasets/kitchen")
     page.click("button:has-text('Delete')")
     dialog = page.get_by_role("dialog")
-    assert "32 grasps" in dialog.inner_text() and "Its snapshots go too" in dialog.inner_text()
+    assert "32 grasps" in dialog.inner_text() and "Delete its snapshots too" in dialog.inner_text()
     dialog.get_by_role("button", name="Delete").click()
     assert dialog.is_visible(), "the browser asks for the name and the snapshots"
     dialog.get_by_role("button", name="Keep it").click()
@@ -282,11 +282,11 @@ def test_grasps_are_chosen_tagged_found_and_exported_by_keyboard(page: Any, serv
     for row in (0, 2):
         boxes.nth(row).focus()
         page.keyboard.press("Space")
-    assert page.inner_text("[data-chosen]") == "2 grasps chosen"
+    assert page.inner_text("[data-chosen]") == "2 grasps selected"
     page.fill("form.choose input[name=tag]", "good")
     page.keyboard.press("Tab")
     page.keyboard.press("Enter")
-    page.wait_for_selector("text=2 grasps given the tag good.")
+    page.wait_for_selector("text=2 grasps tagged good.")
     page.select_option("#tag", "good")
     page.wait_for_url("**tag=good**")
     page.wait_for_selector("#found .tag-head")
@@ -298,4 +298,4 @@ def test_grasps_are_chosen_tagged_found_and_exported_by_keyboard(page: Any, serv
     assert Path(download.value.path()).read_text().count("\n") == 3
     page.fill("#where", "epsilon > 1000")
     page.keyboard.press("Enter")
-    page.wait_for_selector("text=No grasp fits these filters")
+    page.wait_for_selector("text=No grasp matches these filters")

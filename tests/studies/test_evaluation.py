@@ -199,7 +199,7 @@ def test_the_command_prints_json_or_a_table(shared_data: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        (["--joint-map", "FFJ3=bend"], "name that hand"),
+        (["--joint-map", "FFJ3=bend"], "needs --validation-hand"),
         (["--validation-hand", "shadow", "--joint-map", "FFJ3"], "must be OURS=THEIRS"),
         (["--validation-hand", "shadow", "--joint-map", "FFJ3=a,FFJ3=b"], "once for each joint"),
         (["--validation-hand", "shadow", "--joint-map", "FFJ3=bend,FFJ4=knuckle"], "grasps.h5"),

@@ -109,7 +109,7 @@ def test_a_file_that_is_no_chart_is_refused_in_a_line(tmp_path: Path, content: s
     done = CliRunner().invoke(app, ["chart", "--from", str(file)])
     assert done.exit_code == 2 and words in " ".join(done.output.split())
     done = CliRunner().invoke(app, ["chart", *ARGUMENTS, "--objects", "block", "--sweep"])
-    assert done.exit_code == 2 and "leave out --scene" in done.output
+    assert done.exit_code == 2 and "omit --scene" in done.output
 
 
 def test_seconds_are_those_of_the_clock_of_the_settings_device(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -92,9 +92,9 @@ def write_subset(shards: Shards, choose: Chooser, out: Path, *, said: Mapping[st
 
 UnvalidatedOption = Annotated[
     bool,
-    typer.Option("--unvalidated", help="Instead of valid grasps those that are feasible and that are not validated."),
+    typer.Option("--unvalidated", help="Select feasible grasps without validation instead of valid ones."),
 ]
-EveryOption = Annotated[bool, typer.Option("--all", help="All grasps, also those that failed.")]
+EveryOption = Annotated[bool, typer.Option("--all", help="Select all grasps, including failed ones.")]
 
 
 def choose(base: Shard, *, unvalidated: bool = False, every: bool = False) -> tuple[NDArray[np.bool_], str]:

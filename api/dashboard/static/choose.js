@@ -8,7 +8,7 @@
   function tell(form) {
     const what = form.dataset.choose, count = boxes(form).filter((box) => box.checked).length;
     const all = form.querySelector("input[name=all]"), every = form.querySelector("input[data-every]");
-    const said = all?.checked ? all.dataset.said : count ? `${count} ${what}${count === 1 ? "" : "s"} chosen` : `Choose ${what}s`;
+    const said = all?.checked ? all.dataset.said : count ? `${count} ${what}${count === 1 ? "" : "s"} selected` : `Select ${what}s`;
     form.querySelector("[data-chosen]").textContent = said;
     for (const button of form.querySelectorAll("button[data-acts]")) button.disabled = count === 0 && !all?.checked;
     if (every) {

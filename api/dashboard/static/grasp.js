@@ -98,6 +98,6 @@ function wire(figure, { stage, hand, thing, scenery, contacts, slider, way, show
 for (const figure of document.querySelectorAll("[data-viewer=grasp]")) {
   start(figure).catch((error) => {
     figure.dataset.state = "failed";
-    figure.querySelector("[data-say]").textContent = `No 3D view: ${error.message}. The numbers beside it are complete.`;
+    figure.querySelector("[data-say]").textContent = `No 3D view: ${error.message}. The page lists all numbers.`;
   });
 }

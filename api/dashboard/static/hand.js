@@ -207,7 +207,7 @@ function find() {
     figure.dataset.state = "reading";
     start(figure).catch((error) => {
       figure.dataset.state = "failed";
-      figure.querySelector("[data-say]").textContent = `No 3D view: ${error.message}. The form beside it is complete.`;
+      figure.querySelector("[data-say]").textContent = `No 3D view: ${error.message}. The form lists all settings.`;
     });
   }
 }

@@ -100,7 +100,7 @@
         show("", `${file.name} (refused)`, "");
         say(error.message, "bad");
         if (error.page) said.innerHTML = error.page;
-        hold(thing, `${file.name} was refused: fix that, or choose a known ${kind}.`);
+        hold(thing, `${file.name} was refused: fix that, or select a known ${kind}.`);
       }
     }
 

@@ -39,7 +39,7 @@ def test_service_and_job_count_as_tries_only_what_was_validated(http: TestClient
     assert (told["unvalidated"]["validated"], told["unvalidated"]["valid_yield"]) == (0, None)
     words = f"{int(100 * share(http, jobs['validated']) + 1e-9)} %"
     home = http.get("/").text
-    assert words in home and "320 more are not validated" in home
+    assert words in home and "320 candidates not validated" in home
     assert words in http.get("/datasets").text
 
 

@@ -142,7 +142,7 @@ def test_what_is_deleted_by_a_word_is_restored(graspd: Shell, kind: str) -> None
     command, group = kind.split(), kind.split()[:-1]
     done = graspd(*command, name)
     assert (done.returncode, done.stdout) == (2, "")
-    assert "--yes deletes it without asking" in said(done)
+    assert "--yes deletes without it" in said(done)
     gone = graspd(*command, name, "--yes")
     assert gone.returncode == 0, gone.stderr
     done = graspd(*group, "restore", name)

@@ -65,9 +65,9 @@ def test_a_folder_of_objects_lies_beside_the_spec(tmp_path: Path) -> None:
         ("hands = [", "is no TOML"),
         ('hands = ["allegro"]\ncolour = 1', "colour"),
         ('hands = ["allegro"]\ngrasps = 0', "grasps"),
-        ("grasps = 3\ntotal_grasps = 4", "say one of them"),
-        ('hands = ["allegro"]', "say which objects"),
-        ('objects = ["mug"]', "say which hands"),
+        ("grasps = 3\ntotal_grasps = 4", "give one of them"),
+        ('hands = ["allegro"]', "give the objects"),
+        ('objects = ["mug"]', "give the hands"),
     ],
 )
 def test_a_spec_that_cannot_be_used_says_what_is_wrong(tmp_path: Path, text: str, words: str) -> None:

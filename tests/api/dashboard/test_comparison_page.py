@@ -31,13 +31,13 @@ def test_the_page_shows_what_differs_and_every_cell(http: TestClient, services: 
     assert "Objects of its own</th>" in page and ">block</td>" in page
     assert page.count("<td>allegro</td>") == 2
     assert page.count('<figure class="card histo twin">') > 3
-    assert "They ask for the same" not in page
+    assert "options are the same" not in page
 
 
 def test_a_dataset_beside_itself_differs_in_nothing(http: TestClient, services: Services) -> None:
     _two(services)
     page = http.get("/compare", params={"one": "rough", "other": "rough"}).text
-    assert "They ask for the same" in page and "+0 points" in page
+    assert "options are the same" in page and "+0 points" in page
     assert "No grasp yet" in http.get("/compare", params={"one": "fine", "other": "fine"}).text
     assert http.get("/compare", params={"one": "rough", "other": "gone"}).status_code == 404
     page = http.get("/compare").text

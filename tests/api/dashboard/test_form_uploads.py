@@ -101,7 +101,7 @@ def test_a_file_that_cannot_be_kept_is_asked_for_again(http: TestClient, service
     page = http.post("/submit", data=FORM, files={"file": ("notes.txt", b"hello")})
     assert "notes.txt holds no object file" in page.text
     again = http.post("/submit", data=fields_of(page.text))
-    assert again.status_code == 422 and "choose a known object, or a file" in again.text
+    assert again.status_code == 422 and "select a known object, or a file" in again.text
     assert jobs(services) == []
 
 
@@ -114,12 +114,12 @@ def test_a_mistake_in_another_field_keeps_the_file(http: TestClient, services: S
 
 def test_a_form_that_names_no_known_object_gets_none(http: TestClient, services: Services) -> None:
     answer = http.post("/submit", data={key: value for key, value in FORM.items() if key != "object"})
-    assert answer.status_code == 422 and "choose a known object, or a file" in answer.text
+    assert answer.status_code == 422 and "select a known object, or a file" in answer.text
     assert http.post("/submit", data=FORM | {"object": "", "object_held": "0" * 32}).status_code == 422
     assert jobs(services) == []
     page = http.get("/submit", params={"object": "lost"}).text
     assert fields_of(page)["object"] == "lost"
-    assert "lost (not known here)" in page
+    assert "lost (unknown)" in page
 
 
 #: What the check of a mesh in millimetres tells beside its message.
@@ -144,9 +144,9 @@ def test_a_refusal_is_told_in_words_with_buttons(http: TestClient, services: Ser
     for page in (whole, part):
         assert "the mesh is 60 m long" in page and "a thing of 60 m" not in page
         assert list(fixes_of(page)) == [
-            "Read it as millimetres: 60 mm long",
-            "Read it as centimetres: 600 mm long",
-            "Scale it to this size",
+            "Read in millimetres: 60 mm long",
+            "Read in centimetres: 600 mm long",
+            "Scale to this size",
         ]
     assert "<html" not in part
 
@@ -154,8 +154,8 @@ def test_a_refusal_is_told_in_words_with_buttons(http: TestClient, services: Ser
 @pytest.mark.parametrize(
     ("words", "field", "said"),
     [
-        ("Read it as millimetres: 60 mm long", {}, {"units": "mm"}),
-        ("Scale it to this size", {"object_scale_to": "120"}, {"scale_to": 0.12}),
+        ("Read in millimetres: 60 mm long", {}, {"units": "mm"}),
+        ("Scale to this size", {"object_scale_to": "120"}, {"scale_to": 0.12}),
     ],
 )
 def test_the_button_of_a_fix_checks_again_and_submits_nothing(
@@ -173,7 +173,7 @@ def test_the_button_of_a_fix_checks_again_and_submits_nothing(
 def test_a_fix_without_its_number_asks_for_it(http: TestClient, services: Services, typed: str) -> None:
     uploaded(http, services, "refuse", TOO_LARGE)
     page = http.post("/submit", data=FORM, files={"file": MESH}).text
-    fix = fixes_of(page)["Scale it to this size"]
+    fix = fixes_of(page)["Scale to this size"]
     again = http.post("/submit", data=fields_of(page) | {"object_scale_to": typed, "object_fix": fix})
     assert again.status_code == 422 and "Longest side [mm]" in again.text
     assert fields_of(again.text)["object_held"] == fields_of(page)["object_held"]
@@ -182,10 +182,10 @@ def test_a_fix_without_its_number_asks_for_it(http: TestClient, services: Servic
 @pytest.mark.parametrize(
     ("suggested", "words"),
     [
-        ({"keep_largest": True}, "Keep the largest part alone"),
-        ({"compound": True}, "Take the parts as one rigid body"),
-        ({"allow_open": True}, "Take it as it is, open"),
-        ({"root": "palm"}, "Begin the hand at palm"),
+        ({"keep_largest": True}, "Keep only the largest part"),
+        ({"compound": True}, "Treat the parts as one rigid body"),
+        ({"allow_open": True}, "Accept the open mesh"),
+        ({"root": "palm"}, "Use palm as root link"),
         ({"fix": {"wrist": 0}}, "Fix wrist at 0"),
     ],
 )
@@ -201,7 +201,7 @@ def test_facts_that_an_upload_says_of_itself_break_no_page(http: TestClient, ser
     odd = {"units_suggested": "mm", "options_suggested": [3, {}, {"a": 1}, {"root": "<b>"}], "lengths_m": [1]}
     asset = uploaded(http, services, "refuse", odd)
     page = http.get(f"/submit/refusals/object/{asset.digest}").text
-    assert list(fixes_of(page)) == ["Begin the hand at &lt;b&gt;"]
+    assert list(fixes_of(page)) == ["Use &lt;b&gt; as root link"]
 
 
 def test_what_was_refused_can_be_chosen_nowhere(http: TestClient, services: Services) -> None:

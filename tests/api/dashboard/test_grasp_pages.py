@@ -83,15 +83,15 @@ def test_grasps_of_a_scene_job_say_where_they_are_for(http: TestClient, services
     assert '<span class="note">table</span>' in page and 'aria-current="true">valid in a scene' in page
     assert '<span class="note">table</span>' not in http.get("/grasps", params={"scene": "free"}).text
     assert "valid grasps on a table" in " ".join(http.get(f"/jobs/{table.id}").text.split())
-    assert "Valid in their scenes" in http.get(f"/jobs/{table.id}").text
-    assert "Valid in their scenes" not in http.get(f"/jobs/{free.id}").text
+    assert "Valid in scenes" in http.get(f"/jobs/{table.id}").text
+    assert "Valid in scenes" not in http.get(f"/jobs/{free.id}").text
 
 
 def test_robust_grasps_are_found_by_share_and_first_failure(http: TestClient, services: Services) -> None:
     plain = finish_all(services, add_job(services))[0].shard_id
     document = http.get(f"/v1/grasps/{plain}/0").json()
     assert (document["robust_share"], document["robust_weakest"]) == (None, None)
-    assert "Models survived" not in http.get(f"/grasps/{plain}/0").text
+    assert "Robust share" not in http.get(f"/grasps/{plain}/0").text
     job = add_job(services, robust_models=8)
     manifest = finish_all(services, job)[0]
     shard = read_shard(services.store.get(manifest.key))
@@ -109,9 +109,9 @@ def test_robust_grasps_are_found_by_share_and_first_failure(http: TestClient, se
     assert found(robust_weakest="friction") == set(np.flatnonzero(weakest == Axis.FRICTION).tolist())
     assert http.get("/v1/grasps", params={"robust_weakest": "luck"}).status_code == 422
     page = http.get(f"/grasps/{manifest.shard_id}/{row}").text
-    assert "Models survived" in page and f"first lost to {AXIS_MEANINGS[Axis(int(weakest[row]))]}" in page
+    assert "Robust share" in page and f"first failure: {AXIS_MEANINGS[Axis(int(weakest[row]))]}" in page
     listed = http.get("/grasps", params={"min_robust_share": 0.75, "view": "table"}).text
-    assert 'name="min_robust_share"' in listed and "Fails first along" in listed
+    assert 'name="min_robust_share"' in listed and "First failure" in listed
 
 
 def test_forms_tag_chosen_grasps_and_lead_back_to_the_list(http: TestClient, services: Services) -> None:
@@ -125,12 +125,12 @@ def test_forms_tag_chosen_grasps_and_lead_back_to_the_list(http: TestClient, ser
     filters = {"filter": f"job={record.id}&valid=false", "here": "/grasps", "view": "table"}
     back = does("tag", grasp=[f"{shard}:1", f"{shard}:2"], **filters)
     assert back == f"/grasps?job={record.id}&valid=false&view=table&did=tagged&done=2&named=good"
-    assert "2 grasps given the tag good." in http.get(back).text
+    assert "2 grasps tagged good." in http.get(back).text
     assert does("untag", all="true", filter="tag=good", here=f"/jobs/{record.id}").startswith(f"/jobs/{record.id}?did=")
     # What a form says of where it stands leads nowhere else; and a form that chooses nothing says so.
     assert does("tag", grasp=f"{shard}:1", here="//example.org").startswith("/grasps?")
     assert does("tag") == does("tag", all="true", filter="job=none") == does("export", grasp="../../x:1") == "422"
-    assert "no grasp is chosen" in http.post("/grasps/tag", data={"tag": "good"}).text
+    assert "no grasp is selected" in http.post("/grasps/tag", data={"tag": "good"}).text
     assert http.post("/grasps/tag", data=filters, headers={"Origin": "https://example.org"}).status_code == 403
     assert http.post("/grasps/export", data={"grasp": f"{shard}:1", "format": "csv"}).text.count("\r\n") == 2
     assert http.post("/tags/good/delete").status_code == 422, "its name was not typed"

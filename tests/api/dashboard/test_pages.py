@@ -117,7 +117,7 @@ def test_the_table_of_grasps_keeps_its_filters_on_the_next_page(http: TestClient
 
 def test_a_filter_that_fits_nothing_or_cannot_be_read_says_so(http: TestClient, services: Services) -> None:
     finish_all(services, add_job(services))
-    assert "No grasp fits these filters" in http.get("/grasps", params={"min_epsilon": 99}).text
+    assert "No grasp matches these filters" in http.get("/grasps", params={"min_epsilon": 99}).text
     answer = http.get("/grasps", params={"min_epsilon": "much"})
     assert answer.status_code == 422 and "min_epsilon" in answer.text
 

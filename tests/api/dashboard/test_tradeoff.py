@@ -105,7 +105,7 @@ def test_the_page_draws_free_charts_and_those_in_scenes_apart(http: TestClient, 
     for kind in ("table", "bin"):
         publish(services.store, f"scene_charts/{kind}", scenes_of(kind, lifted("standard", 18), lifted("fine", 19)))
     page = http.get("/chart", params={"lifts": "lift_hard"}).text
-    titles = ["Around free objects", "In a bin", "On a table"]
+    titles = ["Free objects", "In a bin", "On a table"]
     assert [page.index(title) for title in titles] == sorted(page.index(title) for title in titles)
     assert page.count("lifted grasps per second</text>") == 2 and page.count("valid grasps per second</text>") == 1
     assert page.count("Lifted at half the friction [%]</text>") == 2
@@ -114,7 +114,7 @@ def test_the_page_draws_free_charts_and_those_in_scenes_apart(http: TestClient, 
 def test_a_chart_in_scenes_is_drawn_where_there_is_no_other(http: TestClient, services: Services) -> None:
     publish(services.store, "scene_charts/table", scenes_of("table", lifted("standard", 18)))
     page = http.get("/chart", params={"lifts": "magic"}).text
-    assert "Around free objects" not in page and "Lifted, of all candidates [%]</text>" in page
+    assert "Free objects" not in page and "Lifted share of candidates [%]</text>" in page
 
 
 def test_the_page_shows_the_chart_that_was_published_last(http: TestClient, services: Services) -> None:

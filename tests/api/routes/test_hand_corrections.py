@@ -118,7 +118,7 @@ def test_a_reader_corrects_nothing_and_a_writer_owns_the_hand(settings: Settings
         assert http.post(path, json=body).status_code == 401
         assert http.post(path, json=body, headers=people["reader"]).status_code == 403
         assert http.post("/hands/barrett", data={"closing.0": "1"}, headers=people["reader"]).status_code == 403
-        assert "Save as a hand" not in http.get("/hands/barrett", headers=people["reader"]).text
+        assert "Save as a new hand" not in http.get("/hands/barrett", headers=people["reader"]).text
         made = http.post(path, json=body, headers=people["writer"]).json()
         assert load_asset(services.store, AssetKind.HAND, made["digest"]).owner == made["owner"] != ""
 
@@ -133,7 +133,7 @@ def test_the_page_has_a_field_for_each_guess_without_scripts(http: TestClient) -
     made = http.get("/v1/hands/barrett-2").json()
     assert answer.headers["location"] == f"/hands/{made['digest']}"
     shown = http.get(answer.headers["location"]).text
-    assert "A worker looks at it" in shown and 'data-poll="2"' in shown
+    assert "A worker checks the hand" in shown and 'data-poll="2"' in shown
 
 
 @pytest.mark.parametrize(
@@ -150,7 +150,7 @@ def test_the_page_has_a_field_for_each_guess_without_scripts(http: TestClient) -
 def test_a_wrong_form_is_shown_again_with_what_is_wrong(http: TestClient, field: str, value: str, says: str) -> None:
     answer = http.post("/hands/barrett", data={"palm_link": "palm", "fingertip": "finger_1_distal_link", field: value})
     assert answer.status_code == 422
-    assert says in answer.text and "That cannot be kept" in answer.text
+    assert says in answer.text and "cannot be saved" in answer.text
 
 
 def test_hands_are_listed_with_their_own_words_as_text(http: TestClient) -> None:

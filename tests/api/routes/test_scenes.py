@@ -78,7 +78,7 @@ def test_neighbours_are_named_and_come_back_with_their_digests(http: TestClient)
     assert [one["object"] for one in job["request"]["neighbours"]] == ["block", "bottle"]
     assert job["request"]["neighbours"][0]["digest"] == block
     page = http.get(f"/jobs/{job['id']}").text
-    assert "in a bin beside block, bottle" in page
+    assert "in a bin with neighbours block, bottle" in page
     again = http.post("/v1/jobs", json=job["request"])
     assert again.json()["id"] == job["id"], "what was read can be sent again"
     unknown = http.post("/v1/jobs", json={**JOB, "scene": "bin", "neighbours": ["teapot"]})

@@ -123,7 +123,7 @@ def test_the_command_makes_an_older_index_anew(tmp_path: Path) -> None:
     assert "run `graspd admin index rebuild`" in refused.output
     done = CliRunner().invoke(app, ["index", "rebuild", "--data-dir", str(tmp_path)])
     assert done.exit_code == 0, done.output
-    assert "was of revision 0007" in done.output
+    assert "revision 0007" in done.output
     made = Index(Settings(data_dir=tmp_path).resolved_index_url)
     assert made.notes.completeness() is not None
     made.close()
