@@ -12,6 +12,7 @@ from graspd.service.model.digests import digest_json, job_id, shard_id
 from graspd.service.model.domain import SCENES, JobOptions, JobRequest
 from graspd.service.model.planning import message_of, plan
 from graspd.service.model.records import JobRecord, Member
+from graspd.service.model.renamed import original
 from graspd.service.model.states import Priority, Stage
 from graspd.service.model.version import STAGE_REVISIONS
 from graspd.service.pipeline.datasets.spec import describe
@@ -39,7 +40,7 @@ def test_a_job_without_a_scene_keeps_its_id_and_its_record() -> None:
     wanted = {**PLAIN, "hand": "gripper", "object": "ball"}
     job = record(request())
     assert job.request.model_dump(mode="json") == wanted
-    said = {"request": wanted, "hand": HAND, "object": OBJECT, "revisions": STAGE_REVISIONS}
+    said = {"request": original(wanted), "hand": HAND, "object": OBJECT, "revisions": STAGE_REVISIONS}
     assert job.id == digest_json(said)
     (task,) = plan(job)
     assert message_of(job, task, attempt=1, max_attempt=3).model_dump(mode="json")["request"] == wanted
@@ -49,7 +50,9 @@ def test_a_dataset_without_a_scene_keeps_its_digest() -> None:
     hands, objects = [Member(name="h", digest=HAND)], [Member(name="o", digest=OBJECT)]
     made = describe("d", hands, objects, JobOptions(), lambda one: (one, None))
     options = {name: value for name, value in PLAIN.items() if name not in ("options", "target")}
-    assert made.digest == digest_json({"hands": [["h", HAND]], "objects": [["o", OBJECT]], "options": options})
+    assert made.digest == digest_json(
+        {"hands": [["h", HAND]], "objects": [["o", OBJECT]], "options": original(options)}
+    )
 
 
 def test_scenes_after_the_grasps_have_the_address_that_they_had() -> None:

@@ -49,6 +49,7 @@ print(wp.config.kernel_cache_dir)
 LOAD = START + f"wp.load_module(importlib.import_module({MODULE!r}), device='cpu')"
 BAKE = f"""
 from graspd.worker.engines import backend
+from tests.conftest import PACKAGES, REPOSITORY
 backend.start()
 backend.bake([{MODULE!r}], architectures=[90])
 """
@@ -108,7 +109,7 @@ def test_a_cache_keeps_what_it_has(kernels: Path, tmp_path: Path, monkeypatch: p
 
 def test_every_module_of_kernels_is_known() -> None:
     # Modules are found by their names: one with a kernel under another name would be compiled at first use.
-    sources = Path(backend.__file__).parents[1].rglob("*.py")
+    sources = [file for package in PACKAGES for file in (REPOSITORY / package).rglob("*.py")]
     having = {file for file in sources if "@wp.kernel" in file.read_text()}
     assert {file.stem for file in having} <= {part for name in backend.modules() for part in name.split(".")}
     assert len(having) == len(backend.modules())
