@@ -13,6 +13,7 @@ import pytest
 from graspd.service import user_cache
 from graspd.worker.engines import backend
 from graspd.worker.engines.backend import kernel_cache
+from tests.conftest import PACKAGES, REPOSITORY
 from tests.waiting import PATIENCE_S
 
 
