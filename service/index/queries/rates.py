@@ -57,7 +57,7 @@ class Machine:
         """Return the origin of a stored number with the applied factor."""
         if not self.batches:
             return origin
-        return f"{origin}, x {self.factor:.2g} as {self.batches} batches took here"
+        return f"{origin}, x {self.factor:.2g}, measured here (batches: {self.batches})"
 
 
 @dataclass(frozen=True)
