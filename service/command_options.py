@@ -40,7 +40,7 @@ def with_options(model: type[BaseModel], place: Place) -> Callable[[Callable[...
 def _parameter(row: Row) -> inspect.Parameter:
     words = row.meaning[:1].upper() + row.meaning[1:]
     if row.kind == list[str]:
-        words += "; several times"
+        words += "; repeatable"
     elif row.default not in (None, "") and row.kind is not bool:
         words += f". Default: {row.default}"
     least, most = (row.bounds.get(key) if row.kind in (int, float) else None for key in ("ge", "le"))

@@ -26,6 +26,8 @@ VALUES: Final = {
     "verdict_level": _LEVELS,
     "want": {"raw": "candidates"},
 }
+_OLD_KEYS: Final = {new: old for old, new in KEYS.items()}
+_OLD_VALUES: Final = {key: {new: old for old, new in names.items()} for key, names in VALUES.items()}
 #: Columns of base shards: present path, and path in schema graspd/base@1.
 COLUMNS: Final = {
     "quality/feasible": "quality/sound",
@@ -45,7 +47,9 @@ def has_old_names(document: bytes) -> bool:
 def renamed(value: Any) -> Any:
     """Convert a JSON document, or a part of one, to present names."""
     if isinstance(value, dict):
-        found = {KEYS.get(key, key): renamed(inner) for key, inner in value.items()}
+        # Beside a method stand the planner's own options, whose names are not ours.
+        own = {"options"} if "method" in value else set()
+        found = {KEYS.get(key, key): inner if key in own else renamed(inner) for key, inner in value.items()}
         for key, names in VALUES.items():
             if isinstance(old := found.get(key), str):
                 found[key] = names.get(old, old)
@@ -57,10 +61,9 @@ def renamed(value: Any) -> Any:
 
 def original(request: dict[str, Any]) -> dict[str, Any]:
     """Return a job's request with the names of graspd 0.2: addresses of jobs and shards are digests of these."""
-    values = {key: {new: old for old, new in names.items()} for key, names in VALUES.items()}
-    keys = {new: old for old, new in KEYS.items()}
     return {
-        keys.get(key, key): values[key].get(value, value) if key in values else value for key, value in request.items()
+        _OLD_KEYS.get(key, key): _OLD_VALUES[key].get(value, value) if key in _OLD_VALUES else value
+        for key, value in request.items()
     }
 
 

@@ -29,6 +29,14 @@ def test_a_request_has_the_names_of_0_2_and_back() -> None:
     assert parse_record(JobRequest, json.dumps(document).encode(), "a request") == NEW
 
 
+def test_a_planners_own_options_keep_their_names() -> None:
+    own = {"tried": 1, "lane": 2, "want": "raw"}
+    made = request(method="other", options=own)
+    for document in (made.model_dump(mode="json"), renamed.original(made.model_dump(mode="json"))):
+        assert renamed.renamed(document)["options"] == own
+    assert renamed.renamed({"options": made.model_dump(mode="json")})["options"]["options"] == own
+
+
 def test_only_a_worker_of_0_2_gets_its_names() -> None:
     message = {"request": NEW.model_dump(mode="json"), "stage": "synthesize"}
     assert renamed.for_worker_of(24, "synthesize", message) == message
