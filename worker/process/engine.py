@@ -152,8 +152,9 @@ class Engine:
         while True:
             try:
                 word, about = self._connection.recv()
-            except (EOFError, OSError):
-                word, about = "end", StopReason.LEASE_LOST  # no caller waits for the current task
+            except (EOFError, OSError, TypeError):
+                # Nobody waits for the current task. TypeError: closed by the other thread between two reads.
+                word, about = "end", StopReason.LEASE_LOST
             with self._changing:
                 if word in ("stop", "end"):
                     self._reason = about
