@@ -11,13 +11,7 @@ from dataclasses import dataclass, field
 
 from graspd.service.model.states import Priority, Stage
 from graspd.service.model.workers import WorkerBeat
-from graspd.service.queue.port import (
-    Event,
-    Lease,
-    Message,
-    QueueStatus,
-    priority_order,
-)
+from graspd.service.queue.port import Event, Lease, Message, QueueStatus, priority_order
 from graspd.service.queue.rq_queue import RqQueue
 
 

@@ -176,11 +176,7 @@ class KeyFile:
         with self._changing() as document:
             old = _live(document, name)
             fresh = old[-1].model_copy(
-                update={
-                    "sha256": _sha256(token),
-                    "created": _now(),
-                    "expires": _now(lifetime) if lifetime else None,
-                }
+                update={"sha256": _sha256(token), "created": _now(), "expires": _now(lifetime) if lifetime else None}
             )
             for key in old:
                 if grace:

@@ -177,10 +177,7 @@ _LONGEST_FILTER: Final = 40_000
 _PAGES: Final = re.compile(r"/grasps(/[0-9a-f]{32}/[0-9]{1,10})?|/jobs/[0-9a-f]{32}")
 _NAME: Final[TypeAdapter[str]] = TypeAdapter(TagName)
 _FORMAT: Final[TypeAdapter[Format]] = TypeAdapter(Format)
-_DONE: Final = {
-    "tagged": "{done} {grasps} tagged {tag}.",
-    "untagged": "Tag {tag} removed from {done} {grasps}.",
-}
+_DONE: Final = {"tagged": "{done} {grasps} tagged {tag}.", "untagged": "Tag {tag} removed from {done} {grasps}."}
 T = TypeVar("T")
 
 

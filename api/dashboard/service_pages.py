@@ -99,10 +99,7 @@ def chart_page(
 ) -> HTMLResponse:
     """Show speed against accuracy of methods and fidelities, from the last `graspd chart` of each kind."""
     measured = tradeoff.load(store)
-    axis = {
-        False: y if y in tradeoff.FREE else "gsr",
-        True: lifts if lifts in tradeoff.IN_SCENES else "lift",
-    }
+    axis = {False: y if y in tradeoff.FREE else "gsr", True: lifts if lifts in tradeoff.IN_SCENES else "lift"}
     drawn = [tradeoff.draw(one, axis=axis[one.scene is not None], hand=hand, object=object) for one in measured]
     return render(
         request,
@@ -168,12 +165,7 @@ _SUMMED = ("grasps", "valid", "tasks", "gpu_seconds", "cpu_seconds")
 
 
 @router.get("/usage", dependencies=[Depends(may_read)])
-def usage_page(
-    request: Request,
-    usage: UsageOf,
-    since: Since = None,
-    until: Until = None,
-) -> HTMLResponse:
+def usage_page(request: Request, usage: UsageOf, since: Since = None, until: Until = None) -> HTMLResponse:
     """Show the usage of each project: in total, against its quotas, and per day."""
     days = usage.days(since, until)
     limits = usage.limits()

@@ -100,10 +100,7 @@ def list_cells(
 
 
 @router.post(
-    "/{name}/cancel",
-    status_code=202,
-    dependencies=[Depends(may_submit)],
-    responses=responses(401, 403, 404, 409, 503),
+    "/{name}/cancel", status_code=202, dependencies=[Depends(may_submit)], responses=responses(401, 403, 404, 409, 503)
 )
 def cancel_dataset(name: DatasetName, response: Response, datasets: DatasetsOf) -> DatasetView:
     """Cancel a dataset and its unfinished jobs; results remain, and jobs of other datasets continue."""
@@ -111,10 +108,7 @@ def cancel_dataset(name: DatasetName, response: Response, datasets: DatasetsOf) 
 
 
 @router.post(
-    "/{name}/retry",
-    status_code=202,
-    dependencies=[Depends(may_submit)],
-    responses=responses(401, 403, 404, 409, 503),
+    "/{name}/retry", status_code=202, dependencies=[Depends(may_submit)], responses=responses(401, 403, 404, 409, 503)
 )
 def retry_dataset(name: DatasetName, response: Response, datasets: DatasetsOf) -> DatasetView:
     """Restart failed and cancelled cells; existing results are not made again."""
@@ -122,10 +116,7 @@ def retry_dataset(name: DatasetName, response: Response, datasets: DatasetsOf) -
 
 
 @router.delete(
-    "/{name}",
-    status_code=204,
-    dependencies=[Depends(may_submit)],
-    responses=responses(401, 403, 404, 409, 422, 503),
+    "/{name}", status_code=204, dependencies=[Depends(may_submit)], responses=responses(401, 403, 404, 409, 422, 503)
 )
 def delete_dataset(
     name: DatasetName,
@@ -182,10 +173,7 @@ def get_snapshot(name: DatasetName, digest: SnapshotDigest, datasets: DatasetsOf
 
 
 @sets_router.post(
-    "",
-    status_code=201,
-    dependencies=[Depends(may_submit)],
-    responses=responses(400, 401, 403, 404, 409, 413, 422, 503),
+    "", status_code=201, dependencies=[Depends(may_submit)], responses=responses(400, 401, 403, 404, 409, 413, 422, 503)
 )
 def add_object_set(body: ObjectSetRequest, response: Response, datasets: DatasetsOf) -> ObjectSetView:
     """Name a set of objects. Its owner or an admin may store other objects as the set's next version."""

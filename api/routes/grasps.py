@@ -71,10 +71,7 @@ async def exported(
 
 @router.get("", dependencies=[Depends(may_read)], responses=responses(401, 403, 404, 422, 503))
 def list_grasps(
-    request: Request,
-    response: Response,
-    grasps: GraspsOf,
-    query: Annotated[GraspPageQuery, Query()],
+    request: Request, response: Response, grasps: GraspsOf, query: Annotated[GraspPageQuery, Query()]
 ) -> Page[GraspView]:
     """List grasps that pass every filter, in the requested order."""
     page = grasps.page(query, limit=query.limit, cursor=query.cursor)

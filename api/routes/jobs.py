@@ -29,15 +29,7 @@ IdempotencyKey = Annotated[
     status_code=202,
     dependencies=[Depends(may_submit)],
     responses=responses(
-        400,
-        401,
-        403,
-        404,
-        409,
-        413,
-        422,
-        503,
-        others={200: {"model": JobDetail, "description": "It has ended"}},
+        400, 401, 403, 404, 409, 413, 422, 503, others={200: {"model": JobDetail, "description": "It has ended"}}
     ),
 )
 def submit(body: JobRequest, response: Response, jobs: JobsOf, idempotency_key: IdempotencyKey = None) -> JobDetail:
@@ -94,10 +86,7 @@ def retry(job_id: str, jobs: JobsOf) -> JobDetail:
 
 
 @router.delete(
-    "/{job_id}",
-    status_code=204,
-    dependencies=[Depends(may_submit)],
-    responses=responses(401, 403, 404, 409, 503),
+    "/{job_id}", status_code=204, dependencies=[Depends(may_submit)], responses=responses(401, 403, 404, 409, 503)
 )
 def delete(job_id: str, jobs: JobsOf) -> None:
     """Delete an ended job. After a grace time its shards follow, unless another job needs them; until then

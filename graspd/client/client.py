@@ -129,12 +129,7 @@ class Client:
         fields |= {name: "true" for name, wanted in {"self_test": self_test, "shared": shared}.items() if wanted}
         try:
             with path.open("rb") as file:
-                answer = self.send(
-                    "POST",
-                    f"/v1/{kind.value}s",
-                    files={"file": (path.name, file)},
-                    data=fields,
-                )
+                answer = self.send("POST", f"/v1/{kind.value}s", files={"file": (path.name, file)}, data=fields)
         except OSError as error:
             raise InputError(f"{path} cannot be read: {error.strerror}") from None
         return AssetView.model_validate_json(answer.content)

@@ -199,9 +199,7 @@ def asset_commands(kind: AssetKind) -> typer.Typer:
     @group.command("show", help=f"Show a {kind.value} with the findings of its check.")
     @reporting_errors
     def show(
-        name: Annotated[str, typer.Argument(help="Name of the asset.")],
-        url: UrlOption = None,
-        json: JsonFlag = False,
+        name: Annotated[str, typer.Argument(help="Name of the asset.")], url: UrlOption = None, json: JsonFlag = False
     ) -> None:
         """Show one with the findings of its check."""
         with open_client(url) as client:

@@ -141,13 +141,7 @@ def list_datasets(
         made = f"{count(one.counted)} {one.options.standing} of {count(one.asked)}"
         cells = count(one.cells)
         table.add_row(
-            one.name,
-            one.state,
-            cells,
-            percent(one.progress),
-            made,
-            size(one.size_bytes),
-            minute(one.created),
+            one.name, one.state, cells, percent(one.progress), made, size(one.size_bytes), minute(one.created)
         )
     empty = "no dataset yet; `graspd datasets create NAME --hands allegro --objects mug,bottle` makes one"
     plain_console().print(table if page.items else empty)

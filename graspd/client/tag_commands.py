@@ -20,10 +20,7 @@ app = typer.Typer(no_args_is_help=True, help="Tag grasps of the service; list an
 _PATIENCE_S: Final = 600.0
 
 NameArgument = Annotated[str, typer.Argument(metavar="TAG", help="Name of the tag: `graspd tags list`.")]
-GraspsArgument = Annotated[
-    list[str] | None,
-    typer.Argument(metavar="[SHARD:ROW]...", help="Grasps by shard and row."),
-]
+GraspsArgument = Annotated[list[str] | None, typer.Argument(metavar="[SHARD:ROW]...", help="Grasps by shard and row.")]
 WhereOption = Annotated[
     str | None, typer.Option(help="Grasps that satisfy an expression: epsilon > 0.3 and lift and robust >= 0.75.")
 ]

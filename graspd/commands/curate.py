@@ -80,11 +80,7 @@ def balance(
 
 @app.command(epilog="graspd datasets diff kitchen-v1 kitchen-v2 --json")
 @reporting_errors
-def diff(
-    first: SourceArgument,
-    second: SourceArgument,
-    json: JsonFlag = False,
-) -> None:
+def diff(first: SourceArgument, second: SourceArgument, json: JsonFlag = False) -> None:
     """Compare two datasets, or two snapshots, given as NAME@SNAPSHOT."""
     found = difference(*(shards_of(*_version(one)) for one in (first, second)))
     if json:

@@ -97,8 +97,7 @@ def kernels(settings: Settings, *, child: Child = run_child) -> Finding:
         fix = f"see the message; for a damaged cache remove {found['cache']}"
         return bad(name, f"on {found['device']}: {found['error']}", fix)
     return good(
-        name,
-        f"plausible grasps, scenes and pictures of a ball on {found['device']}; kernel cache {found['cache']}",
+        name, f"plausible grasps, scenes and pictures of a ball on {found['device']}; kernel cache {found['cache']}"
     )
 
 

@@ -82,8 +82,7 @@ def evaluate_command(
         typer.Option(min=0.01, max=3.0, help="Coulomb friction coefficient of ε; default: that of the file."),
     ] = None,
     validation_hand: Annotated[
-        str | None,
-        typer.Option(help="Second model of the same hand, URDF or MJCF, for an additional validation."),
+        str | None, typer.Option(help="Second model of the same hand, URDF or MJCF, for an additional validation.")
     ] = None,
     joint_map: Annotated[
         str | None, typer.Option(help="OURS=THEIRS,...: corresponding joints with different names.")
@@ -93,11 +92,7 @@ def evaluate_command(
     ] = 1e3 * TOLERANCE_M,
     out: Annotated[
         Path | None,
-        typer.Option(
-            "-o",
-            "--out",
-            help="With --robust: copy of the shard, or folder of copies, with robust shares.",
-        ),
+        typer.Option("-o", "--out", help="With --robust: copy of the shard, or folder of copies, with robust shares."),
     ] = None,
     threads: Annotated[int, typer.Option(min=0, help="CPU threads; 0: one per core.")] = 0,
     json: JsonFlag = False,

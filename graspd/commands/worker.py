@@ -63,11 +63,7 @@ def worker(
         from graspd.worker.process.main import run_worker
 
     ended_well = run_worker(
-        settings,
-        stages=_parse_stages(stages),
-        burst=burst or once,
-        idle_s=idle,
-        max_tasks=1 if once else max_tasks,
+        settings, stages=_parse_stages(stages), burst=burst or once, idle_s=idle, max_tasks=1 if once else max_tasks
     )
     raise typer.Exit(0 if ended_well else 1)
 

@@ -158,9 +158,7 @@ class JobOptions(Model):
         1.0, gt=0, le=3, description="Coulomb coefficient of the quality metrics"
     )
     mass: Annotated[
-        Mass | None,
-        Option("basic", schema=5),
-        Form("grasps", "Mass of the object", "empty: its own, else 0.1 kg"),
+        Mass | None, Option("basic", schema=5), Form("grasps", "Mass of the object", "empty: its own, else 0.1 kg")
     ] = _sparse(None, description=f"mass of the object [kg]; default: its own, else {MASS_KG:g} kg")
     density: Annotated[Density | None, Option(schema=5)] = _sparse(
         None, description="density of the object [kg/m^3], instead of the mass"
@@ -170,14 +168,12 @@ class JobOptions(Model):
         Option(schema=5),
         Form("grasps", "Friction in simulation", "Coulomb; empty: the object's own, else 0.6"),
     ] = _sparse(
-        None,
-        description=f"Coulomb coefficient of contacts in simulation; default: the object's own, else {FRICTION:g}",
+        None, description=f"Coulomb coefficient of contacts in simulation; default: the object's own, else {FRICTION:g}"
     )
     want: Annotated[
         Literal["valid", "candidates"], Option("basic"), Form("grasps", "Counted grasps", choices=_WANTS_IN_WORDS)
     ] = Field(
-        "valid",
-        description="grasps that count. valid: valid ones (feasible ones without validation); candidates: all",
+        "valid", description="grasps that count. valid: valid ones (feasible ones without validation); candidates: all"
     )
     budget: Annotated[float, Option()] = Field(
         4.0, ge=1, le=100, description="largest number of candidates for each valid grasp wanted"

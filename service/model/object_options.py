@@ -40,8 +40,7 @@ class ObjectOptions(MeshOptions):
     )
     mass: Annotated[Mass | None, _MATTER] = Field(None, description=f"mass of the object [kg]; default: {MASS_KG:g}")
     friction: Annotated[Friction | None, _MATTER] = Field(
-        None,
-        description=f"Coulomb coefficient of the object's contacts in simulation; default: {FRICTION:g}",
+        None, description=f"Coulomb coefficient of the object's contacts in simulation; default: {FRICTION:g}"
     )
 
     @model_validator(mode="after")

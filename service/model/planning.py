@@ -19,12 +19,7 @@ from graspd.service.model.messages import IngestMessage, TaskMessage
 from graspd.service.model.options import rows
 from graspd.service.model.records import JobRecord
 from graspd.service.model.states import AssetKind, Priority, Stage, State
-from graspd.service.model.version import (
-    OLDEST_TASK_SCHEMA,
-    SCHEMA_OF_NETWORKS,
-    SCHEMA_OF_RANGES,
-    TASK_SCHEMA,
-)
+from graspd.service.model.version import OLDEST_TASK_SCHEMA, SCHEMA_OF_NETWORKS, SCHEMA_OF_RANGES, TASK_SCHEMA
 
 #: Largest interactive job: a user waits for it. Larger jobs run in bulk.
 INTERACTIVE_GRASPS: Final = 4 * BATCH_SIZE

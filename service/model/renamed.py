@@ -21,11 +21,7 @@ KEYS: Final = {
 }
 _LEVELS: Final = {"letter": "dexgraspbench", "certificate": "standard", "screen": "fast"}
 #: Values of keys, by present name of the key.
-VALUES: Final = {
-    "validation": _LEVELS,
-    "verdict_level": _LEVELS,
-    "want": {"raw": "candidates"},
-}
+VALUES: Final = {"validation": _LEVELS, "verdict_level": _LEVELS, "want": {"raw": "candidates"}}
 _OLD_KEYS: Final = {new: old for old, new in KEYS.items()}
 _OLD_VALUES: Final = {key: {new: old for old, new in names.items()} for key, names in VALUES.items()}
 #: Columns of base shards: present path, and path in schema graspd/base@1.

@@ -30,11 +30,7 @@ _OPERATORS: Final[dict[str, Callable[[Any, Any], Any]]] = {
     "!=": operator.ne,
 }
 #: Columns of flags; 1 means true.
-_FLAGS: Final = {
-    "held": "quality/success",
-    "lift": "quality/lift_outcome",
-    "lift_hard": "quality/lift_hard",
-}
+_FLAGS: Final = {"held": "quality/success", "lift": "quality/lift_outcome", "lift_hard": "quality/lift_hard"}
 
 
 def parse(text: str) -> Test:

@@ -12,10 +12,7 @@ from graspd.service.model.states import AssetKind
 
 #: Surface displacement from rounding that is not reported [m].
 _NOTHING_M = 1e-7
-_OVERRIDES = {
-    "palm": "--palm LINK --approach x,y,z",
-    "preshape": "--pre-shape JOINT=VALUE,...",
-}
+_OVERRIDES = {"palm": "--palm LINK --approach x,y,z", "preshape": "--pre-shape JOINT=VALUE,..."}
 
 
 def say_check(kind: AssetKind, report: Mapping[str, Any]) -> None:

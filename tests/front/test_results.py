@@ -115,9 +115,7 @@ def test_a_figure_of_older_algorithms_is_shown_as_stale() -> None:
     assert staleness(study, record | {"stage_revisions": dict(STAGE_REVISIONS)}) == ""
 
 
-def test_a_revision_leaves_figures_fresh_but_those_it_changes(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_revision_leaves_figures_fresh_but_those_it_changes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(STAGE_REVISIONS, "synthesize", 9)
     monkeypatch.setattr(
         manifest, "SAME", {("synthesize", 9): (8, frozenset({"robust"})), ("synthesize", 8): (7, frozenset({"chart"}))}

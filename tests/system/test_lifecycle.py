@@ -190,9 +190,7 @@ def load() -> Iterator[None]:
 @pytest.mark.chaos
 @pytest.mark.slow
 @pytest.mark.timeout(_LONGEST_S)
-def test_on_a_busy_machine_no_worker_is_lost(
-    start: Callable[..., System],
-) -> None:
+def test_on_a_busy_machine_no_worker_is_lost(start: Callable[..., System]) -> None:
     """Each task holds the interpreter lock for two leases, as a kernel that compiles does."""
     system = start(workers=2, environment={"FAKE_LOCK_S": "4"}, lease_s=2.0, task_attempts=1)
     # That they start is no part of it, and would take the tests beside this one their processors for long.

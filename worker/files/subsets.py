@@ -91,8 +91,7 @@ def write_subset(shards: Shards, choose: Chooser, out: Path, *, said: Mapping[st
 
 
 UnvalidatedOption = Annotated[
-    bool,
-    typer.Option("--unvalidated", help="Select feasible grasps without validation instead of valid ones."),
+    bool, typer.Option("--unvalidated", help="Select feasible grasps without validation instead of valid ones.")
 ]
 EveryOption = Annotated[bool, typer.Option("--all", help="Select all grasps, including failed ones.")]
 

@@ -183,9 +183,7 @@ def _fold_limits(dof: str, moving: dict[str, Drive], robot: Robot, options: Hand
             continue
         if joint.type == "prismatic" and joint.upper - joint.lower >= 2 * UNLIMITED_M:
             raise HandError.with_fixes(
-                f"joint {name!r} slides without a range",
-                f"give it one, or fix it: --fix {name}=0",
-                {"fix": {name: 0}},
+                f"joint {name!r} slides without a range", f"give it one, or fix it: --fix {name}=0", {"fix": {name: 0}}
             )
         ends = sorted((limit - drive.offset) / drive.multiplier for limit in (joint.lower, joint.upper))
         if ends[0] > lower or ends[1] < upper:

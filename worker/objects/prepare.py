@@ -361,15 +361,7 @@ def _thinned(original: ReferenceMesh, error_m: float) -> list[Mesh]:
     return []
 
 
-_ARRAYS: Final = (
-    "vertices",
-    "faces",
-    "corner_normals",
-    "centre_of_mass",
-    "inertia",
-    "hull_vertices",
-    "hull_faces",
-)
+_ARRAYS: Final = ("vertices", "faces", "corner_normals", "centre_of_mass", "inertia", "hull_vertices", "hull_faces")
 _NAMES: Final = ("name", "digest", "about_centre")
 
 

@@ -43,10 +43,7 @@ log = logging.getLogger(__name__)
 Publish = Callable[[Event], None]
 _TRACE_CHARACTERS: Final = 8000
 
-_STOPPED: Final = {
-    StopReason.CANCELLED: EventKind.CANCELLED,
-    StopReason.SHUTDOWN: EventKind.RETURNED,
-}
+_STOPPED: Final = {StopReason.CANCELLED: EventKind.CANCELLED, StopReason.SHUTDOWN: EventKind.RETURNED}
 
 
 class Runner:

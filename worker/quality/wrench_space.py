@@ -58,13 +58,7 @@ def cone_edges(
 
 
 def wrenches(
-    points: Floats,
-    normals: Floats,
-    *,
-    friction: float,
-    centre: Floats,
-    radius: float,
-    edges: int = EDGES,
+    points: Floats, normals: Floats, *, friction: float, centre: Floats, radius: float, edges: int = EDGES
 ) -> Floats:
     """Return edge wrenches (..., E, 6): force, then torque about `centre` over `radius`.
 

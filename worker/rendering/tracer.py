@@ -98,11 +98,7 @@ class Tracer:
         every = _structs([look for world in looks for look in world], Material, self.device)
         self._materials = every.reshape(poses.shape[:2])
 
-    def shoot(
-        self,
-        shot: CameraShot,
-        run: ExecutionContext = DEFAULT_CONTEXT,
-    ) -> Pictures:
+    def shoot(self, shot: CameraShot, run: ExecutionContext = DEFAULT_CONTEXT) -> Pictures:
         """Trace all cameras.
 
         Args:

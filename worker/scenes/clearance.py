@@ -37,11 +37,7 @@ class Rejection(IntEnum):
 
 
 def transfer(
-    hand: HandModel,
-    grasp: Posture,
-    pregrasp: Posture,
-    object_pose: Floats,
-    neighbours: Neighbours | None = None,
+    hand: HandModel, grasp: Posture, pregrasp: Posture, object_pose: Floats, neighbours: Neighbours | None = None
 ) -> dict[str, NDArray[np.generic]]:
     """Transfer every grasp to every scene and compute the clearance of the hand and its mounting.
 

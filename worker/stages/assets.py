@@ -122,10 +122,7 @@ def beside_attributes(message: TaskMessage) -> dict[str, Attribute]:
     beside = message.request.beside
     if not beside:
         return {}
-    return {
-        "neighbours": [one.object for one in beside],
-        "neighbour_digests": [one.digest or "" for one in beside],
-    }
+    return {"neighbours": [one.object for one in beside], "neighbour_digests": [one.digest or "" for one in beside]}
 
 
 def _cached(key: Hashable, load: Callable[[], T]) -> T:

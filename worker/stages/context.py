@@ -96,13 +96,7 @@ class Output:
 
 
 def shard_of(
-    message: TaskMessage,
-    output: Output,
-    *,
-    device: str,
-    seconds: float,
-    worker: str,
-    lost: ShardManifest | None = None,
+    message: TaskMessage, output: Output, *, device: str, seconds: float, worker: str, lost: ShardManifest | None = None
 ) -> tuple[ShardManifest, bytes]:
     """Build the shard of a stage: its manifest and its HDF5 bytes.
 

@@ -23,15 +23,7 @@ from graspd.worker.engines.mujoco_warnings import void
 from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.simulation.environment import RISE_M, PlacedGrasps
 from graspd.worker.validation.model import Scene, blend
-from graspd.worker.validation.protocol import (
-    MAX_PENETRATION_M,
-    MAX_ROTATION,
-    STAGE_S,
-    STAGES,
-    Outcome,
-    Rollout,
-    Test,
-)
+from graspd.worker.validation.protocol import MAX_PENETRATION_M, MAX_ROTATION, STAGE_S, STAGES, Outcome, Rollout, Test
 
 #: Largest displacement [m] and tilt [rad] of a neighbour; it may turn about the vertical.
 NEIGHBOUR_MOVED_M: Final = 0.02

@@ -152,10 +152,7 @@ def _due(not_before: Column[float], now: float) -> ColumnElement[bool]:
 
 def _record(row: Any) -> JobRecord:
     return JobRecord(
-        id=row["job_id"],
-        **{name: row[name] for name in _OF_THE_JOB},
-        priority=row["priority"],
-        created=row["created"],
+        id=row["job_id"], **{name: row[name] for name in _OF_THE_JOB}, priority=row["priority"], created=row["created"]
     )
 
 

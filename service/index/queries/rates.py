@@ -83,11 +83,7 @@ STORED_SPREAD: Final = (1 / 3, 10.0)
 ORIGIN: Final = "stored default: 2 CPU cores, docs/explanation/scaling.md"
 #: Seconds per candidate, with postures, quality and verdict; valid yield of standard (its first matrix: 1,785 of 2,542
 #: candidates), also used for the others.
-STORED: Final[dict[str, tuple[float, float]]] = {
-    "draft": (0.13, 0.7),
-    "standard": (0.16, 0.7),
-    "fine": (0.24, 0.7),
-}
+STORED: Final[dict[str, tuple[float, float]]] = {"draft": (0.13, 0.7), "standard": (0.16, 0.7), "fine": (0.24, 0.7)}
 #: The same for other methods at their source's budget: the planner's time and success in docs/results/chart.md, and the
 #: cost of postures, quality and verdict.
 STORED_METHODS: Final[dict[str, tuple[float, float]]] = {

@@ -35,9 +35,7 @@ def closed(settings: Settings, services: Services, keys: KeyFile) -> Iterator[tu
         yield client, tokens
 
 
-def test_a_closed_service_answers_401_without_a_good_key(
-    closed: tuple[TestClient, dict[Scope, str]],
-) -> None:
+def test_a_closed_service_answers_401_without_a_good_key(closed: tuple[TestClient, dict[Scope, str]]) -> None:
     client, tokens = closed
     answer = client.get("/v1/jobs")
     assert answer.status_code == 401

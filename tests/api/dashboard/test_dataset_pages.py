@@ -118,10 +118,7 @@ def test_cells_of_one_state_are_a_list(http: TestClient, services: Services) -> 
 
 @pytest.mark.parametrize(
     ("options", "shown"),
-    [
-        ({"validation": "none"}, "32 feasible"),
-        ({"validation": "none", "want": "candidates"}, "32 kept"),
-    ],
+    [({"validation": "none"}, "32 feasible"), ({"validation": "none", "want": "candidates"}, "32 kept")],
 )
 def test_unjudged_grasps_are_counted_and_not_called_valid(
     http: TestClient, services: Services, options: dict[str, str], shown: str

@@ -129,8 +129,7 @@ def test_the_form_submits_a_job_and_shows_it(http: TestClient) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "words"),
-    [({"grasps": "0"}, "must be at least 1"), ({"views": "3", "scenes": "0"}, "views need scenes")],
+    ("change", "words"), [({"grasps": "0"}, "must be at least 1"), ({"views": "3", "scenes": "0"}, "views need scenes")]
 )
 def test_a_form_in_error_keeps_what_was_typed(http: TestClient, change: dict[str, str], words: str) -> None:
     answer = http.post("/submit", data=FORM | {"seed": "77"} | change)

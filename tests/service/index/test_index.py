@@ -183,11 +183,7 @@ def test_a_cursor_of_another_list_is_refused(services: Services) -> None:
 
 
 def test_unknown_ids_are_named(services: Services) -> None:
-    for call in (
-        services.index.jobs.get,
-        services.index.shards.get,
-        services.index.jobs.task,
-    ):
+    for call in (services.index.jobs.get, services.index.shards.get, services.index.jobs.task):
         with pytest.raises(NotFoundError, match="nothing-here"):
             call("nothing-here")
     with pytest.raises(NotFoundError, match="there are: gripper"):

@@ -108,8 +108,7 @@ def test_an_error_and_a_log_line_hold_no_secret(text: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "text",
-    ["file:///srv/a@b/store", "see https://example.org/a?x=1", "unix:///srv/a@b", "mail a@b.c", "graspd: gd_x"],
+    "text", ["file:///srv/a@b/store", "see https://example.org/a?x=1", "unix:///srv/a@b", "mail a@b.c", "graspd: gd_x"]
 )
 def test_what_is_no_secret_stays(text: str) -> None:
     assert without_secrets(text) == text

@@ -15,8 +15,7 @@ from graspd.service.model.libraries import _distributions, imports, own_process,
 
 
 @pytest.mark.parametrize(
-    "library",
-    ["numpy", "scipy", "manifold3d", "fast-simplification", "coacd", "pydantic_settings"],
+    "library", ["numpy", "scipy", "manifold3d", "fast-simplification", "coacd", "pydantic_settings"]
 )
 def test_a_version_is_that_of_the_distribution(library: str) -> None:
     assert version_of.__wrapped__(library) == version(library)

@@ -68,9 +68,7 @@ def test_a_lease_is_renewed_while_held_and_given_back() -> None:
     assert queue.lead("another", 600)
 
 
-def test_who_waits_leads_soon_after_the_other_fell_silent(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_who_waits_leads_soon_after_the_other_fell_silent(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("graspd.service.pipeline.leading._RENEWALS", 3.0)
     stop = Pauses()
     stop.queue.lead("silent", LEASE_S)

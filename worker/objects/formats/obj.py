@@ -60,11 +60,7 @@ def read(data: bytes, nearby: Nearby = nothing_nearby) -> Soup:
 
 
 def _material_colours(
-    used: list[tuple[int, bytes]],
-    libraries: list[bytes],
-    nearby: Nearby,
-    counts: np.ndarray,
-    shown: np.ndarray | None,
+    used: list[tuple[int, bytes]], libraries: list[bytes], nearby: Nearby, counts: np.ndarray, shown: np.ndarray | None
 ) -> np.ndarray | None:
     """Return `shown` (F, 3), with material colours for faces without a colour; None if no face has one."""
     known: dict[bytes, np.ndarray] = {}

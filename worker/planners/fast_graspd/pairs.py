@@ -88,9 +88,7 @@ def pair_of(hand: HandModel, obj: ObjectModel, fidelity: Fidelity, device: str, 
                 obj=whole.thinned(COARSE_SAMPLES),
             ),
             fine=PhaseGeometry(
-                points=sample_surface(hand, fidelity.fine_points),
-                own=sample_surface(hand, FINE_SELF_POINTS),
-                obj=whole,
+                points=sample_surface(hand, fidelity.fine_points), own=sample_surface(hand, FINE_SELF_POINTS), obj=whole
             ),
             options=loss_options(fidelity),
             hand=DeviceHand.create(hand, device),
