@@ -88,20 +88,24 @@ class SelfTest:
         """Return a summary in one line."""
         share = f"{100 * self.gsr:.0f} % hold"
         lifts = f"{100 * self.table:.0f} % lift off a table"
+        if self.gsr >= READY and self.table >= TABLE_READY:
+            return f"ready: {share}, {lifts}"
         if self.gsr >= READY:
-            if self.table >= TABLE_READY:
-                return f"ready: {share}, {lifts}"
             return f"suspicious: {share}, but {lifts}: look at closing, pre-shape and palm"
-        if self.table < TABLE_READY:
-            share += f", {lifts}"
         worst = min(self.by_object, key=lambda name: self.by_object[name])
-        says = f"suspicious: {share}, {100 * self.by_object[worst]:.0f} % of a {worst}; "
+        weak = f"{100 * self.by_object[worst]:.0f} % of a {worst}; {self._weakness()}"
+        if self.table >= TABLE_READY:
+            return f"ready for tables: {lifts}; of free grasps {share}, {weak}"
+        return f"suspicious: {share}, {lifts}, {weak}"
+
+    def _weakness(self) -> str:
+        """Return the likely reason why free grasps do not hold."""
         if self.lost > 0.5:
-            return says + "most are lost while it closes: look at palm, closing and pads"
+            return "most are lost while it closes: look at palm, closing and pads"
         if self.give_m < SOFT_M:
             give = f"{1e3 * self.give_m:.1f} mm of a fingertip's way"
-            return says + f"its servos reach their limits within {give}: give less stiffness in asset.json"
-        return says + "most slip when pushed: look at effort, stiffness and pads"
+            return f"its servos reach their limits within {give}: give less stiffness in asset.json"
+        return "most slip when pushed: look at effort, stiffness and pads"
 
     def facts(self) -> dict[str, Any]:
         """Return the facts that a check reports."""
