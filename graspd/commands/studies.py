@@ -22,6 +22,7 @@ from graspd.service.model.cores import available_cores
 from graspd.service.model.errors import InputError, one_of
 from graspd.service.model.fidelity import FIDELITIES, OFFERED, Fidelity
 from graspd.service.model.metrics import ROBUST_MODELS
+from graspd.service.model.renamed import renamed_chart
 from graspd.service.model.scene_spec import SceneSpec, parse_scene
 from graspd.service.model.studies import Stability, from_json
 from graspd.service.model.version import PACKAGE_VERSION
@@ -306,7 +307,7 @@ def _write(chart: dict[str, Any], out: Path) -> None:
 
 def _read_chart(path: Path) -> dict[str, Any]:
     try:
-        found = loads(path.read_text())
+        found = renamed_chart(loads(path.read_text()))
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}") from None
     except ValueError:

@@ -21,7 +21,7 @@ KEYS: Final = {
 }
 _LEVELS: Final = {"letter": "dexgraspbench", "certificate": "standard", "screen": "fast"}
 #: Values of keys, by present name of the key.
-VALUES: Final = {"validation": _LEVELS, "verdict_level": _LEVELS, "want": {"raw": "candidates"}}
+VALUES: Final = {"validation": _LEVELS, "verdict_level": _LEVELS, "level": _LEVELS, "want": {"raw": "candidates"}}
 _OLD_KEYS: Final = {new: old for old, new in KEYS.items()}
 _OLD_VALUES: Final = {key: {new: old for old, new in names.items()} for key, names in VALUES.items()}
 #: Columns of base shards: present path, and path in schema graspd/base@1.
@@ -33,6 +33,9 @@ COLUMNS: Final = {
 #: Revision of each stage in graspd 0.2.
 _REVISIONS: Final = {"synthesize": 23, "scene": 2, "render": 4}
 _OLD: Final = re.compile(rb'"(?:' + b"|".join([*map(str.encode, KEYS), *map(str.encode, _LEVELS), b"raw"]) + rb')"')
+
+#: Measures of charts: success by the unmodified protocol, free or lifted, and speed of all candidates.
+_CHART: Final = re.compile(r"^(lift_)?(?:(letter)(?=_low$|_high$|_count$|$)|raw(?=_end_to_end_per_second$))")
 
 
 def has_old_names(document: bytes) -> bool:
@@ -53,6 +56,23 @@ def renamed(value: Any) -> Any:
     if isinstance(value, list):
         return [renamed(inner) for inner in value]
     return value
+
+
+def renamed_chart(chart: Any) -> Any:
+    """Convert a chart of `graspd chart` to present names."""
+    return _measures(renamed(chart))
+
+
+def _measures(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {_of_chart(key): _measures(inner) for key, inner in value.items()}
+    if isinstance(value, list):
+        return [_of_chart(inner) if isinstance(inner, str) else _measures(inner) for inner in value]
+    return value
+
+
+def _of_chart(name: str) -> str:
+    return _CHART.sub(lambda found: f"{found[1] or ''}{'dexgraspbench' if found[2] else 'candidates'}", name)
 
 
 def original(request: dict[str, Any]) -> dict[str, Any]:

@@ -32,7 +32,7 @@ from graspd.service.model.records import (
     Snapshot,
     Tag,
 )
-from graspd.service.model.renamed import has_old_names, renamed
+from graspd.service.model.renamed import has_old_names, renamed, renamed_chart
 from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.store.integrity import get_document, is_sealed, put_document, put_sealed
 from graspd.service.store.store import Store
@@ -223,13 +223,13 @@ def publish(store: Store, kind: str, record: Mapping[str, Any]) -> str:
 
 
 def latest(store: Store, kind: str) -> dict[str, Any] | None:
-    """Load the record of a kind that was published last; None if there is none.
+    """Load the record of a kind that was published last, with present names; None if there is none.
 
     Raises:
         DamagedError: its bytes do not match the seal.
     """
     key = latest_key(store, kind)
-    return get_document(store, key) if key else None
+    return renamed_chart(get_document(store, key)) if key else None
 
 
 def latest_key(store: Store, kind: str) -> str:

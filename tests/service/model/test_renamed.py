@@ -13,7 +13,7 @@ from graspd.service.model import renamed
 from graspd.service.model.domain import JobRequest
 from graspd.service.readers.files import open_shards
 from graspd.service.readers.grasps import Grasps
-from graspd.service.store.records import parse_record
+from graspd.service.store.records import CHARTS, latest, parse_record, publish
 from graspd.service.store.shards import read_shard, write_shard
 from graspd.service.store.store import open_store
 from tests.fakes import make_shard, message_for, request
@@ -35,6 +35,18 @@ def test_a_planners_own_options_keep_their_names() -> None:
     for document in (made.model_dump(mode="json"), renamed.original(made.model_dump(mode="json"))):
         assert renamed.renamed(document)["options"] == own
     assert renamed.renamed({"options": made.model_dump(mode="json")})["options"]["options"] == own
+
+
+def test_a_chart_of_0_2_has_todays_measures() -> None:
+    row = {"letter": 0.9, "letter_low": 0.8, "lift_letter_count": 3, "front": ["letter"]}
+    today = {"dexgraspbench": 0.9, "dexgraspbench_low": 0.8, "lift_dexgraspbench_count": 3, "front": ["dexgraspbench"]}
+    others = {"gsr": 1.0, "options": {"letters": 1}, "remark": "a letter"}
+    old = {"by_hand": {"allegro": [row]}, "referee": {"level": "certificate"}, "raw_end_to_end_per_second": 2.0}
+    new = {"by_hand": {"allegro": [today]}, "validation": {"level": "standard"}}
+    assert renamed.renamed_chart(old | others) == new | others | {"candidates_end_to_end_per_second": 2.0}
+    store = open_store("memory://")
+    publish(store, CHARTS, {"created": "2026-11-25", "summary": [row]})
+    assert latest(store, CHARTS) == {"created": "2026-11-25", "summary": [today]}
 
 
 def test_only_a_worker_of_0_2_gets_its_names() -> None:
