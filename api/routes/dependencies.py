@@ -1,10 +1,11 @@
-"""Dependencies of routes: services, permissions, page links, threads, conditions (RFC 9110 §13)."""
+"""Dependencies of routes: services, permissions, pages, threads, conditions (RFC 9110 §13)."""
 
 from __future__ import annotations
 
 import asyncio
 import re
 from collections.abc import Callable, Coroutine
+from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any, Final, TypeVar
 
@@ -26,12 +27,13 @@ from graspd.api.catalog.jobs import Jobs
 from graspd.api.catalog.overview import Overview, Usage
 from graspd.api.catalog.shards import Shards
 from graspd.api.catalog.tags import Tags
+from graspd.service.index.views import Page
 from graspd.service.model.errors import UnavailableError
 from graspd.service.pipeline.backends import Services
 from graspd.service.queue.connection import connect, redis_url
 from graspd.service.store.store import Store
 
-MAX_LIMIT = 200
+T = TypeVar("T")
 
 
 def provide(app: FastAPI, services: Services) -> None:
@@ -64,6 +66,10 @@ def may_submit(request: Request) -> None:
     authorize(request, Scope.SUBMIT)
 
 
+READ: Final = [Depends(may_read)]
+SUBMIT: Final = [Depends(may_submit)]
+
+
 def may_scrape(request: Request) -> None:
     """Allow callers that may read; or everyone, if the settings say so."""
     if request.app.state.settings.metrics_need_key:
@@ -91,14 +97,31 @@ ExportsOf = Annotated[GraspExports, Depends(_provided("grasp_exports"))]
 DeletionsOf = Annotated[Deletions, Depends(_provided("deletions"))]
 WebhooksOf = Annotated[Webhooks, Depends(_provided("webhooks"))]
 OverviewOf = Annotated[Overview, Depends(_provided("overview"))]
-Limit = Annotated[int, Query(ge=1, le=MAX_LIMIT, description="items on a page")]
+Limit = Annotated[int, Query(ge=1, le=200, description="items on a page")]
 Cursor = Annotated[str | None, Query(max_length=512, description="`next` of the page before")]
 
 
-def link_next(request: Request, response: Response, cursor: str | None) -> None:
-    """Set the Link header (RFC 8288) to the next page, with the same filters."""
-    if cursor is not None:
-        response.headers["Link"] = f'<{next_address(request, cursor)}>; rel="next"'
+@dataclass(frozen=True)
+class Paging:
+    """Requested part of a list."""
+
+    request: Request
+    response: Response
+    limit: int
+    cursor: str | None
+
+    def linked(self, page: Page[T]) -> Page[T]:
+        """Set the Link header (RFC 8288) to the next page, with the same filters."""
+        if page.next is not None:
+            self.response.headers["Link"] = f'<{next_address(self.request, page.next)}>; rel="next"'
+        return page
+
+
+async def _paging(request: Request, response: Response, limit: Limit = 50, cursor: Cursor = None) -> Paging:
+    return Paging(request, response, limit, cursor)
+
+
+PagingOf = Annotated[Paging, Depends(_paging)]
 
 
 def next_address(request: Request, cursor: str) -> str:
@@ -107,14 +130,14 @@ def next_address(request: Request, cursor: str) -> str:
     return f"{url.path}?{url.query}"
 
 
-T = TypeVar("T")
 #: Uploads unpacked and packed at once; each may hold one file of its size in memory.
 UPLOADS: Final = 4
 #: Forms with an upload at once: they also wait for its check.
 FORMS: Final = 8
 #: Files of selected grasps written at once.
 EXPORTS: Final = 2
-_WAITING: Final = 32
+#: Requests that may wait for a thread.
+_MOST_WAITING: Final = 32
 _PATIENCE_S: Final = 20.0
 
 
@@ -123,15 +146,13 @@ class RequestLimiter:
 
     Args:
         at_once: number of threads.
-        waiting: number of requests that may wait.
         patience_s: longest wait of a request [s].
     """
 
-    def __init__(self, at_once: int, *, waiting: int = _WAITING, patience_s: float = _PATIENCE_S) -> None:
+    def __init__(self, at_once: int, *, patience_s: float = _PATIENCE_S) -> None:
         self._free = asyncio.Semaphore(at_once)
         self._threads = CapacityLimiter(at_once)
         self._waiting = 0
-        self._most_waiting = waiting
         self._patience_s = patience_s
 
     async def run(self, function: Callable[..., T], *args: Any, **options: Any) -> T:
@@ -148,7 +169,7 @@ class RequestLimiter:
 
     async def _take(self) -> None:
         busy = UnavailableError("too many requests of this kind at once; try again in a moment")
-        if self._free.locked() and self._waiting >= self._most_waiting:
+        if self._free.locked() and self._waiting >= _MOST_WAITING:
             raise busy
         self._waiting += 1
         try:

@@ -11,7 +11,7 @@ from fastapi.sse import EventSourceResponse, ServerSentEvent
 from graspd.api.catalog import events
 from graspd.api.models import Job, JobDetail
 from graspd.api.problems import responses
-from graspd.api.routes.dependencies import Cursor, JobsOf, Limit, link_next, may_read, may_submit
+from graspd.api.routes.dependencies import READ, SUBMIT, JobsOf, PagingOf
 from graspd.service.index.views import Page
 from graspd.service.model.domain import JobRequest
 from graspd.service.model.states import State
@@ -27,10 +27,8 @@ IdempotencyKey = Annotated[
 @router.post(
     "",
     status_code=202,
-    dependencies=[Depends(may_submit)],
-    responses=responses(
-        400, 401, 403, 404, 409, 413, 422, 503, others={200: {"model": JobDetail, "description": "It has ended"}}
-    ),
+    dependencies=SUBMIT,
+    responses=responses(400, 404, 409, others={200: {"model": JobDetail, "description": "It has ended"}}),
 )
 def submit(body: JobRequest, response: Response, jobs: JobsOf, idempotency_key: IdempotencyKey = None) -> JobDetail:
     """Submit a job. Identical content gives the same job: its id follows from request, hand and object."""
@@ -43,51 +41,38 @@ def submit(body: JobRequest, response: Response, jobs: JobsOf, idempotency_key: 
     return job
 
 
-@router.get("", dependencies=[Depends(may_read)], responses=responses(401, 403, 422, 503))
+@router.get("", dependencies=READ)
 def list_jobs(
-    request: Request,
-    response: Response,
     jobs: JobsOf,
+    paging: PagingOf,
     state: State | None = None,
     hand: Annotated[str | None, Query(max_length=64)] = None,
     object: Annotated[str | None, Query(max_length=64)] = None,
-    limit: Limit = 50,
-    cursor: Cursor = None,
 ) -> Page[Job]:
     """List jobs, newest first."""
-    page = jobs.page(state=state, hand=hand, object=object, limit=limit, cursor=cursor)
-    link_next(request, response, page.next)
-    return page
+    page = jobs.page(state=state, hand=hand, object=object, limit=paging.limit, cursor=paging.cursor)
+    return paging.linked(page)
 
 
-@router.get("/{job_id}", dependencies=[Depends(may_read)], responses=responses(401, 403, 404, 503))
+@router.get("/{job_id}", dependencies=READ, responses=responses(404))
 def get_job(job_id: str, jobs: JobsOf) -> JobDetail:
     """Return a job with the progress of its stages, failed attempts, mean metrics and shards."""
     return jobs.one(job_id)
 
 
-@router.post(
-    "/{job_id}/cancel",
-    status_code=202,
-    dependencies=[Depends(may_submit)],
-    responses=responses(401, 403, 404, 409, 503),
-)
+@router.post("/{job_id}/cancel", status_code=202, dependencies=SUBMIT, responses=responses(404, 409))
 def cancel(job_id: str, jobs: JobsOf) -> JobDetail:
     """Cancel a job's waiting and running tasks; results remain."""
     return jobs.cancel(job_id)
 
 
-@router.post(
-    "/{job_id}/retry", status_code=202, dependencies=[Depends(may_submit)], responses=responses(401, 403, 404, 409, 503)
-)
+@router.post("/{job_id}/retry", status_code=202, dependencies=SUBMIT, responses=responses(404, 409))
 def retry(job_id: str, jobs: JobsOf) -> JobDetail:
     """Run failed and cancelled tasks again; existing results are not made again."""
     return jobs.retry(job_id)
 
 
-@router.delete(
-    "/{job_id}", status_code=204, dependencies=[Depends(may_submit)], responses=responses(401, 403, 404, 409, 503)
-)
+@router.delete("/{job_id}", status_code=204, dependencies=SUBMIT, responses=responses(404, 409))
 def delete(job_id: str, jobs: JobsOf) -> None:
     """Delete an ended job. After a grace time its shards follow, unless another job needs them; until then
     `POST .../restore` restores the job."""
@@ -101,9 +86,9 @@ def known_job(job_id: str, jobs: JobsOf) -> None:
 
 @router.get(
     "/{job_id}/events",
-    dependencies=[Depends(may_read), Depends(known_job)],
+    dependencies=[*READ, Depends(known_job)],
     response_class=EventSourceResponse,
-    responses=responses(401, 403, 404, 503),
+    responses=responses(404),
 )
 async def watch(job_id: str, request: Request, jobs: JobsOf) -> AsyncIterable[ServerSentEvent]:
     """Stream a job's progress: `progress` with the job at each change, `end` with its last state."""

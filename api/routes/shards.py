@@ -5,12 +5,12 @@ from __future__ import annotations
 import re
 from typing import Annotated, Literal
 
-from fastapi import APIRouter, Depends, Query, Request, Response
+from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import RedirectResponse, StreamingResponse
 
 from graspd.api.models import Shard
 from graspd.api.problems import ApiError, responses
-from graspd.api.routes.dependencies import Cursor, Limit, ShardsOf, is_known, link_next, may_read, range_applies
+from graspd.api.routes.dependencies import READ, PagingOf, ShardsOf, is_known, range_applies
 from graspd.service.index.views import Page
 
 router = APIRouter(prefix="/v1/shards", tags=["shards"])
@@ -20,39 +20,31 @@ _MEDIA_TYPE = "application/x-hdf5"
 _RANGE = re.compile(r"bytes=([0-9]{0,18})-([0-9]{0,18})")
 
 
-@router.get("", dependencies=[Depends(may_read)], responses=responses(401, 403, 404, 422, 503))
+@router.get("", dependencies=READ, responses=responses(404))
 def list_shards(
-    request: Request,
-    response: Response,
     shards: ShardsOf,
+    paging: PagingOf,
     job: Annotated[str | None, Query(max_length=64)] = None,
     kind: Literal["base", "scene", "views"] | None = None,
-    limit: Limit = 50,
-    cursor: Cursor = None,
 ) -> Page[Shard]:
     """List shards, all or those of a job."""
-    page = shards.page(job=job, kind=kind, limit=limit, cursor=cursor)
-    link_next(request, response, page.next)
-    return page
+    return paging.linked(shards.page(job=job, kind=kind, limit=paging.limit, cursor=paging.cursor))
 
 
-@router.get("/{shard_id}", dependencies=[Depends(may_read)], responses=responses(401, 403, 404, 503))
+@router.get("/{shard_id}", dependencies=READ, responses=responses(404))
 def get_shard(shard_id: str, shards: ShardsOf) -> Shard:
     """Return a shard with its whole manifest."""
     return shards.one(shard_id)
 
 
-@router.head("/{shard_id}/file", dependencies=[Depends(may_read)], include_in_schema=False)
+@router.head("/{shard_id}/file", dependencies=READ, include_in_schema=False)
 @router.get(
     "/{shard_id}/file",
-    dependencies=[Depends(may_read)],
+    dependencies=READ,
     response_class=StreamingResponse,
     responses=responses(
-        401,
-        403,
         404,
         416,
-        503,
         others={
             200: {"content": {_MEDIA_TYPE: {}}, "description": "The file"},
             206: {"content": {_MEDIA_TYPE: {}}, "description": "The bytes asked for"},

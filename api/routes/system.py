@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from datetime import date
-from typing import Annotated, Final, get_args
+from typing import Annotated, get_args
 
 from fastapi import APIRouter, Depends, Path, Query, Request, Response
 from pydantic import BeforeValidator
@@ -16,20 +16,20 @@ from graspd.api.catalog.overview import as_csv
 from graspd.api.metrics import CONTENT_TYPE, Metrics
 from graspd.api.models import Health, Worker
 from graspd.api.problems import responses
-from graspd.api.routes.dependencies import DeletionsOf, OverviewOf, UsageOf, may_read, may_scrape, may_submit
+from graspd.api.routes.dependencies import READ, SUBMIT, DeletionsOf, OverviewOf, UsageOf, may_scrape
 from graspd.service.index.views import Stats, UsageDay
 from graspd.service.store.records import What
 
 router = APIRouter(tags=["system"])
 
 
-@router.get("/v1/workers", dependencies=[Depends(may_read)], responses=responses(401, 403, 503))
+@router.get("/v1/workers", dependencies=READ)
 def list_workers(overview: OverviewOf) -> list[Worker]:
     """List workers with a recent heartbeat: device, present stage, age of the lease."""
     return overview.workers()
 
 
-@router.get("/v1/stats", dependencies=[Depends(may_read)], responses=responses(401, 403, 503))
+@router.get("/v1/stats", dependencies=READ)
 def get_stats(overview: OverviewOf) -> Stats:
     """Return statistics of the whole service, from the index."""
     return overview.stats()
@@ -61,7 +61,7 @@ def readyz(request: Request, overview: OverviewOf, response: Response) -> Health
     "/metrics",
     dependencies=[Depends(may_scrape)],
     response_class=Response,
-    responses=responses(401, 403, others={200: {"content": {"text/plain": {}}}}),
+    responses=responses(others={200: {"content": {"text/plain": {}}}}),
 )
 def metrics(request: Request, overview: OverviewOf) -> Response:
     """Return metrics as Prometheus text. A scrape succeeds even if a part is down, without its series."""
@@ -84,7 +84,7 @@ Since = Annotated[Day | None, Query(description="first day (UTC); default: a mon
 Until = Annotated[Day | None, Query(description="last day (UTC); default: today")]
 
 
-@usage_router.get("/v1/usage", dependencies=[Depends(may_read)], responses=responses(400, 401, 403, 422, 503))
+@usage_router.get("/v1/usage", dependencies=READ, responses=responses(400))
 def get_usage(usage: UsageOf, since: Since = None, until: Until = None) -> list[UsageDay]:
     """Return each project's grasps and seconds per day, newest first; all projects with `admin`."""
     return usage.days(since, until)
@@ -92,16 +92,9 @@ def get_usage(usage: UsageOf, since: Since = None, until: Until = None) -> list[
 
 @usage_router.get(
     "/v1/usage.csv",
-    dependencies=[Depends(may_read)],
+    dependencies=READ,
     response_class=Response,
-    responses=responses(
-        400,
-        401,
-        403,
-        422,
-        503,
-        others={200: {"content": {"text/csv": {}}, "description": "One line a day and project"}},
-    ),
+    responses=responses(400, others={200: {"content": {"text/csv": {}}, "description": "One line a day and project"}}),
 )
 def get_usage_csv(usage: UsageOf, since: Since = None, until: Until = None) -> Response:
     """Return the same as a table."""
@@ -112,10 +105,9 @@ def get_usage_csv(usage: UsageOf, since: Since = None, until: Until = None) -> R
 deletion_router = APIRouter(tags=["deletions"])
 
 Name = Annotated[str, Path(max_length=64, description="its name, or its id")]
-KINDS: Final[tuple[What, ...]] = get_args(What)
 
 
-@deletion_router.get("/v1/deletions", dependencies=[Depends(may_read)], responses=responses(401, 403, 503))
+@deletion_router.get("/v1/deletions", dependencies=READ)
 def list_deletions(deletions: DeletionsOf) -> list[DeletionView]:
     """List what can be restored, newest first."""
     return deletions.recent()
@@ -123,15 +115,12 @@ def list_deletions(deletions: DeletionsOf) -> list[DeletionView]:
 
 def _add_restore(what: What) -> None:
     @deletion_router.post(
-        f"/v1/{what}s/{{name}}/restore",
-        dependencies=[Depends(may_submit)],
-        responses=responses(401, 403, 404, 409, 422, 503),
-        name=f"restore_{what}",
+        f"/v1/{what}s/{{name}}/restore", dependencies=SUBMIT, responses=responses(404, 409), name=f"restore_{what}"
     )
     def restore(name: Name, deletions: DeletionsOf) -> DeletionView:
         """Restore a resource deleted within the grace time (`GRASPD_SHARD_GRACE_S`), unchanged."""
         return deletions.restore(what, name)
 
 
-for _kind in KINDS:
+for _kind in get_args(What):
     _add_restore(_kind)
