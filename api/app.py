@@ -105,7 +105,6 @@ def create_app(settings: Settings, services: Services | None = None) -> FastAPI:
 
 
 def check_exposure(host: str, keys: KeyFile) -> None:
-    """Raise InputError if other machines could reach a service that has no live key."""
     if not keys.has_live_key and not is_loopback(host):
         raise InputError(
             f"{host} is reachable from other machines and there is no live key; "

@@ -26,7 +26,6 @@ def metric(value: float | None) -> str:
 
 
 def count(value: float | None) -> str:
-    """Format a whole number with separated thousands."""
     return NONE if value is None else f"{value:,.0f}"
 
 
@@ -71,7 +70,6 @@ def duration(seconds: float | None) -> str:
 
 
 def size(value: float | None) -> str:
-    """Format bytes in decimal units."""
     if value is None:
         return NONE
     for unit in ("B", "kB", "MB", "GB"):

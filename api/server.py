@@ -26,10 +26,6 @@ from graspd.service.settings import Settings
 
 #: A stop waits at most this long for open event streams, which end only with their clients [s].
 _GRACE_S = 3
-#: Limit from the start of a connection, or the first byte of a later request, to the end of its headers [s].
-HEADERS_S: Final = 20.0
-#: Limit for the rest of a body after its answer [s]: a client that still sends may read the answer first.
-REST_S: Final = 5.0
 _TOO_SLOW: Final = b"HTTP/1.1 408 Request Timeout\r\nConnection: close\r\nContent-Length: 0\r\n\r\n"
 
 
@@ -77,7 +73,6 @@ def serve(settings: Settings) -> None:
 
 
 def configuration(app: ASGIApp, settings: Settings) -> uvicorn.Config:
-    """Return uvicorn's configuration for the application."""
     return uvicorn.Config(
         app,
         http=TimedProtocol,
@@ -96,8 +91,10 @@ def configuration(app: ASGIApp, settings: Settings) -> uvicorn.Config:
 class TimedProtocol(H11Protocol):
     """HTTP/1.1 connection with time limits that trickling bytes do not extend."""
 
-    headers_s = HEADERS_S
-    rest_s = REST_S
+    #: Limit from the start of a connection, or the first byte of a later request, to the end of its headers [s].
+    headers_s = 20.0
+    #: Limit for the rest of a body after its answer [s]: a client that still sends may read the answer first.
+    rest_s = 5.0
     _patience: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]

@@ -1,4 +1,4 @@
-"""Quotas of a key, and of a project's keys together: grasps in unfinished jobs, and requests per day.
+"""Quotas of a key, and of a project's keys together: grasps in unfinished jobs, and requests per day. Idempotency keys.
 
 Redis counts them in one atomic step for all API processes. Its loss resets quotas, but loses no job. From submission to
 end, a job counts with its requested grasps. The index is asked for ended jobs only if the quota would be exceeded, so a
@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 import uuid
 from collections.abc import Callable, Collection, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from typing import Any, Final
@@ -19,7 +19,9 @@ from redis.exceptions import RedisError
 
 from graspd.api.access.keys import Key, ProjectLimits
 from graspd.service.index.index import Index
-from graspd.service.model.errors import QuotaError
+from graspd.service.model.digests import digest_bytes, digest_json
+from graspd.service.model.domain import JobRequest
+from graspd.service.model.errors import InputError, QueueUnavailable, QuotaError
 from graspd.service.settings import Settings
 
 log = logging.getLogger(__name__)
@@ -117,10 +119,6 @@ class _Holder:
     counts_jobs: bool
 
     @property
-    def is_limited(self) -> bool:
-        return bool(self.grasps or self.today)
-
-    @property
     def held(self) -> str:
         return f"graspd:quota:{self.name}:held"
 
@@ -169,15 +167,7 @@ class Quotas:
 
     @contextmanager
     def claim(self, key: Key | None, job: str, grasps: int, *, is_new: bool = True) -> Iterator[SubmissionClaim]:
-        """Count a job submitted or retried in this context, unless that fails or makes nothing new.
-
-        Args:
-            key: the submitting key; None while the service is open, without quotas.
-            is_new: whether the job counts as one of today; a retried job does not.
-
-        Raises:
-            QuotaError: the quota of the key or of its project is used up.
-        """
+        """Count a job submitted or retried (not `is_new`) in this context, unless that fails or makes nothing new."""
         claim = SubmissionClaim()
         if key is None:
             yield claim
@@ -198,7 +188,6 @@ class Quotas:
             )
 
     def _holders(self, key: Key) -> list[_Holder]:
-        """Return the owners of counters that a submission increases: those with a limit."""
         own, all_ = key.limits, self._settings
         grasps = all_.quota_grasps_in_flight if own.grasps_in_flight is None else own.grasps_in_flight
         jobs = all_.quota_jobs_per_day if own.jobs_per_day is None else own.jobs_per_day
@@ -209,7 +198,7 @@ class Quotas:
             # Names of keys contain no colon.
             words = f"the project {key.project!r}"
             found.append(_Holder(f"project:{key.project}", words, *most, counts_jobs=False))
-        return [holder for holder in found if holder.is_limited]
+        return [holder for holder in found if holder.grasps or holder.today]
 
     @contextmanager
     def _counted(
@@ -227,9 +216,7 @@ class Quotas:
                 self._end(holder, job, grasps, number, met, counts=claim.counts, is_new=is_new)
 
     def _claim(self, holder: _Holder, job: str, grasps: int, number: str, *, is_new: bool) -> str:
-        """Return how a job is counted.
-
-        Empty: by this claim. `shared`: by another pending claim. `known`: by an earlier one. `unknown`: no Redis."""
+        """Return how it is counted: `shared` by another pending claim, `known`, `unknown` without Redis, or empty."""
         met, amount = self._ask(holder, job, grasps, number, is_new=is_new)
         if met == "grasps":
             with self._forgiving(holder):
@@ -281,7 +268,6 @@ class Quotas:
 
 
 def _amount(holder: _Holder, grasps: int) -> int:
-    """Return the amount that a new job adds to the counter of the day."""
     return 1 if holder.counts_jobs else grasps
 
 
@@ -299,3 +285,52 @@ def unfinished(index: Index, ids: Collection[str]) -> set[str]:
     names = {one.removeprefix(DATASET_PREFIX) for one in ids if one.startswith(DATASET_PREFIX)}
     found = index.jobs.unfinished([one for one in ids if not one.startswith(DATASET_PREFIX)])
     return found | {DATASET_PREFIX + name for name in index.datasets.unfinished(names)}
+
+
+_KEY_KEPT_S: Final = 24 * 3600
+_FREE: Final = "if redis.call('GET', KEYS[1]) == ARGV[1] then redis.call('DEL', KEYS[1]) end"
+
+
+class Idempotency:
+    """Idempotency-Key (IETF draft): the same key with a different body is an input error.
+
+    Identical requests give the same job even without a key, because its id depends on its content. So no answer is
+    stored, only the content of each key, in Redis for a day: its loss loses a check, never a job.
+    """
+
+    def __init__(self, connection: Any) -> None:
+        self._connection = connection
+
+    @contextmanager
+    def claim(self, owner: str, key: str, request: JobRequest) -> Iterator[None]:
+        """Bind a key of an API key's `owner` to a request recorded in this context; a failure releases it.
+
+        Raises:
+            InputError: the key is bound to another request.
+        """
+        name = f"graspd:idempotency:{digest_bytes(f'{owner} {key}'.encode())}"
+        content = digest_json(request.model_dump(mode="json")).encode()
+        is_ours = self._bind(name, content)
+        try:
+            yield
+        except BaseException:
+            if is_ours:
+                with suppress(RedisError):
+                    self._connection.eval(_FREE, 1, name, content)
+            raise
+        if not is_ours:
+            # The request that bound the key may have failed and released it meanwhile.
+            with suppress(RedisError):
+                self._connection.set(name, content, ex=_KEY_KEPT_S, nx=True)
+
+    def _bind(self, name: str, content: bytes) -> bool:
+        """Bind the key to content; return whether it was free."""
+        try:
+            if self._connection.set(name, content, ex=_KEY_KEPT_S, nx=True):
+                return True
+            bound = self._connection.get(name)
+        except RedisError as error:
+            raise QueueUnavailable(f"Redis does not answer: {error}") from None
+        if bound not in (None, content):
+            raise InputError("this Idempotency-Key came with another request before; take a new key")
+        return False

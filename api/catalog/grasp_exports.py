@@ -52,16 +52,7 @@ class GraspExports:
         self._tags = tags
 
     def made(self, places: Sequence[Grasp], format: Format, said: Mapping[str, Any]) -> Export:
-        """Write a file of these grasps, which must be visible to the caller.
-
-        Args:
-            said: description of the selection, written into JSON and the ZIP's `subset.json`.
-
-        Raises:
-            InputError: a ZIP without grasps.
-            LimitError: a ZIP of grasps from more than `MOST_SHARDS` shards.
-            DamagedShard: a shard does not match its checksum.
-        """
+        """Write a file of these grasps, which must be visible to the caller; `said` describes the selection in it."""
         file = TemporaryFile()  # noqa: SIM115 (it is closed once it is sent)
         try:
             {"csv": self._csv, "json": self._json, "zip": self._zip}[format](file, places, said)

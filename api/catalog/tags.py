@@ -19,18 +19,16 @@ log = logging.getLogger(__name__)
 
 
 class Tags:
-    """Tags of the caller's project, and the grasps that have them."""
+    """Tags of the caller's project, each by its name or id; changes raise ForeignResource."""
 
     def __init__(self, services: Services, grasps: Grasps) -> None:
         self._services = services
         self._grasps = grasps
 
     def all(self) -> list[TagView]:
-        """Return tags in scope, by name."""
         return self._services.index.tags.all(scope=project_scope())
 
     def one(self, name: str) -> TagView:
-        """Return a tag by its name or id."""
         wanted = self._services.index.tags.named(name, scope=project_scope())
         return next(tag for tag in self.all() if tag.id == wanted)
 
@@ -39,11 +37,7 @@ class Tags:
         return self._services.index.tags.of(grasps, scope=project_scope())
 
     def chosen(self, selection: Selection) -> list[Grasp]:
-        """Return the grasps of a selection, each once, in order.
-
-        Raises:
-            NotFoundError: a listed grasp does not exist or is out of scope.
-        """
+        """Return the grasps of a selection, each once, in order; NotFoundError if one is out of scope."""
         if selection.filter is not None:
             return self._grasps.members(selection.filter)
         named = sorted({(grasp.shard_id, grasp.row) for grasp in selection.grasps or ()})
@@ -54,13 +48,6 @@ class Tags:
         return named
 
     def give(self, name: str, selection: Selection) -> TagChange:
-        """Give a tag of the caller's project to grasps; a new tag is created.
-
-        Raises:
-            InputError: the selection is empty.
-            NotYours: another key made the tag.
-            LimitError: there are already `MOST_TAGS` tags, or too many grasps would have it.
-        """
         if not (grasps := self.chosen(selection)):
             raise InputError("no grasp passes this filter, so none gets the tag")
         project = project_scope().project
@@ -75,21 +62,11 @@ class Tags:
         return TagChange(tag=self.one(tag_id(name, project)), changed=changed)
 
     def take_off(self, name: str, selection: Selection) -> TagChange:
-        """Remove a tag from grasps.
-
-        Raises:
-            NotYours: another key made the tag.
-        """
         tag = self._services.index.tags.named(name, scope=project_scope())
         changed = tagging.take_off(self._services, tag, self.chosen(selection), permit=_permit)
         return TagChange(tag=self.one(tag), changed=changed)
 
     def remove(self, name: str) -> None:
-        """Delete a tag; its grasps remain.
-
-        Raises:
-            NotYours: another key made the tag.
-        """
         tag = self._services.index.tags.named(name, scope=project_scope())
         tagging.remove(self._services, tag, permit=_permit, owner=caller_id())
         log.info("tag %s removed", name)

@@ -40,7 +40,6 @@ class Plot:
     label: str
     points: str
     data: str
-    height: int = 180
 
 
 @dataclass(frozen=True)
@@ -58,13 +57,7 @@ class Bar:
 
 
 def line(xs: Sequence[float], ys: Sequence[float], *, x: str, y: str, unit: str = "", log: bool = False) -> Plot:
-    """Draw a line through points; a logarithmic axis omits values at or below zero.
-
-    Args:
-        x: name of the horizontal axis, with its unit.
-        y: name of the values.
-        unit: of the values.
-    """
+    """Draw a line of `y` [unit] over `x`; a logarithmic axis omits values at or below zero."""
     kept = [(a, b) for a, b in zip(xs, ys, strict=True) if math.isfinite(b) and (b > 0 or not log)]
     scaled = [(a, math.log10(b) if log else b) for a, b in kept]
     low, high = (min(b for _, b in scaled), max(b for _, b in scaled)) if scaled else (0.0, 1.0)
@@ -80,8 +73,8 @@ def line(xs: Sequence[float], ys: Sequence[float], *, x: str, y: str, unit: str 
     return Plot(label, points, json.dumps(data | {"log": log}))
 
 
-def minutes(values: Sequence[int], start: float, *, step_s: int = 60) -> Plot:
-    """Draw bars of the grasps made in each interval from `start` [s since 1970]."""
+def minutes(values: Sequence[int], start: float) -> Plot:
+    """Draw bars of the grasps made in each minute from `start` [s since 1970]."""
     top = max([*values, 1])
     width = WIDTH / max(len(values), 1)
     points = " ".join(
@@ -91,7 +84,7 @@ def minutes(values: Sequence[int], start: float, *, step_s: int = 60) -> Plot:
     )
     data = {
         "kind": "bars",
-        "xs": [start + i * step_s for i in range(len(values))],
+        "xs": [start + i * 60 for i in range(len(values))],
         "ys": list(values),
         "x": "Time",
         "y": "Valid grasps",
@@ -102,18 +95,12 @@ def minutes(values: Sequence[int], start: float, *, step_s: int = 60) -> Plot:
 
 
 def bars(histogram: Histogram, path: str, where: dict[str, str]) -> list[Bar]:
-    """Return the bars of a histogram; each links to the grasps whose metric is in its range.
-
-    Args:
-        path: page of the list.
-        where: its other filters.
-    """
-    count = len(histogram.counts)
-    width = (histogram.high - histogram.low) / count
+    """Return the bars of a histogram; each links to the page `path` of the grasps in its range and `where`."""
+    width, top = (histogram.high - histogram.low) / len(histogram.counts), max(histogram.counts) or 1
     made = []
-    for index, (share, number) in enumerate(zip(histogram.bars, histogram.counts, strict=True)):
+    for index, number in enumerate(histogram.counts):
         low, high = histogram.low + index * width, histogram.low + (index + 1) * width
-        tall = max(60 * share, 1.5 if number else 0)
+        tall = max(60 * (number / top), 1.5 if number else 0)
         query = where | {f"min_{histogram.metric}": f"{low:.6g}", f"max_{histogram.metric}": f"{high:.6g}"}
         made.append(Bar(10.0 * index + 1, 63 - tall, 8.0, tall, number, low, high, f"{path}?{urlencode(query)}"))
     return made
@@ -192,7 +179,6 @@ class Grid:
 
 
 def of_dataset(dataset: DatasetView, cells: Sequence[CellView]) -> Grid:
-    """Return the matrix of a dataset."""
     found = {
         (cell.hand, cell.object): Tile(
             hand=cell.hand,
@@ -214,7 +200,6 @@ def of_dataset(dataset: DatasetView, cells: Sequence[CellView]) -> Grid:
 
 
 def of_service(cells: Iterable[MatrixCell], hands: Sequence[str], objects: Sequence[str]) -> Grid:
-    """Return the matrix of the service: all known hands and objects, with the results of their jobs."""
     found = {
         (cell.hand, cell.object): Tile(
             hand=cell.hand,
@@ -245,11 +230,7 @@ def _grid(hands: Sequence[str], objects: Sequence[str], found: dict[tuple[str, s
 
 
 def _state(cell: MatrixCell) -> str:
-    if cell.running:
-        return State.RUNNING.value
-    if cell.queued:
-        return State.QUEUED.value
-    return State.FAILED.value if cell.failed else State.SUCCEEDED.value
+    return next((state for state in ("running", "queued", "failed") if getattr(cell, state)), "succeeded")
 
 
 #: Width and height of a cell with its gap [px], as in the style sheet: lines are drawn over the cells.
@@ -306,11 +287,9 @@ class MapDrawing:
     panels: list[Panel]
     counts: dict[Outcome, int]
     reached: list[Share]
-    still_breaks: list[str]
 
 
 def load(store: Store) -> Stability | None:
-    """Load the last published maps; None if there are none, or if they cannot be read."""
     try:
         found = latest(store, STABILITY)
         return None if found is None else from_json(found)
@@ -319,13 +298,11 @@ def load(store: Store) -> Stability | None:
 
 
 def draw(one: StabilityMap) -> MapDrawing:
-    """Convert a map to panels and numbers."""
     return MapDrawing(
         map=one,
         panels=[_panel(one, name) for name in one.panels],
         counts={outcome: number for outcome, number in counts(one.cells).items() if number},
         reached=_shares(one.reached()),
-        still_breaks=one.still_breaks(),
     )
 
 

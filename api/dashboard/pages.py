@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import AsyncIterable
 from typing import Annotated, Final
 
-from fastapi import APIRouter, Depends, FastAPI, Form, Request
+from fastapi import APIRouter, FastAPI, Form, Request
 from fastapi.responses import HTMLResponse, RedirectResponse
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 
@@ -19,7 +19,7 @@ from graspd.api.dashboard import dataset_pages, forms, grasp_pages, hand_pages, 
 from graspd.api.dashboard.forms import Expectations
 from graspd.api.dashboard.job_pages import Pictures
 from graspd.api.dashboard.rendering import environment, render
-from graspd.api.routes.dependencies import OverviewOf, may_read
+from graspd.api.routes.dependencies import READ, OverviewOf
 from graspd.service.model.errors import ERRORS
 from graspd.service.pipeline.backends import Services
 
@@ -39,29 +39,25 @@ routers: Final = (
 
 
 def install(app: FastAPI, services: Services) -> None:
-    """Set up what the pages need from the application, besides their routes."""
     app.state.templates = environment()
     app.state.pictures = Pictures(services.store)
     app.state.expectations = Expectations(services.index)
 
 
-@router.get("/events", dependencies=[Depends(may_read)], response_class=EventSourceResponse)
+@router.get("/events", dependencies=READ, response_class=EventSourceResponse)
 async def watch(request: Request, overview: OverviewOf) -> AsyncIterable[ServerSentEvent]:
-    """Stream an event whenever something on the home page has changed."""
     async for event in events.service_events(overview, request):
         yield event
 
 
-@router.get("/docs", dependencies=[Depends(may_read)])
+@router.get("/docs", dependencies=READ)
 def explorer(request: Request) -> HTMLResponse:
-    """Show every route, with a form to try it."""
     return render(request, "explorer.html")
 
 
 @router.get("/problems")
 @router.get("/problems/{slug}")
 def problem_types(request: Request, slug: str = "") -> HTMLResponse:
-    """Explain the types of problem documents."""
     types = [(name, error.status, (error.__doc__ or "").splitlines()[0]) for name, error in ERRORS.items()]
     types += [(name, status, text) for name, (status, text) in _HTTP_PROBLEMS.items()]
     return render(request, "problems.html", types=sorted(types, key=lambda row: (row[1], row[0])))
@@ -80,7 +76,6 @@ _HTTP_PROBLEMS: Final = {
 
 @router.get("/login")
 def login_page(request: Request) -> HTMLResponse:
-    """Show the form for the key; in a session, its key and the button to sign out."""
     key = request.scope["state"].get("key") if SESSION_COOKIE in request.cookies else None
     return render(request, "login.html", problem="", health=None, session=key.name if key else "")
 
@@ -95,7 +90,6 @@ def logout(request: Request) -> RedirectResponse:
 
 @router.post("/login", response_model=None)
 def login(request: Request, key: Annotated[str, Form(max_length=200)]) -> HTMLResponse | RedirectResponse:
-    """Exchange a key for a cookie."""
     keys: KeyFile = request.app.state.keys
     found = keys.find(key.strip())
     if found is None:

@@ -7,15 +7,17 @@ from collections import defaultdict
 from datetime import UTC, datetime, timedelta
 from typing import Annotated, Final
 
-from fastapi import APIRouter, Depends, Form, Query, Request
+from fastapi import APIRouter, Form, Query, Request
 from fastapi.responses import HTMLResponse, RedirectResponse
 
 from graspd.api.catalog.datasets import Datasets
-from graspd.api.catalog.overview import Overview
+from graspd.api.catalog.overview import MINUTES, Overview
 from graspd.api.dashboard import figures, tradeoff
 from graspd.api.dashboard.rendering import render
 from graspd.api.models import STAGE_LABELS
 from graspd.api.routes.dependencies import (
+    READ,
+    SUBMIT,
     DatasetsOf,
     DeletionsOf,
     JobsOf,
@@ -23,8 +25,6 @@ from graspd.api.routes.dependencies import (
     StoreOf,
     TagsOf,
     UsageOf,
-    may_read,
-    may_submit,
 )
 from graspd.api.routes.system import Since, Until
 from graspd.service.index.views import DatasetView, WorkerView
@@ -34,7 +34,6 @@ from graspd.service.store.records import What
 
 PAGE_SIZE: Final = 25
 _LOST_SHOWN: Final = timedelta(minutes=10)
-_MINUTES: Final = 60
 _DATASETS: Final = 6
 #: Polling interval [s]: a study takes minutes, and no event announces its publication.
 _STUDY_S: Final = 10
@@ -42,7 +41,7 @@ _STUDY_S: Final = 10
 router = APIRouter(include_in_schema=False)
 
 
-@router.get("/", dependencies=[Depends(may_read)])
+@router.get("/", dependencies=READ)
 def home(
     request: Request,
     overview: OverviewOf,
@@ -51,10 +50,9 @@ def home(
     state: str = "",
     cursor: Annotated[str | None, Query(max_length=512)] = None,
 ) -> HTMLResponse:
-    """Show health, throughput, jobs, queue, workers and failures."""
     chosen = State(state) if state in set(State) else None
-    minutes = overview.valid_per_minute(minutes=_MINUTES)
-    start = time.time() // 60 * 60 - 60 * (_MINUTES - 1)
+    minutes = overview.valid_per_minute()
+    start = time.time() // 60 * 60 - 60 * (MINUTES - 1)
     return render(
         request,
         "home.html",
@@ -68,15 +66,14 @@ def home(
         jobs=jobs.page(state=chosen, limit=PAGE_SIZE, cursor=cursor),
         stages=stage_depths(overview),
         workers=[worker for worker in overview.workers() if is_recent(worker)],
-        failures=overview.failures(limit=4),
+        failures=overview.failures(),
         datasets=_latest_datasets(datasets),
         damage=overview.damage(),
     )
 
 
-@router.get("/workers", dependencies=[Depends(may_read)])
+@router.get("/workers", dependencies=READ)
 def workers_page(request: Request, overview: OverviewOf) -> HTMLResponse:
-    """Show each worker with its device, its present task and the task's start."""
     workers = [worker for worker in overview.workers() if is_recent(worker)]
     return render(
         request,
@@ -93,11 +90,10 @@ def workers_page(request: Request, overview: OverviewOf) -> HTMLResponse:
     )
 
 
-@router.get("/chart", dependencies=[Depends(may_read)])
+@router.get("/chart", dependencies=READ)
 def chart_page(
     request: Request, store: StoreOf, y: str = "gsr", lifts: str = "lift", hand: str = "", object: str = ""
 ) -> HTMLResponse:
-    """Show speed against accuracy of methods and fidelities, from the last `graspd chart` of each kind."""
     measured = tradeoff.load(store)
     axis = {False: y if y in tradeoff.FREE else "gsr", True: lifts if lifts in tradeoff.IN_SCENES else "lift"}
     drawn = [tradeoff.draw(one, axis=axis[one.scene is not None], hand=hand, object=object) for one in measured]
@@ -123,9 +119,8 @@ def chart_page(
     )
 
 
-@router.get("/stability", dependencies=[Depends(may_read)])
+@router.get("/stability", dependencies=READ)
 def stability_page(request: Request, store: StoreOf) -> HTMLResponse:
-    """Show maps of where integrators and the planner fail, from the last `graspd stability`."""
     measured = figures.load(store)
     return render(
         request,
@@ -156,7 +151,6 @@ def stage_depths(overview: Overview) -> list[tuple[str, int]]:
 
 
 def _latest_datasets(datasets: Datasets) -> list[DatasetView]:
-    """Return the newest datasets, unfinished ones first."""
     newest = datasets.page(limit=_DATASETS).items
     return sorted(newest, key=lambda dataset: dataset.state.is_final)[:4]
 
@@ -164,9 +158,8 @@ def _latest_datasets(datasets: Datasets) -> list[DatasetView]:
 _SUMMED = ("grasps", "valid", "tasks", "gpu_seconds", "cpu_seconds")
 
 
-@router.get("/usage", dependencies=[Depends(may_read)])
+@router.get("/usage", dependencies=READ)
 def usage_page(request: Request, usage: UsageOf, since: Since = None, until: Until = None) -> HTMLResponse:
-    """Show the usage of each project: in total, against its quotas, and per day."""
     days = usage.days(since, until)
     limits = usage.limits()
     today = datetime.now(UTC).date().isoformat()
@@ -177,7 +170,6 @@ def usage_page(request: Request, usage: UsageOf, since: Since = None, until: Unt
             total[name] += getattr(one, name)
             if one.day == today:
                 total[f"today_{name}"] += getattr(one, name)
-    given = request.url.query
     return render(
         request,
         "usage.html",
@@ -186,7 +178,7 @@ def usage_page(request: Request, usage: UsageOf, since: Since = None, until: Unt
         days=days,
         totals=[(name, totals[name], limits.get(name)) for name in sorted(totals)],
         has_projects=bool(limits) or any(one.project for one in days),
-        csv="/v1/usage.csv" + (f"?{given}" if given else ""),
+        csv="/v1/usage.csv" + (f"?{request.url.query}" if request.url.query else ""),
         since=since or "",
         until=until or "",
     )
@@ -197,42 +189,38 @@ SHORT_ID = 12
 Typed = Annotated[str, Form(max_length=64)]
 
 
-@router.get("/deleted", dependencies=[Depends(may_read)])
+@router.get("/deleted", dependencies=READ)
 def deleted_page(request: Request, deletions: DeletionsOf, done: str = "") -> HTMLResponse:
     """Show what can be restored; `done` is the id of the latest deletion."""
     found = deletions.recent()
     return render(request, "deleted.html", found=found, just_now=next((one for one in found if one.id == done), None))
 
 
-@router.post("/deleted/{what}/{name}/restore", dependencies=[Depends(may_submit)])
+@router.post("/deleted/{what}/{name}/restore", dependencies=SUBMIT)
 def restore(what: What, name: str, deletions: DeletionsOf) -> RedirectResponse:
-    """Restore a resource and show it."""
     found = deletions.restore(what, name)
     pages = {"job": f"/jobs/{found.id}", "dataset": f"/datasets/{found.id}", "hand": f"/hands/{found.name}"}
     return RedirectResponse(pages.get(what, "/grasps" if what == "tag" else "/deleted"), status_code=303)
 
 
-@router.post("/datasets/{name}/delete", dependencies=[Depends(may_submit)])
+@router.post("/datasets/{name}/delete", dependencies=SUBMIT)
 def delete_dataset(
     name: str, datasets: DatasetsOf, typed: Typed = "", with_snapshots: Annotated[bool, Form()] = False
 ) -> RedirectResponse:
-    """Delete an ended dataset."""
     _confirmed(typed, name)
     datasets.delete(name, with_snapshots=with_snapshots)
     return _deleted(name)
 
 
-@router.post("/jobs/{job_id}/delete", dependencies=[Depends(may_submit)])
+@router.post("/jobs/{job_id}/delete", dependencies=SUBMIT)
 def delete_job(job_id: str, jobs: JobsOf, typed: Typed = "") -> RedirectResponse:
-    """Delete an ended job."""
     _confirmed(typed, job_id, job_id[:SHORT_ID])
     jobs.delete(job_id)
     return _deleted(job_id)
 
 
-@router.post("/tags/{name}/delete", dependencies=[Depends(may_submit)])
+@router.post("/tags/{name}/delete", dependencies=SUBMIT)
 def delete_tag(name: str, tags: TagsOf, typed: Typed = "") -> RedirectResponse:
-    """Delete a tag; its grasps remain."""
     _confirmed(typed, name)
     tag = tags.one(name)
     tags.remove(name)

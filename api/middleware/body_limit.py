@@ -50,36 +50,10 @@ class BodyLimit:
             return
         is_upload = scope["method"] == "POST" and scope["path"].rstrip("/") in self.upload_paths
         limit = self.upload_bytes + _FORM_SLACK_BYTES if is_upload else MAX_BODY_BYTES
-        given = dict(scope["headers"])
-        if b"transfer-encoding" in given and b"content-length" in given:
-            # Two lengths: a proxy may have used the other one, and the remainder would be read as the next request.
-            await _refuse(
-                ApiError(400, "Transfer-Encoding and Content-Length exclude each other"), scope, receive, send
-            )
+        if (refusal := _refusal(scope, limit, is_upload=is_upload)) is not None:
+            await _refuse(refusal, scope, receive, send)
             return
-        encoding = given.get(b"content-encoding", b"").decode("latin-1").strip().lower()
-        if encoding not in ("", "identity") and scope["method"] not in SAFE_METHODS:
-            await _refuse(_encoded(encoding), scope, receive, send)
-            return
-        declared = given.get(b"content-length", b"0")
-        if not declared.isdigit() or len(declared) > _MOST_DIGITS or int(declared) > limit:
-            await _refuse(_too_large(limit), scope, receive, send)
-            return
-        if declared != b"0" or b"transfer-encoding" in given:
-            try:
-                self._authorize(scope, is_upload)
-            except ApiError as error:
-                await _refuse(error, scope, receive, send)
-                return
         await self._watch(scope, receive, send, limit)
-
-    @staticmethod
-    def _authorize(scope: Scope, is_upload: bool) -> None:
-        """Refuse a body before reading it if the caller lacks permission; routes check further."""
-        if is_upload:
-            authorize(Request(scope), KeyScope.SUBMIT)
-        elif scope["path"].startswith("/v1/"):
-            authorize(Request(scope), KeyScope.READ)
 
     async def _watch(self, scope: Scope, receive: Receive, send: Send, limit: int) -> None:
         received, began = 0, time.monotonic()
@@ -119,16 +93,36 @@ class BodyLimit:
             await _refuse(refusal, scope, receive, send)
 
 
+def _refusal(scope: Scope, limit: int, *, is_upload: bool) -> Exception | None:
+    """Return why a body is refused before it is read; None: it is not."""
+    given = dict(scope["headers"])
+    if b"transfer-encoding" in given and b"content-length" in given:
+        # Two lengths: a proxy may have used the other one, and the remainder would be read as the next request.
+        return ApiError(400, "Transfer-Encoding and Content-Length exclude each other")
+    encoding = given.get(b"content-encoding", b"").decode("latin-1").strip().lower()
+    if encoding not in ("", "identity") and scope["method"] not in SAFE_METHODS:
+        return ApiError(
+            415,
+            f"the body has Content-Encoding {encoding[:40]!r}, and only plain bodies are read; send it as it is",
+            headers={"Accept-Encoding": "identity"},
+        )
+    declared = given.get(b"content-length", b"0")
+    if not declared.isdigit() or len(declared) > _MOST_DIGITS or int(declared) > limit:
+        return _too_large(limit)
+    if declared != b"0" or b"transfer-encoding" in given:
+        try:
+            # Routes check further.
+            if is_upload:
+                authorize(Request(scope), KeyScope.SUBMIT)
+            elif scope["path"].startswith("/v1/"):
+                authorize(Request(scope), KeyScope.READ)
+        except ApiError as error:
+            return error
+    return None
+
+
 def _too_large(limit: int) -> LimitError:
     return LimitError(f"the body is larger than {limit} bytes; send a smaller one")
-
-
-def _encoded(encoding: str) -> ApiError:
-    return ApiError(
-        415,
-        f"the body has Content-Encoding {encoding[:40]!r}, and only plain bodies are read; send it as it is",
-        headers={"Accept-Encoding": "identity"},
-    )
 
 
 async def _refuse(error: Exception, scope: Scope, receive: Receive, send: Send) -> None:

@@ -67,7 +67,7 @@ class RateLimit:
     async def _count(self, scope: Scope, receive: Receive, send: Send, key: Key | None) -> None:
         request = Request(scope)
         name = f"key:{key.name}" if key else f"address:{request.client.host if request.client else ''}"
-        allowance = allowance_of(key, self.settings)
+        allowance = _allowance_of(key, self.settings)
         # Not the request's id: a caller may choose that, and so count many requests as one.
         number = uuid.uuid4().hex
         admission = await self.rates.enter(name, allowance, number)
@@ -78,35 +78,26 @@ class RateLimit:
         if admission.refused:
             await answer(request, _refusal(admission, allowance, headers))(scope, receive, send)
             return
+        kept = time.monotonic()
+
+        async def counted(message: Message) -> None:
+            nonlocal kept
+            if message["type"] == "http.response.start":
+                MutableHeaders(scope=message).update(headers)
+            elif time.monotonic() - kept > HELD_S / 3:
+                # A long answer renews the request's entry.
+                kept = time.monotonic()
+                await self.rates.keep(name, number)
+            await send(message)
+
         try:
-            await self.app(scope, receive, _Told(self.rates, name, number, headers, send))
+            await self.app(scope, receive, counted)
         finally:
             if allowance.concurrency:
                 await self.rates.leave(name, number)
 
 
-class _Told:
-    """Sends messages on, adds the rate headers, and renews the request's entry during a long answer."""
-
-    def __init__(self, rates: Rates, name: str, number: str, headers: dict[str, str], send: Send) -> None:
-        self.rates = rates
-        self.name = name
-        self.number = number
-        self.headers = headers
-        self.send = send
-        self.kept = time.monotonic()
-
-    async def __call__(self, message: Message) -> None:
-        if message["type"] == "http.response.start":
-            MutableHeaders(scope=message).update(self.headers)
-        elif time.monotonic() - self.kept > HELD_S / 3:
-            self.kept = time.monotonic()
-            await self.rates.keep(self.name, self.number)
-        await self.send(message)
-
-
-def allowance_of(key: Key | None, settings: Settings) -> Allowance:
-    """Return the limits of a key, or of an address without a key."""
+def _allowance_of(key: Key | None, settings: Settings) -> Allowance:
     if key is None:
         return Allowance(settings.address_requests_per_minute, settings.concurrency)
     own = key.limits
@@ -121,12 +112,12 @@ def _headers(allowance: Allowance, admission: Admission) -> dict[str, str]:
         return {}
     return {
         "RateLimit-Policy": f'"requests";q={allowance.per_minute};w={WINDOW_S}',
-        "RateLimit": f'"requests";r={admission.remaining};t={seconds_up(admission.seconds)}',
+        "RateLimit": f'"requests";r={admission.remaining};t={_seconds_up(admission.seconds)}',
     }
 
 
 def _refusal(admission: Admission, allowance: Allowance, headers: dict[str, str]) -> ApiError:
-    wait = seconds_up(admission.seconds)
+    wait = _seconds_up(admission.seconds)
     if admission.refused == "concurrency":
         reason = f"{allowance.concurrency} of your requests are being answered, and more at once are not"
         headers = {}
@@ -219,11 +210,9 @@ class Rates:
         return Admission(refused, int(remaining), float(seconds))
 
     async def keep(self, caller: str, request: str) -> None:
-        """Renew a long request that is still in progress."""
         await self._run(_KEEP, _keys(caller)[1:], (request, HELD_S))
 
     async def leave(self, caller: str, request: str) -> None:
-        """Remove a finished request from the count."""
         await self._run("redis.call('ZREM', KEYS[1], ARGV[1])", _keys(caller)[1:], (request,))
 
     async def close(self) -> None:
@@ -249,8 +238,7 @@ class Rates:
         return self._client
 
 
-def seconds_up(seconds: float) -> int:
-    """Round up to whole seconds, at least one, for Retry-After."""
+def _seconds_up(seconds: float) -> int:
     return max(1, math.ceil(seconds))
 
 

@@ -20,12 +20,13 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from graspd.api.formatting import host_name
 from graspd.api.metrics import Metrics
-from graspd.api.problems import ApiError, answer, log_unforeseen
+from graspd.api.problems import ApiError, answer
 from graspd.service import telemetry
 from graspd.service.model.errors import GraspdError
 from graspd.service.telemetry import bind
 
 _access = logging.getLogger("graspd.access")
+_log = logging.getLogger("graspd.api")
 #: Paths that monitoring requests every few seconds.
 _QUIET: Final = ("/static/", "/healthz", "/readyz", "/metrics")
 
@@ -34,13 +35,9 @@ SAFE_METHODS: Final = frozenset({"GET", "HEAD", "OPTIONS"})
 _METHODS: Final = SAFE_METHODS | {"POST", "PUT", "PATCH", "DELETE"}
 _REQUEST_ID: Final = re.compile(r"[A-Za-z0-9._-]{1,64}")
 
-CONTENT_SECURITY_POLICY: Final = (
-    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; font-src 'self'; "
-    "connect-src 'self'; form-action 'self'; frame-ancestors 'none'; base-uri 'none'"
-)
-
 _SECURITY_HEADERS: Final = {
-    "Content-Security-Policy": CONTENT_SECURITY_POLICY,
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; "
+    "font-src 'self'; connect-src 'self'; form-action 'self'; frame-ancestors 'none'; base-uri 'none'",
     "X-Content-Type-Options": "nosniff",
     "X-Frame-Options": "DENY",
     "Referrer-Policy": "same-origin",
@@ -61,9 +58,11 @@ class RequestContext:
         if scope["type"] != "http":
             await self.app(scope, receive, send)
             return
-        request_id = _request_id(Headers(scope=scope).get("x-request-id"))
+        headers = Headers(scope=scope)
+        given = headers.get("x-request-id", "")
+        request_id = given if _REQUEST_ID.fullmatch(given) else uuid.uuid4().hex[:16]
         scope.setdefault("state", {})["request_id"] = request_id
-        parent = Headers(scope=scope).get("traceparent", "")
+        parent = headers.get("traceparent", "")
         with telemetry.span(f"HTTP {_method(scope)}", parent=parent, request=request_id) as facts:
             with bind(request=request_id, traceparent=telemetry.traceparent()):
                 await self._answer(scope, receive, send, request_id)
@@ -91,16 +90,14 @@ class RequestContext:
             await self.app(scope, receive, with_headers)
         except Exception as error:
             if not isinstance(error, GraspdError):
-                log_unforeseen(scope["path"], request_id, error)
+                _log.error("request %s on %s failed", request_id, scope["path"], exc_info=error)
             if status:
                 raise
-            answered = getattr(scope["app"].state, "answer_error", answer) if "app" in scope else answer
-            await answered(Request(scope), error)(scope, receive, with_headers)
+            await scope["app"].state.answer_error(Request(scope), error)(scope, receive, with_headers)
         finally:
             self._note(scope, status, time.perf_counter() - started)
 
     def _note(self, scope: Scope, status: int, seconds: float) -> None:
-        """Count the answer and write its log line."""
         route = _route(scope)
         self.metrics.observe(_method(scope), route, status, seconds)
         level = logging.DEBUG if scope["path"].startswith(_QUIET) else logging.INFO
@@ -117,10 +114,6 @@ def _method(scope: Scope) -> str:
 
 def _route(scope: Scope) -> str:
     return getattr(scope.get("route"), "path", "unmatched")
-
-
-def _request_id(given: str | None) -> str:
-    return given if given and _REQUEST_ID.fullmatch(given) else uuid.uuid4().hex[:16]
 
 
 class Head:
@@ -166,11 +159,7 @@ _COOKIE_PATH: Final = re.compile(r";\s*Path=/(?=;|$)", re.IGNORECASE)
 
 
 class RootPath:
-    """Removes the prefix from paths and adds it to `Location` and to cookie paths.
-
-    Args:
-        prefix: such as `/graspd`.
-    """
+    """Removes a prefix such as `/graspd` from paths and adds it to `Location` and to cookie paths."""
 
     def __init__(self, app: ASGIApp, *, prefix: str) -> None:
         self.app = app
@@ -248,7 +237,6 @@ class SameOrigin:
 
 
 def _place(origin: str) -> str | None:
-    """Return host and port of an origin; None if it is no valid address."""
     try:
         return urlsplit(origin).netloc
     except ValueError:

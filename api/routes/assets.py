@@ -71,7 +71,7 @@ def asset_router(kind: AssetKind) -> APIRouter:
         return assets.one(kind, name)
 
     if kind is not AssetKind.NETWORK:
-        _add_model_routes(router, kind)
+        _add_model_route(router, kind)
 
     @router.post(
         "",
@@ -120,9 +120,7 @@ def asset_router(kind: AssetKind) -> APIRouter:
     return router
 
 
-def _add_model_routes(router: APIRouter, kind: AssetKind) -> None:
-    """Add routes of models for viewers; networks have no shape."""
-
+def _add_model_route(router: APIRouter, kind: AssetKind) -> None:
     @router.get(
         "/{name}/model",
         dependencies=READ,

@@ -14,18 +14,15 @@ from fastapi import Depends, FastAPI, Query, Request, Response
 from starlette.datastructures import Headers
 
 from graspd.api.access.auth import authorize
-from graspd.api.access.idempotency import Idempotency
 from graspd.api.access.keys import Scope
-from graspd.api.access.quotas import Quotas, unfinished
+from graspd.api.access.quotas import Idempotency, Quotas, unfinished
 from graspd.api.catalog.assets import Assets
-from graspd.api.catalog.datasets import Comparisons, Datasets
-from graspd.api.catalog.deletions import Deletions
+from graspd.api.catalog.datasets import Datasets
 from graspd.api.catalog.events import Webhooks
 from graspd.api.catalog.grasp_exports import GraspExports
 from graspd.api.catalog.grasps import Grasps
-from graspd.api.catalog.jobs import Jobs
-from graspd.api.catalog.overview import Overview, Usage
-from graspd.api.catalog.shards import Shards
+from graspd.api.catalog.jobs import Jobs, Shards
+from graspd.api.catalog.overview import Deletions, Overview, Usage
 from graspd.api.catalog.tags import Tags
 from graspd.service.index.views import Page
 from graspd.service.model.errors import UnavailableError
@@ -51,7 +48,6 @@ def provide(app: FastAPI, services: Services) -> None:
     state.grasps, state.shards = Grasps(services), Shards(services)
     state.jobs = Jobs(services, quotas, Idempotency(redis), state.grasps, state.shards)
     state.datasets, state.assets = Datasets(services, quotas), Assets(services)
-    state.comparisons = Comparisons(services, state.datasets)
     state.overview, state.usage = Overview(services, state.jobs), Usage(services, state.keys)
     state.webhooks, state.tags = Webhooks(services), Tags(services, state.grasps)
     state.deletions = Deletions(services)
@@ -86,7 +82,6 @@ def _provided(name: str) -> Callable[[Request], Coroutine[Any, Any, Any]]:
 
 JobsOf = Annotated[Jobs, Depends(_provided("jobs"))]
 DatasetsOf = Annotated[Datasets, Depends(_provided("datasets"))]
-ComparisonsOf = Annotated[Comparisons, Depends(_provided("comparisons"))]
 AssetsOf = Annotated[Assets, Depends(_provided("assets"))]
 GraspsOf = Annotated[Grasps, Depends(_provided("grasps"))]
 ShardsOf = Annotated[Shards, Depends(_provided("shards"))]

@@ -11,8 +11,7 @@ from pydantic import BeforeValidator
 
 from graspd.api.access.auth import is_allowed
 from graspd.api.access.keys import Scope
-from graspd.api.catalog.deletions import DeletionView
-from graspd.api.catalog.overview import as_csv
+from graspd.api.catalog.overview import DeletionView, as_csv
 from graspd.api.metrics import CONTENT_TYPE, Metrics
 from graspd.api.models import Health, Worker
 from graspd.api.problems import responses

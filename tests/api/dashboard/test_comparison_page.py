@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from starlette.testclient import TestClient
 
-from graspd.api.catalog.datasets import Comparisons, Datasets, Pair
+from graspd.api.catalog.datasets import Datasets, Pair
 from graspd.service.index.queries.grasps import GraspFilter
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.datasets import actions
@@ -64,4 +64,4 @@ def test_more_cells_than_anybody_reads_are_left_out(services: Services, monkeypa
     _two(services)
     monkeypatch.setattr("graspd.api.catalog.datasets.MOST_CELLS", 1)
     datasets = Datasets(services, None)  # type: ignore[arg-type]
-    assert Comparisons(services, datasets).of("rough", "fine").pairs == []
+    assert datasets.compare("rough", "fine").pairs == []
