@@ -13,19 +13,8 @@ from functools import lru_cache
 from itertools import zip_longest
 from typing import Any, Final, Literal
 
+from graspd.api import models
 from graspd.api.access.auth import project_scope
-from graspd.api.models import (
-    Diversity,
-    GraspDetail,
-    GraspQuery,
-    GraspScene,
-    Histogram,
-    JobDetail,
-    Neighbour,
-    Posture,
-    Push,
-    Waypoint,
-)
 from graspd.service.index.queries.grasps import GraspFilter, GraspSort, Metric
 from graspd.service.index.queries.statistics import GraspKinds
 from graspd.service.index.views import GraspView, JobView, Page, ShardView
@@ -51,7 +40,7 @@ from graspd.service.store.store import Store
 _KEPT_STATISTICS: Final = 256
 _BINS: Final = 20
 #: Filters of the index that requests name alike.
-_SHARED: Final = GraspFilter.model_fields.keys() & GraspQuery.model_fields.keys()
+_SHARED: Final = GraspFilter.model_fields.keys() & models.GraspQuery.model_fields.keys()
 MEAN_METRICS: Final[tuple[Metric, ...]] = tuple(metric.name for metric in indexed(IndexLevel.OFFERED))
 
 
@@ -63,11 +52,11 @@ class Grasps:
         self._files = GraspFiles(services.store)
         self._statistics = lru_cache(maxsize=_KEPT_STATISTICS)(self._read_statistics)
 
-    def page(self, query: GraspQuery, *, limit: int = 50, cursor: str | None = None) -> Page[GraspView]:
+    def page(self, query: models.GraspQuery, *, limit: int = 50, cursor: str | None = None) -> Page[GraspView]:
         sort = GraspSort(by=query.sort, descending=query.order == "desc")
         return self._index.grasps.page(self._filter(query), sort=sort, limit=limit, cursor=cursor)
 
-    def members(self, query: GraspQuery) -> list[Grasp]:
+    def members(self, query: models.GraspQuery) -> list[Grasp]:
         """Return identifiers of all grasps that pass every filter; LimitError if a selection may not hold so many."""
         found = self._index.grasps.members(self._filter(query), limit=MOST_TAGGED + 1)
         if len(found) > MOST_TAGGED:
@@ -78,7 +67,7 @@ class Grasps:
         """Yield grasps by identifier, which must be visible to the caller; deleted ones are omitted."""
         return self._index.grasps.listed(places)
 
-    def _filter(self, query: GraspQuery) -> GraspFilter:
+    def _filter(self, query: models.GraspQuery) -> GraspFilter:
         seen = project_scope()
         if query.dataset is not None:
             self._index.datasets.get(query.dataset, scope=seen)
@@ -90,11 +79,11 @@ class Grasps:
         }
         return GraspFilter(**found)
 
-    def one(self, shard_id: str, row: int) -> GraspDetail:
+    def one(self, shard_id: str, row: int) -> models.GraspDetail:
         grasp, shard = self._index.grasps.get(shard_id, row, scope=project_scope()), self._index.shards.get(shard_id)
         return self._files.detail(grasp, shard)
 
-    def statistics(self, job: JobView | JobDetail) -> tuple[list[Histogram], Diversity | None]:
+    def statistics(self, job: JobView | models.JobDetail) -> tuple[list[models.Histogram], models.Diversity | None]:
         """Return distributions and diversity of a job's valid grasps, or of all stored ones if not validated.
 
         The result is cached while the number of grasps is unchanged.
@@ -103,11 +92,13 @@ class Grasps:
         count = job.valid if validated else job.grasps
         return self._statistics(job.id, validated, count) if count else ([], None)
 
-    def _read_statistics(self, job_id: str, validated: bool, count: int) -> tuple[list[Histogram], Diversity | None]:
+    def _read_statistics(
+        self, job_id: str, validated: bool, count: int
+    ) -> tuple[list[models.Histogram], models.Diversity | None]:
         """Read the statistics of a job; `count` only distinguishes cached results."""
         where, known = GraspFilter(job=job_id, valid=True if validated else None), self._index.statistics
         histograms = [
-            Histogram(
+            models.Histogram(
                 metric=metric, **vars(summary), counts=known.histogram(where, metric, summary.low, summary.high, _BINS)
             )
             for metric, summary in known.summaries(where, MEAN_METRICS).items()
@@ -115,10 +106,10 @@ class Grasps:
         return histograms, _told(known.kinds(where))
 
 
-def _told(kinds: GraspKinds) -> Diversity | None:
+def _told(kinds: GraspKinds) -> models.Diversity | None:
     if not kinds.cells:
         return None
-    return Diversity(
+    return models.Diversity(
         grasps=sum(kinds.cells.values()),
         types={kind.name.lower(): kinds.types[kind] for kind in GraspType if kinds.types.get(kind)},
         type_entropy_bits=round(entropy_bits(kinds.types.values()), 4),
@@ -128,7 +119,7 @@ def _told(kinds: GraspKinds) -> Diversity | None:
     )
 
 
-def _bounds(query: GraspQuery, end: Literal["min", "max"]) -> dict[Metric, float]:
+def _bounds(query: models.GraspQuery, end: Literal["min", "max"]) -> dict[Metric, float]:
     values = {metric: getattr(query, f"{end}_{metric}", None) for metric in MEAN_METRICS}
     found = {metric: value for metric, value in values.items() if value is not None}
     return found if query.type is None else {"grasp_type": float(GraspType[query.type.upper()])} | found
@@ -154,10 +145,10 @@ class GraspFiles:
         self._store = store
         self._read = lru_cache(maxsize=_KEPT_SHARDS)(self._fetch)
 
-    def detail(self, grasp: GraspView, shard: ShardView) -> GraspDetail:
+    def detail(self, grasp: GraspView, shard: ShardView) -> models.GraspDetail:
         file = self._read(shard.key, shard.sha256)
         row = grasp.row
-        return GraspDetail(
+        return models.GraspDetail(
             **grasp.model_dump(),
             hand_digest=shard.hand_digest,
             object_digest=shard.object_digest,
@@ -186,9 +177,9 @@ class GraspFiles:
             raise NotFoundError(f"{key} holds no grasps that can be shown: {error}") from None
 
 
-def _posture(file: Shard, name: str, row: int) -> Posture:
+def _posture(file: Shard, name: str, row: int) -> models.Posture:
     pose, joints = file[f"{name}/hand_pose"][row], file[f"{name}/joint_positions"][row]
-    return Posture(hand_pose=pose.tolist(), joint_positions=joints.tolist())
+    return models.Posture(hand_pose=pose.tolist(), joint_positions=joints.tolist())
 
 
 def validated_by(file: Shard, row: int) -> Literal["mujoco", "mujoco_warp"] | None:
@@ -199,12 +190,12 @@ def validated_by(file: Shard, row: int) -> Literal["mujoco", "mujoco_warp"] | No
     return "mujoco_warp" if validated is not None and validated[row] == 1 else "mujoco"
 
 
-def _pushes(file: Shard, row: int) -> list[Push]:
+def _pushes(file: Shard, row: int) -> list[models.Push]:
     outcomes = file.arrays.get(_OUTCOME)
     if outcomes is None or _verdict(file, "quality/success", row) is None:
         return []
     return [
-        Push(direction=direction, outcome=_OUTCOMES.get(code, "unknown"))
+        models.Push(direction=direction, outcome=_OUTCOMES.get(code, "unknown"))
         for direction, code in zip(_DIRECTIONS, outcomes[row].tolist(), strict=False)
     ]
 
@@ -231,10 +222,10 @@ def _texts(value: Any) -> list[str]:
     return [str(name) for name in value] if isinstance(value, list) else []
 
 
-def _way(file: Shard, row: int) -> list[Waypoint]:
+def _way(file: Shard, row: int) -> list[models.Waypoint]:
     points = way_of(file, row)
     return [
-        Waypoint(
+        models.Waypoint(
             name=point.name,
             place=place,
             hand_pose=point.hand_pose.tolist(),
@@ -245,14 +236,14 @@ def _way(file: Shard, row: int) -> list[Waypoint]:
     ]
 
 
-def _scene(file: Shard, row: int) -> GraspScene | None:
+def _scene(file: Shard, row: int) -> models.GraspScene | None:
     """Return the scene of a grasp; None if it was planned around a free object."""
     spec = scene_spec_of(file)
     if spec is None or spec.kind == "free" or "grasp/scene_index" not in file.arrays:
         return None
     number = int(file["grasp/scene_index"][row])
     tried = int(file[_LIFT][row]) if _LIFT in file.arrays else 0
-    return GraspScene(
+    return models.GraspScene(
         kind=spec.kind,
         number=number,
         object_pose=file["scene/object_pose"][number].tolist(),
@@ -264,13 +255,13 @@ def _scene(file: Shard, row: int) -> GraspScene | None:
     )
 
 
-def _neighbours(file: Shard, number: int) -> list[Neighbour]:
+def _neighbours(file: Shard, number: int) -> list[models.Neighbour]:
     if "scene/neighbour_pose" not in file.arrays:
         return []
     names, digests = (file.attributes.get(key) for key in ("neighbours", "neighbour_digests"))
     poses = file["scene/neighbour_pose"][number].tolist()
     known = zip_longest(names if isinstance(names, list) else [], digests if isinstance(digests, list) else [])
     return [
-        Neighbour(name=str(name), digest=str(digest), pose=pose)
+        models.Neighbour(name=str(name), digest=str(digest), pose=pose)
         for (name, digest), pose in zip(known, poses, strict=False)
     ]

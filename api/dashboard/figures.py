@@ -12,19 +12,9 @@ from urllib.parse import urlencode
 from graspd.api.models import Histogram
 from graspd.service.index.queries.statistics import Distribution
 from graspd.service.index.views import CellView, DatasetView, MatrixCell
+from graspd.service.model import studies
 from graspd.service.model.errors import DamagedError
 from graspd.service.model.states import State
-from graspd.service.model.studies import (
-    OUTCOMES,
-    MapCell,
-    Outcome,
-    Stability,
-    StabilityMap,
-    between,
-    counts,
-    from_json,
-    tick,
-)
 from graspd.service.store.records import STABILITY, latest
 from graspd.service.store.store import Store
 
@@ -241,7 +231,7 @@ PITCH: Final = (40, 30)
 class CellSquare:
     """Cell of a map, ready to draw."""
 
-    outcome: Outcome
+    outcome: studies.Outcome
     text: str
     said: str
     """Description in one line, for the tooltip."""
@@ -273,7 +263,7 @@ class Panel:
 class Share:
     """Part of a bar of width 100."""
 
-    outcome: Outcome
+    outcome: studies.Outcome
     count: int
     x: float
     width: float
@@ -283,60 +273,61 @@ class Share:
 class MapDrawing:
     """One map with the numbers below it."""
 
-    map: StabilityMap
+    map: studies.StabilityMap
     panels: list[Panel]
-    counts: dict[Outcome, int]
+    counts: dict[studies.Outcome, int]
     reached: list[Share]
 
 
-def load(store: Store) -> Stability | None:
+def load(store: Store) -> studies.Stability | None:
     try:
         found = latest(store, STABILITY)
-        return None if found is None else from_json(found)
+        return None if found is None else studies.from_json(found)
     except (ValueError, DamagedError):
         return None
 
 
-def draw(one: StabilityMap) -> MapDrawing:
+def draw(one: studies.StabilityMap) -> MapDrawing:
     return MapDrawing(
         map=one,
         panels=[_panel(one, name) for name in one.panels],
-        counts={outcome: number for outcome, number in counts(one.cells).items() if number},
+        counts={outcome: number for outcome, number in studies.counts(one.cells).items() if number},
         reached=_shares(one.reached()),
     )
 
 
-def _panel(one: StabilityMap, name: str) -> Panel:
+def _panel(one: studies.StabilityMap, name: str) -> Panel:
     cells = one.of(name)
     xs, ys = ([*dict.fromkeys(getattr(cell, axis) for cell in cells)] for axis in ("x", "y"))
     squares = {(cell.x, cell.y): _square(one, cell, ringed=one.is_divided and cell.reached) for cell in cells}
     line = one.lines.get(name, [])
     if any(isinstance(x, str) for x in xs):
         # Words fit better before a row than under a narrow column.
-        rows = [(tick(x), [squares.get((x, y)) for y in ys]) for x in xs]
-        return Panel(name, one.y, one.x, [tick(y) for y in ys], rows, "")
+        rows = [(studies.tick(x), [squares.get((x, y)) for y in ys]) for x in xs]
+        return Panel(name, one.y, one.x, [studies.tick(y) for y in ys], rows, "")
     upward = ys if all(isinstance(y, str) for y in ys) else ys[::-1]
-    rows = [(tick(y), [squares.get((x, y)) for x in xs]) for y in upward]
+    rows = [(studies.tick(y), [squares.get((x, y)) for x in xs]) for y in upward]
     points = " ".join(
-        f"{PITCH[0] * (between(xs, x) + 0.5):.1f},{PITCH[1] * (len(ys) - 0.5 - between(ys, y)):.1f}" for x, y in line
+        f"{PITCH[0] * (studies.between(xs, x) + 0.5):.1f},{PITCH[1] * (len(ys) - 0.5 - studies.between(ys, y)):.1f}"
+        for x, y in line
     )
-    return Panel(name, one.x, one.y, [tick(x) for x in xs], rows, points)
+    return Panel(name, one.x, one.y, [studies.tick(x) for x in xs], rows, points)
 
 
-def _square(one: StabilityMap, cell: MapCell, *, ringed: bool) -> CellSquare:
+def _square(one: studies.StabilityMap, cell: studies.MapCell, *, ringed: bool) -> CellSquare:
     value = cell.note or (f"{cell.value:.3g}" if cell.value == cell.value else "no value")
     return CellSquare(
         outcome=cell.outcome,
         text=cell.text,
-        said=f"{one.x} {tick(cell.x)}, {one.y} {tick(cell.y)}: {cell.outcome}; {value}",
+        said=f"{one.x} {studies.tick(cell.x)}, {one.y} {studies.tick(cell.y)}: {cell.outcome}; {value}",
         ringed=ringed,
     )
 
 
-def _shares(cells: Sequence[MapCell]) -> list[Share]:
-    found = counts(cells)
+def _shares(cells: Sequence[studies.MapCell]) -> list[Share]:
+    found = studies.counts(cells)
     shares, x = [], 0.0
-    for outcome in OUTCOMES:
+    for outcome in studies.OUTCOMES:
         if found[outcome]:
             width = 100.0 * found[outcome] / len(cells)
             shares.append(Share(outcome, found[outcome], x, width))

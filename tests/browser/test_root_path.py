@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import httpx
 import pytest
-import uvicorn
 from fastapi import FastAPI
 
 from graspd.api.app import create_app
-from graspd.api.server import bind
 from graspd.service.model.states import AssetKind
 from graspd.service.pipeline.backends import Services
 from graspd.service.settings import Settings
 from graspd.service.store.assets import builtin_files
 from tests.api.factories import add_job, finish_all
-from tests.waiting import until
+from tests.browser.conftest import serving
 
 pytestmark = pytest.mark.browser
 
@@ -55,19 +51,6 @@ class ReverseProxy:
             async for chunk in answer.aiter_raw():
                 await send({"type": "http.response.body", "body": chunk, "more_body": True})
             await send({"type": "http.response.body"})
-
-
-@contextmanager
-def serving(app: Any) -> Iterator[str]:
-    """Address of an application on loopback."""
-    with bind("127.0.0.1", 0) as listener:
-        server = uvicorn.Server(uvicorn.Config(app, log_level="critical", timeout_graceful_shutdown=1))
-        thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
-        thread.start()
-        until(lambda: server.started, "the server listens")
-        yield f"http://127.0.0.1:{listener.getsockname()[1]}"
-        server.should_exit = True
-        thread.join()
 
 
 @pytest.fixture

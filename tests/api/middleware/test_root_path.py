@@ -47,7 +47,6 @@ def http(request: pytest.FixtureRequest, below: Settings, services: Services) ->
 
 
 def addresses(page: str) -> set[str]:
-    """Addresses of this host in a page."""
     return set(re.findall(r'\s(?:href|src|action|formaction|hx-get|data-[a-z]+)="(/[^"#]*)', page))
 
 

@@ -48,9 +48,8 @@ def test_a_range_behind_the_end_is_refused_with_the_size(http: TestClient, shard
     assert answer.headers["content-range"].startswith("bytes */")
 
 
-@pytest.mark.parametrize("header", [None, "bytes=-", "items=0-3", "bytes=0-1,4-5"])
-def test_a_range_that_is_not_a_single_byte_range_sends_the_whole(header: str | None) -> None:
-    assert parse_range(header, 100) is None
+def test_a_range_that_is_not_a_single_byte_range_sends_the_whole() -> None:
+    assert [parse_range(header, 100) for header in (None, "bytes=-", "items=0-3", "bytes=0-1,4-5")] == [None] * 4
 
 
 def test_a_store_that_signs_hands_the_file_out_itself(
@@ -71,15 +70,6 @@ def test_grasps_come_in_the_order_and_by_the_filters_asked_for(http: TestClient,
     assert all(g["valid"] and g["epsilon"] >= 0.1 and g["intersection_volume_cm3"] <= 0.3 for g in grasps)
     assert http.get("/v1/grasps", params=query | {"hand": "shadow"}).json()["items"] == []
     assert http.get("/v1/grasps", params={"colour": "red"}).status_code == 422
-
-
-def test_pages_of_grasps_meet_without_gap_or_overlap(http: TestClient, shard: str) -> None:
-    seen, path = [], "/v1/grasps?limit=7"
-    while path:
-        answer = http.get(path)
-        seen += [(grasp["shard_id"], grasp["row"]) for grasp in answer.json()["items"]]
-        path = answer.links["next"]["url"] if "next" in answer.links else ""
-    assert len(seen) == len(set(seen)) == 32
 
 
 @pytest.mark.parametrize("harm", [flip, cut, remove])
