@@ -21,7 +21,7 @@ from graspd.api.metrics import Metrics
 from graspd.api.middleware.body_limit import BodyLimit
 from graspd.api.middleware.rate_limit import RateLimit, Rates
 from graspd.api.middleware.request_context import Head, RequestContext, RootPath, SameOrigin
-from graspd.api.routes import assets, datasets, grasps, jobs, shards, system, webhooks
+from graspd.api.routes import assets, datasets, grasps, jobs, system, webhooks
 from graspd.api.routes.assets import asset_router
 from graspd.api.routes.dependencies import EXPORTS, FORMS, UPLOADS, RequestLimiter, provide
 from graspd.service.index.rebuild import complete_if_new
@@ -38,7 +38,7 @@ _log = logging.getLogger("graspd.api")
 _ROUTERS: Final = (
     jobs.router,
     grasps.router,
-    shards.router,
+    jobs.shard_router,
     system.router,
     assets.correction_router,
     grasps.tag_router,
@@ -50,14 +50,7 @@ _LOOPBACK_NAMES = frozenset({"127.0.0.1", "localhost", "::1"})
 
 
 def create_app(settings: Settings, services: Services | None = None) -> FastAPI:
-    """Create the application with given services, or with its own, which it opens and closes.
-
-    Raises:
-        InputError: the address to bind is reachable from other machines and no key exists; or the settings of a
-            proxy are invalid.
-        BusyError: store, index or Redis belong to another service.
-        StoreUnavailable, IndexUnavailable: store or index cannot be opened.
-    """
+    """Create the application with given services, or with its own, which it opens and closes."""
     proxy = Proxy(settings)
     keys = KeyFile(settings.resolved_keys_file, closed=proxy.is_on)
     if not proxy.is_on:

@@ -30,12 +30,7 @@ _TOO_SLOW: Final = b"HTTP/1.1 408 Request Timeout\r\nConnection: close\r\nConten
 
 
 def bind(host: str, port: int) -> socket.socket:
-    """Return a listening socket.
-
-    Raises:
-        BusyError: the port is taken.
-        InputError: the address does not belong to this machine, or the port needs other privileges.
-    """
+    """Return a listening socket; BusyError if the port is taken, InputError if it cannot be bound."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     # asyncio disables Nagle's delay only on sockets with an explicit protocol; else each body arrives 40 ms late.
     listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
@@ -52,13 +47,7 @@ def bind(host: str, port: int) -> socket.socket:
 
 
 def serve(settings: Settings) -> None:
-    """Answer requests until SIGINT or SIGTERM.
-
-    Raises:
-        BusyError: the port is taken.
-        InputError: other machines could reach the service without a key.
-        StoreUnavailable, IndexUnavailable: store or index cannot be opened.
-    """
+    """Answer requests until SIGINT or SIGTERM."""
     listener = bind(settings.host, settings.port)
     with listener:
         # Spool uploads here, not in /tmp, which may be in memory.

@@ -28,22 +28,7 @@ _NAME: Final = re.compile(r"[^A-Za-z0-9._-]+")
 def files_of_upload(
     kind: AssetKind, filename: str, data: bytes | IO[bytes], *, limit_bytes: int, options: str = ""
 ) -> MutableMapping[str, bytes]:
-    """Return the files of an asset, including `asset.json`, from an uploaded file or ZIP.
-
-    Files of a ZIP are read on access.
-
-    Args:
-        kind: hand, object or network.
-        filename: name given by the user.
-        data: content, or an open file with it.
-        limit_bytes: largest upload [bytes].
-        options: a JSON object; its keys override those of `asset.json`.
-
-    Raises:
-        InputError: empty upload, unknown suffix, options that are no JSON object, or a ZIP without a clear main file.
-        LimitError: it exceeds the limit; or its ZIP unpacks to more than `UNPACK_FACTOR` times that, or holds too
-            many files.
-    """
+    """Return the files of an asset, including `asset.json`, from an upload; `options` override its keys."""
     leaf = PurePosixPath(filename.replace("\\", "/")).name
     file = io.BytesIO(data) if isinstance(data, bytes) else data
     size = file.seek(0, io.SEEK_END)

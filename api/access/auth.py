@@ -151,11 +151,7 @@ _USER: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._@+-]*")
 
 
 class Proxy:
-    """Authenticating proxy from the settings, if any.
-
-    Raises:
-        InputError: only one of addresses and secret is set, the secret is short, or an address or a group is invalid.
-    """
+    """Authenticating proxy from the settings, if any; InputError if they are incomplete or invalid."""
 
     def __init__(self, settings: Settings) -> None:
         secret = settings.proxy_secret.get_secret_value() if settings.proxy_secret else ""

@@ -98,11 +98,7 @@ class _Document(BaseModel):
 
 
 class KeyFile:
-    """File of the keys.
-
-    Args:
-        closed: whether callers can authenticate without a key: then the service is closed even before the first key.
-    """
+    """File of the keys. If callers can authenticate without a key, it is `closed` even before the first key."""
 
     def __init__(self, path: Path, *, closed: bool = False) -> None:
         self.path = path

@@ -141,14 +141,7 @@ class _Holder:
 
 
 class Quotas:
-    """Counters of all keys and projects.
-
-    Args:
-        connection: Redis.
-        unfinished: returns those of the given job ids whose job has not ended.
-        limits_of: returns the limits of a project.
-        gpu_seconds: returns the time of GPU workers on a project's tasks on a day [s].
-    """
+    """Counters of all keys and projects. `unfinished` returns those of the given job ids whose job has not ended."""
 
     def __init__(
         self,
@@ -205,7 +198,8 @@ class Quotas:
         self, holder: _Holder, claim: SubmissionClaim, job: str, grasps: int, *, is_new: bool
     ) -> Iterator[None]:
         number = uuid.uuid4().hex
-        met = self._claim(holder, job, grasps, number, is_new=is_new)
+        today = 0 if not is_new else 1 if holder.counts_jobs else grasps
+        met = self._claim(holder, job, grasps, number, today)
         try:
             yield
         except BaseException:
@@ -213,32 +207,37 @@ class Quotas:
             raise
         finally:
             with self._forgiving(holder):
-                self._end(holder, job, grasps, number, met, counts=claim.counts, is_new=is_new)
+                if claim.counts or met == "known":
+                    self._connection.eval(_SETTLE, 1, holder.held, job, grasps, number)
+                else:
+                    self._connection.eval(_UNDO, 1, holder.held, job, number)
+                # Of two claims of one job, the one that created it counts as one of today.
+                if today and met == "shared" and claim.counts:
+                    self._connection.incrby(holder.day, today)
+                if today and met == "" and not claim.counts:
+                    self._connection.decrby(holder.day, today)
 
-    def _claim(self, holder: _Holder, job: str, grasps: int, number: str, *, is_new: bool) -> str:
+    def _claim(self, holder: _Holder, job: str, grasps: int, number: str, today: int) -> str:
         """Return how it is counted: `shared` by another pending claim, `known`, `unknown` without Redis, or empty."""
-        met, amount = self._ask(holder, job, grasps, number, is_new=is_new)
+        met, amount = self._ask(holder, job, grasps, number, today)
         if met == "grasps":
             with self._forgiving(holder):
                 self._forget_ended(holder)
-            met, amount = self._ask(holder, job, grasps, number, is_new=is_new)
+            met, amount = self._ask(holder, job, grasps, number, today)
         if met in ("grasps", "today"):
             raise holder.refusal(met, amount)
         return met
 
-    def _ask(self, holder: _Holder, job: str, grasps: int, number: str, *, is_new: bool) -> tuple[str, int]:
-        limits = (holder.grasps, holder.today if is_new else 0)
-        about = (job, grasps, *limits, _KEPT_S, _amount(holder, grasps) if is_new else 0, number, _PENDING_S)
+    def _ask(self, holder: _Holder, job: str, grasps: int, number: str, today: int) -> tuple[str, int]:
+        limits = (holder.grasps, holder.today if today else 0)
+        about = (job, grasps, *limits, _KEPT_S, today, number, _PENDING_S)
         met, amount = b"unknown", b"0"
         with self._forgiving(holder):
             met, amount = self._connection.eval(_CLAIM, 2, holder.held, holder.day, *about)
         return met.decode(), int(amount)
 
     def _forget_ended(self, holder: _Holder) -> None:
-        """Drop ended jobs. Pending ones are excluded, because the index does not contain them yet.
-
-        The entry of a job that is claimed again meanwhile changes, and so it remains.
-        """
+        """Drop ended jobs, but neither pending ones, which the index lacks, nor those claimed again meanwhile."""
         found = [word.decode(errors="replace") for word in self._connection.eval(_ENTERED, 1, holder.held)]
         entries = dict(zip(found[::2], found[1::2], strict=True))
         ended = sorted(entries.keys() - set(self._unfinished(list(entries))))
@@ -246,29 +245,12 @@ class Quotas:
             some = [word for job in ended[start : start + _AT_ONCE] for word in (job, entries[job])]
             self._connection.eval(_DROP, 1, holder.held, *some)
 
-    def _end(
-        self, holder: _Holder, job: str, grasps: int, number: str, met: str, *, counts: bool, is_new: bool
-    ) -> None:
-        if counts or met == "known":
-            self._connection.eval(_SETTLE, 1, holder.held, job, grasps, number)
-        else:
-            self._connection.eval(_UNDO, 1, holder.held, job, number)
-        # Of two claims of one job, the one that created it counts as one of today.
-        if is_new and met == "shared" and counts:
-            self._connection.incrby(holder.day, _amount(holder, grasps))
-        if is_new and met == "" and not counts:
-            self._connection.decrby(holder.day, _amount(holder, grasps))
-
     @contextmanager
     def _forgiving(self, holder: _Holder) -> Iterator[None]:
         try:
             yield
         except RedisError as error:
             log.warning("the quota of %s is not counted while Redis does not answer: %s", holder.words, error)
-
-
-def _amount(holder: _Holder, grasps: int) -> int:
-    return 1 if holder.counts_jobs else grasps
 
 
 def _until_midnight() -> int:
@@ -303,11 +285,7 @@ class Idempotency:
 
     @contextmanager
     def claim(self, owner: str, key: str, request: JobRequest) -> Iterator[None]:
-        """Bind a key of an API key's `owner` to a request recorded in this context; a failure releases it.
-
-        Raises:
-            InputError: the key is bound to another request.
-        """
+        """Bind a key of an API key's `owner` to a request recorded in this context; a failure releases it."""
         name = f"graspd:idempotency:{digest_bytes(f'{owner} {key}'.encode())}"
         content = digest_json(request.model_dump(mode="json")).encode()
         is_ours = self._bind(name, content)

@@ -65,15 +65,8 @@ class Assets:
     ) -> AssetView:
         """Store an upload. The controller queues the check of a hand or an object; a network is checked here.
 
-        With `self_test` the check of a hand ends with grasps.
-
-        Args:
-            shared: whether every project may use it.
-            rename: use the next free name if the name is taken; known content retains its own name.
-
-        Raises:
-            ConflictError: the name is taken, or the content has another name or belongs to another project.
-            InputError: the file is no network.
+        With `self_test` the check of a hand ends with grasps. Every project may use what is `shared`. With `rename` it
+        gets the next free name if the name is taken; known content retains its own name.
         """
         found = network_report(files, name) if kind is AssetKind.NETWORK else None
         project = project_scope().project
@@ -107,15 +100,7 @@ class Assets:
     def correct(self, name: str, corrections: HandCorrections, new_name: str = "") -> AssetView:
         """Create a hand from the same files with corrected facts in `asset.json`; its check is queued.
 
-        Args:
-            name: the hand with wrong guesses, or its digest.
-            corrections: corrected values.
-            new_name: name of the corrected hand; empty: the name with the next free number.
-
-        Raises:
-            NotFoundError: there is no such hand, or no model of it yet.
-            ConflictError: the new name is taken, or these corrections exist under another name.
-            InputError: a link or joint that the hand does not have, or a value out of range.
+        Without a new name it gets the name with the next free number.
         """
         hand = self.one(AssetKind.HAND, name)
         facts = self.hand_facts(hand)

@@ -28,13 +28,7 @@ _MOST_DIGITS: Final = 18
 
 
 class BodyLimit:
-    """Refuses bodies whose Content-Length exceeds the limit; aborts those that become too long or slow.
-
-    Args:
-        upload_paths: paths that take files.
-        upload_bytes: largest file [bytes].
-        piece_s: longest wait for the next piece of a body [s].
-    """
+    """Refuses bodies whose Content-Length exceeds the limit; aborts those that become too long or slow."""
 
     def __init__(
         self, app: ASGIApp, *, upload_paths: frozenset[str], upload_bytes: int, piece_s: float = PIECE_S

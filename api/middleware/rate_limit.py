@@ -203,17 +203,17 @@ class Rates:
         if allowance.per_minute <= 0 and allowance.concurrency <= 0:
             return None
         arguments = (allowance.per_minute, WINDOW_S, allowance.concurrency, request, HELD_S)
-        reply = await self._run(_ENTER, _keys(caller), arguments)
+        reply = await self._run(_ENTER, (f"graspd:rate:{caller}", f"graspd:held:{caller}"), arguments)
         if reply is None:
             return None
         refused, remaining, seconds = (part.decode() for part in reply)
         return Admission(refused, int(remaining), float(seconds))
 
     async def keep(self, caller: str, request: str) -> None:
-        await self._run(_KEEP, _keys(caller)[1:], (request, HELD_S))
+        await self._run(_KEEP, (f"graspd:held:{caller}",), (request, HELD_S))
 
     async def leave(self, caller: str, request: str) -> None:
-        await self._run("redis.call('ZREM', KEYS[1], ARGV[1])", _keys(caller)[1:], (request,))
+        await self._run("redis.call('ZREM', KEYS[1], ARGV[1])", (f"graspd:held:{caller}",), (request,))
 
     async def close(self) -> None:
         if self._client is not None and self._loop is asyncio.get_running_loop():
@@ -240,7 +240,3 @@ class Rates:
 
 def _seconds_up(seconds: float) -> int:
     return max(1, math.ceil(seconds))
-
-
-def _keys(caller: str) -> tuple[str, str]:
-    return f"graspd:rate:{caller}", f"graspd:held:{caller}"

@@ -205,9 +205,6 @@ class SameOrigin:
 
     A browser sends the page that a request comes from (Sec-Fetch-Site, Origin); other clients do not. While no keys
     exist, only names of this machine are accepted as host, which prevents DNS rebinding.
-
-    Args:
-        allowed_hosts: host names that the service answers to; None: any.
     """
 
     def __init__(self, app: ASGIApp, *, allowed_hosts: frozenset[str] | None) -> None:

@@ -158,11 +158,7 @@ def store_upload(
 ) -> AssetView:
     """Store an asset of immutable content and its check task. Until then the upload is a temporary file.
 
-    Args:
-        said: `self_test`, `shared` and `rename`, as in `Assets.add`.
-
-    Raises:
-        RateError: too many uploads are in progress; their number bounds the memory they use.
+    `said`: `self_test`, `shared` and `rename`, as in `Assets.add`. The number of uploads bounds the memory they use.
     """
     filename = file.filename or ""
     with _one_of_few():

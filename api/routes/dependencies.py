@@ -137,12 +137,7 @@ _PATIENCE_S: Final = 20.0
 
 
 class RequestLimiter:
-    """Pool with limits on its threads and on the requests that wait for one.
-
-    Args:
-        at_once: number of threads.
-        patience_s: longest wait of a request [s].
-    """
+    """Pool with limits on its threads and on the requests that wait for one."""
 
     def __init__(self, at_once: int, *, patience_s: float = _PATIENCE_S) -> None:
         self._free = asyncio.Semaphore(at_once)
@@ -151,11 +146,7 @@ class RequestLimiter:
         self._patience_s = patience_s
 
     async def run(self, function: Callable[..., T], *args: Any, **options: Any) -> T:
-        """Run a function in a thread of this pool and return its result.
-
-        Raises:
-            UnavailableError: too many requests wait already, or no thread became free in time.
-        """
+        """Run a function in a thread of this pool; UnavailableError if none becomes free in time."""
         await self._take()
         try:
             return await to_thread.run_sync(partial(function, *args, **options), limiter=self._threads)
@@ -180,11 +171,7 @@ _TAGS: Final = re.compile(r'\s*((?:W/)?"[^"]*")\s*(?:,|$)')
 
 
 def is_known(headers: Headers, etag: str) -> bool:
-    """Check whether If-None-Match names this file, so that the answer is 304.
-
-    Args:
-        etag: strong entity tag, with its quotes.
-    """
+    """Check whether If-None-Match names the strong tag of this file, so that the answer is 304."""
     given = headers.getlist("if-none-match")
     return any(value.strip() == "*" for value in given) or etag in {
         tag.removeprefix("W/") for value in given for tag in _TAGS.findall(value)

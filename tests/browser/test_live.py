@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import pytest
 
@@ -257,3 +258,21 @@ def test_grasps_are_chosen_tagged_found_and_exported_by_keyboard(page: Any, serv
     page.fill("#where", "epsilon > 1000")
     page.keyboard.press("Enter")
     page.wait_for_selector("text=No grasp matches these filters")
+
+
+@pytest.mark.parametrize(("scheme", "dark"), [("light", False), ("dark", True)])
+def test_a_route_is_opened_and_tried(page: Any, scheme: str, dark: bool) -> None:
+    hosts = set()
+    page.on("request", lambda request: hosts.add(urlsplit(request.url).netloc))
+    page.emulate_media(color_scheme=scheme)
+    page.goto("/docs")
+    page.locator("#explorer .opblock").first.wait_for()
+    assert page.evaluate("document.documentElement.classList.contains('dark-mode')") is dark
+    stats = page.locator("#explorer .opblock", has_text="/v1/stats")
+    stats.locator(".opblock-summary-control").click()
+    stats.get_by_role("button", name="Try it out").click()
+    stats.get_by_role("button", name="Execute").click()
+    answer = stats.locator(".live-responses-table td.response-col_status:not(.col_header)")
+    answer.wait_for()
+    assert answer.inner_text().split()[0] == "200"
+    assert len({host for host in hosts if host}) == 1

@@ -1,4 +1,4 @@
-"""Keys, scopes, sessions, and what a foreign web page may not do."""
+"""Keys, scopes, sessions, what a foreign web page may not do, and keys as the doctor sees them."""
 
 from __future__ import annotations
 
@@ -6,16 +6,19 @@ import stat
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from datetime import timedelta
+from pathlib import Path
 
 import pytest
 from fastapi import FastAPI
 from starlette.testclient import TestClient
 
+from graspd.api.access.doctor import keys as keys_finding
 from graspd.api.access.keys import KeyFile, KeyLimits, Scope
 from graspd.api.app import create_app
 from graspd.client.access_commands import duration
 from graspd.service.model.errors import ConflictError, InputError, NotFoundError, QueueUnavailable
 from graspd.service.pipeline.backends import Services
+from graspd.service.run.doctor.checks import Condition
 from graspd.service.settings import Settings
 from tests.api.conftest import BASE_URL
 from tests.api.factories import bearer
@@ -35,8 +38,7 @@ def closed(settings: Settings, services: Services, keys: KeyFile) -> Iterator[Cl
 def test_a_closed_service_answers_401_without_a_good_key(closed: Closed) -> None:
     client, tokens = closed
     answer = client.get("/v1/jobs")
-    assert answer.status_code == 401
-    assert answer.headers["www-authenticate"].startswith("Bearer")
+    assert answer.status_code == 401 and answer.headers["www-authenticate"].startswith("Bearer")
     assert client.get("/v1/jobs", headers=bearer("gd_wrong")).status_code == 401
     assert client.get("/healthz").status_code == 200
     assert client.get("/metrics").status_code == 401
@@ -66,8 +68,12 @@ def test_a_key_opens_a_session_and_its_end_ends_it(closed: Closed, keys: KeyFile
     assert client.get("/v1/jobs").status_code == 401
 
 
-def test_a_session_ends_where_its_visitor_signs_out(closed: Closed) -> None:
+def test_a_session_ends_where_its_visitor_signs_out(closed: Closed, keys: KeyFile) -> None:
     client, tokens = closed
+    claim, _, _ = keys.open_session(keys.list()[2]).partition(".")
+    client.cookies.set("graspd_session", f"{claim}.{'0' * 64}")
+    assert client.get("/v1/jobs").status_code == 401, "it is forged"
+    client.cookies.clear()
     assert "Sign out" not in client.get("/login").text
     client.post("/login", data={"key": tokens[Scope.READ]})
     page = client.get("/login").text
@@ -75,19 +81,6 @@ def test_a_session_ends_where_its_visitor_signs_out(closed: Closed) -> None:
     answer = client.post("/logout", follow_redirects=False)
     assert (answer.status_code, answer.headers["location"]) == (303, "/login")
     assert client.get("/v1/jobs").status_code == 401
-
-
-def test_a_forged_session_is_refused(closed: Closed, keys: KeyFile) -> None:
-    client, _ = closed
-    claim, _, _ = keys.open_session(keys.list()[2]).partition(".")
-    client.cookies.set("graspd_session", f"{claim}.{'0' * 64}")
-    assert client.get("/v1/jobs").status_code == 401
-
-
-def test_keys_are_kept_hashed_in_a_private_file(keys: KeyFile) -> None:
-    token = keys.add("me", Scope.ADMIN)
-    assert token not in keys.path.read_text()
-    assert stat.S_IMODE(keys.path.stat().st_mode) == 0o600
 
 
 @pytest.mark.parametrize("cookie", ["", "x", "x.y", ".", "é.é"])
@@ -102,8 +95,9 @@ def test_a_project_has_a_plain_name(keys: KeyFile, project: str) -> None:
         keys.add("ann", Scope.SUBMIT, project=project)
 
 
-def test_two_live_keys_cannot_share_a_name(keys: KeyFile) -> None:
-    keys.add("me", Scope.READ)
+def test_keys_are_kept_hashed_in_a_private_file_by_name(keys: KeyFile) -> None:
+    assert keys.add("me", Scope.READ) not in keys.path.read_text()
+    assert stat.S_IMODE(keys.path.stat().st_mode) == 0o600
     with pytest.raises(ConflictError):
         keys.add("me", Scope.READ)
     keys.revoke("me")
@@ -138,13 +132,10 @@ def test_keys_made_at_the_same_time_are_all_kept(keys: KeyFile) -> None:
     assert all(keys.find(token) for token in tokens)
 
 
-def test_a_service_whose_last_key_was_revoked_stays_closed(closed: Closed, keys: KeyFile) -> None:
+def test_a_damaged_key_file_opens_nothing(closed: Closed, keys: KeyFile) -> None:
     for scope in Scope:
         keys.revoke(scope.value)
-    assert closed[0].get("/v1/jobs").status_code == 401
-
-
-def test_a_damaged_key_file_opens_nothing(closed: Closed, keys: KeyFile) -> None:
+    assert closed[0].get("/v1/jobs").status_code == 401, "nor does a service without a live key"
     keys.path.write_text("{")
     answer = closed[0].get("/v1/jobs")
     assert (answer.status_code, answer.json()["type"]) == (503, "/problems/unavailable")
@@ -198,3 +189,36 @@ def test_a_form_on_a_foreign_page_is_refused(http: TestClient, sent: str) -> Non
 def test_an_open_service_has_the_names_of_this_machine_alone(http: TestClient, host: str) -> None:
     assert http.get("/healthz", headers={"Host": host}).status_code == 200
     assert http.get("/v1/jobs", headers={"Host": "evil.example"}).status_code == 421
+
+
+def test_without_keys_only_this_machine_is_served(tmp_path: Path) -> None:
+    settings = Settings(data_dir=tmp_path, host="0.0.0.0")
+    assert keys_finding(settings).fix == "graspd keys add admin --scope admin"
+    assert keys_finding(Settings(data_dir=tmp_path)).condition is Condition.GOOD
+    KeyFile(settings.resolved_keys_file).add("admin", Scope.ADMIN)
+    assert keys_finding(settings).condition is Condition.GOOD
+
+
+def test_keys_that_end_soon_are_named_unless_they_were_rotated(tmp_path: Path) -> None:
+    settings = Settings(data_dir=tmp_path)
+    file = KeyFile(settings.resolved_keys_file)
+    file.add("admin", Scope.ADMIN)
+    file.add("robot", Scope.SUBMIT, lifetime=timedelta(days=2))
+    found = keys_finding(settings)
+    assert (found.condition, found.fix) == (Condition.WARNING, "graspd keys rotate robot --grace 24h")
+    file.rotate("robot", grace=timedelta(hours=24))
+    assert keys_finding(settings).condition is Condition.GOOD
+    file.revoke("admin")
+    assert keys_finding(settings).condition is Condition.WARNING, "nobody is admin"
+    file.revoke("robot")
+    assert not keys_finding(settings).ok, "no key opens it"
+
+
+def test_a_file_that_everybody_reads_or_nobody_can_is_bad(tmp_path: Path) -> None:
+    settings = Settings(data_dir=tmp_path)
+    KeyFile(settings.resolved_keys_file).add("admin", Scope.ADMIN)
+    settings.resolved_keys_file.chmod(0o644)
+    assert "chmod 600" in keys_finding(settings).fix
+    settings.resolved_keys_file.write_text("{")
+    found = keys_finding(settings)
+    assert not found.ok and str(settings.resolved_keys_file) in found.message

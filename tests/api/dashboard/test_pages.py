@@ -110,8 +110,7 @@ def test_a_filter_that_fits_nothing_or_cannot_be_read_says_so(http: TestClient, 
 
 def test_the_form_submits_a_job_and_shows_it(http: TestClient) -> None:
     answer = http.post("/submit", data=FORM, follow_redirects=False)
-    assert answer.status_code == 303
-    assert http.get(answer.headers["location"]).status_code == 200
+    assert answer.status_code == 303 and http.get(answer.headers["location"]).status_code == 200
 
 
 @pytest.mark.parametrize(
@@ -155,8 +154,7 @@ def test_pages_are_read_on_while_redis_is_away(
     for method in ("ping", "depths"):
         monkeypatch.setattr(MemoryQueue, method, away)
     page = http.get("/")
-    assert page.status_code == 200
-    assert "Redis does not answer at unix:///redis.sock" in page.text
+    assert page.status_code == 200 and "Redis does not answer at unix:///redis.sock" in page.text
     assert http.get(f"/jobs/{record.id}").status_code == 200
     health = http.get("/readyz")
     assert (health.status_code, health.json()["parts"]["redis"]["ok"]) == (503, False)

@@ -46,12 +46,6 @@ def test_two_applications_share_one_rate_and_say_when_to_come(make_twins: Twins,
     assert 1 <= int(answer.headers["retry-after"]) <= 30
 
 
-def test_a_key_without_a_limit_has_that_of_the_settings(make_twins: Twins, keys: KeyFile) -> None:
-    headers = bearer(keys.add("me", Scope.READ))
-    client, _ = make_twins(requests_per_minute=1)
-    assert [client.get("/v1/stats", headers=headers).status_code for _ in range(2)] == [200, 429]
-
-
 def test_guesses_at_the_login_are_slowed_down_and_health_is_not(make_twins: Twins, keys: KeyFile) -> None:
     headers = bearer(keys.add("me", Scope.READ))
     client, _ = make_twins(address_requests_per_minute=3)
@@ -62,9 +56,11 @@ def test_guesses_at_the_login_are_slowed_down_and_health_is_not(make_twins: Twin
     assert {client.get("/healthz").status_code for _ in range(4)} == {200}
 
 
-def test_an_open_service_counts_nothing(make_twins: Twins) -> None:
+def test_limits_of_the_settings_count_for_keys_and_not_while_there_are_none(make_twins: Twins, keys: KeyFile) -> None:
     client, _ = make_twins(requests_per_minute=1, address_requests_per_minute=1)
     assert {client.get("/v1/stats").status_code for _ in range(4)} == {200}
+    headers = bearer(keys.add("me", Scope.READ))
+    assert [client.get("/v1/stats", headers=headers).status_code for _ in range(2)] == [200, 429]
 
 
 def test_without_redis_the_limits_let_everybody_in(settings: Settings, services: Services, keys: KeyFile) -> None:
@@ -144,14 +140,6 @@ def test_a_dataset_counts_with_all_its_cells_until_it_ends(
     plan_all(services)
     assert client.post("/v1/jobs", json=JOB | {"seed": 1}, headers=headers).status_code == 202
     assert client.post("/v1/datasets/d/retry", headers=headers).status_code == 429
-
-
-def test_an_idempotency_key_belongs_to_the_key_that_sent_it(make_twins: Twins, keys: KeyFile) -> None:
-    mine, yours = (bearer(keys.add(name, Scope.SUBMIT)) | {"Idempotency-Key": "1"} for name in ("me", "you"))
-    first, second = make_twins()
-    assert first.post("/v1/jobs", json=JOB, headers=mine).status_code == 202
-    assert second.post("/v1/jobs", json=JOB | {"seed": 1}, headers=mine).status_code == 422
-    assert second.post("/v1/jobs", json=JOB | {"seed": 1}, headers=yours).status_code == 202
 
 
 async def reads_all(scope: Any, receive: Any, send: Any) -> None:

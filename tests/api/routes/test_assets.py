@@ -19,11 +19,6 @@ from tests.api.factories import zipped
 STL = b"solid box\nendsolid box\n"
 
 
-def test_the_built_in_hands_and_objects_are_listed(http: TestClient) -> None:
-    for kind, name in (("hands", "allegro"), ("objects", "mug")):
-        assert name in {asset["name"] for asset in http.get(f"/v1/{kind}").json()["items"]}
-
-
 def test_an_upload_is_kept_whole_and_waits_for_its_check(http: TestClient, services: Services) -> None:
     answer = http.post("/v1/objects", files={"file": ("My box (2).stl", STL)})
     assert answer.status_code == 202
