@@ -89,7 +89,6 @@ def stamp(value: str) -> str:
     return datetime.fromisoformat(value).strftime("%Y-%m-%d %H:%M UTC")
 
 
-#: Kind of scene, and its name in templates.
 _PLACES: Final = {"table": "on a table", "bin": "in a bin", "shelf": "on a shelf", "file": "in a scene of their own"}
 
 

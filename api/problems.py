@@ -21,10 +21,8 @@ MEDIA_TYPE: Final = "application/problem+json"
 RETRY_AFTER_S: Final = 2
 _FULL_SAID: Final = "no space is left on the disk of this service; the same request succeeds when there is room"
 _LONGEST_POINTER: Final = 200
-#: Largest number of errors reported for one request.
 _MOST_ERRORS: Final = 100
 
-#: Problem types of statuses defined by HTTP.
 HTTP_SLUGS: Final[dict[int, str]] = {
     400: "bad-request",
     401: "unauthorized",

@@ -38,7 +38,11 @@ def files_of_upload(
     if not leaf or not size:
         raise InputError(f"the upload {leaf or 'without a name'} is empty; choose a file with content")
     if kind is AssetKind.NETWORK:
-        files: MutableMapping[str, bytes] = {NETWORK_FILE: _network(leaf, file, size)}
+        # An .npz is a ZIP itself, so it is not unpacked.
+        if PurePosixPath(leaf).suffix.lower() not in MAIN_SUFFIXES[kind]:
+            raise InputError(f"{leaf} is no network; upload its .npz file as it is")
+        check_size(size, leaf)
+        files: MutableMapping[str, bytes] = {NETWORK_FILE: file.read()}
     elif PurePosixPath(leaf).suffix.lower() == ".zip":
         files = ZipFiles(file, limit_bytes=limit_bytes * UNPACK_FACTOR).without_common_folder()
     else:
@@ -60,14 +64,6 @@ def name_of_upload(filename: str) -> str:
     leaf = PurePosixPath(filename.replace("\\", "/")).name
     stem = hand_name(leaf) if leaf.lower().endswith(SUFFIXES) else PurePosixPath(leaf).stem
     return refuse_long(_NAME.sub("-", stem).strip("-._") or "unnamed")
-
-
-def _network(leaf: str, file: IO[bytes], size: int) -> bytes:
-    """Return the content of a network's file: .npz is a ZIP itself, so it is not unpacked."""
-    if PurePosixPath(leaf).suffix.lower() not in MAIN_SUFFIXES[AssetKind.NETWORK]:
-        raise InputError(f"{leaf} is no network; upload its .npz file as it is")
-    check_size(size, leaf)
-    return file.read()
 
 
 def _main_file(kind: AssetKind, upload: str, files: Mapping[str, bytes]) -> str:

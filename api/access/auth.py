@@ -35,7 +35,6 @@ SESSION_COOKIE: Final = "graspd_session"
 #: Headers added by proxies: in an open service they reveal that requests of others arrive here.
 _OF_PROXIES: Final = ("x-forwarded-for", "x-forwarded-host", "forwarded", "via", "x-real-ip")
 
-#: Key of the present request; None while the service is open.
 caller: ContextVar[Key | None] = ContextVar("caller", default=None)
 
 

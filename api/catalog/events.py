@@ -29,7 +29,6 @@ from graspd.service.pipeline.recording import recording
 
 log = logging.getLogger(__name__)
 POLL_S: Final = 0.5
-#: Delay before a client reconnects [ms].
 RETRY_MS: Final = 2000
 _ENDS_AT_ONCE: Final = 100
 

@@ -29,7 +29,6 @@ _PAGE: Final = 200
 _LOOKED_AT: Final = 20
 _ORDER: Final = {stage: place for place, stage in enumerate(Stage)}
 _KEPT_LOSSES: Final = 256
-#: Fields of a job's document that are those of the index.
 _SHARED: Final = Job.model_fields.keys() & JobView.model_fields.keys() - {"reason", "stages"}
 _DETAILS: Final = ("request", "choice", "note", "outcomes", "rechecked", "recheck_held", "hand_digest", "object_digest")
 _LOSS_BATCHES: Final = 8

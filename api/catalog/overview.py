@@ -252,7 +252,6 @@ class _Probe:
             self._part = Part(ok=False, detail=f"{type(error).__name__}: {error}")
 
 
-#: Default number of days reported.
 DAYS: Final = 31
 MOST_DAYS: Final = 366
 _COLUMNS: Final = tuple(UsageDay.model_fields)

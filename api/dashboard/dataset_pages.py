@@ -35,7 +35,6 @@ _CELLS_AT_ONCE: Final = 200
 Fields = Annotated[FormData, fields_of(4000)]
 _DONE: Final = {"submit": "submitted", "retry": "retried", "cancel": "cancelled", "snapshot": "taken as a snapshot"}
 
-#: Fields of a dataset's form, and their initial values.
 _MAKE: Final = {"name": "", "grasps": "320", "fidelity": "standard"} | {
     one.name: one.default for one in inputs_of(cells=True)
 }
@@ -209,7 +208,6 @@ def _overview(
     )
 
 
-#: Datasets offered for comparison, newest first.
 _OFFERED: Final = 200
 
 comparison_router = APIRouter(include_in_schema=False)

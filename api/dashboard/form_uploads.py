@@ -37,7 +37,6 @@ _ASKED: Final = {
     "scale_to": ("Longest side [mm]", 'type="number" min="1" max="3000" step="any"', "Scale to this size"),
     "root": ("Link", 'type="text" maxlength="200"', "Use as root link"),
 }
-#: Form field of each kind's file.
 FILE_FIELDS: Final = {AssetKind.HAND: "hand_file", AssetKind.OBJECT: "file"}
 
 
@@ -69,9 +68,7 @@ class AssetChoice:
     name: str = ""
     """Name of the job's asset; empty: none yet."""
     refused: Refusal | None = None
-    """Reason why there is none."""
     file: str = ""
-    """Name of the file that cannot be used."""
     held: str = ""
     """Digest of that file in the store; empty: it must be chosen again."""
 

@@ -28,11 +28,9 @@ from graspd.service.model.metrics import AXIS_MEANINGS, GRASP_METRICS, GraspType
 from graspd.service.model.states import AssetKind
 
 PAGE_SIZES: Final = {"cards": 24, "table": 50}
-#: Sort key, label and unit of the metrics shown in lists of grasps.
 COLUMNS: Final = tuple((metric.name, metric.column_title, metric.unit) for metric in indexed(IndexLevel.OFFERED))
 #: Metrics of which less is better: the first click sorts them in ascending order.
 _LESS_IS_BETTER: Final = frozenset(metric.name for metric in indexed() if metric.less_is_better)
-#: Metrics shown beside the verdict of a grasp.
 _BESIDE_VERDICT: Final = frozenset({"contact_links", "robustness", "robust_share", "grasp_type", "approach_cell"})
 
 #: Difference along each axis of the models around the nominal one.
@@ -157,7 +155,6 @@ def _view_link(request: Request, view: str) -> str:
 
 
 Fields = Annotated[FormData, fields_of(400)]
-#: Longest query that a form returns.
 _LONGEST_FILTER: Final = 40_000
 _PAGES: Final = re.compile(r"/grasps(/[0-9a-f]{32}/[0-9]{1,10})?|/jobs/[0-9a-f]{32}")
 _NAME: Final[TypeAdapter[str]] = TypeAdapter(TagName)

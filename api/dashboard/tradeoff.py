@@ -137,7 +137,6 @@ class Point:
     y: float = 0.0
     label_y: float = 0.0
     is_left: bool = False
-    """Whether its label is on the left."""
     series: int = 0
 
     @property

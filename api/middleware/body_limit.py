@@ -11,13 +11,12 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from graspd.api.access.auth import authorize
 from graspd.api.access.keys import Scope as KeyScope
-from graspd.api.middleware.request_context import SAFE_METHODS
+from graspd.api.middleware.request_context import SAFE_METHODS, HttpMiddleware
 from graspd.api.problems import ApiError, answer
 from graspd.service.model.errors import LimitError
 
 #: Limit of a JSON body or a form without a file: job requests take a few hundred bytes.
 MAX_BODY_BYTES: Final = 1 << 20
-#: Longest wait for the next piece of a body [s].
 PIECE_S: Final = 30.0
 #: Least rate of a body; without it, single bytes would hold a connection forever [bytes/s].
 LEAST_BYTES_S: Final = 16 << 10
@@ -27,21 +26,18 @@ _FORM_SLACK_BYTES: Final = 64 << 10
 _MOST_DIGITS: Final = 18
 
 
-class BodyLimit:
+class BodyLimit(HttpMiddleware):
     """Refuses bodies whose Content-Length exceeds the limit; aborts those that become too long or slow."""
 
     def __init__(
         self, app: ASGIApp, *, upload_paths: frozenset[str], upload_bytes: int, piece_s: float = PIECE_S
     ) -> None:
-        self.app = app
+        super().__init__(app)
         self.upload_paths = upload_paths
         self.upload_bytes = upload_bytes
         self.piece_s = piece_s
 
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http":
-            await self.app(scope, receive, send)
-            return
+    async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
         is_upload = scope["method"] == "POST" and scope["path"].rstrip("/") in self.upload_paths
         limit = self.upload_bytes + _FORM_SLACK_BYTES if is_upload else MAX_BODY_BYTES
         if (refusal := _refusal(scope, limit, is_upload=is_upload)) is not None:

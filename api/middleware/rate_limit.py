@@ -24,6 +24,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from graspd.api.access.auth import Proxy, identify
 from graspd.api.access.auth import caller as present_caller
 from graspd.api.access.keys import Key, KeyFile
+from graspd.api.middleware.request_context import HttpMiddleware
 from graspd.api.problems import ApiError, answer
 from graspd.service.settings import Settings
 from graspd.service.telemetry import bind
@@ -32,7 +33,7 @@ from graspd.service.telemetry import bind
 _FREE: Final = ("/static/", "/healthz", "/readyz")
 
 
-class RateLimit:
+class RateLimit(HttpMiddleware):
     """Finds the key of a request (`scope["state"]["key"]`) and enforces the limits of that key.
 
     A request without a key counts against its address. An open service serves one machine and counts nothing.
@@ -42,16 +43,13 @@ class RateLimit:
     """
 
     def __init__(self, app: ASGIApp, *, keys: KeyFile, proxy: Proxy, settings: Settings, rates: Rates) -> None:
-        self.app = app
+        super().__init__(app)
         self.keys = keys
         self.proxy = proxy
         self.settings = settings
         self.rates = rates
 
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http":
-            await self.app(scope, receive, send)
-            return
+    async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
         is_open = self.keys.is_open
         key = scope.setdefault("state", {})["key"] = None if is_open else identify(scope, self.keys, self.proxy)
         token = present_caller.set(key)

@@ -47,17 +47,27 @@ _SECURITY_HEADERS: Final = {
 }
 
 
-class RequestContext:
+class HttpMiddleware:
+    """Middleware of HTTP requests; the start and the end of the application pass it."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self.app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        await (self.handle if scope["type"] == "http" else self.app)(scope, receive, send)
+
+    async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
+        raise NotImplementedError
+
+
+class RequestContext(HttpMiddleware):
     """Outermost middleware: sets the request id, times the request, reports unexpected errors as problems."""
 
     def __init__(self, app: ASGIApp, *, metrics: Metrics) -> None:
-        self.app = app
+        super().__init__(app)
         self.metrics = metrics
 
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http":
-            await self.app(scope, receive, send)
-            return
+    async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
         headers = Headers(scope=scope)
         given = headers.get("x-request-id", "")
         request_id = given if _REQUEST_ID.fullmatch(given) else uuid.uuid4().hex[:16]
@@ -116,14 +126,13 @@ def _route(scope: Scope) -> str:
     return getattr(scope.get("route"), "path", "unmatched")
 
 
-class Head:
+class Head(HttpMiddleware):
     """Answers HEAD as GET if no route handles HEAD itself."""
 
-    def __init__(self, app: ASGIApp) -> None:
-        self.app = app
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http" or scope["method"] != "HEAD" or _is_taken(scope):
+    async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["method"] != "HEAD" or any(
+            route.matches(dict(scope))[0] is Match.FULL for route in scope["app"].routes
+        ):
             await self.app(scope, receive, send)
             return
 
@@ -149,26 +158,19 @@ class Head:
             scope["method"], scope["headers"] = "HEAD", headers
 
 
-def _is_taken(scope: Scope) -> bool:
-    return any(route.matches(dict(scope))[0] is Match.FULL for route in scope["app"].routes)
-
-
 #: Attribute whose value is an address on this host. Text from users contains no quotes in a page.
 _ADDRESS: Final = re.compile(r'(?<=\s)((?:href|src|action|formaction|hx-[a-z-]+|data-[a-z-]+)=")(?=/(?!/))')
 _COOKIE_PATH: Final = re.compile(r";\s*Path=/(?=;|$)", re.IGNORECASE)
 
 
-class RootPath:
+class RootPath(HttpMiddleware):
     """Removes a prefix such as `/graspd` from paths and adds it to `Location` and to cookie paths."""
 
     def __init__(self, app: ASGIApp, *, prefix: str) -> None:
-        self.app = app
+        super().__init__(app)
         self.prefix = prefix
 
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http":
-            await self.app(scope, receive, send)
-            return
+    async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["path"] == self.prefix or scope["path"].startswith(f"{self.prefix}/"):
             scope = {**scope, "path": scope["path"].removeprefix(self.prefix) or "/"}
             if raw := scope.get("raw_path"):
@@ -200,7 +202,7 @@ def with_prefix(page: str, prefix: str) -> str:
     return _ADDRESS.sub(rf"\g<1>{prefix}", page) if prefix else page
 
 
-class SameOrigin:
+class SameOrigin(HttpMiddleware):
     """Refuses requests that a page of another site triggers in a visitor's browser.
 
     A browser sends the page that a request comes from (Sec-Fetch-Site, Origin); other clients do not. While no keys
@@ -208,14 +210,12 @@ class SameOrigin:
     """
 
     def __init__(self, app: ASGIApp, *, allowed_hosts: frozenset[str] | None) -> None:
-        self.app = app
+        super().__init__(app)
         self.allowed_hosts = allowed_hosts
 
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] == "http" and (error := self._refusal(scope)) is not None:
-            await answer(Request(scope), error)(scope, receive, send)
-            return
-        await self.app(scope, receive, send)
+    async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
+        error = self._refusal(scope)
+        await (answer(Request(scope), error) if error else self.app)(scope, receive, send)
 
     def _refusal(self, scope: Scope) -> ApiError | None:
         headers = Headers(scope=scope)

@@ -39,7 +39,6 @@ _AT_ONCE: Final = BoundedSemaphore(UPLOADS)
 _TURN_S: Final = 20.0
 
 _ZIPPED: Final = "Upload a file, or a ZIP of its folder. It is checked by a worker before the first job uses it."
-#: OpenAPI responses of an upload.
 _ADDED: Final = {
     AssetKind.HAND: _ZIPPED,
     AssetKind.OBJECT: _ZIPPED,

@@ -129,9 +129,7 @@ def next_address(request: Request, cursor: str) -> str:
 UPLOADS: Final = 4
 #: Forms with an upload at once: they also wait for its check.
 FORMS: Final = 8
-#: Files of selected grasps written at once.
 EXPORTS: Final = 2
-#: Requests that may wait for a thread.
 _MOST_WAITING: Final = 32
 _PATIENCE_S: Final = 20.0
 
