@@ -18,10 +18,9 @@ from graspd.api.dashboard import pages
 from graspd.api.dashboard.rendering import STATIC, problem_page
 from graspd.api.formatting import host_name, is_loopback
 from graspd.api.metrics import Metrics
-from graspd.api.middleware.body_limit import BodyLimit
-from graspd.api.middleware.rate_limit import RateLimit, Rates
+from graspd.api.middleware.limits import BodyLimit, RateLimit, Rates
 from graspd.api.middleware.request_context import Head, RequestContext, RootPath, SameOrigin
-from graspd.api.routes import assets, datasets, grasps, jobs, system, webhooks
+from graspd.api.routes import assets, datasets, grasps, jobs, system
 from graspd.api.routes.assets import asset_router
 from graspd.api.routes.dependencies import EXPORTS, FORMS, UPLOADS, RequestLimiter, provide
 from graspd.service.index.rebuild import complete_if_new
@@ -43,7 +42,7 @@ _ROUTERS: Final = (
     assets.correction_router,
     grasps.tag_router,
     system.usage_router,
-    webhooks.router,
+    system.event_router,
     system.deletion_router,
 )
 _LOOPBACK_NAMES = frozenset({"127.0.0.1", "localhost", "::1"})

@@ -13,8 +13,7 @@ from pydantic import TypeAdapter, ValidationError
 from starlette.datastructures import FormData
 
 from graspd.api.catalog.assets import Assets
-from graspd.api.catalog.grasp_exports import Format
-from graspd.api.catalog.tags import Tags
+from graspd.api.catalog.tags import Format, Tags
 from graspd.api.dashboard import rendering
 from graspd.api.dashboard.forms import fields_of, first_message
 from graspd.api.dashboard.rendering import base_url, render

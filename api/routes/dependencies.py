@@ -19,11 +19,10 @@ from graspd.api.access.quotas import Idempotency, Quotas, unfinished
 from graspd.api.catalog.assets import Assets
 from graspd.api.catalog.datasets import Datasets
 from graspd.api.catalog.events import Webhooks
-from graspd.api.catalog.grasp_exports import GraspExports
 from graspd.api.catalog.grasps import Grasps
 from graspd.api.catalog.jobs import Jobs, Shards
 from graspd.api.catalog.overview import Deletions, Overview, Usage
-from graspd.api.catalog.tags import Tags
+from graspd.api.catalog.tags import GraspExports, Tags
 from graspd.service.index.views import Page
 from graspd.service.model.errors import UnavailableError
 from graspd.service.pipeline.backends import Services

@@ -7,8 +7,7 @@ from typing import Annotated
 from fastapi import APIRouter, Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
 
-from graspd.api.catalog.grasp_exports import MEDIA_TYPES, Format, GraspExports
-from graspd.api.catalog.tags import Tags
+from graspd.api.catalog.tags import MEDIA_TYPES, Format, GraspExports, Tags
 from graspd.api.models import (
     GraspDetail,
     GraspExportQuery,

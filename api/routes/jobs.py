@@ -180,6 +180,6 @@ def parse_range(header: str | None, size: int) -> tuple[int, int] | None:
         start, end = max(0, size - int(last)), size
     else:
         start, end = int(first), min(size, int(last) + 1) if last else size
-    if start >= size or end <= start:
+    if end <= start:
         raise ApiError(416, f"the file has {size} bytes", headers={"Content-Range": f"bytes */{size}"})
     return start, end

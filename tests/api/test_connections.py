@@ -84,6 +84,12 @@ def rest(connection: socket.socket) -> bytes:
 def test_half_sent_headers_are_given_up(connect: Connect) -> None:
     assert rest(connect()) == b""
     assert rest(connect(_HALF)).startswith(b"HTTP/1.1 408 ")
+    answer = rest(connect(_WHOLE + _HALF))
+    assert answer.index(b" 200 ") < answer.index(b" 408 ")
+    later = connect(_WHOLE)
+    assert b" 200 " in later.recv(65536)
+    later.sendall(_HALF)
+    assert b" 408 " in rest(later)
 
 
 def test_headers_that_trickle_in_win_no_time(connect: Connect) -> None:
@@ -101,19 +107,6 @@ def test_headers_that_trickle_in_win_no_time(connect: Connect) -> None:
 
     until(trickle, "the server gives up")
     assert answer.startswith(b"HTTP/1.1 408 ")
-
-
-def test_half_of_a_later_request_is_given_up_too(connect: Connect) -> None:
-    connection = connect(_WHOLE)
-    assert b" 200 " in connection.recv(65536)
-    connection.sendall(_HALF)
-    assert b" 408 " in rest(connection)
-
-
-def test_half_of_a_request_behind_another_is_given_up(connect: Connect) -> None:
-    connection = connect(_WHOLE + _HALF)
-    answer = rest(connection)
-    assert answer.index(b" 200 ") < answer.index(b" 408 ")
 
 
 def test_a_request_of_two_lengths_is_refused(connect: Connect, app: FastAPI) -> None:

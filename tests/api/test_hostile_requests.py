@@ -57,6 +57,8 @@ _LONG_KEYS = ("Bearer " + "a" * 4000, "Basic " + "QQ==" * 500, "graspd_session=W
 
 METHODS, NAMES, PATHS = _METHODS.split(), _NAMES.split(), _PATHS.split()
 VALUES = [*_VALUES.split("|"), *_LONG, *_LONG_KEYS]
+#: Sent first, one each, for what the server itself reads of a request.
+_PAIRS = [(name, value) for name in ("origin", "host", "cookie", "authorization", "range") for value in VALUES]
 JOB_BODY = b'{"hand": "allegro", "object": "mug", "grasps": 32}'
 _QUERY_KEYS = "limit cursor since until state where sort hand tag format views x"
 _KEYS = _QUERY_KEYS.encode().split()
@@ -128,8 +130,8 @@ def ask(settings: Settings, services: Services, redis_server: str, rq_queue: RqQ
 def walk(ask: Ask, requests: int, seed: int) -> Counter[int]:
     """How often each status came; fails with the requests that made a 5xx."""
     chance, found, wrong = random.Random(seed), Counter[int](), []
-    for _ in range(requests):
-        request = _request(chance)
+    for number in range(requests):
+        request = _request(chance, _PAIRS[number : number + 1])
         status = ask(request)
         found[status] += 1
         if status >= 500:
@@ -138,14 +140,16 @@ def walk(ask: Ask, requests: int, seed: int) -> Counter[int]:
     return found
 
 
-def _request(chance: random.Random) -> bytes:
+def _request(chance: random.Random, odd: list[tuple[str, str]]) -> bytes:
     path = chance.choice(_ASKED).encode() + (chance.choice(_TAILS) if chance.random() < 0.2 else b"")
     query = b"&".join(chance.choice(_KEYS) + b"=" + chance.choice(_WORDS) for _ in range(chance.choice((0, 0, 1, 3))))
     headers = [(b"Host", b"127.0.0.1"), (b"Authorization", b"Bearer KEY")]
     headers.append((b"Accept", chance.choice((b"text/html", b"*/*"))))
-    for name in chance.sample(NAMES, chance.choice((0, 1, 2, 4))):
+    for name, value in odd or [
+        (name, chance.choice(VALUES)) for name in chance.sample(NAMES, chance.choice((0, 1, 2, 4)))
+    ]:
         headers = [one for one in headers if one[0].lower() != name.encode() or chance.random() < 0.2]
-        headers.append((name.encode(), chance.choice(VALUES).encode("latin-1")))
+        headers.append((name.encode(), value.encode("latin-1")))
     method, body = chance.choice(METHODS).encode(), chance.choice(_BODIES) if chance.random() < 0.5 else b""
     headers.append((b"Content-Length", b"%d" % len(body)))
     if method in (b"POST", b"PUT") and chance.random() < 0.7:

@@ -13,8 +13,7 @@ from starlette.testclient import TestClient
 
 from graspd.api.access.keys import KeyFile, KeyLimits, Scope
 from graspd.api.app import create_app
-from graspd.api.middleware.body_limit import BodyLimit
-from graspd.api.middleware.rate_limit import Allowance, Rates
+from graspd.api.middleware.limits import Allowance, BodyLimit, Rates
 from graspd.service.pipeline.backends import Services
 from graspd.service.queue.rq_queue import RqQueue
 from graspd.service.settings import Settings
@@ -30,7 +29,7 @@ Twins = Callable[..., list[TestClient]]
 @pytest.fixture(autouse=True)
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
     """On a busy machine Redis may be slow to answer, and what is not counted is let in."""
-    monkeypatch.setattr("graspd.api.middleware.rate_limit._ANSWER_S", PATIENCE_S)
+    monkeypatch.setattr("graspd.api.middleware.limits._ANSWER_S", PATIENCE_S)
 
 
 def test_two_applications_share_one_rate_and_say_when_to_come(make_twins: Twins, keys: KeyFile) -> None:
@@ -178,5 +177,5 @@ def test_a_body_that_trickles_in_is_given_up(monkeypatch: pytest.MonkeyPatch) ->
         clock[0] += 20.0
         return {"type": "http.request", "body": b"x", "more_body": True}
 
-    monkeypatch.setattr("graspd.api.middleware.body_limit.time.monotonic", lambda: clock[0])
+    monkeypatch.setattr("graspd.api.middleware.limits.time.monotonic", lambda: clock[0])
     assert answer_to(trickling) == 408 and pieces == 2

@@ -207,7 +207,7 @@ def test_a_zip_of_nothing_too_much_or_a_damaged_shard_is_refused(
     (services.settings.data_dir / "store" / made.key).write_bytes(b"other bytes")
     answer = http.get(address)
     assert answer.status_code == 500 and made.key in answer.json()["detail"]
-    monkeypatch.setattr("graspd.api.catalog.grasp_exports.MOST_SHARDS", 0)
+    monkeypatch.setattr("graspd.api.catalog.tags.MOST_SHARDS", 0)
     assert http.get(address).status_code == 413
 
 

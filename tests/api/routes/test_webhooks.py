@@ -8,6 +8,7 @@ import json
 import threading
 import time
 from concurrent.futures import wait
+from contextlib import closing
 from typing import Any
 
 import pytest
@@ -149,14 +150,11 @@ def test_webhooks_survive_a_rebuild_and_tell_nothing_old(http: TestClient, servi
     hook = add(http)
     end_a_job(services)
     ear.round()
-    fresh = Index("sqlite://")
-    try:
+    with closing(Index("sqlite://")) as fresh:
         rebuild(fresh, services.store)
         assert [one.id for one in fresh.outbox.hooks()] == [hook["id"]]
         fresh.outbox.plan()
         assert fresh.outbox.due(time.time()) == []
-    finally:
-        fresh.close()
     rebuild(services.index, services.store)
     ear.round()
     assert len(ear.heard) == 1
