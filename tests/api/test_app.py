@@ -10,12 +10,9 @@ from functools import cache
 from typing import Any
 
 import pytest
-import typer
 from pydantic import TypeAdapter
 from starlette.testclient import TestClient
-from typer.core import TyperGroup
 
-import graspd.cli
 from graspd.api.app import create_app
 from graspd.api.metrics import Metrics, Snapshot
 from graspd.api.server import bind
@@ -126,11 +123,3 @@ def test_the_page_of_the_api_lists_every_route(http: TestClient) -> None:
     assert [path for path in answer.json()["paths"] if f"`{path}`" not in page] == []
     wanted = {part.partition('"')[0] for part in answer.text.split("#/components/schemas/")[1:]}
     assert wanted <= set(answer.json()["components"]["schemas"])
-
-
-@pytest.mark.parametrize("name", [name for name, module, _, _ in graspd.cli.COMMANDS if module != "graspd.demo"])
-def test_every_command_of_the_overview_opens(name: str) -> None:
-    module = next(module for known, module, _, _ in graspd.cli.COMMANDS if known == name)
-    root = typer.main.get_command(graspd.cli.build())
-    assert isinstance(root, TyperGroup)
-    assert graspd.cli.load(module, name) is not None
