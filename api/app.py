@@ -18,10 +18,9 @@ from graspd.api.dashboard import pages
 from graspd.api.dashboard.rendering import STATIC, problem_page
 from graspd.api.formatting import host_name, is_loopback
 from graspd.api.metrics import Metrics
-from graspd.api.middleware.body_limit import BodyLimit
-from graspd.api.middleware.rate_limit import RateLimit, Rates
+from graspd.api.middleware.limits import BodyLimit, RateLimit, Rates
 from graspd.api.middleware.request_context import Head, RequestContext, RootPath, SameOrigin
-from graspd.api.routes import assets, datasets, grasps, jobs, shards, system, webhooks
+from graspd.api.routes import assets, datasets, grasps, jobs, system
 from graspd.api.routes.assets import asset_router
 from graspd.api.routes.dependencies import EXPORTS, FORMS, UPLOADS, RequestLimiter, provide
 from graspd.service.index.rebuild import complete_if_new
@@ -38,26 +37,19 @@ _log = logging.getLogger("graspd.api")
 _ROUTERS: Final = (
     jobs.router,
     grasps.router,
-    shards.router,
+    jobs.shard_router,
     system.router,
     assets.correction_router,
     grasps.tag_router,
     system.usage_router,
-    webhooks.router,
+    system.event_router,
     system.deletion_router,
 )
 _LOOPBACK_NAMES = frozenset({"127.0.0.1", "localhost", "::1"})
 
 
 def create_app(settings: Settings, services: Services | None = None) -> FastAPI:
-    """Create the application with given services, or with its own, which it opens and closes.
-
-    Raises:
-        InputError: the address to bind is reachable from other machines and no key exists; or the settings of a
-            proxy are invalid.
-        BusyError: store, index or Redis belong to another service.
-        StoreUnavailable, IndexUnavailable: store or index cannot be opened.
-    """
+    """Create the application with given services, or with its own, which it opens and closes."""
     proxy = Proxy(settings)
     keys = KeyFile(settings.resolved_keys_file, closed=proxy.is_on)
     if not proxy.is_on:
@@ -105,7 +97,6 @@ def create_app(settings: Settings, services: Services | None = None) -> FastAPI:
 
 
 def check_exposure(host: str, keys: KeyFile) -> None:
-    """Raise InputError if other machines could reach a service that has no live key."""
     if not keys.has_live_key and not is_loopback(host):
         raise InputError(
             f"{host} is reachable from other machines and there is no live key; "

@@ -26,7 +26,6 @@ def metric(value: float | None) -> str:
 
 
 def count(value: float | None) -> str:
-    """Format a whole number with separated thousands."""
     return NONE if value is None else f"{value:,.0f}"
 
 
@@ -71,7 +70,6 @@ def duration(seconds: float | None) -> str:
 
 
 def size(value: float | None) -> str:
-    """Format bytes in decimal units."""
     if value is None:
         return NONE
     for unit in ("B", "kB", "MB", "GB"):
@@ -91,7 +89,6 @@ def stamp(value: str) -> str:
     return datetime.fromisoformat(value).strftime("%Y-%m-%d %H:%M UTC")
 
 
-#: Kind of scene, and its name in templates.
 _PLACES: Final = {"table": "on a table", "bin": "in a bin", "shelf": "on a shelf", "file": "in a scene of their own"}
 
 

@@ -32,12 +32,10 @@ class Metrics:
         )
 
     def observe(self, method: str, route: str, status: int, seconds: float) -> None:
-        """Count one answered request."""
         self._requests.labels(method, route, str(status)).inc()
         self._seconds.labels(method, route).observe(seconds)
 
     def render(self, service: Snapshot) -> bytes:
-        """Render the text exposition format."""
         snapshot = CollectorRegistry()
         snapshot.register(service)
         return generate_latest(self.registry) + generate_latest(snapshot)
@@ -79,7 +77,6 @@ class Snapshot:
         self._set("graspd_grasps_per_second", "valid", value=index.valid_per_s)
 
     def add_sums(self, sums: Mapping[str, float]) -> None:
-        """Set the sums that the controller counted."""
         self._sums = sums
 
     def collect(self) -> Iterator[Metric]:

@@ -289,24 +289,13 @@ class Histogram(BaseModel):
     high: float
     counts: list[int] = Field(description="counts in equal bins from low to high")
 
-    @property
-    def bars(self) -> list[float]:
-        """Heights of the bars as shares of the highest bin."""
-        top = max(self.counts) or 1
-        return [count / top for count in self.counts]
-
 
 def stage_state(stage: StageProgress) -> State:
     """Return the state of a stage from the states of its tasks."""
     if stage.succeeded == stage.tasks:
         return State.SUCCEEDED
-    if stage.running:
-        return State.RUNNING
-    if stage.failed:
-        return State.FAILED
-    if stage.cancelled:
-        return State.CANCELLED
-    return State.RUNNING if stage.succeeded else State.QUEUED
+    known = (state for state in (State.RUNNING, State.FAILED, State.CANCELLED) if getattr(stage, state))
+    return next(known, State.RUNNING if stage.succeeded else State.QUEUED)
 
 
 STAGE_LABELS: dict[Stage, str] = {

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import logging
 from collections.abc import Callable
 from http import HTTPStatus
 from typing import Any, Final
@@ -22,12 +21,8 @@ MEDIA_TYPE: Final = "application/problem+json"
 RETRY_AFTER_S: Final = 2
 _FULL_SAID: Final = "no space is left on the disk of this service; the same request succeeds when there is room"
 _LONGEST_POINTER: Final = 200
-#: Largest number of errors reported for one request.
 _MOST_ERRORS: Final = 100
 
-_log = logging.getLogger("graspd.api")
-
-#: Problem types of statuses defined by HTTP.
 HTTP_SLUGS: Final[dict[int, str]] = {
     400: "bad-request",
     401: "unauthorized",
@@ -87,9 +82,8 @@ def problem_response(
     errors: list[FieldError] | None = None,
     headers: dict[str, str] | None = None,
 ) -> JSONResponse:
-    """Return the problem document of a failed request."""
     problem = Problem(
-        type=f"{_root_path(request)}/problems/{slug}",
+        type=f"{request.app.state.settings.api_root_path or ''}/problems/{slug}",
         title=title,
         status=status,
         detail=detail,
@@ -105,11 +99,6 @@ def problem_response(
     )
 
 
-def _root_path(request: Request) -> str:
-    settings = getattr(request.app.state, "settings", None) if "app" in request.scope else None
-    return (settings.api_root_path or "") if settings is not None else ""
-
-
 def describe(error: Exception) -> tuple[str, str, int, str]:
     """Return (slug, title, status, detail) of an exception; unexpected errors reveal no internals."""
     if isinstance(error, GraspdError):
@@ -117,12 +106,13 @@ def describe(error: Exception) -> tuple[str, str, int, str]:
     if _is_full(error) or _is_full(error.__cause__):
         return StoreUnavailable.slug, StoreUnavailable.title, StoreUnavailable.status, _FULL_SAID
     if isinstance(error, ApiError):
-        return HTTP_SLUGS.get(error.status, "internal"), HTTPStatus(error.status).phrase, error.status, str(error)
-    if isinstance(error, HTTPException):
-        phrase = HTTPStatus(error.status_code).phrase
-        return HTTP_SLUGS.get(error.status_code, "internal"), phrase, error.status_code, str(error.detail)
-    detail = "an unforeseen error; the log names it under this request id"
-    return GraspdError.slug, GraspdError.title, GraspdError.status, detail
+        status, detail = error.status, str(error)
+    elif isinstance(error, HTTPException):
+        status, detail = error.status_code, str(error.detail)
+    else:
+        detail = "an unforeseen error; the log names it under this request id"
+        return GraspdError.slug, GraspdError.title, GraspdError.status, detail
+    return HTTP_SLUGS.get(status, "internal"), HTTPStatus(status).phrase, status, detail
 
 
 def _is_full(error: BaseException | None) -> bool:
@@ -136,7 +126,6 @@ def plain(text: str) -> str:
 
 
 def answer(request: Request, error: Exception) -> JSONResponse:
-    """Return the problem document of any exception."""
     slug, title, status, detail = describe(error)
     if isinstance(error, HTTPException) and status == 404:
         detail = f"there is no {request.url.path}"
@@ -151,19 +140,17 @@ def answer(request: Request, error: Exception) -> JSONResponse:
 
 def _allowed_methods(request: Request) -> list[str]:
     """Return the methods of all routes at this path (RFC 9110 §15.5.6); one route has only its own."""
-    routes = request.app.routes if "app" in request.scope else []
     return [
         method
         for method in ("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE")
         if any(
             route.matches(dict(request.scope) | {"method": "GET" if method == "HEAD" else method})[0] is Match.FULL
-            for route in routes
+            for route in request.app.routes
         )
     ]
 
 
 def validation_answer(request: Request, error: RequestValidationError) -> JSONResponse:
-    """Return a problem document that lists every invalid field."""
     errors = [_field_error(entry) for entry in error.errors()]
     is_syntax = any(entry.type == "json_invalid" for entry in errors)
     first = errors[0]
@@ -192,19 +179,14 @@ def _field_error(entry: dict[str, Any]) -> FieldError:
 
 
 def request_id_of(request: Request) -> str | None:
-    """Return the request id set by the outermost middleware."""
     return request.scope.get("state", {}).get("request_id")
 
 
-def install(app: FastAPI, page: Callable[[Request, dict[str, Any]], Response] | None = None) -> None:
-    """Convert every exception of the application to a problem document.
-
-    Args:
-        page: renders the problem as a page, for dashboard addresses opened in a browser.
-    """
+def install(app: FastAPI, page: Callable[[Request, dict[str, Any]], Response]) -> None:
+    """Convert every exception to a problem document, or for dashboard addresses in a browser to a `page` of it."""
 
     def answer_any(request: Request, error: Exception) -> Response:
-        if page is not None and _is_page(request):
+        if _is_page(request):
             slug, title, status, detail = describe(error)
             facts = {"type": slug, "title": title, "status": status, "detail": detail}
             return page(request, facts | {"request_id": request_id_of(request)})
@@ -219,9 +201,8 @@ def install(app: FastAPI, page: Callable[[Request, dict[str, Any]], Response] | 
 
     #: Used by the outermost middleware if no handler was reached.
     app.state.answer_error = answer_any
-    app.add_exception_handler(GraspdError, any_error)
-    app.add_exception_handler(ApiError, any_error)
-    app.add_exception_handler(HTTPException, any_error)
+    for kind in (GraspdError, ApiError, HTTPException):
+        app.add_exception_handler(kind, any_error)
     app.add_exception_handler(RequestValidationError, bad_request)
 
 
@@ -239,8 +220,3 @@ def responses(*statuses: int, others: dict[int | str, dict[str, Any]] | None = N
         }
         for status in statuses
     }
-
-
-def log_unforeseen(path: str, request_id: str, error: Exception) -> None:
-    """Log the stack trace for the operator."""
-    _log.error("request %s on %s failed", request_id, path, exc_info=error)

@@ -26,20 +26,11 @@ from graspd.service.settings import Settings
 
 #: A stop waits at most this long for open event streams, which end only with their clients [s].
 _GRACE_S = 3
-#: Limit from the start of a connection, or the first byte of a later request, to the end of its headers [s].
-HEADERS_S: Final = 20.0
-#: Limit for the rest of a body after its answer [s]: a client that still sends may read the answer first.
-REST_S: Final = 5.0
 _TOO_SLOW: Final = b"HTTP/1.1 408 Request Timeout\r\nConnection: close\r\nContent-Length: 0\r\n\r\n"
 
 
 def bind(host: str, port: int) -> socket.socket:
-    """Return a listening socket.
-
-    Raises:
-        BusyError: the port is taken.
-        InputError: the address does not belong to this machine, or the port needs other privileges.
-    """
+    """Return a listening socket; BusyError if the port is taken, InputError if it cannot be bound."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     # asyncio disables Nagle's delay only on sockets with an explicit protocol; else each body arrives 40 ms late.
     listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
@@ -56,13 +47,7 @@ def bind(host: str, port: int) -> socket.socket:
 
 
 def serve(settings: Settings) -> None:
-    """Answer requests until SIGINT or SIGTERM.
-
-    Raises:
-        BusyError: the port is taken.
-        InputError: other machines could reach the service without a key.
-        StoreUnavailable, IndexUnavailable: store or index cannot be opened.
-    """
+    """Answer requests until SIGINT or SIGTERM."""
     listener = bind(settings.host, settings.port)
     with listener:
         # Spool uploads here, not in /tmp, which may be in memory.
@@ -77,7 +62,6 @@ def serve(settings: Settings) -> None:
 
 
 def configuration(app: ASGIApp, settings: Settings) -> uvicorn.Config:
-    """Return uvicorn's configuration for the application."""
     return uvicorn.Config(
         app,
         http=TimedProtocol,
@@ -96,8 +80,10 @@ def configuration(app: ASGIApp, settings: Settings) -> uvicorn.Config:
 class TimedProtocol(H11Protocol):
     """HTTP/1.1 connection with time limits that trickling bytes do not extend."""
 
-    headers_s = HEADERS_S
-    rest_s = REST_S
+    #: Limit from the start of a connection, or the first byte of a later request, to the end of its headers [s].
+    headers_s = 20.0
+    #: Limit for the rest of a body after its answer [s]: a client that still sends may read the answer first.
+    rest_s = 5.0
     _patience: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]

@@ -28,22 +28,7 @@ _NAME: Final = re.compile(r"[^A-Za-z0-9._-]+")
 def files_of_upload(
     kind: AssetKind, filename: str, data: bytes | IO[bytes], *, limit_bytes: int, options: str = ""
 ) -> MutableMapping[str, bytes]:
-    """Return the files of an asset, including `asset.json`, from an uploaded file or ZIP.
-
-    Files of a ZIP are read on access.
-
-    Args:
-        kind: hand, object or network.
-        filename: name given by the user.
-        data: content, or an open file with it.
-        limit_bytes: largest upload [bytes].
-        options: a JSON object; its keys override those of `asset.json`.
-
-    Raises:
-        InputError: empty upload, unknown suffix, options that are no JSON object, or a ZIP without a clear main file.
-        LimitError: it exceeds the limit; or its ZIP unpacks to more than `UNPACK_FACTOR` times that, or holds too
-            many files.
-    """
+    """Return the files of an asset, including `asset.json`, from an upload; `options` override its keys."""
     leaf = PurePosixPath(filename.replace("\\", "/")).name
     file = io.BytesIO(data) if isinstance(data, bytes) else data
     size = file.seek(0, io.SEEK_END)
@@ -53,7 +38,11 @@ def files_of_upload(
     if not leaf or not size:
         raise InputError(f"the upload {leaf or 'without a name'} is empty; choose a file with content")
     if kind is AssetKind.NETWORK:
-        files: MutableMapping[str, bytes] = {NETWORK_FILE: _network(leaf, file, size)}
+        # An .npz is a ZIP itself, so it is not unpacked.
+        if PurePosixPath(leaf).suffix.lower() not in MAIN_SUFFIXES[kind]:
+            raise InputError(f"{leaf} is no network; upload its .npz file as it is")
+        check_size(size, leaf)
+        files: MutableMapping[str, bytes] = {NETWORK_FILE: file.read()}
     elif PurePosixPath(leaf).suffix.lower() == ".zip":
         files = ZipFiles(file, limit_bytes=limit_bytes * UNPACK_FACTOR).without_common_folder()
     else:
@@ -75,14 +64,6 @@ def name_of_upload(filename: str) -> str:
     leaf = PurePosixPath(filename.replace("\\", "/")).name
     stem = hand_name(leaf) if leaf.lower().endswith(SUFFIXES) else PurePosixPath(leaf).stem
     return refuse_long(_NAME.sub("-", stem).strip("-._") or "unnamed")
-
-
-def _network(leaf: str, file: IO[bytes], size: int) -> bytes:
-    """Return the content of a network's file: .npz is a ZIP itself, so it is not unpacked."""
-    if PurePosixPath(leaf).suffix.lower() not in MAIN_SUFFIXES[AssetKind.NETWORK]:
-        raise InputError(f"{leaf} is no network; upload its .npz file as it is")
-    check_size(size, leaf)
-    return file.read()
 
 
 def _main_file(kind: AssetKind, upload: str, files: Mapping[str, bytes]) -> str:

@@ -35,12 +35,10 @@ SESSION_COOKIE: Final = "graspd_session"
 #: Headers added by proxies: in an open service they reveal that requests of others arrive here.
 _OF_PROXIES: Final = ("x-forwarded-for", "x-forwarded-host", "forwarded", "via", "x-real-ip")
 
-#: Key of the present request; None while the service is open.
 caller: ContextVar[Key | None] = ContextVar("caller", default=None)
 
 
 def caller_id() -> str:
-    """Return the id of the caller's key; empty while the service is open."""
     key = caller.get()
     return key.id if key else ""
 
@@ -56,14 +54,10 @@ class ForeignResource(ApiError):
 
 
 def authorize(request: HTTPConnection, scope: Scope) -> Key | None:
-    """Return the key of a request; None while the service is open.
-
-    Raises:
-        ApiError: 401 without a live key, 403 if the key's scope is insufficient.
-    """
+    """Return the key of a request; None while the service is open. Otherwise 401 or 403."""
     keys: KeyFile = request.app.state.keys
     if keys.is_open:
-        refuse_strangers(request)
+        _refuse_strangers(request)
         return None
     key: Key | None = request.scope.get("state", {}).get("key")
     if key is None:
@@ -87,13 +81,7 @@ def may_still(request: HTTPConnection, scope: Scope) -> bool:
 
 
 def may_change(owner: str, project: str = "") -> bool:
-    """Check whether the present key may cancel, retry or delete a resource.
-
-    Args:
-        owner: id of the key that submitted the resource; empty if it was submitted without a key, or before ids
-            were recorded: then only `admin` may change it.
-        project: project of the resource. Its keys may change each other's resources; without one, only the owner may.
-    """
+    """Check whether the present key may change a resource; without an owner or a project only `admin` may."""
     key = caller.get()
     if key is None or key.scope.includes(Scope.ADMIN):
         return True
@@ -102,15 +90,7 @@ def may_change(owner: str, project: str = "") -> bool:
 
 
 def must_own(owner: str, what: str, project: str = "") -> None:
-    """Refuse to change a resource of another owner. The route has already required `submit`.
-
-    Args:
-        owner, project: as in `may_change`.
-        what: name of the resource in the message, such as "job 1a2b".
-
-    Raises:
-        NotYours: the caller does not own it, and the key has no `admin` scope.
-    """
+    """Raise ForeignResource unless the key may change `what`, such as `job 1a2b`. Routes require `submit`."""
     if not may_change(owner, project):
         key = caller.get()
         assert key is not None
@@ -122,7 +102,6 @@ def must_own(owner: str, what: str, project: str = "") -> None:
 
 
 def is_allowed(request: HTTPConnection, scope: Scope) -> bool:
-    """Check whether `authorize` would accept the request."""
     try:
         authorize(request, scope)
     except ApiError:
@@ -130,12 +109,8 @@ def is_allowed(request: HTTPConnection, scope: Scope) -> bool:
     return True
 
 
-def refuse_strangers(request: HTTPConnection) -> None:
-    """Restrict an open service to this machine.
-
-    Raises:
-        ApiError: 403, the request comes from another machine, or through a proxy that may serve anyone.
-    """
+def _refuse_strangers(request: HTTPConnection) -> None:
+    """Restrict an open service to this machine: refuse others, and proxies, which may serve anyone."""
     passed_on = next((name for name in _OF_PROXIES if name in request.headers), None)
     address = request.client.host if request.client else ""
     if passed_on is None and not _is_elsewhere(address):
@@ -149,7 +124,6 @@ def refuse_strangers(request: HTTPConnection) -> None:
 
 
 def identify(scope: AsgiScope, keys: KeyFile, proxy: Proxy) -> Key | None:
-    """Return the live key of a header or session cookie, or the person authenticated by the proxy."""
     scheme, _, token = Headers(scope=scope).get("authorization", "").partition(" ")
     if scheme.lower() == "bearer" and token:
         return keys.find(token.strip())
@@ -176,11 +150,7 @@ _USER: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._@+-]*")
 
 
 class Proxy:
-    """Authenticating proxy from the settings, if any.
-
-    Raises:
-        InputError: only one of addresses and secret is set, the secret is short, or an address or a group is invalid.
-    """
+    """Authenticating proxy from the settings, if any; InputError if they are incomplete or invalid."""
 
     def __init__(self, settings: Settings) -> None:
         secret = settings.proxy_secret.get_secret_value() if settings.proxy_secret else ""
@@ -198,10 +168,7 @@ class Proxy:
         return bool(self._secret)
 
     def find(self, scope: AsgiScope) -> Key | None:
-        """Return the authenticated person as a key with the rights of their first group in the settings.
-
-        None if nobody is authenticated, or if none of their groups has rights.
-        """
+        """Return the authenticated person as a key with the rights of their first group in the settings, or None."""
         if not self.is_on or not self._is_from_proxy(scope):
             return None
         headers = Headers(scope=scope)

@@ -18,7 +18,6 @@ _ADD: Final = "graspd keys add admin --scope admin"
 
 
 def keys(settings: Settings) -> Finding:
-    """Check the file of API keys."""
     name, path = "keys", settings.resolved_keys_file
     try:
         found = KeyFile(path).list()

@@ -86,7 +86,6 @@ class Key(BaseModel):
 
     @property
     def is_live(self) -> bool:
-        """Whether the key is valid now."""
         return self.revoked is None and (self.expires is None or _now() < self.expires)
 
 
@@ -99,11 +98,7 @@ class _Document(BaseModel):
 
 
 class KeyFile:
-    """File of the keys.
-
-    Args:
-        closed: whether callers can authenticate without a key: then the service is closed even before the first key.
-    """
+    """File of the keys. If callers can authenticate without a key, it is `closed` even before the first key."""
 
     def __init__(self, path: Path, *, closed: bool = False) -> None:
         self.path = path
@@ -112,7 +107,6 @@ class KeyFile:
         self._document = _Document(session_secret="")
 
     def list(self) -> list[Key]:
-        """Return all keys, including revoked ones."""
         return list(self._read().keys)
 
     @property
@@ -133,15 +127,7 @@ class KeyFile:
         limits: KeyLimits | None = None,
         project: str = "",
     ) -> str:
-        """Make a key and return it; it cannot be shown again.
-
-        Args:
-            project: project of what the key submits; empty: the one without a name.
-
-        Raises:
-            ConflictError: a live key has this name.
-            InputError: the name or the project is not a plain word.
-        """
+        """Make a key and return it; it cannot be shown again. An empty project is the one without a name."""
         with self._changing() as document:
             if any(key.name == name and key.is_live for key in document.keys):
                 raise ConflictError(f"there is a key named {name!r}; revoke or rotate it, or take another name")
@@ -167,11 +153,7 @@ class KeyFile:
         return token
 
     def rotate(self, name: str, *, grace: timedelta = timedelta(0), lifetime: timedelta | None = None) -> str:
-        """Return a new secret for a key; the old one stays valid for `grace`. Scope, project, limits stay.
-
-        Raises:
-            NotFoundError: no live key has this name.
-        """
+        """Return a new secret for a key; the old one stays valid for `grace`. Scope, project, limits stay."""
         token = PREFIX + secrets.token_urlsafe(32)
         with self._changing() as document:
             old = _live(document, name)
@@ -187,11 +169,7 @@ class KeyFile:
         return token
 
     def limit(self, name: str, limits: KeyLimits) -> KeyLimits:
-        """Change the given limits of a key; return all of its limits.
-
-        Raises:
-            NotFoundError: no live key has this name.
-        """
+        """Change the given limits of a key; return all of its limits."""
         with self._changing() as document:
             for key in (found := _live(document, name)):
                 key.limits = key.limits.model_copy(update=limits.model_dump(exclude_unset=True))
@@ -204,15 +182,10 @@ class KeyFile:
         return dict(sorted((named | document.projects).items()))
 
     def limits_of(self, project: str) -> ProjectLimits:
-        """Return the limits of a project."""
         return self._read().projects.get(project, ProjectLimits())
 
     def limit_project(self, project: str, limits: ProjectLimits) -> ProjectLimits:
-        """Change the given limits of a project; return all of its limits.
-
-        Raises:
-            InputError: it is no name of a project.
-        """
+        """Change the given limits of a project; return all of its limits."""
         if not re.fullmatch(PATTERN, project):
             raise InputError(_no_project(project))
         with self._changing() as document:
@@ -221,26 +194,16 @@ class KeyFile:
         return document.projects[project]
 
     def revoke(self, name: str) -> None:
-        """Revoke a key; it remains in the list.
-
-        Raises:
-            NotFoundError: no live key has this name.
-        """
         with self._changing() as document:
             for key in _live(document, name):
                 key.revoked = _now()
 
     def find(self, token: str) -> Key | None:
-        """Return the live key of a token."""
         digest = _sha256(token)
         return self._first(lambda key: hmac.compare_digest(key.sha256, digest))
 
     def open_session(self, key: Key) -> str:
-        """Return a signed cookie for a browser that presented a key.
-
-        Raises:
-            UnavailableError: the file of keys has no secret for signatures.
-        """
+        """Return a signed cookie for a browser that presented a key."""
         if not self._read().session_secret:
             raise UnavailableError(f"the key file {self.path} has no session_secret; `graspd keys add` gives it one")
         claim = base64.urlsafe_b64encode(json.dumps([key.sha256, int(time.time()) + SESSION_S]).encode()).decode()

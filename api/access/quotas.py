@@ -1,4 +1,4 @@
-"""Quotas of a key, and of a project's keys together: grasps in unfinished jobs, and requests per day.
+"""Quotas of a key, and of a project's keys together: grasps in unfinished jobs, and requests per day. Idempotency keys.
 
 Redis counts them in one atomic step for all API processes. Its loss resets quotas, but loses no job. From submission to
 end, a job counts with its requested grasps. The index is asked for ended jobs only if the quota would be exceeded, so a
@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 import uuid
 from collections.abc import Callable, Collection, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from typing import Any, Final
@@ -19,7 +19,9 @@ from redis.exceptions import RedisError
 
 from graspd.api.access.keys import Key, ProjectLimits
 from graspd.service.index.index import Index
-from graspd.service.model.errors import QuotaError
+from graspd.service.model.digests import digest_bytes, digest_json
+from graspd.service.model.domain import JobRequest
+from graspd.service.model.errors import InputError, QueueUnavailable, QuotaError
 from graspd.service.settings import Settings
 
 log = logging.getLogger(__name__)
@@ -117,10 +119,6 @@ class _Holder:
     counts_jobs: bool
 
     @property
-    def is_limited(self) -> bool:
-        return bool(self.grasps or self.today)
-
-    @property
     def held(self) -> str:
         return f"graspd:quota:{self.name}:held"
 
@@ -143,14 +141,7 @@ class _Holder:
 
 
 class Quotas:
-    """Counters of all keys and projects.
-
-    Args:
-        connection: Redis.
-        unfinished: returns those of the given job ids whose job has not ended.
-        limits_of: returns the limits of a project.
-        gpu_seconds: returns the time of GPU workers on a project's tasks on a day [s].
-    """
+    """Counters of all keys and projects. `unfinished` returns those of the given job ids whose job has not ended."""
 
     def __init__(
         self,
@@ -169,15 +160,7 @@ class Quotas:
 
     @contextmanager
     def claim(self, key: Key | None, job: str, grasps: int, *, is_new: bool = True) -> Iterator[SubmissionClaim]:
-        """Count a job submitted or retried in this context, unless that fails or makes nothing new.
-
-        Args:
-            key: the submitting key; None while the service is open, without quotas.
-            is_new: whether the job counts as one of today; a retried job does not.
-
-        Raises:
-            QuotaError: the quota of the key or of its project is used up.
-        """
+        """Count a job submitted or retried (not `is_new`) in this context, unless that fails or makes nothing new."""
         claim = SubmissionClaim()
         if key is None:
             yield claim
@@ -198,7 +181,6 @@ class Quotas:
             )
 
     def _holders(self, key: Key) -> list[_Holder]:
-        """Return the owners of counters that a submission increases: those with a limit."""
         own, all_ = key.limits, self._settings
         grasps = all_.quota_grasps_in_flight if own.grasps_in_flight is None else own.grasps_in_flight
         jobs = all_.quota_jobs_per_day if own.jobs_per_day is None else own.jobs_per_day
@@ -209,14 +191,15 @@ class Quotas:
             # Names of keys contain no colon.
             words = f"the project {key.project!r}"
             found.append(_Holder(f"project:{key.project}", words, *most, counts_jobs=False))
-        return [holder for holder in found if holder.is_limited]
+        return [holder for holder in found if holder.grasps or holder.today]
 
     @contextmanager
     def _counted(
         self, holder: _Holder, claim: SubmissionClaim, job: str, grasps: int, *, is_new: bool
     ) -> Iterator[None]:
         number = uuid.uuid4().hex
-        met = self._claim(holder, job, grasps, number, is_new=is_new)
+        today = 0 if not is_new else 1 if holder.counts_jobs else grasps
+        met = self._claim(holder, job, grasps, number, today)
         try:
             yield
         except BaseException:
@@ -224,34 +207,37 @@ class Quotas:
             raise
         finally:
             with self._forgiving(holder):
-                self._end(holder, job, grasps, number, met, counts=claim.counts, is_new=is_new)
+                if claim.counts or met == "known":
+                    self._connection.eval(_SETTLE, 1, holder.held, job, grasps, number)
+                else:
+                    self._connection.eval(_UNDO, 1, holder.held, job, number)
+                # Of two claims of one job, the one that created it counts as one of today.
+                if today and met == "shared" and claim.counts:
+                    self._connection.incrby(holder.day, today)
+                if today and met == "" and not claim.counts:
+                    self._connection.decrby(holder.day, today)
 
-    def _claim(self, holder: _Holder, job: str, grasps: int, number: str, *, is_new: bool) -> str:
-        """Return how a job is counted.
-
-        Empty: by this claim. `shared`: by another pending claim. `known`: by an earlier one. `unknown`: no Redis."""
-        met, amount = self._ask(holder, job, grasps, number, is_new=is_new)
+    def _claim(self, holder: _Holder, job: str, grasps: int, number: str, today: int) -> str:
+        """Return how it is counted: `shared` by another pending claim, `known`, `unknown` without Redis, or empty."""
+        met, amount = self._ask(holder, job, grasps, number, today)
         if met == "grasps":
             with self._forgiving(holder):
                 self._forget_ended(holder)
-            met, amount = self._ask(holder, job, grasps, number, is_new=is_new)
+            met, amount = self._ask(holder, job, grasps, number, today)
         if met in ("grasps", "today"):
             raise holder.refusal(met, amount)
         return met
 
-    def _ask(self, holder: _Holder, job: str, grasps: int, number: str, *, is_new: bool) -> tuple[str, int]:
-        limits = (holder.grasps, holder.today if is_new else 0)
-        about = (job, grasps, *limits, _KEPT_S, _amount(holder, grasps) if is_new else 0, number, _PENDING_S)
+    def _ask(self, holder: _Holder, job: str, grasps: int, number: str, today: int) -> tuple[str, int]:
+        limits = (holder.grasps, holder.today if today else 0)
+        about = (job, grasps, *limits, _KEPT_S, today, number, _PENDING_S)
         met, amount = b"unknown", b"0"
         with self._forgiving(holder):
             met, amount = self._connection.eval(_CLAIM, 2, holder.held, holder.day, *about)
         return met.decode(), int(amount)
 
     def _forget_ended(self, holder: _Holder) -> None:
-        """Drop ended jobs. Pending ones are excluded, because the index does not contain them yet.
-
-        The entry of a job that is claimed again meanwhile changes, and so it remains.
-        """
+        """Drop ended jobs, but neither pending ones, which the index lacks, nor those claimed again meanwhile."""
         found = [word.decode(errors="replace") for word in self._connection.eval(_ENTERED, 1, holder.held)]
         entries = dict(zip(found[::2], found[1::2], strict=True))
         ended = sorted(entries.keys() - set(self._unfinished(list(entries))))
@@ -259,30 +245,12 @@ class Quotas:
             some = [word for job in ended[start : start + _AT_ONCE] for word in (job, entries[job])]
             self._connection.eval(_DROP, 1, holder.held, *some)
 
-    def _end(
-        self, holder: _Holder, job: str, grasps: int, number: str, met: str, *, counts: bool, is_new: bool
-    ) -> None:
-        if counts or met == "known":
-            self._connection.eval(_SETTLE, 1, holder.held, job, grasps, number)
-        else:
-            self._connection.eval(_UNDO, 1, holder.held, job, number)
-        # Of two claims of one job, the one that created it counts as one of today.
-        if is_new and met == "shared" and counts:
-            self._connection.incrby(holder.day, _amount(holder, grasps))
-        if is_new and met == "" and not counts:
-            self._connection.decrby(holder.day, _amount(holder, grasps))
-
     @contextmanager
     def _forgiving(self, holder: _Holder) -> Iterator[None]:
         try:
             yield
         except RedisError as error:
             log.warning("the quota of %s is not counted while Redis does not answer: %s", holder.words, error)
-
-
-def _amount(holder: _Holder, grasps: int) -> int:
-    """Return the amount that a new job adds to the counter of the day."""
-    return 1 if holder.counts_jobs else grasps
 
 
 def _until_midnight() -> int:
@@ -299,3 +267,48 @@ def unfinished(index: Index, ids: Collection[str]) -> set[str]:
     names = {one.removeprefix(DATASET_PREFIX) for one in ids if one.startswith(DATASET_PREFIX)}
     found = index.jobs.unfinished([one for one in ids if not one.startswith(DATASET_PREFIX)])
     return found | {DATASET_PREFIX + name for name in index.datasets.unfinished(names)}
+
+
+_KEY_KEPT_S: Final = 24 * 3600
+_FREE: Final = "if redis.call('GET', KEYS[1]) == ARGV[1] then redis.call('DEL', KEYS[1]) end"
+
+
+class Idempotency:
+    """Idempotency-Key (IETF draft): the same key with a different body is an input error.
+
+    Identical requests give the same job even without a key, because its id depends on its content. So no answer is
+    stored, only the content of each key, in Redis for a day: its loss loses a check, never a job.
+    """
+
+    def __init__(self, connection: Any) -> None:
+        self._connection = connection
+
+    @contextmanager
+    def claim(self, owner: str, key: str, request: JobRequest) -> Iterator[None]:
+        """Bind a key of an API key's `owner` to a request recorded in this context; a failure releases it."""
+        name = f"graspd:idempotency:{digest_bytes(f'{owner} {key}'.encode())}"
+        content = digest_json(request.model_dump(mode="json")).encode()
+        is_ours = self._bind(name, content)
+        try:
+            yield
+        except BaseException:
+            if is_ours:
+                with suppress(RedisError):
+                    self._connection.eval(_FREE, 1, name, content)
+            raise
+        if not is_ours:
+            # The request that bound the key may have failed and released it meanwhile.
+            with suppress(RedisError):
+                self._connection.set(name, content, ex=_KEY_KEPT_S, nx=True)
+
+    def _bind(self, name: str, content: bytes) -> bool:
+        """Bind the key to content; return whether it was free."""
+        try:
+            if self._connection.set(name, content, ex=_KEY_KEPT_S, nx=True):
+                return True
+            bound = self._connection.get(name)
+        except RedisError as error:
+            raise QueueUnavailable(f"Redis does not answer: {error}") from None
+        if bound not in (None, content):
+            raise InputError("this Idempotency-Key came with another request before; take a new key")
+        return False

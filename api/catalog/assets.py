@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import io
 import json
 import logging
@@ -16,7 +15,7 @@ from graspd.service.model import names
 from graspd.service.model.digests import digest_files
 from graspd.service.model.errors import ConflictError, DamagedError, LimitError, NotFoundError
 from graspd.service.model.names import MOST, fitted
-from graspd.service.model.projects import marks_of
+from graspd.service.model.projects import EVERYTHING, ProjectScope, marks_of
 from graspd.service.model.states import AssetKind
 from graspd.service.pipeline import deletion
 from graspd.service.pipeline.backends import Services
@@ -40,7 +39,6 @@ class Assets:
     def page(
         self, kind: AssetKind, *, limit: int = 50, cursor: str | None = None, refused: bool = False
     ) -> Page[AssetView]:
-        """Return assets of a kind, newest first; refused ones only on request."""
         return self._services.index.assets.page(
             kind, limit=limit, cursor=cursor, refused=refused, scope=project_scope()
         )
@@ -49,16 +47,10 @@ class Assets:
         return self._services.index.assets.get(kind, name, scope=project_scope())
 
     def files(self, asset: AssetView) -> Mapping[str, bytes]:
-        """Return the uploaded files, including `asset.json`."""
         return library.load_asset_files(self._services.store, asset.kind, asset.digest)
 
     def model(self, asset: AssetView) -> bytes:
-        """Return the prepared hand or object as binary glTF.
-
-        Raises:
-            NotFoundError: it has not been checked yet, or was refused.
-            DamagedError: its content does not match its checksum.
-        """
+        """Return the prepared hand or object as binary glTF; NotFoundError until it has been checked."""
         return get_sealed(self._services.store, names.asset_model(asset.kind, asset.digest))
 
     def add(
@@ -73,27 +65,20 @@ class Assets:
     ) -> AssetView:
         """Store an upload. The controller queues the check of a hand or an object; a network is checked here.
 
-        With `self_test` the check of a hand ends with grasps.
-
-        Args:
-            shared: whether every project may use it.
-            rename: use the next free name if the name is taken; known content retains its own name.
-
-        Raises:
-            ConflictError: the name is taken, or the content has another name or belongs to another project.
-            InputError: the file is no network.
+        With `self_test` the check of a hand ends with grasps. Every project may use what is `shared`. With `rename` it
+        gets the next free name if the name is taken; known content retains its own name.
         """
         found = network_report(files, name) if kind is AssetKind.NETWORK else None
         project = project_scope().project
         digest = self._mark(kind, name, files, "" if shared else project)
-        self._refuse_hidden(kind, digest)
-        with contextlib.suppress(NotFoundError):
-            known = self.one(kind, digest)
-            # A refused upload does not occupy its name.
-            if rename or known.verdict == "refuse":
-                return known
-        if rename:
-            name = self._free_name(kind, name)
+        known = self._find(kind, digest)
+        if known is None and self._find(kind, digest, EVERYTHING):
+            raise ConflictError(f"another project keeps this {kind.value} to itself; upload it without sharing it")
+        # A refused upload does not occupy its name.
+        if known and (rename or known.verdict == "refuse"):
+            return known
+        if rename and self._holder(kind, name):
+            name = self._next_name(kind, name)
         self._refuse_taken(kind, name, digest)
         index, store = self._services.index, self._services.store
         said = {"owner": caller_id(), "project": project, "shared": shared, "self_test": self_test}
@@ -109,26 +94,13 @@ class Assets:
         return self.one(kind, asset.digest)
 
     def hand_facts(self, asset: AssetView) -> HandFacts:
-        """Return the facts and guesses about a hand.
-
-        Raises:
-            NotFoundError: it has not been checked yet, or was refused.
-            ConflictError: its model was made by an older version.
-        """
+        """Return the facts and guesses about a hand; ConflictError if an older version made its model."""
         return facts_of(self.model(asset))
 
     def correct(self, name: str, corrections: HandCorrections, new_name: str = "") -> AssetView:
         """Create a hand from the same files with corrected facts in `asset.json`; its check is queued.
 
-        Args:
-            name: the hand with wrong guesses, or its digest.
-            corrections: corrected values.
-            new_name: name of the corrected hand; empty: the name with the next free number.
-
-        Raises:
-            NotFoundError: there is no such hand, or no model of it yet.
-            ConflictError: the new name is taken, or these corrections exist under another name.
-            InputError: a link or joint that the hand does not have, or a value out of range.
+        Without a new name it gets the name with the next free number.
         """
         hand = self.one(AssetKind.HAND, name)
         facts = self.hand_facts(hand)
@@ -145,12 +117,9 @@ class Assets:
             # The same corrections give the same hand.
             for mark in ({}, marks_of(files, project_scope().project)):
                 files.update(mark)
-                with contextlib.suppress(NotFoundError):
-                    return self.one(AssetKind.HAND, digest_files(AssetKind.HAND, files))
+                if known := self._find(AssetKind.HAND, digest_files(AssetKind.HAND, files)):
+                    return known
         return self.add(AssetKind.HAND, new_name or self._next_name(AssetKind.HAND, hand.name), files)
-
-    def _free_name(self, kind: AssetKind, name: str) -> str:
-        return self._next_name(kind, name) if self._holder(kind, name) else name
 
     def _next_name(self, kind: AssetKind, name: str) -> str:
         stem, _, number = name.rpartition("-")
@@ -162,11 +131,6 @@ class Assets:
         raise ConflictError(f"there are many {kind.value}s named {stem}-...; choose a name")
 
     def delete(self, kind: AssetKind, name: str) -> None:
-        """Delete a hand, object or network that nothing needs.
-
-        Raises:
-            NotYours: another key uploaded it.
-        """
         asset = self.one(kind, name)
         if not asset.builtin:
             must_own(asset.owner, f"{kind.value} {name!r}", asset.project)
@@ -179,32 +143,26 @@ class Assets:
         digest = digest_files(kind, files)
         if not project:
             return digest
-        with contextlib.suppress(NotFoundError):
+        known = self._find(kind, digest)
+        if known and known.name == name and (known.shared or known.builtin):
             # The identical files are shared already: do not create a second asset.
-            known = self.one(kind, digest)
-            if known.name == name and (known.shared or known.builtin):
-                return digest
+            return digest
         files.update(marks_of(files, project))
         return digest_files(kind, files)
 
-    def _refuse_hidden(self, kind: AssetKind, digest: str) -> None:
-        known = None
-        with contextlib.suppress(NotFoundError):
-            known = self._services.index.assets.get(kind, digest)
-        if known is not None:
-            with contextlib.suppress(NotFoundError):
-                self.one(kind, digest)
-                return
-            raise ConflictError(f"another project keeps this {kind.value} to itself; upload it without sharing it")
+    def _find(self, kind: AssetKind, name: str, scope: ProjectScope | None = None) -> AssetView | None:
+        """Return an asset in a scope (default: the caller's), or None."""
+        try:
+            return self._services.index.assets.get(kind, name, scope=scope or project_scope())
+        except NotFoundError:
+            return None
 
     def _holder(self, kind: AssetKind, name: str) -> str:
         """Return the digest that a name refers to; empty: the name is free."""
-        with contextlib.suppress(NotFoundError):
-            # Names of other projects do not count here, not even for an admin.
-            known = self._services.index.assets.get(kind, name, scope=replace(project_scope(), everything=False))
-            # A refused upload does not occupy its name: a fixed file may use it.
-            return known.digest if known.verdict != "refuse" else ""
-        return ""
+        # Names of other projects do not count here, not even for an admin.
+        known = self._find(kind, name, replace(project_scope(), everything=False))
+        # A refused upload does not occupy its name: a fixed file may use it.
+        return known.digest if known and known.verdict != "refuse" else ""
 
     def _refuse_taken(self, kind: AssetKind, name: str, digest: str) -> None:
         if self._holder(kind, name) not in ("", digest):

@@ -31,18 +31,13 @@ log = logging.getLogger(__name__)
 
 
 class Datasets:
-    """Datasets in the caller's scope; changes require ownership."""
+    """Datasets in the caller's scope; changes raise ForeignResource or QuotaError."""
 
     def __init__(self, services: Services, quotas: Quotas) -> None:
         self._services = services
         self._quotas = quotas
 
     def create(self, request: DatasetRequest) -> DatasetView:
-        """Run `actions.create` within the caller's quota.
-
-        Raises:
-            QuotaError: the quota of the caller's key is used up.
-        """
         hands, objects = actions.members(self._services, request, project_scope())
         asked = len(hands) * len(objects) * request.grasps
         with self._quotas.claim(caller.get(), DATASET_PREFIX + request.name, asked) as claim:
@@ -50,21 +45,11 @@ class Datasets:
         return dataset
 
     def cancel(self, name: str) -> DatasetView:
-        """Run `actions.cancel` on the caller's own dataset.
-
-        Raises:
-            NotYours: another key submitted it.
-        """
         self._owned(name)
         return actions.cancel(self._services, name)
 
     def retry(self, name: str) -> DatasetView:
-        """Run `actions.retry` on the caller's own dataset; restarted cells count against the quota.
-
-        Raises:
-            NotYours: another key submitted it.
-            QuotaError: the quota of the caller's key is used up.
-        """
+        """Run `actions.retry`; restarted cells count against the quota."""
         dataset = self._owned(name)
         again = dataset.states[State.FAILED] + dataset.states[State.CANCELLED]
         grasps = again * dataset.options.grasps
@@ -72,21 +57,15 @@ class Datasets:
             return actions.retry(self._services, name)
 
     def delete(self, name: str, *, with_snapshots: bool = False) -> None:
-        """Delete an ended dataset; one with snapshots requires `with_snapshots`.
-
-        Raises:
-            NotYours: another key submitted it.
-        """
+        """Delete an ended dataset; one with snapshots requires `with_snapshots`."""
         self._owned(name)
         deletion.delete_dataset(self._services, name, owner=caller_id(), with_snapshots=with_snapshots)
         log.info("dataset %s deleted", name)
 
     def estimate(self, matrix: Matrix) -> Estimate:
-        """Estimate the cost of a matrix. Nothing is recorded."""
         return estimate(self._services.index, matrix, Resolver(self._services.store), scope=project_scope())
 
     def page(self, *, limit: int = 50, cursor: str | None = None) -> Page[DatasetView]:
-        """Return datasets, newest first."""
         return self._services.index.datasets.page(limit=limit, cursor=cursor, scope=project_scope())
 
     def one(self, name: str) -> DatasetView:
@@ -98,6 +77,14 @@ class Datasets:
         """Return each cell (hand x object) of a dataset with its job, ordered by hand."""
         return self._services.index.datasets.cells(name, state=state, limit=limit, cursor=cursor, scope=project_scope())
 
+    def all_cells(self, name: str) -> Iterator[CellView]:
+        cursor: str | None = None
+        while True:
+            page = self.cells(name, limit=_AT_ONCE, cursor=cursor)
+            yield from page.items
+            if (cursor := page.next) is None:
+                return
+
     def matrix(self) -> list[MatrixCell]:
         """Return each pair of hand and object that has a job, with or without a dataset."""
         return self._services.index.overview.matrix(scope=project_scope())
@@ -108,20 +95,14 @@ class Datasets:
         return actions.snapshot(self._services, name)
 
     def snapshots(self, name: str, *, limit: int = 50, cursor: str | None = None) -> Page[SnapshotView]:
-        """Return snapshots of a dataset, newest first."""
         return self._services.index.datasets.snapshots(name, limit=limit, cursor=cursor, scope=project_scope())
 
     def snapshot(self, name: str, digest: str) -> Snapshot:
-        """Return a snapshot with its list of shards."""
         self.one(name)
         return load_snapshot(self._services.store, name, digest)
 
     def add_object_set(self, name: str, objects: tuple[str, ...]) -> ObjectSetView:
-        """Name a set of objects; other objects under the same name are its next version.
-
-        Raises:
-            NotYours: another key made the set.
-        """
+        """Name a set of objects; other objects under the same name are its next version."""
         return actions.add_object_set(
             self._services,
             name,
@@ -132,11 +113,24 @@ class Datasets:
         )
 
     def object_sets(self) -> list[ObjectSetView]:
-        """Return the newest version of each set, by name."""
         return self._services.index.object_sets.newest(scope=project_scope())
 
     def object_set(self, name: str) -> ObjectSetView:
         return self._services.index.object_sets.get(name, scope=project_scope())
+
+    def compare(self, one: str, other: str) -> Comparison:
+        both = self.one(one), self.one(other)
+        filters = [
+            GraspFilter(dataset=each.name, valid=True if each.options.standing == "valid" else None) for each in both
+        ]
+        metrics = self._services.index.statistics.side_by_side(filters, MEAN_METRICS)
+        few = max(each.cells for each in both) <= MOST_CELLS
+        return Comparison(*both, list(_settings(*both)), self._pairs(one, other) if few else [], metrics)
+
+    def _pairs(self, one: str, other: str) -> list[Pair]:
+        cells = [{(cell.hand, cell.object): cell for cell in self.all_cells(name)} for name in (one, other)]
+        names = sorted({*cells[0], *cells[1]})
+        return [Pair(*name, cells[0].get(name), cells[1].get(name)) for name in names]
 
     def _owned(self, name: str) -> DatasetView:
         dataset = self.one(name)
@@ -147,15 +141,6 @@ class Datasets:
 #: Most cells compared one by one; a longer table would be unreadable.
 MOST_CELLS: Final = 1000
 _AT_ONCE: Final = 200
-
-
-@dataclass(frozen=True)
-class Setting:
-    """Option that differs, with both values."""
-
-    name: str
-    one: str
-    other: str
 
 
 @dataclass(frozen=True)
@@ -181,58 +166,24 @@ class Comparison:
 
     one: DatasetView
     other: DatasetView
-    settings: list[Setting]
+    settings: list[tuple[str, str, str]]
+    """Options that differ, with both values."""
     pairs: list[Pair]
     """Ordered by hand; empty if a dataset has more than `MOST_CELLS` cells."""
     metrics: dict[Metric, list[Distribution | None]]
     """Distributions over each dataset's counted grasps, in the same bins."""
 
 
-class Comparisons:
-    """Comparison of datasets in the caller's scope."""
-
-    def __init__(self, services: Services, datasets: Datasets) -> None:
-        self._services = services
-        self._datasets = datasets
-
-    def of(self, one: str, other: str) -> Comparison:
-        """Compare two datasets by name.
-
-        Raises:
-            NotFoundError: there is no such dataset in scope.
-        """
-        both = self._datasets.one(one), self._datasets.one(other)
-        filters = [
-            GraspFilter(dataset=each.name, valid=True if each.options.standing == "valid" else None) for each in both
-        ]
-        metrics = self._services.index.statistics.side_by_side(filters, MEAN_METRICS)
-        few = max(each.cells for each in both) <= MOST_CELLS
-        return Comparison(*both, list(_settings(*both)), self._pairs(one, other) if few else [], metrics)
-
-    def _pairs(self, one: str, other: str) -> list[Pair]:
-        cells = [{(cell.hand, cell.object): cell for cell in self._cells(name)} for name in (one, other)]
-        names = sorted({*cells[0], *cells[1]})
-        return [Pair(*name, cells[0].get(name), cells[1].get(name)) for name in names]
-
-    def _cells(self, name: str) -> Iterator[CellView]:
-        cursor: str | None = None
-        while True:
-            page = self._datasets.cells(name, limit=_AT_ONCE, cursor=cursor)
-            yield from page.items
-            if (cursor := page.next) is None:
-                return
-
-
-def _settings(one: DatasetView, other: DatasetView) -> Iterator[Setting]:
+def _settings(one: DatasetView, other: DatasetView) -> Iterator[tuple[str, str, str]]:
     """Yield options that differ; then hands and objects that only one dataset has."""
     said = [each.options.model_dump(mode="json") for each in (one, other)]
     for name in said[0]:
         if said[0][name] != said[1][name]:
-            yield Setting(name.replace("_", " "), _text(said[0][name]), _text(said[1][name]))
+            yield name.replace("_", " "), _text(said[0][name]), _text(said[1][name])
     for name in ("hands", "objects"):
         first, second = (set(getattr(each, name)) for each in (one, other))
         if first != second:
-            yield Setting(f"{name} of its own", _text(sorted(first - second)), _text(sorted(second - first)))
+            yield f"{name} of its own", _text(sorted(first - second)), _text(sorted(second - first))
 
 
 def _text(value: Any) -> str:

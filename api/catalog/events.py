@@ -27,8 +27,8 @@ from graspd.service.model.webhooks import MOST_HOOKS, End, Webhook, check_url, s
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.recording import recording
 
+log = logging.getLogger(__name__)
 POLL_S: Final = 0.5
-#: Delay before a client reconnects [ms].
 RETRY_MS: Final = 2000
 _ENDS_AT_ONCE: Final = 100
 
@@ -55,7 +55,6 @@ async def job_events(jobs: Jobs, job_id: str, request: Request) -> AsyncIterator
 
 
 async def ends(webhooks: Webhooks, since: int, request: Request) -> AsyncIterator[ServerSentEvent]:
-    """Send `end` with each ended job and dataset, in order."""
     while not await request.is_disconnected() and may_still(request, Scope.READ):
         try:
             found = await run_sync(partial(webhooks.ends, since, limit=_ENDS_AT_ONCE))
@@ -84,9 +83,6 @@ async def service_events(overview: Overview, request: Request) -> AsyncIterator[
         await asyncio.sleep(2 * POLL_S)
 
 
-log = logging.getLogger(__name__)
-
-
 class Webhooks:
     """Webhooks of the caller's project, and their deliveries."""
 
@@ -94,17 +90,10 @@ class Webhooks:
         self._services = services
 
     def ends(self, since: int, *, limit: int) -> list[EndView]:
-        """Return the next ends of jobs and datasets in scope, after a given number."""
         return self._services.index.outbox.ends(since, limit=limit, scope=project_scope())
 
     def add(self, url: str, states: tuple[End, ...]) -> tuple[WebhookView, str]:
-        """Add a webhook; return it with its secret, which cannot be shown again.
-
-        Raises:
-            InputError: the address cannot receive requests.
-            LimitError: the project already has `MOST_HOOKS` webhooks.
-            ConflictError: the operator has not enabled webhooks.
-        """
+        """Add a webhook; return it with its secret, which cannot be shown again."""
         master = self._services.settings.webhook_secret
         if master is None:
             raise ConflictError(
@@ -130,22 +119,14 @@ class Webhooks:
 
     def all(self) -> list[WebhookView]:
         """Return webhooks that the caller may change: addresses of others may contain credentials."""
-        return [hook for hook in self._services.index.outbox.hooks(scope=project_scope()) if self._is_theirs(hook)]
+        hooks = self._services.index.outbox.hooks(scope=project_scope())
+        return [hook for hook in hooks if may_change(hook.owner, hook.project)]
 
     def log(self, webhook: str, *, limit: int = 50) -> list[DeliveryView]:
-        """Return deliveries of a webhook, newest first.
-
-        Raises:
-            NotYours: another key made it.
-        """
         return self._services.index.outbox.log(self._owned(webhook).id, limit=limit)
 
     def delete(self, webhook: str) -> None:
-        """Delete a webhook; its pending deliveries are dropped.
-
-        Raises:
-            NotYours: another key made it.
-        """
+        """Delete a webhook; its pending deliveries are dropped."""
         hook = self._owned(webhook)
         # Delete the record first: an interrupted deletion then leaves only a row that a rebuild drops.
         self._services.store.delete(names.webhook(hook.id))
@@ -156,6 +137,3 @@ class Webhooks:
         hook = self._services.index.outbox.hook(webhook, scope=project_scope())
         must_own(hook.owner, f"webhook {webhook}", hook.project)
         return hook
-
-    def _is_theirs(self, hook: WebhookView) -> bool:
-        return may_change(hook.owner, hook.project)

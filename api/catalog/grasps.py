@@ -13,19 +13,8 @@ from functools import lru_cache
 from itertools import zip_longest
 from typing import Any, Final, Literal
 
+from graspd.api import models
 from graspd.api.access.auth import project_scope
-from graspd.api.models import (
-    Diversity,
-    GraspDetail,
-    GraspQuery,
-    GraspScene,
-    Histogram,
-    JobDetail,
-    Neighbour,
-    Posture,
-    Push,
-    Waypoint,
-)
 from graspd.service.index.queries.grasps import GraspFilter, GraspSort, Metric
 from graspd.service.index.queries.statistics import GraspKinds
 from graspd.service.index.views import GraspView, JobView, Page, ShardView
@@ -48,7 +37,10 @@ from graspd.service.store.integrity import read_checked
 from graspd.service.store.shards import Shard, read_shard
 from graspd.service.store.store import Store
 
-_KEPT_HISTOGRAMS: Final = 256
+_KEPT_STATISTICS: Final = 256
+_BINS: Final = 20
+#: Filters of the index that requests name alike.
+_SHARED: Final = GraspFilter.model_fields.keys() & models.GraspQuery.model_fields.keys()
 MEAN_METRICS: Final[tuple[Metric, ...]] = tuple(metric.name for metric in indexed(IndexLevel.OFFERED))
 
 
@@ -58,20 +50,14 @@ class Grasps:
     def __init__(self, services: Services) -> None:
         self._index = services.index
         self._files = GraspFiles(services.store)
-        self._histograms: dict[tuple[str, int], list[Histogram]] = {}
-        self._diversities: dict[tuple[str, int], Diversity | None] = {}
+        self._statistics = lru_cache(maxsize=_KEPT_STATISTICS)(self._read_statistics)
 
-    def page(self, query: GraspQuery, *, limit: int = 50, cursor: str | None = None) -> Page[GraspView]:
-        """Return the grasps that pass every filter."""
+    def page(self, query: models.GraspQuery, *, limit: int = 50, cursor: str | None = None) -> Page[GraspView]:
         sort = GraspSort(by=query.sort, descending=query.order == "desc")
         return self._index.grasps.page(self._filter(query), sort=sort, limit=limit, cursor=cursor)
 
-    def members(self, query: GraspQuery) -> list[Grasp]:
-        """Return identifiers of all grasps that pass every filter.
-
-        Raises:
-            LimitError: there are more than one selection may hold.
-        """
+    def members(self, query: models.GraspQuery) -> list[Grasp]:
+        """Return identifiers of all grasps that pass every filter; LimitError if a selection may not hold so many."""
         found = self._index.grasps.members(self._filter(query), limit=MOST_TAGGED + 1)
         if len(found) > MOST_TAGGED:
             raise LimitError(f"more than {MOST_TAGGED} grasps pass this filter, which is the most at once; narrow it")
@@ -81,69 +67,49 @@ class Grasps:
         """Yield grasps by identifier, which must be visible to the caller; deleted ones are omitted."""
         return self._index.grasps.listed(places)
 
-    def _filter(self, query: GraspQuery) -> GraspFilter:
-        """Convert a request's parameters to the index's filter, in the caller's scope.
-
-        Raises:
-            NotFoundError: there is no such tag or dataset.
-        """
+    def _filter(self, query: models.GraspQuery) -> GraspFilter:
         seen = project_scope()
         if query.dataset is not None:
             self._index.datasets.get(query.dataset, scope=seen)
-        named = {
+        found = query.model_dump(include=_SHARED) | {
             "project": None if seen.everything else seen.project,
-            "dataset": query.dataset,
             "tag": query.tag and self._index.tags.named(query.tag, scope=seen),
+            "at_least": _bounds(query, "min"),
+            "at_most": _bounds(query, "max"),
         }
-        return _bounded(query).model_copy(update=named)
+        return GraspFilter(**found)
 
-    def one(self, shard_id: str, row: int) -> GraspDetail:
-        """Return one grasp with all data of its shard."""
+    def one(self, shard_id: str, row: int) -> models.GraspDetail:
         grasp, shard = self._index.grasps.get(shard_id, row, scope=project_scope()), self._index.shards.get(shard_id)
         return self._files.detail(grasp, shard)
 
-    def histograms(self, job: JobView | JobDetail, *, bins: int = 20) -> list[Histogram]:
-        """Return each metric's distribution over a job's valid grasps, or all stored ones if not validated.
+    def statistics(self, job: JobView | models.JobDetail) -> tuple[list[models.Histogram], models.Diversity | None]:
+        """Return distributions and diversity of a job's valid grasps, or of all stored ones if not validated.
 
         The result is cached while the number of grasps is unchanged.
         """
         validated = job.request.validation != "none"
-        key = (job.id, count := job.valid if validated else job.grasps)
-        if not count:
-            return []
-        if (found := self._histograms.get(key)) is None:
-            where = GraspFilter(job=job.id, valid=True if validated else None)
-            found = [
-                Histogram(
-                    metric=metric,
-                    **vars(summary),
-                    counts=self._index.statistics.histogram(where, metric, summary.low, summary.high, bins),
-                )
-                for metric, summary in self._index.statistics.summaries(where, MEAN_METRICS).items()
-            ]
-            if len(self._histograms) >= _KEPT_HISTOGRAMS:
-                self._histograms.clear()
-            self._histograms[key] = found
-        return found
+        count = job.valid if validated else job.grasps
+        return self._statistics(job.id, validated, count) if count else ([], None)
 
-    def diversity(self, job: JobView | JobDetail) -> Diversity | None:
-        """Return types and directions of the same grasps as `histograms`."""
-        validated = job.request.validation != "none"
-        key = (job.id, count := job.valid if validated else job.grasps)
-        if not count:
-            return None
-        if key not in self._diversities:
-            if len(self._diversities) >= _KEPT_HISTOGRAMS:
-                self._diversities.clear()
-            where = GraspFilter(job=job.id, valid=True if validated else None)
-            self._diversities[key] = _told(self._index.statistics.kinds(where))
-        return self._diversities[key]
+    def _read_statistics(
+        self, job_id: str, validated: bool, count: int
+    ) -> tuple[list[models.Histogram], models.Diversity | None]:
+        """Read the statistics of a job; `count` only distinguishes cached results."""
+        where, known = GraspFilter(job=job_id, valid=True if validated else None), self._index.statistics
+        histograms = [
+            models.Histogram(
+                metric=metric, **vars(summary), counts=known.histogram(where, metric, summary.low, summary.high, _BINS)
+            )
+            for metric, summary in known.summaries(where, MEAN_METRICS).items()
+        ]
+        return histograms, _told(known.kinds(where))
 
 
-def _told(kinds: GraspKinds) -> Diversity | None:
+def _told(kinds: GraspKinds) -> models.Diversity | None:
     if not kinds.cells:
         return None
-    return Diversity(
+    return models.Diversity(
         grasps=sum(kinds.cells.values()),
         types={kind.name.lower(): kinds.types[kind] for kind in GraspType if kinds.types.get(kind)},
         type_entropy_bits=round(entropy_bits(kinds.types.values()), 4),
@@ -153,48 +119,23 @@ def _told(kinds: GraspKinds) -> Diversity | None:
     )
 
 
-def _bounded(query: GraspQuery) -> GraspFilter:
-    """Convert the parameters that restrict the grasps themselves."""
-    bounds: dict[str, dict[Metric, float]] = {"min": {}, "max": {}}
-    if query.type is not None:
-        kind = float(GraspType[query.type.upper()])
-        bounds = {"min": {"grasp_type": kind}, "max": {"grasp_type": kind}}
-    for end, metrics in bounds.items():
-        for metric in MEAN_METRICS:
-            value = getattr(query, f"{end}_{metric}", None)
-            if value is not None:
-                metrics[metric] = value
-    return GraspFilter(
-        job=query.job,
-        hand=query.hand,
-        object=query.object,
-        where=query.where,
-        valid=query.valid,
-        success=query.success,
-        scene=query.scene,
-        neighbours=query.neighbours,
-        lift_hard=query.lift_hard,
-        validated=query.validated,
-        robust_weakest=query.robust_weakest,
-        at_least=bounds["min"],
-        at_most=bounds["max"],
-    )
+def _bounds(query: models.GraspQuery, end: Literal["min", "max"]) -> dict[Metric, float]:
+    values = {metric: getattr(query, f"{end}_{metric}", None) for metric in MEAN_METRICS}
+    found = {metric: value for metric, value in values.items() if value is not None}
+    return found if query.type is None else {"grasp_type": float(GraspType[query.type.upper()])} | found
 
 
 #: Cached base shards. One of 32 grasps takes about 60 kB; a page needs at most one shard per row.
 _KEPT_SHARDS: Final = 64
 _POSTURES: Final = ("pregrasp", "grasp", "squeeze")
 _OUTCOME: Final = "quality/verdict_outcome"
-#: Meaning of the column's numbers, from its description in the schema.
-OUTCOMES: Final = {
-    int(code): words for code, words in re.findall(r"(\d) ([a-z ]+)", SCHEMAS["base"][_OUTCOME].description)
-}
-DIRECTIONS: Final = ("+x", "−x", "+y", "−y", "+z", "−z")
 _LIFT: Final = "quality/lift_outcome"
-#: Meaning of the column's numbers, from its description in the schema.
-LIFT_OUTCOMES: Final = {
-    int(code): words for code, words in re.findall(r"(\d) ([a-z ]+)", SCHEMAS["base"][_LIFT].description)
-}
+#: Meanings of the numbers of both columns, from their descriptions in the schema.
+_OUTCOMES, _LIFT_OUTCOMES = (
+    {int(code): words for code, words in re.findall(r"(\d) ([a-z ]+)", SCHEMAS["base"][column].description)}
+    for column in (_OUTCOME, _LIFT)
+)
+_DIRECTIONS: Final = ("+x", "−x", "+y", "−y", "+z", "−z")
 
 
 class GraspFiles:
@@ -204,16 +145,10 @@ class GraspFiles:
         self._store = store
         self._read = lru_cache(maxsize=_KEPT_SHARDS)(self._fetch)
 
-    def detail(self, grasp: GraspView, shard: ShardView) -> GraspDetail:
-        """Return a grasp of the index with the data of its shard.
-
-        Raises:
-            NotFoundError: the shard holds no grasps.
-            DamagedShard: its file is missing, or does not match its checksum.
-        """
+    def detail(self, grasp: GraspView, shard: ShardView) -> models.GraspDetail:
         file = self._read(shard.key, shard.sha256)
         row = grasp.row
-        return GraspDetail(
+        return models.GraspDetail(
             **grasp.model_dump(),
             hand_digest=shard.hand_digest,
             object_digest=shard.object_digest,
@@ -225,8 +160,8 @@ class GraspFiles:
                 for metric in GRASP_METRICS
                 if metric.swept and metric.path in file.arrays
             },
-            way=way(file, row),
-            scene=scene(file, row),
+            way=_way(file, row),
+            scene=_scene(file, row),
             pushes=_pushes(file, row),
             verdict_margin=_value(file, "quality/verdict_margin", row),
             validated_by=validated_by(file, row),
@@ -242,9 +177,9 @@ class GraspFiles:
             raise NotFoundError(f"{key} holds no grasps that can be shown: {error}") from None
 
 
-def _posture(file: Shard, name: str, row: int) -> Posture:
+def _posture(file: Shard, name: str, row: int) -> models.Posture:
     pose, joints = file[f"{name}/hand_pose"][row], file[f"{name}/joint_positions"][row]
-    return Posture(hand_pose=pose.tolist(), joint_positions=joints.tolist())
+    return models.Posture(hand_pose=pose.tolist(), joint_positions=joints.tolist())
 
 
 def validated_by(file: Shard, row: int) -> Literal["mujoco", "mujoco_warp"] | None:
@@ -255,14 +190,13 @@ def validated_by(file: Shard, row: int) -> Literal["mujoco", "mujoco_warp"] | No
     return "mujoco_warp" if validated is not None and validated[row] == 1 else "mujoco"
 
 
-def _pushes(file: Shard, row: int) -> list[Push]:
+def _pushes(file: Shard, row: int) -> list[models.Push]:
     outcomes = file.arrays.get(_OUTCOME)
     if outcomes is None or _verdict(file, "quality/success", row) is None:
         return []
-    codes = outcomes[row].tolist()
     return [
-        Push(direction=direction, outcome=OUTCOMES.get(code, "unknown"))
-        for direction, code in zip(DIRECTIONS, codes, strict=False)
+        models.Push(direction=direction, outcome=_OUTCOMES.get(code, "unknown"))
+        for direction, code in zip(_DIRECTIONS, outcomes[row].tolist(), strict=False)
     ]
 
 
@@ -288,11 +222,10 @@ def _texts(value: Any) -> list[str]:
     return [str(name) for name in value] if isinstance(value, list) else []
 
 
-def way(file: Shard, row: int) -> list[Waypoint]:
-    """Return the postures of a grasp in order."""
+def _way(file: Shard, row: int) -> list[models.Waypoint]:
     points = way_of(file, row)
     return [
-        Waypoint(
+        models.Waypoint(
             name=point.name,
             place=place,
             hand_pose=point.hand_pose.tolist(),
@@ -303,37 +236,32 @@ def way(file: Shard, row: int) -> list[Waypoint]:
     ]
 
 
-def scene(file: Shard, row: int) -> GraspScene | None:
-    """Return the scene of a grasp; None if it was planned around a free object.
-
-    Raises:
-        InputError: the shard's scene is invalid.
-    """
+def _scene(file: Shard, row: int) -> models.GraspScene | None:
+    """Return the scene of a grasp; None if it was planned around a free object."""
     spec = scene_spec_of(file)
     if spec is None or spec.kind == "free" or "grasp/scene_index" not in file.arrays:
         return None
     number = int(file["grasp/scene_index"][row])
     tried = int(file[_LIFT][row]) if _LIFT in file.arrays else 0
-    clearance = float(file["quality/clearance_m"][row]) if "quality/clearance_m" in file.arrays else math.nan
-    return GraspScene(
+    return models.GraspScene(
         kind=spec.kind,
         number=number,
         object_pose=file["scene/object_pose"][number].tolist(),
         supports=list(supports_in(spec)),
         neighbours=_neighbours(file, number),
-        clearance_m=clearance if math.isfinite(clearance) else None,
-        lift=LIFT_OUTCOMES.get(tried, "unknown") if tried else None,
+        clearance_m=_value(file, "quality/clearance_m", row),
+        lift=_LIFT_OUTCOMES.get(tried, "unknown") if tried else None,
         lift_hard=_verdict(file, "quality/lift_hard", row),
     )
 
 
-def _neighbours(file: Shard, number: int) -> list[Neighbour]:
+def _neighbours(file: Shard, number: int) -> list[models.Neighbour]:
     if "scene/neighbour_pose" not in file.arrays:
         return []
     names, digests = (file.attributes.get(key) for key in ("neighbours", "neighbour_digests"))
     poses = file["scene/neighbour_pose"][number].tolist()
     known = zip_longest(names if isinstance(names, list) else [], digests if isinstance(digests, list) else [])
     return [
-        Neighbour(name=str(name), digest=str(digest), pose=pose)
+        models.Neighbour(name=str(name), digest=str(digest), pose=pose)
         for (name, digest), pose in zip(known, poses, strict=False)
     ]

@@ -1,4 +1,4 @@
-"""Jobs: submission within quotas, progress, rate and expected end, and changes by their owners."""
+"""Jobs: submission within quotas, progress, rate and expected end, changes by their owners; and their shards."""
 
 from __future__ import annotations
 
@@ -7,20 +7,20 @@ import logging
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
-from typing import Final
+from collections.abc import Callable, Collection, Iterator, Sequence
+from functools import lru_cache
+from typing import Final, Literal
 
 from graspd.api.access.auth import caller, caller_id, must_own, project_scope
-from graspd.api.access.idempotency import Idempotency
-from graspd.api.access.quotas import Quotas
+from graspd.api.access.quotas import Idempotency, Quotas
 from graspd.api.catalog.grasps import MEAN_METRICS, Grasps
-from graspd.api.catalog.shards import Shards
-from graspd.api.models import Job, JobDetail, LossCurve, MeanMetrics, StageStatus, stage_state
-from graspd.service.index.views import JobView, Page, StageProgress, TaskView
+from graspd.api.models import Job, JobDetail, LossCurve, MeanMetrics, Shard, StageStatus, stage_state
+from graspd.service.index.views import JobView, Page, ShardView, StageProgress, TaskView
 from graspd.service.model.domain import JobRequest
 from graspd.service.model.states import Stage, State
 from graspd.service.pipeline import deletion, job_actions
 from graspd.service.pipeline.backends import Services
+from graspd.service.store.integrity import CheckedObjects
 from graspd.service.telemetry import bind
 
 log = logging.getLogger(__name__)
@@ -29,11 +29,63 @@ _PAGE: Final = 200
 _LOOKED_AT: Final = 20
 _ORDER: Final = {stage: place for place, stage in enumerate(Stage)}
 _KEPT_LOSSES: Final = 256
+_SHARED: Final = Job.model_fields.keys() & JobView.model_fields.keys() - {"reason", "stages"}
+_DETAILS: Final = ("request", "choice", "note", "outcomes", "rechecked", "recheck_held", "hand_digest", "object_digest")
 _LOSS_BATCHES: Final = 8
 
 
+class Shards:
+    """Shards of the jobs in the caller's scope; they never change."""
+
+    def __init__(self, services: Services) -> None:
+        self._services = services
+        self._checked = CheckedObjects(services.store)
+
+    def page(
+        self,
+        *,
+        job: str | None = None,
+        kind: Literal["base", "scene", "views"] | None = None,
+        limit: int = 50,
+        cursor: str | None = None,
+    ) -> Page[Shard]:
+        page = self._services.index.shards.page(job=job, kind=kind, limit=limit, cursor=cursor, scope=project_scope())
+        return Page[Shard](items=[_shard(shard) for shard in page.items], next=page.next)
+
+    def one(self, shard_id: str) -> Shard:
+        return _shard(self._services.index.shards.get(shard_id, scope=project_scope()))
+
+    def intact(self, shard_id: str) -> Shard:
+        """Return a shard whose file matches its checksum; a file is read again only after it changed."""
+        shard = self.one(shard_id)
+        self._checked.check(shard.key, shard.sha256)
+        return shard
+
+    def address(self, shard: Shard) -> str | None:
+        """Return the address at which the store itself serves the file to GET; None if it does not."""
+        return self._services.store.sign(shard.key)
+
+    def size(self, shard: Shard) -> int:
+        return self._services.store.size(shard.key)
+
+    def stream(self, shard: Shard, start: int, length: int) -> Iterator[bytes]:
+        """Yield bytes of the file in chunks; DamagedShard if they changed since the file was found intact."""
+        return self._checked.stream(shard.key, shard.sha256, start, length)
+
+    def job_of(self, shard_id: str) -> str | None:
+        return self._services.index.shards.job_of(shard_id, scope=project_scope())
+
+    def assets_of(self, ids: Collection[str]) -> dict[str, tuple[str, str]]:
+        """Return the digests of the hand and the object of each shard."""
+        return self._services.index.shards.assets_of(ids)
+
+
+def _shard(shard: ShardView) -> Shard:
+    return Shard(**shard.model_dump(), file=f"/v1/shards/{shard.id}/file")
+
+
 class Jobs:
-    """Jobs in the caller's scope; changes require ownership."""
+    """Jobs in the caller's scope; changes raise ForeignResource or QuotaError."""
 
     def __init__(
         self, services: Services, quotas: Quotas, idempotency: Idempotency, grasps: Grasps, shards: Shards
@@ -44,15 +96,10 @@ class Jobs:
         self._grasps = grasps
         self._shards = shards
         self._paces = TaskRates()
-        self._losses: dict[str, tuple[int, list[float]] | None] = {}
+        self._loss = lru_cache(maxsize=_KEPT_LOSSES)(self._read_loss)
 
     def submit(self, request: JobRequest, *, idempotency_key: str | None = None) -> JobDetail:
-        """Record a job, or return the existing identical one.
-
-        Raises:
-            InputError: the idempotency key belongs to another request.
-            QuotaError: the quota of the caller's key is used up.
-        """
+        """Record a job, or return the existing identical one."""
         key = caller.get()
         bound: contextlib.AbstractContextManager[None] = contextlib.nullcontext()
         if idempotency_key is not None:
@@ -67,11 +114,6 @@ class Jobs:
         return self._detail(job).model_copy(update={"choice": record.choice or job.choice})
 
     def cancel(self, job_id: str) -> JobDetail:
-        """Cancel a job.
-
-        Raises:
-            NotYours: another key submitted it.
-        """
         self._owned(job_id)
         with bind(job=job_id):
             job = job_actions.cancel(self._services, job_id)
@@ -79,12 +121,6 @@ class Jobs:
         return self._detail(job)
 
     def retry(self, job_id: str) -> JobDetail:
-        """Run failed and cancelled tasks again.
-
-        Raises:
-            NotYours: another key submitted it.
-            QuotaError: the quota of the caller's key is used up.
-        """
         grasps = self._owned(job_id).request.grasps
         with bind(job=job_id), self._quotas.claim(caller.get(), job_id, grasps, is_new=False):
             job = job_actions.retry(self._services, job_id)
@@ -92,11 +128,6 @@ class Jobs:
         return self._detail(job)
 
     def delete(self, job_id: str) -> None:
-        """Delete an ended job.
-
-        Raises:
-            NotYours: another key submitted it.
-        """
         self._owned(job_id)
         with bind(job=job_id):
             deletion.delete_job(self._services, job_id, owner=caller_id())
@@ -111,14 +142,12 @@ class Jobs:
         limit: int = 50,
         cursor: str | None = None,
     ) -> Page[Job]:
-        """Return jobs, newest first."""
         page = self._services.index.jobs.page(
             state=state, hand=hand, object=object, limit=limit, cursor=cursor, scope=project_scope()
         )
         return Page[Job](items=[self._job(job, ()) for job in page.items], next=page.next)
 
     def one(self, job_id: str) -> JobDetail:
-        """Return a job with its attempts, mean metrics and shards."""
         return self._detail(self._services.index.jobs.get(job_id, scope=project_scope()))
 
     def moving(self, job_id: str) -> Job:
@@ -128,23 +157,18 @@ class Jobs:
     def loss_curve(self, job: JobDetail) -> LossCurve | None:
         """Return the planner's mean loss over a job's first batches; None if the planner records none."""
         batches = [shard.id for shard in job.shards if shard.kind == "base"][:_LOSS_BATCHES]
-        kept = [self._loss(shard) for shard in batches]
-        curves = [curve for curve in kept if curve is not None]
+        curves = [curve for shard in batches if (curve := self._loss(shard)) is not None]
         if not curves:
             return None
         length = min(len(losses) for _, losses in curves)
         means = [sum(losses[i] for _, losses in curves) / len(curves) for i in range(length)]
         return LossCurve(iterations=[(i + 1) * curves[0][0] for i in range(length)], losses=means)
 
-    def _loss(self, shard_id: str) -> tuple[int, list[float]] | None:
-        """Return iterations between two values, and the values; cached, because a shard never changes."""
-        if shard_id not in self._losses:
-            info = self._services.index.shards.get(shard_id).manifest.get("info", {})
-            curve = [value for value in info.get("loss_curve") or [] if value is not None]
-            if len(self._losses) >= _KEPT_LOSSES:
-                self._losses.clear()
-            self._losses[shard_id] = (int(info.get("chunk", 1)), curve) if curve else None
-        return self._losses[shard_id]
+    def _read_loss(self, shard_id: str) -> tuple[int, list[float]] | None:
+        """Return iterations between two values, and the values; None if the planner records none."""
+        info = self._services.index.shards.get(shard_id).manifest.get("info", {})
+        curve = [value for value in info.get("loss_curve") or [] if value is not None]
+        return (int(info.get("chunk", 1)), curve) if curve else None
 
     def _owned(self, job_id: str) -> JobView:
         job = self._services.index.jobs.get(job_id, scope=project_scope())
@@ -152,46 +176,28 @@ class Jobs:
         return job
 
     def _detail(self, job: JobView) -> JobDetail:
-        mean = {data.metric: data.mean for data in self._grasps.histograms(job)}
+        histograms, diversity = self._grasps.statistics(job)
+        mean = {data.metric: data.mean for data in histograms}
         shards = self._shards.page(job=job.id, limit=_PAGE).items
         return JobDetail(
             **self._job(job, self._running(job.id)).model_dump(),
-            request=job.request,
-            choice=job.choice,
-            note=job.note,
-            outcomes=job.outcomes,
-            rechecked=job.rechecked,
-            recheck_held=job.recheck_held,
-            hand_digest=job.hand_digest,
-            object_digest=job.object_digest,
+            **{name: getattr(job, name) for name in _DETAILS},
             attempts=self._services.index.jobs.attempts(job=job.id, limit=50),
             mean=MeanMetrics(**{metric: mean.get(metric) for metric in MEAN_METRICS}),
-            diversity=self._grasps.diversity(job),
+            diversity=diversity,
             shards=sorted(shards, key=lambda shard: (shard.batch, _ORDER[shard.stage])),
         )
 
     def _job(self, job: JobView, running: Sequence[TaskView]) -> Job:
-        fidelity = job.request.fidelity
+        request = job.request
         stages = stage_statuses(job, running, self._paces)
         return Job(
-            id=job.id,
-            state=job.state,
-            hand=job.request.hand,
-            object=job.request.object,
-            method=job.request.method,
-            fidelity=fidelity if isinstance(fidelity, str) else fidelity.name,
-            requested=job.request.grasps,
-            grasps=job.grasps,
-            valid=job.valid,
-            candidates=job.candidates,
-            validated=job.validated,
-            standing=job.request.standing,
+            **{name: getattr(job, name) for name in _SHARED},
+            **{name: getattr(request, name) for name in ("hand", "object", "method", "standing")},
+            fidelity=request.fidelity if isinstance(request.fidelity, str) else request.fidelity.name,
+            requested=request.grasps,
             progress=progress_of_job(job),
             eta_s=eta_of_job(job, stages),
-            created=job.created,
-            owner=job.owner,
-            project=job.project,
-            finished=job.finished,
             reason=job.reason or job.note,
             stages=stages,
         )
@@ -236,11 +242,7 @@ class TaskRates:
 
 
 def stage_statuses(job: JobView, tasks: Sequence[TaskView], paces: TaskRates) -> list[StageStatus]:
-    """Return the stages of a job in order, each with its state and, if known, its rate and end.
-
-    Args:
-        tasks: running tasks, and waiting ones that give a reason.
-    """
+    """Return the stages of a job; `tasks` are its running tasks, and waiting ones that give a reason."""
     return [_status(stage, [task for task in tasks if task.stage is stage.stage], paces) for stage in job.stages]
 
 

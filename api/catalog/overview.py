@@ -1,24 +1,27 @@
-"""Overview of the service: workers, queue, statistics, usage of projects, and health of its parts."""
+"""Overview of the service: workers, queue, statistics, health of its parts, usage of projects, and deletions."""
 
 from __future__ import annotations
 
 import contextlib
 import csv
 import io
+import logging
 import threading
 import time
 from collections.abc import Callable, Iterable
 from datetime import UTC, date, datetime, timedelta
 from typing import Final
 
-from graspd.api.access.auth import caller, project_scope
+from pydantic import Field
+
+from graspd.api.access.auth import caller, must_own, project_scope
 from graspd.api.access.keys import KeyFile, ProjectLimits
 from graspd.api.catalog.jobs import Jobs
 from graspd.api.metrics import Snapshot
 from graspd.api.models import Health, Part, Worker
 from graspd.service.index.notes import Damage
 from graspd.service.index.queries.overview import read_index
-from graspd.service.index.views import FailureGroup, Stats, TaskView, UsageDay
+from graspd.service.index.views import FailureGroup, Stats, TaskView, UsageDay, View
 from graspd.service.model.digests import digest_json
 from graspd.service.model.errors import (
     BusyError,
@@ -30,12 +33,17 @@ from graspd.service.model.errors import (
 )
 from graspd.service.model.projects import ProjectScope
 from graspd.service.model.states import Priority, Stage
+from graspd.service.pipeline import deletion
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.identity import check_queue
 from graspd.service.pipeline.leading import PART
 from graspd.service.queue.port import QueueStatus
+from graspd.service.store.records import Deletion, What, deletions
 
+log = logging.getLogger(__name__)
 _DAMAGE_SHOWN: Final = 5
+_FAILURES_SHOWN: Final = 4
+MINUTES: Final = 60
 _JOBS_WATCHED: Final = 20
 #: Least time between two computations of the fingerprint, for any number of watching pages [s].
 FINGERPRINT_S: Final = 1.0
@@ -84,26 +92,24 @@ class Overview:
     def stats(self) -> Stats:
         return self._services.index.overview.stats(scope=project_scope())
 
-    def valid_per_minute(self, *, minutes: int = 60) -> list[int]:
-        """Return the numbers of valid grasps made in each of the last minutes, oldest first."""
-        start = datetime.now(UTC).replace(second=0, microsecond=0) - timedelta(minutes=minutes - 1)
-        made = [0] * minutes
+    def valid_per_minute(self) -> list[int]:
+        """Return the numbers of valid grasps made in each of the last `MINUTES`, oldest first."""
+        start = datetime.now(UTC).replace(second=0, microsecond=0) - timedelta(minutes=MINUTES - 1)
+        made = [0] * MINUTES
         for bucket in self._services.index.overview.throughput(
             since=start.isoformat().replace("+00:00", "Z"), bucket_s=60, scope=project_scope()
         ):
             minute = int((datetime.fromisoformat(bucket.start) - start).total_seconds() // 60)
-            made[min(max(minute, 0), minutes - 1)] += bucket.valid
+            made[min(max(minute, 0), MINUTES - 1)] += bucket.valid
         return made
 
-    def failures(self, *, limit: int = 5) -> list[FailureGroup]:
-        return self._services.index.overview.failures(limit=limit, scope=project_scope())
+    def failures(self) -> list[FailureGroup]:
+        return self._services.index.overview.failures(limit=_FAILURES_SHOWN, scope=project_scope())
 
     def depths(self) -> dict[tuple[Priority, Stage], int]:
-        """Return the numbers of waiting tasks by priority and stage."""
         return self._services.queue.depths()
 
     def health(self) -> Health:
-        """Return the state of the three parts; probed at most every two seconds."""
         return self._probes.health()
 
     def damage(self) -> tuple[int, list[Damage]]:
@@ -113,10 +119,9 @@ class Overview:
         return self._services.index.damage.known(limit=_DAMAGE_SHOWN)
 
     def snapshot(self) -> Snapshot:
-        """Return the metrics for Prometheus, without those of a part that does not answer."""
         found = Snapshot()
-        parts = self.health().parts
-        found.add_parts({name: _seconds(part) for name, part in parts.items()})
+        latencies = {name: part.latency_ms for name, part in self.health().parts.items()}
+        found.add_parts({name: None if ms is None else ms / 1000 for name, ms in latencies.items()})
         with contextlib.suppress(UnavailableError):
             queue = self._services.queue
             found.add_queue(self._queue_now(), is_kept=queue.announced(PART))
@@ -143,20 +148,12 @@ class Overview:
 
     def _seen(self, tasks: Iterable[str]) -> set[str]:
         """Return those tasks that are in scope or belong to no job, such as the check of an upload."""
-        wanted = set(tasks)
-        return (
-            wanted
-            if project_scope().everything
-            else wanted - self._services.index.jobs.out_of_scope(wanted, project_scope())
-        )
+        wanted, scope = set(tasks), project_scope()
+        return wanted if scope.everything else wanted - self._services.index.jobs.out_of_scope(wanted, scope)
 
     def _queue_now(self) -> QueueStatus:
         # A worker's registration expires in whole seconds: see `worker.process.heartbeat`.
         return self._services.queue.now(lease_s=max(2, round(self._services.settings.lease_s)))
-
-
-def _seconds(part: Part) -> float | None:
-    return None if part.latency_ms is None else part.latency_ms / 1000
 
 
 #: Least time between two probes of the parts [s].
@@ -169,9 +166,8 @@ _INCOMPLETE: Final = "the controller makes it from the store now; until it has, 
 class Probes:
     """Probes of Redis, index and store, in parallel threads; a hanging probe is not started again."""
 
-    def __init__(self, services: Services, *, patience_s: float = PATIENCE_S) -> None:
+    def __init__(self, services: Services) -> None:
         self._services = services
-        self._patience_s = patience_s
         self._known: tuple[float, Health] | None = None
         self._hanging: dict[str, _Probe] = {}
         self._service: str | None = None
@@ -193,7 +189,7 @@ class Probes:
             "store": lambda: _answering(self._services.store.probe()),
         }
         probes = {name: self._hanging.get(name) or _Probe(name, question) for name, question in questions.items()}
-        deadline = time.monotonic() + self._patience_s
+        deadline = time.monotonic() + PATIENCE_S
         parts = {name: probe.part(deadline) for name, probe in probes.items()}
         self._hanging = {name: probe for name, probe in probes.items() if probe.thread.is_alive()}
         controller, workers = self._others() if parts["redis"].ok else (False, 0)
@@ -236,8 +232,6 @@ def _answering(seconds: float) -> Part:
 
 
 class _Probe:
-    """One probe of one part."""
-
     def __init__(self, name: str, question: Callable[[], Part]) -> None:
         self._question = question
         self._part: Part | None = None
@@ -245,7 +239,6 @@ class _Probe:
         self.thread.start()
 
     def part(self, deadline: float) -> Part:
-        """Return the result, if it arrives before the deadline."""
         start = time.monotonic()
         self.thread.join(max(0.0, deadline - start))
         return self._part or Part(ok=False, detail="it has not answered in time; see the log of the part itself")
@@ -259,7 +252,6 @@ class _Probe:
             self._part = Part(ok=False, detail=f"{type(error).__name__}: {error}")
 
 
-#: Default number of days reported.
 DAYS: Final = 31
 MOST_DAYS: Final = 366
 _COLUMNS: Final = tuple(UsageDay.model_fields)
@@ -273,11 +265,7 @@ class Usage:
         self._keys = keys
 
     def days(self, since: date | None = None, until: date | None = None) -> list[UsageDay]:
-        """Return the usage of each project on each day, newest first; by default of the last month.
-
-        Raises:
-            InputError: the days are out of order, or span more than a year.
-        """
+        """Return the usage of each project on each day, newest first; by default of the last month."""
         last = until or datetime.now(UTC).date()
         first = since or last - timedelta(days=min(DAYS - 1, last.toordinal() - 1))
         if first > last:
@@ -287,17 +275,54 @@ class Usage:
         return self._services.index.usage.days(first.isoformat(), last.isoformat(), scope=project_scope())
 
     def limits(self) -> dict[str, ProjectLimits]:
-        """Return the shared limits of each project in scope."""
-        key = caller.get()
-        if key is None:
+        if caller.get() is None:
             return {}
         return {name: limits for name, limits in self._keys.projects().items() if project_scope().sees(name)}
 
 
 def as_csv(days: list[UsageDay]) -> str:
-    """Format a table with a header line (RFC 4180)."""
     text = io.StringIO()
     table = csv.writer(text)
     table.writerow(_COLUMNS)
     table.writerows([getattr(one, column) for column in _COLUMNS] for one in days)
     return text.getvalue()
+
+
+class DeletionView(View):
+    """Resource that was deleted within the grace time."""
+
+    what: What
+    id: str = Field(description="of the job, tag, hand, object or network; name of the dataset")
+    name: str
+    at: str = Field(description="when it was deleted")
+    until: str = Field(description="until then it can be restored")
+    owner: str = Field(description="id of the key that it was submitted with")
+    project: str
+
+
+class Deletions:
+    """Deletions in the caller's scope; permission to delete includes permission to restore."""
+
+    def __init__(self, services: Services) -> None:
+        self._services = services
+
+    def recent(self) -> list[DeletionView]:
+        return [self._view(one) for one in deletions(self._services.store) if _is_seen(one)]
+
+    def restore(self, what: What, name: str) -> DeletionView:
+        def permit(one: Deletion) -> None:
+            must_own(one.submitter, f"{what} {name!r}", one.project)
+
+        found = deletion.restore(self._services, what, name, permit=permit, among=_is_seen)
+        log.info("%s %s restored", what, found.name or found.id)
+        return self._view(found)
+
+    def _view(self, one: Deletion) -> DeletionView:
+        ends = datetime.fromisoformat(one.at) + timedelta(seconds=self._services.settings.shard_grace_s)
+        until = ends.isoformat(timespec="seconds").replace("+00:00", "Z")
+        said = {"name": one.name or one.id, "owner": one.submitter}
+        return DeletionView(what=one.what, id=one.id, at=one.at, until=until, project=one.project, **said)
+
+
+def _is_seen(one: Deletion) -> bool:
+    return project_scope().sees(one.project)

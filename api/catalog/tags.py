@@ -1,36 +1,47 @@
-"""Tags: names that users give to grasps of their project."""
+"""Tags, which users give to grasps of their project, and exports of selected grasps as CSV, JSON or shards in a ZIP."""
 
 from __future__ import annotations
 
+import csv
+import io
+import json
 import logging
-from collections.abc import Collection
+import zipfile
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import PurePosixPath
+from tempfile import TemporaryFile
+from typing import IO, Any, Final, Literal
+
+import numpy as np
 
 from graspd.api.access.auth import caller_id, may_change, must_own, project_scope
 from graspd.api.catalog.grasps import Grasps
 from graspd.api.models import Selection, TagChange
-from graspd.service.index.views import TagView
+from graspd.service.index.views import GraspView, TagView
 from graspd.service.model.errors import InputError, LimitError, NotFoundError
 from graspd.service.model.projects import ProjectScope
-from graspd.service.model.records import MOST_TAGS, Grasp, Tag, tag_id
+from graspd.service.model.records import MOST_TAGS, Grasp, Tag, by_shard, tag_id
 from graspd.service.pipeline import tagging
 from graspd.service.pipeline.backends import Services
+from graspd.service.store.integrity import read_checked
+from graspd.service.store.shards import part_of_shard, place_of, read_shard
 
 log = logging.getLogger(__name__)
 
 
 class Tags:
-    """Tags of the caller's project, and the grasps that have them."""
+    """Tags of the caller's project, each by its name or id; changes raise ForeignResource."""
 
     def __init__(self, services: Services, grasps: Grasps) -> None:
         self._services = services
         self._grasps = grasps
 
     def all(self) -> list[TagView]:
-        """Return tags in scope, by name."""
         return self._services.index.tags.all(scope=project_scope())
 
     def one(self, name: str) -> TagView:
-        """Return a tag by its name or id."""
         wanted = self._services.index.tags.named(name, scope=project_scope())
         return next(tag for tag in self.all() if tag.id == wanted)
 
@@ -39,11 +50,7 @@ class Tags:
         return self._services.index.tags.of(grasps, scope=project_scope())
 
     def chosen(self, selection: Selection) -> list[Grasp]:
-        """Return the grasps of a selection, each once, in order.
-
-        Raises:
-            NotFoundError: a listed grasp does not exist or is out of scope.
-        """
+        """Return the grasps of a selection, each once, in order; NotFoundError if one is out of scope."""
         if selection.filter is not None:
             return self._grasps.members(selection.filter)
         named = sorted({(grasp.shard_id, grasp.row) for grasp in selection.grasps or ()})
@@ -54,13 +61,6 @@ class Tags:
         return named
 
     def give(self, name: str, selection: Selection) -> TagChange:
-        """Give a tag of the caller's project to grasps; a new tag is created.
-
-        Raises:
-            InputError: the selection is empty.
-            NotYours: another key made the tag.
-            LimitError: there are already `MOST_TAGS` tags, or too many grasps would have it.
-        """
         if not (grasps := self.chosen(selection)):
             raise InputError("no grasp passes this filter, so none gets the tag")
         project = project_scope().project
@@ -75,21 +75,11 @@ class Tags:
         return TagChange(tag=self.one(tag_id(name, project)), changed=changed)
 
     def take_off(self, name: str, selection: Selection) -> TagChange:
-        """Remove a tag from grasps.
-
-        Raises:
-            NotYours: another key made the tag.
-        """
         tag = self._services.index.tags.named(name, scope=project_scope())
         changed = tagging.take_off(self._services, tag, self.chosen(selection), permit=_permit)
         return TagChange(tag=self.one(tag), changed=changed)
 
     def remove(self, name: str) -> None:
-        """Delete a tag; its grasps remain.
-
-        Raises:
-            NotYours: another key made the tag.
-        """
         tag = self._services.index.tags.named(name, scope=project_scope())
         tagging.remove(self._services, tag, permit=_permit, owner=caller_id())
         log.info("tag %s removed", name)
@@ -103,3 +93,93 @@ class Tags:
 def _permit(tag: Tag | None) -> None:
     if tag is not None:
         must_own(tag.owner, f"the tag {tag.name!r}", tag.project)
+
+
+Format = Literal["csv", "json", "zip"]
+MEDIA_TYPES: Final[dict[Format, str]] = {"csv": "text/csv", "json": "application/json", "zip": "application/zip"}
+#: Most shards per ZIP: about ten seconds of work.
+MOST_SHARDS: Final = 2000
+_CHUNK: Final = 1 << 20
+_COLUMNS: Final = (*GraspView.model_fields, "tags")
+
+
+@dataclass(frozen=True)
+class Export:
+    """File ready to be sent."""
+
+    media_type: str
+    filename: str
+    size: int
+    chunks: Iterator[bytes]
+
+
+class GraspExports:
+    """Writes selected grasps into files, which stay on the service's disk until they are sent."""
+
+    def __init__(self, services: Services, grasps: Grasps, tags: Tags) -> None:
+        self._services = services
+        self._grasps = grasps
+        self._tags = tags
+
+    def made(self, places: Sequence[Grasp], format: Format, said: Mapping[str, Any]) -> Export:
+        """Write a file of these grasps, which must be visible to the caller; `said` describes the selection in it."""
+        file = TemporaryFile()  # noqa: SIM115 (it is closed once it is sent)
+        try:
+            {"csv": self._csv, "json": self._json, "zip": self._zip}[format](file, places, said)
+            size = file.tell()
+            file.seek(0)
+        except BaseException:
+            file.close()
+            raise
+        return Export(MEDIA_TYPES[format], f"grasps.{format}", size, _sent(file))
+
+    def _rows(self, places: Sequence[Grasp]) -> Iterator[dict[str, Any]]:
+        tags = self._tags.of(places)
+        for grasp in self._grasps.listed(places):
+            yield grasp.model_dump(mode="json") | {"tags": tags.get((grasp.shard_id, grasp.row), [])}
+
+    def _csv(self, file: IO[bytes], places: Sequence[Grasp], _: Mapping[str, Any]) -> None:
+        text = io.TextIOWrapper(file, encoding="utf-8", newline="")
+        rows = csv.DictWriter(text, _COLUMNS)
+        rows.writeheader()
+        for row in self._rows(places):
+            rows.writerow(row | {"tags": " ".join(row["tags"])})
+        text.flush()
+        text.detach()
+
+    def _json(self, file: IO[bytes], places: Sequence[Grasp], said: Mapping[str, Any]) -> None:
+        file.write(b'{"chosen": ' + json.dumps(said).encode() + b', "items": [')
+        for number, row in enumerate(self._rows(places)):
+            file.write((b",\n" if number else b"\n") + json.dumps(row).encode())
+        file.write(b"\n]}\n")
+
+    def _zip(self, file: IO[bytes], places: Sequence[Grasp], said: Mapping[str, Any]) -> None:
+        shards = by_shard(places)
+        if not shards:
+            raise InputError("no grasp is chosen, and a file of none says nothing; choose others")
+        if len(shards) > MOST_SHARDS:
+            raise LimitError(
+                f"these grasps lie in {len(shards)} shards and a ZIP takes them of at most {MOST_SHARDS}; choose "
+                "fewer, or write them with `graspd grasps where` where the store is at hand"
+            )
+        looked_at, names = 0, list[PurePosixPath]()
+        with zipfile.ZipFile(file, "w") as packed:
+            for shard_id, rows in shards.items():
+                known = self._services.index.shards.get(shard_id, scope=project_scope())
+                shard = read_shard(
+                    read_checked(self._services.store, known.key, known.sha256), kind="base", name=known.key
+                )
+                mask = np.zeros(known.count, bool)
+                mask[list(rows)] = True
+                looked_at += len(mask)
+                names.append(place_of(shard, names))
+                # ZipInfo has a fixed date, so that the same grasps give an identical file.
+                packed.writestr(zipfile.ZipInfo(str(names[-1])), part_of_shard(shard, mask))
+            told = {**said, "looked_at": looked_at, "kept": len(set(places)), "shards": [str(name) for name in names]}
+            packed.writestr(zipfile.ZipInfo("subset.json"), json.dumps(told, indent=1) + "\n")
+
+
+def _sent(file: IO[bytes]) -> Iterator[bytes]:
+    with closing(file):
+        while chunk := file.read(_CHUNK):
+            yield chunk

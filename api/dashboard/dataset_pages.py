@@ -6,10 +6,9 @@ from collections.abc import Callable, Iterable
 from typing import Annotated, Any, Final
 from urllib.parse import urlencode
 
-from fastapi import APIRouter, Depends, Query, Request
+from fastapi import APIRouter, Query, Request
 from fastapi.responses import HTMLResponse, RedirectResponse
 from pydantic import ValidationError
-from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import FormData
 
 from graspd.api.access.auth import ForeignResource
@@ -19,11 +18,10 @@ from graspd.api.catalog.jobs import Jobs
 from graspd.api.dashboard import figures
 from graspd.api.dashboard.figures import twins
 from graspd.api.dashboard.form_uploads import asset_choices
-from graspd.api.dashboard.forms import first_message, inputs_of, listed
+from graspd.api.dashboard.forms import fields_of, first_message, inputs_of, listed
 from graspd.api.dashboard.grasp_pages import COLUMNS
 from graspd.api.dashboard.rendering import render
-from graspd.api.routes.dependencies import AssetsOf, ComparisonsOf, DatasetsOf, JobsOf, may_read, may_submit
-from graspd.service.index.views import CellView
+from graspd.api.routes.dependencies import READ, SUBMIT, AssetsOf, DatasetsOf, JobsOf
 from graspd.service.model.domain import JobRequest
 from graspd.service.model.errors import ConflictError, InputError
 from graspd.service.model.fidelity import OFFERED
@@ -34,10 +32,9 @@ PAGE_SIZE: Final = 20
 #: Largest matrix shown as a table; larger ones are shown as a paginated list, which is easier to read.
 MATRIX_CELLS: Final = 1000
 _CELLS_AT_ONCE: Final = 200
-_MAX_FIELDS: Final = 4000
+Fields = Annotated[FormData, fields_of(4000)]
 _DONE: Final = {"submit": "submitted", "retry": "retried", "cancel": "cancelled", "snapshot": "taken as a snapshot"}
 
-#: Fields of a dataset's form, and their initial values.
 _MAKE: Final = {"name": "", "grasps": "320", "fidelity": "standard"} | {
     one.name: one.default for one in inputs_of(cells=True)
 }
@@ -45,34 +42,47 @@ _MAKE: Final = {"name": "", "grasps": "320", "fidelity": "standard"} | {
 router = APIRouter(prefix="/datasets", include_in_schema=False)
 
 
-@router.get("", dependencies=[Depends(may_read)])
+@router.get("", dependencies=READ)
 def datasets_page(
     request: Request,
     datasets: DatasetsOf,
     assets: AssetsOf,
     cursor: Annotated[str | None, Query(max_length=512)] = None,
 ) -> HTMLResponse:
-    """Show all datasets, and all hands and objects of the service as a matrix."""
     return _overview(request, datasets, assets, cursor=cursor)
 
 
-@router.post("", dependencies=[Depends(may_submit)], response_model=None)
-async def create(request: Request, datasets: DatasetsOf, assets: AssetsOf) -> HTMLResponse | RedirectResponse:
-    """Make a dataset from the form."""
-    async with request.form(max_fields=_MAX_FIELDS) as fields:
-        return await run_in_threadpool(_create, request, datasets, assets, fields)
+@router.post("", dependencies=SUBMIT, response_model=None)
+def create(request: Request, datasets: DatasetsOf, assets: AssetsOf, fields: Fields) -> HTMLResponse | RedirectResponse:
+    form = {key: str(fields[key]) for key in _MAKE if fields.get(key)}
+    wanted = form | {"hands": fields.getlist("hands"), "objects": fields.getlist("objects")}
+    beside = {"neighbours": listed(form.get("neighbours", ""))}
+    try:
+        dataset = datasets.create(DatasetRequest.model_validate(wanted | beside))
+    except (ValidationError, InputError) as error:
+        return _overview(request, datasets, assets, problem=first_message(error), form=wanted, status=422)
+    return RedirectResponse(f"/datasets/{dataset.name}", status_code=303)
 
 
-@router.post("/cells", dependencies=[Depends(may_submit)], response_model=None)
-async def act_on_pairs(
-    request: Request, jobs: JobsOf, datasets: DatasetsOf, assets: AssetsOf
+@router.post("/cells", dependencies=SUBMIT, response_model=None)
+def act_on_pairs(
+    request: Request, jobs: JobsOf, datasets: DatasetsOf, assets: AssetsOf, fields: Fields
 ) -> HTMLResponse | RedirectResponse:
-    """Submit, retry or cancel the jobs of selected pairs."""
-    async with request.form(max_fields=_MAX_FIELDS) as fields:
-        return await run_in_threadpool(_act_on_pairs, request, jobs, datasets, assets, fields)
+    action = str(fields.get("action", ""))
+    pairs = [(hand, obj) for cell in fields.getlist("cell") for hand, _, obj in [str(cell).partition("|")] if obj]
+    try:
+        if action == "submit":
+            options = {key: str(fields[key]) for key in ("grasps", "fidelity") if fields.get(key)}
+            wanted = [JobRequest.model_validate(options | {"hand": hand, "object": obj}) for hand, obj in pairs]
+            done, left = _each(jobs.submit, wanted)
+        else:
+            done, left = _each(_job_action(jobs, action), _jobs_of(jobs, pairs, action))
+    except (ValidationError, InputError) as error:
+        return _overview(request, datasets, assets, problem=first_message(error), status=422)
+    return _redirect("/datasets", action, done=done, left=left)
 
 
-@router.get("/{name}", dependencies=[Depends(may_read)])
+@router.get("/{name}", dependencies=READ)
 def dataset_page(
     request: Request,
     name: str,
@@ -80,12 +90,11 @@ def dataset_page(
     state: str = "",
     cursor: Annotated[str | None, Query(max_length=512)] = None,
 ) -> HTMLResponse:
-    """Show one dataset: matrix, progress and snapshots."""
     dataset = datasets.one(name)
     chosen = State(state) if state in set(State) else None
     as_matrix = dataset.cells <= MATRIX_CELLS and chosen is None
     page = None if as_matrix else datasets.cells(name, state=chosen, limit=_CELLS_AT_ONCE, cursor=cursor)
-    cells = _all_cells(datasets, name) if page is None else page.items
+    cells = list(datasets.all_cells(name)) if page is None else page.items
     return render(
         request,
         "dataset.html",
@@ -102,69 +111,31 @@ def dataset_page(
     )
 
 
-@router.post("/{name}/cells", dependencies=[Depends(may_submit)])
-async def act_on_cells(request: Request, name: str, jobs: JobsOf) -> RedirectResponse:
-    """Retry or cancel the jobs of selected cells of a dataset."""
-    async with request.form(max_fields=_MAX_FIELDS) as fields:
-        return await run_in_threadpool(_act_on_cells, jobs, name, fields)
-
-
-@router.post("/{name}/{action}", dependencies=[Depends(may_submit)], response_model=None)
-def act(request: Request, name: str, action: str, datasets: DatasetsOf) -> RedirectResponse | HTMLResponse:
-    """Cancel or retry a whole dataset, or take a snapshot of it."""
-    do: dict[str, Callable[[], Any]] = {
-        "cancel": lambda: datasets.cancel(name),
-        "retry": lambda: datasets.retry(name),
-        "snapshot": lambda: datasets.take_snapshot(name),
-    }
-    if action not in do:
-        raise InputError(f"a dataset has no action {action!r}; there are: {', '.join(do)}")
-    do[action]()
-    return _redirect(f"/datasets/{name}", action, done=1)
-
-
-def _create(request: Request, datasets: Datasets, assets: Assets, fields: FormData) -> HTMLResponse | RedirectResponse:
-    form = {key: str(fields[key]) for key in _MAKE if fields.get(key)}
-    wanted = form | {"hands": fields.getlist("hands"), "objects": fields.getlist("objects")}
-    beside = {"neighbours": listed(form.get("neighbours", ""))}
-    try:
-        dataset = datasets.create(DatasetRequest.model_validate(wanted | beside))
-    except (ValidationError, InputError) as error:
-        message = first_message(error) if isinstance(error, ValidationError) else str(error)
-        return _overview(request, datasets, assets, problem=message, form=wanted, status=422)
-    return RedirectResponse(f"/datasets/{dataset.name}", status_code=303)
-
-
-def _act_on_pairs(
-    request: Request, jobs: Jobs, datasets: Datasets, assets: Assets, fields: FormData
-) -> HTMLResponse | RedirectResponse:
-    action = str(fields.get("action", ""))
-    pairs = [(hand, obj) for cell in fields.getlist("cell") for hand, _, obj in [str(cell).partition("|")] if obj]
-    try:
-        if action == "submit":
-            options = {key: str(fields[key]) for key in ("grasps", "fidelity") if fields.get(key)}
-            wanted = [JobRequest.model_validate(options | {"hand": hand, "object": obj}) for hand, obj in pairs]
-            done, left = _each(jobs.submit, wanted)
-        else:
-            done, left = _each(_job_action(jobs, action), _jobs_of(jobs, pairs, action))
-    except (ValidationError, InputError) as error:
-        message = first_message(error) if isinstance(error, ValidationError) else str(error)
-        return _overview(request, datasets, assets, problem=message, status=422)
-    return _redirect("/datasets", action, done=done, left=left)
-
-
-def _act_on_cells(jobs: Jobs, name: str, fields: FormData) -> RedirectResponse:
+@router.post("/{name}/cells", dependencies=SUBMIT)
+def act_on_cells(name: str, jobs: JobsOf, fields: Fields) -> RedirectResponse:
     action = str(fields.get("action", ""))
     done, left = _each(_job_action(jobs, action), [str(cell) for cell in fields.getlist("cell")])
     return _redirect(f"/datasets/{name}", action, done=done, left=left)
 
 
+@router.post("/{name}/{action}", dependencies=SUBMIT)
+def act(name: str, action: str, datasets: DatasetsOf) -> RedirectResponse:
+    do: dict[str, Callable[[str], Any]] = {
+        "cancel": datasets.cancel,
+        "retry": datasets.retry,
+        "snapshot": datasets.take_snapshot,
+    }
+    if action not in do:
+        raise InputError(f"a dataset has no action {action!r}; there are: {', '.join(do)}")
+    do[action](name)
+    return _redirect(f"/datasets/{name}", action, done=1)
+
+
 def _job_action(jobs: Jobs, action: str) -> Callable[[str], Any]:
-    if action == "retry":
-        return jobs.retry
-    if action == "cancel":
-        return jobs.cancel
-    raise InputError(f"cells have no action {action!r}; they can be submitted, retried or cancelled")
+    do = {"retry": jobs.retry, "cancel": jobs.cancel}
+    if action not in do:
+        raise InputError(f"cells have no action {action!r}; they can be submitted, retried or cancelled")
+    return do[action]
 
 
 def _jobs_of(jobs: Jobs, pairs: Iterable[tuple[str, str]], action: str) -> list[str]:
@@ -194,7 +165,6 @@ def _redirect(address: str, action: str, *, done: int, left: int = 0) -> Redirec
 
 
 def _did(request: Request) -> str:
-    """Describe the result of the last action."""
     given = request.query_params
     done, left = given.get("done", ""), given.get("left", "0")
     if given.get("did") not in _DONE or not done.isdigit() or not left.isdigit():
@@ -202,21 +172,8 @@ def _did(request: Request) -> str:
     if given["did"] == "snapshot":
         return "The snapshot is taken; it lists all present shards."
     what = "job" if done == "1" else "jobs"
-    words = f"{done} {what} {_DONE[given['did']]}"
-    return (
-        words + (f"; {left} unchanged: owned by another key, or not in a suitable state" if left != "0" else "") + "."
-    )
-
-
-def _all_cells(datasets: Datasets, name: str) -> list[CellView]:
-    cells: list[CellView] = []
-    cursor = None
-    while True:
-        page = datasets.cells(name, limit=_CELLS_AT_ONCE, cursor=cursor)
-        cells += page.items
-        cursor = page.next
-        if cursor is None:
-            return cells
+    unchanged = f"; {left} unchanged: owned by another key, or not in a suitable state" if left != "0" else ""
+    return f"{done} {what} {_DONE[given['did']]}{unchanged}."
 
 
 def _overview(
@@ -251,7 +208,6 @@ def _overview(
     )
 
 
-#: Datasets offered for comparison, newest first.
 _OFFERED: Final = 200
 
 comparison_router = APIRouter(include_in_schema=False)
@@ -259,12 +215,9 @@ comparison_router = APIRouter(include_in_schema=False)
 Named = Annotated[str, Query(max_length=64)]
 
 
-@comparison_router.get("/compare", dependencies=[Depends(may_read)])
-def compare_page(
-    request: Request, datasets: DatasetsOf, comparisons: ComparisonsOf, one: Named = "", other: Named = ""
-) -> HTMLResponse:
-    """Compare two datasets: options, yields of cells, metrics of grasps. The URL can be shared."""
-    found = comparisons.of(one, other) if one and other else None
+@comparison_router.get("/compare", dependencies=READ)
+def compare_page(request: Request, datasets: DatasetsOf, one: Named = "", other: Named = "") -> HTMLResponse:
+    found = datasets.compare(one, other) if one and other else None
     shown = {key: (label, unit) for key, label, unit in COLUMNS}
     return render(
         request,

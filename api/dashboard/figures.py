@@ -12,19 +12,9 @@ from urllib.parse import urlencode
 from graspd.api.models import Histogram
 from graspd.service.index.queries.statistics import Distribution
 from graspd.service.index.views import CellView, DatasetView, MatrixCell
+from graspd.service.model import studies
 from graspd.service.model.errors import DamagedError
 from graspd.service.model.states import State
-from graspd.service.model.studies import (
-    OUTCOMES,
-    MapCell,
-    Outcome,
-    Stability,
-    StabilityMap,
-    between,
-    counts,
-    from_json,
-    tick,
-)
 from graspd.service.store.records import STABILITY, latest
 from graspd.service.store.store import Store
 
@@ -40,7 +30,6 @@ class Plot:
     label: str
     points: str
     data: str
-    height: int = 180
 
 
 @dataclass(frozen=True)
@@ -58,13 +47,7 @@ class Bar:
 
 
 def line(xs: Sequence[float], ys: Sequence[float], *, x: str, y: str, unit: str = "", log: bool = False) -> Plot:
-    """Draw a line through points; a logarithmic axis omits values at or below zero.
-
-    Args:
-        x: name of the horizontal axis, with its unit.
-        y: name of the values.
-        unit: of the values.
-    """
+    """Draw a line of `y` [unit] over `x`; a logarithmic axis omits values at or below zero."""
     kept = [(a, b) for a, b in zip(xs, ys, strict=True) if math.isfinite(b) and (b > 0 or not log)]
     scaled = [(a, math.log10(b) if log else b) for a, b in kept]
     low, high = (min(b for _, b in scaled), max(b for _, b in scaled)) if scaled else (0.0, 1.0)
@@ -80,8 +63,8 @@ def line(xs: Sequence[float], ys: Sequence[float], *, x: str, y: str, unit: str 
     return Plot(label, points, json.dumps(data | {"log": log}))
 
 
-def minutes(values: Sequence[int], start: float, *, step_s: int = 60) -> Plot:
-    """Draw bars of the grasps made in each interval from `start` [s since 1970]."""
+def minutes(values: Sequence[int], start: float) -> Plot:
+    """Draw bars of the grasps made in each minute from `start` [s since 1970]."""
     top = max([*values, 1])
     width = WIDTH / max(len(values), 1)
     points = " ".join(
@@ -91,7 +74,7 @@ def minutes(values: Sequence[int], start: float, *, step_s: int = 60) -> Plot:
     )
     data = {
         "kind": "bars",
-        "xs": [start + i * step_s for i in range(len(values))],
+        "xs": [start + i * 60 for i in range(len(values))],
         "ys": list(values),
         "x": "Time",
         "y": "Valid grasps",
@@ -102,18 +85,12 @@ def minutes(values: Sequence[int], start: float, *, step_s: int = 60) -> Plot:
 
 
 def bars(histogram: Histogram, path: str, where: dict[str, str]) -> list[Bar]:
-    """Return the bars of a histogram; each links to the grasps whose metric is in its range.
-
-    Args:
-        path: page of the list.
-        where: its other filters.
-    """
-    count = len(histogram.counts)
-    width = (histogram.high - histogram.low) / count
+    """Return the bars of a histogram; each links to the page `path` of the grasps in its range and `where`."""
+    width, top = (histogram.high - histogram.low) / len(histogram.counts), max(histogram.counts) or 1
     made = []
-    for index, (share, number) in enumerate(zip(histogram.bars, histogram.counts, strict=True)):
+    for index, number in enumerate(histogram.counts):
         low, high = histogram.low + index * width, histogram.low + (index + 1) * width
-        tall = max(60 * share, 1.5 if number else 0)
+        tall = max(60 * (number / top), 1.5 if number else 0)
         query = where | {f"min_{histogram.metric}": f"{low:.6g}", f"max_{histogram.metric}": f"{high:.6g}"}
         made.append(Bar(10.0 * index + 1, 63 - tall, 8.0, tall, number, low, high, f"{path}?{urlencode(query)}"))
     return made
@@ -192,7 +169,6 @@ class Grid:
 
 
 def of_dataset(dataset: DatasetView, cells: Sequence[CellView]) -> Grid:
-    """Return the matrix of a dataset."""
     found = {
         (cell.hand, cell.object): Tile(
             hand=cell.hand,
@@ -214,7 +190,6 @@ def of_dataset(dataset: DatasetView, cells: Sequence[CellView]) -> Grid:
 
 
 def of_service(cells: Iterable[MatrixCell], hands: Sequence[str], objects: Sequence[str]) -> Grid:
-    """Return the matrix of the service: all known hands and objects, with the results of their jobs."""
     found = {
         (cell.hand, cell.object): Tile(
             hand=cell.hand,
@@ -245,11 +220,7 @@ def _grid(hands: Sequence[str], objects: Sequence[str], found: dict[tuple[str, s
 
 
 def _state(cell: MatrixCell) -> str:
-    if cell.running:
-        return State.RUNNING.value
-    if cell.queued:
-        return State.QUEUED.value
-    return State.FAILED.value if cell.failed else State.SUCCEEDED.value
+    return next((state for state in ("running", "queued", "failed") if getattr(cell, state)), "succeeded")
 
 
 #: Width and height of a cell with its gap [px], as in the style sheet: lines are drawn over the cells.
@@ -260,7 +231,7 @@ PITCH: Final = (40, 30)
 class CellSquare:
     """Cell of a map, ready to draw."""
 
-    outcome: Outcome
+    outcome: studies.Outcome
     text: str
     said: str
     """Description in one line, for the tooltip."""
@@ -292,7 +263,7 @@ class Panel:
 class Share:
     """Part of a bar of width 100."""
 
-    outcome: Outcome
+    outcome: studies.Outcome
     count: int
     x: float
     width: float
@@ -302,64 +273,61 @@ class Share:
 class MapDrawing:
     """One map with the numbers below it."""
 
-    map: StabilityMap
+    map: studies.StabilityMap
     panels: list[Panel]
-    counts: dict[Outcome, int]
+    counts: dict[studies.Outcome, int]
     reached: list[Share]
-    still_breaks: list[str]
 
 
-def load(store: Store) -> Stability | None:
-    """Load the last published maps; None if there are none, or if they cannot be read."""
+def load(store: Store) -> studies.Stability | None:
     try:
         found = latest(store, STABILITY)
-        return None if found is None else from_json(found)
+        return None if found is None else studies.from_json(found)
     except (ValueError, DamagedError):
         return None
 
 
-def draw(one: StabilityMap) -> MapDrawing:
-    """Convert a map to panels and numbers."""
+def draw(one: studies.StabilityMap) -> MapDrawing:
     return MapDrawing(
         map=one,
         panels=[_panel(one, name) for name in one.panels],
-        counts={outcome: number for outcome, number in counts(one.cells).items() if number},
+        counts={outcome: number for outcome, number in studies.counts(one.cells).items() if number},
         reached=_shares(one.reached()),
-        still_breaks=one.still_breaks(),
     )
 
 
-def _panel(one: StabilityMap, name: str) -> Panel:
+def _panel(one: studies.StabilityMap, name: str) -> Panel:
     cells = one.of(name)
     xs, ys = ([*dict.fromkeys(getattr(cell, axis) for cell in cells)] for axis in ("x", "y"))
     squares = {(cell.x, cell.y): _square(one, cell, ringed=one.is_divided and cell.reached) for cell in cells}
     line = one.lines.get(name, [])
     if any(isinstance(x, str) for x in xs):
         # Words fit better before a row than under a narrow column.
-        rows = [(tick(x), [squares.get((x, y)) for y in ys]) for x in xs]
-        return Panel(name, one.y, one.x, [tick(y) for y in ys], rows, "")
+        rows = [(studies.tick(x), [squares.get((x, y)) for y in ys]) for x in xs]
+        return Panel(name, one.y, one.x, [studies.tick(y) for y in ys], rows, "")
     upward = ys if all(isinstance(y, str) for y in ys) else ys[::-1]
-    rows = [(tick(y), [squares.get((x, y)) for x in xs]) for y in upward]
+    rows = [(studies.tick(y), [squares.get((x, y)) for x in xs]) for y in upward]
     points = " ".join(
-        f"{PITCH[0] * (between(xs, x) + 0.5):.1f},{PITCH[1] * (len(ys) - 0.5 - between(ys, y)):.1f}" for x, y in line
+        f"{PITCH[0] * (studies.between(xs, x) + 0.5):.1f},{PITCH[1] * (len(ys) - 0.5 - studies.between(ys, y)):.1f}"
+        for x, y in line
     )
-    return Panel(name, one.x, one.y, [tick(x) for x in xs], rows, points)
+    return Panel(name, one.x, one.y, [studies.tick(x) for x in xs], rows, points)
 
 
-def _square(one: StabilityMap, cell: MapCell, *, ringed: bool) -> CellSquare:
+def _square(one: studies.StabilityMap, cell: studies.MapCell, *, ringed: bool) -> CellSquare:
     value = cell.note or (f"{cell.value:.3g}" if cell.value == cell.value else "no value")
     return CellSquare(
         outcome=cell.outcome,
         text=cell.text,
-        said=f"{one.x} {tick(cell.x)}, {one.y} {tick(cell.y)}: {cell.outcome}; {value}",
+        said=f"{one.x} {studies.tick(cell.x)}, {one.y} {studies.tick(cell.y)}: {cell.outcome}; {value}",
         ringed=ringed,
     )
 
 
-def _shares(cells: Sequence[MapCell]) -> list[Share]:
-    found = counts(cells)
+def _shares(cells: Sequence[studies.MapCell]) -> list[Share]:
+    found = studies.counts(cells)
     shares, x = [], 0.0
-    for outcome in OUTCOMES:
+    for outcome in studies.OUTCOMES:
         if found[outcome]:
             width = 100.0 * found[outcome] / len(cells)
             shares.append(Share(outcome, found[outcome], x, width))

@@ -37,7 +37,6 @@ _ASKED: Final = {
     "scale_to": ("Longest side [mm]", 'type="number" min="1" max="3000" step="any"', "Scale to this size"),
     "root": ("Link", 'type="text" maxlength="200"', "Use as root link"),
 }
-#: Form field of each kind's file.
 FILE_FIELDS: Final = {AssetKind.HAND: "hand_file", AssetKind.OBJECT: "file"}
 
 
@@ -69,14 +68,11 @@ class AssetChoice:
     name: str = ""
     """Name of the job's asset; empty: none yet."""
     refused: Refusal | None = None
-    """Reason why there is none."""
     file: str = ""
-    """Name of the file that cannot be used."""
     held: str = ""
     """Digest of that file in the store; empty: it must be chosen again."""
 
     def place(self, kind: AssetKind) -> str:
-        """Return the form field that a refusal belongs to."""
         return FILE_FIELDS[kind] if self.file else kind.value
 
 
@@ -100,10 +96,7 @@ def chosen(request: Request, assets: Assets, fields: FormData, kind: AssetKind) 
 
 
 def refusal_of(asset: AssetView) -> Refusal:
-    """Return an asset's refusal, with suggested options as buttons.
-
-    Facts mix data from the upload with findings of the check, so they may be of any type.
-    """
+    """Return an asset's refusal. Facts of an upload may be of any type."""
     facts = asset.facts
     lengths = facts.get("lengths_m")
     units = [
@@ -114,8 +107,7 @@ def refusal_of(asset: AssetView) -> Refusal:
     others = [
         fix for one in _entries(facts, "options_suggested") if isinstance(one, dict) and (fix := _fix(one)) is not None
     ]
-    problem = facts.get("problem")
-    return Refusal(str(problem or asset.message or "refused"), (*units, *others))
+    return Refusal(str(facts.get("problem") or asset.message or "refused"), (*units, *others))
 
 
 def _entries(facts: Mapping[str, Any], key: str) -> list[Any]:
@@ -167,11 +159,7 @@ def _again(assets: Assets, kind: AssetKind, digest: str, fields: FormData) -> As
 
 
 def pressed(fields: FormData, kind: AssetKind) -> dict[str, Any]:
-    """Return the options of the pressed button; values of null come from its field.
-
-    Raises:
-        InputError: its field is empty, or is not a number where one is required.
-    """
+    """Return the options of the pressed button; values of null come from its field."""
     said = json_object(text, "the option") if (text := _text(fields, f"{kind.value}_fix")) else {}
     for key in [key for key, value in said.items() if value is None and key in _ASKED]:
         label, given = _ASKED[key][0], _text(fields, f"{kind.value}_{key}").strip()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import AsyncIterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -19,9 +19,9 @@ from graspd.api.catalog.assets import Assets
 from graspd.api.catalog.jobs import Jobs
 from graspd.api.dashboard.form_uploads import FILE_FIELDS, UNITS, AssetChoice, choices, chosen, refusal_of
 from graspd.api.dashboard.rendering import render
-from graspd.api.routes.dependencies import AssetsOf, JobsOf, may_read, may_submit
+from graspd.api.routes.dependencies import READ, SUBMIT, AssetsOf, JobsOf
 from graspd.service.index.index import Index
-from graspd.service.index.queries.overview import BatchCost, Costs
+from graspd.service.index.queries.overview import BatchCost
 from graspd.service.model.base import refusal, words
 from graspd.service.model.domain import JobOptions, JobRequest
 from graspd.service.model.errors import GraspdError, InputError
@@ -33,6 +33,16 @@ from graspd.service.pipeline.datasets.cost import estimate
 from graspd.service.pipeline.datasets.spec import Matrix
 
 router = APIRouter(include_in_schema=False)
+
+
+def fields_of(most: int) -> Any:
+    """Return a dependency: the fields of a form, of which there may be at most this number."""
+
+    async def fields(request: Request) -> AsyncIterator[FormData]:
+        async with request.form(max_fields=most) as found:
+            yield found
+
+    return Depends(fields)
 
 
 @dataclass(frozen=True)
@@ -50,7 +60,6 @@ class FormInput:
 
     @classmethod
     def of(cls, row: Row, form: Form) -> FormInput:
-        """Create the field of a row of the options' table."""
         kind = "checkbox" if row.kind is bool else "select" if form.choices else "text"
         limits: dict[str, Any] = {}
         if row.kind in (int, float):
@@ -76,23 +85,20 @@ def inputs_of(section: str = "", *, cells: bool = False) -> list[FormInput]:
 DEFAULTS: Final = {"hand": "allegro", "object": "mug"} | {one.name: one.default for one in inputs_of()}
 
 
-@router.get("/submit", dependencies=[Depends(may_read)])
+@router.get("/submit", dependencies=READ)
 def submit_page(request: Request, assets: AssetsOf) -> HTMLResponse:
-    """Show the form; URL parameters fill it in."""
     given = {key: value for key, value in request.query_params.items() if key in DEFAULTS}
     return _form(request, assets, DEFAULTS | given)
 
 
-@router.get("/submit/refusals/{kind}/{digest}", dependencies=[Depends(may_read)])
+@router.get("/submit/refusals/{kind}/{digest}", dependencies=READ)
 def refused(request: Request, kind: AssetKind, digest: str, assets: AssetsOf) -> HTMLResponse:
-    """Show why an upload was refused and how to fix it, as a part of the form."""
     found = refusal_of(assets.one(kind, digest))
     return render(request, "refusal.html", kind=kind.value, problem=found.problem, fixes=found.fixes)
 
 
-@router.post("/submit", dependencies=[Depends(may_submit)], response_model=None)
+@router.post("/submit", dependencies=SUBMIT, response_model=None)
 async def submit(request: Request, jobs: JobsOf, assets: AssetsOf) -> HTMLResponse | RedirectResponse:
-    """Submit the form, after the upload of a hand or a mesh if there is one."""
     async with request.form(max_files=2, max_fields=32) as fields:
         sent = any(isinstance(value, UploadFile) and value.filename for value in fields.values())
         # A refused file that the form refers to is read and checked like an uploaded one.
@@ -101,22 +107,19 @@ async def submit(request: Request, jobs: JobsOf, assets: AssetsOf) -> HTMLRespon
         return await run(_submit, request, jobs, assets, fields)
 
 
-@router.post("/jobs/{job_id}/cancel", dependencies=[Depends(may_submit)])
+@router.post("/jobs/{job_id}/cancel", dependencies=SUBMIT)
 def cancel(job_id: str, jobs: JobsOf) -> RedirectResponse:
-    """Cancel a job and show it."""
     jobs.cancel(job_id)
     return RedirectResponse(f"/jobs/{job_id}", status_code=303)
 
 
-@router.post("/jobs/{job_id}/retry", dependencies=[Depends(may_submit)])
+@router.post("/jobs/{job_id}/retry", dependencies=SUBMIT)
 def retry(job_id: str, jobs: JobsOf) -> RedirectResponse:
-    """Retry a job and show it."""
     jobs.retry(job_id)
     return RedirectResponse(f"/jobs/{job_id}", status_code=303)
 
 
-def first_message(error: ValueError) -> str:
-    """Return the first error of a validation, in one line."""
+def first_message(error: Exception) -> str:
     return refusal(error) if isinstance(error, ValidationError) else str(error)
 
 
@@ -221,11 +224,12 @@ def listed(text: str) -> list[str]:
 
 
 class Expectations:
-    """Estimates for the form of a job; its state is only a cache."""
+    """Estimates for the form of a job; its state is only a cache of the costs of batches."""
 
     def __init__(self, index: Index) -> None:
         self._index = index
-        self._costs = _RememberedCosts(index.costs)
+        self._read: dict[tuple[Stage, ProjectScope], tuple[float, list[BatchCost]]] = {}
+        self._lock = threading.Lock()
 
     def of(self, form: Mapping[str, Any]) -> list[FidelityPrice]:
         """Estimate every offered fidelity for a form; without numbers if that is not possible."""
@@ -239,26 +243,16 @@ class Expectations:
     def _one(self, name: str, wanted: dict[str, Any], hand: str, obj: str) -> FidelityPrice:
         try:
             matrix = Matrix.model_validate(wanted | {"hands": (hand,), "objects": (obj,), "fidelity": name})
-            cost = estimate(self._index, matrix, costs=self._costs.of_batches, scope=project_scope())
+            cost = estimate(self._index, matrix, costs=self._costs, scope=project_scope())
         except (ValidationError, GraspdError):
             return FidelityPrice(name, WORDS[name], None, None, None, None, "")
-        rate = cost.rates[0] if cost.rates else None
-        share, origin = (rate.valid_yield, rate.origin) if rate else (None, "")
+        share, origin = (cost.rates[0].valid_yield, cost.rates[0].origin) if cost.rates else (None, "")
         return FidelityPrice(name, WORDS[name], cost.seconds, cost.seconds_low, cost.seconds_high, share, origin)
 
-
-class _RememberedCosts:
-    """Cache of the costs of batches."""
-
-    def __init__(self, costs: Costs) -> None:
-        self._costs = costs
-        self._read: dict[tuple[Stage, ProjectScope], tuple[float, list[BatchCost]]] = {}
-        self._lock = threading.Lock()
-
-    def of_batches(self, stage: Stage) -> list[BatchCost]:
+    def _costs(self, stage: Stage) -> list[BatchCost]:
         with self._lock:
             now = time.monotonic()
             key = (stage, project_scope())
             if key not in self._read or now - self._read[key][0] > KEPT_S:
-                self._read[key] = (now, self._costs.of_batches(stage, scope=project_scope()))
+                self._read[key] = (now, self._index.costs.of_batches(stage, scope=project_scope()))
             return self._read[key][1]

@@ -4,32 +4,21 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from typing import Any, Final, TypeVar
+from typing import Annotated, Any, Final, TypeVar
 from urllib.parse import parse_qsl, urlencode
 
-from fastapi import APIRouter, Depends, Request
+from fastapi import APIRouter, Request
 from fastapi.responses import HTMLResponse, RedirectResponse, StreamingResponse
 from pydantic import TypeAdapter, ValidationError
-from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import FormData
 
 from graspd.api.catalog.assets import Assets
-from graspd.api.catalog.grasp_exports import Format
-from graspd.api.catalog.tags import Tags
+from graspd.api.catalog.tags import Format, Tags
 from graspd.api.dashboard import rendering
-from graspd.api.dashboard.forms import first_message
+from graspd.api.dashboard.forms import fields_of, first_message
 from graspd.api.dashboard.rendering import base_url, render
 from graspd.api.models import GraspDetail, GraspName, GraspQuery, Selection
-from graspd.api.routes.dependencies import (
-    AssetsOf,
-    ExportsOf,
-    GraspsOf,
-    ShardsOf,
-    TagsOf,
-    may_read,
-    may_submit,
-    next_address,
-)
+from graspd.api.routes.dependencies import READ, SUBMIT, AssetsOf, ExportsOf, GraspsOf, ShardsOf, TagsOf, next_address
 from graspd.api.routes.grasps import exported
 from graspd.service.index.views import GraspView, TagView
 from graspd.service.model.base import TagName
@@ -38,11 +27,9 @@ from graspd.service.model.metrics import AXIS_MEANINGS, GRASP_METRICS, GraspType
 from graspd.service.model.states import AssetKind
 
 PAGE_SIZES: Final = {"cards": 24, "table": 50}
-#: Sort key, label and unit of the metrics shown in lists of grasps.
 COLUMNS: Final = tuple((metric.name, metric.column_title, metric.unit) for metric in indexed(IndexLevel.OFFERED))
 #: Metrics of which less is better: the first click sorts them in ascending order.
 _LESS_IS_BETTER: Final = frozenset(metric.name for metric in indexed() if metric.less_is_better)
-#: Metrics shown beside the verdict of a grasp.
 _BESIDE_VERDICT: Final = frozenset({"contact_links", "robustness", "robust_share", "grasp_type", "approach_cell"})
 
 #: Difference along each axis of the models around the nominal one.
@@ -51,7 +38,7 @@ _WEAKEST: Final = {axis.word: words for axis, words in AXIS_MEANINGS.items()}
 router = APIRouter(include_in_schema=False)
 
 
-@router.get("/grasps", dependencies=[Depends(may_read)], response_model=None)
+@router.get("/grasps", dependencies=READ, response_model=None)
 def grasps_page(
     request: Request, grasps: GraspsOf, shards: ShardsOf, assets: AssetsOf, tags: TagsOf
 ) -> HTMLResponse | RedirectResponse:
@@ -67,10 +54,8 @@ def grasps_page(
     try:
         query = GraspQuery.model_validate(given)
         page = grasps.page(query, limit=PAGE_SIZES[view], cursor=cursor)
-    except ValueError as error:
+    except (ValueError, InputError) as error:
         problem = first_message(error)
-    except InputError as error:
-        problem = str(error)
     rows = page.items if page else []
     known = tags.all()
     return render(
@@ -107,11 +92,10 @@ def grasps_page(
     )
 
 
-@router.get("/grasps/{shard_id}/{row}", dependencies=[Depends(may_read)])
+@router.get("/grasps/{shard_id}/{row}", dependencies=READ)
 def grasp_page(
     request: Request, shard_id: str, row: int, grasps: GraspsOf, shards: ShardsOf, tags: TagsOf
 ) -> HTMLResponse:
-    """Show one grasp: 3D view, verdict, metrics, tags, and its shard."""
     grasp, shard = grasps.one(shard_id, row), shards.one(shard_id)
     return render(
         request,
@@ -135,7 +119,6 @@ def grasp_page(
 def choice_of(
     tags: Tags, rows: Sequence[GraspView], known: Sequence[TagView], where: Mapping[str, str]
 ) -> dict[str, Any]:
-    """Return data of the form that selects grasps: their tags, all tags, and the query of the list."""
     return {
         "tagged": tags.of([(grasp.shard_id, grasp.row) for grasp in rows]),
         "tags": known,
@@ -152,8 +135,7 @@ def _metrics(grasp: GraspDetail) -> list[tuple[str, float | None, str]]:
 
 
 def _names(assets: Assets, kind: AssetKind) -> list[tuple[str, str]]:
-    names = sorted({asset.name for asset in assets.page(kind, limit=200).items})
-    return [(name, name) for name in names]
+    return [(name, name) for name in sorted({asset.name for asset in assets.page(kind, limit=200).items})]
 
 
 def _sort_link(request: Request, query: GraspQuery, key: str) -> str:
@@ -171,8 +153,7 @@ def _view_link(request: Request, view: str) -> str:
     return f"{url.path}?{url.query}" if url.query else str(url.path)
 
 
-_MAX_FIELDS: Final = 400
-#: Longest query that a form returns.
+Fields = Annotated[FormData, fields_of(400)]
 _LONGEST_FILTER: Final = 40_000
 _PAGES: Final = re.compile(r"/grasps(/[0-9a-f]{32}/[0-9]{1,10})?|/jobs/[0-9a-f]{32}")
 _NAME: Final[TypeAdapter[str]] = TypeAdapter(TagName)
@@ -181,26 +162,20 @@ _DONE: Final = {"tagged": "{done} {grasps} tagged {tag}.", "untagged": "Tag {tag
 T = TypeVar("T")
 
 
-@router.post("/grasps/tag", dependencies=[Depends(may_submit)])
-async def tag(request: Request, tags: TagsOf) -> RedirectResponse:
-    """Give a tag to the selected grasps and show the list again."""
-    async with request.form(max_fields=_MAX_FIELDS) as fields:
-        return await run_in_threadpool(_tag, tags, fields, on=True)
+@router.post("/grasps/tag", dependencies=SUBMIT)
+def tag(tags: TagsOf, fields: Fields) -> RedirectResponse:
+    return _tag(tags, fields, on=True)
 
 
-@router.post("/grasps/untag", dependencies=[Depends(may_submit)])
-async def untag(request: Request, tags: TagsOf) -> RedirectResponse:
-    """Remove a tag from the selected grasps and show the list again."""
-    async with request.form(max_fields=_MAX_FIELDS) as fields:
-        return await run_in_threadpool(_tag, tags, fields, on=False)
+@router.post("/grasps/untag", dependencies=SUBMIT)
+def untag(tags: TagsOf, fields: Fields) -> RedirectResponse:
+    return _tag(tags, fields, on=False)
 
 
-@router.post("/grasps/export", dependencies=[Depends(may_read)])
-async def export(request: Request, tags: TagsOf, exports: ExportsOf) -> StreamingResponse:
-    """Send the selected grasps as a file."""
-    async with request.form(max_fields=_MAX_FIELDS) as fields:
-        wanted = _checked(_FORMAT, fields.get("format") or "zip", "format")
-        return await exported(request, tags, exports, _selection(fields), wanted)
+@router.post("/grasps/export", dependencies=READ)
+async def export(request: Request, tags: TagsOf, exports: ExportsOf, fields: Fields) -> StreamingResponse:
+    wanted = _checked(_FORMAT, fields.get("format") or "zip", "format")
+    return await exported(request, tags, exports, _selection(fields), wanted)
 
 
 def did(given: dict[str, str]) -> str:
@@ -229,11 +204,6 @@ def _tag(tags: Tags, fields: FormData, *, on: bool) -> RedirectResponse:
 
 
 def _selection(fields: FormData) -> Selection:
-    """Return the ticked grasps, or all of the list.
-
-    Raises:
-        InputError: no grasp is selected, or the selection is invalid.
-    """
     try:
         if fields.get("all"):
             return Selection(filter=GraspQuery.model_validate(dict(_filter(fields))))

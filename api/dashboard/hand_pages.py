@@ -5,16 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Annotated, Any, Final
 
-from fastapi import APIRouter, Depends, Query, Request
+from fastapi import APIRouter, Query, Request
 from fastapi.responses import HTMLResponse, RedirectResponse
-from pydantic import ValidationError
 from starlette.datastructures import FormData
 
 from graspd.api.catalog.assets import Assets
 from graspd.api.dashboard.forms import first_message
 from graspd.api.dashboard.rendering import render
 from graspd.api.routes.assets import CorrectionRequest, store_correction
-from graspd.api.routes.dependencies import AssetsOf, may_read, may_submit
+from graspd.api.routes.dependencies import READ, SUBMIT, AssetsOf
 from graspd.service.index.views import AssetView
 from graspd.service.model.errors import ConflictError, InputError, NotFoundError
 from graspd.service.model.states import AssetKind
@@ -25,16 +24,15 @@ PAGE_SIZE: Final = 50
 #: Polling interval [s]; a check takes seconds.
 _CHECK_S: Final = 2
 _MAX_FIELDS: Final = 16 + 3 * MAX_ENTRIES
-_CENTRE_DIGITS_MM: Final = 3
 
 router = APIRouter(prefix="/hands", include_in_schema=False)
 
 
-@router.get("", dependencies=[Depends(may_read)])
+@router.get("", dependencies=READ)
 def hands_page(
     request: Request, assets: AssetsOf, cursor: Annotated[str | None, Query(max_length=512)] = None
 ) -> HTMLResponse:
-    """List all hands, newest first, and the newest networks. Includes refused hands: their page says why."""
+    """Refused hands are included: their page says why."""
     page = assets.page(AssetKind.HAND, limit=PAGE_SIZE, cursor=cursor, refused=True)
     # Facts mix data from the upload with findings of the check, so they may be of any type.
     numbers = {
@@ -58,17 +56,15 @@ def hands_page(
     )
 
 
-@router.get("/{name}", dependencies=[Depends(may_read)])
+@router.get("/{name}", dependencies=READ)
 def hand_page(request: Request, name: str, assets: AssetsOf) -> HTMLResponse:
-    """Show one hand in 3D, and the form to correct it."""
     hand = assets.one(AssetKind.HAND, name)
     facts, trouble = _facts(assets, hand)
     return _page(request, hand, facts, problem=trouble, form=_form_of(facts) if facts else {})
 
 
-@router.post("/{name}", dependencies=[Depends(may_submit)], response_model=None)
+@router.post("/{name}", dependencies=SUBMIT, response_model=None)
 async def correct(request: Request, name: str, assets: AssetsOf) -> HTMLResponse | RedirectResponse:
-    """Store the corrections as another hand, and show it."""
     async with request.form(max_files=0, max_fields=_MAX_FIELDS) as fields:
         return await request.app.state.uploads.run(_correct, request, assets, name, fields)
 
@@ -82,8 +78,7 @@ def _correct(request: Request, assets: Assets, name: str, fields: FormData) -> H
         said = CorrectionRequest.model_validate(dict(_said(facts, shown)))
         made = store_correction(assets, hand.digest, said, said.name)
     except (InputError, ConflictError, ValueError) as error:
-        message = first_message(error) if isinstance(error, ValidationError) else str(error)
-        return _page(request, hand, facts, problem=message, form=shown, status=422)
+        return _page(request, hand, facts, problem=first_message(error), form=shown, status=422)
     return RedirectResponse(f"/hands/{made.digest}", status_code=303)
 
 
@@ -107,18 +102,7 @@ def _page(
         guessed=guessed if isinstance(guessed, list) else [],
         self_test=self_test_line(hand.facts),
         limit=limit_line(hand.facts),
-        approaches=_APPROACHES,
     )
-
-
-_APPROACHES: Final = (
-    ("+x", "1,0,0"),
-    ("-x", "-1,0,0"),
-    ("+y", "0,1,0"),
-    ("-y", "0,-1,0"),
-    ("+z", "0,0,1"),
-    ("-z", "0,0,-1"),
-)
 
 
 def _facts(assets: Assets, hand: AssetView) -> tuple[HandFacts | None, str]:
@@ -132,10 +116,9 @@ def _facts(assets: Assets, hand: AssetView) -> tuple[HandFacts | None, str]:
 
 
 def _form_of(facts: HandFacts) -> dict[str, Any]:
-    """Return the form before any correction."""
     form: dict[str, Any] = {"palm_link": facts.root, "name": "", "fingertips": facts.fingertips}
     for axis, centre, approach in zip("xyz", facts.palm_centre, facts.palm_approach, strict=True):
-        form[f"centre_{axis}"] = f"{round(1e3 * centre, _CENTRE_DIGITS_MM):g}"
+        form[f"centre_{axis}"] = f"{round(1e3 * centre, 3):g}"
         form[f"approach_{axis}"] = f"{approach:.6g}"
     for number, dof in enumerate(facts.dofs):
         form[f"closing.{number}"] = str(facts.closing[dof])
@@ -152,20 +135,9 @@ def _said(facts: HandFacts, form: dict[str, Any]) -> Iterator[tuple[str, Any]]:
     if any(form[key] != before[key] for key in ("palm_link", *palm)):
         x, y, z, *approach = (_number(form, key) for key in palm)
         yield "palm", {"link": form["palm_link"], "centre": [x / 1e3, y / 1e3, z / 1e3], "approach": approach}
-    turned = {
-        dof: _direction(form, f"closing.{i}")
-        for i, dof in enumerate(facts.dofs)
-        if form[f"closing.{i}"] != before[f"closing.{i}"]
-    }
-    yield "closing", turned
-    yield (
-        "preshape",
-        {
-            dof: _number(form, f"preshape.{i}")
-            for i, dof in enumerate(facts.dofs)
-            if form[f"preshape.{i}"] != before[f"preshape.{i}"]
-        },
-    )
+    for name, read in (("closing", _direction), ("preshape", _number)):
+        keys = {dof: f"{name}.{number}" for number, dof in enumerate(facts.dofs)}
+        yield name, {dof: read(form, key) for dof, key in keys.items() if form[key] != before[key]}
     if set(form["fingertips"]) != set(facts.fingertips):
         yield "fingertips", form["fingertips"]
 

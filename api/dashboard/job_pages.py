@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Callable
 from functools import lru_cache, partial
 from typing import Annotated, Any, Final, Literal
 
 import numpy as np
-from fastapi import APIRouter, Depends, Query, Request, Response
+from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import HTMLResponse
 from numpy.typing import NDArray
 from PIL import Image
@@ -15,8 +16,8 @@ from PIL import Image
 from graspd.api.dashboard import figures, rendering
 from graspd.api.dashboard.grasp_pages import COLUMNS, choice_of, did
 from graspd.api.dashboard.rendering import base_url, render
-from graspd.api.models import GraspQuery, JobDetail, LossCurve
-from graspd.api.routes.dependencies import GraspsOf, JobsOf, ShardsOf, TagsOf, may_read
+from graspd.api.models import GraspQuery, JobDetail
+from graspd.api.routes.dependencies import READ, GraspsOf, JobsOf, ShardsOf, TagsOf
 from graspd.service.model.errors import NotFoundError
 from graspd.service.store.integrity import read_checked
 from graspd.service.store.shards import open_shard
@@ -28,11 +29,10 @@ _SHOWN_GRASPS: Final = 10
 router = APIRouter(include_in_schema=False)
 
 
-@router.get("/jobs/{job_id}", dependencies=[Depends(may_read)])
+@router.get("/jobs/{job_id}", dependencies=READ)
 def job_page(request: Request, job_id: str, jobs: JobsOf, grasps: GraspsOf, tags: TagsOf) -> HTMLResponse:
-    """Show one job."""
     job = jobs.one(job_id)
-    pictures = _pictures(job)
+    pictures, loss = _pictures(job), jobs.loss_curve(job)
     shown = {key: (label, unit) for key, label, unit in COLUMNS}
     validated = job.request.validation != "none"
     query = GraspQuery(job=job_id, valid=True if validated else None)
@@ -45,9 +45,9 @@ def job_page(request: Request, job_id: str, jobs: JobsOf, grasps: GraspsOf, tags
         refresh_s=0 if job.state.is_final else 3,
         job=job,
         histograms=[
-            (*shown[data.metric], data, figures.bars(data, "/grasps", where)) for data in grasps.histograms(job)
+            (*shown[data.metric], data, figures.bars(data, "/grasps", where)) for data in grasps.statistics(job)[0]
         ],
-        loss=_loss(jobs.loss_curve(job)),
+        loss=figures.line(loss.iterations, loss.losses, x="iteration", y="Loss", log=True) if loss else None,
         pictures=pictures[:_SHOWN_PICTURES],
         picture_count=len(pictures),
         rows=rows,
@@ -68,7 +68,7 @@ def job_page(request: Request, job_id: str, jobs: JobsOf, grasps: GraspsOf, tags
 Channel = Literal["rgb", "depth", "segmentation", "rgb_hand"]
 
 
-@router.get("/shards/{shard_id}/pictures/{index}.png", dependencies=[Depends(may_read)])
+@router.get("/shards/{shard_id}/pictures/{index}.png", dependencies=READ)
 def picture(
     request: Request,
     shard_id: str,
@@ -77,16 +77,9 @@ def picture(
     channel: Channel = "rgb",
     width: Annotated[int | None, Query(ge=16, le=4096)] = None,
 ) -> Response:
-    """Return one rendered view as PNG: colour, depth or segmentation, at most `width` pixels wide."""
     shard = shards.one(shard_id)
     data = request.app.state.pictures.png(shard.key, shard.sha256, index, channel, width)
     return Response(data, media_type="image/png", headers={"Cache-Control": "private, max-age=86400, immutable"})
-
-
-def _loss(curve: LossCurve | None) -> figures.Plot | None:
-    if curve is None:
-        return None
-    return figures.line(curve.iterations, curve.losses, x="iteration", y="Loss", log=True)
 
 
 def _pictures(job: JobDetail) -> list[dict[str, Any]]:
@@ -125,13 +118,8 @@ class Pictures:
     def __init__(self, store: Store) -> None:
         self._fetch = lru_cache(maxsize=_KEPT_SHARDS)(partial(read_checked, store))
 
-    def png(self, key: str, sha256: str, index: int, channel: Channel = "rgb", width: int | None = None) -> bytes:
-        """Return the picture at row `index` of a channel as PNG, at most `width` pixels wide.
-
-        Raises:
-            NotFoundError: the shard holds fewer pictures, or none of this channel.
-            DamagedShard: its file is missing, or does not match its checksum.
-        """
+    def png(self, key: str, sha256: str, index: int, channel: Channel, width: int | None) -> bytes:
+        """Return the picture at row `index` of a channel as PNG, at most `width` pixels wide."""
         with open_shard(self._fetch(key, sha256), name=key) as file:
             path = f"image/{channel}"
             if path not in file:
@@ -139,7 +127,7 @@ class Pictures:
             pictures = file[path]
             if not 0 <= index < len(pictures):
                 raise NotFoundError(f"the shard holds {len(pictures)} pictures; there is no picture {index}")
-            pixels = _PAINTERS[channel](np.asarray(pictures[index]))
+            pixels = _PAINTERS[channel](pictures[index])
         image = Image.fromarray(pixels)
         if width is not None and width < image.width:
             kind = Image.Resampling.NEAREST if channel == "segmentation" else Image.Resampling.LANCZOS
@@ -168,9 +156,9 @@ def paint_segmentation(labels: NDArray[Any]) -> NDArray[np.uint8]:
     return _CLASSES[np.minimum(labels, len(_CLASSES) - 1)]
 
 
-_PAINTERS: Final = {
-    "rgb": lambda pixels: pixels,
-    "rgb_hand": lambda pixels: pixels,
+_PAINTERS: Final[dict[str, Callable[[Any], NDArray[Any]]]] = {
+    "rgb": np.asarray,
+    "rgb_hand": np.asarray,
     "depth": paint_depth,
     "segmentation": paint_segmentation,
 }

@@ -1,67 +1,284 @@
-"""Dashboard: its pages, the event stream that updates them, problem types, and the session.
+"""Pages of the whole service: home, workers, charts, failure maps, usage, deletions, problem types, and the session.
 
 Sign-in with a key sets a signed cookie, which is valid as long as the key.
 """
 
 from __future__ import annotations
 
+import time
+from collections import defaultdict
 from collections.abc import AsyncIterable
+from datetime import UTC, datetime, timedelta
 from typing import Annotated, Final
 
-from fastapi import APIRouter, Depends, FastAPI, Form, Request
+from fastapi import APIRouter, FastAPI, Form, Query, Request
 from fastapi.responses import HTMLResponse, RedirectResponse
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 
 from graspd.api.access.auth import SESSION_COOKIE
 from graspd.api.access.keys import SESSION_S, KeyFile
 from graspd.api.catalog import events
-from graspd.api.dashboard import dataset_pages, forms, grasp_pages, hand_pages, job_pages, service_pages
+from graspd.api.catalog.datasets import Datasets
+from graspd.api.catalog.overview import MINUTES, Overview
+from graspd.api.dashboard import dataset_pages, figures, forms, grasp_pages, hand_pages, job_pages, tradeoff
 from graspd.api.dashboard.forms import Expectations
 from graspd.api.dashboard.job_pages import Pictures
 from graspd.api.dashboard.rendering import environment, render
-from graspd.api.routes.dependencies import OverviewOf, may_read
-from graspd.service.model.errors import ERRORS
+from graspd.api.models import STAGE_LABELS
+from graspd.api.routes.dependencies import (
+    READ,
+    SUBMIT,
+    DatasetsOf,
+    DeletionsOf,
+    JobsOf,
+    OverviewOf,
+    StoreOf,
+    TagsOf,
+    UsageOf,
+)
+from graspd.api.routes.system import Since, Until
+from graspd.service.index.views import DatasetView, WorkerView
+from graspd.service.model.errors import ERRORS, InputError, UnavailableError
+from graspd.service.model.states import State
 from graspd.service.pipeline.backends import Services
+from graspd.service.store.records import What
+
+PAGE_SIZE: Final = 25
+_LOST_SHOWN: Final = timedelta(minutes=10)
+_DATASETS: Final = 6
+#: Polling interval [s]: a study takes minutes, and no event announces its publication.
+_STUDY_S: Final = 10
 
 router = APIRouter(include_in_schema=False)
 
+
+@router.get("/", dependencies=READ)
+def home(
+    request: Request,
+    overview: OverviewOf,
+    jobs: JobsOf,
+    datasets: DatasetsOf,
+    state: str = "",
+    cursor: Annotated[str | None, Query(max_length=512)] = None,
+) -> HTMLResponse:
+    chosen = State(state) if state in set(State) else None
+    minutes = overview.valid_per_minute()
+    start = time.time() // 60 * 60 - 60 * (MINUTES - 1)
+    return render(
+        request,
+        "home.html",
+        page="/",
+        events="/events",
+        refresh_s=5,
+        chosen=chosen or "",
+        stats=overview.stats(),
+        minutes=minutes,
+        pace=figures.minutes(minutes, start),
+        jobs=jobs.page(state=chosen, limit=PAGE_SIZE, cursor=cursor),
+        stages=stage_depths(overview),
+        workers=[worker for worker in overview.workers() if is_recent(worker)],
+        failures=overview.failures(),
+        datasets=_latest_datasets(datasets),
+        damage=overview.damage(),
+    )
+
+
+@router.get("/workers", dependencies=READ)
+def workers_page(request: Request, overview: OverviewOf) -> HTMLResponse:
+    workers = [worker for worker in overview.workers() if is_recent(worker)]
+    return render(
+        request,
+        "workers.html",
+        page="/workers",
+        events="/events",
+        refresh_s=5,
+        workers=workers,
+        tasks={worker.name: task for worker in workers if (task := overview.task_of(worker)) is not None},
+        busy=sum(worker.state == "busy" for worker in workers),
+        alive=sum(worker.state != "lost" for worker in workers),
+        stages=stage_depths(overview),
+        damage=overview.damage(),
+    )
+
+
+@router.get("/chart", dependencies=READ)
+def chart_page(
+    request: Request, store: StoreOf, y: str = "gsr", lifts: str = "lift", hand: str = "", object: str = ""
+) -> HTMLResponse:
+    measured = tradeoff.load(store)
+    axis = {False: y if y in tradeoff.FREE else "gsr", True: lifts if lifts in tradeoff.IN_SCENES else "lift"}
+    drawn = [tradeoff.draw(one, axis=axis[one.scene is not None], hand=hand, object=object) for one in measured]
+    return render(
+        request,
+        "chart.html",
+        page="/chart",
+        poll_s=_STUDY_S,
+        charts=list(zip(measured, drawn, strict=True)),
+        # For each kind of chart: title, name in the URL, accuracies, and the selected one.
+        choices=[
+            (title, field, axes, axis[in_scene])
+            for title, field, axes, in_scene in (
+                ("Accuracy", "y", tradeoff.FREE, False),
+                ("In scenes", "lifts", tradeoff.IN_SCENES, True),
+            )
+            if any((one.scene is not None) == in_scene for one in measured)
+        ],
+        hands=sorted({run.hand for one in measured for run in one.runs}),
+        objects=sorted({run.object for one in measured for run in one.runs}),
+        hand=hand,
+        object=object,
+    )
+
+
+@router.get("/stability", dependencies=READ)
+def stability_page(request: Request, store: StoreOf) -> HTMLResponse:
+    measured = figures.load(store)
+    return render(
+        request,
+        "stability.html",
+        page="/stability",
+        poll_s=_STUDY_S,
+        measured=measured,
+        maps=[figures.draw(one) for one in measured.maps] if measured else [],
+    )
+
+
+def is_recent(worker: WorkerView) -> bool:
+    """Check whether to show a worker; a lost one remains for a while, so that its loss is noticed."""
+    age = datetime.now(UTC) - datetime.fromisoformat(worker.seen)
+    return worker.state != "lost" or age < _LOST_SHOWN
+
+
+def stage_depths(overview: Overview) -> list[tuple[str, int]]:
+    """Return waiting tasks by stage; empty if Redis does not answer, which the page reports elsewhere."""
+    try:
+        depths = overview.depths()
+    except UnavailableError:
+        return []
+    totals = dict.fromkeys(STAGE_LABELS, 0)
+    for (_, stage), waiting in depths.items():
+        totals[stage] += waiting
+    return [(STAGE_LABELS[stage], waiting) for stage, waiting in totals.items()]
+
+
+def _latest_datasets(datasets: Datasets) -> list[DatasetView]:
+    newest = datasets.page(limit=_DATASETS).items
+    return sorted(newest, key=lambda dataset: dataset.state.is_final)[:4]
+
+
+_SUMMED = ("grasps", "valid", "tasks", "gpu_seconds", "cpu_seconds")
+
+
+@router.get("/usage", dependencies=READ)
+def usage_page(request: Request, usage: UsageOf, since: Since = None, until: Until = None) -> HTMLResponse:
+    days = usage.days(since, until)
+    limits = usage.limits()
+    today = datetime.now(UTC).date().isoformat()
+    totals: dict[str, dict[str, float]] = {name: defaultdict(float) for name in limits}
+    for one in days:
+        total = totals.setdefault(one.project, defaultdict(float))
+        for name in _SUMMED:
+            total[name] += getattr(one, name)
+            if one.day == today:
+                total[f"today_{name}"] += getattr(one, name)
+    return render(
+        request,
+        "usage.html",
+        page="/usage",
+        poll_s=30,
+        days=days,
+        totals=[(name, totals[name], limits.get(name)) for name in sorted(totals)],
+        has_projects=bool(limits) or any(one.project for one in days),
+        csv="/v1/usage.csv" + (f"?{request.url.query}" if request.url.query else ""),
+        since=since or "",
+        until=until or "",
+    )
+
+
+#: Characters of a job's id that its page shows, and that confirm its deletion.
+SHORT_ID = 12
+Typed = Annotated[str, Form(max_length=64)]
+
+
+@router.get("/deleted", dependencies=READ)
+def deleted_page(request: Request, deletions: DeletionsOf, done: str = "") -> HTMLResponse:
+    """Show what can be restored; `done` is the id of the latest deletion."""
+    found = deletions.recent()
+    return render(request, "deleted.html", found=found, just_now=next((one for one in found if one.id == done), None))
+
+
+@router.post("/deleted/{what}/{name}/restore", dependencies=SUBMIT)
+def restore(what: What, name: str, deletions: DeletionsOf) -> RedirectResponse:
+    found = deletions.restore(what, name)
+    pages = {"job": f"/jobs/{found.id}", "dataset": f"/datasets/{found.id}", "hand": f"/hands/{found.name}"}
+    return RedirectResponse(pages.get(what, "/grasps" if what == "tag" else "/deleted"), status_code=303)
+
+
+@router.post("/datasets/{name}/delete", dependencies=SUBMIT)
+def delete_dataset(
+    name: str, datasets: DatasetsOf, typed: Typed = "", with_snapshots: Annotated[bool, Form()] = False
+) -> RedirectResponse:
+    _confirmed(typed, name)
+    datasets.delete(name, with_snapshots=with_snapshots)
+    return _deleted(name)
+
+
+@router.post("/jobs/{job_id}/delete", dependencies=SUBMIT)
+def delete_job(job_id: str, jobs: JobsOf, typed: Typed = "") -> RedirectResponse:
+    _confirmed(typed, job_id, job_id[:SHORT_ID])
+    jobs.delete(job_id)
+    return _deleted(job_id)
+
+
+@router.post("/tags/{name}/delete", dependencies=SUBMIT)
+def delete_tag(name: str, tags: TagsOf, typed: Typed = "") -> RedirectResponse:
+    _confirmed(typed, name)
+    tag = tags.one(name)
+    tags.remove(name)
+    return _deleted(tag.id)
+
+
+def _confirmed(typed: str, *names: str) -> None:
+    if typed.strip() not in names:
+        raise InputError(f"nothing was deleted: to confirm it, type {names[-1]}")
+
+
+def _deleted(id: str) -> RedirectResponse:
+    return RedirectResponse(f"/deleted?done={id}", status_code=303)
+
+
 #: Routers of all pages, in matching order.
 routers: Final = (
-    service_pages.router,
+    router,
     job_pages.router,
     grasp_pages.router,
     hand_pages.router,
     dataset_pages.router,
     dataset_pages.comparison_router,
     forms.router,
-    router,
 )
 
 
 def install(app: FastAPI, services: Services) -> None:
-    """Set up what the pages need from the application, besides their routes."""
     app.state.templates = environment()
     app.state.pictures = Pictures(services.store)
     app.state.expectations = Expectations(services.index)
 
 
-@router.get("/events", dependencies=[Depends(may_read)], response_class=EventSourceResponse)
+@router.get("/events", dependencies=READ, response_class=EventSourceResponse)
 async def watch(request: Request, overview: OverviewOf) -> AsyncIterable[ServerSentEvent]:
-    """Stream an event whenever something on the home page has changed."""
     async for event in events.service_events(overview, request):
         yield event
 
 
-@router.get("/docs", dependencies=[Depends(may_read)])
+@router.get("/docs", dependencies=READ)
 def explorer(request: Request) -> HTMLResponse:
-    """Show every route, with a form to try it."""
     return render(request, "explorer.html")
 
 
 @router.get("/problems")
 @router.get("/problems/{slug}")
 def problem_types(request: Request, slug: str = "") -> HTMLResponse:
-    """Explain the types of problem documents."""
     types = [(name, error.status, (error.__doc__ or "").splitlines()[0]) for name, error in ERRORS.items()]
     types += [(name, status, text) for name, (status, text) in _HTTP_PROBLEMS.items()]
     return render(request, "problems.html", types=sorted(types, key=lambda row: (row[1], row[0])))
@@ -80,7 +297,6 @@ _HTTP_PROBLEMS: Final = {
 
 @router.get("/login")
 def login_page(request: Request) -> HTMLResponse:
-    """Show the form for the key; in a session, its key and the button to sign out."""
     key = request.scope["state"].get("key") if SESSION_COOKIE in request.cookies else None
     return render(request, "login.html", problem="", health=None, session=key.name if key else "")
 
@@ -95,7 +311,6 @@ def logout(request: Request) -> RedirectResponse:
 
 @router.post("/login", response_model=None)
 def login(request: Request, key: Annotated[str, Form(max_length=200)]) -> HTMLResponse | RedirectResponse:
-    """Exchange a key for a cookie."""
     keys: KeyFile = request.app.state.keys
     found = keys.find(key.strip())
     if found is None:

@@ -45,16 +45,9 @@ def environment() -> Environment:
 
 
 def render(request: Request, template: str, *, status: int = 200, **context: Any) -> HTMLResponse:
-    """Render a page. `page` is its place in the navigation, `events` the stream that updates it.
-
-    `poll_s` is the interval of updates without a stream [s]."""
-    context = {
-        "page": "",
-        "events": "",
-        "refresh_s": 0,
-        "poll_s": 0,
-        "health": request.app.state.overview.health(),
-    } | context
+    """Render a page: its navigation entry `page`, the stream `events` that updates it, or an interval `poll_s` [s]."""
+    defaults = {"page": "", "events": "", "refresh_s": 0, "poll_s": 0, "health": request.app.state.overview.health()}
+    context = defaults | context
     context |= {
         "navigation": NAVIGATION if request.app.state.keys.is_open else NAVIGATION + _WITH_KEYS,
         "version": PACKAGE_VERSION,
@@ -75,19 +68,17 @@ def base_url(request: Request) -> str:
 
 
 def problem_page(request: Request, problem: dict[str, Any]) -> Response:
-    """Show an error; without a key, redirect to the sign-in."""
     if problem["status"] == 401:
         return RedirectResponse("/login", status_code=303)
     return render(request, "problem.html", status=problem["status"], problem=problem, health=None)
 
 
 def loader(job: JobDetail, base_url: str) -> str:
-    """Return Python code that fetches the job's grasps; empty while there are none."""
     if not any(shard.kind == "base" for shard in job.shards):
         return ""
     return f"""import graspd  # pip install 'graspd[api]'
 
-with graspd.Client("{base_url.rstrip("/")}") as client:  # key="..." where the service asks for one
+with graspd.Client("{base_url}") as client:  # key="..." where the service asks for one
     grasps = client.job("{job.id}").grasps()
 best = grasps.valid().top("epsilon", 10)
 best.hand_pose        # (N, 7) x y z [m], quaternion w x y z
@@ -96,17 +87,13 @@ print(grasps)"""
 
 
 def curl(job: JobDetail, base_url: str) -> str:
-    """Return shell commands that download every shard on the job's page."""
-    base = base_url.rstrip("/")
-    lines = [f"curl -fL -o {shard.kind}-{shard.batch:04}.h5 {base}{shard.file}" for shard in job.shards]
-    return "\n".join(lines)
+    return "\n".join(f"curl -fL -o {shard.kind}-{shard.batch:04}.h5 {base_url}{shard.file}" for shard in job.shards)
 
 
 def grasp_loader(grasp: GraspDetail, base_url: str) -> str:
-    """Return Python code that fetches one grasp of a shard."""
     return f"""import graspd  # pip install 'graspd[api]'
 
-with graspd.Client("{base_url.rstrip("/")}") as client:  # key="..." where the service asks for one
+with graspd.Client("{base_url}") as client:  # key="..." where the service asks for one
     grasp = client.shard("{grasp.shard_id}")[{grasp.row}]
 grasp.hand_pose  # (7,) x y z [m], quaternion w x y z
 grasp.joints     # position of each joint by its name, rad or m"""

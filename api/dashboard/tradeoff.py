@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel
 
 from graspd.service.model.errors import DamagedError
 from graspd.service.model.scene_spec import SceneSpec
@@ -60,8 +60,6 @@ IN_SCENES: Final[dict[str, Axis]] = {
 class Run(BaseModel):
     """One method at one fidelity on one hand and object; in scenes, planned there or filtered afterwards."""
 
-    model_config = ConfigDict(extra="ignore")
-
     method: str
     fidelity: str
     hand: str
@@ -90,7 +88,6 @@ class Run(BaseModel):
 
     @property
     def label(self) -> str:
-        """Name with the fidelity, if the method has any."""
         return self.name if self.fidelity == _NO_FIDELITY else f"{self.name} {self.fidelity}"
 
     @property
@@ -100,7 +97,6 @@ class Run(BaseModel):
 
     @property
     def seconds(self) -> float:
-        """Their time, end to end."""
         return sum(self.end_seconds) if isinstance(self.end_seconds, list) else self.end_seconds or 0.0
 
     @property
@@ -112,8 +108,6 @@ class Run(BaseModel):
 class Measured(BaseModel):
     """Results of one `graspd chart`."""
 
-    model_config = ConfigDict(extra="ignore")
-
     runs: list[Run]
     created: str | None = None
     device: str | None = None
@@ -121,12 +115,10 @@ class Measured(BaseModel):
 
     @property
     def axes(self) -> dict[str, Axis]:
-        """Accuracies that it may contain."""
         return IN_SCENES if self.scene else FREE
 
     @property
     def counted(self) -> str:
-        """Grasps that its speeds count."""
         return "lifted" if self.scene else "valid"
 
 
@@ -145,16 +137,13 @@ class Point:
     y: float = 0.0
     label_y: float = 0.0
     is_left: bool = False
-    """Whether its label is on the left."""
     series: int = 0
 
     @property
     def label(self) -> tuple[str, str]:
-        """Method and fidelity as text of the label."""
         return self.method, "" if self.fidelity == _NO_FIDELITY else self.fidelity
 
     def label_box(self, move: float, *, is_left: bool) -> tuple[float, float, float, float]:
-        """Left, top, right and bottom of its label."""
         width = _LETTER * len(" ".join(self.label))
         start = self.x - _AWAY - width if is_left else self.x + _AWAY
         return start, self.y + move - _LINE / 2, start + width, self.y + move + _LINE / 2
@@ -186,7 +175,7 @@ def load(store: Store) -> list[Measured]:
 
 
 def draw(measured: Measured, *, axis: str, hand: str = "", object: str = "") -> Drawing:
-    """Draw points of every method and fidelity over the runs of a hand and an object (empty: all)."""
+    """Draw every method and fidelity over the runs of a hand and an object (empty: all)."""
     shown = measured.axes[axis]
     chosen = [run for run in measured.runs if hand in ("", run.hand) and object in ("", run.object)]
     names = sorted({run.name for run in measured.runs})
@@ -196,12 +185,8 @@ def draw(measured: Measured, *, axis: str, hand: str = "", object: str = "") -> 
     front = pareto([(p.speed, p.accuracy if shown.more_is_better else -p.accuracy) for p in points])
     across, x_ticks = _logarithmic([point.speed for point in points])
     up, y_ticks = _linear([point.accuracy for point in points], top=100.0 if shown.unit == "%" else None)
-    placed = _labelled(
-        [
-            replace(point, on_front=index in front, x=across(point.speed), y=up(point.accuracy))
-            for index, point in enumerate(points)
-        ]
-    )
+    shown_at = (replace(p, on_front=n in front, x=across(p.speed), y=up(p.accuracy)) for n, p in enumerate(points))
+    placed = _labelled(list(shown_at))
     line = " ".join(f"{point.x:.1f},{point.y:.1f}" for point in placed if point.on_front)
     nothing = [group[0].label for group in _groups(chosen) if not _speed(group)]
     return Drawing(placed, line, x_ticks, y_ticks, shown, nothing)

@@ -20,12 +20,13 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from graspd.api.formatting import host_name
 from graspd.api.metrics import Metrics
-from graspd.api.problems import ApiError, answer, log_unforeseen
+from graspd.api.problems import ApiError, answer
 from graspd.service import telemetry
 from graspd.service.model.errors import GraspdError
 from graspd.service.telemetry import bind
 
 _access = logging.getLogger("graspd.access")
+_log = logging.getLogger("graspd.api")
 #: Paths that monitoring requests every few seconds.
 _QUIET: Final = ("/static/", "/healthz", "/readyz", "/metrics")
 
@@ -34,13 +35,9 @@ SAFE_METHODS: Final = frozenset({"GET", "HEAD", "OPTIONS"})
 _METHODS: Final = SAFE_METHODS | {"POST", "PUT", "PATCH", "DELETE"}
 _REQUEST_ID: Final = re.compile(r"[A-Za-z0-9._-]{1,64}")
 
-CONTENT_SECURITY_POLICY: Final = (
-    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; font-src 'self'; "
-    "connect-src 'self'; form-action 'self'; frame-ancestors 'none'; base-uri 'none'"
-)
-
 _SECURITY_HEADERS: Final = {
-    "Content-Security-Policy": CONTENT_SECURITY_POLICY,
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; "
+    "font-src 'self'; connect-src 'self'; form-action 'self'; frame-ancestors 'none'; base-uri 'none'",
     "X-Content-Type-Options": "nosniff",
     "X-Frame-Options": "DENY",
     "Referrer-Policy": "same-origin",
@@ -50,20 +47,32 @@ _SECURITY_HEADERS: Final = {
 }
 
 
-class RequestContext:
+class HttpMiddleware:
+    """Middleware of HTTP requests; the start and the end of the application pass it."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self.app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        await (self.handle if scope["type"] == "http" else self.app)(scope, receive, send)
+
+    async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
+        raise NotImplementedError
+
+
+class RequestContext(HttpMiddleware):
     """Outermost middleware: sets the request id, times the request, reports unexpected errors as problems."""
 
     def __init__(self, app: ASGIApp, *, metrics: Metrics) -> None:
-        self.app = app
+        super().__init__(app)
         self.metrics = metrics
 
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http":
-            await self.app(scope, receive, send)
-            return
-        request_id = _request_id(Headers(scope=scope).get("x-request-id"))
+    async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
+        headers = Headers(scope=scope)
+        given = headers.get("x-request-id", "")
+        request_id = given if _REQUEST_ID.fullmatch(given) else uuid.uuid4().hex[:16]
         scope.setdefault("state", {})["request_id"] = request_id
-        parent = Headers(scope=scope).get("traceparent", "")
+        parent = headers.get("traceparent", "")
         with telemetry.span(f"HTTP {_method(scope)}", parent=parent, request=request_id) as facts:
             with bind(request=request_id, traceparent=telemetry.traceparent()):
                 await self._answer(scope, receive, send, request_id)
@@ -91,16 +100,14 @@ class RequestContext:
             await self.app(scope, receive, with_headers)
         except Exception as error:
             if not isinstance(error, GraspdError):
-                log_unforeseen(scope["path"], request_id, error)
+                _log.error("request %s on %s failed", request_id, scope["path"], exc_info=error)
             if status:
                 raise
-            answered = getattr(scope["app"].state, "answer_error", answer) if "app" in scope else answer
-            await answered(Request(scope), error)(scope, receive, with_headers)
+            await scope["app"].state.answer_error(Request(scope), error)(scope, receive, with_headers)
         finally:
             self._note(scope, status, time.perf_counter() - started)
 
     def _note(self, scope: Scope, status: int, seconds: float) -> None:
-        """Count the answer and write its log line."""
         route = _route(scope)
         self.metrics.observe(_method(scope), route, status, seconds)
         level = logging.DEBUG if scope["path"].startswith(_QUIET) else logging.INFO
@@ -119,18 +126,13 @@ def _route(scope: Scope) -> str:
     return getattr(scope.get("route"), "path", "unmatched")
 
 
-def _request_id(given: str | None) -> str:
-    return given if given and _REQUEST_ID.fullmatch(given) else uuid.uuid4().hex[:16]
-
-
-class Head:
+class Head(HttpMiddleware):
     """Answers HEAD as GET if no route handles HEAD itself."""
 
-    def __init__(self, app: ASGIApp) -> None:
-        self.app = app
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http" or scope["method"] != "HEAD" or _is_taken(scope):
+    async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["method"] != "HEAD" or any(
+            route.matches(dict(scope))[0] is Match.FULL for route in scope["app"].routes
+        ):
             await self.app(scope, receive, send)
             return
 
@@ -156,30 +158,19 @@ class Head:
             scope["method"], scope["headers"] = "HEAD", headers
 
 
-def _is_taken(scope: Scope) -> bool:
-    return any(route.matches(dict(scope))[0] is Match.FULL for route in scope["app"].routes)
-
-
 #: Attribute whose value is an address on this host. Text from users contains no quotes in a page.
 _ADDRESS: Final = re.compile(r'(?<=\s)((?:href|src|action|formaction|hx-[a-z-]+|data-[a-z-]+)=")(?=/(?!/))')
 _COOKIE_PATH: Final = re.compile(r";\s*Path=/(?=;|$)", re.IGNORECASE)
 
 
-class RootPath:
-    """Removes the prefix from paths and adds it to `Location` and to cookie paths.
-
-    Args:
-        prefix: such as `/graspd`.
-    """
+class RootPath(HttpMiddleware):
+    """Removes a prefix such as `/graspd` from paths and adds it to `Location` and to cookie paths."""
 
     def __init__(self, app: ASGIApp, *, prefix: str) -> None:
-        self.app = app
+        super().__init__(app)
         self.prefix = prefix
 
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http":
-            await self.app(scope, receive, send)
-            return
+    async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["path"] == self.prefix or scope["path"].startswith(f"{self.prefix}/"):
             scope = {**scope, "path": scope["path"].removeprefix(self.prefix) or "/"}
             if raw := scope.get("raw_path"):
@@ -211,25 +202,20 @@ def with_prefix(page: str, prefix: str) -> str:
     return _ADDRESS.sub(rf"\g<1>{prefix}", page) if prefix else page
 
 
-class SameOrigin:
+class SameOrigin(HttpMiddleware):
     """Refuses requests that a page of another site triggers in a visitor's browser.
 
     A browser sends the page that a request comes from (Sec-Fetch-Site, Origin); other clients do not. While no keys
     exist, only names of this machine are accepted as host, which prevents DNS rebinding.
-
-    Args:
-        allowed_hosts: host names that the service answers to; None: any.
     """
 
     def __init__(self, app: ASGIApp, *, allowed_hosts: frozenset[str] | None) -> None:
-        self.app = app
+        super().__init__(app)
         self.allowed_hosts = allowed_hosts
 
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] == "http" and (error := self._refusal(scope)) is not None:
-            await answer(Request(scope), error)(scope, receive, send)
-            return
-        await self.app(scope, receive, send)
+    async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
+        error = self._refusal(scope)
+        await (answer(Request(scope), error) if error else self.app)(scope, receive, send)
 
     def _refusal(self, scope: Scope) -> ApiError | None:
         headers = Headers(scope=scope)
@@ -248,7 +234,6 @@ class SameOrigin:
 
 
 def _place(origin: str) -> str | None:
-    """Return host and port of an origin; None if it is no valid address."""
     try:
         return urlsplit(origin).netloc
     except ValueError:

@@ -9,22 +9,22 @@ from functools import cache
 from threading import BoundedSemaphore
 from typing import Annotated, Final
 
-from fastapi import APIRouter, Depends, Form, Query, Request, Response, UploadFile
+from fastapi import APIRouter, Form, Query, Request, Response, UploadFile
 from pydantic import Field
 from starlette.datastructures import UploadFile as AnyUpload
 
 from graspd.api.catalog.assets import Assets
 from graspd.api.problems import responses
 from graspd.api.routes.dependencies import (
+    READ,
+    SUBMIT,
     UPLOADS,
     AssetsOf,
     Cursor,
     Limit,
+    Paging,
     RequestLimiter,
     is_known,
-    link_next,
-    may_read,
-    may_submit,
 )
 from graspd.api.uploads import files_of_upload, name_of_upload
 from graspd.service.index.views import AssetView, Page
@@ -39,7 +39,6 @@ _AT_ONCE: Final = BoundedSemaphore(UPLOADS)
 _TURN_S: Final = 20.0
 
 _ZIPPED: Final = "Upload a file, or a ZIP of its folder. It is checked by a worker before the first job uses it."
-#: OpenAPI responses of an upload.
 _ADDED: Final = {
     AssetKind.HAND: _ZIPPED,
     AssetKind.OBJECT: _ZIPPED,
@@ -52,7 +51,7 @@ def asset_router(kind: AssetKind) -> APIRouter:
     """Create the routes of one kind of asset."""
     router = APIRouter(prefix=f"/v1/{kind.value}s", tags=[f"{kind.value}s"])
 
-    @router.get("", dependencies=[Depends(may_read)], responses=responses(401, 403, 422, 503), name=f"list_{kind}s")
+    @router.get("", dependencies=READ, name=f"list_{kind}s")
     def list_assets(
         request: Request,
         response: Response,
@@ -63,24 +62,21 @@ def asset_router(kind: AssetKind) -> APIRouter:
     ) -> Page[AssetView]:
         """List all of them, newest first; refused ones only on request."""
         page = assets.page(kind, limit=limit, cursor=cursor, refused=refused)
-        link_next(request, response, page.next)
-        return page
+        return Paging(request, response, limit, cursor).linked(page)
 
-    @router.get(
-        "/{name}", dependencies=[Depends(may_read)], responses=responses(401, 403, 404, 503), name=f"get_{kind}"
-    )
+    @router.get("/{name}", dependencies=READ, responses=responses(404), name=f"get_{kind}")
     def get_asset(name: str, assets: AssetsOf) -> AssetView:
         """Return one of them, with the findings of its check."""
         return assets.one(kind, name)
 
     if kind is not AssetKind.NETWORK:
-        _add_model_routes(router, kind)
+        _add_model_route(router, kind)
 
     @router.post(
         "",
         status_code=201 if kind is AssetKind.NETWORK else 202,
-        dependencies=[Depends(may_submit)],
-        responses=responses(400, 401, 403, 409, 413, 422, 503),
+        dependencies=SUBMIT,
+        responses=responses(400, 409),
         name=f"add_{kind}",
         description=_ADDED[kind],
     )
@@ -102,33 +98,19 @@ def asset_router(kind: AssetKind) -> APIRouter:
             bool, Form(description="whether the next free name is given where the name stands for something else")
         ] = False,
     ) -> AssetView:
-        limit = request.app.state.settings.max_upload_bytes
         uploads: RequestLimiter = request.app.state.uploads
         if self_test and kind is not AssetKind.HAND:
             raise InputError("self_test: only a hand can be tried")
-        asset = await uploads.run(
-            store_upload,
-            assets,
-            kind,
-            file,
-            name,
-            limit_bytes=limit,
-            options=options,
-            self_test=self_test,
-            shared=shared,
-            rename=rename,
-        )
+        said = {"options": options, "self_test": self_test, "shared": shared, "rename": rename}
+        limit = request.app.state.settings.max_upload_bytes
+        asset = await uploads.run(store_upload, assets, kind, file, name, limit_bytes=limit, **said)
         response.headers["Location"] = f"/v1/{kind.value}s/{asset.name}"
         if asset.verdict is None:
             response.headers["Retry-After"] = "1"
         return asset
 
     @router.delete(
-        "/{name}",
-        status_code=204,
-        dependencies=[Depends(may_submit)],
-        responses=responses(401, 403, 404, 409, 503),
-        name=f"delete_{kind}",
+        "/{name}", status_code=204, dependencies=SUBMIT, responses=responses(404, 409), name=f"delete_{kind}"
     )
     def delete_asset(name: str, assets: AssetsOf) -> None:
         """Delete it; refused while a job, a dataset or a set of objects needs it. `name` may be a digest."""
@@ -137,18 +119,13 @@ def asset_router(kind: AssetKind) -> APIRouter:
     return router
 
 
-def _add_model_routes(router: APIRouter, kind: AssetKind) -> None:
-    """Add routes of models for viewers; networks have no shape."""
-
+def _add_model_route(router: APIRouter, kind: AssetKind) -> None:
     @router.get(
         "/{name}/model",
-        dependencies=[Depends(may_read)],
+        dependencies=READ,
         response_class=Response,
         responses=responses(
-            401,
-            403,
             404,
-            503,
             others={
                 200: {"content": {_GLB: {}}, "description": "Binary glTF"},
                 304: {"description": "What If-None-Match names is this file"},
@@ -176,28 +153,20 @@ def store_upload(
     *,
     limit_bytes: int,
     options: str = "",
-    self_test: bool = False,
-    shared: bool = False,
-    rename: bool = False,
+    **said: bool,
 ) -> AssetView:
     """Store an asset of immutable content and its check task. Until then the upload is a temporary file.
 
-    Raises:
-        RateError: too many uploads are in progress; their number bounds the memory they use.
+    `said`: `self_test`, `shared` and `rename`, as in `Assets.add`. The number of uploads bounds the memory they use.
     """
     filename = file.filename or ""
     with _one_of_few():
         files = files_of_upload(kind, filename, file.file, limit_bytes=limit_bytes, options=options)
-        named = name or name_of_upload(filename)
-        return assets.add(kind, named, files, self_test=self_test, shared=shared, rename=rename)
+        return assets.add(kind, name or name_of_upload(filename), files, **said)
 
 
 def store_correction(assets: Assets, name: str, corrections: HandCorrections, new_name: str | None) -> AssetView:
-    """Store a corrected hand and its check task; it counts as an upload.
-
-    Raises:
-        RateError: too many uploads are in progress.
-    """
+    """Store a corrected hand and its check task; it counts as an upload."""
     with _one_of_few():
         return assets.correct(name, corrections, new_name or "")
 
@@ -221,12 +190,7 @@ class CorrectionRequest(HandCorrections):
     name: Name | None = Field(None, description="of the corrected hand; default: the hand's name with the next number")
 
 
-@correction_router.post(
-    "/{name}/corrections",
-    status_code=202,
-    dependencies=[Depends(may_submit)],
-    responses=responses(400, 401, 403, 404, 409, 413, 422, 429, 503),
-)
+@correction_router.post("/{name}/corrections", status_code=202, dependencies=SUBMIT, responses=responses(400, 404, 409))
 async def correct_hand(
     name: str, body: CorrectionRequest, request: Request, response: Response, assets: AssetsOf
 ) -> AssetView:

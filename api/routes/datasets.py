@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Depends, Path, Query, Request, Response
+from fastapi import APIRouter, Path, Query, Response
 from pydantic import BaseModel, ConfigDict, Field
 from starlette.routing import Route
 from starlette.types import Receive, Scope, Send
 
 from graspd.api.problems import ApiError, responses
-from graspd.api.routes.dependencies import Cursor, DatasetsOf, Limit, link_next, may_read, may_submit
+from graspd.api.routes.dependencies import READ, SUBMIT, DatasetsOf, PagingOf
 from graspd.service.index.views import CellView, DatasetView, ObjectSetView, Page, SnapshotView
 from graspd.service.model.domain import Name
 from graspd.service.model.records import Snapshot
@@ -36,12 +36,7 @@ class ObjectSetRequest(BaseModel):
     objects: Names = Field(min_length=1, max_length=100_000)
 
 
-@router.post(
-    "",
-    status_code=202,
-    dependencies=[Depends(may_submit)],
-    responses=responses(400, 401, 403, 404, 409, 413, 422, 503, others=_ENDED),
-)
+@router.post("", status_code=202, dependencies=SUBMIT, responses=responses(400, 404, 409, others=_ENDED))
 def create_dataset(body: DatasetRequest, response: Response, datasets: DatasetsOf) -> DatasetView:
     """Create a dataset. The same name and content give the same dataset; existing results are reused."""
     dataset = datasets.create(body)
@@ -50,7 +45,7 @@ def create_dataset(body: DatasetRequest, response: Response, datasets: DatasetsO
     return _placed(dataset, response)
 
 
-@router.post("/estimate", dependencies=[Depends(may_read)], responses=responses(400, 401, 403, 404, 413, 422, 503))
+@router.post("/estimate", dependencies=READ, responses=responses(400, 404))
 def estimate_dataset(body: Matrix, datasets: DatasetsOf) -> Estimate:
     """Estimate a dataset's time for 1, 8 and 64 workers, storage and network. Nothing is recorded."""
     return datasets.estimate(body)
@@ -67,57 +62,37 @@ class _NoDataset:
 router.routes.append(Route("/v1/datasets/estimate", _NoDataset(), include_in_schema=False))
 
 
-@router.get("", dependencies=[Depends(may_read)], responses=responses(401, 403, 422, 503))
-def list_datasets(
-    request: Request, response: Response, datasets: DatasetsOf, limit: Limit = 50, cursor: Cursor = None
-) -> Page[DatasetView]:
+@router.get("", dependencies=READ)
+def list_datasets(datasets: DatasetsOf, paging: PagingOf) -> Page[DatasetView]:
     """List datasets, newest first."""
-    page = datasets.page(limit=limit, cursor=cursor)
-    link_next(request, response, page.next)
-    return page
+    return paging.linked(datasets.page(limit=paging.limit, cursor=paging.cursor))
 
 
-@router.get("/{name}", dependencies=[Depends(may_read)], responses=responses(401, 403, 404, 503))
+@router.get("/{name}", dependencies=READ, responses=responses(404))
 def get_dataset(name: DatasetName, datasets: DatasetsOf) -> DatasetView:
     """Return a dataset's numbers: cells by state, grasps, progress, time, bytes."""
     return datasets.one(name)
 
 
-@router.get("/{name}/cells", dependencies=[Depends(may_read)], responses=responses(401, 403, 404, 422, 503))
-def list_cells(
-    name: DatasetName,
-    request: Request,
-    response: Response,
-    datasets: DatasetsOf,
-    state: State | None = None,
-    limit: Limit = 50,
-    cursor: Cursor = None,
-) -> Page[CellView]:
+@router.get("/{name}/cells", dependencies=READ, responses=responses(404))
+def list_cells(name: DatasetName, datasets: DatasetsOf, paging: PagingOf, state: State | None = None) -> Page[CellView]:
     """List each cell (hand x object) with its job, state, yield and failures, ordered by hand."""
-    page = datasets.cells(name, state=state, limit=limit, cursor=cursor)
-    link_next(request, response, page.next)
-    return page
+    return paging.linked(datasets.cells(name, state=state, limit=paging.limit, cursor=paging.cursor))
 
 
-@router.post(
-    "/{name}/cancel", status_code=202, dependencies=[Depends(may_submit)], responses=responses(401, 403, 404, 409, 503)
-)
+@router.post("/{name}/cancel", status_code=202, dependencies=SUBMIT, responses=responses(404, 409))
 def cancel_dataset(name: DatasetName, response: Response, datasets: DatasetsOf) -> DatasetView:
     """Cancel a dataset and its unfinished jobs; results remain, and jobs of other datasets continue."""
     return _placed(datasets.cancel(name), response)
 
 
-@router.post(
-    "/{name}/retry", status_code=202, dependencies=[Depends(may_submit)], responses=responses(401, 403, 404, 409, 503)
-)
+@router.post("/{name}/retry", status_code=202, dependencies=SUBMIT, responses=responses(404, 409))
 def retry_dataset(name: DatasetName, response: Response, datasets: DatasetsOf) -> DatasetView:
     """Restart failed and cancelled cells; existing results are not made again."""
     return _placed(datasets.retry(name), response)
 
 
-@router.delete(
-    "/{name}", status_code=204, dependencies=[Depends(may_submit)], responses=responses(401, 403, 404, 409, 422, 503)
-)
+@router.delete("/{name}", status_code=204, dependencies=SUBMIT, responses=responses(404, 409))
 def delete_dataset(
     name: DatasetName,
     datasets: DatasetsOf,
@@ -135,9 +110,9 @@ def delete_dataset(
 @router.post(
     "/{name}/snapshots",
     status_code=201,
-    dependencies=[Depends(may_submit)],
+    dependencies=SUBMIT,
     responses=responses(
-        401, 403, 404, 409, 503, others={200: {"model": SnapshotView, "description": "There was one of these shards"}}
+        404, 409, others={200: {"model": SnapshotView, "description": "There was one of these shards"}}
     ),
 )
 def take_snapshot(name: DatasetName, response: Response, datasets: DatasetsOf) -> SnapshotView:
@@ -149,32 +124,19 @@ def take_snapshot(name: DatasetName, response: Response, datasets: DatasetsOf) -
     return SnapshotView(**taken.model_dump(exclude={"shards", "version", "dataset_digest"}), shards=len(taken.shards))
 
 
-@router.get("/{name}/snapshots", dependencies=[Depends(may_read)], responses=responses(401, 403, 404, 422, 503))
-def list_snapshots(
-    name: DatasetName,
-    request: Request,
-    response: Response,
-    datasets: DatasetsOf,
-    limit: Limit = 50,
-    cursor: Cursor = None,
-) -> Page[SnapshotView]:
+@router.get("/{name}/snapshots", dependencies=READ, responses=responses(404))
+def list_snapshots(name: DatasetName, datasets: DatasetsOf, paging: PagingOf) -> Page[SnapshotView]:
     """List snapshots of a dataset, newest first."""
-    page = datasets.snapshots(name, limit=limit, cursor=cursor)
-    link_next(request, response, page.next)
-    return page
+    return paging.linked(datasets.snapshots(name, limit=paging.limit, cursor=paging.cursor))
 
 
-@router.get(
-    "/{name}/snapshots/{digest}", dependencies=[Depends(may_read)], responses=responses(401, 403, 404, 422, 503)
-)
+@router.get("/{name}/snapshots/{digest}", dependencies=READ, responses=responses(404))
 def get_snapshot(name: DatasetName, digest: SnapshotDigest, datasets: DatasetsOf) -> Snapshot:
     """Return a snapshot with its list of shards and their checksums."""
     return datasets.snapshot(name, digest)
 
 
-@sets_router.post(
-    "", status_code=201, dependencies=[Depends(may_submit)], responses=responses(400, 401, 403, 404, 409, 413, 422, 503)
-)
+@sets_router.post("", status_code=201, dependencies=SUBMIT, responses=responses(400, 404, 409))
 def add_object_set(body: ObjectSetRequest, response: Response, datasets: DatasetsOf) -> ObjectSetView:
     """Name a set of objects. Its owner or an admin may store other objects as the set's next version."""
     found = datasets.add_object_set(body.name, body.objects)
@@ -182,13 +144,13 @@ def add_object_set(body: ObjectSetRequest, response: Response, datasets: Dataset
     return found
 
 
-@sets_router.get("", dependencies=[Depends(may_read)], responses=responses(401, 403, 503))
+@sets_router.get("", dependencies=READ)
 def list_object_sets(datasets: DatasetsOf) -> list[ObjectSetView]:
     """List the newest version of each set, by name."""
     return datasets.object_sets()
 
 
-@sets_router.get("/{name}", dependencies=[Depends(may_read)], responses=responses(401, 403, 404, 503))
+@sets_router.get("/{name}", dependencies=READ, responses=responses(404))
 def get_object_set(name: DatasetName, datasets: DatasetsOf) -> ObjectSetView:
     """Return the newest version of a set."""
     return datasets.object_set(name)

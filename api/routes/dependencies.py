@@ -1,10 +1,11 @@
-"""Dependencies of routes: services, permissions, page links, threads, conditions (RFC 9110 §13)."""
+"""Dependencies of routes: services, permissions, pages, threads, conditions (RFC 9110 §13)."""
 
 from __future__ import annotations
 
 import asyncio
 import re
 from collections.abc import Callable, Coroutine
+from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any, Final, TypeVar
 
@@ -13,25 +14,22 @@ from fastapi import Depends, FastAPI, Query, Request, Response
 from starlette.datastructures import Headers
 
 from graspd.api.access.auth import authorize
-from graspd.api.access.idempotency import Idempotency
 from graspd.api.access.keys import Scope
-from graspd.api.access.quotas import Quotas, unfinished
+from graspd.api.access.quotas import Idempotency, Quotas, unfinished
 from graspd.api.catalog.assets import Assets
-from graspd.api.catalog.datasets import Comparisons, Datasets
-from graspd.api.catalog.deletions import Deletions
+from graspd.api.catalog.datasets import Datasets
 from graspd.api.catalog.events import Webhooks
-from graspd.api.catalog.grasp_exports import GraspExports
 from graspd.api.catalog.grasps import Grasps
-from graspd.api.catalog.jobs import Jobs
-from graspd.api.catalog.overview import Overview, Usage
-from graspd.api.catalog.shards import Shards
-from graspd.api.catalog.tags import Tags
+from graspd.api.catalog.jobs import Jobs, Shards
+from graspd.api.catalog.overview import Deletions, Overview, Usage
+from graspd.api.catalog.tags import GraspExports, Tags
+from graspd.service.index.views import Page
 from graspd.service.model.errors import UnavailableError
 from graspd.service.pipeline.backends import Services
 from graspd.service.queue.connection import connect, redis_url
 from graspd.service.store.store import Store
 
-MAX_LIMIT = 200
+T = TypeVar("T")
 
 
 def provide(app: FastAPI, services: Services) -> None:
@@ -49,7 +47,6 @@ def provide(app: FastAPI, services: Services) -> None:
     state.grasps, state.shards = Grasps(services), Shards(services)
     state.jobs = Jobs(services, quotas, Idempotency(redis), state.grasps, state.shards)
     state.datasets, state.assets = Datasets(services, quotas), Assets(services)
-    state.comparisons = Comparisons(services, state.datasets)
     state.overview, state.usage = Overview(services, state.jobs), Usage(services, state.keys)
     state.webhooks, state.tags = Webhooks(services), Tags(services, state.grasps)
     state.deletions = Deletions(services)
@@ -62,6 +59,10 @@ def may_read(request: Request) -> None:
 
 def may_submit(request: Request) -> None:
     authorize(request, Scope.SUBMIT)
+
+
+READ: Final = [Depends(may_read)]
+SUBMIT: Final = [Depends(may_submit)]
 
 
 def may_scrape(request: Request) -> None:
@@ -80,7 +81,6 @@ def _provided(name: str) -> Callable[[Request], Coroutine[Any, Any, Any]]:
 
 JobsOf = Annotated[Jobs, Depends(_provided("jobs"))]
 DatasetsOf = Annotated[Datasets, Depends(_provided("datasets"))]
-ComparisonsOf = Annotated[Comparisons, Depends(_provided("comparisons"))]
 AssetsOf = Annotated[Assets, Depends(_provided("assets"))]
 GraspsOf = Annotated[Grasps, Depends(_provided("grasps"))]
 ShardsOf = Annotated[Shards, Depends(_provided("shards"))]
@@ -91,14 +91,31 @@ ExportsOf = Annotated[GraspExports, Depends(_provided("grasp_exports"))]
 DeletionsOf = Annotated[Deletions, Depends(_provided("deletions"))]
 WebhooksOf = Annotated[Webhooks, Depends(_provided("webhooks"))]
 OverviewOf = Annotated[Overview, Depends(_provided("overview"))]
-Limit = Annotated[int, Query(ge=1, le=MAX_LIMIT, description="items on a page")]
+Limit = Annotated[int, Query(ge=1, le=200, description="items on a page")]
 Cursor = Annotated[str | None, Query(max_length=512, description="`next` of the page before")]
 
 
-def link_next(request: Request, response: Response, cursor: str | None) -> None:
-    """Set the Link header (RFC 8288) to the next page, with the same filters."""
-    if cursor is not None:
-        response.headers["Link"] = f'<{next_address(request, cursor)}>; rel="next"'
+@dataclass(frozen=True)
+class Paging:
+    """Requested part of a list."""
+
+    request: Request
+    response: Response
+    limit: int
+    cursor: str | None
+
+    def linked(self, page: Page[T]) -> Page[T]:
+        """Set the Link header (RFC 8288) to the next page, with the same filters."""
+        if page.next is not None:
+            self.response.headers["Link"] = f'<{next_address(self.request, page.next)}>; rel="next"'
+        return page
+
+
+async def _paging(request: Request, response: Response, limit: Limit = 50, cursor: Cursor = None) -> Paging:
+    return Paging(request, response, limit, cursor)
+
+
+PagingOf = Annotated[Paging, Depends(_paging)]
 
 
 def next_address(request: Request, cursor: str) -> str:
@@ -107,39 +124,26 @@ def next_address(request: Request, cursor: str) -> str:
     return f"{url.path}?{url.query}"
 
 
-T = TypeVar("T")
 #: Uploads unpacked and packed at once; each may hold one file of its size in memory.
 UPLOADS: Final = 4
 #: Forms with an upload at once: they also wait for its check.
 FORMS: Final = 8
-#: Files of selected grasps written at once.
 EXPORTS: Final = 2
-_WAITING: Final = 32
+_MOST_WAITING: Final = 32
 _PATIENCE_S: Final = 20.0
 
 
 class RequestLimiter:
-    """Pool with limits on its threads and on the requests that wait for one.
+    """Pool with limits on its threads and on the requests that wait for one."""
 
-    Args:
-        at_once: number of threads.
-        waiting: number of requests that may wait.
-        patience_s: longest wait of a request [s].
-    """
-
-    def __init__(self, at_once: int, *, waiting: int = _WAITING, patience_s: float = _PATIENCE_S) -> None:
+    def __init__(self, at_once: int, *, patience_s: float = _PATIENCE_S) -> None:
         self._free = asyncio.Semaphore(at_once)
         self._threads = CapacityLimiter(at_once)
         self._waiting = 0
-        self._most_waiting = waiting
         self._patience_s = patience_s
 
     async def run(self, function: Callable[..., T], *args: Any, **options: Any) -> T:
-        """Run a function in a thread of this pool and return its result.
-
-        Raises:
-            UnavailableError: too many requests wait already, or no thread became free in time.
-        """
+        """Run a function in a thread of this pool; UnavailableError if none becomes free in time."""
         await self._take()
         try:
             return await to_thread.run_sync(partial(function, *args, **options), limiter=self._threads)
@@ -148,7 +152,7 @@ class RequestLimiter:
 
     async def _take(self) -> None:
         busy = UnavailableError("too many requests of this kind at once; try again in a moment")
-        if self._free.locked() and self._waiting >= self._most_waiting:
+        if self._free.locked() and self._waiting >= _MOST_WAITING:
             raise busy
         self._waiting += 1
         try:
@@ -164,11 +168,7 @@ _TAGS: Final = re.compile(r'\s*((?:W/)?"[^"]*")\s*(?:,|$)')
 
 
 def is_known(headers: Headers, etag: str) -> bool:
-    """Check whether If-None-Match names this file, so that the answer is 304.
-
-    Args:
-        etag: strong entity tag, with its quotes.
-    """
+    """Check whether If-None-Match names the strong tag of this file, so that the answer is 304."""
     given = headers.getlist("if-none-match")
     return any(value.strip() == "*" for value in given) or etag in {
         tag.removeprefix("W/") for value in given for tag in _TAGS.findall(value)

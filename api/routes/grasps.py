@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import APIRouter, Depends, Path, Query, Request, Response
+from fastapi import APIRouter, Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
 
-from graspd.api.catalog.grasp_exports import MEDIA_TYPES, Format, GraspExports
-from graspd.api.catalog.tags import Tags
+from graspd.api.catalog.tags import MEDIA_TYPES, Format, GraspExports, Tags
 from graspd.api.models import (
     GraspDetail,
     GraspExportQuery,
@@ -19,13 +18,13 @@ from graspd.api.models import (
     TagRequest,
 )
 from graspd.api.problems import responses
-from graspd.api.routes.dependencies import ExportsOf, GraspsOf, TagsOf, link_next, may_read, may_submit
+from graspd.api.routes.dependencies import READ, SUBMIT, ExportsOf, GraspsOf, Paging, TagsOf
 from graspd.service.index.views import GraspView, Page, TagView
 
 router = APIRouter(prefix="/v1/grasps", tags=["grasps"])
 
 
-@router.get("/{shard_id}/{row}", dependencies=[Depends(may_read)], responses=responses(401, 403, 404, 422, 503))
+@router.get("/{shard_id}/{row}", dependencies=READ, responses=responses(404))
 def get_grasp(shard_id: str, row: int, response: Response, grasps: GraspsOf) -> GraspDetail:
     """Return one grasp with its postures, and its metrics at every contact threshold."""
     response.headers["Cache-Control"] = "private, max-age=86400"
@@ -34,16 +33,12 @@ def get_grasp(shard_id: str, row: int, response: Response, grasps: GraspsOf) -> 
 
 @router.get(
     "/export",
-    dependencies=[Depends(may_read)],
+    dependencies=READ,
     response_class=StreamingResponse,
     responses=responses(
-        401,
-        403,
         404,
         413,
-        422,
         500,
-        503,
         others={200: {"content": {media: {} for media in MEDIA_TYPES.values()}, "description": "The file"}},
     ),
 )
@@ -69,14 +64,13 @@ async def exported(
     return StreamingResponse(made.chunks, media_type=made.media_type, headers=headers)
 
 
-@router.get("", dependencies=[Depends(may_read)], responses=responses(401, 403, 404, 422, 503))
+@router.get("", dependencies=READ, responses=responses(404))
 def list_grasps(
     request: Request, response: Response, grasps: GraspsOf, query: Annotated[GraspPageQuery, Query()]
 ) -> Page[GraspView]:
     """List grasps that pass every filter, in the requested order."""
-    page = grasps.page(query, limit=query.limit, cursor=query.cursor)
-    link_next(request, response, page.next)
-    return page
+    paging = Paging(request, response, query.limit, query.cursor)
+    return paging.linked(grasps.page(query, limit=query.limit, cursor=query.cursor))
 
 
 tag_router = APIRouter(prefix="/v1/tags", tags=["tags"])
@@ -84,35 +78,31 @@ tag_router = APIRouter(prefix="/v1/tags", tags=["tags"])
 TagName = Annotated[str, Path(max_length=64, description="name of the tag, or its id")]
 
 
-@tag_router.get("", dependencies=[Depends(may_read)], responses=responses(401, 403, 503))
+@tag_router.get("", dependencies=READ)
 def list_tags(tags: TagsOf) -> list[TagView]:
     """List tags of the key's project by name, with their numbers of grasps."""
     return tags.all()
 
 
-@tag_router.post("", dependencies=[Depends(may_submit)], responses=responses(400, 401, 403, 404, 409, 413, 422, 503))
+@tag_router.post("", dependencies=SUBMIT, responses=responses(400, 404, 409))
 def give_tag(body: TagRequest, tags: TagsOf) -> TagChange:
     """Give a tag to grasps, listed by name or by a filter; a new tag is created."""
     return tags.give(body.name, body)
 
 
-@tag_router.get("/{name}", dependencies=[Depends(may_read)], responses=responses(401, 403, 404, 422, 503))
+@tag_router.get("/{name}", dependencies=READ, responses=responses(404))
 def get_tag(name: TagName, tags: TagsOf) -> TagView:
     """Return a tag; `GET /v1/grasps?tag=NAME` lists its grasps."""
     return tags.one(name)
 
 
-@tag_router.post(
-    "/{name}/remove", dependencies=[Depends(may_submit)], responses=responses(400, 401, 403, 404, 409, 413, 422, 503)
-)
+@tag_router.post("/{name}/remove", dependencies=SUBMIT, responses=responses(400, 404, 409))
 def take_tag_off(name: TagName, body: Selection, tags: TagsOf) -> TagChange:
     """Remove a tag from grasps, listed by name or by a filter."""
     return tags.take_off(name, body)
 
 
-@tag_router.delete(
-    "/{name}", status_code=204, dependencies=[Depends(may_submit)], responses=responses(401, 403, 404, 409, 422, 503)
-)
+@tag_router.delete("/{name}", status_code=204, dependencies=SUBMIT, responses=responses(404, 409))
 def delete_tag(name: TagName, tags: TagsOf) -> None:
     """Delete a tag; its grasps remain."""
     tags.remove(name)

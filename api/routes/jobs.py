@@ -1,17 +1,19 @@
-"""`/v1/jobs`: submit, list, watch, cancel, retry, delete."""
+"""`/v1/jobs`: submit, list, watch, cancel, retry, delete; `/v1/shards`: HDF5 files, with byte ranges."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import AsyncIterable
-from typing import Annotated
+from typing import Annotated, Literal
 
 from fastapi import APIRouter, Depends, Header, Query, Request, Response
+from fastapi.responses import RedirectResponse, StreamingResponse
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 
 from graspd.api.catalog import events
-from graspd.api.models import Job, JobDetail
-from graspd.api.problems import responses
-from graspd.api.routes.dependencies import Cursor, JobsOf, Limit, link_next, may_read, may_submit
+from graspd.api.models import Job, JobDetail, Shard
+from graspd.api.problems import ApiError, responses
+from graspd.api.routes.dependencies import READ, SUBMIT, JobsOf, PagingOf, ShardsOf, is_known, range_applies
 from graspd.service.index.views import Page
 from graspd.service.model.domain import JobRequest
 from graspd.service.model.states import State
@@ -27,10 +29,8 @@ IdempotencyKey = Annotated[
 @router.post(
     "",
     status_code=202,
-    dependencies=[Depends(may_submit)],
-    responses=responses(
-        400, 401, 403, 404, 409, 413, 422, 503, others={200: {"model": JobDetail, "description": "It has ended"}}
-    ),
+    dependencies=SUBMIT,
+    responses=responses(400, 404, 409, others={200: {"model": JobDetail, "description": "It has ended"}}),
 )
 def submit(body: JobRequest, response: Response, jobs: JobsOf, idempotency_key: IdempotencyKey = None) -> JobDetail:
     """Submit a job. Identical content gives the same job: its id follows from request, hand and object."""
@@ -43,51 +43,38 @@ def submit(body: JobRequest, response: Response, jobs: JobsOf, idempotency_key: 
     return job
 
 
-@router.get("", dependencies=[Depends(may_read)], responses=responses(401, 403, 422, 503))
+@router.get("", dependencies=READ)
 def list_jobs(
-    request: Request,
-    response: Response,
     jobs: JobsOf,
+    paging: PagingOf,
     state: State | None = None,
     hand: Annotated[str | None, Query(max_length=64)] = None,
     object: Annotated[str | None, Query(max_length=64)] = None,
-    limit: Limit = 50,
-    cursor: Cursor = None,
 ) -> Page[Job]:
     """List jobs, newest first."""
-    page = jobs.page(state=state, hand=hand, object=object, limit=limit, cursor=cursor)
-    link_next(request, response, page.next)
-    return page
+    page = jobs.page(state=state, hand=hand, object=object, limit=paging.limit, cursor=paging.cursor)
+    return paging.linked(page)
 
 
-@router.get("/{job_id}", dependencies=[Depends(may_read)], responses=responses(401, 403, 404, 503))
+@router.get("/{job_id}", dependencies=READ, responses=responses(404))
 def get_job(job_id: str, jobs: JobsOf) -> JobDetail:
     """Return a job with the progress of its stages, failed attempts, mean metrics and shards."""
     return jobs.one(job_id)
 
 
-@router.post(
-    "/{job_id}/cancel",
-    status_code=202,
-    dependencies=[Depends(may_submit)],
-    responses=responses(401, 403, 404, 409, 503),
-)
+@router.post("/{job_id}/cancel", status_code=202, dependencies=SUBMIT, responses=responses(404, 409))
 def cancel(job_id: str, jobs: JobsOf) -> JobDetail:
     """Cancel a job's waiting and running tasks; results remain."""
     return jobs.cancel(job_id)
 
 
-@router.post(
-    "/{job_id}/retry", status_code=202, dependencies=[Depends(may_submit)], responses=responses(401, 403, 404, 409, 503)
-)
+@router.post("/{job_id}/retry", status_code=202, dependencies=SUBMIT, responses=responses(404, 409))
 def retry(job_id: str, jobs: JobsOf) -> JobDetail:
     """Run failed and cancelled tasks again; existing results are not made again."""
     return jobs.retry(job_id)
 
 
-@router.delete(
-    "/{job_id}", status_code=204, dependencies=[Depends(may_submit)], responses=responses(401, 403, 404, 409, 503)
-)
+@router.delete("/{job_id}", status_code=204, dependencies=SUBMIT, responses=responses(404, 409))
 def delete(job_id: str, jobs: JobsOf) -> None:
     """Delete an ended job. After a grace time its shards follow, unless another job needs them; until then
     `POST .../restore` restores the job."""
@@ -101,11 +88,98 @@ def known_job(job_id: str, jobs: JobsOf) -> None:
 
 @router.get(
     "/{job_id}/events",
-    dependencies=[Depends(may_read), Depends(known_job)],
+    dependencies=[*READ, Depends(known_job)],
     response_class=EventSourceResponse,
-    responses=responses(401, 403, 404, 503),
+    responses=responses(404),
 )
 async def watch(job_id: str, request: Request, jobs: JobsOf) -> AsyncIterable[ServerSentEvent]:
     """Stream a job's progress: `progress` with the job at each change, `end` with its last state."""
     async for event in events.job_events(jobs, job_id, request):
         yield event
+
+
+shard_router = APIRouter(prefix="/v1/shards", tags=["shards"])
+
+_MEDIA_TYPE = "application/x-hdf5"
+#: No file size has more than 18 digits; a longer number is no valid range, and the whole file is sent.
+_RANGE = re.compile(r"bytes=([0-9]{0,18})-([0-9]{0,18})")
+
+
+@shard_router.get("", dependencies=READ, responses=responses(404))
+def list_shards(
+    shards: ShardsOf,
+    paging: PagingOf,
+    job: Annotated[str | None, Query(max_length=64)] = None,
+    kind: Literal["base", "scene", "views"] | None = None,
+) -> Page[Shard]:
+    """List shards, all or those of a job."""
+    return paging.linked(shards.page(job=job, kind=kind, limit=paging.limit, cursor=paging.cursor))
+
+
+@shard_router.get("/{shard_id}", dependencies=READ, responses=responses(404))
+def get_shard(shard_id: str, shards: ShardsOf) -> Shard:
+    """Return a shard with its whole manifest."""
+    return shards.one(shard_id)
+
+
+@shard_router.head("/{shard_id}/file", dependencies=READ, include_in_schema=False)
+@shard_router.get(
+    "/{shard_id}/file",
+    dependencies=READ,
+    response_class=StreamingResponse,
+    responses=responses(
+        404,
+        416,
+        others={
+            200: {"content": {_MEDIA_TYPE: {}}, "description": "The file"},
+            206: {"content": {_MEDIA_TYPE: {}}, "description": "The bytes asked for"},
+            304: {"description": "What If-None-Match names is this file"},
+            307: {"description": "The store hands the file out itself, under a signed address"},
+        },
+    ),
+)
+def get_file(shard_id: str, request: Request, shards: ShardsOf) -> Response:
+    """Send the HDF5 file: from the store if it signs addresses, else through the API; Range is supported.
+
+    If-None-Match and If-Range are supported. A file that does not match its checksum is refused.
+    """
+    shard = shards.intact(shard_id)
+    # The id depends on the content, so cached copies never become stale.
+    headers = {"ETag": f'"{shard.sha256}"', "Cache-Control": "private, max-age=31536000, immutable"}
+    if is_known(request.headers, headers["ETag"]):
+        return Response(status_code=304, headers=headers)
+    only_head = request.method == "HEAD"
+    # A signed address is valid for GET only.
+    if not only_head and (address := shards.address(shard)) is not None:
+        return RedirectResponse(address, status_code=307)
+    size = shards.size(shard)
+    wanted = request.headers.get("range")
+    span = None if only_head or not range_applies(request.headers, headers["ETag"]) else parse_range(wanted, size)
+    start, end = span or (0, size)
+    headers |= {
+        "Accept-Ranges": "bytes",
+        "Content-Length": str(end - start),
+        "Content-Disposition": f'attachment; filename="{shard.kind}-{shard_id}.h5"',
+    }
+    if only_head:
+        return Response(media_type=_MEDIA_TYPE, headers=headers)
+    if span is not None:
+        headers["Content-Range"] = f"bytes {start}-{end - 1}/{size}"
+    chunks = shards.stream(shard, start, end - start)
+    status = 200 if span is None else 206
+    return StreamingResponse(chunks, status_code=status, media_type=_MEDIA_TYPE, headers=headers)
+
+
+def parse_range(header: str | None, size: int) -> tuple[int, int] | None:
+    """Return (start, end) of a single byte range; None to send the whole file (RFC 9110 §14.2)."""
+    match = _RANGE.fullmatch(header.strip()) if header else None
+    if match is None or match.groups() == ("", ""):
+        return None
+    first, last = match.groups()
+    if not first:
+        start, end = max(0, size - int(last)), size
+    else:
+        start, end = int(first), min(size, int(last) + 1) if last else size
+    if end <= start:
+        raise ApiError(416, f"the file has {size} bytes", headers={"Content-Range": f"bytes */{size}"})
+    return start, end

@@ -1,35 +1,38 @@
-"""Workers, statistics, health and metrics; `/v1/usage`; `/v1/deletions` and restores."""
+"""Workers, statistics, health, metrics; usage; deletions and restores; ends of jobs and datasets, and webhooks."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import AsyncIterable
 from datetime import date
-from typing import Annotated, Final, get_args
+from typing import Annotated, get_args
 
-from fastapi import APIRouter, Depends, Path, Query, Request, Response
-from pydantic import BeforeValidator
+from fastapi import APIRouter, Depends, Header, Path, Query, Request, Response
+from fastapi.sse import EventSourceResponse, ServerSentEvent
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from graspd.api.access.auth import is_allowed
 from graspd.api.access.keys import Scope
-from graspd.api.catalog.deletions import DeletionView
-from graspd.api.catalog.overview import as_csv
+from graspd.api.catalog import events
+from graspd.api.catalog.overview import DeletionView, as_csv
 from graspd.api.metrics import CONTENT_TYPE, Metrics
 from graspd.api.models import Health, Worker
 from graspd.api.problems import responses
-from graspd.api.routes.dependencies import DeletionsOf, OverviewOf, UsageOf, may_read, may_scrape, may_submit
-from graspd.service.index.views import Stats, UsageDay
+from graspd.api.routes.dependencies import READ, SUBMIT, DeletionsOf, Limit, OverviewOf, UsageOf, WebhooksOf, may_scrape
+from graspd.service.index.views import DeliveryView, EndView, Stats, UsageDay, WebhookView
+from graspd.service.model.webhooks import MAX_URL, End
 from graspd.service.store.records import What
 
 router = APIRouter(tags=["system"])
 
 
-@router.get("/v1/workers", dependencies=[Depends(may_read)], responses=responses(401, 403, 503))
+@router.get("/v1/workers", dependencies=READ)
 def list_workers(overview: OverviewOf) -> list[Worker]:
     """List workers with a recent heartbeat: device, present stage, age of the lease."""
     return overview.workers()
 
 
-@router.get("/v1/stats", dependencies=[Depends(may_read)], responses=responses(401, 403, 503))
+@router.get("/v1/stats", dependencies=READ)
 def get_stats(overview: OverviewOf) -> Stats:
     """Return statistics of the whole service, from the index."""
     return overview.stats()
@@ -61,7 +64,7 @@ def readyz(request: Request, overview: OverviewOf, response: Response) -> Health
     "/metrics",
     dependencies=[Depends(may_scrape)],
     response_class=Response,
-    responses=responses(401, 403, others={200: {"content": {"text/plain": {}}}}),
+    responses=responses(others={200: {"content": {"text/plain": {}}}}),
 )
 def metrics(request: Request, overview: OverviewOf) -> Response:
     """Return metrics as Prometheus text. A scrape succeeds even if a part is down, without its series."""
@@ -84,7 +87,7 @@ Since = Annotated[Day | None, Query(description="first day (UTC); default: a mon
 Until = Annotated[Day | None, Query(description="last day (UTC); default: today")]
 
 
-@usage_router.get("/v1/usage", dependencies=[Depends(may_read)], responses=responses(400, 401, 403, 422, 503))
+@usage_router.get("/v1/usage", dependencies=READ, responses=responses(400))
 def get_usage(usage: UsageOf, since: Since = None, until: Until = None) -> list[UsageDay]:
     """Return each project's grasps and seconds per day, newest first; all projects with `admin`."""
     return usage.days(since, until)
@@ -92,16 +95,9 @@ def get_usage(usage: UsageOf, since: Since = None, until: Until = None) -> list[
 
 @usage_router.get(
     "/v1/usage.csv",
-    dependencies=[Depends(may_read)],
+    dependencies=READ,
     response_class=Response,
-    responses=responses(
-        400,
-        401,
-        403,
-        422,
-        503,
-        others={200: {"content": {"text/csv": {}}, "description": "One line a day and project"}},
-    ),
+    responses=responses(400, others={200: {"content": {"text/csv": {}}, "description": "One line a day and project"}}),
 )
 def get_usage_csv(usage: UsageOf, since: Since = None, until: Until = None) -> Response:
     """Return the same as a table."""
@@ -112,10 +108,9 @@ def get_usage_csv(usage: UsageOf, since: Since = None, until: Until = None) -> R
 deletion_router = APIRouter(tags=["deletions"])
 
 Name = Annotated[str, Path(max_length=64, description="its name, or its id")]
-KINDS: Final[tuple[What, ...]] = get_args(What)
 
 
-@deletion_router.get("/v1/deletions", dependencies=[Depends(may_read)], responses=responses(401, 403, 503))
+@deletion_router.get("/v1/deletions", dependencies=READ)
 def list_deletions(deletions: DeletionsOf) -> list[DeletionView]:
     """List what can be restored, newest first."""
     return deletions.recent()
@@ -123,15 +118,88 @@ def list_deletions(deletions: DeletionsOf) -> list[DeletionView]:
 
 def _add_restore(what: What) -> None:
     @deletion_router.post(
-        f"/v1/{what}s/{{name}}/restore",
-        dependencies=[Depends(may_submit)],
-        responses=responses(401, 403, 404, 409, 422, 503),
-        name=f"restore_{what}",
+        f"/v1/{what}s/{{name}}/restore", dependencies=SUBMIT, responses=responses(404, 409), name=f"restore_{what}"
     )
     def restore(name: Name, deletions: DeletionsOf) -> DeletionView:
         """Restore a resource deleted within the grace time (`GRASPD_SHARD_GRACE_S`), unchanged."""
         return deletions.restore(what, name)
 
 
-for _kind in KINDS:
+for _kind in get_args(What):
     _add_restore(_kind)
+
+
+event_router = APIRouter(tags=["events"])
+
+WebhookId = Annotated[str, Path(max_length=64)]
+AfterEnd = Annotated[
+    int, Query(ge=0, lt=2**62, description="`seq` of the last end that is known; 0: from the first on")
+]
+
+
+class DeliveryPage(BaseModel):
+    """Page of ends, and the number to continue from."""
+
+    items: list[EndView]
+    next: int = Field(description="`since` of the next request")
+
+
+class WebhookRequest(BaseModel):
+    """Address to notify of ends."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    url: str = Field(max_length=MAX_URL, description="https://host/path")
+    states: tuple[End, ...] = Field(("succeeded", "failed", "cancelled"), min_length=1, max_length=3)
+
+
+class CreatedWebhook(WebhookView):
+    """Webhook and the secret that signs its bodies."""
+
+    secret: str = Field(description="told this once")
+
+
+@event_router.get("/v1/events", dependencies=READ)
+def list_ends(webhooks: WebhooksOf, since: AfterEnd = 0, limit: Limit = 50) -> DeliveryPage:
+    """List ended jobs and datasets in order. Ends are stored for 30 days; each appears at least once."""
+    items = webhooks.ends(since, limit=limit)
+    return DeliveryPage(items=items, next=items[-1].seq if items else since)
+
+
+@event_router.get("/v1/events/stream", dependencies=READ, response_class=EventSourceResponse)
+async def stream_ends(
+    request: Request,
+    webhooks: WebhooksOf,
+    since: AfterEnd = 0,
+    last_event_id: Annotated[str | None, Header(max_length=20, description="goes over `since`")] = None,
+) -> AsyncIterable[ServerSentEvent]:
+    """Stream the same: one `end` event each. A client that reconnects continues where it stopped."""
+    start = int(last_event_id) if last_event_id and last_event_id.isascii() and last_event_id.isdigit() else since
+    async for event in events.ends(webhooks, min(start, 2**62), request):
+        yield event
+
+
+@event_router.post("/v1/webhooks", status_code=201, dependencies=SUBMIT, responses=responses(400, 409))
+def add_webhook(body: WebhookRequest, response: Response, webhooks: WebhooksOf) -> CreatedWebhook:
+    """Add a webhook for ended jobs and datasets of the key's project. The secret is shown only once."""
+    hook, secret = webhooks.add(body.url, body.states)
+    response.headers["Location"] = f"/v1/webhooks/{hook.id}/deliveries"
+    return CreatedWebhook(**hook.model_dump(), secret=secret)
+
+
+@event_router.get("/v1/webhooks", dependencies=SUBMIT)
+def list_webhooks(webhooks: WebhooksOf) -> list[WebhookView]:
+    """List webhooks that the key may change, without their secrets."""
+    return webhooks.all()
+
+
+@event_router.get("/v1/webhooks/{webhook_id}/deliveries", dependencies=SUBMIT, responses=responses(404))
+def list_deliveries(webhook_id: WebhookId, webhooks: WebhooksOf, limit: Limit = 50) -> list[DeliveryView]:
+    """List deliveries of a webhook, newest first; stored for 30 days."""
+    return webhooks.log(webhook_id, limit=limit)
+
+
+@event_router.delete("/v1/webhooks/{webhook_id}", status_code=204, dependencies=SUBMIT, responses=responses(404))
+def delete_webhook(webhook_id: WebhookId, webhooks: WebhooksOf) -> None:
+    """Delete a webhook."""
+    webhooks.delete(webhook_id)

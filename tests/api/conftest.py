@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from datetime import datetime, tzinfo
 from pathlib import Path
+from typing import Any
 
 import pytest
 from fastapi import FastAPI
+from pydantic import SecretStr
 from starlette.testclient import TestClient
 
+from graspd.api.access.keys import KeyFile
 from graspd.api.app import create_app
 from graspd.service.index.index import Index
 from graspd.service.pipeline.backends import Services
+from graspd.service.queue.rq_queue import RqQueue
 from graspd.service.settings import Settings
 from graspd.service.store.store import open_store
 from tests.api.factories import add_builtins
@@ -39,8 +44,6 @@ def furnished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 class _Noon(datetime):
-    """A clock that stands still."""
-
     @classmethod
     def now(cls, tz: tzinfo | None = None) -> _Noon:
         return cls.fromisoformat(f"{TODAY}T12:00:00+00:00")
@@ -76,3 +79,24 @@ def app(settings: Settings, services: Services) -> FastAPI:
 def http(app: FastAPI) -> Iterator[TestClient]:
     with TestClient(app, base_url=BASE_URL, raise_server_exceptions=False) as client:
         yield client
+
+
+@pytest.fixture
+def keys(settings: Settings) -> KeyFile:
+    return KeyFile(settings.resolved_keys_file)
+
+
+@pytest.fixture
+def make_twins(
+    settings: Settings, services: Services, redis_server: str, rq_queue: RqQueue, noon: None
+) -> Iterator[Callable[..., list[TestClient]]]:
+    """Makes two applications over the same services, keys and Redis, with these settings."""
+    with ExitStack() as clients:
+
+        def make(**changes: Any) -> list[TestClient]:
+            wanted = settings.model_copy(update={"redis_url": SecretStr(redis_server), **changes})
+            shared = Services(wanted, services.store, services.index, services.queue)
+            apps = [create_app(wanted, shared) for _ in range(2)]
+            return [clients.enter_context(TestClient(app, base_url=BASE_URL)) for app in apps]
+
+        yield make

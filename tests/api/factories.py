@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -31,13 +33,11 @@ Arrays = dict[str, NDArray[np.generic]]
 
 
 def add_builtins(services: Services) -> None:
-    """The built-in hands and objects, as `graspd up` publishes them."""
     for asset in publish_builtins(services.store):
         services.index.write.add_asset(asset, {"verdict": "accept", "message": "", "repairs": [], "facts": {}})
 
 
 def add_job(services: Services, **fields: object) -> JobRecord:
-    """A job that waits."""
     request = JobRequest.model_validate({"hand": "allegro", "object": "mug", "grasps": 32} | fields)
     hand = services.index.assets.get(AssetKind.HAND, request.hand).digest
     object_ = services.index.assets.get(AssetKind.OBJECT, request.object).digest
@@ -88,24 +88,28 @@ def finish_with(services: Services, file: Path, **fields: object) -> ShardManife
 
 
 def finish_all(services: Services, record: JobRecord) -> list[ShardManifest]:
-    """Every task of a job, done."""
     return [finish(services, record, task) for task in plan(record)]
 
 
 def fail(services: Services, record: JobRecord, reason: str) -> None:
-    """The first task of a job, failed for the last time."""
     task = next(plan(record))
     fail_task(services, record.id, task, kind="MeshError", reason=reason, worker="worker-1", started=timestamp())
 
 
 def add_worker(services: Services, name: str = "worker-1", state: str = "idle") -> None:
-    """A worker that lives."""
     beat = beat_of(name, host="here", device_name="x86_64, 2 cores", version="0.1.0", state=state)
     services.index.live.set_workers([beat], forget_before="2000-01-01T00:00:00Z")
 
 
+def zipped(files: dict[str, bytes]) -> bytes:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, data in files.items():
+            archive.writestr(name, data)
+    return buffer.getvalue()
+
+
 def bearer(token: str) -> dict[str, str]:
-    """The header that a key comes in."""
     return {"Authorization": f"Bearer {token}"}
 
 

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import io
 import json
 import os
 import tracemalloc
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +23,7 @@ from graspd.service.store.assets import builtin_files, pack
 from graspd.service.store.library import load_asset, load_asset_files, load_check, publish_asset
 from graspd.worker.stages import ingest
 from graspd.worker.stages.context import TaskContext
+from tests.api.factories import zipped
 
 
 def check(
@@ -44,46 +43,17 @@ def stl(*meshes: trimesh.Trimesh) -> bytes:
 
 
 def shell() -> bytes:
-    """A ball without its top."""
     ball = trimesh.creation.icosphere(subdivisions=3, radius=0.04)
     ball.update_faces(ball.triangles_center[:, 2] < 0.01)
     return stl(ball)
 
 
-#: A brick in millimetres; a ball of 4 cm, as its triangles have it, beside a crumb; and the shell.
-BRICK = stl(trimesh.creation.box((60.0, 40.0, 30.0)))
-
-
-BALL = trimesh.creation.icosphere(subdivisions=3, radius=0.04)
-
-
-TWO = stl(BALL, trimesh.creation.box((0.01, 0.01, 0.01)).apply_translation((0.1, 0, 0)))
-
-
-@pytest.mark.parametrize(
-    ("data", "options", "verdict", "volume"),
-    [
-        (BRICK, {"units": "mm", "density": 950.0}, "accept", 60e-3 * 40e-3 * 30e-3),
-        (BRICK, {"scale_to": 0.1}, "accept", 60e-3 * 40e-3 * 30e-3 * (0.1 / 0.06) ** 3),
-        (TWO, {"keep_largest": True, "mass": 0.2}, "repair", BALL.volume),
-        (shell(), {"allow_open": True}, "accept", None),
-        (shell(), {}, "refuse", None),
-    ],
-    ids=["units", "scale", "largest", "open", "none"],
-)
-def test_an_option_of_an_object_decides_its_check(
-    http: TestClient, services: Services, data: bytes, options: dict[str, Any], verdict: str, volume: float | None
-) -> None:
-    found = check(http, services, AssetKind.OBJECT, ("thing.stl", data), options)
-    assert found["verdict"] == verdict, found["message"]
-    facts = found["facts"]
-    if volume is not None:
-        # Simplified within 0.3 mm: a per cent of the volume.
-        assert facts["volume_m3"] == pytest.approx(volume, rel=0.01)
-    if "density" in options:
-        assert facts["mass_kg"] == pytest.approx(options["density"] * facts["volume_m3"])
-    if "mass" in options:
-        assert facts["mass_kg"] == options["mass"]
+def test_the_options_of_an_object_decide_its_check(http: TestClient, services: Services) -> None:
+    brick = ("brick.stl", stl(trimesh.creation.box((60.0, 40.0, 30.0))))
+    facts = check(http, services, AssetKind.OBJECT, brick, {"units": "mm", "density": 950.0})["facts"]
+    # Simplified within 0.3 mm: a per cent of the volume.
+    assert facts["volume_m3"] == pytest.approx(60e-3 * 40e-3 * 30e-3, rel=0.01)
+    assert facts["mass_kg"] == pytest.approx(950.0 * facts["volume_m3"])
 
 
 def test_the_options_of_a_hand_decide_its_check(http: TestClient, services: Services) -> None:
@@ -124,12 +94,8 @@ MIB = 1 << 20
 
 def folder_of(count: int, size: int) -> bytes:
     """ZIP of a folder with a mesh and textures that do not compress."""
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w") as archive:
-        archive.writestr("thing/mesh.stl", b"solid x\nendsolid x\n")
-        for number in range(count):
-            archive.writestr(f"thing/texture-{number}.png", os.urandom(size))
-    return buffer.getvalue()
+    textures = {f"thing/texture-{number}.png": os.urandom(size) for number in range(count)}
+    return zipped({"thing/mesh.stl": b"solid x\nendsolid x\n", **textures})
 
 
 def test_a_zip_is_kept_without_ever_being_whole_in_memory(services: Services, tmp_path: Path) -> None:
@@ -154,10 +120,7 @@ def test_a_zip_on_disk_and_in_memory_are_the_same_asset() -> None:
 
 
 def test_a_zip_whose_header_understates_its_files_is_refused() -> None:
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("mesh.stl", b"0" * 5000)
-    data = buffer.getvalue()
+    data = zipped({"mesh.stl": b"0" * 5000})
     true, false = (5000).to_bytes(4, "little"), (10).to_bytes(4, "little")
     assert data.count(true) == 2
     with pytest.raises(InputError, match="damaged"):

@@ -23,35 +23,52 @@ from graspd.service.pipeline.backends import Services
 from graspd.service.queue.rq_queue import RqQueue
 from graspd.service.settings import Settings
 from tests.api.factories import add_job, finish_all
-from tests.api.hostile import JOB_BODY, METHODS, NAMES, PATHS, VALUES
 from tests.waiting import PATIENCE_S
 
+_METHODS = "GET GET GET POST POST HEAD PUT PATCH DELETE OPTIONS TRACE X"
+
+_NAMES = """
+    host origin referer cookie authorization range if-range if-none-match if-match if-modified-since accept
+    accept-encoding accept-language content-type content-length content-encoding transfer-encoding expect connection
+    upgrade forwarded via te x-forwarded-for x-forwarded-host x-forwarded-proto x-forwarded-groups x-forwarded-user
+    x-real-ip idempotency-key last-event-id x-request-id traceparent tracestate sec-fetch-site x-http-method-override
+    hx-request hx-target user-agent
+"""
+
+#: With {job} and {shard}.
+_PATHS = """
+    / /v1/jobs /v1/jobs/ /v1/jobs/{job} /v1/jobs/{job}/cancel /v1/shards/{shard} /v1/shards/{shard}/file /v1/grasps
+    /v1/stats /v1/hands /v1/hands/allegro /v1/hands/allegro/model /v1/hands/allegro/model.glb /v1/objects /v1/datasets
+    /v1/datasets/estimate /v1/webhooks /v1/tags /v1/events /v1/usage /v1/object-sets /healthz /readyz /metrics /login
+    /logout /submit /jobs /jobs/{job} /datasets /grasps /hands /hands/allegro /workers /usage /events
+    /static/style.css /static/app.css /openapi.json /problems/x /nowhere //evil.example/x *
+"""
+
+_VALUES = (
+    "| |*|null|http://[|http://[::1|//[|[|[::1]:x|http://\xe9|\xff\xfe|http://a:99999/|http://a:b|-1|0x10|1e400|NaN|"
+    'bytes=|bytes=-|bytes=9-1|bytes=a-b|bytes=0-0,1-1|W/"|W/*|Thu, 99 Foo 9999 99:99:99 GMT|Bearer|Bearer |Bearer \xa0|'
+    'Bearer gd_\xe9|Basic !!!|graspd_session=|graspd_session=\xff; a=b; ;;=|a="\\|=|application/json; charset=nonsense|'
+    "100-continue|multipart/form-data|multipart/form-data; boundary=|multipart/form-data; boundary=b|text/html|"
+    'text/html;q=\xb2|application/x-www-form-urlencoded|gzip, br|for="[::1";by=|1.2.3.4, , \xe9|127.0.0.1:x|chunked|'
+    "h2c|cross-site|%00|\x01|\x7f|../../etc/passwd|../../x|<script>|{}"
+)
+_LONG = ("a" * 8000, "9" * 5000, '"' * 400, "bytes=0-" + "9" * 400, "bytes=0-0,1-1," + "2-2," * 200, "00-" + "0" * 60)
+_LONG_KEYS = ("Bearer " + "a" * 4000, "Basic " + "QQ==" * 500, "graspd_session=W10=." + "0" * 64)
+
+METHODS, NAMES, PATHS = _METHODS.split(), _NAMES.split(), _PATHS.split()
+VALUES = [*_VALUES.split("|"), *_LONG, *_LONG_KEYS]
+#: Sent first, one each, for what the server itself reads of a request.
+_PAIRS = [(name, value) for name in ("origin", "host", "cookie", "authorization", "range") for value in VALUES]
+JOB_BODY = b'{"hand": "allegro", "object": "mug", "grasps": 32}'
 _QUERY_KEYS = "limit cursor since until state where sort hand tag format views x"
 _KEYS = _QUERY_KEYS.encode().split()
-_TAILS = (
-    b"",
-    b"/",
-    b"//",
-    b"/%00",
-    b"/%ff%fe",
-    b"/..%2f..",
-    b"/%0d%0aX:1",
-    b";a=b",
-    b"/" + b"9" * 300,
-    b"/\\",
-    b"/%u0041",
-)
+_TAILS = (*b"|/|//|/%00|/%ff%fe|/..%2f..|/%0d%0aX:1|;a=b|/\\|/%u0041".split(b"|"), b"/" + b"9" * 300)
 _ODD = b"|0|-1|1e400|NaN|%00|%ff|%|%zz|[|null|true|'|\"|1_0|\xff\xfe|%F0%9F%A4%96|2026-01-31|../../etc/passwd|${x}"
 _WORDS = (*_ODD.split(b"|"), b"9" * 400, b"[[" * 400, b"a" * 3000, b"epsilon > 1e999")
 #: Without a controller a service is not ready, and says so.
 _ASKED = [path for path in PATHS if path != "/readyz"]
 _BODIES = (
-    b"",
-    b"{}",
-    b"[",
-    b"[" * 50_000,
-    b"\xff" * 50,
-    JOB_BODY,
+    *(b"", b"{}", b"[", b"[" * 50_000, b"\xff" * 50, JOB_BODY),
     b'{"hand": "\\ud800"}',
     b'{"name": "d", "hands": ["allegro"], "objects": ["mug"], "grasps": 1e400}',
     b"key=%ff&key=gd_",
@@ -113,8 +130,8 @@ def ask(settings: Settings, services: Services, redis_server: str, rq_queue: RqQ
 def walk(ask: Ask, requests: int, seed: int) -> Counter[int]:
     """How often each status came; fails with the requests that made a 5xx."""
     chance, found, wrong = random.Random(seed), Counter[int](), []
-    for _ in range(requests):
-        request = _request(chance)
+    for number in range(requests):
+        request = _request(chance, _PAIRS[number : number + 1])
         status = ask(request)
         found[status] += 1
         if status >= 500:
@@ -123,17 +140,16 @@ def walk(ask: Ask, requests: int, seed: int) -> Counter[int]:
     return found
 
 
-def _request(chance: random.Random) -> bytes:
+def _request(chance: random.Random, odd: list[tuple[str, str]]) -> bytes:
     path = chance.choice(_ASKED).encode() + (chance.choice(_TAILS) if chance.random() < 0.2 else b"")
     query = b"&".join(chance.choice(_KEYS) + b"=" + chance.choice(_WORDS) for _ in range(chance.choice((0, 0, 1, 3))))
-    headers = [
-        (b"Host", b"127.0.0.1"),
-        (b"Authorization", b"Bearer KEY"),
-        (b"Accept", chance.choice((b"text/html", b"*/*"))),
-    ]
-    for name in chance.sample(NAMES, chance.choice((0, 1, 2, 4))):
+    headers = [(b"Host", b"127.0.0.1"), (b"Authorization", b"Bearer KEY")]
+    headers.append((b"Accept", chance.choice((b"text/html", b"*/*"))))
+    for name, value in odd or [
+        (name, chance.choice(VALUES)) for name in chance.sample(NAMES, chance.choice((0, 1, 2, 4)))
+    ]:
         headers = [one for one in headers if one[0].lower() != name.encode() or chance.random() < 0.2]
-        headers.append((name.encode(), chance.choice(VALUES).encode("latin-1")))
+        headers.append((name.encode(), value.encode("latin-1")))
     method, body = chance.choice(METHODS).encode(), chance.choice(_BODIES) if chance.random() < 0.5 else b""
     headers.append((b"Content-Length", b"%d" % len(body)))
     if method in (b"POST", b"PUT") and chance.random() < 0.7:

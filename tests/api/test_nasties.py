@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import base64
 import errno
-import io
 import json
 import os
 import tempfile
-import zipfile
 from typing import Any
 
 import pytest
@@ -17,14 +15,13 @@ from starlette.testclient import TestClient
 
 from graspd.api.access.keys import Key, Scope
 from graspd.api.access.quotas import Quotas
-from graspd.api.middleware.body_limit import MAX_BODY_BYTES
-from graspd.service.index import project_scope
+from graspd.api.middleware.limits import MAX_BODY_BYTES
 from graspd.service.model.errors import QuotaError
 from graspd.service.model.states import AssetKind
 from graspd.service.pipeline.backends import Services
 from graspd.service.settings import Settings
 from graspd.service.store.library import load_asset, load_check
-from tests.api.factories import add_job, finish_all
+from tests.api.factories import zipped
 
 STL = b"solid box\nendsolid box\n"
 LISTS: dict[str, tuple[Any, ...]] = {"/v1/grasps": (0.5, "s", 1), "/v1/datasets": ("t", "n")}
@@ -51,25 +48,12 @@ def shown(value: object) -> str:
 def test_a_cursor_of_somebody_s_own_making_is_refused(http: TestClient, path: str) -> None:
     for cursor in _nasty(LISTS[path]):
         answer = http.get(path, params={"cursor": cursor})
-        assert answer.status_code == 422, cursor
-        assert "cursor" in answer.json()["detail"]
-
-
-def test_a_cursor_that_a_list_gave_out_is_taken(http: TestClient) -> None:
-    assert http.get("/v1/objects", params={"cursor": project_scope.encode("a", "b")}).status_code == 200
+        assert answer.status_code == 422 and "cursor" in answer.json()["detail"], cursor
 
 
 @pytest.mark.parametrize("row", ["9223372036854775808", "9" * 4000])
 def test_a_row_that_no_shard_has_is_no_500(http: TestClient, row: str) -> None:
     assert http.get(f"/v1/grasps/{'0' * 32}/{row}").status_code in (404, 422)
-
-
-def test_a_range_of_4400_digits_is_no_range(http: TestClient, services: Services) -> None:
-    shard = finish_all(services, add_job(services))[0].shard_id
-    path = f"/v1/shards/{shard}/file"
-    for nasty in (f"bytes=-{'9' * 4400}", f"bytes={'9' * 4400}-", f"bytes=0-{'9' * 4400}"):
-        answer = http.get(path, headers={"Range": nasty})
-        assert (answer.status_code, len(answer.content)) == (200, services.store.size(f"shards/base/{shard}.h5"))
 
 
 def test_a_length_of_4400_digits_is_too_large(http: TestClient) -> None:
@@ -90,8 +74,7 @@ def test_a_body_made_to_break_the_reader_is_refused(http: TestClient, path: str,
 
 def test_the_answer_to_a_thousand_mistakes_is_short(http: TestClient) -> None:
     answer = http.post("/v1/jobs", json={f"{i:04}" * 60: i for i in range(3000)})
-    assert answer.status_code == 422
-    assert len(answer.content) < MAX_BODY_BYTES // 10
+    assert answer.status_code == 422 and len(answer.content) < MAX_BODY_BYTES // 10
 
 
 _NO_OPTIONS = (
@@ -116,11 +99,7 @@ def test_upload_options_that_are_no_short_object_are_refused(http: TestClient, o
 @pytest.mark.parametrize(
     "description",
     [
-        b"[" * 100_000,
-        b"5",
-        b"null",
-        b"",
-        b"\xff\xfe",
+        *(b"[" * 100_000, b"5", b"null", b"", b"\xff\xfe"),
         b'{"file": "box.stl", "facts": {"x": ' + DEEP.encode() + b"}}",
         b'{"file": "box.stl", "facts": {"x": "\\ud800"}}',
         b" " * 10_000_000 + b'{"file": "box.stl"}',
@@ -128,7 +107,7 @@ def test_upload_options_that_are_no_short_object_are_refused(http: TestClient, o
     ids=shown,
 )
 def test_an_asset_json_made_to_break_the_reader_is_refused(http: TestClient, description: bytes) -> None:
-    answer = http.post("/v1/objects", files={"file": ("x.zip", _zipped({"asset.json": description, "box.stl": STL}))})
+    answer = http.post("/v1/objects", files={"file": ("x.zip", zipped({"asset.json": description, "box.stl": STL}))})
     assert answer.status_code == 422, answer.text
     assert "asset.json" in answer.json()["detail"]
 
@@ -136,7 +115,7 @@ def test_an_asset_json_made_to_break_the_reader_is_refused(http: TestClient, des
 def test_facts_of_an_upload_cannot_make_the_list_long(http: TestClient) -> None:
     """195 KB of ZIP held facts of 200 MB, which every list of objects sent."""
     facts = json.dumps({"file": "box.stl", "facts": {"x": "x" * 40_000_000}}).encode()
-    packed = _zipped({"asset.json": facts, "box.stl": STL})
+    packed = zipped({"asset.json": facts, "box.stl": STL})
     assert len(packed) < 200_000
     assert http.post("/v1/objects", files={"file": ("x.zip", packed)}).status_code == 422
     assert len(http.get("/v1/objects").content) < 100_000
@@ -157,7 +136,7 @@ def test_long_findings_of_a_check_do_not_make_the_list_long(http: TestClient, se
 
 def test_names_of_files_are_bounded(http: TestClient) -> None:
     for files in ({f"{i}" * 60 + "n" * 300: b"" for i in range(3)}, {f"{i:05}" + "n" * 200: b"" for i in range(1500)}):
-        answer = http.post("/v1/objects", files={"file": ("x.zip", _zipped({**files, "box.stl": STL}))})
+        answer = http.post("/v1/objects", files={"file": ("x.zip", zipped({**files, "box.stl": STL}))})
         assert answer.status_code in (413, 422)
 
 
@@ -196,11 +175,3 @@ def test_redis_lost_in_the_middle_of_a_claim_forgets_no_job() -> None:
     key = Key(name="k", scope=Scope.SUBMIT, sha256="0" * 64, created="2026-01-01T00:00:00Z")
     with pytest.raises(QuotaError, match="has 7 grasps in work"), quotas.claim(key, "j", 5):
         pass
-
-
-def _zipped(files: dict[str, bytes]) -> bytes:
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, data in files.items():
-            archive.writestr(name, data)
-    return buffer.getvalue()

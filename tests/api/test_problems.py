@@ -30,7 +30,6 @@ def problem(answer: Any, status: int, slug: str) -> dict[str, Any]:
     ("change", "pointer", "words"),
     [
         ({"grasps": 0}, "#/grasps", "must be at least 1"),
-        ({"grasps": -3}, "#/grasps", "must be at least 1"),
         ({"fidelity": "perfect"}, "#/fidelity", "draft, standard, fine"),
         ({"seed": "x"}, "#/seed", "whole number"),
         ({"colour": "red"}, "#/colour", "is not known"),
@@ -55,18 +54,16 @@ def test_what_is_unknown_is_named(http: TestClient) -> None:
         assert name in problem(http.post("/v1/jobs", json=JOB | {kind: name}), 404, "not-found")["detail"]
     for path in ("/v1/jobs/none", "/v1/shards/none", "/v1/shards/none/file", "/v1/hands/none"):
         assert "none" in problem(http.get(path), 404, "not-found")["detail"]
-    problem(http.get("/v1/nowhere"), 404, "not-found")
+    answer = http.get("/v1/nowhere")
+    problem(answer, 404, "not-found")
+    assert "default-src 'none'" in answer.headers["content-security-policy"]
+    assert "unsafe" not in answer.headers["content-security-policy"]
+    assert answer.headers["x-content-type-options"] == "nosniff"
 
 
-def test_a_wrong_method_is_named_with_what_is_allowed(http: TestClient) -> None:
-    answer = http.delete("/v1/jobs")
-    problem(answer, 405, "method-not-allowed")
-    assert "GET" in answer.headers["allow"]
-
-
-@pytest.mark.parametrize("limit", [0, 201])
-def test_a_page_has_between_1_and_200_items(http: TestClient, limit: int) -> None:
-    problem(http.get("/v1/jobs", params={"limit": limit}), 422, "invalid-input")
+def test_a_page_has_between_1_and_200_items(http: TestClient) -> None:
+    for limit in (0, 201):
+        problem(http.get("/v1/jobs", params={"limit": limit}), 422, "invalid-input")
 
 
 def test_a_body_over_the_limit_is_refused_by_length_or_arrival(http: TestClient) -> None:
@@ -101,19 +98,13 @@ def test_an_unforeseen_error_tells_nothing_of_its_inside(
         raise RuntimeError("secret: /home/someone")
 
     monkeypatch.setattr(app.state.overview, "stats", burst)
-    document = problem(http.get("/v1/stats"), 500, "internal")
-    assert "secret" not in str(document)
-
-
-def test_every_problem_answer_has_the_security_headers(http: TestClient) -> None:
-    headers = http.get("/v1/nowhere").headers
-    assert "default-src 'none'" in headers["content-security-policy"]
-    assert "unsafe" not in headers["content-security-policy"]
-    assert headers["x-content-type-options"] == "nosniff"
+    assert "secret" not in str(problem(http.get("/v1/stats"), 500, "internal"))
+    page = http.get("/", headers={"Accept": "text/html"})
+    assert (page.status_code, page.headers["content-type"]) == (500, "text/html; charset=utf-8")
+    assert "secret" not in page.text and page.headers["x-request-id"] in page.text
 
 
 def test_a_page_that_does_not_exist_is_a_page_in_a_browser(http: TestClient) -> None:
     answer = http.get("/jobs/none", headers={"Accept": "text/html"})
-    assert answer.status_code == 404
-    assert answer.headers["content-type"].startswith("text/html")
+    assert answer.status_code == 404 and answer.headers["content-type"].startswith("text/html")
     assert "none" in answer.text

@@ -5,9 +5,8 @@ from __future__ import annotations
 import shutil
 import sys
 import threading
-import time
 from collections.abc import Iterator
-from pathlib import Path
+from contextlib import contextmanager
 from typing import Any
 
 import pytest
@@ -18,7 +17,7 @@ from graspd.api.server import bind
 from graspd.service.run.supervisor import Supervisor
 from graspd.service.settings import Settings
 from tests.api.conftest import app, furnished, services, settings
-from tests.waiting import PATIENCE_S, until_a_worker_is_idle
+from tests.waiting import PATIENCE_S, until, until_a_worker_is_idle
 
 __all__ = ["app", "furnished", "services", "settings"]
 
@@ -32,18 +31,22 @@ ARGUMENTS = tuple(_ARGUMENTS.split())
 SHOWN_MS = 1000 * PATIENCE_S
 
 
+@contextmanager
+def serving(app: Any) -> Iterator[str]:
+    with bind("127.0.0.1", 0) as listener:
+        server = uvicorn.Server(uvicorn.Config(app, log_level="critical", timeout_graceful_shutdown=1))
+        thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
+        thread.start()
+        until(lambda: server.started, "the server listens")
+        yield f"http://127.0.0.1:{listener.getsockname()[1]}"
+        server.should_exit = True
+        thread.join()
+
+
 @pytest.fixture
 def address(app: FastAPI) -> Iterator[str]:
-    listener = bind("127.0.0.1", 0)
-    server = uvicorn.Server(uvicorn.Config(app, log_level="warning", timeout_graceful_shutdown=1))
-    thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
-    thread.start()
-    while not server.started:
-        time.sleep(0.01)
-    yield f"http://127.0.0.1:{listener.getsockname()[1]}"
-    server.should_exit = True
-    thread.join()
-    listener.close()
+    with serving(app) as found:
+        yield found
 
 
 @pytest.fixture(scope="module")
@@ -84,38 +87,34 @@ class Watch:
             self.trouble.append(text)
 
 
-@pytest.fixture
-def page(address: str, chromium: Any) -> Iterator[Any]:
-    """A page of the application in this process; the test fails if anything went wrong on it."""
+@contextmanager
+def watched(chromium: Any, address: str) -> Iterator[Any]:
+    """A page of a service; the test fails if anything went wrong on it."""
     watch = Watch(address)
-    context = chromium.new_context(base_url=address, viewport={"width": 1440, "height": 900})
+    context = chromium.new_context(base_url=address, viewport={"width": 1440, "height": 900}, accept_downloads=True)
     context.set_default_timeout(SHOWN_MS)
     yield watch(context.new_page())
     context.close()
     assert watch.trouble == []
+
+
+@pytest.fixture
+def page(address: str, chromium: Any) -> Iterator[Any]:
+    with watched(chromium, address) as found:
+        yield found
 
 
 @pytest.fixture(scope="session")
 def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """Address of a whole service: Redis, API, controller, and a worker with the real engine on the CPU."""
     wanted = Settings(data_dir=tmp_path_factory.mktemp("service"), port=0, device="cpu", controller_interval_s=0.5)
-    worker = (sys.executable, "-m", "graspd", "worker")
-    supervisor = Supervisor(wanted, workers=1, worker_command=worker)
-    supervisor.start()
-    try:
+    with Supervisor(wanted, workers=1, worker_command=(sys.executable, "-m", "graspd", "worker")) as supervisor:
         supervisor.wait_ready(PATIENCE_S)
         until_a_worker_is_idle(supervisor.api_url)
         yield supervisor.api_url
-    finally:
-        supervisor.stop()
 
 
 @pytest.fixture
-def real_page(service: str, chromium: Any, tmp_path: Path) -> Iterator[Any]:
-    """A page of the whole service."""
-    watch = Watch(service)
-    context = chromium.new_context(base_url=service, viewport={"width": 1440, "height": 900}, accept_downloads=True)
-    context.set_default_timeout(SHOWN_MS)
-    yield watch(context.new_page())
-    context.close()
-    assert watch.trouble == []
+def real_page(service: str, chromium: Any) -> Iterator[Any]:
+    with watched(chromium, service) as found:
+        yield found

@@ -27,6 +27,7 @@ from PIL import Image
 from graspd.service.run.supervisor import Supervisor
 from graspd.service.settings import Settings
 from tests.browser.conftest import ARGUMENTS
+from tests.waiting import until
 
 REPOSITORY: Final = Path(__file__).resolve().parents[2]
 CHARTS: Final = [REPOSITORY / "docs" / "results" / one / "chart.json" for one in ("", "scenes-chart")]
@@ -43,7 +44,6 @@ LONG: Final[dict[str, Any]] = {"hand": "shadow", "object": "mug", "grasps": 640,
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Start, work, photograph."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data-dir", type=Path)
     parser.add_argument("--out", type=Path, default=REPOSITORY / "docs" / "images")
@@ -71,12 +71,12 @@ def work(client: httpx.Client, supervisor: Supervisor) -> dict[str, str]:
     """Jobs of every kind: finished with views, a dataset, one attempt that lost its worker, one that runs."""
     viewed = client.post("/v1/jobs", json=VIEWED).raise_for_status().json()["id"]
     if not client.get("/v1/datasets/kitchen-1").is_success:
-        until(lambda: client.get(f"/v1/jobs/{viewed}").json()["state"] == "running", "a job runs")
+        until(lambda: client.get(f"/v1/jobs/{viewed}").json()["state"] == "running", "a job runs", seconds=WORK_S)
         # What a lost worker leaves: its task runs again, and the attempt keeps the reason.
         os.kill(supervisor.pids["worker-0"], 9)
     client.post("/v1/datasets", json=DATASET).raise_for_status()
-    until(lambda: client.get("/v1/datasets/kitchen-1").json()["state"] == "succeeded", "the dataset")
-    until(lambda: client.get(f"/v1/jobs/{viewed}").json()["state"] == "succeeded", "the job with views")
+    until(lambda: client.get("/v1/datasets/kitchen-1").json()["state"] == "succeeded", "the dataset", seconds=WORK_S)
+    until(lambda: client.get(f"/v1/jobs/{viewed}").json()["state"] == "succeeded", "the job with views", seconds=WORK_S)
     folder = str(supervisor.settings.data_dir)
     if "card pad trade" not in client.get("/chart").text:
         for chart in CHARTS:
@@ -87,18 +87,9 @@ def work(client: httpx.Client, supervisor: Supervisor) -> dict[str, str]:
         subprocess.run(command, check=True, cwd=REPOSITORY, stdout=subprocess.DEVNULL)
     seed = int(time.time()) % 2**31
     running = client.post("/v1/jobs", json=LONG | {"seed": seed}).raise_for_status().json()["id"]
-    until(lambda: client.get(f"/v1/jobs/{running}").json()["progress"] > 0.002, "the long job moves")
+    until(lambda: client.get(f"/v1/jobs/{running}").json()["progress"] > 0.002, "the long job moves", seconds=WORK_S)
     best = client.get("/v1/grasps", params={"job": viewed, "valid": "true", "limit": 3}).json()["items"][-1]
     return {"viewed": viewed, "running": running, "grasp": f"{best['shard_id']}/{best['row']}"}
-
-
-def until(met: Any, what: str) -> None:
-    """Wait for a condition."""
-    deadline = time.monotonic() + WORK_S
-    while not met():
-        if time.monotonic() > deadline:
-            raise TimeoutError(f"after {WORK_S:.0f} s still not: {what}")
-        time.sleep(1.0)
 
 
 def photograph(address: str, places: dict[str, str], folder: Path, only: set[str]) -> None:

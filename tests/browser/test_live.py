@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import re
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import pytest
 
@@ -17,6 +16,7 @@ from graspd.service.pipeline.datasets import actions
 from graspd.service.pipeline.datasets.spec import DatasetRequest
 from graspd.service.store.records import publish
 from tests.api.dashboard.test_stability_page import a_record
+from tests.api.dashboard.test_tradeoff import RUNS
 from tests.api.factories import add_job, add_worker, fail, finish, finish_all
 from tests.fakes import record_of
 from tests.planning import plan_all
@@ -29,16 +29,7 @@ AXE = Path(__file__).parent / "vendor" / "axe.min.js"
 COLOURS = ["color-contrast", "link-in-text-block"]
 #: Pages that show all colours between them.
 IN_DARK = re.compile(r"/$|/datasets/kitchen$|/jobs/|/grasps$|/grasps/|/hands/|/stability|/chart|/submit|/problems")
-_RUN = {"method": "fast_graspd", "hand": "allegro", "object": "mug", "epsilon": 0.4, "pd_mm": 0.2}
-_MEASURED = (("draft", 9.0, 0.6), ("standard", 4.0, 0.8), ("fine", 1.5, 0.85))
-CHART = {
-    "created": "2026-11-21T12:00:00Z",
-    "device": "cpu",
-    "runs": [
-        _RUN | {"fidelity": name, "valid_per_second": speed, "seconds_to_first_valid": 2.0, "gsr": share}
-        for name, speed, share in _MEASURED
-    ],
-}
+CHART = {"created": "2026-11-21T12:00:00Z", "device": "cpu", "runs": RUNS}
 
 
 @pytest.fixture
@@ -52,7 +43,7 @@ def places(services: Services) -> list[str]:
     add_worker(services, "worker-1", "idle")
     wanted = DatasetRequest.model_validate({"name": "kitchen", "hands": ["allegro"], "objects": ["mug", "block"]})
     actions.create(services, wanted)
-    services.store.put("charts/20261121T120000Z.json", json.dumps(CHART).encode())
+    publish(services.store, "charts", CHART)
     publish(services.store, "stability", a_record())
     tagging.give(services, "good ones", [(shard, 0), (shard, 1)], project="", owner="", permit=lambda _: None)
     gone = add_job(services, seed=11)
@@ -78,13 +69,6 @@ def test_a_job_page_follows_its_job_without_a_reload(page: Any, services: Servic
     page.wait_for_selector("#head .succeeded")
     page.wait_for_selector("#views img")
     assert page.evaluate("window.stayed") is True
-
-
-def test_the_home_page_shows_a_job_that_comes_later(page: Any, services: Services) -> None:
-    page.goto("/")
-    page.wait_for_selector("text=No job yet")
-    record = add_job(services)
-    page.wait_for_selector(f'a[href="/jobs/{record.id}"]')
 
 
 def test_chosen_cells_stay_chosen_while_the_matrix_moves(page: Any, services: Services) -> None:
@@ -117,8 +101,7 @@ def test_a_filter_takes_effect_at_once_and_stands_in_the_address(page: Any, serv
 
 
 def test_a_press_on_a_bar_shows_the_grasps_in_it(page: Any, services: Services) -> None:
-    record = add_job(services)
-    finish_all(services, record)
+    finish_all(services, record := add_job(services))
     page.goto(f"/jobs/{record.id}")
     bar = page.locator("svg.hist a").first
     count = int(bar.get_attribute("aria-label").split()[0])
@@ -126,26 +109,13 @@ def test_a_press_on_a_bar_shows_the_grasps_in_it(page: Any, services: Services) 
     assert page.locator("#found tbody tr").count() == count
 
 
-def a_look_later(page: Any) -> None:
-    """The page's clock moves on by as long as it waits between two looks at what no event tells of."""
-    page.clock.fast_forward(1000 * int(page.get_attribute("body", "data-poll")))
-
-
-def test_a_chart_that_is_published_appears(page: Any, services: Services) -> None:
-    page.clock.install()
-    page.goto("/chart")
-    page.wait_for_selector("text=No measurements yet")
-    services.store.put("charts/20261121T120000Z.json", json.dumps(CHART).encode())
-    a_look_later(page)
-    page.wait_for_selector(".trade circle")
-
-
 def test_maps_that_are_published_appear_and_say_what_a_cell_is(page: Any, services: Services) -> None:
     page.clock.install()
     page.goto("/stability")
     page.wait_for_selector("text=No measurements yet")
     publish(services.store, "stability", a_record())
-    a_look_later(page)
+    # The page's clock moves on by as long as it waits between two looks at what no event tells of.
+    page.clock.fast_forward(1000 * int(page.get_attribute("body", "data-poll")))
     page.wait_for_selector(".cells td.broken")
     page.locator("#stiffness .cells td.broken").first.hover()
     assert "penalty: stiffness [N/m] 1e4, time step [s] 0.01: broken; note 4" in page.inner_text("#stiffness .reading")
@@ -231,13 +201,9 @@ def test_every_page_reads_without_javascript(address: str, page: Any, places: li
     texts = {path: _text_of(context.new_page(), path) for path in places}
     context.close()
     assert all(len(text) > 40 for text in texts.values())
-    of: Callable[[str], str] = lambda start: next(text for path, text in texts.items() if path.startswith(start))  # noqa: E731
-    assert "Penetration" in of("/grasps/")
-    assert "allegro × mug" in of("/grasps")
-    assert "kitchen" in of("/datasets")
-    assert "Save as a new hand" in of("/hands/")
-    assert "standard" in of("/chart")
-    assert "hands sink in" in of("/stability")
+    told = {"/grasps/": "Penetration", "/grasps": "allegro × mug", "/datasets": "kitchen", "/chart": "standard"}
+    for start, words in (told | {"/hands/": "Save as a new hand", "/stability": "hands sink in"}).items():
+        assert words in next(text for path, text in texts.items() if path.startswith(start))
 
 
 def test_a_dataset_is_deleted_by_its_name_and_comes_back(page: Any, services: Services) -> None:
@@ -267,13 +233,6 @@ def test_a_dataset_is_deleted_by_its_name_and_comes_back(page: Any, services: Se
     assert services.index.datasets.get("kitchen").grasps == 32
 
 
-def test_an_error_is_a_page_of_its_own(page: Any) -> None:
-    answer = page.request.get("/jobs/nonsense", headers={"Accept": "text/html"})
-    assert answer.status == 404
-    assert "there is no job" in answer.text()
-    assert "Back to the overview" in answer.text()
-
-
 def test_grasps_are_chosen_tagged_found_and_exported_by_keyboard(page: Any, services: Services) -> None:
     finish_all(services, add_job(services))
     page.goto("/grasps?view=table")
@@ -299,3 +258,21 @@ def test_grasps_are_chosen_tagged_found_and_exported_by_keyboard(page: Any, serv
     page.fill("#where", "epsilon > 1000")
     page.keyboard.press("Enter")
     page.wait_for_selector("text=No grasp matches these filters")
+
+
+@pytest.mark.parametrize(("scheme", "dark"), [("light", False), ("dark", True)])
+def test_a_route_is_opened_and_tried(page: Any, scheme: str, dark: bool) -> None:
+    hosts = set()
+    page.on("request", lambda request: hosts.add(urlsplit(request.url).netloc))
+    page.emulate_media(color_scheme=scheme)
+    page.goto("/docs")
+    page.locator("#explorer .opblock").first.wait_for()
+    assert page.evaluate("document.documentElement.classList.contains('dark-mode')") is dark
+    stats = page.locator("#explorer .opblock", has_text="/v1/stats")
+    stats.locator(".opblock-summary-control").click()
+    stats.get_by_role("button", name="Try it out").click()
+    stats.get_by_role("button", name="Execute").click()
+    answer = stats.locator(".live-responses-table td.response-col_status:not(.col_header)")
+    answer.wait_for()
+    assert answer.inner_text().split()[0] == "200"
+    assert len({host for host in hosts if host}) == 1

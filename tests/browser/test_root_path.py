@@ -1,73 +1,24 @@
-"""The dashboard below a path of a reverse proxy, in a real browser: pages, live updates, forms, models in 3D."""
+"""The dashboard below a path, in a real browser: pages, live updates, forms, models in 3D."""
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
-import httpx
 import pytest
-import uvicorn
 from fastapi import FastAPI
 
 from graspd.api.app import create_app
-from graspd.api.server import bind
 from graspd.service.model.states import AssetKind
 from graspd.service.pipeline.backends import Services
 from graspd.service.settings import Settings
 from graspd.service.store.assets import builtin_files
 from tests.api.factories import add_job, finish_all
-from tests.waiting import until
+from tests.browser.conftest import serving
 
 pytestmark = pytest.mark.browser
 
 PREFIX = "/graspd"
-_OF_A_HOP = (b"connection", b"transfer-encoding", b"keep-alive")
-
-
-class ReverseProxy:
-    """What nginx does with `location /graspd/ { proxy_pass http://…/; }`; of other paths it knows nothing."""
-
-    def __init__(self, target: str) -> None:
-        self.target = target
-
-    async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
-        if scope["type"] != "http":
-            return
-        path = scope["raw_path"].decode()
-        if not path.startswith(f"{PREFIX}/"):
-            await send({"type": "http.response.start", "status": 404, "headers": []})
-            await send({"type": "http.response.body"})
-            return
-        body = b""
-        while (message := await receive()).get("more_body"):
-            body += message["body"]
-        url = f"{self.target}{path.removeprefix(PREFIX)}?{scope['query_string'].decode()}".rstrip("?")
-        headers = [one for one in scope["headers"] if one[0] not in _OF_A_HOP]
-        async with (
-            httpx.AsyncClient(trust_env=False, timeout=None) as client,
-            client.stream(scope["method"], url, headers=headers, content=body + message.get("body", b"")) as answer,
-        ):
-            raw = [one for one in answer.headers.raw if one[0].lower() not in _OF_A_HOP]
-            await send({"type": "http.response.start", "status": answer.status_code, "headers": raw})
-            async for chunk in answer.aiter_raw():
-                await send({"type": "http.response.body", "body": chunk, "more_body": True})
-            await send({"type": "http.response.body"})
-
-
-@contextmanager
-def serving(app: Any) -> Iterator[str]:
-    """Address of an application on loopback."""
-    with bind("127.0.0.1", 0) as listener:
-        server = uvicorn.Server(uvicorn.Config(app, log_level="critical", timeout_graceful_shutdown=1))
-        thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
-        thread.start()
-        until(lambda: server.started, "the server listens")
-        yield f"http://127.0.0.1:{listener.getsockname()[1]}"
-        server.should_exit = True
-        thread.join()
 
 
 @pytest.fixture
@@ -78,7 +29,7 @@ def app(settings: Settings, services: Services) -> FastAPI:
 @pytest.fixture
 def address(app: FastAPI) -> Iterator[str]:
     """As the browser sees it; a request to anywhere else fails the test that uses `page`."""
-    with serving(app) as inner, serving(ReverseProxy(inner)) as outer:
+    with serving(app) as outer:
         yield f"{outer}{PREFIX}"
 
 

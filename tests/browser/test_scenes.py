@@ -23,23 +23,8 @@ STOPS = ["standoff", "pregrasp", "grasp", "squeeze", "lift"]
 def bin_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two feasible grasps in a bin; the page shows them whether they lift or not."""
     path = tmp_path_factory.mktemp("scene") / "bin.h5"
-    arguments = [
-        "--hand",
-        "allegro",
-        "--object",
-        "mug",
-        "--scene",
-        "bin",
-        "--scenes",
-        "1",
-        "-n",
-        "2",
-        "--want",
-        "candidates",
-    ]
-    result = CliRunner().invoke(
-        synth, [*arguments, "--fidelity", "draft", "--device", "cpu", "-o", str(path), "--json"]
-    )
+    arguments = "--hand allegro --object mug --scene bin --scenes 1 -n 2 --want candidates --fidelity draft"
+    result = CliRunner().invoke(synth, [*arguments.split(), "--device", "cpu", "-o", str(path), "--json"])
     assert result.exit_code == 0, result.output
     return path
 

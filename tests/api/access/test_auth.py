@@ -1,4 +1,4 @@
-"""Keys, scopes, sessions, and what a foreign web page may not do."""
+"""Keys, scopes, sessions, what a foreign web page may not do, and keys as the doctor sees them."""
 
 from __future__ import annotations
 
@@ -6,40 +6,39 @@ import stat
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from datetime import timedelta
+from pathlib import Path
 
 import pytest
 from fastapi import FastAPI
 from starlette.testclient import TestClient
 
+from graspd.api.access.doctor import keys as keys_finding
 from graspd.api.access.keys import KeyFile, KeyLimits, Scope
 from graspd.api.app import create_app
 from graspd.client.access_commands import duration
 from graspd.service.model.errors import ConflictError, InputError, NotFoundError, QueueUnavailable
 from graspd.service.pipeline.backends import Services
+from graspd.service.run.doctor.checks import Condition
 from graspd.service.settings import Settings
+from tests.api.conftest import BASE_URL
 from tests.api.factories import bearer
 from tests.memory_queue import MemoryQueue
 
 JOB = {"hand": "allegro", "object": "mug"}
+Closed = tuple[TestClient, dict[Scope, str]]
 
 
 @pytest.fixture
-def keys(settings: Settings) -> KeyFile:
-    return KeyFile(settings.data_dir / "keys.json")
-
-
-@pytest.fixture
-def closed(settings: Settings, services: Services, keys: KeyFile) -> Iterator[tuple[TestClient, dict[Scope, str]]]:
+def closed(settings: Settings, services: Services, keys: KeyFile) -> Iterator[Closed]:
     tokens = {scope: keys.add(scope.value, scope) for scope in Scope}
     with TestClient(create_app(settings, services), base_url="https://graspd.example") as client:
         yield client, tokens
 
 
-def test_a_closed_service_answers_401_without_a_good_key(closed: tuple[TestClient, dict[Scope, str]]) -> None:
+def test_a_closed_service_answers_401_without_a_good_key(closed: Closed) -> None:
     client, tokens = closed
     answer = client.get("/v1/jobs")
-    assert answer.status_code == 401
-    assert answer.headers["www-authenticate"].startswith("Bearer")
+    assert answer.status_code == 401 and answer.headers["www-authenticate"].startswith("Bearer")
     assert client.get("/v1/jobs", headers=bearer("gd_wrong")).status_code == 401
     assert client.get("/healthz").status_code == 200
     assert client.get("/metrics").status_code == 401
@@ -49,9 +48,7 @@ def test_a_closed_service_answers_401_without_a_good_key(closed: tuple[TestClien
 
 
 @pytest.mark.parametrize("scope", Scope)
-def test_a_reader_only_reads_and_a_wider_scope_includes_it(
-    closed: tuple[TestClient, dict[Scope, str]], keys: KeyFile, scope: Scope
-) -> None:
+def test_a_reader_only_reads_and_a_wider_scope_includes_it(closed: Closed, keys: KeyFile, scope: Scope) -> None:
     client, tokens = closed
     headers = bearer(tokens[scope])
     assert client.post("/v1/jobs", json=JOB, headers=headers).status_code == (403 if scope is Scope.READ else 202)
@@ -60,7 +57,7 @@ def test_a_reader_only_reads_and_a_wider_scope_includes_it(
     assert client.get("/v1/jobs", headers=headers).status_code == 401
 
 
-def test_a_key_opens_a_session_and_its_end_ends_it(closed: tuple[TestClient, dict[Scope, str]], keys: KeyFile) -> None:
+def test_a_key_opens_a_session_and_its_end_ends_it(closed: Closed, keys: KeyFile) -> None:
     client, tokens = closed
     answer = client.post("/login", data={"key": tokens[Scope.SUBMIT]}, follow_redirects=False)
     cookie = answer.headers["set-cookie"]
@@ -71,8 +68,12 @@ def test_a_key_opens_a_session_and_its_end_ends_it(closed: tuple[TestClient, dic
     assert client.get("/v1/jobs").status_code == 401
 
 
-def test_a_session_ends_where_its_visitor_signs_out(closed: tuple[TestClient, dict[Scope, str]]) -> None:
+def test_a_session_ends_where_its_visitor_signs_out(closed: Closed, keys: KeyFile) -> None:
     client, tokens = closed
+    claim, _, _ = keys.open_session(keys.list()[2]).partition(".")
+    client.cookies.set("graspd_session", f"{claim}.{'0' * 64}")
+    assert client.get("/v1/jobs").status_code == 401, "it is forged"
+    client.cookies.clear()
     assert "Sign out" not in client.get("/login").text
     client.post("/login", data={"key": tokens[Scope.READ]})
     page = client.get("/login").text
@@ -82,31 +83,21 @@ def test_a_session_ends_where_its_visitor_signs_out(closed: tuple[TestClient, di
     assert client.get("/v1/jobs").status_code == 401
 
 
-def test_another_web_site_signs_nobody_out(closed: tuple[TestClient, dict[Scope, str]]) -> None:
-    assert closed[0].post("/logout", headers={"Origin": "https://evil.example"}).status_code == 403
-
-
-def test_a_forged_session_is_refused(closed: tuple[TestClient, dict[Scope, str]], keys: KeyFile) -> None:
-    client, _ = closed
-    claim, _, _ = keys.open_session(keys.list()[2]).partition(".")
-    client.cookies.set("graspd_session", f"{claim}.{'0' * 64}")
-    assert client.get("/v1/jobs").status_code == 401
-
-
 @pytest.mark.parametrize("cookie", ["", "x", "x.y", ".", "é.é"])
 def test_a_session_of_nonsense_is_refused(keys: KeyFile, cookie: str) -> None:
     keys.add("me", Scope.READ)
     assert keys.find_session(cookie) is None
 
 
-def test_keys_are_kept_hashed_in_a_private_file(keys: KeyFile) -> None:
-    token = keys.add("me", Scope.ADMIN)
-    assert token not in keys.path.read_text()
+@pytest.mark.parametrize("project", ["Red", "a b", "../x", "x" * 33, "-a"])
+def test_a_project_has_a_plain_name(keys: KeyFile, project: str) -> None:
+    with pytest.raises(InputError, match="no name of a project"):
+        keys.add("ann", Scope.SUBMIT, project=project)
+
+
+def test_keys_are_kept_hashed_in_a_private_file_by_name(keys: KeyFile) -> None:
+    assert keys.add("me", Scope.READ) not in keys.path.read_text()
     assert stat.S_IMODE(keys.path.stat().st_mode) == 0o600
-
-
-def test_two_live_keys_cannot_share_a_name(keys: KeyFile) -> None:
-    keys.add("me", Scope.READ)
     with pytest.raises(ConflictError):
         keys.add("me", Scope.READ)
     keys.revoke("me")
@@ -124,14 +115,10 @@ def test_a_rotated_key_keeps_scope_and_limits_not_its_secret(keys: KeyFile) -> N
     assert keys.find(old) is None
     newer = keys.rotate("me", grace=timedelta(hours=1))
     assert keys.find(new) is not None and keys.find(newer) is not None
-    keys.revoke("me")
-    assert (keys.find(new), keys.find(newer)) == (None, None)
-
-
-def test_the_grace_of_a_rotation_ends(keys: KeyFile) -> None:
-    old = keys.add("me", Scope.READ)
     keys.rotate("me", grace=timedelta(microseconds=1))
-    assert keys.find(old) is None
+    assert keys.find(newer) is None, "the grace of a rotation ends"
+    keys.revoke("me")
+    assert keys.find(new) is None
 
 
 def test_a_key_opens_until_it_expires(keys: KeyFile) -> None:
@@ -145,35 +132,23 @@ def test_keys_made_at_the_same_time_are_all_kept(keys: KeyFile) -> None:
     assert all(keys.find(token) for token in tokens)
 
 
-def test_a_service_whose_last_key_was_revoked_stays_closed(
-    closed: tuple[TestClient, dict[Scope, str]], keys: KeyFile
-) -> None:
+def test_a_damaged_key_file_opens_nothing(closed: Closed, keys: KeyFile) -> None:
     for scope in Scope:
         keys.revoke(scope.value)
-    assert closed[0].get("/v1/jobs").status_code == 401
-
-
-def test_a_damaged_key_file_opens_nothing(closed: tuple[TestClient, dict[Scope, str]], keys: KeyFile) -> None:
+    assert closed[0].get("/v1/jobs").status_code == 401, "nor does a service without a live key"
     keys.path.write_text("{")
     answer = closed[0].get("/v1/jobs")
     assert (answer.status_code, answer.json()["type"]) == (503, "/problems/unavailable")
 
 
 @pytest.mark.parametrize("name", ["X-Forwarded-For", "Forwarded", "Via"])
-def test_an_open_service_answers_nobody_behind_a_proxy(http: TestClient, name: str) -> None:
+def test_an_open_service_answers_its_own_machine_only(app: FastAPI, http: TestClient, name: str) -> None:
     answer = http.get("/v1/jobs", headers={name: "203.0.113.9"})
-    assert answer.status_code == 403
-    assert "graspd keys add" in answer.json()["detail"]
+    assert answer.status_code == 403 and "graspd keys add" in answer.json()["detail"]
+    assert TestClient(app, base_url=BASE_URL, client=("203.0.113.9", 50000)).get("/v1/jobs").status_code == 403
 
 
-def test_an_open_service_answers_its_own_machine_only(app: FastAPI) -> None:
-    elsewhere = TestClient(app, base_url="http://127.0.0.1:8000", client=("203.0.113.9", 50000))
-    assert elsewhere.get("/v1/jobs").status_code == 403
-
-
-def test_only_who_may_read_is_told_what_is_wrong_with_a_part(
-    closed: tuple[TestClient, dict[Scope, str]], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_only_who_may_read_is_told_what_is_wrong_with_a_part(closed: Closed, monkeypatch: pytest.MonkeyPatch) -> None:
     def away(*_: object) -> float:
         raise QueueUnavailable("Redis does not answer at redis://inside:6379")
 
@@ -183,13 +158,9 @@ def test_only_who_may_read_is_told_what_is_wrong_with_a_part(
     assert "inside" in client.get("/readyz", headers=bearer(tokens[Scope.READ])).text
 
 
-@pytest.mark.parametrize(("text", "seconds"), [("90d", 90 * 86400), ("12h", 43200), ("30m", 1800), ("45s", 45)])
-def test_a_length_of_time_is_read(text: str, seconds: int) -> None:
-    assert duration(text).total_seconds() == seconds
-
-
 @pytest.mark.parametrize("text", ["", "90", "d", "-1d", "1w", "1.5h"])
-def test_what_is_no_length_of_time_is_said_so(text: str) -> None:
+def test_a_length_of_time_is_read_or_said_to_be_none(text: str) -> None:
+    assert [duration(one).total_seconds() for one in ("90d", "12h", "30m", "45s")] == [7776000, 43200, 1800, 45]
     with pytest.raises(InputError, match="90d"):
         duration(text)
 
@@ -206,22 +177,48 @@ def test_an_address_strangers_reach_needs_a_key(
 
 
 @pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("Sec-Fetch-Site", "cross-site"),
-        ("Sec-Fetch-Site", "same-site"),
-        ("Origin", "https://evil.example"),
-        ("Origin", "null"),
-    ],
+    "sent", ["Sec-Fetch-Site: cross-site", "Sec-Fetch-Site: same-site", "Origin: null", "Origin: http://x"]
 )
-def test_a_form_on_a_foreign_page_is_refused(http: TestClient, name: str, value: str) -> None:
-    assert http.post("/submit", data=JOB, headers={name: value}).status_code == 403
-
-
-def test_a_rebound_host_name_reaches_nothing_of_an_open_service(http: TestClient) -> None:
-    assert http.get("/v1/jobs", headers={"Host": "evil.example"}).status_code == 421
+def test_a_form_on_a_foreign_page_is_refused(http: TestClient, sent: str) -> None:
+    headers = dict([sent.split(": ")])
+    assert http.post("/submit", data=JOB, headers=headers).status_code == 403
+    assert http.post("/logout", headers=headers).status_code == 403
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1:9", "localhost", "[::1]:8000"])
-def test_this_machine_has_several_names(http: TestClient, host: str) -> None:
+def test_an_open_service_has_the_names_of_this_machine_alone(http: TestClient, host: str) -> None:
     assert http.get("/healthz", headers={"Host": host}).status_code == 200
+    assert http.get("/v1/jobs", headers={"Host": "evil.example"}).status_code == 421
+
+
+def test_without_keys_only_this_machine_is_served(tmp_path: Path) -> None:
+    settings = Settings(data_dir=tmp_path, host="0.0.0.0")
+    assert keys_finding(settings).fix == "graspd keys add admin --scope admin"
+    assert keys_finding(Settings(data_dir=tmp_path)).condition is Condition.GOOD
+    KeyFile(settings.resolved_keys_file).add("admin", Scope.ADMIN)
+    assert keys_finding(settings).condition is Condition.GOOD
+
+
+def test_keys_that_end_soon_are_named_unless_they_were_rotated(tmp_path: Path) -> None:
+    settings = Settings(data_dir=tmp_path)
+    file = KeyFile(settings.resolved_keys_file)
+    file.add("admin", Scope.ADMIN)
+    file.add("robot", Scope.SUBMIT, lifetime=timedelta(days=2))
+    found = keys_finding(settings)
+    assert (found.condition, found.fix) == (Condition.WARNING, "graspd keys rotate robot --grace 24h")
+    file.rotate("robot", grace=timedelta(hours=24))
+    assert keys_finding(settings).condition is Condition.GOOD
+    file.revoke("admin")
+    assert keys_finding(settings).condition is Condition.WARNING, "nobody is admin"
+    file.revoke("robot")
+    assert not keys_finding(settings).ok, "no key opens it"
+
+
+def test_a_file_that_everybody_reads_or_nobody_can_is_bad(tmp_path: Path) -> None:
+    settings = Settings(data_dir=tmp_path)
+    KeyFile(settings.resolved_keys_file).add("admin", Scope.ADMIN)
+    settings.resolved_keys_file.chmod(0o644)
+    assert "chmod 600" in keys_finding(settings).fix
+    settings.resolved_keys_file.write_text("{")
+    found = keys_finding(settings)
+    assert not found.ok and str(settings.resolved_keys_file) in found.message

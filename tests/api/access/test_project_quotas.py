@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import pytest
-from pydantic import SecretStr
 from sqlalchemy import update
 from starlette.testclient import TestClient
 
 from graspd.api.access.keys import KeyFile, ProjectLimits, Scope
-from graspd.api.app import create_app
 from graspd.service.index.tables import shards
 from graspd.service.pipeline.backends import Services
-from graspd.service.queue.rq_queue import RqQueue
 from graspd.service.settings import Settings
 from tests.api.conftest import TODAY
-from tests.api.factories import finish_all, people_of
+from tests.api.factories import bearer, finish_all, people_of
 from tests.fakes import record_of
 
 JOB = {"hand": "allegro", "object": "mug", "grasps": 32}
@@ -25,13 +22,8 @@ Ask = Callable[..., Any]
 
 
 @pytest.fixture
-def service(
-    settings: Settings, services: Services, redis_server: str, rq_queue: RqQueue, noon: None
-) -> Iterator[TestClient]:
-    wanted = settings.model_copy(update={"redis_url": SecretStr(redis_server)})
-    shared = Services(wanted, services.store, services.index, services.queue)
-    with TestClient(create_app(wanted, shared), base_url="http://127.0.0.1:8000") as client:
-        yield client
+def service(make_twins: Callable[[], list[TestClient]]) -> TestClient:
+    return make_twins()[0]
 
 
 @pytest.fixture
@@ -52,7 +44,6 @@ def limit(settings: Settings, **limits: int) -> None:
 
 
 def done(services: Services, job: str, *, seconds: float, device: str = "cuda:0", day: str = TODAY) -> None:
-    """A job of a single task is done: on that day, in that time."""
     (made,) = finish_all(services, record_of(services, job))
     values = {"device": device, "created": f"{day}T11:00:00.000000Z", "seconds": seconds}
     with services.index.database.writing() as connection:
@@ -60,7 +51,6 @@ def done(services: Services, job: str, *, seconds: float, device: str = "cuda:0"
 
 
 def refused(answer: Any) -> str:
-    """Why."""
     assert answer.status_code == 429 and answer.json()["type"] == "/problems/quota-exceeded", answer.text
     return str(answer.json()["detail"])
 
@@ -112,8 +102,7 @@ def test_usage_is_told_of_the_own_project_alone(
     reader, admin = keys.add("reader", Scope.READ, project="red"), keys.add("root", Scope.ADMIN)
 
     def read(path: str, token: str) -> Any:
-        headers = {"Authorization": f"Bearer {token}"}
-        return service.get(path, params={"since": TODAY, "until": TODAY}, headers=headers)
+        return service.get(path, params={"since": TODAY, "until": TODAY}, headers=bearer(token))
 
     (own,) = read("/v1/usage", reader).json()
     assert (own["project"], own["day"], own["grasps"], own["gpu_seconds"]) == ("red", TODAY, 32, 2.5)

@@ -8,7 +8,9 @@ import re
 import shutil
 import zipfile
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +19,11 @@ from fastapi.routing import APIRoute
 from pydantic import SecretStr
 from starlette.testclient import TestClient
 
-from graspd.api.access.keys import KeyFile, Scope
+from graspd.api.access.keys import Scope
 from graspd.api.app import create_app
 from graspd.service.index.index import Index
 from graspd.service.index.rebuild import differences, rebuild
 from graspd.service.model import names
-from graspd.service.model.errors import InputError
 from graspd.service.model.planning import plan
 from graspd.service.model.states import AssetKind
 from graspd.service.pipeline.backends import Services
@@ -64,50 +65,42 @@ class World:
     said: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        ann = self.people["ann"]
-        job = self.post("/v1/jobs", ann, json=JOB).json()["id"]
+        post = partial(self.ask, "ann", "POST")
+        job = post("/v1/jobs", json=JOB).json()["id"]
         record = record_of(self.services, job)
         finish_all(self.services, record)
         shard = next(task.output for task in plan(record))
         views = [task.output for task in plan(record)][-1]
-        failed = self.post("/v1/jobs", ann, json=JOB | {"seed": 78}).json()["id"]
+        failed = post("/v1/jobs", json=JOB | {"seed": 78}).json()["id"]
         fail(self.services, record_of(self.services, failed), "red-secret broke")
-        waiting = self.post("/v1/jobs", ann, json=JOB | {"seed": 79}).json()["id"]
+        waiting = post("/v1/jobs", json=JOB | {"seed": 79}).json()["id"]
         for kind, name in (("objects", "red-secret-ball"), ("hands", "red-secret-hand")):
             file = ("ball.stl", _BALL) if kind == "objects" else ("hand.urdf", _URDF)
-            added = self.post(f"/v1/{kind}", ann, data={"name": name}, files={"file": file})
+            added = post(f"/v1/{kind}", data={"name": name}, files={"file": file})
             assert added.status_code == 202, added.text
             self.said[f"{kind}_digest"] = added.json()["digest"]
         file = ("gone.stl", _BALL + b" ")
-        self.post("/v1/objects", ann, data={"name": "red-secret-gone"}, files={"file": file})
-        assert self.client.delete("/v1/objects/red-secret-gone", headers=ann).status_code == 204
-        digest = self.client.get("/v1/hands/allegro", headers=ann).json()["digest"]
+        post("/v1/objects", data={"name": "red-secret-gone"}, files={"file": file})
+        assert self.ask("ann", "DELETE", "/v1/objects/red-secret-gone").status_code == 204
+        digest = self.ask("ann", "GET", "/v1/hands/allegro").json()["digest"]
         file = ("net.npz", to_bytes(random_network(hand="allegro", digest=digest)))
-        added = self.post("/v1/networks", ann, data={"name": "red-secret-net"}, files={"file": file})
+        added = post("/v1/networks", data={"name": "red-secret-net"}, files={"file": file})
         assert added.status_code == 201, added.text
         self.said["networks_digest"] = added.json()["digest"]
-        self.post("/v1/object-sets", ann, json={"name": "red-secret-set", "objects": ["red-secret-ball", "mug"]})
+        post("/v1/object-sets", json={"name": "red-secret-set", "objects": ["red-secret-ball", "mug"]})
         matrix = {"name": "red-secret-data", "hands": ["allegro"], "objects": ["mug", "bottle"], "grasps": 32}
-        self.post("/v1/datasets", ann, json=matrix | {"scenes": 1, "views": 1, "seed": 77})
+        post("/v1/datasets", json=matrix | {"scenes": 1, "views": 1, "seed": 77})
         plan_all(self.services)
-        hook = self.post("/v1/webhooks", ann, json={"url": "https://red-secret.example/"}).json()
-        snapshot = self.post("/v1/datasets/red-secret-data/snapshots", ann).json()["digest"]
-        tag = self.post("/v1/tags", ann, json={"name": "red-secret-tag", "grasps": [{"shard_id": shard, "row": 0}]})
+        hook = post("/v1/webhooks", json={"url": "https://red-secret.example/"}).json()
+        snapshot = post("/v1/datasets/red-secret-data/snapshots").json()["digest"]
+        tag = post("/v1/tags", json={"name": "red-secret-tag", "grasps": [{"shard_id": shard, "row": 0}]})
         assert tag.status_code == 200, tag.text
         add_worker(self.services)
-        self.said |= {
-            "job_id": job,
-            "failed": failed,
-            "waiting": waiting,
-            "shard_id": shard,
-            "views": views,
-            "digest": snapshot,
-            "webhook": hook["id"],
-            "webhook_secret": hook["secret"],
-        }
+        self.said |= {"job_id": job, "failed": failed, "waiting": waiting, "shard_id": shard, "views": views}
+        self.said |= {"digest": snapshot, "webhook": hook["id"], "webhook_secret": hook["secret"]}
 
-    def post(self, path: str, headers: Headers, **content: Any) -> Any:
-        return self.client.post(path, headers=headers, **content)
+    def ask(self, who: str, method: str, path: str, **content: Any) -> Any:
+        return self.client.request(method, path, headers=self.people[who], **content)
 
     @property
     def secrets(self) -> list[str]:
@@ -122,9 +115,8 @@ _URDF = b"""<robot name="two"><link name="base"/><link name="tip"/><joint name="
 #: For each parameter of a path: what of the project it may name.
 _VALUES: dict[str, tuple[str, ...]] = (
     {"job_id": ("job_id", "failed", "waiting"), "shard_id": ("shard_id", "views"), "kind": ("object", "hand")}
-    | {"digest": ("digest", "objects_digest"), "row": ("0",), "number": ("0",), "index": ("0",), "channel": ("rgb",)}
-    | {"slug": ("not-found",), "webhook_id": ("webhook",), "action": ("cancel", "retry", "snapshot", "delete")}
-    | {"what": ("object",)}
+    | {"digest": ("digest", "objects_digest"), "row": ("0",), "index": ("0",), "slug": ("not-found",)}
+    | {"webhook_id": ("webhook",), "action": ("cancel", "retry", "snapshot", "delete"), "what": ("object",)}
 )
 _NAMES = {
     "hands": ("red-secret-hand", "hands_digest"),
@@ -193,7 +185,6 @@ def _bodies(world: World, method: str, address: str) -> list[dict[str, Any]]:
 
 
 def _leaks(world: World, sent: str, text: str) -> list[str]:
-    """Secrets in an answer that the request did not say itself."""
     return [secret for secret in world.secrets if secret in text.replace(sent, "") and secret not in sent]
 
 
@@ -206,7 +197,7 @@ def test_no_route_tells_or_changes_anything_of_another_project(world: World, who
             continue
         for address in _addresses(world, template):
             for content in _bodies(world, method, address):
-                answer = world.client.request(method, address, headers=world.people[who], **content)
+                answer = world.ask(who, method, address, **content)
                 where = f"{method} {address} {content} -> {answer.status_code}"
                 assert answer.status_code < 500 or template == "/readyz", where
                 if template != address:
@@ -226,8 +217,7 @@ _NOT_THERE = (403, 404, 405, 422)
 
 def _state(world: World) -> Any:
     """All that belongs to the project, as an admin sees it."""
-    root = world.people["root"]
-    get = lambda path: world.client.get(path, headers=root).json()  # noqa: E731
+    get = lambda path: world.ask("root", "GET", path).json()  # noqa: E731
     jobs = {job["id"]: job["state"] for job in get("/v1/jobs?limit=200")["items"] if job["project"] == "red"}
     data = get("/v1/datasets/red-secret-data")
     gone = [one["name"] for one in get("/v1/deletions")]
@@ -238,82 +228,74 @@ def test_what_is_out_of_scope_is_refused_as_if_it_were_absent(world: World) -> N
     gone, waiting, shard = "nothing-of-this-name", world.said["waiting"], world.said["shard_id"]
     hidden = {"jobs": waiting, "datasets": "red-secret-data", "objects": "red-secret-ball", "shards": shard}
     for kind, name in hidden.items():
-        answers = {one: world.client.get(f"/v1/{kind}/{one}", headers=world.people["bob"]) for one in (name, gone)}
+        answers = {one: world.ask("bob", "GET", f"/v1/{kind}/{one}") for one in (name, gone)}
         assert {answer.status_code for answer in answers.values()} == {404}
         assert len({answer.json()["detail"].replace(one, "X") for one, answer in answers.items()}) == 1
-    assert world.client.get(f"/v1/jobs/{waiting}/events", headers=world.people["bob"]).status_code == 404
+    assert world.ask("bob", "GET", f"/v1/jobs/{waiting}/events").status_code == 404
 
 
 def test_the_project_itself_and_an_admin_see_all_of_it(world: World) -> None:
     for who in ("ann", "amy", "root"):
-        get = lambda path, who=who: world.client.get(path, headers=world.people[who])  # noqa: E731
-        jobs = [job["id"] for job in get("/v1/jobs?limit=200").json()["items"]]
+        jobs = [job["id"] for job in world.ask(who, "GET", "/v1/jobs?limit=200").json()["items"]]
         assert {world.said["job_id"], world.said["waiting"]} <= set(jobs)
-        assert get("/v1/datasets/red-secret-data").status_code == 200
-        assert get("/v1/hands/red-secret-hand").status_code == 200
-        assert get(f"/v1/shards/{world.said['shard_id']}/file").status_code == 200
-        assert get(f"/v1/grasps/{world.said['shard_id']}/0").status_code == 200
-        assert get(f"/v1/grasps?job={world.said['job_id']}").json()["items"]
-
-
-def test_lists_of_a_project_hold_what_is_its_own(world: World) -> None:
-    mine = world.post("/v1/jobs", world.people["bob"], json=JOB | {"seed": 500}).json()["id"]
-    jobs = world.client.get("/v1/jobs", headers=world.people["bob"]).json()["items"]
+        shard = world.said["shard_id"]
+        for path in ("datasets/red-secret-data", "hands/red-secret-hand", f"shards/{shard}/file", f"grasps/{shard}/0"):
+            assert world.ask(who, "GET", f"/v1/{path}").status_code == 200
+        assert world.ask(who, "GET", f"/v1/grasps?job={world.said['job_id']}").json()["items"]
+    job = world.ask("ann", "POST", "/v1/jobs", json=JOB | {"seed": 80}).json()["id"]
+    assert world.ask("amy", "POST", f"/v1/jobs/{job}/cancel").status_code == 202
+    mine = world.ask("bob", "POST", "/v1/jobs", json=JOB | {"seed": 500}).json()["id"]
+    jobs = world.ask("bob", "GET", "/v1/jobs").json()["items"]
     assert mine in [job["id"] for job in jobs] and {job["project"] for job in jobs} == {"blue"}
-    assert world.client.get("/v1/grasps", headers=world.people["old"]).json()["items"] == []
+    assert world.ask("old", "GET", "/v1/grasps").json()["items"] == []
 
 
 def test_one_request_of_two_projects_is_two_jobs_of_one_shard(world: World) -> None:
-    job = world.post("/v1/jobs", world.people["bob"], json=JOB).json()
+    job = world.ask("bob", "POST", "/v1/jobs", json=JOB).json()
     assert job["id"] != world.said["job_id"] and job["state"] == "succeeded"
     assert world.said["shard_id"] in [shard["id"] for shard in job["shards"]]
-    assert world.client.get(f"/v1/shards/{world.said['shard_id']}", headers=world.people["bob"]).status_code == 200
-    assert world.client.delete(f"/v1/jobs/{job['id']}", headers=world.people["bob"]).status_code == 204
-    assert world.client.get(f"/v1/shards/{world.said['shard_id']}", headers=world.people["bob"]).status_code == 404
-
-
-def test_keys_of_a_project_act_for_each_other(world: World) -> None:
-    job = world.post("/v1/jobs", world.people["ann"], json=JOB | {"seed": 80}).json()["id"]
-    assert world.post(f"/v1/jobs/{job}/cancel", world.people["amy"]).status_code == 202
+    assert world.ask("bob", "GET", f"/v1/shards/{world.said['shard_id']}").status_code == 200
+    assert world.ask("bob", "DELETE", f"/v1/jobs/{job['id']}").status_code == 204
+    assert world.ask("bob", "GET", f"/v1/shards/{world.said['shard_id']}").status_code == 404
 
 
 def test_the_same_file_of_two_projects_is_two_objects(world: World) -> None:
     file = {"file": ("ball.stl", _BALL)}
-    own = world.post("/v1/objects", world.people["bob"], data={"name": "red-secret-ball"}, files=file).json()
+    own = world.ask("bob", "POST", "/v1/objects", data={"name": "red-secret-ball"}, files=file).json()
     assert own["digest"] != world.said["objects_digest"] and own["project"] == "blue"
-    found = world.client.get("/v1/objects/red-secret-ball", headers=world.people["bob"]).json()
+    found = world.ask("bob", "GET", "/v1/objects/red-secret-ball").json()
     assert found["digest"] == own["digest"]
-    assert world.client.delete("/v1/objects/red-secret-ball", headers=world.people["bob"]).status_code == 204
-    assert world.client.get("/v1/objects/red-secret-ball", headers=world.people["ann"]).status_code == 200
+    assert world.ask("bob", "DELETE", "/v1/objects/red-secret-ball").status_code == 204
+    assert world.ask("ann", "GET", "/v1/objects/red-secret-ball").status_code == 200
 
 
 def test_the_same_network_of_two_projects_is_two_networks(world: World) -> None:
-    digest = world.client.get("/v1/hands/allegro", headers=world.people["bob"]).json()["digest"]
+    digest = world.ask("bob", "GET", "/v1/hands/allegro").json()["digest"]
     file = {"file": ("net.npz", to_bytes(random_network(hand="allegro", digest=digest)))}
     job = {"hand": "allegro", "object": "mug", "scene": "table", "method": "learned"}
     job |= {"options": {"network": "red-secret-net"}}
-    assert world.post("/v1/jobs", world.people["bob"], json=job).status_code == 404
-    own = world.post("/v1/networks", world.people["bob"], data={"name": "red-secret-net"}, files=file).json()
+    assert world.ask("bob", "POST", "/v1/jobs", json=job).status_code == 404
+    own = world.ask("bob", "POST", "/v1/networks", data={"name": "red-secret-net"}, files=file).json()
     assert own["digest"] != world.said["networks_digest"] and own["project"] == "blue"
-    made = world.post("/v1/jobs", world.people["bob"], json=job).json()
+    made = world.ask("bob", "POST", "/v1/jobs", json=job).json()
     assert made["request"]["options"]["network"] == own["digest"]
-    world.post(f"/v1/jobs/{made['id']}/cancel", world.people["bob"])
-    assert world.client.delete(f"/v1/jobs/{made['id']}", headers=world.people["bob"]).status_code == 204
-    assert world.client.delete("/v1/networks/red-secret-net", headers=world.people["bob"]).status_code == 204
-    assert world.client.get("/v1/networks/red-secret-net", headers=world.people["ann"]).status_code == 200
+    world.ask("bob", "POST", f"/v1/jobs/{made['id']}/cancel")
+    assert world.ask("bob", "DELETE", f"/v1/jobs/{made['id']}").status_code == 204
+    assert world.ask("bob", "DELETE", "/v1/networks/red-secret-net").status_code == 204
+    assert world.ask("ann", "GET", "/v1/networks/red-secret-net").status_code == 200
 
 
 def test_what_is_shared_is_used_by_all_and_deleted_by_its_own(world: World) -> None:
     data = {"name": "common", "shared": "true"}
     file = {"file": ("common.stl", _BALL.replace(b"ball", b"common"))}
-    made = world.post("/v1/objects", world.people["ann"], data=data, files=file).json()
+    made = world.ask("ann", "POST", "/v1/objects", data=data, files=file).json()
     assert made["shared"] is True
     for who in ("bob", "old"):
-        assert world.client.get("/v1/objects/common", headers=world.people[who]).json()["digest"] == made["digest"]
-    again = world.post("/v1/objects", world.people["bob"], data={"name": "common"}, files=file).json()
+        assert world.ask(who, "GET", "/v1/objects/common").json()["digest"] == made["digest"]
+    again = world.ask("bob", "POST", "/v1/objects", data={"name": "common"}, files=file).json()
     assert again["digest"] == made["digest"]
-    assert world.client.delete("/v1/objects/common", headers=world.people["bob"]).status_code == 403
-    assert world.client.delete("/v1/objects/common", headers=world.people["amy"]).status_code == 204
+    assert world.ask("bob", "DELETE", "/v1/objects/common").status_code == 403
+    assert world.ask("amy", "DELETE", "/v1/objects/common").status_code == 204
 
 
 def test_an_upload_with_the_mark_of_a_project_is_not_its_own(world: World) -> None:
@@ -323,37 +305,26 @@ def test_an_upload_with_the_mark_of_a_project_is_not_its_own(world: World) -> No
         assert "graspd-project.txt" in archive.namelist()
     for said in ({}, {"shared": "true"}):
         file = {"file": ("ball.zip", stored)}
-        answer = world.post("/v1/objects", world.people["old"], data={"name": "forged"} | said, files=file)
+        answer = world.ask("old", "POST", "/v1/objects", data={"name": "forged"} | said, files=file)
         assert answer.status_code != 202 or answer.json()["digest"] != made.digest
-        assert world.client.get(f"/v1/objects/{made.digest}", headers=world.people["old"]).status_code == 404
-        world.client.delete("/v1/objects/forged", headers=world.people["old"])
+        assert world.ask("old", "GET", f"/v1/objects/{made.digest}").status_code == 404
+        world.ask("old", "DELETE", "/v1/objects/forged")
 
 
 def test_a_name_of_another_project_is_refused_without_detail(world: World) -> None:
     matrix = {"name": "red-secret-data", "hands": ["allegro"], "objects": ["mug"], "grasps": 32}
-    answer = world.post("/v1/datasets", world.people["bob"], json=matrix)
+    answer = world.ask("bob", "POST", "/v1/datasets", json=matrix)
     assert answer.status_code == 409 and "bottle" not in answer.text and "another dataset" not in answer.text
     objects = {"name": "red-secret-set", "objects": ["mug"]}
-    assert world.post("/v1/object-sets", world.people["bob"], json=objects).status_code == 409
+    assert world.ask("bob", "POST", "/v1/object-sets", json=objects).status_code == 409
 
 
 def test_projects_are_in_the_store_and_survive_a_lost_index(world: World) -> None:
     told = differences(world.services.index, world.services.store)
     assert [line for line in told if "project" in line or "shared" in line] == []
-    fresh = Index("sqlite://")
-    rebuild(fresh, world.services.store)
-    try:
-        assert fresh.jobs.get(world.said["job_id"]).project == "red"
-        assert fresh.datasets.get("red-secret-data").project == "red"
-        assert fresh.assets.get(AssetKind.HAND, "red-secret-hand").project == "red"
-        assert fresh.object_sets.get("red-secret-set").project == "red"
-        cell = fresh.datasets.cells("red-secret-data").items[0].job_id
-        assert fresh.jobs.get(cell).project == "red"
-    finally:
-        fresh.close()
-
-
-@pytest.mark.parametrize("project", ["Red", "a b", "../x", "x" * 33, "-a"])
-def test_a_project_has_a_plain_name(tmp_path: Path, project: str) -> None:
-    with pytest.raises(InputError, match="no name of a project"):
-        KeyFile(tmp_path / "keys.json").add("ann", Scope.SUBMIT, project=project)
+    with closing(Index("sqlite://")) as fresh:
+        rebuild(fresh, world.services.store)
+        hand, data = fresh.assets.get(AssetKind.HAND, "red-secret-hand"), fresh.datasets.get("red-secret-data")
+        cell = fresh.jobs.get(fresh.datasets.cells("red-secret-data").items[0].job_id)
+        found = (fresh.jobs.get(world.said["job_id"]), data, hand, fresh.object_sets.get("red-secret-set"), cell)
+        assert [one.project for one in found] == ["red"] * 5

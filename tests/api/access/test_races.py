@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from threading import Barrier, BrokenBarrierError
@@ -15,7 +15,6 @@ from starlette.testclient import TestClient
 
 from graspd.api.access.keys import Key, KeyFile, KeyLimits, Scope
 from graspd.api.access.quotas import Quotas
-from graspd.api.app import create_app
 from graspd.service.index.rebuild import differences
 from graspd.service.model.errors import ConflictError, QuotaError
 from graspd.service.model.records import JobRecord, ObjectSet, object_set_of
@@ -36,31 +35,21 @@ SETS = "/v1/object-sets"
 MATRIX = {"hands": ["allegro"], "objects": ["mug"], "grasps": 5}
 JOB = {"hand": "allegro", "object": "mug", "grasps": 5}
 KEY = Key(id="1", name="me", scope=Scope.SUBMIT, sha256="", created="", limits=KeyLimits(grasps_in_flight=20))
-Unfinished = Callable[[Collection[str]], Collection[str]]
+MakeQuotas = Callable[[Callable[[Collection[str]], Collection[str]]], Quotas]
 
 
 @pytest.fixture
-def twins(
-    settings: Settings, services: Services, redis_server: str, rq_queue: RqQueue, noon: None
-) -> Iterator[list[TestClient]]:
-    """Two applications over the same services, keys and Redis."""
-    wanted = settings.model_copy(update={"redis_url": SecretStr(redis_server), "webhook_secret": SecretStr("s" * 16)})
-    shared = Services(wanted, services.store, services.index, services.queue)
-    clients = [TestClient(create_app(wanted, shared), base_url="http://127.0.0.1:8000") for _ in range(2)]
-    for client in clients:
-        client.__enter__()
-    yield clients
-    for client in clients:
-        client.__exit__(None, None, None)
+def twins(make_twins: Callable[..., list[TestClient]], keys: KeyFile) -> list[TestClient]:
+    """Clients of two applications with one key."""
+    made = make_twins(webhook_secret=SecretStr("s" * 16))
+    headers = bearer(keys.add("me", Scope.SUBMIT, limits=KEY.limits))
+    for client in made:
+        client.headers.update(headers)
+    return made
 
 
 @pytest.fixture
-def headers(settings: Settings) -> dict[str, str]:
-    return bearer(KeyFile(settings.resolved_keys_file).add("me", Scope.SUBMIT, limits=KEY.limits))
-
-
-@pytest.fixture
-def quotas(settings: Settings, rq_queue: RqQueue, noon: None) -> Callable[[Unfinished], Quotas]:
+def quotas(settings: Settings, rq_queue: RqQueue, noon: None) -> MakeQuotas:
     return lambda unfinished: Quotas(settings, rq_queue.connection, unfinished)
 
 
@@ -68,32 +57,20 @@ def held(rq_queue: RqQueue) -> int:
     return int(rq_queue.connection.hget("graspd:quota:me:held", "grasps") or 0)
 
 
-def test_thirty_jobs_at_once_over_two_apis_stay_within_the_quota(
-    twins: list[TestClient], headers: dict[str, str]
-) -> None:
+def test_thirty_jobs_at_once_over_two_apis_stay_within_the_quota(twins: list[TestClient]) -> None:
     def submit(seed: int) -> int:
-        return twins[seed % 2].post("/v1/jobs", json=JOB | {"seed": seed}, headers=headers).status_code
+        return twins[seed % 2].post("/v1/jobs", json=JOB | {"seed": seed}).status_code
 
     with ThreadPoolExecutor(30) as pool:
         answers = sorted(pool.map(submit, range(30)))
     assert answers == [202] * 4 + [429] * 26
 
 
-def test_a_job_that_is_being_entered_is_not_taken_for_ended(
-    quotas: Callable[[Unfinished], Quotas], rq_queue: RqQueue
-) -> None:
-    nothing_known = quotas(lambda ids: set())
-    with nothing_known.claim(KEY, "a", 20), pytest.raises(QuotaError), nothing_known.claim(KEY, "b", 5):
+def test_a_job_that_is_entered_or_retried_meanwhile_stays_counted(quotas: MakeQuotas, rq_queue: RqQueue) -> None:
+    one = quotas(lambda ids: set())
+    with one.claim(KEY, "a", 20), pytest.raises(QuotaError), one.claim(KEY, "b", 5):
         pass
     assert held(rq_queue) == 20
-
-
-def test_a_job_that_is_retried_meanwhile_stays_counted(
-    quotas: Callable[[Unfinished], Quotas], rq_queue: RqQueue
-) -> None:
-    one = quotas(lambda ids: set())
-    with one.claim(KEY, "a", 20):
-        pass
 
     def retried_meanwhile(ids: Collection[str]) -> set[str]:
         with one.claim(KEY, "a", 20, is_new=False):
@@ -107,7 +84,7 @@ def test_a_job_that_is_retried_meanwhile_stays_counted(
 
 @pytest.mark.parametrize(("first_made", "second_made"), [(True, False), (False, True), (False, False)])
 def test_of_two_claims_of_one_job_the_one_that_made_it_counts(
-    quotas: Callable[[Unfinished], Quotas], rq_queue: RqQueue, first_made: bool, second_made: bool
+    quotas: MakeQuotas, rq_queue: RqQueue, first_made: bool, second_made: bool
 ) -> None:
     one, was_made = quotas(set), first_made or second_made
     with one.claim(KEY, "a", 20) as first:
@@ -120,7 +97,7 @@ def test_of_two_claims_of_one_job_the_one_that_made_it_counts(
         assert int(rq_queue.connection.get(today)) == 1
 
 
-def test_a_retry_of_fewer_grasps_leaves_the_sum_true(quotas: Callable[[Unfinished], Quotas], rq_queue: RqQueue) -> None:
+def test_a_retry_of_fewer_grasps_leaves_the_sum_true(quotas: MakeQuotas, rq_queue: RqQueue) -> None:
     ended: set[str] = set()
     one = quotas(lambda ids: set(ids) - ended)
     with one.claim(KEY, "a", 20):
@@ -134,7 +111,7 @@ def test_a_retry_of_fewer_grasps_leaves_the_sum_true(quotas: Callable[[Unfinishe
 
 
 def test_a_claim_of_a_process_that_died_ends(
-    quotas: Callable[[Unfinished], Quotas], rq_queue: RqQueue, monkeypatch: pytest.MonkeyPatch
+    quotas: MakeQuotas, rq_queue: RqQueue, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("graspd.api.access.quotas._PENDING_S", 0)
     one = quotas(lambda ids: set())
@@ -147,16 +124,18 @@ def test_a_claim_of_a_process_that_died_ends(
 
 @pytest.mark.parametrize("refused", [{"object": "unheard-of"}, {"grasps": 21}])
 def test_a_refused_request_leaves_its_idempotency_key_free(
-    twins: list[TestClient], headers: dict[str, str], refused: dict[str, Any]
+    twins: list[TestClient], keys: KeyFile, refused: dict[str, Any]
 ) -> None:
-    keyed = headers | {"Idempotency-Key": "one"}
+    keyed = {"Idempotency-Key": "one"}
     assert twins[0].post("/v1/jobs", json=JOB | refused, headers=keyed).status_code in (404, 429)
     assert twins[1].post("/v1/jobs", json=JOB, headers=keyed).status_code == 202
     assert twins[0].post("/v1/jobs", json=JOB | {"seed": 9}, headers=keyed).status_code == 422
+    yours = keyed | bearer(keys.add("you", Scope.SUBMIT))
+    assert twins[0].post("/v1/jobs", json=JOB | {"seed": 9}, headers=yours).status_code == 202
 
 
 def test_of_two_objects_of_one_name_at_once_one_gets_it(
-    twins: list[TestClient], headers: dict[str, str], services: Services, monkeypatch: pytest.MonkeyPatch
+    twins: list[TestClient], services: Services, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     together = Barrier(2)
     put_file = Store.put_file
@@ -168,10 +147,8 @@ def test_of_two_objects_of_one_name_at_once_one_gets_it(
         return put_file(self, key, file)
 
     def upload(number: int) -> int:
-        ball = (f"ball{number}.stl", f"solid {number}\nendsolid {number}\n".encode())
-        return (
-            twins[number].post("/v1/objects", files={"file": ball}, data={"name": "ball"}, headers=headers).status_code
-        )
+        file = {"file": (f"ball{number}.stl", f"solid {number}\nendsolid {number}\n".encode())}
+        return twins[number].post("/v1/objects", files=file, data={"name": "ball"}).status_code
 
     monkeypatch.setattr(Store, "put_file", both_have_looked)
     with ThreadPoolExecutor(2) as pool:
@@ -217,13 +194,11 @@ def test_of_two_projects_that_want_one_set_name_one_gets_it(
     assert strayed(services) == []
 
 
-def test_of_two_versions_of_a_set_at_once_one_follows_the_other(
-    twins: list[TestClient], headers: dict[str, str], services: Services
-) -> None:
+def test_of_two_versions_of_a_set_at_once_one_follows_the_other(twins: list[TestClient], services: Services) -> None:
     for number in range(ROUNDS):
         name = f"set{number}"
         bodies = [{"name": name, "objects": objects} for objects in (["mug"], ["block"])]
-        answers = at_once(twins, lambda http, n, bodies=bodies: http.post(SETS, json=bodies[n], headers=headers))
+        answers = at_once(twins, lambda http, n, bodies=bodies: http.post(SETS, json=bodies[n]))
         assert codes(answers) == [201, 201]
         kept = [read_record(ObjectSet, services.store, one.key) for one in services.store.list(f"object_sets/{name}")]
         first = next(one for one in kept if one.digest == object_set_of(name, one.objects).digest)
@@ -231,11 +206,9 @@ def test_of_two_versions_of_a_set_at_once_one_follows_the_other(
         assert later.digest == object_set_of(name, later.objects, after=first.digest).digest
 
 
-def test_of_two_datasets_of_one_name_at_once_one_gets_it(
-    twins: list[TestClient], headers: dict[str, str], services: Services
-) -> None:
+def test_of_two_datasets_of_one_name_at_once_one_gets_it(twins: list[TestClient], services: Services) -> None:
     def create(http: TestClient, number: int) -> Response:
-        return http.post("/v1/datasets", json=MATRIX | {"name": "all", "seed": number}, headers=headers)
+        return http.post("/v1/datasets", json=MATRIX | {"name": "all", "seed": number})
 
     assert codes(at_once(twins, create)) == [202, 409]
     assert strayed(services) == []
@@ -254,42 +227,38 @@ def test_of_two_last_webhooks_at_once_one_is_made(twins: list[TestClient], proje
 
 
 @pytest.mark.parametrize("what", ["job", "dataset"])
-def test_of_two_cancellations_at_once_one_counts(
-    twins: list[TestClient], headers: dict[str, str], services: Services, what: str
-) -> None:
+def test_of_two_cancellations_at_once_one_counts(twins: list[TestClient], services: Services, what: str) -> None:
     """Each leaves an event in the store: of two with one number a rebuild would not know which came last."""
     for number in range(4):
         body = JOB | {"grasps": 1, "seed": number} if what == "job" else MATRIX | {"name": f"all{number}", "grasps": 1}
-        made = twins[0].post(f"/v1/{what}s", json=body, headers=headers).json()
+        made = twins[0].post(f"/v1/{what}s", json=body).json()
         name = made["id"] if what == "job" else made["name"]
         for count, action in enumerate(("cancel", "retry"), start=1):
             path = f"/v1/{what}s/{name}/{action}"
-            assert codes(at_once(twins, lambda http, _, path=path: http.post(path, headers=headers))) == [202, 409]
+            assert codes(at_once(twins, lambda http, _, path=path: http.post(path))) == [202, 409]
             assert len(list(services.store.list(f"{what}s/{name}/events"))) == count
 
 
-def test_two_snapshots_at_once_are_one(twins: list[TestClient], headers: dict[str, str], services: Services) -> None:
-    twins[0].post("/v1/datasets", json=MATRIX | {"name": "all"}, headers=headers)
+def test_two_snapshots_at_once_are_one(twins: list[TestClient], services: Services) -> None:
+    twins[0].post("/v1/datasets", json=MATRIX | {"name": "all"})
     DatasetRounds(services).advance()
     job = next(services.store.list("jobs")).key
     finish_all(services, read_record(JobRecord, services.store, job))
-    answers = at_once(twins, lambda http, _: http.post("/v1/datasets/all/snapshots", headers=headers))
+    answers = at_once(twins, lambda http, _: http.post("/v1/datasets/all/snapshots"))
     assert codes(answers) == [200, 201]
     assert answers[0].json() == answers[1].json()
 
 
-def test_a_tag_given_twice_at_once_has_the_grasps_of_both(
-    twins: list[TestClient], headers: dict[str, str], services: Services
-) -> None:
-    job = twins[0].post("/v1/jobs", json=JOB, headers=headers).json()["id"]
+def test_a_tag_given_twice_at_once_has_the_grasps_of_both(twins: list[TestClient], services: Services) -> None:
+    job = twins[0].post("/v1/jobs", json=JOB).json()["id"]
     shard = finish_all(services, record_of(services, job))[0].shard_id
 
     def give(http: TestClient, number: int) -> Response:
         chosen = {"name": "good", "grasps": [{"shard_id": shard, "row": number}]}
-        return http.post("/v1/tags", json=chosen, headers=headers)
+        return http.post("/v1/tags", json=chosen)
 
     assert codes(at_once(twins, give)) == [200, 200]
-    assert [tag["grasps"] for tag in twins[0].get("/v1/tags", headers=headers).json()] == [2]
+    assert [tag["grasps"] for tag in twins[0].get("/v1/tags").json()] == [2]
     assert strayed(services) == []
 
 

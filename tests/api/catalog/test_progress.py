@@ -28,19 +28,12 @@ def task(done: float) -> TaskView:
 
 def job(*stages: StageProgress, state: State = State.RUNNING) -> JobView:
     request = JobRequest(hand="allegro", object="mug", grasps=64)
-    what = {
-        "id": "j",
-        "priority": Priority.INTERACTIVE,
-        "hand_digest": "",
-        "object_digest": "",
-        "finished": None,
-        "reason": None,
-    }
+    what = {"id": "j", "priority": Priority.INTERACTIVE, "hand_digest": "", "object_digest": ""}
+    what |= dict.fromkeys(("finished", "reason"))
     return JobView(**what, state=state, request=request, created="2026-01-01T00:00:00Z", stages=list(stages))
 
 
 def status_of(stage: StageProgress, *tasks: TaskView, paces: TaskRates | None = None, **of: Any) -> StageStatus:
-    """What is told of a stage alone."""
     (status,) = stage_statuses(job(stage, **of), list(tasks), paces or TaskRates(Clock()))
     return status
 
@@ -98,36 +91,13 @@ def test_without_a_terminal_progress_is_plain_lines() -> None:
     assert ("succeeded" in last, "8.0 s" in last) == (True, True)
 
 
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [
-        (None, "–"),
-        (math.nan, "–"),
-        (0, "0"),
-        (2.5e-7, "< 0.001"),
-        (0.12345, "0.123"),
-        (34.2, "34.2"),
-        (12345, "12,345"),
-    ],
-)
-def test_a_metric_is_said_with_three_digits(value: float | None, text: str) -> None:
-    assert metric(value) == text
-
-
-@pytest.mark.parametrize(("value", "text"), [(0, "0 %"), (0.999, "99 %"), (1.0, "100 %"), (0.004, "0.4 %")])
-def test_a_share_is_100_per_cent_only_when_it_is_all(value: float, text: str) -> None:
-    assert percent(value) == text
-
-
-@pytest.mark.parametrize(
-    ("seconds", "text"), [(0.52, "0.5 s"), (42, "42 s"), (61, "1 min 1 s"), (3661, "1 h 1 min"), (200000, "2 d 7 h")]
-)
-def test_a_time_span_is_said_in_its_two_largest_units(seconds: float, text: str) -> None:
-    assert duration(seconds) == text
-
-
-@pytest.mark.parametrize(
-    ("value", "text"), [(12, "12 B"), (1234, "1.2 kB"), (123456, "123 kB"), (67_108_864, "67.1 MB")]
-)
-def test_bytes_are_said_in_decimal_units(value: float, text: str) -> None:
-    assert size(value) == text
+def test_numbers_are_said_as_people_read_them() -> None:
+    """Three digits; 100 per cent only when it is all; the two largest units of a time; decimal units of bytes."""
+    metrics = {"–": math.nan, "0": 0, "< 0.001": 2.5e-7, "0.123": 0.12345, "34.2": 34.2, "12,345": 12345}
+    assert [metric(value) for value in (None, *metrics.values())] == ["–", *metrics]
+    shares = {"0 %": 0, "99 %": 0.999, "100 %": 1.0, "0.4 %": 0.004}
+    assert [percent(value) for value in shares.values()] == [*shares]
+    spans = {"0.5 s": 0.52, "42 s": 42, "1 min 1 s": 61, "1 h 1 min": 3661, "2 d 7 h": 200000}
+    assert [duration(value) for value in spans.values()] == [*spans]
+    sizes = {"12 B": 12, "1.2 kB": 1234, "123 kB": 123456, "67.1 MB": 67_108_864}
+    assert [size(value) for value in sizes.values()] == [*sizes]

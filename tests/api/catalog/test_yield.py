@@ -7,11 +7,7 @@ import pytest
 from starlette.testclient import TestClient
 
 from graspd.service.pipeline.backends import Services
-from graspd.service.pipeline.datasets import actions
-from graspd.service.pipeline.datasets.spec import DatasetRequest
 from tests.api.factories import add_job, finish_all
-from tests.fakes import record_of
-from tests.planning import plan_all
 
 
 @pytest.fixture
@@ -41,19 +37,6 @@ def test_service_and_job_count_as_tries_only_what_was_validated(http: TestClient
     home = http.get("/").text
     assert words in home and "320 candidates not validated" in home
     assert words in http.get("/datasets").text
-
-
-def test_a_dataset_of_unjudged_grasps_has_no_yield(http: TestClient, services: Services) -> None:
-    wanted = {"name": "d", "hands": ["allegro"], "objects": ["mug"], "validation": "none"}
-    actions.create(services, DatasetRequest.model_validate(wanted))
-    plan_all(services)
-    (job,) = services.index.jobs.page().items
-    finish_all(services, record_of(services, job.id))
-    (cell,) = http.get("/v1/datasets/d/cells").json()["items"]
-    assert (cell["candidates"], cell["validated"], cell["valid_yield"]) == (32, 0, None)
-    assert http.get("/v1/datasets/d").json()["valid_yield"] is None
-    for page in ("/datasets/d", "/datasets", "/compare?one=d&other=d", f"/jobs/{job.id}", "/"):
-        assert "not validated" in http.get(page).text, page
 
 
 def test_unjudged_grasps_are_not_among_the_rejected(http: TestClient, jobs: dict[str, str]) -> None:

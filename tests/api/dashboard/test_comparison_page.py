@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from starlette.testclient import TestClient
 
-from graspd.api.catalog.datasets import Comparisons, Datasets, Pair
+from graspd.api.catalog.datasets import Datasets, Pair
 from graspd.service.index.queries.grasps import GraspFilter
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.datasets import actions
@@ -56,12 +56,8 @@ def test_distributions_of_two_share_their_bins_and_count_all(services: Services)
     assert [a + b for a, b in zip(one.counts, other.counts, strict=True)] == both.counts
 
 
-def test_a_cell_that_only_one_has_makes_no_difference() -> None:
-    assert Pair("hand", "object", None, None).gain is None
-
-
 def test_more_cells_than_anybody_reads_are_left_out(services: Services, monkeypatch: pytest.MonkeyPatch) -> None:
     _two(services)
     monkeypatch.setattr("graspd.api.catalog.datasets.MOST_CELLS", 1)
     datasets = Datasets(services, None)  # type: ignore[arg-type]
-    assert Comparisons(services, datasets).of("rough", "fine").pairs == []
+    assert datasets.compare("rough", "fine").pairs == [] and Pair("hand", "object", None, None).gain is None

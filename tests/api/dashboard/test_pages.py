@@ -24,23 +24,14 @@ from tests.memory_queue import MemoryQueue
 FORM = {"hand": "allegro", "object": "mug", "grasps": "32", "fidelity": "standard", "seed": "0", "friction": "1.0"}
 
 
-def test_an_empty_service_says_what_to_do(http: TestClient) -> None:
-    page = http.get("/").text
-    assert "graspd submit" in page
-    assert "graspd worker" in page
-
-
 @pytest.mark.parametrize("path", ["/", "/workers"])
 def test_damage_of_the_store_is_shown_while_there_is_some(http: TestClient, services: Services, path: str) -> None:
     assert "graspd admin store verify" not in http.get(path).text
     services.index.damage.mark([Damage(f"shards/base/{n}.h5", "its <file> is gone", f"{n}") for n in range(7)])
     page = http.get(path).text
-    assert "7 objects of the store are damaged or missing" in page
-    assert "graspd admin store verify --repair" in page
+    assert "7 objects of the store are damaged or missing" in page and "graspd admin store verify --repair" in page
     if path == "/":
-        assert "shards/base/0.h5" in page
-        assert "its &lt;file&gt; is gone" in page
-        assert "and 2 more" in page
+        assert all(words in page for words in ("shards/base/0.h5", "its &lt;file&gt; is gone", "and 2 more"))
     services.index.damage.replace([])
     assert "damaged or missing" not in http.get(path).text
 
@@ -51,16 +42,15 @@ def test_home_shows_jobs_workers_and_failures(http: TestClient, services: Servic
     fail(services, add_job(services, seed=2), "the mesh has 12 open edges")
     add_worker(services, "worker-7", "busy")
     page = http.get("/").text
-    assert f'href="/jobs/{record.id}"' in page
-    assert "worker-7" in page
-    assert "the mesh has 12 open edges" in page
+    assert f'href="/jobs/{record.id}"' in page and "worker-7" in page and "the mesh has 12 open edges" in page
 
 
-@pytest.mark.parametrize("state", list(State))
-def test_home_filters_by_state(http: TestClient, services: Services, state: State) -> None:
+def test_home_filters_by_state(http: TestClient, services: Services) -> None:
+    empty = http.get("/").text
+    assert "graspd submit" in empty and "graspd worker" in empty, "it says what to do"
     add_job(services)
-    page = http.get("/", params={"state": state.value}).text
-    assert ("allegro" in page) == (state is State.QUEUED)
+    shown = [state for state in State if "allegro" in http.get("/", params={"state": state.value}).text]
+    assert shown == [State.QUEUED]
 
 
 def test_a_finished_job_shows_quality_views_files_and_code(http: TestClient, services: Services) -> None:
@@ -83,11 +73,9 @@ def test_a_job_that_has_not_ended_can_be_cancelled_on_its_page(http: TestClient,
 
 
 def test_a_failed_job_says_why_and_offers_a_retry(http: TestClient, services: Services) -> None:
-    record = add_job(services)
-    fail(services, record, "<b>not</b> watertight")
+    fail(services, record := add_job(services), "<b>not</b> watertight")
     page = http.get(f"/jobs/{record.id}").text
-    assert "&lt;b&gt;not&lt;/b&gt; watertight" in page
-    assert f'action="/jobs/{record.id}/retry"' in page
+    assert "&lt;b&gt;not&lt;/b&gt; watertight" in page and f'action="/jobs/{record.id}/retry"' in page
 
 
 def test_a_thumbnail_is_the_picture_of_the_shard(http: TestClient, services: Services) -> None:
@@ -108,9 +96,7 @@ def test_a_thumbnail_is_the_picture_of_the_shard(http: TestClient, services: Ser
 def test_the_table_of_grasps_keeps_its_filters_on_the_next_page(http: TestClient, services: Services) -> None:
     finish_all(services, add_job(services, grasps=128))
     page = http.get("/grasps", params={"valid": "true", "sort": "penetration_depth_mm", "order": "asc"}).text
-    link = re.search(r'href="([^"]*)" rel="next"|rel="next" href="([^"]*)"', page)
-    assert link is not None
-    address = (link.group(1) or link.group(2)).replace("&amp;", "&")
+    (address,) = re.findall(r'rel="next" href="([^"]*)"', page.replace("&amp;", "&"))
     assert "valid=true" in address
     assert http.get(address).text.count('<li class="card grasp">') > 2
 
@@ -124,8 +110,7 @@ def test_a_filter_that_fits_nothing_or_cannot_be_read_says_so(http: TestClient, 
 
 def test_the_form_submits_a_job_and_shows_it(http: TestClient) -> None:
     answer = http.post("/submit", data=FORM, follow_redirects=False)
-    assert answer.status_code == 303
-    assert http.get(answer.headers["location"]).status_code == 200
+    assert answer.status_code == 303 and http.get(answer.headers["location"]).status_code == 200
 
 
 @pytest.mark.parametrize(
@@ -133,9 +118,7 @@ def test_the_form_submits_a_job_and_shows_it(http: TestClient) -> None:
 )
 def test_a_form_in_error_keeps_what_was_typed(http: TestClient, change: dict[str, str], words: str) -> None:
     answer = http.post("/submit", data=FORM | {"seed": "77"} | change)
-    assert answer.status_code == 422
-    assert words in answer.text
-    assert 'value="77"' in answer.text
+    assert answer.status_code == 422 and words in answer.text and 'value="77"' in answer.text
 
 
 def test_the_buttons_cancel_and_retry_a_job(http: TestClient, services: Services) -> None:
@@ -171,8 +154,7 @@ def test_pages_are_read_on_while_redis_is_away(
     for method in ("ping", "depths"):
         monkeypatch.setattr(MemoryQueue, method, away)
     page = http.get("/")
-    assert page.status_code == 200
-    assert "Redis does not answer at unix:///redis.sock" in page.text
+    assert page.status_code == 200 and "Redis does not answer at unix:///redis.sock" in page.text
     assert http.get(f"/jobs/{record.id}").status_code == 200
     health = http.get("/readyz")
     assert (health.status_code, health.json()["parts"]["redis"]["ok"]) == (503, False)
@@ -188,19 +170,6 @@ def test_a_page_without_its_index_says_so_as_a_page(http: TestClient, monkeypatc
     answer = http.get("/", headers={"Accept": "text/html"})
     assert (answer.status_code, answer.headers["content-type"]) == (503, "text/html; charset=utf-8")
     assert "the index does not answer" in answer.text
-
-
-def test_an_unforeseen_error_is_a_page_that_gives_nothing_away(
-    http: TestClient, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def broken(*_: object, **__: object) -> None:
-        raise RuntimeError("a secret")
-
-    monkeypatch.setattr(Overview, "stats", broken)
-    answer = http.get("/", headers={"Accept": "text/html"})
-    assert (answer.status_code, answer.headers["content-type"]) == (500, "text/html; charset=utf-8")
-    assert "a secret" not in answer.text
-    assert answer.headers["x-request-id"] in answer.text
 
 
 def test_what_came_with_the_service_was_not_added(http: TestClient) -> None:

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from pydantic import SecretStr
 from starlette.testclient import TestClient
 
 from graspd.api.access.keys import KeyFile, KeyLimits, Scope
 from graspd.api.app import create_app
-from graspd.api.middleware.body_limit import BodyLimit
-from graspd.api.middleware.rate_limit import Allowance, Rates
+from graspd.api.middleware.limits import Allowance, BodyLimit, Rates
 from graspd.service.pipeline.backends import Services
 from graspd.service.queue.rq_queue import RqQueue
 from graspd.service.settings import Settings
@@ -24,42 +23,18 @@ from tests.planning import plan_all
 from tests.waiting import PATIENCE_S
 
 JOB = {"hand": "allegro", "object": "mug", "grasps": 32}
-Twins = Callable[..., tuple[TestClient, TestClient]]
+Twins = Callable[..., list[TestClient]]
 
 
 @pytest.fixture(autouse=True)
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
     """On a busy machine Redis may be slow to answer, and what is not counted is let in."""
-    monkeypatch.setattr("graspd.api.middleware.rate_limit._ANSWER_S", PATIENCE_S)
+    monkeypatch.setattr("graspd.api.middleware.limits._ANSWER_S", PATIENCE_S)
 
 
-@pytest.fixture
-def twins(settings: Settings, services: Services, redis_server: str, rq_queue: RqQueue, noon: None) -> Iterator[Twins]:
-    """Two applications over the same services, keys and Redis."""
-    open_clients: list[TestClient] = []
-
-    def make(**changes: Any) -> tuple[TestClient, TestClient]:
-        wanted = settings.model_copy(update={"redis_url": SecretStr(redis_server), **changes})
-        shared = Services(wanted, services.store, services.index, services.queue)
-        for _ in range(2):
-            client = TestClient(create_app(wanted, shared), base_url="http://127.0.0.1:8000")
-            client.__enter__()
-            open_clients.append(client)
-        return open_clients[0], open_clients[1]
-
-    yield make
-    for client in open_clients:
-        client.__exit__(None, None, None)
-
-
-@pytest.fixture
-def keys(settings: Settings) -> KeyFile:
-    return KeyFile(settings.resolved_keys_file)
-
-
-def test_two_applications_share_one_rate_and_say_when_to_come(twins: Twins, keys: KeyFile) -> None:
+def test_two_applications_share_one_rate_and_say_when_to_come(make_twins: Twins, keys: KeyFile) -> None:
     headers = bearer(keys.add("me", Scope.READ, limits=KeyLimits(requests_per_minute=2)))
-    first, second = twins()
+    first, second = make_twins()
     assert first.get("/v1/stats", headers=headers).status_code == 200
     assert second.get("/v1/stats", headers=headers).headers["ratelimit"].startswith('"requests";r=0;t=')
     answer = first.get("/v1/stats", headers=headers)
@@ -70,30 +45,21 @@ def test_two_applications_share_one_rate_and_say_when_to_come(twins: Twins, keys
     assert 1 <= int(answer.headers["retry-after"]) <= 30
 
 
-def test_a_key_without_a_limit_has_that_of_the_settings(twins: Twins, keys: KeyFile) -> None:
+def test_guesses_at_the_login_are_slowed_down_and_health_is_not(make_twins: Twins, keys: KeyFile) -> None:
     headers = bearer(keys.add("me", Scope.READ))
-    client, _ = twins(requests_per_minute=1)
-    assert [client.get("/v1/stats", headers=headers).status_code for _ in range(2)] == [200, 429]
-
-
-def test_strangers_are_counted_by_address(twins: Twins, keys: KeyFile) -> None:
-    headers = bearer(keys.add("me", Scope.READ))
-    client, _ = twins(address_requests_per_minute=2)
-    assert [client.get("/v1/stats", headers=bearer("gd_guess")).status_code for _ in range(3)] == [401, 401, 429]
-    assert client.get("/v1/stats", headers=headers).status_code == 200
-
-
-def test_guesses_at_the_login_are_slowed_down_and_health_is_not(twins: Twins, keys: KeyFile) -> None:
-    keys.add("me", Scope.READ)
-    client, _ = twins(address_requests_per_minute=3)
-    answers = [client.post("/login", data={"key": f"gd_{i}"}).status_code for i in range(4)]
-    assert answers == [401, 401, 401, 429]
+    client, _ = make_twins(address_requests_per_minute=3)
+    assert client.get("/v1/stats", headers=bearer("gd_guess")).status_code == 401
+    answers = [client.post("/login", data={"key": f"gd_{i}"}).status_code for i in range(3)]
+    assert answers == [401, 401, 429]
+    assert client.get("/v1/stats", headers=headers).status_code == 200, "strangers are counted by address"
     assert {client.get("/healthz").status_code for _ in range(4)} == {200}
 
 
-def test_an_open_service_counts_nothing(twins: Twins) -> None:
-    client, _ = twins(requests_per_minute=1, address_requests_per_minute=1)
+def test_limits_of_the_settings_count_for_keys_and_not_while_there_are_none(make_twins: Twins, keys: KeyFile) -> None:
+    client, _ = make_twins(requests_per_minute=1, address_requests_per_minute=1)
     assert {client.get("/v1/stats").status_code for _ in range(4)} == {200}
+    headers = bearer(keys.add("me", Scope.READ))
+    assert [client.get("/v1/stats", headers=headers).status_code for _ in range(2)] == [200, 429]
 
 
 def test_without_redis_the_limits_let_everybody_in(settings: Settings, services: Services, keys: KeyFile) -> None:
@@ -118,8 +84,6 @@ def test_only_so_many_requests_are_answered_at_once(redis_server: str, rq_queue:
 
 
 def enter(redis_server: str, allowance: Allowance) -> Any:
-    """How a request of a key is let in."""
-
     async def ask() -> Any:
         rates = Rates(redis_server)
         admission = await rates.enter("key:me", allowance, "new")
@@ -129,21 +93,18 @@ def enter(redis_server: str, allowance: Allowance) -> Any:
     return asyncio.run(ask())
 
 
-def test_requests_of_a_killed_process_count_for_a_minute_at_most(redis_server: str, rq_queue: RqQueue) -> None:
+def test_a_killed_process_or_a_clock_set_back_shuts_nobody_out_for_long(redis_server: str, rq_queue: RqQueue) -> None:
     rq_queue.connection.zadd("graspd:held:key:me", {"lost": time.time() - 1})
     assert enter(redis_server, Allowance(0, 1)).refused == ""
     assert 0 < rq_queue.connection.pttl("graspd:held:key:me") <= 60_000
-
-
-def test_a_clock_set_back_shuts_nobody_out_for_long(redis_server: str, rq_queue: RqQueue) -> None:
     rq_queue.connection.set("graspd:rate:key:me", time.time() + 86400)
     assert enter(redis_server, Allowance(10, 0)).seconds <= 60
 
 
-def test_jobs_over_the_daily_quota_are_refused_until_midnight(twins: Twins, keys: KeyFile) -> None:
+def test_jobs_over_the_daily_quota_are_refused_until_midnight(make_twins: Twins, keys: KeyFile) -> None:
     """What is refused, or the same again, costs nothing, and another key has a quota of its own."""
     headers = bearer(keys.add("me", Scope.SUBMIT, limits=KeyLimits(jobs_per_day=2, grasps_in_flight=96)))
-    clients = twins()
+    clients = make_twins()
     assert clients[0].post("/v1/jobs", json=JOB | {"hand": "claw"}, headers=headers).status_code == 404
     seeds = (0, 0, 0, 1, 2)
     answers = [clients[i % 2].post("/v1/jobs", json=JOB | {"seed": s}, headers=headers) for i, s in enumerate(seeds)]
@@ -154,18 +115,20 @@ def test_jobs_over_the_daily_quota_are_refused_until_midnight(twins: Twins, keys
     assert clients[0].post("/v1/jobs", json=JOB | {"seed": 2}, headers=other).status_code == 202
 
 
-def test_grasps_in_flight_come_free_as_jobs_end(twins: Twins, keys: KeyFile, services: Services) -> None:
+def test_grasps_in_flight_come_free_as_jobs_end(make_twins: Twins, keys: KeyFile, services: Services) -> None:
     headers = bearer(keys.add("me", Scope.SUBMIT, limits=KeyLimits(grasps_in_flight=64)))
-    client, _ = twins()
+    client, _ = make_twins()
     first = client.post("/v1/jobs", json=JOB, headers=headers).json()["id"]
     assert client.post("/v1/jobs", json=JOB | {"seed": 1, "grasps": 33}, headers=headers).status_code == 429
     finish_all(services, record_of(services, first))
     assert client.post("/v1/jobs", json=JOB | {"seed": 1, "grasps": 33}, headers=headers).status_code == 202
 
 
-def test_a_dataset_counts_with_all_its_cells_until_it_ends(twins: Twins, keys: KeyFile, services: Services) -> None:
+def test_a_dataset_counts_with_all_its_cells_until_it_ends(
+    make_twins: Twins, keys: KeyFile, services: Services
+) -> None:
     headers = bearer(keys.add("me", Scope.SUBMIT, limits=KeyLimits(grasps_in_flight=64)))
-    client, _ = twins()
+    client, _ = make_twins()
     matrix = {"name": "d", "hands": ["allegro", "barrett"], "objects": ["mug"], "grasps": 32}
     large = client.post("/v1/datasets", json=matrix | {"grasps": 33}, headers=headers)
     assert large.status_code == 429 and client.get("/v1/datasets", headers=headers).json()["items"] == []
@@ -176,14 +139,6 @@ def test_a_dataset_counts_with_all_its_cells_until_it_ends(twins: Twins, keys: K
     plan_all(services)
     assert client.post("/v1/jobs", json=JOB | {"seed": 1}, headers=headers).status_code == 202
     assert client.post("/v1/datasets/d/retry", headers=headers).status_code == 429
-
-
-def test_an_idempotency_key_belongs_to_the_key_that_sent_it(twins: Twins, keys: KeyFile) -> None:
-    mine, yours = (bearer(keys.add(name, Scope.SUBMIT)) | {"Idempotency-Key": "1"} for name in ("me", "you"))
-    first, second = twins()
-    assert first.post("/v1/jobs", json=JOB, headers=mine).status_code == 202
-    assert second.post("/v1/jobs", json=JOB | {"seed": 1}, headers=mine).status_code == 422
-    assert second.post("/v1/jobs", json=JOB | {"seed": 1}, headers=yours).status_code == 202
 
 
 async def reads_all(scope: Any, receive: Any, send: Any) -> None:
@@ -200,6 +155,7 @@ def answer_to(receive: Callable[[], Any], **options: float) -> int:
 
     limit = BodyLimit(reads_all, upload_paths=frozenset(), upload_bytes=1, **options)
     scope = {"type": "http", "method": "POST", "path": "/v1/jobs", "headers": [], "query_string": b"", "server": None}
+    scope["app"] = SimpleNamespace(state=SimpleNamespace(settings=Settings()))
     asyncio.run(limit(scope, receive, send))
     return int(sent[0]["status"])
 
@@ -221,5 +177,5 @@ def test_a_body_that_trickles_in_is_given_up(monkeypatch: pytest.MonkeyPatch) ->
         clock[0] += 20.0
         return {"type": "http.request", "body": b"x", "more_body": True}
 
-    monkeypatch.setattr("graspd.api.middleware.body_limit.time.monotonic", lambda: clock[0])
+    monkeypatch.setattr("graspd.api.middleware.limits.time.monotonic", lambda: clock[0])
     assert answer_to(trickling) == 408 and pieces == 2

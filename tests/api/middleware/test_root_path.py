@@ -47,7 +47,6 @@ def http(request: pytest.FixtureRequest, below: Settings, services: Services) ->
 
 
 def addresses(page: str) -> set[str]:
-    """Addresses of this host in a page."""
     return set(re.findall(r'\s(?:href|src|action|formaction|hx-get|data-[a-z]+)="(/[^"#]*)', page))
 
 
@@ -77,7 +76,9 @@ def test_redirects_and_cookies_are_below_the_prefix(http: TestClient, below: Set
     assert http.get(f"{PREFIX}/").status_code == 200
 
 
-def test_the_api_tells_where_it_is(http: TestClient) -> None:
+def test_the_api_tells_where_it_is(http: TestClient, services: Services) -> None:
+    finish_all(services, job := add_job(services))
+    assert f"{BASE_URL}{PREFIX}/v1/shards/" in http.get(f"{PREFIX}/jobs/{job.id}").text, "a snippet, too"
     assert http.get(f"{PREFIX}/openapi.json").json()["servers"] == [{"url": PREFIX}]
     made = http.post(f"{PREFIX}/v1/jobs", json={"hand": "allegro", "object": "mug", "grasps": 32})
     assert http.get(made.headers["location"]).json()["id"] == made.json()["id"]
@@ -97,42 +98,27 @@ def test_the_client_works_below_a_prefix(http: TestClient, services: Services, t
         assert client.download(shard, tmp_path / "x.h5").stat().st_size > 0
 
 
-def test_a_snippet_names_the_address_that_the_visitor_sees(http: TestClient, services: Services) -> None:
-    job = add_job(services)
-    finish_all(services, job)
-    assert f"{BASE_URL}{PREFIX}/v1/shards/" in http.get(f"{PREFIX}/jobs/{job.id}").text
-
-
 def test_what_is_no_address_of_this_host_stays() -> None:
-    same = (
-        '<p title="/x">="/x"</p><a href="//cdn/x"><a href="https://x/"><a href="#x"><a href="?x"><input value="/jobs">'
-    )
+    links = '<a href="//cdn/x"><a href="https://x/"><a href="#x"><a href="?x">'
+    same = f'<p title="/x">="/x"</p>{links}<input value="/jobs">'
     assert with_prefix(same, PREFIX) == same
 
 
-@pytest.mark.parametrize(
-    ("where", "expected"),
-    [
-        *[("/x?a=/b#c", "/graspd/x?a=/b#c"), ("http://me/x", "http://me/graspd/x")],
-        *[(other, other) for other in ("http://you/x", "x", "?x")],
-    ],
-)
-def test_a_redirect_to_this_host_gets_the_prefix(where: str, expected: str) -> None:
-    assert RootPath(create_app, prefix=PREFIX)._below(where, "me") == expected  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize(("said", "meant"), [("graspd", PREFIX), ("/graspd/", PREFIX), ("/", None), ("a/b", "/a/b")])
-def test_slashes_at_the_ends_do_not_matter(said: str, meant: str | None) -> None:
-    assert Settings(api_root_path=said).api_root_path == meant
+def test_a_redirect_to_this_host_gets_the_prefix() -> None:
+    prefixed = {"/x?a=/b#c": "/graspd/x?a=/b#c", "http://me/x": "http://me/graspd/x"}
+    for where, expected in (prefixed | {other: other for other in ("http://you/x", "x", "?x")}).items():
+        assert RootPath(create_app, prefix=PREFIX)._below(where, "me") == expected  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("said", ["/a b", "/a?b", "/ü", "/../x", "http://x/y", '/"x', "/a//b"])
 def test_what_is_no_path_is_refused(said: str) -> None:
     with pytest.raises(ValidationError, match="such as /graspd"):
         Settings(api_root_path=said)
+    meant = {"graspd": PREFIX, "/graspd/": PREFIX, "/": None, "a/b": "/a/b"}
+    assert [Settings(api_root_path=one).api_root_path for one in meant] == [*meant.values()]
 
 
-@pytest.mark.parametrize("said", ["/v1", "/jobs", "/static/x", "/metrics"])
-def test_a_path_of_the_service_itself_is_refused(settings: Settings, services: Services, said: str) -> None:
-    with pytest.raises(InputError, match="GRASPD_API_ROOT_PATH"):
-        create_app(settings.model_copy(update={"api_root_path": said}), services)
+def test_a_path_of_the_service_itself_is_refused(settings: Settings, services: Services) -> None:
+    for said in ("/v1", "/jobs", "/static/x", "/metrics"):
+        with pytest.raises(InputError, match="GRASPD_API_ROOT_PATH"):
+            create_app(settings.model_copy(update={"api_root_path": said}), services)

@@ -12,7 +12,7 @@ from graspd.service.store.records import publish
 from tests.api.factories import finish_all
 from tests.fakes import record_of
 from tests.planning import plan_all
-from tests.service.pipeline.test_fidelity_choice import CHART, scene_chart
+from tests.service.pipeline.test_fidelity_choice import CHART
 
 WANTED = {"name": "kitchen", "hands": ["allegro", "barrett"], "objects": ["mug", "block"], "grasps": 64}
 
@@ -25,7 +25,6 @@ def kitchen(http: TestClient) -> dict[str, Any]:
 
 
 def finish_cells(services: Services, http: TestClient, count: int) -> None:
-    """Do all tasks of the first cells."""
     plan_all(services)
     for cell in http.get("/v1/datasets/kitchen/cells").json()["items"][:count]:
         finish_all(services, record_of(services, cell["job_id"]))
@@ -44,19 +43,10 @@ def test_a_new_dataset_has_a_place_and_a_done_one_is_found(http: TestClient, ser
     assert again.status_code == 200 and again.json()["state"] == "succeeded"
 
 
-def test_options_of_the_method_reach_the_jobs_of_the_cells(http: TestClient, services: Services) -> None:
-    answer = http.post("/v1/datasets", json=WANTED | {"method": "graspit", "options": {"keep": 20}})
-    assert answer.json()["options"]["options"] == {"keep": 20}
-    plan_all(services)
-    cell = http.get("/v1/datasets/kitchen/cells").json()["items"][0]
-    assert http.get(f"/v1/jobs/{cell['job_id']}").json()["request"]["options"] == {"keep": 20}
-    assert "graspit keep=20" in http.get("/datasets/kitchen").text
-
-
 def test_with_auto_each_cell_says_which_fidelity_it_got(http: TestClient, services: Services) -> None:
     wanted = WANTED | {"fidelity": "auto", "target": "gsr>=0.6"}
-    for path, body in (("/v1/datasets", wanted), ("/v1/datasets/estimate", {**wanted, "name": None})):
-        body = {key: value for key, value in body.items() if value is not None}
+    unnamed = {key: value for key, value in wanted.items() if key != "name"}
+    for path, body in (("/v1/datasets", wanted), ("/v1/datasets/estimate", unnamed)):
         answer = http.post(path, json=body)
         assert answer.status_code == 422 and "graspd chart --publish" in answer.text
     publish(services.store, "charts", CHART)
@@ -64,20 +54,6 @@ def test_with_auto_each_cell_says_which_fidelity_it_got(http: TestClient, servic
     cells = http.get("/v1/datasets/kitchen/cells").json()["items"]
     assert {(cell["hand"], cell["fidelity"]) for cell in cells} == {("allegro", "standard"), ("barrett", "draft")}
     assert "auto (gsr&gt;=0.6)" in http.get("/datasets/kitchen").text
-
-
-def test_cells_in_scenes_are_chosen_by_the_chart_of_such_scenes(http: TestClient, services: Services) -> None:
-    wanted = WANTED | {"scene": "table", "views": 0, "fidelity": "auto", "target": "lift>=0.8"}
-    publish(services.store, "charts", CHART)
-    answer = http.post("/v1/datasets", json=wanted)
-    assert answer.status_code == 422 and "graspd chart --scene table --publish" in answer.text
-    key = publish(services.store, "scene_charts/table", scene_chart())
-    assert http.post("/v1/datasets", json=wanted).status_code == 202
-    cells = http.get("/v1/datasets/kitchen/cells").json()["items"]
-    assert [(cell["fidelity"], cell["choice"]["measured_on"]) for cell in cells] == [
-        *[("standard", "hand and object"), ("draft", "hand"), ("standard", "hand"), ("standard", "hand")]
-    ]
-    assert {cell["choice"]["chart"] for cell in cells} == {key}
 
 
 def test_cells_come_in_pages_with_a_link_to_the_next(
@@ -99,8 +75,6 @@ def test_cells_come_in_pages_with_a_link_to_the_next(
     [
         ({"hands": ["foot"]}, 404, "there is no hand 'foot'"),
         ({"objects": []}, 422, "needs objects"),
-        ({"hands": []}, 422, "hands"),
-        ({"grasps": 0}, 422, "grasps"),
         ({"views": 2}, 422, "views need scenes"),
         ({"scene": "bin", "neighbours": ["teapot"]}, 404, "there is no object 'teapot'"),
         ({"name": "../etc"}, 422, "name"),
@@ -110,13 +84,7 @@ def test_cells_come_in_pages_with_a_link_to_the_next(
 def test_what_cannot_be_made_is_refused(http: TestClient, changes: dict[str, Any], status: int, words: str) -> None:
     answer = http.post("/v1/datasets", json=WANTED | changes)
     assert answer.status_code == status and words in answer.json()["detail"]
-    assert answer.headers["content-type"] == "application/problem+json"
     assert http.get("/v1/datasets").json()["items"] == []
-
-
-def test_another_dataset_of_the_same_name_is_a_conflict(http: TestClient, kitchen: dict[str, Any]) -> None:
-    answer = http.post("/v1/datasets", json=WANTED | {"grasps": 32})
-    assert answer.status_code == 409 and "another dataset named 'kitchen'" in answer.json()["detail"]
 
 
 def test_an_estimate_records_nothing(http: TestClient) -> None:
@@ -128,6 +96,8 @@ def test_an_estimate_records_nothing(http: TestClient) -> None:
 
 
 def test_cancel_and_retry_are_accepted_once(http: TestClient, services: Services, kitchen: dict[str, Any]) -> None:
+    answer = http.post("/v1/datasets", json=WANTED | {"grasps": 32})
+    assert answer.status_code == 409 and "another dataset named 'kitchen'" in answer.json()["detail"]
     plan_all(services)
     assert http.post("/v1/datasets/kitchen/retry").status_code == 409
     assert http.post("/v1/datasets/kitchen/cancel").status_code == 202
@@ -151,13 +121,6 @@ def test_a_snapshot_is_made_once_and_names_checksums(
     whole = http.get(taken.headers["Location"]).json()
     for shard in whole["shards"]:
         assert shard["sha256"] == http.get(f"/v1/shards/{shard['id']}").json()["sha256"]
-
-
-def test_unknown_datasets_are_404(http: TestClient) -> None:
-    for path in ("", "/cells", "/snapshots", f"/snapshots/{'0' * 32}"):
-        assert http.get(f"/v1/datasets/none{path}").status_code == 404
-    for path in ("cancel", "retry", "snapshots"):
-        assert http.post(f"/v1/datasets/none/{path}").status_code == 404
 
 
 def test_objects_get_a_name_together_and_make_a_dataset(http: TestClient) -> None:

@@ -6,7 +6,6 @@ import json
 from typing import Any
 
 import pytest
-from fastapi import FastAPI
 from starlette.testclient import TestClient
 
 from graspd.api.access.keys import Scope
@@ -57,14 +56,11 @@ def test_the_same_corrections_are_the_same_hand(http: TestClient) -> None:
     ("body", "says"),
     [
         ({"closing": {"elbow": 1}}, "no joint 'elbow'"),
-        ({"preshape": {"elbow": 1}}, "no joint 'elbow'"),
         ({"preshape": {"finger_1_medial": 3}}, "outside its limits"),
         ({"fingertips": ["elbow"]}, "'elbow' is no link that a joint moves"),
-        ({"fingertips": ["palm"]}, "'palm' is no link that a joint moves"),
         ({"fingertips": []}, "fingertips"),
         ({"palm": {"link": "elbow"}}, "no link 'elbow'"),
         ({"palm": {"link": "palm", "approach": [0, 0, 0]}}, "no direction"),
-        ({"palm": {"link": "palm", "centre": [0, 0, 9]}}, "centre"),
         ({"closing": {"finger_1_medial": 2}}, "closing"),
         ({"closing": {str(n): 1 for n in range(MAX_ENTRIES + 1)}}, "closing"),
         ({"closing": {"x" * 300: 1}}, "closing"),
@@ -82,11 +78,11 @@ def test_what_a_hand_does_not_have_is_refused_and_leaves_nothing(
     assert http.get("/v1/hands").json() == before
 
 
-@pytest.mark.parametrize("number", ["NaN", "Infinity", "1e999"])
-def test_a_number_that_is_none_is_refused(http: TestClient, number: str) -> None:
-    text = f'{{"preshape": {{"finger_1_medial": {number}}}}}'
-    answer = http.post("/v1/hands/barrett/corrections", content=text, headers={"content-type": "application/json"})
-    assert answer.status_code == 422
+def test_a_number_that_is_none_is_refused(http: TestClient) -> None:
+    for number in ("NaN", "Infinity", "1e999"):
+        text = f'{{"preshape": {{"finger_1_medial": {number}}}}}'
+        answer = http.post("/v1/hands/barrett/corrections", content=text, headers={"content-type": "application/json"})
+        assert answer.status_code == 422
 
 
 def test_an_unknown_hand_or_one_without_a_model_is_not_found(http: TestClient) -> None:
@@ -97,7 +93,8 @@ def test_an_unknown_hand_or_one_without_a_model_is_not_found(http: TestClient) -
 
 def test_a_model_of_an_older_version_says_the_mend(http: TestClient, services: Services) -> None:
     made = http.post("/v1/hands", files={"file": ("old.urdf", b"<robot/>")}).json()
-    for model in (b"glTF", b"glTF" + bytes(40), services.store.get(names.asset_model(AssetKind.OBJECT, mug(http)))):
+    mug = http.get("/v1/objects/mug").json()["digest"]
+    for model in (b"glTF", b"glTF" + bytes(40), services.store.get(names.asset_model(AssetKind.OBJECT, mug))):
         key = names.asset_model(AssetKind.HAND, made["digest"])
         services.store.delete(key)
         services.store.put(key, model)
@@ -106,14 +103,9 @@ def test_a_model_of_an_older_version_says_the_mend(http: TestClient, services: S
         assert "older version" in http.get("/hands/old").text
 
 
-def mug(http: TestClient) -> str:
-    return str(http.get("/v1/objects/mug").json()["digest"])
-
-
 def test_a_reader_corrects_nothing_and_a_writer_owns_the_hand(settings: Settings, services: Services) -> None:
     people = people_of(settings, reader=(Scope.READ, ""), writer=(Scope.SUBMIT, ""))
-    app: FastAPI = create_app(settings, services)
-    with TestClient(app, base_url=BASE_URL, raise_server_exceptions=False) as http:
+    with TestClient(create_app(settings, services), base_url=BASE_URL) as http:
         body, path = {"closing": {"finger_1_spread": 1}}, "/v1/hands/barrett/corrections"
         assert http.post(path, json=body).status_code == 401
         assert http.post(path, json=body, headers=people["reader"]).status_code == 403
@@ -143,8 +135,6 @@ def test_the_page_has_a_field_for_each_guess_without_scripts(http: TestClient) -
         ("closing.0", "7", "must be -1, 0 or 1"),
         ("palm_link", "<b>", "&lt;b&gt;"),
         ("name", "a b", "name"),
-        ("preshape.1", "9", "outside its limits"),
-        ("fingertip", "elbow", "elbow"),
     ],
 )
 def test_a_wrong_form_is_shown_again_with_what_is_wrong(http: TestClient, field: str, value: str, says: str) -> None:

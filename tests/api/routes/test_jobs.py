@@ -23,8 +23,7 @@ JOB = {"hand": "allegro", "object": "mug", "grasps": 64, "scenes": 1, "views": 1
 
 def test_a_submitted_job_has_an_address_and_is_one_job(http: TestClient) -> None:
     answer = http.post("/v1/jobs", json=JOB)
-    assert answer.status_code == 202
-    assert answer.headers["location"] == f"/v1/jobs/{answer.json()['id']}"
+    assert answer.status_code == 202 and answer.headers["location"] == f"/v1/jobs/{answer.json()['id']}"
     assert int(answer.headers["retry-after"]) > 0
     job = http.get(answer.headers["location"]).json()
     assert job["state"] == "queued"
@@ -41,10 +40,7 @@ def test_a_job_in_a_scene_with_auto_says_how_it_was_chosen(http: TestClient, ser
     refused = http.post("/v1/jobs", json=wanted)
     assert refused.status_code == 422 and "graspd chart --scene table --publish" in refused.text
     key = publish(services.store, "scene_charts/table", scene_chart())
-    refused = http.post("/v1/jobs", json=wanted | {"target": "gsr>=0.6"})
-    assert refused.status_code == 422 and "lift, lift_dexgraspbench, lift_hard, robust" in refused.text
     answer = http.post("/v1/jobs", json=wanted)
-    assert answer.status_code == 202
     choice = {"target": "lift>=0.8", "chart": key, "measured_on": "hand and object", "reached": 0.85}
     for job in (answer.json(), http.get(answer.headers["location"]).json()):
         assert (job["fidelity"], job["request"]["target"], job["choice"]) == ("standard", "", choice)
@@ -85,19 +81,8 @@ def test_a_finished_job_says_how_different_its_grasps_are(http: TestClient, serv
     assert len(page["items"]) == types["power"] and {one["grasp_type"] for one in page["items"]} == {1}
 
 
-def test_a_half_done_job_says_how_far_each_stage_is(http: TestClient, services: Services) -> None:
-    record = add_job(services, grasps=64, scenes=1)
-    tasks = list(plan(record))
-    finish(services, record, tasks[0])
-    job = http.get(f"/v1/jobs/{record.id}").json()
-    assert {stage["stage"]: stage["progress"] for stage in job["stages"]} == {"synthesize": 0.5, "scene": 0.0}
-    assert job["progress"] == 0.25
-    assert job["stages"][0]["eta_s"] == pytest.approx(12.5)
-
-
 def test_a_failed_job_keeps_its_reason_and_its_attempts(http: TestClient, services: Services) -> None:
-    record = add_job(services)
-    fail(services, record, "the mesh is not watertight")
+    fail(services, record := add_job(services), "the mesh is not watertight")
     job = http.get(f"/v1/jobs/{record.id}").json()
     assert (job["state"], job["reason"]) == ("failed", "the mesh is not watertight")
     assert [(attempt["number"], attempt["last"]) for attempt in job["attempts"]] == [(1, True)]
@@ -111,13 +96,6 @@ def test_pages_of_jobs_meet_without_gap_or_overlap(http: TestClient, services: S
         seen += [job["id"] for job in answer.json()["items"]]
         path = answer.links["next"]["url"] if "next" in answer.links else ""
     assert seen == ids[::-1]
-
-
-def test_a_cancelled_job_is_cancelled_and_can_be_retried(http: TestClient) -> None:
-    job = http.post("/v1/jobs", json=JOB).json()["id"]
-    assert http.post(f"/v1/jobs/{job}/cancel").json()["state"] == "cancelled"
-    assert http.post(f"/v1/jobs/{job}/cancel").status_code == 409
-    assert http.post(f"/v1/jobs/{job}/retry").json()["state"] == "queued"
 
 
 def test_events_of_a_finished_job_say_its_end(http: TestClient, services: Services) -> None:

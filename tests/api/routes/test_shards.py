@@ -10,7 +10,7 @@ import pytest
 from starlette.testclient import TestClient
 
 from graspd.api.dashboard.job_pages import Pictures
-from graspd.api.routes.shards import parse_range
+from graspd.api.routes.jobs import parse_range
 from graspd.service.pipeline.backends import Services
 from graspd.service.store.store import Store
 from tests.api.factories import add_job, finish_all
@@ -19,8 +19,7 @@ from tests.damage import cut, flip, remove
 
 @pytest.fixture
 def shard(http: TestClient, services: Services) -> str:
-    record = add_job(services)
-    return finish_all(services, record)[0].shard_id
+    return finish_all(services, add_job(services))[0].shard_id
 
 
 def test_a_downloaded_shard_is_hdf5_with_its_sum_as_etag(http: TestClient, shard: str) -> None:
@@ -31,26 +30,17 @@ def test_a_downloaded_shard_is_hdf5_with_its_sum_as_etag(http: TestClient, shard
         assert file["grasp/hand_pose"].shape == (32, 7)
 
 
-@pytest.mark.parametrize(
-    ("header", "start", "stop"), [("bytes=0-99", 0, 100), ("bytes=100-", 100, None), ("bytes=-7", -7, None)]
-)
-def test_a_range_gives_just_its_bytes(http: TestClient, shard: str, header: str, start: int, stop: int | None) -> None:
+def test_a_range_gives_just_its_bytes_and_what_is_none_the_whole(http: TestClient, shard: str) -> None:
     whole = http.get(f"/v1/shards/{shard}/file").content
-    part = http.get(f"/v1/shards/{shard}/file", headers={"Range": header})
-    assert part.status_code == 206
-    assert part.content == whole[start:stop]
-    assert part.headers["content-range"].endswith(f"/{len(whole)}")
-
-
-def test_a_range_behind_the_end_is_refused_with_the_size(http: TestClient, shard: str) -> None:
+    for header, wanted in (("bytes=0-99", whole[:100]), ("bytes=100-", whole[100:]), ("bytes=-7", whole[-7:])):
+        part = http.get(f"/v1/shards/{shard}/file", headers={"Range": header})
+        assert (part.status_code, part.content) == (206, wanted)
+        assert part.headers["content-range"].endswith(f"/{len(whole)}")
     answer = http.get(f"/v1/shards/{shard}/file", headers={"Range": "bytes=99999999-"})
-    assert answer.status_code == 416
-    assert answer.headers["content-range"].startswith("bytes */")
-
-
-@pytest.mark.parametrize("header", [None, "bytes=-", "items=0-3", "bytes=0-1,4-5"])
-def test_a_range_that_is_not_a_single_byte_range_sends_the_whole(header: str | None) -> None:
-    assert parse_range(header, 100) is None
+    assert (answer.status_code, answer.headers["content-range"]) == (416, f"bytes */{len(whole)}")
+    digits = "9" * 4400
+    odd = ("bytes=-", "items=0-3", "bytes=0-1,4-5", f"bytes=-{digits}", f"bytes={digits}-", f"bytes=0-{digits}")
+    assert {parse_range(header, 100) for header in (None, *odd)} == {None}
 
 
 def test_a_store_that_signs_hands_the_file_out_itself(
@@ -67,19 +57,9 @@ def test_grasps_come_in_the_order_and_by_the_filters_asked_for(http: TestClient,
     assert depths == sorted(depths)
     query = {"hand": "allegro", "valid": "true", "min_epsilon": 0.1, "max_intersection_volume_cm3": 0.3}
     grasps = http.get("/v1/grasps", params=query).json()["items"]
-    assert grasps
-    assert all(g["valid"] and g["epsilon"] >= 0.1 and g["intersection_volume_cm3"] <= 0.3 for g in grasps)
+    assert grasps and all(g["valid"] and g["epsilon"] >= 0.1 and g["intersection_volume_cm3"] <= 0.3 for g in grasps)
     assert http.get("/v1/grasps", params=query | {"hand": "shadow"}).json()["items"] == []
     assert http.get("/v1/grasps", params={"colour": "red"}).status_code == 422
-
-
-def test_pages_of_grasps_meet_without_gap_or_overlap(http: TestClient, shard: str) -> None:
-    seen, path = [], "/v1/grasps?limit=7"
-    while path:
-        answer = http.get(path)
-        seen += [(grasp["shard_id"], grasp["row"]) for grasp in answer.json()["items"]]
-        path = answer.links["next"]["url"] if "next" in answer.links else ""
-    assert len(seen) == len(set(seen)) == 32
 
 
 @pytest.mark.parametrize("harm", [flip, cut, remove])
@@ -91,8 +71,7 @@ def test_a_damaged_shard_is_refused_with_its_name(
     answer = http.get(path.format(shard), headers={"Range": "bytes=0-9"})
     assert (answer.status_code, answer.json()["type"]) == (500, "/problems/damaged-shard")
     assert shard in answer.json()["detail"]
-    assert "etag" not in answer.headers
-    assert "immutable" not in answer.headers.get("cache-control", "")
+    assert "etag" not in answer.headers and "immutable" not in answer.headers.get("cache-control", "")
 
 
 def test_a_picture_of_a_damaged_shard_is_refused(http: TestClient, services: Services) -> None:
@@ -101,5 +80,4 @@ def test_a_picture_of_a_damaged_shard_is_refused(http: TestClient, services: Ser
     flip(services.store, views.key)
     http.app.state.pictures = Pictures(services.store)  # type: ignore[attr-defined]
     answer = http.get(f"/shards/{views.shard_id}/pictures/0.png")
-    assert answer.status_code == 500
-    assert views.key in answer.text
+    assert answer.status_code == 500 and views.key in answer.text

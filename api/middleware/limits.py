@@ -1,4 +1,4 @@
-"""Rate-limit middleware: identifies the caller and enforces limits before the request is read.
+"""Limits of requests: rates and number at once for each caller, and permission, size and duration of bodies.
 
 Rates follow GCRA (ITU-T I.371 annex A): a leaky bucket stored as one number per caller, the time at which the bucket is
 empty again. Requests in progress form a sorted set with an expiry time each, so that requests of a killed process
@@ -21,10 +21,13 @@ from starlette.datastructures import MutableHeaders
 from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from graspd.api.access.auth import Proxy, identify
+from graspd.api.access.auth import Proxy, authorize, identify
 from graspd.api.access.auth import caller as present_caller
 from graspd.api.access.keys import Key, KeyFile
+from graspd.api.access.keys import Scope as KeyScope
+from graspd.api.middleware.request_context import SAFE_METHODS, HttpMiddleware
 from graspd.api.problems import ApiError, answer
+from graspd.service.model.errors import LimitError
 from graspd.service.settings import Settings
 from graspd.service.telemetry import bind
 
@@ -32,7 +35,7 @@ from graspd.service.telemetry import bind
 _FREE: Final = ("/static/", "/healthz", "/readyz")
 
 
-class RateLimit:
+class RateLimit(HttpMiddleware):
     """Finds the key of a request (`scope["state"]["key"]`) and enforces the limits of that key.
 
     A request without a key counts against its address. An open service serves one machine and counts nothing.
@@ -42,16 +45,13 @@ class RateLimit:
     """
 
     def __init__(self, app: ASGIApp, *, keys: KeyFile, proxy: Proxy, settings: Settings, rates: Rates) -> None:
-        self.app = app
+        super().__init__(app)
         self.keys = keys
         self.proxy = proxy
         self.settings = settings
         self.rates = rates
 
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http":
-            await self.app(scope, receive, send)
-            return
+    async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
         is_open = self.keys.is_open
         key = scope.setdefault("state", {})["key"] = None if is_open else identify(scope, self.keys, self.proxy)
         token = present_caller.set(key)
@@ -67,7 +67,7 @@ class RateLimit:
     async def _count(self, scope: Scope, receive: Receive, send: Send, key: Key | None) -> None:
         request = Request(scope)
         name = f"key:{key.name}" if key else f"address:{request.client.host if request.client else ''}"
-        allowance = allowance_of(key, self.settings)
+        allowance = _allowance_of(key, self.settings)
         # Not the request's id: a caller may choose that, and so count many requests as one.
         number = uuid.uuid4().hex
         admission = await self.rates.enter(name, allowance, number)
@@ -78,35 +78,26 @@ class RateLimit:
         if admission.refused:
             await answer(request, _refusal(admission, allowance, headers))(scope, receive, send)
             return
+        kept = time.monotonic()
+
+        async def counted(message: Message) -> None:
+            nonlocal kept
+            if message["type"] == "http.response.start":
+                MutableHeaders(scope=message).update(headers)
+            elif time.monotonic() - kept > HELD_S / 3:
+                # A long answer renews the request's entry.
+                kept = time.monotonic()
+                await self.rates.keep(name, number)
+            await send(message)
+
         try:
-            await self.app(scope, receive, _Told(self.rates, name, number, headers, send))
+            await self.app(scope, receive, counted)
         finally:
             if allowance.concurrency:
                 await self.rates.leave(name, number)
 
 
-class _Told:
-    """Sends messages on, adds the rate headers, and renews the request's entry during a long answer."""
-
-    def __init__(self, rates: Rates, name: str, number: str, headers: dict[str, str], send: Send) -> None:
-        self.rates = rates
-        self.name = name
-        self.number = number
-        self.headers = headers
-        self.send = send
-        self.kept = time.monotonic()
-
-    async def __call__(self, message: Message) -> None:
-        if message["type"] == "http.response.start":
-            MutableHeaders(scope=message).update(self.headers)
-        elif time.monotonic() - self.kept > HELD_S / 3:
-            self.kept = time.monotonic()
-            await self.rates.keep(self.name, self.number)
-        await self.send(message)
-
-
-def allowance_of(key: Key | None, settings: Settings) -> Allowance:
-    """Return the limits of a key, or of an address without a key."""
+def _allowance_of(key: Key | None, settings: Settings) -> Allowance:
     if key is None:
         return Allowance(settings.address_requests_per_minute, settings.concurrency)
     own = key.limits
@@ -121,12 +112,12 @@ def _headers(allowance: Allowance, admission: Admission) -> dict[str, str]:
         return {}
     return {
         "RateLimit-Policy": f'"requests";q={allowance.per_minute};w={WINDOW_S}',
-        "RateLimit": f'"requests";r={admission.remaining};t={seconds_up(admission.seconds)}',
+        "RateLimit": f'"requests";r={admission.remaining};t={_seconds_up(admission.seconds)}',
     }
 
 
 def _refusal(admission: Admission, allowance: Allowance, headers: dict[str, str]) -> ApiError:
-    wait = seconds_up(admission.seconds)
+    wait = _seconds_up(admission.seconds)
     if admission.refused == "concurrency":
         reason = f"{allowance.concurrency} of your requests are being answered, and more at once are not"
         headers = {}
@@ -212,19 +203,17 @@ class Rates:
         if allowance.per_minute <= 0 and allowance.concurrency <= 0:
             return None
         arguments = (allowance.per_minute, WINDOW_S, allowance.concurrency, request, HELD_S)
-        reply = await self._run(_ENTER, _keys(caller), arguments)
+        reply = await self._run(_ENTER, (f"graspd:rate:{caller}", f"graspd:held:{caller}"), arguments)
         if reply is None:
             return None
         refused, remaining, seconds = (part.decode() for part in reply)
         return Admission(refused, int(remaining), float(seconds))
 
     async def keep(self, caller: str, request: str) -> None:
-        """Renew a long request that is still in progress."""
-        await self._run(_KEEP, _keys(caller)[1:], (request, HELD_S))
+        await self._run(_KEEP, (f"graspd:held:{caller}",), (request, HELD_S))
 
     async def leave(self, caller: str, request: str) -> None:
-        """Remove a finished request from the count."""
-        await self._run("redis.call('ZREM', KEYS[1], ARGV[1])", _keys(caller)[1:], (request,))
+        await self._run("redis.call('ZREM', KEYS[1], ARGV[1])", (f"graspd:held:{caller}",), (request,))
 
     async def close(self) -> None:
         if self._client is not None and self._loop is asyncio.get_running_loop():
@@ -249,10 +238,111 @@ class Rates:
         return self._client
 
 
-def seconds_up(seconds: float) -> int:
-    """Round up to whole seconds, at least one, for Retry-After."""
+def _seconds_up(seconds: float) -> int:
     return max(1, math.ceil(seconds))
 
 
-def _keys(caller: str) -> tuple[str, str]:
-    return f"graspd:rate:{caller}", f"graspd:held:{caller}"
+#: Limit of a JSON body or a form without a file: job requests take a few hundred bytes.
+MAX_BODY_BYTES: Final = 1 << 20
+PIECE_S: Final = 30.0
+#: Least rate of a body; without it, single bytes would hold a connection forever [bytes/s].
+LEAST_BYTES_S: Final = 16 << 10
+#: Allowance for multipart framing and the other fields of an upload.
+_FORM_SLACK_BYTES: Final = 64 << 10
+#: Most digits of a Content-Length: Python parses thousands of digits slowly, or refuses them.
+_MOST_DIGITS: Final = 18
+
+
+class BodyLimit(HttpMiddleware):
+    """Refuses bodies whose Content-Length exceeds the limit; aborts those that become too long or slow."""
+
+    def __init__(
+        self, app: ASGIApp, *, upload_paths: frozenset[str], upload_bytes: int, piece_s: float = PIECE_S
+    ) -> None:
+        super().__init__(app)
+        self.upload_paths = upload_paths
+        self.upload_bytes = upload_bytes
+        self.piece_s = piece_s
+
+    async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
+        is_upload = scope["method"] == "POST" and scope["path"].rstrip("/") in self.upload_paths
+        limit = self.upload_bytes + _FORM_SLACK_BYTES if is_upload else MAX_BODY_BYTES
+        if (refusal := _body_refusal(scope, limit, is_upload=is_upload)) is not None:
+            await _refuse(refusal, scope, receive, send)
+            return
+        await self._watch(scope, receive, send, limit)
+
+    async def _watch(self, scope: Scope, receive: Receive, send: Send, limit: int) -> None:
+        received, began = 0, time.monotonic()
+        is_whole = is_answered = False
+        refusal: Exception | None = None
+
+        async def counted() -> Message:
+            nonlocal received, is_whole, refusal
+            try:
+                # After the body, only a disconnect can arrive, and the answer may take any time.
+                async with asyncio.timeout(None if is_whole else self.piece_s):
+                    message = await receive()
+            except TimeoutError:
+                refusal = ApiError(408, f"no piece of the body came for {self.piece_s:g} s; send it again")
+                return {"type": "http.disconnect"}
+            is_whole = not message.get("more_body", False)
+            received += len(message.get("body", b""))
+            late = time.monotonic() - began - self.piece_s
+            if not is_whole and received < late * LEAST_BYTES_S:
+                refusal = ApiError(408, f"the body comes at less than {LEAST_BYTES_S >> 10} KiB/s; send it again")
+                return {"type": "http.disconnect"}
+            if received > limit:
+                refusal = _too_large(limit)
+                # Simulate a disconnect, so that the application stops; its answer is replaced below.
+                return {"type": "http.disconnect"}
+            return message
+
+        async def guarded(message: Message) -> None:
+            nonlocal is_answered
+            if refusal is not None and not is_answered:
+                return
+            is_answered = True
+            await send(message)
+
+        await self.app(scope, counted, guarded)
+        if refusal is not None and not is_answered:
+            await _refuse(refusal, scope, receive, send)
+
+
+def _body_refusal(scope: Scope, limit: int, *, is_upload: bool) -> Exception | None:
+    """Return why a body is refused before it is read; None: it is not."""
+    given = dict(scope["headers"])
+    if b"transfer-encoding" in given and b"content-length" in given:
+        # Two lengths: a proxy may have used the other one, and the remainder would be read as the next request.
+        return ApiError(400, "Transfer-Encoding and Content-Length exclude each other")
+    encoding = given.get(b"content-encoding", b"").decode("latin-1").strip().lower()
+    if encoding not in ("", "identity") and scope["method"] not in SAFE_METHODS:
+        return ApiError(
+            415,
+            f"the body has Content-Encoding {encoding[:40]!r}, and only plain bodies are read; send it as it is",
+            headers={"Accept-Encoding": "identity"},
+        )
+    declared = given.get(b"content-length", b"0")
+    if not declared.isdigit() or len(declared) > _MOST_DIGITS or int(declared) > limit:
+        return _too_large(limit)
+    if declared != b"0" or b"transfer-encoding" in given:
+        try:
+            # Routes check further.
+            if is_upload:
+                authorize(Request(scope), KeyScope.SUBMIT)
+            elif scope["path"].startswith("/v1/"):
+                authorize(Request(scope), KeyScope.READ)
+        except ApiError as error:
+            return error
+    return None
+
+
+def _too_large(limit: int) -> LimitError:
+    return LimitError(f"the body is larger than {limit} bytes; send a smaller one")
+
+
+async def _refuse(error: Exception, scope: Scope, receive: Receive, send: Send) -> None:
+    response = answer(Request(scope), error)
+    response.headers["Connection"] = "close"
+    await response(scope, receive, send)
