@@ -205,7 +205,7 @@ def with_prefix(page: str, prefix: str) -> str:
 class SameOrigin(HttpMiddleware):
     """Refuses requests that a page of another site triggers in a visitor's browser.
 
-    A browser sends the page that a request comes from (Sec-Fetch-Site, Origin); other clients do not. While no keys
+    Browsers send the origin of the requesting page (Sec-Fetch-Site, Origin); other clients do not. While no keys
     exist, only names of this machine are accepted as host, which prevents DNS rebinding.
     """
 
