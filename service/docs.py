@@ -20,7 +20,6 @@ from graspd.service.store.columns import ATTRIBUTES, SCHEMAS, ShardKind
 
 
 def schema_table(kind: ShardKind) -> str:
-    """Return the Markdown table of a shard's datasets."""
     lines = ["| dataset | shape | type | unit | frame | meaning |", "| --- | --- | --- | --- | --- | --- |"]
     for path, column in SCHEMAS[kind].items():
         shape = ", ".join(column.shape.split())
@@ -33,7 +32,6 @@ def schema_table(kind: ShardKind) -> str:
 
 
 def attributes_table() -> str:
-    """Return the Markdown table of the shards' root attributes."""
     lines = ["| attribute | of | type | meaning |", "| --- | --- | --- | --- |"]
     for name, one in ATTRIBUTES.items():
         lines.append(f"| `{name}` | {', '.join(one.kinds)} | {one.type} | {one.description} |")
@@ -41,7 +39,6 @@ def attributes_table() -> str:
 
 
 def settings_table() -> str:
-    """Return the Markdown table of the environment variables."""
     lines = ["| variable | default | meaning |", "| --- | --- | --- |"]
     for name, field in Settings.model_fields.items():
         default = "" if field.default is None else f"`{field.default}`"
@@ -50,7 +47,6 @@ def settings_table() -> str:
 
 
 def options_table() -> str:
-    """Return the Markdown tables of the options of jobs and of runs in this process, basic ones first."""
     job, local = rows(JobOptions, "job"), rows(LocalOptions, "synth")
     same = {row.name for row in local if any(_cells(row) == _cells(other) for other in job)}
     found = [(row, "both" if row.name in same else "job") for row in job]
@@ -76,7 +72,6 @@ def _cells(row: Row) -> tuple[str, str, str]:
 
 
 def keywords_stub() -> str:
-    """Return type stubs for keywords of `graspd.synthesize` and `graspd.Client.submit` (`**options`)."""
     parts = [
         '"""Keywords that follow from the options; `python -m graspd.service.docs` writes them."""\n',
         "from collections.abc import Mapping, Sequence",
@@ -107,7 +102,6 @@ STUB: Final = "graspd/keywords.pyi"
 
 
 def renewed(text: str) -> str:
-    """Return the page with every marked part regenerated."""
     for name, make in PARTS.items():
         pattern = re.compile(rf"(<!-- {name} -->\n).*?(<!-- /{name} -->)", re.DOTALL)
         text = pattern.sub(lambda found, make=make: f"{found[1]}{make()}\n{found[2]}", text)  # type: ignore[misc]
@@ -115,7 +109,6 @@ def renewed(text: str) -> str:
 
 
 def main(root: Path) -> None:
-    """Regenerate all pages and type stubs of a checkout."""
     for page in PAGES:
         path = root / page
         path.write_text(renewed(path.read_text()))

@@ -49,11 +49,7 @@ def bound(subject: str) -> str:
 
 
 def set_up_logs(settings: Settings, process: str = "graspd") -> None:
-    """Log the lines of this process to stderr.
-
-    Args:
-        process: its name in every JSON line, e.g. api, controller, worker.
-    """
+    """Log the lines of this process to stderr; `process` is its name in JSON lines."""
     is_text = settings.log_format == "text" or (settings.log_format == "auto" and sys.stderr.isatty())
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(_TextLines() if is_text else JsonLines(process))
@@ -112,7 +108,6 @@ def _plain(record: logging.LogRecord) -> logging.LogRecord:
 
 
 def _subjects(record: logging.LogRecord) -> dict[str, Any]:
-    """Return the subjects bound to the record's context, and those given with the line."""
     found = dict(_bound.get())
     found.update((name, vars(record)[name]) for name in SUBJECTS if name in vars(record))
     return {name: found[name] for name in SUBJECTS if found.get(name)}
@@ -155,7 +150,6 @@ def set_up_tracing(process: str, *, exporter: Any = None) -> None:
 
 
 def stop() -> None:
-    """Stop making spans."""
     global _tracer
     _tracer = None
 
@@ -203,7 +197,6 @@ class HeartbeatFile:
     """File touched at most every few seconds, regardless of the number of calls."""
 
     def __init__(self, path: Path | None) -> None:
-        """`path` is None if no check reads it."""
         self._path = path
         self._again = 0.0
 

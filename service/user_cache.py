@@ -26,10 +26,7 @@ _LIMIT_BYTES: Final = 2 << 30
 
 
 def folder(name: str) -> Path:
-    """Return the folder of one kind of entries: `$XDG_CACHE_HOME/graspd/NAME`, by default in `~/.cache`.
-
-    If that is not writable, use a private folder among the temporary files and log it once.
-    """
+    """Return the folder of one kind of entries, in `$XDG_CACHE_HOME/graspd`, else a private temporary one."""
     return _root(os.environ.get("XDG_CACHE_HOME", ""), os.environ.get("HOME", ""), tempfile.gettempdir()) / name
 
 

@@ -83,7 +83,6 @@ def bounds_of(field: FieldInfo) -> dict[str, float]:
 
 
 def _metadata(annotation: object) -> list[object]:
-    """Return the metadata of an Annotated."""
     inner = get_args(annotation)[1:] if get_origin(annotation) is Annotated else ()
     return [part for one in inner for part in (one.metadata if isinstance(one, FieldInfo) else (one,))]
 

@@ -18,14 +18,7 @@ _V1: Final = ("cpu", "cpu,cpuacct")
 
 
 def available_cores(root: Path = ROOT) -> int:
-    """Return the cores for this process: its affinity, or its control group's CPU quota if less.
-
-    Quotas round up: 1.5 cores give 2, because a throttled thread costs less than half a core unused. Call it before
-    each piece of work: a changed quota takes effect within seconds.
-
-    Args:
-        root: folder that contains `proc` and `sys`.
-    """
+    """Return the cores for this process: its affinity, or its control group's quota, rounded up, if less."""
     given = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return max(1, min([given, *(math.ceil(quota) for quota in _lately(root, int(time.monotonic() / _LATELY_S)))]))
 
@@ -51,11 +44,7 @@ def _quotas(root: Path) -> Iterator[float]:
 
 
 def available_memory(root: Path = ROOT) -> int:
-    """Return the memory for this process [bytes]: the machine's, or its control group's limit if less.
-
-    Args:
-        root: folder that contains `proc` and `sys`.
-    """
+    """Return the memory for this process [bytes]: the machine's, or its control group's limit if less."""
     return min([os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"), *_memory_limits(root)])
 
 

@@ -356,7 +356,6 @@ class JobOptions(Model):
 
     @property
     def measures_payload(self) -> bool:
-        """Whether to measure the payload of each valid grasp."""
         return self.payload or self.min_payload > 0
 
     @property
@@ -372,7 +371,6 @@ class JobOptions(Model):
 
     @property
     def place(self) -> SceneSpec:
-        """The scene."""
         return scene_of(self.scene, faces=self.faces, touch=self.touch, beside=self._dropped)
 
     @property
@@ -439,7 +437,6 @@ class JobOptions(Model):
 
     @property
     def _first_turn(self) -> int:
-        """Offset of a job in the cycle of rechecks."""
         named = [getattr(self, name, "") for name in ("hand", "object")]
         return zlib.crc32("/".join([*named, str(self.seed)]).encode()) % _RECHECK_EVERY
 
@@ -454,7 +451,6 @@ class JobRequest(JobOptions):
 
 
 def batches_of(grasps: int) -> int:
-    """Return the number of batches for a number of grasps."""
     return -(-grasps // BATCH_SIZE)
 
 

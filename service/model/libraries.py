@@ -38,7 +38,6 @@ def version_of(library: str) -> str:
 
 @lru_cache(maxsize=16)
 def _distributions(place: str) -> list[tuple[str, str]]:
-    """Return folder names and versions of the distributions in an entry of `sys.path`."""
     try:
         names = [found.name for found in Path(place or ".").iterdir()]
     except OSError:
@@ -62,7 +61,6 @@ def own_process() -> None:
 
 @contextmanager
 def imports() -> Iterator[None]:
-    """Context for imports without garbage collection."""
     collects = gc.isenabled()
     gc.disable()
     try:

@@ -61,7 +61,6 @@ class GraspMetric:
 
     @property
     def path(self) -> str:
-        """Path of the dataset in a base shard."""
         return f"quality/{self.name}"
 
     @property
@@ -77,12 +76,10 @@ class GraspMetric:
 
     @property
     def column_title(self) -> str:
-        """Heading of a column."""
         return self.short or self.title
 
     @property
     def heading(self) -> str:
-        """Heading within a text, with the unit."""
         words = self.column_title if len(self.column_title) < _SYMBOL else self.column_title.lower()
         return f"{words}, {self.unit}" if self.unit else words
 
@@ -266,7 +263,6 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
 
 
 def indexed(least: IndexLevel = IndexLevel.KEPT) -> tuple[GraspMetric, ...]:
-    """Return the metrics at or above a level of the index."""
     return tuple(metric for metric in GRASP_METRICS if metric.indexed >= least)
 
 
@@ -292,7 +288,6 @@ class Axis(IntEnum):
 
     @property
     def word(self) -> str:
-        """Name of the axis in documents and pages."""
         return self.name.lower()
 
 

@@ -69,17 +69,14 @@ class Row:
 
     @property
     def form(self) -> Form | None:
-        """Presentation in forms; None: not in forms."""
         return next((one for one in self.field.metadata if isinstance(one, Form)), None)
 
     @property
     def flags(self) -> list[str]:
-        """Flags on the command line, as Typer expects them."""
         return self.option.flags.split() or [f"--{self.name.replace('_', '-')}"]
 
     @property
     def keyword(self) -> str:
-        """Keyword of `graspd.synthesize`."""
         return self.option.keyword or self.name
 
     @property
@@ -89,18 +86,15 @@ class Row:
 
     @property
     def unit(self) -> str:
-        """Unit of the value; empty: none."""
         found = _UNIT.search(self.meaning)
         return found[1] if found else ""
 
     @property
     def default(self) -> Any:
-        """Default value."""
         return self.field.get_default(call_default_factory=True)
 
     @property
     def bounds(self) -> dict[str, float]:
-        """Bounds of a number by their names in Pydantic: ge, gt, le, lt."""
         return bounds_of(self.field)
 
     @property
@@ -115,7 +109,6 @@ class Row:
 
 
 def rows(model: type[BaseModel], place: Place) -> list[Row]:
-    """Return the options of a model for one kind of user, basic ones first."""
     found = [
         Row(name, one, option)
         for name, one in model.model_fields.items()
@@ -126,16 +119,7 @@ def rows(model: type[BaseModel], place: Place) -> list[Row]:
 
 
 def accepted(model: type[ModelT], values: Mapping[str, Any], *, names: Mapping[str, str] | None = None) -> ModelT:
-    """Validate values and return a model.
-
-    Args:
-        model: the model.
-        values: values by names of fields.
-        names: fields in the caller's spelling, for messages; others keep their own names.
-
-    Raises:
-        InputError: states the first invalid value.
-    """
+    """Validate values; InputError states the first invalid one, by its name in `names` if given."""
     try:
         return model.model_validate(values)
     except ValidationError as error:
@@ -159,7 +143,6 @@ def with_keywords(model: type[BaseModel], place: Place) -> Callable[[FunctionT],
 
 
 def keywords_of(model: type[BaseModel], place: Place) -> list[tuple[str, Row, str]]:
-    """Return each option with its keyword and its type as text."""
     found = rows(model, place)
     return [(row.keyword if place == "python" else row.name, row, type_text(row.field.annotation)) for row in found]
 

@@ -62,7 +62,6 @@ def priority_of(request: JobRequest) -> Priority:
 
 
 def stages_of(request: JobOptions) -> tuple[Stage, ...]:
-    """Return the stages of each batch of the job, in order."""
     render = (Stage.RENDER,) if request.views else ()
     if request.in_scene:
         return (Stage.SCENE, Stage.SYNTHESIZE, *render)
@@ -70,12 +69,10 @@ def stages_of(request: JobOptions) -> tuple[Stage, ...]:
 
 
 def task_id(job: str, stage: Stage, batch: int) -> str:
-    """Return the id of a task; it depends only on job, stage and batch."""
     return digest_json({"job": job, "stage": stage, "batch": batch})
 
 
 def ranges_of(grasps: int, span: int) -> int:
-    """Return the number of ranges of `span` batches for a number of grasps."""
     return -(-batches_of(grasps) // span)
 
 
@@ -102,7 +99,6 @@ def plan(job: JobRecord, ranges: range | None = None) -> Iterator[PlannedTask]:
 
 
 def message_of(job: JobRecord, task: PlannedTask, *, attempt: int, max_attempt: int) -> TaskMessage:
-    """Return the message of a task for the worker."""
     return TaskMessage(
         schema_=max(needed_schema(job.request), SCHEMA_OF_RANGES if batches_of(task.count) > 1 else 0),
         newest_schema=TASK_SCHEMA,
@@ -129,11 +125,7 @@ _SCHEMAS: Final = {row.name: row.option.schema for row in rows(JobOptions, "job"
 
 
 def needed_schema(request: JobRequest, since: Mapping[str, int] = _SCHEMAS) -> int:
-    """Return the oldest schema that can express a request: that of its newest option in use.
-
-    Args:
-        since: first schema of each option.
-    """
+    """Return the oldest schema that can express a request: that of its newest option in use."""
     fields = JobRequest.model_fields
     used = [schema for name, schema in since.items() if getattr(request, name) != fields[name].get_default()]
     used += [SCHEMA_OF_NETWORKS] if request.network else []
@@ -146,12 +138,10 @@ def backoff(first_s: float, failures: int) -> float:
 
 
 def ingest_id(kind: AssetKind, digest: str) -> str:
-    """Return the id of the task that checks an upload."""
     return digest_json({"ingest": kind, "digest": digest})
 
 
 def ingest_message(kind: AssetKind, name: str, digest: str, *, attempt: int, max_attempt: int) -> IngestMessage:
-    """Return the message of a task that checks an upload."""
     return IngestMessage(
         schema_=OLDEST_TASK_SCHEMA,
         newest_schema=TASK_SCHEMA,
@@ -188,7 +178,6 @@ def batch_ready(states: Sequence[State]) -> list[bool]:
 
 
 def job_state(tasks: Iterable[State]) -> State:
-    """Return the state of a job from the states of its tasks."""
     states = set(tasks)
     if states & {State.QUEUED, State.RUNNING}:
         return State.QUEUED if states == {State.QUEUED} else State.RUNNING
@@ -248,7 +237,6 @@ class RoundRobin:
         return [(job, -(-limit // (len(number) * number[job.key]))) for job in chosen]
 
     def served(self, jobs: Sequence[WaitingJob]) -> None:
-        """Record that these jobs were served, in this order."""
         for job in jobs:
             self._count += 1
             self._served[f"job {job.id}"] = self._served[f"key {job.key}"] = self._count
@@ -294,7 +282,6 @@ def totals(parts: Iterable[Mapping[str, int]]) -> dict[str, int]:
 
 
 def told(outcomes: Mapping[str, int]) -> str:
-    """Format counts as text, most frequent first."""
     order = sorted(outcomes.items(), key=lambda pair: -pair[1])
     return ", ".join(f"{count:,} {OUTCOMES.get(name, name.replace('_', ' '))}" for name, count in order if count)
 
@@ -323,16 +310,7 @@ def shortfall(
 
 
 def limit_told(hand: str, friction: float, grasps: int, lifts: float, bound: float, wanted: float | None = None) -> str:
-    """Describe a hand's lifting limit in a sentence.
-
-    Args:
-        hand: its name.
-        friction: Coulomb coefficient.
-        grasps: number of measured grasps.
-        lifts: payload of the best of them [kg].
-        bound: upper bound from actuator effort and friction [kg]; inf: none.
-        wanted: mass to lift [kg]; None: not specified.
-    """
+    """Describe a hand's lifting limit in a sentence; `bound` [kg] is that of actuators and friction, inf: none."""
     most = f", and at most {bound:.2g} kg by actuator effort" if math.isfinite(bound) else ""
     less = "" if wanted is None else f"; {wanted:.3g} kg are wanted"
     return f"{hand} lifts {lifts:.2g} kg at friction {friction:g} in the best of {grasps} grasps{most}{less}"

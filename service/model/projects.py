@@ -38,9 +38,5 @@ EVERYTHING: Final = ProjectScope()
 
 
 def marks_of(files: Mapping[str, bytes], project: str) -> dict[str, bytes]:
-    """Return the mark of a private upload; of a shared one, an empty file over any existing mark.
-
-    Args:
-        project: empty for shared uploads, and for the unnamed project.
-    """
+    """Return the mark of a private upload; of a shared one, an empty file over any existing mark."""
     return {MARK: project.encode()} if project or MARK in files else {}

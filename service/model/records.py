@@ -85,7 +85,6 @@ class JobRecord(Record):
 
     @property
     def assets(self) -> tuple[tuple[AssetKind, str], ...]:
-        """Kind and digest of each asset that the job uses."""
         further = [(AssetKind.OBJECT, one.digest or "") for one in self.request.beside]
         further += [(AssetKind.NETWORK, network)] if (network := self.request.network) else []
         return ((AssetKind.HAND, self.hand_digest), (AssetKind.OBJECT, self.object_digest), *further)
@@ -118,7 +117,6 @@ class AttemptRecord(Record):
 
     @classmethod
     def of(cls, message: TaskMessage | IngestMessage, **facts: Any) -> Self:
-        """Make a record of a failure at the current time."""
         job = message.job_id if isinstance(message, TaskMessage) else ""
         return cls(
             task_id=message.task_id, job_id=job, stage=message.stage, number=message.attempt, ended=timestamp(), **facts
@@ -179,7 +177,6 @@ class DatasetRecord(Record):
         return self
 
     def cells(self) -> Iterator[Cell]:
-        """Yield the cells in order."""
         pairs = ((hand, obj) for hand in self.hands for obj in self.objects)
         for position, ((hand, obj), job) in enumerate(zip(pairs, self.jobs, strict=True)):
             fidelity = self.fidelities[position] if self.fidelities else ""
@@ -253,12 +250,7 @@ def request_of(options: JobOptions, hand: str, obj: str, fidelity: str = "") -> 
 
 
 def job_of(cell: Cell, options: JobOptions, revisions: dict[str, int], owner: str = "", project: str = "") -> JobRecord:
-    """Return the job of a cell as planned at the creation of the dataset. Jobs of datasets run in bulk.
-
-    Args:
-        owner: owner of the dataset.
-        project: project of the dataset.
-    """
+    """Return the job of a cell as planned at the creation of the dataset. Jobs of datasets run in bulk."""
     return JobRecord(
         id=cell.job_id,
         request=request_of(options, cell.hand.name, cell.object.name, cell.fidelity),
@@ -312,17 +304,14 @@ class Tag(Record):
 
     @property
     def members(self) -> set[Grasp]:
-        """Grasps of the tag."""
         return {(shard, row) for shard, rows in self.grasps.items() for row in rows}
 
 
 def tag_id(name: str, project: str) -> str:
-    """Return the id of a project's tag in the store."""
     return digest_json(["tag", project, name])
 
 
 def by_shard(grasps: Iterable[Grasp]) -> Mapping[str, tuple[int, ...]]:
-    """Group rows by shard, sorted."""
     found: dict[str, list[int]] = {}
     for shard, row in sorted(set(grasps)):
         found.setdefault(shard, []).append(row)

@@ -183,7 +183,6 @@ def parse_scene(
 
 
 def read_scene(path: Path) -> SceneSpec:
-    """Read a scene file; see `parse_scene`."""
     try:
         if path.stat().st_size > MAX_FILE_BYTES:
             raise InputError(f"the scene file {path} is larger than {MAX_FILE_BYTES // 1024} KiB")
@@ -200,7 +199,6 @@ def read_scene(path: Path) -> SceneSpec:
 
 
 def _found_from(folder: Path, spec: SceneSpec) -> SceneSpec:
-    """Resolve the neighbours' file paths relative to the scene file."""
     beside = tuple(
         one.model_copy(update={"object": str(folder / one.object)}) if (folder / one.object).is_file() else one
         for one in spec.neighbours
@@ -222,7 +220,6 @@ def _loaded(text: str, path: Path) -> object:
 
 
 def first_mistake(error: ValidationError | TypeError) -> str:
-    """Return the first error in one line with its location."""
     if isinstance(error, TypeError):
         return str(error)
     return refusal(error)
@@ -257,7 +254,6 @@ def supports_in(spec: SceneSpec) -> tuple[HalfSpace | Box, ...]:
 
 
 def has_table(spec: SceneSpec) -> bool:
-    """Check whether a scene has a level half-space."""
     flat = (one for one in supports_in(spec) if isinstance(one, HalfSpace))
     return any(one.normal[2] / math.hypot(*one.normal) > UPRIGHT for one in flat)
 

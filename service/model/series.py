@@ -68,7 +68,6 @@ SERIES: Final[dict[str, Series]] = {series.name: series for series in _ALL}
 
 
 def series_table() -> str:
-    """Return the Markdown table of all series."""
     lines = ["| series | type | labels | meaning | from |", "| --- | --- | --- | --- | --- |"]
     for series in SERIES.values():
         labels = ", ".join(f"`{label}`" for label in series.labels)

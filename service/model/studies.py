@@ -69,7 +69,6 @@ class StabilityMap:
     """Which cells a job can reach, and why no others."""
 
     def share(self, panel: str) -> float:
-        """Return the share of good cells of a panel."""
         cells = self.of(panel)
         return sum(cell.outcome == "good" for cell in cells) / max(1, len(cells))
 
@@ -81,12 +80,10 @@ class StabilityMap:
         return [cell for cell in self.cells if cell.panel == panel]
 
     def reached(self) -> list[MapCell]:
-        """Return the cells that a job can reach."""
         return [cell for cell in self.cells if cell.reached]
 
     @property
     def is_divided(self) -> bool:
-        """Whether a job can reach some cells but not all."""
         return 0 < len(self.reached()) < len(self.cells)
 
     def still_breaks(self) -> list[str]:
@@ -120,16 +117,11 @@ class Stability:
 
 
 def from_json(record: Mapping[str, Any]) -> Stability:
-    """Read a record of `as_json`.
-
-    Raises:
-        ValueError: not such a record.
-    """
+    """Read a record of `as_json`; ValueError if it is none."""
     return _RECORD.validate_python(record)
 
 
 def counts(cells: Iterable[MapCell]) -> dict[Outcome, int]:
-    """Count the cells by outcome."""
     outcomes = [cell.outcome for cell in cells]
     return {outcome: outcomes.count(outcome) for outcome in OUTCOMES}
 
@@ -142,7 +134,6 @@ def graded(value: float, weak: float, broken: float) -> Outcome:
 
 
 def reachable(cells: Iterable[MapCell], where: Callable[[MapCell], bool]) -> list[MapCell]:
-    """Return the cells, marked where a job can reach them."""
     return [replace(cell, reached=where(cell)) for cell in cells]
 
 

@@ -91,11 +91,7 @@ Node = Flag | MetricComparison | WordComparison | TypeComparison | Negation | Co
 
 
 def parsed(text: str) -> Node:
-    """Parse an expression to its tree.
-
-    Raises:
-        InputError: not an expression; states the position, or the known names.
-    """
+    """Parse an expression to its tree; InputError states the position of a mistake, or the known names."""
     if len(text) > LONGEST:
         raise InputError(f"the expression is {len(text)} characters long; at most {LONGEST} are read")
     parser = _Parser(_tokens(text))

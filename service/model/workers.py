@@ -73,7 +73,6 @@ class WorkerBeat:
 
     @property
     def ability(self) -> Capabilities:
-        """Capabilities of the worker."""
         return Capabilities(self.schemas, self.revisions)
 
 
@@ -117,11 +116,9 @@ class Capabilities:
 
 
 def own_ability() -> Capabilities:
-    """Return the capabilities of this version of graspd."""
     return Capabilities((OLDEST_TASK_SCHEMA, TASK_SCHEMA), STAGE_REVISIONS)
 
 
 def need_of(message: TaskMessage | IngestMessage) -> Requirements:
-    """Return the requirements of a message."""
     revision = message.revision if isinstance(message, TaskMessage) else 0
     return Requirements(message.stage, message.schema_, message.newest_schema or message.schema_, revision)

@@ -24,7 +24,6 @@ class ShardCache:
     """Files of a store, named by their SHA-256. Processes may share a folder: writes are atomic."""
 
     def __init__(self, folder: Path, *, limit_bytes: int = DEFAULT_BYTES) -> None:
-        """Create the folder. Raises InputError if that fails."""
         self.folder, self.limit_bytes, self._process = folder, limit_bytes, os.getpid()
         try:
             folder.mkdir(parents=True, exist_ok=True)
@@ -35,13 +34,7 @@ class ShardCache:
         self.__dict__.update(state, _process=os.getpid())
 
     def fetch(self, store: Store, key: str, sha256: str) -> Path:
-        """Return the local path of a file of the store; download it if necessary.
-
-        Raises:
-            DamagedShard: the store has no such file, or its content does not match the checksum.
-            InputError: this process was forked, see `check_not_forked`.
-            StoreUnavailable: the store does not answer.
-        """
+        """Return the local path of a file of the store, downloaded if necessary; DamagedShard if missing or damaged."""
         path = self.folder / f"{sha256}.h5"
         if self._is_intact(path, sha256):
             return path
@@ -51,7 +44,6 @@ class ShardCache:
 
     @staticmethod
     def _is_intact(path: Path, sha256: str) -> bool:
-        """Check whether a cached file exists and is unchanged; a changed file is downloaded again."""
         try:
             check_content(path, sha256)
             facts = path.stat()
@@ -79,11 +71,7 @@ class ShardCache:
 
 
 def check_not_forked(store: Store, process: int) -> None:
-    """Refuse a remote store in a fork of the process that opened it: its requests would never return.
-
-    Raises:
-        InputError: the current process is not the one with this number.
-    """
+    """Refuse a remote store in a fork of the process that opened it: its requests would never return."""
     if os.getpid() != process and not store.url.startswith(("file:", "memory:")):
         raise InputError(
             f"{store.url} cannot be read in a fork of the process that opened it; "

@@ -166,7 +166,6 @@ class Clouds(Sequence[dict[str, Any]]):
         return graspness(on_object, hands, touch_m=self._touch)
 
     def _labels(self, scenes: Scenes, scene: int, extrinsics: Floats, into: Floats) -> dict[str, Any]:
-        """Return the poses of the grasps in every frame."""
         found = scenes.grasps(scene, extrinsics)
         rows, pose = scenes.base_rows(scene), scenes.object_pose(scene)
         labels = {name: value for name, value in found.items() if name not in ("grasp/hand_pose", "object/pose")}
@@ -276,7 +275,6 @@ class CloudView:
 
     @classmethod
     def of(cls, columns: Mapping[str, Array], noise: DepthNoise | None, draw: np.random.Generator) -> CloudView:
-        """Build a view of a picture; `draw` generates the noise."""
         depth = np.asarray(columns["image/depth"], float)
         k = np.asarray(columns["camera/intrinsics"], float)
         if noise is None:
@@ -311,12 +309,10 @@ class CloudView:
         return transforms.quat_rotate(self._back[3:], fitted)
 
     def is_object(self, row: Ints, column: Ints) -> NDArray[np.bool_]:
-        """Return (P,) whether pixels show the object."""
         return np.asarray(self.columns["image/segmentation"][row, column] == _OBJECT)
 
     @property
     def extrinsics(self) -> Floats:
-        """Extrinsics (4, 4), table to camera."""
         return np.asarray(self.columns["camera/extrinsics"], float)
 
     @property

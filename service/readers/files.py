@@ -84,12 +84,10 @@ class Shards:
         return Shards(tuple(kept), self.store, self.cache, self.stream)
 
     def streamed(self, file: ShardFile) -> bool:
-        """Check whether a shard is read by byte ranges."""
         return self.stream and file.path is None and file.kind == "views"
 
     @cached_property
     def ranges(self) -> RangeReader:
-        """Reader of the shards that are `streamed`."""
         assert self.store is not None, "a shard without a path comes from a store"
         return RangeReader(self.store)
 

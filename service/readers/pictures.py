@@ -49,7 +49,6 @@ class PictureAddress:
 
     @property
     def names(self) -> dict[str, Any]:
-        """Columns of a sample that identify its source."""
         return {
             "hand": self.file.hand,
             "object": self.file.object,
@@ -127,15 +126,10 @@ class Pictures(Sequence[dict[str, Any]]):
 
     @property
     def places(self) -> Sequence[PictureAddress]:
-        """Locations of the pictures."""
         return self._places
 
     def columns_of(self, place: PictureAddress, columns: Iterable[str]) -> dict[str, Array]:
-        """Read columns of one picture.
-
-        Raises:
-            DamagedShard: the stored data does not match its checksum.
-        """
+        """Read columns of one picture; DamagedShard if they do not match their checksum."""
         file, row, wanted = place.file, place.row, list(columns)
         if not self.shards.streamed(file):
             path = self.shards.path(file)
@@ -146,7 +140,6 @@ class Pictures(Sequence[dict[str, Any]]):
         )
 
     def scenes_of(self, place: PictureAddress) -> Scenes:
-        """Return the scenes of the picture's shard with the selected grasps."""
         return self._scenes_of(place.scene_shard)
 
     def clouds(self, points: int = 1024, **options: Any) -> Clouds:

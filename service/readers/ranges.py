@@ -62,16 +62,7 @@ class RangeReader:
 
     @contextmanager
     def open(self, key: str, *, whole: bool) -> Iterator[h5py.File]:
-        """Open the HDF5 file of a shard.
-
-        Args:
-            whole: pictures are needed as well; a small shard is read whole.
-
-        Raises:
-            InputError: not HDF5, or this process was forked, see `check_not_forked`.
-            DamagedShard: it is missing or unreadable, here or in the body.
-            StoreUnavailable: the store does not answer.
-        """
+        """Open the HDF5 file of a shard; `whole`: pictures too, so a small shard is read at once."""
         held = self._of(key)
         with held.lock:
             held.size = held.size or self._size(key)
@@ -124,7 +115,6 @@ class RangeReader:
         return found
 
     def forget(self) -> None:
-        """Release all cached bytes."""
         with self._lock:
             self._objects.clear()
 
@@ -279,11 +269,7 @@ class RowTable:
 
     @classmethod
     def of(cls, file: h5py.File, columns: Iterable[str], name: str) -> RowTable:
-        """Read the table of an open shard; values of columns that are not packed are read and checked.
-
-        Raises:
-            DamagedShard: values do not match their checksum.
-        """
+        """Read the table of an open shard; values of columns that are not packed are read and checked."""
         packed, held = {}, {}
         for column in columns:
             found = _packed(file[column])
@@ -295,11 +281,9 @@ class RowTable:
 
     @property
     def columns(self) -> set[str]:
-        """Names of the known columns."""
         return {*self.packed, *self.held}
 
     def has(self, columns: Iterable[str]) -> bool:
-        """Check whether all these columns are known."""
         return all(name in self.packed or name in self.held for name in columns)
 
     def ranges(self, row: int, columns: Iterable[str]) -> list[tuple[int, int]]:
@@ -308,11 +292,7 @@ class RowTable:
         return [(int(places[row, 0]), int(places[row, 1])) for places in found if row < len(places)]
 
     def row(self, row: int, columns: Iterable[str], read: ReadRanges) -> dict[str, Array]:
-        """Return one row of some columns; the caller owns the arrays.
-
-        Raises:
-            DamagedShard: bytes are missing or do not match their checksum.
-        """
+        """Return one row of some columns, owned by the caller; DamagedShard if bytes are missing or damaged."""
         wanted = list(columns)
         packed = [name for name in wanted if name in self.packed]
         ranges = self.ranges(row, packed)
@@ -326,7 +306,6 @@ class RowTable:
 
 
 def read_file(path: Path, ranges: list[tuple[int, int]]) -> list[bytes]:
-    """Read byte ranges of a file."""
     handle = os.open(path, os.O_RDONLY)
     try:
         return [os.pread(handle, length, start) for start, length in ranges]

@@ -34,11 +34,7 @@ _FLAGS: Final = {"held": "quality/success", "lift": "quality/lift_outcome", "lif
 
 
 def parse(text: str) -> Test:
-    """Compile an expression to a test. Comparisons with a missing metric or nan are false.
-
-    Raises:
-        InputError: not an expression; states the position, or the known names.
-    """
+    """Compile an expression to a test; InputError if it is none. Comparisons with a missing metric or nan are false."""
     tree = parsed(text)
     return lambda columns, said: _mask(tree, columns, said)
 

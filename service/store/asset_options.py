@@ -54,7 +54,6 @@ SourceOption = Annotated[str | None, typer.Option("--source", help="Source: a UR
 
 
 def provenance(licence: str | None, source: str | None) -> dict[str, Any]:
-    """Return the keys of `asset.json` for licence and source; absent ones are omitted."""
     return {key: value for key, value in (("licence", licence), ("source", source)) if value}
 
 
@@ -71,11 +70,6 @@ def hand_options(
     fix: list[str] | None = None,
     drop: list[str] | None = None,
 ) -> dict[str, Any]:
-    """Return the keys of a hand's `asset.json`; absent ones are omitted.
-
-    Raises:
-        InputError: a text is neither a vector nor JOINT=VALUE.
-    """
     options: dict[str, Any] = {
         "file": urdf,
         "xacro": dict(map(_argument, xacro or [])),

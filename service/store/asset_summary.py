@@ -26,7 +26,6 @@ def say_check(kind: AssetKind, report: Mapping[str, Any]) -> None:
 
 
 def verdict_line(asset: Mapping[str, Any]) -> str:
-    """Format an asset as one line of a list."""
     return f"{asset['verdict'] or 'waiting':<8} {asset['message'] or asset['name']}"
 
 
@@ -50,13 +49,11 @@ def limit_line(facts: Mapping[str, Any]) -> str:
 
 
 def self_test_lines(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Return the available ones of both lines, with labels."""
     lines = [("self-test", self_test_line(facts)), ("payload", limit_line(facts))]
     return [(label, says) for label, says in lines if says]
 
 
 def hand_line(facts: Mapping[str, Any]) -> str:
-    """Return name and digest of the hand of a network."""
     return f"{facts.get('hand', '')} ({str(facts.get('hand_digest', ''))[:12]})"
 
 

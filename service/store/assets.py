@@ -58,12 +58,7 @@ def pack_into(files: Mapping[str, bytes], target: IO[bytes]) -> None:
 
 
 def unpack(data: bytes, *, limit_bytes: int) -> dict[str, bytes]:
-    """Unpack a ZIP in memory; no file is written under a name from the archive.
-
-    Raises:
-        InputError: not a ZIP, encrypted, or a name outside the archive.
-        LimitError: more than `limit_bytes` unpacked, or more than `MAX_FILES` files.
-    """
+    """Unpack a ZIP in memory; InputError for a bad archive or name, LimitError above `limit_bytes` or `MAX_FILES`."""
     archive = _open_zip(io.BytesIO(data))
     files: dict[str, bytes] = {}
     total = 0
@@ -118,7 +113,6 @@ class ZipFiles(StreamedFiles):
             self._known[name] = (size, digest)
 
     def without_common_folder(self) -> Self:
-        """See the function of the same name."""
         self._found = without_common_folder(self._found)
         self._known = without_common_folder(self._known)
         return self
@@ -219,11 +213,7 @@ def check_path(name: str) -> str:
 
 
 def builtin_files(kind: AssetKind, name: str) -> dict[str, bytes]:
-    """Load the files of a built-in hand (`asset.json`, URDF) or object (`asset.json`, mesh).
-
-    Raises:
-        NotFoundError: no such built-in asset.
-    """
+    """Load the files of a built-in hand or object: `asset.json` with URDF or mesh; NotFoundError if there is none."""
     folder = Path(str(resources.files("graspd.service"))) / "builtin" / f"{kind.value}s" / name
     if not (folder / "asset.json").is_file():
         known = ", ".join(builtin_names(kind))
@@ -234,23 +224,18 @@ def builtin_files(kind: AssetKind, name: str) -> dict[str, bytes]:
 
 
 def builtin_model(kind: AssetKind, name: str) -> bytes:
-    """Load the binary glTF of a built-in hand or object, made by `python -m graspd.worker.stages.models`."""
     return (
         Path(str(resources.files("graspd.service"))) / "builtin" / "models" / f"{kind.value}-{name}.glb"
     ).read_bytes()
 
 
 def builtin_names(kind: AssetKind) -> tuple[str, ...]:
-    """Return the names of the built-in hands or objects."""
     root = Path(str(resources.files("graspd.service"))) / "builtin" / f"{kind.value}s"
     return tuple(sorted(path.parent.name for path in root.glob("*/asset.json")))
 
 
 def describe(kind: AssetKind, name: str, files: Mapping[str, bytes], *, created: str, builtin: bool = False) -> Asset:
-    """Make the asset record of files with an `asset.json` whose key `file` is the main file.
-
-    A hand's `asset.json` may also contain palm, approach, preshape, couplings, ...; an object's units and density.
-    """
+    """Make the asset record of files with an `asset.json` whose key `file` is the main file."""
     described = parse_description(asset_json(files), f"{kind.value} {name!r}")
     main = described.file
     if main not in files:
@@ -278,6 +263,5 @@ def asset_json(files: Mapping[str, bytes]) -> bytes:
 
 
 def builtin_asset(kind: AssetKind, name: str) -> tuple[Asset, dict[str, bytes]]:
-    """Load a built-in hand or object with its files."""
     files = builtin_files(kind, name)
     return describe(kind, name, files, created=_BUILTIN_CREATED, builtin=True), files

@@ -15,7 +15,6 @@ _VERSIONS: Final[dict[str, int]] = {"base": 2, "scene": 1, "views": 1}
 
 
 def schema_of(kind: str) -> str:
-    """Return the schema name of a kind of shard, such as `graspd/base@2`."""
     return f"graspd/{kind}@{_VERSIONS[kind]}"
 
 
@@ -361,7 +360,6 @@ ATTRIBUTES: Final[dict[str, RootAttribute]] = {
 
 
 def check_attributes(kind: str, said: Mapping[str, Attribute]) -> None:
-    """Raise InputError for an unknown attribute or a wrong type."""
     for name, value in said.items():
         known = ATTRIBUTES.get(name)
         if known is None or kind not in known.kinds:

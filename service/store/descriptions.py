@@ -137,11 +137,7 @@ class HandFacts(BaseModel):
 
 
 def facts_of(model: bytes) -> HandFacts:
-    """Read the facts in the binary glTF of a hand.
-
-    Raises:
-        ConflictError: facts are missing, because an older version made the model.
-    """
+    """Read the facts in the binary glTF of a hand; ConflictError if an older version made the model."""
     try:
         (length,) = struct.unpack("<I", model[12:16])
         document = json.loads(model[20 : 20 + length])

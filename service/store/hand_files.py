@@ -48,7 +48,6 @@ def files_of_hand(path: Path) -> tuple[dict[str, Path], str]:
 
 
 def _looks(files: Mapping[str, Path], root: Path) -> dict[str, Path]:
-    """Find material libraries and pictures of meshes, inside the root."""
     found: dict[str, Path] = {}
     waiting = [name for name in files if name.lower().endswith(MESHES)]
     while waiting and len(files) + len(found) < MAX_FILES:
@@ -109,10 +108,7 @@ def _package(path: Path) -> Path:
 
 
 def _named_by(path: Path, root: Path) -> set[str]:
-    """Return names of files below the root to which a description and its includes may refer.
-
-    `worker.hands.visuals.find_mesh` and `worker.hands.mjcf_source` select among them.
-    """
+    """Return names of files below the root to which a description and its includes may refer."""
     seen, waiting = {path}, [path]
     bases, folders, references = set(), {""}, set()
     found: set[str] = set()
@@ -274,7 +270,6 @@ def _named(wanted: str, known: list[str], where: str) -> str:
 
 
 def _outermost(files: Mapping[str, bytes], found: list[str]) -> list[str]:
-    """Return the files that no other file includes."""
     contents = {name: text_of(files[name]).lower() for name in found}
     return [
         name

@@ -36,12 +36,7 @@ _REMEMBERED: Final = 100_000
 
 
 def read_checked(store: Store, key: str, sha256: str) -> bytes:
-    """Read an object completely and verify its checksum.
-
-    Raises:
-        DamagedShard: it is missing or does not match the checksum.
-        StoreUnavailable: the store does not answer.
-    """
+    """Read an object and verify its checksum; DamagedShard if it is missing or does not match."""
     try:
         data = store.get(key)
     except NotFoundError:
@@ -51,13 +46,11 @@ def read_checked(store: Store, key: str, sha256: str) -> bytes:
 
 
 def check_digest(name: str, found: str, expected: str) -> None:
-    """Raise DamagedShard with the shard's name if the checksums differ."""
     if found != expected:
         raise DamagedShard(f"{name} is damaged: its SHA-256 is {found[:12]}..., expected {expected[:12]}...; {FIX}")
 
 
 def gone(key: str) -> DamagedShard:
-    """Make the error for a shard with a manifest but without a file."""
     return DamagedShard(f"{key} is gone from the store, and its manifest is there; {FIX}")
 
 
@@ -81,12 +74,7 @@ class CheckedObjects:
         self._lock = threading.Lock()
 
     def check(self, key: str, sha256: str) -> None:
-        """Verify an object by reading it, unless that was done recently.
-
-        Raises:
-            DamagedShard: it is missing or does not match the checksum.
-            StoreUnavailable: the store does not answer.
-        """
+        """Verify an object by reading it, unless that was done recently; DamagedShard if missing or damaged."""
         self._intact(key, sha256)
 
     def stream(self, key: str, sha256: str, start: int, length: int) -> Iterator[bytes]:
@@ -153,7 +141,6 @@ def check_file(path: Path) -> None:
 
 
 def check_content(path: Path, sha256: str | None) -> None:
-    """Check a file against a known checksum; None: there is none."""
     stamp = _file_stamp(path)
     if _known.get(path) == stamp:
         return
@@ -197,7 +184,6 @@ def _of_manifest(path: Path) -> str | None:
 
 @lru_cache(maxsize=8)
 def _listed(sums: Path, _changed: int) -> dict[str, str]:
-    """Read a list written by `sha256sum`: digests by name."""
     lines = (line.split(maxsplit=1) for line in sums.read_text(errors="replace").splitlines())
     return {parts[1].removeprefix("*"): parts[0] for parts in lines if len(parts) == 2 and _DIGEST.fullmatch(parts[0])}
 
@@ -221,19 +207,13 @@ def put_sealed(store: Store, key: str, data: bytes) -> bool:
 
 
 def get_sealed(store: Store, key: str) -> bytes:
-    """Read an object and verify its seal, if it has one.
-
-    Raises:
-        NotFoundError: there is no such object.
-        DamagedError: its bytes do not match the seal.
-    """
+    """Read an object and verify its seal, if it has one; DamagedError if it does not match."""
     data = store.get(key)
     is_sealed(key, [data], len(data))
     return data
 
 
 def put_document(store: Store, key: str, document: Mapping[str, Any]) -> bool:
-    """Write JSON with its seal if absent."""
     return put_sealed(store, key, json.dumps(dict(document)).encode())
 
 

@@ -111,12 +111,10 @@ def record_asset(store: Store, asset: Asset, put: Put | None = None) -> Asset:
 
 
 def builtin_assets() -> list[Asset]:
-    """Return the built-in hands and objects."""
     return [builtin_asset(kind, name)[0] for kind in AssetKind for name in builtin_names(kind)]
 
 
 def publish_builtins(store: Store) -> list[Asset]:
-    """Publish the built-in hands and objects."""
     published = []
     for kind in AssetKind:
         for name in builtin_names(kind):
@@ -130,7 +128,6 @@ def publish_builtins(store: Store) -> list[Asset]:
 
 
 def _put_model(store: Store, key: str, model: bytes) -> None:
-    """Write a model file; it depends on program and asset, so one of an older version is replaced."""
     model = sealed(key, model)
     if not store.put(key, model) and store.get(key) != model:
         store.delete(key)
@@ -152,12 +149,7 @@ def load_asset(store: Store, kind: AssetKind, digest: str) -> Asset:
 
 
 def load_asset_files(store: Store, kind: AssetKind, digest: str) -> dict[str, bytes]:
-    """Load all files of a hand or object and verify its digest.
-
-    Raises:
-        NotFoundError: no such asset.
-        InputError: the archive in the store does not match its name.
-    """
+    """Load all files of a hand or object; InputError if they do not match the digest."""
     files = unpack(store.get(names.asset_files(kind, digest)), limit_bytes=UNPACKED_LIMIT_BYTES)
     if digest_files(kind, files) != digest:
         raise InputError(f"the archive of {kind.value} {digest} in the store is damaged; upload it again")
@@ -165,11 +157,7 @@ def load_asset_files(store: Store, kind: AssetKind, digest: str) -> dict[str, by
 
 
 def load_check(store: Store, kind: AssetKind, digest: str) -> dict[str, object] | None:
-    """Load the report of ingest (`verdict`, `message`, `repairs`, `facts`); None before it has run.
-
-    Raises:
-        DamagedError: the record does not match its name.
-    """
+    """Load the report of ingest (`verdict`, `message`, `repairs`, `facts`); None before it has run."""
     key = names.asset_check(kind, digest)
     if not store.exists(key):
         return None

@@ -123,7 +123,6 @@ def manifest_of(
     worker: str,
     info: Mapping[str, Any] | None = None,
 ) -> ShardManifest:
-    """Make the manifest of a task's shard from its columns, root attributes and axis lengths."""
     kind = names.SHARD_KINDS[message.stage]
     return ShardManifest(
         shard_id=message.output,
@@ -155,7 +154,6 @@ def manifest_of(
 
 
 def _contents(kind: str, arrays: Mapping[str, NDArray[Any]], attributes: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the fields of the manifest that follow from the shard's columns and attributes."""
     valid = validity.valid(arrays) if kind == "base" else arrays.get("grasp/valid")
     fields: dict[str, Any] = {"valid": 0 if valid is None else int(np.count_nonzero(valid))}
     if kind == "base":
@@ -203,17 +201,11 @@ def publish_shard(store: Store, manifest: ShardManifest, data: bytes) -> bool:
 
 
 def load_manifest(store: Store, stage: Stage, shard: str) -> ShardManifest:
-    """Load the manifest of a shard; NotFoundError if the shard does not exist."""
     return read_record(ShardManifest, store, names.shard_manifest(stage, shard))
 
 
 def load_shard(store: Store, stage: Stage, shard: str) -> Shard:
-    """Load a finished shard and verify it against its manifest.
-
-    Raises:
-        NotFoundError: there is no such shard.
-        DamagedShard: its file is missing or does not match the manifest.
-    """
+    """Load a finished shard; DamagedShard if its file is missing or does not match the manifest."""
     manifest = load_manifest(store, stage, shard)
     return read_shard(read_checked(store, manifest.key, manifest.sha256), kind=manifest.kind, name=manifest.key)
 
@@ -223,12 +215,7 @@ def shard_exists(store: Store, stage: Stage, shard: str) -> bool:
 
 
 def described_again(said: Mapping[str, Any], data: bytes) -> ShardManifest:
-    """Rebuild the manifest of a file; other fields come from an existing manifest of the shard.
-
-    Args:
-        said: that manifest as JSON; its grasps are not needed.
-        data: HDF5 bytes of the shard.
-    """
+    """Rebuild the manifest of a file; other fields come from an existing manifest, as JSON, of the shard."""
     pictures = tuple(path for path in SCHEMAS["views"] if path.startswith("image/"))
     shard = read_shard(data, without=pictures, name=said["key"])
     told = {"sha256": hashlib.sha256(data).hexdigest(), "size_bytes": len(data)}

@@ -94,7 +94,6 @@ class ProposalNetwork:
 
     @property
     def numbers(self) -> int:
-        """D, numbers per grasp."""
         return numbers(len(self.joint_names))
 
 
@@ -127,11 +126,7 @@ def weight_shapes(joints: int) -> dict[str, tuple[int, ...]]:
 
 
 def to_bytes(network: ProposalNetwork) -> bytes:
-    """Serialise a network.
-
-    Raises:
-        InputError: `from_bytes` would reject it.
-    """
+    """Serialise a network; InputError if `from_bytes` would reject it."""
     joints = len(network.joint_names)
     try:
         meta = _Meta(
@@ -155,12 +150,7 @@ def to_bytes(network: ProposalNetwork) -> bytes:
 
 
 def read_file(path: Path) -> bytes:
-    """Read the bytes of a possible network file.
-
-    Raises:
-        LimitError: it has more than `MAX_BYTES`.
-        InputError: it cannot be read.
-    """
+    """Read the bytes of a possible network file; LimitError above `MAX_BYTES`."""
     try:
         with Path(path).open("rb") as file:
             data = file.read(MAX_BYTES + 1)
@@ -171,16 +161,7 @@ def read_file(path: Path) -> bytes:
 
 
 def from_bytes(data: bytes, what: str) -> ProposalNetwork:
-    """Parse a network file.
-
-    Args:
-        data: the file.
-        what: name of the file in messages.
-
-    Raises:
-        LimitError: more than `MAX_BYTES`, packed or unpacked.
-        InputError: not a complete, finite file of this schema.
-    """
+    """Parse a network file, named `what` in messages; LimitError if too large, InputError if invalid."""
     check_size(len(data), what)
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
@@ -221,7 +202,6 @@ def from_bytes(data: bytes, what: str) -> ProposalNetwork:
 
 
 def check_size(size: int, what: str) -> None:
-    """Raise LimitError for more bytes than any network has."""
     if size > MAX_BYTES:
         raise LimitError(f"{what} has more than {MAX_BYTES >> 20} MiB; no proposal network needs as much")
 
@@ -286,7 +266,6 @@ def _check(arrays: Mapping[str, Floats32], joints: int, what: str) -> None:
 
 
 def _difference(found: list[str], expected: Mapping[str, object]) -> str:
-    """Describe missing arrays and unknown files."""
     wanted = {f"{name}.npy" for name in [_META, *expected]}
     missing, foreign = sorted(wanted - {*found, f"{_META}.npy"}), sorted(set(found) - wanted)
     parts = [f"{word} {', '.join(names[:4])}" for word, names in (("without", missing), ("besides", foreign)) if names]
@@ -298,15 +277,7 @@ NETWORK_FILE: Final = "network.npz"
 
 
 def network_bytes(files: Mapping[str, bytes], what: str) -> bytes:
-    """Return the network's file of an asset; `from_bytes` validates it.
-
-    Args:
-        files: the file and `asset.json`.
-        what: name of the asset in messages.
-
-    Raises:
-        InputError: it is missing, or `asset.json` has keys that a network does not have.
-    """
+    """Return the network's file of an asset; InputError if missing, or if `asset.json` has other keys."""
     described = parse_description(asset_json(files), what)
     if described.file not in files:
         raise InputError(f"{what}: the main file {described.file!r} is not among its files")
@@ -316,12 +287,7 @@ def network_bytes(files: Mapping[str, bytes], what: str) -> bytes:
 
 
 def network_report(files: Mapping[str, bytes], name: str) -> dict[str, Any]:
-    """Return the check's report of a usable network.
-
-    Raises:
-        LimitError: larger than any network.
-        InputError: not a network.
-    """
+    """Return the check's report of a usable network; InputError for others."""
     data = network_bytes(files, name)
     network = from_bytes(data, name)
     joints = len(network.joint_names)
@@ -340,7 +306,6 @@ def network_report(files: Mapping[str, bytes], name: str) -> dict[str, Any]:
 
 
 def check_network(files: Mapping[str, bytes], name: str) -> dict[str, Any]:
-    """Return `network_report`, or a refusal."""
     try:
         return network_report(files, name)
     except InputError as error:

@@ -25,12 +25,7 @@ Objects = dict[str, dict[str, bytes]]
 
 
 def files_of_set(path: Path) -> Objects | None:
-    """Find names and files of objects in a folder or ZIP; None if the path is a single object.
-
-    Raises:
-        InputError: no mesh in the folder, or no readable ZIP.
-        LimitError: more than the service accepts in one ZIP.
-    """
+    """Find names and files of objects in a folder or ZIP; None if the path is a single object."""
     if not path.is_dir() and not (path.suffix.lower() == ".zip" and path.is_file()):
         return None
     files = read_set(path, limit_bytes=UNPACK_FACTOR * load_settings().max_upload_bytes)
@@ -73,12 +68,7 @@ def object_set(files: Mapping[str, bytes]) -> dict[str, dict[str, bytes]]:
 
 
 def read_set(path: Path, *, limit_bytes: int) -> dict[str, bytes]:
-    """Read the files of a folder or ZIP; links that lead out of the folder are ignored.
-
-    Raises:
-        InputError: neither a folder nor a readable ZIP.
-        LimitError: more than `limit_bytes` or `MAX_FILES`.
-    """
+    """Read the files of a folder or ZIP, up to `limit_bytes`; links that lead out of the folder are ignored."""
     if path.is_file():
         return unpack(path.read_bytes(), limit_bytes=limit_bytes)
     if not path.is_dir():

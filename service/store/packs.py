@@ -48,7 +48,6 @@ class _Packed(BaseModel):
 
 
 def has_packs(store: Store) -> bool:
-    """Check whether a store has packs of graspd 0.2."""
     return next(iter(store.list(_FOLDER)), None) is not None
 
 
@@ -106,7 +105,6 @@ def _take_apart(store: Store, key: str, dead: list[str]) -> Iterator[ShardManife
 
 
 def _directory(key: str, data: bytes) -> tuple[int, list[_Packed]]:
-    """Return the start of the pieces, and the directory."""
     head, rest = data[: _HEAD.size], data[_HEAD.size :]
     magic, length = _HEAD.unpack(head) if len(head) == _HEAD.size else (b"", 0)
     directory = rest[:length]

@@ -43,7 +43,6 @@ Put = Callable[[str, BaseModel], bool]
 
 
 def read_record(model: type[RecordT], store: Store, key: str) -> RecordT:
-    """Load a record by its key; NotFoundError if absent, DamagedError if damaged."""
     return parse_record(model, store.get(key), key)
 
 
@@ -62,12 +61,10 @@ def parse_record(model: type[RecordT], data: bytes, key: str) -> RecordT:
 
 
 def put_record(store: Store, key: str, record: BaseModel) -> bool:
-    """Write a record if absent; False if the key exists."""
     return put_sealed(store, key, record.model_dump_json().encode())
 
 
 def job_events(store: Store, job: str) -> list[JobEvent]:
-    """Load the user actions on a job, in order."""
     keys = sorted(entry.key for entry in store.list(names.job_events(job)))
     return [read_record(JobEvent, store, key) for key in keys]
 
@@ -92,18 +89,15 @@ def add_job_event(
 
 
 def task_attempts(store: Store, task: str) -> list[AttemptRecord]:
-    """Load the failed attempts of a task, in order."""
     entries = [entry.key for entry in store.list(names.attempts(task))]
     return sorted((read_record(AttemptRecord, store, key) for key in entries), key=lambda attempt: attempt.number)
 
 
 def load_dataset(store: Store, name: str) -> DatasetRecord:
-    """Load the record of a dataset; NotFoundError if there is none."""
     return read_record(DatasetRecord, store, names.dataset_record(name))
 
 
 def dataset_events(store: Store, name: str) -> list[DatasetEvent]:
-    """Load the user actions on a dataset, in order."""
     keys = sorted(entry.key for entry in store.list(names.dataset_events(name)))
     return [read_record(DatasetEvent, store, key) for key in keys]
 
@@ -111,7 +105,6 @@ def dataset_events(store: Store, name: str) -> list[DatasetEvent]:
 def add_dataset_event(
     store: Store, name: str, what: Literal["cancelled", "retried"], *, put: Put | None = None
 ) -> DatasetEvent:
-    """Append an event to a dataset."""
     put = put or partial(put_record, store)
     while True:
         taken = [event.number for event in dataset_events(store, name)]
@@ -121,7 +114,6 @@ def add_dataset_event(
 
 
 def load_snapshot(store: Store, dataset: str, digest: str) -> Snapshot:
-    """Load a snapshot; NotFoundError if there is none."""
     return read_record(Snapshot, store, names.dataset_snapshot(dataset, digest))
 
 
@@ -136,21 +128,13 @@ def newest_snapshot(store: Store, dataset: str, digest: str | None = None) -> Sn
 
 
 def newest_version(store: Store, tag: str) -> Tag | None:
-    """Load the current version of a tag; None if there is none.
-
-    Raises:
-        DamagedError: its record does not match its name.
-    """
+    """Load the current version of a tag; None if there is none."""
     keys = sorted(entry.key for entry in store.list(names.tag_versions(tag)))
     return read_record(Tag, store, keys[-1]) if keys else None
 
 
 def put_version(put: Put, tag: Tag) -> None:
-    """Write a tag after a change.
-
-    Raises:
-        ConflictError: another change was written first.
-    """
+    """Write a tag after a change; ConflictError if another change was written first."""
     if not put(names.tag_version(tag.id, tag.number), tag):
         raise ConflictError(f"the tag {tag.name!r} was changed a moment ago; try again")
 
@@ -164,7 +148,6 @@ def drop_older(store: Store, tag: Tag) -> None:
 
 
 def newest_mark(store: Store) -> str:
-    """Return the mark of a store; empty if it has none."""
     return max((entry.key.rpartition("/")[2].removesuffix(".json") for entry in store.list(names.MARKS)), default="")
 
 
@@ -175,7 +158,6 @@ def next_mark(mark: str) -> str:
 
 
 def set_mark(store: Store, mark: str) -> None:
-    """Replace the mark of a store."""
     put_document(store, names.mark(mark), {"at": timestamp()})
     for key in [entry.key for entry in store.list(names.MARKS)]:
         if key != names.mark(mark):
@@ -201,12 +183,10 @@ def charts_of(place: SceneSpec) -> str:
 
 
 def kind_of(chart: Mapping[str, Any]) -> str:
-    """Return the kind of a chart made by `graspd chart`."""
     return charts_of(SceneSpec.model_validate(chart["scene"])) if "scene" in chart else CHARTS
 
 
 def scene_kinds(store: Store) -> list[str]:
-    """Return the kinds of stored charts in scenes, by name."""
     return sorted({entry.key.rpartition("/")[0] for entry in store.list(IN_SCENES) if entry.key.endswith(".json")})
 
 
@@ -223,17 +203,12 @@ def publish(store: Store, kind: str, record: Mapping[str, Any]) -> str:
 
 
 def latest(store: Store, kind: str) -> dict[str, Any] | None:
-    """Load the record of a kind that was published last, with present names; None if there is none.
-
-    Raises:
-        DamagedError: its bytes do not match the seal.
-    """
+    """Load the record of a kind that was published last, with present names; None if there is none."""
     key = latest_key(store, kind)
     return renamed_chart(get_document(store, key)) if key else None
 
 
 def latest_key(store: Store, kind: str) -> str:
-    """Return the key of that record; empty if there is none."""
     return max((entry.key for entry in store.list(kind) if entry.key.endswith(".json")), default="")
 
 

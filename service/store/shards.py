@@ -83,7 +83,6 @@ def write_shard(kind: ShardKind, arrays: Arrays, attributes: Mapping[str, Attrib
 
 
 def check_columns(kind: ShardKind, arrays: Arrays) -> dict[str, int]:
-    """Return the lengths of the shape letters (N, T, S, ...); InputError if arrays do not fit the schema."""
     schema = SCHEMAS[kind]
     if unknown := set(arrays) - set(schema):
         raise InputError(f"a {kind} shard has no dataset {sorted(unknown)[0]!r}")
@@ -153,12 +152,7 @@ class ShardH5(h5py.File):  # type: ignore[misc]
 
 @contextmanager
 def open_shard(source: bytes | Path | io.RawIOBase, *, name: str = "") -> Iterator[h5py.File]:
-    """Open the HDF5 file of a shard for partial reading; files in folders are verified by `check_file`.
-
-    Raises:
-        InputError: not HDF5.
-        DamagedShard: it does not match its checksum, or is unreadable, here or in the body.
-    """
+    """Open a shard for partial reading; DamagedShard if it does not match its checksum or is unreadable, also later."""
     name = name or (str(source) if isinstance(source, Path) else "shard")
     if isinstance(source, Path) and source.is_file():
         check_file(source)
@@ -209,7 +203,6 @@ def _check_contents(file: h5py.File, name: str) -> None:
 
 
 def kind_of(file: h5py.File, name: str) -> ShardKind:
-    """Return the kind of an open shard; InputError if it is not a graspd shard."""
     schema = str(file.attrs.get("schema", ""))
     found = schema.removeprefix("graspd/").partition("@")[0]
     if not schema.startswith("graspd/") or found not in SCHEMAS:
@@ -243,7 +236,6 @@ def _attribute(value: object) -> Attribute:
 
 
 def json_attribute(value: object) -> str:
-    """Convert a value to JSON text for an HDF5 attribute."""
     return json.dumps(value, sort_keys=True)
 
 

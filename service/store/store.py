@@ -89,12 +89,10 @@ class Store:
             return
 
     def get(self, key: str) -> bytes:
-        """Read an object; NotFoundError if there is none."""
         with _mapped(key, self.url):
             return bytes(obstore.get(self._backend, check_key(key)).bytes())
 
     def get_range(self, key: str, start: int, length: int) -> bytes:
-        """Read `length` bytes from offset `start`; NotFoundError if there is no such object."""
         with _mapped(key, self.url):
             return bytes(obstore.get_range(self._backend, check_key(key), start=start, length=length))
 
@@ -108,7 +106,6 @@ class Store:
             yield chunk
 
     def size(self, key: str) -> int:
-        """Return the size of an object [bytes]; NotFoundError if there is none."""
         with _mapped(key, self.url):
             return int(obstore.head(self._backend, check_key(key))["size"])
 
@@ -117,7 +114,6 @@ class Store:
         self.move(key, f"damaged/{key}")
 
     def move(self, key: str, to: str) -> None:
-        """Rename an object, if it exists."""
         try:
             with _mapped(key, self.url):
                 obstore.rename(self._backend, check_key(key), check_key(to), overwrite=True)
@@ -200,11 +196,7 @@ def open_store(url: str, *, public_endpoint: str | None = None, make: bool = Tru
 
 
 def local_folder(url: str) -> Path | None:
-    """Return the folder of a local store; None for other stores.
-
-    Raises:
-        InputError: the path in the URL is not absolute, or has characters that end a path.
-    """
+    """Return the folder of a local store, None for others; InputError unless the path is absolute and plain."""
     parts = urlsplit(url)
     if parts.scheme != "file":
         return None
@@ -225,7 +217,6 @@ def check_key(key: str) -> str:
 
 
 def _endpoint() -> str | None:
-    """Return a custom S3 endpoint, if any."""
     return os.environ.get("AWS_ENDPOINT_URL") or os.environ.get("AWS_ENDPOINT") or None
 
 
