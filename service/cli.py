@@ -182,8 +182,6 @@ def load_settings(**overrides: Any) -> Settings:
 
 @dataclass(frozen=True)
 class EngineSettings:
-    """Settings of a command that plans and validates in its own process, with defaults."""
-
     prefilter: Literal["auto", "on", "off"] = "auto"
     processes: int = 0
 

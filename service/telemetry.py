@@ -83,8 +83,6 @@ class JsonLines(logging.Formatter):
 
 
 class _TextLines(logging.Formatter):
-    """Time, level, module, message, and the subjects in brackets."""
-
     def format(self, record: logging.LogRecord) -> str:
         record = _plain(record)
         about = " ".join(f"{name}={value}" for name, value in _subjects(record).items())

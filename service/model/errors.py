@@ -33,7 +33,7 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, ClassVar, Final, Self
 
 #: Line breaks with surrounding space (all those of `str.splitlines`) and control characters.
@@ -213,34 +213,15 @@ class TaskRefused(TaskError):
     slug, title = "task-refused", "The task was refused"
 
 
+def _below(kind: type[GraspdError]) -> Iterator[type[GraspdError]]:
+    for one in kind.__subclasses__():
+        yield one
+        yield from _below(one)
+
+
 #: Errors by problem type, for the client and the reference page.
-ERRORS: Final[dict[str, type[GraspdError]]] = {
-    error.slug: error
-    for error in (
-        InputError,
-        NotFoundError,
-        ConflictError,
-        MeshError,
-        HandError,
-        SceneError,
-        LoadError,
-        LimitError,
-        QuotaError,
-        UnavailableError,
-        QueueUnavailable,
-        StoreUnavailable,
-        IndexUnavailable,
-        IndexDamaged,
-        RateError,
-        BusyError,
-        DamagedError,
-        DamagedShard,
-        TaskError,
-        TaskCancelled,
-        TaskRefused,
-        GraspdError,
-    )
-}
+ERRORS: Final = {error.slug: error for error in _below(GraspdError) if error is not AssetError}
+ERRORS[GraspdError.slug] = GraspdError
 
 #: User and password of a URL, up to the last @: an unquoted password may contain an @ or a slash.
 _LOGIN: Final = re.compile(r"(?<=://)[^/\s\"'<>][^\s\"'<>]*@")

@@ -32,8 +32,6 @@ class IndexLevel(IntEnum):
 
 @dataclass(frozen=True)
 class GraspMetric:
-    """Definition of one number per grasp."""
-
     name: str
     """Its dataset in a base shard is `quality/{name}`; this name is used everywhere else."""
     units: str
@@ -41,18 +39,14 @@ class GraspMetric:
     meaning: str
     title: str
     short: str = ""
-    """Short heading; by default the title."""
     swept: bool = False
     """One value per contact threshold; the index has the value at `INDEX_THRESHOLD_M`."""
     whole: bool = False
-    """A count."""
     code: bool = False
     """A number that encodes a category; its sums and means are meaningless."""
     optional: bool = False
-    """A shard may lack it."""
     indexed: IndexLevel = IndexLevel.NO
     bounds: tuple[float, float] = (0, math.inf)
-    """Least and largest value of a filter."""
     less_is_better: bool = False
     digits: int | None = None
     """Decimal places in the table of a card; None: not in the table."""

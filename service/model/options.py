@@ -31,8 +31,6 @@ _UNIT: Final = re.compile(r"\[([^\]]+)\]")
 
 @dataclass(frozen=True)
 class Form:
-    """Presentation of an option in a form of the dashboard."""
-
     section: Literal["grasps", "scenes"]
     label: str
     hint: str = ""
@@ -45,8 +43,6 @@ class Form:
 
 @dataclass(frozen=True)
 class Option:
-    """Metadata of a user option."""
-
     group: Literal["basic", "advanced"] = "advanced"
     places: tuple[Place, ...] = EVERYWHERE
     flags: str = ""
@@ -61,8 +57,6 @@ class Option:
 
 @dataclass(frozen=True)
 class Row:
-    """One row of the table of options."""
-
     name: str
     field: FieldInfo
     option: Option

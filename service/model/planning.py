@@ -42,15 +42,11 @@ class PlannedTask:
 
 @dataclass
 class TaskFacts:
-    """Facts that determine a task's state."""
-
     stage: Stage
     done: bool = False
     """Whether the manifest of its shard is in the store."""
     last_attempt: int = 0
-    """Number of the last failed attempt."""
     exhausted: bool = False
-    """Whether that attempt was the last."""
     retried_upto: int = 0
     """Attempts up to this number are ignored: a user retried the job."""
     running: bool = False

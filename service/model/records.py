@@ -13,10 +13,10 @@ from typing import Annotated, Any, Final, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
 
 from graspd.service.model import names
-from graspd.service.model.base import TagName
+from graspd.service.model.base import Digest, Name, TagName
 from graspd.service.model.clock import timestamp
 from graspd.service.model.digests import digest_json
-from graspd.service.model.domain import Digest, JobOptions, JobRequest, Name, check_known
+from graspd.service.model.domain import JobOptions, JobRequest, check_known
 from graspd.service.model.fidelity import AUTO
 from graspd.service.model.messages import IngestMessage, Origin, TaskMessage
 from graspd.service.model.projects import Project
@@ -139,7 +139,6 @@ class Cell:
     object: Member
     job_id: str
     fidelity: str = ""
-    """Fidelity chosen by the chart for this cell, if the dataset's fidelity is `auto`."""
     choice: Choice | None = None
     """Reason of that choice; None also for datasets from before it was recorded."""
 
@@ -238,9 +237,7 @@ class ObjectSet(Record):
     objects: tuple[Name, ...]
     created: str
     owner: str = ""
-    """Id of the key that created the set; empty: none or unknown."""
     project: Project = ""
-    """Project of that key; empty: the unnamed project."""
 
 
 def request_of(options: JobOptions, hand: str, obj: str, fidelity: str = "") -> JobRequest:

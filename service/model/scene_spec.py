@@ -70,7 +70,6 @@ class Box(Part):
     size: tuple[_Extent, _Extent, _Extent]
     """Full extents x y z [m]."""
     pose: Pose = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
-    """x y z [m], unit quaternion w x y z."""
 
     @model_validator(mode="after")
     def _turned(self) -> Self:
@@ -105,7 +104,6 @@ class SceneSpec(Part):
 
     kind: SceneKind = "free"
     supports: Supports = Field((), max_length=MOST_SUPPORTS)
-    """Only with kind `file`."""
     target: Pose | None = None
     """Pose of the object in the scene; None: it is dropped onto the support below."""
     faces: Literal["drawn", "all"] = "drawn"
@@ -115,7 +113,6 @@ class SceneSpec(Part):
     """Clearance of fingertips to supports [mm]: 2, as for the rest of the hand; 0: contact allowed; below: they press.
     """
     neighbours: tuple[NeighbourSpec, ...] = Field((), max_length=MOST_NEIGHBOURS)
-    """Objects besides the target."""
 
     @model_validator(mode="after")
     def _whole(self) -> Self:

@@ -19,8 +19,6 @@ HTTP_BUCKETS_S: Final = (0.002, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 1.0, 5.0)
 
 @dataclass(frozen=True)
 class Series:
-    """A Prometheus series."""
-
     name: str
     kind: Literal["gauge", "counter", "histogram"]
     labels: tuple[str, ...]
@@ -65,14 +63,6 @@ _ALL: Final = (
 )
 
 SERIES: Final[dict[str, Series]] = {series.name: series for series in _ALL}
-
-
-def series_table() -> str:
-    lines = ["| series | type | labels | meaning | from |", "| --- | --- | --- | --- | --- |"]
-    for series in SERIES.values():
-        labels = ", ".join(f"`{label}`" for label in series.labels)
-        lines.append(f"| `{series.name}` | {series.kind} | {labels} | {series.meaning} | {series.source} |")
-    return "\n".join(lines)
 
 
 def field(name: str, *labels: str) -> str:

@@ -23,18 +23,13 @@ _Number = Annotated[float, BeforeValidator(lambda value: math.nan if value is No
 
 @dataclass(frozen=True)
 class MapCell:
-    """One point of a map."""
-
     panel: str
     x: float | str
     y: float | str
     value: _Number
-    """The measured value, in the map's unit; nan: none."""
     outcome: Outcome
     note: str = ""
-    """The value in words, or the reason for its absence."""
     label: str = ""
-    """Short label if it differs from the value."""
     reached: bool = False
     """Whether any job can reach this point."""
 
@@ -45,24 +40,18 @@ class MapCell:
 
 @dataclass(frozen=True)
 class StabilityMap:
-    """One stability map."""
-
     name: str
     title: str
     x: str
-    """Label of the horizontal axis with its unit."""
     y: str
     measure: str
-    """Quantity shown in a cell, with its unit."""
     bounds: str
     """Thresholds of weak and broken cells."""
     cells: list[MapCell]
     shows: str
     """Symptoms of the failure for a user."""
     guard: str
-    """Guard that catches the failure, or a note that none exists."""
     guard_test: str = ""
-    """Test of the guard."""
     lines: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
     """Theoretical boundaries to draw over the panel of that name."""
     reach: str = ""
@@ -104,8 +93,6 @@ class StabilityMap:
 
 @dataclass(frozen=True)
 class Stability:
-    """All maps of one run of the command."""
-
     created: str
     command: str
     versions: dict[str, str]

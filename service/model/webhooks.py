@@ -9,7 +9,7 @@ from urllib.parse import urlsplit
 
 from pydantic import Field
 
-from graspd.service.model.domain import Digest
+from graspd.service.model.base import Digest
 from graspd.service.model.errors import InputError
 from graspd.service.model.projects import Project
 from graspd.service.model.records import Record

@@ -39,8 +39,6 @@ _TOKEN: Final = re.compile(
 
 @dataclass(frozen=True)
 class Flag:
-    """One of `FLAGS`."""
-
     name: str
 
 
@@ -50,14 +48,11 @@ class MetricComparison:
 
     name: str
     op: str
-    """One of < <= > >= = !=."""
     bound: float
 
 
 @dataclass(frozen=True)
 class WordComparison:
-    """Comparison of `hand` or `object` with a word by = or !=."""
-
     name: str
     op: str
     word: str
@@ -73,17 +68,12 @@ class TypeComparison:
 
 @dataclass(frozen=True)
 class Negation:
-    """Negation of a node."""
-
     part: Node
 
 
 @dataclass(frozen=True)
 class Connective:
-    """Conjunction or disjunction of its parts."""
-
     word: str
-    """and, or."""
     parts: tuple[Node, ...]
 
 
@@ -104,7 +94,6 @@ def parsed(text: str) -> Node:
 @dataclass(frozen=True)
 class _Token:
     kind: str
-    """number, op, quoted or word."""
     text: str
 
 

@@ -39,8 +39,6 @@ _TABLES: Final = 4096
 
 @dataclass(frozen=True)
 class PictureAddress:
-    """Location of a picture."""
-
     file: ShardFile
     scene_shard: str
     """Id of the scene shard, or of the base shard with its scenes."""

@@ -153,13 +153,10 @@ class RangeReader:
 
 @dataclass
 class _Object:
-    """Cached bytes of an object."""
-
     lock: threading.Lock = field(default_factory=threading.Lock)
     size: int = 0
     spans: list[Span] = field(default_factory=list)
     row: int | None = None
-    """Last requested row."""
 
     @property
     def bytes(self) -> int:
@@ -237,10 +234,7 @@ _DEFLATE: Final = h5py.h5z.FILTER_DEFLATE
 
 @dataclass(frozen=True)
 class _Packed:
-    """A column with one chunk per row."""
-
     shape: tuple[int, ...]
-    """Shape of a row."""
     dtype: np.dtype[Any]
     shuffled: bool
     places: NDArray[np.int64]
@@ -263,7 +257,6 @@ class RowTable:
     """Columns of a shard: file positions of the rows of packed columns, values of all others."""
 
     name: str
-    """Name of the shard in error messages."""
     packed: dict[str, _Packed]
     held: dict[str, Array]
 

@@ -17,8 +17,6 @@ _TYPED: Final = Option(places=ASSET)
 
 
 class HandWords(Model):
-    """Keys of a hand's `asset.json` with command-line options; see `hand_options`."""
-
     urdf: Annotated[str | None, _TYPED] = Field(
         None, description="main file of the hand in the folder or ZIP (URDF, xacro or MJCF): NAME"
     )

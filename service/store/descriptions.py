@@ -117,8 +117,6 @@ class HandCorrections(_Said):
 
 
 class HandFacts(BaseModel):
-    """Facts about a hand in its model (`worker.stages.models`)."""
-
     model_config = ConfigDict(frozen=True)
 
     root: str

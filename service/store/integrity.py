@@ -56,13 +56,10 @@ def gone(key: str) -> DamagedShard:
 
 @dataclass(frozen=True)
 class _Intact:
-    """Facts about a verified object."""
-
     stamp: Stamp
     until: float
     size: int
     blocks: tuple[bytes, ...]
-    """Digest of each block of `STREAM_BYTES`."""
 
 
 class CheckedObjects:

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from graspd.service.model import names
+from graspd.service.model.base import Digest
 from graspd.service.model.clock import timestamp
-from graspd.service.model.domain import Digest, JobRequest, batches_of
+from graspd.service.model.domain import JobRequest, batches_of
 from graspd.service.model.messages import TaskMessage
 from graspd.service.model.metric_fields import values, with_fields
 from graspd.service.model.metrics import axis_word, indexed

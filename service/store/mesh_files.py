@@ -21,12 +21,9 @@ _OURS: Final = frozenset({"package", "model", "file"})
 
 @dataclass(frozen=True)
 class Reference:
-    """Possible targets of a file name in a description."""
-
     names: tuple[str, ...]
     """Candidate names in the upload, in order of preference."""
     scheme: str = ""
-    """Scheme of `package://...`, `model://...` and `file://...`."""
     tails: tuple[str, ...] = ()
     """With a scheme: path tails that may be below any folder; all but the bare file name."""
 

@@ -48,8 +48,6 @@ Floats32 = NDArray[np.float32]
 
 
 class _Meta(BaseModel):
-    """JSON text of a file."""
-
     model_config = ConfigDict(frozen=True, extra="forbid", protected_namespaces=())
 
     schema_: Literal["graspd/proposals@1"] = Field(alias="schema")
@@ -76,7 +74,6 @@ class ProposalNetwork:
 
     hand: str
     hand_digest: str
-    """Digest of the hand's files: `HandModel.digest`."""
     joint_names: tuple[str, ...]
     """(J,) all moving joints, as in `HandModel.joint_names`."""
     weights: Mapping[str, Floats32]
@@ -86,11 +83,8 @@ class ProposalNetwork:
     std: Floats32
     """(D,) standard deviation, positive."""
     points: int = 512
-    """P, number of points of a cloud."""
     steps: int = 16
-    """Number of Euler steps of the flow."""
     about: str = field(default="", kw_only=True)
-    """Training data, in words."""
 
     @property
     def numbers(self) -> int:

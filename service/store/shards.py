@@ -102,13 +102,10 @@ def check_columns(kind: ShardKind, arrays: Arrays) -> dict[str, int]:
 
 @dataclass(frozen=True)
 class Shard:
-    """A shard in memory."""
-
     kind: ShardKind
     attributes: dict[str, Attribute]
     arrays: dict[str, NDArray[np.generic]]
     path: Path | None = None
-    """File that it was read from."""
 
     def __getitem__(self, path: str) -> NDArray[np.generic]:
         return self.arrays[path]

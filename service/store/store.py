@@ -39,8 +39,6 @@ _REMOTE: Final[dict[str, Any]] = {
 
 @dataclass(frozen=True)
 class Entry:
-    """An object in a listing."""
-
     key: str
     size: int
 
