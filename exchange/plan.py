@@ -86,7 +86,7 @@ def looks(pictures: Pictures) -> Iterator[PictureReference]:
         if camera["camera/eye"] == RIGHT:
             continue
         extrinsics = np.asarray(camera["camera/extrinsics"], float)
-        found = pictures.scenes_of(place).grasps(place.scene, extrinsics)
+        found = pictures.scenes_of(place.scene_shard).grasps(place.scene, extrinsics)
         pose = compose(invert(pose_from_matrix(extrinsics)), found["object/pose"])
         rows = np.asarray(found["grasp/base_row"], np.intp)
         yield PictureReference(index, found["base_id"], place.file.id, place.scene, extrinsics, pose, rows)

@@ -65,10 +65,6 @@ def job_events(job: str) -> str:
     return f"{JOBS}/{job}/events"
 
 
-def job_event(job: str, number: int, what: str) -> str:
-    return f"{job_events(job)}/{number:06}-{what}.json"
-
-
 def attempts(task: str) -> str:
     return f"{TASKS}/{task}/attempts"
 
@@ -93,8 +89,9 @@ def dataset_events(dataset: str) -> str:
     return f"{DATASETS}/{dataset}/events"
 
 
-def dataset_event(dataset: str, number: int, what: str) -> str:
-    return f"{dataset_events(dataset)}/{number:06}-{what}.json"
+def event(events: str, number: int, what: str) -> str:
+    """Return the key of one of `job_events` or `dataset_events`; numbers start at 1."""
+    return f"{events}/{number:06}-{what}.json"
 
 
 def dataset_snapshots(dataset: str) -> str:

@@ -58,7 +58,3 @@ def __getattr__(name: str) -> Any:
     found = getattr(import_module(f"{__name__}.{_LIVES_IN[name]}"), name)
     globals()[name] = found
     return found
-
-
-def __dir__() -> list[str]:
-    return __all__

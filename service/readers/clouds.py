@@ -109,7 +109,7 @@ class Clouds(Sequence[dict[str, Any]]):
         if isinstance(index, slice):
             return [self[i] for i in range(*index.indices(len(self)))]
         places = self._places[index]
-        first, scenes = places[0], self.pictures.scenes_of(places[0])
+        first, scenes = places[0], self.pictures.scenes_of(places[0].scene_shard)
         draw = np.random.default_rng([self._seed, self.epoch, *_words(first)])
         views = [CloudView.of(self.pictures.columns_of(place, COLUMNS), self._noise, draw) for place in places]
         object_pose = scenes.object_pose(first.scene)

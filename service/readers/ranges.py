@@ -28,14 +28,9 @@ from graspd.service.store.integrity import gone
 from graspd.service.store.shards import open_shard, read_column
 from graspd.service.store.store import Store
 
+#: Offset and length [bytes]; offset and the bytes from there.
 Range = tuple[int, int]
-
-"""Offset and length [bytes]."""
-
 Span = tuple[int, memoryview]
-
-"""Offset and the bytes from there."""
-
 #: Largest request when pictures are read in sequence [bytes]; a smaller shard is read whole.
 AHEAD_BYTES: Final = 4 << 20
 #: Memory limit for the bytes of all shards [bytes].
@@ -65,7 +60,9 @@ class RangeReader:
         """Open the HDF5 file of a shard; `whole`: pictures too, so a small shard is read at once."""
         held = self._of(key)
         with held.lock:
-            held.size = held.size or self._size(key)
+            if not held.size:
+                with self._reading(key):
+                    held.size = self._store.size(key)
             small = whole and held.size <= AHEAD_BYTES
             if small and not _covers(held.spans, (0, held.size)):
                 held.spans = [self._get(key, (0, held.size))]
@@ -134,16 +131,14 @@ class RangeReader:
                     used -= self._objects.pop(other).bytes
 
     def _get(self, key: str, one: Range) -> Span:
-        check_not_forked(self._store, self._process)
-        try:
+        with self._reading(key):
             return one[0], memoryview(self._store.get_range(key, *one))
-        except NotFoundError:
-            raise gone(self._name(key)) from None
 
-    def _size(self, key: str) -> int:
+    @contextmanager
+    def _reading(self, key: str) -> Iterator[None]:
         check_not_forked(self._store, self._process)
         try:
-            return self._store.size(key)
+            yield
         except NotFoundError:
             raise gone(self._name(key)) from None
 
@@ -263,21 +258,14 @@ class RowTable:
     @classmethod
     def of(cls, file: h5py.File, columns: Iterable[str], name: str) -> RowTable:
         """Read the table of an open shard; values of columns that are not packed are read and checked."""
-        packed, held = {}, {}
-        for column in columns:
-            found = _packed(file[column])
-            if found is None:
-                held[column] = read_column(file, column, name)
-            else:
-                packed[column] = found
+        found = {column: _packed(file[column]) for column in columns}
+        packed = {column: places for column, places in found.items() if places is not None}
+        held = {column: read_column(file, column, name) for column in found.keys() - packed}
         return cls(name, packed, held)
 
     @property
     def columns(self) -> set[str]:
         return {*self.packed, *self.held}
-
-    def has(self, columns: Iterable[str]) -> bool:
-        return all(name in self.packed or name in self.held for name in columns)
 
     def ranges(self, row: int, columns: Iterable[str]) -> list[tuple[int, int]]:
         """Return offset and length [bytes] of a row in each packed column; empty after the last row."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Annotated, Any, Final
 
 import typer
@@ -55,30 +56,20 @@ def provenance(licence: str | None, source: str | None) -> dict[str, Any]:
     return {key: value for key, value in (("licence", licence), ("source", source)) if value}
 
 
-def hand_options(
-    *,
-    urdf: str | None = None,
-    xacro: list[str] | None = None,
-    palm: str | None = None,
-    approach: str | None = None,
-    root: str | None = None,
-    pre_shape: list[str] | None = None,
-    closing: list[str] | None = None,
-    fingertips: str | None = None,
-    fix: list[str] | None = None,
-    drop: list[str] | None = None,
-) -> dict[str, Any]:
+def hand_options(**given: Any) -> dict[str, Any]:
+    """Return the keys of a hand's `asset.json` for options of `HandWords`; absent ones are omitted."""
+    words = HandWords(**given)
     options: dict[str, Any] = {
-        "file": urdf,
-        "xacro": dict(map(_argument, xacro or [])),
-        "palm": {"link": palm} if palm else None,
-        "approach": _vector(approach) if approach else None,
-        "root": root,
-        "preshape": _assignments("--pre-shape", pre_shape) if pre_shape else None,
-        "closing": _directions(closing) if closing else None,
-        "fingertips": [link.strip() for link in fingertips.split(",") if link.strip()] if fingertips else None,
-        "fix": _assignments("--fix", fix) if fix else None,
-        "drop": drop,
+        "file": words.urdf,
+        "xacro": dict(map(_argument, words.xacro)),
+        "palm": {"link": words.palm} if words.palm else None,
+        "approach": _vector(words.approach) if words.approach else None,
+        "root": words.root,
+        "preshape": _assignments("--pre-shape", words.pre_shape) if words.pre_shape else None,
+        "closing": _directions(words.closing) if words.closing else None,
+        "fingertips": [link for part in (words.fingertips or "").split(",") if (link := part.strip())],
+        "fix": _assignments("--fix", words.fix) if words.fix else None,
+        "drop": list(words.drop),
     }
     return {key: value for key, value in options.items() if value}
 
@@ -102,7 +93,7 @@ def _vector(text: str) -> list[float]:
     return [x, y, z]
 
 
-def _assignments(option: str, texts: list[str]) -> dict[str, float]:
+def _assignments(option: str, texts: Sequence[str]) -> dict[str, float]:
     values: dict[str, float] = {}
     for text in ",".join(texts).split(","):
         name, _, value = text.strip().partition("=")
@@ -120,7 +111,7 @@ def _argument(text: str) -> tuple[str, str]:
     return name, value
 
 
-def _directions(texts: list[str]) -> dict[str, int]:
+def _directions(texts: Sequence[str]) -> dict[str, int]:
     values = _assignments("--closing", texts)
     for name, value in values.items():
         if value not in (-1, 0, 1):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Final, Literal
 
@@ -291,6 +291,12 @@ ATTRIBUTES: Final[dict[str, RootAttribute]] = {
     "neighbour_digests": RootAttribute("texts", "digests of the neighbours' files"),
     "neighbour_sources": RootAttribute("texts", "paths from which a local command read them; empty: built in"),
 }
+
+
+def check_known(kind: ShardKind, columns: Iterable[str]) -> None:
+    """Raise InputError for a column that no shard of this kind has."""
+    if unknown := set(columns) - set(SCHEMAS[kind]):
+        raise InputError(f"{kind} shards have no column {sorted(unknown)[0]!r}; docs/reference/dataset.md lists them")
 
 
 def check_attributes(kind: str, said: Mapping[str, Attribute]) -> None:

@@ -41,6 +41,8 @@ BLOCKS: Final = 2
 #: Numbers of a grasp besides its joints: position, two columns of the rotation, approach direction.
 POSE: Final = 12
 _META: Final = "meta"
+#: Fields of a network in its JSON text.
+_SHARED: Final = ("hand", "hand_digest", "joint_names", "points", "steps", "about")
 #: A text array takes four bytes per character; each array has a header.
 _MOST_META: Final = 4 * (64 << 10)
 _HEADER: Final = 4096
@@ -123,19 +125,12 @@ def to_bytes(network: ProposalNetwork) -> bytes:
     """Serialise a network; InputError if `from_bytes` would reject it."""
     joints = len(network.joint_names)
     try:
-        meta = _Meta(
-            schema=SCHEMA,
-            hand=network.hand,
-            hand_digest=network.hand_digest,
-            joint_names=network.joint_names,
-            points=network.points,
-            steps=network.steps,
-            sizes=sizes(joints),
-            about=network.about,
-        )
+        shared = {name: getattr(network, name) for name in _SHARED}
+        meta = _Meta(schema=SCHEMA, sizes=sizes(joints), **shared)
     except ValidationError as error:
         raise InputError(f"the network cannot be written: {refusal(error)}") from None
-    arrays = {name: np.asarray(array, np.float32) for name, array in _arrays(network).items()}
+    found = {"mean": network.mean, "std": network.std, **network.weights}
+    arrays = {name: np.asarray(array, np.float32) for name, array in found.items()}
     _check(arrays, joints, "the network cannot be written")
     buffer = io.BytesIO()
     members: dict[str, Any] = {_META: np.array(meta.model_dump_json(by_alias=True)), **arrays}
@@ -172,7 +167,6 @@ def from_bytes(data: bytes, what: str) -> ProposalNetwork:
         EOFError,
         KeyError,
         MemoryError,
-        NotImplementedError,
         RuntimeError,
         zipfile.BadZipFile,
         zlib.error,
@@ -182,17 +176,8 @@ def from_bytes(data: bytes, what: str) -> ProposalNetwork:
     for array in arrays.values():
         array.flags.writeable = False
     weights = {name: arrays[name] for name in weight_shapes(joints)}
-    return ProposalNetwork(
-        meta.hand,
-        meta.hand_digest,
-        meta.joint_names,
-        weights,
-        arrays["mean"],
-        arrays["std"],
-        meta.points,
-        meta.steps,
-        about=meta.about,
-    )
+    shared = {name: getattr(meta, name) for name in _SHARED}
+    return ProposalNetwork(weights=weights, mean=arrays["mean"], std=arrays["std"], **shared)
 
 
 def check_size(size: int, what: str) -> None:
@@ -202,10 +187,6 @@ def check_size(size: int, what: str) -> None:
 
 def _expected(joints: int) -> dict[str, tuple[int, ...]]:
     return {"mean": (numbers(joints),), "std": (numbers(joints),), **weight_shapes(joints)}
-
-
-def _arrays(network: ProposalNetwork) -> dict[str, Any]:
-    return {"mean": network.mean, "std": network.std, **network.weights}
 
 
 def _read_meta(archive: zipfile.ZipFile, what: str) -> _Meta:

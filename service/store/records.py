@@ -11,7 +11,7 @@ import itertools
 import json
 import re
 import secrets
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, Final, Literal, TypeVar
 
@@ -64,9 +64,16 @@ def put_record(store: Store, key: str, record: BaseModel) -> bool:
     return put_sealed(store, key, record.model_dump_json().encode())
 
 
+def _keys(store: Store, prefix: str) -> list[str]:
+    return sorted(entry.key for entry in store.list(prefix))
+
+
+def _records(model: type[RecordT], store: Store, prefix: str) -> list[RecordT]:
+    return [read_record(model, store, key) for key in _keys(store, prefix)]
+
+
 def job_events(store: Store, job: str) -> list[JobEvent]:
-    keys = sorted(entry.key for entry in store.list(names.job_events(job)))
-    return [read_record(JobEvent, store, key) for key in keys]
+    return _records(JobEvent, store, names.job_events(job))
 
 
 def add_job_event(
@@ -81,16 +88,14 @@ def add_job_event(
     """Append an event to a job; its state follows from all events in order."""
     put = put or partial(put_record, store)
     while True:
-        taken = [int(entry.key.rsplit("/", 1)[1].partition("-")[0]) for entry in store.list(names.job_events(job))]
-        number = max(taken, default=0) + 1
+        number = max((event.number for event in job_events(store, job)), default=0) + 1
         event = JobEvent(number=number, what=what, at=timestamp(), retried=retried or {}, cause=cause)
-        if put(names.job_event(job, event.number, what), event):
+        if put(names.event(names.job_events(job), number, what), event):
             return event
 
 
 def task_attempts(store: Store, task: str) -> list[AttemptRecord]:
-    entries = [entry.key for entry in store.list(names.attempts(task))]
-    return sorted((read_record(AttemptRecord, store, key) for key in entries), key=lambda attempt: attempt.number)
+    return sorted(_records(AttemptRecord, store, names.attempts(task)), key=lambda attempt: attempt.number)
 
 
 def load_dataset(store: Store, name: str) -> DatasetRecord:
@@ -98,8 +103,7 @@ def load_dataset(store: Store, name: str) -> DatasetRecord:
 
 
 def dataset_events(store: Store, name: str) -> list[DatasetEvent]:
-    keys = sorted(entry.key for entry in store.list(names.dataset_events(name)))
-    return [read_record(DatasetEvent, store, key) for key in keys]
+    return _records(DatasetEvent, store, names.dataset_events(name))
 
 
 def add_dataset_event(
@@ -107,9 +111,9 @@ def add_dataset_event(
 ) -> DatasetEvent:
     put = put or partial(put_record, store)
     while True:
-        taken = [event.number for event in dataset_events(store, name)]
-        event = DatasetEvent(number=max(taken, default=0) + 1, what=what, at=timestamp())
-        if put(names.dataset_event(name, event.number, what), event):
+        number = max((event.number for event in dataset_events(store, name)), default=0) + 1
+        event = DatasetEvent(number=number, what=what, at=timestamp())
+        if put(names.event(names.dataset_events(name), number, what), event):
             return event
 
 
@@ -121,7 +125,7 @@ def newest_snapshot(store: Store, dataset: str, digest: str | None = None) -> Sn
     """Load the newest snapshot of a dataset, or the one with a digest; NotFoundError if there is none."""
     if digest is not None:
         return load_snapshot(store, dataset, digest)
-    taken = [read_record(Snapshot, store, entry.key) for entry in store.list(names.dataset_snapshots(dataset))]
+    taken = _records(Snapshot, store, names.dataset_snapshots(dataset))
     if not taken:
         raise NotFoundError(f"dataset {dataset!r} has no snapshot; `graspd datasets snapshot {dataset}` takes one")
     return max(taken, key=lambda one: (one.created, one.digest))
@@ -129,7 +133,7 @@ def newest_snapshot(store: Store, dataset: str, digest: str | None = None) -> Sn
 
 def newest_version(store: Store, tag: str) -> Tag | None:
     """Load the current version of a tag; None if there is none."""
-    keys = sorted(entry.key for entry in store.list(names.tag_versions(tag)))
+    keys = _keys(store, names.tag_versions(tag))
     return read_record(Tag, store, keys[-1]) if keys else None
 
 
@@ -142,13 +146,13 @@ def put_version(put: Put, tag: Tag) -> None:
 def drop_older(store: Store, tag: Tag) -> None:
     """Remove outdated versions of a tag; of a deleted tag also the last one, in the end."""
     last = names.tag_version(tag.id, tag.number)
-    for key in sorted(entry.key for entry in store.list(names.tag_versions(tag.id))):
+    for key in _keys(store, names.tag_versions(tag.id)):
         if key < last or (key == last and tag.gone):
             store.delete(key)
 
 
 def newest_mark(store: Store) -> str:
-    return max((entry.key.rpartition("/")[2].removesuffix(".json") for entry in store.list(names.MARKS)), default="")
+    return max(_keys(store, names.MARKS), default="").rpartition("/")[2].removesuffix(".json")
 
 
 def next_mark(mark: str) -> str:
@@ -159,7 +163,7 @@ def next_mark(mark: str) -> str:
 
 def set_mark(store: Store, mark: str) -> None:
     put_document(store, names.mark(mark), {"at": timestamp()})
-    for key in [entry.key for entry in store.list(names.MARKS)]:
+    for key in _keys(store, names.MARKS):
         if key != names.mark(mark):
             store.delete(key)
 
@@ -187,7 +191,7 @@ def kind_of(chart: Mapping[str, Any]) -> str:
 
 
 def scene_kinds(store: Store) -> list[str]:
-    return sorted({entry.key.rpartition("/")[0] for entry in store.list(IN_SCENES) if entry.key.endswith(".json")})
+    return sorted({key.rpartition("/")[0] for key in _keys(store, IN_SCENES) if key.endswith(".json")})
 
 
 def publish(store: Store, kind: str, record: Mapping[str, Any]) -> str:
@@ -209,7 +213,7 @@ def latest(store: Store, kind: str) -> dict[str, Any] | None:
 
 
 def latest_key(store: Store, kind: str) -> str:
-    return max((entry.key for entry in store.list(kind) if entry.key.endswith(".json")), default="")
+    return max((key for key in _keys(store, kind) if key.endswith(".json")), default="")
 
 
 _DIGITS: Final = re.compile(r"\D")
@@ -241,7 +245,7 @@ class DeletedJob(Record):
 
 def pending(store: Store) -> set[tuple[str, str]]:
     """Return kind and id of all deleted things with objects left in the store."""
-    keys = [entry.key.split("/") for entry in store.list(names.DELETIONS)]
+    keys = [key.split("/") for key in _keys(store, names.DELETIONS)]
     return {(key[1], key[2].removesuffix(".json")) for key in keys if len(key) == 3}
 
 
@@ -264,18 +268,13 @@ def removed_before(key: str, at: str) -> bool:
 def deletions(store: Store, what: str = "") -> list[Deletion]:
     """Return the deletions that can be undone, newest first, of one kind of thing or of all."""
     found: dict[str, Deletion] = {}
-
-    def read(keys: Iterable[str]) -> None:
-        for key in keys:
-            with contextlib.suppress(NotFoundError, DamagedError):
-                deletion = read_record(Deletion, store, key)
-                found[removed_folder(deletion)] = deletion
-
     # Objects being moved by the controller are in the second folder before they leave the first.
-    waiting = [entry.key for entry in store.list(names.DELETIONS) if entry.key.count("/") == 2]
-    read(key for key in waiting if not what or key.split("/")[1] == what)
-    removed = [entry.key for entry in store.list(names.REMOVED) if entry.key.count("/") == 2]
-    read(key for key in removed if not what or key.split("-")[1] == what)
+    for folder, before_kind in ((names.DELETIONS, "/"), (names.REMOVED, "-")):
+        for key in _keys(store, folder):
+            if key.count("/") == 2 and (not what or key.split(before_kind)[1] == what):
+                with contextlib.suppress(NotFoundError, DamagedError):
+                    deletion = read_record(Deletion, store, key)
+                    found[removed_folder(deletion)] = deletion
     return sorted(found.values(), key=lambda one: one.at, reverse=True)
 
 
