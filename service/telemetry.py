@@ -122,12 +122,7 @@ _tracer: Any = None
 
 
 def set_up_tracing(process: str, *, exporter: Any = None) -> None:
-    """Send the spans of this process to the exporter configured in the environment, if any.
-
-    Args:
-        process: name of the process: api or worker; the spans' service is `graspd-{process}`.
-        exporter: replaces the configured one.
-    """
+    """Send the spans of this process to `exporter`, or to the one configured in the environment, if any."""
     global _tracer
     if exporter is None and not any(os.environ.get(name) for name in _ASKED_BY):
         return

@@ -57,11 +57,7 @@ _CHOICES: Final = re.compile(r"'(?P<word>.*?)' is not one of (?P<expected>'.*')"
 def refusal(
     error: ValidationError, model: type[BaseModel] | None = None, names: Mapping[str, str] | None = None
 ) -> str:
-    """Return the first error after its location: `scene.touch: must be at least -1`.
-
-    With the model, the message states the whole range: `share: must be more than 0 and at most 1; got 3`. `names` maps
-    fields to the caller's spelling: `--share: must be ...`.
-    """
+    """Return the first error after its location: `scene.touch: must be at least -1`; with a model, the whole range."""
     first = error.errors(include_url=False)[0]
     # For a union of models, pydantic adds the name of the one it validated.
     place = [str(part) for part in first["loc"] if not _CLASS.match(str(part))]

@@ -71,10 +71,7 @@ def shard_id(
     revision: int,
     inputs: Iterable[str] = (),
 ) -> str:
-    """Return the id of the shard that a stage makes from its inputs.
-
-    Only inputs that affect the result count: scenes after the grasps do not change them, views do not change scenes.
-    """
+    """Return the id of the shard that a stage makes from its inputs: only those that affect the result count."""
     inputs_of: dict[str, object] = {
         "stage": stage,
         "revision": revision,

@@ -395,10 +395,7 @@ class JobOptions(Model):
 
     @property
     def standing(self) -> Literal["valid", "feasible", "kept"]:
-        """Grasps counted in tables: valid ones, or without validation all stored ones.
-
-        Those are feasible unless candidates were wanted.
-        """
+        """Grasps counted in tables: valid ones, or without validation all stored ones."""
         return "kept" if self.counted == "feasible" and self.want == "candidates" else self.counted
 
     def rechecks_of(self, batch: int) -> int:

@@ -90,14 +90,7 @@ class AssetError(InputError):
 
     @classmethod
     def with_fixes(cls, problem: str, hint: str, *fixes: Mapping[str, Any], **facts: Any) -> Self:
-        """Make an error with fixes as options; `problem` and `options_suggested` suit any front end.
-
-        Args:
-            problem: the problem.
-            hint: the fixes as options of the command line.
-            fixes: keys of `asset.json` with their values; None: the user chooses the value.
-            facts: further facts.
-        """
+        """Make an error with fixes as options of commands (`hint`) and as keys of `asset.json` (None: any value)."""
         return cls(f"{problem}; {hint}", facts={"problem": problem, "options_suggested": list(fixes), **facts})
 
 

@@ -17,13 +17,7 @@ from pathlib import Path
 
 @lru_cache(maxsize=64)
 def version_of(library: str) -> str:
-    """Return the version of an installed distribution.
-
-    It is read from the folder's name: importing `importlib.metadata` takes longer than loading a hand.
-
-    Raises:
-        importlib.metadata.PackageNotFoundError: it is not installed.
-    """
+    """Return the version of an installed distribution, from its folder's name: `importlib.metadata` is slow."""
     wanted = re.sub(r"[-_.]+", "_", library).lower()
     for place in sys.path:
         found = [version for name, version in _distributions(place) if name == wanted]

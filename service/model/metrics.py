@@ -336,9 +336,6 @@ def entropy_bits(counts: Iterable[int]) -> float:
 
 
 def evenness(counts: Iterable[int], kinds: int) -> float:
-    """Return 2^entropy / kinds: the effective number of equally used categories, relative to all of them.
-
-    1: uniform; 1 / kinds: a single category; 0: no grasps.
-    """
+    """Return 2^entropy / kinds: 1: uniform; 1 / kinds: a single category; 0: no grasps."""
     counts = list(counts)
     return float(2 ** entropy_bits(counts) / kinds) if any(counts) else 0.0

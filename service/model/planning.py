@@ -151,10 +151,7 @@ def ingest_message(kind: AssetKind, name: str, digest: str, *, attempt: int, max
 
 
 def batch_states(chain: Sequence[TaskFacts], *, job_cancelled: bool) -> list[State]:
-    """Return the states of the tasks of one range, in the order of their stages.
-
-    A task behind a failed or cancelled one can never start, so it is cancelled.
-    """
+    """Return the states of one range's tasks; one behind a failed or cancelled task is cancelled."""
     states: list[State] = []
     blocked = False
     for facts in chain:

@@ -345,11 +345,7 @@ def scene_of(
     touch: float = TOUCH,
     beside: Sequence[NeighbourSpec] = (),
 ) -> SceneSpec:
-    """Return the scene of a request, with more neighbours than its document has.
-
-    Raises:
-        ValueError: faces, touch or neighbours do not fit the scene, in one line.
-    """
+    """Return the scene of a request, with more neighbours than its document has; ValueError if they do not fit."""
     try:
         if isinstance(option, SceneDocument):
             touch = option.touch if touch == TOUCH else touch

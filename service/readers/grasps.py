@@ -98,11 +98,7 @@ class Grasps(Sequence[dict[str, Any]]):
         raise InputError(f"none of the shards is of the hand {hand!r}")
 
     def arrays(self, *columns: str) -> dict[str, Array]:
-        """Return columns of all grasps, by default those of the samples; `hand` and `object` name each row's.
-
-        Raises:
-            InputError: numbers of joints or thresholds differ, so the values do not fit into one array.
-        """
+        """Return columns of all grasps, by default those of samples; InputError if they do not fit into one array."""
         wanted = columns or self.columns
         parts: dict[str, list[Array]] = {name: [] for name in (*wanted, "hand", "object")}
         for file, rows in zip(self._files, self._rows, strict=True):

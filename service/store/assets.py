@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from importlib import resources
 from pathlib import Path, PurePosixPath
-from typing import IO, Final, Self, TypeVar
+from typing import IO, Final, Literal, Self, TypeVar
 
 from graspd.service.model.digests import StreamedFiles, digest_bytes, digest_files
 from graspd.service.model.domain import Asset
@@ -63,7 +63,8 @@ def unpack(data: bytes, *, limit_bytes: int) -> dict[str, bytes]:
     files: dict[str, bytes] = {}
     total = 0
     for name, entry in _entries(archive).items():
-        content = _read_entry(archive, entry, limit_bytes - total + 1)
+        with _damage_said(entry), archive.open(entry) as stream:
+            content = stream.read(limit_bytes - total + 1)  # regardless of the size in its header
         total += len(content)
         if total > limit_bytes:
             raise LimitError(f"the archive unpacks to more than {limit_bytes} bytes")
@@ -90,14 +91,7 @@ def without_common_folder(files: dict[str, _T]) -> dict[str, _T]:
 
 
 class ZipFiles(StreamedFiles):
-    """Files of a ZIP on disk, unpacked in pieces on demand; files can be added.
-
-    The constructor unpacks it once to measure and to digest the true contents.
-
-    Raises:
-        InputError: not a ZIP, encrypted, damaged, or a name outside the archive.
-        LimitError: more than `limit_bytes` unpacked, or more than `MAX_FILES` files.
-    """
+    """Files of a ZIP on disk, unpacked in pieces on demand; digests are of the true contents. Files can be added."""
 
     def __init__(self, file: IO[bytes], *, limit_bytes: int) -> None:
         self._archive = _open_zip(file)
@@ -176,12 +170,6 @@ def _entries(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
     return found
 
 
-def _read_entry(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, limit: int) -> bytes:
-    """Read at most `limit` bytes of an entry, regardless of its header."""
-    with _damage_said(entry), archive.open(entry) as stream:
-        return stream.read(limit)
-
-
 def _measure_entry(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, limit: int) -> tuple[int, str]:
     """Return size (up to `limit`) and digest of an entry, read in pieces."""
     count, digest = 0, hashlib.sha256()
@@ -212,26 +200,27 @@ def check_path(name: str) -> str:
     return str(path)
 
 
+def _builtin_folder(kind: AssetKind | Literal["model"]) -> Path:
+    return Path(str(resources.files("graspd.service"))) / "builtin" / f"{kind}s"
+
+
 def builtin_files(kind: AssetKind, name: str) -> dict[str, bytes]:
     """Load the files of a built-in hand or object: `asset.json` with URDF or mesh; NotFoundError if there is none."""
-    folder = Path(str(resources.files("graspd.service"))) / "builtin" / f"{kind.value}s" / name
+    folder = _builtin_folder(kind) / name
     if not (folder / "asset.json").is_file():
         known = ", ".join(builtin_names(kind))
         raise NotFoundError(f"there is no built-in {kind.value} {name!r}; there are: {known}")
-    return {
-        path.relative_to(folder).as_posix(): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()
-    }
+    files = (path for path in sorted(folder.rglob("*")) if path.is_file())
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
 
 
 def builtin_model(kind: AssetKind, name: str) -> bytes:
-    return (
-        Path(str(resources.files("graspd.service"))) / "builtin" / "models" / f"{kind.value}-{name}.glb"
-    ).read_bytes()
+    """Load the binary glTF of a built-in hand or object, made by `python -m graspd.worker.stages.models`."""
+    return (_builtin_folder("model") / f"{kind.value}-{name}.glb").read_bytes()
 
 
 def builtin_names(kind: AssetKind) -> tuple[str, ...]:
-    root = Path(str(resources.files("graspd.service"))) / "builtin" / f"{kind.value}s"
-    return tuple(sorted(path.parent.name for path in root.glob("*/asset.json")))
+    return tuple(sorted(path.parent.name for path in _builtin_folder(kind).glob("*/asset.json")))
 
 
 def describe(kind: AssetKind, name: str, files: Mapping[str, bytes], *, created: str, builtin: bool = False) -> Asset:

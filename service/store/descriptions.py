@@ -162,13 +162,7 @@ def described(facts: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def corrected(said: Mapping[str, Any], facts: HandFacts, corrections: HandCorrections) -> dict[str, Any]:
-    """Return an `asset.json` with all given, found and corrected values, so that no guess remains.
-
-    A joint whose closing direction changes gets a new guess of its pre-shape unless one is given.
-
-    Raises:
-        InputError: unknown link or joint, a value outside its limits, or an invalid direction.
-    """
+    """Return an `asset.json` with all given, found and corrected values; InputError for a value out of its limits."""
     _check(facts, corrections)
     found = described(facts.model_dump())
     turned = {name for name, way in corrections.closing.items() if way != facts.closing[name]}

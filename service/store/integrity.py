@@ -126,13 +126,7 @@ def _of_block(data: bytes) -> bytes:
 
 
 def check_file(path: Path) -> None:
-    """Check a shard in a folder against the manifest or checksum list there, if any.
-
-    A verified file is not read again by this process while size and modification time do not change.
-
-    Raises:
-        DamagedShard: it does not match the checksum.
-    """
+    """Check a shard in a folder, once while it is unchanged, against the manifest or checksum list there, if any."""
     if _known.get(path) != _file_stamp(path):
         check_content(path, _expected(path))
 
@@ -253,16 +247,7 @@ def seal_archive(file: BufferedRandom) -> None:
 
 
 def is_sealed(key: str, chunks: Iterable[bytes], size: int) -> bool:
-    """Check whether an object has a valid seal; False if graspd 0.2 wrote it without one.
-
-    Args:
-        key: its name, whose suffix gives the format.
-        chunks: its bytes.
-        size: number of bytes.
-
-    Raises:
-        DamagedError: its bytes do not match the seal.
-    """
+    """Check for a valid seal; False if graspd 0.2 wrote the object without one; DamagedError if it does not match."""
     is_zip = key.endswith((".zip", ".npz"))
     before, start = (_GLB, _GLB_AT) if key.endswith(".glb") else (_JSON, 0)
     at = size - len(_ZEROS) if is_zip else start + len(before)

@@ -25,50 +25,26 @@ UNPACKED_LIMIT_BYTES: Final = 2 * 2**30
 
 
 def publish_asset(
-    store: Store,
-    kind: AssetKind,
-    name: str,
-    files: Mapping[str, bytes],
-    *,
-    builtin: bool = False,
-    created: str = "",
-    owner: str = "",
+    store: Store, kind: AssetKind, name: str, files: Mapping[str, bytes], said: Mapping[str, object] | None = None
 ) -> Asset:
-    """Publish a hand or object: the archive first, its record last. Idempotent.
-
-    Args:
-        files: `asset.json` (names the main file) and all required files.
-        owner: id of the uploading API key.
-
-    Raises:
-        InputError: `asset.json` is missing or invalid.
-        ConflictError: the same content exists under another name.
-    """
-    asset = store_files(store, kind, name, files, builtin=builtin, created=created, said={"owner": owner})
-    return record_asset(store, asset)
+    """Publish a hand or object: the archive first, its record last; see `store_files`, `record_asset`. Idempotent."""
+    return record_asset(store, store_files(store, kind, name, files, said))
 
 
 def store_files(
-    store: Store,
-    kind: AssetKind,
-    name: str,
-    files: Mapping[str, bytes],
-    *,
-    builtin: bool = False,
-    created: str = "",
-    said: Mapping[str, object] | None = None,
+    store: Store, kind: AssetKind, name: str, files: Mapping[str, bytes], said: Mapping[str, object] | None = None
 ) -> Asset:
-    """Store the archive, the first half of `publish_asset`; the asset does not exist for readers yet.
+    """Store the archive of an asset, which does not exist for readers yet.
 
     Args:
-        said: further fields of the record: `owner`, `project`, `shared`, `self_test`. Private files contain their
-            project's mark (`service.model.projects.marks_of`).
+        files: `asset.json` (names the main file) and all required files; private ones contain their project's mark
+            (`service.model.projects.marks_of`).
+        said: further fields of the record, such as `owner`, `project`, `shared`, `self_test`.
 
     Raises:
         InputError: `asset.json` is missing or invalid.
     """
-    asset = describe(kind, name, files, created=created or timestamp(), builtin=builtin)
-    asset = asset.model_copy(update=dict(said or {}))
+    asset = describe(kind, name, files, created=timestamp()).model_copy(update=dict(said or {}))
     with tempfile.TemporaryFile() as archive:
         pack_into(files, archive)
         seal_archive(archive)
@@ -88,10 +64,7 @@ def _is_damaged(store: Store, key: str) -> bool:
 
 
 def record_asset(store: Store, asset: Asset, put: Put | None = None) -> Asset:
-    """Write the record, the second half of `publish_asset`; from now on the asset exists.
-
-    Args:
-        put: function that writes the record; None: write to this store.
+    """Write the record, with `put` if given; from now on the asset exists.
 
     Raises:
         ConflictError: the same content exists under another name, or is being removed.
@@ -120,18 +93,16 @@ def publish_builtins(store: Store) -> list[Asset]:
         for name in builtin_names(kind):
             asset, files = builtin_asset(kind, name)
             try:
-                published.append(publish_asset(store, kind, name, files, builtin=True, created=asset.created))
+                published.append(publish_asset(store, kind, name, files, {"builtin": True, "created": asset.created}))
             except DamagedError as error:
                 log.warning("the built-in %s %s cannot be used: %s", kind.value, name, error)
-            _put_model(store, names.asset_model(kind, asset.digest), builtin_model(kind, name))
+            key = names.asset_model(kind, asset.digest)
+            model = sealed(key, builtin_model(kind, name))
+            # The model depends on program and asset: one of an older version is replaced.
+            if not store.put(key, model) and store.get(key) != model:
+                store.delete(key)
+                store.put(key, model)
     return published
-
-
-def _put_model(store: Store, key: str, model: bytes) -> None:
-    model = sealed(key, model)
-    if not store.put(key, model) and store.get(key) != model:
-        store.delete(key)
-        store.put(key, model)
 
 
 def stored_assets(store: Store) -> list[tuple[AssetKind, str]]:

@@ -191,12 +191,9 @@ def summarise(
 
 
 def publish_shard(store: Store, manifest: ShardManifest, data: bytes) -> bool:
-    """Store a shard, manifest last. Returns False if it exists, which is success too.
-
-    If two workers raced, or one died between the two writes, the file may be of another run. The manifest then
-    describes the bytes in the store.
-    """
+    """Store a shard, manifest last. False if it exists, which is success too."""
     if not store.put(manifest.key, data):
+        # Two workers raced, or one died between the two writes: the manifest describes the bytes in the store.
         manifest = described_again(manifest.model_dump(mode="json"), store.get(manifest.key))
     return put_record(store, names.shard_manifest(manifest.stage, manifest.shard_id), manifest)
 

@@ -109,13 +109,7 @@ def reference_of(text: bytes) -> str:
 
 
 def beside(name: str, reference: str, there: Callable[[str], bool]) -> str | None:
-    """Resolve a mesh's reference, by path or name in its folder; None if not a picture or library there.
-
-    Args:
-        name: name of the mesh or library among a hand's files.
-        reference: name of the other file as written; of an absolute path only the last part counts.
-        there: checks whether the hand has a file of that name.
-    """
+    """Resolve a mesh's reference, by path or name in its folder; None if not a picture or library that is `there`."""
     folder = posixpath.dirname(name)
     said = reference.replace("\\", "/").partition("://")[2] or reference.replace("\\", "/")
     if not said.lower().endswith(_TAKEN) or "\0" in said:

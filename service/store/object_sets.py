@@ -37,20 +37,7 @@ def files_of_set(path: Path) -> Objects | None:
 
 
 def object_set(files: Mapping[str, bytes]) -> dict[str, dict[str, bytes]]:
-    """Group files by the objects of a set.
-
-    In the layout of EGAD each mesh of one folder is an object. In the layout of YCB each object has a folder, perhaps
-    with inner folders of variants: the best mesh is taken.
-
-    Args:
-        files: relative names and contents.
-
-    Returns:
-        Names of objects, sorted, each with its mesh and an `asset.json` beside it, if any.
-
-    Raises:
-        InputError: no mesh.
-    """
+    """Group files by the objects of a set; return sorted names, each with its mesh and its `asset.json`, if any."""
     meshes = sorted(name for name in files if PurePosixPath(name).suffix.lower() in SUFFIXES)
     if not meshes:
         raise InputError(f"no mesh among {len(files)} files; a set holds {', '.join(SUFFIXES)}")
@@ -60,6 +47,7 @@ def object_set(files: Mapping[str, bytes]) -> dict[str, dict[str, bytes]]:
     top = _common(owners)
     chosen: dict[str, str] = {}
     for owner, names in owners.items():
+        # EGAD: each mesh of one folder is an object; YCB: each object has a folder, perhaps with variants of its mesh.
         is_object = len(owner) > len(top) and _variants(names)
         for name in [min(names, key=_rank)] if is_object else names:
             parts = owner[len(top) :] if is_object else (*owner[len(top) :], PurePosixPath(name).stem)

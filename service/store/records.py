@@ -174,10 +174,7 @@ STABILITY: Final = "stability"
 
 
 def charts_of(place: SceneSpec) -> str:
-    """Return the kind of charts for a scene: one per kind of scene, and one per scene file.
-
-    A scene file counts by its supports and the target's pose, not by neighbours, faces and `touch`.
-    """
+    """Return the kind of charts for a scene; a scene file counts by its supports and the target's pose."""
     if place.kind == "free":
         return CHARTS
     if place.kind != "file":
@@ -195,11 +192,7 @@ def scene_kinds(store: Store) -> list[str]:
 
 
 def publish(store: Store, kind: str, record: Mapping[str, Any]) -> str:
-    """Append a record to those of its kind; return its key, which is its `created`, numbered if taken.
-
-    Raises:
-        ValueError: it contains a number that JSON lacks.
-    """
+    """Append a record to those of its kind; return its key, which is its `created`, numbered if taken."""
     stem = f"{kind}/{re.sub(r'[^0-9A-Za-z]', '', str(record['created']))}"
     keys = (f"{stem}{number:03}.json" if number else f"{stem}.json" for number in itertools.count())
     data = json.dumps(record, allow_nan=False).encode()

@@ -114,15 +114,7 @@ class Shard:
 def read_shard(
     source: bytes | Path, *, kind: ShardKind | None = None, without: tuple[str, ...] = (), name: str = ""
 ) -> Shard:
-    """Read a shard completely, except the datasets in `without`.
-
-    Args:
-        name: name in error messages for a shard given as bytes.
-
-    Raises:
-        InputError: not HDF5, not a graspd shard, or not of the expected kind.
-        DamagedShard: it does not match its checksums, or is truncated.
-    """
+    """Read a shard, except the datasets in `without`; InputError for another kind, DamagedShard for damage."""
     name = name or ("shard" if isinstance(source, bytes) else str(source))
     with open_shard(source, name=name) as file:
         found = kind_of(file, name)
@@ -168,10 +160,7 @@ def open_shard(source: bytes | Path | io.RawIOBase, *, name: str = "") -> Iterat
 
 
 def _check_contents(file: h5py.File, name: str) -> None:
-    """Raise InputError if a file has external data or claims more data than it can contain.
-
-    HDF5 follows links into other files, reads raw bytes of any file as values, and invents values never written.
-    """
+    """Raise InputError if a file has external data or claims more than it can contain: HDF5 follows any link."""
     claimed = held = 0
     seen, waiting = {h5py.h5o.get_info(file["/"].id).addr}, [(file, "")]
     while waiting:

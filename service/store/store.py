@@ -58,11 +58,7 @@ class Store:
         self._root = Path(backend.prefix) if isinstance(backend, LocalStore) and backend.prefix is not None else None
 
     def put(self, key: str, data: bytes) -> bool:
-        """Write an object atomically if the name is free.
-
-        Returns:
-            True if written, False if the name exists (for content-addressed names: with the same bytes).
-        """
+        """Write an object atomically; False if the name exists (for content-addressed names: with the same bytes)."""
         return self.put_file(key, io.BytesIO(data))
 
     def put_file(self, key: str, file: IO[bytes]) -> bool:
