@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from pathlib import Path
 from typing import Any, Literal
 
 import pytest
@@ -27,12 +28,9 @@ def test_a_quoted_line_break_does_not_make_a_second_line(kind: type[GraspdError]
     assert str(kind("asset.json: a\n  b: unknown key")) == "asset.json: a b: unknown key"
 
 
-@pytest.mark.parametrize("character", ["\r", "\x1b", "\x85", "\u2028", "\x00"])
-def test_separators_and_escapes_of_a_terminal_are_quoted(character: str) -> None:
-    assert str(GraspdError(f"a{character}b")).isprintable()
-
-
-def test_a_message_in_another_script_stays_as_it_is() -> None:
+def test_controls_of_a_terminal_are_quoted_and_other_scripts_are_not() -> None:
+    for character in "\r\x1b\x85\u2028\x00":
+        assert str(GraspdError(f"a{character}b")).isprintable()
     assert str(GraspdError("no hand 'Hände 手'")) == "no hand 'Hände 手'"
 
 
@@ -45,7 +43,6 @@ class Kind(BaseModel):
     name: Name = "mug"
     fidelity: Literal["draft", "standard", "fine"] = "draft"
     text: str = Field("", max_length=3)
-    names: tuple[str, ...] = Field((), max_length=1)
 
     @field_validator("text")
     @classmethod
@@ -59,11 +56,8 @@ class Kind(BaseModel):
     ("given", "line"),
     [
         ({"n": 0}, "n: must be at least 1"),
-        ({"n": 10}, "n: must be at most 9"),
         ({"n": "many"}, "n: must be a whole number"),
-        ({"n": 1.5}, "n: must be a whole number"),
         ({"share": 0}, "share: must be more than 0"),
-        ({"share": 1}, "share: must be less than 1"),
         ({"share": "half"}, "share: must be a number"),
         ({"on": "perhaps"}, "on: must be true or false"),
         (
@@ -71,10 +65,8 @@ class Kind(BaseModel):
             "name: must begin with a letter or digit and hold at most 64 letters, digits, dots, dashes and underscores",
         ),
         ({"fidelity": "strandard"}, "fidelity: must be one of draft, standard, fine; did you mean standard?"),
-        ({"fidelity": 3}, "fidelity: must be one of draft, standard, fine"),
         ({"text": "long"}, "text: must have at most 3 characters"),
         ({"text": "x"}, "text: x is taken"),
-        ({"names": ["a", "b"]}, "names: must have at most 1 item"),
         ({"knob": 1}, "knob: is not known"),
     ],
 )
@@ -86,8 +78,6 @@ def test_the_first_mistake_is_one_line(given: dict[str, Any], line: str) -> None
 
 
 SECRET = "s3cr3t"
-
-
 QUOTING = [
     f"redis://:{SECRET}@host:6379/0 is away",
     f"redis://:a/b#{SECRET}@host:6379",
@@ -124,19 +114,13 @@ def test_a_redis_url_that_cannot_be_used_is_not_told(url: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "url", [f"postgresql+psycopg://me:x@host:{SECRET}/db", f"mysql://me:{SECRET}@host/db", f"{SECRET}", f"{SECRET}://x"]
+    "url", [f"postgresql+psycopg://me:x@host:{SECRET}/db", f"mysql://me:{SECRET}@host/db", f"{SECRET}"]
 )
-def test_an_index_url_that_is_refused_is_told_without_password(url: str) -> None:
+def test_a_url_that_is_refused_is_told_without_password(url: str) -> None:
     for opened in (Index, look):
-        with pytest.raises(InputError, match=r"\(GRASPD_INDEX_URL\) cannot be used"):
+        with pytest.raises(InputError, match=r"\(GRASPD_INDEX_URL\) cannot be used") as refused:
             opened(url)
-    if not url.startswith(f"{SECRET}:"):
-        with pytest.raises(InputError) as refused:
-            Index(url)
         assert SECRET not in str(refused.value)
-
-
-def test_a_store_url_that_is_refused_is_told_without_password() -> None:
     with pytest.raises(InputError) as refused:
         open_store(f"s4://me:{SECRET}@host")
     assert SECRET not in str(refused.value)
@@ -149,22 +133,17 @@ def test_settings_show_no_secret(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("GRASPD_WEBHOOK_SECRET", SECRET)
     with pytest.raises(ValidationError) as refused:
         Settings()
-    assert SECRET not in f"{refused.value!r} {refused.value}"
-
-
-def test_what_other_machines_join_with_is_not_shown(tmp_path: object) -> None:
-    assert SECRET not in repr(ListenAddress(tmp_path, "host", "127.0.0.1", 1, SECRET))  # type: ignore[arg-type]
+    assert SECRET not in f"{refused.value!r} {refused.value} {ListenAddress(Path(), 'host', '127.0.0.1', 1, SECRET)!r}"
 
 
 LONG = "mujoco-Office_Depot_Canon_CL211XL_Remanufactured_Ink_Cartridge_TriColor"
 
 
-def test_the_file_of_a_thing_with_a_long_name_is_refused() -> None:
+def test_a_long_name_of_an_upload_is_refused_and_one_of_others_is_cut_and_told(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     with pytest.raises(InputError, match=f"the name {LONG} has 71 characters, at most 64 are taken; give a shorter"):
         name_of_upload(f"{LONG}.stl")
-
-
-def test_a_long_name_of_others_is_cut_told_and_stays_its_own(caplog: pytest.LogCaptureFixture) -> None:
     fitted.cache_clear()
     first, second = plain_name(LONG), plain_name(f"{LONG}2")
     assert first != second and len(first) == len(second) == 64
@@ -173,7 +152,4 @@ def test_a_long_name_of_others_is_cut_told_and_stays_its_own(caplog: pytest.LogC
         f"the name {name} has more than 64 characters; it becomes {short}"
         for name, short in ((LONG, first), (f"{LONG}2", second))
     ]
-
-
-def test_a_short_name_stays_as_it_is() -> None:
     assert plain_name("sem-Bottle a86d") == "sem-Bottle-a86d" and name_of_upload("mug.stl") == "mug"

@@ -6,7 +6,7 @@ import pytest
 from pydantic import ValidationError
 
 from graspd.service.model.digests import job_id, shard_id
-from graspd.service.model.domain import BATCH_SIZE, RECHECKS, JobOptions, JobRequest
+from graspd.service.model.domain import BATCH_SIZE, RECHECKS, JobRequest
 from graspd.service.model.metrics import AXIS_MEANINGS, MIN_DISTANCE_M, ROBUST_MODELS, Axis, axis_word
 from graspd.service.model.states import Stage
 from tests.fakes import request
@@ -25,16 +25,14 @@ def test_other_options_make_another_shard_of_grasps_alone() -> None:
     assert shard(Stage.SCENE, plain) == shard(Stage.SCENE, changed)
 
 
-def test_the_default_distance_stays_out_of_documents_and_ids() -> None:
-    assert "min_distance" not in JobOptions(min_distance=MIN_DISTANCE_M).model_dump(mode="json")
-    assert request().model_dump_json() == request(min_distance=MIN_DISTANCE_M).model_dump_json()
-    assert job_id(request(), HAND, OBJECT) == job_id(request(min_distance=MIN_DISTANCE_M), HAND, OBJECT)
-
-
-def test_another_distance_is_another_job_and_another_shard() -> None:
-    far = request(min_distance=0.02)
-    assert JobRequest.model_validate_json(far.model_dump_json()).min_distance == 0.02
-    assert job_id(far, HAND, OBJECT) != job_id(request(), HAND, OBJECT) and shard(BASE, far) != shard(BASE, request())
+def test_a_default_stays_out_of_documents_and_ids_and_another_value_moves_the_grasps() -> None:
+    plain, document = request(), request().model_dump(mode="json")
+    assert {"min_distance", "robust", "robust_models"}.isdisjoint(document)
+    assert document == request(min_distance=MIN_DISTANCE_M).model_dump(mode="json")
+    others = [request(min_distance=0.02), request(robust=0.5), request(robust_models=8)]
+    assert len({job_id(one, HAND, OBJECT) for one in (plain, *others)}) == 4
+    assert shard(BASE, others[0]) != shard(BASE, plain)
+    assert [JobRequest.model_validate_json(one.model_dump_json()) for one in others] == others
 
 
 def test_candidate_grasps_do_not_depend_on_the_distance() -> None:
@@ -46,14 +44,6 @@ def test_a_wanted_share_is_of_eight_models_unless_told() -> None:
     assert (request().models, request(robust=0.9).models) == (0, ROBUST_MODELS)
     assert request(robust=0.9, scene="table").models == ROBUST_MODELS, "in scenes as around free objects"
     assert request(robust=0.9, robust_models=16).models == request(robust_models=16).models == 16
-
-
-def test_jobs_without_a_share_keep_their_documents_and_ids() -> None:
-    assert {"robust", "robust_models"}.isdisjoint(request().model_dump(mode="json"))
-    ids = {job_id(one, HAND, OBJECT) for one in (request(), request(robust=0.5), request(robust_models=8))}
-    assert len(ids) == 3
-    again = JobRequest.model_validate(request(robust=0.9).model_dump(mode="json"))
-    assert again == request(robust=0.9)
 
 
 @pytest.mark.parametrize(
@@ -95,18 +85,14 @@ def test_audits_of_the_default_take_a_twentieth_of_a_jobs_time(seed: int, batche
     assert price <= 0.05
 
 
-def test_half_of_many_short_jobs_are_audited() -> None:
+def test_half_of_many_short_jobs_are_audited_and_a_long_one_has_all() -> None:
     first = [request(seed=seed).rechecks_of(0) for seed in range(200)]
     assert 70 < sum(first) < 130
     assert {first[k] + request(seed=k).rechecks_of(1) for k in range(200)} == {1}
-
-
-def test_a_long_job_has_all_of_them() -> None:
     for seed in range(6):
         assert sum(request(seed=seed).rechecks_of(batch) for batch in range(100)) == RECHECKS
 
 
 def test_any_other_number_is_of_the_first_grasps() -> None:
     assert [request(rechecks=40).rechecks_of(batch) for batch in range(3)] == [32, 8, 0]
-    assert [request(rechecks=3).rechecks_of(batch) for batch in range(2)] == [3, 0]
     assert request(rechecks=40, validation="dexgraspbench").rechecks_of(0) == 0

@@ -109,11 +109,7 @@ def test_fingertips_may_touch_unless_it_is_said_otherwise() -> None:
     ("changes", "words"),
     [
         ({"scene": "tabel"}, "'free', 'table', 'bin' or 'shelf'"),  # codespell:ignore tabel
-        ({"scene": 5}, "'free', 'table', 'bin' or 'shelf'"),
         ({"scene": {"supports": []}}, "at least 1"),
-        ({"scene": {"supports": [PLANE] * 33}}, "at most 32"),
-        ({"scene": {"supports": [{"kind": "half_space", "normal": [0, 0, 0]}]}}, "normal that is not zero"),
-        ({"scene": {"supports": [{"kind": "box", "size": [0.1, 0.1, 1e9]}]}}, "less than or equal to 20"),
         ({"scene": {"supports": [{"kind": "half_space", "offset": float("nan")}]}}, "finite number"),
         ({"scene": {"supports": [PLANE], "target": [0, 0, 0, 1, 1, 0, 0]}}, "unit length"),
         ({"scene": {"supports": [PLANE], "file": "/etc/passwd"}}, "Extra inputs"),
@@ -121,7 +117,6 @@ def test_fingertips_may_touch_unless_it_is_said_otherwise() -> None:
         ({"faces": "all"}, "lies on no face"),
         ({"touch": 1}, "nothing to touch"),
         ({"scene": "table", "touch": -1.5}, "greater than or equal to -1"),
-        ({"scene": "table", "touch": 2.5}, "less than or equal to 2"),
         ({"scene": "table", "touch": float("nan")}, "finite number"),
         ({"scene": "table", "method": "dfc"}, "plans around free objects only"),
         ({"scene": "table", "method": "learned"}, "needs the option network"),
