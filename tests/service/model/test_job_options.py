@@ -5,18 +5,14 @@ from __future__ import annotations
 import pytest
 from pydantic import ValidationError
 
-from graspd.service.model.digests import job_id, shard_id
+from graspd.service.model.digests import job_id
 from graspd.service.model.domain import BATCH_SIZE, RECHECKS, JobRequest
 from graspd.service.model.metrics import AXIS_MEANINGS, MIN_DISTANCE_M, ROBUST_MODELS, Axis, axis_word
 from graspd.service.model.states import Stage
 from tests.fakes import request
+from tests.service.model.jobs import HAND, OBJECT, shard
 
-HAND, OBJECT = "a" * 32, "b" * 32
 BASE = Stage.SYNTHESIZE
-
-
-def shard(stage: Stage, wanted: JobRequest) -> str:
-    return shard_id(stage, request=wanted, hand_digest=HAND, object_digest=OBJECT, batch=0, count=32, revision=1)
 
 
 def test_other_options_make_another_shard_of_grasps_alone() -> None:

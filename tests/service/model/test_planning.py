@@ -9,9 +9,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from graspd.service.model.clock import timestamp
-from graspd.service.model.digests import job_id
-from graspd.service.model.domain import JobRequest
 from graspd.service.model.planning import (
     MAX_BACKOFF_S,
     OUTCOMES,
@@ -27,21 +24,13 @@ from graspd.service.model.planning import (
     shortfall,
     totals,
 )
-from graspd.service.model.records import JobRecord
 from graspd.service.model.states import Priority, Stage, State
 from tests.fakes import request
+from tests.service.model.jobs import record
 
-HAND, OBJECT = "a" * 32, "b" * 32
 CHAIN = (Stage.SYNTHESIZE, Stage.SCENE, Stage.RENDER)
 DONE, QUEUED, FAILED, GONE = State.SUCCEEDED, State.QUEUED, State.FAILED, State.CANCELLED
 OVER = {"last_attempt": 3, "exhausted": True}
-
-
-def record(wanted: JobRequest) -> JobRecord:
-    digests = {"hand_digest": HAND, "object_digest": OBJECT}
-    return JobRecord(
-        id=job_id(wanted, HAND, OBJECT), request=wanted, priority=Priority.BULK, created=timestamp(), **digests
-    )
 
 
 def test_a_job_is_cut_into_batches_of_32_and_only_what_was_asked_for_stage_by_stage() -> None:

@@ -7,19 +7,18 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from graspd.service.model.clock import timestamp
-from graspd.service.model.digests import digest_json, job_id, shard_id
+from graspd.service.model.digests import digest_json, shard_id
 from graspd.service.model.domain import SCENES, JobOptions, JobRequest
 from graspd.service.model.planning import message_of, plan
-from graspd.service.model.records import JobRecord, Member
+from graspd.service.model.records import Member
 from graspd.service.model.renamed import original
-from graspd.service.model.states import Priority, Stage
+from graspd.service.model.states import Stage
 from graspd.service.model.version import STAGE_REVISIONS
 from graspd.service.pipeline.datasets.spec import describe
 from graspd.worker.planners.registry import PLANNERS, method
 from tests.fakes import request
+from tests.service.model.jobs import DIGESTS, HAND, OBJECT, record
 
-HAND, OBJECT = "a" * 32, "b" * 32
 #: A job as it was written before jobs had scenes.
 PLAIN: dict[str, Any] = (
     {"grasps": 32, "method": "fast_graspd", "fidelity": "standard", "seed": 0, "scenes": 0, "views": 0}
@@ -27,13 +26,6 @@ PLAIN: dict[str, Any] = (
     | {"validation": "standard", "rechecks": 8, "robustness": 0, "options": {}, "target": ""}
 )
 PLANE = {"kind": "half_space"}
-
-
-def record(wanted: JobRequest) -> JobRecord:
-    digests = {"hand_digest": HAND, "object_digest": OBJECT}
-    return JobRecord(
-        id=job_id(wanted, HAND, OBJECT), request=wanted, priority=Priority.BULK, created=timestamp(), **digests
-    )
 
 
 def test_a_job_without_a_scene_keeps_its_id_and_its_record() -> None:
@@ -58,8 +50,8 @@ def test_a_dataset_without_a_scene_keeps_its_digest() -> None:
 def test_scenes_after_the_grasps_have_the_address_that_they_had() -> None:
     common = {"hand": HAND, "object": OBJECT, "names": ["gripper", "ball"], "batch": 1, "count": 32, "seed": 0}
     said = {**common, "stage": "scene", "revision": 2, "inputs": ["x"], "scenes": 3}
-    of = {"hand_digest": HAND, "object_digest": OBJECT, "batch": 1, "count": 32, "revision": 2, "inputs": ("x",)}
-    assert digest_json(said) == shard_id(Stage.SCENE, request=request(scenes=3), **of)
+    of = {"batch": 1, "count": 32, "revision": 2, "inputs": ("x",)}
+    assert digest_json(said) == shard_id(Stage.SCENE, request=request(scenes=3), **DIGESTS, **of)
 
 
 def test_a_job_in_a_scene_makes_its_scenes_first() -> None:
@@ -88,20 +80,15 @@ def test_where_no_number_of_scenes_is_named_there_are_a_few() -> None:
     assert request().scenes == 0
 
 
-def test_a_document_is_a_scene_and_comes_back_as_it_was() -> None:
-    wanted = request(
-        scene={"supports": [PLANE, {"kind": "box", "size": [0.1, 0.2, 0.3]}], "target": [0, 0, 1, 1, 0, 0, 0]}
-    )
-    assert (wanted.place.kind, len(wanted.place.supports), wanted.in_scene) == ("file", 2, True)
-    assert JobRequest.model_validate_json(wanted.model_dump_json()) == wanted
-
-
-def test_fingertips_may_touch_unless_it_is_said_otherwise() -> None:
+def test_a_document_comes_back_and_fingertips_may_touch_unless_it_says_otherwise() -> None:
     assert "touch" not in request(scene="table").model_dump()
     assert record(request(scene="table", touch=0)).id == record(request(scene="table")).id
     assert request(scene="table").place.touch == 0
-    document = {"supports": [PLANE], "touch": -0.5}
-    assert request(scene=document).place.touch == -0.5
+    box = {"kind": "box", "size": [0.1, 0.2, 0.3]}
+    document = {"supports": [PLANE, box], "touch": -0.5, "target": [0, 0, 1, 1, 0, 0, 0]}
+    wanted = request(scene=document)
+    assert (wanted.place.kind, len(wanted.place.supports), wanted.place.touch) == ("file", 2, -0.5)
+    assert JobRequest.model_validate_json(wanted.model_dump_json()) == wanted
     assert request(scene=document, touch=2).place.touch == 2
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import os
 import threading
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,9 +12,8 @@ import numpy as np
 import pytest
 
 from graspd.service.model.errors import DamagedShard, InputError, NotFoundError
-from graspd.service.model.names import dataset_snapshot, shard_file
+from graspd.service.model.names import dataset_snapshot
 from graspd.service.model.records import JobRecord, Snapshot
-from graspd.service.model.states import Stage
 from graspd.service.model.transforms import compose, pose_from_matrix
 from graspd.service.pipeline.backends import Services
 from graspd.service.readers import Grasps, Pictures, ShardCache, Shards, open_shards, prefetched
@@ -138,17 +136,14 @@ def test_a_wrong_value_in_a_file_is_refused_and_not_handed_out(folder: Path) -> 
         Grasps(open_shards(folder))[0]
 
 
-def test_a_full_cache_drops_what_was_unused_longest(services: Services, tmp_path: Path) -> None:
-    blobs = {shard_file(Stage.SYNTHESIZE, f"{number:032x}"): bytes([number]) * 1000 for number in range(3)}
-    for key, blob in blobs.items():
-        services.store.put(key, blob)
-    cache = ShardCache(tmp_path / "small", limit_bytes=2500)
-    sums = [hashlib.sha256(blob).hexdigest() for blob in blobs.values()]
-    for age, (key, digest) in enumerate(zip(blobs, sums, strict=True)):
-        path = cache.fetch(services.store, key, digest)
-        if age < 2:
-            os.utime(path, (1000 - 100 * age, 1000 - 100 * age))
-    assert {path.stem for path in cache.folder.iterdir()} == {sums[0], sums[2]}
+def test_a_full_cache_drops_what_was_unused_longest(services: Services, shards: Shards, tmp_path: Path) -> None:
+    sizes = {shard.sha256: len(services.store.get(shard.key)) for shard in shards}
+    cache = ShardCache(tmp_path / "small", limit_bytes=sum(sizes.values()) // 2)
+    for shard in shards:
+        cache.fetch(services.store, shard.key, shard.sha256)
+    held = {path.stem for path in cache.folder.iterdir()}
+    assert shards.files[-1].sha256 in held and shards.files[0].sha256 not in held
+    assert sum(sizes[name] for name in held) <= cache.limit_bytes
 
 
 def _put_snapshot(services: Services, dataset: str, shards: Shards, *, created: str) -> None:
@@ -166,13 +161,8 @@ def test_what_was_read_once_from_s3_needs_the_server_no_more(s3_url: str, s3_ser
     index = empty_index(f"sqlite:///{tmp_path / 'index.sqlite'}")
     remote = Services(Settings(data_dir=tmp_path), open_store(s3_url), index, MemoryQueue())
     job = a_job(remote)
-    small = open_shards(s3_url, job=job.id, cache=tmp_path / "small", cache_bytes=60_000)
-    written = [remote.store.get(file.key) for file in small]
-    assert sum(1 for _ in Grasps(small, valid=False)) == GRASPS
-    held = sum(path.stat().st_size for path in (tmp_path / "small").iterdir())
-    assert held <= max(60_000, *map(len, written)) < sum(map(len, written))
     shards = open_shards(s3_url, job=job.id, cache=tmp_path / "cache")
-    assert [shards.path(file).read_bytes() for file in shards] == written
+    assert [shards.path(file).read_bytes() for file in shards] == [remote.store.get(file.key) for file in shards]
     s3_server.kill()
     try:
         assert len(Grasps(shards, valid=False)) == GRASPS and len(Pictures(shards)) == 8

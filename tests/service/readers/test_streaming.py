@@ -214,12 +214,6 @@ def test_ranges_with_little_between_them_are_one() -> None:
     assert ranges.joined([(0, 100), (20, 10)]) == [(0, 100)]
 
 
-@pytest.mark.s3
-def test_pictures_of_s3_are_those_of_the_files(folder: Path, tmp_path: Path, s3_url: str) -> None:
-    remote = Pictures(streamed(folder, open_store(s3_url), tmp_path))
-    same(list(prefetched(remote, workers=4)), Pictures(open_shards(folder)))
-
-
 @pytest.fixture
 def views(folder: Path) -> Path:
     return folder / "views.h5"

@@ -14,7 +14,7 @@ import pytest
 
 from graspd.service.model.errors import InputError, NotFoundError, StoreUnavailable
 from graspd.service.store.store import Entry, Store, open_store
-from tests.servers import MissingServer, S3Server, free_ports
+from tests.servers import S3Server, free_ports
 
 
 @pytest.fixture(params=["memory", "file", pytest.param("s3", marks=pytest.mark.s3)])
@@ -175,20 +175,3 @@ def test_a_server_that_is_away_is_unavailable_for_every_call(s3_url: str, monkey
             call()
         assert not isinstance(found.value, NotFoundError)
         assert "\n" not in str(found.value)
-
-
-@pytest.mark.s3
-def test_what_was_written_is_there_after_the_server_was_killed(monkeypatch: pytest.MonkeyPatch) -> None:
-    try:
-        own = S3Server()
-    except MissingServer as missing:
-        pytest.skip(str(missing))
-    with own as server:
-        for name, value in server.environment.items():
-            monkeypatch.setenv(name, value)
-        store = open_store(server.url)
-        store.put("jobs/j/job.json", b"first")
-        server.kill()
-        server.start()
-        assert store.put("jobs/j/job.json", b"second") is False
-        assert store.get("jobs/j/job.json") == b"first"
