@@ -153,7 +153,6 @@ def plain_console(*, stderr: bool = False) -> Console:
 
 
 def plain_table(*headings: str, whole: Collection[str] = ()) -> Table:
-    """Return a table that truncates nothing: long cells wrap, except in the columns `whole`."""
     from rich.table import Table
 
     table = Table(box=None, header_style="bold", padding=(0, 2, 0, 0))

@@ -44,7 +44,6 @@ def bind(**subjects: Any) -> Iterator[None]:
 
 
 def bound(subject: str) -> str:
-    """Return a bound subject, e.g. `bound("request")`; empty if not bound."""
     return str(_bound.get().get(subject, ""))
 
 
@@ -172,7 +171,6 @@ def span(name: str, *, parent: str = "", **attributes: Any) -> Iterator[dict[str
 
 
 def traceparent() -> str:
-    """Return the W3C trace context of the current span; empty without one."""
     if _tracer is None:
         return ""
     from opentelemetry.trace.propagation.tracecontext import TraceContextTextMapPropagator

@@ -51,7 +51,6 @@ def keep(file: Path, content: bytes, *, limit_bytes: int = _LIMIT_BYTES) -> None
 
 
 def write_whole(file: Path, content: bytes) -> None:
-    """Write a file atomically, and create its folder if necessary. Raises OSError."""
     file.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(dir=file.parent, suffix=".part")
     partial = Path(name)

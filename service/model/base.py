@@ -84,7 +84,6 @@ def _metadata(annotation: object) -> list[object]:
 
 
 def range_words(bounds: Mapping[str, float]) -> str:
-    """Format bounds as a phrase: `must be at least 0 and at most 3`."""
     said = [_WORDS[name].format(**{key: f"{bounds[key]:.12g}"}) for name, key in _BOUNDS.items() if key in bounds]
     return " and ".join([*said[:1], *(words.removeprefix("must be ") for words in said[1:])])
 

@@ -47,7 +47,6 @@ class StreamedFiles(MutableMapping[str, bytes]):
 
 
 def digest_files(kind: AssetKind, files: Mapping[str, bytes]) -> str:
-    """Return the digest of a set of named files, independent of their order."""
     if isinstance(files, StreamedFiles):
         digests = {name: files.digest(name) for name in files}
     else:
@@ -103,7 +102,6 @@ def shard_id(
 
 
 def _verdict_text(request: JobRequest, batches: range) -> dict[str, object]:
-    """Return the inputs that decide the selection of grasps in some batches and their measurements."""
     found: dict[str, object] = {}
     if request.want == "valid":
         found |= {"want": request.want, "budget": request.budget}

@@ -364,7 +364,6 @@ class JobOptions(Model):
         return (*placed, *self._dropped)
 
     def with_beside(self, found: Sequence[NamedNeighbour]) -> Self:
-        """Return a copy with other neighbours, in the order of `beside`."""
         if not found:
             return self
         first = len(self.beside) - len(self.neighbours)
@@ -380,7 +379,6 @@ class JobOptions(Model):
 
     @property
     def in_scene(self) -> bool:
-        """Whether grasps are planned in their scene; otherwise they can be put into scenes afterwards."""
         return self.scene != "free"
 
     @property

@@ -250,6 +250,5 @@ def did_you_mean(word: str, choices: Iterable[str]) -> str:
 
 
 def one_of(word: str, choices: Iterable[str]) -> str:
-    """Return `A, B, C` and the most similar choice."""
     known = list(choices)
     return f"{', '.join(known)}{did_you_mean(word, known)}"

@@ -20,7 +20,6 @@ else:
 
 
 def values(*, optional: bool, default: Any = ...) -> dict[str, Any]:
-    """Return model fields for the indexed metrics: those that every shard has, or the optional ones."""
     # Manifests list the sorted metrics first.
     chosen = sorted(indexed(), key=lambda metric: metric.indexed < IndexLevel.SORTED)
     return {

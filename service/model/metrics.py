@@ -65,7 +65,6 @@ class GraspMetric:
 
     @property
     def unit(self) -> str:
-        """Unit for display; empty: none."""
         return "" if self.units == "1" else self.units.replace("^2", "²").replace("^3", "³")
 
     @property
@@ -260,7 +259,6 @@ def indexed(least: IndexLevel = IndexLevel.KEPT) -> tuple[GraspMetric, ...]:
     return tuple(metric for metric in GRASP_METRICS if metric.indexed >= least)
 
 
-#: Default number of perturbed models for validation.
 ROBUST_MODELS: Final = 8
 
 MOST_ROBUST_MODELS: Final = 64
@@ -285,7 +283,6 @@ class Axis(IntEnum):
         return self.name.lower()
 
 
-#: Description of each axis for users.
 AXIS_MEANINGS: Final[dict[Axis, str]] = {
     Axis.SHAPES: "collision shapes",
     Axis.JOINTS: "joint drives",
@@ -298,12 +295,10 @@ AXIS_MEANINGS: Final[dict[Axis, str]] = {
     Axis.ORDER: "order of closing",
 }
 
-#: Names of the axes.
 AXIS_WORDS: Final = tuple(axis.word for axis in AXIS_MEANINGS)
 
 
 def axis_word(number: int) -> str | None:
-    """Return the name of an axis from its number in a shard; None: none, or unknown to this version."""
     return Axis(number).word if number in AXIS_MEANINGS else None
 
 

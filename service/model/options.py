@@ -161,16 +161,13 @@ def type_text(annotation: Any) -> str:
     return "Any" if annotation is Any else str(annotation.__name__)
 
 
-def _parts(annotation: Any) -> tuple[Any, ...]:
-    return get_args(annotation) if get_origin(annotation) in (Union, UnionType) else (annotation,)
-
-
 def _kind(annotation: Any) -> Any:
     while get_origin(annotation) is Annotated:
         annotation = get_args(annotation)[0]
     if get_origin(annotation) in (tuple, dict):
         return list[str]
-    parts = [one for one in _parts(annotation) if one is not type(None)]
+    members = get_args(annotation) if get_origin(annotation) in (Union, UnionType) else (annotation,)
+    parts = [one for one in members if one is not type(None)]
     if len(parts) == 1 and parts[0] is not annotation:
         return _kind(parts[0])
     return annotation if annotation in (bool, int, float) or get_origin(annotation) is Literal else str

@@ -11,6 +11,7 @@ import math
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from typing import Final, TypeVar
 
 from graspd.service.model.digests import digest_json, shard_id
@@ -24,7 +25,6 @@ from graspd.service.model.version import OLDEST_TASK_SCHEMA, SCHEMA_OF_NETWORKS,
 #: Largest interactive job: a user waits for it. Larger jobs run in bulk.
 INTERACTIVE_GRASPS: Final = 4 * BATCH_SIZE
 
-#: Longest delay between two attempts of a task [s].
 MAX_BACKOFF_S: Final = 300.0
 
 
@@ -239,8 +239,7 @@ class RoundRobin:
 
 def interleave(lists: Sequence[Sequence[T]]) -> list[T]:
     """Interleave lists: the first items of all, then the second ones, and so on."""
-    longest = max(map(len, lists), default=0)
-    return [some[place] for place in range(longest) for some in lists if place < len(some)]
+    return [item for turn in zip_longest(*lists) for item in turn if item is not None]
 
 
 #: Outcomes of rejected candidates, in the order of the tests, with descriptions.
@@ -282,17 +281,7 @@ def told(outcomes: Mapping[str, int]) -> str:
 def shortfall(
     found: int, wanted: int, counted: str, candidates: int, budget: float, outcomes: Mapping[str, int], limit: str = ""
 ) -> str | None:
-    """Explain in a sentence why fewer grasps were found than wanted; None if all were found.
-
-    Args:
-        found: number of grasps that count.
-        wanted: number of grasps requested.
-        counted: which grasps count: valid or feasible.
-        candidates: number of planned candidates.
-        budget: candidates allowed for each grasp wanted: candidates and repeated attempts.
-        outcomes: rejected candidates by `OUTCOMES`, and the repeated attempts.
-        limit: the hand's lifting limit, if that ended the search instead of the budget.
-    """
+    """Explain why fewer grasps were found than wanted; None if all were. `limit`: the hand's, not the budget's."""
     if found >= wanted:
         return None
     lost, tries = told(outcomes), candidates + outcomes.get("repeated", 0)

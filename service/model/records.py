@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from itertools import groupby
+from operator import itemgetter
 from typing import Annotated, Any, Final, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
@@ -241,7 +243,6 @@ class ObjectSet(Record):
 
 
 def request_of(options: JobOptions, hand: str, obj: str, fidelity: str = "") -> JobRequest:
-    """Return the request of one cell, with a fidelity in place of `auto` if given."""
     shared = {name: getattr(options, name) for name in JobOptions.model_fields}
     return JobRequest(hand=hand, object=obj, **shared | ({"fidelity": fidelity, "target": ""} if fidelity else {}))
 
@@ -265,7 +266,6 @@ def job_of(cell: Cell, options: JobOptions, revisions: dict[str, int], owner: st
 def object_set_of(
     name: str, objects: Iterable[str], *, after: str = "", owner: str = "", project: str = ""
 ) -> ObjectSet:
-    """Return the version of a set after the one with digest `after`; the objects' order does not matter."""
     members = tuple(sorted(set(objects)))
     return ObjectSet(
         name=name,
@@ -309,7 +309,5 @@ def tag_id(name: str, project: str) -> str:
 
 
 def by_shard(grasps: Iterable[Grasp]) -> Mapping[str, tuple[int, ...]]:
-    found: dict[str, list[int]] = {}
-    for shard, row in sorted(set(grasps)):
-        found.setdefault(shard, []).append(row)
-    return {shard: tuple(rows) for shard, rows in found.items()}
+    groups = groupby(sorted(set(grasps)), key=itemgetter(0))
+    return {shard: tuple(row for _, row in rows) for shard, rows in groups}

@@ -11,9 +11,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Self
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Discriminator, Field, Tag, ValidationError, model_validator
+from pydantic import AfterValidator, Discriminator, Field, Tag, ValidationError, model_validator
 
-from graspd.service.model.base import Digest, Name, refusal, why
+from graspd.service.model.base import Digest, Model, Name, refusal, why
 from graspd.service.model.errors import InputError, did_you_mean
 
 #: Kinds of scenes; `free`: a floating object, `file`: supports from a file.
@@ -26,11 +26,9 @@ MOST_TOUCH: Final = 2.0
 TOUCH: Final = 0.0
 SCENE_FILES: Final = (".json", ".yaml", ".yml")
 MOST_NEIGHBOURS: Final = 8
-#: Largest number of scenes over which one call distributes its grasps.
 MOST_SCENES: Final = 4096
 #: Largest extent of a scene [m].
 FARTHEST_M: Final = 10.0
-#: Largest scene file [bytes].
 MAX_FILE_BYTES: Final = 64 * 1024
 
 _Metres = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M, allow_inf_nan=False)]
@@ -41,13 +39,7 @@ Vector = tuple[_Metres, _Metres, _Metres]
 Pose = tuple[_Metres, _Metres, _Metres, _Number, _Number, _Number, _Number]
 
 
-class Part(BaseModel):
-    """Base class of the parts of a scene."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class HalfSpace(Part):
+class HalfSpace(Model):
     """A half-space: everything below a plane."""
 
     kind: Literal["half_space"] = "half_space"
@@ -63,7 +55,7 @@ class HalfSpace(Part):
         return self
 
 
-class Box(Part):
+class Box(Model):
     """A box centred at its pose."""
 
     kind: Literal["box"] = "box"
@@ -77,7 +69,7 @@ class Box(Part):
         return self
 
 
-class NeighbourSpec(Part):
+class NeighbourSpec(Model):
     """Another object in the scene."""
 
     object: str = Field(min_length=1, max_length=1024)
@@ -99,7 +91,7 @@ class NeighbourSpec(Part):
 Supports = tuple[Annotated[HalfSpace | Box, Field(discriminator="kind")], ...]
 
 
-class SceneSpec(Part):
+class SceneSpec(Model):
     """Surroundings of the object: supports and neighbours."""
 
     kind: SceneKind = "free"
@@ -223,7 +215,6 @@ def first_mistake(error: ValidationError | TypeError) -> str:
 
 
 def check_quaternion(pose: tuple[float, ...]) -> None:
-    """Raise ValueError if the quaternion of a pose is not a rotation."""
     if abs(math.hypot(*pose[3:]) - 1.0) > 1e-3:
         raise ValueError("the quaternion w x y z of a pose must have unit length")
 
@@ -240,7 +231,6 @@ UPRIGHT: Final = 1 - 1e-6
 
 
 def supports_in(spec: SceneSpec) -> tuple[HalfSpace | Box, ...]:
-    """Return the supports of a scene in the scene frame; none for a free object."""
     if spec.kind == "free":
         return ()
     if spec.kind == "file":
@@ -299,7 +289,7 @@ BesideOption = Annotated[
 ]
 
 
-class SceneDocument(Part):
+class SceneDocument(Model):
     """A complete scene within a request."""
 
     supports: Supports = Field(

@@ -11,9 +11,7 @@ from typing import Final, Literal
 
 from pydantic_core import from_json
 
-#: Upper bounds of the histogram of stage times [s].
 STAGE_BUCKETS_S: Final = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0)
-#: Upper bounds of the histogram of response times [s].
 HTTP_BUCKETS_S: Final = (0.002, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 1.0, 5.0)
 
 
@@ -66,7 +64,6 @@ SERIES: Final[dict[str, Series]] = {series.name: series for series in _ALL}
 
 
 def field(name: str, *labels: str) -> str:
-    """Return the name of a sum: the series and its label values."""
     return json.dumps([name, *labels])
 
 

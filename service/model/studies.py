@@ -76,7 +76,6 @@ class StabilityMap:
         return 0 < len(self.reached()) < len(self.cells)
 
     def still_breaks(self) -> list[str]:
-        """Return broken cells that a job can reach, one line per panel: no guard covers them."""
         lines = []
         for panel in self.panels:
             by_x: dict[float | str, list[str]] = {}
@@ -114,7 +113,6 @@ def counts(cells: Iterable[MapCell]) -> dict[Outcome, int]:
 
 
 def graded(value: float, weak: float, broken: float) -> Outcome:
-    """Grade a value: good below `weak`, broken from `broken` on and for nan."""
     if not value < broken:  # also for nan
         return "broken"
     return "good" if value < weak else "weak"
@@ -135,7 +133,6 @@ def short(value: float) -> str:
 
 
 def tick(value: float | str) -> str:
-    """Format an axis value as short as possible without loss."""
     if isinstance(value, str):
         return value
     return f"{value:g}" if value == 0 or 1e-3 <= abs(value) < 1e4 else _exponent(f"{value:g}")

@@ -28,7 +28,6 @@ _METRICS: Final = {metric.name: metric for metric in GRASP_METRICS if not metric
 _SHORT: Final = {"robust": "robust_share"}
 _WORDS: Final = ("hand", "object", "type")
 _TYPES: Final = tuple(kind.name.lower() for kind in GraspType)
-#: Boolean names.
 FLAGS: Final = ("validated", "valid", "feasible", "held", "lift", "lift_hard")
 _COMPARISONS: Final = {"<": "<", "<=": "<=", ">": ">", ">=": ">=", "=": "=", "==": "=", "!=": "!="}
 _TOKEN: Final = re.compile(

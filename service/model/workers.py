@@ -53,20 +53,8 @@ class WorkerBeat:
 
     @classmethod
     def of_this_process(cls, name: str, device: str, stages: Iterable[Stage]) -> Self:
-        """Return the report of a worker before its first check."""
-        now, own = timestamp(), own_ability()
-        facts = (
-            socket.gethostname(),
-            os.getpid(),
-            device,
-            "",
-            tuple(stages),
-            PACKAGE_VERSION,
-            "checking",
-            "",
-            now,
-            now,
-        )
+        host, now, own = socket.gethostname(), timestamp(), own_ability()
+        facts = (host, os.getpid(), device, "", tuple(stages), PACKAGE_VERSION, "checking", "", now, now)
         return cls(name, *facts, schemas=own.schemas, revisions=dict(own.revisions))
 
     @property
@@ -93,7 +81,6 @@ class Capabilities:
     revisions: Mapping[str, int]
 
     def lacks(self, need: Requirements) -> str:
-        """Return why such a worker cannot do a task; "" if it can."""
         oldest, newest = self.schemas
         if need.schema > newest:
             return f"schema {need.schema} of tasks is needed, and {newest} is the newest known"

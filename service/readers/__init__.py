@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from graspd.service.readers.grasps import Grasps
     from graspd.service.readers.pictures import Pictures
 
-#: Module of each name.
 _LIVES_IN: Final = {
     "Clouds": "clouds",
     "DepthNoise": "depth_noise",

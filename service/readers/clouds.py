@@ -197,7 +197,6 @@ def _by_scene(places: Sequence[PictureAddress]) -> list[list[PictureAddress]]:
 
 
 def _of(views: Sequence[CloudView], pixel: Ints, what: Callable[[CloudView, Ints, Ints], Array]) -> Array:
-    """Evaluate a function of the views at pixels (P, 3): view, row, column."""
     parts = [what(view, *pixel[pixel[:, 0] == number, 1:].T) for number, view in enumerate(views)]
     found = np.empty((len(pixel), *parts[0].shape[1:]), parts[0].dtype)
     for number, part in enumerate(parts):
@@ -206,7 +205,6 @@ def _of(views: Sequence[CloudView], pixel: Ints, what: Callable[[CloudView, Ints
 
 
 def _voxels(points: Floats, edge: float, draw: np.random.Generator) -> Ints:
-    """Select one point of each cube, uniformly at random."""
     order = draw.permutation(len(points))
     cubes = np.floor(points[order] / edge).astype(np.int64)
     return order[np.unique(cubes, axis=0, return_index=True)[1]]
@@ -283,7 +281,6 @@ class CloudView:
         return cls(columns, noise, noise.apply(depth, k, draw, angle=angle), angle)
 
     def pixels(self, *, whole: bool) -> tuple[Ints, Ints]:
-        """Return rows and columns of the pixels with depth of the object, or of the whole scene."""
         labels = self.columns["image/segmentation"]
         wanted = np.isfinite(self.seen) & ((labels > 0) if whole else (labels == _OBJECT))
         if self.noise is None:  # a pixel without neighbours has no normal
@@ -292,11 +289,9 @@ class CloudView:
         return row, column
 
     def points(self, row: Ints, column: Ints) -> Floats:
-        """Back-project pixels to measured points (P, 3) in the frame of the table [m]."""
         return transforms.apply(self._back, self._points[row, column])
 
     def true_points(self, row: Ints, column: Ints) -> Floats:
-        """Back-project pixels to points (P, 3) without noise [m]."""
         return transforms.apply(self._back, self._true[row, column])
 
     def normals(self, row: Ints, column: Ints) -> Floats:

@@ -176,7 +176,6 @@ def _beside(depth: Floats, sigma_px: Floats, draw: np.random.Generator) -> Float
 
 
 def _mixed(depth: Floats, draw: np.random.Generator) -> Floats:
-    """Mix a random share of the right or lower neighbour's depth into each pixel on an edge."""
     found = depth
     for axis in (1, 0):
         after = np.concatenate(
@@ -221,7 +220,6 @@ NOISES: Final[Mapping[str, DepthNoise]] = MappingProxyType(
 
 
 def noise_of(given: str | DepthNoise | None) -> DepthNoise | None:
-    """Look up a noise model by name; InputError if there is none."""
     if given is None or isinstance(given, DepthNoise):
         return given
     if given not in NOISES:

@@ -64,17 +64,14 @@ class Shards:
         return iter(self.files)
 
     def of(self, kind: str) -> tuple[ShardFile, ...]:
-        """Return the shards of one kind."""
         return tuple(file for file in self.files if file.kind == kind)
 
     def by_id(self, shard: str) -> ShardFile:
-        """Return a shard by its id; NotFoundError if it is not among these."""
         if shard not in self._by_id:
             raise NotFoundError(f"shard {shard[:12]} is not among the {len(self)} shards given")
         return self._by_id[shard]
 
     def only(self, *, hands: Iterable[str] = (), objects: Iterable[str] = ()) -> Shards:
-        """Select the shards of some hands and objects; by default all."""
         of_hands, of_objects = set(hands), set(objects)
         kept = (
             file

@@ -19,7 +19,6 @@ Array = NDArray[Any]
 #: Maps the columns of one base shard to a mask (N,) of the selected grasps.
 Where = Callable[[Mapping[str, Array]], Array]
 
-#: Columns of a grasp sample.
 DEFAULT_COLUMNS: Final = (
     "grasp/hand_pose",
     "grasp/joint_positions",

@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
 Array = NDArray[Any]
 
-#: Columns of a picture sample.
 DEFAULT_COLUMNS: Final = (
     "image/rgb",
     "image/depth",
@@ -203,11 +202,9 @@ class Scenes:
         return len(self._of(scene))
 
     def object_pose(self, scene: int) -> NDArray[np.float64]:
-        """Return the rest pose (7,) of the object in the frame of the table."""
         return self._object[scene]
 
     def base_rows(self, scene: int) -> NDArray[np.intp]:
-        """Return the base-shard rows (K,) of the grasps selected in one scene."""
         return self._row[self._of(scene)]
 
     def _of(self, scene: int) -> NDArray[np.intp]:

@@ -198,7 +198,6 @@ class _Source(io.RawIOBase):
 
 
 def joined(ranges: Sequence[Range]) -> list[Range]:
-    """Sort ranges and merge those with small gaps."""
     found: list[Range] = []
     for start, length in sorted(ranges):
         if found and start - sum(found[-1]) <= GAP_BYTES:
@@ -236,7 +235,6 @@ class _Packed:
     """(rows, 2) offset and length in the file [bytes]."""
 
     def unpack(self, data: bytes | memoryview) -> Array:
-        """Decompress a row; zlib.error or ValueError if the bytes are not one."""
         raw = np.frombuffer(zlib.decompress(data), np.uint8)
         size = self.dtype.itemsize
         if not self.shuffled or size == 1:

@@ -16,7 +16,6 @@ _OVERRIDES = {"palm": "--palm LINK --approach x,y,z", "preshape": "--pre-shape J
 
 
 def say_check(kind: AssetKind, report: Mapping[str, Any]) -> None:
-    """Print a check's report; a refusal goes to stderr in one line."""
     if report["verdict"] == "refuse":
         typer.echo(f"graspd: refused: {report['message']}", err=True)
         return
@@ -30,7 +29,6 @@ def verdict_line(asset: Mapping[str, Any]) -> str:
 
 
 def summary(kind: AssetKind, facts: Mapping[str, Any]) -> list[str]:
-    """Return lines of label and value; missing facts are omitted."""
     pairs = {AssetKind.HAND: _hand, AssetKind.OBJECT: _object, AssetKind.NETWORK: _network}[kind](facts)
     return [f"{label:<18} {text}" for label, text in pairs]
 
@@ -42,7 +40,6 @@ def self_test_line(facts: Mapping[str, Any]) -> str:
 
 
 def limit_line(facts: Mapping[str, Any]) -> str:
-    """Return the best payload of a hand's self-test; empty if not run, or nothing was lifted."""
     tried = facts.get("self_test")
     limit = tried.get("limit") if isinstance(tried, Mapping) else None
     return str(limit.get("says", "")) if isinstance(limit, Mapping) else ""

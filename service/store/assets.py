@@ -38,7 +38,6 @@ _T = TypeVar("_T")
 
 
 def pack(files: Mapping[str, bytes]) -> bytes:
-    """Pack named files into a ZIP; equal files give equal bytes."""
     buffer = io.BytesIO()
     pack_into(files, buffer)
     return buffer.getvalue()
@@ -73,7 +72,6 @@ def unpack(data: bytes, *, limit_bytes: int) -> dict[str, bytes]:
 
 
 def unpack_file(path: Path) -> dict[str, bytes]:
-    """Unpack a file, up to the limit of uploads; errors name the file."""
     from graspd.service.settings import Settings
 
     try:
@@ -150,7 +148,6 @@ def _open_zip(file: IO[bytes]) -> zipfile.ZipFile:
 
 
 def _entries(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
-    """Return the files of an archive by plain names after checking all entries."""
     entries = [entry for entry in archive.infolist() if not entry.is_dir()]
     if len(entries) > MAX_FILES:
         raise LimitError(f"the archive holds {len(entries)} files; at most {MAX_FILES} are taken")
@@ -243,7 +240,6 @@ def describe(kind: AssetKind, name: str, files: Mapping[str, bytes], *, created:
 
 
 def asset_json(files: Mapping[str, bytes]) -> bytes:
-    """Return the bytes of `asset.json`; InputError if it is missing or too large."""
     if "asset.json" not in files:
         raise InputError("asset.json, a JSON object that names the main file, is not among the files")
     if isinstance(files, StreamedFiles) and files.size("asset.json") > MAX_BYTES:

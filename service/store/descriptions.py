@@ -14,7 +14,7 @@ from typing import Annotated, Any, Final, Literal
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StringConstraints, ValidationError
 from pydantic_core import from_json, to_json
 
-from graspd.service.model.base import refusal
+from graspd.service.model.base import Model, refusal
 from graspd.service.model.errors import ConflictError, InputError
 
 #: The built-in hands need 2 KB; every list of hands or objects contains these facts.
@@ -46,7 +46,6 @@ class Description(BaseModel):
 
 
 def parse_description(data: bytes, what: str) -> Description:
-    """Parse an `asset.json`; InputError, which begins with `what`, if it is invalid."""
     given = json_object(data, f"{what}: asset.json")
     try:
         return Description.model_validate(given)
@@ -55,7 +54,6 @@ def parse_description(data: bytes, what: str) -> Description:
 
 
 def json_object(text: bytes | str, what: str) -> dict[str, Any]:
-    """Parse a JSON object of bounded size and depth; InputError if it is invalid."""
     data = text.encode(errors="replace") if isinstance(text, str) else text
     if len(data) > MAX_BYTES:
         raise InputError(f"{what} has more than {MAX_BYTES} bytes; leave out what is not needed")
@@ -91,11 +89,7 @@ Share = Annotated[float, Field(ge=-1e3, le=1e3)]
 Direction = Literal[-1, 0, 1]
 
 
-class _Said(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class PalmCorrection(_Said):
+class PalmCorrection(Model):
     """The palm in the frame of a link, with the hand in its pre-shape. Missing values are guessed again."""
 
     link: Text
@@ -103,7 +97,7 @@ class PalmCorrection(_Said):
     approach: tuple[Share, Share, Share] | None = Field(None, description="direction out of the palm; any length")
 
 
-class HandCorrections(_Said):
+class HandCorrections(Model):
     """A user's corrections of wrong guesses about a hand. Missing values stay as found."""
 
     palm: PalmCorrection | None = None

@@ -100,7 +100,6 @@ def _of_description(path: Path) -> tuple[dict[str, Path], str]:
 
 
 def _package(path: Path) -> Path:
-    """Return the folder of the ROS package around a description, or else its own folder."""
     for folder in list(path.parents)[:_ABOVE]:
         if (folder / "package.xml").is_file():
             return folder
@@ -135,7 +134,6 @@ def _named_by(path: Path, root: Path) -> set[str]:
 
 
 def _names(written: str, base: str, folder: str, root: Path) -> Iterator[str]:
-    """Yield the names of files below the root to which a reference may resolve."""
     with suppress(InputError):
         reference = read_reference(posixpath.join(folder, written), base)
         if not reference.scheme or not folder:
@@ -259,7 +257,7 @@ def _named(wanted: str, known: list[str], where: str) -> str:
     for fits in (
         [name for name in known if name == path],
         [name for name in known if name.endswith("/" + path)],
-        [name for name in known if _stem(name) == path],
+        [name for name in known if hand_name(PurePosixPath(name).name) == path],
     ):
         if len(fits) == 1:
             return fits[0]
@@ -279,13 +277,8 @@ def _outermost(files: Mapping[str, bytes], found: list[str]) -> list[str]:
 
 
 def _short(names: list[str]) -> str:
-    """Return the first name in its shortest unique form."""
     leaves = [PurePosixPath(name).name for name in names]
     return leaves[0] if leaves.count(leaves[0]) == 1 else names[0]
-
-
-def _stem(name: str) -> str:
-    return hand_name(PurePosixPath(name).name)
 
 
 def hand_name(leaf: str) -> str:
@@ -297,7 +290,6 @@ def hand_name(leaf: str) -> str:
 
 
 def _described_head(files: Mapping[str, bytes], name: str) -> bytes:
-    """Return the part of a file that decides its format; all of a robot's, which may have macros anywhere."""
     if PurePosixPath(name).suffix.lower() not in SUFFIXES:
         return b""
     if isinstance(files, StreamedFiles) and files.size(name) > 1 << 23:

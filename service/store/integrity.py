@@ -193,7 +193,6 @@ _END_MARK: Final = b"PK\x05\x06"
 
 
 def put_sealed(store: Store, key: str, data: bytes) -> bool:
-    """Write an object with its seal if absent; False if the name exists."""
     return store.put(key, sealed(key, data))
 
 
@@ -236,7 +235,6 @@ def sealed(key: str, data: bytes) -> bytes:
 
 
 def seal_archive(file: BufferedRandom) -> None:
-    """Seal a ZIP in a file open for reading and writing."""
     comment = _ZIP + _ZEROS
     file.seek(-2, 2)
     file.write(struct.pack("<H", len(comment)) + comment)
@@ -286,7 +284,6 @@ def _without_digits(chunk: bytes, at: int) -> bytes:
 
 
 def _with_extras(data: bytes) -> bytes:
-    """Add space for the seal at the beginning of a binary glTF's document."""
     length = int.from_bytes(data[12:16], "little")
     document = _GLB + _ZEROS + b'"},' + data[_GLB_AT + 1 : _GLB_AT + length]
     document += b" " * (-len(document) % 4)

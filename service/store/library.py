@@ -106,7 +106,6 @@ def publish_builtins(store: Store) -> list[Asset]:
 
 
 def stored_assets(store: Store) -> list[tuple[AssetKind, str]]:
-    """Return kind and digest of every hand and object in the store that is not deleted."""
     records = [entry.key.split("/") for entry in store.list(names.ASSETS)]
     gone = {entry.key for entry in store.list(names.DELETIONS)}
     # Other files of an asset may have deeper keys, such as an object's convex pieces.
@@ -115,7 +114,6 @@ def stored_assets(store: Store) -> list[tuple[AssetKind, str]]:
 
 
 def load_asset(store: Store, kind: AssetKind, digest: str) -> Asset:
-    """Load the record of a hand or object; NotFoundError if absent, DamagedError if damaged."""
     return read_record(Asset, store, names.asset_record(kind, digest))
 
 

@@ -9,7 +9,7 @@ from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from graspd.service.model import names
 from graspd.service.model.base import Digest
@@ -18,6 +18,7 @@ from graspd.service.model.domain import JobRequest, batches_of
 from graspd.service.model.messages import TaskMessage
 from graspd.service.model.metric_fields import values, with_fields
 from graspd.service.model.metrics import axis_word, indexed
+from graspd.service.model.records import Record
 from graspd.service.model.states import Stage
 from graspd.service.model.version import PACKAGE_VERSION, STAGE_REVISIONS
 from graspd.service.store import validity
@@ -32,10 +33,8 @@ INDEX_THRESHOLD_M: Final = 0.005
 
 
 @with_fields(valid=values(optional=False, default=None), last=values(optional=True, default=None))
-class GraspSummary(BaseModel):
+class GraspSummary(Record):
     """Quality of one grasp, in the units of the shard's columns; None for nan."""
-
-    model_config = ConfigDict(frozen=True, extra="ignore")
 
     valid: bool
     success: bool | None = None
@@ -46,10 +45,8 @@ class GraspSummary(BaseModel):
     )
 
 
-class ShardManifest(BaseModel):
+class ShardManifest(Record):
     """Inputs and contents of a shard."""
-
-    model_config = ConfigDict(frozen=True, extra="ignore")
 
     version: Literal[1] = 1
     shard_id: Digest
@@ -107,7 +104,6 @@ class ShardManifest(BaseModel):
 
     @property
     def count(self) -> int:
-        """Number of main rows: grasps; transferred grasps or scenes to plan in; pictures."""
         scenes = "S" if self.request.in_scene else "K"
         return self.counts.get({"base": "N", "scene": scenes, "views": "V"}[self.kind], 0)
 
@@ -161,10 +157,8 @@ def _contents(kind: str, arrays: Mapping[str, NDArray[Any]], attributes: Mapping
         recheck = arrays.get("quality/recheck", np.empty(0, np.int8))
         fields["index_threshold_m"], fields["grasps"] = summarise(arrays, attributes)
         fields["candidates"] = int(attributes.get("candidates", len(arrays["quality/valid"])))
-        fields["rechecked"], fields["recheck_held"] = (
-            int(np.count_nonzero(recheck >= 0)),
-            int(np.count_nonzero(recheck == 1)),
-        )
+        fields["rechecked"] = int(np.count_nonzero(recheck >= 0))
+        fields["recheck_held"] = int(np.count_nonzero(recheck == 1))
     return fields
 
 

@@ -57,7 +57,6 @@ def read_reference(written: str, base: str) -> Reference:
 
 
 def one_like(name: str, files: Iterable[str]) -> str:
-    """Return the only file with this name, ignoring capitals; empty if none."""
     wanted = name.lower()
     like = [file for file in files if file.lower() == wanted]
     return like[0] if len(like) == 1 else ""
@@ -103,7 +102,6 @@ def named_by(name: str, data: bytes) -> list[str]:
 
 
 def reference_of(text: bytes) -> str:
-    """Return the file name in a line, after options such as `-s 1 1 1`."""
     words = text.decode(errors="replace").strip()
     return words.split()[-1] if words.startswith("-") else words
 

@@ -94,12 +94,10 @@ class ProposalNetwork:
 
 
 def numbers(joints: int) -> int:
-    """Return D, the numbers per grasp of a hand with this many moving joints."""
     return POSE + 3 * joints
 
 
 def sizes(joints: int) -> dict[str, tuple[int, ...]]:
-    """Return the widths of the architecture, which a file repeats for its reader."""
     return {
         "encoder": (*ENCODER, FEATURE),
         "condition": (CONDITION,),
@@ -211,7 +209,6 @@ def _read(archive: zipfile.ZipFile, name: str, shape: tuple[int, ...], what: str
 
 
 def _member(archive: zipfile.ZipFile, name: str, limit: int) -> bytes:
-    """Read a member's bytes, at most as many as the archive's directory states."""
     member = archive.getinfo(f"{name}.npy")
     if member.file_size > limit:
         raise ValueError(f"{name} unpacks to {member.file_size} bytes")

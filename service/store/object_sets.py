@@ -12,7 +12,6 @@ from graspd.service.model.errors import InputError, LimitError
 from graspd.service.model.names import fitted
 from graspd.service.store.assets import MAX_FILES, UNPACK_FACTOR, unpack
 
-#: Suffixes of meshes.
 SUFFIXES: Final = (".stl", ".obj", ".ply", ".off", ".glb")
 #: Preferred stems if an object has several meshes: names of closed and cleaned scans first.
 PREFERRED: Final = ("clean", "nontextured", "textured_simple", "textured", "collision", "visual", "raw")
@@ -36,7 +35,7 @@ def files_of_set(path: Path) -> Objects | None:
     return found if path.is_dir() or len(found) > 1 else None
 
 
-def object_set(files: Mapping[str, bytes]) -> dict[str, dict[str, bytes]]:
+def object_set(files: Mapping[str, bytes]) -> Objects:
     """Group files by the objects of a set; return sorted names, each with its mesh and its `asset.json`, if any."""
     meshes = sorted(name for name in files if PurePosixPath(name).suffix.lower() in SUFFIXES)
     if not meshes:
@@ -74,7 +73,6 @@ def read_set(path: Path, *, limit_bytes: int) -> dict[str, bytes]:
 
 
 def _owner(mesh: str) -> tuple[str, ...]:
-    """Return the folders of a mesh without those that only name a variant."""
     parts = PurePosixPath(mesh).parts[:-1]
     while len(parts) > 1 and parts[-1].lower() in _INNER:
         parts = parts[:-1]

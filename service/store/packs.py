@@ -13,12 +13,13 @@ import struct
 from collections.abc import Iterator
 from typing import Final
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field, ValidationError
 
 from graspd.service.model import names
 from graspd.service.model.base import Digest
 from graspd.service.model.digests import digest_bytes
 from graspd.service.model.errors import DamagedError, NotFoundError
+from graspd.service.model.records import Record
 from graspd.service.model.states import Stage
 from graspd.service.store.manifests import ShardManifest, load_manifest, publish_shard
 from graspd.service.store.records import parse_record, put_record
@@ -32,10 +33,8 @@ _MAGIC: Final = b"graspd\x00\x01"
 _HEAD: Final = struct.Struct("<8sQ")
 
 
-class _Packed(BaseModel):
+class _Packed(Record):
     """Positions of a shard's manifest and file behind the directory [bytes], with their checksums."""
-
-    model_config = ConfigDict(frozen=True, extra="ignore")
 
     id: Digest
     stage: Stage
@@ -117,6 +116,5 @@ def _directory(key: str, data: bytes) -> tuple[int, list[_Packed]]:
 
 
 def _piece(data: bytes, start: int, length: int, sha256: str) -> bytes | None:
-    """Return bytes of a pack; None if they do not match the directory."""
     piece = data[start : start + length]
     return piece if hashlib.sha256(piece).hexdigest() == sha256 else None

@@ -47,7 +47,6 @@ def read_record(model: type[RecordT], store: Store, key: str) -> RecordT:
 
 
 def parse_record(model: type[RecordT], data: bytes, key: str) -> RecordT:
-    """Parse a record; DamagedError if the seal does not match or the content is no such record."""
     is_sealed(key, [data], len(data))
     try:
         if has_old_names(data):
@@ -85,7 +84,6 @@ def add_job_event(
     cause: str = "",
     put: Put | None = None,
 ) -> JobEvent:
-    """Append an event to a job; its state follows from all events in order."""
     put = put or partial(put_record, store)
     while True:
         number = max((event.number for event in job_events(store, job)), default=0) + 1
@@ -132,7 +130,6 @@ def newest_snapshot(store: Store, dataset: str, digest: str | None = None) -> Sn
 
 
 def newest_version(store: Store, tag: str) -> Tag | None:
-    """Load the current version of a tag; None if there is none."""
     keys = _keys(store, names.tag_versions(tag))
     return read_record(Tag, store, keys[-1]) if keys else None
 
@@ -237,13 +234,11 @@ class DeletedJob(Record):
 
 
 def pending(store: Store) -> set[tuple[str, str]]:
-    """Return kind and id of all deleted things with objects left in the store."""
     keys = [key.split("/") for key in _keys(store, names.DELETIONS)]
     return {(key[1], key[2].removesuffix(".json")) for key in keys if len(key) == 3}
 
 
 def refuse_pending(store: Store, what: str, name: str) -> None:
-    """Raise ConflictError while a thing of this id is being removed: a new one would be removed with it."""
     if store.exists(names.deletion(what, name)):
         raise ConflictError(f"the {what} {name} of before is still being removed; try again in a moment")
 

@@ -197,7 +197,6 @@ def kind_of(file: h5py.File, name: str) -> ShardKind:
 
 
 def read_column(file: h5py.File, path: str, name: str) -> NDArray[Any]:
-    """Read a complete dataset; DamagedShard if the values do not match their checksum."""
     dataset = file[path]
     data = np.asarray(dataset)
     if (expected := dataset.attrs.get(_DIGEST)) is not None and _digest(data) != expected:
@@ -226,7 +225,6 @@ def json_attribute(value: object) -> str:
 
 
 def carried(shard: Shard) -> dict[str, Attribute]:
-    """Return the root attributes for a copy of a shard: all that `write_shard` does not set itself."""
     return {name: value for name, value in shard.attributes.items() if name != "schema"}
 
 
