@@ -6,7 +6,6 @@ within contains it, from any module.
 
 from __future__ import annotations
 
-import copy
 import json
 import logging
 import os
@@ -83,25 +82,18 @@ class JsonLines(logging.Formatter):
 
 class _TextLines(logging.Formatter):
     def format(self, record: logging.LogRecord) -> str:
-        record = _plain(record)
         about = " ".join(f"{name}={value}" for name, value in _subjects(record).items())
         trace = f"\n{self.formatException(record.exc_info)}" if record.exc_info else ""
-        text = f"{_time(record)[11:23]} {record.levelname} {record.name} {record.getMessage()}"
+        message = record.getMessage().translate(_OBEYED)
+        text = f"{_time(record)[11:23]} {record.levelname} {record.name} {message}"
         return without_secrets(f"{text} [{about}]{trace}" if about else f"{text}{trace}")
 
 
-#: Characters that end a line or control a terminal.
+#: Characters that end a line or control a terminal: foreign paths and names must not forge lines.
 _OBEYED: Final = {
     code: repr(chr(code))[1:-1]
     for code in (*range(0x20), *range(0x7F, 0xA0), 0x2028, 0x2029, *range(0x202A, 0x202F), *range(0x2066, 0x206A))
 }
-
-
-def _plain(record: logging.LogRecord) -> logging.LogRecord:
-    """Return the record with a one-line message, so that foreign paths and names cannot forge lines."""
-    made = copy.copy(record)
-    made.msg, made.args = record.getMessage().translate(_OBEYED), ()
-    return made
 
 
 def _subjects(record: logging.LogRecord) -> dict[str, Any]:
@@ -120,30 +112,23 @@ _ASKED_BY: Final = ("OTEL_EXPORTER_OTLP_ENDPOINT", "OTEL_EXPORTER_OTLP_TRACES_EN
 _tracer: Any = None
 
 
-def set_up_tracing(process: str, *, exporter: Any = None) -> None:
-    """Send the spans of this process to `exporter`, or to the one configured in the environment, if any."""
+def set_up_tracing(process: str) -> None:
+    """Send the spans of this process to the exporter configured in the environment, if any."""
     global _tracer
-    if exporter is None and not any(os.environ.get(name) for name in _ASKED_BY):
+    if not any(os.environ.get(name) for name in _ASKED_BY):
         return
     try:
         from opentelemetry.exporter.otlp.proto.http.trace_exporter import OTLPSpanExporter
         from opentelemetry.sdk.resources import Resource
         from opentelemetry.sdk.trace import TracerProvider
-        from opentelemetry.sdk.trace.export import BatchSpanProcessor, SimpleSpanProcessor
+        from opentelemetry.sdk.trace.export import BatchSpanProcessor
     except ImportError:
         log.warning("no traces are sent: run `pip install 'graspd[otel]'`, or unset %s", _ASKED_BY[0])
         return
     resource = Resource.create({"service.name": os.environ.get("OTEL_SERVICE_NAME", f"graspd-{process}")})
     provider = TracerProvider(resource=resource)
-    provider.add_span_processor(
-        SimpleSpanProcessor(exporter) if exporter is not None else BatchSpanProcessor(OTLPSpanExporter())
-    )
+    provider.add_span_processor(BatchSpanProcessor(OTLPSpanExporter()))
     _tracer = provider.get_tracer("graspd")
-
-
-def stop() -> None:
-    global _tracer
-    _tracer = None
 
 
 @contextmanager

@@ -155,15 +155,15 @@ def _contents(kind: str, arrays: Mapping[str, NDArray[Any]], attributes: Mapping
     fields: dict[str, Any] = {"valid": 0 if valid is None else int(np.count_nonzero(valid))}
     if kind == "base":
         recheck = arrays.get("quality/recheck", np.empty(0, np.int8))
-        fields["index_threshold_m"], fields["grasps"] = summarise(arrays, attributes)
+        fields["index_threshold_m"], fields["grasps"] = _summaries(arrays, attributes)
         fields["candidates"] = int(attributes.get("candidates", len(arrays["quality/valid"])))
         fields["rechecked"] = int(np.count_nonzero(recheck >= 0))
         fields["recheck_held"] = int(np.count_nonzero(recheck == 1))
     return fields
 
 
-def summarise(
-    arrays: Mapping[str, NDArray[Any]], attributes: Mapping[str, Any] | None = None
+def _summaries(
+    arrays: Mapping[str, NDArray[Any]], attributes: Mapping[str, Any]
 ) -> tuple[float, tuple[GraspSummary, ...]]:
     """Return the contact threshold nearest to `INDEX_THRESHOLD_M` [m], and each grasp's quality at it."""
     thresholds = np.asarray(arrays["quality/thresholds_m"], float)
@@ -176,7 +176,7 @@ def summarise(
     }
     columns["valid"] = validity.valid(arrays).tolist()
     columns["success"] = [_verdict(int(v)) for v in arrays.get("quality/success", np.full(count, -1))]
-    level = (attributes or {}).get("verdict_level")
+    level = attributes.get("verdict_level")
     columns["verdict_level"] = [None if verdict is None else level for verdict in columns["success"]]
     columns["lift_hard"] = [_verdict(int(v)) for v in arrays.get("quality/lift_hard", np.full(count, -1))]
     columns["robust_weakest"] = [axis_word(int(v)) for v in arrays.get("quality/robust_weakest", np.zeros(count))]

@@ -66,12 +66,7 @@ def write_shard(kind: ShardKind, arrays: Arrays, attributes: Mapping[str, Attrib
             options: dict[str, Any] = {}
             if data.ndim >= 3 and data.nbytes > 65536:
                 # One chunk per row, that is per picture: readers unpack no other rows.
-                options = {
-                    "compression": "gzip",
-                    "compression_opts": 1,
-                    "shuffle": True,
-                    "chunks": (1, *data.shape[1:]),
-                }
+                options.update(compression="gzip", compression_opts=1, shuffle=True, chunks=(1, *data.shape[1:]))
             dataset = file.create_dataset(path, data=data, track_times=False, **options)
             dataset.attrs["units"] = column.units
             dataset.attrs["frame"] = column.frame
