@@ -98,7 +98,7 @@ RIGHT: Final = 2
 
 def object_points(sample: Mapping[str, Any], index: int, noise: DepthNoise | None) -> Floats:
     """Return (P, 3) object points of a picture in the table's frame [m]; its index seeds the noise."""
-    view = CloudView.of(sample, noise, np.random.default_rng(index))
+    view = CloudView(sample, noise, np.random.default_rng(index))
     return view.points(*view.pixels(whole=False))
 
 

@@ -45,7 +45,7 @@ class GraspMetric:
     code: bool = False
     """A number that encodes a category; its sums and means are meaningless."""
     optional: bool = False
-    indexed: IndexLevel = IndexLevel.NO
+    indexed: IndexLevel = IndexLevel.OFFERED
     bounds: tuple[float, float] = (0, math.inf)
     less_is_better: bool = False
     digits: int | None = None
@@ -85,7 +85,6 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
         title="ε (Ferrari-Canny)",
         short="ε",
         swept=True,
-        indexed=IndexLevel.OFFERED,
         digits=2,
         plot="whole",
     ),
@@ -105,7 +104,6 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
         "hand surface closer to the object than the threshold",
         title="Contact area",
         swept=True,
-        indexed=IndexLevel.OFFERED,
         digits=0,
         plot="whole",
     ),
@@ -115,7 +113,6 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
         "volume shared by hand and object",
         title="Intersection volume",
         short="Intersection",
-        indexed=IndexLevel.OFFERED,
         less_is_better=True,
         digits=3,
         plot="cut",
@@ -125,7 +122,6 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
         "mm",
         "deepest hand-object penetration",
         title="Penetration",
-        indexed=IndexLevel.OFFERED,
         less_is_better=True,
         digits=2,
         plot="cut",
@@ -146,6 +142,7 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
         title="Simulated displacement",
         short="Displacement",
         optional=True,
+        indexed=IndexLevel.NO,
         less_is_better=True,
         digits=2,
         plot="cut",
@@ -170,7 +167,6 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
         title="Robust share",
         short="Robust",
         optional=True,
-        indexed=IndexLevel.OFFERED,
         bounds=(0, 1),
         digits=2,
         plot="whole",
@@ -182,7 +178,6 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
         "under the six pushes; nan: not measured",
         title="Payload",
         optional=True,
-        indexed=IndexLevel.OFFERED,
         bounds=(0, 100),
         digits=2,
         plot="cut",
@@ -195,7 +190,6 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
         title="Motion when shaken",
         short="Shaken",
         optional=True,
-        indexed=IndexLevel.OFFERED,
         less_is_better=True,
         digits=2,
         plot="cut",
@@ -207,7 +201,6 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
         title="Clearance in its scene",
         short="Clearance",
         optional=True,
-        indexed=IndexLevel.OFFERED,
         bounds=(-1, 1),
         digits=4,
     ),

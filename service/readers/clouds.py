@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final, Literal
 
@@ -20,8 +19,6 @@ from graspd.service.readers.pictures import PictureAddress, Pictures, Scenes
 from graspd.service.store.shards import Shard
 
 Array = NDArray[Any]
-
-
 Ints = NDArray[np.intp]
 #: Maps a base shard and K of its rows to points (K, H, 3) on the hand's surface in the object's frame [m].
 HandSurface = Callable[[Shard, Ints], Floats]
@@ -30,7 +27,6 @@ FRAMES: Final[tuple[Frame, ...]] = ("camera", "table", "object")
 POSTURES: Final = ("pregrasp", "grasp", "squeeze")
 #: Prefixes of the keys with one row per grasp.
 OF_GRASPS: Final = ("pregrasp/", "grasp/", "squeeze/", "quality/")
-_NOWHERE: Final = np.array([0.0, 0, 0, 1, 0, 0, 0])
 #: Largest distance of a contact between the hand's surface and a point [m]: the middle contact threshold of shards.
 TOUCH_M: Final = 0.005
 
@@ -111,7 +107,7 @@ class Clouds(Sequence[dict[str, Any]]):
         places = self._places[index]
         first, scenes = places[0], self.pictures.scenes_of(places[0].scene_shard)
         draw = np.random.default_rng([self._seed, self.epoch, *_words(first)])
-        views = [CloudView.of(self.pictures.columns_of(place, COLUMNS), self._noise, draw) for place in places]
+        views = [CloudView(self.pictures.columns_of(place, COLUMNS), self._noise, draw) for place in places]
         object_pose = scenes.object_pose(first.scene)
         into = self._into(views[0].extrinsics, object_pose)
         sample = self._cloud(views, draw, into)
@@ -186,7 +182,7 @@ class Clouds(Sequence[dict[str, Any]]):
             return transforms.pose_from_matrix(extrinsics)
         if self.frame == "object":
             return transforms.invert(object_pose)
-        return _NOWHERE
+        return transforms.IDENTITY_POSE
 
 
 def _by_scene(places: Sequence[PictureAddress]) -> list[list[PictureAddress]]:
@@ -260,30 +256,24 @@ _DEVIATIONS: Final = 4.0
 _SLOPE: Final = 3.0
 
 
-@dataclass(frozen=True)
 class CloudView:
-    """Columns `COLUMNS` of one picture, and its depth as measured by a camera."""
+    """Columns `COLUMNS` of one picture, and its depth as measured by a camera; `draw` generates the noise."""
 
-    columns: Mapping[str, Array]
-    noise: DepthNoise | None
-    seen: Floats
-    """(H, W) measured depth [m]; not finite: no measurement."""
-    angle: Floats | None
-    """(H, W) angle of incidence [rad]; None without noise, which alone needs it."""
-
-    @classmethod
-    def of(cls, columns: Mapping[str, Array], noise: DepthNoise | None, draw: np.random.Generator) -> CloudView:
-        depth = np.asarray(columns["image/depth"], float)
-        k = np.asarray(columns["camera/intrinsics"], float)
-        if noise is None:
-            return cls(columns, noise, depth, None)
-        angle = incidence(depth, k)
-        return cls(columns, noise, noise.apply(depth, k, draw, angle=angle), angle)
+    def __init__(self, columns: Mapping[str, Array], noise: DepthNoise | None, draw: np.random.Generator) -> None:
+        self.columns, self._noise = columns, noise
+        self.extrinsics = np.asarray(columns["camera/extrinsics"], float)  # (4, 4), table to camera
+        self._back = transforms.invert(transforms.pose_from_matrix(self.extrinsics))
+        self._k = np.asarray(columns["camera/intrinsics"], float)
+        #: Measured depth (H, W) [m]; not finite: no measurement.
+        self.seen = depth = np.asarray(columns["image/depth"], float)
+        if noise is not None:
+            self._angle = incidence(depth, self._k)
+            self.seen = noise.apply(depth, self._k, draw, angle=self._angle)
 
     def pixels(self, *, whole: bool) -> tuple[Ints, Ints]:
         labels = self.columns["image/segmentation"]
         wanted = np.isfinite(self.seen) & ((labels > 0) if whole else (labels == _OBJECT))
-        if self.noise is None:  # a pixel without neighbours has no normal
+        if self._noise is None:  # a pixel without neighbours has no normal
             wanted &= np.isfinite(self._normals[..., 0])
         row, column = np.nonzero(wanted & np.isfinite(self._true[..., 2]))
         return row, column
@@ -296,27 +286,15 @@ class CloudView:
 
     def normals(self, row: Ints, column: Ints) -> Floats:
         """Return unit normals (P, 3) of pixels, toward the camera, in the frame of the table."""
-        if self.noise is None or self.angle is None:
+        if self._noise is None:
             return transforms.quat_rotate(self._back[3:], self._normals[row, column])
         z = self._points[row, column, 2]
-        gap = _SLOPE * _RADIUS * z / self._k[0, 0] + _DEVIATIONS * self.noise.sigma(z, self.angle[row, column])
+        gap = _SLOPE * _RADIUS * z / self._k[0, 0] + _DEVIATIONS * self._noise.sigma(z, self._angle[row, column])
         fitted = fitted_normals(self._points, row, column, radius=_RADIUS, gap_m=gap)
         return transforms.quat_rotate(self._back[3:], fitted)
 
     def is_object(self, row: Ints, column: Ints) -> NDArray[np.bool_]:
         return np.asarray(self.columns["image/segmentation"][row, column] == _OBJECT)
-
-    @property
-    def extrinsics(self) -> Floats:
-        return np.asarray(self.columns["camera/extrinsics"], float)
-
-    @property
-    def _k(self) -> Floats:
-        return np.asarray(self.columns["camera/intrinsics"], float)
-
-    @cached_property
-    def _back(self) -> Floats:
-        return transforms.invert(transforms.pose_from_matrix(self.extrinsics))
 
     @cached_property
     def _true(self) -> Floats:
@@ -324,7 +302,7 @@ class CloudView:
 
     @cached_property
     def _points(self) -> Floats:
-        return self._true if self.noise is None else back_project(self._k, self.seen)
+        return self._true if self._noise is None else back_project(self._k, self.seen)
 
     @cached_property
     def _normals(self) -> Floats:

@@ -143,7 +143,7 @@ class Pictures(Sequence[dict[str, Any]]):
                 raise InputError(f"shard {file.id[:12]} of {file.object} has no column {absent[0]!r}")
         held = self.scenes_of(scene_shard)
         for row, scene in enumerate(scenes):
-            if not with_grasps_only or held.count(int(scene)):
+            if not with_grasps_only or len(held.base_rows(int(scene))):
                 self.places.append(PictureAddress(file, scene_shard, int(scene), row))
 
     def _table(self, file: ShardFile, columns: Sequence[str]) -> RowTable:
@@ -197,9 +197,6 @@ class Scenes:
             for name in ("grasp/joint_positions", *quality)
             if name in base.arrays
         }
-
-    def count(self, scene: int) -> int:
-        return len(self._of(scene))
 
     def object_pose(self, scene: int) -> NDArray[np.float64]:
         return self._object[scene]
