@@ -1,8 +1,4 @@
-"""Telemetry of every process: log lines, OpenTelemetry spans, heartbeat file for health checks.
-
-Log lines are JSON for machines, and text on a terminal. `bind` sets the context of a piece of work; every line logged
-within contains it, from any module.
-"""
+"""Telemetry of every process: log lines, OpenTelemetry spans, heartbeat file for health checks."""
 
 from __future__ import annotations
 

@@ -1,7 +1,6 @@
 """Metadata of job options besides type, default, bounds and description; tables derived from it.
 
-A field with an `Option` in its metadata is offered to users. `rows` is the only source for the command line, the
-dashboard's forms, the Python signatures and the documentation tables.
+`rows` is the only source for the command line, the dashboard's forms, the Python signatures and the docs' tables.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""Projects: groups of keys that share jobs, datasets, hands and objects, isolated from each other.
-
-Without project names everything belongs to the unnamed project.
-"""
+"""Projects: groups of keys that share jobs, datasets, hands and objects, isolated from each other."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Definitions of every series of `/metrics`, and the names under which their sums are stored.
-
-`docs/reference/metrics.md` has the table.
-"""
+"""Definitions of every series of `/metrics`, and the names under which their sums are stored."""
 
 from __future__ import annotations
 

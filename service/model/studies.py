@@ -1,7 +1,4 @@
-"""Records of studies: stability maps, and terms of charts of speed against accuracy.
-
-`graspd stability` makes and publishes the maps; report and dashboard draw the same record.
-"""
+"""Records of studies: stability maps, and terms of charts of speed against accuracy."""
 
 from __future__ import annotations
 

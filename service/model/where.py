@@ -5,10 +5,9 @@
     factor       not factor | ( expression ) | NAME | NAME op VALUE
     op           < <= > >= = == !=
 
-Metrics have their names in `service.model.metrics`; a swept one has its value at the index's threshold. Metrics are
-compared with numbers, `hand`, `object` and `type` with words; flags stand alone. Comparisons with a missing number are
-false. The text is parsed to a tree here and never evaluated as code. `service.readers.where` applies it to base shards,
-`service.index.queries.grasps` to the index.
+Metrics are compared with numbers, `hand`, `object` and `type` with words; flags stand alone. Comparisons with a missing
+number are false. The text is parsed to a tree and never evaluated as code. `service.readers.where` applies it to base
+shards, `service.index.queries.grasps` to the index.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """Reader of pictures in a store by byte ranges: read-ahead, no HDF5 library, no disk cache.
 
-A picture is one zlib-compressed chunk of its column. Opening a file and its datasets costs as much as unpacking a
-picture, and the HDF5 library runs one thread at a time. Byte ranges can be read and unpacked by any number of threads.
-The checksum of the compressed data (Adler-32) shows damage.
+A picture is one zlib-compressed chunk of its column; its checksum (Adler-32) shows damage. Any number of threads can
+read and unpack byte ranges, while the HDF5 library runs one thread at a time.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""Stored hands and objects: immutable archives in the store, and the built-in ones on disk.
-
-An archive is a reproducible ZIP: sorted names, fixed time stamps, no variable attributes.
-"""
+"""Hands and objects: reproducible ZIPs (sorted names, fixed time stamps) in the store, and the built-in ones on disk."""
 
 from __future__ import annotations
 

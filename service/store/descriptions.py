@@ -1,7 +1,4 @@
-"""`asset.json`, a small, flat JSON object, and corrections of guesses about a hand.
-
-Workers check the meaning of its keys (`worker.hands.options`, `worker.objects.options`).
-"""
+"""`asset.json`, a small, flat JSON object, and corrections of guesses about a hand. Workers check the meaning of its keys."""
 
 from __future__ import annotations
 
