@@ -1,4 +1,4 @@
-"""Hands and objects: reproducible ZIPs (sorted names, fixed time stamps) in the store, and the built-in ones on disk."""
+"""Hands and objects: reproducible ZIPs (sorted names, fixed times) in the store, and the built-in ones on disk."""
 
 from __future__ import annotations
 

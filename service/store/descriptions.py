@@ -1,4 +1,4 @@
-"""`asset.json`, a small, flat JSON object, and corrections of guesses about a hand. Workers check the meaning of its keys."""
+"""`asset.json`, a small JSON object whose meaning workers check, and corrections of guesses about a hand."""
 
 from __future__ import annotations
 

@@ -26,13 +26,8 @@ VIEWS = len(EYES)
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return box_scenes.write(tmp_path_factory.mktemp("box"))
-
-
-@pytest.fixture(scope="module")
-def pictures(folder: Path) -> Pictures:
-    return Pictures(open_shards(folder))
+def pictures(box: Path) -> Pictures:
+    return Pictures(open_shards(box))
 
 
 def on_box(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -95,8 +90,8 @@ def test_views_fused_agree_and_show_more_than_each(pictures: Pictures) -> None:
         assert faces[0] > faces[1]
 
 
-def test_labels_stand_in_each_frame_and_are_the_valid_grasps(pictures: Pictures, folder: Path) -> None:
-    base = read_shard(folder / "base.h5")
+def test_labels_stand_in_each_frame_and_are_the_valid_grasps(pictures: Pictures, box: Path) -> None:
+    base = read_shard(box / "base.h5")
     clouds = pictures.clouds(8, postures=("pregrasp", "grasp", "squeeze"))
     for index in (1, VIEWS + 2):
         sample = clouds[index]

@@ -13,7 +13,7 @@ import pytest
 
 from graspd.service.model.errors import DamagedShard, InputError, NotFoundError
 from graspd.service.model.names import dataset_snapshot
-from graspd.service.model.records import JobRecord, Snapshot
+from graspd.service.model.records import Snapshot
 from graspd.service.model.transforms import compose, pose_from_matrix
 from graspd.service.pipeline.backends import Services
 from graspd.service.readers import Grasps, Pictures, ShardCache, Shards, open_shards, prefetched
@@ -21,26 +21,11 @@ from graspd.service.settings import Settings
 from graspd.service.store.records import put_record
 from graspd.service.store.shards import read_shard
 from graspd.service.store.store import open_store
-from tests.api import factories
 from tests.damage import flipped, flipped_values
 from tests.indexes import empty_index
 from tests.memory_queue import MemoryQueue
 from tests.servers import S3Server
-
-GRASPS = 40
-
-
-def a_job(services: Services) -> JobRecord:
-    """A finished job of two batches with scenes and pictures."""
-    factories.add_builtins(services)
-    record = factories.add_job(services, grasps=GRASPS, scenes=2, views=2, width=24, height=16)
-    factories.finish_all(services, record)
-    return record
-
-
-@pytest.fixture
-def shards(services: Services, tmp_path: Path) -> Shards:
-    return open_shards(services.store, job=a_job(services).id, cache=tmp_path / "cache")
+from tests.service.readers.conftest import GRASPS, job_in
 
 
 @pytest.fixture
@@ -160,8 +145,8 @@ def _put_snapshot(services: Services, dataset: str, shards: Shards, *, created: 
 def test_what_was_read_once_from_s3_needs_the_server_no_more(s3_url: str, s3_server: S3Server, tmp_path: Path) -> None:
     index = empty_index(f"sqlite:///{tmp_path / 'index.sqlite'}")
     remote = Services(Settings(data_dir=tmp_path), open_store(s3_url), index, MemoryQueue())
-    job = a_job(remote)
-    shards = open_shards(s3_url, job=job.id, cache=tmp_path / "cache")
+    job = job_in(remote)
+    shards = open_shards(s3_url, job=job, cache=tmp_path / "cache")
     assert [shards.path(file).read_bytes() for file in shards] == [remote.store.get(file.key) for file in shards]
     s3_server.kill()
     try:
