@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import pytest
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import ValidationError
 
 from graspd.api.uploads import name_of_upload
 from graspd.exchange.plan import plain_name
 from graspd.service.index.index import Index
 from graspd.service.index.sample import look
-from graspd.service.model.base import Name, refusal
+from graspd.service.model.base import refusal
 from graspd.service.model.errors import ERRORS, GraspdError, InputError, without_secrets
 from graspd.service.model.names import fitted
 from graspd.service.queue.connection import connect
@@ -21,6 +21,7 @@ from graspd.service.run.address import ListenAddress
 from graspd.service.settings import Settings
 from graspd.service.store.store import open_store
 from graspd.service.telemetry import JsonLines, _TextLines
+from tests.fakes import request
 
 
 @pytest.mark.parametrize("kind", ERRORS.values(), ids=ERRORS.keys())
@@ -34,45 +35,29 @@ def test_controls_of_a_terminal_are_quoted_and_other_scripts_are_not() -> None:
     assert str(GraspdError("no hand 'Hände 手'")) == "no hand 'Hände 手'"
 
 
-class Kind(BaseModel):
-    model_config = ConfigDict(extra="forbid")
-
-    n: int = Field(1, ge=1, le=9)
-    share: float = Field(0.5, gt=0, lt=1)
-    on: bool = True
-    name: Name = "mug"
-    fidelity: Literal["draft", "standard", "fine"] = "draft"
-    text: str = Field("", max_length=3)
-
-    @field_validator("text")
-    @classmethod
-    def _no_x(cls, text: str) -> str:
-        if text == "x":
-            raise ValueError("x is taken")
-        return text
-
-
 @pytest.mark.parametrize(
     ("given", "line"),
     [
-        ({"n": 0}, "n: must be at least 1"),
-        ({"n": "many"}, "n: must be a whole number"),
-        ({"share": 0}, "share: must be more than 0"),
-        ({"share": "half"}, "share: must be a number"),
-        ({"on": "perhaps"}, "on: must be true or false"),
+        ({"grasps": 0}, "grasps: must be at least 1"),
+        ({"grasps": "many"}, "grasps: must be a whole number"),
+        ({"grasps": 1.5}, "grasps: must be a whole number"),
+        ({"friction": 0}, "friction: must be more than 0"),
+        ({"friction": "half"}, "friction: must be a number"),
+        ({"stereo": "perhaps"}, "stereo: must be true or false"),
         (
-            {"name": "a/b"},
-            "name: must begin with a letter or digit and hold at most 64 letters, digits, dots, dashes and underscores",
+            {"hand": "a/b"},
+            "hand: must begin with a letter or digit and hold at most 64 letters, digits, dots, dashes and underscores",
         ),
-        ({"fidelity": "strandard"}, "fidelity: must be one of draft, standard, fine; did you mean standard?"),
-        ({"text": "long"}, "text: must have at most 3 characters"),
-        ({"text": "x"}, "text: x is taken"),
+        ({"want": "vaild"}, "want: must be one of valid, candidates; did you mean valid?"),  # codespell:ignore vaild
+        ({"target": "x" * 41}, "target: must have at most 40 characters"),
+        ({"fidelity": "paint"}, "fidelity: unknown fidelity 'paint'"),
+        ({"views": 1}, "views need scenes"),
         ({"knob": 1}, "knob: is not known"),
     ],
 )
 def test_the_first_mistake_is_one_line(given: dict[str, Any], line: str) -> None:
     with pytest.raises(ValidationError) as refused:
-        Kind.model_validate(given)
+        request(**given)
     assert refusal(refused.value).startswith(line)
     assert "nput should" not in refusal(refused.value)
 

@@ -9,21 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from graspd.service.model.planning import (
-    MAX_BACKOFF_S,
-    OUTCOMES,
-    TaskFacts,
-    backoff,
-    batch_ready,
-    batch_states,
-    job_state,
-    limit_told,
-    message_of,
-    plan,
-    priority_of,
-    shortfall,
-    totals,
-)
+from graspd.service.model import planning
+from graspd.service.model.planning import MAX_BACKOFF_S, OUTCOMES, TaskFacts, plan, shortfall, totals
 from graspd.service.model.states import Priority, Stage, State
 from tests.fakes import request
 from tests.service.model.jobs import record
@@ -54,14 +41,14 @@ def test_a_plan_makes_each_grasp_once_and_names_nothing_twice(grasps: int, scene
 
 
 def test_a_small_job_is_interactive_and_a_large_one_is_bulk() -> None:
-    assert priority_of(request(grasps=32)) is Priority.INTERACTIVE
-    assert priority_of(request(grasps=100_000)) is Priority.BULK
+    assert planning.priority_of(request(grasps=32)) is Priority.INTERACTIVE
+    assert planning.priority_of(request(grasps=100_000)) is Priority.BULK
 
 
 def test_a_message_is_enough_to_do_the_task() -> None:
     job = record(request(scenes=1))
     _, scene = plan(job)
-    message = message_of(job, scene, attempt=2, max_attempt=3)
+    message = planning.message_of(job, scene, attempt=2, max_attempt=3)
     assert (message.task_id, message.inputs, message.output) == (scene.id, scene.inputs, scene.output)
     assert (message.attempt, message.max_attempt) == (2, 3)
 
@@ -83,9 +70,9 @@ def test_states_of_a_batch_follow_from_facts(
     first: dict[str, Any], cancelled: bool, states: list[State], ready: int | None
 ) -> None:
     chain = [TaskFacts(stage, **(first if stage is CHAIN[0] else {})) for stage in CHAIN]
-    found = batch_states(chain, job_cancelled=cancelled)
+    found = planning.batch_states(chain, job_cancelled=cancelled)
     assert found == states
-    assert batch_ready(found) == [place == ready for place in range(3)]
+    assert planning.batch_ready(found) == [place == ready for place in range(3)]
 
 
 @pytest.mark.parametrize(
@@ -101,12 +88,12 @@ def test_states_of_a_batch_follow_from_facts(
     ],
 )
 def test_the_state_of_a_job_follows_from_its_tasks(tasks: set[str], state: str) -> None:
-    assert job_state(State(task) for task in tasks) == state
+    assert planning.job_state(State(task) for task in tasks) == state
 
 
 def test_the_wait_doubles_up_to_a_bound() -> None:
-    assert [backoff(2.0, failures) for failures in (1, 2, 3)] == [2.0, 4.0, 8.0]
-    assert backoff(2.0, 1000) == MAX_BACKOFF_S
+    assert [planning.backoff(2.0, failures) for failures in (1, 2, 3)] == [2.0, 4.0, 8.0]
+    assert planning.backoff(2.0, 1000) == MAX_BACKOFF_S
 
 
 def test_why_fewer_grasps_were_found_is_told_the_most_frequent_first() -> None:
@@ -122,6 +109,6 @@ def test_why_fewer_grasps_were_found_is_told_the_most_frequent_first() -> None:
 
 
 def test_a_limit_of_the_hand_stands_where_the_budget_would() -> None:
-    limit = limit_told("barrett", 0.6, 16, 5.66, math.inf, 100.0)
+    limit = planning.limit_told("barrett", 0.6, 16, 5.66, math.inf, 100.0)
     assert limit == "barrett lifts 5.7 kg at friction 0.6 in the best of 16 grasps; 100 kg are wanted"
     assert str(shortfall(0, 4, "valid", 4, 4, {}, limit)) == f"found 0 of 4 valid grasps in 4 candidates; {limit}"

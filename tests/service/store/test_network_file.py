@@ -106,7 +106,6 @@ HOSTILE: dict[str, tuple[Callable[[Arrays], bytes], str]] = {
     "another schema": (lambda arrays: with_meta(arrays, schema="graspd/proposals@2"), "schema"),
     "another joint": (lambda arrays: with_meta(arrays, joint_names=["a", "b", "c"]), "sizes"),
     "a joint twice": (lambda arrays: with_meta(arrays, joint_names=["a", "a"]), "named twice"),
-    "endless steps": (lambda arrays: with_meta(arrays, steps=10**9), "steps"),
     "a long text": (lambda arrays: with_meta(arrays, about="x" * 5000), "about"),
     "a path for a name": (lambda arrays: with_meta(arrays, hand="../up"), "hand"),
     "deep JSON": (lambda arrays: packed(arrays | {"meta": np.array("[" * 9000)}), "JSON"),
