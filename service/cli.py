@@ -186,9 +186,7 @@ class EngineSettings:
 
 
 def engine_settings() -> EngineSettings:
-    """Load them from the environment; InputError for a bad value. The module of settings is imported only
-    if one is set: that takes as long as loading hand and object together.
-    """
+    """Load them from the environment; the module of settings, slow to import, only if one is set."""
     if not any(name.upper().startswith("GRASPD_") for name in os.environ):
         return EngineSettings()
     found = load_settings()
@@ -202,10 +200,7 @@ def log_to_stderr(settings: Settings, process: str = "graspd") -> None:
 
 
 def keep_private(settings: Settings) -> None:
-    """Restrict files of this process and its children to their user, and an open data folder too.
-
-    They contain requests, results and hashes of keys; those of an older graspd were readable by all users.
-    """
+    """Restrict files of this process and its children, and a data folder that others can read, to their user."""
     os.umask(0o077)
     with contextlib.suppress(OSError):
         status = settings.data_dir.stat()

@@ -129,15 +129,7 @@ def set_up_tracing(process: str) -> None:
 
 @contextmanager
 def span(name: str, *, parent: str = "", **attributes: Any) -> Iterator[dict[str, Any]]:
-    """Open a span around the work within; an exception marks it as failed.
-
-    Args:
-        parent: `traceparent` of the causing span (W3C trace context), from any process.
-        attributes: span attributes, named `graspd.{name}`.
-
-    Yields:
-        Dictionary whose entries become attributes at the end.
-    """
+    """Open a span around the work within; entries of the yielded dictionary become attributes at the end."""
     later: dict[str, Any] = {}
     if _tracer is None:
         yield later

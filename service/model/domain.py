@@ -397,11 +397,7 @@ class JobOptions(Model):
         return "kept" if self.counted == "feasible" and self.want == "candidates" else self.counted
 
     def rechecks_of(self, batch: int) -> int:
-        """Return the number of rechecks of a batch; longer and shorter jobs share their first batches.
-
-        A given number goes to the first batches. The default is spread over every other batch; every other job begins
-        with its first batch, so that datasets of short jobs are rechecked as well.
-        """
+        """Return the number of rechecks of a batch: of the first ones, or by default of every other batch."""
         if self.validation in ("none", "dexgraspbench"):
             return 0
         if self.rechecks == RECHECKS:

@@ -77,12 +77,7 @@ class ConflictError(InputError):
 
 
 class AssetError(InputError):
-    """A hand or an object cannot be used.
-
-    Args:
-        message: the problem, and the fix as options of the command line.
-        facts: findings before the error, for the report of a check.
-    """
+    """A hand or an object cannot be used; `facts` are findings before the error, for the report of a check."""
 
     def __init__(self, message: str = "", *, facts: Mapping[str, Any] | None = None) -> None:
         super().__init__(message)

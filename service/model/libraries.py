@@ -45,10 +45,7 @@ _ours = False
 
 
 def own_process() -> None:
-    """Declare this process as graspd's own: collections exclude imported objects, which stay until exit.
-
-    In a foreign process this would also retain its garbage.
-    """
+    """Declare this process as graspd's own: collections exclude imported objects, which stay until exit."""
     global _ours
     _ours = True
 

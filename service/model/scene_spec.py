@@ -144,12 +144,7 @@ class SceneSpec(Model):
 def parse_scene(
     text: str, *, faces: str = "drawn", touch: float | None = None, beside: Sequence[str] = ()
 ) -> SceneSpec:
-    """Parse a user's scene: one of `KINDS`, or a JSON or YAML file. `beside` are dropped neighbours.
-    For `faces` and `touch` see `SceneSpec` (None: as in the file).
-
-    Raises:
-        InputError: unknown kind, or unreadable or invalid file, in one line.
-    """
+    """Parse a user's scene: one of `KINDS`, or a file; None: `touch` of the file. InputError in one line."""
     if faces not in ("drawn", "all"):
         raise InputError(f"unknown faces {faces!r}; choose drawn or all")
     path = Path(text)
@@ -362,16 +357,7 @@ def known_name(text: str) -> str:
 def scene_option(
     text: str, *, beside: Path | None = None, named: Callable[[str], str] = known_name
 ) -> str | dict[str, Any]:
-    """Return the scene for a request from a user's text: the kind, or the document in a file.
-
-    Args:
-        text: one of `KINDS`, or a JSON or YAML file.
-        beside: folder of the file; None: the current one.
-        named: maps a neighbour in the file, a name or path, to a name of the service.
-
-    Raises:
-        InputError: as `parse_scene`.
-    """
+    """Return the scene for a request from a user's text; `named` maps a neighbour in a file to the service's name."""
     if text in KINDS:
         return text
     is_file = Path(text).suffix.lower() in SCENE_FILES

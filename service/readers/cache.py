@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import tempfile
 import time
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
@@ -15,7 +14,7 @@ from typing import Any, Final
 from graspd.service.model.errors import DamagedShard, InputError, NotFoundError
 from graspd.service.store.integrity import check_content, check_digest, gone
 from graspd.service.store.store import Store
-from graspd.service.user_cache import make_room
+from graspd.service.user_cache import make_room, write_whole
 
 DEFAULT_BYTES: Final = 20 << 30
 
@@ -36,10 +35,9 @@ class ShardCache:
     def fetch(self, store: Store, key: str, sha256: str) -> Path:
         """Return the local path of a file of the store, downloaded if necessary; DamagedShard if missing or damaged."""
         path = self.folder / f"{sha256}.h5"
-        if self._is_intact(path, sha256):
-            return path
-        self._download(store, key, sha256, path)
-        make_room(self.folder, path.suffix, self.limit_bytes, keep=path)
+        if not self._is_intact(path, sha256):
+            write_whole(path, self._checked(store, key, sha256))
+            make_room(self.folder, path.suffix, self.limit_bytes, keep=path)
         return path
 
     @staticmethod
@@ -53,21 +51,16 @@ class ShardCache:
             return False
         return True
 
-    def _download(self, store: Store, key: str, sha256: str, path: Path) -> None:
+    def _checked(self, store: Store, key: str, sha256: str) -> Iterator[bytes]:
         check_not_forked(store, self._process)
-        handle, name = tempfile.mkstemp(dir=self.folder, suffix=".part")
-        partial, digest = Path(name), hashlib.sha256()
+        digest = hashlib.sha256()
         try:
-            with os.fdopen(handle, "wb") as file:
-                for chunk in store.stream(key):
-                    digest.update(chunk)
-                    file.write(chunk)
-            check_digest(f"{store.url}/{key}", digest.hexdigest(), sha256)
-            partial.replace(path)
+            for chunk in store.stream(key):
+                digest.update(chunk)
+                yield chunk
         except NotFoundError:
             raise gone(f"{store.url}/{key}") from None
-        finally:
-            partial.unlink(missing_ok=True)
+        check_digest(f"{store.url}/{key}", digest.hexdigest(), sha256)
 
 
 def check_not_forked(store: Store, process: int) -> None:

@@ -84,17 +84,7 @@ class RangeReader:
             raise problem
 
     def read(self, key: str, wanted: Sequence[Range], row: int, further: Callable[[int], Sequence[Range]]) -> list[Any]:
-        """Return the bytes of some ranges, in their order.
-
-        Args:
-            row: row of the object to which the ranges belong.
-            further: maps another row number to its ranges; empty after the last row.
-
-        Raises:
-            DamagedShard: the object is missing.
-            InputError: this process was forked, see `check_not_forked`.
-            StoreUnavailable: the store does not answer.
-        """
+        """Return the bytes of some ranges of a row; `further` maps another row to its ranges, empty after the last."""
         held = self._of(key)
         with held.lock:
             if not all(_covers(held.spans, one) for one in wanted):

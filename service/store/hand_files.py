@@ -33,15 +33,8 @@ _ABOVE: Final = 4
 def files_of_hand(path: Path) -> tuple[dict[str, Path], str]:
     """Find a hand's files with relative names, and the name of its description (empty for a folder).
 
-    Links that lead out of the hand's folder are ignored.
-
-    Args:
-        path: the folder of a hand, or its description. With a description: the files that it names, and `DESCRIPTIONS`;
-            names are relative to the ROS package around it, or else to its own folder.
-
-    Raises:
-        InputError: a folder without a description.
-        LimitError: too many files.
+    With a description: the files that it names, relative to the ROS package around it or else to its own folder. Links
+    that lead out of the hand's folder are ignored.
     """
     files, main = (_of_folder(path), "") if path.is_dir() else _of_description(path)
     return files | _looks(files, path.resolve() if path.is_dir() else _package(path.resolve())), main
@@ -220,16 +213,7 @@ def text_of(data: bytes) -> str:
 
 
 def main_of(files: Mapping[str, bytes], wanted: str = "", *, where: str = "the hand") -> str:
-    """Return the name of the file that describes the hand.
-
-    Args:
-        files: all files of the hand.
-        wanted: the user's name for the file: its name, the end of its path, or its name without suffix.
-        where: description of the source, for messages.
-
-    Raises:
-        InputError: no file, several without `wanted`, or `wanted` matches none or several.
-    """
+    """Return the file that describes the hand; InputError if none, or several, fit `wanted`, a part of its name."""
     known = {name: kind for name in sorted(files) if (kind := format_of(name, _described_head(files, name)))}
     if wanted:
         return _named(wanted, [name for name in sorted(files) if name in known or name == wanted], where)

@@ -77,11 +77,7 @@ class CheckedObjects:
     def stream(self, key: str, sha256: str, start: int, length: int) -> Iterator[bytes]:
         """Yield bytes of an object; each block is read again and verified before any of it is returned.
 
-        The modification time does not reveal bit rot. The first block is verified at the call.
-
-        Raises:
-            DamagedShard: it does not match its checksum; also raised by the iterator, which then ends early.
-            StoreUnavailable: the store does not answer.
+        The modification time does not reveal bit rot. DamagedShard at the call or from the iterator, which ends early.
         """
         known = self._intact(key, sha256)
         end = min(known.size, start + length)

@@ -34,15 +34,9 @@ def publish_asset(
 def store_files(
     store: Store, kind: AssetKind, name: str, files: Mapping[str, bytes], said: Mapping[str, object] | None = None
 ) -> Asset:
-    """Store the archive of an asset, which does not exist for readers yet.
+    """Store the archive of an asset, which does not exist for readers yet; InputError for an invalid `asset.json`.
 
-    Args:
-        files: `asset.json` (names the main file) and all required files; private ones contain their project's mark
-            (`service.model.projects.marks_of`).
-        said: further fields of the record, such as `owner`, `project`, `shared`, `self_test`.
-
-    Raises:
-        InputError: `asset.json` is missing or invalid.
+    `said` are further fields of the record. Private files contain their project's mark (`service.model.projects`).
     """
     asset = describe(kind, name, files, created=timestamp()).model_copy(update=dict(said or {}))
     with tempfile.TemporaryFile() as archive:
@@ -64,11 +58,7 @@ def _is_damaged(store: Store, key: str) -> bool:
 
 
 def record_asset(store: Store, asset: Asset, put: Put | None = None) -> Asset:
-    """Write the record, with `put` if given; from now on the asset exists.
-
-    Raises:
-        ConflictError: the same content exists under another name, or is being removed.
-    """
+    """Write the record, with `put` if given; ConflictError if the content has another name, or is being removed."""
     record = names.asset_record(asset.kind, asset.digest)
     new = put(record, asset) if put is not None else put_record(store, record, asset)
     if store.exists(names.deletion(asset.kind.value, asset.digest)):

@@ -29,17 +29,10 @@ class Reference:
 
 
 def read_reference(written: str, base: str) -> Reference:
-    """Resolve a name, with either kind of slashes, and spaces or `%20`.
+    """Resolve a name, with either kind of slashes, and spaces or `%20`; InputError continues after the name.
 
     A ROS package may be packed with or without its folder and those above, and next to other packages.
     `package://NAME/a/b.stl` is NAME/a/b.stl, a/b.stl or b.stl, from the description's folder or from the top.
-
-    Args:
-        written: the name.
-        base: folder of the description.
-
-    Raises:
-        InputError: it leads out of the upload, or is not a file name; the message continues after the name.
     """
     text = written.strip().replace("\\", "/")
     found = _SCHEME.match(text)

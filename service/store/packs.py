@@ -51,13 +51,10 @@ def has_packs(store: Store) -> bool:
 
 
 def take_apart(store: Store) -> Iterator[ShardManifest]:
-    """Replace each pack by a file and a manifest per shard; yield the manifests.
+    """Replace each pack by a file and a manifest per shard; yield the manifests. An interrupted call can be repeated.
 
-    A pack is removed after its shards are stored, so an interrupted call can be repeated. Damaged packs are moved to
-    `damaged/`. For a damaged file only the manifest is stored, so that its replacement must match the checksum.
-
-    Raises:
-        StoreUnavailable: the store does not answer; repeat the call.
+    Damaged packs are moved to `damaged/`. For a damaged file only the manifest is stored, so that its replacement must
+    match the checksum.
     """
     keys = sorted(entry.key for entry in store.list(_FOLDER))
     for key in keys:

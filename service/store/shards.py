@@ -40,16 +40,9 @@ _UNREADABLE: Final = (OSError, KeyError, ValueError, TypeError, RuntimeError, Ov
 
 
 def write_shard(kind: ShardKind, arrays: Arrays, attributes: Mapping[str, Attribute]) -> bytes:
-    """Write a shard; return its HDF5 bytes.
+    """Write a shard; return its HDF5 bytes. InputError if a column or an attribute does not fit the schema.
 
-    Args:
-        kind: base, scene or views.
-        arrays: one array for each column of `SCHEMAS[kind]`; optional columns may be absent.
-        attributes: root attributes besides `schema`; `created` and `code_version` replace the current values;
-            `joint_names` is also an attribute of the joint datasets.
-
-    Raises:
-        InputError: a column is missing, unknown or of wrong rank, lengths differ, or an attribute is unknown.
+    `created` and `code_version` replace the current values; `joint_names` is also an attribute of the joint datasets.
     """
     check_columns(kind, arrays)
     check_attributes(kind, attributes)

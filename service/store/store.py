@@ -152,11 +152,6 @@ def open_store(url: str, *, public_endpoint: str | None = None, make: bool = Tru
         public_endpoint: S3 endpoint for clients. Without it, AWS_ENDPOINT_URL is taken as internal to the service's
             network: then downloads are not signed, and files go through the API.
         make: create a missing folder. For readers an empty folder is useless, and it would hide a mistyped path.
-
-    Raises:
-        NotFoundError: the folder is missing, and `make` is False.
-        InputError: unknown kind of URL.
-        StoreUnavailable: the folder cannot be created or written.
     """
     parts = urlsplit(url)
     if parts.scheme == "memory":
