@@ -83,8 +83,7 @@ class NeighbourSpec(Model):
 
     @model_validator(mode="after")
     def _turned(self) -> Self:
-        if self.pose is not None:
-            check_quaternion(self.pose)
+        check_quaternion(self.pose)
         return self
 
 
@@ -117,10 +116,9 @@ class SceneSpec(Model):
             raise ValueError("a free object lies on no face: choose table, bin or shelf")
         if self.kind == "free" and self.touch != TOUCH:
             raise ValueError("around a free object there is nothing to touch: choose table, bin or shelf")
-        if self.target is not None:
-            check_quaternion(self.target)
-            if self.faces == "all":
-                raise ValueError("a target with a pose lies on one face: faces all goes with a dropped target")
+        check_quaternion(self.target)
+        if self.target is not None and self.faces == "all":
+            raise ValueError("a target with a pose lies on one face: faces all goes with a dropped target")
         return self
 
     def told(self) -> dict[str, Any]:
@@ -157,13 +155,12 @@ def parse_scene(
     touch = found.touch if touch is None else touch
     if faces == found.faces and touch == found.touch and not beside:
         return found
-    more = [{"object": name} for name in beside]
     said = found.model_dump(exclude={"faces", "touch", "neighbours"})
+    others = [*(one.model_dump() for one in found.neighbours), *({"object": name} for name in beside)]
     try:
-        others = [*(one.model_dump() for one in found.neighbours), *more]
         return SceneSpec(**said, faces=faces, touch=touch, neighbours=others)
     except ValidationError as error:
-        raise InputError(f"scene {text}: {first_mistake(error)}") from None
+        raise InputError(f"scene {text}: {refusal(error)}") from None
 
 
 def read_scene(path: Path) -> SceneSpec:
@@ -177,15 +174,14 @@ def read_scene(path: Path) -> SceneSpec:
     if not isinstance(found, dict):
         raise InputError(f"the scene file {path} must hold one object with supports and a target")
     try:
-        return _found_from(path.parent, SceneSpec(**{"kind": "file", **found}))
+        spec = SceneSpec(**{"kind": "file", **found})
     except (ValidationError, TypeError) as error:
-        raise InputError(f"the scene file {path} is wrong: {first_mistake(error)}") from None
-
-
-def _found_from(folder: Path, spec: SceneSpec) -> SceneSpec:
+        said = refusal(error) if isinstance(error, ValidationError) else str(error)
+        raise InputError(f"the scene file {path} is wrong: {said}") from None
+    files = [path.parent / one.object for one in spec.neighbours]
     beside = tuple(
-        one.model_copy(update={"object": str(folder / one.object)}) if (folder / one.object).is_file() else one
-        for one in spec.neighbours
+        one.model_copy(update={"object": str(file)}) if file.is_file() else one
+        for one, file in zip(spec.neighbours, files, strict=True)
     )
     return spec.model_copy(update={"neighbours": beside})
 
@@ -203,14 +199,8 @@ def _loaded(text: str, path: Path) -> object:
         raise InputError(f"the scene file {path} is not {path.suffix[1:].upper()}: {reason[:200]}") from None
 
 
-def first_mistake(error: ValidationError | TypeError) -> str:
-    if isinstance(error, TypeError):
-        return str(error)
-    return refusal(error)
-
-
-def check_quaternion(pose: tuple[float, ...]) -> None:
-    if abs(math.hypot(*pose[3:]) - 1.0) > 1e-3:
+def check_quaternion(pose: Pose | None) -> None:
+    if pose is not None and abs(math.hypot(*pose[3:]) - 1.0) > 1e-3:
         raise ValueError("the quaternion w x y z of a pose must have unit length")
 
 
@@ -307,8 +297,7 @@ class SceneDocument(Model):
 
     @model_validator(mode="after")
     def _turned(self) -> Self:
-        if self.target is not None:
-            check_quaternion(self.target)
+        check_quaternion(self.target)
         return self
 
 
@@ -344,7 +333,7 @@ def scene_of(
             )
         return SceneSpec(kind=option, faces=faces, touch=touch, neighbours=tuple(beside))
     except ValidationError as error:
-        raise ValueError(first_mistake(error)) from None
+        raise ValueError(refusal(error)) from None
 
 
 def known_name(text: str) -> str:

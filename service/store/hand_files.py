@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from html import unescape
+from itertools import product
 from pathlib import Path, PurePosixPath
 from typing import Final, Literal
 
@@ -111,13 +112,7 @@ def _named_by(path: Path, root: Path) -> set[str]:
         folders |= {unescape(folder) for folder in _FOLDER.findall(text)}
         references |= {unescape(reference) for reference in _REFERENCE.findall(text)}
         # Names in an included file are relative to its folder or to that of the description, depending on the reader.
-        found = {
-            name
-            for reference in references
-            for base in bases
-            for folder in folders
-            for name in _names(reference, base, folder, root)
-        }
+        found = {name for parts in product(references, bases, folders) for name in _names(*parts, root)}
         for name in sorted(found):
             inner = (root / name).resolve()
             if inner.suffix.lower() in SUFFIXES and inner not in seen and len(seen) < _MAX_INCLUDED:
