@@ -86,7 +86,7 @@ def fitted_normals(
     rows = np.clip(row[:, None, None] + offset[:, None], 0, height - 1)
     columns = np.clip(column[:, None, None] + offset[None, :], 0, width - 1)
     centre = points[row, column]
-    window = points[rows, columns].reshape(len(row), -1, 3) - centre[:, None]
+    window = points[rows, columns].reshape(len(row), len(offset) ** 2, 3) - centre[:, None]
     with np.errstate(invalid="ignore"):
         counts = np.abs(window[..., 2]) <= gap_m[:, None]
     weight = counts.astype(float)

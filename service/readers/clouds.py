@@ -133,24 +133,16 @@ class Clouds(Sequence[dict[str, Any]]):
             pixel = pixel[draw.choice(seen, self.points, replace=False)]
         elif seen:  # each point appears at least once
             pixel = np.concatenate([pixel, pixel[draw.integers(seen, size=self.points - seen)]])
-        else:
-            empty = np.zeros((self.points, 3), np.float32)
-            none = np.zeros(self.points, np.uint8)
-            return {
-                "cloud/points": empty,
-                "cloud/normals": empty.copy(),
-                "cloud/object": none,
-                "cloud/pixel": np.zeros((self.points, 3), np.int32),
-                "cloud/seen": 0,
-            }
         normals = transforms.quat_rotate(into[3:], _of(views, pixel, CloudView.normals))
-        return {
+        cloud: dict[str, Any] = {
             "cloud/points": transforms.apply(into, _of(views, pixel, CloudView.points)).astype(np.float32),
             "cloud/normals": normals.astype(np.float32),
             "cloud/object": _of(views, pixel, CloudView.is_object).astype(np.uint8),
             "cloud/pixel": pixel.astype(np.int32),
-            "cloud/seen": seen,
         }
+        if not seen:
+            cloud = {name: np.zeros((self.points, *part.shape[1:]), part.dtype) for name, part in cloud.items()}
+        return cloud | {"cloud/seen": seen}
 
     def _graspness(self, views: Sequence[CloudView], pixel: Ints, scenes: Scenes, scene: int) -> Floats:
         """Compute graspness at the true points: noise changes the measured points, not the contacts."""
