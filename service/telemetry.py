@@ -109,7 +109,6 @@ _tracer: Any = None
 
 
 def set_up_tracing(process: str) -> None:
-    """Send the spans of this process to the exporter configured in the environment, if any."""
     global _tracer
     if not any(os.environ.get(name) for name in _ASKED_BY):
         return

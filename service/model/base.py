@@ -89,7 +89,6 @@ def range_words(bounds: Mapping[str, float]) -> str:
 
 
 def words(entry: Mapping[str, Any]) -> str:
-    """Format one entry of `ValidationError.errors()` without its location."""
     facts = entry.get("ctx", {})
     message = _SUBJECT.sub(lambda found: "" if found[1] else "must ", entry["msg"])
     if facts.get("pattern") == NAME:

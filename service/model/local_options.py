@@ -93,7 +93,6 @@ class LocalOptions(MeshOptions, JobOptions):
 
     @property
     def mesh(self) -> dict[str, Any]:
-        """Options for reading the object's mesh, as keys of its `asset.json`."""
         given = self.model_fields_set & MeshOptions.model_fields.keys()
         return {name: value for name in sorted(given) if (value := getattr(self, name))}
 

@@ -59,7 +59,6 @@ class GraspMetric:
 
     @property
     def limits(self) -> tuple[float | None, float | None]:
-        """The bounds; None: unbounded."""
         low, high = (bound if math.isfinite(bound) else None for bound in self.bounds)
         return low, high
 

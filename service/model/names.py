@@ -49,7 +49,6 @@ def asset_model(kind: AssetKind, digest: str) -> str:
 
 
 def object_prepared(digest: str, key: str) -> str:
-    """Return the key of a repaired and simplified object; `key` is a digest of the parameters."""
     return f"{ASSETS}/{AssetKind.OBJECT.value}/{digest}/prepared/{key}.npz"
 
 

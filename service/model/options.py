@@ -74,7 +74,6 @@ class Row:
 
     @property
     def meaning(self) -> str:
-        """Description for values typed by a user."""
         return self.option.typed or self.field.description or ""
 
     @property

@@ -265,7 +265,6 @@ OUTCOMES: Final = {
 
 
 def totals(parts: Iterable[Mapping[str, int]]) -> dict[str, int]:
-    """Sum several counts by outcome; positive ones, in the order of `OUTCOMES`."""
     found: dict[str, int] = dict.fromkeys(OUTCOMES, 0)
     for part in parts:
         for name, count in part.items():

@@ -26,7 +26,6 @@ class ProjectScope:
     everything: bool = True
 
     def sees(self, project: str) -> bool:
-        """Check whether the jobs and datasets of a project are visible."""
         return self.everything or project == self.project
 
 

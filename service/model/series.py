@@ -65,7 +65,6 @@ def field(name: str, *labels: str) -> str:
 
 
 def parse_field(text: str) -> tuple[str, tuple[str, ...]] | None:
-    """Return series and label values of a sum; None if the name is unknown."""
     try:
         name, *labels = from_json(text)
     except (ValueError, TypeError):

@@ -123,7 +123,6 @@ class Clouds(Sequence[dict[str, Any]]):
         return sample | self._labels(scenes, first.scene, views[0].extrinsics, into) | first.names
 
     def _cloud(self, views: Sequence[CloudView], draw: np.random.Generator, into: Floats) -> dict[str, Any]:
-        """Draw P of the points that the views see, in the sample's frame."""
         found = [view.pixels(whole=self._whole) for view in views]
         pixel = np.concatenate([np.stack([np.full(len(row), v), row, col], 1) for v, (row, col) in enumerate(found)])
         if self._voxel:

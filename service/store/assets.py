@@ -41,7 +41,6 @@ def pack(files: Mapping[str, bytes]) -> bytes:
 
 
 def pack_into(files: Mapping[str, bytes], target: IO[bytes]) -> None:
-    """Write that ZIP to a file, in pieces for files outside memory."""
     with zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED, compresslevel=6) as archive:
         for name in sorted(files):
             entry = zipfile.ZipInfo(check_path(name), _EPOCH)
@@ -165,7 +164,6 @@ def _entries(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
 
 
 def _measure_entry(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, limit: int) -> tuple[int, str]:
-    """Return size (up to `limit`) and digest of an entry, read in pieces."""
     count, digest = 0, hashlib.sha256()
     with _damage_said(entry), archive.open(entry) as stream:
         while count < limit and (piece := stream.read(min(_PIECE_BYTES, limit - count))):

@@ -180,7 +180,6 @@ _NAMED: Final = re.compile(r"iso-?8859|latin|windows-12|cp12|gb|big5|shift|euc|k
 
 
 def format_of(name: str, data: bytes) -> Format | None:
-    """Detect the format of a file; None if it does not describe a robot."""
     suffix = PurePosixPath(name).suffix.lower()
     if suffix not in SUFFIXES:
         return None

@@ -274,7 +274,6 @@ def _damaged(key: str) -> DamagedError:
 
 
 def _without_digits(chunk: bytes, at: int) -> bytes:
-    """Replace the digits in a chunk by zeros; they begin at offset `at`."""
     first, last = max(0, at), min(len(chunk), at + len(_ZEROS))
     return chunk if first >= last else chunk[:first] + b"0" * (last - first) + chunk[last:]
 

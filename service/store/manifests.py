@@ -197,7 +197,6 @@ def load_manifest(store: Store, stage: Stage, shard: str) -> ShardManifest:
 
 
 def load_shard(store: Store, stage: Stage, shard: str) -> Shard:
-    """Load a finished shard; DamagedShard if its file is missing or does not match the manifest."""
     manifest = load_manifest(store, stage, shard)
     return read_shard(read_checked(store, manifest.key, manifest.sha256), kind=manifest.kind, name=manifest.key)
 

@@ -106,7 +106,6 @@ def sizes(joints: int) -> dict[str, tuple[int, ...]]:
 
 
 def weight_shapes(joints: int) -> dict[str, tuple[int, ...]]:
-    """Return name and shape of each weight array for a hand with this many moving joints."""
     count = numbers(joints)
     layers = {f"encoder.{i}": (out, into) for i, (into, out) in enumerate(pairwise(ENCODER))}
     layers["encoder.out"] = (FEATURE, ENCODER[-1])
@@ -137,7 +136,6 @@ def to_bytes(network: ProposalNetwork) -> bytes:
 
 
 def read_file(path: Path) -> bytes:
-    """Read the bytes of a possible network file; LimitError above `MAX_BYTES`."""
     try:
         with Path(path).open("rb") as file:
             data = file.read(MAX_BYTES + 1)
@@ -259,7 +257,6 @@ def network_bytes(files: Mapping[str, bytes], what: str) -> bytes:
 
 
 def network_report(files: Mapping[str, bytes], name: str) -> dict[str, Any]:
-    """Return the check's report of a usable network; InputError for others."""
     data = network_bytes(files, name)
     network = from_bytes(data, name)
     joints = len(network.joint_names)

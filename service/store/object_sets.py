@@ -102,7 +102,6 @@ def _rank(name: str) -> tuple[int, str]:
 
 
 def _name(text: str, taken: Mapping[str, str]) -> str:
-    """Return an unused name that the service accepts; a shortened name is logged."""
     name = fitted(re.sub(r"[^A-Za-z0-9._-]+", "_", text).lstrip("._-") or "object", 60)
     number = 2
     while name in taken:

@@ -120,7 +120,6 @@ def load_snapshot(store: Store, dataset: str, digest: str) -> Snapshot:
 
 
 def newest_snapshot(store: Store, dataset: str, digest: str | None = None) -> Snapshot:
-    """Load the newest snapshot of a dataset, or the one with a digest; NotFoundError if there is none."""
     if digest is not None:
         return load_snapshot(store, dataset, digest)
     taken = _records(Snapshot, store, names.dataset_snapshots(dataset))
