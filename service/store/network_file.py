@@ -43,6 +43,8 @@ POSE: Final = 12
 _META: Final = "meta"
 #: Fields of a network in its JSON text.
 _SHARED: Final = ("hand", "hand_digest", "joint_names", "points", "steps", "about")
+#: Exceptions for bytes that are no archive of arrays.
+_BROKEN: Final = (OSError, ValueError, EOFError, KeyError, MemoryError, RuntimeError, zipfile.BadZipFile, zlib.error)
 #: A text array takes four bytes per character; each array has a header.
 _MOST_META: Final = 4 * (64 << 10)
 _HEADER: Final = 4096
@@ -157,16 +159,7 @@ def from_bytes(data: bytes, what: str) -> ProposalNetwork:
             if found != sorted(f"{name}.npy" for name in [_META, *expected]):
                 raise InputError(f"{what}: its arrays are not those of {SCHEMA}: {_difference(found, expected)}")
             arrays = {name: _read(archive, name, shape, what) for name, shape in expected.items()}
-    except (
-        OSError,
-        ValueError,
-        EOFError,
-        KeyError,
-        MemoryError,
-        RuntimeError,
-        zipfile.BadZipFile,
-        zlib.error,
-    ) as error:
+    except _BROKEN as error:
         raise InputError(f"{what} is no .npz file of {SCHEMA}: {error}") from None
     _check(arrays, joints, what)
     for array in arrays.values():
