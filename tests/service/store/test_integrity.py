@@ -59,26 +59,23 @@ def test_a_harmed_shard_is_refused_with_its_name(
             read()
 
 
-def test_a_file_beside_its_manifest_is_checked_against_it(tmp_path: Path, store: Store, shard: ShardManifest) -> None:
-    path = tmp_path / "store" / shard.key
-    assert read_shard(path)["grasp/hand_pose"].shape == (32, 7)
-    # Of the attributes only the manifest knows what they were.
-    overwrite(store, shard.key, store.get(shard.key).replace(b"gripper", b"grapper"))
-    with pytest.raises(DamagedShard, match=shard.shard_id):
-        read_shard(path)
-
-
-@pytest.mark.parametrize("name", ["SHA256SUMS", "checksums.sha256"])
-def test_a_file_of_an_export_is_checked_against_its_list(
-    tmp_path: Path, store: Store, shard: ShardManifest, name: str
-) -> None:
+def test_a_file_is_checked_against_its_manifest_or_list(tmp_path: Path, store: Store, shard: ShardManifest) -> None:
+    stored, exported = tmp_path / "store" / shard.key, tmp_path / "out" / "hand" / "object" / "base-00000.h5"
     data = store.get(shard.key)
-    path = tmp_path / "out" / "hand" / "object" / "base-00000.h5"
-    path.parent.mkdir(parents=True)
-    (tmp_path / "out" / name).write_text(f"{hashlib.sha256(data).hexdigest()}  hand/object/base-00000.h5\n")
-    path.write_bytes(data.replace(b"gripper", b"grapper"))
-    with pytest.raises(DamagedShard, match="base-00000"):
-        read_shard(path)
+    assert read_shard(stored)["grasp/hand_pose"].shape == (32, 7)
+    # Of the attributes only the manifest or a list knows what they were.
+    harmed = data.replace(b"gripper", b"grapper")
+    overwrite(store, shard.key, harmed)
+    with pytest.raises(DamagedShard, match=shard.shard_id):
+        read_shard(stored)
+    exported.parent.mkdir(parents=True)
+    for name in ("SHA256SUMS", "checksums.sha256"):
+        listed = tmp_path / "out" / name
+        listed.write_text(f"{hashlib.sha256(data).hexdigest()}  hand/object/base-00000.h5\n")
+        exported.write_bytes(harmed)
+        with pytest.raises(DamagedShard, match="base-00000"):
+            read_shard(exported)
+        listed.unlink()
 
 
 def test_a_file_that_stands_alone_knows_its_own_values(tmp_path: Path, store: Store, shard: ShardManifest) -> None:
@@ -101,35 +98,26 @@ def test_a_file_that_cannot_be_read_is_refused_in_one_line(tmp_path: Path, store
             assert "\n" not in str(error), at
 
 
-def turn_in_secret(tmp_path: Path, key: str, at: int) -> None:
-    """Another byte, and the time of change kept."""
-    path = tmp_path / "store" / key
-    facts = path.stat()
-    path.write_bytes(flipped(path.read_bytes(), at))
-    os.utime(path, ns=(facts.st_atime_ns, facts.st_mtime_ns))
-
-
-def test_bytes_that_turned_in_secret_are_not_given(tmp_path: Path, store: Store, shard: ShardManifest) -> None:
-    checked = CheckedObjects(store)
-    checked.check(shard.key, shard.sha256)
-    turn_in_secret(tmp_path, shard.key, 100)
-    with pytest.raises(DamagedShard, match=shard.shard_id):
-        checked.stream(shard.key, shard.sha256, 50, 10)
-    with pytest.raises(DamagedShard):
-        checked.check(shard.key, shard.sha256)
-
-
-def test_a_large_file_is_cut_off_before_what_turned(tmp_path: Path, store: Store) -> None:
+@pytest.mark.parametrize(("turned", "given"), [(100, 0), (2_200_000, 2 << 20)])
+def test_bytes_that_turned_in_secret_are_not_given(tmp_path: Path, store: Store, turned: int, given: int) -> None:
     data = bytes(range(256)) * 10_000
     store.put("large.bin", data)
     digest, checked = hashlib.sha256(data).hexdigest(), CheckedObjects(store)
     assert b"".join(checked.stream("large.bin", digest, 0, len(data))) == data
     assert b"".join(checked.stream("large.bin", digest, 1_000_000, 100_000)) == data[1_000_000:1_100_000]
-    turn_in_secret(tmp_path, "large.bin", 2_200_000)
+    path = tmp_path / "store" / "large.bin"
+    facts = path.stat()
+    path.write_bytes(flipped(data, turned))
+    os.utime(path, ns=(facts.st_atime_ns, facts.st_mtime_ns))
+    if not given:  # told before the first byte of an answer
+        with pytest.raises(DamagedShard, match="some of its bytes turned"):
+            checked.stream("large.bin", digest, 50, 100)
     got = list[bytes]()
     with pytest.raises(DamagedShard):
         got.extend(checked.stream("large.bin", digest, 0, len(data)))
-    assert b"".join(got) == data[: 2 << 20]
+    assert b"".join(got) == data[:given]
+    with pytest.raises(DamagedShard):
+        checked.check("large.bin", digest)
 
 
 #: Columns valid, feasible and success of a grasp (None: absent), and whether it is valid, or feasible and unvalidated.
