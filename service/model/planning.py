@@ -75,20 +75,15 @@ def ranges_of(grasps: int, span: int) -> int:
 def plan(job: JobRecord, ranges: range | None = None) -> Iterator[PlannedTask]:
     """Yield the tasks of a job, for all ranges or some, each range in the order of its stages."""
     request = job.request
+    digests = {"hand_digest": job.hand_digest, "object_digest": job.object_digest}
     for number in ranges if ranges is not None else range(ranges_of(request.grasps, job.span)):
         batch = number * job.span
         count = min(job.span * BATCH_SIZE, request.grasps - batch * BATCH_SIZE)
         inputs: tuple[str, ...] = ()
         for stage in stages_of(request):
+            revision = job.revisions[stage]
             output = shard_id(
-                stage,
-                request=request,
-                hand_digest=job.hand_digest,
-                object_digest=job.object_digest,
-                batch=batch,
-                count=count,
-                revision=job.revisions[stage],
-                inputs=inputs,
+                stage, request=request, batch=batch, count=count, revision=revision, inputs=inputs, **digests
             )
             yield PlannedTask(task_id(job.id, stage, batch), stage, batch, count, inputs, output)
             inputs = (output,)
