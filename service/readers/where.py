@@ -29,6 +29,7 @@ _OPERATORS: Final[dict[str, Callable[[Any, Any], Any]]] = {
     "=": operator.eq,
     "!=": operator.ne,
 }
+_STATUSES: Final = {"valid": validity.valid, "feasible": validity.feasible, "validated": validity.validated}
 #: Columns of flags; 1 means true.
 _FLAGS: Final = {"held": "quality/success", "lift": "quality/lift_outcome", "lift_hard": "quality/lift_hard"}
 
@@ -60,12 +61,8 @@ def _mask(node: Node, columns: Mapping[str, Array], said: Mapping[str, Any]) -> 
 
 
 def _flag(name: str, columns: Mapping[str, Array]) -> Mask:
-    if name == "valid":
-        return validity.valid(columns)
-    if name == "feasible":
-        return validity.feasible(columns)
-    if name == "validated":
-        return np.asarray(columns.get("quality/success", np.full(len(columns["quality/valid"]), -1))) >= 0
+    if name in _STATUSES:
+        return _STATUSES[name](columns)
     path = _FLAGS[name]
     return np.asarray(columns[path]) == 1 if path in columns else np.zeros(len(columns["quality/valid"]), bool)
 
