@@ -121,12 +121,6 @@ def _verdict_text(request: JobRequest, batches: range) -> dict[str, object]:
 
 def job_id(request: JobRequest, hand_digest: str, object_digest: str, project: str = "") -> str:
     """Return the id of a job: equal requests on equal hand and object in one project are one job."""
-    return digest_json(
-        {
-            "request": original(request.model_dump(mode="json")),
-            "hand": hand_digest,
-            "object": object_digest,
-            "revisions": STAGE_REVISIONS,
-            **({"project": project} if project else {}),
-        }
-    )
+    wanted = original(request.model_dump(mode="json"))
+    said = {"request": wanted, "hand": hand_digest, "object": object_digest, "revisions": STAGE_REVISIONS}
+    return digest_json(said | ({"project": project} if project else {}))

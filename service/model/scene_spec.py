@@ -321,17 +321,12 @@ def scene_of(
 ) -> SceneSpec:
     """Return the scene of a request, with more neighbours than its document has; ValueError if they do not fit."""
     try:
-        if isinstance(option, SceneDocument):
-            touch = option.touch if touch == TOUCH else touch
-            return SceneSpec(
-                kind="file",
-                supports=option.supports,
-                target=option.target,
-                faces=faces,
-                touch=touch,
-                neighbours=(*option.neighbours, *beside),
-            )
-        return SceneSpec(kind=option, faces=faces, touch=touch, neighbours=tuple(beside))
+        if not isinstance(option, SceneDocument):
+            return SceneSpec(kind=option, faces=faces, touch=touch, neighbours=tuple(beside))
+        touch = option.touch if touch == TOUCH else touch
+        others = (*option.neighbours, *beside)
+        spec = {"kind": "file", "supports": option.supports, "target": option.target, "neighbours": others}
+        return SceneSpec(**spec, faces=faces, touch=touch)
     except ValidationError as error:
         raise ValueError(refusal(error)) from None
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import operator
 from collections.abc import Callable, Mapping
 from functools import reduce
+from operator import and_, eq, ge, gt, le, lt, ne, or_
 from typing import Any, Final
 
 import numpy as np
@@ -21,14 +21,7 @@ Mask = NDArray[np.bool_]
 Test = Callable[[Mapping[str, Array], Mapping[str, Any]], Mask]
 
 _METRICS: Final = {metric.name: metric for metric in GRASP_METRICS}
-_OPERATORS: Final[dict[str, Callable[[Any, Any], Any]]] = {
-    "<": operator.lt,
-    "<=": operator.le,
-    ">": operator.gt,
-    ">=": operator.ge,
-    "=": operator.eq,
-    "!=": operator.ne,
-}
+_OPERATORS: Final = {"<": lt, "<=": le, ">": gt, ">=": ge, "=": eq, "!=": ne}
 _STATUSES: Final = {"valid": validity.valid, "feasible": validity.feasible, "validated": validity.validated}
 #: Columns of flags; 1 means true.
 _FLAGS: Final = {"held": "quality/success", "lift": "quality/lift_outcome", "lift_hard": "quality/lift_hard"}
@@ -43,7 +36,7 @@ def parse(text: str) -> Test:
 def _mask(node: Node, columns: Mapping[str, Array], said: Mapping[str, Any]) -> Mask:
     count = len(columns["quality/valid"])
     if isinstance(node, Connective):
-        join = operator.or_ if node.word == "or" else operator.and_
+        join = or_ if node.word == "or" else and_
         return reduce(join, (_mask(part, columns, said) for part in node.parts))
     if isinstance(node, Negation):
         return ~_mask(node.part, columns, said)

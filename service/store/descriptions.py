@@ -142,14 +142,9 @@ def facts_of(model: bytes) -> HandFacts:
 
 def described(facts: Mapping[str, Any]) -> dict[str, Any]:
     """Return found or guessed values as keys of `asset.json`: root, palm, pre-shape, closing, fingertips."""
-    root = facts["root"]
-    return {
-        "root": root,
-        "palm": {"link": root, "centre": facts["palm_centre"], "approach": facts["palm_approach"]},
-        "preshape": facts["preshape"],
-        "closing": facts["closing"],
-        "fingertips": facts["fingertips"],
-    }
+    palm = {"link": facts["root"], "centre": facts["palm_centre"], "approach": facts["palm_approach"]}
+    same = {name: facts[name] for name in ("preshape", "closing", "fingertips")}
+    return {"root": facts["root"], "palm": palm, **same}
 
 
 def corrected(said: Mapping[str, Any], facts: HandFacts, corrections: HandCorrections) -> dict[str, Any]:

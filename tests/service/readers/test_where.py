@@ -33,6 +33,7 @@ SAID = {"hand": "allegro", "object": "006_mustard_bottle"}
         ("(epsilon = 0.3 or epsilon != 0.1) and valid", [1]),
         ("valid and lift", [0, 2]),
         ("lift and not held", [3]),
+        ("not validated", []),
         ("type = power or type = 'lateral'", [0, 2]),
         ("hand = allegro and object = 006_mustard_bottle and penetration_depth_mm < 1", [0, 2]),
         ("hand != allegro", []),
