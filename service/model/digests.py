@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from abc import abstractmethod
-from collections.abc import Iterable, Mapping, MutableMapping
-from contextlib import AbstractContextManager
-from typing import IO, Final
+from collections.abc import Iterable, Mapping
+from typing import Final
 
 from graspd.service.model.domain import JobRequest, batches_of
 from graspd.service.model.metrics import MIN_DISTANCE_M
@@ -30,24 +28,8 @@ def digest_json(value: object) -> str:
     return digest_bytes(text.encode())
 
 
-class StreamedFiles(MutableMapping[str, bytes]):
-    """Named files outside memory, with known digests."""
-
-    @abstractmethod
-    def digest(self, name: str) -> str:
-        """Return `digest_bytes` of a file."""
-
-    @abstractmethod
-    def size(self, name: str) -> int:
-        """Return the size of a file [bytes]."""
-
-    @abstractmethod
-    def open(self, name: str) -> AbstractContextManager[IO[bytes]]:
-        """Open a file for reading in pieces."""
-
-
 def digest_files(kind: AssetKind, files: Mapping[str, bytes]) -> str:
-    if isinstance(files, StreamedFiles):
+    if hasattr(files, "digest"):  # an archive on disk (`service.store.assets.ZipFiles`)
         digests = {name: files.digest(name) for name in files}
     else:
         digests = {name: digest_bytes(data) for name, data in files.items()}

@@ -7,13 +7,13 @@ import io
 import shutil
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, MutableMapping
 from contextlib import contextmanager
 from importlib import resources
 from pathlib import Path, PurePosixPath
 from typing import IO, Final, Literal, Self, TypeVar
 
-from graspd.service.model.digests import StreamedFiles, digest_bytes, digest_files
+from graspd.service.model.digests import digest_bytes, digest_files
 from graspd.service.model.domain import Asset
 from graspd.service.model.errors import InputError, LimitError, NotFoundError
 from graspd.service.model.states import AssetKind
@@ -45,7 +45,7 @@ def pack_into(files: Mapping[str, bytes], target: IO[bytes]) -> None:
         for name in sorted(files):
             entry = zipfile.ZipInfo(check_path(name), _EPOCH)
             entry.compress_type = zipfile.ZIP_DEFLATED
-            if isinstance(files, StreamedFiles):
+            if isinstance(files, ZipFiles):
                 with files.open(name) as source, archive.open(entry, "w") as packed:
                     shutil.copyfileobj(source, packed, _PIECE_BYTES)
             else:
@@ -84,7 +84,7 @@ def without_common_folder(files: dict[str, _T]) -> dict[str, _T]:
     return files
 
 
-class ZipFiles(StreamedFiles):
+class ZipFiles(MutableMapping[str, bytes]):
     """Files of a ZIP on disk, unpacked in pieces on demand; digests are of the true contents. Files can be added."""
 
     def __init__(self, file: IO[bytes], *, limit_bytes: int) -> None:
@@ -227,7 +227,7 @@ def describe(kind: AssetKind, name: str, files: Mapping[str, bytes], *, created:
         digest=digest_files(kind, files),
         filename=main,
         files=tuple(sorted(files)),
-        size_bytes=sum(files.size(name) if isinstance(files, StreamedFiles) else len(files[name]) for name in files),
+        size_bytes=sum(files.size(name) if isinstance(files, ZipFiles) else len(files[name]) for name in files),
         created=created,
         builtin=builtin,
         facts=described.facts,
@@ -237,7 +237,7 @@ def describe(kind: AssetKind, name: str, files: Mapping[str, bytes], *, created:
 def asset_json(files: Mapping[str, bytes]) -> bytes:
     if "asset.json" not in files:
         raise InputError("asset.json, a JSON object that names the main file, is not among the files")
-    if isinstance(files, StreamedFiles) and files.size("asset.json") > MAX_BYTES:
+    if isinstance(files, ZipFiles) and files.size("asset.json") > MAX_BYTES:
         raise InputError(f"asset.json has more than {MAX_BYTES} bytes; leave out what is not needed")
     return files["asset.json"]
 

@@ -11,9 +11,8 @@ from itertools import product
 from pathlib import Path, PurePosixPath
 from typing import Final, Literal
 
-from graspd.service.model.digests import StreamedFiles
 from graspd.service.model.errors import InputError, LimitError
-from graspd.service.store.assets import MAX_FILES
+from graspd.service.store.assets import MAX_FILES, ZipFiles
 from graspd.service.store.mesh_files import HEAD_BYTES, MESHES, beside, named_by, one_like, read_reference
 
 #: Descriptions that supplement a hand's URDF; the first takes precedence.
@@ -270,7 +269,7 @@ def hand_name(leaf: str) -> str:
 def _described_head(files: Mapping[str, bytes], name: str) -> bytes:
     if PurePosixPath(name).suffix.lower() not in SUFFIXES:
         return b""
-    if isinstance(files, StreamedFiles) and files.size(name) > 1 << 23:
+    if isinstance(files, ZipFiles) and files.size(name) > 1 << 23:
         with files.open(name) as stream:
             return stream.read(_HEAD_BYTES)
     return files[name]
