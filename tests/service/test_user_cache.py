@@ -48,6 +48,8 @@ def test_the_longest_unused_entries_go_when_it_is_full(tmp_path: Path) -> None:
         os.utime(tmp_path / f"{k}.npz", (k, k))
     user_cache.keep(tmp_path / "new.npz", bytes(1000), limit_bytes=3200)
     assert sorted(file.name for file in tmp_path.glob("*.npz")) == ["2.npz", "3.npz", "new.npz"]
+    user_cache.keep(tmp_path / "large.npz", bytes(5000), limit_bytes=3200)
+    assert [file.name for file in tmp_path.glob("*.npz")] == ["large.npz"]
 
 
 def test_it_lies_where_the_environment_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
