@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import posixpath
 import re
 from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
@@ -84,10 +85,7 @@ def _common(owners: Mapping[tuple[str, ...], list[str]]) -> tuple[str, ...]:
     folders = list(owners)
     if len(folders) == 1:
         return folders[0][:-1] if _variants(owners[folders[0]]) else folders[0]
-    shared = 0
-    while all(len(o) > shared for o in folders) and len({o[shared] for o in folders}) == 1:
-        shared += 1
-    return folders[0][:shared]
+    return PurePosixPath(posixpath.commonpath(["/".join(folder) for folder in folders])).parts
 
 
 def _variants(names: list[str]) -> bool:
