@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from graspd.service.index.views import AttemptView, GraspView, ShardView, StageProgress, TagView, Validated, WorkerView
-from graspd.service.model.base import TagName
-from graspd.service.model.domain import Digest, JobRequest
+from graspd.service.model.base import Digest, TagName
+from graspd.service.model.domain import JobRequest
 from graspd.service.model.metric_fields import OfferedName, filters, means, with_fields
 from graspd.service.model.metrics import AXIS_WORDS, DIRECTION_CELLS
 from graspd.service.model.records import Choice

@@ -145,7 +145,7 @@ def _write_scene(
     np.save(path / "camera_poses.npy", np.array([poses[view % len(some)] for view in range(VIEWS)]))
     for view, look in enumerate(some):
         sample = pictures[look.index]
-        steps = CloudView.of(sample, noise, np.random.default_rng(look.index)).seen * FACTOR
+        steps = CloudView(sample, noise, np.random.default_rng(look.index)).seen * FACTOR
         steps = np.where(steps < np.iinfo(np.uint16).max + 0.5, np.rint(steps), 0)
         export_png(path / "depth_gt" / f"{view:04}.png", steps.astype(np.uint16))
         labels = np.maximum(np.asarray(sample["image/segmentation"], int) - (OBJECT - 1), 0).astype(np.uint8)

@@ -86,7 +86,7 @@ def looks(pictures: Pictures) -> Iterator[PictureReference]:
         if camera["camera/eye"] == RIGHT:
             continue
         extrinsics = np.asarray(camera["camera/extrinsics"], float)
-        found = pictures.scenes_of(place).grasps(place.scene, extrinsics)
+        found = pictures.scenes_of(place.scene_shard).grasps(place.scene, extrinsics)
         pose = compose(invert(pose_from_matrix(extrinsics)), found["object/pose"])
         rows = np.asarray(found["grasp/base_row"], np.intp)
         yield PictureReference(index, found["base_id"], place.file.id, place.scene, extrinsics, pose, rows)
@@ -98,7 +98,7 @@ RIGHT: Final = 2
 
 def object_points(sample: Mapping[str, Any], index: int, noise: DepthNoise | None) -> Floats:
     """Return (P, 3) object points of a picture in the table's frame [m]; its index seeds the noise."""
-    view = CloudView.of(sample, noise, np.random.default_rng(index))
+    view = CloudView(sample, noise, np.random.default_rng(index))
     return view.points(*view.pixels(whole=False))
 
 

@@ -55,10 +55,7 @@ def reporting_errors(command: Callable[P, R]) -> Callable[P, R]:
 
 
 def at_the_door(command: Callable[[], object]) -> None:
-    """Run the whole command line; report system errors (no space, no permission, closed pipe) in one line.
-
-    Other exceptions are bugs of graspd and keep their trace.
-    """
+    """Run the command line; report system errors in one line. Other exceptions are bugs and keep their trace."""
     for descriptor in range(3):
         try:
             os.fstat(descriptor)
@@ -100,7 +97,6 @@ def _refusal(error: OSError | MemoryError) -> str:
 
 
 def _silence(stream: TextIO | None) -> None:
-    """Prevent Python's error message about a closed stream at exit."""
     with contextlib.suppress(OSError, ValueError):
         if stream is not None:
             os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
@@ -145,7 +141,6 @@ def told_to_stop() -> Iterator[list[int]]:
 
 
 def fail(message: str, code: int) -> NoReturn:
-    """Print an error on stderr and exit with this code."""
     typer.echo(f"graspd: {' '.join(message.split())}", err=True)
     raise typer.Exit(code)
 
@@ -158,11 +153,6 @@ def plain_console(*, stderr: bool = False) -> Console:
 
 
 def plain_table(*headings: str, whole: Collection[str] = ()) -> Table:
-    """Return a table that truncates nothing at 80 columns: long names wrap.
-
-    Args:
-        whole: columns whose cells stay on one line, such as ids and times.
-    """
     from rich.table import Table
 
     table = Table(box=None, header_style="bold", padding=(0, 2, 0, 0))
@@ -172,7 +162,6 @@ def plain_table(*headings: str, whole: Collection[str] = ()) -> Table:
 
 
 def emit(value: BaseModel | dict[str, Any]) -> None:
-    """Print one JSON object on one line of stdout."""
     plain = value.model_dump(mode="json") if isinstance(value, BaseModel) else value
     typer.echo(json.dumps(plain, allow_nan=False, default=str))
 
@@ -192,16 +181,12 @@ def load_settings(**overrides: Any) -> Settings:
 
 @dataclass(frozen=True)
 class EngineSettings:
-    """Settings of a command that plans and validates in its own process, with defaults."""
-
     prefilter: Literal["auto", "on", "off"] = "auto"
     processes: int = 0
 
 
 def engine_settings() -> EngineSettings:
-    """Load them from the environment; InputError for a bad value. The module of settings is imported only
-    if one is set: that takes as long as loading hand and object together.
-    """
+    """Load them from the environment; the module of settings, slow to import, only if one is set."""
     if not any(name.upper().startswith("GRASPD_") for name in os.environ):
         return EngineSettings()
     found = load_settings()
@@ -209,17 +194,13 @@ def engine_settings() -> EngineSettings:
 
 
 def log_to_stderr(settings: Settings, process: str = "graspd") -> None:
-    """Configure this process's log lines: JSON, or text on a terminal."""
     from graspd.service import telemetry
 
     telemetry.set_up_logs(settings, process)
 
 
 def keep_private(settings: Settings) -> None:
-    """Restrict files of this process and its children to their user, and an open data folder too.
-
-    They contain requests, results and hashes of keys; those of an older graspd were readable by all users.
-    """
+    """Restrict files of this process and its children, and a data folder that others can read, to their user."""
     os.umask(0o077)
     with contextlib.suppress(OSError):
         status = settings.data_dir.stat()

@@ -16,8 +16,6 @@ from graspd.service.model.options import EVERYWHERE, ModelT, Place, Row, accepte
 
 
 def with_options(model: type[BaseModel], place: Place) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Replace a command's parameter `options` by one option per row; the command receives the given ones."""
-
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
         @functools.wraps(command)
         def wrapper(**given: Any) -> None:

@@ -7,50 +7,55 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Final
 
 from graspd.service.model.domain import JobOptions
 from graspd.service.model.local_options import LocalOptions
 from graspd.service.model.options import Place, Row, keywords_of, rows
-from graspd.service.model.series import series_table
+from graspd.service.model.series import SERIES
 from graspd.service.settings import Settings
 from graspd.service.store.columns import ATTRIBUTES, SCHEMAS, ShardKind
 
 
+def _table(headings: str, rows: Iterable[Iterable[object]]) -> str:
+    names = headings.split(", ")
+    lines = [names, ["---"] * len(names), *rows]
+    return "\n".join(f"| {' | '.join(map(str, line))} |" for line in lines)
+
+
 def schema_table(kind: ShardKind) -> str:
-    """Return the Markdown table of a shard's datasets."""
-    lines = ["| dataset | shape | type | unit | frame | meaning |", "| --- | --- | --- | --- | --- | --- |"]
-    for path, column in SCHEMAS[kind].items():
-        shape = ", ".join(column.shape.split())
-        absent = " *(may be absent)*" if column.optional else ""
-        lines.append(
-            f"| `{path}` | ({shape}) | {column.dtype} | {column.units} | {column.frame} "
-            f"| {column.description}{absent} |"
-        )
-    return "\n".join(lines)
+    absent = {True: " *(may be absent)*", False: ""}
+    cells = (
+        (f"`{path}`", f"({', '.join(c.shape.split())})", c.dtype, c.units, c.frame, c.description + absent[c.optional])
+        for path, c in SCHEMAS[kind].items()
+    )
+    return _table("dataset, shape, type, unit, frame, meaning", cells)
 
 
 def attributes_table() -> str:
-    """Return the Markdown table of the shards' root attributes."""
-    lines = ["| attribute | of | type | meaning |", "| --- | --- | --- | --- |"]
-    for name, one in ATTRIBUTES.items():
-        lines.append(f"| `{name}` | {', '.join(one.kinds)} | {one.type} | {one.description} |")
-    return "\n".join(lines)
+    cells = ((f"`{name}`", ", ".join(one.kinds), one.type, one.description) for name, one in ATTRIBUTES.items())
+    return _table("attribute, of, type, meaning", cells)
 
 
 def settings_table() -> str:
-    """Return the Markdown table of the environment variables."""
-    lines = ["| variable | default | meaning |", "| --- | --- | --- |"]
-    for name, field in Settings.model_fields.items():
-        default = "" if field.default is None else f"`{field.default}`"
-        lines.append(f"| `GRASPD_{name.upper()}` | {default} | {field.description} |")
-    return "\n".join(lines)
+    cells = (
+        (f"`GRASPD_{name.upper()}`", "" if field.default is None else f"`{field.default}`", field.description)
+        for name, field in Settings.model_fields.items()
+    )
+    return _table("variable, default, meaning", cells)
+
+
+def series_table() -> str:
+    cells = (
+        (f"`{one.name}`", one.kind, ", ".join(f"`{label}`" for label in one.labels), one.meaning, one.source)
+        for one in SERIES.values()
+    )
+    return _table("series, type, labels, meaning, from", cells)
 
 
 def options_table() -> str:
-    """Return the Markdown tables of the options of jobs and of runs in this process, basic ones first."""
     job, local = rows(JobOptions, "job"), rows(LocalOptions, "synth")
     same = {row.name for row in local if any(_cells(row) == _cells(other) for other in job)}
     found = [(row, "both" if row.name in same else "job") for row in job]
@@ -59,14 +64,13 @@ def options_table() -> str:
     found.sort(key=lambda one: order.index(one[0].name))
     tables = []
     for group in ("basic", "advanced"):
-        lines = [f"## {group.capitalize()}", "", "| option | command line | of | default | bounds | meaning |"]
-        lines += ["| --- | --- | --- | --- | --- | --- |"]
-        for row, where in found:
-            if row.option.group == group:
-                default, bounds, meaning = _cells(row)
-                flags = ", ".join(f"`{flag}`" for flag in row.flags)
-                lines.append(f"| `{row.name}` | {flags} | {where} | {default} | {bounds} | {meaning} |")
-        tables.append("\n".join(lines))
+        cells = (
+            (f"`{row.name}`", ", ".join(f"`{flag}`" for flag in row.flags), where, *_cells(row))
+            for row, where in found
+            if row.option.group == group
+        )
+        table = _table("option, command line, of, default, bounds, meaning", cells)
+        tables.append(f"## {group.capitalize()}\n\n{table}")
     return "\n\n".join(tables)
 
 
@@ -76,7 +80,6 @@ def _cells(row: Row) -> tuple[str, str, str]:
 
 
 def keywords_stub() -> str:
-    """Return type stubs for keywords of `graspd.synthesize` and `graspd.Client.submit` (`**options`)."""
     parts = [
         '"""Keywords that follow from the options; `python -m graspd.service.docs` writes them."""\n',
         "from collections.abc import Mapping, Sequence",
@@ -107,7 +110,6 @@ STUB: Final = "graspd/keywords.pyi"
 
 
 def renewed(text: str) -> str:
-    """Return the page with every marked part regenerated."""
     for name, make in PARTS.items():
         pattern = re.compile(rf"(<!-- {name} -->\n).*?(<!-- /{name} -->)", re.DOTALL)
         text = pattern.sub(lambda found, make=make: f"{found[1]}{make()}\n{found[2]}", text)  # type: ignore[misc]
@@ -115,7 +117,6 @@ def renewed(text: str) -> str:
 
 
 def main(root: Path) -> None:
-    """Regenerate all pages and type stubs of a checkout."""
     for page in PAGES:
         path = root / page
         path.write_text(renewed(path.read_text()))

@@ -16,11 +16,7 @@ IMAGE: Final = "image"
 
 
 def arrow() -> Any:
-    """Import pyarrow.
-
-    Raises:
-        InputError: it is not installed.
-    """
+    """Import pyarrow; InputError if it is not installed."""
     try:
         import pyarrow
         import pyarrow.parquet
@@ -49,11 +45,7 @@ def schema_of(columns: Mapping[str, str], also: Mapping[str, str] | None = None)
 
 
 def write(file: Path, schema: Any, groups: Iterable[Sequence[Mapping[str, Any]]]) -> int:
-    """Write rows, each group of them as one row group.
-
-    Returns:
-        Number of rows.
-    """
+    """Write rows, each group of them as one row group; return their number."""
     pa = arrow()
     file.parent.mkdir(parents=True, exist_ok=True)
     count = 0
@@ -65,11 +57,7 @@ def write(file: Path, schema: Any, groups: Iterable[Sequence[Mapping[str, Any]]]
 
 
 def read(file: Path, wanted: Iterable[str]) -> dict[str, list[Any]]:
-    """Read the wanted columns that a file has.
-
-    Raises:
-        InputError: pyarrow is absent, it is not a Parquet file, or these columns unpack to more than `LARGEST`.
-    """
+    """Read the wanted columns that a file has; InputError if it is no Parquet file or larger than `LARGEST`."""
     pa = arrow()
     try:
         with pa.parquet.ParquetFile(file) as found:

@@ -1,12 +1,7 @@
-"""Telemetry of every process: log lines, OpenTelemetry spans, heartbeat file for health checks.
-
-Log lines are JSON for machines, and text on a terminal. `bind` sets the context of a piece of work; every line logged
-within contains it, from any module.
-"""
+"""Telemetry of every process: log lines, OpenTelemetry spans, heartbeat file for health checks."""
 
 from __future__ import annotations
 
-import copy
 import json
 import logging
 import os
@@ -44,16 +39,11 @@ def bind(**subjects: Any) -> Iterator[None]:
 
 
 def bound(subject: str) -> str:
-    """Return a bound subject, e.g. `bound("request")`; empty if not bound."""
     return str(_bound.get().get(subject, ""))
 
 
 def set_up_logs(settings: Settings, process: str = "graspd") -> None:
-    """Log the lines of this process to stderr.
-
-    Args:
-        process: its name in every JSON line, e.g. api, controller, worker.
-    """
+    """Log the lines of this process to stderr; `process` is its name in JSON lines."""
     is_text = settings.log_format == "text" or (settings.log_format == "auto" and sys.stderr.isatty())
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(_TextLines() if is_text else JsonLines(process))
@@ -87,32 +77,22 @@ class JsonLines(logging.Formatter):
 
 
 class _TextLines(logging.Formatter):
-    """Time, level, module, message, and the subjects in brackets."""
-
     def format(self, record: logging.LogRecord) -> str:
-        record = _plain(record)
         about = " ".join(f"{name}={value}" for name, value in _subjects(record).items())
         trace = f"\n{self.formatException(record.exc_info)}" if record.exc_info else ""
-        text = f"{_time(record)[11:23]} {record.levelname} {record.name} {record.getMessage()}"
+        message = record.getMessage().translate(_OBEYED)
+        text = f"{_time(record)[11:23]} {record.levelname} {record.name} {message}"
         return without_secrets(f"{text} [{about}]{trace}" if about else f"{text}{trace}")
 
 
-#: Characters that end a line or control a terminal.
+#: Characters that end a line or control a terminal: foreign paths and names must not forge lines.
 _OBEYED: Final = {
     code: repr(chr(code))[1:-1]
     for code in (*range(0x20), *range(0x7F, 0xA0), 0x2028, 0x2029, *range(0x202A, 0x202F), *range(0x2066, 0x206A))
 }
 
 
-def _plain(record: logging.LogRecord) -> logging.LogRecord:
-    """Return the record with a one-line message, so that foreign paths and names cannot forge lines."""
-    made = copy.copy(record)
-    made.msg, made.args = record.getMessage().translate(_OBEYED), ()
-    return made
-
-
 def _subjects(record: logging.LogRecord) -> dict[str, Any]:
-    """Return the subjects bound to the record's context, and those given with the line."""
     found = dict(_bound.get())
     found.update((name, vars(record)[name]) for name in SUBJECTS if name in vars(record))
     return {name: found[name] for name in SUBJECTS if found.get(name)}
@@ -128,49 +108,27 @@ _ASKED_BY: Final = ("OTEL_EXPORTER_OTLP_ENDPOINT", "OTEL_EXPORTER_OTLP_TRACES_EN
 _tracer: Any = None
 
 
-def set_up_tracing(process: str, *, exporter: Any = None) -> None:
-    """Send the spans of this process to the exporter configured in the environment, if any.
-
-    Args:
-        process: name of the process: api or worker; the spans' service is `graspd-{process}`.
-        exporter: replaces the configured one.
-    """
+def set_up_tracing(process: str) -> None:
     global _tracer
-    if exporter is None and not any(os.environ.get(name) for name in _ASKED_BY):
+    if not any(os.environ.get(name) for name in _ASKED_BY):
         return
     try:
         from opentelemetry.exporter.otlp.proto.http.trace_exporter import OTLPSpanExporter
         from opentelemetry.sdk.resources import Resource
         from opentelemetry.sdk.trace import TracerProvider
-        from opentelemetry.sdk.trace.export import BatchSpanProcessor, SimpleSpanProcessor
+        from opentelemetry.sdk.trace.export import BatchSpanProcessor
     except ImportError:
         log.warning("no traces are sent: run `pip install 'graspd[otel]'`, or unset %s", _ASKED_BY[0])
         return
     resource = Resource.create({"service.name": os.environ.get("OTEL_SERVICE_NAME", f"graspd-{process}")})
     provider = TracerProvider(resource=resource)
-    provider.add_span_processor(
-        SimpleSpanProcessor(exporter) if exporter is not None else BatchSpanProcessor(OTLPSpanExporter())
-    )
+    provider.add_span_processor(BatchSpanProcessor(OTLPSpanExporter()))
     _tracer = provider.get_tracer("graspd")
-
-
-def stop() -> None:
-    """Stop making spans."""
-    global _tracer
-    _tracer = None
 
 
 @contextmanager
 def span(name: str, *, parent: str = "", **attributes: Any) -> Iterator[dict[str, Any]]:
-    """Open a span around the work within; an exception marks it as failed.
-
-    Args:
-        parent: `traceparent` of the causing span (W3C trace context), from any process.
-        attributes: span attributes, named `graspd.{name}`.
-
-    Yields:
-        Dictionary whose entries become attributes at the end.
-    """
+    """Open a span around the work within; entries of the yielded dictionary become attributes at the end."""
     later: dict[str, Any] = {}
     if _tracer is None:
         yield later
@@ -185,7 +143,6 @@ def span(name: str, *, parent: str = "", **attributes: Any) -> Iterator[dict[str
 
 
 def traceparent() -> str:
-    """Return the W3C trace context of the current span; empty without one."""
     if _tracer is None:
         return ""
     from opentelemetry.trace.propagation.tracecontext import TraceContextTextMapPropagator
@@ -203,7 +160,6 @@ class HeartbeatFile:
     """File touched at most every few seconds, regardless of the number of calls."""
 
     def __init__(self, path: Path | None) -> None:
-        """`path` is None if no check reads it."""
         self._path = path
         self._again = 0.0
 

@@ -13,6 +13,7 @@ import os
 import shutil
 import stat
 import tempfile
+from collections.abc import Iterable
 from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
@@ -26,10 +27,7 @@ _LIMIT_BYTES: Final = 2 << 30
 
 
 def folder(name: str) -> Path:
-    """Return the folder of one kind of entries: `$XDG_CACHE_HOME/graspd/NAME`, by default in `~/.cache`.
-
-    If that is not writable, use a private folder among the temporary files and log it once.
-    """
+    """Return the folder of one kind of entries, in `$XDG_CACHE_HOME/graspd`, else a private temporary one."""
     return _root(os.environ.get("XDG_CACHE_HOME", ""), os.environ.get("HOME", ""), tempfile.gettempdir()) / name
 
 
@@ -49,18 +47,18 @@ def load(file: Path) -> bytes | None:
 def keep(file: Path, content: bytes, *, limit_bytes: int = _LIMIT_BYTES) -> None:
     """Write an entry; remove the least recently used ones of its folder above `limit_bytes`."""
     with suppress(OSError):
-        write_whole(file, hashlib.sha256(content).digest() + content)
+        write_whole(file, [hashlib.sha256(content).digest(), content])
         make_room(file.parent, file.suffix, limit_bytes, keep=file)
 
 
-def write_whole(file: Path, content: bytes) -> None:
-    """Write a file atomically, and create its folder if necessary. Raises OSError."""
+def write_whole(file: Path, pieces: Iterable[bytes]) -> None:
+    """Write a file atomically, and create its folder; nothing if the iteration raises."""
     file.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(dir=file.parent, suffix=".part")
     partial = Path(name)
     try:
         with os.fdopen(handle, "wb") as opened:
-            opened.write(content)
+            opened.writelines(pieces)
         partial.replace(file)
     finally:
         partial.unlink(missing_ok=True)

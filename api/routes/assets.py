@@ -28,7 +28,7 @@ from graspd.api.routes.dependencies import (
 )
 from graspd.api.uploads import files_of_upload, name_of_upload
 from graspd.service.index.views import AssetView, Page
-from graspd.service.model.domain import Name
+from graspd.service.model.base import Name
 from graspd.service.model.errors import InputError, RateError
 from graspd.service.model.states import AssetKind
 from graspd.service.store.descriptions import HandCorrections

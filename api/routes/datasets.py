@@ -12,7 +12,7 @@ from starlette.types import Receive, Scope, Send
 from graspd.api.problems import ApiError, responses
 from graspd.api.routes.dependencies import READ, SUBMIT, DatasetsOf, PagingOf
 from graspd.service.index.views import CellView, DatasetView, ObjectSetView, Page, SnapshotView
-from graspd.service.model.domain import Name
+from graspd.service.model.base import Name
 from graspd.service.model.records import Snapshot
 from graspd.service.model.states import State
 from graspd.service.pipeline.datasets.estimate import Estimate

@@ -13,8 +13,8 @@ import typer
 from pydantic import Field, model_validator
 
 from graspd.service.command_options import pairs
-from graspd.service.model.base import why
-from graspd.service.model.domain import JobOptions, Name
+from graspd.service.model.base import Name, why
+from graspd.service.model.domain import JobOptions
 from graspd.service.model.errors import InputError
 from graspd.service.model.options import accepted
 from graspd.service.model.scene_spec import known_name, scene_option

@@ -57,11 +57,7 @@ _CHOICES: Final = re.compile(r"'(?P<word>.*?)' is not one of (?P<expected>'.*')"
 def refusal(
     error: ValidationError, model: type[BaseModel] | None = None, names: Mapping[str, str] | None = None
 ) -> str:
-    """Return the first error after its location: `scene.touch: must be at least -1`.
-
-    With the model, the message states the whole range: `share: must be more than 0 and at most 1; got 3`. `names` maps
-    fields to the caller's spelling: `--share: must be ...`.
-    """
+    """Return the first error after its location: `scene.touch: must be at least -1`; with a model, the whole range."""
     first = error.errors(include_url=False)[0]
     # For a union of models, pydantic adds the name of the one it validated.
     place = [str(part) for part in first["loc"] if not _CLASS.match(str(part))]
@@ -83,19 +79,16 @@ def bounds_of(field: FieldInfo) -> dict[str, float]:
 
 
 def _metadata(annotation: object) -> list[object]:
-    """Return the metadata of an Annotated."""
     inner = get_args(annotation)[1:] if get_origin(annotation) is Annotated else ()
     return [part for one in inner for part in (one.metadata if isinstance(one, FieldInfo) else (one,))]
 
 
 def range_words(bounds: Mapping[str, float]) -> str:
-    """Format bounds as a phrase: `must be at least 0 and at most 3`."""
     said = [_WORDS[name].format(**{key: f"{bounds[key]:.12g}"}) for name, key in _BOUNDS.items() if key in bounds]
     return " and ".join([*said[:1], *(words.removeprefix("must be ") for words in said[1:])])
 
 
 def words(entry: Mapping[str, Any]) -> str:
-    """Format one entry of `ValidationError.errors()` without its location."""
     facts = entry.get("ctx", {})
     message = _SUBJECT.sub(lambda found: "" if found[1] else "must ", entry["msg"])
     if facts.get("pattern") == NAME:

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from abc import abstractmethod
-from collections.abc import Iterable, Mapping, MutableMapping
-from contextlib import AbstractContextManager
-from typing import IO, Final
+from collections.abc import Iterable, Mapping
+from typing import Final
 
 from graspd.service.model.domain import JobRequest, batches_of
 from graspd.service.model.metrics import MIN_DISTANCE_M
@@ -30,25 +28,8 @@ def digest_json(value: object) -> str:
     return digest_bytes(text.encode())
 
 
-class StreamedFiles(MutableMapping[str, bytes]):
-    """Named files outside memory, with known digests."""
-
-    @abstractmethod
-    def digest(self, name: str) -> str:
-        """Return `digest_bytes` of a file."""
-
-    @abstractmethod
-    def size(self, name: str) -> int:
-        """Return the size of a file [bytes]."""
-
-    @abstractmethod
-    def open(self, name: str) -> AbstractContextManager[IO[bytes]]:
-        """Open a file for reading in pieces."""
-
-
 def digest_files(kind: AssetKind, files: Mapping[str, bytes]) -> str:
-    """Return the digest of a set of named files, independent of their order."""
-    if isinstance(files, StreamedFiles):
+    if hasattr(files, "digest"):  # an archive on disk (`service.store.assets.ZipFiles`)
         digests = {name: files.digest(name) for name in files}
     else:
         digests = {name: digest_bytes(data) for name, data in files.items()}
@@ -71,10 +52,7 @@ def shard_id(
     revision: int,
     inputs: Iterable[str] = (),
 ) -> str:
-    """Return the id of the shard that a stage makes from its inputs.
-
-    Only inputs that affect the result count: scenes after the grasps do not change them, views do not change scenes.
-    """
+    """Return the id of the shard that a stage makes from its inputs: only those that affect the result count."""
     inputs_of: dict[str, object] = {
         "stage": stage,
         "revision": revision,
@@ -106,7 +84,6 @@ def shard_id(
 
 
 def _verdict_text(request: JobRequest, batches: range) -> dict[str, object]:
-    """Return the inputs that decide the selection of grasps in some batches and their measurements."""
     found: dict[str, object] = {}
     if request.want == "valid":
         found |= {"want": request.want, "budget": request.budget}
@@ -126,12 +103,6 @@ def _verdict_text(request: JobRequest, batches: range) -> dict[str, object]:
 
 def job_id(request: JobRequest, hand_digest: str, object_digest: str, project: str = "") -> str:
     """Return the id of a job: equal requests on equal hand and object in one project are one job."""
-    return digest_json(
-        {
-            "request": original(request.model_dump(mode="json")),
-            "hand": hand_digest,
-            "object": object_digest,
-            "revisions": STAGE_REVISIONS,
-            **({"project": project} if project else {}),
-        }
-    )
+    wanted = original(request.model_dump(mode="json"))
+    said = {"request": wanted, "hand": hand_digest, "object": object_digest, "revisions": STAGE_REVISIONS}
+    return digest_json(said | ({"project": project} if project else {}))

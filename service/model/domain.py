@@ -12,10 +12,7 @@ from typing import Annotated, Any, ClassVar, Final, Literal, Self
 
 from pydantic import ConfigDict, Field, field_validator, model_validator
 
-from graspd.service.model.base import DIGEST, Model
-from graspd.service.model.base import Digest as Digest
-from graspd.service.model.base import Name as Name
-from graspd.service.model.base import Word as Word
+from graspd.service.model.base import DIGEST, Digest, Model, Name
 from graspd.service.model.fidelity import AUTO, OFFERED, Fidelity, resolve_fidelity
 from graspd.service.model.matter import FRICTION, MASS_KG, MOST_KG, Density, Friction, Mass
 from graspd.service.model.metrics import MIN_DISTANCE_M, MOST_ROBUST_MODELS, ROBUST_MODELS
@@ -280,15 +277,6 @@ class JobOptions(Model):
         # Sorted: the order of channels must not make another job.
         return tuple(name for name in EXTRA_CHANNELS if name in value)
 
-    @model_validator(mode="after")
-    def _auto_needs_a_target(self) -> Self:
-        if self.fidelity == AUTO and not self.target:
-            example = "lift>=0.9" if self.in_scene else "gsr>=0.6"
-            raise ValueError(f"fidelity auto needs a target, such as {example}")
-        if self.target and self.fidelity != AUTO:
-            raise ValueError("a target goes with fidelity auto")
-        return self
-
     @model_validator(mode="before")
     @classmethod
     def _some_scenes(cls, data: Any) -> Any:
@@ -297,7 +285,12 @@ class JobOptions(Model):
         return data
 
     @model_validator(mode="after")
-    def _one_mass(self) -> Self:
+    def _consistent(self) -> Self:
+        if self.fidelity == AUTO and not self.target:
+            example = "lift>=0.9" if self.in_scene else "gsr>=0.6"
+            raise ValueError(f"fidelity auto needs a target, such as {example}")
+        if self.target and self.fidelity != AUTO:
+            raise ValueError("a target goes with fidelity auto")
         if self.mass is not None and self.density is not None:
             raise ValueError("mass and density both: give one of them")
         if self.validation == "dexgraspbench" and self.matter:
@@ -305,58 +298,43 @@ class JobOptions(Model):
                 f"validation dexgraspbench gives all objects {MASS_KG:g} kg and friction "
                 f"{FRICTION:g}: {', '.join(self.matter)} goes with standard, fast or none"
             )
+        self._check_scene()
+        if self.views and not self.scenes:
+            raise ValueError("views need scenes: ask for scenes >= 1")
+        if self.validation == "none":
+            self._check_without_validation()
         return self
 
-    @model_validator(mode="after")
-    def _planned_in_its_scene(self) -> Self:
-        if self.place.kind == "free":
-            return self
-        if self.method in FREE_ONLY_METHODS:
-            raise ValueError(f"method {self.method} plans around free objects only: with a scene take fast_graspd")
-        if self.robustness:
-            raise ValueError("robustness repeats the six pushes of free grasps: it goes with scene free")
-        return self
-
-    @model_validator(mode="after")
-    def _shaken_when_lifted(self) -> Self:
-        if self.SUBMITTED and self.shake and not self.in_scene:
+    def _check_scene(self) -> None:
+        if self.place.kind != "free":
+            if self.method in FREE_ONLY_METHODS:
+                raise ValueError(f"method {self.method} plans around free objects only: with a scene take fast_graspd")
+            if self.robustness:
+                raise ValueError("robustness repeats the six pushes of free grasps: it goes with scene free")
+        if not self.SUBMITTED:
+            return
+        if self.shake and not self.in_scene:
             raise ValueError(SHAKE_NEEDS_A_SCENE)
-        return self
-
-    @model_validator(mode="after")
-    def _proposed_on_a_table(self) -> Self:
-        if not self.SUBMITTED or self.method not in NETWORK_METHODS:
-            return self
-        if not self.network:
+        if self.method in NETWORK_METHODS and not self.network:
             raise ValueError(f"method {self.method} needs the option network: the name of one that the service keeps")
-        if not has_table(self.place):
+        if self.method in NETWORK_METHODS and not has_table(self.place):
             raise ValueError(
                 f"method {self.method} proposes grasps of things on a table: choose scene table or bin, or a document "
                 "with a level half-space"
             )
-        return self
 
-    @model_validator(mode="after")
-    def _views_need_scenes(self) -> Self:
-        if self.views and not self.scenes:
-            raise ValueError("views need scenes: ask for scenes >= 1")
-        return self
-
-    @model_validator(mode="after")
-    def _noise_needs_validation(self) -> Self:
-        if self.robustness and self.validation == "none":
+    def _check_without_validation(self) -> None:
+        if self.robustness:
             raise ValueError("robustness counts verdicts: choose a validator")
-        if self.models and self.validation == "none":
+        if self.models:
             raise ValueError("robust counts verdicts: choose a validator")
-        if self.measures_payload and self.validation == "none":
+        if self.measures_payload:
             raise ValueError("payload is what the validator sees lifted: choose one")
-        if self.shake and self.validation == "none":
+        if self.shake:
             raise ValueError("shake is of what the validator sees lifted: choose one")
-        return self
 
     @property
     def measures_payload(self) -> bool:
-        """Whether to measure the payload of each valid grasp."""
         return self.payload or self.min_payload > 0
 
     @property
@@ -372,7 +350,6 @@ class JobOptions(Model):
 
     @property
     def place(self) -> SceneSpec:
-        """The scene."""
         return scene_of(self.scene, faces=self.faces, touch=self.touch, beside=self._dropped)
 
     @property
@@ -387,7 +364,6 @@ class JobOptions(Model):
         return (*placed, *self._dropped)
 
     def with_beside(self, found: Sequence[NamedNeighbour]) -> Self:
-        """Return a copy with other neighbours, in the order of `beside`."""
         if not found:
             return self
         first = len(self.beside) - len(self.neighbours)
@@ -403,7 +379,6 @@ class JobOptions(Model):
 
     @property
     def in_scene(self) -> bool:
-        """Whether grasps are planned in their scene; otherwise they can be put into scenes afterwards."""
         return self.scene != "free"
 
     @property
@@ -418,18 +393,11 @@ class JobOptions(Model):
 
     @property
     def standing(self) -> Literal["valid", "feasible", "kept"]:
-        """Grasps counted in tables: valid ones, or without validation all stored ones.
-
-        Those are feasible unless candidates were wanted.
-        """
+        """Grasps counted in tables: valid ones, or without validation all stored ones."""
         return "kept" if self.counted == "feasible" and self.want == "candidates" else self.counted
 
     def rechecks_of(self, batch: int) -> int:
-        """Return the number of rechecks of a batch; longer and shorter jobs share their first batches.
-
-        A given number goes to the first batches. The default is spread over every other batch; every other job begins
-        with its first batch, so that datasets of short jobs are rechecked as well.
-        """
+        """Return the number of rechecks of a batch: of the first ones, or by default of every other batch."""
         if self.validation in ("none", "dexgraspbench"):
             return 0
         if self.rechecks == RECHECKS:
@@ -439,7 +407,6 @@ class JobOptions(Model):
 
     @property
     def _first_turn(self) -> int:
-        """Offset of a job in the cycle of rechecks."""
         named = [getattr(self, name, "") for name in ("hand", "object")]
         return zlib.crc32("/".join([*named, str(self.seed)]).encode()) % _RECHECK_EVERY
 
@@ -454,7 +421,6 @@ class JobRequest(JobOptions):
 
 
 def batches_of(grasps: int) -> int:
-    """Return the number of batches for a number of grasps."""
     return -(-grasps // BATCH_SIZE)
 
 

@@ -33,7 +33,7 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, ClassVar, Final, Self
 
 #: Line breaks with surrounding space (all those of `str.splitlines`) and control characters.
@@ -77,12 +77,7 @@ class ConflictError(InputError):
 
 
 class AssetError(InputError):
-    """A hand or an object cannot be used.
-
-    Args:
-        message: the problem, and the fix as options of the command line.
-        facts: findings before the error, for the report of a check.
-    """
+    """A hand or an object cannot be used; `facts` are findings before the error, for the report of a check."""
 
     def __init__(self, message: str = "", *, facts: Mapping[str, Any] | None = None) -> None:
         super().__init__(message)
@@ -90,14 +85,7 @@ class AssetError(InputError):
 
     @classmethod
     def with_fixes(cls, problem: str, hint: str, *fixes: Mapping[str, Any], **facts: Any) -> Self:
-        """Make an error with fixes as options; `problem` and `options_suggested` suit any front end.
-
-        Args:
-            problem: the problem.
-            hint: the fixes as options of the command line.
-            fixes: keys of `asset.json` with their values; None: the user chooses the value.
-            facts: further facts.
-        """
+        """Make an error with fixes as options of commands (`hint`) and as keys of `asset.json` (None: any value)."""
         return cls(f"{problem}; {hint}", facts={"problem": problem, "options_suggested": list(fixes), **facts})
 
 
@@ -213,34 +201,15 @@ class TaskRefused(TaskError):
     slug, title = "task-refused", "The task was refused"
 
 
+def _below(kind: type[GraspdError]) -> Iterator[type[GraspdError]]:
+    for one in kind.__subclasses__():
+        yield one
+        yield from _below(one)
+
+
 #: Errors by problem type, for the client and the reference page.
-ERRORS: Final[dict[str, type[GraspdError]]] = {
-    error.slug: error
-    for error in (
-        InputError,
-        NotFoundError,
-        ConflictError,
-        MeshError,
-        HandError,
-        SceneError,
-        LoadError,
-        LimitError,
-        QuotaError,
-        UnavailableError,
-        QueueUnavailable,
-        StoreUnavailable,
-        IndexUnavailable,
-        IndexDamaged,
-        RateError,
-        BusyError,
-        DamagedError,
-        DamagedShard,
-        TaskError,
-        TaskCancelled,
-        TaskRefused,
-        GraspdError,
-    )
-}
+ERRORS: Final = {error.slug: error for error in _below(GraspdError) if error is not AssetError}
+ERRORS[GraspdError.slug] = GraspdError
 
 #: User and password of a URL, up to the last @: an unquoted password may contain an @ or a slash.
 _LOGIN: Final = re.compile(r"(?<=://)[^/\s\"'<>][^\s\"'<>]*@")
@@ -276,6 +245,5 @@ def did_you_mean(word: str, choices: Iterable[str]) -> str:
 
 
 def one_of(word: str, choices: Iterable[str]) -> str:
-    """Return `A, B, C` and the most similar choice."""
     known = list(choices)
     return f"{', '.join(known)}{did_you_mean(word, known)}"

@@ -97,11 +97,7 @@ OFFERED: Final = ("draft", "standard", "fine")
 
 
 def resolve_fidelity(value: str | Fidelity) -> Fidelity:
-    """Return the settings of a named fidelity.
-
-    Raises:
-        ValueError: the name is not in `FIDELITIES`.
-    """
+    """Return the settings of a named fidelity; ValueError if there is none."""
     if isinstance(value, Fidelity):
         return value
     if value not in FIDELITIES:

@@ -17,13 +17,7 @@ from pathlib import Path
 
 @lru_cache(maxsize=64)
 def version_of(library: str) -> str:
-    """Return the version of an installed distribution.
-
-    It is read from the folder's name: importing `importlib.metadata` takes longer than loading a hand.
-
-    Raises:
-        importlib.metadata.PackageNotFoundError: it is not installed.
-    """
+    """Return the version of an installed distribution, from its folder's name: `importlib.metadata` is slow."""
     wanted = re.sub(r"[-_.]+", "_", library).lower()
     for place in sys.path:
         found = [version for name, version in _distributions(place) if name == wanted]
@@ -38,7 +32,6 @@ def version_of(library: str) -> str:
 
 @lru_cache(maxsize=16)
 def _distributions(place: str) -> list[tuple[str, str]]:
-    """Return folder names and versions of the distributions in an entry of `sys.path`."""
     try:
         names = [found.name for found in Path(place or ".").iterdir()]
     except OSError:
@@ -52,17 +45,13 @@ _ours = False
 
 
 def own_process() -> None:
-    """Declare this process as graspd's own: collections exclude imported objects, which stay until exit.
-
-    In a foreign process this would also retain its garbage.
-    """
+    """Declare this process as graspd's own: collections exclude imported objects, which stay until exit."""
     global _ours
     _ours = True
 
 
 @contextmanager
 def imports() -> Iterator[None]:
-    """Context for imports without garbage collection."""
     collects = gc.isenabled()
     gc.disable()
     try:

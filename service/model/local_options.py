@@ -80,7 +80,6 @@ class LocalOptions(MeshOptions, JobOptions):
 
     @property
     def knobs(self) -> Fidelity:
-        """Settings of the fidelity, with another contact solver if given."""
         knobs, solver = FIDELITIES[self.fidelity], self.contact_solver
         if solver is None:
             return knobs
@@ -94,19 +93,11 @@ class LocalOptions(MeshOptions, JobOptions):
 
     @property
     def mesh(self) -> dict[str, Any]:
-        """Options for reading the object's mesh, as keys of its `asset.json`."""
         given = self.model_fields_set & MeshOptions.model_fields.keys()
         return {name: value for name in sorted(given) if (value := getattr(self, name))}
 
     def request(self, options: dict[str, Any]) -> JobOptions:
-        """Return the job without its place and without rechecks.
-
-        Args:
-            options: options of the method, with digests for files.
-
-        Raises:
-            InputError: an option is neither a number nor a short text.
-        """
+        """Return the job without its place and rechecks. `options` has digests for files; InputError for a bad one."""
         shared = {name: getattr(self, name) for name in JobOptions.model_fields.keys() - _OF_PLACE}
         # Rechecks sample many jobs; a single file can be validated under the DexGraspBench protocol completely.
         return accepted(JobOptions, shared | {"fidelity": self.knobs, "options": options, "rechecks": 0})

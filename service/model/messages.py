@@ -69,5 +69,4 @@ class IngestMessage(Model):
 
 
 def message_type(raw: Mapping[str, Any]) -> type[TaskMessage | IngestMessage]:
-    """Return the type of a message from its stage."""
     return IngestMessage if raw.get("stage") == Stage.INGEST else TaskMessage

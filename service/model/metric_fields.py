@@ -20,7 +20,6 @@ else:
 
 
 def values(*, optional: bool, default: Any = ...) -> dict[str, Any]:
-    """Return model fields for the indexed metrics: those that every shard has, or the optional ones."""
     # Manifests list the sorted metrics first.
     chosen = sorted(indexed(), key=lambda metric: metric.indexed < IndexLevel.SORTED)
     return {
@@ -31,12 +30,10 @@ def values(*, optional: bool, default: Any = ...) -> dict[str, Any]:
 
 
 def means() -> dict[str, Any]:
-    """Return model fields for the means of the offered metrics; None if absent."""
     return {metric.name: (float | None, None) for metric in indexed(IndexLevel.OFFERED)}
 
 
 def filters() -> dict[str, Any]:
-    """Return query fields `min_...` and `max_...` for the offered metrics."""
     fields: dict[str, Any] = {}
     for metric in indexed(IndexLevel.OFFERED):
         low, high = metric.limits

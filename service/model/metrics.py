@@ -32,8 +32,6 @@ class IndexLevel(IntEnum):
 
 @dataclass(frozen=True)
 class GraspMetric:
-    """Definition of one number per grasp."""
-
     name: str
     """Its dataset in a base shard is `quality/{name}`; this name is used everywhere else."""
     units: str
@@ -41,18 +39,14 @@ class GraspMetric:
     meaning: str
     title: str
     short: str = ""
-    """Short heading; by default the title."""
     swept: bool = False
     """One value per contact threshold; the index has the value at `INDEX_THRESHOLD_M`."""
     whole: bool = False
-    """A count."""
     code: bool = False
     """A number that encodes a category; its sums and means are meaningless."""
     optional: bool = False
-    """A shard may lack it."""
-    indexed: IndexLevel = IndexLevel.NO
+    indexed: IndexLevel = IndexLevel.OFFERED
     bounds: tuple[float, float] = (0, math.inf)
-    """Least and largest value of a filter."""
     less_is_better: bool = False
     digits: int | None = None
     """Decimal places in the table of a card; None: not in the table."""
@@ -61,28 +55,23 @@ class GraspMetric:
 
     @property
     def path(self) -> str:
-        """Path of the dataset in a base shard."""
         return f"quality/{self.name}"
 
     @property
     def limits(self) -> tuple[float | None, float | None]:
-        """The bounds; None: unbounded."""
         low, high = (bound if math.isfinite(bound) else None for bound in self.bounds)
         return low, high
 
     @property
     def unit(self) -> str:
-        """Unit for display; empty: none."""
         return "" if self.units == "1" else self.units.replace("^2", "²").replace("^3", "³")
 
     @property
     def column_title(self) -> str:
-        """Heading of a column."""
         return self.short or self.title
 
     @property
     def heading(self) -> str:
-        """Heading within a text, with the unit."""
         words = self.column_title if len(self.column_title) < _SYMBOL else self.column_title.lower()
         return f"{words}, {self.unit}" if self.unit else words
 
@@ -95,7 +84,6 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
         title="ε (Ferrari-Canny)",
         short="ε",
         swept=True,
-        indexed=IndexLevel.OFFERED,
         digits=2,
         plot="whole",
     ),
@@ -115,7 +103,6 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
         "hand surface closer to the object than the threshold",
         title="Contact area",
         swept=True,
-        indexed=IndexLevel.OFFERED,
         digits=0,
         plot="whole",
     ),
@@ -125,7 +112,6 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
         "volume shared by hand and object",
         title="Intersection volume",
         short="Intersection",
-        indexed=IndexLevel.OFFERED,
         less_is_better=True,
         digits=3,
         plot="cut",
@@ -135,7 +121,6 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
         "mm",
         "deepest hand-object penetration",
         title="Penetration",
-        indexed=IndexLevel.OFFERED,
         less_is_better=True,
         digits=2,
         plot="cut",
@@ -156,6 +141,7 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
         title="Simulated displacement",
         short="Displacement",
         optional=True,
+        indexed=IndexLevel.NO,
         less_is_better=True,
         digits=2,
         plot="cut",
@@ -180,7 +166,6 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
         title="Robust share",
         short="Robust",
         optional=True,
-        indexed=IndexLevel.OFFERED,
         bounds=(0, 1),
         digits=2,
         plot="whole",
@@ -192,7 +177,6 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
         "under the six pushes; nan: not measured",
         title="Payload",
         optional=True,
-        indexed=IndexLevel.OFFERED,
         bounds=(0, 100),
         digits=2,
         plot="cut",
@@ -205,7 +189,6 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
         title="Motion when shaken",
         short="Shaken",
         optional=True,
-        indexed=IndexLevel.OFFERED,
         less_is_better=True,
         digits=2,
         plot="cut",
@@ -217,7 +200,6 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
         title="Clearance in its scene",
         short="Clearance",
         optional=True,
-        indexed=IndexLevel.OFFERED,
         bounds=(-1, 1),
         digits=4,
     ),
@@ -266,11 +248,9 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
 
 
 def indexed(least: IndexLevel = IndexLevel.KEPT) -> tuple[GraspMetric, ...]:
-    """Return the metrics at or above a level of the index."""
     return tuple(metric for metric in GRASP_METRICS if metric.indexed >= least)
 
 
-#: Default number of perturbed models for validation.
 ROBUST_MODELS: Final = 8
 
 MOST_ROBUST_MODELS: Final = 64
@@ -292,11 +272,9 @@ class Axis(IntEnum):
 
     @property
     def word(self) -> str:
-        """Name of the axis in documents and pages."""
         return self.name.lower()
 
 
-#: Description of each axis for users.
 AXIS_MEANINGS: Final[dict[Axis, str]] = {
     Axis.SHAPES: "collision shapes",
     Axis.JOINTS: "joint drives",
@@ -309,12 +287,10 @@ AXIS_MEANINGS: Final[dict[Axis, str]] = {
     Axis.ORDER: "order of closing",
 }
 
-#: Names of the axes.
 AXIS_WORDS: Final = tuple(axis.word for axis in AXIS_MEANINGS)
 
 
 def axis_word(number: int) -> str | None:
-    """Return the name of an axis from its number in a shard; None: none, or unknown to this version."""
     return Axis(number).word if number in AXIS_MEANINGS else None
 
 
@@ -347,9 +323,6 @@ def entropy_bits(counts: Iterable[int]) -> float:
 
 
 def evenness(counts: Iterable[int], kinds: int) -> float:
-    """Return 2^entropy / kinds: the effective number of equally used categories, relative to all of them.
-
-    1: uniform; 1 / kinds: a single category; 0: no grasps.
-    """
+    """Return 2^entropy / kinds: 1: uniform; 1 / kinds: a single category; 0: no grasps."""
     counts = list(counts)
     return float(2 ** entropy_bits(counts) / kinds) if any(counts) else 0.0

@@ -29,132 +29,103 @@ SHARD_KINDS: Final[dict[Stage, str]] = {Stage.SYNTHESIZE: "base", Stage.SCENE: "
 
 
 def asset_files(kind: AssetKind, digest: str) -> str:
-    """Return the key of the ZIP of all files of a hand or object."""
     return f"{ASSETS}/{kind.value}/{digest}/files.zip"
 
 
 def asset_record(kind: AssetKind, digest: str) -> str:
-    """Return the key of `Asset` as JSON, written after the files."""
     return f"{ASSETS}/{kind.value}/{digest}/asset.json"
 
 
 def asset_check(kind: AssetKind, digest: str) -> str:
-    """Return the key of the report of ingest."""
     return f"{ASSETS}/{kind.value}/{digest}/check.json"
 
 
 def hand_expanded(digest: str) -> str:
-    """Return the key of the URDF expanded from a hand's xacro file at first reading."""
     return f"{ASSETS}/{AssetKind.HAND.value}/{digest}/expanded.json"
 
 
 def asset_model(kind: AssetKind, digest: str) -> str:
-    """Return the key of the prepared hand or object as binary glTF, for viewers."""
     return f"{ASSETS}/{kind.value}/{digest}/model.glb"
 
 
 def object_prepared(digest: str, key: str) -> str:
-    """Return the key of a repaired and simplified object; `key` is a digest of the parameters."""
     return f"{ASSETS}/{AssetKind.OBJECT.value}/{digest}/prepared/{key}.npz"
 
 
 def object_pieces(digest: str, key: str) -> str:
-    """Return the key of an object's convex pieces for the validator; `key` is a digest of the parameters."""
     return f"{ASSETS}/{AssetKind.OBJECT.value}/{digest}/pieces/{key}.npz"
 
 
 def job_record(job: str) -> str:
-    """Return the key of the request with the digests of hand and object."""
     return f"{JOBS}/{job}/job.json"
 
 
 def job_events(job: str) -> str:
-    """Return the prefix of the later user actions on a job."""
     return f"{JOBS}/{job}/events"
 
 
-def job_event(job: str, number: int, what: str) -> str:
-    """Return the key of one of `job_events`; numbers start at 1."""
-    return f"{job_events(job)}/{number:06}-{what}.json"
-
-
 def attempts(task: str) -> str:
-    """Return the prefix of a task's failed attempts."""
     return f"{TASKS}/{task}/attempts"
 
 
 def attempt(task: str, number: int) -> str:
-    """Return the key of a failed attempt; numbers start at 1."""
     return f"{attempts(task)}/{number}.json"
 
 
 def shard_file(stage: Stage, shard: str) -> str:
-    """Return the key of the HDF5 file of a shard."""
     return f"{SHARDS}/{SHARD_KINDS[stage]}/{shard}.h5"
 
 
 def shard_manifest(stage: Stage, shard: str) -> str:
-    """Return the key of the manifest of a shard: readers see the shard once this exists."""
     return f"{SHARDS}/{SHARD_KINDS[stage]}/{shard}.json"
 
 
 def dataset_record(dataset: str) -> str:
-    """Return the key of the record with a dataset's hands, objects, options and resulting jobs."""
     return f"{DATASETS}/{dataset}/dataset.json"
 
 
 def dataset_events(dataset: str) -> str:
-    """Return the prefix of the later user actions on a dataset."""
     return f"{DATASETS}/{dataset}/events"
 
 
-def dataset_event(dataset: str, number: int, what: str) -> str:
-    """Return the key of one of `dataset_events`; numbers start at 1."""
-    return f"{dataset_events(dataset)}/{number:06}-{what}.json"
+def event(events: str, number: int, what: str) -> str:
+    """Return the key of one of `job_events` or `dataset_events`; numbers start at 1."""
+    return f"{events}/{number:06}-{what}.json"
 
 
 def dataset_snapshots(dataset: str) -> str:
-    """Return the prefix of a dataset's snapshots."""
     return f"{DATASETS}/{dataset}/snapshots"
 
 
 def dataset_snapshot(dataset: str, digest: str) -> str:
-    """Return the key of an immutable list of shards."""
     return f"{dataset_snapshots(dataset)}/{digest}.json"
 
 
 def object_set(name: str, digest: str) -> str:
-    """Return the key of one version of a named set of objects."""
     return f"{OBJECT_SETS}/{name}/{digest}.json"
 
 
 def webhook(webhook: str) -> str:
-    """Return the key of a webhook; removed when its owner deletes it."""
     return f"{WEBHOOKS}/{webhook}.json"
 
 
 def tag_versions(tag: str) -> str:
-    """Return the prefix of the versions of a tag."""
     return f"{TAGS}/{tag}"
 
 
 def tag_version(tag: str, number: int) -> str:
-    """Return the key of one of `tag_versions`; numbers start at 1; the last one is current, older ones go."""
     return f"{tag_versions(tag)}/{number:06}.json"
 
 
 def service(number: int) -> str:
-    """Return the key of the identity of the store's service; numbers start at 1, the last one is current."""
     return f"{SERVICE}/{number:06}.json"
 
 
 def mark(mark: str) -> str:
-    """Return the key of a mark that shows whether the index is as old as the store."""
     return f"{MARKS}/{mark}.json"
 
 
 def deletion(what: str, name: str) -> str:
-    """Return the key of an unfinished deletion: of a hand or object by its digest, a job, a dataset."""
     return f"{DELETIONS}/{what}/{name}.json"
 
 

@@ -1,7 +1,6 @@
 """Metadata of job options besides type, default, bounds and description; tables derived from it.
 
-A field with an `Option` in its metadata is offered to users. `rows` is the only source for the command line, the
-dashboard's forms, the Python signatures and the documentation tables.
+`rows` is the only source for the command line, the dashboard's forms, the Python signatures and the docs' tables.
 """
 
 from __future__ import annotations
@@ -31,8 +30,6 @@ _UNIT: Final = re.compile(r"\[([^\]]+)\]")
 
 @dataclass(frozen=True)
 class Form:
-    """Presentation of an option in a form of the dashboard."""
-
     section: Literal["grasps", "scenes"]
     label: str
     hint: str = ""
@@ -45,8 +42,6 @@ class Form:
 
 @dataclass(frozen=True)
 class Option:
-    """Metadata of a user option."""
-
     group: Literal["basic", "advanced"] = "advanced"
     places: tuple[Place, ...] = EVERYWHERE
     flags: str = ""
@@ -61,46 +56,37 @@ class Option:
 
 @dataclass(frozen=True)
 class Row:
-    """One row of the table of options."""
-
     name: str
     field: FieldInfo
     option: Option
 
     @property
     def form(self) -> Form | None:
-        """Presentation in forms; None: not in forms."""
         return next((one for one in self.field.metadata if isinstance(one, Form)), None)
 
     @property
     def flags(self) -> list[str]:
-        """Flags on the command line, as Typer expects them."""
         return self.option.flags.split() or [f"--{self.name.replace('_', '-')}"]
 
     @property
     def keyword(self) -> str:
-        """Keyword of `graspd.synthesize`."""
         return self.option.keyword or self.name
 
     @property
     def meaning(self) -> str:
-        """Description for values typed by a user."""
         return self.option.typed or self.field.description or ""
 
     @property
     def unit(self) -> str:
-        """Unit of the value; empty: none."""
         found = _UNIT.search(self.meaning)
         return found[1] if found else ""
 
     @property
     def default(self) -> Any:
-        """Default value."""
         return self.field.get_default(call_default_factory=True)
 
     @property
     def bounds(self) -> dict[str, float]:
-        """Bounds of a number by their names in Pydantic: ge, gt, le, lt."""
         return bounds_of(self.field)
 
     @property
@@ -115,7 +101,6 @@ class Row:
 
 
 def rows(model: type[BaseModel], place: Place) -> list[Row]:
-    """Return the options of a model for one kind of user, basic ones first."""
     found = [
         Row(name, one, option)
         for name, one in model.model_fields.items()
@@ -126,16 +111,7 @@ def rows(model: type[BaseModel], place: Place) -> list[Row]:
 
 
 def accepted(model: type[ModelT], values: Mapping[str, Any], *, names: Mapping[str, str] | None = None) -> ModelT:
-    """Validate values and return a model.
-
-    Args:
-        model: the model.
-        values: values by names of fields.
-        names: fields in the caller's spelling, for messages; others keep their own names.
-
-    Raises:
-        InputError: states the first invalid value.
-    """
+    """Validate values; InputError states the first invalid one, by its name in `names` if given."""
     try:
         return model.model_validate(values)
     except ValidationError as error:
@@ -159,7 +135,6 @@ def with_keywords(model: type[BaseModel], place: Place) -> Callable[[FunctionT],
 
 
 def keywords_of(model: type[BaseModel], place: Place) -> list[tuple[str, Row, str]]:
-    """Return each option with its keyword and its type as text."""
     found = rows(model, place)
     return [(row.keyword if place == "python" else row.name, row, type_text(row.field.annotation)) for row in found]
 
@@ -184,16 +159,13 @@ def type_text(annotation: Any) -> str:
     return "Any" if annotation is Any else str(annotation.__name__)
 
 
-def _parts(annotation: Any) -> tuple[Any, ...]:
-    return get_args(annotation) if get_origin(annotation) in (Union, UnionType) else (annotation,)
-
-
 def _kind(annotation: Any) -> Any:
     while get_origin(annotation) is Annotated:
         annotation = get_args(annotation)[0]
     if get_origin(annotation) in (tuple, dict):
         return list[str]
-    parts = [one for one in _parts(annotation) if one is not type(None)]
+    members = get_args(annotation) if get_origin(annotation) in (Union, UnionType) else (annotation,)
+    parts = [one for one in members if one is not type(None)]
     if len(parts) == 1 and parts[0] is not annotation:
         return _kind(parts[0])
     return annotation if annotation in (bool, int, float) or get_origin(annotation) is Literal else str

@@ -15,10 +15,10 @@ EDGE: Final = 0.02
 _BEND_UNKNOWN: Final = 0.5
 
 
-def pixel_rays(k: Floats, width: int, height: int, shift: tuple[float, float] = (0.0, 0.0)) -> Floats:
-    """Return rays (H, W, 3) with z = 1 in the camera frame, `shift` [px] off the pixel centres."""
-    columns = (np.arange(width) + 0.5 + shift[0] - k[0, 2]) / k[0, 0]
-    rows = (np.arange(height) + 0.5 + shift[1] - k[1, 2]) / k[1, 1]
+def pixel_rays(k: Floats, width: int, height: int) -> Floats:
+    """Return rays (H, W, 3) with z = 1 in the camera frame, through the pixel centres."""
+    columns = (np.arange(width) + 0.5 - k[0, 2]) / k[0, 0]
+    rows = (np.arange(height) + 0.5 - k[1, 2]) / k[1, 1]
     x, y = np.meshgrid(columns, rows)
     return np.stack([x, y, np.ones_like(x)], axis=-1)
 
@@ -86,7 +86,7 @@ def fitted_normals(
     rows = np.clip(row[:, None, None] + offset[:, None], 0, height - 1)
     columns = np.clip(column[:, None, None] + offset[None, :], 0, width - 1)
     centre = points[row, column]
-    window = points[rows, columns].reshape(len(row), -1, 3) - centre[:, None]
+    window = points[rows, columns].reshape(len(row), len(offset) ** 2, 3) - centre[:, None]
     with np.errstate(invalid="ignore"):
         counts = np.abs(window[..., 2]) <= gap_m[:, None]
     weight = counts.astype(float)

@@ -11,6 +11,7 @@ import math
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from typing import Final, TypeVar
 
 from graspd.service.model.digests import digest_json, shard_id
@@ -24,7 +25,6 @@ from graspd.service.model.version import OLDEST_TASK_SCHEMA, SCHEMA_OF_NETWORKS,
 #: Largest interactive job: a user waits for it. Larger jobs run in bulk.
 INTERACTIVE_GRASPS: Final = 4 * BATCH_SIZE
 
-#: Longest delay between two attempts of a task [s].
 MAX_BACKOFF_S: Final = 300.0
 
 
@@ -42,15 +42,11 @@ class PlannedTask:
 
 @dataclass
 class TaskFacts:
-    """Facts that determine a task's state."""
-
     stage: Stage
     done: bool = False
     """Whether the manifest of its shard is in the store."""
     last_attempt: int = 0
-    """Number of the last failed attempt."""
     exhausted: bool = False
-    """Whether that attempt was the last."""
     retried_upto: int = 0
     """Attempts up to this number are ignored: a user retried the job."""
     running: bool = False
@@ -62,7 +58,6 @@ def priority_of(request: JobRequest) -> Priority:
 
 
 def stages_of(request: JobOptions) -> tuple[Stage, ...]:
-    """Return the stages of each batch of the job, in order."""
     render = (Stage.RENDER,) if request.views else ()
     if request.in_scene:
         return (Stage.SCENE, Stage.SYNTHESIZE, *render)
@@ -70,39 +65,31 @@ def stages_of(request: JobOptions) -> tuple[Stage, ...]:
 
 
 def task_id(job: str, stage: Stage, batch: int) -> str:
-    """Return the id of a task; it depends only on job, stage and batch."""
     return digest_json({"job": job, "stage": stage, "batch": batch})
 
 
 def ranges_of(grasps: int, span: int) -> int:
-    """Return the number of ranges of `span` batches for a number of grasps."""
     return -(-batches_of(grasps) // span)
 
 
 def plan(job: JobRecord, ranges: range | None = None) -> Iterator[PlannedTask]:
     """Yield the tasks of a job, for all ranges or some, each range in the order of its stages."""
     request = job.request
+    digests = {"hand_digest": job.hand_digest, "object_digest": job.object_digest}
     for number in ranges if ranges is not None else range(ranges_of(request.grasps, job.span)):
         batch = number * job.span
         count = min(job.span * BATCH_SIZE, request.grasps - batch * BATCH_SIZE)
         inputs: tuple[str, ...] = ()
         for stage in stages_of(request):
+            revision = job.revisions[stage]
             output = shard_id(
-                stage,
-                request=request,
-                hand_digest=job.hand_digest,
-                object_digest=job.object_digest,
-                batch=batch,
-                count=count,
-                revision=job.revisions[stage],
-                inputs=inputs,
+                stage, request=request, batch=batch, count=count, revision=revision, inputs=inputs, **digests
             )
             yield PlannedTask(task_id(job.id, stage, batch), stage, batch, count, inputs, output)
             inputs = (output,)
 
 
 def message_of(job: JobRecord, task: PlannedTask, *, attempt: int, max_attempt: int) -> TaskMessage:
-    """Return the message of a task for the worker."""
     return TaskMessage(
         schema_=max(needed_schema(job.request), SCHEMA_OF_RANGES if batches_of(task.count) > 1 else 0),
         newest_schema=TASK_SCHEMA,
@@ -129,11 +116,7 @@ _SCHEMAS: Final = {row.name: row.option.schema for row in rows(JobOptions, "job"
 
 
 def needed_schema(request: JobRequest, since: Mapping[str, int] = _SCHEMAS) -> int:
-    """Return the oldest schema that can express a request: that of its newest option in use.
-
-    Args:
-        since: first schema of each option.
-    """
+    """Return the oldest schema that can express a request: that of its newest option in use."""
     fields = JobRequest.model_fields
     used = [schema for name, schema in since.items() if getattr(request, name) != fields[name].get_default()]
     used += [SCHEMA_OF_NETWORKS] if request.network else []
@@ -146,12 +129,10 @@ def backoff(first_s: float, failures: int) -> float:
 
 
 def ingest_id(kind: AssetKind, digest: str) -> str:
-    """Return the id of the task that checks an upload."""
     return digest_json({"ingest": kind, "digest": digest})
 
 
 def ingest_message(kind: AssetKind, name: str, digest: str, *, attempt: int, max_attempt: int) -> IngestMessage:
-    """Return the message of a task that checks an upload."""
     return IngestMessage(
         schema_=OLDEST_TASK_SCHEMA,
         newest_schema=TASK_SCHEMA,
@@ -165,10 +146,7 @@ def ingest_message(kind: AssetKind, name: str, digest: str, *, attempt: int, max
 
 
 def batch_states(chain: Sequence[TaskFacts], *, job_cancelled: bool) -> list[State]:
-    """Return the states of the tasks of one range, in the order of their stages.
-
-    A task behind a failed or cancelled one can never start, so it is cancelled.
-    """
+    """Return the states of one range's tasks; one behind a failed or cancelled task is cancelled."""
     states: list[State] = []
     blocked = False
     for facts in chain:
@@ -188,7 +166,6 @@ def batch_ready(states: Sequence[State]) -> list[bool]:
 
 
 def job_state(tasks: Iterable[State]) -> State:
-    """Return the state of a job from the states of its tasks."""
     states = set(tasks)
     if states & {State.QUEUED, State.RUNNING}:
         return State.QUEUED if states == {State.QUEUED} else State.RUNNING
@@ -248,7 +225,6 @@ class RoundRobin:
         return [(job, -(-limit // (len(number) * number[job.key]))) for job in chosen]
 
     def served(self, jobs: Sequence[WaitingJob]) -> None:
-        """Record that these jobs were served, in this order."""
         for job in jobs:
             self._count += 1
             self._served[f"job {job.id}"] = self._served[f"key {job.key}"] = self._count
@@ -258,8 +234,7 @@ class RoundRobin:
 
 def interleave(lists: Sequence[Sequence[T]]) -> list[T]:
     """Interleave lists: the first items of all, then the second ones, and so on."""
-    longest = max(map(len, lists), default=0)
-    return [some[place] for place in range(longest) for some in lists if place < len(some)]
+    return [item for turn in zip_longest(*lists) for item in turn if item is not None]
 
 
 #: Outcomes of rejected candidates, in the order of the tests, with descriptions.
@@ -285,7 +260,6 @@ OUTCOMES: Final = {
 
 
 def totals(parts: Iterable[Mapping[str, int]]) -> dict[str, int]:
-    """Sum several counts by outcome; positive ones, in the order of `OUTCOMES`."""
     found: dict[str, int] = dict.fromkeys(OUTCOMES, 0)
     for part in parts:
         for name, count in part.items():
@@ -294,7 +268,6 @@ def totals(parts: Iterable[Mapping[str, int]]) -> dict[str, int]:
 
 
 def told(outcomes: Mapping[str, int]) -> str:
-    """Format counts as text, most frequent first."""
     order = sorted(outcomes.items(), key=lambda pair: -pair[1])
     return ", ".join(f"{count:,} {OUTCOMES.get(name, name.replace('_', ' '))}" for name, count in order if count)
 
@@ -302,17 +275,7 @@ def told(outcomes: Mapping[str, int]) -> str:
 def shortfall(
     found: int, wanted: int, counted: str, candidates: int, budget: float, outcomes: Mapping[str, int], limit: str = ""
 ) -> str | None:
-    """Explain in a sentence why fewer grasps were found than wanted; None if all were found.
-
-    Args:
-        found: number of grasps that count.
-        wanted: number of grasps requested.
-        counted: which grasps count: valid or feasible.
-        candidates: number of planned candidates.
-        budget: candidates allowed for each grasp wanted: candidates and repeated attempts.
-        outcomes: rejected candidates by `OUTCOMES`, and the repeated attempts.
-        limit: the hand's lifting limit, if that ended the search instead of the budget.
-    """
+    """Explain why fewer grasps were found than wanted; None if all were. `limit`: the hand's, not the budget's."""
     if found >= wanted:
         return None
     lost, tries = told(outcomes), candidates + outcomes.get("repeated", 0)
@@ -323,16 +286,7 @@ def shortfall(
 
 
 def limit_told(hand: str, friction: float, grasps: int, lifts: float, bound: float, wanted: float | None = None) -> str:
-    """Describe a hand's lifting limit in a sentence.
-
-    Args:
-        hand: its name.
-        friction: Coulomb coefficient.
-        grasps: number of measured grasps.
-        lifts: payload of the best of them [kg].
-        bound: upper bound from actuator effort and friction [kg]; inf: none.
-        wanted: mass to lift [kg]; None: not specified.
-    """
+    """Describe a hand's lifting limit in a sentence; `bound` [kg] is that of actuators and friction, inf: none."""
     most = f", and at most {bound:.2g} kg by actuator effort" if math.isfinite(bound) else ""
     less = "" if wanted is None else f"; {wanted:.3g} kg are wanted"
     return f"{hand} lifts {lifts:.2g} kg at friction {friction:g} in the best of {grasps} grasps{most}{less}"

@@ -1,7 +1,4 @@
-"""Projects: groups of keys that share jobs, datasets, hands and objects, isolated from each other.
-
-Without project names everything belongs to the unnamed project.
-"""
+"""Projects: groups of keys that share jobs, datasets, hands and objects, isolated from each other."""
 
 from __future__ import annotations
 
@@ -29,7 +26,6 @@ class ProjectScope:
     everything: bool = True
 
     def sees(self, project: str) -> bool:
-        """Check whether the jobs and datasets of a project are visible."""
         return self.everything or project == self.project
 
 
@@ -38,9 +34,5 @@ EVERYTHING: Final = ProjectScope()
 
 
 def marks_of(files: Mapping[str, bytes], project: str) -> dict[str, bytes]:
-    """Return the mark of a private upload; of a shared one, an empty file over any existing mark.
-
-    Args:
-        project: empty for shared uploads, and for the unnamed project.
-    """
+    """Return the mark of a private upload; of a shared one, an empty file over any existing mark."""
     return {MARK: project.encode()} if project or MARK in files else {}

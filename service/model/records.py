@@ -8,15 +8,17 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from itertools import groupby
+from operator import itemgetter
 from typing import Annotated, Any, Final, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
 
 from graspd.service.model import names
-from graspd.service.model.base import TagName
+from graspd.service.model.base import Digest, Name, TagName
 from graspd.service.model.clock import timestamp
 from graspd.service.model.digests import digest_json
-from graspd.service.model.domain import Digest, JobOptions, JobRequest, Name, check_known
+from graspd.service.model.domain import JobOptions, JobRequest, check_known
 from graspd.service.model.fidelity import AUTO
 from graspd.service.model.messages import IngestMessage, Origin, TaskMessage
 from graspd.service.model.projects import Project
@@ -85,7 +87,6 @@ class JobRecord(Record):
 
     @property
     def assets(self) -> tuple[tuple[AssetKind, str], ...]:
-        """Kind and digest of each asset that the job uses."""
         further = [(AssetKind.OBJECT, one.digest or "") for one in self.request.beside]
         further += [(AssetKind.NETWORK, network)] if (network := self.request.network) else []
         return ((AssetKind.HAND, self.hand_digest), (AssetKind.OBJECT, self.object_digest), *further)
@@ -118,7 +119,6 @@ class AttemptRecord(Record):
 
     @classmethod
     def of(cls, message: TaskMessage | IngestMessage, **facts: Any) -> Self:
-        """Make a record of a failure at the current time."""
         job = message.job_id if isinstance(message, TaskMessage) else ""
         return cls(
             task_id=message.task_id, job_id=job, stage=message.stage, number=message.attempt, ended=timestamp(), **facts
@@ -141,7 +141,6 @@ class Cell:
     object: Member
     job_id: str
     fidelity: str = ""
-    """Fidelity chosen by the chart for this cell, if the dataset's fidelity is `auto`."""
     choice: Choice | None = None
     """Reason of that choice; None also for datasets from before it was recorded."""
 
@@ -179,7 +178,6 @@ class DatasetRecord(Record):
         return self
 
     def cells(self) -> Iterator[Cell]:
-        """Yield the cells in order."""
         pairs = ((hand, obj) for hand in self.hands for obj in self.objects)
         for position, ((hand, obj), job) in enumerate(zip(pairs, self.jobs, strict=True)):
             fidelity = self.fidelities[position] if self.fidelities else ""
@@ -241,24 +239,16 @@ class ObjectSet(Record):
     objects: tuple[Name, ...]
     created: str
     owner: str = ""
-    """Id of the key that created the set; empty: none or unknown."""
     project: Project = ""
-    """Project of that key; empty: the unnamed project."""
 
 
 def request_of(options: JobOptions, hand: str, obj: str, fidelity: str = "") -> JobRequest:
-    """Return the request of one cell, with a fidelity in place of `auto` if given."""
     shared = {name: getattr(options, name) for name in JobOptions.model_fields}
     return JobRequest(hand=hand, object=obj, **shared | ({"fidelity": fidelity, "target": ""} if fidelity else {}))
 
 
 def job_of(cell: Cell, options: JobOptions, revisions: dict[str, int], owner: str = "", project: str = "") -> JobRecord:
-    """Return the job of a cell as planned at the creation of the dataset. Jobs of datasets run in bulk.
-
-    Args:
-        owner: owner of the dataset.
-        project: project of the dataset.
-    """
+    """Return the job of a cell as planned at the creation of the dataset. Jobs of datasets run in bulk."""
     return JobRecord(
         id=cell.job_id,
         request=request_of(options, cell.hand.name, cell.object.name, cell.fidelity),
@@ -276,7 +266,6 @@ def job_of(cell: Cell, options: JobOptions, revisions: dict[str, int], owner: st
 def object_set_of(
     name: str, objects: Iterable[str], *, after: str = "", owner: str = "", project: str = ""
 ) -> ObjectSet:
-    """Return the version of a set after the one with digest `after`; the objects' order does not matter."""
     members = tuple(sorted(set(objects)))
     return ObjectSet(
         name=name,
@@ -312,18 +301,13 @@ class Tag(Record):
 
     @property
     def members(self) -> set[Grasp]:
-        """Grasps of the tag."""
         return {(shard, row) for shard, rows in self.grasps.items() for row in rows}
 
 
 def tag_id(name: str, project: str) -> str:
-    """Return the id of a project's tag in the store."""
     return digest_json(["tag", project, name])
 
 
 def by_shard(grasps: Iterable[Grasp]) -> Mapping[str, tuple[int, ...]]:
-    """Group rows by shard, sorted."""
-    found: dict[str, list[int]] = {}
-    for shard, row in sorted(set(grasps)):
-        found.setdefault(shard, []).append(row)
-    return {shard: tuple(rows) for shard, rows in found.items()}
+    groups = groupby(sorted(set(grasps)), key=itemgetter(0))
+    return {shard: tuple(row for _, row in rows) for shard, rows in groups}

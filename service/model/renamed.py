@@ -39,12 +39,10 @@ _CHART: Final = re.compile(r"^(lift_)?(?:(letter)(?=_low$|_high$|_count$|$)|raw(
 
 
 def has_old_names(document: bytes) -> bool:
-    """Check whether a JSON text may contain names of graspd 0.2."""
     return _OLD.search(document) is not None
 
 
 def renamed(value: Any) -> Any:
-    """Convert a JSON document, or a part of one, to present names."""
     if isinstance(value, dict):
         # Beside a method stand the planner's own options, whose names are not ours.
         own = {"options"} if "method" in value else set()

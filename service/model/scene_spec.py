@@ -11,9 +11,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Self
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Discriminator, Field, Tag, ValidationError, model_validator
+from pydantic import AfterValidator, Discriminator, Field, Tag, ValidationError, model_validator
 
-from graspd.service.model.base import Digest, Name, refusal, why
+from graspd.service.model.base import Digest, Model, Name, refusal, why
 from graspd.service.model.errors import InputError, did_you_mean
 
 #: Kinds of scenes; `free`: a floating object, `file`: supports from a file.
@@ -26,11 +26,9 @@ MOST_TOUCH: Final = 2.0
 TOUCH: Final = 0.0
 SCENE_FILES: Final = (".json", ".yaml", ".yml")
 MOST_NEIGHBOURS: Final = 8
-#: Largest number of scenes over which one call distributes its grasps.
 MOST_SCENES: Final = 4096
 #: Largest extent of a scene [m].
 FARTHEST_M: Final = 10.0
-#: Largest scene file [bytes].
 MAX_FILE_BYTES: Final = 64 * 1024
 
 _Metres = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M, allow_inf_nan=False)]
@@ -41,13 +39,7 @@ Vector = tuple[_Metres, _Metres, _Metres]
 Pose = tuple[_Metres, _Metres, _Metres, _Number, _Number, _Number, _Number]
 
 
-class Part(BaseModel):
-    """Base class of the parts of a scene."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class HalfSpace(Part):
+class HalfSpace(Model):
     """A half-space: everything below a plane."""
 
     kind: Literal["half_space"] = "half_space"
@@ -63,14 +55,13 @@ class HalfSpace(Part):
         return self
 
 
-class Box(Part):
+class Box(Model):
     """A box centred at its pose."""
 
     kind: Literal["box"] = "box"
     size: tuple[_Extent, _Extent, _Extent]
     """Full extents x y z [m]."""
     pose: Pose = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
-    """x y z [m], unit quaternion w x y z."""
 
     @model_validator(mode="after")
     def _turned(self) -> Self:
@@ -78,7 +69,7 @@ class Box(Part):
         return self
 
 
-class NeighbourSpec(Part):
+class NeighbourSpec(Model):
     """Another object in the scene."""
 
     object: str = Field(min_length=1, max_length=1024)
@@ -92,20 +83,18 @@ class NeighbourSpec(Part):
 
     @model_validator(mode="after")
     def _turned(self) -> Self:
-        if self.pose is not None:
-            check_quaternion(self.pose)
+        check_quaternion(self.pose)
         return self
 
 
 Supports = tuple[Annotated[HalfSpace | Box, Field(discriminator="kind")], ...]
 
 
-class SceneSpec(Part):
+class SceneSpec(Model):
     """Surroundings of the object: supports and neighbours."""
 
     kind: SceneKind = "free"
     supports: Supports = Field((), max_length=MOST_SUPPORTS)
-    """Only with kind `file`."""
     target: Pose | None = None
     """Pose of the object in the scene; None: it is dropped onto the support below."""
     faces: Literal["drawn", "all"] = "drawn"
@@ -115,7 +104,6 @@ class SceneSpec(Part):
     """Clearance of fingertips to supports [mm]: 2, as for the rest of the hand; 0: contact allowed; below: they press.
     """
     neighbours: tuple[NeighbourSpec, ...] = Field((), max_length=MOST_NEIGHBOURS)
-    """Objects besides the target."""
 
     @model_validator(mode="after")
     def _whole(self) -> Self:
@@ -128,10 +116,9 @@ class SceneSpec(Part):
             raise ValueError("a free object lies on no face: choose table, bin or shelf")
         if self.kind == "free" and self.touch != TOUCH:
             raise ValueError("around a free object there is nothing to touch: choose table, bin or shelf")
-        if self.target is not None:
-            check_quaternion(self.target)
-            if self.faces == "all":
-                raise ValueError("a target with a pose lies on one face: faces all goes with a dropped target")
+        check_quaternion(self.target)
+        if self.target is not None and self.faces == "all":
+            raise ValueError("a target with a pose lies on one face: faces all goes with a dropped target")
         return self
 
     def told(self) -> dict[str, Any]:
@@ -155,12 +142,7 @@ class SceneSpec(Part):
 def parse_scene(
     text: str, *, faces: str = "drawn", touch: float | None = None, beside: Sequence[str] = ()
 ) -> SceneSpec:
-    """Parse a user's scene: one of `KINDS`, or a JSON or YAML file. `beside` are dropped neighbours.
-    For `faces` and `touch` see `SceneSpec` (None: as in the file).
-
-    Raises:
-        InputError: unknown kind, or unreadable or invalid file, in one line.
-    """
+    """Parse a user's scene: one of `KINDS`, or a file; None: `touch` of the file. InputError in one line."""
     if faces not in ("drawn", "all"):
         raise InputError(f"unknown faces {faces!r}; choose drawn or all")
     path = Path(text)
@@ -173,17 +155,15 @@ def parse_scene(
     touch = found.touch if touch is None else touch
     if faces == found.faces and touch == found.touch and not beside:
         return found
-    more = [{"object": name} for name in beside]
     said = found.model_dump(exclude={"faces", "touch", "neighbours"})
+    others = [*(one.model_dump() for one in found.neighbours), *({"object": name} for name in beside)]
     try:
-        others = [*(one.model_dump() for one in found.neighbours), *more]
         return SceneSpec(**said, faces=faces, touch=touch, neighbours=others)
     except ValidationError as error:
-        raise InputError(f"scene {text}: {first_mistake(error)}") from None
+        raise InputError(f"scene {text}: {refusal(error)}") from None
 
 
 def read_scene(path: Path) -> SceneSpec:
-    """Read a scene file; see `parse_scene`."""
     try:
         if path.stat().st_size > MAX_FILE_BYTES:
             raise InputError(f"the scene file {path} is larger than {MAX_FILE_BYTES // 1024} KiB")
@@ -194,16 +174,14 @@ def read_scene(path: Path) -> SceneSpec:
     if not isinstance(found, dict):
         raise InputError(f"the scene file {path} must hold one object with supports and a target")
     try:
-        return _found_from(path.parent, SceneSpec(**{"kind": "file", **found}))
+        spec = SceneSpec(**{"kind": "file", **found})
     except (ValidationError, TypeError) as error:
-        raise InputError(f"the scene file {path} is wrong: {first_mistake(error)}") from None
-
-
-def _found_from(folder: Path, spec: SceneSpec) -> SceneSpec:
-    """Resolve the neighbours' file paths relative to the scene file."""
+        said = refusal(error) if isinstance(error, ValidationError) else str(error)
+        raise InputError(f"the scene file {path} is wrong: {said}") from None
+    files = [path.parent / one.object for one in spec.neighbours]
     beside = tuple(
-        one.model_copy(update={"object": str(folder / one.object)}) if (folder / one.object).is_file() else one
-        for one in spec.neighbours
+        one.model_copy(update={"object": str(file)}) if file.is_file() else one
+        for one, file in zip(spec.neighbours, files, strict=True)
     )
     return spec.model_copy(update={"neighbours": beside})
 
@@ -221,16 +199,8 @@ def _loaded(text: str, path: Path) -> object:
         raise InputError(f"the scene file {path} is not {path.suffix[1:].upper()}: {reason[:200]}") from None
 
 
-def first_mistake(error: ValidationError | TypeError) -> str:
-    """Return the first error in one line with its location."""
-    if isinstance(error, TypeError):
-        return str(error)
-    return refusal(error)
-
-
-def check_quaternion(pose: tuple[float, ...]) -> None:
-    """Raise ValueError if the quaternion of a pose is not a rotation."""
-    if abs(math.hypot(*pose[3:]) - 1.0) > 1e-3:
+def check_quaternion(pose: Pose | None) -> None:
+    if pose is not None and abs(math.hypot(*pose[3:]) - 1.0) > 1e-3:
         raise ValueError("the quaternion w x y z of a pose must have unit length")
 
 
@@ -246,7 +216,6 @@ UPRIGHT: Final = 1 - 1e-6
 
 
 def supports_in(spec: SceneSpec) -> tuple[HalfSpace | Box, ...]:
-    """Return the supports of a scene in the scene frame; none for a free object."""
     if spec.kind == "free":
         return ()
     if spec.kind == "file":
@@ -257,7 +226,6 @@ def supports_in(spec: SceneSpec) -> tuple[HalfSpace | Box, ...]:
 
 
 def has_table(spec: SceneSpec) -> bool:
-    """Check whether a scene has a level half-space."""
     flat = (one for one in supports_in(spec) if isinstance(one, HalfSpace))
     return any(one.normal[2] / math.hypot(*one.normal) > UPRIGHT for one in flat)
 
@@ -306,7 +274,7 @@ BesideOption = Annotated[
 ]
 
 
-class SceneDocument(Part):
+class SceneDocument(Model):
     """A complete scene within a request."""
 
     supports: Supports = Field(
@@ -329,8 +297,7 @@ class SceneDocument(Part):
 
     @model_validator(mode="after")
     def _turned(self) -> Self:
-        if self.target is not None:
-            check_quaternion(self.target)
+        check_quaternion(self.target)
         return self
 
 
@@ -352,25 +319,16 @@ def scene_of(
     touch: float = TOUCH,
     beside: Sequence[NeighbourSpec] = (),
 ) -> SceneSpec:
-    """Return the scene of a request, with more neighbours than its document has.
-
-    Raises:
-        ValueError: faces, touch or neighbours do not fit the scene, in one line.
-    """
+    """Return the scene of a request, with more neighbours than its document has; ValueError if they do not fit."""
     try:
-        if isinstance(option, SceneDocument):
-            touch = option.touch if touch == TOUCH else touch
-            return SceneSpec(
-                kind="file",
-                supports=option.supports,
-                target=option.target,
-                faces=faces,
-                touch=touch,
-                neighbours=(*option.neighbours, *beside),
-            )
-        return SceneSpec(kind=option, faces=faces, touch=touch, neighbours=tuple(beside))
+        if not isinstance(option, SceneDocument):
+            return SceneSpec(kind=option, faces=faces, touch=touch, neighbours=tuple(beside))
+        touch = option.touch if touch == TOUCH else touch
+        others = (*option.neighbours, *beside)
+        spec = {"kind": "file", "supports": option.supports, "target": option.target, "neighbours": others}
+        return SceneSpec(**spec, faces=faces, touch=touch)
     except ValidationError as error:
-        raise ValueError(first_mistake(error)) from None
+        raise ValueError(refusal(error)) from None
 
 
 def known_name(text: str) -> str:
@@ -383,16 +341,7 @@ def known_name(text: str) -> str:
 def scene_option(
     text: str, *, beside: Path | None = None, named: Callable[[str], str] = known_name
 ) -> str | dict[str, Any]:
-    """Return the scene for a request from a user's text: the kind, or the document in a file.
-
-    Args:
-        text: one of `KINDS`, or a JSON or YAML file.
-        beside: folder of the file; None: the current one.
-        named: maps a neighbour in the file, a name or path, to a name of the service.
-
-    Raises:
-        InputError: as `parse_scene`.
-    """
+    """Return the scene for a request from a user's text; `named` maps a neighbour in a file to the service's name."""
     if text in KINDS:
         return text
     is_file = Path(text).suffix.lower() in SCENE_FILES

@@ -1,7 +1,4 @@
-"""Definitions of every series of `/metrics`, and the names under which their sums are stored.
-
-`docs/reference/metrics.md` has the table.
-"""
+"""Definitions of every series of `/metrics`, and the names under which their sums are stored."""
 
 from __future__ import annotations
 
@@ -11,16 +8,12 @@ from typing import Final, Literal
 
 from pydantic_core import from_json
 
-#: Upper bounds of the histogram of stage times [s].
 STAGE_BUCKETS_S: Final = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0)
-#: Upper bounds of the histogram of response times [s].
 HTTP_BUCKETS_S: Final = (0.002, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 1.0, 5.0)
 
 
 @dataclass(frozen=True)
 class Series:
-    """A Prometheus series."""
-
     name: str
     kind: Literal["gauge", "counter", "histogram"]
     labels: tuple[str, ...]
@@ -67,22 +60,11 @@ _ALL: Final = (
 SERIES: Final[dict[str, Series]] = {series.name: series for series in _ALL}
 
 
-def series_table() -> str:
-    """Return the Markdown table of all series."""
-    lines = ["| series | type | labels | meaning | from |", "| --- | --- | --- | --- | --- |"]
-    for series in SERIES.values():
-        labels = ", ".join(f"`{label}`" for label in series.labels)
-        lines.append(f"| `{series.name}` | {series.kind} | {labels} | {series.meaning} | {series.source} |")
-    return "\n".join(lines)
-
-
 def field(name: str, *labels: str) -> str:
-    """Return the name of a sum: the series and its label values."""
     return json.dumps([name, *labels])
 
 
 def parse_field(text: str) -> tuple[str, tuple[str, ...]] | None:
-    """Return series and label values of a sum; None if the name is unknown."""
     try:
         name, *labels = from_json(text)
     except (ValueError, TypeError):

@@ -1,7 +1,4 @@
-"""Records of studies: stability maps, and terms of charts of speed against accuracy.
-
-`graspd stability` makes and publishes the maps; report and dashboard draw the same record.
-"""
+"""Records of studies: stability maps, and terms of charts of speed against accuracy."""
 
 from __future__ import annotations
 
@@ -23,18 +20,13 @@ _Number = Annotated[float, BeforeValidator(lambda value: math.nan if value is No
 
 @dataclass(frozen=True)
 class MapCell:
-    """One point of a map."""
-
     panel: str
     x: float | str
     y: float | str
     value: _Number
-    """The measured value, in the map's unit; nan: none."""
     outcome: Outcome
     note: str = ""
-    """The value in words, or the reason for its absence."""
     label: str = ""
-    """Short label if it differs from the value."""
     reached: bool = False
     """Whether any job can reach this point."""
 
@@ -45,31 +37,24 @@ class MapCell:
 
 @dataclass(frozen=True)
 class StabilityMap:
-    """One stability map."""
-
     name: str
     title: str
     x: str
-    """Label of the horizontal axis with its unit."""
     y: str
     measure: str
-    """Quantity shown in a cell, with its unit."""
     bounds: str
     """Thresholds of weak and broken cells."""
     cells: list[MapCell]
     shows: str
     """Symptoms of the failure for a user."""
     guard: str
-    """Guard that catches the failure, or a note that none exists."""
     guard_test: str = ""
-    """Test of the guard."""
     lines: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
     """Theoretical boundaries to draw over the panel of that name."""
     reach: str = ""
     """Which cells a job can reach, and why no others."""
 
     def share(self, panel: str) -> float:
-        """Return the share of good cells of a panel."""
         cells = self.of(panel)
         return sum(cell.outcome == "good" for cell in cells) / max(1, len(cells))
 
@@ -81,16 +66,13 @@ class StabilityMap:
         return [cell for cell in self.cells if cell.panel == panel]
 
     def reached(self) -> list[MapCell]:
-        """Return the cells that a job can reach."""
         return [cell for cell in self.cells if cell.reached]
 
     @property
     def is_divided(self) -> bool:
-        """Whether a job can reach some cells but not all."""
         return 0 < len(self.reached()) < len(self.cells)
 
     def still_breaks(self) -> list[str]:
-        """Return broken cells that a job can reach, one line per panel: no guard covers them."""
         lines = []
         for panel in self.panels:
             by_x: dict[float | str, list[str]] = {}
@@ -107,8 +89,6 @@ class StabilityMap:
 
 @dataclass(frozen=True)
 class Stability:
-    """All maps of one run of the command."""
-
     created: str
     command: str
     versions: dict[str, str]
@@ -120,29 +100,22 @@ class Stability:
 
 
 def from_json(record: Mapping[str, Any]) -> Stability:
-    """Read a record of `as_json`.
-
-    Raises:
-        ValueError: not such a record.
-    """
+    """Read a record of `as_json`; ValueError if it is none."""
     return _RECORD.validate_python(record)
 
 
 def counts(cells: Iterable[MapCell]) -> dict[Outcome, int]:
-    """Count the cells by outcome."""
     outcomes = [cell.outcome for cell in cells]
     return {outcome: outcomes.count(outcome) for outcome in OUTCOMES}
 
 
 def graded(value: float, weak: float, broken: float) -> Outcome:
-    """Grade a value: good below `weak`, broken from `broken` on and for nan."""
     if not value < broken:  # also for nan
         return "broken"
     return "good" if value < weak else "weak"
 
 
 def reachable(cells: Iterable[MapCell], where: Callable[[MapCell], bool]) -> list[MapCell]:
-    """Return the cells, marked where a job can reach them."""
     return [replace(cell, reached=where(cell)) for cell in cells]
 
 
@@ -157,7 +130,6 @@ def short(value: float) -> str:
 
 
 def tick(value: float | str) -> str:
-    """Format an axis value as short as possible without loss."""
     if isinstance(value, str):
         return value
     return f"{value:g}" if value == 0 or 1e-3 <= abs(value) < 1e4 else _exponent(f"{value:g}")

@@ -9,7 +9,7 @@ from urllib.parse import urlsplit
 
 from pydantic import Field
 
-from graspd.service.model.domain import Digest
+from graspd.service.model.base import Digest
 from graspd.service.model.errors import InputError
 from graspd.service.model.projects import Project
 from graspd.service.model.records import Record
@@ -37,11 +37,7 @@ class Webhook(Record):
 
 
 def check_url(url: str) -> str:
-    """Return the URL if requests to it are possible; the host it resolves to is checked at each delivery.
-
-    Raises:
-        InputError: not http or https, no host, or with a user.
-    """
+    """Return the URL; InputError unless it is http or https, with a host and without a user."""
     try:
         parts = urlsplit(url)
         host, _ = parts.hostname, parts.port
@@ -60,10 +56,6 @@ def secret_of(master: str, webhook: str) -> str:
 
 
 def signature(secret: str, at: int, body: bytes) -> str:
-    """Return the value of `X-Graspd-Signature`: `t=TIME,v1=HEX`, the HMAC-SHA256 of `TIME.BODY`.
-
-    Args:
-        at: seconds since 1970. Receivers reject a signature that is minutes old, to prevent replay.
-    """
+    """Return `t=TIME,v1=HEX`, the HMAC-SHA256 of `TIME.BODY`; `at` is in seconds since 1970."""
     mac = hmac.new(secret.encode(), b"%d." % at + body, hashlib.sha256)
     return f"t={at},v1={mac.hexdigest()}"

@@ -5,10 +5,9 @@
     factor       not factor | ( expression ) | NAME | NAME op VALUE
     op           < <= > >= = == !=
 
-Metrics have their names in `service.model.metrics`; a swept one has its value at the index's threshold. Metrics are
-compared with numbers, `hand`, `object` and `type` with words; flags stand alone. Comparisons with a missing number are
-false. The text is parsed to a tree here and never evaluated as code. `service.readers.where` applies it to base shards,
-`service.index.queries.grasps` to the index.
+Metrics are compared with numbers, `hand`, `object` and `type` with words; flags stand alone. Comparisons with a missing
+number are false. The text is parsed to a tree and never evaluated as code. `service.readers.where` applies it to base
+shards, `service.index.queries.grasps` to the index.
 """
 
 from __future__ import annotations
@@ -28,7 +27,6 @@ _METRICS: Final = {metric.name: metric for metric in GRASP_METRICS if not metric
 _SHORT: Final = {"robust": "robust_share"}
 _WORDS: Final = ("hand", "object", "type")
 _TYPES: Final = tuple(kind.name.lower() for kind in GraspType)
-#: Boolean names.
 FLAGS: Final = ("validated", "valid", "feasible", "held", "lift", "lift_hard")
 _COMPARISONS: Final = {"<": "<", "<=": "<=", ">": ">", ">=": ">=", "=": "=", "==": "=", "!=": "!="}
 _TOKEN: Final = re.compile(
@@ -39,8 +37,6 @@ _TOKEN: Final = re.compile(
 
 @dataclass(frozen=True)
 class Flag:
-    """One of `FLAGS`."""
-
     name: str
 
 
@@ -50,14 +46,11 @@ class MetricComparison:
 
     name: str
     op: str
-    """One of < <= > >= = !=."""
     bound: float
 
 
 @dataclass(frozen=True)
 class WordComparison:
-    """Comparison of `hand` or `object` with a word by = or !=."""
-
     name: str
     op: str
     word: str
@@ -73,17 +66,12 @@ class TypeComparison:
 
 @dataclass(frozen=True)
 class Negation:
-    """Negation of a node."""
-
     part: Node
 
 
 @dataclass(frozen=True)
 class Connective:
-    """Conjunction or disjunction of its parts."""
-
     word: str
-    """and, or."""
     parts: tuple[Node, ...]
 
 
@@ -91,11 +79,7 @@ Node = Flag | MetricComparison | WordComparison | TypeComparison | Negation | Co
 
 
 def parsed(text: str) -> Node:
-    """Parse an expression to its tree.
-
-    Raises:
-        InputError: not an expression; states the position, or the known names.
-    """
+    """Parse an expression to its tree; InputError states the position of a mistake, or the known names."""
     if len(text) > LONGEST:
         raise InputError(f"the expression is {len(text)} characters long; at most {LONGEST} are read")
     parser = _Parser(_tokens(text))
@@ -108,7 +92,6 @@ def parsed(text: str) -> Node:
 @dataclass(frozen=True)
 class _Token:
     kind: str
-    """number, op, quoted or word."""
     text: str
 
 

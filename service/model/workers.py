@@ -14,8 +14,8 @@ from typing import Annotated, Final, Self
 
 from pydantic import Field
 
+from graspd.service.model.base import Word
 from graspd.service.model.clock import timestamp
-from graspd.service.model.domain import Word
 from graspd.service.model.messages import IngestMessage, TaskMessage
 from graspd.service.model.states import Stage
 from graspd.service.model.version import OLDEST_TASK_SCHEMA, PACKAGE_VERSION, STAGE_REVISIONS, TASK_SCHEMA
@@ -43,11 +43,9 @@ class WorkerBeat:
     started: Annotated[str, Field(max_length=32)]
     seen: Annotated[str, Field(max_length=32)]
     reason: Annotated[str, Field(max_length=300)] = ""
-    """Reason of the quarantine."""
     schemas: tuple[Count, Count] = (0, 0)
     """Oldest and newest readable task message; workers of graspd 0.1 report none and get no tasks."""
     revisions: Annotated[dict[HostWord, Count], Field(max_length=16)] = field(default_factory=dict)
-    """Revision of each stage in this worker."""
     done: Amount = 0.0
     total: Amount = 0.0
     """Total work of its task, of which `done` is finished; 0: unknown."""
@@ -55,25 +53,12 @@ class WorkerBeat:
 
     @classmethod
     def of_this_process(cls, name: str, device: str, stages: Iterable[Stage]) -> Self:
-        """Return the report of a worker before its first check."""
-        now, own = timestamp(), own_ability()
-        facts = (
-            socket.gethostname(),
-            os.getpid(),
-            device,
-            "",
-            tuple(stages),
-            PACKAGE_VERSION,
-            "checking",
-            "",
-            now,
-            now,
-        )
+        host, now, own = socket.gethostname(), timestamp(), own_ability()
+        facts = (host, os.getpid(), device, "", tuple(stages), PACKAGE_VERSION, "checking", "", now, now)
         return cls(name, *facts, schemas=own.schemas, revisions=dict(own.revisions))
 
     @property
     def ability(self) -> Capabilities:
-        """Capabilities of the worker."""
         return Capabilities(self.schemas, self.revisions)
 
 
@@ -83,28 +68,19 @@ FIRST_SCHEMA: Final = 2
 
 @dataclass(frozen=True)
 class Requirements:
-    """Requirements of a task on its worker."""
-
     stage: Stage
     schema: int
-    """Oldest schema that can express it."""
     newest: int
-    """Newest schema known to its writer."""
     revision: int
     """Revision of the stage; 0 for the check of an asset, which has none."""
 
 
 @dataclass(frozen=True)
 class Capabilities:
-    """Schemas and revisions that a worker supports."""
-
     schemas: tuple[int, int]
-    """Oldest and newest readable schema."""
     revisions: Mapping[str, int]
-    """Revision of each stage."""
 
     def lacks(self, need: Requirements) -> str:
-        """Return why such a worker cannot do a task; "" if it can."""
         oldest, newest = self.schemas
         if need.schema > newest:
             return f"schema {need.schema} of tasks is needed, and {newest} is the newest known"
@@ -117,11 +93,9 @@ class Capabilities:
 
 
 def own_ability() -> Capabilities:
-    """Return the capabilities of this version of graspd."""
     return Capabilities((OLDEST_TASK_SCHEMA, TASK_SCHEMA), STAGE_REVISIONS)
 
 
 def need_of(message: TaskMessage | IngestMessage) -> Requirements:
-    """Return the requirements of a message."""
     revision = message.revision if isinstance(message, TaskMessage) else 0
     return Requirements(message.stage, message.schema_, message.newest_schema or message.schema_, revision)

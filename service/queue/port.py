@@ -9,8 +9,7 @@ from typing import Annotated, Any, Final
 
 from pydantic import BeforeValidator, ConfigDict, Field
 
-from graspd.service.model.base import Model
-from graspd.service.model.domain import Word
+from graspd.service.model.base import Model, Word
 from graspd.service.model.messages import IngestMessage, TaskMessage
 from graspd.service.model.states import Priority, Stage
 from graspd.service.model.workers import Amount, Count, HostWord, WorkerBeat

@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from graspd.service.readers.grasps import Grasps
     from graspd.service.readers.pictures import Pictures
 
-#: Module of each name.
 _LIVES_IN: Final = {
     "Clouds": "clouds",
     "DepthNoise": "depth_noise",
@@ -58,7 +57,3 @@ def __getattr__(name: str) -> Any:
     found = getattr(import_module(f"{__name__}.{_LIVES_IN[name]}"), name)
     globals()[name] = found
     return found
-
-
-def __dir__() -> list[str]:
-    return __all__

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import tempfile
 import time
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
@@ -15,7 +14,7 @@ from typing import Any, Final
 from graspd.service.model.errors import DamagedShard, InputError, NotFoundError
 from graspd.service.store.integrity import check_content, check_digest, gone
 from graspd.service.store.store import Store
-from graspd.service.user_cache import make_room
+from graspd.service.user_cache import make_room, write_whole
 
 DEFAULT_BYTES: Final = 20 << 30
 
@@ -24,7 +23,6 @@ class ShardCache:
     """Files of a store, named by their SHA-256. Processes may share a folder: writes are atomic."""
 
     def __init__(self, folder: Path, *, limit_bytes: int = DEFAULT_BYTES) -> None:
-        """Create the folder. Raises InputError if that fails."""
         self.folder, self.limit_bytes, self._process = folder, limit_bytes, os.getpid()
         try:
             folder.mkdir(parents=True, exist_ok=True)
@@ -35,23 +33,15 @@ class ShardCache:
         self.__dict__.update(state, _process=os.getpid())
 
     def fetch(self, store: Store, key: str, sha256: str) -> Path:
-        """Return the local path of a file of the store; download it if necessary.
-
-        Raises:
-            DamagedShard: the store has no such file, or its content does not match the checksum.
-            InputError: this process was forked, see `check_not_forked`.
-            StoreUnavailable: the store does not answer.
-        """
+        """Return the local path of a file of the store, downloaded if necessary; DamagedShard if missing or damaged."""
         path = self.folder / f"{sha256}.h5"
-        if self._is_intact(path, sha256):
-            return path
-        self._download(store, key, sha256, path)
-        make_room(self.folder, path.suffix, self.limit_bytes, keep=path)
+        if not self._is_intact(path, sha256):
+            write_whole(path, self._checked(store, key, sha256))
+            make_room(self.folder, path.suffix, self.limit_bytes, keep=path)
         return path
 
     @staticmethod
     def _is_intact(path: Path, sha256: str) -> bool:
-        """Check whether a cached file exists and is unchanged; a changed file is downloaded again."""
         try:
             check_content(path, sha256)
             facts = path.stat()
@@ -61,29 +51,20 @@ class ShardCache:
             return False
         return True
 
-    def _download(self, store: Store, key: str, sha256: str, path: Path) -> None:
+    def _checked(self, store: Store, key: str, sha256: str) -> Iterator[bytes]:
         check_not_forked(store, self._process)
-        handle, name = tempfile.mkstemp(dir=self.folder, suffix=".part")
-        partial, digest = Path(name), hashlib.sha256()
+        digest = hashlib.sha256()
         try:
-            with os.fdopen(handle, "wb") as file:
-                for chunk in store.stream(key):
-                    digest.update(chunk)
-                    file.write(chunk)
-            check_digest(f"{store.url}/{key}", digest.hexdigest(), sha256)
-            partial.replace(path)
+            for chunk in store.stream(key):
+                digest.update(chunk)
+                yield chunk
         except NotFoundError:
             raise gone(f"{store.url}/{key}") from None
-        finally:
-            partial.unlink(missing_ok=True)
+        check_digest(f"{store.url}/{key}", digest.hexdigest(), sha256)
 
 
 def check_not_forked(store: Store, process: int) -> None:
-    """Refuse a remote store in a fork of the process that opened it: its requests would never return.
-
-    Raises:
-        InputError: the current process is not the one with this number.
-    """
+    """Refuse a remote store in a fork of the process that opened it: its requests would never return."""
     if os.getpid() != process and not store.url.startswith(("file:", "memory:")):
         raise InputError(
             f"{store.url} cannot be read in a fork of the process that opened it; "

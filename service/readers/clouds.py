@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final, Literal
 
@@ -20,8 +19,6 @@ from graspd.service.readers.pictures import PictureAddress, Pictures, Scenes
 from graspd.service.store.shards import Shard
 
 Array = NDArray[Any]
-
-
 Ints = NDArray[np.intp]
 #: Maps a base shard and K of its rows to points (K, H, 3) on the hand's surface in the object's frame [m].
 HandSurface = Callable[[Shard, Ints], Floats]
@@ -30,7 +27,6 @@ FRAMES: Final[tuple[Frame, ...]] = ("camera", "table", "object")
 POSTURES: Final = ("pregrasp", "grasp", "squeeze")
 #: Prefixes of the keys with one row per grasp.
 OF_GRASPS: Final = ("pregrasp/", "grasp/", "squeeze/", "quality/")
-_NOWHERE: Final = np.array([0.0, 0, 0, 1, 0, 0, 0])
 #: Largest distance of a contact between the hand's surface and a point [m]: the middle contact threshold of shards.
 TOUCH_M: Final = 0.005
 
@@ -109,9 +105,9 @@ class Clouds(Sequence[dict[str, Any]]):
         if isinstance(index, slice):
             return [self[i] for i in range(*index.indices(len(self)))]
         places = self._places[index]
-        first, scenes = places[0], self.pictures.scenes_of(places[0])
+        first, scenes = places[0], self.pictures.scenes_of(places[0].scene_shard)
         draw = np.random.default_rng([self._seed, self.epoch, *_words(first)])
-        views = [CloudView.of(self.pictures.columns_of(place, COLUMNS), self._noise, draw) for place in places]
+        views = [CloudView(self.pictures.columns_of(place, COLUMNS), self._noise, draw) for place in places]
         object_pose = scenes.object_pose(first.scene)
         into = self._into(views[0].extrinsics, object_pose)
         sample = self._cloud(views, draw, into)
@@ -127,7 +123,6 @@ class Clouds(Sequence[dict[str, Any]]):
         return sample | self._labels(scenes, first.scene, views[0].extrinsics, into) | first.names
 
     def _cloud(self, views: Sequence[CloudView], draw: np.random.Generator, into: Floats) -> dict[str, Any]:
-        """Draw P of the points that the views see, in the sample's frame."""
         found = [view.pixels(whole=self._whole) for view in views]
         pixel = np.concatenate([np.stack([np.full(len(row), v), row, col], 1) for v, (row, col) in enumerate(found)])
         if self._voxel:
@@ -137,24 +132,16 @@ class Clouds(Sequence[dict[str, Any]]):
             pixel = pixel[draw.choice(seen, self.points, replace=False)]
         elif seen:  # each point appears at least once
             pixel = np.concatenate([pixel, pixel[draw.integers(seen, size=self.points - seen)]])
-        else:
-            empty = np.zeros((self.points, 3), np.float32)
-            none = np.zeros(self.points, np.uint8)
-            return {
-                "cloud/points": empty,
-                "cloud/normals": empty.copy(),
-                "cloud/object": none,
-                "cloud/pixel": np.zeros((self.points, 3), np.int32),
-                "cloud/seen": 0,
-            }
         normals = transforms.quat_rotate(into[3:], _of(views, pixel, CloudView.normals))
-        return {
+        cloud: dict[str, Any] = {
             "cloud/points": transforms.apply(into, _of(views, pixel, CloudView.points)).astype(np.float32),
             "cloud/normals": normals.astype(np.float32),
             "cloud/object": _of(views, pixel, CloudView.is_object).astype(np.uint8),
             "cloud/pixel": pixel.astype(np.int32),
-            "cloud/seen": seen,
         }
+        if not seen:
+            cloud = {name: np.zeros((self.points, *part.shape[1:]), part.dtype) for name, part in cloud.items()}
+        return cloud | {"cloud/seen": seen}
 
     def _graspness(self, views: Sequence[CloudView], pixel: Ints, scenes: Scenes, scene: int) -> Floats:
         """Compute graspness at the true points: noise changes the measured points, not the contacts."""
@@ -166,7 +153,6 @@ class Clouds(Sequence[dict[str, Any]]):
         return graspness(on_object, hands, touch_m=self._touch)
 
     def _labels(self, scenes: Scenes, scene: int, extrinsics: Floats, into: Floats) -> dict[str, Any]:
-        """Return the poses of the grasps in every frame."""
         found = scenes.grasps(scene, extrinsics)
         rows, pose = scenes.base_rows(scene), scenes.object_pose(scene)
         labels = {name: value for name, value in found.items() if name not in ("grasp/hand_pose", "object/pose")}
@@ -187,7 +173,7 @@ class Clouds(Sequence[dict[str, Any]]):
             return transforms.pose_from_matrix(extrinsics)
         if self.frame == "object":
             return transforms.invert(object_pose)
-        return _NOWHERE
+        return transforms.IDENTITY_POSE
 
 
 def _by_scene(places: Sequence[PictureAddress]) -> list[list[PictureAddress]]:
@@ -198,7 +184,6 @@ def _by_scene(places: Sequence[PictureAddress]) -> list[list[PictureAddress]]:
 
 
 def _of(views: Sequence[CloudView], pixel: Ints, what: Callable[[CloudView, Ints, Ints], Array]) -> Array:
-    """Evaluate a function of the views at pixels (P, 3): view, row, column."""
     parts = [what(view, *pixel[pixel[:, 0] == number, 1:].T) for number, view in enumerate(views)]
     found = np.empty((len(pixel), *parts[0].shape[1:]), parts[0].dtype)
     for number, part in enumerate(parts):
@@ -207,7 +192,6 @@ def _of(views: Sequence[CloudView], pixel: Ints, what: Callable[[CloudView, Ints
 
 
 def _voxels(points: Floats, edge: float, draw: np.random.Generator) -> Ints:
-    """Select one point of each cube, uniformly at random."""
     order = draw.permutation(len(points))
     cubes = np.floor(points[order] / edge).astype(np.int64)
     return order[np.unique(cubes, axis=0, return_index=True)[1]]
@@ -263,69 +247,45 @@ _DEVIATIONS: Final = 4.0
 _SLOPE: Final = 3.0
 
 
-@dataclass(frozen=True)
 class CloudView:
-    """Columns `COLUMNS` of one picture, and its depth as measured by a camera."""
+    """Columns `COLUMNS` of one picture, and its depth as measured by a camera; `draw` generates the noise."""
 
-    columns: Mapping[str, Array]
-    noise: DepthNoise | None
-    seen: Floats
-    """(H, W) measured depth [m]; not finite: no measurement."""
-    angle: Floats | None
-    """(H, W) angle of incidence [rad]; None without noise, which alone needs it."""
-
-    @classmethod
-    def of(cls, columns: Mapping[str, Array], noise: DepthNoise | None, draw: np.random.Generator) -> CloudView:
-        """Build a view of a picture; `draw` generates the noise."""
-        depth = np.asarray(columns["image/depth"], float)
-        k = np.asarray(columns["camera/intrinsics"], float)
-        if noise is None:
-            return cls(columns, noise, depth, None)
-        angle = incidence(depth, k)
-        return cls(columns, noise, noise.apply(depth, k, draw, angle=angle), angle)
+    def __init__(self, columns: Mapping[str, Array], noise: DepthNoise | None, draw: np.random.Generator) -> None:
+        self.columns, self._noise = columns, noise
+        self.extrinsics = np.asarray(columns["camera/extrinsics"], float)  # (4, 4), table to camera
+        self._back = transforms.invert(transforms.pose_from_matrix(self.extrinsics))
+        self._k = np.asarray(columns["camera/intrinsics"], float)
+        #: Measured depth (H, W) [m]; not finite: no measurement.
+        self.seen = depth = np.asarray(columns["image/depth"], float)
+        if noise is not None:
+            self._angle = incidence(depth, self._k)
+            self.seen = noise.apply(depth, self._k, draw, angle=self._angle)
 
     def pixels(self, *, whole: bool) -> tuple[Ints, Ints]:
-        """Return rows and columns of the pixels with depth of the object, or of the whole scene."""
         labels = self.columns["image/segmentation"]
         wanted = np.isfinite(self.seen) & ((labels > 0) if whole else (labels == _OBJECT))
-        if self.noise is None:  # a pixel without neighbours has no normal
+        if self._noise is None:  # a pixel without neighbours has no normal
             wanted &= np.isfinite(self._normals[..., 0])
         row, column = np.nonzero(wanted & np.isfinite(self._true[..., 2]))
         return row, column
 
     def points(self, row: Ints, column: Ints) -> Floats:
-        """Back-project pixels to measured points (P, 3) in the frame of the table [m]."""
         return transforms.apply(self._back, self._points[row, column])
 
     def true_points(self, row: Ints, column: Ints) -> Floats:
-        """Back-project pixels to points (P, 3) without noise [m]."""
         return transforms.apply(self._back, self._true[row, column])
 
     def normals(self, row: Ints, column: Ints) -> Floats:
         """Return unit normals (P, 3) of pixels, toward the camera, in the frame of the table."""
-        if self.noise is None or self.angle is None:
+        if self._noise is None:
             return transforms.quat_rotate(self._back[3:], self._normals[row, column])
         z = self._points[row, column, 2]
-        gap = _SLOPE * _RADIUS * z / self._k[0, 0] + _DEVIATIONS * self.noise.sigma(z, self.angle[row, column])
+        gap = _SLOPE * _RADIUS * z / self._k[0, 0] + _DEVIATIONS * self._noise.sigma(z, self._angle[row, column])
         fitted = fitted_normals(self._points, row, column, radius=_RADIUS, gap_m=gap)
         return transforms.quat_rotate(self._back[3:], fitted)
 
     def is_object(self, row: Ints, column: Ints) -> NDArray[np.bool_]:
-        """Return (P,) whether pixels show the object."""
         return np.asarray(self.columns["image/segmentation"][row, column] == _OBJECT)
-
-    @property
-    def extrinsics(self) -> Floats:
-        """Extrinsics (4, 4), table to camera."""
-        return np.asarray(self.columns["camera/extrinsics"], float)
-
-    @property
-    def _k(self) -> Floats:
-        return np.asarray(self.columns["camera/intrinsics"], float)
-
-    @cached_property
-    def _back(self) -> Floats:
-        return transforms.invert(transforms.pose_from_matrix(self.extrinsics))
 
     @cached_property
     def _true(self) -> Floats:
@@ -333,7 +293,7 @@ class CloudView:
 
     @cached_property
     def _points(self) -> Floats:
-        return self._true if self.noise is None else back_project(self._k, self.seen)
+        return self._true if self._noise is None else back_project(self._k, self.seen)
 
     @cached_property
     def _normals(self) -> Floats:

@@ -176,12 +176,10 @@ def _beside(depth: Floats, sigma_px: Floats, draw: np.random.Generator) -> Float
 
 
 def _mixed(depth: Floats, draw: np.random.Generator) -> Floats:
-    """Mix a random share of the right or lower neighbour's depth into each pixel on an edge."""
     found = depth
     for axis in (1, 0):
-        after = np.concatenate(
-            [np.take(depth, range(1, depth.shape[axis]), axis=axis), np.take(depth, [-1], axis=axis)], axis=axis
-        )
+        last = depth.shape[axis] - 1
+        after = np.take(depth, np.minimum(np.arange(last + 1) + 1, last), axis=axis)
         edge = np.abs(after - depth) > EDGE * depth
         share = draw.random(depth.shape)
         found = np.where(edge, (1 - share) * found + share * after, found)
@@ -221,7 +219,6 @@ NOISES: Final[Mapping[str, DepthNoise]] = MappingProxyType(
 
 
 def noise_of(given: str | DepthNoise | None) -> DepthNoise | None:
-    """Look up a noise model by name; InputError if there is none."""
     if given is None or isinstance(given, DepthNoise):
         return given
     if given not in NOISES:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Final
@@ -52,16 +52,16 @@ class Shards:
     cache: ShardCache | None = None
     stream: bool = False
     """Pictures of the store are read by byte ranges and not cached."""
-    _by_id: dict[str, ShardFile] = field(default_factory=dict, repr=False)
-
-    def __post_init__(self) -> None:
-        self._by_id.update({file.id: file for file in self.files})
 
     def __len__(self) -> int:
         return len(self.files)
 
     def __iter__(self) -> Iterator[ShardFile]:
         return iter(self.files)
+
+    @cached_property
+    def _by_id(self) -> dict[str, ShardFile]:
+        return {file.id: file for file in self.files}
 
     def of(self, kind: str) -> tuple[ShardFile, ...]:
         """Return the shards of one kind."""
@@ -84,36 +84,19 @@ class Shards:
         return Shards(tuple(kept), self.store, self.cache, self.stream)
 
     def streamed(self, file: ShardFile) -> bool:
-        """Check whether a shard is read by byte ranges."""
         return self.stream and file.path is None and file.kind == "views"
 
     @cached_property
     def ranges(self) -> RangeReader:
-        """Reader of the shards that are `streamed`."""
         assert self.store is not None, "a shard without a path comes from a store"
         return RangeReader(self.store)
 
-    @contextmanager
-    def opened(self, file: ShardFile, *, whole: bool = False) -> Iterator[h5py.File]:
-        """Open the HDF5 file of a shard; `whole`: pictures of a streamed shard are needed too.
-
-        Raises:
-            Exception: see `path`, `open_shard` and `RangeReader.open`.
-        """
-        if self.streamed(file):
-            with self.ranges.open(file.key, whole=whole) as found:
-                yield found
-        else:
-            with open_shard(self.path(file)) as found:
-                yield found
+    def opened(self, file: ShardFile, *, whole: bool = False) -> AbstractContextManager[h5py.File]:
+        """Open the HDF5 file of a shard; `whole`: pictures of a streamed shard are needed too."""
+        return self.ranges.open(file.key, whole=whole) if self.streamed(file) else open_shard(self.path(file))
 
     def path(self, file: ShardFile) -> Path:
-        """Return the local file, downloaded if necessary, and verified.
-
-        Raises:
-            DamagedShard: it does not match its checksum.
-            Exception: see `ShardCache.fetch`.
-        """
+        """Return the local file, downloaded if necessary; DamagedShard if it does not match its checksum."""
         if file.path is not None:
             check_file(file.path)
             return file.path

@@ -12,14 +12,13 @@ from numpy.typing import NDArray
 from graspd.service.model.errors import InputError
 from graspd.service.readers.files import ShardFile, Shards
 from graspd.service.store import validity
-from graspd.service.store.columns import SCHEMAS
+from graspd.service.store.columns import SCHEMAS, check_known
 from graspd.service.store.shards import open_shard, read_column
 
 Array = NDArray[Any]
 #: Maps the columns of one base shard to a mask (N,) of the selected grasps.
 Where = Callable[[Mapping[str, Array]], Array]
 
-#: Columns of a grasp sample.
 DEFAULT_COLUMNS: Final = (
     "grasp/hand_pose",
     "grasp/joint_positions",
@@ -64,17 +63,17 @@ class Grasps(Sequence[dict[str, Any]]):
         Raises:
             InputError: unknown column, or a mask of wrong length.
         """
-        if unknown := set(columns) - set(SCHEMAS["base"]):
-            raise InputError(f"base shards have no column {sorted(unknown)[0]!r}; docs/reference/dataset.md lists them")
+        check_known("base", columns)
         self.shards, self.columns = shards, tuple(columns)
         self._valid, self._unvalidated, self._where = valid, unvalidated, where
         self._files = shards.of("base")
         self._memory: OrderedDict[str, dict[str, Array]] = OrderedDict()
         self._rows = [self._kept(file) for file in self._files]
-        self._ends = np.cumsum([len(rows) for rows in self._rows], dtype=np.int64)
+        #: Index (shards,) after the last grasp of each base shard.
+        self.ends = np.cumsum([len(rows) for rows in self._rows], dtype=np.int64)
 
     def __len__(self) -> int:
-        return int(self._ends[-1]) if len(self._ends) else 0
+        return int(self.ends[-1]) if len(self.ends) else 0
 
     def __getitem__(self, index: Any) -> Any:
         if isinstance(index, slice):
@@ -82,15 +81,12 @@ class Grasps(Sequence[dict[str, Any]]):
         at = index + len(self) if index < 0 else index
         if not 0 <= at < len(self):
             raise IndexError(index)
-        number = int(np.searchsorted(self._ends, at, side="right"))
+        number = int(np.searchsorted(self.ends, at, side="right"))
         rows, file = self._rows[number], self._files[number]
-        row = int(rows[at - (int(self._ends[number]) - len(rows))])
-        return self._sample(file, row)
-
-    @property
-    def ends(self) -> NDArray[np.int64]:
-        """Index (shards,) after the last grasp of each base shard, for readers that group grasps by shard."""
-        return self._ends
+        row = int(rows[at - (int(self.ends[number]) - len(rows))])
+        held = self._load(file, self.columns)
+        sample: dict[str, Any] = {name: held[name][row] for name in self.columns}
+        return sample | {"hand": file.hand, "object": file.object, "shard_id": file.id, "row": row}
 
     def joint_names(self, hand: str) -> list[str]:
         """Return joint names in the order of `joint_positions`; InputError if no shard has the hand."""
@@ -101,11 +97,7 @@ class Grasps(Sequence[dict[str, Any]]):
         raise InputError(f"none of the shards is of the hand {hand!r}")
 
     def arrays(self, *columns: str) -> dict[str, Array]:
-        """Return columns of all grasps, by default those of the samples; `hand` and `object` name each row's.
-
-        Raises:
-            InputError: numbers of joints or thresholds differ, so the values do not fit into one array.
-        """
+        """Return columns of all grasps, by default those of samples; InputError if they do not fit into one array."""
         wanted = columns or self.columns
         parts: dict[str, list[Array]] = {name: [] for name in (*wanted, "hand", "object")}
         for file, rows in zip(self._files, self._rows, strict=True):
@@ -120,11 +112,6 @@ class Grasps(Sequence[dict[str, Any]]):
             raise InputError(
                 f"the shards do not fit into one array ({error}); read one hand: shards.only(...)"
             ) from None
-
-    def _sample(self, file: ShardFile, row: int) -> dict[str, Any]:
-        held = self._load(file, self.columns)
-        sample: dict[str, Any] = {name: held[name][row] for name in self.columns}
-        return sample | {"hand": file.hand, "object": file.object, "shard_id": file.id, "row": row}
 
     def _kept(self, file: ShardFile) -> NDArray[np.intp]:
         held = self._load(file, tuple(SCHEMAS["base"]) if self._where else validity.COLUMNS, keep=False)
@@ -145,15 +132,11 @@ class Grasps(Sequence[dict[str, Any]]):
         if missing:
             with open_shard(self.shards.path(file)) as opened:
                 held = held | {name: read_column(opened, name, file.id) for name in missing if name in opened}
-            self._check(file, columns, held, optional=not keep)
+            may_lack = {name for name, column in SCHEMAS["base"].items() if column.optional and not keep}
+            if absent := [name for name in columns if name not in held and name not in may_lack]:
+                raise InputError(f"shard {file.id[:12]} of {file.hand} on {file.object} has no column {absent[0]!r}")
             if keep:
                 self._memory[file.id] = held
                 if len(self._memory) > _KEPT:
                     self._memory.popitem(last=False)
         return held
-
-    @staticmethod
-    def _check(file: ShardFile, columns: Sequence[str], held: Mapping[str, Array], *, optional: bool) -> None:
-        absent = [name for name in columns if name not in held and not (optional and SCHEMAS["base"][name].optional)]
-        if absent:
-            raise InputError(f"shard {file.id[:12]} of {file.hand} on {file.object} has no column {absent[0]!r}")

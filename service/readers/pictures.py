@@ -15,7 +15,7 @@ from graspd.service.model.errors import InputError
 from graspd.service.readers.files import ShardFile, Shards
 from graspd.service.readers.ranges import RowTable, read_file
 from graspd.service.store import validity
-from graspd.service.store.columns import SCHEMAS
+from graspd.service.store.columns import check_known
 from graspd.service.store.shards import read_shard
 
 if TYPE_CHECKING:
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
 Array = NDArray[Any]
 
-#: Columns of a picture sample.
 DEFAULT_COLUMNS: Final = (
     "image/rgb",
     "image/depth",
@@ -39,8 +38,6 @@ _TABLES: Final = 4096
 
 @dataclass(frozen=True)
 class PictureAddress:
-    """Location of a picture."""
-
     file: ShardFile
     scene_shard: str
     """Id of the scene shard, or of the base shard with its scenes."""
@@ -49,14 +46,8 @@ class PictureAddress:
 
     @property
     def names(self) -> dict[str, Any]:
-        """Columns of a sample that identify its source."""
-        return {
-            "hand": self.file.hand,
-            "object": self.file.object,
-            "shard_id": self.file.id,
-            "row": self.row,
-            "scene": self.scene,
-        }
+        file = self.file
+        return {"hand": file.hand, "object": file.object, "shard_id": file.id, "row": self.row, "scene": self.scene}
 
 
 class Pictures(Sequence[dict[str, Any]]):
@@ -99,55 +90,39 @@ class Pictures(Sequence[dict[str, Any]]):
             InputError: unknown column.
             NotFoundError: the scene or base shard of a views shard is not among the shards.
         """
-        if unknown := set(columns) - set(SCHEMAS["views"]):
-            raise InputError(
-                f"views shards have no column {sorted(unknown)[0]!r}; docs/reference/dataset.md lists them"
-            )
-        if unknown := set(grasp_quality) - set(SCHEMAS["base"]):
-            raise InputError(f"base shards have no column {sorted(unknown)[0]!r}; docs/reference/dataset.md lists them")
+        check_known("views", columns)
+        check_known("base", grasp_quality)
         self.shards, self.columns, self._quality = shards, tuple(columns), tuple(grasp_quality)
         self._which = {"clear": clear, "valid": valid, "unvalidated": unvalidated}
         self._scenes: OrderedDict[str, Scenes] = OrderedDict()
         self._tables: OrderedDict[str, RowTable] = OrderedDict()
-        self._places: list[PictureAddress] = []
+        self.places: list[PictureAddress] = []
         for file in shards.of("views"):
             self._add(file, with_grasps_only=with_grasps_only)
 
     def __len__(self) -> int:
-        return len(self._places)
+        return len(self.places)
 
     def __getitem__(self, index: Any) -> Any:
         if isinstance(index, slice):
             return [self[i] for i in range(*index.indices(len(self)))]
-        place = self._places[index]
+        place = self.places[index]
         sample = self.columns_of(place, {*self.columns, "camera/extrinsics"})
         extrinsics = np.asarray(sample["camera/extrinsics"], float)
         sample = {name: sample[name] for name in self.columns}
-        return sample | self.scenes_of(place).grasps(place.scene, extrinsics) | place.names
-
-    @property
-    def places(self) -> Sequence[PictureAddress]:
-        """Locations of the pictures."""
-        return self._places
+        return sample | self.scenes_of(place.scene_shard).grasps(place.scene, extrinsics) | place.names
 
     def columns_of(self, place: PictureAddress, columns: Iterable[str]) -> dict[str, Array]:
-        """Read columns of one picture.
-
-        Raises:
-            DamagedShard: the stored data does not match its checksum.
-        """
+        """Read columns of one picture; DamagedShard if they do not match their checksum."""
         file, row, wanted = place.file, place.row, list(columns)
+        table = self._table(file, wanted)
         if not self.shards.streamed(file):
             path = self.shards.path(file)
-            return self._table(file, wanted).row(row, wanted, lambda ranges: read_file(path, ranges))
-        table, reader, key = self._table(file, wanted), self.shards.ranges, file.key
+            return table.row(row, wanted, lambda ranges: read_file(path, ranges))
+        reader = self.shards.ranges
         return table.row(
-            row, wanted, lambda ranges: reader.read(key, ranges, row, lambda other: table.ranges(other, wanted))
+            row, wanted, lambda ranges: reader.read(file.key, ranges, row, lambda other: table.ranges(other, wanted))
         )
-
-    def scenes_of(self, place: PictureAddress) -> Scenes:
-        """Return the scenes of the picture's shard with the selected grasps."""
-        return self._scenes_of(place.scene_shard)
 
     def clouds(self, points: int = 1024, **options: Any) -> Clouds:
         """Return the pictures as labelled point clouds; see `Clouds` for the options."""
@@ -166,15 +141,15 @@ class Pictures(Sequence[dict[str, Any]]):
                 )
             if absent := [name for name in self.columns if name not in opened]:
                 raise InputError(f"shard {file.id[:12]} of {file.object} has no column {absent[0]!r}")
-        held = self._scenes_of(scene_shard)
+        held = self.scenes_of(scene_shard)
         for row, scene in enumerate(scenes):
-            if not with_grasps_only or held.count(int(scene)):
-                self._places.append(PictureAddress(file, scene_shard, int(scene), row))
+            if not with_grasps_only or len(held.base_rows(int(scene))):
+                self.places.append(PictureAddress(file, scene_shard, int(scene), row))
 
     def _table(self, file: ShardFile, columns: Sequence[str]) -> RowTable:
         table = self._tables.get(file.id)
-        if table is None or not table.has(columns):
-            known = table.columns if table else ()
+        known = table.columns if table else set()
+        if table is None or not known.issuperset(columns):
             with self.shards.opened(file, whole=True) as opened:
                 table = RowTable.of(opened, {*columns, *known}, str(file.path or file.key))
             self._tables[file.id] = table
@@ -182,7 +157,7 @@ class Pictures(Sequence[dict[str, Any]]):
                 self._tables.popitem(last=False)
         return table
 
-    def _scenes_of(self, shard: str) -> Scenes:
+    def scenes_of(self, shard: str) -> Scenes:
         found = self._scenes.get(shard)
         if found is None:  # concurrent threads may both build it; either result is right
             found = self._scenes[shard] = Scenes(self.shards, shard, self._quality, **self._which)
@@ -223,15 +198,10 @@ class Scenes:
             if name in base.arrays
         }
 
-    def count(self, scene: int) -> int:
-        return len(self._of(scene))
-
     def object_pose(self, scene: int) -> NDArray[np.float64]:
-        """Return the rest pose (7,) of the object in the frame of the table."""
         return self._object[scene]
 
     def base_rows(self, scene: int) -> NDArray[np.intp]:
-        """Return the base-shard rows (K,) of the grasps selected in one scene."""
         return self._row[self._of(scene)]
 
     def _of(self, scene: int) -> NDArray[np.intp]:

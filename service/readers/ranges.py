@@ -1,8 +1,7 @@
 """Reader of pictures in a store by byte ranges: read-ahead, no HDF5 library, no disk cache.
 
-A picture is one zlib-compressed chunk of its column. Opening a file and its datasets costs as much as unpacking a
-picture, and the HDF5 library runs one thread at a time. Byte ranges can be read and unpacked by any number of threads.
-The checksum of the compressed data (Adler-32) shows damage.
+A picture is one zlib-compressed chunk of its column; its checksum (Adler-32) shows damage. Any number of threads can
+read and unpack byte ranges, while the HDF5 library runs one thread at a time.
 """
 
 from __future__ import annotations
@@ -28,14 +27,9 @@ from graspd.service.store.integrity import gone
 from graspd.service.store.shards import open_shard, read_column
 from graspd.service.store.store import Store
 
+#: Offset and length [bytes]; offset and the bytes from there.
 Range = tuple[int, int]
-
-"""Offset and length [bytes]."""
-
 Span = tuple[int, memoryview]
-
-"""Offset and the bytes from there."""
-
 #: Largest request when pictures are read in sequence [bytes]; a smaller shard is read whole.
 AHEAD_BYTES: Final = 4 << 20
 #: Memory limit for the bytes of all shards [bytes].
@@ -62,19 +56,12 @@ class RangeReader:
 
     @contextmanager
     def open(self, key: str, *, whole: bool) -> Iterator[h5py.File]:
-        """Open the HDF5 file of a shard.
-
-        Args:
-            whole: pictures are needed as well; a small shard is read whole.
-
-        Raises:
-            InputError: not HDF5, or this process was forked, see `check_not_forked`.
-            DamagedShard: it is missing or unreadable, here or in the body.
-            StoreUnavailable: the store does not answer.
-        """
+        """Open the HDF5 file of a shard; `whole`: pictures too, so a small shard is read at once."""
         held = self._of(key)
         with held.lock:
-            held.size = held.size or self._size(key)
+            if not held.size:
+                with self._reading(key):
+                    held.size = self._store.size(key)
             small = whole and held.size <= AHEAD_BYTES
             if small and not _covers(held.spans, (0, held.size)):
                 held.spans = [self._get(key, (0, held.size))]
@@ -97,17 +84,7 @@ class RangeReader:
             raise problem
 
     def read(self, key: str, wanted: Sequence[Range], row: int, further: Callable[[int], Sequence[Range]]) -> list[Any]:
-        """Return the bytes of some ranges, in their order.
-
-        Args:
-            row: row of the object to which the ranges belong.
-            further: maps another row number to its ranges; empty after the last row.
-
-        Raises:
-            DamagedShard: the object is missing.
-            InputError: this process was forked, see `check_not_forked`.
-            StoreUnavailable: the store does not answer.
-        """
+        """Return the bytes of some ranges of a row; `further` maps another row to its ranges, empty after the last."""
         held = self._of(key)
         with held.lock:
             if not all(_covers(held.spans, one) for one in wanted):
@@ -124,7 +101,6 @@ class RangeReader:
         return found
 
     def forget(self) -> None:
-        """Release all cached bytes."""
         with self._lock:
             self._objects.clear()
 
@@ -144,16 +120,14 @@ class RangeReader:
                     used -= self._objects.pop(other).bytes
 
     def _get(self, key: str, one: Range) -> Span:
-        check_not_forked(self._store, self._process)
-        try:
+        with self._reading(key):
             return one[0], memoryview(self._store.get_range(key, *one))
-        except NotFoundError:
-            raise gone(self._name(key)) from None
 
-    def _size(self, key: str) -> int:
+    @contextmanager
+    def _reading(self, key: str) -> Iterator[None]:
         check_not_forked(self._store, self._process)
         try:
-            return self._store.size(key)
+            yield
         except NotFoundError:
             raise gone(self._name(key)) from None
 
@@ -163,13 +137,10 @@ class RangeReader:
 
 @dataclass
 class _Object:
-    """Cached bytes of an object."""
-
     lock: threading.Lock = field(default_factory=threading.Lock)
     size: int = 0
     spans: list[Span] = field(default_factory=list)
     row: int | None = None
-    """Last requested row."""
 
     @property
     def bytes(self) -> int:
@@ -216,7 +187,6 @@ class _Source(io.RawIOBase):
 
 
 def joined(ranges: Sequence[Range]) -> list[Range]:
-    """Sort ranges and merge those with small gaps."""
     found: list[Range] = []
     for start, length in sorted(ranges):
         if found and start - sum(found[-1]) <= GAP_BYTES:
@@ -247,17 +217,13 @@ _DEFLATE: Final = h5py.h5z.FILTER_DEFLATE
 
 @dataclass(frozen=True)
 class _Packed:
-    """A column with one chunk per row."""
-
     shape: tuple[int, ...]
-    """Shape of a row."""
     dtype: np.dtype[Any]
     shuffled: bool
     places: NDArray[np.int64]
     """(rows, 2) offset and length in the file [bytes]."""
 
     def unpack(self, data: bytes | memoryview) -> Array:
-        """Decompress a row; zlib.error or ValueError if the bytes are not one."""
         raw = np.frombuffer(zlib.decompress(data), np.uint8)
         size = self.dtype.itemsize
         if not self.shuffled or size == 1:
@@ -273,34 +239,20 @@ class RowTable:
     """Columns of a shard: file positions of the rows of packed columns, values of all others."""
 
     name: str
-    """Name of the shard in error messages."""
     packed: dict[str, _Packed]
     held: dict[str, Array]
 
     @classmethod
     def of(cls, file: h5py.File, columns: Iterable[str], name: str) -> RowTable:
-        """Read the table of an open shard; values of columns that are not packed are read and checked.
-
-        Raises:
-            DamagedShard: values do not match their checksum.
-        """
-        packed, held = {}, {}
-        for column in columns:
-            found = _packed(file[column])
-            if found is None:
-                held[column] = read_column(file, column, name)
-            else:
-                packed[column] = found
+        """Read the table of an open shard; values of columns that are not packed are read and checked."""
+        found = {column: _packed(file[column]) for column in columns}
+        packed = {column: places for column, places in found.items() if places is not None}
+        held = {column: read_column(file, column, name) for column in found.keys() - packed}
         return cls(name, packed, held)
 
     @property
     def columns(self) -> set[str]:
-        """Names of the known columns."""
         return {*self.packed, *self.held}
-
-    def has(self, columns: Iterable[str]) -> bool:
-        """Check whether all these columns are known."""
-        return all(name in self.packed or name in self.held for name in columns)
 
     def ranges(self, row: int, columns: Iterable[str]) -> list[tuple[int, int]]:
         """Return offset and length [bytes] of a row in each packed column; empty after the last row."""
@@ -308,11 +260,7 @@ class RowTable:
         return [(int(places[row, 0]), int(places[row, 1])) for places in found if row < len(places)]
 
     def row(self, row: int, columns: Iterable[str], read: ReadRanges) -> dict[str, Array]:
-        """Return one row of some columns; the caller owns the arrays.
-
-        Raises:
-            DamagedShard: bytes are missing or do not match their checksum.
-        """
+        """Return one row of some columns, owned by the caller; DamagedShard if bytes are missing or damaged."""
         wanted = list(columns)
         packed = [name for name in wanted if name in self.packed]
         ranges = self.ranges(row, packed)
@@ -326,7 +274,6 @@ class RowTable:
 
 
 def read_file(path: Path, ranges: list[tuple[int, int]]) -> list[bytes]:
-    """Read byte ranges of a file."""
     handle = os.open(path, os.O_RDONLY)
     try:
         return [os.pread(handle, length, start) for start, length in ranges]

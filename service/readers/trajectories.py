@@ -86,11 +86,7 @@ def wrists_of(shard: Shard, rows: NDArray[np.integer[Any]]) -> Floats | None:
 
 
 def scene_spec_of(shard: Shard) -> SceneSpec | None:
-    """Return the scene of a shard's grasps, poses or pictures; None if it states none.
-
-    Raises:
-        InputError: the attribute is not a scene.
-    """
+    """Return the scene of a shard's grasps, poses or pictures; None if it states none. InputError if invalid."""
     said = shard.attributes.get("scene")
     if said is None:
         return None

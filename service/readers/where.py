@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import operator
 from collections.abc import Callable, Mapping
 from functools import reduce
+from operator import and_, eq, ge, gt, le, lt, ne, or_
 from typing import Any, Final
 
 import numpy as np
@@ -21,24 +21,14 @@ Mask = NDArray[np.bool_]
 Test = Callable[[Mapping[str, Array], Mapping[str, Any]], Mask]
 
 _METRICS: Final = {metric.name: metric for metric in GRASP_METRICS}
-_OPERATORS: Final[dict[str, Callable[[Any, Any], Any]]] = {
-    "<": operator.lt,
-    "<=": operator.le,
-    ">": operator.gt,
-    ">=": operator.ge,
-    "=": operator.eq,
-    "!=": operator.ne,
-}
+_OPERATORS: Final = {"<": lt, "<=": le, ">": gt, ">=": ge, "=": eq, "!=": ne}
+_STATUSES: Final = {"valid": validity.valid, "feasible": validity.feasible, "validated": validity.validated}
 #: Columns of flags; 1 means true.
 _FLAGS: Final = {"held": "quality/success", "lift": "quality/lift_outcome", "lift_hard": "quality/lift_hard"}
 
 
 def parse(text: str) -> Test:
-    """Compile an expression to a test. Comparisons with a missing metric or nan are false.
-
-    Raises:
-        InputError: not an expression; states the position, or the known names.
-    """
+    """Compile an expression to a test; InputError if it is none. Comparisons with a missing metric or nan are false."""
     tree = parsed(text)
     return lambda columns, said: _mask(tree, columns, said)
 
@@ -46,7 +36,7 @@ def parse(text: str) -> Test:
 def _mask(node: Node, columns: Mapping[str, Array], said: Mapping[str, Any]) -> Mask:
     count = len(columns["quality/valid"])
     if isinstance(node, Connective):
-        join = operator.or_ if node.word == "or" else operator.and_
+        join = or_ if node.word == "or" else and_
         return reduce(join, (_mask(part, columns, said) for part in node.parts))
     if isinstance(node, Negation):
         return ~_mask(node.part, columns, said)
@@ -64,12 +54,8 @@ def _mask(node: Node, columns: Mapping[str, Array], said: Mapping[str, Any]) -> 
 
 
 def _flag(name: str, columns: Mapping[str, Array]) -> Mask:
-    if name == "valid":
-        return validity.valid(columns)
-    if name == "feasible":
-        return validity.feasible(columns)
-    if name == "validated":
-        return np.asarray(columns.get("quality/success", np.full(len(columns["quality/valid"]), -1))) >= 0
+    if name in _STATUSES:
+        return _STATUSES[name](columns)
     path = _FLAGS[name]
     return np.asarray(columns[path]) == 1 if path in columns else np.zeros(len(columns["quality/valid"]), bool)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Annotated, Any, Final
 
 import typer
@@ -17,8 +18,6 @@ _TYPED: Final = Option(places=ASSET)
 
 
 class HandWords(Model):
-    """Keys of a hand's `asset.json` with command-line options; see `hand_options`."""
-
     urdf: Annotated[str | None, _TYPED] = Field(
         None, description="main file of the hand in the folder or ZIP (URDF, xacro or MJCF): NAME"
     )
@@ -54,39 +53,23 @@ SourceOption = Annotated[str | None, typer.Option("--source", help="Source: a UR
 
 
 def provenance(licence: str | None, source: str | None) -> dict[str, Any]:
-    """Return the keys of `asset.json` for licence and source; absent ones are omitted."""
     return {key: value for key, value in (("licence", licence), ("source", source)) if value}
 
 
-def hand_options(
-    *,
-    urdf: str | None = None,
-    xacro: list[str] | None = None,
-    palm: str | None = None,
-    approach: str | None = None,
-    root: str | None = None,
-    pre_shape: list[str] | None = None,
-    closing: list[str] | None = None,
-    fingertips: str | None = None,
-    fix: list[str] | None = None,
-    drop: list[str] | None = None,
-) -> dict[str, Any]:
-    """Return the keys of a hand's `asset.json`; absent ones are omitted.
-
-    Raises:
-        InputError: a text is neither a vector nor JOINT=VALUE.
-    """
+def hand_options(**given: Any) -> dict[str, Any]:
+    """Return the keys of a hand's `asset.json` for options of `HandWords`; absent ones are omitted."""
+    words = HandWords(**given)
     options: dict[str, Any] = {
-        "file": urdf,
-        "xacro": dict(map(_argument, xacro or [])),
-        "palm": {"link": palm} if palm else None,
-        "approach": _vector(approach) if approach else None,
-        "root": root,
-        "preshape": _assignments("--pre-shape", pre_shape) if pre_shape else None,
-        "closing": _directions(closing) if closing else None,
-        "fingertips": [link.strip() for link in fingertips.split(",") if link.strip()] if fingertips else None,
-        "fix": _assignments("--fix", fix) if fix else None,
-        "drop": drop,
+        "file": words.urdf,
+        "xacro": dict(map(_argument, words.xacro)),
+        "palm": {"link": words.palm} if words.palm else None,
+        "approach": _vector(words.approach) if words.approach else None,
+        "root": words.root,
+        "preshape": _assignments("--pre-shape", words.pre_shape) if words.pre_shape else None,
+        "closing": _directions(words.closing) if words.closing else None,
+        "fingertips": [link for part in (words.fingertips or "").split(",") if (link := part.strip())],
+        "fix": _assignments("--fix", words.fix) if words.fix else None,
+        "drop": list(words.drop),
     }
     return {key: value for key, value in options.items() if value}
 
@@ -110,7 +93,7 @@ def _vector(text: str) -> list[float]:
     return [x, y, z]
 
 
-def _assignments(option: str, texts: list[str]) -> dict[str, float]:
+def _assignments(option: str, texts: Sequence[str]) -> dict[str, float]:
     values: dict[str, float] = {}
     for text in ",".join(texts).split(","):
         name, _, value = text.strip().partition("=")
@@ -128,7 +111,7 @@ def _argument(text: str) -> tuple[str, str]:
     return name, value
 
 
-def _directions(texts: list[str]) -> dict[str, int]:
+def _directions(texts: Sequence[str]) -> dict[str, int]:
     values = _assignments("--closing", texts)
     for name, value in values.items():
         if value not in (-1, 0, 1):

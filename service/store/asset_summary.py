@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import typer
@@ -16,7 +16,6 @@ _OVERRIDES = {"palm": "--palm LINK --approach x,y,z", "preshape": "--pre-shape J
 
 
 def say_check(kind: AssetKind, report: Mapping[str, Any]) -> None:
-    """Print a check's report; a refusal goes to stderr in one line."""
     if report["verdict"] == "refuse":
         typer.echo(f"graspd: refused: {report['message']}", err=True)
         return
@@ -26,12 +25,10 @@ def say_check(kind: AssetKind, report: Mapping[str, Any]) -> None:
 
 
 def verdict_line(asset: Mapping[str, Any]) -> str:
-    """Format an asset as one line of a list."""
     return f"{asset['verdict'] or 'waiting':<8} {asset['message'] or asset['name']}"
 
 
 def summary(kind: AssetKind, facts: Mapping[str, Any]) -> list[str]:
-    """Return lines of label and value; missing facts are omitted."""
     pairs = {AssetKind.HAND: _hand, AssetKind.OBJECT: _object, AssetKind.NETWORK: _network}[kind](facts)
     return [f"{label:<18} {text}" for label, text in pairs]
 
@@ -43,41 +40,36 @@ def self_test_line(facts: Mapping[str, Any]) -> str:
 
 
 def limit_line(facts: Mapping[str, Any]) -> str:
-    """Return the best payload of a hand's self-test; empty if not run, or nothing was lifted."""
     tried = facts.get("self_test")
     limit = tried.get("limit") if isinstance(tried, Mapping) else None
     return str(limit.get("says", "")) if isinstance(limit, Mapping) else ""
 
 
 def self_test_lines(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Return the available ones of both lines, with labels."""
     lines = [("self-test", self_test_line(facts)), ("payload", limit_line(facts))]
     return [(label, says) for label, says in lines if says]
 
 
 def hand_line(facts: Mapping[str, Any]) -> str:
-    """Return name and digest of the hand of a network."""
     return f"{facts.get('hand', '')} ({str(facts.get('hand_digest', ''))[:12]})"
 
 
-def _hand(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
+def _hand(facts: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     guessed = facts.get("guessed", [])
-    lines: list[tuple[str, str]] = []
     if "palm_centre" in facts:
-        lines.append(("palm", f"{facts.get('root', '')} at {_vector(facts['palm_centre'], 1e3)} mm"))
-        lines.append(("approach", _vector(facts["palm_approach"])))
+        yield "palm", f"{facts.get('root', '')} at {_vector(facts['palm_centre'], 1e3)} mm"
+        yield "approach", _vector(facts["palm_approach"])
     if "fingertips" in facts:
-        lines.append(("fingertips", ", ".join(facts["fingertips"])))
+        yield "fingertips", ", ".join(facts["fingertips"])
     if "opening_m" in facts:
-        lines.append(("opening", f"{1e3 * facts['opening_m']:.1f} mm between the pads"))
-    lines += self_test_lines(facts)
+        yield "opening", f"{1e3 * facts['opening_m']:.1f} mm between the pads"
+    yield from self_test_lines(facts)
     if "dofs" in facts:
-        lines.append(("dofs", f"{len(facts['dofs'])}, driving {len(facts.get('joints', []))} joints"))
-        lines += [("", _dof(name, facts)) for name in facts["dofs"]]
+        yield "dofs", f"{len(facts['dofs'])}, driving {len(facts.get('joints', []))} joints"
+        yield from (("", _dof(name, facts)) for name in facts["dofs"])
     fix = [_OVERRIDES[key] for key in guessed if key in _OVERRIDES]
     if guessed:
-        lines.append(("guessed", f"{', '.join(guessed)}{'; override: ' + ' '.join(fix) if fix else ''}"))
-    return lines
+        yield "guessed", f"{', '.join(guessed)}{'; override: ' + ' '.join(fix) if fix else ''}"
 
 
 def _dof(name: str, facts: Mapping[str, Any]) -> str:
@@ -86,38 +78,29 @@ def _dof(name: str, facts: Mapping[str, Any]) -> str:
     return f"{name:<32} {limits:<18} {closing:<9} pre-shape {_angle(facts['preshape'][name])}"
 
 
-def _object(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
-    lines: list[tuple[str, str]] = []
+def _object(facts: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     if "extents_m" in facts:
-        lines.append(("size", f"{_vector(facts['extents_m'], 1e3)} mm, read as {facts.get('units', 'm')}"))
+        yield "size", f"{_vector(facts['extents_m'], 1e3)} mm, read as {facts.get('units', 'm')}"
     if "prepared_faces" in facts:
-        lines.append(
-            (
-                "mesh",
-                f"{facts['faces']} faces, simplified to {facts['prepared_faces']}; "
-                f"largest surface deviation {1e3 * facts['deviation_m']:.2f} mm",
-            )
-        )
+        faces = f"{facts['faces']} faces, simplified to {facts['prepared_faces']}"
+        yield "mesh", f"{faces}; largest surface deviation {1e3 * facts['deviation_m']:.2f} mm"
     if (moved := facts.get("repair_deviation_m")) is not None and moved > _NOTHING_M:
-        lines.append(("repaired", f"surface moved by at most {1e3 * moved:.2g} mm"))
+        yield "repaired", f"surface moved by at most {1e3 * moved:.2g} mm"
     if "volume_m3" in facts:
         mass = facts.get("mass_kg")
         assumed = " assumed" if facts.get("mass_stated") is False else ""
-        lines.append(("volume", f"{1e6 * facts['volume_m3']:.1f} cm3" + (f", {mass:.3g} kg{assumed}" if mass else "")))
-    return lines
+        yield "volume", f"{1e6 * facts['volume_m3']:.1f} cm3" + (f", {mass:.3g} kg{assumed}" if mass else "")
 
 
-def _network(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
-    lines: list[tuple[str, str]] = []
+def _network(facts: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     if "hand_digest" in facts:
-        lines.append(("hand", f"{facts.get('hand', '')} {facts['hand_digest']}, {facts.get('joints', 0)} joints"))
+        yield "hand", f"{facts.get('hand', '')} {facts['hand_digest']}, {facts.get('joints', 0)} joints"
     if "points" in facts:
-        lines.append(("cloud", f"{facts['points']} points, {facts.get('steps', 0)} steps of the flow"))
+        yield "cloud", f"{facts['points']} points, {facts.get('steps', 0)} steps of the flow"
     if "file_digest" in facts:
-        lines.append(("file digest", str(facts["file_digest"])))
+        yield "file digest", str(facts["file_digest"])
     if facts.get("about"):
-        lines.append(("about", str(facts["about"])))
-    return lines
+        yield "about", str(facts["about"])
 
 
 def _vector(values: Sequence[float], scale: float = 1.0) -> str:

@@ -1,7 +1,4 @@
-"""Stored hands and objects: immutable archives in the store, and the built-in ones on disk.
-
-An archive is a reproducible ZIP: sorted names, fixed time stamps, no variable attributes.
-"""
+"""Hands and objects: reproducible ZIPs (sorted names, fixed times) in the store, and the built-in ones on disk."""
 
 from __future__ import annotations
 
@@ -10,13 +7,13 @@ import io
 import shutil
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, MutableMapping
 from contextlib import contextmanager
 from importlib import resources
 from pathlib import Path, PurePosixPath
-from typing import IO, Final, Self, TypeVar
+from typing import IO, Final, Literal, Self, TypeVar
 
-from graspd.service.model.digests import StreamedFiles, digest_bytes, digest_files
+from graspd.service.model.digests import digest_bytes, digest_files
 from graspd.service.model.domain import Asset
 from graspd.service.model.errors import InputError, LimitError, NotFoundError
 from graspd.service.model.states import AssetKind
@@ -38,19 +35,17 @@ _T = TypeVar("_T")
 
 
 def pack(files: Mapping[str, bytes]) -> bytes:
-    """Pack named files into a ZIP; equal files give equal bytes."""
     buffer = io.BytesIO()
     pack_into(files, buffer)
     return buffer.getvalue()
 
 
 def pack_into(files: Mapping[str, bytes], target: IO[bytes]) -> None:
-    """Write that ZIP to a file, in pieces for files outside memory."""
     with zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED, compresslevel=6) as archive:
         for name in sorted(files):
             entry = zipfile.ZipInfo(check_path(name), _EPOCH)
             entry.compress_type = zipfile.ZIP_DEFLATED
-            if isinstance(files, StreamedFiles):
+            if isinstance(files, ZipFiles):
                 with files.open(name) as source, archive.open(entry, "w") as packed:
                     shutil.copyfileobj(source, packed, _PIECE_BYTES)
             else:
@@ -58,17 +53,13 @@ def pack_into(files: Mapping[str, bytes], target: IO[bytes]) -> None:
 
 
 def unpack(data: bytes, *, limit_bytes: int) -> dict[str, bytes]:
-    """Unpack a ZIP in memory; no file is written under a name from the archive.
-
-    Raises:
-        InputError: not a ZIP, encrypted, or a name outside the archive.
-        LimitError: more than `limit_bytes` unpacked, or more than `MAX_FILES` files.
-    """
+    """Unpack a ZIP in memory; InputError for a bad archive or name, LimitError above `limit_bytes` or `MAX_FILES`."""
     archive = _open_zip(io.BytesIO(data))
     files: dict[str, bytes] = {}
     total = 0
     for name, entry in _entries(archive).items():
-        content = _read_entry(archive, entry, limit_bytes - total + 1)
+        with _damage_said(entry), archive.open(entry) as stream:
+            content = stream.read(limit_bytes - total + 1)  # regardless of the size in its header
         total += len(content)
         if total > limit_bytes:
             raise LimitError(f"the archive unpacks to more than {limit_bytes} bytes")
@@ -77,7 +68,6 @@ def unpack(data: bytes, *, limit_bytes: int) -> dict[str, bytes]:
 
 
 def unpack_file(path: Path) -> dict[str, bytes]:
-    """Unpack a file, up to the limit of uploads; errors name the file."""
     from graspd.service.settings import Settings
 
     try:
@@ -94,15 +84,8 @@ def without_common_folder(files: dict[str, _T]) -> dict[str, _T]:
     return files
 
 
-class ZipFiles(StreamedFiles):
-    """Files of a ZIP on disk, unpacked in pieces on demand; files can be added.
-
-    The constructor unpacks it once to measure and to digest the true contents.
-
-    Raises:
-        InputError: not a ZIP, encrypted, damaged, or a name outside the archive.
-        LimitError: more than `limit_bytes` unpacked, or more than `MAX_FILES` files.
-    """
+class ZipFiles(MutableMapping[str, bytes]):
+    """Files of a ZIP on disk, unpacked in pieces on demand; digests are of the true contents. Files can be added."""
 
     def __init__(self, file: IO[bytes], *, limit_bytes: int) -> None:
         self._archive = _open_zip(file)
@@ -118,7 +101,6 @@ class ZipFiles(StreamedFiles):
             self._known[name] = (size, digest)
 
     def without_common_folder(self) -> Self:
-        """See the function of the same name."""
         self._found = without_common_folder(self._found)
         self._known = without_common_folder(self._known)
         return self
@@ -162,7 +144,6 @@ def _open_zip(file: IO[bytes]) -> zipfile.ZipFile:
 
 
 def _entries(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
-    """Return the files of an archive by plain names after checking all entries."""
     entries = [entry for entry in archive.infolist() if not entry.is_dir()]
     if len(entries) > MAX_FILES:
         raise LimitError(f"the archive holds {len(entries)} files; at most {MAX_FILES} are taken")
@@ -182,14 +163,7 @@ def _entries(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
     return found
 
 
-def _read_entry(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, limit: int) -> bytes:
-    """Read at most `limit` bytes of an entry, regardless of its header."""
-    with _damage_said(entry), archive.open(entry) as stream:
-        return stream.read(limit)
-
-
 def _measure_entry(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, limit: int) -> tuple[int, str]:
-    """Return size (up to `limit`) and digest of an entry, read in pieces."""
     count, digest = 0, hashlib.sha256()
     with _damage_said(entry), archive.open(entry) as stream:
         while count < limit and (piece := stream.read(min(_PIECE_BYTES, limit - count))):
@@ -218,39 +192,31 @@ def check_path(name: str) -> str:
     return str(path)
 
 
-def builtin_files(kind: AssetKind, name: str) -> dict[str, bytes]:
-    """Load the files of a built-in hand (`asset.json`, URDF) or object (`asset.json`, mesh).
+def _builtin_folder(kind: AssetKind | Literal["model"]) -> Path:
+    return Path(str(resources.files("graspd.service"))) / "builtin" / f"{kind}s"
 
-    Raises:
-        NotFoundError: no such built-in asset.
-    """
-    folder = Path(str(resources.files("graspd.service"))) / "builtin" / f"{kind.value}s" / name
+
+def builtin_files(kind: AssetKind, name: str) -> dict[str, bytes]:
+    """Load the files of a built-in hand or object: `asset.json` with URDF or mesh; NotFoundError if there is none."""
+    folder = _builtin_folder(kind) / name
     if not (folder / "asset.json").is_file():
         known = ", ".join(builtin_names(kind))
         raise NotFoundError(f"there is no built-in {kind.value} {name!r}; there are: {known}")
-    return {
-        path.relative_to(folder).as_posix(): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()
-    }
+    files = (path for path in sorted(folder.rglob("*")) if path.is_file())
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
 
 
 def builtin_model(kind: AssetKind, name: str) -> bytes:
     """Load the binary glTF of a built-in hand or object, made by `python -m graspd.worker.stages.models`."""
-    return (
-        Path(str(resources.files("graspd.service"))) / "builtin" / "models" / f"{kind.value}-{name}.glb"
-    ).read_bytes()
+    return (_builtin_folder("model") / f"{kind.value}-{name}.glb").read_bytes()
 
 
 def builtin_names(kind: AssetKind) -> tuple[str, ...]:
-    """Return the names of the built-in hands or objects."""
-    root = Path(str(resources.files("graspd.service"))) / "builtin" / f"{kind.value}s"
-    return tuple(sorted(path.parent.name for path in root.glob("*/asset.json")))
+    return tuple(sorted(path.parent.name for path in _builtin_folder(kind).glob("*/asset.json")))
 
 
 def describe(kind: AssetKind, name: str, files: Mapping[str, bytes], *, created: str, builtin: bool = False) -> Asset:
-    """Make the asset record of files with an `asset.json` whose key `file` is the main file.
-
-    A hand's `asset.json` may also contain palm, approach, preshape, couplings, ...; an object's units and density.
-    """
+    """Make the asset record of files with an `asset.json` whose key `file` is the main file."""
     described = parse_description(asset_json(files), f"{kind.value} {name!r}")
     main = described.file
     if main not in files:
@@ -261,7 +227,7 @@ def describe(kind: AssetKind, name: str, files: Mapping[str, bytes], *, created:
         digest=digest_files(kind, files),
         filename=main,
         files=tuple(sorted(files)),
-        size_bytes=sum(files.size(name) if isinstance(files, StreamedFiles) else len(files[name]) for name in files),
+        size_bytes=sum(files.size(name) if isinstance(files, ZipFiles) else len(files[name]) for name in files),
         created=created,
         builtin=builtin,
         facts=described.facts,
@@ -269,15 +235,13 @@ def describe(kind: AssetKind, name: str, files: Mapping[str, bytes], *, created:
 
 
 def asset_json(files: Mapping[str, bytes]) -> bytes:
-    """Return the bytes of `asset.json`; InputError if it is missing or too large."""
     if "asset.json" not in files:
         raise InputError("asset.json, a JSON object that names the main file, is not among the files")
-    if isinstance(files, StreamedFiles) and files.size("asset.json") > MAX_BYTES:
+    if isinstance(files, ZipFiles) and files.size("asset.json") > MAX_BYTES:
         raise InputError(f"asset.json has more than {MAX_BYTES} bytes; leave out what is not needed")
     return files["asset.json"]
 
 
 def builtin_asset(kind: AssetKind, name: str) -> tuple[Asset, dict[str, bytes]]:
-    """Load a built-in hand or object with its files."""
     files = builtin_files(kind, name)
     return describe(kind, name, files, created=_BUILTIN_CREATED, builtin=True), files

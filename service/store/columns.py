@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Final, Literal
 
@@ -15,7 +15,6 @@ _VERSIONS: Final[dict[str, int]] = {"base": 2, "scene": 1, "views": 1}
 
 
 def schema_of(kind: str) -> str:
-    """Return the schema name of a kind of shard, such as `graspd/base@2`."""
     return f"graspd/{kind}@{_VERSIONS[kind]}"
 
 
@@ -31,6 +30,7 @@ class Column:
     optional: bool = False
 
 
+_REST = "share of drops that come to rest on the same face of the convex hull"
 _POSE = "position x y z [m] and unit quaternion w x y z of the hand's root link"
 
 
@@ -43,16 +43,23 @@ def _posture(prefix: str, what: str) -> dict[str, Column]:
     }
 
 
+def _absent(shape: str, dtype: str, units: str, frame: str, description: str) -> Column:
+    return Column(shape, dtype, units, frame, description, optional=True)
+
+
+def _flag(description: str, dtype: str = "i1") -> Column:
+    return _absent("N", dtype, "bool", "none", description)
+
+
+def _code(description: str, shape: str = "N") -> Column:
+    return _absent(shape, "u1", "enum", "none", description)
+
+
 def _wrist(rows: str) -> Column:
-    return Column(
-        f"{rows} U",
-        "f8",
-        "rad",
-        "joint",
-        "wrist angles above the hand's root that keep the links above it free of collision, order in "
-        "attribute wrist_joint_names",
-        optional=True,
+    description = (
+        "wrist angles above the hand's root that keep the links above it free of collision, order in attribute"
     )
+    return _absent(f"{rows} U", "f8", "rad", "joint", f"{description} wrist_joint_names")
 
 
 def _measured(*, optional: bool) -> dict[str, Column]:
@@ -80,123 +87,65 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
         "quality/valid": Column(
             "N", "u1", "bool", "none", "1: feasible, and held by the validator; 0 also if not validated"
         ),
-        "quality/feasible": Column(
-            "N", "u1", "bool", "none", "1: within the geometric limits of penetration and contact", optional=True
+        "quality/feasible": _flag("1: within the geometric limits of penetration and contact", "u1"),
+        "quality/success": _flag(
+            "verdict of the validator at the level of attribute verdict_level: 1 held, 0 dropped, -1 not tested"
         ),
-        "quality/success": Column(
-            "N",
-            "i1",
-            "bool",
-            "none",
-            "verdict of the validator at the level of attribute verdict_level: 1 held, 0 dropped, -1 not tested",
-            optional=True,
-        ),
-        "quality/verdict_outcome": Column(
-            "N D",
-            "u1",
-            "enum",
-            "none",
+        "quality/verdict_outcome": _code(
             "outcome per push +x -x +y -y +z -z: 0 not tested, 1 held, 2 penetration, 3 lost while "
             "closing, 4 displaced, 5 rotated, 6 diverged",
-            optional=True,
+            "N D",
         ),
-        "quality/verdict_margin": Column(
+        "quality/verdict_margin": _absent(
             "N",
             "f8",
             "1",
             "none",
             "largest ratio of displacement or rotation to its limit under the pushes; below 1: held",
-            optional=True,
         ),
-        "quality/validated_by": Column(
-            "N",
-            "u1",
-            "enum",
-            "none",
-            "engine of the verdict `success`: 0 MuJoCo on the CPU, which alone certifies, 1 MuJoCo Warp, the prefilter",
-            optional=True,
+        "quality/validated_by": _code(
+            "engine of the verdict `success`: 0 MuJoCo on the CPU, which alone certifies, 1 MuJoCo Warp, the prefilter"
         ),
-        "quality/recheck": Column(
-            "N",
-            "i1",
-            "bool",
-            "none",
-            "verdict under the unmodified DexGraspBench protocol: 1 held, 0 dropped, -1 not rechecked",
-            optional=True,
+        "quality/recheck": _flag(
+            "verdict under the unmodified DexGraspBench protocol: 1 held, 0 dropped, -1 not rechecked"
         ),
-        "quality/published": Column(
-            "N", "i1", "bool", "none", "imported grasps: published verdict: 1 held, 0 dropped, -1 none", True
-        ),
+        "quality/published": _flag("imported grasps: published verdict: 1 held, 0 dropped, -1 none"),
         **_measured(optional=True),
-        "quality/robust_weakest": Column(
-            "N",
-            "u1",
-            "enum",
-            "none",
+        "quality/robust_weakest": _code(
             "perturbed parameter of the first model in which the grasp does not hold: 0 none, "
-            + ", ".join(f"{axis:d} {words}" for axis, words in AXIS_MEANINGS.items()),
-            optional=True,
+            + ", ".join(f"{axis:d} {words}" for axis, words in AXIS_MEANINGS.items())
         ),
         # Grasps planned for a scene state the scene, the approach and the lift.
-        "scene/object_pose": Column(
-            "S 7", "f8", "m, 1", "scene", "object frame at rest in each scene; z is up", optional=True
+        "scene/object_pose": _absent("S 7", "f8", "m, 1", "scene", "object frame at rest in each scene; z is up"),
+        "scene/rest_probability": _absent("S", "f8", "1", "none", _REST),
+        "scene/neighbour_pose": _absent(
+            "S M 7", "f8", "m, 1", "scene", "poses of the neighbours in each scene; names in attribute neighbours"
         ),
-        "scene/rest_probability": Column(
-            "S",
-            "f8",
-            "1",
-            "none",
-            "share of drops that come to rest on the same face of the convex hull",
-            optional=True,
-        ),
-        "scene/neighbour_pose": Column(
-            "S M 7",
-            "f8",
-            "m, 1",
-            "scene",
-            "poses of the neighbours in each scene; names in attribute neighbours",
-            optional=True,
-        ),
-        "grasp/scene_index": Column("N", "i4", "1", "none", "row of the grasp's scene in /scene", optional=True),
-        "grasp/approach": Column(
+        "grasp/scene_index": _absent("N", "i4", "1", "none", "row of the grasp's scene in /scene"),
+        "grasp/approach": _absent(
             "N W 7",
             "f8",
             "m, 1",
             "object",
             f"approach waypoints from standoff to pregrasp, joints in approach_joint_positions: {_POSE}",
-            optional=True,
         ),
-        "grasp/approach_joint_positions": Column(
-            "N J", "f8", "rad or m", "joint", "joints of the open hand on approach, order in joint_names", optional=True
+        "grasp/approach_joint_positions": _absent(
+            "N J", "f8", "rad or m", "joint", "joints of the open hand on approach, order in joint_names"
         ),
-        "grasp/lift": Column("N 7", "f8", "m, 1", "object", f"squeeze posture raised by 10 cm: {_POSE}", optional=True),
+        "grasp/lift": _absent("N 7", "f8", "m, 1", "object", f"squeeze posture raised by 10 cm: {_POSE}"),
         "grasp/wrist_positions": _wrist("N"),
-        "quality/lift_outcome": Column(
-            "N",
-            "u1",
-            "enum",
-            "none",
+        "quality/lift_outcome": _code(
             "lift test: 0 not tested, 1 lifted, 2 penetration, 3 contact on the approach, 4 lost while "
-            "closing, 5 not lifted, 6 rotated, 7 diverged, 8 neighbour moved",
-            optional=True,
+            "closing, 5 not lifted, 6 rotated, 7 diverged, 8 neighbour moved"
         ),
-        "quality/lift_hard": Column(
-            "N", "i1", "bool", "none", "lift test at half the friction: 1 lifted, 0 not, -1 not tested", optional=True
-        ),
-        "quality/pushes": Column(
-            "N",
-            "i1",
-            "bool",
-            "none",
-            "only in files of graspd 0.2: six pushes without the scene: 1 held, 0 dropped, -1 not tested",
-            optional=True,
+        "quality/lift_hard": _flag("lift test at half the friction: 1 lifted, 0 not, -1 not tested"),
+        "quality/pushes": _flag(
+            "only in files of graspd 0.2: six pushes without the scene: 1 held, 0 dropped, -1 not tested"
         ),
     },
     "scene": {
         "scene/object_pose": Column("S 7", "f8", "m, 1", "table", "object frame at rest; table top is z = 0"),
-        "scene/rest_probability": Column(
-            "S", "f8", "1", "none", "share of drops that come to rest on the same face of the convex hull"
-        ),
+        "scene/rest_probability": Column("S", "f8", "1", "none", _REST),
         "scene/drop_seconds": Column("S", "f8", "s", "none", "simulated time until rest"),
         "grasp/base_index": Column("K", "i4", "1", "none", "row of the grasp in the base shard"),
         "grasp/scene_index": Column("K", "i4", "1", "none", "row of the scene in /scene"),
@@ -205,34 +154,24 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
             "K", "f8", "m", "table", "lowest point of the hand above the table, at contact and on the approach"
         ),
         "grasp/valid": Column("K", "u1", "bool", "none", "1: hand clear at contact and on the approach"),
-        "grasp/rejection": Column(
-            "K",
-            "u1",
-            "enum",
-            "none",
+        "grasp/rejection": _code(
             "0 not rejected; insufficient clearance to: 1 the table at contact, 2 the table on the "
             "approach, 3 a neighbour at contact, 4 a neighbour on the approach",
-            optional=True,
+            "K",
         ),
-        "grasp/contact_table_clearance_m": Column(
-            "K", "f8", "m", "table", "lowest point of the hand above the table at contact", optional=True
+        "grasp/contact_table_clearance_m": _absent(
+            "K", "f8", "m", "table", "lowest point of the hand above the table at contact"
         ),
-        "grasp/neighbour_clearance_m": Column(
+        "grasp/neighbour_clearance_m": _absent(
             "K",
             "f8",
             "m",
             "table",
             "signed distance of the hand from the neighbours' convex hulls at contact and on approach, at most 0.1",
-            optional=True,
         ),
         "grasp/wrist_positions": _wrist("K"),
-        "scene/neighbour_pose": Column(
-            "S M 7",
-            "f8",
-            "m, 1",
-            "table",
-            "poses of the neighbours at rest; names in attribute neighbours",
-            optional=True,
+        "scene/neighbour_pose": _absent(
+            "S M 7", "f8", "m, 1", "table", "poses of the neighbours at rest; names in attribute neighbours"
         ),
     },
     "views": {
@@ -257,20 +196,16 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
             "V 4", "f4", "px", "image", "x_min y_min x_max y_max of the projected object, occluded or not"
         ),
         "box/bounding_box_3d": Column("V 8 3", "f4", "m", "camera", "corners of the object-aligned box"),
-        "box/occlusion_ratio": Column(
-            "V", "f4", "1", "image", "occluded share of the object's pixels; nan: not in view", optional=True
+        "box/occlusion_ratio": _absent(
+            "V", "f4", "1", "image", "occluded share of the object's pixels; nan: not in view"
         ),
-        "image/distance": Column(
-            "V H W", "f4", "m", "camera", "distance from the optical centre; inf: no surface", optional=True
+        "image/distance": _absent("V H W", "f4", "m", "camera", "distance from the optical centre; inf: no surface"),
+        "image/normals": _absent("V H W 3", "f2", "1", "table", "unit shading normal, outward; 0 0 0: no surface"),
+        "image/rgb_hand": _absent(
+            "V H W 3", "u1", "sRGB", "image", "colour with the hand in its grasp pose, for display"
         ),
-        "image/normals": Column(
-            "V H W 3", "f2", "1", "table", "unit shading normal, outward; 0 0 0: no surface", optional=True
-        ),
-        "image/rgb_hand": Column(
-            "V H W 3", "u1", "sRGB", "image", "colour with the hand in its grasp pose, for display", optional=True
-        ),
-        "camera/hand_grasp": Column(
-            "V", "i4", "1", "none", "row of the grasp that rgb_hand shows in the scene shard; -1: none", optional=True
+        "camera/hand_grasp": _absent(
+            "V", "i4", "1", "none", "row of the grasp that rgb_hand shows in the scene shard; -1: none"
         ),
     },
 }
@@ -280,8 +215,6 @@ Attribute = str | int | float | list[str]
 
 @dataclass(frozen=True)
 class RootAttribute:
-    """One root attribute of a shard."""
-
     type: str
     """text, integer, number or texts."""
     description: str
@@ -360,8 +293,13 @@ ATTRIBUTES: Final[dict[str, RootAttribute]] = {
 }
 
 
+def check_known(kind: ShardKind, columns: Iterable[str]) -> None:
+    """Raise InputError for a column that no shard of this kind has."""
+    if unknown := set(columns) - set(SCHEMAS[kind]):
+        raise InputError(f"{kind} shards have no column {sorted(unknown)[0]!r}; docs/reference/dataset.md lists them")
+
+
 def check_attributes(kind: str, said: Mapping[str, Attribute]) -> None:
-    """Raise InputError for an unknown attribute or a wrong type."""
     for name, value in said.items():
         known = ATTRIBUTES.get(name)
         if known is None or kind not in known.kinds:

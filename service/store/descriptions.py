@@ -1,7 +1,4 @@
-"""`asset.json`, a small, flat JSON object, and corrections of guesses about a hand.
-
-Workers check the meaning of its keys (`worker.hands.options`, `worker.objects.options`).
-"""
+"""`asset.json`, a small JSON object whose meaning workers check, and corrections of guesses about a hand."""
 
 from __future__ import annotations
 
@@ -14,7 +11,7 @@ from typing import Annotated, Any, Final, Literal
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StringConstraints, ValidationError
 from pydantic_core import from_json, to_json
 
-from graspd.service.model.base import refusal
+from graspd.service.model.base import Model, refusal
 from graspd.service.model.errors import ConflictError, InputError
 
 #: The built-in hands need 2 KB; every list of hands or objects contains these facts.
@@ -46,7 +43,6 @@ class Description(BaseModel):
 
 
 def parse_description(data: bytes, what: str) -> Description:
-    """Parse an `asset.json`; InputError, which begins with `what`, if it is invalid."""
     given = json_object(data, f"{what}: asset.json")
     try:
         return Description.model_validate(given)
@@ -55,7 +51,6 @@ def parse_description(data: bytes, what: str) -> Description:
 
 
 def json_object(text: bytes | str, what: str) -> dict[str, Any]:
-    """Parse a JSON object of bounded size and depth; InputError if it is invalid."""
     data = text.encode(errors="replace") if isinstance(text, str) else text
     if len(data) > MAX_BYTES:
         raise InputError(f"{what} has more than {MAX_BYTES} bytes; leave out what is not needed")
@@ -91,11 +86,7 @@ Share = Annotated[float, Field(ge=-1e3, le=1e3)]
 Direction = Literal[-1, 0, 1]
 
 
-class _Said(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class PalmCorrection(_Said):
+class PalmCorrection(Model):
     """The palm in the frame of a link, with the hand in its pre-shape. Missing values are guessed again."""
 
     link: Text
@@ -103,7 +94,7 @@ class PalmCorrection(_Said):
     approach: tuple[Share, Share, Share] | None = Field(None, description="direction out of the palm; any length")
 
 
-class HandCorrections(_Said):
+class HandCorrections(Model):
     """A user's corrections of wrong guesses about a hand. Missing values stay as found."""
 
     palm: PalmCorrection | None = None
@@ -117,8 +108,6 @@ class HandCorrections(_Said):
 
 
 class HandFacts(BaseModel):
-    """Facts about a hand in its model (`worker.stages.models`)."""
-
     model_config = ConfigDict(frozen=True)
 
     root: str
@@ -137,11 +126,7 @@ class HandFacts(BaseModel):
 
 
 def facts_of(model: bytes) -> HandFacts:
-    """Read the facts in the binary glTF of a hand.
-
-    Raises:
-        ConflictError: facts are missing, because an older version made the model.
-    """
+    """Read the facts in the binary glTF of a hand; ConflictError if an older version made the model."""
     try:
         (length,) = struct.unpack("<I", model[12:16])
         document = json.loads(model[20 : 20 + length])
@@ -157,24 +142,13 @@ def facts_of(model: bytes) -> HandFacts:
 
 def described(facts: Mapping[str, Any]) -> dict[str, Any]:
     """Return found or guessed values as keys of `asset.json`: root, palm, pre-shape, closing, fingertips."""
-    root = facts["root"]
-    return {
-        "root": root,
-        "palm": {"link": root, "centre": facts["palm_centre"], "approach": facts["palm_approach"]},
-        "preshape": facts["preshape"],
-        "closing": facts["closing"],
-        "fingertips": facts["fingertips"],
-    }
+    palm = {"link": facts["root"], "centre": facts["palm_centre"], "approach": facts["palm_approach"]}
+    same = {name: facts[name] for name in ("preshape", "closing", "fingertips")}
+    return {"root": facts["root"], "palm": palm, **same}
 
 
 def corrected(said: Mapping[str, Any], facts: HandFacts, corrections: HandCorrections) -> dict[str, Any]:
-    """Return an `asset.json` with all given, found and corrected values, so that no guess remains.
-
-    A joint whose closing direction changes gets a new guess of its pre-shape unless one is given.
-
-    Raises:
-        InputError: unknown link or joint, a value outside its limits, or an invalid direction.
-    """
+    """Return an `asset.json` with all given, found and corrected values; InputError for a value out of its limits."""
     _check(facts, corrections)
     found = described(facts.model_dump())
     turned = {name for name, way in corrections.closing.items() if way != facts.closing[name]}

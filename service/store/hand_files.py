@@ -7,12 +7,12 @@ import re
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from html import unescape
+from itertools import product
 from pathlib import Path, PurePosixPath
 from typing import Final, Literal
 
-from graspd.service.model.digests import StreamedFiles
 from graspd.service.model.errors import InputError, LimitError
-from graspd.service.store.assets import MAX_FILES
+from graspd.service.store.assets import MAX_FILES, ZipFiles
 from graspd.service.store.mesh_files import HEAD_BYTES, MESHES, beside, named_by, one_like, read_reference
 
 #: Descriptions that supplement a hand's URDF; the first takes precedence.
@@ -33,22 +33,14 @@ _ABOVE: Final = 4
 def files_of_hand(path: Path) -> tuple[dict[str, Path], str]:
     """Find a hand's files with relative names, and the name of its description (empty for a folder).
 
-    Links that lead out of the hand's folder are ignored.
-
-    Args:
-        path: the folder of a hand, or its description. With a description: the files that it names, and `DESCRIPTIONS`;
-            names are relative to the ROS package around it, or else to its own folder.
-
-    Raises:
-        InputError: a folder without a description.
-        LimitError: too many files.
+    With a description: the files that it names, relative to the ROS package around it or else to its own folder. Links
+    that lead out of the hand's folder are ignored.
     """
     files, main = (_of_folder(path), "") if path.is_dir() else _of_description(path)
     return files | _looks(files, path.resolve() if path.is_dir() else _package(path.resolve())), main
 
 
 def _looks(files: Mapping[str, Path], root: Path) -> dict[str, Path]:
-    """Find material libraries and pictures of meshes, inside the root."""
     found: dict[str, Path] = {}
     waiting = [name for name in files if name.lower().endswith(MESHES)]
     while waiting and len(files) + len(found) < MAX_FILES:
@@ -101,7 +93,6 @@ def _of_description(path: Path) -> tuple[dict[str, Path], str]:
 
 
 def _package(path: Path) -> Path:
-    """Return the folder of the ROS package around a description, or else its own folder."""
     for folder in list(path.parents)[:_ABOVE]:
         if (folder / "package.xml").is_file():
             return folder
@@ -109,10 +100,7 @@ def _package(path: Path) -> Path:
 
 
 def _named_by(path: Path, root: Path) -> set[str]:
-    """Return names of files below the root to which a description and its includes may refer.
-
-    `worker.hands.visuals.find_mesh` and `worker.hands.mjcf_source` select among them.
-    """
+    """Return names of files below the root to which a description and its includes may refer."""
     seen, waiting = {path}, [path]
     bases, folders, references = set(), {""}, set()
     found: set[str] = set()
@@ -123,13 +111,7 @@ def _named_by(path: Path, root: Path) -> set[str]:
         folders |= {unescape(folder) for folder in _FOLDER.findall(text)}
         references |= {unescape(reference) for reference in _REFERENCE.findall(text)}
         # Names in an included file are relative to its folder or to that of the description, depending on the reader.
-        found = {
-            name
-            for reference in references
-            for base in bases
-            for folder in folders
-            for name in _names(reference, base, folder, root)
-        }
+        found = {name for parts in product(references, bases, folders) for name in _names(*parts, root)}
         for name in sorted(found):
             inner = (root / name).resolve()
             if inner.suffix.lower() in SUFFIXES and inner not in seen and len(seen) < _MAX_INCLUDED:
@@ -139,7 +121,6 @@ def _named_by(path: Path, root: Path) -> set[str]:
 
 
 def _names(written: str, base: str, folder: str, root: Path) -> Iterator[str]:
-    """Yield the names of files below the root to which a reference may resolve."""
     with suppress(InputError):
         reference = read_reference(posixpath.join(folder, written), base)
         if not reference.scheme or not folder:
@@ -198,7 +179,6 @@ _NAMED: Final = re.compile(r"iso-?8859|latin|windows-12|cp12|gb|big5|shift|euc|k
 
 
 def format_of(name: str, data: bytes) -> Format | None:
-    """Detect the format of a file; None if it does not describe a robot."""
     suffix = PurePosixPath(name).suffix.lower()
     if suffix not in SUFFIXES:
         return None
@@ -226,16 +206,7 @@ def text_of(data: bytes) -> str:
 
 
 def main_of(files: Mapping[str, bytes], wanted: str = "", *, where: str = "the hand") -> str:
-    """Return the name of the file that describes the hand.
-
-    Args:
-        files: all files of the hand.
-        wanted: the user's name for the file: its name, the end of its path, or its name without suffix.
-        where: description of the source, for messages.
-
-    Raises:
-        InputError: no file, several without `wanted`, or `wanted` matches none or several.
-    """
+    """Return the file that describes the hand; InputError if none, or several, fit `wanted`, a part of its name."""
     known = {name: kind for name in sorted(files) if (kind := format_of(name, _described_head(files, name)))}
     if wanted:
         return _named(wanted, [name for name in sorted(files) if name in known or name == wanted], where)
@@ -263,7 +234,7 @@ def _named(wanted: str, known: list[str], where: str) -> str:
     for fits in (
         [name for name in known if name == path],
         [name for name in known if name.endswith("/" + path)],
-        [name for name in known if _stem(name) == path],
+        [name for name in known if hand_name(PurePosixPath(name).name) == path],
     ):
         if len(fits) == 1:
             return fits[0]
@@ -274,7 +245,6 @@ def _named(wanted: str, known: list[str], where: str) -> str:
 
 
 def _outermost(files: Mapping[str, bytes], found: list[str]) -> list[str]:
-    """Return the files that no other file includes."""
     contents = {name: text_of(files[name]).lower() for name in found}
     return [
         name
@@ -284,13 +254,8 @@ def _outermost(files: Mapping[str, bytes], found: list[str]) -> list[str]:
 
 
 def _short(names: list[str]) -> str:
-    """Return the first name in its shortest unique form."""
     leaves = [PurePosixPath(name).name for name in names]
     return leaves[0] if leaves.count(leaves[0]) == 1 else names[0]
-
-
-def _stem(name: str) -> str:
-    return hand_name(PurePosixPath(name).name)
 
 
 def hand_name(leaf: str) -> str:
@@ -302,10 +267,9 @@ def hand_name(leaf: str) -> str:
 
 
 def _described_head(files: Mapping[str, bytes], name: str) -> bytes:
-    """Return the part of a file that decides its format; all of a robot's, which may have macros anywhere."""
     if PurePosixPath(name).suffix.lower() not in SUFFIXES:
         return b""
-    if isinstance(files, StreamedFiles) and files.size(name) > 1 << 23:
+    if isinstance(files, ZipFiles) and files.size(name) > 1 << 23:
         with files.open(name) as stream:
             return stream.read(_HEAD_BYTES)
     return files[name]

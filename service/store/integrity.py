@@ -36,12 +36,7 @@ _REMEMBERED: Final = 100_000
 
 
 def read_checked(store: Store, key: str, sha256: str) -> bytes:
-    """Read an object completely and verify its checksum.
-
-    Raises:
-        DamagedShard: it is missing or does not match the checksum.
-        StoreUnavailable: the store does not answer.
-    """
+    """Read an object and verify its checksum; DamagedShard if it is missing or does not match."""
     try:
         data = store.get(key)
     except NotFoundError:
@@ -51,25 +46,20 @@ def read_checked(store: Store, key: str, sha256: str) -> bytes:
 
 
 def check_digest(name: str, found: str, expected: str) -> None:
-    """Raise DamagedShard with the shard's name if the checksums differ."""
     if found != expected:
         raise DamagedShard(f"{name} is damaged: its SHA-256 is {found[:12]}..., expected {expected[:12]}...; {FIX}")
 
 
 def gone(key: str) -> DamagedShard:
-    """Make the error for a shard with a manifest but without a file."""
     return DamagedShard(f"{key} is gone from the store, and its manifest is there; {FIX}")
 
 
 @dataclass(frozen=True)
 class _Intact:
-    """Facts about a verified object."""
-
     stamp: Stamp
     until: float
     size: int
     blocks: tuple[bytes, ...]
-    """Digest of each block of `STREAM_BYTES`."""
 
 
 class CheckedObjects:
@@ -81,22 +71,13 @@ class CheckedObjects:
         self._lock = threading.Lock()
 
     def check(self, key: str, sha256: str) -> None:
-        """Verify an object by reading it, unless that was done recently.
-
-        Raises:
-            DamagedShard: it is missing or does not match the checksum.
-            StoreUnavailable: the store does not answer.
-        """
+        """Verify an object by reading it, unless that was done recently; DamagedShard if missing or damaged."""
         self._intact(key, sha256)
 
     def stream(self, key: str, sha256: str, start: int, length: int) -> Iterator[bytes]:
         """Yield bytes of an object; each block is read again and verified before any of it is returned.
 
-        The modification time does not reveal bit rot. The first block is verified at the call.
-
-        Raises:
-            DamagedShard: it does not match its checksum; also raised by the iterator, which then ends early.
-            StoreUnavailable: the store does not answer.
+        The modification time does not reveal bit rot. DamagedShard at the call or from the iterator, which ends early.
         """
         known = self._intact(key, sha256)
         end = min(known.size, start + length)
@@ -141,19 +122,12 @@ def _of_block(data: bytes) -> bytes:
 
 
 def check_file(path: Path) -> None:
-    """Check a shard in a folder against the manifest or checksum list there, if any.
-
-    A verified file is not read again by this process while size and modification time do not change.
-
-    Raises:
-        DamagedShard: it does not match the checksum.
-    """
+    """Check a shard in a folder, once while it is unchanged, against the manifest or checksum list there, if any."""
     if _known.get(path) != _file_stamp(path):
         check_content(path, _expected(path))
 
 
 def check_content(path: Path, sha256: str | None) -> None:
-    """Check a file against a known checksum; None: there is none."""
     stamp = _file_stamp(path)
     if _known.get(path) == stamp:
         return
@@ -197,7 +171,6 @@ def _of_manifest(path: Path) -> str | None:
 
 @lru_cache(maxsize=8)
 def _listed(sums: Path, _changed: int) -> dict[str, str]:
-    """Read a list written by `sha256sum`: digests by name."""
     lines = (line.split(maxsplit=1) for line in sums.read_text(errors="replace").splitlines())
     return {parts[1].removeprefix("*"): parts[0] for parts in lines if len(parts) == 2 and _DIGEST.fullmatch(parts[0])}
 
@@ -216,24 +189,17 @@ _END_MARK: Final = b"PK\x05\x06"
 
 
 def put_sealed(store: Store, key: str, data: bytes) -> bool:
-    """Write an object with its seal if absent; False if the name exists."""
     return store.put(key, sealed(key, data))
 
 
 def get_sealed(store: Store, key: str) -> bytes:
-    """Read an object and verify its seal, if it has one.
-
-    Raises:
-        NotFoundError: there is no such object.
-        DamagedError: its bytes do not match the seal.
-    """
+    """Read an object and verify its seal, if it has one; DamagedError if it does not match."""
     data = store.get(key)
     is_sealed(key, [data], len(data))
     return data
 
 
 def put_document(store: Store, key: str, document: Mapping[str, Any]) -> bool:
-    """Write JSON with its seal if absent."""
     return put_sealed(store, key, json.dumps(dict(document)).encode())
 
 
@@ -265,7 +231,6 @@ def sealed(key: str, data: bytes) -> bytes:
 
 
 def seal_archive(file: BufferedRandom) -> None:
-    """Seal a ZIP in a file open for reading and writing."""
     comment = _ZIP + _ZEROS
     file.seek(-2, 2)
     file.write(struct.pack("<H", len(comment)) + comment)
@@ -276,16 +241,7 @@ def seal_archive(file: BufferedRandom) -> None:
 
 
 def is_sealed(key: str, chunks: Iterable[bytes], size: int) -> bool:
-    """Check whether an object has a valid seal; False if graspd 0.2 wrote it without one.
-
-    Args:
-        key: its name, whose suffix gives the format.
-        chunks: its bytes.
-        size: number of bytes.
-
-    Raises:
-        DamagedError: its bytes do not match the seal.
-    """
+    """Check for a valid seal; False if graspd 0.2 wrote the object without one; DamagedError if it does not match."""
     is_zip = key.endswith((".zip", ".npz"))
     before, start = (_GLB, _GLB_AT) if key.endswith(".glb") else (_JSON, 0)
     at = size - len(_ZEROS) if is_zip else start + len(before)
@@ -318,13 +274,11 @@ def _damaged(key: str) -> DamagedError:
 
 
 def _without_digits(chunk: bytes, at: int) -> bytes:
-    """Replace the digits in a chunk by zeros; they begin at offset `at`."""
     first, last = max(0, at), min(len(chunk), at + len(_ZEROS))
     return chunk if first >= last else chunk[:first] + b"0" * (last - first) + chunk[last:]
 
 
 def _with_extras(data: bytes) -> bytes:
-    """Add space for the seal at the beginning of a binary glTF's document."""
     length = int.from_bytes(data[12:16], "little")
     document = _GLB + _ZEROS + b'"},' + data[_GLB_AT + 1 : _GLB_AT + length]
     document += b" " * (-len(document) % 4)

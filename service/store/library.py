@@ -25,50 +25,20 @@ UNPACKED_LIMIT_BYTES: Final = 2 * 2**30
 
 
 def publish_asset(
-    store: Store,
-    kind: AssetKind,
-    name: str,
-    files: Mapping[str, bytes],
-    *,
-    builtin: bool = False,
-    created: str = "",
-    owner: str = "",
+    store: Store, kind: AssetKind, name: str, files: Mapping[str, bytes], said: Mapping[str, object] | None = None
 ) -> Asset:
-    """Publish a hand or object: the archive first, its record last. Idempotent.
-
-    Args:
-        files: `asset.json` (names the main file) and all required files.
-        owner: id of the uploading API key.
-
-    Raises:
-        InputError: `asset.json` is missing or invalid.
-        ConflictError: the same content exists under another name.
-    """
-    asset = store_files(store, kind, name, files, builtin=builtin, created=created, said={"owner": owner})
-    return record_asset(store, asset)
+    """Publish a hand or object: the archive first, its record last; see `store_files`, `record_asset`. Idempotent."""
+    return record_asset(store, store_files(store, kind, name, files, said))
 
 
 def store_files(
-    store: Store,
-    kind: AssetKind,
-    name: str,
-    files: Mapping[str, bytes],
-    *,
-    builtin: bool = False,
-    created: str = "",
-    said: Mapping[str, object] | None = None,
+    store: Store, kind: AssetKind, name: str, files: Mapping[str, bytes], said: Mapping[str, object] | None = None
 ) -> Asset:
-    """Store the archive, the first half of `publish_asset`; the asset does not exist for readers yet.
+    """Store the archive of an asset, which does not exist for readers yet; InputError for an invalid `asset.json`.
 
-    Args:
-        said: further fields of the record: `owner`, `project`, `shared`, `self_test`. Private files contain their
-            project's mark (`service.model.projects.marks_of`).
-
-    Raises:
-        InputError: `asset.json` is missing or invalid.
+    `said` are further fields of the record. Private files contain their project's mark (`service.model.projects`).
     """
-    asset = describe(kind, name, files, created=created or timestamp(), builtin=builtin)
-    asset = asset.model_copy(update=dict(said or {}))
+    asset = describe(kind, name, files, created=timestamp()).model_copy(update=dict(said or {}))
     with tempfile.TemporaryFile() as archive:
         pack_into(files, archive)
         seal_archive(archive)
@@ -88,14 +58,7 @@ def _is_damaged(store: Store, key: str) -> bool:
 
 
 def record_asset(store: Store, asset: Asset, put: Put | None = None) -> Asset:
-    """Write the record, the second half of `publish_asset`; from now on the asset exists.
-
-    Args:
-        put: function that writes the record; None: write to this store.
-
-    Raises:
-        ConflictError: the same content exists under another name, or is being removed.
-    """
+    """Write the record, with `put` if given; ConflictError if the content has another name, or is being removed."""
     record = names.asset_record(asset.kind, asset.digest)
     new = put(record, asset) if put is not None else put_record(store, record, asset)
     if store.exists(names.deletion(asset.kind.value, asset.digest)):
@@ -111,34 +74,28 @@ def record_asset(store: Store, asset: Asset, put: Put | None = None) -> Asset:
 
 
 def builtin_assets() -> list[Asset]:
-    """Return the built-in hands and objects."""
     return [builtin_asset(kind, name)[0] for kind in AssetKind for name in builtin_names(kind)]
 
 
 def publish_builtins(store: Store) -> list[Asset]:
-    """Publish the built-in hands and objects."""
     published = []
     for kind in AssetKind:
         for name in builtin_names(kind):
             asset, files = builtin_asset(kind, name)
             try:
-                published.append(publish_asset(store, kind, name, files, builtin=True, created=asset.created))
+                published.append(publish_asset(store, kind, name, files, {"builtin": True, "created": asset.created}))
             except DamagedError as error:
                 log.warning("the built-in %s %s cannot be used: %s", kind.value, name, error)
-            _put_model(store, names.asset_model(kind, asset.digest), builtin_model(kind, name))
+            key = names.asset_model(kind, asset.digest)
+            model = sealed(key, builtin_model(kind, name))
+            # The model depends on program and asset: one of an older version is replaced.
+            if not store.put(key, model) and store.get(key) != model:
+                store.delete(key)
+                store.put(key, model)
     return published
 
 
-def _put_model(store: Store, key: str, model: bytes) -> None:
-    """Write a model file; it depends on program and asset, so one of an older version is replaced."""
-    model = sealed(key, model)
-    if not store.put(key, model) and store.get(key) != model:
-        store.delete(key)
-        store.put(key, model)
-
-
 def stored_assets(store: Store) -> list[tuple[AssetKind, str]]:
-    """Return kind and digest of every hand and object in the store that is not deleted."""
     records = [entry.key.split("/") for entry in store.list(names.ASSETS)]
     gone = {entry.key for entry in store.list(names.DELETIONS)}
     # Other files of an asset may have deeper keys, such as an object's convex pieces.
@@ -147,17 +104,11 @@ def stored_assets(store: Store) -> list[tuple[AssetKind, str]]:
 
 
 def load_asset(store: Store, kind: AssetKind, digest: str) -> Asset:
-    """Load the record of a hand or object; NotFoundError if absent, DamagedError if damaged."""
     return read_record(Asset, store, names.asset_record(kind, digest))
 
 
 def load_asset_files(store: Store, kind: AssetKind, digest: str) -> dict[str, bytes]:
-    """Load all files of a hand or object and verify its digest.
-
-    Raises:
-        NotFoundError: no such asset.
-        InputError: the archive in the store does not match its name.
-    """
+    """Load all files of a hand or object; InputError if they do not match the digest."""
     files = unpack(store.get(names.asset_files(kind, digest)), limit_bytes=UNPACKED_LIMIT_BYTES)
     if digest_files(kind, files) != digest:
         raise InputError(f"the archive of {kind.value} {digest} in the store is damaged; upload it again")
@@ -165,11 +116,7 @@ def load_asset_files(store: Store, kind: AssetKind, digest: str) -> dict[str, by
 
 
 def load_check(store: Store, kind: AssetKind, digest: str) -> dict[str, object] | None:
-    """Load the report of ingest (`verdict`, `message`, `repairs`, `facts`); None before it has run.
-
-    Raises:
-        DamagedError: the record does not match its name.
-    """
+    """Load the report of ingest (`verdict`, `message`, `repairs`, `facts`); None before it has run."""
     key = names.asset_check(kind, digest)
     if not store.exists(key):
         return None

@@ -9,14 +9,16 @@ from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from graspd.service.model import names
+from graspd.service.model.base import Digest
 from graspd.service.model.clock import timestamp
-from graspd.service.model.domain import Digest, JobRequest, batches_of
+from graspd.service.model.domain import JobRequest, batches_of
 from graspd.service.model.messages import TaskMessage
 from graspd.service.model.metric_fields import values, with_fields
 from graspd.service.model.metrics import axis_word, indexed
+from graspd.service.model.records import Record
 from graspd.service.model.states import Stage
 from graspd.service.model.version import PACKAGE_VERSION, STAGE_REVISIONS
 from graspd.service.store import validity
@@ -31,10 +33,8 @@ INDEX_THRESHOLD_M: Final = 0.005
 
 
 @with_fields(valid=values(optional=False, default=None), last=values(optional=True, default=None))
-class GraspSummary(BaseModel):
+class GraspSummary(Record):
     """Quality of one grasp, in the units of the shard's columns; None for nan."""
-
-    model_config = ConfigDict(frozen=True, extra="ignore")
 
     valid: bool
     success: bool | None = None
@@ -45,10 +45,8 @@ class GraspSummary(BaseModel):
     )
 
 
-class ShardManifest(BaseModel):
+class ShardManifest(Record):
     """Inputs and contents of a shard."""
-
-    model_config = ConfigDict(frozen=True, extra="ignore")
 
     version: Literal[1] = 1
     shard_id: Digest
@@ -106,7 +104,6 @@ class ShardManifest(BaseModel):
 
     @property
     def count(self) -> int:
-        """Number of main rows: grasps; transferred grasps or scenes to plan in; pictures."""
         scenes = "S" if self.request.in_scene else "K"
         return self.counts.get({"base": "N", "scene": scenes, "views": "V"}[self.kind], 0)
 
@@ -123,7 +120,6 @@ def manifest_of(
     worker: str,
     info: Mapping[str, Any] | None = None,
 ) -> ShardManifest:
-    """Make the manifest of a task's shard from its columns, root attributes and axis lengths."""
     kind = names.SHARD_KINDS[message.stage]
     return ShardManifest(
         shard_id=message.output,
@@ -155,22 +151,19 @@ def manifest_of(
 
 
 def _contents(kind: str, arrays: Mapping[str, NDArray[Any]], attributes: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the fields of the manifest that follow from the shard's columns and attributes."""
     valid = validity.valid(arrays) if kind == "base" else arrays.get("grasp/valid")
     fields: dict[str, Any] = {"valid": 0 if valid is None else int(np.count_nonzero(valid))}
     if kind == "base":
         recheck = arrays.get("quality/recheck", np.empty(0, np.int8))
-        fields["index_threshold_m"], fields["grasps"] = summarise(arrays, attributes)
+        fields["index_threshold_m"], fields["grasps"] = _summaries(arrays, attributes)
         fields["candidates"] = int(attributes.get("candidates", len(arrays["quality/valid"])))
-        fields["rechecked"], fields["recheck_held"] = (
-            int(np.count_nonzero(recheck >= 0)),
-            int(np.count_nonzero(recheck == 1)),
-        )
+        fields["rechecked"] = int(np.count_nonzero(recheck >= 0))
+        fields["recheck_held"] = int(np.count_nonzero(recheck == 1))
     return fields
 
 
-def summarise(
-    arrays: Mapping[str, NDArray[Any]], attributes: Mapping[str, Any] | None = None
+def _summaries(
+    arrays: Mapping[str, NDArray[Any]], attributes: Mapping[str, Any]
 ) -> tuple[float, tuple[GraspSummary, ...]]:
     """Return the contact threshold nearest to `INDEX_THRESHOLD_M` [m], and each grasp's quality at it."""
     thresholds = np.asarray(arrays["quality/thresholds_m"], float)
@@ -183,7 +176,7 @@ def summarise(
     }
     columns["valid"] = validity.valid(arrays).tolist()
     columns["success"] = [_verdict(int(v)) for v in arrays.get("quality/success", np.full(count, -1))]
-    level = (attributes or {}).get("verdict_level")
+    level = attributes.get("verdict_level")
     columns["verdict_level"] = [None if verdict is None else level for verdict in columns["success"]]
     columns["lift_hard"] = [_verdict(int(v)) for v in arrays.get("quality/lift_hard", np.full(count, -1))]
     columns["robust_weakest"] = [axis_word(int(v)) for v in arrays.get("quality/robust_weakest", np.zeros(count))]
@@ -192,28 +185,18 @@ def summarise(
 
 
 def publish_shard(store: Store, manifest: ShardManifest, data: bytes) -> bool:
-    """Store a shard, manifest last. Returns False if it exists, which is success too.
-
-    If two workers raced, or one died between the two writes, the file may be of another run. The manifest then
-    describes the bytes in the store.
-    """
+    """Store a shard, manifest last. False if it exists, which is success too."""
     if not store.put(manifest.key, data):
+        # Two workers raced, or one died between the two writes: the manifest describes the bytes in the store.
         manifest = described_again(manifest.model_dump(mode="json"), store.get(manifest.key))
     return put_record(store, names.shard_manifest(manifest.stage, manifest.shard_id), manifest)
 
 
 def load_manifest(store: Store, stage: Stage, shard: str) -> ShardManifest:
-    """Load the manifest of a shard; NotFoundError if the shard does not exist."""
     return read_record(ShardManifest, store, names.shard_manifest(stage, shard))
 
 
 def load_shard(store: Store, stage: Stage, shard: str) -> Shard:
-    """Load a finished shard and verify it against its manifest.
-
-    Raises:
-        NotFoundError: there is no such shard.
-        DamagedShard: its file is missing or does not match the manifest.
-    """
     manifest = load_manifest(store, stage, shard)
     return read_shard(read_checked(store, manifest.key, manifest.sha256), kind=manifest.kind, name=manifest.key)
 
@@ -223,12 +206,7 @@ def shard_exists(store: Store, stage: Stage, shard: str) -> bool:
 
 
 def described_again(said: Mapping[str, Any], data: bytes) -> ShardManifest:
-    """Rebuild the manifest of a file; other fields come from an existing manifest of the shard.
-
-    Args:
-        said: that manifest as JSON; its grasps are not needed.
-        data: HDF5 bytes of the shard.
-    """
+    """Rebuild the manifest of a file; other fields come from an existing manifest, as JSON, of the shard."""
     pictures = tuple(path for path in SCHEMAS["views"] if path.startswith("image/"))
     shard = read_shard(data, without=pictures, name=said["key"])
     told = {"sha256": hashlib.sha256(data).hexdigest(), "size_bytes": len(data)}

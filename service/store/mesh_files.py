@@ -21,28 +21,18 @@ _OURS: Final = frozenset({"package", "model", "file"})
 
 @dataclass(frozen=True)
 class Reference:
-    """Possible targets of a file name in a description."""
-
     names: tuple[str, ...]
     """Candidate names in the upload, in order of preference."""
     scheme: str = ""
-    """Scheme of `package://...`, `model://...` and `file://...`."""
     tails: tuple[str, ...] = ()
     """With a scheme: path tails that may be below any folder; all but the bare file name."""
 
 
 def read_reference(written: str, base: str) -> Reference:
-    """Resolve a name, with either kind of slashes, and spaces or `%20`.
+    """Resolve a name, with either kind of slashes, and spaces or `%20`; InputError continues after the name.
 
     A ROS package may be packed with or without its folder and those above, and next to other packages.
     `package://NAME/a/b.stl` is NAME/a/b.stl, a/b.stl or b.stl, from the description's folder or from the top.
-
-    Args:
-        written: the name.
-        base: folder of the description.
-
-    Raises:
-        InputError: it leads out of the upload, or is not a file name; the message continues after the name.
     """
     text = written.strip().replace("\\", "/")
     found = _SCHEME.match(text)
@@ -60,7 +50,6 @@ def read_reference(written: str, base: str) -> Reference:
 
 
 def one_like(name: str, files: Iterable[str]) -> str:
-    """Return the only file with this name, ignoring capitals; empty if none."""
     wanted = name.lower()
     like = [file for file in files if file.lower() == wanted]
     return like[0] if len(like) == 1 else ""
@@ -106,19 +95,12 @@ def named_by(name: str, data: bytes) -> list[str]:
 
 
 def reference_of(text: bytes) -> str:
-    """Return the file name in a line, after options such as `-s 1 1 1`."""
     words = text.decode(errors="replace").strip()
     return words.split()[-1] if words.startswith("-") else words
 
 
 def beside(name: str, reference: str, there: Callable[[str], bool]) -> str | None:
-    """Resolve a mesh's reference, by path or name in its folder; None if not a picture or library there.
-
-    Args:
-        name: name of the mesh or library among a hand's files.
-        reference: name of the other file as written; of an absolute path only the last part counts.
-        there: checks whether the hand has a file of that name.
-    """
+    """Resolve a mesh's reference, by path or name in its folder; None if not a picture or library that is `there`."""
     folder = posixpath.dirname(name)
     said = reference.replace("\\", "/").partition("://")[2] or reference.replace("\\", "/")
     if not said.lower().endswith(_TAKEN) or "\0" in said:

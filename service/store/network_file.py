@@ -41,6 +41,10 @@ BLOCKS: Final = 2
 #: Numbers of a grasp besides its joints: position, two columns of the rotation, approach direction.
 POSE: Final = 12
 _META: Final = "meta"
+#: Fields of a network in its JSON text.
+_SHARED: Final = ("hand", "hand_digest", "joint_names", "points", "steps", "about")
+#: Exceptions for bytes that are no archive of arrays.
+_BROKEN: Final = (OSError, ValueError, EOFError, KeyError, MemoryError, RuntimeError, zipfile.BadZipFile, zlib.error)
 #: A text array takes four bytes per character; each array has a header.
 _MOST_META: Final = 4 * (64 << 10)
 _HEADER: Final = 4096
@@ -48,8 +52,6 @@ Floats32 = NDArray[np.float32]
 
 
 class _Meta(BaseModel):
-    """JSON text of a file."""
-
     model_config = ConfigDict(frozen=True, extra="forbid", protected_namespaces=())
 
     schema_: Literal["graspd/proposals@1"] = Field(alias="schema")
@@ -76,7 +78,6 @@ class ProposalNetwork:
 
     hand: str
     hand_digest: str
-    """Digest of the hand's files: `HandModel.digest`."""
     joint_names: tuple[str, ...]
     """(J,) all moving joints, as in `HandModel.joint_names`."""
     weights: Mapping[str, Floats32]
@@ -86,25 +87,19 @@ class ProposalNetwork:
     std: Floats32
     """(D,) standard deviation, positive."""
     points: int = 512
-    """P, number of points of a cloud."""
     steps: int = 16
-    """Number of Euler steps of the flow."""
     about: str = field(default="", kw_only=True)
-    """Training data, in words."""
 
     @property
     def numbers(self) -> int:
-        """D, numbers per grasp."""
         return numbers(len(self.joint_names))
 
 
 def numbers(joints: int) -> int:
-    """Return D, the numbers per grasp of a hand with this many moving joints."""
     return POSE + 3 * joints
 
 
 def sizes(joints: int) -> dict[str, tuple[int, ...]]:
-    """Return the widths of the architecture, which a file repeats for its reader."""
     return {
         "encoder": (*ENCODER, FEATURE),
         "condition": (CONDITION,),
@@ -113,7 +108,6 @@ def sizes(joints: int) -> dict[str, tuple[int, ...]]:
 
 
 def weight_shapes(joints: int) -> dict[str, tuple[int, ...]]:
-    """Return name and shape of each weight array for a hand with this many moving joints."""
     count = numbers(joints)
     layers = {f"encoder.{i}": (out, into) for i, (into, out) in enumerate(pairwise(ENCODER))}
     layers["encoder.out"] = (FEATURE, ENCODER[-1])
@@ -127,26 +121,15 @@ def weight_shapes(joints: int) -> dict[str, tuple[int, ...]]:
 
 
 def to_bytes(network: ProposalNetwork) -> bytes:
-    """Serialise a network.
-
-    Raises:
-        InputError: `from_bytes` would reject it.
-    """
+    """Serialise a network; InputError if `from_bytes` would reject it."""
     joints = len(network.joint_names)
     try:
-        meta = _Meta(
-            schema=SCHEMA,
-            hand=network.hand,
-            hand_digest=network.hand_digest,
-            joint_names=network.joint_names,
-            points=network.points,
-            steps=network.steps,
-            sizes=sizes(joints),
-            about=network.about,
-        )
+        shared = {name: getattr(network, name) for name in _SHARED}
+        meta = _Meta(schema=SCHEMA, sizes=sizes(joints), **shared)
     except ValidationError as error:
         raise InputError(f"the network cannot be written: {refusal(error)}") from None
-    arrays = {name: np.asarray(array, np.float32) for name, array in _arrays(network).items()}
+    found = {"mean": network.mean, "std": network.std, **network.weights}
+    arrays = {name: np.asarray(array, np.float32) for name, array in found.items()}
     _check(arrays, joints, "the network cannot be written")
     buffer = io.BytesIO()
     members: dict[str, Any] = {_META: np.array(meta.model_dump_json(by_alias=True)), **arrays}
@@ -155,12 +138,6 @@ def to_bytes(network: ProposalNetwork) -> bytes:
 
 
 def read_file(path: Path) -> bytes:
-    """Read the bytes of a possible network file.
-
-    Raises:
-        LimitError: it has more than `MAX_BYTES`.
-        InputError: it cannot be read.
-    """
     try:
         with Path(path).open("rb") as file:
             data = file.read(MAX_BYTES + 1)
@@ -171,16 +148,7 @@ def read_file(path: Path) -> bytes:
 
 
 def from_bytes(data: bytes, what: str) -> ProposalNetwork:
-    """Parse a network file.
-
-    Args:
-        data: the file.
-        what: name of the file in messages.
-
-    Raises:
-        LimitError: more than `MAX_BYTES`, packed or unpacked.
-        InputError: not a complete, finite file of this schema.
-    """
+    """Parse a network file, named `what` in messages; LimitError if too large, InputError if invalid."""
     check_size(len(data), what)
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
@@ -191,47 +159,23 @@ def from_bytes(data: bytes, what: str) -> ProposalNetwork:
             if found != sorted(f"{name}.npy" for name in [_META, *expected]):
                 raise InputError(f"{what}: its arrays are not those of {SCHEMA}: {_difference(found, expected)}")
             arrays = {name: _read(archive, name, shape, what) for name, shape in expected.items()}
-    except (
-        OSError,
-        ValueError,
-        EOFError,
-        KeyError,
-        MemoryError,
-        NotImplementedError,
-        RuntimeError,
-        zipfile.BadZipFile,
-        zlib.error,
-    ) as error:
+    except _BROKEN as error:
         raise InputError(f"{what} is no .npz file of {SCHEMA}: {error}") from None
     _check(arrays, joints, what)
     for array in arrays.values():
         array.flags.writeable = False
     weights = {name: arrays[name] for name in weight_shapes(joints)}
-    return ProposalNetwork(
-        meta.hand,
-        meta.hand_digest,
-        meta.joint_names,
-        weights,
-        arrays["mean"],
-        arrays["std"],
-        meta.points,
-        meta.steps,
-        about=meta.about,
-    )
+    shared = {name: getattr(meta, name) for name in _SHARED}
+    return ProposalNetwork(weights=weights, mean=arrays["mean"], std=arrays["std"], **shared)
 
 
 def check_size(size: int, what: str) -> None:
-    """Raise LimitError for more bytes than any network has."""
     if size > MAX_BYTES:
         raise LimitError(f"{what} has more than {MAX_BYTES >> 20} MiB; no proposal network needs as much")
 
 
 def _expected(joints: int) -> dict[str, tuple[int, ...]]:
     return {"mean": (numbers(joints),), "std": (numbers(joints),), **weight_shapes(joints)}
-
-
-def _arrays(network: ProposalNetwork) -> dict[str, Any]:
-    return {"mean": network.mean, "std": network.std, **network.weights}
 
 
 def _read_meta(archive: zipfile.ZipFile, what: str) -> _Meta:
@@ -256,7 +200,6 @@ def _read(archive: zipfile.ZipFile, name: str, shape: tuple[int, ...], what: str
 
 
 def _member(archive: zipfile.ZipFile, name: str, limit: int) -> bytes:
-    """Read a member's bytes, at most as many as the archive's directory states."""
     member = archive.getinfo(f"{name}.npy")
     if member.file_size > limit:
         raise ValueError(f"{name} unpacks to {member.file_size} bytes")
@@ -286,7 +229,6 @@ def _check(arrays: Mapping[str, Floats32], joints: int, what: str) -> None:
 
 
 def _difference(found: list[str], expected: Mapping[str, object]) -> str:
-    """Describe missing arrays and unknown files."""
     wanted = {f"{name}.npy" for name in [_META, *expected]}
     missing, foreign = sorted(wanted - {*found, f"{_META}.npy"}), sorted(set(found) - wanted)
     parts = [f"{word} {', '.join(names[:4])}" for word, names in (("without", missing), ("besides", foreign)) if names]
@@ -298,15 +240,7 @@ NETWORK_FILE: Final = "network.npz"
 
 
 def network_bytes(files: Mapping[str, bytes], what: str) -> bytes:
-    """Return the network's file of an asset; `from_bytes` validates it.
-
-    Args:
-        files: the file and `asset.json`.
-        what: name of the asset in messages.
-
-    Raises:
-        InputError: it is missing, or `asset.json` has keys that a network does not have.
-    """
+    """Return the network's file of an asset; InputError if missing, or if `asset.json` has other keys."""
     described = parse_description(asset_json(files), what)
     if described.file not in files:
         raise InputError(f"{what}: the main file {described.file!r} is not among its files")
@@ -316,12 +250,6 @@ def network_bytes(files: Mapping[str, bytes], what: str) -> bytes:
 
 
 def network_report(files: Mapping[str, bytes], name: str) -> dict[str, Any]:
-    """Return the check's report of a usable network.
-
-    Raises:
-        LimitError: larger than any network.
-        InputError: not a network.
-    """
     data = network_bytes(files, name)
     network = from_bytes(data, name)
     joints = len(network.joint_names)
@@ -340,7 +268,6 @@ def network_report(files: Mapping[str, bytes], name: str) -> dict[str, Any]:
 
 
 def check_network(files: Mapping[str, bytes], name: str) -> dict[str, Any]:
-    """Return `network_report`, or a refusal."""
     try:
         return network_report(files, name)
     except InputError as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import posixpath
 import re
 from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
@@ -12,7 +13,6 @@ from graspd.service.model.errors import InputError, LimitError
 from graspd.service.model.names import fitted
 from graspd.service.store.assets import MAX_FILES, UNPACK_FACTOR, unpack
 
-#: Suffixes of meshes.
 SUFFIXES: Final = (".stl", ".obj", ".ply", ".off", ".glb")
 #: Preferred stems if an object has several meshes: names of closed and cleaned scans first.
 PREFERRED: Final = ("clean", "nontextured", "textured_simple", "textured", "collision", "visual", "raw")
@@ -25,12 +25,7 @@ Objects = dict[str, dict[str, bytes]]
 
 
 def files_of_set(path: Path) -> Objects | None:
-    """Find names and files of objects in a folder or ZIP; None if the path is a single object.
-
-    Raises:
-        InputError: no mesh in the folder, or no readable ZIP.
-        LimitError: more than the service accepts in one ZIP.
-    """
+    """Find names and files of objects in a folder or ZIP; None if the path is a single object."""
     if not path.is_dir() and not (path.suffix.lower() == ".zip" and path.is_file()):
         return None
     files = read_set(path, limit_bytes=UNPACK_FACTOR * load_settings().max_upload_bytes)
@@ -41,21 +36,8 @@ def files_of_set(path: Path) -> Objects | None:
     return found if path.is_dir() or len(found) > 1 else None
 
 
-def object_set(files: Mapping[str, bytes]) -> dict[str, dict[str, bytes]]:
-    """Group files by the objects of a set.
-
-    In the layout of EGAD each mesh of one folder is an object. In the layout of YCB each object has a folder, perhaps
-    with inner folders of variants: the best mesh is taken.
-
-    Args:
-        files: relative names and contents.
-
-    Returns:
-        Names of objects, sorted, each with its mesh and an `asset.json` beside it, if any.
-
-    Raises:
-        InputError: no mesh.
-    """
+def object_set(files: Mapping[str, bytes]) -> Objects:
+    """Group files by the objects of a set; return sorted names, each with its mesh and its `asset.json`, if any."""
     meshes = sorted(name for name in files if PurePosixPath(name).suffix.lower() in SUFFIXES)
     if not meshes:
         raise InputError(f"no mesh among {len(files)} files; a set holds {', '.join(SUFFIXES)}")
@@ -65,6 +47,7 @@ def object_set(files: Mapping[str, bytes]) -> dict[str, dict[str, bytes]]:
     top = _common(owners)
     chosen: dict[str, str] = {}
     for owner, names in owners.items():
+        # EGAD: each mesh of one folder is an object; YCB: each object has a folder, perhaps with variants of its mesh.
         is_object = len(owner) > len(top) and _variants(names)
         for name in [min(names, key=_rank)] if is_object else names:
             parts = owner[len(top) :] if is_object else (*owner[len(top) :], PurePosixPath(name).stem)
@@ -73,12 +56,7 @@ def object_set(files: Mapping[str, bytes]) -> dict[str, dict[str, bytes]]:
 
 
 def read_set(path: Path, *, limit_bytes: int) -> dict[str, bytes]:
-    """Read the files of a folder or ZIP; links that lead out of the folder are ignored.
-
-    Raises:
-        InputError: neither a folder nor a readable ZIP.
-        LimitError: more than `limit_bytes` or `MAX_FILES`.
-    """
+    """Read the files of a folder or ZIP, up to `limit_bytes`; links that lead out of the folder are ignored."""
     if path.is_file():
         return unpack(path.read_bytes(), limit_bytes=limit_bytes)
     if not path.is_dir():
@@ -96,7 +74,6 @@ def read_set(path: Path, *, limit_bytes: int) -> dict[str, bytes]:
 
 
 def _owner(mesh: str) -> tuple[str, ...]:
-    """Return the folders of a mesh without those that only name a variant."""
     parts = PurePosixPath(mesh).parts[:-1]
     while len(parts) > 1 and parts[-1].lower() in _INNER:
         parts = parts[:-1]
@@ -108,10 +85,7 @@ def _common(owners: Mapping[tuple[str, ...], list[str]]) -> tuple[str, ...]:
     folders = list(owners)
     if len(folders) == 1:
         return folders[0][:-1] if _variants(owners[folders[0]]) else folders[0]
-    shared = 0
-    while all(len(o) > shared for o in folders) and len({o[shared] for o in folders}) == 1:
-        shared += 1
-    return folders[0][:shared]
+    return PurePosixPath(posixpath.commonpath(["/".join(folder) for folder in folders])).parts
 
 
 def _variants(names: list[str]) -> bool:
@@ -126,7 +100,6 @@ def _rank(name: str) -> tuple[int, str]:
 
 
 def _name(text: str, taken: Mapping[str, str]) -> str:
-    """Return an unused name that the service accepts; a shortened name is logged."""
     name = fitted(re.sub(r"[^A-Za-z0-9._-]+", "_", text).lstrip("._-") or "object", 60)
     number = 2
     while name in taken:

@@ -13,12 +13,13 @@ import struct
 from collections.abc import Iterator
 from typing import Final
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field, ValidationError
 
 from graspd.service.model import names
 from graspd.service.model.base import Digest
 from graspd.service.model.digests import digest_bytes
 from graspd.service.model.errors import DamagedError, NotFoundError
+from graspd.service.model.records import Record
 from graspd.service.model.states import Stage
 from graspd.service.store.manifests import ShardManifest, load_manifest, publish_shard
 from graspd.service.store.records import parse_record, put_record
@@ -32,10 +33,8 @@ _MAGIC: Final = b"graspd\x00\x01"
 _HEAD: Final = struct.Struct("<8sQ")
 
 
-class _Packed(BaseModel):
+class _Packed(Record):
     """Positions of a shard's manifest and file behind the directory [bytes], with their checksums."""
-
-    model_config = ConfigDict(frozen=True, extra="ignore")
 
     id: Digest
     stage: Stage
@@ -48,18 +47,14 @@ class _Packed(BaseModel):
 
 
 def has_packs(store: Store) -> bool:
-    """Check whether a store has packs of graspd 0.2."""
     return next(iter(store.list(_FOLDER)), None) is not None
 
 
 def take_apart(store: Store) -> Iterator[ShardManifest]:
-    """Replace each pack by a file and a manifest per shard; yield the manifests.
+    """Replace each pack by a file and a manifest per shard; yield the manifests. An interrupted call can be repeated.
 
-    A pack is removed after its shards are stored, so an interrupted call can be repeated. Damaged packs are moved to
-    `damaged/`. For a damaged file only the manifest is stored, so that its replacement must match the checksum.
-
-    Raises:
-        StoreUnavailable: the store does not answer; repeat the call.
+    Damaged packs are moved to `damaged/`. For a damaged file only the manifest is stored, so that its replacement must
+    match the checksum.
     """
     keys = sorted(entry.key for entry in store.list(_FOLDER))
     for key in keys:
@@ -106,7 +101,6 @@ def _take_apart(store: Store, key: str, dead: list[str]) -> Iterator[ShardManife
 
 
 def _directory(key: str, data: bytes) -> tuple[int, list[_Packed]]:
-    """Return the start of the pieces, and the directory."""
     head, rest = data[: _HEAD.size], data[_HEAD.size :]
     magic, length = _HEAD.unpack(head) if len(head) == _HEAD.size else (b"", 0)
     directory = rest[:length]
@@ -119,6 +113,5 @@ def _directory(key: str, data: bytes) -> tuple[int, list[_Packed]]:
 
 
 def _piece(data: bytes, start: int, length: int, sha256: str) -> bytes | None:
-    """Return bytes of a pack; None if they do not match the directory."""
     piece = data[start : start + length]
     return piece if hashlib.sha256(piece).hexdigest() == sha256 else None

@@ -11,7 +11,7 @@ import itertools
 import json
 import re
 import secrets
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, Final, Literal, TypeVar
 
@@ -43,12 +43,10 @@ Put = Callable[[str, BaseModel], bool]
 
 
 def read_record(model: type[RecordT], store: Store, key: str) -> RecordT:
-    """Load a record by its key; NotFoundError if absent, DamagedError if damaged."""
     return parse_record(model, store.get(key), key)
 
 
 def parse_record(model: type[RecordT], data: bytes, key: str) -> RecordT:
-    """Parse a record; DamagedError if the seal does not match or the content is no such record."""
     is_sealed(key, [data], len(data))
     try:
         if has_old_names(data):
@@ -62,14 +60,19 @@ def parse_record(model: type[RecordT], data: bytes, key: str) -> RecordT:
 
 
 def put_record(store: Store, key: str, record: BaseModel) -> bool:
-    """Write a record if absent; False if the key exists."""
     return put_sealed(store, key, record.model_dump_json().encode())
 
 
+def _keys(store: Store, prefix: str) -> list[str]:
+    return sorted(entry.key for entry in store.list(prefix))
+
+
+def _records(model: type[RecordT], store: Store, prefix: str) -> list[RecordT]:
+    return [read_record(model, store, key) for key in _keys(store, prefix)]
+
+
 def job_events(store: Store, job: str) -> list[JobEvent]:
-    """Load the user actions on a job, in order."""
-    keys = sorted(entry.key for entry in store.list(names.job_events(job)))
-    return [read_record(JobEvent, store, key) for key in keys]
+    return _records(JobEvent, store, names.job_events(job))
 
 
 def add_job_event(
@@ -81,76 +84,57 @@ def add_job_event(
     cause: str = "",
     put: Put | None = None,
 ) -> JobEvent:
-    """Append an event to a job; its state follows from all events in order."""
     put = put or partial(put_record, store)
     while True:
-        taken = [int(entry.key.rsplit("/", 1)[1].partition("-")[0]) for entry in store.list(names.job_events(job))]
-        number = max(taken, default=0) + 1
+        number = max((event.number for event in job_events(store, job)), default=0) + 1
         event = JobEvent(number=number, what=what, at=timestamp(), retried=retried or {}, cause=cause)
-        if put(names.job_event(job, event.number, what), event):
+        if put(names.event(names.job_events(job), number, what), event):
             return event
 
 
 def task_attempts(store: Store, task: str) -> list[AttemptRecord]:
-    """Load the failed attempts of a task, in order."""
-    entries = [entry.key for entry in store.list(names.attempts(task))]
-    return sorted((read_record(AttemptRecord, store, key) for key in entries), key=lambda attempt: attempt.number)
+    return sorted(_records(AttemptRecord, store, names.attempts(task)), key=lambda attempt: attempt.number)
 
 
 def load_dataset(store: Store, name: str) -> DatasetRecord:
-    """Load the record of a dataset; NotFoundError if there is none."""
     return read_record(DatasetRecord, store, names.dataset_record(name))
 
 
 def dataset_events(store: Store, name: str) -> list[DatasetEvent]:
-    """Load the user actions on a dataset, in order."""
-    keys = sorted(entry.key for entry in store.list(names.dataset_events(name)))
-    return [read_record(DatasetEvent, store, key) for key in keys]
+    return _records(DatasetEvent, store, names.dataset_events(name))
 
 
 def add_dataset_event(
     store: Store, name: str, what: Literal["cancelled", "retried"], *, put: Put | None = None
 ) -> DatasetEvent:
-    """Append an event to a dataset."""
     put = put or partial(put_record, store)
     while True:
-        taken = [event.number for event in dataset_events(store, name)]
-        event = DatasetEvent(number=max(taken, default=0) + 1, what=what, at=timestamp())
-        if put(names.dataset_event(name, event.number, what), event):
+        number = max((event.number for event in dataset_events(store, name)), default=0) + 1
+        event = DatasetEvent(number=number, what=what, at=timestamp())
+        if put(names.event(names.dataset_events(name), number, what), event):
             return event
 
 
 def load_snapshot(store: Store, dataset: str, digest: str) -> Snapshot:
-    """Load a snapshot; NotFoundError if there is none."""
     return read_record(Snapshot, store, names.dataset_snapshot(dataset, digest))
 
 
 def newest_snapshot(store: Store, dataset: str, digest: str | None = None) -> Snapshot:
-    """Load the newest snapshot of a dataset, or the one with a digest; NotFoundError if there is none."""
     if digest is not None:
         return load_snapshot(store, dataset, digest)
-    taken = [read_record(Snapshot, store, entry.key) for entry in store.list(names.dataset_snapshots(dataset))]
+    taken = _records(Snapshot, store, names.dataset_snapshots(dataset))
     if not taken:
         raise NotFoundError(f"dataset {dataset!r} has no snapshot; `graspd datasets snapshot {dataset}` takes one")
     return max(taken, key=lambda one: (one.created, one.digest))
 
 
 def newest_version(store: Store, tag: str) -> Tag | None:
-    """Load the current version of a tag; None if there is none.
-
-    Raises:
-        DamagedError: its record does not match its name.
-    """
-    keys = sorted(entry.key for entry in store.list(names.tag_versions(tag)))
+    keys = _keys(store, names.tag_versions(tag))
     return read_record(Tag, store, keys[-1]) if keys else None
 
 
 def put_version(put: Put, tag: Tag) -> None:
-    """Write a tag after a change.
-
-    Raises:
-        ConflictError: another change was written first.
-    """
+    """Write a tag after a change; ConflictError if another change was written first."""
     if not put(names.tag_version(tag.id, tag.number), tag):
         raise ConflictError(f"the tag {tag.name!r} was changed a moment ago; try again")
 
@@ -158,14 +142,13 @@ def put_version(put: Put, tag: Tag) -> None:
 def drop_older(store: Store, tag: Tag) -> None:
     """Remove outdated versions of a tag; of a deleted tag also the last one, in the end."""
     last = names.tag_version(tag.id, tag.number)
-    for key in sorted(entry.key for entry in store.list(names.tag_versions(tag.id))):
+    for key in _keys(store, names.tag_versions(tag.id)):
         if key < last or (key == last and tag.gone):
             store.delete(key)
 
 
 def newest_mark(store: Store) -> str:
-    """Return the mark of a store; empty if it has none."""
-    return max((entry.key.rpartition("/")[2].removesuffix(".json") for entry in store.list(names.MARKS)), default="")
+    return max(_keys(store, names.MARKS), default="").rpartition("/")[2].removesuffix(".json")
 
 
 def next_mark(mark: str) -> str:
@@ -175,9 +158,8 @@ def next_mark(mark: str) -> str:
 
 
 def set_mark(store: Store, mark: str) -> None:
-    """Replace the mark of a store."""
     put_document(store, names.mark(mark), {"at": timestamp()})
-    for key in [entry.key for entry in store.list(names.MARKS)]:
+    for key in _keys(store, names.MARKS):
         if key != names.mark(mark):
             store.delete(key)
 
@@ -188,10 +170,7 @@ STABILITY: Final = "stability"
 
 
 def charts_of(place: SceneSpec) -> str:
-    """Return the kind of charts for a scene: one per kind of scene, and one per scene file.
-
-    A scene file counts by its supports and the target's pose, not by neighbours, faces and `touch`.
-    """
+    """Return the kind of charts for a scene; a scene file counts by its supports and the target's pose."""
     if place.kind == "free":
         return CHARTS
     if place.kind != "file":
@@ -201,21 +180,15 @@ def charts_of(place: SceneSpec) -> str:
 
 
 def kind_of(chart: Mapping[str, Any]) -> str:
-    """Return the kind of a chart made by `graspd chart`."""
     return charts_of(SceneSpec.model_validate(chart["scene"])) if "scene" in chart else CHARTS
 
 
 def scene_kinds(store: Store) -> list[str]:
-    """Return the kinds of stored charts in scenes, by name."""
-    return sorted({entry.key.rpartition("/")[0] for entry in store.list(IN_SCENES) if entry.key.endswith(".json")})
+    return sorted({key.rpartition("/")[0] for key in _keys(store, IN_SCENES) if key.endswith(".json")})
 
 
 def publish(store: Store, kind: str, record: Mapping[str, Any]) -> str:
-    """Append a record to those of its kind; return its key, which is its `created`, numbered if taken.
-
-    Raises:
-        ValueError: it contains a number that JSON lacks.
-    """
+    """Append a record to those of its kind; return its key, which is its `created`, numbered if taken."""
     stem = f"{kind}/{re.sub(r'[^0-9A-Za-z]', '', str(record['created']))}"
     keys = (f"{stem}{number:03}.json" if number else f"{stem}.json" for number in itertools.count())
     data = json.dumps(record, allow_nan=False).encode()
@@ -223,18 +196,13 @@ def publish(store: Store, kind: str, record: Mapping[str, Any]) -> str:
 
 
 def latest(store: Store, kind: str) -> dict[str, Any] | None:
-    """Load the record of a kind that was published last, with present names; None if there is none.
-
-    Raises:
-        DamagedError: its bytes do not match the seal.
-    """
+    """Load the record of a kind that was published last, with present names; None if there is none."""
     key = latest_key(store, kind)
     return renamed_chart(get_document(store, key)) if key else None
 
 
 def latest_key(store: Store, kind: str) -> str:
-    """Return the key of that record; empty if there is none."""
-    return max((entry.key for entry in store.list(kind) if entry.key.endswith(".json")), default="")
+    return max((key for key in _keys(store, kind) if key.endswith(".json")), default="")
 
 
 _DIGITS: Final = re.compile(r"\D")
@@ -265,13 +233,11 @@ class DeletedJob(Record):
 
 
 def pending(store: Store) -> set[tuple[str, str]]:
-    """Return kind and id of all deleted things with objects left in the store."""
-    keys = [entry.key.split("/") for entry in store.list(names.DELETIONS)]
+    keys = [key.split("/") for key in _keys(store, names.DELETIONS)]
     return {(key[1], key[2].removesuffix(".json")) for key in keys if len(key) == 3}
 
 
 def refuse_pending(store: Store, what: str, name: str) -> None:
-    """Raise ConflictError while a thing of this id is being removed: a new one would be removed with it."""
     if store.exists(names.deletion(what, name)):
         raise ConflictError(f"the {what} {name} of before is still being removed; try again in a moment")
 
@@ -289,18 +255,13 @@ def removed_before(key: str, at: str) -> bool:
 def deletions(store: Store, what: str = "") -> list[Deletion]:
     """Return the deletions that can be undone, newest first, of one kind of thing or of all."""
     found: dict[str, Deletion] = {}
-
-    def read(keys: Iterable[str]) -> None:
-        for key in keys:
-            with contextlib.suppress(NotFoundError, DamagedError):
-                deletion = read_record(Deletion, store, key)
-                found[removed_folder(deletion)] = deletion
-
     # Objects being moved by the controller are in the second folder before they leave the first.
-    waiting = [entry.key for entry in store.list(names.DELETIONS) if entry.key.count("/") == 2]
-    read(key for key in waiting if not what or key.split("/")[1] == what)
-    removed = [entry.key for entry in store.list(names.REMOVED) if entry.key.count("/") == 2]
-    read(key for key in removed if not what or key.split("-")[1] == what)
+    for folder, before_kind in ((names.DELETIONS, "/"), (names.REMOVED, "-")):
+        for key in _keys(store, folder):
+            if key.count("/") == 2 and (not what or key.split(before_kind)[1] == what):
+                with contextlib.suppress(NotFoundError, DamagedError):
+                    deletion = read_record(Deletion, store, key)
+                    found[removed_folder(deletion)] = deletion
     return sorted(found.values(), key=lambda one: one.at, reverse=True)
 
 

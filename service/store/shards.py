@@ -40,16 +40,9 @@ _UNREADABLE: Final = (OSError, KeyError, ValueError, TypeError, RuntimeError, Ov
 
 
 def write_shard(kind: ShardKind, arrays: Arrays, attributes: Mapping[str, Attribute]) -> bytes:
-    """Write a shard; return its HDF5 bytes.
+    """Write a shard; return its HDF5 bytes. InputError if a column or an attribute does not fit the schema.
 
-    Args:
-        kind: base, scene or views.
-        arrays: one array for each column of `SCHEMAS[kind]`; optional columns may be absent.
-        attributes: root attributes besides `schema`; `created` and `code_version` replace the current values;
-            `joint_names` is also an attribute of the joint datasets.
-
-    Raises:
-        InputError: a column is missing, unknown or of wrong rank, lengths differ, or an attribute is unknown.
+    `created` and `code_version` replace the current values; `joint_names` is also an attribute of the joint datasets.
     """
     check_columns(kind, arrays)
     check_attributes(kind, attributes)
@@ -66,12 +59,7 @@ def write_shard(kind: ShardKind, arrays: Arrays, attributes: Mapping[str, Attrib
             options: dict[str, Any] = {}
             if data.ndim >= 3 and data.nbytes > 65536:
                 # One chunk per row, that is per picture: readers unpack no other rows.
-                options = {
-                    "compression": "gzip",
-                    "compression_opts": 1,
-                    "shuffle": True,
-                    "chunks": (1, *data.shape[1:]),
-                }
+                options.update(compression="gzip", compression_opts=1, shuffle=True, chunks=(1, *data.shape[1:]))
             dataset = file.create_dataset(path, data=data, track_times=False, **options)
             dataset.attrs["units"] = column.units
             dataset.attrs["frame"] = column.frame
@@ -83,7 +71,6 @@ def write_shard(kind: ShardKind, arrays: Arrays, attributes: Mapping[str, Attrib
 
 
 def check_columns(kind: ShardKind, arrays: Arrays) -> dict[str, int]:
-    """Return the lengths of the shape letters (N, T, S, ...); InputError if arrays do not fit the schema."""
     schema = SCHEMAS[kind]
     if unknown := set(arrays) - set(schema):
         raise InputError(f"a {kind} shard has no dataset {sorted(unknown)[0]!r}")
@@ -103,13 +90,10 @@ def check_columns(kind: ShardKind, arrays: Arrays) -> dict[str, int]:
 
 @dataclass(frozen=True)
 class Shard:
-    """A shard in memory."""
-
     kind: ShardKind
     attributes: dict[str, Attribute]
     arrays: dict[str, NDArray[np.generic]]
     path: Path | None = None
-    """File that it was read from."""
 
     def __getitem__(self, path: str) -> NDArray[np.generic]:
         return self.arrays[path]
@@ -118,15 +102,7 @@ class Shard:
 def read_shard(
     source: bytes | Path, *, kind: ShardKind | None = None, without: tuple[str, ...] = (), name: str = ""
 ) -> Shard:
-    """Read a shard completely, except the datasets in `without`.
-
-    Args:
-        name: name in error messages for a shard given as bytes.
-
-    Raises:
-        InputError: not HDF5, not a graspd shard, or not of the expected kind.
-        DamagedShard: it does not match its checksums, or is truncated.
-    """
+    """Read a shard, except the datasets in `without`; InputError for another kind, DamagedShard for damage."""
     name = name or ("shard" if isinstance(source, bytes) else str(source))
     with open_shard(source, name=name) as file:
         found = kind_of(file, name)
@@ -153,12 +129,7 @@ class ShardH5(h5py.File):  # type: ignore[misc]
 
 @contextmanager
 def open_shard(source: bytes | Path | io.RawIOBase, *, name: str = "") -> Iterator[h5py.File]:
-    """Open the HDF5 file of a shard for partial reading; files in folders are verified by `check_file`.
-
-    Raises:
-        InputError: not HDF5.
-        DamagedShard: it does not match its checksum, or is unreadable, here or in the body.
-    """
+    """Open a shard for partial reading; DamagedShard if it does not match its checksum or is unreadable, also later."""
     name = name or (str(source) if isinstance(source, Path) else "shard")
     if isinstance(source, Path) and source.is_file():
         check_file(source)
@@ -177,10 +148,7 @@ def open_shard(source: bytes | Path | io.RawIOBase, *, name: str = "") -> Iterat
 
 
 def _check_contents(file: h5py.File, name: str) -> None:
-    """Raise InputError if a file has external data or claims more data than it can contain.
-
-    HDF5 follows links into other files, reads raw bytes of any file as values, and invents values never written.
-    """
+    """Raise InputError if a file has external data or claims more than it can contain: HDF5 follows any link."""
     claimed = held = 0
     seen, waiting = {h5py.h5o.get_info(file["/"].id).addr}, [(file, "")]
     while waiting:
@@ -209,7 +177,6 @@ def _check_contents(file: h5py.File, name: str) -> None:
 
 
 def kind_of(file: h5py.File, name: str) -> ShardKind:
-    """Return the kind of an open shard; InputError if it is not a graspd shard."""
     schema = str(file.attrs.get("schema", ""))
     found = schema.removeprefix("graspd/").partition("@")[0]
     if not schema.startswith("graspd/") or found not in SCHEMAS:
@@ -218,7 +185,6 @@ def kind_of(file: h5py.File, name: str) -> ShardKind:
 
 
 def read_column(file: h5py.File, path: str, name: str) -> NDArray[Any]:
-    """Read a complete dataset; DamagedShard if the values do not match their checksum."""
     dataset = file[path]
     data = np.asarray(dataset)
     if (expected := dataset.attrs.get(_DIGEST)) is not None and _digest(data) != expected:
@@ -243,12 +209,10 @@ def _attribute(value: object) -> Attribute:
 
 
 def json_attribute(value: object) -> str:
-    """Convert a value to JSON text for an HDF5 attribute."""
     return json.dumps(value, sort_keys=True)
 
 
 def carried(shard: Shard) -> dict[str, Attribute]:
-    """Return the root attributes for a copy of a shard: all that `write_shard` does not set itself."""
     return {name: value for name, value in shard.attributes.items() if name != "schema"}
 
 

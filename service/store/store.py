@@ -13,7 +13,7 @@ import re
 import shutil
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
@@ -28,7 +28,6 @@ from graspd.service.model.errors import InputError, NotFoundError, StoreUnavaila
 
 _KEY: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._=-]*(/[A-Za-z0-9][A-Za-z0-9._=-]*)*")
 _PROBE: Final = "health/probe"
-#: Size of one chunk of a stream.
 STREAM_BYTES: Final = 1 << 20
 #: Retries of a failed request by the client; after that the task's own back-off applies.
 _REMOTE: Final[dict[str, Any]] = {
@@ -39,8 +38,6 @@ _REMOTE: Final[dict[str, Any]] = {
 
 @dataclass(frozen=True)
 class Entry:
-    """An object in a listing."""
-
     key: str
     size: int
 
@@ -60,11 +57,7 @@ class Store:
         self._root = Path(backend.prefix) if isinstance(backend, LocalStore) and backend.prefix is not None else None
 
     def put(self, key: str, data: bytes) -> bool:
-        """Write an object atomically if the name is free.
-
-        Returns:
-            True if written, False if the name exists (for content-addressed names: with the same bytes).
-        """
+        """Write an object atomically; False if the name exists (for content-addressed names: with the same bytes)."""
         return self.put_file(key, io.BytesIO(data))
 
     def put_file(self, key: str, file: IO[bytes]) -> bool:
@@ -81,20 +74,14 @@ class Store:
             return True
 
     def delete(self, key: str) -> None:
-        """Remove an object, if it exists. Only the controller calls this, for deletions by users."""
-        try:
-            with _mapped(key, self.url):
-                obstore.delete(self._backend, check_key(key))
-        except NotFoundError:
-            return
+        with suppress(NotFoundError), _mapped(key, self.url):
+            obstore.delete(self._backend, check_key(key))
 
     def get(self, key: str) -> bytes:
-        """Read an object; NotFoundError if there is none."""
         with _mapped(key, self.url):
             return bytes(obstore.get(self._backend, check_key(key)).bytes())
 
     def get_range(self, key: str, start: int, length: int) -> bytes:
-        """Read `length` bytes from offset `start`; NotFoundError if there is no such object."""
         with _mapped(key, self.url):
             return bytes(obstore.get_range(self._backend, check_key(key), start=start, length=length))
 
@@ -108,21 +95,15 @@ class Store:
             yield chunk
 
     def size(self, key: str) -> int:
-        """Return the size of an object [bytes]; NotFoundError if there is none."""
         with _mapped(key, self.url):
             return int(obstore.head(self._backend, check_key(key))["size"])
 
     def set_aside(self, key: str) -> None:
-        """Move a damaged object below `damaged/` to free its name; a missing one is not an error."""
         self.move(key, f"damaged/{key}")
 
     def move(self, key: str, to: str) -> None:
-        """Rename an object, if it exists."""
-        try:
-            with _mapped(key, self.url):
-                obstore.rename(self._backend, check_key(key), check_key(to), overwrite=True)
-        except NotFoundError:
-            return
+        with suppress(NotFoundError), _mapped(key, self.url):
+            obstore.rename(self._backend, check_key(key), check_key(to), overwrite=True)
 
     def stamp(self, key: str) -> Stamp:
         """Return a stamp that changes when an object is replaced; NotFoundError if there is none."""
@@ -146,12 +127,10 @@ class Store:
     def sign(self, key: str, *, seconds: int = 3600) -> str | None:
         """Return a temporary URL for reading the object without credentials; None if unsupported."""
         check_key(key)
+        if self._signer is None:
+            return None
         try:
-            return (
-                None
-                if self._signer is None
-                else str(obstore.sign(self._signer, "GET", key, timedelta(seconds=seconds)))
-            )
+            return str(obstore.sign(self._signer, "GET", key, timedelta(seconds=seconds)))
         except (BaseError, ValueError, TypeError, NotImplementedError, OSError):
             # The credentials may read but not sign: the API serves the file itself.
             return None
@@ -173,11 +152,6 @@ def open_store(url: str, *, public_endpoint: str | None = None, make: bool = Tru
         public_endpoint: S3 endpoint for clients. Without it, AWS_ENDPOINT_URL is taken as internal to the service's
             network: then downloads are not signed, and files go through the API.
         make: create a missing folder. For readers an empty folder is useless, and it would hide a mistyped path.
-
-    Raises:
-        NotFoundError: the folder is missing, and `make` is False.
-        InputError: unknown kind of URL.
-        StoreUnavailable: the folder cannot be created or written.
     """
     parts = urlsplit(url)
     if parts.scheme == "memory":
@@ -189,7 +163,8 @@ def open_store(url: str, *, public_endpoint: str | None = None, make: bool = Tru
     if parts.scheme not in ("s3", "gs", "az"):
         raise InputError(f"the store URL {url!r} names no known store; use file://, s3://, gs:// or az://")
     with _mapped(url, url):
-        endpoint = _endpoint() if parts.scheme == "s3" else None
+        own = os.environ.get("AWS_ENDPOINT_URL") or os.environ.get("AWS_ENDPOINT") or None
+        endpoint = own if parts.scheme == "s3" else None
         backend: Any = from_url(url, **_remote_options(endpoint))
         signer: Any
         if public_endpoint and parts.scheme == "s3":
@@ -200,11 +175,7 @@ def open_store(url: str, *, public_endpoint: str | None = None, make: bool = Tru
 
 
 def local_folder(url: str) -> Path | None:
-    """Return the folder of a local store; None for other stores.
-
-    Raises:
-        InputError: the path in the URL is not absolute, or has characters that end a path.
-    """
+    """Return the folder of a local store, None for others; InputError unless the path is absolute and plain."""
     parts = urlsplit(url)
     if parts.scheme != "file":
         return None
@@ -218,15 +189,9 @@ def local_folder(url: str) -> Path | None:
 
 
 def check_key(key: str) -> str:
-    """Return the key if it is a plain relative name; InputError otherwise."""
     if not _KEY.fullmatch(key) or ".." in key:
         raise InputError(f"{key!r} is no name of an object in the store")
     return key
-
-
-def _endpoint() -> str | None:
-    """Return a custom S3 endpoint, if any."""
-    return os.environ.get("AWS_ENDPOINT_URL") or os.environ.get("AWS_ENDPOINT") or None
 
 
 def _remote_options(endpoint: str | None) -> dict[str, Any]:

@@ -17,14 +17,12 @@ COLUMNS: Final = ("quality/valid", "quality/feasible", "quality/success")
 
 
 def validated(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.bool_]:
-    """Return (N,) whether the grasp was validated."""
     if "quality/success" not in columns:
         return np.zeros(len(columns["quality/valid"]), bool)
     return np.asarray(columns["quality/success"]) >= 0
 
 
 def valid(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.bool_]:
-    """Return (N,) whether the grasp is valid."""
     return (np.asarray(columns["quality/valid"]) == 1) & validated(columns)
 
 

@@ -1,4 +1,4 @@
-"""What a command that plans itself reads of the settings, without the library that reads them where none is set."""
+"""Settings of a command that plans itself, read without their library where none is set."""
 
 from __future__ import annotations
 
@@ -18,24 +18,17 @@ def nothing_set(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.delenv(name)
 
 
-def test_where_nothing_is_set_they_are_the_defaults() -> None:
+def test_where_nothing_is_set_they_are_the_defaults_and_nothing_is_loaded() -> None:
     whole = load_settings()
-    assert engine_settings() == EngineSettings() == EngineSettings(whole.prefilter, whole.processes)
-
-
-@pytest.mark.parametrize("name", ["GRASPD_PROCESSES", "graspd_processes"])
-def test_what_is_set_counts(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(name, "3")
-    assert engine_settings() == EngineSettings("auto", 3)
-
-
-def test_a_bad_value_is_refused_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("GRASPD_PREFILTER", "perhaps")
-    with pytest.raises(InputError, match="GRASPD_PREFILTER"):
-        engine_settings()
-
-
-def test_nothing_is_loaded_for_settings_that_nobody_made() -> None:
+    assert engine_settings() == EngineSettings(whole.prefilter, whole.processes)
     code = "import sys; from graspd.service.cli import engine_settings; engine_settings(); print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert "pydantic_settings" not in done.stdout.split()
+
+
+def test_what_is_set_counts_and_a_bad_value_is_refused_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("graspd_processes", "3")
+    assert engine_settings() == EngineSettings("auto", 3)
+    monkeypatch.setenv("GRASPD_PREFILTER", "perhaps")
+    with pytest.raises(InputError, match="GRASPD_PREFILTER"):
+        engine_settings()

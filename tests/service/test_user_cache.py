@@ -30,19 +30,14 @@ def test_an_entry_is_read_as_it_was_kept(tmp_path: Path) -> None:
     assert [found.name for found in file.parent.iterdir()] == ["a.npz"]
 
 
-@pytest.mark.parametrize("harm", ["cut", "turned", "empty", "short"])
-def test_a_damaged_entry_is_as_none(tmp_path: Path, harm: str) -> None:
+def test_a_damaged_or_foreign_entry_is_as_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file = tmp_path / "a.npz"
     user_cache.keep(file, b"x" * 100)
     whole = file.read_bytes()
-    turned = bytes([*whole[:60], whole[60] ^ 1, *whole[61:]])
-    file.write_bytes({"cut": whole[:-1], "turned": turned, "empty": b"", "short": whole[:20]}[harm])
-    assert user_cache.load(file) is None
-
-
-def test_an_entry_of_another_user_is_as_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    file = tmp_path / "a.npz"
-    user_cache.keep(file, b"x")
+    for harmed in (whole[:-1], bytes([*whole[:60], whole[60] ^ 1, *whole[61:]]), b"", whole[:20]):
+        file.write_bytes(harmed)
+        assert user_cache.load(file) is None
+    file.write_bytes(whole)
     monkeypatch.setattr(os, "geteuid", lambda: os.getuid() + 1)
     assert user_cache.load(file) is None
 
@@ -53,6 +48,8 @@ def test_the_longest_unused_entries_go_when_it_is_full(tmp_path: Path) -> None:
         os.utime(tmp_path / f"{k}.npz", (k, k))
     user_cache.keep(tmp_path / "new.npz", bytes(1000), limit_bytes=3200)
     assert sorted(file.name for file in tmp_path.glob("*.npz")) == ["2.npz", "3.npz", "new.npz"]
+    user_cache.keep(tmp_path / "large.npz", bytes(5000), limit_bytes=3200)
+    assert [file.name for file in tmp_path.glob("*.npz")] == ["large.npz"]
 
 
 def test_it_lies_where_the_environment_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

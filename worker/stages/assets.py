@@ -191,7 +191,7 @@ def _fetch(store: Store, key: str, file: Path) -> None:
         return
     # A folder that is not writable only costs time.
     with suppress(OSError):
-        write_whole(file, data)
+        write_whole(file, [data])
 
 
 def input_of(message: TaskMessage, context: TaskContext, stage: Stage) -> Shard:

@@ -7,9 +7,10 @@ from typing import Annotated, Final, Self
 
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
+from graspd.service.model.base import Name
 from graspd.service.model.clock import timestamp
 from graspd.service.model.digests import digest_json, job_id
-from graspd.service.model.domain import JobOptions, JobRequest, Name
+from graspd.service.model.domain import JobOptions, JobRequest
 from graspd.service.model.fidelity import AUTO
 from graspd.service.model.records import Choice, DatasetRecord, Member, request_of
 from graspd.service.model.renamed import original

@@ -82,7 +82,7 @@ def of_attempt(services: Services) -> str:
 
 def of_event(services: Services) -> str:
     event = add_job_event(services.store, a_job(services), "cancelled")
-    return names.job_event(a_job(services), event.number, "cancelled")
+    return names.event(names.job_events(a_job(services)), event.number, "cancelled")
 
 
 def of_asset(services: Services) -> str:

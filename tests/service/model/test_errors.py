@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import logging
-from typing import Any, Literal
+from pathlib import Path
+from typing import Any
 
 import pytest
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import ValidationError
 
 from graspd.api.uploads import name_of_upload
 from graspd.exchange.plan import plain_name
 from graspd.service.index.index import Index
 from graspd.service.index.sample import look
-from graspd.service.model.base import Name, refusal
+from graspd.service.model.base import refusal
 from graspd.service.model.errors import ERRORS, GraspdError, InputError, without_secrets
 from graspd.service.model.names import fitted
 from graspd.service.queue.connection import connect
@@ -20,6 +21,7 @@ from graspd.service.run.address import ListenAddress
 from graspd.service.settings import Settings
 from graspd.service.store.store import open_store
 from graspd.service.telemetry import JsonLines, _TextLines
+from tests.fakes import request
 
 
 @pytest.mark.parametrize("kind", ERRORS.values(), ids=ERRORS.keys())
@@ -27,67 +29,40 @@ def test_a_quoted_line_break_does_not_make_a_second_line(kind: type[GraspdError]
     assert str(kind("asset.json: a\n  b: unknown key")) == "asset.json: a b: unknown key"
 
 
-@pytest.mark.parametrize("character", ["\r", "\x1b", "\x85", "\u2028", "\x00"])
-def test_separators_and_escapes_of_a_terminal_are_quoted(character: str) -> None:
-    assert str(GraspdError(f"a{character}b")).isprintable()
-
-
-def test_a_message_in_another_script_stays_as_it_is() -> None:
+def test_controls_of_a_terminal_are_quoted_and_other_scripts_are_not() -> None:
+    for character in "\r\x1b\x85\u2028\x00":
+        assert str(GraspdError(f"a{character}b")).isprintable()
     assert str(GraspdError("no hand 'Hände 手'")) == "no hand 'Hände 手'"
-
-
-class Kind(BaseModel):
-    model_config = ConfigDict(extra="forbid")
-
-    n: int = Field(1, ge=1, le=9)
-    share: float = Field(0.5, gt=0, lt=1)
-    on: bool = True
-    name: Name = "mug"
-    fidelity: Literal["draft", "standard", "fine"] = "draft"
-    text: str = Field("", max_length=3)
-    names: tuple[str, ...] = Field((), max_length=1)
-
-    @field_validator("text")
-    @classmethod
-    def _no_x(cls, text: str) -> str:
-        if text == "x":
-            raise ValueError("x is taken")
-        return text
 
 
 @pytest.mark.parametrize(
     ("given", "line"),
     [
-        ({"n": 0}, "n: must be at least 1"),
-        ({"n": 10}, "n: must be at most 9"),
-        ({"n": "many"}, "n: must be a whole number"),
-        ({"n": 1.5}, "n: must be a whole number"),
-        ({"share": 0}, "share: must be more than 0"),
-        ({"share": 1}, "share: must be less than 1"),
-        ({"share": "half"}, "share: must be a number"),
-        ({"on": "perhaps"}, "on: must be true or false"),
+        ({"grasps": 0}, "grasps: must be at least 1"),
+        ({"grasps": "many"}, "grasps: must be a whole number"),
+        ({"grasps": 1.5}, "grasps: must be a whole number"),
+        ({"friction": 0}, "friction: must be more than 0"),
+        ({"friction": "half"}, "friction: must be a number"),
+        ({"stereo": "perhaps"}, "stereo: must be true or false"),
         (
-            {"name": "a/b"},
-            "name: must begin with a letter or digit and hold at most 64 letters, digits, dots, dashes and underscores",
+            {"hand": "a/b"},
+            "hand: must begin with a letter or digit and hold at most 64 letters, digits, dots, dashes and underscores",
         ),
-        ({"fidelity": "strandard"}, "fidelity: must be one of draft, standard, fine; did you mean standard?"),
-        ({"fidelity": 3}, "fidelity: must be one of draft, standard, fine"),
-        ({"text": "long"}, "text: must have at most 3 characters"),
-        ({"text": "x"}, "text: x is taken"),
-        ({"names": ["a", "b"]}, "names: must have at most 1 item"),
+        ({"want": "vaild"}, "want: must be one of valid, candidates; did you mean valid?"),  # codespell:ignore vaild
+        ({"target": "x" * 41}, "target: must have at most 40 characters"),
+        ({"fidelity": "paint"}, "fidelity: unknown fidelity 'paint'"),
+        ({"views": 1}, "views need scenes"),
         ({"knob": 1}, "knob: is not known"),
     ],
 )
 def test_the_first_mistake_is_one_line(given: dict[str, Any], line: str) -> None:
     with pytest.raises(ValidationError) as refused:
-        Kind.model_validate(given)
+        request(**given)
     assert refusal(refused.value).startswith(line)
     assert "nput should" not in refusal(refused.value)
 
 
 SECRET = "s3cr3t"
-
-
 QUOTING = [
     f"redis://:{SECRET}@host:6379/0 is away",
     f"redis://:a/b#{SECRET}@host:6379",
@@ -124,19 +99,13 @@ def test_a_redis_url_that_cannot_be_used_is_not_told(url: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "url", [f"postgresql+psycopg://me:x@host:{SECRET}/db", f"mysql://me:{SECRET}@host/db", f"{SECRET}", f"{SECRET}://x"]
+    "url", [f"postgresql+psycopg://me:x@host:{SECRET}/db", f"mysql://me:{SECRET}@host/db", f"{SECRET}"]
 )
-def test_an_index_url_that_is_refused_is_told_without_password(url: str) -> None:
+def test_a_url_that_is_refused_is_told_without_password(url: str) -> None:
     for opened in (Index, look):
-        with pytest.raises(InputError, match=r"\(GRASPD_INDEX_URL\) cannot be used"):
+        with pytest.raises(InputError, match=r"\(GRASPD_INDEX_URL\) cannot be used") as refused:
             opened(url)
-    if not url.startswith(f"{SECRET}:"):
-        with pytest.raises(InputError) as refused:
-            Index(url)
         assert SECRET not in str(refused.value)
-
-
-def test_a_store_url_that_is_refused_is_told_without_password() -> None:
     with pytest.raises(InputError) as refused:
         open_store(f"s4://me:{SECRET}@host")
     assert SECRET not in str(refused.value)
@@ -149,22 +118,17 @@ def test_settings_show_no_secret(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("GRASPD_WEBHOOK_SECRET", SECRET)
     with pytest.raises(ValidationError) as refused:
         Settings()
-    assert SECRET not in f"{refused.value!r} {refused.value}"
-
-
-def test_what_other_machines_join_with_is_not_shown(tmp_path: object) -> None:
-    assert SECRET not in repr(ListenAddress(tmp_path, "host", "127.0.0.1", 1, SECRET))  # type: ignore[arg-type]
+    assert SECRET not in f"{refused.value!r} {refused.value} {ListenAddress(Path(), 'host', '127.0.0.1', 1, SECRET)!r}"
 
 
 LONG = "mujoco-Office_Depot_Canon_CL211XL_Remanufactured_Ink_Cartridge_TriColor"
 
 
-def test_the_file_of_a_thing_with_a_long_name_is_refused() -> None:
+def test_a_long_name_of_an_upload_is_refused_and_one_of_others_is_cut_and_told(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     with pytest.raises(InputError, match=f"the name {LONG} has 71 characters, at most 64 are taken; give a shorter"):
         name_of_upload(f"{LONG}.stl")
-
-
-def test_a_long_name_of_others_is_cut_told_and_stays_its_own(caplog: pytest.LogCaptureFixture) -> None:
     fitted.cache_clear()
     first, second = plain_name(LONG), plain_name(f"{LONG}2")
     assert first != second and len(first) == len(second) == 64
@@ -173,7 +137,4 @@ def test_a_long_name_of_others_is_cut_told_and_stays_its_own(caplog: pytest.LogC
         f"the name {name} has more than 64 characters; it becomes {short}"
         for name, short in ((LONG, first), (f"{LONG}2", second))
     ]
-
-
-def test_a_short_name_stays_as_it_is() -> None:
     assert plain_name("sem-Bottle a86d") == "sem-Bottle-a86d" and name_of_upload("mug.stl") == "mug"

@@ -1,22 +1,26 @@
-"""Options of a job that move some of its shards: a method's own, least distance, share of models, rechecks."""
+"""Options of a job: which shards they move, what is refused, and that a job without scenes is what it always was."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import pytest
 from pydantic import ValidationError
 
-from graspd.service.model.digests import job_id, shard_id
-from graspd.service.model.domain import BATCH_SIZE, RECHECKS, JobOptions, JobRequest
+from graspd.service.model.digests import digest_json, job_id, shard_id
+from graspd.service.model.domain import BATCH_SIZE, RECHECKS, SCENES, JobOptions, JobRequest
 from graspd.service.model.metrics import AXIS_MEANINGS, MIN_DISTANCE_M, ROBUST_MODELS, Axis, axis_word
+from graspd.service.model.planning import message_of, plan
+from graspd.service.model.records import Member
+from graspd.service.model.renamed import original
 from graspd.service.model.states import Stage
+from graspd.service.model.version import STAGE_REVISIONS
+from graspd.service.pipeline.datasets.spec import describe
+from graspd.worker.planners.registry import PLANNERS, method
 from tests.fakes import request
+from tests.service.model.jobs import DIGESTS, HAND, OBJECT, record, shard
 
-HAND, OBJECT = "a" * 32, "b" * 32
 BASE = Stage.SYNTHESIZE
-
-
-def shard(stage: Stage, wanted: JobRequest) -> str:
-    return shard_id(stage, request=wanted, hand_digest=HAND, object_digest=OBJECT, batch=0, count=32, revision=1)
 
 
 def test_other_options_make_another_shard_of_grasps_alone() -> None:
@@ -25,16 +29,14 @@ def test_other_options_make_another_shard_of_grasps_alone() -> None:
     assert shard(Stage.SCENE, plain) == shard(Stage.SCENE, changed)
 
 
-def test_the_default_distance_stays_out_of_documents_and_ids() -> None:
-    assert "min_distance" not in JobOptions(min_distance=MIN_DISTANCE_M).model_dump(mode="json")
-    assert request().model_dump_json() == request(min_distance=MIN_DISTANCE_M).model_dump_json()
-    assert job_id(request(), HAND, OBJECT) == job_id(request(min_distance=MIN_DISTANCE_M), HAND, OBJECT)
-
-
-def test_another_distance_is_another_job_and_another_shard() -> None:
-    far = request(min_distance=0.02)
-    assert JobRequest.model_validate_json(far.model_dump_json()).min_distance == 0.02
-    assert job_id(far, HAND, OBJECT) != job_id(request(), HAND, OBJECT) and shard(BASE, far) != shard(BASE, request())
+def test_a_default_stays_out_of_documents_and_ids_and_another_value_moves_the_grasps() -> None:
+    plain, document = request(), request().model_dump(mode="json")
+    assert {"min_distance", "robust", "robust_models"}.isdisjoint(document)
+    assert document == request(min_distance=MIN_DISTANCE_M).model_dump(mode="json")
+    others = [request(min_distance=0.02), request(robust=0.5), request(robust_models=8)]
+    assert len({job_id(one, HAND, OBJECT) for one in (plain, *others)}) == 4
+    assert shard(BASE, others[0]) != shard(BASE, plain)
+    assert [JobRequest.model_validate_json(one.model_dump_json()) for one in others] == others
 
 
 def test_candidate_grasps_do_not_depend_on_the_distance() -> None:
@@ -46,31 +48,6 @@ def test_a_wanted_share_is_of_eight_models_unless_told() -> None:
     assert (request().models, request(robust=0.9).models) == (0, ROBUST_MODELS)
     assert request(robust=0.9, scene="table").models == ROBUST_MODELS, "in scenes as around free objects"
     assert request(robust=0.9, robust_models=16).models == request(robust_models=16).models == 16
-
-
-def test_jobs_without_a_share_keep_their_documents_and_ids() -> None:
-    assert {"robust", "robust_models"}.isdisjoint(request().model_dump(mode="json"))
-    ids = {job_id(one, HAND, OBJECT) for one in (request(), request(robust=0.5), request(robust_models=8))}
-    assert len(ids) == 3
-    again = JobRequest.model_validate(request(robust=0.9).model_dump(mode="json"))
-    assert again == request(robust=0.9)
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ({"robust": 0.5, "validation": "none"}, "choose a validator"),
-        ({"robust": 1.5}, "less than or equal to 1"),
-        ({"robust": float("nan")}, "finite"),
-        ({"robust_models": 65}, "less than or equal to 64"),
-        *[({"min_distance": least}, "min_distance") for least in (-0.001, 0.2, float("nan"), float("inf"))],
-        *[({"options": {name: value}}, "options") for name, value in (("x", float("nan")), ("x", [1]), ("x" * 41, 1))],
-        ({"options": {f"o{i}": i for i in range(17)}}, "options"),
-    ],
-)
-def test_what_is_no_such_option_is_refused(options: dict[str, object], words: str) -> None:
-    with pytest.raises(ValidationError, match=words):
-        request(**options)
 
 
 def test_every_axis_has_its_words_and_no_other_number_has() -> None:
@@ -95,18 +72,139 @@ def test_audits_of_the_default_take_a_twentieth_of_a_jobs_time(seed: int, batche
     assert price <= 0.05
 
 
-def test_half_of_many_short_jobs_are_audited() -> None:
+def test_half_of_many_short_jobs_are_audited_and_a_long_one_has_all() -> None:
     first = [request(seed=seed).rechecks_of(0) for seed in range(200)]
     assert 70 < sum(first) < 130
     assert {first[k] + request(seed=k).rechecks_of(1) for k in range(200)} == {1}
-
-
-def test_a_long_job_has_all_of_them() -> None:
     for seed in range(6):
         assert sum(request(seed=seed).rechecks_of(batch) for batch in range(100)) == RECHECKS
 
 
 def test_any_other_number_is_of_the_first_grasps() -> None:
     assert [request(rechecks=40).rechecks_of(batch) for batch in range(3)] == [32, 8, 0]
-    assert [request(rechecks=3).rechecks_of(batch) for batch in range(2)] == [3, 0]
     assert request(rechecks=40, validation="dexgraspbench").rechecks_of(0) == 0
+
+
+#: A job as it was written before jobs had scenes.
+PLAIN: dict[str, Any] = (
+    {"grasps": 32, "method": "fast_graspd", "fidelity": "standard", "seed": 0, "scenes": 0, "views": 0}
+    | {"stereo": False, "width": 320, "height": 240, "channels": [], "friction": 1.0, "want": "valid", "budget": 4.0}
+    | {"validation": "standard", "rechecks": 8, "robustness": 0, "options": {}, "target": ""}
+)
+PLANE, NAN = {"kind": "half_space"}, float("nan")
+
+
+def test_a_job_without_a_scene_keeps_its_id_and_its_record() -> None:
+    wanted = {**PLAIN, "hand": "gripper", "object": "ball"}
+    job = record(request())
+    assert job.request.model_dump(mode="json") == wanted
+    said = {"request": original(wanted), "hand": HAND, "object": OBJECT, "revisions": STAGE_REVISIONS}
+    assert job.id == digest_json(said)
+    (task,) = plan(job)
+    assert message_of(job, task, attempt=1, max_attempt=3).model_dump(mode="json")["request"] == wanted
+
+
+def test_a_dataset_without_a_scene_keeps_its_digest() -> None:
+    hands, objects = [Member(name="h", digest=HAND)], [Member(name="o", digest=OBJECT)]
+    made = describe("d", hands, objects, JobOptions(), lambda one: (one, None))
+    options = {name: value for name, value in PLAIN.items() if name not in ("options", "target")}
+    assert made.digest == digest_json(
+        {"hands": [["h", HAND]], "objects": [["o", OBJECT]], "options": original(options)}
+    )
+
+
+def test_scenes_after_the_grasps_have_the_address_that_they_had() -> None:
+    common = {"hand": HAND, "object": OBJECT, "names": ["gripper", "ball"], "batch": 1, "count": 32, "seed": 0}
+    said = {**common, "stage": "scene", "revision": 2, "inputs": ["x"], "scenes": 3}
+    of = {"batch": 1, "count": 32, "revision": 2, "inputs": ("x",)}
+    assert digest_json(said) == shard_id(Stage.SCENE, request=request(scenes=3), **DIGESTS, **of)
+
+
+def test_a_job_in_a_scene_makes_its_scenes_first() -> None:
+    job = record(request(scene="table", views=2))
+    assert job.id != record(request(scenes=SCENES, views=2)).id
+    scene, base, views = plan(job)
+    assert [task.stage for task in (scene, base, views)] == [Stage.SCENE, Stage.SYNTHESIZE, Stage.RENDER]
+    assert (scene.inputs, base.inputs, views.inputs) == ((), (scene.output,), (base.output,))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        *[("scene", "bin"), ("scene", {"supports": [PLANE]}), ("scenes", 5), ("faces", "all"), ("seed", 1)],
+        *[("touch", 2), ("touch", -0.5), ("fidelity", "draft")],
+    ],
+)
+def test_whatever_moves_scenes_gives_them_another_address(name: str, value: Any) -> None:
+    first = next(plan(record(request(scene="table"))))
+    assert next(plan(record(request(**{"scene": "table", name: value})))).output != first.output
+
+
+def test_where_no_number_of_scenes_is_named_there_are_a_few() -> None:
+    assert request(scene="table").scenes == request(scene="table", scenes="0").scenes == SCENES
+    assert request(scene="table", scenes=7).scenes == 7
+    assert request().scenes == 0
+
+
+def test_a_document_comes_back_and_fingertips_may_touch_unless_it_says_otherwise() -> None:
+    assert "touch" not in request(scene="table").model_dump()
+    assert record(request(scene="table", touch=0)).id == record(request(scene="table")).id
+    assert request(scene="table").place.touch == 0
+    box = {"kind": "box", "size": [0.1, 0.2, 0.3]}
+    document = {"supports": [PLANE, box], "touch": -0.5, "target": [0, 0, 1, 1, 0, 0, 0]}
+    wanted = request(scene=document)
+    assert (wanted.place.kind, len(wanted.place.supports), wanted.place.touch) == ("file", 2, -0.5)
+    assert JobRequest.model_validate_json(wanted.model_dump_json()) == wanted
+    assert request(scene=document, touch=2).place.touch == 2
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"scene": "tabel"}, "'free', 'table', 'bin' or 'shelf'"),  # codespell:ignore tabel
+        ({"scene": {"supports": []}}, "at least 1"),
+        ({"scene": {"supports": [{"kind": "half_space", "offset": NAN}]}}, "finite number"),
+        ({"scene": {"supports": [PLANE], "target": [0, 0, 0, 1, 1, 0, 0]}}, "unit length"),
+        ({"scene": {"supports": [PLANE], "file": "/etc/passwd"}}, "Extra inputs"),
+        ({"scene": {"supports": [PLANE], "target": [0, 0, 0, 1, 0, 0, 0]}, "faces": "all"}, "lies on one face"),
+        ({"faces": "all"}, "lies on no face"),
+        ({"touch": 1}, "nothing to touch"),
+        ({"scene": "table", "touch": -1.5}, "greater than or equal to -1"),
+        ({"scene": "table", "touch": NAN}, "finite number"),
+        ({"scene": "table", "method": "dfc"}, "plans around free objects only"),
+        ({"scene": "table", "method": "learned"}, "needs the option network"),
+        ({"scene": "shelf", "method": "learned", "options": {"network": "n"}}, "things on a table"),
+        ({"method": "learned", "options": {"network": "n"}}, "things on a table"),
+        ({"scene": "table", "robustness": 2}, "six pushes"),
+        ({"scene": "table", "scenes": 65}, "less than or equal to 64"),
+        ({"robust": 0.5, "validation": "none"}, "choose a validator"),
+        ({"robust": 1.5}, "less than or equal to 1"),
+        ({"robust": NAN}, "finite number"),
+        ({"robust_models": 65}, "less than or equal to 64"),
+        ({"min_distance": -0.001}, "greater than or equal to 0"),
+        ({"min_distance": 0.2}, "less than or equal to 0.1"),
+        ({"min_distance": NAN}, "finite number"),
+        ({"options": {"x": NAN}}, "finite number"),
+        ({"options": {"x": [1]}}, "valid integer"),
+        ({"options": {"x" * 41: 1}}, "at most 40"),
+        ({"options": {f"o{i}": i for i in range(17)}}, "at most 16"),
+    ],
+)
+def test_nonsense_is_refused_in_a_line(changes: dict[str, Any], words: str) -> None:
+    with pytest.raises(ValidationError) as refused:
+        request(**changes)
+    first = refused.value.errors()[0]["msg"]
+    assert words in first
+    assert "\n" not in first
+
+
+def test_the_methods_that_know_no_scene_are_those_of_the_engine() -> None:
+    known = {name for name in PLANNERS if method(name).in_scenes and not method(name).files}
+    taken = set()
+    for name in PLANNERS:
+        try:
+            request(scene="table", method=name)
+            taken.add(name)
+        except ValidationError:
+            pass
+    assert taken == known

@@ -34,14 +34,6 @@ def test_a_normal_does_not_bridge_two_surfaces() -> None:
         np.testing.assert_allclose(found[:, columns], expected, atol=1e-9)
 
 
-def test_where_nothing_is_seen_there_is_neither_point_nor_normal() -> None:
-    depth = np.full((HEIGHT, WIDTH), np.inf)
-    depth[10, 10] = 0.5
-    points = back_project(K, depth)
-    assert np.isfinite(points[..., 2]).sum() == 1
-    assert np.isnan(surface_normals(points)).all()
-
-
 def test_a_fitted_normal_is_the_planes_beside_edges_and_rims() -> None:
     left, right = np.array([0.6, 0, -0.8]), np.array([0.0, 0.6, -0.8])
     depth = np.where(np.arange(WIDTH) < 30, plane_depth(left, -0.3), plane_depth(right, -0.6))
@@ -51,9 +43,10 @@ def test_a_fitted_normal_is_the_planes_beside_edges_and_rims() -> None:
     np.testing.assert_allclose(found, [left, left, right, right], atol=1e-6)
 
 
-def test_a_point_alone_looks_at_the_camera() -> None:
-    depth = np.full((HEIGHT, WIDTH), np.nan)
+def test_a_point_alone_has_no_normal_of_its_own_and_looks_at_the_camera() -> None:
+    depth = np.full((HEIGHT, WIDTH), np.inf)
     depth[20, 40] = 0.7
     points = back_project(K, depth)
+    assert np.isfinite(points[..., 2]).sum() == 1 and np.isnan(surface_normals(points)).all()
     found = fitted_normals(points, np.array([20]), np.array([40]), radius=3, gap_m=np.array([0.1]))[0]
     np.testing.assert_allclose(found, -points[20, 40] / np.linalg.norm(points[20, 40]), atol=1e-12)

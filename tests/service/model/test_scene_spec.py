@@ -10,8 +10,10 @@ from pydantic import ValidationError
 
 from graspd.service.model.errors import InputError
 from graspd.service.model.scene_spec import MAX_FILE_BYTES, SceneSpec, parse_scene, scene_option
+from tests.conftest import REPOSITORY
 
 TABLE = {"supports": [{"kind": "half_space"}]}
+POSE, NAMES = [0, 0, 0, 1, 0, 0, 0], ("cup.stl", "mug")
 
 
 def test_a_kind_is_a_scene_and_an_unknown_one_lists_them() -> None:
@@ -23,22 +25,23 @@ def test_a_kind_is_a_scene_and_an_unknown_one_lists_them() -> None:
         parse_scene("nowhere.yaml")
 
 
-@pytest.mark.parametrize("suffix", [".json", ".yaml"])
-def test_a_file_says_supports_and_the_targets_pose(tmp_path: Path, suffix: str) -> None:
+def test_a_file_says_supports_neighbours_and_the_targets_pose(tmp_path: Path) -> None:
+    (tmp_path / "cup.stl").write_bytes(b"")
     supports = [{"kind": "half_space", "normal": [0, 0, 1]}, {"kind": "box", "size": [0.1, 0.2, 0.3]}]
-    path = tmp_path / f"scene{suffix}"
-    path.write_text(json.dumps({"supports": supports, "target": [0, 0, 0.1, 1, 0, 0, 0]}))  # JSON is YAML
-    found = parse_scene(str(path))
-    assert found.kind == "file"
-    assert [s.kind for s in found.supports] == ["half_space", "box"]
-    assert found.target == (0, 0, 0.1, 1, 0, 0, 0)
+    poses = {"target": [0, 0, 0.1, 1, 0, 0, 0], "neighbours": [{"object": name, "pose": POSE} for name in NAMES]}
+    for suffix in (".json", ".yaml"):  # JSON is YAML
+        path = tmp_path / f"scene{suffix}"
+        path.write_text(json.dumps({"supports": supports} | poses))
+        found = parse_scene(str(path))
+        assert (found.kind, [s.kind for s in found.supports]) == ("file", ["half_space", "box"])
+        assert found.target == (0, 0, 0.1, 1, 0, 0, 0)
+        assert [one.object for one in found.neighbours] == [str(tmp_path / "cup.stl"), "mug"]
 
 
 @pytest.mark.parametrize(
     ("said", "reason"),
     [
         ({}, "supports"),
-        ({"supports": []}, "supports"),
         ({"supports": [{"kind": "ball"}]}, "supports"),
         ({"supports": [{"kind": "half_space", "normal": [0, 0, 0]}]}, "not zero"),
         ({"supports": [{"kind": "half_space", "offset": 1e9}]}, "offset"),
@@ -48,11 +51,11 @@ def test_a_file_says_supports_and_the_targets_pose(tmp_path: Path, suffix: str) 
         ({**TABLE, "target": [0, 0, 0, 2, 0, 0, 0]}, "unit length"),
         ({**TABLE, "colour": "red"}, "colour"),
         ([1, 2], "one object"),
-        ({**TABLE, "neighbours": [{"object": "mug", "pose": [0, 0, 0, 1, 0, 0, 0]}] * 9}, "neighbours"),
+        ({**TABLE, "neighbours": [{"object": "mug", "pose": POSE}] * 9}, "neighbours"),
         ({**TABLE, "neighbours": [{"object": ""}]}, "object"),
         ({**TABLE, "neighbours": [{"object": "mug", "pose": [0, 0, 0, 2, 0, 0, 0]}]}, "unit length"),
         (
-            {**TABLE, "neighbours": [{"object": "mug"}, {"object": "mug", "pose": [0, 0, 0, 1, 0, 0, 0]}]},
+            {**TABLE, "neighbours": [{"object": "mug"}, {"object": "mug", "pose": POSE}]},
             "all neighbours a pose, or none",
         ),
     ],
@@ -94,14 +97,6 @@ def test_a_free_object_has_no_faces_to_choose() -> None:
         parse_scene("free", faces="all")
 
 
-def test_a_neighbours_mesh_is_found_beside_the_scene_file(tmp_path: Path) -> None:
-    (tmp_path / "cup.stl").write_bytes(b"")
-    path = tmp_path / "scene.json"
-    path.write_text(json.dumps({**TABLE, "neighbours": [{"object": "cup.stl"}, {"object": "mug"}]}))
-    assert [one.object for one in parse_scene(str(path)).neighbours] == [str(tmp_path / "cup.stl"), "mug"]
-
-
 def test_the_example_scenes_are_scenes():
-    folder = Path(__file__).parents[3] / "examples" / "scenes"
-    found = [parse_scene(str(path)) for path in sorted(folder.glob("*.yaml"))]
+    found = [parse_scene(str(path)) for path in (REPOSITORY / "examples" / "scenes").glob("*.yaml")]
     assert found and all(spec.kind == "file" for spec in found)

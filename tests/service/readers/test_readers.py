@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-import os
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,64 +12,42 @@ import numpy as np
 import pytest
 
 from graspd.service.model.errors import DamagedShard, InputError, NotFoundError
-from graspd.service.model.names import dataset_snapshot, shard_file
-from graspd.service.model.records import JobRecord, Snapshot
-from graspd.service.model.states import Stage
+from graspd.service.model.names import dataset_snapshot
+from graspd.service.model.records import Snapshot
 from graspd.service.model.transforms import compose, pose_from_matrix
 from graspd.service.pipeline.backends import Services
 from graspd.service.readers import Grasps, Pictures, ShardCache, Shards, open_shards, prefetched
 from graspd.service.settings import Settings
 from graspd.service.store.records import put_record
-from graspd.service.store.shards import Shard, read_shard
+from graspd.service.store.shards import read_shard
 from graspd.service.store.store import open_store
-from tests.api import factories
 from tests.damage import flipped, flipped_values
 from tests.indexes import empty_index
 from tests.memory_queue import MemoryQueue
 from tests.servers import S3Server
-from tests.service.readers import box_scenes
-
-GRASPS = 40
+from tests.service.readers.conftest import GRASPS, job_in
 
 
 @pytest.fixture
-def job(services: Services) -> JobRecord:
-    """A finished job of two batches with scenes and pictures."""
-    factories.add_builtins(services)
-    record = factories.add_job(services, grasps=GRASPS, scenes=2, views=2, width=24, height=16)
-    factories.finish_all(services, record)
-    return record
-
-
-@pytest.fixture
-def folder(services: Services, job: JobRecord, tmp_path: Path) -> Path:
+def folder(services: Services, shards: Shards, tmp_path: Path) -> Path:
     """The job's files as a user has them who downloaded them."""
     out = tmp_path / "files"
     out.mkdir()
-    for number, shard in enumerate(open_shards(services.store, job=job.id, cache=tmp_path / "cache")):
+    for number, shard in enumerate(shards):
         (out / f"{number}.h5").write_bytes(services.store.get(shard.key))
     return out
-
-
-@pytest.fixture
-def shards(services: Services, job: JobRecord, tmp_path: Path) -> Shards:
-    """Of the job, in the store."""
-    return open_shards(services.store, job=job.id, cache=tmp_path / "cache")
-
-
-def bases(services: Services, shards: Shards) -> list[Shard]:
-    return [read_shard(services.store.get(file.key), kind="base") for file in shards.of("base")]
 
 
 def test_a_job_in_a_store_is_read_valid_or_whole(services: Services, shards: Shards) -> None:
     assert [file.kind for file in shards] == ["base", "scene", "views"] * 2
     assert len(Grasps(shards, valid=False)) == GRASPS
-    valid = sum(int(np.count_nonzero(base["quality/valid"])) for base in bases(services, shards))
+    bases = [read_shard(services.store.get(file.key), kind="base") for file in shards.of("base")]
+    valid = sum(int(np.count_nonzero(base["quality/valid"])) for base in bases)
     assert 0 < valid < GRASPS
     assert len(Grasps(shards)) == valid
 
 
-def test_a_sample_is_a_row_and_arrays_hold_them_in_order(shards: Shards) -> None:
+def test_a_sample_is_a_row_and_arrays_hold_them_in_order(shards: Shards, folder: Path) -> None:
     grasps = Grasps(shards)
     sample = grasps[-1]
     base = read_shard(shards.path(shards.by_id(sample["shard_id"])), kind="base")
@@ -79,6 +56,8 @@ def test_a_sample_is_a_row_and_arrays_hold_them_in_order(shards: Shards) -> None
     arrays = grasps.arrays("quality/epsilon")
     np.testing.assert_array_equal(arrays["quality/epsilon"], [sample["quality/epsilon"] for sample in grasps])
     assert len(arrays["hand"]) == len(grasps)
+    local = Grasps(open_shards(folder)).arrays("quality/epsilon")
+    np.testing.assert_array_equal(local["quality/epsilon"], arrays["quality/epsilon"])
 
 
 def test_a_condition_keeps_the_grasps_it_holds_for(shards: Shards) -> None:
@@ -87,11 +66,6 @@ def test_a_condition_keeps_the_grasps_it_holds_for(shards: Shards) -> None:
     assert all(sample["quality/penetration_depth_mm"] < 0.5 for sample in good)
     with pytest.raises(InputError, match="mask of shape"):
         Grasps(shards, where=lambda columns: np.ones(3, bool))
-
-
-def test_files_in_a_folder_are_the_same_dataset(shards: Shards, folder: Path) -> None:
-    stored, local = (Grasps(source).arrays() for source in (shards, open_shards(folder)))
-    np.testing.assert_array_equal(local["grasp/joint_positions"], stored["grasp/joint_positions"])
 
 
 def test_a_picture_comes_with_its_grasps_in_the_camera_frame(folder: Path) -> None:
@@ -147,17 +121,14 @@ def test_a_wrong_value_in_a_file_is_refused_and_not_handed_out(folder: Path) -> 
         Grasps(open_shards(folder))[0]
 
 
-def test_a_full_cache_drops_what_was_unused_longest(services: Services, tmp_path: Path) -> None:
-    blobs = {shard_file(Stage.SYNTHESIZE, f"{number:032x}"): bytes([number]) * 1000 for number in range(3)}
-    for key, blob in blobs.items():
-        services.store.put(key, blob)
-    cache = ShardCache(tmp_path / "small", limit_bytes=2500)
-    sums = [hashlib.sha256(blob).hexdigest() for blob in blobs.values()]
-    for age, (key, digest) in enumerate(zip(blobs, sums, strict=True)):
-        path = cache.fetch(services.store, key, digest)
-        if age < 2:
-            os.utime(path, (1000 - 100 * age, 1000 - 100 * age))
-    assert {path.stem for path in cache.folder.iterdir()} == {sums[0], sums[2]}
+def test_a_full_cache_drops_what_was_unused_longest(services: Services, shards: Shards, tmp_path: Path) -> None:
+    sizes = {shard.sha256: len(services.store.get(shard.key)) for shard in shards}
+    cache = ShardCache(tmp_path / "small", limit_bytes=sum(sizes.values()) // 2)
+    for shard in shards:
+        cache.fetch(services.store, shard.key, shard.sha256)
+    held = {path.stem for path in cache.folder.iterdir()}
+    assert shards.files[-1].sha256 in held and shards.files[0].sha256 not in held
+    assert sum(sizes[name] for name in held) <= cache.limit_bytes
 
 
 def _put_snapshot(services: Services, dataset: str, shards: Shards, *, created: str) -> None:
@@ -170,55 +141,19 @@ def _put_snapshot(services: Services, dataset: str, shards: Shards, *, created: 
     put_record(services.store, dataset_snapshot(dataset, digest), taken)
 
 
-@pytest.fixture
-def remote(tmp_path: Path, s3_url: str) -> Iterator[Services]:
+@pytest.mark.s3
+def test_what_was_read_once_from_s3_needs_the_server_no_more(s3_url: str, s3_server: S3Server, tmp_path: Path) -> None:
     index = empty_index(f"sqlite:///{tmp_path / 'index.sqlite'}")
-    made = Services(Settings(data_dir=tmp_path), open_store(s3_url), index, MemoryQueue())
-    factories.add_builtins(made)
-    yield made
-    made.close()
-
-
-@pytest.fixture
-def remote_job(remote: Services) -> JobRecord:
-    record = factories.add_job(remote, grasps=40, scenes=2, views=2, width=24, height=16)
-    factories.finish_all(remote, record)
-    return record
-
-
-@pytest.mark.s3
-def test_what_is_read_from_s3_is_what_was_written(
-    remote: Services, remote_job: JobRecord, s3_url: str, tmp_path: Path
-) -> None:
-    shards = open_shards(s3_url, job=remote_job.id, cache=tmp_path / "cache")
-    written = [remote.store.get(file.key) for file in shards]
-    assert [shards.path(file).read_bytes() for file in shards] == written
-    assert len(Grasps(shards, valid=False)) == 40 and len(Pictures(shards)) == 8
-
-
-@pytest.mark.s3
-def test_what_was_read_once_needs_the_server_no_more(
-    remote: Services, remote_job: JobRecord, s3_url: str, s3_server: S3Server, tmp_path: Path
-) -> None:
-    shards = open_shards(s3_url, job=remote_job.id, cache=tmp_path / "cache")
-    first = Grasps(shards).arrays("grasp/hand_pose")
+    remote = Services(Settings(data_dir=tmp_path), open_store(s3_url), index, MemoryQueue())
+    job = job_in(remote)
+    shards = open_shards(s3_url, job=job, cache=tmp_path / "cache")
+    assert [shards.path(file).read_bytes() for file in shards] == [remote.store.get(file.key) for file in shards]
     s3_server.kill()
     try:
-        again = Grasps(shards).arrays("grasp/hand_pose")
+        assert len(Grasps(shards, valid=False)) == GRASPS and len(Pictures(shards)) == 8
     finally:
         s3_server.start()
-    np.testing.assert_array_equal(again["grasp/hand_pose"], first["grasp/hand_pose"])
-
-
-@pytest.mark.s3
-def test_a_cache_smaller_than_the_job_still_reads_all_of_it(
-    remote: Services, remote_job: JobRecord, s3_url: str, tmp_path: Path
-) -> None:
-    shards = open_shards(s3_url, job=remote_job.id, cache=tmp_path / "cache", cache_bytes=60_000)
-    largest = max(len(remote.store.get(file.key)) for file in shards)
-    assert sum(1 for _ in Grasps(shards, valid=False)) == 40
-    held = sum(path.stat().st_size for path in (tmp_path / "cache").iterdir())
-    assert held <= max(60_000, largest) < sum(len(remote.store.get(file.key)) for file in shards)
+    remote.close()
 
 
 class Counted(Sequence[dict[str, Any]]):
@@ -259,17 +194,6 @@ def test_an_error_comes_when_it_is_its_turn() -> None:
     assert [next(found)["number"] for _ in range(4)] == [0, 1, 2, 3]
     with pytest.raises(InputError, match="no such number"):
         next(found)
-
-
-@pytest.mark.parametrize("options", [{"workers": 0}, {"ahead": 0}])
-def test_numbers_below_one_are_refused_at_once(options: dict[str, int]) -> None:
-    with pytest.raises(InputError, match="at least one"):
-        prefetched(Counted(), **options)
-
-
-def test_pictures_and_clouds_are_the_same_ahead(tmp_path: Path) -> None:
-    pictures = Pictures(open_shards(box_scenes.write(tmp_path / "box")))
-    for source in (pictures, pictures.clouds(64, noise="tof")):
-        for index, sample in enumerate(prefetched(source, workers=3)):
-            for name, value in source[index].items():
-                np.testing.assert_array_equal(sample[name], value)
+    for options in ({"workers": 0}, {"ahead": 0}):
+        with pytest.raises(InputError, match="at least one"):
+            prefetched(Counted(), **options)

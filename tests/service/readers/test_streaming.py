@@ -5,8 +5,8 @@ from __future__ import annotations
 import hashlib
 import os
 import pickle
+import shutil
 import sys
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,41 +22,30 @@ from graspd.service.readers.ranges import RowTable, read_file
 from graspd.service.store.columns import SCHEMAS
 from graspd.service.store.store import Store, open_store
 from tests.conftest import REPOSITORY
-from tests.service.readers import box_scenes
 from tests.service.readers.box_scenes import VIEWS
 from tests.shell import completed
 
 VIEWS_KEY = f"shards/views/{'c' * 32}.h5"
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return box_scenes.write(tmp_path_factory.mktemp("box"))
+@pytest.fixture
+def shards(box: Path, tmp_path: Path) -> Shards:
+    return streamed(box, open_store("memory://"), tmp_path / "cache")
 
 
 @pytest.fixture
-def shards(folder: Path, tmp_path: Path) -> Shards:
-    return streamed(folder, open_store("memory://"), tmp_path / "cache")
-
-
-@pytest.fixture
-def asked(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[tuple[str, int, int]]]:
+def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, int, int]]:
     """Every range that a store is asked for."""
     found: list[tuple[str, int, int]] = []
     get_range = Store.get_range
-
-    def counted(self: Store, key: str, start: int, length: int) -> bytes:
-        found.append((key, start, length))
-        return get_range(self, key, start, length)
-
-    monkeypatch.setattr(Store, "get_range", counted)
-    yield found
+    monkeypatch.setattr(Store, "get_range", lambda self, *args: found.append(args) or get_range(self, *args))
+    return found
 
 
-def streamed(folder: Path, store: Store, cache: Path) -> Shards:
+def streamed(box: Path, store: Store, cache: Path) -> Shards:
     """The shards of a folder, put into a store."""
     files = []
-    for file in open_shards(folder):
+    for file in open_shards(box):
         assert file.path is not None
         data, key = file.path.read_bytes(), f"shards/{file.kind}/{file.id}.h5"
         store.put(key, data)
@@ -75,25 +64,26 @@ def same(first: Any, second: Any) -> None:
 
 @pytest.mark.parametrize("largest", [0, 60_000, 1 << 22], ids=["row by row", "some ahead", "whole"])
 def test_the_samples_are_those_of_the_files(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, largest: int
+    box: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, largest: int
 ) -> None:
     monkeypatch.setattr(ranges, "AHEAD_BYTES", largest)
-    local = Pictures(open_shards(folder))
-    remote = Pictures(streamed(folder, open_store("memory://"), tmp_path))
+    local = Pictures(open_shards(box))
+    remote = Pictures(streamed(box, open_store("memory://"), tmp_path))
     same(remote, local)
     same([remote[k] for k in (5, 0, 3, 3)], [local[k] for k in (5, 0, 3, 3)])
     same(list(prefetched(remote, workers=4, ahead=4)), local)
-    same(remote.clouds(64, noise="stereo", fuse=True), local.clouds(64, noise="stereo", fuse=True))
+    clouds = remote.clouds(64, noise="stereo", fuse=True)
+    same(list(prefetched(clouds, workers=3)), local.clouds(64, noise="stereo", fuse=True))
 
 
-def test_pictures_leave_nothing_on_the_disk(folder: Path, shards: Shards, tmp_path: Path) -> None:
+def test_pictures_leave_nothing_on_the_disk(box: Path, shards: Shards, tmp_path: Path) -> None:
     assert sum(1 for _ in Pictures(shards)) == VIEWS
     (base,) = (tmp_path / "cache").iterdir()
-    assert base.read_bytes() == (folder / "base.h5").read_bytes()
+    assert base.read_bytes() == (box / "base.h5").read_bytes()
 
 
 def test_a_request_brings_what_is_read_in_turn(
-    folder: Path, shards: Shards, asked: list[tuple[str, int, int]], monkeypatch: pytest.MonkeyPatch
+    box: Path, shards: Shards, asked: list[tuple[str, int, int]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pictures = Pictures(shards, ["image/rgb", "image/depth"])
     pictures[0]
@@ -105,12 +95,12 @@ def test_a_request_brings_what_is_read_in_turn(
     shards.ranges.forget()
     asked.clear()
     pictures[4]
-    size = (folder / "views.h5").stat().st_size
+    size = (box / "views.h5").stat().st_size
     assert len(asked) == 2
     assert sum(length for _, _, length in asked) < size / VIEWS
 
 
-def test_what_is_held_is_bounded(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_held_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     reader = ranges.RangeReader(open_store("memory://"))
     for number in range(6):
         reader._store.put(f"object-{number}", bytes(1000))
@@ -121,28 +111,33 @@ def test_what_is_held_is_bounded(folder: Path, tmp_path: Path, monkeypatch: pyte
     assert set(reader._objects) == {"object-4", "object-5"}
 
 
-def test_damage_is_told_with_the_row_or_the_name(folder: Path, tmp_path: Path) -> None:
-    store = open_store(f"file://{tmp_path / 'store'}")
-    shards = streamed(folder, store, tmp_path / "cache")
-    pictures = Pictures(shards, ["image/depth"])
-    pictures[0]
-    table = pictures._table(shards.of("views")[0], ["image/depth"])
-    (start, length) = table.ranges(2, ["image/depth"])[0]
-    path = tmp_path / "store" / VIEWS_KEY
+def turn_a_byte(path: Path) -> None:
+    """Another byte in the depth of picture 2."""
+    with h5py.File(path) as file:
+        start, length = RowTable.of(file, ["image/depth"], "views").packed["image/depth"].places[2]
     data = bytearray(path.read_bytes())
     data[start + length // 2] ^= 0x10
     path.write_bytes(data)
-    shards.ranges.forget()
-    with pytest.raises(DamagedShard, match="row 2 of image/depth"):
+
+
+@pytest.mark.parametrize("stream", [True, False])
+def test_a_picture_whose_bytes_turned_is_refused_alone(box: Path, tmp_path: Path, stream: bool) -> None:
+    copy = tmp_path / "store" / VIEWS_KEY if stream else tmp_path / "set" / "views.h5"
+    if stream:
+        shards = streamed(box, open_store(f"file://{tmp_path / 'store'}"), tmp_path / "cache")
+    else:
+        shutil.copytree(box, tmp_path / "set")
+    turn_a_byte(copy)
+    pictures = Pictures(shards if stream else open_shards(tmp_path / "set"), ["image/depth"])
+    with pytest.raises(DamagedShard, match="row 2 of image/depth") as told:
         pictures[2]
-    path.write_bytes(data[: start + 5])
-    shards.ranges.forget()
-    with pytest.raises((DamagedShard, StoreUnavailable)):
-        pictures[2]
-    path.unlink()
-    shards.ranges.forget()
-    with pytest.raises(DamagedShard, match="is gone from the store"):
-        pictures[1]
+    assert "\n" not in str(told.value)
+    assert pictures[1]["image/depth"].shape == pictures[3]["image/depth"].shape
+    if stream:
+        copy.unlink()
+        shards.ranges.forget()
+        with pytest.raises(DamagedShard, match="is gone from the store"):
+            pictures[1]
 
 
 @pytest.mark.parametrize("largest", [0, 1 << 22], ids=["ranges", "whole"])
@@ -180,9 +175,9 @@ except InputError as error:
     assert (done.returncode, "not a readable HDF5 file" in done.stdout) == (0, True), done.stderr[-1000:]
 
 
-def test_a_reader_begins_with_nothing_in_another_process(folder: Path, tmp_path: Path) -> None:
+def test_a_reader_begins_with_nothing_in_another_process(box: Path, tmp_path: Path) -> None:
     store = open_store(f"file://{tmp_path / 'store'}")
-    pictures = Pictures(streamed(folder, store, tmp_path / "cache"))
+    pictures = Pictures(streamed(box, store, tmp_path / "cache"))
     first = pictures[3]
     again = pickle.loads(pickle.dumps(pictures))
     assert not again.shards.ranges._objects
@@ -190,11 +185,9 @@ def test_a_reader_begins_with_nothing_in_another_process(folder: Path, tmp_path:
 
 
 @pytest.mark.parametrize("stream", [True, False])
-def test_a_fork_is_told_to_start_anew(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stream: bool
-) -> None:
+def test_a_fork_is_told_to_start_anew(box: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stream: bool) -> None:
     remote = Store(MemoryStore(), "s3://bucket/graspd")
-    shards = replace(streamed(folder, remote, tmp_path), stream=stream)
+    shards = replace(streamed(box, remote, tmp_path), stream=stream)
     pictures = Pictures(shards)
     pictures[0]
     shards.ranges.forget()
@@ -213,24 +206,13 @@ def test_ranges_with_little_between_them_are_one() -> None:
     assert ranges.joined([(0, 100), (20, 10)]) == [(0, 100)]
 
 
-@pytest.mark.s3
-def test_pictures_of_s3_are_those_of_the_files(folder: Path, tmp_path: Path, s3_url: str) -> None:
-    remote = Pictures(streamed(folder, open_store(s3_url), tmp_path))
-    same(list(prefetched(remote, workers=4)), Pictures(open_shards(folder)))
-
-
-@pytest.fixture(scope="module")
-def views(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return box_scenes.write(tmp_path_factory.mktemp("box")) / "views.h5"
-
-
-def test_every_row_of_every_column_is_what_h5py_reads(views: Path) -> None:
-    with h5py.File(views) as file:
+def test_every_row_of_every_column_is_what_h5py_reads(box: Path) -> None:
+    with h5py.File(box / "views.h5") as file:
         columns = [name for name in SCHEMAS["views"] if name in file]
         table = RowTable.of(file, columns, "views")
         assert {"image/rgb", "image/depth"} <= set(table.packed) and "camera/eye" in table.held
         for row in range(len(file["camera/eye"])):
-            found = table.row(row, columns, lambda ranges: read_file(views, ranges))
+            found = table.row(row, columns, lambda ranges: read_file(box / "views.h5", ranges))
             for name in columns:
                 expected = file[name][row]
                 assert found[name].dtype == expected.dtype
@@ -261,32 +243,16 @@ def test_what_is_packed_in_another_way_is_read_by_the_library(tmp_path: Path) ->
     assert not table.row(0, ["half"], lambda _: [])["half"].any()
 
 
-def test_a_picture_whose_bytes_turned_is_refused_alone(views: Path, tmp_path: Path) -> None:
-    folder = tmp_path / "set"
-    folder.mkdir()
-    (folder / "base.h5").write_bytes((views.parent / "base.h5").read_bytes())
-    with h5py.File(views) as file:
-        start, length = RowTable.of(file, ["image/depth"], "views").packed["image/depth"].places[2]
-    data = bytearray(views.read_bytes())
-    data[start + length // 2] ^= 0x10
-    (folder / "views.h5").write_bytes(data)
-    pictures = Pictures(open_shards(folder), ["image/depth"])
-    with pytest.raises(DamagedShard, match="row 2 of image/depth") as told:
-        pictures[2]
-    assert "\n" not in str(told.value)
-    assert pictures[1]["image/depth"].shape == pictures[3]["image/depth"].shape
-
-
-def test_a_file_that_ends_too_early_is_refused(views: Path, tmp_path: Path) -> None:
-    with h5py.File(views) as file:
+def test_a_file_that_ends_too_early_is_refused(box: Path, tmp_path: Path) -> None:
+    with h5py.File(box / "views.h5") as file:
         table = RowTable.of(file, ["image/rgb"], "views")
-    (tmp_path / "cut.h5").write_bytes(views.read_bytes()[:3000])
+    (tmp_path / "cut.h5").write_bytes((box / "views.h5").read_bytes()[:3000])
     with pytest.raises(DamagedShard, match="views is damaged"):
         table.row(1, ["image/rgb"], lambda ranges: read_file(tmp_path / "cut.h5", ranges))
 
 
-def test_a_sample_is_the_callers_own(views: Path) -> None:
-    pictures = Pictures(open_shards(views.parent), ["image/rgb", "image/depth", "camera/intrinsics"])
+def test_a_sample_is_the_callers_own(box: Path) -> None:
+    pictures = Pictures(open_shards(box), ["image/rgb", "image/depth", "camera/intrinsics"])
     first = pictures[0]
     for value in first.values():
         if isinstance(value, np.ndarray):

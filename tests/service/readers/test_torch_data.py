@@ -7,24 +7,12 @@ from typing import Any
 
 import pytest
 
-from graspd.service.pipeline.backends import Services
 from graspd.service.readers import Grasps, Pictures, Shards, open_shards
-from tests.api import factories
-from tests.service.readers import box_scenes
 
 torch = pytest.importorskip("torch", reason="torch is not installed; `pip install torch` runs these tests")
 from torch.utils.data import DataLoader  # noqa: E402
 
 from graspd.service.readers.torch_data import Samples, ShuffledShards, collate  # noqa: E402
-
-
-@pytest.fixture
-def shards(services: Services, tmp_path: Path) -> Shards:
-    """Three batches of a finished job."""
-    factories.add_builtins(services)
-    record = factories.add_job(services, grasps=80, scenes=1, views=2, width=24, height=16)
-    factories.finish_all(services, record)
-    return open_shards(services.store, job=record.id, cache=tmp_path / "cache")
 
 
 def rows(batches: Any) -> list[tuple[str, int]]:
@@ -61,8 +49,8 @@ def test_pictures_are_stacked_and_their_grasps_listed(shards: Shards) -> None:
 
 
 @pytest.mark.parametrize("processes", [0, 2])
-def test_clouds_are_stacked_and_their_grasps_listed(tmp_path: Path, processes: int) -> None:
-    clouds = Pictures(open_shards(box_scenes.write(tmp_path / "box"))).clouds(128, noise="stereo", seed=2)
+def test_clouds_are_stacked_and_their_grasps_listed(box: Path, processes: int) -> None:
+    clouds = Pictures(open_shards(box)).clouds(128, noise="stereo", seed=2)
     loader = DataLoader(Samples(clouds), batch_size=4, collate_fn=collate, num_workers=processes)
     batches = list(loader)
     assert [tuple(batch["cloud/points"].shape) for batch in batches] == [(4, 128, 3), (2, 128, 3)]

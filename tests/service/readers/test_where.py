@@ -35,12 +35,9 @@ SAID = {"hand": "allegro", "object": "006_mustard_bottle"}
         ("lift and not held", [3]),
         ("not validated", []),
         ("type = power or type = 'lateral'", [0, 2]),
-        ("type != power", [1, 2, 3]),
         ("hand = allegro and object = 006_mustard_bottle and penetration_depth_mm < 1", [0, 2]),
-        ("object = '006_mustard_bottle'", [0, 1, 2, 3]),
         ("hand != allegro", []),
         ("clearance_m > -1", []),  # a shard that lacks a metric fails every comparison with it
-        ("lift_hard", []),
         ("robust >= 0.75 or robust_share < 0.75", []),
     ],
 )
@@ -64,7 +61,6 @@ def test_an_expression_chooses_what_it_says(text: str, rows: list[int]) -> None:
         ("hand < allegro", "a word"),
         ("epsilon > 1; import os", "cannot be read"),
         ("__import__('os').system('true')", "cannot be read"),
-        ("epsilon > 0x10", "cannot be read|left over|compared with"),
         ("(" * 200 + "valid" + ")" * 200, "nested"),
         ("not " * 200 + "valid", "nested"),
         ("valid and " * LONGEST, "characters long"),

@@ -37,9 +37,6 @@ def test_asset_json_beside_a_mesh_goes_with_it() -> None:
 
 def test_names_are_made_fit_for_the_service_and_stay_apart() -> None:
     assert set(names("x/my mug!.stl", "x/my_mug_.stl")) == {"my_mug_", "my_mug_-2"}
-
-
-def test_a_set_without_meshes_is_refused() -> None:
     with pytest.raises(InputError, match="no mesh"):
         object_set({"a.txt": b""})
 
@@ -49,18 +46,14 @@ def test_the_reference_objects_are_recognised(shared_data: Path) -> None:
     assert len(found) == 14 and list(found["025_mug"]) == ["clean.stl"]
 
 
-def test_a_link_out_of_the_folder_is_left_alone(tmp_path: Path) -> None:
+def test_a_link_out_of_the_folder_is_left_alone_and_too_large_a_set_refused(tmp_path: Path) -> None:
     (tmp_path / "secret.stl").write_bytes(b"secret")
     (tmp_path / "set").mkdir()
-    (tmp_path / "set" / "a.stl").write_bytes(b"a")
+    (tmp_path / "set" / "a.stl").write_bytes(b"x" * 100)
     (tmp_path / "set" / "b.stl").symlink_to(tmp_path / "secret.stl")
     assert list(read_set(tmp_path / "set", limit_bytes=100)) == ["a.stl"]
-
-
-def test_a_set_over_the_limit_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "a.stl").write_bytes(b"x" * 101)
     with pytest.raises(LimitError):
-        read_set(tmp_path, limit_bytes=100)
+        read_set(tmp_path / "set", limit_bytes=99)
 
 
 def test_a_machine_without_memory_damages_no_archive(monkeypatch: pytest.MonkeyPatch) -> None:

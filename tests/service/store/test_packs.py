@@ -79,14 +79,6 @@ def test_it_may_break_off_anywhere_and_the_next_one_goes_on(
         read_checked(store, manifest.key, manifest.sha256)
 
 
-def test_what_a_record_says_is_gone_stays_gone(store: Store) -> None:
-    messages = batches(3)
-    pack(store, messages, dead=[messages[1]])
-    assert len(list(take_apart(store))) == 2
-    assert there(store, messages) == [True, False, True]
-    assert not has_packs(store)
-
-
 def test_a_file_of_its_own_counts_before_one_in_a_pack(store: Store) -> None:
     (message,) = batches(1)
     manifest, data = made_of(message, worker="first")
