@@ -221,7 +221,7 @@ def read(path: Path, *, hand: str, obj: str, object_name: str = "") -> list[Impo
         object_name: the object's name in the file; optional with a single object.
 
     Raises:
-        InputError: pyarrow, file or object is missing, or the scenes are other than tables.
+        InputError: pyarrow, the file or the object is missing, or a scene is not a table.
     """
     files = [path] if path.is_file() else sorted((path / "grasps").glob("*.parquet"))
     columns: dict[str, list[Any]] = {}

@@ -59,13 +59,21 @@ class Settings(BaseSettings):
         {}, description='rights of proxy groups; the first match counts: {"lab": "vision:submit", "*": ":read"}'
     )
     metrics_need_key: bool = Field(True, description="whether /metrics requires a key once keys exist")
-    requests_per_minute: int = Field(1200, ge=0, description="requests of one key per minute; 0: no limit")
-    address_requests_per_minute: int = Field(
-        120, ge=0, description="requests of one address without a key per minute; 0: no limit"
+    requests_per_minute: int = Field(
+        1200, ge=0, description="maximum requests per minute with one API key; 0: no limit"
     )
-    concurrency: int = Field(64, ge=0, description="concurrent requests of one key or address; 0: no limit")
-    quota_grasps_in_flight: int = Field(0, ge=0, description="grasps in unfinished jobs of one key; 0: no limit")
-    quota_jobs_per_day: int = Field(0, ge=0, description="new jobs of one key per day, from midnight UTC; 0: no limit")
+    address_requests_per_minute: int = Field(
+        120, ge=0, description="maximum requests per minute from one IP address without an API key; 0: no limit"
+    )
+    concurrency: int = Field(
+        64, ge=0, description="maximum concurrent requests with one API key or from one IP address; 0: no limit"
+    )
+    quota_grasps_in_flight: int = Field(
+        0, ge=0, description="maximum number of grasps in unfinished jobs of one API key; 0: no limit"
+    )
+    quota_jobs_per_day: int = Field(
+        0, ge=0, description="maximum new jobs of one API key per day, from midnight UTC; 0: no limit"
+    )
     webhook_secret: SecretStr | None = Field(
         None,
         min_length=16,
@@ -79,7 +87,7 @@ class Settings(BaseSettings):
         None, ge=0, description="number of a worker on its machine: with device auto, worker k uses the k-th GPU"
     )
     prefilter: Literal["auto", "on", "off"] = Field(
-        "auto", description="whether MuJoCo Warp gives the clear verdicts; auto: on a GPU, if installed"
+        "auto", description="whether MuJoCo Warp decides clear cases of validation; auto: on a GPU, if installed"
     )
     threads: int = Field(0, ge=0, description="CPU threads of a worker; 0: one per core")
     processes: int = Field(
@@ -100,7 +108,7 @@ class Settings(BaseSettings):
     controller_name: str | None = Field(
         None,
         max_length=200,
-        description="name of a controller: restarted under the same name, it leads without a wait; unset: a new name",
+        description="name of a controller; after a restart under the same name it leads at once; unset: a new name",
     )
     task_attempts: int = Field(3, ge=1, le=20, description="attempts of a task before its job fails")
     task_s: float = Field(
@@ -117,7 +125,9 @@ class Settings(BaseSettings):
         64 * 2**20, gt=0, description="largest upload of a hand, object or network over HTTP [bytes]"
     )
     queue_window: int = Field(
-        1000, ge=1, description="tasks in the queue per priority, at least two per worker; the rest waits in the index"
+        1000,
+        ge=1,
+        description="maximum tasks in the queue per priority, at least two per worker; further tasks wait in the index",
     )
     shard_grace_s: float = Field(
         7 * 86400.0,

@@ -35,7 +35,7 @@ class Validated(View):
     valid: int = Field(
         0, description="valid grasps: within the geometric limits and held in validation; 0 without validation"
     )
-    candidates: int = Field(0, description="candidates planned for them, stored or not")
+    candidates: int = Field(0, description="candidates planned for these grasps, stored or not")
     validated: int = Field(
         0, description="candidates tested against the geometric limits and by a validator; 0 without validation"
     )
@@ -241,7 +241,7 @@ class Throughput(View):
 class EndView(View):
     """A job or a dataset that ended."""
 
-    seq: int = Field(description="sequence number, larger for later ends; `since` of the next request")
+    seq: int = Field(description="sequence number, larger for later ends; value of `since` in the next request")
     kind: Literal["job", "dataset"]
     subject: str = Field(description="id of the job, or name of the dataset")
     state: State = Field(description="succeeded, failed or cancelled")
@@ -259,7 +259,7 @@ class WebhookView(View):
     created: str
     owner: str = Field("", description="id of the key that created it")
     project: str = Field("", description="project whose jobs and datasets it reports")
-    seen: int = Field(0, description="ends up to this sequence number are processed")
+    seen: int = Field(0, description="sequence number of the last processed end")
 
 
 class TagView(View):
@@ -327,7 +327,7 @@ class DatasetView(Validated):
     tasks_done: int
     tasks_failed: int
     progress: float = Field(ge=0, le=1)
-    seconds: float = Field(description="total time of workers for it [s]")
+    seconds: float = Field(description="total worker time [s]")
     eta_s: float | None = Field(description="expected time until it ends, at the current number of running tasks [s]")
     shards: int
     size_bytes: int
@@ -370,7 +370,7 @@ class CellView(Validated):
     tasks_failed: int
     attempts_failed: int = Field(description="failed attempts, including those followed by a successful one")
     progress: float = Field(ge=0, le=1)
-    seconds: float = Field(description="total time of workers for it [s]")
+    seconds: float = Field(description="total worker time [s]")
     reason: str | None = Field(description="why it failed, or found fewer grasps than requested")
 
     def counted(self, options: JobOptions) -> int:

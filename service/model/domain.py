@@ -170,10 +170,11 @@ class JobOptions(Model):
     want: Annotated[
         Literal["valid", "candidates"], Option("basic"), Form("grasps", "Counted grasps", choices=_WANTS_IN_WORDS)
     ] = Field(
-        "valid", description="grasps that count. valid: valid ones (feasible ones without validation); candidates: all"
+        "valid",
+        description="kind of grasps that count. valid: valid ones (feasible ones without validation); candidates: all",
     )
     budget: Annotated[float, Option()] = Field(
-        4.0, ge=1, le=100, description="largest number of candidates for each valid grasp wanted"
+        4.0, ge=1, le=100, description="maximum number of candidates per requested valid grasp"
     )
     min_distance: Annotated[
         float, Option(), Form("grasps", "Least distance", "between two grasps of a batch; 0: no limit", cells=True)
@@ -191,7 +192,7 @@ class JobOptions(Model):
         Form("grasps", "Validation in MuJoCo", choices=_REFEREES_IN_WORDS),
     ] = Field(
         "standard",
-        description="level of validation in MuJoCo. fast: MuJoCo Warp on a GPU gives the clear verdicts; none: "
+        description="level of validation in MuJoCo. fast: MuJoCo Warp on a GPU decides clear cases; none: "
         "grasps are feasible at best",
     )
     rechecks: Annotated[int, Option(places=JOB)] = Field(
@@ -259,7 +260,7 @@ class JobOptions(Model):
     target: Annotated[str, Option(places=JOB)] = Field(
         "",
         max_length=40,
-        description="accuracy wanted with fidelity `auto`, such as gsr>=0.6, dexgraspbench>=0.9 or pd_mm<=1; in a "
+        description="required accuracy for fidelity `auto`, such as gsr>=0.6, dexgraspbench>=0.9 or pd_mm<=1; in a "
         "scene lift>=0.9, lift_hard or robust. Submission selects the cheapest fidelity that meets it "
         "in the stored chart of such grasps",
     )
@@ -447,7 +448,7 @@ class Asset(Model):
     project: Project = Field("", description="project of that key; empty: the unnamed project")
     shared: bool = Field(False, description="whether all projects may use it")
     facts: dict[str, object] = Field(default_factory=dict, description="measurements of ingest")
-    self_test: bool = Field(False, description="for a hand: whether the check ends with grasps of simple objects")
+    self_test: bool = Field(False, description="for a hand: whether its check includes the self-test")
 
     # A newer graspd may have written further fields.
     model_config = ConfigDict(frozen=True, extra="ignore")

@@ -38,7 +38,7 @@ class Record(BaseModel):
 class Choice(Record):
     """How a chart resolved the fidelity `auto`."""
 
-    target: str = Field(description="accuracy wanted")
+    target: str = Field(description="required accuracy")
     chart: str = Field(description="key of the chart in the store")
     measured_on: Literal["hand and object", "hand", "all"] = Field(
         description="runs of the chart that count: those of the same hand and object, of the same hand, or all"
@@ -99,7 +99,7 @@ class JobEvent(Record):
     what: Literal["cancelled", "retried"]
     at: str
     retried: dict[str, int] = Field(default_factory=dict)
-    cause: str = Field("", description="event of the dataset that caused it: name, slash, number")
+    cause: str = Field("", description="dataset event that caused this job event, as NAME/NUMBER; empty: none")
 
 
 class AttemptRecord(Record):

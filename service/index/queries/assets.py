@@ -74,7 +74,7 @@ class Assets:
         return _asset_view(row)
 
     def sizes(self, kind: AssetKind, wanted: Collection[str], *, scope: ProjectScope = EVERYTHING) -> dict[str, int]:
-        """Return the bytes of the named hands or objects; unknown ones are omitted."""
+        """Return the sizes [bytes] of the named hands or objects; unknown names are omitted."""
         names = set(wanted)
         query = select(assets.c.name, assets.c.size_bytes).where(assets.c.kind == kind.value, *seen_assets(scope))
         query = query.order_by(assets.c.created)
