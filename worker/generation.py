@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from typing import Any, Final
+from typing import Any, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -131,8 +131,6 @@ def validated_grasps(
     """Plan one batch of a job: `count` valid grasps, or as many as the budget finds.
 
     Args:
-        hand: the hand.
-        obj: the object.
         request: method, fidelity, seed, friction, level, budget; whether valid grasps or `count` of any kind.
         count: grasps wanted; feasible ones where nothing is validated.
         batch: number of the batch within its job.
@@ -148,7 +146,7 @@ def validated_grasps(
         TaskCancelled: `run.cancelled()` returned True; with `partial`, before anything was validated.
     """
     require_graspable(hand, obj)
-    with Scoring.begun(hand, obj, request, scenes=scenes, pieces=pieces, run=run) as scoring:
+    with Scoring(hand, obj, request, scenes=scenes, pieces=pieces, run=run) as scoring:
         work = Batch(scoring, batch, count, run)
         try:
             while work.needed is not None:
@@ -190,7 +188,7 @@ def scored(
         TaskCancelled: `run.cancelled()` returned True.
     """
     request = request.model_copy(update={"want": "candidates"})
-    with Scoring.begun(hand, obj, request, scenes=scenes, pieces=pieces, run=run) as scoring:
+    with Scoring(hand, obj, request, scenes=scenes, pieces=pieces, run=run) as scoring:
         work = Batch(scoring, 0, len(grasps), run)
         work.add(scoring.scored(grasps.moved(np.negative(obj.centre)), run))
         return work.finish()
@@ -200,19 +198,7 @@ class Scoring:
     """Verdicts and metrics of a job's grasps; those of one grasp do not depend on the others."""
 
     def __init__(
-        self, hand: HandModel, obj: ObjectModel, request: JobOptions, scenes: Scenes | None, run: ExecutionContext
-    ) -> None:
-        self.hand, self.obj, self.request, self.run = hand, obj.centred, request, run
-        self.centre = obj.centre
-        self.scenes = None if scenes is None else scenes.centred(obj)
-        self.pieces: Future[ConvexPieces] | None = None
-        self.beside: ThreadPoolExecutor
-        """Thread for background work."""
-
-    @classmethod
-    @contextmanager
-    def begun(
-        cls,
+        self,
         hand: HandModel,
         obj: ObjectModel,
         request: JobOptions,
@@ -220,12 +206,19 @@ class Scoring:
         scenes: Scenes | None,
         pieces: Callable[[ObjectModel], ConvexPieces],
         run: ExecutionContext,
-    ) -> Iterator[Scoring]:
-        """Create the scoring and start the decomposition of the object, where grasps are validated."""
-        made = cls(hand, obj, request, scenes, run)
-        with ThreadPoolExecutor(1, thread_name_prefix="beside") as made.beside:
-            made.pieces = made.beside.submit(pieces, made.obj) if request.validation != "none" else None
-            yield made
+    ) -> None:
+        """Start the decomposition of the object, where grasps are validated."""
+        self.hand, self.obj, self.request, self.run = hand, obj.centred, request, run
+        self.centre = obj.centre
+        self.scenes = None if scenes is None else scenes.centred(obj)
+        self.beside = ThreadPoolExecutor(1, thread_name_prefix="beside")
+        self.pieces = self.beside.submit(pieces, self.obj) if request.validation != "none" else None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.beside.shutdown()
 
     def goes_on(self) -> None:
         """Ignore cancellation from here on."""
@@ -284,10 +277,9 @@ class Scoring:
         planned = planned.take(finite)
         size, every = len(planned), self.request.want == "candidates"
         in_scene: dict[str, NDArray[np.bool_]] = {}
-        if self.scenes is None:
-            columns = self._validated(planned, run, seconds, known, prefilter)
-        else:
-            planned, columns = self._validated_in_scenes(planned, self.scenes, run, seconds, known)
+        with _timed(seconds, "validation"):
+            planned, columns = self._validated(planned, run.part(*PARTS[:2]), known, prefilter)
+        if self.scenes is not None:
             fates[finite[columns["quality/success"] < 0]] = "no_place"
             for name, those in outcomes_in_scenes(columns).items():
                 in_scene[name] = np.zeros(len(fates), bool)
@@ -295,17 +287,16 @@ class Scoring:
         why = _why(columns, size)
         rows = np.arange(size) if every or not columns else np.flatnonzero(columns["quality/success"] == 1)
         grasps = planned.take(rows)
-        columns = {path: array[rows] for path, array in columns.items()} | self._measured(grasps, run, seconds)
+        columns = {path: array[rows] for path, array in columns.items()}
+        with _timed(seconds, "quality"):
+            friction = self.request.friction
+            columns |= measure(self.hand, self.obj, grasps, friction=friction, run=run.part(*PARTS[1:]))
         columns["quality/feasible"] = passes(columns)
         feasible = columns["quality/feasible"] == 1
         held = columns.get("quality/success", np.zeros(len(rows), np.int8)) == 1
         columns["quality/valid"] = (feasible & held).astype(np.uint8)
-        if self.request.models:
-            columns |= self._in_models(grasps, held if every else feasible & held, run, seconds)
-        if self.request.measures_payload:
-            columns["quality/payload_kg"] = self._payloads(grasps, feasible & held, run, seconds)
-        if self.request.shake:
-            columns["quality/shake_margin"] = self._shaken(grasps, feasible & held, run, seconds)
+        with _timed(seconds, "validation"):
+            columns |= self._further_tests(grasps, held if every else feasible & held, feasible & held, run.quiet())
         if not every:
             wanted = feasible if self.pieces is None else feasible & held
             lost = np.setdiff1d(np.arange(size), rows)
@@ -324,75 +315,62 @@ class Scoring:
             rows = rows[wanted]
         return Round(grasps, columns, finite[rows], fates, in_scene, seconds)
 
-    def _validated_in_scenes(
-        self, grasps: GraspSet, scenes: Scenes, run: ExecutionContext, seconds: dict[str, float], known: Known | None
-    ) -> tuple[GraspSet, Arrays]:
-        """Return the grasps with their trajectories, and their verdicts."""
-        began = time.perf_counter()
-        found = scene_verdicts(
-            self.hand,
-            self.obj,
-            grasps,
-            scenes,
-            level=lift_level(self.request.validation),
-            pieces=None if self.pieces is None else self.pieces.result(),
-            known=known,
-            run=run.part(*PARTS[:2]),
-        )
-        seconds["validation"] += time.perf_counter() - began
-        return found
-
     def _validated(
-        self,
-        grasps: GraspSet,
-        run: ExecutionContext,
-        seconds: dict[str, float],
-        known: Known | None,
-        prefilter: PrefilterVerdicts | None,
-    ) -> Arrays:
-        if self.pieces is None:
-            return {}
+        self, grasps: GraspSet, run: ExecutionContext, known: Known | None, prefilter: PrefilterVerdicts | None
+    ) -> tuple[GraspSet, Arrays]:
+        """Return the grasps, in scenes with their trajectories, and their verdicts."""
+        pieces = None if self.pieces is None else self.pieces.result()
+        if self.scenes is not None:
+            level = lift_level(self._level)
+            return scene_verdicts(
+                self.hand, self.obj, grasps, self.scenes, level=level, pieces=pieces, known=known, run=run
+            )
+        if pieces is None:
+            return grasps, {}
         verdicts = validate(
-            self.hand,
-            self.obj,
-            grasps,
-            level=self._level,
-            pieces=self.pieces.result(),
-            known=known,
-            prefilter=prefilter,
-            run=run.part(*PARTS[:2]),
+            self.hand, self.obj, grasps, level=self._level, pieces=pieces, known=known, prefilter=prefilter, run=run
         )
-        seconds["validation"] += verdicts.seconds
-        return {
+        columns: Arrays = {
             "quality/success": verdicts.success,
             "quality/verdict_outcome": verdicts.outcome.reshape(-1, len(DIRECTIONS)),
             "quality/verdict_margin": verdicts.margin,
-            **(
-                {"quality/validated_by": verdicts.validated_by} if first_terms(self.hand, self._level, self.run) else {}
-            ),
         }
+        if first_terms(self.hand, self._level, self.run):
+            columns["quality/validated_by"] = verdicts.validated_by
+        return grasps, columns
 
-    def _in_models(
-        self, grasps: GraspSet, held: NDArray[np.bool_], run: ExecutionContext, seconds: dict[str, float]
+    def _further_tests(
+        self, grasps: GraspSet, in_models: NDArray[np.bool_], valid: NDArray[np.bool_], run: ExecutionContext
     ) -> Arrays:
-        """Return shares of models in which held grasps hold (exact for candidates) and first failed axes."""
+        """Return the wanted columns of further tests: of grasps `in_models` (N,) robustness (exact for candidates),
+        of `valid` ones (N,) payload and shake."""
+        request, columns = self.request, dict[str, NDArray[Any]]()
+        if not (request.models or request.measures_payload or request.shake):
+            return columns
         assert self.pieces is not None
-        wish = self.request
-        found = robust(
-            self.hand,
-            self.obj,
-            grasps,
-            held=held,
-            placed=self.placed(grasps),
-            level=lift_level(wish.validation),
-            models=wish.models,
-            seed=wish.seed,
-            pieces=self.pieces.result(),
-            wanted=wish.robust if wish.want == "valid" else 0,
-            run=run.quiet(),
-        )
-        seconds["validation"] += found.seconds
-        return found.columns
+        common: dict[str, Any] = {"pieces": self.pieces.result(), "run": run}
+        placed = self.placed(grasps)
+        if request.models:
+            columns |= robust(
+                self.hand,
+                self.obj,
+                grasps,
+                held=in_models,
+                placed=placed,
+                level=lift_level(request.validation),
+                models=request.models,
+                seed=request.seed,
+                wanted=request.robust if request.want == "valid" else 0,
+                **common,
+            ).columns
+        if request.measures_payload:
+            found = payloads(self.hand, self.obj, grasps, placed=placed, held=valid, **common)
+            # A valid grasp lifted at least the object's own mass.
+            columns["quality/payload_kg"] = np.where(valid & np.isnan(found), self.obj.mass, found)
+        if request.shake:
+            assert placed is not None, "shake goes with a scene"
+            columns["quality/shake_margin"] = shake_margins(self.hand, self.obj, grasps, placed, held=valid, **common)
+        return columns
 
     def placed(self, grasps: GraspSet) -> PlacedGrasps | None:
         """Return the grasps with their scenes; None: the object is free."""
@@ -401,42 +379,13 @@ class Scoring:
         assert grasps.scene is not None
         return self.scenes.placed(grasps.scene)
 
-    def _payloads(
-        self, grasps: GraspSet, held: NDArray[np.bool_], run: ExecutionContext, seconds: dict[str, float]
-    ) -> NDArray[np.float64]:
-        """Return payloads (N,) of `held` grasps [kg], at least the object's own mass, which they lifted."""
-        assert self.pieces is not None
-        began = time.perf_counter()
-        found = payloads(
-            self.hand,
-            self.obj,
-            grasps,
-            pieces=self.pieces.result(),
-            placed=self.placed(grasps),
-            held=held,
-            run=run.quiet(),
-        )
-        seconds["validation"] += time.perf_counter() - began
-        return np.where(held & np.isnan(found), self.obj.mass, found)
 
-    def _shaken(
-        self, grasps: GraspSet, held: NDArray[np.bool_], run: ExecutionContext, seconds: dict[str, float]
-    ) -> NDArray[np.float64]:
-        """Return shake margins (N,) of `held` grasps, shaken after the lift."""
-        assert self.pieces is not None
-        began, placed = time.perf_counter(), self.placed(grasps)
-        assert placed is not None, "shake goes with a scene"
-        found = shake_margins(
-            self.hand, self.obj, grasps, placed, pieces=self.pieces.result(), held=held, run=run.quiet()
-        )
-        seconds["validation"] += time.perf_counter() - began
-        return found
-
-    def _measured(self, grasps: GraspSet, run: ExecutionContext, seconds: dict[str, float]) -> Arrays:
-        began = time.perf_counter()
-        columns = measure(self.hand, self.obj, grasps, friction=self.request.friction, run=run.part(*PARTS[1:]))
-        seconds["quality"] += time.perf_counter() - began
-        return dict(columns)
+@contextmanager
+def _timed(seconds: dict[str, float], name: str) -> Iterator[None]:
+    """Add the wall time of a block to `seconds[name]`."""
+    began = time.perf_counter()
+    yield
+    seconds[name] += time.perf_counter() - began
 
 
 @dataclass(frozen=True)
@@ -614,8 +563,7 @@ class Batch:
         columns = joined_columns([part.columns for part in rounds])
         fates = np.concatenate([part.fates for part in rounds])
         # The last round may find more grasps than were missing. Only candidates up to the last selected grasp count,
-        # else
-        # the share of valid ones would look worse than it is.
+        # else the share of valid ones would look worse than it is.
         places = np.flatnonzero(fates == "kept")
         candidates = int(places[count - 1]) + 1 if len(places) >= count else len(fates)
         absent = {"blocked"} if scoring.scenes is None else set()
@@ -671,27 +619,24 @@ class Batch:
                 scoring.hand, scoring.obj, grasps.grasp, pieces=scoring.pieces.result(), run=scoring.run
             )
         }
-        began = time.perf_counter()
-        if count := self.request.rechecks_of(self.number):
-            rechecked, recheck = np.flatnonzero(valid)[:count], np.full(len(grasps), -1, np.int8)
-            if len(rechecked):
-                known = (
-                    self._rechecks.result() if self._rechecks is not None else self._rechecked(grasps.take(rechecked))
+        with _timed(self.seconds, "validation"):
+            if count := self.request.rechecks_of(self.number):
+                rechecked, recheck = np.flatnonzero(valid)[:count], np.full(len(grasps), -1, np.int8)
+                if len(rechecked):
+                    known = self._rechecks.result() if self._rechecks else self._rechecked(grasps.take(rechecked))
+                    recheck[rechecked] = known[: len(rechecked)]
+                columns["quality/recheck"] = recheck
+            if repeats := self.request.robustness:
+                columns["quality/robustness"] = robustness(
+                    scoring.hand,
+                    scoring.obj,
+                    grasps,
+                    held=valid,
+                    repeats=repeats,
+                    seed=self.request.seed,
+                    pieces=scoring.pieces.result(),
+                    run=scoring.run.quiet(),
                 )
-                recheck[rechecked] = known[: len(rechecked)]
-            columns["quality/recheck"] = recheck
-        if repeats := self.request.robustness:
-            columns["quality/robustness"] = robustness(
-                scoring.hand,
-                scoring.obj,
-                grasps,
-                held=valid,
-                repeats=repeats,
-                seed=self.request.seed,
-                pieces=scoring.pieces.result(),
-                run=scoring.run.quiet(),
-            )
-        self.seconds["validation"] += time.perf_counter() - began
         return columns
 
     def _begin_rechecks(self, first: Round) -> None:

@@ -138,7 +138,7 @@ class _Job:
         scenes = scenes_together(several) if several else self.scenes[0]
         going, waiting = dict[int, Batch](), deque[Batch]()
         with (
-            Scoring.begun(self.hand, self.obj, self.request, scenes=scenes, pieces=self.pieces, run=run) as scoring,
+            Scoring(self.hand, self.obj, self.request, scenes=scenes, pieces=self.pieces, run=run) as scoring,
             ThreadPoolExecutor(1, thread_name_prefix="device") as device,
         ):
             fresh = (

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import threading
 from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 import warp as wp
-from cachetools import LRUCache
 from numpy.typing import NDArray
 
 from graspd.service.model.integers import distinct_values
 from graspd.service.model.transforms import Floats
 from graspd.worker.grasps import Posture
 from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.memory_cache import cached_by_content
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.quality.contact import LINK_CONTACT_M, contact_links, finger_of_body
 from graspd.worker.quality.probe import Probe, probe_of
@@ -147,14 +146,7 @@ def _points(probe: Probe) -> Any:
     return out
 
 
-_posings: LRUCache[tuple[str, str, int, str], PostureData] = LRUCache(8)
-_lock = threading.Lock()
-
-
-def posing_of(hand: HandModel, obj: ObjectModel, *, points: int, device: str = "cpu") -> PostureData:
+@cached_by_content(8)
+def posing_of(hand: HandModel, obj: ObjectModel, *, points: int, device: str) -> PostureData:
     """Return the pair on a device with `points` hand points, cached in memory."""
-    key = (hand.content, obj.content, points, device)
-    with _lock:
-        if key not in _posings:
-            _posings[key] = PostureData.of(probe_of(hand, obj, hand_points=points, object_points=64, device=device))
-        return _posings[key]
+    return PostureData.of(probe_of(hand, obj, hand_points=points, object_points=64, device=device))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -11,7 +10,6 @@ from typing import Any, Final
 
 import numpy as np
 import warp as wp
-from cachetools import LRUCache
 from numpy.typing import NDArray
 
 from graspd.service.model.transforms import Floats, compose, quat_to_matrix
@@ -19,8 +17,10 @@ from graspd.worker.engines.backend import binary_name
 from graspd.worker.grasps import Posture
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel, SurfacePoints
+from graspd.worker.hands.primitives import triangle_areas
 from graspd.worker.hands.surface import sample_surface
 from graspd.worker.objects.disk_cache import arrays_kept_or_made
+from graspd.worker.objects.memory_cache import cached_by_content
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.simulation.device import DeviceHand, PosedBodies, to_xyzw
 from graspd.worker.simulation.kernels import distance as kernels
@@ -138,9 +138,7 @@ class Probe:
     @cached_property
     def sample_spacing(self) -> float:
         """Distance between neighbouring object points if they were on a square grid [m]."""
-        corners = self.obj.vertices[self.obj.faces]
-        cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        return float(np.sqrt(0.5 * np.linalg.norm(cross, axis=1).sum() / len(self.samples)))
+        return float(np.sqrt(triangle_areas(self.obj.vertices, self.obj.faces).sum() / len(self.samples)))
 
     def signed_distance(self, points: Floats, *, reach: float = REACH_M) -> tuple[Floats, Floats, Floats]:
         """Return signed distance (P,), closest point (P, 3) and outward normal (P, 3) of points (P, 3).
@@ -283,16 +281,7 @@ def _is_grid(kept: Mapping[str, NDArray[Any]], counts: Sequence[int]) -> bool:
     return set(kept) == {"coarse"} and kept["coarse"].shape == tuple(counts) and kept["coarse"].dtype == np.float32
 
 
-_probes: LRUCache[tuple[str, str, int, int, str], Probe] = LRUCache(8)
-_lock = threading.Lock()
-
-
+@cached_by_content(8)
 def probe_of(hand: HandModel, obj: ObjectModel, *, hand_points: int, object_points: int, device: str = "cpu") -> Probe:
     """Return the probe of a pair, cached in memory."""
-    key = (hand.content, obj.content, hand_points, object_points, device)
-    with _lock:
-        probe = _probes.get(key)
-        if probe is None:
-            probe = Probe(hand, obj, hand_points=hand_points, object_points=object_points, device=device)
-            _probes[key] = probe
-        return probe
+    return Probe(hand, obj, hand_points=hand_points, object_points=object_points, device=device)

@@ -49,7 +49,7 @@ from graspd.worker.quality.diversity import approach_cells
 from graspd.worker.quality.overlap import Overlap, penetration_depth
 from graspd.worker.quality.probe import HAND_POINTS, OBJECT_POINTS, REACH_M, Distances, Probe, probe_of
 from graspd.worker.quality.volume import SharedVolume
-from graspd.worker.quality.wrench_space import Norm, measure_spaces, wrenches
+from graspd.worker.quality.wrench_space import measure_spaces, wrenches
 
 Columns = dict[str, NDArray[np.generic]]
 
@@ -65,7 +65,7 @@ class _Pair:
 
     def __init__(self, terms: _Terms) -> None:
         hand, obj = terms.hand, terms.obj
-        self.obj, self.friction, self.norm = obj, terms.friction, terms.norm
+        self.obj, self.friction = obj, terms.friction
         self.thresholds = np.array(terms.thresholds)
         told = int(np.argmin(np.abs(self.thresholds - INDEX_THRESHOLD_M)))
         self.with_volume = (np.arange(len(self.thresholds)) == told) | terms.every_volume
@@ -92,9 +92,7 @@ class _Pair:
             radius=self.obj.radius,
         )
         wanted = np.broadcast_to(self.with_volume, count.shape)
-        epsilon, volume = measure_spaces(
-            edges.reshape(-1, *edges.shape[2:]), count.ravel(), wanted.ravel(), norm=self.norm
-        )
+        epsilon, volume = measure_spaces(edges.reshape(-1, *edges.shape[2:]), count.ravel(), wanted.ravel())
         return epsilon.reshape(count.shape), volume.reshape(count.shape)
 
 
@@ -111,19 +109,14 @@ def measure(
     *,
     friction: float = DEFAULT_FRICTION,
     thresholds_m: Sequence[float] = DEFAULT_THRESHOLDS_M,
-    norm: Norm = "l1",
     every_volume: bool = False,
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> dict[str, NDArray[np.generic]]:
     """Compute the quality columns of a base shard for N grasps, at the posture of contact.
 
     Args:
-        hand: the hand.
-        obj: the object.
-        grasps: N grasps.
         friction: Coulomb coefficient of the wrench space.
         thresholds_m: T contact thresholds, at most `REACH_M` [m].
-        norm: l1 (GraspIt!'s) or linf wrench space.
         every_volume: compute the volume at all thresholds; else only at the index's, nan at the others: a volume takes
             ten times as long as an epsilon.
         run: receives the number of finished grasps; polled for cancellation between chunks.
@@ -140,7 +133,7 @@ def measure(
         raise InputError(
             f"contact thresholds must be above 0 and at most {REACH_M * 1e3:g} mm; got {list(thresholds_m)}"
         )
-    terms = _Terms(hand, obj, friction, tuple(thresholds.tolist()), norm, every_volume)
+    terms = _Terms(hand, obj, friction, tuple(thresholds.tolist()), every_volume)
     chunks = [slice(i, min(i + CHUNK, len(grasps))) for i in range(0, len(grasps), CHUNK)]
     postures = [Posture(grasps.grasp.hand_pose[chunk], grasps.grasp.joint_positions[chunk]) for chunk in chunks]
     parts = _measured(terms, postures, Count(len(grasps), run, "quality"), run)
@@ -158,7 +151,6 @@ class _Terms:
     obj: ObjectModel
     friction: float
     thresholds: tuple[float, ...]
-    norm: Norm
     every_volume: bool
 
     @cached_property

@@ -81,9 +81,7 @@ def _each_face(obj: ObjectModel, seed: int) -> dict[str, Floats]:
     poses = []
     for number, face in enumerate(chosen):
         turn = np.random.default_rng([seed, number]).uniform(0, 2 * np.pi)
-        pose = lay_flat(faces, face, np.array([0.0, 0, 0, 1, 0, 0, 0]))
-        about = np.concatenate([np.zeros(3), quat_from_axis_angle(np.array([0.0, 0, 1]), np.asarray(turn))])
-        pose = compose(about, pose)
+        pose = turned(lay_flat(faces, face, np.array([0.0, 0, 0, 1, 0, 0, 0])), turn)
         pose[:2] -= (pose[:3] + quat_rotate(pose[3:], obj.centre_of_mass))[:2]
         poses.append(pose)
     return {
@@ -91,6 +89,12 @@ def _each_face(obj: ObjectModel, seed: int) -> dict[str, Floats]:
         "scene/rest_probability": rest_probability(obj, chosen),
         "scene/drop_seconds": np.zeros(len(poses)),
     }
+
+
+def turned(pose: Floats, angle: float) -> Floats:
+    """Return the pose turned about the vertical through the origin."""
+    about = np.concatenate([np.zeros(3), quat_from_axis_angle(np.array([0.0, 0, 1]), np.asarray(angle))])
+    return compose(about, pose)
 
 
 def inside(obj: ObjectModel, pose: Floats, size: tuple[float, float], rng: np.random.Generator) -> Floats:

@@ -9,7 +9,6 @@ from typing import Any, Final
 
 import mujoco
 import numpy as np
-from cachetools import LRUCache
 from numpy.typing import NDArray
 
 from graspd.service.model.errors import MeshError, SceneError
@@ -17,6 +16,7 @@ from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.model.transforms import Floats
 from graspd.worker.hands.primitives import convex_edges
 from graspd.worker.objects.convex import union_volume
+from graspd.worker.objects.memory_cache import cached_by_content
 from graspd.worker.objects.mesh_geometry import to_centre, to_file
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.scenes.kinds import SUNK, check_free, inside, rest_poses, room_in, supports_of
@@ -26,8 +26,6 @@ from graspd.worker.validation.decomposition import decompose
 
 #: Most convex pieces of a neighbour: no hand reaches into a neighbour's hollow, so hollows may be filled.
 MOST_PIECES: Final = 8
-
-_made: LRUCache[str, Neighbour] = LRUCache(32)
 
 
 def neighbour_of(obj: ObjectModel) -> Neighbour:
@@ -40,17 +38,18 @@ def neighbour_of(obj: ObjectModel) -> Neighbour:
         middle, by = neighbour_of(obj.centred), np.array([*obj.centre, 1.0, 0, 0, 0])
         pieces = tuple(piece + by[:3] for piece in middle.pieces)
         return Neighbour(obj, pieces, tuple(solid.moved(by) for solid in middle.solids), middle.error_m, middle)
-    if (found := _made.get(obj.content)) is not None:
-        return replace(found, obj=obj)  # the same mesh may have another name
+    return replace(_neighbour(obj), obj=obj)  # the same mesh may have another name
+
+
+@cached_by_content(32)
+def _neighbour(obj: ObjectModel) -> Neighbour:
     try:
         pieces = decompose(obj).vertices
     except MeshError:
         pieces = (obj.hull_vertices,)  # an oversized shape is safe for an obstacle
     pieces = joined_pieces(pieces)
     solids = [outer_solid(piece) for piece in pieces]
-    made = Neighbour(obj, pieces, tuple(solid for solid, _ in solids), max(error for _, error in solids))
-    _made[obj.content] = made
-    return made
+    return Neighbour(obj, pieces, tuple(solid for solid, _ in solids), max(error for _, error in solids))
 
 
 def joined_pieces(pieces: Sequence[Floats], most: int = MOST_PIECES) -> tuple[Floats, ...]:
@@ -134,7 +133,11 @@ def _scenes_of(
         stand = np.asarray(given, float)
         poses["scene/neighbour_pose"] = np.tile(stand, (len(poses["scene/object_pose"]), 1, 1))
     elif spec.faces == "drawn" and room_in(spec) is None:
-        poses = _dropped(obj, others, supports, count=count, seed=seed)
+        try:
+            poses = drop_together(obj, others, count=count, seed=seed)
+        except MeshError:
+            # Too many never come to rest apart.
+            poses = _laid(SceneSpec(kind="table"), obj, others, supports, count=count, seed=seed)
         check_free(obj, poses["scene/object_pose"], supports)
     else:
         poses = _laid(spec, obj, others, supports, count=count, seed=seed)
@@ -142,18 +145,9 @@ def _scenes_of(
     for number, other in enumerate(others):
         check_free(other, poses["scene/neighbour_pose"][:, number], supports)
     if given:
-        _check_apart([neighbour_of(obj), *beside], _all_poses(poses))
+        whole = np.concatenate([poses["scene/object_pose"][:, None], poses["scene/neighbour_pose"]], axis=1)
+        _check_apart([neighbour_of(obj), *beside], whole)
     return Scenes(supports, poses["scene/object_pose"], beside, poses["scene/neighbour_pose"]), poses
-
-
-def _dropped(
-    obj: ObjectModel, others: Sequence[ObjectModel], supports: Sequence[Obstacle], *, count: int, seed: int
-) -> dict[str, Floats]:
-    """Drop objects together; where too many never come to rest apart, lay them beside each other."""
-    try:
-        return drop_together(obj, others, count=count, seed=seed)
-    except MeshError:
-        return _laid(SceneSpec(kind="table"), obj, others, supports, count=count, seed=seed)
 
 
 def _laid(
@@ -178,15 +172,9 @@ def _laid(
     return {**poses, "scene/object_pose": found, "scene/neighbour_pose": beside}
 
 
-def _all_poses(poses: dict[str, Floats]) -> Floats:
-    """Return the poses (S, 1 + M, 7) of the object and its neighbours."""
-    return np.concatenate([poses["scene/object_pose"][:, None], poses["scene/neighbour_pose"]], axis=1)
-
-
 def _check_apart(things: Sequence[Neighbour], poses: Floats) -> None:
     """Check that no two objects penetrate each other more than rounded poses explain."""
-    gaps = gaps_between(things, poses)
-    for (a, b), gap in gaps.items():
+    for (a, b), gap in gaps_between(things, poses).items():
         if -gap.min() > SUNK:
             names = things[a].obj.name, things[b].obj.name
             raise SceneError(

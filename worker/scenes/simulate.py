@@ -8,7 +8,6 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any, Final
 
 import mujoco
@@ -21,6 +20,7 @@ from graspd.service.model.transforms import Floats, quat_rotate
 from graspd.worker.engines.mujoco_warnings import void
 from graspd.worker.grasps import moved
 from graspd.worker.objects.disk_cache import arrays_kept_or_made
+from graspd.worker.objects.memory_cache import cached_by_content
 from graspd.worker.objects.mesh_geometry import to_file
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.scenes import rest as resting
@@ -43,21 +43,8 @@ MAX_ATTEMPTS: Final = 50
 #: Drops behind `scene/rest_probability`; a share of 64 is known to +-6 % (one standard deviation at one half).
 REFERENCE_DROPS: Final = 64
 _REFERENCE_SEED: Final = 2**31
-
-# Friction: sliding 0.8, and enough torsional and rolling friction (lengths, m) that a can or a ball stops on a cloth.
-_SCENE = """
-<mujoco>
-  <option timestep="{timestep}" integrator="implicitfast" cone="elliptic" gravity="0 0 -9.81"/>
-  <asset><mesh name="hull" inertia="shell"/></asset>
-  <worldbody>
-    <geom name="table" type="plane" size="5 5 0.1" friction="0.8 0.005 0.002" condim="6" solref="0.006 1"/>
-    <body name="object">
-      <freejoint/>
-      <geom type="mesh" mesh="hull" friction="0.8 0.005 0.002" condim="6" solref="0.006 1"/>
-    </body>
-  </worldbody>
-</mujoco>
-"""
+#: Friction: sliding 0.8, and enough torsional and rolling friction (lengths, m) that a can or a ball stops on a cloth.
+_CONTACT: Final[dict[str, Any]] = {"friction": [0.8, 0.005, 0.002], "condim": 6, "solref": [0.006, 1]}
 
 
 @dataclass(frozen=True)
@@ -126,7 +113,7 @@ def steadied(
     Where it may roll there, draw one of the faces of the reference drops on which it does not, with their frequency. An
     object that is round on all of them stays as it lies.
     """
-    if not faces.rolls(face) or not (steady := _steady_faces(_ByContent(obj))):
+    if not faces.rolls(face) or not (steady := _steady_faces(obj)):
         return face, pose
     chosen = int(rng.choice(steady))
     return chosen, lay_flat(faces, chosen, pose)
@@ -142,27 +129,14 @@ def reference_share(obj: ObjectModel, faces: Sequence[int]) -> Floats:
     if not faces:
         return np.zeros(0)
     obj = obj.centred
-    known, reference = resting_faces(obj), np.array(_reference_faces(_ByContent(obj)))
+    known, reference = resting_faces(obj), np.array(_reference_faces(obj))
     return np.array([same_face(known, face, reference).sum() for face in faces]) / REFERENCE_DROPS
 
 
-class _ByContent:
-    """An object as a cache key."""
-
-    def __init__(self, obj: ObjectModel) -> None:
-        self.obj = obj
-
-    def __hash__(self) -> int:
-        return hash(self.obj.content)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _ByContent) and self.obj.content == other.obj.content
-
-
-@lru_cache(maxsize=64)
-def _reference_faces(of: _ByContent) -> tuple[int, ...]:
+@cached_by_content(64)
+def _reference_faces(obj: ObjectModel) -> tuple[int, ...]:
     """Return the faces that the reference drops rest on: two seconds of computation, cached on disk."""
-    obj, code = of.obj, (sys.modules[__name__], resting)
+    code = (sys.modules[__name__], resting)
 
     def drops() -> dict[str, NDArray[Any]]:
         table = _build(obj)
@@ -178,26 +152,42 @@ def _reference_faces(of: _ByContent) -> tuple[int, ...]:
     return tuple(kept["face"].tolist())
 
 
-@lru_cache(maxsize=64)
-def _steady_faces(of: _ByContent) -> tuple[int, ...]:
+@cached_by_content(64)
+def _steady_faces(obj: ObjectModel) -> tuple[int, ...]:
     """Return those of the reference faces on which the object does not roll."""
-    faces = resting_faces(of.obj)
-    return tuple(face for face in _reference_faces(of) if not faces.rolls(face))
+    faces = resting_faces(obj)
+    return tuple(face for face in _reference_faces(obj) if not faces.rolls(face))
+
+
+def spec_above_table(objects: Sequence[ObjectModel]) -> Any:
+    """Return the specification of free objects, as convex hulls, above a table."""
+    spec = mujoco.MjSpec()
+    spec.option.timestep = TIMESTEP_S
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[5, 5, 0.1], **_CONTACT)
+    for number, obj in enumerate(objects):
+        body = spec.worldbody.add_body(name=str(number))
+        body.add_freejoint()
+        add_hull(spec, body, str(number), obj.hull_vertices, obj.hull_faces, **_CONTACT)
+        mass = DENSITY * obj.volume
+        body.explicitinertial = True
+        body.mass, body.ipos = mass, obj.centre_of_mass
+        body.fullinertia = (mass * obj.inertia)[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+    return spec
+
+
+def add_hull(spec: Any, body: Any, name: str, vertices: Floats, faces: NDArray[Any], **options: Any) -> None:
+    """Add a convex hull to a body of a MuJoCo specification, with options of the geom."""
+    mesh = spec.add_mesh(name=name, inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)
+    mesh.uservert = np.asarray(vertices, np.float32).ravel()
+    mesh.userface = np.asarray(faces, np.int32).ravel()
+    body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, **options)
 
 
 def _build(obj: ObjectModel) -> _Table:
-    spec = mujoco.MjSpec.from_string(_SCENE.format(timestep=TIMESTEP_S))
-    mesh = spec.mesh("hull")
-    mesh.uservert = np.asarray(obj.hull_vertices, np.float32).ravel()
-    mesh.userface = np.asarray(obj.hull_faces, np.int32).ravel()
-    body = spec.body("object")
-    mass = DENSITY * obj.volume
-    body.explicitinertial = True
-    body.mass, body.ipos = mass, obj.centre_of_mass
-    inertia = mass * obj.inertia
-    body.fullinertia = [inertia[0, 0], inertia[1, 1], inertia[2, 2], inertia[0, 1], inertia[0, 2], inertia[1, 2]]
     try:
-        model = spec.compile()
+        model = spec_above_table([obj]).compile()
     except ValueError as error:
         reason = str(error).splitlines()[0]
         raise MeshError(f"{obj.name!r} cannot be dropped: {reason}; check that its mesh has volume") from None

@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 import time
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Final, Literal, get_args
 
 import numpy as np
@@ -67,7 +66,6 @@ def validate_lifts(
     level: LiftLevel = "lift",
     hard: bool = False,
     pieces: ConvexPieces | None = None,
-    cache: Path | None = None,
     known: KnownLifts | None = None,
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> LiftVerdicts:
@@ -81,7 +79,6 @@ def validate_lifts(
         level: dexgraspbench or lift.
         hard: sliding friction halved, torsional friction a tenth, of supports too.
         pieces: convex pieces of the object; by default its CoACD pieces.
-        cache: folder of the pieces.
         known: finished lifts of this hand, object and level, which are reused; new ones are added.
         run: receives the number of finished grasps; polled for cancellation between grasps.
 
@@ -92,7 +89,7 @@ def validate_lifts(
     """
     require_ways(grasps, placed, level)
     began = time.perf_counter()
-    pieces = pieces or decompose(obj, cache=cache)
+    pieces = pieces or decompose(obj)
     physics = MujocoOptions().hardened() if hard else MujocoOptions()
     scene = scene_of(hand, obj, pieces, physics, placed.supports, placed.neighbours)
     done, lock = 0, threading.Lock()

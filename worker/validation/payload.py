@@ -358,7 +358,7 @@ def capacities(hand: HandModel, obj: ObjectModel, grasp: Posture, against: Float
         grasp: N postures at contact.
         against: (N, K, 3) unit vectors against the weight; the least of K counts.
     """
-    probe = posing_of(hand, obj, points=_POINTS).probe
+    probe = posing_of(hand, obj, points=_POINTS, device="cpu").probe
     found = probe.touch(grasp)
     facing = (found.distance < WITHIN_M) & probe.facing(found)
     q = hand.reduce(grasp.joint_positions)

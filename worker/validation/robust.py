@@ -13,7 +13,6 @@ import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -27,7 +26,6 @@ from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.simulation.environment import PlacedGrasps
 from graspd.worker.validation.decomposition import ConvexPieces, decompose
-from graspd.worker.validation.key import Level
 from graspd.worker.validation.lifting import LiftLevel, require_ways
 from graspd.worker.validation.model import MujocoOptions
 from graspd.worker.validation.validator import validate
@@ -105,15 +103,11 @@ def robust(
     seed: int = 0,
     hard: bool = False,
     pieces: ConvexPieces | None = None,
-    cache: Path | None = None,
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> Robustness:
     """Validate grasps in models around the nominal one, by six pushes at level standard or by lifts.
 
     Args:
-        hand: the hand.
-        obj: the object.
-        grasps: N grasps.
         held: (N,) verdicts of the nominal model; only grasps with 1 are tested. By default all.
         placed: their scenes, for the lift test; None: six pushes.
         level: of the lift test.
@@ -122,7 +116,6 @@ def robust(
         seed: of the models, with the grasp's own numbers.
         hard: at the hard protocol's friction.
         pieces: convex pieces of the object; by default its CoACD pieces.
-        cache: folder of the pieces, see `decompose`.
         run: receives the number of finished grasps; polled for cancellation between models.
 
     Raises:
@@ -140,7 +133,7 @@ def robust(
         return Robustness(verdicts, axes, wanted, 0.0)
     physics = MujocoOptions().hardened() if hard else MujocoOptions()
     beside = (placed.supports, placed.neighbours) if placed is not None else ()
-    around = Models(hand, obj, pieces or decompose(obj, cache=cache), physics, *beside)
+    around = Models(hand, obj, pieces or decompose(obj), physics, *beside)
     least, done, lock = needed(wanted, models), 0, threading.Lock()
 
     def holds(row: int, variant: Variant) -> bool:
@@ -182,6 +175,7 @@ def _words(grasps: GraspSet, row: int) -> tuple[int, ...]:
     return tuple(np.frombuffer(whole.digest()[:16], "<u4").tolist())
 
 
+#: Size of the random shift [m] and of the turn [rad] of the object.
 NOISE_M: Final = 1e-3
 NOISE_RAD: Final = float(np.radians(1.0))
 
@@ -192,57 +186,37 @@ def robustness(
     grasps: GraspSet,
     *,
     held: NDArray[np.generic] | None = None,
-    repeats: int = 5,
-    noise_m: float = NOISE_M,
-    noise_rad: float = NOISE_RAD,
+    repeats: int,
     seed: int = 0,
-    level: Level = "fast",
-    hard: bool = False,
-    pieces: ConvexPieces | None = None,
-    cache: Path | None = None,
+    pieces: ConvexPieces,
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> Floats:
-    """Return the share (N,) of `repeats` in which a grasp holds with noise on the object's pose.
+    """Return the share (N,) of `repeats` in which a grasp holds with noise on the object's pose; nan: not tested.
 
-    The object is moved by `noise_m` in a random direction and turned by `noise_rad` about a random axis through its
-    centre of mass; a grasp's noise follows from `seed`, the repeat and its place in the set. nan: not tested.
-
-    Args:
-        hand: the hand.
-        obj: the object.
-        grasps: N grasps.
-        held: (N,) verdicts without noise; only grasps with 1 are tested. By default all.
-        repeats: noisy verdicts for each grasp.
-        noise_m: size of the shift [m].
-        noise_rad: size of the turn [rad].
-        seed: of the noise.
-        level: of noisy verdicts; the cheap level suffices, for a share is not a success rate.
-        hard: the hard protocol's friction.
-        pieces: convex pieces of the object; by default its CoACD pieces.
-        cache: folder of the pieces, see `decompose`.
-        run: receives the number of finished verdicts; polled for cancellation between them.
+    The object is moved by `NOISE_M` in a random direction and turned by `NOISE_RAD` about a random axis through its
+    centre of mass; a grasp's noise follows from `seed`, the repeat and its place in the set. Only grasps with `held`
+    (N,) 1 are tested, by default all, at level fast: it suffices, for a share is not a success rate.
 
     Raises:
-        MeshError: the object has no usable convex pieces.
         TaskCancelled: when `run.cancelled()` answers True.
     """
     out = np.full(len(grasps), np.nan)
     tried = np.arange(len(grasps)) if held is None else np.flatnonzero(np.asarray(held) == 1)
     if not len(tried) or repeats < 1:
         return out
-    moves = np.array([_noise(obj, noise_m, noise_rad, (seed, k, int(i))) for k in range(repeats) for i in tried])
+    moves = np.array([_noise(obj, (seed, k, int(i))) for k in range(repeats) for i in tried])
     noisy = _moved(grasps, np.tile(tried, repeats), invert(moves))
-    verdicts = validate(hand, obj, noisy, level=level, hard=hard, pieces=pieces, cache=cache, run=run)
+    verdicts = validate(hand, obj, noisy, level="fast", pieces=pieces, run=run)
     out[tried] = verdicts.success.reshape(repeats, len(tried)).mean(axis=0)
     return out
 
 
-def _noise(obj: ObjectModel, noise_m: float, noise_rad: float, seed: tuple[int, ...]) -> Floats:
+def _noise(obj: ObjectModel, seed: tuple[int, ...]) -> Floats:
     """Return a random motion (7,) of the object."""
     rng = np.random.default_rng(seed)
     shift, axis = rng.normal(size=(2, 3))
-    rotation = quat_from_axis_angle(axis / np.linalg.norm(axis), np.array(noise_rad))
-    about = np.concatenate([obj.centre_of_mass + noise_m * shift / np.linalg.norm(shift), rotation])
+    rotation = quat_from_axis_angle(axis / np.linalg.norm(axis), np.array(NOISE_RAD))
+    about = np.concatenate([obj.centre_of_mass + NOISE_M * shift / np.linalg.norm(shift), rotation])
     return compose(about, np.concatenate([-obj.centre_of_mass, [1.0, 0, 0, 0]]))
 
 

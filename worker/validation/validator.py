@@ -8,7 +8,6 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -93,7 +92,6 @@ def validate(
     level: Level = "standard",
     hard: bool = False,
     pieces: ConvexPieces | None = None,
-    cache: Path | None = None,
     known: KnownRollouts | None = None,
     prefilter: PrefilterVerdicts | None = None,
     run: ExecutionContext = DEFAULT_CONTEXT,
@@ -110,7 +108,6 @@ def validate(
         level: dexgraspbench, standard, or fast.
         hard: sliding friction halved, torsional friction a tenth.
         pieces: convex pieces of the object; by default its CoACD pieces.
-        cache: folder of the pieces, see `decompose`.
         known: finished CPU rollouts on these terms, which are reused; new ones are added.
         prefilter: result of `prefiltered` on these grasps and terms; None: it is computed.
         run: receives the number of finished grasps; polled for cancellation between grasps.
@@ -123,7 +120,7 @@ def validate(
     if level not in LEVELS:
         raise InputError(f"unknown level {level!r}; choose one of {', '.join(LEVELS)}")
     began = time.perf_counter()
-    pieces = pieces or decompose(obj, cache=cache)
+    pieces = pieces or decompose(obj)
     prefilter_terms = first_terms(hand, level, run)
     # The prefilter leaves only cases near a limit, for which coarse physics would defer to level standard as well.
     of_the_cpu: Level = "standard" if prefilter_terms else level

@@ -36,8 +36,7 @@ from graspd.worker.planners.fast_graspd.antipodal_starts import (
 )
 from graspd.worker.planners.fast_graspd.candidates import posture_of
 from graspd.worker.planners.fast_graspd.pairs import pair_of
-from graspd.worker.planners.fast_graspd.retreat import hindrance
-from graspd.worker.planners.fast_graspd.scene_starts import REACHING, clear_scene_starts, free_ways
+from graspd.worker.planners.fast_graspd.scene_starts import REACHING, clear_scene_starts, free_ways, hindrance
 from graspd.worker.planners.fast_graspd.starts import CLEAR, start_generator
 from graspd.worker.simulation.data import HandState
 from graspd.worker.simulation.environment import Environment, Obstacle, Scenes
@@ -177,7 +176,7 @@ def test_outlines_tell_how_far_a_hand_must_rise(block, barrett, tips_m) -> None:
     scene = Environment((table,), UP)
     found = across(barrett, block, opening, uniform, ways)
     centre = found.pivot + block.centre_of_mass
-    told = outlines_of(barrett, oppositions_of(barrett)).lacks(found.posture, found.turn, centre, scene, room=0.006)
+    told = outlines_of(barrett, oppositions_of(barrett).q).lacks(found.posture, found.turn, centre, scene, room=0.006)
     root = centre - np.einsum("nij,j->ni", found.turn, barrett.palm.centre)
     q = found.q(barrett, np.zeros((60, barrett.dofs)))
     posture = Posture(np.concatenate([root, quat_from_matrix(found.turn)], axis=1), barrett.expand(q))

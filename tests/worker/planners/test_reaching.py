@@ -138,7 +138,7 @@ def drawn_alone(pair: starts._Pair, rng: np.random.Generator) -> tuple[np.ndarra
     point = a + u * (b - a) + v * (c - a)
     normal = np.cross(b - a, c - a)
     normal /= np.linalg.norm(normal)
-    tilt = starts._frame(normal)[:, :2] @ rng.normal(size=2)
+    tilt = starts.frames_about(normal)[:, :2] @ rng.normal(size=2)
     angle = np.linalg.norm(tilt) * starts.TILT
     axis = tilt / np.linalg.norm(tilt)
     approach = -(normal * np.cos(angle) + np.cross(axis, normal) * np.sin(angle))

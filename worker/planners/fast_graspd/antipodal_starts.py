@@ -12,13 +12,11 @@ hold. Space for this ball is necessary for a grasp between opposed fingertips, n
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from cachetools import LRUCache
 from numpy.typing import NDArray
 
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply, spread_directions
@@ -27,7 +25,9 @@ from graspd.worker.hands.jaws import thinnest_fingertip
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.pinch_postures import Oppositions, oppositions_of
+from graspd.worker.objects.memory_cache import cached_by_content
 from graspd.worker.objects.model import ObjectModel
+from graspd.worker.planners.fitting import even_points, surface_of
 from graspd.worker.simulation.environment import CLEAR_M, Environment
 from graspd.worker.simulation.mounting import OUTERMOST, points_of
 from graspd.worker.simulation.obstacles import MARGIN_M
@@ -81,20 +81,11 @@ class Crossings:
         return self.middle - half, self.middle + half
 
 
-_known: LRUCache[str, Crossings] = LRUCache(16)
-_lock = threading.Lock()
-
-
+@cached_by_content(16)
 def crossings_of(obj: ObjectModel) -> Crossings:
     """Return the pairs of an object, cached."""
-    with _lock:
-        if obj.content not in _known:
-            _known[obj.content] = _crossings(obj)
-        return _known[obj.content]
-
-
-def _crossings(obj: ObjectModel) -> Crossings:
-    place, normal = _surface(obj)
+    place, face = even_points(obj, SAMPLES, np.random.default_rng(0))
+    normal = surface_of(obj)[1][face]
     line = place[None] - place[:, None]
     width = np.linalg.norm(line, axis=-1)
     unit = line / np.maximum(width, 1e-9)[..., None]
@@ -102,20 +93,6 @@ def _crossings(obj: ObjectModel) -> Crossings:
     enters = np.einsum("ijk,jk->ij", unit, normal)
     i, j = np.nonzero(np.triu((np.minimum(leaves, enters) > ACROSS) & (width > THINNEST_M), 1))
     return Crossings(0.5 * (place[i] + place[j]), unit[i, j], width[i, j])
-
-
-def _surface(obj: ObjectModel) -> tuple[Floats, Floats]:
-    """Return (SAMPLES, 3) area-uniform points and the normals of their faces."""
-    rng = np.random.default_rng(0)
-    corners = obj.vertices[obj.faces]
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    area = np.linalg.norm(cross, axis=1)
-    share = (np.arange(SAMPLES) + rng.random(SAMPLES)) / SAMPLES
-    face = np.minimum(np.searchsorted(np.cumsum(area) / area.sum(), share), len(area) - 1)
-    u, v = rng.random((2, SAMPLES, 1))
-    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
-    c = corners[face]
-    return c[:, 0] + u * (c[:, 1] - c[:, 0]) + v * (c[:, 2] - c[:, 0]), cross[face] / area[face, None].clip(1e-18)
 
 
 @dataclass(frozen=True)
@@ -139,7 +116,7 @@ class Openings:
     def of(
         cls, known: Oppositions, obj: ObjectModel, scene: Environment, *, tip: float = 0.0, upright: bool = False
     ) -> Openings:
-        """Select pairs; `tip`: thickness of fingertips that must fit beside them [m]; `upright`: the field."""
+        """Select pairs beside which fingertips of thickness `tip` [m] fit."""
         pairs = crossings_of(obj)
         level = np.abs(pairs.axis @ scene.up) < STEEP
         fits = pairs.width + 2 * ROOM_M[0] <= known.widest
@@ -213,15 +190,7 @@ class AntipodalHands:
 
 
 def across(hand: HandModel, obj: ObjectModel, opening: Openings, uniform: Floats, ways: Floats) -> AntipodalHands:
-    """Place hands with opposed fingers across the object.
-
-    Args:
-        hand: the hand.
-        obj: the object.
-        opening: pairs to grasp, at least one.
-        uniform: (n, 6) random numbers.
-        ways: (K, 3) free directions away from the object.
-    """
+    """Place hands across the object by random numbers (n, 6); `ways` (K, 3) are free directions away from it."""
     known = opening.known
     if opening.upright and (upright := ways @ opening.up > UPRIGHT).any():
         ways = ways[upright]
@@ -258,19 +227,10 @@ def promising(
 ) -> tuple[NDArray[np.intp], Floats]:
     """Select the `keep` of C draws per hand that need the least rise to clear the obstacles, (n, keep).
     Also return the distance of the pair from between the pads (n, keep) [m]. Near enough draws keep their order.
-
-    Args:
-        hand: the hand.
-        obj: the object.
-        opening: pairs to grasp, at least one.
-        uniform: (n, C, 6) random numbers.
-        ways: (K, 3) free directions away from the object.
-        scene: the obstacles.
-        room: clearance to keep in addition to the margin [m].
-        keep: at most C.
+    `uniform` (n, C, 6) and `ways`: see `across`; `room`: clearance to keep in addition to the margin [m].
     """
     count, draws, _ = uniform.shape
-    outlines, off = outlines_of(hand, opening.known), np.zeros((count, draws))
+    outlines, off = outlines_of(hand, opening.known.q), np.zeros((count, draws))
     for rows in np.array_split(np.arange(count), 1 + count // AT_ONCE):
         found = across(hand, obj, opening, uniform[rows].reshape(-1, 6), ways)
         lack = outlines.lacks(found.posture, found.turn, found.pivot + obj.centre_of_mass, scene, room=room)
@@ -308,16 +268,8 @@ class PostureOutlines:
     def lacks(
         self, posture: NDArray[np.intp], turn: Floats, centre: Floats, scene: Environment, *, room: float
     ) -> Floats:
-        """Return the clearance (n,) from obstacles that hands and mountings lack [m], at least 0.
-        Required are the margin and `room`.
-
-        Args:
-            posture: (n,) indices into the K postures.
-            turn: (n, 3, 3) rotations.
-            centre: (n, 3) palm centres, object frame [m].
-            scene: the obstacles.
-            room: clearance besides the margin [m].
-        """
+        """Return the clearance (n,) that hands and mountings lack to the margin plus `room` [m], at least 0.
+        They have postures (n,), rotations (n, 3, 3) and palm centres (n, 3), object frame [m]."""
         place = np.matmul(self.points[posture], np.swapaxes(turn, -1, -2)) + centre[:, None]
         lack = np.zeros(len(posture))
         for obstacle in scene.obstacles:
@@ -336,21 +288,9 @@ class PostureOutlines:
         return least
 
 
-_known_outlines: LRUCache[tuple[str, bytes], PostureOutlines] = LRUCache(16)
-
-_outline_lock = threading.Lock()
-
-
-def outlines_of(hand: HandModel, postures: Oppositions) -> PostureOutlines:
-    """Return the outlines of opposed postures of a hand, cached."""
-    key = (hand.content, postures.q.tobytes())
-    with _outline_lock:
-        if key not in _known_outlines:
-            _known_outlines[key] = _outlines(hand, postures.q)
-        return _known_outlines[key]
-
-
-def _outlines(hand: HandModel, q: Floats) -> PostureOutlines:
+@cached_by_content(16)
+def outlines_of(hand: HandModel, q: Floats) -> PostureOutlines:
+    """Return the outlines of postures (P, D) of a hand, cached."""
     bodies = body_poses(hand, np.tile(IDENTITY_POSE, (len(q), 1)), hand.expand(q))
     points, tips = [], []
     for tip in (True, False):

@@ -34,8 +34,11 @@ class Batches:
         In scenes, `warm` proposes the starts of hands; None: `scene_starts` finds them."""
         self.asked, self.warm = asked, warm
         wanted = [one.wanted for one in asked]
-        in_scenes = wanted[0].placed is not None
-        self.fidelity: Fidelity = _adapted(wanted[0].fidelity, in_scenes=in_scenes, tried=self.has_rollout)
+        self.fidelity = wanted[0].fidelity
+        if wanted[0].placed is not None:
+            self.fidelity = in_scene(self.fidelity)
+        elif self.has_rollout:
+            self.fidelity = with_rollout(self.fidelity)
         if warm is not None:
             self.fidelity = warm.adapted(self.fidelity)
         counts = [one.count for one in wanted]
@@ -53,15 +56,12 @@ class Batches:
         self.ways: list[Floats] = []
         """Free directions of each scene."""
         for owner, scenes in enumerate(placed):
-            self._find_ways(owner, scenes, obj)
-
-    def _find_ways(self, owner: int, scenes: PlacedGrasps, obj: ObjectModel) -> None:
-        try:
-            # All scenes of a batch or none: a scene's directions are found by its number.
-            self.ways += [free_ways(scene, obj) for scene in scenes.scenes]
-        except InputError as error:
-            self.ways += [np.zeros((0, 3))] * len(scenes.scenes)
-            self.put_out(owner, error)
+            try:
+                # All scenes of a batch or none: a scene's directions are found by its number.
+                self.ways += [free_ways(scene, obj) for scene in scenes.scenes]
+            except InputError as error:
+                self.ways += [np.zeros((0, 3))] * len(scenes.scenes)
+                self.put_out(owner, error)
 
     @property
     def has_rollout(self) -> bool:
@@ -131,12 +131,6 @@ class Batches:
             except Exception as error:
                 self.put_out(owner, error)
         return scores
-
-
-def _adapted(fidelity: Fidelity, *, in_scenes: bool, tried: bool) -> Fidelity:
-    if in_scenes:
-        return in_scene(fidelity)
-    return with_rollout(fidelity) if tried else fidelity
 
 
 def finalists(fidelity: Fidelity) -> int:

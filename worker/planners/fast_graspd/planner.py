@@ -40,7 +40,6 @@ from graspd.worker.planners.fast_graspd.candidates import (
     with_postures,
 )
 from graspd.worker.planners.fast_graspd.pairs import Pair, pair_of
-from graspd.worker.planners.fast_graspd.retreat import hindrance
 from graspd.worker.planners.fast_graspd.schedule import AROUND, DILATION, WarmStart, coarse_schedule, fine_schedule
 from graspd.worker.planners.fast_graspd.starts import NO_PLACE, Probe
 from graspd.worker.planners.port import BatchRequest, Method, PlanRequest
@@ -52,6 +51,7 @@ from graspd.worker.simulation.launches import Launches
 from graspd.worker.simulation.model import Model
 from graspd.worker.simulation.obstacles import DeviceObstacles
 from graspd.worker.simulation.projection import Projection, ProjectionOptions
+from graspd.worker.simulation.record import record_iteration
 
 Rows = NDArray[np.intp]
 
@@ -305,7 +305,7 @@ def _work(launch: _Launch, begun: _Begun) -> LaunchPart:
     data.set_schedule(coarse_schedule(fidelity))
     data.set_state(begun.state, dilation=begun.touch)
     # The dilation shrinks during the coarse phase and changes its loss, so nothing converges before its end.
-    launches = pair.iteration(launch.coarse, data, fidelity.optimizer, patience=0)
+    launches = record_iteration(launch.coarse, data, fidelity.optimizer, patience=0)
     curve: list[Floats] = []
     state = _descend(launches, data, batches, rows, fidelity.coarse_iterations, "coarse optimization", curve)
     losses = _losses(data, len(state.pivot))
@@ -315,7 +315,7 @@ def _work(launch: _Launch, begun: _Begun) -> LaunchPart:
         if placed is None:
             merit -= NEARNESS * data.near_share(NEAR_M, len(state.pivot))
         else:
-            merit += hindrance(launch.coarse, state, placed.take(np.repeat(np.arange(n), fidelity.starts)))
+            merit += scene_starts.hindrance(launch.coarse, state, placed.take(np.repeat(np.arange(n), fidelity.starts)))
         order = ranked(merit, n)[:, :last]
     seats = _Seats(launch, rows, state, losses, curve)
     if batches.has_rollout:
@@ -403,7 +403,7 @@ class _Seats:
         data = _in_scenes(Data(launch.fine, len(flat)), launch.placed(mine), rows.shape[1])
         data.set_schedule(fine_schedule(fidelity))
         data.set_state(state)
-        launches = launch.pair.iteration(launch.fine, data, fidelity.optimizer, patience=fidelity.patience)
+        launches = record_iteration(launch.fine, data, fidelity.optimizer, patience=fidelity.patience)
         curve, self.curve = self.curve, []
         state = _descend(launches, data, launch.batches, mine, fidelity.fine_iterations, "refinement", curve)
         if fidelity.fine_iterations:

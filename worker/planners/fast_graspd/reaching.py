@@ -7,13 +7,11 @@ penetrates the object: balls in the hand reject these before the simulation chec
 
 from __future__ import annotations
 
-import threading
 from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 import warp as wp
-from cachetools import LRUCache
 from numpy.typing import NDArray
 
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, quat_from_matrix, quat_rotate
@@ -22,6 +20,7 @@ from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.pinch_postures import Oppositions, oppositions_of
 from graspd.worker.hands.surface import sample_surface
+from graspd.worker.objects.memory_cache import cached_by_content
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.planners.fast_graspd.antipodal_starts import ALIKE_M, BESIDE_M, NOISE, ROOM_M, crossings_of, frames
 from graspd.worker.simulation.data import HandState
@@ -57,18 +56,8 @@ class ReachSampling:
     @classmethod
     def of(cls, model: Model) -> ReachSampling | None:
         """Return None if the hand opposes no fingers, or the object is too wide everywhere."""
-        hand, obj = model.hand.model, model.obj.model
-        width = crossings_of(obj).width
-        size = size_to_pads(hand, width)
-        known = _postures(hand, width, size)
-        if not len(known):
-            return None
-        key = (hand.content, obj.content, model.device)
-        with _lock:
-            if key not in _known:
-                # Objects that are too small or too wide are held where space was found, never nearer to the palm.
-                _known[key] = _grips(hand, obj, known, model.device, deep=0.0 if size else 1.0)
-            return cls(model, _known[key], size is not None)
+        known = _grips(model.hand.model, model.obj.model, model.device)
+        return None if known is None else cls(model, *known)
 
     def starts(self, seeds: NDArray[np.int32], first: NDArray[np.int32], retreats: Floats) -> tuple[HandState, Any]:
         """Return hands (n,) of the first draws, from numbers `first` (n,) on, that pass the ball test.
@@ -97,10 +86,6 @@ class ReachSampling:
         return found, number.numpy()
 
 
-_known: LRUCache[tuple[str, str, str], Any] = LRUCache(8)
-_lock = threading.Lock()
-
-
 def size_to_pads(hand: HandModel, width: Floats) -> Size | None:
     """Classify an object with pair widths (P,) as too small or wide for the pads; None if a pair fits."""
     known = oppositions_of(hand)
@@ -119,8 +104,14 @@ def _postures(hand: HandModel, width: Floats, size: Size | None) -> Oppositions:
     return known if (width + 2 * ROOM_M[0] <= known.widest).any() else Oppositions.of_none(hand)
 
 
-def _grips(hand: HandModel, obj: ObjectModel, known: Oppositions, device: str, *, deep: float) -> Any:
+@cached_by_content(8)
+def _grips(hand: HandModel, obj: ObjectModel, device: str) -> tuple[Any, bool] | None:
+    """Return `ReachSampling.grips` and `.only`; None if no posture holds a pair."""
     pairs, out = crossings_of(obj), kernels.Grips()
+    size = size_to_pads(hand, pairs.width)
+    known = _postures(hand, pairs.width, size)
+    if not len(known):
+        return None
     kept = np.flatnonzero(pairs.width + 2 * ROOM_M[0] <= known.widest)
     middle = pairs.middle[kept] - obj.centre_of_mass
     chance = np.exp(-((np.linalg.norm(middle, axis=1) / BESIDE_M) ** 2)) + FAR
@@ -138,8 +129,9 @@ def _grips(hand: HandModel, obj: ObjectModel, known: Oppositions, device: str, *
         out.opened = wp.array(known.width, dtype=wp.float32)
         out.balls = wp.array(balls, dtype=wp.vec3)
         out.radius = BALL_M - SLACK_M
-        out.deep = deep
+        # Objects that are too small or too wide are held where space was found, never nearer to the palm.
+        out.deep = 0.0 if size else 1.0
         out.palm = wp.vec3(*hand.palm.approach)
         out.noise = wp.array(NOISE * hand.span, dtype=wp.float32)
         out.lower, out.upper = wp.array(hand.lower, dtype=wp.float32), wp.array(hand.upper, dtype=wp.float32)
-    return out
+    return out, size is not None

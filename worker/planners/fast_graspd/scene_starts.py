@@ -1,6 +1,9 @@
 """Sampling of approaches in scenes from the free directions, for all hands at once.
 Most starts are antipodal; the others face a random point of the object, as in `starts`.
 A start keeps `ROOM` from obstacles besides the later margin, so that the optimisation can turn the hand.
+
+Before the expensive phases `hindrance` tests whether each hand can leave its grasp: open, back along the approach, and
+closed, by the lift. A hand hooked around an edge holds well but cannot get there; one close below a board cannot lift.
 """
 
 from __future__ import annotations
@@ -18,16 +21,19 @@ from graspd.service.model.transforms import (
     quat_from_axis_angle,
     quat_from_matrix,
     quat_multiply,
+    quat_rotate,
     spread_directions,
 )
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.planners.fast_graspd.antipodal_starts import NEAR_M, AntipodalHands, Openings, across, promising
 from graspd.worker.planners.fast_graspd.candidates import posture_of
-from graspd.worker.planners.fast_graspd.starts import CLEAR, POSTURE_NOISE, TILT, Probe
+from graspd.worker.planners.fast_graspd.starts import CLEAR, POSTURE_NOISE, TILT, Probe, frames_about, put
+from graspd.worker.planners.fitting import points_in, surface_of
 from graspd.worker.planners.port import NoStartFound
+from graspd.worker.quality.contact import finger_of_body
 from graspd.worker.simulation.data import HandState
-from graspd.worker.simulation.environment import STANDOFF_M, Environment, PlacedGrasps
+from graspd.worker.simulation.environment import RISE_M, STANDOFF_M, Environment, PlacedGrasps
 from graspd.worker.simulation.model import Model
 from graspd.worker.simulation.mounting import mounting_lack
 
@@ -52,23 +58,6 @@ REACHES: Final = 8
 CANDIDATES: Final = 48
 #: Uniform numbers of one draw: face, two for the point, roll, gap, share and goal of a turn.
 _UNIFORM: Final = 7
-
-
-@dataclass(frozen=True)
-class _Surface:
-    """Faces of the object, prepared for draws."""
-
-    corners: Floats
-    normals: Floats
-    sums: Floats
-    """(F,) cumulative share of the area."""
-
-    @classmethod
-    def of(cls, obj: ObjectModel) -> _Surface:
-        corners = obj.vertices[obj.faces]
-        cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        area = np.linalg.norm(cross, axis=1)
-        return cls(corners, cross / np.maximum(area, 1e-20)[:, None], np.cumsum(area) / area.sum())
 
 
 def free_ways(scene: Environment, obj: ObjectModel) -> Floats:
@@ -106,13 +95,7 @@ def clear_scene_starts(
     That is the first clear draw, or the least deep; of antipodal ones the clear draw with the best placed pair.
 
     In a narrow scene some grasps find no clear start: they end blocked, and the batch consists of the others.
-
-    Args:
-        model: hand and object, with the scenes' obstacles.
-        generators: of the starts, those of one grasp side by side.
-        each: starts per grasp.
-        placed: scenes of the grasps.
-        ways: result of `free_ways` for each scene.
+    `ways` are `free_ways` of each scene.
     """
     hand, obj = model.hand.model, model.obj.model
     probe = Probe(model, len(generators), room=ROOM)
@@ -121,7 +104,7 @@ def clear_scene_starts(
     scene = np.repeat(placed.index, each)
     reaching = np.arange(len(scene)) % each % EVERY < REACHING
     reaching &= np.array([len(openings[s].sums) > 0 for s in scene.tolist()], bool)
-    count, around = len(scene), _Around(hand, obj, _Surface.of(obj), ways, openings)
+    count, around = len(scene), _Around(hand, obj, ways, openings)
     uniform = np.array([g.random((DRAWS, _UNIFORM)) for g in generators])
     normal = np.zeros((count, 0, 2 + hand.dofs))
     best = HandState(np.zeros((count, 3)), np.tile([1.0, 0, 0, 0], (count, 1)), np.zeros((count, hand.dofs)))
@@ -153,11 +136,7 @@ def clear_scene_starts(
         taken = drawn.states[(at[0] * len(RETREATS) + pick)[better]]
         depth[rows[better]] = least[better]
         beside[rows[better]] = np.where(least <= CLEAR, off[at], beside[rows])[better]
-        best.pivot[rows[better]], best.rotation[rows[better]], best.q[rows[better]] = (
-            taken.pivot,
-            taken.rotation,
-            taken.q,
-        )
+        put(best, rows[better], taken)
     return best, depth
 
 
@@ -241,7 +220,6 @@ class _Around:
 
     hand: HandModel
     obj: ObjectModel
-    surface: _Surface
     ways: Sequence[Floats]
     """Free directions of each scene."""
     openings: Mapping[int, Openings]
@@ -291,15 +269,13 @@ class _Around:
 
     def _towards(self, uniform: Floats, normal: Floats, ways: Floats) -> tuple[Floats, Floats, Floats, Floats]:
         """Place hands that face random points of the surface, in the form of `across` but without a pair."""
-        hand, obj, surface = self.hand, self.obj, self.surface
-        face = np.minimum(np.searchsorted(surface.sums, uniform[:, 0]), len(surface.sums) - 1)
-        u, v = uniform[:, 1:2], uniform[:, 2:3]
-        u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
-        corner = surface.corners[face]
-        point = corner[:, 0] + u * (corner[:, 1] - corner[:, 0]) + v * (corner[:, 2] - corner[:, 0])
-        away = _tilted(surface.normals[face], TILT * normal[:, :2])
+        hand, obj = self.hand, self.obj
+        corners, normals, sums = surface_of(obj)
+        face = np.minimum(np.searchsorted(sums, uniform[:, 0]), len(sums) - 1)
+        point = points_in(corners[face], uniform[:, 1:2], uniform[:, 2:3])
+        away = _tilted(normals[face], TILT * normal[:, :2])
         away = np.array([_turned(a, ways, t) for a, t in zip(away, uniform[:, 5:7], strict=True)])
-        align = _frames(-away) @ _frames(hand.palm.approach[None])[0].T
+        align = frames_about(-away) @ frames_about(hand.palm.approach).T
         roll = quat_from_axis_angle(-away, 2 * np.pi * uniform[:, 3])
         rotation = quat_multiply(roll, quat_from_matrix(align))
         q = np.clip(hand.preshape + POSTURE_NOISE * hand.span * normal[:, 2:], hand.lower, hand.upper)
@@ -322,15 +298,69 @@ def _turned(away: Floats, ways: Floats, random: Floats) -> Floats:
 
 def _tilted(normals: Floats, angles: Floats) -> Floats:
     """Return unit vectors (n, 3): normals turned about two perpendicular axes by `angles` (n, 2) [rad]."""
-    axis = np.einsum("nij,nj->ni", _frames(normals)[..., :2], angles)
+    axis = np.einsum("nij,nj->ni", frames_about(normals)[..., :2], angles)
     angle = np.linalg.norm(axis, axis=1, keepdims=True)
     unit = axis / np.maximum(angle, 1e-12)
     return np.asarray(normals * np.cos(angle) + np.cross(unit, normals) * np.sin(angle))
 
 
-def _frames(z: Floats) -> Floats:
-    """Return rotations (n, 3, 3) with third columns z (n, 3) and arbitrary but fixed first columns."""
-    helper = np.eye(3)[np.argmin(np.abs(z), axis=1)]
-    x = np.cross(helper, z)
-    x /= np.linalg.norm(x, axis=1, keepdims=True)
-    return np.stack([x, np.cross(z, x), z], axis=-1)
+#: Shares of their range by which fingers have opened, and the distance that the hand has moved back [m].
+OUT: Final = ((0.2, 0.0), (0.3, 0.015), (0.4, 0.04))
+#: Tolerated depth [m]: a hand can open differently from this simple motion.
+TOLERATED_M: Final = 0.001
+#: Merit lost per metre of depth. The weight is small: hands that hold well enclose the object, and most of them find
+#: another trajectory out.
+WEIGHT: Final = 25.0
+DEEPEST_M: Final = 0.01
+#: Shares of the lift at which obstacles above are checked.
+UP: Final = (0.5, 1.0)
+
+
+def hindrance(model: Model, state: HandState, placed: PlacedGrasps) -> Floats:
+    """Compute the merit (n,) that hands lose for a blocked retreat or lift in their scenes.
+    It grows with the depth of the hand in object or obstacles on the way, or of its mounting at the grasp."""
+    hand, obj = model.hand.model, model.obj.model
+    mounted = mounting_lack(hand, posture_of(hand, obj, state).hand_pose, placed.scenes, placed.index)
+    deep = np.maximum(_back(model, state, placed.index), mounted)
+    rows = np.flatnonzero(np.array([not _open_above(scene) for scene in placed.scenes])[placed.index])
+    if len(rows):
+        deep[rows] = np.maximum(deep[rows], _rising(model, state[rows], placed.take(rows)))
+    return np.asarray(WEIGHT * np.clip(deep - TOLERATED_M, 0.0, DEEPEST_M), float)
+
+
+def _back(model: Model, state: HandState, scenes: NDArray[np.integer]) -> Floats:
+    """Return the depth (n,) of hands that open and move back [m]."""
+    hand = model.hand.model
+    finger = finger_of_body(hand)
+    driven = np.zeros(hand.dofs, bool)
+    driven[hand.dof[finger >= 0]] = True
+    back = -quat_rotate(state.rotation, hand.palm.approach)
+    n = len(state.pivot)
+    opened = [np.where(driven, state.q - share * hand.span * hand.closing, state.q) for share, _ in OUT]
+    states = HandState(
+        np.concatenate([state.pivot + far * back for _, far in OUT]),
+        np.tile(state.rotation, (len(OUT), 1)),
+        np.clip(np.concatenate(opened), hand.lower, hand.upper),
+    )
+    probe = Probe(model, len(OUT) * n)
+    probe.data.set_scenes(np.tile(scenes, len(OUT)))
+    probe.depths(states)
+    found = probe.data.depths
+    depth = np.max([kind.numpy()[: len(OUT) * n] for kind in (found.points, found.object, found.obstacles)], axis=0)
+    return np.asarray(depth.reshape(len(OUT), n).max(axis=0), float)
+
+
+def _open_above(scene: Environment) -> bool:
+    """Check whether all obstacles are floors, which a rising hand always leaves."""
+    return all(len(o.planes) == 1 and o.planes[0, :3] @ scene.up > 1 - 1e-6 for o in scene.obstacles)
+
+
+def _rising(model: Model, state: HandState, placed: PlacedGrasps) -> Floats:
+    """Return the depth (n,) in obstacles of hands that rise in their grasp posture [m]."""
+    n = len(state.pivot)
+    up = np.array([scene.up for scene in placed.scenes])[placed.index]
+    pivot = np.concatenate([state.pivot + share * RISE_M * up for share in UP])
+    probe = Probe(model, len(UP) * n)
+    probe.data.set_scenes(np.tile(placed.index, len(UP)))
+    probe.depths(HandState(pivot, np.tile(state.rotation, (len(UP), 1)), np.tile(state.q, (len(UP), 1))))
+    return np.asarray(probe.data.depths.obstacles.numpy()[: len(UP) * n].reshape(len(UP), n).max(axis=0), float)

@@ -29,7 +29,7 @@ from graspd.worker.hands.jaws import Jaws, jaws_of
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.planners.fast_graspd.reaching import LOOKS, ReachSampling
-from graspd.worker.planners.fitting import Pairs, fitting_pairs
+from graspd.worker.planners.fitting import Pairs, fitting_pairs, points_in
 from graspd.worker.simulation.data import Data, HandState
 from graspd.worker.simulation.model import Model
 from graspd.worker.simulation.record import record_placement
@@ -59,7 +59,7 @@ def start_generator(seed: int, batch: int, index: int, start: int) -> np.random.
     return np.random.default_rng(np.random.SeedSequence([seed, batch, index, start]))
 
 
-def _frame(z: Floats) -> Floats:
+def frames_about(z: Floats) -> Floats:
     """Return rotations (..., 3, 3) with third columns z (..., 3) and arbitrary but fixed first columns."""
     helper = np.eye(3)[np.argmin(np.abs(z), axis=-1)]
     x = cross(helper, z)
@@ -94,51 +94,40 @@ class _Pair:
         area = np.linalg.norm(across, axis=1)
         share = np.cumsum(area / area.sum())
         return cls(
-            hand, obj.centre_of_mass, corners, across, area, share / share[-1], _frame(hand.palm.approach).T, gap
+            hand, obj.centre_of_mass, corners, across, area, share / share[-1], frames_about(hand.palm.approach).T, gap
         )
 
 
-@dataclass(frozen=True)
-class _Numbers:
-    """Random numbers of n draws, in the order in which they are drawn."""
-
-    uniform: Floats
-    """(n, 5) face, two for the point, roll, gap."""
-    normal: Floats
-    """(n, 2 + D) tilt, then noise of the pre-shape."""
-
-    @classmethod
-    def of(cls, generators: list[np.random.Generator], dofs: int) -> _Numbers:
-        uniform, normal = np.empty((len(generators), 5)), np.empty((len(generators), 2 + dofs))
-        for i, rng in enumerate(generators):
-            uniform[i, :3] = rng.random(3)
-            normal[i, :2] = rng.standard_normal(2)
-            uniform[i, 3] = rng.random()
-            normal[i, 2:] = rng.standard_normal(dofs)
-            uniform[i, 4] = rng.random()
-        return cls(uniform, normal)
+def _numbers(generators: list[np.random.Generator], dofs: int) -> tuple[Floats, Floats]:
+    """Return random numbers of draws, in the order in which they are drawn.
+    Uniform (n, 5): face, two for the point, roll, gap. Normal (n, 2 + D): tilt, then noise of the pre-shape."""
+    uniform, normal = np.empty((len(generators), 5)), np.empty((len(generators), 2 + dofs))
+    for i, rng in enumerate(generators):
+        uniform[i, :3] = rng.random(3)
+        normal[i, :2] = rng.standard_normal(2)
+        uniform[i, 3] = rng.random()
+        normal[i, 2:] = rng.standard_normal(dofs)
+        uniform[i, 4] = rng.random()
+    return uniform, normal
 
 
 def draw(pair: _Pair, generators: list[np.random.Generator]) -> tuple[HandState, Floats]:
     """Draw one start per generator at its nearest distance; also return the palms' directions (n, 3)."""
-    hand, number = pair.hand, _Numbers.of(generators, pair.hand.dofs)
-    face = pair.share.searchsorted(number.uniform[:, 0], side="right")
-    inside = number.uniform[:, 1:3]
-    u, v = np.where(inside.sum(axis=1, keepdims=True) > 1, 1 - inside, inside).T[..., None]
-    a, b, c = np.moveaxis(pair.corners[face], 1, 0)
-    point = a + u * (b - a) + v * (c - a)
+    hand, (uniform, noise) = pair.hand, _numbers(generators, pair.hand.dofs)
+    face = pair.share.searchsorted(uniform[:, 0], side="right")
+    point = points_in(pair.corners[face], uniform[:, 1:2], uniform[:, 2:3])
     normal = pair.across[face] / pair.area[face, None]
-    tilt = np.einsum("nij,nj->ni", _frame(normal)[..., :2], number.normal[:, :2])
+    tilt = np.einsum("nij,nj->ni", frames_about(normal)[..., :2], noise[:, :2])
     length = np.linalg.norm(tilt, axis=1, keepdims=True)
     angle = np.where(length * TILT > 1e-9, length * TILT, 0.0)
     normal = normal * np.cos(angle) + cross(tilt / np.maximum(length, 1e-12), normal) * np.sin(angle)
     approach = -normal
-    roll = quat_from_axis_angle(approach, 2 * np.pi * number.uniform[:, 3])
-    rotation = quat_multiply(roll, quat_from_matrix(_frame(approach) @ pair.palm))
-    noise = POSTURE_NOISE * (hand.upper - hand.lower) * number.normal[:, 2:]
+    roll = quat_from_axis_angle(approach, 2 * np.pi * uniform[:, 3])
+    rotation = quat_multiply(roll, quat_from_matrix(frames_about(approach) @ pair.palm))
+    q = hand.preshape + POSTURE_NOISE * (hand.upper - hand.lower) * noise[:, 2:]
     near, far = pair.gap
-    pivot = point - pair.centre - approach * (near + (far - near) * number.uniform[:, 4:])
-    return HandState(pivot, rotation, np.clip(hand.preshape + noise, hand.lower, hand.upper)), approach
+    pivot = point - pair.centre - approach * (near + (far - near) * uniform[:, 4:])
+    return HandState(pivot, rotation, np.clip(q, hand.lower, hand.upper)), approach
 
 
 def _retreated(state: HandState, approach: Floats) -> HandState:
@@ -281,7 +270,7 @@ def _draw_until_clear(
         found = states[np.arange(len(rows)) * depth.shape[1] + pick]
         depth = depth[np.arange(len(rows)), pick]
         better = depth < deepest[rows]
-        _put(best, rows[better], found[better])
+        put(best, rows[better], found[better])
         deepest[rows[better]] = depth[better]
         rows = rows[deepest[rows] > CLEAR]
 
@@ -307,14 +296,14 @@ def _reach(
         first[left] = number[some] + 1
         depth = probe.depths(found)
         clear = depth <= CLEAR
-        _put(best, rows[left[clear]], found[clear])
+        put(best, rows[left[clear]], found[clear])
         deepest[rows[left[clear]]] = depth[clear]
         left = left[~clear]
         if not len(left):
             return
 
 
-def _put(states: HandState, rows: NDArray[np.intp], others: HandState) -> None:
+def put(states: HandState, rows: NDArray[np.intp], others: HandState) -> None:
     """Replace these rows of the states."""
     states.pivot[rows], states.rotation[rows], states.q[rows] = others.pivot, others.rotation, others.q
 
