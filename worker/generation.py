@@ -185,7 +185,6 @@ def scored(
 
     Raises:
         MeshError: the object has no usable convex pieces.
-        TaskCancelled: `run.cancelled()` returned True.
     """
     request = request.model_copy(update={"want": "candidates"})
     with Scoring(hand, obj, request, scenes=scenes, pieces=pieces, run=run) as scoring:

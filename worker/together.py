@@ -47,15 +47,11 @@ def validated_batches(
     """Plan consecutive batches of a job; each has the same result as with `validated_grasps`.
 
     Args:
-        hand: the hand.
-        obj: the object.
-        request: see `validated_grasps`.
         sizes: grasps wanted for each batch.
         first: number of the first batch within its job.
         join: batches whose grasps are planned in one launch; 1: one batch after the other.
         scenes: see `validated_grasps`; common to all batches, or one per batch.
         pieces: computes the object's convex pieces; called once.
-        run: receives the number of finished grasps.
         partial: when cancelled, return the batches validated before; the last one may be incomplete.
         checked: called with the number of each finished batch and its result; may raise.
         empty_on: errors after which a batch has no grasps; not for a job's first batch, nor if all fail.
@@ -194,11 +190,7 @@ def _next_wave(waiting: deque[Batch], fresh: Iterator[Batch], most: int) -> list
 
 
 def _planned(scoring: Scoring, batches: Sequence[Batch]) -> _Wave:
-    """Plan what the batches need, in the single thread that owns the device.
-
-    Raises:
-        TaskCancelled: the planning was cancelled.
-    """
+    """Plan what the batches need, in the single thread that owns the device."""
     known: Known = {}
     rollout, request, asked = scoring.rollout(known), scoring.request, list[BatchRequest]()
     for batch in batches:

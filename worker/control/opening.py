@@ -105,9 +105,7 @@ class Openings:
 
     def without_jams(self, blocked: Blocked | None = None) -> Floats:
         """Return the open dofs (N, D), reduced towards the grasp where fingers jam or `blocked` applies.
-
-        Fingers that jam never reach the grasp when they close again.
-        """
+        Fingers that jam never reach the grasp when they close again."""
         device, jams = self.posing.device, self._jams()
         depth = self._depths(jams)
         depth[0].run()

@@ -53,11 +53,9 @@ def pregrasp(
     hand: HandModel, obj: ObjectModel, grasp: Posture, placed: PlacedGrasps | None = None, *, device: str = "cpu"
 ) -> Posture:
     """Compute N postures from which the hand closes.
-
     Every finger leaves the object along its contact normals until its points are `CLEARANCE_M` away. It stops earlier
     at other fingers or, where the grasps are `placed`, at an obstacle of their scene. Then the root retreats along the
-    palm's approach while the hand is in contact, and rises where fingers would dip into a support they may touch.
-    """
+    palm's approach while the hand is in contact, and rises where fingers would dip into a support they may touch."""
     posing = posing_of(hand, obj, points=_POINTS, device=device)
     poses, joints = np.zeros((len(grasp), 7)), np.zeros((len(grasp), len(hand.joint_names)))
     for rows in posing.parts(len(grasp)):

@@ -54,10 +54,7 @@ def balanced(
     Where torques exceed a limit, all forces are scaled together, which keeps the balance.
 
     Args:
-        posing: hand and object.
-        grasp: the grasps.
         total_normal_force: wanted sum of normal forces [N].
-        friction: Coulomb coefficient of the pyramids.
         within: hand points within this distance of the object press on it [m].
         most: largest number of these points; the most spread out are used.
         closing: distance within which points of a finger without contact press [m].

@@ -45,8 +45,6 @@ def cut(count: int, run: ExecutionContext, *, least: int = 1) -> list[range]:
     """Cut a batch into contiguous, nearly equal parts: one on a GPU, at most one per thread on a CPU.
 
     Args:
-        count: grasps.
-        run: its device and threads.
         least: fewest grasps for which a thread pays.
     """
     if wp.get_device(run.device).is_cuda:
@@ -58,10 +56,8 @@ def cut(count: int, run: ExecutionContext, *, least: int = 1) -> list[range]:
 
 def run_parts(parts: list[range], work: Callable[[range], T]) -> list[T]:
     """Run `work` on every part, each in its own thread, in order.
-
     A part that exceeds a GPU's memory is split in two, one after the other, down to single grasps: there may be more
-    results than parts.
-    """
+    results than parts."""
     if len(parts) == 1:
         return _fitted(parts[0], work)
     with ThreadPoolExecutor(len(parts), thread_name_prefix="synthesize") as pool:

@@ -42,7 +42,6 @@ def choose_contacts(
         place: (N, 3) contact points [m].
         normal: (N, 3) unit normals; contacts differ by place over `scale` and by direction.
         scale: length that weighs places against directions: the torque scale [m].
-        limit: most contacts.
     """
     index = np.flatnonzero(near)
     if len(index) <= limit:
@@ -60,7 +59,6 @@ def spread_contacts(
         place: (B, N, 3) contact points [m].
         normal: (B, N, 3) unit normals.
         scale: length that weighs places against directions [m].
-        limit: most contacts.
 
     Returns:
         (B, T, limit) indices, and their number (B, T); further indices are undefined.

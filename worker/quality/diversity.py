@@ -24,11 +24,9 @@ FEW: Final = 256
 
 def explained_variance(posture: Posture) -> Floats:
     """Compute the explained variance of (translation, rotation vector, joints), largest first.
-
     The entries are shares of variance along the principal components. Diversity D is the first entry: near 1 all grasps
     lie on a line of variants, lower is more diverse. Units stay metres and radians, as in DexGraspBench. Empty for
-    fewer than 2 grasps.
-    """
+    fewer than 2 grasps."""
     if len(posture) < 2:
         return np.zeros(0)
     features = np.hstack(
@@ -42,7 +40,6 @@ def explained_variance(posture: Posture) -> Floats:
 
 def hand_points(hand: HandModel, posture: Posture) -> Floats:
     """Return the positions (N, P, 3) of the same `POINTS` surface points in N postures, object frame [m].
-
     The distance of two grasps is the mean distance of these points [m]. This metric joins the hand's pose and joints
     and weighs a joint by the motion it causes. It does not identify grasps that an object's symmetry makes equivalent.
     """

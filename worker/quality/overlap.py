@@ -21,11 +21,9 @@ _DIGITS: Final = 7
 
 class Overlap:
     """Conservative overlap test of a hand's pieces with a closed object.
-
     A piece is excluded only if it shares no volume: no face of the object reaches into it, none of its corners is in
     the object, and nothing of the object is in it. A face also counts if only a plane through
-    two edges would separate it.
-    """
+    two edges would separate it."""
 
     def __init__(self, hand: HandModel, probe: Probe) -> None:
         self._probe = probe
@@ -93,9 +91,7 @@ def _planes(piece: ConvexPiece) -> Floats:
 
 def penetration_depth(found: Distances) -> Floats:
     """Return the deepest penetration (B,), of hand points in the object and object points in the hand [m].
-
-    One direction alone is blind: a thin wall passes between hand points, a small fingertip between object points.
-    """
+    One direction alone is blind: a thin wall passes between hand points, a small fingertip between object points."""
     hand_in_object = np.maximum(0.0, -found.distance).max(axis=1)
     object_in_hand = np.maximum(0.0, -found.piece_distance).max(axis=1)
     deepest: Floats = np.maximum(hand_in_object, object_in_hand)

@@ -52,12 +52,9 @@ def wrenches(
     """Return edge wrenches (..., E, 6): force, then torque about `centre` over `radius`.
 
     Args:
-        points: (..., 3) contact points [m].
         normals: (..., 3) unit normals into the object.
-        friction: Coulomb coefficient.
         centre: (3,) torque origin, the centre of mass [m].
         radius: torque scale, the object's largest radius [m].
-        edges: edges of the pyramid.
     """
     force = cone_edges(normals, friction, edges=edges)
     torque = cross((np.asarray(points, float) - centre)[..., None, :] / radius, force)
@@ -71,7 +68,6 @@ def measure_spaces(
 
     Args:
         edge_wrenches: (S, N, E, D) edge wrenches; each space uses its first `contacts` contacts.
-        contacts: (S,).
         with_volume: (S,) whether the volume is wanted: epsilon alone is as exact, in a tenth of the time.
 
     Returns:
@@ -173,7 +169,6 @@ def measure_hulls(clouds: Floats, count: NDArray[np.integer], whole: NDArray[np.
 
     Args:
         clouds: (H, P, 6) points, P at most `MAX_POINTS`; each hull uses its first `count`.
-        count: (H,).
         whole: (H,) whether the volume is wanted; else the hull is built only where it is nearest to the origin, in a
             tenth of the time, with an equally exact radius.
 
@@ -256,10 +251,8 @@ def _simplices(
 
 def _planes(corner: Floats) -> tuple[Floats, Floats]:
     """Return planes (H, 7, 6), (H, 7) of the facets of simplices (H, 7, 6) about the origin.
-
     Facet i omits corner i. n x - d is minus 6! times the volume of the simplex of x and the facet: the barycentric
-    coordinate of corner i, times the determinant of the edges.
-    """
+    coordinate of corner i, times the determinant of the edges."""
     edges = corner[:, 1:] - corner[:, :1]
     size = np.abs(np.linalg.det(edges))[:, None, None]
     slope = np.swapaxes(np.linalg.inv(edges), 1, 2)

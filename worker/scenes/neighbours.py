@@ -78,12 +78,6 @@ def drop_together(obj: ObjectModel, neighbours: Sequence[ObjectModel], *, count:
     The object falls in the middle, the neighbours around it. Drops are redone if an object does not come to rest, rolls
     away, or leans or lies on another. Scene i depends on the objects, the seed and i alone.
 
-    Args:
-        obj: the object that is grasped.
-        neighbours: M others.
-        count: number of scenes S.
-        seed: any non-negative integer.
-
     Returns:
         As `worker.scenes.simulate.drop`, and `scene/neighbour_pose` (S, M, 7).
 
@@ -200,10 +194,8 @@ def neighbour_clearance(hand: HandModel, path: Posture, object_pose: Floats, nei
     """Compute signed distances of the hand from neighbours' hulls [m], at most `FARTHEST_M`.
 
     Args:
-        hand: the hand; its convex pieces count.
         path: P postures in the object frame.
         object_pose: (S, 7) of the object in the table frame.
-        neighbours: objects to avoid.
 
     Returns:
         (S, P); negative: the hand penetrates a hull.
@@ -265,12 +257,9 @@ def lay_beside(
     All are `BETWEEN` apart and clear of all supports.
 
     Args:
-        obj: the object that is grasped.
         again: its pose (7,) in scene i at attempt k.
         others: the neighbours; each rests on z = 0.
-        supports: in the scene frame.
         within: x by y about the origin that they must not leave [m].
-        count: number of scenes S.
         seed: any non-negative integer. Scene i depends on the objects, the supports, the seed and i alone.
 
     Raises:
@@ -369,9 +358,7 @@ class _Hulls:
 
 def _beyond(support: Obstacle, corners: Floats) -> bool:
     """Check whether a hull lies beyond one plane of a support: on an upward plane, `GAP` away from others.
-
-    A plane separates two convex bodies. Where only an edge against an edge would separate them, the result is False.
-    """
+    A plane separates two convex bodies. Where only an edge against an edge would separate them, the result is False."""
     room = (corners @ support.planes[:, :3].T - support.planes[:, 3]).min(axis=0)
     least = np.where(support.planes[:, 2] > 1 - 1e-6, -SUNK, GAP)
     return bool((room >= least).any())

@@ -79,11 +79,7 @@ def scenes_of(
     """Create `count` scenes from a specification (with `faces all`, one for each stable face).
 
     Args:
-        spec: the surroundings of the object; not free.
-        obj: the object.
         others: the objects of `spec.neighbours`, in that order.
-        count: number of scenes S.
-        seed: any non-negative integer.
 
     Returns:
         The scenes, and `scene/object_pose` (S, 7), `scene/rest_probability` (S,), `scene/drop_seconds` (S,) and, where

@@ -158,9 +158,7 @@ def _edges(mesh: trimesh.Trimesh, label: Ints, normal: Floats, centre: Floats) -
 
 def settle(faces: RestingFaces, quaternion: Floats) -> tuple[int, float]:
     """Return the stable face below the object, and the angle by which it turns to lie flat [rad].
-
-    Start at the most downward face and tip over edges until a face is stable.
-    """
+    Start at the most downward face and tip over edges until a face is stable."""
     down = quat_rotate(np.asarray(quaternion) * np.array([1.0, -1, -1, -1]), np.array([0.0, 0.0, -1.0]))
     face = int(np.argmax(faces.normal @ down))
     # Tipping lowers the centre of mass, so it ends; the bound guards against rounding on spheres.

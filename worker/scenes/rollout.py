@@ -48,7 +48,6 @@ def rollout_on(
     level: Level = "standard",
 ) -> Callable[[GraspSet, PlacedGrasps | None, Floats], Floats] | None:
     """Return the rollout for `run`; None: the planner's loss decides. `known` caches verdicts of `level`.
-
     Around free objects a GPU plans faster than the CPU simulates; in scenes it waits for the rollouts, on all threads.
     """
     on_gpu = run.device.startswith("cuda")
@@ -67,15 +66,7 @@ def hold_rollout(
     level: Level = "standard",
 ) -> Callable[[GraspSet, PlacedGrasps | None, Floats], Floats]:
     """Return a `worker.planners.Rollout` that scores free grasps (N,) by short pushes.
-    Scores are below 2 for grasps that also hold against the six pushes.
-
-    Args:
-        hand: the hand.
-        obj: the object.
-        pieces: computes the object's convex pieces on first use.
-        known: cache of verdicts for the validator.
-        level: of the verdicts.
-    """
+    Scores are below 2 for grasps that also hold against the six pushes."""
     short, run = push_rollout(hand, obj, pieces), ExecutionContext(threads=1)
 
     def rollout(grasps: GraspSet, placed: PlacedGrasps | None, beat: Floats | None = None) -> Floats:
@@ -107,12 +98,7 @@ def lift_rollout(
     hand slowly at first.
 
     Args:
-        hand: the hand.
-        obj: the object.
-        pieces: computes the object's convex pieces on first use.
         threads: per call; planners on the CPU already call from all their threads.
-        known: cache of lifts for the validator.
-        level: of the lift test.
     """
     shorts, run = LiftRollouts(hand, obj, pieces, threads=threads), ExecutionContext(threads=threads)
 
@@ -180,13 +166,8 @@ def scene_verdicts(
     Grasps that do not lift are not tested at half the friction.
 
     Args:
-        hand: the hand.
-        obj: the object.
         grasps: N grasps with `scene`.
-        scenes: the scenes.
-        level: of the lift test.
         pieces: the object's convex pieces; None: grasps are only checked for clearance, not validated.
-        known: see `validate_lifts`.
         run: receives the number of validated grasps; polled for cancellation between grasps.
 
     Returns:

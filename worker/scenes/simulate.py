@@ -76,11 +76,6 @@ def drop(obj: ObjectModel, *, count: int, seed: int) -> dict[str, Floats]:
     changes by a millimetre. An object that rolls is laid on a steady face, see `steadied`. Scene i depends on the
     object, the seed and i alone.
 
-    Args:
-        obj: the object.
-        count: number of scenes S.
-        seed: any non-negative integer.
-
     Returns:
         `scene/object_pose` (S, 7) with the lowest point of the object at z = 0; `scene/rest_probability` (S,), the
         share of `REFERENCE_DROPS` fixed drops (and this one) that rest on the same face; `scene/drop_seconds` (S,).
@@ -109,10 +104,8 @@ def steadied(
     obj: ObjectModel, faces: RestingFaces, face: int, pose: Floats, rng: np.random.Generator
 ) -> tuple[int, Floats]:
     """Return the face on which a centred object stays after coming to rest on `face`, and its pose (7,).
-
     Where it may roll there, draw one of the faces of the reference drops on which it does not, with their frequency. An
-    object that is round on all of them stays as it lies.
-    """
+    object that is round on all of them stays as it lies."""
     if not faces.rolls(face) or not (steady := _steady_faces(obj)):
         return face, pose
     chosen = int(rng.choice(steady))

@@ -106,10 +106,8 @@ def plan_way(hand: HandModel, obj: ObjectModel, grasps: GraspSet, placed: Placed
 
 def plan_free_way(hand: HandModel, obj: ObjectModel, grasps: GraspSet) -> Trajectory:
     """Plan trajectories around an object that stands alone: a retreat of `STANDOFF_M` free of the object.
-
     The palm's own direction of retreat comes first, then directions ever farther from it. `lift` is the squeeze posture
-    after that retreat, with the object in hand. There are no obstacles, so all clearances are infinite.
-    """
+    after that retreat, with the object in hand. There are no obstacles, so all clearances are infinite."""
     hand_points, object_points = _FREE_POINTS
     probe = probe_of(hand, obj, hand_points=hand_points, object_points=object_points)
     nowhere = PlacedGrasps((), IDENTITY_POSE[None], np.zeros(len(grasps), np.intp))

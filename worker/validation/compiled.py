@@ -80,15 +80,7 @@ Answer = TypeVar("Answer")
 def answers(
     rows: Sequence[int], make: Callable[[], Test], ask: Callable[[Test, int], Answer], *, threads: int, name: str
 ) -> list[Answer]:
-    """Run tests on some grasps in parallel; return the results in their order.
-
-    Args:
-        rows: the grasps.
-        make: creates a test.
-        ask: runs a test on a grasp.
-        threads: at most.
-        name: of the threads.
-    """
+    """Run tests on some grasps in parallel; return the results in their order."""
     tests: queue.SimpleQueue[Test] = queue.SimpleQueue()
     workers = max(1, min(threads, len(rows)))
     for _ in range(workers):
@@ -114,19 +106,7 @@ def measured(
     run: ExecutionContext,
     name: str,
 ) -> NDArray[np.float64]:
-    """Return measurements (count,) on grasps that are `held` (count,), None: all; nan for the others.
-
-    Args:
-        count: grasps.
-        held: which of them are tested.
-        make: creates a test; not called where there is nothing to test.
-        ask: runs a test on a grasp.
-        run: polled for cancellation between grasps.
-        name: of the threads.
-
-    Raises:
-        TaskCancelled: `run.cancelled()` returned True.
-    """
+    """Return measurements (count,) on grasps that are `held` (count,), None: all; nan for the others."""
 
     def asked(test: Test, row: int) -> float:
         run.check("the validator")

@@ -87,7 +87,6 @@ def decompose(obj: ObjectModel, *, cache: Path | None = None) -> ConvexPieces:
     """Return the convex pieces of an object, from the cache if possible.
 
     Args:
-        obj: the object.
         cache: cache folder; by default `$XDG_CACHE_HOME/graspd/convex`.
 
     Raises:

@@ -53,10 +53,8 @@ class ForeignVerdicts:
 
 def share_counts(held: Mapping[str, int]) -> dict[str, Any]:
     """Return shares from counts of grasps that hold in both models, in one alone, or in neither.
-
     foreign_held: the counts; agreement: share with the same verdict in both; foreign_share: of the grasps that hold
-    nominally, the share that holds in the other model; foreign_gsr: the share of all that does. None: no grasps.
-    """
+    nominally, the share that holds in the other model; foreign_gsr: the share of all that does. None: no grasps."""
     n, nominal = sum(held.values()), held["both"] + held["nominal"]
 
     def share(part: int, whole: int) -> float | None:
@@ -88,11 +86,9 @@ def foreign_verdicts(
 
 def driven_as(same: SameHand) -> HandModel:
     """Return the other model with the gains and limits of ours.
-
     A dof of gain k and limit e that moves n joints by m_i gives each of them the gain k / (n m_i^2) and the limit
     e / (n |m_i|). It takes sum(m_i^2 k_i) and sum(|m_i| e_i) from joints. So the drive along the joints' common
-    motion stays the same, whether a model turns them as one or hangs them on a tendon of equal pulls.
-    """
+    motion stays the same, whether a model turns them as one or hangs them on a tendon of equal pulls."""
     ours, theirs = same.ours, same.theirs
     gain, limit = _of_joints(ours)
     gain, limit = gain[same.joints], limit[same.joints]
@@ -112,9 +108,7 @@ def _of_joints(hand: HandModel) -> tuple[Floats, Floats]:
 
 def in_other_model(same: SameHand, grasps: GraspSet) -> GraspSet:
     """Return the grasps as postures of the other model: base transformed, joints matched by name.
-
-    Where joints are coupled in the other model but not in ours, they take the nearest feasible values.
-    """
+    Where joints are coupled in the other model but not in ours, they take the nearest feasible values."""
 
     def posture(part: Posture) -> Posture:
         pose = compose(np.asarray(part.hand_pose, float), same.base)

@@ -72,11 +72,9 @@ def verdict_key(
     hand: HandModel, obj: ObjectModel, level: Level, hard: bool, *, pieces: ConvexPieces, prefilter: Sequence[Any] = ()
 ) -> str:
     """Return the digest of the terms of a verdict: all that determines it except the grasp's postures.
-
     It covers level, friction, masses, gains and torque limits, the rules of pregrasp and squeeze, shapes of the hand,
     convex pieces of the object, the constants of `MOVES` and of the level, version of the engine; and `prefilter`,
-    the prefilter's terms where it takes part.
-    """
+    the prefilter's terms where it takes part."""
     shapes = b"".join(np.round(p.vertices, 9).tobytes() + np.round(p.pose, 9).tobytes() for p in hand.pieces)
     return digest_json(
         {

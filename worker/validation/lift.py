@@ -214,7 +214,6 @@ class Lift(Test):
 
     def _yielded(self) -> tuple[Floats, Floats] | None:
         """Return the root's position (3,) and its rotation (4,) from the command; None: fixed or irrelevant.
-
         The protocol's weld yields by 10 degrees under a hammer, which no arm does: an object that only follows the hand
         has not moved in it."""
         at = self.scene.root_qpos

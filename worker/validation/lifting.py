@@ -76,7 +76,6 @@ def validate_lifts(
         obj: the object, with its mass and friction; `ObjectModel.published` has those of the protocol.
         grasps: N grasps with pregrasp, squeeze and, for level lift, approach.
         placed: their scenes; `index` has one for each grasp.
-        level: dexgraspbench or lift.
         hard: sliding friction halved, torsional friction a tenth, of supports too.
         pieces: convex pieces of the object; by default its CoACD pieces.
         known: finished lifts of this hand, object and level, which are reused; new ones are added.

@@ -174,16 +174,9 @@ def payloads(
     """Compute payloads (N,) of grasps [kg]; nan: not tested, or the grasp does not lift the object.
 
     Args:
-        hand: the hand.
         obj: the object; masses below its own are not tested.
-        grasps: N grasps.
-        pieces: the object's convex pieces.
         placed: the scenes of the lifts; None: a free object is pushed in six directions.
         held: (N,) which grasps are tested; None: all.
-        run: polled for cancellation between grasps.
-
-    Raises:
-        TaskCancelled: `run.cancelled()` returned True.
     """
 
     def make() -> LiftPayload | PushPayload:
@@ -248,17 +241,8 @@ def limit_of(
     """Return the payload limit of N grasps; None: the wanted mass is lifted, or fewer than `least` lift.
 
     Args:
-        hand: the hand.
-        obj: the object.
-        grasps: N grasps.
-        pieces: the object's convex pieces.
-        placed: their scenes; None: the object is free.
         wanted: mass that should be lifted [kg]; None: none.
         least: grasps that must lift a light object.
-        run: polled for cancellation between grasps.
-
-    Raises:
-        TaskCancelled: `run.cancelled()` returned True.
     """
     if len(grasps) < least:
         return None
@@ -321,16 +305,7 @@ def shake_margins(
     The motion is displacement or rotation; below 1 the grasp holds.
 
     Args:
-        hand: the hand.
-        obj: the object.
-        grasps: N grasps.
-        placed: their scenes.
-        pieces: the object's convex pieces.
         held: (N,) which grasps are tested; None: all.
-        run: polled for cancellation between grasps.
-
-    Raises:
-        TaskCancelled: `run.cancelled()` returned True.
     """
 
     def make() -> Shake:
@@ -353,7 +328,6 @@ def capacities(hand: HandModel, obj: ObjectModel, grasp: Posture, against: Float
     """Compute load capacities (N,) [kg]; 0: no contact; inf: no drive and no friction limits it.
 
     Args:
-        hand: the hand.
         obj: the object, with its friction.
         grasp: N postures at contact.
         against: (N, K, 3) unit vectors against the weight; the least of K counts.

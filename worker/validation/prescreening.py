@@ -210,9 +210,6 @@ def push_rollout(
     that hold at half the friction, and below 2 at full friction.
 
     Args:
-        hand: the hand.
-        obj: the object.
-        pieces: computes the object's convex pieces on first use.
         threads: per call; planners on the CPU already call from all their threads.
     """
     pushes = PushRollouts(hand, obj, pieces, threads=threads)

@@ -110,8 +110,6 @@ def robust(
     Args:
         held: (N,) verdicts of the nominal model; only grasps with 1 are tested. By default all.
         placed: their scenes, for the lift test; None: six pushes.
-        level: of the lift test.
-        models: for each grasp.
         wanted: share of them; the validation of a grasp ends once the share is decided. 0: all are validated.
         seed: of the models, with the grasp's own numbers.
         hard: at the hard protocol's friction.
@@ -121,7 +119,6 @@ def robust(
     Raises:
         InputError: no scene or approach of each grasp.
         MeshError: the object has no usable convex pieces.
-        TaskCancelled: `run.cancelled()` returned True.
     """
     if placed is not None:
         require_ways(grasps, placed, level)
@@ -192,14 +189,9 @@ def robustness(
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> Floats:
     """Return the share (N,) of `repeats` in which a grasp holds with noise on the object's pose; nan: not tested.
-
     The object is moved by `NOISE_M` in a random direction and turned by `NOISE_RAD` about a random axis through its
     centre of mass; a grasp's noise follows from `seed`, the repeat and its place in the set. Only grasps with `held`
-    (N,) 1 are tested, by default all, at level fast: it suffices, for a share is not a success rate.
-
-    Raises:
-        TaskCancelled: when `run.cancelled()` answers True.
-    """
+    (N,) 1 are tested, by default all, at level fast: it suffices, for a share is not a success rate."""
     out = np.full(len(grasps), np.nan)
     tried = np.arange(len(grasps)) if held is None else np.flatnonzero(np.asarray(held) == 1)
     if not len(tried) or repeats < 1:

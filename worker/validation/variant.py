@@ -166,10 +166,8 @@ def _vector(rng: np.random.Generator, most: float) -> Vector:
 
 def recoupled(hand: HandModel, coupling: Coupling) -> HandModel:
     """Return the hand with its tendons read otherwise; itself without tendons, or for other readings.
-
     separate: each joint of a tendon gets the drive it would have without the tendon. ratio: joints of a tendon turn as
-    one, by equal angles with their coefficients' signs, with the sum of their drives' gains and limits.
-    """
+    one, by equal angles with their coefficients' signs, with the sum of their drives' gains and limits."""
     if not hand.tendons or coupling not in ("separate", "ratio"):
         return hand
     if coupling == "separate":

@@ -66,9 +66,7 @@ class Models:
 
         Args:
             grasps: the grasps, with their approach except at level dexgraspbench.
-            row: of the grasp.
             placed: the scenes of all grasps; their supports and neighbours are those of these models.
-            variant: the model.
             dexgraspbench: run the published test instead of the whole one.
         """
         number = int(placed.index[row])

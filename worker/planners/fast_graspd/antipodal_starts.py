@@ -227,8 +227,7 @@ def promising(
 ) -> tuple[NDArray[np.intp], Floats]:
     """Select the `keep` of C draws per hand that need the least rise to clear the obstacles, (n, keep).
     Also return the distance of the pair from between the pads (n, keep) [m]. Near enough draws keep their order.
-    `uniform` (n, C, 6) and `ways`: see `across`; `room`: clearance to keep in addition to the margin [m].
-    """
+    `uniform` (n, C, 6) and `ways`: see `across`; `room`: clearance to keep in addition to the margin [m]."""
     count, draws, _ = uniform.shape
     outlines, off = outlines_of(hand, opening.known.q), np.zeros((count, draws))
     for rows in np.array_split(np.arange(count), 1 + count // AT_ONCE):

@@ -103,14 +103,8 @@ def tried(
     without a good one. Unbalanced or infeasible hands have no rollout, but each grasp's first candidate is taken.
 
     Args:
-        hand: the hand.
-        obj: the object.
         order: (n, each) rows of the hands of each grasp, the most promising first.
-        seat: seats hands.
-        placed: scenes of the n grasps; None: free.
-        rollout: computes the scores.
         together: hands of each grasp that are seated at once.
-        device: finds the postures that the rollout needs.
     """
     taken, left = Selection.none(len(order), hand.dofs), np.arange(len(order))
     for wave in np.split(order, range(together, order.shape[1], together), axis=1):

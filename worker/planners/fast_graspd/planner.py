@@ -283,7 +283,6 @@ def _set_out(launch: _Launch, rows: Rows, attempt: Rows) -> _Begun:
 
 def _with_place(launch: _Launch, begun: _Begun) -> Rows:
     """Return the rows of the batches that found starts.
-
     Around a free object every grasp must have one; in scenes one per batch suffices, made here or elsewhere."""
     batches = launch.batches
     deep = begun.depth.reshape(len(begun.rows), -1)
@@ -337,7 +336,6 @@ def _work(launch: _Launch, begun: _Begun) -> LaunchPart:
 
 def _tried_again(launch: _Launch, part: LaunchPart, run: ExecutionContext) -> LaunchPart:
     """Retry grasps that fail their rollout or, if free, balance poorly; keep the first good or the best.
-
     The last few grasps would leave cores idle, and a hand costs a third more in a small launch. They make some attempts
     ahead; attempts after a good one are dropped, so the result equals that of sequential attempts."""
     closer = (STANDS,) * CLOSER + (FAILED,) * (ATTEMPTS - CLOSER)

@@ -95,8 +95,7 @@ def clear_scene_starts(
     That is the first clear draw, or the least deep; of antipodal ones the clear draw with the best placed pair.
 
     In a narrow scene some grasps find no clear start: they end blocked, and the batch consists of the others.
-    `ways` are `free_ways` of each scene.
-    """
+    `ways` are `free_ways` of each scene."""
     hand, obj = model.hand.model, model.obj.model
     probe = Probe(model, len(generators), room=ROOM)
     used = set(placed.index.tolist())
@@ -154,8 +153,7 @@ def _depths(
     """Return depths (n, len(RETREATS)) [m] of hands and mountings in scenes (n,); inf if not computed.
     They run from the farthest distance with `worth` (n, len(RETREATS)) inwards while clear.
 
-    Most draws fail for reasons that no retreat fixes, and hardly any is clear nearer than where it is not.
-    """
+    Most draws fail for reasons that no retreat fixes, and hardly any is clear nearer than where it is not."""
     found, open_ = np.full((len(scene), len(RETREATS)), np.inf), np.ones(len(scene), bool)
     for k in reversed(range(len(RETREATS))):
         left = np.flatnonzero(open_ & worth[:, k])
@@ -185,8 +183,7 @@ def _raise(
     """Lift draws `rows` in scenes (n,), at all distances, by the clearance of the nearest that is lacking.
     Return the distance (n, len(RETREATS)) of their pairs from between the pads [m], 0 for other draws.
 
-    Steps of retreat are too coarse for low objects: fingers would end above the object, not beside it.
-    """
+    Steps of retreat are too coarse for low objects: fingers would end above the object, not beside it."""
     off = np.zeros((len(scene), len(RETREATS)))
     if not len(rows):
         return off

@@ -192,10 +192,8 @@ def no_place(model: Model) -> InputError:
 
 def clear_starts(model: Model, generators: list[np.random.Generator], *, each: int = 1) -> tuple[HandState, Floats]:
     """Return a start per generator, the least deep of its draws, and its depth (n,) [m]; most are clear.
-
     Of the `each` starts of a grasp every second one, not the first, reaches across the object where possible. All do
-    if the object is too small or too wide for the hand's pads.
-    """
+    if the object is too small or too wide for the hand's pads."""
     hand, obj = model.hand.model, model.obj.model
     count, jaws = len(generators), JawStarts.of(hand, obj)
     retreats = RETREATS if jaws is None else JAW_RETREATS
@@ -223,7 +221,6 @@ def open_further(
     The pre-shape of some hands leaves no gap as wide as the object.
 
     Args:
-        model: of the starts.
         generators: of the n starts, in the state that `clear_starts` left.
         state, depth: result of `clear_starts`; better starts replace it.
         wanted: (n,) which of them may be opened.

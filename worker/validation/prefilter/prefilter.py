@@ -279,14 +279,7 @@ def screened(scene: Scene, terms: str, grasps: GraspSet, *, level: str, run: Exe
     """Run the prefilter on grasps in a scene.
 
     Args:
-        scene: the validator's own.
         terms: digest of everything that determines the scene.
-        grasps: N grasps.
-        level: standard or fast.
-        run: its device runs the worlds.
-
-    Raises:
-        TaskCancelled: `run.cancelled()` returned True.
     """
 
     postures = GraspSet(grasps.grasp, grasps.pregrasp, grasps.squeeze, grasps.stability_loss)
