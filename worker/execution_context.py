@@ -37,7 +37,6 @@ class CoreSharing:
         self._lock = threading.Lock()
 
     def leave(self) -> None:
-        """Release the cores of one part."""
         with self._lock:
             self.members -= 1
 
@@ -75,24 +74,19 @@ class ExecutionContext:
         return replace(self, progress=tell)
 
     def quiet(self) -> ExecutionContext:
-        """Return the context without progress, for parts that are too short or of unknown length."""
         return replace(self, progress=_silent)
 
     def check(self, what: str) -> None:
-        """Raise TaskCancelled if the work should stop."""
         if self.cancelled():
             raise TaskCancelled(f"{what} was cancelled")
 
 
 class Count:
-    """Counter of finished grasps, which reports progress from any thread."""
-
     def __init__(self, total: int, run: ExecutionContext, what: str, done: int = 0) -> None:
         self._total, self._run, self._what, self._done = total, run, what, done
         self._lock = threading.Lock()
 
     def add(self, more: int) -> None:
-        """Count `more` finished grasps."""
         with self._lock:
             self._done += more
             self._run.progress(self._done, self._total, self._what)

@@ -85,8 +85,6 @@ PARTS: Final = (0.6, 0.8, 1.0)
 
 @dataclass(frozen=True)
 class ValidatedBatch:
-    """Result of one batch."""
-
     grasps: GraspSet
     columns: Arrays
     """The `quality/...` columns of a base shard."""
@@ -112,7 +110,6 @@ class ValidatedBatch:
     """Payload limit of the best grasps, where none is selected because of the weight."""
 
     def moved(self, by: Sequence[float]) -> ValidatedBatch:
-        """Return the batch with its grasps moved by a vector (3,) [m]."""
         return replace(self, grasps=self.grasps.moved(by))
 
 
@@ -220,7 +217,6 @@ class Scoring:
         self.beside.shutdown()
 
     def goes_on(self) -> None:
-        """Ignore cancellation from here on."""
         self.run = replace(self.run, cancelled=DEFAULT_CONTEXT.cancelled)
 
     def rollout(self, known: Known) -> Rollout | None:
@@ -239,7 +235,6 @@ class Scoring:
         )
 
     def key(self) -> str:
-        """Return the digest of the terms of the verdicts."""
         assert self.pieces is not None
         pieces = self.pieces.result()
         if self.scenes is None:
@@ -317,7 +312,6 @@ class Scoring:
     def _validated(
         self, grasps: GraspSet, run: ExecutionContext, known: Known | None, prefilter: PrefilterVerdicts | None
     ) -> tuple[GraspSet, Arrays]:
-        """Return the grasps, in scenes with their trajectories, and their verdicts."""
         pieces = None if self.pieces is None else self.pieces.result()
         if self.scenes is not None:
             level = lift_level(self._level)
@@ -381,7 +375,6 @@ class Scoring:
 
 @contextmanager
 def _timed(seconds: dict[str, float], name: str) -> Iterator[None]:
-    """Add the wall time of a block to `seconds[name]`."""
     began = time.perf_counter()
     yield
     seconds[name] += time.perf_counter() - began
@@ -389,8 +382,6 @@ def _timed(seconds: dict[str, float], name: str) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Needed:
-    """Candidates that a batch needs next."""
-
     number: int
     """Number of the round."""
     rows: range
@@ -444,7 +435,6 @@ class Batch:
             number += 1
 
     def add(self, made: Round) -> None:
-        """Add a round, without near-duplicates of selected grasps."""
         self.candidates += len(made.fates)
         self.repeated += made.repeated
         for name in self.seconds:
@@ -484,7 +474,6 @@ class Batch:
         return not self.scoring.run.device.startswith("cuda") and method(self.request.method).in_parts
 
     def made(self, asked: Needed) -> Round:
-        """Plan, validate and measure what is needed; on the CPU in parallel parts."""
         known: Known = {}
         run = self.run.part(*asked.progress)
         rollout = self.scoring.rollout(known)  # one for all parts
@@ -524,7 +513,6 @@ class Batch:
         return whole
 
     def wanted(self, asked: Needed, rollout: Rollout | None, *, others_have_place: bool) -> PlanRequest:
-        """Return the planner's request for the needed candidates."""
         number = self.number + asked.number * ROUND_STRIDE
         rows, scenes, placed = asked.rows, self.scoring.scenes, None
         if scenes is not None:
@@ -551,7 +539,6 @@ class Batch:
         return made
 
     def refused(self, error: NoStartFound) -> NoStartFound:
-        """Return the error with the geometric reason, where there is one."""
         why = self._narrow()
         return NoStartFound(f"{error}: {why}") if why else error
 
@@ -652,7 +639,6 @@ class Batch:
             self._rechecks = self.scoring.beside.submit(self._rechecked, first.grasps.take(valid[:count]))
 
     def _rechecked(self, grasps: GraspSet) -> NDArray[np.int8]:
-        """Return the verdicts of level `dexgraspbench` on grasps."""
         scoring = self.scoring
         assert scoring.pieces is not None
         run, pieces = scoring.run.quiet(), scoring.pieces.result()
@@ -664,7 +650,6 @@ class Batch:
 
 
 def _why(columns: Arrays, count: int) -> NDArray[np.object_]:
-    """Return the validator's outcome (N,) of each grasp that it drops."""
     found = np.full(count, "not_lifted", object)
     if "quality/lift_outcome" in columns:
         for lift, name in _LIFTED.items():

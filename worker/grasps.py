@@ -24,7 +24,6 @@ GRID_M: Final = 2.0**-30
 
 
 def on_grid(positions: ArrayLike) -> Floats:
-    """Round positions to `GRID_M`."""
     return np.rint(np.asarray(positions, float) / GRID_M) * GRID_M
 
 
@@ -48,11 +47,9 @@ class Posture:
         return len(self.hand_pose)
 
     def take(self, rows: NDArray[np.intp] | slice) -> Posture:
-        """Return some of the postures, in the order of `rows`."""
         return Posture(np.asarray(self.hand_pose, float)[rows], np.asarray(self.joint_positions, float)[rows])
 
     def moved(self, by: ArrayLike) -> Posture:
-        """Return the postures moved by a vector (3,) [m]."""
         return Posture(moved(self.hand_pose, by), self.joint_positions)
 
     @classmethod

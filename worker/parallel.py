@@ -24,8 +24,6 @@ class ProgressShares:
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def of(self, part: int) -> Progress:
-        """Return the progress callback of one part."""
-
         def tell(done: float, total: float, message: str) -> None:
             with self._lock:
                 self._done[part] = self.sizes[part] * (done / total if total > 0 else 0.0)

@@ -27,8 +27,6 @@ _LEAST_RATE: Final = 0.1
 
 @dataclass
 class Round:
-    """Selected grasps of one round."""
-
     grasps: GraspSet
     columns: Arrays
     rows: NDArray[np.intp]
@@ -46,7 +44,6 @@ class Round:
 
     @classmethod
     def joined(cls, parts: Sequence[Round]) -> Round:
-        """Join several rounds."""
         in_scene = {name: np.concatenate([part.in_scene[name] for part in parts]) for name in parts[0].in_scene}
         firsts = accumulate((len(part.fates) for part in parts), initial=0)
         seconds = {name: sum(part.seconds[name] for part in parts) for name in parts[0].seconds}
@@ -106,5 +103,4 @@ def parts_of(rows: range, cores: int) -> list[range]:
 
 
 def taken(grasps: GraspSet, columns: Arrays, rows: NDArray[np.intp]) -> tuple[GraspSet, Arrays]:
-    """Return some of the grasps (K,) with their columns."""
     return grasps.take(rows), {path: array if path == THRESHOLDS else array[rows] for path, array in columns.items()}

@@ -63,7 +63,6 @@ def fingers_of_bodies(hand: HandModel) -> NDArray[np.int32]:
 
 
 def count_fingers(hand: HandModel) -> int:
-    """Return the size of arrays by finger."""
     return max(1, len(hand.fingertips), int(fingers_of_bodies(hand).max()) + 1)
 
 
@@ -169,7 +168,6 @@ class Openings:
         return out
 
     def _leave(self, grasp: Posture, sweep: Any) -> None:
-        """Compute the direction in which each finger leaves the object."""
         posing, hand = self.posing, self.posing.hand
         bodies, near = posing.touch(grasp, CLEARANCE_M)
         with wp.ScopedDevice(posing.device):
@@ -189,7 +187,6 @@ class Openings:
             )
 
     def _step(self, sweep: Any) -> None:
-        """Step along a sweep's path until all fingers are clear."""
         posing, out = self.posing, Launches(self.posing.device)
         out.add(
             opening.place_opening,
@@ -251,7 +248,6 @@ class Openings:
         return found
 
     def _blocked(self, jams: Any, blocked: Blocked) -> NDArray[np.int32]:
-        """Return the blocked fingers (N, F) of hands that are still checked."""
         rows = np.flatnonzero(jams.going.numpy())
         out = np.zeros((self.count, self.fingers_count), np.int32)
         if len(rows):

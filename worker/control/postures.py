@@ -131,7 +131,6 @@ def hold_forces(
 
 
 def normal_force(obj: ObjectModel) -> float:
-    """Return the sum of the contact forces' normal components that hold an object [N]."""
     least, most = (times * ACCELERATION * obj.mass for times in OF_WEIGHT)
     return min(max(TOTAL_NORMAL_FORCE, least), most)
 
@@ -149,7 +148,6 @@ def standing_off(hand: HandModel, obj: ObjectModel, grasp: Posture, *, device: s
 
 
 def _in_the_way(hand: HandModel, opening: Openings, placed: PlacedGrasps | None) -> Blocked | None:
-    """Return the check for obstacles of opening fingers."""
     if placed is None:
         return None
     pose = opening.hand_pose

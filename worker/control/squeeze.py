@@ -30,8 +30,6 @@ SUM: Final = 10.0
 
 @dataclass(frozen=True)
 class HoldForces:
-    """Balanced forces of N grasps."""
-
     residual: Floats
     """(N,) net wrench over the sum of normal forces, torques over the object's radius.
     0: balanced; 1: nothing presses. It predicts whether a grasp holds."""
@@ -150,7 +148,6 @@ def solved(matrix: Any, target: Floats, ridge: float, count: Any) -> Any:
 
 
 def _plain(matrix: Floats, target: Floats, ridge: float, count: int) -> Floats:
-    """Solve one system by SciPy, with the ridge as additional rows."""
     from scipy.optimize import nnls
 
     system = np.vstack([matrix[:count].T, ridge * np.eye(count)])

@@ -30,7 +30,6 @@ def keep_file(path: Path) -> str:
 
 
 def keep(digest: str, network: ProposalNetwork) -> None:
-    """Cache a network under a digest; the most recently used ones stay."""
     with _lock:
         _known[digest] = network
 

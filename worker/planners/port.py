@@ -67,8 +67,6 @@ class Planner(Protocol):
 
 @dataclass(frozen=True)
 class BatchRequest:
-    """One of several batches requested at once."""
-
     wanted: PlanRequest
     run: ExecutionContext
 

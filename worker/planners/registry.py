@@ -32,7 +32,6 @@ PLANNERS: Final[dict[str, tuple[str, str]]] = {
 
 
 def method_names() -> list[str]:
-    """Return all methods: graspd's own, then those of other packages."""
     return [*PLANNERS, *sorted(set(_offered()) - set(PLANNERS))]
 
 

@@ -33,7 +33,6 @@ class StepCounter:
         self._lock = threading.Lock()
 
     def __call__(self, work: float, message: str) -> None:
-        """Add finished work; raise TaskCancelled on cancellation."""
         self._run.check("the synthesis")
         with self._lock:
             self._done += work
@@ -65,7 +64,6 @@ def run_parts(parts: list[range], work: Callable[[range], T]) -> list[T]:
 
 
 def _fitted(part: range, work: Callable[[range], T]) -> list[T]:
-    """Run the work of a part, in as many launches as its GPU's memory requires."""
     try:
         return [work(part)]
     except RuntimeError as error:

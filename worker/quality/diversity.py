@@ -111,7 +111,6 @@ def _rotation_vector(quaternion: Floats) -> Floats:
 
 
 def approach_cells(hand: HandModel, quaternions: NDArray[np.float64]) -> NDArray[np.int32]:
-    """Return the approach cells (B,) of B grasps from the root's quaternions (B, 4)."""
     return cells_of(-quat_rotate(quaternions, hand.palm.approach)).astype(np.int32)
 
 

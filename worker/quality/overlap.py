@@ -47,7 +47,6 @@ class Overlap:
         return out
 
     def _crossed(self, piece: NDArray[np.intp], poses: Floats) -> NDArray[np.bool_]:
-        """Check (K,) whether a face of the object may reach into pieces, with their bodies at poses (K, 7)."""
         centre = self._probe.obj.centre_of_mass
         given = np.concatenate([poses[:, :3] - centre, to_xyzw(poses[:, 3:])], axis=1)
         with wp.ScopedDevice("cpu"):

@@ -30,8 +30,6 @@ GPU_HANDS: Final = 4096
 
 @dataclass(frozen=True)
 class PostureData:
-    """Device data of a hand and an object for the posture kernels."""
-
     probe: Probe
     chain: Any
     points: Any
@@ -70,25 +68,20 @@ class PostureData:
 
     @property
     def lane(self) -> int:
-        """Points of a hand per thread."""
         return 1 if self.is_cuda else CPU_LANE
 
     @property
     def lanes(self) -> int:
-        """Threads per hand."""
         return -(-len(self.probe.points) // self.lane)
 
     @property
     def at_once(self) -> int:
-        """Hands processed at a time."""
         return GPU_HANDS if self.is_cuda else CPU_HANDS
 
     def parts(self, count: int) -> list[slice]:
-        """Return slices of `count` hands, to be processed one after the other."""
         return [slice(i, min(i + self.at_once, count)) for i in range(0, count, self.at_once)]
 
     def bodies(self, count: int) -> Any:
-        """Allocate the bodies of `count` hands."""
         with wp.ScopedDevice(self.device):
             return room_for_bodies(self.hand, count)
 

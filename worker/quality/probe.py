@@ -105,7 +105,6 @@ class Probe:
         self.skin = self._skin()
 
     def _skin(self) -> Any:
-        """The object's surface with a coarse grid of distances."""
         obj, margin = self.obj, 1e-4
         low = obj.vertices.min(axis=0) - obj.centre_of_mass - REACH_M - margin
         high = obj.vertices.max(axis=0) - obj.centre_of_mass + REACH_M + margin
@@ -172,7 +171,6 @@ class Probe:
         return gap.numpy().astype(float)
 
     def posed_points(self, bodies: Floats) -> Floats:
-        """Return hand points (B, N, 3) in the object frame for body poses (B, L, 7)."""
         body, position = self.points.body, self.points.position
         return _turned(bodies, body, position) + bodies[:, body, :3]
 
@@ -192,7 +190,6 @@ class Probe:
         )
 
     def measure(self, posture: Posture) -> Distances:
-        """Measure all distances of B postures."""
         found = self.touch(posture)
         return Distances(
             **vars(found),
@@ -236,7 +233,6 @@ class Probe:
         return least.numpy().astype(float)
 
     def _posed_pieces(self, bodies: Floats) -> list[Any]:
-        """Return the pieces with positions and rotations in the kernels' layout."""
         frames = compose(bodies[:, self._piece_body], self._piece_frame[None])
         with wp.ScopedDevice(self.device):
             position: Any = wp.array(frames[..., :3] - self.obj.centre_of_mass, dtype=wp.vec3)
@@ -277,11 +273,9 @@ def _kernel_frame(kind: str, pose: Floats, vertices: Floats) -> Floats:
 
 
 def _is_grid(kept: Mapping[str, NDArray[Any]], counts: Sequence[int]) -> bool:
-    """Check whether a cached array can be the coarse grid with so many nodes per side."""
     return set(kept) == {"coarse"} and kept["coarse"].shape == tuple(counts) and kept["coarse"].dtype == np.float32
 
 
 @cached_by_content(8)
 def probe_of(hand: HandModel, obj: ObjectModel, *, hand_points: int, object_points: int, device: str = "cpu") -> Probe:
-    """Return the probe of a pair, cached in memory."""
     return Probe(hand, obj, hand_points=hand_points, object_points=object_points, device=device)

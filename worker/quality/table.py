@@ -61,8 +61,6 @@ CHUNK: Final = 16
 
 
 class _Pair:
-    """Data shared by the chunks of one pair's tables. Thread-safe."""
-
     def __init__(self, terms: _Terms) -> None:
         hand, obj = terms.hand, terms.obj
         self.obj, self.friction = obj, terms.friction
@@ -145,8 +143,6 @@ def measure(
 
 @dataclass(frozen=True)
 class _Terms:
-    """Subject and terms of a measurement."""
-
     hand: HandModel
     obj: ObjectModel
     friction: float
@@ -163,13 +159,11 @@ class _Terms:
             return _pairs[content]
 
     def empty(self) -> Columns:
-        """Columns of no grasps."""
         swept = {metric.name for metric in GRASP_METRICS if metric.swept}
         return {f"quality/{name}": np.zeros((0, len(self.thresholds)) if name in swept else 0) for name in MEASURES}
 
 
 def _measured(terms: _Terms, postures: Sequence[Posture], done: Count, run: ExecutionContext) -> list[Columns]:
-    """Measure the columns of each chunk, in threads or in the processes of a pool."""
     if run.pool is not None:
         return run.pool.map(
             _columns,
@@ -197,8 +191,6 @@ def _columns(terms: _Terms, posture: Posture) -> Columns:
 
 @dataclass(frozen=True)
 class _Chunk:
-    """Some grasps of a table, and their distances."""
-
     pair: _Pair
     found: Distances
 
@@ -236,7 +228,6 @@ ENVELOPING: Final = 2
 
 
 def grasp_types(probe: Probe, found: Distances) -> NDArray[np.int32]:
-    """Return the `GraspType` (B,) of B grasps."""
     hand = probe.hand
     finger = finger_of_body(hand)
     touching = probe.body_distance(found) < LINK_CONTACT_M

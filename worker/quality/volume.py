@@ -32,7 +32,6 @@ class SharedVolume:
 
     @property
     def exact(self) -> bool:
-        """Whether volumes come from the boolean of solids."""
         return self._object is not None
 
     def of(self, bodies: Floats, near: NDArray[np.bool_]) -> Floats:
@@ -62,7 +61,6 @@ class SharedVolume:
         return float(whole.volume()) / _UNIT**3 * 1e6
 
     def _matrices(self, poses: Floats) -> Floats:
-        """Return the matrices (K, 3, 4) of body poses (K, 7) for manifold3d."""
         matrices = pose_to_matrix(poses)[:, :3]
         matrices[..., 3] = (matrices[..., 3] - self.obj.centre_of_mass) * _UNIT
         return matrices
@@ -81,7 +79,6 @@ class VoxelVolume:
         self._probe = Probe(hand, obj, hand_points=hand.bodies * 16, object_points=64)
 
     def volume_cm3(self, bodies: Floats, pieces: NDArray[np.intp]) -> float:
-        """Return the shared volume of the given pieces, posed by bodies (L, 7) [cm^3]."""
         low, high = self._box(bodies, pieces)
         if (high <= low).any():
             return 0.0

@@ -94,7 +94,6 @@ def transfer(
 
 
 def count_rejections(rejection: NDArray[np.uint8]) -> dict[str, int]:
-    """Count the grasps rejected for each reason."""
     return {r.name.lower(): int((rejection == r).sum()) for r in Rejection if r is not Rejection.NONE}
 
 

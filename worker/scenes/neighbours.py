@@ -57,15 +57,12 @@ MOST_NEIGHBOURS: Final = 8
 
 @dataclass(frozen=True)
 class Neighbours:
-    """The M other objects on the table."""
-
     objects: Sequence[ObjectModel]
     poses: Floats
     """(S, M, 7) in the table frame."""
 
     @property
     def centred(self) -> Neighbours:
-        """Return the objects with their frames at their centres."""
         poses = np.array(self.poses, float)
         for number, obj in enumerate(self.objects):
             poses[:, number] = to_centre(poses[:, number], obj.centre)
@@ -104,8 +101,6 @@ def drop_together(obj: ObjectModel, neighbours: Sequence[ObjectModel], *, count:
 
 
 class _Heap:
-    """Compiled simulation of some objects above a table."""
-
     def __init__(self, objects: Sequence[ObjectModel]) -> None:
         self.objects = objects
         self.faces = [resting_faces(obj) for obj in objects]
@@ -315,8 +310,6 @@ def _drawn(
 
 
 class _Hulls:
-    """Convex hulls of some objects, with their distances from each other and from obstacles."""
-
     def __init__(
         self, objects: Sequence[ObjectModel], supports: Sequence[Obstacle], within: tuple[float, float] | None
     ) -> None:
@@ -330,7 +323,6 @@ class _Hulls:
         self._data = mujoco.MjData(self._model)
 
     def middle(self, number: int, pose: Floats) -> Floats:
-        """Return the position (2,) of an object's centre of mass."""
         return np.asarray((quat_rotate(pose[3:], self.objects[number].centre_of_mass) + pose[:3])[:2])
 
     def room(self, number: int, pose: Floats) -> tuple[Floats, Floats]:

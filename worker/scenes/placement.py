@@ -118,7 +118,6 @@ def _centred_spec(spec: SceneSpec, obj: ObjectModel, others: Sequence[ObjectMode
 def _scenes_of(
     spec: SceneSpec, obj: ObjectModel, others: Sequence[ObjectModel], *, count: int, seed: int
 ) -> tuple[Scenes, dict[str, Floats]]:
-    """Create scenes of centred objects; see `scenes_of`."""
     supports = supports_of(spec)
     given = [one.pose for one in spec.neighbours if one.pose is not None]
     if not others:
@@ -169,7 +168,6 @@ def _laid(
 
 
 def _check_apart(things: Sequence[Neighbour], poses: Floats) -> None:
-    """Check that no two objects penetrate each other more than rounded poses explain."""
     for (a, b), gap in gaps_between(things, poses).items():
         if -gap.min() > SUNK:
             names = things[a].obj.name, things[b].obj.name
@@ -253,7 +251,6 @@ def _box(corners: Floats) -> Floats:
 
 
 def _as_qhull(planes: Floats) -> Floats:
-    """Return rows n, -d of n.x - d <= 0."""
     return np.column_stack([planes[:, :3], -planes[:, 3]])
 
 
@@ -272,7 +269,6 @@ def _corners_and_edges(points: Floats) -> tuple[Floats, NDArray[np.intp]]:
 
 
 def _outward(corners: Floats, triangles: NDArray[Any], normals: Floats) -> NDArray[Any]:
-    """Return the triangles, flipped where they face inwards."""
     a, b, c = (corners[triangles[:, k]] for k in range(3))
     inward = (np.cross(b - a, c - a) * normals).sum(axis=1) < 0
     triangles[inward] = triangles[inward][:, ::-1]

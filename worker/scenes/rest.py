@@ -51,7 +51,6 @@ class RestingFaces:
 
     @property
     def stable(self) -> Ints:
-        """Indices of the stable faces."""
         return np.flatnonzero(self.successor == np.arange(len(self.successor))).astype(np.int32)
 
     def looseness(self, face: int) -> tuple[float, float]:

@@ -120,7 +120,6 @@ def lift_rollout(
         return score
 
     def lifted(grasps: GraspSet, placed: PlacedGrasps, score: Floats, beat: Floats) -> Floats:
-        """Return scores (k,) of candidates that hold briefly and whose trajectory is clear."""
         lift = partial(validate_lifts, hand, obj, level=level, pieces=pieces(), known=known, run=run)
         out, barely = np.maximum(score, SLIPS), score >= SLIPS
         some = np.flatnonzero(~barely)

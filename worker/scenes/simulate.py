@@ -49,8 +49,6 @@ _CONTACT: Final[dict[str, Any]] = {"friction": [0.8, 0.005, 0.002], "condim": 6,
 
 @dataclass(frozen=True)
 class RestPose:
-    """Result of a drop."""
-
     pose: Floats
     """(7,) object frame in the table frame, laid flat on `face`."""
     face: int
@@ -59,8 +57,6 @@ class RestPose:
 
 @dataclass(frozen=True)
 class _Table:
-    """Compiled simulation of one object."""
-
     model: mujoco.MjModel
     data: mujoco.MjData
     faces: RestingFaces
@@ -147,13 +143,11 @@ def _reference_faces(obj: ObjectModel) -> tuple[int, ...]:
 
 @cached_by_content(64)
 def _steady_faces(obj: ObjectModel) -> tuple[int, ...]:
-    """Return those of the reference faces on which the object does not roll."""
     faces = resting_faces(obj)
     return tuple(face for face in _reference_faces(obj) if not faces.rolls(face))
 
 
 def spec_above_table(objects: Sequence[ObjectModel]) -> Any:
-    """Return the specification of free objects, as convex hulls, above a table."""
     spec = mujoco.MjSpec()
     spec.option.timestep = TIMESTEP_S
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
@@ -198,7 +192,6 @@ def _redo_until_rest(table: _Table, name: str, key: tuple[int, int]) -> RestPose
 
 
 def _drop_once(table: _Table, rng: np.random.Generator) -> RestPose | None:
-    """Drop once; None if it timed out, rolled away, or ended on no face or on one that it topples from."""
     quaternion = rng.normal(size=4)
     quaternion /= np.linalg.norm(quaternion)
     lowest = float(quat_rotate(quaternion, table.hull)[:, 2].min())
@@ -220,7 +213,6 @@ def _drop_once(table: _Table, rng: np.random.Generator) -> RestPose | None:
 
 
 def _run(table: _Table) -> float | None:
-    """Simulate until rest; return simulated seconds, or None after `TIMEOUT_S`."""
     model, data = table.model, table.data
     window = round(REST_WINDOW_S / TIMESTEP_S)
     quiet = 0

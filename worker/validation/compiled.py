@@ -28,8 +28,6 @@ KEPT: Final = 8
 
 @dataclass(frozen=True)
 class _Asked:
-    """Cache key: everything that determines a model."""
-
     test: str
     hand: HandModel
     obj: ObjectModel

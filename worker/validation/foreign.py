@@ -100,7 +100,6 @@ def driven_as(same: SameHand) -> HandModel:
 
 
 def _of_joints(hand: HandModel) -> tuple[Floats, Floats]:
-    """Return gains and limits (J,) of joints."""
     dof, rate = hand.dof[hand.joint_body], hand.multiplier[hand.joint_body]
     joints = np.bincount(dof, minlength=hand.dofs)[dof]
     return hand.stiffness[dof] / (joints * rate**2), hand.effort[dof] / (joints * np.abs(rate))

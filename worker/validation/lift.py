@@ -43,8 +43,6 @@ SMOOTHLY: Final = np.asarray(np.polyval([6, -15, 10, 0, 0, 0], np.linspace(0, 1,
 
 
 class LiftOutcome(IntEnum):
-    """Outcome of a lift."""
-
     NOT_TRIED = 0
     LIFTED = 1
     PENETRATION = 2
@@ -58,8 +56,6 @@ class LiftOutcome(IntEnum):
 
 @dataclass
 class LiftTest:
-    """Verdict on one grasp."""
-
     outcome: LiftOutcome = LiftOutcome.NOT_TRIED
     margin: float = 0.0
     """Worst displacement or rotation from the commanded pose over its limit, from the lift's end on."""
@@ -135,7 +131,6 @@ class Lift(Test):
             self.data.xfrc_applied[free.body, :3] = -ACCELERATION * free.mass * self._up
 
     def _neighbours_moved(self) -> bool:
-        """Check whether a neighbour was displaced or toppled."""
         for free, pose in zip(self.scene.neighbours, self._beside, strict=True):
             now = self.data.qpos[free.qpos : free.qpos + 7]
             moved = float(np.linalg.norm(now[:3] - pose[:3] - quat_rotate(pose[3:], free.centre)))
@@ -208,7 +203,6 @@ class Lift(Test):
         return np.asarray(at - self._goal)
 
     def _turned(self) -> Floats:
-        """Return the rotation (4,) of the object since the start."""
         turned, yielded = super()._turned(), self._yielded()
         return turned if yielded is None else quat_multiply(quat_conjugate(yielded[1]), turned)
 

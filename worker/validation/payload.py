@@ -218,7 +218,6 @@ class Limit:
 
     @property
     def line(self) -> str:
-        """Sentence for the user."""
         return limit_told(self.hand, self.friction, self.grasps, self.lifts_kg, self.bound_kg, self.wanted_kg)
 
     def facts(self) -> dict[str, Any]:

@@ -181,10 +181,7 @@ class _Shorts:
 
 
 class LiftRollouts(_Shorts):
-    """Short lifts of grasps in their scenes."""
-
     def scores(self, grasps: GraspSet, placed: PlacedGrasps, beat: Floats | None = None) -> Floats:
-        """Return scores (N,), see `LiftRollout.score`."""
         least = np.full(len(grasps), np.inf) if beat is None else beat
 
         def test(scenes: Frictions) -> Callable[[int], float]:
@@ -195,10 +192,7 @@ class LiftRollouts(_Shorts):
 
 
 class PushRollouts(_Shorts):
-    """Short pushes of grasps of a free object."""
-
     def scores(self, grasps: GraspSet) -> Floats:
-        """Return scores (N,), see `PushRollout.score`."""
         return np.array(self._each(lambda s: partial(PushRollout(s).score, grasps), len(grasps), None), float)
 
 

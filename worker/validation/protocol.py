@@ -48,8 +48,6 @@ FAST_BAND: Final = (0.3, 3.0)
 
 
 class Outcome(IntEnum):
-    """Outcome of one push."""
-
     NOT_TRIED = 0
     HELD = 1
     PENETRATION = 2
@@ -68,8 +66,6 @@ class ValidatedBy(IntEnum):
 
 @dataclass
 class Rollout:
-    """Verdict on one grasp."""
-
     outcomes: list[Outcome] = field(default_factory=lambda: [Outcome.NOT_TRIED] * len(DIRECTIONS))
     margin: float = 0.0
     """Worst displacement or rotation over its limit, from the end of the squeeze on."""
@@ -152,7 +148,6 @@ class Test:
         return rollout
 
     def _put(self, hand_pose: Floats, joints: Floats) -> None:
-        """Place the object at its start and the hand (7,), (J,) at rest."""
         self.scene.place(self.data, hand_pose, joints)
 
     def _depths(self, posture: Posture, row: int) -> tuple[float, float]:
@@ -250,12 +245,10 @@ class Test:
         return np.asarray(self.data.qpos[at : at + 3] - turned)
 
     def _turned(self) -> Floats:
-        """Return the rotation (4,) of the object since the start."""
         at = self.scene.object_qpos
         return np.asarray(self.data.qpos[at + 3 : at + 7])
 
     def _motion(self) -> tuple[float, float]:
-        """Return displacement [m] and rotation [rad] of the object since the start."""
         q = self._turned()
         turned = 2 * math.atan2(math.sqrt(q[1] ** 2 + q[2] ** 2 + q[3] ** 2), abs(q[0]))
         return float(np.linalg.norm(self._offset())), turned

@@ -47,7 +47,6 @@ def refitted(hand: HandModel, fit: Fit, grown_m: float = 0.0) -> HandModel:
 
 
 def fits_of(hand: HandModel) -> frozenset[Fit]:
-    """Return the fits that change something in this hand."""
     links = {(piece.body, piece.link) for piece in hand.pieces}
     found: set[Fit] = set()
     if len(links) < len(hand.pieces):

@@ -67,7 +67,6 @@ class Robustness:
 
     @property
     def columns(self) -> dict[str, NDArray[Any]]:
-        """Columns of a base shard."""
         return {"quality/robust_share": self.share, "quality/robust_weakest": self.weakest}
 
     def by_axis(self) -> dict[Axis, tuple[int, int]]:
@@ -157,14 +156,12 @@ def robust(
 
 
 def models_of(hand: HandModel, grasps: GraspSet, row: int, models: int, seed: int) -> list[tuple[Axis, Variant]]:
-    """Return the models in which a grasp is validated, in order."""
     words = (seed, *_words(grasps, row))
     axes = dealt(hand, models, words)
     return [(axis, draw(axis, hand, np.random.default_rng((*words, k)))) for k, axis in enumerate(axes)]
 
 
 def _words(grasps: GraspSet, row: int) -> tuple[int, ...]:
-    """Return a grasp's own numbers as a seed."""
     whole = hashlib.sha256()
     for part in (grasps.pregrasp, grasps.grasp, grasps.squeeze):
         for array in (part.hand_pose, part.joint_positions):
@@ -204,7 +201,6 @@ def robustness(
 
 
 def _noise(obj: ObjectModel, seed: tuple[int, ...]) -> Floats:
-    """Return a random motion (7,) of the object."""
     rng = np.random.default_rng(seed)
     shift, axis = rng.normal(size=(2, 3))
     rotation = quat_from_axis_angle(axis / np.linalg.norm(axis), np.array(NOISE_RAD))
@@ -213,8 +209,6 @@ def _noise(obj: ObjectModel, seed: tuple[int, ...]) -> Floats:
 
 
 def _moved(grasps: GraspSet, rows: NDArray[np.intp], motion: Floats) -> GraspSet:
-    """Return the rows of the grasps with the hand moved by one motion (K, 7) each."""
-
     def moved(part: Posture) -> Posture:
         pose, joints = np.asarray(part.hand_pose, float), np.asarray(part.joint_positions, float)
         return Posture(compose(motion, pose[rows]), joints[rows])

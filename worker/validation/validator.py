@@ -165,8 +165,6 @@ def _screened(
 
 @dataclass(frozen=True)
 class _Case:
-    """Subject and terms of a validation."""
-
     hand: HandModel
     obj: ObjectModel
     pieces: ConvexPieces
@@ -175,7 +173,6 @@ class _Case:
 
     @cached_property
     def scene(self) -> Scene:
-        """The scene of level standard."""
         return self._scene(MujocoOptions())
 
     @property
@@ -187,12 +184,10 @@ class _Case:
 
     @cached_property
     def bench(self) -> _Bench:
-        """Tests in a process of a pool, cached with the case."""
         return _Bench(self, 1)
 
 
 def _try(case: _Case, grasps: GraspSet, rows: list[int], rollouts: dict[int, Rollout], run: ExecutionContext) -> None:
-    """Add the rollouts of some grasps to `rollouts`."""
     if run.pool is None:
         _Bench(case, run.cores).validate(grasps, rows, rollouts, run)
         return
@@ -206,13 +201,10 @@ def _try(case: _Case, grasps: GraspSet, rows: list[int], rollouts: dict[int, Rol
 
 
 def _rollouts(case: _Case, grasps: GraspSet) -> list[Rollout]:
-    """Return the rollouts of some grasps, run one after the other."""
     return [case.bench.rollout(grasps, row) for row in range(len(grasps))]
 
 
 class _Bench:
-    """One test per thread."""
-
     def __init__(self, case: _Case, threads: int) -> None:
         self.level, self.threads = case.level, threads
         self._full: queue.SimpleQueue[Test] = queue.SimpleQueue()
@@ -224,7 +216,6 @@ class _Bench:
                 self._coarse.put(Test(coarse))
 
     def validate(self, grasps: GraspSet, rows: list[int], rollouts: dict[int, Rollout], run: ExecutionContext) -> None:
-        """Add the rollouts of some grasps to `rollouts`."""
         done = Count(len(grasps), run, "validation", len(grasps) - len(rows))
 
         def work(row: int) -> None:

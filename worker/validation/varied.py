@@ -140,8 +140,6 @@ class _OneByOne(Test):
 
 
 class VariantTest(_OneByOne):
-    """Six pushes of one grasp with another weight and order of closing."""
-
     __test__ = False
 
     def __init__(self, scene: Scene, variant: Variant, lags: Floats | None) -> None:
@@ -154,8 +152,6 @@ class VariantTest(_OneByOne):
 
 
 class VariantLift(_OneByOne, Lift):
-    """The lift of one grasp with another weight and order of closing."""
-
     __test__ = False
 
     def __init__(self, scene: Scene, placed: PlacedGrasps, variant: Variant, lags: Floats | None) -> None:
@@ -216,7 +212,6 @@ def seen(obj: ObjectModel, grasps: GraspSet, row: int, variant: Variant) -> Gras
 
 
 def moves_object(variant: Variant) -> bool:
-    """Check whether the object is displaced in a variant."""
     return any((*variant.object_shift_m, *variant.object_turn))
 
 

@@ -76,14 +76,12 @@ class Crossings:
         return len(self.width)
 
     def ends(self) -> tuple[Floats, Floats]:
-        """Return the two points (P, 3) of each pair."""
         half = 0.5 * self.width[:, None] * self.axis
         return self.middle - half, self.middle + half
 
 
 @cached_by_content(16)
 def crossings_of(obj: ObjectModel) -> Crossings:
-    """Return the pairs of an object, cached."""
     place, face = even_points(obj, SAMPLES, np.random.default_rng(0))
     normal = surface_of(obj)[1][face]
     line = place[None] - place[:, None]
@@ -176,7 +174,6 @@ class AntipodalHands:
     """(n,) distance of the pads beyond the pair, which brings the palm nearer to the object [m]."""
 
     def q(self, hand: HandModel, normal: Floats) -> Floats:
-        """Return dofs (n, D) with normally distributed noise `normal` (n, D)."""
         known = self.known.q[self.posture]
         return np.clip(known + NOISE * hand.span * normal, hand.lower, hand.upper)
 
@@ -289,7 +286,6 @@ class PostureOutlines:
 
 @cached_by_content(16)
 def outlines_of(hand: HandModel, q: Floats) -> PostureOutlines:
-    """Return the outlines of postures (P, D) of a hand, cached."""
     bodies = body_poses(hand, np.tile(IDENTITY_POSE, (len(q), 1)), hand.expand(q))
     points, tips = [], []
     for tip in (True, False):

@@ -71,7 +71,6 @@ class Batches:
         return several and all(one.wanted.rollout is not None for one in self.asked)
 
     def put_out(self, owner: int, error: Exception) -> None:
-        """Stop a batch; its first error is stored."""
         self.errors.setdefault(owner, error)
 
     def going(self, rows: Rows) -> NDArray[np.bool_]:
@@ -139,5 +138,4 @@ def finalists(fidelity: Fidelity) -> int:
 
 
 def hands(fidelity: Fidelity) -> int:
-    """Return the number of hand iterations per grasp."""
     return fidelity.starts * fidelity.coarse_iterations + finalists(fidelity) * fidelity.fine_iterations

@@ -41,7 +41,6 @@ def with_postures(
     *,
     device: str = "cpu",
 ) -> GraspSet:
-    """Convert hands (n) to grasps and find the postures around them on a device."""
     grasp = posture_of(hand, obj, state)
     before = pregrasp(hand, obj, grasp, placed, device=device)
     return GraspSet(grasp, before, squeeze(hand, obj, grasp, device=device), losses)
@@ -83,7 +82,6 @@ class Selection:
         return cls(empty, np.zeros(count), np.full(count, np.inf), {})
 
     def joined(self) -> GraspSet:
-        """Return the grasps in their order."""
         return joined([self.grasps[k] for k in range(len(self.score))])
 
 
@@ -131,7 +129,6 @@ def tried(
 def _scores(
     found: GraspSet, infeasible: NDArray[np.bool_], which: NDArray[np.intp], beat: Floats, rollout: RolloutOf
 ) -> Floats:
-    """Score (k,) one hand each of the grasps `which` (k,) by rollout; `beat` (k,) are their scores so far."""
     score, feasible = np.full(len(which), HOPELESS), np.flatnonzero(~infeasible)
     if len(feasible):
         score[feasible] = np.nan_to_num(
@@ -170,7 +167,6 @@ def _take(
     score: Floats,
     taken: Selection,
 ) -> None:
-    """Replace selected candidates by better ones: one hand each (k,) for the grasps `which` (k,)."""
     state, losses = seated.state[rows], seated.losses[rows]
     for k in np.flatnonzero(score < taken.score[which]):
         grasp = int(which[k])
@@ -197,7 +193,6 @@ NEAR_M: Final = 0.005
 
 
 def posture_of(hand: HandModel, obj: ObjectModel, state: HandState) -> Posture:
-    """Return the hands of a state in the object frame."""
     root = state.pivot + obj.centre_of_mass - quat_rotate(state.rotation, hand.palm.centre)
     return Posture(np.concatenate([root, state.rotation], axis=1), hand.expand(state.q))
 
@@ -229,5 +224,4 @@ def ranked(merit: Floats, grasps: int) -> NDArray[np.intp]:
 
 
 def best_of_each(merit: Floats, grasps: int, keep: int) -> NDArray[np.intp]:
-    """Return rows of the `keep` best hands of each grasp, in the order of their starts."""
     return np.sort(ranked(merit, grasps)[:, :keep], axis=1).ravel()

@@ -32,8 +32,6 @@ KEPT: Final = 4
 
 @dataclass(frozen=True)
 class PhaseGeometry:
-    """Resolution of hand and object in a phase."""
-
     points: SurfacePoints
     own: SurfacePoints
     """Points tested against other links."""

@@ -100,14 +100,12 @@ class LaunchPart:
             self.attempts = np.ones(len(self.rows), int)
 
     def take(self, which: NDArray[np.intp]) -> LaunchPart:
-        """Select some of the grasps."""
         grasps = None if self.grasps is None else self.grasps.take(which)
         curve = [one[which] for one in self.curve]
         parts = (self.rows[which], self.state[which], self.loss[which], self.merit[which], curve, grasps)
         return LaunchPart(*parts, self.attempts[which])
 
     def followed_by(self, other: LaunchPart) -> LaunchPart:
-        """Concatenate the grasps of both."""
         curve = [np.concatenate(both) for both in zip(self.curve, other.curve, strict=True)]
         both = [part.grasps for part in (self, other) if part.grasps is not None]
         rows, loss, merit, attempts = (
@@ -216,7 +214,6 @@ class _Launch:
         return self.batches.placed.take(rows) if self.batches.placed is not None else None
 
     def merits(self, state: HandState, losses: Floats, depths: Floats | None = None) -> Floats:
-        """See `candidates.merits`."""
         hand, obj, device = self.pair.hand.model, self.pair.fine.obj.model, self.pair.hand.device
         friction = FRICTION if self.batches.placed is None else SCENE_FRICTION
         return merits(hand, obj, state, losses, depths, friction=friction, device=device)
@@ -241,15 +238,12 @@ class _Begun:
     """Share of the dilation at which each hand touches; None: all of it."""
 
     def take(self, which: NDArray[np.intp], each: int) -> _Begun:
-        """Select some of the grasps, `each` hands of each."""
         hands = (which[:, None] * each + np.arange(each)).ravel()
         touch = None if self.touch is None else self.touch[hands]
         return _Begun(self.rows[which], self.state[hands], self.depth[hands], touch)
 
 
 def _begun(launch: _Launch, rows: Rows, run: ExecutionContext) -> _Begun:
-    """Sample the starts of grasps."""
-
     def work(which: range) -> _Begun:
         some = rows[which.start : which.stop]
         found = _set_out(launch, some, np.zeros(len(some), int))
@@ -265,7 +259,6 @@ def _begun(launch: _Launch, rows: Rows, run: ExecutionContext) -> _Begun:
 
 
 def _set_out(launch: _Launch, rows: Rows, attempt: Rows) -> _Begun:
-    """Sample starts at attempts (n,), 0 being the first; a grasp may appear with several attempts."""
     batches, coarse = launch.batches, launch.coarse
     fidelity, placed, generators = batches.fidelity, launch.placed(rows), batches.generators(rows, attempt)
     if placed is None:
@@ -376,7 +369,6 @@ def _set_out_again(launch: _Launch, rows: Rows, attempt: Rows, run: ExecutionCon
 
 
 def _posed(launch: _Launch, part: LaunchPart) -> LaunchPart:
-    """Add the postures around the grasps of a part."""
     hand, obj = launch.pair.hand.model, launch.pair.fine.obj.model
     placed, device = launch.placed(part.rows), launch.pair.hand.device
     return replace(part, grasps=with_postures(hand, obj, part.state, part.loss, placed, device=device))
@@ -394,7 +386,6 @@ class _Seats:
     """Loss curve, continued by the hands that are seated first."""
 
     def seated(self, rows: NDArray[np.intp], which: NDArray[np.intp]) -> Refinements:
-        """Seat hands `rows` (k, each) of the grasps `which` (k,) of this part."""
         launch, flat = self.launch, rows.ravel()
         fidelity, mine = launch.batches.fidelity, self.rows[which]
         state, losses = self.state[flat], self.losses[flat]
@@ -421,14 +412,12 @@ def _obstacles(pair: Pair, placed: PlacedGrasps | None) -> DeviceObstacles | Non
 
 
 def _in_scenes(data: Data, placed: PlacedGrasps | None, each: int) -> Data:
-    """Set the scene of every hand in the data, `each` hands per grasp."""
     if placed is not None:
         data.set_scenes(np.repeat(placed.index, each))
     return data
 
 
 def _losses(data: Data, n: int) -> Floats:
-    """Return L_stable (n,) of the last iteration."""
     return data.loss.numpy()[:n].mean(axis=1).astype(float)
 
 
@@ -464,7 +453,6 @@ def grasps_of(
     *,
     device: str = "cpu",
 ) -> GraspSet:
-    """Convert the parts of a batch to grasps with the postures around them."""
     curve = [np.concatenate(chunk).mean() for chunk in zip(*(part.curve for part in parts), strict=True)]
     known = [part.grasps for part in parts if part.grasps is not None]
     if len(known) == len(parts):

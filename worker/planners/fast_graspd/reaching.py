@@ -45,8 +45,6 @@ SLACK_M: Final = 0.001
 
 @dataclass(frozen=True)
 class ReachSampling:
-    """Data shared by the draws of a hand around an object."""
-
     model: Model
     grips: Any
     only: bool

@@ -80,7 +80,6 @@ def free_ways(scene: Environment, obj: ObjectModel) -> Floats:
 
 
 def no_place(model: Model) -> NoStartFound:
-    """Return the error of a batch without a clear start."""
     hand, obj = model.hand.model, model.obj.model
     return NoStartFound(
         f"{hand.name} finds no free place around {obj.name} in this scene: the object is too large, or what stands "
@@ -140,7 +139,6 @@ def clear_scene_starts(
 
 
 def _normal(generators: list[np.random.Generator], rows: NDArray[np.intp], dofs: int) -> Floats:
-    """Return (n, DRAWN, 2 + D) random numbers for the next draws of starts `rows`; 0 for the others."""
     out = np.zeros((len(generators), DRAWN, 2 + dofs))
     for row in rows.tolist():
         out[row] = generators[row].standard_normal((DRAWN, 2 + dofs))
@@ -203,8 +201,6 @@ def _raise(
 
 @dataclass(frozen=True)
 class _Drawn:
-    """Draws for n starts."""
-
     states: HandState
     """(n * len(RETREATS)) hands, each at each distance."""
     reaching: list[tuple[NDArray[np.intp], AntipodalHands]]
@@ -213,8 +209,6 @@ class _Drawn:
 
 @dataclass(frozen=True)
 class _Around:
-    """Data shared by the draws of one hand around one object."""
-
     hand: HandModel
     obj: ObjectModel
     ways: Sequence[Floats]
@@ -326,7 +320,6 @@ def hindrance(model: Model, state: HandState, placed: PlacedGrasps) -> Floats:
 
 
 def _back(model: Model, state: HandState, scenes: NDArray[np.integer]) -> Floats:
-    """Return the depth (n,) of hands that open and move back [m]."""
     hand = model.hand.model
     finger = finger_of_body(hand)
     driven = np.zeros(hand.dofs, bool)
@@ -348,12 +341,10 @@ def _back(model: Model, state: HandState, scenes: NDArray[np.integer]) -> Floats
 
 
 def _open_above(scene: Environment) -> bool:
-    """Check whether all obstacles are floors, which a rising hand always leaves."""
     return all(len(o.planes) == 1 and o.planes[0, :3] @ scene.up > 1 - 1e-6 for o in scene.obstacles)
 
 
 def _rising(model: Model, state: HandState, placed: PlacedGrasps) -> Floats:
-    """Return the depth (n,) in obstacles of hands that rise in their grasp posture [m]."""
     n = len(state.pivot)
     up = np.array([scene.up for scene in placed.scenes])[placed.index]
     pivot = np.concatenate([state.pivot + share * RISE_M * up for share in UP])

@@ -87,7 +87,6 @@ def coarse_schedule(fidelity: Fidelity) -> Schedule:
 
 
 def fine_schedule(fidelity: Fidelity) -> Schedule:
-    """Return weights without dilation and with a high penetration weight."""
     n = fidelity.fine_iterations
     if fidelity.optimizer == "gd":
         return Schedule(np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n), np.tile(PAPER_RATES, (n, 1)))

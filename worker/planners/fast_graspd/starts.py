@@ -55,7 +55,6 @@ NO_PLACE: Final = 0.01
 
 
 def start_generator(seed: int, batch: int, index: int, start: int) -> np.random.Generator:
-    """Return the generator of one start of one grasp, independent of every other."""
     return np.random.default_rng(np.random.SeedSequence([seed, batch, index, start]))
 
 
@@ -69,8 +68,6 @@ def frames_about(z: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class _Pair:
-    """Data shared by all draws of a hand around an object."""
-
     hand: HandModel
     centre: Floats
     """(3,) centre of mass of the object [m]."""
@@ -131,7 +128,6 @@ def draw(pair: _Pair, generators: list[np.random.Generator]) -> tuple[HandState,
 
 
 def _retreated(state: HandState, approach: Floats) -> HandState:
-    """Return each hand at each distance of retreat, (n * len(RETREATS)) hands."""
     back = np.array(RETREATS)[None, :, None]
     pivot = state.pivot[:, None] - back * approach[:, None]
     repeat = len(RETREATS)
@@ -182,7 +178,6 @@ def sample_starts(model: Model, *, seed: int, batch: int, indices: range, each: 
 
 
 def no_place(model: Model) -> InputError:
-    """Return the error of a grasp without a clear start."""
     hand, obj = model.hand.model, model.obj.model
     return InputError(
         f"{hand.name} finds no free place around {obj.name}: the object is too large or encloses the hand; "
@@ -301,7 +296,6 @@ def _reach(
 
 
 def put(states: HandState, rows: NDArray[np.intp], others: HandState) -> None:
-    """Replace these rows of the states."""
     states.pivot[rows], states.rotation[rows], states.q[rows] = others.pivot, others.rotation, others.q
 
 
@@ -322,8 +316,6 @@ CENTRAL: Final = 0.35
 
 @dataclass(frozen=True)
 class JawStarts:
-    """Data shared by the draws for a gripper and an object."""
-
     hand: HandModel
     obj: ObjectModel
     jaws: Jaws

@@ -66,7 +66,6 @@ class PrefilterOutcomes:
         return [engine, REVISION, *BAND, PATIENCE, MOST_TICKS, RECHECK_ONE_IN]
 
     def put(self, rows: NDArray[np.intp], again: Self) -> Self:
-        """Return the outcomes with some rows replaced by those of repeated tests."""
         changed: dict[str, Any] = {}
         for field in fields(self):
             changed[field.name] = getattr(self, field.name).copy()

@@ -92,7 +92,6 @@ class WorldPool:
         return terms
 
     def _allocate(self) -> None:
-        """Allocate the simulations' data, with the capacity known to be needed."""
         model, w, more = self.scene.model, self.worlds, 2**self._doublings
         self._data = data = self._engine.make_data(model, nworld=w, nconmax=CONTACTS * more, njmax=ROWS * more)
         self._graph: Any = None
@@ -160,7 +159,6 @@ class WorldPool:
         return out.astype(np.float32)
 
     def _ask(self, grasps: GraspSet, starts: NDArray[np.float32], queue: NDArray[np.intp]) -> None:
-        """Copy grasps to the device, with the order in which they are taken."""
         scene, parts = self.scene, (grasps.pregrasp, grasps.grasp, grasps.squeeze)
         poses = np.stack([part.hand_pose for part in parts], axis=1)
         joints = np.stack([part.joint_positions for part in parts], axis=1)
@@ -196,7 +194,6 @@ class WorldPool:
         return out.numpy().astype(float), short
 
     def _simulate(self, count: int, run: ExecutionContext) -> None:
-        """Tick until no world has a grasp."""
         self.launches = 0
         self._state.assign(np.array([0, self.worlds, count], np.int32))
         wp.launch(
@@ -249,7 +246,6 @@ class PrefilterVerdicts:
     """Clear verdicts that the CPU rechecks, by row: whether the prefilter held the grasp."""
 
     def contradicted(self, rollouts: dict[int, Rollout]) -> int:
-        """Count the rechecked verdicts that the CPU's rollouts contradict."""
         return sum(rollouts[row].success != held for row, held in self.rechecked.items())
 
     def believed(self, contradicted: int) -> bool:
