@@ -1,24 +1,22 @@
-"""Execution context of a computation: device, progress, cancellation and the shared cores."""
+"""Execution context of a computation: device, progress, cancellation and the shared cores; parallel parts of it."""
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Final, Literal
+from collections.abc import Callable, Sequence
+from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
+from dataclasses import dataclass, field, replace
+from typing import Final, Literal, TypeVar
 
 from graspd.service.model.cores import available_cores
 from graspd.service.model.errors import TaskCancelled
 from graspd.worker.pool.pool import Pool
 
 PrefilterMode = Literal["auto", "on", "off"]
+#: Receives the amount done, the total and a short message; called often, from any thread.
 Progress = Callable[[float, float, str], None]
-
-"""Receives the amount done, the total and a short message; called often, from any thread."""
-
+#: Returns whether to stop; called often, from any thread.
 Cancelled = Callable[[], bool]
-
-"""Return whether to stop; called often, from any thread."""
 
 
 def _silent(done: float, total: float, message: str) -> None:
@@ -47,7 +45,6 @@ class ExecutionContext:
     Results do not depend on it, except for rounding on a GPU and for the engine that validates."""
 
     device: str = "cpu"
-    """Warp device."""
     threads: int = 0
     """CPU threads; 0: one per core this process may use."""
     progress: Progress = _silent
@@ -94,3 +91,62 @@ class Count:
 
 #: On the CPU with all its cores, without progress or cancellation.
 DEFAULT_CONTEXT: Final = ExecutionContext()
+
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+
+@dataclass
+class ProgressShares:
+    """Combined progress of all parts, in the unit of their sizes."""
+
+    sizes: Sequence[int]
+    told: Progress
+    _done: dict[int, float] = field(default_factory=dict)
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def of(self, part: int) -> Progress:
+        def tell(done: float, total: float, message: str) -> None:
+            with self._lock:
+                self._done[part] = self.sizes[part] * (done / total if total > 0 else 0.0)
+                self.told(sum(self._done.values()), sum(self.sizes), message)
+
+        return tell
+
+
+def parallel_map(
+    parts: Sequence[T], work: Callable[[T, ExecutionContext], R], run: ExecutionContext, *, size: Callable[[T], int]
+) -> list[R]:
+    """Run `work` on every part in parallel; return the results in order.
+    Each part has its own share of the cores, and of the progress by `size`. The first failure stops the others.
+
+    Raises:
+        Exception: the error of the first part that failed, once all have ended.
+    """
+    if len(parts) == 1:
+        return [work(parts[0], run)]
+    sharing, stop, shares = (
+        CoreSharing(len(parts)),
+        threading.Event(),
+        ProgressShares([size(part) for part in parts], run.progress),
+    )
+
+    def run_part(number: int) -> R:
+        own = replace(
+            run, sharing=sharing, progress=shares.of(number), cancelled=lambda: stop.is_set() or run.cancelled()
+        )
+        try:
+            return work(parts[number], own)
+        finally:
+            sharing.leave()
+
+    with ThreadPoolExecutor(len(parts), thread_name_prefix="part") as pool:
+        futures = [pool.submit(run_part, number) for number in range(len(parts))]
+        try:
+            done, _ = wait(futures, return_when=FIRST_EXCEPTION)
+        finally:
+            stop.set()
+    if failed := [error for one in done if (error := one.exception()) is not None]:
+        raise failed[0]
+    return [one.result() for one in futures]

@@ -23,12 +23,11 @@ from numpy.typing import NDArray
 from graspd.service.model.domain import JobOptions
 from graspd.service.model.errors import TaskCancelled
 from graspd.service.model.planning import totals
-from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
+from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext, parallel_map
 from graspd.worker.grasps import GraspSet, joined, joined_columns
 from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.pinch_postures import require_opposing
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.parallel import parallel_map
 from graspd.worker.planners import NoStartFound, PlanRequest, Rollout, fitting_pairs, method, synthesize
 from graspd.worker.planners.fast_graspd.antipodal_starts import why_narrow
 from graspd.worker.quality.diversity import POINTS, distinct, hand_points
@@ -87,7 +86,6 @@ PARTS: Final = (0.6, 0.8, 1.0)
 class ValidatedBatch:
     grasps: GraspSet
     columns: Arrays
-    """The `quality/...` columns of a base shard."""
     candidates: int
     """Number of candidates up to the last selected grasp; all where fewer were found than wanted."""
     rejected: dict[str, int]
@@ -97,9 +95,7 @@ class ValidatedBatch:
     verdict_key: str | None
     """Digest of the terms of the verdicts; None: not validated."""
     planned: int
-    """Total number of planned candidates."""
     seconds: dict[str, float] = field(default_factory=dict)
-    """Wall time of planning, validating and measuring [s]."""
     shares: dict[str, float] = field(default_factory=dict)
     """In scenes, shares of all candidates:
     clear_share (free of obstacles at contact, on the approach and in the lift), lift_share (also lifted),
@@ -383,9 +379,7 @@ def _timed(seconds: dict[str, float], name: str) -> Iterator[None]:
 @dataclass(frozen=True)
 class Needed:
     number: int
-    """Number of the round."""
     rows: range
-    """Rows of the round."""
     begun: int
     """Number of the batch's candidates planned before the round."""
     progress: tuple[float, float]

@@ -36,11 +36,8 @@ class Round:
     in_scene: dict[str, NDArray[np.bool_]]
     """In scenes: which planned grasps were clear, lifted, lifted at half friction."""
     seconds: dict[str, float]
-    """Wall time of planning, validating and measuring [s]."""
     repeated: int = 0
-    """In scenes: number of retries."""
     planned: list[GraspSet] = field(default_factory=list)
-    """All planned grasps."""
 
     @classmethod
     def joined(cls, parts: Sequence[Round]) -> Round:

@@ -16,12 +16,11 @@ import numpy as np
 from graspd.service.model.domain import BATCH_SIZE, JobOptions
 from graspd.service.model.errors import InputError, TaskCancelled
 from graspd.worker.engines.devices import check_device, exclusive
-from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
+from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext, ProgressShares
 from graspd.worker.generation import PARTS, Batch, Known, Scoring, ValidatedBatch, require_graspable, validated_grasps
 from graspd.worker.grasps import GraspSet, joined
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.parallel import ProgressShares
 from graspd.worker.planners import BatchRequest, NoStartFound, synthesize_batches
 from graspd.worker.rounds import Round, taken
 from graspd.worker.simulation.environment import Scenes, scenes_together
@@ -169,9 +168,7 @@ class _Wave:
 
     batches: Sequence[Batch]
     made: Sequence[GraspSet | Exception]
-    """One entry per batch."""
     whole: GraspSet | None
-    """The grasps of all batches."""
     known: Known
     prefilter: PrefilterVerdicts | None
 

@@ -14,12 +14,11 @@ from graspd.service.model.errors import TaskCancelled
 from graspd.service.model.fidelity import resolve_fidelity
 from graspd.service.model.scene_spec import SceneSpec
 from graspd.worker import generation
-from graspd.worker.execution_context import CoreSharing, ExecutionContext
+from graspd.worker.execution_context import CoreSharing, ExecutionContext, parallel_map
 from graspd.worker.generation import ValidatedBatch, validated_grasps
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.objects.prepare import object_from_path
-from graspd.worker.parallel import parallel_map
 from graspd.worker.planners import NoStartFound, PlanRequest, synthesize
 from graspd.worker.rounds import SMALLEST_PART, parts_of
 from graspd.worker.scenes.kinds import rest_poses, supports_of
@@ -188,7 +187,7 @@ def test_a_lane_that_ends_leaves_its_cores_to_the_others() -> None:
         return [shared, run.cores]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("graspd.worker.parallel.CoreSharing", Watched)
+        patch.setattr("graspd.worker.execution_context.CoreSharing", Watched)
         assert parallel_map([0, 1], work, ExecutionContext(threads=4), size=lambda _: 1)[1] == [2, 4]
 
 

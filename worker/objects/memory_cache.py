@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import inspect
 import threading
 from collections.abc import Callable, Hashable
+from dataclasses import is_dataclass
 from functools import wraps
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 from cachetools import LRUCache
-from cachetools.keys import hashkey
+
+from graspd.worker.objects.disk_cache import content_of
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -20,11 +23,13 @@ def cached_by_content(size: int) -> Callable[[Callable[P, T]], Callable[P, T]]:
 
     def decorate(make: Callable[P, T]) -> Callable[P, T]:
         known: LRUCache[Hashable, T] = LRUCache(size)
-        lock = threading.RLock()
+        lock, signature = threading.RLock(), inspect.signature(make)
 
         @wraps(make)
         def call(*args: P.args, **kwargs: P.kwargs) -> T:
-            key = hashkey(*map(_content, args), **{name: _content(value) for name, value in kwargs.items()})
+            given = signature.bind(*args, **kwargs)
+            given.apply_defaults()
+            key = tuple(map(_content, given.arguments.values()))
             with lock:
                 if key not in known:
                     known[key] = make(*args, **kwargs)
@@ -35,5 +40,11 @@ def cached_by_content(size: int) -> Callable[[Callable[P, T]], Callable[P, T]]:
     return decorate
 
 
-def _content(value: object) -> object:
-    return value.tobytes() if isinstance(value, np.ndarray) else getattr(value, "content", value)
+def _content(value: Any) -> Hashable:
+    if isinstance(value, np.ndarray):
+        return value.tobytes()
+    if isinstance(value, (list, tuple)):
+        return tuple(map(_content, value))
+    if not is_dataclass(value):
+        return value
+    return getattr(value, "content", None) or content_of(value)

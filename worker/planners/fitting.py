@@ -55,12 +55,10 @@ _CHUNK: Final = 64
 
 @dataclass(frozen=True)
 class Pairs:
-    """P pairs, object frame. The space between the points may be hollow: two fingers go around it."""
+    """P pairs of points (P, 3), object frame [m]. The space between them may be hollow: two fingers go around it."""
 
     start: Floats
-    """(P, 3) [m]"""
     end: Floats
-    """(P, 3) [m]"""
 
     @property
     def width(self) -> Floats:

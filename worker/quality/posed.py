@@ -34,7 +34,6 @@ class PostureData:
     chain: Any
     points: Any
     effort: Any
-    """(D,)"""
     finger: Any
     """(L,) finger of each body, -1: none."""
     fingers: int

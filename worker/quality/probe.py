@@ -45,9 +45,7 @@ class NearestPoints:
     """Hand points of B grasps and the object's surface near them; object frame, metres."""
 
     bodies: Floats
-    """(B, L, 7) poses of the bodies."""
     hand_points: Floats
-    """(B, N, 3)"""
     hand_normals: Floats
     """(B, N, 3) outward unit normals of the hand at its points."""
     distance: Floats

@@ -46,9 +46,8 @@ from graspd.worker.quality.contact import (
     spread_contacts,
 )
 from graspd.worker.quality.diversity import approach_cells
-from graspd.worker.quality.overlap import Overlap, penetration_depth
 from graspd.worker.quality.probe import HAND_POINTS, OBJECT_POINTS, REACH_M, Distances, Probe, probe_of
-from graspd.worker.quality.volume import SharedVolume
+from graspd.worker.quality.volume import Overlap, SharedVolume, penetration_depth
 from graspd.worker.quality.wrench_space import measure_spaces, wrenches
 
 Columns = dict[str, NDArray[np.generic]]

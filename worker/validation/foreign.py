@@ -22,6 +22,7 @@ from graspd.worker.objects.model import ObjectModel
 from graspd.worker.validation.decomposition import ConvexPieces
 from graspd.worker.validation.key import Level
 from graspd.worker.validation.validator import Verdicts, validate
+from graspd.worker.validation.variant import nearest
 
 
 @dataclass(frozen=True)
@@ -110,20 +111,12 @@ def in_other_model(same: SameHand, grasps: GraspSet) -> GraspSet:
     Where joints are coupled in the other model but not in ours, they take the nearest feasible values."""
 
     def posture(part: Posture) -> Posture:
-        pose = compose(np.asarray(part.hand_pose, float), same.base)
-        return Posture(pose, _nearest(same.theirs, np.asarray(part.joint_positions, float)[:, same.joints]))
+        pose, joints = compose(part.hand_pose, same.base), part.joint_positions[:, same.joints]
+        free = same.theirs.dofs == len(same.theirs.joint_names)
+        return Posture(pose, joints if free else nearest(same.theirs, joints))
 
     loss = np.asarray(grasps.stability_loss, float)
     return GraspSet(posture(grasps.grasp), posture(grasps.pregrasp), posture(grasps.squeeze), loss)
-
-
-def _nearest(hand: HandModel, joints: Floats) -> Floats:
-    if hand.dofs == len(hand.joint_names):
-        return joints
-    dof, rate = hand.dof[hand.joint_body], hand.multiplier[hand.joint_body]
-    drive = np.zeros((len(dof), hand.dofs))
-    drive[np.arange(len(dof)), dof] = rate
-    return hand.expand((joints - hand.offset[hand.joint_body]) @ np.linalg.pinv(drive).T)
 
 
 def with_our_shapes(same: SameHand) -> HandModel:

@@ -111,9 +111,7 @@ def _values(names: dict[ModuleType, tuple[str, ...]]) -> dict[str, Any]:
     out: dict[str, Any] = {}
     for part, there in names.items():
         group = out.setdefault((postures if part is opening else part).__name__.rpartition(".")[2], {})
-        group |= {name: _plain(getattr(part, name)) for name in there}
+        for name in there:
+            value = getattr(part, name)
+            group[name] = asdict(value) if isinstance(value, model.MujocoOptions) else value
     return out
-
-
-def _plain(value: Any) -> Any:
-    return asdict(value) if isinstance(value, model.MujocoOptions) else value

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from dataclasses import asdict, dataclass
 from typing import Final, Literal, get_args
@@ -13,18 +12,18 @@ from numpy.typing import NDArray
 from graspd.service.model.digests import digest_bytes, digest_json
 from graspd.service.model.errors import InputError
 from graspd.worker.control import postures
-from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
+from graspd.worker.execution_context import DEFAULT_CONTEXT, Count, ExecutionContext
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.simulation import environment as surroundings
 from graspd.worker.simulation.environment import PlacedGrasps
 from graspd.worker.validation import lift as protocol
-from graspd.worker.validation.compiled import answers, scene_of
 from graspd.worker.validation.decomposition import ConvexPieces, decompose
 from graspd.worker.validation.key import postures_key, verdict_key
 from graspd.worker.validation.lift import Lift, LiftOutcome, LiftTest
-from graspd.worker.validation.model import TOUCH_ROUNDING_M, MujocoOptions
+from graspd.worker.validation.model import TOUCH_ROUNDING_M, MujocoOptions, scene_of
+from graspd.worker.validation.protocol import answers
 
 LiftLevel = Literal["dexgraspbench", "lift"]
 #: Finished lifts, by `lift_of`.
@@ -42,9 +41,7 @@ class LiftVerdicts:
     success: NDArray[np.int8]
     """(N,) 1 lifted and held, 0 not."""
     outcome: NDArray[np.uint8]
-    """(N,) `LiftOutcome`."""
     margin: NDArray[np.float64]
-    """(N,) worst displacement or rotation over its limit."""
     level: LiftLevel
     hard: bool
     terms: str
@@ -91,10 +88,9 @@ def validate_lifts(
     pieces = pieces or decompose(obj)
     physics = MujocoOptions().hardened() if hard else MujocoOptions()
     scene = scene_of(hand, obj, pieces, physics, placed.supports, placed.neighbours)
-    done, lock = 0, threading.Lock()
+    done = Count(len(grasps), run, "lifts")
 
     def ask(test: Lift, row: int) -> LiftTest:
-        nonlocal done
         run.check("the validator")
         key = lift_of(grasps, row, placed, hard=hard) if known is not None else ""
         rollout = known.get(key) if known is not None else None
@@ -102,9 +98,7 @@ def validate_lifts(
             rollout = test.dexgraspbench(grasps, row) if level == "dexgraspbench" else test.lift(grasps, row)
             if known is not None:
                 known[key] = rollout
-        with lock:
-            done += 1
-            run.progress(done, len(grasps), "lifts")
+        done.add(1)
         return rollout
 
     rollouts = answers(range(len(grasps)), lambda: Lift(scene, placed), ask, threads=run.cores, name="lift")

@@ -19,6 +19,7 @@ from graspd.worker.grasps import Posture
 from graspd.worker.hands.jaws import jaws_of
 from graspd.worker.hands.model import ConvexPiece, HandModel, JointType
 from graspd.worker.hands.tendons import Tendon, actuators
+from graspd.worker.objects.memory_cache import cached_by_content
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.simulation.environment import CLEAR_M, Neighbour, Obstacle
 from graspd.worker.validation.decomposition import ConvexPieces
@@ -75,7 +76,6 @@ class FreeBody:
     body: int
     qpos: int
     centre: Floats
-    """(3,) centre of mass in its object frame."""
     mass: float
 
 
@@ -87,7 +87,6 @@ class Scene:
     hand: HandModel
     physics: MujocoOptions
     hand_geoms: NDArray[np.bool_]
-    """(G,) geoms of the hand."""
     object_body: int
     object_qpos: int
     root_qpos: int
@@ -102,13 +101,10 @@ class Scene:
     centre: Floats
     """(3,) the object's centre of mass in the object frame."""
     mass: float
-    """Mass of the object [kg]."""
     support_geoms: NDArray[np.bool_]
     """(G,) geoms of the scene's supports and neighbours; the scene frame is the mocap body 1."""
     neighbours: tuple[FreeBody, ...]
-    """The other objects of the scene."""
     tip_geoms: NDArray[np.bool_]
-    """(G,) geoms of fingertips."""
     pressing: Floats
     """(G,) how deep approaching fingertips may press into a geom [m]; above 0 where supports allow it."""
 
@@ -175,6 +171,19 @@ def build(
         tip_geoms=np.isin(body_of_geom, [model.body(f"body{b}").id for b in hand.fingertips]),
         pressing=_pressing(model, supports),
     )
+
+
+@cached_by_content(8)
+def scene_of(
+    hand: HandModel,
+    obj: ObjectModel,
+    pieces: ConvexPieces,
+    physics: MujocoOptions,
+    supports: Sequence[Obstacle] = (),
+    neighbours: Sequence[Neighbour] = (),
+) -> Scene:
+    """Return `build` of the arguments, cached. Threads share the scene: its model is read-only."""
+    return build(hand, obj, pieces, physics, supports, neighbours)
 
 
 def _pressing(model: Any, supports: Sequence[Obstacle]) -> Floats:
@@ -377,8 +386,7 @@ def add_object(
     body.add_freejoint(name=name)
     # By default MuJoCo would use the body's position in its parent as the position of its mass.
     body.mass, body.ipos = mass, [0, 0, 0]
-    inertia = mass * obj.inertia
-    body.fullinertia = [inertia[0, 0], inertia[1, 1], inertia[2, 2], inertia[0, 1], inertia[0, 2], inertia[1, 2]]
+    body.fullinertia = (mass * obj.inertia)[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
     body.explicitinertial = True
     for i, corners in enumerate(pieces):
         geom = body.add_geom(condim=4, friction=friction, name=f"{name}-{i}")

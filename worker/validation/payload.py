@@ -39,11 +39,10 @@ from graspd.worker.quality.contact import choose_contacts
 from graspd.worker.quality.posed import posing_of
 from graspd.worker.quality.wrench_space import EDGES, cone_edges
 from graspd.worker.simulation.environment import PlacedGrasps
-from graspd.worker.validation.compiled import measured, scene_of
 from graspd.worker.validation.decomposition import ConvexPieces
-from graspd.worker.validation.model import Scene
+from graspd.worker.validation.model import Scene, scene_of
 from graspd.worker.validation.prescreening import HANGING_CLOSING, LIFTING, FixedRootScene
-from graspd.worker.validation.protocol import DIRECTIONS, LOST, Outcome, Test
+from graspd.worker.validation.protocol import DIRECTIONS, LOST, Outcome, Test, measured
 
 #: Resolution of payloads, a ratio; they are rounded down.
 TOLD: Final = 1.03
@@ -209,7 +208,6 @@ class Limit:
     bound_kg: float
     """Largest load capacity of a grasp (`worker.validation.payload`)."""
     wanted_kg: float | None = None
-    """Wanted payload; None: none."""
 
     @property
     def hopeless(self) -> bool:

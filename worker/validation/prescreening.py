@@ -11,13 +11,10 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import partial
-from typing import Final, TypeVar
+from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graspd.service.model.matter import ACCELERATION
 from graspd.service.model.transforms import Floats
@@ -26,13 +23,10 @@ from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.simulation.environment import PlacedGrasps
-from graspd.worker.validation.compiled import scene_of
 from graspd.worker.validation.decomposition import ConvexPieces
 from graspd.worker.validation.lift import Lift, LiftOutcome
-from graspd.worker.validation.model import MujocoOptions, Scene
-from graspd.worker.validation.protocol import LOST, STAGE_S, Outcome, Test
-
-_T = TypeVar("_T")
+from graspd.worker.validation.model import MujocoOptions, Scene, scene_of
+from graspd.worker.validation.protocol import LOST, STAGE_S, Outcome, Test, answers
 
 #: The root is fixed, because the protocol's root on a spring costs twice as much. In so short a time nothing slips for
 #: lack of iterations against slip.
@@ -148,27 +142,11 @@ class _Shorts:
     def __init__(
         self, hand: HandModel, obj: ObjectModel, pieces: Callable[[], ConvexPieces], *, threads: int = 1
     ) -> None:
-        self.hand, self.obj, self._pieces, self._threads = hand, obj, pieces, threads
+        self.hand, self.obj, self._pieces, self.threads = hand, obj, pieces, threads
         self._scenes: Frictions | None = None
         self._lock = threading.Lock()
 
-    def _each(
-        self, test: Callable[[Frictions], Callable[[int], _T]], count: int, placed: PlacedGrasps | None
-    ) -> list[_T]:
-        """Run a test on each of `count` grasps; `test` creates one per thread."""
-        scenes = self._compiled(placed)
-
-        def work(rows: NDArray[np.intp]) -> list[_T]:
-            ask = test(scenes)
-            return [ask(int(row)) for row in rows]
-
-        parts = np.array_split(np.arange(count), max(1, min(self._threads, count)))
-        if len(parts) == 1:
-            return work(parts[0])
-        with ThreadPoolExecutor(len(parts), thread_name_prefix="short-test") as pool:
-            return [answer for part in pool.map(work, parts) for answer in part]
-
-    def _compiled(self, placed: PlacedGrasps | None) -> Frictions:
+    def compiled(self, placed: PlacedGrasps | None) -> Frictions:
         with self._lock:
             if self._scenes is None:
                 pieces = self._pieces()
@@ -184,16 +162,15 @@ class LiftRollouts(_Shorts):
     def scores(self, grasps: GraspSet, placed: PlacedGrasps, beat: Floats | None = None) -> Floats:
         least = np.full(len(grasps), np.inf) if beat is None else beat
 
-        def test(scenes: Frictions) -> Callable[[int], float]:
-            short = LiftRollout(scenes, placed)
-            return lambda row: short.score(grasps, row, float(least[row]))
-
-        return np.array(self._each(test, len(grasps), placed), float)
-
-
-class PushRollouts(_Shorts):
-    def scores(self, grasps: GraspSet) -> Floats:
-        return np.array(self._each(lambda s: partial(PushRollout(s).score, grasps), len(grasps), None), float)
+        scenes = self.compiled(placed)
+        found = answers(
+            range(len(grasps)),
+            lambda: LiftRollout(scenes, placed),
+            lambda test, row: test.score(grasps, row, float(least[row])),
+            threads=self.threads,
+            name="short-test",
+        )
+        return np.array(found, float)
 
 
 def push_rollout(
@@ -206,10 +183,18 @@ def push_rollout(
     Args:
         threads: per call; planners on the CPU already call from all their threads.
     """
-    pushes = PushRollouts(hand, obj, pieces, threads=threads)
+    shorts = _Shorts(hand, obj, pieces, threads=threads)
 
     def rollout(grasps: GraspSet, placed: PlacedGrasps | None, beat: Floats | None = None) -> Floats:
-        return pushes.scores(grasps)
+        scenes = shorts.compiled(None)
+        found = answers(
+            range(len(grasps)),
+            lambda: PushRollout(scenes),
+            lambda test, row: test.score(grasps, row),
+            threads=threads,
+            name="short-test",
+        )
+        return np.array(found, float)
 
     return rollout
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -20,7 +19,7 @@ from numpy.typing import NDArray
 
 from graspd.service.model.metrics import ROBUST_MODELS, Axis
 from graspd.service.model.transforms import Floats, compose, invert, quat_from_axis_angle
-from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
+from graspd.worker.execution_context import DEFAULT_CONTEXT, Count, ExecutionContext
 from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
@@ -30,7 +29,7 @@ from graspd.worker.validation.lifting import LiftLevel, require_ways
 from graspd.worker.validation.model import MujocoOptions
 from graspd.worker.validation.validator import validate
 from graspd.worker.validation.variant import Variant, dealt, draw
-from graspd.worker.validation.varied import Models
+from graspd.worker.validation.varied import Models, about_centre
 
 NOT_VALIDATED: Final = -1
 #: Tolerance of wanted shares: 0.9 of 10 models is 9 of them.
@@ -44,7 +43,6 @@ class Robustness:
     held: NDArray[np.int8]
     """(N, k) 1 held, 0 not, -1 not validated: the grasp was not tested, or its share was decided."""
     axis: NDArray[np.uint8]
-    """(N, k) `Axis` of each model."""
     wanted: float
     seconds: float
 
@@ -130,7 +128,7 @@ def robust(
     physics = MujocoOptions().hardened() if hard else MujocoOptions()
     beside = (placed.supports, placed.neighbours) if placed is not None else ()
     around = Models(hand, obj, pieces or decompose(obj), physics, *beside)
-    least, done, lock = needed(wanted, models), 0, threading.Lock()
+    least, done = needed(wanted, models), Count(len(tried), run, "robustness")
 
     def holds(row: int, variant: Variant) -> bool:
         if placed is None:
@@ -138,7 +136,6 @@ def robust(
         return around.lift(grasps, row, placed, variant, dexgraspbench=level == "dexgraspbench").success
 
     def work(row: int) -> None:
-        nonlocal done
         for k, (axis, variant) in enumerate(models_of(hand, grasps, row, models, seed)):
             run.check("robustness")
             axes[row, k] = axis
@@ -146,9 +143,7 @@ def robust(
             ok, lost = (verdicts[row] == 1).sum(), (verdicts[row] == 0).sum()
             if wanted > 0 and (ok >= least or models - lost < least):
                 break
-        with lock:
-            done += 1
-            run.progress(done, len(tried), "robustness")
+        done.add(1)
 
     with ThreadPoolExecutor(run.cores, thread_name_prefix="robust") as pool:
         list(pool.map(work, tried.tolist()))
@@ -204,8 +199,7 @@ def _noise(obj: ObjectModel, seed: tuple[int, ...]) -> Floats:
     rng = np.random.default_rng(seed)
     shift, axis = rng.normal(size=(2, 3))
     rotation = quat_from_axis_angle(axis / np.linalg.norm(axis), np.array(NOISE_RAD))
-    about = np.concatenate([obj.centre_of_mass + NOISE_M * shift / np.linalg.norm(shift), rotation])
-    return compose(about, np.concatenate([-obj.centre_of_mass, [1.0, 0, 0, 0]]))
+    return about_centre(obj, NOISE_M * shift / np.linalg.norm(shift), rotation)
 
 
 def _moved(grasps: GraspSet, rows: NDArray[np.intp], motion: Floats) -> GraspSet:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import logging
-import queue
 import time
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Final
@@ -20,12 +18,11 @@ from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.disk_cache import content_of
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.validation.compiled import scene_of
 from graspd.worker.validation.decomposition import ConvexPieces, decompose
 from graspd.worker.validation.key import Level, postures_key, verdict_key
-from graspd.worker.validation.model import COARSE, MujocoOptions, Scene
+from graspd.worker.validation.model import COARSE, MujocoOptions, Scene, scene_of
 from graspd.worker.validation.prefilter.prefilter import PrefilterVerdicts, first_terms, screened
-from graspd.worker.validation.protocol import DIRECTIONS, FAST_BAND, Outcome, Rollout, Test
+from graspd.worker.validation.protocol import DIRECTIONS, FAST_BAND, Outcome, Rollout, Test, answers
 
 log = logging.getLogger(__name__)
 #: Grasps per task of a process pool: few, so that many processes share the grasps of one batch.
@@ -48,7 +45,6 @@ class Verdicts:
     penetration_depth_mm: Floats
     """(N,) hand-object, with the engine's convex pieces."""
     self_penetration_depth_mm: Floats
-    """(N,)"""
     level: str
     hard: bool
     pieces: int
@@ -63,13 +59,10 @@ class Verdicts:
     validated_by: NDArray[np.uint8]
     """(N,) `ValidatedBy`: engine of the verdict. Only MuJoCo on the CPU is the reference."""
     seconds: float
-    """Wall time."""
     steps: int
-    """Simulation steps of all rollouts."""
     rechecked: int = 0
     """Verdicts of the prefilter rechecked on the CPU; where they differ, the CPU's stands."""
     contradicted: int = 0
-    """Number of rechecked verdicts that differed."""
 
     @property
     def reasons(self) -> list[str]:
@@ -183,17 +176,25 @@ class _Case:
         return scene_of(self.hand, self.obj, self.pieces, physics.hardened() if self.hard else physics)
 
     @cached_property
-    def bench(self) -> _Bench:
-        return _Bench(self, 1)
+    def tests(self) -> _Tests:
+        return _Tests(self)
 
 
 def _try(case: _Case, grasps: GraspSet, rows: list[int], rollouts: dict[int, Rollout], run: ExecutionContext) -> None:
+    done = Count(len(grasps), run, "validation", len(grasps) - len(rows))
     if run.pool is None:
-        _Bench(case, run.cores).validate(grasps, rows, rollouts, run)
+
+        def ask(tests: _Tests, row: int) -> Rollout:
+            run.check("the validator")
+            rollout = tests.rollout(grasps, row)
+            done.add(1)
+            return rollout
+
+        found = answers(rows, lambda: _Tests(case), ask, threads=run.cores, name="validation")
+        rollouts.update(zip(rows, found, strict=True))
         return
     bare = GraspSet(grasps.grasp, grasps.pregrasp, grasps.squeeze, grasps.stability_loss)
     parts = [bare.take(np.array(rows[k : k + _CHUNK], np.intp)) for k in range(0, len(rows), _CHUNK)]
-    done = Count(len(grasps), run, "validation", len(grasps) - len(rows))
     made = run.pool.map(
         _rollouts, content_of(case), case, parts, cancelled=run.cancelled, done=lambda k: done.add(len(parts[k]))
     )
@@ -201,50 +202,31 @@ def _try(case: _Case, grasps: GraspSet, rows: list[int], rollouts: dict[int, Rol
 
 
 def _rollouts(case: _Case, grasps: GraspSet) -> list[Rollout]:
-    return [case.bench.rollout(grasps, row) for row in range(len(grasps))]
+    return [case.tests.rollout(grasps, row) for row in range(len(grasps))]
 
 
-class _Bench:
-    def __init__(self, case: _Case, threads: int) -> None:
-        self.level, self.threads = case.level, threads
-        self._full: queue.SimpleQueue[Test] = queue.SimpleQueue()
-        self._coarse: queue.SimpleQueue[Test] = queue.SimpleQueue()
-        full, coarse = case.scene, case.coarse
-        for _ in range(threads):
-            self._full.put(Test(full))
-            if coarse is not None:
-                self._coarse.put(Test(coarse))
+class _Tests:
+    """Tests of one thread."""
 
-    def validate(self, grasps: GraspSet, rows: list[int], rollouts: dict[int, Rollout], run: ExecutionContext) -> None:
-        done = Count(len(grasps), run, "validation", len(grasps) - len(rows))
-
-        def work(row: int) -> None:
-            run.check("the validator")
-            rollouts[row] = self.rollout(grasps, row)
-            done.add(1)
-
-        with ThreadPoolExecutor(self.threads, thread_name_prefix="validation") as pool:
-            list(pool.map(work, rows))
+    def __init__(self, case: _Case) -> None:
+        self.level, coarse = case.level, case.coarse
+        self._full = Test(case.scene)
+        self._coarse = None if coarse is None else Test(coarse)
 
     def rollout(self, grasps: GraspSet, row: int) -> Rollout:
-        if self.level == "fast":
-            rollout = self._with(self._coarse, grasps, row)
-            low, high = FAST_BAND
-            # A penetration has no margin: it is geometric, the same in either physics.
-            clear = rollout.outcomes[0] is Outcome.PENETRATION or not low < rollout.margin < high
-            if clear and Outcome.DIVERGED not in rollout.outcomes:
-                return rollout
-            second = self._with(self._full, grasps, row)
-            second.steps += rollout.steps
-            return second
-        return self._with(self._full, grasps, row)
-
-    def _with(self, tests: queue.SimpleQueue[Test], grasps: GraspSet, row: int) -> Rollout:
-        test = tests.get()
-        try:
-            return test.dexgraspbench(grasps, row) if self.level == "dexgraspbench" else test.standard(grasps, row)
-        finally:
-            tests.put(test)
+        if self.level == "dexgraspbench":
+            return self._full.dexgraspbench(grasps, row)
+        if self._coarse is None:
+            return self._full.standard(grasps, row)
+        rollout = self._coarse.standard(grasps, row)
+        low, high = FAST_BAND
+        # A penetration has no margin: it is geometric, the same in either physics.
+        clear = rollout.outcomes[0] is Outcome.PENETRATION or not low < rollout.margin < high
+        if clear and Outcome.DIVERGED not in rollout.outcomes:
+            return rollout
+        second = self._full.standard(grasps, row)
+        second.steps += rollout.steps
+        return second
 
 
 def _verdicts(rollouts: list[Rollout], case: _Case, terms: str, key: str, seconds: float) -> Verdicts:

@@ -38,28 +38,24 @@ Coupling = Literal["own", "compliant", "separate", "ratio"]
 
 @dataclass(frozen=True)
 class Variant:
-    """A model near the nominal one; by default the nominal one."""
+    """A model near the nominal one; by default the nominal one. Lengths [m]; factors of the model's own values."""
 
     fit: Fit = "own"
     """Replacement of the hand's collision shapes, see `refit`."""
     grown_m: float = 0.0
-    """Growth of the hand's collision shapes [m]."""
     armature: float | None = None
     """Armature of every joint [kg m^2 or kg]; None: the model's own."""
     dry_friction: float | None = None
     """Dry friction of every joint [N m or N]; None: the model's own."""
     damping: float = 1.0
-    """Joint damping over the model's own."""
     gain: float = 1.0
     """Position gain over the model's own; torque limits stay."""
     coupling: Coupling = "own"
     """compliant: couplings yield under load; separate, ratio: other readings of tendons, see `recoupled`."""
     friction: float = 1.0
-    """Sliding and torsional friction over the model's own."""
     mass: float = 1.0
     """Mass of the object over the model's own; pushes equal its weight and grow with it."""
     centre_m: Vector = (0.0, 0.0, 0.0)
-    """Shift of the object's centre of mass in its frame [m]."""
     object_shift_m: Vector = (0.0, 0.0, 0.0)
     """Shift of the object, in its frame [m]."""
     object_turn: Vector = (0.0, 0.0, 0.0)

@@ -17,10 +17,9 @@ from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.simulation.environment import Neighbour, Obstacle, PlacedGrasps
-from graspd.worker.validation.compiled import scene_of
 from graspd.worker.validation.decomposition import ConvexPieces
 from graspd.worker.validation.lift import Lift, LiftTest
-from graspd.worker.validation.model import MujocoOptions, Scene, blend, build
+from graspd.worker.validation.model import MujocoOptions, Scene, blend, build, scene_of
 from graspd.worker.validation.protocol import STAGES, Rollout, Test
 from graspd.worker.validation.refit import Fit, refitted
 from graspd.worker.validation.variant import Coupling, Variant, nearest, recoupled
@@ -220,7 +219,12 @@ def motion_of(obj: ObjectModel, variant: Variant) -> Floats:
     turn = np.array(variant.object_turn)
     angle = float(np.linalg.norm(turn))
     turned = quat_from_axis_angle(turn / angle if angle else np.array([1.0, 0, 0]), np.array(angle))
-    about = np.concatenate([obj.centre_of_mass + variant.object_shift_m, turned])
+    return about_centre(obj, np.array(variant.object_shift_m), turned)
+
+
+def about_centre(obj: ObjectModel, shift: Floats, turn: Floats) -> Floats:
+    """Return the motion (7,) of an object: a turn (4,) about its centre of mass and a shift (3,) [m]."""
+    about = np.concatenate([obj.centre_of_mass + shift, turn])
     return compose(about, np.concatenate([-obj.centre_of_mass, [1.0, 0, 0, 0]]))
 
 

@@ -44,10 +44,9 @@ from graspd.worker.quality.diversity import (
 )
 from graspd.worker.quality.gate import MAX_PENETRATION_MM, MAX_SELF_PENETRATION_MM, MIN_CONTACT_LINKS, passes
 from graspd.worker.quality.intervals import wilson, wilson_of_mean
-from graspd.worker.quality.overlap import Overlap
 from graspd.worker.quality.probe import HAND_POINTS, REACH_M, Probe
 from graspd.worker.quality.table import MEASURES, measure
-from graspd.worker.quality.volume import SharedVolume, VoxelVolume
+from graspd.worker.quality.volume import Overlap, SharedVolume, VoxelVolume
 from tests.worker.models import object_from_mesh, two_finger_hand
 from tests.worker.quality.helpers import grasp_set, pad_hand, plate_hand, posture
 from tests.worker.simulation.rigs import ball

@@ -35,12 +35,11 @@ from graspd.worker.planners import synthesize
 from graspd.worker.planners.port import PlanRequest
 from graspd.worker.simulation.environment import Obstacle
 from graspd.worker.validation import model, protocol
-from graspd.worker.validation.compiled import measured, scene_of
 from graspd.worker.validation.decomposition import ConvexPieces, decompose
 from graspd.worker.validation.displacement import GRAVITY, STEPS, TIMESTEP_S, simulated_displacement_cm
 from graspd.worker.validation.key import LEVEL_MOVES, MOVES, Level, verdict_key
-from graspd.worker.validation.model import MujocoOptions, blend, build
-from graspd.worker.validation.protocol import HOLD_S, MAX_DISPLACEMENT_M, MAX_ROTATION, Outcome, Rollout, Test
+from graspd.worker.validation.model import MujocoOptions, blend, build, scene_of
+from graspd.worker.validation.protocol import HOLD_S, MAX_DISPLACEMENT_M, MAX_ROTATION, Outcome, Rollout, Test, measured
 from graspd.worker.validation.robust import robustness
 from graspd.worker.validation.validator import validate
 from tests.worker.models import object_from_mesh, two_finger_hand

@@ -63,14 +63,11 @@ ALIKE_M: Final = (0.002, 0.006)
 
 @dataclass(frozen=True)
 class Crossings:
-    """P pairs of surface points of an object that face away from each other, object frame."""
+    """P pairs of surface points that face away from each other: middle (P, 3) [m], axis (P, 3), width (P,) [m]."""
 
     middle: Floats
-    """(P, 3) [m]"""
     axis: Floats
-    """(P, 3) unit."""
     width: Floats
-    """(P,) [m]"""
 
     def __len__(self) -> int:
         return len(self.width)
@@ -101,7 +98,6 @@ class Openings:
     sums: Floats
     """(P,) cumulative chance; empty if there is no pair."""
     known: Oppositions
-    """The hand's postures."""
     up: Floats
     """(3,) against gravity, object frame."""
     upright: bool
@@ -159,7 +155,7 @@ def room_beside(pairs: Crossings, scene: Environment, width: float) -> Floats:
 
 @dataclass(frozen=True)
 class AntipodalHands:
-    """n hands that oppose their fingers across the object."""
+    """n hands that oppose their fingers across the object, turned by (n, 3, 3); they retreat along `away` (n, 3)."""
 
     known: Oppositions
     posture: NDArray[np.intp]
@@ -167,9 +163,7 @@ class AntipodalHands:
     pivot: Floats
     """(n, 3) palm centres relative to the object's centre of mass [m]."""
     turn: Floats
-    """(n, 3, 3) rotations."""
     away: Floats
-    """(n, 3) directions of retreat."""
     deep: Floats
     """(n,) distance of the pads beyond the pair, which brings the palm nearer to the object [m]."""
 
@@ -254,7 +248,6 @@ class PostureOutlines:
     """Outermost points of a hand in each of its K opposed postures, relative to the palm's centre."""
 
     points: Floats
-    """(K, P, 3) [m]"""
     tips: NDArray[np.bool_]
     """(P,) mask of the fingertips' points."""
     mounting: Floats

@@ -52,9 +52,7 @@ class Refinements:
 
     state: HandState
     losses: Floats
-    """L_stable of each."""
     merit: Floats
-    """Smaller is better."""
     infeasible: NDArray[np.bool_]
     """Whether its depth or number of touching links fails the geometric gate: then it has no rollout."""
 

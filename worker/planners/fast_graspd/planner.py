@@ -82,10 +82,8 @@ class LaunchPart:
     """Grasps of a launch that one thread works on."""
 
     rows: Rows
-    """(n,) rows of the launch."""
     state: HandState
     loss: Floats
-    """(n,) L_stable."""
     merit: Floats
     """(n,) merit of the chosen hand, or its rollout score; 0 where there was no choice."""
     curve: list[Floats] = field(default_factory=list)
@@ -93,7 +91,6 @@ class LaunchPart:
     grasps: GraspSet | None = None
     """Grasps with their postures, where these were requested or a rollout needed them."""
     attempts: Rows = field(default_factory=lambda: np.zeros(0, int))
-    """(n,) number of attempts."""
 
     def __post_init__(self) -> None:
         if len(self.attempts) != len(self.rows):

@@ -204,7 +204,6 @@ class _Drawn:
     states: HandState
     """(n * len(RETREATS)) hands, each at each distance."""
     reaching: list[tuple[NDArray[np.intp], AntipodalHands]]
-    """Antipodal hands, and their indices among the n."""
 
 
 @dataclass(frozen=True)
@@ -212,9 +211,7 @@ class _Around:
     hand: HandModel
     obj: ObjectModel
     ways: Sequence[Floats]
-    """Free directions of each scene."""
     openings: Mapping[int, Openings]
-    """Openings of each scene."""
 
     def order(
         self, uniform: Floats, scene: NDArray[np.intp], reaching: NDArray[np.bool_], placed: PlacedGrasps

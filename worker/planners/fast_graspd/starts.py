@@ -70,9 +70,7 @@ def frames_about(z: Floats) -> Floats:
 class _Pair:
     hand: HandModel
     centre: Floats
-    """(3,) centre of mass of the object [m]."""
     corners: Floats
-    """(F, 3, 3) corners of its faces [m]."""
     across: Floats
     """(F, 3) normals of twice the faces' area [m^2]."""
     area: Floats
@@ -80,7 +78,6 @@ class _Pair:
     share: Floats
     """(F,) cumulative share of the area."""
     palm: Floats
-    """(3, 3) rotation to the frame of the palm's approach."""
     gap: tuple[float, float]
     """Distance of the palm from the surface, nearest and farthest [m]."""
 
@@ -321,7 +318,6 @@ class JawStarts:
     jaws: Jaws
     pairs: Pairs
     sums: Floats
-    """(P,) cumulative chance of pairs."""
 
     @classmethod
     def of(cls, hand: HandModel, obj: ObjectModel) -> JawStarts | None:

@@ -15,10 +15,10 @@ import hashlib
 import importlib.util
 import logging
 from collections import OrderedDict
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from functools import cache
 from importlib.metadata import version
-from typing import Any, Final
+from typing import Any, Final, Self
 
 import numpy as np
 import warp as wp
@@ -35,17 +35,67 @@ from graspd.worker.hands.model import HandModel
 from graspd.worker.validation import protocol
 from graspd.worker.validation.model import Scene
 from graspd.worker.validation.prefilter import kernels
-from graspd.worker.validation.prefilter.phases import RECHECK_ONE_IN, PrefilterOutcomes
+from graspd.worker.validation.prefilter.kernels import BAND, MOST_TICKS, PATIENCE
 from graspd.worker.validation.protocol import INTERVAL_S, Outcome, Rollout, ValidatedBy
 
 log = logging.getLogger(__name__)
 
+#: One clear verdict in so many is validated on the CPU as well.
+RECHECK_ONE_IN: Final = 50
+#: Increase when the code changes the prefilter's verdicts, constants aside.
+REVISION: Final = 1
 #: Pool sizes, for few grasps and for many; with arbitrary sizes nearly every launch would build a new pool.
 WORLDS: Final = {"cuda": (256, 1024), "cpu": (8, 32)}
 #: Number of cached pools, each with its model, arrays and graph: those of the pairs validated last.
 _KEPT_POOLS: Final = 4
 #: Largest share of rechecked verdicts that the CPU may contradict, beyond one, before the prefilter is not trusted.
 _MOST_CONTRADICTED: Final = 0.05
+
+
+@dataclass(frozen=True)
+class PrefilterOutcomes:
+    """Outcomes of N grasps in the worlds."""
+
+    outcome: NDArray[np.uint8]
+    """(N, 6) `Outcome` of each push; an undecided grasp has pushes that were not simulated."""
+    margin: Floats
+    """(N,) worst displacement or rotation over its limit."""
+    penetration_m: Floats
+    self_penetration_m: Floats
+    overflow: NDArray[np.bool_]
+    """(N,) whether contacts or constraints were dropped for lack of memory."""
+    ticks: NDArray[np.int32]
+    """(N,) simulated ticks, of `protocol.INTERVAL_S` each."""
+
+    @property
+    def held(self) -> NDArray[np.bool_]:
+        """(N,) whether all six pushes were held, clearly or not."""
+        return np.asarray((self.outcome == Outcome.HELD).all(axis=1))
+
+    @property
+    def clearly_held(self) -> NDArray[np.bool_]:
+        """(N,) whether the grasp held with a clear margin."""
+        return np.asarray(self.held & (self.margin < BAND[0]) & ~self.overflow)
+
+    @property
+    def clearly_failed(self) -> NDArray[np.bool_]:
+        """(N,) whether the object is lost, or the hand starts inside it."""
+        inside = self.outcome[:, 0] == Outcome.PENETRATION
+        kinds = (Outcome.LOST_WHILE_CLOSING, Outcome.DISPLACED, Outcome.ROTATED)
+        lost = np.isin(self.outcome, kinds).any(axis=1) & np.isfinite(self.margin) & (self.margin > BAND[1])
+        return np.asarray((inside | lost) & ~self.overflow)
+
+    @staticmethod
+    def terms(engine: str) -> list[Any]:
+        """Return the terms of verdicts by a version of the engine, besides those of level standard."""
+        return [engine, REVISION, *BAND, PATIENCE, MOST_TICKS, RECHECK_ONE_IN]
+
+    def put(self, rows: NDArray[np.intp], again: Self) -> Self:
+        changed: dict[str, Any] = {}
+        for field in fields(self):
+            changed[field.name] = getattr(self, field.name).copy()
+            changed[field.name][rows] = getattr(again, field.name)
+        return replace(self, **changed)
 
 
 class WorldPool:

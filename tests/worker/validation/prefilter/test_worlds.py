@@ -26,8 +26,7 @@ from graspd.worker.validation.key import Level
 from graspd.worker.validation.model import MujocoOptions, build
 from graspd.worker.validation.prefilter import phases as rollouts
 from graspd.worker.validation.prefilter import prefilter as screening
-from graspd.worker.validation.prefilter.phases import PrefilterOutcomes
-from graspd.worker.validation.prefilter.prefilter import ROWS, WorldPool
+from graspd.worker.validation.prefilter.prefilter import ROWS, PrefilterOutcomes, WorldPool
 from graspd.worker.validation.protocol import Outcome, ValidatedBy
 from graspd.worker.validation.validator import Verdicts, prefiltered, validate
 from tests.worker.quality.helpers import posture
