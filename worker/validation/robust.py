@@ -28,8 +28,7 @@ from graspd.worker.validation.decomposition import ConvexPieces, decompose
 from graspd.worker.validation.lifting import LiftLevel, require_ways
 from graspd.worker.validation.model import MujocoOptions
 from graspd.worker.validation.validator import validate
-from graspd.worker.validation.variant import Variant, dealt, draw
-from graspd.worker.validation.varied import Models, about_centre
+from graspd.worker.validation.variant import Models, Variant, about_centre, dealt, draw
 
 NOT_VALIDATED: Final = -1
 #: Tolerance of wanted shares: 0.9 of 10 models is 9 of them.

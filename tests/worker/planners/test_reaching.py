@@ -21,9 +21,9 @@ from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners import PlanRequest, synthesize
 from graspd.worker.planners.fast_graspd import starts
+from graspd.worker.planners.fast_graspd.antipodal_starts import ReachSampling
 from graspd.worker.planners.fast_graspd.candidates import posture_of
 from graspd.worker.planners.fast_graspd.pairs import pair_of
-from graspd.worker.planners.fast_graspd.reaching import ReachSampling
 from graspd.worker.planners.fast_graspd.starts import (
     CLEAR,
     NO_PLACE,

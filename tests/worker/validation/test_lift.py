@@ -33,8 +33,7 @@ from graspd.worker.validation.prescreening import (
 )
 from graspd.worker.validation.protocol import MAX_DISPLACEMENT_M, STAGE_S, STAGES
 from graspd.worker.validation.robust import robust
-from graspd.worker.validation.variant import NOMINAL, Variant
-from graspd.worker.validation.varied import Models, VariantLift, motion_of, seen, upright
+from graspd.worker.validation.variant import NOMINAL, Models, Variant, VariantLift, motion_of, seen, upright
 from tests.worker.models import object_from_mesh
 from tests.worker.quality.helpers import pad_hand, posture
 

@@ -28,8 +28,19 @@ from graspd.worker.validation.protocol import STAGES, Outcome, Rollout, Test
 from graspd.worker.validation.refit import fits_of, grown, refitted
 from graspd.worker.validation.robust import Robustness, models_of, needed, robust
 from graspd.worker.validation.validator import validate
-from graspd.worker.validation.variant import NOMINAL, SHAPES, Variant, axes_of, couplings_of, draw, nearest, recoupled
-from graspd.worker.validation.varied import Models, VariantTest, seen
+from graspd.worker.validation.variant import (
+    NOMINAL,
+    SHAPES,
+    Models,
+    Variant,
+    VariantTest,
+    axes_of,
+    couplings_of,
+    draw,
+    nearest,
+    recoupled,
+    seen,
+)
 from tests.worker.models import object_from_mesh, piece, two_finger_hand
 from tests.worker.quality.helpers import pad_hand, plate_hand, posture
 

@@ -1,5 +1,5 @@
 """Starts of hands: in every second one of a grasp the palm faces a random surface point nearby.
-The others reach across the object (`reaching`), as do all if it is too small or too wide for the pads.
+The others reach across the object (`ReachSampling`), as do all if it is too small or too wide for the pads.
 
 A start must be free of contact: hands that start inside a thin wall never leave it.
 
@@ -28,7 +28,7 @@ from graspd.service.model.transforms import (
 from graspd.worker.hands.jaws import Jaws, jaws_of
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.planners.fast_graspd.reaching import LOOKS, ReachSampling
+from graspd.worker.planners.fast_graspd.antipodal_starts import LOOKS, ReachSampling
 from graspd.worker.planners.fitting import Pairs, fitting_pairs, points_in
 from graspd.worker.simulation.data import Data, HandState
 from graspd.worker.simulation.model import Model
