@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import queue
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field, replace
 from typing import Final, Literal, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
 
 from graspd.service.model.cores import available_cores
 from graspd.service.model.errors import TaskCancelled
@@ -150,3 +154,48 @@ def parallel_map(
     if failed := [error for one in done if (error := one.exception()) is not None]:
         raise failed[0]
     return [one.result() for one in futures]
+
+
+def answers(
+    rows: Sequence[int], make: Callable[[], T], ask: Callable[[T, int], R], *, threads: int, name: str
+) -> list[R]:
+    """Run tests on some grasps in parallel; return the results in their order."""
+    workers = min(threads, len(rows))
+    if workers <= 1:
+        test = make()
+        return [ask(test, row) for row in rows]
+    tests: queue.SimpleQueue[T] = queue.SimpleQueue()
+    for _ in range(workers):
+        tests.put(make())
+
+    def work(row: int) -> R:
+        test = tests.get()
+        try:
+            return ask(test, row)
+        finally:
+            tests.put(test)
+
+    with ThreadPoolExecutor(workers, thread_name_prefix=name) as pool:
+        return list(pool.map(work, rows))
+
+
+def measured(
+    count: int,
+    held: NDArray[np.bool_] | None,
+    make: Callable[[], T],
+    ask: Callable[[T, int], float],
+    *,
+    run: ExecutionContext,
+    name: str,
+) -> NDArray[np.float64]:
+    """Return measurements (count,) on grasps that are `held` (count,), None: all; nan for the others."""
+
+    def asked(test: T, row: int) -> float:
+        run.check("the validator")
+        return ask(test, row)
+
+    out = np.full(count, np.nan)
+    rows = np.arange(count) if held is None else np.flatnonzero(held)
+    if len(rows):
+        out[rows] = answers(rows.tolist(), make, asked, threads=run.cores, name=name)
+    return out

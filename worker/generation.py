@@ -50,15 +50,8 @@ from graspd.worker.validation.validator import prefiltered, validate
 #: Reasons to reject a grasp: its numbers are not finite, an obstacle of its scene blocks it, the validator dropped it,
 #: it failed the geometric gate, held in too few models, lifts too little, or is a near-duplicate of a selected one.
 REJECTIONS: Final = ("diverged", "blocked", "dropped", "gate", "not_robust", "weak", "alike")
-#: Outcomes whose name differs from that of their rejection.
-_REJECTION_OF: Final = {
-    "no_place": "blocked",
-    "diverged": "diverged",
-    "not_robust": "not_robust",
-    "weak": "weak",
-    "alike": "alike",
-    **{f"gate_{name}": "gate" for name in GATES},
-}
+#: Outcomes of other names than their rejections; those of the validator are `dropped`.
+_REJECTION_OF: Final = {"no_place": "blocked", **{f"gate_{name}": "gate" for name in GATES}}
 #: Outcome names of pushes and of lifts that drop a grasp.
 _PUSHED: Final = {
     Outcome.PENETRATION: "penetration",
@@ -553,7 +546,7 @@ class Batch:
         outcomes = totals([Counter(fate for fate in fates[:candidates].tolist() if fate != "kept")])
         rejected = dict.fromkeys(reasons, 0)
         for name, number in outcomes.items():
-            rejected[_REJECTION_OF.get(name, "dropped")] += number
+            rejected[_REJECTION_OF.get(name, name if name in reasons else "dropped")] += number
         grasps, columns = taken(grasps, columns, np.arange(min(count, len(grasps))))
         if self.repeated:
             outcomes["repeated"] = self.repeated

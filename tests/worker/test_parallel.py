@@ -23,6 +23,7 @@ from graspd.worker.planners import NoStartFound, PlanRequest, synthesize
 from graspd.worker.rounds import SMALLEST_PART, parts_of
 from graspd.worker.scenes.kinds import rest_poses, supports_of
 from graspd.worker.simulation.environment import Scenes
+from tests.worker.batches import assert_same_batch
 
 REQUEST = JobOptions(fidelity=resolve_fidelity("draft"), rechecks=2, seed=3)
 COUNT = 2 * SMALLEST_PART
@@ -44,18 +45,6 @@ def one_lane(pair) -> ValidatedBatch:
     return validated_grasps(*pair, REQUEST, count=COUNT, run=ExecutionContext(threads=1))
 
 
-def assert_same(found: ValidatedBatch, other: ValidatedBatch) -> None:
-    assert (found.candidates, found.rejected, found.verdict_key) == (
-        other.candidates,
-        other.rejected,
-        other.verdict_key,
-    )
-    columns, others = (one.grasps.to_columns() | one.columns for one in (found, other))
-    assert columns.keys() == others.keys()
-    for name, values in others.items():
-        np.testing.assert_array_equal(columns[name], values, err_msg=name)
-
-
 def noted(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int, int]]:
     """Round, first grasp and number of grasps of each call of the planner from now on."""
     calls: list[tuple[int, int, int]] = []
@@ -73,7 +62,7 @@ def test_grasps_of_several_lanes_are_those_of_one(pair, one_lane, monkeypatch: p
     calls = noted(monkeypatch)
     found = validated_grasps(*pair, REQUEST, count=COUNT, run=ExecutionContext(threads=2))
     assert sorted(calls)[:2] == [(0, 0, SMALLEST_PART), (0, SMALLEST_PART, SMALLEST_PART)]
-    assert_same(found, one_lane)
+    assert_same_batch(found, one_lane)
 
 
 def test_grasps_of_several_lanes_in_scenes_are_those_of_one(pair, scenes, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -83,8 +72,7 @@ def test_grasps_of_several_lanes_in_scenes_are_those_of_one(pair, scenes, monkey
         validated_grasps(*pair, wish, count=COUNT, scenes=scenes, run=ExecutionContext(threads=n)) for n in (1, 2)
     )
     assert (0, SMALLEST_PART, SMALLEST_PART) in calls
-    assert_same(two, one)
-    np.testing.assert_array_equal(two.grasps.scene, one.grasps.scene)
+    assert_same_batch(two, one)
 
 
 def test_a_round_ends_as_soon_as_enough_are_found(pair, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -105,7 +93,7 @@ def test_a_round_ends_as_soon_as_enough_are_found(pair, monkeypatch: pytest.Monk
     monkeypatch.setattr(generation.Batch, "_in_parts", False)
     rounds = validated_grasps(*pair, wish, count=6, run=ExecutionContext(threads=1))
     assert parts.planned <= rounds.planned
-    assert_same(parts, rounds)
+    assert_same_batch(parts, rounds)
 
 
 def test_lane_without_a_place_ends_blocked_where_another_has_one(pair, scenes, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -125,7 +113,7 @@ def test_lane_without_a_place_ends_blocked_where_another_has_one(pair, scenes, m
     without = (SMALLEST_PART,)
     found = validated_grasps(*pair, wish, count=COUNT, scenes=scenes, run=ExecutionContext(threads=2))
     assert refused == [SMALLEST_PART]
-    assert_same(found, free)
+    assert_same_batch(found, free)
     without = (0, SMALLEST_PART)
     with pytest.raises(NoStartFound):
         validated_grasps(*pair, wish, count=COUNT, scenes=scenes, run=ExecutionContext(threads=2))

@@ -24,6 +24,7 @@ from graspd.worker.pool.pool import MODULES, Pool
 from graspd.worker.scenes.kinds import rest_poses, supports_of
 from graspd.worker.simulation.environment import Scenes
 from graspd.worker.together import validated_batches
+from tests.worker.batches import assert_same_batch
 
 REQUEST = JobOptions(fidelity=resolve_fidelity("draft"), rechecks=0, grasps=6)
 
@@ -41,15 +42,8 @@ def alone(pair):
 
 def assert_same(batches, others) -> None:
     for one, other in zip(batches, others, strict=True):
-        assert (one.candidates, one.rejected, one.planned, one.verdict_key) == (
-            other.candidates,
-            other.rejected,
-            other.planned,
-            other.verdict_key,
-        )
-        columns = one.grasps.to_columns() | one.columns
-        for name, values in (other.grasps.to_columns() | other.columns).items():
-            np.testing.assert_array_equal(columns[name], values, err_msg=name)
+        assert one.planned == other.planned
+        assert_same_batch(one, other)
 
 
 def test_joined_batches_of_a_job_are_the_same_from_plan_to_verdict(

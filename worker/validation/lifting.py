@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from graspd.service.model.digests import digest_bytes, digest_json
 from graspd.service.model.errors import InputError
 from graspd.worker.control import postures
-from graspd.worker.execution_context import DEFAULT_CONTEXT, Count, ExecutionContext
+from graspd.worker.execution_context import DEFAULT_CONTEXT, Count, ExecutionContext, answers
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
@@ -23,7 +23,6 @@ from graspd.worker.validation.decomposition import ConvexPieces, decompose
 from graspd.worker.validation.key import postures_key, verdict_key
 from graspd.worker.validation.lift import Lift, LiftOutcome, LiftTest
 from graspd.worker.validation.model import TOUCH_ROUNDING_M, MujocoOptions, scene_of
-from graspd.worker.validation.protocol import answers
 
 LiftLevel = Literal["dexgraspbench", "lift"]
 #: Finished lifts, by `lift_of`.

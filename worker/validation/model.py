@@ -173,17 +173,8 @@ def build(
     )
 
 
-@cached_by_content(8)
-def scene_of(
-    hand: HandModel,
-    obj: ObjectModel,
-    pieces: ConvexPieces,
-    physics: MujocoOptions,
-    supports: Sequence[Obstacle] = (),
-    neighbours: Sequence[Neighbour] = (),
-) -> Scene:
-    """Return `build` of the arguments, cached. Threads share the scene: its model is read-only."""
-    return build(hand, obj, pieces, physics, supports, neighbours)
+#: `build`, cached. Threads share the scene: its model is read-only.
+scene_of = cached_by_content(8)(build)
 
 
 def _pressing(model: Any, supports: Sequence[Obstacle]) -> Floats:

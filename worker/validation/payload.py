@@ -30,7 +30,7 @@ from graspd.service.model.matter import ACCELERATION, MASS_KG, MOST_KG
 from graspd.service.model.planning import limit_told
 from graspd.service.model.transforms import Floats, cross, quat_rotate
 from graspd.worker.engines.mujoco_warnings import void
-from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
+from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext, measured
 from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.kinematics import generalized_forces
 from graspd.worker.hands.model import HandModel
@@ -42,7 +42,7 @@ from graspd.worker.simulation.environment import PlacedGrasps
 from graspd.worker.validation.decomposition import ConvexPieces
 from graspd.worker.validation.model import Scene, scene_of
 from graspd.worker.validation.prescreening import HANGING_CLOSING, LIFTING, FixedRootScene
-from graspd.worker.validation.protocol import DIRECTIONS, LOST, Outcome, Test, measured
+from graspd.worker.validation.protocol import DIRECTIONS, LOST, Outcome, Test
 
 #: Resolution of payloads, a ratio; they are rounded down.
 TOLD: Final = 1.03

@@ -19,6 +19,7 @@ import numpy as np
 from graspd.service.model.matter import ACCELERATION
 from graspd.service.model.transforms import Floats
 from graspd.worker.engines.mujoco_warnings import void
+from graspd.worker.execution_context import answers
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
@@ -26,7 +27,7 @@ from graspd.worker.simulation.environment import PlacedGrasps
 from graspd.worker.validation.decomposition import ConvexPieces
 from graspd.worker.validation.lift import Lift, LiftOutcome
 from graspd.worker.validation.model import MujocoOptions, Scene, scene_of
-from graspd.worker.validation.protocol import LOST, STAGE_S, Outcome, Test, answers
+from graspd.worker.validation.protocol import LOST, STAGE_S, Outcome, Test
 
 #: The root is fixed, because the protocol's root on a spring costs twice as much. In so short a time nothing slips for
 #: lack of iterations against slip.

@@ -8,20 +8,16 @@ fast: coarser physics (fixed root, 6 ms); where the margin is not clear, level s
 from __future__ import annotations
 
 import math
-import queue
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import Any, Final, TypeVar
+from typing import Any, Final
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from graspd.service.model.transforms import Floats
 from graspd.worker.engines.mujoco_warnings import void
-from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.validation.model import Scene, blend
 
@@ -269,52 +265,3 @@ class Test:
         if not moved < MAX_DISPLACEMENT_M:
             return Outcome.DISPLACED
         return Outcome.HELD if turned < MAX_ROTATION else Outcome.ROTATED
-
-
-T = TypeVar("T")
-R = TypeVar("R")
-
-
-def answers(
-    rows: Sequence[int], make: Callable[[], T], ask: Callable[[T, int], R], *, threads: int, name: str
-) -> list[R]:
-    """Run tests on some grasps in parallel; return the results in their order."""
-    workers = min(threads, len(rows))
-    if workers <= 1:
-        test = make()
-        return [ask(test, row) for row in rows]
-    tests: queue.SimpleQueue[T] = queue.SimpleQueue()
-    for _ in range(workers):
-        tests.put(make())
-
-    def work(row: int) -> R:
-        test = tests.get()
-        try:
-            return ask(test, row)
-        finally:
-            tests.put(test)
-
-    with ThreadPoolExecutor(workers, thread_name_prefix=name) as pool:
-        return list(pool.map(work, rows))
-
-
-def measured(
-    count: int,
-    held: NDArray[np.bool_] | None,
-    make: Callable[[], T],
-    ask: Callable[[T, int], float],
-    *,
-    run: ExecutionContext,
-    name: str,
-) -> NDArray[np.float64]:
-    """Return measurements (count,) on grasps that are `held` (count,), None: all; nan for the others."""
-
-    def asked(test: T, row: int) -> float:
-        run.check("the validator")
-        return ask(test, row)
-
-    out = np.full(count, np.nan)
-    rows = np.arange(count) if held is None else np.flatnonzero(held)
-    if len(rows):
-        out[rows] = answers(rows.tolist(), make, asked, threads=run.cores, name=name)
-    return out

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import Floats
-from graspd.worker.execution_context import DEFAULT_CONTEXT, Count, ExecutionContext
+from graspd.worker.execution_context import DEFAULT_CONTEXT, Count, ExecutionContext, answers
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.disk_cache import content_of
@@ -22,7 +22,7 @@ from graspd.worker.validation.decomposition import ConvexPieces, decompose
 from graspd.worker.validation.key import Level, postures_key, verdict_key
 from graspd.worker.validation.model import COARSE, MujocoOptions, Scene, scene_of
 from graspd.worker.validation.prefilter.prefilter import PrefilterVerdicts, first_terms, screened
-from graspd.worker.validation.protocol import DIRECTIONS, FAST_BAND, Outcome, Rollout, Test, answers
+from graspd.worker.validation.protocol import DIRECTIONS, FAST_BAND, Outcome, Rollout, Test
 
 log = logging.getLogger(__name__)
 #: Grasps per task of a process pool: few, so that many processes share the grasps of one batch.

@@ -14,6 +14,7 @@ from graspd.service.model.domain import JobOptions
 from graspd.service.model.errors import InputError
 from graspd.service.model.fidelity import resolve_fidelity
 from graspd.service.model.scene_spec import SceneSpec
+from graspd.service.model.transforms import apply
 from graspd.service.store.shards import read_shard
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.generation import validated_grasps
@@ -75,24 +76,27 @@ def test_fingertips_keep_what_the_scene_says_and_no_less() -> None:
     assert mujoco_distances(rest, found, table).min() >= MARGIN_M
 
 
-def test_the_whole_way_is_as_clear_as_it_says(planned) -> None:
-    hand, obj, placed, grasps = planned
+def least_room(hand, way, grasps, row: int, scene) -> float:
+    """Least distance of a hand from the obstacles on its whole way, by MuJoCo, at a hundred postures [m]."""
+    one, wide = grasps.take(slice(row, row + 1)), way.open[row : row + 1]
+    coming = approach(Posture(way.approach[row, -1:], wide), Posture(way.approach[row, :1], wide), 40)
+    closing = approach(one.grasp, one.pregrasp, 30)
+    lifting = Posture(np.repeat(one.grasp.hand_pose, 30, axis=0), np.repeat(one.grasp.joint_positions, 30, axis=0))
+    lifting.hand_pose[:, :3] += np.linspace(0, 0.1, 30)[:, None] * scene.up
+    parts, table = (coming, closing, lifting), scene.obstacles[0]
+    found = [mujoco_room(hand, part, table).min() for part in parts]
+    found += [mujoco_distances(hand, part, solid).min() for part in parts for solid in scene.obstacles[1:]]
+    return min(found)
+
+
+@pytest.mark.parametrize("case", ["planned", "planned_beside"])
+def test_the_whole_way_is_as_clear_as_it_says(case: str, request: pytest.FixtureRequest) -> None:
+    hand, obj, placed, grasps = request.getfixturevalue(case)
     way = plan_way(hand, obj, grasps, placed)
     assert way.clear.any()
-    for row in np.flatnonzero(way.clear):
-        scene = placed.scenes[placed.index[row]]
-        coming = approach(
-            Posture(way.approach[row, -1:], way.open[row : row + 1]),
-            Posture(way.approach[row, :1], way.open[row : row + 1]),
-            40,
-        )
-        one = grasps.take(slice(row, row + 1))
-        closing = approach(one.grasp, one.pregrasp, 30)
-        lifting = Posture(np.repeat(one.grasp.hand_pose, 30, axis=0), np.repeat(one.grasp.joint_positions, 30, axis=0))
-        lifting.hand_pose[:, :3] += np.linspace(0, 0.1, 30)[:, None] * scene.up
-        least = min(mujoco_room(hand, part, scene.obstacles[0]).min() for part in (coming, closing, lifting))
+    for row in np.flatnonzero(way.clear)[:4]:
         # Postures between those that were looked at may be nearer by what a finger's arc deviates from its chord.
-        assert least >= MARGIN_M - 5e-4
+        assert least_room(hand, way, grasps, row, placed.scenes[placed.index[row]]) >= MARGIN_M - 5e-4
         assert np.linalg.norm(way.approach[row, 0, :3] - way.approach[row, -1, :3]) == pytest.approx(STANDOFF_M)
 
 
@@ -161,6 +165,9 @@ def test_dropped_neighbours_stand_apart_on_the_table() -> None:
     together = np.concatenate([poses["scene/object_pose"][:, None], poses["scene/neighbour_pose"]], axis=1)
     gaps = gaps_between([neighbour_of(one) for one in (thing, *others)], together)
     assert all((gap > 0).all() for gap in gaps.values())
+    for number, one in enumerate((thing, *others)):
+        for pose in together[:, number]:
+            assert apply(pose, one.hull_vertices)[:, 2].min() == pytest.approx(0.0, abs=1e-9)
     assert len(scenes.placed(np.zeros(1, int)).scenes[0].obstacles) == 3
 
 
@@ -200,26 +207,6 @@ def planned_beside():
     placed = scenes.placed(np.zeros(8, int))
     grasps = synthesize(hand, thing, PlanRequest(count=8, fidelity=QUICK, seed=4, placed=placed))
     return hand, thing, placed, grasps
-
-
-def test_a_way_between_neighbours_is_as_clear_as_mujoco_says(planned_beside) -> None:
-    """At a hundred postures; those between the ones that were looked at may be nearer by what a finger's arc deviates
-    from its chord."""
-    hand, thing, placed, grasps = planned_beside
-    way = plan_way(hand, thing, grasps, placed)
-    assert way.clear.any()
-    scene = placed.scenes[0]
-    for row in np.flatnonzero(way.clear)[:4]:
-        one = grasps.take(slice(row, row + 1))
-        wide = way.open[row : row + 1]
-        coming = approach(Posture(way.approach[row, -1:], wide), Posture(way.approach[row, :1], wide), 40)
-        closing = approach(one.grasp, one.pregrasp, 30)
-        lifting = Posture(np.repeat(one.grasp.hand_pose, 30, axis=0), np.repeat(one.grasp.joint_positions, 30, axis=0))
-        lifting.hand_pose[:, :3] += np.linspace(0, 0.1, 30)[:, None] * scene.up
-        for part in (coming, closing, lifting):
-            found = [mujoco_room(hand, part, scene.obstacles[0])]
-            found += [mujoco_distances(hand, part, solid) for solid in scene.obstacles[1:]]
-            assert np.min(found) >= MARGIN_M - 5e-4
 
 
 def test_without_neighbours_the_hand_would_reach_through_them(planned_beside) -> None:

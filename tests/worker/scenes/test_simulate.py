@@ -88,15 +88,6 @@ def test_a_can_lies_on_its_side_or_stands():
     assert np.all(np.minimum(np.abs(centre - flat), np.abs(centre - height / 2)) < 1e-6)
 
 
-def test_a_thin_slab_almost_never_stands_on_an_edge():
-    obj = object_from_mesh(trimesh.creation.box((0.1, 0.08, 0.008)), "slab")
-    result = drop(obj, count=10, seed=0)
-    up = np.abs(quat_rotate(result["scene/object_pose"][:, 3:], np.array([0.0, 0, 1]))[:, 2])
-    assert np.all(up > 0.999)
-    # Two faces share all drops; the estimate from 64 drops scatters by 0.06.
-    assert np.all(np.abs(result["scene/rest_probability"] - 0.5) < 4 * 0.0625)
-
-
 def test_same_seed_gives_same_scenes_and_more_scenes_keep_first():
     obj = bracket()
     first, again, more = drop(obj, count=3, seed=7), drop(obj, count=3, seed=7), drop(obj, count=5, seed=7)
@@ -120,25 +111,12 @@ def test_stable_faces_agree_with_trimeshs():
     np.testing.assert_allclose((found.normal[found.stable] @ expected.T).max(axis=1), 1.0, atol=1e-9)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("size", [(0.04, 0.06, 0.09), (0.05, 0.06, 0.07)])
-def test_bricks_rest_on_faces_as_often_as_theory_says(size):
-    """Chi-square of 300 drops against Goldberg et al. (1999), which knows no bouncing: contacts here hardly bounce."""
-    mesh = trimesh.creation.box(size)
-    poses = drop(object_from_mesh(mesh), count=300, seed=0)["scene/object_pose"]
-    down = quat_rotate(poses[:, 3:] * np.array([1, -1, -1, -1]), np.array([0.0, 0, -1]))
-    counts = np.bincount(np.argmax(np.abs(down), axis=1), minlength=3)
-    transforms, probability = trimesh.poses.compute_stable_poses(mesh, sigma=0.0, n_samples=1)
-    axis = np.argmax(np.abs(transforms[:, 2, :3]), axis=1)
-    expected = np.bincount(axis, weights=probability, minlength=3)
-    assert chisquare(counts, 300 * expected / expected.sum()).pvalue > 0.01
-
-
 def hull_of(points) -> trimesh.Trimesh:
     return trimesh.convex.convex_hull(np.array(points, float))
 
 
 CONVEX = {
+    "brick": trimesh.creation.box((0.04, 0.06, 0.09)),
     "prism": hull_of([(x, y, z) for x, y in [(0, 0), (0.06, 0), (0.02, 0.05)] for z in (0, 0.05)]),
     "frustum": hull_of([(x * w, y * w, z) for w, z in ((0.035, 0), (0.022, 0.05)) for x in (-1, 1) for y in (-1, 1)]),
     "tetrahedron": hull_of([(0, 0, 0), (0.07, 0, 0), (0.01, 0.06, 0), (0.02, 0.02, 0.055)]),
@@ -151,6 +129,7 @@ CONVEX = {
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CONVEX)
 def test_convex_objects_rest_on_faces_as_often_as_theory_says(name):
+    """Chi-square of 300 drops against Goldberg et al. (1999), which knows no bouncing: contacts here hardly bounce."""
     mesh = CONVEX[name]
     poses = drop(object_from_mesh(mesh, name), count=300, seed=0)["scene/object_pose"]
     down = quat_rotate(poses[:, 3:] * np.array([1, -1, -1, -1]), np.array([0.0, 0, -1]))

@@ -79,6 +79,18 @@ class Selection:
         empty = HandState(np.zeros((count, 3)), np.zeros((count, 4)), np.zeros((count, dofs)))
         return cls(empty, np.zeros(count), np.full(count, np.inf), {})
 
+    def take(
+        self, found: GraspSet, seated: Refinements, rows: NDArray[np.intp], which: NDArray[np.intp], score: Floats
+    ) -> None:
+        """Take candidates `rows` (k,) of the grasps `which` (k,) where they are better."""
+        state, losses = seated.state[rows], seated.losses[rows]
+        for k in np.flatnonzero(score < self.score[which]):
+            grasp = int(which[k])
+            self.grasps[grasp] = found.take(slice(k, k + 1))
+            self.score[grasp], self.losses[grasp] = score[k], losses[k]
+            for name in ("pivot", "rotation", "q"):
+                getattr(self.state, name)[grasp] = getattr(state, name)[k]
+
     def joined(self) -> GraspSet:
         return joined([self.grasps[k] for k in range(len(self.score))])
 
@@ -119,7 +131,7 @@ def tried(
             )
             score = _scores(found, seated.infeasible[rows[open_]], which, taken.score[which], rollout)
             _gentler(hand, obj, found, score, which, rollout, device)
-            _take(found, seated, rows[open_], which, score, taken)
+            taken.take(found, seated, rows[open_], which, score)
         left = left[~(taken.score[left] < 1.0)]
     return taken
 
@@ -155,23 +167,6 @@ def _gentler(
     better = again < score[poor]
     found.squeeze.joint_positions[poor[better]] = gentle.squeeze.joint_positions[better]
     score[poor[better]] = again[better]
-
-
-def _take(
-    found: GraspSet,
-    seated: Refinements,
-    rows: NDArray[np.intp],
-    which: NDArray[np.intp],
-    score: Floats,
-    taken: Selection,
-) -> None:
-    state, losses = seated.state[rows], seated.losses[rows]
-    for k in np.flatnonzero(score < taken.score[which]):
-        grasp = int(which[k])
-        taken.grasps[grasp] = found.take(slice(k, k + 1))
-        taken.score[grasp], taken.losses[grasp] = score[k], losses[k]
-        for name in ("pivot", "rotation", "q"):
-            getattr(taken.state, name)[grasp] = getattr(state, name)[k]
 
 
 #: Coulomb coefficient for the balance of contacts: lower than in any test, so that balanced grasps have a reserve.
