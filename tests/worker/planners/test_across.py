@@ -174,7 +174,10 @@ def test_outlines_tell_how_far_a_hand_must_rise(block, barrett, tips_m) -> None:
     scene = Environment((table,), UP)
     found = across(barrett, block, opening, uniform, ways)
     centre = found.pivot + block.centre_of_mass
-    told = outlines_of(barrett, oppositions_of(barrett).q).lacks(found.posture, found.turn, centre, scene, room=0.006)
+    known = oppositions_of(barrett).q
+    outlines = outlines_of(barrett, known)
+    assert outlines is outlines_of(barrett, known.copy()) and len(outlines_of(barrett, known[:3]).points) == 3
+    told = outlines.lacks(found.posture, found.turn, centre, scene, room=0.006)
     root = centre - np.einsum("nij,j->ni", found.turn, barrett.palm.centre)
     q = found.q(barrett, np.zeros((60, barrett.dofs)))
     posture = Posture(np.concatenate([root, quat_from_matrix(found.turn)], axis=1), barrett.expand(q))

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import trimesh
 
-import graspd
 from graspd.service.model.fidelity import FIDELITIES
 from graspd.service.model.transforms import quat_rotate
 from graspd.studies.stability.assets import ring_hand
@@ -105,16 +102,6 @@ def test_what_is_too_wide_all_over_is_looked_at_only() -> None:
     looking, _ = starts_of(wide, 2, 2)
     alone = [start_generator(3, 0, i, k) for i in range(2) for k in range(2)]
     np.testing.assert_array_equal(looking.pivot, clear_starts(wide, alone)[0].pivot)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("side", [0.01, 0.2])
-def test_cubes_too_small_or_wide_for_pads_are_held_by_others(side: float, tmp_path: Path) -> None:
-    file = tmp_path / "cube.stl"
-    trimesh.creation.box((side,) * 3).export(file)
-    grasps = graspd.synthesize("allegro", file, count=64, want="candidates", seed=23)
-    # Measured: .41 and .55 of other seeds; the share of 64 is off by .06.
-    assert grasps.is_valid.mean() > 1 / 4
 
 
 @pytest.mark.parametrize("side", [0.01, 0.2])

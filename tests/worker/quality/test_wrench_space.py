@@ -83,16 +83,6 @@ def test_contacts_on_the_unit_sphere(
     assert sphere_space(points, friction, **options) == pytest.approx((epsilon, volume), abs=PRINTED)
 
 
-@pytest.mark.parametrize(("friction", "epsilon", "volume"), [(0.5, 0.469, 1.485), (1.0, 0.939, 23.9)])
-def test_many_contacts_saturate(friction: float, epsilon: float, volume: float) -> None:
-    turn = np.arange(30) + 0.5
-    polar, around = np.arccos(1 - turn / 15), np.pi * (1 + math.sqrt(5)) * turn
-    ring = np.sin(polar)
-    points = np.stack([np.cos(around) * ring, np.sin(around) * ring, np.cos(polar)], axis=1)
-    # The published spiral may begin elsewhere on the sphere.
-    assert sphere_space(points, friction) == pytest.approx((epsilon, volume), rel=0.01)
-
-
 @pytest.mark.parametrize(
     ("points", "friction", "bound"),
     [(TETRAHEDRON, 0.2, 0.142), (TETRAHEDRON, 0.5, 0.370), (TETRAHEDRON, 1.0, 0.747),

@@ -59,14 +59,6 @@ def test_transferred_poses_are_base_poses_seen_from_the_table():
     )
 
 
-def test_a_hand_pointing_down_clears_the_table_by_its_fingertips():
-    # Palm looks down from 0.2 m: the tips' spheres end 0.068 + 0.011 below the root.
-    down = np.concatenate([[0, 0, 0.2], quat_from_axis_angle(np.array([1.0, 0, 0]), np.asarray(np.pi))])[None]
-    posture = Posture(down, np.zeros((1, 2)))
-    result = transfer(HAND, posture, posture, IDENTITY)
-    assert result["grasp/table_clearance_m"][0] == pytest.approx(0.2 - 0.079, abs=1e-12)
-
-
 @pytest.mark.parametrize(("gap", "valid"), [(MARGIN_M + 1e-6, 1), (MARGIN_M - 1e-6, 0)])
 def test_a_grasp_is_valid_from_the_stated_margin_on(gap, valid):
     # Palm up: the lowest point is the bottom of the palm box, 0.03 below the root.

@@ -39,7 +39,7 @@ from graspd.worker.validation.variant import (
     recoupled,
     seen,
 )
-from tests.worker.models import piece, two_finger_hand
+from tests.worker.models import on_one_dof, piece, two_finger_hand
 from tests.worker.quality.helpers import BOX, PADS, WHOLE, many_grasps, plate_hand, posture
 
 
@@ -327,26 +327,10 @@ def test_fingers_that_close_one_after_another_end_together() -> None:
     assert late[0][1][0] != pytest.approx(start[0]), "the first one does not"
 
 
-def one_drive() -> HandModel:
-    """Two fingers on one dof."""
-    return dataclasses.replace(
-        two_finger_hand(),
-        digest="1" * 32,
-        dof=np.array([-1, 0, 0], np.int32),
-        dof_names=("both",),
-        lower=np.full(1, -0.3),
-        upper=np.full(1, 1.2),
-        effort=np.ones(1),
-        stiffness=np.full(1, 10.0),
-        preshape=np.zeros(1),
-        closing=np.ones(1),
-    )
-
-
 def test_a_compliant_coupling_gives_way_under_load() -> None:
-    assert Axis.COUPLINGS in axes_of(one_drive()) and Axis.COUPLINGS not in axes_of(two_finger_hand())
+    assert Axis.COUPLINGS in axes_of(on_one_dof(two_finger_hand())) and Axis.COUPLINGS not in axes_of(two_finger_hand())
     apart = []
-    around = models(one_drive())
+    around = models(on_one_dof(two_finger_hand()))
     for variant in (NOMINAL, Variant(coupling="compliant")):
         scene = around.scene(variant)
         data = mujoco.MjData(scene.model)
@@ -360,7 +344,7 @@ def test_a_compliant_coupling_gives_way_under_load() -> None:
 @pytest.mark.parametrize("axis", [axis for axis in Axis if axis is not Axis.NONE])
 def test_a_draw_stays_in_the_range_of_its_axis(axis: Axis) -> None:
     rng = np.random.default_rng(5)
-    hand = one_drive() if axis is Axis.COUPLINGS else PADS
+    hand = on_one_dof(two_finger_hand()) if axis is Axis.COUPLINGS else PADS
     drawn = [draw(axis, hand, rng) for _ in range(60)]
     for one in drawn:
         assert 0.5 <= min(one.gain, one.damping, one.mass) <= max(one.gain, one.damping, one.mass) <= 2

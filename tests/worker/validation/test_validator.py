@@ -26,7 +26,6 @@ from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext, m
 from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path
-from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.convex import union_volume
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.simulation.environment import Obstacle
@@ -38,7 +37,7 @@ from graspd.worker.validation.model import MujocoOptions, blend, build, scene_of
 from graspd.worker.validation.protocol import HOLD_S, MAX_DISPLACEMENT_M, MAX_ROTATION, Outcome, Rollout, Test
 from graspd.worker.validation.robust import robustness
 from graspd.worker.validation.validator import validate
-from tests.worker.models import object_from_mesh, two_finger_hand
+from tests.worker.models import object_from_mesh, on_one_dof, two_finger_hand
 from tests.worker.quality.helpers import (
     BOX,
     CONTACT,
@@ -305,17 +304,8 @@ def test_forward_kinematics_agree_with_ours() -> None:
         assert abs(float(data.body(f"body{b}").xquat @ ours[b, 3:])) == pytest.approx(1.0, abs=1e-12)
 
 
-def coupled_pads() -> HandModel:
-    """One dof closes both pads, the right one at half the pace from an offset of 10 mm."""
-    return dataclasses.replace(
-        PADS, dof=np.array([-1, 0, 0], np.int32), multiplier=np.array([1.0, 1.0, 0.5]),
-        offset=np.array([0.0, 0.0, 0.01]), dof_names=("grip",), lower=np.zeros(1), upper=np.full(1, 0.1),
-        effort=np.full(1, 100.0), stiffness=np.full(1, 100.0), preshape=np.zeros(1), closing=np.ones(1),
-    )  # fmt: skip
-
-
 def test_coupled_joints_stay_coupled_while_moving() -> None:
-    hand = coupled_pads()
+    hand = on_one_dof(PADS, 0.5, 0.01)
     scene = build(hand, BOX, WHOLE, MujocoOptions())
     assert scene.model.nu == 1
     data = mujoco.MjData(scene.model)
