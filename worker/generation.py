@@ -213,15 +213,8 @@ class Scoring:
         Verdicts at the validator's own level are added to `known`."""
         if self.pieces is None:
             return None
-        return rollout_on(
-            self.run,
-            self.hand,
-            self.obj,
-            self.pieces.result,
-            in_scenes=self.scenes is not None,
-            known=known,
-            level=self._level,
-        )
+        pieces, in_scenes = self.pieces.result, self.scenes is not None
+        return rollout_on(self.run, self.hand, self.obj, pieces, in_scenes=in_scenes, known=known, level=self._level)
 
     def key(self) -> str:
         assert self.pieces is not None
@@ -468,15 +461,8 @@ class Batch:
 
         def planned(part: range, own: ExecutionContext, others: bool) -> Round:
             wanted = self.wanted(replace(asked, rows=part), rollout, others_have_place=others)
-            request = self.request
-            found = synthesize(
-                self.scoring.hand,
-                self.scoring.obj,
-                wanted,
-                own.part(0.0, PARTS[0]),
-                method=request.method,
-                options=request.options,
-            )
+            hand, obj, request, run = self.scoring.hand, self.scoring.obj, self.request, own.part(0.0, PARTS[0])
+            found = synthesize(hand, obj, wanted, run, method=request.method, options=request.options)
             told = self.told(wanted, found)
             # Verdicts and metrics are many short jobs: they may use all cores, whatever the other parts do.
             made = self.scoring.scored(told, replace(own, sharing=None), known)

@@ -75,30 +75,13 @@ def _balanced(
         scratch = [wp.empty((count, points), dtype=kind) for kind in (wp.int32, wp.float64)]
         touches = wp.empty((count, posing.fingers), dtype=wp.bool)
         chosen, used = wp.empty((count, most), dtype=wp.int32), wp.empty(count, dtype=wp.int32)
-        launch(
-            touching.choose,
-            count,
-            inputs=[posing.points, posing.finger, near, *reach, wp.float64(FACING_COS), wp.float64(radius)],
-            outputs=[touches, *scratch, chosen, used],
-        )
+        places = [wp.float64(FACING_COS), wp.float64(radius)]
+        inputs = [posing.points, posing.finger, near, *reach, *places]
+        launch(touching.choose, count, inputs=inputs, outputs=[touches, *scratch, chosen, used])
         matrix = wp.empty((count, most * int(touching.EDGES), rows), dtype=wp.float64)
-        launch(
-            touching.columns,
-            chosen.shape,
-            inputs=[
-                posing.chain,
-                posing.effort,
-                posing.points,
-                bodies,
-                near,
-                chosen,
-                used,
-                wp.float64(friction),
-                wp.float64(radius),
-                wp.float64(SUM),
-            ],
-            outputs=[matrix],
-        )
+        inputs = [posing.chain, posing.effort, posing.points, bodies, near, chosen, used]
+        inputs += [wp.float64(friction), wp.float64(radius), wp.float64(SUM)]
+        launch(touching.columns, chosen.shape, inputs=inputs, outputs=[matrix])
         unit = wp.empty(count, dtype=wp.float64)
         launch(touching.scale_torques, count, inputs=[wp.float64(TORQUE)], outputs=[used, matrix, unit])
         target = np.zeros(rows)
@@ -106,12 +89,8 @@ def _balanced(
         share = solved(matrix, target, SPREAD, used)
         residual = wp.empty(count, dtype=wp.float64)
         torque = wp.empty((count, posing.hand.dofs), dtype=wp.float64)
-        launch(
-            touching.hold,
-            count,
-            inputs=[posing.effort, matrix, share, used, unit, wp.float64(total)],
-            outputs=[residual, torque],
-        )
+        inputs = [posing.effort, matrix, share, used, unit, wp.float64(total)]
+        launch(touching.hold, count, inputs=inputs, outputs=[residual, torque])
     return residual, torque
 
 
@@ -132,12 +111,8 @@ def solved(matrix: Any, target: Floats, ridge: float, count: Any) -> Any:
         work.used = wp.empty((batch, columns), dtype=wp.int32)
         x = wp.empty((batch, columns), dtype=wp.float64)
         feasible = wp.empty(batch, dtype=wp.int32)
-        launch(
-            kernels.nonnegative,
-            batch,
-            inputs=[matrix, wp.array(target, dtype=wp.float64), wp.float64(ridge), count],
-            outputs=[work, x, feasible],
-        )
+        inputs = [matrix, wp.array(target, dtype=wp.float64), wp.float64(ridge), count]
+        launch(kernels.nonnegative, batch, inputs=inputs, outputs=[work, x, feasible])
     unsolved = np.flatnonzero(feasible.numpy() == 0)
     if len(unsolved):
         found, columns, used = x.numpy(), matrix.numpy(), count.numpy()

@@ -100,12 +100,8 @@ class PostureData:
         with wp.ScopedDevice(self.device):
             near.distance, near.cosine = wp.empty(shape, dtype=wp.float32), wp.empty(shape, dtype=wp.float64)
             near.closest, near.normal = (wp.empty(shape, dtype=wp.vec3) for _ in range(2))
-            launch(
-                touching.touch,
-                (count, self.lanes),
-                inputs=[self.probe.skin, self.points, self.lane, bodies, reach],
-                outputs=[near],
-            )
+            inputs = [self.probe.skin, self.points, self.lane, bodies, reach]
+            launch(touching.touch, (count, self.lanes), inputs=inputs, outputs=[near])
         return bodies, near
 
     def touching_links(self, posture: Posture) -> NDArray[np.int32]:

@@ -366,14 +366,8 @@ def _load(forces: Floats, moments: Floats, torques: Floats, efforts: Floats, alo
     balance = np.column_stack([np.hstack([forces, moments]).T, -np.concatenate([along, np.zeros(3)])])
     exerted = np.column_stack([np.vstack([torques.T, -torques.T]), np.zeros(len(efforts))])
     limited = np.isfinite(efforts)
-    solved = linprog(
-        np.append(np.zeros(count), -1.0),
-        A_ub=exerted[limited],
-        b_ub=efforts[limited],
-        A_eq=balance,
-        b_eq=np.zeros(6),
-        bounds=(0, None),
-    )
+    goal, still = np.append(np.zeros(count), -1.0), np.zeros(6)
+    solved = linprog(goal, exerted[limited], efforts[limited], A_eq=balance, b_eq=still, bounds=(0, None))
     if solved.status == _UNBOUNDED:
         return math.inf
     return -float(solved.fun) if solved.fun is not None else 0.0

@@ -220,15 +220,9 @@ class _Around:
         order, least = np.zeros((len(scene), REACHES), np.intp), np.full((len(scene), REACHES), np.inf)
         for s in np.unique(scene[reaching]):
             rows = np.flatnonzero(reaching & (scene == s))
+            opening, ways, drawn = self.openings[s], self.ways[s], uniform[rows, :CANDIDATES, :6]
             order[rows], least[rows] = promising(
-                self.hand,
-                self.obj,
-                self.openings[s],
-                uniform[rows, :CANDIDATES, :6],
-                self.ways[s],
-                placed.scenes[s],
-                room=ROOM,
-                keep=REACHES,
+                self.hand, self.obj, opening, drawn, ways, placed.scenes[s], room=ROOM, keep=REACHES
             )
         return order, least
 

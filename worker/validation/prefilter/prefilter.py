@@ -212,13 +212,8 @@ class WorldPool:
         scene, parts = self.scene, (grasps.pregrasp, grasps.grasp, grasps.squeeze)
         poses = np.stack([part.hand_pose for part in parts], axis=1)
         joints = np.stack([part.joint_positions for part in parts], axis=1)
-        values: dict[str, Any] = {
-            "queue": queue,
-            "start": starts,
-            "position": poses[..., :3],
-            "turn": poses[..., 3:],
-            "control": scene.controls(joints),
-        }
+        values: dict[str, Any] = {"queue": queue, "start": starts, "control": scene.controls(joints)}
+        values |= {"position": poses[..., :3], "turn": poses[..., 3:]}
         for name, value in values.items():
             array = getattr(self._asked, name)
             whole = array.numpy()
@@ -233,12 +228,8 @@ class WorldPool:
             wp.launch(kernels.place, self.worlds, inputs=[first, rows], outputs=[self._arrays])
             self._engine.fwd_position(self._model, data)
             contact = data.contact
-            wp.launch(
-                kernels.depths,
-                data.naconmax,
-                inputs=[first, self._of_hand, data.nacon, contact.worldid, contact.geom, contact.dist],
-                outputs=[out],
-            )
+            inputs = [first, self._of_hand, data.nacon, contact.worldid, contact.geom, contact.dist]
+            wp.launch(kernels.depths, data.naconmax, inputs=inputs, outputs=[out])
             most = max(int(data.nacon.numpy()[0]), int(data.ncollision.numpy()[0]))
             short[first : first + self.worlds] = most > data.naconmax
         return out.numpy().astype(float), short
@@ -246,12 +237,8 @@ class WorldPool:
     def _simulate(self, count: int, run: ExecutionContext) -> None:
         self.launches = 0
         self._state.assign(np.array([0, self.worlds, count], np.int32))
-        wp.launch(
-            kernels.begin,
-            self.worlds,
-            inputs=[self._terms, self._asked],
-            outputs=[self._worlds, self._arrays, self._state],
-        )
+        outputs = [self._worlds, self._arrays, self._state]
+        wp.launch(kernels.begin, self.worlds, inputs=[self._terms, self._asked], outputs=outputs)
         while True:
             taken, alive, _ = self._state.numpy()
             run.progress(min(int(taken), count) - int(alive), count, "prefilter")
@@ -275,12 +262,8 @@ class WorldPool:
     def _launch(self) -> None:
         for _ in range(self._steps):
             self._engine.step(self._model, self._data)
-        wp.launch(
-            kernels.look,
-            self.worlds,
-            inputs=[self._terms, self._asked],
-            outputs=[self._worlds, self._arrays, self._found, self._state],
-        )
+        outputs = [self._worlds, self._arrays, self._found, self._state]
+        wp.launch(kernels.look, self.worlds, inputs=[self._terms, self._asked], outputs=outputs)
 
 
 _pools: OrderedDict[tuple[str, str, int], WorldPool] = OrderedDict()
