@@ -60,14 +60,8 @@ _PUSHED: Final = {
     Outcome.ROTATED: "turned",
     Outcome.DIVERGED: "unstable",
 }
-_LIFTED: Final = {
-    LiftOutcome.PENETRATION: "penetration",
-    LiftOutcome.TOUCHED_ON_THE_WAY: "touched_on_the_way",
-    LiftOutcome.LOST_WHILE_CLOSING: "lost_while_closing",
-    LiftOutcome.NOT_LIFTED: "not_lifted",
-    LiftOutcome.TURNED: "turned",
-    LiftOutcome.DIVERGED: "unstable",
-    LiftOutcome.NEIGHBOUR_MOVED: "neighbour_moved",
+_LIFTED: Final = {outcome: outcome.name.lower() for outcome in LiftOutcome if outcome > LiftOutcome.LIFTED} | {
+    LiftOutcome.DIVERGED: "unstable"
 }
 #: Verdicts on candidates from the planner's rollouts, of lifts or of pushes.
 Known = dict[str, Any]
@@ -436,15 +430,9 @@ class Batch:
         planned = joined([grasps for one in self.rounds for grasps in one.planned])
         latest = max(ENOUGH, sum(map(len, self.rounds[-1].planned)))
         planned = planned.take(slice(max(0, len(planned) - latest), None))
-        self.limit = limit_of(
-            scoring.hand,
-            scoring.obj,
-            planned,
-            wanted=max(scoring.obj.mass, self.request.min_payload),
-            pieces=scoring.pieces.result(),
-            placed=scoring.placed(planned),
-            run=scoring.run.quiet(),
-        )
+        hand, obj, placed = scoring.hand, scoring.obj, scoring.placed(planned)
+        pieces, run, wanted = scoring.pieces.result(), scoring.run.quiet(), max(obj.mass, self.request.min_payload)
+        self.limit = limit_of(hand, obj, planned, wanted=wanted, pieces=pieces, placed=placed, run=run)
         return self.limit is not None and self.limit.hopeless
 
     @property
@@ -573,11 +561,9 @@ class Batch:
         Rechecks validate the first valid grasps at level `dexgraspbench`."""
         scoring = self.scoring
         assert scoring.pieces is not None
-        columns: Arrays = {
-            "quality/simulated_displacement_cm": simulated_displacement_cm(
-                scoring.hand, scoring.obj, grasps.grasp, pieces=scoring.pieces.result(), run=scoring.run
-            )
-        }
+        hand, obj, run, pieces = scoring.hand, scoring.obj, scoring.run, scoring.pieces.result()
+        displacement = simulated_displacement_cm(hand, obj, grasps.grasp, pieces=pieces, run=run)
+        columns: Arrays = {"quality/simulated_displacement_cm": displacement}
         with _timed(self.seconds, "validation"):
             if count := self.request.rechecks_of(self.number):
                 rechecked, recheck = np.flatnonzero(valid)[:count], np.full(len(grasps), -1, np.int8)
@@ -586,15 +572,9 @@ class Batch:
                     recheck[rechecked] = known[: len(rechecked)]
                 columns["quality/recheck"] = recheck
             if repeats := self.request.robustness:
+                seed, quiet = self.request.seed, run.quiet()
                 columns["quality/robustness"] = robustness(
-                    scoring.hand,
-                    scoring.obj,
-                    grasps,
-                    held=valid,
-                    repeats=repeats,
-                    seed=self.request.seed,
-                    pieces=scoring.pieces.result(),
-                    run=scoring.run.quiet(),
+                    hand, obj, grasps, held=valid, repeats=repeats, seed=seed, pieces=pieces, run=quiet
                 )
         return columns
 

@@ -103,13 +103,11 @@ class VoxelVolume:
         return float((depth < 0).sum()) * self.edge**3 * 1e6
 
     def _box(self, bodies: Floats, pieces: NDArray[np.intp]) -> tuple[Floats, Floats]:
-        corners = np.concatenate(
-            [
-                self.hand.pieces[p].vertices @ pose_to_matrix(bodies[self.hand.pieces[p].body])[:3, :3].T
-                + bodies[self.hand.pieces[p].body, :3]
-                for p in pieces
-            ]
-        )
+        posed = []
+        for piece in (self.hand.pieces[p] for p in pieces):
+            rotation = pose_to_matrix(bodies[piece.body])[:3, :3]
+            posed.append(piece.vertices @ rotation.T + bodies[piece.body, :3])
+        corners = np.concatenate(posed)
         vertices = self._probe.obj.vertices
         return np.maximum(corners.min(0), vertices.min(0)), np.minimum(corners.max(0), vertices.max(0))
 

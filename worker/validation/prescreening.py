@@ -12,7 +12,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, TypeVar
 
 import numpy as np
 
@@ -28,6 +28,8 @@ from graspd.worker.validation.decomposition import ConvexPieces
 from graspd.worker.validation.lift import Lift, LiftOutcome
 from graspd.worker.validation.model import MujocoOptions, Scene, scene_of
 from graspd.worker.validation.protocol import LOST, STAGE_S, Outcome, Test
+
+T = TypeVar("T")
 
 #: The root is fixed, because the protocol's root on a spring costs twice as much. In so short a time nothing slips for
 #: lack of iterations against slip.
@@ -147,7 +149,15 @@ class _Shorts:
         self._scenes: Frictions | None = None
         self._lock = threading.Lock()
 
-    def compiled(self, placed: PlacedGrasps | None) -> Frictions:
+    def scored(
+        self, count: int, placed: PlacedGrasps | None, make: Callable[[Frictions], T], score: Callable[[T, int], float]
+    ) -> Floats:
+        """Return scores (count,) of grasps by tests that `make` creates."""
+        scenes = self._compiled(placed)
+        found = answers(range(count), lambda: make(scenes), score, threads=self.threads, name="short-test")
+        return np.array(found, float)
+
+    def _compiled(self, placed: PlacedGrasps | None) -> Frictions:
         with self._lock:
             if self._scenes is None:
                 pieces = self._pieces()
@@ -163,15 +173,10 @@ class LiftRollouts(_Shorts):
     def scores(self, grasps: GraspSet, placed: PlacedGrasps, beat: Floats | None = None) -> Floats:
         least = np.full(len(grasps), np.inf) if beat is None else beat
 
-        scenes = self.compiled(placed)
-        found = answers(
-            range(len(grasps)),
-            lambda: LiftRollout(scenes, placed),
-            lambda test, row: test.score(grasps, row, float(least[row])),
-            threads=self.threads,
-            name="short-test",
-        )
-        return np.array(found, float)
+        def score(test: LiftRollout, row: int) -> float:
+            return test.score(grasps, row, float(least[row]))
+
+        return self.scored(len(grasps), placed, lambda scenes: LiftRollout(scenes, placed), score)
 
 
 def push_rollout(
@@ -187,15 +192,7 @@ def push_rollout(
     shorts = _Shorts(hand, obj, pieces, threads=threads)
 
     def rollout(grasps: GraspSet, placed: PlacedGrasps | None, beat: Floats | None = None) -> Floats:
-        scenes = shorts.compiled(None)
-        found = answers(
-            range(len(grasps)),
-            lambda: PushRollout(scenes),
-            lambda test, row: test.score(grasps, row),
-            threads=threads,
-            name="short-test",
-        )
-        return np.array(found, float)
+        return shorts.scored(len(grasps), None, PushRollout, lambda test, row: test.score(grasps, row))
 
     return rollout
 

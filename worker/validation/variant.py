@@ -268,13 +268,8 @@ class Models:
         one, where = seen(self.obj, grasps, row, variant), placed.take(slice(row, row + 1))
         if moves_object(variant):
             pose = compose(placed.object_pose[number], motion_of(self.obj, variant))
-            where = PlacedGrasps(
-                placed.supports,
-                pose[None],
-                np.zeros(1, np.intp),
-                placed.neighbours,
-                placed.neighbour_pose[number : number + 1],
-            )
+            beside = placed.neighbour_pose[number : number + 1]
+            where = replace(placed, object_pose=pose[None], index=np.zeros(1, np.intp), neighbour_pose=beside)
         test = VariantLift(self.scene(variant), where, variant, self._lags(variant))
         one = self._taken(test.scene, one)
         return test.dexgraspbench(one, 0) if dexgraspbench else test.lift(one, 0)

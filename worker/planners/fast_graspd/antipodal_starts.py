@@ -396,21 +396,10 @@ class ReachSampling:
             number = wp.empty(count, dtype=wp.int32)
             pivot, rotation = wp.zeros(count, dtype=wp.vec3), wp.zeros(count, dtype=wp.quat)
             q = wp.zeros((count, m.dofs), dtype=wp.float32)
-            launch(
-                kernels.reach,
-                count,
-                inputs=[
-                    m.obj.surface,
-                    self.grips,
-                    wp.array(seeds, dtype=wp.int32),
-                    wp.array(first, dtype=wp.int32),
-                    DRAWS,
-                    wp.vec2(*ALIKE_M),
-                    wp.vec2(*ROOM_M),
-                    wp.array(retreats, dtype=wp.float32),
-                ],
-                outputs=[number, pivot, rotation, q],
-            )
+            draws = [wp.array(numbers, dtype=wp.int32) for numbers in (seeds, first)]
+            inputs = [m.obj.surface, self.grips, *draws, DRAWS, wp.vec2(*ALIKE_M), wp.vec2(*ROOM_M)]
+            inputs.append(wp.array(retreats, dtype=wp.float32))
+            launch(kernels.reach, count, inputs=inputs, outputs=[number, pivot, rotation, q])
         found = HandState(pivot.numpy().astype(float), to_wxyz(rotation.numpy().astype(float)), q.numpy().astype(float))
         return found, number.numpy()
 
