@@ -160,8 +160,9 @@ def answers(
     rows: Sequence[int], make: Callable[[], T], ask: Callable[[T, int], R], *, threads: int, name: str
 ) -> list[R]:
     """Run tests on some grasps in parallel; return the results in their order."""
-    workers = min(threads, len(rows))
-    if workers <= 1:
+    if not len(rows):
+        return []
+    if (workers := min(threads, len(rows))) <= 1:
         test = make()
         return [ask(test, row) for row in rows]
     tests: queue.SimpleQueue[T] = queue.SimpleQueue()
@@ -196,6 +197,5 @@ def measured(
 
     out = np.full(count, np.nan)
     rows = np.arange(count) if held is None else np.flatnonzero(held)
-    if len(rows):
-        out[rows] = answers(rows.tolist(), make, asked, threads=run.cores, name=name)
+    out[rows] = answers(rows.tolist(), make, asked, threads=run.cores, name=name)
     return out

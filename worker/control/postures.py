@@ -68,15 +68,11 @@ def pregrasp(
     return found if placed is None else raised(hand, grasp, found, placed)
 
 
-def wide_open(
-    hand: HandModel, obj: ObjectModel, pregrasp: Posture, placed: PlacedGrasps, *, device: str = "cpu"
-) -> Floats:
+def wide_open(hand: HandModel, obj: ObjectModel, pregrasp: Posture, placed: PlacedGrasps) -> Floats:
     """Return joint positions (N, J) for the approach: fingers opened plainly by `WIDE` of their range.
     They stop where they would run into one another or into an obstacle."""
-    posing, joints = (
-        posing_of(hand, obj, points=_POINTS, device=device),
-        np.zeros((len(pregrasp), len(hand.joint_names))),
-    )
+    posing = posing_of(hand, obj, points=_POINTS, device="cpu")
+    joints = np.zeros((len(pregrasp), len(hand.joint_names)))
     for rows in posing.parts(len(pregrasp)):
         some, scene = pregrasp.take(rows), placed.take(rows)
         q = hand.reduce(some.joint_positions)
@@ -88,20 +84,14 @@ def wide_open(
 
 
 def squeeze(
-    hand: HandModel,
-    obj: ObjectModel,
-    grasp: Posture,
-    *,
-    total_normal_force: float | None = None,
-    friction: float = FRICTION,
-    device: str = "cpu",
+    hand: HandModel, obj: ObjectModel, grasp: Posture, *, total_normal_force: float | None = None, device: str = "cpu"
 ) -> Posture:
     """Compute N commanded postures that press, q + Kp^-1 J^T f; root fixed; see `worker.control.squeeze`."""
     force = normal_force(obj) if total_normal_force is None else total_normal_force
     if (jaws := jaws_of(hand)) is not None:
         probe = posing_of(hand, obj, points=_POINTS, device=device).probe
         return jaw_squeeze(probe, jaws, grasp, total_normal_force=force)
-    holds = hold_forces(hand, obj, grasp, total_normal_force=force, friction=friction, closing=CLOSING_M, device=device)
+    holds = hold_forces(hand, obj, grasp, total_normal_force=force, closing=CLOSING_M, device=device)
     q = hand.reduce(grasp.joint_positions) + holds.torque / hand.stiffness
     return Posture(np.array(grasp.hand_pose, float), hand.expand(q))
 
@@ -119,15 +109,12 @@ def hold_forces(
     """Compute balanced contact forces of N grasps; `HoldForces.residual` predicts whether a grasp holds.
     Fingers without contact press with their points within `closing` [m]."""
     posing = posing_of(hand, obj, points=_POINTS, device=device)
-    return balanced(
-        posing,
-        grasp,
-        total_normal_force=normal_force(obj) if total_normal_force is None else total_normal_force,
-        friction=friction,
-        within=PRESSING_M,
-        most=MAX_PRESSING,
-        closing=closing,
-    )
+    total, reach = normal_force(obj) if total_normal_force is None else total_normal_force, (PRESSING_M, closing)
+    found = HoldForces(np.ones(len(grasp)), np.zeros((len(grasp), hand.dofs)))
+    for rows in posing.parts(len(grasp)):
+        residual, torque = balanced(posing, grasp.take(rows), total, friction, reach, MAX_PRESSING)
+        found.residual[rows], found.torque[rows] = residual, torque
+    return found
 
 
 def normal_force(obj: ObjectModel) -> float:

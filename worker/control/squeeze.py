@@ -38,36 +38,12 @@ class HoldForces:
 
 
 def balanced(
-    posing: PostureData,
-    grasp: Posture,
-    *,
-    total_normal_force: float,
-    friction: float,
-    within: float,
-    most: int,
-    closing: float = 0.0,
-) -> HoldForces:
-    """Compute balanced contact forces of N grasps within the hand's torque limits.
-
-    Where torques exceed a limit, all forces are scaled together, which keeps the balance.
-
-    Args:
-        total_normal_force: wanted sum of normal forces [N].
-        within: hand points within this distance of the object press on it [m].
-        most: largest number of these points; the most spread out are used.
-        closing: distance within which points of a finger without contact press [m].
-    """
-    hand = posing.hand
-    found = HoldForces(np.ones(len(grasp)), np.zeros((len(grasp), hand.dofs)))
-    for rows in posing.parts(len(grasp)):
-        residual, torque = _balanced(posing, grasp.take(rows), total_normal_force, friction, (within, closing), most)
-        found.residual[rows], found.torque[rows] = residual.numpy(), torque.numpy()
-    return found
-
-
-def _balanced(
     posing: PostureData, grasp: Posture, total: float, friction: float, reach: tuple[float, float], most: int
-) -> tuple[Any, Any]:
+) -> tuple[Floats, Floats]:
+    """Compute balanced contact forces of grasps within the hand's torque limits: residuals and torques of `HoldForces`.
+    Their normal components sum to `total` [N]. Where torques exceed a limit, all forces are scaled together, which
+    keeps the balance. At most `most` hand points press, the most spread out: those within the first `reach` of the
+    object, of a finger without contact those within the second [m]."""
     bodies, near = posing.touch(grasp, max(reach))
     count, points, radius = len(grasp), len(posing.probe.points), posing.probe.obj.radius
     rows = int(touching.FIRST_TORQUE) + posing.hand.dofs
@@ -91,7 +67,7 @@ def _balanced(
         torque = wp.empty((count, posing.hand.dofs), dtype=wp.float64)
         inputs = [posing.effort, matrix, share, used, unit, wp.float64(total)]
         launch(touching.hold, count, inputs=inputs, outputs=[residual, torque])
-    return residual, torque
+    return residual.numpy(), torque.numpy()
 
 
 def solved(matrix: Any, target: Floats, ridge: float, count: Any) -> Any:

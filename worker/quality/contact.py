@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from graspd.service.model.transforms import Floats
 from graspd.worker.hands.model import HandModel
-from graspd.worker.hands.surface import farthest_points
 
 #: A body closer than this is in contact [m] (DexGraspBench).
 LINK_CONTACT_M: Final = 0.002
@@ -32,33 +31,16 @@ def contact_area_cm2(distance: Floats, area: Floats, thresholds_m: Floats) -> Fl
     return np.stack([np.where(near < t, area, 0.0).sum(axis=-1) for t in thresholds_m], axis=-1) * 1e4
 
 
-def choose_contacts(
-    near: NDArray[np.bool_], place: Floats, normal: Floats, *, scale: float, limit: int
-) -> NDArray[np.intp]:
-    """Choose at most `limit` of the near points, spread as widely as possible; return their indices.
-
-    Args:
-        near: (N,) points to choose from.
-        place: (N, 3) contact points [m].
-        normal: (N, 3) unit normals; contacts differ by place over `scale` and by direction.
-        scale: length that weighs places against directions: the torque scale [m].
-    """
-    index = np.flatnonzero(near)
-    if len(index) <= limit:
-        return index
-    return index[farthest_points(np.hstack([place[index] / scale, normal[index]]), limit)]
-
-
 def spread_contacts(
     near: NDArray[np.bool_], place: Floats, normal: Floats, *, scale: float, limit: int
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Run `choose_contacts` on many sets at once.
+    """Choose at most `limit` of the near points of many sets, spread as widely as possible.
 
     Args:
         near: (B, T, N) points to choose from, of B grasps at T thresholds.
         place: (B, N, 3) contact points [m].
-        normal: (B, N, 3) unit normals.
-        scale: length that weighs places against directions [m].
+        normal: (B, N, 3) unit normals; contacts differ by place over `scale` and by direction.
+        scale: length that weighs places against directions: the torque scale [m].
 
     Returns:
         (B, T, limit) indices, and their number (B, T); further indices are undefined.
@@ -81,7 +63,7 @@ def spread_contacts(
 
 
 def _farthest(points: Floats, inside: NDArray[np.bool_], count: int) -> NDArray[np.intp]:
-    """Return points (S, count) chosen by `farthest_points` from each set (S, W, K), if `inside` (S, W)."""
+    """Return points (S, count) chosen as by `farthest_points` from each set (S, W, K), if `inside` (S, W)."""
     rows = np.arange(len(points))
     mean = np.einsum("sw,swk->sk", inside.astype(float), points) / np.maximum(inside.sum(axis=1), 1)[:, None]
     start = np.where(inside, ((points - mean[:, None]) ** 2).sum(axis=2), -1.0)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -28,54 +27,23 @@ CPU_HANDS: Final = 128
 GPU_HANDS: Final = 4096
 
 
-@dataclass(frozen=True)
 class PostureData:
-    probe: Probe
-    chain: Any
-    points: Any
-    effort: Any
-    finger: Any
-    """(L,) finger of each body, -1: none."""
-    fingers: int
+    """Device data of a hand and an object for the posture kernels."""
 
-    @classmethod
-    def of(cls, probe: Probe) -> PostureData:
-        with wp.ScopedDevice(probe.device):
+    def __init__(self, probe: Probe) -> None:
+        self.probe, self.hand, self.device = probe, probe.hand, probe.device
+        is_cuda, finger = bool(wp.get_device(self.device).is_cuda), finger_of_body(probe.hand)
+        #: Points of a hand per thread, threads per hand, and hands processed at a time.
+        self.lane, self.at_once = (1, GPU_HANDS) if is_cuda else (CPU_LANE, CPU_HANDS)
+        self.lanes = -(-len(probe.points) // self.lane)
+        self.fingers = max(1, int(finger.max()) + 1)
+        with wp.ScopedDevice(self.device):
             for module in (touching, balance, opening, jamming, optimizers):
-                wp.load_module(module=module, device=probe.device)
-            finger = finger_of_body(probe.hand)
-            return cls(
-                probe,
-                chain_of(probe.hand, probe.device),
-                _points(probe),
-                wp.array(probe.hand.effort, dtype=wp.float64),
-                wp.array(finger, dtype=wp.int32),
-                max(1, int(finger.max()) + 1),
-            )
-
-    @property
-    def hand(self) -> HandModel:
-        return self.probe.hand
-
-    @property
-    def device(self) -> str:
-        return self.probe.device
-
-    @property
-    def is_cuda(self) -> bool:
-        return bool(wp.get_device(self.device).is_cuda)
-
-    @property
-    def lane(self) -> int:
-        return 1 if self.is_cuda else CPU_LANE
-
-    @property
-    def lanes(self) -> int:
-        return -(-len(self.probe.points) // self.lane)
-
-    @property
-    def at_once(self) -> int:
-        return GPU_HANDS if self.is_cuda else CPU_HANDS
+                wp.load_module(module=module, device=self.device)
+            self.chain, self.points = chain_of(probe.hand, self.device), _points(probe)
+            self.effort = wp.array(probe.hand.effort, dtype=wp.float64)
+            #: (L,) finger of each body, -1: none.
+            self.finger = wp.array(finger, dtype=wp.int32)
 
     def parts(self, count: int) -> list[slice]:
         return [slice(i, min(i + self.at_once, count)) for i in range(0, count, self.at_once)]
@@ -137,4 +105,4 @@ def _points(probe: Probe) -> Any:
 @cached_by_content(8)
 def posing_of(hand: HandModel, obj: ObjectModel, *, points: int, device: str) -> PostureData:
     """Return the pair on a device with `points` hand points, cached in memory."""
-    return PostureData.of(probe_of(hand, obj, hand_points=points, object_points=64, device=device))
+    return PostureData(probe_of(hand, obj, hand_points=points, object_points=64, device=device))

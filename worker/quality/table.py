@@ -74,24 +74,6 @@ class _Pair:
         chunk = _Chunk(self, self.probe.measure(posture))
         return {f"quality/{name}": measured(chunk) for name, measured in MEASURES.items()}
 
-    def spaces(self, found: Distances) -> tuple[Floats, Floats]:
-        """Return epsilon and volume (B, T) of the wrench spaces of B grasps."""
-        near = self.probe.facing(found)[:, None] & (np.abs(found.distance)[:, None] < self.thresholds[:, None])
-        chosen, count = spread_contacts(near, found.closest, found.normal, scale=self.obj.radius, limit=MAX_CONTACTS)
-        rows = np.arange(len(chosen))[:, None, None]
-        counts = (np.arange(MAX_CONTACTS) < count[..., None])[..., None]
-        inward = np.where(counts, -found.normal[rows, chosen], [0.0, 0.0, 1.0])
-        edges = wrenches(
-            found.closest[rows, chosen],
-            inward,
-            friction=self.friction,
-            centre=self.obj.centre_of_mass,
-            radius=self.obj.radius,
-        )
-        wanted = np.broadcast_to(self.with_volume, count.shape)
-        epsilon, volume = measure_spaces(edges.reshape(-1, *edges.shape[2:]), count.ravel(), wanted.ravel())
-        return epsilon.reshape(count.shape), volume.reshape(count.shape)
-
 
 _pairs: LRUCache[str, _Pair] = LRUCache(4)
 _lock = threading.Lock()
@@ -195,7 +177,17 @@ class _Chunk:
 
     @cached_property
     def spaces(self) -> tuple[Floats, Floats]:
-        return self.pair.spaces(self.found)
+        """Epsilon and volume (B, T) of the wrench spaces of B grasps."""
+        pair, found, obj = self.pair, self.found, self.pair.obj
+        near = pair.probe.facing(found)[:, None] & (np.abs(found.distance)[:, None] < pair.thresholds[:, None])
+        chosen, count = spread_contacts(near, found.closest, found.normal, scale=obj.radius, limit=MAX_CONTACTS)
+        rows = np.arange(len(chosen))[:, None, None]
+        counts = (np.arange(MAX_CONTACTS) < count[..., None])[..., None]
+        place, inward = found.closest[rows, chosen], np.where(counts, -found.normal[rows, chosen], [0.0, 0.0, 1.0])
+        edges = wrenches(place, inward, friction=pair.friction, centre=obj.centre_of_mass, radius=obj.radius)
+        wanted = np.broadcast_to(pair.with_volume, count.shape)
+        epsilon, volume = measure_spaces(edges.reshape(-1, *edges.shape[2:]), count.ravel(), wanted.ravel())
+        return epsilon.reshape(count.shape), volume.reshape(count.shape)
 
     def shared_volume(self) -> Floats:
         # A face of the object may enter a piece between two object points, half a diagonal of their grid from either.

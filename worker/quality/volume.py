@@ -58,7 +58,8 @@ class SharedVolume:
             return 0.0
         if self._object is None:
             return self._voxels.volume_cm3(bodies, pieces)
-        matrices = self._matrices(bodies[self._body[pieces]])
+        matrices = pose_to_matrix(bodies[self._body[pieces]])[:, :3]
+        matrices[..., 3] = (matrices[..., 3] - self.obj.centre_of_mass) * _UNIT
         posed = [self._pieces[p].transform(matrix) for p, matrix in zip(pieces, matrices, strict=True)]
         parts = [part for part in (self._object ^ solid for solid in posed) if not part.is_empty()]
         if not parts:
@@ -66,11 +67,6 @@ class SharedVolume:
         # Intersections rarely overlap, so their union is cheap; the union of whole pieces is not.
         whole = parts[0] if len(parts) == 1 else m3d.Manifold.batch_boolean(parts, m3d.OpType.Add)
         return float(whole.volume()) / _UNIT**3 * 1e6
-
-    def _matrices(self, poses: Floats) -> Floats:
-        matrices = pose_to_matrix(poses)[:, :3]
-        matrices[..., 3] = (matrices[..., 3] - self.obj.centre_of_mass) * _UNIT
-        return matrices
 
     @cached_property
     def _voxels(self) -> VoxelVolume:
@@ -80,16 +76,15 @@ class SharedVolume:
 class VoxelVolume:
     """Intersection volume by counting voxel centres of the object that lie inside the pieces."""
 
-    def __init__(self, hand: HandModel, obj: ObjectModel, edge: float = VOXEL_M) -> None:
+    def __init__(self, hand: HandModel, obj: ObjectModel) -> None:
         self.hand = hand
-        self.edge = edge
         self._probe = Probe(hand, obj, hand_points=hand.bodies * 16, object_points=64)
 
     def volume_cm3(self, bodies: Floats, pieces: NDArray[np.intp]) -> float:
         low, high = self._box(bodies, pieces)
         if (high <= low).any():
             return 0.0
-        axes = [np.arange(a + self.edge / 2, b, self.edge) for a, b in zip(low, high, strict=True)]
+        axes = [np.arange(a + VOXEL_M / 2, b, VOXEL_M) for a, b in zip(low, high, strict=True)]
         grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
         inside = np.zeros(len(grid), dtype=bool)
         for p in pieces:
@@ -100,7 +95,7 @@ class VoxelVolume:
         if not inside.any():
             return 0.0
         depth = self._probe.signed_distance(grid[inside])[0]
-        return float((depth < 0).sum()) * self.edge**3 * 1e6
+        return float((depth < 0).sum()) * VOXEL_M**3 * 1e6
 
     def _box(self, bodies: Floats, pieces: NDArray[np.intp]) -> tuple[Floats, Floats]:
         posed = []

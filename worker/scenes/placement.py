@@ -210,8 +210,8 @@ ENOUGH_M: Final = 1e-3
 _SAME_M: Final = 1e-7
 
 
-def outer_solid(corners: Floats, most: int = MOST_PLANES) -> tuple[Obstacle, float]:
-    """Return a convex solid of at most `most` faces around points (V, 3).
+def outer_solid(corners: Floats) -> tuple[Obstacle, float]:
+    """Return a convex solid of at most `MOST_PLANES` faces around points (V, 3).
 
     It begins as their box. While it exceeds the points' hull by more than `ENOUGH_M`, its farthest corner is cut off by
     the face of the hull that it is farthest from. It never cuts into the hull.
@@ -230,7 +230,7 @@ def outer_solid(corners: Floats, most: int = MOST_PLANES) -> tuple[Obstacle, flo
         planes = _box(corners)
         middle = corners[hull.vertices].mean(axis=0)
         found = HalfspaceIntersection(_as_qhull(planes), middle, incremental=True)
-        while len(planes) < most:
+        while len(planes) < MOST_PLANES:
             depth = found.intersections @ faces[:, :3].T - faces[:, 3]
             out = depth.max(axis=1)
             worst = int(np.argmax(out))

@@ -60,9 +60,7 @@ class _Table:
     model: mujoco.MjModel
     data: mujoco.MjData
     faces: RestingFaces
-    hull: Floats
-    centre: Floats
-    radius: float
+    obj: ObjectModel
 
 
 def drop(obj: ObjectModel, *, count: int, seed: int) -> dict[str, Floats]:
@@ -178,9 +176,7 @@ def _build(obj: ObjectModel) -> _Table:
     except ValueError as error:
         reason = str(error).splitlines()[0]
         raise MeshError(f"{obj.name!r} cannot be dropped: {reason}; check that its mesh has volume") from None
-    return _Table(
-        model, mujoco.MjData(model), resting_faces(obj), obj.hull_vertices, obj.centre_of_mass, float(obj.radius)
-    )
+    return _Table(model, mujoco.MjData(model), resting_faces(obj), obj)
 
 
 def _redo_until_rest(table: _Table, name: str, key: tuple[int, int]) -> RestPose:
@@ -194,8 +190,8 @@ def _redo_until_rest(table: _Table, name: str, key: tuple[int, int]) -> RestPose
 def _drop_once(table: _Table, rng: np.random.Generator) -> RestPose | None:
     quaternion = rng.normal(size=4)
     quaternion /= np.linalg.norm(quaternion)
-    lowest = float(quat_rotate(quaternion, table.hull)[:, 2].min())
-    centre = quat_rotate(quaternion, table.centre)
+    lowest = float(quat_rotate(quaternion, table.obj.hull_vertices)[:, 2].min())
+    centre = quat_rotate(quaternion, table.obj.centre_of_mass)
     position = np.array([-centre[0], -centre[1], rng.uniform(*DROP_HEIGHT) - lowest])
     data = table.data
     mujoco.mj_resetData(table.model, data)
@@ -208,7 +204,7 @@ def _drop_once(table: _Table, rng: np.random.Generator) -> RestPose | None:
     if angle > MAX_SETTLE_ANGLE or table.faces.topples(face):
         return None
     pose = lay_flat(table.faces, face, np.concatenate([data.qpos[:3], quaternion]))
-    away = float(np.hypot(*(pose[:3] + quat_rotate(pose[3:], table.centre))[:2]))
+    away = float(np.hypot(*(pose[:3] + quat_rotate(pose[3:], table.obj.centre_of_mass))[:2]))
     return RestPose(pose, face, seconds) if away < REACH else None
 
 
@@ -220,8 +216,8 @@ def _run(table: _Table) -> float | None:
         mujoco.mj_step(model, data)
         # Velocity of the body frame's origin and spin in the body frame: the spin bounds the speed of any point.
         spin = data.qvel[3:]
-        centre_velocity = data.qvel[:3] + quat_rotate(data.qpos[3:], np.cross(spin, table.centre))
-        speed = np.linalg.norm(centre_velocity) + table.radius * np.linalg.norm(spin)
+        centre_velocity = data.qvel[:3] + quat_rotate(data.qpos[3:], np.cross(spin, table.obj.centre_of_mass))
+        speed = np.linalg.norm(centre_velocity) + table.obj.radius * np.linalg.norm(spin)
         quiet = quiet + 1 if speed < REST_SPEED and data.ncon > 0 else 0
         if quiet >= window:
             return (step + 1) * TIMESTEP_S

@@ -35,7 +35,7 @@ from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.kinematics import generalized_forces
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.quality.contact import choose_contacts
+from graspd.worker.quality.contact import spread_contacts
 from graspd.worker.quality.posed import posing_of
 from graspd.worker.quality.wrench_space import EDGES, cone_edges
 from graspd.worker.simulation.environment import PlacedGrasps
@@ -332,10 +332,11 @@ def capacities(hand: HandModel, obj: ObjectModel, grasp: Posture, against: Float
     probe = posing_of(hand, obj, points=_POINTS, device="cpu").probe
     found = probe.touch(grasp)
     facing = (found.distance < WITHIN_M) & probe.facing(found)
+    spread, count = spread_contacts(facing[:, None], found.closest, found.normal, scale=obj.radius, limit=MOST)
     q = hand.reduce(grasp.joint_positions)
     out = np.zeros(len(grasp))
     for row in range(len(grasp)):
-        chosen = choose_contacts(facing[row], found.closest[row], found.normal[row], scale=obj.radius, limit=MOST)
+        chosen = spread[row, 0, : count[row, 0]]
         if not len(chosen):
             continue
         points = found.closest[row, chosen]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Final
 
@@ -135,8 +135,25 @@ def validate(
         )
         _try(case, grasps, list(first.stands), rollouts, run)
     ordered = [rollouts[row] for row in range(len(grasps))]
-    found = _verdicts(ordered, case, terms, postures_key(terms, grasps), time.perf_counter() - began)
-    return replace(found, level=level, rechecked=len(first.rechecked), contradicted=contradicted)
+    return Verdicts(
+        success=np.array([t.success for t in ordered], np.int8),
+        outcome=np.array([t.outcomes for t in ordered], np.uint8).reshape(-1, len(DIRECTIONS)),
+        margin=np.array([t.margin for t in ordered], float),
+        penetration_depth_mm=np.array([t.penetration_m for t in ordered], float) * 1e3,
+        self_penetration_depth_mm=np.array([t.self_penetration_m for t in ordered], float) * 1e3,
+        validated_by=np.array([t.validated_by for t in ordered], np.uint8),
+        level=level,
+        hard=hard,
+        pieces=len(pieces),
+        volume_ratio=pieces.volume_ratio,
+        excess_m=pieces.excess_m,
+        terms=terms,
+        key=postures_key(terms, grasps),
+        seconds=time.perf_counter() - began,
+        steps=sum(t.steps for t in ordered),
+        rechecked=len(first.rechecked),
+        contradicted=contradicted,
+    )
 
 
 def prefiltered(
@@ -145,9 +162,8 @@ def prefiltered(
     """Run the GPU prefilter for `validate` beforehand, in the thread that has the device."""
     prefilter_terms = first_terms(hand, level, run)
     terms = verdict_key(hand, obj, level, False, pieces=pieces, prefilter=prefilter_terms)
-    return _screened(
-        _Case(hand, obj, pieces, "standard", False), terms, grasps, level, run if prefilter_terms else None
-    )
+    case = _Case(hand, obj, pieces, "standard", False)
+    return _screened(case, terms, grasps, level, run if prefilter_terms else None)
 
 
 def _screened(
@@ -227,23 +243,3 @@ class _Tests:
         second = self._full.standard(grasps, row)
         second.steps += rollout.steps
         return second
-
-
-def _verdicts(rollouts: list[Rollout], case: _Case, terms: str, key: str, seconds: float) -> Verdicts:
-    return Verdicts(
-        success=np.array([t.success for t in rollouts], np.int8),
-        outcome=np.array([t.outcomes for t in rollouts], np.uint8).reshape(-1, len(DIRECTIONS)),
-        margin=np.array([t.margin for t in rollouts], float),
-        penetration_depth_mm=np.array([t.penetration_m for t in rollouts], float) * 1e3,
-        self_penetration_depth_mm=np.array([t.self_penetration_m for t in rollouts], float) * 1e3,
-        validated_by=np.array([t.validated_by for t in rollouts], np.uint8),
-        level=case.level,
-        hard=case.hard,
-        pieces=len(case.pieces),
-        volume_ratio=case.pieces.volume_ratio,
-        excess_m=case.pieces.excess_m,
-        terms=terms,
-        key=key,
-        seconds=seconds,
-        steps=sum(t.steps for t in rollouts),
-    )

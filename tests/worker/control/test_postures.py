@@ -233,7 +233,7 @@ def test_fingers_that_stand_off_close_as_in_numpy(case: tuple[HandModel, Probe, 
     hand, probe, grasp = case
     wanted = reference.balanced(probe, grasp, total_normal_force=20.0, friction=0.3, closing=CLOSING_M)
     near = reference.balanced(probe, grasp, total_normal_force=20.0, friction=0.3)
-    command = squeeze(hand, OBJ, grasp, total_normal_force=20.0, friction=0.3)
+    command = squeeze(hand, OBJ, grasp, total_normal_force=20.0)
     pressed = (hand.reduce(command.joint_positions) - hand.reduce(grasp.joint_positions)) * hand.stiffness
     np.testing.assert_allclose(pressed, [torque for _, torque in wanted], atol=1e-7)
     assert any(np.abs(a - b).max() > 1e-3 for (_, a), (_, b) in zip(near, wanted, strict=True))

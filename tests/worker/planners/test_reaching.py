@@ -137,7 +137,7 @@ def drawn_alone(pair: starts._Pair, rng: np.random.Generator) -> tuple[np.ndarra
 
 def test_draws_at_once_are_those_of_each_generator_alone() -> None:
     hand, obj = hand_from_path("allegro"), object_from_path("mug")
-    pair = starts._Pair.of(hand, obj)
+    pair = starts._Pair(hand, obj)
     state, approach = starts.draw(pair, [starts.start_generator(7, 0, i, 0) for i in range(64)])
     for i in range(64):
         pivot, way, q = drawn_alone(pair, starts.start_generator(7, 0, i, 0))

@@ -10,6 +10,7 @@ import trimesh
 from graspd.worker.control.postures import pregrasp, squeeze
 from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.model import HandModel, PalmFrame
+from graspd.worker.hands.surface import farthest_points
 from graspd.worker.validation.decomposition import ConvexPieces
 from tests.worker.models import object_from_mesh, piece, two_finger_hand
 
@@ -65,6 +66,14 @@ def pad_hand() -> HandModel:
     ball = trimesh.creation.icosphere(subdivisions=3, radius=radius)
     pads = tuple(piece(body, ball, "sphere", (radius,), (0, 0, 0.005 - radius)) for body in (1, 2))
     return dataclasses.replace(plates, name="pads", digest="9ad5" * 8, pieces=(plates.pieces[0], *pads))
+
+
+def choose_contacts(near: np.ndarray, place: np.ndarray, normal: np.ndarray, *, scale: float, limit: int) -> np.ndarray:
+    """What `spread_contacts` does, of one set."""
+    index = np.flatnonzero(near)
+    if len(index) <= limit:
+        return index
+    return index[farthest_points(np.hstack([place[index] / scale, normal[index]]), limit)]
 
 
 BOX = object_from_mesh(trimesh.creation.box((0.06, 0.04, 0.05)))

@@ -26,12 +26,7 @@ from graspd.worker.hands.surface import sample_surface
 from graspd.worker.objects import disk_cache
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.quality import diversity, probe
-from graspd.worker.quality.contact import (
-    choose_contacts,
-    contact_distance_consistency_mm,
-    finger_of_body,
-    spread_contacts,
-)
+from graspd.worker.quality.contact import contact_distance_consistency_mm, finger_of_body, spread_contacts
 from graspd.worker.quality.diversity import (
     POINTS,
     approach_cells,
@@ -46,9 +41,9 @@ from graspd.worker.quality.gate import MAX_PENETRATION_MM, MAX_SELF_PENETRATION_
 from graspd.worker.quality.intervals import wilson, wilson_of_mean
 from graspd.worker.quality.probe import HAND_POINTS, REACH_M, Probe
 from graspd.worker.quality.table import MEASURES, measure
-from graspd.worker.quality.volume import Overlap, SharedVolume, VoxelVolume
+from graspd.worker.quality.volume import VOXEL_M, Overlap, SharedVolume, VoxelVolume
 from tests.worker.models import object_from_mesh, two_finger_hand
-from tests.worker.quality.helpers import grasp_set, pad_hand, plate_hand, posture
+from tests.worker.quality.helpers import choose_contacts, grasp_set, pad_hand, plate_hand, posture
 from tests.worker.simulation.rigs import ball
 
 #: Single precision of coordinates around 0.1 m.
@@ -94,7 +89,7 @@ def test_voxels_agree_with_the_exact_volume() -> None:
     bodies = Probe(hand, BOX).measure(closed_on_box(0.004)).bodies[0]
     voxels = VoxelVolume(hand, BOX)
     surface_cm2 = 2 * (2 * 9 + 4 * 3 * 0.4)
-    bound = surface_cm2 * voxels.edge * 100 / 2
+    bound = surface_cm2 * VOXEL_M * 100 / 2
     assert voxels.volume_cm3(bodies, np.array([1, 2])) == pytest.approx(7.2, abs=bound)
     # Pieces that overlap are counted once.
     twice = dataclasses.replace(hand, pieces=(*hand.pieces, hand.pieces[1]))

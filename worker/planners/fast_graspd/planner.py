@@ -203,7 +203,10 @@ class _Launch:
     fine: Model = field(init=False)
 
     def __post_init__(self) -> None:
-        obstacles = _obstacles(self.pair, self.batches.placed)
+        placed, centre = self.batches.placed, self.pair.fine.obj.model.centre_of_mass
+        hand, obstacles = self.pair.hand, None
+        if placed is not None:
+            obstacles = DeviceObstacles.create(hand.model, placed.scenes, centre, hand.device)
         object.__setattr__(self, "coarse", self.pair.model(self.pair.coarse, obstacles, pulled=self.pulled))
         object.__setattr__(self, "fine", self.pair.model(self.pair.fine, obstacles, pulled=self.pulled))
 
@@ -399,13 +402,6 @@ class _Seats:
         state, depths = Projection(launch.fine, data, options).run(state, fidelity.polish_iterations)
         merit = launch.merits(state, losses, depths) if rows.shape[1] > 1 else np.zeros(len(flat))
         return Refinements(state, losses, merit, launch.infeasible(state, depths))
-
-
-def _obstacles(pair: Pair, placed: PlacedGrasps | None) -> DeviceObstacles | None:
-    if placed is None:
-        return None
-    centre = pair.fine.obj.model.centre_of_mass
-    return DeviceObstacles.create(pair.hand.model, placed.scenes, centre, pair.hand.device)
 
 
 def _in_scenes(data: Data, placed: PlacedGrasps | None, each: int) -> Data:

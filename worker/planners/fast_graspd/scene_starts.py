@@ -60,6 +60,10 @@ CANDIDATES: Final = 48
 _UNIFORM: Final = 7
 
 
+#: Antipodal hands, and their indices among the draws.
+_AcrossPairs = list[tuple[NDArray[np.intp], AntipodalHands]]
+
+
 def free_ways(scene: Environment, obj: ObjectModel) -> Floats:
     """Return free approach directions (K, 3), unit vectors in the object frame.
     Along them a ball as wide as a palm leaves the object without touching an obstacle on `STANDOFF_M`.
@@ -120,18 +124,18 @@ def clear_scene_starts(
             normal = np.concatenate([normal, _normal(generators, rows, hand.dofs)], axis=1)
         reach = reaching[rows] & (number < REACHES)
         numbers = np.where(reach, order[rows, min(number, REACHES - 1)], number)
-        drawn = around.draws(uniform[rows, numbers], normal[rows, number], scene[rows], reach)
-        off = _raise(drawn, np.flatnonzero(reach), placed, scene[rows], probe)
+        states, across_pairs = around.draws(uniform[rows, numbers], normal[rows, number], scene[rows], reach)
+        off = _raise(states, across_pairs, np.flatnonzero(reach), placed, scene[rows], probe)
         worth = off < beside[rows, None]
         worth[~reach | (depth[rows] > CLEAR)] = True
-        found = _depths(probe, drawn.states, placed, scene[rows], worth)
+        found = _depths(probe, states, placed, scene[rows], worth)
         # Select the nearest clear distance, or else the least deep.
         clear = found <= CLEAR
         pick = np.where(clear.any(axis=1), clear.argmax(axis=1), found.argmin(axis=1))
         at = np.arange(len(rows)), pick
         least = found[at]
         better = np.where(least <= CLEAR, (depth[rows] > CLEAR) | (off[at] < beside[rows]), least < depth[rows])
-        taken = drawn.states[(at[0] * len(RETREATS) + pick)[better]]
+        taken = states[(at[0] * len(RETREATS) + pick)[better]]
         depth[rows[better]] = least[better]
         beside[rows[better]] = np.where(least <= CLEAR, off[at], beside[rows])[better]
         put(best, rows[better], taken)
@@ -176,7 +180,12 @@ def _mounting_lack(
 
 
 def _raise(
-    drawn: _Drawn, rows: NDArray[np.intp], placed: PlacedGrasps, scene: NDArray[np.intp], probe: Probe
+    states: HandState,
+    across_pairs: _AcrossPairs,
+    rows: NDArray[np.intp],
+    placed: PlacedGrasps,
+    scene: NDArray[np.intp],
+    probe: Probe,
 ) -> Floats:
     """Lift draws `rows` in scenes (n,), at all distances, by the clearance of the nearest that is lacking.
     Return the distance (n, len(RETREATS)) of their pairs from between the pads [m], 0 for other draws.
@@ -185,7 +194,7 @@ def _raise(
     off = np.zeros((len(scene), len(RETREATS)))
     if not len(rows):
         return off
-    states, repeat, up = drawn.states, len(RETREATS), np.array([s.up for s in placed.scenes])[scene]
+    repeat, up = len(RETREATS), np.array([s.up for s in placed.scenes])[scene]
     probe.data.set_scenes(scene[rows])
     probe.depths(states[rows * repeat])
     lifted = np.zeros((len(scene), 3))
@@ -194,16 +203,9 @@ def _raise(
     lifted[rows] = lack[:, None] * up[rows]
     every = (rows[:, None] * repeat + np.arange(repeat)).ravel()
     states.pivot[every] += np.repeat(lifted[rows], repeat, axis=0)
-    for at, reaches in drawn.reaching:
+    for at, reaches in across_pairs:
         off[at] = reaches.beside(lifted[at][:, None] + np.array(RETREATS)[:, None] * reaches.away[:, None])
     return off
-
-
-@dataclass(frozen=True)
-class _Drawn:
-    states: HandState
-    """(n * len(RETREATS)) hands, each at each distance."""
-    reaching: list[tuple[NDArray[np.intp], AntipodalHands]]
 
 
 @dataclass(frozen=True)
@@ -226,8 +228,10 @@ class _Around:
             )
         return order, least
 
-    def draws(self, uniform: Floats, normal: Floats, scene: NDArray[np.intp], reach: NDArray[np.bool_]) -> _Drawn:
-        """Return draws at each distance in scenes (n,); `reach` (n,) marks antipodal ones.
+    def draws(
+        self, uniform: Floats, normal: Floats, scene: NDArray[np.intp], reach: NDArray[np.bool_]
+    ) -> tuple[HandState, _AcrossPairs]:
+        """Return hands drawn in scenes (n,), n * len(RETREATS), at each distance; and the antipodal ones, `reach` (n,).
         They depend on uniform (n, 7) and normal (n, 2 + D) random numbers."""
         n, dofs = len(uniform), self.hand.dofs
         pivot, rotation, q, away = np.zeros((n, 3)), np.zeros((n, 4)), np.zeros((n, dofs)), np.zeros((n, 3))
@@ -247,7 +251,7 @@ class _Around:
         pivot = pivot[:, None] + np.array(RETREATS)[None, :, None] * away[:, None]
         repeat = len(RETREATS)
         states = HandState(pivot.reshape(-1, 3), np.repeat(rotation, repeat, axis=0), np.repeat(q, repeat, axis=0))
-        return _Drawn(states, reaching)
+        return states, reaching
 
     def _towards(self, uniform: Floats, normal: Floats, ways: Floats) -> tuple[Floats, Floats, Floats, Floats]:
         """Place hands that face random points of the surface, in the form of `across` but without a pair."""

@@ -66,30 +66,18 @@ def frames_about(z: Floats) -> Floats:
     return np.stack([x, cross(z, x), z], axis=-1)
 
 
-@dataclass(frozen=True)
 class _Pair:
-    hand: HandModel
-    centre: Floats
-    corners: Floats
-    across: Floats
-    """(F, 3) normals of twice the faces' area [m^2]."""
-    area: Floats
-    """(F,) [m^2], doubled."""
-    share: Floats
-    """(F,) cumulative share of the area."""
-    palm: Floats
-    gap: tuple[float, float]
-    """Distance of the palm from the surface, nearest and farthest [m]."""
+    """Data shared by all draws of a hand around an object: its faces (F), the distance `gap` of the palm [m]."""
 
-    @classmethod
-    def of(cls, hand: HandModel, obj: ObjectModel, gap: tuple[float, float] = GAP) -> _Pair:
-        corners = obj.vertices[obj.faces]
-        across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        area = np.linalg.norm(across, axis=1)
-        share = np.cumsum(area / area.sum())
-        return cls(
-            hand, obj.centre_of_mass, corners, across, area, share / share[-1], frames_about(hand.palm.approach).T, gap
-        )
+    def __init__(self, hand: HandModel, obj: ObjectModel, gap: tuple[float, float] = GAP) -> None:
+        self.hand, self.centre, self.gap = hand, obj.centre_of_mass, gap
+        self.corners = obj.vertices[obj.faces]
+        #: Normals (F, 3) of twice the faces' area [m^2].
+        self.across = np.cross(self.corners[:, 1] - self.corners[:, 0], self.corners[:, 2] - self.corners[:, 0])
+        self.area = np.linalg.norm(self.across, axis=1)
+        share = np.cumsum(self.area / self.area.sum())
+        self.share = share / share[-1]
+        self.palm = frames_about(hand.palm.approach).T
 
 
 def _numbers(generators: list[np.random.Generator], dofs: int) -> tuple[Floats, Floats]:
@@ -190,7 +178,7 @@ def clear_starts(model: Model, generators: list[np.random.Generator], *, each: i
     count, jaws = len(generators), JawStarts.of(hand, obj)
     retreats = RETREATS if jaws is None else JAW_RETREATS
     probe = Probe(model, count * len(retreats))
-    pair = _Pair.of(hand, obj)
+    pair = _Pair(hand, obj)
     best = HandState(np.zeros((count, 3)), np.tile([1.0, 0, 0, 0], (count, 1)), np.zeros((count, hand.dofs)))
     deepest = np.full(count, np.inf)
     if jaws is None and each > 1 and (reaching := ReachSampling.of(model)) is not None:
@@ -229,7 +217,7 @@ def open_further(
     ends = np.where(hand.closing > 0, hand.lower, np.where(hand.closing < 0, hand.upper, hand.preshape))
     for share in OPENED:
         wider = replace(hand, preshape=hand.preshape + share * (ends - hand.preshape))
-        pair = _Pair.of(wider, obj, OPENED_GAP)
+        pair = _Pair(wider, obj, OPENED_GAP)
 
         def drawn(rows: NDArray[np.intp], pair: _Pair = pair) -> HandState:
             return _retreated(*draw(pair, [generators[i] for i in rows]))
