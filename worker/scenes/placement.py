@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import combinations
+from itertools import combinations, product
 from typing import Any, Final
 
 import mujoco
@@ -196,10 +196,8 @@ def gaps_between(things: Sequence[Neighbour], poses: Floats, farthest: float = 0
         data.mocap_pos[:], data.mocap_quat[:] = scene[:, :3], scene[:, 3:]
         mujoco.mj_kinematics(model, data)
         for a, b in pairs:
-            for i in range(first[a], first[a + 1]):
-                for j in range(first[b], first[b + 1]):
-                    gap = mujoco.mj_geomDistance(model, data, i, j, farthest, None)
-                    gaps[a, b][number] = min(gaps[a, b][number], gap)
+            geoms = product(range(first[a], first[a + 1]), range(first[b], first[b + 1]))
+            gaps[a, b][number] = min(mujoco.mj_geomDistance(model, data, i, j, farthest, None) for i, j in geoms)
     return gaps
 
 

@@ -379,21 +379,18 @@ class Exploding(Test):
 
 
 @pytest.mark.parametrize("level", ["dexgraspbench", "standard"])
-def test_a_blown_up_push_is_not_held(level: str) -> None:
+def test_a_blown_up_push_is_not_held_and_spoils_no_other_grasp(
+    level: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
     test = Exploding(build(PADS, BOX, WHOLE, MujocoOptions()))
-    rollout = test.dexgraspbench(grasp_of(), 0) if level == "dexgraspbench" else test.standard(grasp_of(), 0)
-    assert rollout.outcomes[0] is Outcome.DIVERGED
-    assert not rollout.success
+    rollout = getattr(test, level)(grasp_of(), 0)
+    assert rollout.outcomes[0] is Outcome.DIVERGED and not rollout.success
     # What the guard is for: after MuJoCo's reset the object stands where it began.
-    assert test._motion()[0] < 0.05
-
-
-def test_the_next_grasp_is_validated_afresh() -> None:
-    test = Exploding(build(PADS, BOX, WHOLE, MujocoOptions()))
-    test.standard(grasp_of(), 0)
-    assert void(test.data)
-    Test._start(test, grasp_of(), 0)
+    assert test._motion()[0] < 0.05 and void(test.data)
+    test._start(grasp_of(), 0)
     assert not void(test.data)
+    assert list(tmp_path.iterdir()) == [], "MuJoCo's warnings go to no file"
 
 
 def test_a_screen_that_blew_up_asks_the_certificate(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -418,12 +415,6 @@ def test_a_displacement_that_is_no_number_is_told_as_none(monkeypatch: pytest.Mo
 
     monkeypatch.setattr(mujoco, "mj_step", poisoned)
     assert np.isnan(simulated_displacement_cm(PADS, BOX, grasp_of().grasp, pieces=WHOLE)[0])
-
-
-def test_warnings_leave_no_file_in_the_working_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    Exploding(build(PADS, BOX, WHOLE, MujocoOptions())).standard(grasp_of(), 0)
-    assert list(tmp_path.iterdir()) == []
 
 
 class Scripted(Test):
@@ -473,26 +464,18 @@ SHORT_PADS, PLATES = pad_hand(), plate_hand()
 TABLE = Obstacle.half_space((0, 0, 1), -0.3)
 
 
-def test_the_same_pair_is_compiled_once() -> None:
-    again = replace(BOX, name="another name")
-    assert scene_of(SHORT_PADS, BOX, WHOLE, MujocoOptions()) is scene_of(SHORT_PADS, again, WHOLE, MujocoOptions())
-    assert scene_of(SHORT_PADS, BOX, WHOLE, MujocoOptions(), [TABLE]) is scene_of(
-        SHORT_PADS, BOX, WHOLE, MujocoOptions(), [TABLE]
-    )
-
-
-@pytest.mark.parametrize(
-    "other",
-    [
+def test_a_model_is_compiled_once_for_all_that_moves_a_verdict() -> None:
+    own = (SHORT_PADS, BOX, WHOLE, MujocoOptions())
+    assert scene_of(*own) is scene_of(SHORT_PADS, replace(BOX, name="another name"), WHOLE, MujocoOptions())
+    assert scene_of(*own, [TABLE]) is scene_of(*own, (TABLE,))
+    others = [
         (PLATES, BOX, WHOLE, MujocoOptions()),
         (SHORT_PADS, replace(BOX, inertia=2 * BOX.inertia), WHOLE, MujocoOptions()),
         (SHORT_PADS, BOX, ConvexPieces((1.01 * BOX.hull_vertices,), 1.0, 0.0, "box"), MujocoOptions()),
         (SHORT_PADS, BOX, WHOLE, MujocoOptions().hardened()),
-        (SHORT_PADS, BOX, WHOLE, MujocoOptions(), [TABLE]),
-    ],
-)
-def test_whatever_moves_a_verdict_gives_another_model(other: tuple) -> None:
-    assert scene_of(*other) is not scene_of(SHORT_PADS, BOX, WHOLE, MujocoOptions())
+        (*own, [TABLE]),
+    ]
+    assert all(scene_of(*other) is not scene_of(*own) for other in others)
 
 
 class Whole(Test):
