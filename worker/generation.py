@@ -139,12 +139,7 @@ def validated_grasps(
 
 
 def require_graspable(hand: HandModel, obj: ObjectModel) -> None:
-    """Check that the hand can grasp the object.
-
-    Raises:
-        HandError: no two digits of the hand oppose each other.
-        InputError: the object does not fit into the gripper.
-    """
+    """Raise HandError where no two digits oppose each other, InputError where the object does not fit the gripper."""
     require_opposing(hand)
     fitting_pairs(hand, obj.centred)
 

@@ -69,16 +69,7 @@ class Round:
 
 def next_round(wanted: int, valid: int, candidates: int, budget: int) -> int:
     """Return the number of grasps to plan next: those missing at the rate so far, and 10 % more.
-
-    Args:
-        wanted: valid grasps wanted in all.
-        valid: valid grasps found so far.
-        candidates: planned so far.
-        budget: planned at most.
-
-    Returns:
-        0 when enough are found or the budget is used up.
-    """
+    `wanted` valid ones are wanted, at most `budget` are planned; 0: enough are found or the budget is used up."""
     if valid >= wanted or candidates >= budget:
         return 0
     if candidates == 0:

@@ -72,13 +72,7 @@ def balanced(
 
 def solved(matrix: Any, target: Floats, ridge: float, count: Any) -> Any:
     """Return the x >= 0 (B, K) that minimise |M x - t|^2 + ridge^2 |x|^2 for B systems, on their device.
-
-    Args:
-        matrix: (B, K, R) columns of M, a Warp array in double precision.
-        target: (R,) t.
-        ridge: weight of x itself, above 0.
-        count: (B,) used columns of each system, a Warp array; x is 0 for the others.
-    """
+    `matrix` (B, K, R) has the columns of M, `count` (B,) says how many of them are used; x is 0 for the others."""
     (batch, columns, rows), device = matrix.shape, matrix.device
     with wp.ScopedDevice(device):
         work = kernels.Workspace()

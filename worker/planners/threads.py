@@ -42,10 +42,7 @@ class StepCounter:
 
 def cut(count: int, run: ExecutionContext, *, least: int = 1) -> list[range]:
     """Cut a batch into contiguous, nearly equal parts: one on a GPU, at most one per thread on a CPU.
-
-    Args:
-        least: fewest grasps for which a thread pays.
-    """
+    A thread pays for at least `least` grasps."""
     if wp.get_device(run.device).is_cuda:
         return [range(count)]
     parts = max(1, min(run.cores, count // least))

@@ -72,13 +72,8 @@ def nearest(points: Floats) -> float | None:
 
 
 def distinct(points: Floats, least: float, *, given: int = 0) -> NDArray[np.bool_]:
-    """Select grasps (N,) so that no two are closer than `least` [m], in order.
-
-    Args:
-        points: (N, P, 3) of `hand_points`.
-        least: least distance; 0 selects all.
-        given: number of first grasps that are always selected.
-    """
+    """Select grasps (N,), in order, so that no two of `points` (N, P, 3) are closer than `least` [m]; 0 selects all.
+    The first `given` grasps are always selected."""
     kept = np.ones(len(points), bool)
     if least <= 0 or len(points) < 2:
         return kept

@@ -42,15 +42,8 @@ class SharedVolume:
         return self._object is not None
 
     def of(self, bodies: Floats, near: NDArray[np.bool_]) -> Floats:
-        """Compute the volume inside both the object and the union of the hand's pieces [cm^3].
-
-        Args:
-            bodies: (B, L, 7) body poses in the object frame.
-            near: (B, P) pieces that may intersect the object; the others are ignored.
-
-        Returns:
-            (B,)
-        """
+        """Compute the volume (B,) inside both the object and the union of the hand's pieces [cm^3].
+        The bodies are at (B, L, 7) in the object frame; only pieces `near` (B, P) count."""
         return np.array([self._one(bodies[b], np.flatnonzero(near[b])) for b in range(len(bodies))])
 
     def _one(self, bodies: Floats, pieces: NDArray[np.intp]) -> float:

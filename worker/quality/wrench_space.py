@@ -49,13 +49,8 @@ def cone_edges(normals: Floats, friction: float, *, edges: int = EDGES) -> Float
 def wrenches(
     points: Floats, normals: Floats, *, friction: float, centre: Floats, radius: float, edges: int = EDGES
 ) -> Floats:
-    """Return edge wrenches (..., E, 6): force, then torque about `centre` over `radius`.
-
-    Args:
-        normals: (..., 3) unit normals into the object.
-        centre: (3,) torque origin, the centre of mass [m].
-        radius: torque scale, the object's largest radius [m].
-    """
+    """Return edge wrenches (..., E, 6): force, then torque about `centre` over `radius`, the object's largest [m].
+    Contacts are at `points` (..., 3) [m] with unit normals (..., 3) into the object."""
     force = cone_edges(normals, friction, edges=edges)
     torque = cross((np.asarray(points, float) - centre)[..., None, :] / radius, force)
     return np.concatenate([force, torque], axis=-1)
@@ -64,15 +59,9 @@ def wrenches(
 def measure_spaces(
     edge_wrenches: Floats, contacts: NDArray[np.integer], with_volume: NDArray[np.bool_]
 ) -> tuple[Floats, Floats]:
-    """Compute epsilon and volume of many wrench spaces.
-
-    Args:
-        edge_wrenches: (S, N, E, D) edge wrenches; each space uses its first `contacts` contacts.
-        with_volume: (S,) whether the volume is wanted: epsilon alone is as exact, in a tenth of the time.
-
-    Returns:
-        (S,) epsilon; (S,) volume, nan where it is not wanted.
-    """
+    """Compute epsilon and volume (S,) of many wrench spaces of edge wrenches (S, N, E, D).
+    Each space uses its first `contacts` (S,) contacts. The volume is nan where `with_volume` (S,) is false: epsilon
+    alone is as exact, in a tenth of the time."""
     epsilon, volume = np.full((2, len(edge_wrenches)), np.nan)
     none = np.asarray(contacts) == 0
     epsilon[none], volume[none] = 0.0, 0.0
@@ -168,15 +157,13 @@ def measure_hulls(clouds: Floats, count: NDArray[np.integer], whole: NDArray[np.
     """Compute inner radius and volume of many hulls, in one launch.
 
     Args:
-        clouds: (H, P, 6) points, P at most `MAX_POINTS`; each hull uses its first `count`.
+        clouds: (H, P, 6) points, P at most `MAX_POINTS`; each hull uses its first `count` (H,).
         whole: (H,) whether the volume is wanted; else the hull is built only where it is nearest to the origin, in a
             tenth of the time, with an equally exact radius.
 
     Returns:
-        (H,) distance of the nearest facet from the origin, at most 0 where the origin is outside; (H,) volume, nan
-        where it is not wanted. Both nan where there is no closed hull: too few points, flat ones, or more facets than
-        `CAPACITY`; use another method.
-    """
+        Distance (H,) of the nearest facet from the origin, at most 0 where the origin is outside, and volume (H,), nan
+        where it is not wanted. Both are nan where there is no closed hull of at most `CAPACITY` facets."""
     radius, volume = np.full((2, len(clouds)), np.nan)
     some = np.flatnonzero(np.asarray(count) > _DIMENSION)
     if not len(some):

@@ -98,11 +98,7 @@ def turned(pose: Floats, angle: float) -> Floats:
 
 
 def inside(obj: ObjectModel, pose: Floats, size: tuple[float, float], rng: np.random.Generator) -> Floats:
-    """Move the pose to a random place within a rectangle of x by y [m] about the origin.
-
-    Raises:
-        SceneError: the object is too large for it.
-    """
+    """Move the pose to a random place in a rectangle of x by y [m] about the origin; raise SceneError if there is no room."""
     corners = quat_rotate(pose[3:], obj.hull_vertices)[:, :2]
     low, high = corners.min(axis=0), corners.max(axis=0)
     room = np.asarray(size) / 2 - GAP
@@ -116,11 +112,7 @@ def inside(obj: ObjectModel, pose: Floats, size: tuple[float, float], rng: np.ra
 
 
 def check_free(obj: ObjectModel, poses: Floats, supports: tuple[Obstacle, ...]) -> None:
-    """Check that no pose (S, 7) puts the object deeper into a support than rounding does.
-
-    Raises:
-        InputError: one does.
-    """
+    """Raise SceneError where a pose (S, 7) puts the object deeper into a support than rounding does."""
     for pose in poses:
         corners = quat_rotate(pose[3:], obj.hull_vertices) + pose[:3]
         for number, support in enumerate(supports):

@@ -186,15 +186,8 @@ class _Heap:
 
 
 def neighbour_clearance(hand: HandModel, path: Posture, object_pose: Floats, neighbours: Neighbours) -> Floats:
-    """Compute signed distances of the hand from neighbours' hulls [m], at most `FARTHEST_M`.
-
-    Args:
-        path: P postures in the object frame.
-        object_pose: (S, 7) of the object in the table frame.
-
-    Returns:
-        (S, P); negative: the hand penetrates a hull.
-    """
+    """Compute signed distances (S, P) of the hand's pieces from neighbours' hulls [m], at most `FARTHEST_M`.
+    `path` has P postures in the object frame, `object_pose` (S, 7) is in the table frame."""
     spec = mujoco.MjSpec()
     for k, piece in enumerate(hand.pieces):
         _add_piece(spec, spec.worldbody.add_body(mocap=True), f"p{k}", piece)
@@ -249,18 +242,16 @@ def lay_beside(
     seed: int,
 ) -> tuple[Floats, Floats]:
     """Place M neighbours beside an object; return poses (S, 7) of the object and (S, M, 7).
-    All are `BETWEEN` apart and clear of all supports.
+    All are `BETWEEN` apart and clear of supports. Scene i depends on the objects, the supports, the seed and i alone.
 
     Args:
-        again: its pose (7,) in scene i at attempt k.
+        again: pose (7,) of the object in scene i at attempt k.
         others: the neighbours; each rests on z = 0.
         within: x by y about the origin that they must not leave [m].
-        seed: any non-negative integer. Scene i depends on the objects, the supports, the seed and i alone.
 
     Raises:
         SceneError: they do not all fit.
-        MeshError: one never comes to rest, or is flat.
-    """
+        MeshError: one never comes to rest, or is flat."""
     resting = [drop(one, count=count, seed=_seed_of(seed, k))["scene/object_pose"] for k, one in enumerate(others)]
     hulls = _Hulls([obj, *others], supports, within)
     poses = np.zeros((count, 1 + len(others), 7))

@@ -30,10 +30,7 @@ MOST_PIECES: Final = 8
 
 def neighbour_of(obj: ObjectModel) -> Neighbour:
     """Return an object as a neighbour: convex pieces, merged by least added volume to `MOST_PIECES`.
-
-    Raises:
-        MeshError: the object is flat.
-    """
+    Raise MeshError for a flat object."""
     if any(obj.centre):
         middle, by = neighbour_of(obj.centred), np.array([*obj.centre, 1.0, 0, 0, 0])
         pieces = tuple(piece + by[:3] for piece in middle.pieces)
@@ -214,11 +211,7 @@ def outer_solid(corners: Floats) -> tuple[Obstacle, float]:
     It begins as their box. While it exceeds the points' hull by more than `ENOUGH_M`, its farthest corner is cut off by
     the face of the hull that it is farthest from. It never cuts into the hull.
 
-    Returns:
-        The solid, and its largest excess over the points' hull [m].
-
-    Raises:
-        MeshError: the points lie in a plane.
+    Return the solid, and its largest excess over the points' hull [m]; raise MeshError if the points lie in a plane.
     """
     from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
 

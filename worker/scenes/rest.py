@@ -94,11 +94,7 @@ def rolling_note(rolling: int, scenes: int) -> str | None:
 
 
 def resting_faces(obj: ObjectModel) -> RestingFaces:
-    """Compute the faces of the object's convex hull and how it tips over them.
-
-    Raises:
-        MeshError: the hull is flat.
-    """
+    """Compute the faces of the object's convex hull and how it tips over them; raise MeshError for a flat hull."""
     import trimesh  # slow to load, seldom needed
 
     mesh = trimesh.Trimesh(obj.hull_vertices, obj.hull_faces, process=False)

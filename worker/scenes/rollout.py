@@ -93,13 +93,8 @@ def lift_rollout(
 ) -> Callable[[GraspSet, PlacedGrasps | None, Floats], Floats]:
     """Return a `worker.planners.Rollout` that scores grasps (N,) in scenes by short lifts.
     Scores are below 1 for grasps with a clear trajectory that lift at half friction, below 2 at full friction.
-
     Candidates that hold the hanging object briefly get the validator's lift: a squeeze may turn an object out of the
-    hand slowly at first.
-
-    Args:
-        threads: per call; planners on the CPU already call from all their threads.
-    """
+    hand slowly at first. `threads` are per call; planners on the CPU already call from all their threads."""
     shorts, run = LiftRollouts(hand, obj, pieces, threads=threads), ExecutionContext(threads=threads)
 
     def rollout(grasps: GraspSet, placed: PlacedGrasps | None, beat: Floats | None = None) -> Floats:
@@ -161,18 +156,11 @@ def scene_verdicts(
     run: ExecutionContext,
 ) -> tuple[GraspSet, Arrays]:
     """Plan the trajectories of grasps in their scenes, and validate those that are clear.
-
-    Grasps that do not lift are not tested at half the friction.
-
-    Args:
-        grasps: N grasps with `scene`.
-        pieces: the object's convex pieces; None: grasps are only checked for clearance, not validated.
-        run: receives the number of validated grasps; polled for cancellation between grasps.
+    Grasps that do not lift are not tested at half the friction. Without `pieces` grasps are only checked for clearance.
 
     Returns:
         The grasps with `approach`, `coming`, `lift` and `wrist`; columns of the base shard, `quality/success` being the
-        verdict of the lift (-1: not clear).
-    """
+        verdict of the lift (-1: not clear)."""
     assert grasps.scene is not None
     placed = scenes.placed(grasps.scene)
     way = plan_way(hand, obj, grasps, placed)

@@ -122,11 +122,7 @@ def lift_of(grasps: GraspSet, row: int, placed: PlacedGrasps, *, hard: bool) -> 
 
 
 def require_ways(grasps: GraspSet, placed: PlacedGrasps, level: LiftLevel) -> None:
-    """Check that each grasp has a scene and an approach.
-
-    Raises:
-        InputError: unknown level, or no scene or approach to lift from.
-    """
+    """Raise InputError for an unknown level, or where a grasp has no scene or approach to lift from."""
     if level not in LEVELS:
         raise InputError(f"unknown level {level!r} of the lift test; choose one of {', '.join(LEVELS)}")
     if len(placed.index) != len(grasps) or (level == "lift" and grasps.approach is None):

@@ -170,13 +170,8 @@ def payloads(
     held: NDArray[np.bool_] | None = None,
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> Floats:
-    """Compute payloads (N,) of grasps [kg]; nan: not tested, or the grasp does not lift the object.
-
-    Args:
-        obj: the object; masses below its own are not tested.
-        placed: the scenes of the lifts; None: a free object is pushed in six directions.
-        held: (N,) which grasps are tested; None: all.
-    """
+    """Compute payloads (N,) of grasps [kg], at least the object's mass; nan: not `held` (N,), or not lifted.
+    Grasps lift in the scenes `placed`; None: a free object is pushed in six directions."""
 
     def make() -> LiftPayload | PushPayload:
         around = (placed.supports, placed.neighbours) if placed is not None else ()
@@ -235,12 +230,8 @@ def limit_of(
     least: int = LEAST,
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> Limit | None:
-    """Return the payload limit of N grasps; None: the wanted mass is lifted, or fewer than `least` lift.
-
-    Args:
-        wanted: mass that should be lifted [kg]; None: none.
-        least: grasps that must lift a light object.
-    """
+    """Return the payload limit of N grasps; None: the `wanted` mass [kg] is lifted, or fewer than `least` grasps lift a
+    light object."""
     if len(grasps) < least:
         return None
     light = obj.weighing(mass=MASS_KG if wanted is None else min(MASS_KG, LIGHT * wanted))
@@ -298,12 +289,8 @@ def shake_margins(
     held: NDArray[np.bool_] | None = None,
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> Floats:
-    """Return shake margins (N,), the worst motion over its limit; nan: not tested.
-    The motion is displacement or rotation; below 1 the grasp holds.
-
-    Args:
-        held: (N,) which grasps are tested; None: all.
-    """
+    """Return shake margins (N,), the worst displacement or rotation over its limit; nan: not `held` (N,).
+    Below 1 the grasp holds."""
 
     def make() -> Shake:
         return Shake(scene_of(hand, obj, pieces, LIFTING, placed.supports, placed.neighbours), placed)
@@ -323,12 +310,7 @@ _UNBOUNDED: Final = 3
 
 def capacities(hand: HandModel, obj: ObjectModel, grasp: Posture, against: Floats) -> Floats:
     """Compute load capacities (N,) [kg]; 0: no contact; inf: no drive and no friction limits it.
-
-    Args:
-        obj: the object, with its friction.
-        grasp: N postures at contact.
-        against: (N, K, 3) unit vectors against the weight; the least of K counts.
-    """
+    `against` (N, K, 3) are unit vectors against the weight; the least of K counts."""
     probe = posing_of(hand, obj, points=_POINTS, device="cpu").probe
     found = probe.touch(grasp)
     facing = (found.distance < WITHIN_M) & probe.facing(found)

@@ -78,11 +78,7 @@ class Batches:
         return ~np.isin(self.owner[rows], list(self.errors))
 
     def left(self) -> Rows:
-        """Return the rows of the batches that are still planned.
-
-        Raises:
-            Exception: error of the first batch, if all have stopped.
-        """
+        """Return the rows of the batches that are still planned; raise the first batch's error if all have stopped."""
         rows = np.flatnonzero(self.going(np.arange(len(self.owner))))
         if not len(rows):
             raise self.errors[min(self.errors)]
@@ -90,10 +86,7 @@ class Batches:
 
     def step(self, rows: Rows, work: float, message: str) -> None:
         """Report so much work for each of the rows; stop batches that are cancelled.
-
-        Raises:
-            Exception: error of the first batch, if all have stopped.
-        """
+        Raise the first batch's error if all have stopped."""
         owners, counts = np.unique(self.owner[rows], return_counts=True)
         for owner, count in zip(owners.tolist(), counts.tolist(), strict=True):
             if owner not in self.errors:

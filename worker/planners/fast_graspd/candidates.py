@@ -107,13 +107,8 @@ def tried(
     device: str = "cpu",
 ) -> Selection:
     """Return each grasp's first candidate with a good enough rollout, or else the one with least score.
-    `together` candidates of each grasp are seated and simulated in order of merit, then as many again for grasps
-    without a good one. Unbalanced or infeasible hands have no rollout, but each grasp's first candidate is taken.
-
-    Args:
-        order: (n, each) rows of the hands of each grasp, the most promising first.
-        together: hands of each grasp that are seated at once.
-    """
+    `together` candidates of each grasp are seated and simulated in the order (n, each) of merit, then as many again
+    for grasps without a good one. Unbalanced or infeasible hands have no rollout, but a grasp's first one is taken."""
     taken, left = Selection.none(len(order), hand.dofs), np.arange(len(order))
     for wave in np.split(order, range(together, order.shape[1], together), axis=1):
         if not len(left):

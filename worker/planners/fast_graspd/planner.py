@@ -167,11 +167,7 @@ def optimise_pair(pair: Pair, wanted: PlanRequest, run: ExecutionContext) -> lis
 
 def optimise(pair: Pair, batches: Batches, run: ExecutionContext, *, postures: bool = False) -> list[LaunchPart]:
     """Do the same for several batches; return the parts of those that did not stop, and perhaps others.
-    `postures` adds the postures around the grasps.
-
-    Raises:
-        Exception: error of the first batch, if all have stopped.
-    """
+    `postures` adds the postures around the grasps. Raise the first batch's error if all have stopped."""
     launch = _Launch(pair, batches)
     begun = _begun(launch, batches.left(), run)
     rows = _with_place(launch, begun)

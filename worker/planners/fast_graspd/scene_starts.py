@@ -67,10 +67,7 @@ _AcrossPairs = list[tuple[NDArray[np.intp], AntipodalHands]]
 def free_ways(scene: Environment, obj: ObjectModel) -> Floats:
     """Return free approach directions (K, 3), unit vectors in the object frame.
     Along them a ball as wide as a palm leaves the object without touching an obstacle on `STANDOFF_M`.
-
-    Raises:
-        InputError: there is none.
-    """
+    Raise InputError if there is none."""
     ways = spread_directions(DIRECTIONS)
     out = ((obj.hull_vertices - obj.centre_of_mass) @ ways.T).max(axis=0)
     path = out[:, None] + PALM_RADIUS + np.linspace(0.0, STANDOFF_M, 9)

@@ -150,10 +150,7 @@ class Probe:
 
 def sample_starts(model: Model, *, seed: int, batch: int, indices: range, each: int) -> HandState:
     """Sample collision-free starts of the grasps `indices` of a batch, `each` per grasp side by side.
-
-    Raises:
-        InputError: no draw of some grasp came within 10 mm of being clear.
-    """
+    Raise InputError where no draw of some grasp came within 10 mm of being clear."""
     generators = [start_generator(seed, batch, i, k) for i in indices for k in range(each)]
     state, depth = clear_starts(model, generators, each=each)
     open_further(model, generators, state, depth, np.ones(len(depth), bool))
@@ -197,17 +194,9 @@ def clear_starts(model: Model, generators: list[np.random.Generator], *, each: i
 def open_further(
     model: Model, generators: list[np.random.Generator], state: HandState, depth: Floats, wanted: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
-    """Retry with more open hands where `clear_starts` found no clear start.
-    The pre-shape of some hands leaves no gap as wide as the object.
-
-    Args:
-        generators: of the n starts, in the state that `clear_starts` left.
-        state, depth: result of `clear_starts`; better starts replace it.
-        wanted: (n,) which of them may be opened.
-
-    Returns:
-        (n,) which were opened.
-    """
+    """Retry with more open hands where `clear_starts` found no clear start, of those `wanted` (n,).
+    The pre-shape of some hands leaves no gap as wide as the object. `generators` are in the state that `clear_starts`
+    left; better starts replace its results. Return which (n,) were opened."""
     hand, obj = model.hand.model, model.obj.model
     lost = wanted & (depth > NO_PLACE)
     if not lost.any() or JawStarts.of(hand, obj) is not None:
@@ -309,11 +298,7 @@ class JawStarts:
 
     @classmethod
     def of(cls, hand: HandModel, obj: ObjectModel) -> JawStarts | None:
-        """Return None if the hand is no gripper.
-
-        Raises:
-            InputError: the object does not fit between the jaws.
-        """
+        """Return None if the hand is no gripper; raise InputError if the object does not fit between the jaws."""
         jaws, pairs = jaws_of(hand), fitting_pairs(hand, obj)
         if jaws is None or pairs is None:
             return None

@@ -305,11 +305,7 @@ def first_terms(hand: HandModel, level: str, run: ExecutionContext) -> list[Any]
 
 
 def screened(scene: Scene, terms: str, grasps: GraspSet, *, level: str, run: ExecutionContext) -> PrefilterVerdicts:
-    """Run the prefilter on grasps in a scene.
-
-    Args:
-        terms: digest of everything that determines the scene.
-    """
+    """Run the prefilter on grasps in a scene; `terms` is a digest of everything that determines the scene."""
 
     postures = GraspSet(grasps.grasp, grasps.pregrasp, grasps.squeeze, grasps.stability_loss)
     if not len(grasps):
@@ -380,11 +376,7 @@ def has_mujoco_warp() -> bool:
 
 
 def mujoco_warp_version() -> str:
-    """Return name and version.
-
-    Raises:
-        InputError: MuJoCo Warp is not installed.
-    """
+    """Return name and version; raise InputError if MuJoCo Warp is not installed."""
     if not has_mujoco_warp():
         raise InputError("the prefilter needs mujoco-warp; run pip install 'graspd[gpu]'")
     return f"mujoco-warp {version('mujoco-warp')}"
@@ -392,11 +384,7 @@ def mujoco_warp_version() -> str:
 
 @cache
 def mujoco_warp() -> Any:
-    """Return the module, with Warp initialised.
-
-    Raises:
-        InputError: MuJoCo Warp is not installed.
-    """
+    """Return the module, with Warp initialised; raise InputError if it is not installed."""
     mujoco_warp_version()
     backend.start()
     import mujoco_warp as engine
