@@ -98,7 +98,7 @@ def turned(pose: Floats, angle: float) -> Floats:
 
 
 def inside(obj: ObjectModel, pose: Floats, size: tuple[float, float], rng: np.random.Generator) -> Floats:
-    """Move the pose to a random place in a rectangle of x by y [m] about the origin; raise SceneError if there is no room."""
+    """Move the pose to a random place in a rectangle x by y [m] about the origin; SceneError: there is no room."""
     corners = quat_rotate(pose[3:], obj.hull_vertices)[:, :2]
     low, high = corners.min(axis=0), corners.max(axis=0)
     room = np.asarray(size) / 2 - GAP

@@ -148,9 +148,10 @@ def test_a_cancelled_table_stops_and_wide_thresholds_are_refused() -> None:
 
 def test_no_more_contacts_than_the_limit_and_they_span_the_patch() -> None:
     place = np.stack(np.meshgrid(np.linspace(0, 1, 30), np.linspace(0, 1, 30), [0.0]), axis=-1).reshape(-1, 3)
-    chosen = choose_contacts(np.ones(900, bool), place, np.tile([0, 0, 1.0], (900, 1)), scale=1.0, limit=12)
-    assert len(chosen) == 12
-    assert np.ptp(place[chosen], axis=0)[:2] == pytest.approx([1.0, 1.0])
+    normal = np.tile([0, 0, 1.0], (1, 900, 1))
+    chosen, count = spread_contacts(np.ones((1, 1, 900), bool), place[None], normal, scale=1.0, limit=12)
+    assert count == 12
+    assert np.ptp(place[chosen[0, 0]], axis=0)[:2] == pytest.approx([1.0, 1.0])
 
 
 def test_consistency_is_the_spread_of_finger_distances() -> None:
