@@ -19,7 +19,7 @@ from graspd.worker.generation import ValidatedBatch, validated_grasps
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.objects.prepare import object_from_path
-from graspd.worker.planners import NoStartFound, PlanRequest, synthesize
+from graspd.worker.planners import NoStartFound, PlanRequest
 from graspd.worker.rounds import SMALLEST_PART, parts_of
 from graspd.worker.scenes.kinds import rest_poses, supports_of
 from graspd.worker.simulation.environment import Scenes
@@ -119,34 +119,16 @@ def test_lane_without_a_place_ends_blocked_where_another_has_one(pair, scenes, m
         validated_grasps(*pair, wish, count=COUNT, scenes=scenes, run=ExecutionContext(threads=2))
 
 
-@pytest.mark.parametrize("first", [0, 3])
-def test_grasps_from_one_of_a_batch_on_are_those_of_the_whole(pair, first: int) -> None:
-    whole = synthesize(*pair, PlanRequest(5, REQUEST.knobs, seed=2), ExecutionContext(threads=1))
-    rest = synthesize(*pair, PlanRequest(5 - first, REQUEST.knobs, seed=2, first=first), ExecutionContext(threads=2))
-    np.testing.assert_array_equal(rest.grasp.hand_pose, whole.grasp.hand_pose[first:])
-    np.testing.assert_array_equal(rest.squeeze.joint_positions, whole.squeeze.joint_positions[first:])
-
-
-def test_the_first_valid_grasps_are_audited_whoever_finds_them(pair, one_lane, monkeypatch: pytest.MonkeyPatch) -> None:
-    begun: list[int] = []
-    whole = generation.Batch._begin_rechecks
-    monkeypatch.setattr(
-        generation.Batch, "_begin_rechecks", lambda work, first: (begun.append(len(first.grasps)), whole(work, first))
-    )
+def test_the_first_valid_grasps_are_audited_whoever_finds_them(pair, monkeypatch: pytest.MonkeyPatch) -> None:
     rechecked: list[GraspSet] = []
     recheck = generation.Batch._rechecked
     monkeypatch.setattr(
         generation.Batch, "_rechecked", lambda work, some: (rechecked.append(some), recheck(work, some))[1]
     )
     found = validated_grasps(*pair, REQUEST, count=COUNT, run=ExecutionContext(threads=2))
-    assert len(begun) == len(rechecked) == 1
-    first = rechecked[0].moved(pair[1].centre)  # the engine works about the middle of the object
+    (first,) = (some.moved(pair[1].centre) for some in rechecked)  # the engine works about the middle of the object
     np.testing.assert_array_equal(first.grasp.hand_pose, found.grasps.grasp.hand_pose[:2])
     np.testing.assert_array_equal(found.columns["quality/recheck"] >= 0, np.arange(COUNT) < 2)
-    np.testing.assert_array_equal(found.columns["quality/recheck"], one_lane.columns["quality/recheck"])
-    monkeypatch.setattr(generation.Batch, "_begin_rechecks", lambda work, first: None)
-    late = validated_grasps(*pair, REQUEST, count=COUNT, run=ExecutionContext(threads=2))
-    np.testing.assert_array_equal(found.columns["quality/recheck"], late.columns["quality/recheck"])
 
 
 @pytest.mark.parametrize(

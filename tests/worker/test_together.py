@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from graspd.service.model.domain import JobOptions
-from graspd.service.model.errors import MeshError, TaskCancelled
+from graspd.service.model.errors import MeshError
 from graspd.service.model.fidelity import resolve_fidelity
 from graspd.service.model.scene_spec import SceneSpec
 from graspd.worker import together
@@ -155,15 +155,6 @@ def test_what_becomes_of_one_batch_ends_the_job(pair) -> None:
 
     with pytest.raises(MeshError, match="no pieces"):
         validated_batches(*pair, REQUEST, sizes=[2, 2], join=2, pieces=torn, run=ExecutionContext(threads=1))  # type: ignore[arg-type]
-
-
-def test_a_job_that_is_cancelled_stops_all_its_batches(pair) -> None:
-    told: list[str] = []
-    run = ExecutionContext(
-        threads=1, progress=lambda done, total, message: told.append(message), cancelled=lambda: bool(told)
-    )
-    with pytest.raises(TaskCancelled):
-        validated_batches(*pair, REQUEST, sizes=[2, 2], join=2, run=run)
 
 
 def test_how_many_are_joined_where_nobody_says() -> None:

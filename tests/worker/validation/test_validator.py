@@ -25,9 +25,7 @@ from graspd.worker.engines.mujoco_warnings import void
 from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext, measured
 from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.kinematics import body_poses
-from graspd.worker.hands.load import hand_from_path
 from graspd.worker.objects.convex import union_volume
-from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.simulation.environment import Obstacle
 from graspd.worker.validation import model, protocol
 from graspd.worker.validation.decomposition import ConvexPieces, decompose
@@ -270,25 +268,6 @@ def test_every_constant_is_said_to_move_verdicts_or_not() -> None:
 def _assigned(module: ModuleType, name: str) -> bool:
     """Whether the constant is the module's own, not imported from another."""
     return re.search(rf"^{name}\b[^=\n]*=", inspect.getsource(module), re.MULTILINE) is not None
-
-
-def test_a_verdict_does_not_depend_on_the_origin_of_the_mesh() -> None:
-    away = np.array([0.03, -0.02, 0.2])
-    moved = object_from_mesh(trimesh.creation.box((0.06, 0.04, 0.05), trimesh.transformations.translation_matrix(away)))
-    scene = build(PADS, moved, ConvexPieces((moved.hull_vertices,), 1.0, 0.0, "box"), MujocoOptions())
-    data = mujoco.MjData(scene.model)
-    scene.place(data, *(part[0] for part in (CONTACT.hand_pose + 5, CONTACT.joint_positions)))
-    mujoco.mj_kinematics(scene.model, data)
-    mujoco.mj_comPos(scene.model, data)
-    np.testing.assert_allclose(data.xipos[scene.object_body], moved.centre_of_mass, atol=1e-9)
-    there = ConvexPieces((moved.hull_vertices,), 1.0, 0.0, "box")
-    grasps = many_grasps()
-    here = validate(PADS, BOX, grasps, level="dexgraspbench", pieces=WHOLE)
-    parts = (grasps.grasp, grasps.pregrasp, grasps.squeeze)
-    shifted = [Posture(p.hand_pose + np.append(away, np.zeros(4)), p.joint_positions) for p in parts]
-    found = validate(PADS, moved, GraspSet(*shifted, grasps.stability_loss), level="dexgraspbench", pieces=there)
-    assert 0 < here.success.sum() < len(grasps)
-    np.testing.assert_array_equal(found.success, here.success)
 
 
 def test_forward_kinematics_agree_with_ours() -> None:
@@ -537,19 +516,6 @@ def test_a_published_grasp_without_its_thumb_is_refused(shared_data: Path) -> No
     whole, found = (validate(case.hand, case.obj, grasps) for grasps in (some, without))
     assert whole.success.all() and not found.success.any()
     assert all(reason.startswith(("rotated", "displaced", "lost")) for reason in found.reasons)
-
-
-def test_object_that_lies_in_the_open_palm_is_pushed_out_of_it() -> None:
-    hand, obj = hand_from_path("allegro"), object_from_path("block")
-    half = hand.palm.approach + np.array([0.0, 0, 1])
-    half = half / np.linalg.norm(half) if np.linalg.norm(half) > 1e-6 else np.array([1.0, 0, 0])
-    turn = np.array([0.0, *half])  # half a turn about the middle of approach and up
-    rotation = 2 * np.outer(half, half) - np.eye(3)
-    below = np.array([*obj.centre_of_mass[:2], obj.vertices[:, 2].min() - 0.001])
-    pose = np.array([[*(below - rotation @ hand.palm.centre), *turn]])
-    flat = Posture(pose, hand.expand(np.clip(np.zeros(hand.dofs), hand.lower, hand.upper)[None]))
-    found = validate(hand, obj, GraspSet(flat, flat, flat, np.full(1, np.nan)))
-    assert not found.success.any() and found.reasons[0] != "penetration"
 
 
 def test_measured_tests_held_grasps_by_row_and_may_be_stopped() -> None:
