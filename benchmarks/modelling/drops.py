@@ -35,10 +35,10 @@ def drops(objects: list[ObjectModel], count: int) -> list[Row]:
         rests, seconds = {}, {}
         for name, table in tables.items():
             with cpu() as clock:
-                rests[name] = [simulate._redo_until_rest(table, obj.name, (SEED, k)) for k in range(count)]
+                rests[name] = [simulate._redo_until_rest(table, (SEED, k)) for k in range(count)]
             seconds[name] = clock.seconds
         faces = {name: np.array([rest.face for rest in found]) for name, found in rests.items()}
-        again = np.array([simulate._redo_until_rest(hull, obj.name, (SEED + 1, k)).face for k in range(count)])
+        again = np.array([simulate._redo_until_rest(hull, (SEED + 1, k)).face for k in range(count)])
         rows.append(
             {
                 "object": obj.name,

@@ -83,7 +83,7 @@ def drop(obj: ObjectModel, *, count: int, seed: int) -> dict[str, Floats]:
     table = _build(obj.centred)
     rests = []
     for scene in range(count):
-        rest, rng = _redo_until_rest(table, obj.name, (seed, scene)), np.random.default_rng([seed, scene, MAX_ATTEMPTS])
+        rest, rng = _redo_until_rest(table, (seed, scene)), np.random.default_rng([seed, scene, MAX_ATTEMPTS])
         face, pose = steadied(obj.centred, table.faces, rest.face, rest.pose, rng)
         rests.append(RestPose(pose, face, rest.seconds))
     poses = moved(np.array([rest.pose for rest in rests]).reshape(count, 7), np.zeros(3))
@@ -127,7 +127,7 @@ def _reference_faces(obj: ObjectModel) -> tuple[int, ...]:
 
     def drops() -> dict[str, NDArray[Any]]:
         table = _build(obj)
-        rests = [_redo_until_rest(table, obj.name, (_REFERENCE_SEED, k)) for k in range(REFERENCE_DROPS)]
+        rests = [_redo_until_rest(table, (_REFERENCE_SEED, k)) for k in range(REFERENCE_DROPS)]
         return {"face": np.array([rest.face for rest in rests])}
 
     def fits(kept: Mapping[str, NDArray[Any]]) -> bool:
@@ -179,12 +179,12 @@ def _build(obj: ObjectModel) -> _Table:
     return _Table(model, mujoco.MjData(model), resting_faces(obj), obj)
 
 
-def _redo_until_rest(table: _Table, name: str, key: tuple[int, int]) -> RestPose:
+def _redo_until_rest(table: _Table, key: tuple[int, int]) -> RestPose:
     for attempt in range(MAX_ATTEMPTS):
         rest = _drop_once(table, np.random.default_rng([*key, attempt]))
         if rest is not None:
             return rest
-    raise MeshError(f"{name!r} did not come to rest in any of {MAX_ATTEMPTS} drops; is it a perfect ball?")
+    raise MeshError(f"{table.obj.name!r} did not come to rest in any of {MAX_ATTEMPTS} drops; is it a perfect ball?")
 
 
 def _drop_once(table: _Table, rng: np.random.Generator) -> RestPose | None:
@@ -209,9 +209,7 @@ def _drop_once(table: _Table, rng: np.random.Generator) -> RestPose | None:
 
 
 def _run(table: _Table) -> float | None:
-    model, data = table.model, table.data
-    window = round(REST_WINDOW_S / TIMESTEP_S)
-    quiet = 0
+    model, data, quiet = table.model, table.data, 0
     for step in range(round(TIMEOUT_S / TIMESTEP_S)):
         mujoco.mj_step(model, data)
         # Velocity of the body frame's origin and spin in the body frame: the spin bounds the speed of any point.
@@ -219,6 +217,6 @@ def _run(table: _Table) -> float | None:
         centre_velocity = data.qvel[:3] + quat_rotate(data.qpos[3:], np.cross(spin, table.obj.centre_of_mass))
         speed = np.linalg.norm(centre_velocity) + table.obj.radius * np.linalg.norm(spin)
         quiet = quiet + 1 if speed < REST_SPEED and data.ncon > 0 else 0
-        if quiet >= window:
+        if quiet >= round(REST_WINDOW_S / TIMESTEP_S):
             return (step + 1) * TIMESTEP_S
     return None

@@ -183,8 +183,7 @@ def push_rollout(
     hand: HandModel, obj: ObjectModel, pieces: Callable[[], ConvexPieces], *, threads: int = 1
 ) -> Callable[[GraspSet, PlacedGrasps | None, Floats], Floats]:
     """Return a `worker.planners.Rollout` that scores free grasps (N,) by short pushes.
-    Scores are below 1 for grasps
-    that hold at half the friction, and below 2 at full friction.
+    Scores are below 1 for grasps that hold at half the friction, and below 2 at full friction.
 
     Args:
         threads: per call; planners on the CPU already call from all their threads.

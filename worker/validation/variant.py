@@ -361,7 +361,7 @@ def _with_numbers(scene: Scene, variant: Variant) -> Scene:
     if variant == plain:
         return scene
     model = copy.copy(scene.model)
-    dofs = model.jnt_dofadr[[_joint_of(model, int(qpos)) for qpos in scene.joint_qpos]]
+    dofs = model.jnt_dofadr[np.searchsorted(model.jnt_qposadr, scene.joint_qpos)]
     if variant.armature is not None:
         model.dof_armature[dofs] = variant.armature
     if variant.dry_friction is not None:
@@ -378,10 +378,6 @@ def _with_numbers(scene: Scene, variant: Variant) -> Scene:
     # Contact stiffness depends on inverse inertias, which follow from masses and armature.
     mujoco.mj_setConst(model, mujoco.MjData(model))
     return replace(scene, model=model)
-
-
-def _joint_of(model: Any, qpos: int) -> int:
-    return int(np.flatnonzero(model.jnt_qposadr == qpos)[0])
 
 
 def seen(obj: ObjectModel, grasps: GraspSet, row: int, variant: Variant) -> GraspSet:

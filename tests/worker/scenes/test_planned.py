@@ -28,7 +28,7 @@ from graspd.worker.scenes.clearance import MARGIN_M, approach
 from graspd.worker.scenes.kinds import rest_poses, supports_of
 from graspd.worker.scenes.placement import gaps_between, joined_pieces, neighbour_of, scenes_of
 from graspd.worker.scenes.trajectory import plan_way
-from graspd.worker.simulation.environment import STANDOFF_M, Obstacle, PlacedGrasps, Scenes
+from graspd.worker.simulation.environment import STANDOFF_M, PlacedGrasps, Scenes
 from tests.worker.commands_run import graspd, refused
 from tests.worker.hands.grippers import gripper
 from tests.worker.models import object_from_mesh
@@ -105,14 +105,6 @@ def test_a_grasp_does_not_depend_on_the_scenes_of_the_others(planned) -> None:
     alone = PlacedGrasps(placed.supports, placed.object_pose, placed.index[:3])
     found = synthesize(hand, obj, PlanRequest(count=3, fidelity=QUICK, seed=4, placed=alone))
     assert np.array_equal(found.grasp.hand_pose, grasps.grasp.hand_pose[:3])
-
-
-def test_without_obstacles_a_hand_may_come_from_below() -> None:
-    hand, obj = hand_from_path("barrett"), object_from_path("block", face_error_m=QUICK.face_error_m)
-    nothing = PlacedGrasps((), np.array([[0, 0, 0, 1.0, 0, 0, 0]]), np.zeros(8, int))
-    found = synthesize(hand, obj, PlanRequest(count=8, fidelity=QUICK, seed=4, placed=nothing))
-    below = Obstacle.half_space([0, 0, 1], -0.03)
-    assert (mujoco_distances(hand, found.grasp, below) < 0).any()
 
 
 def test_synth_in_a_scene_counts_grasps_that_lift(tmp_path: Path) -> None:
@@ -207,15 +199,6 @@ def planned_beside():
     placed = scenes.placed(np.zeros(8, int))
     grasps = synthesize(hand, thing, PlanRequest(count=8, fidelity=QUICK, seed=4, placed=placed))
     return hand, thing, placed, grasps
-
-
-def test_without_neighbours_the_hand_would_reach_through_them(planned_beside) -> None:
-    """The test above would pass for a scene in which nothing is in the way."""
-    hand, thing, placed, _ = planned_beside
-    alone = type(placed)(placed.supports, placed.object_pose, placed.index)
-    grasps = synthesize(hand, thing, PlanRequest(count=8, fidelity=QUICK, seed=4, placed=alone))
-    least = [mujoco_distances(hand, grasps.grasp, solid) for solid in placed.scenes[0].obstacles[1:]]
-    assert np.min(least) < 0
 
 
 def test_synth_with_neighbours_writes_them_lifts_judge_alike(tmp_path: Path) -> None:

@@ -128,9 +128,9 @@ def dropped(monkeypatch, tmp_path) -> list[tuple[int, int]]:
     keys: list[tuple[int, int]] = []
     whole = simulate._redo_until_rest
 
-    def counted(table, name, key):
+    def counted(table, key):
         keys.append(key)
-        return whole(table, name, key)
+        return whole(table, key)
 
     monkeypatch.setattr(simulate, "_redo_until_rest", counted)
     monkeypatch.setattr(simulate, "_reference_faces", simulate._reference_faces.__wrapped__)

@@ -209,7 +209,3 @@ def ranked(merit: Floats, grasps: int) -> NDArray[np.intp]:
     each = merit.reshape(grasps, -1)
     # The stable sort keeps hands of equal merit in the order of their starts.
     return np.argsort(each, axis=1, kind="stable") + np.arange(grasps)[:, None] * each.shape[1]
-
-
-def best_of_each(merit: Floats, grasps: int, keep: int) -> NDArray[np.intp]:
-    return np.sort(ranked(merit, grasps)[:, :keep], axis=1).ravel()

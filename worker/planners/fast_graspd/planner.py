@@ -32,7 +32,6 @@ from graspd.worker.planners.fast_graspd.candidates import (
     SCENE_FRICTION,
     TOGETHER,
     Refinements,
-    best_of_each,
     merits,
     posture_of,
     ranked,
@@ -319,7 +318,7 @@ def _work(launch: _Launch, begun: _Begun) -> LaunchPart:
             score = np.where(off & (score < STANDS), STANDS + 1e-3 * score, score)
         return LaunchPart(rows, taken.state, taken.losses, score, curve, found)
     seated = seats.seated(np.sort(order, axis=1), np.arange(n))
-    winners = best_of_each(seated.merit, n, 1) if last > 1 else np.arange(n)
+    winners = ranked(seated.merit, n)[:, 0] if last > 1 else np.arange(n)
     return LaunchPart(rows, seated.state[winners], seated.losses[winners], seated.merit[winners], curve)
 
 

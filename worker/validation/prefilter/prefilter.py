@@ -114,7 +114,9 @@ class WorldPool:
             self._model = self._engine.put_model(scene.model)
             self._model.opt.warn_overflow = 0
             self._of_hand = wp.array(scene.hand_geoms.astype(np.int32), dtype=wp.int32)
-            self._terms = self._make_terms()
+            terms = self._terms = kernels.TestConstants()
+            terms.object_qpos, terms.object_body, terms.push = scene.object_qpos, scene.object_body, scene.push
+            terms.centre = wp.vec3(*(float(x) for x in scene.centre))
             self._allocate()
 
     def validate(self, grasps: GraspSet, run: ExecutionContext = DEFAULT_CONTEXT) -> PrefilterOutcomes:
@@ -133,13 +135,6 @@ class WorldPool:
                 found = found.put(lost, self._validate(grasps.take(lost), run.quiet()))
                 lost = np.flatnonzero(found.overflow)
         return found
-
-    def _make_terms(self) -> Any:
-        scene, terms = self.scene, kernels.TestConstants()
-        terms.object_qpos, terms.object_body = scene.object_qpos, scene.object_body
-        terms.push = scene.push
-        terms.centre = wp.vec3(*(float(x) for x in scene.centre))
-        return terms
 
     def _allocate(self) -> None:
         model, w, more = self.scene.model, self.worlds, 2**self._doublings
@@ -306,7 +301,6 @@ def first_terms(hand: HandModel, level: str, run: ExecutionContext) -> list[Any]
 
 def screened(scene: Scene, terms: str, grasps: GraspSet, *, level: str, run: ExecutionContext) -> PrefilterVerdicts:
     """Run the prefilter on grasps in a scene; `terms` is a digest of everything that determines the scene."""
-
     postures = GraspSet(grasps.grasp, grasps.pregrasp, grasps.squeeze, grasps.stability_loss)
     if not len(grasps):
         return PrefilterVerdicts({}, {})
@@ -337,7 +331,6 @@ def _pool(scene: Scene, terms: str, device: str, count: int) -> WorldPool:
     if key not in _pools:
         while len(_pools) >= _KEPT_POOLS:
             _pools.popitem(last=False)
-
         _pools[key] = WorldPool(scene, device, size)
     _pools.move_to_end(key)
     return _pools[key]
