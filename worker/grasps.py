@@ -107,14 +107,9 @@ class GraspSet:
 
     def moved(self, by: ArrayLike) -> GraspSet:
         """Return the grasps and trajectories moved by a vector (3,) [m], into a frame with another origin."""
-        return replace(
-            self,
-            grasp=self.grasp.moved(by),
-            pregrasp=self.pregrasp.moved(by),
-            squeeze=self.squeeze.moved(by),
-            approach=None if self.approach is None else moved(self.approach, by),
-            lift=None if self.lift is None else self.lift.moved(by),
-        )
+        postures = {name: getattr(self, name).moved(by) for name in _POSTURES}
+        approach = None if self.approach is None else moved(self.approach, by)
+        return replace(self, **postures, approach=approach, lift=None if self.lift is None else self.lift.moved(by))
 
     def to_columns(self) -> dict[str, NDArray[Any]]:
         """Return the posture columns of a base shard; the planner's loss is a column of the quality table."""

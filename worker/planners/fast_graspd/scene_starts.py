@@ -28,7 +28,7 @@ from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.planners.fast_graspd.antipodal_starts import NEAR_M, AntipodalHands, Openings, across, promising
 from graspd.worker.planners.fast_graspd.candidates import posture_of
-from graspd.worker.planners.fast_graspd.starts import CLEAR, POSTURE_NOISE, TILT, Probe, frames_about, put
+from graspd.worker.planners.fast_graspd.starts import CLEAR, POSTURE_NOISE, TILT, Probe, at_distances, frames_about, put
 from graspd.worker.planners.fitting import points_in, surface_of
 from graspd.worker.planners.port import NoStartFound
 from graspd.worker.quality.contact import finger_of_body
@@ -246,9 +246,7 @@ class _Around:
                     uniform[rows], normal[rows], self.ways[s]
                 )
         pivot = pivot[:, None] + np.array(RETREATS)[None, :, None] * away[:, None]
-        repeat = len(RETREATS)
-        states = HandState(pivot.reshape(-1, 3), np.repeat(rotation, repeat, axis=0), np.repeat(q, repeat, axis=0))
-        return states, reaching
+        return at_distances(pivot, rotation, q), reaching
 
     def _towards(self, uniform: Floats, normal: Floats, ways: Floats) -> tuple[Floats, Floats, Floats, Floats]:
         """Place hands that face random points of the surface, in the form of `across` but without a pair."""

@@ -114,11 +114,13 @@ def draw(pair: _Pair, generators: list[np.random.Generator]) -> tuple[HandState,
 
 def _retreated(state: HandState, approach: Floats) -> HandState:
     back = np.array(RETREATS)[None, :, None]
-    pivot = state.pivot[:, None] - back * approach[:, None]
-    repeat = len(RETREATS)
-    return HandState(
-        pivot.reshape(-1, 3), np.repeat(state.rotation, repeat, axis=0), np.repeat(state.q, repeat, axis=0)
-    )
+    return at_distances(state.pivot[:, None] - back * approach[:, None], state.rotation, state.q)
+
+
+def at_distances(pivot: Floats, rotation: Floats, q: Floats) -> HandState:
+    """Return hands (n * K) at pivots (n, K, 3), with rotations (n, 4) and dofs (n, D)."""
+    each = pivot.shape[1]
+    return HandState(pivot.reshape(-1, 3), np.repeat(rotation, each, axis=0), np.repeat(q, each, axis=0))
 
 
 class Probe:
@@ -323,8 +325,7 @@ class JawStarts:
         place = (AHEAD[0] + (AHEAD[1] - AHEAD[0]) * uniform[:, 4])[:, None] + np.array(JAW_RETREATS)[None]
         at = ((start + end) / 2)[:, None] - length * place[..., None] * ahead[:, None]
         pivot = at - self.obj.centre_of_mass + quat_rotate(rotation, self.hand.palm.centre - middle)[:, None]
-        each = len(JAW_RETREATS)
-        return HandState(pivot.reshape(-1, 3), np.repeat(rotation, each, axis=0), np.repeat(q, each, axis=0))
+        return at_distances(pivot, rotation, q)
 
 
 def _across(line: Floats, turn: Floats) -> Floats:

@@ -85,11 +85,6 @@ class PrefilterOutcomes:
         lost = np.isin(self.outcome, kinds).any(axis=1) & np.isfinite(self.margin) & (self.margin > BAND[1])
         return np.asarray((inside | lost) & ~self.overflow)
 
-    @staticmethod
-    def terms(engine: str) -> list[Any]:
-        """Return the terms of verdicts by a version of the engine, besides those of level standard."""
-        return [engine, REVISION, *BAND, PATIENCE, MOST_TICKS, RECHECK_ONE_IN]
-
     def put(self, rows: NDArray[np.intp], again: Self) -> Self:
         changed: dict[str, Any] = {}
         for field in fields(self):
@@ -296,7 +291,7 @@ def first_terms(hand: HandModel, level: str, run: ExecutionContext) -> list[Any]
         return []
     if run.prefilter == "auto" and not (run.device.startswith("cuda") and has_mujoco_warp()):
         return []
-    return PrefilterOutcomes.terms(mujoco_warp_version())
+    return [mujoco_warp_version(), REVISION, *BAND, PATIENCE, MOST_TICKS, RECHECK_ONE_IN]
 
 
 def screened(scene: Scene, terms: str, grasps: GraspSet, *, level: str, run: ExecutionContext) -> PrefilterVerdicts:
