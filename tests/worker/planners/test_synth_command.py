@@ -74,6 +74,7 @@ def test_grasps_called_valid_were_validated_as_in_a_job(validated: tuple[Path, d
     assert said["candidates"] >= 3 and shard.attributes["candidates"] == said["candidates"]
     assert (shard["quality/success"] == 1).all()
     assert shard.attributes["verdict_level"] == "standard" and "verdict_key" in shard.attributes
+    assert said["reason"] is None and "reason" not in shard.attributes
 
 
 def test_grasps_that_nobody_validated_are_sound_and_never_valid(unvalidated: tuple[Path, dict[str, Any]]) -> None:
@@ -133,11 +134,6 @@ def test_an_object_is_named_after_its_folder_where_the_file_says_nothing(of_own_
     assert read_shard(of_own_mesh).attributes["object"] == "brick"
 
 
-def test_keep_largest_leaves_the_rest_out(of_own_mesh: Path) -> None:
-    obj = object_of_shard(read_shard(of_own_mesh), None)
-    assert np.ptp(obj.vertices, axis=0) == pytest.approx([0.05, 0.06, 0.07])
-
-
 def elsewhere(file: Path, folder: Path) -> Shard:
     """The shard in another folder, whose mesh is no longer where it was."""
     moved = folder / "shard" / "own.h5"
@@ -194,10 +190,6 @@ def test_fewer_grasps_than_asked_are_told_with_the_reason_and_exit_code_3(
     assert json.loads(str(shard.attributes["outcomes"])) == said["outcomes"]
     again = graspd.open(out)
     assert (again.reason, again.outcomes) == (said["reason"], said["outcomes"])
-
-
-def test_all_that_were_asked_need_no_reason(validated: tuple[Path, dict[str, Any]]) -> None:
-    assert validated[1]["reason"] is None and "reason" not in read_shard(validated[0]).attributes
 
 
 @pytest.mark.parametrize("asked", [signal.SIGINT, signal.SIGTERM])

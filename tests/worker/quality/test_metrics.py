@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from graspd.exchange.inputs import load_case
 from graspd.service.model.errors import InputError, TaskCancelled
-from graspd.service.model.metrics import DIRECTION_CELLS, GRASP_METRICS, GraspType, entropy_bits, evenness
+from graspd.service.model.metrics import DIRECTION_CELLS, GraspType, entropy_bits, evenness
 from graspd.service.model.transforms import compose
 from graspd.service.store.columns import SCHEMAS
 from graspd.worker.execution_context import ExecutionContext
@@ -40,7 +40,7 @@ from graspd.worker.quality.diversity import (
 from graspd.worker.quality.gate import MAX_PENETRATION_MM, MAX_SELF_PENETRATION_MM, MIN_CONTACT_LINKS, passes
 from graspd.worker.quality.intervals import wilson, wilson_of_mean
 from graspd.worker.quality.probe import HAND_POINTS, REACH_M, Probe
-from graspd.worker.quality.table import MEASURES, measure
+from graspd.worker.quality.table import measure
 from graspd.worker.quality.volume import VOXEL_M, Overlap, SharedVolume, VoxelVolume
 from tests.worker.models import object_from_mesh, two_finger_hand
 from tests.worker.quality.helpers import choose_contacts, grasp_set, pad_hand, plate_hand, posture
@@ -172,10 +172,6 @@ def test_held_out_points_differ_from_the_planner_s() -> None:
     hand = two_finger_hand()
     ours, theirs = Probe(hand, BOX).points.position, sample_surface(hand, HAND_POINTS).position
     assert not (ours[:, None] == theirs[None]).all(axis=-1).any()
-
-
-def test_every_measure_has_its_row_in_the_table_of_metrics() -> None:
-    assert set(MEASURES) <= {metric.name for metric in GRASP_METRICS}
 
 
 def test_the_volume_is_measured_where_the_index_tells_it() -> None:
