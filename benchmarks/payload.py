@@ -33,10 +33,9 @@ from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.scenes.placement import scenes_of
 from graspd.worker.simulation.environment import PlacedGrasps
-from graspd.worker.validation.compiled import scene_of
 from graspd.worker.validation.decomposition import decompose
 from graspd.worker.validation.lift import LiftOutcome
-from graspd.worker.validation.model import MujocoOptions
+from graspd.worker.validation.model import MujocoOptions, scene_of
 from graspd.worker.validation.payload import LIFTING, LiftPayload, PushPayload, limit_of
 from graspd.worker.validation.protocol import DIRECTIONS, Outcome, Rollout
 

@@ -24,8 +24,7 @@ from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.quality.intervals import wilson
 from graspd.worker.validation.decomposition import decompose
 from graspd.worker.validation.model import MujocoOptions, build
-from graspd.worker.validation.prefilter.phases import PrefilterOutcomes
-from graspd.worker.validation.prefilter.prefilter import WorldPool, mujoco_warp
+from graspd.worker.validation.prefilter.prefilter import PrefilterOutcomes, WorldPool, mujoco_warp
 
 OBJECTS = ("005_tomato_soup_can", "025_mug", "011_banana", "035_power_drill")
 #: Largest shift of a grasp that is validated again for its time [m].

@@ -25,8 +25,7 @@ from graspd.worker.validation.decomposition import decompose
 from graspd.worker.validation.model import MujocoOptions
 from graspd.worker.validation.refit import fits_of
 from graspd.worker.validation.robust import reaches, robust
-from graspd.worker.validation.variant import SHAPES, Variant, axes_of, couplings_of, draw, together
-from graspd.worker.validation.varied import Models
+from graspd.worker.validation.variant import SHAPES, Models, Variant, axes_of, couplings_of, draw, together
 
 OBJECTS = ["003_cracker_box", "005_tomato_soup_can", "011_banana", "025_mug"]
 #: Of the draws; jobs of these seeds have other models.

@@ -64,7 +64,7 @@ def poses_of(obj: ObjectModel, variants: int) -> list[str]:
     faces = resting_faces(obj)
     table = simulate._build(obj.centred)
     with patch.object(RestingFaces, "topples", lambda self, face: False):
-        found = np.array([simulate._redo_until_rest(table, obj.name, (SEED, k)).face for k in range(DROPS)])
+        found = np.array([simulate._redo_until_rest(table, (SEED, k)).face for k in range(DROPS)])
     steady, cells = not all(faces.rolls(int(face)) for face in found), []
     for face, count in sorted(zip(*np.unique(found, return_counts=True), strict=True), key=lambda one: -one[1]):
         turn, _ = faces.looseness(int(face))

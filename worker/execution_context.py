@@ -1,24 +1,26 @@
-"""Execution context of a computation: device, progress, cancellation and the shared cores."""
+"""Execution context of a computation: device, progress, cancellation and the shared cores; parallel parts of it."""
 
 from __future__ import annotations
 
+import queue
 import threading
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Final, Literal
+from collections.abc import Callable, Sequence
+from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
+from dataclasses import dataclass, field, replace
+from typing import Final, Literal, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
 
 from graspd.service.model.cores import available_cores
 from graspd.service.model.errors import TaskCancelled
 from graspd.worker.pool.pool import Pool
 
 PrefilterMode = Literal["auto", "on", "off"]
+#: Receives the amount done, the total and a short message; called often, from any thread.
 Progress = Callable[[float, float, str], None]
-
-"""Receives the amount done, the total and a short message; called often, from any thread."""
-
+#: Returns whether to stop; called often, from any thread.
 Cancelled = Callable[[], bool]
-
-"""Return whether to stop; called often, from any thread."""
 
 
 def _silent(done: float, total: float, message: str) -> None:
@@ -37,7 +39,6 @@ class CoreSharing:
         self._lock = threading.Lock()
 
     def leave(self) -> None:
-        """Release the cores of one part."""
         with self._lock:
             self.members -= 1
 
@@ -48,7 +49,6 @@ class ExecutionContext:
     Results do not depend on it, except for rounding on a GPU and for the engine that validates."""
 
     device: str = "cpu"
-    """Warp device."""
     threads: int = 0
     """CPU threads; 0: one per core this process may use."""
     progress: Progress = _silent
@@ -75,24 +75,19 @@ class ExecutionContext:
         return replace(self, progress=tell)
 
     def quiet(self) -> ExecutionContext:
-        """Return the context without progress, for parts that are too short or of unknown length."""
         return replace(self, progress=_silent)
 
     def check(self, what: str) -> None:
-        """Raise TaskCancelled if the work should stop."""
         if self.cancelled():
             raise TaskCancelled(f"{what} was cancelled")
 
 
 class Count:
-    """Counter of finished grasps, which reports progress from any thread."""
-
     def __init__(self, total: int, run: ExecutionContext, what: str, done: int = 0) -> None:
         self._total, self._run, self._what, self._done = total, run, what, done
         self._lock = threading.Lock()
 
     def add(self, more: int) -> None:
-        """Count `more` finished grasps."""
         with self._lock:
             self._done += more
             self._run.progress(self._done, self._total, self._what)
@@ -100,3 +95,107 @@ class Count:
 
 #: On the CPU with all its cores, without progress or cancellation.
 DEFAULT_CONTEXT: Final = ExecutionContext()
+
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+
+@dataclass
+class ProgressShares:
+    """Combined progress of all parts, in the unit of their sizes."""
+
+    sizes: Sequence[int]
+    told: Progress
+    _done: dict[int, float] = field(default_factory=dict)
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def of(self, part: int) -> Progress:
+        def tell(done: float, total: float, message: str) -> None:
+            with self._lock:
+                self._done[part] = self.sizes[part] * (done / total if total > 0 else 0.0)
+                self.told(sum(self._done.values()), sum(self.sizes), message)
+
+        return tell
+
+
+def parallel_map(
+    parts: Sequence[T], work: Callable[[T, ExecutionContext], R], run: ExecutionContext, *, size: Callable[[T], int]
+) -> list[R]:
+    """Run `work` on every part in parallel; return the results in order.
+    Each part has its own share of the cores, and of the progress by `size`. The first failure stops the others.
+
+    Raises:
+        Exception: the error of the first part that failed, once all have ended.
+    """
+    if len(parts) == 1:
+        return [work(parts[0], run)]
+    sharing, stop, shares = (
+        CoreSharing(len(parts)),
+        threading.Event(),
+        ProgressShares([size(part) for part in parts], run.progress),
+    )
+
+    def run_part(number: int) -> R:
+        own = replace(
+            run, sharing=sharing, progress=shares.of(number), cancelled=lambda: stop.is_set() or run.cancelled()
+        )
+        try:
+            return work(parts[number], own)
+        finally:
+            sharing.leave()
+
+    with ThreadPoolExecutor(len(parts), thread_name_prefix="part") as pool:
+        futures = [pool.submit(run_part, number) for number in range(len(parts))]
+        try:
+            done, _ = wait(futures, return_when=FIRST_EXCEPTION)
+        finally:
+            stop.set()
+    if failed := [error for one in done if (error := one.exception()) is not None]:
+        raise failed[0]
+    return [one.result() for one in futures]
+
+
+def answers(
+    rows: Sequence[int], make: Callable[[], T], ask: Callable[[T, int], R], *, threads: int, name: str
+) -> list[R]:
+    """Run tests on some grasps in parallel; return the results in their order."""
+    if not len(rows):
+        return []
+    if (workers := min(threads, len(rows))) <= 1:
+        test = make()
+        return [ask(test, row) for row in rows]
+    tests: queue.SimpleQueue[T] = queue.SimpleQueue()
+    for _ in range(workers):
+        tests.put(make())
+
+    def work(row: int) -> R:
+        test = tests.get()
+        try:
+            return ask(test, row)
+        finally:
+            tests.put(test)
+
+    with ThreadPoolExecutor(workers, thread_name_prefix=name) as pool:
+        return list(pool.map(work, rows))
+
+
+def measured(
+    count: int,
+    held: NDArray[np.bool_] | None,
+    make: Callable[[], T],
+    ask: Callable[[T, int], float],
+    *,
+    run: ExecutionContext,
+    name: str,
+) -> NDArray[np.float64]:
+    """Return measurements (count,) on grasps that are `held` (count,), None: all; nan for the others."""
+
+    def asked(test: T, row: int) -> float:
+        run.check("the validator")
+        return ask(test, row)
+
+    out = np.full(count, np.nan)
+    rows = np.arange(count) if held is None else np.flatnonzero(held)
+    out[rows] = answers(rows.tolist(), make, asked, threads=run.cores, name=name)
+    return out

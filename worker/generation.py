@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from typing import Any, Final
+from typing import Any, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,12 +23,11 @@ from numpy.typing import NDArray
 from graspd.service.model.domain import JobOptions
 from graspd.service.model.errors import TaskCancelled
 from graspd.service.model.planning import totals
-from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
+from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext, parallel_map
 from graspd.worker.grasps import GraspSet, joined, joined_columns
 from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.pinch_postures import require_opposing
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.parallel import parallel_map
 from graspd.worker.planners import NoStartFound, PlanRequest, Rollout, fitting_pairs, method, synthesize
 from graspd.worker.planners.fast_graspd.antipodal_starts import why_narrow
 from graspd.worker.quality.diversity import POINTS, distinct, hand_points
@@ -51,15 +50,8 @@ from graspd.worker.validation.validator import prefiltered, validate
 #: Reasons to reject a grasp: its numbers are not finite, an obstacle of its scene blocks it, the validator dropped it,
 #: it failed the geometric gate, held in too few models, lifts too little, or is a near-duplicate of a selected one.
 REJECTIONS: Final = ("diverged", "blocked", "dropped", "gate", "not_robust", "weak", "alike")
-#: Outcomes whose name differs from that of their rejection.
-_REJECTION_OF: Final = {
-    "no_place": "blocked",
-    "diverged": "diverged",
-    "not_robust": "not_robust",
-    "weak": "weak",
-    "alike": "alike",
-    **{f"gate_{name}": "gate" for name in GATES},
-}
+#: Outcomes of other names than their rejections; those of the validator are `dropped`.
+_REJECTION_OF: Final = {"no_place": "blocked", **{f"gate_{name}": "gate" for name in GATES}}
 #: Outcome names of pushes and of lifts that drop a grasp.
 _PUSHED: Final = {
     Outcome.PENETRATION: "penetration",
@@ -68,14 +60,8 @@ _PUSHED: Final = {
     Outcome.ROTATED: "turned",
     Outcome.DIVERGED: "unstable",
 }
-_LIFTED: Final = {
-    LiftOutcome.PENETRATION: "penetration",
-    LiftOutcome.TOUCHED_ON_THE_WAY: "touched_on_the_way",
-    LiftOutcome.LOST_WHILE_CLOSING: "lost_while_closing",
-    LiftOutcome.NOT_LIFTED: "not_lifted",
-    LiftOutcome.TURNED: "turned",
-    LiftOutcome.DIVERGED: "unstable",
-    LiftOutcome.NEIGHBOUR_MOVED: "neighbour_moved",
+_LIFTED: Final = {outcome: outcome.name.lower() for outcome in LiftOutcome if outcome > LiftOutcome.LIFTED} | {
+    LiftOutcome.DIVERGED: "unstable"
 }
 #: Verdicts on candidates from the planner's rollouts, of lifts or of pushes.
 Known = dict[str, Any]
@@ -85,11 +71,8 @@ PARTS: Final = (0.6, 0.8, 1.0)
 
 @dataclass(frozen=True)
 class ValidatedBatch:
-    """Result of one batch."""
-
     grasps: GraspSet
     columns: Arrays
-    """The `quality/...` columns of a base shard."""
     candidates: int
     """Number of candidates up to the last selected grasp; all where fewer were found than wanted."""
     rejected: dict[str, int]
@@ -99,9 +82,7 @@ class ValidatedBatch:
     verdict_key: str | None
     """Digest of the terms of the verdicts; None: not validated."""
     planned: int
-    """Total number of planned candidates."""
     seconds: dict[str, float] = field(default_factory=dict)
-    """Wall time of planning, validating and measuring [s]."""
     shares: dict[str, float] = field(default_factory=dict)
     """In scenes, shares of all candidates:
     clear_share (free of obstacles at contact, on the approach and in the lift), lift_share (also lifted),
@@ -112,7 +93,6 @@ class ValidatedBatch:
     """Payload limit of the best grasps, where none is selected because of the weight."""
 
     def moved(self, by: Sequence[float]) -> ValidatedBatch:
-        """Return the batch with its grasps moved by a vector (3,) [m]."""
         return replace(self, grasps=self.grasps.moved(by))
 
 
@@ -131,8 +111,6 @@ def validated_grasps(
     """Plan one batch of a job: `count` valid grasps, or as many as the budget finds.
 
     Args:
-        hand: the hand.
-        obj: the object.
         request: method, fidelity, seed, friction, level, budget; whether valid grasps or `count` of any kind.
         count: grasps wanted; feasible ones where nothing is validated.
         batch: number of the batch within its job.
@@ -148,7 +126,7 @@ def validated_grasps(
         TaskCancelled: `run.cancelled()` returned True; with `partial`, before anything was validated.
     """
     require_graspable(hand, obj)
-    with Scoring.begun(hand, obj, request, scenes=scenes, pieces=pieces, run=run) as scoring:
+    with Scoring(hand, obj, request, scenes=scenes, pieces=pieces, run=run) as scoring:
         work = Batch(scoring, batch, count, run)
         try:
             while work.needed is not None:
@@ -161,12 +139,7 @@ def validated_grasps(
 
 
 def require_graspable(hand: HandModel, obj: ObjectModel) -> None:
-    """Check that the hand can grasp the object.
-
-    Raises:
-        HandError: no two digits of the hand oppose each other.
-        InputError: the object does not fit into the gripper.
-    """
+    """Raise HandError where no two digits oppose each other, InputError where the object does not fit the gripper."""
     require_opposing(hand)
     fitting_pairs(hand, obj.centred)
 
@@ -187,10 +160,9 @@ def scored(
 
     Raises:
         MeshError: the object has no usable convex pieces.
-        TaskCancelled: `run.cancelled()` returned True.
     """
     request = request.model_copy(update={"want": "candidates"})
-    with Scoring.begun(hand, obj, request, scenes=scenes, pieces=pieces, run=run) as scoring:
+    with Scoring(hand, obj, request, scenes=scenes, pieces=pieces, run=run) as scoring:
         work = Batch(scoring, 0, len(grasps), run)
         work.add(scoring.scored(grasps.moved(np.negative(obj.centre)), run))
         return work.finish()
@@ -200,19 +172,7 @@ class Scoring:
     """Verdicts and metrics of a job's grasps; those of one grasp do not depend on the others."""
 
     def __init__(
-        self, hand: HandModel, obj: ObjectModel, request: JobOptions, scenes: Scenes | None, run: ExecutionContext
-    ) -> None:
-        self.hand, self.obj, self.request, self.run = hand, obj.centred, request, run
-        self.centre = obj.centre
-        self.scenes = None if scenes is None else scenes.centred(obj)
-        self.pieces: Future[ConvexPieces] | None = None
-        self.beside: ThreadPoolExecutor
-        """Thread for background work."""
-
-    @classmethod
-    @contextmanager
-    def begun(
-        cls,
+        self,
         hand: HandModel,
         obj: ObjectModel,
         request: JobOptions,
@@ -220,15 +180,21 @@ class Scoring:
         scenes: Scenes | None,
         pieces: Callable[[ObjectModel], ConvexPieces],
         run: ExecutionContext,
-    ) -> Iterator[Scoring]:
-        """Create the scoring and start the decomposition of the object, where grasps are validated."""
-        made = cls(hand, obj, request, scenes, run)
-        with ThreadPoolExecutor(1, thread_name_prefix="beside") as made.beside:
-            made.pieces = made.beside.submit(pieces, made.obj) if request.validation != "none" else None
-            yield made
+    ) -> None:
+        """Start the decomposition of the object, where grasps are validated."""
+        self.hand, self.obj, self.request, self.run = hand, obj.centred, request, run
+        self.centre = obj.centre
+        self.scenes = None if scenes is None else scenes.centred(obj)
+        self.beside = ThreadPoolExecutor(1, thread_name_prefix="beside")
+        self.pieces = self.beside.submit(pieces, self.obj) if request.validation != "none" else None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.beside.shutdown()
 
     def goes_on(self) -> None:
-        """Ignore cancellation from here on."""
         self.run = replace(self.run, cancelled=DEFAULT_CONTEXT.cancelled)
 
     def rollout(self, known: Known) -> Rollout | None:
@@ -236,18 +202,10 @@ class Scoring:
         Verdicts at the validator's own level are added to `known`."""
         if self.pieces is None:
             return None
-        return rollout_on(
-            self.run,
-            self.hand,
-            self.obj,
-            self.pieces.result,
-            in_scenes=self.scenes is not None,
-            known=known,
-            level=self._level,
-        )
+        pieces, in_scenes = self.pieces.result, self.scenes is not None
+        return rollout_on(self.run, self.hand, self.obj, pieces, in_scenes=in_scenes, known=known, level=self._level)
 
     def key(self) -> str:
-        """Return the digest of the terms of the verdicts."""
         assert self.pieces is not None
         pieces = self.pieces.result()
         if self.scenes is None:
@@ -284,10 +242,9 @@ class Scoring:
         planned = planned.take(finite)
         size, every = len(planned), self.request.want == "candidates"
         in_scene: dict[str, NDArray[np.bool_]] = {}
-        if self.scenes is None:
-            columns = self._validated(planned, run, seconds, known, prefilter)
-        else:
-            planned, columns = self._validated_in_scenes(planned, self.scenes, run, seconds, known)
+        with _timed(seconds, "validation"):
+            planned, columns = self._validated(planned, run.part(*PARTS[:2]), known, prefilter)
+        if self.scenes is not None:
             fates[finite[columns["quality/success"] < 0]] = "no_place"
             for name, those in outcomes_in_scenes(columns).items():
                 in_scene[name] = np.zeros(len(fates), bool)
@@ -295,17 +252,16 @@ class Scoring:
         why = _why(columns, size)
         rows = np.arange(size) if every or not columns else np.flatnonzero(columns["quality/success"] == 1)
         grasps = planned.take(rows)
-        columns = {path: array[rows] for path, array in columns.items()} | self._measured(grasps, run, seconds)
+        columns = {path: array[rows] for path, array in columns.items()}
+        with _timed(seconds, "quality"):
+            friction = self.request.friction
+            columns |= measure(self.hand, self.obj, grasps, friction=friction, run=run.part(*PARTS[1:]))
         columns["quality/feasible"] = passes(columns)
         feasible = columns["quality/feasible"] == 1
         held = columns.get("quality/success", np.zeros(len(rows), np.int8)) == 1
         columns["quality/valid"] = (feasible & held).astype(np.uint8)
-        if self.request.models:
-            columns |= self._in_models(grasps, held if every else feasible & held, run, seconds)
-        if self.request.measures_payload:
-            columns["quality/payload_kg"] = self._payloads(grasps, feasible & held, run, seconds)
-        if self.request.shake:
-            columns["quality/shake_margin"] = self._shaken(grasps, feasible & held, run, seconds)
+        with _timed(seconds, "validation"):
+            columns |= self._further_tests(grasps, held if every else feasible & held, feasible & held, run.quiet())
         if not every:
             wanted = feasible if self.pieces is None else feasible & held
             lost = np.setdiff1d(np.arange(size), rows)
@@ -324,75 +280,61 @@ class Scoring:
             rows = rows[wanted]
         return Round(grasps, columns, finite[rows], fates, in_scene, seconds)
 
-    def _validated_in_scenes(
-        self, grasps: GraspSet, scenes: Scenes, run: ExecutionContext, seconds: dict[str, float], known: Known | None
-    ) -> tuple[GraspSet, Arrays]:
-        """Return the grasps with their trajectories, and their verdicts."""
-        began = time.perf_counter()
-        found = scene_verdicts(
-            self.hand,
-            self.obj,
-            grasps,
-            scenes,
-            level=lift_level(self.request.validation),
-            pieces=None if self.pieces is None else self.pieces.result(),
-            known=known,
-            run=run.part(*PARTS[:2]),
-        )
-        seconds["validation"] += time.perf_counter() - began
-        return found
-
     def _validated(
-        self,
-        grasps: GraspSet,
-        run: ExecutionContext,
-        seconds: dict[str, float],
-        known: Known | None,
-        prefilter: PrefilterVerdicts | None,
-    ) -> Arrays:
-        if self.pieces is None:
-            return {}
+        self, grasps: GraspSet, run: ExecutionContext, known: Known | None, prefilter: PrefilterVerdicts | None
+    ) -> tuple[GraspSet, Arrays]:
+        pieces = None if self.pieces is None else self.pieces.result()
+        if self.scenes is not None:
+            level = lift_level(self._level)
+            return scene_verdicts(
+                self.hand, self.obj, grasps, self.scenes, level=level, pieces=pieces, known=known, run=run
+            )
+        if pieces is None:
+            return grasps, {}
         verdicts = validate(
-            self.hand,
-            self.obj,
-            grasps,
-            level=self._level,
-            pieces=self.pieces.result(),
-            known=known,
-            prefilter=prefilter,
-            run=run.part(*PARTS[:2]),
+            self.hand, self.obj, grasps, level=self._level, pieces=pieces, known=known, prefilter=prefilter, run=run
         )
-        seconds["validation"] += verdicts.seconds
-        return {
+        columns: Arrays = {
             "quality/success": verdicts.success,
             "quality/verdict_outcome": verdicts.outcome.reshape(-1, len(DIRECTIONS)),
             "quality/verdict_margin": verdicts.margin,
-            **(
-                {"quality/validated_by": verdicts.validated_by} if first_terms(self.hand, self._level, self.run) else {}
-            ),
         }
+        if first_terms(self.hand, self._level, self.run):
+            columns["quality/validated_by"] = verdicts.validated_by
+        return grasps, columns
 
-    def _in_models(
-        self, grasps: GraspSet, held: NDArray[np.bool_], run: ExecutionContext, seconds: dict[str, float]
+    def _further_tests(
+        self, grasps: GraspSet, in_models: NDArray[np.bool_], valid: NDArray[np.bool_], run: ExecutionContext
     ) -> Arrays:
-        """Return shares of models in which held grasps hold (exact for candidates) and first failed axes."""
+        """Return the wanted columns of further tests: of grasps `in_models` (N,) robustness (exact for candidates),
+        of `valid` ones (N,) payload and shake."""
+        request, columns = self.request, dict[str, NDArray[Any]]()
+        if not (request.models or request.measures_payload or request.shake):
+            return columns
         assert self.pieces is not None
-        wish = self.request
-        found = robust(
-            self.hand,
-            self.obj,
-            grasps,
-            held=held,
-            placed=self.placed(grasps),
-            level=lift_level(wish.validation),
-            models=wish.models,
-            seed=wish.seed,
-            pieces=self.pieces.result(),
-            wanted=wish.robust if wish.want == "valid" else 0,
-            run=run.quiet(),
-        )
-        seconds["validation"] += found.seconds
-        return found.columns
+        common: dict[str, Any] = {"pieces": self.pieces.result(), "run": run}
+        placed = self.placed(grasps)
+        if request.models:
+            columns |= robust(
+                self.hand,
+                self.obj,
+                grasps,
+                held=in_models,
+                placed=placed,
+                level=lift_level(request.validation),
+                models=request.models,
+                seed=request.seed,
+                wanted=request.robust if request.want == "valid" else 0,
+                **common,
+            ).columns
+        if request.measures_payload:
+            found = payloads(self.hand, self.obj, grasps, placed=placed, held=valid, **common)
+            # A valid grasp lifted at least the object's own mass.
+            columns["quality/payload_kg"] = np.where(valid & np.isnan(found), self.obj.mass, found)
+        if request.shake:
+            assert placed is not None, "shake goes with a scene"
+            columns["quality/shake_margin"] = shake_margins(self.hand, self.obj, grasps, placed, held=valid, **common)
+        return columns
 
     def placed(self, grasps: GraspSet) -> PlacedGrasps | None:
         """Return the grasps with their scenes; None: the object is free."""
@@ -401,52 +343,18 @@ class Scoring:
         assert grasps.scene is not None
         return self.scenes.placed(grasps.scene)
 
-    def _payloads(
-        self, grasps: GraspSet, held: NDArray[np.bool_], run: ExecutionContext, seconds: dict[str, float]
-    ) -> NDArray[np.float64]:
-        """Return payloads (N,) of `held` grasps [kg], at least the object's own mass, which they lifted."""
-        assert self.pieces is not None
-        began = time.perf_counter()
-        found = payloads(
-            self.hand,
-            self.obj,
-            grasps,
-            pieces=self.pieces.result(),
-            placed=self.placed(grasps),
-            held=held,
-            run=run.quiet(),
-        )
-        seconds["validation"] += time.perf_counter() - began
-        return np.where(held & np.isnan(found), self.obj.mass, found)
 
-    def _shaken(
-        self, grasps: GraspSet, held: NDArray[np.bool_], run: ExecutionContext, seconds: dict[str, float]
-    ) -> NDArray[np.float64]:
-        """Return shake margins (N,) of `held` grasps, shaken after the lift."""
-        assert self.pieces is not None
-        began, placed = time.perf_counter(), self.placed(grasps)
-        assert placed is not None, "shake goes with a scene"
-        found = shake_margins(
-            self.hand, self.obj, grasps, placed, pieces=self.pieces.result(), held=held, run=run.quiet()
-        )
-        seconds["validation"] += time.perf_counter() - began
-        return found
-
-    def _measured(self, grasps: GraspSet, run: ExecutionContext, seconds: dict[str, float]) -> Arrays:
-        began = time.perf_counter()
-        columns = measure(self.hand, self.obj, grasps, friction=self.request.friction, run=run.part(*PARTS[1:]))
-        seconds["quality"] += time.perf_counter() - began
-        return dict(columns)
+@contextmanager
+def _timed(seconds: dict[str, float], name: str) -> Iterator[None]:
+    began = time.perf_counter()
+    yield
+    seconds[name] += time.perf_counter() - began
 
 
 @dataclass(frozen=True)
 class Needed:
-    """Candidates that a batch needs next."""
-
     number: int
-    """Number of the round."""
     rows: range
-    """Rows of the round."""
     begun: int
     """Number of the batch's candidates planned before the round."""
     progress: tuple[float, float]
@@ -496,7 +404,6 @@ class Batch:
             number += 1
 
     def add(self, made: Round) -> None:
-        """Add a round, without near-duplicates of selected grasps."""
         self.candidates += len(made.fates)
         self.repeated += made.repeated
         for name in self.seconds:
@@ -518,15 +425,9 @@ class Batch:
         planned = joined([grasps for one in self.rounds for grasps in one.planned])
         latest = max(ENOUGH, sum(map(len, self.rounds[-1].planned)))
         planned = planned.take(slice(max(0, len(planned) - latest), None))
-        self.limit = limit_of(
-            scoring.hand,
-            scoring.obj,
-            planned,
-            wanted=max(scoring.obj.mass, self.request.min_payload),
-            pieces=scoring.pieces.result(),
-            placed=scoring.placed(planned),
-            run=scoring.run.quiet(),
-        )
+        hand, obj, placed = scoring.hand, scoring.obj, scoring.placed(planned)
+        pieces, run, wanted = scoring.pieces.result(), scoring.run.quiet(), max(obj.mass, self.request.min_payload)
+        self.limit = limit_of(hand, obj, planned, wanted=wanted, pieces=pieces, placed=placed, run=run)
         return self.limit is not None and self.limit.hopeless
 
     @property
@@ -536,7 +437,6 @@ class Batch:
         return not self.scoring.run.device.startswith("cuda") and method(self.request.method).in_parts
 
     def made(self, asked: Needed) -> Round:
-        """Plan, validate and measure what is needed; on the CPU in parallel parts."""
         known: Known = {}
         run = self.run.part(*asked.progress)
         rollout = self.scoring.rollout(known)  # one for all parts
@@ -544,15 +444,8 @@ class Batch:
 
         def planned(part: range, own: ExecutionContext, others: bool) -> Round:
             wanted = self.wanted(replace(asked, rows=part), rollout, others_have_place=others)
-            request = self.request
-            found = synthesize(
-                self.scoring.hand,
-                self.scoring.obj,
-                wanted,
-                own.part(0.0, PARTS[0]),
-                method=request.method,
-                options=request.options,
-            )
+            hand, obj, request, run = self.scoring.hand, self.scoring.obj, self.request, own.part(0.0, PARTS[0])
+            found = synthesize(hand, obj, wanted, run, method=request.method, options=request.options)
             told = self.told(wanted, found)
             # Verdicts and metrics are many short jobs: they may use all cores, whatever the other parts do.
             made = self.scoring.scored(told, replace(own, sharing=None), known)
@@ -576,7 +469,6 @@ class Batch:
         return whole
 
     def wanted(self, asked: Needed, rollout: Rollout | None, *, others_have_place: bool) -> PlanRequest:
-        """Return the planner's request for the needed candidates."""
         number = self.number + asked.number * ROUND_STRIDE
         rows, scenes, placed = asked.rows, self.scoring.scenes, None
         if scenes is not None:
@@ -603,7 +495,6 @@ class Batch:
         return made
 
     def refused(self, error: NoStartFound) -> NoStartFound:
-        """Return the error with the geometric reason, where there is one."""
         why = self._narrow()
         return NoStartFound(f"{error}: {why}") if why else error
 
@@ -614,8 +505,7 @@ class Batch:
         columns = joined_columns([part.columns for part in rounds])
         fates = np.concatenate([part.fates for part in rounds])
         # The last round may find more grasps than were missing. Only candidates up to the last selected grasp count,
-        # else
-        # the share of valid ones would look worse than it is.
+        # else the share of valid ones would look worse than it is.
         places = np.flatnonzero(fates == "kept")
         candidates = int(places[count - 1]) + 1 if len(places) >= count else len(fates)
         absent = {"blocked"} if scoring.scenes is None else set()
@@ -625,7 +515,7 @@ class Batch:
         outcomes = totals([Counter(fate for fate in fates[:candidates].tolist() if fate != "kept")])
         rejected = dict.fromkeys(reasons, 0)
         for name, number in outcomes.items():
-            rejected[_REJECTION_OF.get(name, "dropped")] += number
+            rejected[_REJECTION_OF.get(name, name if name in reasons else "dropped")] += number
         grasps, columns = taken(grasps, columns, np.arange(min(count, len(grasps))))
         if self.repeated:
             outcomes["repeated"] = self.repeated
@@ -666,32 +556,21 @@ class Batch:
         Rechecks validate the first valid grasps at level `dexgraspbench`."""
         scoring = self.scoring
         assert scoring.pieces is not None
-        columns: Arrays = {
-            "quality/simulated_displacement_cm": simulated_displacement_cm(
-                scoring.hand, scoring.obj, grasps.grasp, pieces=scoring.pieces.result(), run=scoring.run
-            )
-        }
-        began = time.perf_counter()
-        if count := self.request.rechecks_of(self.number):
-            rechecked, recheck = np.flatnonzero(valid)[:count], np.full(len(grasps), -1, np.int8)
-            if len(rechecked):
-                known = (
-                    self._rechecks.result() if self._rechecks is not None else self._rechecked(grasps.take(rechecked))
+        hand, obj, run, pieces = scoring.hand, scoring.obj, scoring.run, scoring.pieces.result()
+        displacement = simulated_displacement_cm(hand, obj, grasps.grasp, pieces=pieces, run=run)
+        columns: Arrays = {"quality/simulated_displacement_cm": displacement}
+        with _timed(self.seconds, "validation"):
+            if count := self.request.rechecks_of(self.number):
+                rechecked, recheck = np.flatnonzero(valid)[:count], np.full(len(grasps), -1, np.int8)
+                if len(rechecked):
+                    known = self._rechecks.result() if self._rechecks else self._rechecked(grasps.take(rechecked))
+                    recheck[rechecked] = known[: len(rechecked)]
+                columns["quality/recheck"] = recheck
+            if repeats := self.request.robustness:
+                seed, quiet = self.request.seed, run.quiet()
+                columns["quality/robustness"] = robustness(
+                    hand, obj, grasps, held=valid, repeats=repeats, seed=seed, pieces=pieces, run=quiet
                 )
-                recheck[rechecked] = known[: len(rechecked)]
-            columns["quality/recheck"] = recheck
-        if repeats := self.request.robustness:
-            columns["quality/robustness"] = robustness(
-                scoring.hand,
-                scoring.obj,
-                grasps,
-                held=valid,
-                repeats=repeats,
-                seed=self.request.seed,
-                pieces=scoring.pieces.result(),
-                run=scoring.run.quiet(),
-            )
-        self.seconds["validation"] += time.perf_counter() - began
         return columns
 
     def _begin_rechecks(self, first: Round) -> None:
@@ -708,7 +587,6 @@ class Batch:
             self._rechecks = self.scoring.beside.submit(self._rechecked, first.grasps.take(valid[:count]))
 
     def _rechecked(self, grasps: GraspSet) -> NDArray[np.int8]:
-        """Return the verdicts of level `dexgraspbench` on grasps."""
         scoring = self.scoring
         assert scoring.pieces is not None
         run, pieces = scoring.run.quiet(), scoring.pieces.result()
@@ -720,7 +598,6 @@ class Batch:
 
 
 def _why(columns: Arrays, count: int) -> NDArray[np.object_]:
-    """Return the validator's outcome (N,) of each grasp that it drops."""
     found = np.full(count, "not_lifted", object)
     if "quality/lift_outcome" in columns:
         for lift, name in _LIFTED.items():

@@ -15,8 +15,10 @@ Columns = Mapping[str, NDArray[Any]]
 #: The only column of a base shard without a row per grasp.
 THRESHOLDS: Final = "quality/thresholds_m"
 #: Columns of grasps in scenes; either all are present or none.
-_IN_SCENES = ("scene_index", "approach", "approach_joint_positions", "lift")
-
+_IN_SCENES: Final = ("scene_index", "approach", "approach_joint_positions", "lift")
+#: Postures of every `GraspSet`, and its arrays by grasp that are there only in scenes.
+_POSTURES: Final = ("grasp", "pregrasp", "squeeze")
+_ARRAYS: Final = ("approach", "coming", "scene", "wrist")
 
 #: Step of positions [m]. Doubles hold its multiples exactly up to 8,388 km. Grasps on the grid therefore move into the
 #: frame of a file and back with identical bits.
@@ -24,7 +26,6 @@ GRID_M: Final = 2.0**-30
 
 
 def on_grid(positions: ArrayLike) -> Floats:
-    """Round positions to `GRID_M`."""
     return np.rint(np.asarray(positions, float) / GRID_M) * GRID_M
 
 
@@ -48,11 +49,9 @@ class Posture:
         return len(self.hand_pose)
 
     def take(self, rows: NDArray[np.intp] | slice) -> Posture:
-        """Return some of the postures, in the order of `rows`."""
         return Posture(np.asarray(self.hand_pose, float)[rows], np.asarray(self.joint_positions, float)[rows])
 
     def moved(self, by: ArrayLike) -> Posture:
-        """Return the postures moved by a vector (3,) [m]."""
         return Posture(moved(self.hand_pose, by), self.joint_positions)
 
     @classmethod
@@ -100,25 +99,17 @@ class GraspSet:
 
     def take(self, rows: NDArray[np.intp] | slice) -> GraspSet:
         """Return some of the grasps, in the order of `rows`; the planner's info on the whole set stays."""
-        loss = np.asarray(self.stability_loss, float)[rows]
-        grasp, pregrasp, squeeze = (part.take(rows) for part in (self.grasp, self.pregrasp, self.squeeze))
-        approach = None if self.approach is None else np.asarray(self.approach, float)[rows]
-        lift = None if self.lift is None else self.lift.take(rows)
-        scene = None if self.scene is None else self.scene[rows]
-        coming = None if self.coming is None else np.asarray(self.coming, float)[rows]
-        wrist = None if self.wrist is None else np.asarray(self.wrist, float)[rows]
-        return GraspSet(grasp, pregrasp, squeeze, loss, self.seconds, self.info, approach, coming, scene, lift, wrist)
+        changed: dict[str, Any] = {}
+        for name in (*_POSTURES, "lift", "stability_loss", *_ARRAYS):
+            if (part := getattr(self, name)) is not None:
+                changed[name] = part.take(rows) if isinstance(part, Posture) else np.asarray(part)[rows]
+        return replace(self, **changed, attempts=0)
 
     def moved(self, by: ArrayLike) -> GraspSet:
         """Return the grasps and trajectories moved by a vector (3,) [m], into a frame with another origin."""
-        return replace(
-            self,
-            grasp=self.grasp.moved(by),
-            pregrasp=self.pregrasp.moved(by),
-            squeeze=self.squeeze.moved(by),
-            approach=None if self.approach is None else moved(self.approach, by),
-            lift=None if self.lift is None else self.lift.moved(by),
-        )
+        postures = {name: getattr(self, name).moved(by) for name in _POSTURES}
+        approach = None if self.approach is None else moved(self.approach, by)
+        return replace(self, **postures, approach=approach, lift=None if self.lift is None else self.lift.moved(by))
 
     def to_columns(self) -> dict[str, NDArray[Any]]:
         """Return the posture columns of a base shard; the planner's loss is a column of the quality table."""
@@ -154,22 +145,12 @@ class GraspSet:
 
 def joined(sets: Sequence[GraspSet]) -> GraspSet:
     """Join several sets of one hand on one object; the info is that of the first set."""
-    grasp, pregrasp, squeeze = (
-        _joined([getattr(part, name) for part in sets]) for name in ("grasp", "pregrasp", "squeeze")
-    )
-    loss = np.concatenate([np.asarray(part.stability_loss, float) for part in sets])
-    ways = [part.approach for part in sets if part.approach is not None]
-    lifts = [part.lift for part in sets if part.lift is not None]
-    approach = np.concatenate(ways) if len(ways) == len(sets) else None
-    lift = _joined(lifts) if len(lifts) == len(sets) else None
-    seconds = sum(part.seconds for part in sets)
-    numbers = [part.scene for part in sets if part.scene is not None]
-    scene = np.concatenate(numbers) if len(numbers) == len(sets) else None
-    opens = [part.coming for part in sets if part.coming is not None]
-    coming = np.concatenate(opens) if len(opens) == len(sets) else None
-    wrists = [part.wrist for part in sets if part.wrist is not None]
-    wrist = np.concatenate(wrists) if len(wrists) == len(sets) else None
-    return GraspSet(grasp, pregrasp, squeeze, loss, seconds, dict(sets[0].info), approach, coming, scene, lift, wrist)
+    whole: dict[str, Any] = {"seconds": sum(one.seconds for one in sets), "info": dict(sets[0].info)}
+    for name in (*_POSTURES, "lift", "stability_loss", *_ARRAYS):
+        parts = [getattr(one, name) for one in sets]
+        if all(part is not None for part in parts):
+            whole[name] = _joined(parts) if isinstance(parts[0], Posture) else np.concatenate(parts)
+    return GraspSet(**whole)
 
 
 def joined_columns(parts: Sequence[Columns]) -> dict[str, NDArray[Any]]:

@@ -27,8 +27,6 @@ _LEAST_RATE: Final = 0.1
 
 @dataclass
 class Round:
-    """Selected grasps of one round."""
-
     grasps: GraspSet
     columns: Arrays
     rows: NDArray[np.intp]
@@ -38,15 +36,11 @@ class Round:
     in_scene: dict[str, NDArray[np.bool_]]
     """In scenes: which planned grasps were clear, lifted, lifted at half friction."""
     seconds: dict[str, float]
-    """Wall time of planning, validating and measuring [s]."""
     repeated: int = 0
-    """In scenes: number of retries."""
     planned: list[GraspSet] = field(default_factory=list)
-    """All planned grasps."""
 
     @classmethod
     def joined(cls, parts: Sequence[Round]) -> Round:
-        """Join several rounds."""
         in_scene = {name: np.concatenate([part.in_scene[name] for part in parts]) for name in parts[0].in_scene}
         firsts = accumulate((len(part.fates) for part in parts), initial=0)
         seconds = {name: sum(part.seconds[name] for part in parts) for name in parts[0].seconds}
@@ -75,16 +69,7 @@ class Round:
 
 def next_round(wanted: int, valid: int, candidates: int, budget: int) -> int:
     """Return the number of grasps to plan next: those missing at the rate so far, and 10 % more.
-
-    Args:
-        wanted: valid grasps wanted in all.
-        valid: valid grasps found so far.
-        candidates: planned so far.
-        budget: planned at most.
-
-    Returns:
-        0 when enough are found or the budget is used up.
-    """
+    `wanted` valid ones are wanted, at most `budget` are planned; 0: enough are found or the budget is used up."""
     if valid >= wanted or candidates >= budget:
         return 0
     if candidates == 0:
@@ -106,5 +91,4 @@ def parts_of(rows: range, cores: int) -> list[range]:
 
 
 def taken(grasps: GraspSet, columns: Arrays, rows: NDArray[np.intp]) -> tuple[GraspSet, Arrays]:
-    """Return some of the grasps (K,) with their columns."""
     return grasps.take(rows), {path: array if path == THRESHOLDS else array[rows] for path, array in columns.items()}

@@ -16,12 +16,11 @@ import numpy as np
 from graspd.service.model.domain import BATCH_SIZE, JobOptions
 from graspd.service.model.errors import InputError, TaskCancelled
 from graspd.worker.engines.devices import check_device, exclusive
-from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
+from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext, ProgressShares
 from graspd.worker.generation import PARTS, Batch, Known, Scoring, ValidatedBatch, require_graspable, validated_grasps
 from graspd.worker.grasps import GraspSet, joined
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.parallel import ProgressShares
 from graspd.worker.planners import BatchRequest, NoStartFound, synthesize_batches
 from graspd.worker.rounds import Round, taken
 from graspd.worker.simulation.environment import Scenes, scenes_together
@@ -47,15 +46,11 @@ def validated_batches(
     """Plan consecutive batches of a job; each has the same result as with `validated_grasps`.
 
     Args:
-        hand: the hand.
-        obj: the object.
-        request: see `validated_grasps`.
         sizes: grasps wanted for each batch.
         first: number of the first batch within its job.
         join: batches whose grasps are planned in one launch; 1: one batch after the other.
         scenes: see `validated_grasps`; common to all batches, or one per batch.
         pieces: computes the object's convex pieces; called once.
-        run: receives the number of finished grasps.
         partial: when cancelled, return the batches validated before; the last one may be incomplete.
         checked: called with the number of each finished batch and its result; may raise.
         empty_on: errors after which a batch has no grasps; not for a job's first batch, nor if all fail.
@@ -138,7 +133,7 @@ class _Job:
         scenes = scenes_together(several) if several else self.scenes[0]
         going, waiting = dict[int, Batch](), deque[Batch]()
         with (
-            Scoring.begun(self.hand, self.obj, self.request, scenes=scenes, pieces=self.pieces, run=run) as scoring,
+            Scoring(self.hand, self.obj, self.request, scenes=scenes, pieces=self.pieces, run=run) as scoring,
             ThreadPoolExecutor(1, thread_name_prefix="device") as device,
         ):
             fresh = (
@@ -173,9 +168,7 @@ class _Wave:
 
     batches: Sequence[Batch]
     made: Sequence[GraspSet | Exception]
-    """One entry per batch."""
     whole: GraspSet | None
-    """The grasps of all batches."""
     known: Known
     prefilter: PrefilterVerdicts | None
 
@@ -194,11 +187,7 @@ def _next_wave(waiting: deque[Batch], fresh: Iterator[Batch], most: int) -> list
 
 
 def _planned(scoring: Scoring, batches: Sequence[Batch]) -> _Wave:
-    """Plan what the batches need, in the single thread that owns the device.
-
-    Raises:
-        TaskCancelled: the planning was cancelled.
-    """
+    """Plan what the batches need, in the single thread that owns the device."""
     known: Known = {}
     rollout, request, asked = scoring.rollout(known), scoring.request, list[BatchRequest]()
     for batch in batches:

@@ -35,10 +35,10 @@ def drops(objects: list[ObjectModel], count: int) -> list[Row]:
         rests, seconds = {}, {}
         for name, table in tables.items():
             with cpu() as clock:
-                rests[name] = [simulate._redo_until_rest(table, obj.name, (SEED, k)) for k in range(count)]
+                rests[name] = [simulate._redo_until_rest(table, (SEED, k)) for k in range(count)]
             seconds[name] = clock.seconds
         faces = {name: np.array([rest.face for rest in found]) for name, found in rests.items()}
-        again = np.array([simulate._redo_until_rest(hull, obj.name, (SEED + 1, k)).face for k in range(count)])
+        again = np.array([simulate._redo_until_rest(hull, (SEED + 1, k)).face for k in range(count)])
         rows.append(
             {
                 "object": obj.name,
@@ -58,10 +58,10 @@ def drops(objects: list[ObjectModel], count: int) -> list[Row]:
 
 def _in_pieces(obj: ObjectModel, pieces: ConvexPieces, hull: Any) -> Any:
     """The scene of a drop with the object's pieces as collision shapes; masses, friction and table as in `hull`."""
-    spec = mujoco.MjSpec.from_string(simulate._SCENE.format(timestep=simulate.TIMESTEP_S))
-    body = spec.body("object")
-    spec.delete(spec.body("object").geoms[0])
-    spec.delete(spec.mesh("hull"))
+    spec = simulate.spec_above_table([obj])
+    body = spec.body("0")
+    spec.delete(body.geoms[0])
+    spec.delete(spec.mesh("0"))
     for i, corners in enumerate(pieces.vertices):
         mesh = spec.add_mesh(name=f"piece{i}")
         mesh.uservert = np.asarray(corners, np.float32).ravel()
@@ -69,11 +69,6 @@ def _in_pieces(obj: ObjectModel, pieces: ConvexPieces, hull: Any) -> Any:
         geom = body.add_geom(condim=6, friction=[0.8, 0.005, 0.002], solref=[0.006, 1.0])
         geom.type, geom.meshname = mujoco.mjtGeom.mjGEOM_MESH, f"piece{i}"
         # The table alone is touched: pieces of one body never touch each other.
-    mass = simulate.DENSITY * obj.volume
-    body.explicitinertial = True
-    body.mass, body.ipos = mass, obj.centre_of_mass
-    inertia = mass * obj.inertia
-    body.fullinertia = [inertia[0, 0], inertia[1, 1], inertia[2, 2], inertia[0, 1], inertia[0, 2], inertia[1, 2]]
     model = spec.compile()
     assert np.isclose(model.body_mass[1], hull.body_mass[1])
     return model

@@ -12,8 +12,8 @@ from graspd.service.model.fidelity import FIDELITIES
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.planners import synthesize
 from graspd.worker.planners.port import PlanRequest
-from graspd.worker.quality.overlap import penetration_depth
 from graspd.worker.quality.probe import probe_of
+from graspd.worker.quality.volume import penetration_depth
 from graspd.worker.validation.decomposition import decompose
 from graspd.worker.validation.model import MujocoOptions, build
 

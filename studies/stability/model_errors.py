@@ -32,10 +32,10 @@ from graspd.worker.validation.variant import (
     LATEST,
     SHIFT_M,
     TURN,
+    Models,
     Variant,
     Vector,
 )
-from graspd.worker.validation.varied import Models
 
 Direction = NDArray[np.float64]
 Make = Callable[[HandModel, float, Direction], Variant]

@@ -16,9 +16,8 @@ from graspd.worker.hands.jaws import MAX_DOFS
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners.fast_graspd import scene_starts
-from graspd.worker.planners.fast_graspd.antipodal_starts import crossings_of
+from graspd.worker.planners.fast_graspd.antipodal_starts import crossings_of, size_to_pads
 from graspd.worker.planners.fast_graspd.pairs import pair_of
-from graspd.worker.planners.fast_graspd.reaching import size_to_pads
 from graspd.worker.simulation.environment import Environment, Obstacle
 from graspd.worker.simulation.obstacles import DeviceObstacles
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import trimesh
 
@@ -85,6 +87,17 @@ def two_finger_hand() -> HandModel:
         neighbours=frozenset({(0, 1), (0, 2)}),
         masses=np.array([0.3, 0.05, 0.05]),
     )
+
+
+def on_one_dof(hand: HandModel, rate: float = 1.0, offset: float = 0.0) -> HandModel:
+    """A hand of two joints with both driven by the first one's dof, the second at another rate from an offset."""
+    first = {
+        name: getattr(hand, name)[:1]
+        for name in ("dof_names", "lower", "upper", "effort", "stiffness", "preshape", "closing")
+    }
+    dof, multiplier = np.array([-1, 0, 0], np.int32), np.array([1.0, 1.0, rate])
+    offsets = np.array([0.0, 0.0, offset])
+    return replace(hand, digest="1" * 32, dof=dof, multiplier=multiplier, offset=offsets, **first)
 
 
 def quality_columns(count: int) -> dict[str, np.ndarray]:

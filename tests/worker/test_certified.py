@@ -141,12 +141,6 @@ def test_a_grasp_like_one_that_is_kept_makes_room_for_another(
     assert validated_grasps(hand, block, wish(**plain, min_distance=0), count=COUNT).rejected["alike"] == 0
 
 
-def test_the_same_batch_is_the_same_grasps(hand: HandModel, block: ObjectModel, valid: ValidatedBatch) -> None:
-    again = validated_grasps(hand, block, wish(rechecks=2), count=COUNT)
-    np.testing.assert_array_equal(again.grasps.squeeze.joint_positions, valid.grasps.squeeze.joint_positions)
-    assert again.candidates == valid.candidates
-
-
 def test_candidate_grasps_are_all_kept_with_their_verdicts(hand: HandModel, block: ObjectModel) -> None:
     found = validated_grasps(hand, block, wish(want="candidates", rechecks=0), count=COUNT)
     assert (len(found.grasps), found.candidates, found.rejected) == (

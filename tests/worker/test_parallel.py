@@ -14,16 +14,16 @@ from graspd.service.model.errors import TaskCancelled
 from graspd.service.model.fidelity import resolve_fidelity
 from graspd.service.model.scene_spec import SceneSpec
 from graspd.worker import generation
-from graspd.worker.execution_context import CoreSharing, ExecutionContext
+from graspd.worker.execution_context import CoreSharing, ExecutionContext, parallel_map
 from graspd.worker.generation import ValidatedBatch, validated_grasps
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.objects.prepare import object_from_path
-from graspd.worker.parallel import parallel_map
-from graspd.worker.planners import NoStartFound, PlanRequest, synthesize
+from graspd.worker.planners import NoStartFound, PlanRequest
 from graspd.worker.rounds import SMALLEST_PART, parts_of
 from graspd.worker.scenes.kinds import rest_poses, supports_of
 from graspd.worker.simulation.environment import Scenes
+from tests.worker.batches import assert_same_batch
 
 REQUEST = JobOptions(fidelity=resolve_fidelity("draft"), rechecks=2, seed=3)
 COUNT = 2 * SMALLEST_PART
@@ -45,18 +45,6 @@ def one_lane(pair) -> ValidatedBatch:
     return validated_grasps(*pair, REQUEST, count=COUNT, run=ExecutionContext(threads=1))
 
 
-def assert_same(found: ValidatedBatch, other: ValidatedBatch) -> None:
-    assert (found.candidates, found.rejected, found.verdict_key) == (
-        other.candidates,
-        other.rejected,
-        other.verdict_key,
-    )
-    columns, others = (one.grasps.to_columns() | one.columns for one in (found, other))
-    assert columns.keys() == others.keys()
-    for name, values in others.items():
-        np.testing.assert_array_equal(columns[name], values, err_msg=name)
-
-
 def noted(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int, int]]:
     """Round, first grasp and number of grasps of each call of the planner from now on."""
     calls: list[tuple[int, int, int]] = []
@@ -74,7 +62,7 @@ def test_grasps_of_several_lanes_are_those_of_one(pair, one_lane, monkeypatch: p
     calls = noted(monkeypatch)
     found = validated_grasps(*pair, REQUEST, count=COUNT, run=ExecutionContext(threads=2))
     assert sorted(calls)[:2] == [(0, 0, SMALLEST_PART), (0, SMALLEST_PART, SMALLEST_PART)]
-    assert_same(found, one_lane)
+    assert_same_batch(found, one_lane)
 
 
 def test_grasps_of_several_lanes_in_scenes_are_those_of_one(pair, scenes, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -84,8 +72,7 @@ def test_grasps_of_several_lanes_in_scenes_are_those_of_one(pair, scenes, monkey
         validated_grasps(*pair, wish, count=COUNT, scenes=scenes, run=ExecutionContext(threads=n)) for n in (1, 2)
     )
     assert (0, SMALLEST_PART, SMALLEST_PART) in calls
-    assert_same(two, one)
-    np.testing.assert_array_equal(two.grasps.scene, one.grasps.scene)
+    assert_same_batch(two, one)
 
 
 def test_a_round_ends_as_soon_as_enough_are_found(pair, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -106,7 +93,7 @@ def test_a_round_ends_as_soon_as_enough_are_found(pair, monkeypatch: pytest.Monk
     monkeypatch.setattr(generation.Batch, "_in_parts", False)
     rounds = validated_grasps(*pair, wish, count=6, run=ExecutionContext(threads=1))
     assert parts.planned <= rounds.planned
-    assert_same(parts, rounds)
+    assert_same_batch(parts, rounds)
 
 
 def test_lane_without_a_place_ends_blocked_where_another_has_one(pair, scenes, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -126,40 +113,22 @@ def test_lane_without_a_place_ends_blocked_where_another_has_one(pair, scenes, m
     without = (SMALLEST_PART,)
     found = validated_grasps(*pair, wish, count=COUNT, scenes=scenes, run=ExecutionContext(threads=2))
     assert refused == [SMALLEST_PART]
-    assert_same(found, free)
+    assert_same_batch(found, free)
     without = (0, SMALLEST_PART)
     with pytest.raises(NoStartFound):
         validated_grasps(*pair, wish, count=COUNT, scenes=scenes, run=ExecutionContext(threads=2))
 
 
-@pytest.mark.parametrize("first", [0, 3])
-def test_grasps_from_one_of_a_batch_on_are_those_of_the_whole(pair, first: int) -> None:
-    whole = synthesize(*pair, PlanRequest(5, REQUEST.knobs, seed=2), ExecutionContext(threads=1))
-    rest = synthesize(*pair, PlanRequest(5 - first, REQUEST.knobs, seed=2, first=first), ExecutionContext(threads=2))
-    np.testing.assert_array_equal(rest.grasp.hand_pose, whole.grasp.hand_pose[first:])
-    np.testing.assert_array_equal(rest.squeeze.joint_positions, whole.squeeze.joint_positions[first:])
-
-
-def test_the_first_valid_grasps_are_audited_whoever_finds_them(pair, one_lane, monkeypatch: pytest.MonkeyPatch) -> None:
-    begun: list[int] = []
-    whole = generation.Batch._begin_rechecks
-    monkeypatch.setattr(
-        generation.Batch, "_begin_rechecks", lambda work, first: (begun.append(len(first.grasps)), whole(work, first))
-    )
+def test_the_first_valid_grasps_are_audited_whoever_finds_them(pair, monkeypatch: pytest.MonkeyPatch) -> None:
     rechecked: list[GraspSet] = []
     recheck = generation.Batch._rechecked
     monkeypatch.setattr(
         generation.Batch, "_rechecked", lambda work, some: (rechecked.append(some), recheck(work, some))[1]
     )
     found = validated_grasps(*pair, REQUEST, count=COUNT, run=ExecutionContext(threads=2))
-    assert len(begun) == len(rechecked) == 1
-    first = rechecked[0].moved(pair[1].centre)  # the engine works about the middle of the object
+    (first,) = (some.moved(pair[1].centre) for some in rechecked)  # the engine works about the middle of the object
     np.testing.assert_array_equal(first.grasp.hand_pose, found.grasps.grasp.hand_pose[:2])
     np.testing.assert_array_equal(found.columns["quality/recheck"] >= 0, np.arange(COUNT) < 2)
-    np.testing.assert_array_equal(found.columns["quality/recheck"], one_lane.columns["quality/recheck"])
-    monkeypatch.setattr(generation.Batch, "_begin_rechecks", lambda work, first: None)
-    late = validated_grasps(*pair, REQUEST, count=COUNT, run=ExecutionContext(threads=2))
-    np.testing.assert_array_equal(found.columns["quality/recheck"], late.columns["quality/recheck"])
 
 
 @pytest.mark.parametrize(
@@ -188,7 +157,7 @@ def test_a_lane_that_ends_leaves_its_cores_to_the_others() -> None:
         return [shared, run.cores]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("graspd.worker.parallel.CoreSharing", Watched)
+        patch.setattr("graspd.worker.execution_context.CoreSharing", Watched)
         assert parallel_map([0, 1], work, ExecutionContext(threads=4), size=lambda _: 1)[1] == [2, 4]
 
 

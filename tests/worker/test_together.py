@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from graspd.service.model.domain import JobOptions
-from graspd.service.model.errors import MeshError, TaskCancelled
+from graspd.service.model.errors import MeshError
 from graspd.service.model.fidelity import resolve_fidelity
 from graspd.service.model.scene_spec import SceneSpec
 from graspd.worker import together
@@ -24,6 +24,7 @@ from graspd.worker.pool.pool import MODULES, Pool
 from graspd.worker.scenes.kinds import rest_poses, supports_of
 from graspd.worker.simulation.environment import Scenes
 from graspd.worker.together import validated_batches
+from tests.worker.batches import assert_same_batch
 
 REQUEST = JobOptions(fidelity=resolve_fidelity("draft"), rechecks=0, grasps=6)
 
@@ -41,15 +42,8 @@ def alone(pair):
 
 def assert_same(batches, others) -> None:
     for one, other in zip(batches, others, strict=True):
-        assert (one.candidates, one.rejected, one.planned, one.verdict_key) == (
-            other.candidates,
-            other.rejected,
-            other.planned,
-            other.verdict_key,
-        )
-        columns = one.grasps.to_columns() | one.columns
-        for name, values in (other.grasps.to_columns() | other.columns).items():
-            np.testing.assert_array_equal(columns[name], values, err_msg=name)
+        assert one.planned == other.planned
+        assert_same_batch(one, other)
 
 
 def test_joined_batches_of_a_job_are_the_same_from_plan_to_verdict(
@@ -161,15 +155,6 @@ def test_what_becomes_of_one_batch_ends_the_job(pair) -> None:
 
     with pytest.raises(MeshError, match="no pieces"):
         validated_batches(*pair, REQUEST, sizes=[2, 2], join=2, pieces=torn, run=ExecutionContext(threads=1))  # type: ignore[arg-type]
-
-
-def test_a_job_that_is_cancelled_stops_all_its_batches(pair) -> None:
-    told: list[str] = []
-    run = ExecutionContext(
-        threads=1, progress=lambda done, total, message: told.append(message), cancelled=lambda: bool(told)
-    )
-    with pytest.raises(TaskCancelled):
-        validated_batches(*pair, REQUEST, sizes=[2, 2], join=2, run=run)
 
 
 def test_how_many_are_joined_where_nobody_says() -> None:

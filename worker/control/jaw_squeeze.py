@@ -22,11 +22,9 @@ LEAST_WAY: Final = 1e-4
 
 def jaw_squeeze(probe: Probe, jaws: Jaws, grasp: Posture, *, total_normal_force: float) -> Posture:
     """Compute N commanded postures of a gripper, within its stroke; the root is unchanged.
-
     Each pad presses with half of `total_normal_force` [N], or with what the limits of the dofs allow: a dof that moves
     both pads divides its limit between them. Commands are clipped to the stroke, because a gripper commanded beyond it
-    reports an error instead of pressing.
-    """
+    reports an error instead of pressing."""
     hand = probe.hand
     q = hand.reduce(np.asarray(grasp.joint_positions, float))
     gaps = np.maximum(_gaps(probe, jaws, grasp), 0.0)

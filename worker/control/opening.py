@@ -63,7 +63,6 @@ def fingers_of_bodies(hand: HandModel) -> NDArray[np.int32]:
 
 
 def count_fingers(hand: HandModel) -> int:
-    """Return the size of arrays by finger."""
     return max(1, len(hand.fingertips), int(fingers_of_bodies(hand).max()) + 1)
 
 
@@ -87,47 +86,27 @@ class Openings:
         first, plain = self._sweep(), self._sweep()
         self._leave(grasp, first)
         self._step(first)
-        launch(
-            opening.open_plainly,
-            self.count,
-            inputs=[self.fingers, STUCK_M, first],
-            outputs=[plain, self.step],
-            device=self.posing.device,
-        )
+        self._launch(opening.open_plainly, self.count, [self.fingers, STUCK_M, first], [plain, self.step])
         self._step(plain)
-        launch(
-            opening.take_opening,
-            (self.count, self.posing.hand.dofs),
-            inputs=[self.fingers, self.hands, STUCK_M, first, plain],
-            outputs=[self.open],
-            device=self.posing.device,
-        )
+        inputs = [self.fingers, self.hands, STUCK_M, first, plain]
+        self._launch(opening.take_opening, self.open.shape, inputs, [self.open])
 
     def without_jams(self, blocked: Blocked | None = None) -> Floats:
         """Return the open dofs (N, D), reduced towards the grasp where fingers jam or `blocked` applies.
-
-        Fingers that jam never reach the grasp when they close again.
-        """
-        device, jams = self.posing.device, self._jams()
+        Fingers that jam never reach the grasp when they close again."""
+        jams = self._jams()
         depth = self._depths(jams)
         depth[0].run()
-        launch(jamming.limit_depth, self.count, inputs=[JAM_M], outputs=[jams], device=device)
+        self._launch(jamming.limit_depth, self.count, [JAM_M], [jams])
         for look in range(JAM_LOOKS):
             for way in depth[1:]:
                 way.run()
             if blocked is not None:
                 jams.blocked.assign(self._blocked(jams, blocked))
             less = wp.float64(0.5 if look < JAM_LOOKS - 1 else 0.0)
-            launch(jamming.hold_back, self.count, inputs=[less], outputs=[jams], device=device)
-        launch(
-            jamming.take_way,
-            (self.count, self.posing.hand.dofs),
-            inputs=[self.fingers, self.hands, jams],
-            outputs=[self.open],
-            device=device,
-        )
-        found: Floats = self.open.numpy().copy()
-        return found
+            self._launch(jamming.hold_back, self.count, [less], [jams])
+        self._launch(jamming.take_way, self.open.shape, [self.fingers, self.hands, jams], [self.open])
+        return np.array(self.open.numpy())
 
     def retreated(self) -> Floats:
         """Return root poses (N, 7) of the open hands, moved back along the palm's approach while in contact."""
@@ -140,26 +119,18 @@ class Openings:
             jams = self._jams()
             self._place(Launches(device), jams, 1.0).run()
             approach = wp.vec3d(*posing.hand.palm.approach)
-            for step, way in enumerate(RETREATS_M):
-                launch(
-                    jamming.hand_clearance,
-                    (self.count, posing.lanes),
-                    inputs=[
-                        posing.probe.skin,
-                        posing.points,
-                        posing.lane,
-                        approach,
-                        PALM_CLEARANCE_M,
-                        wp.float64(way),
-                        self.bodies,
-                    ],
-                    outputs=[back],
-                )
-                launch(jamming.measure_retreat, self.count, inputs=[PALM_CLEARANCE_M, step], outputs=[back])
+        points = [posing.probe.skin, posing.points, posing.lane]
+        for step, way in enumerate(RETREATS_M):
+            inputs = [*points, approach, PALM_CLEARANCE_M, wp.float64(way), self.bodies]
+            self._launch(jamming.hand_clearance, (self.count, posing.lanes), inputs, [back])
+            self._launch(jamming.measure_retreat, self.count, [PALM_CLEARANCE_M, step], [back])
         poses = self.hand_pose.copy()
         away = np.array(RETREATS_M)[back.chosen.numpy()]
         poses[:, :3] -= away[:, None] * quat_rotate(poses[:, 3:], posing.hand.palm.approach)
         return poses
+
+    def _launch(self, kernel: Any, dim: Any, inputs: list[Any], outputs: list[Any]) -> None:
+        launch(kernel, dim, inputs=inputs, outputs=outputs, device=self.posing.device)
 
     def _sweep(self) -> Any:
         out, shape = opening.Sweep(), (self.count, self.fingers_count)
@@ -171,40 +142,22 @@ class Openings:
         return out
 
     def _leave(self, grasp: Posture, sweep: Any) -> None:
-        """Compute the direction in which each finger leaves the object."""
         posing, hand = self.posing, self.posing.hand
         bodies, near = posing.touch(grasp, CLEARANCE_M)
         with wp.ScopedDevice(posing.device):
             wrench = [wp.empty((self.count, hand.bodies), dtype=wp.vec3d) for _ in range(2)]
-            launch(
-                opening.body_wrenches,
-                (self.count, hand.bodies),
-                inputs=[posing.points, bodies, near, CLEARANCE_M],
-                outputs=wrench,
-            )
             away = wp.empty((self.count, hand.dofs), dtype=wp.float64)
-            launch(
-                opening.leave,
-                self.count,
-                inputs=[posing.chain, self.fingers, wp.float64(PLAIN_OPENING), bodies],
-                outputs=[*wrench, away, sweep],
-            )
+        inputs = [posing.points, bodies, near, CLEARANCE_M]
+        self._launch(opening.body_wrenches, (self.count, hand.bodies), inputs, wrench)
+        inputs = [posing.chain, self.fingers, wp.float64(PLAIN_OPENING), bodies]
+        self._launch(opening.leave, self.count, inputs, [*wrench, away, sweep])
 
     def _step(self, sweep: Any) -> None:
-        """Step along a sweep's path until all fingers are clear."""
         posing, out = self.posing, Launches(self.posing.device)
-        out.add(
-            opening.place_opening,
-            self.count,
-            inputs=[posing.chain, self.fingers, self.hands, CLEARANCE_M, self.step],
-            outputs=[sweep, self.bodies],
-        )
-        out.add(
-            opening.finger_clearance,
-            (self.count, posing.lanes),
-            inputs=[posing.probe.skin, posing.points, self.fingers, posing.lane, CLEARANCE_M, self.bodies],
-            outputs=[sweep],
-        )
+        inputs = [posing.chain, self.fingers, self.hands, CLEARANCE_M, self.step]
+        out.add(opening.place_opening, self.count, inputs=inputs, outputs=[sweep, self.bodies])
+        inputs = [posing.probe.skin, posing.points, self.fingers, posing.lane, CLEARANCE_M, self.bodies]
+        out.add(opening.finger_clearance, (self.count, posing.lanes), inputs=inputs, outputs=[sweep])
         out.add(opening.measure_opening, self.count, inputs=[CLEARANCE_M, self.step], outputs=[sweep])
         out.add(optimizers.advance, 1, inputs=[], outputs=[self.step])
         out.run(OPENING_STEPS + 1)
@@ -219,17 +172,13 @@ class Openings:
         return out
 
     def _place(self, out: Launches, jams: Any, way: float) -> Launches:
-        out.add(
-            jamming.place_on_way,
-            self.count,
-            inputs=[self.posing.chain, self.fingers, self.hands, jams, self.open, wp.float64(way)],
-            outputs=[self.bodies],
-        )
+        inputs = [self.posing.chain, self.fingers, self.hands, jams, self.open, wp.float64(way)]
+        out.add(jamming.place_on_way, self.count, inputs=inputs, outputs=[self.bodies])
         return out
 
     def _depths(self, jams: Any) -> list[Launches]:
         """Return launches that compute fingers' depths in the grasp, then at each check on the path."""
-        posing = self.posing
+        posing, probe = self.posing, self.posing.probe
         shape = (self.count, len(posing.hand.pieces))
         with wp.ScopedDevice(posing.device):
             frames = [wp.empty(shape, dtype=wp.vec3), wp.empty(shape, dtype=wp.quat)]
@@ -237,23 +186,14 @@ class Openings:
         found = []
         for way in (0.0, *WAY):
             out = self._place(Launches(posing.device), jams, way)
-            out.add(
-                distance.place_pieces,
-                shape,
-                inputs=[posing.probe.pieces, wp.vec3d(), *posing.probe.frames, *bodies],
-                outputs=frames,
-            )
-            out.add(
-                jamming.finger_depth,
-                (self.count, posing.hand.bodies),
-                inputs=[posing.probe.pieces, posing.probe.body_points, self.fingers, self.bodies, *frames],
-                outputs=[jams],
-            )
+            inputs = [probe.pieces, wp.vec3d(), *probe.frames, *bodies]
+            out.add(distance.place_pieces, shape, inputs=inputs, outputs=frames)
+            inputs = [probe.pieces, probe.body_points, self.fingers, self.bodies, *frames]
+            out.add(jamming.finger_depth, (self.count, posing.hand.bodies), inputs=inputs, outputs=[jams])
             found.append(out)
         return found
 
     def _blocked(self, jams: Any, blocked: Blocked) -> NDArray[np.int32]:
-        """Return the blocked fingers (N, F) of hands that are still checked."""
         rows = np.flatnonzero(jams.going.numpy())
         out = np.zeros((self.count, self.fingers_count), np.int32)
         if len(rows):

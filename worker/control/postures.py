@@ -53,11 +53,9 @@ def pregrasp(
     hand: HandModel, obj: ObjectModel, grasp: Posture, placed: PlacedGrasps | None = None, *, device: str = "cpu"
 ) -> Posture:
     """Compute N postures from which the hand closes.
-
     Every finger leaves the object along its contact normals until its points are `CLEARANCE_M` away. It stops earlier
     at other fingers or, where the grasps are `placed`, at an obstacle of their scene. Then the root retreats along the
-    palm's approach while the hand is in contact, and rises where fingers would dip into a support they may touch.
-    """
+    palm's approach while the hand is in contact, and rises where fingers would dip into a support they may touch."""
     posing = posing_of(hand, obj, points=_POINTS, device=device)
     poses, joints = np.zeros((len(grasp), 7)), np.zeros((len(grasp), len(hand.joint_names)))
     for rows in posing.parts(len(grasp)):
@@ -70,15 +68,11 @@ def pregrasp(
     return found if placed is None else raised(hand, grasp, found, placed)
 
 
-def wide_open(
-    hand: HandModel, obj: ObjectModel, pregrasp: Posture, placed: PlacedGrasps, *, device: str = "cpu"
-) -> Floats:
+def wide_open(hand: HandModel, obj: ObjectModel, pregrasp: Posture, placed: PlacedGrasps) -> Floats:
     """Return joint positions (N, J) for the approach: fingers opened plainly by `WIDE` of their range.
     They stop where they would run into one another or into an obstacle."""
-    posing, joints = (
-        posing_of(hand, obj, points=_POINTS, device=device),
-        np.zeros((len(pregrasp), len(hand.joint_names))),
-    )
+    posing = posing_of(hand, obj, points=_POINTS, device="cpu")
+    joints = np.zeros((len(pregrasp), len(hand.joint_names)))
     for rows in posing.parts(len(pregrasp)):
         some, scene = pregrasp.take(rows), placed.take(rows)
         q = hand.reduce(some.joint_positions)
@@ -90,20 +84,14 @@ def wide_open(
 
 
 def squeeze(
-    hand: HandModel,
-    obj: ObjectModel,
-    grasp: Posture,
-    *,
-    total_normal_force: float | None = None,
-    friction: float = FRICTION,
-    device: str = "cpu",
+    hand: HandModel, obj: ObjectModel, grasp: Posture, *, total_normal_force: float | None = None, device: str = "cpu"
 ) -> Posture:
     """Compute N commanded postures that press, q + Kp^-1 J^T f; root fixed; see `worker.control.squeeze`."""
     force = normal_force(obj) if total_normal_force is None else total_normal_force
     if (jaws := jaws_of(hand)) is not None:
         probe = posing_of(hand, obj, points=_POINTS, device=device).probe
         return jaw_squeeze(probe, jaws, grasp, total_normal_force=force)
-    holds = hold_forces(hand, obj, grasp, total_normal_force=force, friction=friction, closing=CLOSING_M, device=device)
+    holds = hold_forces(hand, obj, grasp, total_normal_force=force, closing=CLOSING_M, device=device)
     q = hand.reduce(grasp.joint_positions) + holds.torque / hand.stiffness
     return Posture(np.array(grasp.hand_pose, float), hand.expand(q))
 
@@ -121,19 +109,15 @@ def hold_forces(
     """Compute balanced contact forces of N grasps; `HoldForces.residual` predicts whether a grasp holds.
     Fingers without contact press with their points within `closing` [m]."""
     posing = posing_of(hand, obj, points=_POINTS, device=device)
-    return balanced(
-        posing,
-        grasp,
-        total_normal_force=normal_force(obj) if total_normal_force is None else total_normal_force,
-        friction=friction,
-        within=PRESSING_M,
-        most=MAX_PRESSING,
-        closing=closing,
-    )
+    total, reach = normal_force(obj) if total_normal_force is None else total_normal_force, (PRESSING_M, closing)
+    found = HoldForces(np.ones(len(grasp)), np.zeros((len(grasp), hand.dofs)))
+    for rows in posing.parts(len(grasp)):
+        residual, torque = balanced(posing, grasp.take(rows), total, friction, reach, MAX_PRESSING)
+        found.residual[rows], found.torque[rows] = residual, torque
+    return found
 
 
 def normal_force(obj: ObjectModel) -> float:
-    """Return the sum of the contact forces' normal components that hold an object [N]."""
     least, most = (times * ACCELERATION * obj.mass for times in OF_WEIGHT)
     return min(max(TOTAL_NORMAL_FORCE, least), most)
 
@@ -151,7 +135,6 @@ def standing_off(hand: HandModel, obj: ObjectModel, grasp: Posture, *, device: s
 
 
 def _in_the_way(hand: HandModel, opening: Openings, placed: PlacedGrasps | None) -> Blocked | None:
-    """Return the check for obstacles of opening fingers."""
     if placed is None:
         return None
     pose = opening.hand_pose

@@ -30,8 +30,6 @@ SUM: Final = 10.0
 
 @dataclass(frozen=True)
 class HoldForces:
-    """Balanced forces of N grasps."""
-
     residual: Floats
     """(N,) net wrench over the sum of normal forces, torques over the object's radius.
     0: balanced; 1: nothing presses. It predicts whether a grasp holds."""
@@ -40,39 +38,12 @@ class HoldForces:
 
 
 def balanced(
-    posing: PostureData,
-    grasp: Posture,
-    *,
-    total_normal_force: float,
-    friction: float,
-    within: float,
-    most: int,
-    closing: float = 0.0,
-) -> HoldForces:
-    """Compute balanced contact forces of N grasps within the hand's torque limits.
-
-    Where torques exceed a limit, all forces are scaled together, which keeps the balance.
-
-    Args:
-        posing: hand and object.
-        grasp: the grasps.
-        total_normal_force: wanted sum of normal forces [N].
-        friction: Coulomb coefficient of the pyramids.
-        within: hand points within this distance of the object press on it [m].
-        most: largest number of these points; the most spread out are used.
-        closing: distance within which points of a finger without contact press [m].
-    """
-    hand = posing.hand
-    found = HoldForces(np.ones(len(grasp)), np.zeros((len(grasp), hand.dofs)))
-    for rows in posing.parts(len(grasp)):
-        residual, torque = _balanced(posing, grasp.take(rows), total_normal_force, friction, (within, closing), most)
-        found.residual[rows], found.torque[rows] = residual.numpy(), torque.numpy()
-    return found
-
-
-def _balanced(
     posing: PostureData, grasp: Posture, total: float, friction: float, reach: tuple[float, float], most: int
-) -> tuple[Any, Any]:
+) -> tuple[Floats, Floats]:
+    """Compute balanced contact forces of grasps within the hand's torque limits: residuals and torques of `HoldForces`.
+    Their normal components sum to `total` [N]. Where torques exceed a limit, all forces are scaled together, which
+    keeps the balance. At most `most` hand points press, the most spread out: those within the first `reach` of the
+    object, of a finger without contact those within the second [m]."""
     bodies, near = posing.touch(grasp, max(reach))
     count, points, radius = len(grasp), len(posing.probe.points), posing.probe.obj.radius
     rows = int(touching.FIRST_TORQUE) + posing.hand.dofs
@@ -80,30 +51,13 @@ def _balanced(
         scratch = [wp.empty((count, points), dtype=kind) for kind in (wp.int32, wp.float64)]
         touches = wp.empty((count, posing.fingers), dtype=wp.bool)
         chosen, used = wp.empty((count, most), dtype=wp.int32), wp.empty(count, dtype=wp.int32)
-        launch(
-            touching.choose,
-            count,
-            inputs=[posing.points, posing.finger, near, *reach, wp.float64(FACING_COS), wp.float64(radius)],
-            outputs=[touches, *scratch, chosen, used],
-        )
+        places = [wp.float64(FACING_COS), wp.float64(radius)]
+        inputs = [posing.points, posing.finger, near, *reach, *places]
+        launch(touching.choose, count, inputs=inputs, outputs=[touches, *scratch, chosen, used])
         matrix = wp.empty((count, most * int(touching.EDGES), rows), dtype=wp.float64)
-        launch(
-            touching.columns,
-            chosen.shape,
-            inputs=[
-                posing.chain,
-                posing.effort,
-                posing.points,
-                bodies,
-                near,
-                chosen,
-                used,
-                wp.float64(friction),
-                wp.float64(radius),
-                wp.float64(SUM),
-            ],
-            outputs=[matrix],
-        )
+        inputs = [posing.chain, posing.effort, posing.points, bodies, near, chosen, used]
+        inputs += [wp.float64(friction), wp.float64(radius), wp.float64(SUM)]
+        launch(touching.columns, chosen.shape, inputs=inputs, outputs=[matrix])
         unit = wp.empty(count, dtype=wp.float64)
         launch(touching.scale_torques, count, inputs=[wp.float64(TORQUE)], outputs=[used, matrix, unit])
         target = np.zeros(rows)
@@ -111,24 +65,14 @@ def _balanced(
         share = solved(matrix, target, SPREAD, used)
         residual = wp.empty(count, dtype=wp.float64)
         torque = wp.empty((count, posing.hand.dofs), dtype=wp.float64)
-        launch(
-            touching.hold,
-            count,
-            inputs=[posing.effort, matrix, share, used, unit, wp.float64(total)],
-            outputs=[residual, torque],
-        )
-    return residual, torque
+        inputs = [posing.effort, matrix, share, used, unit, wp.float64(total)]
+        launch(touching.hold, count, inputs=inputs, outputs=[residual, torque])
+    return residual.numpy(), torque.numpy()
 
 
 def solved(matrix: Any, target: Floats, ridge: float, count: Any) -> Any:
     """Return the x >= 0 (B, K) that minimise |M x - t|^2 + ridge^2 |x|^2 for B systems, on their device.
-
-    Args:
-        matrix: (B, K, R) columns of M, a Warp array in double precision.
-        target: (R,) t.
-        ridge: weight of x itself, above 0.
-        count: (B,) used columns of each system, a Warp array; x is 0 for the others.
-    """
+    `matrix` (B, K, R) has the columns of M, `count` (B,) says how many of them are used; x is 0 for the others."""
     (batch, columns, rows), device = matrix.shape, matrix.device
     with wp.ScopedDevice(device):
         work = kernels.Workspace()
@@ -137,12 +81,8 @@ def solved(matrix: Any, target: Floats, ridge: float, count: Any) -> Any:
         work.used = wp.empty((batch, columns), dtype=wp.int32)
         x = wp.empty((batch, columns), dtype=wp.float64)
         feasible = wp.empty(batch, dtype=wp.int32)
-        launch(
-            kernels.nonnegative,
-            batch,
-            inputs=[matrix, wp.array(target, dtype=wp.float64), wp.float64(ridge), count],
-            outputs=[work, x, feasible],
-        )
+        inputs = [matrix, wp.array(target, dtype=wp.float64), wp.float64(ridge), count]
+        launch(kernels.nonnegative, batch, inputs=inputs, outputs=[work, x, feasible])
     unsolved = np.flatnonzero(feasible.numpy() == 0)
     if len(unsolved):
         found, columns, used = x.numpy(), matrix.numpy(), count.numpy()
@@ -153,7 +93,6 @@ def solved(matrix: Any, target: Floats, ridge: float, count: Any) -> Any:
 
 
 def _plain(matrix: Floats, target: Floats, ridge: float, count: int) -> Floats:
-    """Solve one system by SciPy, with the ridge as additional rows."""
     from scipy.optimize import nnls
 
     system = np.vstack([matrix[:count].T, ridge * np.eye(count)])

@@ -5,18 +5,17 @@ Two opposite fingers can hold an object at pairs of surface points that face awa
 
 from __future__ import annotations
 
-import threading
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from cachetools import LRUCache
 from numpy.typing import NDArray
 
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import Floats
 from graspd.worker.hands.jaws import jaws_of
 from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.memory_cache import cached_by_content
 from graspd.worker.objects.model import ObjectModel
 
 #: Clearance between the opening and the object on each side [m].
@@ -25,6 +24,7 @@ FIT_M: Final = 0.001
 
 def fitting_pairs(hand: HandModel, obj: ObjectModel) -> Pairs | None:
     """Return pairs of opposite points that fit between the jaws of a hand; None if the hand is no gripper.
+
     Raises:
         InputError: no pair fits; the message names the joint and its opening.
     """
@@ -32,9 +32,9 @@ def fitting_pairs(hand: HandModel, obj: ObjectModel) -> Pairs | None:
     if jaws is None:
         return None
     pairs = antipodal_pairs(obj)
-    fits = pairs.narrower(jaws.opening - 2 * FIT_M)
-    if len(fits.start):
-        return fits
+    fits = pairs.width <= jaws.opening - 2 * FIT_M
+    if fits.any():
+        return Pairs(pairs.start[fits], pairs.end[fits])
     if not len(pairs.start):
         raise InputError(f"{obj.name} has no two opposite sides that a gripper such as {hand.name} could hold")
     raise InputError(
@@ -55,49 +55,23 @@ _CHUNK: Final = 64
 
 @dataclass(frozen=True)
 class Pairs:
-    """P pairs, object frame. The space between the points may be hollow: two fingers go around it."""
+    """P pairs of points (P, 3), object frame [m]. The space between them may be hollow: two fingers go around it."""
 
     start: Floats
-    """(P, 3) [m]"""
     end: Floats
-    """(P, 3) [m]"""
 
     @property
     def width(self) -> Floats:
         """(P,) distance of the points [m]."""
         return np.asarray(np.linalg.norm(self.end - self.start, axis=1))
 
-    def narrower(self, width: float) -> Pairs:
-        """Select the pairs that fit into a width [m]."""
-        fits = self.width <= width
-        return Pairs(self.start[fits], self.end[fits])
 
-
+@cached_by_content(16)
 def antipodal_pairs(obj: ObjectModel) -> Pairs:
-    """Return the pairs of an object, cached; the same object gives the same pairs."""
-    with _lock:
-        if obj.content not in _found:
-            _found[obj.content] = _pairs(obj)
-        return _found[obj.content]
-
-
-_found: LRUCache[str, Pairs] = LRUCache(16)
-_lock = threading.Lock()
-
-
-def _pairs(obj: ObjectModel) -> Pairs:
     """Cast lines inwards from points spread evenly over the area; each exit from the solid gives a pair."""
-    corners = obj.vertices[obj.faces]
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    area = np.linalg.norm(cross, axis=1)
-    normal = cross / np.maximum(area, 1e-20)[:, None]
     rng = np.random.default_rng(0xA47)
-    face = np.searchsorted(np.cumsum(area) / area.sum(), (np.arange(_POINTS) + rng.random(_POINTS)) / _POINTS)
-    face = np.minimum(face, len(area) - 1)
-    u, v = rng.random((2, _POINTS, 1))
-    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
-    at = corners[face]
-    start = at[:, 0] + u * (at[:, 1] - at[:, 0]) + v * (at[:, 2] - at[:, 0])
+    corners, normal, _ = surface_of(obj)
+    start, face = even_points(obj, _POINTS, rng)
     way = -normal[face] + _TILT * rng.standard_normal((_POINTS, 3))
     way /= np.linalg.norm(way, axis=1, keepdims=True)
     starts, ends = [], []
@@ -107,6 +81,29 @@ def _pairs(obj: ObjectModel) -> Pairs:
         starts.append(start[rows][ray])
         ends.append(start[rows][ray] + length[:, None] * way[rows][ray])
     return Pairs(np.concatenate(starts), np.concatenate(ends))
+
+
+def surface_of(obj: ObjectModel) -> tuple[Floats, Floats, Floats]:
+    """Return the faces' corners (F, 3, 3), unit normals (F, 3) and cumulative share of the area (F,)."""
+    corners = obj.vertices[obj.faces]
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.linalg.norm(cross, axis=1)
+    return corners, cross / np.maximum(area, 1e-20)[:, None], np.cumsum(area) / area.sum()
+
+
+def points_in(corners: Floats, u: Floats, v: Floats) -> Floats:
+    """Return points of triangles (n, 3, 3), uniform for uniform numbers (n, 1) in [0, 1)."""
+    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
+    return corners[:, 0] + u * (corners[:, 1] - corners[:, 0]) + v * (corners[:, 2] - corners[:, 0])
+
+
+def even_points(obj: ObjectModel, count: int, rng: np.random.Generator) -> tuple[Floats, NDArray[np.intp]]:
+    """Return points (count, 3) spread evenly over the area of the surface, and their faces (count,)."""
+    corners, _, sums = surface_of(obj)
+    face = np.searchsorted(sums, (np.arange(count) + rng.random(count)) / count)
+    face = np.minimum(face, len(sums) - 1)
+    u, v = rng.random((2, count, 1))
+    return points_in(corners[face], u, v), face
 
 
 def _exits(start: Floats, way: Floats, corners: Floats, normal: Floats) -> tuple[NDArray[np.intp], Floats]:

@@ -18,11 +18,7 @@ _lock: Final = threading.Lock()
 
 
 def keep_file(path: Path) -> str:
-    """Load a network's file, cache it and return its digest.
-
-    Raises:
-        InputError: the file is no network.
-    """
+    """Load a network's file, cache it and return its digest; raise InputError if the file is no network."""
     data = read_file(path)
     digest = digest_bytes(data)
     keep(digest, from_bytes(data, str(path)))
@@ -30,17 +26,12 @@ def keep_file(path: Path) -> str:
 
 
 def keep(digest: str, network: ProposalNetwork) -> None:
-    """Cache a network under a digest; the most recently used ones stay."""
     with _lock:
         _known[digest] = network
 
 
 def kept(digest: str) -> ProposalNetwork:
-    """Return the network of a digest.
-
-    Raises:
-        InputError: none is cached under it.
-    """
+    """Return the network cached under a digest; raise InputError if there is none."""
     with _lock:
         found = _known.get(digest)
     if found is None:

@@ -67,8 +67,6 @@ class Planner(Protocol):
 
 @dataclass(frozen=True)
 class BatchRequest:
-    """One of several batches requested at once."""
-
     wanted: PlanRequest
     run: ExecutionContext
 
@@ -78,8 +76,7 @@ class BatchPlanner(Protocol):
     All are around a free object, or all in scenes with the same supports and neighbours (`PlacedGrasps.fixed`).
 
     Each batch equals the result of the `Planner` alone; on the CPU bit for bit. A batch that fails is replaced by its
-    error, TaskCancelled if its own `run.cancelled()` returned True; the others continue.
-    """
+    error, TaskCancelled if its own `run.cancelled()` returned True; the others continue."""
 
     def __call__(
         self, hand: HandModel, obj: ObjectModel, asked: Sequence[BatchRequest]

@@ -32,7 +32,6 @@ PLANNERS: Final[dict[str, tuple[str, str]]] = {
 
 
 def method_names() -> list[str]:
-    """Return all methods: graspd's own, then those of other packages."""
     return [*PLANNERS, *sorted(set(_offered()) - set(PLANNERS))]
 
 
@@ -91,10 +90,7 @@ def _options(name: str, options: Mapping[str, Any] | None) -> Options:
 
 def of_this_machine(name: str, options: Mapping[str, Any] | None) -> dict[str, Any]:
     """Replace files in a local user's options by digests and cache the files in this process.
-
-    Raises:
-        InputError: unknown method, or a file that cannot be used.
-    """
+    Raise InputError for an unknown method, or a file that cannot be used."""
     files, given = method(name).files, dict(options or {})
     return given | {key: files[key](Path(str(value))) for key, value in given.items() if key in files}
 

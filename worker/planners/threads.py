@@ -33,7 +33,6 @@ class StepCounter:
         self._lock = threading.Lock()
 
     def __call__(self, work: float, message: str) -> None:
-        """Add finished work; raise TaskCancelled on cancellation."""
         self._run.check("the synthesis")
         with self._lock:
             self._done += work
@@ -43,12 +42,7 @@ class StepCounter:
 
 def cut(count: int, run: ExecutionContext, *, least: int = 1) -> list[range]:
     """Cut a batch into contiguous, nearly equal parts: one on a GPU, at most one per thread on a CPU.
-
-    Args:
-        count: grasps.
-        run: its device and threads.
-        least: fewest grasps for which a thread pays.
-    """
+    A thread pays for at least `least` grasps."""
     if wp.get_device(run.device).is_cuda:
         return [range(count)]
     parts = max(1, min(run.cores, count // least))
@@ -58,10 +52,8 @@ def cut(count: int, run: ExecutionContext, *, least: int = 1) -> list[range]:
 
 def run_parts(parts: list[range], work: Callable[[range], T]) -> list[T]:
     """Run `work` on every part, each in its own thread, in order.
-
     A part that exceeds a GPU's memory is split in two, one after the other, down to single grasps: there may be more
-    results than parts.
-    """
+    results than parts."""
     if len(parts) == 1:
         return _fitted(parts[0], work)
     with ThreadPoolExecutor(len(parts), thread_name_prefix="synthesize") as pool:
@@ -69,7 +61,6 @@ def run_parts(parts: list[range], work: Callable[[range], T]) -> list[T]:
 
 
 def _fitted(part: range, work: Callable[[range], T]) -> list[T]:
-    """Run the work of a part, in as many launches as its GPU's memory requires."""
     try:
         return [work(part)]
     except RuntimeError as error:

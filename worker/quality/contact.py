@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from graspd.service.model.transforms import Floats
 from graspd.worker.hands.model import HandModel
-from graspd.worker.hands.surface import farthest_points
 
 #: A body closer than this is in contact [m] (DexGraspBench).
 LINK_CONTACT_M: Final = 0.002
@@ -20,51 +19,19 @@ MAX_CONTACTS: Final = 20
 
 
 def contact_area_cm2(distance: Floats, area: Floats, thresholds_m: Floats) -> Floats:
-    """Compute the hand area (B, T) within each threshold of the object's surface, on either side [cm^2].
-
-    Args:
-        distance: (B, N) signed distances of hand points [m].
-        area: (N,) area represented by each point [m^2].
-        thresholds_m: (T,) [m].
-    """
+    """Compute the hand area (B, T) within each threshold (T,) of the object's surface, on either side [cm^2].
+    The distances (B, N) are signed [m]; each point represents an `area` (N,) [m^2]."""
     near = np.abs(distance)
     # Row by row: the rounding of a matrix product depends on its number of rows.
     return np.stack([np.where(near < t, area, 0.0).sum(axis=-1) for t in thresholds_m], axis=-1) * 1e4
 
 
-def choose_contacts(
-    near: NDArray[np.bool_], place: Floats, normal: Floats, *, scale: float, limit: int
-) -> NDArray[np.intp]:
-    """Choose at most `limit` of the near points, spread as widely as possible; return their indices.
-
-    Args:
-        near: (N,) points to choose from.
-        place: (N, 3) contact points [m].
-        normal: (N, 3) unit normals; contacts differ by place over `scale` and by direction.
-        scale: length that weighs places against directions: the torque scale [m].
-        limit: most contacts.
-    """
-    index = np.flatnonzero(near)
-    if len(index) <= limit:
-        return index
-    return index[farthest_points(np.hstack([place[index] / scale, normal[index]]), limit)]
-
-
 def spread_contacts(
     near: NDArray[np.bool_], place: Floats, normal: Floats, *, scale: float, limit: int
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Run `choose_contacts` on many sets at once.
-
-    Args:
-        near: (B, T, N) points to choose from, of B grasps at T thresholds.
-        place: (B, N, 3) contact points [m].
-        normal: (B, N, 3) unit normals.
-        scale: length that weighs places against directions [m].
-        limit: most contacts.
-
-    Returns:
-        (B, T, limit) indices, and their number (B, T); further indices are undefined.
-    """
+    """Choose at most `limit` of the points `near` (B, T, N) of each grasp and threshold, spread as widely as possible.
+    They differ by place (B, N, 3) over `scale`, the torque scale [m], and by normal (B, N, 3).
+    Return indices (B, T, limit) and their number (B, T); further indices are undefined."""
     grasps, sets, _ = near.shape
     count = near.sum(axis=2)
     width = max(int(count.max(initial=0)), limit)
@@ -83,7 +50,7 @@ def spread_contacts(
 
 
 def _farthest(points: Floats, inside: NDArray[np.bool_], count: int) -> NDArray[np.intp]:
-    """Return points (S, count) chosen by `farthest_points` from each set (S, W, K), if `inside` (S, W)."""
+    """Return points (S, count) chosen as by `farthest_points` from each set (S, W, K), if `inside` (S, W)."""
     rows = np.arange(len(points))
     mean = np.einsum("sw,swk->sk", inside.astype(float), points) / np.maximum(inside.sum(axis=1), 1)[:, None]
     start = np.where(inside, ((points - mean[:, None]) ** 2).sum(axis=2), -1.0)

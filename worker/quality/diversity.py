@@ -24,11 +24,9 @@ FEW: Final = 256
 
 def explained_variance(posture: Posture) -> Floats:
     """Compute the explained variance of (translation, rotation vector, joints), largest first.
-
     The entries are shares of variance along the principal components. Diversity D is the first entry: near 1 all grasps
     lie on a line of variants, lower is more diverse. Units stay metres and radians, as in DexGraspBench. Empty for
-    fewer than 2 grasps.
-    """
+    fewer than 2 grasps."""
     if len(posture) < 2:
         return np.zeros(0)
     features = np.hstack(
@@ -42,7 +40,6 @@ def explained_variance(posture: Posture) -> Floats:
 
 def hand_points(hand: HandModel, posture: Posture) -> Floats:
     """Return the positions (N, P, 3) of the same `POINTS` surface points in N postures, object frame [m].
-
     The distance of two grasps is the mean distance of these points [m]. This metric joins the hand's pose and joints
     and weighs a joint by the motion it causes. It does not identify grasps that an object's symmetry makes equivalent.
     """
@@ -75,13 +72,8 @@ def nearest(points: Floats) -> float | None:
 
 
 def distinct(points: Floats, least: float, *, given: int = 0) -> NDArray[np.bool_]:
-    """Select grasps (N,) so that no two are closer than `least` [m], in order.
-
-    Args:
-        points: (N, P, 3) of `hand_points`.
-        least: least distance; 0 selects all.
-        given: number of first grasps that are always selected.
-    """
+    """Select grasps (N,), in order, so that no two of `points` (N, P, 3) are closer than `least` [m]; 0 selects all.
+    The first `given` grasps are always selected."""
     kept = np.ones(len(points), bool)
     if least <= 0 or len(points) < 2:
         return kept
@@ -114,7 +106,6 @@ def _rotation_vector(quaternion: Floats) -> Floats:
 
 
 def approach_cells(hand: HandModel, quaternions: NDArray[np.float64]) -> NDArray[np.int32]:
-    """Return the approach cells (B,) of B grasps from the root's quaternions (B, 4)."""
     return cells_of(-quat_rotate(quaternions, hand.palm.approach)).astype(np.int32)
 
 

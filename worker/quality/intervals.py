@@ -23,9 +23,7 @@ def wilson(part: int, whole: int) -> tuple[float, float]:
 
 def wilson_of_mean(total: float, count: int) -> tuple[float, float]:
     """Return the 95 % interval of the mean of `count` values from 0 to 1 that sum to `total`.
-
-    It is Wilson's for a share: wide enough, since zeros and ones spread most among values from 0 to 1.
-    """
+    It is Wilson's for a share: wide enough, since zeros and ones spread most among values from 0 to 1."""
     mean, grown = total / count, 1 + _Z**2 / count
     middle = (mean + _Z**2 / (2 * count)) / grown
     half = _Z / grown * math.sqrt(max(0.0, mean * (1 - mean)) / count + _Z**2 / (4 * count**2))

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import threading
-from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 import warp as wp
-from cachetools import LRUCache
 from numpy.typing import NDArray
 
 from graspd.service.model.integers import distinct_values
 from graspd.service.model.transforms import Floats
 from graspd.worker.grasps import Posture
 from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.memory_cache import cached_by_content
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.quality.contact import LINK_CONTACT_M, contact_links, finger_of_body
 from graspd.worker.quality.probe import Probe, probe_of
@@ -29,67 +27,28 @@ CPU_HANDS: Final = 128
 GPU_HANDS: Final = 4096
 
 
-@dataclass(frozen=True)
 class PostureData:
     """Device data of a hand and an object for the posture kernels."""
 
-    probe: Probe
-    chain: Any
-    points: Any
-    effort: Any
-    """(D,)"""
-    finger: Any
-    """(L,) finger of each body, -1: none."""
-    fingers: int
-
-    @classmethod
-    def of(cls, probe: Probe) -> PostureData:
-        with wp.ScopedDevice(probe.device):
+    def __init__(self, probe: Probe) -> None:
+        self.probe, self.hand, self.device = probe, probe.hand, probe.device
+        is_cuda, finger = bool(wp.get_device(self.device).is_cuda), finger_of_body(probe.hand)
+        #: Points of a hand per thread, threads per hand, and hands processed at a time.
+        self.lane, self.at_once = (1, GPU_HANDS) if is_cuda else (CPU_LANE, CPU_HANDS)
+        self.lanes = -(-len(probe.points) // self.lane)
+        self.fingers = max(1, int(finger.max()) + 1)
+        with wp.ScopedDevice(self.device):
             for module in (touching, balance, opening, jamming, optimizers):
-                wp.load_module(module=module, device=probe.device)
-            finger = finger_of_body(probe.hand)
-            return cls(
-                probe,
-                chain_of(probe.hand, probe.device),
-                _points(probe),
-                wp.array(probe.hand.effort, dtype=wp.float64),
-                wp.array(finger, dtype=wp.int32),
-                max(1, int(finger.max()) + 1),
-            )
-
-    @property
-    def hand(self) -> HandModel:
-        return self.probe.hand
-
-    @property
-    def device(self) -> str:
-        return self.probe.device
-
-    @property
-    def is_cuda(self) -> bool:
-        return bool(wp.get_device(self.device).is_cuda)
-
-    @property
-    def lane(self) -> int:
-        """Points of a hand per thread."""
-        return 1 if self.is_cuda else CPU_LANE
-
-    @property
-    def lanes(self) -> int:
-        """Threads per hand."""
-        return -(-len(self.probe.points) // self.lane)
-
-    @property
-    def at_once(self) -> int:
-        """Hands processed at a time."""
-        return GPU_HANDS if self.is_cuda else CPU_HANDS
+                wp.load_module(module=module, device=self.device)
+            self.chain, self.points = chain_of(probe.hand, self.device), _points(probe)
+            self.effort = wp.array(probe.hand.effort, dtype=wp.float64)
+            #: (L,) finger of each body, -1: none.
+            self.finger = wp.array(finger, dtype=wp.int32)
 
     def parts(self, count: int) -> list[slice]:
-        """Return slices of `count` hands, to be processed one after the other."""
         return [slice(i, min(i + self.at_once, count)) for i in range(0, count, self.at_once)]
 
     def bodies(self, count: int) -> Any:
-        """Allocate the bodies of `count` hands."""
         with wp.ScopedDevice(self.device):
             return room_for_bodies(self.hand, count)
 
@@ -109,12 +68,8 @@ class PostureData:
         with wp.ScopedDevice(self.device):
             near.distance, near.cosine = wp.empty(shape, dtype=wp.float32), wp.empty(shape, dtype=wp.float64)
             near.closest, near.normal = (wp.empty(shape, dtype=wp.vec3) for _ in range(2))
-            launch(
-                touching.touch,
-                (count, self.lanes),
-                inputs=[self.probe.skin, self.points, self.lane, bodies, reach],
-                outputs=[near],
-            )
+            inputs = [self.probe.skin, self.points, self.lane, bodies, reach]
+            launch(touching.touch, (count, self.lanes), inputs=inputs, outputs=[near])
         return bodies, near
 
     def touching_links(self, posture: Posture) -> NDArray[np.int32]:
@@ -147,14 +102,7 @@ def _points(probe: Probe) -> Any:
     return out
 
 
-_posings: LRUCache[tuple[str, str, int, str], PostureData] = LRUCache(8)
-_lock = threading.Lock()
-
-
-def posing_of(hand: HandModel, obj: ObjectModel, *, points: int, device: str = "cpu") -> PostureData:
+@cached_by_content(8)
+def posing_of(hand: HandModel, obj: ObjectModel, *, points: int, device: str) -> PostureData:
     """Return the pair on a device with `points` hand points, cached in memory."""
-    key = (hand.content, obj.content, points, device)
-    with _lock:
-        if key not in _posings:
-            _posings[key] = PostureData.of(probe_of(hand, obj, hand_points=points, object_points=64, device=device))
-        return _posings[key]
+    return PostureData(probe_of(hand, obj, hand_points=points, object_points=64, device=device))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -11,7 +10,6 @@ from typing import Any, Final
 
 import numpy as np
 import warp as wp
-from cachetools import LRUCache
 from numpy.typing import NDArray
 
 from graspd.service.model.transforms import Floats, compose, quat_to_matrix
@@ -19,8 +17,10 @@ from graspd.worker.engines.backend import binary_name
 from graspd.worker.grasps import Posture
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel, SurfacePoints
+from graspd.worker.hands.primitives import triangle_areas
 from graspd.worker.hands.surface import sample_surface
 from graspd.worker.objects.disk_cache import arrays_kept_or_made
+from graspd.worker.objects.memory_cache import cached_by_content
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.simulation.device import DeviceHand, PosedBodies, to_xyzw
 from graspd.worker.simulation.kernels import distance as kernels
@@ -45,9 +45,7 @@ class NearestPoints:
     """Hand points of B grasps and the object's surface near them; object frame, metres."""
 
     bodies: Floats
-    """(B, L, 7) poses of the bodies."""
     hand_points: Floats
-    """(B, N, 3)"""
     hand_normals: Floats
     """(B, N, 3) outward unit normals of the hand at its points."""
     distance: Floats
@@ -105,7 +103,6 @@ class Probe:
         self.skin = self._skin()
 
     def _skin(self) -> Any:
-        """The object's surface with a coarse grid of distances."""
         obj, margin = self.obj, 1e-4
         low = obj.vertices.min(axis=0) - obj.centre_of_mass - REACH_M - margin
         high = obj.vertices.max(axis=0) - obj.centre_of_mass + REACH_M + margin
@@ -138,9 +135,7 @@ class Probe:
     @cached_property
     def sample_spacing(self) -> float:
         """Distance between neighbouring object points if they were on a square grid [m]."""
-        corners = self.obj.vertices[self.obj.faces]
-        cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        return float(np.sqrt(0.5 * np.linalg.norm(cross, axis=1).sum() / len(self.samples)))
+        return float(np.sqrt(triangle_areas(self.obj.vertices, self.obj.faces).sum() / len(self.samples)))
 
     def signed_distance(self, points: Floats, *, reach: float = REACH_M) -> tuple[Floats, Floats, Floats]:
         """Return signed distance (P,), closest point (P, 3) and outward normal (P, 3) of points (P, 3).
@@ -174,7 +169,6 @@ class Probe:
         return gap.numpy().astype(float)
 
     def posed_points(self, bodies: Floats) -> Floats:
-        """Return hand points (B, N, 3) in the object frame for body poses (B, L, 7)."""
         body, position = self.points.body, self.points.position
         return _turned(bodies, body, position) + bodies[:, body, :3]
 
@@ -194,7 +188,6 @@ class Probe:
         )
 
     def measure(self, posture: Posture) -> Distances:
-        """Measure all distances of B postures."""
         found = self.touch(posture)
         return Distances(
             **vars(found),
@@ -238,7 +231,6 @@ class Probe:
         return least.numpy().astype(float)
 
     def _posed_pieces(self, bodies: Floats) -> list[Any]:
-        """Return the pieces with positions and rotations in the kernels' layout."""
         frames = compose(bodies[:, self._piece_body], self._piece_frame[None])
         with wp.ScopedDevice(self.device):
             position: Any = wp.array(frames[..., :3] - self.obj.centre_of_mass, dtype=wp.vec3)
@@ -279,20 +271,9 @@ def _kernel_frame(kind: str, pose: Floats, vertices: Floats) -> Floats:
 
 
 def _is_grid(kept: Mapping[str, NDArray[Any]], counts: Sequence[int]) -> bool:
-    """Check whether a cached array can be the coarse grid with so many nodes per side."""
     return set(kept) == {"coarse"} and kept["coarse"].shape == tuple(counts) and kept["coarse"].dtype == np.float32
 
 
-_probes: LRUCache[tuple[str, str, int, int, str], Probe] = LRUCache(8)
-_lock = threading.Lock()
-
-
+@cached_by_content(8)
 def probe_of(hand: HandModel, obj: ObjectModel, *, hand_points: int, object_points: int, device: str = "cpu") -> Probe:
-    """Return the probe of a pair, cached in memory."""
-    key = (hand.content, obj.content, hand_points, object_points, device)
-    with _lock:
-        probe = _probes.get(key)
-        if probe is None:
-            probe = Probe(hand, obj, hand_points=hand_points, object_points=object_points, device=device)
-            _probes[key] = probe
-        return probe
+    return Probe(hand, obj, hand_points=hand_points, object_points=object_points, device=device)

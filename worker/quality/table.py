@@ -46,10 +46,9 @@ from graspd.worker.quality.contact import (
     spread_contacts,
 )
 from graspd.worker.quality.diversity import approach_cells
-from graspd.worker.quality.overlap import Overlap, penetration_depth
 from graspd.worker.quality.probe import HAND_POINTS, OBJECT_POINTS, REACH_M, Distances, Probe, probe_of
-from graspd.worker.quality.volume import SharedVolume
-from graspd.worker.quality.wrench_space import Norm, measure_spaces, wrenches
+from graspd.worker.quality.volume import Overlap, SharedVolume, penetration_depth
+from graspd.worker.quality.wrench_space import measure_spaces, wrenches
 
 Columns = dict[str, NDArray[np.generic]]
 
@@ -61,11 +60,9 @@ CHUNK: Final = 16
 
 
 class _Pair:
-    """Data shared by the chunks of one pair's tables. Thread-safe."""
-
     def __init__(self, terms: _Terms) -> None:
         hand, obj = terms.hand, terms.obj
-        self.obj, self.friction, self.norm = obj, terms.friction, terms.norm
+        self.obj, self.friction = obj, terms.friction
         self.thresholds = np.array(terms.thresholds)
         told = int(np.argmin(np.abs(self.thresholds - INDEX_THRESHOLD_M)))
         self.with_volume = (np.arange(len(self.thresholds)) == told) | terms.every_volume
@@ -76,26 +73,6 @@ class _Pair:
     def columns(self, posture: Posture) -> Columns:
         chunk = _Chunk(self, self.probe.measure(posture))
         return {f"quality/{name}": measured(chunk) for name, measured in MEASURES.items()}
-
-    def spaces(self, found: Distances) -> tuple[Floats, Floats]:
-        """Return epsilon and volume (B, T) of the wrench spaces of B grasps."""
-        near = self.probe.facing(found)[:, None] & (np.abs(found.distance)[:, None] < self.thresholds[:, None])
-        chosen, count = spread_contacts(near, found.closest, found.normal, scale=self.obj.radius, limit=MAX_CONTACTS)
-        rows = np.arange(len(chosen))[:, None, None]
-        counts = (np.arange(MAX_CONTACTS) < count[..., None])[..., None]
-        inward = np.where(counts, -found.normal[rows, chosen], [0.0, 0.0, 1.0])
-        edges = wrenches(
-            found.closest[rows, chosen],
-            inward,
-            friction=self.friction,
-            centre=self.obj.centre_of_mass,
-            radius=self.obj.radius,
-        )
-        wanted = np.broadcast_to(self.with_volume, count.shape)
-        epsilon, volume = measure_spaces(
-            edges.reshape(-1, *edges.shape[2:]), count.ravel(), wanted.ravel(), norm=self.norm
-        )
-        return epsilon.reshape(count.shape), volume.reshape(count.shape)
 
 
 _pairs: LRUCache[str, _Pair] = LRUCache(4)
@@ -111,19 +88,14 @@ def measure(
     *,
     friction: float = DEFAULT_FRICTION,
     thresholds_m: Sequence[float] = DEFAULT_THRESHOLDS_M,
-    norm: Norm = "l1",
     every_volume: bool = False,
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> dict[str, NDArray[np.generic]]:
     """Compute the quality columns of a base shard for N grasps, at the posture of contact.
 
     Args:
-        hand: the hand.
-        obj: the object.
-        grasps: N grasps.
         friction: Coulomb coefficient of the wrench space.
         thresholds_m: T contact thresholds, at most `REACH_M` [m].
-        norm: l1 (GraspIt!'s) or linf wrench space.
         every_volume: compute the volume at all thresholds; else only at the index's, nan at the others: a volume takes
             ten times as long as an epsilon.
         run: receives the number of finished grasps; polled for cancellation between chunks.
@@ -140,7 +112,7 @@ def measure(
         raise InputError(
             f"contact thresholds must be above 0 and at most {REACH_M * 1e3:g} mm; got {list(thresholds_m)}"
         )
-    terms = _Terms(hand, obj, friction, tuple(thresholds.tolist()), norm, every_volume)
+    terms = _Terms(hand, obj, friction, tuple(thresholds.tolist()), every_volume)
     chunks = [slice(i, min(i + CHUNK, len(grasps))) for i in range(0, len(grasps), CHUNK)]
     postures = [Posture(grasps.grasp.hand_pose[chunk], grasps.grasp.joint_positions[chunk]) for chunk in chunks]
     parts = _measured(terms, postures, Count(len(grasps), run, "quality"), run)
@@ -152,13 +124,10 @@ def measure(
 
 @dataclass(frozen=True)
 class _Terms:
-    """Subject and terms of a measurement."""
-
     hand: HandModel
     obj: ObjectModel
     friction: float
     thresholds: tuple[float, ...]
-    norm: Norm
     every_volume: bool
 
     @cached_property
@@ -171,13 +140,11 @@ class _Terms:
             return _pairs[content]
 
     def empty(self) -> Columns:
-        """Columns of no grasps."""
         swept = {metric.name for metric in GRASP_METRICS if metric.swept}
         return {f"quality/{name}": np.zeros((0, len(self.thresholds)) if name in swept else 0) for name in MEASURES}
 
 
 def _measured(terms: _Terms, postures: Sequence[Posture], done: Count, run: ExecutionContext) -> list[Columns]:
-    """Measure the columns of each chunk, in threads or in the processes of a pool."""
     if run.pool is not None:
         return run.pool.map(
             _columns,
@@ -205,14 +172,22 @@ def _columns(terms: _Terms, posture: Posture) -> Columns:
 
 @dataclass(frozen=True)
 class _Chunk:
-    """Some grasps of a table, and their distances."""
-
     pair: _Pair
     found: Distances
 
     @cached_property
     def spaces(self) -> tuple[Floats, Floats]:
-        return self.pair.spaces(self.found)
+        """Epsilon and volume (B, T) of the wrench spaces of B grasps."""
+        pair, found, obj = self.pair, self.found, self.pair.obj
+        near = pair.probe.facing(found)[:, None] & (np.abs(found.distance)[:, None] < pair.thresholds[:, None])
+        chosen, count = spread_contacts(near, found.closest, found.normal, scale=obj.radius, limit=MAX_CONTACTS)
+        rows = np.arange(len(chosen))[:, None, None]
+        counts = (np.arange(MAX_CONTACTS) < count[..., None])[..., None]
+        place, inward = found.closest[rows, chosen], np.where(counts, -found.normal[rows, chosen], [0.0, 0.0, 1.0])
+        edges = wrenches(place, inward, friction=pair.friction, centre=obj.centre_of_mass, radius=obj.radius)
+        wanted = np.broadcast_to(pair.with_volume, count.shape)
+        epsilon, volume = measure_spaces(edges.reshape(-1, *edges.shape[2:]), count.ravel(), wanted.ravel())
+        return epsilon.reshape(count.shape), volume.reshape(count.shape)
 
     def shared_volume(self) -> Floats:
         # A face of the object may enter a piece between two object points, half a diagonal of their grid from either.
@@ -244,7 +219,6 @@ ENVELOPING: Final = 2
 
 
 def grasp_types(probe: Probe, found: Distances) -> NDArray[np.int32]:
-    """Return the `GraspType` (B,) of B grasps."""
     hand = probe.hand
     finger = finger_of_body(hand)
     touching = probe.body_distance(found) < LINK_CONTACT_M

@@ -1,19 +1,26 @@
-"""Volume shared by hand and object: exact boolean of solids, or voxels where the object is no solid."""
+"""Volume shared by hand and object: exact boolean of solids, or voxels where the object is no solid.
+
+Also the pieces that may share volume, and the depth of penetration.
+"""
 
 from __future__ import annotations
 
 from functools import cached_property
-from typing import Final
+from typing import Any, Final
 
 import manifold3d as m3d
 import numpy as np
+import warp as wp
 from numpy.typing import NDArray
 
-from graspd.service.model.transforms import Floats, pose_to_matrix
+from graspd.service.model.transforms import Floats, apply, pose_to_matrix
 from graspd.worker.hands.model import ConvexPiece, HandModel
 from graspd.worker.hands.surface import piece_distance
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.quality.probe import Probe
+from graspd.worker.quality.probe import Distances, Probe
+from graspd.worker.simulation.device import to_xyzw
+from graspd.worker.simulation.kernels import crossing as kernels
+from graspd.worker.simulation.launches import launch
 
 #: Edge of a voxel in the fallback [m]: the error is at most half an edge times the shared volume's surface.
 VOXEL_M: Final = 5e-4
@@ -32,19 +39,11 @@ class SharedVolume:
 
     @property
     def exact(self) -> bool:
-        """Whether volumes come from the boolean of solids."""
         return self._object is not None
 
     def of(self, bodies: Floats, near: NDArray[np.bool_]) -> Floats:
-        """Compute the volume inside both the object and the union of the hand's pieces [cm^3].
-
-        Args:
-            bodies: (B, L, 7) body poses in the object frame.
-            near: (B, P) pieces that may intersect the object; the others are ignored.
-
-        Returns:
-            (B,)
-        """
+        """Compute the volume (B,) inside both the object and the union of the hand's pieces [cm^3].
+        The bodies are at (B, L, 7) in the object frame; only pieces `near` (B, P) count."""
         return np.array([self._one(bodies[b], np.flatnonzero(near[b])) for b in range(len(bodies))])
 
     def _one(self, bodies: Floats, pieces: NDArray[np.intp]) -> float:
@@ -52,7 +51,8 @@ class SharedVolume:
             return 0.0
         if self._object is None:
             return self._voxels.volume_cm3(bodies, pieces)
-        matrices = self._matrices(bodies[self._body[pieces]])
+        matrices = pose_to_matrix(bodies[self._body[pieces]])[:, :3]
+        matrices[..., 3] = (matrices[..., 3] - self.obj.centre_of_mass) * _UNIT
         posed = [self._pieces[p].transform(matrix) for p, matrix in zip(pieces, matrices, strict=True)]
         parts = [part for part in (self._object ^ solid for solid in posed) if not part.is_empty()]
         if not parts:
@@ -60,12 +60,6 @@ class SharedVolume:
         # Intersections rarely overlap, so their union is cheap; the union of whole pieces is not.
         whole = parts[0] if len(parts) == 1 else m3d.Manifold.batch_boolean(parts, m3d.OpType.Add)
         return float(whole.volume()) / _UNIT**3 * 1e6
-
-    def _matrices(self, poses: Floats) -> Floats:
-        """Return the matrices (K, 3, 4) of body poses (K, 7) for manifold3d."""
-        matrices = pose_to_matrix(poses)[:, :3]
-        matrices[..., 3] = (matrices[..., 3] - self.obj.centre_of_mass) * _UNIT
-        return matrices
 
     @cached_property
     def _voxels(self) -> VoxelVolume:
@@ -75,17 +69,15 @@ class SharedVolume:
 class VoxelVolume:
     """Intersection volume by counting voxel centres of the object that lie inside the pieces."""
 
-    def __init__(self, hand: HandModel, obj: ObjectModel, edge: float = VOXEL_M) -> None:
+    def __init__(self, hand: HandModel, obj: ObjectModel) -> None:
         self.hand = hand
-        self.edge = edge
         self._probe = Probe(hand, obj, hand_points=hand.bodies * 16, object_points=64)
 
     def volume_cm3(self, bodies: Floats, pieces: NDArray[np.intp]) -> float:
-        """Return the shared volume of the given pieces, posed by bodies (L, 7) [cm^3]."""
         low, high = self._box(bodies, pieces)
         if (high <= low).any():
             return 0.0
-        axes = [np.arange(a + self.edge / 2, b, self.edge) for a, b in zip(low, high, strict=True)]
+        axes = [np.arange(a + VOXEL_M / 2, b, VOXEL_M) for a, b in zip(low, high, strict=True)]
         grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
         inside = np.zeros(len(grid), dtype=bool)
         for p in pieces:
@@ -96,16 +88,14 @@ class VoxelVolume:
         if not inside.any():
             return 0.0
         depth = self._probe.signed_distance(grid[inside])[0]
-        return float((depth < 0).sum()) * self.edge**3 * 1e6
+        return float((depth < 0).sum()) * VOXEL_M**3 * 1e6
 
     def _box(self, bodies: Floats, pieces: NDArray[np.intp]) -> tuple[Floats, Floats]:
-        corners = np.concatenate(
-            [
-                self.hand.pieces[p].vertices @ pose_to_matrix(bodies[self.hand.pieces[p].body])[:3, :3].T
-                + bodies[self.hand.pieces[p].body, :3]
-                for p in pieces
-            ]
-        )
+        posed = []
+        for piece in (self.hand.pieces[p] for p in pieces):
+            rotation = pose_to_matrix(bodies[piece.body])[:3, :3]
+            posed.append(piece.vertices @ rotation.T + bodies[piece.body, :3])
+        corners = np.concatenate(posed)
         vertices = self._probe.obj.vertices
         return np.maximum(corners.min(0), vertices.min(0)), np.minimum(corners.max(0), vertices.max(0))
 
@@ -127,3 +117,85 @@ def _solid(vertices: Floats, faces: NDArray[np.int32]) -> m3d.Manifold | None:
 
 def _hull(piece: ConvexPiece) -> m3d.Manifold:
     return m3d.Manifold.hull_points(np.ascontiguousarray(piece.vertices * _UNIT, dtype=np.float32))
+
+
+#: Planes are distinguished by so many digits [m, and of unit normals].
+_DIGITS: Final = 7
+
+
+class Overlap:
+    """Conservative overlap test of a hand's pieces with a closed object.
+    A piece is excluded only if it shares no volume: no face of the object reaches into it, none of its corners is in
+    the object, and nothing of the object is in it. A face also counts if only a plane through
+    two edges would separate it."""
+
+    def __init__(self, hand: HandModel, probe: Probe) -> None:
+        self._probe = probe
+        self._body = np.array([p.body for p in hand.pieces], np.intp)
+        self._corner = np.array([p.vertices[0] for p in hand.pieces])
+        with wp.ScopedDevice("cpu"):
+            wp.load_module(module=kernels, device="cpu")
+        self._solids = _solids(hand.pieces)
+
+    def of(self, found: Distances, near: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Return the pieces (B, P), among those that are `near` (B, P), that may share volume with the object."""
+        row, piece = np.nonzero(near)
+        if not len(row):
+            return near
+        poses = found.bodies[row, self._body[piece]]
+        meets = self._crossed(piece, poses) | (found.piece_distance[row, piece] < 0)
+        rest = np.flatnonzero(~meets)
+        meets[rest] = self._probe.signed_distance(apply(poses[rest], self._corner[piece[rest]]))[0] < 0
+        out = np.zeros_like(near)
+        out[row, piece] = meets
+        return out
+
+    def _crossed(self, piece: NDArray[np.intp], poses: Floats) -> NDArray[np.bool_]:
+        centre = self._probe.obj.centre_of_mass
+        given = np.concatenate([poses[:, :3] - centre, to_xyzw(poses[:, 3:])], axis=1)
+        with wp.ScopedDevice("cpu"):
+            crossed = wp.zeros(len(piece), dtype=wp.int32)
+            inputs = [
+                self._probe.mesh.id,
+                self._solids,
+                wp.array(piece, dtype=wp.int32),
+                wp.array(given, dtype=wp.transform),
+            ]
+            launch(kernels.faces_in_solids, len(piece), inputs=inputs, outputs=[crossed], device="cpu")
+            found: NDArray[np.bool_] = crossed.numpy() != 0
+        return found
+
+
+def _solids(pieces: tuple[ConvexPiece, ...]) -> Any:
+    planes, corners = [_planes(p) for p in pieces], [p.vertices for p in pieces]
+    low, high = (np.array([f(c, axis=0) for c in corners]) for f in (np.min, np.max))
+    solids = kernels.Solids()
+    with wp.ScopedDevice("cpu"):
+        solids.plane = wp.array(np.concatenate(planes), dtype=wp.vec4)
+        solids.first_plane = wp.array(np.cumsum([0, *map(len, planes)]), dtype=wp.int32)
+        solids.corner = wp.array(np.concatenate(corners), dtype=wp.vec3)
+        solids.first_corner = wp.array(np.cumsum([0, *map(len, corners)]), dtype=wp.int32)
+        solids.middle = wp.array((low + high) / 2, dtype=wp.vec3)
+        solids.half = wp.array((high - low) / 2, dtype=wp.vec3)
+    return solids
+
+
+def _planes(piece: ConvexPiece) -> Floats:
+    """Return the distinct planes (F, 4) n x <= d of a piece's faces; every corner is below all of them."""
+    a, b, c = (piece.vertices[piece.faces[:, k]] for k in range(3))
+    normal = np.cross(b - a, c - a)
+    length = np.linalg.norm(normal, axis=1)
+    normal = normal[length > 0] / length[length > 0, None]
+    offset = (normal @ piece.vertices.T).max(axis=1)
+    # One of the planes that are equal except for rounding, itself unrounded.
+    _, first = np.unique(np.round(np.column_stack([normal, offset]), _DIGITS), axis=0, return_index=True)
+    return np.column_stack([normal, offset])[first]
+
+
+def penetration_depth(found: Distances) -> Floats:
+    """Return the deepest penetration (B,), of hand points in the object and object points in the hand [m].
+    One direction alone is blind: a thin wall passes between hand points, a small fingertip between object points."""
+    hand_in_object = np.maximum(0.0, -found.distance).max(axis=1)
+    object_in_hand = np.maximum(0.0, -found.piece_distance).max(axis=1)
+    deepest: Floats = np.maximum(hand_in_object, object_in_hand)
+    return deepest

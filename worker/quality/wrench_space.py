@@ -1,9 +1,8 @@
 """Grasp wrench space by the conventions of GraspIt! (Miller & Allen 2004): epsilon and volume.
 
 Epsilon follows Ferrari & Canny 1992. Each contact's friction cone is a pyramid of 8 edges with unit normal component, f
-= n + mu (cos a t1 + sin a t2); its torque about the centre of mass is divided by the object's largest radius. The L1
-space is the convex hull of all edges (normal forces sum to at most 1). The L-infinity space is the Minkowski sum of the
-contacts' pyramids with their apex (each at most 1).
+= n + mu (cos a t1 + sin a t2); its torque about the centre of mass is divided by the object's largest radius. The space
+is the convex hull of all edges: normal forces sum to at most 1 (L1).
 
 Epsilon is the radius of the largest ball around the origin inside the space: 0 where the origin is not inside (GraspIt!
 reports -1 there). Flat spaces have epsilon 0 and volume 0.
@@ -12,24 +11,19 @@ reports -1 there). Flat spaces have epsilon 0 and volume 0.
 from __future__ import annotations
 
 import threading
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import Floats, cross
 from graspd.worker.simulation.kernels import hull as kernels
 from graspd.worker.simulation.launches import launch
 
-Norm = Literal["l1", "linf"]
-
 EDGES: Final = 8
 #: Ratio of least to largest singular value below which a set of wrenches is flat.
 FLATNESS: Final = 1e-7
-#: Most contacts of an L-infinity space: its points grow ninefold with each.
-MAX_LINF_CONTACTS: Final = 4
 #: Number of points from which our own hull is faster.
 MANY: Final = 24
 
@@ -43,115 +37,65 @@ def tangents(normals: Floats) -> tuple[Floats, Floats]:
     return t1, cross(n, t1)
 
 
-def cone_edges(
-    normals: Floats, friction: float, *, edges: int = EDGES, unit: Literal["normal", "force"] = "normal"
-) -> Floats:
+def cone_edges(normals: Floats, friction: float, *, edges: int = EDGES) -> Floats:
     """Return edge forces (..., E, 3) of the friction pyramids about inward unit normals (..., 3).
-
-    `unit` selects the part of length 1: the normal component (GraspIt!) or the force itself (FRoGGeR).
-    """
+    Their normal components are 1, as in GraspIt!."""
     t1, t2 = tangents(normals)
     angle = 2 * np.pi * np.arange(edges) / edges
     around = np.cos(angle)[:, None] * t1[..., None, :] + np.sin(angle)[:, None] * t2[..., None, :]
-    force: Floats = np.asarray(normals, float)[..., None, :] + friction * around
-    return force / np.sqrt(1 + friction**2) if unit == "force" else force
+    return np.asarray(np.asarray(normals, float)[..., None, :] + friction * around)
 
 
 def wrenches(
     points: Floats, normals: Floats, *, friction: float, centre: Floats, radius: float, edges: int = EDGES
 ) -> Floats:
-    """Return edge wrenches (..., E, 6): force, then torque about `centre` over `radius`.
-
-    Args:
-        points: (..., 3) contact points [m].
-        normals: (..., 3) unit normals into the object.
-        friction: Coulomb coefficient.
-        centre: (3,) torque origin, the centre of mass [m].
-        radius: torque scale, the object's largest radius [m].
-        edges: edges of the pyramid.
-    """
+    """Return edge wrenches (..., E, 6): force, then torque about `centre` over `radius`, the object's largest [m].
+    Contacts are at `points` (..., 3) [m] with unit normals (..., 3) into the object."""
     force = cone_edges(normals, friction, edges=edges)
     torque = cross((np.asarray(points, float) - centre)[..., None, :] / radius, force)
     return np.concatenate([force, torque], axis=-1)
 
 
 def measure_spaces(
-    edge_wrenches: Floats, contacts: NDArray[np.integer], with_volume: NDArray[np.bool_], *, norm: Norm = "l1"
+    edge_wrenches: Floats, contacts: NDArray[np.integer], with_volume: NDArray[np.bool_]
 ) -> tuple[Floats, Floats]:
-    """Compute epsilon and volume of many wrench spaces.
-
-    Args:
-        edge_wrenches: (S, N, E, D) edge wrenches; each space uses its first `contacts` contacts.
-        contacts: (S,).
-        with_volume: (S,) whether the volume is wanted: epsilon alone is as exact, in a tenth of the time.
-        norm: l1 or linf.
-
-    Returns:
-        (S,) epsilon; (S,) volume, nan where it is not wanted.
-
-    Raises:
-        InputError: linf with more than `MAX_LINF_CONTACTS` contacts.
-    """
+    """Compute epsilon and volume (S,) of many wrench spaces of edge wrenches (S, N, E, D).
+    Each space uses its first `contacts` (S,) contacts. The volume is nan where `with_volume` (S,) is false: epsilon
+    alone is as exact, in a tenth of the time."""
     epsilon, volume = np.full((2, len(edge_wrenches)), np.nan)
     none = np.asarray(contacts) == 0
     epsilon[none], volume[none] = 0.0, 0.0
-    if norm == "l1" and edge_wrenches.shape[-1] == 6:
+    if edge_wrenches.shape[-1] == 6:
         clouds = edge_wrenches.reshape(len(edge_wrenches), -1, 6)
         count = np.asarray(contacts) * edge_wrenches.shape[2]
         ours = np.flatnonzero((count >= MANY) & (count <= MAX_POINTS))
         most = int(count[ours].max(initial=0))
         epsilon[ours], volume[ours] = measure_hulls(clouds[ours, :most], count[ours], np.asarray(with_volume)[ours])
     for row in np.flatnonzero(np.isnan(epsilon)):
-        epsilon[row], volume[row] = _measure_by_qhull(edge_wrenches[row, : contacts[row]], norm)
+        epsilon[row], volume[row] = _measure_by_qhull(edge_wrenches[row, : contacts[row]])
     return np.maximum(epsilon, 0.0), np.where(with_volume | none, volume, np.nan)
 
 
-def _measure_by_qhull(edge_wrenches: Floats, norm: Norm) -> tuple[float, float]:
+def _measure_by_qhull(edge_wrenches: Floats) -> tuple[float, float]:
     """Compute epsilon and volume where our own hull does not apply: few, flat, or too many contacts."""
-    hull = _hull(_points(edge_wrenches, norm))
-    if hull is None:
-        return 0.0, 0.0
-    return float(-hull.equations[:, -1].max()), float(hull.volume)
-
-
-def _points(edge_wrenches: Floats, norm: Norm) -> Floats:
-    return edge_wrenches.reshape(-1, edge_wrenches.shape[-1]) if norm == "l1" else _minkowski(edge_wrenches)
-
-
-def _hull(points: Floats) -> Any:
     from scipy.spatial import ConvexHull, QhullError
 
+    points = edge_wrenches.reshape(-1, edge_wrenches.shape[-1])
     if len(points) <= points.shape[1] or _flat(points):
-        return None
+        return 0.0, 0.0
     # Joggled input is fastest and simplicial; exact merging is the fallback.
     for options in ("QJ", "Qt Qx"):
         try:
-            return ConvexHull(points, qhull_options=options)
+            hull = ConvexHull(points, qhull_options=options)
         except QhullError:
             continue
-    return None
+        return float(-hull.equations[:, -1].max()), float(hull.volume)
+    return 0.0, 0.0
 
 
 def _flat(points: Floats) -> bool:
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     return bool(spread[-1] <= FLATNESS * max(spread[0], 1e-300))
-
-
-def _minkowski(edge_wrenches: Floats) -> Floats:
-    """Return points whose hull is the Minkowski sum of the contacts' pyramids, with apexes at the origin."""
-    contacts, _, dimension = edge_wrenches.shape
-    if contacts > MAX_LINF_CONTACTS:
-        raise InputError(
-            f"the L-infinity wrench space of {contacts} contacts is too large: take at most {MAX_LINF_CONTACTS}, or L1"
-        )
-    total = np.zeros((1, dimension))
-    for edges in edge_wrenches:
-        # Only corners of the sum so far can become corners of the whole.
-        hull = _hull(total)
-        total = total if hull is None else total[hull.vertices]
-        pyramid = np.vstack([np.zeros((1, dimension)), edges])
-        total = (total[:, None] + pyramid[None]).reshape(-1, dimension)
-    return total
 
 
 #: Points are moved randomly by this share of the largest coordinate, so that no 7 of them lie in one hyperplane. Less
@@ -213,16 +157,13 @@ def measure_hulls(clouds: Floats, count: NDArray[np.integer], whole: NDArray[np.
     """Compute inner radius and volume of many hulls, in one launch.
 
     Args:
-        clouds: (H, P, 6) points, P at most `MAX_POINTS`; each hull uses its first `count`.
-        count: (H,).
+        clouds: (H, P, 6) points, P at most `MAX_POINTS`; each hull uses its first `count` (H,).
         whole: (H,) whether the volume is wanted; else the hull is built only where it is nearest to the origin, in a
             tenth of the time, with an equally exact radius.
 
     Returns:
-        (H,) distance of the nearest facet from the origin, at most 0 where the origin is outside; (H,) volume, nan
-        where it is not wanted. Both nan where there is no closed hull: too few points, flat ones, or more facets than
-        `CAPACITY`; use another method.
-    """
+        Distance (H,) of the nearest facet from the origin, at most 0 where the origin is outside, and volume (H,), nan
+        where it is not wanted. Both are nan where there is no closed hull of at most `CAPACITY` facets."""
     radius, volume = np.full((2, len(clouds)), np.nan)
     some = np.flatnonzero(np.asarray(count) > _DIMENSION)
     if not len(some):
@@ -297,10 +238,8 @@ def _simplices(
 
 def _planes(corner: Floats) -> tuple[Floats, Floats]:
     """Return planes (H, 7, 6), (H, 7) of the facets of simplices (H, 7, 6) about the origin.
-
     Facet i omits corner i. n x - d is minus 6! times the volume of the simplex of x and the facet: the barycentric
-    coordinate of corner i, times the determinant of the edges.
-    """
+    coordinate of corner i, times the determinant of the edges."""
     edges = corner[:, 1:] - corner[:, :1]
     size = np.abs(np.linalg.det(edges))[:, None, None]
     slope = np.swapaxes(np.linalg.inv(edges), 1, 2)

@@ -44,7 +44,6 @@ def transfer(
     The wrist of a mounting has the first angles that keep it off the table; neighbours do not decide them.
 
     Args:
-        hand: the hand.
         grasp: N postures at contact, object frame.
         pregrasp: N postures before contact, object frame; the hand moves straight from it to the grasp.
         object_pose: (S, 7) rest poses in the table frame.
@@ -95,15 +94,12 @@ def transfer(
 
 
 def count_rejections(rejection: NDArray[np.uint8]) -> dict[str, int]:
-    """Count the grasps rejected for each reason."""
     return {r.name.lower(): int((rejection == r).sum()) for r in Rejection if r is not Rejection.NONE}
 
 
 def approach(grasp: Posture, pregrasp: Posture, postures: int = PATH_POSTURES) -> Posture:
     """Return (N * postures) postures on the straight trajectory from each pregrasp to its grasp.
-
-    Positions and joints move linearly, orientations along the shorter arc (normalised linear interpolation).
-    """
+    Positions and joints move linearly, orientations along the shorter arc (normalised linear interpolation)."""
     t = np.linspace(0.0, 1.0, postures)[None, :, None]
     start, end = pregrasp.hand_pose[:, None], grasp.hand_pose[:, None]
     sign = np.where((start[..., 3:] * end[..., 3:]).sum(-1, keepdims=True) < 0, -1.0, 1.0)

@@ -81,9 +81,7 @@ def _each_face(obj: ObjectModel, seed: int) -> dict[str, Floats]:
     poses = []
     for number, face in enumerate(chosen):
         turn = np.random.default_rng([seed, number]).uniform(0, 2 * np.pi)
-        pose = lay_flat(faces, face, np.array([0.0, 0, 0, 1, 0, 0, 0]))
-        about = np.concatenate([np.zeros(3), quat_from_axis_angle(np.array([0.0, 0, 1]), np.asarray(turn))])
-        pose = compose(about, pose)
+        pose = turned(lay_flat(faces, face, np.array([0.0, 0, 0, 1, 0, 0, 0])), turn)
         pose[:2] -= (pose[:3] + quat_rotate(pose[3:], obj.centre_of_mass))[:2]
         poses.append(pose)
     return {
@@ -93,12 +91,14 @@ def _each_face(obj: ObjectModel, seed: int) -> dict[str, Floats]:
     }
 
 
-def inside(obj: ObjectModel, pose: Floats, size: tuple[float, float], rng: np.random.Generator) -> Floats:
-    """Move the pose to a random place within a rectangle of x by y [m] about the origin.
+def turned(pose: Floats, angle: float) -> Floats:
+    """Return the pose turned about the vertical through the origin."""
+    about = np.concatenate([np.zeros(3), quat_from_axis_angle(np.array([0.0, 0, 1]), np.asarray(angle))])
+    return compose(about, pose)
 
-    Raises:
-        SceneError: the object is too large for it.
-    """
+
+def inside(obj: ObjectModel, pose: Floats, size: tuple[float, float], rng: np.random.Generator) -> Floats:
+    """Move the pose to a random place in a rectangle x by y [m] about the origin; SceneError: there is no room."""
     corners = quat_rotate(pose[3:], obj.hull_vertices)[:, :2]
     low, high = corners.min(axis=0), corners.max(axis=0)
     room = np.asarray(size) / 2 - GAP
@@ -112,11 +112,7 @@ def inside(obj: ObjectModel, pose: Floats, size: tuple[float, float], rng: np.ra
 
 
 def check_free(obj: ObjectModel, poses: Floats, supports: tuple[Obstacle, ...]) -> None:
-    """Check that no pose (S, 7) puts the object deeper into a support than rounding does.
-
-    Raises:
-        InputError: one does.
-    """
+    """Raise SceneError where a pose (S, 7) puts the object deeper into a support than rounding does."""
     for pose in poses:
         corners = quat_rotate(pose[3:], obj.hull_vertices) + pose[:3]
         for number, support in enumerate(supports):

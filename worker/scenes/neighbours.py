@@ -17,17 +17,16 @@ import mujoco
 import numpy as np
 
 from graspd.service.model.errors import InputError, MeshError, SceneError
-from graspd.service.model.transforms import Floats, compose, quat_from_axis_angle, quat_rotate
+from graspd.service.model.transforms import Floats, compose, quat_rotate
 from graspd.worker.engines.mujoco_warnings import void
 from graspd.worker.grasps import Posture, moved
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import ConvexPiece, HandModel
 from graspd.worker.objects.mesh_geometry import to_centre, to_file
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.scenes.kinds import GAP, SUNK
-from graspd.worker.scenes.rest import RestingFaces, lay_flat, resting_faces, settle
+from graspd.worker.scenes.kinds import GAP, SUNK, turned
+from graspd.worker.scenes.rest import lay_flat, resting_faces, settle
 from graspd.worker.scenes.simulate import (
-    DENSITY,
     DROP_HEIGHT,
     MAX_ATTEMPTS,
     MAX_SETTLE_ANGLE,
@@ -35,11 +34,14 @@ from graspd.worker.scenes.simulate import (
     REST_SPEED,
     REST_WINDOW_S,
     TIMESTEP_S,
+    add_hull,
     drop,
     rest_probability,
+    spec_above_table,
     steadied,
 )
 from graspd.worker.simulation.environment import Obstacle
+from graspd.worker.validation.model import add_shape
 
 TIMEOUT_S: Final = 6.0
 #: Distance of falling neighbours from the object, as a multiple of the sum of both bounding radii.
@@ -51,25 +53,16 @@ MAX_LIFT: Final = 0.003
 #: Clearances are capped at this [m].
 FARTHEST_M: Final = 0.1
 MOST_NEIGHBOURS: Final = 8
-_SHAPES: Final = {
-    "box": mujoco.mjtGeom.mjGEOM_BOX,
-    "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
-    "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
-    "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
-}
 
 
 @dataclass(frozen=True)
 class Neighbours:
-    """The M other objects on the table."""
-
     objects: Sequence[ObjectModel]
     poses: Floats
     """(S, M, 7) in the table frame."""
 
     @property
     def centred(self) -> Neighbours:
-        """Return the objects with their frames at their centres."""
         poses = np.array(self.poses, float)
         for number, obj in enumerate(self.objects):
             poses[:, number] = to_centre(poses[:, number], obj.centre)
@@ -81,12 +74,6 @@ def drop_together(obj: ObjectModel, neighbours: Sequence[ObjectModel], *, count:
 
     The object falls in the middle, the neighbours around it. Drops are redone if an object does not come to rest, rolls
     away, or leans or lies on another. Scene i depends on the objects, the seed and i alone.
-
-    Args:
-        obj: the object that is grasped.
-        neighbours: M others.
-        count: number of scenes S.
-        seed: any non-negative integer.
 
     Returns:
         As `worker.scenes.simulate.drop`, and `scene/neighbour_pose` (S, M, 7).
@@ -114,28 +101,11 @@ def drop_together(obj: ObjectModel, neighbours: Sequence[ObjectModel], *, count:
 
 
 class _Heap:
-    """Compiled simulation of some objects above a table."""
-
     def __init__(self, objects: Sequence[ObjectModel]) -> None:
         self.objects = objects
-        self.faces: list[RestingFaces] = [resting_faces(obj) for obj in objects]
-        spec = mujoco.MjSpec()
-        spec.option.timestep = TIMESTEP_S
-        spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-        spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-        contact: dict[str, Any] = {"friction": [0.8, 0.005, 0.002], "condim": 6, "solref": [0.006, 1]}
-        spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[5, 5, 0.1], **contact)
-        for k, obj in enumerate(objects):
-            body = spec.worldbody.add_body(name=str(k))
-            body.add_freejoint()
-            add_hull(spec, body, str(k), obj, **contact)
-            body.explicitinertial = True
-            mass = DENSITY * obj.volume
-            inertia = mass * obj.inertia
-            body.mass, body.ipos = mass, obj.centre_of_mass
-            body.fullinertia = inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+        self.faces = [resting_faces(obj) for obj in objects]
         try:
-            self.model = spec.compile()
+            self.model = spec_above_table(objects).compile()
         except ValueError as error:
             reason = str(error).splitlines()[0]
             raise MeshError(f"these objects cannot be dropped: {reason}; check that each mesh has volume") from None
@@ -216,26 +186,17 @@ class _Heap:
 
 
 def neighbour_clearance(hand: HandModel, path: Posture, object_pose: Floats, neighbours: Neighbours) -> Floats:
-    """Compute signed distances of the hand from neighbours' hulls [m], at most `FARTHEST_M`.
-
-    Args:
-        hand: the hand; its convex pieces count.
-        path: P postures in the object frame.
-        object_pose: (S, 7) of the object in the table frame.
-        neighbours: objects to avoid.
-
-    Returns:
-        (S, P); negative: the hand penetrates a hull.
-    """
+    """Compute signed distances (S, P) of the hand's pieces from neighbours' hulls [m], at most `FARTHEST_M`.
+    `path` has P postures in the object frame, `object_pose` (S, 7) is in the table frame."""
     spec = mujoco.MjSpec()
     for k, piece in enumerate(hand.pieces):
         _add_piece(spec, spec.worldbody.add_body(mocap=True), f"p{k}", piece)
     neighbours = neighbours.centred
     for k, obj in enumerate(neighbours.objects):
-        add_hull(spec, spec.worldbody.add_body(mocap=True), f"n{k}", obj)
+        add_hull(spec, spec.worldbody.add_body(mocap=True), f"n{k}", obj.hull_vertices, obj.hull_faces)
     model = spec.compile()
     data = mujoco.MjData(model)
-    pieces, count = len(hand.pieces), len(neighbours.objects)
+    pieces = len(hand.pieces)
     body = np.array([piece.body for piece in hand.pieces])
     in_object = body_poses(hand, path.hand_pose, path.joint_positions)[:, body]
     clearance = np.full((len(object_pose), len(path)), FARTHEST_M)
@@ -249,29 +210,14 @@ def neighbour_clearance(hand: HandModel, path: Posture, object_pose: Floats, nei
             for a, b in np.argwhere(gap < clearance[s, p]):
                 distance = mujoco.mj_geomDistance(model, data, int(a), pieces + int(b), FARTHEST_M, None)
                 clearance[s, p] = min(clearance[s, p], distance)
-    assert model.ngeom == pieces + count
     return clearance
 
 
-def add_hull(spec: Any, body: Any, name: str, obj: ObjectModel, **options: Any) -> None:
-    """Add an object's convex hull to a body of a MuJoCo specification, with options of the geom."""
-    mesh = spec.add_mesh(name=name, inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)
-    mesh.uservert = np.asarray(obj.hull_vertices, np.float32).ravel()
-    mesh.userface = np.asarray(obj.hull_faces, np.int32).ravel()
-    body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, **options)
-
-
 def _add_piece(spec: Any, body: Any, name: str, piece: ConvexPiece) -> None:
-    if piece.kind not in _SHAPES:
-        mesh = spec.add_mesh(name=name, inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)
-        mesh.uservert = np.asarray(piece.vertices, np.float32).ravel()
-        mesh.userface = np.asarray(piece.faces, np.int32).ravel()
-        body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name)
-        return
-    size = [0.5 * x for x in piece.size] if piece.kind == "box" else [piece.size[0], *(0.5 * x for x in piece.size[1:])]
-    body.add_geom(
-        type=_SHAPES[piece.kind], size=[*size, 0, 0, 0][:3], pos=piece.pose[:3].tolist(), quat=piece.pose[3:].tolist()
-    )
+    if piece.kind == "hull":
+        add_hull(spec, body, name, piece.vertices, piece.faces)
+    else:
+        add_shape(spec, body.add_geom(), piece, name)
 
 
 #: Least gap between two objects [m]; from walls it is that of the object, `GAP`.
@@ -296,21 +242,16 @@ def lay_beside(
     seed: int,
 ) -> tuple[Floats, Floats]:
     """Place M neighbours beside an object; return poses (S, 7) of the object and (S, M, 7).
-    All are `BETWEEN` apart and clear of all supports.
+    All are `BETWEEN` apart and clear of supports. Scene i depends on the objects, the supports, the seed and i alone.
 
     Args:
-        obj: the object that is grasped.
-        again: its pose (7,) in scene i at attempt k.
+        again: pose (7,) of the object in scene i at attempt k.
         others: the neighbours; each rests on z = 0.
-        supports: in the scene frame.
         within: x by y about the origin that they must not leave [m].
-        count: number of scenes S.
-        seed: any non-negative integer. Scene i depends on the objects, the supports, the seed and i alone.
 
     Raises:
         SceneError: they do not all fit.
-        MeshError: one never comes to rest, or is flat.
-    """
+        MeshError: one never comes to rest, or is flat."""
     resting = [drop(one, count=count, seed=_seed_of(seed, k))["scene/object_pose"] for k, one in enumerate(others)]
     hulls = _Hulls([obj, *others], supports, within)
     poses = np.zeros((count, 1 + len(others), 7))
@@ -344,7 +285,7 @@ def _drawn(
     for number, rest in enumerate(resting, start=1):
         far = reach * (hulls.objects[0].radius + hulls.objects[number].radius)
         for _ in range(_PLACES):
-            pose = _turned(rest, rng.uniform(0, 2 * np.pi))
+            pose = turned(rest, rng.uniform(0, 2 * np.pi))
             low, high = hulls.room(number, pose)
             centre = hulls.middle(number, pose)
             low, high = np.maximum(low, middle - far - centre), np.minimum(high, middle + far - centre)
@@ -359,15 +300,7 @@ def _drawn(
     return np.array(placed)
 
 
-def _turned(pose: Floats, angle: float) -> Floats:
-    """Return the pose turned about the vertical through the origin."""
-    about = np.concatenate([np.zeros(3), quat_from_axis_angle(np.array([0.0, 0, 1]), np.asarray(angle))])
-    return compose(about, pose)
-
-
 class _Hulls:
-    """Convex hulls of some objects, with their distances from each other and from obstacles."""
-
     def __init__(
         self, objects: Sequence[ObjectModel], supports: Sequence[Obstacle], within: tuple[float, float] | None
     ) -> None:
@@ -376,12 +309,11 @@ class _Hulls:
         self._room = np.inf if within is None else np.asarray(within) / 2 - GAP
         spec: Any = mujoco.MjSpec()
         for number, one in enumerate(objects):
-            add_hull(spec, spec.worldbody.add_body(mocap=True), str(number), one)
+            add_hull(spec, spec.worldbody.add_body(mocap=True), str(number), one.hull_vertices, one.hull_faces)
         self._model = spec.compile()
         self._data = mujoco.MjData(self._model)
 
     def middle(self, number: int, pose: Floats) -> Floats:
-        """Return the position (2,) of an object's centre of mass."""
         return np.asarray((quat_rotate(pose[3:], self.objects[number].centre_of_mass) + pose[:3])[:2])
 
     def room(self, number: int, pose: Floats) -> tuple[Floats, Floats]:
@@ -409,9 +341,7 @@ class _Hulls:
 
 def _beyond(support: Obstacle, corners: Floats) -> bool:
     """Check whether a hull lies beyond one plane of a support: on an upward plane, `GAP` away from others.
-
-    A plane separates two convex bodies. Where only an edge against an edge would separate them, the result is False.
-    """
+    A plane separates two convex bodies. Where only an edge against an edge would separate them, the result is False."""
     room = (corners @ support.planes[:, :3].T - support.planes[:, 3]).min(axis=0)
     least = np.where(support.planes[:, 2] > 1 - 1e-6, -SUNK, GAP)
     return bool((room >= least).any())

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import combinations
+from itertools import combinations, product
 from typing import Any, Final
 
 import mujoco
 import numpy as np
-from cachetools import LRUCache
 from numpy.typing import NDArray
 
 from graspd.service.model.errors import MeshError, SceneError
@@ -17,6 +16,7 @@ from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.model.transforms import Floats
 from graspd.worker.hands.primitives import convex_edges
 from graspd.worker.objects.convex import union_volume
+from graspd.worker.objects.memory_cache import cached_by_content
 from graspd.worker.objects.mesh_geometry import to_centre, to_file
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.scenes.kinds import SUNK, check_free, inside, rest_poses, room_in, supports_of
@@ -27,30 +27,26 @@ from graspd.worker.validation.decomposition import decompose
 #: Most convex pieces of a neighbour: no hand reaches into a neighbour's hollow, so hollows may be filled.
 MOST_PIECES: Final = 8
 
-_made: LRUCache[str, Neighbour] = LRUCache(32)
-
 
 def neighbour_of(obj: ObjectModel) -> Neighbour:
     """Return an object as a neighbour: convex pieces, merged by least added volume to `MOST_PIECES`.
-
-    Raises:
-        MeshError: the object is flat.
-    """
+    Raise MeshError for a flat object."""
     if any(obj.centre):
         middle, by = neighbour_of(obj.centred), np.array([*obj.centre, 1.0, 0, 0, 0])
         pieces = tuple(piece + by[:3] for piece in middle.pieces)
         return Neighbour(obj, pieces, tuple(solid.moved(by) for solid in middle.solids), middle.error_m, middle)
-    if (found := _made.get(obj.content)) is not None:
-        return replace(found, obj=obj)  # the same mesh may have another name
+    return replace(_neighbour(obj), obj=obj)  # the same mesh may have another name
+
+
+@cached_by_content(32)
+def _neighbour(obj: ObjectModel) -> Neighbour:
     try:
         pieces = decompose(obj).vertices
     except MeshError:
         pieces = (obj.hull_vertices,)  # an oversized shape is safe for an obstacle
     pieces = joined_pieces(pieces)
     solids = [outer_solid(piece) for piece in pieces]
-    made = Neighbour(obj, pieces, tuple(solid for solid, _ in solids), max(error for _, error in solids))
-    _made[obj.content] = made
-    return made
+    return Neighbour(obj, pieces, tuple(solid for solid, _ in solids), max(error for _, error in solids))
 
 
 def joined_pieces(pieces: Sequence[Floats], most: int = MOST_PIECES) -> tuple[Floats, ...]:
@@ -80,11 +76,7 @@ def scenes_of(
     """Create `count` scenes from a specification (with `faces all`, one for each stable face).
 
     Args:
-        spec: the surroundings of the object; not free.
-        obj: the object.
         others: the objects of `spec.neighbours`, in that order.
-        count: number of scenes S.
-        seed: any non-negative integer.
 
     Returns:
         The scenes, and `scene/object_pose` (S, 7), `scene/rest_probability` (S,), `scene/drop_seconds` (S,) and, where
@@ -123,7 +115,6 @@ def _centred_spec(spec: SceneSpec, obj: ObjectModel, others: Sequence[ObjectMode
 def _scenes_of(
     spec: SceneSpec, obj: ObjectModel, others: Sequence[ObjectModel], *, count: int, seed: int
 ) -> tuple[Scenes, dict[str, Floats]]:
-    """Create scenes of centred objects; see `scenes_of`."""
     supports = supports_of(spec)
     given = [one.pose for one in spec.neighbours if one.pose is not None]
     if not others:
@@ -134,7 +125,11 @@ def _scenes_of(
         stand = np.asarray(given, float)
         poses["scene/neighbour_pose"] = np.tile(stand, (len(poses["scene/object_pose"]), 1, 1))
     elif spec.faces == "drawn" and room_in(spec) is None:
-        poses = _dropped(obj, others, supports, count=count, seed=seed)
+        try:
+            poses = drop_together(obj, others, count=count, seed=seed)
+        except MeshError:
+            # Too many never come to rest apart.
+            poses = _laid(SceneSpec(kind="table"), obj, others, supports, count=count, seed=seed)
         check_free(obj, poses["scene/object_pose"], supports)
     else:
         poses = _laid(spec, obj, others, supports, count=count, seed=seed)
@@ -142,18 +137,9 @@ def _scenes_of(
     for number, other in enumerate(others):
         check_free(other, poses["scene/neighbour_pose"][:, number], supports)
     if given:
-        _check_apart([neighbour_of(obj), *beside], _all_poses(poses))
+        whole = np.concatenate([poses["scene/object_pose"][:, None], poses["scene/neighbour_pose"]], axis=1)
+        _check_apart([neighbour_of(obj), *beside], whole)
     return Scenes(supports, poses["scene/object_pose"], beside, poses["scene/neighbour_pose"]), poses
-
-
-def _dropped(
-    obj: ObjectModel, others: Sequence[ObjectModel], supports: Sequence[Obstacle], *, count: int, seed: int
-) -> dict[str, Floats]:
-    """Drop objects together; where too many never come to rest apart, lay them beside each other."""
-    try:
-        return drop_together(obj, others, count=count, seed=seed)
-    except MeshError:
-        return _laid(SceneSpec(kind="table"), obj, others, supports, count=count, seed=seed)
 
 
 def _laid(
@@ -178,15 +164,8 @@ def _laid(
     return {**poses, "scene/object_pose": found, "scene/neighbour_pose": beside}
 
 
-def _all_poses(poses: dict[str, Floats]) -> Floats:
-    """Return the poses (S, 1 + M, 7) of the object and its neighbours."""
-    return np.concatenate([poses["scene/object_pose"][:, None], poses["scene/neighbour_pose"]], axis=1)
-
-
 def _check_apart(things: Sequence[Neighbour], poses: Floats) -> None:
-    """Check that no two objects penetrate each other more than rounded poses explain."""
-    gaps = gaps_between(things, poses)
-    for (a, b), gap in gaps.items():
+    for (a, b), gap in gaps_between(things, poses).items():
         if -gap.min() > SUNK:
             names = things[a].obj.name, things[b].obj.name
             raise SceneError(
@@ -214,10 +193,8 @@ def gaps_between(things: Sequence[Neighbour], poses: Floats, farthest: float = 0
         data.mocap_pos[:], data.mocap_quat[:] = scene[:, :3], scene[:, 3:]
         mujoco.mj_kinematics(model, data)
         for a, b in pairs:
-            for i in range(first[a], first[a + 1]):
-                for j in range(first[b], first[b + 1]):
-                    gap = mujoco.mj_geomDistance(model, data, i, j, farthest, None)
-                    gaps[a, b][number] = min(gaps[a, b][number], gap)
+            geoms = product(range(first[a], first[a + 1]), range(first[b], first[b + 1]))
+            gaps[a, b][number] = min(mujoco.mj_geomDistance(model, data, i, j, farthest, None) for i, j in geoms)
     return gaps
 
 
@@ -228,17 +205,13 @@ ENOUGH_M: Final = 1e-3
 _SAME_M: Final = 1e-7
 
 
-def outer_solid(corners: Floats, most: int = MOST_PLANES) -> tuple[Obstacle, float]:
-    """Return a convex solid of at most `most` faces around points (V, 3).
+def outer_solid(corners: Floats) -> tuple[Obstacle, float]:
+    """Return a convex solid of at most `MOST_PLANES` faces around points (V, 3).
 
     It begins as their box. While it exceeds the points' hull by more than `ENOUGH_M`, its farthest corner is cut off by
     the face of the hull that it is farthest from. It never cuts into the hull.
 
-    Returns:
-        The solid, and its largest excess over the points' hull [m].
-
-    Raises:
-        MeshError: the points lie in a plane.
+    Return the solid, and its largest excess over the points' hull [m]; raise MeshError if the points lie in a plane.
     """
     from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
 
@@ -248,7 +221,7 @@ def outer_solid(corners: Floats, most: int = MOST_PLANES) -> tuple[Obstacle, flo
         planes = _box(corners)
         middle = corners[hull.vertices].mean(axis=0)
         found = HalfspaceIntersection(_as_qhull(planes), middle, incremental=True)
-        while len(planes) < most:
+        while len(planes) < MOST_PLANES:
             depth = found.intersections @ faces[:, :3].T - faces[:, 3]
             out = depth.max(axis=1)
             worst = int(np.argmax(out))
@@ -269,7 +242,6 @@ def _box(corners: Floats) -> Floats:
 
 
 def _as_qhull(planes: Floats) -> Floats:
-    """Return rows n, -d of n.x - d <= 0."""
     return np.column_stack([planes[:, :3], -planes[:, 3]])
 
 
@@ -288,7 +260,6 @@ def _corners_and_edges(points: Floats) -> tuple[Floats, NDArray[np.intp]]:
 
 
 def _outward(corners: Floats, triangles: NDArray[Any], normals: Floats) -> NDArray[Any]:
-    """Return the triangles, flipped where they face inwards."""
     a, b, c = (corners[triangles[:, k]] for k in range(3))
     inward = (np.cross(b - a, c - a) * normals).sum(axis=1) < 0
     triangles[inward] = triangles[inward][:, ::-1]

@@ -51,7 +51,6 @@ class RestingFaces:
 
     @property
     def stable(self) -> Ints:
-        """Indices of the stable faces."""
         return np.flatnonzero(self.successor == np.arange(len(self.successor))).astype(np.int32)
 
     def looseness(self, face: int) -> tuple[float, float]:
@@ -95,11 +94,7 @@ def rolling_note(rolling: int, scenes: int) -> str | None:
 
 
 def resting_faces(obj: ObjectModel) -> RestingFaces:
-    """Compute the faces of the object's convex hull and how it tips over them.
-
-    Raises:
-        MeshError: the hull is flat.
-    """
+    """Compute the faces of the object's convex hull and how it tips over them; raise MeshError for a flat hull."""
     import trimesh  # slow to load, seldom needed
 
     mesh = trimesh.Trimesh(obj.hull_vertices, obj.hull_faces, process=False)
@@ -158,9 +153,7 @@ def _edges(mesh: trimesh.Trimesh, label: Ints, normal: Floats, centre: Floats) -
 
 def settle(faces: RestingFaces, quaternion: Floats) -> tuple[int, float]:
     """Return the stable face below the object, and the angle by which it turns to lie flat [rad].
-
-    Start at the most downward face and tip over edges until a face is stable.
-    """
+    Start at the most downward face and tip over edges until a face is stable."""
     down = quat_rotate(np.asarray(quaternion) * np.array([1.0, -1, -1, -1]), np.array([0.0, 0.0, -1.0]))
     face = int(np.argmax(faces.normal @ down))
     # Tipping lowers the centre of mass, so it ends; the bound guards against rounding on spheres.

@@ -48,7 +48,6 @@ def rollout_on(
     level: Level = "standard",
 ) -> Callable[[GraspSet, PlacedGrasps | None, Floats], Floats] | None:
     """Return the rollout for `run`; None: the planner's loss decides. `known` caches verdicts of `level`.
-
     Around free objects a GPU plans faster than the CPU simulates; in scenes it waits for the rollouts, on all threads.
     """
     on_gpu = run.device.startswith("cuda")
@@ -67,15 +66,7 @@ def hold_rollout(
     level: Level = "standard",
 ) -> Callable[[GraspSet, PlacedGrasps | None, Floats], Floats]:
     """Return a `worker.planners.Rollout` that scores free grasps (N,) by short pushes.
-    Scores are below 2 for grasps that also hold against the six pushes.
-
-    Args:
-        hand: the hand.
-        obj: the object.
-        pieces: computes the object's convex pieces on first use.
-        known: cache of verdicts for the validator.
-        level: of the verdicts.
-    """
+    Scores are below 2 for grasps that also hold against the six pushes."""
     short, run = push_rollout(hand, obj, pieces), ExecutionContext(threads=1)
 
     def rollout(grasps: GraspSet, placed: PlacedGrasps | None, beat: Floats | None = None) -> Floats:
@@ -102,18 +93,8 @@ def lift_rollout(
 ) -> Callable[[GraspSet, PlacedGrasps | None, Floats], Floats]:
     """Return a `worker.planners.Rollout` that scores grasps (N,) in scenes by short lifts.
     Scores are below 1 for grasps with a clear trajectory that lift at half friction, below 2 at full friction.
-
     Candidates that hold the hanging object briefly get the validator's lift: a squeeze may turn an object out of the
-    hand slowly at first.
-
-    Args:
-        hand: the hand.
-        obj: the object.
-        pieces: computes the object's convex pieces on first use.
-        threads: per call; planners on the CPU already call from all their threads.
-        known: cache of lifts for the validator.
-        level: of the lift test.
-    """
+    hand slowly at first. `threads` are per call; planners on the CPU already call from all their threads."""
     shorts, run = LiftRollouts(hand, obj, pieces, threads=threads), ExecutionContext(threads=threads)
 
     def rollout(grasps: GraspSet, placed: PlacedGrasps | None, beat: Floats | None = None) -> Floats:
@@ -134,7 +115,6 @@ def lift_rollout(
         return score
 
     def lifted(grasps: GraspSet, placed: PlacedGrasps, score: Floats, beat: Floats) -> Floats:
-        """Return scores (k,) of candidates that hold briefly and whose trajectory is clear."""
         lift = partial(validate_lifts, hand, obj, level=level, pieces=pieces(), known=known, run=run)
         out, barely = np.maximum(score, SLIPS), score >= SLIPS
         some = np.flatnonzero(~barely)
@@ -176,23 +156,11 @@ def scene_verdicts(
     run: ExecutionContext,
 ) -> tuple[GraspSet, Arrays]:
     """Plan the trajectories of grasps in their scenes, and validate those that are clear.
-
-    Grasps that do not lift are not tested at half the friction.
-
-    Args:
-        hand: the hand.
-        obj: the object.
-        grasps: N grasps with `scene`.
-        scenes: the scenes.
-        level: of the lift test.
-        pieces: the object's convex pieces; None: grasps are only checked for clearance, not validated.
-        known: see `validate_lifts`.
-        run: receives the number of validated grasps; polled for cancellation between grasps.
+    Grasps that do not lift are not tested at half the friction. Without `pieces` grasps are only checked for clearance.
 
     Returns:
         The grasps with `approach`, `coming`, `lift` and `wrist`; columns of the base shard, `quality/success` being the
-        verdict of the lift (-1: not clear).
-    """
+        verdict of the lift (-1: not clear)."""
     assert grasps.scene is not None
     placed = scenes.placed(grasps.scene)
     way = plan_way(hand, obj, grasps, placed)

@@ -8,7 +8,6 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any, Final
 
 import mujoco
@@ -21,6 +20,7 @@ from graspd.service.model.transforms import Floats, quat_rotate
 from graspd.worker.engines.mujoco_warnings import void
 from graspd.worker.grasps import moved
 from graspd.worker.objects.disk_cache import arrays_kept_or_made
+from graspd.worker.objects.memory_cache import cached_by_content
 from graspd.worker.objects.mesh_geometry import to_file
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.scenes import rest as resting
@@ -43,27 +43,12 @@ MAX_ATTEMPTS: Final = 50
 #: Drops behind `scene/rest_probability`; a share of 64 is known to +-6 % (one standard deviation at one half).
 REFERENCE_DROPS: Final = 64
 _REFERENCE_SEED: Final = 2**31
-
-# Friction: sliding 0.8, and enough torsional and rolling friction (lengths, m) that a can or a ball stops on a cloth.
-_SCENE = """
-<mujoco>
-  <option timestep="{timestep}" integrator="implicitfast" cone="elliptic" gravity="0 0 -9.81"/>
-  <asset><mesh name="hull" inertia="shell"/></asset>
-  <worldbody>
-    <geom name="table" type="plane" size="5 5 0.1" friction="0.8 0.005 0.002" condim="6" solref="0.006 1"/>
-    <body name="object">
-      <freejoint/>
-      <geom type="mesh" mesh="hull" friction="0.8 0.005 0.002" condim="6" solref="0.006 1"/>
-    </body>
-  </worldbody>
-</mujoco>
-"""
+#: Friction: sliding 0.8, and enough torsional and rolling friction (lengths, m) that a can or a ball stops on a cloth.
+_CONTACT: Final[dict[str, Any]] = {"friction": [0.8, 0.005, 0.002], "condim": 6, "solref": [0.006, 1]}
 
 
 @dataclass(frozen=True)
 class RestPose:
-    """Result of a drop."""
-
     pose: Floats
     """(7,) object frame in the table frame, laid flat on `face`."""
     face: int
@@ -72,14 +57,10 @@ class RestPose:
 
 @dataclass(frozen=True)
 class _Table:
-    """Compiled simulation of one object."""
-
     model: mujoco.MjModel
     data: mujoco.MjData
     faces: RestingFaces
-    hull: Floats
-    centre: Floats
-    radius: float
+    obj: ObjectModel
 
 
 def drop(obj: ObjectModel, *, count: int, seed: int) -> dict[str, Floats]:
@@ -88,11 +69,6 @@ def drop(obj: ObjectModel, *, count: int, seed: int) -> dict[str, Floats]:
     Drops are redone with a new sample if they time out, roll away or end on no face that stays stable if the surface
     changes by a millimetre. An object that rolls is laid on a steady face, see `steadied`. Scene i depends on the
     object, the seed and i alone.
-
-    Args:
-        obj: the object.
-        count: number of scenes S.
-        seed: any non-negative integer.
 
     Returns:
         `scene/object_pose` (S, 7) with the lowest point of the object at z = 0; `scene/rest_probability` (S,), the
@@ -107,7 +83,7 @@ def drop(obj: ObjectModel, *, count: int, seed: int) -> dict[str, Floats]:
     table = _build(obj.centred)
     rests = []
     for scene in range(count):
-        rest, rng = _redo_until_rest(table, obj.name, (seed, scene)), np.random.default_rng([seed, scene, MAX_ATTEMPTS])
+        rest, rng = _redo_until_rest(table, (seed, scene)), np.random.default_rng([seed, scene, MAX_ATTEMPTS])
         face, pose = steadied(obj.centred, table.faces, rest.face, rest.pose, rng)
         rests.append(RestPose(pose, face, rest.seconds))
     poses = moved(np.array([rest.pose for rest in rests]).reshape(count, 7), np.zeros(3))
@@ -122,11 +98,9 @@ def steadied(
     obj: ObjectModel, faces: RestingFaces, face: int, pose: Floats, rng: np.random.Generator
 ) -> tuple[int, Floats]:
     """Return the face on which a centred object stays after coming to rest on `face`, and its pose (7,).
-
     Where it may roll there, draw one of the faces of the reference drops on which it does not, with their frequency. An
-    object that is round on all of them stays as it lies.
-    """
-    if not faces.rolls(face) or not (steady := _steady_faces(_ByContent(obj))):
+    object that is round on all of them stays as it lies."""
+    if not faces.rolls(face) or not (steady := _steady_faces(obj)):
         return face, pose
     chosen = int(rng.choice(steady))
     return chosen, lay_flat(faces, chosen, pose)
@@ -142,31 +116,18 @@ def reference_share(obj: ObjectModel, faces: Sequence[int]) -> Floats:
     if not faces:
         return np.zeros(0)
     obj = obj.centred
-    known, reference = resting_faces(obj), np.array(_reference_faces(_ByContent(obj)))
+    known, reference = resting_faces(obj), np.array(_reference_faces(obj))
     return np.array([same_face(known, face, reference).sum() for face in faces]) / REFERENCE_DROPS
 
 
-class _ByContent:
-    """An object as a cache key."""
-
-    def __init__(self, obj: ObjectModel) -> None:
-        self.obj = obj
-
-    def __hash__(self) -> int:
-        return hash(self.obj.content)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _ByContent) and self.obj.content == other.obj.content
-
-
-@lru_cache(maxsize=64)
-def _reference_faces(of: _ByContent) -> tuple[int, ...]:
+@cached_by_content(64)
+def _reference_faces(obj: ObjectModel) -> tuple[int, ...]:
     """Return the faces that the reference drops rest on: two seconds of computation, cached on disk."""
-    obj, code = of.obj, (sys.modules[__name__], resting)
+    code = (sys.modules[__name__], resting)
 
     def drops() -> dict[str, NDArray[Any]]:
         table = _build(obj)
-        rests = [_redo_until_rest(table, obj.name, (_REFERENCE_SEED, k)) for k in range(REFERENCE_DROPS)]
+        rests = [_redo_until_rest(table, (_REFERENCE_SEED, k)) for k in range(REFERENCE_DROPS)]
         return {"face": np.array([rest.face for rest in rests])}
 
     def fits(kept: Mapping[str, NDArray[Any]]) -> bool:
@@ -178,48 +139,59 @@ def _reference_faces(of: _ByContent) -> tuple[int, ...]:
     return tuple(kept["face"].tolist())
 
 
-@lru_cache(maxsize=64)
-def _steady_faces(of: _ByContent) -> tuple[int, ...]:
-    """Return those of the reference faces on which the object does not roll."""
-    faces = resting_faces(of.obj)
-    return tuple(face for face in _reference_faces(of) if not faces.rolls(face))
+@cached_by_content(64)
+def _steady_faces(obj: ObjectModel) -> tuple[int, ...]:
+    faces = resting_faces(obj)
+    return tuple(face for face in _reference_faces(obj) if not faces.rolls(face))
+
+
+def spec_above_table(objects: Sequence[ObjectModel]) -> Any:
+    spec = mujoco.MjSpec()
+    spec.option.timestep = TIMESTEP_S
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[5, 5, 0.1], **_CONTACT)
+    for number, obj in enumerate(objects):
+        body = spec.worldbody.add_body(name=str(number))
+        body.add_freejoint()
+        add_hull(spec, body, str(number), obj.hull_vertices, obj.hull_faces, **_CONTACT)
+        mass = DENSITY * obj.volume
+        body.explicitinertial = True
+        body.mass, body.ipos = mass, obj.centre_of_mass
+        body.fullinertia = (mass * obj.inertia)[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+    return spec
+
+
+def add_hull(spec: Any, body: Any, name: str, vertices: Floats, faces: NDArray[Any], **options: Any) -> None:
+    """Add a convex hull to a body of a MuJoCo specification, with options of the geom."""
+    mesh = spec.add_mesh(name=name, inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)
+    mesh.uservert = np.asarray(vertices, np.float32).ravel()
+    mesh.userface = np.asarray(faces, np.int32).ravel()
+    body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, **options)
 
 
 def _build(obj: ObjectModel) -> _Table:
-    spec = mujoco.MjSpec.from_string(_SCENE.format(timestep=TIMESTEP_S))
-    mesh = spec.mesh("hull")
-    mesh.uservert = np.asarray(obj.hull_vertices, np.float32).ravel()
-    mesh.userface = np.asarray(obj.hull_faces, np.int32).ravel()
-    body = spec.body("object")
-    mass = DENSITY * obj.volume
-    body.explicitinertial = True
-    body.mass, body.ipos = mass, obj.centre_of_mass
-    inertia = mass * obj.inertia
-    body.fullinertia = [inertia[0, 0], inertia[1, 1], inertia[2, 2], inertia[0, 1], inertia[0, 2], inertia[1, 2]]
     try:
-        model = spec.compile()
+        model = spec_above_table([obj]).compile()
     except ValueError as error:
         reason = str(error).splitlines()[0]
         raise MeshError(f"{obj.name!r} cannot be dropped: {reason}; check that its mesh has volume") from None
-    return _Table(
-        model, mujoco.MjData(model), resting_faces(obj), obj.hull_vertices, obj.centre_of_mass, float(obj.radius)
-    )
+    return _Table(model, mujoco.MjData(model), resting_faces(obj), obj)
 
 
-def _redo_until_rest(table: _Table, name: str, key: tuple[int, int]) -> RestPose:
+def _redo_until_rest(table: _Table, key: tuple[int, int]) -> RestPose:
     for attempt in range(MAX_ATTEMPTS):
         rest = _drop_once(table, np.random.default_rng([*key, attempt]))
         if rest is not None:
             return rest
-    raise MeshError(f"{name!r} did not come to rest in any of {MAX_ATTEMPTS} drops; is it a perfect ball?")
+    raise MeshError(f"{table.obj.name!r} did not come to rest in any of {MAX_ATTEMPTS} drops; is it a perfect ball?")
 
 
 def _drop_once(table: _Table, rng: np.random.Generator) -> RestPose | None:
-    """Drop once; None if it timed out, rolled away, or ended on no face or on one that it topples from."""
     quaternion = rng.normal(size=4)
     quaternion /= np.linalg.norm(quaternion)
-    lowest = float(quat_rotate(quaternion, table.hull)[:, 2].min())
-    centre = quat_rotate(quaternion, table.centre)
+    lowest = float(quat_rotate(quaternion, table.obj.hull_vertices)[:, 2].min())
+    centre = quat_rotate(quaternion, table.obj.centre_of_mass)
     position = np.array([-centre[0], -centre[1], rng.uniform(*DROP_HEIGHT) - lowest])
     data = table.data
     mujoco.mj_resetData(table.model, data)
@@ -232,22 +204,19 @@ def _drop_once(table: _Table, rng: np.random.Generator) -> RestPose | None:
     if angle > MAX_SETTLE_ANGLE or table.faces.topples(face):
         return None
     pose = lay_flat(table.faces, face, np.concatenate([data.qpos[:3], quaternion]))
-    away = float(np.hypot(*(pose[:3] + quat_rotate(pose[3:], table.centre))[:2]))
+    away = float(np.hypot(*(pose[:3] + quat_rotate(pose[3:], table.obj.centre_of_mass))[:2]))
     return RestPose(pose, face, seconds) if away < REACH else None
 
 
 def _run(table: _Table) -> float | None:
-    """Simulate until rest; return simulated seconds, or None after `TIMEOUT_S`."""
-    model, data = table.model, table.data
-    window = round(REST_WINDOW_S / TIMESTEP_S)
-    quiet = 0
+    model, data, quiet = table.model, table.data, 0
     for step in range(round(TIMEOUT_S / TIMESTEP_S)):
         mujoco.mj_step(model, data)
         # Velocity of the body frame's origin and spin in the body frame: the spin bounds the speed of any point.
         spin = data.qvel[3:]
-        centre_velocity = data.qvel[:3] + quat_rotate(data.qpos[3:], np.cross(spin, table.centre))
-        speed = np.linalg.norm(centre_velocity) + table.radius * np.linalg.norm(spin)
+        centre_velocity = data.qvel[:3] + quat_rotate(data.qpos[3:], np.cross(spin, table.obj.centre_of_mass))
+        speed = np.linalg.norm(centre_velocity) + table.obj.radius * np.linalg.norm(spin)
         quiet = quiet + 1 if speed < REST_SPEED and data.ncon > 0 else 0
-        if quiet >= window:
+        if quiet >= round(REST_WINDOW_S / TIMESTEP_S):
             return (step + 1) * TIMESTEP_S
     return None

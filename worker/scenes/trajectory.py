@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import Final
 
 import numpy as np
@@ -106,10 +107,8 @@ def plan_way(hand: HandModel, obj: ObjectModel, grasps: GraspSet, placed: Placed
 
 def plan_free_way(hand: HandModel, obj: ObjectModel, grasps: GraspSet) -> Trajectory:
     """Plan trajectories around an object that stands alone: a retreat of `STANDOFF_M` free of the object.
-
     The palm's own direction of retreat comes first, then directions ever farther from it. `lift` is the squeeze posture
-    after that retreat, with the object in hand. There are no obstacles, so all clearances are infinite.
-    """
+    after that retreat, with the object in hand. There are no obstacles, so all clearances are infinite."""
     hand_points, object_points = _FREE_POINTS
     probe = probe_of(hand, obj, hand_points=hand_points, object_points=object_points)
     nowhere = PlacedGrasps((), IDENTITY_POSE[None], np.zeros(len(grasps), np.intp))
@@ -149,6 +148,13 @@ def _tilted(axis: Floats, tilt: float, side: int) -> Floats:
     return quat_rotate(quat_from_axis_angle(axis, np.full(len(axis), 2 * np.pi * side / SIDES)), leaning)
 
 
+def _retreat(hand_pose: Floats, way: Floats, steps: int) -> Floats:
+    """Return poses (n, steps, 7) from `STANDOFF_M` along ways (n, 3) to the hands' poses."""
+    poses = np.repeat(hand_pose[:, None], steps, axis=1)
+    poses[..., :3] += np.linspace(STANDOFF_M, 0.0, steps)[:, None] * way[:, None]
+    return poses
+
+
 def _coming(
     probe: Probe, pregrasp: Posture, scene: Environment, ways: Sequence[Floats]
 ) -> tuple[Floats, Floats, NDArray[np.bool_], Floats]:
@@ -162,8 +168,7 @@ def _coming(
     open_ = np.arange(count)
     for tried in ways:
         way = tried[open_]
-        poses = np.repeat(pregrasp.hand_pose[open_, None], looks, axis=1)
-        poses[..., :3] += np.linspace(STANDOFF_M, 0.0, looks)[:, None] * way[:, None]
+        poses = _retreat(pregrasp.hand_pose[open_], way, looks)
         joints = np.repeat(pregrasp.joint_positions[open_], looks, axis=0)
         postures = Posture(poses.reshape(-1, 7), joints)
         room = obstacle_room(probe.hand, postures, [scene]).reshape(len(open_), looks).min(axis=1)
@@ -177,9 +182,7 @@ def _coming(
         open_ = open_[best[open_] < MARGIN_M]
         if not len(open_):
             break
-    poses = np.repeat(pregrasp.hand_pose[:, None], WAYPOINTS, axis=1)
-    poses[..., :3] += np.linspace(STANDOFF_M, 0.0, WAYPOINTS)[:, None] * chosen[:, None]
-    return poses, least, touching, chosen
+    return _retreat(pregrasp.hand_pose, chosen, WAYPOINTS), least, touching, chosen
 
 
 def _gaps(probe: Probe, postures: Posture) -> Floats:
@@ -217,27 +220,20 @@ def come_open(
     best, least, touching = np.full(count, -np.inf), np.zeros(count), np.ones(count, bool)
     chosen, joints = np.zeros((count, 3)), np.array(wide)
     open_ = np.arange(count)
-    for openness in OPENNESS:
-        for share in SHARES_UP:
-            way = (1 - share) * back[open_] + share * up[open_]
-            length = np.linalg.norm(way, axis=1, keepdims=True)
-            way = np.where(length > 1e-6, way / np.maximum(length, 1e-6), up[open_])
-            start = pregrasp.joint_positions[open_]
-            opened = start + openness * (wide[open_] - start)
-            room, gap = _seen(probe, pregrasp.take(open_), opened, wrist[open_], way, placed.take(open_))
-            score = np.minimum(room, MARGIN_M) + 0.1 * np.minimum(gap, OBJECT_WANTED_M) - (gap < OBJECT_MARGIN_M)
-            better = score > best[open_]
-            rows = open_[better]
-            best[rows], least[rows], touching[rows] = score[better], room[better], gap[better] < OBJECT_MARGIN_M
-            chosen[rows], joints[rows] = way[better], opened[better]
-            open_ = open_[best[open_] < MARGIN_M + 0.1 * OBJECT_WANTED_M - 1e-9]
-            if not len(open_):
-                break
+    for openness, share in product(OPENNESS, SHARES_UP):
+        way = _unit((1 - share) * back[open_] + share * up[open_], up[open_])
+        start = pregrasp.joint_positions[open_]
+        opened = start + openness * (wide[open_] - start)
+        room, gap = _seen(probe, pregrasp.take(open_), opened, wrist[open_], way, placed.take(open_))
+        score = np.minimum(room, MARGIN_M) + 0.1 * np.minimum(gap, OBJECT_WANTED_M) - (gap < OBJECT_MARGIN_M)
+        better = score > best[open_]
+        rows = open_[better]
+        best[rows], least[rows], touching[rows] = score[better], room[better], gap[better] < OBJECT_MARGIN_M
+        chosen[rows], joints[rows] = way[better], opened[better]
+        open_ = open_[best[open_] < MARGIN_M + 0.1 * OBJECT_WANTED_M - 1e-9]
         if not len(open_):
             break
-    poses = np.repeat(pregrasp.hand_pose[:, None], WAYPOINTS, axis=1)
-    poses[..., :3] += np.linspace(STANDOFF_M, 0.0, WAYPOINTS)[:, None] * chosen[:, None]
-    return poses, joints, least, touching
+    return _retreat(pregrasp.hand_pose, chosen, WAYPOINTS), joints, least, touching
 
 
 def _seen(

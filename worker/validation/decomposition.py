@@ -10,11 +10,12 @@ from __future__ import annotations
 import hashlib
 import logging
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from pathlib import Path
+from threading import Condition
 from typing import Final
 
 import numpy as np
+from cachetools import LRUCache, cached
 
 from graspd.service.model.digests import digest_json
 from graspd.service.model.errors import MeshError
@@ -86,13 +87,12 @@ def decompose(obj: ObjectModel, *, cache: Path | None = None) -> ConvexPieces:
     """Return the convex pieces of an object, from the cache if possible.
 
     Args:
-        obj: the object.
         cache: cache folder; by default `$XDG_CACHE_HOME/graspd/convex`.
 
     Raises:
         MeshError: the mean excess of the best pieces is above `MAX_EXCESS_M`.
     """
-    pieces = _load_or_make(_Key(obj.centred), cache or default_cache())
+    pieces = _load_or_make(obj.centred, piece_file(obj, cache))
     if pieces.excess_m > MAX_EXCESS_M:
         raise MeshError(
             f"{obj.name}: its {len(pieces)} convex pieces have {pieces.volume_ratio:.2f} times its volume and "
@@ -105,38 +105,20 @@ def decompose(obj: ObjectModel, *, cache: Path | None = None) -> ConvexPieces:
 
 def piece_file(obj: ObjectModel, cache: Path | None = None) -> Path:
     """Return the cache file of an object's pieces; its stem is a digest of all that determines them."""
-    return _file(_Key(obj.centred), cache or default_cache())
+    mesh = obj.centred
+    shape = hashlib.sha256(mesh.vertices.tobytes() + mesh.faces.tobytes()).hexdigest()
+    settings = [_COACD, THRESHOLDS, GOOD_EXCESS_M, version_of("coacd")]
+    return (cache or default_cache()) / f"{digest_json({'shape': shape, 'settings': settings})}.npz"
 
 
-class _Key:
-    """An object with the digest of everything that determines its pieces."""
-
-    def __init__(self, obj: ObjectModel) -> None:
-        self.obj = obj
-        shape = hashlib.sha256(obj.vertices.tobytes() + obj.faces.tobytes()).hexdigest()
-        settings = [_COACD, THRESHOLDS, GOOD_EXCESS_M, version_of("coacd")]
-        self.digest = digest_json({"shape": shape, "settings": settings})
-
-    def __hash__(self) -> int:
-        return hash(self.digest)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Key) and other.digest == self.digest
-
-
-@lru_cache(maxsize=64)
-def _load_or_make(key: _Key, cache: Path) -> ConvexPieces:
-    file = _file(key, cache)
+@cached(LRUCache(64), key=lambda _, file: file, condition=Condition())
+def _load_or_make(obj: ObjectModel, file: Path) -> ConvexPieces:
     parts = load_parts(file) if file.is_file() else None
     if parts is None:
-        parts = _make(key.obj)
+        parts = _make(obj)
         keep_parts(file, parts)
     volume = union_volume(parts)
-    return ConvexPieces(parts, volume / key.obj.volume, _excess(volume, key.obj), _digest(parts))
-
-
-def _file(key: _Key, cache: Path) -> Path:
-    return cache / f"{key.digest}.npz"
+    return ConvexPieces(parts, volume / obj.volume, _excess(volume, obj), _digest(parts))
 
 
 def _excess(volume: float, obj: ObjectModel) -> float:

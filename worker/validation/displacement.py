@@ -19,8 +19,8 @@ from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
 from graspd.worker.grasps import Posture
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.memory_cache import cached_by_content
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.validation.compiled import slipping_model
 from graspd.worker.validation.decomposition import ConvexPieces, decompose
 from graspd.worker.validation.model import add_object, add_shape
 
@@ -39,12 +39,8 @@ def simulated_displacement_cm(
     pieces: ConvexPieces | None = None,
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> Floats:
-    """Return displacements (N,) of the centre of mass for N postures [cm]; nan: simulation diverged.
-
-    Raises:
-        MeshError: the object has no usable convex pieces.
-    """
-    model = slipping_model(hand, obj, pieces or decompose(obj), _build)
+    """Return displacements (N,) of the centre of mass for N postures [cm]; nan: simulation diverged."""
+    model = _model(hand, obj, pieces or decompose(obj))
     bodies = body_poses(hand, grasp.hand_pose, grasp.joint_positions)
     centre = obj.centre_of_mass
 
@@ -59,7 +55,8 @@ def simulated_displacement_cm(
         return 100.0 * np.array(list(pool.map(work, bodies)), float)
 
 
-def _build(hand: HandModel, obj: ObjectModel, pieces: ConvexPieces) -> Any:
+@cached_by_content(8)
+def _model(hand: HandModel, obj: ObjectModel, pieces: ConvexPieces) -> Any:
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
     spec.memory = ARENA

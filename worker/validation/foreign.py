@@ -22,6 +22,7 @@ from graspd.worker.objects.model import ObjectModel
 from graspd.worker.validation.decomposition import ConvexPieces
 from graspd.worker.validation.key import Level
 from graspd.worker.validation.validator import Verdicts, validate
+from graspd.worker.validation.variant import nearest
 
 
 @dataclass(frozen=True)
@@ -53,10 +54,8 @@ class ForeignVerdicts:
 
 def share_counts(held: Mapping[str, int]) -> dict[str, Any]:
     """Return shares from counts of grasps that hold in both models, in one alone, or in neither.
-
     foreign_held: the counts; agreement: share with the same verdict in both; foreign_share: of the grasps that hold
-    nominally, the share that holds in the other model; foreign_gsr: the share of all that does. None: no grasps.
-    """
+    nominally, the share that holds in the other model; foreign_gsr: the share of all that does. None: no grasps."""
     n, nominal = sum(held.values()), held["both"] + held["nominal"]
 
     def share(part: int, whole: int) -> float | None:
@@ -88,11 +87,9 @@ def foreign_verdicts(
 
 def driven_as(same: SameHand) -> HandModel:
     """Return the other model with the gains and limits of ours.
-
     A dof of gain k and limit e that moves n joints by m_i gives each of them the gain k / (n m_i^2) and the limit
     e / (n |m_i|). It takes sum(m_i^2 k_i) and sum(|m_i| e_i) from joints. So the drive along the joints' common
-    motion stays the same, whether a model turns them as one or hangs them on a tendon of equal pulls.
-    """
+    motion stays the same, whether a model turns them as one or hangs them on a tendon of equal pulls."""
     ours, theirs = same.ours, same.theirs
     gain, limit = _of_joints(ours)
     gain, limit = gain[same.joints], limit[same.joints]
@@ -104,7 +101,6 @@ def driven_as(same: SameHand) -> HandModel:
 
 
 def _of_joints(hand: HandModel) -> tuple[Floats, Floats]:
-    """Return gains and limits (J,) of joints."""
     dof, rate = hand.dof[hand.joint_body], hand.multiplier[hand.joint_body]
     joints = np.bincount(dof, minlength=hand.dofs)[dof]
     return hand.stiffness[dof] / (joints * rate**2), hand.effort[dof] / (joints * np.abs(rate))
@@ -112,25 +108,15 @@ def _of_joints(hand: HandModel) -> tuple[Floats, Floats]:
 
 def in_other_model(same: SameHand, grasps: GraspSet) -> GraspSet:
     """Return the grasps as postures of the other model: base transformed, joints matched by name.
-
-    Where joints are coupled in the other model but not in ours, they take the nearest feasible values.
-    """
+    Where joints are coupled in the other model but not in ours, they take the nearest feasible values."""
 
     def posture(part: Posture) -> Posture:
-        pose = compose(np.asarray(part.hand_pose, float), same.base)
-        return Posture(pose, _nearest(same.theirs, np.asarray(part.joint_positions, float)[:, same.joints]))
+        pose, joints = compose(part.hand_pose, same.base), part.joint_positions[:, same.joints]
+        free = same.theirs.dofs == len(same.theirs.joint_names)
+        return Posture(pose, joints if free else nearest(same.theirs, joints))
 
     loss = np.asarray(grasps.stability_loss, float)
     return GraspSet(posture(grasps.grasp), posture(grasps.pregrasp), posture(grasps.squeeze), loss)
-
-
-def _nearest(hand: HandModel, joints: Floats) -> Floats:
-    if hand.dofs == len(hand.joint_names):
-        return joints
-    dof, rate = hand.dof[hand.joint_body], hand.multiplier[hand.joint_body]
-    drive = np.zeros((len(dof), hand.dofs))
-    drive[np.arange(len(dof)), dof] = rate
-    return hand.expand((joints - hand.offset[hand.joint_body]) @ np.linalg.pinv(drive).T)
 
 
 def with_our_shapes(same: SameHand) -> HandModel:

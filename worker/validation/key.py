@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict
-from pathlib import Path
 from types import ModuleType
 from typing import Any, Final, Literal
 
@@ -19,7 +18,7 @@ from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.validation import model, protocol
-from graspd.worker.validation.decomposition import ConvexPieces, decompose
+from graspd.worker.validation.decomposition import ConvexPieces
 
 Level = Literal["dexgraspbench", "standard", "fast"]
 
@@ -70,25 +69,12 @@ LEVEL_MOVES: Final[dict[Level, dict[ModuleType, tuple[str, ...]]]] = {
 
 
 def verdict_key(
-    hand: HandModel,
-    obj: ObjectModel,
-    level: Level,
-    hard: bool,
-    *,
-    pieces: ConvexPieces | None = None,
-    cache: Path | None = None,
-    prefilter: Sequence[Any] = (),
+    hand: HandModel, obj: ObjectModel, level: Level, hard: bool, *, pieces: ConvexPieces, prefilter: Sequence[Any] = ()
 ) -> str:
     """Return the digest of the terms of a verdict: all that determines it except the grasp's postures.
-
     It covers level, friction, masses, gains and torque limits, the rules of pregrasp and squeeze, shapes of the hand,
     convex pieces of the object, the constants of `MOVES` and of the level, version of the engine; and `prefilter`,
-    the prefilter's terms where it takes part.
-
-    Raises:
-        MeshError: `pieces` is not given and the object has no usable ones.
-    """
-    pieces = pieces or decompose(obj, cache=cache)
+    the prefilter's terms where it takes part."""
     shapes = b"".join(np.round(p.vertices, 9).tobytes() + np.round(p.pose, 9).tobytes() for p in hand.pieces)
     return digest_json(
         {
@@ -125,9 +111,7 @@ def _values(names: dict[ModuleType, tuple[str, ...]]) -> dict[str, Any]:
     out: dict[str, Any] = {}
     for part, there in names.items():
         group = out.setdefault((postures if part is opening else part).__name__.rpartition(".")[2], {})
-        group |= {name: _plain(getattr(part, name)) for name in there}
+        for name in there:
+            value = getattr(part, name)
+            group[name] = asdict(value) if isinstance(value, model.MujocoOptions) else value
     return out
-
-
-def _plain(value: Any) -> Any:
-    return asdict(value) if isinstance(value, model.MujocoOptions) else value

@@ -43,8 +43,6 @@ SMOOTHLY: Final = np.asarray(np.polyval([6, -15, 10, 0, 0, 0], np.linspace(0, 1,
 
 
 class LiftOutcome(IntEnum):
-    """Outcome of a lift."""
-
     NOT_TRIED = 0
     LIFTED = 1
     PENETRATION = 2
@@ -58,8 +56,6 @@ class LiftOutcome(IntEnum):
 
 @dataclass
 class LiftTest:
-    """Verdict on one grasp."""
-
     outcome: LiftOutcome = LiftOutcome.NOT_TRIED
     margin: float = 0.0
     """Worst displacement or rotation from the commanded pose over its limit, from the lift's end on."""
@@ -121,7 +117,7 @@ class Lift(Test):
         self._put(grasps.pregrasp.hand_pose[row], grasps.pregrasp.joint_positions[row])
         mujoco.mj_forward(self.scene.model, self.data)
         rollout = LiftTest()
-        if max(self._depths_here()) > MAX_PENETRATION_M:
+        if max(self.penetration()) > MAX_PENETRATION_M:
             rollout.outcome = LiftOutcome.PENETRATION
         return rollout
 
@@ -135,7 +131,6 @@ class Lift(Test):
             self.data.xfrc_applied[free.body, :3] = -ACCELERATION * free.mass * self._up
 
     def _neighbours_moved(self) -> bool:
-        """Check whether a neighbour was displaced or toppled."""
         for free, pose in zip(self.scene.neighbours, self._beside, strict=True):
             now = self.data.qpos[free.qpos : free.qpos + 7]
             moved = float(np.linalg.norm(now[:3] - pose[:3] - quat_rotate(pose[3:], free.centre)))
@@ -144,39 +139,24 @@ class Lift(Test):
                 return True
         return False
 
-    def _depths_here(self) -> tuple[float, float]:
-        """Return the deepest penetration of the hand into the object, and into itself or a support [m]."""
-        contact = self.data.contact
-        if not len(contact.dist):
-            return 0.0, 0.0
-        ours, support = self.scene.hand_geoms[contact.geom], self.scene.support_geoms[contact.geom]
-        hand, within = ours.any(axis=1), ours.all(axis=1) | (ours | support).all(axis=1)
-        depth = np.maximum(0.0, -np.asarray(contact.dist))
-        return float(depth[hand & ~within].max(initial=0.0)), float(depth[hand & within].max(initial=0.0))
-
     def _touches(self, grasps: GraspSet, row: int) -> bool:
         """Check whether the open hand penetrates the object or a support on its approach."""
         assert grasps.approach is not None, "a lift needs the grasps' approach"
         assert grasps.coming is not None
         path, joints = grasps.approach[row], grasps.coming[row]
+        shares = np.arange(LOOKS) / LOOKS
         for a, b in pairwise(path):
-            for share in np.arange(LOOKS) / LOOKS:
+            for share in shares:
                 pose = np.concatenate([(1 - share) * a[:3] + share * b[:3], slerp(a[3:], b[3:], float(share))])
-                self._put(pose, joints)
-                mujoco.mj_kinematics(self.scene.model, self.data)
-                mujoco.mj_collision(self.scene.model, self.data)
-                if self._in_touch():
+                if self._in_touch(pose, joints):
                     return True
         wide, closed = Posture(path[-1:], joints[None]), grasps.pregrasp.take(slice(row, row + 1))
-        for share in np.arange(LOOKS) / LOOKS:
-            self._put(*blend(wide, closed, 0, float(share)))
-            mujoco.mj_kinematics(self.scene.model, self.data)
-            mujoco.mj_collision(self.scene.model, self.data)
-            if self._in_touch():
-                return True
-        return False
+        return any(self._in_touch(*blend(wide, closed, 0, float(share))) for share in shares)
 
-    def _in_touch(self) -> bool:
+    def _in_touch(self, hand_pose: Floats, joints: Floats) -> bool:
+        self._put(hand_pose, joints)
+        mujoco.mj_kinematics(self.scene.model, self.data)
+        mujoco.mj_collision(self.scene.model, self.data)
         contact = self.data.contact
         if not len(contact.dist):
             return False
@@ -208,13 +188,11 @@ class Lift(Test):
         return np.asarray(at - self._goal)
 
     def _turned(self) -> Floats:
-        """Return the rotation (4,) of the object since the start."""
         turned, yielded = super()._turned(), self._yielded()
         return turned if yielded is None else quat_multiply(quat_conjugate(yielded[1]), turned)
 
     def _yielded(self) -> tuple[Floats, Floats] | None:
         """Return the root's position (3,) and its rotation (4,) from the command; None: fixed or irrelevant.
-
         The protocol's weld yields by 10 degrees under a hammer, which no arm does: an object that only follows the hand
         has not moved in it."""
         at = self.scene.root_qpos

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Final, Literal, get_args
 
 import numpy as np
@@ -14,18 +12,17 @@ from numpy.typing import NDArray
 from graspd.service.model.digests import digest_bytes, digest_json
 from graspd.service.model.errors import InputError
 from graspd.worker.control import postures
-from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
+from graspd.worker.execution_context import DEFAULT_CONTEXT, Count, ExecutionContext, answers
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.simulation import environment as surroundings
 from graspd.worker.simulation.environment import PlacedGrasps
 from graspd.worker.validation import lift as protocol
-from graspd.worker.validation.compiled import answers, scene_of
 from graspd.worker.validation.decomposition import ConvexPieces, decompose
 from graspd.worker.validation.key import postures_key, verdict_key
 from graspd.worker.validation.lift import Lift, LiftOutcome, LiftTest
-from graspd.worker.validation.model import TOUCH_ROUNDING_M, MujocoOptions
+from graspd.worker.validation.model import TOUCH_ROUNDING_M, MujocoOptions, scene_of
 
 LiftLevel = Literal["dexgraspbench", "lift"]
 #: Finished lifts, by `lift_of`.
@@ -43,9 +40,7 @@ class LiftVerdicts:
     success: NDArray[np.int8]
     """(N,) 1 lifted and held, 0 not."""
     outcome: NDArray[np.uint8]
-    """(N,) `LiftOutcome`."""
     margin: NDArray[np.float64]
-    """(N,) worst displacement or rotation over its limit."""
     level: LiftLevel
     hard: bool
     terms: str
@@ -67,7 +62,6 @@ def validate_lifts(
     level: LiftLevel = "lift",
     hard: bool = False,
     pieces: ConvexPieces | None = None,
-    cache: Path | None = None,
     known: KnownLifts | None = None,
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> LiftVerdicts:
@@ -78,10 +72,8 @@ def validate_lifts(
         obj: the object, with its mass and friction; `ObjectModel.published` has those of the protocol.
         grasps: N grasps with pregrasp, squeeze and, for level lift, approach.
         placed: their scenes; `index` has one for each grasp.
-        level: dexgraspbench or lift.
         hard: sliding friction halved, torsional friction a tenth, of supports too.
         pieces: convex pieces of the object; by default its CoACD pieces.
-        cache: folder of the pieces.
         known: finished lifts of this hand, object and level, which are reused; new ones are added.
         run: receives the number of finished grasps; polled for cancellation between grasps.
 
@@ -92,13 +84,12 @@ def validate_lifts(
     """
     require_ways(grasps, placed, level)
     began = time.perf_counter()
-    pieces = pieces or decompose(obj, cache=cache)
+    pieces = pieces or decompose(obj)
     physics = MujocoOptions().hardened() if hard else MujocoOptions()
     scene = scene_of(hand, obj, pieces, physics, placed.supports, placed.neighbours)
-    done, lock = 0, threading.Lock()
+    done = Count(len(grasps), run, "lifts")
 
     def ask(test: Lift, row: int) -> LiftTest:
-        nonlocal done
         run.check("the validator")
         key = lift_of(grasps, row, placed, hard=hard) if known is not None else ""
         rollout = known.get(key) if known is not None else None
@@ -106,9 +97,7 @@ def validate_lifts(
             rollout = test.dexgraspbench(grasps, row) if level == "dexgraspbench" else test.lift(grasps, row)
             if known is not None:
                 known[key] = rollout
-        with lock:
-            done += 1
-            run.progress(done, len(grasps), "lifts")
+        done.add(1)
         return rollout
 
     rollouts = answers(range(len(grasps)), lambda: Lift(scene, placed), ask, threads=run.cores, name="lift")
@@ -133,11 +122,7 @@ def lift_of(grasps: GraspSet, row: int, placed: PlacedGrasps, *, hard: bool) -> 
 
 
 def require_ways(grasps: GraspSet, placed: PlacedGrasps, level: LiftLevel) -> None:
-    """Check that each grasp has a scene and an approach.
-
-    Raises:
-        InputError: unknown level, or no scene or approach to lift from.
-    """
+    """Raise InputError for an unknown level, or where a grasp has no scene or approach to lift from."""
     if level not in LEVELS:
         raise InputError(f"unknown level {level!r} of the lift test; choose one of {', '.join(LEVELS)}")
     if len(placed.index) != len(grasps) or (level == "lift" and grasps.approach is None):

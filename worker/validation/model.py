@@ -19,6 +19,7 @@ from graspd.worker.grasps import Posture
 from graspd.worker.hands.jaws import jaws_of
 from graspd.worker.hands.model import ConvexPiece, HandModel, JointType
 from graspd.worker.hands.tendons import Tendon, actuators
+from graspd.worker.objects.memory_cache import cached_by_content
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.simulation.environment import CLEAR_M, Neighbour, Obstacle
 from graspd.worker.validation.decomposition import ConvexPieces
@@ -75,7 +76,6 @@ class FreeBody:
     body: int
     qpos: int
     centre: Floats
-    """(3,) centre of mass in its object frame."""
     mass: float
 
 
@@ -87,7 +87,6 @@ class Scene:
     hand: HandModel
     physics: MujocoOptions
     hand_geoms: NDArray[np.bool_]
-    """(G,) geoms of the hand."""
     object_body: int
     object_qpos: int
     root_qpos: int
@@ -102,13 +101,10 @@ class Scene:
     centre: Floats
     """(3,) the object's centre of mass in the object frame."""
     mass: float
-    """Mass of the object [kg]."""
     support_geoms: NDArray[np.bool_]
     """(G,) geoms of the scene's supports and neighbours; the scene frame is the mocap body 1."""
     neighbours: tuple[FreeBody, ...]
-    """The other objects of the scene."""
     tip_geoms: NDArray[np.bool_]
-    """(G,) geoms of fingertips."""
     pressing: Floats
     """(G,) how deep approaching fingertips may press into a geom [m]; above 0 where supports allow it."""
 
@@ -150,7 +146,7 @@ def build(
     model = scene_spec(hand, obj, pieces, physics, supports, neighbours).compile()
     if model.nv >= SPARSE:
         model.opt.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
-    gain, shift = leading_joints(hand)
+    lead = leading_bodies(hand)
     body_of_geom = model.geom_bodyid
     object_body = model.body("object").id
     beside = tuple(_free_body(model, f"neighbour{k}", one.obj) for k, one in enumerate(neighbours))
@@ -165,8 +161,8 @@ def build(
         object_qpos=int(model.joint("object").qposadr[0]),
         root_qpos=int(model.joint("root").qposadr[0]) if physics.root == "weld" else -1,
         joint_qpos=np.array([int(model.joint(f"joint{b}").qposadr[0]) for b in hand.joint_body], np.intp),
-        dof_gain=gain,
-        dof_shift=shift,
+        dof_gain=hand.multiplier[lead],
+        dof_shift=hand.offset[lead],
         pulls=actuators(hand.tendons, hand.dofs) if hand.tendons else None,
         centre=obj.centre_of_mass,
         mass=obj.mass,
@@ -175,6 +171,10 @@ def build(
         tip_geoms=np.isin(body_of_geom, [model.body(f"body{b}").id for b in hand.fingertips]),
         pressing=_pressing(model, supports),
     )
+
+
+#: `build`, cached. Threads share the scene: its model is read-only.
+scene_of = cached_by_content(8)(build)
 
 
 def _pressing(model: Any, supports: Sequence[Obstacle]) -> Floats:
@@ -333,15 +333,13 @@ def _add_actuators(spec: Any, hand: HandModel) -> None:
     for d, lead in enumerate(leading):
         if (tendon := pulled.get(d)) is not None:
             if d == min(tendon.dofs):
-                add_tendon(spec, hand, tendon, f"dof{d}", leading)
+                _add_tendon(spec, hand, tendon, f"dof{d}", leading)
             continue
         # The actuator acts on the joint: a dof's gain and limit are converted by the joint's multiplier.
         m = float(hand.multiplier[lead])
         actuator = spec.add_actuator(name=f"dof{d}", target=f"joint{lead}", trntype=mujoco.mjtTrn.mjTRN_JOINT)
         actuator.set_to_position(kp=float(hand.stiffness[d]) / m**2)
-        limit = float(hand.effort[d]) / abs(m)
-        actuator.forcerange = [-limit, limit]
-        actuator.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
+        _limit(actuator, float(hand.effort[d]) / abs(m))
         for b in np.flatnonzero(hand.dof == d):
             if b == lead:
                 continue
@@ -377,8 +375,7 @@ def add_object(
     body.add_freejoint(name=name)
     # By default MuJoCo would use the body's position in its parent as the position of its mass.
     body.mass, body.ipos = mass, [0, 0, 0]
-    inertia = mass * obj.inertia
-    body.fullinertia = [inertia[0, 0], inertia[1, 1], inertia[2, 2], inertia[0, 1], inertia[0, 2], inertia[1, 2]]
+    body.fullinertia = (mass * obj.inertia)[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
     body.explicitinertial = True
     for i, corners in enumerate(pieces):
         geom = body.add_geom(condim=4, friction=friction, name=f"{name}-{i}")
@@ -407,27 +404,24 @@ def blend(a: Posture, b: Posture, row: int, share: float) -> tuple[Floats, Float
     return pose, (1 - share) * a.joint_positions[row] + share * b.joint_positions[row]
 
 
-def leading_joints(hand: HandModel) -> tuple[Floats, Floats]:
-    """Return multiplier and offset of the first body that each dof drives."""
-    first = leading_bodies(hand)
-    return hand.multiplier[first], hand.offset[first]
-
-
 def leading_bodies(hand: HandModel) -> NDArray[np.intp]:
     """Return the body (D,) whose joint carries each dof's actuator: the first, as `HandModel.reduce`."""
     drives = hand.dof[hand.joint_body]
     return np.array([hand.joint_body[int(np.flatnonzero(drives == d)[0])] for d in range(hand.dofs)], np.intp)
 
 
-def add_tendon(spec: Any, hand: HandModel, tendon: Tendon, name: str, leading: NDArray[np.intp]) -> None:
+def _add_tendon(spec: Any, hand: HandModel, tendon: Tendon, name: str, leading: NDArray[np.intp]) -> None:
     """Add one actuator on the sum of joints; the joints are not coupled otherwise."""
     cord = spec.add_tendon(name=name)
     for d, pull in zip(tendon.dofs, tendon.coefficients, strict=True):
         cord.wrap_joint(f"joint{leading[d]}", pull)
     actuator = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_TENDON)
     actuator.set_to_position(kp=tendon.gain(hand.stiffness))
-    limit = tendon.limit(hand.effort)
-    actuator.forcerange = [-limit, limit]
+    _limit(actuator, tendon.limit(hand.effort))
+
+
+def _limit(actuator: Any, effort: float) -> None:
+    actuator.forcerange = [-effort, effort]
     actuator.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
 
 

@@ -30,18 +30,17 @@ from graspd.service.model.matter import ACCELERATION, MASS_KG, MOST_KG
 from graspd.service.model.planning import limit_told
 from graspd.service.model.transforms import Floats, cross, quat_rotate
 from graspd.worker.engines.mujoco_warnings import void
-from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
+from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext, measured
 from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.kinematics import generalized_forces
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.quality.contact import choose_contacts
+from graspd.worker.quality.contact import spread_contacts
 from graspd.worker.quality.posed import posing_of
 from graspd.worker.quality.wrench_space import EDGES, cone_edges
 from graspd.worker.simulation.environment import PlacedGrasps
-from graspd.worker.validation.compiled import measured, scene_of
 from graspd.worker.validation.decomposition import ConvexPieces
-from graspd.worker.validation.model import Scene
+from graspd.worker.validation.model import Scene, scene_of
 from graspd.worker.validation.prescreening import HANGING_CLOSING, LIFTING, FixedRootScene
 from graspd.worker.validation.protocol import DIRECTIONS, LOST, Outcome, Test
 
@@ -171,20 +170,8 @@ def payloads(
     held: NDArray[np.bool_] | None = None,
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> Floats:
-    """Compute payloads (N,) of grasps [kg]; nan: not tested, or the grasp does not lift the object.
-
-    Args:
-        hand: the hand.
-        obj: the object; masses below its own are not tested.
-        grasps: N grasps.
-        pieces: the object's convex pieces.
-        placed: the scenes of the lifts; None: a free object is pushed in six directions.
-        held: (N,) which grasps are tested; None: all.
-        run: polled for cancellation between grasps.
-
-    Raises:
-        TaskCancelled: `run.cancelled()` returned True.
-    """
+    """Compute payloads (N,) of grasps [kg], at least the object's mass; nan: not `held` (N,), or not lifted.
+    Grasps lift in the scenes `placed`; None: a free object is pushed in six directions."""
 
     def make() -> LiftPayload | PushPayload:
         around = (placed.supports, placed.neighbours) if placed is not None else ()
@@ -216,7 +203,6 @@ class Limit:
     bound_kg: float
     """Largest load capacity of a grasp (`worker.validation.payload`)."""
     wanted_kg: float | None = None
-    """Wanted payload; None: none."""
 
     @property
     def hopeless(self) -> bool:
@@ -225,7 +211,6 @@ class Limit:
 
     @property
     def line(self) -> str:
-        """Sentence for the user."""
         return limit_told(self.hand, self.friction, self.grasps, self.lifts_kg, self.bound_kg, self.wanted_kg)
 
     def facts(self) -> dict[str, Any]:
@@ -245,21 +230,8 @@ def limit_of(
     least: int = LEAST,
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> Limit | None:
-    """Return the payload limit of N grasps; None: the wanted mass is lifted, or fewer than `least` lift.
-
-    Args:
-        hand: the hand.
-        obj: the object.
-        grasps: N grasps.
-        pieces: the object's convex pieces.
-        placed: their scenes; None: the object is free.
-        wanted: mass that should be lifted [kg]; None: none.
-        least: grasps that must lift a light object.
-        run: polled for cancellation between grasps.
-
-    Raises:
-        TaskCancelled: `run.cancelled()` returned True.
-    """
+    """Return the payload limit of N grasps; None: the `wanted` mass [kg] is lifted, or fewer than `least` grasps lift a
+    light object."""
     if len(grasps) < least:
         return None
     light = obj.weighing(mass=MASS_KG if wanted is None else min(MASS_KG, LIGHT * wanted))
@@ -317,21 +289,8 @@ def shake_margins(
     held: NDArray[np.bool_] | None = None,
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> Floats:
-    """Return shake margins (N,), the worst motion over its limit; nan: not tested.
-    The motion is displacement or rotation; below 1 the grasp holds.
-
-    Args:
-        hand: the hand.
-        obj: the object.
-        grasps: N grasps.
-        placed: their scenes.
-        pieces: the object's convex pieces.
-        held: (N,) which grasps are tested; None: all.
-        run: polled for cancellation between grasps.
-
-    Raises:
-        TaskCancelled: `run.cancelled()` returned True.
-    """
+    """Return shake margins (N,), the worst displacement or rotation over its limit; nan: not `held` (N,).
+    Below 1 the grasp holds."""
 
     def make() -> Shake:
         return Shake(scene_of(hand, obj, pieces, LIFTING, placed.supports, placed.neighbours), placed)
@@ -351,20 +310,15 @@ _UNBOUNDED: Final = 3
 
 def capacities(hand: HandModel, obj: ObjectModel, grasp: Posture, against: Floats) -> Floats:
     """Compute load capacities (N,) [kg]; 0: no contact; inf: no drive and no friction limits it.
-
-    Args:
-        hand: the hand.
-        obj: the object, with its friction.
-        grasp: N postures at contact.
-        against: (N, K, 3) unit vectors against the weight; the least of K counts.
-    """
-    probe = posing_of(hand, obj, points=_POINTS).probe
+    `against` (N, K, 3) are unit vectors against the weight; the least of K counts."""
+    probe = posing_of(hand, obj, points=_POINTS, device="cpu").probe
     found = probe.touch(grasp)
     facing = (found.distance < WITHIN_M) & probe.facing(found)
+    spread, count = spread_contacts(facing[:, None], found.closest, found.normal, scale=obj.radius, limit=MOST)
     q = hand.reduce(grasp.joint_positions)
     out = np.zeros(len(grasp))
     for row in range(len(grasp)):
-        chosen = choose_contacts(facing[row], found.closest[row], found.normal[row], scale=obj.radius, limit=MOST)
+        chosen = spread[row, 0, : count[row, 0]]
         if not len(chosen):
             continue
         points = found.closest[row, chosen]
@@ -395,14 +349,8 @@ def _load(forces: Floats, moments: Floats, torques: Floats, efforts: Floats, alo
     balance = np.column_stack([np.hstack([forces, moments]).T, -np.concatenate([along, np.zeros(3)])])
     exerted = np.column_stack([np.vstack([torques.T, -torques.T]), np.zeros(len(efforts))])
     limited = np.isfinite(efforts)
-    solved = linprog(
-        np.append(np.zeros(count), -1.0),
-        A_ub=exerted[limited],
-        b_ub=efforts[limited],
-        A_eq=balance,
-        b_eq=np.zeros(6),
-        bounds=(0, None),
-    )
+    goal, still = np.append(np.zeros(count), -1.0), np.zeros(6)
+    solved = linprog(goal, exerted[limited], efforts[limited], A_eq=balance, b_eq=still, bounds=(0, None))
     if solved.status == _UNBOUNDED:
         return math.inf
     return -float(solved.fun) if solved.fun is not None else 0.0

@@ -11,28 +11,25 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import partial
 from typing import Final, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graspd.service.model.matter import ACCELERATION
 from graspd.service.model.transforms import Floats
 from graspd.worker.engines.mujoco_warnings import void
+from graspd.worker.execution_context import answers
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.simulation.environment import PlacedGrasps
-from graspd.worker.validation.compiled import scene_of
 from graspd.worker.validation.decomposition import ConvexPieces
 from graspd.worker.validation.lift import Lift, LiftOutcome
-from graspd.worker.validation.model import MujocoOptions, Scene
+from graspd.worker.validation.model import MujocoOptions, Scene, scene_of
 from graspd.worker.validation.protocol import LOST, STAGE_S, Outcome, Test
 
-_T = TypeVar("_T")
+T = TypeVar("T")
 
 #: The root is fixed, because the protocol's root on a spring costs twice as much. In so short a time nothing slips for
 #: lack of iterations against slip.
@@ -148,25 +145,17 @@ class _Shorts:
     def __init__(
         self, hand: HandModel, obj: ObjectModel, pieces: Callable[[], ConvexPieces], *, threads: int = 1
     ) -> None:
-        self.hand, self.obj, self._pieces, self._threads = hand, obj, pieces, threads
+        self.hand, self.obj, self._pieces, self.threads = hand, obj, pieces, threads
         self._scenes: Frictions | None = None
         self._lock = threading.Lock()
 
-    def _each(
-        self, test: Callable[[Frictions], Callable[[int], _T]], count: int, placed: PlacedGrasps | None
-    ) -> list[_T]:
-        """Run a test on each of `count` grasps; `test` creates one per thread."""
+    def scored(
+        self, count: int, placed: PlacedGrasps | None, make: Callable[[Frictions], T], score: Callable[[T, int], float]
+    ) -> Floats:
+        """Return scores (count,) of grasps by tests that `make` creates."""
         scenes = self._compiled(placed)
-
-        def work(rows: NDArray[np.intp]) -> list[_T]:
-            ask = test(scenes)
-            return [ask(int(row)) for row in rows]
-
-        parts = np.array_split(np.arange(count), max(1, min(self._threads, count)))
-        if len(parts) == 1:
-            return work(parts[0])
-        with ThreadPoolExecutor(len(parts), thread_name_prefix="short-test") as pool:
-            return [answer for part in pool.map(work, parts) for answer in part]
+        found = answers(range(count), lambda: make(scenes), score, threads=self.threads, name="short-test")
+        return np.array(found, float)
 
     def _compiled(self, placed: PlacedGrasps | None) -> Frictions:
         with self._lock:
@@ -181,44 +170,28 @@ class _Shorts:
 
 
 class LiftRollouts(_Shorts):
-    """Short lifts of grasps in their scenes."""
-
     def scores(self, grasps: GraspSet, placed: PlacedGrasps, beat: Floats | None = None) -> Floats:
-        """Return scores (N,), see `LiftRollout.score`."""
         least = np.full(len(grasps), np.inf) if beat is None else beat
 
-        def test(scenes: Frictions) -> Callable[[int], float]:
-            short = LiftRollout(scenes, placed)
-            return lambda row: short.score(grasps, row, float(least[row]))
+        def score(test: LiftRollout, row: int) -> float:
+            return test.score(grasps, row, float(least[row]))
 
-        return np.array(self._each(test, len(grasps), placed), float)
-
-
-class PushRollouts(_Shorts):
-    """Short pushes of grasps of a free object."""
-
-    def scores(self, grasps: GraspSet) -> Floats:
-        """Return scores (N,), see `PushRollout.score`."""
-        return np.array(self._each(lambda s: partial(PushRollout(s).score, grasps), len(grasps), None), float)
+        return self.scored(len(grasps), placed, lambda scenes: LiftRollout(scenes, placed), score)
 
 
 def push_rollout(
     hand: HandModel, obj: ObjectModel, pieces: Callable[[], ConvexPieces], *, threads: int = 1
 ) -> Callable[[GraspSet, PlacedGrasps | None, Floats], Floats]:
     """Return a `worker.planners.Rollout` that scores free grasps (N,) by short pushes.
-    Scores are below 1 for grasps
-    that hold at half the friction, and below 2 at full friction.
+    Scores are below 1 for grasps that hold at half the friction, and below 2 at full friction.
 
     Args:
-        hand: the hand.
-        obj: the object.
-        pieces: computes the object's convex pieces on first use.
         threads: per call; planners on the CPU already call from all their threads.
     """
-    pushes = PushRollouts(hand, obj, pieces, threads=threads)
+    shorts = _Shorts(hand, obj, pieces, threads=threads)
 
     def rollout(grasps: GraspSet, placed: PlacedGrasps | None, beat: Floats | None = None) -> Floats:
-        return pushes.scores(grasps)
+        return shorts.scored(len(grasps), None, PushRollout, lambda test, row: test.score(grasps, row))
 
     return rollout
 

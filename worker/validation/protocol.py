@@ -48,8 +48,6 @@ FAST_BAND: Final = (0.3, 3.0)
 
 
 class Outcome(IntEnum):
-    """Outcome of one push."""
-
     NOT_TRIED = 0
     HELD = 1
     PENETRATION = 2
@@ -68,8 +66,6 @@ class ValidatedBy(IntEnum):
 
 @dataclass
 class Rollout:
-    """Verdict on one grasp."""
-
     outcomes: list[Outcome] = field(default_factory=lambda: [Outcome.NOT_TRIED] * len(DIRECTIONS))
     margin: float = 0.0
     """Worst displacement or rotation over its limit, from the end of the squeeze on."""
@@ -152,7 +148,6 @@ class Test:
         return rollout
 
     def _put(self, hand_pose: Floats, joints: Floats) -> None:
-        """Place the object at its start and the hand (7,), (J,) at rest."""
         self.scene.place(self.data, hand_pose, joints)
 
     def _depths(self, posture: Posture, row: int) -> tuple[float, float]:
@@ -164,14 +159,14 @@ class Test:
         return self.penetration()
 
     def penetration(self) -> tuple[float, float]:
-        """Return the deepest hand-object and hand-hand penetration of the present state [m]."""
+        """Return the deepest penetration of the hand into the object, and into itself or a support [m]."""
         contact = self.data.contact
         if not len(contact.dist):
             return 0.0, 0.0
-        ours = self.scene.hand_geoms[contact.geom]
-        within = ours.all(axis=1)
+        ours, support = self.scene.hand_geoms[contact.geom], self.scene.support_geoms[contact.geom]
+        hand, within = ours.any(axis=1), ours.all(axis=1) | (ours | support).all(axis=1)
         depth = np.maximum(0.0, -np.asarray(contact.dist))
-        return float(depth[~within].max(initial=0.0)), float(depth[within].max(initial=0.0))
+        return float(depth[hand & ~within].max(initial=0.0)), float(depth[hand & within].max(initial=0.0))
 
     def _close(self, grasps: GraspSet, row: int, *, give_up: bool = False, stages: int = STAGES) -> bool:
         """Move from pregrasp over grasp to squeeze, each in `stages` stages; return whether the object stayed.
@@ -250,12 +245,10 @@ class Test:
         return np.asarray(self.data.qpos[at : at + 3] - turned)
 
     def _turned(self) -> Floats:
-        """Return the rotation (4,) of the object since the start."""
         at = self.scene.object_qpos
         return np.asarray(self.data.qpos[at + 3 : at + 7])
 
     def _motion(self) -> tuple[float, float]:
-        """Return displacement [m] and rotation [rad] of the object since the start."""
         q = self._turned()
         turned = 2 * math.atan2(math.sqrt(q[1] ** 2 + q[2] ** 2 + q[3] ** 2), abs(q[0]))
         return float(np.linalg.norm(self._offset())), turned

@@ -32,9 +32,7 @@ _PRIMITIVES: Final = ("box", "cylinder", "capsule")
 
 def refitted(hand: HandModel, fit: Fit, grown_m: float = 0.0) -> HandModel:
     """Return the hand with its collision shapes replaced, then grown by `grown_m` [m] (negative: shrunk).
-
-    Contacts between bodies that touch at rest in their new shapes are ignored, as in the hand itself.
-    """
+    Contacts between bodies that touch at rest in their new shapes are ignored, as in the hand itself."""
     pieces = hand.pieces
     if fit == "hull":
         pieces = _hulls(hand)
@@ -49,7 +47,6 @@ def refitted(hand: HandModel, fit: Fit, grown_m: float = 0.0) -> HandModel:
 
 
 def fits_of(hand: HandModel) -> frozenset[Fit]:
-    """Return the fits that change something in this hand."""
     links = {(piece.body, piece.link) for piece in hand.pieces}
     found: set[Fit] = set()
     if len(links) < len(hand.pieces):
@@ -63,10 +60,8 @@ def fits_of(hand: HandModel) -> frozenset[Fit]:
 
 def grown(piece: ConvexPiece, by_m: float) -> ConvexPiece:
     """Return a piece with its surface offset by `by_m` [m] along all face normals (negative: inwards).
-
     Boxes and cylinders keep their edges, capsules and spheres are exact. Corners of a hull are cut at the offset
-    surface of the Minkowski sum with a ball. A piece too thin to shrink keeps half of its thickness.
-    """
+    surface of the Minkowski sum with a ball. A piece too thin to shrink keeps half of its thickness."""
     if piece.kind == "hull":
         vertices, faces = hull(_offset(piece.vertices, by_m))
         return replace(piece, vertices=vertices, faces=faces)
@@ -154,10 +149,8 @@ def _like(piece: ConvexPiece, kind: str) -> ConvexPiece:
 
 def _capsule(solid: float, across: float) -> tuple[float, float]:
     """Return radius and length of a capsule of a volume [m^3] and a variance across its axis [m^2].
-
     The variance is at least the sphere's. A cylinder's variance is r^2 / 4, a ball's r^2 / 5, a capsule's r^2 (1 / 4 -
-    s / 20) if its caps are the share s of its volume. Iterated: s grows with r^3 and moves r little.
-    """
+    s / 20) if its caps are the share s of its volume. Iterated: s grows with r^3 and moves r little."""
     radius = 2 * math.sqrt(across)
     for _ in range(20):
         caps = min(1.0, 4 / 3 * math.pi * radius**3 / solid)
@@ -174,10 +167,8 @@ def _distance(one: ConvexPiece, piece: ConvexPiece) -> float:
 
 def _offset(vertices: Floats, by_m: float) -> Floats:
     """Return the corners of a convex solid with its faces moved outward by `by_m` [m].
-
     It intersects half-spaces of the faces and, if growing, of the corners' mean normals, each at the distance of the
-    sum with a ball. A solid that grows by 1 mm has its support 1 mm farther in all of these directions.
-    """
+    sum with a ball. A solid that grows by 1 mm has its support 1 mm farther in all of these directions."""
     from scipy.spatial import ConvexHull, HalfspaceIntersection
 
     scale = float(np.ptp(vertices, axis=0).max())

@@ -9,11 +9,9 @@ from __future__ import annotations
 
 import hashlib
 import math
-import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -21,18 +19,16 @@ from numpy.typing import NDArray
 
 from graspd.service.model.metrics import ROBUST_MODELS, Axis
 from graspd.service.model.transforms import Floats, compose, invert, quat_from_axis_angle
-from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
+from graspd.worker.execution_context import DEFAULT_CONTEXT, Count, ExecutionContext
 from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.simulation.environment import PlacedGrasps
 from graspd.worker.validation.decomposition import ConvexPieces, decompose
-from graspd.worker.validation.key import Level
 from graspd.worker.validation.lifting import LiftLevel, require_ways
 from graspd.worker.validation.model import MujocoOptions
 from graspd.worker.validation.validator import validate
-from graspd.worker.validation.variant import Variant, dealt, draw
-from graspd.worker.validation.varied import Models
+from graspd.worker.validation.variant import Models, Variant, about_centre, dealt, draw
 
 NOT_VALIDATED: Final = -1
 #: Tolerance of wanted shares: 0.9 of 10 models is 9 of them.
@@ -46,7 +42,6 @@ class Robustness:
     held: NDArray[np.int8]
     """(N, k) 1 held, 0 not, -1 not validated: the grasp was not tested, or its share was decided."""
     axis: NDArray[np.uint8]
-    """(N, k) `Axis` of each model."""
     wanted: float
     seconds: float
 
@@ -69,7 +64,6 @@ class Robustness:
 
     @property
     def columns(self) -> dict[str, NDArray[Any]]:
-        """Columns of a base shard."""
         return {"quality/robust_share": self.share, "quality/robust_weakest": self.weakest}
 
     def by_axis(self) -> dict[Axis, tuple[int, int]]:
@@ -105,30 +99,22 @@ def robust(
     seed: int = 0,
     hard: bool = False,
     pieces: ConvexPieces | None = None,
-    cache: Path | None = None,
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> Robustness:
     """Validate grasps in models around the nominal one, by six pushes at level standard or by lifts.
 
     Args:
-        hand: the hand.
-        obj: the object.
-        grasps: N grasps.
         held: (N,) verdicts of the nominal model; only grasps with 1 are tested. By default all.
         placed: their scenes, for the lift test; None: six pushes.
-        level: of the lift test.
-        models: for each grasp.
         wanted: share of them; the validation of a grasp ends once the share is decided. 0: all are validated.
         seed: of the models, with the grasp's own numbers.
         hard: at the hard protocol's friction.
         pieces: convex pieces of the object; by default its CoACD pieces.
-        cache: folder of the pieces, see `decompose`.
         run: receives the number of finished grasps; polled for cancellation between models.
 
     Raises:
         InputError: no scene or approach of each grasp.
         MeshError: the object has no usable convex pieces.
-        TaskCancelled: `run.cancelled()` returned True.
     """
     if placed is not None:
         require_ways(grasps, placed, level)
@@ -140,8 +126,8 @@ def robust(
         return Robustness(verdicts, axes, wanted, 0.0)
     physics = MujocoOptions().hardened() if hard else MujocoOptions()
     beside = (placed.supports, placed.neighbours) if placed is not None else ()
-    around = Models(hand, obj, pieces or decompose(obj, cache=cache), physics, *beside)
-    least, done, lock = needed(wanted, models), 0, threading.Lock()
+    around = Models(hand, obj, pieces or decompose(obj), physics, *beside)
+    least, done = needed(wanted, models), Count(len(tried), run, "robustness")
 
     def holds(row: int, variant: Variant) -> bool:
         if placed is None:
@@ -149,7 +135,6 @@ def robust(
         return around.lift(grasps, row, placed, variant, dexgraspbench=level == "dexgraspbench").success
 
     def work(row: int) -> None:
-        nonlocal done
         for k, (axis, variant) in enumerate(models_of(hand, grasps, row, models, seed)):
             run.check("robustness")
             axes[row, k] = axis
@@ -157,9 +142,7 @@ def robust(
             ok, lost = (verdicts[row] == 1).sum(), (verdicts[row] == 0).sum()
             if wanted > 0 and (ok >= least or models - lost < least):
                 break
-        with lock:
-            done += 1
-            run.progress(done, len(tried), "robustness")
+        done.add(1)
 
     with ThreadPoolExecutor(run.cores, thread_name_prefix="robust") as pool:
         list(pool.map(work, tried.tolist()))
@@ -167,14 +150,12 @@ def robust(
 
 
 def models_of(hand: HandModel, grasps: GraspSet, row: int, models: int, seed: int) -> list[tuple[Axis, Variant]]:
-    """Return the models in which a grasp is validated, in order."""
     words = (seed, *_words(grasps, row))
     axes = dealt(hand, models, words)
     return [(axis, draw(axis, hand, np.random.default_rng((*words, k)))) for k, axis in enumerate(axes)]
 
 
 def _words(grasps: GraspSet, row: int) -> tuple[int, ...]:
-    """Return a grasp's own numbers as a seed."""
     whole = hashlib.sha256()
     for part in (grasps.pregrasp, grasps.grasp, grasps.squeeze):
         for array in (part.hand_pose, part.joint_positions):
@@ -182,6 +163,7 @@ def _words(grasps: GraspSet, row: int) -> tuple[int, ...]:
     return tuple(np.frombuffer(whole.digest()[:16], "<u4").tolist())
 
 
+#: Size of the random shift [m] and of the turn [rad] of the object.
 NOISE_M: Final = 1e-3
 NOISE_RAD: Final = float(np.radians(1.0))
 
@@ -192,63 +174,34 @@ def robustness(
     grasps: GraspSet,
     *,
     held: NDArray[np.generic] | None = None,
-    repeats: int = 5,
-    noise_m: float = NOISE_M,
-    noise_rad: float = NOISE_RAD,
+    repeats: int,
     seed: int = 0,
-    level: Level = "fast",
-    hard: bool = False,
-    pieces: ConvexPieces | None = None,
-    cache: Path | None = None,
+    pieces: ConvexPieces,
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> Floats:
-    """Return the share (N,) of `repeats` in which a grasp holds with noise on the object's pose.
-
-    The object is moved by `noise_m` in a random direction and turned by `noise_rad` about a random axis through its
-    centre of mass; a grasp's noise follows from `seed`, the repeat and its place in the set. nan: not tested.
-
-    Args:
-        hand: the hand.
-        obj: the object.
-        grasps: N grasps.
-        held: (N,) verdicts without noise; only grasps with 1 are tested. By default all.
-        repeats: noisy verdicts for each grasp.
-        noise_m: size of the shift [m].
-        noise_rad: size of the turn [rad].
-        seed: of the noise.
-        level: of noisy verdicts; the cheap level suffices, for a share is not a success rate.
-        hard: the hard protocol's friction.
-        pieces: convex pieces of the object; by default its CoACD pieces.
-        cache: folder of the pieces, see `decompose`.
-        run: receives the number of finished verdicts; polled for cancellation between them.
-
-    Raises:
-        MeshError: the object has no usable convex pieces.
-        TaskCancelled: when `run.cancelled()` answers True.
-    """
+    """Return the share (N,) of `repeats` in which a grasp holds with noise on the object's pose; nan: not tested.
+    The object is moved by `NOISE_M` in a random direction and turned by `NOISE_RAD` about a random axis through its
+    centre of mass; a grasp's noise follows from `seed`, the repeat and its place in the set. Only grasps with `held`
+    (N,) 1 are tested, by default all, at level fast: it suffices, for a share is not a success rate."""
     out = np.full(len(grasps), np.nan)
     tried = np.arange(len(grasps)) if held is None else np.flatnonzero(np.asarray(held) == 1)
     if not len(tried) or repeats < 1:
         return out
-    moves = np.array([_noise(obj, noise_m, noise_rad, (seed, k, int(i))) for k in range(repeats) for i in tried])
+    moves = np.array([_noise(obj, (seed, k, int(i))) for k in range(repeats) for i in tried])
     noisy = _moved(grasps, np.tile(tried, repeats), invert(moves))
-    verdicts = validate(hand, obj, noisy, level=level, hard=hard, pieces=pieces, cache=cache, run=run)
+    verdicts = validate(hand, obj, noisy, level="fast", pieces=pieces, run=run)
     out[tried] = verdicts.success.reshape(repeats, len(tried)).mean(axis=0)
     return out
 
 
-def _noise(obj: ObjectModel, noise_m: float, noise_rad: float, seed: tuple[int, ...]) -> Floats:
-    """Return a random motion (7,) of the object."""
+def _noise(obj: ObjectModel, seed: tuple[int, ...]) -> Floats:
     rng = np.random.default_rng(seed)
     shift, axis = rng.normal(size=(2, 3))
-    rotation = quat_from_axis_angle(axis / np.linalg.norm(axis), np.array(noise_rad))
-    about = np.concatenate([obj.centre_of_mass + noise_m * shift / np.linalg.norm(shift), rotation])
-    return compose(about, np.concatenate([-obj.centre_of_mass, [1.0, 0, 0, 0]]))
+    rotation = quat_from_axis_angle(axis / np.linalg.norm(axis), np.array(NOISE_RAD))
+    return about_centre(obj, NOISE_M * shift / np.linalg.norm(shift), rotation)
 
 
 def _moved(grasps: GraspSet, rows: NDArray[np.intp], motion: Floats) -> GraspSet:
-    """Return the rows of the grasps with the hand moved by one motion (K, 7) each."""
-
     def moved(part: Posture) -> Posture:
         pose, joints = np.asarray(part.hand_pose, float), np.asarray(part.joint_positions, float)
         return Posture(compose(motion, pose[rows]), joints[rows])

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import logging
-import queue
 import time
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -16,15 +13,14 @@ from numpy.typing import NDArray
 
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import Floats
-from graspd.worker.execution_context import DEFAULT_CONTEXT, Count, ExecutionContext
+from graspd.worker.execution_context import DEFAULT_CONTEXT, Count, ExecutionContext, answers
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.disk_cache import content_of
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.validation.compiled import scene_of
 from graspd.worker.validation.decomposition import ConvexPieces, decompose
 from graspd.worker.validation.key import Level, postures_key, verdict_key
-from graspd.worker.validation.model import COARSE, MujocoOptions, Scene
+from graspd.worker.validation.model import COARSE, MujocoOptions, Scene, scene_of
 from graspd.worker.validation.prefilter.prefilter import PrefilterVerdicts, first_terms, screened
 from graspd.worker.validation.protocol import DIRECTIONS, FAST_BAND, Outcome, Rollout, Test
 
@@ -49,7 +45,6 @@ class Verdicts:
     penetration_depth_mm: Floats
     """(N,) hand-object, with the engine's convex pieces."""
     self_penetration_depth_mm: Floats
-    """(N,)"""
     level: str
     hard: bool
     pieces: int
@@ -64,13 +59,10 @@ class Verdicts:
     validated_by: NDArray[np.uint8]
     """(N,) `ValidatedBy`: engine of the verdict. Only MuJoCo on the CPU is the reference."""
     seconds: float
-    """Wall time."""
     steps: int
-    """Simulation steps of all rollouts."""
     rechecked: int = 0
     """Verdicts of the prefilter rechecked on the CPU; where they differ, the CPU's stands."""
     contradicted: int = 0
-    """Number of rechecked verdicts that differed."""
 
     @property
     def reasons(self) -> list[str]:
@@ -93,7 +85,6 @@ def validate(
     level: Level = "standard",
     hard: bool = False,
     pieces: ConvexPieces | None = None,
-    cache: Path | None = None,
     known: KnownRollouts | None = None,
     prefilter: PrefilterVerdicts | None = None,
     run: ExecutionContext = DEFAULT_CONTEXT,
@@ -110,7 +101,6 @@ def validate(
         level: dexgraspbench, standard, or fast.
         hard: sliding friction halved, torsional friction a tenth.
         pieces: convex pieces of the object; by default its CoACD pieces.
-        cache: folder of the pieces, see `decompose`.
         known: finished CPU rollouts on these terms, which are reused; new ones are added.
         prefilter: result of `prefiltered` on these grasps and terms; None: it is computed.
         run: receives the number of finished grasps; polled for cancellation between grasps.
@@ -123,7 +113,7 @@ def validate(
     if level not in LEVELS:
         raise InputError(f"unknown level {level!r}; choose one of {', '.join(LEVELS)}")
     began = time.perf_counter()
-    pieces = pieces or decompose(obj, cache=cache)
+    pieces = pieces or decompose(obj)
     prefilter_terms = first_terms(hand, level, run)
     # The prefilter leaves only cases near a limit, for which coarse physics would defer to level standard as well.
     of_the_cpu: Level = "standard" if prefilter_terms else level
@@ -145,8 +135,25 @@ def validate(
         )
         _try(case, grasps, list(first.stands), rollouts, run)
     ordered = [rollouts[row] for row in range(len(grasps))]
-    found = _verdicts(ordered, case, terms, postures_key(terms, grasps), time.perf_counter() - began)
-    return replace(found, level=level, rechecked=len(first.rechecked), contradicted=contradicted)
+    return Verdicts(
+        success=np.array([t.success for t in ordered], np.int8),
+        outcome=np.array([t.outcomes for t in ordered], np.uint8).reshape(-1, len(DIRECTIONS)),
+        margin=np.array([t.margin for t in ordered], float),
+        penetration_depth_mm=np.array([t.penetration_m for t in ordered], float) * 1e3,
+        self_penetration_depth_mm=np.array([t.self_penetration_m for t in ordered], float) * 1e3,
+        validated_by=np.array([t.validated_by for t in ordered], np.uint8),
+        level=level,
+        hard=hard,
+        pieces=len(pieces),
+        volume_ratio=pieces.volume_ratio,
+        excess_m=pieces.excess_m,
+        terms=terms,
+        key=postures_key(terms, grasps),
+        seconds=time.perf_counter() - began,
+        steps=sum(t.steps for t in ordered),
+        rechecked=len(first.rechecked),
+        contradicted=contradicted,
+    )
 
 
 def prefiltered(
@@ -155,9 +162,8 @@ def prefiltered(
     """Run the GPU prefilter for `validate` beforehand, in the thread that has the device."""
     prefilter_terms = first_terms(hand, level, run)
     terms = verdict_key(hand, obj, level, False, pieces=pieces, prefilter=prefilter_terms)
-    return _screened(
-        _Case(hand, obj, pieces, "standard", False), terms, grasps, level, run if prefilter_terms else None
-    )
+    case = _Case(hand, obj, pieces, "standard", False)
+    return _screened(case, terms, grasps, level, run if prefilter_terms else None)
 
 
 def _screened(
@@ -168,8 +174,6 @@ def _screened(
 
 @dataclass(frozen=True)
 class _Case:
-    """Subject and terms of a validation."""
-
     hand: HandModel
     obj: ObjectModel
     pieces: ConvexPieces
@@ -178,7 +182,6 @@ class _Case:
 
     @cached_property
     def scene(self) -> Scene:
-        """The scene of level standard."""
         return self._scene(MujocoOptions())
 
     @property
@@ -189,19 +192,25 @@ class _Case:
         return scene_of(self.hand, self.obj, self.pieces, physics.hardened() if self.hard else physics)
 
     @cached_property
-    def bench(self) -> _Bench:
-        """Tests in a process of a pool, cached with the case."""
-        return _Bench(self, 1)
+    def tests(self) -> _Tests:
+        return _Tests(self)
 
 
 def _try(case: _Case, grasps: GraspSet, rows: list[int], rollouts: dict[int, Rollout], run: ExecutionContext) -> None:
-    """Add the rollouts of some grasps to `rollouts`."""
+    done = Count(len(grasps), run, "validation", len(grasps) - len(rows))
     if run.pool is None:
-        _Bench(case, run.cores).validate(grasps, rows, rollouts, run)
+
+        def ask(tests: _Tests, row: int) -> Rollout:
+            run.check("the validator")
+            rollout = tests.rollout(grasps, row)
+            done.add(1)
+            return rollout
+
+        found = answers(rows, lambda: _Tests(case), ask, threads=run.cores, name="validation")
+        rollouts.update(zip(rows, found, strict=True))
         return
     bare = GraspSet(grasps.grasp, grasps.pregrasp, grasps.squeeze, grasps.stability_loss)
     parts = [bare.take(np.array(rows[k : k + _CHUNK], np.intp)) for k in range(0, len(rows), _CHUNK)]
-    done = Count(len(grasps), run, "validation", len(grasps) - len(rows))
     made = run.pool.map(
         _rollouts, content_of(case), case, parts, cancelled=run.cancelled, done=lambda k: done.add(len(parts[k]))
     )
@@ -209,71 +218,28 @@ def _try(case: _Case, grasps: GraspSet, rows: list[int], rollouts: dict[int, Rol
 
 
 def _rollouts(case: _Case, grasps: GraspSet) -> list[Rollout]:
-    """Return the rollouts of some grasps, run one after the other."""
-    return [case.bench.rollout(grasps, row) for row in range(len(grasps))]
+    return [case.tests.rollout(grasps, row) for row in range(len(grasps))]
 
 
-class _Bench:
-    """One test per thread."""
+class _Tests:
+    """Tests of one thread."""
 
-    def __init__(self, case: _Case, threads: int) -> None:
-        self.level, self.threads = case.level, threads
-        self._full: queue.SimpleQueue[Test] = queue.SimpleQueue()
-        self._coarse: queue.SimpleQueue[Test] = queue.SimpleQueue()
-        full, coarse = case.scene, case.coarse
-        for _ in range(threads):
-            self._full.put(Test(full))
-            if coarse is not None:
-                self._coarse.put(Test(coarse))
-
-    def validate(self, grasps: GraspSet, rows: list[int], rollouts: dict[int, Rollout], run: ExecutionContext) -> None:
-        """Add the rollouts of some grasps to `rollouts`."""
-        done = Count(len(grasps), run, "validation", len(grasps) - len(rows))
-
-        def work(row: int) -> None:
-            run.check("the validator")
-            rollouts[row] = self.rollout(grasps, row)
-            done.add(1)
-
-        with ThreadPoolExecutor(self.threads, thread_name_prefix="validation") as pool:
-            list(pool.map(work, rows))
+    def __init__(self, case: _Case) -> None:
+        self.level, coarse = case.level, case.coarse
+        self._full = Test(case.scene)
+        self._coarse = None if coarse is None else Test(coarse)
 
     def rollout(self, grasps: GraspSet, row: int) -> Rollout:
-        if self.level == "fast":
-            rollout = self._with(self._coarse, grasps, row)
-            low, high = FAST_BAND
-            # A penetration has no margin: it is geometric, the same in either physics.
-            clear = rollout.outcomes[0] is Outcome.PENETRATION or not low < rollout.margin < high
-            if clear and Outcome.DIVERGED not in rollout.outcomes:
-                return rollout
-            second = self._with(self._full, grasps, row)
-            second.steps += rollout.steps
-            return second
-        return self._with(self._full, grasps, row)
-
-    def _with(self, tests: queue.SimpleQueue[Test], grasps: GraspSet, row: int) -> Rollout:
-        test = tests.get()
-        try:
-            return test.dexgraspbench(grasps, row) if self.level == "dexgraspbench" else test.standard(grasps, row)
-        finally:
-            tests.put(test)
-
-
-def _verdicts(rollouts: list[Rollout], case: _Case, terms: str, key: str, seconds: float) -> Verdicts:
-    return Verdicts(
-        success=np.array([t.success for t in rollouts], np.int8),
-        outcome=np.array([t.outcomes for t in rollouts], np.uint8).reshape(-1, len(DIRECTIONS)),
-        margin=np.array([t.margin for t in rollouts], float),
-        penetration_depth_mm=np.array([t.penetration_m for t in rollouts], float) * 1e3,
-        self_penetration_depth_mm=np.array([t.self_penetration_m for t in rollouts], float) * 1e3,
-        validated_by=np.array([t.validated_by for t in rollouts], np.uint8),
-        level=case.level,
-        hard=case.hard,
-        pieces=len(case.pieces),
-        volume_ratio=case.pieces.volume_ratio,
-        excess_m=case.pieces.excess_m,
-        terms=terms,
-        key=key,
-        seconds=seconds,
-        steps=sum(t.steps for t in rollouts),
-    )
+        if self.level == "dexgraspbench":
+            return self._full.dexgraspbench(grasps, row)
+        if self._coarse is None:
+            return self._full.standard(grasps, row)
+        rollout = self._coarse.standard(grasps, row)
+        low, high = FAST_BAND
+        # A penetration has no margin: it is geometric, the same in either physics.
+        clear = rollout.outcomes[0] is Outcome.PENETRATION or not low < rollout.margin < high
+        if clear and Outcome.DIVERGED not in rollout.outcomes:
+            return rollout
+        second = self._full.standard(grasps, row)
+        second.steps += rollout.steps
+        return second

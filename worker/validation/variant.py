@@ -1,20 +1,32 @@
 """Variants of the validator's model: other plausible shapes, drives, tendons, masses and poses.
 
-A `Variant` describes a model's departure from the nominal one; `draw` draws one, `varied.Models` validates in it.
+A `Variant` describes a model's departure from the nominal one; `draw` draws one, `Models` validates in it: shapes are
+recompiled, numbers changed in a copy.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import copy
+import threading
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Final, Literal
 
+import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from graspd.service.model.metrics import Axis
-from graspd.service.model.transforms import Floats
+from graspd.service.model.transforms import Floats, compose, invert, quat_from_axis_angle
+from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.model import HandModel
-from graspd.worker.validation.refit import Fit, fits_of
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.simulation.environment import Neighbour, Obstacle, PlacedGrasps
+from graspd.worker.validation.decomposition import ConvexPieces
+from graspd.worker.validation.lift import Lift, LiftTest
+from graspd.worker.validation.model import MujocoOptions, Scene, blend, build, scene_of
+from graspd.worker.validation.protocol import STAGES, Rollout, Test
+from graspd.worker.validation.refit import Fit, fits_of, refitted
 
 Vector = tuple[float, float, float]
 
@@ -38,28 +50,24 @@ Coupling = Literal["own", "compliant", "separate", "ratio"]
 
 @dataclass(frozen=True)
 class Variant:
-    """A model near the nominal one; by default the nominal one."""
+    """A model near the nominal one; by default the nominal one. Lengths [m]; factors of the model's own values."""
 
     fit: Fit = "own"
     """Replacement of the hand's collision shapes, see `refit`."""
     grown_m: float = 0.0
-    """Growth of the hand's collision shapes [m]."""
     armature: float | None = None
     """Armature of every joint [kg m^2 or kg]; None: the model's own."""
     dry_friction: float | None = None
     """Dry friction of every joint [N m or N]; None: the model's own."""
     damping: float = 1.0
-    """Joint damping over the model's own."""
     gain: float = 1.0
     """Position gain over the model's own; torque limits stay."""
     coupling: Coupling = "own"
     """compliant: couplings yield under load; separate, ratio: other readings of tendons, see `recoupled`."""
     friction: float = 1.0
-    """Sliding and torsional friction over the model's own."""
     mass: float = 1.0
     """Mass of the object over the model's own; pushes equal its weight and grow with it."""
     centre_m: Vector = (0.0, 0.0, 0.0)
-    """Shift of the object's centre of mass in its frame [m]."""
     object_shift_m: Vector = (0.0, 0.0, 0.0)
     """Shift of the object, in its frame [m]."""
     object_turn: Vector = (0.0, 0.0, 0.0)
@@ -166,10 +174,8 @@ def _vector(rng: np.random.Generator, most: float) -> Vector:
 
 def recoupled(hand: HandModel, coupling: Coupling) -> HandModel:
     """Return the hand with its tendons read otherwise; itself without tendons, or for other readings.
-
     separate: each joint of a tendon gets the drive it would have without the tendon. ratio: joints of a tendon turn as
-    one, by equal angles with their coefficients' signs, with the sum of their drives' gains and limits.
-    """
+    one, by equal angles with their coefficients' signs, with the sum of their drives' gains and limits."""
     if not hand.tendons or coupling not in ("separate", "ratio"):
         return hand
     if coupling == "separate":
@@ -213,3 +219,222 @@ def nearest(hand: HandModel, joints: Floats) -> Floats:
     drive = np.zeros((len(dof), hand.dofs))
     drive[np.arange(len(dof)), dof] = rate
     return hand.expand((joints - hand.offset[hand.joint_body]) @ np.linalg.pinv(drive).T)
+
+
+#: Compliant couplings: MuJoCo's default constraint, 2.5 times as slow as the protocol's and softer.
+COMPLIANT_SOLREF: Final = (0.02, 1.0)
+COMPLIANT_SOLIMP: Final = (0.9, 0.95, 1e-3, 0.5, 2.0)
+#: Compiled parts of a variant: shapes, their growth, drives.
+_Build = tuple[Fit, float, Coupling]
+
+
+class Models:
+    """Models around the nominal one of a hand, an object and its surroundings. Thread-safe."""
+
+    def __init__(
+        self,
+        hand: HandModel,
+        obj: ObjectModel,
+        pieces: ConvexPieces,
+        physics: MujocoOptions,
+        supports: Sequence[Obstacle] = (),
+        neighbours: Sequence[Neighbour] = (),
+    ) -> None:
+        self.hand, self.obj = hand, obj
+        self._pieces, self._physics, self._around = pieces, physics, (supports, neighbours)
+        self._scenes: dict[_Build, Scene] = {("own", 0.0, "own"): scene_of(hand, obj, pieces, physics, *self._around)}
+        self._hands: dict[_Build, HandModel] = {("own", 0.0, "own"): hand}
+        self._lock = threading.Lock()
+        self._fingers = _fingers(hand)
+
+    def standard(self, grasps: GraspSet, row: int, variant: Variant) -> Rollout:
+        """Return the verdict of level standard on one grasp in a variant.
+        The nominal variant reproduces the verdict of `validate` bit for bit."""
+        test = VariantTest(self.scene(variant), variant, self._lags(variant))
+        return test.standard(self._taken(test.scene, seen(self.obj, grasps, row, variant)), 0)
+
+    def lift(
+        self, grasps: GraspSet, row: int, placed: PlacedGrasps, variant: Variant, *, dexgraspbench: bool = False
+    ) -> LiftTest:
+        """Lift a grasp in a variant; the nominal one reproduces `validate_lifts` bit for bit.
+
+        Args:
+            grasps: the grasps, with their approach except at level dexgraspbench.
+            placed: the scenes of all grasps; their supports and neighbours are those of these models.
+            dexgraspbench: run the published test instead of the whole one.
+        """
+        number = int(placed.index[row])
+        variant = upright(variant, placed.scenes[number].up)
+        one, where = seen(self.obj, grasps, row, variant), placed.take(slice(row, row + 1))
+        if moves_object(variant):
+            pose = compose(placed.object_pose[number], motion_of(self.obj, variant))
+            beside = placed.neighbour_pose[number : number + 1]
+            where = replace(placed, object_pose=pose[None], index=np.zeros(1, np.intp), neighbour_pose=beside)
+        test = VariantLift(self.scene(variant), where, variant, self._lags(variant))
+        one = self._taken(test.scene, one)
+        return test.dexgraspbench(one, 0) if dexgraspbench else test.lift(one, 0)
+
+    def _taken(self, scene: Scene, one: GraspSet) -> GraspSet:
+        """Project the grasp on a hand of fewer dofs, which cannot take all postures."""
+        if scene.hand.dofs < self.hand.dofs:
+            for part in (one.grasp, one.pregrasp, one.squeeze):
+                part.joint_positions = nearest(scene.hand, part.joint_positions)
+            if one.coming is not None:
+                one.coming = nearest(scene.hand, one.coming)
+        return one
+
+    def scene(self, variant: Variant) -> Scene:
+        """Return the compiled model of a variant, with the addresses for `place` and `command`."""
+        built: _Build = (variant.fit, variant.grown_m, "own" if variant.coupling == "compliant" else variant.coupling)
+        with self._lock:
+            if built not in self._scenes:
+                self._hands[built] = recoupled(refitted(self.hand, *built[:2]), built[2])
+                self._scenes[built] = build(self._hands[built], self.obj, self._pieces, self._physics, *self._around)
+            scene = self._scenes[built]
+        if any(variant.centre_m):
+            # The body's frame is at the centre of mass.
+            obj = replace(self.obj, centre_of_mass=self.obj.centre_of_mass + variant.centre_m)
+            scene = build(self._hands[built], obj, self._pieces, self._physics, *self._around)
+        return _with_numbers(scene, variant)
+
+    def _lags(self, variant: Variant) -> Floats | None:
+        """Return delays (J,) of joints, as shares of the time of closing; None: all start at once."""
+        if not any(variant.lags):
+            return None
+        lags = np.array([0.0, *variant.lags])
+        return np.asarray(lags[self._fingers + 1])
+
+
+class _OneByOne(Test):
+    """A test in which fingers may begin to close one after another."""
+
+    __test__ = False
+    _lags: Floats | None = None
+
+    def _way(self, grasps: GraspSet, row: int, stages: int = STAGES) -> Iterator[tuple[Floats, Floats]]:
+        if self._lags is None:
+            yield from super()._way(grasps, row, stages)
+            return
+        parts = (grasps.pregrasp, grasps.grasp, grasps.squeeze)
+        for stage in range(1, 2 * stages + 1):
+            even = stage / stages
+            part = int(even >= 1)
+            pose, _ = blend(parts[part], parts[part + 1], row, even - part)
+            # Delayed joints move faster: all arrive at the same time.
+            late = np.clip((even / 2 - self._lags) / (1 - self._lags.max()), 0, 1) * 2
+            joints = [part.joint_positions[row] for part in parts]
+            first, second = np.minimum(late, 1), np.maximum(late - 1, 0)
+            closing = (1 - first) * joints[0] + first * joints[1]
+            yield pose, np.where(late <= 1, closing, (1 - second) * joints[1] + second * joints[2])
+
+
+class VariantTest(_OneByOne):
+    __test__ = False
+
+    def __init__(self, scene: Scene, variant: Variant, lags: Floats | None) -> None:
+        super().__init__(scene)
+        self._weight, self._lags = variant.mass, lags
+
+    def _push(self, direction: int) -> None:
+        super()._push(direction)
+        self.data.xfrc_applied[self.scene.object_body, :3] *= self._weight
+
+
+class VariantLift(_OneByOne, Lift):
+    __test__ = False
+
+    def __init__(self, scene: Scene, placed: PlacedGrasps, variant: Variant, lags: Floats | None) -> None:
+        super().__init__(scene, placed)
+        self._weight, self._lags = variant.mass, lags
+
+    def _put(self, hand_pose: Floats, joints: Floats) -> None:
+        super()._put(hand_pose, joints)
+        self.data.xfrc_applied[self.scene.object_body, :3] *= self._weight
+
+
+def _with_numbers(scene: Scene, variant: Variant) -> Scene:
+    """Return the scene with a variant's numbers in a copy of its model; itself if nothing changes."""
+    compiled = "own" if variant.coupling == "compliant" else variant.coupling
+    plain = replace(
+        variant, armature=None, dry_friction=None, damping=1.0, gain=1.0, friction=1.0, mass=1.0, coupling=compiled
+    )
+    if variant == plain:
+        return scene
+    model = copy.copy(scene.model)
+    dofs = model.jnt_dofadr[np.searchsorted(model.jnt_qposadr, scene.joint_qpos)]
+    if variant.armature is not None:
+        model.dof_armature[dofs] = variant.armature
+    if variant.dry_friction is not None:
+        model.dof_frictionloss[dofs] = variant.dry_friction
+    model.dof_damping[dofs] *= variant.damping
+    model.actuator_gainprm[:, 0] *= variant.gain
+    model.actuator_biasprm[:, 1] *= variant.gain
+    model.geom_friction[:, :2] *= variant.friction
+    model.body_mass[scene.object_body] *= variant.mass
+    model.body_inertia[scene.object_body] *= variant.mass
+    if variant.coupling == "compliant":
+        of_joints = model.eq_type == int(mujoco.mjtEq.mjEQ_JOINT)
+        model.eq_solref[of_joints], model.eq_solimp[of_joints] = COMPLIANT_SOLREF, COMPLIANT_SOLIMP
+    # Contact stiffness depends on inverse inertias, which follow from masses and armature.
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    return replace(scene, model=model)
+
+
+def seen(obj: ObjectModel, grasps: GraspSet, row: int, variant: Variant) -> GraspSet:
+    """Return one grasp relative to the object, for a variant with displaced object or hand."""
+    one = grasps.take(np.array([row]))
+    if not (moves_object(variant) or any(variant.hand_shift_m)):
+        return one
+    back, off = invert(motion_of(obj, variant)), np.array([*variant.hand_shift_m, 1.0, 0, 0, 0])
+
+    def moved(part: Posture) -> Posture:
+        return Posture(compose(compose(back, part.hand_pose), off), part.joint_positions)
+
+    way = None if one.approach is None else compose(compose(back, one.approach), off)
+    return replace(
+        one, grasp=moved(one.grasp), pregrasp=moved(one.pregrasp), squeeze=moved(one.squeeze), approach=way, lift=None
+    )
+
+
+def moves_object(variant: Variant) -> bool:
+    return any((*variant.object_shift_m, *variant.object_turn))
+
+
+def motion_of(obj: ObjectModel, variant: Variant) -> Floats:
+    """Return the motion (7,) from the nominal to the displaced object, in its frame."""
+    turn = np.array(variant.object_turn)
+    angle = float(np.linalg.norm(turn))
+    turned = quat_from_axis_angle(turn / angle if angle else np.array([1.0, 0, 0]), np.array(angle))
+    return about_centre(obj, np.array(variant.object_shift_m), turned)
+
+
+def about_centre(obj: ObjectModel, shift: Floats, turn: Floats) -> Floats:
+    """Return the motion (7,) of an object: a turn (4,) about its centre of mass and a shift (3,) [m]."""
+    about = np.concatenate([obj.centre_of_mass + shift, turn])
+    return compose(about, np.concatenate([-obj.centre_of_mass, [1.0, 0, 0, 0]]))
+
+
+def upright(variant: Variant, up: Floats) -> Variant:
+    """Restrict a variant to an object on a support: shifts along the support, turns about the vertical.
+    `up` (3,) is against gravity, in the object frame."""
+    if not moves_object(variant):
+        return variant
+    shift, turn = np.array(variant.object_shift_m), np.array(variant.object_turn)
+    level, about = shift - (shift @ up) * up, (turn @ up) * up
+    return replace(variant, object_shift_m=tuple(level.tolist()), object_turn=tuple(about.tolist()))
+
+
+def _fingers(hand: HandModel) -> NDArray[np.intp]:
+    """Return the index (J,) in `hand.fingertips` of the fingertip that a joint moves; -1: several or none."""
+    moved: list[set[int]] = [set() for _ in range(hand.bodies)]
+    for place, tip in enumerate(hand.fingertips):
+        body = tip
+        while body >= 0:
+            moved[body].add(place)
+            body = int(hand.parent[body])
+    # Joints of one dof move together, and so do the fingertips that any of them moves.
+    of_dof: dict[int, set[int]] = {}
+    for body in hand.joint_body.tolist():
+        of_dof.setdefault(int(hand.dof[body]), set()).update(moved[body])
+    found = [of_dof[int(hand.dof[body])] for body in hand.joint_body.tolist()]
+    return np.array([next(iter(one)) if len(one) == 1 else -1 for one in found], np.intp)

@@ -29,9 +29,10 @@ from graspd.worker.grasps import Posture
 from graspd.worker.hands.jaws import slides
 from graspd.worker.hands.kinematics import body_poses, generalized_forces
 from graspd.worker.hands.model import HandModel
-from graspd.worker.quality.contact import choose_contacts, finger_of_body
+from graspd.worker.quality.contact import finger_of_body
 from graspd.worker.quality.probe import NearestPoints, Probe
 from graspd.worker.quality.wrench_space import wrenches
+from tests.worker.quality.helpers import choose_contacts
 
 
 def pregrasp(probe: Probe, grasp: Posture) -> Posture:

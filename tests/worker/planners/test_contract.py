@@ -16,31 +16,27 @@ from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners import PLANNERS, method, synthesize
 from graspd.worker.planners.port import PlanRequest
 
-#: All methods around free objects but fast_graspd, with the options that make them quick.
-PEERS: dict[str, dict[str, object]] = {
-    name: dict(method(name).quick) for name in PLANNERS if name != "fast_graspd" and method(name).free
-}
+#: All methods around free objects, with the options that make them quick.
+PEERS: dict[str, dict[str, object]] = {name: dict(method(name).quick) for name in PLANNERS if method(name).free}
 PEERS["graspd2022"]["grid"] = 24
+ONE = ExecutionContext(threads=1)
 EACH = pytest.mark.parametrize("name", sorted(PEERS))
 
 
-def grasps(name: str, count: int, *, threads: int = 1, seed: int = 0, hand: str = "barrett") -> GraspSet:
-    return synthesize(
-        hand_from_path(hand),
-        object_from_path("block"),
-        PlanRequest(count=count, fidelity=FIDELITIES["draft"], seed=seed),
-        ExecutionContext(threads=threads),
-        method=name,
-        options=PEERS[name],
-    )
+def grasps(
+    name: str, count: int, *, run: ExecutionContext = ONE, seed: int = 0, batch: int = 0, hand: str = "barrett"
+) -> GraspSet:
+    wanted, obj = PlanRequest(count, FIDELITIES["draft"], seed, batch), object_from_path("block")
+    return synthesize(hand_from_path(hand), obj, wanted, run, method=name, options=PEERS[name])
 
 
 @EACH
-def test_a_grasp_depends_on_seed_and_index_alone(name: str) -> None:
-    small, large, other = grasps(name, 2), grasps(name, 5, threads=2), grasps(name, 2, seed=1)
+def test_a_grasp_depends_on_seed_batch_and_index_alone(name: str) -> None:
+    small, large, other = grasps(name, 2), grasps(name, 5, run=ExecutionContext(threads=2)), grasps(name, 2, seed=1)
     assert np.array_equal(small.grasp.hand_pose, large.grasp.hand_pose[:2])
     assert np.array_equal(small.grasp.joint_positions, large.grasp.joint_positions[:2])
     assert not np.allclose(small.grasp.hand_pose, other.grasp.hand_pose)
+    assert not np.allclose(small.grasp.hand_pose, grasps(name, 2, batch=1).grasp.hand_pose)
 
 
 @EACH
@@ -60,13 +56,7 @@ def test_cancelling_stops_at_the_first_look(name: str) -> None:
         calls.append(done)
         stop.set()
 
+    run = ExecutionContext(threads=1, progress=progress, cancelled=stop.is_set)
     with pytest.raises(TaskCancelled):
-        synthesize(
-            hand_from_path("barrett"),
-            object_from_path("block"),
-            PlanRequest(count=2, fidelity=FIDELITIES["draft"]),
-            ExecutionContext(threads=1, progress=progress, cancelled=stop.is_set),
-            method=name,
-            options=PEERS[name],
-        )
+        grasps(name, 2, run=run)
     assert len(calls) == 1

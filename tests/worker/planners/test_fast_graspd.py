@@ -3,27 +3,19 @@
 from __future__ import annotations
 
 import resource
-import threading
-from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
-from graspd.service.model.errors import InputError, TaskCancelled
 from graspd.service.model.fidelity import FIDELITIES, Fidelity
-from graspd.service.model.transforms import apply
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.grasps import GraspSet
-from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path
-from graspd.worker.hands.surface import sample_surface
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners import synthesize
 from graspd.worker.planners.fast_graspd import pairs, planner, schedule
 from graspd.worker.planners.port import PlanRequest
 from graspd.worker.quality.table import measure
-from graspd.worker.simulation.projection import ProjectionOptions
 
 DRAFT = FIDELITIES["draft"]
 QUICK = DRAFT.model_copy(update={"coarse_iterations": 20, "fine_iterations": 6, "polish_iterations": 2})
@@ -43,31 +35,6 @@ def grasps(
     return synthesize(hand_from_path(hand), object_from_path(obj), wanted, ExecutionContext(threads=threads))
 
 
-def test_the_seed_and_batch_alone_decide_a_grasp_bit_for_bit() -> None:
-    a, b = grasps(4), grasps(4)
-    assert np.array_equal(a.grasp.hand_pose, b.grasp.hand_pose)
-    assert np.array_equal(a.grasp.joint_positions, b.grasp.joint_positions)
-    a = grasps(2)
-    assert not np.allclose(a.grasp.hand_pose, grasps(2, seed=1).grasp.hand_pose)
-    assert not np.allclose(a.grasp.hand_pose, grasps(2, batch=1).grasp.hand_pose)
-
-
-def test_grasp_does_not_depend_on_batch_it_sits_in_or_on_threads() -> None:
-    small, large = grasps(3), grasps(9, threads=2)
-    assert np.array_equal(small.grasp.hand_pose, large.grasp.hand_pose[:3])
-    assert np.array_equal(small.grasp.joint_positions, large.grasp.joint_positions[:3])
-
-
-@pytest.mark.parametrize("hand", ["allegro", "barrett", "shadow"])
-def test_grasps_respect_joint_limits_and_unit_quaternions(hand: str) -> None:
-    model = hand_from_path(hand)
-    found = grasps(4, hand=hand)
-    q = model.reduce(found.grasp.joint_positions)
-    assert np.all(q >= model.lower - 1e-6) and np.all(q <= model.upper + 1e-6)
-    np.testing.assert_allclose(model.expand(q), found.grasp.joint_positions, atol=1e-9)
-    np.testing.assert_allclose(np.linalg.norm(found.grasp.hand_pose[:, 3:], axis=1), 1, atol=1e-6)
-
-
 @pytest.mark.parametrize(
     ("hand", "obj"), [("allegro", "mug"), ("allegro", "bottle"), ("barrett", "block"), ("shadow", "bottle")]
 )
@@ -81,57 +48,6 @@ def test_grasps_touch_with_several_links_and_hardly_penetrate(hand: str, obj: st
     column = int(np.argmin(np.abs(quality["quality/thresholds_m"] - 0.005)))
     assert np.median(quality["quality/contact_area_cm2"][:, column]) > 12
     assert np.mean(quality["quality/epsilon"][:, column] > 0.02) > 0.5
-
-
-def measured(name: str, hand: str, obj: str) -> dict[str, NDArray[Any]]:
-    """24 hands without a trial; pairs are kept by the name of their fidelity, too."""
-    fidelity = FIDELITIES["standard"].model_copy(update={"name": name})
-    found = grasps(24, hand=hand, obj=obj, fidelity=fidelity, threads=2, seed=5)
-    return measure(
-        hand_from_path(hand),
-        object_from_path(obj),
-        found,
-        friction=1.0,
-        thresholds_m=[0.005],
-        run=ExecutionContext(threads=2),
-    )
-
-
-def area(name: str) -> float:
-    """Mean contact area [cm^2] of a Barrett hand on a mug."""
-    return float(np.mean(measured(name, "barrett", "mug")["quality/contact_area_cm2"]))
-
-
-@pytest.fixture(scope="module")
-def plain_area() -> float:
-    return area("plain")
-
-
-def test_hands_that_are_pulled_lie_around_more_of_the_object(
-    plain_area: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A fifth more area with each of three seeds, of which a half is asked for."""
-    monkeypatch.setattr(schedule, "PULL", 0.0)
-    assert plain_area > 1.1 * area("not pulled")
-
-
-def test_drawing_in_what_is_farther_off_leaves_more_of_the_hand(
-    plain_area: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """7 to 24 % more area with each of three seeds; half of the least is asked for."""
-    monkeypatch.setattr(planner, "AROUND", ProjectionOptions())
-    assert plain_area > 1.04 * area("drawn in as among obstacles")
-
-
-def test_hands_enter_an_object_less_where_more_of_it_is_tested(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Depth is measured at points that the planner has not seen: .06 to .62 of it with each of three seeds."""
-
-    def depth(name: str) -> float:
-        return float(np.median(measured(name, "allegro", "mug")["quality/penetration_depth_mm"]))
-
-    dense = depth("dense")
-    monkeypatch.setattr(pairs, "DENSER", 1)
-    assert dense < 0.75 * depth("sparse")
 
 
 def test_a_surface_is_tested_where_the_fidelity_says() -> None:
@@ -172,27 +88,6 @@ def test_the_other_contact_solvers_also_reach_the_object(solver: str) -> None:
     assert np.median(quality["quality/contact_links"]) >= 2
 
 
-def test_cancelling_stops_soon_and_unknown_methods_are_refused() -> None:
-    calls, stop = [], threading.Event()
-
-    def progress(done: float, total: float, message: str) -> None:
-        calls.append((done, total, message))
-        stop.set()
-
-    with pytest.raises(TaskCancelled):
-        synthesize(
-            hand_from_path("allegro"),
-            object_from_path("mug"),
-            PlanRequest(count=4, fidelity=DRAFT),
-            ExecutionContext(threads=1, progress=progress, cancelled=stop.is_set),
-        )
-    assert len(calls) == 1
-    with pytest.raises(InputError, match="fast_graspd"):
-        synthesize(
-            hand_from_path("allegro"), object_from_path("mug"), PlanRequest(count=1, fidelity=DRAFT), method="magic"
-        )
-
-
 FIDELITY = FIDELITIES["draft"].model_copy(update={"name": "custom", "finalists": 2, "coarse_iterations": 30})
 
 
@@ -223,20 +118,6 @@ def test_what_balances_poorly_sets_out_again_the_better_stays(monkeypatch: pytes
     few = parts(3)
     for name in ("pivot", "rotation", "q"):
         np.testing.assert_array_equal(getattr(few.state, name), getattr(twice.state, name)[:3])
-
-
-#: Mean distance between the same surface points of two hands [m]. A difference of 5 mm is seen at a glance.
-ALIKE_M = 0.005
-
-
-def test_no_two_grasps_of_a_batch_are_alike() -> None:
-    hand = hand_from_path("allegro")
-    found = synthesize(hand, object_from_path("block"), PlanRequest(count=32, fidelity=FIDELITIES["draft"]))
-    points = sample_surface(hand, 200)
-    poses = body_poses(hand, found.grasp.hand_pose, found.grasp.joint_positions)
-    world = apply(poses[:, points.body], points.position)
-    distance = np.linalg.norm(world[:, None] - world[None], axis=-1).mean(axis=-1)
-    assert distance[np.triu_indices(32, 1)].min() > ALIKE_M
 
 
 @pytest.mark.slow

@@ -50,21 +50,15 @@ def made(name: str, fidelity: Fidelity) -> dict[str, str]:
     hand = hand_from_path("barrett")
     obj = load_object({"egg.stl": egg()}, name="egg", digest="egg", face_error_m=fidelity.face_error_m)
     options = dict(method(name).quick) | ({"grid": 24} if name == "graspd2022" else {})
-    found = synthesize(
-        hand,
-        obj,
-        PlanRequest(count=2, fidelity=fidelity, seed=3),
-        ExecutionContext(threads=1),
-        method=name,
-        options=options,
-    )
+    wanted, run = PlanRequest(count=2, fidelity=fidelity, seed=3), ExecutionContext(threads=1)
+    found = synthesize(hand, obj, wanted, run, method=name, options=options)
     columns = {
         "faces": obj.faces,
         "grasp": found.grasp.hand_pose,
         "joints": found.grasp.joint_positions,
         "pregrasp": found.pregrasp.joint_positions,
         "squeeze": found.squeeze.joint_positions,
-        **measure(hand, obj, found, run=ExecutionContext(threads=1)),
+        **measure(hand, obj, found, run=run),
     }
     return {column: digest_bytes(values.tobytes()) for column, values in columns.items()}
 

@@ -19,6 +19,7 @@ from graspd.worker.planners.fast_graspd import planner
 from graspd.worker.planners.fast_graspd.planner import plan_joined
 from graspd.worker.scenes.kinds import rest_poses, supports_of
 from graspd.worker.simulation.environment import PlacedGrasps
+from tests.worker.batches import assert_same_grasps
 
 QUICK = resolve_fidelity("draft").model_copy(
     update={"coarse_iterations": 20, "fine_iterations": 6, "polish_iterations": 2}
@@ -37,13 +38,8 @@ def made(pair, asked: list[BatchRequest]) -> list[GraspSet | Exception]:
 
 def assert_same(one: GraspSet | Exception, other: GraspSet) -> None:
     """Bit for bit, with what the planner remarks."""
-    assert isinstance(one, GraspSet)
-    columns, others = one.to_columns(), other.to_columns()
-    assert columns.keys() == others.keys()
-    for name, values in columns.items():
-        np.testing.assert_array_equal(values, others[name], err_msg=name)
-    np.testing.assert_array_equal(one.stability_loss, other.stability_loss)
-    assert one.info == other.info
+    assert_same_grasps(one, other)
+    assert isinstance(one, GraspSet) and one.info == other.info
 
 
 @pytest.mark.parametrize("threads", [1, 2])

@@ -62,6 +62,8 @@ def test_an_entry_point_that_is_no_method_is_named_in_the_error(monkeypatch: pyt
     offer(monkeypatch, "theirs", value)
     with pytest.raises(InputError, match="theirs"):
         method("theirs")
+    with pytest.raises(InputError, match=r"unknown method 'magic'.*fast_graspd"):
+        method("magic")
 
 
 def documented_example() -> str:

@@ -22,33 +22,18 @@ from graspd.service.store.shards import Shard, read_shard
 from graspd.worker import generation
 from graspd.worker.files import synthesis
 from graspd.worker.files.provenance import object_of_shard
+from tests.worker.commands_run import graspd as graspd_command
 
 
 def run(*words: str | Path) -> Any:
     return CliRunner().invoke(build(), [str(word) for word in words])
 
 
-def synth(out: Path, *more: str | Path, obj: str | Path = "block") -> dict[str, Any]:
-    done = run(
-        "synth",
-        "--hand",
-        "allegro",
-        "--object",
-        obj,
-        "-n",
-        3,
-        "--fidelity",
-        "draft",
-        "--device",
-        "cpu",
-        "-o",
-        out,
-        "--json",
-        *more,
-    )
-    assert done.exit_code == 0, done.output
-    found: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
-    return found
+DRAFT = "--fidelity draft --device cpu"
+
+
+def synth(out: Path, more: str, obj: str | Path = "block") -> dict[str, Any]:
+    return graspd_command(f"synth --hand allegro -n 3 {DRAFT} {more} --object", obj, "-o", out)
 
 
 @pytest.fixture(scope="module")
@@ -58,12 +43,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def validated(folder: Path) -> tuple[Path, dict[str, Any]]:
-    return folder / "validated.h5", synth(folder / "validated.h5", "--budget", "8")
+    return folder / "validated.h5", synth(folder / "validated.h5", "--budget 8")
 
 
 @pytest.fixture(scope="module")
 def unvalidated(folder: Path) -> tuple[Path, dict[str, Any]]:
-    return folder / "unvalidated.h5", synth(folder / "unvalidated.h5", "--validation", "none")
+    return folder / "unvalidated.h5", synth(folder / "unvalidated.h5", "--validation none")
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +63,7 @@ def own_mesh(folder: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def of_own_mesh(folder: Path, own_mesh: Path) -> Path:
-    synth(folder / "own.h5", "--validation", "none", "--keep-largest", obj=own_mesh)
+    synth(folder / "own.h5", "--validation none --keep-largest", own_mesh)
     return folder / "own.h5"
 
 
@@ -89,6 +74,7 @@ def test_grasps_called_valid_were_validated_as_in_a_job(validated: tuple[Path, d
     assert said["candidates"] >= 3 and shard.attributes["candidates"] == said["candidates"]
     assert (shard["quality/success"] == 1).all()
     assert shard.attributes["verdict_level"] == "standard" and "verdict_key" in shard.attributes
+    assert said["reason"] is None and "reason" not in shard.attributes
 
 
 def test_grasps_that_nobody_validated_are_sound_and_never_valid(unvalidated: tuple[Path, dict[str, Any]]) -> None:
@@ -100,9 +86,7 @@ def test_grasps_that_nobody_validated_are_sound_and_never_valid(unvalidated: tup
 
 
 def test_evaluate_gives_a_verdict_of_each_grasp_that_agrees(validated: tuple[Path, Any]) -> None:
-    done = run("evaluate", validated[0], "--json")
-    assert done.exit_code == 0, done.output
-    told = json.loads(done.stdout.splitlines()[-1])
+    told = graspd_command("evaluate", validated[0])
     assert [(one["file"], one["row"], one["held"]) for one in told["verdicts"]] == [
         (str(validated[0]), row, True) for row in range(3)
     ]
@@ -133,23 +117,8 @@ def test_export_and_pictures_take_grasps_that_nobody_validated_only_when_told(
 
 
 def test_the_line_for_people_says_that_nobody_validated(tmp_path: Path) -> None:
-    done = run(
-        "synth",
-        "--hand",
-        "allegro",
-        "--object",
-        "block",
-        "-n",
-        1,
-        "--fidelity",
-        "draft",
-        "--device",
-        "cpu",
-        "--validation",
-        "none",
-        "-o",
-        tmp_path / "g.h5",
-    )
+    words = f"synth --hand allegro --object block -n 1 {DRAFT} --validation none -o"
+    done = run(*words.split(), tmp_path / "g.h5")
     assert "1 feasible of" in done.stdout and "not validated" in done.stdout
     assert not re.search(r"\bvalid\b", done.stdout)
 
@@ -163,11 +132,6 @@ def test_a_word_that_is_none_is_refused_before_the_files_are_read(words: tuple[s
 
 def test_an_object_is_named_after_its_folder_where_the_file_says_nothing(of_own_mesh: Path) -> None:
     assert read_shard(of_own_mesh).attributes["object"] == "brick"
-
-
-def test_keep_largest_leaves_the_rest_out(of_own_mesh: Path) -> None:
-    obj = object_of_shard(read_shard(of_own_mesh), None)
-    assert np.ptp(obj.vertices, axis=0) == pytest.approx([0.05, 0.06, 0.07])
 
 
 def elsewhere(file: Path, folder: Path) -> Shard:
@@ -208,23 +172,8 @@ def test_a_given_file_is_read_with_the_options_of_the_shard(of_own_mesh: Path, o
 
 
 def test_every_command_finds_hand_and_object_of_a_file_by_itself(of_own_mesh: Path, tmp_path: Path) -> None:
-    scene = run("scene", of_own_mesh, "--scenes", 1, "-o", tmp_path / "s.h5")
-    assert scene.exit_code == 0, scene.output
-    views = run(
-        "render",
-        tmp_path / "s.h5",
-        "--views",
-        1,
-        "--width",
-        32,
-        "--height",
-        24,
-        "--device",
-        "cpu",
-        "-o",
-        tmp_path / "v.h5",
-    )
-    assert views.exit_code == 0, views.output
+    graspd_command("scene --scenes 1", of_own_mesh, "-o", tmp_path / "s.h5")
+    graspd_command("render --views 1 --width 32 --height 24 --device cpu", tmp_path / "s.h5", "-o", tmp_path / "v.h5")
 
 
 def test_fewer_grasps_than_asked_are_told_with_the_reason_and_exit_code_3(
@@ -232,10 +181,8 @@ def test_fewer_grasps_than_asked_are_told_with_the_reason_and_exit_code_3(
 ) -> None:
     out = folder / "few.h5"
     monkeypatch.setattr(generation, "passes", lambda columns: np.zeros(len(columns["quality/success"]), np.uint8))
-    words = ["--hand", "barrett", "--object", "block", "-n", 2, "--budget", 1, "--json"]
-    done = run("synth", *words, "--fidelity", "draft", "--device", "cpu", "-o", out)  # type: ignore[arg-type]
-    said = json.loads(done.stdout.splitlines()[-1])
-    assert (done.exit_code, said["grasps"], said["valid"], said["wanted"]) == (3, 0, 0, 2), done.output
+    said = graspd_command(f"synth --hand barrett --object block -n 2 --budget 1 {DRAFT} -o", out, code=3)
+    assert (said["grasps"], said["valid"], said["wanted"]) == (0, 0, 2)
     assert sum(said["outcomes"].values()) == said["candidates"] == 2
     assert said["reason"].startswith("found 0 of 2 valid grasps in 2 candidates: ")
     shard = read_shard(out, kind="base")
@@ -243,10 +190,6 @@ def test_fewer_grasps_than_asked_are_told_with_the_reason_and_exit_code_3(
     assert json.loads(str(shard.attributes["outcomes"])) == said["outcomes"]
     again = graspd.open(out)
     assert (again.reason, again.outcomes) == (said["reason"], said["outcomes"])
-
-
-def test_all_that_were_asked_need_no_reason(validated: tuple[Path, dict[str, Any]]) -> None:
-    assert validated[1]["reason"] is None and "reason" not in read_shard(validated[0]).attributes
 
 
 @pytest.mark.parametrize("asked", [signal.SIGINT, signal.SIGTERM])
@@ -264,8 +207,8 @@ def test_who_stops_it_keeps_what_was_validated(
 
     before = signal.getsignal(asked)
     monkeypatch.setattr(synthesis, "synthesized", stopped)
-    words = ["--hand", "barrett", "--object", "block", "-n", 64, "--budget", 1, "--validation", "none", "--json"]
-    done = run("synth", *words, "--fidelity", "draft", "--device", "cpu", "-o", out)  # type: ignore[arg-type]
+    words = f"synth --hand barrett --object block -n 64 --budget 1 --validation none --json {DRAFT} -o"
+    done = run(*words.split(), out)
     shard = read_shard(out, kind="base")
     kept = len(shard["quality/valid"])
     assert done.exit_code == 128 + asked and 0 < kept <= 32

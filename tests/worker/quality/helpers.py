@@ -7,9 +7,12 @@ import dataclasses
 import numpy as np
 import trimesh
 
+from graspd.worker.control.postures import pregrasp, squeeze
 from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.model import HandModel, PalmFrame
-from tests.worker.models import piece, two_finger_hand
+from graspd.worker.hands.surface import farthest_points
+from graspd.worker.validation.decomposition import ConvexPieces
+from tests.worker.models import object_from_mesh, piece, two_finger_hand
 
 
 def posture(*rows: tuple[tuple[float, float, float], tuple[float, ...]]) -> Posture:
@@ -63,3 +66,30 @@ def pad_hand() -> HandModel:
     ball = trimesh.creation.icosphere(subdivisions=3, radius=radius)
     pads = tuple(piece(body, ball, "sphere", (radius,), (0, 0, 0.005 - radius)) for body in (1, 2))
     return dataclasses.replace(plates, name="pads", digest="9ad5" * 8, pieces=(plates.pieces[0], *pads))
+
+
+def choose_contacts(near: np.ndarray, place: np.ndarray, normal: np.ndarray, *, scale: float, limit: int) -> np.ndarray:
+    """What `spread_contacts` does, of one set."""
+    index = np.flatnonzero(near)
+    if len(index) <= limit:
+        return index
+    return index[farthest_points(np.hstack([place[index] / scale, normal[index]]), limit)]
+
+
+BOX = object_from_mesh(trimesh.creation.box((0.06, 0.04, 0.05)))
+WHOLE = ConvexPieces((BOX.hull_vertices,), 1.0, 0.0, "box")
+#: Their soft drives press with 10 N from 10 cm behind the box.
+PADS = dataclasses.replace(pad_hand(), upper=np.full(2, 0.2))
+CONTACT = posture(((0, 0, 0), (0.065, 0.065)))
+
+
+def grasp_of(contact: Posture = CONTACT, force: float = 20.0) -> GraspSet:
+    """Pads that open by 10 mm, touch the box, press."""
+    command = squeeze(PADS, BOX, contact, total_normal_force=force)
+    return GraspSet(contact, pregrasp(PADS, BOX, contact), command, np.full(len(contact), np.nan))
+
+
+def many_grasps(count: int = 8) -> GraspSet:
+    """Pads that hold the box ever nearer to its edge, from firm to none at all."""
+    rows = [((0, 0, z), (0.065, 0.065)) for z in np.linspace(0.0, 0.055, count)]
+    return grasp_of(contact=posture(*rows))

@@ -12,19 +12,9 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
-from scipy.stats import spearmanr
 
-from graspd.service.model.errors import InputError
 from graspd.worker.quality import wrench_space
-from graspd.worker.quality.wrench_space import (
-    MAX_POINTS,
-    Norm,
-    cone_edges,
-    measure_hulls,
-    measure_spaces,
-    tangents,
-    wrenches,
-)
+from graspd.worker.quality.wrench_space import MAX_POINTS, cone_edges, measure_hulls, measure_spaces, tangents, wrenches
 
 #: The table of reference values is printed with six digits.
 PRINTED = 1e-5
@@ -34,9 +24,9 @@ ORIGIN = np.zeros(3)
 OCTAHEDRON = np.vstack([np.eye(3), -np.eye(3)])
 
 
-def measure_space(edge_wrenches: np.ndarray, norm: Norm = "l1") -> tuple[float, float]:
+def measure_space(edge_wrenches: np.ndarray) -> tuple[float, float]:
     """Epsilon and volume of one space."""
-    one = measure_spaces(edge_wrenches[None], np.array([len(edge_wrenches)]), np.ones(1, bool), norm=norm)
+    one = measure_spaces(edge_wrenches[None], np.array([len(edge_wrenches)]), np.ones(1, bool))
     return float(one[0][0]), float(one[1][0])
 
 
@@ -68,12 +58,9 @@ def test_spaces_of_closed_form() -> None:
         (0.5 * math.cos(math.pi / 8), 8 * 0.25 * math.sin(math.pi / 4)), abs=PRINTED
     )
     assert sphere_space(opposed, 0.5) == (0.0, 0.0)
-    # Face centres of a cube; and forces of unit length along the edges of the cone.
+    # Face centres of a cube.
     edges = wrenches(0.05 * OCTAHEDRON, -OCTAHEDRON, friction=0.5, centre=ORIGIN, radius=0.05 * math.sqrt(3))
     assert measure_space(edges) == pytest.approx((0.235702, 0.115207), abs=PRINTED)
-    force = cone_edges(-OCTAHEDRON, 0.5, unit="force")
-    edges = np.concatenate([force, np.cross(OCTAHEDRON[:, None], force)], axis=-1)
-    assert measure_space(edges) == pytest.approx((0.365148, 0.306500), abs=PRINTED)
 
 
 TETRAHEDRON = np.array([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / math.sqrt(3)
@@ -94,16 +81,6 @@ def test_contacts_on_the_unit_sphere(
     points: np.ndarray, options: dict[str, Any], friction: float, epsilon: float, volume: float
 ) -> None:
     assert sphere_space(points, friction, **options) == pytest.approx((epsilon, volume), abs=PRINTED)
-
-
-@pytest.mark.parametrize(("friction", "epsilon", "volume"), [(0.5, 0.469, 1.485), (1.0, 0.939, 23.9)])
-def test_many_contacts_saturate(friction: float, epsilon: float, volume: float) -> None:
-    turn = np.arange(30) + 0.5
-    polar, around = np.arccos(1 - turn / 15), np.pi * (1 + math.sqrt(5)) * turn
-    ring = np.sin(polar)
-    points = np.stack([np.cos(around) * ring, np.sin(around) * ring, np.cos(polar)], axis=1)
-    # The published spiral may begin elsewhere on the sphere.
-    assert sphere_space(points, friction) == pytest.approx((epsilon, volume), rel=0.01)
 
 
 @pytest.mark.parametrize(
@@ -139,15 +116,6 @@ def test_origin_outside_the_space_has_no_ball() -> None:
     assert volume > 0.0
 
 
-def test_the_l_infinity_space_is_a_minkowski_sum_of_few_contacts() -> None:
-    contacts = np.array([[[1.0, 0]], [[-1.0, 0]], [[0, 1.0]], [[0, -1.0]]])
-    assert measure_space(contacts, norm="linf") == pytest.approx((1.0, 4.0), abs=JOGGLE)
-    assert measure_space(contacts, norm="l1") == pytest.approx((math.sqrt(0.5), 2.0), abs=JOGGLE)
-    contacts = np.random.default_rng(0).normal(size=(12, 8, 6))
-    with pytest.raises(InputError, match="take at most 4, or L1"):
-        measure_space(contacts, norm="linf")
-
-
 def frogger_edges(grasp: dict[str, list[list[float]]]) -> np.ndarray:
     """Edge wrenches by the contact model that the reference files state."""
     normal = np.array(grasp["contact_normals_into_object_derived"])
@@ -173,31 +141,6 @@ def test_published_frogger_grasps_have_their_ferrari_canny(shared_data: Path) ->
     assert count == 378
     # Stored points and normals are rounded to 1e-7 m and 1e-6, the stored metric to 1e-8.
     assert worst < 1e-6
-
-
-@pytest.mark.parametrize(
-    ("name", "pearson", "spearman"),
-    [("003_cracker_box", 0.92, 0.94), ("005_tomato_soup_can", 0.87, 0.88), ("006_mustard_bottle", 0.97, 0.97),
-     ("011_banana", 0.97, 0.98), ("048_hammer", 0.90, 0.92), ("056_tennis_ball", 0.96, 0.91),
-     ("061_foam_brick", 0.94, 0.81), ("077_rubiks_cube", 0.81, 0.67)],
-)  # fmt: skip
-def test_recomputed_values_follow_the_published_ones(
-    shared_data: Path, name: str, pearson: float, spearman: float
-) -> None:
-    """The published ones were computed on other meshes of the same objects, so they agree in order, not in digits."""
-    file = shared_data / "reference_grasps" / "frogger_allegro" / f"{name}.json"
-    grasps = json.loads(file.read_text())["grasps"]
-    ours = [measure_space(frogger_edges(grasp))[0] for grasp in grasps]
-    theirs = [grasp["ferrari_canny_L1_published"] for grasp in grasps]
-    assert np.corrcoef(ours, theirs)[0, 1] == pytest.approx(pearson, abs=0.006)
-    assert spearmanr(ours, theirs).statistic == pytest.approx(spearman, abs=0.006)
-
-
-def test_hull_of_a_published_grasp_agrees_with_exact_merging(shared_data: Path) -> None:
-    file = shared_data / "reference_grasps" / "frogger_allegro" / "061_foam_brick.json"
-    edges = frogger_edges(json.loads(file.read_text())["grasps"][0])
-    exact = ConvexHull(edges.reshape(-1, 6), qhull_options="Qt Qx")
-    assert measure_space(edges)[1] == pytest.approx(exact.volume, rel=JOGGLE)
 
 
 #: Both hulls joggle their points, ours by 1e-8; slivers between nearly coplanar points multiply that.

@@ -59,14 +59,6 @@ def test_transferred_poses_are_base_poses_seen_from_the_table():
     )
 
 
-def test_a_hand_pointing_down_clears_the_table_by_its_fingertips():
-    # Palm looks down from 0.2 m: the tips' spheres end 0.068 + 0.011 below the root.
-    down = np.concatenate([[0, 0, 0.2], quat_from_axis_angle(np.array([1.0, 0, 0]), np.asarray(np.pi))])[None]
-    posture = Posture(down, np.zeros((1, 2)))
-    result = transfer(HAND, posture, posture, IDENTITY)
-    assert result["grasp/table_clearance_m"][0] == pytest.approx(0.2 - 0.079, abs=1e-12)
-
-
 @pytest.mark.parametrize(("gap", "valid"), [(MARGIN_M + 1e-6, 1), (MARGIN_M - 1e-6, 0)])
 def test_a_grasp_is_valid_from_the_stated_margin_on(gap, valid):
     # Palm up: the lowest point is the bottom of the palm box, 0.03 below the root.
@@ -124,35 +116,6 @@ LEVEL = np.array([[0.0, 0, 0, 1, 0, 0, 0]])
 
 def box(*size: float):
     return object_from_mesh(trimesh.creation.box(size), "box" + "x".join(map(str, size)))
-
-
-def hulls(objects, poses) -> list[np.ndarray]:
-    return [apply(pose, obj.hull_vertices) for obj, pose in zip(objects, poses, strict=True)]
-
-
-def separated(a: np.ndarray, b: np.ndarray, normals: np.ndarray) -> bool:
-    """Whether one of the directions parts the two point sets (separating axis theorem)."""
-    return bool(np.any((a @ normals.T).max(axis=0) <= (b @ normals.T).min(axis=0) + 1e-6))
-
-
-def test_objects_rest_on_the_table_and_apart():
-    objects = [box(0.05, 0.06, 0.07), box(0.04, 0.04, 0.12), box(0.03, 0.08, 0.05)]
-    result = drop_together(objects[0], objects[1:], count=4, seed=1)
-    for s in range(4):
-        poses = [result["scene/object_pose"][s], *result["scene/neighbour_pose"][s]]
-        placed = hulls(objects, poses)
-        for points in placed:
-            assert points[:, 2].min() == pytest.approx(0, abs=1e-9)
-        for a in range(3):
-            for b in range(3):
-                if a < b:
-                    # Boxes flat on a table are parted by one of their upright faces or not at all.
-                    axes = np.concatenate([_axes(poses[a]), _axes(poses[b])])
-                    assert separated(placed[a], placed[b], np.concatenate([axes, -axes]))
-
-
-def _axes(pose: np.ndarray) -> np.ndarray:
-    return apply(np.concatenate([np.zeros(3), pose[3:]]), np.eye(3))
 
 
 def test_same_seed_gives_same_scenes_and_more_scenes_keep_first():

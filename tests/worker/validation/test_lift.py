@@ -10,13 +10,12 @@ import trimesh
 
 from graspd.service.model.errors import InputError
 from graspd.service.model.matter import ACCELERATION
-from graspd.service.model.metrics import Axis
 from graspd.service.model.transforms import quat_from_axis_angle, quat_multiply, quat_rotate
 from graspd.worker.grasps import GraspSet, Posture, joined
 from graspd.worker.simulation.environment import Neighbour, Obstacle, PlacedGrasps
 from graspd.worker.simulation.obstacles import obstacle_room
 from graspd.worker.validation.decomposition import ConvexPieces
-from graspd.worker.validation.lift import RISING, RISING_S, Lift, LiftOutcome, LiftTest
+from graspd.worker.validation.lift import RISING, RISING_S, Lift, LiftOutcome
 from graspd.worker.validation.lifting import lift_key, validate_lifts
 from graspd.worker.validation.model import FRICTION, HARD, MujocoOptions, build
 from graspd.worker.validation.prescreening import (
@@ -31,10 +30,9 @@ from graspd.worker.validation.prescreening import (
     LiftRollouts,
     push_rollout,
 )
-from graspd.worker.validation.protocol import MAX_DISPLACEMENT_M, STAGE_S, STAGES
+from graspd.worker.validation.protocol import MAX_DISPLACEMENT_M, STAGE_S
 from graspd.worker.validation.robust import robust
-from graspd.worker.validation.variant import NOMINAL, Variant
-from graspd.worker.validation.varied import Models, VariantLift, motion_of, seen, upright
+from graspd.worker.validation.variant import NOMINAL, Models, Variant, VariantLift, motion_of, seen, upright
 from tests.worker.models import object_from_mesh
 from tests.worker.quality.helpers import pad_hand, posture
 
@@ -87,17 +85,6 @@ def test_a_lift_ends_where_its_object_is_lost() -> None:
     # Half of the rise takes the hand 5 cm away from a box that stays.
     rise = RISING * RISING_S / MujocoOptions().timestep
     assert lost.steps < held.steps - 0.3 * rise
-
-
-def test_a_slippery_table_changes_nothing_once_the_box_is_lifted() -> None:
-    test = lift_test()
-    rough = test.lift(grasp(0.05), 0)
-    model = test.scene.model
-    model.geom_priority[test.scene.support_geoms] = 1
-    model.geom_friction[test.scene.support_geoms] = 1e-6
-    smooth = test.lift(grasp(0.05), 0)
-    assert smooth.outcome is rough.outcome is LiftOutcome.LIFTED
-    assert smooth.margin == pytest.approx(rough.margin, abs=0.05)
 
 
 def test_a_hand_that_comes_through_box_or_table_has_touched_them() -> None:
@@ -288,17 +275,6 @@ def models(friction: tuple[float, float] = FRICTION) -> Models:
     return Models(HAND, BOX, WHOLE, MujocoOptions(friction=friction), PLACED.supports)
 
 
-def by_luck(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Lifts that succeed as a coin falls that follows from the grasp and the variant."""
-
-    def lift(self: Models, grasps: GraspSet, row: int, placed: PlacedGrasps, variant: Variant, **_: object) -> LiftTest:
-        words = np.frombuffer(repr((variant, grasps.squeeze.joint_positions[row].tolist())).encode(), np.uint8)
-        lifted = np.random.default_rng(words.tolist()).random() < 0.7
-        return LiftTest(LiftOutcome.LIFTED if lifted else LiftOutcome.NOT_LIFTED)
-
-    monkeypatch.setattr(Models, "lift", lift)
-
-
 @pytest.mark.parametrize("level", ["dexgraspbench", "lift"])
 def test_nominal_model_has_verdicts_of_the_lift_test_bit_for_bit(level: str) -> None:
     verdicts = validate_lifts(HAND, BOX, MANY, WHERE, level=level, pieces=WHOLE)  # type: ignore[arg-type]
@@ -319,27 +295,6 @@ def test_half_the_friction_is_the_hard_lift() -> None:
     assert [rollout.margin for rollout in found] == hard.margin.tolist()
     plain = validate_lifts(HAND, BOX, MANY, WHERE, pieces=WHOLE)
     assert 0 < hard.success.sum() < plain.success.sum()
-
-
-def test_only_what_lifts_is_asked_eight_of_sixteen_are_the_first() -> None:
-    few = MANY.take(np.array([0, 3]))
-    where = WHERE.take(slice(0, 2))
-    held = validate_lifts(HAND, BOX, few, where, pieces=WHOLE).success
-    assert held.tolist() == [0, 1]
-    sixteen, eight = (robust(HAND, BOX, few, held=held, placed=where, models=k, pieces=WHOLE, seed=2) for k in (16, 8))
-    assert np.array_equal(sixteen.held[:, :8], eight.held) and np.array_equal(sixteen.axis[:, :8], eight.axis)
-    assert np.isnan(eight.share[0]) and (eight.held[0] == -1).all() and eight.weakest[0] == Axis.NONE
-    assert (eight.held[1:] >= 0).all()
-
-
-@pytest.mark.parametrize("wanted", [0.25, 0.75, 0.9])
-def test_lifts_that_end_early_say_of_the_share_what_all_say(monkeypatch: pytest.MonkeyPatch, wanted: float) -> None:
-    by_luck(monkeypatch)
-    whole, early = (robust(HAND, BOX, MANY, placed=WHERE, pieces=WHOLE, wanted=one) for one in (0.0, wanted))
-    assert ((early.share >= wanted - 1e-9) == (whole.share >= wanted - 1e-9)).all()
-    validated = early.held >= 0
-    assert (early.held[validated] == whole.held[validated]).all()
-    assert validated.sum() < whole.held.size
 
 
 def test_a_heavier_object_weighs_more_and_takes_more_to_lift() -> None:
@@ -370,16 +325,6 @@ def test_an_object_that_stands_off_slides_and_the_hand_stays() -> None:
     turn = quat_from_axis_angle(up, np.array(0.02 * np.sign(np.array(variant.object_turn) @ up)))
     assert abs(float(motion[3:] @ turn)) == pytest.approx(1.0)
     assert models().lift(MANY, 5, WHERE, variant).success
-
-
-def test_fingers_of_a_lift_close_one_after_another_too() -> None:
-    variant = Variant(lags=(0.0, 0.25))
-    test = VariantLift(models().scene(variant), PLACED, variant, models()._lags(variant))
-    start = MANY.pregrasp.joint_positions[5]
-    way = [joints for _, joints in test._way(MANY, 5)]
-    assert len(way) == 2 * STAGES
-    assert way[4][1] == pytest.approx(start[1]) and way[4][0] > start[0]
-    assert way[-1] == pytest.approx(MANY.squeeze.joint_positions[5])
 
 
 def test_neighbours_stand_beside_the_object_in_every_model() -> None:

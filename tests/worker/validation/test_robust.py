@@ -14,7 +14,6 @@ from graspd.service.model.errors import TaskCancelled
 from graspd.service.model.matter import MASS_KG
 from graspd.service.model.metrics import Axis
 from graspd.service.model.transforms import apply
-from graspd.worker.control.postures import pregrasp, squeeze
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.model import HandModel
@@ -22,26 +21,26 @@ from graspd.worker.hands.primitives import tessellate, volume
 from graspd.worker.hands.tendons import Tendon
 from graspd.worker.validation import model
 from graspd.worker.validation import robust as robustness
-from graspd.worker.validation.decomposition import ConvexPieces
 from graspd.worker.validation.model import MujocoOptions
 from graspd.worker.validation.protocol import STAGES, Outcome, Rollout, Test
 from graspd.worker.validation.refit import fits_of, grown, refitted
 from graspd.worker.validation.robust import Robustness, models_of, needed, robust
 from graspd.worker.validation.validator import validate
-from graspd.worker.validation.variant import NOMINAL, SHAPES, Variant, axes_of, couplings_of, draw, nearest, recoupled
-from graspd.worker.validation.varied import Models, VariantTest, seen
-from tests.worker.models import object_from_mesh, piece, two_finger_hand
-from tests.worker.quality.helpers import pad_hand, plate_hand, posture
-
-BOX = object_from_mesh(trimesh.creation.box((0.06, 0.04, 0.05)))
-WHOLE = ConvexPieces((BOX.hull_vertices,), 1.0, 0.0, "box")
-PADS = dataclasses.replace(pad_hand(), upper=np.full(2, 0.2))
-
-
-def many_grasps(count: int = 8) -> GraspSet:
-    """Pads that hold the box ever nearer to its edge, from firm to none at all."""
-    contact = posture(*[((0, 0, z), (0.065, 0.065)) for z in np.linspace(0.0, 0.055, count)])
-    return GraspSet(contact, pregrasp(PADS, BOX, contact), squeeze(PADS, BOX, contact), np.full(count, np.nan))
+from graspd.worker.validation.variant import (
+    NOMINAL,
+    SHAPES,
+    Models,
+    Variant,
+    VariantTest,
+    axes_of,
+    couplings_of,
+    draw,
+    nearest,
+    recoupled,
+    seen,
+)
+from tests.worker.models import on_one_dof, piece, two_finger_hand
+from tests.worker.quality.helpers import BOX, PADS, WHOLE, many_grasps, plate_hand, posture
 
 
 def by_luck(monkeypatch: pytest.MonkeyPatch, odds: float = 0.7) -> None:
@@ -141,14 +140,6 @@ def test_it_stops_when_it_is_told_to() -> None:
 RNG = np.random.default_rng(11)
 
 
-def pressing_grasps(force: float = 20.0) -> GraspSet:
-    """Pads that hold the box ever nearer to its edge, from firm to none at all."""
-    contact = posture(*[((0, 0, z), (0.065, 0.065)) for z in np.linspace(0.0, 0.055, 8)])
-    return GraspSet(
-        contact, pregrasp(PADS, BOX, contact), squeeze(PADS, BOX, contact, total_normal_force=force), np.full(8, np.nan)
-    )
-
-
 def models(hand: HandModel = PADS, friction: tuple[float, float] = (0.6, 0.02)) -> Models:
     return Models(hand, BOX, WHOLE, MujocoOptions(friction=friction))
 
@@ -244,7 +235,7 @@ def test_fits_that_change_nothing_are_not_offered() -> None:
 
 
 def test_nominal_variant_has_verdicts_of_the_judge_bit_for_bit() -> None:
-    grasps = pressing_grasps()
+    grasps = many_grasps()
     verdicts = validate(PADS, BOX, grasps, pieces=WHOLE)
     found = [models().standard(grasps, row, NOMINAL) for row in range(len(grasps))]
     assert [rollout.success for rollout in found] == (verdicts.success == 1).tolist()
@@ -305,7 +296,7 @@ def test_the_centre_of_mass_moves_and_the_object_stays() -> None:
 
 
 def test_object_or_a_hand_that_is_off_is_met_the_other_way_round() -> None:
-    grasps = pressing_grasps()
+    grasps = many_grasps()
     shift, turn = (0.001, -0.002, 0.0005), (0.0, 0.0, 0.03)
     moved = seen(BOX, grasps, 3, Variant(object_shift_m=shift))
     assert moved.pregrasp.hand_pose[0, :3] == pytest.approx(grasps.pregrasp.hand_pose[3, :3] - shift)
@@ -323,7 +314,7 @@ def test_object_or_a_hand_that_is_off_is_met_the_other_way_round() -> None:
 
 
 def test_fingers_that_close_one_after_another_end_together() -> None:
-    grasps, around = pressing_grasps(), models()
+    grasps, around = many_grasps(), models()
     variant = Variant(lags=(0.0, 0.25))
     plain = list(VariantTest(around.scene(NOMINAL), NOMINAL, None)._way(grasps, 0))
     late = list(VariantTest(around.scene(variant), variant, around._lags(variant))._way(grasps, 0))
@@ -336,37 +327,10 @@ def test_fingers_that_close_one_after_another_end_together() -> None:
     assert late[0][1][0] != pytest.approx(start[0]), "the first one does not"
 
 
-def test_less_friction_holds_no_more() -> None:
-    grasps = pressing_grasps(force=6.0)
-    around = models(friction=(0.3, 0.01))
-    shares = [
-        np.mean([around.standard(grasps, row, Variant(friction=factor)).success for row in range(len(grasps))])
-        for factor in (0.1, 0.5, 1.0, 3.0)
-    ]
-    assert shares == sorted(shares)
-    assert shares[0] < shares[-1]
-
-
-def one_drive() -> HandModel:
-    """Two fingers on one dof."""
-    return dataclasses.replace(
-        two_finger_hand(),
-        digest="1" * 32,
-        dof=np.array([-1, 0, 0], np.int32),
-        dof_names=("both",),
-        lower=np.full(1, -0.3),
-        upper=np.full(1, 1.2),
-        effort=np.ones(1),
-        stiffness=np.full(1, 10.0),
-        preshape=np.zeros(1),
-        closing=np.ones(1),
-    )
-
-
 def test_a_compliant_coupling_gives_way_under_load() -> None:
-    assert Axis.COUPLINGS in axes_of(one_drive()) and Axis.COUPLINGS not in axes_of(two_finger_hand())
+    assert Axis.COUPLINGS in axes_of(on_one_dof(two_finger_hand())) and Axis.COUPLINGS not in axes_of(two_finger_hand())
     apart = []
-    around = models(one_drive())
+    around = models(on_one_dof(two_finger_hand()))
     for variant in (NOMINAL, Variant(coupling="compliant")):
         scene = around.scene(variant)
         data = mujoco.MjData(scene.model)
@@ -380,7 +344,7 @@ def test_a_compliant_coupling_gives_way_under_load() -> None:
 @pytest.mark.parametrize("axis", [axis for axis in Axis if axis is not Axis.NONE])
 def test_a_draw_stays_in_the_range_of_its_axis(axis: Axis) -> None:
     rng = np.random.default_rng(5)
-    hand = one_drive() if axis is Axis.COUPLINGS else PADS
+    hand = on_one_dof(two_finger_hand()) if axis is Axis.COUPLINGS else PADS
     drawn = [draw(axis, hand, rng) for _ in range(60)]
     for one in drawn:
         assert 0.5 <= min(one.gain, one.damping, one.mass) <= max(one.gain, one.damping, one.mass) <= 2

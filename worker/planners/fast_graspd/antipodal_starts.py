@@ -6,29 +6,47 @@ Pairs are found by comparing samples of the surface with one another.
 A few outline points per posture give the distance by which a hand must rise to be clear of obstacles. The test is
 cheap enough for many more hands than the exact collision test.
 
+Around a free object, too, hands start around drawn pairs no wider than the hand opens (`ReachSampling`). In most draws
+a finger or the palm penetrates the object: balls in the hand reject these before the simulation checks a draw.
+
 A fingertip is modelled as a ball as wide as the hand's thinnest fingertip, beside an end of a pair that the hand could
 hold. Space for this ball is necessary for a grasp between opposed fingertips, not sufficient.
 """
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
-from cachetools import LRUCache
+import warp as wp
 from numpy.typing import NDArray
 
-from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply, spread_directions
+from graspd.service.model.transforms import (
+    IDENTITY_POSE,
+    Floats,
+    apply,
+    quat_from_matrix,
+    quat_rotate,
+    spread_directions,
+)
 from graspd.worker.hands.flat_pinches import HEIGHTS_M, pinches_of
+from graspd.worker.hands.grasp_widths import Size, spans_of, widest_span
 from graspd.worker.hands.jaws import thinnest_fingertip
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.pinch_postures import Oppositions, oppositions_of
+from graspd.worker.hands.surface import sample_surface
+from graspd.worker.objects.memory_cache import cached_by_content
 from graspd.worker.objects.model import ObjectModel
+from graspd.worker.planners.fitting import even_points, surface_of
+from graspd.worker.simulation.data import HandState
+from graspd.worker.simulation.device import to_wxyz, to_xyzw
 from graspd.worker.simulation.environment import CLEAR_M, Environment
+from graspd.worker.simulation.kernels import reaching as kernels
+from graspd.worker.simulation.launches import launch
+from graspd.worker.simulation.model import Model
 from graspd.worker.simulation.mounting import OUTERMOST, points_of
 from graspd.worker.simulation.obstacles import MARGIN_M
 
@@ -63,38 +81,24 @@ ALIKE_M: Final = (0.002, 0.006)
 
 @dataclass(frozen=True)
 class Crossings:
-    """P pairs of surface points of an object that face away from each other, object frame."""
+    """P pairs of surface points that face away from each other: middle (P, 3) [m], axis (P, 3), width (P,) [m]."""
 
     middle: Floats
-    """(P, 3) [m]"""
     axis: Floats
-    """(P, 3) unit."""
     width: Floats
-    """(P,) [m]"""
 
     def __len__(self) -> int:
         return len(self.width)
 
     def ends(self) -> tuple[Floats, Floats]:
-        """Return the two points (P, 3) of each pair."""
         half = 0.5 * self.width[:, None] * self.axis
         return self.middle - half, self.middle + half
 
 
-_known: LRUCache[str, Crossings] = LRUCache(16)
-_lock = threading.Lock()
-
-
+@cached_by_content(16)
 def crossings_of(obj: ObjectModel) -> Crossings:
-    """Return the pairs of an object, cached."""
-    with _lock:
-        if obj.content not in _known:
-            _known[obj.content] = _crossings(obj)
-        return _known[obj.content]
-
-
-def _crossings(obj: ObjectModel) -> Crossings:
-    place, normal = _surface(obj)
+    place, face = even_points(obj, SAMPLES, np.random.default_rng(0))
+    normal = surface_of(obj)[1][face]
     line = place[None] - place[:, None]
     width = np.linalg.norm(line, axis=-1)
     unit = line / np.maximum(width, 1e-9)[..., None]
@@ -102,20 +106,6 @@ def _crossings(obj: ObjectModel) -> Crossings:
     enters = np.einsum("ijk,jk->ij", unit, normal)
     i, j = np.nonzero(np.triu((np.minimum(leaves, enters) > ACROSS) & (width > THINNEST_M), 1))
     return Crossings(0.5 * (place[i] + place[j]), unit[i, j], width[i, j])
-
-
-def _surface(obj: ObjectModel) -> tuple[Floats, Floats]:
-    """Return (SAMPLES, 3) area-uniform points and the normals of their faces."""
-    rng = np.random.default_rng(0)
-    corners = obj.vertices[obj.faces]
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    area = np.linalg.norm(cross, axis=1)
-    share = (np.arange(SAMPLES) + rng.random(SAMPLES)) / SAMPLES
-    face = np.minimum(np.searchsorted(np.cumsum(area) / area.sum(), share), len(area) - 1)
-    u, v = rng.random((2, SAMPLES, 1))
-    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
-    c = corners[face]
-    return c[:, 0] + u * (c[:, 1] - c[:, 0]) + v * (c[:, 2] - c[:, 0]), cross[face] / area[face, None].clip(1e-18)
 
 
 @dataclass(frozen=True)
@@ -126,7 +116,6 @@ class Openings:
     sums: Floats
     """(P,) cumulative chance; empty if there is no pair."""
     known: Oppositions
-    """The hand's postures."""
     up: Floats
     """(3,) against gravity, object frame."""
     upright: bool
@@ -139,7 +128,7 @@ class Openings:
     def of(
         cls, known: Oppositions, obj: ObjectModel, scene: Environment, *, tip: float = 0.0, upright: bool = False
     ) -> Openings:
-        """Select pairs; `tip`: thickness of fingertips that must fit beside them [m]; `upright`: the field."""
+        """Select pairs beside which fingertips of thickness `tip` [m] fit."""
         pairs = crossings_of(obj)
         level = np.abs(pairs.axis @ scene.up) < STEEP
         fits = pairs.width + 2 * ROOM_M[0] <= known.widest
@@ -184,7 +173,7 @@ def room_beside(pairs: Crossings, scene: Environment, width: float) -> Floats:
 
 @dataclass(frozen=True)
 class AntipodalHands:
-    """n hands that oppose their fingers across the object."""
+    """n hands that oppose their fingers across the object, turned by (n, 3, 3); they retreat along `away` (n, 3)."""
 
     known: Oppositions
     posture: NDArray[np.intp]
@@ -192,14 +181,11 @@ class AntipodalHands:
     pivot: Floats
     """(n, 3) palm centres relative to the object's centre of mass [m]."""
     turn: Floats
-    """(n, 3, 3) rotations."""
     away: Floats
-    """(n, 3) directions of retreat."""
     deep: Floats
     """(n,) distance of the pads beyond the pair, which brings the palm nearer to the object [m]."""
 
     def q(self, hand: HandModel, normal: Floats) -> Floats:
-        """Return dofs (n, D) with normally distributed noise `normal` (n, D)."""
         known = self.known.q[self.posture]
         return np.clip(known + NOISE * hand.span * normal, hand.lower, hand.upper)
 
@@ -213,15 +199,7 @@ class AntipodalHands:
 
 
 def across(hand: HandModel, obj: ObjectModel, opening: Openings, uniform: Floats, ways: Floats) -> AntipodalHands:
-    """Place hands with opposed fingers across the object.
-
-    Args:
-        hand: the hand.
-        obj: the object.
-        opening: pairs to grasp, at least one.
-        uniform: (n, 6) random numbers.
-        ways: (K, 3) free directions away from the object.
-    """
+    """Place hands across the object by random numbers (n, 6); `ways` (K, 3) are free directions away from it."""
     known = opening.known
     if opening.upright and (upright := ways @ opening.up > UPRIGHT).any():
         ways = ways[upright]
@@ -258,19 +236,9 @@ def promising(
 ) -> tuple[NDArray[np.intp], Floats]:
     """Select the `keep` of C draws per hand that need the least rise to clear the obstacles, (n, keep).
     Also return the distance of the pair from between the pads (n, keep) [m]. Near enough draws keep their order.
-
-    Args:
-        hand: the hand.
-        obj: the object.
-        opening: pairs to grasp, at least one.
-        uniform: (n, C, 6) random numbers.
-        ways: (K, 3) free directions away from the object.
-        scene: the obstacles.
-        room: clearance to keep in addition to the margin [m].
-        keep: at most C.
-    """
+    `uniform` (n, C, 6) and `ways`: see `across`; `room`: clearance to keep in addition to the margin [m]."""
     count, draws, _ = uniform.shape
-    outlines, off = outlines_of(hand, opening.known), np.zeros((count, draws))
+    outlines, off = outlines_of(hand, opening.known.q), np.zeros((count, draws))
     for rows in np.array_split(np.arange(count), 1 + count // AT_ONCE):
         found = across(hand, obj, opening, uniform[rows].reshape(-1, 6), ways)
         lack = outlines.lacks(found.posture, found.turn, found.pivot + obj.centre_of_mass, scene, room=room)
@@ -298,7 +266,6 @@ class PostureOutlines:
     """Outermost points of a hand in each of its K opposed postures, relative to the palm's centre."""
 
     points: Floats
-    """(K, P, 3) [m]"""
     tips: NDArray[np.bool_]
     """(P,) mask of the fingertips' points."""
     mounting: Floats
@@ -308,16 +275,8 @@ class PostureOutlines:
     def lacks(
         self, posture: NDArray[np.intp], turn: Floats, centre: Floats, scene: Environment, *, room: float
     ) -> Floats:
-        """Return the clearance (n,) from obstacles that hands and mountings lack [m], at least 0.
-        Required are the margin and `room`.
-
-        Args:
-            posture: (n,) indices into the K postures.
-            turn: (n, 3, 3) rotations.
-            centre: (n, 3) palm centres, object frame [m].
-            scene: the obstacles.
-            room: clearance besides the margin [m].
-        """
+        """Return the clearance (n,) that hands and mountings lack to the margin plus `room` [m], at least 0.
+        They have postures (n,), rotations (n, 3, 3) and palm centres (n, 3), object frame [m]."""
         place = np.matmul(self.points[posture], np.swapaxes(turn, -1, -2)) + centre[:, None]
         lack = np.zeros(len(posture))
         for obstacle in scene.obstacles:
@@ -336,21 +295,8 @@ class PostureOutlines:
         return least
 
 
-_known_outlines: LRUCache[tuple[str, bytes], PostureOutlines] = LRUCache(16)
-
-_outline_lock = threading.Lock()
-
-
-def outlines_of(hand: HandModel, postures: Oppositions) -> PostureOutlines:
-    """Return the outlines of opposed postures of a hand, cached."""
-    key = (hand.content, postures.q.tobytes())
-    with _outline_lock:
-        if key not in _known_outlines:
-            _known_outlines[key] = _outlines(hand, postures.q)
-        return _known_outlines[key]
-
-
-def _outlines(hand: HandModel, q: Floats) -> PostureOutlines:
+@cached_by_content(16)
+def outlines_of(hand: HandModel, q: Floats) -> PostureOutlines:
     bodies = body_poses(hand, np.tile(IDENTITY_POSE, (len(q), 1)), hand.expand(q))
     points, tips = [], []
     for tip in (True, False):
@@ -412,3 +358,98 @@ def _widest_gap(pairs: Crossings, fits: NDArray[np.bool_], scene: Environment, t
         middle = 0.5 * (low + high)
         low, high = (middle, high) if room_beside(pairs, scene, middle).max() >= 0.0 else (low, middle)
     return low
+
+
+#: Draws per start, and the number of draws clear by the ball test that the simulation checks.
+DRAWS: Final = 512
+LOOKS: Final = 8
+#: Chance of a pair far from the centre of mass, relative to a pair through it.
+FAR_ACROSS: Final = 0.05
+#: Number of balls in the hand and their radius [m]: they touch its surface from within and protrude from thinner links.
+BALLS: Final = 96
+BALL_M: Final = 0.005
+#: An object is small if all its pairs are narrower than this and than the smallest gap of the hand's pads [m].
+SMALL_M: Final = 0.017
+#: Error of the grid's distances [m].
+SLACK_M: Final = 0.001
+
+
+@dataclass(frozen=True)
+class ReachSampling:
+    model: Model
+    grips: Any
+    only: bool
+    """Whether all starts reach across, because the object is too small or too wide for the pads.
+    Starts that face a random point then rarely succeed."""
+
+    @classmethod
+    def of(cls, model: Model) -> ReachSampling | None:
+        """Return None if the hand opposes no fingers, or the object is too wide everywhere."""
+        known = _grips(model.hand.model, model.obj.model, model.device)
+        return None if known is None else cls(model, *known)
+
+    def starts(self, seeds: NDArray[np.int32], first: NDArray[np.int32], retreats: Floats) -> tuple[HandState, Any]:
+        """Return hands (n,) of the first draws, from numbers `first` (n,) on, that pass the ball test.
+        Also return the draws' numbers (n,), -1 if there is none. `retreats`: ascending steps from the object [m]."""
+        m, count = self.model, len(seeds)
+        with wp.ScopedDevice(m.device):
+            number = wp.empty(count, dtype=wp.int32)
+            pivot, rotation = wp.zeros(count, dtype=wp.vec3), wp.zeros(count, dtype=wp.quat)
+            q = wp.zeros((count, m.dofs), dtype=wp.float32)
+            draws = [wp.array(numbers, dtype=wp.int32) for numbers in (seeds, first)]
+            inputs = [m.obj.surface, self.grips, *draws, DRAWS, wp.vec2(*ALIKE_M), wp.vec2(*ROOM_M)]
+            inputs.append(wp.array(retreats, dtype=wp.float32))
+            launch(kernels.reach, count, inputs=inputs, outputs=[number, pivot, rotation, q])
+        found = HandState(pivot.numpy().astype(float), to_wxyz(rotation.numpy().astype(float)), q.numpy().astype(float))
+        return found, number.numpy()
+
+
+def size_to_pads(hand: HandModel, width: Floats) -> Size | None:
+    """Classify an object with pair widths (P,) as too small or wide for the pads; None if a pair fits."""
+    known = oppositions_of(hand)
+    if not len(known) or not len(width):
+        return None
+    if width.max() < min(SMALL_M, known.width[0]):
+        return "small"
+    return "wide" if width.min() + 2 * ROOM_M[0] > known.widest else None
+
+
+def _postures(hand: HandModel, width: Floats, size: Size | None) -> Oppositions:
+    """Return the postures for pairs of the widths (P,), empty if none holds a pair."""
+    if size == "wide" and width.min() + 2 * ROOM_M[0] > widest_span(hand):
+        return Oppositions.of_none(hand)
+    known = oppositions_of(hand) if size is None else spans_of(hand, size)
+    return known if (width + 2 * ROOM_M[0] <= known.widest).any() else Oppositions.of_none(hand)
+
+
+@cached_by_content(8)
+def _grips(hand: HandModel, obj: ObjectModel, device: str) -> tuple[Any, bool] | None:
+    """Return `ReachSampling.grips` and `.only`; None if no posture holds a pair."""
+    pairs, out = crossings_of(obj), kernels.Grips()
+    size = size_to_pads(hand, pairs.width)
+    known = _postures(hand, pairs.width, size)
+    if not len(known):
+        return None
+    kept = np.flatnonzero(pairs.width + 2 * ROOM_M[0] <= known.widest)
+    middle = pairs.middle[kept] - obj.centre_of_mass
+    chance = np.exp(-((np.linalg.norm(middle, axis=1) / BESIDE_M) ** 2)) + FAR_ACROSS
+    points = sample_surface(hand, BALLS)
+    pose = body_poses(hand, np.tile(IDENTITY_POSE, (len(known), 1)), hand.expand(known.q))[:, points.body]
+    balls = quat_rotate(pose[..., 3:], points.position - BALL_M * points.normal) + pose[..., :3] - hand.palm.centre
+    own = quat_from_matrix(frames(known.axis, np.tile(hand.palm.approach, (len(known), 1))))
+    with wp.ScopedDevice(device):
+        out.middle, out.axis = wp.array(middle, dtype=wp.vec3), wp.array(pairs.axis[kept], dtype=wp.vec3)
+        out.width = wp.array(pairs.width[kept], dtype=wp.float32)
+        out.sums = wp.array(np.cumsum(chance) / chance.sum(), dtype=wp.float32)
+        out.posture = wp.array(known.q, dtype=wp.float32)
+        out.between = wp.array(known.middle - hand.palm.centre, dtype=wp.vec3)
+        out.frame = wp.array(to_xyzw(own), dtype=wp.quat)
+        out.opened = wp.array(known.width, dtype=wp.float32)
+        out.balls = wp.array(balls, dtype=wp.vec3)
+        out.radius = BALL_M - SLACK_M
+        # Objects that are too small or too wide are held where space was found, never nearer to the palm.
+        out.deep = 0.0 if size else 1.0
+        out.palm = wp.vec3(*hand.palm.approach)
+        out.noise = wp.array(NOISE * hand.span, dtype=wp.float32)
+        out.lower, out.upper = wp.array(hand.lower, dtype=wp.float32), wp.array(hand.upper, dtype=wp.float32)
+    return out, size is not None

@@ -34,8 +34,11 @@ class Batches:
         In scenes, `warm` proposes the starts of hands; None: `scene_starts` finds them."""
         self.asked, self.warm = asked, warm
         wanted = [one.wanted for one in asked]
-        in_scenes = wanted[0].placed is not None
-        self.fidelity: Fidelity = _adapted(wanted[0].fidelity, in_scenes=in_scenes, tried=self.has_rollout)
+        self.fidelity = wanted[0].fidelity
+        if wanted[0].placed is not None:
+            self.fidelity = in_scene(self.fidelity)
+        elif self.has_rollout:
+            self.fidelity = with_rollout(self.fidelity)
         if warm is not None:
             self.fidelity = warm.adapted(self.fidelity)
         counts = [one.count for one in wanted]
@@ -53,15 +56,12 @@ class Batches:
         self.ways: list[Floats] = []
         """Free directions of each scene."""
         for owner, scenes in enumerate(placed):
-            self._find_ways(owner, scenes, obj)
-
-    def _find_ways(self, owner: int, scenes: PlacedGrasps, obj: ObjectModel) -> None:
-        try:
-            # All scenes of a batch or none: a scene's directions are found by its number.
-            self.ways += [free_ways(scene, obj) for scene in scenes.scenes]
-        except InputError as error:
-            self.ways += [np.zeros((0, 3))] * len(scenes.scenes)
-            self.put_out(owner, error)
+            try:
+                # All scenes of a batch or none: a scene's directions are found by its number.
+                self.ways += [free_ways(scene, obj) for scene in scenes.scenes]
+            except InputError as error:
+                self.ways += [np.zeros((0, 3))] * len(scenes.scenes)
+                self.put_out(owner, error)
 
     @property
     def has_rollout(self) -> bool:
@@ -71,7 +71,6 @@ class Batches:
         return several and all(one.wanted.rollout is not None for one in self.asked)
 
     def put_out(self, owner: int, error: Exception) -> None:
-        """Stop a batch; its first error is stored."""
         self.errors.setdefault(owner, error)
 
     def going(self, rows: Rows) -> NDArray[np.bool_]:
@@ -79,11 +78,7 @@ class Batches:
         return ~np.isin(self.owner[rows], list(self.errors))
 
     def left(self) -> Rows:
-        """Return the rows of the batches that are still planned.
-
-        Raises:
-            Exception: error of the first batch, if all have stopped.
-        """
+        """Return the rows of the batches that are still planned; raise the first batch's error if all have stopped."""
         rows = np.flatnonzero(self.going(np.arange(len(self.owner))))
         if not len(rows):
             raise self.errors[min(self.errors)]
@@ -91,10 +86,7 @@ class Batches:
 
     def step(self, rows: Rows, work: float, message: str) -> None:
         """Report so much work for each of the rows; stop batches that are cancelled.
-
-        Raises:
-            Exception: error of the first batch, if all have stopped.
-        """
+        Raise the first batch's error if all have stopped."""
         owners, counts = np.unique(self.owner[rows], return_counts=True)
         for owner, count in zip(owners.tolist(), counts.tolist(), strict=True):
             if owner not in self.errors:
@@ -133,17 +125,10 @@ class Batches:
         return scores
 
 
-def _adapted(fidelity: Fidelity, *, in_scenes: bool, tried: bool) -> Fidelity:
-    if in_scenes:
-        return in_scene(fidelity)
-    return with_rollout(fidelity) if tried else fidelity
-
-
 def finalists(fidelity: Fidelity) -> int:
     """Return the number of hands per grasp that enter the fine phase, at most the number of starts."""
     return min(fidelity.finalists, fidelity.starts)
 
 
 def hands(fidelity: Fidelity) -> int:
-    """Return the number of hand iterations per grasp."""
     return fidelity.starts * fidelity.coarse_iterations + finalists(fidelity) * fidelity.fine_iterations

@@ -41,7 +41,6 @@ def with_postures(
     *,
     device: str = "cpu",
 ) -> GraspSet:
-    """Convert hands (n) to grasps and find the postures around them on a device."""
     grasp = posture_of(hand, obj, state)
     before = pregrasp(hand, obj, grasp, placed, device=device)
     return GraspSet(grasp, before, squeeze(hand, obj, grasp, device=device), losses)
@@ -53,9 +52,7 @@ class Refinements:
 
     state: HandState
     losses: Floats
-    """L_stable of each."""
     merit: Floats
-    """Smaller is better."""
     infeasible: NDArray[np.bool_]
     """Whether its depth or number of touching links fails the geometric gate: then it has no rollout."""
 
@@ -82,8 +79,19 @@ class Selection:
         empty = HandState(np.zeros((count, 3)), np.zeros((count, 4)), np.zeros((count, dofs)))
         return cls(empty, np.zeros(count), np.full(count, np.inf), {})
 
+    def take(
+        self, found: GraspSet, seated: Refinements, rows: NDArray[np.intp], which: NDArray[np.intp], score: Floats
+    ) -> None:
+        """Take candidates `rows` (k,) of the grasps `which` (k,) where they are better."""
+        state, losses = seated.state[rows], seated.losses[rows]
+        for k in np.flatnonzero(score < self.score[which]):
+            grasp = int(which[k])
+            self.grasps[grasp] = found.take(slice(k, k + 1))
+            self.score[grasp], self.losses[grasp] = score[k], losses[k]
+            for name in ("pivot", "rotation", "q"):
+                getattr(self.state, name)[grasp] = getattr(state, name)[k]
+
     def joined(self) -> GraspSet:
-        """Return the grasps in their order."""
         return joined([self.grasps[k] for k in range(len(self.score))])
 
 
@@ -99,19 +107,8 @@ def tried(
     device: str = "cpu",
 ) -> Selection:
     """Return each grasp's first candidate with a good enough rollout, or else the one with least score.
-    `together` candidates of each grasp are seated and simulated in order of merit, then as many again for grasps
-    without a good one. Unbalanced or infeasible hands have no rollout, but each grasp's first candidate is taken.
-
-    Args:
-        hand: the hand.
-        obj: the object.
-        order: (n, each) rows of the hands of each grasp, the most promising first.
-        seat: seats hands.
-        placed: scenes of the n grasps; None: free.
-        rollout: computes the scores.
-        together: hands of each grasp that are seated at once.
-        device: finds the postures that the rollout needs.
-    """
+    `together` candidates of each grasp are seated and simulated in the order (n, each) of merit, then as many again
+    for grasps without a good one. Unbalanced or infeasible hands have no rollout, but a grasp's first one is taken."""
     taken, left = Selection.none(len(order), hand.dofs), np.arange(len(order))
     for wave in np.split(order, range(together, order.shape[1], together), axis=1):
         if not len(left):
@@ -129,7 +126,7 @@ def tried(
             )
             score = _scores(found, seated.infeasible[rows[open_]], which, taken.score[which], rollout)
             _gentler(hand, obj, found, score, which, rollout, device)
-            _take(found, seated, rows[open_], which, score, taken)
+            taken.take(found, seated, rows[open_], which, score)
         left = left[~(taken.score[left] < 1.0)]
     return taken
 
@@ -137,7 +134,6 @@ def tried(
 def _scores(
     found: GraspSet, infeasible: NDArray[np.bool_], which: NDArray[np.intp], beat: Floats, rollout: RolloutOf
 ) -> Floats:
-    """Score (k,) one hand each of the grasps `which` (k,) by rollout; `beat` (k,) are their scores so far."""
     score, feasible = np.full(len(which), HOPELESS), np.flatnonzero(~infeasible)
     if len(feasible):
         score[feasible] = np.nan_to_num(
@@ -168,24 +164,6 @@ def _gentler(
     score[poor[better]] = again[better]
 
 
-def _take(
-    found: GraspSet,
-    seated: Refinements,
-    rows: NDArray[np.intp],
-    which: NDArray[np.intp],
-    score: Floats,
-    taken: Selection,
-) -> None:
-    """Replace selected candidates by better ones: one hand each (k,) for the grasps `which` (k,)."""
-    state, losses = seated.state[rows], seated.losses[rows]
-    for k in np.flatnonzero(score < taken.score[which]):
-        grasp = int(which[k])
-        taken.grasps[grasp] = found.take(slice(k, k + 1))
-        taken.score[grasp], taken.losses[grasp] = score[k], losses[k]
-        for name in ("pivot", "rotation", "q"):
-            getattr(taken.state, name)[grasp] = getattr(state, name)[k]
-
-
 #: Coulomb coefficient for the balance of contacts: lower than in any test, so that balanced grasps have a reserve.
 FRICTION: Final = 0.3
 #: The same in scenes: hands that balance with it mostly lift at half friction (AUC .80 of seated hands of Allegro and
@@ -203,7 +181,6 @@ NEAR_M: Final = 0.005
 
 
 def posture_of(hand: HandModel, obj: ObjectModel, state: HandState) -> Posture:
-    """Return the hands of a state in the object frame."""
     root = state.pivot + obj.centre_of_mass - quat_rotate(state.rotation, hand.palm.centre)
     return Posture(np.concatenate([root, state.rotation], axis=1), hand.expand(state.q))
 
@@ -232,8 +209,3 @@ def ranked(merit: Floats, grasps: int) -> NDArray[np.intp]:
     each = merit.reshape(grasps, -1)
     # The stable sort keeps hands of equal merit in the order of their starts.
     return np.argsort(each, axis=1, kind="stable") + np.arange(grasps)[:, None] * each.shape[1]
-
-
-def best_of_each(merit: Floats, grasps: int, keep: int) -> NDArray[np.intp]:
-    """Return rows of the `keep` best hands of each grasp, in the order of their starts."""
-    return np.sort(ranked(merit, grasps)[:, :keep], axis=1).ravel()

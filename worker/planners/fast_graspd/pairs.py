@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
-import threading
 from dataclasses import dataclass, replace
 from typing import Final
-
-from cachetools import LRUCache
 
 from graspd.service.model.fidelity import Fidelity
 from graspd.worker.hands.model import HandModel, SurfacePoints
 from graspd.worker.hands.surface import sample_surface
+from graspd.worker.objects.memory_cache import cached_by_content
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.planners.fast_graspd.schedule import loss_options
 from graspd.worker.simulation import kernels
-from graspd.worker.simulation.data import Data
 from graspd.worker.simulation.device import DeviceHand, DeviceObject
-from graspd.worker.simulation.launches import Launches
 from graspd.worker.simulation.model import LossOptions, Model
 from graspd.worker.simulation.obstacles import DeviceObstacles
-from graspd.worker.simulation.record import record_iteration
 from graspd.worker.simulation.sampling import object_samples
 
 #: Cell of the coarse distance grid [m].
@@ -37,8 +32,6 @@ KEPT: Final = 4
 
 @dataclass(frozen=True)
 class PhaseGeometry:
-    """Resolution of hand and object in a phase."""
-
     points: SurfacePoints
     own: SurfacePoints
     """Points tested against other links."""
@@ -60,38 +53,29 @@ class Pair:
         options = self.options if obstacles is None and pulled else replace(self.options, pull=0.0)
         return Model.create(self.hand, side.obj, side.points, side.own, options, obstacles)
 
-    def iteration(self, model: Model, data: Data, optimizer: str, patience: int) -> Launches:
-        """See `record_iteration`."""
-        return record_iteration(model, data, optimizer, patience=patience)
-
-
-_pairs: LRUCache[tuple[str, str, str, int, str], Pair] = LRUCache(KEPT)
-_lock = threading.Lock()
-
 
 def pair_of(hand: HandModel, obj: ObjectModel, fidelity: Fidelity, device: str, *, in_scenes: bool = False) -> Pair:
     """Return the pair, cached. Without projection out of a free object it also has the fidelity's samples."""
     count = fidelity.object_points
     if fidelity.polish_iterations and not in_scenes:
         count = max(count, min(DENSER * count, DENSEST))
-    key = (hand.content, obj.content, fidelity.model_dump_json(), count, device)
-    with _lock:
-        if key in _pairs:
-            return _pairs[key]
-        kernels.load(device)
-        samples = object_samples(obj, count)
-        whole = DeviceObject.create(obj, device, samples=samples, phong_alpha=fidelity.phong_alpha, cell=FIELD_CELL)
-        pair = Pair(
-            coarse=PhaseGeometry(
-                points=sample_surface(hand, fidelity.coarse_points),
-                own=sample_surface(hand, COARSE_SELF_POINTS),
-                obj=whole.thinned(COARSE_SAMPLES),
-            ),
-            fine=PhaseGeometry(
-                points=sample_surface(hand, fidelity.fine_points), own=sample_surface(hand, FINE_SELF_POINTS), obj=whole
-            ),
-            options=loss_options(fidelity),
-            hand=DeviceHand.create(hand, device),
-        )
-        _pairs[key] = pair
-        return pair
+    return _pair(hand, obj, fidelity, count, device)
+
+
+@cached_by_content(KEPT)
+def _pair(hand: HandModel, obj: ObjectModel, fidelity: Fidelity, count: int, device: str) -> Pair:
+    kernels.load(device)
+    samples = object_samples(obj, count)
+    whole = DeviceObject.create(obj, device, samples=samples, phong_alpha=fidelity.phong_alpha, cell=FIELD_CELL)
+    return Pair(
+        coarse=PhaseGeometry(
+            points=sample_surface(hand, fidelity.coarse_points),
+            own=sample_surface(hand, COARSE_SELF_POINTS),
+            obj=whole.thinned(COARSE_SAMPLES),
+        ),
+        fine=PhaseGeometry(
+            points=sample_surface(hand, fidelity.fine_points), own=sample_surface(hand, FINE_SELF_POINTS), obj=whole
+        ),
+        options=loss_options(fidelity),
+        hand=DeviceHand.create(hand, device),
+    )

@@ -32,7 +32,6 @@ from graspd.worker.planners.fast_graspd.candidates import (
     SCENE_FRICTION,
     TOGETHER,
     Refinements,
-    best_of_each,
     merits,
     posture_of,
     ranked,
@@ -40,7 +39,6 @@ from graspd.worker.planners.fast_graspd.candidates import (
     with_postures,
 )
 from graspd.worker.planners.fast_graspd.pairs import Pair, pair_of
-from graspd.worker.planners.fast_graspd.retreat import hindrance
 from graspd.worker.planners.fast_graspd.schedule import AROUND, DILATION, WarmStart, coarse_schedule, fine_schedule
 from graspd.worker.planners.fast_graspd.starts import NO_PLACE, Probe
 from graspd.worker.planners.port import BatchRequest, Method, PlanRequest
@@ -52,6 +50,7 @@ from graspd.worker.simulation.launches import Launches
 from graspd.worker.simulation.model import Model
 from graspd.worker.simulation.obstacles import DeviceObstacles
 from graspd.worker.simulation.projection import Projection, ProjectionOptions
+from graspd.worker.simulation.record import record_iteration
 
 Rows = NDArray[np.intp]
 
@@ -82,10 +81,8 @@ class LaunchPart:
     """Grasps of a launch that one thread works on."""
 
     rows: Rows
-    """(n,) rows of the launch."""
     state: HandState
     loss: Floats
-    """(n,) L_stable."""
     merit: Floats
     """(n,) merit of the chosen hand, or its rollout score; 0 where there was no choice."""
     curve: list[Floats] = field(default_factory=list)
@@ -93,21 +90,18 @@ class LaunchPart:
     grasps: GraspSet | None = None
     """Grasps with their postures, where these were requested or a rollout needed them."""
     attempts: Rows = field(default_factory=lambda: np.zeros(0, int))
-    """(n,) number of attempts."""
 
     def __post_init__(self) -> None:
         if len(self.attempts) != len(self.rows):
             self.attempts = np.ones(len(self.rows), int)
 
     def take(self, which: NDArray[np.intp]) -> LaunchPart:
-        """Select some of the grasps."""
         grasps = None if self.grasps is None else self.grasps.take(which)
         curve = [one[which] for one in self.curve]
         parts = (self.rows[which], self.state[which], self.loss[which], self.merit[which], curve, grasps)
         return LaunchPart(*parts, self.attempts[which])
 
     def followed_by(self, other: LaunchPart) -> LaunchPart:
-        """Concatenate the grasps of both."""
         curve = [np.concatenate(both) for both in zip(self.curve, other.curve, strict=True)]
         both = [part.grasps for part in (self, other) if part.grasps is not None]
         rows, loss, merit, attempts = (
@@ -172,11 +166,7 @@ def optimise_pair(pair: Pair, wanted: PlanRequest, run: ExecutionContext) -> lis
 
 def optimise(pair: Pair, batches: Batches, run: ExecutionContext, *, postures: bool = False) -> list[LaunchPart]:
     """Do the same for several batches; return the parts of those that did not stop, and perhaps others.
-    `postures` adds the postures around the grasps.
-
-    Raises:
-        Exception: error of the first batch, if all have stopped.
-    """
+    `postures` adds the postures around the grasps. Raise the first batch's error if all have stopped."""
     launch = _Launch(pair, batches)
     begun = _begun(launch, batches.left(), run)
     rows = _with_place(launch, begun)
@@ -208,7 +198,10 @@ class _Launch:
     fine: Model = field(init=False)
 
     def __post_init__(self) -> None:
-        obstacles = _obstacles(self.pair, self.batches.placed)
+        placed, centre = self.batches.placed, self.pair.fine.obj.model.centre_of_mass
+        hand, obstacles = self.pair.hand, None
+        if placed is not None:
+            obstacles = DeviceObstacles.create(hand.model, placed.scenes, centre, hand.device)
         object.__setattr__(self, "coarse", self.pair.model(self.pair.coarse, obstacles, pulled=self.pulled))
         object.__setattr__(self, "fine", self.pair.model(self.pair.fine, obstacles, pulled=self.pulled))
 
@@ -216,7 +209,6 @@ class _Launch:
         return self.batches.placed.take(rows) if self.batches.placed is not None else None
 
     def merits(self, state: HandState, losses: Floats, depths: Floats | None = None) -> Floats:
-        """See `candidates.merits`."""
         hand, obj, device = self.pair.hand.model, self.pair.fine.obj.model, self.pair.hand.device
         friction = FRICTION if self.batches.placed is None else SCENE_FRICTION
         return merits(hand, obj, state, losses, depths, friction=friction, device=device)
@@ -241,15 +233,12 @@ class _Begun:
     """Share of the dilation at which each hand touches; None: all of it."""
 
     def take(self, which: NDArray[np.intp], each: int) -> _Begun:
-        """Select some of the grasps, `each` hands of each."""
         hands = (which[:, None] * each + np.arange(each)).ravel()
         touch = None if self.touch is None else self.touch[hands]
         return _Begun(self.rows[which], self.state[hands], self.depth[hands], touch)
 
 
 def _begun(launch: _Launch, rows: Rows, run: ExecutionContext) -> _Begun:
-    """Sample the starts of grasps."""
-
     def work(which: range) -> _Begun:
         some = rows[which.start : which.stop]
         found = _set_out(launch, some, np.zeros(len(some), int))
@@ -265,7 +254,6 @@ def _begun(launch: _Launch, rows: Rows, run: ExecutionContext) -> _Begun:
 
 
 def _set_out(launch: _Launch, rows: Rows, attempt: Rows) -> _Begun:
-    """Sample starts at attempts (n,), 0 being the first; a grasp may appear with several attempts."""
     batches, coarse = launch.batches, launch.coarse
     fidelity, placed, generators = batches.fidelity, launch.placed(rows), batches.generators(rows, attempt)
     if placed is None:
@@ -283,7 +271,6 @@ def _set_out(launch: _Launch, rows: Rows, attempt: Rows) -> _Begun:
 
 def _with_place(launch: _Launch, begun: _Begun) -> Rows:
     """Return the rows of the batches that found starts.
-
     Around a free object every grasp must have one; in scenes one per batch suffices, made here or elsewhere."""
     batches = launch.batches
     deep = begun.depth.reshape(len(begun.rows), -1)
@@ -305,7 +292,7 @@ def _work(launch: _Launch, begun: _Begun) -> LaunchPart:
     data.set_schedule(coarse_schedule(fidelity))
     data.set_state(begun.state, dilation=begun.touch)
     # The dilation shrinks during the coarse phase and changes its loss, so nothing converges before its end.
-    launches = pair.iteration(launch.coarse, data, fidelity.optimizer, patience=0)
+    launches = record_iteration(launch.coarse, data, fidelity.optimizer, patience=0)
     curve: list[Floats] = []
     state = _descend(launches, data, batches, rows, fidelity.coarse_iterations, "coarse optimization", curve)
     losses = _losses(data, len(state.pivot))
@@ -315,7 +302,7 @@ def _work(launch: _Launch, begun: _Begun) -> LaunchPart:
         if placed is None:
             merit -= NEARNESS * data.near_share(NEAR_M, len(state.pivot))
         else:
-            merit += hindrance(launch.coarse, state, placed.take(np.repeat(np.arange(n), fidelity.starts)))
+            merit += scene_starts.hindrance(launch.coarse, state, placed.take(np.repeat(np.arange(n), fidelity.starts)))
         order = ranked(merit, n)[:, :last]
     seats = _Seats(launch, rows, state, losses, curve)
     if batches.has_rollout:
@@ -331,13 +318,12 @@ def _work(launch: _Launch, begun: _Begun) -> LaunchPart:
             score = np.where(off & (score < STANDS), STANDS + 1e-3 * score, score)
         return LaunchPart(rows, taken.state, taken.losses, score, curve, found)
     seated = seats.seated(np.sort(order, axis=1), np.arange(n))
-    winners = best_of_each(seated.merit, n, 1) if last > 1 else np.arange(n)
+    winners = ranked(seated.merit, n)[:, 0] if last > 1 else np.arange(n)
     return LaunchPart(rows, seated.state[winners], seated.losses[winners], seated.merit[winners], curve)
 
 
 def _tried_again(launch: _Launch, part: LaunchPart, run: ExecutionContext) -> LaunchPart:
     """Retry grasps that fail their rollout or, if free, balance poorly; keep the first good or the best.
-
     The last few grasps would leave cores idle, and a hand costs a third more in a small launch. They make some attempts
     ahead; attempts after a good one are dropped, so the result equals that of sequential attempts."""
     closer = (STANDS,) * CLOSER + (FAILED,) * (ATTEMPTS - CLOSER)
@@ -378,7 +364,6 @@ def _set_out_again(launch: _Launch, rows: Rows, attempt: Rows, run: ExecutionCon
 
 
 def _posed(launch: _Launch, part: LaunchPart) -> LaunchPart:
-    """Add the postures around the grasps of a part."""
     hand, obj = launch.pair.hand.model, launch.pair.fine.obj.model
     placed, device = launch.placed(part.rows), launch.pair.hand.device
     return replace(part, grasps=with_postures(hand, obj, part.state, part.loss, placed, device=device))
@@ -396,14 +381,13 @@ class _Seats:
     """Loss curve, continued by the hands that are seated first."""
 
     def seated(self, rows: NDArray[np.intp], which: NDArray[np.intp]) -> Refinements:
-        """Seat hands `rows` (k, each) of the grasps `which` (k,) of this part."""
         launch, flat = self.launch, rows.ravel()
         fidelity, mine = launch.batches.fidelity, self.rows[which]
         state, losses = self.state[flat], self.losses[flat]
         data = _in_scenes(Data(launch.fine, len(flat)), launch.placed(mine), rows.shape[1])
         data.set_schedule(fine_schedule(fidelity))
         data.set_state(state)
-        launches = launch.pair.iteration(launch.fine, data, fidelity.optimizer, patience=fidelity.patience)
+        launches = record_iteration(launch.fine, data, fidelity.optimizer, patience=fidelity.patience)
         curve, self.curve = self.curve, []
         state = _descend(launches, data, launch.batches, mine, fidelity.fine_iterations, "refinement", curve)
         if fidelity.fine_iterations:
@@ -415,22 +399,13 @@ class _Seats:
         return Refinements(state, losses, merit, launch.infeasible(state, depths))
 
 
-def _obstacles(pair: Pair, placed: PlacedGrasps | None) -> DeviceObstacles | None:
-    if placed is None:
-        return None
-    centre = pair.fine.obj.model.centre_of_mass
-    return DeviceObstacles.create(pair.hand.model, placed.scenes, centre, pair.hand.device)
-
-
 def _in_scenes(data: Data, placed: PlacedGrasps | None, each: int) -> Data:
-    """Set the scene of every hand in the data, `each` hands per grasp."""
     if placed is not None:
         data.set_scenes(np.repeat(placed.index, each))
     return data
 
 
 def _losses(data: Data, n: int) -> Floats:
-    """Return L_stable (n,) of the last iteration."""
     return data.loss.numpy()[:n].mean(axis=1).astype(float)
 
 
@@ -466,7 +441,6 @@ def grasps_of(
     *,
     device: str = "cpu",
 ) -> GraspSet:
-    """Convert the parts of a batch to grasps with the postures around them."""
     curve = [np.concatenate(chunk).mean() for chunk in zip(*(part.curve for part in parts), strict=True)]
     known = [part.grasps for part in parts if part.grasps is not None]
     if len(known) == len(parts):

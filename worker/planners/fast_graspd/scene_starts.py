@@ -1,6 +1,9 @@
 """Sampling of approaches in scenes from the free directions, for all hands at once.
 Most starts are antipodal; the others face a random point of the object, as in `starts`.
 A start keeps `ROOM` from obstacles besides the later margin, so that the optimisation can turn the hand.
+
+Before the expensive phases `hindrance` tests whether each hand can leave its grasp: open, back along the approach, and
+closed, by the lift. A hand hooked around an edge holds well but cannot get there; one close below a board cannot lift.
 """
 
 from __future__ import annotations
@@ -18,16 +21,19 @@ from graspd.service.model.transforms import (
     quat_from_axis_angle,
     quat_from_matrix,
     quat_multiply,
+    quat_rotate,
     spread_directions,
 )
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.planners.fast_graspd.antipodal_starts import NEAR_M, AntipodalHands, Openings, across, promising
 from graspd.worker.planners.fast_graspd.candidates import posture_of
-from graspd.worker.planners.fast_graspd.starts import CLEAR, POSTURE_NOISE, TILT, Probe
+from graspd.worker.planners.fast_graspd.starts import CLEAR, POSTURE_NOISE, TILT, Probe, at_distances, frames_about, put
+from graspd.worker.planners.fitting import points_in, surface_of
 from graspd.worker.planners.port import NoStartFound
+from graspd.worker.quality.contact import finger_of_body
 from graspd.worker.simulation.data import HandState
-from graspd.worker.simulation.environment import STANDOFF_M, Environment, PlacedGrasps
+from graspd.worker.simulation.environment import RISE_M, STANDOFF_M, Environment, PlacedGrasps
 from graspd.worker.simulation.model import Model
 from graspd.worker.simulation.mounting import mounting_lack
 
@@ -54,30 +60,14 @@ CANDIDATES: Final = 48
 _UNIFORM: Final = 7
 
 
-@dataclass(frozen=True)
-class _Surface:
-    """Faces of the object, prepared for draws."""
-
-    corners: Floats
-    normals: Floats
-    sums: Floats
-    """(F,) cumulative share of the area."""
-
-    @classmethod
-    def of(cls, obj: ObjectModel) -> _Surface:
-        corners = obj.vertices[obj.faces]
-        cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        area = np.linalg.norm(cross, axis=1)
-        return cls(corners, cross / np.maximum(area, 1e-20)[:, None], np.cumsum(area) / area.sum())
+#: Antipodal hands, and their indices among the draws.
+_AcrossPairs = list[tuple[NDArray[np.intp], AntipodalHands]]
 
 
 def free_ways(scene: Environment, obj: ObjectModel) -> Floats:
     """Return free approach directions (K, 3), unit vectors in the object frame.
     Along them a ball as wide as a palm leaves the object without touching an obstacle on `STANDOFF_M`.
-
-    Raises:
-        InputError: there is none.
-    """
+    Raise InputError if there is none."""
     ways = spread_directions(DIRECTIONS)
     out = ((obj.hull_vertices - obj.centre_of_mass) @ ways.T).max(axis=0)
     path = out[:, None] + PALM_RADIUS + np.linspace(0.0, STANDOFF_M, 9)
@@ -91,7 +81,6 @@ def free_ways(scene: Environment, obj: ObjectModel) -> Floats:
 
 
 def no_place(model: Model) -> NoStartFound:
-    """Return the error of a batch without a clear start."""
     hand, obj = model.hand.model, model.obj.model
     return NoStartFound(
         f"{hand.name} finds no free place around {obj.name} in this scene: the object is too large, or what stands "
@@ -106,14 +95,7 @@ def clear_scene_starts(
     That is the first clear draw, or the least deep; of antipodal ones the clear draw with the best placed pair.
 
     In a narrow scene some grasps find no clear start: they end blocked, and the batch consists of the others.
-
-    Args:
-        model: hand and object, with the scenes' obstacles.
-        generators: of the starts, those of one grasp side by side.
-        each: starts per grasp.
-        placed: scenes of the grasps.
-        ways: result of `free_ways` for each scene.
-    """
+    `ways` are `free_ways` of each scene."""
     hand, obj = model.hand.model, model.obj.model
     probe = Probe(model, len(generators), room=ROOM)
     used = set(placed.index.tolist())
@@ -121,7 +103,7 @@ def clear_scene_starts(
     scene = np.repeat(placed.index, each)
     reaching = np.arange(len(scene)) % each % EVERY < REACHING
     reaching &= np.array([len(openings[s].sums) > 0 for s in scene.tolist()], bool)
-    count, around = len(scene), _Around(hand, obj, _Surface.of(obj), ways, openings)
+    count, around = len(scene), _Around(hand, obj, ways, openings)
     uniform = np.array([g.random((DRAWS, _UNIFORM)) for g in generators])
     normal = np.zeros((count, 0, 2 + hand.dofs))
     best = HandState(np.zeros((count, 3)), np.tile([1.0, 0, 0, 0], (count, 1)), np.zeros((count, hand.dofs)))
@@ -139,30 +121,25 @@ def clear_scene_starts(
             normal = np.concatenate([normal, _normal(generators, rows, hand.dofs)], axis=1)
         reach = reaching[rows] & (number < REACHES)
         numbers = np.where(reach, order[rows, min(number, REACHES - 1)], number)
-        drawn = around.draws(uniform[rows, numbers], normal[rows, number], scene[rows], reach)
-        off = _raise(drawn, np.flatnonzero(reach), placed, scene[rows], probe)
+        states, across_pairs = around.draws(uniform[rows, numbers], normal[rows, number], scene[rows], reach)
+        off = _raise(states, across_pairs, np.flatnonzero(reach), placed, scene[rows], probe)
         worth = off < beside[rows, None]
         worth[~reach | (depth[rows] > CLEAR)] = True
-        found = _depths(probe, drawn.states, placed, scene[rows], worth)
+        found = _depths(probe, states, placed, scene[rows], worth)
         # Select the nearest clear distance, or else the least deep.
         clear = found <= CLEAR
         pick = np.where(clear.any(axis=1), clear.argmax(axis=1), found.argmin(axis=1))
         at = np.arange(len(rows)), pick
         least = found[at]
         better = np.where(least <= CLEAR, (depth[rows] > CLEAR) | (off[at] < beside[rows]), least < depth[rows])
-        taken = drawn.states[(at[0] * len(RETREATS) + pick)[better]]
+        taken = states[(at[0] * len(RETREATS) + pick)[better]]
         depth[rows[better]] = least[better]
         beside[rows[better]] = np.where(least <= CLEAR, off[at], beside[rows])[better]
-        best.pivot[rows[better]], best.rotation[rows[better]], best.q[rows[better]] = (
-            taken.pivot,
-            taken.rotation,
-            taken.q,
-        )
+        put(best, rows[better], taken)
     return best, depth
 
 
 def _normal(generators: list[np.random.Generator], rows: NDArray[np.intp], dofs: int) -> Floats:
-    """Return (n, DRAWN, 2 + D) random numbers for the next draws of starts `rows`; 0 for the others."""
     out = np.zeros((len(generators), DRAWN, 2 + dofs))
     for row in rows.tolist():
         out[row] = generators[row].standard_normal((DRAWN, 2 + dofs))
@@ -175,8 +152,7 @@ def _depths(
     """Return depths (n, len(RETREATS)) [m] of hands and mountings in scenes (n,); inf if not computed.
     They run from the farthest distance with `worth` (n, len(RETREATS)) inwards while clear.
 
-    Most draws fail for reasons that no retreat fixes, and hardly any is clear nearer than where it is not.
-    """
+    Most draws fail for reasons that no retreat fixes, and hardly any is clear nearer than where it is not."""
     found, open_ = np.full((len(scene), len(RETREATS)), np.inf), np.ones(len(scene), bool)
     for k in reversed(range(len(RETREATS))):
         left = np.flatnonzero(open_ & worth[:, k])
@@ -201,17 +177,21 @@ def _mounting_lack(
 
 
 def _raise(
-    drawn: _Drawn, rows: NDArray[np.intp], placed: PlacedGrasps, scene: NDArray[np.intp], probe: Probe
+    states: HandState,
+    across_pairs: _AcrossPairs,
+    rows: NDArray[np.intp],
+    placed: PlacedGrasps,
+    scene: NDArray[np.intp],
+    probe: Probe,
 ) -> Floats:
     """Lift draws `rows` in scenes (n,), at all distances, by the clearance of the nearest that is lacking.
     Return the distance (n, len(RETREATS)) of their pairs from between the pads [m], 0 for other draws.
 
-    Steps of retreat are too coarse for low objects: fingers would end above the object, not beside it.
-    """
+    Steps of retreat are too coarse for low objects: fingers would end above the object, not beside it."""
     off = np.zeros((len(scene), len(RETREATS)))
     if not len(rows):
         return off
-    states, repeat, up = drawn.states, len(RETREATS), np.array([s.up for s in placed.scenes])[scene]
+    repeat, up = len(RETREATS), np.array([s.up for s in placed.scenes])[scene]
     probe.data.set_scenes(scene[rows])
     probe.depths(states[rows * repeat])
     lifted = np.zeros((len(scene), 3))
@@ -220,32 +200,17 @@ def _raise(
     lifted[rows] = lack[:, None] * up[rows]
     every = (rows[:, None] * repeat + np.arange(repeat)).ravel()
     states.pivot[every] += np.repeat(lifted[rows], repeat, axis=0)
-    for at, reaches in drawn.reaching:
+    for at, reaches in across_pairs:
         off[at] = reaches.beside(lifted[at][:, None] + np.array(RETREATS)[:, None] * reaches.away[:, None])
     return off
 
 
 @dataclass(frozen=True)
-class _Drawn:
-    """Draws for n starts."""
-
-    states: HandState
-    """(n * len(RETREATS)) hands, each at each distance."""
-    reaching: list[tuple[NDArray[np.intp], AntipodalHands]]
-    """Antipodal hands, and their indices among the n."""
-
-
-@dataclass(frozen=True)
 class _Around:
-    """Data shared by the draws of one hand around one object."""
-
     hand: HandModel
     obj: ObjectModel
-    surface: _Surface
     ways: Sequence[Floats]
-    """Free directions of each scene."""
     openings: Mapping[int, Openings]
-    """Openings of each scene."""
 
     def order(
         self, uniform: Floats, scene: NDArray[np.intp], reaching: NDArray[np.bool_], placed: PlacedGrasps
@@ -254,20 +219,16 @@ class _Around:
         order, least = np.zeros((len(scene), REACHES), np.intp), np.full((len(scene), REACHES), np.inf)
         for s in np.unique(scene[reaching]):
             rows = np.flatnonzero(reaching & (scene == s))
+            opening, ways, drawn = self.openings[s], self.ways[s], uniform[rows, :CANDIDATES, :6]
             order[rows], least[rows] = promising(
-                self.hand,
-                self.obj,
-                self.openings[s],
-                uniform[rows, :CANDIDATES, :6],
-                self.ways[s],
-                placed.scenes[s],
-                room=ROOM,
-                keep=REACHES,
+                self.hand, self.obj, opening, drawn, ways, placed.scenes[s], room=ROOM, keep=REACHES
             )
         return order, least
 
-    def draws(self, uniform: Floats, normal: Floats, scene: NDArray[np.intp], reach: NDArray[np.bool_]) -> _Drawn:
-        """Return draws at each distance in scenes (n,); `reach` (n,) marks antipodal ones.
+    def draws(
+        self, uniform: Floats, normal: Floats, scene: NDArray[np.intp], reach: NDArray[np.bool_]
+    ) -> tuple[HandState, _AcrossPairs]:
+        """Return hands drawn in scenes (n,), n * len(RETREATS), at each distance; and the antipodal ones, `reach` (n,).
         They depend on uniform (n, 7) and normal (n, 2 + D) random numbers."""
         n, dofs = len(uniform), self.hand.dofs
         pivot, rotation, q, away = np.zeros((n, 3)), np.zeros((n, 4)), np.zeros((n, dofs)), np.zeros((n, 3))
@@ -285,21 +246,17 @@ class _Around:
                     uniform[rows], normal[rows], self.ways[s]
                 )
         pivot = pivot[:, None] + np.array(RETREATS)[None, :, None] * away[:, None]
-        repeat = len(RETREATS)
-        states = HandState(pivot.reshape(-1, 3), np.repeat(rotation, repeat, axis=0), np.repeat(q, repeat, axis=0))
-        return _Drawn(states, reaching)
+        return at_distances(pivot, rotation, q), reaching
 
     def _towards(self, uniform: Floats, normal: Floats, ways: Floats) -> tuple[Floats, Floats, Floats, Floats]:
         """Place hands that face random points of the surface, in the form of `across` but without a pair."""
-        hand, obj, surface = self.hand, self.obj, self.surface
-        face = np.minimum(np.searchsorted(surface.sums, uniform[:, 0]), len(surface.sums) - 1)
-        u, v = uniform[:, 1:2], uniform[:, 2:3]
-        u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
-        corner = surface.corners[face]
-        point = corner[:, 0] + u * (corner[:, 1] - corner[:, 0]) + v * (corner[:, 2] - corner[:, 0])
-        away = _tilted(surface.normals[face], TILT * normal[:, :2])
+        hand, obj = self.hand, self.obj
+        corners, normals, sums = surface_of(obj)
+        face = np.minimum(np.searchsorted(sums, uniform[:, 0]), len(sums) - 1)
+        point = points_in(corners[face], uniform[:, 1:2], uniform[:, 2:3])
+        away = _tilted(normals[face], TILT * normal[:, :2])
         away = np.array([_turned(a, ways, t) for a, t in zip(away, uniform[:, 5:7], strict=True)])
-        align = _frames(-away) @ _frames(hand.palm.approach[None])[0].T
+        align = frames_about(-away) @ frames_about(hand.palm.approach).T
         roll = quat_from_axis_angle(-away, 2 * np.pi * uniform[:, 3])
         rotation = quat_multiply(roll, quat_from_matrix(align))
         q = np.clip(hand.preshape + POSTURE_NOISE * hand.span * normal[:, 2:], hand.lower, hand.upper)
@@ -322,15 +279,66 @@ def _turned(away: Floats, ways: Floats, random: Floats) -> Floats:
 
 def _tilted(normals: Floats, angles: Floats) -> Floats:
     """Return unit vectors (n, 3): normals turned about two perpendicular axes by `angles` (n, 2) [rad]."""
-    axis = np.einsum("nij,nj->ni", _frames(normals)[..., :2], angles)
+    axis = np.einsum("nij,nj->ni", frames_about(normals)[..., :2], angles)
     angle = np.linalg.norm(axis, axis=1, keepdims=True)
     unit = axis / np.maximum(angle, 1e-12)
     return np.asarray(normals * np.cos(angle) + np.cross(unit, normals) * np.sin(angle))
 
 
-def _frames(z: Floats) -> Floats:
-    """Return rotations (n, 3, 3) with third columns z (n, 3) and arbitrary but fixed first columns."""
-    helper = np.eye(3)[np.argmin(np.abs(z), axis=1)]
-    x = np.cross(helper, z)
-    x /= np.linalg.norm(x, axis=1, keepdims=True)
-    return np.stack([x, np.cross(z, x), z], axis=-1)
+#: Shares of their range by which fingers have opened, and the distance that the hand has moved back [m].
+OUT: Final = ((0.2, 0.0), (0.3, 0.015), (0.4, 0.04))
+#: Tolerated depth [m]: a hand can open differently from this simple motion.
+TOLERATED_M: Final = 0.001
+#: Merit lost per metre of depth. The weight is small: hands that hold well enclose the object, and most of them find
+#: another trajectory out.
+WEIGHT: Final = 25.0
+DEEPEST_M: Final = 0.01
+#: Shares of the lift at which obstacles above are checked.
+UP: Final = (0.5, 1.0)
+
+
+def hindrance(model: Model, state: HandState, placed: PlacedGrasps) -> Floats:
+    """Compute the merit (n,) that hands lose for a blocked retreat or lift in their scenes.
+    It grows with the depth of the hand in object or obstacles on the way, or of its mounting at the grasp."""
+    hand, obj = model.hand.model, model.obj.model
+    mounted = mounting_lack(hand, posture_of(hand, obj, state).hand_pose, placed.scenes, placed.index)
+    deep = np.maximum(_back(model, state, placed.index), mounted)
+    rows = np.flatnonzero(np.array([not _open_above(scene) for scene in placed.scenes])[placed.index])
+    if len(rows):
+        deep[rows] = np.maximum(deep[rows], _rising(model, state[rows], placed.take(rows)))
+    return np.asarray(WEIGHT * np.clip(deep - TOLERATED_M, 0.0, DEEPEST_M), float)
+
+
+def _back(model: Model, state: HandState, scenes: NDArray[np.integer]) -> Floats:
+    hand = model.hand.model
+    finger = finger_of_body(hand)
+    driven = np.zeros(hand.dofs, bool)
+    driven[hand.dof[finger >= 0]] = True
+    back = -quat_rotate(state.rotation, hand.palm.approach)
+    n = len(state.pivot)
+    opened = [np.where(driven, state.q - share * hand.span * hand.closing, state.q) for share, _ in OUT]
+    states = HandState(
+        np.concatenate([state.pivot + far * back for _, far in OUT]),
+        np.tile(state.rotation, (len(OUT), 1)),
+        np.clip(np.concatenate(opened), hand.lower, hand.upper),
+    )
+    probe = Probe(model, len(OUT) * n)
+    probe.data.set_scenes(np.tile(scenes, len(OUT)))
+    probe.depths(states)
+    found = probe.data.depths
+    depth = np.max([kind.numpy()[: len(OUT) * n] for kind in (found.points, found.object, found.obstacles)], axis=0)
+    return np.asarray(depth.reshape(len(OUT), n).max(axis=0), float)
+
+
+def _open_above(scene: Environment) -> bool:
+    return all(len(o.planes) == 1 and o.planes[0, :3] @ scene.up > 1 - 1e-6 for o in scene.obstacles)
+
+
+def _rising(model: Model, state: HandState, placed: PlacedGrasps) -> Floats:
+    n = len(state.pivot)
+    up = np.array([scene.up for scene in placed.scenes])[placed.index]
+    pivot = np.concatenate([state.pivot + share * RISE_M * up for share in UP])
+    probe = Probe(model, len(UP) * n)
+    probe.data.set_scenes(np.tile(placed.index, len(UP)))
+    probe.depths(HandState(pivot, np.tile(state.rotation, (len(UP), 1)), np.tile(state.q, (len(UP), 1))))
+    return np.asarray(probe.data.depths.obstacles.numpy()[: len(UP) * n].reshape(len(UP), n).max(axis=0), float)

@@ -32,13 +32,13 @@ PULL: Final = 3e-4
 AROUND: Final = ProjectionOptions(hold=5e-3)
 
 
-def loss_options(fidelity: Fidelity, *, friction: float = 0.8) -> LossOptions:
+def loss_options(fidelity: Fidelity) -> LossOptions:
     """Return the simulation options of a fidelity; plain descent has limits as a penalty, as in the paper."""
     paper = fidelity.optimizer == "gd"
     return LossOptions(
         contact_solver=fidelity.contact_solver,
         velocities=fidelity.velocities,
-        friction=friction,
+        friction=0.8,
         passes=4 if fidelity.contact_solver == "direct" else 8,
         one_sided=fidelity.leak == "one_sided",
         leak_length=0.02 if fidelity.leak == "one_sided" else 1e3,
@@ -87,7 +87,6 @@ def coarse_schedule(fidelity: Fidelity) -> Schedule:
 
 
 def fine_schedule(fidelity: Fidelity) -> Schedule:
-    """Return weights without dilation and with a high penetration weight."""
     n = fidelity.fine_iterations
     if fidelity.optimizer == "gd":
         return Schedule(np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n), np.tile(PAPER_RATES, (n, 1)))

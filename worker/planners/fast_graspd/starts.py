@@ -1,5 +1,5 @@
 """Starts of hands: in every second one of a grasp the palm faces a random surface point nearby.
-The others reach across the object (`reaching`), as do all if it is too small or too wide for the pads.
+The others reach across the object (`ReachSampling`), as do all if it is too small or too wide for the pads.
 
 A start must be free of contact: hands that start inside a thin wall never leave it.
 
@@ -28,8 +28,8 @@ from graspd.service.model.transforms import (
 from graspd.worker.hands.jaws import Jaws, jaws_of
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.planners.fast_graspd.reaching import LOOKS, ReachSampling
-from graspd.worker.planners.fitting import Pairs, fitting_pairs
+from graspd.worker.planners.fast_graspd.antipodal_starts import LOOKS, ReachSampling
+from graspd.worker.planners.fitting import Pairs, fitting_pairs, points_in
 from graspd.worker.simulation.data import Data, HandState
 from graspd.worker.simulation.model import Model
 from graspd.worker.simulation.record import record_placement
@@ -55,11 +55,10 @@ NO_PLACE: Final = 0.01
 
 
 def start_generator(seed: int, batch: int, index: int, start: int) -> np.random.Generator:
-    """Return the generator of one start of one grasp, independent of every other."""
     return np.random.default_rng(np.random.SeedSequence([seed, batch, index, start]))
 
 
-def _frame(z: Floats) -> Floats:
+def frames_about(z: Floats) -> Floats:
     """Return rotations (..., 3, 3) with third columns z (..., 3) and arbitrary but fixed first columns."""
     helper = np.eye(3)[np.argmin(np.abs(z), axis=-1)]
     x = cross(helper, z)
@@ -67,88 +66,61 @@ def _frame(z: Floats) -> Floats:
     return np.stack([x, cross(z, x), z], axis=-1)
 
 
-@dataclass(frozen=True)
 class _Pair:
-    """Data shared by all draws of a hand around an object."""
+    """Data shared by all draws of a hand around an object: its faces (F), the distance `gap` of the palm [m]."""
 
-    hand: HandModel
-    centre: Floats
-    """(3,) centre of mass of the object [m]."""
-    corners: Floats
-    """(F, 3, 3) corners of its faces [m]."""
-    across: Floats
-    """(F, 3) normals of twice the faces' area [m^2]."""
-    area: Floats
-    """(F,) [m^2], doubled."""
-    share: Floats
-    """(F,) cumulative share of the area."""
-    palm: Floats
-    """(3, 3) rotation to the frame of the palm's approach."""
-    gap: tuple[float, float]
-    """Distance of the palm from the surface, nearest and farthest [m]."""
-
-    @classmethod
-    def of(cls, hand: HandModel, obj: ObjectModel, gap: tuple[float, float] = GAP) -> _Pair:
-        corners = obj.vertices[obj.faces]
-        across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        area = np.linalg.norm(across, axis=1)
-        share = np.cumsum(area / area.sum())
-        return cls(
-            hand, obj.centre_of_mass, corners, across, area, share / share[-1], _frame(hand.palm.approach).T, gap
-        )
+    def __init__(self, hand: HandModel, obj: ObjectModel, gap: tuple[float, float] = GAP) -> None:
+        self.hand, self.centre, self.gap = hand, obj.centre_of_mass, gap
+        self.corners = obj.vertices[obj.faces]
+        #: Normals (F, 3) of twice the faces' area [m^2].
+        self.across = np.cross(self.corners[:, 1] - self.corners[:, 0], self.corners[:, 2] - self.corners[:, 0])
+        self.area = np.linalg.norm(self.across, axis=1)
+        share = np.cumsum(self.area / self.area.sum())
+        self.share = share / share[-1]
+        self.palm = frames_about(hand.palm.approach).T
 
 
-@dataclass(frozen=True)
-class _Numbers:
-    """Random numbers of n draws, in the order in which they are drawn."""
-
-    uniform: Floats
-    """(n, 5) face, two for the point, roll, gap."""
-    normal: Floats
-    """(n, 2 + D) tilt, then noise of the pre-shape."""
-
-    @classmethod
-    def of(cls, generators: list[np.random.Generator], dofs: int) -> _Numbers:
-        uniform, normal = np.empty((len(generators), 5)), np.empty((len(generators), 2 + dofs))
-        for i, rng in enumerate(generators):
-            uniform[i, :3] = rng.random(3)
-            normal[i, :2] = rng.standard_normal(2)
-            uniform[i, 3] = rng.random()
-            normal[i, 2:] = rng.standard_normal(dofs)
-            uniform[i, 4] = rng.random()
-        return cls(uniform, normal)
+def _numbers(generators: list[np.random.Generator], dofs: int) -> tuple[Floats, Floats]:
+    """Return random numbers of draws, in the order in which they are drawn.
+    Uniform (n, 5): face, two for the point, roll, gap. Normal (n, 2 + D): tilt, then noise of the pre-shape."""
+    uniform, normal = np.empty((len(generators), 5)), np.empty((len(generators), 2 + dofs))
+    for i, rng in enumerate(generators):
+        uniform[i, :3] = rng.random(3)
+        normal[i, :2] = rng.standard_normal(2)
+        uniform[i, 3] = rng.random()
+        normal[i, 2:] = rng.standard_normal(dofs)
+        uniform[i, 4] = rng.random()
+    return uniform, normal
 
 
 def draw(pair: _Pair, generators: list[np.random.Generator]) -> tuple[HandState, Floats]:
     """Draw one start per generator at its nearest distance; also return the palms' directions (n, 3)."""
-    hand, number = pair.hand, _Numbers.of(generators, pair.hand.dofs)
-    face = pair.share.searchsorted(number.uniform[:, 0], side="right")
-    inside = number.uniform[:, 1:3]
-    u, v = np.where(inside.sum(axis=1, keepdims=True) > 1, 1 - inside, inside).T[..., None]
-    a, b, c = np.moveaxis(pair.corners[face], 1, 0)
-    point = a + u * (b - a) + v * (c - a)
+    hand, (uniform, noise) = pair.hand, _numbers(generators, pair.hand.dofs)
+    face = pair.share.searchsorted(uniform[:, 0], side="right")
+    point = points_in(pair.corners[face], uniform[:, 1:2], uniform[:, 2:3])
     normal = pair.across[face] / pair.area[face, None]
-    tilt = np.einsum("nij,nj->ni", _frame(normal)[..., :2], number.normal[:, :2])
+    tilt = np.einsum("nij,nj->ni", frames_about(normal)[..., :2], noise[:, :2])
     length = np.linalg.norm(tilt, axis=1, keepdims=True)
     angle = np.where(length * TILT > 1e-9, length * TILT, 0.0)
     normal = normal * np.cos(angle) + cross(tilt / np.maximum(length, 1e-12), normal) * np.sin(angle)
     approach = -normal
-    roll = quat_from_axis_angle(approach, 2 * np.pi * number.uniform[:, 3])
-    rotation = quat_multiply(roll, quat_from_matrix(_frame(approach) @ pair.palm))
-    noise = POSTURE_NOISE * (hand.upper - hand.lower) * number.normal[:, 2:]
+    roll = quat_from_axis_angle(approach, 2 * np.pi * uniform[:, 3])
+    rotation = quat_multiply(roll, quat_from_matrix(frames_about(approach) @ pair.palm))
+    q = hand.preshape + POSTURE_NOISE * (hand.upper - hand.lower) * noise[:, 2:]
     near, far = pair.gap
-    pivot = point - pair.centre - approach * (near + (far - near) * number.uniform[:, 4:])
-    return HandState(pivot, rotation, np.clip(hand.preshape + noise, hand.lower, hand.upper)), approach
+    pivot = point - pair.centre - approach * (near + (far - near) * uniform[:, 4:])
+    return HandState(pivot, rotation, np.clip(q, hand.lower, hand.upper)), approach
 
 
 def _retreated(state: HandState, approach: Floats) -> HandState:
-    """Return each hand at each distance of retreat, (n * len(RETREATS)) hands."""
     back = np.array(RETREATS)[None, :, None]
-    pivot = state.pivot[:, None] - back * approach[:, None]
-    repeat = len(RETREATS)
-    return HandState(
-        pivot.reshape(-1, 3), np.repeat(state.rotation, repeat, axis=0), np.repeat(state.q, repeat, axis=0)
-    )
+    return at_distances(state.pivot[:, None] - back * approach[:, None], state.rotation, state.q)
+
+
+def at_distances(pivot: Floats, rotation: Floats, q: Floats) -> HandState:
+    """Return hands (n * K) at pivots (n, K, 3), with rotations (n, 4) and dofs (n, D)."""
+    each = pivot.shape[1]
+    return HandState(pivot.reshape(-1, 3), np.repeat(rotation, each, axis=0), np.repeat(q, each, axis=0))
 
 
 class Probe:
@@ -180,10 +152,7 @@ class Probe:
 
 def sample_starts(model: Model, *, seed: int, batch: int, indices: range, each: int) -> HandState:
     """Sample collision-free starts of the grasps `indices` of a batch, `each` per grasp side by side.
-
-    Raises:
-        InputError: no draw of some grasp came within 10 mm of being clear.
-    """
+    Raise InputError where no draw of some grasp came within 10 mm of being clear."""
     generators = [start_generator(seed, batch, i, k) for i in indices for k in range(each)]
     state, depth = clear_starts(model, generators, each=each)
     open_further(model, generators, state, depth, np.ones(len(depth), bool))
@@ -193,7 +162,6 @@ def sample_starts(model: Model, *, seed: int, batch: int, indices: range, each: 
 
 
 def no_place(model: Model) -> InputError:
-    """Return the error of a grasp without a clear start."""
     hand, obj = model.hand.model, model.obj.model
     return InputError(
         f"{hand.name} finds no free place around {obj.name}: the object is too large or encloses the hand; "
@@ -203,15 +171,13 @@ def no_place(model: Model) -> InputError:
 
 def clear_starts(model: Model, generators: list[np.random.Generator], *, each: int = 1) -> tuple[HandState, Floats]:
     """Return a start per generator, the least deep of its draws, and its depth (n,) [m]; most are clear.
-
     Of the `each` starts of a grasp every second one, not the first, reaches across the object where possible. All do
-    if the object is too small or too wide for the hand's pads.
-    """
+    if the object is too small or too wide for the hand's pads."""
     hand, obj = model.hand.model, model.obj.model
     count, jaws = len(generators), JawStarts.of(hand, obj)
     retreats = RETREATS if jaws is None else JAW_RETREATS
     probe = Probe(model, count * len(retreats))
-    pair = _Pair.of(hand, obj)
+    pair = _Pair(hand, obj)
     best = HandState(np.zeros((count, 3)), np.tile([1.0, 0, 0, 0], (count, 1)), np.zeros((count, hand.dofs)))
     deepest = np.full(count, np.inf)
     if jaws is None and each > 1 and (reaching := ReachSampling.of(model)) is not None:
@@ -230,18 +196,9 @@ def clear_starts(model: Model, generators: list[np.random.Generator], *, each: i
 def open_further(
     model: Model, generators: list[np.random.Generator], state: HandState, depth: Floats, wanted: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
-    """Retry with more open hands where `clear_starts` found no clear start.
-    The pre-shape of some hands leaves no gap as wide as the object.
-
-    Args:
-        model: of the starts.
-        generators: of the n starts, in the state that `clear_starts` left.
-        state, depth: result of `clear_starts`; better starts replace it.
-        wanted: (n,) which of them may be opened.
-
-    Returns:
-        (n,) which were opened.
-    """
+    """Retry with more open hands where `clear_starts` found no clear start, of those `wanted` (n,).
+    The pre-shape of some hands leaves no gap as wide as the object. `generators` are in the state that `clear_starts`
+    left; better starts replace its results. Return which (n,) were opened."""
     hand, obj = model.hand.model, model.obj.model
     lost = wanted & (depth > NO_PLACE)
     if not lost.any() or JawStarts.of(hand, obj) is not None:
@@ -251,7 +208,7 @@ def open_further(
     ends = np.where(hand.closing > 0, hand.lower, np.where(hand.closing < 0, hand.upper, hand.preshape))
     for share in OPENED:
         wider = replace(hand, preshape=hand.preshape + share * (ends - hand.preshape))
-        pair = _Pair.of(wider, obj, OPENED_GAP)
+        pair = _Pair(wider, obj, OPENED_GAP)
 
         def drawn(rows: NDArray[np.intp], pair: _Pair = pair) -> HandState:
             return _retreated(*draw(pair, [generators[i] for i in rows]))
@@ -281,7 +238,7 @@ def _draw_until_clear(
         found = states[np.arange(len(rows)) * depth.shape[1] + pick]
         depth = depth[np.arange(len(rows)), pick]
         better = depth < deepest[rows]
-        _put(best, rows[better], found[better])
+        put(best, rows[better], found[better])
         deepest[rows[better]] = depth[better]
         rows = rows[deepest[rows] > CLEAR]
 
@@ -307,15 +264,14 @@ def _reach(
         first[left] = number[some] + 1
         depth = probe.depths(found)
         clear = depth <= CLEAR
-        _put(best, rows[left[clear]], found[clear])
+        put(best, rows[left[clear]], found[clear])
         deepest[rows[left[clear]]] = depth[clear]
         left = left[~clear]
         if not len(left):
             return
 
 
-def _put(states: HandState, rows: NDArray[np.intp], others: HandState) -> None:
-    """Replace these rows of the states."""
+def put(states: HandState, rows: NDArray[np.intp], others: HandState) -> None:
     states.pivot[rows], states.rotation[rows], states.q[rows] = others.pivot, others.rotation, others.q
 
 
@@ -336,22 +292,15 @@ CENTRAL: Final = 0.35
 
 @dataclass(frozen=True)
 class JawStarts:
-    """Data shared by the draws for a gripper and an object."""
-
     hand: HandModel
     obj: ObjectModel
     jaws: Jaws
     pairs: Pairs
     sums: Floats
-    """(P,) cumulative chance of pairs."""
 
     @classmethod
     def of(cls, hand: HandModel, obj: ObjectModel) -> JawStarts | None:
-        """Return None if the hand is no gripper.
-
-        Raises:
-            InputError: the object does not fit between the jaws.
-        """
+        """Return None if the hand is no gripper; raise InputError if the object does not fit between the jaws."""
         jaws, pairs = jaws_of(hand), fitting_pairs(hand, obj)
         if jaws is None or pairs is None:
             return None
@@ -376,8 +325,7 @@ class JawStarts:
         place = (AHEAD[0] + (AHEAD[1] - AHEAD[0]) * uniform[:, 4])[:, None] + np.array(JAW_RETREATS)[None]
         at = ((start + end) / 2)[:, None] - length * place[..., None] * ahead[:, None]
         pivot = at - self.obj.centre_of_mass + quat_rotate(rotation, self.hand.palm.centre - middle)[:, None]
-        each = len(JAW_RETREATS)
-        return HandState(pivot.reshape(-1, 3), np.repeat(rotation, each, axis=0), np.repeat(q, each, axis=0))
+        return at_distances(pivot, rotation, q)
 
 
 def _across(line: Floats, turn: Floats) -> Floats:

@@ -5,14 +5,23 @@ Worlds do not wait for each other; a world with a decided verdict takes the next
 y z, stored in the order of `wp.quat`'s components as in MuJoCo Warp.
 """
 
+from typing import Final
+
 import warp as wp
 
 from graspd.worker.validation import protocol
-from graspd.worker.validation.prefilter.phases import BAND, MOST_TICKS, PATIENCE
 from graspd.worker.validation.protocol import Outcome
 
 wp.set_module_options({"enable_backward": False})
 
+#: A verdict is clear if the worst motion is below the first share of its limit, or above the second. The margins of a
+#: grasp that holds differ between both engines by 0.11 at the 99th percentile (benchmarks.prefilter).
+BAND: Final = (0.8, 1.2)
+#: Ticks of a push after it breaks a limit; if still in the band then, the verdict is not clear.
+PATIENCE: Final = 5
+#: Ticks (of `protocol.INTERVAL_S`) after which a grasp stays undecided. A grasp that holds takes 32 at least, 1 of 100
+#: more than 47; a few slow creepers would delay the whole launch.
+MOST_TICKS: Final = 48
 #: Ticks of one stage of closing, of closing in all, until the first check of a push, and of a whole push.
 STAGE = wp.constant(round(protocol.STAGE_S / protocol.INTERVAL_S))
 STAGES = wp.constant(protocol.STAGES)

@@ -15,10 +15,10 @@ import hashlib
 import importlib.util
 import logging
 from collections import OrderedDict
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from functools import cache
 from importlib.metadata import version
-from typing import Any, Final
+from typing import Any, Final, Self
 
 import numpy as np
 import warp as wp
@@ -35,17 +35,62 @@ from graspd.worker.hands.model import HandModel
 from graspd.worker.validation import protocol
 from graspd.worker.validation.model import Scene
 from graspd.worker.validation.prefilter import kernels
-from graspd.worker.validation.prefilter.phases import RECHECK_ONE_IN, PrefilterOutcomes
+from graspd.worker.validation.prefilter.kernels import BAND, MOST_TICKS, PATIENCE
 from graspd.worker.validation.protocol import INTERVAL_S, Outcome, Rollout, ValidatedBy
 
 log = logging.getLogger(__name__)
 
+#: One clear verdict in so many is validated on the CPU as well.
+RECHECK_ONE_IN: Final = 50
+#: Increase when the code changes the prefilter's verdicts, constants aside.
+REVISION: Final = 1
 #: Pool sizes, for few grasps and for many; with arbitrary sizes nearly every launch would build a new pool.
 WORLDS: Final = {"cuda": (256, 1024), "cpu": (8, 32)}
 #: Number of cached pools, each with its model, arrays and graph: those of the pairs validated last.
 _KEPT_POOLS: Final = 4
 #: Largest share of rechecked verdicts that the CPU may contradict, beyond one, before the prefilter is not trusted.
 _MOST_CONTRADICTED: Final = 0.05
+
+
+@dataclass(frozen=True)
+class PrefilterOutcomes:
+    """Outcomes of N grasps in the worlds."""
+
+    outcome: NDArray[np.uint8]
+    """(N, 6) `Outcome` of each push; an undecided grasp has pushes that were not simulated."""
+    margin: Floats
+    """(N,) worst displacement or rotation over its limit."""
+    penetration_m: Floats
+    self_penetration_m: Floats
+    overflow: NDArray[np.bool_]
+    """(N,) whether contacts or constraints were dropped for lack of memory."""
+    ticks: NDArray[np.int32]
+    """(N,) simulated ticks, of `protocol.INTERVAL_S` each."""
+
+    @property
+    def held(self) -> NDArray[np.bool_]:
+        """(N,) whether all six pushes were held, clearly or not."""
+        return np.asarray((self.outcome == Outcome.HELD).all(axis=1))
+
+    @property
+    def clearly_held(self) -> NDArray[np.bool_]:
+        """(N,) whether the grasp held with a clear margin."""
+        return np.asarray(self.held & (self.margin < BAND[0]) & ~self.overflow)
+
+    @property
+    def clearly_failed(self) -> NDArray[np.bool_]:
+        """(N,) whether the object is lost, or the hand starts inside it."""
+        inside = self.outcome[:, 0] == Outcome.PENETRATION
+        kinds = (Outcome.LOST_WHILE_CLOSING, Outcome.DISPLACED, Outcome.ROTATED)
+        lost = np.isin(self.outcome, kinds).any(axis=1) & np.isfinite(self.margin) & (self.margin > BAND[1])
+        return np.asarray((inside | lost) & ~self.overflow)
+
+    def put(self, rows: NDArray[np.intp], again: Self) -> Self:
+        changed: dict[str, Any] = {}
+        for field in fields(self):
+            changed[field.name] = getattr(self, field.name).copy()
+            changed[field.name][rows] = getattr(again, field.name)
+        return replace(self, **changed)
 
 
 class WorldPool:
@@ -64,7 +109,9 @@ class WorldPool:
             self._model = self._engine.put_model(scene.model)
             self._model.opt.warn_overflow = 0
             self._of_hand = wp.array(scene.hand_geoms.astype(np.int32), dtype=wp.int32)
-            self._terms = self._make_terms()
+            terms = self._terms = kernels.TestConstants()
+            terms.object_qpos, terms.object_body, terms.push = scene.object_qpos, scene.object_body, scene.push
+            terms.centre = wp.vec3(*(float(x) for x in scene.centre))
             self._allocate()
 
     def validate(self, grasps: GraspSet, run: ExecutionContext = DEFAULT_CONTEXT) -> PrefilterOutcomes:
@@ -84,15 +131,7 @@ class WorldPool:
                 lost = np.flatnonzero(found.overflow)
         return found
 
-    def _make_terms(self) -> Any:
-        scene, terms = self.scene, kernels.TestConstants()
-        terms.object_qpos, terms.object_body = scene.object_qpos, scene.object_body
-        terms.push = scene.push
-        terms.centre = wp.vec3(*(float(x) for x in scene.centre))
-        return terms
-
     def _allocate(self) -> None:
-        """Allocate the simulations' data, with the capacity known to be needed."""
         model, w, more = self.scene.model, self.worlds, 2**self._doublings
         self._data = data = self._engine.make_data(model, nworld=w, nconmax=CONTACTS * more, njmax=ROWS * more)
         self._graph: Any = None
@@ -160,17 +199,11 @@ class WorldPool:
         return out.astype(np.float32)
 
     def _ask(self, grasps: GraspSet, starts: NDArray[np.float32], queue: NDArray[np.intp]) -> None:
-        """Copy grasps to the device, with the order in which they are taken."""
         scene, parts = self.scene, (grasps.pregrasp, grasps.grasp, grasps.squeeze)
         poses = np.stack([part.hand_pose for part in parts], axis=1)
         joints = np.stack([part.joint_positions for part in parts], axis=1)
-        values: dict[str, Any] = {
-            "queue": queue,
-            "start": starts,
-            "position": poses[..., :3],
-            "turn": poses[..., 3:],
-            "control": scene.controls(joints),
-        }
+        values: dict[str, Any] = {"queue": queue, "start": starts, "control": scene.controls(joints)}
+        values |= {"position": poses[..., :3], "turn": poses[..., 3:]}
         for name, value in values.items():
             array = getattr(self._asked, name)
             whole = array.numpy()
@@ -185,26 +218,17 @@ class WorldPool:
             wp.launch(kernels.place, self.worlds, inputs=[first, rows], outputs=[self._arrays])
             self._engine.fwd_position(self._model, data)
             contact = data.contact
-            wp.launch(
-                kernels.depths,
-                data.naconmax,
-                inputs=[first, self._of_hand, data.nacon, contact.worldid, contact.geom, contact.dist],
-                outputs=[out],
-            )
+            inputs = [first, self._of_hand, data.nacon, contact.worldid, contact.geom, contact.dist]
+            wp.launch(kernels.depths, data.naconmax, inputs=inputs, outputs=[out])
             most = max(int(data.nacon.numpy()[0]), int(data.ncollision.numpy()[0]))
             short[first : first + self.worlds] = most > data.naconmax
         return out.numpy().astype(float), short
 
     def _simulate(self, count: int, run: ExecutionContext) -> None:
-        """Tick until no world has a grasp."""
         self.launches = 0
         self._state.assign(np.array([0, self.worlds, count], np.int32))
-        wp.launch(
-            kernels.begin,
-            self.worlds,
-            inputs=[self._terms, self._asked],
-            outputs=[self._worlds, self._arrays, self._state],
-        )
+        outputs = [self._worlds, self._arrays, self._state]
+        wp.launch(kernels.begin, self.worlds, inputs=[self._terms, self._asked], outputs=outputs)
         while True:
             taken, alive, _ = self._state.numpy()
             run.progress(min(int(taken), count) - int(alive), count, "prefilter")
@@ -228,12 +252,8 @@ class WorldPool:
     def _launch(self) -> None:
         for _ in range(self._steps):
             self._engine.step(self._model, self._data)
-        wp.launch(
-            kernels.look,
-            self.worlds,
-            inputs=[self._terms, self._asked],
-            outputs=[self._worlds, self._arrays, self._found, self._state],
-        )
+        outputs = [self._worlds, self._arrays, self._found, self._state]
+        wp.launch(kernels.look, self.worlds, inputs=[self._terms, self._asked], outputs=outputs)
 
 
 _pools: OrderedDict[tuple[str, str, int], WorldPool] = OrderedDict()
@@ -249,7 +269,6 @@ class PrefilterVerdicts:
     """Clear verdicts that the CPU rechecks, by row: whether the prefilter held the grasp."""
 
     def contradicted(self, rollouts: dict[int, Rollout]) -> int:
-        """Count the rechecked verdicts that the CPU's rollouts contradict."""
         return sum(rollouts[row].success != held for row, held in self.rechecked.items())
 
     def believed(self, contradicted: int) -> bool:
@@ -272,23 +291,11 @@ def first_terms(hand: HandModel, level: str, run: ExecutionContext) -> list[Any]
         return []
     if run.prefilter == "auto" and not (run.device.startswith("cuda") and has_mujoco_warp()):
         return []
-    return PrefilterOutcomes.terms(mujoco_warp_version())
+    return [mujoco_warp_version(), REVISION, *BAND, PATIENCE, MOST_TICKS, RECHECK_ONE_IN]
 
 
 def screened(scene: Scene, terms: str, grasps: GraspSet, *, level: str, run: ExecutionContext) -> PrefilterVerdicts:
-    """Run the prefilter on grasps in a scene.
-
-    Args:
-        scene: the validator's own.
-        terms: digest of everything that determines the scene.
-        grasps: N grasps.
-        level: standard or fast.
-        run: its device runs the worlds.
-
-    Raises:
-        TaskCancelled: `run.cancelled()` returned True.
-    """
-
+    """Run the prefilter on grasps in a scene; `terms` is a digest of everything that determines the scene."""
     postures = GraspSet(grasps.grasp, grasps.pregrasp, grasps.squeeze, grasps.stability_loss)
     if not len(grasps):
         return PrefilterVerdicts({}, {})
@@ -319,7 +326,6 @@ def _pool(scene: Scene, terms: str, device: str, count: int) -> WorldPool:
     if key not in _pools:
         while len(_pools) >= _KEPT_POOLS:
             _pools.popitem(last=False)
-
         _pools[key] = WorldPool(scene, device, size)
     _pools.move_to_end(key)
     return _pools[key]
@@ -358,11 +364,7 @@ def has_mujoco_warp() -> bool:
 
 
 def mujoco_warp_version() -> str:
-    """Return name and version.
-
-    Raises:
-        InputError: MuJoCo Warp is not installed.
-    """
+    """Return name and version; raise InputError if MuJoCo Warp is not installed."""
     if not has_mujoco_warp():
         raise InputError("the prefilter needs mujoco-warp; run pip install 'graspd[gpu]'")
     return f"mujoco-warp {version('mujoco-warp')}"
@@ -370,11 +372,7 @@ def mujoco_warp_version() -> str:
 
 @cache
 def mujoco_warp() -> Any:
-    """Return the module, with Warp initialised.
-
-    Raises:
-        InputError: MuJoCo Warp is not installed.
-    """
+    """Return the module, with Warp initialised; raise InputError if it is not installed."""
     mujoco_warp_version()
     backend.start()
     import mujoco_warp as engine

@@ -24,15 +24,12 @@ from graspd.worker.planners.port import PlanRequest
 from graspd.worker.validation.decomposition import decompose
 from graspd.worker.validation.key import Level
 from graspd.worker.validation.model import MujocoOptions, build
-from graspd.worker.validation.prefilter import phases as rollouts
 from graspd.worker.validation.prefilter import prefilter as screening
-from graspd.worker.validation.prefilter.phases import PrefilterOutcomes
-from graspd.worker.validation.prefilter.prefilter import ROWS, WorldPool
+from graspd.worker.validation.prefilter.prefilter import ROWS, PrefilterOutcomes, WorldPool
 from graspd.worker.validation.protocol import Outcome, ValidatedBy
 from graspd.worker.validation.validator import Verdicts, prefiltered, validate
-from tests.worker.quality.helpers import posture
+from tests.worker.quality.helpers import BOX, PADS, WHOLE, grasp_of, many_grasps, posture
 from tests.worker.validation.prefilter.engine import Stand
-from tests.worker.validation.test_validator import BOX, PADS, WHOLE, grasp_of, many_grasps
 
 
 def every_kind() -> GraspSet:
@@ -160,7 +157,7 @@ def test_at_level_screen_clear_verdicts_stand_both_ways(monkeypatch: pytest.Monk
     standard = verdicts(ExecutionContext())
     assert first.level == "fast"
     np.testing.assert_array_equal(first.success, standard.success)
-    monkeypatch.setattr(rollouts, "BAND", (0.0, 1e9))
+    monkeypatch.setattr(screening, "BAND", (0.0, 1e9))
     band = verdicts(ON, "fast")
     inside = band.outcome[:, 0] == 2
     assert (band.validated_by[~inside] == ValidatedBy.MUJOCO).all()
