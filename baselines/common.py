@@ -10,7 +10,7 @@ import threading
 import time
 from collections.abc import Callable
 from types import ModuleType
-from typing import Final, Generic, TypeVar
+from typing import Any, Final, TypeVar
 
 import numpy as np
 import warp as wp
@@ -36,25 +36,18 @@ T = TypeVar("T")
 GROUND: Final = Fidelity(
     name="peers", coarse_points=400, fine_points=1000, object_points=4000, polish_iterations=0, phong_alpha=0.0
 )
-_lock = threading.Lock()
+_searches: Final[LRUCache[tuple[object, ...], Any]] = LRUCache(8)
+_lock: Final = threading.Lock()
 
 
-class PairCache(Generic[T]):
-    """Cache of values that a method computes once per pair and options, for the most recent pairs."""
-
-    def __init__(self, make: Callable[..., T], size: int = 4) -> None:
-        self._make = make
-        self._found: LRUCache[tuple[object, ...], tuple[Pair, T]] = LRUCache(size)
-        self._lock = threading.Lock()
-
-    def __call__(self, pair: Pair, *options: object) -> T:
-        """Return `make(pair, *options)`, cached if recently used."""
-        key = (id(pair), *options)
-        with self._lock:
-            if key not in self._found:
-                # The cached reference to the pair prevents reuse of its id.
-                self._found[key] = (pair, self._make(pair, *options))
-            return self._found[key][1]
+def search_of(make: Callable[..., T], pair: Pair, *options: object) -> T:
+    """Return `make(pair, *options)`, which a method computes once; the most recent ones are cached."""
+    key = (make, id(pair), *options)
+    with _lock:
+        if key not in _searches:
+            # The cached reference to the pair prevents reuse of its id.
+            _searches[key] = (pair, make(pair, *options))
+        return _searches[key][1]
 
 
 def ground_of(hand: HandModel, obj: ObjectModel, device: str, *kernels: ModuleType) -> Pair:
@@ -69,6 +62,13 @@ def ground_of(hand: HandModel, obj: ObjectModel, device: str, *kernels: ModuleTy
 def free_starts(pair: Pair, *, seed: int, batch: int, indices: range) -> HandState:
     """Sample a free start for each grasp, its palm towards a random surface point (Grasp'D, 2022)."""
     return sample_starts(pair.model(pair.coarse), seed=seed, batch=batch, indices=indices, each=1)
+
+
+def frame_along(z: Floats) -> Floats:
+    """Return a rotation matrix whose third column is `z`."""
+    x = np.cross(np.eye(3)[int(np.argmin(np.abs(z)))], z)
+    x /= np.linalg.norm(x)
+    return np.column_stack([x, np.cross(z, x), z])
 
 
 def joined(states: list[HandState]) -> HandState:

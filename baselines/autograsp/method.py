@@ -24,7 +24,7 @@ from graspd.worker.hands.kinematics import ancestors
 from graspd.worker.hands.model import HandModel, JointType, SurfacePoints
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.planners.fast_graspd.pairs import Pair
-from graspd.worker.planners.port import Method, Options, Planner, PlanRequest
+from graspd.worker.planners.port import Method, Options, PlanRequest
 from graspd.worker.planners.threads import StepCounter, cut, run_parts
 from graspd.worker.simulation.data import Data, HandState
 from graspd.worker.simulation.launches import Launches
@@ -33,16 +33,14 @@ from graspd.worker.simulation.record import add_poses
 
 
 class AutograspOptions(Options):
-    """Options of `autograsp`."""
-
     standoff_m: float = Field(0.005, ge=0.0, le=0.05, description="gap at which the approach ends [m]")
 
 
+@dataclass(frozen=True)
 class Autograsp:
     """See `worker.planners.Planner`."""
 
-    def __init__(self, options: AutograspOptions) -> None:
-        self.options = options
+    options: AutograspOptions
 
     def __call__(self, hand: HandModel, obj: ObjectModel, wanted: PlanRequest, run: ExecutionContext) -> GraspSet:
         began = time.perf_counter()
@@ -64,14 +62,10 @@ class Autograsp:
         return grasp_set(pair, joined(states), began, {})
 
 
-def _planner(options: AutograspOptions) -> Planner:
-    return Autograsp(options)
-
-
 METHOD: Final = Method(
     summary="a random approach, then the fingers close until contact",
     source="A. T. Miller and P. K. Allen, GraspIt!, IEEE Robotics and Automation Magazine 2004",
-    planner=_planner,
+    planner=Autograsp,
     options=AutograspOptions,
     uses=("face_error_m",),
 )
@@ -207,7 +201,8 @@ class HandCloser:
         m, d, device = self.model, self.data, self.model.device
         self._poses.run()
         pose = [d.body_p, d.body_q]
-        wp.launch(kernels.clear, self.near.shape, inputs=[REACH_M], outputs=[self.near, self.pairs], device=device)
+        self.near.fill_(REACH_M)
+        self.pairs.fill_(REACH_M)
         wp.launch(
             kernels.points_to_object,
             (self.capacity, m.count),

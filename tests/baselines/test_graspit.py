@@ -7,10 +7,10 @@ import pytest
 import trimesh
 import warp as wp
 
-from graspd.baselines.common import ground_of
+from graspd.baselines.common import ground_of, inside_points
 from graspd.baselines.graspit import kernels
-from graspd.baselines.graspit.method import Search, eigengrasps, virtual_contacts
-from graspd.baselines.graspit.schedule import FIRST_STEP
+from graspd.baselines.graspit.kernels import FIRST_STEP
+from graspd.baselines.graspit.method import EACH, ON_PALM, Search, eigengrasps
 from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.planners.threads import StepCounter
@@ -108,7 +108,7 @@ def test_barrett_has_graspits_own_eigengrasps() -> None:
 @pytest.mark.parametrize("name", ["allegro", "barrett", "shadow"])
 def test_contacts_lie_on_every_finger_amplitudes_reach_limits(name: str) -> None:
     hand = hand_from_path(name)
-    found = virtual_contacts(hand)
+    found = inside_points(hand, each=EACH, on_palm=ON_PALM)
     assert set(hand.fingertips) <= set(found.body.tolist())
     palm = found.normal[found.body == 0]
     assert len(palm) >= 1 and np.all(palm @ hand.palm.approach > 0.7)

@@ -9,6 +9,7 @@ import pytest
 
 from graspd.baselines.learned import network as net
 from graspd.service.model.errors import InputError
+from graspd.service.store.network_file import ProposalNetwork
 from tests.networks import random_network
 
 Floats = np.ndarray[Any, np.dtype[np.float64]]
@@ -21,13 +22,13 @@ def cloud(count: int = 64, seed: int = 1) -> tuple[Floats, Floats]:
     return 0.05 * normals + [0.3, -0.2, 0.5], normals
 
 
-def proposed(network: net.ProposalNetwork, count: int, **given: Any) -> net.Proposals:
+def proposed(network: ProposalNetwork, count: int, **given: Any) -> net.Proposals:
     points, normals = cloud()
     rng = np.random.default_rng(7)
     return net.propose(network, points, normals, table_height=0.45, count=count, rng=rng, **given)
 
 
-def float64_rows(network: net.ProposalNetwork, noise: Floats, label: float) -> Floats:
+def float64_rows(network: ProposalNetwork, noise: Floats, label: float) -> Floats:
     """The definition, point by point and row by row, in double precision."""
     w = {name: np.asarray(array, float) for name, array in network.weights.items()}
     points, normals = cloud()
