@@ -27,8 +27,7 @@ from benchmarks.success import HANDS
 from graspd.service.model.cores import available_cores
 from graspd.service.model.fidelity import FIDELITIES
 from graspd.service.model.version import PACKAGE_VERSION
-from graspd.studies.bench import device_name
-from graspd.studies.timing import kernel_shares
+from graspd.studies.bench import device_name, kernel_shares
 from graspd.worker.engines.devices import Device
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.hands.load import hand_from_path

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from graspd.service.model.domain import EXTRA_CHANNELS
 from graspd.service.store.shards import write_shard
-from graspd.studies.clock import clock_of
+from graspd.studies.bench import clock_of
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.rendering.scene_setup import CameraPlan, Setting

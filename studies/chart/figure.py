@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 from graspd.studies.chart.statistics import most_valid
 
 Row = Mapping[str, Any]
+#: Text at a point, from its row and all rows.
+PointLabel = Callable[[Row, Sequence[Row]], str]
 
 #: Title and key of the accuracies over speed.
 PANELS: Final = (
@@ -47,7 +49,7 @@ def draw(rows: Sequence[Row], files: Sequence[Path]) -> None:
     styles, words = _styles(rows), "valid grasps per second, end to end"
     labels = []
     for axes, (title, key) in zip(panels.flat[:5], PANELS, strict=True):
-        labels += _over_speed(axes, rows, styles, key, title, words, SPEED)
+        labels += _over_speed(axes, rows, styles, key, title, words)
     last, timed = panels.flat[5], [row for row in rows if row["seconds_to_first_valid"]]
     labels += _panel(last, timed, styles, x="seconds_to_first_valid", y="dexgraspbench")
     last.set_xlabel("seconds to the first valid grasp, end to end (less is better)")
@@ -59,12 +61,11 @@ def draw(rows: Sequence[Row], files: Sequence[Path]) -> None:
 
 def draw_hands(
     by_hand: Mapping[str, Sequence[Row]],
-    files: Sequence[Path],
+    file: Path,
     *,
     key: str,
-    speed: str,
     words: tuple[str, str],
-    label: Callable[[Row, Sequence[Row]], str] | None = None,
+    label: PointLabel | None = None,
 ) -> None:
     """Plot a panel per hand: one accuracy over speed, both in `words`; `label` returns a point's label."""
     from matplotlib.figure import Figure
@@ -76,12 +77,12 @@ def draw_hands(
     styles = _styles([row for rows in by_hand.values() for row in rows])
     labels = []
     for axes, (hand, rows) in zip(panels.flat, by_hand.items(), strict=False):
-        labels += _over_speed(axes, rows, styles, key, hand, words[1], speed, label=label)
+        labels += _over_speed(axes, rows, styles, key, hand, words[1], label)
     for axes in panels.flat[len(by_hand) :]:
         axes.set_visible(False)
     figure.supylabel(words[0], fontsize=10)
     figure.legend(*panels.flat[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
-    _save(figure, labels, files)
+    _save(figure, labels, [file])
 
 
 def _save(figure: Any, labels: Sequence[Label], files: Sequence[Path]) -> None:
@@ -97,13 +98,23 @@ def _over_speed(
     key: str,
     title: str,
     words: str,
-    speed: str,
-    label: Callable[[Row, Sequence[Row]], str] | None = None,
+    label: PointLabel | None = None,
 ) -> list[Label]:
-    """Plot one accuracy over a speed, with the front; return its labels."""
+    """Plot one accuracy over the speed, with the Pareto front; return its labels."""
     known = [row for row in rows if row[key] is not None]
-    labels = _panel(axes, known, styles, x=speed, y=key, label=label)
-    _front(axes, known, key, speed)
+    labels = _panel(axes, known, styles, x=SPEED, y=key, label=label)
+    front = sorted((row for row in known if key in row["front"] and row[SPEED]), key=lambda row: row[SPEED])
+    axes.step(
+        [row[SPEED] for row in front],
+        [row[key] for row in front],
+        where="pre",
+        color=INK,
+        linewidth=1,
+        linestyle="--",
+        alpha=0.6,
+        zorder=1,
+        label="Pareto front",
+    )
     axes.set_xlabel(words)
     axes.set_title(title, loc="left", fontsize=11)
     if key in OF_ONE:
@@ -112,11 +123,7 @@ def _over_speed(
 
 
 def draw_scenes(rows: Sequence[Row], files: Sequence[Path], *, second: str) -> None:
-    """Plot shares of candidates over lifted grasps per second, and lifts over seconds to the first.
-
-    Args:
-        second: name of a second.
-    """
+    """Plot shares of candidates over lifted grasps per `second`, and lifts over seconds to the first."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(15.5, 8.6), layout="constrained")
@@ -125,7 +132,7 @@ def draw_scenes(rows: Sequence[Row], files: Sequence[Path], *, second: str) -> N
     words = f"lifted grasps per {second}, end to end"
     labels = []
     for axes, (title, key) in zip(panels.flat[:4], IN_SCENES, strict=True):
-        labels += _over_speed(axes, rows, styles, key, title, words, SPEED, label=one_of_several)
+        labels += _over_speed(axes, rows, styles, key, title, words, one_of_several)
     timed = [row for row in rows if row["seconds_to_first"]]
     last = panels.flat[4]
     labels += _panel(last, timed, styles, x="seconds_to_first", y="lift", label=one_of_several)
@@ -150,7 +157,7 @@ def _panel(
     *,
     x: str,
     y: str,
-    label: Callable[[Row, Sequence[Row]], str] | None = None,
+    label: PointLabel | None = None,
 ) -> list[Label]:
     """Plot the points; return their labels."""
     shown: set[str] = set()
@@ -227,21 +234,6 @@ def _label(row: Row, rows: Sequence[Row]) -> str:
 def one_of_several(row: Row, rows: Sequence[Row]) -> str:
     """Return the fidelity if a method has several; the legend names the others."""
     return str(row["fidelity"]) if sum(r["method"] == row["method"] for r in rows) > 1 else ""
-
-
-def _front(axes: Any, rows: Sequence[Row], key: str, speed: str) -> None:
-    front = sorted((r for r in rows if key in r["front"] and r[speed]), key=lambda r: r[speed])
-    axes.step(
-        [r[speed] for r in front],
-        [r[key] for r in front],
-        where="pre",
-        color=INK,
-        linewidth=1,
-        linestyle="--",
-        alpha=0.6,
-        zorder=1,
-        label="Pareto front",
-    )
 
 
 def draw_sweeps(rows: Sequence[Row], file: Path) -> None:
@@ -344,17 +336,13 @@ def _place(axes: Any, pixels: float, labels: Sequence[Label]) -> list[Any]:
             chosen[index] = int(np.argmin(np.array(costs) + fixed[index]))
         if chosen == before:
             break
-    return [
-        _write(
-            axes,
-            labels[index],
-            points[index],
-            offered[index][at],
-            pixels,
-            led=_is_led(offered[index][at], points, index, at),
-        )
-        for index, at in chosen.items()
-    ]
+    made = []
+    for index, at in chosen.items():
+        box = offered[index][at]
+        # Far from its point, or nearer to another one, a label would be ambiguous without a line.
+        led = at // len(_TURNS) > 1 or _is_nearer_to_another(box, points, index)
+        made.append(_write(axes, labels[index], points[index], box, pixels, led=led))
+    return made
 
 
 def _fixed_costs(boxes: Sequence[Boxes], points: Boxes, own: int, bars: Boxes, inside: Boxes) -> Boxes:
@@ -374,11 +362,6 @@ def _fixed_costs(boxes: Sequence[Boxes], points: Boxes, own: int, bars: Boxes, i
 def _is_nearer_to_another(box: Boxes, points: Boxes, own: int) -> bool:
     away = np.linalg.norm(points - np.clip(points, box[:2], box[2:]), axis=1)
     return bool(np.any(np.delete(away, own) < away[own]))
-
-
-def _is_led(box: Boxes, points: Boxes, own: int, at: int) -> bool:
-    """Check whether a label needs a line to its point, without which it would be ambiguous."""
-    return at // len(_TURNS) > 1 or _is_nearer_to_another(box, points, own)
 
 
 def _write(axes: Any, label: Label, point: Boxes, box: Boxes, pixels: float, *, led: bool) -> Any:

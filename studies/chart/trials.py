@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from graspd.service.model.fidelity import Fidelity
 from graspd.service.model.transforms import Floats
-from graspd.studies.clock import clock_of
+from graspd.studies.bench import clock_of
 from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
 from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.model import HandModel
@@ -22,6 +22,7 @@ from graspd.worker.planners import Rollout as Tried
 from graspd.worker.quality.gate import passes
 from graspd.worker.quality.table import measure
 from graspd.worker.scenes.rollout import rollout_on
+from graspd.worker.simulation.environment import PlacedGrasps
 from graspd.worker.validation.decomposition import ConvexPieces
 from graspd.worker.validation.displacement import simulated_displacement_cm
 from graspd.worker.validation.robust import robust
@@ -76,14 +77,15 @@ class Setting:
         count: int,
         seed: int,
         *,
+        placed: PlacedGrasps | None = None,
         rollout: Tried | None = None,
         warm: bool = False,
     ) -> GraspSet:
-        """Make grasps; methods with rollouts run them by `rollout`."""
+        """Make grasps, in the scenes if `placed`; methods with rollouts run them by `rollout`."""
         if self.make is not None:
             return self.make(hand, obj, count, seed)
         options = {**self.options, **(self.warm if warm else {})}
-        wanted = PlanRequest(count, self.knobs, seed, rollout=rollout)
+        wanted = PlanRequest(count, self.knobs, seed, placed=placed, rollout=rollout)
         return synthesize(hand, obj, wanted, self.run, method=self.method, options=options)
 
 
@@ -121,10 +123,7 @@ class Rollout:
     @cached_property
     def tried(self) -> Tried | None:
         """Rollouts of candidates, as in jobs."""
-        return rollout_on(self.setting.run, self.hand, self.obj, self._pieces, in_scenes=False)
-
-    def _pieces(self) -> ConvexPieces:
-        return self.pieces
+        return rollout_on(self.setting.run, self.hand, self.obj, lambda: self.pieces, in_scenes=False)
 
     @property
     def _clock(self) -> Callable[[], float]:

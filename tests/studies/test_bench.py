@@ -16,7 +16,7 @@ from graspd.baselines.learned.network import save
 from graspd.commands.studies import app
 from graspd.service.model.domain import JobOptions
 from graspd.service.model.fidelity import FIDELITIES
-from graspd.studies.timing import host_ms, kernel_shares
+from graspd.studies.bench import host_ms, kernel_shares
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.generation import validated_grasps
 from graspd.worker.hands.load import hand_from_path

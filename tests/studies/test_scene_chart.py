@@ -20,7 +20,7 @@ from graspd.service.store.records import latest
 from graspd.service.store.store import open_store
 from graspd.studies.chart import scenes
 from graspd.studies.chart.chart import ChartObject, settings_of
-from graspd.studies.chart.scene_report import markdown
+from graspd.studies.chart.report import markdown
 from graspd.studies.chart.scenes import figures, summed
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.hands.load import hand_from_path
