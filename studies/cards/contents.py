@@ -49,14 +49,6 @@ class AssetFacts:
 
 
 @dataclass(frozen=True)
-class MissingBatches:
-    """Missing batches of a cell of the snapshot, and the reason."""
-
-    tasks: int
-    reason: str
-
-
-@dataclass(frozen=True)
 class Contents:
     """Input of a card. `snapshot` and `record` are None if there are only files."""
 
@@ -66,7 +58,8 @@ class Contents:
     objects: Mapping[str, AssetFacts]
     snapshot: Snapshot | None = None
     record: DatasetRecord | None = None
-    gaps: Mapping[Pair, MissingBatches] = field(default_factory=dict)
+    gaps: Mapping[Pair, tuple[int, str]] = field(default_factory=dict)
+    """Number of batches of a cell that the snapshot lacks, and the reason."""
     root: Path | None = None
     """Folder of the shards, if they are files."""
 
@@ -176,7 +169,6 @@ def _described(name: str, digest: str, files: Mapping[str, bytes], facts: Any, *
 
 @lru_cache
 def _checked(kind: AssetKind, name: str) -> dict[str, Any]:
-    """Return the facts of a built-in asset; it may be read in this process."""
     files = builtin_files(kind, name)
     if kind is AssetKind.HAND:
         from graspd.worker.hands.check import check_hand
@@ -201,17 +193,14 @@ def _digests(shards: Shards, kind: AssetKind) -> dict[str, str]:
     return found
 
 
-def _gaps(store: Store, record: DatasetRecord, taken: Snapshot) -> dict[Pair, MissingBatches]:
-    """Return the planned batches that the snapshot lacks."""
+def _gaps(store: Store, record: DatasetRecord, taken: Snapshot) -> dict[Pair, tuple[int, str]]:
     there = {shard.id for shard in taken.shards}
-    gaps: dict[Pair, MissingBatches] = {}
+    gaps = {}
     for cell in record.cells():
         missing = [task for task in plan(job_of(cell, record.options, record.revisions)) if task.output not in there]
         if missing:
             reasons = (attempts[-1].reason for task in missing if (attempts := task_attempts(store, task.id)))
-            gaps[cell.hand.name, cell.object.name] = MissingBatches(
-                len(missing), next(reasons, "not made yet, or cancelled")
-            )
+            gaps[cell.hand.name, cell.object.name] = len(missing), next(reasons, "not made yet, or cancelled")
     return gaps
 
 
@@ -245,7 +234,7 @@ class ShardContents:
     size_bytes: int
     rows: int
     """Grasps, pairs of grasp and scene, or pictures."""
-    info: Mapping[str, Any]
+    info: Mapping[str, Any] = field(default_factory=dict)
     """Remarks of the stage: seconds of its parts, rejected candidates."""
     revision: int | None = None
 
@@ -261,24 +250,18 @@ def pieces(contents: Contents) -> Iterator[ShardContents]:
 
 def _piece(contents: Contents, file: ShardFile, size: int | None) -> ShardContents:
     manifest = _manifest(contents, file)
-    if manifest is not None and file.kind == "views":
-        return _unopened(file, manifest)
+    unopened = None if manifest is None else _unopened(file, manifest)
+    if unopened is not None and file.kind == "views":
+        return unopened
     path = contents.shards.path(file)
     with open_shard(path) as opened:
         said = {key: _plain(value) for key, value in opened.attrs.items()}
         columns = {name: read_column(opened, name, str(path)) for name in COLUMNS[file.kind] if name in opened}
         rows = len(opened[{"base": "quality/valid", "scene": "grasp/valid", "views": "camera/eye"}[file.kind]])
-    if manifest is not None:
-        said = {**_unopened(file, manifest).said, **said}
-    return ShardContents(
-        file,
-        columns,
-        said,
-        size or path.stat().st_size,
-        rows,
-        manifest.info if manifest else {},
-        manifest.stage_revision if manifest else None,
-    )
+    found = ShardContents(file, columns, said, size or path.stat().st_size, rows)
+    if unopened is None:
+        return found
+    return replace(found, said={**unopened.said, **said}, info=unopened.info, revision=unopened.revision)
 
 
 def _manifest(contents: Contents, file: ShardFile) -> ShardManifest | None:
@@ -292,13 +275,9 @@ def _manifest(contents: Contents, file: ShardFile) -> ShardManifest | None:
 
 
 def _unopened(file: ShardFile, manifest: ShardManifest) -> ShardContents:
-    said: dict[str, Any] = {
-        "seconds": manifest.seconds,
-        "device": manifest.device,
-        "worker": manifest.worker,
-        "seed": manifest.seed,
-        "created": manifest.created,
-        "code_version": manifest.code_version,
+    copied = ("seconds", "device", "worker", "seed", "created", "code_version")
+    said: dict[str, Any] = {name: getattr(manifest, name) for name in copied}
+    said |= {
         "method": manifest.request.method,
         "fidelity": json_attribute(manifest.request.knobs.model_dump(mode="json")),
         "want": manifest.request.want,

@@ -174,18 +174,8 @@ class Tally:
 
 
 _ATTRIBUTES: Final = (
-    "method",
-    "fidelity",
-    "seed",
-    "want",
-    "device",
-    "worker",
-    "code_version",
-    "verdict_level",
-    "mu",
-    "source",
-    "verdict_key",
-    "scene",
+    *("method", "fidelity", "seed", "want", "device", "worker", "code_version"),
+    *("verdict_level", "verdict_key", "mu", "source", "scene"),
 )
 
 
@@ -211,7 +201,6 @@ def tally_of(contents: Contents, pieces: Iterable[ShardContents]) -> Tally:
 
 
 def _note(tally: Tally, cell: CellTally, piece: ShardContents) -> None:
-    """Add the sums that are independent of the kind of shard."""
     kind = piece.file.kind
     tally.shards[kind] += 1
     tally.bytes[kind] += piece.size_bytes
