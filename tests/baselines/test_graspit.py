@@ -67,12 +67,14 @@ def test_temperature_jumps_and_chances_follow_ingbers_schedule() -> None:
     assert hot[2] == pytest.approx(np.exp(-1e-6 / hot[0]), rel=2e-4) and cold[2] < hot[2]
 
 
+def search_on(*sides: float) -> Search:
+    box = object_from_mesh(trimesh.creation.box(sides))
+    return Search(ground_of(two_finger_hand(), box, "cpu", kernels))
+
+
 def palm_only(gap: float, turn: float) -> float:
     """Contact energy with one virtual contact in the middle of the palm, which looks along z at a box's face."""
-    search = Search(
-        ground_of(two_finger_hand(), object_from_mesh(trimesh.creation.box((0.2, 0.2, 0.1))), "cpu", kernels)
-    )
-    problem = search.problem
+    problem = search_on(0.2, 0.2, 0.1).problem
     problem.contact_body = wp.array([0], dtype=wp.int32, device="cpu")
     problem.contact_position = wp.array([[0.0, 0, 0]], dtype=wp.vec3, device="cpu")
     problem.contact_normal = wp.array([[0.0, 0, 1]], dtype=wp.vec3, device="cpu")
@@ -121,9 +123,7 @@ def test_contacts_lie_on_every_finger_amplitudes_reach_limits(name: str) -> None
 
 
 def test_annealing_lowers_energy_and_keeps_states_that_differ() -> None:
-    search = Search(
-        ground_of(two_finger_hand(), object_from_mesh(trimesh.creation.box((0.05, 0.05, 0.05))), "cpu", kernels)
-    )
+    search = search_on(0.05, 0.05, 0.05)
     told: list[float] = []
     steps = StepCounter(1e6, ExecutionContext(progress=lambda done, total, message: told.append(done)))
     few = search.run([[0, 0, c] for c in range(4)], steps=FIRST_STEP + 50, keep=1, tell=steps)
