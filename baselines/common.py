@@ -72,13 +72,10 @@ def frame_along(z: Floats) -> Floats:
 
 
 def joined(states: list[HandState]) -> HandState:
-    """Concatenate the hands of all parts of a batch, in order."""
     return HandState(*(np.concatenate([getattr(s, name) for s in states]) for name in ("pivot", "rotation", "q")))
 
 
-def grasp_set(
-    pair: Pair, state: HandState, began: float, info: dict[str, object], loss: Floats | None = None
-) -> GraspSet:
+def grasp_set(pair: Pair, state: HandState, began: float, info: dict[str, object]) -> GraspSet:
     """Return hands as grasps with their postures; `began` is the planner's start by `time.perf_counter`."""
     hand, obj = pair.hand.model, pair.fine.obj.model
     seconds = time.perf_counter() - began
@@ -87,7 +84,7 @@ def grasp_set(
         grasp=grasp,
         pregrasp=pregrasp(hand, obj, grasp, device=pair.hand.device),
         squeeze=squeeze(hand, obj, grasp, device=pair.hand.device),
-        stability_loss=np.full(len(grasp), np.nan) if loss is None else loss,
+        stability_loss=np.full(len(grasp), np.nan),
         seconds=seconds,
         info=info,
     )
@@ -114,7 +111,6 @@ def inside_points(hand: HandModel, *, each: int, on_palm: int) -> SurfacePoints:
 
 
 def _inside(hand: HandModel, points: SurfacePoints) -> NDArray[np.bool_]:
-    """Return (N,) whether a point lies on the inner side of its link."""
     before, after = (_posed(hand, points, hand.preshape + t * hand.closing) for t in (0.0, STEP))
     motion = after[0] - before[0]
     speed = np.linalg.norm(motion, axis=1)

@@ -60,7 +60,8 @@ def bench(
         `host_ms_per_grasp` (None on a GPU, where waiting threads spin), `kernels`.
     """
     first = fidelities[0]
-    start = _start_times(hand, load(first.face_error_m), first, device)
+    nominal = load(first.face_error_m)
+    start = _start_times(hand, nominal, first, device)
     runs = []
     for fidelity in fidelities:
         obj = load(fidelity.face_error_m)
@@ -71,17 +72,17 @@ def bench(
                 f"{fidelity.name:9s} batch {batch:5d} x {join} threads {count}: {run['grasps_per_second']:8.1f} "
                 f"grasps/s, {run['ms_per_iteration']:7.2f} ms/iteration"
             )
-    pair = pair_of(hand, load(first.face_error_m), first, device)
-    launch = min(LARGE, max(batches) * max(joins))
-    host = None if wp.get_device(device).is_cuda else host_ms(hand, load(first.face_error_m), first, launch)
+    host = None
+    if not wp.get_device(device).is_cuda:
+        host = round(host_ms(hand, nominal, first, min(LARGE, max(batches) * max(joins))), 3)
     return {
         "device": device_name(device),
         "hand": hand.name,
-        "object": load(first.face_error_m).name,
+        "object": nominal.name,
         "versions": {"graspd": PACKAGE_VERSION, "warp": wp.config.version},
         "start": start,
-        "host_ms_per_grasp": None if host is None else round(host, 3),
-        "kernels": kernel_shares(pair, first, min(32, max(batches))),
+        "host_ms_per_grasp": host,
+        "kernels": kernel_shares(pair_of(hand, nominal, first, device), first, min(32, max(batches))),
         "runs": runs,
     }
 
@@ -224,7 +225,6 @@ def host_ms(hand: HandModel, obj: ObjectModel, fidelity: Fidelity, count: int) -
 
 
 def device_name(device: str) -> str:
-    """Return the common name of the device."""
     found = wp.get_device(device)
     return str(found.name) if found.is_cuda else f"cpu ({available_cores()} cores)"
 
@@ -235,7 +235,6 @@ def clock_of(device: str) -> Callable[[], float]:
 
 
 def table(result: dict[str, Any]) -> str:
-    """Return Markdown: runs, kernel shares, start times."""
     lines = [
         f"{result['hand']} on {result['object']}, {result['device']}, graspd {result['versions']['graspd']}, "
         f"Warp {result['versions']['warp']}",
@@ -263,12 +262,10 @@ def table(result: dict[str, Any]) -> str:
 
 
 def _batches(run: dict[str, Any]) -> str:
-    """Return the batch, and the number of batches per launch."""
     return str(run["batch"]) if run["join"] == 1 else f"{run['join']} × {run['batch']}"
 
 
 def write(result: dict[str, Any], folder: Path) -> None:
-    """Write bench.json, bench.md and bench.png to a folder."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "bench.json").write_text(json.dumps(result, indent=1) + "\n")
     (folder / "bench.md").write_text(table(result) + "\n")
@@ -276,7 +273,6 @@ def write(result: dict[str, Any], folder: Path) -> None:
 
 
 def _plot(result: dict[str, Any], path: Path) -> None:
-    """Plot grasps per second over the batch, one line per fidelity and thread count."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(7, 4.2), layout="constrained")

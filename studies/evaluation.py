@@ -151,7 +151,6 @@ def _success(case: Case, verdicts: Verdicts) -> dict[str, Any]:
 
 
 def _with_ways(case: Case, placed: PlacedGrasps) -> tuple[GraspSet, NDArray[np.bool_]]:
-    """Return the grasps with trajectories, and (N,) whether they are clear."""
     way, grasps = plan_way(case.hand, case.obj, case.grasps, placed), case.grasps
     if grasps.approach is None or grasps.coming is None:
         # Imported files have grasps, but rarely trajectories.
@@ -278,7 +277,6 @@ def combine(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _models(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return shares of several rows, weighted by their grasps."""
     axes: dict[str, list[tuple[float, int]]] = {}
     for row in rows:
         for axis, one in row["robust_axes"].items():

@@ -38,8 +38,6 @@ class AutograspOptions(Options):
 
 @dataclass(frozen=True)
 class Autograsp:
-    """See `worker.planners.Planner`."""
-
     options: AutograspOptions
 
     def __call__(self, hand: HandModel, obj: ObjectModel, wanted: PlanRequest, run: ExecutionContext) -> GraspSet:

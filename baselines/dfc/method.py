@@ -56,8 +56,6 @@ class DfcOptions(Options):
 
 @dataclass(frozen=True)
 class Dfc:
-    """See `worker.planners.Planner`."""
-
     options: DfcOptions
 
     def __call__(self, hand: HandModel, obj: ObjectModel, wanted: PlanRequest, run: ExecutionContext) -> GraspSet:
@@ -226,7 +224,6 @@ class Descent:
             tell(self.n * count, "annealing")
 
     def hands(self) -> HandState:
-        """Return the present hands, joints inside their limits."""
         for mine, other in zip(self._proposed(), self.state, strict=True):
             wp.copy(mine, other)
         found = self.proposal.state(self.n)

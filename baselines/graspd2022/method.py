@@ -63,8 +63,6 @@ class Search:
 
 @dataclass(frozen=True)
 class Graspd2022:
-    """See `worker.planners.Planner`."""
-
     options: Graspd2022Options
 
     def __call__(self, hand: HandModel, obj: ObjectModel, wanted: PlanRequest, run: ExecutionContext) -> GraspSet:
@@ -138,8 +136,6 @@ def physics_of(gyration: float) -> Any:
 
 
 class _Batch:
-    """Arrays and launches of a batch."""
-
     def __init__(self, search: Search, starts: HandState, steps: int) -> None:
         pair, n = search.pair, len(starts.pivot)
         self.grid, self.n = search.grid, n

@@ -129,8 +129,6 @@ class GraspitOptions(Options):
 
 @dataclass(frozen=True)
 class Graspit:
-    """See `worker.planners.Planner`."""
-
     options: GraspitOptions
 
     def __call__(self, hand: HandModel, obj: ObjectModel, wanted: PlanRequest, run: ExecutionContext) -> GraspSet:

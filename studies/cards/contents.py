@@ -84,7 +84,7 @@ def contents_of_store(store: Store, dataset: str, snapshot: str | None = None, c
     )
 
 
-def contents_of_folder(folder: Path, name: str | None = None) -> Contents:
+def contents_of_folder(folder: Path) -> Contents:
     """Return the shards of a folder, such as an export, with facts of built-in hands and objects only.
 
     Raises:
@@ -98,8 +98,8 @@ def contents_of_folder(folder: Path, name: str | None = None) -> Contents:
         {known: _builtin(kind, known, digest) for known, digest in sorted(_digests(shards, kind).items())}
         for kind in (AssetKind.HAND, AssetKind.OBJECT)
     )
-    known_as = name or (taken.dataset if taken else folder.resolve().name)
-    return Contents(known_as, shards, hands, objects, taken, root=folder)
+    name = taken.dataset if taken else folder.resolve().name
+    return Contents(name, shards, hands, objects, taken, root=folder)
 
 
 def with_provenance(contents: Contents, file: Path) -> Contents:
@@ -183,7 +183,6 @@ def _checked(kind: AssetKind, name: str) -> dict[str, Any]:
 
 
 def _digests(shards: Shards, kind: AssetKind) -> dict[str, str]:
-    """Return names and digests, from the first shard of each."""
     found: dict[str, str] = {}
     for file in shards:
         name = file.hand if kind is AssetKind.HAND else file.object

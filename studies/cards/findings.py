@@ -256,5 +256,4 @@ def _listed(words: Sequence[str]) -> str:
 
 
 def _percent(value: float) -> str:
-    """Return a share with as many digits as needed."""
     return f"{100 * value:.0f} %" if value >= 0.095 or value == 0 else f"{100 * value:.1f} %"

@@ -63,8 +63,8 @@ def _objects(card: Row) -> list[str]:
     return [obj["name"] for obj in card["composition"]["objects"]]
 
 
-def _plain(axes: Any, *, grid: str = "both") -> None:
-    axes.grid(alpha=0.25, axis=grid)
+def _plain(axes: Any) -> None:
+    axes.grid(alpha=0.25)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
 

@@ -62,7 +62,6 @@ def _origin(asset: Row) -> dict[str, str]:
 
 
 def validity_table(card: Row) -> str:
-    """Return a table by hand and in total: candidates, valid ones, rejections, rechecks, cost."""
     found = {**card["validity"]["by_hand"], "**all**": card["validity"]}
     rows = []
     for name, row in found.items():
@@ -85,7 +84,6 @@ def validity_table(card: Row) -> str:
 
 
 def quality_table(card: Row) -> str:
-    """Return the median and the range from the 5th to the 95th percentile, by hand."""
     hands = list(card["quality"])
     rows = []
     for name, (title, digits) in QUALITY_NAMES.items():
@@ -100,7 +98,6 @@ def quality_table(card: Row) -> str:
 
 
 def cells_table(card: Row) -> str:
-    """Return a row for each hand x object."""
     rows = []
     for cell in card["cells"]:
         used = cell["directions"] and 1 - cell["directions"]["empty"] / card["directions"]["cells"]
@@ -138,7 +135,6 @@ _SHOWN: Final = (
 
 
 def interval(found: Row | None) -> str:
-    """Return a share with its 95 % interval."""
     if found is None:
         return "not known"
     return f"{percent(found['share'])} ({percent(found['low'])} to {percent(found['high'])})"

@@ -163,7 +163,6 @@ def _variant(text: str) -> tuple[str, dict[str, str], int | None]:
 
 
 def _options_of(texts: Sequence[str], methods: Sequence[str]) -> Mapping[str, dict[str, str]]:
-    """Group `METHOD:NAME=VALUE` by method."""
     found: dict[str, dict[str, str]] = {}
     for text in texts:
         name, colon, rest = text.partition(":")

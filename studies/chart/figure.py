@@ -145,7 +145,6 @@ def draw_scenes(rows: Sequence[Row], files: Sequence[Path], *, second: str) -> N
 
 
 def _styles(rows: Sequence[Row]) -> dict[str, tuple[str, str]]:
-    """Return colour and marker of each method; its fidelities share them."""
     methods = list(dict.fromkeys(row["method"] for row in rows))
     return {m: (COLOURS[i % len(COLOURS)], MARKERS[i % len(MARKERS)]) for i, m in enumerate(methods)}
 
@@ -159,7 +158,6 @@ def _panel(
     y: str,
     label: PointLabel | None = None,
 ) -> list[Label]:
-    """Plot the points; return their labels."""
     shown: set[str] = set()
     labels = []
     for row in rows:
@@ -346,7 +344,6 @@ def _place(axes: Any, pixels: float, labels: Sequence[Label]) -> list[Any]:
 
 
 def _fixed_costs(boxes: Sequence[Boxes], points: Boxes, own: int, bars: Boxes, inside: Boxes) -> Boxes:
-    """Return the costs of a label's places that are independent of other labels."""
     return np.array(
         [
             _CROSSED * _share(box, bars)
@@ -414,7 +411,6 @@ def _side(part: float) -> float:
 
 
 def _bars(axes: Any, labels: Sequence[Label], half: float) -> Boxes:
-    """Return the bars of the points as boxes (N, 4) [px]."""
     ends = [((low, label.y), (high, label.y)) for label in labels if label.x_bar for low, high in [label.x_bar]]
     ends += [((label.x, low), (label.x, high)) for label in labels if label.y_bar for low, high in [label.y_bar]]
     if not ends:

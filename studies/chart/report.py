@@ -8,9 +8,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from graspd.service.model.studies import FILTERED, IN_SCENE
+from graspd.service.model.studies import FILTERED, IN_SCENE, IN_SCENES
 from graspd.studies.chart.figure import SPEED, draw, draw_hands, draw_scenes, draw_sweeps, one_of_several
-from graspd.studies.chart.scenes import ACCURACIES as SCENE_ACCURACIES
 from graspd.studies.chart.statistics import most_valid
 
 Row = Mapping[str, Any]
@@ -92,7 +91,6 @@ def _page(chart: Row) -> str:
 
 
 def _names(chart: Row) -> tuple[str, str]:
-    """Return the hands and the objects of its runs."""
     hands, objects = (", ".join(dict.fromkeys(run[name] for run in chart["runs"])) for name in ("hand", "object"))
     return hands, objects
 
@@ -181,7 +179,6 @@ def _ratios(rows: Sequence[Row]) -> str:
 
 
 def runs_table(runs: Sequence[Row]) -> str:
-    """Return a row per run."""
     lines = [
         "| hand | object | method | fidelity | valid/s | dexgraspbench | hard | robust | ε | penetration mm | "
         "self mm | contact cm² |",
@@ -292,7 +289,7 @@ def _summary(rows: Sequence[Row], second: str) -> str:
         gain = "–" if row["gain"] is None else f"{row['gain']:.3g}"
         lines.append(
             f"| {row['way']} | {row['method']} | {row['fidelity']} | {row['grasps']} | {row['clear']:.2f} | "
-            f"{' | '.join(_bold(row, key) for key in SCENE_ACCURACIES)} | "
+            f"{' | '.join(_bold(row, key) for key in IN_SCENES)} | "
             f"{row[SPEED]:.3g} | {row['valid_per_second']:.3g} | {_first(row['seconds_to_first'])} | "
             f"{row['pairs_with_one']} of {row['pairs']} | {gain} |"
         )

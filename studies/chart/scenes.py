@@ -1,10 +1,10 @@
 """Grasps planned in a scene against grasps of a free object, filtered in the same scene.
 
 A setting of a method that plans in scenes runs in both modes, others only in the second. Grasp i uses scene i of the
-object's stable faces in turn, in both modes, with the same tests: clear trajectory, lifted, lifted by the letter, at
-half the friction, and in models around the nominal one. Speed is lifted grasps over seconds, on a CPU core-seconds,
-which are independent of other load: of planner and postures alone, and end to end, with trajectory, validator and the
-metrics of lifted grasps.
+object's stable faces in turn, in both modes, with the same tests: clear trajectory, lifted, lifted under the unmodified
+protocol, at half the friction, and in models around the nominal one. Speed is lifted grasps over seconds, on a CPU
+core-seconds, which are independent of other load: of planner and postures alone, and end to end, with trajectory,
+validator and the metrics of lifted grasps.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from graspd.service.model.clock import timestamp
 from graspd.service.model.digests import digest_json
 from graspd.service.model.errors import InputError
 from graspd.service.model.scene_spec import SceneSpec
-from graspd.service.model.studies import FILTERED, IN_SCENE
+from graspd.service.model.studies import FILTERED, IN_SCENE, IN_SCENES
 from graspd.service.model.version import PACKAGE_VERSION, STAGE_REVISIONS
 from graspd.studies.bench import clock_of, device_name
 from graspd.studies.chart.chart import TRUE_ERROR_M, ChartObject
-from graspd.studies.chart.statistics import first_valid, pareto, plain
+from graspd.studies.chart.statistics import first_valid, mark_fronts, plain
 from graspd.studies.chart.trials import FRICTION, MODELS_SEED, SEED, WARM_SEED, Setting
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.model import HandModel
@@ -48,8 +48,6 @@ Say = Callable[[str], None]
 
 #: Shares of all candidates, by their column.
 SHARES: Final = ("clear", "lift", "lift_dexgraspbench", "lift_hard")
-#: Accuracies with a Pareto front.
-ACCURACIES: Final = ("lift", "lift_dexgraspbench", "lift_hard", "robust")
 SPEEDS: Final = (("valid_per_second", "seconds"), ("end_to_end_per_second", "end_seconds"))
 #: Increase it when a row has other columns: cached results are then discarded.
 FORM: Final = 2
@@ -114,7 +112,6 @@ def scene_chart(
 
 
 def _ways(settings: Sequence[Setting]) -> list[tuple[Setting, str]]:
-    """Return each setting with its planning modes."""
     found = []
     for setting in settings:
         able = method(setting.method).in_scenes
@@ -266,8 +263,7 @@ def figures(rows: Sequence[Mapping[str, Any]]) -> Row:
 def summed(runs: Sequence[Row]) -> list[Row]:
     """Return a row for each mode, method and fidelity over all pairs.
 
-    `gain` compares with the same fidelity, filtered: the median over pairs in which that found any. `front` names the
-    accuracies in which no method that is faster end to end is better.
+    `gain` compares with the same fidelity, filtered: the median over pairs in which that found any.
     """
     groups: dict[tuple[str, str, str, int], list[Row]] = {}
     for run in runs:
@@ -282,12 +278,7 @@ def summed(runs: Sequence[Row]) -> list[Row]:
         row["pairs_with_one"] = sum(run["lift_count"] > 0 for run in own)
         row["gain"] = _gain(own, groups.get((FILTERED, name, fidelity, batch), [])) if way == IN_SCENE else None
         rows.append(row)
-    for row in rows:
-        row["front"] = []
-    for key in ACCURACIES:
-        able = [row for row in rows if row["end_to_end_per_second"] and row[key] is not None]
-        for index in pareto([(row["end_to_end_per_second"], row[key]) for row in able]):
-            able[index]["front"].append(key)
+    mark_fronts(rows, IN_SCENES)
     return rows
 
 

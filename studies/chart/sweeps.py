@@ -39,8 +39,6 @@ DEFAULT: Final = FIDELITIES["standard"]
 
 @dataclass(frozen=True)
 class KnobValue:
-    """One knob at one value."""
-
     knob: str
     value: str
     fidelity: Fidelity = DEFAULT

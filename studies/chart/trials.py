@@ -188,7 +188,6 @@ class Rollout:
         self.first_calls.append(self._clock() - began)
 
     def values(self, key: str) -> Floats:
-        """Return a column of all repeats."""
         return np.concatenate([columns[key] for columns in self.columns])
 
     def best(self) -> dict[str, float]:

@@ -117,7 +117,6 @@ class MapOptions:
 def shape_map(
     hand: HandModel, options: MapOptions, *, fidelities: Sequence[str], families: Sequence[str], defects: Sequence[str]
 ) -> StabilityMap:
-    """Return valid grasps on each shape at each fidelity, or the reason of its refusal."""
     jobs: list[tuple[str, float | str, Any]] = [
         (f"{family}: {FAMILIES[family][0]}", value, FAMILIES[family][1](value))
         for family in families
@@ -186,7 +185,6 @@ def shape_cell(
 
 
 def outcome_of(valid: float) -> Outcome:
-    """Grade a share of valid grasps."""
     return "broken" if valid == 0 else "weak" if valid < 0.5 else "good"
 
 
@@ -277,7 +275,6 @@ def hand_map(
     sizes: Sequence[float] = (),
     ratios: Sequence[float] = (),
 ) -> StabilityMap:
-    """Return valid grasps of a cube by each hand, or the reason of its refusal."""
     makes: list[tuple[str, float, str, Callable[[], HandModel]]] = []
     for way in couplings:
         makes += [("fingers of a ring", n, way, partial(ring_hand, n, coupling=way)) for n in fingers]

@@ -41,8 +41,6 @@ RESIDUAL: Final = (0.35, 0.9)
 
 @dataclass(frozen=True)
 class Descent:
-    """Result of n hands."""
-
     state: HandState
     depths: Floats
     """(n,) deepest penetration after the projection [m], as in a job: before, it is millimetres."""
@@ -87,7 +85,6 @@ def descend(
 
 
 def start_map(hand: HandModel, obj: ObjectModel, *, count: int, say: Say) -> StabilityMap:
-    """Map starts that are moved along the approach, into the object and away from it."""
     fidelity = FIDELITIES["standard"]
     pair = pair_of(hand, obj, fidelity, "cpu")
     state = starts_of(pair, count)
@@ -116,7 +113,6 @@ def start_map(hand: HandModel, obj: ObjectModel, *, count: int, say: Say) -> Sta
 def rate_map(
     hand: HandModel, obj: ObjectModel, *, rates: Sequence[float], weights: Sequence[float], count: int, say: Say
 ) -> StabilityMap:
-    """Map learning rate x penetration weight, for Adam and for plain descent."""
     fidelity = FIDELITIES["draft"]
     pair = pair_of(hand, obj, fidelity, "cpu")
     state = starts_of(pair, count)
@@ -142,7 +138,6 @@ def rate_map(
 
 
 def length_map(hand: HandModel, obj: ObjectModel, *, lengths: Sequence[int], say: Say) -> StabilityMap:
-    """Map fine phases far longer than any schedule, to detect drift."""
     fidelity = FIDELITIES["draft"]
     pair = pair_of(hand, obj, fidelity, "cpu")
     state = starts_of(pair, 4)
@@ -178,7 +173,6 @@ _BOUNDS: Final = (
 
 
 def starts_of(pair: Pair, count: int) -> HandState:
-    """Return starts sampled as in the planner."""
     return sample_starts(pair.model(pair.coarse), seed=11, batch=0, indices=range(count), each=1)
 
 

@@ -81,7 +81,6 @@ def reference_gradient(name: str, contacts: Contacts, world: World) -> Floats:
 
 
 def gradient_map(sizes: Sequence[float], gaps: Sequence[float], *, repeats: int) -> StabilityMap:
-    """Map the angle between the two gradients over the object's size and the spread of gaps."""
     cells = []
     for name, size, gap in product(_SOLVERS, sizes, gaps):
         worst = float(np.median([_angle(name, size, gap, seed) for seed in range(repeats)]))

@@ -47,15 +47,13 @@ MASSES: Final = (0.01, 0.1, 1.0, 10.0)
 COUNTS: Final = (1, 2, 4, 8, 16, 64, 256)
 
 
-def cage(count: int) -> Floats:
-    """Return (count, 3) unit directions, evenly spread (Fibonacci)."""
+def _cage_around(dt: float, speed: float) -> Floats:
+    """Return 24 points of a cage, evenly spread (Fibonacci) [m]."""
+    count = 24
     k = np.arange(count) + 0.5
     polar, turn = np.arccos(1 - 2 * k / count), np.pi * (1 + 5**0.5) * k
-    return np.stack([np.cos(turn) * np.sin(polar), np.sin(turn) * np.sin(polar), np.cos(polar)], axis=1)
-
-
-def _cage_around(count: int, dt: float, speed: float) -> Floats:
-    return cage(count) * (RADIUS_M + min(GAP_M, FLIGHT_STEPS * dt * speed))
+    directions = np.stack([np.cos(turn) * np.sin(polar), np.sin(turn) * np.sin(polar), np.cos(polar)], axis=1)
+    return directions * (RADIUS_M + min(GAP_M, FLIGHT_STEPS * dt * speed))
 
 
 def contacts_of(points: Floats, centre: Floats) -> Contacts:
@@ -77,9 +75,9 @@ def ball_world(dt: float, speed: float) -> World:
     )
 
 
-def position_based(solver: Solver, *, dt: float, speed: float, count: int = 24) -> tuple[float, float]:
+def position_based(solver: Solver, *, dt: float, speed: float) -> tuple[float, float]:
     """Return largest energy over the first, and deepest sink [m], of a ball; position-based integrator."""
-    points = _cage_around(count, dt, speed)
+    points = _cage_around(dt, speed)
     world = ball_world(dt, speed)
 
     def flight() -> Iterator[tuple[Floats, float]]:
@@ -93,11 +91,9 @@ def position_based(solver: Solver, *, dt: float, speed: float, count: int = 24) 
     return _extremes(points, flight())
 
 
-def force_based(
-    *, dt: float, speed: float, stiffness: float, mass: float = 1.0, count: int = 24
-) -> tuple[float, float]:
+def force_based(*, dt: float, speed: float, stiffness: float, mass: float = 1.0) -> tuple[float, float]:
     """Return the same under penalty forces -k c n and friction; `stiffness` [N/m], `mass` [kg]."""
-    points = _cage_around(count, dt, speed)
+    points = _cage_around(dt, speed)
     inertia = 0.4 * mass * RADIUS_M**2
 
     def flight() -> Iterator[tuple[Floats, float]]:
@@ -169,7 +165,6 @@ _OFFERED: Final = tuple(SOLVERS)[:3]
 
 
 def time_step_map(time_steps: Sequence[float], speeds: Sequence[float]) -> StabilityMap:
-    """Map every integrator over time step and speed."""
     grid = list(product(time_steps, speeds))
     cells = [
         _ball_cell(name, dt, speed, position_based(solver, dt=dt, speed=speed))
@@ -212,7 +207,6 @@ def _ball_cell(name: str, dt: float, speed: float, found: tuple[float, float]) -
 
 
 def stiffness_map(stiffnesses: Sequence[float], masses: Sequence[float], time_steps: Sequence[float]) -> StabilityMap:
-    """Map the force-based integrator over stiffness, mass and time step, with the theoretical bound."""
     cells = []
     lines = {}
     for mass in masses:
@@ -244,7 +238,6 @@ def stiffness_map(stiffnesses: Sequence[float], masses: Sequence[float], time_st
 
 
 def contact_count_map(counts: Sequence[int]) -> StabilityMap:
-    """Map one step against a wall of ever more contact points: the remaining motion into it."""
     cells = [
         _wall_cell(name, solver, count, depth, 1e-3)
         for name, solver in SOLVERS.items()

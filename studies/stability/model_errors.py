@@ -49,8 +49,6 @@ _ROUNDING: Final = 1e-9
 
 @dataclass(frozen=True)
 class _Error:
-    """One error of the model."""
-
     amounts: tuple[float, ...]
     drawn: tuple[float, float]
     """Least and largest amount in `--robust`."""

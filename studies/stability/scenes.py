@@ -60,7 +60,6 @@ Placement = tuple[tuple[float, ...], SceneSpec]
 def height_map(
     hands: Sequence[HandModel], options: MapOptions, *, heights: Sequence[float], sides: Sequence[float]
 ) -> StabilityMap:
-    """Map boxes from a plate to a tower on a table."""
     cells = [
         _cell(hand, height, side, _standing((side, side, height)), options)
         for hand, side, height in product(hands, sides, heights)
@@ -78,7 +77,6 @@ def height_map(
 def wall_map(
     hands: Sequence[HandModel], options: MapOptions, *, gaps: Sequence[float], walls: Sequence[str]
 ) -> StabilityMap:
-    """Map a box with walls at a distance from its sides."""
     cells = [
         _cell(hand, gap, name, _standing(TARGET_MM, _walls(WALLS[name], gap)), options)
         for hand, name, gap in product(hands, walls, gaps)
@@ -96,7 +94,6 @@ def wall_map(
 def neighbour_map(
     hands: Sequence[HandModel], options: MapOptions, *, gaps: Sequence[float], around: Sequence[str]
 ) -> StabilityMap:
-    """Map a box among boxes of its size."""
     cells = [
         _cell(hand, gap, name, _standing(TARGET_MM, _neighbours(NEIGHBOURS[name], gap)), options)
         for hand, name, gap in product(hands, around, gaps)
@@ -114,7 +111,6 @@ def neighbour_map(
 def size_map(
     hands: Sequence[HandModel], options: MapOptions, *, ratios: Sequence[float], kinds: Sequence[str]
 ) -> StabilityMap:
-    """Map cubes from a crumb to the hand's size, afloat and in scenes."""
     cells = [
         _cell(hand, ratio, kind, (3 * (1e3 * ratio * span_of(hand),), SceneSpec(kind=kind)), options)
         for hand, kind, ratio in product(hands, kinds, ratios)

@@ -117,7 +117,6 @@ SHAPES: Final[dict[str, tuple[float, ...]]] = {
 def peer_map(
     hand: HandModel, options: MapOptions, *, methods: Sequence[str], shapes: dict[str, tuple[float, ...]]
 ) -> StabilityMap:
-    """Map valid grasps of each method on each shape, at its published settings."""
     cells = []
     for family, values in shapes.items():
         unit, make, _ = FAMILIES[family]
