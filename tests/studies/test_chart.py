@@ -144,6 +144,8 @@ def test_sums_divide_all_valid_by_all_seconds() -> None:
     assert able["front"] == ["dexgraspbench", "hard", "robust", "gsr", "epsilon", "pd_mm"]
     assert unable["front"] == [] and unable["robust"] is None
     assert unable["seconds_to_first_valid"] is None
+    fast, gentle = summed([run_of("a", 5, 1.0, 0.5), run_of("b", 5, 2.0, 0.1)])
+    assert "pd_mm" in fast["front"] and gentle["front"] == ["pd_mm"]
 
 
 def test_a_ratio_to_a_method_without_a_valid_grasp_is_a_bound() -> None:

@@ -25,7 +25,7 @@ from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.model.studies import MapCell, Stability, StabilityMap, from_json, graded
 from graspd.service.store.records import latest
 from graspd.service.store.store import open_store
-from graspd.studies.stability import assets, descents, gradients, integrators, model_errors, report, scenes, studies
+from graspd.studies.stability import assets, descents, gradients, integrators, report, scenes, studies
 from graspd.studies.stability.assets import Coupling, MapOptions, ring_hand
 from graspd.studies.stability.model_errors import ERRORS, model_error_map
 from graspd.studies.stability.report import markdown, write
@@ -170,13 +170,6 @@ def command(*arguments: str) -> tuple[int, str]:
     return done.exit_code, done.output
 
 
-def test_without_a_choice_all_studies_are_made(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[str] = []
-    monkeypatch.setattr(studies, "run", lambda names, *_, **__: asked.extend(names) or [])
-    assert command("--json")[0] == 0
-    assert asked == list(STUDIES)
-
-
 @pytest.mark.parametrize("words", ["no json", "{}", '{"maps": 3}', "--only magic", "--from nowhere.json"])
 def test_wrong_files_and_options_are_the_callers_mistake(tmp_path: Path, words: str) -> None:
     if words.startswith("--"):
@@ -268,27 +261,10 @@ def test_amounts_within_reach_are_those_that_robust_draws(name: str) -> None:
     # Draws come near the ends, but for that of nothing: the bounds are no wider than they need be.
     assert high - max(drawn) < 0.2 * (high - low)
     assert low == 0.0 or min(drawn) - low < 0.2 * (high - low)
-
-
-@pytest.mark.parametrize("name", ERRORS)
-def test_an_amount_departs_along_one_axis_only(name: str) -> None:
-    error, along = ERRORS[name], np.array([0.6, 0.0, 0.8])
-    one = error.variant(hand_from_path("barrett"), error.amounts[-1], along)
-    changed = [field for field, value in vars(one).items() if value != getattr(Variant(), field)]
-    assert len(changed) == 1
-    assert AMOUNTS[name][1](one) == pytest.approx(error.amounts[-1])
-
-
-def test_a_hand_without_valid_grasps_is_no_number_and_broken(monkeypatch: pytest.MonkeyPatch) -> None:
-    found = model_errors.validated_grasps
-
-    def none(*arguments: object, **options: object) -> object:
-        made = found(*arguments, **options)  # type: ignore[arg-type]
-        return replace(made, grasps=made.grasps.take(np.zeros(0, int)))
-
-    monkeypatch.setattr(model_errors, "validated_grasps", none)
-    (cell,) = validated(monkeypatch, MASS, (1.0,))
-    assert cell.outcome == "broken" and not np.isfinite(cell.value)
+    # An amount departs along one axis only.
+    one = ERRORS[name].variant(hand, ERRORS[name].amounts[-1], np.array([0.6, 0.0, 0.8]))
+    assert sum(value != getattr(Variant(), field) for field, value in vars(one).items()) == 1
+    assert amount(one) == pytest.approx(ERRORS[name].amounts[-1])
 
 
 def assert_valid_ones_are_clear(hand: HandModel, found: ValidatedBatch, spec: SceneSpec) -> None:

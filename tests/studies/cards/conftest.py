@@ -72,7 +72,7 @@ class Case:
 
 def case(folder: Path, *, drawn: bool = True, **options: Any) -> Case:
     """The card of a dataset, with its plots or without; options as of `dataset`."""
-    made = dataset(folder, (folder / "store").as_uri(), **options)
+    made = dataset(folder, **options)
     contents = contents_of_store(made.services.store, NAME, cache=folder / "cache")
     if drawn:
         card = write_card(contents, folder / "card", licence="CC-BY-4.0")
@@ -105,7 +105,6 @@ def export(kitchen: Case, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def dataset(
     folder: Path,
-    url: str,
     *,
     change: Change = lambda hand, obj, columns: None,
     fails: tuple[str, str] | None = None,
@@ -114,7 +113,9 @@ def dataset(
 ) -> Made:
     """Two hands x two objects, two batches each, with scenes and pictures; of the cell `fails` the first task fails."""
     index = f"sqlite:///{folder / 'index.sqlite'}"
-    services = Services(Settings(data_dir=folder), open_store(url), empty_index(index), MemoryQueue())
+    services = Services(
+        Settings(data_dir=folder), open_store((folder / "store").as_uri()), empty_index(index), MemoryQueue()
+    )
     factories.add_builtins(services)
     given = {"scenes": 2, "views": 1, "width": 24, "height": 16, "stereo": False, **options}
     wanted = {"name": NAME, "hands": HANDS, "objects": OBJECTS, "grasps": grasps, **given}

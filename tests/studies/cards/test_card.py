@@ -31,18 +31,7 @@ from graspd.studies.cards.page import front_matter, page
 from graspd.studies.cards.plots import draw
 from graspd.studies.cards.tally import CellTally, JointUse, Tally, cell_counts, elevations
 from tests.shell import completed
-from tests.studies.cards.conftest import (
-    HANDS,
-    OBJECTS,
-    SECONDS,
-    STILL_HAND,
-    STILL_JOINT,
-    Array,
-    Case,
-    case,
-    dataset,
-    undrawn,
-)
+from tests.studies.cards.conftest import HANDS, OBJECTS, SECONDS, STILL_HAND, STILL_JOINT, Array, Case, case, undrawn
 
 CHECK = ("sha256sum", "-c", "--strict", "checksums.sha256")
 
@@ -97,18 +86,6 @@ def test_what_a_folder_does_not_know_is_said_to_be_missing(export: Path, tmp_pat
     assert completed(CHECK, cwd=tmp_path / "plain").returncode == 0
     assert "| revisions of the stages | not recorded |" in page
     assert "No licence was stated for this dataset" in page and "Not measured: robustness" in page
-
-
-@pytest.mark.s3
-def test_a_snapshot_on_s3_has_the_same_card(kitchen: Case, tmp_path: Path, s3_url: str) -> None:
-    made = dataset(tmp_path, s3_url)
-    try:
-        contents = contents_of_store(made.services.store, "kitchen", cache=tmp_path / "cache")
-        found = undrawn(contents)
-    finally:
-        made.services.close()
-    for part in ("quality", "table", "directions", "joints", "cells"):
-        assert found[part] == kitchen.card[part], part
 
 
 def test_a_dataset_without_a_snapshot_says_how_to_take_one(kitchen: Case) -> None:
