@@ -79,7 +79,6 @@ def main() -> None:
 
 
 def lifts(given: Any, hand: str, name: str, mesh: Path) -> dict[str, Any]:
-    """What comes of candidates."""
     made = on_table(given, hand, mesh, density=DENSITY)
     if given.keep:
         given.keep.mkdir(parents=True, exist_ok=True)

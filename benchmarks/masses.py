@@ -52,7 +52,6 @@ def main() -> None:
 
 
 def arguments(description: str | None, seed: int) -> argparse.ArgumentParser:
-    """Options of a table of hands and objects with their masses."""
     parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", type=Path)
     parser.add_argument("--hands", nargs="+", default=list(HANDS), choices=list(HANDS))
@@ -65,7 +64,6 @@ def arguments(description: str | None, seed: int) -> argparse.ArgumentParser:
 
 
 def masses(data: Path) -> dict[str, float]:
-    """Published masses of objects [kg]."""
     told = {meta.parent.name: json.loads(meta.read_text()) for meta in sorted((data / "objects").glob("*/meta.json"))}
     known = {name: meta.get("real", {}).get("mass_kg") for name, meta in told.items()}
     return {name: float(mass) for name, mass in known.items() if mass}
