@@ -39,6 +39,15 @@ Protocol = Literal["dexgraspbench", "displacement", "lift"]
 
 #: Contact threshold of the row's area, epsilon and volume: the paper's [m].
 THRESHOLD_M: Final = 0.005
+#: Keys of the row, and metrics of a grasp.
+COLUMNS: Final = {
+    "pd_mm": "penetration_depth_mm",
+    "spd_mm": "self_penetration_depth_mm",
+    "ca_cm2": "contact_area_cm2",
+    "iv_cm3": "intersection_volume_cm3",
+    "epsilon": "epsilon",
+    "wrench_volume": "wrench_volume",
+}
 #: Seed of the models around the nominal one, used by no job: so results do not confirm a job's own choice.
 MODELS_SEED: Final = 2**31
 
@@ -212,15 +221,7 @@ def _told(
 def _medians(case: Case, table: dict[str, NDArray[Any]], sd: NDArray[np.float64] | None) -> dict[str, Any]:
     probe = probe_of(case.hand, case.obj, hand_points=HAND_POINTS, object_points=OBJECT_POINTS)
     cdc = contact_distance_consistency_mm(case.hand, probe.body_distance(probe.measure(case.grasps.grasp)))
-    columns = {
-        "pd_mm": "penetration_depth_mm",
-        "spd_mm": "self_penetration_depth_mm",
-        "ca_cm2": "contact_area_cm2",
-        "iv_cm3": "intersection_volume_cm3",
-        "epsilon": "epsilon",
-        "wrench_volume": "wrench_volume",
-    }
-    row = {key: _median(table[f"quality/{name}"]) for key, name in columns.items()}
+    row = {key: _median(table[f"quality/{name}"]) for key, name in COLUMNS.items()}
     shares = explained_variance(case.grasps.grasp)
     apart = nearest(hand_points(case.hand, case.grasps.grasp))
     return row | {
@@ -240,7 +241,7 @@ def _plain(value: float) -> float:
 
 
 #: Numbers that are combined by medians over rows.
-_MEDIANS: Final = ("pd_mm", "spd_mm", "ca_cm2", "iv_cm3", "epsilon", "wrench_volume", "cdc_mm", "sd_cm", "diversity")
+_MEDIANS: Final = (*COLUMNS, "cdc_mm", "sd_cm", "diversity")
 
 
 def combine(rows: list[dict[str, Any]]) -> dict[str, Any]:

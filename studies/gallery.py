@@ -72,13 +72,8 @@ def _views(objects: Sequence[ObjectModel], device: str, seed: int) -> bytes:
         poses = drop(obj, count=1, seed=seed + k)["scene/object_pose"]
         rows.append(scene_cells(_seen(obj, poses, device, seed + k, Extras(channels=("normals",)), stereo=True)))
         names.append([obj.name])
-    return label_page(
-        rows,
-        _CHANNELS,
-        names,
-        title="What the cameras see",
-        subtitle="one scene per object; stereo pair with 60 mm baseline",
-    )
+    subtitle = "one scene per object; stereo pair with 60 mm baseline"
+    return label_page(rows, _CHANNELS, names, title="What the cameras see", subtitle=subtitle)
 
 
 def _hands(hands: Sequence[HandModel], objects: Sequence[ObjectModel], device: str, seed: int, say: Say) -> bytes:
@@ -94,13 +89,8 @@ def _hands(hands: Sequence[HandModel], objects: Sequence[ObjectModel], device: s
             below.append(f"{obj.name}: {kept} of {tried} fit")
         rows.append(cells)
         names.append(below)
-    return label_page(
-        rows,
-        [hand.name for hand in hands],
-        names,
-        title="Grasps on the table",
-        subtitle="a hand that stays clear of the table all the way; an object alone: none of those tried fits",
-    )
+    subtitle = "a hand that stays clear of the table all the way; an object alone: none of those tried fits"
+    return label_page(rows, [hand.name for hand in hands], names, title="Grasps on the table", subtitle=subtitle)
 
 
 def _fitting(hand: HandModel, obj: ObjectModel, device: str, seed: int) -> tuple[DrawnHand, Floats, int, int]:
@@ -157,13 +147,8 @@ def _neighbours(objects: Sequence[ObjectModel], device: str, seed: int) -> bytes
         rows.append(scene_cells(seen))
         hidden = float(np.asarray(seen["box/occlusion_ratio"])[0])
         names.append([f"{first.name}, {100 * hidden:.0f} % hidden"])
-    return label_page(
-        rows,
-        _CHANNELS,
-        names,
-        title="Several objects",
-        subtitle="labels 3, 4, ... are the neighbours; boxes are the grasped object's",
-    )
+    subtitle = "labels 3, 4, ... are the neighbours; boxes are the grasped object's"
+    return label_page(rows, _CHANNELS, names, title="Several objects", subtitle=subtitle)
 
 
 def _past(poses: Floats, obj: ObjectModel, beside: Neighbours) -> GivenCameras:

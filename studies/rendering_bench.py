@@ -59,17 +59,8 @@ def bench_render(obj: ObjectModel, *, width: int, height: int, device: str, repe
     extras = Extras(channels=EXTRA_CHANNELS)
 
     def whole() -> dict[str, NDArray[np.generic]]:
-        return render(
-            obj,
-            poses,
-            views=VIEWS,
-            stereo=False,
-            width=width,
-            height=height,
-            seed=0,
-            extras=extras,
-            run=ExecutionContext(device=device, threads=1),
-        )
+        size: dict[str, Any] = {"views": VIEWS, "stereo": False, "width": width, "height": height}
+        return render(obj, poses, seed=0, extras=extras, run=ExecutionContext(device, 1), **size)
 
     arrays = whole()
     timer = partial(_timed, clock=clock_of(device), repeats=repeats)

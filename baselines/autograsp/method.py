@@ -159,13 +159,7 @@ class HandCloser:
             along = wp.array(direction, dtype=wp.vec3)
         for _ in range(ADVANCES):
             self._measure()
-            wp.launch(
-                kernels.advance,
-                self.capacity,
-                inputs=[near, along, standoff, SHARE],
-                outputs=[active, self.data.pivot],
-                device=self.model.device,
-            )
+            self._launch(kernels.advance, (), [near, along, standoff, SHARE], [active, self.data.pivot])
             if not active.numpy().any():
                 break
         return self.data.state(n)
@@ -178,13 +172,8 @@ class HandCloser:
         self.stopped.assign(idle)
         for _ in range(STEPS):
             self._measure(fingers=True)
-            wp.launch(
-                kernels.close,
-                self.capacity,
-                inputs=[self.closing, self.near, self.pairs, TOUCH_M, SHARE, LARGEST],
-                outputs=[data.active, self.stopped, data.q],
-                device=data.device,
-            )
+            given = [self.closing, self.near, self.pairs, TOUCH_M, SHARE, LARGEST]
+            self._launch(kernels.close, (), given, [data.active, self.stopped, data.q])
             if not data.active.numpy().any():
                 break
         return ClosedHands(data.state(n), self.stopped.numpy()[:n].astype(np.int32))
@@ -196,31 +185,20 @@ class HandCloser:
         return self.near.numpy()[: len(state.pivot)].astype(float)
 
     def _measure(self, *, fingers: bool = False) -> None:
-        m, d, device = self.model, self.data, self.model.device
+        m, d = self.model, self.data
         self._poses.run()
-        pose = [d.body_p, d.body_q]
+        posed = [d.active, d.body_p, d.body_q]
         self.near.fill_(REACH_M)
         self.pairs.fill_(REACH_M)
-        wp.launch(
-            kernels.points_to_object,
-            (self.capacity, m.count),
-            inputs=[m.obj.surface, REACH_M, m.options.exact_below, m.point_body, m.point_position, d.active, *pose],
-            outputs=[self.near],
-            device=device,
-        )
-        shape = (self.capacity, m.pieces)
-        wp.launch(
-            kernels.object_to_pieces,
-            shape,
-            inputs=[m.hand.pieces, m.obj.bvh.id, m.obj.samples, d.active, *pose, MARGIN_M],
-            outputs=[self.near],
-            device=device,
-        )
+        surface = [m.obj.surface, REACH_M, m.options.exact_below]
+        points = [*surface, m.point_body, m.point_position, *posed]
+        self._launch(kernels.points_to_object, (m.count,), points, [self.near])
+        samples = [m.hand.pieces, m.obj.bvh.id, m.obj.samples, *posed, MARGIN_M]
+        self._launch(kernels.object_to_pieces, (m.pieces,), samples, [self.near])
         if fingers:
-            wp.launch(
-                kernels.bodies_to_pieces,
-                shape,
-                inputs=[m.hand.pieces, m.body_points, d.active, *pose, MARGIN_M],
-                outputs=[self.pairs],
-                device=device,
-            )
+            bodies = [m.hand.pieces, m.body_points, *posed, MARGIN_M]
+            self._launch(kernels.bodies_to_pieces, (m.pieces,), bodies, [self.pairs])
+
+    def _launch(self, kernel: Any, dims: tuple[int, ...], inputs: list[Any], outputs: list[Any]) -> None:
+        """Launch over the hands, and over further dimensions."""
+        wp.launch(kernel, (self.capacity, *dims), inputs=inputs, outputs=outputs, device=self.model.device)

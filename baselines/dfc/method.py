@@ -184,35 +184,21 @@ class Descent:
     def _record(self) -> Launches:
         s, m, n, out = self.proposal, self.model, self.n, Launches(self.device)
         pose, own = [s.body_p, s.body_q], [self.new_terms, s.wrench]
-        out.add(
-            kernels.propose,
-            n,
-            inputs=[len(self.candidates), s.iteration, self.gradient, *self.state, self.contact],
-            outputs=[self.rng, self.moment, *self._proposed(), self.new_contact, self.new_terms],
-        )
+        present = [*self.state, self.contact]
+        proposed = [*self._proposed(), self.new_contact]
+        given = [len(self.candidates), s.iteration, self.gradient, *present]
+        out.add(kernels.propose, n, inputs=given, outputs=[self.rng, self.moment, *proposed, self.new_terms])
         add_poses(out, m, s)
-        out.add(
-            kernels.force_closure,
-            n,
-            inputs=[self.obj.surface, self.candidate_body, self.candidate_position, self.new_contact, *pose],
-            outputs=own,
-        )
-        out.add(
-            kernels.penetration,
-            (n, m.pieces),
-            inputs=[m.hand.pieces, self.obj.bvh.id, self.obj.samples, *pose],
-            outputs=own,
-        )
+        contacts = [self.candidate_body, self.candidate_position, self.new_contact]
+        out.add(kernels.force_closure, n, inputs=[self.obj.surface, *contacts, *pose], outputs=own)
+        samples = [m.hand.pieces, self.obj.bvh.id, self.obj.samples]
+        out.add(kernels.penetration, (n, m.pieces), inputs=[*samples, *pose], outputs=own)
         if self.pairs:
             out.add(kernels.self_penetration, (n, self.pairs), inputs=[*self.keys, *pose], outputs=own)
         add_root_gradient(out, m, s)
         out.add(kernels.limits, n, inputs=[m.hand.lower, m.hand.upper, s.q], outputs=[self.new_terms, s.gradient])
-        out.add(
-            kernels.accept,
-            n,
-            inputs=[s.iteration, self.new_terms, s.gradient, *self._proposed(), self.new_contact],
-            outputs=[self.rng, self.terms, self.gradient, *self.state, self.contact, self.taken],
-        )
+        kept = [self.rng, self.terms, self.gradient, *present, self.taken]
+        out.add(kernels.accept, n, inputs=[s.iteration, self.new_terms, s.gradient, *proposed], outputs=kept)
         out.add(optimizers.advance, 1, inputs=[], outputs=[s.iteration])
         return out
 

@@ -159,19 +159,12 @@ def flow(network: ProposalNetwork, noise: Floats32, condition: Floats32) -> Floa
 
 def encode(proposals: Proposals, anchor: ArrayLike) -> Floats:
     """Return grasp rows (n, D), not standardised: input of `decode`, and training target."""
+    position = proposals.hand_pose[:, :3] - np.asarray(anchor, float)
     rotation = quat_to_matrix(proposals.hand_pose[:, 3:])
-    return np.concatenate(
-        [
-            proposals.hand_pose[:, :3] - np.asarray(anchor, float),
-            rotation[:, :, 0],
-            rotation[:, :, 1],
-            proposals.approach,
-            proposals.joints,
-            proposals.pregrasp - proposals.joints,
-            proposals.squeeze - proposals.joints,
-        ],
-        axis=1,
-    )
+    joints = proposals.joints
+    opened, pressed = proposals.pregrasp - joints, proposals.squeeze - joints
+    parts = [position, rotation[:, :, 0], rotation[:, :, 1], proposals.approach, joints, opened, pressed]
+    return np.concatenate(parts, axis=1)
 
 
 def decode(rows: ArrayLike, anchor: ArrayLike) -> Proposals:

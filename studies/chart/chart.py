@@ -15,7 +15,8 @@ from graspd.service.model.fidelity import FIDELITIES
 from graspd.service.model.version import PACKAGE_VERSION
 from graspd.studies.bench import device_name
 from graspd.studies.chart.statistics import figures, plain, summed
-from graspd.studies.chart.trials import FRICTION, THRESHOLD_M, Rollout, Setting
+from graspd.studies.chart.trials import FRICTION, Rollout, Setting
+from graspd.studies.evaluation import THRESHOLD_M
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel

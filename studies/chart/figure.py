@@ -104,17 +104,8 @@ def _over_speed(
     known = [row for row in rows if row[key] is not None]
     labels = _panel(axes, known, styles, x=SPEED, y=key, label=label)
     front = sorted((row for row in known if key in row["front"] and row[SPEED]), key=lambda row: row[SPEED])
-    axes.step(
-        [row[SPEED] for row in front],
-        [row[key] for row in front],
-        where="pre",
-        color=INK,
-        linewidth=1,
-        linestyle="--",
-        alpha=0.6,
-        zorder=1,
-        label="Pareto front",
-    )
+    style = {"color": INK, "linewidth": 1, "linestyle": "--", "alpha": 0.6, "zorder": 1, "label": "Pareto front"}
+    axes.step([row[SPEED] for row in front], [row[key] for row in front], where="pre", **style)
     axes.set_xlabel(words)
     axes.set_title(title, loc="left", fontsize=11)
     if key in OF_ONE:
@@ -170,21 +161,11 @@ def _panel(
         }
         if none:
             bars |= {"xerr": [[0.55 * at], [0.0]], "xuplims": True}
-        axes.errorbar(
-            at,
-            row[y],
-            **bars,
-            fmt=marker,
-            color=colour,
-            ecolor=colour,
-            elinewidth=1,
-            capsize=2,
-            markersize=7,
-            markeredgecolor=colour if none else "white",
-            markerfacecolor="white" if none else colour,
-            label=None if row["method"] in shown else row["method"],
-            zorder=3,
-        )
+        edge, face = (colour, "white") if none else ("white", colour)
+        bars |= {"ecolor": colour, "elinewidth": 1, "capsize": 2}
+        bars |= {"fmt": marker, "markersize": 7, "markeredgecolor": edge, "markerfacecolor": face}
+        name = None if row["method"] in shown else row["method"]
+        axes.errorbar(at, row[y], **bars, color=colour, label=name, zorder=3)
         shown.add(row["method"])
         text = (label or _label)(row, rows)
         words = ", ".join(filter(None, (text, f"0 of {row['grasps']}" * none)))
@@ -248,17 +229,9 @@ def draw_sweeps(rows: Sequence[Row], file: Path) -> None:
         own = sorted((r for r in rows if r["knob"] == knob), key=lambda r: r["speedup"])
         axes.plot([r["speedup"] for r in own], [r["gsr"] for r in own], color=COLOURS[0], alpha=0.4)
         for row in own:
-            axes.errorbar(
-                row["speedup"],
-                row["gsr"],
-                yerr=_error(row, "gsr"),
-                fmt="o",
-                color=COLOURS[0],
-                capsize=2,
-                elinewidth=1,
-                markerfacecolor=COLOURS[0] if row["default"] else "white",
-                markersize=6,
-            )
+            face = COLOURS[0] if row["default"] else "white"
+            style = {"fmt": "o", "color": COLOURS[0], "markerfacecolor": face, "markersize": 6}
+            axes.errorbar(row["speedup"], row["gsr"], yerr=_error(row, "gsr"), capsize=2, elinewidth=1, **style)
             labels.append(Label(axes, row["speedup"], row["gsr"], str(row["value"]), INK, y_bar=_ends(row, "gsr")))
         axes.set_title(knob, loc="left", fontsize=10)
         axes.set_ylim(0, 1.05)
@@ -366,20 +339,10 @@ def _write(axes: Any, label: Label, point: Boxes, box: Boxes, pixels: float, *, 
 
     offset = (box[:2] - point) / pixels
     line = {"arrowstyle": "-", "color": label.colour, "linewidth": 0.6, "alpha": 0.7, "shrinkA": 0, "shrinkB": 4}
-    note = axes.annotate(
-        label.text,
-        (label.x, label.y),
-        xytext=offset,
-        textcoords="offset points",
-        fontsize=SIZE_PT,
-        color=label.colour,
-        ha="left",
-        va="bottom",
-        zorder=4,
-        arrowprops=line if led else None,
-        annotation_clip=False,
-        path_effects=[withStroke(linewidth=2, foreground="white")],
-    )
+    style = {"fontsize": SIZE_PT, "color": label.colour, "ha": "left", "va": "bottom", "zorder": 4}
+    style |= {"arrowprops": line if led else None, "path_effects": [withStroke(linewidth=2, foreground="white")]}
+    place = {"xytext": offset, "textcoords": "offset points", "annotation_clip": False}
+    note = axes.annotate(label.text, (label.x, label.y), **place, **style)
     # The layout was computed without it: a label must not move the panels below the others.
     note.set_in_layout(False)
     return note

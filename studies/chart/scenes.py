@@ -218,15 +218,9 @@ class ValidatedGrasps:
         For lifted grasps, it also sums the shares of models in which they are lifted.
         """
         lifted = self.lifted
-        shares = robust(
-            self.hand,
-            self.place.true,
-            self.grasps.take(lifted),
-            placed=self.placed.take(lifted),
-            models=models,
-            seed=MODELS_SEED,
-            pieces=self.place.pieces,
-        ).share
+        grasps, placed = self.grasps.take(lifted), self.placed.take(lifted)
+        given: dict[str, Any] = {"models": models, "seed": MODELS_SEED, "pieces": self.place.pieces}
+        shares = robust(self.hand, self.place.true, grasps, placed=placed, **given).share
         return {
             "clear_count": len(self.clear),
             "lift_count": len(lifted),

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from graspd.service.model.fidelity import Fidelity
 from graspd.service.model.transforms import Floats
 from graspd.studies.bench import clock_of
+from graspd.studies.evaluation import COLUMNS, THRESHOLD_M
 from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
 from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.model import HandModel
@@ -28,8 +29,7 @@ from graspd.worker.validation.displacement import simulated_displacement_cm
 from graspd.worker.validation.robust import robust
 from graspd.worker.validation.validator import validate
 
-#: Contact threshold and Coulomb coefficient of area, epsilon and wrench volume: the paper's.
-THRESHOLD_M: Final = 0.005
+#: Coulomb coefficient of epsilon and wrench volume: the paper's.
 FRICTION: Final = 1.0
 #: A seed that no setting was tuned with; repeats take the next ones.
 SEED: Final = 4711
@@ -38,15 +38,6 @@ WARM_SEED: Final = 1
 MODELS_SEED: Final = 2**31 + 1
 #: Grasps per object in the paper's table 2: the best by epsilon.
 BEST: Final = 10
-#: Stored columns of every grasp.
-COLUMNS: Final = {
-    "epsilon": "epsilon",
-    "pd_mm": "penetration_depth_mm",
-    "spd_mm": "self_penetration_depth_mm",
-    "ca_cm2": "contact_area_cm2",
-    "iv_cm3": "intersection_volume_cm3",
-    "wrench_volume": "wrench_volume",
-}
 
 
 Make = Callable[[HandModel, ObjectModel, int, int], GraspSet]
