@@ -77,17 +77,11 @@ def joined(states: list[HandState]) -> HandState:
 
 def grasp_set(pair: Pair, state: HandState, began: float, info: dict[str, object]) -> GraspSet:
     """Return hands as grasps with their postures; `began` is the planner's start by `time.perf_counter`."""
-    hand, obj = pair.hand.model, pair.fine.obj.model
+    hand, obj, device = pair.hand.model, pair.fine.obj.model, pair.hand.device
     seconds = time.perf_counter() - began
     grasp = posture_of(hand, obj, state)
-    return GraspSet(
-        grasp=grasp,
-        pregrasp=pregrasp(hand, obj, grasp, device=pair.hand.device),
-        squeeze=squeeze(hand, obj, grasp, device=pair.hand.device),
-        stability_loss=np.full(len(grasp), np.nan),
-        seconds=seconds,
-        info=info,
-    )
+    opened, pressed = (pose(hand, obj, grasp, device=device) for pose in (pregrasp, squeeze))
+    return GraspSet(grasp, opened, pressed, np.full(len(grasp), np.nan), seconds=seconds, info=info)
 
 
 #: Inner side: when the fingers close, the surface moves within 45 degrees of its normal; on the palm it faces ahead.

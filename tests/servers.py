@@ -90,14 +90,8 @@ class Server:
     def _run(self, command: Sequence[str], ready: Callable[[], object], **options: Any) -> None:
         if self._log is None:
             self._log = (self.folder / "log").open("ab")
-        self.process = subprocess.Popen(
-            command,
-            stdout=self._log,
-            stderr=subprocess.STDOUT,
-            start_new_session=True,
-            preexec_fn=_die_with_parent,
-            **options,
-        )
+        options |= {"stdout": self._log, "stderr": subprocess.STDOUT, "start_new_session": True}
+        self.process = subprocess.Popen(command, preexec_fn=_die_with_parent, **options)
         deadline = time.monotonic() + _START_S
         while True:
             try:

@@ -208,14 +208,10 @@ def distance_grid(obj: DeviceObject, cells: int) -> Any:
         out.field = wp.zeros((0, 0, 0), dtype=wp.float32)
 
     def slab(first: int, last: int) -> None:
-        corner = low + np.array([first * cell, 0.0, 0.0])
+        corner, dim = low + np.array([first * cell, 0.0, 0.0]), (last - first, shape[1], shape[2])
+        given = [out, wp.vec3(*corner), cell, reach]
         with wp.ScopedDevice(device):
-            wp.launch(
-                surface.sample_field,
-                dim=(last - first, shape[1], shape[2]),
-                inputs=[out, wp.vec3(*corner), cell, reach],
-                outputs=[field[first:last]],
-            )
+            wp.launch(surface.sample_field, dim, inputs=given, outputs=[field[first:last]])
 
     threads = 1 if wp.get_device(device).is_cuda else available_cores()
     bounds = np.linspace(0, shape[0], 4 * threads + 1).astype(int)

@@ -97,10 +97,8 @@ class Search:
                 raise InputError(f"{self.hand.name} finds no free place around {self.pair.fine.obj.model.name}")
             tell(0, "starts")
             begun, done = state.numpy(), 0
-            given, found = (
-                [self.problem, ROUNDS, steps, ALIKE],
-                [counter, rng, state, energy, best, best_energy, *scratch],
-            )
+            given = [self.problem, ROUNDS, steps, ALIKE]
+            found = [counter, rng, state, energy, best, best_energy, *scratch]
             for _ in range(0, max(0, PATIENCE * (steps - FIRST_STEP)), ROUNDS):
                 wp.launch(kernels.anneal, chains, inputs=given, outputs=found)
                 now = int((counter.numpy() - FIRST_STEP).sum())

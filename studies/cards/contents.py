@@ -118,11 +118,8 @@ def with_provenance(contents: Contents, file: Path) -> Contents:
         raise InputError(f"{file} cannot be read: {error.strerror}") from None
     except (ValueError, AttributeError, TypeError):
         raise InputError(f'{file} is not as {{"objects": {{"mug": {{"licence": "...", "source": "..."}}}}}}') from None
-    return replace(
-        contents,
-        hands=_informed(contents.hands, groups["hands"], file),
-        objects=_informed(contents.objects, groups["objects"], file),
-    )
+    hands, objects = (_informed(getattr(contents, kind), said, file) for kind, said in groups.items())
+    return replace(contents, hands=hands, objects=objects)
 
 
 def _informed(

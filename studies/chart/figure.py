@@ -341,8 +341,8 @@ def _write(axes: Any, label: Label, point: Boxes, box: Boxes, pixels: float, *, 
     line = {"arrowstyle": "-", "color": label.colour, "linewidth": 0.6, "alpha": 0.7, "shrinkA": 0, "shrinkB": 4}
     style = {"fontsize": SIZE_PT, "color": label.colour, "ha": "left", "va": "bottom", "zorder": 4}
     style |= {"arrowprops": line if led else None, "path_effects": [withStroke(linewidth=2, foreground="white")]}
-    place = {"xytext": offset, "textcoords": "offset points", "annotation_clip": False}
-    note = axes.annotate(label.text, (label.x, label.y), **place, **style)
+    where = {"xytext": offset, "textcoords": "offset points", "annotation_clip": False}
+    note = axes.annotate(label.text, (label.x, label.y), **where, **style)
     # The layout was computed without it: a label must not move the panels below the others.
     note.set_in_layout(False)
     return note

@@ -65,14 +65,8 @@ def contacts_of(points: Floats, centre: Floats) -> Contacts:
 
 
 def ball_world(dt: float, speed: float) -> World:
-    inertia = 0.4 * RADIUS_M**2 * np.eye(3)
-    return World(
-        inertia=inertia,
-        gyration=math.sqrt(0.4) * RADIUS_M,
-        friction=FRICTION,
-        stiffness=1.0,
-        step=max(dt * speed, 1e-9),
-    )
+    inertia, gyration = 0.4 * RADIUS_M**2 * np.eye(3), math.sqrt(0.4) * RADIUS_M
+    return World(inertia, gyration=gyration, friction=FRICTION, stiffness=1.0, step=max(dt * speed, 1e-9))
 
 
 def position_based(solver: Solver, *, dt: float, speed: float) -> tuple[float, float]:
