@@ -32,12 +32,9 @@ def findings(card: Row) -> list[str]:
 
 
 def _snapshot(card: Row) -> str:
-    taken = card["snapshot"]
-    return (
-        "**Not complete**: the snapshot was taken before every cell had succeeded."
-        if taken and not taken["complete"]
-        else ""
-    )
+    if not card["snapshot"] or card["snapshot"]["complete"]:
+        return ""
+    return "**Not complete**: the snapshot was taken before every cell had succeeded."
 
 
 def _gaps(card: Row) -> list[str]:

@@ -63,35 +63,23 @@ def turns(quick: bool = False, knobs: Sequence[str] = ()) -> list[KnobValue]:
         InputError: a name is not a knob.
     """
 
-    def knob(name: str, text: str, **values: Sequence[Any]) -> list[KnobValue]:
-        changes = [dict(zip(values, row, strict=True)) for row in zip(*values.values(), strict=True)]
-        return [KnobValue(name, text.format(**one), DEFAULT.model_copy(update=one)) for one in changes]
+    def knob(name: str, between: str, **values: Sequence[Any]) -> list[KnobValue]:
+        rows = zip(*values.values(), strict=True)
+        return [
+            KnobValue(name, between.join(map(str, row)), DEFAULT.model_copy(update=dict(zip(values, row, strict=True))))
+            for row in rows
+        ]
 
-    errors = (0, 1e-4, 3e-4, 1e-3, 3e-3)
-    found = [
-        *knob(
-            "hand points",
-            "{coarse_points}, {fine_points}",
-            coarse_points=(64, 128, 256, 512),
-            fine_points=(500, 1000, 2000, 4000),
-        ),
-        *(
-            KnobValue("face error bound, mm", f"{1e3 * e:g}", DEFAULT.model_copy(update={"face_error_m": e}))
-            for e in errors
-        ),
-        *knob(
-            "iterations",
-            "{coarse_iterations} + {fine_iterations}",
-            coarse_iterations=(25, 50, 100, 200),
-            fine_iterations=(10, 20, 40, 80),
-        ),
-        *knob("starts, finalists", "{starts}, {finalists}", starts=(1, 2, 4, 8), finalists=(1, 1, 2, 4)),
-        *knob("contact solver", "{contact_solver}", contact_solver=("direct", "jacobi", "gauss_seidel")),
-    ]
-    passes = LossOptions().passes
-    found += [
-        KnobValue("solver passes", str(n), change=None if n == passes else _options(passes=n)) for n in (1, 2, 4, 8)
-    ]
+    found = knob("hand points", ", ", coarse_points=(64, 128, 256, 512), fine_points=(500, 1000, 2000, 4000))
+    for error in (0, 1e-4, 3e-4, 1e-3, 3e-3):
+        changed = DEFAULT.model_copy(update={"face_error_m": error})
+        found.append(KnobValue("face error bound, mm", f"{1e3 * error:g}", changed))
+    found += knob("iterations", " + ", coarse_iterations=(25, 50, 100, 200), fine_iterations=(10, 20, 40, 80))
+    found += knob("starts, finalists", ", ", starts=(1, 2, 4, 8), finalists=(1, 1, 2, 4))
+    found += knob("contact solver", "", contact_solver=("direct", "jacobi", "gauss_seidel"))
+    for passes in (1, 2, 4, 8):
+        change = None if passes == LossOptions().passes else _options(passes=passes)
+        found.append(KnobValue("solver passes", str(passes), change=change))
     found += [KnobValue("queries", "shared"), KnobValue("queries", "one per velocity", change=asking_each)]
     found += [
         KnobValue("culling", "grid and band"),
@@ -142,10 +130,8 @@ def sweep(
     for turn in turns(quick, knobs):
         found = base if turn.default else figures(cells[turn.knob, turn.value])
         faster = found["grasps_per_second"] / base["grasps_per_second"]
-        rows.append(
-            {"knob": turn.knob, "value": turn.value, "default": turn.default, "hand": hand.name, "object": thing.name}
-            | {"speedup": plain(faster), **found}
-        )
+        row = {"knob": turn.knob, "value": turn.value, "default": turn.default, "hand": hand.name, "object": thing.name}
+        rows.append(row | {"speedup": plain(faster), **found})
         say(f"{turn.knob:22s} {turn.value:18s} x {faster:5.2f}  GSR {found['gsr']:.2f}  PD {found['pd_mm']:.2f} mm")
     return rows
 
