@@ -10,7 +10,7 @@ import threading
 import time
 from collections.abc import Callable
 from types import ModuleType
-from typing import Final, Generic, TypeVar
+from typing import Any, Final, TypeVar
 
 import numpy as np
 import warp as wp
@@ -36,25 +36,18 @@ T = TypeVar("T")
 GROUND: Final = Fidelity(
     name="peers", coarse_points=400, fine_points=1000, object_points=4000, polish_iterations=0, phong_alpha=0.0
 )
-_lock = threading.Lock()
+_searches: Final[LRUCache[tuple[object, ...], Any]] = LRUCache(8)
+_lock: Final = threading.Lock()
 
 
-class PairCache(Generic[T]):
-    """Cache of values that a method computes once per pair and options, for the most recent pairs."""
-
-    def __init__(self, make: Callable[..., T], size: int = 4) -> None:
-        self._make = make
-        self._found: LRUCache[tuple[object, ...], tuple[Pair, T]] = LRUCache(size)
-        self._lock = threading.Lock()
-
-    def __call__(self, pair: Pair, *options: object) -> T:
-        """Return `make(pair, *options)`, cached if recently used."""
-        key = (id(pair), *options)
-        with self._lock:
-            if key not in self._found:
-                # The cached reference to the pair prevents reuse of its id.
-                self._found[key] = (pair, self._make(pair, *options))
-            return self._found[key][1]
+def search_of(make: Callable[..., T], pair: Pair, *options: object) -> T:
+    """Return `make(pair, *options)`, which a method computes once; the most recent ones are cached."""
+    key = (make, id(pair), *options)
+    with _lock:
+        if key not in _searches:
+            # The cached reference to the pair prevents reuse of its id.
+            _searches[key] = (pair, make(pair, *options))
+        return _searches[key][1]
 
 
 def ground_of(hand: HandModel, obj: ObjectModel, device: str, *kernels: ModuleType) -> Pair:
@@ -71,26 +64,24 @@ def free_starts(pair: Pair, *, seed: int, batch: int, indices: range) -> HandSta
     return sample_starts(pair.model(pair.coarse), seed=seed, batch=batch, indices=indices, each=1)
 
 
+def frame_along(z: Floats) -> Floats:
+    """Return a rotation matrix whose third column is `z`."""
+    x = np.cross(np.eye(3)[int(np.argmin(np.abs(z)))], z)
+    x /= np.linalg.norm(x)
+    return np.column_stack([x, np.cross(z, x), z])
+
+
 def joined(states: list[HandState]) -> HandState:
-    """Concatenate the hands of all parts of a batch, in order."""
     return HandState(*(np.concatenate([getattr(s, name) for s in states]) for name in ("pivot", "rotation", "q")))
 
 
-def grasp_set(
-    pair: Pair, state: HandState, began: float, info: dict[str, object], loss: Floats | None = None
-) -> GraspSet:
+def grasp_set(pair: Pair, state: HandState, began: float, info: dict[str, object]) -> GraspSet:
     """Return hands as grasps with their postures; `began` is the planner's start by `time.perf_counter`."""
-    hand, obj = pair.hand.model, pair.fine.obj.model
+    hand, obj, device = pair.hand.model, pair.fine.obj.model, pair.hand.device
     seconds = time.perf_counter() - began
     grasp = posture_of(hand, obj, state)
-    return GraspSet(
-        grasp=grasp,
-        pregrasp=pregrasp(hand, obj, grasp, device=pair.hand.device),
-        squeeze=squeeze(hand, obj, grasp, device=pair.hand.device),
-        stability_loss=np.full(len(grasp), np.nan) if loss is None else loss,
-        seconds=seconds,
-        info=info,
-    )
+    opened, pressed = (pose(hand, obj, grasp, device=device) for pose in (pregrasp, squeeze))
+    return GraspSet(grasp, opened, pressed, np.full(len(grasp), np.nan), seconds=seconds, info=info)
 
 
 #: Inner side: when the fingers close, the surface moves within 45 degrees of its normal; on the palm it faces ahead.
@@ -114,7 +105,6 @@ def inside_points(hand: HandModel, *, each: int, on_palm: int) -> SurfacePoints:
 
 
 def _inside(hand: HandModel, points: SurfacePoints) -> NDArray[np.bool_]:
-    """Return (N,) whether a point lies on the inner side of its link."""
     before, after = (_posed(hand, points, hand.preshape + t * hand.closing) for t in (0.0, STEP))
     motion = after[0] - before[0]
     speed = np.linalg.norm(motion, axis=1)

@@ -164,7 +164,6 @@ def compare_services(given: argparse.Namespace) -> dict[str, Any]:
 
 
 def compare_stages(given: argparse.Namespace) -> dict[str, Any]:
-    """The stages of all pairs, of both checkouts."""
     found: dict[str, Any] = {}
     for number, pair in enumerate(given.pairs):
         hand, obj = pair.split(":")

@@ -41,7 +41,6 @@ TITLES = ("target", "scene", "neighbours", "gap, mm", "valid", "candidates", "cl
 
 
 def study(hand: HandModel, obj: ObjectModel, others: list[ObjectModel], scene: int, seconds: float) -> dict[str, Any]:
-    """The numbers of one scene."""
     spec = SceneSpec(kind="table", neighbours=tuple({"object": other.name} for other in others))  # type: ignore[arg-type]
     scenes, poses = scenes_of(spec, obj, others, count=scene + 1, seed=SEED)
     things = [neighbour_of(obj), *scenes.neighbours]

@@ -123,7 +123,6 @@ def head(title: str, names: Sequence[str]) -> list[str]:
 
 
 def row(name: str, values: Sequence[float]) -> str:
-    """A line of it; the quotient is the first checkout's value over the last one's."""
     cells = [name, *(f"{value:.2f}" for value in values)]
     if len(values) > 1:
         cells.append(f"{values[0] / values[-1]:.2f}" if values[-1] > 0 else "")
@@ -131,7 +130,6 @@ def row(name: str, values: Sequence[float]) -> str:
 
 
 def table(title: str, found: Mapping[str, list[dict[str, float]]]) -> list[str]:
-    """Medians of each part."""
     parts = next(iter(found.values()))[0]
     rows = [row(part, [median(run[part] for run in runs) for runs in found.values()]) for part in parts]
     return [*head(title, list(found)), *rows, ""]

@@ -82,8 +82,6 @@ for name, module in sorted({row[0]: row[1] for row in graspd.COMMANDS}.items()):
 
 @dataclass(frozen=True)
 class Checkout:
-    """A checkout, and the folder for what it makes."""
-
     root: Path
     work: Path
 
@@ -133,7 +131,6 @@ def document_differences(before: Any, after: Any, at: str = "") -> tuple[list[st
 
 
 def text_differences(before: str, after: str) -> list[str]:
-    """Lines that only one of two texts has."""
     a, b = before.splitlines(), after.splitlines()
     found = [f"- {line}" for line in a if line not in b] + [f"+ {line}" for line in b if line not in a]
     return found or ([] if a == b else ["the same lines in another order"])
@@ -175,7 +172,6 @@ def compare_interfaces(before: Checkout, after: Checkout, report: Report) -> Non
 
 
 def compare_synth(before: Checkout, after: Checkout, methods: list[str], report: Report) -> None:
-    """Shards of each method for each built-in hand on the mug."""
     hands = sorted(path.name for path in (before.root / "service/builtin/hands").iterdir() if path.is_dir())
     for method in methods:
         for hand in hands:

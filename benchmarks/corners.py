@@ -46,7 +46,6 @@ of gaps narrower than a fingertip (Allegro 24 mm, Barrett 19 mm, Shadow 15 mm) o
 
 
 def place_of(name: str, gap: float, mesh: str) -> SceneSpec:
-    """The scene with this gap [m]."""
     upright, supports, others = (1.0, 0.0, 0.0, 0.0), [HalfSpace()], []
     for x, y in PLACES[name]:
         if name == "neighbours":

@@ -28,8 +28,6 @@ _SIZES: Final = {"base_bytes_per_grasp": ("base", "N"), "scene_bytes": ("scene",
 
 @dataclass(frozen=True)
 class Work:
-    """What is to be made."""
-
     grasps: int
     """Grasps in the dataset; valid ones, as jobs give them by default."""
     days: float = 7.0
@@ -112,8 +110,6 @@ class Prices:
 
 @dataclass(frozen=True)
 class Estimate:
-    """What it takes."""
-
     grasps: int
     batches: int
     tasks: int
@@ -206,7 +202,6 @@ def estimate(work: Work, measured: Measured, prices: Prices, *, cores_per_worker
 
 
 def gpu_hours(work: Work, grasps_per_second: float) -> float:
-    """Hours of one GPU for the synthesis alone, at a rate measured on that GPU: `graspd bench --device cuda:0`."""
     return work.grasps / grasps_per_second / 3600
 
 
@@ -229,7 +224,6 @@ def sizes(data: Path) -> dict[str, float]:
 
 
 def table(estimates: Sequence[Estimate]) -> str:
-    """Markdown, one column a dataset."""
     head = ["what", *(f"{item.grasps:,} grasps" for item in estimates)]
     lines = [f"| {' | '.join(head)} |", f"| --- |{' --: |' * len(estimates)}"]
     for field in dataclasses.fields(Estimate)[1:]:
@@ -245,7 +239,6 @@ def _shown(value: float) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Print the table, or JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--grasps", type=int, action="append")
     parser.add_argument("--cores-per-worker", type=int, default=4)

@@ -36,7 +36,6 @@ _CHROMIUM = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftsh
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data-dir", type=Path, required=True)
     parser.add_argument("--repeats", type=int, default=20)
@@ -59,7 +58,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def say(line: str) -> None:
-    """Print a line at once."""
     sys.stdout.write(line + "\n")
     sys.stdout.flush()
 
@@ -113,7 +111,6 @@ def first_paints(address: str, paths: Sequence[str]) -> dict[str, float]:
 
 @contextmanager
 def serving(settings: Settings, services: Services) -> Iterator[str]:
-    """The application on a free port of this machine."""
     listener = bind("127.0.0.1", 0)
     app = create_app(settings, services)
     server = uvicorn.Server(uvicorn.Config(app, log_level="warning", timeout_graceful_shutdown=1))

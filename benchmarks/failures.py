@@ -66,7 +66,6 @@ def found_out(cell: Cell) -> dict[str, Any]:
 
 
 def kind(reason: str) -> str:
-    """A reason without its direction."""
     words = {"displaced": "slips", "rotated": "turns", "lost while closing": "lost while closing"}
     return next((word for start, word in words.items() if reason.startswith(start)), reason)
 
@@ -117,7 +116,6 @@ def chosen(found: dict[str, Any]) -> list[int]:
 
 
 def picture(cell: Cell, found: dict[str, Any], file: Path) -> None:
-    """Some grasps at the moment of contact, with what became of them."""
     rows = chosen(found)
     grasp = cell.grasps.grasp.take(np.array(rows))
     drawn = grasp_pictures(cell.hand, cell.obj, grasp.hand_pose, grasp.joint_positions, (EDGE, EDGE), samples=8)[:, 0]

@@ -18,10 +18,8 @@ import numpy as np
 import trimesh
 
 from benchmarks.cells import HANDS
-from graspd.service.model.domain import JobOptions
-from graspd.service.model.scene_spec import parse_scene
+from benchmarks.masses import on_table
 from graspd.service.store.shards import write_shard
-from graspd.worker.files.synthesis import synthesized
 
 #: Not a seed that any setting was chosen with.
 SEED = 1300
@@ -81,19 +79,7 @@ def main() -> None:
 
 
 def lifts(given: Any, hand: str, name: str, mesh: Path) -> dict[str, Any]:
-    """What comes of candidates."""
-    request = JobOptions(
-        grasps=given.grasps,
-        want="candidates",
-        rechecks=0,
-        seed=given.seed,
-        scene="table",
-        scenes=given.scenes,
-        density=DENSITY,
-    )
-    made = synthesized(
-        str(given.data / "hands" / HANDS[hand]), str(mesh), request, place=parse_scene("table"), scenes=given.scenes
-    )
+    made = on_table(given, hand, mesh, density=DENSITY)
     if given.keep:
         given.keep.mkdir(parents=True, exist_ok=True)
         kept = given.keep / f"{hand}-{name}.h5"

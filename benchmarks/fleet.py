@@ -52,8 +52,6 @@ _PATIENCE_S: Final = 240.0
 
 @dataclass(frozen=True)
 class Result:
-    """What one number of workers came to."""
-
     workers: int
     lag_s: float
     """Age of the oldest event that was not in the index: 95th of 100 looks."""
@@ -84,7 +82,6 @@ class Machine:
         return self.services.queue
 
     def submit(self, tasks: int) -> None:
-        """Jobs of so many tasks in all."""
         while tasks > 0:
             some = min(tasks, _BATCHES_A_JOB)
             self._seed += 1
@@ -167,7 +164,6 @@ def environment(settings: Settings) -> dict[str, str]:
 
 
 def measure(workers: int, given: argparse.Namespace) -> Result:
-    """Both runs with one number of workers."""
     with machine(sqlite=given.sqlite, s3=given.s3) as at:
         task_s = workers / given.rate
         at.submit(workers + int(given.rate * (given.seconds + task_s + 30)))

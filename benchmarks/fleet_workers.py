@@ -45,8 +45,6 @@ _QUEUES: Final = tuple(queue_name(priority, Stage.SYNTHESIZE) for priority in Pr
 
 @dataclass
 class Held:
-    """A task in hand."""
-
     worker: str
     message: dict[str, Any]
     queue: str
@@ -78,7 +76,6 @@ class Fleet:
         self._first = True
 
     def tick(self) -> None:
-        """All that is due."""
         now = time.monotonic()
         with self._connection.pipeline(transaction=False) as pipe:
             self._end_due(pipe, now)
@@ -162,7 +159,6 @@ class Fleet:
         put_event(pipe, event)
 
     def _publish(self, message: dict[str, Any]) -> None:
-        """Put the manifest of a task's shard."""
         self._store.put(names.shard_manifest(Stage.SYNTHESIZE, message["output"]), self._manifest(message).encode())
 
     def _manifest(self, message: dict[str, Any]) -> str:

@@ -77,7 +77,6 @@ class Upstream:
 
 
 def matrices(poses: np.ndarray) -> np.ndarray:
-    """(N, 4, 4) of poses (N, 7)."""
     found = np.array([trimesh.transformations.quaternion_matrix(pose[3:]) for pose in poses])
     found[:, :3, 3] = poses[:, :3]
     return found
@@ -128,7 +127,6 @@ def meets(a: trimesh.Trimesh, b: trimesh.Trimesh) -> bool:
 
 
 def matrix(pose: np.ndarray) -> np.ndarray:
-    """(4, 4) of a pose (7,)."""
     found = trimesh.transformations.quaternion_matrix(pose[3:])
     found[:3, 3] = pose[:3]
     return np.asarray(found)
@@ -178,7 +176,6 @@ def main() -> None:
 
 
 def planned(urdf: Path, given: argparse.Namespace, name: str, count: int) -> SynthesisResult:
-    """Candidates of the hand on an object."""
     mesh = given.data / "objects" / name / "clean.stl"
     request = JobOptions(grasps=count, seed=given.seed, want="candidates")
     beside = tuple(NeighbourSpec(object=str(given.data / "objects" / one / "clean.stl")) for one in given.beside)
@@ -193,7 +190,6 @@ def ready(urdf: Path, given: argparse.Namespace) -> None:
 
 
 def total(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """Shares over all objects."""
     counts = {key: sum(row[key] for row in rows) for key in rows[0] if key not in ("object", "deepest_mm", "seconds")}
     valid = max(1, counts["valid"])
     return counts | {

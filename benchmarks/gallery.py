@@ -225,7 +225,6 @@ def keep(done: dict[str, Any], results: Path) -> None:
 
 
 def page(done: dict[str, Any]) -> str:
-    """The page of all hands that were tried."""
     lines = [
         "# Gallery of hands",
         "",

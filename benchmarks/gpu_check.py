@@ -36,8 +36,6 @@ HOT = ("gather", "object_in_pieces", "pieces_in_pieces", "direct", "obstacle")
 
 @dataclass(frozen=True)
 class Kernel:
-    """One kernel on one architecture."""
-
     module: str
     name: str
     arch: int
@@ -52,7 +50,6 @@ class Kernel:
 
     @property
     def faults(self) -> list[str]:
-        """What is wrong with it."""
         found = [f"spills {self.spilled_bytes} bytes"] if self.spilled_bytes else []
         if self.stack_bytes > STACK_BYTES:
             found.append(f"has a stack of {self.stack_bytes} bytes")
@@ -62,7 +59,6 @@ class Kernel:
 
 
 def ptx_of(name: str, arch: int, folder: Path) -> Path:
-    """The PTX of a module."""
     made = wp.compile_aot_module(import_module(name), arch=arch, module_dir=folder, use_ptx=True)
     return next(path for path in (made or sorted(folder.glob("*.ptx"))) if str(path).endswith(".ptx"))
 

@@ -79,7 +79,6 @@ def cell(hand: HandModel, mesh: Path, grasps: int) -> float | str:
 
 
 def page(done: dict[str, Any]) -> str:
-    """The table: an object a row, a gripper a column."""
     names = [name for name in GRIPPERS if name in done]
     objects = sorted({obj for name in names for obj in done[name]["cells"]})
     means = []

@@ -25,7 +25,6 @@ _LONGEST_S = 300.0
 
 
 def family(pid: int) -> Iterator[int]:
-    """A process and all that it started."""
     yield pid
     for thread in Path(f"/proc/{pid}/task").iterdir():
         for child in (thread / "children").read_text().split():

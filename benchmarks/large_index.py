@@ -115,7 +115,6 @@ class _Maker:
         return record, state
 
     def _at(self, number: int, share: float) -> str:
-        """A time within the job of that number."""
         ago = timedelta(days=30) * (1 - (number + share) / self._jobs)
         return (self._now - ago).isoformat(timespec="milliseconds").replace("+00:00", "Z")
 

@@ -66,7 +66,6 @@ def study(
     batch = {}
 
     def made(name: str, count: int, scenes: Scenes, seed: int, want: str = "valid") -> tuple[int, int, float]:
-        """Valid grasps, candidates, processor time."""
         request = JobOptions(
             method=name.split()[0],
             options=methods[name],
@@ -110,7 +109,6 @@ def study(
 
 
 def table(rows: Sequence[dict[str, Any]]) -> str:
-    """The rows as Markdown."""
     lines = ["| " + " | ".join(TITLES.values()) + " |", "| --- | --- | --- |" + " --: |" * (len(TITLES) - 3)]
     for row in rows:
         shown = row | {"found": f"{row['found']} of {row['seeds']}"}

@@ -18,7 +18,7 @@ from benchmarks.cells import HANDS
 from graspd.service.model.domain import JobOptions
 from graspd.service.model.matter import MASS_KG
 from graspd.service.model.scene_spec import parse_scene
-from graspd.worker.files.synthesis import synthesized
+from graspd.worker.files.synthesis import SynthesisResult, synthesized
 
 #: Not a seed that any setting was chosen with.
 SEED = 1200
@@ -52,7 +52,6 @@ def main() -> None:
 
 
 def arguments(description: str | None, seed: int) -> argparse.ArgumentParser:
-    """Options of a table of hands and objects with their masses."""
     parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", type=Path)
     parser.add_argument("--hands", nargs="+", default=list(HANDS), choices=list(HANDS))
@@ -65,7 +64,6 @@ def arguments(description: str | None, seed: int) -> argparse.ArgumentParser:
 
 
 def masses(data: Path) -> dict[str, float]:
-    """Published masses of objects [kg]."""
     told = {meta.parent.name: json.loads(meta.read_text()) for meta in sorted((data / "objects").glob("*/meta.json"))}
     known = {name: meta.get("real", {}).get("mass_kg") for name, meta in told.items()}
     return {name: float(mass) for name, mass in known.items() if mass}
@@ -73,24 +71,16 @@ def masses(data: Path) -> dict[str, float]:
 
 def lifts(given: Any, hand: str, name: str, mass: float) -> tuple[float, float]:
     """Shares of candidates that lift the object, and that do at half the friction."""
-    request = JobOptions(
-        grasps=given.grasps,
-        want="candidates",
-        rechecks=0,
-        seed=given.seed,
-        scene="table",
-        scenes=given.scenes,
-        mass=mass,
-    )
-    made = synthesized(
-        str(given.data / "hands" / HANDS[hand]),
-        str(given.data / "objects" / name / "clean.stl"),
-        request,
-        place=parse_scene("table"),
-        scenes=given.scenes,
-    )
-    told = made.summary()
+    told = on_table(given, hand, given.data / "objects" / name / "clean.stl", mass=mass).summary()
     return told["lift_share"], told["lift_hard_share"]
+
+
+def on_table(given: Any, hand: str, mesh: Path, **matter: float) -> SynthesisResult:
+    """Candidates of a hand on an object of this mass or density on a table."""
+    common: dict[str, Any] = {"grasps": given.grasps, "want": "candidates", "rechecks": 0, "seed": given.seed}
+    request = JobOptions(**common, scene="table", scenes=given.scenes, **matter)
+    urdf = str(given.data / "hands" / HANDS[hand])
+    return synthesized(urdf, str(mesh), request, place=parse_scene("table"), scenes=given.scenes)
 
 
 def line(hand: str, name: str, mass: str, shares: list[float]) -> str:

@@ -50,7 +50,6 @@ class ExecutionContext:
     url: str = ""
 
     def up(self) -> float:
-        """Start the service; seconds until it answered."""
         start = time.monotonic()
         log = (self.folder / "up.log").open("ab")
         command = [
@@ -75,7 +74,6 @@ class ExecutionContext:
         return time.monotonic() - start
 
     def kill(self) -> None:
-        """kill -9 of everything at once."""
         for pid in self.processes:
             os.kill(pid, signal.SIGKILL)
         os.waitpid(self.processes[0], 0)
@@ -85,7 +83,6 @@ class ExecutionContext:
         os.waitpid(self.processes[0], 0)
 
     def graspd(self, *arguments: str) -> dict[str, Any]:
-        """The JSON object of a command."""
         command = [sys.executable, "-m", "graspd", *arguments, "--json"]
         done = subprocess.run(command, capture_output=True, text=True, env=self.environment, check=False)
         if done.returncode:
@@ -96,7 +93,6 @@ class ExecutionContext:
         return Client(self.url)
 
     def shards(self) -> dict[str, tuple[str, str]]:
-        """Checksum and time of each manifest in the store."""
         found = {}
         for file in (self.folder / "data" / "store" / "shards" / "base").glob("*.json"):
             manifest = json.loads(file.read_bytes())
@@ -201,7 +197,6 @@ def follow(run: ExecutionContext, *, until: float, end: float) -> float:
 
 
 def page(found: DatasetView, cells: list[CellView], facts: dict[str, str], options: str) -> str:
-    """The results as Markdown."""
     at = {(cell.hand, cell.object): cell for cell in cells}
     lines = [
         "# Four hands, fourteen objects",

@@ -27,8 +27,7 @@ from benchmarks.success import HANDS
 from graspd.service.model.cores import available_cores
 from graspd.service.model.fidelity import FIDELITIES
 from graspd.service.model.version import PACKAGE_VERSION
-from graspd.studies.bench import device_name
-from graspd.studies.timing import kernel_shares
+from graspd.studies.bench import device_name, kernel_shares
 from graspd.worker.engines.devices import Device
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.hands.load import hand_from_path
@@ -54,7 +53,6 @@ SHOWN: Final = {"gsr": 2, **COLUMNS}
 
 
 def say(line: str) -> None:
-    """One line, at once."""
     sys.stdout.write(line + "\n")
     sys.stdout.flush()
 
@@ -67,7 +65,6 @@ def timed(work: Callable[[], T]) -> tuple[T, float]:
 
 
 def quality(hand: HandModel, obj: ObjectModel, device: str, count: int) -> dict[str, float]:
-    """Success and quality of `count` grasps that were made on a device."""
     run = ExecutionContext(device)
     grasps = planner.plan(hand, obj, PlanRequest(count, FIDELITY, SEED), run)
     held = validate(hand, obj, grasps, pieces=decompose(obj)).success == 1
@@ -105,12 +102,10 @@ def stages(hand: HandModel, obj: ObjectModel, device: str, batch: int) -> dict[s
 
 
 def speed(hand: HandModel, obj: ObjectModel, device: str, batches: Sequence[int]) -> list[dict[str, Any]]:
-    """Stages of launches of several sizes."""
     return [{"batch": batch, **stages(hand, obj, device, batch)} for batch in batches]
 
 
 def page(result: dict[str, Any]) -> str:
-    """The report, as Markdown."""
     lines = [
         "# A GPU against the CPU of the same machine",
         "",

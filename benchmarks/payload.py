@@ -161,7 +161,6 @@ def squeezed(hand: HandModel, obj: ObjectModel, grasps: GraspSet) -> GraspSet:
 
 
 def every(grasps: GraspSet) -> NDArray[np.intp]:
-    """Rows of `squeezed`."""
     return np.tile(np.arange(len(grasps)), 1 + len(FORCES_N))
 
 

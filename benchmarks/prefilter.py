@@ -36,7 +36,6 @@ def pool_of(cell: Cell, device: str, worlds: int) -> WorldPool:
 
 
 def agreement(cell: Cell, device: str) -> dict[str, Any]:
-    """What the prefilter says of a cell's grasps beside what the standard level says."""
     standard = cell.verdicts("standard", False)
     grasps, held = cell.grasps, np.array(standard["success"]) == 1
     cpu = time.process_time()
@@ -61,7 +60,6 @@ def agreement(cell: Cell, device: str) -> dict[str, Any]:
 
 
 def together(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """The cells of one hand, or of all, as one row."""
     total = {key: sum(row[key] for row in rows) for key in rows[0] if key not in ("hand", "object")}
     clear = total["clear_holds"] + total["clear_failures"]
     wrong = total["false_accepts"] + total["false_refusals"]

@@ -52,13 +52,11 @@ class Trajectory:
         return int(self.name[:-1])
 
     def told(self) -> str:
-        """In words."""
         what = "thread" if self.name.endswith("t") else "process"
         return f"{self.number} {what}{'' if self.number == 1 else 'es' if what == 'process' else 's'}"
 
 
 def processor_s(pids: Sequence[int]) -> float:
-    """Processor time of this process and others [s]."""
     spent = time.process_time()
     for pid in pids:
         fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()

@@ -121,7 +121,6 @@ def lift_share(hand: HandModel, folder: Path, grasps: int) -> float | None:
 
 
 def page(done: dict[str, Any]) -> str:
-    """The results as Markdown."""
     rows, agreeing = [], 0
     for row in done.values():
         known = [share for share in row["lifts"].values() if share is not None]

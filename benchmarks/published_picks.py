@@ -179,7 +179,6 @@ def pushed(case: Case, pieces: ConvexPieces, **terms: Any) -> dict[str, Any]:
 
 
 def lifted(case: Case, pieces: ConvexPieces) -> dict[str, Any]:
-    """graspd's own level `lift`: the hand also comes from its standoff, and nothing may be touched."""
     placed = on_table(case)
     way = plan_way(case.hand, case.obj, case.grasps, placed)
     grasps = replace(case.grasps, approach=way.approach, coming=way.open, lift=way.lift)
@@ -262,7 +261,6 @@ def answers(case: Case, work: Path) -> dict[str, dict[str, Any]]:
 
 
 def row(words: str, held: NDArray[np.bool_], margin: Floats | None, truth: NDArray[np.bool_]) -> dict[str, Any]:
-    """Figures of one test over all picks."""
     agree = int((held == truth).sum())
     right, wrong = int((~held & ~truth).sum()), int((~held & truth).sum())
     # A test differs from the constant only where it says "fails": McNemar, exact.

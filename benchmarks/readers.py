@@ -92,7 +92,6 @@ def _row_by_row(shards: Shards, kind: str, columns: Sequence[str]) -> int:
 
 
 def ways(shards: Shards) -> dict[str, Trajectory]:
-    """All ways there are to read these shards."""
     found = {
         "h5py, whole columns": Trajectory(lambda: plain_columns(shards), "h5py, whole columns"),
         "Grasps.arrays": Trajectory(lambda: sum(map(arrays_of, by_hand(shards))), "h5py, whole columns"),
@@ -124,7 +123,6 @@ def of_pictures(shards: Shards) -> dict[str, Trajectory]:
 
 
 def loaders(shards: Shards) -> dict[str, Trajectory]:
-    """The same through PyTorch's DataLoader."""
     import torch
     from torch.utils.data import DataLoader
 
@@ -152,7 +150,6 @@ def by_hand(shards: Shards) -> list[Shards]:
 
 
 def arrays_of(shards: Shards) -> int:
-    """All grasps of one hand as arrays."""
     return len(Grasps(shards, valid=False).arrays()["hand"])
 
 
@@ -190,15 +187,12 @@ def streamed(local: Shards, url: str, scratch: Path) -> dict[str, Trajectory]:
 
 @dataclass(frozen=True)
 class Rate:
-    """Samples per second."""
-
     by_clock: float
     by_processor: float
     """Of the processor time of this process alone."""
 
 
 def run(chosen: dict[str, Trajectory]) -> dict[str, Rate]:
-    """The best of each way."""
     for way in chosen.values():
         way.work()  # warms the files
     best = dict.fromkeys(chosen, Rate(0.0, 0.0))
@@ -227,7 +221,6 @@ def main() -> None:
 
 
 def tell(chosen: dict[str, Trajectory], found: dict[str, Rate]) -> None:
-    """The table, or its figures."""
     if "--json" in sys.argv:
         typer.echo(json.dumps({name: round(rate.by_clock, 1) for name, rate in found.items()}))
         return

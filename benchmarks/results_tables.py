@@ -60,7 +60,6 @@ PRINTED = (
 
 
 def metrics(cell: Cell) -> dict[str, Any]:
-    """Every metric of every grasp of a cell."""
     grasps = cell.grasps
     table = measure(cell.hand, cell.obj, grasps, friction=FRICTION, thresholds_m=[THRESHOLD_M])
     found: dict[str, Any] = {key: np.ravel(table[f"quality/{name}"]).tolist() for key, name in COLUMNS.items()}
@@ -83,7 +82,6 @@ def in_models(cell: Cell) -> dict[str, Any]:
 
 
 def row(cell: Cell) -> dict[str, Any]:
-    """The numbers of one object; seconds are of two cores."""
     dexgraspbench, hard = (np.array(cell.verdicts("dexgraspbench", h)["success"]) == 1 for h in (False, True))
     standard = cell.verdicts("standard", False)
     quality = cell.kept("metrics", lambda: metrics(cell))

@@ -94,7 +94,6 @@ def study(cell: Cell, draws: int) -> dict[str, Any]:
 
 
 def summed(hand: str, found: dict[str, dict[str, Any]]) -> dict[str, Any]:
-    """The cells of one hand as one."""
     every = list(found.values())
     rows: dict[str, list[int]] = {}
     for cell in every:
@@ -127,7 +126,6 @@ def summed(hand: str, found: dict[str, dict[str, Any]]) -> dict[str, Any]:
 
 
 def page(done: list[dict[str, Any]], objects: list[str], draws: int) -> str:
-    """docs/results/robust.md."""
     hands = [one["hand"] for one in done]
     held = ", ".join(f"{one['hand']} {one['held']}" for one in done)
     lines = [

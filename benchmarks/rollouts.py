@@ -67,7 +67,6 @@ def found_of(hand: HandModel, mesh: Path, count: int) -> dict[str, dict[str, Any
 
 
 def row(hand: str, way: str, pairs: list[dict[str, Any]]) -> str:
-    """A line of the page: one hand's pairs, one way."""
     grasps, held, hard = (sum(found[key] for found in pairs) for key in ("grasps", "held", "hard"))
     planned, validated = (1e3 * sum(found[key] for found in pairs) for key in ("planned_s", "validated_s"))
     worst = min(found["held"] / found["grasps"] for found in pairs)

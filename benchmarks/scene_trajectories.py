@@ -76,7 +76,6 @@ def run(count: int) -> list[dict[str, Any]]:
 
 
 def page(rows: list[dict[str, Any]], total: dict[str, int]) -> str:
-    """What the counts mean, and a table of the rows with their sums below."""
     lines = [COLUMNS, ["---"] * 3 + ["--:"] * (len(COLUMNS) - 3)]
     lines += [[str(row[name]) for name in COLUMNS] for row in rows]
     lines += [["**all**", "", "", "", *(f"**{count}**" for count in total.values())]]

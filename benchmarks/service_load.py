@@ -83,7 +83,6 @@ def running(*, workers: int, task_s: float, api: bool, **settings: Any) -> Itera
 
 
 def run(services: Services, batches: int, seed: int) -> float:
-    """Seconds from the submission of a bulk job to its end."""
     start = time.perf_counter()
     job = job_actions.submit(services, request(grasps=32 * batches, seed=seed), priority=Priority.BULK)[0].id
     while services.index.jobs.get(job).state is not State.SUCCEEDED:

@@ -25,8 +25,6 @@ _LOOK_S: Final = 0.1
 
 @dataclass(frozen=True)
 class Service:
-    """One that runs."""
-
     url: str
     pid: int
     """Of its supervisor."""
@@ -95,7 +93,6 @@ def service_of(root: Path) -> Iterator[Service]:
 
 
 def _address(process: subprocess.Popen[str]) -> str:
-    """Where the API of a service answers, from what it prints."""
     assert process.stdout is not None
     for line in process.stdout:
         for word in line.split():

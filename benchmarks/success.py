@@ -37,8 +37,6 @@ COLUMNS = ("contact_area_cm2", "epsilon", "wrench_volume", "intersection_volume_
 
 @dataclass
 class Results:
-    """What became of one hand's grasps."""
-
     success: list[NDArray[np.int8]] = field(default_factory=list)
     hard: list[NDArray[np.int8]] = field(default_factory=list)
     depth: list[NDArray[np.generic]] = field(default_factory=list)
@@ -46,7 +44,6 @@ class Results:
     seconds: float = 0.0
 
     def add(self, hand: HandModel, obj: ObjectModel, count: int) -> str:
-        """Grasps of one more object; the cells of its row."""
         pieces = decompose(obj)
         found = planned(hand, obj, count=count, seed=SEED)
         self.seconds += found.seconds

@@ -23,7 +23,6 @@ LEVELS = ("dexgraspbench", "standard", "fast")
 
 
 def row(found: list[dict[str, Any]], dexgraspbench: np.ndarray) -> dict[str, Any]:
-    """Numbers of one level over the cells of one hand, against the DexGraspBench protocol's verdicts."""
     held = np.concatenate([np.array(f["success"]) for f in found]) == 1
     agree = int((held == dexgraspbench).sum())
     cpu = sum(f["cpu_seconds"] for f in found)

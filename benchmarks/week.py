@@ -82,8 +82,6 @@ HARSH: Final = Rates(
 
 @dataclass
 class Told:
-    """What came of it."""
-
     node_s: float = 0.0
     """Time that nodes were there."""
     done: int = 0
@@ -139,7 +137,6 @@ class Week:
         self._number = 0
 
     def run(self) -> Told:
-        """All of it."""
         for one in self._nodes:
             one.task_s = self._drawn()
             # Nodes of a fleet do not work in step.
@@ -283,7 +280,6 @@ class Week:
             self._nodes[who] = _Node(since=back, task_s=self._drawn())
 
     def _store(self, at: float) -> None:
-        """What ends meanwhile is lost, and no attempt is used up."""
         back = at + self._rates.store_away_s
         for who, node in enumerate(self._nodes):
             if at < node.since:
@@ -327,7 +323,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def table(told: Told) -> list[str]:
-    """The rows of docs/explanation/scaling.md."""
     work = told.useful_s + sum(told.lost_s.values())
     idle = sorted(told.idle_s.items())
     rows = [

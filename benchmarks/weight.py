@@ -52,7 +52,6 @@ def closure(extra: str) -> set[str]:
 
 
 def size_mb(name: str) -> float:
-    """Bytes of a package's files, compiled ones too [MB]."""
     files = distribution(name).files or []
     paths = (Path(str(file.locate())) for file in files)
     return sum(path.stat().st_size for path in paths if path.is_file()) / 1e6
@@ -81,7 +80,6 @@ def parts_ms(code: str) -> list[tuple[str, float]]:
 
 
 def wheel_kb() -> float | None:
-    """Size of the wheel [kB]; None where nothing can build one."""
     with tempfile.TemporaryDirectory() as folder:
         done = subprocess.run(
             [sys.executable, str(REPOSITORY / "docker" / "dist.py"), folder], capture_output=True, check=False
@@ -91,7 +89,6 @@ def wheel_kb() -> float | None:
 
 
 def lines(found: dict[str, Any]) -> Iterator[str]:
-    """The tables."""
     yield "| install | packages | MB | largest, MB |\n| --- | --: | --: | --- |"
     for extra, told in found["installs"].items():
         largest = ", ".join(f"{name} {mb:.0f}" for name, mb in told["largest"])

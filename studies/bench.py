@@ -1,6 +1,6 @@
-"""Throughput of the planner over fidelities, batches, threads, hand points and object faces.
+"""Throughput of the planner over fidelities, batches, threads, hand points and object faces: table, JSON and plot.
 
-The results are a table, JSON and a plot.
+An iteration is timed launch by launch, a batch in kernels and on the host.
 """
 
 from __future__ import annotations
@@ -14,58 +14,54 @@ from pathlib import Path
 from statistics import median
 from typing import Any, Final
 
+import numpy as np
 import warp as wp
 
 from graspd.service.model.cores import available_cores
 from graspd.service.model.fidelity import Fidelity
 from graspd.service.model.version import PACKAGE_VERSION
-from graspd.studies.timing import host_ms, kernel_shares
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.planners.fast_graspd import pairs
 from graspd.worker.planners.fast_graspd.batches import Batches
-from graspd.worker.planners.fast_graspd.planner import optimise, optimise_batch
+from graspd.worker.planners.fast_graspd.pairs import Pair, pair_of
+from graspd.worker.planners.fast_graspd.planner import optimise, optimise_batch, plan
+from graspd.worker.planners.fast_graspd.schedule import coarse_schedule, fine_schedule
+from graspd.worker.planners.fast_graspd.starts import sample_starts
 from graspd.worker.planners.port import BatchRequest, PlanRequest
+from graspd.worker.simulation.data import Data, HandState, Schedule
+from graspd.worker.simulation.launches import kernel_seconds
+from graspd.worker.simulation.model import Model
+from graspd.worker.simulation.record import record_iteration
 
 #: Largest number of grasps per launch for which host time is reported.
 LARGE: Final = 1024
 
-Load = Callable[[float], ObjectModel]
-Say = Callable[[str], None]
-
 
 def bench(
     hand: HandModel,
-    load: Load,
+    load: Callable[[float], ObjectModel],
     *,
     fidelities: Sequence[Fidelity],
     batches: Sequence[int],
     threads: Sequence[int],
     device: str,
     repeats: int,
-    joins: Sequence[int] = (1,),
-    say: Say = lambda line: None,
+    joins: Sequence[int],
+    say: Callable[[str], None],
 ) -> dict[str, Any]:
-    """Run each fidelity x batch x joins x threads once.
+    """Run each fidelity x batch x joins x threads once; `say` receives a line per run.
 
-    Args:
-        hand: the hand.
-        load: function that loads the object at a fidelity's simplification error bound [m].
-        fidelities: fidelities to run.
-        batches: grasps per call.
-        threads: CPU threads per call; a GPU takes the whole batch at once.
-        device: Warp device.
-        repeats: timed calls per run, after an untimed one; the median is reported.
-        joins: batches in one launch.
-        say: receives a line per run.
+    `load` loads the object at a fidelity's simplification error bound [m]; `joins` are batches in one launch. Of
+    `repeats` timed calls after an untimed one the median is reported. A GPU ignores `threads`.
 
     Returns:
         `device`, `runs[]` with the keys of the command line's contract, `start` with cold and warm seconds,
         `host_ms_per_grasp` (None on a GPU, where waiting threads spin), `kernels`.
     """
     first = fidelities[0]
-    start = _start_times(hand, load(first.face_error_m), first, device)
+    nominal = load(first.face_error_m)
+    start = _start_times(hand, nominal, first, device)
     runs = []
     for fidelity in fidelities:
         obj = load(fidelity.face_error_m)
@@ -76,17 +72,17 @@ def bench(
                 f"{fidelity.name:9s} batch {batch:5d} x {join} threads {count}: {run['grasps_per_second']:8.1f} "
                 f"grasps/s, {run['ms_per_iteration']:7.2f} ms/iteration"
             )
-    pair = pairs.pair_of(hand, load(first.face_error_m), first, device)
-    launch = min(LARGE, max(batches) * max(joins))
-    host = None if wp.get_device(device).is_cuda else host_ms(hand, load(first.face_error_m), first, launch)
+    host = None
+    if not wp.get_device(device).is_cuda:
+        host = round(host_ms(hand, nominal, first, min(LARGE, max(batches) * max(joins))), 3)
     return {
         "device": device_name(device),
         "hand": hand.name,
-        "object": load(first.face_error_m).name,
+        "object": nominal.name,
         "versions": {"graspd": PACKAGE_VERSION, "warp": wp.config.version},
         "start": start,
-        "host_ms_per_grasp": None if host is None else round(host, 3),
-        "kernels": kernel_shares(pair, first, min(32, max(batches))),
+        "host_ms_per_grasp": host,
+        "kernels": kernel_shares(pair_of(hand, nominal, first, device), first, min(32, max(batches))),
         "runs": runs,
     }
 
@@ -96,12 +92,7 @@ def _start_times(hand: HandModel, obj: ObjectModel, fidelity: Fidelity, device: 
     seconds = []
     for seed in (0, 1):
         began = time.perf_counter()
-        optimise_batch(
-            hand,
-            obj,
-            PlanRequest(count=1, fidelity=fidelity, seed=seed, batch=0),
-            ExecutionContext(threads=1, device=device),
-        )
+        optimise_batch(hand, obj, PlanRequest(1, fidelity, seed), ExecutionContext(device, threads=1))
         seconds.append(round(time.perf_counter() - began, 3))
     return {"first_grasp_s": seconds[0], "next_grasp_s": seconds[1]}
 
@@ -120,7 +111,7 @@ def _run(
     for seed in range(repeats + 1):
         began = time.perf_counter()
         asked = [BatchRequest(PlanRequest(batch, fidelity, seed, number), run) for number in range(join)]
-        optimise(pairs.pair_of(hand, obj, fidelity, device), Batches(asked, obj), run)
+        optimise(pair_of(hand, obj, fidelity, device), Batches(asked, obj), run)
         seconds.append(time.perf_counter() - began)
     typical = median(seconds[1:])
     iterations = fidelity.coarse_iterations + fidelity.fine_iterations
@@ -148,14 +139,102 @@ def _peak_memory_mb(device: str) -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
+#: Timed iterations, launch by launch, from the middle of a phase.
+SAMPLED: Final = 12
+
+
+def kernel_shares(pair: Pair, fidelity: Fidelity, count: int) -> dict[str, Any]:
+    """Return ms per iteration of both phases, shares of kernels, and closest-point queries per second.
+
+    `count` grasps are planned at once, on one thread.
+    """
+    state = sample_starts(pair.model(pair.coarse), seed=0, batch=0, indices=range(count), each=1)
+    phases: dict[str, Any] = {}
+    for name, side, schedule in (
+        ("coarse", pair.coarse, coarse_schedule(fidelity)),
+        ("fine", pair.fine, fine_schedule(fidelity)),
+    ):
+        if len(schedule) < 2:
+            continue
+        model = pair.model(side)
+        data = Data(model, count)
+        used = _iterations_used(model, data, state, schedule, fidelity, name)
+        times, state = _timed(model, data, state, schedule, fidelity)
+        total = sum(times.values())
+        phases[name] = {
+            "iterations_to_convergence": round(used, 1),
+            "ms_per_iteration": round(1e3 * total, 3),
+            "points": len(side.points),
+            "share": {kernel: round(t / total, 4) for kernel, t in sorted(times.items(), key=lambda item: -item[1])},
+            "queries_per_second": round(count * len(side.points) / times["gather"]) if times.get("gather") else None,
+        }
+    return phases
+
+
+def _iterations_used(
+    model: Model, data: Data, state: HandState, schedule: Schedule, fidelity: Fidelity, phase: str
+) -> float:
+    """Return the mean iterations until a hand is switched off; the coarse phase always runs to its end."""
+    if phase == "coarse" or not fidelity.patience:
+        return float(len(schedule))
+    data.set_schedule(schedule)
+    data.set_state(state)
+    launches = record_iteration(model, data, fidelity.optimizer, patience=fidelity.patience)
+    alive = 0
+    for _ in range(len(schedule)):
+        alive += int(data.active.numpy().sum())
+        launches.run()
+    return alive / len(state.pivot)
+
+
+def _timed(
+    model: Model, data: Data, state: HandState, schedule: Schedule, fidelity: Fidelity
+) -> tuple[dict[str, float], HandState]:
+    """Return kernel seconds per iteration, medians over `SAMPLED` iterations mid-schedule."""
+    data.set_schedule(schedule)
+    data.set_state(state)
+    launches = record_iteration(model, data, fidelity.optimizer)
+    sampled = min(SAMPLED, len(schedule))
+    before = (len(schedule) - sampled) // 2
+    launches.run(before)
+    wp.synchronize_device(data.device)
+    found: dict[str, list[float]] = {}
+    for _ in range(sampled):
+        for name, command in launches.named():
+            began = time.perf_counter()
+            command.launch()
+            wp.synchronize_device(data.device)
+            found.setdefault(name, []).append(time.perf_counter() - began)
+    launches.run(len(schedule) - before - sampled)
+    return {name: float(np.median(values)) for name, values in found.items()}, data.state(len(state.pivot))
+
+
+def host_ms(hand: HandModel, obj: ObjectModel, fidelity: Fidelity, count: int) -> float:
+    """Return host time per candidate on the CPU [ms]: one thread outside the planner's kernels.
+
+    It includes starts, merits, projection, the postures around the grasp, copies and launches. An earlier batch of
+    `count` grasps warms up caches.
+    """
+    run = ExecutionContext("cpu", threads=1)
+    plan(hand, obj, PlanRequest(count, fidelity, seed=1), run)
+    with kernel_seconds() as elsewhere:
+        began = time.thread_time()
+        plan(hand, obj, PlanRequest(count, fidelity, seed=0), run)
+        total = time.thread_time() - began
+    return 1e3 * (total - sum(elsewhere)) / count
+
+
 def device_name(device: str) -> str:
-    """Return the common name of the device."""
     found = wp.get_device(device)
     return str(found.name) if found.is_cuda else f"cpu ({available_cores()} cores)"
 
 
+def clock_of(device: str) -> Callable[[], float]:
+    """Return core-seconds of all threads on a CPU (nearly independent of load), wall clock on a GPU."""
+    return time.process_time if device == "cpu" else time.perf_counter
+
+
 def table(result: dict[str, Any]) -> str:
-    """Return Markdown: runs, kernel shares, start times."""
     lines = [
         f"{result['hand']} on {result['object']}, {result['device']}, graspd {result['versions']['graspd']}, "
         f"Warp {result['versions']['warp']}",
@@ -183,12 +262,10 @@ def table(result: dict[str, Any]) -> str:
 
 
 def _batches(run: dict[str, Any]) -> str:
-    """Return the batch, and the number of batches per launch."""
     return str(run["batch"]) if run["join"] == 1 else f"{run['join']} × {run['batch']}"
 
 
 def write(result: dict[str, Any], folder: Path) -> None:
-    """Write bench.json, bench.md and bench.png to a folder."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "bench.json").write_text(json.dumps(result, indent=1) + "\n")
     (folder / "bench.md").write_text(table(result) + "\n")
@@ -196,7 +273,6 @@ def write(result: dict[str, Any], folder: Path) -> None:
 
 
 def _plot(result: dict[str, Any], path: Path) -> None:
-    """Plot grasps per second over the batch, one line per fidelity and thread count."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(7, 4.2), layout="constrained")

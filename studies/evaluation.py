@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
+from enum import IntEnum
 from pathlib import Path
 from typing import Any, Final, Literal, cast
 
@@ -25,7 +25,7 @@ from graspd.worker.quality.probe import HAND_POINTS, OBJECT_POINTS, probe_of
 from graspd.worker.quality.table import DEFAULT_FRICTION, measure
 from graspd.worker.scenes.trajectory import plan_way
 from graspd.worker.simulation.environment import PlacedGrasps
-from graspd.worker.validation.decomposition import ConvexPieces, decompose
+from graspd.worker.validation.decomposition import decompose
 from graspd.worker.validation.displacement import simulated_displacement_cm
 from graspd.worker.validation.foreign import foreign_verdicts, share_counts
 from graspd.worker.validation.key import Level
@@ -36,11 +36,18 @@ from graspd.worker.validation.robust import Robustness, robust
 from graspd.worker.validation.validator import Verdicts, validate
 
 Protocol = Literal["dexgraspbench", "displacement", "lift"]
-#: Validates grasps in models around the nominal one: `_in_others` without its first argument.
-InOthers = Callable[..., dict[str, Any]]
 
 #: Contact threshold of the row's area, epsilon and volume: the paper's [m].
 THRESHOLD_M: Final = 0.005
+#: Keys of the row, and metrics of a grasp.
+COLUMNS: Final = {
+    "pd_mm": "penetration_depth_mm",
+    "spd_mm": "self_penetration_depth_mm",
+    "ca_cm2": "contact_area_cm2",
+    "iv_cm3": "intersection_volume_cm3",
+    "epsilon": "epsilon",
+    "wrench_volume": "wrench_volume",
+}
 #: Seed of the models around the nominal one, used by no job: so results do not confirm a job's own choice.
 MODELS_SEED: Final = 2**31
 
@@ -60,13 +67,13 @@ def evaluate(
 ) -> dict[str, Any]:
     """Return one row of numbers; None for undefined ones: too thin an object has no verdict.
 
-    Level letter uses the protocol's own mass and friction, the others the object's.
+    Level dexgraspbench uses the protocol's own mass and friction, the others the object's.
 
     Keys: n, protocol, level, hard, mu, mass_kg, object_friction; gsr (share that holds), osr (1 if any holds), sgs
     (held grasps per second of planning and validation; of planning alone: sgs_without_validation), pd_mm and spd_mm
     (penetration, self-penetration), ca_cm2, iv_cm3, epsilon, wrench_volume, cdc_mm, sd_cm: medians; diversity: variance
     explained by the first principal component; nearest_mm: distance of the two most similar grasps. verdicts, after
-    validation: see `told`. With `models` models around the nominal one, by the same protocol: robust_share, the mean
+    validation: see `_told`. With `models` models around the nominal one, by the same protocol: robust_share, the mean
     over held grasps, robust_n, their number, robust_axes, the share by axis; `tell` receives the result of each grasp.
     With protocol lift also clear_share (no collision with the scene in approach, closing and lift). With another model
     of the hand as `validation_hand` also `ForeignVerdicts.facts`, and in the verdicts held_foreign and reason_foreign.
@@ -90,97 +97,60 @@ def evaluate(
         "mass_kg": case.obj.mass,
         "object_friction": case.obj.friction,
     }
-    row |= _success(case, None, 0.0)
+    row |= dict.fromkeys(("gsr", "osr", "sgs", "sgs_without_validation", "agreement_published"))
     try:
         pieces = decompose(case.obj, cache=cache)
     except MeshError as error:
         row["note"] = str(error)
-        sd = None
-    else:
-        validated = partial(_in_others, case, models=models, hard=hard, pieces=pieces, tell=tell, run=run)
-        if protocol == "dexgraspbench":
-            row |= _pushed(case, cast(Level, level), validation_hand, validated, hard=hard, pieces=pieces, run=run)
-        if protocol == "lift" and case.placed is not None:
-            chosen: LiftLevel = "dexgraspbench" if level == "dexgraspbench" else "lift"
-            row |= _lifted_out(case, case.placed, chosen, validated, hard=hard, pieces=pieces, run=run)
-        sd = simulated_displacement_cm(case.hand, case.obj, case.grasps.grasp, pieces=pieces, run=run)
-        row |= pieces.facts
-    return row | _medians(case, table, sd)
-
-
-def _pushed(
-    case: Case,
-    level: Level,
-    validation_hand: SameHand | None,
-    in_others: InOthers,
-    *,
-    hard: bool,
-    pieces: ConvexPieces,
-    run: ExecutionContext,
-) -> dict[str, Any]:
-    """Return results of the six pushes, in the nominal model and in others."""
-    verdicts = validate(case.hand, case.obj, case.grasps, level=level, hard=hard, pieces=pieces, run=run)
-    row = _success(case, verdicts, verdicts.seconds)
-    row |= in_others(case.grasps, row.get("verdicts", []), held=verdicts.success)
-    if validation_hand is not None:
-        both = foreign_verdicts(validation_hand, case.obj, case.grasps, verdicts, pieces=pieces, run=run)
-        row |= both.facts()
-        for one, held, reason in zip(row["verdicts"], both.foreign.success, both.foreign.reasons, strict=True):
-            one |= {"held_foreign": bool(held), "reason_foreign": reason}
-    return row
-
-
-def _lifted_out(
-    case: Case,
-    placed: PlacedGrasps,
-    level: LiftLevel,
-    in_others: InOthers,
-    *,
-    hard: bool,
-    pieces: ConvexPieces,
-    run: ExecutionContext,
-) -> dict[str, Any]:
-    """Return results of the lift in the scenes, in the nominal model and in others."""
-    grasps, clear = _with_ways(case, placed)
-    lifts = validate_lifts(case.hand, case.obj, grasps, placed, level=level, hard=hard, pieces=pieces, run=run)
-    row = _lifted(lifts, clear)
-    return row | in_others(grasps, row["verdicts"], held=lifts.success, placed=placed, level=level)
+        return row | _medians(case, table, None)
+    common: dict[str, Any] = {"hard": hard, "pieces": pieces, "run": run}
+    if protocol == "dexgraspbench":
+        verdicts = validate(case.hand, case.obj, case.grasps, level=cast(Level, level), **common)
+        row |= _success(case, verdicts)
+        if models:
+            row |= _in_others(case, case.grasps, row, models, tell, held=verdicts.success, **common)
+        if validation_hand is not None:
+            both = foreign_verdicts(validation_hand, case.obj, case.grasps, verdicts, pieces=pieces, run=run)
+            row |= both.facts()
+            for one, held, reason in zip(row["verdicts"], both.foreign.success, both.foreign.reasons, strict=True):
+                one |= {"held_foreign": bool(held), "reason_foreign": reason}
+    elif protocol == "lift" and case.placed is not None:
+        common |= {"placed": case.placed, "level": "dexgraspbench" if level == "dexgraspbench" else "lift"}
+        grasps, clear = _with_ways(case, case.placed)
+        lifts = validate_lifts(case.hand, case.obj, grasps, **common)
+        row |= _lifted(lifts, clear)
+        if models:
+            row |= _in_others(case, grasps, row, models, tell, held=lifts.success, **common)
+    sd = simulated_displacement_cm(case.hand, case.obj, case.grasps.grasp, pieces=pieces, run=run)
+    return row | pieces.facts | _medians(case, table, sd)
 
 
 def _in_others(
-    case: Case,
-    grasps: GraspSet,
-    verdicts: list[dict[str, Any]],
-    *,
-    models: int,
-    tell: Callable[[Robustness], None],
-    **given: Any,
+    case: Case, grasps: GraspSet, row: dict[str, Any], models: int, tell: Callable[[Robustness], None], **given: Any
 ) -> dict[str, Any]:
-    """Return results of models around the nominal one, if requested; add its share to each verdict."""
-    if not models:
-        return {}
+    """Return results of models around the nominal one; add each grasp's share to its verdict."""
     found = robust(case.hand, case.obj, grasps, models=models, seed=MODELS_SEED, **given)
     tell(found)
-    return in_models(found, verdicts)
+    return _in_models(found, row.get("verdicts", []))
 
 
-def _success(case: Case, verdicts: Verdicts | None, seconds: float) -> dict[str, Any]:
-    if verdicts is None or not len(case.grasps):
-        return dict.fromkeys(("gsr", "osr", "sgs", "sgs_without_validation", "agreement_published"))
+def _success(case: Case, verdicts: Verdicts) -> dict[str, Any]:
+    if not len(case.grasps):
+        return {}
     held = int(verdicts.success.sum())
     made = case.seconds
-    whole = None if made is None else made + (0.0 if case.validated else seconds)
+    whole = None if made is None else made + (0.0 if case.validated else verdicts.seconds)
     row: dict[str, Any] = {
         "level": verdicts.level,
         "gsr": _plain(held / len(case.grasps)),
         "osr": float(held > 0),
         "sgs": _plain(held / whole) if whole else None,
         "sgs_without_validation": _plain(held / made) if made and not case.validated else None,
-        "validation_seconds": _plain(seconds),
+        "validation_seconds": _plain(verdicts.seconds),
         "published": 0,
         "reasons": dict(Counter(verdicts.reasons).most_common()),
         "verdict_key": verdicts.terms,
-        "verdicts": told(verdicts),
+        "verdicts": _told(verdicts.success, verdicts.outcome, verdicts.margin, verdicts.reasons, Outcome),
         "agreement_published": None,
     }
     if case.published is not None and (known := case.published >= 0).any():
@@ -190,7 +160,6 @@ def _success(case: Case, verdicts: Verdicts | None, seconds: float) -> dict[str,
 
 
 def _with_ways(case: Case, placed: PlacedGrasps) -> tuple[GraspSet, NDArray[np.bool_]]:
-    """Return the grasps with trajectories, and (N,) whether they are clear."""
     way, grasps = plan_way(case.hand, case.obj, case.grasps, placed), case.grasps
     if grasps.approach is None or grasps.coming is None:
         # Imported files have grasps, but rarely trajectories.
@@ -200,7 +169,7 @@ def _with_ways(case: Case, placed: PlacedGrasps) -> tuple[GraspSet, NDArray[np.b
 
 def _lifted(verdicts: LiftVerdicts, clear: NDArray[np.bool_]) -> dict[str, Any]:
     count, held = len(clear), int(verdicts.success.sum())
-    rows = zip(verdicts.success, verdicts.outcome, verdicts.margin, verdicts.reasons, clear, strict=True)
+    rows = _told(verdicts.success, verdicts.outcome[:, None], verdicts.margin, verdicts.reasons, LiftOutcome)
     return {
         "level": verdicts.level,
         "gsr": _plain(held / max(1, count)),
@@ -209,21 +178,11 @@ def _lifted(verdicts: LiftVerdicts, clear: NDArray[np.bool_]) -> dict[str, Any]:
         "validation_seconds": _plain(verdicts.seconds),
         "reasons": dict(Counter(verdicts.reasons).most_common()),
         "verdict_key": verdicts.terms,
-        "verdicts": [
-            {
-                "row": row,
-                "held": bool(one),
-                "outcomes": [LiftOutcome(int(what)).name.lower()],
-                "margin": _plain(margin) if math.isfinite(margin) else None,
-                "reason": reason,
-                "clear": bool(free),
-            }
-            for row, (one, what, margin, reason, free) in enumerate(rows)
-        ],
+        "verdicts": [row | {"clear": bool(free)} for row, free in zip(rows, clear, strict=True)],
     }
 
 
-def in_models(found: Robustness, verdicts: list[dict[str, Any]]) -> dict[str, Any]:
+def _in_models(found: Robustness, verdicts: list[dict[str, Any]]) -> dict[str, Any]:
     """Return shares of a row; add each verdict's share and first failing axis, None if not tested."""
     tried = np.isfinite(found.share)
     for one, share, weakest in zip(verdicts, found.share, found.weakest, strict=True):
@@ -239,33 +198,30 @@ def in_models(found: Robustness, verdicts: list[dict[str, Any]]) -> dict[str, An
     }
 
 
-def told(verdicts: Verdicts) -> list[dict[str, Any]]:
-    """Return per grasp: row, held, outcomes of the six pushes, margin (None: diverged), reason."""
-    rows = zip(verdicts.success, verdicts.outcome, verdicts.margin, verdicts.reasons, strict=True)
+def _told(
+    success: NDArray[Any],
+    outcomes: NDArray[Any],
+    margins: NDArray[np.float64],
+    reasons: Sequence[str],
+    kind: type[IntEnum],
+) -> list[dict[str, Any]]:
+    """Return per grasp: row, held, outcomes of its pushes or of its lift, margin (None: diverged), reason."""
     return [
         {
             "row": row,
             "held": bool(held),
-            "outcomes": [Outcome(int(one)).name.lower() for one in outcomes],
+            "outcomes": [kind(int(one)).name.lower() for one in own],
             "margin": _plain(margin) if math.isfinite(margin) else None,
             "reason": reason,
         }
-        for row, (held, outcomes, margin, reason) in enumerate(rows)
+        for row, (held, own, margin, reason) in enumerate(zip(success, outcomes, margins, reasons, strict=True))
     ]
 
 
 def _medians(case: Case, table: dict[str, NDArray[Any]], sd: NDArray[np.float64] | None) -> dict[str, Any]:
     probe = probe_of(case.hand, case.obj, hand_points=HAND_POINTS, object_points=OBJECT_POINTS)
     cdc = contact_distance_consistency_mm(case.hand, probe.body_distance(probe.measure(case.grasps.grasp)))
-    columns = {
-        "pd_mm": "penetration_depth_mm",
-        "spd_mm": "self_penetration_depth_mm",
-        "ca_cm2": "contact_area_cm2",
-        "iv_cm3": "intersection_volume_cm3",
-        "epsilon": "epsilon",
-        "wrench_volume": "wrench_volume",
-    }
-    row = {key: _median(table[f"quality/{name}"]) for key, name in columns.items()}
+    row = {key: _median(table[f"quality/{name}"]) for key, name in COLUMNS.items()}
     shares = explained_variance(case.grasps.grasp)
     apart = nearest(hand_points(case.hand, case.grasps.grasp))
     return row | {
@@ -285,7 +241,7 @@ def _plain(value: float) -> float:
 
 
 #: Numbers that are combined by medians over rows.
-_MEDIANS: Final = ("pd_mm", "spd_mm", "ca_cm2", "iv_cm3", "epsilon", "wrench_volume", "cdc_mm", "sd_cm", "diversity")
+_MEDIANS: Final = (*COLUMNS, "cdc_mm", "sd_cm", "diversity")
 
 
 def combine(rows: list[dict[str, Any]]) -> dict[str, Any]:
@@ -322,7 +278,6 @@ def combine(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _models(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return shares of several rows, weighted by their grasps."""
     axes: dict[str, list[tuple[float, int]]] = {}
     for row in rows:
         for axis, one in row["robust_axes"].items():

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 from PIL import Image
 
 from graspd.service.model.fidelity import FIDELITIES
@@ -25,7 +26,6 @@ from graspd.worker.scenes import Neighbours, drop, drop_together, transfer
 
 Say = Callable[[str], None]
 #: Size of one picture [px].
-
 SIZE: Final = (300, 225)
 #: Rays per pixel, for pictures that people view.
 SAMPLES: Final = 32
@@ -35,7 +35,7 @@ SCENES: Final = 24
 ROUNDS: Final = 4
 #: Cosine of the elevation of the camera beside a neighbour.
 _LEVEL: Final = 0.94
-_VIEW: Final[dict[str, Any]] = {"stereo": False, "width": SIZE[0], "height": SIZE[1], "samples": SAMPLES}
+_CHANNELS: Final = ("left", "right", "depth", "normals", "segmentation", "boxes")
 
 
 def paint(
@@ -58,29 +58,22 @@ def paint(
     return written
 
 
+def _seen(
+    obj: ObjectModel, poses: Floats, device: str, seed: int, extras: Extras, *, stereo: bool
+) -> dict[str, NDArray[np.generic]]:
+    run, (width, height) = ExecutionContext(device=device), SIZE
+    view: dict[str, Any] = {"views": 1, "width": width, "height": height, "samples": SAMPLES}
+    return render(obj, poses, seed=seed, extras=extras, stereo=stereo, run=run, **view)
+
+
 def _views(objects: Sequence[ObjectModel], device: str, seed: int) -> bytes:
     rows, names = [], []
     for k, obj in enumerate(objects):
         poses = drop(obj, count=1, seed=seed + k)["scene/object_pose"]
-        options: dict[str, Any] = {**_VIEW, "stereo": True}
-        seen = render(
-            obj,
-            poses,
-            views=1,
-            seed=seed + k,
-            extras=Extras(channels=("normals",)),
-            **options,
-            run=ExecutionContext(device=device),
-        )
-        rows.append(scene_cells(seen))
+        rows.append(scene_cells(_seen(obj, poses, device, seed + k, Extras(channels=("normals",)), stereo=True)))
         names.append([obj.name])
-    return label_page(
-        rows,
-        ["left", "right", "depth", "normals", "segmentation", "boxes"],
-        names,
-        title="What the cameras see",
-        subtitle="one scene per object; stereo pair with 60 mm baseline",
-    )
+    subtitle = "one scene per object; stereo pair with 60 mm baseline"
+    return label_page(rows, _CHANNELS, names, title="What the cameras see", subtitle=subtitle)
 
 
 def _hands(hands: Sequence[HandModel], objects: Sequence[ObjectModel], device: str, seed: int, say: Say) -> bytes:
@@ -90,27 +83,14 @@ def _hands(hands: Sequence[HandModel], objects: Sequence[ObjectModel], device: s
         for hand in hands:
             drawn, pose, kept, tried = _fitting(hand, obj, device, seed)
             say(f"{hand.name} on {obj.name}: {kept} of {tried} grasps stay clear")
-            camera = _camera(drawn, obj, pose)
-            seen = render(
-                obj,
-                pose[None],
-                views=1,
-                seed=seed + k,
-                extras=Extras(cameras=GivenCameras(extrinsics=camera[None]), drawn=drawn),
-                **_VIEW,
-                run=ExecutionContext(device=device),
-            )
+            extras = Extras(cameras=GivenCameras(extrinsics=_camera(drawn, obj, pose)[None]), drawn=drawn)
+            seen = _seen(obj, pose[None], device, seed + k, extras, stereo=False)
             cells.append(Image.fromarray(np.asarray(seen["image/rgb_hand"][0], np.uint8)))
             below.append(f"{obj.name}: {kept} of {tried} fit")
         rows.append(cells)
         names.append(below)
-    return label_page(
-        rows,
-        [hand.name for hand in hands],
-        names,
-        title="Grasps on the table",
-        subtitle="a hand that stays clear of the table all the way; an object alone: none of those tried fits",
-    )
+    subtitle = "a hand that stays clear of the table all the way; an object alone: none of those tried fits"
+    return label_page(rows, [hand.name for hand in hands], names, title="Grasps on the table", subtitle=subtitle)
 
 
 def _fitting(hand: HandModel, obj: ObjectModel, device: str, seed: int) -> tuple[DrawnHand, Floats, int, int]:
@@ -163,20 +143,12 @@ def _neighbours(objects: Sequence[ObjectModel], device: str, seed: int) -> bytes
         scene = drop_together(first, others, count=1, seed=seed + k)
         poses, beside = scene["scene/object_pose"], Neighbours(others, scene["scene/neighbour_pose"])
         extras = Extras(channels=("normals", "occlusion"), cameras=_past(poses, first, beside), neighbours=beside)
-        options: dict[str, Any] = {**_VIEW, "stereo": True}
-        seen = render(
-            first, poses, views=1, seed=seed + k, extras=extras, **options, run=ExecutionContext(device=device)
-        )
+        seen = _seen(first, poses, device, seed + k, extras, stereo=True)
         rows.append(scene_cells(seen))
         hidden = float(np.asarray(seen["box/occlusion_ratio"])[0])
         names.append([f"{first.name}, {100 * hidden:.0f} % hidden"])
-    return label_page(
-        rows,
-        ["left", "right", "depth", "normals", "segmentation", "boxes"],
-        names,
-        title="Several objects",
-        subtitle="labels 3, 4, ... are the neighbours; boxes are the grasped object's",
-    )
+    subtitle = "labels 3, 4, ... are the neighbours; boxes are the grasped object's"
+    return label_page(rows, _CHANNELS, names, title="Several objects", subtitle=subtitle)
 
 
 def _past(poses: Floats, obj: ObjectModel, beside: Neighbours) -> GivenCameras:

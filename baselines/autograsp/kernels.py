@@ -29,21 +29,6 @@ class Closing:
 
 
 @wp.kernel
-def clear(
-    # In:
-    reach_in: wp.float32,
-    # Data out:
-    near_out: wp.array2d(dtype=wp.float32),
-    pair_out: wp.array3d(dtype=wp.float32),
-):
-    """Reset all distances to `reach`. Launch over (B, L)."""
-    b, a = wp.tid()
-    near_out[b, a] = reach_in
-    for other in range(pair_out.shape[2]):
-        pair_out[b, a, other] = reach_in
-
-
-@wp.kernel
 def points_to_object(
     # Model:
     surface_in: Surface,

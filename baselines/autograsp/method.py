@@ -24,7 +24,7 @@ from graspd.worker.hands.kinematics import ancestors
 from graspd.worker.hands.model import HandModel, JointType, SurfacePoints
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.planners.fast_graspd.pairs import Pair
-from graspd.worker.planners.port import Method, Options, Planner, PlanRequest
+from graspd.worker.planners.port import Method, Options, PlanRequest
 from graspd.worker.planners.threads import StepCounter, cut, run_parts
 from graspd.worker.simulation.data import Data, HandState
 from graspd.worker.simulation.launches import Launches
@@ -33,16 +33,12 @@ from graspd.worker.simulation.record import add_poses
 
 
 class AutograspOptions(Options):
-    """Options of `autograsp`."""
-
     standoff_m: float = Field(0.005, ge=0.0, le=0.05, description="gap at which the approach ends [m]")
 
 
+@dataclass(frozen=True)
 class Autograsp:
-    """See `worker.planners.Planner`."""
-
-    def __init__(self, options: AutograspOptions) -> None:
-        self.options = options
+    options: AutograspOptions
 
     def __call__(self, hand: HandModel, obj: ObjectModel, wanted: PlanRequest, run: ExecutionContext) -> GraspSet:
         began = time.perf_counter()
@@ -64,14 +60,10 @@ class Autograsp:
         return grasp_set(pair, joined(states), began, {})
 
 
-def _planner(options: AutograspOptions) -> Planner:
-    return Autograsp(options)
-
-
 METHOD: Final = Method(
     summary="a random approach, then the fingers close until contact",
     source="A. T. Miller and P. K. Allen, GraspIt!, IEEE Robotics and Automation Magazine 2004",
-    planner=_planner,
+    planner=Autograsp,
     options=AutograspOptions,
     uses=("face_error_m",),
 )
@@ -167,13 +159,7 @@ class HandCloser:
             along = wp.array(direction, dtype=wp.vec3)
         for _ in range(ADVANCES):
             self._measure()
-            wp.launch(
-                kernels.advance,
-                self.capacity,
-                inputs=[near, along, standoff, SHARE],
-                outputs=[active, self.data.pivot],
-                device=self.model.device,
-            )
+            self._launch(kernels.advance, (), [near, along, standoff, SHARE], [active, self.data.pivot])
             if not active.numpy().any():
                 break
         return self.data.state(n)
@@ -186,13 +172,8 @@ class HandCloser:
         self.stopped.assign(idle)
         for _ in range(STEPS):
             self._measure(fingers=True)
-            wp.launch(
-                kernels.close,
-                self.capacity,
-                inputs=[self.closing, self.near, self.pairs, TOUCH_M, SHARE, LARGEST],
-                outputs=[data.active, self.stopped, data.q],
-                device=data.device,
-            )
+            given = [self.closing, self.near, self.pairs, TOUCH_M, SHARE, LARGEST]
+            self._launch(kernels.close, (), given, [data.active, self.stopped, data.q])
             if not data.active.numpy().any():
                 break
         return ClosedHands(data.state(n), self.stopped.numpy()[:n].astype(np.int32))
@@ -204,30 +185,20 @@ class HandCloser:
         return self.near.numpy()[: len(state.pivot)].astype(float)
 
     def _measure(self, *, fingers: bool = False) -> None:
-        m, d, device = self.model, self.data, self.model.device
+        m, d = self.model, self.data
         self._poses.run()
-        pose = [d.body_p, d.body_q]
-        wp.launch(kernels.clear, self.near.shape, inputs=[REACH_M], outputs=[self.near, self.pairs], device=device)
-        wp.launch(
-            kernels.points_to_object,
-            (self.capacity, m.count),
-            inputs=[m.obj.surface, REACH_M, m.options.exact_below, m.point_body, m.point_position, d.active, *pose],
-            outputs=[self.near],
-            device=device,
-        )
-        shape = (self.capacity, m.pieces)
-        wp.launch(
-            kernels.object_to_pieces,
-            shape,
-            inputs=[m.hand.pieces, m.obj.bvh.id, m.obj.samples, d.active, *pose, MARGIN_M],
-            outputs=[self.near],
-            device=device,
-        )
+        posed = [d.active, d.body_p, d.body_q]
+        self.near.fill_(REACH_M)
+        self.pairs.fill_(REACH_M)
+        surface = [m.obj.surface, REACH_M, m.options.exact_below]
+        points = [*surface, m.point_body, m.point_position, *posed]
+        self._launch(kernels.points_to_object, (m.count,), points, [self.near])
+        samples = [m.hand.pieces, m.obj.bvh.id, m.obj.samples, *posed, MARGIN_M]
+        self._launch(kernels.object_to_pieces, (m.pieces,), samples, [self.near])
         if fingers:
-            wp.launch(
-                kernels.bodies_to_pieces,
-                shape,
-                inputs=[m.hand.pieces, m.body_points, d.active, *pose, MARGIN_M],
-                outputs=[self.pairs],
-                device=device,
-            )
+            bodies = [m.hand.pieces, m.body_points, *posed, MARGIN_M]
+            self._launch(kernels.bodies_to_pieces, (m.pieces,), bodies, [self.pairs])
+
+    def _launch(self, kernel: Any, dims: tuple[int, ...], inputs: list[Any], outputs: list[Any]) -> None:
+        """Launch over the hands, and over further dimensions."""
+        wp.launch(kernel, (self.capacity, *dims), inputs=inputs, outputs=outputs, device=self.model.device)

@@ -1,22 +1,12 @@
-"""DexGraspNet's energies, gradients on bodies, and Metropolis-adjusted descent. See `schedule`."""
+"""DexGraspNet's energies, gradients on bodies, and Metropolis-adjusted descent.
+
+E = E_fc + 100 E_dis + 100 E_pen + 10 E_spen + E_joints
+step 0.005 * 0.95^floor(t / 50), each gradient over its root mean square, v <- 0.98 g^2 + 0.02 v
+temperature 18 * 0.95^floor(t / 30): a proposal is accepted with probability min(1, exp((E - E') / T))
+"""
 
 import warp as wp
 
-from graspd.baselines.dfc.schedule import (
-    CONTACTS,
-    DECAY,
-    DISTANCE_WEIGHT,
-    JOINT_WEIGHT,
-    MOMENT,
-    PENETRATION_WEIGHT,
-    SELF_GAP_M,
-    SELF_WEIGHT,
-    STEP_PERIOD,
-    STEP_SIZE,
-    SWITCH,
-    TEMPERATURE,
-    TEMPERATURE_PERIOD,
-)
 from graspd.worker.simulation.kernels.optimizers import turn
 from graspd.worker.simulation.kernels.pieces import (
     Pieces,
@@ -31,19 +21,21 @@ from graspd.worker.simulation.kernels.wrenches import Wrenches, add_wrench
 
 wp.set_module_options({"enable_backward": False})
 
-N_CONTACTS = wp.constant(CONTACTS)
-W_DISTANCE = wp.constant(DISTANCE_WEIGHT)
-W_PENETRATION = wp.constant(PENETRATION_WEIGHT)
-W_SELF = wp.constant(SELF_WEIGHT)
-W_JOINTS = wp.constant(JOINT_WEIGHT)
-GAP = wp.constant(SELF_GAP_M)
-STEP0 = wp.constant(STEP_SIZE)
-STEP_EVERY = wp.constant(float(STEP_PERIOD))
-T0 = wp.constant(TEMPERATURE)
-T_EVERY = wp.constant(float(TEMPERATURE_PERIOD))
-COOL = wp.constant(DECAY)
-MU = wp.constant(MOMENT)
-SWAP = wp.constant(SWITCH)
+N_CONTACTS = wp.constant(4)
+W_DISTANCE = wp.constant(100.0)
+W_PENETRATION = wp.constant(100.0)
+W_SELF = wp.constant(10.0)
+W_JOINTS = wp.constant(1.0)
+#: Key points of the hand nearer than this count as self-penetration [m].
+GAP = wp.constant(0.02)
+STEP0 = wp.constant(0.005)
+STEP_EVERY = wp.constant(50.0)
+T0 = wp.constant(18.0)
+T_EVERY = wp.constant(30.0)
+COOL = wp.constant(0.95)
+MU = wp.constant(0.98)
+#: Probability of a new contact.
+SWAP = wp.constant(0.5)
 #: Largest distance that is computed [m].
 FAR = wp.constant(1.0)
 

@@ -6,6 +6,7 @@ All hands are returned; info contains which of them the source would accept.
 from __future__ import annotations
 
 import time
+from dataclasses import dataclass
 from itertools import combinations
 from typing import Any, Final
 
@@ -14,9 +15,8 @@ import warp as wp
 from numpy.typing import NDArray
 from pydantic import Field
 
-from graspd.baselines.common import grasp_set, ground_of, inside_points, joined
+from graspd.baselines.common import frame_along, grasp_set, ground_of, inside_points, joined
 from graspd.baselines.dfc import kernels
-from graspd.baselines.dfc.schedule import CONTACTS, SELF_GAP_M, STEPS
 from graspd.service.model.transforms import (
     IDENTITY_POSE,
     Floats,
@@ -32,7 +32,7 @@ from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.distance import sample_faces
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.planners.fast_graspd.pairs import Pair
-from graspd.worker.planners.port import Method, Options, Planner, PlanRequest
+from graspd.worker.planners.port import Method, Options, PlanRequest
 from graspd.worker.planners.threads import StepCounter, cut, run_parts
 from graspd.worker.simulation.data import Data, HandState
 from graspd.worker.simulation.kernels import optimizers
@@ -51,16 +51,12 @@ POSTURE: Final = 0.1
 
 
 class DfcOptions(Options):
-    """Options of `dfc`."""
-
-    steps: int = Field(STEPS, ge=1, le=100_000, description="proposals of each hand")
+    steps: int = Field(6000, ge=1, le=100_000, description="proposals of each hand")
 
 
+@dataclass(frozen=True)
 class Dfc:
-    """See `worker.planners.Planner`."""
-
-    def __init__(self, options: DfcOptions) -> None:
-        self.options = options
+    options: DfcOptions
 
     def __call__(self, hand: HandModel, obj: ObjectModel, wanted: PlanRequest, run: ExecutionContext) -> GraspSet:
         began = time.perf_counter()
@@ -80,14 +76,10 @@ class Dfc:
         return grasp_set(pair, joined([part[0] for part in found]), began, {"passed": passed.tolist()})
 
 
-def _planner(options: DfcOptions) -> Planner:
-    return Dfc(options)
-
-
 METHOD: Final = Method(
     summary="annealed descent of force closure, distance and penetration energies of four contacts",
     source="R. Wang et al., DexGraspNet, ICRA 2023; T. Liu et al., Differentiable force closure, RA-L 2021",
-    planner=_planner,
+    planner=Dfc,
     options=DfcOptions,
     uses=("face_error_m",),
     quick={"steps": 60},
@@ -108,18 +100,12 @@ def _start(hand: HandModel, obj: ObjectModel, rng: np.random.Generator) -> tuple
     side = np.cross(normal, rng.normal(size=3))
     axis, angle = side / np.linalg.norm(side), rng.uniform(0.0, TILT)
     normal = normal * np.cos(angle) + np.cross(axis, normal) * np.sin(angle)
-    align = _frame(-normal) @ _frame(hand.palm.approach).T
+    align = frame_along(-normal) @ frame_along(hand.palm.approach).T
     roll = quat_from_axis_angle(-normal, np.array(rng.uniform(0.0, 2 * np.pi)))
     span = hand.upper - hand.lower
     q = np.clip(hand.preshape + POSTURE * span * rng.normal(size=hand.dofs), hand.lower, hand.upper)
     pivot = points[0] + rng.uniform(*DISTANCE) * normal - obj.centre_of_mass
     return pivot, quat_multiply(roll, quat_from_matrix(align)), q
-
-
-def _frame(z: np.ndarray) -> np.ndarray:
-    x = np.cross(np.eye(3)[int(np.argmin(np.abs(z)))], z)
-    x /= np.linalg.norm(x)
-    return np.column_stack([x, np.cross(z, x), z])
 
 
 Ints = NDArray[np.int32]
@@ -145,7 +131,7 @@ def key_points(hand: HandModel) -> tuple[Ints, Floats, Ints, Ints]:
         for i, j in combinations(range(len(body)), 2)
         if body[i] != body[j]
         and (min(body[i], body[j]), max(body[i], body[j])) not in hand.neighbours
-        and np.linalg.norm(rest[i] - rest[j]) > SELF_GAP_M
+        and np.linalg.norm(rest[i] - rest[j]) > kernels.GAP
     ]
     first, second = (np.array([pair[k] for pair in pairs], np.int32) for k in (0, 1))
     return body, place, first, second
@@ -165,7 +151,7 @@ class Descent:
         self.device = self.model.device
         generators = [np.random.default_rng([*seed, 1]) for seed in seeds]
         random = np.array([g.integers(2**32, dtype=np.uint32) for g in generators], np.uint32)
-        contacts = np.array([g.integers(len(self.candidates), size=CONTACTS) for g in generators], np.int32)
+        contacts = np.array([g.integers(len(self.candidates), size=kernels.N_CONTACTS) for g in generators], np.int32)
         with wp.ScopedDevice(self.device):
             self.rng = wp.array(random, dtype=wp.uint32)
             self._allocate(contacts)
@@ -198,35 +184,21 @@ class Descent:
     def _record(self) -> Launches:
         s, m, n, out = self.proposal, self.model, self.n, Launches(self.device)
         pose, own = [s.body_p, s.body_q], [self.new_terms, s.wrench]
-        out.add(
-            kernels.propose,
-            n,
-            inputs=[len(self.candidates), s.iteration, self.gradient, *self.state, self.contact],
-            outputs=[self.rng, self.moment, *self._proposed(), self.new_contact, self.new_terms],
-        )
+        present = [*self.state, self.contact]
+        proposed = [*self._proposed(), self.new_contact]
+        given = [len(self.candidates), s.iteration, self.gradient, *present]
+        out.add(kernels.propose, n, inputs=given, outputs=[self.rng, self.moment, *proposed, self.new_terms])
         add_poses(out, m, s)
-        out.add(
-            kernels.force_closure,
-            n,
-            inputs=[self.obj.surface, self.candidate_body, self.candidate_position, self.new_contact, *pose],
-            outputs=own,
-        )
-        out.add(
-            kernels.penetration,
-            (n, m.pieces),
-            inputs=[m.hand.pieces, self.obj.bvh.id, self.obj.samples, *pose],
-            outputs=own,
-        )
+        contacts = [self.candidate_body, self.candidate_position, self.new_contact]
+        out.add(kernels.force_closure, n, inputs=[self.obj.surface, *contacts, *pose], outputs=own)
+        samples = [m.hand.pieces, self.obj.bvh.id, self.obj.samples]
+        out.add(kernels.penetration, (n, m.pieces), inputs=[*samples, *pose], outputs=own)
         if self.pairs:
             out.add(kernels.self_penetration, (n, self.pairs), inputs=[*self.keys, *pose], outputs=own)
         add_root_gradient(out, m, s)
         out.add(kernels.limits, n, inputs=[m.hand.lower, m.hand.upper, s.q], outputs=[self.new_terms, s.gradient])
-        out.add(
-            kernels.accept,
-            n,
-            inputs=[s.iteration, self.new_terms, s.gradient, *self._proposed(), self.new_contact],
-            outputs=[self.rng, self.terms, self.gradient, *self.state, self.contact, self.taken],
-        )
+        kept = [self.rng, self.terms, self.gradient, *present, self.taken]
+        out.add(kernels.accept, n, inputs=[s.iteration, self.new_terms, s.gradient, *proposed], outputs=kept)
         out.add(optimizers.advance, 1, inputs=[], outputs=[s.iteration])
         return out
 
@@ -238,7 +210,6 @@ class Descent:
             tell(self.n * count, "annealing")
 
     def hands(self) -> HandState:
-        """Return the present hands, joints inside their limits."""
         for mine, other in zip(self._proposed(), self.state, strict=True):
             wp.copy(mine, other)
         found = self.proposal.state(self.n)

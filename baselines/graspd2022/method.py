@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import time
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, Final
 
@@ -15,7 +16,7 @@ import warp as wp
 from numpy.typing import NDArray
 from pydantic import Field
 
-from graspd.baselines.common import PairCache, free_starts, grasp_set, ground_of, joined
+from graspd.baselines.common import free_starts, grasp_set, ground_of, joined, search_of
 from graspd.baselines.graspd2022 import kernels
 from graspd.service.model.cores import available_cores
 from graspd.service.model.transforms import Floats, quat_rotate
@@ -25,7 +26,7 @@ from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.surface import sample_surface
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.planners.fast_graspd.pairs import Pair
-from graspd.worker.planners.port import Method, Options, Planner, PlanRequest
+from graspd.worker.planners.port import Method, Options, PlanRequest
 from graspd.worker.planners.threads import StepCounter, cut, run_parts
 from graspd.worker.simulation.data import Data, HandState, Schedule
 from graspd.worker.simulation.device import DeviceObject
@@ -36,8 +37,6 @@ from graspd.worker.simulation.record import add_poses, add_root_gradient, add_se
 
 
 class Graspd2022Options(Options):
-    """Options of `graspd2022`."""
-
     steps: int = Field(10_000, ge=1, le=100_000, description="iterations of descent")
     grid: int = Field(128, ge=16, le=256, description="cells of the distance grid along its longest side")
 
@@ -46,34 +45,30 @@ class Search:
     """Grasp'D's search for one hand and object; hands run in batches."""
 
     def __init__(self, pair: Pair, cells: int) -> None:
-        self.pair, self.cells = pair, cells
+        self.pair = pair
         self.grid = distance_grid(pair.fine.obj, cells)
         self.points = sample_surface(pair.hand.model, POINTS)
 
     def run(self, starts: HandState, *, steps: int, tell: StepCounter) -> tuple[HandState, Floats]:
         """Return hands after `steps` iterations, and their force residuals of the task, (n,), relative to 1."""
-        batch = _Batch(self, _retreated(self.pair, starts), steps)
         n = len(starts.pivot)
+        back = quat_rotate(starts.rotation, self.pair.hand.model.palm.approach)
+        batch = _Batch(self, replace(starts, pivot=starts.pivot - BACKOFF_M * back), steps)
         for first in range(0, steps, CHUNK):
             count = min(CHUNK, steps - first)
-            batch.run(count)
+            batch.launches.run(count)
             tell(n * count, "descent")
         return batch.data.state(n), batch.residual()
 
 
-_searches: Final = PairCache(Search)
-
-
+@dataclass(frozen=True)
 class Graspd2022:
-    """See `worker.planners.Planner`."""
-
-    def __init__(self, options: Graspd2022Options) -> None:
-        self.options = options
+    options: Graspd2022Options
 
     def __call__(self, hand: HandModel, obj: ObjectModel, wanted: PlanRequest, run: ExecutionContext) -> GraspSet:
         began = time.perf_counter()
-        pair: Pair = ground_of(hand, obj, run.device, kernels)
-        search = _searches(pair, self.options.grid)
+        pair = ground_of(hand, obj, run.device, kernels)
+        search = search_of(Search, pair, self.options.grid)
         steps = StepCounter(wanted.count * (self.options.steps + 1), run)
 
         def work(indices: range) -> tuple[HandState, Floats]:
@@ -86,14 +81,10 @@ class Graspd2022:
         return grasp_set(pair, joined([part[0] for part in found]), began, {"residual": residual.round(4).tolist()})
 
 
-def _planner(options: Graspd2022Options) -> Planner:
-    return Graspd2022(options)
-
-
 METHOD: Final = Method(
     summary="descent on a distance grid with force-based contact, relaxed by contact-invariant forces",
     source="D. Turpin et al., Grasp'D: Differentiable Contact-rich Grasp Synthesis, ECCV 2022",
-    planner=_planner,
+    planner=Graspd2022,
     options=Graspd2022Options,
     uses=("face_error_m",),
     quick={"steps": 60},
@@ -135,23 +126,16 @@ def schedule(steps: int) -> Schedule:
     return Schedule(dilation, zero, zero, own, rates)
 
 
-def physics_of(gyration: float, *, mismatch: float = MISMATCH) -> Any:
+def physics_of(gyration: float) -> Any:
     """Return the constants for the kernels; `gyration` [m] weighs torques."""
     out = kernels.ForceModel()
     out.stiffness, out.viscous, out.friction, out.leak = STIFFNESS, VISCOUS, FRICTION, LEAK
-    out.mismatch, out.gyration, out.tolerance = mismatch, gyration, TOLERANCE_N
+    out.mismatch, out.gyration, out.tolerance = MISMATCH, gyration, TOLERANCE_N
     out.damping, out.rate, out.warmup = DAMPING, FORCE_RATE, float(WARMUP)
     return out
 
 
-def _retreated(pair: Pair, starts: HandState) -> HandState:
-    back = quat_rotate(starts.rotation, pair.hand.model.palm.approach)
-    return HandState(starts.pivot - BACKOFF_M * back, starts.rotation, starts.q)
-
-
 class _Batch:
-    """Arrays and launches of a batch."""
-
     def __init__(self, search: Search, starts: HandState, steps: int) -> None:
         pair, n = search.pair, len(starts.pivot)
         self.grid, self.n = search.grid, n
@@ -181,50 +165,23 @@ class _Batch:
         poses.run()
         with wp.ScopedDevice(self.device):
             least = wp.full(self.n, 1e3, dtype=wp.float32)
-            wp.launch(
-                kernels.nearest,
-                (self.n, POINTS),
-                inputs=[self.grid, m.point_body, m.point_position, d.body_p, d.body_q],
-                outputs=[least],
-            )
+            points = [m.point_body, m.point_position, d.body_p, d.body_q]
+            wp.launch(kernels.nearest, (self.n, POINTS), inputs=[self.grid, *points], outputs=[least])
             return np.clip((least.numpy() - APART_M) / MAX_DILATION, 0.0, 1.0).astype(np.float32)
 
     def _record(self) -> Launches:
         m, d, n, out = self.model, self.data, self.n, Launches(self.device)
         add_poses(out, m, d)
-        out.add(
-            kernels.multipliers,
-            (n, 3),
-            inputs=[self.physics, self.task, d.active],
-            outputs=[self.total, self.multiplier, self.pull, self.gap],
-        )
-        out.add(
-            kernels.relax,
-            (n, POINTS),
-            inputs=[
-                self.physics,
-                self.grid,
-                self.velocity,
-                m.point_body,
-                m.point_position,
-                d.active,
-                d.iteration,
-                d.schedule.dilation,
-                d.dilation_scale,
-                d.body_p,
-                d.body_q,
-                self.pull,
-            ],
-            outputs=[self.force, self.first, self.largest, self.total, d.wrench],
-        )
+        sums = [self.total, self.multiplier, self.pull, self.gap]
+        out.add(kernels.multipliers, (n, 3), inputs=[self.physics, self.task, d.active], outputs=sums)
+        model = [self.physics, self.grid, self.velocity, m.point_body, m.point_position]
+        state = [d.active, d.iteration, d.schedule.dilation, d.dilation_scale, d.body_p, d.body_q, self.pull]
+        forces = [self.force, self.first, self.largest, self.total, d.wrench]
+        out.add(kernels.relax, (n, POINTS), inputs=[*model, *state], outputs=forces)
         add_self_penalty(out, m, d, 0.0)
         add_root_gradient(out, m, d)
         add_step(out, m, d, "adam", betas=BETAS)
         return out
-
-    def run(self, iterations: int) -> None:
-        """Launch `iterations` iterations."""
-        self.launches.run(iterations)
 
     def residual(self) -> Floats:
         """Return (n,) largest residuals of the moving tasks; 1: no contact force."""
@@ -242,31 +199,23 @@ def distance_grid(obj: DeviceObject, cells: int) -> Any:
     cell = float((high - low).max()) / cells
     shape = [int(n) for n in np.ceil((high - low) / cell).astype(int) + 1]
     reach = float(np.linalg.norm(high - low))
-    flat = surface.Surface()
-    flat.mesh, flat.corner_normals, flat.alpha = obj.surface.mesh, obj.surface.corner_normals, 0.0
-    flat.cells = obj.surface.cells
+    out = surface.Surface()
+    out.mesh, out.corner_normals, out.alpha = obj.surface.mesh, obj.surface.corner_normals, 0.0
+    out.cells = obj.surface.cells
     device = obj.device
     with wp.ScopedDevice(device):
         field = wp.empty(tuple(shape), dtype=wp.float32)
-        flat.field = wp.zeros((0, 0, 0), dtype=wp.float32)
+        out.field = wp.zeros((0, 0, 0), dtype=wp.float32)
 
     def slab(first: int, last: int) -> None:
-        corner = low + np.array([first * cell, 0.0, 0.0])
+        corner, dim = low + np.array([first * cell, 0.0, 0.0]), (last - first, shape[1], shape[2])
+        given = [out, wp.vec3(*corner), cell, reach]
         with wp.ScopedDevice(device):
-            wp.launch(
-                surface.sample_field,
-                dim=(last - first, shape[1], shape[2]),
-                inputs=[flat, wp.vec3(*corner), cell, reach],
-                outputs=[field[first:last]],
-                device=device,
-            )
+            wp.launch(surface.sample_field, dim, inputs=given, outputs=[field[first:last]])
 
     threads = 1 if wp.get_device(device).is_cuda else available_cores()
     bounds = np.linspace(0, shape[0], 4 * threads + 1).astype(int)
     with ThreadPoolExecutor(threads) as pool:
         list(pool.map(lambda ends: slab(*ends), pairwise(bounds.tolist())))
-    out = surface.Surface()
-    out.mesh, out.corner_normals, out.alpha, out.cells = flat.mesh, flat.corner_normals, 0.0, flat.cells
-    out.field, out.field_origin, out.field_cell = field, wp.vec3(*low), cell
-    out.field_error = 0.5 * cell
+    out.field, out.field_origin, out.field_cell, out.field_error = field, wp.vec3(*low), cell, 0.5 * cell
     return out

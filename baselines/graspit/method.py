@@ -21,18 +21,18 @@ from pydantic import Field
 
 from graspd.baselines.autograsp import kernels as closing_kernels
 from graspd.baselines.autograsp.method import HandCloser
-from graspd.baselines.common import PairCache, grasp_set, ground_of, inside_points, joined
+from graspd.baselines.common import frame_along, grasp_set, ground_of, inside_points, joined, search_of
 from graspd.baselines.graspit import kernels
-from graspd.baselines.graspit.schedule import FIRST_STEP
+from graspd.baselines.graspit.kernels import FIRST_STEP
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import Floats, quat_from_matrix
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.kinematics import ancestors
-from graspd.worker.hands.model import HandModel, SurfacePoints
+from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.planners.fast_graspd.pairs import Pair
-from graspd.worker.planners.port import Method, Options, Planner, PlanRequest
+from graspd.worker.planners.port import Method, Options, PlanRequest
 from graspd.worker.planners.threads import StepCounter, cut, run_parts
 from graspd.worker.simulation.data import Data, HandState
 from graspd.worker.simulation.device import to_wxyz, to_xyzw
@@ -51,7 +51,7 @@ class Search:
             self.problem = self._problem()
 
     def _problem(self) -> Any:
-        hand, obj, contacts = self.hand, self.pair.fine.obj, virtual_contacts(self.hand)
+        hand, obj, contacts = self.hand, self.pair.fine.obj, inside_points(self.hand, each=EACH, on_palm=ON_PALM)
         out = kernels.Problem()
         out.tree, out.surface, out.pieces = self.pair.hand.tree, obj.surface, self.pair.hand.pieces
         out.points = body_points(self.pair.fine.points, hand.bodies)
@@ -63,7 +63,7 @@ class Search:
         jumps = [PLACE_JUMP] * 3 + list(ANGLE_JUMPS) + list(np.ptp(self.eigen.limits, axis=1) / 4)
         out.low, out.high = kernels.vec8(*bounds[:, 0]), kernels.vec8(*bounds[:, 1])
         out.jump, out.circular = kernels.vec8(*jumps), PHI
-        out.palm = wp.quat(*to_xyzw(_approach_frame(hand)))
+        out.palm = wp.quat(*to_xyzw(quat_from_matrix(frame_along(hand.palm.approach))))
         out.origin = wp.array(self.eigen.origin, dtype=wp.float32)
         out.eigen = wp.array(self.eigen.directions, dtype=wp.float32)
         out.lower, out.upper = self.pair.hand.lower, self.pair.hand.upper
@@ -97,13 +97,10 @@ class Search:
                 raise InputError(f"{self.hand.name} finds no free place around {self.pair.fine.obj.model.name}")
             tell(0, "starts")
             begun, done = state.numpy(), 0
+            given = [self.problem, ROUNDS, steps, ALIKE]
+            found = [counter, rng, state, energy, best, best_energy, *scratch]
             for _ in range(0, max(0, PATIENCE * (steps - FIRST_STEP)), ROUNDS):
-                wp.launch(
-                    kernels.anneal,
-                    chains,
-                    inputs=[self.problem, ROUNDS, steps, ALIKE],
-                    outputs=[counter, rng, state, energy, best, best_energy, *scratch],
-                )
+                wp.launch(kernels.anneal, chains, inputs=given, outputs=found)
                 now = int((counter.numpy() - FIRST_STEP).sum())
                 tell(now - done, "annealing")
                 done = now
@@ -120,28 +117,21 @@ class Search:
         return HandState(pivot.numpy().astype(float), to_wxyz(rotation.numpy().astype(float)), q.numpy().astype(float))
 
 
-_searches: Final = PairCache(Search)
-
-
 class GraspitOptions(Options):
-    """Options of `graspit`."""
-
     steps: int = Field(
         70_000, gt=FIRST_STEP, le=1_000_000, description=f"step at which annealing ends; it counts from {FIRST_STEP}"
     )
     keep: int = Field(1, ge=1, le=20, description="grasps taken from the list of best states of each chain")
 
 
+@dataclass(frozen=True)
 class Graspit:
-    """See `worker.planners.Planner`."""
-
-    def __init__(self, options: GraspitOptions) -> None:
-        self.options = options
+    options: GraspitOptions
 
     def __call__(self, hand: HandModel, obj: ObjectModel, wanted: PlanRequest, run: ExecutionContext) -> GraspSet:
         began = time.perf_counter()
         pair = ground_of(hand, obj, run.device, kernels, closing_kernels)
-        search = _searches(pair)
+        search = search_of(Search, pair)
         keep, moves = self.options.keep, self.options.steps - FIRST_STEP
         chains = -(-wanted.count // keep)
         steps = StepCounter(chains * moves, run)
@@ -155,14 +145,10 @@ class Graspit:
         return grasp_set(pair, states[: wanted.count], began, {"chains": chains, "moves": moves})
 
 
-def _planner(options: GraspitOptions) -> Planner:
-    return Graspit(options)
-
-
 METHOD: Final = Method(
     summary="simulated annealing over eigengrasps with contact energy, then autograsp",
     source="M. T. Ciocarlie and P. K. Allen, Hand posture subspaces for dexterous robotic grasping, IJRR 2009",
-    planner=_planner,
+    planner=Graspit,
     options=GraspitOptions,
     uses=("face_error_m",),
     quick={"steps": FIRST_STEP + 400},
@@ -205,14 +191,6 @@ def clash_grid(pair: Pair, eigen: Eigengrasps) -> NDArray[np.int32]:
     return (depth > CLASH_M).astype(np.int32).reshape(CLASH_GRID, CLASH_GRID)
 
 
-def _approach_frame(hand: HandModel) -> Floats:
-    """Return the quaternion w x y z from the frame with z along the approach to the root frame."""
-    z = hand.palm.approach
-    x = np.cross(np.eye(3)[int(np.argmin(np.abs(z)))], z)
-    x /= np.linalg.norm(x)
-    return quat_from_matrix(np.column_stack([x, np.cross(z, x), z]))
-
-
 def _sorted(best: Floats, energy: Floats, begun: Floats) -> Floats:
     """Return (chains * keep, 8) best states first; missing ones are the chain's best, or its start."""
     out = np.empty_like(best)
@@ -221,11 +199,6 @@ def _sorted(best: Floats, energy: Floats, begun: Floats) -> Floats:
         rows = [states[k] for k in found] or [begun[c]]
         out[c] = [rows[min(k, len(rows) - 1)] for k in range(len(states))]
     return out.reshape(-1, best.shape[-1])
-
-
-def virtual_contacts(hand: HandModel) -> SurfacePoints:
-    """Return points with normals; none on links that neither close nor carry the palm."""
-    return inside_points(hand, each=EACH, on_palm=ON_PALM)
 
 
 #: Weights of a finger's first, second and later closing joints in the human hand's eigengrasps.
@@ -249,7 +222,6 @@ class Eigengrasps:
     """(2, 2) least and largest amplitude of each, beyond which no joint moves"""
 
     def posture(self, amplitudes: Floats, hand: HandModel) -> Floats:
-        """Return joint positions (n, D) for amplitudes (n, 2)."""
         return np.clip(self.origin + np.asarray(amplitudes) @ self.directions, hand.lower, hand.upper)
 
 
@@ -266,7 +238,6 @@ def places(hand: HandModel) -> NDArray[np.int32]:
 
 
 def eigengrasps(hand: HandModel) -> Eigengrasps:
-    """Return the two eigengrasps of a hand."""
     place, closing = places(hand), np.asarray(hand.closing, float)
     closes = closing != 0
     if place.max() <= 0:

@@ -11,12 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from graspd.baselines.learned.network import ProposalNetwork, cloud_inputs, conditions, decode, flow
+from graspd.baselines.learned.network import cloud_inputs, conditions, decode, flow
 from graspd.service.model.base import Digest
 from graspd.service.model.errors import InputError, SceneError
 from graspd.service.model.fidelity import Fidelity
 from graspd.service.model.scene_spec import UPRIGHT
 from graspd.service.model.transforms import Floats, compose, cross, invert, quat_conjugate, quat_rotate
+from graspd.service.store.network_file import ProposalNetwork
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.model import HandModel
@@ -38,11 +39,11 @@ class LearnedOptions(Options):
     starts: int = Field(4, ge=1, le=32, description="proposals of each grasp that set out")
 
 
+@dataclass(frozen=True)
 class LearnedPlanner:
     """fast_graspd with starts from a network's proposals."""
 
-    def __init__(self, options: LearnedOptions) -> None:
-        self.options = options
+    options: LearnedOptions
 
     def __call__(self, hand: HandModel, obj: ObjectModel, wanted: PlanRequest, run: ExecutionContext) -> GraspSet:
         """See `worker.planners.Planner`."""

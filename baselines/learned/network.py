@@ -28,33 +28,8 @@ from numpy.typing import ArrayLike
 
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import Floats, cross, quat_from_matrix, quat_to_matrix
-from graspd.service.store.network_file import (
-    BLOCKS,
-    CONDITION,
-    ENCODER,
-    POSE,
-    Floats32,
-    ProposalNetwork,
-    from_bytes,
-    read_file,
-    to_bytes,
-    weight_shapes,
-)
+from graspd.service.store.network_file import BLOCKS, CONDITION, ENCODER, POSE, Floats32, ProposalNetwork, to_bytes
 
-__all__ = [
-    "LENGTH_M",
-    "ProposalNetwork",
-    "Proposals",
-    "cloud_inputs",
-    "conditions",
-    "decode",
-    "encode",
-    "flow",
-    "load",
-    "propose",
-    "save",
-    "weight_shapes",
-]
 #: Unit of lengths in the encoder's input and in the condition [m].
 LENGTH_M: Final = 0.1
 #: Matrix products are cut into 32 rows and at most this many multiplications. OpenBLAS computes such products on one
@@ -84,22 +59,13 @@ class Proposals:
         return len(self.hand_pose)
 
 
-def load(path: Path) -> ProposalNetwork:
-    """Load a network from its file.
-
-    Raises:
-        InputError: the file is missing or no network; see `service.store.network_file.from_bytes`.
-    """
-    return from_bytes(read_file(path), str(path))
-
-
 def save(network: ProposalNetwork, path: Path) -> None:
     """Write a network's file.
 
     Raises:
-        InputError: `load` would refuse it.
+        InputError: `service.store.network_file.from_bytes` would refuse it.
     """
-    Path(path).write_bytes(to_bytes(network))
+    path.write_bytes(to_bytes(network))
 
 
 def propose(
@@ -193,19 +159,12 @@ def flow(network: ProposalNetwork, noise: Floats32, condition: Floats32) -> Floa
 
 def encode(proposals: Proposals, anchor: ArrayLike) -> Floats:
     """Return grasp rows (n, D), not standardised: input of `decode`, and training target."""
+    position = proposals.hand_pose[:, :3] - np.asarray(anchor, float)
     rotation = quat_to_matrix(proposals.hand_pose[:, 3:])
-    return np.concatenate(
-        [
-            proposals.hand_pose[:, :3] - np.asarray(anchor, float),
-            rotation[:, :, 0],
-            rotation[:, :, 1],
-            proposals.approach,
-            proposals.joints,
-            proposals.pregrasp - proposals.joints,
-            proposals.squeeze - proposals.joints,
-        ],
-        axis=1,
-    )
+    joints = proposals.joints
+    opened, pressed = proposals.pregrasp - joints, proposals.squeeze - joints
+    parts = [position, rotation[:, :, 0], rotation[:, :, 1], proposals.approach, joints, opened, pressed]
+    return np.concatenate(parts, axis=1)
 
 
 def decode(rows: ArrayLike, anchor: ArrayLike) -> Proposals:

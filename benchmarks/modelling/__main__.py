@@ -44,7 +44,6 @@ def studies(data: Path | None, count: dict[str, int]) -> dict[str, Callable[[], 
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the studies, keep their numbers, print their tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, help="folder with hands/ and objects/; by default what is built in")
     parser.add_argument("--out", type=Path, help="folder for modelling.json")

@@ -74,12 +74,10 @@ class Subject:
 
 
 def hand_of(data: Path | None) -> HandModel:
-    """The Allegro of the data folder, or the built-in one."""
     return hand_from_path("allegro" if data is None else data / ALLEGRO)
 
 
 def object_of(data: Path | None, name: str, face_error_m: float = FIDELITIES["standard"].face_error_m) -> ObjectModel:
-    """A YCB object of the data folder, or a built-in one."""
     found = object_from_path(name if data is None else data / "objects" / name / "clean.stl", face_error_m=face_error_m)
     return replace(found, name=name)
 

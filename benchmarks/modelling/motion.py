@@ -76,8 +76,6 @@ def _rollouts(subjects: list[Subject]) -> tuple[list[Floats], float]:
 
 
 def _soft(width_m: float) -> Callable[[Scene], None]:
-    """Hand surfaces that give way up to a depth before they are hard."""
-
     def soften(scene: Scene) -> None:
         # The harder side of a contact would win by half: the hand's word counts alone.
         scene.model.geom_priority[scene.hand_geoms] = 1

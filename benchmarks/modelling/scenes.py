@@ -168,7 +168,6 @@ def slabs(tables: list[OnTable]) -> Row:
 
 
 def study(subjects: list[Subject], count: int) -> dict[str, Any]:
-    """Everything about scenes, of `count` grasps of each object."""
     tables = [OnTable(replace(subject, count=count)) for subject in subjects]
     for one in tables:
         _ = (one.clear, one.subject.pieces)  # grasps, ways and pieces are there before a clock starts

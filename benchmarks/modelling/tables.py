@@ -8,7 +8,6 @@ Row = dict[str, Any]
 
 
 def tables(found: dict[str, Any]) -> dict[str, str]:
-    """Title -> table, of the studies that are there."""
     out = {}
     if "motion" in found:
         study = found["motion"]
@@ -50,7 +49,6 @@ def _table(head: str, rows: Any) -> str:
 
 
 def percent(rate: Row) -> str:
-    """A rate with its interval, in percent."""
     return f"{100 * rate['value']:.0f} % ({100 * rate['low']:.0f} to {100 * rate['high']:.0f})"
 
 

@@ -48,7 +48,6 @@ def load(docs: Path) -> Manifest:
 
 
 def save(docs: Path, records: Manifest) -> None:
-    """Write the records in the order of the list."""
     order = list(BY_NAME)
     known = sorted(records, key=lambda name: order.index(name) if name in order else len(order))
     ordered = {name: records[name] for name in known}

@@ -212,7 +212,6 @@ def slim(file: Path) -> None:
 
 
 def machine() -> str:
-    """Processor and number of cores."""
     names = re.findall(r"model name\s*: (.*)", Path("/proc/cpuinfo").read_text()) if sys.platform == "linux" else []
     return f"{names[0] if names else platform.machine()}, {available_cores()} cores"
 

@@ -23,8 +23,9 @@ from examples.train_grasp_predictor.sheet import page
 from examples.train_grasp_predictor.table import markdown
 from examples.train_grasp_predictor.training import SHOWN, Trained, TrainingData, train
 from examples.train_grasp_predictor.without_network import SQUEEZE, Nearest, across
-from graspd.baselines.learned.network import ProposalNetwork, Proposals, propose, save
+from graspd.baselines.learned.network import Proposals, propose, save
 from graspd.service.readers import Shards, open_shards
+from graspd.service.store.network_file import ProposalNetwork
 from graspd.worker.engines import backend
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel

@@ -8,10 +8,8 @@ import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from importlib import import_module
 from json import loads
 from pathlib import Path
-from types import ModuleType
 from typing import Annotated, Any, Final
 
 import typer
@@ -238,6 +236,7 @@ def chart(
 ) -> None:
     """Compare speed and accuracy: methods and fidelities on the same hands and objects, in MuJoCo."""
     from graspd.studies.chart.chart import settings_of
+    from graspd.studies.chart.report import write
     from graspd.studies.chart.sweeps import sweep as turn
     from graspd.studies.chart.sweeps import turns
     from graspd.worker.hands.load import hand_from_path
@@ -268,7 +267,7 @@ def chart(
 
     def keep(so_far: dict[str, Any]) -> None:
         if out is not None:
-            _write(so_far | said, out)
+            write(so_far | said, out)
 
     if place is None:
         from graspd.studies.chart.chart import chart as run
@@ -286,23 +285,16 @@ def chart(
 
 
 def _finish(result: dict[str, Any], out: Path | None, data_dir: Path | None, *, publish: bool, json: bool) -> None:
+    from graspd.studies.chart.report import markdown, write
+
     if out is not None:
-        _write(result, out)
+        write(result, out)
     if publish:
         _publish_chart(result, data_dir)
     if json:
         emit(result)
     else:
-        typer.echo(_report(result).markdown(result))
-
-
-def _report(chart: dict[str, Any]) -> ModuleType:
-    """Return the module that writes the chart: a chart in scenes has other columns."""
-    return import_module(f"graspd.studies.chart.{'scene_report' if 'scene' in chart else 'report'}")
-
-
-def _write(chart: dict[str, Any], out: Path) -> None:
-    _report(chart).write(chart, out)
+        typer.echo(markdown(result))
 
 
 def _read_chart(path: Path) -> dict[str, Any]:

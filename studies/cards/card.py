@@ -25,8 +25,6 @@ from graspd.worker.rendering import sheets
 
 #: Sample pictures of the dataset.
 SHEET: Final = "samples.jpg"
-#: Called after each shard: number done, total number.
-Progress = Callable[[int, int], None]
 MOST: Final = 12
 _COLUMNS: Final = 4
 _WIDTH: Final = 240
@@ -40,9 +38,11 @@ def write_card(
     *,
     licence: str = "",
     source: str = "",
-    progress: Progress = lambda done, total: None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> dict[str, Any]:
     """Read all shards and write the card; replace files of an earlier one.
+
+    `progress` is called after each shard with the numbers of done and of all shards.
 
     Returns:
         the figures, as in `card.json`, and under `plots` the names of the pictures.
@@ -57,7 +57,13 @@ def write_card(
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"the folder {folder} cannot be made: {error.strerror}") from None
-    tally = tally_of(contents, _counted(pieces(contents), len(contents.shards), progress))
+
+    def counted() -> Iterator[ShardContents]:
+        for number, piece in enumerate(pieces(contents), start=1):
+            yield piece
+            progress(number, len(contents.shards))
+
+    tally = tally_of(contents, counted())
     card = numbers(contents, tally, licence=licence, source=source)
     plots = draw(card, tally, folder)
     if write_samples(contents.shards, folder / SHEET):
@@ -81,12 +87,6 @@ def checksums(contents: Contents) -> Iterator[str]:
             yield f"{hashlib.file_digest(opened, 'sha256').hexdigest()}  {path.relative_to(root)}\n"
 
 
-def _counted(found: Iterator[ShardContents], total: int, progress: Progress) -> Iterator[ShardContents]:
-    for number, piece in enumerate(found, start=1):
-        yield piece
-        progress(number, total)
-
-
 def write_samples(shards: Shards, file: Path) -> bool:
     """Write a JPEG; return False for a dataset without pictures. Each shown shard is fetched completely."""
     chosen = choose(shards.of("views"))
@@ -107,16 +107,16 @@ def write_samples(shards: Shards, file: Path) -> bool:
     return True
 
 
-def choose(files: tuple[ShardFile, ...], most: int = MOST) -> list[ShardFile]:
-    """Choose at most `most` shards over all objects, with a different hand each time."""
+def choose(files: tuple[ShardFile, ...]) -> list[ShardFile]:
+    """Choose at most `MOST` shards over all objects, with a different hand each time."""
     cells: dict[tuple[str, str], list[ShardFile]] = {}
     for file in files:
         cells.setdefault((file.hand, file.object), []).append(file)
     hands = list(dict.fromkeys(hand for hand, _ in cells))
     objects = list(dict.fromkeys(obj for _, obj in cells))
     ranked = sorted(cells, key=lambda cell: (hands.index(cell[0]) - objects.index(cell[1])) % len(hands))
-    some = ranked[: max(most, len(objects))]
-    spread = some if len(some) <= most else [some[round(k)] for k in np.linspace(0, len(some) - 1, most)]
+    some = ranked[: max(MOST, len(objects))]
+    spread = some if len(some) <= MOST else [some[round(k)] for k in np.linspace(0, len(some) - 1, MOST)]
     # A different batch each: batches of one number share materials and lamps.
     chosen = (cells[cell] for cell in sorted(spread, key=lambda cell: objects.index(cell[1])))
     return [batches[number % len(batches)] for number, batches in enumerate(chosen)]

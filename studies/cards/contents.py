@@ -49,14 +49,6 @@ class AssetFacts:
 
 
 @dataclass(frozen=True)
-class MissingBatches:
-    """Missing batches of a cell of the snapshot, and the reason."""
-
-    tasks: int
-    reason: str
-
-
-@dataclass(frozen=True)
 class Contents:
     """Input of a card. `snapshot` and `record` are None if there are only files."""
 
@@ -66,7 +58,8 @@ class Contents:
     objects: Mapping[str, AssetFacts]
     snapshot: Snapshot | None = None
     record: DatasetRecord | None = None
-    gaps: Mapping[Pair, MissingBatches] = field(default_factory=dict)
+    gaps: Mapping[Pair, tuple[int, str]] = field(default_factory=dict)
+    """Number of batches of a cell that the snapshot lacks, and the reason."""
     root: Path | None = None
     """Folder of the shards, if they are files."""
 
@@ -91,7 +84,7 @@ def contents_of_store(store: Store, dataset: str, snapshot: str | None = None, c
     )
 
 
-def contents_of_folder(folder: Path, name: str | None = None) -> Contents:
+def contents_of_folder(folder: Path) -> Contents:
     """Return the shards of a folder, such as an export, with facts of built-in hands and objects only.
 
     Raises:
@@ -105,8 +98,8 @@ def contents_of_folder(folder: Path, name: str | None = None) -> Contents:
         {known: _builtin(kind, known, digest) for known, digest in sorted(_digests(shards, kind).items())}
         for kind in (AssetKind.HAND, AssetKind.OBJECT)
     )
-    known_as = name or (taken.dataset if taken else folder.resolve().name)
-    return Contents(known_as, shards, hands, objects, taken, root=folder)
+    name = taken.dataset if taken else folder.resolve().name
+    return Contents(name, shards, hands, objects, taken, root=folder)
 
 
 def with_provenance(contents: Contents, file: Path) -> Contents:
@@ -125,11 +118,8 @@ def with_provenance(contents: Contents, file: Path) -> Contents:
         raise InputError(f"{file} cannot be read: {error.strerror}") from None
     except (ValueError, AttributeError, TypeError):
         raise InputError(f'{file} is not as {{"objects": {{"mug": {{"licence": "...", "source": "..."}}}}}}') from None
-    return replace(
-        contents,
-        hands=_informed(contents.hands, groups["hands"], file),
-        objects=_informed(contents.objects, groups["objects"], file),
-    )
+    hands, objects = (_informed(getattr(contents, kind), said, file) for kind, said in groups.items())
+    return replace(contents, hands=hands, objects=objects)
 
 
 def _informed(
@@ -176,7 +166,6 @@ def _described(name: str, digest: str, files: Mapping[str, bytes], facts: Any, *
 
 @lru_cache
 def _checked(kind: AssetKind, name: str) -> dict[str, Any]:
-    """Return the facts of a built-in asset; it may be read in this process."""
     files = builtin_files(kind, name)
     if kind is AssetKind.HAND:
         from graspd.worker.hands.check import check_hand
@@ -191,7 +180,6 @@ def _checked(kind: AssetKind, name: str) -> dict[str, Any]:
 
 
 def _digests(shards: Shards, kind: AssetKind) -> dict[str, str]:
-    """Return names and digests, from the first shard of each."""
     found: dict[str, str] = {}
     for file in shards:
         name = file.hand if kind is AssetKind.HAND else file.object
@@ -201,17 +189,14 @@ def _digests(shards: Shards, kind: AssetKind) -> dict[str, str]:
     return found
 
 
-def _gaps(store: Store, record: DatasetRecord, taken: Snapshot) -> dict[Pair, MissingBatches]:
-    """Return the planned batches that the snapshot lacks."""
+def _gaps(store: Store, record: DatasetRecord, taken: Snapshot) -> dict[Pair, tuple[int, str]]:
     there = {shard.id for shard in taken.shards}
-    gaps: dict[Pair, MissingBatches] = {}
+    gaps = {}
     for cell in record.cells():
         missing = [task for task in plan(job_of(cell, record.options, record.revisions)) if task.output not in there]
         if missing:
             reasons = (attempts[-1].reason for task in missing if (attempts := task_attempts(store, task.id)))
-            gaps[cell.hand.name, cell.object.name] = MissingBatches(
-                len(missing), next(reasons, "not made yet, or cancelled")
-            )
+            gaps[cell.hand.name, cell.object.name] = len(missing), next(reasons, "not made yet, or cancelled")
     return gaps
 
 
@@ -245,7 +230,7 @@ class ShardContents:
     size_bytes: int
     rows: int
     """Grasps, pairs of grasp and scene, or pictures."""
-    info: Mapping[str, Any]
+    info: Mapping[str, Any] = field(default_factory=dict)
     """Remarks of the stage: seconds of its parts, rejected candidates."""
     revision: int | None = None
 
@@ -261,24 +246,18 @@ def pieces(contents: Contents) -> Iterator[ShardContents]:
 
 def _piece(contents: Contents, file: ShardFile, size: int | None) -> ShardContents:
     manifest = _manifest(contents, file)
-    if manifest is not None and file.kind == "views":
-        return _unopened(file, manifest)
+    unopened = None if manifest is None else _unopened(file, manifest)
+    if unopened is not None and file.kind == "views":
+        return unopened
     path = contents.shards.path(file)
     with open_shard(path) as opened:
         said = {key: _plain(value) for key, value in opened.attrs.items()}
         columns = {name: read_column(opened, name, str(path)) for name in COLUMNS[file.kind] if name in opened}
         rows = len(opened[{"base": "quality/valid", "scene": "grasp/valid", "views": "camera/eye"}[file.kind]])
-    if manifest is not None:
-        said = {**_unopened(file, manifest).said, **said}
-    return ShardContents(
-        file,
-        columns,
-        said,
-        size or path.stat().st_size,
-        rows,
-        manifest.info if manifest else {},
-        manifest.stage_revision if manifest else None,
-    )
+    found = ShardContents(file, columns, said, size or path.stat().st_size, rows)
+    if unopened is None:
+        return found
+    return replace(found, said={**unopened.said, **said}, info=unopened.info, revision=unopened.revision)
 
 
 def _manifest(contents: Contents, file: ShardFile) -> ShardManifest | None:
@@ -292,13 +271,9 @@ def _manifest(contents: Contents, file: ShardFile) -> ShardManifest | None:
 
 
 def _unopened(file: ShardFile, manifest: ShardManifest) -> ShardContents:
-    said: dict[str, Any] = {
-        "seconds": manifest.seconds,
-        "device": manifest.device,
-        "worker": manifest.worker,
-        "seed": manifest.seed,
-        "created": manifest.created,
-        "code_version": manifest.code_version,
+    copied = ("seconds", "device", "worker", "seed", "created", "code_version")
+    said: dict[str, Any] = {name: getattr(manifest, name) for name in copied}
+    said |= {
         "method": manifest.request.method,
         "fidelity": json_attribute(manifest.request.knobs.model_dump(mode="json")),
         "want": manifest.request.want,

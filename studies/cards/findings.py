@@ -32,12 +32,9 @@ def findings(card: Row) -> list[str]:
 
 
 def _snapshot(card: Row) -> str:
-    taken = card["snapshot"]
-    return (
-        "**Not complete**: the snapshot was taken before every cell had succeeded."
-        if taken and not taken["complete"]
-        else ""
-    )
+    if not card["snapshot"] or card["snapshot"]["complete"]:
+        return ""
+    return "**Not complete**: the snapshot was taken before every cell had succeeded."
 
 
 def _gaps(card: Row) -> list[str]:
@@ -256,5 +253,4 @@ def _listed(words: Sequence[str]) -> str:
 
 
 def _percent(value: float) -> str:
-    """Return a share with as many digits as needed."""
     return f"{100 * value:.0f} %" if value >= 0.095 or value == 0 else f"{100 * value:.1f} %"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -48,7 +48,7 @@ def numbers(contents: Contents, tally: Tally, *, licence: str = "", source: str 
         "making": _making(contents, tally),
         "validity": {**_validity(cells), "by_hand": {hand: _validity(tally.of_hand(hand)) for hand in contents.hands}},
         "quality": {hand: _quality(tally.of_hand(hand)) for hand in contents.hands},
-        "contact_threshold_m": _most(tally.threshold_m),
+        "contact_threshold_m": next((value for value, _ in tally.threshold_m.most_common(1)), None),
         "table": {**_table(cells), "by_object": {obj: _table(tally.of_object(obj)) for obj in contents.objects}},
         "elevation": {
             hand: {name: counts.tolist() for name, counts in sums.items()} for hand, sums in tally.elevation.items()
@@ -104,19 +104,14 @@ def _asset(asset: AssetFacts, cells: Sequence[CellTally], kind: AssetKind) -> Ro
 def _making(contents: Contents, tally: Tally) -> Row:
     valid = sum(cell.valid for cell in tally.cells.values())
     total = sum(tally.seconds.values())
+    scenes = [_knobs(text) for text in _said(tally, "scene")]
     return {
         "methods": _said(tally, "method"),
         "fidelities": [_knobs(text) for text in _said(tally, "fidelity")],
         "levels": _said(tally, "verdict_level"),
         "verdict_keys": len(tally.values.get("verdict_key", {})),
-        "scenes": sorted({str(_knobs(text).get("kind", "")) for text in _said(tally, "scene")} - {"", "free"}),
-        "neighbours": sorted(
-            {
-                str(one.get("object", ""))
-                for text in _said(tally, "scene")
-                for one in _knobs(text).get("neighbours") or ()
-            }
-        ),
+        "scenes": sorted({str(spec.get("kind", "")) for spec in scenes} - {"", "free"}),
+        "neighbours": sorted({str(one.get("object", "")) for spec in scenes for one in spec.get("neighbours") or ()}),
         "wants": _said(tally, "want"),
         "seeds": _said(tally, "seed"),
         "friction": _said(tally, "mu"),
@@ -231,15 +226,13 @@ def _cells(contents: Contents, tally: Tally) -> list[Row]:
     pairs = [(hand, obj) for hand in contents.hands for obj in contents.objects] if contents.record else [*tally.cells]
     rows = []
     for pair in pairs:
-        cell, gap = tally.cells.get(pair, CellTally()), contents.gaps.get(pair)
+        cell, gap = tally.cells.get(pair, CellTally()), contents.gaps.get(pair, (0, None))
         valid = _validity([cell])
         row: Row = {"hand": pair[0], "object": pair[1], "asked": asked, "grasps": cell.grasps}
-        row |= {
-            key: valid[key]
-            for key in ("candidates", "validated", "valid", "rejected", "rechecked", "recheck_dropped", "seconds")
-        }
+        copied = ("candidates", "validated", "valid", "rejected", "rechecked", "recheck_dropped", "seconds")
+        row |= {key: valid[key] for key in copied}
         row["of_validated"] = valid["of_validated"] and valid["of_validated"]["share"]
-        row |= {"missing_tasks": gap.tasks if gap else 0, "missing_because": gap.reason if gap else None}
+        row |= {"missing_tasks": gap[0], "missing_because": gap[1]}
         row["median"] = {name: found["median"] for name, found in _quality([cell]).items()}
         row["clear_of_table"] = (_table([cell])["of_grasps"] or {}).get("share")
         row["directions"] = _directions([cell])
@@ -259,13 +252,8 @@ def _diversity(cell: CellTally) -> float | None:
 
 
 def _repeated(cell: CellTally) -> int:
-    """Return the number of valid grasps that equal an earlier one of the same cell."""
     prints = np.concatenate([np.empty(0, np.int64), *cell.prints])
     return len(prints) - len(np.unique(prints))
-
-
-def _most(counts: Mapping[Any, int]) -> Any:
-    return max(counts, key=lambda key: counts[key]) if counts else None
 
 
 def _six(value: float | np.floating[Any] | NDArray[Any]) -> float:

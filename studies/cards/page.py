@@ -6,16 +6,9 @@ import json
 from collections.abc import Iterable, Mapping
 from typing import Any, Final
 
+from graspd.studies.cards import tables
 from graspd.studies.cards.findings import findings
-from graspd.studies.cards.tables import (
-    cells_table,
-    hands_table,
-    objects_table,
-    percent,
-    quality_table,
-    size,
-    validity_table,
-)
+from graspd.studies.cards.tables import percent, size
 from graspd.worker.quality import gate as gates
 
 Row = Mapping[str, Any]
@@ -157,15 +150,14 @@ def _composition(card: Row) -> str:
         f"{made['scenes']:,} scenes, {made['pairs']:,} pairs of grasp and scene, {made['pictures']:,} pictures. "
         f"Shards: {shards}; {size(sum(made['bytes'].values()))} in all."
     )
-    objects = objects_table(card)
+    objects = tables.objects_table(card)
     if len(made["objects"]) > _UNFOLDED:
         objects = _details(f"Objects: {len(made['objects']):,}", objects)
-    return f"## What it holds\n\n{counts}\n\n{hands_table(card)}\n\n{objects}"
+    return f"## What it holds\n\n{counts}\n\n{tables.hands_table(card)}\n\n{objects}"
 
 
 def _making(card: Row) -> str:
     making = card["making"]
-    total = sum(making["seconds"].values())
     knobs = ", ".join(str(found.get("name", "custom")) for found in making["fidelities"])
     rows = {
         "method, fidelity": f"{', '.join(making['methods'])}; {knobs}",
@@ -183,7 +175,7 @@ def _making(card: Row) -> str:
         "made": f"{making['first_shard'][:19]}Z to {making['last_shard'][:19]}Z" if making["first_shard"] else "",
         "worker seconds": ", ".join(f"{kind} {value:,.0f}" for kind, value in making["seconds"].items()),
         "of the base shards": ", ".join(f"{name} {value:,.0f}" for name, value in making["synthesis_parts"].items()),
-        "per 1,000 valid grasps": _per_thousand(card) if total else "",
+        "per 1,000 valid grasps": _per_thousand(card),
     }
     lines = "\n".join(
         f"| {name} | {value or 'not recorded'} |" for name, value in rows.items() if value or name != "imported from"
@@ -196,7 +188,7 @@ def _making(card: Row) -> str:
 
 def _per_thousand(card: Row) -> str:
     making, valid = card["making"], card["composition"]["valid"]
-    if not valid:
+    if not making["seconds_per_1000_valid"]:
         return ""
     each = ", ".join(f"{kind} {1000 * value / valid:,.0f} s" for kind, value in making["seconds"].items())
     return f"{making['seconds_per_1000_valid']:,.0f} worker seconds ({each})"
@@ -225,7 +217,7 @@ def _validity(card: Row, plots: Mapping[str, str]) -> str:
             f"Not validated: no grasp is valid. A grasp that passes the geometric gate, {gate}, is feasible: "
             "whether it holds is not known."
         )
-    return f"## Validity\n\n{text}\n\n{validity_table(card)}{_plot('yield.png', plots)}"
+    return f"## Validity\n\n{text}\n\n{tables.validity_table(card)}{_plot('yield.png', plots)}"
 
 
 def _hard(card: Row) -> str:
@@ -241,8 +233,8 @@ def _quality(card: Row, plots: Mapping[str, str]) -> str:
         f"lower is more diverse. Directions are {card['directions']['cells']} of equal area, from where the palm comes "
         "in the object's frame."
     )
-    fold = _details("Each hand on each object (medians)", f"{cells_table(card)}\n\n{note}")
-    return f"## Quality\n\n{text}\n\n{quality_table(card)}{_plot('quality.png', plots)}\n\n{fold}"
+    fold = _details("Each hand on each object (medians)", f"{tables.cells_table(card)}\n\n{note}")
+    return f"## Quality\n\n{text}\n\n{tables.quality_table(card)}{_plot('quality.png', plots)}\n\n{fold}"
 
 
 def _coverage(card: Row, plots: Mapping[str, str]) -> str:
@@ -339,7 +331,7 @@ def _millimetres(value: float | None) -> str:
 def citations(methods: Iterable[str], name: str, version: str, year: str, snapshot: str) -> str:
     """Return BibTeX of the methods' papers and of the dataset itself; `snapshot` may be empty."""
     note = f",\n  note   = {{snapshot {snapshot}}}" if snapshot else ""
-    key = "".join(dexgraspbench for dexgraspbench in name if dexgraspbench.isalnum()) or "dataset"
+    key = "".join(letter for letter in name if letter.isalnum()) or "dataset"
     own = f"""@misc{{{key}{year},
   title  = {{{name}: grasps made by graspd {version}}},
   year   = {{{year}}}{note}

@@ -63,8 +63,8 @@ def _objects(card: Row) -> list[str]:
     return [obj["name"] for obj in card["composition"]["objects"]]
 
 
-def _plain(axes: Any, *, grid: str = "both") -> None:
-    axes.grid(alpha=0.25, axis=grid)
+def _plain(axes: Any) -> None:
+    axes.grid(alpha=0.25)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
 
@@ -231,14 +231,9 @@ def _sizes(card: Row, tally: Tally) -> Any:
     for axes, place, what in zip(panels, range(3), ("smallest", "middle", "largest"), strict=True):
         for number, hand in enumerate(_hands(card)):
             own = [cell for cell in rows if cell["hand"] == hand]
-            axes.scatter(
-                [1e3 * sizes[cell["object"]][place] for cell in own],
-                [100 * cell["of_validated"] for cell in own],
-                s=22,
-                color=COLOURS[number % len(COLOURS)],
-                label=hand,
-                alpha=0.85,
-            )
+            extents = [1e3 * sizes[cell["object"]][place] for cell in own]
+            shares = [100 * cell["of_validated"] for cell in own]
+            axes.scatter(extents, shares, s=22, color=COLOURS[number % len(COLOURS)], label=hand, alpha=0.85)
         axes.set_xlabel(f"{what} extent of the object, mm", fontsize=9)
         axes.tick_params(labelsize=8)
         axes.set_xlim(0, None)

@@ -23,76 +23,67 @@ def markdown(head: Sequence[str], rows: Sequence[Sequence[str]], *, words: int =
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
+def _by_heading(rows: Sequence[Mapping[str, str]], *, words: int = 1) -> str:
+    return markdown(list(rows[0]), [list(row.values()) for row in rows], words=words)
+
+
 def hands_table(card: Row) -> str:
     rows = [
-        [
-            hand["name"],
-            hand["description"] or "-",
-            hand["licence"] or "not recorded",
-            hand["source"] or "not recorded",
-            _code(hand["digest"]),
-            _number(hand["dofs"]),
-            _number(hand["fingertips"]),
-            f"{hand['valid']:,}",
-        ]
+        {
+            "hand": hand["name"],
+            "what": hand["description"] or "-",
+            **_origin(hand),
+            "dofs": _number(hand["dofs"]),
+            "fingertips": _number(hand["fingertips"]),
+            "valid grasps": f"{hand['valid']:,}",
+        }
         for hand in card["composition"]["hands"]
     ]
-    head = ("hand", "what", "licence", "source", "digest", "dofs", "fingertips", "valid grasps")
-    return markdown(head, rows, words=5)
+    return _by_heading(rows, words=5)
 
 
 def objects_table(card: Row) -> str:
     rows = [
-        [
-            obj["name"],
-            obj["licence"] or "not recorded",
-            obj["source"] or "not recorded",
-            _code(obj["digest"]),
-            _size(obj["extents_m"]),
-            "-" if obj["volume_m3"] is None else f"{1e6 * obj['volume_m3']:.0f}",
-            f"{obj['valid']:,}",
-        ]
+        {
+            "object": obj["name"],
+            **_origin(obj),
+            "size, mm": _size(obj["extents_m"]),
+            "cm³": "-" if obj["volume_m3"] is None else f"{1e6 * obj['volume_m3']:.0f}",
+            "valid grasps": f"{obj['valid']:,}",
+        }
         for obj in card["composition"]["objects"]
     ]
-    return markdown(("object", "licence", "source", "digest", "size, mm", "cm³", "valid grasps"), rows, words=4)
+    return _by_heading(rows, words=4)
+
+
+def _origin(asset: Row) -> dict[str, str]:
+    known = {key: asset[key] or "not recorded" for key in ("licence", "source")}
+    return {**known, "digest": f"`{asset['digest'][:12]}`" if asset["digest"] else "-"}
 
 
 def validity_table(card: Row) -> str:
-    """Return a table by hand and in total: candidates, valid ones, rejections, rechecks, cost."""
     found = {**card["validity"]["by_hand"], "**all**": card["validity"]}
     rows = []
     for name, row in found.items():
         of_validated = interval(row["of_validated"]) if row["validated"] or not row["candidates"] else "not validated"
         each = 1000 * row["seconds"] / row["valid"] if row["valid"] and row["seconds"] else None
         rows.append(
-            [
-                name,
-                f"{row['candidates']:,}",
-                f"{row['valid']:,}",
-                of_validated,
-                _rejected(row["rejected"]),
-                f"{row['rechecked']:,}",
-                str(row["recheck_dropped"]) if row["rechecked"] else "-",
-                interval(row["false_valid"]),
-                "not recorded" if each is None else f"{each:,.0f}",
-            ]
+            {
+                "hand": name,
+                "candidates": f"{row['candidates']:,}",
+                "valid": f"{row['valid']:,}",
+                "valid of validated (95 %)": of_validated,
+                "why not": _rejected(row["rejected"]),
+                "rechecked": f"{row['rechecked']:,}",
+                "overturned": str(row["recheck_dropped"]) if row["rechecked"] else "-",
+                "false valid (95 %)": interval(row["false_valid"]),
+                "worker s per 1,000": "not recorded" if each is None else f"{each:,.0f}",
+            }
         )
-    head = (
-        "hand",
-        "candidates",
-        "valid",
-        "valid of validated (95 %)",
-        "why not",
-        "rechecked",
-        "overturned",
-        "false valid (95 %)",
-        "worker s per 1,000",
-    )
-    return markdown(head, rows)
+    return _by_heading(rows)
 
 
 def quality_table(card: Row) -> str:
-    """Return the median and the range from the 5th to the 95th percentile, by hand."""
     hands = list(card["quality"])
     rows = []
     for name, (title, digits) in QUALITY_NAMES.items():
@@ -107,45 +98,31 @@ def quality_table(card: Row) -> str:
 
 
 def cells_table(card: Row) -> str:
-    """Return a row for each hand x object."""
     rows = []
     for cell in card["cells"]:
-        median = cell["median"]
-        rows.append(
-            [
-                cell["hand"],
-                cell["object"],
-                "-" if cell["asked"] is None else f"{cell['asked']:,}",
-                f"{cell['candidates']:,}",
-                f"{cell['valid']:,}",
-                percent(cell["of_validated"]),
-                *(_fixed(median.get(name), QUALITY_NAMES[name][1]) for name in _SHOWN),
-                percent(cell["clear_of_table"]),
-                _fixed(cell["diversity"], 2),
-                percent(1 - cell["directions"]["empty"] / card["directions"]["cells"]) if cell["directions"] else "-",
-                _bits(cell["directions"]),
-                _bits(cell.get("types")),
-                cell["missing_because"] or "",
-            ]
-        )
-    head = [
-        "hand",
-        "object",
-        "asked",
-        "candidates",
-        "valid",
-        "of validated",
-        *(QUALITY_NAMES[name][0] for name in _SHOWN),
-        "clear of table",
-        "D",
-        "directions used",
-        "entropy of directions, bit",
-        "of types, bit",
-        "missing because",
-    ]
-    if not any(row[-1] for row in rows):
-        head, rows = head[:-1], [row[:-1] for row in rows]
-    return markdown(head, rows, words=2)
+        used = cell["directions"] and 1 - cell["directions"]["empty"] / card["directions"]["cells"]
+        row = {
+            "hand": cell["hand"],
+            "object": cell["object"],
+            "asked": "-" if cell["asked"] is None else f"{cell['asked']:,}",
+            "candidates": f"{cell['candidates']:,}",
+            "valid": f"{cell['valid']:,}",
+            "of validated": percent(cell["of_validated"]),
+        }
+        for name in _SHOWN:
+            title, digits = QUALITY_NAMES[name]
+            row[title] = _fixed(cell["median"].get(name), digits)
+        row |= {
+            "clear of table": percent(cell["clear_of_table"]),
+            "D": _fixed(cell["diversity"], 2),
+            "directions used": percent(used),
+            "entropy of directions, bit": _bits(cell["directions"]),
+            "of types, bit": _bits(cell["types"]),
+        }
+        if any(one["missing_because"] for one in card["cells"]):
+            row["missing because"] = cell["missing_because"] or ""
+        rows.append(row)
+    return _by_heading(rows, words=2)
 
 
 _SHOWN: Final = (
@@ -158,7 +135,6 @@ _SHOWN: Final = (
 
 
 def interval(found: Row | None) -> str:
-    """Return a share with its 95 % interval."""
     if found is None:
         return "not known"
     return f"{percent(found['share'])} ({percent(found['low'])} to {percent(found['high'])})"
@@ -172,7 +148,6 @@ def percent(value: float | None) -> str:
 
 
 def size(count: int) -> str:
-    """Return bytes as readable text."""
     value, unit = float(count), 0
     while value >= 1000 and unit < len(_UNITS) - 1:
         value, unit = value / 1000, unit + 1
@@ -186,7 +161,6 @@ def _spread(cell: Row | None, digits: int) -> str:
 
 
 def _rejected(rejected: Mapping[str, int] | None) -> str:
-    """Return the outcomes of rejected candidates in words."""
     words = {
         "dropped": "dropped by the validator",
         "gate": "failed the gate",
@@ -208,10 +182,6 @@ def _bits(found: Row | None) -> str:
 
 def _number(value: int | None) -> str:
     return "-" if value is None else str(value)
-
-
-def _code(digest: str | None) -> str:
-    return f"`{digest[:12]}`" if digest else "-"
 
 
 def _size(extents: Sequence[float] | None) -> str:

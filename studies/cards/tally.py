@@ -43,12 +43,8 @@ class JointUse:
         """Return empty histograms for the joints with limits in the hand's facts."""
         lower, upper = dict(facts.get("lower", {})), dict(facts.get("upper", {}))
         known = tuple(name for name in names if name in lower and upper[name] > lower[name])
-        return cls(
-            known,
-            np.array([lower[name] for name in known]),
-            np.array([upper[name] for name in known]),
-            np.zeros((len(known), BINS), np.int64),
-        )
+        low, high = (np.array([ends[name] for name in known]) for ends in (lower, upper))
+        return cls(known, low, high, np.zeros((len(known), BINS), np.int64))
 
     def add(self, names: tuple[str, ...], positions: Floats) -> None:
         """Count grasps (N, joints) of these names; positions outside the limits count at the limit."""
@@ -174,18 +170,8 @@ class Tally:
 
 
 _ATTRIBUTES: Final = (
-    "method",
-    "fidelity",
-    "seed",
-    "want",
-    "device",
-    "worker",
-    "code_version",
-    "verdict_level",
-    "mu",
-    "source",
-    "verdict_key",
-    "scene",
+    *("method", "fidelity", "seed", "want", "device", "worker", "code_version"),
+    *("verdict_level", "verdict_key", "mu", "source", "scene"),
 )
 
 
@@ -211,7 +197,6 @@ def tally_of(contents: Contents, pieces: Iterable[ShardContents]) -> Tally:
 
 
 def _note(tally: Tally, cell: CellTally, piece: ShardContents) -> None:
-    """Add the sums that are independent of the kind of shard."""
     kind = piece.file.kind
     tally.shards[kind] += 1
     tally.bytes[kind] += piece.size_bytes

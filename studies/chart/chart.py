@@ -15,7 +15,8 @@ from graspd.service.model.fidelity import FIDELITIES
 from graspd.service.model.version import PACKAGE_VERSION
 from graspd.studies.bench import device_name
 from graspd.studies.chart.statistics import figures, plain, summed
-from graspd.studies.chart.trials import FRICTION, THRESHOLD_M, Rollout, Setting
+from graspd.studies.chart.trials import FRICTION, Rollout, Setting
+from graspd.studies.evaluation import THRESHOLD_M
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
@@ -43,19 +44,12 @@ def chart(
     *,
     repeats: int,
     models: int,
-    say: Say = lambda line: None,
-    keep: Callable[[dict[str, Any]], None] = lambda result: None,
+    say: Say,
+    keep: Callable[[dict[str, Any]], None],
 ) -> dict[str, Any]:
-    """Run all settings on all pairs.
+    """Run all settings on all pairs, each held grasp in `models` models around the nominal one.
 
-    Args:
-        hands: the hands.
-        things: the objects.
-        settings: compared settings.
-        repeats: timed calls of each setting on each pair.
-        models: models around the nominal one for each held grasp.
-        say: receives a line per cell.
-        keep: called with the partial result after each pair.
+    `say` receives a line per cell, `keep` the partial result after each pair.
 
     Returns:
         `runs[]` with the keys of the command line's contract, `summary[]` over hands and objects, `by_hand` over each
@@ -82,6 +76,7 @@ def chart(
 
 
 def _result(runs: Sequence[dict[str, Any]], settings: Sequence[Setting], models: int) -> dict[str, Any]:
+    hands = dict.fromkeys(run["hand"] for run in runs)
     return {
         "created": timestamp(),
         "device": device_name(settings[0].run.device),
@@ -93,12 +88,8 @@ def _result(runs: Sequence[dict[str, Any]], settings: Sequence[Setting], models:
         "threshold_m": THRESHOLD_M,
         "runs": list(runs),
         "summary": summed(runs),
-        "by_hand": {hand: summed(own) for hand, own in _of_hands(runs).items()},
+        "by_hand": {hand: summed([run for run in runs if run["hand"] == hand]) for hand in hands},
     }
-
-
-def _of_hands(runs: Sequence[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
-    return {hand: [run for run in runs if run["hand"] == hand] for hand in dict.fromkeys(run["hand"] for run in runs)}
 
 
 def _row(cell: Rollout, hand: HandModel, thing: ChartObject) -> dict[str, Any]:
@@ -173,7 +164,6 @@ def _variant(text: str) -> tuple[str, dict[str, str], int | None]:
 
 
 def _options_of(texts: Sequence[str], methods: Sequence[str]) -> Mapping[str, dict[str, str]]:
-    """Group `METHOD:NAME=VALUE` by method."""
     found: dict[str, dict[str, str]] = {}
     for text in texts:
         name, colon, rest = text.partition(":")

@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 from graspd.studies.chart.statistics import most_valid
 
 Row = Mapping[str, Any]
+#: Text at a point, from its row and all rows.
+PointLabel = Callable[[Row, Sequence[Row]], str]
 
 #: Title and key of the accuracies over speed.
 PANELS: Final = (
@@ -47,7 +49,7 @@ def draw(rows: Sequence[Row], files: Sequence[Path]) -> None:
     styles, words = _styles(rows), "valid grasps per second, end to end"
     labels = []
     for axes, (title, key) in zip(panels.flat[:5], PANELS, strict=True):
-        labels += _over_speed(axes, rows, styles, key, title, words, SPEED)
+        labels += _over_speed(axes, rows, styles, key, title, words)
     last, timed = panels.flat[5], [row for row in rows if row["seconds_to_first_valid"]]
     labels += _panel(last, timed, styles, x="seconds_to_first_valid", y="dexgraspbench")
     last.set_xlabel("seconds to the first valid grasp, end to end (less is better)")
@@ -59,12 +61,11 @@ def draw(rows: Sequence[Row], files: Sequence[Path]) -> None:
 
 def draw_hands(
     by_hand: Mapping[str, Sequence[Row]],
-    files: Sequence[Path],
+    file: Path,
     *,
     key: str,
-    speed: str,
     words: tuple[str, str],
-    label: Callable[[Row, Sequence[Row]], str] | None = None,
+    label: PointLabel | None = None,
 ) -> None:
     """Plot a panel per hand: one accuracy over speed, both in `words`; `label` returns a point's label."""
     from matplotlib.figure import Figure
@@ -76,12 +77,12 @@ def draw_hands(
     styles = _styles([row for rows in by_hand.values() for row in rows])
     labels = []
     for axes, (hand, rows) in zip(panels.flat, by_hand.items(), strict=False):
-        labels += _over_speed(axes, rows, styles, key, hand, words[1], speed, label=label)
+        labels += _over_speed(axes, rows, styles, key, hand, words[1], label)
     for axes in panels.flat[len(by_hand) :]:
         axes.set_visible(False)
     figure.supylabel(words[0], fontsize=10)
     figure.legend(*panels.flat[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
-    _save(figure, labels, files)
+    _save(figure, labels, [file])
 
 
 def _save(figure: Any, labels: Sequence[Label], files: Sequence[Path]) -> None:
@@ -97,13 +98,14 @@ def _over_speed(
     key: str,
     title: str,
     words: str,
-    speed: str,
-    label: Callable[[Row, Sequence[Row]], str] | None = None,
+    label: PointLabel | None = None,
 ) -> list[Label]:
-    """Plot one accuracy over a speed, with the front; return its labels."""
+    """Plot one accuracy over the speed, with the Pareto front; return its labels."""
     known = [row for row in rows if row[key] is not None]
-    labels = _panel(axes, known, styles, x=speed, y=key, label=label)
-    _front(axes, known, key, speed)
+    labels = _panel(axes, known, styles, x=SPEED, y=key, label=label)
+    front = sorted((row for row in known if key in row["front"] and row[SPEED]), key=lambda row: row[SPEED])
+    style = {"color": INK, "linewidth": 1, "linestyle": "--", "alpha": 0.6, "zorder": 1, "label": "Pareto front"}
+    axes.step([row[SPEED] for row in front], [row[key] for row in front], where="pre", **style)
     axes.set_xlabel(words)
     axes.set_title(title, loc="left", fontsize=11)
     if key in OF_ONE:
@@ -112,11 +114,7 @@ def _over_speed(
 
 
 def draw_scenes(rows: Sequence[Row], files: Sequence[Path], *, second: str) -> None:
-    """Plot shares of candidates over lifted grasps per second, and lifts over seconds to the first.
-
-    Args:
-        second: name of a second.
-    """
+    """Plot shares of candidates over lifted grasps per `second`, and lifts over seconds to the first."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(15.5, 8.6), layout="constrained")
@@ -125,7 +123,7 @@ def draw_scenes(rows: Sequence[Row], files: Sequence[Path], *, second: str) -> N
     words = f"lifted grasps per {second}, end to end"
     labels = []
     for axes, (title, key) in zip(panels.flat[:4], IN_SCENES, strict=True):
-        labels += _over_speed(axes, rows, styles, key, title, words, SPEED, label=one_of_several)
+        labels += _over_speed(axes, rows, styles, key, title, words, one_of_several)
     timed = [row for row in rows if row["seconds_to_first"]]
     last = panels.flat[4]
     labels += _panel(last, timed, styles, x="seconds_to_first", y="lift", label=one_of_several)
@@ -138,7 +136,6 @@ def draw_scenes(rows: Sequence[Row], files: Sequence[Path], *, second: str) -> N
 
 
 def _styles(rows: Sequence[Row]) -> dict[str, tuple[str, str]]:
-    """Return colour and marker of each method; its fidelities share them."""
     methods = list(dict.fromkeys(row["method"] for row in rows))
     return {m: (COLOURS[i % len(COLOURS)], MARKERS[i % len(MARKERS)]) for i, m in enumerate(methods)}
 
@@ -150,9 +147,8 @@ def _panel(
     *,
     x: str,
     y: str,
-    label: Callable[[Row, Sequence[Row]], str] | None = None,
+    label: PointLabel | None = None,
 ) -> list[Label]:
-    """Plot the points; return their labels."""
     shown: set[str] = set()
     labels = []
     for row in rows:
@@ -165,21 +161,11 @@ def _panel(
         }
         if none:
             bars |= {"xerr": [[0.55 * at], [0.0]], "xuplims": True}
-        axes.errorbar(
-            at,
-            row[y],
-            **bars,
-            fmt=marker,
-            color=colour,
-            ecolor=colour,
-            elinewidth=1,
-            capsize=2,
-            markersize=7,
-            markeredgecolor=colour if none else "white",
-            markerfacecolor="white" if none else colour,
-            label=None if row["method"] in shown else row["method"],
-            zorder=3,
-        )
+        edge, face = (colour, "white") if none else ("white", colour)
+        bars |= {"ecolor": colour, "elinewidth": 1, "capsize": 2}
+        bars |= {"fmt": marker, "markersize": 7, "markeredgecolor": edge, "markerfacecolor": face}
+        name = None if row["method"] in shown else row["method"]
+        axes.errorbar(at, row[y], **bars, color=colour, label=name, zorder=3)
         shown.add(row["method"])
         text = (label or _label)(row, rows)
         words = ", ".join(filter(None, (text, f"0 of {row['grasps']}" * none)))
@@ -229,21 +215,6 @@ def one_of_several(row: Row, rows: Sequence[Row]) -> str:
     return str(row["fidelity"]) if sum(r["method"] == row["method"] for r in rows) > 1 else ""
 
 
-def _front(axes: Any, rows: Sequence[Row], key: str, speed: str) -> None:
-    front = sorted((r for r in rows if key in r["front"] and r[speed]), key=lambda r: r[speed])
-    axes.step(
-        [r[speed] for r in front],
-        [r[key] for r in front],
-        where="pre",
-        color=INK,
-        linewidth=1,
-        linestyle="--",
-        alpha=0.6,
-        zorder=1,
-        label="Pareto front",
-    )
-
-
 def draw_sweeps(rows: Sequence[Row], file: Path) -> None:
     """Plot a panel per knob: success over speed, a point per value."""
     from matplotlib.figure import Figure
@@ -258,17 +229,9 @@ def draw_sweeps(rows: Sequence[Row], file: Path) -> None:
         own = sorted((r for r in rows if r["knob"] == knob), key=lambda r: r["speedup"])
         axes.plot([r["speedup"] for r in own], [r["gsr"] for r in own], color=COLOURS[0], alpha=0.4)
         for row in own:
-            axes.errorbar(
-                row["speedup"],
-                row["gsr"],
-                yerr=_error(row, "gsr"),
-                fmt="o",
-                color=COLOURS[0],
-                capsize=2,
-                elinewidth=1,
-                markerfacecolor=COLOURS[0] if row["default"] else "white",
-                markersize=6,
-            )
+            face = COLOURS[0] if row["default"] else "white"
+            style = {"fmt": "o", "color": COLOURS[0], "markerfacecolor": face, "markersize": 6}
+            axes.errorbar(row["speedup"], row["gsr"], yerr=_error(row, "gsr"), capsize=2, elinewidth=1, **style)
             labels.append(Label(axes, row["speedup"], row["gsr"], str(row["value"]), INK, y_bar=_ends(row, "gsr")))
         axes.set_title(knob, loc="left", fontsize=10)
         axes.set_ylim(0, 1.05)
@@ -344,21 +307,16 @@ def _place(axes: Any, pixels: float, labels: Sequence[Label]) -> list[Any]:
             chosen[index] = int(np.argmin(np.array(costs) + fixed[index]))
         if chosen == before:
             break
-    return [
-        _write(
-            axes,
-            labels[index],
-            points[index],
-            offered[index][at],
-            pixels,
-            led=_is_led(offered[index][at], points, index, at),
-        )
-        for index, at in chosen.items()
-    ]
+    made = []
+    for index, at in chosen.items():
+        box = offered[index][at]
+        # Far from its point, or nearer to another one, a label would be ambiguous without a line.
+        led = at // len(_TURNS) > 1 or _is_nearer_to_another(box, points, index)
+        made.append(_write(axes, labels[index], points[index], box, pixels, led=led))
+    return made
 
 
 def _fixed_costs(boxes: Sequence[Boxes], points: Boxes, own: int, bars: Boxes, inside: Boxes) -> Boxes:
-    """Return the costs of a label's places that are independent of other labels."""
     return np.array(
         [
             _CROSSED * _share(box, bars)
@@ -376,30 +334,15 @@ def _is_nearer_to_another(box: Boxes, points: Boxes, own: int) -> bool:
     return bool(np.any(np.delete(away, own) < away[own]))
 
 
-def _is_led(box: Boxes, points: Boxes, own: int, at: int) -> bool:
-    """Check whether a label needs a line to its point, without which it would be ambiguous."""
-    return at // len(_TURNS) > 1 or _is_nearer_to_another(box, points, own)
-
-
 def _write(axes: Any, label: Label, point: Boxes, box: Boxes, pixels: float, *, led: bool) -> Any:
     from matplotlib.patheffects import withStroke
 
     offset = (box[:2] - point) / pixels
     line = {"arrowstyle": "-", "color": label.colour, "linewidth": 0.6, "alpha": 0.7, "shrinkA": 0, "shrinkB": 4}
-    note = axes.annotate(
-        label.text,
-        (label.x, label.y),
-        xytext=offset,
-        textcoords="offset points",
-        fontsize=SIZE_PT,
-        color=label.colour,
-        ha="left",
-        va="bottom",
-        zorder=4,
-        arrowprops=line if led else None,
-        annotation_clip=False,
-        path_effects=[withStroke(linewidth=2, foreground="white")],
-    )
+    style = {"fontsize": SIZE_PT, "color": label.colour, "ha": "left", "va": "bottom", "zorder": 4}
+    style |= {"arrowprops": line if led else None, "path_effects": [withStroke(linewidth=2, foreground="white")]}
+    where = {"xytext": offset, "textcoords": "offset points", "annotation_clip": False}
+    note = axes.annotate(label.text, (label.x, label.y), **where, **style)
     # The layout was computed without it: a label must not move the panels below the others.
     note.set_in_layout(False)
     return note
@@ -431,7 +374,6 @@ def _side(part: float) -> float:
 
 
 def _bars(axes: Any, labels: Sequence[Label], half: float) -> Boxes:
-    """Return the bars of the points as boxes (N, 4) [px]."""
     ends = [((low, label.y), (high, label.y)) for label in labels if label.x_bar for low, high in [label.x_bar]]
     ends += [((label.x, low), (label.x, high)) for label in labels if label.y_bar for low, high in [label.y_bar]]
     if not ends:

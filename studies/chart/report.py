@@ -1,4 +1,4 @@
-"""A chart as JSON, CSV, Markdown and plots."""
+"""A chart as JSON, CSV, Markdown and plots: of free objects, or of scenes."""
 
 from __future__ import annotations
 
@@ -8,85 +8,68 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from graspd.studies.chart.figure import SPEED, draw, draw_hands, draw_sweeps
+from graspd.service.model.studies import FILTERED, IN_SCENE, IN_SCENES
+from graspd.studies.chart.figure import SPEED, draw, draw_hands, draw_scenes, draw_sweeps, one_of_several
 from graspd.studies.chart.statistics import most_valid
 
 Row = Mapping[str, Any]
 
+
+def _with_bars(*names: str) -> tuple[str, ...]:
+    return tuple(f"{name}{end}" for name in names for end in ("", "_low", "_high"))
+
+
 #: Columns of the CSV file, one row per run.
 COLUMNS: Final = (
-    "method",
-    "fidelity",
-    "batch",
-    "hand",
-    "object",
-    "grasps",
-    "valid",
-    "repeats",
-    "grasps_per_second",
-    "kept",
-    "end_to_end_per_second",
-    "end_to_end_per_second_low",
-    "end_to_end_per_second_high",
+    *("method", "fidelity", "batch", "hand", "object", "grasps", "valid", "repeats", "grasps_per_second", "kept"),
+    *_with_bars("end_to_end_per_second"),
     "seconds_to_first_valid",
-    "valid_per_second",
-    "valid_per_second_low",
-    "valid_per_second_high",
-    "dexgraspbench",
-    "dexgraspbench_low",
-    "dexgraspbench_high",
-    "hard",
-    "hard_low",
-    "hard_high",
-    "robust",
-    "robust_low",
-    "robust_high",
-    "gsr",
-    "gsr_low",
-    "gsr_high",
-    "epsilon",
-    "epsilon_low",
-    "epsilon_high",
-    "pd_mm",
-    "pd_mm_low",
-    "pd_mm_high",
-    "spd_mm",
-    "ca_cm2",
-    "iv_cm3",
-    "wrench_volume",
+    *_with_bars("valid_per_second", "dexgraspbench", "hard", "robust", "gsr", "epsilon", "pd_mm"),
+    *("spd_mm", "ca_cm2", "iv_cm3", "wrench_volume"),
+)
+SCENE_COLUMNS: Final = (
+    *("way", "method", "fidelity", "hand", "object", "scenes", "grasps", "seconds", "end_seconds"),
+    *("clear_count", "lift_count", "lift_dexgraspbench_count", "lift_hard_count", "clear"),
+    *_with_bars("lift", "lift_dexgraspbench", "lift_hard", "robust"),
+    "grasps_per_second",
+    *_with_bars("valid_per_second", "end_to_end_per_second"),
+    *("seconds_to_first", "note"),
 )
 
 #: Accuracies of the summary, and their formats.
 ACCURACIES: Final = (("dexgraspbench", ".2f"), ("hard", ".2f"), ("robust", ".2f"), ("epsilon", ".3f"), ("pd_mm", ".2f"))
 
 
-def write(chart: Row, folder: Path) -> list[Path]:
+def write(chart: Row, folder: Path) -> None:
     """Write chart.{json,csv,md,png,svg}, chart.hands.png, and sweeps.png if there are sweeps, to a folder."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "chart.json").write_text(json.dumps(chart, indent=1, allow_nan=False) + "\n")
     with (folder / "chart.csv").open("w", newline="") as stream:
-        writer = csv.DictWriter(stream, COLUMNS, extrasaction="ignore")
+        columns = SCENE_COLUMNS if "scene" in chart else COLUMNS
+        writer = csv.DictWriter(stream, columns, extrasaction="ignore")
         writer.writeheader()
         writer.writerows(chart["runs"])
-    files = [folder / name for name in ("chart.json", "chart.csv", "chart.md", "chart.png", "chart.svg")]
-    draw(chart["summary"], files[3:])
-    files.append(folder / "chart.hands.png")
-    draw_hands(
-        chart["by_hand"],
-        files[-1:],
-        key="dexgraspbench",
-        speed=SPEED,
-        words=("success under the DexGraspBench protocol", "valid grasps per second, end to end"),
-    )
+    pictures, by_hand = [folder / "chart.png", folder / "chart.svg"], folder / "chart.hands.png"
+    if "scene" in chart:
+        draw_scenes([named(row) for row in chart["summary"]], pictures, second=second_of(chart))
+        hands = {hand: [named(row) for row in rows] for hand, rows in chart["by_hand"].items()}
+        words = ("share of all candidates that is lifted", f"lifted grasps per {second_of(chart)}, end to end")
+        draw_hands(hands, by_hand, key="lift", words=words, label=one_of_several)
+    else:
+        draw(chart["summary"], pictures)
+        words = ("success under the DexGraspBench protocol", "valid grasps per second, end to end")
+        draw_hands(chart["by_hand"], by_hand, key="dexgraspbench", words=words)
     if chart.get("sweeps"):
-        files.append(folder / "sweeps.png")
-        draw_sweeps(chart["sweeps"], files[-1])
-    files[2].write_text(markdown(chart) + "\n")
-    return files
+        draw_sweeps(chart["sweeps"], folder / "sweeps.png")
+    (folder / "chart.md").write_text(markdown(chart) + "\n")
 
 
 def markdown(chart: Row) -> str:
     """Return the chart as a page: its settings, then one table per question."""
+    return _scene_page(chart) if "scene" in chart else _page(chart)
+
+
+def _page(chart: Row) -> str:
     parts = [_head(chart), summary_table(chart["summary"]), _ratios(chart["summary"])]
     if len(chart["by_hand"]) > 1:
         parts += ["## Each hand", "![Success under the DexGraspBench protocol over speed](chart.hands.png)"]
@@ -98,18 +81,34 @@ def markdown(chart: Row) -> str:
         best_table(chart["runs"]),
     ]
     if chart.get("sweeps"):
-        parts += ["## What each knob costs and buys", _sweep_head(chart["sweeps"]), "![Knobs](sweeps.png)"]
-        parts += [sweeps_table(chart["sweeps"])]
+        one = chart["sweeps"][0]
+        head = (
+            f"{one['hand']} on {one['object']}, {one['grasps']} grasps a value, standard with one knob turned; "
+            "speed is against the default."
+        )
+        parts += ["## What each knob costs and buys", head, "![Knobs](sweeps.png)", sweeps_table(chart["sweeps"])]
     return "\n\n".join(part for part in parts if part)
 
 
+def _names(chart: Row) -> tuple[str, str]:
+    hands, objects = (", ".join(dict.fromkeys(run[name] for run in chart["runs"])) for name in ("hand", "object"))
+    return hands, objects
+
+
+def _command(chart: Row) -> str:
+    return f"    {chart['command']}\n\n" if chart.get("command") else ""
+
+
+def _remark(chart: Row) -> str:
+    return f" {chart['remark']}" if chart.get("remark") else ""
+
+
 def _head(chart: Row) -> str:
-    hands, objects = (", ".join(dict.fromkeys(r[name] for r in chart["runs"])) for name in ("hand", "object"))
-    command = f"    {chart['command']}\n\n" if chart.get("command") else ""
+    hands, objects = _names(chart)
     return (
-        f"# Speed against accuracy\n\n{command}{chart['device']}, {chart['threads']} threads, graspd "
+        f"# Speed against accuracy\n\n{_command(chart)}{chart['device']}, {chart['threads']} threads, graspd "
         f"{chart['versions']['graspd']}, Warp {chart['versions']['warp']}, {chart['created']}. Hands: {hands}. "
-        f"Objects: {objects}. Warm, repeats in turn.{' ' + chart['remark'] if chart.get('remark') else ''}\n\n"
+        f"Objects: {objects}. Warm, repeats in turn.{_remark(chart)}\n\n"
         f"- *valid*: holds in MuJoCo (DexGraspBench protocol, level *{chart['validation']['level']}*) and is feasible\n"
         "- speeds are end to end, as a job works: planned, validated, and measured where it holds; *planner's*: grasps "
         "that hold over the seconds of planner and postures alone; on a CPU a second is one of one core\n"
@@ -132,7 +131,7 @@ def summary_table(rows: Sequence[Row]) -> str:
     ]
     for row in sorted(rows, key=lambda r: -r[SPEED]):
         cells = [row["method"], row["fidelity"], row["batch"], _with_bar(row, SPEED, ".3g")]
-        cells += [first(row["seconds_to_first_valid"]), f"{row['valid_per_second']:.3g}"]
+        cells += [_first(row["seconds_to_first_valid"]), f"{row['valid_per_second']:.3g}"]
         for key, form in ACCURACIES:
             text = _with_bar(row, key, form)
             cells.append(f"**{text}**" if key in row["front"] else text)
@@ -147,13 +146,11 @@ def _with_bar(row: Row, key: str, form: str) -> str:
     return f"{row[key]:{form}} ± {half:.1g}" if form == ".3g" else f"{row[key]:{form}} ± {half:{form}}"
 
 
-def share(value: float | None) -> str:
-    """Return a share, or a dash if there is none."""
+def _share(value: float | None) -> str:
     return "–" if value is None else f"{value:.2f}"
 
 
-def first(value: float | None) -> str:
-    """Return seconds to the first, or a dash if there was none."""
+def _first(value: float | None) -> str:
     return "–" if value is None else f"{value:.2g}"
 
 
@@ -182,7 +179,6 @@ def _ratios(rows: Sequence[Row]) -> str:
 
 
 def runs_table(runs: Sequence[Row]) -> str:
-    """Return a row per run."""
     lines = [
         "| hand | object | method | fidelity | valid/s | dexgraspbench | hard | robust | ε | penetration mm | "
         "self mm | contact cm² |",
@@ -190,7 +186,7 @@ def runs_table(runs: Sequence[Row]) -> str:
     ]
     lines += [
         f"| {run['hand']} | {run['object']} | {run['method']} | {run['fidelity']} | {run[SPEED]:.3g} "
-        f"| {run['dexgraspbench']:.2f} | {run['hard']:.2f} | {share(run['robust'])} | {run['epsilon']:.3f} | "
+        f"| {run['dexgraspbench']:.2f} | {run['hard']:.2f} | {_share(run['robust'])} | {run['epsilon']:.3f} | "
         f"{run['pd_mm']:.2f} | {run['spd_mm']:.2f} | {run['ca_cm2']:.1f} |"
         for run in sorted(runs, key=lambda r: (r["hand"], r["object"]))
     ]
@@ -217,14 +213,6 @@ def best_table(runs: Sequence[Row]) -> str:
     return "\n".join(lines)
 
 
-def _sweep_head(sweeps: Sequence[Row]) -> str:
-    first = sweeps[0]
-    return (
-        f"{first['hand']} on {first['object']}, {first['grasps']} grasps a value, standard with one knob turned; "
-        "speed is against the default."
-    )
-
-
 def _mean(values: Sequence[float | None]) -> float:
     known = [value for value in values if value is not None]
     return sum(known) / len(known) if known else float("nan")
@@ -241,5 +229,91 @@ def sweeps_table(sweeps: Sequence[Row]) -> str:
         f"| {1.0 / row['grasps_per_second']:.3g} | × {row['speedup']:.2f} | {_with_bar(row, 'gsr', '.2f')} "
         f"| {_with_bar(row, 'epsilon', '.3f')} | {_with_bar(row, 'pd_mm', '.2f')} |"
         for row in sweeps
+    ]
+    return "\n".join(lines)
+
+
+def second_of(chart: Row) -> str:
+    """Return the name of its second: core-seconds on a CPU, wall-clock seconds on a GPU."""
+    return "CPU second" if str(chart["device"]).startswith("cpu") else "second"
+
+
+def named(row: Row) -> dict[str, Any]:
+    """Return the row with its planning mode in the method's name, as in the plot."""
+    return {**row, "method": f"{row['method']}, {row['way']}"}
+
+
+def _scene_page(chart: Row) -> str:
+    parts = [_scene_head(chart), "![Speed against lifts](chart.png)", _summary(chart["summary"], second_of(chart))]
+    if len(chart["by_hand"]) > 1:
+        parts += ["## Each hand", "![Lifted over speed](chart.hands.png)"]
+        parts += [f"### {hand}\n\n{_summary(rows, second_of(chart))}" for hand, rows in chart["by_hand"].items()]
+    parts += ["## Each hand and object", _runs(chart["runs"], second_of(chart))]
+    if refused := [run for run in chart["runs"] if run["note"]]:
+        lines = [
+            f"- {run['method']} {run['fidelity']}, {run['hand']}, {run['object']}: {run['note']}" for run in refused
+        ]
+        parts += ["## Refused", "\n".join(lines)]
+    return "\n\n".join(parts)
+
+
+def _scene_head(chart: Row) -> str:
+    hands, objects = _names(chart)
+    seconds = "CPU seconds, all cores together" if second_of(chart) == "CPU second" else "seconds that pass"
+    return (
+        f"# In the scene, or filtered\n\n{_command(chart)}{chart['device']}, graspd {chart['versions']['graspd']}, "
+        f"{chart['created']}. Scene: {chart['scene']['kind']}, faces {chart['scene']['faces']}. Hands: {hands}. "
+        f"Objects: {objects}.{_remark(chart)}\n\n"
+        f"- *{IN_SCENE}*: planned for the scene\n"
+        f"- *{FILTERED}*: planned around a free object and put into the same scenes, grasp i into scene i in turn: all "
+        "that peers can do\n"
+        "- *clear*: free of what stands there, coming, closing and lifting\n"
+        "- *lifted*: clear, and lifted by MuJoCo (level *lift*); *dexgraspbench*: lifted in DexGraspBench's test; "
+        "*half friction*: lifted at that too; shares of all candidates\n"
+        f"- *robust*: share of {chart['models']} models around the nominal one in which a lifted grasp is lifted, on "
+        "average\n"
+        f"- speed: lifted grasps over {seconds}, end to end: planner, postures, way, lift, and "
+        "the metrics of what is lifted; *planner's*: over those of planner and postures\n"
+        "- bars: 95 % (Wilson); hollow: none was lifted, the most that there can be"
+    )
+
+
+def _summary(rows: Sequence[Row], second: str) -> str:
+    lines = [
+        "| way | method | fidelity | n | clear | lifted | dexgraspbench | half friction | robust | "
+        f"lifted per {second} | planner's | first, {second.removesuffix('econd')} | pairs with one | "
+        "× over filtered |",
+        "| --- | --- | --- | --: | --: | --: | --: | --: | --: | --: | --: | --: | --: | --: |",
+    ]
+    for row in rows:
+        gain = "–" if row["gain"] is None else f"{row['gain']:.3g}"
+        lines.append(
+            f"| {row['way']} | {row['method']} | {row['fidelity']} | {row['grasps']} | {row['clear']:.2f} | "
+            f"{' | '.join(_bold(row, key) for key in IN_SCENES)} | "
+            f"{row[SPEED]:.3g} | {row['valid_per_second']:.3g} | {_first(row['seconds_to_first'])} | "
+            f"{row['pairs_with_one']} of {row['pairs']} | {gain} |"
+        )
+    note = (
+        "× over filtered: planner's speed, median of the pairs in which the same fidelity, filtered, had any at all. "
+        "Bold: nobody faster is better."
+    )
+    return "\n".join(lines) + f"\n\n{note}"
+
+
+def _bold(row: Row, key: str) -> str:
+    return f"**{_share(row[key])}**" if key in row["front"] else _share(row[key])
+
+
+def _runs(runs: Sequence[Row], second: str) -> str:
+    lines = [
+        "| hand | object | way | method | fidelity | n | clear | lifted | dexgraspbench | half friction | robust | "
+        f"lifted per {second} |",
+        "| --- | --- | --- | --- | --- | --: | --: | --: | --: | --: | --: | --: |",
+    ]
+    lines += [
+        f"| {run['hand']} | {run['object']} | {run['way']} | {run['method']} | {run['fidelity']} | {run['grasps']} | "
+        f"{run['clear']:.2f} | {run['lift']:.2f} | {run['lift_dexgraspbench']:.2f} | {run['lift_hard']:.2f} | "
+        f"{_share(run['robust'])} | {run[SPEED]:.3g} |"
+        for run in runs
     ]
     return "\n".join(lines)

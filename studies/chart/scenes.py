@@ -1,10 +1,10 @@
 """Grasps planned in a scene against grasps of a free object, filtered in the same scene.
 
 A setting of a method that plans in scenes runs in both modes, others only in the second. Grasp i uses scene i of the
-object's stable faces in turn, in both modes, with the same tests: clear trajectory, lifted, lifted by the letter, at
-half the friction, and in models around the nominal one. Speed is lifted grasps over seconds, on a CPU core-seconds,
-which are independent of other load: of planner and postures alone, and end to end, with trajectory, validator and the
-metrics of lifted grasps.
+object's stable faces in turn, in both modes, with the same tests: clear trajectory, lifted, lifted under the unmodified
+protocol, at half the friction, and in models around the nominal one. Speed is lifted grasps over seconds, on a CPU
+core-seconds, which are independent of other load: of planner and postures alone, and end to end, with trajectory,
+validator and the metrics of lifted grasps.
 """
 
 from __future__ import annotations
@@ -23,17 +23,16 @@ from graspd.service.model.clock import timestamp
 from graspd.service.model.digests import digest_json
 from graspd.service.model.errors import InputError
 from graspd.service.model.scene_spec import SceneSpec
-from graspd.service.model.studies import FILTERED, IN_SCENE
+from graspd.service.model.studies import FILTERED, IN_SCENE, IN_SCENES
 from graspd.service.model.version import PACKAGE_VERSION, STAGE_REVISIONS
-from graspd.studies.bench import device_name
+from graspd.studies.bench import clock_of, device_name
 from graspd.studies.chart.chart import TRUE_ERROR_M, ChartObject
-from graspd.studies.chart.statistics import first_valid, pareto, plain
+from graspd.studies.chart.statistics import first_valid, mark_fronts, plain
 from graspd.studies.chart.trials import FRICTION, MODELS_SEED, SEED, WARM_SEED, Setting
-from graspd.studies.clock import clock_of
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.planners import PlanRequest, Rollout, method, synthesize
+from graspd.worker.planners import Rollout, method
 from graspd.worker.quality.intervals import wilson, wilson_of_mean
 from graspd.worker.quality.table import measure
 from graspd.worker.scenes.kinds import rest_poses, supports_of
@@ -49,8 +48,6 @@ Say = Callable[[str], None]
 
 #: Shares of all candidates, by their column.
 SHARES: Final = ("clear", "lift", "lift_dexgraspbench", "lift_hard")
-#: Accuracies with a Pareto front.
-ACCURACIES: Final = ("lift", "lift_dexgraspbench", "lift_hard", "robust")
 SPEEDS: Final = (("valid_per_second", "seconds"), ("end_to_end_per_second", "end_seconds"))
 #: Increase it when a row has other columns: cached results are then discarded.
 FORM: Final = 2
@@ -90,21 +87,15 @@ def scene_chart(
     spec: SceneSpec,
     *,
     models: int,
-    work: Path | None = None,
-    say: Say = lambda line: None,
-    keep: Callable[[Row], None] = lambda result: None,
+    work: Path | None,
+    say: Say,
+    keep: Callable[[Row], None],
 ) -> Row:
-    """Run all settings on all pairs.
+    """Run all settings on all pairs; a setting's `batch` is the number of its grasps on each pair.
 
-    Args:
-        hands: the hands.
-        things: the objects.
-        settings: compared settings; a setting's `batch` is the number of its grasps on each pair.
-        spec: the scene.
-        models: models around the nominal one, in which each lifted grasp is lifted again.
-        work: folder with the result of each setting on each pair; an interrupted run resumes from it.
-        say: receives a line per cell.
-        keep: called with the partial result after each pair.
+    Each lifted grasp is lifted again in `models` models around the nominal one. `work` is a folder with the result of
+    each setting on each pair, from which an interrupted run resumes. `say` receives a line per cell, `keep` the partial
+    result after each pair.
 
     Returns:
         `runs[]` of one setting on one pair each, `summary[]` over the pairs, `by_hand`, `device`, `created`.
@@ -121,7 +112,6 @@ def scene_chart(
 
 
 def _ways(settings: Sequence[Setting]) -> list[tuple[Setting, str]]:
-    """Return each setting with its planning modes."""
     found = []
     for setting in settings:
         able = method(setting.method).in_scenes
@@ -167,7 +157,7 @@ def _tried(setting: Setting, way: str, hand: HandModel, place: ObjectScenes, mod
     clock = clock_of(setting.run.device)
     try:
         rollout = lift_rollout(hand, obj, lambda: place.pieces) if way == IN_SCENE else None
-        _planned(setting, hand, obj, _first(placed), rollout, warm=True)
+        _planned(setting, hand, obj, placed.take(slice(0, 1)), rollout, warm=True)
         began = clock()
         grasps = _planned(setting, hand, obj, placed, rollout)
         row["seconds"] = clock() - began
@@ -190,10 +180,6 @@ def _tried(setting: Setting, way: str, hand: HandModel, place: ObjectScenes, mod
     return {**row, **told, "scenes": len(place.scenes.object_pose), "note": note}
 
 
-def _first(placed: PlacedGrasps) -> PlacedGrasps:
-    return placed.take(slice(0, 1))
-
-
 def _planned(
     setting: Setting,
     hand: HandModel,
@@ -204,15 +190,8 @@ def _planned(
     warm: bool = False,
 ) -> GraspSet:
     """Plan grasps in the scenes with a rollout, or for a free object without one."""
-    options = {**setting.options, **(setting.warm if warm else {})}
-    wanted = PlanRequest(
-        len(placed.index),
-        setting.knobs,
-        WARM_SEED if warm else SEED,
-        placed=placed if rollout else None,
-        rollout=rollout,
-    )
-    return synthesize(hand, obj, wanted, setting.run, method=setting.method, options=options)
+    seed, there = WARM_SEED if warm else SEED, placed if rollout else None
+    return setting.grasps(hand, obj, len(placed.index), seed, placed=there, rollout=rollout, warm=warm)
 
 
 class ValidatedGrasps:
@@ -229,15 +208,9 @@ class ValidatedGrasps:
     def _lifting(self, rows: NDArray[np.intp], **options: Any) -> NDArray[np.intp]:
         if not len(rows):
             return rows
-        success = validate_lifts(
-            self.hand,
-            self.place.true,
-            self.grasps.take(rows),
-            self.placed.take(rows),
-            pieces=self.place.pieces,
-            **options,
-        ).success
-        return rows[success == 1]
+        grasps, placed = self.grasps.take(rows), self.placed.take(rows)
+        found = validate_lifts(self.hand, self.place.true, grasps, placed, pieces=self.place.pieces, **options)
+        return rows[found.success == 1]
 
     def counts(self, models: int) -> Row:
         """Count clear grasps, also lifted ones, by DexGraspBench's protocol, and at half the friction.
@@ -245,15 +218,9 @@ class ValidatedGrasps:
         For lifted grasps, it also sums the shares of models in which they are lifted.
         """
         lifted = self.lifted
-        shares = robust(
-            self.hand,
-            self.place.true,
-            self.grasps.take(lifted),
-            placed=self.placed.take(lifted),
-            models=models,
-            seed=MODELS_SEED,
-            pieces=self.place.pieces,
-        ).share
+        grasps, placed = self.grasps.take(lifted), self.placed.take(lifted)
+        given: dict[str, Any] = {"models": models, "seed": MODELS_SEED, "pieces": self.place.pieces}
+        shares = robust(self.hand, self.place.true, grasps, placed=placed, **given).share
         return {
             "clear_count": len(self.clear),
             "lift_count": len(lifted),
@@ -290,8 +257,7 @@ def figures(rows: Sequence[Mapping[str, Any]]) -> Row:
 def summed(runs: Sequence[Row]) -> list[Row]:
     """Return a row for each mode, method and fidelity over all pairs.
 
-    `gain` compares with the same fidelity, filtered: the median over pairs in which that found any. `front` names the
-    accuracies in which no method that is faster end to end is better.
+    `gain` compares with the same fidelity, filtered: the median over pairs in which that found any.
     """
     groups: dict[tuple[str, str, str, int], list[Row]] = {}
     for run in runs:
@@ -306,12 +272,7 @@ def summed(runs: Sequence[Row]) -> list[Row]:
         row["pairs_with_one"] = sum(run["lift_count"] > 0 for run in own)
         row["gain"] = _gain(own, groups.get((FILTERED, name, fidelity, batch), [])) if way == IN_SCENE else None
         rows.append(row)
-    for row in rows:
-        row["front"] = []
-    for key in ACCURACIES:
-        able = [row for row in rows if row["end_to_end_per_second"] and row[key] is not None]
-        for index in pareto([(row["end_to_end_per_second"], row[key]) for row in able]):
-            able[index]["front"].append(key)
+    mark_fronts(rows, IN_SCENES)
     return rows
 
 

@@ -25,8 +25,7 @@ MEDIANS: Final = ("epsilon", "pd_mm", "spd_mm", "ca_cm2", "iv_cm3", "wrench_volu
 def figures(cell: Rollout) -> dict[str, Any]:
     """Return the keys of a run: speed, accuracy, and `KEY_low`, `KEY_high` of each."""
     held, kept = (np.concatenate(rows).astype(float) for rows in (cell.success, cell.kept))
-    seconds, batch = np.array(cell.seconds), cell.setting.batch
-    draws = _draws(cell)
+    seconds = np.array(cell.seconds)
     row: dict[str, Any] = {
         "seconds": [round(s, 6) for s in cell.seconds],
         "grasps": len(held),
@@ -38,11 +37,11 @@ def figures(cell: Rollout) -> dict[str, Any]:
         "seconds_to_first_valid": first_valid(float(kept.mean()), cell.first_calls, cell.first_grasps),
         "valid_per_second": held.sum() / seconds.sum(),
         "gsr": held.mean(),
-        "batch": batch,
+        "batch": cell.setting.batch,
         "repeats": len(seconds),
     }
     row |= {key: float(np.median(cell.values(key))) for key in MEDIANS}
-    for key, values in draws.items():
+    for key, values in _draws(cell).items():
         row[f"{key}_low"], row[f"{key}_high"] = np.percentile(values, BAR)
     widen(row, int(held.sum()), len(held), len(held) / float(seconds.sum()))
     widen_speed(row, "end_to_end_per_second", int(kept.sum()), len(kept), len(kept) / sum(cell.end_seconds))
@@ -111,7 +110,6 @@ def summed(runs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Return one row per method, fidelity and batch, over all hands and objects.
 
     Speed is all valid grasps over all seconds; accuracies are means over the pairs, with bars that shrink accordingly.
-    `front` names the accuracies in which no method that is faster end to end is better.
     """
     groups: dict[tuple[str, str, int], list[dict[str, Any]]] = {}
     for run in runs:
@@ -139,15 +137,19 @@ def summed(runs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         widen_speed(row, "end_to_end_per_second", kept, row["grasps"], row["grasps"] / end)
         row["candidates_end_to_end_per_second"] = row["grasps"] / end
         rows.append({key: plain(value) for key, value in row.items()})
-    for key, more in METRICS.items():
+    mark_fronts(rows, METRICS)
+    return rows
+
+
+def mark_fronts(rows: Sequence[dict[str, Any]], metrics: Mapping[str, bool]) -> None:
+    """Add `front`: the accuracies in which no row that is faster end to end is better; True: more is better."""
+    for row in rows:
+        row["front"] = []
+    for key, more in metrics.items():
         # Methods without valid grasps are on no front: a hand without contact has no penetration either.
         able = [row for row in rows if row["end_to_end_per_second"] and row[key] is not None]
-        front = pareto([(row["end_to_end_per_second"], row[key] if more else -row[key]) for row in able])
-        for row in rows:
-            row.setdefault("front", [])
-        for index in front:
+        for index in pareto([(row["end_to_end_per_second"], row[key] if more else -row[key]) for row in able]):
             able[index]["front"].append(key)
-    return rows
 
 
 def _bar(runs: Sequence[dict[str, Any]], key: str) -> tuple[float, float]:

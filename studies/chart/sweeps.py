@@ -33,15 +33,12 @@ from graspd.worker.simulation.launches import Launches
 from graspd.worker.simulation.model import LossOptions, Model
 from graspd.worker.validation.decomposition import decompose
 
-Say = Callable[[str], None]
 Change = Callable[[Pair], Pair]
 DEFAULT: Final = FIDELITIES["standard"]
 
 
 @dataclass(frozen=True)
 class KnobValue:
-    """One knob at one value."""
-
     knob: str
     value: str
     fidelity: Fidelity = DEFAULT
@@ -50,10 +47,6 @@ class KnobValue:
     @property
     def default(self) -> bool:
         return self.fidelity == DEFAULT and self.change is None
-
-
-def _same(pair: Pair) -> Pair:
-    return pair
 
 
 def _options(**changes: Any) -> Change:
@@ -70,29 +63,23 @@ def turns(quick: bool = False, knobs: Sequence[str] = ()) -> list[KnobValue]:
         InputError: a name is not a knob.
     """
 
-    def knob(name: str, values: Sequence[tuple[str, dict[str, Any]]]) -> list[KnobValue]:
-        return [KnobValue(name, text, DEFAULT.model_copy(update=change)) for text, change in values]
+    def knob(name: str, between: str, **values: Sequence[Any]) -> list[KnobValue]:
+        rows = zip(*values.values(), strict=True)
+        return [
+            KnobValue(name, between.join(map(str, row)), DEFAULT.model_copy(update=dict(zip(values, row, strict=True))))
+            for row in rows
+        ]
 
-    def points(coarse: int, fine: int) -> tuple[str, dict[str, Any]]:
-        return f"{coarse}, {fine}", {"coarse_points": coarse, "fine_points": fine}
-
-    def iterations(coarse: int, fine: int) -> tuple[str, dict[str, Any]]:
-        return f"{coarse} + {fine}", {"coarse_iterations": coarse, "fine_iterations": fine}
-
-    def starts(count: int, finalists: int) -> tuple[str, dict[str, Any]]:
-        return f"{count}, {finalists}", {"starts": count, "finalists": finalists}
-
-    found = [
-        *knob("hand points", [points(64, 500), points(128, 1000), points(256, 2000), points(512, 4000)]),
-        *knob("face error bound, mm", [(f"{1e3 * e:g}", {"face_error_m": e}) for e in (0, 1e-4, 3e-4, 1e-3, 3e-3)]),
-        *knob("iterations", [iterations(25, 10), iterations(50, 20), iterations(100, 40), iterations(200, 80)]),
-        *knob("starts, finalists", [starts(1, 1), starts(2, 1), starts(4, 2), starts(8, 4)]),
-        *knob("contact solver", [(s, {"contact_solver": s}) for s in ("direct", "jacobi", "gauss_seidel")]),
-    ]
-    passes = LossOptions().passes
-    found += [
-        KnobValue("solver passes", str(n), change=None if n == passes else _options(passes=n)) for n in (1, 2, 4, 8)
-    ]
+    found = knob("hand points", ", ", coarse_points=(64, 128, 256, 512), fine_points=(500, 1000, 2000, 4000))
+    for error in (0, 1e-4, 3e-4, 1e-3, 3e-3):
+        changed = DEFAULT.model_copy(update={"face_error_m": error})
+        found.append(KnobValue("face error bound, mm", f"{1e3 * error:g}", changed))
+    found += knob("iterations", " + ", coarse_iterations=(25, 50, 100, 200), fine_iterations=(10, 20, 40, 80))
+    found += knob("starts, finalists", ", ", starts=(1, 2, 4, 8), finalists=(1, 1, 2, 4))
+    found += knob("contact solver", "", contact_solver=("direct", "jacobi", "gauss_seidel"))
+    for passes in (1, 2, 4, 8):
+        change = None if passes == LossOptions().passes else _options(passes=passes)
+        found.append(KnobValue("solver passes", str(passes), change=change))
     found += [KnobValue("queries", "shared"), KnobValue("queries", "one per velocity", change=asking_each)]
     found += [
         KnobValue("culling", "grid and band"),
@@ -115,8 +102,8 @@ def sweep(
     repeats: int,
     quick: bool,
     run: ExecutionContext,
-    knobs: Sequence[str] = (),
-    say: Say = lambda line: None,
+    knobs: Sequence[str],
+    say: Callable[[str], None],
 ) -> list[dict[str, Any]]:
     """Return one row per knob and value: `knob`, `value`, `default`, `speedup` and a run's figures.
 
@@ -130,9 +117,9 @@ def sweep(
     cells: dict[tuple[str, str], Rollout] = {}
     for turn in [default, *turns(quick, knobs)]:
         if turn is default or not turn.default:
-            cells[turn.knob, turn.value] = Rollout(
-                _setting(turn, batch, run), hand, thing.load(turn.fidelity.face_error_m), true, pieces
-            )
+            make = partial(_make, turn=turn, run=run)
+            setting = Setting("fast_graspd", turn.value, turn.fidelity, batch=batch, run=run, make=make)
+            cells[turn.knob, turn.value] = Rollout(setting, hand, thing.load(turn.fidelity.face_error_m), true, pieces)
     for _ in range(repeats):
         for cell in cells.values():
             # More settings than the device caches: each is prepared just before it is timed.
@@ -143,24 +130,19 @@ def sweep(
     for turn in turns(quick, knobs):
         found = base if turn.default else figures(cells[turn.knob, turn.value])
         faster = found["grasps_per_second"] / base["grasps_per_second"]
-        rows.append(
-            {"knob": turn.knob, "value": turn.value, "default": turn.default, "hand": hand.name, "object": thing.name}
-            | {"speedup": plain(faster), **found}
-        )
+        row = {"knob": turn.knob, "value": turn.value, "default": turn.default, "hand": hand.name, "object": thing.name}
+        rows.append(row | {"speedup": plain(faster), **found})
         say(f"{turn.knob:22s} {turn.value:18s} x {faster:5.2f}  GSR {found['gsr']:.2f}  PD {found['pd_mm']:.2f} mm")
     return rows
-
-
-def _setting(turn: KnobValue, batch: int, run: ExecutionContext) -> Setting:
-    make = partial(_make, turn=turn, run=run)
-    return Setting("fast_graspd", turn.value, turn.fidelity, batch=batch, run=run, make=make)
 
 
 def _make(
     hand: HandModel, obj: ObjectModel, count: int, seed: int, *, turn: KnobValue, run: ExecutionContext
 ) -> GraspSet:
     began = time.perf_counter()
-    pair = (turn.change or _same)(pair_of(hand, obj, turn.fidelity, run.device))
+    pair = pair_of(hand, obj, turn.fidelity, run.device)
+    if turn.change is not None:
+        pair = turn.change(pair)
     parts = optimise_pair(pair, PlanRequest(count, turn.fidelity, seed), run)
     return grasps_of(hand, obj, parts, time.perf_counter() - began)
 
@@ -184,5 +166,4 @@ class QueryPerVelocity(Pair):
 
 
 def asking_each(pair: Pair) -> Pair:
-    """Return the pair with a query for each velocity."""
     return QueryPerVelocity(pair.coarse, pair.fine, pair.options, pair.hand)

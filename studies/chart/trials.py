@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from graspd.service.model.fidelity import Fidelity
 from graspd.service.model.transforms import Floats
-from graspd.studies.clock import clock_of
+from graspd.studies.bench import clock_of
+from graspd.studies.evaluation import COLUMNS, THRESHOLD_M
 from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
 from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.model import HandModel
@@ -22,13 +23,13 @@ from graspd.worker.planners import Rollout as Tried
 from graspd.worker.quality.gate import passes
 from graspd.worker.quality.table import measure
 from graspd.worker.scenes.rollout import rollout_on
+from graspd.worker.simulation.environment import PlacedGrasps
 from graspd.worker.validation.decomposition import ConvexPieces
 from graspd.worker.validation.displacement import simulated_displacement_cm
 from graspd.worker.validation.robust import robust
 from graspd.worker.validation.validator import validate
 
-#: Contact threshold and Coulomb coefficient of area, epsilon and wrench volume: the paper's.
-THRESHOLD_M: Final = 0.005
+#: Coulomb coefficient of epsilon and wrench volume: the paper's.
 FRICTION: Final = 1.0
 #: A seed that no setting was tuned with; repeats take the next ones.
 SEED: Final = 4711
@@ -37,15 +38,6 @@ WARM_SEED: Final = 1
 MODELS_SEED: Final = 2**31 + 1
 #: Grasps per object in the paper's table 2: the best by epsilon.
 BEST: Final = 10
-#: Stored columns of every grasp.
-COLUMNS: Final = {
-    "epsilon": "epsilon",
-    "pd_mm": "penetration_depth_mm",
-    "spd_mm": "self_penetration_depth_mm",
-    "ca_cm2": "contact_area_cm2",
-    "iv_cm3": "intersection_volume_cm3",
-    "wrench_volume": "wrench_volume",
-}
 
 
 Make = Callable[[HandModel, ObjectModel, int, int], GraspSet]
@@ -76,14 +68,15 @@ class Setting:
         count: int,
         seed: int,
         *,
+        placed: PlacedGrasps | None = None,
         rollout: Tried | None = None,
         warm: bool = False,
     ) -> GraspSet:
-        """Make grasps; methods with rollouts run them by `rollout`."""
+        """Make grasps, in the scenes if `placed`; methods with rollouts run them by `rollout`."""
         if self.make is not None:
             return self.make(hand, obj, count, seed)
         options = {**self.options, **(self.warm if warm else {})}
-        wanted = PlanRequest(count, self.knobs, seed, rollout=rollout)
+        wanted = PlanRequest(count, self.knobs, seed, placed=placed, rollout=rollout)
         return synthesize(hand, obj, wanted, self.run, method=self.method, options=options)
 
 
@@ -121,10 +114,7 @@ class Rollout:
     @cached_property
     def tried(self) -> Tried | None:
         """Rollouts of candidates, as in jobs."""
-        return rollout_on(self.setting.run, self.hand, self.obj, self._pieces, in_scenes=False)
-
-    def _pieces(self) -> ConvexPieces:
-        return self.pieces
+        return rollout_on(self.setting.run, self.hand, self.obj, lambda: self.pieces, in_scenes=False)
 
     @property
     def _clock(self) -> Callable[[], float]:
@@ -189,7 +179,6 @@ class Rollout:
         self.first_calls.append(self._clock() - began)
 
     def values(self, key: str) -> Floats:
-        """Return a column of all repeats."""
         return np.concatenate([columns[key] for columns in self.columns])
 
     def best(self) -> dict[str, float]:

@@ -6,7 +6,9 @@ All go through ingest. The hands are a family: equal three-joint fingers in a ri
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
+from itertools import product
 from typing import Any, Final, Literal
 
 import numpy as np
@@ -61,21 +63,23 @@ def cube(side_mm: float) -> Any:
     return trimesh.creation.box(3 * (side_mm * MILLIMETRES,))
 
 
-def _opened() -> Any:
-    mesh = trimesh.creation.box((0.07, 0.06, 0.05))
-    return trimesh.Trimesh(mesh.vertices, mesh.faces[2:], process=False)
+def _opened(faces: Any) -> Any:
+    return faces[2:]
 
 
-def _inverted() -> Any:
-    mesh = trimesh.creation.box((0.07, 0.06, 0.05))
-    return trimesh.Trimesh(mesh.vertices, mesh.faces[:, ::-1], process=False)
+def _inverted(faces: Any) -> Any:
+    return faces[:, ::-1]
 
 
-def _half_inverted() -> Any:
-    mesh = trimesh.creation.box((0.07, 0.06, 0.05))
-    faces = mesh.faces.copy()
+def _half_inverted(faces: Any) -> Any:
     faces[::2] = faces[::2, ::-1]
-    return trimesh.Trimesh(mesh.vertices, faces, process=False)
+    return faces
+
+
+def defective(name: str) -> Any:
+    """Return a box with a defect of `DEFECTS`."""
+    mesh = trimesh.creation.box((0.07, 0.06, 0.05))
+    return trimesh.Trimesh(mesh.vertices, DEFECTS[name](mesh.faces.copy()), process=False)
 
 
 #: Family -> unit of its parameter, constructor, parameters.
@@ -86,43 +90,48 @@ FAMILIES: Final[dict[str, tuple[str, Callable[[float], Any], tuple[float, ...]]]
     "cross": ("depth of the corners [mm]", corner, (2, 5, 10, 20)),
     "cube": ("side [mm]", cube, (1, 3, 10, 30, 60, 100, 200, 500, 1000)),
 }
-#: Meshes with a defect, and their options.
-DEFECTS: Final[dict[str, tuple[Callable[[], Any], dict[str, Any]]]] = {
-    "a side is missing": (_opened, {}),
-    "a side is missing, --allow-open": (_opened, {"allow_open": True}),
-    "inside out": (_inverted, {}),
-    "every other face inside out": (_half_inverted, {}),
+_ALLOW_OPEN: Final = "a side is missing, --allow-open"
+#: Defects of a box, as functions on its faces.
+DEFECTS: Final[dict[str, Callable[[Any], Any]]] = {
+    "a side is missing": _opened,
+    _ALLOW_OPEN: _opened,
+    "inside out": _inverted,
+    "every other face inside out": _half_inverted,
 }
 #: Meshes that ingest refuses or closes.
-CLOSED: Final = tuple(name for name, (_, options) in DEFECTS.items() if not options)
+CLOSED: Final = tuple(name for name in DEFECTS if name != _ALLOW_OPEN)
+
+
+@dataclass(frozen=True)
+class MapOptions:
+    """Jobs behind the cells of a map."""
+
+    count: int
+    """Grasps of each."""
+    fidelity: str = "draft"
+    run: ExecutionContext = DEFAULT_CONTEXT
+    say: Callable[[str], None] = lambda line: None
+    """Receives a line per cell."""
 
 
 def shape_map(
-    hand: HandModel,
-    *,
-    fidelities: Sequence[str] = ("draft", "standard", "fine"),
-    count: int = 8,
-    run: ExecutionContext = DEFAULT_CONTEXT,
-    families: Sequence[str] = tuple(FAMILIES),
-    defects: Sequence[str] = tuple(DEFECTS),
-    say: Callable[[str], None] = lambda line: None,
+    hand: HandModel, options: MapOptions, *, fidelities: Sequence[str], families: Sequence[str], defects: Sequence[str]
 ) -> StabilityMap:
-    """Return valid grasps on each shape at each fidelity, or the reason of its refusal."""
-    jobs: list[tuple[str, float | str, Any, dict[str, Any]]] = [
-        (f"{family}: {FAMILIES[family][0]}", value, FAMILIES[family][1](value), {"units": "m"})
+    jobs: list[tuple[str, float | str, Any]] = [
+        (f"{family}: {FAMILIES[family][0]}", value, FAMILIES[family][1](value))
         for family in families
         for value in FAMILIES[family][2]
     ]
-    jobs += [("mesh of a box", name, DEFECTS[name][0](), {"units": "m", **DEFECTS[name][1]}) for name in defects]
+    jobs += [("mesh of a box", name, defective(name)) for name in defects]
     cells = []
-    for panel, value, mesh, options in jobs:
-        for fidelity in fidelities:
-            cell = shape_cell(hand, (panel, value, fidelity), mesh, options, {"fidelity": fidelity}, count, run)
-            say(f"{panel} {value} {fidelity}: {cell.outcome} {cell.value:.2f} {cell.note}")
-            cells.append(cell)
+    for (panel, value, mesh), fidelity in product(jobs, fidelities):
+        place, allow_open = (panel, value, fidelity), value == _ALLOW_OPEN
+        cell = shape_cell(hand, place, mesh, options, allow_open=allow_open, fidelity=fidelity)
+        options.say(f"{panel} {value} {fidelity}: {cell.outcome} {cell.value:.2f} {cell.note}")
+        cells.append(cell)
     return StabilityMap(
         "shapes",
-        f"{count} grasps of {hand.name} on shapes that are hard",
+        f"{options.count} grasps of {hand.name} on shapes that are hard",
         "the shape's parameter",
         "fidelity",
         MEASURE,
@@ -136,10 +145,10 @@ def shape_map(
     )
 
 
-def prepared(mesh: Any, options: dict[str, Any], face_error_m: float) -> ObjectModel:
-    """Prepare the mesh like an upload; MeshError if it is refused."""
+def prepared(mesh: Any, face_error_m: float, *, allow_open: bool = False) -> ObjectModel:
+    """Prepare a mesh in metres like an upload; MeshError if it is refused."""
     files = {"shape.ply": bytes(mesh.export(file_type="ply"))}
-    digest = digest_files(AssetKind.OBJECT, files)
+    digest, options = digest_files(AssetKind.OBJECT, files), {"units": "m", "allow_open": allow_open}
     return load_object(files, name="shape", digest=digest, face_error_m=face_error_m, options=options)
 
 
@@ -147,10 +156,10 @@ def shape_cell(
     hand: HandModel,
     place: tuple[str, float | str, float | str],
     mesh: Any,
-    options: dict[str, Any],
-    asked: dict[str, Any],
-    count: int,
-    run: ExecutionContext,
+    options: MapOptions,
+    *,
+    allow_open: bool = False,
+    **asked: Any,
 ) -> MapCell:
     """Return candidates of a hand on a mesh, planned and validated as in a job.
 
@@ -158,26 +167,28 @@ def shape_cell(
         hand: the hand.
         place: panel, x and y of the cell.
         mesh: is prepared like an upload.
-        options: options of the object, as in an upload.
-        asked: fidelity or method of the job, and further options.
-        count: grasps.
-        run: its execution context.
+        options: size of the job, and where it runs.
+        allow_open: whether the mesh may be open.
+        asked: fidelity or method of the job.
     """
-    request = JobRequest(hand="hand", object="shape", grasps=count, want="candidates", rechecks=0, **asked)
+    request = JobRequest(hand="hand", object="shape", grasps=options.count, want="candidates", rechecks=0, **asked)
     try:
-        obj = prepared(mesh, options, request.knobs.face_error_m)
-        found = validated_grasps(hand, obj, request, count=count, run=run)
+        obj = prepared(mesh, request.knobs.face_error_m, allow_open=allow_open)
+        found = validated_grasps(hand, obj, request, count=options.count, run=options.run)
     except GraspdError as error:
         return refused(*place, error)
     valid = float(found.columns["quality/valid"].mean())
     depth = float(np.median(found.columns["quality/penetration_depth_mm"]))
     finite = bool(np.isfinite(found.grasps.grasp.hand_pose).all() and np.isfinite(depth))
-    outcome: Outcome = "broken" if not finite or valid == 0 else "weak" if valid < 0.5 else "good"
+    outcome = outcome_of(valid) if finite else "broken"
     return MapCell(*place, valid, outcome, f"{valid:.0%} valid, {depth:.2f} mm deep (median)")
 
 
+def outcome_of(valid: float) -> Outcome:
+    return "broken" if valid == 0 else "weak" if valid < 0.5 else "good"
+
+
 def refused(panel: str, x: float | str, y: float | str, error: GraspdError) -> MapCell:
-    """Return the cell of an asset that is refused with an error."""
     return MapCell(panel, x, y, float("nan"), "refused", str(error))
 
 
@@ -213,20 +224,14 @@ def ring_hand(fingers: int, *, coupling: Coupling = "each joint", size: float = 
     Raises:
         HandError: the hand is unusable.
     """
-    urdf = ring_urdf(fingers, coupling=coupling, size=size, ratio=ratio)
-    files = {"ring.urdf": urdf.encode()}
-    return load_hand(files, name=f"ring of {fingers}", digest=digest_files(AssetKind.HAND, files))
-
-
-def ring_urdf(fingers: int, *, coupling: Coupling, size: float, ratio: float) -> str:
-    """Return the URDF of `ring_hand`."""
     radius, height = (size * x for x in _PALM_M)
     parts = [f'<robot name="ring"><link name="palm">{_solid("cylinder", -height / 2, radius, height)}</link>']
     for k in range(fingers):
         angle = 2 * np.pi * k / fingers
         at = f"{radius * np.cos(angle):.6f} {radius * np.sin(angle):.6f} 0"
         parts += _finger(k, f'<origin xyz="{at}" rpy="0 {_LEAN} {angle:.6f}"/>', coupling, size, ratio)
-    return "\n".join([*parts, "</robot>"])
+    files = {"ring.urdf": "\n".join([*parts, "</robot>"]).encode()}
+    return load_hand(files, name=f"ring of {fingers}", digest=digest_files(AssetKind.HAND, files))
 
 
 def _finger(k: int, base: str, coupling: Coupling, size: float, ratio: float) -> list[str]:
@@ -263,17 +268,13 @@ def _solid(kind: str, height: float, radius: float, length: float) -> str:
 
 
 def hand_map(
+    options: MapOptions,
     *,
-    fingers: Sequence[int] = FINGERS,
-    sizes: Sequence[float] = SIZES,
-    ratios: Sequence[float] = RATIOS,
-    couplings: Sequence[Coupling] = COUPLINGS,
-    fidelity: str = "standard",
-    count: int = 8,
-    run: ExecutionContext = DEFAULT_CONTEXT,
-    say: Callable[[str], None] = lambda line: None,
+    fingers: Sequence[int],
+    couplings: Sequence[Coupling],
+    sizes: Sequence[float] = (),
+    ratios: Sequence[float] = (),
 ) -> StabilityMap:
-    """Return valid grasps of a cube by each hand, or the reason of its refusal."""
     makes: list[tuple[str, float, str, Callable[[], HandModel]]] = []
     for way in couplings:
         makes += [("fingers of a ring", n, way, partial(ring_hand, n, coupling=way)) for n in fingers]
@@ -281,10 +282,17 @@ def hand_map(
     for n in (2, 3, 4):
         following = partial(ring_hand, n, coupling="distal follows")
         makes += [("distal over middle joint", r, f"{n} fingers", partial(following, ratio=r)) for r in ratios]
-    cells = [_cell(panel, x, y, make, fidelity, count, run, say) for panel, x, y, make in makes]
+    cells = []
+    for panel, x, y, make in makes:
+        try:
+            cell = shape_cell(make(), (panel, x, y), cube(CUBE_MM), options, fidelity=options.fidelity)
+        except GraspdError as error:
+            cell = refused(panel, x, y, error)
+        options.say(f"{panel} {x:g} {y}: {cell.outcome} {cell.value:.2f} {cell.note}")
+        cells.append(cell)
     return StabilityMap(
         "hands",
-        f"{count} grasps of a cube of {CUBE_MM:g} mm in hands that are hard, {fidelity}",
+        f"{options.count} grasps of a cube of {CUBE_MM:g} mm in hands that are hard, {options.fidelity}",
         "the hand's parameter",
         "what a drive moves",
         MEASURE,
@@ -296,23 +304,3 @@ def hand_map(
         "tests/studies/test_stability.py::test_palm_without_fingers_is_refused_and_three_of_them_hold",
         reach="all: users bring such hands",
     )
-
-
-def _cell(
-    panel: str,
-    x: float,
-    y: str,
-    make: Callable[[], HandModel],
-    fidelity: str,
-    count: int,
-    run: ExecutionContext,
-    say: Callable[[str], None],
-) -> MapCell:
-    try:
-        hand = make()
-    except GraspdError as error:
-        cell = refused(panel, x, y, error)
-    else:
-        cell = shape_cell(hand, (panel, x, y), cube(CUBE_MM), {"units": "m"}, {"fidelity": fidelity}, count, run)
-    say(f"{panel} {x:g} {y}: {cell.outcome} {cell.value:.2f} {cell.note}")
-    return cell

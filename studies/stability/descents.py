@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from itertools import product
 from typing import Final
 
 import numpy as np
@@ -40,8 +41,6 @@ RESIDUAL: Final = (0.35, 0.9)
 
 @dataclass(frozen=True)
 class Descent:
-    """Result of n hands."""
-
     state: HandState
     depths: Floats
     """(n,) deepest penetration after the projection [m], as in a job: before, it is millimetres."""
@@ -61,25 +60,23 @@ def descend(
 ) -> Descent:
     """Run coarse and fine phase and projection from given hands.
 
-    Args:
-        pair: hand and object.
-        state: n hands.
-        fidelity: fidelity with the schedules.
-        rates: factor on the rates.
-        weights: factor on the weights of penetration.
-        iterations: of the fine phase, with its last row repeated; default: the fidelity's.
-        optimizer: adam or gd.
+    `rates` and `weights` are factors on the rates and on the weights of penetration. `iterations` are those of the fine
+    phase, with its last row repeated; default: the fidelity's.
     """
     n = len(state.pivot)
     for side, schedule in ((pair.coarse, coarse_schedule(fidelity)), (pair.fine, fine_schedule(fidelity))):
         model = pair.model(side)
         data = Data(model, n)
-        scaled = _scaled(schedule, rates, weights)
-        data.set_schedule(_lengthened(scaled, iterations) if side is pair.fine else scaled)
-        data.set_state(state)
-        record_iteration(model, data, optimizer).run(
-            len(schedule) if side is pair.coarse or iterations is None else iterations
+        scaled = replace(
+            schedule,
+            rates=rates * schedule.rates,
+            penetration=weights * schedule.penetration,
+            object_penetration=weights * schedule.object_penetration,
         )
+        steps = len(schedule) if side is pair.coarse or iterations is None else iterations
+        data.set_schedule(_lengthened(scaled, steps))
+        data.set_state(state)
+        record_iteration(model, data, optimizer).run(steps)
         state = data.state(n)
     # The projection normalises quaternions: the drift of the descent is measured before.
     drift = float(np.abs(np.linalg.norm(state.rotation, axis=1) - 1.0).max())
@@ -87,8 +84,7 @@ def descend(
     return Descent(state, depths, drift)
 
 
-def start_map(hand: HandModel, obj: ObjectModel, *, count: int = 8, say: Say = lambda line: None) -> StabilityMap:
-    """Map starts that are moved along the approach, into the object and away from it."""
+def start_map(hand: HandModel, obj: ObjectModel, *, count: int, say: Say) -> StabilityMap:
     fidelity = FIDELITIES["standard"]
     pair = pair_of(hand, obj, fidelity, "cpu")
     state = starts_of(pair, count)
@@ -115,25 +111,17 @@ def start_map(hand: HandModel, obj: ObjectModel, *, count: int = 8, say: Say = l
 
 
 def rate_map(
-    hand: HandModel,
-    obj: ObjectModel,
-    *,
-    rates: Sequence[float] = RATES,
-    weights: Sequence[float] = WEIGHTS,
-    count: int = 8,
-    say: Say = lambda line: None,
+    hand: HandModel, obj: ObjectModel, *, rates: Sequence[float], weights: Sequence[float], count: int, say: Say
 ) -> StabilityMap:
-    """Map learning rate x penetration weight, for Adam and for plain descent."""
     fidelity = FIDELITIES["draft"]
     pair = pair_of(hand, obj, fidelity, "cpu")
     state = starts_of(pair, count)
     cells = []
-    for optimizer in _OPTIMIZERS:
-        for rate in rates:
-            for weight in weights:
-                found = descend(pair, state, fidelity, rates=rate, weights=weight, optimizer=optimizer)
-                cells += _cells(pair, found, _OPTIMIZERS[optimizer], rate, weight)
-            say(f"{optimizer} rate x {rate:g}: {[cell.outcome for cell in cells[-len(weights) :]]}")
+    for optimizer, rate in product(_OPTIMIZERS, rates):
+        for weight in weights:
+            found = descend(pair, state, fidelity, rates=rate, weights=weight, optimizer=optimizer)
+            cells += _cells(pair, found, _OPTIMIZERS[optimizer], rate, weight)
+        say(f"{optimizer} rate x {rate:g}: {[cell.outcome for cell in cells[-len(weights) :]]}")
     return StabilityMap(
         "rates",
         f"Rates and weights of the descent, draft, {hand.name} on {obj.name}",
@@ -149,13 +137,10 @@ def rate_map(
     )
 
 
-def length_map(
-    hand: HandModel, obj: ObjectModel, *, lengths: Sequence[int] = LENGTHS, count: int = 4, say: Say = lambda line: None
-) -> StabilityMap:
-    """Map fine phases far longer than any schedule, to detect drift."""
+def length_map(hand: HandModel, obj: ObjectModel, *, lengths: Sequence[int], say: Say) -> StabilityMap:
     fidelity = FIDELITIES["draft"]
     pair = pair_of(hand, obj, fidelity, "cpu")
-    state = starts_of(pair, count)
+    state = starts_of(pair, 4)
     cells = []
     for length in lengths:
         found = descend(pair, state, fidelity, iterations=length)
@@ -188,7 +173,6 @@ _BOUNDS: Final = (
 
 
 def starts_of(pair: Pair, count: int) -> HandState:
-    """Return starts sampled as in the planner."""
     return sample_starts(pair.model(pair.coarse), seed=11, batch=0, indices=range(count), each=1)
 
 
@@ -207,28 +191,7 @@ def _cells(pair: Pair, found: Descent, panel: str, x: float | str, y: float | st
     return [MapCell(panel, x, y, residual, deep if is_deep else held, said, label)]
 
 
-def _scaled(schedule: Schedule, rates: float, weights: float) -> Schedule:
-    return replace(
-        schedule,
-        rates=rates * schedule.rates,
-        penetration=weights * schedule.penetration,
-        object_penetration=weights * schedule.object_penetration,
-    )
-
-
-def _lengthened(schedule: Schedule, iterations: int | None) -> Schedule:
+def _lengthened(schedule: Schedule, iterations: int) -> Schedule:
     """Return the schedule with its last row repeated."""
-    if iterations is None or iterations <= len(schedule):
-        return schedule
-    more = iterations - len(schedule)
-
-    def longer(values: Floats) -> Floats:
-        return np.concatenate([values, np.repeat(values[-1:], more, axis=0)])
-
-    return Schedule(
-        longer(schedule.dilation),
-        longer(schedule.penetration),
-        longer(schedule.object_penetration),
-        longer(schedule.self_penetration),
-        longer(schedule.rates),
-    )
+    rows = np.minimum(np.arange(max(iterations, len(schedule))), len(schedule) - 1)
+    return replace(schedule, **{field.name: getattr(schedule, field.name)[rows] for field in fields(schedule)})

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
+from itertools import product
 from typing import Any, Final
 
 import numpy as np
@@ -11,6 +13,7 @@ import warp as wp
 
 from graspd.service.model.studies import MapCell, StabilityMap, graded, reachable
 from graspd.service.model.transforms import Floats
+from graspd.studies.stability.integrators import Solver, sweep
 from graspd.worker.simulation import reference
 from graspd.worker.simulation.kernels import contact
 from graspd.worker.simulation.model import initial_motions
@@ -23,16 +26,12 @@ GAPS: Final = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0)
 STEP_M: Final = 1e-3
 #: Sine of the angle between the two gradients that counts as weak and as broken.
 ANGLE: Final = (0.25, 0.7)
-_KERNELS: Final = {"direct": contact.direct, "gauss_seidel": contact.gauss_seidel, "jacobi": contact.jacobi}
-
-
-def solve64(name: str, contacts: Contacts, s0: Floats, world: World) -> Floats:
-    """Return the reference's step of a solver."""
-    if name == "direct":
-        return reference.direct(contacts, s0, world, PASSES)
-    if name == "gauss_seidel":
-        return reference.gauss_seidel(contacts, s0, world)[0]
-    return reference.jacobi(contacts, s0, world, PASSES)
+#: Kernel of each solver, and its step in the reference.
+_SOLVERS: Final[dict[str, tuple[Any, Solver]]] = {
+    "direct": (contact.direct, partial(reference.direct, passes=PASSES)),
+    "gauss_seidel": (contact.gauss_seidel, sweep),
+    "jacobi": (contact.jacobi, partial(reference.jacobi, passes=PASSES)),
+}
 
 
 def kernel_gradient(name: str, contacts: Contacts, world: World) -> Floats:
@@ -64,7 +63,7 @@ def kernel_gradient(name: str, contacts: Contacts, world: World) -> Floats:
             )
         else:
             states = wp.zeros((1, m, max(n, PASSES)), dtype=contact.vec6)
-            wp.launch(_KERNELS[name], dim=(1, m), inputs=inputs, outputs=[states, loss, end, gradient])
+            wp.launch(_SOLVERS[name][0], dim=(1, m), inputs=inputs, outputs=[states, loss, end, gradient])
         return gradient.numpy()[0].astype(float)
 
 
@@ -75,23 +74,17 @@ def reference_gradient(name: str, contacts: Contacts, world: World) -> Floats:
     steps = step * np.eye(len(contacts.points))[:, None]
 
     def losses(distances: Floats) -> Floats:
-        ends = solve64(name, replace(contacts, distances=distances), motions, world)
+        ends = _SOLVERS[name][1](replace(contacts, distances=distances), motions, world)
         return np.asarray(np.mean(reference.loss(ends, world), axis=-1))
 
     return (losses(contacts.distances + steps) - losses(contacts.distances - steps)) / (2 * step)
 
 
-def gradient_map(
-    sizes: Sequence[float] = SIZES_M, gaps: Sequence[float] = GAPS, *, repeats: int = 3, count: int = 8
-) -> StabilityMap:
-    """Map the angle between the two gradients over the object's size and the spread of gaps."""
+def gradient_map(sizes: Sequence[float], gaps: Sequence[float], *, repeats: int) -> StabilityMap:
     cells = []
-    for name in _KERNELS:
-        for size in sizes:
-            for gap in gaps:
-                angles = [_angle(name, size, gap, count, seed) for seed in range(repeats)]
-                worst = float(np.median(angles))
-                cells.append(MapCell(name, size, gap, worst, graded(worst, *ANGLE)))
+    for name, size, gap in product(_SOLVERS, sizes, gaps):
+        worst = float(np.median([_angle(name, size, gap, seed) for seed in range(repeats)]))
+        cells.append(MapCell(name, size, gap, worst, graded(worst, *ANGLE)))
     return StabilityMap(
         "gradient",
         "Gradient of the float32 kernels against float64 differences",
@@ -119,8 +112,8 @@ def _physics(world: World) -> Any:
     return out
 
 
-def _angle(name: str, size: float, gap: float, count: int, seed: int) -> float:
-    rng = np.random.default_rng(seed)
+def _angle(name: str, size: float, gap: float, seed: int) -> float:
+    count, rng = 8, np.random.default_rng(seed)
     normals = rng.normal(size=(count, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     distances = STEP_M * gap * (rng.uniform(-1.0, 0.5, count))

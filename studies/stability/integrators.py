@@ -8,7 +8,9 @@ tests; the force-based one is the penalty force of Grasp'D (2022) under semi-imp
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from itertools import product
 from typing import Final
 
 import numpy as np
@@ -45,15 +47,13 @@ MASSES: Final = (0.01, 0.1, 1.0, 10.0)
 COUNTS: Final = (1, 2, 4, 8, 16, 64, 256)
 
 
-def cage(count: int) -> Floats:
-    """Return (count, 3) unit directions, evenly spread (Fibonacci)."""
+def _cage_around(dt: float, speed: float) -> Floats:
+    """Return 24 points of a cage, evenly spread (Fibonacci) [m]."""
+    count = 24
     k = np.arange(count) + 0.5
     polar, turn = np.arccos(1 - 2 * k / count), np.pi * (1 + 5**0.5) * k
-    return np.stack([np.cos(turn) * np.sin(polar), np.sin(turn) * np.sin(polar), np.cos(polar)], axis=1)
-
-
-def _cage_around(count: int, dt: float, speed: float) -> Floats:
-    return cage(count) * (RADIUS_M + min(GAP_M, FLIGHT_STEPS * dt * speed))
+    directions = np.stack([np.cos(turn) * np.sin(polar), np.sin(turn) * np.sin(polar), np.cos(polar)], axis=1)
+    return directions * (RADIUS_M + min(GAP_M, FLIGHT_STEPS * dt * speed))
 
 
 def contacts_of(points: Floats, centre: Floats) -> Contacts:
@@ -65,49 +65,48 @@ def contacts_of(points: Floats, centre: Floats) -> Contacts:
 
 
 def ball_world(dt: float, speed: float) -> World:
-    inertia = 0.4 * RADIUS_M**2 * np.eye(3)
-    return World(
-        inertia=inertia,
-        gyration=math.sqrt(0.4) * RADIUS_M,
-        friction=FRICTION,
-        stiffness=1.0,
-        step=max(dt * speed, 1e-9),
-    )
+    inertia, gyration = 0.4 * RADIUS_M**2 * np.eye(3), math.sqrt(0.4) * RADIUS_M
+    return World(inertia, gyration=gyration, friction=FRICTION, stiffness=1.0, step=max(dt * speed, 1e-9))
 
 
-def position_based(solver: Solver, *, dt: float, speed: float, count: int = 24) -> tuple[float, float]:
+def position_based(solver: Solver, *, dt: float, speed: float) -> tuple[float, float]:
     """Return largest energy over the first, and deepest sink [m], of a ball; position-based integrator."""
-    points = _cage_around(count, dt, speed)
+    points = _cage_around(dt, speed)
     world = ball_world(dt, speed)
-    centre, velocity = np.zeros(3), np.array([0.8, 0.36, 0.48, 0, 0, 0]) * speed
-    first, most, deepest = world.mass @ velocity @ velocity, 1.0, 0.0
-    for _ in range(STEPS):
-        contacts = contacts_of(points, centre)
-        motion = solver(contacts, velocity * dt, world)
-        centre = centre + motion[:3]
-        velocity = motion / dt
-        most = max(most, float(world.mass @ velocity @ velocity / first))
-        deepest = max(deepest, _sunk(points, centre))
-        if not np.isfinite(most) or most > 1e6:
-            return math.inf, deepest
-    return most, deepest
+
+    def flight() -> Iterator[tuple[Floats, float]]:
+        centre, velocity = np.zeros(3), np.array([0.8, 0.36, 0.48, 0, 0, 0]) * speed
+        first = world.mass @ velocity @ velocity
+        for _ in range(STEPS):
+            motion = solver(contacts_of(points, centre), velocity * dt, world)
+            centre, velocity = centre + motion[:3], motion / dt
+            yield centre, float(world.mass @ velocity @ velocity / first)
+
+    return _extremes(points, flight())
 
 
-def force_based(
-    *, dt: float, speed: float, stiffness: float, mass: float = 1.0, count: int = 24
-) -> tuple[float, float]:
+def force_based(*, dt: float, speed: float, stiffness: float, mass: float = 1.0) -> tuple[float, float]:
     """Return the same under penalty forces -k c n and friction; `stiffness` [N/m], `mass` [kg]."""
-    points = _cage_around(count, dt, speed)
+    points = _cage_around(dt, speed)
     inertia = 0.4 * mass * RADIUS_M**2
-    centre, v, w = np.zeros(3), np.array([0.8, 0.36, 0.48]) * speed, np.zeros(3)
-    first, most, deepest = mass * float(v @ v), 1.0, 0.0
-    for _ in range(STEPS):
-        contacts = contacts_of(points, centre)
-        force, torque = _penalty(contacts, v, w, stiffness)
-        v, w = v + dt * force / mass, w + dt * torque / inertia
-        centre = centre + dt * v
-        most = max(most, (mass * float(v @ v) + inertia * float(w @ w)) / first)
-        deepest = max(deepest, _sunk(points, centre))
+
+    def flight() -> Iterator[tuple[Floats, float]]:
+        centre, v, w = np.zeros(3), np.array([0.8, 0.36, 0.48]) * speed, np.zeros(3)
+        first = mass * float(v @ v)
+        for _ in range(STEPS):
+            force, torque = _penalty(contacts_of(points, centre), v, w, stiffness)
+            v, w = v + dt * force / mass, w + dt * torque / inertia
+            centre = centre + dt * v
+            yield centre, (mass * float(v @ v) + inertia * float(w @ w)) / first
+
+    return _extremes(points, flight())
+
+
+def _extremes(points: Floats, flight: Iterator[tuple[Floats, float]]) -> tuple[float, float]:
+    """Return largest energy and deepest sink of a flight: centres, and energies over the first."""
+    most, deepest = 1.0, 0.0
+    for centre, energy in flight:
+        most, deepest = max(most, energy), max(deepest, _sunk(points, centre))
         if not np.isfinite(most) or most > 1e6:
             return math.inf, deepest
     return most, deepest
@@ -130,16 +129,8 @@ def _sunk(points: Floats, centre: Floats) -> float:
     return max(0.0, RADIUS_M - float(np.linalg.norm(points - centre, axis=1).min()))
 
 
-def _direct(contacts: Contacts, s0: Floats, world: World) -> Floats:
-    return reference.direct(contacts, s0, world, passes=6)
-
-
-def _sweep(contacts: Contacts, s0: Floats, world: World) -> Floats:
+def sweep(contacts: Contacts, s0: Floats, world: World) -> Floats:
     return reference.gauss_seidel(contacts, s0, world)[0]
-
-
-def _averaged(contacts: Contacts, s0: Floats, world: World) -> Floats:
-    return reference.jacobi(contacts, s0, world, passes=8)
 
 
 def summed_jacobi(contacts: Contacts, s0: Floats, world: World) -> Floats:
@@ -158,18 +149,17 @@ def summed_jacobi(contacts: Contacts, s0: Floats, world: World) -> Floats:
 
 
 SOLVERS: Final[dict[str, Solver]] = {
-    "direct (default)": _direct,
-    "Gauss-Seidel, one sweep": _sweep,
-    "Jacobi, averaged": _averaged,
+    "direct (default)": partial(reference.direct, passes=6),
+    "Gauss-Seidel, one sweep": sweep,
+    "Jacobi, averaged": partial(reference.jacobi, passes=8),
     "Jacobi, summed": summed_jacobi,
 }
 #: Values of `contact_solver`.
 _OFFERED: Final = tuple(SOLVERS)[:3]
 
 
-def time_step_map(time_steps: Sequence[float] = TIME_STEPS, speeds: Sequence[float] = SPEEDS) -> StabilityMap:
-    """Map every integrator over time step and speed."""
-    grid = [(dt, speed) for dt in time_steps for speed in speeds]
+def time_step_map(time_steps: Sequence[float], speeds: Sequence[float]) -> StabilityMap:
+    grid = list(product(time_steps, speeds))
     cells = [
         _ball_cell(name, dt, speed, position_based(solver, dt=dt, speed=speed))
         for name, solver in SOLVERS.items()
@@ -210,24 +200,18 @@ def _ball_cell(name: str, dt: float, speed: float, found: tuple[float, float]) -
     return MapCell(name, dt, speed, energy, worst, said, label)
 
 
-def stiffness_map(
-    stiffnesses: Sequence[float] = STIFFNESSES,
-    masses: Sequence[float] = MASSES,
-    time_steps: Sequence[float] = TIME_STEPS,
-) -> StabilityMap:
-    """Map the force-based integrator over stiffness, mass and time step, with the theoretical bound."""
+def stiffness_map(stiffnesses: Sequence[float], masses: Sequence[float], time_steps: Sequence[float]) -> StabilityMap:
     cells = []
     lines = {}
     for mass in masses:
         panel = f"penalty force, {mass:g} kg"
-        for stiffness in stiffnesses:
-            for dt in time_steps:
-                found = force_based(dt=dt, speed=0.3, stiffness=stiffness, mass=mass)
-                cells.append(_ball_cell(panel, stiffness, dt, found))
+        for stiffness, dt in product(stiffnesses, time_steps):
+            found = force_based(dt=dt, speed=0.3, stiffness=stiffness, mass=mass)
+            cells.append(_ball_cell(panel, stiffness, dt, found))
         # Semi-implicit Euler on m x'' = -k x is stable for dt < 2 sqrt(m / k).
         lines[panel] = [(k, 2 * math.sqrt(mass / k)) for k in stiffnesses]
     cells += [
-        _ball_cell("direct (has no such knob)", k, dt, position_based(_direct, dt=dt, speed=0.3))
+        _ball_cell("direct (has no such knob)", k, dt, position_based(SOLVERS["direct (default)"], dt=dt, speed=0.3))
         for k in stiffnesses
         for dt in time_steps
     ]
@@ -247,8 +231,7 @@ def stiffness_map(
     )
 
 
-def contact_count_map(counts: Sequence[int] = COUNTS) -> StabilityMap:
-    """Map one step against a wall of ever more contact points: the remaining motion into it."""
+def contact_count_map(counts: Sequence[int]) -> StabilityMap:
     cells = [
         _wall_cell(name, solver, count, depth, 1e-3)
         for name, solver in SOLVERS.items()

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from graspd.service.model.domain import JobRequest
 from graspd.service.model.studies import MapCell, Outcome, StabilityMap
-from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
+from graspd.studies.stability.assets import MapOptions
 from graspd.worker.generation import validated_grasps
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
@@ -49,8 +49,6 @@ _ROUNDING: Final = 1e-9
 
 @dataclass(frozen=True)
 class _Error:
-    """One error of the model."""
-
     amounts: tuple[float, ...]
     drawn: tuple[float, float]
     """Least and largest amount in `--robust`."""
@@ -105,19 +103,16 @@ ERRORS: Final[dict[str, _Error]] = {
 def model_error_map(
     hands: Sequence[HandModel],
     obj: ObjectModel,
+    options: MapOptions,
     *,
     errors: Sequence[str] = tuple(ERRORS),
     every: int = 1,
-    fidelity: str = "standard",
-    count: int = 16,
-    run: ExecutionContext = DEFAULT_CONTEXT,
-    say: Callable[[str], None] = lambda line: None,
 ) -> StabilityMap:
     """Map the share of valid grasps that are held despite one error; `every` thins out the amounts."""
-    cells = [cell for hand in hands for cell in _cells(hand, obj, errors, every, fidelity, count, run, say)]
+    cells = [cell for hand in hands for cell in _cells(hand, obj, options, errors, every)]
     return StabilityMap(
         "model_errors",
-        f"{count} valid grasps of {obj.name}, validated in models that are wrong",
+        f"{options.count} valid grasps of {obj.name}, validated in models that are wrong",
         "by how much",
         "hand",
         "share of the grasps that hold there, too",
@@ -131,17 +126,9 @@ def model_error_map(
     )
 
 
-def _cells(
-    hand: HandModel,
-    obj: ObjectModel,
-    errors: Sequence[str],
-    every: int,
-    fidelity: str,
-    count: int,
-    run: ExecutionContext,
-    say: Callable[[str], None],
-) -> list[MapCell]:
-    request = JobRequest(hand="hand", object="object", grasps=count, fidelity=fidelity, rechecks=0)
+def _cells(hand: HandModel, obj: ObjectModel, options: MapOptions, errors: Sequence[str], every: int) -> list[MapCell]:
+    count, run = options.count, options.run
+    request = JobRequest(hand="hand", object="object", grasps=count, fidelity=options.fidelity, rechecks=0)
     grasps = validated_grasps(hand, obj, request, count=count, run=run).grasps
     models = Models(hand, obj, decompose(obj), MujocoOptions())
     ways = np.random.default_rng(11).normal(size=(count, 3))
@@ -164,5 +151,5 @@ def _cells(
             outcome: Outcome = "good" if held >= WEAK else "weak" if held >= BROKEN else "broken"
             cell = MapCell(name, amount, hand.name, held, outcome, f"{held:.0%} of {len(grasps)} hold")
             cells.append(replace(cell, reached=low - _ROUNDING <= amount <= high + _ROUNDING))
-            say(f"{hand.name}: {name} {amount:g}: {cell.outcome} {cell.note}")
+            options.say(f"{hand.name}: {name} {amount:g}: {cell.outcome} {cell.note}")
     return cells

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
+from itertools import product
 from typing import Any, Final
 
 import numpy as np
@@ -14,23 +15,19 @@ from graspd.service.model.fidelity import FIDELITIES
 from graspd.service.model.scene_spec import Box, HalfSpace, SceneSpec
 from graspd.service.model.studies import MapCell, Outcome, StabilityMap, reachable
 from graspd.service.model.transforms import quat_rotate
-from graspd.studies.stability.assets import prepared, refused
-from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
+from graspd.studies.stability.assets import MILLIMETRES, MapOptions, outcome_of, prepared, refused
 from graspd.worker.generation import ValidatedBatch, validated_grasps
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
 from graspd.worker.scenes.kinds import rest_poses, supports_of
 from graspd.worker.simulation.environment import Scenes
 
-Say = Callable[[str], None]
-Support = HalfSpace | Box
-
-MILLIMETRES: Final = 1e-3
 #: Boxes on a table: heights, and sides of their square footprints [mm].
 HEIGHTS_MM: Final = (5, 10, 20, 40, 80, 140, 200)
 SIDES_MM: Final = (30, 60, 120)
 #: Target beside walls and neighbours: sides and height [mm].
 TARGET_MM: Final = (50, 50, 80)
+_TARGET: Final = "50 x 50 x 80 mm"
 GAPS_MM: Final = (5, 10, 20, 40, 80, 160)
 #: Walls by name: their directions from the target.
 WALLS: Final[dict[str, tuple[tuple[int, int], ...]]] = {
@@ -51,157 +48,108 @@ NEIGHBOURS: Final[dict[str, tuple[tuple[int, int], ...]]] = {
 RATIOS: Final = (0.05, 0.1, 0.2, 0.3, 0.4, 0.6, 0.8)
 KINDS: Final = ("free", "table", "bin", "shelf")
 
-_TABLE: Final = HalfSpace()
 _MEASURE: Final = "share of candidates that are lifted out of the scene; – where no hand came in clear"
-_BOUNDS: Final = "weak: under a half; broken: none"
-_SHOWS: Final = (
-    "few or no valid grasps: `clear_share` and `lift_share` of `graspd synth --json` say which of both is missing"
-)
 _FEWER: Final = (
     "what is not clear on its way or not lifted is never valid; a run whose budget ends first says how many were "
     "found; a scene that leaves no way to the object is refused in a line"
 )
-_TEST: Final = "tests/studies/test_stability.py::"
+#: A box's sides [mm], and the scene in which it stands.
+Placement = tuple[tuple[float, ...], SceneSpec]
 
 
 def height_map(
-    hands: Sequence[HandModel],
-    *,
-    heights: Sequence[float] = HEIGHTS_MM,
-    sides: Sequence[float] = SIDES_MM,
-    fidelity: str = "draft",
-    count: int = 8,
-    run: ExecutionContext = DEFAULT_CONTEXT,
-    say: Say = lambda line: None,
+    hands: Sequence[HandModel], options: MapOptions, *, heights: Sequence[float], sides: Sequence[float]
 ) -> StabilityMap:
-    """Map boxes from a plate to a tower on a table."""
     cells = [
-        _cell(hand, hand.name, height, side, _standing((side, side, height), ()), fidelity, count, run, say)
-        for hand in hands
-        for side in sides
-        for height in heights
+        _cell(hand, height, side, _standing((side, side, height)), options)
+        for hand, side, height in product(hands, sides, heights)
     ]
-    return StabilityMap(
+    return _map(
         "scene_height",
-        f"{count} grasps of boxes on a table, {fidelity}",
-        "height [mm]",
-        "side of the footprint [mm]",
-        _MEASURE,
-        _BOUNDS,
-        reachable(cells, lambda cell: True),
-        _SHOWS,
-        _FEWER,
-        _TEST + "test_a_plate_flat_on_a_table_ends_with_fewer_and_says_so",
-        reach="all: users bring such things",
+        f"{options.count} grasps of boxes on a table, {options.fidelity}",
+        ("height [mm]", "side of the footprint [mm]"),
+        cells,
+        "test_a_plate_flat_on_a_table_ends_with_fewer_and_says_so",
+        "users bring such things",
     )
 
 
 def wall_map(
-    hands: Sequence[HandModel],
-    *,
-    gaps: Sequence[float] = GAPS_MM,
-    walls: Sequence[str] = tuple(WALLS),
-    fidelity: str = "draft",
-    count: int = 8,
-    run: ExecutionContext = DEFAULT_CONTEXT,
-    say: Say = lambda line: None,
+    hands: Sequence[HandModel], options: MapOptions, *, gaps: Sequence[float], walls: Sequence[str]
 ) -> StabilityMap:
-    """Map a box with walls at a distance from its sides."""
     cells = [
-        _cell(hand, hand.name, gap, name, _standing(TARGET_MM, _walls(WALLS[name], gap)), fidelity, count, run, say)
-        for hand in hands
-        for name in walls
-        for gap in gaps
+        _cell(hand, gap, name, _standing(TARGET_MM, _walls(WALLS[name], gap)), options)
+        for hand, name, gap in product(hands, walls, gaps)
     ]
-    return StabilityMap(
+    return _map(
         "scene_wall",
-        f"{count} grasps of a box of {_size(TARGET_MM)} mm beside walls, {fidelity}",
-        "distance from the walls [mm]",
-        "walls",
-        _MEASURE,
-        _BOUNDS,
-        reachable(cells, lambda cell: True),
-        _SHOWS,
-        _FEWER,
-        _TEST + "test_object_in_a_narrow_well_is_refused_or_comes_out_valid",
-        reach="all: bins, shelves and files bring such walls",
+        f"{options.count} grasps of a box of {_TARGET} beside walls, {options.fidelity}",
+        ("distance from the walls [mm]", "walls"),
+        cells,
+        "test_object_in_a_narrow_well_is_refused_or_comes_out_valid",
+        "bins, shelves and files bring such walls",
     )
 
 
 def neighbour_map(
-    hands: Sequence[HandModel],
-    *,
-    gaps: Sequence[float] = GAPS_MM,
-    around: Sequence[str] = tuple(NEIGHBOURS),
-    fidelity: str = "draft",
-    count: int = 8,
-    run: ExecutionContext = DEFAULT_CONTEXT,
-    say: Say = lambda line: None,
+    hands: Sequence[HandModel], options: MapOptions, *, gaps: Sequence[float], around: Sequence[str]
 ) -> StabilityMap:
-    """Map a box among boxes of its size."""
     cells = [
-        _cell(
-            hand,
-            hand.name,
-            gap,
-            name,
-            _standing(TARGET_MM, _neighbours(NEIGHBOURS[name], gap)),
-            fidelity,
-            count,
-            run,
-            say,
-        )
-        for hand in hands
-        for name in around
-        for gap in gaps
+        _cell(hand, gap, name, _standing(TARGET_MM, _neighbours(NEIGHBOURS[name], gap)), options)
+        for hand, name, gap in product(hands, around, gaps)
     ]
-    return StabilityMap(
+    return _map(
         "scene_neighbours",
-        f"{count} grasps of a box of {_size(TARGET_MM)} mm among its like, {fidelity}",
-        "gap between them [mm]",
-        "fixed boxes around it",
-        _MEASURE,
-        _BOUNDS,
-        reachable(cells, lambda cell: True),
-        _SHOWS,
-        _FEWER,
-        _TEST + "test_a_box_among_boxes_is_lifted_out_or_not_valid",
-        reach="all: clutter is like that",
+        f"{options.count} grasps of a box of {_TARGET} among its like, {options.fidelity}",
+        ("gap between them [mm]", "fixed boxes around it"),
+        cells,
+        "test_a_box_among_boxes_is_lifted_out_or_not_valid",
+        "clutter is like that",
     )
 
 
 def size_map(
-    hands: Sequence[HandModel],
-    *,
-    ratios: Sequence[float] = RATIOS,
-    kinds: Sequence[str] = KINDS,
-    fidelity: str = "draft",
-    count: int = 8,
-    run: ExecutionContext = DEFAULT_CONTEXT,
-    say: Say = lambda line: None,
+    hands: Sequence[HandModel], options: MapOptions, *, ratios: Sequence[float], kinds: Sequence[str]
 ) -> StabilityMap:
-    """Map cubes from a crumb to the hand's size, afloat and in scenes."""
-    cells = []
-    for hand in hands:
-        span = span_of(hand)
-        for kind in kinds:
-            for ratio in ratios:
-                sides = 3 * (1e3 * ratio * span,)
-                scene = (sides, SceneSpec(kind=kind))
-                cells.append(_cell(hand, hand.name, ratio, kind, scene, fidelity, count, run, say))
+    cells = [
+        _cell(hand, ratio, kind, (3 * (1e3 * ratio * span_of(hand),), SceneSpec(kind=kind)), options)
+        for hand, kind, ratio in product(hands, kinds, ratios)
+    ]
     spans = ", ".join(f"{hand.name} {1e3 * span_of(hand):.0f} mm" for hand in hands)
-    return StabilityMap(
+    return _map(
         "scene_size",
-        f"{count} grasps of cubes as large as a part of the hand's span, {fidelity}",
-        "side of the cube over the hand's span",
-        "scene",
-        f"{_MEASURE}; free: that hold six pushes; span, between fingertips before the grasp: {spans}",
-        _BOUNDS,
+        f"{options.count} grasps of cubes as large as a part of the hand's span, {options.fidelity}",
+        ("side of the cube over the hand's span", "scene"),
+        cells,
+        "test_a_cube_that_does_not_fit_its_bin_is_refused",
+        "users bring such things",
+        measure=f"{_MEASURE}; free: that hold six pushes; span, between fingertips before the grasp: {spans}",
+        guard=_FEWER + "; an object larger than the bin or the shelf is refused in a line",
+    )
+
+
+def _map(
+    name: str,
+    title: str,
+    axes: tuple[str, str],
+    cells: list[MapCell],
+    guard_test: str,
+    reach: str,
+    *,
+    measure: str = _MEASURE,
+    guard: str = _FEWER,
+) -> StabilityMap:
+    return StabilityMap(
+        name,
+        title,
+        *axes,
+        measure,
+        "weak: under a half; broken: none",
         reachable(cells, lambda cell: True),
-        _SHOWS,
-        _FEWER + "; an object larger than the bin or the shelf is refused in a line",
-        _TEST + "test_a_cube_that_does_not_fit_its_bin_is_refused",
-        reach="all: users bring such things",
+        "few or no valid grasps: `clear_share` and `lift_share` of `graspd synth --json` say which of both is missing",
+        guard,
+        f"tests/studies/test_stability.py::{guard_test}",
+        reach=f"all: {reach}",
     )
 
 
@@ -214,14 +162,11 @@ def span_of(hand: HandModel) -> float:
     return float(np.linalg.norm(places[:, None] - places[None], axis=2).max())
 
 
-Placement = tuple[tuple[float, ...], SceneSpec]
-
-
-def _standing(sides_mm: tuple[float, ...], around: Iterable[Support]) -> Placement:
-    """Return a box of these sides [mm] upright on a table, with supports around it."""
+def _standing(sides_mm: tuple[float, ...], around: Iterable[Box] = ()) -> Placement:
+    """Return a box of these sides [mm] upright on a table, with boxes around it."""
     height = sides_mm[2] * MILLIMETRES
     target = (0.0, 0.0, height / 2, 1.0, 0.0, 0.0, 0.0)
-    return sides_mm, SceneSpec(kind="file", supports=(_TABLE, *around), target=target)
+    return sides_mm, SceneSpec(kind="file", supports=(HalfSpace(), *around), target=target)
 
 
 def _walls(directions: Sequence[tuple[int, int]], gap_mm: float) -> list[Box]:
@@ -244,58 +189,36 @@ def _neighbours(directions: Sequence[tuple[int, int]], gap_mm: float) -> list[Bo
     ]
 
 
-def _size(sides_mm: Sequence[float]) -> str:
-    return " x ".join(f"{side:g}" for side in sides_mm)
-
-
-def _cell(
-    hand: HandModel,
-    panel: str,
-    x: float | str,
-    y: float | str,
-    placement: Placement,
-    fidelity: str,
-    count: int,
-    run: ExecutionContext,
-    say: Say,
-) -> MapCell:
-    sides, spec = placement
+def _cell(hand: HandModel, x: float | str, y: float | str, placement: Placement, options: MapOptions) -> MapCell:
     try:
-        found = planned(hand, sides, spec, fidelity, count, run)
+        found = planned(hand, *placement, options)
     except GraspdError as error:
-        cell = refused(panel, x, y, error)
+        cell = refused(hand.name, x, y, error)
     else:
-        cell = MapCell(panel, x, y, *_told(found))
-    say(f"{panel} {x} {y}: {cell.outcome} {cell.note}")
+        cell = MapCell(hand.name, x, y, *_told(found))
+    options.say(f"{hand.name} {x} {y}: {cell.outcome} {cell.note}")
     return cell
 
 
-def planned(
-    hand: HandModel,
-    sides_mm: Sequence[float],
-    spec: SceneSpec,
-    fidelity: str,
-    count: int,
-    run: ExecutionContext = DEFAULT_CONTEXT,
-) -> ValidatedBatch:
+def planned(hand: HandModel, sides_mm: Sequence[float], spec: SceneSpec, options: MapOptions) -> ValidatedBatch:
     """Return candidates of a box of these sides [mm] in a scene, prepared like a user's.
 
     Raises:
         GraspdError: the box or the scene is refused.
     """
     mesh: Any = trimesh.creation.box(np.asarray(sides_mm) * MILLIMETRES)
-    obj = prepared(mesh, {"units": "m"}, FIDELITIES[fidelity].face_error_m)
+    count, fidelity = options.count, options.fidelity
+    obj = prepared(mesh, FIDELITIES[fidelity].face_error_m)
     request = JobRequest(hand="hand", object="box", grasps=count, want="candidates", fidelity=fidelity, rechecks=0)
     scenes = None
     if spec.kind != "free":
         scenes = Scenes(supports_of(spec), rest_poses(spec, obj, count=2, seed=0)["scene/object_pose"])
-    return validated_grasps(hand, obj, request, count=count, scenes=scenes, run=run)
+    return validated_grasps(hand, obj, request, count=count, scenes=scenes, run=options.run)
 
 
 def _told(found: ValidatedBatch) -> tuple[float, Outcome, str, str]:
     """Return value, outcome, note and label of a cell."""
     valid = float(found.columns["quality/valid"].mean())
     clear = found.shares.get("clear_share", 1.0)
-    outcome: Outcome = "broken" if valid == 0 else "weak" if valid < 0.5 else "good"
     said = f"{valid:.0%} valid" if not found.shares else f"{clear:.0%} clear, {valid:.0%} lifted"
-    return valid, outcome, said, "–" if clear == 0 else ""
+    return valid, outcome_of(valid), said, "–" if clear == 0 else ""

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
+from itertools import product
 from typing import Any, Final
 
 from graspd.service.model.studies import StabilityMap, reachable
 from graspd.studies.stability import assets, descents, gradients, integrators, model_errors, scenes
-from graspd.studies.stability.assets import BOUNDS, FAMILIES, MEASURE, SHOWS, shape_cell
-from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
+from graspd.studies.stability.assets import BOUNDS, FAMILIES, MEASURE, SHOWS, MapOptions, shape_cell
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.prepare import object_from_path
-
-Say = Callable[[str], None]
 
 #: Further hands, for effects of a hand's size and build.
 OTHER_HANDS: Final = ("barrett",)
@@ -22,7 +22,14 @@ ALL_HANDS: Final = ("allegro", "barrett", "shadow")
 
 
 def run(
-    names: Sequence[str], hand: str, obj: str, *, quick: bool, long: bool, work: ExecutionContext, say: Say
+    names: Sequence[str],
+    hand: str,
+    obj: str,
+    *,
+    quick: bool,
+    long: bool,
+    work: ExecutionContext,
+    say: Callable[[str], None],
 ) -> list[StabilityMap]:
     """Return the maps of the named studies, in the order of the names."""
     model, thing = hand_from_path(hand), object_from_path(obj)
@@ -35,7 +42,10 @@ def run(
 
     pair = beside(OTHER_HANDS)
     gaps = (5, 80) if quick else scenes.GAPS_MM
-    place: dict[str, Any] = {"count": 2 if quick else 8, "run": work, "say": say}
+    options = MapOptions(4 if quick else 8, "draft" if quick else "standard", work, say)
+    counted: dict[str, Any] = {"count": options.count, "say": say}
+    few_errors = replace(options, count=2 if quick else 16)
+    in_scenes = replace(options, count=2 if quick else 8, fidelity="draft")
     lengths = descents.LENGTHS[:1] if quick else (*descents.LENGTHS, *((descents.LONG,) if long else ()))
     studies: dict[str, Callable[[], StabilityMap]] = {
         "time_step": lambda: integrators.time_step_map(few(integrators.TIME_STEPS), few(integrators.SPEEDS)),
@@ -48,57 +58,41 @@ def run(
         ),
         "shapes": lambda: assets.shape_map(
             model,
+            options,
             fidelities=("draft",) if quick else ("draft", "standard", "fine"),
-            count=4 if quick else 8,
             families=("plate", "cube") if quick else tuple(assets.FAMILIES),
             # Grasps on an open mesh cost more than the rest of a quick run.
             defects=assets.CLOSED if quick else tuple(assets.DEFECTS),
-            run=work,
-            say=say,
         ),
-        "starts": lambda: descents.start_map(model, thing, count=4 if quick else 8, say=say),
+        "starts": lambda: descents.start_map(model, thing, **counted),
         "rates": lambda: descents.rate_map(
-            model, thing, rates=few(descents.RATES), weights=few(descents.WEIGHTS), count=4 if quick else 8, say=say
+            model, thing, rates=few(descents.RATES), weights=few(descents.WEIGHTS), **counted
         ),
         "length": lambda: descents.length_map(model, thing, lengths=lengths, say=say),
         "hands": lambda: assets.hand_map(
+            options,
             fingers=(1, 3) if quick else assets.FINGERS,
             sizes=() if quick else assets.SIZES,
             ratios=() if quick else assets.RATIOS,
             couplings=("each joint",) if quick else assets.COUPLINGS,
-            fidelity="draft" if quick else "standard",
-            count=4 if quick else 8,
-            run=work,
-            say=say,
         ),
         "model_errors": lambda: model_errors.model_error_map(
-            beside(ALL_HANDS),
-            thing,
-            every=3 if quick else 1,
-            fidelity="draft" if quick else "standard",
-            count=2 if quick else 16,
-            run=work,
-            say=say,
+            beside(ALL_HANDS), thing, few_errors, every=3 if quick else 1
         ),
         "peers": lambda: peer_map(
-            model,
-            methods=METHODS[:2] if quick else METHODS,
-            shapes={"cube": (60,)} if quick else SHAPES,
-            count=4 if quick else 8,
-            run=work,
-            say=say,
+            model, options, methods=METHODS[:2] if quick else METHODS, shapes={"cube": (60,)} if quick else SHAPES
         ),
         "scene_height": lambda: scenes.height_map(
-            pair, heights=(10, 80) if quick else scenes.HEIGHTS_MM, sides=(60,) if quick else scenes.SIDES_MM, **place
+            pair, in_scenes, heights=(10, 80) if quick else scenes.HEIGHTS_MM, sides=(60,) if quick else scenes.SIDES_MM
         ),
         "scene_wall": lambda: scenes.wall_map(
-            pair, gaps=gaps, walls=("corner",) if quick else tuple(scenes.WALLS), **place
+            pair, in_scenes, gaps=gaps, walls=("corner",) if quick else tuple(scenes.WALLS)
         ),
         "scene_neighbours": lambda: scenes.neighbour_map(
-            pair, gaps=gaps, around=("four",) if quick else tuple(scenes.NEIGHBOURS), **place
+            pair, in_scenes, gaps=gaps, around=("four",) if quick else tuple(scenes.NEIGHBOURS)
         ),
         "scene_size": lambda: scenes.size_map(
-            pair, ratios=(0.1, 0.3) if quick else scenes.RATIOS, kinds=("table",) if quick else scenes.KINDS, **place
+            pair, in_scenes, ratios=(0.1, 0.3) if quick else scenes.RATIOS, kinds=("table",) if quick else scenes.KINDS
         ),
     }
     found = []
@@ -121,27 +115,18 @@ SHAPES: Final[dict[str, tuple[float, ...]]] = {
 
 
 def peer_map(
-    hand: HandModel,
-    *,
-    methods: Sequence[str] = METHODS,
-    shapes: dict[str, tuple[float, ...]] = SHAPES,
-    count: int = 8,
-    run: ExecutionContext = DEFAULT_CONTEXT,
-    say: Callable[[str], None] = lambda line: None,
+    hand: HandModel, options: MapOptions, *, methods: Sequence[str], shapes: dict[str, tuple[float, ...]]
 ) -> StabilityMap:
-    """Map valid grasps of each method on each shape, at its published settings."""
     cells = []
     for family, values in shapes.items():
         unit, make, _ = FAMILIES[family]
-        for value in values:
-            for method in methods:
-                place = (f"{family}: {unit}", value, method)
-                cell = shape_cell(hand, place, make(value), {"units": "m"}, {"method": method}, count, run)
-                say(f"{family} {value:g} {method}: {cell.outcome} {cell.value:.2f} {cell.note}")
-                cells.append(cell)
+        for value, method in product(values, methods):
+            cell = shape_cell(hand, (f"{family}: {unit}", value, method), make(value), options, method=method)
+            options.say(f"{family} {value:g} {method}: {cell.outcome} {cell.value:.2f} {cell.note}")
+            cells.append(cell)
     return StabilityMap(
         "peers",
-        f"{count} grasps of {hand.name} by each method on shapes that are hard",
+        f"{options.count} grasps of {hand.name} by each method on shapes that are hard",
         "the shape's parameter",
         "method",
         MEASURE,

@@ -16,10 +16,14 @@ from tests.worker.models import object_from_mesh, two_finger_hand
 SAMPLED = 1.5e-3
 
 
+def closer_on(*box: float) -> HandCloser:
+    obj = object_from_mesh(trimesh.creation.box(box))
+    return HandCloser(ground_of(two_finger_hand(), obj, "cpu", kernels), 1)
+
+
 def closed(box: tuple[float, float, float], shift: float = 0.0) -> tuple[ClosedHands, np.ndarray]:
     """Two fingers, 80 mm apart, closed on a box in front of the palm; and each body's distance from it."""
-    hand, obj = two_finger_hand(), object_from_mesh(trimesh.creation.box(box))
-    closer = HandCloser(ground_of(hand, obj, "cpu", kernels), 1)
+    closer = closer_on(*box)
     pivot = np.array([[shift, 0.0, -0.06]])
     found = closer.close(HandState(pivot, np.array([[1.0, 0, 0, 0]]), np.zeros((1, 2))))
     return found, closer.distances(found.state)
@@ -50,8 +54,7 @@ def test_nothing_is_passed_through_however_thin(thickness: float) -> None:
 
 
 def test_the_approach_ends_at_the_standoff() -> None:
-    hand, obj = two_finger_hand(), object_from_mesh(trimesh.creation.box((0.03, 0.03, 0.03)))
-    closer = HandCloser(ground_of(hand, obj, "cpu", kernels), 1)
+    closer = closer_on(0.03, 0.03, 0.03)
     start = HandState(np.array([[0.0, 0.0, -0.15]]), np.array([[1.0, 0, 0, 0]]), np.zeros((1, 2)))
     there = closer.approach(start, 0.004)
     assert closer.distances(there).min() == pytest.approx(0.004, abs=3e-4)

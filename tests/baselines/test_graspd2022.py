@@ -64,14 +64,9 @@ def probed(
     grid = grid or grid_of_sphere(CELLS)
     n = len(points)
     found: list[Any] = [wp.zeros(n, dtype=kind, device="cpu") for kind in (wp.float32, wp.vec3, wp.vec3)]
-    given = wp.array(points, dtype=wp.vec3, device="cpu")
-    wp.launch(
-        _probe,
-        n,
-        inputs=[physics_of(SPHERE.gyration_radius), grid, given, wp.vec3(*velocity)],
-        outputs=found,
-        device="cpu",
-    )
+    at = wp.array(points, dtype=wp.vec3, device="cpu")
+    given = [physics_of(SPHERE.gyration_radius), grid, at, wp.vec3(*velocity)]
+    wp.launch(_probe, n, inputs=given, outputs=found, device="cpu")
     return tuple(f.numpy() for f in found)
 
 

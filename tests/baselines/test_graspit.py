@@ -7,10 +7,10 @@ import pytest
 import trimesh
 import warp as wp
 
-from graspd.baselines.common import ground_of
+from graspd.baselines.common import ground_of, inside_points
 from graspd.baselines.graspit import kernels
-from graspd.baselines.graspit.method import Search, eigengrasps, virtual_contacts
-from graspd.baselines.graspit.schedule import FIRST_STEP
+from graspd.baselines.graspit.kernels import FIRST_STEP
+from graspd.baselines.graspit.method import EACH, ON_PALM, Search, eigengrasps
 from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.planners.threads import StepCounter
@@ -67,12 +67,14 @@ def test_temperature_jumps_and_chances_follow_ingbers_schedule() -> None:
     assert hot[2] == pytest.approx(np.exp(-1e-6 / hot[0]), rel=2e-4) and cold[2] < hot[2]
 
 
+def search_on(*sides: float) -> Search:
+    box = object_from_mesh(trimesh.creation.box(sides))
+    return Search(ground_of(two_finger_hand(), box, "cpu", kernels))
+
+
 def palm_only(gap: float, turn: float) -> float:
     """Contact energy with one virtual contact in the middle of the palm, which looks along z at a box's face."""
-    search = Search(
-        ground_of(two_finger_hand(), object_from_mesh(trimesh.creation.box((0.2, 0.2, 0.1))), "cpu", kernels)
-    )
-    problem = search.problem
+    problem = search_on(0.2, 0.2, 0.1).problem
     problem.contact_body = wp.array([0], dtype=wp.int32, device="cpu")
     problem.contact_position = wp.array([[0.0, 0, 0]], dtype=wp.vec3, device="cpu")
     problem.contact_normal = wp.array([[0.0, 0, 1]], dtype=wp.vec3, device="cpu")
@@ -108,7 +110,7 @@ def test_barrett_has_graspits_own_eigengrasps() -> None:
 @pytest.mark.parametrize("name", ["allegro", "barrett", "shadow"])
 def test_contacts_lie_on_every_finger_amplitudes_reach_limits(name: str) -> None:
     hand = hand_from_path(name)
-    found = virtual_contacts(hand)
+    found = inside_points(hand, each=EACH, on_palm=ON_PALM)
     assert set(hand.fingertips) <= set(found.body.tolist())
     palm = found.normal[found.body == 0]
     assert len(palm) >= 1 and np.all(palm @ hand.palm.approach > 0.7)
@@ -121,9 +123,7 @@ def test_contacts_lie_on_every_finger_amplitudes_reach_limits(name: str) -> None
 
 
 def test_annealing_lowers_energy_and_keeps_states_that_differ() -> None:
-    search = Search(
-        ground_of(two_finger_hand(), object_from_mesh(trimesh.creation.box((0.05, 0.05, 0.05))), "cpu", kernels)
-    )
+    search = search_on(0.05, 0.05, 0.05)
     told: list[float] = []
     steps = StepCounter(1e6, ExecutionContext(progress=lambda done, total, message: told.append(done)))
     few = search.run([[0, 0, c] for c in range(4)], steps=FIRST_STEP + 50, keep=1, tell=steps)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import pickle
 from pathlib import Path
 
 import numpy as np
@@ -44,13 +42,11 @@ def test_row_has_the_contract_s_keys_and_counts_what_holds(tmp_path: Path) -> No
     assert row["sgs"] < row["sgs_without_validation"] == pytest.approx(2.0)
     assert row["reasons"] == {"held": 2, "displaced under +x": 1}
     json.dumps(row, allow_nan=False)
-    verdicts = row["verdicts"]
-    assert [one["row"] for one in verdicts] == [0, 1, 2]
-    assert [one["held"] for one in verdicts] == [True, True, False]
-    assert all(set(one) == {"row", "held", "outcomes", "margin", "reason"} for one in verdicts)
-    assert verdicts[0]["outcomes"] == ["held"] * 6 and verdicts[0]["margin"] < 1
-    assert verdicts[2]["outcomes"] == ["displaced"] + ["not_tried"] * 5 and verdicts[2]["margin"] > 1
-    assert verdicts[2]["reason"] == "displaced under +x"
+    first, _, last = row["verdicts"]
+    assert first["outcomes"] == ["held"] * 6 and first["margin"] < 1
+    assert last.pop("margin") > 1
+    outcomes = ["displaced"] + ["not_tried"] * 5
+    assert last == {"row": 2, "held": False, "outcomes": outcomes, "reason": "displaced under +x"}
 
 
 def test_what_holds_is_validated_in_other_models_when_asked(tmp_path: Path) -> None:
@@ -103,32 +99,27 @@ def test_several_objects_are_weighed_and_seconds_add_up(tmp_path: Path) -> None:
     assert whole["level"] == "standard"
 
 
-def test_published_grasps_are_read_with_results_from_a_folder(shared_data: Path) -> None:
-    found = expand(shared_data / "reference_grasps")
-    assert len(found) == 8
-    assert found[0].name == "003_cracker_box.json"
-    case = load_case(shared_data / "reference_grasps" / "frogger_allegro" / "056_tennis_ball.json")
-    assert len(case.grasps) == 22
-    assert case.published is not None
-    assert (case.published == 1).mean() == pytest.approx(0.91, abs=0.005)
-
-
 def test_what_holds_no_grasps_is_refused_by_its_name(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no shards"):
         expand(tmp_path)
     with pytest.raises(NotFoundError, match=r"nothing\.h5 does not exist"):
         load_case(tmp_path / "nothing.h5")
-    other = tmp_path / "a" / "b" / "other.json"
-    other.parent.mkdir(parents=True)
+    (tmp_path / "0.npy").touch()
+    with pytest.raises(InputError, match="--hand and --object"):
+        load_case(tmp_path)
+    other = tmp_path / "other.json"
     other.write_text('{"grasps": []}')
     with pytest.raises(InputError, match="no file of reference grasps"):
         load_case(other)
 
 
 def test_published_contacts_lie_on_fingertips_as_we_pose_them(shared_data: Path) -> None:
-    file = shared_data / "reference_grasps" / "frogger_allegro" / "056_tennis_ball.json"
-    case = load_case(file)
-    stored = json.loads(file.read_text())["grasps"]
+    found = expand(shared_data / "reference_grasps")
+    assert len(found) == 8
+    file = next(file for file in found if file.name == "056_tennis_ball.json")
+    case, stored = load_case(file), json.loads(file.read_text())["grasps"]
+    assert case.published is not None
+    assert (case.published == 1).mean() == pytest.approx(0.91, abs=0.005)
     bodies = body_poses(case.hand, case.grasps.grasp.hand_pose, case.grasps.grasp.joint_positions)
     tips = [p for p in case.hand.pieces if p.body in case.hand.fingertips and "tip" in p.link]
     for row, grasp in zip(bodies, stored, strict=True):
@@ -136,49 +127,6 @@ def test_published_contacts_lie_on_fingertips_as_we_pose_them(shared_data: Path)
             nearest = min(abs(float(piece_distance(p, apply(invert(row[p.body]), point[None]))[0])) for p in tips)
             # Fingertip meshes are reduced to 50 corners, which moves their surface by a fraction of a millimetre.
             assert nearest < 5e-4
-
-
-def bench_folder(folder: Path, **change: object) -> Path:
-    case = plates_case()
-    folder.mkdir(exist_ok=True)
-    parts = {"grasp": case.grasps.grasp, "pregrasp": case.grasps.pregrasp, "squeeze": case.grasps.squeeze}
-    for i in range(len(case.grasps)):
-        row = {
-            f"{name}_qpos": np.concatenate([part.hand_pose[i], part.joint_positions[i]]) for name, part in parts.items()
-        }
-        np.save(folder / f"{i}.npy", np.array({**row, **change}, dtype=object), allow_pickle=True)
-    return folder
-
-
-@pytest.fixture
-def known_pair(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("graspd.exchange.dexgraspbench.hand_from_path", lambda path: HAND)
-    monkeypatch.setattr("graspd.exchange.dexgraspbench.scaled_object", lambda path, scale: BOX)
-
-
-@pytest.mark.usefixtures("known_pair")
-def test_dexgraspbench_folders_round_trip_with_hand_and_object(tmp_path: Path) -> None:
-    case = load_case(bench_folder(tmp_path / "bench"), hand="plates", obj="box")
-    ours = plates_case().grasps
-    assert np.allclose(case.grasps.squeeze.joint_positions, ours.squeeze.joint_positions)
-    assert np.allclose(case.grasps.grasp.hand_pose, ours.grasp.hand_pose)
-    with pytest.raises(InputError, match="--hand and --object"):
-        load_case(bench_folder(tmp_path / "bench"))
-
-
-class Exploit:
-    """Runs a command when unpickled by a trusting reader."""
-
-    def __reduce__(self) -> tuple[object, tuple[str]]:
-        return os.system, ("true",)
-
-
-@pytest.mark.usefixtures("known_pair")
-def test_dexgraspbench_file_that_would_run_code_is_refused(tmp_path: Path) -> None:
-    assert pickle.loads(pickle.dumps(Exploit())) == 0, "on a trusting reader it works"
-    folder = bench_folder(tmp_path / "bench", extra=Exploit())
-    with pytest.raises(InputError, match=r"it would run (posix|nt)\.system"):
-        load_case(folder, hand="plates", obj="box")
 
 
 def test_the_command_prints_json_or_a_table(shared_data: Path) -> None:

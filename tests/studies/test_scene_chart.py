@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Callable
-from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -13,21 +11,14 @@ import pytest
 from typer.testing import CliRunner
 
 from graspd.commands.studies import app
-from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.model.studies import FILTERED, IN_SCENE
 from graspd.service.pipeline.fidelity_choice import cheapest
 from graspd.service.store.records import latest
 from graspd.service.store.store import open_store
-from graspd.studies.chart import scenes
-from graspd.studies.chart.chart import ChartObject, settings_of
-from graspd.studies.chart.scene_report import markdown
+from graspd.studies.chart.report import markdown
 from graspd.studies.chart.scenes import figures, summed
-from graspd.worker.execution_context import ExecutionContext
-from graspd.worker.hands.load import hand_from_path
-from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.quality.intervals import wilson
 
-TABLE = SceneSpec(kind="table", faces="all")
 ARGUMENTS = ("--scene", "table", "--quick", "--methods", "fast_graspd,autograsp", "--hands", "barrett")
 
 
@@ -69,12 +60,12 @@ def test_a_run_that_was_stopped_plans_only_what_is_missing(
     assert len(kept) == 3
     kept[0].unlink()
     planned = []
-
-    def tried(setting: Any, way: str, hand: Any, place: Any, models: int) -> dict[str, Any]:
-        planned.append((setting.method, way))
-        return {**runs[setting.method, way]}
-
     runs = {(run["method"], run["way"]): run for run in found["runs"]}
+
+    def tried(setting: Any, way: str, *_: object) -> dict[str, Any]:
+        planned.append((setting.method, way))
+        return runs[setting.method, way]
+
     monkeypatch.setattr("graspd.studies.chart.scenes._tried", tried)
     arguments = [*ARGUMENTS, "--objects", "block", "--work", str(folder / "work"), "--json"]
     again = json.loads(CliRunner().invoke(app, ["chart", *arguments]).stdout.strip().splitlines()[-1])
@@ -112,51 +103,9 @@ def test_a_file_that_is_no_chart_is_refused_in_a_line(tmp_path: Path, content: s
     assert done.exit_code == 2 and "omit --scene" in done.output
 
 
-def test_seconds_are_those_of_the_clock_of_the_settings_device(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A clock that goes 7 s at each look; on a GPU one of the seconds that pass."""
-    asked: list[str] = []
-
-    def clock(device: str) -> Callable[[], float]:
-        asked.append(device)
-        return count(0.0, 7.0).__next__
-
-    class Verdict:
-        def __init__(self, *_: object) -> None: ...
-
-        def counts(self, models: int) -> dict[str, Any]:
-            return {
-                "clear_count": 2,
-                "lift_count": 2,
-                "lift_dexgraspbench_count": 2,
-                "lift_hard_count": 1,
-                "robust_sum": 2.0,
-            }
-
-    monkeypatch.setattr(scenes, "clock_of", clock)
-    monkeypatch.setattr(scenes, "_planned", lambda *_, **__: None)
-    monkeypatch.setattr(scenes, "ValidatedGrasps", Verdict)
-    (setting,) = settings_of(
-        ["fast_graspd"], ["draft"], batches=[2], peer_batch=2, options=[], quick=True, run=ExecutionContext("cuda:0", 1)
-    )
-    place = scenes.ObjectScenes(
-        ChartObject("block", lambda error: object_from_path("block", face_error_m=error)), TABLE
-    )
-    row = scenes._tried(setting, FILTERED, hand_from_path("barrett"), place, 1)
-    assert asked == ["cuda:0"]
-    assert (row["seconds"], row["end_seconds"], row["valid_per_second"]) == (7.0, 14.0, pytest.approx(2 / 7, rel=1e-4))
-
-
 def run_of(way: str, pair: str, lifted: int, seconds: float, grasps: int = 10) -> dict[str, Any]:
-    counts = {
-        "grasps": grasps,
-        "seconds": seconds,
-        "end_seconds": 2 * seconds,
-        "clear_count": lifted,
-        "lift_count": lifted,
-        "lift_dexgraspbench_count": lifted,
-        "lift_hard_count": 0,
-        "robust_sum": 0.5 * lifted,
-    }
+    counts = {"grasps": grasps, "seconds": seconds, "end_seconds": 2 * seconds, "robust_sum": 0.5 * lifted}
+    counts |= dict.fromkeys(("clear_count", "lift_count", "lift_dexgraspbench_count"), lifted) | {"lift_hard_count": 0}
     said = {"way": way, "method": "m", "fidelity": "f", "batch": grasps, "hand": "h", "object": pair, "note": ""}
     return {**said, **counts, **figures([counts]), "scenes": 1, "seconds_to_first": seconds if lifted else None}
 
@@ -177,14 +126,6 @@ def test_a_pair_that_is_refused_counts_as_tries_without_a_lift() -> None:
     (row,) = summed([refused, run_of(IN_SCENE, "b", 5, 1.0)])
     assert row["lift"] == 0.25 and row["grasps_per_second"] == pytest.approx(10.0)
     assert row["valid_per_second"] == pytest.approx(5.0)
-    chart = {
-        "runs": [refused],
-        "summary": [row],
-        "device": "d",
-        "created": "c",
-        "versions": {"graspd": "0"},
-        "models": 2,
-        "by_hand": {},
-    }
-    said = markdown(chart | {"scene": {"kind": "table", "faces": "all"}})
+    chart = {"runs": [refused], "summary": [row], "by_hand": {}, "models": 2, "versions": {"graspd": "0"}}
+    said = markdown(chart | {"device": "d", "created": "c", "scene": {"kind": "table", "faces": "all"}})
     assert "## Refused" in said and "nothing can reach it" in said

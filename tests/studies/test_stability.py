@@ -18,15 +18,15 @@ from typer.testing import CliRunner
 from graspd.cli import build
 from graspd.commands.studies import STUDIES, app
 from graspd.service.model.domain import JobRequest
-from graspd.service.model.errors import InputError, MeshError
+from graspd.service.model.errors import InputError
 from graspd.service.model.fidelity import FIDELITIES
 from graspd.service.model.metrics import Axis
 from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.model.studies import MapCell, Stability, StabilityMap, from_json, graded
 from graspd.service.store.records import latest
 from graspd.service.store.store import open_store
-from graspd.studies.stability import assets, descents, gradients, integrators, model_errors, report, scenes, studies
-from graspd.studies.stability.assets import Coupling, ring_hand
+from graspd.studies.stability import assets, descents, gradients, integrators, report, scenes, studies
+from graspd.studies.stability.assets import Coupling, MapOptions, ring_hand
 from graspd.studies.stability.model_errors import ERRORS, model_error_map
 from graspd.studies.stability.report import markdown, write
 from graspd.worker.engines import backend
@@ -43,6 +43,8 @@ from graspd.worker.simulation.data import HandState
 from graspd.worker.simulation.model import LossOptions
 from graspd.worker.validation.variant import Variant, draw
 from tests.worker.simulation.test_surroundings import mujoco_room
+
+FEW = MapOptions(4)
 
 
 @pytest.fixture(scope="module")
@@ -86,18 +88,10 @@ def test_gradients_agree_at_the_sizes_of_hands_and_their_objects() -> None:
 
 
 def test_a_shape_is_refused_or_its_grasps_are_sound(hand: HandModel) -> None:
-    found = assets.shape_map(
-        hand, fidelities=("draft",), count=4, families=(), defects=("a side is missing", "inside out")
-    )
-    by_name = {cell.x: cell for cell in found.cells}
-    assert by_name["a side is missing"].outcome == "refused"
-    assert by_name["inside out"].outcome in ("good", "weak"), by_name["inside out"].note
-
-
-def test_a_mesh_without_an_inside_is_refused_with_the_mend() -> None:
-    mesh, options = assets.DEFECTS["a side is missing"]
-    with pytest.raises(MeshError, match="allow-open"):
-        assets.prepared(mesh(), options, 1e-3)
+    defects = ("a side is missing", "inside out")
+    opened, inverted = assets.shape_map(hand, FEW, fidelities=("draft",), families=(), defects=defects).cells
+    assert opened.outcome == "refused" and "allow-open" in opened.note
+    assert inverted.outcome in ("good", "weak"), inverted.note
 
 
 def test_a_start_that_is_too_far_is_flagged(pair: Pair) -> None:
@@ -108,7 +102,7 @@ def test_a_start_that_is_too_far_is_flagged(pair: Pair) -> None:
 
 
 def test_a_job_whose_every_grasp_is_bad_ends_with_none(hand: HandModel) -> None:
-    crumb = assets.prepared(assets.cube(1), {"units": "m"}, 1e-5)
+    crumb = assets.prepared(assets.cube(1), 1e-5)
     request = JobRequest(hand="hand", object="crumb", grasps=2, fidelity="draft", budget=2, rechecks=0)
     found = validated_grasps(hand, crumb, request, count=2)
     assert found.candidates == len(found.grasps) + sum(found.rejected.values())
@@ -149,12 +143,11 @@ def a_record(*maps: StabilityMap) -> Stability:
 def test_a_report_has_pictures_tables_and_says_what_still_breaks(tmp_path: Path) -> None:
     found = [graded(value, 1.0, 2.0) for value in (0.5, 1.5, 2.5, math.nan, math.inf)]
     assert found == ["good", "weak", "broken", "broken", "broken"]
-    written = write(a_record(), tmp_path)
-    assert {path.name for path in written} == {"stability.json", "stability.md", "stability-demo.png"}
-    assert json.loads(written[0].read_text())["maps"][0]["cells"][1]["value"] is None
-    assert "| a | 1 | 0 | 2 | 0 |" in markdown(a_record())
-    assert written[2].read_bytes().startswith(b"\x89PNG")
-    said = markdown(a_record())
+    data, page, picture = write(a_record(), tmp_path)
+    assert json.loads(data.read_text())["maps"][0]["cells"][1]["value"] is None
+    assert picture.name == "stability-demo.png" and picture.read_bytes().startswith(b"\x89PNG")
+    said = page.read_text()
+    assert "| a | 1 | 0 | 2 | 0 |" in said
     assert "| A demo | 1 | 0 | 1 | 0 | a 2 (10) | it flies |" in said
     whole = [replace(cell, outcome="good") for cell in a_map().cells]
     assert "| A demo | 2 | 0 | 0 | 0 | nothing | – |" in markdown(a_record(a_map(cells=whole)))
@@ -175,23 +168,6 @@ def test_numbers_on_a_picture_stay_within_their_cells(letters: str) -> None:
 def command(*arguments: str) -> tuple[int, str]:
     done = CliRunner().invoke(app, ["stability", *arguments])
     return done.exit_code, done.output
-
-
-def test_without_a_choice_all_studies_are_made(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[str] = []
-    monkeypatch.setattr(studies, "run", lambda names, *_, **__: asked.extend(names) or [])
-    assert command("--json")[0] == 0
-    assert asked == list(STUDIES)
-    assert len(asked) == 15
-
-
-def test_published_maps_are_the_latest_in_the_store(tmp_path: Path) -> None:
-    write(a_record(), tmp_path)
-    code, said = command("--from", str(tmp_path / "stability.json"), "--publish", "--data-dir", str(tmp_path))
-    assert code == 0, said
-    stored = latest(open_store((tmp_path / "store").as_uri()), "stability")
-    assert stored is not None
-    assert from_json(stored).as_json() == a_record().as_json()
 
 
 @pytest.mark.parametrize("words", ["no json", "{}", '{"maps": 3}', "--only magic", "--from nowhere.json"])
@@ -237,18 +213,11 @@ def test_fingers_open_outward_scale_and_follow_by_ratio() -> None:
 
 def test_palm_without_fingers_is_refused_and_three_of_them_hold() -> None:
     backend.start()
-    found = assets.hand_map(
-        fingers=(0, 3), sizes=(), ratios=(), couplings=("distal follows",), fidelity="draft", count=4
-    )
-    by_fingers = {cell.x: cell for cell in found.cells}
-    assert by_fingers[0].outcome == "refused"
-    assert by_fingers[3].value > 0
-
-
-def test_fingers_of_one_drive_hold_a_cube_between_them() -> None:
-    backend.start()
-    found = assets.hand_map(fingers=(3, 5), sizes=(), ratios=(), couplings=("one drive",), fidelity="draft", count=4)
-    assert [cell.outcome for cell in found.cells] == ["good", "good"]
+    none, three = assets.hand_map(FEW, fingers=(0, 3), couplings=("distal follows",)).cells
+    assert none.outcome == "refused" and three.value > 0
+    assert [cell.outcome for cell in assets.hand_map(FEW, fingers=(3, 5), couplings=("one drive",)).cells] == 2 * [
+        "good"
+    ]
 
 
 FRICTION, MASS = "friction over the model's", "mass over the model's"
@@ -258,7 +227,7 @@ def validated(monkeypatch: pytest.MonkeyPatch, name: str, amounts: tuple[float, 
     monkeypatch.setitem(ERRORS, name, replace(ERRORS[name], amounts=amounts))
     backend.start()
     hand, obj = hand_from_path("barrett"), object_from_path("block")
-    return model_error_map([hand], obj, errors=[name], fidelity="draft", count=3).cells
+    return model_error_map([hand], obj, MapOptions(3), errors=[name]).cells
 
 
 def test_the_models_friction_keeps_what_holds_ice_keeps_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -292,27 +261,10 @@ def test_amounts_within_reach_are_those_that_robust_draws(name: str) -> None:
     # Draws come near the ends, but for that of nothing: the bounds are no wider than they need be.
     assert high - max(drawn) < 0.2 * (high - low)
     assert low == 0.0 or min(drawn) - low < 0.2 * (high - low)
-
-
-@pytest.mark.parametrize("name", ERRORS)
-def test_an_amount_departs_along_one_axis_only(name: str) -> None:
-    error, along = ERRORS[name], np.array([0.6, 0.0, 0.8])
-    one = error.variant(hand_from_path("barrett"), error.amounts[-1], along)
-    changed = [field for field, value in vars(one).items() if value != getattr(Variant(), field)]
-    assert len(changed) == 1
-    assert AMOUNTS[name][1](one) == pytest.approx(error.amounts[-1])
-
-
-def test_a_hand_without_valid_grasps_is_no_number_and_broken(monkeypatch: pytest.MonkeyPatch) -> None:
-    found = model_errors.validated_grasps
-
-    def none(*arguments: object, **options: object) -> object:
-        made = found(*arguments, **options)  # type: ignore[arg-type]
-        return replace(made, grasps=made.grasps.take(np.zeros(0, int)))
-
-    monkeypatch.setattr(model_errors, "validated_grasps", none)
-    (cell,) = validated(monkeypatch, MASS, (1.0,))
-    assert cell.outcome == "broken" and not np.isfinite(cell.value)
+    # An amount departs along one axis only.
+    one = ERRORS[name].variant(hand, ERRORS[name].amounts[-1], np.array([0.6, 0.0, 0.8]))
+    assert sum(value != getattr(Variant(), field) for field, value in vars(one).items()) == 1
+    assert amount(one) == pytest.approx(ERRORS[name].amounts[-1])
 
 
 def assert_valid_ones_are_clear(hand: HandModel, found: ValidatedBatch, spec: SceneSpec) -> None:
@@ -339,35 +291,27 @@ def test_a_plate_flat_on_a_table_ends_with_fewer_and_says_so(tmp_path: Path) -> 
 def test_object_in_a_narrow_well_is_refused_or_comes_out_valid(hand: HandModel, gap: float) -> None:
     sides, spec = scenes._standing(scenes.TARGET_MM, scenes._walls(scenes.WALLS["four"], gap))
     try:
-        found = scenes.planned(hand, sides, spec, "draft", 2)
+        found = scenes.planned(hand, sides, spec, MapOptions(2))
     except InputError as error:
         assert "\n" not in str(error) and ("no room" in str(error) or "on every side" in str(error))
     else:
         assert_valid_ones_are_clear(hand, found, spec)
 
 
-def test_one_wall_nearby_costs_grasps_but_is_no_reason_to_refuse(hand: HandModel) -> None:
-    sides, spec = scenes._standing(scenes.TARGET_MM, scenes._walls(scenes.WALLS["one"], 20))
-    found = scenes.planned(hand, sides, spec, "draft", 6)
-    assert found.shares["clear_share"] > 0.5
-    assert_valid_ones_are_clear(hand, found, spec)
-
-
 def test_a_box_among_boxes_is_lifted_out_or_not_valid(hand: HandModel) -> None:
     sides, spec = scenes._standing(scenes.TARGET_MM, scenes._neighbours(scenes.NEIGHBOURS["four"], 120))
-    found = scenes.planned(hand, sides, spec, "draft", 6)
+    found = scenes.planned(hand, sides, spec, MapOptions(6))
     assert found.shares["lift_share"] > 0, "with so much room some must come out"
     assert_valid_ones_are_clear(hand, found, spec)
 
 
 def test_a_cube_that_does_not_fit_its_bin_is_refused(hand: HandModel) -> None:
     with pytest.raises(InputError, match="there is room for 380 x 280 mm"):
-        scenes.planned(hand, (350, 350, 350), SceneSpec(kind="bin"), "draft", 2)
+        scenes.planned(hand, (350, 350, 350), SceneSpec(kind="bin"), MapOptions(2))
 
 
 def test_refused_scenes_are_cells_that_say_why_walls_stand_off(hand: HandModel) -> None:
-    found = scenes.wall_map([hand], gaps=(-5,), walls=("one",), count=2)
-    (cell,) = found.cells
+    (cell,) = scenes.wall_map([hand], MapOptions(2), gaps=(-5,), walls=("one",)).cells
     assert cell.outcome == "refused" and "deep in support" in cell.note
     half = np.array(scenes.TARGET_MM[:2]) * scenes.MILLIMETRES / 2
     for boxes in (scenes._walls(scenes.WALLS["four"], 20), scenes._neighbours(scenes.NEIGHBOURS["eight"], 20)):
@@ -393,8 +337,10 @@ def test_maps_of_several_runs_are_drawn_and_published_as_one(tmp_path: Path) -> 
         run = Stability(f"2026-01-0{value:.0f}T00:00:00Z", f"graspd stability {name}", {"graspd": "0"}, [one, own])
         (tmp_path / f"{name}.json").write_text(json.dumps(run.as_json()))
     words = [part for name in ("first", "second") for part in ("--from", str(tmp_path / f"{name}.json"))]
-    result = CliRunner().invoke(app, ["stability", *words, "--out", str(tmp_path / "out"), "--json"])
-    assert result.exit_code == 0, result.output
-    found = from_json(json.loads((tmp_path / "out" / "stability.json").read_text()))
+    code, said = command(*words, "--out", str(tmp_path / "out"), "--json", "--publish", "--data-dir", str(tmp_path))
+    assert code == 0, said
+    written = json.loads((tmp_path / "out" / "stability.json").read_text())
+    assert latest(open_store((tmp_path / "store").as_uri()), "stability") == written
+    found = from_json(written)
     assert {one.name: one.title for one in found.maps} == {"shared": "second", "first": "first", "second": "second"}
     assert found.command == "graspd stability first; graspd stability second"

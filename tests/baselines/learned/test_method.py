@@ -114,8 +114,10 @@ def proposing(network: ProposalNetwork, found: Proposals, anchor: np.ndarray) ->
     return replace(network, weights=weights, mean=rows, std=np.full_like(rows, 1e-4))
 
 
-def started(pair: Pair, seeds: Seeds, placed: PlacedGrasps, each: int) -> tuple[HandState, np.ndarray, Probe]:
-    hand, obj = pair.hand.model, pair.coarse.obj.model
+def started(pair: Pair, network: ProposalNetwork, height: float, placed: PlacedGrasps) -> HandState:
+    """Clear starts, two a grasp, from a network that proposes a palm at a height above the anchor [m]."""
+    hand, obj, each = pair.hand.model, pair.coarse.obj.model, 2
+    seeds = Seeds(proposing(network, down(hand, height), np.zeros(3)), each)
     obstacles = DeviceObstacles.create(hand, placed.scenes, obj.centre_of_mass, "cpu")
     model = pair.model(pair.coarse, obstacles)
     generators = [start_generator(0, 0, i, k) for i in range(len(placed.index)) for k in range(each)]
@@ -123,7 +125,8 @@ def started(pair: Pair, seeds: Seeds, placed: PlacedGrasps, each: int) -> tuple[
     state, depth = seeds(model, generators, each=each, placed=placed, ways=ways)
     probe = Probe(model, len(generators), room=ROOM)
     probe.data.set_scenes(np.repeat(placed.index, each))
-    return state, depth, probe
+    assert (depth <= CLEAR).all() and (probe.depths(state) <= CLEAR).all()
+    return state
 
 
 def down(hand: HandModel, height: float) -> Proposals:
@@ -141,9 +144,7 @@ def down(hand: HandModel, height: float) -> Proposals:
 
 def test_hands_set_out_as_proposed_backed_off_until_clear(hand, block, network) -> None:
     pair, placed = pair_of(hand, block, QUICK, "cpu"), on_table(block, 2)
-    fixed = proposing(network, down(hand, 0.1), np.zeros(3))
-    state, depth, probe = started(pair, Seeds(fixed, 2), placed, 2)
-    assert (depth <= CLEAR).all() and (probe.depths(state) <= CLEAR).all()
+    state = started(pair, network, 0.1, placed)
     for row, scene in enumerate(np.repeat(placed.index, 2)):
         pose = placed.object_pose[scene]
         palm = quat_rotate(pose[3:], state.pivot[row] + block.centre_of_mass) + pose[:3]
@@ -154,19 +155,17 @@ def test_hands_set_out_as_proposed_backed_off_until_clear(hand, block, network) 
         assert 0.1 < palm[2] < 0.1 + 2 * block.radius
         assert np.linalg.norm(palm[:2] - compose(pose, np.array([*block.centre_of_mass, 1, 0, 0, 0]))[:2]) < 0.03
     # From within the block it comes out the way it came, no farther than it must.
-    deeper, depth, probe = started(pair, Seeds(proposing(network, down(hand, 0.0), np.zeros(3)), 2), placed, 2)
-    assert (depth <= CLEAR).all() and (probe.depths(deeper) <= CLEAR).all()
+    deeper = started(pair, network, 0.0, placed)
     up = np.array([s.up for s in placed.scenes])[np.repeat(placed.index, 2)]
     lower = ((state.pivot - deeper.pivot) * up).sum(axis=1)
     assert ((lower > 0.1 - max(RETREATS) - 1e-3) & (lower < 0.1)).all()
     np.testing.assert_allclose(deeper.rotation, state.rotation, atol=2e-3)
 
 
-@pytest.mark.parametrize("height", [-0.5, 3.0, 1e30])
+@pytest.mark.parametrize("height", [-0.5, 1e30])
 def test_with_no_proposal_clear_hands_set_out_without_a_network(hand, block, network, height) -> None:
     pair, placed = pair_of(hand, block, QUICK, "cpu"), on_table(block, 2)
-    state, depth, probe = started(pair, Seeds(proposing(network, down(hand, height), np.zeros(3)), 2), placed, 2)
-    assert (depth <= CLEAR).all() and (probe.depths(state) <= CLEAR).all()
+    state = started(pair, network, height, placed)
     assert (np.linalg.norm(state.pivot, axis=1) < block.radius + 0.15).all()
 
 
@@ -219,6 +218,8 @@ def test_points_lie_on_the_surface_and_are_seen_by_the_camera(mug: ObjectModel) 
         assert len(set(ray.tolist())) >= 396  # a ray along an edge may miss
         # A pixel whose front no sample fell into shows what is behind: inside of the mug, the wall behind the handle.
         assert (np.abs(gap) < 1e-3).mean() > 0.97
+    points, _ = seen.cloud(POSE, camera, 8192, rng)  # more than the pixels that see the mug
+    assert points.shape == (8192, 3) and np.isfinite(points).all()
 
 
 def test_cameras_stand_where_pictures_have_them(mug: ObjectModel) -> None:
@@ -230,10 +231,3 @@ def test_cameras_stand_where_pictures_have_them(mug: ObjectModel) -> None:
     assert (elevation >= ELEVATION[0] - 1e-9).all() and (elevation <= ELEVATION[1] + 1e-9).all()
     assert (distance >= NEAREST_M + mug.radius - 1e-9).all() and (distance < 0.8).all()
     assert np.linalg.norm((out[:, :2] / distance[:, None]).mean(axis=0)) < 0.15  # from all sides
-
-
-def test_few_pixels_still_fill_a_cloud(mug: ObjectModel) -> None:
-    seen = SurfaceView.of(mug)
-    rng = np.random.default_rng(0)
-    points, _ = seen.cloud(POSE, seen.camera(POSE, rng), 8192, rng)
-    assert points.shape == (8192, 3) and np.isfinite(points).all()
