@@ -80,10 +80,7 @@ def start() -> None:
 
 
 def kernel_cache() -> Path | None:
-    """Return a cache folder for Warp; None if Warp's own (`$WARP_CACHE_PATH`, or in the home) is writable.
-
-    Containers run as any user, possibly on a read-only root file system.
-    """
+    """Return a cache folder for Warp; None if Warp's own is writable (containers run as any user)."""
     named = os.environ.get("WARP_CACHE_PATH", "")
     cache = os.environ.get("XDG_CACHE_HOME") or Path(os.environ.get("HOME") or "/") / ".cache"
     wanted = Path(named) if named else Path(cache) / "warp"
@@ -106,7 +103,6 @@ ARCHITECTURES: Final = (80, 90, 100)
 
 
 def modules() -> list[str]:
-    """Return the names of all graspd modules with Warp kernels."""
     names = [
         info.name
         for package in map(import_module, ("graspd.worker", "graspd.baselines", "graspd.studies"))
@@ -121,10 +117,7 @@ def _has_kernels(name: str) -> bool:
 
 
 def bake(names: Iterable[str], *, architectures: Sequence[int] = ARCHITECTURES, cpu: bool = True) -> list[Path]:
-    """Compile modules into Warp's cache: binaries for these GPU architectures, and objects for this CPU.
-
-    No GPU is needed. Returns all files of the cache.
-    """
+    """Compile modules into Warp's cache for these architectures and this CPU; return all files. No GPU is needed."""
     for name in names:
         module = import_module(name)
         if architectures:
@@ -136,13 +129,7 @@ def bake(names: Iterable[str], *, architectures: Sequence[int] = ARCHITECTURES, 
 
 
 def lay_out(cache: Path) -> int:
-    """Copy kernels in `$GRASPD_KERNELS` for this version of Warp that are missing from the cache into it.
-
-    A missing or unreadable folder is ignored: kernels are then compiled.
-
-    Returns:
-        Number of files copied.
-    """
+    """Copy missing kernels from `$GRASPD_KERNELS` into the cache, if the folder is readable; return their number."""
     named = os.environ.get(VARIABLE, "")
     if not named:
         return 0

@@ -49,8 +49,6 @@ class Device:
             self.resolve()
 
     def find_out(self, then: Callable[[], None]) -> None:
-        """Resolve in a thread, then call `then`."""
-
         def work() -> None:
             self.resolve()
             then()
@@ -66,7 +64,6 @@ class Device:
 
 
 def cpu_name() -> str:
-    """Return the model name of the processor."""
     try:
         text = Path("/proc/cpuinfo").read_text()
     except OSError:
@@ -89,7 +86,6 @@ def _ask_warp(wanted: str, number: int | None) -> tuple[str, str]:
 
 
 def visible_gpus() -> list[Gpu]:
-    """Return the GPUs that CUDA shows to this process."""
     import warp as wp
 
     from graspd.worker.engines import backend
@@ -100,8 +96,6 @@ def visible_gpus() -> list[Gpu]:
 
 @dataclass(frozen=True)
 class Gpu:
-    """A GPU visible to this process."""
-
     name: str
     """Warp name: cuda:0, ..."""
     id: str
@@ -159,16 +153,11 @@ class DeviceLost(GraspdError):
 
 
 def is_out_of_memory(error: BaseException) -> bool:
-    """Check whether an error is due to insufficient GPU memory."""
     return isinstance(error, RuntimeError) and _NO_MEMORY.search(str(error)) is not None
 
 
 def check_device(device: str) -> None:
-    """Wait for all launches on a device.
-
-    Raises:
-        DeviceLost: CUDA reports an error from which its context cannot recover.
-    """
+    """Wait for all launches on a device; raise DeviceLost for an error from which its context cannot recover."""
     if not device.startswith("cuda"):
         return
     import warp as wp

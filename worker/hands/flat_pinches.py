@@ -189,7 +189,6 @@ class _Look:
 
 
 def _spread(points: SurfacePoints, body: int, count: int) -> NDArray[np.intp]:
-    """Select rows of at most `count` points of a body that are far from one another."""
     mine = np.flatnonzero(points.body == body)
     return mine[farthest_points(points.position[mine], min(count, len(mine)))]
 

@@ -113,7 +113,6 @@ class _Found:
     cost: Floats
 
     def take(self, rows: NDArray[np.bool_], other: _Found) -> None:
-        """Replace these rows by those of another."""
         for mine, its in zip(vars(self).values(), vars(other).values(), strict=True):
             mine[rows] = its[rows]
 
@@ -233,7 +232,6 @@ def _flatness(hand: HandModel, points: SurfacePoints) -> Floats:
 
 
 def _any_across(axis: Floats) -> Floats:
-    """Return unit vectors (..., 3) perpendicular to others."""
     helper = np.eye(3)[np.argmin(np.abs(axis), axis=-1)]
     across = np.cross(axis, helper)
     unit: Floats = across / np.linalg.norm(across, axis=-1, keepdims=True)

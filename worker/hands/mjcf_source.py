@@ -109,7 +109,6 @@ def _shown(elements: list[Element]) -> str:
 
 
 def _is_read(actuator: Element) -> bool:
-    """Check whether it drives joints or tendons in a supported form."""
     return actuator.tag in _ACTUATORS and bool(actuator.attrib.keys() & {"joint", "jointinparent", "tendon"})
 
 
@@ -176,7 +175,6 @@ def _find(wanted: str, files: Mapping[str, bytes], folders: list[str], main: str
 
 
 def _mesh_folder(root: Element) -> tuple[str, bool]:
-    """Return the mesh folder of the compiler elements, and whether they strip folders from mesh names."""
     folder, strip = "", False
     for compiler in root.findall("compiler"):
         folder = compiler.get("meshdir", compiler.get("assetdir", folder))
@@ -218,7 +216,6 @@ def _prune(element: Element) -> None:
 
 
 def _prune_actuators(root: Element) -> None:
-    """Remove actuators of joints and tendons that no longer exist."""
     tendons = {tendon.get("name") for section in root.findall("tendon") for tendon in section.findall("fixed")}
     for section in root.findall("actuator"):
         for actuator in list(section):

@@ -93,7 +93,6 @@ class Joint:
 
     @property
     def moves(self) -> bool:
-        """Check whether it is a movable joint of a supported type."""
         return self.type in MOVING and not self.fault
 
 
@@ -153,7 +152,6 @@ def build_robot(
 
 
 def chain_to(robot: Robot, link: str) -> tuple[Joint, ...]:
-    """Return all joints, fixed ones too, from the root to a link, in this order."""
     carrier = {joint.child: joint for joint in robot.joints.values()}
     found: list[Joint] = []
     while link in carrier:
@@ -163,7 +161,6 @@ def chain_to(robot: Robot, link: str) -> tuple[Joint, ...]:
 
 
 def _check_tree(links: dict[str, Link], joints: dict[str, Joint], filename: str) -> str:
-    """Return the name of the only root link; check that every other link has exactly one parent joint."""
     parent_of: dict[str, str] = {}
     for joint in joints.values():
         for end, link in (("parent", joint.parent), ("child", joint.child)):

@@ -152,7 +152,6 @@ def _body_of_the_same_joint(ours: HandModel, theirs: HandModel, joints: NDArray[
 
 
 def _middle(hand: HandModel, body: int) -> Floats:
-    """Return the mean (3,) of the corners of a body's pieces; the origin of a body without any."""
     corners = [piece.vertices for piece in hand.pieces if piece.body == body]
     return np.concatenate(corners).mean(axis=0) if corners else np.zeros(3)
 

@@ -19,12 +19,13 @@ from graspd.service.model.errors import HandError, MeshError
 from graspd.service.model.libraries import version_of
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply, quat_to_matrix
 from graspd.worker.hands.model import ConvexPiece
-from graspd.worker.hands.primitives import hull, new_hull, signed_distance, tessellate, triangle_areas, volume
+from graspd.worker.hands.primitives import hull, hull_planes, new_hull, signed_distance, tessellate, volume
 from graspd.worker.hands.robot import Ints, Shape
 from graspd.worker.hands.visuals import find_mesh
 from graspd.worker.objects.convex import WorkLimitExceeded, coacd_parts, default_cache, keep_parts, load_parts
 from graspd.worker.objects.disk_cache import recalled
 from graspd.worker.objects.formats import read_mesh
+from graspd.worker.objects.topology import face_areas
 
 #: A hull of V corners has at most 2 V - 4 triangles: 96 here. Every plane costs time in each distance query.
 MAX_HULL_VERTICES: Final = 50
@@ -214,14 +215,13 @@ def _decomposed(vertices: Floats, faces: Ints) -> tuple[tuple[Floats, ...], bool
 
 def _is_convex(vertices: Floats, faces: Ints) -> bool:
     """Check whether nearly all of the surface lies on the hull, so that no decomposition is needed."""
-    normals, offsets = _planes(vertices[np.unique(faces)])
+    normals, offsets = hull_planes(*hull(vertices[np.unique(faces)]))
     depth = (offsets - _sample(vertices, faces) @ normals.T).min(axis=1)
     return float(np.quantile(depth, _SHARE)) < _FLAT_M
 
 
 def _sample(vertices: Floats, faces: Ints) -> Floats:
-    """Return area-uniform points (N, 3), reproducibly."""
-    areas = triangle_areas(vertices, faces)
+    areas = face_areas(vertices, faces)
     ladder = (np.arange(_POINTS) + 0.5) / _POINTS * areas.sum()
     face = np.minimum(np.searchsorted(np.cumsum(areas), ladder), len(faces) - 1)
     u, v = np.random.default_rng(0).random((2, _POINTS, 1))
@@ -277,7 +277,7 @@ def _hits(points: Floats, direction: Floats, corners: Floats) -> NDArray[np.bool
 
 def _ways_out(part: Floats, points: Floats) -> Floats:
     """Return the distance (D, P) from points along directions out of a part's hull; 0 outside of it."""
-    normals, offsets = _planes(part)
+    normals, offsets = hull_planes(*hull(part))
     inside = offsets - points @ normals.T
     rates = _DIRECTIONS @ normals.T
     way = np.full((len(_DIRECTIONS), len(points)), np.inf)
@@ -285,17 +285,6 @@ def _ways_out(part: Floats, points: Floats) -> Floats:
         onward = rate > 1e-9
         way[number] = (inside[:, onward] / rate[onward]).min(axis=1)
     return np.where((inside < -_START_M).any(axis=1), 0.0, np.maximum(way, 0.0))
-
-
-def _planes(points: Floats) -> tuple[Floats, Floats]:
-    """Return outward unit normals (P, 3) and offsets (P,) of the faces of a hull."""
-    corners, faces = hull(points)
-    a, b, c = np.moveaxis(corners[faces], 1, 0)
-    normals = np.cross(b - a, c - a)
-    lengths = np.linalg.norm(normals, axis=1)
-    keep = lengths > 1e-9 * lengths.max()
-    normals = normals[keep] / lengths[keep, None]
-    return normals, np.einsum("ij,ij->i", normals, a[keep])
 
 
 def _simplified(vertices: Floats, faces: Ints) -> tuple[Floats, Ints]:

@@ -54,7 +54,7 @@ def _read_link(element: ElementTree.Element, materials: dict[str, Colour | None]
 
 
 def _read_visuals(element: ElementTree.Element, link: str, materials: dict[str, Colour | None]) -> tuple[Shape, ...]:
-    """Read visual elements with their colours. Unusable ones are left out: only pictures need them."""
+    """Read visual elements; unusable ones are left out, since only pictures need them."""
     found = []
     for visual in element.findall("visual")[:MAX_VISUALS]:
         try:
@@ -185,7 +185,6 @@ def _limits(element: ElementTree.Element, kind: str, what: str) -> tuple[float, 
 
 
 def _follower_limits(element: ElementTree.Element, kind: str, what: str) -> tuple[float, float, float]:
-    """Return the limits of a follower, which do not bind it; none if they are junk."""
     try:
         return _limits(element, kind, what)
     except HandError:

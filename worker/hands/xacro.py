@@ -84,16 +84,7 @@ def expand(files: Mapping[str, bytes], main: str, arguments: Mapping[str, str]) 
 
 
 def read_robot(files: Mapping[str, bytes], main: str, arguments: Mapping[str, str] | None = None) -> Robot:
-    """Read and check the description `main` among a hand's files; its root element determines the format.
-
-    Args:
-        files: all files of the hand.
-        main: the description.
-        arguments: values of a xacro file's arguments.
-
-    Raises:
-        HandError, LimitError: see the readers.
-    """
+    """Read and check the description `main` among a hand's files; its root element determines the format."""
     refuse_stand_in(main, files[main], HandError)
     match format_of(main, files[main]):
         case "mjcf":

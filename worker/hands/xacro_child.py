@@ -36,7 +36,6 @@ class Refused(Exception):
 
 
 def main() -> None:
-    """Expand the given xacro file on standard output."""
     given = json.loads(sys.stdin.buffer.read())
     # A file can make the library print without end; only the answer is needed.
     answers, nowhere = os.dup(1), os.open(os.devnull, os.O_WRONLY)
@@ -70,7 +69,6 @@ def _expand(given: dict[str, Any]) -> str:
     names: list[str] = given["names"]
 
     def named(path: str) -> str:
-        """Return the name of a file of the hand; raise Refused if the path leads out of its folder."""
         inside = posixpath.normpath(posixpath.join(_TOP, path.replace("\\", "/")))
         if not inside.startswith(_TOP + "/"):
             said = path.removeprefix(_TOP + "/")
@@ -149,7 +147,6 @@ _PLAIN: Final[dict[str, Any]] = {
 
 
 def _checked(expression: str) -> Any:
-    """Compile an expression after checking that none of its names leads out of it."""
     tree = ast.parse(expression.strip(), "<expression>", "eval")
     for count, node in enumerate(ast.walk(tree)):
         name = getattr(node, "attr", None) or getattr(node, "id", None) or ""

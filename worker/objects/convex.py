@@ -67,12 +67,10 @@ def union_volume(parts: tuple[Floats, ...]) -> float:
 
 
 def default_cache() -> Path:
-    """Return the folder for pieces that can be recomputed."""
     return user_cache.folder("convex")
 
 
 def load_parts(file: Path) -> tuple[Floats, ...] | None:
-    """Load parts from a file; None if it is missing or unreadable."""
     try:
         with np.load(file) as stored:
             return tuple(stored[name] for name in sorted(stored.files))

@@ -22,8 +22,6 @@ Ints = NDArray[np.int32]
 
 @dataclass(frozen=True)
 class ObjectModel:
-    """Prepared object: its shape, mass and friction."""
-
     name: str
     digest: str
     vertices: Floats

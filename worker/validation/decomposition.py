@@ -20,7 +20,6 @@ from graspd.service.model.digests import digest_json
 from graspd.service.model.errors import MeshError
 from graspd.service.model.libraries import version_of
 from graspd.service.model.transforms import Floats
-from graspd.worker.hands.primitives import triangle_areas
 from graspd.worker.objects.convex import (
     WorkLimitExceeded,
     coacd_parts,
@@ -30,6 +29,7 @@ from graspd.worker.objects.convex import (
     union_volume,
 )
 from graspd.worker.objects.model import ObjectModel
+from graspd.worker.objects.topology import face_areas
 
 log = logging.getLogger(__name__)
 
@@ -140,7 +140,7 @@ def _file(key: _Key, cache: Path) -> Path:
 
 
 def _excess(volume: float, obj: ObjectModel) -> float:
-    return (volume - obj.volume) / float(triangle_areas(obj.vertices, obj.faces).sum())
+    return (volume - obj.volume) / float(face_areas(obj.vertices, obj.faces).sum())
 
 
 def _make(obj: ObjectModel) -> tuple[Floats, ...]:

@@ -1,4 +1,4 @@
-"""The built-in hands: generated from the facts, and the same hands as the makers' files."""
+"""The built-in hands are the same hands as the makers' files."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ import pytest
 
 from graspd.service.model.states import AssetKind
 from graspd.service.model.transforms import IDENTITY_POSE, compose, invert
-from graspd.service.store.assets import builtin_asset, builtin_files
-from graspd.worker.hands.builtins import HANDS, files_of
+from graspd.service.store.assets import builtin_asset, builtin_names
 from graspd.worker.hands.collisions import touching_bodies
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path
@@ -23,14 +22,13 @@ FRAME_TOLERANCE_M = 2e-5
 
 
 @pytest.mark.parametrize(("name", "joints", "dofs"), [("allegro", 16, 16), ("barrett", 8, 4), ("shadow", 22, 22)])
-def test_files_are_what_the_generator_writes_and_have_their_dofs(name: str, joints: int, dofs: int) -> None:
-    assert builtin_files(AssetKind.HAND, name) == files_of(name)
+def test_built_in_hands_have_their_dofs(name: str, joints: int, dofs: int) -> None:
     hand = hand_from_path(name)
     assert (len(hand.joint_names), hand.dofs) == (joints, dofs)
     assert builtin_asset(AssetKind.HAND, name)[0].digest == hand.digest
 
 
-@pytest.mark.parametrize("name", sorted(HANDS))
+@pytest.mark.parametrize("name", builtin_names(AssetKind.HAND))
 def test_fingers_stand_out_from_the_palm_and_do_not_touch(name: str) -> None:
     hand = hand_from_path(name)
     tips = body_poses(hand, IDENTITY_POSE, hand.expand(hand.preshape))[0, list(hand.fingertips), :3]

@@ -256,6 +256,9 @@ def test_macros_are_found_in_any_encoding(coding: str, name: str, tmp_path: Path
         ("model://any/../meshes/pad.stl", "meshes/pad.stl"),
         ("./meshes//x/../pad.stl", "meshes/pad.stl"),
         (" meshes/pad.stl ", "meshes/pad.stl"),
+        ("meshes\\pad.stl", "meshes/pad.stl"),
+        ("model:\\\\any\\meshes\\pad.stl", "meshes/pad.stl"),
+        ("file:///meshes/pad.stl", "meshes/pad.stl"),
         ("a&amp;b.stl", "a&b.stl"),
         ("meshes&#x5c;pad.stl", "meshes/pad.stl"),
     ],
@@ -301,6 +304,7 @@ def test_a_model_with_an_included_file_is_read_by_its_name_alone(tmp_path: Path)
 @pytest.mark.parametrize(
     ("files", "pointer"),
     [
+        ({"h.urdf": POINTER}, "h.urdf"),
         ({"h.urdf": claw("a.stl").encode(), "a.stl": POINTER}, "a.stl"),
         ({"h.xml": CLAW.encode(), "meshes/tip.stl": POINTER}, "meshes/tip.stl"),
         ({"h.xml": b'<mujoco><include file="a.xml"/></mujoco>', "a.xml": POINTER}, "a.xml"),
@@ -309,7 +313,6 @@ def test_a_model_with_an_included_file_is_read_by_its_name_alone(tmp_path: Path)
             "'a.xacro', which",
         ),
     ],
-    ids=["a mesh of a URDF", "a mesh of an MJCF model", "a part of an MJCF model", "a part of a xacro file"],
 )
 def test_a_pointer_among_the_files_of_a_hand_is_told(files: dict[str, bytes], pointer: str, tmp_path: Path) -> None:
     for told in verdicts(files, next(iter(files)), tmp_path):

@@ -17,7 +17,7 @@ from graspd.worker.hands.collisions import hull_distance
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path, load_hand
 from graspd.worker.hands.model import HandModel
-from graspd.worker.hands.shapes import MAX_HULL_VERTICES, find_mesh, parts_of, reduce_hull
+from graspd.worker.hands.shapes import MAX_HULL_VERTICES, parts_of, reduce_hull
 from graspd.worker.hands.surface import (
     BURIED_M,
     COINCIDENT_M,
@@ -26,8 +26,8 @@ from graspd.worker.hands.surface import (
     piece_distance,
     sample_surface,
 )
-from graspd.worker.objects.builtin import stl_bytes
 from graspd.worker.objects.convex import union_volume
+from graspd.worker.objects.formats.bare import stl_bytes
 from tests.worker.hands.urdfs import joint, link, robot
 
 SIZES = {"box": (0.1, 0.06, 0.03), "sphere": (0.04,), "cylinder": (0.02, 0.1), "capsule": (0.02, 0.1)}
@@ -97,26 +97,6 @@ def test_distance_of_two_boxes(offset: tuple[float, float, float], expected: flo
     assert hull_distance(box, box + np.array(offset)) == pytest.approx(expected, abs=1e-5)
     with pytest.raises(HandError, match="flat"):
         primitives.hull(np.random.default_rng(0).random((10, 3)) * [1, 1, 0])
-
-
-@pytest.mark.parametrize(
-    ("filename", "found"),
-    [
-        ("meshes/a.stl", "urdf/meshes/a.stl"),
-        ("package://hand/meshes/b.stl", "meshes/b.stl"),
-        ("package://hand/c.stl", "hand/c.stl"),
-        ("../meshes/b.stl", "meshes/b.stl"),
-    ],
-)
-def test_meshes_are_found_beside_the_urdf_and_in_the_package(filename: str, found: str) -> None:
-    files = dict.fromkeys(["urdf/meshes/a.stl", "meshes/b.stl", "hand/c.stl"], b"")
-    assert find_mesh(filename, files, "urdf", "l") == found
-
-
-@pytest.mark.parametrize("filename", ["../../etc/passwd", "/etc/passwd", "file:///../x", "C:\\x.stl", "http://h/x.stl"])
-def test_a_mesh_outside_the_upload_is_refused(filename: str) -> None:
-    with pytest.raises(HandError):
-        find_mesh(filename, {"etc/passwd": b""} if "etc" not in filename else {}, "urdf", "l")
 
 
 def hand_with_mesh(scale: str, size: float) -> dict[str, bytes]:
@@ -214,8 +194,6 @@ def test_a_failed_decomposition_leaves_the_hull_and_is_not_kept(monkeypatch: pyt
 
 
 def test_real_hands_keep_their_hulls_but_for_barretts_palm(shared_data: Path) -> None:
-    from graspd.worker.hands.load import hand_from_path
-
     counts = {"allegro/allegro_hand_right.urdf": 23, "barrett_bh280/bh280.urdf": 14, "barrett/bhand_model.urdf": 33}
     for file, count in counts.items():
         assert len(hand_from_path(shared_data / "hands" / file).pieces) == count, file

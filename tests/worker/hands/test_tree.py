@@ -73,12 +73,8 @@ def test_roots_and_dropped_links_take_what_hangs_on_them() -> None:
 @pytest.mark.parametrize(
     ("options", "named"),
     [
-        ({"fix": {"nope": 0.0}}, "nope"),
         ({"drop": ["nowhere"]}, "nowhere"),
-        ({"preshape": {"j9": 0.1}}, "j9"),
         ({"preshape": {"j1": 9.0}}, "limits"),
-        ({"fingertips": ["zz"]}, "zz"),
-        ({"palm": {"link": "zz"}}, "zz"),
         ({"stifness": 3.0}, "stifness"),  # codespell:ignore stifness
         ({"stiffness": -1.0}, "stiffness"),
         ({"effort": 0.0}, "effort"),

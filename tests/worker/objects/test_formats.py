@@ -16,9 +16,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from graspd.service.model.errors import LimitError, MeshError
-from graspd.worker.objects.builtin import stl_bytes
 from graspd.worker.objects.check import check_object
 from graspd.worker.objects.formats import read_mesh
+from graspd.worker.objects.formats.bare import stl_bytes
 from graspd.worker.objects.formats.soup import MAX_FACES, triangulate
 from tests.worker.objects.shapes import Mesh, box
 

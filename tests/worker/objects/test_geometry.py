@@ -16,9 +16,8 @@ import trimesh
 from graspd.exchange.training_export import families, signature
 from graspd.service.model.errors import MeshError
 from graspd.service.model.states import AssetKind
-from graspd.service.store.assets import builtin_files
+from graspd.service.store.assets import builtin_files, builtin_names
 from graspd.worker.grasps import GRID_M, GraspSet, Posture
-from graspd.worker.objects.builtin import OBJECTS, files_of
 from graspd.worker.objects.check import check_object
 from graspd.worker.objects.convex import WorkLimitExceeded, coacd_parts
 from graspd.worker.objects.distance import MeshDistance, deviation, point_triangle_distance, sample_faces
@@ -306,17 +305,7 @@ def test_the_signature_of_a_ball_is_that_of_chords() -> None:
     np.testing.assert_allclose(found, np.sqrt(2.0 * share), atol=0.01)
 
 
-@pytest.mark.parametrize("name", sorted(OBJECTS))
-def test_the_committed_mesh_is_the_one_the_generator_makes(name: str) -> None:
-    """Not bit for bit: another version of the boolean kernel may order its triangles otherwise."""
-    committed = object_from_path(name, 0.0)
-    made = load_object(files_of(name), name=name, digest="", face_error_m=0.0)
-    assert made.volume == pytest.approx(committed.volume, rel=1e-6)
-    apart = deviation((made.vertices, made.faces.astype(int)), (committed.vertices, committed.faces.astype(int)))
-    assert apart < 1e-6
-
-
-@pytest.mark.parametrize("name", sorted(OBJECTS))
+@pytest.mark.parametrize("name", builtin_names(AssetKind.OBJECT))
 def test_a_built_in_object_needs_no_repair(name: str) -> None:
     report = check_object(builtin_files(AssetKind.OBJECT, name), name)
     assert report["verdict"] == "accept" and report["facts"]["mass_kg"] > 0.05
