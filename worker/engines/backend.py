@@ -1,10 +1,7 @@
 """Quiet initialisation of Warp, its kernel cache, and ahead-of-time compilation of kernels.
 
-Compiled kernels are cached in Warp's default folder, or in one that this user can write.
-
 A folder of precompiled kernels has the layout of Warp's cache, VERSION/MODULE/FILE. File names contain the digest of
-the module's source and options, and the GPU's architecture or the compiling CPU's instruction set. Kernels that do not
-match a machine are not found and are compiled as usual.
+the module's source and options, and the architecture. Kernels that do not match a machine are compiled as usual.
 """
 
 from __future__ import annotations
@@ -155,11 +152,7 @@ def _copied(source: Path, target: Path) -> bool:
 
 
 def binary_name(module: ModuleType) -> str:
-    """Return the identity of a module's compiled kernels on this CPU.
-    A digest of sources, callees and compile options, and Warp's file name with the CPU's instruction set.
-
-    Two processes with the same value run the same instructions.
-    """
+    """Return the identity of a module's kernels on this CPU: two processes with the same one run the same code."""
     known = wp.get_module(module.__name__)
     # A launch on the CPU has blocks of one thread.
     name = known._get_compile_output_name(wp.get_device("cpu"), block_dim=1)

@@ -1,12 +1,11 @@
 """Warp devices: their names, the default GPU of a process, and GPU errors.
 
-`CUDA_VISIBLE_DEVICES` determines the available GPUs: the driver shows no others. Worker number k takes the k-th,
-cyclically; a process without a number takes the one with the fewest processes. Processes are counted by file locks,
-which the kernel releases with the process: lock n of a GPU is held by the n-th process on it. The locks are in the
-user's cache, which the containers of one machine share.
+Worker number k takes the k-th GPU that `CUDA_VISIBLE_DEVICES` shows, cyclically; a process without a number takes the
+one with the fewest processes. Processes are counted by file locks, which the kernel releases with the process: lock n
+of a GPU is held by the n-th process on it, in the user's cache, which the containers of one machine share.
 
-After an illegal access, a reset or a bus error nothing runs in the process's CUDA context any more. Warp only writes a
-line to stderr and continues with undefined memory, so results leave the process only after the device is synchronised.
+After an illegal access, a reset or a bus error Warp only writes a line to stderr and continues with undefined memory,
+so results leave the process only after the device is synchronised.
 """
 
 from __future__ import annotations

@@ -1,5 +1,4 @@
-"""Postures in which any two parts of a hand face each other.
-They serve objects narrower than the least gap between pads, or wider than the widest.
+"""Postures in which any two parts of a hand face each other, for objects narrower than pads can grip, or wider.
 
 An object of 10 mm is held between the sides of two fingers or a finger and the palm; one as wide as the hand's span,
 between the sides of fingertips. Both are pairs of surface points with normals along the line between them and space for

@@ -139,7 +139,7 @@ def _fingertips(hand: HandModel, tree: Tree, options: HandOptions) -> tuple[int,
 
 
 def guess_approach(hand: HandModel) -> tuple[Floats, bool]:
-    """Return the direction out of the palm, and whether it is a tie.
+    """Return the direction out of the palm, and whether the side on which the hand grasps is a tie.
 
     There are two estimates. The mean motion of the fingertips during closing points out of a human-like palm. The
     position of the tips of the half-closed hand is ahead of a gripper's palm, but also far along the fingers of a

@@ -294,15 +294,10 @@ def files_from_path(path: str | Path) -> tuple[str, dict[str, bytes], dict[str, 
 
 
 def with_drive(hand: HandModel, stated: Collection[str], assumed: Sequence[str]) -> HandModel:
-    """Replace the defaults of revolute joints by those of sliding joints and jaws.
+    """Replace the defaults of revolute joints by those of sliding joints and jaws, unless stated.
 
     A dof that moves pads by v [m/rad or 1] along their line gets the gain k v^2, summed over the pads, and the limit
     f v: at each pad that is k [N/m] and f [N], independent of the gearing.
-
-    Args:
-        hand: the hand with its palm and closing.
-        stated: dofs with a stated position gain, which is retained.
-        assumed: dofs without a stated torque or force limit.
     """
     slide, jaws = slides(hand), jaws_of(hand)
     if jaws is None and not slide.any():

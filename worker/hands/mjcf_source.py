@@ -1,7 +1,7 @@
 """Sanitise MJCF for MuJoCo's own reader: one text that names no file, and the meshes that it needs.
 
-MuJoCo reads any file on disk that a model names. So this module inserts includes, looks up meshes among the hand's
-files and renames them, and removes all parts that a hand does not need: only what is listed here reaches MuJoCo.
+MuJoCo reads any file on disk that a model names. So this module inserts includes, renames meshes of the hand's files,
+and removes all parts that a hand does not need: only what is listed here reaches MuJoCo.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Collision shapes of a robot as convex pieces.
 Primitives stay exact; a mesh becomes one hull, or several where one would cover surface that can touch.
 
-The error of a mesh's pieces is the depth of its surface beneath them, along the shortest free direction out. It is the
-ninth decile over the surface visible from outside; interiors of housings do not count.
+The error of a mesh's pieces is the depth of its surface beneath them, along the shortest free direction out: the ninth
+decile over the surface visible from outside.
 """
 
 from __future__ import annotations
@@ -38,16 +38,9 @@ Hulls = dict[tuple[str, tuple[float, ...]], list[tuple[Floats, Ints]]]
 def make_pieces(
     shape: Shape, *, body: int, pose: Floats, link: str, files: Mapping[str, bytes], base: str, hulls: Hulls
 ) -> list[ConvexPiece]:
-    """Make the convex pieces of a collision element: one, or several for a mesh with hollows.
+    """Make the convex pieces of a collision element at `pose` (7,) in the body frame; several for a mesh with hollows.
 
-    Args:
-        shape: the element.
-        body: index of the body it moves with.
-        pose: (7,) pose of the element's frame in the body frame.
-        link: link it comes from.
-        files: all files of the hand.
-        base: folder of the robot's description inside `files`.
-        hulls: hulls of this hand's meshes so far, by name and scale: fingers often share a fingertip mesh.
+    `hulls` are those of this hand's meshes so far, by name and scale: fingers often share a fingertip mesh.
 
     Raises:
         HandError: a mesh is missing, outside the upload, unreadable, flat or far too large.
@@ -165,11 +158,7 @@ _MIN_EXTENT_M: Final = 1e-3
 
 
 def parts_of(vertices: Floats, faces: Ints) -> tuple[Floats, ...]:
-    """Return corners of the convex pieces of a mesh: the mesh's own vertices if its hull is near enough.
-
-    Args:
-        vertices: (V, 3) in metres.
-        faces: (F, 3) triangles; they need not be closed.
+    """Return corners of the convex pieces of a mesh, which need not be closed; its own if its hull is near enough.
 
     Raises:
         HandError: the decomposition exceeds its CPU time limit.

@@ -87,8 +87,10 @@ def build_tree(robot: Robot, options: HandOptions) -> Tree:
     still = {
         joint.name: joint.lower
         for joint in kept
-        if joint.moves and mimics[joint.name] is None and joint.upper - joint.lower < LEAST_RANGE
-        if joint.name not in options.fix
+        if joint.moves
+        and mimics[joint.name] is None
+        and joint.name not in options.fix
+        and joint.upper - joint.lower < LEAST_RANGE
     }
     fixed = still | options.fix
     drives = {j.name: _resolve(j.name, mimics, fixed) for j in kept if j.type != "fixed"}
@@ -150,10 +152,7 @@ def _kept_joints(robot: Robot, root: str, drop: set[str]) -> list[Joint]:
 
 
 def _resolve(name: str, mimics: Mapping[str, Mimic | None], fixed: Mapping[str, float]) -> Drive | float:
-    """Return the drive of a joint through a chain of mimics, or its value if a fixed joint ends the chain.
-
-    q = m1 (m2 (... ) + o2) + o1, so the multipliers multiply and each offset is scaled by those before it.
-    """
+    """Return the drive of a joint through a chain of mimics, or its value if a fixed joint ends the chain."""
     multiplier, offset, at = 1.0, 0.0, name
     seen = {name}
     while True:

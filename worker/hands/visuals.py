@@ -112,12 +112,12 @@ def _meshes(item: PlacedShape, files: Mapping[str, bytes], base: str, soups: dic
     if shape.mesh is not None:
         return [VisualMesh(item.body, apply(item.pose, shape.mesh[0]), shape.mesh[1], shape.colour)]
     name = _file_of(item, files, base)
+    if not name:
+        return []
     try:
-        if name and name not in soups:
+        if name not in soups:
             soups[name] = read_mesh(name, files[name], _nearby(name, files))
     except InputError:
-        return []
-    if not name:
         return []
     soup, scale = soups[name], np.asarray(shape.size)
     vertices = apply(item.pose, soup.vertices * scale)

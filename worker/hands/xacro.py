@@ -32,12 +32,8 @@ _READ: Final = (".xacro", ".urdf", ".xml", ".yaml", ".yml")
 
 
 def expand(files: Mapping[str, bytes], main: str, arguments: Mapping[str, str]) -> bytes:
-    """Expand a xacro file to a URDF.
-
-    Args:
-        files: all files of the hand; includes and `$(find PACKAGE)` are searched among them only.
-        main: the file to expand.
-        arguments: values of `<xacro:arg>` by name.
+    """Expand a xacro file with values of its `<xacro:arg>` to a URDF.
+    Includes and `$(find PACKAGE)` are searched among the hand's files only.
 
     Raises:
         HandError: it cannot be expanded, or refers to files outside the hand's folder; the message states the reason.

@@ -137,12 +137,7 @@ _PLAIN: Final[dict[str, Any]] = {
     "false": False,
     "True": True,
     "False": False,
-    "list": list,
-    "dict": dict,
-    "map": map,
-    "str": str,
-    "float": float,
-    "int": int,
+    **{kind.__name__: kind for kind in (list, dict, map, str, float, int)},
 }
 
 

@@ -1,8 +1,4 @@
-"""Prepare an object from its files: read, repair, simplify, add normals, hull and mass properties.
-Objects are serialised bit for bit.
-
-Objects prepared by one command on this machine load in milliseconds in every later one.
-"""
+"""Prepare an object from its files: read, repair, simplify, add normals, hull and mass; cached by content."""
 
 from __future__ import annotations
 

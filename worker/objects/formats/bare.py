@@ -1,5 +1,4 @@
-"""Formats of bare geometry: PLY (ASCII, binary of both byte orders), STL (binary, ASCII), OFF.
-Colours and normals are ignored."""
+"""PLY (ASCII, binary of both byte orders), STL (binary, ASCII) and OFF; colours and normals are ignored."""
 
 from __future__ import annotations
 

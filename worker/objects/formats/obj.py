@@ -1,5 +1,4 @@
-"""Wavefront OBJ: positions, polygons, and colours of vertices, materials or their pictures' mean.
-Normals and groups are ignored."""
+"""Wavefront OBJ: positions, polygons, and colours of vertices, materials or their pictures' mean."""
 
 from __future__ import annotations
 
