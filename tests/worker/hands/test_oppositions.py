@@ -52,17 +52,6 @@ def test_a_wide_hand_opposes_over_a_range_one_finger_nothing() -> None:
     assert alone.widest == 0.0
 
 
-def test_postures_that_machine_keeps_are_those_that_were_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    hand = hand_from_path("barrett")
-    found = []
-    for find in (oppositions._oppositions, lambda hand: pytest.fail("it is there already")):
-        monkeypatch.setattr(oppositions, "_oppositions", find)
-        monkeypatch.setattr(oppositions, "_known", {})
-        found.append(vars(oppositions_of(hand)))
-    assert all(np.array_equal(found[0][name], array) for name, array in found[1].items())
-
-
 HEIGHT_M = 0.012
 
 

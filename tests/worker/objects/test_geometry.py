@@ -309,25 +309,3 @@ def test_the_signature_of_a_ball_is_that_of_chords() -> None:
 def test_a_built_in_object_needs_no_repair(name: str) -> None:
     report = check_object(builtin_files(AssetKind.OBJECT, name), name)
     assert report["verdict"] == "accept" and report["facts"]["mass_kg"] > 0.05
-
-
-@pytest.mark.parametrize(("name", "holes"), [("mug", 1), ("bottle", 0), ("block", 0)])
-def test_topology(name: str, holes: int) -> None:
-    """Euler: V - E + F = 2 - 2 g; only the mug's handle makes a hole."""
-    model = object_from_path(name, 0.0)
-    assert is_closed(model.faces.astype(np.int64))
-    assert len(np.unique(model.faces)) - len(model.faces) // 2 == 2 - 2 * holes
-
-
-def test_the_mug_is_hollow_and_the_block_chamfered() -> None:
-    model = object_from_path("mug", 0.0)
-    # Outer cylinder of 40 mm less the inner of 35.5 mm, plus floor and handle.
-    assert 95e-6 < model.volume < 0.35 * np.pi * 0.04**2 * 0.095
-    x, y, z, c = 0.060, 0.045, 0.090, 0.003
-    # Twelve edge prisms of c^2 / 2, and at each corner what three of them and the box leave beyond the hull: each
-    # corner loses c^3 in its cube, of which three half prisms overlap; a corner keeps no triangle of its own.
-    lengths = 4 * ((x - 2 * c) + (y - 2 * c) + (z - 2 * c))
-    corner = c**3 * (1 - 1 / 6)
-    assert object_from_path("block", 0.0).volume == pytest.approx(
-        x * y * z - lengths * c * c / 2 - 8 * corner, rel=1e-6
-    )
