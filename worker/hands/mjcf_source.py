@@ -90,17 +90,12 @@ def _passed_over(root: Element) -> list[str]:
         if (one.tag == "weld" and len(one.attrib.keys() & {"body1", "body2", "site1", "site2"}) == 2)
         or {one.get("tendon1"), one.get("tendon2")} & spatial - {None}
     ]
-    notes = []
-    if pulled:
-        notes.append(
-            f"{_shown(pulled)} on spatial tendons, which are passed over: joints are planned as if each had a drive of "
-            "its own"
-        )
-    if others:
-        notes.append(f"{_shown(others)} passed over: only motors and servos of joints and fixed tendons are read")
-    if held:
-        notes.append(f"{_shown(held)} passed over: what it holds together is planned as free")
-    return notes
+    told = (
+        (pulled, "on spatial tendons, which are passed over: joints are planned as if each had a drive of its own"),
+        (others, "passed over: only motors and servos of joints and fixed tendons are read"),
+        (held, "passed over: what it holds together is planned as free"),
+    )
+    return [f"{_shown(elements)} {note}" for elements, note in told if elements]
 
 
 def _shown(elements: list[Element]) -> str:

@@ -11,7 +11,7 @@ from graspd.service.store.assets import builtin_files
 from tests.worker.hands.grippers import gripper_urdf
 from tests.worker.hands.mjcfs import FOUR_BAR
 from tests.worker.hands.test_descriptions import package
-from tests.worker.hands.test_roots import humanoid
+from tests.worker.hands.test_tree import humanoid
 from tests.worker.hands.urdfs import joint, link, robot
 
 #: Names of the built-in hand that stands for the reader's own, and of that.
