@@ -238,7 +238,6 @@ def test_macros_are_found_in_any_encoding(coding: str, name: str, tmp_path: Path
         ("meshes\\pad.stl", "meshes/pad.stl"),
         ("model:\\\\any\\meshes\\pad.stl", "meshes/pad.stl"),
         ("file:///meshes/pad.stl", "meshes/pad.stl"),
-        ("package://any/meshes/pad.stl", "far/meshes/pad.stl"),
         ("a&amp;b.stl", "a&b.stl"),
     ],
 )
