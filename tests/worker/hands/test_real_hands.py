@@ -115,10 +115,9 @@ def test_barretts_quirks_efforts_signs_masses_and_tips(hands: Callable[..., Hand
     # 3 kg for a hand of 1 kg: nothing that is static needs them, so they are kept and shown, not corrected.
     assert hand.masses.sum() == pytest.approx(said["total_mass_kg"], rel=1e-4)
     assert "finger_1_med_liink" in hand.body_names
-    hand = bare(shared_data, "barrett", drop=["finger_1_med_liink"])
-    assert hand.dofs == 6
-    tips = {hand.body_names[body] for body in bare(shared_data, "barrett").fingertips}
-    assert tips == set(said["fingertips"].values())
+    assert bare(shared_data, "barrett", drop=["finger_1_med_liink"]).dofs == 6
+    hand = bare(shared_data, "barrett")
+    assert {hand.body_names[body] for body in hand.fingertips} == set(said["fingertips"].values())
 
 
 def test_bh280_couples_by_mimics_and_stands_open_at_zero(hands: Callable[..., HandModel]) -> None:
