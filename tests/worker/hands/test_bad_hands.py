@@ -26,6 +26,7 @@ from graspd.worker.hands.robot import MAX_LINKS
 from graspd.worker.hands.urdf import MAX_BYTES, read_urdf
 from tests.worker.hands.mjcfs import CLAW, FOUR_BAR
 from tests.worker.hands.urdfs import joint, link, report, robot
+from tests.worker.objects.shapes import damaged
 from tests.worker.objects.test_colours import BOMB, SCENE, dae
 from tests.worker.stages.test_ingest import upload, zipped
 
@@ -316,15 +317,7 @@ SOURCE = builtin_files(AssetKind.HAND, "barrett")
 WORDS = [b"nan", b"-1e308", b"inf", b"0", b"", b"<", b'"', b"&x;", b"../../", b"palm", b"finger_1_medial", b"\xff\xfe"]
 
 
-@st.composite
-def mutated(draw: st.DrawFn, source: bytes) -> bytes:
-    """A file with a few spans replaced, dropped or repeated."""
-    data = source
-    for _ in range(draw(st.integers(1, 4))):
-        start = draw(st.integers(0, len(data)))
-        end = min(len(data), start + draw(st.integers(0, 60)))
-        data = data[:start] + draw(st.sampled_from(WORDS) | st.binary(max_size=12)) + data[end:]
-    return data
+URDFS, ASSETS = (damaged(SOURCE[name], WORDS) for name in ("barrett.urdf", "asset.json"))
 
 
 def answers(urdf: bytes, asset: bytes) -> None:
@@ -337,7 +330,7 @@ def answers(urdf: bytes, asset: bytes) -> None:
 
 
 @settings(max_examples=120)
-@given(mutated(SOURCE["barrett.urdf"]), mutated(SOURCE["asset.json"]))
+@given(URDFS, ASSETS)
 def test_a_damaged_urdf_or_asset_json_loads_or_is_refused(urdf: bytes, asset: bytes) -> None:
     answers(urdf, SOURCE["asset.json"])
     answers(SOURCE["barrett.urdf"], asset)
@@ -345,6 +338,6 @@ def test_a_damaged_urdf_or_asset_json_loads_or_is_refused(urdf: bytes, asset: by
 
 @pytest.mark.slow
 @settings(derandomize=False, max_examples=10_000)
-@given(mutated(SOURCE["barrett.urdf"]), mutated(SOURCE["asset.json"]) | st.just(SOURCE["asset.json"]))
+@given(URDFS, ASSETS | st.just(SOURCE["asset.json"]))
 def test_ten_thousand_damaged_hands_load_or_are_refused(urdf: bytes, asset: bytes) -> None:
     answers(urdf, asset)

@@ -19,7 +19,7 @@ from graspd.worker.objects.check import check_object
 from graspd.worker.objects.formats import read_mesh
 from graspd.worker.objects.formats.bare import stl_bytes
 from graspd.worker.objects.formats.soup import MAX_FACES, triangulate
-from tests.worker.objects.shapes import Mesh, box
+from tests.worker.objects.shapes import Mesh, box, damaged
 from tests.worker.stages.test_ingest import zipped
 
 VOLUME = 0.06 * 0.05 * 0.04
@@ -453,16 +453,8 @@ def test_a_hint_of_units_fits_the_size(length: float, units: str, likely: list[s
 WORDS = [b"nan", b"1e999", b"-1", b"0", b"999999999", b"\n", b"f 1 2 3\n", b"\xff\xff\xff\xff", b"\x7f\x7f\x80\0", b"{"]
 
 
-@st.composite
-def mutated(draw: st.DrawFn) -> tuple[str, bytes]:
-    """A file of any format with a few spans replaced, dropped or repeated."""
-    name = draw(st.sampled_from(sorted(FILES)))
-    data = FILES[name]
-    for _ in range(draw(st.integers(1, 5))):
-        start = draw(st.integers(0, len(data)))
-        end = min(len(data), start + draw(st.integers(0, 40)))
-        data = data[:start] + draw(st.sampled_from(WORDS) | st.binary(max_size=16)) + data[end:]
-    return name, data
+#: A file of any format, damaged.
+MUTATED = st.sampled_from(sorted(FILES)).flatmap(lambda name: st.tuples(st.just(name), damaged(FILES[name], WORDS)))
 
 
 def answers(name: str, data: bytes, allow_open: bool) -> None:
@@ -474,7 +466,7 @@ def answers(name: str, data: bytes, allow_open: bool) -> None:
 
 
 @settings(max_examples=250)
-@given(mutated(), st.booleans())
+@given(MUTATED, st.booleans())
 def test_a_damaged_mesh_loads_or_is_refused(file: tuple[str, bytes], allow_open: bool) -> None:
     answers(*file, allow_open)
 
@@ -487,7 +479,7 @@ def test_noise_is_refused(name: str, data: bytes) -> None:
 
 @pytest.mark.slow
 @settings(derandomize=False, max_examples=10_000)
-@given(mutated(), st.booleans())
+@given(MUTATED, st.booleans())
 def test_ten_thousand_damaged_meshes_load_or_are_refused(file: tuple[str, bytes], allow_open: bool) -> None:
     answers(*file, allow_open)
 
