@@ -8,12 +8,10 @@ a cube of that width. They are found by sampling and random steps.
 from __future__ import annotations
 
 import sys
-import threading
 from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
-from cachetools import LRUCache
 from numpy.typing import NDArray
 
 from graspd.service.model import transforms
@@ -22,9 +20,8 @@ from graspd.worker.hands import kinematics, primitives, surface
 from graspd.worker.hands import pinch_postures as oppositions
 from graspd.worker.hands.kinematics import body_poses, generalized_forces
 from graspd.worker.hands.model import HandModel, SurfacePoints
-from graspd.worker.hands.pinch_postures import Oppositions, oppositions_of
+from graspd.worker.hands.pinch_postures import Oppositions, cached_postures, oppositions_of
 from graspd.worker.hands.surface import sample_surface
-from graspd.worker.objects.disk_cache import arrays_kept_or_made
 
 Ints = NDArray[np.intp]
 Size = Literal["small", "wide"]
@@ -63,17 +60,8 @@ _NEXT_TO: Final = 1e-9
 
 def spans_of(hand: HandModel, size: Size) -> Oppositions:
     """Return postures for small or wide objects, cached in memory and on this machine."""
-    key = (hand.content, size)
-    with _lock:
-        if key not in _known:
-            code = (sys.modules[__name__], oppositions, kinematics, kinematics, primitives, surface, transforms)
-            made = arrays_kept_or_made("spans", key, code, lambda: vars(_spans(hand, size)))
-            _known[key] = Oppositions(**made)
-        return _known[key]
-
-
-_known: LRUCache[tuple[str, str], Oppositions] = LRUCache(16)
-_lock = threading.Lock()
+    code = (sys.modules[__name__], oppositions, kinematics, primitives, surface, transforms)
+    return cached_postures("spans", (hand.content, size), code, lambda: _spans(hand, size))
 
 
 def widest_span(hand: HandModel) -> float:

@@ -81,17 +81,23 @@ class Oppositions:
         return cls(np.zeros((0, hand.dofs)), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
 
 
-_known: LRUCache[str, Oppositions] = LRUCache(16)
-_lock = threading.Lock()
+_known: LRUCache[tuple[str, ...], Oppositions] = LRUCache(48)
+_lock = threading.RLock()
+
+
+def cached_postures(
+    kind: str, key: tuple[str, ...], code: tuple[ModuleType, ...], make: Callable[[], Oppositions]
+) -> Oppositions:
+    """Return postures cached in memory and on this machine; `make` may ask for other kinds of them."""
+    with _lock:
+        if (kind, *key) not in _known:
+            _known[kind, *key] = Oppositions(**arrays_kept_or_made(kind, key, code, lambda: vars(make())))
+        return _known[kind, *key]
 
 
 def oppositions_of(hand: HandModel) -> Oppositions:
     """Return the opposed postures of a hand, cached in memory and on this machine; one finger has none."""
-    with _lock:
-        if hand.content not in _known:
-            made = arrays_kept_or_made("oppositions", (hand.content,), _code(), lambda: vars(_oppositions(hand)))
-            _known[hand.content] = Oppositions(**made)
-        return _known[hand.content]
+    return cached_postures("oppositions", (hand.content,), _code(), lambda: _oppositions(hand))
 
 
 def _code() -> tuple[ModuleType, ...]:
