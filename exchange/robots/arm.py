@@ -14,12 +14,11 @@ from graspd.service.model.errors import InputError
 from graspd.service.model.states import AssetKind
 from graspd.service.model.transforms import Floats
 from graspd.worker.hands.collisions import resting_neighbours
-from graspd.worker.hands.load import body_model, files_from_path, main_file
+from graspd.worker.hands.load import HandSource, body_model, files_from_path
 from graspd.worker.hands.model import HandModel
-from graspd.worker.hands.options import HandOptions, parse_options
+from graspd.worker.hands.options import HandOptions
 from graspd.worker.hands.robot import FREE, MOVING, Robot, chain_to
 from graspd.worker.hands.tree import build_tree
-from graspd.worker.hands.xacro import read_robot
 
 
 @dataclass(frozen=True)
@@ -48,9 +47,8 @@ def read_arm(path: str | Path, mount: str, hand_pose: Floats) -> Arm:
         InputError: the mount link is missing, or no joint moves it.
     """
     name, files, stated = files_from_path(path)
-    options = parse_options(files, stated)
-    main = main_file(files, options)
-    robot = read_robot(files, main, options.xacro)
+    source = HandSource.read(files, stated, name=name, digest=digest_files(AssetKind.HAND, files))
+    robot = source.robot
     if mount not in robot.links:
         near = ", ".join(list(robot.links)[-6:])
         raise InputError(f"the arm {name} has no link {mount[:80]!r} to mount a hand on; its last links: {near}")
@@ -58,15 +56,14 @@ def read_arm(path: str | Path, mount: str, hand_pose: Floats) -> Arm:
     if not moving:
         raise InputError(f"no joint of the arm {name} moves the link {mount!r}; name the link behind its last joint")
     chosen = HandOptions(
-        file=main,
-        xacro=options.xacro,
+        file=source.main,
+        xacro=source.options.xacro,
         root=robot.root,
         drop=tuple(joint.child for joint in robot.joints.values() if joint.parent == mount),
         fix={joint: _rest(robot, joint) for joint in _others(robot, moving, mount)},
     )
     tree = build_tree(robot, chosen)
-    digest = digest_files(AssetKind.HAND, files)
-    model = body_model(robot, tree, chosen, files, main, name=name, digest=digest)
+    model = body_model(replace(source, options=chosen), tree)
     model = replace(model, neighbours=resting_neighbours(model))
     body, pose = tree.links[mount]
     return Arm(model, mount, body, np.asarray(pose, float), hand_pose)
@@ -103,9 +100,8 @@ def describe(files: Mapping[str, bytes], options: Mapping[str, Any] | None = Non
     Raises:
         HandError: the files describe no usable hand.
     """
-    settings = parse_options(files, options)
-    robot = read_robot(files, main_file(files, settings), settings.xacro)
-    tree = build_tree(robot, settings)
+    source = HandSource.read(files, options)
+    robot, tree = source.robot, build_tree(source.robot, source.options)
     return Description(
         dict(tree.links), frozenset(name for name in tree.joint_names if robot.joints[name].mimic is not None)
     )

@@ -1,10 +1,7 @@
 """Quiet initialisation of Warp, its kernel cache, and ahead-of-time compilation of kernels.
 
-Compiled kernels are cached in Warp's default folder, or in one that this user can write.
-
 A folder of precompiled kernels has the layout of Warp's cache, VERSION/MODULE/FILE. File names contain the digest of
-the module's source and options, and the GPU's architecture or the compiling CPU's instruction set. Kernels that do not
-match a machine are not found and are compiled as usual.
+the module's source and options, and the architecture. Kernels that do not match a machine are compiled as usual.
 """
 
 from __future__ import annotations
@@ -80,10 +77,7 @@ def start() -> None:
 
 
 def kernel_cache() -> Path | None:
-    """Return a cache folder for Warp; None if Warp's own (`$WARP_CACHE_PATH`, or in the home) is writable.
-
-    Containers run as any user, possibly on a read-only root file system.
-    """
+    """Return a cache folder for Warp; None if Warp's own is writable (containers run as any user)."""
     named = os.environ.get("WARP_CACHE_PATH", "")
     cache = os.environ.get("XDG_CACHE_HOME") or Path(os.environ.get("HOME") or "/") / ".cache"
     wanted = Path(named) if named else Path(cache) / "warp"
@@ -106,7 +100,6 @@ ARCHITECTURES: Final = (80, 90, 100)
 
 
 def modules() -> list[str]:
-    """Return the names of all graspd modules with Warp kernels."""
     names = [
         info.name
         for package in map(import_module, ("graspd.worker", "graspd.baselines", "graspd.studies"))
@@ -121,10 +114,7 @@ def _has_kernels(name: str) -> bool:
 
 
 def bake(names: Iterable[str], *, architectures: Sequence[int] = ARCHITECTURES, cpu: bool = True) -> list[Path]:
-    """Compile modules into Warp's cache: binaries for these GPU architectures, and objects for this CPU.
-
-    No GPU is needed. Returns all files of the cache.
-    """
+    """Compile modules into Warp's cache for these architectures and this CPU; return all files. No GPU is needed."""
     for name in names:
         module = import_module(name)
         if architectures:
@@ -136,13 +126,7 @@ def bake(names: Iterable[str], *, architectures: Sequence[int] = ARCHITECTURES, 
 
 
 def lay_out(cache: Path) -> int:
-    """Copy kernels in `$GRASPD_KERNELS` for this version of Warp that are missing from the cache into it.
-
-    A missing or unreadable folder is ignored: kernels are then compiled.
-
-    Returns:
-        Number of files copied.
-    """
+    """Copy missing kernels from `$GRASPD_KERNELS` into the cache, if the folder is readable; return their number."""
     named = os.environ.get(VARIABLE, "")
     if not named:
         return 0
@@ -168,11 +152,7 @@ def _copied(source: Path, target: Path) -> bool:
 
 
 def binary_name(module: ModuleType) -> str:
-    """Return the identity of a module's compiled kernels on this CPU.
-    A digest of sources, callees and compile options, and Warp's file name with the CPU's instruction set.
-
-    Two processes with the same value run the same instructions.
-    """
+    """Return the identity of a module's kernels on this CPU: two processes with the same one run the same code."""
     known = wp.get_module(module.__name__)
     # A launch on the CPU has blocks of one thread.
     name = known._get_compile_output_name(wp.get_device("cpu"), block_dim=1)

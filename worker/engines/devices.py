@@ -1,12 +1,11 @@
 """Warp devices: their names, the default GPU of a process, and GPU errors.
 
-`CUDA_VISIBLE_DEVICES` determines the available GPUs: the driver shows no others. Worker number k takes the k-th,
-cyclically; a process without a number takes the one with the fewest processes. Processes are counted by file locks,
-which the kernel releases with the process: lock n of a GPU is held by the n-th process on it. The locks are in the
-user's cache, which the containers of one machine share.
+Worker number k takes the k-th GPU that `CUDA_VISIBLE_DEVICES` shows, cyclically; a process without a number takes the
+one with the fewest processes. Processes are counted by file locks, which the kernel releases with the process: lock n
+of a GPU is held by the n-th process on it, in the user's cache, which the containers of one machine share.
 
-After an illegal access, a reset or a bus error nothing runs in the process's CUDA context any more. Warp only writes a
-line to stderr and continues with undefined memory, so results leave the process only after the device is synchronised.
+After an illegal access, a reset or a bus error Warp only writes a line to stderr and continues with undefined memory,
+so results leave the process only after the device is synchronised.
 """
 
 from __future__ import annotations
@@ -49,8 +48,6 @@ class Device:
             self.resolve()
 
     def find_out(self, then: Callable[[], None]) -> None:
-        """Resolve in a thread, then call `then`."""
-
         def work() -> None:
             self.resolve()
             then()
@@ -66,7 +63,6 @@ class Device:
 
 
 def cpu_name() -> str:
-    """Return the model name of the processor."""
     try:
         text = Path("/proc/cpuinfo").read_text()
     except OSError:
@@ -89,7 +85,6 @@ def _ask_warp(wanted: str, number: int | None) -> tuple[str, str]:
 
 
 def visible_gpus() -> list[Gpu]:
-    """Return the GPUs that CUDA shows to this process."""
     import warp as wp
 
     from graspd.worker.engines import backend
@@ -100,8 +95,6 @@ def visible_gpus() -> list[Gpu]:
 
 @dataclass(frozen=True)
 class Gpu:
-    """A GPU visible to this process."""
-
     name: str
     """Warp name: cuda:0, ..."""
     id: str
@@ -159,16 +152,11 @@ class DeviceLost(GraspdError):
 
 
 def is_out_of_memory(error: BaseException) -> bool:
-    """Check whether an error is due to insufficient GPU memory."""
     return isinstance(error, RuntimeError) and _NO_MEMORY.search(str(error)) is not None
 
 
 def check_device(device: str) -> None:
-    """Wait for all launches on a device.
-
-    Raises:
-        DeviceLost: CUDA reports an error from which its context cannot recover.
-    """
+    """Wait for all launches on a device; raise DeviceLost for an error from which its context cannot recover."""
     if not device.startswith("cuda"):
         return
     import warp as wp

@@ -41,17 +41,10 @@ def fitting(multiprocessors: int, free_bytes: int) -> int:
 
 
 def processes_at_once(device: str, wanted: int, *, threads: int = 0, workers: int = 1, root: Path = ROOT) -> int:
-    """Return the number of processes that validate and measure; 1: the worker's own, with threads.
+    """Return the number of processes that validate and measure: `wanted`, if not 0; 1: the worker's own, with threads.
 
-    By default a worker on a GPU has one per core except its own, within a quarter of the memory. On a CPU the planner
-    uses the same cores at other times, and threads suffice.
-
-    Args:
-        device: Warp device of the planner.
-        wanted: requested number; 0: default.
-        threads: CPU threads of the worker; 0: one per core.
-        workers: number of workers on this machine, which share its cores and memory.
-        root: the folder with `proc` and `sys`.
+    By default one of some `workers` on a GPU has one per core except its own, within a quarter of the memory. On a CPU
+    the planner uses the same cores at other times, and threads (0: one per core) suffice.
     """
     if wanted or not device.startswith("cuda"):
         return wanted or 1

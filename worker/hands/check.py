@@ -10,16 +10,15 @@ import numpy as np
 from graspd.service.model.errors import AssetError, InputError
 from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
 from graspd.worker.hands.closing import chains_of
-from graspd.worker.hands.guess import approach_is_tied
+from graspd.worker.hands.guess import guess_approach
 from graspd.worker.hands.jaws import jaws_of
-from graspd.worker.hands.load import assemble, assumed_efforts, main_file, mounting_of
+from graspd.worker.hands.load import HandSource, assemble, assumed_efforts, mounting_of
 from graspd.worker.hands.model import HandModel
-from graspd.worker.hands.options import HandOptions, parse_options
+from graspd.worker.hands.options import HandOptions
 from graspd.worker.hands.pinch_postures import require_opposing
 from graspd.worker.hands.robot import Robot, chain_to
 from graspd.worker.hands.surface import sample_surface
-from graspd.worker.hands.tree import build_tree, cut_drives, joints_above, passed_limits
-from graspd.worker.hands.xacro import read_robot
+from graspd.worker.hands.tree import build_tree, cut_drives, passed_limits
 
 #: Number of points that measure the outer surface.
 _SURFACE_POINTS = 512
@@ -40,10 +39,9 @@ def check_hand(
         units; for a refusal that options fix, `problem` and `options_suggested`, keys of `HandOptions`.
     """
     try:
-        settings = parse_options(files, options)
-        main = main_file(files, settings)
-        robot = read_robot(files, main, settings.xacro)
-        hand = assemble(robot, settings, files, main, name=name, digest="0" * 32, run=run)
+        source = HandSource.read(files, options, name=name, digest="0" * 32, run=run)
+        robot, settings = source.robot, source.options
+        hand = assemble(source)
         area = float(sample_surface(hand, _SURFACE_POINTS).area.sum())
         require_opposing(hand)
     except InputError as error:
@@ -53,21 +51,10 @@ def check_hand(
         "palm": settings.palm is not None,
         "preshape": bool(settings.preshape),
         "closing": bool(settings.closing),
-        "effort": not assumed_efforts(robot, hand.dof_names, settings),
+        "effort": not assumed_efforts(source, hand.dof_names),
     }
-    facts = hand_facts(hand, robot) | {
-        "surface_area_m2": area,
-        "guessed": [key for key, said in stated.items() if not said]
-        + ([TIED] if (tie := _tie(hand, settings)) else []),
-    }
-    message = (
-        f"{name}: {hand.dofs} degrees of freedom in {len(hand.joint_names)} joints, {len(hand.fingertips)} fingertips, "
-        f"{len(hand.pieces)} convex pieces; palm {hand.root_link!r} facing {_direction(hand)}"
-    )
-    if (jaws := jaws_of(hand)) is not None:
-        facts["opening_m"] = round(jaws.opening, 6)
-        message += f"; opens {1e3 * jaws.opening:.0f} mm"
-    fault = "" if hand.mounting else mounting_of(robot, settings, files, main, hand)[1]
+    tie = _tie(hand, settings)
+    fault = "" if hand.mounting else mounting_of(source, hand)[1]
     notes = [
         *robot.notes,
         *tie,
@@ -77,35 +64,44 @@ def check_hand(
         *_left_out(robot, hand, settings),
         *_mounting(hand, fault),
     ]
-    facts["notes"] = notes
+    facts = {
+        "links": len(robot.links),
+        **model_facts(hand),
+        "mass": float(hand.masses.sum()),
+        "pieces": len(hand.pieces),
+        "notes": notes,
+        "surface_area_m2": area,
+        "guessed": [*(key for key, said in stated.items() if not said), *([TIED] if tie else [])],
+    }
+    message = (
+        f"{name}: {hand.dofs} degrees of freedom in {len(hand.joint_names)} joints, {len(hand.fingertips)} fingertips, "
+        f"{len(hand.pieces)} convex pieces; palm {hand.root_link!r} facing {_direction(hand)}"
+    )
+    if (jaws := jaws_of(hand)) is not None:
+        facts["opening_m"] = round(jaws.opening, 6)
+        message += f"; opens {1e3 * jaws.opening:.0f} mm"
     return {"verdict": "accept", "message": "; ".join([message, *notes]), "repairs": [], "facts": facts}
 
 
 def _tendons(hand: HandModel) -> list[str]:
-    """Return notes on drives that pull several joints."""
     pairs = [" and ".join(hand.dof_names[d] for d in tendon.dofs) for tendon in hand.tendons]
-    return (
-        [f"{', '.join(pairs)} on one tendon each" if len(pairs) > 1 else f"{pairs[0]} on one tendon"] if pairs else []
-    )
+    return [f"{', '.join(pairs)} on one tendon{' each' if len(pairs) > 1 else ''}"] if pairs else []
 
 
 def _open(hand: HandModel) -> list[str]:
-    """Return notes on fingers that no joint closes."""
     chains = zip(hand.fingertips, chains_of(hand), strict=True)
     still = [hand.body_names[tip] for tip, chain in chains if not hand.closing[hand.dof[chain]].any()]
     return [f"no joint closes the finger of {', '.join(still)}: say which does with --closing JOINT=1"] if still else []
 
 
 def _tie(hand: HandModel, settings: HandOptions) -> list[str]:
-    """Return a note on a guess that was a tie."""
     stated = settings.approach or (settings.palm and settings.palm.approach)
-    if stated or jaws_of(hand) is not None or not approach_is_tied(hand):
+    if stated or jaws_of(hand) is not None or not guess_approach(hand)[1]:
         return []
     return ["the palm may face either way along its axis, a tie: say which with --approach"]
 
 
 def _limits(robot: Robot, settings: HandOptions) -> list[str]:
-    """Return notes on joints whose limits do not bind them, or leave them one value."""
     tree = build_tree(robot, settings)
     passed = passed_limits(robot, tree, settings)
     notes = [f"limits of {', '.join(passed)} are not used, as in ROS: they follow other joints"] if passed else []
@@ -115,36 +111,23 @@ def _limits(robot: Robot, settings: HandOptions) -> list[str]:
 
 def _left_out(robot: Robot, hand: HandModel, settings: HandOptions) -> list[str]:
     """Return a note on links left out when a hand was separated from its arm without an option."""
-    above = joints_above(robot, hand.root_link)
+    chain = chain_to(robot, hand.root_link)
+    above = [joint.name for joint in chain if joint.type != "fixed"]
     if settings.root:
-        faulty = [joint for joint in chain_to(robot, hand.root_link) if joint.fault]
-        return [f"{joint.name} ({joint.type}) above the palm taken as fixed" for joint in faulty]
+        return [f"{joint.name} ({joint.type}) above the palm taken as fixed" for joint in chain if joint.fault]
     if not above:
         return []
     return [f"{', '.join(above)} above the palm left out, poses are those of {hand.root_link!r} (--root {robot.root})"]
 
 
 def _mounting(hand: HandModel, fault: str) -> list[str]:
-    """Return notes on links above the hand's root; `fault`: the reason why they cannot be read."""
     if fault:
         return [fault]
     links = () if hand.mounting is None else dict.fromkeys(piece.link for piece in hand.mounting.pieces)
     return [f"{', '.join(links)} above the palm kept clear in scenes"] if links else []
 
 
-def hand_facts(hand: HandModel, robot: Robot) -> dict[str, Any]:
-    """Return facts that a user should review before using a hand; numbers in SI units."""
-    return {
-        "links": len(robot.links),
-        **model_facts(hand),
-        "mass": float(hand.masses.sum()),
-        "pieces": len(hand.pieces),
-        "notes": list(robot.notes),
-    }
-
-
 def model_facts(hand: HandModel) -> dict[str, Any]:
-    """Return the facts that follow from the model alone."""
     return {
         "bodies": hand.bodies,
         "joints": list(hand.joint_names),

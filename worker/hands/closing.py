@@ -100,19 +100,13 @@ def _apart(tip: Floats) -> Floats:
 
 def chains_of(hand: HandModel) -> list[list[int]]:
     """Return the bodies whose joints move each fingertip, the last one first, up to the palm."""
-    carrying, chains = set(carriers(hand)), []
-    for tip in hand.fingertips:
-        chain, body = [], tip
-        while body > 0:
-            if body not in carrying and hand.dof[body] >= 0:
-                chain.append(body)
-            body = int(hand.parent[body])
-        chains.append(chain)
-    return chains
+    carrying = set(carriers(hand))
+    return [
+        [body for body in hand.chain(tip) if body not in carrying and hand.dof[body] >= 0] for tip in hand.fingertips
+    ]
 
 
 def _axes(hand: HandModel, q: Floats) -> Floats:
-    """Return the axes (B, 3) of all joints in the root frame."""
     return np.asarray(quat_rotate(body_poses(hand, IDENTITY_POSE, hand.expand(q))[0, :, 3:], hand.axis))
 
 
@@ -120,17 +114,12 @@ def carriers(hand: HandModel) -> list[int]:
     """Return the bodies that carry all fingertips: root, forearm and wrist, palm."""
     if len(hand.fingertips) < 2:
         return [0]
-    chains = []
-    for tip in hand.fingertips:
-        chain = [tip]
-        while chain[-1] > 0:
-            chain.append(int(hand.parent[chain[-1]]))
-        chains.append(chain[::-1])
+    chains = [[0, *hand.chain(tip)[::-1]] for tip in hand.fingertips]
     return [same[0] for same in zip(*chains, strict=False) if len(set(same)) == 1]
 
 
-def posture(hand: HandModel, share: float) -> Floats:
-    """Return the posture (D,) at a share from open (0) to closed (1); dofs that close nothing stay near 0."""
+def posture(hand: HandModel, share: float | Floats) -> Floats:
+    """Return the posture (..., D) at shares (..., 1) from open (0) to closed (1); other dofs stay near 0."""
     start = np.where(hand.closing < 0, hand.upper, hand.lower)
     end = np.where(hand.closing < 0, hand.lower, hand.upper)
     rest = np.clip(0.0, hand.lower, hand.upper)

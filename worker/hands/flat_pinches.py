@@ -7,12 +7,10 @@ search uses here the surface within the object's height above the plane.
 from __future__ import annotations
 
 import sys
-import threading
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from cachetools import LRUCache
 from numpy.typing import NDArray
 
 from graspd.service.model import transforms
@@ -21,9 +19,8 @@ from graspd.worker.hands import closing, kinematics, primitives, surface
 from graspd.worker.hands import pinch_postures as oppositions
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel, SurfacePoints
-from graspd.worker.hands.pinch_postures import Oppositions, climbed, opposed_finger, random_postures
+from graspd.worker.hands.pinch_postures import Oppositions, cached_postures, climbed, opposed_finger, random_postures
 from graspd.worker.hands.surface import farthest_points, sample_surface
-from graspd.worker.objects.disk_cache import arrays_kept_or_made
 
 #: Object heights with their own postures [m]; higher objects reach the pads.
 HEIGHTS_M: Final = (0.005, 0.008, 0.012, 0.018)
@@ -58,18 +55,8 @@ def pinches_of(hand: HandModel, height: float) -> Oppositions:
     known = [h for h in HEIGHTS_M if h >= height]
     if not known or len(hand.fingertips) < 2:
         return Oppositions.of_none(hand)
-    key = (hand.content, str(known[0]))
-    with _lock:
-        if key not in _known:
-            code = (sys.modules[__name__], closing, kinematics, oppositions, primitives, surface, transforms)
-            _known[key] = Oppositions(
-                **arrays_kept_or_made("pinches", key, code, lambda: vars(_pinches(hand, known[0])))
-            )
-        return _known[key]
-
-
-_known: LRUCache[tuple[str, str], Oppositions] = LRUCache(16)
-_lock = threading.Lock()
+    code = (sys.modules[__name__], closing, kinematics, oppositions, primitives, surface, transforms)
+    return cached_postures("pinches", (hand.content, str(known[0])), code, lambda: _pinches(hand, known[0]))
 
 
 def _pinches(hand: HandModel, height: float) -> Oppositions:
@@ -189,7 +176,6 @@ class _Look:
 
 
 def _spread(points: SurfacePoints, body: int, count: int) -> NDArray[np.intp]:
-    """Select rows of at most `count` points of a body that are far from one another."""
     mine = np.flatnonzero(points.body == body)
     return mine[farthest_points(points.position[mine], min(count, len(mine)))]
 

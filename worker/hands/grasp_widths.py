@@ -1,5 +1,4 @@
-"""Postures in which any two parts of a hand face each other.
-They serve objects narrower than the least gap between pads, or wider than the widest.
+"""Postures in which any two parts of a hand face each other, for objects narrower than pads can grip, or wider.
 
 An object of 10 mm is held between the sides of two fingers or a finger and the palm; one as wide as the hand's span,
 between the sides of fingertips. Both are pairs of surface points with normals along the line between them and space for
@@ -9,12 +8,10 @@ a cube of that width. They are found by sampling and random steps.
 from __future__ import annotations
 
 import sys
-import threading
 from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
-from cachetools import LRUCache
 from numpy.typing import NDArray
 
 from graspd.service.model import transforms
@@ -23,9 +20,8 @@ from graspd.worker.hands import kinematics, primitives, surface
 from graspd.worker.hands import pinch_postures as oppositions
 from graspd.worker.hands.kinematics import body_poses, generalized_forces
 from graspd.worker.hands.model import HandModel, SurfacePoints
-from graspd.worker.hands.pinch_postures import Oppositions, oppositions_of
+from graspd.worker.hands.pinch_postures import Oppositions, cached_postures, oppositions_of
 from graspd.worker.hands.surface import sample_surface
-from graspd.worker.objects.disk_cache import arrays_kept_or_made
 
 Ints = NDArray[np.intp]
 Size = Literal["small", "wide"]
@@ -64,17 +60,8 @@ _NEXT_TO: Final = 1e-9
 
 def spans_of(hand: HandModel, size: Size) -> Oppositions:
     """Return postures for small or wide objects, cached in memory and on this machine."""
-    key = (hand.content, size)
-    with _lock:
-        if key not in _known:
-            code = (sys.modules[__name__], oppositions, kinematics, kinematics, primitives, surface, transforms)
-            made = arrays_kept_or_made("spans", key, code, lambda: vars(_spans(hand, size)))
-            _known[key] = Oppositions(**made)
-        return _known[key]
-
-
-_known: LRUCache[tuple[str, str], Oppositions] = LRUCache(16)
-_lock = threading.Lock()
+    code = (sys.modules[__name__], oppositions, kinematics, primitives, surface, transforms)
+    return cached_postures("spans", (hand.content, size), code, lambda: _spans(hand, size))
 
 
 def widest_span(hand: HandModel) -> float:
@@ -113,7 +100,6 @@ class _Found:
     cost: Floats
 
     def take(self, rows: NDArray[np.bool_], other: _Found) -> None:
-        """Replace these rows by those of another."""
         for mine, its in zip(vars(self).values(), vars(other).values(), strict=True):
             mine[rows] = its[rows]
 
@@ -233,7 +219,6 @@ def _flatness(hand: HandModel, points: SurfacePoints) -> Floats:
 
 
 def _any_across(axis: Floats) -> Floats:
-    """Return unit vectors (..., 3) perpendicular to others."""
     helper = np.eye(3)[np.argmin(np.abs(axis), axis=-1)]
     across = np.cross(axis, helper)
     unit: Floats = across / np.linalg.norm(across, axis=-1, keepdims=True)

@@ -61,7 +61,6 @@ def complete(hand: HandModel, tree: Tree, options: HandOptions) -> HandModel:
 
 
 def _with(closing: Floats, stated: Mapping[int, float]) -> Floats:
-    """Return closing (D,) with the stated values."""
     closing = closing.copy()
     for dof, direction in stated.items():
         closing[dof] = np.sign(direction)
@@ -69,10 +68,9 @@ def _with(closing: Floats, stated: Mapping[int, float]) -> Floats:
 
 
 def _with_palm(hand: HandModel, tree: Tree, options: HandOptions) -> HandModel:
-    """Add the preshape and palm that follow from the hand's closing."""
     approach = _stated_approach(hand, tree, options)
     if approach is None:
-        approach = _guess_approach(hand)
+        approach, _ = guess_approach(hand)
     hand = replace(hand, preshape=_preshape(hand, tree, options))
     return replace(hand, palm=_palm(hand, tree, options, approach))
 
@@ -140,18 +138,8 @@ def _fingertips(hand: HandModel, tree: Tree, options: HandOptions) -> tuple[int,
     return tuple(body for body in range(1, hand.bodies) if body not in set(hand.parent.tolist()))
 
 
-def _guess_approach(hand: HandModel) -> Floats:
-    """Return the direction out of the palm, see `_witnessed`."""
-    return _witnessed(hand)[0]
-
-
-def approach_is_tied(hand: HandModel) -> bool:
-    """Check whether the side of the fingers on which the hand grasps is undetermined."""
-    return _witnessed(hand)[1]
-
-
-def _witnessed(hand: HandModel) -> tuple[Floats, bool]:
-    """Return the direction out of the palm, and whether it is a tie.
+def guess_approach(hand: HandModel) -> tuple[Floats, bool]:
+    """Return the direction out of the palm, and whether the side on which the hand grasps is a tie.
 
     There are two estimates. The mean motion of the fingertips during closing points out of a human-like palm. The
     position of the tips of the half-closed hand is ahead of a gripper's palm, but also far along the fingers of a
@@ -169,7 +157,6 @@ def _witnessed(hand: HandModel) -> tuple[Floats, bool]:
 
 
 def _ways(hand: HandModel) -> Floats:
-    """Return the displacements (T, 3) of the fingertips during closing."""
     return tips(hand, posture(hand, 0.4)) - tips(hand, posture(hand, 0.05))
 
 
@@ -217,17 +204,7 @@ def _between_fingers(hand: HandModel) -> tuple[Floats, bool]:
 def _line_of_joints(
     hand: HandModel, rough: Floats, within: float, least: int, beside: Floats | None = None
 ) -> Floats | None:
-    """Return the direction near a rough one that most joint axes, and perpendiculars of two, share.
-
-    It is independent of the orientation of the hand's root frame.
-
-    Args:
-        hand: the hand.
-        rough: (3,) unit.
-        within: largest angle to it [degrees].
-        least: required number of agreeing directions; else None.
-        beside: (3,) another line, such as the closing line of jaws.
-    """
+    """Return the direction near a rough one (`within`, degrees) that at least `least` lines of the joints share."""
     body = hand.joint_body[:_JOINTS]
     pose = body_poses(hand, IDENTITY_POSE, hand.expand(np.clip(0.0, hand.lower, hand.upper)))[0, body]
     axes = quat_rotate(pose[:, 3:], hand.axis[body])
@@ -252,13 +229,11 @@ def _snapped(mean: Floats, within: float = ROUGH) -> Floats:
 
 
 def _root_axis(direction: Floats) -> Floats:
-    """Return the root axis, of either sign, nearest to a direction."""
     axis = int(np.argmax(np.abs(direction)))
     return np.asarray(np.sign(direction[axis]) * np.eye(3)[axis])
 
 
 def _angle(one: Floats, other: Floats) -> float:
-    """Return the angle between two directions [degrees]."""
     return float(np.rad2deg(np.arctan2(np.linalg.norm(np.cross(one, other)), one @ other)))
 
 
@@ -351,7 +326,6 @@ def _preshape(hand: HandModel, tree: Tree, options: HandOptions, share: float = 
 
 
 def _by_dof(hand: HandModel, tree: Tree, values: Mapping[str, float]) -> list[tuple[int, float]]:
-    """Return (dof, value) of named joints, without those that were frozen, coupled or dropped."""
     for name in values:
         if name not in tree.known:
             known = ", ".join(hand.dof_names[:8]) + (", ..." if hand.dofs > 8 else "")

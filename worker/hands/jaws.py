@@ -16,6 +16,7 @@ from cachetools import LRUCache
 from numpy.typing import NDArray
 
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply, quat_conjugate, quat_rotate, spread_directions
+from graspd.worker.hands.closing import posture
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel, JointType, SurfacePoints
 from graspd.worker.hands.surface import sample_surface
@@ -75,7 +76,6 @@ class Jaws:
 
     @cached_property
     def opening(self) -> float:
-        """Return the largest clear width [m]."""
         return float(self.width.max())
 
     def speeds(self, q: Floats) -> Floats:
@@ -135,7 +135,7 @@ def find_jaws(hand: HandModel, approach: Floats | None = None) -> Jaws | None:
     if not 1 <= len(closing) <= MAX_DOFS or hand.dofs > MAX_DOFS:
         return None
     points = _points(hand)
-    path = _path(hand, np.linspace(0.0, 1.0, _STEPS))
+    path = posture(hand, np.linspace(0.0, 1.0, _STEPS)[:, None])
     if _is_centric(hand, points, path):
         return None
     met = _meeting(hand, points, path)
@@ -147,22 +147,13 @@ def find_jaws(hand: HandModel, approach: Floats | None = None) -> Jaws | None:
     if sides is None:
         return None
     share = float(np.max(np.abs(closed - path[0]) / np.maximum(np.abs(path[-1] - path[0]), 1e-12)))
-    return _measured(hand, points, sides, _path(hand, np.linspace(0.0, share, _STEPS)), approach)
+    return _measured(hand, points, sides, posture(hand, np.linspace(0.0, share, _STEPS)[:, None]), approach)
 
 
 def _points(hand: HandModel) -> SurfacePoints:
     """Sample the hand's surface in the posture that hides least of it: pads of closed jaws may overlap."""
     seen = [sample_surface(replace(hand, preshape=hand.lower + share * hand.span), _POINTS) for share in _LOOKS]
     return seen[int(np.argmax([points.area.sum() for points in seen]))]
-
-
-def _path(hand: HandModel, shares: Floats) -> Floats:
-    """Return postures (K, D) from open (0) to closed (1); a dof that closes nothing is constant."""
-    opened = np.where(hand.closing < 0, hand.upper, hand.lower)
-    closed = np.where(hand.closing < 0, hand.lower, hand.upper)
-    rest = np.clip(0.0, hand.lower, hand.upper)
-    moved = opened + shares[:, None] * (closed - opened)
-    return np.where(hand.closing == 0, rest, moved)
 
 
 def _posed(hand: HandModel, points: SurfacePoints, q: Floats) -> tuple[Floats, Floats]:
@@ -266,7 +257,6 @@ def sign_of(line: Floats) -> float:
 
 
 def _on_pads(side: Ints, points: SurfacePoints, faced: Floats) -> Ints:
-    """Select points of a side on bodies that faced the other most, not on links near only at the end."""
     most = float(faced[points.body[side]].max(initial=0.0))
     return side[faced[points.body[side]] >= _PAD_SHARE * most]
 
@@ -359,10 +349,7 @@ def fingertip_pad(hand: HandModel, tip: int) -> Pad:
     points = sample_surface(hand, _PAD_POINTS)
     mine = points.body == tip
     place, normal = points.position[mine], points.normal[mine]
-    chain, body = [], tip
-    while body > 0:
-        chain.append(body)
-        body = int(hand.parent[body])
+    chain = hand.chain(tip)
     driven = [b for b in chain if hand.closing[hand.dof[b]] != 0] or chain
     if not len(place) or not driven:
         return Pad(tip, np.zeros(3), np.array([0.0, 0, 1]), np.zeros((0, 3)))

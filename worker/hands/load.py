@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -21,7 +21,7 @@ from graspd.worker.hands import collisions, guess, primitives, shapes
 from graspd.worker.hands.collisions import resting_neighbours
 from graspd.worker.hands.guess import complete
 from graspd.worker.hands.jaws import jaws_of, slides
-from graspd.worker.hands.model import ConvexPiece, Drag, HandModel, PalmFrame
+from graspd.worker.hands.model import ConvexPiece, Drag, HandModel, JointType, PalmFrame
 from graspd.worker.hands.mounting import mounting_tree
 from graspd.worker.hands.options import (
     DEFAULT_EFFORT,
@@ -32,10 +32,10 @@ from graspd.worker.hands.options import (
     parse_options,
 )
 from graspd.worker.hands.primitives import volume
-from graspd.worker.hands.robot import Robot, chain_to
+from graspd.worker.hands.robot import Joint, Robot, chain_to
 from graspd.worker.hands.shapes import Hulls, make_pieces
 from graspd.worker.hands.tendons import tendons_of
-from graspd.worker.hands.tree import Tree, build_tree, joint_type
+from graspd.worker.hands.tree import Drive, Tree, build_tree
 from graspd.worker.hands.visuals import PlacedShape, Visuals
 from graspd.worker.hands.xacro import read_robot
 from graspd.worker.objects.disk_cache import recalling
@@ -61,52 +61,58 @@ def load_hand(
     Raises:
         HandError: the files describe no usable hand; the message names the fault and the fix.
     """
-    settings = parse_options(files, options)
-    main = main_file(files, settings)
-    robot = read_robot(files, main, settings.xacro)
+    source = HandSource.read(files, options, name=name, digest=digest)
     with recalling("hand_shapes", (digest_files(AssetKind.HAND, files),), (collisions, guess, primitives, shapes)):
-        hand = assemble(robot, settings, files, main, name=name, digest=digest)
-    return replace(hand, drag=_drag(robot, hand)) if drag else hand
+        hand = assemble(source)
+    return replace(hand, drag=_drag(source.robot, hand)) if drag else hand
 
 
-def assemble(
-    robot: Robot,
-    options: HandOptions,
-    files: Mapping[str, bytes],
-    main: str,
-    *,
-    name: str,
-    digest: str,
-    run: ExecutionContext = DEFAULT_CONTEXT,
-) -> HandModel:
-    """Build the model of a checked robot and options. Raises TaskCancelled if `run` is cancelled."""
-    tree = build_tree(robot, options)
-    hand = complete(body_model(robot, tree, options, files, main, name=name, digest=digest, run=run), tree, options)
-    hand = with_drive(
-        hand, stated_gains(robot, tree.dof_names, options), assumed_efforts(robot, tree.dof_names, options)
-    )
-    mounting, fault = mounting_of(robot, options, files, main, hand, run)
+@dataclass(frozen=True)
+class HandSource:
+    """Checked description of a hand, its options and files."""
+
+    robot: Robot
+    options: HandOptions
+    files: Mapping[str, bytes]
+    main: str
+    name: str
+    digest: str
+    run: ExecutionContext
+
+    @classmethod
+    def read(
+        cls,
+        files: Mapping[str, bytes],
+        options: Mapping[str, Any] | None = None,
+        *,
+        name: str = "",
+        digest: str = "",
+        run: ExecutionContext = DEFAULT_CONTEXT,
+    ) -> HandSource:
+        settings = parse_options(files, options)
+        main = main_file(files, settings)
+        return cls(read_robot(files, main, settings.xacro), settings, files, main, name, digest, run)
+
+
+def assemble(source: HandSource) -> HandModel:
+    """Build the model of a hand. Raises TaskCancelled if its run is cancelled."""
+    tree = build_tree(source.robot, source.options)
+    hand = complete(body_model(source, tree), tree, source.options)
+    hand = with_drive(hand, stated_gains(source, tree.dof_names), assumed_efforts(source, tree.dof_names))
+    mounting, fault = mounting_of(source, hand)
     if fault:
-        log.warning("%s: %s", name, fault)
+        log.warning("%s: %s", source.name, fault)
     return replace(hand, neighbours=resting_neighbours(hand), mounting=mounting)
 
 
-def mounting_of(
-    robot: Robot,
-    options: HandOptions,
-    files: Mapping[str, bytes],
-    main: str,
-    hand: HandModel,
-    run: ExecutionContext = DEFAULT_CONTEXT,
-) -> tuple[HandModel | None, str]:
+def mounting_of(source: HandSource, hand: HandModel) -> tuple[HandModel | None, str]:
     """Return the links above the hand's root, None if there are none, and why their shapes are unreadable.
     Faults above a hand do not refuse it."""
-    tree = mounting_tree(robot, hand.root_link, options)
+    tree = mounting_tree(source.robot, hand.root_link, source.options)
     if tree is None:
         return None, ""
-    shapes = HandOptions(shapes=options.shapes)
     try:
-        return body_model(robot, tree, shapes, files, main, name=hand.name, digest=hand.digest, run=run), ""
+        return body_model(replace(source, options=HandOptions(shapes=source.options.shapes)), tree), ""
     except HandError as error:
         return None, f"what stands above {hand.root_link!r} is no obstacle in scenes: {error}"
 
@@ -118,63 +124,56 @@ def _drag(robot: Robot, hand: HandModel) -> Drag:
     return Drag(armature, dry)
 
 
-def body_model(
-    robot: Robot,
-    tree: Tree,
-    options: HandOptions,
-    files: Mapping[str, bytes],
-    main: str,
-    *,
-    name: str,
-    digest: str,
-    run: ExecutionContext = DEFAULT_CONTEXT,
-) -> HandModel:
+def body_model(source: HandSource, tree: Tree) -> HandModel:
     """Build bodies, joints and pieces of a tree, without palm, fingers, closing and neighbours.
 
     Raises:
         HandError: no part can touch, or a mesh or a number cannot be used.
     """
-    base = str(PurePosixPath(main).parent).removeprefix(".")
-    pieces = _pieces(robot, tree, files, base, options.shapes == "visual", run)
+    robot = source.robot
+    base = str(PurePosixPath(source.main).parent).removeprefix(".")
+    pieces = _pieces(source, tree, base)
     if not pieces:
         raise HandError.with_fixes(
-            f"no link of the hand, from {tree.body_names[0]!r} on, has collision geometry, so nothing can touch",
+            f"no link of the hand, from {tree.bodies[0].name!r} on, has collision geometry, so nothing can touch",
             "add <collision> elements, or begin elsewhere: --root LINK",
             {"root": None},
         )
-    moving = [tree.drives[joint.name] if joint else None for joint in tree.joint]
+    joints = [body.joint for body in tree.bodies]
+    drives = [tree.drives[joint.name] if joint else Drive("", 0.0, 0.0) for joint in joints]
+    number = {joint.name: body for body, joint in enumerate(joints) if joint}
     dofs = len(tree.dof_names)
     return HandModel(
-        name=name,
-        digest=digest,
-        root_link=tree.body_names[0],
-        body_names=tree.body_names,
-        parent=np.array(tree.parent, dtype=np.int32),
-        joint_type=np.array([joint_type(joint) for joint in tree.joint], dtype=np.int32),
-        origin=np.array(tree.origin),
-        axis=np.array([joint.axis if joint else (1.0, 0, 0) for joint in tree.joint]),
-        dof=np.array([tree.dof_names.index(d.dof) if d else -1 for d in moving], dtype=np.int32),
-        multiplier=np.array([d.multiplier if d else 0.0 for d in moving]),
-        offset=np.array([d.offset if d else 0.0 for d in moving]),
+        name=source.name,
+        digest=source.digest,
+        root_link=tree.bodies[0].name,
+        body_names=tuple(body.name for body in tree.bodies),
+        parent=np.array([body.parent for body in tree.bodies], dtype=np.int32),
+        joint_type=np.array([_joint_type(joint) for joint in joints], dtype=np.int32),
+        origin=np.array([body.origin for body in tree.bodies]),
+        axis=np.array([joint.axis if joint else (1.0, 0, 0) for joint in joints]),
+        dof=np.array([tree.dof_names.index(d.dof) if d.dof else -1 for d in drives], dtype=np.int32),
+        multiplier=np.array([d.multiplier for d in drives]),
+        offset=np.array([d.offset for d in drives]),
         dof_names=tree.dof_names,
         lower=tree.lower,
         upper=tree.upper,
-        effort=_effort(robot, tree, options),
-        stiffness=_stiffness(robot, tree, options),
+        effort=_effort(source, tree),
+        stiffness=_stiffness(source, tree),
         preshape=np.clip(np.zeros(dofs), tree.lower, tree.upper),
         closing=np.zeros(dofs),
         joint_names=tree.joint_names,
-        joint_body=np.array([_body_of(tree, joint) for joint in tree.joint_names], dtype=np.int32),
+        joint_body=np.array([number[joint] for joint in tree.joint_names], dtype=np.int32),
         palm=PalmFrame(np.zeros(3), np.array([0.0, 0, 1])),
         fingertips=(),
         pieces=pieces,
         neighbours=frozenset(),
         masses=_masses(robot, tree, pieces),
         velocity=tree.velocity,
-        arm=chain_to(robot, tree.body_names[0]),
-        visuals=Visuals(_placed_visuals(robot, tree), files, base),
+        arm=chain_to(robot, tree.bodies[0].name),
+        visuals=Visuals(_placed_visuals(robot, tree), source.files, base),
         frames=dict(tree.links),
-        tendons=tendons_of(robot, options.tendons, tree.dof_names),
+        tendons=tendons_of(robot, source.options.tendons, tree.dof_names),
     )
 
 
@@ -186,18 +185,16 @@ def main_file(files: Mapping[str, bytes], options: HandOptions) -> str:
         raise HandError(str(error)) from None
 
 
-def _pieces(
-    robot: Robot, tree: Tree, files: Mapping[str, bytes], base: str, as_it_looks: bool, run: ExecutionContext
-) -> tuple[ConvexPiece, ...]:
-    """Make the pieces of collision elements; `as_it_looks` uses a link's visual elements if it has both."""
+def _pieces(source: HandSource, tree: Tree, base: str) -> tuple[ConvexPiece, ...]:
     pieces, hulls = [], Hulls()
-    for number, (link, (body, pose)) in enumerate(tree.links.items()):
-        run.check("reading the hand")
-        run.progress(number, len(tree.links), f"shapes of {link}")
-        shapes, seen = robot.links[link].shapes, robot.links[link].visuals
-        for shape in seen if as_it_looks and shapes and seen else shapes:
+    for number, (name, (body, pose)) in enumerate(tree.links.items()):
+        source.run.check("reading the hand")
+        source.run.progress(number, len(tree.links), f"shapes of {name}")
+        link = source.robot.links[name]
+        as_it_looks = source.options.shapes == "visual" and link.shapes and link.visuals
+        for shape in link.visuals if as_it_looks else link.shapes:
             placed = compose(pose, shape.pose)
-            pieces += make_pieces(shape, body=body, pose=placed, link=link, files=files, base=base, hulls=hulls)
+            pieces += make_pieces(shape, body=body, pose=placed, link=name, files=source.files, base=base, hulls=hulls)
     return tuple(pieces)
 
 
@@ -209,41 +206,42 @@ def _placed_visuals(robot: Robot, tree: Tree) -> tuple[PlacedShape, ...]:
     )
 
 
-def _body_of(tree: Tree, joint: str) -> int:
-    return next(body for body, carried in enumerate(tree.joint) if carried and carried.name == joint)
+def _joint_type(joint: Joint | None) -> JointType:
+    if joint is None:
+        return JointType.FIXED
+    return JointType.PRISMATIC if joint.type == "prismatic" else JointType.REVOLUTE
 
 
-def assumed_efforts(robot: Robot, dofs: Sequence[str], options: HandOptions) -> list[str]:
+def assumed_efforts(source: HandSource, dofs: Sequence[str]) -> list[str]:
     """Return the dofs whose torque or force limit is stated neither by the robot nor by the options."""
-    if isinstance(options.effort, float):
+    stated = source.options.effort
+    if isinstance(stated, float):
         return []
-    return [dof for dof in dofs if dof not in (options.effort or {}) and robot.joints[dof].effort <= 0]
+    return [dof for dof in dofs if dof not in (stated or {}) and source.robot.joints[dof].effort <= 0]
 
 
-def _effort(robot: Robot, tree: Tree, options: HandOptions) -> Floats:
-    """Return effort limits (D,): stated, else the robot's own, else assumed."""
-    assumed = assumed_efforts(robot, tree.dof_names, options)
-    values = []
-    for dof in tree.dof_names:
-        stated = options.effort if isinstance(options.effort, float) else (options.effort or {}).get(dof)
-        effort = stated if stated is not None else DEFAULT_EFFORT if dof in assumed else robot.joints[dof].effort
+def _effort(source: HandSource, tree: Tree) -> Floats:
+    said = source.options.effort
+    efforts = dict.fromkeys(tree.dof_names, said) if isinstance(said, float) else said or {}
+    assumed = dict.fromkeys(assumed_efforts(source, tree.dof_names), DEFAULT_EFFORT)
+    values = [efforts.get(dof, assumed.get(dof, source.robot.joints[dof].effort)) for dof in tree.dof_names]
+    for dof, effort in zip(tree.dof_names, values, strict=True):
         if effort <= 0:
             raise HandError(f"the effort of {dof!r} is {effort:g}; it must be positive")
-        values.append(effort)
     return np.array(values)
 
 
-def stated_gains(robot: Robot, dofs: Sequence[str], options: HandOptions) -> dict[str, float]:
+def stated_gains(source: HandSource, dofs: Sequence[str]) -> dict[str, float]:
     """Return stated position gains: those of the options, else of the robot's servos."""
-    if isinstance(options.stiffness, float):
-        return dict.fromkeys(dofs, options.stiffness)
-    said = {dof: robot.joints[dof].stiffness for dof in dofs if robot.joints[dof].stiffness}
-    return said | {dof: gain for dof, gain in (options.stiffness or {}).items() if dof in dofs}
+    said = source.options.stiffness
+    if isinstance(said, float):
+        return dict.fromkeys(dofs, said)
+    gains = {dof: source.robot.joints[dof].stiffness for dof in dofs}
+    return {dof: gain for dof, gain in gains.items() if gain} | {d: g for d, g in (said or {}).items() if d in dofs}
 
 
-def _stiffness(robot: Robot, tree: Tree, options: HandOptions) -> Floats:
-    """Return stiffness (D,): stated, else assumed."""
-    stated = stated_gains(robot, tree.dof_names, options)
+def _stiffness(source: HandSource, tree: Tree) -> Floats:
+    stated = stated_gains(source, tree.dof_names)
     values = [stated.get(dof, DEFAULT_STIFFNESS) for dof in tree.dof_names]
     if min(values, default=1.0) <= 0:
         raise HandError("a stiffness in asset.json is not positive")
@@ -251,7 +249,7 @@ def _stiffness(robot: Robot, tree: Tree, options: HandOptions) -> Floats:
 
 
 def _masses(robot: Robot, tree: Tree, pieces: tuple[ConvexPiece, ...]) -> Floats:
-    masses = np.zeros(len(tree.body_names))
+    masses = np.zeros(len(tree.bodies))
     for link, (body, _) in tree.links.items():
         mass = robot.links[link].mass
         if mass is None:
@@ -295,19 +293,11 @@ def files_from_path(path: str | Path) -> tuple[str, dict[str, bytes], dict[str, 
     return hand_name(path.resolve().name), files, {"file": main} if main else {}
 
 
-__all__ = ["files_from_path", "hand_from_path", "load_hand"]
-
-
 def with_drive(hand: HandModel, stated: Collection[str], assumed: Sequence[str]) -> HandModel:
-    """Replace the defaults of revolute joints by those of sliding joints and jaws.
+    """Replace the defaults of revolute joints by those of sliding joints and jaws, unless stated.
 
     A dof that moves pads by v [m/rad or 1] along their line gets the gain k v^2, summed over the pads, and the limit
     f v: at each pad that is k [N/m] and f [N], independent of the gearing.
-
-    Args:
-        hand: the hand with its palm and closing.
-        stated: dofs with a stated position gain, which is retained.
-        assumed: dofs without a stated torque or force limit.
     """
     slide, jaws = slides(hand), jaws_of(hand)
     if jaws is None and not slide.any():

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any, Final
 
 import mujoco
@@ -16,8 +16,7 @@ import numpy as np
 
 from graspd.service.model.errors import HandError
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, compose, invert, quat_from_axis_angle
-from graspd.worker.hands.mjcf_couplings import couplings
-from graspd.worker.hands.mjcf_servos import Servo, commanded, servos
+from graspd.worker.hands.mjcf_drives import Couplings, Servo, commanded, servos
 from graspd.worker.hands.mjcf_source import self_contained
 from graspd.worker.hands.primitives import hull
 from graspd.worker.hands.robot import UNLIMITED_M, Joint, Link, Robot, Shape, build_robot
@@ -41,8 +40,12 @@ def read_mjcf(files: Mapping[str, bytes], main: str) -> Robot:
         LimitError: larger than a hand.
     """
     text, assets, notes = self_contained(files, main)
-    model = _compile(text, assets, main)
-    reader = _Reader(model, main, notes=notes)
+    try:
+        model = mujoco.MjModel.from_xml_string(text, assets)
+    except (ValueError, RuntimeError, OSError, mujoco.FatalError) as error:
+        line = " ".join(str(error).replace("XML Error:", "").split())[:200]
+        raise HandError(f"{main}: MuJoCo does not take it ({line}); correct the model") from None
+    reader = _Reader(model, main, notes)
     roots = reader.roots()
     if len(roots) == 1 and not reader.joints_of(roots[0]):
         reader.body(roots[0], "", IDENTITY_POSE)
@@ -50,41 +53,24 @@ def read_mjcf(files: Mapping[str, bytes], main: str) -> Robot:
         reader.links.append(Link("world", (), None))
         for body in roots:
             reader.body(body, "world", _pose(model.body_pos[body], model.body_quat[body]))
-    return build_robot(reader.name, reader.links, reader.joints, reader.notes, main, "MJCF", reader.tendons)
+    return build_robot("", reader.links, reader.joints, reader.notes, main, "MJCF", reader.tendons)
 
 
-def _compile(text: str, assets: dict[str, bytes], main: str) -> Any:
-    try:
-        return mujoco.MjModel.from_xml_string(text, assets)
-    except (ValueError, RuntimeError, OSError, mujoco.FatalError) as error:
-        line = " ".join(str(error).replace("XML Error:", "").split())[:200]
-        raise HandError(f"{main}: MuJoCo does not take it ({line}); correct the model") from None
-
-
-@dataclass
 class _Reader:
-    """Reader of links and joints of a compiled model, body by body."""
-
-    model: Any
-    main: str
-    links: list[Link] = field(default_factory=list)
-    joints: list[Joint] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
-
-    def __post_init__(self) -> None:
-        self.name = ""
-        self._bare = not self.model.ngeom or not any(
-            self.model.geom_contype[g] or self.model.geom_conaffinity[g] for g in range(self.model.ngeom)
-        )
-        coupled = couplings(self.model, self.joint_name)
+    def __init__(self, model: Any, main: str, notes: list[str]) -> None:
+        self.model, self.main = model, main
+        self.links: list[Link] = []
+        self.joints: list[Joint] = []
+        self._bare = not (model.geom_contype.any() or model.geom_conaffinity.any())
+        coupled = Couplings(model, self.joint_name)
         self._mimics, self._faults = coupled.follows, coupled.faults
-        self._servos = servos(self.model, self._mimics, {j for pulls in coupled.tendons.values() for j in pulls})
+        self._servos = servos(model, self._mimics, {j for pulls in coupled.tendons.values() for j in pulls})
         self.tendons = {
             name: {self.joint_name(joint): pull for joint, pull in pulls.items()}
             for name, pulls in coupled.tendons.items()
         }
-        self._commanded = commanded(self.model)
-        self.notes += coupled.notes
+        self._commanded = commanded(model)
+        self.notes = notes + coupled.notes
 
     def roots(self) -> list[int]:
         """Return bodies on the world with moving parts below: the others are furniture or objects."""
@@ -107,7 +93,6 @@ class _Reader:
         return body
 
     def joints_of(self, body: int) -> list[int]:
-        """Return the joints of a body without the free joint of a floating hand."""
         first, count = int(self.model.body_jntadr[body]), int(self.model.body_jntnum[body])
         return [j for j in range(first, first + count) if int(self.model.jnt_type[j]) != _FREE]
 
@@ -207,23 +192,23 @@ class _Reader:
     def _shape(self, geom: int) -> Iterator[Shape]:
         model = self.model
         pose, size = _pose(model.geom_pos[geom], model.geom_quat[geom]), [float(s) for s in model.geom_size[geom]]
-        kind = mujoco.mjtGeom(int(model.geom_type[geom]))
-        if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
-            yield Shape("sphere", (size[0],), pose)
-        elif kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
-            yield Shape("capsule", (size[0], 2 * size[1]), pose)
-        elif kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
-            yield Shape("cylinder", (size[0], 2 * size[1]), pose)
-        elif kind == mujoco.mjtGeom.mjGEOM_BOX:
-            yield Shape("box", (2 * size[0], 2 * size[1], 2 * size[2]), pose)
-        elif kind == mujoco.mjtGeom.mjGEOM_ELLIPSOID:
-            yield Shape("mesh", (1.0, 1.0, 1.0), pose, mesh=_ellipsoid(np.array(size)))
-        elif kind == mujoco.mjtGeom.mjGEOM_MESH:
-            mesh = int(model.geom_dataid[geom])
-            vertex, face = int(model.mesh_vertadr[mesh]), int(model.mesh_faceadr[mesh])
-            vertices = np.asarray(model.mesh_vert[vertex : vertex + model.mesh_vertnum[mesh]], float)
-            faces = np.asarray(model.mesh_face[face : face + model.mesh_facenum[mesh]], np.int32)
-            yield Shape("mesh", (1.0, 1.0, 1.0), pose, mesh=(vertices, faces))
+        match mujoco.mjtGeom(int(model.geom_type[geom])):
+            case mujoco.mjtGeom.mjGEOM_SPHERE:
+                yield Shape("sphere", (size[0],), pose)
+            case mujoco.mjtGeom.mjGEOM_CAPSULE:
+                yield Shape("capsule", (size[0], 2 * size[1]), pose)
+            case mujoco.mjtGeom.mjGEOM_CYLINDER:
+                yield Shape("cylinder", (size[0], 2 * size[1]), pose)
+            case mujoco.mjtGeom.mjGEOM_BOX:
+                yield Shape("box", (2 * size[0], 2 * size[1], 2 * size[2]), pose)
+            case mujoco.mjtGeom.mjGEOM_ELLIPSOID:
+                yield Shape("mesh", (1.0, 1.0, 1.0), pose, mesh=_ellipsoid(np.array(size)))
+            case mujoco.mjtGeom.mjGEOM_MESH:
+                mesh = int(model.geom_dataid[geom])
+                vertex, face = int(model.mesh_vertadr[mesh]), int(model.mesh_faceadr[mesh])
+                vertices = np.asarray(model.mesh_vert[vertex : vertex + model.mesh_vertnum[mesh]], float)
+                faces = np.asarray(model.mesh_face[face : face + model.mesh_facenum[mesh]], np.int32)
+                yield Shape("mesh", (1.0, 1.0, 1.0), pose, mesh=(vertices, faces))
 
     def _colour(self, geom: int) -> tuple[float, float, float] | None:
         rgba, material = self.model.geom_rgba[geom], int(self.model.geom_matid[geom])

@@ -1,7 +1,7 @@
 """Sanitise MJCF for MuJoCo's own reader: one text that names no file, and the meshes that it needs.
 
-MuJoCo reads any file on disk that a model names. So this module inserts includes, looks up meshes among the hand's
-files and renames them, and removes all parts that a hand does not need: only what is listed here reaches MuJoCo.
+MuJoCo reads any file on disk that a model names. So this module inserts includes, renames meshes of the hand's files,
+and removes all parts that a hand does not need: only what is listed here reaches MuJoCo.
 """
 
 from __future__ import annotations
@@ -90,17 +90,12 @@ def _passed_over(root: Element) -> list[str]:
         if (one.tag == "weld" and len(one.attrib.keys() & {"body1", "body2", "site1", "site2"}) == 2)
         or {one.get("tendon1"), one.get("tendon2")} & spatial - {None}
     ]
-    notes = []
-    if pulled:
-        notes.append(
-            f"{_shown(pulled)} on spatial tendons, which are passed over: joints are planned as if each had a drive of "
-            "its own"
-        )
-    if others:
-        notes.append(f"{_shown(others)} passed over: only motors and servos of joints and fixed tendons are read")
-    if held:
-        notes.append(f"{_shown(held)} passed over: what it holds together is planned as free")
-    return notes
+    told = (
+        (pulled, "on spatial tendons, which are passed over: joints are planned as if each had a drive of its own"),
+        (others, "passed over: only motors and servos of joints and fixed tendons are read"),
+        (held, "passed over: what it holds together is planned as free"),
+    )
+    return [f"{_shown(elements)} {note}" for elements, note in told if elements]
 
 
 def _shown(elements: list[Element]) -> str:
@@ -109,7 +104,6 @@ def _shown(elements: list[Element]) -> str:
 
 
 def _is_read(actuator: Element) -> bool:
-    """Check whether it drives joints or tendons in a supported form."""
     return actuator.tag in _ACTUATORS and bool(actuator.attrib.keys() & {"joint", "jointinparent", "tendon"})
 
 
@@ -176,7 +170,6 @@ def _find(wanted: str, files: Mapping[str, bytes], folders: list[str], main: str
 
 
 def _mesh_folder(root: Element) -> tuple[str, bool]:
-    """Return the mesh folder of the compiler elements, and whether they strip folders from mesh names."""
     folder, strip = "", False
     for compiler in root.findall("compiler"):
         folder = compiler.get("meshdir", compiler.get("assetdir", folder))
@@ -218,7 +211,6 @@ def _prune(element: Element) -> None:
 
 
 def _prune_actuators(root: Element) -> None:
-    """Remove actuators of joints and tendons that no longer exist."""
     tendons = {tendon.get("name") for section in root.findall("tendon") for tendon in section.findall("fixed")}
     for section in root.findall("actuator"):
         for actuator in list(section):

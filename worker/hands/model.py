@@ -155,7 +155,6 @@ class HandModel:
 
     @cached_property
     def features(self) -> HandFeatures:
-        """Features of the pieces that can touch a plane first."""
         return HandFeatures.of(self.pieces)
 
     @property
@@ -164,7 +163,6 @@ class HandModel:
 
     @property
     def span(self) -> Floats:
-        """(D,) range of each dof [rad or m]."""
         return self.upper - self.lower
 
     @property
@@ -182,8 +180,15 @@ class HandModel:
         body = self.joint_body[first]
         return (np.asarray(joints)[..., first] - self.offset[body]) / self.multiplier[body]
 
+    def chain(self, body: int) -> list[int]:
+        """Return the bodies from this one up to the root, without the root."""
+        found = []
+        while body > 0:
+            found.append(body)
+            body = int(self.parent[body])
+        return found
+
     @cached_property
     def _first_joint(self) -> NDArray[np.intp]:
-        """Return the first joint (D,) that each dof drives."""
         drives = self.dof[self.joint_body]
         return np.array([int(np.flatnonzero(drives == d)[0]) for d in range(self.dofs)], np.intp)

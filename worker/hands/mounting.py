@@ -18,7 +18,7 @@ from graspd.service.model.transforms import IDENTITY_POSE, Floats, compose, inve
 from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.options import HandOptions
 from graspd.worker.hands.robot import Joint, Robot, chain_to
-from graspd.worker.hands.tree import LEAST_RANGE, Drive, Tree, joint_motion
+from graspd.worker.hands.tree import LEAST_RANGE, Body, Drive, Tree, joint_motion
 
 #: Most joints of a wrist, largest range of one [rad], and its largest distance from the root along the joints [m]. The
 #: last joint of an arm usually has a larger range.
@@ -31,8 +31,7 @@ WRIST_SHARES: Final = (0.5, 1.0)
 
 def mounting_tree(robot: Robot, root: str, options: HandOptions) -> Tree | None:
     """Build the tree of links above the root, poses in the root link's frame; None if none has a shape."""
-    names, parents, origins = [root], [-1], [IDENTITY_POSE.copy()]
-    joints: list[Joint | None] = [None]
+    bodies = [Body(root)]
     links: dict[str, tuple[int, Floats]] = {}
     pose, way = IDENTITY_POSE.copy(), 0.0
     for joint in reversed(chain_to(robot, root)):
@@ -40,39 +39,22 @@ def mounting_tree(robot: Robot, root: str, options: HandOptions) -> Tree | None:
             break
         value = _value(joint, options)
         if value is None:
-            if len(names) > MAX_WRIST_JOINTS or way > MAX_WRIST_M or not _of_wrist(joint):
+            if len(bodies) > MAX_WRIST_JOINTS or way > MAX_WRIST_M or not _of_wrist(joint):
                 break
             # Relative to the child, the parent turns in reverse about the same axis, then has its offset.
-            names.append(joint.parent)
-            parents.append(len(parents) - 1)
-            joints.append(replace(joint, axis=-joint.axis))
-            origins.append(pose)
+            bodies.append(Body(joint.parent, len(bodies) - 1, replace(joint, axis=-joint.axis), pose))
             pose = invert(joint.origin)
         else:
             pose = compose(pose, invert(compose(joint.origin, joint_motion(joint, value))))
         way += float(np.linalg.norm(joint.origin[:3]))
-        links |= {link: (len(names) - 1, at) for link, at in _rigid(robot, joint, pose, options).items()}
+        links |= {link: (len(bodies) - 1, at) for link, at in _rigid(robot, joint, pose, options).items()}
     if not any(robot.links[link].shapes for link in links):
         return None
-    wrist = [joint for joint in joints if joint is not None]
+    wrist = [body.joint for body in bodies if body.joint is not None]
     moving = tuple(joint.name for joint in wrist)
     lower, upper, velocity = np.array([(j.lower, j.upper, j.velocity) for j in wrist]).reshape(-1, 3).T
     drives = {name: Drive(name, 1.0, 0.0) for name in moving}
-    return Tree(
-        tuple(names),
-        tuple(parents),
-        tuple(joints),
-        tuple(origins),
-        links,
-        drives,
-        moving,
-        moving,
-        lower,
-        upper,
-        velocity,
-        (),
-        frozenset(),
-    )
+    return Tree(tuple(bodies), links, drives, moving, moving, lower, upper, velocity, (), frozenset())
 
 
 def _value(joint: Joint, options: HandOptions) -> float | None:

@@ -103,11 +103,7 @@ def _asset_json(files: Mapping[str, bytes]) -> dict[str, Any]:
 
 
 def _hand_json(files: Mapping[str, bytes], urdf: object) -> dict[str, Any]:
-    """Return options from a hand collection's notes: palm link and normal, fingertip links, torque limit.
-
-    Args:
-        urdf: name of the hand's URDF if known; notes on another one are ignored.
-    """
+    """Return options from a hand collection's notes, unless they are on another file than `urdf`, if known."""
     if "hand.json" not in files:
         return {}
     options: dict[str, Any] = {}

@@ -21,7 +21,6 @@ from graspd.service.model import transforms
 from graspd.service.model.errors import HandError
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, quat_rotate
 from graspd.worker.hands import closing, guess, jaws, kinematics, primitives, surface
-from graspd.worker.hands import jaws as pads_code
 from graspd.worker.hands.closing import posture
 from graspd.worker.hands.jaws import Pad, fingertip_pad
 from graspd.worker.hands.kinematics import body_poses
@@ -79,26 +78,30 @@ class Oppositions:
 
     @classmethod
     def of_none(cls, hand: HandModel) -> Oppositions:
-        """Return an empty set of postures."""
         return cls(np.zeros((0, hand.dofs)), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
 
 
-_known: LRUCache[str, Oppositions] = LRUCache(16)
-_lock = threading.Lock()
+_known: LRUCache[tuple[str, ...], Oppositions] = LRUCache(48)
+_lock = threading.RLock()
+
+
+def cached_postures(
+    kind: str, key: tuple[str, ...], code: tuple[ModuleType, ...], make: Callable[[], Oppositions]
+) -> Oppositions:
+    """Return postures cached in memory and on this machine; `make` may ask for other kinds of them."""
+    with _lock:
+        if (kind, *key) not in _known:
+            _known[kind, *key] = Oppositions(**arrays_kept_or_made(kind, key, code, lambda: vars(make())))
+        return _known[kind, *key]
 
 
 def oppositions_of(hand: HandModel) -> Oppositions:
     """Return the opposed postures of a hand, cached in memory and on this machine; one finger has none."""
-    with _lock:
-        if hand.content not in _known:
-            made = arrays_kept_or_made("oppositions", (hand.content,), _code(), lambda: vars(_oppositions(hand)))
-            _known[hand.content] = Oppositions(**made)
-        return _known[hand.content]
+    return cached_postures("oppositions", (hand.content,), _code(), lambda: _oppositions(hand))
 
 
 def _code() -> tuple[ModuleType, ...]:
-    """Return the modules on which the cached data of a hand depend."""
-    return (sys.modules[__name__], closing, guess, jaws, kinematics, pads_code, primitives, surface, transforms)
+    return (sys.modules[__name__], closing, guess, jaws, kinematics, primitives, surface, transforms)
 
 
 def _oppositions(hand: HandModel) -> Oppositions:
@@ -207,12 +210,10 @@ def _ranks(hand: HandModel) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     Also return the number of joints of that finger between the dof and the tip."""
     finger, rank = np.full(hand.dofs, -2, np.intp), np.zeros(hand.dofs, np.intp)
     for number, tip in enumerate(hand.fingertips):
-        seen, body = 0, tip
-        while body > 0:
+        for seen, body in enumerate(hand.chain(tip)):
             dof = int(hand.dof[body])
             finger[dof] = number if finger[dof] in (-2, number) else -1
             rank[dof] = seen
-            seen, body = seen + 1, int(hand.parent[body])
     return finger, rank
 
 
@@ -240,7 +241,6 @@ def _is_one_answer(kept: Mapping[str, NDArray[Any]]) -> bool:
 
 
 def _why_not(hand: HandModel) -> HandError:
-    """Return the error for a hand that can hold nothing, with the reason and the fix."""
     shaped = {piece.body for piece in hand.pieces}
     bare = [hand.body_names[tip] for tip in hand.fingertips if tip not in shaped]
     if bare:

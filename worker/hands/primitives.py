@@ -16,6 +16,7 @@ from graspd.service.model.errors import HandError
 from graspd.service.model.transforms import Floats, quat_rotate
 from graspd.worker.hands.robot import Ints
 from graspd.worker.objects.disk_cache import recalled
+from graspd.worker.objects.topology import directed_edges, face_areas, face_vectors, outward_hull
 
 if TYPE_CHECKING:
     from graspd.worker.hands.model import ConvexPiece
@@ -35,7 +36,6 @@ def hull(points: Floats) -> tuple[Floats, Ints]:
 
 
 def new_hull(points: Floats) -> tuple[Floats, Ints]:
-    """Compute the same without caching, for points that occur once."""
     from scipy.spatial import ConvexHull, QhullError  # slow to load
 
     scale = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
@@ -45,13 +45,7 @@ def new_hull(points: Floats) -> tuple[Floats, Ints]:
         qhull = ConvexHull((points - points.mean(axis=0)) / scale)
     except QhullError:
         raise HandError("a collision shape is flat; give it a thickness") from None
-    keep, faces = np.unique(qhull.simplices, return_inverse=True)
-    faces = faces.reshape(-1, 3)
-    vertices = points[keep]
-    a, b, c = np.moveaxis(vertices[faces], 1, 0)
-    inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), qhull.equations[:, :3]) < 0
-    faces[inward] = faces[inward][:, ::-1]
-    return vertices, faces.astype(np.int32)
+    return outward_hull(points, qhull.simplices, qhull.equations[:, :3])
 
 
 def tessellate(kind: str, size: tuple[float, ...]) -> tuple[Floats, Ints]:
@@ -84,7 +78,7 @@ def area(kind: str, size: tuple[float, ...], vertices: Floats, faces: Ints) -> f
         case "capsule":
             return 2 * math.pi * size[0] * (2 * size[0] + size[1])
         case _:
-            return float(triangle_areas(vertices, faces).sum())
+            return float(face_areas(vertices, faces).sum())
 
 
 def volume(kind: str, size: tuple[float, ...], vertices: Floats, faces: Ints) -> float:
@@ -103,19 +97,13 @@ def volume(kind: str, size: tuple[float, ...], vertices: Floats, faces: Ints) ->
             return float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6)
 
 
-def triangle_areas(vertices: Floats, faces: Ints) -> Floats:
-    """Compute the areas (F,) of triangles."""
-    a, b, c = np.moveaxis(vertices[faces], 1, 0)
-    return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
-
-
 def sample(
     kind: str, size: tuple[float, ...], vertices: Floats, faces: Ints, count: int, rng: np.random.Generator
 ) -> tuple[Floats, Floats]:
     """Sample area-uniform points (count, 3) on the surface with outward normals (count, 3)."""
     if kind in ("sphere", "cylinder", "capsule"):
         return _sample_round(kind, size, count, rng)
-    areas = triangle_areas(vertices, faces)
+    areas = face_areas(vertices, faces)
     # Stratified over the faces: the number on each is its share, rounded up or down.
     ladder = (np.arange(count) + rng.random()) / max(count, 1) * areas.sum()
     face = np.minimum(np.searchsorted(np.cumsum(areas), ladder, side="right"), len(faces) - 1)
@@ -165,13 +153,18 @@ def signed_distance(kind: str, size: tuple[float, ...], vertices: Floats, faces:
             axis = np.clip(points[:, 2], -size[1] / 2, size[1] / 2)
             return np.linalg.norm(points - np.stack([axis * 0, axis * 0, axis], axis=1), axis=1) - size[0]
         case _:
-            a, b, c = np.moveaxis(vertices[faces], 1, 0)
-            normals = np.cross(b - a, c - a)
-            lengths = np.linalg.norm(normals, axis=1)
-            # A sliver of the triangulation has no defined normal.
-            feasible = lengths > 1e-9 * lengths.max()
-            normals, a = normals[feasible] / lengths[feasible, None], a[feasible]
-            return (points @ normals.T - np.einsum("ij,ij->i", normals, a)).max(axis=1)
+            normals, offsets = hull_planes(vertices, faces)
+            return (points @ normals.T - offsets).max(axis=1)
+
+
+def hull_planes(vertices: Floats, faces: Ints) -> tuple[Floats, Floats]:
+    """Return outward unit normals (P, 3) and offsets (P,) of the faces of a hull."""
+    normals = face_vectors(vertices, faces)
+    lengths = np.linalg.norm(normals, axis=1)
+    # A sliver of the triangulation has no defined normal.
+    keep = lengths > 1e-9 * lengths.max()
+    normals = normals[keep] / lengths[keep, None]
+    return normals, np.einsum("ij,ij->i", normals, vertices[faces[keep, 0]])
 
 
 #: Cosine of normals from which on two triangles are one flat face: 0.1 degrees.
@@ -254,10 +247,9 @@ def _edges(piece: ConvexPiece) -> tuple[Floats, float]:
 
 def convex_edges(vertices: Floats, faces: NDArray[np.integer[Any]]) -> NDArray[np.intp]:
     """Return edges (E, 2) at which a convex solid of outward triangles bends, not those within faces."""
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    normal = np.cross(b - a, c - a)
+    normal = face_vectors(vertices, faces)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
-    sides = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    sides = np.sort(directed_edges(faces.astype(np.int64)), axis=1)
     order = np.lexsort(sides.T)
     one, other = order[0::2], order[1::2]
     if len(one) != len(other) or (sides[one] != sides[other]).any():

@@ -1,13 +1,10 @@
-"""Common result of the URDF and MJCF readers: links with shapes and masses, and a tree of joints.
-
-The readers check every value, so later code does not.
-"""
+"""Common result of the readers of URDF and MJCF, which check every value: links with shapes, and a tree of joints."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -93,7 +90,6 @@ class Joint:
 
     @property
     def moves(self) -> bool:
-        """Check whether it is a movable joint of a supported type."""
         return self.type in MOVING and not self.fault
 
 
@@ -127,16 +123,7 @@ def build_robot(
         HandError: duplicate names, joints that form no tree, mimics that form no chain, or nothing moves or can touch.
         LimitError: more links or shapes than a hand has.
     """
-    link_of: dict[str, Link] = {}
-    for link in links:
-        if link.name in link_of:
-            raise HandError(f"{filename}: duplicate link name {link.name!r}; rename one of them")
-        link_of[link.name] = link
-    joint_of: dict[str, Joint] = {}
-    for joint in joints:
-        if joint.name in joint_of:
-            raise HandError(f"{filename}: duplicate joint name {joint.name!r}; rename one of them")
-        joint_of[joint.name] = joint
+    link_of, joint_of = _by_name(links, f"{filename}: duplicate link"), _by_name(joints, f"{filename}: duplicate joint")
     if len(link_of) > MAX_LINKS or sum(len(link.shapes) for link in link_of.values()) > MAX_SHAPES:
         raise LimitError(f"{filename}: more than {MAX_LINKS} links or {MAX_SHAPES} collision elements")
     root = _check_tree(link_of, joint_of, filename)
@@ -152,8 +139,16 @@ def build_robot(
     return Robot(name, link_of, joint_of, root, tuple(notes), fmt, tendons or {})
 
 
+def _by_name(parts: Iterable[Any], duplicate: str) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for part in parts:
+        if part.name in found:
+            raise HandError(f"{duplicate} name {part.name!r}; rename one of them")
+        found[part.name] = part
+    return found
+
+
 def chain_to(robot: Robot, link: str) -> tuple[Joint, ...]:
-    """Return all joints, fixed ones too, from the root to a link, in this order."""
     carrier = {joint.child: joint for joint in robot.joints.values()}
     found: list[Joint] = []
     while link in carrier:
@@ -163,7 +158,6 @@ def chain_to(robot: Robot, link: str) -> tuple[Joint, ...]:
 
 
 def _check_tree(links: dict[str, Link], joints: dict[str, Joint], filename: str) -> str:
-    """Return the name of the only root link; check that every other link has exactly one parent joint."""
     parent_of: dict[str, str] = {}
     for joint in joints.values():
         for end, link in (("parent", joint.parent), ("child", joint.child)):

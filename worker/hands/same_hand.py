@@ -74,21 +74,14 @@ def same_hand(
     tolerance_m: float = TOLERANCE_M,
     seed: int = 0,
 ) -> SameHand:
-    """Match two models of a hand.
+    """Match two models of a hand: ours, for which grasps were planned, and theirs.
 
-    Joints are matched by name, ignoring case. A common prefix of all names of a hand (`rh_`, `robot0:`) is ignored too.
-    The bases are fitted for the best agreement of fingertips over random postures. A fingertip is the mean of the
-    corners of a finger's last body.
-
-    Args:
-        ours: the hand for which grasps were planned.
-        theirs: another model of it.
-        joint_map: joints of ours to joints of theirs, if names do not match.
-        tolerance_m: largest difference of fingertips of the same hand [m].
-        seed: of the postures.
+    Joints are matched by `joint_map` (ours to theirs) or name, ignoring case and a common prefix of all names of a hand
+    (`rh_`, `robot0:`). The bases are fitted for the best agreement of fingertips over random postures. A fingertip is
+    the mean of the corners of a finger's last body.
 
     Raises:
-        InputError: a joint has no match in the other model, or the fingertips do not agree.
+        InputError: a joint has no match in the other model, or fingertips differ by more than `tolerance_m` [m].
     """
     joints = _matched(ours, theirs, joint_map or {})
     tips = [body for body in ours.fingertips if body]
@@ -96,7 +89,8 @@ def same_hand(
     mine = ours.expand(rng.uniform(ours.lower, ours.upper, (POSTURES, ours.dofs)))
     here = body_poses(ours, np.tile(IDENTITY_POSE, (POSTURES, 1)), mine)
     there = body_poses(theirs, np.tile(IDENTITY_POSE, (POSTURES, 1)), mine[:, joints])
-    other = [_body_of_the_same_joint(ours, theirs, joints, body) for body in tips]
+    twins = dict(zip(ours.joint_body[joints].tolist(), theirs.joint_body.tolist(), strict=True))
+    other = [twins[body] for body in tips]
     where = np.stack([apply(here[:, b], _middle(ours, b)) for b in tips], axis=1)
     base, places = _fit(where[:_FITTED], there[:_FITTED, other], np.array([_middle(theirs, b) for b in other]))
     error = np.linalg.norm(apply(base, apply(there[:, other], places)) - where, axis=-1)
@@ -146,13 +140,7 @@ def _plain(name: str, names: Sequence[str]) -> str:
     return name[max((k + 1 for k in range(alike) if not name[k].isalnum()), default=0) :].lower()
 
 
-def _body_of_the_same_joint(ours: HandModel, theirs: HandModel, joints: NDArray[np.intp], body: int) -> int:
-    joint = ours.joint_body.tolist().index(body)
-    return int(theirs.joint_body[joints.tolist().index(joint)])
-
-
 def _middle(hand: HandModel, body: int) -> Floats:
-    """Return the mean (3,) of the corners of a body's pieces; the origin of a body without any."""
     corners = [piece.vertices for piece in hand.pieces if piece.body == body]
     return np.concatenate(corners).mean(axis=0) if corners else np.zeros(3)
 
@@ -160,12 +148,7 @@ def _middle(hand: HandModel, body: int) -> Floats:
 def _fit(where: Floats, poses: Floats, guess: Floats) -> tuple[Floats, Floats]:
     """Fit the pose (7,) of the other base, and positions (T, 3) of fingertips in their body frames there.
 
-    Least squares over both.
-
-    Args:
-        where: (N, T, 3) fingertips in our base frame.
-        poses: (N, T, 7) bodies of fingertips in the other base frame.
-        guess: (T, 3) approximate positions of fingertips in the frames of these bodies.
+    Given: fingertips (N, T, 3) in our base frame, bodies (N, T, 7) in the other one, approximate positions (T, 3).
     """
     from scipy.optimize import least_squares  # slow to load
 

@@ -1,8 +1,8 @@
 """Collision shapes of a robot as convex pieces.
 Primitives stay exact; a mesh becomes one hull, or several where one would cover surface that can touch.
 
-The error of a mesh's pieces is the depth of its surface beneath them, along the shortest free direction out. It is the
-ninth decile over the surface visible from outside; interiors of housings do not count.
+The error of a mesh's pieces is the depth of its surface beneath them, along the shortest free direction out: the ninth
+decile over the surface visible from outside.
 """
 
 from __future__ import annotations
@@ -19,12 +19,13 @@ from graspd.service.model.errors import HandError, MeshError
 from graspd.service.model.libraries import version_of
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply, quat_to_matrix
 from graspd.worker.hands.model import ConvexPiece
-from graspd.worker.hands.primitives import hull, new_hull, signed_distance, tessellate, triangle_areas, volume
+from graspd.worker.hands.primitives import hull, hull_planes, new_hull, signed_distance, tessellate, volume
 from graspd.worker.hands.robot import Ints, Shape
 from graspd.worker.hands.visuals import find_mesh
 from graspd.worker.objects.convex import WorkLimitExceeded, coacd_parts, default_cache, keep_parts, load_parts
 from graspd.worker.objects.disk_cache import recalled
 from graspd.worker.objects.formats import read_mesh
+from graspd.worker.objects.topology import face_areas
 
 #: A hull of V corners has at most 2 V - 4 triangles: 96 here. Every plane costs time in each distance query.
 MAX_HULL_VERTICES: Final = 50
@@ -37,16 +38,9 @@ Hulls = dict[tuple[str, tuple[float, ...]], list[tuple[Floats, Ints]]]
 def make_pieces(
     shape: Shape, *, body: int, pose: Floats, link: str, files: Mapping[str, bytes], base: str, hulls: Hulls
 ) -> list[ConvexPiece]:
-    """Make the convex pieces of a collision element: one, or several for a mesh with hollows.
+    """Make the convex pieces of a collision element at `pose` (7,) in the body frame; several for a mesh with hollows.
 
-    Args:
-        shape: the element.
-        body: index of the body it moves with.
-        pose: (7,) pose of the element's frame in the body frame.
-        link: link it comes from.
-        files: all files of the hand.
-        base: folder of the robot's description inside `files`.
-        hulls: hulls of this hand's meshes so far, by name and scale: fingers often share a fingertip mesh.
+    `hulls` are those of this hand's meshes so far, by name and scale: fingers often share a fingertip mesh.
 
     Raises:
         HandError: a mesh is missing, outside the upload, unreadable, flat or far too large.
@@ -164,11 +158,7 @@ _MIN_EXTENT_M: Final = 1e-3
 
 
 def parts_of(vertices: Floats, faces: Ints) -> tuple[Floats, ...]:
-    """Return corners of the convex pieces of a mesh: the mesh's own vertices if its hull is near enough.
-
-    Args:
-        vertices: (V, 3) in metres.
-        faces: (F, 3) triangles; they need not be closed.
+    """Return corners of the convex pieces of a mesh, which need not be closed; its own if its hull is near enough.
 
     Raises:
         HandError: the decomposition exceeds its CPU time limit.
@@ -214,14 +204,13 @@ def _decomposed(vertices: Floats, faces: Ints) -> tuple[tuple[Floats, ...], bool
 
 def _is_convex(vertices: Floats, faces: Ints) -> bool:
     """Check whether nearly all of the surface lies on the hull, so that no decomposition is needed."""
-    normals, offsets = _planes(vertices[np.unique(faces)])
+    normals, offsets = hull_planes(*hull(vertices[np.unique(faces)]))
     depth = (offsets - _sample(vertices, faces) @ normals.T).min(axis=1)
     return float(np.quantile(depth, _SHARE)) < _FLAT_M
 
 
 def _sample(vertices: Floats, faces: Ints) -> Floats:
-    """Return area-uniform points (N, 3), reproducibly."""
-    areas = triangle_areas(vertices, faces)
+    areas = face_areas(vertices, faces)
     ladder = (np.arange(_POINTS) + 0.5) / _POINTS * areas.sum()
     face = np.minimum(np.searchsorted(np.cumsum(areas), ladder), len(faces) - 1)
     u, v = np.random.default_rng(0).random((2, _POINTS, 1))
@@ -277,7 +266,7 @@ def _hits(points: Floats, direction: Floats, corners: Floats) -> NDArray[np.bool
 
 def _ways_out(part: Floats, points: Floats) -> Floats:
     """Return the distance (D, P) from points along directions out of a part's hull; 0 outside of it."""
-    normals, offsets = _planes(part)
+    normals, offsets = hull_planes(*hull(part))
     inside = offsets - points @ normals.T
     rates = _DIRECTIONS @ normals.T
     way = np.full((len(_DIRECTIONS), len(points)), np.inf)
@@ -285,17 +274,6 @@ def _ways_out(part: Floats, points: Floats) -> Floats:
         onward = rate > 1e-9
         way[number] = (inside[:, onward] / rate[onward]).min(axis=1)
     return np.where((inside < -_START_M).any(axis=1), 0.0, np.maximum(way, 0.0))
-
-
-def _planes(points: Floats) -> tuple[Floats, Floats]:
-    """Return outward unit normals (P, 3) and offsets (P,) of the faces of a hull."""
-    corners, faces = hull(points)
-    a, b, c = np.moveaxis(corners[faces], 1, 0)
-    normals = np.cross(b - a, c - a)
-    lengths = np.linalg.norm(normals, axis=1)
-    keep = lengths > 1e-9 * lengths.max()
-    normals = normals[keep] / lengths[keep, None]
-    return normals, np.einsum("ij,ij->i", normals, a[keep])
 
 
 def _simplified(vertices: Floats, faces: Ints) -> tuple[Floats, Ints]:

@@ -51,15 +51,12 @@ def sample_surface(hand: HandModel, count: int, *, seed: int = 0) -> SurfacePoin
 
 @dataclass(frozen=True)
 class _Shapes:
-    """All parts of a hand that determine its surface."""
-
     pieces: tuple[ConvexPiece, ...]
     rest: Floats
     """(L, 7) poses of its bodies."""
 
 
 def _rest(hand: HandModel) -> Floats:
-    """Return the poses (L, 7) of a hand's bodies in its pre-shape."""
     return body_poses(hand, IDENTITY_POSE, hand.expand(hand.preshape))[0]
 
 

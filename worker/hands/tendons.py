@@ -46,19 +46,14 @@ class Tendon:
 
 def actuators(tendons: tuple[Tendon, ...], dofs: int) -> Floats:
     """Return (A, D) length of each drive from the dofs' values, in dof order, a tendon at its first dof."""
-    rows: list[Floats] = []
-    pulled = {d: tendon for tendon in tendons for d in tendon.dofs}
-    for d in range(dofs):
-        tendon = pulled.get(d)
-        if tendon is not None and d != min(tendon.dofs):
-            continue
-        row = np.zeros(dofs)
-        if tendon is None:
-            row[d] = 1.0
-        else:
-            row[list(tendon.dofs)] = tendon.coefficients
-        rows.append(row)
-    return np.array(rows).reshape(-1, dofs)
+    rows = np.eye(dofs)
+    others: list[int] = []
+    for tendon in tendons:
+        first = min(tendon.dofs)
+        rows[first] = 0.0
+        rows[first, list(tendon.dofs)] = tendon.coefficients
+        others += [d for d in tendon.dofs if d != first]
+    return np.delete(rows, others, axis=0)
 
 
 def tendons_of(

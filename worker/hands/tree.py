@@ -5,16 +5,15 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
 
 from graspd.service.model.errors import HandError, did_you_mean
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, compose, quat_from_axis_angle
-from graspd.worker.hands.model import JointType
 from graspd.worker.hands.options import HandOptions
-from graspd.worker.hands.robot import MAX_LENGTH_M, UNLIMITED_M, Joint, Mimic, Robot, chain_to
+from graspd.worker.hands.robot import MAX_LENGTH_M, UNLIMITED_M, Joint, Mimic, Robot
 from graspd.worker.hands.tendons import check_tendons
 
 #: Share of its range that a drive may lose without a note.
@@ -35,15 +34,21 @@ class Drive:
 
 
 @dataclass(frozen=True)
+class Body:
+    """A body and the moving joint that carries it."""
+
+    name: str
+    parent: int = -1
+    joint: Joint | None = None
+    origin: Floats = field(default_factory=IDENTITY_POSE.copy)
+    """(7,) pose of the joint frame in the parent's body frame."""
+
+
+@dataclass(frozen=True)
 class Tree:
     """Bodies with parents first; body 0 is the root."""
 
-    body_names: tuple[str, ...]
-    parent: tuple[int, ...]
-    joint: tuple[Joint | None, ...]
-    """The moving joint that carries each body; None for the root."""
-    origin: tuple[Floats, ...]
-    """(7,) pose of the joint frame in the parent's body frame."""
+    bodies: tuple[Body, ...]
     links: dict[str, tuple[int, Floats]]
     """Body of each retained link, and its pose in the body's frame."""
     drives: dict[str, Drive]
@@ -78,7 +83,15 @@ def build_tree(robot: Robot, options: HandOptions) -> Tree:
     for joint in kept:
         if joint.fault and joint.name not in options.fix:
             raise HandError(joint.fault)
-    still = {name: robot.joints[name].lower for name in _still(kept, mimics) if name not in options.fix}
+    # Joints that follow nothing and whose limits leave one value.
+    still = {
+        joint.name: joint.lower
+        for joint in kept
+        if joint.moves
+        and mimics[joint.name] is None
+        and joint.name not in options.fix
+        and joint.upper - joint.lower < LEAST_RANGE
+    }
     fixed = still | options.fix
     drives = {j.name: _resolve(j.name, mimics, fixed) for j in kept if j.type != "fixed"}
     frozen = {name: drive for name, drive in drives.items() if isinstance(drive, float)}
@@ -102,10 +115,8 @@ def build_tree(robot: Robot, options: HandOptions) -> Tree:
     lower, upper = np.array([_fold_limits(dof, moving, robot, options) for dof in dofs]).T
     velocity = np.array([_fold_velocity(dof, moving, robot) for dof in dofs])
     known = frozenset(robot.joints) | frozenset(robot.links)
-    bodies, parents, joints, origins, links = _walk(robot, root, kept, frozen)
-    return Tree(
-        bodies, parents, joints, origins, links, moving, names, dofs, lower, upper, velocity, tuple(still), known
-    )
+    bodies, links = _walk(root, kept, frozen)
+    return Tree(bodies, links, moving, names, dofs, lower, upper, velocity, tuple(still), known)
 
 
 def _check_names(robot: Robot, options: HandOptions) -> None:
@@ -120,16 +131,16 @@ def _check_names(robot: Robot, options: HandOptions) -> None:
     check_tendons(robot, options.tendons or {})
 
 
-def joints_above(robot: Robot, link: str) -> tuple[str, ...]:
-    """Return the moving joints from the robot's root to a link, in this order."""
-    return tuple(joint.name for joint in chain_to(robot, link) if joint.type != "fixed")
+def _by_parent(joints: Iterable[Joint]) -> dict[str, list[Joint]]:
+    found: dict[str, list[Joint]] = {}
+    for joint in joints:
+        found.setdefault(joint.parent, []).append(joint)
+    return found
 
 
 def _kept_joints(robot: Robot, root: str, drop: set[str]) -> list[Joint]:
     """Return joints below the root and not below a dropped link, in the robot's order."""
-    children: dict[str, list[Joint]] = {}
-    for joint in robot.joints.values():
-        children.setdefault(joint.parent, []).append(joint)
+    children = _by_parent(robot.joints.values())
     kept: set[str] = set()
     stack = [root]
     while stack:
@@ -140,20 +151,8 @@ def _kept_joints(robot: Robot, root: str, drop: set[str]) -> list[Joint]:
     return [joint for joint in robot.joints.values() if joint.name in kept]
 
 
-def _still(kept: Iterable[Joint], mimics: Mapping[str, Mimic | None]) -> list[str]:
-    """Return joints that follow nothing and whose limits leave one value."""
-    return [
-        joint.name
-        for joint in kept
-        if joint.moves and mimics[joint.name] is None and joint.upper - joint.lower < LEAST_RANGE
-    ]
-
-
 def _resolve(name: str, mimics: Mapping[str, Mimic | None], fixed: Mapping[str, float]) -> Drive | float:
-    """Return the drive of a joint through a chain of mimics, or its value if a fixed joint ends the chain.
-
-    q = m1 (m2 (... ) + o2) + o1, so the multipliers multiply and each offset is scaled by those before it.
-    """
+    """Return the drive of a joint through a chain of mimics, or its value if a fixed joint ends the chain."""
     multiplier, offset, at = 1.0, 0.0, name
     seen = {name}
     while True:
@@ -250,18 +249,11 @@ def _fold_velocity(dof: str, moving: dict[str, Drive], robot: Robot) -> float:
 
 
 def _walk(
-    robot: Robot, root: str, kept: list[Joint], frozen: dict[str, float]
-) -> tuple[
-    tuple[str, ...], tuple[int, ...], tuple[Joint | None, ...], tuple[Floats, ...], dict[str, tuple[int, Floats]]
-]:
+    root: str, kept: list[Joint], frozen: dict[str, float]
+) -> tuple[tuple[Body, ...], dict[str, tuple[int, Floats]]]:
     """Collect bodies depth first; a link behind a fixed or frozen joint joins its parent's body."""
-    names, parents = [root], [-1]
-    joints: list[Joint | None] = [None]
-    origins = [IDENTITY_POSE.copy()]
-    links = {root: (0, IDENTITY_POSE.copy())}
-    children: dict[str, list[Joint]] = {}
-    for joint in kept:
-        children.setdefault(joint.parent, []).append(joint)
+    bodies, links = [Body(root)], {root: (0, IDENTITY_POSE.copy())}
+    children = _by_parent(kept)
     stack = children.get(root, [])[::-1]
     while stack:
         joint = stack.pop()
@@ -270,13 +262,10 @@ def _walk(
         if joint.type == "fixed" or joint.name in frozen:
             links[joint.child] = (body, compose(frame, joint_motion(joint, frozen.get(joint.name, 0.0))))
         else:
-            links[joint.child] = (len(names), IDENTITY_POSE.copy())
-            names.append(joint.child)
-            parents.append(body)
-            joints.append(joint)
-            origins.append(frame)
+            links[joint.child] = (len(bodies), IDENTITY_POSE.copy())
+            bodies.append(Body(joint.child, body, joint, frame))
         stack += children.get(joint.child, [])[::-1]
-    return tuple(names), tuple(parents), tuple(joints), tuple(origins), links
+    return tuple(bodies), links
 
 
 def joint_motion(joint: Joint, value: float) -> Floats:
@@ -287,13 +276,6 @@ def joint_motion(joint: Joint, value: float) -> Floats:
     elif joint.type != "fixed":
         motion[3:] = quat_from_axis_angle(joint.axis, np.asarray(value))
     return motion
-
-
-def joint_type(joint: Joint | None) -> JointType:
-    """Return the type in the model: a continuous joint is revolute."""
-    if joint is None:
-        return JointType.FIXED
-    return JointType.PRISMATIC if joint.type == "prismatic" else JointType.REVOLUTE
 
 
 #: Largest reach of a finger from where the fingers of its hand branch [m]; legs and arms exceed it.
@@ -358,16 +340,17 @@ class _Moving:
 
     def __init__(self, robot: Robot, options: HandOptions) -> None:
         self.robot, self.options = robot, options
-        self._children: dict[str, list[Joint]] = {}
-        for joint in robot.joints.values():
-            if joint.child not in options.drop:
-                self._children.setdefault(joint.parent, []).append(joint)
+        self._children = _by_parent(joint for joint in robot.joints.values() if joint.child not in options.drop)
         self._moves: dict[str, bool] = {}
         self._reach: dict[str, float] = {}
         for link in self._deepest_first(robot.root):
             children = self._children.get(link, [])
             self._moves[link] = any(self.free(joint) or self._moves[joint.child] for joint in children)
-            ways = [self._way(joint) + self._reach[joint.child] for joint in children if self.free_below(joint)]
+            ways = [
+                float(np.linalg.norm(joint.origin[:3])) + self._reach[joint.child]
+                for joint in children
+                if self.free_below(joint)
+            ]
             self._reach[link] = max(ways, default=0.0)
 
     def _deepest_first(self, root: str) -> list[str]:
@@ -378,23 +361,18 @@ class _Moving:
         return order[::-1]
 
     def free(self, joint: Joint) -> bool:
-        """Check whether the joint itself moves."""
         return joint.type != "fixed" and joint.name not in self.options.fix
 
     def free_below(self, joint: Joint) -> bool:
-        """Check whether the joint, or one below it, moves."""
         return self.free(joint) or self._moves[joint.child]
 
     def onward(self, link: str) -> list[Joint]:
-        """Return the joints of a link that lead to moving joints."""
         return [joint for joint in self._children.get(link, []) if self.free_below(joint)]
 
     def reach(self, link: str) -> float:
-        """Return the longest path from a link along its joints to the last moving one [m]."""
         return self._reach[link]
 
     def touches(self, link: str) -> bool:
-        """Check whether two of the branches below a link have collision shapes."""
         return sum(self._has_shape(joint.child) for joint in self.onward(link)) > 1
 
     def stiff_digits(self) -> list[str]:
@@ -412,10 +390,6 @@ class _Moving:
         if self.robot.links[link].shapes:
             return True
         return any(self._has_shape(joint.child) for joint in self._children.get(link, []))
-
-    @staticmethod
-    def _way(joint: Joint) -> float:
-        return float(np.linalg.norm(joint.origin[:3]))
 
 
 def _below_arm(tree: _Moving, root: str, options: HandOptions) -> str:

@@ -1,7 +1,7 @@
 """Reader of URDF and XML from untrusted sources. It checks every value, so later code does not.
 
 The common URDF libraries accept reversed limits, NaN, unknown mimics and several roots, and resolve mimic chains
-wrongly; this reader refuses each with a message. It reads only links with shapes and masses, and joints.
+wrongly; this reader refuses each with a message.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def _read_link(element: ElementTree.Element, materials: dict[str, Colour | None]
 
 
 def _read_visuals(element: ElementTree.Element, link: str, materials: dict[str, Colour | None]) -> tuple[Shape, ...]:
-    """Read visual elements with their colours. Unusable ones are left out: only pictures need them."""
+    """Read visual elements; unusable ones are left out, since only pictures need them."""
     found = []
     for visual in element.findall("visual")[:MAX_VISUALS]:
         try:
@@ -130,10 +130,14 @@ def _moving(element: ElementTree.Element, still: Joint, what: str, notes: list[s
             f"{what}: type {still.type[:40]!r} cannot be used; a hand has revolute, prismatic and fixed joints"
         )
     mimic = _mimic(element, what)
-    if mimic is None:
+    try:
         lower, upper, effort = _limits(element, still.type, what)
-    else:
-        lower, upper, effort = _follower_limits(element, still.type, what)
+    except HandError:
+        # Limits of a follower do not bind it, so junk among them does not matter.
+        if mimic is None:
+            raise
+        most = UNLIMITED_M if still.type == "prismatic" else math.pi
+        lower, upper, effort = -most, most, 0.0
     return replace(
         still,
         axis=_axis(element, what, notes),
@@ -182,15 +186,6 @@ def _limits(element: ElementTree.Element, kind: str, what: str) -> tuple[float, 
     if max(abs(lower), abs(upper)) > (4 * math.pi if kind == "revolute" else MAX_LENGTH_M):
         raise HandError(f"{what}: limits {lower:g} .. {upper:g} are too large; give radians and metres")
     return lower, upper, effort
-
-
-def _follower_limits(element: ElementTree.Element, kind: str, what: str) -> tuple[float, float, float]:
-    """Return the limits of a follower, which do not bind it; none if they are junk."""
-    try:
-        return _limits(element, kind, what)
-    except HandError:
-        most = UNLIMITED_M if kind == "prismatic" else math.pi
-        return -most, most, 0.0
 
 
 def _mimic(element: ElementTree.Element, what: str) -> Mimic | None:
@@ -264,15 +259,8 @@ _MAX_PREFIXES: Final = 100
 def parse_xml(data: bytes, name: str, what: str = "", root: str = "", *, limit_bytes: int) -> Element:
     """Return the root element without its namespace.
 
-    Args:
-        data: the file.
-        name: its name in messages.
-        what: the kind of file, with its article.
-        root: name of its root element; empty: any.
-        limit_bytes: its largest size.
-
     Raises:
-        HandError: it is empty, not XML, or has another root element.
+        HandError: it is empty, not XML, or has another root element than `root`, if given, that begins `what`.
         LimitError: larger than the limit.
     """
     if len(data) > limit_bytes:

@@ -19,6 +19,7 @@ from graspd.service.store.mesh_files import MAX_NAMES, beside, looks_of, one_lik
 from graspd.worker.hands.primitives import tessellate
 from graspd.worker.hands.robot import Ints, Shape
 from graspd.worker.objects.formats import Nearby, Soup, read_mesh
+from graspd.worker.objects.topology import compact
 
 #: Largest total of a hand's visual meshes [faces]: more would not change a picture.
 MAX_FACES: Final = 400_000
@@ -89,7 +90,6 @@ NO_VISUALS: Final = Visuals()
 
 
 def lighter(mesh: VisualMesh, times: float) -> VisualMesh:
-    """Reduce the number of triangles by a factor."""
     # Slow to load, and few meshes come here.
     import trimesh
 
@@ -112,20 +112,21 @@ def _meshes(item: PlacedShape, files: Mapping[str, bytes], base: str, soups: dic
     if shape.mesh is not None:
         return [VisualMesh(item.body, apply(item.pose, shape.mesh[0]), shape.mesh[1], shape.colour)]
     name = _file_of(item, files, base)
+    if not name:
+        return []
     try:
-        if name and name not in soups:
+        if name not in soups:
             soups[name] = read_mesh(name, files[name], _nearby(name, files))
     except InputError:
         return []
-    if not name:
-        return []
     soup, scale = soups[name], np.asarray(shape.size)
     vertices = apply(item.pose, soup.vertices * scale)
-    faces = (soup.faces if np.prod(scale) > 0 else soup.faces[:, ::-1]).astype(np.int32)
-    return [
-        VisualMesh(item.body, *_used(vertices, faces[chosen]), shape.colour or colour)
-        for colour, chosen in soup.by_colour()
-    ]
+    winding = 1 if np.prod(scale) > 0 else -1
+    found = []
+    for colour, chosen in soup.by_colour():
+        points, triangles = compact(vertices, soup.faces[chosen, ::winding])
+        found.append(VisualMesh(item.body, points, triangles.astype(np.int32), shape.colour or colour))
+    return found
 
 
 def _nearby(mesh: str, files: Mapping[str, bytes]) -> Nearby:
@@ -147,12 +148,6 @@ def _nearby(mesh: str, files: Mapping[str, bytes]) -> Nearby:
         return files[name]
 
     return find
-
-
-def _used(vertices: Floats, faces: Ints) -> tuple[Floats, Ints]:
-    """Return the vertices that some faces use, and those faces."""
-    keep, index = np.unique(faces, return_inverse=True)
-    return vertices[keep], index.reshape(-1, 3).astype(np.int32)
 
 
 def _file_of(item: PlacedShape, files: Mapping[str, bytes], base: str) -> str:

@@ -32,12 +32,8 @@ _READ: Final = (".xacro", ".urdf", ".xml", ".yaml", ".yml")
 
 
 def expand(files: Mapping[str, bytes], main: str, arguments: Mapping[str, str]) -> bytes:
-    """Expand a xacro file to a URDF.
-
-    Args:
-        files: all files of the hand; includes and `$(find PACKAGE)` are searched among them only.
-        main: the file to expand.
-        arguments: values of `<xacro:arg>` by name.
+    """Expand a xacro file with values of its `<xacro:arg>` to a URDF.
+    Includes and `$(find PACKAGE)` are searched among the hand's files only.
 
     Raises:
         HandError: it cannot be expanded, or refers to files outside the hand's folder; the message states the reason.
@@ -84,16 +80,7 @@ def expand(files: Mapping[str, bytes], main: str, arguments: Mapping[str, str]) 
 
 
 def read_robot(files: Mapping[str, bytes], main: str, arguments: Mapping[str, str] | None = None) -> Robot:
-    """Read and check the description `main` among a hand's files; its root element determines the format.
-
-    Args:
-        files: all files of the hand.
-        main: the description.
-        arguments: values of a xacro file's arguments.
-
-    Raises:
-        HandError, LimitError: see the readers.
-    """
+    """Read and check the description `main` among a hand's files; its root element determines the format."""
     refuse_stand_in(main, files[main], HandError)
     match format_of(main, files[main]):
         case "mjcf":

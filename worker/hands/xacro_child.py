@@ -36,7 +36,6 @@ class Refused(Exception):
 
 
 def main() -> None:
-    """Expand the given xacro file on standard output."""
     given = json.loads(sys.stdin.buffer.read())
     # A file can make the library print without end; only the answer is needed.
     answers, nowhere = os.dup(1), os.open(os.devnull, os.O_WRONLY)
@@ -70,7 +69,6 @@ def _expand(given: dict[str, Any]) -> str:
     names: list[str] = given["names"]
 
     def named(path: str) -> str:
-        """Return the name of a file of the hand; raise Refused if the path leads out of its folder."""
         inside = posixpath.normpath(posixpath.join(_TOP, path.replace("\\", "/")))
         if not inside.startswith(_TOP + "/"):
             said = path.removeprefix(_TOP + "/")
@@ -139,17 +137,11 @@ _PLAIN: Final[dict[str, Any]] = {
     "false": False,
     "True": True,
     "False": False,
-    "list": list,
-    "dict": dict,
-    "map": map,
-    "str": str,
-    "float": float,
-    "int": int,
+    **{kind.__name__: kind for kind in (list, dict, map, str, float, int)},
 }
 
 
 def _checked(expression: str) -> Any:
-    """Compile an expression after checking that none of its names leads out of it."""
     tree = ast.parse(expression.strip(), "<expression>", "eval")
     for count, node in enumerate(ast.walk(tree)):
         name = getattr(node, "attr", None) or getattr(node, "id", None) or ""

@@ -22,13 +22,7 @@ FAR = 10
 def check_object(
     files: Mapping[str, bytes], name: str, *, face_error_m: float = REPORT_ERROR_M, **options: Any
 ) -> dict[str, Any]:
-    """Check these files with `load_object`.
-
-    Args:
-        files: the mesh and optionally `asset.json`.
-        name: name of the object.
-        face_error_m: simplification bound [m].
-        options: keys of `ObjectOptions` that override `asset.json`; None counts as not given.
+    """Check these files with `load_object`; options that are not None override `asset.json`.
 
     Returns:
         verdict: accept, repair or refuse; message: one line; repairs: changes; facts: measurements in SI units. For a

@@ -1,7 +1,7 @@
 """CoACD in its own process: `python -m graspd.worker.objects.coacd_child SECONDS`, npz in and out.
 
-A signal ends it after so many seconds of CPU time. In: arrays `vertices`, `faces`, and `options` (JSON). Out: one array
-of corners per piece.
+In: arrays `vertices`, `faces`, and `options` (JSON). Out: corners of each piece. A signal ends it after so many seconds
+of CPU time.
 """
 
 from __future__ import annotations

@@ -29,16 +29,10 @@ class WorkLimitExceeded(Exception):
 
 
 def coacd_parts(vertices: Floats, faces: NDArray[Any], options: Mapping[str, Any], cpu_s: int) -> tuple[Floats, ...]:
-    """Compute the corners (V, 3) of each convex piece; none if CoACD fails.
+    """Compute the corners (V, 3) of each convex piece with the arguments of `coacd.run_coacd`; none if CoACD fails.
 
-    CoACD holds the interpreter lock, so it runs in a child and delays no heartbeat. The limit is one of CPU time: a
+    CoACD holds the interpreter lock, so it runs in a child and delays no heartbeat. The limit is one of CPU time [s]: a
     busy machine gives the same pieces as an idle one.
-
-    Args:
-        vertices: (V, 3) of the mesh.
-        faces: (F, 3) triangles.
-        options: arguments of `coacd.run_coacd`, including the threshold.
-        cpu_s: CPU time limit [s].
 
     Raises:
         WorkLimitExceeded: it needs more.
@@ -67,12 +61,10 @@ def union_volume(parts: tuple[Floats, ...]) -> float:
 
 
 def default_cache() -> Path:
-    """Return the folder for pieces that can be recomputed."""
     return user_cache.folder("convex")
 
 
 def load_parts(file: Path) -> tuple[Floats, ...] | None:
-    """Load parts from a file; None if it is missing or unreadable."""
     try:
         with np.load(file) as stored:
             return tuple(stored[name] for name in sorted(stored.files))

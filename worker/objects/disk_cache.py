@@ -39,14 +39,10 @@ def arrays_kept_or_made(
     *,
     fits: Callable[[Arrays], bool] = lambda _: True,
 ) -> Arrays:
-    """Load arrays from the user's cache, or compute and cache them; the same bit for bit.
+    """Load arrays from a folder of the user's cache, or compute and cache them; the same bit for bit.
 
-    Args:
-        kind: folder of the cache.
-        terms: all inputs that determine the arrays, besides the code.
-        code: modules whose change would change them.
-        make: computes them; its errors are not cached.
-        fits: whether loaded arrays are plausible; others are recomputed.
+    All inputs that determine the arrays are in `terms`, besides the code of some modules. Errors of `make` are not
+    cached; loaded arrays that do not `fit` are recomputed.
     """
     file = _file(kind, terms, code)
     if (held := _read(file)) is not None and fits(held):
@@ -60,10 +56,8 @@ def arrays_kept_or_made(
 def recalling(kind: str, terms: tuple[str | int, ...], code: tuple[ModuleType, ...]) -> Iterator[None]:
     """Cache the results of `recalled` inside this context in one entry, and load them the next time.
 
-    For small steps of a large computation, if loading their library is the most expensive part.
-
-    Args:
-        kind, terms, code: see `arrays_kept_or_made`; the terms only distinguish entries.
+    For small steps of a large computation, if loading their library is the most expensive part. The terms only
+    distinguish entries.
     """
     file = _file(kind, terms, code)
     known = _read(file) or {}

@@ -27,11 +27,7 @@ class MeshDistance:
         from scipy.spatial import cKDTree
 
         self._corners = vertices[faces]
-        a, b, c = np.moveaxis(self._corners, 1, 0)
-        area = float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
-        pieces, self._face = cut(self._corners, 2 * np.sqrt(area / _PIECES))
-        centres = pieces.mean(axis=1)
-        self._radius = float(np.linalg.norm(pieces - centres[:, None], axis=2).max())
+        centres, self._radius, self._face = small_pieces(self._corners, 2, _PIECES)
         self._tree = cKDTree(centres)
 
     def __call__(self, points: Floats, enough: float = 0.0) -> Floats:
@@ -64,8 +60,12 @@ class MeshDistance:
         return proven
 
 
-def cut(corners: Floats, length: float) -> tuple[Floats, NDArray[np.int64]]:
-    """Halve triangles (F, 3, 3) across their longest side to at most `length`; return their origin too."""
+def small_pieces(corners: Floats, factor: float, count: int) -> tuple[Floats, float, NDArray[np.int64]]:
+    """Halve triangles (F, 3, 3) to sides of at most `factor` times the root of the area of one of `count` equal ones.
+    Return the centres (P, 3) of the pieces, their largest radius, and the triangle (P,) of each."""
+    a, b, c = np.moveaxis(corners, 1, 0)
+    area = float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
+    length = factor * np.sqrt(area / count)
     done: list[Floats] = []
     owners: list[NDArray[np.int64]] = []
     face = np.arange(len(corners), dtype=np.int64)
@@ -80,7 +80,9 @@ def cut(corners: Floats, length: float) -> tuple[Floats, NDArray[np.int64]]:
         middle = (a + b) / 2
         corners = np.concatenate([np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)])
         face = np.tile(face[~small], 2)
-    return np.concatenate(done), np.concatenate(owners)
+    pieces = np.concatenate(done)
+    centres = pieces.mean(axis=1)
+    return centres, float(np.linalg.norm(pieces - centres[:, None], axis=2).max()), np.concatenate(owners)
 
 
 def deviation(one: tuple[Floats, Indices], two: tuple[Floats, Indices], samples: int = 8000) -> float:

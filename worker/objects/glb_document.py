@@ -61,7 +61,6 @@ class Document:
         return primitive if colour is None else primitive | {"material": self._material(colour)}
 
     def points(self, values: NDArray[Any]) -> dict[str, Any]:
-        """Add a primitive of points (N, 3)."""
         return {"attributes": {"POSITION": self.vectors(values)}, "mode": _POINTS}
 
     def _material(self, colour: tuple[float, float, float]) -> int:
@@ -72,7 +71,6 @@ class Document:
         return self._materials.index(material)
 
     def vectors(self, values: NDArray[Any]) -> int:
-        """Add an accessor of points (N, 3)."""
         data = np.ascontiguousarray(values, np.float32)
         bounds = {"min": data.min(axis=0).tolist(), "max": data.max(axis=0).tolist()}
         return self._accessor(data, _FLOAT, "VEC3", _ARRAY, {}, bounds)

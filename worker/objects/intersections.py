@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from graspd.service.model.transforms import Floats
 from graspd.worker.objects import mesh_geometry, topology
-from graspd.worker.objects.distance import MeshDistance, cut, surface_points
+from graspd.worker.objects.distance import MeshDistance, small_pieces, surface_points
 from graspd.worker.objects.mesh_geometry import signed_volume
 from graspd.worker.objects.topology import Indices
 
@@ -43,12 +43,8 @@ def crossings(vertices: Floats, faces: Indices) -> Indices | None:
     if len(faces) > MAX_FACES:
         return None
     corners = vertices[faces]
-    a, b, c = np.moveaxis(corners, 1, 0)
-    area = float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
     # Well above the edge length of an even mesh of so many faces: only long faces are cut.
-    pieces, owner = cut(corners, 4 * np.sqrt(area / max(len(faces), 2000)))
-    centres = pieces.mean(axis=1)
-    radius = float(np.linalg.norm(pieces - centres[:, None], axis=2).max())
+    centres, radius, owner = small_pieces(corners, 4, max(len(faces), 2000))
     tree = cKDTree(centres)
     if tree.count_neighbors(tree, 2 * radius) > 2 * MAX_PAIRS:
         return None
@@ -72,7 +68,6 @@ def _distinct(pairs: NDArray[np.int64], count: int) -> NDArray[np.int64]:
 
 
 def _boxes_meet(corners: Floats, pairs: Indices) -> NDArray[np.bool_]:
-    """Check (P,) whether the axis-aligned boxes of two faces (P, 2) overlap."""
     low, high = corners.min(axis=1), corners.max(axis=1)
     one, other = pairs.T
     meet = np.ones(len(pairs), dtype=bool)

@@ -12,14 +12,12 @@ from typing import Any, Final
 
 import manifold3d
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from graspd.service.model.transforms import Floats, quat_rotate
 from graspd.worker.grasps import moved
 from graspd.worker.objects.model import Ints
-from graspd.worker.objects.topology import Indices, parts_of_graph
-
-FaceIndices = NDArray[np.int32] | NDArray[np.int64]
+from graspd.worker.objects.topology import FaceIndices, Indices, face_vectors, parts_of_graph
 
 
 @dataclass(frozen=True)
@@ -70,8 +68,7 @@ def corner_normals(vertices: Floats, faces: Ints, crease_deg: float = CREASE_DEG
     """
     from scipy.sparse import csr_matrix
 
-    a, b, c = np.moveaxis(vertices[faces], 1, 0)
-    face_normals = np.cross(b - a, c - a)
+    face_normals = face_vectors(vertices, faces)
     face_normals /= np.maximum(np.linalg.norm(face_normals, axis=1, keepdims=True), 1e-300)
     angles = _corner_angles(vertices[faces]).reshape(-1)
     count = 3 * len(faces)
@@ -114,7 +111,6 @@ def to_manifold(vertices: Floats, faces: Indices) -> Any | None:
 
 
 def from_manifold(solid: Any) -> tuple[Floats, Indices]:
-    """Return vertices and faces of a solid."""
     mesh = solid.to_mesh64()
     return np.array(mesh.vert_properties, dtype=np.float64)[:, :3], np.array(mesh.tri_verts, dtype=np.int64)
 
@@ -136,7 +132,6 @@ def unite(parts: list[tuple[Floats, Indices]], holes: list[tuple[Floats, Indices
 
 
 def union(solids: list[Any]) -> Any:
-    """Return the union of all solids."""
     return manifold3d.Manifold.batch_boolean(solids, manifold3d.OpType.Add)
 
 
@@ -162,7 +157,6 @@ def _nested(a: Any, b: Any) -> bool:
 
 
 def _apart(low: Floats, high: Floats, i: int) -> Floats:
-    """Return the gaps between box `i` and those after it."""
     return np.asarray(np.linalg.norm(np.maximum(0, np.maximum(low[i] - high[i + 1 :], low[i + 1 :] - high[i])), axis=1))
 
 

@@ -1,7 +1,7 @@
 """Model of an object for the engine: a closed, outward, simplified triangle mesh with mass properties.
 
-All data are in the object frame: the frame of the uploaded mesh, in metres. `ObjectModel.centred` is the same object
-relative to its middle, which the engine uses; see `worker.objects.mesh_geometry`.
+All data are in the frame of the uploaded mesh, in metres; `ObjectModel.centred` is relative to its middle, for the
+engine: see `worker.objects.mesh_geometry`.
 """
 
 from __future__ import annotations
@@ -22,8 +22,6 @@ Ints = NDArray[np.int32]
 
 @dataclass(frozen=True)
 class ObjectModel:
-    """Prepared object: its shape, mass and friction."""
-
     name: str
     digest: str
     vertices: Floats

@@ -1,8 +1,4 @@
-"""Prepare an object from its files: read, repair, simplify, add normals, hull and mass properties.
-Objects are serialised bit for bit.
-
-Objects prepared by one command on this machine load in milliseconds in every later one.
-"""
+"""Prepare an object from its files: read, repair, simplify, add normals, hull and mass; cached by content."""
 
 from __future__ import annotations
 
@@ -12,7 +8,8 @@ import json
 import math
 import platform
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import fields, replace
 from functools import lru_cache
 from pathlib import Path
@@ -66,12 +63,10 @@ def load_object(
 
 
 def weighed(model: ObjectModel, options: ObjectOptions) -> ObjectModel:
-    """Return the model with the mass and friction of its options."""
     return model.weighing(mass=options.mass, density=options.density, friction=options.friction)
 
 
 def main_file(files: Mapping[str, bytes], options: ObjectOptions) -> str:
-    """Return the name of the mesh: from `asset.json`, else the only one."""
     if options.file:
         if options.file not in files:
             raise MeshError(f"asset.json names the file {options.file!r}, which is not there")
@@ -87,12 +82,15 @@ def main_file(files: Mapping[str, bytes], options: ObjectOptions) -> str:
 
 @lru_cache(maxsize=8)
 def _prepared(main: str, data: bytes, options_json: str, face_error_m: float) -> ObjectModel:
-    """Prepare with a cache by content: batches of a job use the same object, and commands the same few."""
-    return kept_or_made(
-        (Path(main).suffix.lower(), options_json, repr(face_error_m)),
-        data,
-        lambda: build(repaired_mesh(main, data, ObjectOptions.model_validate_json(options_json)), face_error_m),
-    )
+    """Prepare with caches by content: batches of a job use the same object, and commands the same few."""
+    terms = [Path(main).suffix.lower(), options_json, repr(face_error_m), hashlib.sha256(data).hexdigest(), revision()]
+    file = user_cache.folder("objects") / f"{digest_json(terms)}.npz"
+    if (held := user_cache.load(file)) is not None:
+        with suppress(ValueError, KeyError, TypeError, OSError, EOFError, zipfile.BadZipFile):
+            return from_bytes(held, name="", digest="")
+    obj = build(repaired_mesh(main, data, ObjectOptions.model_validate_json(options_json)), face_error_m)
+    user_cache.keep(file, to_bytes(obj))
+    return obj
 
 
 def repaired_mesh(main: str, data: bytes, options: ObjectOptions) -> RepairedMesh:
@@ -111,7 +109,6 @@ def _repaired(main: str, data: bytes, options_json: str) -> RepairedMesh:
 
 
 def build(mesh: RepairedMesh, face_error_m: float) -> ObjectModel:
-    """Build the model of a repaired mesh."""
     vertices, faces, error = simplify(mesh.vertices, mesh.faces, face_error_m, closed=mesh.watertight)
     hull_vertices, hull_faces = convex_hull(vertices)
     solid = (vertices, faces.astype(np.int32)) if mesh.watertight else (hull_vertices, hull_faces)
@@ -136,20 +133,13 @@ def build(mesh: RepairedMesh, face_error_m: float) -> ObjectModel:
 
 
 def convex_hull(points: Floats) -> tuple[Floats, Ints]:
-    """Compute corners (H, 3) and outward triangles (G, 3)."""
     from scipy.spatial import ConvexHull, QhullError
 
     try:
         qhull = ConvexHull(points)
     except QhullError:
         raise MeshError("the mesh is flat; give it a thickness") from None
-    keep, inverse = np.unique(qhull.simplices, return_inverse=True)
-    faces: Ints = inverse.reshape(-1, 3).astype(np.int32)
-    vertices = points[keep]
-    a, b, c = np.moveaxis(vertices[faces], 1, 0)
-    inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), qhull.equations[:, :3]) < 0
-    faces[inward] = faces[inward][:, ::-1]
-    return vertices, faces
+    return topology.outward_hull(points, qhull.simplices, qhull.equations[:, :3])
 
 
 def object_from_path(
@@ -193,26 +183,6 @@ def files_from_path(path: str | Path) -> tuple[str, dict[str, bytes], dict[str, 
 def name_of(path: Path) -> str:
     """Return the object's name: that of its mesh file, or of the folder if the file name is generic."""
     return path.resolve().parent.name if path.stem.lower() in PLAIN_STEMS else path.stem
-
-
-def kept_or_made(terms: tuple[str, ...], data: bytes, make: Callable[[], ObjectModel]) -> ObjectModel:
-    """Load a prepared object from the user's cache, or prepare and cache it.
-
-    Args:
-        terms: all inputs that determine the object, besides the bytes of its mesh and the code that prepares it.
-        data: the mesh as given.
-        make: prepares it; its errors are not cached.
-    """
-    address = digest_json([*terms, hashlib.sha256(data).hexdigest(), revision()])
-    file = user_cache.folder("objects") / f"{address}.npz"
-    if (held := user_cache.load(file)) is not None:
-        try:
-            return from_bytes(held, name="", digest="")
-        except (ValueError, KeyError, TypeError, OSError, EOFError, zipfile.BadZipFile):
-            pass
-    obj = make()
-    user_cache.keep(file, to_bytes(obj))
-    return obj
 
 
 @lru_cache(maxsize=1)
@@ -287,7 +257,7 @@ class ReferenceMesh:
         self.vertices, self.faces, self.closed = vertices, faces, closed
         self.shells = int(topology.components(faces).max())
         self._distance = MeshDistance(vertices, faces)
-        self._points = self._points_of((vertices, faces))
+        self._points = surface_points(vertices, faces, SAMPLES)
 
     def accepts(self, mesh: Mesh) -> bool:
         """Check whether a mesh is closed, outward and in as many shells as the original, if that is closed."""
@@ -302,17 +272,13 @@ class ReferenceMesh:
 
     def within(self, mesh: Mesh, limit: float) -> bool:
         """Check whether two surfaces lie within `limit` [m], both ways, over vertices and even samples."""
-        back, own = MeshDistance(*mesh), self._points_of(mesh)
+        back, own = MeshDistance(*mesh), surface_points(*mesh, SAMPLES)
         # A few points reject most meshes that are too coarse; all points are checked only if these pass.
         return all(
             float(distance(points[::step], limit).max()) <= limit
             for step in (16, 1)
             for distance, points in ((back, self._points), (self._distance, own))
         )
-
-    @staticmethod
-    def _points_of(mesh: Mesh) -> Floats:
-        return surface_points(*mesh, SAMPLES)
 
 
 def _rollout(original: ReferenceMesh, target: int, error_m: float) -> Mesh | None:

@@ -6,7 +6,7 @@ Every change is reported: silent repairs would make a dataset inexplicable later
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -56,7 +56,6 @@ class RepairedMesh:
     watertight: bool = True
     repairs: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
-    components: int = field(default=1)
     self_intersections: int | None = None
     """Pairs of faces that still intersect; None: not checked."""
     moved_m: float = 0.0
@@ -97,7 +96,7 @@ def _solid(mesh: RepairedMesh, options: ObjectOptions) -> RepairedMesh:
     extent = float(np.ptp(mesh.vertices, axis=0).max())
     if volume < 1e-9 * extent**3:
         raise MeshError("the mesh encloses no volume; give the surface a thickness")
-    wall = 2 * volume / float(_areas(mesh.vertices, mesh.faces).sum())
+    wall = 2 * volume / float(topology.face_areas(mesh.vertices, mesh.faces).sum())
     if wall < THIN_M:
         note = f"thin: walls of {wall * 1e3:.1f} mm on average; use a fine fidelity"
         mesh = replace(mesh, notes=(*mesh.notes, note))
@@ -172,7 +171,6 @@ def _clean(mesh: RepairedMesh) -> RepairedMesh:
 
 
 def _close(mesh: RepairedMesh) -> RepairedMesh:
-    """Unify the winding, split crowded edges, weld seams, fill pinholes."""
     if topology.open_edges(mesh.faces):
         mesh = _weld(mesh)
     faces, orientable = topology.unify_winding(mesh.faces)
@@ -191,17 +189,13 @@ def _close(mesh: RepairedMesh) -> RepairedMesh:
 
 
 def _weld(mesh: RepairedMesh) -> RepairedMesh:
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
     from scipy.spatial import cKDTree
 
     extent = float(np.ptp(mesh.vertices, axis=0).max())
     pairs = cKDTree(mesh.vertices).query_pairs(WELD * extent, output_type="ndarray")
     if not len(pairs) or len(pairs) > 10 * len(mesh.vertices):
         return mesh
-    n = len(mesh.vertices)
-    graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
-    _, label = connected_components(graph, directed=False)
+    label = topology.parts_of_graph(pairs[:, 0], pairs[:, 1], len(mesh.vertices))
     _, first = np.unique(label, return_index=True)
     faces = label[mesh.faces].astype(np.int64)
     faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
@@ -214,9 +208,7 @@ def _fill_pinholes(mesh: RepairedMesh) -> RepairedMesh:
     """Fill each small hole with a fan; the whole mesh stays open if one is large."""
     extent = float(np.ptp(mesh.vertices, axis=0).max())
     loops = [loop for loop in _rims(mesh.faces) or [] if len(loop) > 2]
-    if not loops:
-        return mesh
-    if any(np.ptp(mesh.vertices[loop], axis=0).max() > HOLE * extent for loop in loops):
+    if not loops or any(np.ptp(mesh.vertices[loop], axis=0).max() > HOLE * extent for loop in loops):
         return mesh
     fans = [[loop[0], loop[i + 1], loop[i]] for loop in loops for i in range(1, len(loop) - 1)]
     faces = np.concatenate([mesh.faces, np.array(fans, dtype=np.int64)])
@@ -256,11 +248,6 @@ def _open(mesh: RepairedMesh, options: ObjectOptions) -> RepairedMesh:
     )
 
 
-def _areas(vertices: Floats, faces: Indices) -> Floats:
-    a, b, c = np.moveaxis(vertices[faces], 1, 0)
-    return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
-
-
 def _resolve_components(mesh: RepairedMesh, options: ObjectOptions) -> RepairedMesh:
     """Drop debris, orient components outward, unite overlapping ones; the user chooses among several."""
     shells = topology.components(mesh.faces)
@@ -298,13 +285,13 @@ def _unite(
         mesh = mesh.but(mesh.vertices, mesh.faces[:, ::-1], "winding turned outward")
     boxes = [(p[0].min(axis=0), p[0].max(axis=0)) for p in parts]
     main = int(np.argmax([signed_volume(*part) for part in parts]))
-    cavity = [
+    hollow = [
         bool(flip and (low > boxes[main][0]).all() and (high < boxes[main][1]).all())
         for flip, (low, high) in zip(against, boxes, strict=True)
     ]
-    turned_parts = sum(bool(a) and not c for a, c in zip(against, cavity, strict=True))
-    positives = [p for p, hole in zip(parts, cavity, strict=True) if not hole]
-    holes = [p for p, hole in zip(parts, cavity, strict=True) if hole]
+    turned_parts = sum(bool(a) and not c for a, c in zip(against, hollow, strict=True))
+    positives = [p for p, hole in zip(parts, hollow, strict=True) if not hole]
+    holes = [p for p, hole in zip(parts, hollow, strict=True) if hole]
     united = mesh_geometry.unite(positives, holes)
     if united is None:
         raise MeshError.with_fixes(
@@ -336,7 +323,8 @@ def _unite(
         return mesh.but(
             *mesh_geometry.from_manifold(united), f"united {len(parts)} touching or intersecting components"
         )
-    return replace(mesh, vertices=_join_oriented(positives, holes)[0], faces=_join_oriented(positives, holes)[1])
+    vertices, faces = _join(positives + [(corners, cavity[:, ::-1]) for corners, cavity in holes])
+    return replace(mesh, vertices=vertices, faces=faces)
 
 
 def _resolve_self_intersections(mesh: RepairedMesh) -> RepairedMesh:
@@ -356,9 +344,3 @@ def _join(parts: list[tuple[Floats, Indices]]) -> tuple[Floats, Indices]:
     starts = np.cumsum([0] + [len(vertices) for vertices, _ in parts[:-1]])
     faces = [faces + start for (_, faces), start in zip(parts, starts, strict=True)]
     return np.concatenate([vertices for vertices, _ in parts]), np.concatenate(faces)
-
-
-def _join_oriented(
-    positives: list[tuple[Floats, Indices]], holes: list[tuple[Floats, Indices]]
-) -> tuple[Floats, Indices]:
-    return _join(positives + [(vertices, faces[:, ::-1]) for vertices, faces in holes])

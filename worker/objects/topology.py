@@ -5,12 +5,15 @@ All functions are pure: vertices (V, 3) and faces (F, 3) in, new arrays out.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 from graspd.service.model.transforms import Floats
 
 Indices = NDArray[np.int64]
+FaceIndices = NDArray[np.integer[Any]]
 Mask = NDArray[np.bool_]
 
 #: Faces at an edge whose angles differ by less are coincident [rad].
@@ -30,8 +33,25 @@ def merge_vertices(vertices: Floats, faces: Indices, tolerance: float) -> tuple[
     return vertices[first[order]], rank[inverse.reshape(-1)][faces]
 
 
-def compact(vertices: Floats, faces: Indices) -> tuple[Floats, Indices]:
-    """Drop the vertices that no face uses."""
+def face_vectors(vertices: Floats, faces: FaceIndices) -> Floats:
+    """Compute the normals (F, 3) of faces; their lengths are twice the areas."""
+    a, b, c = np.moveaxis(vertices[faces], 1, 0)
+    return np.cross(b - a, c - a)
+
+
+def face_areas(vertices: Floats, faces: FaceIndices) -> Floats:
+    return np.linalg.norm(face_vectors(vertices, faces), axis=1) / 2
+
+
+def outward_hull(points: Floats, simplices: NDArray[Any], normals: Floats) -> tuple[Floats, NDArray[np.int32]]:
+    """Return corners (H, 3) and outward triangles (G, 3) of qhull's simplices with their outward normals."""
+    corners, faces = compact(points, simplices)
+    inward = np.einsum("ij,ij->i", face_vectors(corners, faces), normals) < 0
+    faces[inward] = faces[inward][:, ::-1]
+    return corners, faces.astype(np.int32)
+
+
+def compact(vertices: Floats, faces: FaceIndices) -> tuple[Floats, Indices]:
     used, inverse = np.unique(faces, return_inverse=True)
     return vertices[used], inverse.reshape(-1, 3)
 

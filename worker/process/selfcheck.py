@@ -97,7 +97,7 @@ def _ball() -> ObjectModel:
     """Return a ball with flat faces, so that it comes to rest."""
     from manifold3d import Manifold
 
-    from graspd.worker.objects.builtin import stl_bytes
+    from graspd.worker.objects.formats.bare import stl_bytes
     from graspd.worker.objects.mesh_geometry import from_manifold
     from graspd.worker.objects.prepare import load_object
 

@@ -21,7 +21,6 @@ from graspd.service.model.digests import digest_json
 from graspd.service.model.errors import MeshError
 from graspd.service.model.libraries import version_of
 from graspd.service.model.transforms import Floats
-from graspd.worker.hands.primitives import triangle_areas
 from graspd.worker.objects.convex import (
     WorkLimitExceeded,
     coacd_parts,
@@ -31,6 +30,7 @@ from graspd.worker.objects.convex import (
     union_volume,
 )
 from graspd.worker.objects.model import ObjectModel
+from graspd.worker.objects.topology import face_areas
 
 log = logging.getLogger(__name__)
 
@@ -122,7 +122,7 @@ def _load_or_make(obj: ObjectModel, file: Path) -> ConvexPieces:
 
 
 def _excess(volume: float, obj: ObjectModel) -> float:
-    return (volume - obj.volume) / float(triangle_areas(obj.vertices, obj.faces).sum())
+    return (volume - obj.volume) / float(face_areas(obj.vertices, obj.faces).sum())
 
 
 def _make(obj: ObjectModel) -> tuple[Floats, ...]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import zipfile
 from pathlib import Path
 from typing import Final
@@ -12,7 +11,7 @@ from graspd.service.store.assets import builtin_files
 from tests.worker.hands.grippers import gripper_urdf
 from tests.worker.hands.mjcfs import FOUR_BAR
 from tests.worker.hands.test_descriptions import package
-from tests.worker.hands.test_roots import humanoid
+from tests.worker.hands.test_tree import humanoid
 from tests.worker.hands.urdfs import joint, link, robot
 
 #: Names of the built-in hand that stands for the reader's own, and of that.
@@ -57,26 +56,14 @@ def write_all(folder: Path) -> None:
     (folder / "shadow" / "shadow_hand_right.urdf").write_bytes(_on_a_wrist())
 
 
-def asset_json_of(page: str) -> dict[str, object]:
-    """The example of the section on asset.json."""
-    block = page.partition("## asset.json")[2].partition("```json\n")[2].partition("```")[0]
-    return dict(json.loads(block))
-
-
 def _on_a_wrist() -> bytes:
-    fingers = [
-        joint("FFJ4", "palm", "ff", origin="0.03 0 0.03", axis="0 -1 0"),
-        joint("THJ5", "palm", "th", origin="-0.03 0 0.03"),
-        joint("LFJ4", "palm", "lf", origin="0.03 0.03 0.03", axis="0 -1 0"),
-    ]
+    fingers = (("FFJ4", "ff", "0.03 0 0.03"), ("THJ5", "th", "-0.03 0 0.03"), ("LFJ4", "lf", "0.03 0.03 0.03"))
     return robot(
-        link("world"),
-        link("wrist"),
-        link("palm"),
-        link("ff"),
-        link("th"),
-        link("lf"),
+        *(link(name) for name in ("world", "wrist", "palm", "ff", "th", "lf")),
         joint("WRJ2", "world", "wrist", axis="1 0 0", limit=f"<limit {_WRIST}/>"),
         joint("WRJ1", "wrist", "palm", limit=f"<limit {_WRIST}/>"),
-        *fingers,
+        *(
+            joint(name, "palm", tip, origin=place, axis="0 1 0" if tip == "th" else "0 -1 0")
+            for name, tip, place in fingers
+        ),
     )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,12 +10,9 @@ import pytest
 from graspd.service.model.states import AssetKind
 from graspd.service.model.transforms import Floats, quat_from_axis_angle, quat_multiply, quat_rotate
 from graspd.service.store.asset_summary import summary
-from graspd.service.store.assets import builtin_files
 from graspd.worker.hands.check import check_hand
 from graspd.worker.hands.jaws import fingertip_pad, sign_of
-from graspd.worker.hands.load import load_hand
 from graspd.worker.hands.model import HandModel
-from tests.worker.commands_run import graspd
 from tests.worker.hands.urdfs import joint, link, load, report, robot
 
 _PALM = '<collision><geometry><box size="0.09 0.02 0.09"/></geometry></collision>'
@@ -57,7 +53,7 @@ def opposing_thumb(bends: str) -> list[str]:
 
 def hand_of(text: bytes, **options: object) -> HandModel:
     said = {"approach": [0, 1, 0], **options}
-    return load_hand({"r.urdf": text}, name="r", digest="0" * 32, options=said)
+    return load(text, **said)
 
 
 def closing_of(hand: HandModel) -> dict[str, int]:
@@ -78,53 +74,12 @@ def test_thumbs_close_to_the_fingers_whatever_their_limits() -> None:
     assert [found[f"{name}_{part}"] for name in ("index", "ring") for part in ("bend", "tip")] == [1, 1, 1, 1]
 
 
-def test_a_finger_that_no_joint_closes_is_told(tmp_path: Path) -> None:
+def test_a_finger_that_no_joint_closes_is_told() -> None:
     text = urdf(*opposing_thumb(limit(-0.2, 1.5)))
     closed = check_hand({"r.urdf": text}, "r", {"approach": [0, 1, 0]})
     assert "no joint closes" not in closed["message"]
     still = {"approach": [0, 1, 0], "closing": dict.fromkeys(("thumb_axial", "thumb_bend", "thumb_tip"), 0)}
     assert "no joint closes the finger of thumb2:" in check_hand({"r.urdf": text}, "r", still)["message"]
-    (tmp_path / "r.urdf").write_bytes(text)
-    told = graspd("hands check --approach 0,1,0 --no-self-test", tmp_path / "r.urdf")
-    assert told["closing"] == closing_of(hand_of(text))
-
-
-_PLATE_PALM = '<collision><geometry><box size="0.09 0.09 0.02"/></geometry></collision>'
-#: A finger that leans in by 30 degrees.
-_LEANING = (
-    '<collision><origin xyz="{x} {y} 0.04" rpy="{roll} {pitch} 0"/>'
-    '<geometry><box size="0.012 0.012 0.09"/></geometry></collision>'
-)
-
-
-def three_fingers(outwards: float, **options: object) -> HandModel:
-    """Fingers at 0 .. 1.2 rad that meet ahead of the palm at 0; `outwards` 1: and part from there; -1: they cross."""
-    parts: list[str] = []
-    for number, angle in enumerate(2 * np.pi * np.arange(3) / 3):
-        c, s = np.cos(angle), np.sin(angle)
-        shape = _LEANING.format(x=-0.02 * c, y=-0.02 * s, roll=0.5 * s, pitch=-0.5 * c)
-        axis = f"{-outwards * s} {outwards * c} 0"
-        parts += [
-            link(f"finger{number}", shape),
-            joint(
-                f"bend{number}",
-                "palm",
-                f"finger{number}",
-                origin=f"{0.05 * c} {0.05 * s} 0.01",
-                axis=axis,
-                limit='<limit lower="0" upper="1.2" effort="1" velocity="1"/>',
-            ),
-        ]
-    urdf = robot(link("palm", _PLATE_PALM), *parts)
-    return load_hand({"r.urdf": urdf}, name="r", digest="0" * 32, options={"approach": [0, 0, 1], **options})
-
-
-def test_fingers_that_meet_at_zero_close_to_it_unless_stated() -> None:
-    hand = three_fingers(1.0)
-    assert hand.closing.tolist() == [-1, -1, -1]
-    assert hand.preshape == pytest.approx(0.75 * hand.upper)
-    hand = three_fingers(1.0, closing={"bend0": 1})
-    assert hand.closing.tolist() == [1, -1, -1]
 
 
 def test_a_wrist_that_stands_ahead_of_the_palm_is_not_the_palm() -> None:
@@ -139,7 +94,7 @@ def test_a_wrist_that_stands_ahead_of_the_palm_is_not_the_palm() -> None:
         for part in (link(f"f{number}", finger), joint(f"j{number}", "palm", f"f{number}", origin=f"0 {y} 0.1"))
     ]
     fingers += [link("thumb", thumb), joint("t", "palm", "thumb", origin="0.005 0 0.01", axis="0 -1 0")]
-    hand = load_hand({"r.urdf": robot(link("palm", plate + wrist), *fingers)}, name="r", digest="0" * 32)
+    hand = load(robot(link("palm", plate + wrist), *fingers))
     assert hand.palm.approach == pytest.approx([1, 0, 0])
     assert hand.palm.centre[0] == pytest.approx(0.005) and 0.05 < hand.palm.centre[2] < 0.1
 
@@ -204,6 +159,14 @@ def test_the_palm_faces_along_the_fingers_and_all_of_them_close(fingers: int, tu
     assert np.linalg.norm(model.palm.centre - (model.palm.centre @ axis) * axis) < 1e-6
 
 
+def test_fingers_that_meet_at_zero_close_to_it_unless_stated() -> None:
+    outwards = claw(3, TURNS["upright"], lower=0.0).replace(b'axis xyz="0 -1 0"', b'axis xyz="0 1 0"')
+    hand = load(outwards, approach=[0, 0, 1])
+    assert hand.closing.tolist() == [-1, -1, -1]
+    assert hand.preshape == pytest.approx(0.75 * hand.upper)
+    assert load(outwards, approach=[0, 0, 1], closing={"ja0": 1}).closing.tolist() == [1, -1, -1]
+
+
 def test_a_tie_is_told_and_one_that_is_settled_is_not() -> None:
     # Fingers that lie in the plane in which they begin, half closed: nothing tells its upper side.
     flat = claw(3, TURNS["upright"], lower=-np.pi)
@@ -226,36 +189,19 @@ def test_a_turned_root_frame_turns_the_palm_with_it(degrees: float) -> None:
         np.testing.assert_allclose(model.palm.approach, quat_rotate(turn, np.array([0, 0, 1.0])), atol=1e-6)
 
 
-@pytest.mark.parametrize("mirrored", [False, True])
-def test_two_fingers_that_oppose_one_take_hold_between_them(mirrored: bool) -> None:
+def test_two_fingers_that_oppose_one_take_hold_between_them() -> None:
     """What the tips do as such a hand closes points half to the side."""
-    side = -1 if mirrored else 1
-    places = ((side * 0.05, 0.0, 0.0), (-side * 0.05, 0.03, np.pi), (-side * 0.05, -0.03, np.pi))
-    parts = [link("palm", f'<collision><origin xyz="{side * 0.03} 0 -0.02"/>{_PLATE_SHAPE}</collision>')]
-    for k, (x, y, yaw) in enumerate(places):
-        about = yaw if not mirrored else np.pi - yaw
+    parts = [link("palm", f'<collision><origin xyz="0.03 0 -0.02"/>{_PLATE_SHAPE}</collision>')]
+    for k, (x, y, yaw) in enumerate(((0.05, 0.0, 0.0), (-0.05, 0.03, np.pi), (-0.05, -0.03, np.pi))):
         bend = {"axis": "0 -1 0", "limit": '<limit lower="0" upper="1.4" effort="10"/>'}
         base = joint(f"j{k}", "palm", f"f{k}", origin=f"{x} {y} 0", **bend)
         parts += [
             link(f"f{k}", _bar(0.05)),
-            base.replace("<origin xyz", f'<origin rpy="0 0 {about}" xyz'),
+            base.replace("<origin xyz", f'<origin rpy="0 0 {yaw}" xyz'),
             link(f"t{k}", _bar(0.04)),
             joint(f"k{k}", f"f{k}", f"t{k}", origin="0 0 0.05", **bend),
         ]
     np.testing.assert_allclose(load(robot(*parts)).palm.approach, [0, 0, 1], atol=1e-9)
-
-
-def test_a_published_hand_in_a_turned_root_frame_faces_as_it_did() -> None:
-    urdf, turn = builtin_files(AssetKind.HAND, "barrett"), "0.3 -0.5 1.1"
-    name = next(name for name in urdf if name.endswith(".urdf"))
-    above = f'{link("world", "")}<joint name="mount" type="fixed"><parent link="world"/><child link="palm"/>'
-    mounted = urdf[name].replace(b"</robot>", f'{above}<origin rpy="{turn}"/></joint></robot>'.encode())
-    options = {"root": "world"}
-    as_it_is = load_hand({name: urdf[name]}, name="h", digest="0" * 32)
-    turned = load_hand({name: mounted}, name="h", digest="0" * 32, options=options)
-    pose = turned.frames["palm"][1]
-    np.testing.assert_allclose(turned.palm.approach, quat_rotate(pose[3:], as_it_is.palm.approach), atol=1e-4)
-    assert turned.closing.tolist() == as_it_is.closing.tolist()
 
 
 def test_rounding_turns_neither_palm_nor_jaws_nor_closing() -> None:

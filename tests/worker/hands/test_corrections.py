@@ -8,11 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from graspd.service.model.states import AssetKind
-from graspd.service.store.assets import builtin_names
 from graspd.service.store.descriptions import HandCorrections, corrected, facts_of
 from graspd.worker.hands.jaws import pads_of
-from graspd.worker.hands.load import files_from_path, hand_from_path, load_hand
+from graspd.worker.hands.load import hand_from_path, load_hand
 from graspd.worker.hands.model import HandModel
 from graspd.worker.stages.models import hand_glb
 from tests.worker.commands_run import graspd
@@ -86,14 +84,3 @@ def test_the_model_tells_every_link_and_pads_are_where_jaws_meet() -> None:
     one, two = pads_of(gripper())
     assert one.body != two.body and len(one.points) > 3 and len(two.points) > 3
     assert one.normal @ two.normal < -0.95
-
-
-@pytest.mark.parametrize("name", builtin_names(AssetKind.HAND))
-def test_each_fingertip_of_a_hand_has_its_pad_on_its_surface(name: str) -> None:
-    _, files, _ = files_from_path(name)
-    hand = load_hand(files, name=name, digest="")
-    pads = pads_of(hand)
-    assert [pad.body for pad in pads] == list(hand.fingertips)
-    for pad in pads:
-        corners = np.concatenate([piece.vertices for piece in hand.pieces if piece.body == pad.body])
-        assert (pad.points >= corners.min(axis=0) - 1e-6).all() and (pad.points <= corners.max(axis=0) + 1e-6).all()

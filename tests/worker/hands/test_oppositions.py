@@ -22,6 +22,7 @@ from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.pinch_postures import oppositions_of, require_opposing
 from graspd.worker.hands.surface import sample_surface
 from tests.worker.hands.grippers import gripper
+from tests.worker.hands.urdfs import BOX, joint, link, robot
 from tests.worker.models import object_from_mesh
 
 
@@ -49,17 +50,6 @@ def test_a_wide_hand_opposes_over_a_range_one_finger_nothing() -> None:
     alone = oppositions_of(replace(hand, name="alone", fingertips=hand.fingertips[:1]))
     assert len(alone) == 0
     assert alone.widest == 0.0
-
-
-def test_postures_that_machine_keeps_are_those_that_were_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    hand = hand_from_path("barrett")
-    found = []
-    for find in (oppositions._oppositions, lambda hand: pytest.fail("it is there already")):
-        monkeypatch.setattr(oppositions, "_oppositions", find)
-        monkeypatch.setattr(oppositions, "_known", {})
-        found.append(vars(oppositions_of(hand)))
-    assert all(np.array_equal(found[0][name], array) for name, array in found[1].items())
 
 
 HEIGHT_M = 0.012
@@ -144,21 +134,12 @@ def test_pairs_taken_together_cost_what_each_of_them_costs() -> None:
     assert len(look.one) == (body[:, None] != body).sum() / 2
 
 
-_LINK = (
-    '<link name="{name}"><collision><origin xyz="0 0 0.02"/><geometry><box size="0.01 0.01 0.04"/></geometry>'
-    "</collision></link>"
-)
-_JOINT = (
-    '<joint name="{name}" type="revolute"><parent link="{parent}"/><child link="{child}"/><origin xyz="0 0 0.04"/>'
-    '<axis xyz="0 1 0"/><limit lower="0" upper="0.3" effort="1" velocity="1"/></joint>'
-)
-
-
 def pointer() -> HandModel:
     """A stick of three links that bends a little: none of them ever faces another."""
-    links = "".join(_LINK.format(name=name) for name in "abc")
-    joints = _JOINT.format(name="one", parent="a", child="b") + _JOINT.format(name="two", parent="b", child="c")
-    files = {"pointer.urdf": f'<robot name="pointer">{links}{joints}</robot>'.encode()}
+    bends = '<limit lower="0" upper="0.3" effort="1" velocity="1"/>'
+    thin = BOX.replace("0.02 0.02 0.04", "0.01 0.01 0.04")
+    joints = joint("one", "a", "b", limit=bends), joint("two", "b", "c", limit=bends)
+    files = {"pointer.urdf": robot(*(link(name, thin) for name in "abc"), *joints)}
     return load_hand(files, name="pointer", digest="0" * 32)
 
 

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import io
 import resource
 import subprocess
 import sys
-import zipfile
 from pathlib import Path
 
 import pytest
@@ -21,6 +19,7 @@ from graspd.worker.hands.check import check_hand
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.xacro import expand
 from graspd.worker.stages.assets import load_hand_files
+from tests.worker.stages.test_ingest import zipped
 
 CLAW = """<?xml version="1.0"?>
 <robot name="claw" xmlns:xacro="http://www.ros.org/wiki/xacro">
@@ -72,11 +71,8 @@ def test_includes_macros_arguments_and_yaml_are_expanded(package: Path) -> None:
 def test_an_upload_of_the_package_is_the_same_hand(package: Path) -> None:
     report = report_hand(str(package), {"xacro": {"stroke": "0.03"}})
     assert report["verdict"] == "accept" and report["facts"]["upper"]["left_joint"] == 0.03
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w") as archive:
-        for name, data in FILES.items():
-            archive.writestr(f"checkout/{name}", data)
-    files = files_of_upload(AssetKind.HAND, "claw.zip", buffer.getvalue(), limit_bytes=1 << 20)
+    packed = zipped({f"checkout/{name}": data for name, data in FILES.items()})
+    files = files_of_upload(AssetKind.HAND, "claw.zip", packed, limit_bytes=1 << 20)
     found, expected = check_hand(files, "claw"), report_hand(str(package))
     # A folder is called as it is, an upload as the user says.
     assert found["verdict"] == "accept" and found["facts"] == expected["facts"]
@@ -166,15 +162,12 @@ def test_of_several_descriptions_one_is_named(tmp_path: Path) -> None:
     message = report_hand(str(tmp_path))["message"]
     assert "left.urdf, right.urdf" in message and "--urdf left.urdf" in message
     assert "nowhere" in report_hand(str(tmp_path), {"file": "nowhere"})["message"]
-    packed = io.BytesIO()
-    with zipfile.ZipFile(packed, "w") as archive:
-        for name in ("left", "right"):
-            archive.writestr(f"hands/urdf/{name}.urdf", urdf.format(name))
+    packed = zipped({f"hands/urdf/{name}.urdf": urdf.format(name).encode() for name in ("left", "right")})
     with pytest.raises(InputError, match=r"--urdf left\.urdf"):
-        files_of_upload(AssetKind.HAND, "h.zip", packed.getvalue(), limit_bytes=1 << 20)
+        files_of_upload(AssetKind.HAND, "h.zip", packed, limit_bytes=1 << 20)
     for said in ("right.urdf", "right", "urdf/right.urdf"):
         options = f'{{"file": "{said}"}}'
-        files = files_of_upload(AssetKind.HAND, "h.zip", packed.getvalue(), limit_bytes=1 << 20, options=options)
+        files = files_of_upload(AssetKind.HAND, "h.zip", packed, limit_bytes=1 << 20, options=options)
         assert b'"urdf/right.urdf"' in files["asset.json"]
 
 

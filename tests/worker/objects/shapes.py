@@ -1,12 +1,13 @@
-"""Small meshes for tests."""
+"""Small meshes for tests, and damage to files."""
 
 from __future__ import annotations
 
 import numpy as np
+from hypothesis import strategies as st
 from manifold3d import Manifold
 from numpy.typing import NDArray
 
-from graspd.worker.objects.builtin import stl_bytes
+from graspd.worker.objects.formats.bare import stl_bytes
 from graspd.worker.objects.mesh_geometry import from_manifold
 
 Mesh = tuple[NDArray[np.float64], NDArray[np.int64]]
@@ -34,3 +35,14 @@ def join(*meshes: Mesh) -> Mesh:
 
 def stl(mesh: Mesh) -> dict[str, bytes]:
     return {"m.stl": stl_bytes(*mesh)}
+
+
+@st.composite
+def damaged(draw: st.DrawFn, source: bytes, words: list[bytes]) -> bytes:
+    """A file with a few spans replaced, dropped or repeated."""
+    data = source
+    for _ in range(draw(st.integers(1, 5))):
+        start = draw(st.integers(0, len(data)))
+        end = min(len(data), start + draw(st.integers(0, 60)))
+        data = data[:start] + draw(st.sampled_from(words) | st.binary(max_size=16)) + data[end:]
+    return data

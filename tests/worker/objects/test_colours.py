@@ -16,10 +16,12 @@ from graspd.service.model.errors import LimitError, MeshError
 from graspd.service.store.hand_files import files_of_hand
 from graspd.service.store.mesh_files import MAX_NAMES, beside, looks_of
 from graspd.worker.hands.load import hand_from_path, load_hand
+from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.formats import read_mesh
 from graspd.worker.objects.formats.glb import material_colour
 from graspd.worker.rendering.hands import hand_parts
 from tests.worker.hands.urdfs import BOX, joint, link, robot
+from tests.worker.objects.test_formats import pack_glb
 
 #: sRGB of a byte, rounded twice.
 STEP = 1.5 / 255
@@ -49,10 +51,17 @@ def test_base_colours_are_srgb_here_and_textures_give_their_mean() -> None:
     assert colour(textured()) == pytest.approx(np.array([230, 20, 20]) / 255, abs=STEP)
 
 
+def urdf_seen_as(mesh: str) -> bytes:
+    seen = f'<visual><geometry><mesh filename="{mesh}"/></geometry></visual>'
+    return robot(link("palm", BOX + seen), link("a"), joint("j", "palm", "a"))
+
+
+def hand_seen_as(mesh: str, files: dict[str, bytes]) -> HandModel:
+    return load_hand({"h.urdf": urdf_seen_as(mesh), **files}, name="h", digest="")
+
+
 def test_a_hand_is_drawn_in_the_colours_of_its_textured_mesh() -> None:
-    seen = '<visual><geometry><mesh filename="part.glb"/></geometry></visual>'
-    urdf = robot(link("palm", BOX + seen), link("a"), joint("j", "palm", "a"))
-    hand = load_hand({"h.urdf": urdf, "part.glb": textured()}, name="h", digest="")
+    hand = hand_seen_as("part.glb", {"part.glb": textured()})
     (palm,) = [part for part in hand_parts(hand) if part.body == 0]
     red, green, blue = palm.look.base
     assert red > 0.7 and green == pytest.approx(blue) and green < 0.02
@@ -63,10 +72,7 @@ def changed(data: bytes, change: object) -> bytes:
     (length,) = struct.unpack("<I", data[12:16])
     document = json.loads(data[20 : 20 + length])
     change(document)  # type: ignore[operator]
-    text = json.dumps(document).encode()
-    text += b" " * (-len(text) % 4)
-    rest = data[20 + length :]
-    return struct.pack("<4sIII4s", b"glTF", 2, 20 + len(text) + len(rest), len(text), b"JSON") + text + rest
+    return pack_glb(document, data[28 + length :])
 
 
 def large() -> bytes:
@@ -154,10 +160,7 @@ def picture(format: str = "PNG") -> bytes:
 
 
 def colours(files: dict[str, bytes], mesh: str = "m/part.obj") -> dict[object, int]:
-    seen = f'<visual><geometry><mesh filename="{mesh}"/></geometry></visual>'
-    urdf = robot(link("palm", BOX + seen), link("a"), joint("j", "palm", "a"))
-    hand = load_hand({"h.urdf": urdf, **files}, name="h", digest="")
-    return {mesh.colour: len(mesh.faces) for mesh in hand.visuals.meshes}
+    return {mesh.colour: len(mesh.faces) for mesh in hand_seen_as(mesh, files).visuals.meshes}
 
 
 def test_obj_has_colours_of_its_library_and_mean_of_its_picture() -> None:
@@ -192,10 +195,8 @@ def test_a_dae_has_the_mean_of_a_picture_beside_it(named: str) -> None:
 def test_a_change_of_a_picture_is_another_look() -> None:
     files = {"m/part.obj": OBJ, "m/looks/part.mtl": MTL, "m/looks/skin.png": picture()}
     assert looks_of("m/part.obj", files) == ["m/looks/part.mtl", "m/looks/skin.png"]
-    seen = '<visual><geometry><mesh filename="m/part.obj"/></geometry></visual>'
-    urdf = robot(link("palm", BOX + seen), link("a"), joint("j", "palm", "a"))
     digests = {
-        load_hand({"h.urdf": urdf, **files, "m/looks/skin.png": data}, name="h", digest="").visuals.content
+        hand_seen_as("m/part.obj", {**files, "m/looks/skin.png": data}).visuals.content
         for data in (picture(), picture() + b" ")
     }
     assert len(digests) == 2
@@ -219,8 +220,7 @@ def test_a_hand_brings_looks_its_meshes_name_none_from_outside(tmp_path: Path) -
     (folder / "m" / "looks" / "skin.png").write_bytes(picture())
     (folder / "m" / "photo of the lab.png").write_bytes(picture())
     (tmp_path / "secret.png").write_bytes(picture())
-    seen = '<visual><geometry><mesh filename="m/part.obj"/></geometry></visual>'
-    (folder / "h.urdf").write_bytes(robot(link("palm", BOX + seen), link("a"), joint("j", "palm", "a")))
+    (folder / "h.urdf").write_bytes(urdf_seen_as("m/part.obj"))
     for given in (folder / "h.urdf", folder):
         files, _ = files_of_hand(given)
         assert set(files) == {"h.urdf", "m/part.obj", "m/looks/part.mtl", "m/other.mtl", "m/looks/skin.png"}
@@ -302,14 +302,7 @@ BOMB = (
         (dae("<asset/>"), "no faces"),
         (dae(SCENE.replace("polylist", "tristrips")), "strips are not read"),
         (dae(SCENE.replace("</polylist>", "</polylist><polygons><ph><p>0</p></ph></polygons>")), "polygons with holes"),
-        (
-            dae(
-                SCENE.replace(
-                    '<instance_geometry url="#g">', '<instance_controller url="#c"/><instance_geometry url="#g">'
-                )
-            ),
-            "skinned",
-        ),
+        (dae(SCENE.replace("<instance_geometry", '<instance_controller url="#c"/><instance_geometry')), "skinned"),
     ],
 )
 def test_a_bad_file_is_refused_and_told(data: bytes, named: str) -> None:

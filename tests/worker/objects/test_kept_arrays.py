@@ -170,18 +170,6 @@ def test_an_entry_that_is_none_is_made_again_and_replaced(own_cache: Path, built
     assert len(built) == 2
 
 
-def test_a_command_that_comes_later_prepares_nothing(own_cache: Path) -> None:
-    script = (
-        "import sys; from graspd.worker.objects import prepare\n"
-        "prepare.object_from_path('block', 1e-3)\n"
-        "prepare.build = None\n"
-        "prepare._prepared.cache_clear()\n"
-        "print(len(prepare.object_from_path('block', 1e-3).faces))\n"
-    )
-    shown = [subprocess.run([sys.executable, "-c", script], capture_output=True, check=True).stdout for _ in range(2)]
-    assert shown[0] == shown[1] and len(list((own_cache / "objects").iterdir())) == 1
-
-
 BRICK = object_from_mesh(trimesh.creation.box((0.06, 0.04, 0.05)))
 HAND = two_finger_hand()
 

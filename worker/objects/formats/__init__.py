@@ -19,7 +19,7 @@ from graspd.worker.objects.stand_ins import other_format, refuse_stand_in
 
 __all__ = ["MAX_FACES", "READERS", "Nearby", "Soup", "read_mesh"]
 
-READERS: Final[dict[str, Callable[[bytes], Soup]]] = {
+READERS: Final[dict[str, Callable[..., Soup]]] = {
     ".stl": bare.read_stl,
     ".obj": obj.read,
     ".ply": bare.read_ply,
@@ -31,17 +31,13 @@ READERS: Final[dict[str, Callable[[bytes], Soup]]] = {
 
 #: Python's quotation of text that it cannot parse as a number.
 _NO_NUMBER: Final = re.compile(r": (?:np\.bytes_\()?b?'(.{1,40}?)'")
-#: Readers that use files beside the mesh for its colours.
-_WITH_LOOKS: Final[dict[str, Callable[[bytes, Nearby], Soup]]] = {".obj": obj.read, ".dae": dae.read}
+#: Formats whose readers use files beside the mesh for its colours.
+_WITH_LOOKS: Final = (".obj", ".dae")
 
 
 def read_mesh(filename: str, data: bytes, nearby: Nearby = nothing_nearby) -> Soup:
     """Read vertices and triangles of a mesh file; the extension determines the format.
-
-    Args:
-        filename: its name.
-        data: its bytes.
-        nearby: returns material libraries and pictures by their names in the file.
+    `nearby` returns material libraries and pictures by their names in the file.
 
     Raises:
         MeshError: unknown format, unreadable, no faces, a bad index or a coordinate that is not finite.
@@ -59,8 +55,7 @@ def read_mesh(filename: str, data: bytes, nearby: Nearby = nothing_nearby) -> So
     try:
         # The check below finds invalid numbers; NumPy's warnings are not needed.
         with np.errstate(all="ignore"):
-            looks = _WITH_LOOKS.get(suffix)
-            return check_soup(looks(text, nearby) if looks else reader(text))
+            return check_soup(reader(text, nearby) if suffix in _WITH_LOOKS else reader(text))
     except GraspdError as error:
         raise type(error)(f"{filename}: {other_format(filename, text) or error}") from None
     except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError, struct.error) as error:

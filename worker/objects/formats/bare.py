@@ -1,5 +1,4 @@
-"""Formats of bare geometry: PLY (ASCII, binary of both byte orders), STL (binary, ASCII), OFF.
-Colours and normals are ignored."""
+"""PLY (ASCII, binary of both byte orders), STL (binary, ASCII) and OFF; colours and normals are ignored."""
 
 from __future__ import annotations
 
@@ -48,7 +47,6 @@ class _Element:
 
 
 def read_ply(data: bytes) -> Soup:
-    """Read vertices x y z and the polygons of `vertex_indices`."""
     found = re.search(rb"[\r\n]end_header", data[:65536])
     if not data.startswith(b"ply") or found is None:
         raise MeshError("a PLY file begins with the word ply and a header of at most 64 KiB")
@@ -104,8 +102,6 @@ _Lists = dict[str, tuple[np.ndarray, np.ndarray]]
 
 
 class _Ascii:
-    """Reader of one line per row."""
-
     def __init__(self, body: bytes) -> None:
         self._lines = [line for line in body.splitlines() if line.strip()]
         self._at = 0
@@ -201,7 +197,6 @@ _VERTEX = re.compile(rb"vertex\s+(\S+)\s+(\S+)\s+(\S+)", re.IGNORECASE)
 
 
 def read_stl(data: bytes) -> Soup:
-    """Read triangles of an STL file; each has its own three vertices."""
     if len(data) >= _HEADER and len(data) == _HEADER + _RECORD.itemsize * _promised(data):
         return _binary(data, _promised(data))
     if b"\0" not in data[:1024] and (_FACET.search(data) or b"endsolid" in data[-1024:].lower()):
@@ -237,6 +232,13 @@ def _ascii(data: bytes) -> Soup:
     return _soup(np.array(rows, dtype="S32").astype(float).reshape(-1, 3))
 
 
+def stl_bytes(vertices: np.ndarray, faces: np.ndarray) -> bytes:
+    """Return a binary STL, without normals."""
+    records = np.zeros(len(faces), _RECORD)
+    records["corners"] = vertices[faces]
+    return b"graspd".ljust(80) + len(faces).to_bytes(4, "little") + records.tobytes()
+
+
 def _soup(corners: np.ndarray) -> Soup:
     return Soup(corners, np.arange(len(corners), dtype=np.int64).reshape(-1, 3))
 
@@ -246,7 +248,6 @@ _HEAD: Final = re.compile(rb"(?:ST)?C?N?(4?n?)OFF(?![A-Z])(\s*BINARY)?", re.IGNO
 
 
 def read_off(data: bytes) -> Soup:
-    """Read triangles of the polygons of an OFF file."""
     lines = [line for raw in data.splitlines() if (line := raw.partition(b"#")[0].strip())]
     head = _HEAD.match(lines[0]) if lines else None
     if head is None:

@@ -67,7 +67,6 @@ def _parse(data: bytes) -> Element:
 
 
 def _unit(root: Element) -> float:
-    """Return the unit of the file in metres."""
     unit = root.find("asset/unit")
     metres = float(unit.get("meter", "1")) if unit is not None else 1.0
     if not 1e-9 < metres < 1e9:
@@ -76,8 +75,6 @@ def _unit(root: Element) -> float:
 
 
 class _Library:
-    """Parts of a file by their ids."""
-
     def __init__(self, root: Element, nearby: Nearby) -> None:
         self._nearby = nearby
         self._known = {identity: element for element in root.iter() if (identity := element.get("id"))}

@@ -82,7 +82,6 @@ def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
 
 
 def _instances(document: dict[str, Any]) -> list[tuple[int, np.ndarray]]:
-    """Return (mesh, 4x4 matrix) of every node with a mesh in the scene."""
     nodes = _list(document, "nodes")
     scenes = _list(document, "scenes")
     if scenes:

@@ -1,12 +1,11 @@
-"""Wavefront OBJ: positions, polygons, and colours of vertices, materials or their pictures' mean.
-Normals and groups are ignored."""
+"""Wavefront OBJ: positions, polygons, and colours of vertices, materials or their pictures' mean."""
 
 from __future__ import annotations
 
 import io
 import warnings
 from collections.abc import Callable, Iterable
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -161,6 +160,7 @@ def _numbers(text: bytes) -> Floats | None:
 
 #: Largest texture that is read [pixels].
 MAX_PIXELS: Final = 2**24
+_PICTURES: Final = ("PNG", "JPEG")
 #: Errors of unreadable pictures.
 UNREADABLE: Final = (ValueError, OSError, SyntaxError)
 
@@ -173,16 +173,14 @@ def mean_colour(data: bytes) -> Floats:
     """
     from PIL import Image  # few meshes have pictures, and every process reads meshes
 
+    bomb = Image.DecompressionBombWarning
     try:
-        return _mean_colour(Image, data)
+        with (
+            warnings.catch_warnings(action="ignore", category=bomb),
+            Image.open(io.BytesIO(data), formats=_PICTURES) as it,
+        ):
+            if it.width * it.height > MAX_PIXELS:
+                raise ValueError("the image is too large")
+            return np.asarray(it.convert("RGB").resize((1, 1), Image.Resampling.BOX), float)[0, 0] / 255
     except Image.DecompressionBombError as error:
         raise ValueError(str(error)) from error
-
-
-def _mean_colour(image: Any, data: bytes) -> Floats:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", image.DecompressionBombWarning)
-        with image.open(io.BytesIO(data), formats=("PNG", "JPEG")) as opened:
-            if opened.width * opened.height > MAX_PIXELS:
-                raise ValueError("the image is too large")
-            return np.asarray(opened.convert("RGB").resize((1, 1), image.Resampling.BOX), float)[0, 0] / 255

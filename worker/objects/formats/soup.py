@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from graspd.service.model.errors import LimitError, MeshError
 from graspd.service.model.transforms import Floats
+from graspd.worker.objects.topology import face_vectors
 
 MAX_FACES: Final = 1_000_000
 #: Largest plausible coordinate in any unit.
@@ -57,7 +58,6 @@ def check_soup(soup: Soup) -> Soup:
 
 
 def check_face_count(count: int) -> None:
-    """Raise LimitError for too many faces."""
     if count > MAX_FACES:
         raise LimitError(f"{count} faces; at most {MAX_FACES} are taken: decimate the mesh first")
 
@@ -87,8 +87,7 @@ def triangulate(vertices: Floats, counts: Ints, corners: Ints) -> Ints:
     triangles = np.stack([corners[start], corners[start + step + 1], corners[start + step + 2]], axis=1)
     if not (number > 1).any() or (triangles < 0).any() or (triangles >= len(vertices)).any():
         return triangles
-    a, b, c = np.moveaxis(vertices[triangles], 1, 0)
-    normals = np.cross(b - a, c - a)
+    normals = face_vectors(vertices, triangles)
     owner = np.repeat(np.arange(len(counts)), number)
     # The sum over a fan is the polygon's vector area for any position of its corners.
     whole = np.stack([np.bincount(owner, normals[:, k], len(counts)) for k in range(3)], axis=1)

@@ -1,0 +1,423 @@
+"""Drives and couplings of the joints of an MJCF model, from actuators, equalities, fixed tendons and closed loops.
+
+Couplings are linear in their drivers. A four-bar linkage is a tree with ends connected by `connect` constraints. The
+loops are solved over the drivers' ranges, and each passive joint is fitted by a line, with the resulting error.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+import mujoco
+import numpy as np
+
+from graspd.service.model.errors import HandError
+from graspd.service.model.transforms import Floats
+from graspd.worker.hands.robot import Mimic
+
+_RANGE_POINTS: Final = 41
+_STEPS: Final = 33
+_ROUNDS: Final = 60
+#: Gap above which the ends of a loop do not meet [m].
+_OPEN_M: Final = 2e-4
+_ONE_VALUE: Final = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+#: Largest deviation of a passive joint from its line [rad].
+MAX_ERROR_RAD: Final = 0.08
+
+
+class Couplings:
+    """Couplings between the joints of a compiled model; `name` returns the name of a joint."""
+
+    def __init__(self, model: Any, name: Callable[[int], str]) -> None:
+        self.model, self.name = model, name
+        #: Mimic of each dependent joint, or the value at which an equality fixes it.
+        self.follows: dict[int, Mimic | float] = {}
+        #: Notes for the user.
+        self.notes: list[str] = []
+        #: Coefficients of the joints that a tendon pulls, by the name of its drive.
+        self.tendons: dict[str, dict[int, float]] = {}
+        #: Joints with an unsolved loop, and the error for a hand that moves by them.
+        self.faults: dict[int, str] = {}
+        self._driven = [driven(model, actuator) for actuator in range(model.nu)]
+        self._actuated = {joint for pulled in self._driven for joint, _ in pulled}
+        active = [equality for equality in range(model.neq) if model.eq_active0[equality]]
+        for equality in active:
+            self._add_equality(equality)
+        self._add_tendons()
+        self._add_loops([e for e in active if model.eq_type[e] == int(mujoco.mjtEq.mjEQ_CONNECT)])
+        self._hold_followers()
+
+    def _add_equality(self, equality: int) -> None:
+        first, second = int(self.model.eq_obj1id[equality]), int(self.model.eq_obj2id[equality])
+        polynomial = np.asarray(self.model.eq_data[equality, :5])
+        kind = int(self.model.eq_type[equality])
+        if kind == int(mujoco.mjtEq.mjEQ_JOINT):
+            self._couple(first, second, polynomial)
+        if kind != int(mujoco.mjtEq.mjEQ_TENDON):
+            return
+        ends = [joints_on_tendon(self.model, tendon) if tendon >= 0 else [] for tendon in (first, second)]
+        if len(ends[0]) == 2 and second < 0:
+            self._couple_on_tendon(float(polynomial[0]), ends[0])
+        elif len(ends[0]) == len(ends[1]) == 1:
+            # c1 (q1 - q1_0) = p(c2 (q2 - q2_0))
+            ((one, own),), ((other, pull),) = ends
+            self._couple(one, other, polynomial * pull ** np.arange(5) / own)
+        else:
+            self.notes.append("an equality of tendons with several joints was left out")
+
+    def _hold_followers(self) -> None:
+        """Fix the joints that follow a fixed joint."""
+        held = {self.name(joint): value for joint, value in self.follows.items() if isinstance(value, float)}
+        while moved := [(j, f) for j, f in self.follows.items() if isinstance(f, Mimic) and f.joint in held]:
+            for joint, follows in moved:
+                value = follows.multiplier * held[follows.joint] + follows.offset
+                self.follows[joint] = held[self.name(joint)] = float(np.clip(value, *self._range(joint)))
+
+    def _couple(self, first: int, second: int, polynomial: Floats) -> None:
+        """Couple by first - first0 = p(second - second0); p of degree 4 is replaced by its best line."""
+        if second < 0:
+            self.follows[first] = self._rest(first) + float(polynomial[0])
+            return
+        if first in self.follows or first == second or self._leads_to(second, first):
+            self.notes.append(f"a second equality of {self.name(first)!r} was left out")
+            return
+        constant, slope = float(polynomial[0]), float(polynomial[1])
+        if np.abs(polynomial[2:]).max() > 1e-9:
+            at = np.linspace(*self._range(second), _RANGE_POINTS) - self._rest(second)
+            values = np.asarray(np.polynomial.polynomial.polyval(at, polynomial), float)
+            slope, constant, error = _line(at, values)
+            self.notes.append(f"{self.name(first)!r} follows {self.name(second)!r} by a line within {error:.2g}")
+        offset = self._rest(first) + constant - slope * self._rest(second)
+        self.follows[first] = Mimic(self.name(second), slope, offset)
+
+    def _leads_to(self, joint: int, first: int) -> bool:
+        """Check whether a joint follows another one through any chain."""
+        number = {self.name(j): j for j in self.follows}
+        while isinstance(follows := self.follows.get(joint), Mimic):
+            if follows.joint == self.name(first):
+                return True
+            joint = number.get(follows.joint, -1)
+        return False
+
+    def _couple_on_tendon(self, length: float, pulled: list[tuple[int, float]]) -> None:
+        """Couple two joints on a fixed tendon: c1 (q1 - q1_0) + c2 (q2 - q2_0) = length; the unactuated follows.
+
+        Limits take precedence over the tendon: where they stop the follower it stays, as in a finger with a compliant
+        end.
+        """
+        free = [pair for pair in pulled if pair[0] not in self.follows and pair[0] not in self._actuated]
+        if not free or abs(free[-1][1]) < 1e-9:
+            self.notes.append(f"a tendon of {' and '.join(self.name(joint) for joint, _ in pulled)} was left out")
+            return
+        joint, coefficient = free[-1]
+        ((driver, pull),) = [pair for pair in pulled if pair[0] != joint]
+        at = np.linspace(*self._range(driver), _RANGE_POINTS)
+        line = self._rest(joint) + (length - pull * (at - self._rest(driver))) / coefficient
+        values = np.clip(line, *self._range(joint))
+        if np.ptp(values) < 1e-6:
+            self.follows[joint] = float(values[0])
+            stays = f"stays at {values[0]:.3g}: its limits stop what its tendon asks of it"
+            self.notes.append(f"{self.name(joint)!r} {stays}")
+            return
+        slope, constant, error = _line(at, values)
+        self.follows[joint] = Mimic(self.name(driver), slope, constant)
+        if error > 1e-6:
+            self.notes.append(f"{self.name(joint)!r} follows {self.name(driver)!r} by a line within {error:.2g}")
+
+    def _add_tendons(self) -> None:
+        """Couple joints that share one actuated tendon and have no other drive.
+
+        Serial joints of one finger share the tendon according to contact. Parallel joints, the jaws of a gripper, bend
+        in the ratio of its pull on them: if they shared it freely, the object could move from side to side.
+        """
+        alone = {pulled[0][0] for pulled in self._driven if len(pulled) == 1}
+        for actuator, pulled in enumerate(self._driven):
+            free = [(j, c) for j, c in pulled if j not in self.follows and j not in alone and abs(c) > 1e-9]
+            if len(free) < 2:
+                continue
+            if self._in_a_row([joint for joint, _ in free]):
+                self.tendons[str(self.model.actuator(actuator).name) or f"tendon_{actuator}"] = dict(free)
+                continue
+            (driver, pull), *others = free
+            for joint, coefficient in others:
+                self.follows[joint] = Mimic(self.name(driver), coefficient / pull, 0.0)
+            followers = ", ".join(self.name(joint) for joint, _ in others)
+            self.notes.append(f"{followers} taken to follow {self.name(driver)} on their tendon")
+
+    def _in_a_row(self, joints: list[int]) -> bool:
+        """Check whether the joints form one chain."""
+        chains = sorted((set(_chain(self.model, int(self.model.jnt_bodyid[joint]))) for joint in joints), key=len)
+        return all(a <= b for a, b in itertools.pairwise(chains))
+
+    def _range(self, joint: int) -> tuple[float, float]:
+        if not self.model.jnt_limited[joint]:
+            return -np.pi, np.pi
+        lower, upper = self.model.jnt_range[joint]
+        return float(lower), float(upper)
+
+    def _rest(self, joint: int) -> float:
+        return float(self.model.qpos0[self.model.jnt_qposadr[joint]])
+
+    def _add_loops(self, loops: list[int]) -> None:
+        """Add the joints that close the loops of the model."""
+        for group in _groups(self.model, loops):
+            joints = sorted({j for e in group for j in _on_loop(self.model, e)})
+            passive = [j for j in joints if j not in self._actuated and j not in self.follows]
+            if not passive:
+                continue
+            try:
+                self._follow(group, joints, passive)
+            except HandError as error:
+                # The fault only matters if the hand moves by this joint.
+                self.faults |= dict.fromkeys(passive, str(error))
+
+    def _follow(self, group: list[int], joints: list[int], passive: list[int]) -> None:
+        """Add the mimics of the passive joints in a group of loops.
+
+        Raises:
+            HandError: it has no driver or several, does not close over its driver's range, or its joints are not
+                linear.
+        """
+        held = ", ".join(map(self.name, joints))
+        if round_ones := [j for j in joints if int(self.model.jnt_type[j]) not in _ONE_VALUE]:
+            raise HandError(
+                f"the loop of {held} turns on {self.name(round_ones[0])}, which is no hinge or slide joint, and is not "
+                "solved; write equalities of joints instead of the loop"
+            )
+        drivers = [j for j in joints if j in self._actuated and j not in self.follows]
+        # Without one, joints that follow others move with these.
+        drivers = drivers or [j for j in joints if j in self.follows and not isinstance(self.follows[j], float)]
+        if not drivers:
+            raise HandError(f"the loop of {held} has no driver; give one of its joints an actuator")
+        if len(drivers) > 1:
+            many = " and ".join(map(self.name, drivers))
+            raise HandError(
+                f"the loop of {held} has {len(drivers)} drivers ({many}), and only loops of one are solved; leave one "
+                "actuator in it, or write equalities of joints instead of the loop"
+            )
+        driver = self.name(drivers[0])
+        values, followers = self._solve(group, drivers[0], passive)
+        worst = 0.0
+        lines: dict[int, Mimic | float] = {}
+        for joint, follower in zip(passive, followers.T, strict=True):
+            slope, constant, error = _line(values, follower)
+            if error > MAX_ERROR_RAD:
+                raise HandError(
+                    f"the loop of {driver!r} moves {self.name(joint)!r} by no line (off by {error:.2f}); "
+                    "write an equality of the two joints instead"
+                )
+            worst = max(worst, error)
+            lines[joint] = Mimic(driver, slope, constant)
+        self.follows |= lines
+        self.notes.append(f"{', '.join(map(self.name, passive))} follow {driver} within {worst:.2g} rad")
+
+    def _solve(self, loops: list[int], driver: int, passive: list[int]) -> tuple[Floats, Floats]:
+        """Return the values of the driver (S,) and of the passive joints (S, P) at which the loops are closed."""
+        data = mujoco.MjData(self.model)
+        lower, upper = self._range(driver)
+        start = float(np.clip(self._rest(driver), lower, upper))
+        values = np.linspace(lower, upper, _STEPS)
+        # From the model's initial value to both ends, each step starting from the last solution.
+        order = np.concatenate([np.flatnonzero(values >= start), np.flatnonzero(values < start)[::-1]])
+        solved = np.full((_STEPS, len(passive)), np.nan)
+        rest = np.array([self._rest(joint) for joint in passive])
+        for step in order:
+            behind = step - 1 if values[step] >= start else step + 1
+            known = 0 <= behind < _STEPS and not np.isnan(solved[behind]).any()
+            guess = solved[behind] if known else rest
+            solved[step], gap = _close(self.model, data, loops, driver, values[step], passive, guess)
+            if gap > _OPEN_M:
+                raise HandError(
+                    f"the loop of {self.name(driver)!r} is open by {1e3 * gap:.1f} mm at {values[step]:.2f}; correct "
+                    "its range"
+                )
+        return values, solved
+
+
+def _line(at: Floats, values: Floats) -> tuple[float, float, float]:
+    """Return slope, constant and largest error of the best line."""
+    slope, constant = map(float, np.polyfit(at, values, 1))
+    return slope, constant, float(np.abs(values - constant - slope * at).max())
+
+
+def _groups(model: Any, loops: list[int]) -> list[list[int]]:
+    groups: list[tuple[set[int], list[int]]] = []
+    for loop in loops:
+        joints = set(_on_loop(model, loop))
+        touching = [group for group in groups if group[0] & joints]
+        merged = (joints.union(*(g[0] for g in touching)), [e for g in touching for e in g[1]] + [loop])
+        groups = [group for group in groups if group not in touching] + [merged]
+    return [members for _, members in groups]
+
+
+def _ends(model: Any, loop: int) -> tuple[int, int]:
+    first, second = int(model.eq_obj1id[loop]), int(model.eq_obj2id[loop])
+    if model.eq_objtype[loop] == int(mujoco.mjtObj.mjOBJ_SITE):
+        return int(model.site_bodyid[first]), int(model.site_bodyid[second])
+    return first, max(second, 0)
+
+
+def _on_loop(model: Any, loop: int) -> list[int]:
+    """Return the joints between the ends and the body at which their chains branch."""
+    chains = [_chain(model, body) for body in _ends(model, loop)]
+    common = set(chains[0]) & set(chains[1])
+    return [
+        joint
+        for chain in chains
+        for body in chain
+        if body not in common
+        for joint in range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body])
+    ]
+
+
+def _chain(model: Any, body: int) -> list[int]:
+    found = []
+    while body:
+        found.append(body)
+        body = int(model.body_parentid[body])
+    return found
+
+
+def _close(
+    model: Any, data: Any, loops: list[int], driver: int, value: float, passive: list[int], guess: Floats
+) -> tuple[Floats, float]:
+    """Solve for passive joint values at a driver value (Gauss-Newton); also return the loops' gap [m]."""
+    address, dofs = [int(model.jnt_qposadr[j]) for j in passive], [int(model.jnt_dofadr[j]) for j in passive]
+    q = guess.copy()
+    gap = np.inf
+    jacobians = np.zeros((2, 3, model.nv))
+    for _ in range(_ROUNDS):
+        data.qpos[:] = model.qpos0
+        data.qpos[model.jnt_qposadr[driver]] = value
+        data.qpos[address] = q
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        rows, residuals = [], []
+        for loop in loops:
+            points = _anchors(model, data, loop)
+            for k, (point, body) in enumerate(zip(points, _ends(model, loop), strict=True)):
+                mujoco.mj_jac(model, data, jacobians[k], None, point, body)
+            rows.append((jacobians[0] - jacobians[1])[:, dofs])
+            residuals.append(points[0] - points[1])
+        residual = np.concatenate(residuals)
+        gap = float(np.abs(residual).max())
+        step = np.linalg.lstsq(np.concatenate(rows), -residual, rcond=1e-8)[0]
+        q = q + np.clip(step, -0.2, 0.2)
+        if np.abs(step).max() < 1e-10:
+            break
+    return q, gap
+
+
+def _anchors(model: Any, data: Any, loop: int) -> tuple[Floats, Floats]:
+    """Return the two points, in the world frame, that a connect constraint joins."""
+    if model.eq_objtype[loop] == int(mujoco.mjtObj.mjOBJ_SITE):
+        return data.site_xpos[int(model.eq_obj1id[loop])], data.site_xpos[int(model.eq_obj2id[loop])]
+    points = []
+    for body, local in zip(_ends(model, loop), (model.eq_data[loop, :3], model.eq_data[loop, 3:6]), strict=True):
+        points.append(data.xpos[body] + data.xmat[body].reshape(3, 3) @ local)
+    return points[0], points[1]
+
+
+@dataclass(frozen=True)
+class Servo:
+    """Drive of a joint; 0: not stated."""
+
+    effort: float = 0.0
+    """[N m or N]"""
+    stiffness: float = 0.0
+    """[N m/rad or N/m]"""
+
+
+def servos(model: Any, mimics: Mapping[int, Mimic | float], shared: Collection[int]) -> dict[int, Servo]:
+    """Return the servo of each joint that an actuator drives.
+
+    An actuator of gear g on a length l pulls with g F dl/dq at joint q. A position servo of gain k holds the joint with
+    k (g dl/dq)^2. On a joint dl/dq is 1. On a fixed tendon it is the joint's coefficient plus those of its followers
+    times their rates. Each of n joints that share a tendon (`shared`) is as stiff as n such joints in series must be
+    for the tendon's gain.
+    """
+    found: dict[int, Servo] = {}
+    joint_of = {str(model.joint(j).name): j for j in range(model.njnt)}
+    for actuator in range(model.nu):
+        gear = float(model.actuator_gear[actuator, 0])
+        rates: dict[int, float] = {}
+        for joint, coefficient in driven(model, actuator):
+            driver, rate = _driver(joint, mimics, joint_of)
+            if driver is not None:
+                rates[driver] = rates.get(driver, 0.0) + coefficient * rate
+        for joint, rate in rates.items():
+            arm = abs(gear * rate)
+            force, gain = _force(model, actuator), _gain(model, actuator)
+            gain *= len(rates) if joint in shared else 1
+            before = found.get(joint, Servo())
+            found[joint] = Servo(before.effort + arm * force, before.stiffness + arm**2 * gain)
+    for joint, servo in list(found.items()):
+        if model.jnt_actfrclimited[joint]:
+            most = float(np.abs(model.jnt_actfrcrange[joint]).max())
+            found[joint] = Servo(min(servo.effort, most) or most, servo.stiffness)
+    return found
+
+
+def commanded(model: Any) -> dict[int, tuple[float, float]]:
+    """Return the command range of a joint's position servo: g k (u - q) with u in its control range."""
+    found = {}
+    for actuator in range(model.nu):
+        kind, gain = int(model.actuator_trntype[actuator]), _gain(model, actuator)
+        gear = float(model.actuator_gear[actuator, 0])
+        if kind != int(mujoco.mjtTrn.mjTRN_JOINT) or gain <= 0 or not gear or not model.actuator_ctrllimited[actuator]:
+            continue
+        told = float(model.actuator_gainprm[actuator, 0]) * np.asarray(model.actuator_ctrlrange[actuator], float)
+        ends = (told + float(model.actuator_biasprm[actuator, 0])) / (gain * gear)
+        if np.ptp(ends) > 1e-6:
+            found[int(model.actuator_trnid[actuator, 0])] = float(ends.min()), float(ends.max())
+    return found
+
+
+def driven(model: Any, actuator: int) -> list[tuple[int, float]]:
+    """Return the joints that an actuator moves, with the rate at which its length changes with each."""
+    kind, target = int(model.actuator_trntype[actuator]), int(model.actuator_trnid[actuator, 0])
+    if kind in (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)):
+        return [(target, 1.0)]
+    return joints_on_tendon(model, target) if kind == int(mujoco.mjtTrn.mjTRN_TENDON) else []
+
+
+def joints_on_tendon(model: Any, tendon: int) -> list[tuple[int, float]]:
+    first, count = int(model.tendon_adr[tendon]), int(model.tendon_num[tendon])
+    return [
+        (int(model.wrap_objid[w]), float(model.wrap_prm[w]))
+        for w in range(first, first + count)
+        if model.wrap_type[w] == int(mujoco.mjtWrap.mjWRAP_JOINT)
+    ]
+
+
+def _driver(joint: int, mimics: Mapping[int, Mimic | float], joint_of: Mapping[str, int]) -> tuple[int | None, float]:
+    """Return the joint at the end of a chain of mimics, and the total rate."""
+    rate = 1.0
+    for _ in range(len(mimics) + 1):
+        follows = mimics.get(joint)
+        if follows is None:
+            return joint, rate
+        if isinstance(follows, float) or follows.joint not in joint_of:
+            return None, 0.0
+        rate *= follows.multiplier
+        joint = joint_of[follows.joint]
+    return None, 0.0
+
+
+def _force(model: Any, actuator: int) -> float:
+    """Return the largest force; 0 if the model states none."""
+    if model.actuator_forcelimited[actuator]:
+        return float(np.abs(model.actuator_forcerange[actuator]).max())
+    if model.actuator_ctrllimited[actuator] and model.actuator_biastype[actuator] == int(mujoco.mjtBias.mjBIAS_NONE):
+        return abs(float(model.actuator_gainprm[actuator, 0])) * float(np.abs(model.actuator_ctrlrange[actuator]).max())
+    return 0.0
+
+
+def _gain(model: Any, actuator: int) -> float:
+    """Return the gain of a position servo; 0 for other actuators."""
+    if model.actuator_biastype[actuator] != int(mujoco.mjtBias.mjBIAS_AFFINE):
+        return 0.0
+    return max(0.0, -float(model.actuator_biasprm[actuator, 1]))
