@@ -8,7 +8,7 @@ time: other programs on the machine change the ratios little. Nothing is stored 
 docs/results/service.md.
 
 With --service a job of built-in hand and object goes through a whole service of each checkout: submitted over HTTP,
-planned, certified, measured, stored, indexed, after a small job that loads everything. Processor time is that of all
+planned, validated, measured, stored, indexed, after a small job that loads everything. Processor time is that of all
 processes of the service; beside it stands what BEFORE's planner alone takes for a candidate. With --pictures jobs are
 as examples/million/million.toml has them: for each batch six pictures of the object at rest on a table, eight rechecks.
 """
@@ -24,24 +24,34 @@ import time
 from pathlib import Path
 from typing import Any, Final
 
-#: Runs in each checkout, so it uses only what both have.
+#: Runs in each checkout: names of this one, or of graspd 0.2.
 CHILD: Final = """
 import json, sys, time
-from dataclasses import replace
 import numpy as np
-from graspd.service.model.domain import JobOptions
-from graspd.worker.hands.load import hand_from_path
-from graspd.worker.objects.prepare import object_from_path
-from graspd.worker.planners import Run, Wanted
-from graspd.worker.planners.fast_graspd import planner
-from graspd.worker.control.postures import pregrasp, squeeze
-from graspd.worker.validation.decomposition import decompose
-from graspd.worker.validation.displacement import simulated_displacement_cm
-from graspd.worker.validation.validator import validate
-from graspd.worker.quality.table import measure
+try:
+    from graspd.service.model.domain import JobOptions
+    from graspd.worker.execution_context import ExecutionContext
+    from graspd.worker.hands.load import hand_from_path
+    from graspd.worker.objects.prepare import object_from_path
+    from graspd.worker.planners.fast_graspd import planner
+    from graspd.worker.planners.port import PlanRequest
+    from graspd.worker.quality.table import measure
+    from graspd.worker.validation.decomposition import decompose
+    from graspd.worker.validation.displacement import simulated_displacement_cm
+    from graspd.worker.validation.validator import validate
+except ImportError:  # a checkout of 0.2
+    from service.model.domain import JobOptions
+    from worker.hands.load import hand_from_path
+    from worker.objects.prepare import object_from_path
+    from worker.planners import Run as ExecutionContext, Wanted as PlanRequest
+    from worker.planners.fast_graspd import planner
+    from worker.quality.referee.decomposition import decompose
+    from worker.quality.referee.displacement import simulated_displacement_cm
+    from worker.quality.referee.judge import judge as validate
+    from worker.quality.table import measure
 
 path, name, count, seed = sys.argv[1], sys.argv[2], int(sys.argv[3]), int(sys.argv[4])
-fidelity, run, spent = JobOptions(fidelity="standard").knobs, Run(threads=1), {}
+fidelity, run, spent = JobOptions(fidelity="standard").knobs, ExecutionContext(threads=1), {}
 hand, obj = hand_from_path(path), object_from_path(name, face_error_m=fidelity.face_error_m)
 pieces = decompose(obj)
 
@@ -61,10 +71,12 @@ def chain(wanted):
     timed("displacement", lambda: simulated_displacement_cm(hand, obj, held.grasp, pieces=pieces, run=run))
     return len(held)
 
-chain(Wanted(4, fidelity, seed=seed + 1))
+chain(PlanRequest(4, fidelity, seed=seed + 1))
 spent.clear()
-valid = sum(chain(Wanted(32, fidelity, seed, batch)) for batch in range(count // 32))
-print(json.dumps({"valid": valid, "raw": count // 32 * 32, "ms": {stage: 1e3 * s for stage, s in spent.items()}}))
+valid = sum(chain(PlanRequest(32, fidelity, seed, batch)) for batch in range(count // 32))
+candidates = count // 32 * 32
+ms = {stage: 1e3 * s for stage, s in spent.items()}
+print(json.dumps({"valid": valid, "candidates": candidates, "ms": ms}))
 """
 
 
@@ -129,7 +141,7 @@ def through_service(root: Path, hand: str, obj: str, grasps: int, wanted: dict[s
 
 
 def service_table(pair: str, before: dict[str, float], after: dict[str, float], raw_ms: float) -> list[str]:
-    """Rates of both jobs, and what the second is of the raw rate of the first checkout's planner."""
+    """Rates of both jobs, and their ratios to the candidate rate of the first checkout's planner."""
     rates = [found["valid"] / found["wall"] for found in (before, after)]
     costs = [1e3 * found["processor"] / found["valid"] for found in (before, after)]
     return [
@@ -182,7 +194,7 @@ def main() -> None:
     parser.add_argument("data", type=Path, nargs="?")
     parser.add_argument("--service", action="store_true", help="jobs through the whole service")
     parser.add_argument("--pictures", action="store_true", help="with --service: and pictures, as the pilot has them")
-    parser.add_argument("--grasps", type=int, help="of each pair, in batches of 32: 64 raw, or 256 valid ones")
+    parser.add_argument("--grasps", type=int, help="of each pair, in batches of 32: 64 candidates, or 256 valid ones")
     parser.add_argument("--pairs", nargs="*", default=["allegro:mug", "shadow:bottle"])
     parser.add_argument("--json", type=Path)
     given = parser.parse_args()

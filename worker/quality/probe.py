@@ -17,11 +17,11 @@ from graspd.worker.engines.backend import binary_name
 from graspd.worker.grasps import Posture
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel, SurfacePoints
-from graspd.worker.hands.primitives import triangle_areas
 from graspd.worker.hands.surface import sample_surface
 from graspd.worker.objects.disk_cache import arrays_kept_or_made
 from graspd.worker.objects.memory_cache import cached_by_content
 from graspd.worker.objects.model import ObjectModel
+from graspd.worker.objects.topology import face_areas
 from graspd.worker.simulation.device import DeviceHand, PosedBodies, to_xyzw
 from graspd.worker.simulation.kernels import distance as kernels
 from graspd.worker.simulation.launches import launch
@@ -135,7 +135,7 @@ class Probe:
     @cached_property
     def sample_spacing(self) -> float:
         """Distance between neighbouring object points if they were on a square grid [m]."""
-        return float(np.sqrt(triangle_areas(self.obj.vertices, self.obj.faces).sum() / len(self.samples)))
+        return float(np.sqrt(face_areas(self.obj.vertices, self.obj.faces).sum() / len(self.samples)))
 
     def signed_distance(self, points: Floats, *, reach: float = REACH_M) -> tuple[Floats, Floats, Floats]:
         """Return signed distance (P,), closest point (P, 3) and outward normal (P, 3) of points (P, 3).
