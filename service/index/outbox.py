@@ -79,8 +79,6 @@ deliveries: Final = Table(
 
 @dataclass(frozen=True)
 class DueDelivery:
-    """A delivery that is due."""
-
     hook: WebhookView
     end: EndView
     attempts: int
@@ -101,12 +99,9 @@ def note_ends(connection: Connection, rows: Sequence[dict[str, Any]]) -> None:
 
 @dataclass(frozen=True)
 class Outbox:
-    """Reads and writes of the feed and of webhooks."""
-
     database: Database
 
     def ends(self, since: int, *, limit: int, scope: ProjectScope = EVERYTHING) -> list[EndView]:
-        """Return the next ends after a number."""
         query = select(ends).where(ends.c.seq > since).order_by(ends.c.seq).limit(limit)
         if not scope.everything:
             query = query.where(ends.c.project == scope.project)
@@ -148,11 +143,9 @@ class Outbox:
             upsert(connection, webhooks, [row], keep=("seen",))
 
     def last(self, *, within: Connection) -> int:
-        """Return the number of the last end."""
         return int(within.scalar(select(func.max(ends.c.seq))) or 0)
 
     def seen(self, *, within: Connection) -> dict[str, int]:
-        """Return the last end of each webhook that has a delivery."""
         return {row.id: row.seen for row in within.execute(select(webhooks.c.id, webhooks.c.seen))}
 
     def told(self, *, within: Connection) -> dict[str, int]:
@@ -165,7 +158,6 @@ class Outbox:
             within.execute(update(datasets).where(datasets.c.name == name).values(told=events))
 
     def hooks(self, *, scope: ProjectScope = EVERYTHING) -> list[WebhookView]:
-        """Return the webhooks, the oldest first."""
         query = select(webhooks).order_by(webhooks.c.created, webhooks.c.id)
         if not scope.everything:
             query = query.where(webhooks.c.project == scope.project)
@@ -173,20 +165,17 @@ class Outbox:
             return [_hook(row) for row in connection.execute(query).mappings()]
 
     def hook(self, webhook: str, *, scope: ProjectScope = EVERYTHING) -> WebhookView:
-        """Return a webhook; NotFoundError if there is none."""
         for one in self.hooks(scope=scope):
             if one.id == webhook:
                 return one
         raise NotFoundError(f"there is no webhook {webhook!r}")
 
     def remove(self, webhook: str) -> None:
-        """Remove a webhook with its log."""
         with self.database.writing() as connection:
             connection.execute(delete(deliveries).where(deliveries.c.webhook == webhook))
             connection.execute(delete(webhooks).where(webhooks.c.id == webhook))
 
     def log(self, webhook: str, *, limit: int = 50) -> list[DeliveryView]:
-        """Return deliveries of a webhook, the newest first."""
         query = (
             select(deliveries, ends.c.kind, ends.c.subject, ends.c.state.label("ended"))
             .join(ends, ends.c.seq == deliveries.c.seq)
@@ -282,7 +271,6 @@ class Outbox:
             connection.execute(update(deliveries).where(*waiting).values(**others))
 
     def forget_old(self) -> None:
-        """Delete ends and deliveries older than `KEPT_S`."""
         oldest = int((time.time() - KEPT_S) * 1000)
         with self.database.writing() as connection:
             connection.execute(delete(deliveries).where(deliveries.c.seq < oldest))

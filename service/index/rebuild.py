@@ -121,7 +121,6 @@ class _Rebuild:
                 self._index.write.add_manifests([parse_record(ShardManifest, data, key)], within=self._connection)
 
     def datasets(self) -> None:
-        """Read datasets with users' actions, snapshots, sets of objects."""
         for key, data in self._read(names.DATASETS, lambda key: key.endswith("/dataset.json")):
             with self._each(key, "datasets"):
                 record = parse_record(DatasetRecord, data, key)
@@ -168,7 +167,6 @@ class _Rebuild:
                     yield key, data
 
     def _is_gone(self, key: str) -> bool:
-        """Check whether it belongs to a job or dataset that a user deleted."""
         folder, _, rest = key.partition("/")
         what = {names.JOBS: "job", names.DATASETS: "dataset"}.get(folder, "")
         return (what, rest.partition("/")[0]) in self._gone
@@ -195,7 +193,6 @@ class _Rebuild:
 
 
 def complete_if_new(index: Index, store: Store) -> None:
-    """Mark an index as complete if the store has no job yet."""
     if index.notes.completeness() is None and not any(
         True for prefix in (names.JOBS, names.DATASETS) for _ in store.list(prefix)
     ):

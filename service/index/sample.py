@@ -44,8 +44,6 @@ _TIMEOUT_S: Final = 5.0
 
 @dataclass(frozen=True)
 class Sample:
-    """The drawn ids."""
-
     shards: tuple[tuple[Stage, str], ...]
     jobs: tuple[str, ...]
 

@@ -43,6 +43,5 @@ class Services:
         return cls(settings, store, index, open_queue(settings, patience=patience))
 
     def close(self) -> None:
-        """Close all connections."""
         self.index.close()
         self.queue.close()

@@ -304,7 +304,6 @@ class Controller:
         self._has_news = False
 
     def _feed_new(self) -> None:
-        """Queue at once the tasks that became ready by new events."""
         if self._has_news:
             self._feed()
             self._has_news = False
@@ -393,7 +392,6 @@ class PeriodicDuty:
         self._again = -math.inf
 
     def __call__(self) -> None:
-        """Run it if it is due."""
         begun = self._clock()
         if begun < self._again:
             return

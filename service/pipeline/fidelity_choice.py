@@ -32,8 +32,6 @@ _NEAR: Final[tuple[tuple[Near, tuple[str, ...]], ...]] = (
 
 
 class ChosenFidelity(NamedTuple):
-    """A fidelity, and the reason for it."""
-
     fidelity: str
     measured_on: Near
     reached: float
@@ -49,12 +47,10 @@ class _Chart:
 
     @cached_property
     def pairs(self) -> set[tuple[str, str]]:
-        """Hand and object of each run."""
         return {(run["hand"], run["object"]) for run in self.content["runs"]}
 
     @cached_property
     def hands(self) -> set[str]:
-        """Hands of the runs."""
         return {hand for hand, _ in self.pairs}
 
 

@@ -54,7 +54,6 @@ class Response:
 
     @property
     def is_taken(self) -> bool:
-        """Whether the receiver accepted it: any 2xx."""
         return self.status is not None and 200 <= self.status < 300
 
 

@@ -34,8 +34,6 @@ _REDIS: Final = (
 
 
 class ServiceRecord(Record):
-    """A service that started work on a store."""
-
     id: str
     at: str
 
@@ -159,7 +157,6 @@ def check_service(store: Store, redis: str | None) -> bool:
 
 
 def service_ids(store: Store) -> list[str]:
-    """Return the ids of all services of a store; the last one is the present one."""
     keys = sorted(entry.key for entry in store.list(names.SERVICE))
     return [read_record(ServiceRecord, store, key).id for key in keys]
 

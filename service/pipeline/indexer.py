@@ -134,7 +134,6 @@ class Indexer:
         self._tally.made(made)
 
     def tell(self, states: Mapping[str, State]) -> None:
-        """Publish the changed states of jobs."""
         changed = {job: state for job, state in states.items() if self._told.get(job) is not state}
         if changed:
             now = timestamp()
@@ -151,12 +150,10 @@ class Indexer:
             self._told.popitem(last=False)
 
     def made(self, manifest: ShardManifest) -> None:
-        """Index a shard."""
         self.tell(self._services.index.write.add_manifest(manifest))
         self._tally.made([manifest])
 
     def checked(self, kind: AssetKind, digest: str) -> None:
-        """Index a hand or object as the store has it now."""
         asset = load_asset(self._services.store, kind, digest)
         self._services.index.write.add_asset(asset, load_check(self._services.store, kind, digest))
 
@@ -177,7 +174,6 @@ class Indexer:
             self.tell({attempt.job_id: state})
 
     def flush(self) -> None:
-        """Add the counts since the last call to the sums for Prometheus."""
         self._tally.flush()
 
     def _apply(self, event: Event) -> bool:

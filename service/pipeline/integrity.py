@@ -132,7 +132,6 @@ def examine(
 
 
 def _model_of(key: str) -> type[Any] | None:
-    """Return the model of a record of this name; None if it is no record."""
     return next((model for pattern, model in _RECORDS if re.fullmatch(pattern, key)), None)
 
 

@@ -97,7 +97,6 @@ class IntegrityScan:
             self.end()
 
     def end(self) -> None:
-        """Release the turn at once."""
         self._turn.end()
 
     def advance(self) -> bool:

@@ -259,7 +259,6 @@ def _told(services: Services, job_id: str) -> JobView:
 
 
 def _present_origin() -> Origin | None:
-    """Return the request that is being answered, if any."""
     origin = Origin(request=bound("request"), key=bound("key"), traceparent=bound("traceparent"))
     return origin if origin != Origin() else None
 

@@ -33,8 +33,6 @@ _LOOK_S: Final = 0.1
 
 
 class Leadership:
-    """Lease of leadership of one process."""
-
     def __init__(self, queue: RqQueue, *, lease_s: float, alive: HeartbeatFile, name: str | None = None) -> None:
         """
         Args:

@@ -107,7 +107,6 @@ class LeaseReaper:
         return True
 
     def _fail(self, task_id: str, stage: Stage, error: DamagedError) -> None:
-        """Fail a task because of a damaged record."""
         task = self._services.index.jobs.task(task_id)
         about = {"task_id": task_id, "job_id": task.job_id, "stage": stage, "number": task.attempt}
         why = {"kind": type(error).__name__, "reason": str(error), "worker": "controller"}

@@ -28,7 +28,6 @@ class Tally:
         self._kinds: set[tuple[str, str]] = set()
 
     def made(self, manifests: Iterable[ShardManifest]) -> None:
-        """Count indexed shards."""
         for manifest in manifests:
             stage = manifest.stage.value
             self.add("graspd_shards_total", stage)
@@ -40,7 +39,6 @@ class Tally:
                 self.add("graspd_grasps_total", "validated", amount=manifest.validated)
 
     def failed(self, stage: str, kind: str) -> None:
-        """Count a failed attempt of a task."""
         if (stage, kind) not in self._kinds:
             if len(self._kinds) >= MOST_KINDS:
                 kind = OTHER_KIND
@@ -59,6 +57,5 @@ class Tally:
         self._amounts[field(f"{name}_sum", *labels)] += seconds
 
     def add(self, name: str, *labels: str, amount: float = 1) -> None:
-        """Add to a series."""
         assert len(SERIES[name].labels) == len(labels)
         self._amounts[field(name, *labels)] += amount

@@ -12,8 +12,6 @@ from graspd.service.model.workers import Capabilities, Requirements, WorkerBeat,
 
 @dataclass(frozen=True)
 class Route:
-    """Destination of a task."""
-
     apart: bool = False
     """Whether it enters a list that only some workers of its stage read."""
     held: str = ""
@@ -21,8 +19,6 @@ class Route:
 
 
 class Routes:
-    """Capabilities of the living workers of each stage."""
-
     def __init__(self, present: Sequence[WorkerBeat] = ()) -> None:
         self._here: dict[Stage, list[Capabilities]] = defaultdict(list)
         for beat in present:

@@ -57,7 +57,6 @@ class WebhookDispatcher:
         self._pool = ThreadPoolExecutor(AT_ONCE, thread_name_prefix="webhooks")
 
     def run(self) -> None:
-        """Run rounds until stopped."""
         look_again = -math.inf
         while not self._stop.is_set():
             # An address gets one delivery at a time: the next starts when the last has ended.
@@ -105,7 +104,6 @@ class WebhookDispatcher:
         return due.attempts > 0 or self._last.get(due.hook.id, (0.0, False))[1]
 
     def tell_datasets(self) -> None:
-        """Write ended datasets to the feed."""
         untold = dict(self._services.index.outbox.untold_datasets())
         for name in untold.keys() - self._services.index.datasets.unfinished(untold):
             dataset = self._services.index.datasets.get(name)

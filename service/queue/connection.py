@@ -65,7 +65,6 @@ def password(data_dir: Path) -> str:
 
 
 def password_file(data_dir: Path) -> Path:
-    """Return the path of an embedded Redis's password, readable by its user only."""
     return data_dir.resolve() / "redis" / "password"
 
 

@@ -45,7 +45,6 @@ def is_wrong_type(error: Exception) -> bool:
 
 
 def message(data: bytes | None) -> Message | None:
-    """Parse the message of an RQ job."""
     if data is None:
         return None
     try:

@@ -129,14 +129,12 @@ class RqQueue:
             pipe.execute()
 
     def waiting(self) -> set[str]:
-        """Return the ids of the tasks in the queue."""
         with _mapped(), self.connection.pipeline(transaction=True) as pipe:
             for key in self._list_keys():
                 pipe.lrange(key, 0, -1)
             return {entries.task_of(entries.text(job))[0] for jobs in pipe.execute() for job in jobs}
 
     def depths(self) -> dict[tuple[Priority, Stage], int]:
-        """Return the number of waiting tasks of each priority and stage."""
         with _mapped(), self.connection.pipeline(transaction=False) as pipe:
             lists = known_lists(self.connection)
             for name in lists:
@@ -203,7 +201,6 @@ class RqQueue:
         return [beat for data in found if (beat := entries.read(WorkerBeat, data)) is not None]
 
     def publish(self, *events: Event) -> None:
-        """Append events."""
         with _mapped(), self.connection.pipeline(transaction=False) as pipe:
             for event in events:
                 put_event(pipe, event)
@@ -220,7 +217,6 @@ class RqQueue:
             return self._known(self._of_group(">", limit, wait_s))
 
     def acknowledge(self, event_ids: Sequence[str]) -> None:
-        """Acknowledge events that are in the index."""
         if event_ids:
             with _mapped():
                 self.connection.xack(EVENTS, _GROUP, *event_ids)
@@ -275,7 +271,6 @@ class RqQueue:
             return False
 
     def resign(self, holder: str) -> None:
-        """Release the leadership, if held."""
         with _mapped(), suppress(LockError):
             self.connection.lock(LEAD).do_release(holder)
 
@@ -312,14 +307,12 @@ class RqQueue:
         return QueueStatus(depth, oldest, running, workers)
 
     def count(self, amounts: Mapping[str, float]) -> None:
-        """Add to the persistent sums."""
         with _mapped(), self.connection.pipeline(transaction=False) as pipe:
             for name, amount in amounts.items():
                 pipe.hincrbyfloat(METRICS, name, amount)
             pipe.execute()
 
     def counted(self) -> dict[str, float]:
-        """Return all persistent sums."""
         with _mapped():
             found = self.connection.hgetall(METRICS)
         sums: dict[str, float] = {}
@@ -347,7 +340,6 @@ class RqQueue:
             pipe.execute()
 
     def close(self) -> None:
-        """Close the connections."""
         self.connection.close()
 
     def _of_group(self, after: str, limit: int, wait_s: float) -> list[tuple[str, Event | None]]:
@@ -389,7 +381,6 @@ def open_queue(settings: Settings, *, patience: int = 3) -> RqQueue:
 
 
 def put_event(pipe: Any, event: Event) -> None:
-    """Append an event to the bounded stream."""
     pipe.xadd(EVENTS, {"e": event.model_dump_json(exclude_defaults=True)}, maxlen=EVENTS_KEPT, approximate=True)
 
 
@@ -399,7 +390,6 @@ def rq_id(task_id: str, attempt: int) -> str:
 
 
 def cancel_key(task_id: str) -> str:
-    """Return the key that requests a worker to stop a task."""
     return f"graspd:cancel:{task_id}"
 
 
@@ -437,7 +427,6 @@ def unlist_worker(connection: Any, left: Event) -> None:
 
 
 def worker_key(name: str) -> str:
-    """Return the key that a living worker renews."""
     return f"{_WORKER.decode()}{name}"
 
 

@@ -93,12 +93,10 @@ class Child:
             self.start()
 
     def ask_to_stop(self) -> None:
-        """Send SIGTERM, if it runs."""
         if self.process is not None and self.process.poll() is None:
             self.process.send_signal(signal.SIGTERM)
 
     def join(self, deadline: float) -> None:
-        """Wait until the deadline of `time.monotonic`, then kill."""
         if self.process is not None:
             try:
                 self.process.wait(timeout=max(0.05, deadline - time.monotonic()))

@@ -233,14 +233,12 @@ def path(data_dir: DataDir = None) -> None:
 
 
 def _check_extras(workers: int) -> None:
-    """Raise UnavailableError if libraries of the children are not installed."""
     needed = ("httpx", "fastapi", "warp") if workers else ("httpx", "fastapi")
     if any(find_spec(library) is None for library in needed):
         raise UnavailableError("`graspd up` is not part of this install; run pip install 'graspd[all]'")
 
 
 def check_controller(settings: Settings) -> None:
-    """Raise UnavailableError without a recent heartbeat of a controller."""
     from graspd.service.pipeline.leading import PART
     from graspd.service.queue.rq_queue import open_queue
 

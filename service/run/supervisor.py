@@ -85,7 +85,6 @@ class Supervisor:
 
     @property
     def pids(self) -> dict[str, int]:
-        """Pids of running children by name."""
         return {child.name: child.process.pid for child in list(self._children) if child.process is not None}
 
     def start(self) -> None:

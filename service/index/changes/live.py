@@ -56,7 +56,6 @@ class Live:
             update_rows(connection, tasks, rows, state=State.RUNNING.value)
 
     def set_queued(self, task_ids: Sequence[str]) -> None:
-        """Mark tasks as queued."""
         with self.database.writing() as connection:
             for some in chunks(task_ids):
                 connection.execute(update(tasks).where(tasks.c.id.in_(some), _UNFINISHED).values(queued=True))
@@ -119,7 +118,6 @@ class Live:
             self._forget(connection, [row.name for row in gone if row.seen < forget_before])
 
     def forget_workers(self, names: Sequence[str]) -> None:
-        """Delete workers that stopped in order."""
         with self.database.writing() as connection:
             self._forget(connection, names)
 
@@ -128,7 +126,6 @@ class Live:
             connection.execute(delete(workers).where(workers.c.name.in_(some)))
 
     def add_asset_attempt(self, digest: str, number: int, *, not_before: float) -> None:
-        """Record a check without a result."""
         values = {"last_attempt": number, "queued": False, "not_before": not_before}
         with self.database.writing() as connection:
             connection.execute(

@@ -248,7 +248,6 @@ class DatasetChanges:
     database: Database
 
     def add(self, record: DatasetRecord, *, within: Connection | None = None) -> None:
-        """Add a dataset with its cells; later actions of users stay unchanged."""
         row = {
             "name": record.name,
             "digest": record.digest,
@@ -294,7 +293,6 @@ class DatasetChanges:
             connection.execute(update(datasets).where(datasets.c.name == name).values(**values))
 
     def add_snapshot(self, snapshot: Snapshot, *, within: Connection | None = None) -> None:
-        """Add a snapshot, without its list of shards."""
         row = {
             "dataset": snapshot.dataset,
             "digest": snapshot.digest,
@@ -309,14 +307,12 @@ class DatasetChanges:
             upsert(connection, dataset_snapshots, [row])
 
     def add_object_set(self, found: ObjectSet, *, within: Connection | None = None) -> None:
-        """Add a version of a named set of objects."""
         row = {"name": found.name, "digest": found.digest, "objects": list(found.objects), "created": found.created}
         row |= {"project": found.project}
         with self.database.writing(within) as connection:
             upsert(connection, object_sets, [row])
 
     def set_progress(self, name: str, *, applied: int | None = None, planned: bool | None = None) -> None:
-        """Set the planner's progress on a dataset."""
         values = {k: v for k, v in {"applied": applied, "planned": planned}.items() if v is not None}
         with self.database.writing() as connection:
             connection.execute(update(datasets).where(datasets.c.name == name).values(**values))

@@ -64,12 +64,10 @@ class Removals:
         return f"belongs to dataset {dataset!r}; delete that first" if dataset else ""
 
     def attempts_of(self, job_id: str, *, within: Connection) -> tuple[tuple[str, int], ...]:
-        """Return task and number of each failed attempt of a job."""
         query = select(attempts.c.task_id, attempts.c.number).where(attempts.c.job_id == job_id)
         return tuple((task, number) for task, number in within.execute(query))
 
     def snapshots_of(self, dataset: str, *, within: Connection) -> int:
-        """Return the number of snapshots of a dataset."""
         query = select(func.count()).where(dataset_snapshots.c.dataset == dataset)
         return int(within.scalar(query) or 0)
 
@@ -89,12 +87,10 @@ class Removals:
             return set(connection.scalars(query))
 
     def remove_asset(self, kind: AssetKind, digest: str, *, within: Connection | None = None) -> None:
-        """Remove a hand, object or network."""
         with self.database.writing(within) as connection:
             connection.execute(delete(assets).where(assets.c.kind == kind.value, assets.c.digest == digest))
 
     def remove_job(self, job_id: str, *, within: Connection | None = None) -> None:
-        """Remove a job, its tasks and their attempts."""
         with self.database.writing(within) as connection:
             of_job = select(tasks.c.id).where(tasks.c.job_id == job_id)
             gone = or_(attempts.c.job_id == job_id, attempts.c.task_id.in_(of_job))
@@ -103,7 +99,6 @@ class Removals:
             connection.execute(delete(jobs).where(jobs.c.id == job_id))
 
     def remove_dataset(self, name: str, *, within: Connection | None = None) -> None:
-        """Remove a dataset with its cells and snapshots."""
         with self.database.writing(within) as connection:
             connection.execute(delete(dataset_snapshots).where(dataset_snapshots.c.dataset == name))
             connection.execute(delete(dataset_cells).where(dataset_cells.c.dataset == name))
@@ -120,7 +115,6 @@ class Removals:
 
 
 def _remember_cost(shard: str, connection: Connection) -> None:
-    """Add the cost of a deleted shard to its project's costs of that day."""
     row = connection.execute(select(shards).where(shards.c.id == shard)).mappings().first()
     if row is None:
         return

@@ -28,7 +28,6 @@ _LONGEST_TEXT: Final = 2000
 
 
 def job_row(record: JobRecord) -> Row:
-    """Return the row of a job at submission."""
     return {
         "id": record.id,
         "state": State.QUEUED.value,
@@ -59,7 +58,6 @@ def beside(options: JobOptions) -> str:
 
 
 def task_rows(record: JobRecord, ranges: range | None = None) -> Iterator[Row]:
-    """Yield the initial rows of a job's tasks, for all ranges or some."""
     order = stages_of(record.request)
     for task in plan(record, ranges):
         yield {
@@ -98,7 +96,6 @@ def clean(text: str, length: int | None = None) -> str:
 
 
 def attempt_row(attempt: AttemptRecord) -> Row:
-    """Return the row of a failed attempt."""
     return {
         "task_id": attempt.task_id,
         "number": attempt.number,
@@ -115,7 +112,6 @@ def attempt_row(attempt: AttemptRecord) -> Row:
 
 
 def shard_row(manifest: ShardManifest) -> Row:
-    """Return the row of a shard; its grasps have separate rows."""
     return {
         "id": manifest.shard_id,
         "kind": manifest.kind,
@@ -146,7 +142,6 @@ def shard_row(manifest: ShardManifest) -> Row:
 
 
 def grasp_rows(manifest: ShardManifest) -> list[Row]:
-    """Return the rows of a base shard's grasps; none for other shards."""
     of_shard = {
         "shard_id": manifest.shard_id,
         "hand": manifest.hand,

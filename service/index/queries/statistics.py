@@ -17,8 +17,6 @@ from graspd.service.index.tables import dataset_cells, grasps, shards, tasks
 
 @dataclass(frozen=True)
 class MetricSummary:
-    """Summary of one metric over the grasps that have it."""
-
     count: int
     mean: float
     low: float
@@ -57,8 +55,6 @@ class GraspKinds:
 
 @dataclass(frozen=True)
 class Statistics:
-    """Reads of all grasps that pass a filter."""
-
     database: Database
 
     def summaries(self, where: GraspFilter, metrics: Sequence[Metric]) -> dict[Metric, MetricSummary]:

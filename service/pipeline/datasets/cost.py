@@ -100,7 +100,6 @@ def estimate(
 
 
 def _once(objects: list[str], options: JobOptions) -> list[str]:
-    """Return the objects of all cells, including neighbours."""
     return list(dict.fromkeys([*objects, *(one.object for one in options.beside)]))
 
 

@@ -51,7 +51,6 @@ FORMATS: Final[dict[str, Callable[[Snapshot, Path, Fetch, Progress | None], int]
 
 
 def path_of(shard: SnapshotShard) -> str:
-    """Return the path of a shard in the folder."""
     return f"{shard.hand}/{shard.object}/{shard.kind}-{shard.batch:05}.h5"
 
 

@@ -45,7 +45,6 @@ class Matrix(JobOptions):
 
     @property
     def shared(self) -> JobOptions:
-        """Options that all cells share."""
         return JobOptions(**{name: getattr(self, name) for name in JobOptions.model_fields})
 
 

@@ -53,7 +53,6 @@ def is_there(settings: Settings) -> bool:
 
 @contextmanager
 def redis_connection(settings: Settings) -> Iterator[Redis]:
-    """Yield a client with a short timeout."""
     client = connect(redis_url(settings), patience=0, timeout_s=_TIMEOUT_S)
     try:
         yield client

@@ -32,8 +32,6 @@ class Condition(StrEnum):
 
 @dataclass(frozen=True)
 class Finding:
-    """Result of one check."""
-
     name: str
     condition: Condition
     message: str
@@ -48,8 +46,6 @@ class Finding:
 
 @dataclass(frozen=True)
 class Check:
-    """A check with its timeout."""
-
     name: str
     look: Callable[[], Finding]
     limit_s: float = 60.0

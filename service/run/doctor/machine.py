@@ -58,7 +58,6 @@ _EXTRAS: Final = ("api", "worker", "embedded", "postgres", "otel", "usd", "arm",
 
 
 def local_store(settings: Settings) -> Path | None:
-    """Return the folder of a local store; None for a bucket."""
     return local_folder(settings.resolved_store_url)
 
 
