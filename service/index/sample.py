@@ -150,8 +150,7 @@ def look(url: str | URL) -> IndexCondition | None:
     """Return the condition of an index; None if the file of an SQLite index does not exist yet.
 
     Raises:
-        InputError: the URL names no known database, or one with another encoding than UTF-8.
-        IndexUnavailable: it is unavailable.
+        InputError, IndexUnavailable: as in `Database`.
         IndexDamaged: the file has invalid content.
     """
     try:

@@ -43,11 +43,7 @@ from graspd.service.store.store import Store
 def delete_asset(
     services: Services, kind: AssetKind, name: str, *, owner: str = "", scope: ProjectScope = EVERYTHING
 ) -> None:
-    """Delete a hand, object or network.
-
-    Args:
-        owner: id of the API key that deletes it.
-        scope: what an error message may name.
+    """Delete a hand, object or network; `scope` restricts what an error message names.
 
     Raises:
         NotFoundError: no asset has that name or digest.
@@ -62,7 +58,7 @@ def delete_asset(
                 user = "a job, a dataset or a set of objects"
             raise ConflictError(f"the {kind.value} {asset.name!r} is needed by {user}; delete that first")
         said = {"name": asset.name, "submitter": asset.owner, "project": asset.project}
-        _record(put, Deletion(what=kind.value, id=asset.digest, at=timestamp(), owner=owner, **said))
+        _put(put, Deletion(what=kind.value, id=asset.digest, at=timestamp(), owner=owner, **said))
         services.index.removals.remove_asset(kind, asset.digest, within=connection)
 
 
@@ -84,15 +80,12 @@ def delete_job(services: Services, job_id: str, *, owner: str = "") -> None:
         attempts = services.index.removals.attempts_of(job_id, within=connection)
         said = {"name": f"{job.request.hand} on {job.request.object}", "submitter": job.owner, "project": job.project}
         deletion = Deletion(what="job", id=job_id, at=timestamp(), owner=owner, job=record, attempts=attempts, **said)
-        _record(put, deletion)
+        _put(put, deletion)
         services.index.removals.remove_job(job_id, within=connection)
 
 
 def delete_dataset(services: Services, name: str, *, owner: str = "", with_snapshots: bool = False) -> None:
     """Delete a dataset; jobs that were planned for it alone follow.
-
-    Args:
-        with_snapshots: whether to delete its snapshots too.
 
     Raises:
         NotFoundError: the dataset does not exist.
@@ -109,7 +102,7 @@ def delete_dataset(services: Services, name: str, *, owner: str = "", with_snaps
                 f"to delete them too: graspd datasets delete {name} --with-snapshots"
             )
         said = {"submitter": dataset.owner, "project": dataset.project}
-        _record(put, Deletion(what="dataset", id=name, at=timestamp(), owner=owner, **said))
+        _put(put, Deletion(what="dataset", id=name, at=timestamp(), owner=owner, **said))
         services.index.removals.remove_dataset(name, within=connection)
 
 
@@ -140,10 +133,9 @@ def restore(
     permit: Callable[[Deletion], None],
     among: Callable[[Deletion], bool] = lambda _: True,
 ) -> Deletion:
-    """Restore what a user deleted, unchanged; a dataset with its deleted jobs.
+    """Restore what a user deleted, by name or id, unchanged; a dataset with its deleted jobs.
 
     Args:
-        name: name or id of the thing.
         permit: called with the deletion; raises if it may not be restored.
         among: whether a deletion is in scope.
 
@@ -153,23 +145,19 @@ def restore(
     """
     known = [one for one in deletions(services.store, what) if name in (one.id, one.name) and among(one)]
     if not known:
-        raise NotFoundError(f"no {what} {name!r} was deleted in the last {_days(services.settings.shard_grace_s)}")
+        days = services.settings.shard_grace_s / 86400
+        raise NotFoundError(f"no {what} {name!r} was deleted in the last {days:.3g} days")
     permit(known[0])
     if what == "tag":
         _restore_tag(services, known[0])
         return known[0]
     with services.index.database.writing() as connection:
         connection.execution_options(**{QUIET: True})
-        if what == "dataset":
-            _restore(services, known[0], connection, before=lambda: _restore_jobs(services, known[0], connection))
-        else:
-            _restore(services, known[0], connection)
+        _restore(services, known[0], connection)
     return known[0]
 
 
-def _restore(
-    services: Services, deletion: Deletion, connection: Connection, *, before: Callable[[], None] = lambda: None
-) -> None:
+def _restore(services: Services, deletion: Deletion, connection: Connection) -> None:
     """Restore objects, then rows, then remove the deletion. Called under the index's write lock."""
     store, record, folder = services.store, _record_of(deletion), removed_folder(deletion)
     waiting = names.deletion(deletion.what, deletion.id)
@@ -180,7 +168,8 @@ def _restore(
     for key in _last([key for key in moved if key != "deletion.json"], record):
         store.move(f"{folder}/{key}", key)
     try:
-        before()
+        if deletion.what == "dataset":
+            _restore_jobs(services, deletion, connection)
         _enter(services, deletion, connection)
     except ConflictError:
         if not store.exists(waiting):
@@ -263,9 +252,5 @@ def _last(keys: Iterable[str], record: str) -> list[str]:
     return sorted(keys, key=lambda key: (key == record, key))
 
 
-def _days(seconds: float) -> str:
-    return f"{seconds / 86400:.3g} days"
-
-
-def _record(put: Put, deletion: Deletion) -> None:
+def _put(put: Put, deletion: Deletion) -> None:
     put(names.deletion(deletion.what, deletion.id), deletion)

@@ -86,9 +86,8 @@ class Resolver:
             method, target, hand, object_ = key
             chart.found[key] = cheapest(chart.content, target, method=method, hand=hand, object_=object_)
         found = chart.found[key]
-        how = Choice(
-            target=request.target, chart=chart.key, measured_on=found.measured_on, reached=round(found.reached, 4)
-        )
+        reached = round(found.reached, 4)
+        how = Choice(target=request.target, chart=chart.key, measured_on=found.measured_on, reached=reached)
         return request.model_copy(update={"fidelity": found.fidelity, "target": ""}), how
 
     def _chart(self, request: JobRequest) -> _Chart:
@@ -130,21 +129,11 @@ def parse_target(text: str, *, in_scene: bool = False) -> tuple[str, float]:
     return metric, float(bound)
 
 
-def cheapest(
-    chart: Row, target: str, *, method: str, hand: str, object_: str, offered: Sequence[str] = OFFERED
-) -> ChosenFidelity:
+def cheapest(chart: Row, target: str, *, method: str, hand: str, object_: str) -> ChosenFidelity:
     """Return the fidelity of a method with most valid grasps per second among those that meet a target.
 
     Runs of the same hand and object count; else runs of the hand; else all. In a chart of scenes only grasps planned
     for them count, by lifted grasps per second.
-
-    Args:
-        chart: as `graspd chart` writes it.
-        target: see `parse_target`.
-        method: the planner.
-        hand: name of the hand.
-        object_: name of the object.
-        offered: fidelities to choose from.
 
     Raises:
         InputError: no such target, no run of the method, or no fidelity that meets the target.
@@ -153,7 +142,7 @@ def cheapest(
     metric, bound = parse_target(target, in_scene=in_scene)
     more = (IN_SCENES if in_scene else FREE)[metric]
     again = f"`graspd chart {'--scene ... ' if in_scene else ''}--publish`"
-    runs = [run for run in chart["runs"] if run["method"] == method and run["fidelity"] in offered]
+    runs = [run for run in chart["runs"] if run["method"] == method and run["fidelity"] in OFFERED]
     runs = [run for run in runs if run.get("way", IN_SCENE) == IN_SCENE]
     if not runs:
         raise InputError(f"the stored chart has no run of {method}; run {again}, or name a fidelity")

@@ -84,13 +84,10 @@ def is_public(address: Address) -> bool:
 
 
 def reachable(host: str, port: int, allowed: Networks) -> list[str]:
-    """Return the addresses of a host if all of them may be reached.
-
-    Args:
-        allowed: networks that the operator allows besides public addresses.
+    """Return the addresses of a host if all of them may be reached: public ones, or in the networks `allowed`.
 
     Raises:
-        Refused: one of them may not be reached.
+        RefusedAddress: one of them may not be reached.
         OSError: it has no address.
     """
     found = list(dict.fromkeys(str(info[4][0]) for info in _looked_up(host, port)))

@@ -93,11 +93,7 @@ class LeaseReaper:
             self._indexer.tell(self._services.index.live.set_waiting(again))
 
     def _find(self, task_id: str, stage: Stage, shard: str) -> bool:
-        """Index an existing shard; a damaged manifest fails its task, since it cannot be made again.
-
-        Returns:
-            whether it exists.
-        """
+        """Index an existing shard, and return whether it exists; a damaged manifest fails its task for good."""
         try:
             self._indexer.made(load_manifest(self._services.store, stage, shard))
         except NotFoundError:
@@ -160,9 +156,8 @@ class LeaseReaper:
 
     def _lose_check(self, message: IngestMessage) -> None:
         if message.attempt >= message.max_attempt:
-            reason = (
-                f"checking this {message.kind.value} ended its worker {message.attempt} times; delete it to try again"
-            )
+            ended = f"checking this {message.kind.value} ended its worker {message.attempt} times"
+            reason = f"{ended}; delete it to try again"
             found = {"verdict": "refuse", "message": reason, "repairs": [], "facts": {}}
             put_document(self._services.store, names.asset_check(message.kind, message.digest), found)
             self._indexer.checked(message.kind, message.digest)

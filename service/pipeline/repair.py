@@ -30,15 +30,11 @@ def repair(services: Services, found: Sequence[Damage]) -> tuple[list[Damage], l
 
     Returns:
         damage that was queued or moved, and damage that was left; `what` of the latter contains the reason.
-
-    Raises:
-        UnavailableError: a backend is unavailable; call it again.
     """
     harmed = {one.shard for one in found if one.shard}
     repaired, left = [], []
     for one in found:
-        why = _fix(services, one, harmed)
-        if why:
+        if why := _fix(services, one, harmed):
             left.append(Damage(one.key, f"{one.what}; {why}", one.shard))
         else:
             repaired.append(one)

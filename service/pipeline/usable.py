@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TypeVar
 
+from sqlalchemy import Connection
+
 from graspd.service.index.views import AssetView
 from graspd.service.model.domain import JobOptions
-from graspd.service.model.errors import ConflictError, InputError
+from graspd.service.model.errors import ConflictError, InputError, NotFoundError
 from graspd.service.model.projects import EVERYTHING, ProjectScope
 from graspd.service.model.records import Member
 from graspd.service.model.states import AssetKind
@@ -33,6 +35,11 @@ def usable(services: Services, kind: AssetKind, name: str, scope: ProjectScope =
     return asset
 
 
+def refuse_deleted(services: Services, wanted: Sequence[tuple[AssetKind, str]], connection: Connection) -> None:
+    if missing := services.index.assets.missing(wanted, within=connection):
+        raise NotFoundError(f"there is no {missing[0]} any more; it was deleted just now")
+
+
 def with_neighbours(
     services: Services, options: Options, scope: ProjectScope = EVERYTHING
 ) -> tuple[Options, Sequence[AssetView]]:
@@ -44,13 +51,11 @@ def with_neighbours(
         as in `usable`; InputError if a name and a digest belong to two objects.
     """
     beside = [usable(services, AssetKind.OBJECT, one.digest or one.object, scope) for one in options.beside]
+    found = []
     for one, asset in zip(options.beside, beside, strict=True):
         if one.object not in (asset.name, asset.digest):
             raise InputError(f"the neighbour {one.object!r} has a digest that is of {asset.name!r}; leave it out")
-    found = [
-        one.model_copy(update={"object": asset.name, "digest": asset.digest})
-        for one, asset in zip(options.beside, beside, strict=True)
-    ]
+        found.append(one.model_copy(update={"object": asset.name, "digest": asset.digest}))
     return options.with_beside(found), beside
 
 

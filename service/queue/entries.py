@@ -75,12 +75,7 @@ def events(reply: Any) -> list[tuple[str, Event | None]]:
 
 
 def sweep(connection: Any, kinds: Mapping[str, str], stream: str) -> None:
-    """Remove entries of a wrong type, and the event stream if it accepts no entries.
-
-    Args:
-        kinds: names with their expected Redis types.
-        stream: name of the event stream.
-    """
+    """Remove entries of another type than that in `kinds`, and the event stream if it accepts no entries."""
     with connection.pipeline(transaction=False) as pipe:
         for name in kinds:
             pipe.type(name)

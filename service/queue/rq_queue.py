@@ -89,14 +89,11 @@ class RqQueue:
     def enqueue(
         self, messages: Sequence[Message], priority: Priority, *, again: bool = False, apart: bool = False
     ) -> int:
-        """Append tasks to a priority. A task (id and attempt) that already waits or runs is not queued twice.
+        """Append tasks to a priority; return how many. One (id and attempt) that waits or runs is not queued twice.
 
         Args:
             again: the caller found these tasks missing in the queue; remaining data of them is replaced.
             apart: only some workers of the stage can do them; the tasks go to separate lists.
-
-        Returns:
-            Number of tasks added.
         """
         stale = [cancel_key(message.task_id) for message in messages]
         if again:
@@ -275,11 +272,7 @@ class RqQueue:
             self.connection.lock(LEAD).do_release(holder)
 
     def now(self, *, lease_s: float) -> QueueStatus:
-        """Return queue lengths, ages and workers for the metrics, at a cost independent of the queue's length.
-
-        Args:
-            lease_s: lifetime of a worker's registration after its heartbeat [s].
-        """
+        """Return queue lengths, ages and workers for the metrics, at a cost independent of the queue's length."""
         beats = self.workers()
         with _mapped(), self.connection.pipeline(transaction=False) as pipe:
             lists = known_lists(self.connection)
@@ -344,9 +337,8 @@ class RqQueue:
 
     def _of_group(self, after: str, limit: int, wait_s: float) -> list[tuple[str, Event | None]]:
         """Read events of the controllers' consumer group; create it if necessary."""
-        read = partial(
-            self.connection.xreadgroup, _GROUP, _GROUP, {EVENTS: after}, count=limit, block=int(wait_s * 1000) or None
-        )
+        block = int(wait_s * 1000) or None
+        read = partial(self.connection.xreadgroup, _GROUP, _GROUP, {EVENTS: after}, count=limit, block=block)
         try:
             return entries.events(read())
         except ResponseError as error:
@@ -362,10 +354,9 @@ class RqQueue:
         return [(event_id, event) for event_id, event in found if event is not None]
 
     def _job(self, message: Message) -> Job:
+        data = message.model_dump(mode="json", by_alias=True)
         return new_job(
-            for_worker_of(
-                getattr(message, "revision", 0), message.stage, message.model_dump(mode="json", by_alias=True)
-            ),
+            for_worker_of(getattr(message, "revision", 0), message.stage, data),
             id=rq_id(message.task_id, message.attempt),
             connection=self.connection,
             description=f"{message.stage} {message.task_id}",

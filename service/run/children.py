@@ -14,7 +14,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Final
 
@@ -44,7 +44,7 @@ class Child:
     starts: int = 0
     _started: float = 0.0
     _pause: float = _FIRST_PAUSE_S
-    _not_before: float = field(default=0.0)
+    _not_before: float = 0.0
 
     @property
     def pid_file(self) -> Path | None:

@@ -9,8 +9,8 @@ from typing import Any
 from sqlalchemy import Connection, delete, select, update
 
 from graspd.service.index.bulk import update_rows, upsert
-from graspd.service.index.changes.rows import clean, settle
-from graspd.service.index.database import Database, chunks
+from graspd.service.index.changes.rows import NO_PROGRESS, clean, settle
+from graspd.service.index.database import Database, chunks, rows_among
 from graspd.service.index.tables import assets, jobs, tasks, workers
 from graspd.service.model.states import State
 from graspd.service.model.workers import WorkerBeat
@@ -28,22 +28,16 @@ class Live:
         """Mark tasks as taken; `workers` maps tasks to workers. Return the changed states of jobs."""
         running = State.RUNNING.value
         with self.database.writing() as connection:
-            jobs_of: dict[str, str] = {}
-            for some in chunks(list(workers)):
-                waiting = tasks.c.id.in_(some) & (tasks.c.state == State.QUEUED.value)
-                found = connection.execute(select(tasks.c.id, tasks.c.job_id).where(waiting))
-                jobs_of |= {row.id: row.job_id for row in found}
-            rows = [
-                {"id": task, "state": running, "queued": True, "worker": clean(workers[task], 128)}
-                | {"progress_done": 0.0, "progress_total": 0.0}
-                for task in jobs_of
-            ]
+            waiting = select(tasks.c.id, tasks.c.job_id).where(tasks.c.state == State.QUEUED.value)
+            jobs_of = {row.id: row.job_id for row in rows_among(connection, waiting, tasks.c.id, workers)}
+            started = {"state": running, "queued": True, "progress_done": 0.0, "progress_total": 0.0}
+            rows = [{"id": task, **started, "worker": clean(workers[task], 128)} for task in jobs_of]
             update_rows(connection, tasks, rows, state=State.QUEUED.value)
             touched = sorted(set(jobs_of.values()))
             for some in chunks(touched):
                 # A running job stays running: its other tasks need no check.
-                waiting = jobs.c.id.in_(some) & (jobs.c.state == State.QUEUED.value)
-                connection.execute(update(jobs).where(waiting).values(state=running))
+                of_waiting = update(jobs).where(jobs.c.id.in_(some), jobs.c.state == State.QUEUED.value)
+                connection.execute(of_waiting.values(state=running))
             return dict.fromkeys(touched, State.RUNNING)
 
     def set_progress(self, progress: Mapping[str, tuple[float, float, str]]) -> None:
@@ -69,7 +63,7 @@ class Live:
             the states of the jobs concerned.
         """
         values = {"queued": False, "not_before": not_before, "state": State.QUEUED.value, "worker": None}
-        values |= {"progress_done": 0.0, "progress_total": 0.0, "progress_message": message and clean(message)}
+        values |= {**NO_PROGRESS, "progress_message": message and clean(message)}
         touched: set[str] = set()
         with self.database.writing() as connection:
             for some in chunks(task_ids):

@@ -65,7 +65,7 @@ class Removals:
 
     def attempts_of(self, job_id: str, *, within: Connection) -> tuple[tuple[str, int], ...]:
         query = select(attempts.c.task_id, attempts.c.number).where(attempts.c.job_id == job_id)
-        return tuple((task, number) for task, number in within.execute(query))
+        return tuple((row.task_id, row.number) for row in within.execute(query))
 
     def snapshots_of(self, dataset: str, *, within: Connection) -> int:
         query = select(func.count()).where(dataset_snapshots.c.dataset == dataset)
@@ -73,18 +73,15 @@ class Removals:
 
     def planned_only(self, ids: Sequence[str]) -> list[str]:
         """Return those of the jobs that only a dataset's planner made and that no dataset contains."""
-        query = select(jobs.c.id).where(
-            jobs.c.id.in_(ids), jobs.c.priority == Priority.BULK.value, jobs.c.origin.is_(None)
-        )
-        query = query.where(~exists().where(dataset_cells.c.job_id == jobs.c.id))
-        with self.database.reading() as connection:
-            return list(connection.scalars(query))
+        planned = (jobs.c.priority == Priority.BULK.value, jobs.c.origin.is_(None))
+        needed = exists().where(dataset_cells.c.job_id == jobs.c.id)
+        query = select(jobs.c.id).where(jobs.c.id.in_(ids), *planned, ~needed)
+        return self.database.column(query)
 
     def unneeded_shards(self, ids: Sequence[str]) -> set[str]:
         """Return those of the shards that exist and that no task of any job makes or reads."""
         query = select(shards.c.id).where(shards.c.id.in_(ids), ~exists().where(tasks.c.shard_id == shards.c.id))
-        with self.database.reading() as connection:
-            return set(connection.scalars(query))
+        return set(self.database.column(query))
 
     def remove_asset(self, kind: AssetKind, digest: str, *, within: Connection | None = None) -> None:
         with self.database.writing(within) as connection:

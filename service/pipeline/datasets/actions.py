@@ -12,16 +12,17 @@ from graspd.service.model import names
 from graspd.service.model.clock import timestamp
 from graspd.service.model.digests import digest_json
 from graspd.service.model.domain import JobOptions
-from graspd.service.model.errors import ConflictError, InputError, LimitError, NotFoundError
+from graspd.service.model.errors import ConflictError, InputError, NotFoundError
 from graspd.service.model.projects import EVERYTHING, ProjectScope
 from graspd.service.model.records import DatasetRecord, Member, ObjectSet, Snapshot, object_set_of
 from graspd.service.model.scene_spec import NamedNeighbour, SceneDocument
 from graspd.service.model.states import AssetKind, State
 from graspd.service.pipeline.backends import Services
-from graspd.service.pipeline.datasets.spec import MAX_CELLS, DatasetRequest, Matrix, describe
+from graspd.service.pipeline.datasets.cost import objects_of
+from graspd.service.pipeline.datasets.spec import DatasetRequest, Matrix, describe
 from graspd.service.pipeline.fidelity_choice import Resolver
 from graspd.service.pipeline.recording import recording
-from graspd.service.pipeline.usable import usable, with_neighbours, with_network
+from graspd.service.pipeline.usable import refuse_deleted, usable, with_neighbours, with_network
 from graspd.service.store.records import (
     Put,
     add_dataset_event,
@@ -76,8 +77,7 @@ def create(
         if not new and (other := _difference(record, hands, objects, shared)):
             raise ConflictError(f"there is another dataset named {record.name!r} ({other}); take another name")
         refuse_pending(services.store, "dataset", record.name)
-        if missing := services.index.assets.missing(wanted, within=connection):
-            raise NotFoundError(f"there is no {missing[0]} any more; it was deleted just now")
+        refuse_deleted(services, wanted, connection)
         services.index.write_dataset.add(record, within=connection)
     return services.index.datasets.get(record.name), new
 
@@ -187,10 +187,7 @@ def add_object_set(
             known = read_record(ObjectSet, services.store, names.object_set(name, after))
             owner, project = known.owner, known.project
             may_follow(owner, project)
-        if missing := services.index.assets.missing(
-            [(AssetKind.OBJECT, one.digest) for one in assets], within=connection
-        ):
-            raise NotFoundError(f"there is no {missing[0]} any more; it was deleted just now")
+        refuse_deleted(services, [(AssetKind.OBJECT, one.digest) for one in assets], connection)
         found = object_set_of(name, wanted, after=after, owner=owner, project=project)
         if not put(key := names.object_set(name, found.digest), found):
             # An earlier request ended before it wrote the row.
@@ -203,19 +200,14 @@ def add_object_set(
 
 def members(services: Services, matrix: Matrix, scope: ProjectScope = EVERYTHING) -> tuple[list[Member], list[Member]]:
     """Return the present hands and objects of a matrix with sets expanded; errors as in `create`."""
-    objects = dict.fromkeys(matrix.objects)
-    for name in matrix.sets:
-        objects |= dict.fromkeys(services.index.object_sets.get(name, scope=scope).objects)
-    if len(matrix.hands) * len(objects) > MAX_CELLS:
-        raise LimitError(f"{len(matrix.hands)} hands x {len(objects)} objects is over {MAX_CELLS} cells; split it")
+    objects = objects_of(services.index, matrix, scope)
     hands = _members(services, AssetKind.HAND, matrix.hands, scope)
     return hands, _members(services, AssetKind.OBJECT, objects, scope)
 
 
 def _members(services: Services, kind: AssetKind, wanted: Iterable[str], scope: ProjectScope) -> list[Member]:
     assets = [usable(services, kind, name, scope) for name in wanted]
-    found = [Member(name=asset.name, digest=asset.digest) for asset in assets]
-    return list(dict.fromkeys(found))
+    return list(dict.fromkeys(Member(name=asset.name, digest=asset.digest) for asset in assets))
 
 
 def _present(services: Services, name: str) -> DatasetRecord:

@@ -409,7 +409,7 @@ def test_writers_at_once_leave_the_rows_of_the_store(services: Services, index_u
         thread.start()
     try:
         for message in messages:
-            services.index.write.add_manifest(make_shard(services.store, message))
+            services.index.write.add_manifests([make_shard(services.store, message)])
     finally:
         done.set()
         for thread in threads:

@@ -18,8 +18,8 @@ from graspd.service.model.states import AssetKind, Stage, State
 from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.controller import Controller
+from graspd.service.pipeline.job_actions import Routes
 from graspd.service.pipeline.lease_reaper import LOST_AFTER_S
-from graspd.service.pipeline.routes import Routes
 from graspd.service.queue.port import Event, EventKind
 from graspd.service.store.library import publish_asset, stored_assets
 from graspd.worker.process.runner import Runner

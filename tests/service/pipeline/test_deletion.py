@@ -37,7 +37,7 @@ def finished(services: Services, **changes: Any) -> str:
 def _make_all(services: Services) -> None:
     queue: Any = services.queue
     while (delivery := queue.take("w")) is not None:
-        services.index.write.add_manifest(make_shard(services.store, delivery.message))
+        services.index.write.add_manifests([make_shard(services.store, delivery.message)])
         queue.finish(delivery)
         for job in services.index.jobs.page().items:
             job_actions._start(services, job.id)

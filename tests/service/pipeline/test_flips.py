@@ -56,7 +56,7 @@ def full(services: Services) -> Services:
     record = read_record(JobRecord, store, names.job_record(job.id))
     lone, first, _ = tasks_of(record)
     manifest = make_shard(store, lone)
-    services.index.write.add_manifest(manifest)
+    services.index.write.add_manifests([manifest])
     add_job_event(store, job.id, "cancelled")
     attempt = {"task_id": first.task_id, "job_id": job.id, "stage": Stage.SYNTHESIZE, "number": 1, "kind": "Error"}
     failed = AttemptRecord(**attempt, reason="broke", worker="w", ended=timestamp(), last=False)

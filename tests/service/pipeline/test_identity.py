@@ -11,7 +11,7 @@ from graspd.service.index.index import Index
 from graspd.service.model.errors import BusyError
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.controller import Controller
-from graspd.service.pipeline.identity import check_queue, identify, service_ids
+from graspd.service.pipeline.identity import check_service, identify, service_ids
 from graspd.service.queue.rq_queue import RqQueue
 from graspd.service.settings import Settings
 from graspd.service.store.store import Store, open_store
@@ -52,10 +52,10 @@ def test_a_second_service_on_a_redis_is_refused(first: Services, tmp_path: Path)
 
 def test_a_worker_of_another_store_is_refused(first: Services, tmp_path: Path) -> None:
     second = service(tmp_path / "second")
-    assert not check_queue(second.store, second.queue)
-    assert check_queue(first.store, first.queue)
+    assert not check_service(second.store, second.queue.service())
+    assert check_service(first.store, first.queue.service())
     with pytest.raises(BusyError, match="Redis belongs to another"):
-        check_queue(second.store, first.queue)
+        check_service(second.store, first.queue.service())
 
 
 def test_processes_that_begin_a_service_at_once_agree(tmp_path: Path) -> None:

@@ -49,7 +49,7 @@ def a_round(services: Services, stop: Slept | None = None) -> None:
     scan = IntegrityScan(services, stop, clock=stop.clock)
     for _ in FOLDERS:
         scan.advance()
-    scan.end()
+    scan.turn.end()
     assert services.index.notes.scan_note().ended
 
 

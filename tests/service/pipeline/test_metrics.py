@@ -19,8 +19,8 @@ from graspd.service.model.messages import TaskMessage
 from graspd.service.model.series import SERIES, parse_field
 from graspd.service.model.states import Priority, Stage, State
 from graspd.service.pipeline.backends import Services
+from graspd.service.pipeline.indexer import MOST_KINDS, OTHER_KIND, Tally
 from graspd.service.pipeline.job_actions import submit
-from graspd.service.pipeline.metrics import MOST_KINDS, OTHER_KIND, Tally
 from graspd.service.queue.rq_queue import WORKERS, RqQueue, worker_key
 from tests.conftest import REPOSITORY
 from tests.fakes import beat_of, make_shard, message_for, request
@@ -76,7 +76,7 @@ def test_damage_of_the_store_is_told(services: Services) -> None:
 def test_unfinished_jobs_and_the_latest_yield_are_told(services: Services) -> None:
     submit(services, request(grasps=32))
     manifest = make_shard(services.store, message_for())
-    services.index.write.add_manifest(manifest)
+    services.index.write.add_manifests([manifest])
     found = overview.read_index(services.index.database)
     assert found.jobs[State.QUEUED] == 1
     assert 0 <= found.oldest_s[State.QUEUED] < 60

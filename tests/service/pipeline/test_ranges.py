@@ -54,7 +54,7 @@ def measured(services: Services, seconds: float) -> None:
     made = fake_stages()[Stage.SYNTHESIZE](message, TaskContext(services.store))
     manifest, data = shard_of(message, made, device="cpu", seconds=seconds, worker="w")
     publish_shard(services.store, manifest, data)
-    services.index.write.add_manifest(manifest)
+    services.index.write.add_manifests([manifest])
 
 
 def span(services: Services, grasps: int, priority: Priority = Priority.BULK, **changes: object) -> int:

@@ -11,7 +11,7 @@ from graspd.service.model.domain import JobRequest
 from graspd.service.model.planning import needed_schema
 from graspd.service.model.states import Priority, Stage
 from graspd.service.model.workers import FIRST_SCHEMA, Requirements, WorkerBeat, own_ability
-from graspd.service.pipeline.routes import Route, Routes
+from graspd.service.pipeline.job_actions import Route, Routes
 from graspd.service.queue import entries
 from graspd.service.queue.lists import known_lists, queue_name, queue_names
 from graspd.service.queue.rq_queue import RqQueue

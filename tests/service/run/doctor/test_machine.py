@@ -99,7 +99,7 @@ def test_findings_come_in_order_and_one_that_hangs_is_bad() -> None:
 
     def hang() -> Finding:
         hold.wait(30)
-        return good("hangs", "late")
+        return good("late")
 
     def break_off() -> Finding:
         raise ZeroDivisionError("by nothing")
@@ -111,7 +111,7 @@ def test_findings_come_in_order_and_one_that_hangs_is_bad() -> None:
         Check("hangs", hang, limit_s=0.05, mend_hang="restart it"),
         Check("breaks", break_off),
         Check("away", away),
-        Check("good", lambda: good("good", "fine")),
+        Check("good", lambda: good("fine")),
     ]
     try:
         found = list(run_checks(checks))
@@ -154,7 +154,7 @@ def test_a_wrong_secret_is_bad_and_the_mend_names_the_variables(
 
 
 def test_a_store_in_memory_is_gone_with_its_process() -> None:
-    assert check_store("store", open_store("memory://")).condition is Condition.WARNING
+    assert check_store(open_store("memory://")).condition is Condition.WARNING
 
 
 class Overwriting(Store):
@@ -184,6 +184,6 @@ class Keeping(Store):
     ("kind", "word"), [(Overwriting, "overwritten"), (Deaf, "not in the list"), (Keeping, "still there")]
 )
 def test_a_store_that_breaks_a_promise_is_bad(kind: type[Store], word: str) -> None:
-    found = check_store("store", kind(MemoryStore(), "fake://"))
+    found = check_store(kind(MemoryStore(), "fake://"))
     assert not found.ok
     assert word in found.message
