@@ -61,11 +61,7 @@ class Database:
     """An engine, with reads and writes as context managers."""
 
     def __init__(self, url: str | URL, *, anew: bool = False) -> None:
-        """Connect, and make the tables of an empty database.
-
-        Args:
-            url: an SQLAlchemy URL.
-            anew: replace the tables of another revision; the caller adds the rows.
+        """Connect, and make the tables of an empty database; `anew` replaces those of another revision.
 
         Raises:
             InputError: the URL names no known database.
@@ -180,6 +176,13 @@ class Database:
         if self._file is not None:
             with mapped(), self._file.opening():
                 self._file.set_aside(self._identity)
+
+
+class IndexPart:
+    """Reads or writes of one subject."""
+
+    def __init__(self, database: Database) -> None:
+        self.database = database
 
 
 def chunks(ids: Sequence[T], size: int = 1000) -> Iterable[Sequence[T]]:

@@ -9,7 +9,7 @@ from typing import Any, Final
 from sqlalchemy import Connection, delete, func, select
 
 from graspd.service.index.bulk import upsert
-from graspd.service.index.database import Database
+from graspd.service.index.database import IndexPart
 from graspd.service.index.tables import damage, notes
 from graspd.service.model.clock import timestamp
 
@@ -31,7 +31,6 @@ class IndexCompleteness:
     left_out: int = 0
     """Damaged records of the store that are not in the index."""
     names: tuple[str, ...] = ()
-    """The first of their names."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +42,6 @@ class StoreMark:
     before: str = ""
     """Previous mark of the store during an update; otherwise the same."""
     changes: int = 0
-    """Number of changes at that time."""
 
 
 @dataclass(frozen=True)
@@ -54,15 +52,10 @@ class ScanNote:
     ended: str = ""
     """End of the round; empty while it runs."""
     folder: int = 0
-    """Position in the list of folders."""
     after: str = ""
-    """Last scanned key of that folder."""
 
 
-@dataclass(frozen=True)
-class Notes:
-    database: Database
-
+class Notes(IndexPart):
     def completeness(self) -> IndexCompleteness | None:
         """Return the completeness, None while a new index may lack records of the store."""
         value = self._get(_REBUILT)
@@ -145,11 +138,8 @@ class Damage:
     found: str = ""
 
 
-@dataclass(frozen=True)
-class KnownDamage:
+class KnownDamage(IndexPart):
     """Objects of the store that were found damaged or missing, and not fixed since."""
-
-    database: Database
 
     def known(self, *, limit: int = 100) -> tuple[int, list[Damage]]:
         """Return the number of damaged objects that are not fixed, and the first of them."""

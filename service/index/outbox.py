@@ -10,7 +10,7 @@ from typing import Any, Final
 from sqlalchemy import Connection, delete, func, select, update
 
 from graspd.service.index.bulk import upsert
-from graspd.service.index.database import Database
+from graspd.service.index.database import IndexPart
 from graspd.service.index.project_scope import seen
 from graspd.service.index.tables import datasets, deliveries, ends, webhooks
 from graspd.service.index.views import DeliveryView, EndView, WebhookView
@@ -47,10 +47,7 @@ def last_end(connection: Connection) -> int:
     return int(connection.scalar(select(func.max(ends.c.seq))) or 0)
 
 
-@dataclass(frozen=True)
-class Outbox:
-    database: Database
-
+class Outbox(IndexPart):
     def ends(self, since: int, *, limit: int, scope: ProjectScope = EVERYTHING) -> list[EndView]:
         query = select(ends).where(ends.c.seq > since, *seen(scope, ends)).order_by(ends.c.seq).limit(limit)
         return [EndView(**row) for row in self.database.rows(query)]

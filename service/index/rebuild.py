@@ -55,10 +55,8 @@ Progress = Callable[[str, int], object]
 def rebuild(index: Index, store: Store, *, progress: Progress = lambda what, number: None) -> dict[str, int]:
     """Replace all rows by those derived from the store. The old rows stay until all new ones exist.
 
-    A damaged record is omitted and named in the log and in `index.notes.completeness()`; the others are read.
-
-    Returns:
-        number of jobs, attempts, shards, assets, datasets, snapshots and object sets read, and of omitted records.
+    A damaged record is omitted and named in the log and in `index.notes.completeness()`. Return the number of records
+    read of each kind, and of omitted ones.
     """
     with index.database.writing() as connection:
         connection.execution_options(**{QUIET: True})

@@ -131,11 +131,9 @@ class IndexCondition:
     """State that the database reports."""
 
     kind: str
-    """sqlite or postgresql, with its version."""
     revision: str
     """Revision of its tables; "" if it has none yet."""
     newest: str
-    """Revision of this graspd."""
     connections: tuple[int, int] = (0, 0)
     """Used and allowed connections; zeros if unknown."""
     may_write: bool = True

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
 from typing import Final
 
 from sqlalchemy import Connection, case, delete, func, select, tuple_
 
 from graspd.service.index.bulk import upsert
-from graspd.service.index.database import Database, chunks
+from graspd.service.index.database import IndexPart, chunks
 from graspd.service.index.project_scope import seen, seen_shards
 from graspd.service.index.tables import grasps, tagged, tags
 from graspd.service.index.views import TagView
@@ -21,10 +20,7 @@ from graspd.service.model.records import Grasp, Tag
 _AT_ONCE: Final = 400
 
 
-@dataclass(frozen=True)
-class Tags:
-    database: Database
-
+class Tags(IndexPart):
     def all(self, *, scope: ProjectScope = EVERYTHING) -> list[TagView]:
         """Return tags by name, with the number of existing grasps of each."""
         there = (grasps.c.shard_id == tagged.c.shard_id) & (grasps.c.row == tagged.c.row)
@@ -33,11 +29,7 @@ class Tags:
         return [TagView(**row) for row in self.database.rows(query.order_by(tags.c.name, tags.c.project))]
 
     def named(self, name: str, *, scope: ProjectScope = EVERYTHING) -> str:
-        """Return the id of a tag by name or id; of equal names the scope's own project's.
-
-        Raises:
-            NotFoundError: no such tag is in scope.
-        """
+        """Return the id of a tag by name or id, of equal names the own project's; NotFoundError if none is in scope."""
         own_first = case((tags.c.id == name, 0), (tags.c.project == scope.project, 1), else_=2)
         query = select(tags.c.id).where((tags.c.name == name) | (tags.c.id == name), *seen(scope, tags))
         found = self.database.value(query.order_by(own_first, tags.c.project).limit(1))

@@ -77,7 +77,6 @@ class Controller:
         self._routes = Routes()
         self._seen: dict[str, tuple[float, WorkerBeat]] = {}
         self._held: set[str] = set()
-        """Reasons why tasks were held back when the queue was last filled."""
         self._has_news = False
         """Whether events arrived since the queue was filled."""
         self._made = False
@@ -151,9 +150,7 @@ class Controller:
     def round(self, *, wait_s: float = 0.0) -> None:
         """Index new events, then check queue, leases and workers.
 
-        Raises:
-            UnavailableError: a backend is unavailable; the round can be run again.
-            BusyError: another service has taken over the store.
+        UnavailableError: a backend is unavailable; run it again. BusyError: another service has taken over the store.
         """
         self._identify()
         self._see_to_the_index()

@@ -45,9 +45,7 @@ def delete_asset(
 ) -> None:
     """Delete a hand, object or network; `scope` restricts what an error message names.
 
-    Raises:
-        NotFoundError: no asset has that name or digest.
-        ConflictError: it comes with graspd, or a job, a dataset or a set of objects needs it.
+    ConflictError: it comes with graspd, or a job, a dataset or a set of objects needs it.
     """
     asset = services.index.assets.get(kind, name)
     if asset.builtin:
@@ -65,9 +63,7 @@ def delete_asset(
 def delete_job(services: Services, job_id: str, *, owner: str = "") -> None:
     """Delete a job; its shards follow after a grace time unless another job needs them.
 
-    Raises:
-        NotFoundError: the job does not exist.
-        ConflictError: it is unfinished, or a dataset contains it.
+    ConflictError: it is unfinished, or a dataset contains it.
     """
     job = services.index.jobs.get(job_id)
     try:
@@ -87,9 +83,7 @@ def delete_job(services: Services, job_id: str, *, owner: str = "") -> None:
 def delete_dataset(services: Services, name: str, *, owner: str = "", with_snapshots: bool = False) -> None:
     """Delete a dataset; jobs that were planned for it alone follow.
 
-    Raises:
-        NotFoundError: the dataset does not exist.
-        ConflictError: it is unfinished, or it has snapshots and `with_snapshots` is False.
+    ConflictError: it is unfinished, or it has snapshots and `with_snapshots` is False.
     """
     dataset = services.index.datasets.get(name)
     if not dataset.state.is_final:
@@ -135,13 +129,8 @@ def restore(
 ) -> Deletion:
     """Restore what a user deleted, by name or id, unchanged; a dataset with its deleted jobs.
 
-    Args:
-        permit: called with the deletion; raises if it may not be restored.
-        among: whether a deletion is in scope.
-
-    Raises:
-        NotFoundError: nothing of that name was deleted within the grace time.
-        ConflictError: the name is in use again, or a dependency is deleted too.
+    `permit` raises if a deletion may not be restored; `among` tells whether it is in scope. NotFoundError: nothing of
+    that name was deleted within the grace time. ConflictError: the name is in use again, or a dependency is deleted.
     """
     known = [one for one in deletions(services.store, what) if name in (one.id, one.name) and among(one)]
     if not known:

@@ -72,8 +72,7 @@ class Resolver:
     def choose(self, request: JobRequest) -> tuple[JobRequest, Choice | None]:
         """Return the request with `auto` replaced by a fidelity, and the reason; None without `auto`.
 
-        Raises:
-            InputError: no chart exists for its scene, or no fidelity meets the target.
+        InputError: no chart exists for its scene, or no fidelity meets the target.
         """
         if request.fidelity != AUTO:
             return request, None
@@ -111,11 +110,7 @@ def _no_chart(request: JobRequest) -> str:
 
 
 def parse_target(text: str, *, in_scene: bool = False) -> tuple[str, float]:
-    """Parse `gsr>=0.6` into metric and bound; in a scene `lift>=0.9`.
-
-    Raises:
-        InputError: another form, an accuracy that such charts lack, or a bound that would ask for a worse grasp.
-    """
+    """Parse `gsr>=0.6` into metric and bound; in a scene `lift>=0.9`. InputError for what no chart can promise."""
     known, examples = IN_SCENES if in_scene else FREE, _EXAMPLES[in_scene]
     found = _TARGET.fullmatch(text)
     if found is None:
@@ -130,13 +125,10 @@ def parse_target(text: str, *, in_scene: bool = False) -> tuple[str, float]:
 
 
 def cheapest(chart: Row, target: str, *, method: str, hand: str, object_: str) -> ChosenFidelity:
-    """Return the fidelity of a method with most valid grasps per second among those that meet a target.
+    """Return the fidelity of a method with most valid grasps per second among those that meet a target; or InputError.
 
     Runs of the same hand and object count; else runs of the hand; else all. In a chart of scenes only grasps planned
     for them count, by lifted grasps per second.
-
-    Raises:
-        InputError: no such target, no run of the method, or no fidelity that meets the target.
     """
     in_scene = "scene" in chart
     metric, bound = parse_target(target, in_scene=in_scene)

@@ -84,12 +84,7 @@ def is_public(address: Address) -> bool:
 
 
 def reachable(host: str, port: int, allowed: Networks) -> list[str]:
-    """Return the addresses of a host if all of them may be reached: public ones, or in the networks `allowed`.
-
-    Raises:
-        RefusedAddress: one of them may not be reached.
-        OSError: it has no address.
-    """
+    """Return a host's addresses, all public or in the networks `allowed`; else raise RefusedAddress or OSError."""
     found = list(dict.fromkeys(str(info[4][0]) for info in _looked_up(host, port)))
     for one in found:
         address = ipaddress.ip_address(one.partition("%")[0])
@@ -150,11 +145,7 @@ def post(
 
 
 class _Connection(http.client.HTTPConnection):
-    """A connection to one of the checked addresses; the library would resolve the name again.
-
-    Args:
-        patience_s: time limit of all addresses together and the handshake [s].
-    """
+    """A connection to one of the checked addresses, within `patience_s`; the library would resolve the name again."""
 
     def __init__(self, scheme: str, host: str, port: int, addresses: Sequence[str], patience_s: float) -> None:
         super().__init__(host, port)

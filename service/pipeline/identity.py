@@ -47,7 +47,6 @@ class Identity:
     redis: str | None = None
     folder: str | None = None
     is_own_store: bool = False
-    """Whether the store lies in the data folder."""
 
     @property
     def is_same(self) -> bool:
@@ -81,7 +80,7 @@ def identify(
     take_over: bool = False,
     holds_redis: bool = False,
 ) -> str:
-    """Check that store, index and Redis belong to one service, and write its id where it is missing.
+    """Check that store, index and Redis belong to one service, and write its id where it is missing; return the id.
 
     Args:
         folder: data folder that also stores the id.
@@ -89,12 +88,8 @@ def identify(
         take_over: become the service of the store, whichever it was before.
         holds_redis: this process has the controller's lease, so Redis belongs to its service in any case.
 
-    Returns:
-        id of the service.
-
     Raises:
         BusyError: one of them belongs to another service.
-        StoreUnavailable, IndexUnavailable, QueueUnavailable: they are unavailable.
     """
     # Redis is read first and the store last, so that concurrent new processes see each other's writes.
     redis = services.queue.service() if ask_redis else None

@@ -48,8 +48,7 @@ class Indexer:
     def apply(self, events: Sequence[Event]) -> list[int]:
         """Update the index. To apply an event twice changes nothing.
 
-        Return positions of events that need the unavailable store; apply these later, or all if another backend is
-        unavailable (UnavailableError).
+        Return the positions of events that need the unavailable store; apply these again later.
         """
         started: dict[str, str] = {}
         finished: list[int] = []

@@ -91,12 +91,7 @@ class IntegrityScan:
             self.turn.end()
 
     def advance(self) -> bool:
-        """Read some more objects. Return whether more can be read now.
-
-        Raises:
-            Interrupted: it shall stop, or `store verify` reads now.
-            UnavailableError: a backend is unavailable; call again.
-        """
+        """Read some more objects; return whether more can be read now. Interrupted: `store verify` reads now."""
         self._look_again_in_time(None)
         note = self._services.index.notes.scan_note()
         if note.folder >= len(FOLDERS):

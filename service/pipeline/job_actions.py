@@ -44,11 +44,7 @@ _SUNK_M: Final = 1e-3
 
 
 def submit(services: Services, request: JobRequest, *, priority: Priority | None = None) -> tuple[JobView, bool]:
-    """Record a job and queue its first tasks; errors as in `prepare`. Equal requests give the same job.
-
-    Returns:
-        the job, and whether it is new. A failed or cancelled job is returned unchanged: see `retry`.
-    """
+    """Call `prepare`, then `enter`. Equal requests give the same job; for a failed or cancelled one see `retry`."""
     return enter(services, prepare(services, request, priority=priority))
 
 
@@ -63,11 +59,9 @@ def prepare(
     """Return the job of a request whose hand, object and network are in scope; a small job is interactive.
 
     Raises:
-        NotFoundError: unknown hand, object, neighbour or network.
-        InputError: one of them failed its check; the network is of another hand; no chart contains a
-            fidelity that meets the target; the object or a neighbour penetrates a support of its scene (SceneError).
-        ConflictError: the check of one of them is still running.
-        QueueUnavailable, StoreUnavailable, IndexUnavailable: a backend is unavailable.
+        NotFoundError, ConflictError: as in `usable`, also of neighbours and network.
+        InputError: one of them failed its check; the network is of another hand; no chart meets the target; the object
+            or a neighbour penetrates a support of its scene (SceneError).
     """
     hand = usable(services, AssetKind.HAND, request.hand, scope)
     obj = usable(services, AssetKind.OBJECT, request.object, scope)
@@ -93,16 +87,13 @@ def prepare(
 
 
 def enter(services: Services, record: JobRecord, *, keeps_assets: bool = False) -> tuple[JobView, bool]:
-    """Record a planned job and queue its first tasks. The controller enters the rest of large jobs.
+    """Record a planned job and queue its first tasks; return it, and whether it is new. The controller enters the rest.
 
     Args:
         keeps_assets: a dataset protects hand, object, neighbours and network from deletion meanwhile.
 
-    Returns:
-        the job, and whether it is new.
-
     Raises:
-        NotFoundError: the hand, the object, a neighbour or the network was deleted meanwhile.
+        NotFoundError: one of them was deleted meanwhile.
         ConflictError: the same job was deleted, and its objects are still being removed.
     """
     key = names.job_record(record.id)
@@ -125,11 +116,7 @@ def enter(services: Services, record: JobRecord, *, keeps_assets: bool = False) 
 def cancel(services: Services, job_id: str, *, cause: str = "") -> JobView:
     """Stop a job: waiting tasks never start, running ones stop at the next launch. Finished shards stay.
 
-    The causing event of a dataset, if any, is stored with the job's event.
-
-    Raises:
-        NotFoundError: unknown job.
-        ConflictError: the job is already finished.
+    The causing event of a dataset, if any, is stored with the job's event. ConflictError for a job that has ended.
     """
     _refuse_ended(services, job_id)
     with _changing(services, job_id) as add:
@@ -144,12 +131,7 @@ def cancel(services: Services, job_id: str, *, cause: str = "") -> JobView:
 
 
 def retry(services: Services, job_id: str, *, cause: str = "") -> JobView:
-    """Queue the failed and cancelled tasks of a job again, with fresh attempts; `cause` as in `cancel`.
-
-    Raises:
-        NotFoundError: unknown job.
-        ConflictError: the job neither failed nor was cancelled.
-    """
+    """Queue the failed and cancelled tasks of a job again, with fresh attempts; ConflictError without any."""
     _refuse_unfailed(services, job_id)
     with _changing(services, job_id) as add:
         _refuse_unfailed(services, job_id)
@@ -163,7 +145,6 @@ class Route:
     apart: bool = False
     """Whether it enters a list that only some workers of its stage read."""
     held: str = ""
-    """Why it is held back; "" if it is not."""
 
 
 class Routes:
@@ -190,10 +171,8 @@ class Routes:
 def queue_tasks(services: Services, ready: Sequence[ReadyTask], *, routes: Routes, again: bool = False) -> set[str]:
     """Queue tasks and mark them in the index; tasks that no worker can do wait, with a reason in the job.
 
-    The mark comes first: the controller queues marked tasks that are missing; unmarked ones might run twice.
-
-    Returns:
-        reasons why tasks are held back.
+    The mark comes first: the controller queues marked tasks that are missing; unmarked ones might run twice. Return the
+    reasons why tasks are held back.
     """
     to_queue: dict[tuple[Priority, bool], list[TaskMessage]] = defaultdict(list)
     held: dict[str, list[str]] = defaultdict(list)
@@ -274,12 +253,9 @@ def _present_origin() -> Origin | None:
 
 
 def check_scene(options: JobOptions, obj: AssetView, beside: Sequence[AssetView] = ()) -> None:
-    """Refuse an object whose centre of mass lies in a support: its hull then penetrates the support.
+    """Raise SceneError for an object whose centre of mass lies in a support: its hull then penetrates the support.
 
     Without a measured centre, and for checks that need meshes, the first task reports the error.
-
-    Raises:
-        SceneError: the target or a neighbour penetrates a support.
     """
     place = options.place
     _check_pose(obj, "target", place.target, place.supports)

@@ -54,10 +54,9 @@ class Leadership:
 
     @contextmanager
     def held(self, stop: threading.Event) -> Iterator[threading.Event]:
-        """Hold the lease; yield an event that is set when another process leads or `stop` is set.
+        """Hold the lease, then release it; yield an event that is set when another process leads or `stop` is set.
 
-        The lease is lost only if Redis reports another holder: while Redis is unavailable, no process can take it. The
-        lease is released at the end.
+        The lease is lost only if Redis reports another holder: while Redis is unavailable, no process can take it.
         """
         over, done = threading.Event(), threading.Event()
         thread = threading.Thread(target=self._renew, args=(stop, over, done), name="controller-lease", daemon=True)

@@ -24,12 +24,9 @@ _OF_ASSET: Final = re.compile(r"assets/(hand|object|network)/([0-9a-f]{32})/(.+)
 
 
 def repair(services: Services, found: Sequence[Damage]) -> tuple[list[Damage], list[Damage]]:
-    """Move damaged objects below `damaged/`, and queue what can be made again.
+    """Move damaged objects below `damaged/`, and queue what can be made again; return what was repaired, and the rest.
 
     A worker stores a repaired shard only if its checksum equals the manifest's.
-
-    Returns:
-        damage that was queued or moved, and damage that was left; `what` of the latter contains the reason.
     """
     harmed = {one.shard for one in found if one.shard}
     repaired, left = [], []

@@ -21,10 +21,7 @@ Options = TypeVar("Options", bound=JobOptions)
 def usable(services: Services, kind: AssetKind, name: str, scope: ProjectScope = EVERYTHING) -> AssetView:
     """Return a hand, object or network, by name or digest, that jobs may use.
 
-    Raises:
-        NotFoundError: none is in scope.
-        InputError: it failed its check.
-        ConflictError: its check is still running.
+    NotFoundError: none is in scope. InputError: it failed its check. ConflictError: its check is still running.
     """
     asset = services.index.assets.get(kind, name, scope=scope)
     if asset.verdict == "refuse":
@@ -45,10 +42,8 @@ def with_neighbours(
 ) -> tuple[Options, Sequence[AssetView]]:
     """Return options with the present digests of the neighbours' names, and these neighbours.
 
-    A digest in the request itself, for example one copied from a job, stays.
-
-    Raises:
-        as in `usable`; InputError if a name and a digest belong to two objects.
+    A digest in the request itself, for example one copied from a job, stays. Errors as in `usable`; InputError if a
+    name and a digest belong to two objects.
     """
     beside = [usable(services, AssetKind.OBJECT, one.digest or one.object, scope) for one in options.beside]
     found = []
@@ -64,11 +59,7 @@ def with_network(
 ) -> Options:
     """Return options with the digest of their network; unchanged if their method uses none.
 
-    Args:
-        hands: hands of the wanted grasps.
-
-    Raises:
-        as in `usable`; InputError if it proposes grasps of another hand.
+    Errors as in `usable`; InputError if it proposes grasps of another hand.
     """
     if not options.network:
         return options

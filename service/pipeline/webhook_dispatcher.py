@@ -35,11 +35,7 @@ Post = Callable[..., Response]
 
 
 class WebhookDispatcher:
-    """Runs beside the rounds of the controller, so that a silent address delays nothing else.
-
-    Args:
-        send: sends a body to an address; as `http_client.post`.
-    """
+    """Runs beside the rounds of the controller, so that a silent address delays nothing else."""
 
     def __init__(self, services: Services, stop: threading.Event, *, send: Post = post) -> None:
         self._services = services

@@ -77,7 +77,6 @@ class RqQueue:
         self._unread = "0"
         """Position up to which an earlier controller's pending events were read; ">": all of them."""
         self._leases: dict[str, Any] = {}
-        """Leadership locks of the candidates on this connection."""
 
     def ping(self) -> float:
         """Return the round-trip time [s]."""
@@ -91,9 +90,8 @@ class RqQueue:
     ) -> int:
         """Append tasks to a priority; return how many. One (id and attempt) that waits or runs is not queued twice.
 
-        Args:
-            again: the caller found these tasks missing in the queue; remaining data of them is replaced.
-            apart: only some workers of the stage can do them; the tasks go to separate lists.
+        `again` replaces remaining data of tasks that the caller found missing. `apart` appends them to separate lists,
+        because only some workers of the stage can do them.
         """
         stale = [cancel_key(message.task_id) for message in messages]
         if again:
@@ -171,10 +169,7 @@ class RqQueue:
         ]
 
     def holder(self, lease: Lease) -> tuple[str, Message | None]:
-        """Return worker and message of a lease; None for data that Redis has lost.
-
-        Call it for lost leases only: reading all leases remains one round trip.
-        """
+        """Return worker and message of a lost lease, one round trip each; None for data that Redis has lost."""
         with _mapped(), self.connection.pipeline(transaction=False) as pipe:
             pipe.hmget(job_key(entries.text(lease.key[1].partition(b":")[0])), "worker_name", "data")
             (found,) = pipe.execute(raise_on_error=False)  # the name may have a value of another type

@@ -94,7 +94,6 @@ class ListenAddress:
 
     file: Path
     host: str
-    """Host name or address for the other machines."""
     address: str
     """Address of this machine to which the name resolves: Redis listens only there."""
     port: int
@@ -126,13 +125,9 @@ class ListenAddress:
 
 
 def joining(settings: Settings, file: Path, *, host: str | None = None, port: int = 0) -> ListenAddress:
-    """Return an address, a free port (or `port`) and a new password.
+    """Return an address of this machine, a free port (or `port`) and a new password.
 
-    Args:
-        host: host name for other machines; by default this machine's name.
-
-    Raises:
-        InputError: other machines cannot share the configured Redis or store through this file.
+    InputError: other machines cannot share the configured Redis or store through this file.
     """
     if settings.redis_url is not None:
         raise InputError("GRASPD_REDIS_URL names a Redis already: give that to the workers, and leave --share away")

@@ -127,11 +127,7 @@ def _run_controller(settings: Settings, stop: threading.Event) -> None:
 
 
 def _identify(settings: Settings, stop: threading.Event, alive: HeartbeatFile) -> None:
-    """Check that store, index and Redis belong to one service, once Redis answers.
-
-    Raises:
-        BusyError: one of them belongs to another service.
-    """
+    """Check that store, index and Redis belong to one service (else BusyError), once Redis answers."""
     from graspd.service.pipeline.backends import Services
     from graspd.service.pipeline.identity import identify
 

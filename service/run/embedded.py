@@ -30,11 +30,7 @@ _OF_DISK: Final = re.compile(r"No space left|Permission denied|Read-only file sy
 
 
 def find_server() -> tuple[Path, str]:
-    """Find a Redis server program; return it with the step of the search that found it.
-
-    Raises:
-        QueueUnavailable: none found; the message lists three solutions.
-    """
+    """Find a Redis server program, and the step of the search; QueueUnavailable lists three solutions."""
     for rung, find in _LADDER:
         path = find()
         if path is not None and os.access(path, os.X_OK):
@@ -46,11 +42,7 @@ def find_server() -> tuple[Path, str]:
 
 
 def server_command(settings: Settings, joining: ListenAddress | None = None) -> list[str]:
-    """Return the foreground command of the embedded Redis; create its folders. Call `own_redis` first.
-
-    Args:
-        joining: address for other machines; None: private socket only.
-    """
+    """Return the foreground command of the embedded Redis; create its folders. Call `own_redis` first."""
     server, _ = find_server()
     folder = settings.data_dir.resolve() / "redis"
     socket = socket_path(settings.data_dir)
@@ -88,11 +80,7 @@ def _write_private(file: Path, text: str) -> None:
 
 
 def own_redis(settings: Settings) -> IO[str]:
-    """Lock a data folder's Redis folder for this process, until the returned file is closed.
-
-    Raises:
-        BusyError: another process runs it.
-    """
+    """Lock a data folder's Redis folder, until the returned file is closed; BusyError if another process runs it."""
     folder = settings.data_dir.resolve() / "redis"
     _private_folder(folder)
     return lock_file(folder / "lock", f"the Redis of {settings.data_dir}")

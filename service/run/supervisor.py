@@ -90,9 +90,7 @@ class Supervisor:
     def start(self) -> None:
         """Lock the data folder and start the children without waiting for them.
 
-        Raises:
-            BusyError: another graspd owns the data folder (the message has its pid), or the port is taken.
-            StoreUnavailable, QueueUnavailable: the folders are not writable; there is no Redis server.
+        BusyError: another graspd owns the data folder (the message has its pid), or the port is taken.
         """
         self._stopping.clear()
         folder = self._wanted.data_dir.resolve()
@@ -124,15 +122,8 @@ class Supervisor:
     ) -> bool:
         """Wait until Redis, controller, a worker and the API answer; False: `stop` was set before.
 
-        Two things end the wait early: a process that ends repeatedly, or an external Redis that is silent.
-
-        Args:
-            timeout: longest wait otherwise [s].
-            say: called every 15 s with the missing parts.
-            stop: ends the wait.
-
-        Raises:
-            UnavailableError: the message lists the parts that do not answer, and the logs.
+        A process that ends repeatedly, or an external Redis that is silent, ends the wait before the `timeout` [s]: the
+        UnavailableError lists the absent parts and the logs. `say` is called every 15 s with the missing parts.
         """
         began = told = time.monotonic()
         starts, logs = self._starts(), self.settings.data_dir / "logs"

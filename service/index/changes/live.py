@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 from sqlalchemy import Connection, delete, select, update
 
 from graspd.service.index.bulk import update_rows, upsert
 from graspd.service.index.changes.rows import NO_PROGRESS, clean, settle
-from graspd.service.index.database import Database, chunks, rows_among
+from graspd.service.index.database import IndexPart, chunks, rows_among
 from graspd.service.index.tables import assets, jobs, tasks, workers
 from graspd.service.model.states import State
 from graspd.service.model.workers import WorkerBeat
@@ -18,11 +17,8 @@ from graspd.service.model.workers import WorkerBeat
 _UNFINISHED = tasks.c.state.in_((State.QUEUED.value, State.RUNNING.value))
 
 
-@dataclass(frozen=True)
-class Live:
+class Live(IndexPart):
     """Writes of data that the store does not contain."""
-
-    database: Database
 
     def set_running(self, workers: Mapping[str, str]) -> dict[str, State]:
         """Mark tasks as taken; `workers` maps tasks to workers. Return the changed states of jobs."""
@@ -57,11 +53,7 @@ class Live:
     def set_waiting(
         self, task_ids: Sequence[str], *, not_before: float = 0.0, message: str | None = None
     ) -> dict[str, State]:
-        """Mark tasks as neither queued nor with a worker, to be queued again after `not_before`.
-
-        Returns:
-            the states of the jobs concerned.
-        """
+        """Mark tasks as neither queued nor with a worker, not due before `not_before`; return their jobs' states."""
         values = {"queued": False, "not_before": not_before, "state": State.QUEUED.value, "worker": None}
         values |= {**NO_PROGRESS, "progress_message": message and clean(message)}
         touched: set[str] = set()

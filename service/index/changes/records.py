@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, Final
 
 from sqlalchemy import Connection, delete, select, update
@@ -25,7 +24,7 @@ from graspd.service.index.changes.rows import (
     shard_row,
     task_rows,
 )
-from graspd.service.index.database import Database, chunks, rows_among
+from graspd.service.index.database import IndexPart, chunks, rows_among
 from graspd.service.index.tables import (
     assets,
     attempts,
@@ -57,11 +56,8 @@ from graspd.service.store.manifests import ShardManifest
 RANGES_AT_ONCE: Final = 500
 
 
-@dataclass(frozen=True)
-class Changes:
+class Changes(IndexPart):
     """Records of the store. `within` makes a write part of a larger transaction."""
-
-    database: Database
 
     def add_job(self, record: JobRecord, *, within: Connection | None = None) -> State:
         """Add a job with all its tasks; tasks whose shard exists have succeeded."""
@@ -94,11 +90,7 @@ class Changes:
     def add_manifests(
         self, manifests: Iterable[ShardManifest], *, within: Connection | None = None
     ) -> dict[str, State]:
-        """Add shards and their grasps, and mark all tasks of any job that make them as succeeded.
-
-        Returns:
-            the states of the jobs concerned.
-        """
+        """Add shards and their grasps; the tasks of any job that make them have succeeded. Return the jobs' states."""
         new = {manifest.shard_id: manifest for manifest in manifests}
         touched: defaultdict[str, set[int]] = defaultdict(set)
         with self.database.writing(within) as connection:
@@ -199,11 +191,8 @@ def _outcome(worker: Any, device: Any, seconds: Any, created: Any) -> dict[str, 
     return {**made, "reason": None, "queued": False, "not_before": 0.0, **NO_PROGRESS}
 
 
-@dataclass(frozen=True)
-class DatasetChanges:
+class DatasetChanges(IndexPart):
     """Writes of datasets. `within` makes a write part of a larger transaction."""
-
-    database: Database
 
     def add(self, record: DatasetRecord, *, within: Connection | None = None) -> None:
         row = {

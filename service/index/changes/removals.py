@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 from sqlalchemy import Connection, delete, exists, func, insert, or_, select, update
 
-from graspd.service.index.database import Database
+from graspd.service.index.database import IndexPart
 from graspd.service.index.tables import (
     assets,
     attempts,
@@ -26,11 +25,8 @@ from graspd.service.model.errors import NotFoundError
 from graspd.service.model.states import AssetKind, Priority, State
 
 
-@dataclass(frozen=True)
-class Removals:
+class Removals(IndexPart):
     """`within` makes a read or write part of a larger transaction, so that checks still hold at the write."""
-
-    database: Database
 
     def user_of_asset(self, asset: AssetView, *, within: Connection) -> str:
         """Return what needs a hand, object or network, in a few words; empty if nothing does."""

@@ -162,12 +162,9 @@ def settle(connection: Connection, job_id: str, batches: Collection[int] | None 
 
 
 def settle_batches(connection: Connection, touched: Mapping[str, Collection[int] | None]) -> dict[str, State]:
-    """Derive the states for some batches, or all (None), of many jobs at once.
+    """Derive the states for some batches, or all (None), of many jobs at once; return the states of these jobs.
 
     If the first batch finds no grasp in its scenes, the job's other batches are skipped: they end as if cancelled.
-
-    Returns:
-        the states of these jobs.
     """
     states: dict[str, State] = {}
     for some in chunks(list(touched), _JOBS_AT_ONCE):

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass
 
 from sqlalchemy import ColumnElement, Connection, and_, case, or_, select
 
-from graspd.service.index.database import Database, rows_among
+from graspd.service.index.database import IndexPart, rows_among
 from graspd.service.index.project_scope import nearest_asset, page_rows, seen, seen_assets
 from graspd.service.index.tables import assets, object_sets
 from graspd.service.index.views import AssetView, ObjectSetView, Page
@@ -16,10 +15,7 @@ from graspd.service.model.projects import EVERYTHING, ProjectScope
 from graspd.service.model.states import AssetKind
 
 
-@dataclass(frozen=True)
-class Assets:
-    database: Database
-
+class Assets(IndexPart):
     def page(
         self,
         kind: AssetKind,
@@ -41,8 +37,7 @@ class Assets:
     def get(self, kind: AssetKind, name_or_digest: str, *, scope: ProjectScope = EVERYTHING) -> AssetView:
         """Return a hand or object by digest, or the newest usable one of a name, the project's own first.
 
-        Raises:
-            NotFoundError: it does not exist; the message lists the existing names.
+        NotFoundError: it does not exist; the message lists the existing names.
         """
         named = and_(assets.c.kind == kind.value, assets.c.name == name_or_digest)
         by_digest = and_(assets.c.kind == kind.value, assets.c.digest == name_or_digest)
@@ -74,10 +69,7 @@ def _not_refused() -> ColumnElement[bool]:
     return or_(assets.c.verdict.is_(None), assets.c.verdict != "refuse")
 
 
-@dataclass(frozen=True)
-class ObjectSets:
-    database: Database
-
+class ObjectSets(IndexPart):
     def newest(self, *, scope: ProjectScope = EVERYTHING) -> list[ObjectSetView]:
         """Return the newest version of each set of objects, by name."""
         query = select(object_sets).where(*seen(scope, object_sets))

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
 from typing import Any, Final
 
 from sqlalchemy import ColumnElement, Connection, Float, case, cast, func, literal, select
 
-from graspd.service.index.database import Database
+from graspd.service.index.database import IndexPart
 from graspd.service.index.project_scope import page_rows, seen
 from graspd.service.index.queries.jobs import SHARE_DONE, outcomes_of
 from graspd.service.index.tables import attempts, dataset_cells, dataset_snapshots, datasets, jobs, shards, tasks
@@ -24,10 +23,7 @@ from graspd.service.model.states import Stage, State
 _IS_BASE: Final = shards.c.stage == Stage.SYNTHESIZE.value
 
 
-@dataclass(frozen=True)
-class Datasets:
-    database: Database
-
+class Datasets(IndexPart):
     def page(
         self, *, limit: int = 50, cursor: str | None = None, scope: ProjectScope = EVERYTHING
     ) -> Page[DatasetView]:

@@ -9,7 +9,7 @@ from typing import Any
 
 from sqlalchemy import Column, ColumnElement, exists, or_, select
 
-from graspd.service.index.database import Database, rows_among
+from graspd.service.index.database import IndexPart, rows_among
 from graspd.service.index.tables import assets, dataset_cells, datasets, jobs, tasks
 from graspd.service.model.domain import JobOptions
 from graspd.service.model.planning import MAX_BACKOFF_S, PlannedTask, RoundRobin, WaitingJob, interleave, share_of
@@ -38,10 +38,7 @@ class ReadyCheck:
     last_attempt: int
 
 
-@dataclass(frozen=True)
-class Feed:
-    database: Database
-
+class Feed(IndexPart):
     def waiting_jobs(self, priority: Priority, *, now: float) -> list[WaitingJob]:
         """Return jobs with tasks that may be queued, oldest first."""
         due = _due(tasks.c.not_before, now)
@@ -154,10 +151,7 @@ class DatasetWork:
     project: str
 
 
-@dataclass(frozen=True)
-class DatasetFeed:
-    database: Database
-
+class DatasetFeed(IndexPart):
     def in_work(self) -> list[DatasetWork]:
         """Return datasets with cells to plan or with events for their jobs, the oldest first."""
         query = (

@@ -35,7 +35,7 @@ from sqlalchemy import (
 )
 from sqlalchemy.sql.operators import in_op, is_
 
-from graspd.service.index.database import Database, chunks
+from graspd.service.index.database import IndexPart, chunks
 from graspd.service.index.project_scope import decode, encode, page_size, seen_shards
 from graspd.service.index.tables import dataset_cells, grasps, jobs, shards, tagged, tasks
 from graspd.service.index.views import GraspView, Page
@@ -63,10 +63,7 @@ _BEST_FIRST = GraspSort()
 _AT_ONCE: Final = 400
 
 
-@dataclass(frozen=True)
-class Grasps:
-    database: Database
-
+class Grasps(IndexPart):
     def page(
         self,
         where: GraspFilter | None = None,
@@ -185,11 +182,7 @@ Test = Condition | Tagged | ExpressionCondition
 
 
 def conditions(where: GraspFilter | None) -> list[Test]:
-    """Return a filter as a conjunction of conditions.
-
-    Raises:
-        InputError: its expression is invalid, or uses values that the index lacks.
-    """
+    """Return a filter as a conjunction; InputError for an invalid expression, or values that the index lacks."""
     where = where or GraspFilter()
     found: list[Test] = []
     if where.shard is not None:
@@ -364,8 +357,7 @@ def _plain(column: ColumnElement[Any]) -> ColumnElement[Any]:
 def truth(node: Node, grasps: Columns) -> ColumnElement[bool]:
     """Return an expression in SQL: true or false for each row, never unknown, so `not` is a complement.
 
-    Raises:
-        InputError: it uses values that the index lacks.
+    InputError: it uses values that the index lacks.
     """
     if isinstance(node, Connective):
         return (or_ if node.word == "or" else and_)(*(truth(part, grasps) for part in node.parts))
@@ -401,22 +393,18 @@ class GraspFilter(Model):
     job: str | None = None
     shard: str | None = None
     dataset: str | None = None
-    """Grasps of its cells."""
     tag: str | None = None
-    """Id of a tag of the grasps."""
     where: str | None = None
     """An expression of `service.model.where`."""
     project: str | None = None
     """Project of the jobs; None: all."""
     validated: bool | None = None
-    """Whether the validator gave a verdict."""
     valid: bool | None = None
     """False: validated, and not valid."""
     success: bool | None = None
     scene: str | None = None
     """Kind of the scene in which it was planned; any: all but free."""
     neighbours: bool | None = None
-    """Whether that scene contained neighbours."""
     lift_hard: bool | None = None
     robust_weakest: str | None = None
     """Axis of the first model in which the grasp fails."""

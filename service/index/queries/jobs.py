@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, Final, Literal
 
 from sqlalchemy import Column, ColumnElement, Connection, Float, and_, case, cast, func, select
 
-from graspd.service.index.database import Database, rows_among
+from graspd.service.index.database import IndexPart, rows_among
 from graspd.service.index.project_scope import page_rows, page_size, seen, seen_shards, seen_with_job
 from graspd.service.index.tables import attempts, jobs, shards, tasks
 from graspd.service.index.views import AttemptView, JobView, Page, ShardView, StageProgress, TaskView
@@ -26,10 +25,7 @@ SHARE_DONE: Final[ColumnElement[float]] = case(
 )
 
 
-@dataclass(frozen=True)
-class Jobs:
-    database: Database
-
+class Jobs(IndexPart):
     def page(
         self,
         *,
@@ -177,10 +173,7 @@ def outcomes_of(connection: Connection, of_jobs: ColumnElement[bool]) -> dict[st
     return totals(one for one in connection.scalars(query) if isinstance(one, dict))
 
 
-@dataclass(frozen=True)
-class Shards:
-    database: Database
-
+class Shards(IndexPart):
     def page(
         self,
         *,

@@ -10,7 +10,7 @@ from typing import Any, Final
 
 from sqlalchemy import ColumnElement, Connection, Select, Table, case, func, select
 
-from graspd.service.index.database import Database
+from graspd.service.index.database import Database, IndexPart
 from graspd.service.index.project_scope import page_size, seen, seen_shards, seen_with_job
 from graspd.service.index.tables import attempts, damage, jobs, shards, spent, tasks, workers
 from graspd.service.index.views import FailureGroup, MatrixCell, Stats, Throughput, UsageDay, WorkerView
@@ -21,10 +21,7 @@ from graspd.service.model.projects import EVERYTHING, ProjectScope
 from graspd.service.model.states import Stage, State
 
 
-@dataclass(frozen=True)
-class Overview:
-    database: Database
-
+class Overview(IndexPart):
     def workers(self) -> list[WorkerView]:
         query = select(workers).order_by(case((workers.c.state == "lost", 1), else_=0), workers.c.name)
         return [WorkerView(**row) for row in self.database.rows(query)]
@@ -192,10 +189,7 @@ def made_since(when: datetime) -> Select[Any]:
     return select(func.sum(shards.c.count), func.sum(shards.c.valid)).where(*base)
 
 
-@dataclass(frozen=True)
-class Usage:
-    database: Database
-
+class Usage(IndexPart):
     def days(self, since: str, until: str, *, scope: ProjectScope = EVERYTHING) -> list[UsageDay]:
         """Return the usage of each project by day (2026-11-22), without empty days, the newest first."""
         day = func.substr(shards.c.created, 1, 10).label("day")
@@ -261,10 +255,7 @@ class BatchCost:
         return self.valid if self.request.counted == "valid" else self.count
 
 
-@dataclass(frozen=True)
-class Costs:
-    database: Database
-
+class Costs(IndexPart):
     def of_batches(self, stage: Stage, *, limit: int = _NEWEST, scope: ProjectScope = EVERYTHING) -> list[BatchCost]:
         """Return the newest finished batches of a stage, from at most `limit` tasks."""
         columns = [shards.c[name] for name in BatchCost.__dataclass_fields__ if name != "request"]

@@ -27,7 +27,6 @@ class Rate:
 
     seconds_per_try: float
     valid_yield: float
-    """Valid grasps per candidate."""
     bytes_per_grasp: float
     origin: str
     batches: int
@@ -107,11 +106,7 @@ STORED_PICTURE: Final = StageRate(2.1, 1.34e6, ORIGIN, 0)
 
 class Rates:
     def __init__(self, batches: Iterable[BatchCost], options: JobOptions, devices: Collection[str]) -> None:
-        """Group the batches of `synthesize` that were made with these options.
-
-        Args:
-            devices: devices of the present workers; empty: all devices count.
-        """
+        """Group the batches of `synthesize` that were made with these options on these devices; empty: on all."""
         self._options = options
         self._groups: dict[Hashable, list[BatchCost]] = defaultdict(list)
         recipe = recipe_of(options)

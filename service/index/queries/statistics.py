@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy import ColumnElement, Connection, Integer, cast, func, select
 
-from graspd.service.index.database import Database
+from graspd.service.index.database import IndexPart
 from graspd.service.index.queries.grasps import GraspFilter, Metric, conditions, sql_conditions
 from graspd.service.index.tables import dataset_cells, grasps, shards, tasks
 
@@ -43,10 +43,7 @@ class GraspKinds:
     cells: dict[int, int]
 
 
-@dataclass(frozen=True)
-class Statistics:
-    database: Database
-
+class Statistics(IndexPart):
     def summaries(self, where: GraspFilter, metrics: Sequence[Metric]) -> dict[Metric, MetricSummary]:
         """Return count, mean and range of each metric; metrics without any grasp are omitted."""
         columns = [

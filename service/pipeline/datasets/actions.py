@@ -39,20 +39,14 @@ def create(
 ) -> tuple[DatasetView, bool]:
     """Record a dataset; the controller plans its jobs. Equal hands, objects and options give one dataset.
 
-    Args:
-        owner: id of the submitting API key, also for its jobs.
-        scope: which hands, objects and networks it may name, and the project of it and its jobs.
-
     Returns:
         the dataset, and whether it is new. A failed or cancelled one is returned unchanged: see `retry`.
 
     Raises:
         NotFoundError: unknown hand, object, neighbour, network or set.
-        InputError: one of them failed its check; the network is of another hand; no chart contains a
-            fidelity that meets the target.
+        InputError: one of them failed its check; the network is of another hand; no chart meets the target.
         ConflictError: a check is still running, or another dataset has the name.
         LimitError: more than `MAX_CELLS` cells.
-        QueueUnavailable, StoreUnavailable, IndexUnavailable: nothing was recorded.
     """
     hands, objects = members(services, request, scope)
     shared, beside = with_neighbours(services, request.shared, scope)
@@ -85,11 +79,8 @@ def create(
 def cancel(services: Services, name: str) -> DatasetView:
     """Stop a dataset: plan no more jobs and cancel its unfinished ones. Finished shards stay.
 
-    A job continues if another dataset waits for it or another key submitted it.
-
-    Raises:
-        NotFoundError: unknown dataset.
-        ConflictError: it is finished or cancelled already.
+    A job continues if another dataset waits for it or another key submitted it. NotFoundError for an unknown dataset,
+    ConflictError for one that is finished or cancelled already.
     """
     with recording(services) as (connection, put):
         dataset = services.index.datasets.get(name)
@@ -100,12 +91,7 @@ def cancel(services: Services, name: str) -> DatasetView:
 
 
 def retry(services: Services, name: str) -> DatasetView:
-    """Restart failed and cancelled cells of a dataset with fresh attempts. Finished work is not repeated.
-
-    Raises:
-        NotFoundError: unknown dataset.
-        ConflictError: no cell failed or was cancelled.
-    """
+    """Restart failed and cancelled cells of a dataset with fresh attempts; ConflictError if there are none."""
     with recording(services) as (connection, put):
         dataset = services.index.datasets.get(name)
         if not dataset.cancelled and not dataset.states[State.FAILED] and not dataset.states[State.CANCELLED]:
@@ -117,12 +103,7 @@ def retry(services: Services, name: str) -> DatasetView:
 def snapshot(services: Services, name: str) -> tuple[Snapshot, bool]:
     """Record the present shards of a dataset. Equal shards give the same snapshot.
 
-    Returns:
-        the snapshot, and whether it is new.
-
-    Raises:
-        NotFoundError: unknown dataset.
-        ConflictError: the dataset has no shard yet.
+    Return the snapshot, and whether it is new; NotFoundError without the dataset, ConflictError without a shard.
     """
     dataset = services.index.datasets.get(name)
     held = tuple(services.index.datasets.shards(name))
@@ -159,17 +140,13 @@ def add_object_set(
     scope: ProjectScope = EVERYTHING,
     may_follow: Callable[[str, str], None] = lambda owner, project: None,
 ) -> ObjectSetView:
-    """Give objects a common name. Equal objects change nothing; others make a new version.
+    """Give objects a common name. Equal objects change nothing; others make a new version, with the owner of the set.
 
     Args:
-        owner: id of the requesting API key; a new version keeps the owner of the set.
-        scope: which objects it may name, and the project that a new set belongs to.
         may_follow: called with owner and project of the set before a new version; raises if that is refused.
 
     Raises:
-        NotFoundError: unknown object.
-        InputError: an object failed its check, or none is given.
-        ConflictError: a check is still running.
+        NotFoundError, InputError, ConflictError: as in `usable`, or no object is given.
     """
     assets = [services.index.assets.get(AssetKind.OBJECT, one, scope=scope) for one in objects]
     wanted = tuple(asset.name for asset in assets)

@@ -63,14 +63,9 @@ def estimate(
     """Estimate the cost of a matrix. Hands and objects need not exist yet.
 
     Args:
-        resolve: replaces `auto` by a fidelity; not needed without `auto`.
+        resolve: replaces `auto` by a fidelity; InputError if no chart contains one that meets the target.
         costs: returns the finished batches of a stage; None: read from the index.
         scope: which sets of objects the matrix may name, and whose measurements count.
-
-    Raises:
-        NotFoundError: unknown set.
-        InputError: no chart contains a fidelity that meets the target.
-        LimitError: more than `MAX_CELLS` cells.
     """
     objects = objects_of(index, matrix, scope)
     options = matrix.shared
@@ -93,7 +88,7 @@ def estimate(
 
 
 def objects_of(index: Index, matrix: Matrix, scope: ProjectScope) -> list[str]:
-    """Return the objects of a matrix with sets expanded; NotFoundError and LimitError as in `estimate`."""
+    """Return the objects of a matrix with sets expanded; LimitError for more than `MAX_CELLS` cells."""
     objects = dict.fromkeys(matrix.objects)
     for name in matrix.sets:
         objects |= dict.fromkeys(index.object_sets.get(name, scope=scope).objects)

@@ -287,7 +287,9 @@ def index_is_store(settings: Settings, *, full: bool = False, settles_s: float =
         with opened.database.reading() as connection:
             count = int(connection.scalar(select(func.count()).select_from(shards)) or 0)
         whole = full or count <= _ALL_SHARDS
-        compared = partial(differences, opened, store) if whole else partial(compare, opened, store, draw(opened, store))
+        compared = (
+            partial(differences, opened, store) if whole else partial(compare, opened, store, draw(opened, store))
+        )
         if found := compared():
             time.sleep(settles_s)
             again = set(compared())

@@ -23,7 +23,6 @@ class Condition(StrEnum):
 
     GOOD = "good"
     WARNING = "warning"
-    """It works, at some cost."""
     BAD = "bad"
     """It does not work, or will lose data."""
     SKIPPED = "skipped"
@@ -35,9 +34,7 @@ class Finding:
     condition: Condition
     message: str
     fix: str = ""
-    """Fix for the user; "" if none is necessary."""
     name: str = ""
-    """Name of the check."""
 
     @property
     def ok(self) -> bool:

@@ -62,11 +62,7 @@ def local_store(settings: Settings) -> Path | None:
 
 
 def disk(settings: Settings, *, usage: Callable[[Path], tuple[int, int, int]] = shutil.disk_usage) -> Finding:
-    """Check the disk space for data, results, caches and scratch files.
-
-    Args:
-        usage: returns total, used and free bytes of a folder's file system.
-    """
+    """Check the disk space for data, results, caches and scratch files."""
     found = []
     for what, folder in _folders(settings):
         there = existing(folder)
@@ -147,11 +143,7 @@ def filesystem(folder: Path, mounts: Path = Path("/proc/self/mounts")) -> str:
 
 
 def versions(requirements: Iterable[str] | None = None) -> Finding:
-    """Check Python and library versions against the requirements of this graspd.
-
-    Args:
-        requirements: requirement strings of a package; by default those of the installed graspd.
-    """
+    """Check Python and library versions against `requirements`, by default those of the installed graspd."""
     try:
         own = importlib.metadata.distribution("graspd")
     except importlib.metadata.PackageNotFoundError:
@@ -188,11 +180,7 @@ def _unmet(text: str) -> str:
 
 
 def limits(*, files: int | None = None, memory: int | None = None) -> Finding:
-    """Report cores, memory and open files available to this process.
-
-    Args:
-        files, memory: replace the system's values.
-    """
+    """Report cores, memory and open files available to this process."""
     files = resource.getrlimit(resource.RLIMIT_NOFILE)[0] if files is None else files
     files = 2**31 if files == resource.RLIM_INFINITY else files
     memory = available_memory() if memory is None else memory
