@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import re
-from collections.abc import Iterator
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Final
 
 import pytest
 
@@ -18,10 +22,28 @@ from graspd.service.settings import Settings
 from graspd.service.store.library import publish_builtins
 from graspd.service.store.store import open_store
 from tests.conftest import REPOSITORY
-from tests.deploy import composition, page
+from tests.deploy import composition
 from tests.fakes import add_assets, request
 from tests.memory_queue import MemoryQueue
 from tests.service.index.test_index import run_all
+from tests.shell import completed
+
+TEXT: Final = "\n".join((REPOSITORY / "docs" / "how-to" / page).read_text() for page in ("install.md", "operations.md"))
+_TRIED: Final = re.compile(r"<!-- tried: ([\w-]+) -->\n```sh\n(.*?)```", re.DOTALL)
+
+
+def run_block(name: str, folder: Path, environment: Mapping[str, str]) -> subprocess.CompletedProcess[str]:
+    """Run a marked block as a user would, `graspd` being that of this environment; a failing line ends it."""
+    shims = folder / "bin"
+    shims.mkdir(exist_ok=True)
+    shim = shims / "graspd"
+    shim.write_text(f'#!/bin/sh\nexec {sys.executable} -m graspd "$@"\n')
+    shim.chmod(0o755)
+    return completed(
+        ["bash", "-euo", "pipefail", "-c", dict(_TRIED.findall(TEXT))[name]],
+        cwd=folder,
+        env=os.environ | {"PATH": f"{shims}:{os.environ['PATH']}", "PYTHONPATH": str(REPOSITORY)} | dict(environment),
+    )
 
 
 @pytest.fixture
@@ -49,7 +71,7 @@ def test_a_back_up_restored_elsewhere_gives_the_same_index(kept: Services, tmp_p
     (data / "store" / "shards" / "half-written.h5#123").write_bytes(b"half")
     where = {"GRASPD_DATA_DIR": str(data), "NEW_DATA_DIR": str(fresh)}
     for step in ("back-up", "restore"):
-        done = page.run(step, tmp_path, where)
+        done = run_block(step, tmp_path, where)
         assert done.returncode == 0, done.stderr
     assert names_of(fresh / "store") == names_of(data / "store") - {"shards/half-written.h5#123"}
     assert (fresh / "keys.json").exists()
@@ -64,14 +86,14 @@ def test_a_back_up_restored_elsewhere_gives_the_same_index(kept: Services, tmp_p
 
 
 def test_a_back_up_works_where_no_key_was_ever_made(kept: Services, tmp_path: Path) -> None:
-    done = page.run("back-up", tmp_path, {"GRASPD_DATA_DIR": str(kept.settings.data_dir)})
+    done = run_block("back-up", tmp_path, {"GRASPD_DATA_DIR": str(kept.settings.data_dir)})
     assert done.returncode == 0, done.stderr
 
 
 def test_a_damaged_copy_is_noticed(kept: Services, tmp_path: Path) -> None:
     where = {"GRASPD_DATA_DIR": str(kept.settings.data_dir), "NEW_DATA_DIR": str(tmp_path / "new")}
-    assert page.run("back-up", tmp_path, where).returncode == 0
-    assert page.run("restore", tmp_path, where).returncode == 0
+    assert run_block("back-up", tmp_path, where).returncode == 0
+    assert run_block("restore", tmp_path, where).returncode == 0
     lost = next((tmp_path / "new" / "store" / "shards").rglob("*.json"))
     lost.unlink()
     restored = Index(Settings(data_dir=tmp_path / "new").resolved_index_url)
@@ -92,7 +114,7 @@ def test_an_empty_index_is_filled_from_the_store(kept: Services) -> None:
 
 
 def test_keys_are_made_rotated_limited_and_revoked(tmp_path: Path) -> None:
-    done = page.run("keys", tmp_path, {"GRASPD_DATA_DIR": str(tmp_path / "data"), "COLUMNS": "200"})
+    done = run_block("keys", tmp_path, {"GRASPD_DATA_DIR": str(tmp_path / "data"), "COLUMNS": "200"})
     assert done.returncode == 0, done.stderr
     first, second = re.findall(r"^(gd_\S+)", done.stdout, re.MULTILINE)
     assert first != second
@@ -101,12 +123,12 @@ def test_keys_are_made_rotated_limited_and_revoked(tmp_path: Path) -> None:
 
 def test_every_profile_service_and_variant_on_the_page_exists() -> None:
     profiles = {name for service in composition.SERVICES.values() for name in service.get("profiles", ())}
-    assert set(re.findall(r"--profile (\S+)", page.TEXT)) <= profiles
-    assert set(re.findall(r"--scale ([\w-]+)=", page.TEXT)) <= composition.SERVICES.keys()
-    for variant in re.findall(r"apply -k (\S+)", page.TEXT):
+    assert set(re.findall(r"--profile (\S+)", TEXT)) <= profiles
+    assert set(re.findall(r"--scale ([\w-]+)=", TEXT)) <= composition.SERVICES.keys()
+    for variant in re.findall(r"apply -k (\S+)", TEXT):
         assert (REPOSITORY / variant / "kustomization.yaml").is_file()
 
 
 def test_every_setting_on_the_page_exists() -> None:
     known = {f"GRASPD_{name.upper()}" for name in Settings.model_fields}
-    assert set(re.findall(r"\bGRASPD_[A-Z_]+\b", page.TEXT)) <= known
+    assert set(re.findall(r"\bGRASPD_[A-Z_]+\b", TEXT)) <= known

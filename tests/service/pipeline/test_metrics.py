@@ -40,9 +40,6 @@ class Sums:
             key = (parsed[0], *parsed[1])
             self.sums[key] = self.sums.get(key, 0.0) + amount
 
-    def counted(self) -> dict[str, float]:
-        return {}
-
 
 def tasks(count: int) -> list[TaskMessage]:
     """Messages of as many tasks."""
@@ -108,16 +105,6 @@ def test_the_cost_of_a_look_does_not_grow_with_the_queue(rq_queue: RqQueue) -> N
     few = commands()
     rq_queue.enqueue(tasks(40), Priority.BULK)
     assert commands() == few
-
-
-def test_forged_entries_in_redis_do_not_break_the_metrics(rq_queue: RqQueue) -> None:
-    rq_queue.connection.rpush("rq:queue:bulk-scene", "forged")
-    rq_queue.connection.sadd(WORKERS, "forged")
-    rq_queue.connection.set(worker_key("forged"), b"\xff{")
-    found = rq_queue.now(lease_s=6)
-    assert found.depth[Priority.BULK, Stage.SCENE] == 1
-    assert (Priority.BULK, Stage.SCENE) not in found.oldest_s
-    assert not found.workers
 
 
 def test_sums_outlive_the_process_that_counts(rq_queue: RqQueue) -> None:

@@ -34,7 +34,6 @@ from graspd.service.pipeline.datasets.rounds import DatasetRounds
 from graspd.service.store.records import job_events
 from graspd.service.store.store import open_store
 from tests.dataset_status import status
-from tests.fakes import with_settings
 from tests.planning import plan_all
 from tests.service.pipeline.datasets.makers import add_asset, done, fail, finish, jobs_of, wanted
 
@@ -232,15 +231,6 @@ def test_an_event_reaches_a_job_once(services: Services) -> None:
     assert services.index.jobs.get(started).state == "queued"
     assert [event.what for event in job_events(services.store, started)] == ["cancelled", "retried"]
     assert [event.what for event in job_events(services.store, jobs_of(services, "grasps")[1])] == ["cancelled"]
-
-
-def test_a_large_dataset_leaves_the_queue_to_others(services: Services) -> None:
-    services = with_settings(services, queue_window=10)
-    actions.create(services, wanted(grasps=320))
-    plan_all(services)
-    assert len(services.queue.waiting()) == 10
-    assert services.queue.depths()[(Priority.INTERACTIVE, "synthesize")] == 0
-    assert services.index.datasets.get("grasps").tasks == 40
 
 
 def test_the_store_alone_tells_everything(either: Services) -> None:
