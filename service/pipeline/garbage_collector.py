@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Final, TypeVar
 
+from graspd.service.index.database import chunks
 from graspd.service.model import names
 from graspd.service.model.clock import timestamp
 from graspd.service.model.errors import ConflictError, DamagedError, NotFoundError
@@ -100,8 +101,8 @@ class GarbageCollector:
             jobs = load_dataset(self._services.store, dataset).jobs
         except (NotFoundError, DamagedError):
             return True
-        for start in range(0, len(jobs), _AT_ONCE):
-            for job in self._services.index.removals.planned_only(jobs[start : start + _AT_ONCE]):
+        for some in chunks(jobs, _AT_ONCE):
+            for job in self._services.index.removals.planned_only(some):
                 if self._clock() > deadline:
                     return False
                 try:
@@ -115,8 +116,7 @@ class GarbageCollector:
 
     def _unneeded(self, released: DeletedJob) -> Iterator[tuple[Stage, str]]:
         planned = [(task.stage, task.output) for task in plan(released.job)]
-        for start in range(0, len(planned), _AT_ONCE):
-            some = planned[start : start + _AT_ONCE]
+        for some in chunks(planned, _AT_ONCE):
             unneeded = self._services.index.removals.unneeded_shards([shard for _, shard in some])
             yield from ((stage, shard) for stage, shard in some if shard in unneeded)
 

@@ -10,6 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Final
 
+from graspd.service.index.database import chunks
 from graspd.service.model.clock import timestamp
 from graspd.service.model.errors import InputError, StoreUnavailable, UnavailableError
 from graspd.service.model.names import attempt as attempt_key
@@ -103,8 +104,7 @@ class Indexer:
     def _loaded(
         self, events: Sequence[Event], places: Sequence[int]
     ) -> Iterator[tuple[int, ShardManifest | Exception]]:
-        for first in range(0, len(places), _MANIFESTS_AT_ONCE):
-            some = places[first : first + _MANIFESTS_AT_ONCE]
+        for some in chunks(places, _MANIFESTS_AT_ONCE):
             yield from zip(some, self._readers.map(self._load, [events[place] for place in some]), strict=True)
 
     def _load(self, event: Event) -> ShardManifest | Exception:

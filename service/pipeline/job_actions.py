@@ -118,9 +118,7 @@ def cancel(services: Services, job_id: str, *, cause: str = "") -> JobView:
 
     The causing event of a dataset, if any, is stored with the job's event. ConflictError for a job that has ended.
     """
-    _refuse_ended(services, job_id)
-    with _changing(services, job_id) as add:
-        _refuse_ended(services, job_id)
+    with _changing(services, job_id, _refuse_ended) as add:
         in_queue = services.index.feed.unfinished_tasks(job_id)
         add("cancelled", cause=cause)
     try:
@@ -132,9 +130,7 @@ def cancel(services: Services, job_id: str, *, cause: str = "") -> JobView:
 
 def retry(services: Services, job_id: str, *, cause: str = "") -> JobView:
     """Queue the failed and cancelled tasks of a job again, with fresh attempts; ConflictError without any."""
-    _refuse_unfailed(services, job_id)
-    with _changing(services, job_id) as add:
-        _refuse_unfailed(services, job_id)
+    with _changing(services, job_id, _refuse_unfailed) as add:
         add("retried", services.index.feed.failed_tasks(job_id), cause=cause)
     _start(services, job_id)
     return _told(services, job_id)
@@ -206,13 +202,15 @@ def _start(services: Services, job_id: str) -> None:
 
 
 @contextmanager
-def _changing(services: Services, job_id: str) -> Iterator[Callable[..., None]]:
-    """Lock a job to append an event; of two concurrent changes the later one sees both.
+def _changing(services: Services, job_id: str, refuse: Callable[[JobView], None]) -> Iterator[Callable[..., None]]:
+    """Lock a job to append an event unless `refuse` raises; of two concurrent changes the later one sees both.
 
     Earlier events are read before the lock, because the store may be slow.
     """
+    refuse(services.index.jobs.get(job_id))
     before = job_events(services.store, job_id)
     with recording(services) as (connection, put):
+        refuse(services.index.jobs.get(job_id))
 
         def add(
             what: Literal["cancelled", "retried"], retried: dict[str, int] | None = None, *, cause: str = ""
@@ -225,17 +223,15 @@ def _changing(services: Services, job_id: str) -> Iterator[Callable[..., None]]:
         yield add
 
 
-def _refuse_ended(services: Services, job_id: str) -> None:
-    job = services.index.jobs.get(job_id)
+def _refuse_ended(job: JobView) -> None:
     if job.state.is_final:
         ended = "been cancelled" if job.state is State.CANCELLED else job.state.value
-        raise ConflictError(f"job {job_id} has already {ended}; there is nothing to cancel")
+        raise ConflictError(f"job {job.id} has already {ended}; there is nothing to cancel")
 
 
-def _refuse_unfailed(services: Services, job_id: str) -> None:
-    job = services.index.jobs.get(job_id)
+def _refuse_unfailed(job: JobView) -> None:
     if job.state not in (State.FAILED, State.CANCELLED):
-        raise ConflictError(f"job {job_id} is {job.state}; only a failed or cancelled job can be retried")
+        raise ConflictError(f"job {job.id} is {job.state}; only a failed or cancelled job can be retried")
 
 
 def _told(services: Services, job_id: str) -> JobView:

@@ -61,7 +61,9 @@ def _fix(services: Services, one: Damage, harmed: set[str]) -> str:
         return "its input is made again first; run it again when that is done"
     if one.what != MISSING:
         _clear(services, one, stage)
-    _queue(services, job, task)
+    number = len(task_attempts(services.store, task.id)) + 1
+    message = message_of(job, task, attempt=number, max_attempt=number)
+    services.queue.enqueue([message], Priority.BULK, again=True)
     return ""
 
 
@@ -85,12 +87,6 @@ def _asset(services: Services, key: str, kind: AssetKind, digest: str, file: str
             services.index.write.add_asset(load_asset(services.store, kind, digest), None)
             services.index.live.set_asset_waiting([digest], queued=False)
     return ""
-
-
-def _queue(services: Services, job: JobRecord, task: PlannedTask) -> None:
-    number = len(task_attempts(services.store, task.id)) + 1
-    message = message_of(job, task, attempt=number, max_attempt=number)
-    services.queue.enqueue([message], Priority.BULK, again=True)
 
 
 def _clear(services: Services, one: Damage, stage: Stage) -> None:

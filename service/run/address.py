@@ -30,10 +30,10 @@ _FILE: Final = "api.json"
 def record_address(folder: Path, url: str) -> None:
     """Record that this process's service has the address `url`."""
     record = {"api_url": url, "pid": os.getpid(), "started": start_of(os.getpid())}
-    _write_private(folder / _FILE, json.dumps(record))
+    write_private(folder / _FILE, json.dumps(record))
 
 
-def _write_private(file: Path, text: str) -> None:
+def write_private(file: Path, text: str) -> None:
     """Write a file atomically, readable by this user only."""
     handle, name = tempfile.mkstemp(dir=file.parent, prefix=f".{file.name}.")
     try:
@@ -113,7 +113,7 @@ class ListenAddress:
         text = "".join(f"{name}={shlex.quote(value)}\n" for name, value in said.items())
         try:
             self.file.parent.mkdir(parents=True, exist_ok=True)
-            _write_private(self.file, text)
+            write_private(self.file, text)
         except OSError as error:
             raise UnavailableError(f"{self.file} cannot be written: {error.strerror}") from None
 

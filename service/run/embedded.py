@@ -17,7 +17,7 @@ from typing import IO, Final
 
 from graspd.service.model.errors import BusyError, QueueUnavailable
 from graspd.service.queue.connection import password_file, socket_path
-from graspd.service.run.address import ListenAddress
+from graspd.service.run.address import ListenAddress, write_private
 from graspd.service.settings import Settings
 
 log = logging.getLogger(__name__)
@@ -67,16 +67,10 @@ def server_command(settings: Settings, joining: ListenAddress | None = None) -> 
     configuration = []
     if joining is not None:
         options |= {"port": str(joining.port), "bind": joining.address, "protected-mode": "yes"}
-        _write_private(secret, joining.password)
-        _write_private(folder / "redis.conf", f"requirepass {joining.password}\n")
+        write_private(secret, joining.password)
+        write_private(folder / "redis.conf", f"requirepass {joining.password}\n")
         configuration = [str(folder / "redis.conf")]
     return [str(server), *configuration, *(part for name, value in options.items() for part in (f"--{name}", value))]
-
-
-def _write_private(file: Path, text: str) -> None:
-    file.unlink(missing_ok=True)
-    with os.fdopen(os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as opened:
-        opened.write(text)
 
 
 def own_redis(settings: Settings) -> IO[str]:

@@ -48,17 +48,6 @@ def test_money_is_compute_store_and_service() -> None:
     assert found.money_per_million == pytest.approx((5008 + 14 + 24) / 64 * 1e6)
 
 
-def test_without_scenes_there_is_one_task_a_batch() -> None:
-    found = estimate(Work(grasps=3200, scenes=0), Measured(), Prices())
-    assert (found.tasks, found.pictures) == (100, 0)
-
-
-def test_half_the_time_needs_twice_the_cores() -> None:
-    slow, fast = (estimate(Work(grasps=10**8, days=days), Measured(), Prices()) for days in (8.0, 4.0))
-    assert fast.cores == pytest.approx(2 * slow.cores, abs=1)
-    assert fast.core_hours == slow.core_hours
-
-
 def test_the_page_shows_what_the_command_prints() -> None:
     shown = re.search(r"<!-- cost -->\n(.*?)\n<!-- /cost -->", PAGE, re.DOTALL)
     assert shown is not None

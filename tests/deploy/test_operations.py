@@ -13,7 +13,7 @@ from typing import Final
 import pytest
 
 from graspd.service.index.index import Index
-from graspd.service.index.rebuild import differences, rebuild
+from graspd.service.index.rebuild import differences
 from graspd.service.model.states import State
 from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.backends import Services
@@ -90,29 +90,6 @@ def test_a_back_up_works_where_no_key_was_ever_made(kept: Services, tmp_path: Pa
     assert done.returncode == 0, done.stderr
 
 
-def test_a_damaged_copy_is_noticed(kept: Services, tmp_path: Path) -> None:
-    where = {"GRASPD_DATA_DIR": str(kept.settings.data_dir), "NEW_DATA_DIR": str(tmp_path / "new")}
-    assert run_block("back-up", tmp_path, where).returncode == 0
-    assert run_block("restore", tmp_path, where).returncode == 0
-    lost = next((tmp_path / "new" / "store" / "shards").rglob("*.json"))
-    lost.unlink()
-    restored = Index(Settings(data_dir=tmp_path / "new").resolved_index_url)
-    try:
-        assert differences(restored, open_store((tmp_path / "new" / "store").as_uri())) != []
-    finally:
-        restored.close()
-
-
-def test_an_empty_index_is_filled_from_the_store(kept: Services) -> None:
-    before = {job.id: job.state for job in kept.index.jobs.page(limit=10).items}
-    empty = Index(f"sqlite:///{kept.settings.data_dir / 'older.sqlite'}")
-    try:
-        rebuild(empty, kept.store)
-        assert {job.id: job.state for job in empty.jobs.page(limit=10).items} == before
-    finally:
-        empty.close()
-
-
 def test_keys_are_made_rotated_limited_and_revoked(tmp_path: Path) -> None:
     done = run_block("keys", tmp_path, {"GRASPD_DATA_DIR": str(tmp_path / "data"), "COLUMNS": "200"})
     assert done.returncode == 0, done.stderr
@@ -127,8 +104,3 @@ def test_every_profile_service_and_variant_on_the_page_exists() -> None:
     assert set(re.findall(r"--scale ([\w-]+)=", TEXT)) <= composition.SERVICES.keys()
     for variant in re.findall(r"apply -k (\S+)", TEXT):
         assert (REPOSITORY / variant / "kustomization.yaml").is_file()
-
-
-def test_every_setting_on_the_page_exists() -> None:
-    known = {f"GRASPD_{name.upper()}" for name in Settings.model_fields}
-    assert set(re.findall(r"\bGRASPD_[A-Z_]+\b", TEXT)) <= known

@@ -25,12 +25,8 @@ from tests.system.conftest import System
 
 pytestmark = pytest.mark.chaos
 Start = Callable[..., System]
-
-
 #: Batches of a dataset that wait in the queue before a later small job.
 _WAITING = 500
-
-
 #: Of these may be done before it: those that run, every fourth turn, and what one worker does while the other has it.
 _BEFORE_IT = 150
 
@@ -159,12 +155,8 @@ def test_a_worker_that_cannot_load_its_engine_takes_no_task(start: Start, tmp_pa
 
 #: Busy processes a core.
 BUSY = 7.5
-
-
 #: A busy process ends by itself, should nobody end it [s].
 _LONGEST_S = 600
-
-
 _BUSY = f"import time\nend = time.monotonic() + {_LONGEST_S}\nwhile time.monotonic() < end: pass"
 
 

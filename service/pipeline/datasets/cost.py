@@ -81,10 +81,11 @@ def estimate(
                 rates[chosen.knobs.name] = Rates(batches, chosen, devices)
             sums.machine = rates[chosen.knobs.name].machine
             _add_cell(sums, hand, rates[chosen.knobs.name].of(hand, obj), options)
-    later = _later_rates(costs, options, sums.machine)
+    scene = scene_rate(costs(Stage.SCENE) if options.scenes else [], options, sums.machine)
+    picture = picture_rate(costs(Stage.RENDER) if options.views else [], options, sums.machine)
     with_neighbours = list(dict.fromkeys([*objects, *(one.object for one in options.beside)]))
     known = _assets(index, matrix.hands, with_neighbours, scope)
-    return _estimate(options, len(matrix.hands) * len(objects), sums, later, known)
+    return _estimate(options, len(matrix.hands) * len(objects), sums, (scene, picture), known)
 
 
 def objects_of(index: Index, matrix: Matrix, scope: ProjectScope) -> list[str]:
@@ -178,11 +179,6 @@ def _plan(
         network_bytes=round(moved),
         network_bytes_per_s=moved / seconds if seconds else 0.0,
     )
-
-
-def _later_rates(costs: Batches, options: JobOptions, machine: Machine) -> tuple[StageRate, StageRate]:
-    scene = scene_rate(costs(Stage.SCENE) if options.scenes else [], options, machine)
-    return scene, picture_rate(costs(Stage.RENDER) if options.views else [], options, machine)
 
 
 def _assets(index: Index, hands: Sequence[str], objects: Sequence[str], scope: ProjectScope) -> tuple[float, list[str]]:

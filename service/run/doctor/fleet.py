@@ -9,12 +9,13 @@ from __future__ import annotations
 import json
 import secrets
 import socket
+import time
 import urllib.error
 import urllib.request
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import closing, suppress
-from datetime import UTC, datetime
+from datetime import datetime
 from typing import Any, Final
 
 from redis.exceptions import RedisError
@@ -186,14 +187,14 @@ def _offsets(settings: Settings) -> Iterator[tuple[str, float]]:
     """Yield name and clock offset to this machine [s]; other checks report missing parts."""
     if is_there(settings):
         with suppress(RedisError, OSError), redis_connection(settings) as client:
-            before = _now()
+            before = time.time()
             seconds, micros = client.time()
-            yield "Redis", seconds + micros / 1e6 - (before + _now()) / 2
+            yield "Redis", seconds + micros / 1e6 - (before + time.time()) / 2
         with suppress(GraspdError), closing(open_queue(settings, patience=0)) as queue:
             beats = queue.workers()
             # Any age up to the next due heartbeat is normal; only the excess is clock offset.
             due = 4 / 3 * settings.lease_s
-            ages = {beat.host: _now() - _seconds(beat.seen) for beat in beats}
+            ages = {beat.host: time.time() - _seconds(beat.seen) for beat in beats}
             yield from ((host, -age if age < 0 else min(0.0, due - age)) for host, age in ages.items())
     if settings.index_url is not None and make_url(settings.resolved_index_url).get_backend_name() == "postgresql":
         with suppress(SQLAlchemyError, GraspdError):
@@ -208,8 +209,9 @@ def _of_postgres(url: str | URL) -> float:
     engine = connect_postgres(url)
     try:
         with engine.connect() as connected:
-            before = _now()
-            return float(connected.scalar(text("SELECT extract(epoch FROM clock_timestamp())"))) - (before + _now()) / 2
+            before = time.time()
+            theirs = float(connected.scalar(text("SELECT extract(epoch FROM clock_timestamp())")))
+            return theirs - (before + time.time()) / 2
     finally:
         engine.dispose()
 
@@ -217,10 +219,10 @@ def _of_postgres(url: str | URL) -> float:
 def _of_store(settings: Settings) -> float:
     """Return the store's time of a new object; some stores have whole seconds only."""
     store, key = open_store(settings.resolved_store_url), f"health/clock-{secrets.token_hex(8)}"
-    before = _now()
+    before = time.time()
     try:
         store.put(key, b"1")
-        after = _now()
+        after = time.time()
         made = _seconds(store.stamp(key)[1])
     finally:
         store.delete(key)
@@ -229,7 +231,3 @@ def _of_store(settings: Settings) -> float:
 
 def _seconds(when: str) -> float:
     return datetime.fromisoformat(when).timestamp()
-
-
-def _now() -> float:
-    return datetime.now(UTC).timestamp()

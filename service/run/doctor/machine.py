@@ -64,37 +64,29 @@ def local_store(settings: Settings) -> Path | None:
 def disk(settings: Settings, *, usage: Callable[[Path], tuple[int, int, int]] = shutil.disk_usage) -> Finding:
     """Check the disk space for data, results, caches and scratch files."""
     found = []
-    for what, folder in _folders(settings):
+    for what, folder, variable in _folders(settings):
         there = existing(folder)
         free = usage(there)[2]
         facts = os.statvfs(there)
         if facts.f_files and facts.f_favail < _FEW_INODES:
             return bad(f"{what} ({folder}): only {facts.f_favail} more files fit", f"remove files below {there}")
-        found.append((free, what, folder))
-    free, what, folder = min(found, key=lambda one: one[0] // _GIB)
+        found.append((free, what, folder, variable))
+    free, what, folder, variable = min(found, key=lambda one: one[0] // _GIB)
     line = f"{free / _GIB:.1f} GiB free for {what} ({folder})"
     if free < _DISK_BAD:
-        return bad(f"only {line}", f"make room below {existing(folder)}, or move it: {_mover(what)}")
+        return bad(f"only {line}", f"make room below {existing(folder)}, or move it: {variable}")
     if free < _DISK_LOW:
-        return warning(f"only {line}", f"make room soon, or move it: {_mover(what)}")
+        return warning(f"only {line}", f"make room soon, or move it: {variable}")
     return good(f"at least {line}")
 
 
-def _folders(settings: Settings) -> Iterable[tuple[str, Path]]:
-    yield "the data folder", settings.data_dir.resolve()
+def _folders(settings: Settings) -> Iterable[tuple[str, Path, str]]:
+    """Yield name and path of each folder, and the variable that moves it."""
+    yield "the data folder", settings.data_dir.resolve(), "GRASPD_DATA_DIR"
     if (store := local_store(settings)) is not None:
-        yield "the store", store
-    yield "caches", user_cache.folder("doctor").parent
-    yield "scratch files", Path(tempfile.gettempdir())
-
-
-def _mover(what: str) -> str:
-    return {
-        "the data folder": "GRASPD_DATA_DIR",
-        "the store": "GRASPD_STORE_URL",
-        "caches": "XDG_CACHE_HOME",
-        "scratch files": "TMPDIR",
-    }[what]
+        yield "the store", store, "GRASPD_STORE_URL"
+    yield "caches", user_cache.folder("doctor").parent, "XDG_CACHE_HOME"
+    yield "scratch files", Path(tempfile.gettempdir()), "TMPDIR"
 
 
 def existing(folder: Path) -> Path:

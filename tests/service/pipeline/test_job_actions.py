@@ -200,11 +200,7 @@ def test_grasps_are_found_by_their_scene(services: Services) -> None:
 
 
 UPRIGHT = [1.0, 0, 0, 0]
-
-
 GROUND = {"kind": "half_space", "normal": [0, 0, 2], "offset": 0.2}
-
-
 SLOPE = {"kind": "box", "size": [0.2, 0.2, 0.2], "pose": [0.5, 0, 0, 0.8, 0, 0.6, 0]}
 
 

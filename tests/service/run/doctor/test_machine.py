@@ -148,8 +148,7 @@ def test_a_wrong_secret_is_bad_and_the_mend_names_the_variables(
 ) -> None:
     monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "of-somebody-else")
     found = store(Settings(data_dir=tmp_path, store_url=s3_url))
-    assert not found.ok
-    assert "AWS_SECRET_ACCESS_KEY" in found.fix
+    assert not found.ok and "AWS_SECRET_ACCESS_KEY" in found.fix
     assert "of-somebody-else" not in str(found)
 
 
@@ -185,5 +184,4 @@ class Keeping(Store):
 )
 def test_a_store_that_breaks_a_promise_is_bad(kind: type[Store], word: str) -> None:
     found = check_store(kind(MemoryStore(), "fake://"))
-    assert not found.ok
-    assert word in found.message
+    assert not found.ok and word in found.message
