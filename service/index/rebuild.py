@@ -6,7 +6,7 @@ import logging
 import tempfile
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
@@ -195,17 +195,16 @@ def complete_if_new(index: Index, store: Store) -> None:
 
 def differences(index: Index, store: Store) -> list[str]:
     """Return damaged records, then the rows that `rebuild` would change, one line each; empty if equal."""
-    with tempfile.TemporaryDirectory(prefix="graspd-index-") as folder:
-        fresh = Index(sqlite_url(Path(folder) / "index.sqlite"))
-        try:
-            rebuild(fresh, store)
-            made = fresh.notes.completeness()
-            damaged = [f"{name}: damaged, and left out" for name in made.names] if made is not None else []
-            with index.database.reading() as live, fresh.database.reading() as derived:
-                rows = [line for table in metadata.tables.values() for line in _compare(table, live, derived)]
-            return [*damaged, *rows][:_SHOWN_DIFFERENCES]
-        finally:
-            fresh.close()
+    with (
+        tempfile.TemporaryDirectory(prefix="graspd-index-") as folder,
+        closing(Index(sqlite_url(Path(folder) / "index.sqlite"))) as fresh,
+    ):
+        rebuild(fresh, store)
+        made = fresh.notes.completeness()
+        damaged = [f"{name}: damaged, and left out" for name in made.names] if made is not None else []
+        with index.database.reading() as live, fresh.database.reading() as derived:
+            rows = [line for table in metadata.tables.values() for line in _compare(table, live, derived)]
+        return [*damaged, *rows][:_SHOWN_DIFFERENCES]
 
 
 def _compare(table: Table, live: Connection, derived: Connection) -> Iterator[str]:

@@ -12,6 +12,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import IO, Final, Self
 
@@ -127,8 +128,7 @@ class Supervisor:
         """
         began = told = time.monotonic()
         starts, logs = self._starts(), self.settings.data_dir / "logs"
-        queue = open_queue(self.settings, patience=0)
-        try:
+        with closing(open_queue(self.settings, patience=0)) as queue:
             while missing := self._missing(queue):
                 if stop is not None and stop.is_set():
                     return False
@@ -145,8 +145,6 @@ class Supervisor:
                     told = now
                     say(f"not ready after {now - began:.0f} s, waiting for {', '.join(missing)}; logs in {logs}")
                 time.sleep(_PROBE_S)
-        finally:
-            queue.close()
         return True
 
     def stop(self) -> None:
@@ -202,10 +200,8 @@ class Supervisor:
         except UnavailableError as error:
             log.warning("%s", error)
             return
-        try:
+        with closing(services):
             mine = identify_if_redis_answers(services, folder=folder)
-        finally:
-            services.close()
         if self._wanted.redis_url is None and before not in (None, mine):
             set_log_aside(self.settings, "it belongs to the service that ran here before")
 

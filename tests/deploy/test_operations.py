@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping
+from contextlib import closing
 from pathlib import Path
 from typing import Final
 
@@ -20,11 +21,10 @@ from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.identity import identify
 from graspd.service.settings import Settings
 from graspd.service.store.library import publish_builtins
-from graspd.service.store.store import open_store
 from tests.conftest import REPOSITORY
 from tests.deploy import composition
 from tests.fakes import add_assets, request
-from tests.memory_queue import MemoryQueue
+from tests.indexes import open_services
 from tests.service.index.test_index import run_all
 from tests.shell import completed
 
@@ -49,16 +49,14 @@ def run_block(name: str, folder: Path, environment: Mapping[str, str]) -> subpro
 @pytest.fixture
 def kept(tmp_path: Path) -> Iterator[Services]:
     """A data folder with a finished job and one that has not begun."""
-    settings = Settings(data_dir=tmp_path / "data")
-    index = Index(settings.resolved_index_url)
-    services = Services(settings, open_store(settings.resolved_store_url), index, MemoryQueue())
+    services = open_services(Settings(data_dir=tmp_path / "data"))
     identify(services)
     add_assets(services)
     publish_builtins(services.store)
     run_all(services, job_actions.submit(services, request(grasps=64, scenes=1))[0].id)
     job_actions.submit(services, request(grasps=32, seed=5))
     yield services
-    index.close()
+    services.close()
 
 
 def names_of(folder: Path) -> set[str]:
@@ -75,14 +73,11 @@ def test_a_back_up_restored_elsewhere_gives_the_same_index(kept: Services, tmp_p
         assert done.returncode == 0, done.stderr
     assert names_of(fresh / "store") == names_of(data / "store") - {"shards/half-written.h5#123"}
     assert (fresh / "keys.json").exists()
-    restored = Index(Settings(data_dir=fresh).resolved_index_url)
-    try:
+    with closing(Index(Settings(data_dir=fresh).resolved_index_url)) as restored:
         assert differences(restored, kept.store) == []
         jobs = {job.id: job.state for job in restored.jobs.page(limit=10).items}
         assert jobs == {job.id: job.state for job in kept.index.jobs.page(limit=10).items}
         assert set(jobs.values()) == {State.SUCCEEDED, State.QUEUED}
-    finally:
-        restored.close()
 
 
 def test_a_back_up_works_where_no_key_was_ever_made(kept: Services, tmp_path: Path) -> None:

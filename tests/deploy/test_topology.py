@@ -6,7 +6,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -135,11 +135,8 @@ def test_the_services_of_the_compose_file_do_a_job_together(
     assert topology.graspd("worker-cpu", "worker", "--check").returncode == 0
     for name, value in topology.environment("api").items():
         monkeypatch.setenv(name, value)
-    index = Index(topology.variables["GRASPD_INDEX_URL"])
-    try:
+    with closing(Index(topology.variables["GRASPD_INDEX_URL"])) as index:
         assert differences(index, open_store(topology.variables["GRASPD_STORE_URL"])) == []
-    finally:
-        index.close()
 
 
 @pytest.mark.s3

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import secrets
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing, contextmanager
+from contextlib import AbstractContextManager, closing
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -52,13 +52,8 @@ def is_there(settings: Settings) -> bool:
     return settings.redis_url is not None or socket_path(settings.data_dir).exists()
 
 
-@contextmanager
-def redis_connection(settings: Settings) -> Iterator[Redis]:
-    client = connect(redis_url(settings), patience=0, timeout_s=_TIMEOUT_S)
-    try:
-        yield client
-    finally:
-        client.close()
+def redis_connection(settings: Settings) -> AbstractContextManager[Redis]:
+    return closing(connect(redis_url(settings), patience=0, timeout_s=_TIMEOUT_S))
 
 
 def redis(settings: Settings) -> Finding:

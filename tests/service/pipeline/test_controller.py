@@ -22,7 +22,7 @@ from graspd.service.pipeline.lease_reaper import LOST_AFTER_S
 from graspd.service.queue.port import Event, EventKind
 from graspd.service.store.library import publish_asset, stored_assets
 from graspd.worker.process.runner import Runner
-from graspd.worker.stages.context import TaskContext
+from graspd.worker.stages.context import StopReason, TaskContext
 from tests.fakes import HAND_FILES, fake_stages, request, with_settings
 from tests.indexes import empty_index
 from tests.memory_queue import Delivery, MemoryQueue
@@ -227,6 +227,17 @@ def test_while_the_store_is_away_what_does_not_need_it_is_known(bench: Bench, mo
     bench.work_off()
     assert bench.services.index.jobs.get(job.id).state is State.SUCCEEDED
     assert bench.services.index.jobs.attempts(job=job.id) == []
+
+
+def test_a_task_handed_back_at_shutdown_is_queued_at_once(bench: Bench) -> None:
+    def told_to_stop(message: TaskMessage, context: TaskContext) -> None:
+        context.stop(StopReason.SHUTDOWN)
+        context.check()
+
+    job_actions.submit(bench.services, request())
+    bench.do(bench.take(), synthesize=told_to_stop)
+    bench.pass_time(1)
+    assert bench.take().message.attempt == 1
 
 
 def test_redis_lost_whole_loses_no_task(bench: Bench) -> None:

@@ -18,7 +18,7 @@ from graspd.service.queue.rq_queue import RqQueue
 from graspd.service.settings import Settings
 from graspd.service.store.store import Store, open_store
 from graspd.service.telemetry import HeartbeatFile
-from tests.indexes import empty_index
+from tests.indexes import open_services
 from tests.memory_queue import MemoryQueue
 from tests.waiting import PATIENCE_S, until
 
@@ -27,9 +27,7 @@ def service(folder: Path, *, store: Store | None = None, queue: RqQueue | None =
     """A service with an index of its own; store and Redis may be shared."""
     if store is not None:
         more["store_url"] = store.url
-    settings = Settings(data_dir=folder, **more)
-    index = empty_index(settings.resolved_index_url)
-    return Services(settings, store or open_store(settings.resolved_store_url), index, queue or MemoryQueue())
+    return open_services(Settings(data_dir=folder, **more), store, queue)
 
 
 @pytest.fixture

@@ -23,14 +23,12 @@ from graspd.service.queue.port import EventKind
 from graspd.service.run import commands, store_commands
 from graspd.service.settings import Settings
 from graspd.service.store.manifests import ShardManifest, load_manifest, load_shard
-from graspd.service.store.store import open_store
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.process.runner import Runner
 from graspd.worker.stages.context import TaskContext
 from tests.damage import cut, flip, overwrite, remove
 from tests.fakes import add_assets, fake_stages, request
-from tests.indexes import empty_index
-from tests.memory_queue import MemoryQueue
+from tests.indexes import open_services
 
 SHARDS = 6
 
@@ -38,7 +36,7 @@ SHARDS = 6
 def service_on(folder: Path, url: str) -> Iterator[Services]:
     """A service without processes: a store, an SQLite index, a hand and an object."""
     settings = Settings(data_dir=folder, store_url=url, retry_backoff_s=0.0, task_s=0.0)
-    made = Services(settings, open_store(url), empty_index(settings.resolved_index_url), MemoryQueue())
+    made = open_services(settings)
     add_assets(made)
     yield made
     made.close()

@@ -45,11 +45,9 @@ from graspd.service.store.records import (
     read_record,
     removed_folder,
 )
-from graspd.service.store.store import open_store
 from tests.damage import flip, flipped, overwrite, remove
 from tests.fakes import HAND_FILES, OBJECT_FILES, make_shard, message_for, request, with_settings
-from tests.indexes import empty_index
-from tests.memory_queue import MemoryQueue
+from tests.indexes import open_services
 from tests.packs import tasks_of
 from tests.waiting import PATIENCE_S, until
 
@@ -306,9 +304,7 @@ def test_it_makes_way_for_a_verify_and_goes_on_afterwards(services: Services, sh
 
 
 def test_a_second_verify_is_refused(tmp_path: Path) -> None:
-    settings = Settings(data_dir=tmp_path)
-    index = empty_index(settings.resolved_index_url)
-    other = Services(settings, open_store(settings.resolved_store_url), index, MemoryQueue())
+    other = open_services(Settings(data_dir=tmp_path))
     assert ReadPermit(other, is_controller=False).is_mine()
     refused = CliRunner().invoke(app, ["store", "verify", "--data-dir", str(tmp_path)])
     other.close()

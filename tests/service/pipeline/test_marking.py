@@ -31,9 +31,8 @@ from graspd.service.pipeline.datasets.spec import DatasetRequest
 from graspd.service.pipeline.deletion import delete_asset, delete_job
 from graspd.service.queue.port import Event, EventKind
 from graspd.service.settings import Settings
-from graspd.service.store.store import open_store
 from tests.fakes import add_assets, make_shard, make_task, record_of, request
-from tests.memory_queue import MemoryQueue
+from tests.indexes import open_services
 
 
 @pytest.fixture
@@ -51,10 +50,7 @@ def rebuilt(monkeypatch: pytest.MonkeyPatch) -> list[object]:
 
 def in_service(folder: Path, act: Callable[[Services], object] = lambda services: None) -> list[str]:
     """A controller starts, a user does something, the controller stops; how the index then differs from the store."""
-    settings = Settings(data_dir=folder)
-    store = open_store(settings.resolved_store_url)
-    services = Services(settings, store, Index(settings.resolved_index_url), MemoryQueue())
-    try:
+    with closing(open_services(Settings(data_dir=folder))) as services:
         working = controller.Controller(services)
         working.round()
         add_assets(services)
@@ -63,9 +59,7 @@ def in_service(folder: Path, act: Callable[[Services], object] = lambda services
         stop = threading.Event()
         stop.set()
         working.run(stop)
-        return [line for line in differences(services.index, store) if not line.startswith("assets ")]
-    finally:
-        services.close()
+        return [line for line in differences(services.index, services.store) if not line.startswith("assets ")]
 
 
 def submit(seed: int) -> Callable[[Services], object]:
@@ -146,9 +140,7 @@ def test_an_index_exchanged_meanwhile_is_made_anew(tmp_path: Path, rebuilt: list
     in_service(data, submit(1))
     copy_index(data, backup)
     in_service(data, submit(2))
-    settings = Settings(data_dir=data)
-    store = open_store(settings.resolved_store_url)
-    services = Services(settings, store, Index(settings.resolved_index_url), MemoryQueue())
+    services = open_services(Settings(data_dir=data))
     working = controller.Controller(services)
     working.round()
     for file in data.glob("index.sqlite*"):

@@ -28,9 +28,8 @@ from graspd.service.queue.allowed import TASK_FUNCTION, allowed_job
 from graspd.service.queue.port import Event, EventKind
 from graspd.service.queue.rq_queue import EVENTS, METRICS, WORKERS, RqQueue, worker_key
 from graspd.service.settings import Settings
-from graspd.service.store.store import open_store
 from tests.fakes import add_assets, beat_of, request
-from tests.indexes import empty_index
+from tests.indexes import open_services
 
 WIP = "rq:wip:interactive-synthesize"
 WAITING = "rq:queue:interactive-synthesize"
@@ -84,10 +83,7 @@ FORGERIES: dict[str, Callable[[Any], object]] = {
 
 @pytest.fixture
 def services(tmp_path: Path, rq_queue: RqQueue) -> Services:
-    settings = Settings(data_dir=tmp_path, retry_backoff_s=0.0)
-    made = Services(
-        settings, open_store(settings.resolved_store_url), empty_index(settings.resolved_index_url), rq_queue
-    )
+    made = open_services(Settings(data_dir=tmp_path, retry_backoff_s=0.0), queue=rq_queue)
     add_assets(made)
     return made
 

@@ -22,7 +22,7 @@ from graspd.service.run.doctor.checks import Condition, Finding
 from graspd.service.settings import Settings
 from graspd.service.store.store import open_store
 from tests.fakes import add_assets, request
-from tests.indexes import empty_index
+from tests.indexes import open_services
 from tests.memory_queue import MemoryQueue
 from tests.servers import PostgresServer, free_ports
 from tests.service.index.test_index import fail, run_all
@@ -33,14 +33,12 @@ Look = Callable[[], Finding]
 @pytest.fixture
 def kept(tmp_path: Path) -> Iterator[Services]:
     """A data folder with a job of two batches, done."""
-    settings = Settings(data_dir=tmp_path)
-    index = empty_index(settings.resolved_index_url)
-    services = Services(settings, open_store(settings.resolved_store_url), index, MemoryQueue())
+    services = open_services(Settings(data_dir=tmp_path))
     add_assets(services)
     run_all(services, job_actions.submit(services, request(grasps=64))[0].id)
-    index.notes.set_complete()
+    services.index.notes.set_complete()
     yield services
-    index.close()
+    services.close()
 
 
 @pytest.fixture(params=["whole", "sample"])
