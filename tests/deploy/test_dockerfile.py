@@ -87,6 +87,10 @@ def test_foreign_images_have_a_full_version() -> None:
         assert re.fullmatch(r"[a-z0-9./-]+:\d+\.\d+\.\d+[\w.-]*", image), image
 
 
+def test_no_image_asks_a_hub_for_how_to_build_it() -> None:
+    assert not re.search(r"^#\s*syntax=", DOCKERFILE.read_text(), re.MULTILINE)
+
+
 def test_the_images_run_a_python_that_graspd_supports() -> None:
     version = re.search(r"python:(\d+)\.(\d+)", DOCKERFILE.read_text())
     assert version is not None

@@ -303,6 +303,12 @@ def test_it_makes_way_for_a_verify_and_goes_on_afterwards(services: Services, sh
     assert scan.advance()
 
 
+def test_a_verify_takes_the_turn_from_a_controller(services: Services) -> None:
+    assert ReadPermit(services, is_controller=True).is_mine()
+    assert not ReadPermit(services, is_controller=True).is_mine()
+    assert ReadPermit(services, is_controller=False).is_mine()
+
+
 def test_a_second_verify_is_refused(tmp_path: Path) -> None:
     other = open_services(Settings(data_dir=tmp_path))
     assert ReadPermit(other, is_controller=False).is_mine()

@@ -236,6 +236,10 @@ def value_of(name: str) -> Any:
     return default + 1
 
 
+def test_only_what_up_settles_itself_does_not_reach_the_children() -> None:
+    assert set(_SETTLED) <= {"data_dir", "redis_url", "host", "port", "api_url"}
+
+
 @pytest.mark.parametrize("name", sorted(Settings.model_fields.keys() - _SETTLED))
 def test_a_setting_reaches_the_children(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     given = Settings(**{name: value_of(name)})
