@@ -116,6 +116,14 @@ def test_a_damaged_record_is_left_out_of_a_lost_index_and_named(
     fresh.index.close()
 
 
+def test_a_check_names_a_damaged_record_and_exits_with_1(services: Services) -> None:
+    rebuild(services.index, services.store)
+    key = of_job(services)
+    overwrite(services.store, key, DAMAGED)
+    told = CliRunner().invoke(app, ["index", "rebuild", "--check", "--data-dir", str(services.settings.data_dir)])
+    assert told.exit_code == 1 and key in told.output
+
+
 def test_a_record_that_was_mended_is_there_again(services: Services) -> None:
     key = of_job(services)
     whole = services.store.get(key)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import socket
@@ -118,7 +119,11 @@ def test_a_check_tells_differences_and_changes_nothing(services: Services) -> No
         shown = runner.invoke(app, damaged)
         assert shown.exit_code == 1
         assert "not in the index" in shown.output
-    assert runner.invoke(app, damaged[:2] + damaged[3:]).exit_code == 0
+    rebuild = [*damaged[:2], "--json", *damaged[3:]]
+    assert [json.loads(runner.invoke(app, rebuild).stdout.splitlines()[-1])["changed"] for _ in range(2)] == [
+        True,
+        False,
+    ]
     assert runner.invoke(app, damaged).exit_code == 0
 
 
