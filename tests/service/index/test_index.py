@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 from pydantic import SecretStr
-from sqlalchemy import delete, update
+from sqlalchemy import delete, insert, update
 
 from graspd.service.index import tables
 from graspd.service.index.index import Index
@@ -308,8 +308,11 @@ def test_every_kind_of_damage_to_the_index_is_seen_and_mended(services: Services
         connection.execute(delete(tables.grasps).where(tables.grasps.c.row == 0))
         connection.execute(update(tables.shards).values(seconds=99.0))
         connection.execute(update(tables.tasks).where(tables.tasks.c.done.is_(True)).values(state="failed"))
+        connection.execute(insert(tables.object_sets).values(name="x", digest="x", objects=[], created="x"))
     found = differences(services.index, services.store)
-    assert {line.split()[0] for line in found} >= {"grasps", "shards"}
+    assert {line.split()[0] for line in found} >= {"grasps", "shards", "object_sets"}
+    for words in ("not in the index", "not in the store", "the store says"):
+        assert any(words in line for line in found)
     rebuild(services.index, services.store)
     assert differences(services.index, services.store) == []
 
