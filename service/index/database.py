@@ -191,10 +191,10 @@ def chunks(ids: Sequence[T], size: int = 1000) -> Iterable[Sequence[T]]:
 
 
 def rows_among(
-    connection: Connection, query: Select[Any], column: ColumnElement[Any], wanted: Iterable[Any]
+    connection: Connection, query: Select[Any], column: ColumnElement[Any], wanted: Iterable[Any], size: int = 1000
 ) -> Iterator[Any]:
     """Yield the rows whose column has one of the wanted values, for any number of these."""
-    for some in chunks(list(wanted)):
+    for some in chunks(list(wanted), size):
         yield from connection.execute(query.where(column.in_(some)))
 
 

@@ -8,7 +8,7 @@ from typing import Final
 from sqlalchemy import Connection, case, delete, func, select, tuple_
 
 from graspd.service.index.bulk import upsert
-from graspd.service.index.database import IndexPart, chunks
+from graspd.service.index.database import IndexPart, rows_among
 from graspd.service.index.project_scope import seen, seen_shards
 from graspd.service.index.tables import grasps, tagged, tags
 from graspd.service.index.views import TagView
@@ -40,23 +40,19 @@ class Tags(IndexPart):
     def of(self, wanted: Collection[Grasp], *, scope: ProjectScope = EVERYTHING) -> dict[Grasp, list[str]]:
         """Return the names of the tags of each of these grasps that has one."""
         found: dict[Grasp, list[str]] = {}
-        query = select(tagged.c.shard_id, tagged.c.row, tags.c.name)
+        query = select(tagged.c.shard_id, tagged.c.row, tags.c.name).order_by(tags.c.name)
         query = query.where(tags.c.id == tagged.c.tag, *seen(scope, tags))
+        key = tuple_(tagged.c.shard_id, tagged.c.row)
         with self.database.reading() as connection:
-            for some in chunks(sorted(wanted), _AT_ONCE):
-                those = tuple_(tagged.c.shard_id, tagged.c.row).in_(some)
-                for shard, row, name in connection.execute(query.where(those).order_by(tags.c.name)):
-                    found.setdefault((shard, row), []).append(name)
+            for shard, row, name in rows_among(connection, query, key, sorted(wanted), _AT_ONCE):
+                found.setdefault((shard, row), []).append(name)
         return found
 
     def there(self, wanted: Sequence[Grasp], *, scope: ProjectScope = EVERYTHING) -> set[Grasp]:
         query = select(grasps.c.shard_id, grasps.c.row).where(*seen_shards(scope, grasps.c.shard_id))
-        found: set[Grasp] = set()
+        key = tuple_(grasps.c.shard_id, grasps.c.row)
         with self.database.reading() as connection:
-            for some in chunks(wanted, _AT_ONCE):
-                rows = connection.execute(query.where(tuple_(grasps.c.shard_id, grasps.c.row).in_(some)))
-                found |= {(shard, row) for shard, row in rows}
-        return found
+            return {(shard, row) for shard, row in rows_among(connection, query, key, wanted, _AT_ONCE)}
 
     def put(self, tag: Tag, *, within: Connection | None = None) -> None:
         row = {name: getattr(tag, name) for name in ("id", "name", "created", "changed", "owner", "project")}

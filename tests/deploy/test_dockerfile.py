@@ -248,8 +248,6 @@ ptxas info    : Function properties for small_00000000_cuda_kernel_forward
     0 bytes stack frame, 0 bytes spill stores, 0 bytes spill loads
 ptxas info    : Used 12 registers, used 0 barriers
 """
-
-
 FEASIBLE = Kernel("simulation.kernels.surface", "gather", 90, 71, 0, 0)
 
 

@@ -66,7 +66,7 @@ def redis(settings: Settings) -> Finding:
         return skipped(f"no service runs on this data folder; `graspd up` starts the Redis of {rung}")
     try:
         with redis_connection(settings) as client:
-            return _check_redis(settings, client, _info(client))
+            return _check_redis(settings, client, dict(client.info()))
     except (RedisError, OSError) as error:
         return bad(f"{_shown(settings)} does not answer: {_line(error)}", _fix(error, settings))
 
@@ -119,7 +119,7 @@ def persistence(settings: Settings) -> Finding:
         return skipped("no service runs on this data folder; the Redis of `graspd up` keeps a log of writes")
     try:
         with redis_connection(settings) as client:
-            info = _info(client)
+            info = dict(client.info())
     except (RedisError, OSError):
         return skipped("Redis does not answer")
     fix = "make room on the disk of Redis and see its log; then redis-cli bgrewriteaof"
@@ -134,10 +134,6 @@ def persistence(settings: Settings) -> Finding:
         "the log of writes is off: after a crash nothing runs until the controller has queued everything again",
         "redis-cli config set appendonly yes, and `appendonly yes` in its configuration",
     )
-
-
-def _info(client: Redis) -> dict[str, Any]:
-    return dict(client.info())
 
 
 def _shown(settings: Settings) -> str:

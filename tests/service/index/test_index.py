@@ -339,8 +339,6 @@ SEARCHED = [
     GraspFilter(hand="gripper", object="ball"),
     GraspFilter(hand="gripper", object="cube"),
 ]
-
-
 WAYS: list[tuple[int, tuple[int, ...]]] = [(1000, (8, 16)), (0, (8, 16)), (0, (1000,))]
 
 

@@ -148,8 +148,6 @@ def test_what_is_not_done_is_due_at_once(work: Callable[[], object]) -> None:
 
 
 WorkOff = Callable[[], list[tuple[str, int]]]
-
-
 LARGE = 32 * (2 * RANGES_AT_ONCE + 1)
 
 

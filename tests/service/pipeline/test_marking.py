@@ -190,8 +190,6 @@ def cancelled(services: Services) -> str:
 
 
 NOBODYS: dict[str, Any] = {"project": "", "owner": "", "permit": lambda tag: None}
-
-
 #: What is there before, and what a user does then, given the id of that.
 ACTS: dict[str, tuple[Callable[[Services], str | object], Callable[[Services, str], object]]] = {
     "submit": (lambda services: "", lambda services, _: job_actions.submit(services, request())),

@@ -168,6 +168,14 @@ def test_a_dataset_that_found_fewer_grasps_tells_the_outcomes(either: Services) 
     assert "3 slipped;" in reasons[0] and f"2 {OUTCOMES['turned']}, 1 slipped;" in reasons[1]
 
 
+def test_datasets_come_newest_first_in_pages(services: Services) -> None:
+    for name in ("a", "b", "c"):
+        actions.create(services, wanted(name))
+    first = services.index.datasets.page(limit=2)
+    rest = services.index.datasets.page(limit=2, cursor=first.next)
+    assert sorted(view.name for view in first.items + rest.items) == ["a", "b", "c"] and rest.next is None
+
+
 def test_cells_come_in_pages_and_by_state(either: Services) -> None:
     actions.create(either, wanted(objects=("ball", "cube", "cone")))
     plan_all(either)
