@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import threading
 from typing import Any
 
@@ -311,6 +312,19 @@ def test_a_check_queued_meanwhile_is_queued_once(bench: Bench, monkeypatch: pyte
     monkeypatch.setattr(MemoryQueue, "leases", lambda _: [])
     bench.controller._look_after_queue()
     assert bench.queue.waiting() == set(), "the worker's check waits a second time"
+
+
+def test_an_upload_is_checked_and_what_was_found_is_indexed(bench: Bench) -> None:
+    add_upload(bench)
+
+    def check(message: IngestMessage, context: TaskContext) -> None:
+        found = {"verdict": "repair", "message": "one hole closed", "repairs": ["hole"], "facts": {"faces": 12}}
+        context.store.put(names.asset_check(message.kind, message.digest), json.dumps(found).encode())
+
+    bench.work_off(ingest=check)
+    view = bench.services.index.assets.get(AssetKind.HAND, "upload")
+    assert (view.verdict, view.repairs, view.facts) == ("repair", ["hole"], {"faces": 12})
+    assert differences(bench.services.index, bench.services.store) == []
 
 
 def test_a_check_that_failed_is_told_and_tried_again(bench: Bench) -> None:
