@@ -53,7 +53,7 @@ def fill(index: Index, store: Store, *, grasps: int = 1_000_000, jobs: int = 100
     Returns:
         number of rows of each table.
     """
-    if index.feed.has_jobs():
+    if index.jobs.page(limit=1).items:
         raise SystemExit("the index is not empty; give another data folder or database")
     for asset in publish_builtins(store):
         index.write.add_asset(asset, {"verdict": "accept", "message": "", "repairs": [], "facts": {}})

@@ -52,7 +52,7 @@ def doctor(
     counts = {condition: sum(one.condition is condition for one in found) for condition in Condition}
     is_well = counts[Condition.BAD] == 0
     if json:
-        told = [{**dataclasses.asdict(one), "ok": one.ok} for one in found]
+        told = [{"name": one.name, **dataclasses.asdict(one), "ok": one.ok} for one in found]
         emit({"ok": is_well, "checks": told, **{condition.value: number for condition, number in counts.items()}})
     else:
         typer.echo(", ".join(f"{number} {condition.value}" for condition, number in counts.items() if number), err=True)
@@ -90,7 +90,7 @@ def _of_worker(settings: Settings) -> list[Check]:
 
 
 def _absent(name: str, extra: str) -> Check:
-    return Check(name, lambda: skipped(name, f"graspd[{extra}] is not part of this install"))
+    return Check(name, lambda: skipped(f"graspd[{extra}] is not part of this install"))
 
 
 def _chosen(checks: list[Check], only: str | None) -> list[Check]:

@@ -142,7 +142,7 @@ def record_of(services: Services, job: str) -> JobRecord:
 def make_task(services: Services, job: JobRecord, task: PlannedTask, **info: Any) -> ShardManifest:
     """A task of a job done on the spot, in store and index; the index believes `info` in its manifest."""
     made = make_shard(services.store, message_of(job, task, attempt=1, max_attempt=3))
-    services.index.write.add_manifest(made.model_copy(update={"info": info}) if info else made)
+    services.index.write.add_manifests([made.model_copy(update={"info": info}) if info else made])
     return made
 
 

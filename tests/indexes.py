@@ -12,7 +12,11 @@ from typing import Final
 from sqlalchemy import URL, Connection, create_engine, make_url, text
 
 from graspd.service.index.index import Index
-from graspd.service.settings import sqlite_url
+from graspd.service.pipeline.backends import Services
+from graspd.service.queue.rq_queue import RqQueue
+from graspd.service.settings import Settings, sqlite_url
+from graspd.service.store.store import Store, open_store
+from tests.memory_queue import MemoryQueue
 from tests.servers import PostgresServer, schema_of
 
 #: Tables of a schema that hold pages, but for the one that names the revision.
@@ -29,6 +33,12 @@ def empty_index(url: str | URL) -> Index:
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_bytes(_made())
     return Index(url)
+
+
+def open_services(settings: Settings, store: Store | None = None, queue: RqQueue | None = None) -> Services:
+    """Services of the settings; the queue is in memory. Where there is no index, an empty one is made."""
+    index = empty_index(settings.resolved_index_url)
+    return Services(settings, store or open_store(settings.resolved_store_url), index, queue or MemoryQueue())
 
 
 @cache

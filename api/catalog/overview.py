@@ -35,7 +35,7 @@ from graspd.service.model.projects import ProjectScope
 from graspd.service.model.states import Priority, Stage
 from graspd.service.pipeline import deletion
 from graspd.service.pipeline.backends import Services
-from graspd.service.pipeline.identity import check_queue
+from graspd.service.pipeline.identity import check_service
 from graspd.service.pipeline.leading import PART
 from graspd.service.queue.port import QueueStatus
 from graspd.service.store.records import Deletion, What, deletions
@@ -200,7 +200,7 @@ class Probes:
         part, service = _answering(self._services.queue.ping()), self._services.queue.service()
         if service != self._service:
             try:
-                check_queue(self._services.store, self._services.queue)
+                check_service(self._services.store, service)
             except BusyError as error:
                 return part.model_copy(update={"ok": False, "detail": str(error)})
             except StoreUnavailable:

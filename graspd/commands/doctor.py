@@ -52,24 +52,22 @@ def gpu(settings: Settings, *, child: Child = run_child, has_driver: Callable[[]
         child: runs this module.
         has_driver: whether the machine appears to have a GPU.
     """
-    name = "gpu"
     found, wrong = _answer(child, ["gpus"])
     if wrong:
         return bad(
-            name, f"the GPUs cannot be queried: {wrong}", "see nvidia-smi and dmesg; restart the driver or the machine"
+            f"the GPUs cannot be queried: {wrong}", "see nvidia-smi and dmesg; restart the driver or the machine"
         )
     gpus: list[dict[str, Any]] = found["gpus"]
     needed = f"the driver has CUDA {_dotted(found['driver'])}, Warp is built for {_dotted(found['toolkit'])}"
     fix = "a driver of R580 or newer; in containers the NVIDIA container toolkit and --gpus all; CUDA_VISIBLE_DEVICES"
     if not gpus:
         if settings.device.startswith("cuda"):
-            return bad(name, f"GRASPD_DEVICE is {settings.device}, and no GPU is found; {needed}", fix)
+            return bad(f"GRASPD_DEVICE is {settings.device}, and no GPU is found; {needed}", fix)
         if (has_driver or _has_driver)():
-            return bad(name, f"this machine has an NVIDIA driver, and no GPU can be used; {needed}", fix)
-        return good(name, "none; work runs on the CPU")
+            return bad(f"this machine has an NVIDIA driver, and no GPU can be used; {needed}", fix)
+        return good("none; work runs on the CPU")
     if settings.device.startswith("cuda") and settings.device not in [one["name"] for one in gpus]:
         return bad(
-            name,
             f"GRASPD_DEVICE is {settings.device}, there are {', '.join(one['name'] for one in gpus)}",
             "set it to one of these, or auto",
         )
@@ -78,27 +76,23 @@ def gpu(settings: Settings, *, child: Child = run_child, has_driver: Callable[[]
     )
     if full := [one["name"] for one in gpus if one["free"] < _MEMORY_LOW]:
         return warning(
-            name, line, f"see nvidia-smi: other processes fill {',  '.join(full)}; launches are halved until they fit"
+            line, f"see nvidia-smi: other processes fill {',  '.join(full)}; launches are halved until they fit"
         )
-    return good(name, f"{line}; {needed}")
+    return good(f"{line}; {needed}")
 
 
 def kernels(settings: Settings, *, child: Child = run_child) -> Finding:
     """Check that the engine gives plausible results, as a worker does before its first task."""
-    name = "kernels"
     found, wrong = _answer(child, ["kernels", settings.device])
     if wrong:
         return bad(
-            name,
             f"the engine does not run: {wrong}",
             "pip install 'graspd[worker]'; see disk and memory; dmesg lists killed processes",
         )
     if found["error"]:
         fix = f"see the message; for a damaged cache remove {found['cache']}"
-        return bad(name, f"on {found['device']}: {found['error']}", fix)
-    return good(
-        name, f"plausible grasps, scenes and pictures of a ball on {found['device']}; kernel cache {found['cache']}"
-    )
+        return bad(f"on {found['device']}: {found['error']}", fix)
+    return good(f"plausible grasps, scenes and pictures of a ball on {found['device']}; kernel cache {found['cache']}")
 
 
 def _answer(child: Child, arguments: Sequence[str]) -> tuple[dict[str, Any], str]:

@@ -18,7 +18,21 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
-from sqlalchemy import URL, Connection, Engine, MetaData, create_engine, event, inspect, make_url, text
+from sqlalchemy import (
+    URL,
+    ColumnElement,
+    Connection,
+    Engine,
+    MetaData,
+    RowMapping,
+    Select,
+    create_engine,
+    event,
+    inspect,
+    make_url,
+    select,
+    text,
+)
 from sqlalchemy.exc import ArgumentError, DataError, NoSuchModuleError, SQLAlchemyError
 
 from graspd.service.index.tables import grasps, metadata
@@ -47,11 +61,7 @@ class Database:
     """An engine, with reads and writes as context managers."""
 
     def __init__(self, url: str | URL, *, anew: bool = False) -> None:
-        """Connect, and make the tables of an empty database.
-
-        Args:
-            url: an SQLAlchemy URL.
-            anew: replace the tables of another revision; the caller adds the rows.
+        """Connect, and make the tables of an empty database; `anew` replaces those of another revision.
 
         Raises:
             InputError: the URL names no known database.
@@ -72,8 +82,11 @@ class Database:
             self._engine = self._open()
 
     @contextmanager
-    def reading(self) -> Iterator[Connection]:
-        """Yield a connection for queries, which all see the same snapshot."""
+    def reading(self, within: Connection | None = None) -> Iterator[Connection]:
+        """Yield a connection for queries, which all see the same snapshot, or the given one."""
+        if within is not None:
+            yield within
+            return
         with self._fixed(), self._present().connect() as connection:
             if connection.dialect.name == "sqlite":
                 connection.exec_driver_sql("BEGIN")
@@ -101,25 +114,30 @@ class Database:
             yield connection
             connection.commit()
 
+    def rows(self, query: Select[Any], within: Connection | None = None) -> Sequence[RowMapping]:
+        with self.reading(within) as connection:
+            return connection.execute(query).mappings().all()
+
+    def column(self, query: Select[Any], within: Connection | None = None) -> list[Any]:
+        """Return the first column of the rows."""
+        with self.reading(within) as connection:
+            return list(connection.scalars(query))
+
+    def value(self, query: Select[Any], within: Connection | None = None) -> Any:
+        """Return the first column of the first row; None without rows."""
+        with self.reading(within) as connection:
+            return connection.scalar(query)
+
     def ping(self) -> float:
         """Return the seconds that a query takes."""
         start = time.perf_counter()
-        with self.reading() as connection:
-            connection.execute(text("SELECT 1"))
+        self.value(select(1))
         return time.perf_counter() - start
 
     def close(self) -> None:
-        """Close the connections."""
         self._engine.dispose()
 
-    def set_aside(self) -> None:
-        """Move the file of the index away and start with an empty one; do nothing without a file."""
-        if self._file is not None:
-            self._put_aside()
-            self._present()
-
     def _open(self) -> Engine:
-        """Return an engine on the present file, which is made if needed."""
         engine = _engine(self._url)
         try:
             with mapped(), self._file.opening() if self._file is not None else nullcontext():
@@ -160,9 +178,24 @@ class Database:
                 self._file.set_aside(self._identity)
 
 
+class IndexPart:
+    """Reads or writes of one subject."""
+
+    def __init__(self, database: Database) -> None:
+        self.database = database
+
+
 def chunks(ids: Sequence[T], size: int = 1000) -> Iterable[Sequence[T]]:
     """Yield ids in parts for one statement each: databases limit the number of parameters."""
     return (ids[start : start + size] for start in range(0, len(ids), size))
+
+
+def rows_among(
+    connection: Connection, query: Select[Any], column: ColumnElement[Any], wanted: Iterable[Any], size: int = 1000
+) -> Iterator[Any]:
+    """Yield the rows whose column has one of the wanted values, for any number of these."""
+    for some in chunks(list(wanted), size):
+        yield from connection.execute(query.where(column.in_(some)))
 
 
 def _file_of(url: str | URL) -> SqliteFile | None:

@@ -22,16 +22,10 @@ GROUP: Final = 20_000
 
 
 def export(database: Database, folder: Path) -> dict[str, int]:
-    """Write each of `TABLES` as `folder/NAME.parquet`, from one snapshot; replace existing files.
+    """Write each of `TABLES` as `folder/NAME.parquet`, from one snapshot; return the number of rows of each.
 
-    Integers are int64, other numbers float64, JSON is text; rows are in the order of their primary key.
-
-    Returns:
-        number of rows of each table.
-
-    Raises:
-        InputError: pyarrow is not installed.
-        IndexUnavailable: the database is unavailable.
+    Integers are int64, other numbers float64, JSON is text; rows are in the order of their primary key. InputError:
+    pyarrow is not installed.
     """
     # Before the query, so that a missing package is reported at once.
     schemas = {name: schema_of({c.name: _word(c) for c in table.columns}) for name, table in TABLES.items()}

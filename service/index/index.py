@@ -28,7 +28,6 @@ class Index:
     """
 
     def __init__(self, url: str | URL, *, anew: bool = False) -> None:
-        """Connect; errors as in `Database`."""
         self.database = database = Database(url, anew=anew)
         # Read-only parts.
         self.jobs = Jobs(database)
@@ -55,5 +54,4 @@ class Index:
         self.tags = Tags(database)
 
     def close(self) -> None:
-        """Close the connections."""
         self.database.close()

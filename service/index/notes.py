@@ -9,7 +9,7 @@ from typing import Any, Final
 from sqlalchemy import Connection, delete, func, select
 
 from graspd.service.index.bulk import upsert
-from graspd.service.index.database import Database
+from graspd.service.index.database import IndexPart
 from graspd.service.index.tables import damage, notes
 from graspd.service.model.clock import timestamp
 
@@ -31,7 +31,6 @@ class IndexCompleteness:
     left_out: int = 0
     """Damaged records of the store that are not in the index."""
     names: tuple[str, ...] = ()
-    """The first of their names."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +42,6 @@ class StoreMark:
     before: str = ""
     """Previous mark of the store during an update; otherwise the same."""
     changes: int = 0
-    """Number of changes at that time."""
 
 
 @dataclass(frozen=True)
@@ -54,37 +52,22 @@ class ScanNote:
     ended: str = ""
     """End of the round; empty while it runs."""
     folder: int = 0
-    """Position in the list of folders."""
     after: str = ""
-    """Last scanned key of that folder."""
 
 
-@dataclass(frozen=True)
-class Notes:
-    """Notes of the service for itself."""
-
-    database: Database
-
+class Notes(IndexPart):
     def completeness(self) -> IndexCompleteness | None:
         """Return the completeness, None while a new index may lack records of the store."""
-        with self.database.reading() as connection:
-            value: Any = connection.scalar(select(notes.c.value).where(notes.c.name == _REBUILT))
+        value = self._get(_REBUILT)
         return None if value is None else IndexCompleteness(value["at"], value["left_out"], tuple(value["names"]))
 
     def set_complete(self, left_out: Sequence[str] = (), *, within: Connection | None = None) -> None:
-        """Mark the index as complete, except for these records."""
         value = {"at": timestamp(), "left_out": len(left_out), "names": list(left_out[:_NAMED])}
-        with self.database.writing(within) as connection:
-            upsert(connection, notes, [{"name": _REBUILT, "value": value}])
+        self._set(_REBUILT, value, within)
 
     def service(self, *, within: Connection | None = None) -> str | None:
         """Return the id of the index's service; None for a new one."""
-        query = select(notes.c.value).where(notes.c.name == _SERVICE)
-        if within is not None:
-            value: Any = within.scalar(query)
-        else:
-            with self.database.reading() as connection:
-                value = connection.scalar(query)
+        value = self._get(_SERVICE, within)
         return None if value is None else str(value["id"])
 
     def name_service(self, identity: str, *, instead: bool = False) -> str:
@@ -92,72 +75,57 @@ class Notes:
         with self.database.writing() as connection:
             known = None if instead else self.service(within=connection)
             if known is None:
-                upsert(connection, notes, [{"name": _SERVICE, "value": {"id": identity}}])
+                self._set(_SERVICE, {"id": identity}, connection)
         return known or identity
 
     def set_incomplete(self) -> None:
-        """Mark the index as incomplete; the controller rebuilds it."""
         with self.database.writing() as connection:
             connection.execute(delete(notes).where(notes.c.name == _REBUILT))
 
     def count_change(self, *, within: Connection) -> None:
-        """Count a change: a user's record was put."""
-        number = int(within.scalar(select(notes.c.value).where(notes.c.name == _CHANGES)) or 0)
-        upsert(within, notes, [{"name": _CHANGES, "value": number + 1}])
+        self._set(_CHANGES, int(self._get(_CHANGES, within) or 0) + 1, within)
 
     def changes(self) -> int:
-        """Return the number of changes."""
-        with self.database.reading() as connection:
-            value: Any = connection.scalar(select(notes.c.value).where(notes.c.name == _CHANGES))
-        return int(value or 0)
+        return int(self._get(_CHANGES) or 0)
 
     def marked(self) -> StoreMark:
-        """Return the mark of the index."""
-        with self.database.reading() as connection:
-            value: Any = connection.scalar(select(notes.c.value).where(notes.c.name == _MARK))
-        return StoreMark(**value) if value else StoreMark()
+        return StoreMark(**(self._get(_MARK) or {}))
 
     def set_marked(self, marked: StoreMark, *, within: Connection | None = None) -> None:
-        with self.database.writing(within) as connection:
-            upsert(connection, notes, [{"name": _MARK, "value": asdict(marked)}])
+        self._set(_MARK, asdict(marked), within)
 
     def scan_note(self) -> ScanNote:
-        """Return the progress of the scan; defaults before the first one."""
-        with self.database.reading() as connection:
-            value: Any = connection.scalar(select(notes.c.value).where(notes.c.name == _SCAN))
-        return ScanNote(**value) if value else ScanNote()
+        return ScanNote(**(self._get(_SCAN) or {}))
 
     def set_scan_note(self, note: ScanNote) -> None:
-        with self.database.writing() as connection:
-            upsert(connection, notes, [{"name": _SCAN, "value": asdict(note)}])
+        self._set(_SCAN, asdict(note))
 
     def take_scan_turn(self, holder: str, *, is_controller: bool, lasts_s: float) -> bool:
         """Take or renew the right to read through the whole store; return False if another holder has it.
 
-        Args:
-            holder: name of the caller.
-            is_controller: a controller yields to other callers.
-            lasts_s: validity after the last call [s].
+        A controller yields to other callers. The right lasts `lasts_s` after the last call [s].
         """
         with self.database.writing() as connection:
-            held: Any = connection.scalar(select(notes.c.value).where(notes.c.name == _SCAN_TURN))
-            if (
-                held
-                and held["holder"] != holder
-                and held["until"] > timestamp()
-                and (is_controller or not held["controller"])
-            ):
+            held = self._get(_SCAN_TURN, connection)
+            others = held and held["holder"] != holder and held["until"] > timestamp()
+            if others and (is_controller or not held["controller"]):
                 return False
             value = {"holder": holder, "controller": is_controller, "until": timestamp(-lasts_s)}
-            upsert(connection, notes, [{"name": _SCAN_TURN, "value": value}])
+            self._set(_SCAN_TURN, value, connection)
         return True
 
     def end_scan_turn(self, holder: str) -> None:
-        """Release the right if the caller has it."""
         with self.database.writing() as connection:
-            held: Any = connection.scalar(select(notes.c.value).where(notes.c.name == _SCAN_TURN))
+            held = self._get(_SCAN_TURN, connection)
             if held and held["holder"] == holder:
                 connection.execute(delete(notes).where(notes.c.name == _SCAN_TURN))
+
+    def _get(self, name: str, within: Connection | None = None) -> Any:
+        return self.database.value(select(notes.c.value).where(notes.c.name == name), within)
+
+    def _set(self, name: str, value: Any, within: Connection | None = None) -> None:
+        with self.database.writing(within) as connection:
+            upsert(connection, notes, [{"name": name, "value": value}])
 
 
 @dataclass(frozen=True)
@@ -170,11 +138,8 @@ class Damage:
     found: str = ""
 
 
-@dataclass(frozen=True)
-class KnownDamage:
+class KnownDamage(IndexPart):
     """Objects of the store that were found damaged or missing, and not fixed since."""
-
-    database: Database
 
     def known(self, *, limit: int = 100) -> tuple[int, list[Damage]]:
         """Return the number of damaged objects that are not fixed, and the first of them."""
@@ -185,7 +150,6 @@ class KnownDamage:
             return count, [Damage(row["key"], row["what"], row["shard"], row["found"]) for row in rows]
 
     def mark(self, found: Sequence[Damage], *, intact: Sequence[str] = ()) -> None:
-        """Record damaged objects, and others that are intact."""
         rows = [{"key": one.key, "what": one.what, "shard": one.shard, "found": timestamp()} for one in found]
         with self.database.writing() as connection:
             upsert(connection, damage, rows, keep=("found",))

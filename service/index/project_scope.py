@@ -1,37 +1,31 @@
-"""Common parts of queries: conditions of the caller's scope, and opaque keyset cursors of pages."""
+"""Common parts of queries: conditions of the caller's scope, and pages with opaque keyset cursors."""
 
 from __future__ import annotations
 
 import base64
 import json
+from collections.abc import Sequence
 from typing import Any, Final
 
 from pydantic_core import from_json
-from sqlalchemy import ColumnElement, Select, case, exists, or_, select
+from sqlalchemy import Column, ColumnElement, Connection, RowMapping, Select, Table, case, exists, or_, select, tuple_
 
-from graspd.service.index.tables import assets, attempts, datasets, jobs, object_sets, tags, tasks
+from graspd.service.index.tables import assets, jobs, tasks
 from graspd.service.model.errors import InputError
 from graspd.service.model.projects import ProjectScope
 
 Tests = tuple[ColumnElement[bool], ...]
 
 
-def seen_jobs(scope: ProjectScope) -> Tests:
-    """Return the conditions on jobs, or on tables joined to them."""
-    return () if scope.everything else (jobs.c.project == scope.project,)
+def seen(scope: ProjectScope, table: Table) -> Tests:
+    """Return the conditions on a table with projects, or on tables joined to it."""
+    return () if scope.everything else (table.c.project == scope.project,)
 
 
-def seen_datasets(scope: ProjectScope) -> Tests:
-    return () if scope.everything else (datasets.c.project == scope.project,)
-
-
-def seen_sets(scope: ProjectScope) -> Tests:
-    """Return the conditions on sets of objects."""
-    return () if scope.everything else (object_sets.c.project == scope.project,)
-
-
-def seen_tags(scope: ProjectScope) -> Tests:
-    return () if scope.everything else (tags.c.project == scope.project,)
+def seen_with_job(scope: ProjectScope, table: Table) -> Tests:
+    """Return the conditions on a table of parts of jobs."""
+    of_project = select(jobs.c.id).where(jobs.c.project == scope.project)
+    return () if scope.everything else (table.c.job_id.in_(of_project),)
 
 
 def seen_assets(scope: ProjectScope) -> Tests:
@@ -47,31 +41,33 @@ def nearest_asset(scope: ProjectScope) -> ColumnElement[int]:
     return case((assets.c.project == scope.project, 0), (shared, 1), else_=2)
 
 
-def seen_tasks(scope: ProjectScope) -> Tests:
-    return () if scope.everything else (tasks.c.job_id.in_(jobs_of(scope)),)
-
-
-def seen_attempts(scope: ProjectScope) -> Tests:
-    """Return the conditions on failed attempts."""
-    return () if scope.everything else (attempts.c.job_id.in_(jobs_of(scope)),)
-
-
 def seen_shards(scope: ProjectScope, shard: ColumnElement[Any]) -> Tests:
     """Return the conditions on shard ids: those that a job of the project makes or reuses."""
-    if scope.everything:
-        return ()
     wanted = (tasks.c.shard_id == shard, tasks.c.job_id == jobs.c.id, jobs.c.project == scope.project)
-    return (exists().where(*wanted),)
-
-
-def jobs_of(scope: ProjectScope) -> Select[tuple[str]]:
-    """Return the ids of the project's jobs."""
-    return select(jobs.c.id).where(jobs.c.project == scope.project)
+    return () if scope.everything else (exists().where(*wanted),)
 
 
 MAX_LIMIT: Final = 200
 #: Upper bound of whole numbers in all databases.
 _MOST: Final = 2**63
+
+
+def page_rows(
+    connection: Connection,
+    query: Select[Any],
+    *key: Column[Any],
+    limit: int,
+    cursor: str | None,
+    descending: bool = True,
+) -> tuple[Sequence[RowMapping], str | None]:
+    """Return the rows of a page in the order of a key, and the cursor of the next page; InputError as in `decode`."""
+    size = page_size(limit)
+    if cursor is not None:
+        start = decode(cursor, *(part.type.python_type for part in key))
+        query = query.where(tuple_(*key) < start if descending else tuple_(*key) > start)
+    query = query.order_by(*(part.desc() if descending else part for part in key)).limit(size + 1)
+    rows = connection.execute(query).mappings().all()
+    return rows[:size], encode(*(rows[size - 1][part.key] for part in key)) if len(rows) > size else None
 
 
 def encode(*key: Any) -> str:

@@ -6,17 +6,18 @@ import logging
 import tempfile
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
-from sqlalchemy import Connection, Table, delete, select
+from sqlalchemy import Connection, Table, delete, select, update
 from sqlalchemy.exc import DataError
 
 from graspd.service.index.changes.rows import QUIET
 from graspd.service.index.index import Index
 from graspd.service.index.notes import StoreMark
-from graspd.service.index.tables import LIVE_COLUMNS, LIVE_TABLES, metadata
+from graspd.service.index.outbox import last_end
+from graspd.service.index.tables import LIVE_COLUMNS, LIVE_TABLES, datasets, metadata, webhooks
 from graspd.service.model import names
 from graspd.service.model.errors import DamagedError, InputError, NotFoundError
 from graspd.service.model.records import (
@@ -39,7 +40,7 @@ from graspd.service.store.records import newest_mark, parse_record, pending
 from graspd.service.store.store import Store
 
 log = logging.getLogger(__name__)
-EventT = TypeVar("EventT", bound=Record)
+RecordT = TypeVar("RecordT", bound=Record)
 #: Exceptions for an invalid record, here or in the database; none of them means an unavailable backend.
 _OF_THE_RECORD: Final = (DamagedError, InputError, DataError, ValueError, TypeError, LookupError, ArithmeticError)
 #: Concurrent reads, to hide the latency of a remote store.
@@ -47,16 +48,15 @@ _READERS: Final = 16
 _SHOWN_DIFFERENCES: Final = 50
 
 
-def rebuild(index: Index, store: Store, *, progress: Callable[[str, int], None] | None = None) -> dict[str, int]:
+#: Called with the kind of records and the number read so far.
+Progress = Callable[[str, int], object]
+
+
+def rebuild(index: Index, store: Store, *, progress: Progress = lambda what, number: None) -> dict[str, int]:
     """Replace all rows by those derived from the store. The old rows stay until all new ones exist.
 
-    A damaged record is omitted and named in the log and in `index.notes.completeness()`; the others are read.
-
-    Args:
-        progress: called with the kind of records and the number read so far.
-
-    Returns:
-        number of jobs, attempts, shards, assets, datasets, snapshots and object sets read, and of omitted records.
+    A damaged record is omitted and named in the log and in `index.notes.completeness()`. Return the number of records
+    read of each kind, and of omitted ones.
     """
     with index.database.writing() as connection:
         connection.execution_options(**{QUIET: True})
@@ -78,16 +78,14 @@ def rebuild(index: Index, store: Store, *, progress: Callable[[str, int], None] 
 class _Rebuild:
     """One rebuild: each record has its own savepoint, so that an invalid one leaves no rows."""
 
-    def __init__(
-        self, index: Index, store: Store, connection: Connection, progress: Callable[[str, int], None] | None
-    ) -> None:
+    def __init__(self, index: Index, store: Store, connection: Connection, progress: Progress) -> None:
         self._index, self._store, self._connection, self._progress = index, store, connection, progress
         self.counts = dict.fromkeys(("assets", "jobs", "attempts", "shards", "datasets", "snapshots", "object_sets"), 0)
         self.left_out: list[str] = []
         self._gone = pending(store)
-        self._last = index.outbox.last(within=connection)
-        self._seen = index.outbox.seen(within=connection)
-        self._told = index.outbox.told(within=connection)
+        self._last = last_end(connection)
+        self._seen = {row.id: row.seen for row in connection.execute(select(webhooks))}
+        self._told = {row.name: row.told for row in connection.execute(select(datasets))}
 
     def assets(self) -> None:
         for kind, digest in stored_assets(self._store):
@@ -104,62 +102,58 @@ class _Rebuild:
                 record = parse_record(JobRecord, data, key)
                 self._index.write.add_job(record, within=self._connection)
                 known.append(record.id)
-        attempts = []
-        for key, data in self._read(names.TASKS, lambda key: key.endswith(".json")):
-            with self._each(key):
-                attempts.append(parse_record(AttemptRecord, data, key))
+        attempts = self._parsed(AttemptRecord, names.TASKS)
         for attempt in sorted(attempts, key=lambda attempt: attempt.number):
             with self._each(names.attempt(attempt.task_id, attempt.number), "attempts"):
                 self._index.write.add_attempt(attempt, within=self._connection)
         for job in known:
-            if events := self._events(JobEvent, names.job_events(job)):
+            if events := self._parsed(JobEvent, names.job_events(job)):
                 self._index.write.set_job_events(job, events, within=self._connection)
 
     def shards(self) -> None:
-        for key, data in self._read(names.SHARDS, lambda key: key.endswith(".json")):
+        for key, data in self._read(names.SHARDS):
             with self._each(key, "shards"):
                 self._index.write.add_manifests([parse_record(ShardManifest, data, key)], within=self._connection)
 
     def datasets(self) -> None:
-        """Read datasets with users' actions, snapshots, sets of objects."""
         for key, data in self._read(names.DATASETS, lambda key: key.endswith("/dataset.json")):
             with self._each(key, "datasets"):
                 record = parse_record(DatasetRecord, data, key)
                 self._index.write_dataset.add(record, within=self._connection)
-                if events := self._events(DatasetEvent, names.dataset_events(record.name)):
+                if events := self._parsed(DatasetEvent, names.dataset_events(record.name)):
                     self._index.write_dataset.set_events(record.name, events, within=self._connection)
-        ended = self._index.datasets.ended(within=self._connection)
-        self._index.outbox.set_told(ended | self._told, within=self._connection)
+        told = self._index.datasets.ended(within=self._connection) | self._told
+        for name, events in told.items():
+            self._connection.execute(update(datasets).where(datasets.c.name == name).values(told=events))
         for key, data in self._read(names.DATASETS, lambda key: "/snapshots/" in key):
             with self._each(key, "snapshots"):
                 self._index.write_dataset.add_snapshot(parse_record(Snapshot, data, key), within=self._connection)
-        for key, data in self._read(names.OBJECT_SETS, lambda key: key.endswith(".json")):
+        for key, data in self._read(names.OBJECT_SETS):
             with self._each(key, "object_sets"):
                 self._index.write_dataset.add_object_set(parse_record(ObjectSet, data, key), within=self._connection)
 
     def webhooks(self) -> None:
-        for key, data in self._read(names.WEBHOOKS, lambda key: key.endswith(".json")):
-            with self._each(key):
-                hook = parse_record(Webhook, data, key)
-                seen = self._seen.get(hook.id, self._last)
-                self._index.outbox.add(hook, seen=seen, within=self._connection)
+        for hook in self._parsed(Webhook, names.WEBHOOKS):
+            with self._each(names.webhook(hook.id)):
+                self._index.outbox.add(hook, seen=self._seen.get(hook.id, self._last), within=self._connection)
 
     def tags(self) -> None:
         """Read the last version of each tag: earlier ones remain from interrupted changes."""
-        found = sorted(self._read(names.TAGS, lambda key: key.endswith(".json")))
-        last = {key.rpartition("/")[0]: (key, data) for key, data in found}
+        last = {key.rpartition("/")[0]: (key, data) for key, data in sorted(self._read(names.TAGS))}
         for key, data in last.values():
             with self._each(key):
                 self._index.tags.put(parse_record(Tag, data, key), within=self._connection)
 
-    def _events(self, model: type[EventT], prefix: str) -> list[EventT]:
+    def _parsed(self, model: type[RecordT], prefix: str) -> list[RecordT]:
         found = []
-        for key, data in sorted(self._read(prefix, lambda key: True)):
+        for key, data in sorted(self._read(prefix)):
             with self._each(key):
                 found.append(parse_record(model, data, key))
         return found
 
-    def _read(self, prefix: str, wanted: Callable[[str], bool]) -> Iterator[tuple[str, bytes]]:
+    def _read(
+        self, prefix: str, wanted: Callable[[str], bool] = lambda key: key.endswith(".json")
+    ) -> Iterator[tuple[str, bytes]]:
         """Yield keys and bytes of records; those removed since the listing are skipped."""
         keys = [entry.key for entry in self._store.list(prefix) if wanted(entry.key) and not self._is_gone(entry.key)]
         with ThreadPoolExecutor(_READERS) as pool:
@@ -168,7 +162,6 @@ class _Rebuild:
                     yield key, data
 
     def _is_gone(self, key: str) -> bool:
-        """Check whether it belongs to a job or dataset that a user deleted."""
         folder, _, rest = key.partition("/")
         what = {names.JOBS: "job", names.DATASETS: "dataset"}.get(folder, "")
         return (what, rest.partition("/")[0]) in self._gone
@@ -190,12 +183,10 @@ class _Rebuild:
             return
         if what is not None:
             self.counts[what] += 1
-            if self._progress is not None:
-                self._progress(what, self.counts[what])
+            self._progress(what, self.counts[what])
 
 
 def complete_if_new(index: Index, store: Store) -> None:
-    """Mark an index as complete if the store has no job yet."""
     if index.notes.completeness() is None and not any(
         True for prefix in (names.JOBS, names.DATASETS) for _ in store.list(prefix)
     ):
@@ -204,17 +195,16 @@ def complete_if_new(index: Index, store: Store) -> None:
 
 def differences(index: Index, store: Store) -> list[str]:
     """Return damaged records, then the rows that `rebuild` would change, one line each; empty if equal."""
-    with tempfile.TemporaryDirectory(prefix="graspd-index-") as folder:
-        fresh = Index(sqlite_url(Path(folder) / "index.sqlite"))
-        try:
-            rebuild(fresh, store)
-            made = fresh.notes.completeness()
-            damaged = [f"{name}: damaged, and left out" for name in made.names] if made is not None else []
-            with index.database.reading() as live, fresh.database.reading() as derived:
-                rows = [line for table in metadata.tables.values() for line in _compare(table, live, derived)]
-            return [*damaged, *rows][:_SHOWN_DIFFERENCES]
-        finally:
-            fresh.close()
+    with (
+        tempfile.TemporaryDirectory(prefix="graspd-index-") as folder,
+        closing(Index(sqlite_url(Path(folder) / "index.sqlite"))) as fresh,
+    ):
+        rebuild(fresh, store)
+        made = fresh.notes.completeness()
+        damaged = [f"{name}: damaged, and left out" for name in made.names] if made is not None else []
+        with index.database.reading() as live, fresh.database.reading() as derived:
+            rows = [line for table in metadata.tables.values() for line in _compare(table, live, derived)]
+        return [*damaged, *rows][:_SHOWN_DIFFERENCES]
 
 
 def _compare(table: Table, live: Connection, derived: Connection) -> Iterator[str]:

@@ -44,8 +44,6 @@ _TIMEOUT_S: Final = 5.0
 
 @dataclass(frozen=True)
 class Sample:
-    """The drawn ids."""
-
     shards: tuple[tuple[Stage, str], ...]
     jobs: tuple[str, ...]
 
@@ -133,11 +131,9 @@ class IndexCondition:
     """State that the database reports."""
 
     kind: str
-    """sqlite or postgresql, with its version."""
     revision: str
     """Revision of its tables; "" if it has none yet."""
     newest: str
-    """Revision of this graspd."""
     connections: tuple[int, int] = (0, 0)
     """Used and allowed connections; zeros if unknown."""
     may_write: bool = True
@@ -152,8 +148,7 @@ def look(url: str | URL) -> IndexCondition | None:
     """Return the condition of an index; None if the file of an SQLite index does not exist yet.
 
     Raises:
-        InputError: the URL names no known database, or one with another encoding than UTF-8.
-        IndexUnavailable: it is unavailable.
+        InputError, IndexUnavailable: as in `Database`.
         IndexDamaged: the file has invalid content.
     """
     try:

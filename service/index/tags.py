@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
 from typing import Final
 
 from sqlalchemy import Connection, case, delete, func, select, tuple_
 
 from graspd.service.index.bulk import upsert
-from graspd.service.index.database import Database, chunks
-from graspd.service.index.project_scope import seen_shards, seen_tags
+from graspd.service.index.database import IndexPart, rows_among
+from graspd.service.index.project_scope import seen, seen_shards
 from graspd.service.index.tables import grasps, tagged, tags
 from graspd.service.index.views import TagView
 from graspd.service.model.errors import NotFoundError
@@ -21,58 +20,41 @@ from graspd.service.model.records import Grasp, Tag
 _AT_ONCE: Final = 400
 
 
-@dataclass(frozen=True)
-class Tags:
-    """Reads and writes of tags and of their grasps."""
-
-    database: Database
-
+class Tags(IndexPart):
     def all(self, *, scope: ProjectScope = EVERYTHING) -> list[TagView]:
         """Return tags by name, with the number of existing grasps of each."""
         there = (grasps.c.shard_id == tagged.c.shard_id) & (grasps.c.row == tagged.c.row)
         number = select(func.count()).select_from(tagged.join(grasps, there)).where(tagged.c.tag == tags.c.id)
-        query = select(tags, number.scalar_subquery().label("grasps")).where(*seen_tags(scope))
-        with self.database.reading() as connection:
-            rows = connection.execute(query.order_by(tags.c.name, tags.c.project)).mappings()
-            return [TagView(**row) for row in rows]
+        query = select(tags, number.scalar_subquery().label("grasps")).where(*seen(scope, tags))
+        return [TagView(**row) for row in self.database.rows(query.order_by(tags.c.name, tags.c.project))]
 
     def named(self, name: str, *, scope: ProjectScope = EVERYTHING) -> str:
-        """Return the id of a tag by name or id; of equal names the scope's own project's.
-
-        Raises:
-            NotFoundError: no such tag is in scope.
-        """
+        """Return the id of a tag by name or id, of equal names the own project's; NotFoundError if none is in scope."""
         own_first = case((tags.c.id == name, 0), (tags.c.project == scope.project, 1), else_=2)
-        query = select(tags.c.id).where((tags.c.name == name) | (tags.c.id == name), *seen_tags(scope))
-        with self.database.reading() as connection:
-            found: str | None = connection.scalar(query.order_by(own_first, tags.c.project).limit(1))
+        query = select(tags.c.id).where((tags.c.name == name) | (tags.c.id == name), *seen(scope, tags))
+        found = self.database.value(query.order_by(own_first, tags.c.project).limit(1))
         if found is None:
             raise NotFoundError(f"there is no tag {name!r}")
-        return found
+        return str(found)
 
     def of(self, wanted: Collection[Grasp], *, scope: ProjectScope = EVERYTHING) -> dict[Grasp, list[str]]:
         """Return the names of the tags of each of these grasps that has one."""
         found: dict[Grasp, list[str]] = {}
-        query = select(tagged.c.shard_id, tagged.c.row, tags.c.name).where(tags.c.id == tagged.c.tag, *seen_tags(scope))
+        query = select(tagged.c.shard_id, tagged.c.row, tags.c.name).order_by(tags.c.name)
+        query = query.where(tags.c.id == tagged.c.tag, *seen(scope, tags))
+        key = tuple_(tagged.c.shard_id, tagged.c.row)
         with self.database.reading() as connection:
-            for some in chunks(sorted(wanted), _AT_ONCE):
-                those = tuple_(tagged.c.shard_id, tagged.c.row).in_(some)
-                for shard, row, name in connection.execute(query.where(those).order_by(tags.c.name)):
-                    found.setdefault((shard, row), []).append(name)
+            for shard, row, name in rows_among(connection, query, key, sorted(wanted), _AT_ONCE):
+                found.setdefault((shard, row), []).append(name)
         return found
 
     def there(self, wanted: Sequence[Grasp], *, scope: ProjectScope = EVERYTHING) -> set[Grasp]:
-        """Return those of the grasps that exist in scope."""
         query = select(grasps.c.shard_id, grasps.c.row).where(*seen_shards(scope, grasps.c.shard_id))
-        found: set[Grasp] = set()
+        key = tuple_(grasps.c.shard_id, grasps.c.row)
         with self.database.reading() as connection:
-            for some in chunks(wanted, _AT_ONCE):
-                rows = connection.execute(query.where(tuple_(grasps.c.shard_id, grasps.c.row).in_(some)))
-                found |= {(shard, row) for shard, row in rows}
-        return found
+            return {(shard, row) for shard, row in rows_among(connection, query, key, wanted, _AT_ONCE)}
 
     def put(self, tag: Tag, *, within: Connection | None = None) -> None:
-        """Write a tag from its record; remove a deleted one."""
         row = {name: getattr(tag, name) for name in ("id", "name", "created", "changed", "owner", "project")}
         members = [{"tag": tag.id, "shard_id": shard, "row": number} for shard, number in sorted(tag.members)]
         with self.database.writing(within) as connection:

@@ -16,8 +16,6 @@ T = TypeVar("T")
 
 
 class View(BaseModel):
-    """Base of the answers."""
-
     model_config = ConfigDict(frozen=True)
 
 
@@ -43,7 +41,6 @@ class Validated(View):
     @computed_field(description="valid grasps per validated candidate; null: not validated")  # type: ignore[prop-decorator]
     @property
     def valid_yield(self) -> float | None:
-        """Share of valid grasps among the validated ones."""
         return self.valid / self.validated if self.validated else None
 
 
@@ -83,7 +80,6 @@ class JobView(Validated):
     @computed_field(description="note on the numbers; null: none")  # type: ignore[prop-decorator]
     @property
     def note(self) -> str | None:
-        """Note on a job that ended with fewer valid (unvalidated: feasible) grasps than requested."""
         request = self.request
         found = self.valid if request.counted == "valid" else self.grasps
         if self.state is not State.SUCCEEDED or request.want != "valid":
@@ -341,7 +337,6 @@ class DatasetView(Validated):
     @computed_field(description="why it ended with fewer grasps than requested; null: it did not")  # type: ignore[prop-decorator]
     @property
     def reason(self) -> str | None:
-        """Note on a dataset that ended with fewer grasps than requested."""
         if not self.state.is_final or self.options.want != "valid":
             return None
         options = self.options

@@ -28,12 +28,8 @@ class Services:
 
         Args:
             patience: attempts to reach Redis before it counts as unavailable.
-            make: whether to create a missing store folder.
-            anew: whether to empty an index of another revision; see `Database`.
-
-        Raises:
-            NotFoundError: the store does not exist and `make` is False.
-            StoreUnavailable, IndexUnavailable: one of them cannot be opened.
+            make: create a missing store folder, else raise NotFoundError.
+            anew: empty an index of another revision; see `Database`.
         """
         from graspd.service.index.index import Index
         from graspd.service.queue.rq_queue import open_queue
@@ -43,6 +39,5 @@ class Services:
         return cls(settings, store, index, open_queue(settings, patience=patience))
 
     def close(self) -> None:
-        """Close all connections."""
         self.index.close()
         self.queue.close()

@@ -29,10 +29,9 @@ from graspd.service.pipeline.garbage_collector import GarbageCollector
 from graspd.service.pipeline.identity import identify
 from graspd.service.pipeline.indexer import Indexer
 from graspd.service.pipeline.integrity_scan import IntegrityScan
-from graspd.service.pipeline.job_actions import HELD_S, queue_tasks
+from graspd.service.pipeline.job_actions import HELD_S, Routes, queue_tasks
 from graspd.service.pipeline.leading import PART
 from graspd.service.pipeline.lease_reaper import LeaseReaper
-from graspd.service.pipeline.routes import Routes
 from graspd.service.pipeline.webhook_dispatcher import WebhookDispatcher
 from graspd.service.queue.port import Event, EventKind
 from graspd.service.store.library import publish_builtins, stored_assets
@@ -78,7 +77,6 @@ class Controller:
         self._routes = Routes()
         self._seen: dict[str, tuple[float, WorkerBeat]] = {}
         self._held: set[str] = set()
-        """Reasons why tasks were held back when the queue was last filled."""
         self._has_news = False
         """Whether events arrived since the queue was filled."""
         self._made = False
@@ -86,13 +84,10 @@ class Controller:
         self._started = False
         self._alive = HeartbeatFile(services.settings.heartbeat_file)
         self._workers = 0
-        """Number of workers at the last count."""
         self._clock = clock
         self._progress: dict[str, tuple[float, float, str]] = {}
-        """Progress of tasks at its last publication."""
         interval_s = services.settings.controller_interval_s
         self._entered = ""
-        """The large job whose tasks were entered last."""
         self._identify = PeriodicDuty(clock, lambda: identify(services, holds_redis=True), _IDENTIFY_EVERY_S)
         self._duties = [
             PeriodicDuty(clock, services.queue.tidy, _WORKERS_EVERY_S),
@@ -155,9 +150,7 @@ class Controller:
     def round(self, *, wait_s: float = 0.0) -> None:
         """Index new events, then check queue, leases and workers.
 
-        Raises:
-            UnavailableError: a backend is unavailable; the round can be run again.
-            BusyError: another service has taken over the store.
+        UnavailableError: a backend is unavailable; run it again. BusyError: another service has taken over the store.
         """
         self._identify()
         self._see_to_the_index()
@@ -304,7 +297,6 @@ class Controller:
         self._has_news = False
 
     def _feed_new(self) -> None:
-        """Queue at once the tasks that became ready by new events."""
         if self._has_news:
             self._feed()
             self._has_news = False
@@ -321,10 +313,8 @@ class Controller:
         window = max(self._services.settings.queue_window, 2 * self._workers)
         held: set[str] = set()
         for priority in Priority:
-            room = window - sum(n for (of, _), n in depths.items() if of is priority)
-            ready = (
-                self._services.index.feed.ready_tasks(priority, self._turns, now=now, limit=room) if room > 0 else []
-            )
+            room = max(0, window - sum(n for (of, _), n in depths.items() if of is priority))
+            ready = self._services.index.feed.ready_tasks(priority, self._turns, now=now, limit=room) if room else []
             if present is None:
                 held |= queue_tasks(self._services, ready, routes=self._routes)
                 continue
@@ -346,13 +336,8 @@ class Controller:
                 with _noted([]):
                     self._indexer.checked(check.kind, check.digest)
             elif ingest_id(check.kind, check.digest) not in (present or ()):
-                message = ingest_message(
-                    check.kind,
-                    check.name,
-                    check.digest,
-                    attempt=check.last_attempt + 1,
-                    max_attempt=self._services.settings.task_attempts,
-                )
+                numbers = {"attempt": check.last_attempt + 1, "max_attempt": self._services.settings.task_attempts}
+                message = ingest_message(check.kind, check.name, check.digest, **numbers)
                 place = self._routes.place(need_of(message))
                 if place.held:
                     self._services.index.live.set_asset_waiting([check.digest], queued=False, not_before=now + HELD_S)
@@ -393,7 +378,6 @@ class PeriodicDuty:
         self._again = -math.inf
 
     def __call__(self) -> None:
-        """Run it if it is due."""
         begun = self._clock()
         if begun < self._again:
             return

@@ -43,15 +43,9 @@ from graspd.service.store.store import Store
 def delete_asset(
     services: Services, kind: AssetKind, name: str, *, owner: str = "", scope: ProjectScope = EVERYTHING
 ) -> None:
-    """Delete a hand, object or network.
+    """Delete a hand, object or network; `scope` restricts what an error message names.
 
-    Args:
-        owner: id of the API key that deletes it.
-        scope: what an error message may name.
-
-    Raises:
-        NotFoundError: no asset has that name or digest.
-        ConflictError: it comes with graspd, or a job, a dataset or a set of objects needs it.
+    ConflictError: it comes with graspd, or a job, a dataset or a set of objects needs it.
     """
     asset = services.index.assets.get(kind, name)
     if asset.builtin:
@@ -62,16 +56,14 @@ def delete_asset(
                 user = "a job, a dataset or a set of objects"
             raise ConflictError(f"the {kind.value} {asset.name!r} is needed by {user}; delete that first")
         said = {"name": asset.name, "submitter": asset.owner, "project": asset.project}
-        _record(put, Deletion(what=kind.value, id=asset.digest, at=timestamp(), owner=owner, **said))
+        _put(put, Deletion(what=kind.value, id=asset.digest, at=timestamp(), owner=owner, **said))
         services.index.removals.remove_asset(kind, asset.digest, within=connection)
 
 
 def delete_job(services: Services, job_id: str, *, owner: str = "") -> None:
     """Delete a job; its shards follow after a grace time unless another job needs them.
 
-    Raises:
-        NotFoundError: the job does not exist.
-        ConflictError: it is unfinished, or a dataset contains it.
+    ConflictError: it is unfinished, or a dataset contains it.
     """
     job = services.index.jobs.get(job_id)
     try:
@@ -84,19 +76,14 @@ def delete_job(services: Services, job_id: str, *, owner: str = "") -> None:
         attempts = services.index.removals.attempts_of(job_id, within=connection)
         said = {"name": f"{job.request.hand} on {job.request.object}", "submitter": job.owner, "project": job.project}
         deletion = Deletion(what="job", id=job_id, at=timestamp(), owner=owner, job=record, attempts=attempts, **said)
-        _record(put, deletion)
+        _put(put, deletion)
         services.index.removals.remove_job(job_id, within=connection)
 
 
 def delete_dataset(services: Services, name: str, *, owner: str = "", with_snapshots: bool = False) -> None:
     """Delete a dataset; jobs that were planned for it alone follow.
 
-    Args:
-        with_snapshots: whether to delete its snapshots too.
-
-    Raises:
-        NotFoundError: the dataset does not exist.
-        ConflictError: it is unfinished, or it has snapshots and `with_snapshots` is False.
+    ConflictError: it is unfinished, or it has snapshots and `with_snapshots` is False.
     """
     dataset = services.index.datasets.get(name)
     if not dataset.state.is_final:
@@ -109,7 +96,7 @@ def delete_dataset(services: Services, name: str, *, owner: str = "", with_snaps
                 f"to delete them too: graspd datasets delete {name} --with-snapshots"
             )
         said = {"submitter": dataset.owner, "project": dataset.project}
-        _record(put, Deletion(what="dataset", id=name, at=timestamp(), owner=owner, **said))
+        _put(put, Deletion(what="dataset", id=name, at=timestamp(), owner=owner, **said))
         services.index.removals.remove_dataset(name, within=connection)
 
 
@@ -140,36 +127,26 @@ def restore(
     permit: Callable[[Deletion], None],
     among: Callable[[Deletion], bool] = lambda _: True,
 ) -> Deletion:
-    """Restore what a user deleted, unchanged; a dataset with its deleted jobs.
+    """Restore what a user deleted, by name or id, unchanged; a dataset with its deleted jobs.
 
-    Args:
-        name: name or id of the thing.
-        permit: called with the deletion; raises if it may not be restored.
-        among: whether a deletion is in scope.
-
-    Raises:
-        NotFoundError: nothing of that name was deleted within the grace time.
-        ConflictError: the name is in use again, or a dependency is deleted too.
+    `permit` raises if a deletion may not be restored; `among` tells whether it is in scope. NotFoundError: nothing of
+    that name was deleted within the grace time. ConflictError: the name is in use again, or a dependency is deleted.
     """
     known = [one for one in deletions(services.store, what) if name in (one.id, one.name) and among(one)]
     if not known:
-        raise NotFoundError(f"no {what} {name!r} was deleted in the last {_days(services.settings.shard_grace_s)}")
+        days = services.settings.shard_grace_s / 86400
+        raise NotFoundError(f"no {what} {name!r} was deleted in the last {days:.3g} days")
     permit(known[0])
     if what == "tag":
         _restore_tag(services, known[0])
         return known[0]
     with services.index.database.writing() as connection:
         connection.execution_options(**{QUIET: True})
-        if what == "dataset":
-            _restore(services, known[0], connection, before=lambda: _restore_jobs(services, known[0], connection))
-        else:
-            _restore(services, known[0], connection)
+        _restore(services, known[0], connection)
     return known[0]
 
 
-def _restore(
-    services: Services, deletion: Deletion, connection: Connection, *, before: Callable[[], None] = lambda: None
-) -> None:
+def _restore(services: Services, deletion: Deletion, connection: Connection) -> None:
     """Restore objects, then rows, then remove the deletion. Called under the index's write lock."""
     store, record, folder = services.store, _record_of(deletion), removed_folder(deletion)
     waiting = names.deletion(deletion.what, deletion.id)
@@ -180,7 +157,8 @@ def _restore(
     for key in _last([key for key in moved if key != "deletion.json"], record):
         store.move(f"{folder}/{key}", key)
     try:
-        before()
+        if deletion.what == "dataset":
+            _restore_jobs(services, deletion, connection)
         _enter(services, deletion, connection)
     except ConflictError:
         if not store.exists(waiting):
@@ -263,9 +241,5 @@ def _last(keys: Iterable[str], record: str) -> list[str]:
     return sorted(keys, key=lambda key: (key == record, key))
 
 
-def _days(seconds: float) -> str:
-    return f"{seconds / 86400:.3g} days"
-
-
-def _record(put: Put, deletion: Deletion) -> None:
+def _put(put: Put, deletion: Deletion) -> None:
     put(names.deletion(deletion.what, deletion.id), deletion)

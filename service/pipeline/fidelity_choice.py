@@ -32,8 +32,6 @@ _NEAR: Final[tuple[tuple[Near, tuple[str, ...]], ...]] = (
 
 
 class ChosenFidelity(NamedTuple):
-    """A fidelity, and the reason for it."""
-
     fidelity: str
     measured_on: Near
     reached: float
@@ -49,12 +47,10 @@ class _Chart:
 
     @cached_property
     def pairs(self) -> set[tuple[str, str]]:
-        """Hand and object of each run."""
         return {(run["hand"], run["object"]) for run in self.content["runs"]}
 
     @cached_property
     def hands(self) -> set[str]:
-        """Hands of the runs."""
         return {hand for hand, _ in self.pairs}
 
 
@@ -76,8 +72,7 @@ class Resolver:
     def choose(self, request: JobRequest) -> tuple[JobRequest, Choice | None]:
         """Return the request with `auto` replaced by a fidelity, and the reason; None without `auto`.
 
-        Raises:
-            InputError: no chart exists for its scene, or no fidelity meets the target.
+        InputError: no chart exists for its scene, or no fidelity meets the target.
         """
         if request.fidelity != AUTO:
             return request, None
@@ -90,9 +85,8 @@ class Resolver:
             method, target, hand, object_ = key
             chart.found[key] = cheapest(chart.content, target, method=method, hand=hand, object_=object_)
         found = chart.found[key]
-        how = Choice(
-            target=request.target, chart=chart.key, measured_on=found.measured_on, reached=round(found.reached, 4)
-        )
+        reached = round(found.reached, 4)
+        how = Choice(target=request.target, chart=chart.key, measured_on=found.measured_on, reached=reached)
         return request.model_copy(update={"fidelity": found.fidelity, "target": ""}), how
 
     def _chart(self, request: JobRequest) -> _Chart:
@@ -116,11 +110,7 @@ def _no_chart(request: JobRequest) -> str:
 
 
 def parse_target(text: str, *, in_scene: bool = False) -> tuple[str, float]:
-    """Parse `gsr>=0.6` into metric and bound; in a scene `lift>=0.9`.
-
-    Raises:
-        InputError: another form, an accuracy that such charts lack, or a bound that would ask for a worse grasp.
-    """
+    """Parse `gsr>=0.6` into metric and bound; in a scene `lift>=0.9`. InputError for what no chart can promise."""
     known, examples = IN_SCENES if in_scene else FREE, _EXAMPLES[in_scene]
     found = _TARGET.fullmatch(text)
     if found is None:
@@ -134,30 +124,17 @@ def parse_target(text: str, *, in_scene: bool = False) -> tuple[str, float]:
     return metric, float(bound)
 
 
-def cheapest(
-    chart: Row, target: str, *, method: str, hand: str, object_: str, offered: Sequence[str] = OFFERED
-) -> ChosenFidelity:
-    """Return the fidelity of a method with most valid grasps per second among those that meet a target.
+def cheapest(chart: Row, target: str, *, method: str, hand: str, object_: str) -> ChosenFidelity:
+    """Return the fidelity of a method with most valid grasps per second among those that meet a target; or InputError.
 
     Runs of the same hand and object count; else runs of the hand; else all. In a chart of scenes only grasps planned
     for them count, by lifted grasps per second.
-
-    Args:
-        chart: as `graspd chart` writes it.
-        target: see `parse_target`.
-        method: the planner.
-        hand: name of the hand.
-        object_: name of the object.
-        offered: fidelities to choose from.
-
-    Raises:
-        InputError: no such target, no run of the method, or no fidelity that meets the target.
     """
     in_scene = "scene" in chart
     metric, bound = parse_target(target, in_scene=in_scene)
     more = (IN_SCENES if in_scene else FREE)[metric]
     again = f"`graspd chart {'--scene ... ' if in_scene else ''}--publish`"
-    runs = [run for run in chart["runs"] if run["method"] == method and run["fidelity"] in offered]
+    runs = [run for run in chart["runs"] if run["method"] == method and run["fidelity"] in OFFERED]
     runs = [run for run in runs if run.get("way", IN_SCENE) == IN_SCENE]
     if not runs:
         raise InputError(f"the stored chart has no run of {method}; run {again}, or name a fidelity")

@@ -9,12 +9,14 @@ import contextlib
 import logging
 import time
 from collections.abc import Callable, Iterator
-from typing import Final
+from typing import Final, TypeVar
 
+from graspd.service.index.database import chunks
 from graspd.service.model import names
 from graspd.service.model.clock import timestamp
 from graspd.service.model.errors import ConflictError, DamagedError, NotFoundError
 from graspd.service.model.planning import plan
+from graspd.service.model.records import Record
 from graspd.service.model.states import AssetKind, Stage
 from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.backends import Services
@@ -22,6 +24,7 @@ from graspd.service.pipeline.deletion import delete_job, put_away
 from graspd.service.store.records import DeletedJob, Deletion, load_dataset, read_record, removed_before
 
 log = logging.getLogger(__name__)
+RecordT = TypeVar("RecordT", bound=Record)
 #: Time for deletions in one round of the controller [s].
 BUDGET_S: Final = 0.5
 _AT_ONCE: Final = 200
@@ -35,21 +38,10 @@ class GarbageCollector:
         self._clock = clock
 
     def advance(self, budget_s: float = BUDGET_S) -> bool:
-        """Work for at most `budget_s`. Return whether work is left.
-
-        Raises:
-            UnavailableError: a backend is unavailable; call again later.
-        """
+        """Work for at most `budget_s`. Return whether work is left."""
         deadline = self._clock() + budget_s
-        for entry in list(self._services.store.list(names.DELETIONS)):
-            if self._clock() > deadline:
-                return True
-            try:
-                deletion = read_record(Deletion, self._services.store, entry.key)
-            except DamagedError as error:
-                log.warning("%s", error)
-                continue
-            if not self._carry_out(deletion, deadline):
+        for _, deletion in self._records(Deletion, names.DELETIONS):
+            if self._clock() > deadline or not self._carry_out(deletion, deadline):
                 return True
             log.info("the objects of %s %s are removed", deletion.what, deletion.id)
         return False
@@ -59,30 +51,32 @@ class GarbageCollector:
         deadline = self._clock() + budget_s
         before = timestamp(self._services.settings.shard_grace_s)
         # The record of the deletion sorts first and is removed last.
-        for entry in sorted(
-            self._services.store.list(names.REMOVED), key=lambda one: one.key.endswith("/deletion.json")
-        ):
+        removed = [entry.key for entry in self._services.store.list(names.REMOVED)]
+        for key in sorted(removed, key=lambda key: key.endswith("/deletion.json")):
             if self._clock() > deadline:
                 return True
-            if removed_before(entry.key, before):
-                self._services.store.delete(entry.key)
+            if removed_before(key, before):
+                self._services.store.delete(key)
         known = self._services.index.notes.completeness()
         if known is not None and known.left_out:
             return False  # a job with an unreadable record may need one of them
-        for entry in sorted(self._services.store.list(names.RELEASED), key=lambda one: one.key):
-            try:
-                released = read_record(DeletedJob, self._services.store, entry.key)
-            except DamagedError as error:
-                log.warning("%s", error)
-                continue
+        for key, released in self._records(DeletedJob, names.RELEASED):
             if released.at > before:
                 break  # the following ones are younger
             for stage, shard in self._unneeded(released):
                 if self._clock() > deadline:
                     return True
                 self._remove_shard(stage, shard)
-            self._services.store.delete(entry.key)
+            self._services.store.delete(key)
         return False
+
+    def _records(self, model: type[RecordT], folder: str) -> Iterator[tuple[str, RecordT]]:
+        """Yield readable records in the order of their keys."""
+        for key in sorted(entry.key for entry in self._services.store.list(folder)):
+            try:
+                yield key, read_record(model, self._services.store, key)
+            except DamagedError as error:
+                log.warning("%s", error)
 
     def _carry_out(self, deletion: Deletion, deadline: float) -> bool:
         """Remove rows again, if the process ended after the record, then objects. Return whether all is done."""
@@ -107,8 +101,8 @@ class GarbageCollector:
             jobs = load_dataset(self._services.store, dataset).jobs
         except (NotFoundError, DamagedError):
             return True
-        for start in range(0, len(jobs), _AT_ONCE):
-            for job in self._services.index.removals.planned_only(jobs[start : start + _AT_ONCE]):
+        for some in chunks(jobs, _AT_ONCE):
+            for job in self._services.index.removals.planned_only(some):
                 if self._clock() > deadline:
                     return False
                 try:
@@ -122,8 +116,7 @@ class GarbageCollector:
 
     def _unneeded(self, released: DeletedJob) -> Iterator[tuple[Stage, str]]:
         planned = [(task.stage, task.output) for task in plan(released.job)]
-        for start in range(0, len(planned), _AT_ONCE):
-            some = planned[start : start + _AT_ONCE]
+        for some in chunks(planned, _AT_ONCE):
             unneeded = self._services.index.removals.unneeded_shards([shard for _, shard in some])
             yield from ((stage, shard) for stage, shard in some if shard in unneeded)
 

@@ -54,7 +54,6 @@ class Response:
 
     @property
     def is_taken(self) -> bool:
-        """Whether the receiver accepted it: any 2xx."""
         return self.status is not None and 200 <= self.status < 300
 
 
@@ -85,15 +84,7 @@ def is_public(address: Address) -> bool:
 
 
 def reachable(host: str, port: int, allowed: Networks) -> list[str]:
-    """Return the addresses of a host if all of them may be reached.
-
-    Args:
-        allowed: networks that the operator allows besides public addresses.
-
-    Raises:
-        Refused: one of them may not be reached.
-        OSError: it has no address.
-    """
+    """Return a host's addresses, all public or in the networks `allowed`; else raise RefusedAddress or OSError."""
     found = list(dict.fromkeys(str(info[4][0]) for info in _looked_up(host, port)))
     for one in found:
         address = ipaddress.ip_address(one.partition("%")[0])
@@ -154,11 +145,7 @@ def post(
 
 
 class _Connection(http.client.HTTPConnection):
-    """A connection to one of the checked addresses; the library would resolve the name again.
-
-    Args:
-        patience_s: time limit of all addresses together and the handshake [s].
-    """
+    """A connection to one of the checked addresses, within `patience_s`; the library would resolve the name again."""
 
     def __init__(self, scheme: str, host: str, port: int, addresses: Sequence[str], patience_s: float) -> None:
         super().__init__(host, port)

@@ -22,7 +22,6 @@ from graspd.service.store.records import put_record, read_record
 
 if TYPE_CHECKING:
     from graspd.service.pipeline.backends import Services
-    from graspd.service.queue.rq_queue import RqQueue
     from graspd.service.store.store import Store
 
 _FILE: Final = "service.id"
@@ -34,8 +33,6 @@ _REDIS: Final = (
 
 
 class ServiceRecord(Record):
-    """A service that started work on a store."""
-
     id: str
     at: str
 
@@ -50,7 +47,6 @@ class Identity:
     redis: str | None = None
     folder: str | None = None
     is_own_store: bool = False
-    """Whether the store lies in the data folder."""
 
     @property
     def is_same(self) -> bool:
@@ -84,7 +80,7 @@ def identify(
     take_over: bool = False,
     holds_redis: bool = False,
 ) -> str:
-    """Check that store, index and Redis belong to one service, and write its id where it is missing.
+    """Check that store, index and Redis belong to one service, and write its id where it is missing; return the id.
 
     Args:
         folder: data folder that also stores the id.
@@ -92,16 +88,12 @@ def identify(
         take_over: become the service of the store, whichever it was before.
         holds_redis: this process has the controller's lease, so Redis belongs to its service in any case.
 
-    Returns:
-        id of the service.
-
     Raises:
         BusyError: one of them belongs to another service.
-        StoreUnavailable, IndexUnavailable, QueueUnavailable: they are unavailable.
     """
     # Redis is read first and the store last, so that concurrent new processes see each other's writes.
     redis = services.queue.service() if ask_redis else None
-    left = _read(folder)
+    left = recorded(folder)
     chain = service_ids(services.store)
     index = services.index.notes.service()
     if not chain:
@@ -113,9 +105,8 @@ def identify(
             raise BusyError(_REDIS)
         _add(services.store, 1, index)
         chain = service_ids(services.store)
-    found = Identity(
-        chain, index, None if holds_redis and redis not in chain else redis, left, services.settings.store_url is None
-    )
+    foreign = holds_redis and redis not in chain
+    found = Identity(chain, index, None if foreign else redis, left, services.settings.store_url is None)
     if why := found.refusal(services.store.url, take_over=take_over):
         raise BusyError(why)
     if take_over and not found.is_same:
@@ -139,34 +130,24 @@ def identify_if_redis_answers(services: Services, *, folder: Path | None = None,
         return identify(services, folder=folder, take_over=take_over, ask_redis=False)
 
 
-def check_queue(store: Store, queue: RqQueue) -> bool:
-    """Check, for a process without an index, whether Redis already has the id of the store's service.
-
-    Raises:
-        BusyError: it belongs to another service.
-    """
-    return check_service(store, queue.service())
-
-
 def check_service(store: Store, redis: str | None) -> bool:
-    """Check the id that Redis returned in the same way."""
-    if redis is None:
-        return False
-    chain = service_ids(store)
-    if redis not in chain:
+    """Check whether Redis already has the id of the store's service; BusyError if it belongs to another one."""
+    if redis is not None and redis not in service_ids(store):
         raise BusyError(_REDIS)
-    return True
+    return redis is not None
 
 
 def service_ids(store: Store) -> list[str]:
-    """Return the ids of all services of a store; the last one is the present one."""
     keys = sorted(entry.key for entry in store.list(names.SERVICE))
     return [read_record(ServiceRecord, store, key).id for key in keys]
 
 
-def recorded(folder: Path) -> str | None:
+def recorded(folder: Path | None) -> str | None:
     """Return the id of the service that last ran in a data folder."""
-    return _read(folder)
+    if folder is not None:
+        with contextlib.suppress(OSError, UnicodeDecodeError):
+            return (folder / _FILE).read_text().strip() or None
+    return None
 
 
 def _others_index(store: str) -> str:
@@ -178,10 +159,3 @@ def _others_index(store: str) -> str:
 
 def _add(store: Store, number: int, identity: str) -> None:
     put_record(store, names.service(number), ServiceRecord(id=identity, at=timestamp()))
-
-
-def _read(folder: Path | None) -> str | None:
-    if folder is not None:
-        with contextlib.suppress(OSError, UnicodeDecodeError):
-            return (folder / _FILE).read_text().strip() or None
-    return None

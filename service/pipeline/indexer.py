@@ -4,20 +4,21 @@ from __future__ import annotations
 
 import logging
 import time
-from collections import OrderedDict
-from collections.abc import Iterator, Mapping, Sequence
+from collections import OrderedDict, defaultdict
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Final
 
+from graspd.service.index.database import chunks
 from graspd.service.model.clock import timestamp
 from graspd.service.model.errors import InputError, StoreUnavailable, UnavailableError
 from graspd.service.model.names import attempt as attempt_key
 from graspd.service.model.planning import backoff
 from graspd.service.model.records import AttemptRecord
+from graspd.service.model.series import SERIES, STAGE_BUCKETS_S, field
 from graspd.service.model.states import AssetKind, Stage, State
 from graspd.service.pipeline.backends import Services
-from graspd.service.pipeline.metrics import Tally
 from graspd.service.queue.port import Event, EventKind
 from graspd.service.store.library import load_asset, load_check
 from graspd.service.store.manifests import ShardManifest, load_manifest
@@ -48,11 +49,7 @@ class Indexer:
     def apply(self, events: Sequence[Event]) -> list[int]:
         """Update the index. To apply an event twice changes nothing.
 
-        Returns:
-            positions of the events that need the unavailable store; apply these again later.
-
-        Raises:
-            UnavailableError: another backend is unavailable; apply the same events again later.
+        Return the positions of events that need the unavailable store; apply these again later.
         """
         started: dict[str, str] = {}
         finished: list[int] = []
@@ -107,8 +104,7 @@ class Indexer:
     def _loaded(
         self, events: Sequence[Event], places: Sequence[int]
     ) -> Iterator[tuple[int, ShardManifest | Exception]]:
-        for first in range(0, len(places), _MANIFESTS_AT_ONCE):
-            some = places[first : first + _MANIFESTS_AT_ONCE]
+        for some in chunks(places, _MANIFESTS_AT_ONCE):
             yield from zip(some, self._readers.map(self._load, [events[place] for place in some]), strict=True)
 
     def _load(self, event: Event) -> ShardManifest | Exception:
@@ -134,7 +130,6 @@ class Indexer:
         self._tally.made(made)
 
     def tell(self, states: Mapping[str, State]) -> None:
-        """Publish the changed states of jobs."""
         changed = {job: state for job, state in states.items() if self._told.get(job) is not state}
         if changed:
             now = timestamp()
@@ -151,12 +146,10 @@ class Indexer:
             self._told.popitem(last=False)
 
     def made(self, manifest: ShardManifest) -> None:
-        """Index a shard."""
-        self.tell(self._services.index.write.add_manifest(manifest))
+        self.tell(self._services.index.write.add_manifests([manifest]))
         self._tally.made([manifest])
 
     def checked(self, kind: AssetKind, digest: str) -> None:
-        """Index a hand or object as the store has it now."""
         asset = load_asset(self._services.store, kind, digest)
         self._services.index.write.add_asset(asset, load_check(self._services.store, kind, digest))
 
@@ -166,18 +159,13 @@ class Indexer:
         not_before = time.time() + wait
         state = self._services.index.write.add_attempt(attempt, not_before=not_before)
         if state is not None:
-            about = {
-                "job": attempt.job_id,
-                "task": attempt.task_id,
-                "attempt": attempt.number,
-                "worker": attempt.worker,
-            }
+            about: dict[str, object] = {"job": attempt.job_id, "task": attempt.task_id}
+            about |= {"attempt": attempt.number, "worker": attempt.worker}
             log.warning("attempt failed: %s: %s", attempt.kind, attempt.reason, extra=about)
             self._tally.failed(attempt.stage.value, attempt.kind)
             self.tell({attempt.job_id: state})
 
     def flush(self) -> None:
-        """Add the counts since the last call to the sums for Prometheus."""
         self._tally.flush()
 
     def _apply(self, event: Event) -> bool:
@@ -230,3 +218,54 @@ def _left_out(what: str) -> Iterator[None]:
         raise
     except Exception:
         log.exception("%s is left out", what)
+
+
+#: Most names of errors with their own series: more than an engine raises, and a bound against forged names.
+MOST_KINDS: Final = 60
+OTHER_KIND: Final = "other"
+
+
+class Tally:
+    """Counts for `/metrics` in memory; `flush` adds them to the sums in Redis, so every API shows the same values.
+
+    The sums restart from zero when Redis is lost, which Prometheus counts as a restart. A repeated event counts twice.
+    """
+
+    def __init__(self, count: Callable[[Mapping[str, float]], None]) -> None:
+        """`count` adds to the sums."""
+        self._count = count
+        self._amounts: defaultdict[str, float] = defaultdict(float)
+        self._kinds: set[tuple[str, str]] = set()
+
+    def made(self, manifests: Iterable[ShardManifest]) -> None:
+        for manifest in manifests:
+            stage = manifest.stage.value
+            self.add("graspd_shards_total", stage)
+            self.add("graspd_shard_bytes_total", stage, amount=manifest.size_bytes)
+            self._observe("graspd_stage_seconds", stage, seconds=manifest.seconds)
+            if manifest.kind == "base":
+                self.add("graspd_grasps_total", "all", amount=manifest.count)
+                self.add("graspd_grasps_total", "valid", amount=manifest.valid)
+                self.add("graspd_grasps_total", "validated", amount=manifest.validated)
+
+    def failed(self, stage: str, kind: str) -> None:
+        if (stage, kind) not in self._kinds:
+            if len(self._kinds) >= MOST_KINDS:
+                kind = OTHER_KIND
+            self._kinds.add((stage, kind))
+        self.add("graspd_task_failures_total", stage, kind)
+
+    def flush(self) -> None:
+        """Add the counts to the sums; after QueueUnavailable they stay for the next call."""
+        if self._amounts:
+            self._count(self._amounts)
+            self._amounts.clear()
+
+    def _observe(self, name: str, *labels: str, seconds: float) -> None:
+        bound = next((bound for bound in STAGE_BUCKETS_S if seconds <= bound), None)
+        self._amounts[field(f"{name}_bucket", *labels, "+Inf" if bound is None else str(bound))] += 1
+        self._amounts[field(f"{name}_sum", *labels)] += seconds
+
+    def add(self, name: str, *labels: str, amount: float = 1) -> None:
+        assert len(SERIES[name].labels) == len(labels)
+        self._amounts[field(name, *labels)] += amount

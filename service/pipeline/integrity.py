@@ -70,7 +70,7 @@ FOLDERS: Final = (
 _SEALED: Final = (".json", ".zip", ".npz", ".glb")
 _UPLOAD: Final = re.compile(r"assets/(hand|object|network)/([0-9a-f]{32})/(files\.zip|check\.json)")
 _SHARD: Final = re.compile(r"shards/(base|scene|views)/([0-9a-f]{32})\.(h5|json)")
-STAGES: Final[dict[str, Stage]] = {kind: stage for stage, kind in names.SHARD_KINDS.items()}
+STAGES: Final = {kind: stage for stage, kind in names.SHARD_KINDS.items()}
 
 MISSING: Final = "its file is gone"
 NO_MANIFEST: Final = "it has no manifest"
@@ -79,7 +79,7 @@ FOREIGN: Final = "nothing that graspd put there"
 #: Time for which a file may lack its manifest [s].
 _ON_ITS_WAY_S: Final = 60.0
 #: Called after each read part with its bytes.
-Read = Callable[[int], None]
+Read = Callable[[int], object]
 #: Called with the key of each object that was written without a checksum.
 Unsealed = Callable[[str], None]
 
@@ -87,11 +87,7 @@ Unsealed = Callable[[str], None]
 def scan(
     store: Store, *folders: str, read: Read = lambda size: None, unsealed: Unsealed = lambda key: None
 ) -> Iterator[tuple[str, Damage | None]]:
-    """Yield every object that can be checked, of all folders or some, with its damage or None.
-
-    Raises:
-        StoreUnavailable: the store is unavailable.
-    """
+    """Yield every object that can be checked, of all folders or some, with its damage or None."""
     for folder in folders or FOLDERS:
         for entry in store.list(folder):
             if is_checked(entry.key):
@@ -132,7 +128,6 @@ def examine(
 
 
 def _model_of(key: str) -> type[Any] | None:
-    """Return the model of a record of this name; None if it is no record."""
     return next((model for pattern, model in _RECORDS if re.fullmatch(pattern, key)), None)
 
 

@@ -51,16 +51,11 @@ class ReadPermit:
         """Take or renew the turn; queries the index every few seconds."""
         now = self._clock()
         if now - self._said >= _TURN_S:
-            if not self._services.index.notes.take_scan_turn(
-                self._holder, is_controller=self._is_controller, lasts_s=3 * _TURN_S
-            ):
+            take = self._services.index.notes.take_scan_turn
+            if not take(self._holder, is_controller=self._is_controller, lasts_s=3 * _TURN_S):
                 return False
             self._said = now
         return True
-
-    def keep(self) -> None:
-        """Renew it during long reads."""
-        self.is_mine()
 
     def end(self) -> None:
         self._services.index.notes.end_scan_turn(self._holder)
@@ -75,7 +70,7 @@ class IntegrityScan:
     ) -> None:
         self._services, self._stop, self._clock = services, stop, clock
         self._rate = services.settings.integrity_scan_mb_per_s * 2**20
-        self._turn = ReadPermit(services, is_controller=True, clock=clock)
+        self.turn = ReadPermit(services, is_controller=True, clock=clock)
         self._paid = clock()
         self._looked = clock()
 
@@ -83,30 +78,20 @@ class IntegrityScan:
         """Run until `stop` is set. Wait for an unavailable backend."""
         while not self._stop.is_set():
             try:
-                if not self._turn.is_mine() or not self.advance():
-                    self._stop.wait(_PAUSE_S)
+                if self.turn.is_mine() and self.advance():
+                    continue
             except Interrupted:
-                self._stop.wait(_PAUSE_S)
+                pass
             except GraspdError as error:
                 log.warning("%s; the integrity scan goes on later", error)
-                self._stop.wait(_PAUSE_S)
             except Exception:
                 log.exception("the integrity scan broke off; it goes on later")
-                self._stop.wait(_PAUSE_S)
+            self._stop.wait(_PAUSE_S)
         with suppress(GraspdError):
-            self.end()
-
-    def end(self) -> None:
-        """Release the turn at once."""
-        self._turn.end()
+            self.turn.end()
 
     def advance(self) -> bool:
-        """Read some more objects. Return whether more can be read now.
-
-        Raises:
-            Interrupted: it shall stop, or `store verify` reads now.
-            UnavailableError: a backend is unavailable; call again.
-        """
+        """Read some more objects; return whether more can be read now. Interrupted: `store verify` reads now."""
         self._look_again_in_time(None)
         note = self._services.index.notes.scan_note()
         if note.folder >= len(FOLDERS):
@@ -136,8 +121,7 @@ class IntegrityScan:
         """Check known damage again; remove fixed and deleted objects from the list."""
         self._looked = self._clock()
         _, known = self._services.index.damage.known(limit=_KNOWN)
-        well = [one.key for one in known if self._is_well(one)]
-        if well:
+        if well := [one.key for one in known if self._is_well(one)]:
             self._services.index.damage.mark([], intact=well)
 
     def _is_well(self, one: Damage) -> bool:
@@ -147,9 +131,8 @@ class IntegrityScan:
 
     def _look(self, key: str) -> None:
         self._pace(_LEAST)
-        if (wrong := examine(self._services.store, key, read=self._pace)) is None:
-            return
-        if not is_on_its_way(self._services.store, wrong):
+        wrong = examine(self._services.store, key, read=self._pace)
+        if wrong is not None and not is_on_its_way(self._services.store, wrong):
             log.warning("%s: %s", wrong.key, wrong.what)
             self._services.index.damage.mark([wrong])
 
@@ -161,5 +144,5 @@ class IntegrityScan:
         """Wait until `size` more bytes are within the rate."""
         now = self._clock()
         self._paid = max(self._paid, now - _BURST_S) + size / self._rate
-        if self._stop.wait(max(0.0, self._paid - now)) or not self._turn.is_mine():
+        if self._stop.wait(max(0.0, self._paid - now)) or not self.turn.is_mine():
             raise Interrupted

@@ -7,6 +7,7 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
@@ -17,21 +18,20 @@ from graspd.service.model import names
 from graspd.service.model.clock import timestamp
 from graspd.service.model.digests import job_id
 from graspd.service.model.domain import JobOptions, JobRequest
-from graspd.service.model.errors import ConflictError, NotFoundError, SceneError, UnavailableError
+from graspd.service.model.errors import ConflictError, SceneError, UnavailableError
 from graspd.service.model.messages import Origin, TaskMessage
 from graspd.service.model.planning import message_of, priority_of
 from graspd.service.model.projects import EVERYTHING, ProjectScope
 from graspd.service.model.records import JobRecord
 from graspd.service.model.scene_spec import HalfSpace, Pose, Supports
-from graspd.service.model.states import AssetKind, Priority, State
+from graspd.service.model.states import AssetKind, Priority, Stage, State
 from graspd.service.model.transforms import quat_conjugate, quat_rotate
-from graspd.service.model.workers import need_of
+from graspd.service.model.workers import Capabilities, Requirements, WorkerBeat, need_of, own_ability
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.fidelity_choice import Resolver
 from graspd.service.pipeline.ranges import TaskRanges
 from graspd.service.pipeline.recording import recording
-from graspd.service.pipeline.routes import Routes
-from graspd.service.pipeline.usable import usable, with_neighbours, with_network
+from graspd.service.pipeline.usable import refuse_deleted, usable, with_neighbours, with_network
 from graspd.service.queue.port import Event, EventKind
 from graspd.service.store.records import add_job_event, job_events, put_record, read_record, refuse_pending
 from graspd.service.telemetry import bound
@@ -44,17 +44,7 @@ _SUNK_M: Final = 1e-3
 
 
 def submit(services: Services, request: JobRequest, *, priority: Priority | None = None) -> tuple[JobView, bool]:
-    """Record a job and queue its first tasks. Equal requests on equal hand and object give the same job.
-
-    Args:
-        priority: bulk for the jobs of a dataset; by default a small job is interactive.
-
-    Returns:
-        the job, and whether it is new. A failed or cancelled job is returned unchanged: see `retry`.
-
-    Raises:
-        as in `prepare`; nothing was recorded then.
-    """
+    """Call `prepare`, then `enter`. Equal requests give the same job; for a failed or cancelled one see `retry`."""
     return enter(services, prepare(services, request, priority=priority))
 
 
@@ -66,18 +56,12 @@ def prepare(
     owner: str = "",
     scope: ProjectScope = EVERYTHING,
 ) -> JobRecord:
-    """Return the job of a request whose hand and object may be used.
-
-    Args:
-        owner: id of the submitting API key.
-        scope: which hands, objects and networks it may name, and its project.
+    """Return the job of a request whose hand, object and network are in scope; a small job is interactive.
 
     Raises:
-        NotFoundError: unknown hand, object, neighbour or network.
-        InputError: one of them failed its check; the network is of another hand; no chart contains a
-            fidelity that meets the target; the object or a neighbour penetrates a support of its scene (SceneError).
-        ConflictError: the check of one of them is still running.
-        QueueUnavailable, StoreUnavailable, IndexUnavailable: a backend is unavailable.
+        NotFoundError, ConflictError: as in `usable`, also of neighbours and network.
+        InputError: one of them failed its check; the network is of another hand; no chart meets the target; the object
+            or a neighbour penetrates a support of its scene (SceneError).
     """
     hand = usable(services, AssetKind.HAND, request.hand, scope)
     obj = usable(services, AssetKind.OBJECT, request.object, scope)
@@ -103,16 +87,13 @@ def prepare(
 
 
 def enter(services: Services, record: JobRecord, *, keeps_assets: bool = False) -> tuple[JobView, bool]:
-    """Record a planned job and queue its first tasks. The controller enters the rest of large jobs.
+    """Record a planned job and queue its first tasks; return it, and whether it is new. The controller enters the rest.
 
     Args:
         keeps_assets: a dataset protects hand, object, neighbours and network from deletion meanwhile.
 
-    Returns:
-        the job, and whether it is new.
-
     Raises:
-        NotFoundError: the hand, the object, a neighbour or the network was deleted meanwhile.
+        NotFoundError: one of them was deleted meanwhile.
         ConflictError: the same job was deleted, and its objects are still being removed.
     """
     key = names.job_record(record.id)
@@ -125,8 +106,8 @@ def enter(services: Services, record: JobRecord, *, keeps_assets: bool = False) 
             if not services.store.exists(key):
                 raise ConflictError(f"job {record.id} was deleted just now; submit it again")
             record = read_record(JobRecord, services.store, key)
-        if not keeps_assets and (missing := services.index.assets.missing(record.assets, within=connection)):
-            raise NotFoundError(f"there is no {missing[0]} any more; it was deleted just now")
+        if not keeps_assets:
+            refuse_deleted(services, record.assets, connection)
         services.index.write.enter_job(record, within=connection)
     _start(services, record.id)
     return services.index.jobs.get(record.id), new
@@ -135,16 +116,9 @@ def enter(services: Services, record: JobRecord, *, keeps_assets: bool = False) 
 def cancel(services: Services, job_id: str, *, cause: str = "") -> JobView:
     """Stop a job: waiting tasks never start, running ones stop at the next launch. Finished shards stay.
 
-    Args:
-        cause: causing event of a dataset, stored with the job's event.
-
-    Raises:
-        NotFoundError: unknown job.
-        ConflictError: the job is already finished.
+    The causing event of a dataset, if any, is stored with the job's event. ConflictError for a job that has ended.
     """
-    _refuse_ended(services, job_id)
-    with _changing(services, job_id) as add:
-        _refuse_ended(services, job_id)
+    with _changing(services, job_id, _refuse_ended) as add:
         in_queue = services.index.feed.unfinished_tasks(job_id)
         add("cancelled", cause=cause)
     try:
@@ -155,42 +129,52 @@ def cancel(services: Services, job_id: str, *, cause: str = "") -> JobView:
 
 
 def retry(services: Services, job_id: str, *, cause: str = "") -> JobView:
-    """Queue the failed and cancelled tasks of a job again, with fresh attempts.
-
-    Args:
-        cause: causing event of a dataset, stored with the job's event.
-
-    Raises:
-        NotFoundError: unknown job.
-        ConflictError: the job neither failed nor was cancelled.
-    """
-    _refuse_unfailed(services, job_id)
-    with _changing(services, job_id) as add:
-        _refuse_unfailed(services, job_id)
+    """Queue the failed and cancelled tasks of a job again, with fresh attempts; ConflictError without any."""
+    with _changing(services, job_id, _refuse_unfailed) as add:
         add("retried", services.index.feed.failed_tasks(job_id), cause=cause)
     _start(services, job_id)
     return _told(services, job_id)
 
 
+@dataclass(frozen=True)
+class Route:
+    apart: bool = False
+    """Whether it enters a list that only some workers of its stage read."""
+    held: str = ""
+
+
+class Routes:
+    def __init__(self, present: Sequence[WorkerBeat] = ()) -> None:
+        self._here: dict[Stage, list[Capabilities]] = defaultdict(list)
+        for beat in present:
+            for stage in beat.stages:
+                if beat.ability not in self._here[stage]:
+                    self._here[stage].append(beat.ability)
+
+    def place(self, need: Requirements) -> Route:
+        """Return the route of a task.
+
+        A task that all workers of its stage can do goes to all; one that some can do goes to those; one that none can
+        do is held back. Without workers, this version's are assumed.
+        """
+        here = self._here.get(need.stage) or [own_ability()]
+        lacking = {one.lacks(need) for one in here} - {""}
+        if all(one.lacks(need) for one in here):
+            return Route(held=f"held back, no worker that is here can do it: {'; '.join(sorted(lacking))}")
+        return Route(apart=bool(lacking))
+
+
 def queue_tasks(services: Services, ready: Sequence[ReadyTask], *, routes: Routes, again: bool = False) -> set[str]:
     """Queue tasks and mark them in the index; tasks that no worker can do wait, with a reason in the job.
 
-    The mark comes first: the controller queues marked tasks that are missing; unmarked ones might run twice.
-
-    Args:
-        routes: capabilities of the living workers.
-
-    Returns:
-        reasons why tasks are held back.
+    The mark comes first: the controller queues marked tasks that are missing; unmarked ones might run twice. Return the
+    reasons why tasks are held back.
     """
     to_queue: dict[tuple[Priority, bool], list[TaskMessage]] = defaultdict(list)
     held: dict[str, list[str]] = defaultdict(list)
     for task in ready:
-        attempts = {
-            "attempt": task.last_attempt + 1,
-            "max_attempt": task.retried_upto + services.settings.task_attempts,
-        }
-        message = message_of(task.job, task.task, **attempts)
+        most = task.retried_upto + services.settings.task_attempts
+        message = message_of(task.job, task.task, attempt=task.last_attempt + 1, max_attempt=most)
         place = routes.place(need_of(message))
         if place.held:
             held[place.held].append(task.task.id)
@@ -218,13 +202,15 @@ def _start(services: Services, job_id: str) -> None:
 
 
 @contextmanager
-def _changing(services: Services, job_id: str) -> Iterator[Callable[..., None]]:
-    """Lock a job to append an event; of two concurrent changes the later one sees both.
+def _changing(services: Services, job_id: str, refuse: Callable[[JobView], None]) -> Iterator[Callable[..., None]]:
+    """Lock a job to append an event unless `refuse` raises; of two concurrent changes the later one sees both.
 
     Earlier events are read before the lock, because the store may be slow.
     """
+    refuse(services.index.jobs.get(job_id))
     before = job_events(services.store, job_id)
     with recording(services) as (connection, put):
+        refuse(services.index.jobs.get(job_id))
 
         def add(
             what: Literal["cancelled", "retried"], retried: dict[str, int] | None = None, *, cause: str = ""
@@ -237,16 +223,15 @@ def _changing(services: Services, job_id: str) -> Iterator[Callable[..., None]]:
         yield add
 
 
-def _refuse_ended(services: Services, job_id: str) -> None:
-    job = services.index.jobs.get(job_id)
+def _refuse_ended(job: JobView) -> None:
     if job.state.is_final:
-        raise ConflictError(f"job {job_id} has already {_ended(job.state)}; there is nothing to cancel")
+        ended = "been cancelled" if job.state is State.CANCELLED else job.state.value
+        raise ConflictError(f"job {job.id} has already {ended}; there is nothing to cancel")
 
 
-def _refuse_unfailed(services: Services, job_id: str) -> None:
-    job = services.index.jobs.get(job_id)
+def _refuse_unfailed(job: JobView) -> None:
     if job.state not in (State.FAILED, State.CANCELLED):
-        raise ConflictError(f"job {job_id} is {job.state}; only a failed or cancelled job can be retried")
+        raise ConflictError(f"job {job.id} is {job.state}; only a failed or cancelled job can be retried")
 
 
 def _told(services: Services, job_id: str) -> JobView:
@@ -259,27 +244,14 @@ def _told(services: Services, job_id: str) -> JobView:
 
 
 def _present_origin() -> Origin | None:
-    """Return the request that is being answered, if any."""
     origin = Origin(request=bound("request"), key=bound("key"), traceparent=bound("traceparent"))
     return origin if origin != Origin() else None
 
 
-def _ended(state: State) -> str:
-    return {"succeeded": "succeeded", "failed": "failed", "cancelled": "been cancelled"}[state.value]
-
-
 def check_scene(options: JobOptions, obj: AssetView, beside: Sequence[AssetView] = ()) -> None:
-    """Refuse an object whose centre of mass lies in a support: its hull then penetrates the support.
+    """Raise SceneError for an object whose centre of mass lies in a support: its hull then penetrates the support.
 
     Without a measured centre, and for checks that need meshes, the first task reports the error.
-
-    Args:
-        options: options with the scene.
-        obj: the target.
-        beside: the neighbours of the scene, in their order.
-
-    Raises:
-        SceneError: the target or a neighbour penetrates a support.
     """
     place = options.place
     _check_pose(obj, "target", place.target, place.supports)

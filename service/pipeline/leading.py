@@ -33,16 +33,8 @@ _LOOK_S: Final = 0.1
 
 
 class Leadership:
-    """Lease of leadership of one process."""
-
     def __init__(self, queue: RqQueue, *, lease_s: float, alive: HeartbeatFile, name: str | None = None) -> None:
-        """
-        Args:
-            queue: used by a separate thread while the lease is held.
-            lease_s: validity of the lease after its last renewal [s].
-            alive: touched while another leads.
-            name: name of the leader; a restarted process of the same name need not wait for its lease.
-        """
+        """`alive` is touched while another leads. A restarted process of the same name need not wait for its lease."""
         self._queue, self._lease_s, self._alive = queue, lease_s, alive
         self.holder = name or f"{socket.gethostname()}-{os.getpid()}-{secrets.token_hex(4)}"
 
@@ -62,10 +54,9 @@ class Leadership:
 
     @contextmanager
     def held(self, stop: threading.Event) -> Iterator[threading.Event]:
-        """Hold the lease; yield an event that is set when another process leads or `stop` is set.
+        """Hold the lease, then release it; yield an event that is set when another process leads or `stop` is set.
 
-        The lease is lost only if Redis reports another holder: while Redis is unavailable, no process can take it. The
-        lease is released at the end.
+        The lease is lost only if Redis reports another holder: while Redis is unavailable, no process can take it.
         """
         over, done = threading.Event(), threading.Event()
         thread = threading.Thread(target=self._renew, args=(stop, over, done), name="controller-lease", daemon=True)

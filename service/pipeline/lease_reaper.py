@@ -93,11 +93,7 @@ class LeaseReaper:
             self._indexer.tell(self._services.index.live.set_waiting(again))
 
     def _find(self, task_id: str, stage: Stage, shard: str) -> bool:
-        """Index an existing shard; a damaged manifest fails its task, since it cannot be made again.
-
-        Returns:
-            whether it exists.
-        """
+        """Index an existing shard, and return whether it exists; a damaged manifest fails its task for good."""
         try:
             self._indexer.made(load_manifest(self._services.store, stage, shard))
         except NotFoundError:
@@ -107,7 +103,6 @@ class LeaseReaper:
         return True
 
     def _fail(self, task_id: str, stage: Stage, error: DamagedError) -> None:
-        """Fail a task because of a damaged record."""
         task = self._services.index.jobs.task(task_id)
         about = {"task_id": task_id, "job_id": task.job_id, "stage": stage, "number": task.attempt}
         why = {"kind": type(error).__name__, "reason": str(error), "worker": "controller"}
@@ -161,9 +156,8 @@ class LeaseReaper:
 
     def _lose_check(self, message: IngestMessage) -> None:
         if message.attempt >= message.max_attempt:
-            reason = (
-                f"checking this {message.kind.value} ended its worker {message.attempt} times; delete it to try again"
-            )
+            ended = f"checking this {message.kind.value} ended its worker {message.attempt} times"
+            reason = f"{ended}; delete it to try again"
             found = {"verdict": "refuse", "message": reason, "repairs": [], "facts": {}}
             put_document(self._services.store, names.asset_check(message.kind, message.digest), found)
             self._indexer.checked(message.kind, message.digest)

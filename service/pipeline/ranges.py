@@ -38,15 +38,7 @@ class TaskRanges:
         self._costs: list[BatchCost] = []
 
     def sized(self, job: JobRecord, *, among: int = 1) -> JobRecord:
-        """Return a job with the number of batches per task.
-
-        Args:
-            job: the planned job.
-            among: number of jobs that are planned together and share the workers.
-
-        Raises:
-            QueueUnavailable, IndexUnavailable: a backend is unavailable.
-        """
+        """Return a job with its number of batches per task, one `among` several that share the workers."""
         batches, wanted_s = batches_of(job.request.grasps), self._services.settings.task_s
         # Pictures of a batch are already a file of megabytes.
         if batches == 1 or job.request.views or not wanted_s:

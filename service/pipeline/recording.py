@@ -18,15 +18,9 @@ log = logging.getLogger(__name__)
 
 @contextmanager
 def recording(services: Services, made: Sequence[str] = ()) -> Iterator[tuple[Connection, Put]]:
-    """Yield a write transaction of the index and a function that puts records; undo them on failure.
+    """Yield a write transaction of the index and a function that puts records; undo them, and `made`, on failure.
 
     No other process writes meanwhile: checks before a record is put still hold when the rows are written.
-
-    Args:
-        made: keys of records that were put just before, and are also removed.
-
-    Raises:
-        IndexUnavailable: the index is unavailable; nothing is recorded.
     """
     keys = list(made)
 

@@ -24,21 +24,14 @@ _OF_ASSET: Final = re.compile(r"assets/(hand|object|network)/([0-9a-f]{32})/(.+)
 
 
 def repair(services: Services, found: Sequence[Damage]) -> tuple[list[Damage], list[Damage]]:
-    """Move damaged objects below `damaged/`, and queue what can be made again.
+    """Move damaged objects below `damaged/`, and queue what can be made again; return what was repaired, and the rest.
 
     A worker stores a repaired shard only if its checksum equals the manifest's.
-
-    Returns:
-        damage that was queued or moved, and damage that was left; `what` of the latter contains the reason.
-
-    Raises:
-        UnavailableError: a backend is unavailable; call it again.
     """
     harmed = {one.shard for one in found if one.shard}
     repaired, left = [], []
     for one in found:
-        why = _fix(services, one, harmed)
-        if why:
+        if why := _fix(services, one, harmed):
             left.append(Damage(one.key, f"{one.what}; {why}", one.shard))
         else:
             repaired.append(one)
@@ -68,7 +61,9 @@ def _fix(services: Services, one: Damage, harmed: set[str]) -> str:
         return "its input is made again first; run it again when that is done"
     if one.what != MISSING:
         _clear(services, one, stage)
-    _queue(services, job, task)
+    number = len(task_attempts(services.store, task.id)) + 1
+    message = message_of(job, task, attempt=number, max_attempt=number)
+    services.queue.enqueue([message], Priority.BULK, again=True)
     return ""
 
 
@@ -92,12 +87,6 @@ def _asset(services: Services, key: str, kind: AssetKind, digest: str, file: str
             services.index.write.add_asset(load_asset(services.store, kind, digest), None)
             services.index.live.set_asset_waiting([digest], queued=False)
     return ""
-
-
-def _queue(services: Services, job: JobRecord, task: PlannedTask) -> None:
-    number = len(task_attempts(services.store, task.id)) + 1
-    message = message_of(job, task, attempt=number, max_attempt=number)
-    services.queue.enqueue([message], Priority.BULK, again=True)
 
 
 def _clear(services: Services, one: Damage, stage: Stage) -> None:

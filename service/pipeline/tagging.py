@@ -17,11 +17,7 @@ Permit = Callable[[Tag | None], None]
 
 
 def give(services: Services, name: str, grasps: Collection[Grasp], *, project: str, owner: str, permit: Permit) -> int:
-    """Give a tag to grasps and create it if needed. Return how many grasps did not have it.
-
-    Raises:
-        LimitError: more than `MOST_TAGGED` grasps would have it.
-    """
+    """Give a tag to grasps, created if needed; return how many did not have it. LimitError: more than `MOST_TAGGED`."""
 
     def added(tag: Tag) -> Tag:
         members = tag.members | set(grasps)
@@ -58,11 +54,7 @@ def remove(services: Services, tag: str, *, permit: Permit, owner: str = "") -> 
 
 
 def bring_back(services: Services, tag: Tag) -> None:
-    """Restore a deleted tag with its grasps.
-
-    Raises:
-        ConflictError: the name is in use again.
-    """
+    """Restore a deleted tag with its grasps; ConflictError if the name is in use again."""
 
     def permit(known: Tag | None) -> None:
         if known is not None:

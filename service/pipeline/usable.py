@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TypeVar
 
+from sqlalchemy import Connection
+
 from graspd.service.index.views import AssetView
 from graspd.service.model.domain import JobOptions
-from graspd.service.model.errors import ConflictError, InputError
+from graspd.service.model.errors import ConflictError, InputError, NotFoundError
 from graspd.service.model.projects import EVERYTHING, ProjectScope
 from graspd.service.model.records import Member
 from graspd.service.model.states import AssetKind
@@ -19,10 +21,7 @@ Options = TypeVar("Options", bound=JobOptions)
 def usable(services: Services, kind: AssetKind, name: str, scope: ProjectScope = EVERYTHING) -> AssetView:
     """Return a hand, object or network, by name or digest, that jobs may use.
 
-    Raises:
-        NotFoundError: none is in scope.
-        InputError: it failed its check.
-        ConflictError: its check is still running.
+    NotFoundError: none is in scope. InputError: it failed its check. ConflictError: its check is still running.
     """
     asset = services.index.assets.get(kind, name, scope=scope)
     if asset.verdict == "refuse":
@@ -33,24 +32,25 @@ def usable(services: Services, kind: AssetKind, name: str, scope: ProjectScope =
     return asset
 
 
+def refuse_deleted(services: Services, wanted: Sequence[tuple[AssetKind, str]], connection: Connection) -> None:
+    if missing := services.index.assets.missing(wanted, within=connection):
+        raise NotFoundError(f"there is no {missing[0]} any more; it was deleted just now")
+
+
 def with_neighbours(
     services: Services, options: Options, scope: ProjectScope = EVERYTHING
 ) -> tuple[Options, Sequence[AssetView]]:
     """Return options with the present digests of the neighbours' names, and these neighbours.
 
-    A digest in the request itself, for example one copied from a job, stays.
-
-    Raises:
-        as in `usable`; InputError if a name and a digest belong to two objects.
+    A digest in the request itself, for example one copied from a job, stays. Errors as in `usable`; InputError if a
+    name and a digest belong to two objects.
     """
     beside = [usable(services, AssetKind.OBJECT, one.digest or one.object, scope) for one in options.beside]
+    found = []
     for one, asset in zip(options.beside, beside, strict=True):
         if one.object not in (asset.name, asset.digest):
             raise InputError(f"the neighbour {one.object!r} has a digest that is of {asset.name!r}; leave it out")
-    found = [
-        one.model_copy(update={"object": asset.name, "digest": asset.digest})
-        for one, asset in zip(options.beside, beside, strict=True)
-    ]
+        found.append(one.model_copy(update={"object": asset.name, "digest": asset.digest}))
     return options.with_beside(found), beside
 
 
@@ -59,11 +59,7 @@ def with_network(
 ) -> Options:
     """Return options with the digest of their network; unchanged if their method uses none.
 
-    Args:
-        hands: hands of the wanted grasps.
-
-    Raises:
-        as in `usable`; InputError if it proposes grasps of another hand.
+    Errors as in `usable`; InputError if it proposes grasps of another hand.
     """
     if not options.network:
         return options

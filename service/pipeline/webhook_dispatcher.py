@@ -35,11 +35,7 @@ Post = Callable[..., Response]
 
 
 class WebhookDispatcher:
-    """Runs beside the rounds of the controller, so that a silent address delays nothing else.
-
-    Args:
-        send: sends a body to an address; as `http_client.post`.
-    """
+    """Runs beside the rounds of the controller, so that a silent address delays nothing else."""
 
     def __init__(self, services: Services, stop: threading.Event, *, send: Post = post) -> None:
         self._services = services
@@ -57,7 +53,6 @@ class WebhookDispatcher:
         self._pool = ThreadPoolExecutor(AT_ONCE, thread_name_prefix="webhooks")
 
     def run(self) -> None:
-        """Run rounds until stopped."""
         look_again = -math.inf
         while not self._stop.is_set():
             # An address gets one delivery at a time: the next starts when the last has ended.
@@ -105,7 +100,6 @@ class WebhookDispatcher:
         return due.attempts > 0 or self._last.get(due.hook.id, (0.0, False))[1]
 
     def tell_datasets(self) -> None:
-        """Write ended datasets to the feed."""
         untold = dict(self._services.index.outbox.untold_datasets())
         for name in untold.keys() - self._services.index.datasets.unfinished(untold):
             dataset = self._services.index.datasets.get(name)

@@ -28,15 +28,8 @@ def new_job(message: dict[str, Any], **options: Any) -> Job:
     """Make a job without timeout, results, retries, callbacks or webhooks: `worker.process.main` and the
     controller provide the necessary ones.
     """
-    return Job.create(
-        TASK_FUNCTION,
-        args=(message,),
-        timeout=-1,
-        result_ttl=0,
-        failure_ttl=FAILURE_TTL_S,
-        serializer=JSONSerializer,
-        **options,
-    )
+    lifetimes = {"timeout": -1, "result_ttl": 0, "failure_ttl": FAILURE_TTL_S}
+    return Job.create(TASK_FUNCTION, args=(message,), **lifetimes, serializer=JSONSerializer, **options)
 
 
 def allowed_job(job: Job, queue: Queue) -> Job:

@@ -21,12 +21,7 @@ _NETWORK: Final = {"socket_connect_timeout": 3.0, "socket_keepalive": True}
 
 
 def connect(url: str, *, patience: int = 3, timeout_s: float = _SOCKET_TIMEOUT_S) -> Redis:
-    """Return a client that reconnects automatically.
-
-    Args:
-        patience: number of attempts before it gives up.
-        timeout_s: timeout of one response [s].
-    """
+    """Return a client that reconnects; it gives up after `patience` attempts, each of `timeout_s` at most."""
     over_network: dict[str, Any] = {} if url.startswith("unix:") else _NETWORK
     try:
         return Redis.from_url(
@@ -65,7 +60,6 @@ def password(data_dir: Path) -> str:
 
 
 def password_file(data_dir: Path) -> Path:
-    """Return the path of an embedded Redis's password, readable by its user only."""
     return data_dir.resolve() / "redis" / "password"
 
 

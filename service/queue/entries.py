@@ -45,7 +45,6 @@ def is_wrong_type(error: Exception) -> bool:
 
 
 def message(data: bytes | None) -> Message | None:
-    """Parse the message of an RQ job."""
     if data is None:
         return None
     try:
@@ -76,12 +75,7 @@ def events(reply: Any) -> list[tuple[str, Event | None]]:
 
 
 def sweep(connection: Any, kinds: Mapping[str, str], stream: str) -> None:
-    """Remove entries of a wrong type, and the event stream if it accepts no entries.
-
-    Args:
-        kinds: names with their expected Redis types.
-        stream: name of the event stream.
-    """
+    """Remove entries of another type than that in `kinds`, and the event stream if it accepts no entries."""
     with connection.pipeline(transaction=False) as pipe:
         for name in kinds:
             pipe.type(name)

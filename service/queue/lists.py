@@ -70,7 +70,6 @@ def known_lists(connection: Any) -> list[str]:
 
 
 def place_of(name: str) -> tuple[Priority, Stage]:
-    """Return priority and stage of a list of `known_lists`."""
     return _PLACES[_common(name)]
 
 
@@ -99,7 +98,6 @@ def _needs(stage: Stage, ability: Capabilities | None) -> list[Requirements]:
 
 
 def list_key(name: str) -> str:
-    """Return the key of the list of waiting tasks."""
     return f"{Queue.redis_queue_namespace_prefix}{name}"
 
 
@@ -109,17 +107,14 @@ def held_key(name: str) -> str:
 
 
 def job_key(job: str) -> str:
-    """Return the key of the data of a task and attempt."""
     return f"{Job.redis_job_namespace_prefix}{job}"
 
 
 def rq_worker_key(name: str) -> str:
-    """Return the key of RQ's data of a worker."""
     return f"{Worker.redis_worker_namespace_prefix}{name}"
 
 
 def workers_key(name: str) -> str:
-    """Return the key of the workers that read a list."""
     return str(WORKERS_BY_QUEUE_KEY % name)
 
 
@@ -130,6 +125,5 @@ def execution_keys(entry: str) -> tuple[str, str]:
 
 
 def kinds(lists: list[str]) -> dict[str, str]:
-    """Return the keys of lists with their Redis types."""
     of_each = ((list_key, "list"), (held_key, "zset"), (workers_key, "set"))
     return {key(name): kind for name in lists for key, kind in of_each}

@@ -80,7 +80,6 @@ class Lease:
     task_id: str
     attempt: int
     key: Any
-    """Key of the lease in the queue."""
     beat: str
     """Value that changes with every heartbeat; only the change has a meaning."""
 

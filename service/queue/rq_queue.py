@@ -77,7 +77,6 @@ class RqQueue:
         self._unread = "0"
         """Position up to which an earlier controller's pending events were read; ">": all of them."""
         self._leases: dict[str, Any] = {}
-        """Leadership locks of the candidates on this connection."""
 
     def ping(self) -> float:
         """Return the round-trip time [s]."""
@@ -89,14 +88,10 @@ class RqQueue:
     def enqueue(
         self, messages: Sequence[Message], priority: Priority, *, again: bool = False, apart: bool = False
     ) -> int:
-        """Append tasks to a priority. A task (id and attempt) that already waits or runs is not queued twice.
+        """Append tasks to a priority; return how many. One (id and attempt) that waits or runs is not queued twice.
 
-        Args:
-            again: the caller found these tasks missing in the queue; remaining data of them is replaced.
-            apart: only some workers of the stage can do them; the tasks go to separate lists.
-
-        Returns:
-            Number of tasks added.
+        `again` replaces remaining data of tasks that the caller found missing. `apart` appends them to separate lists,
+        because only some workers of the stage can do them.
         """
         stale = [cancel_key(message.task_id) for message in messages]
         if again:
@@ -129,14 +124,12 @@ class RqQueue:
             pipe.execute()
 
     def waiting(self) -> set[str]:
-        """Return the ids of the tasks in the queue."""
         with _mapped(), self.connection.pipeline(transaction=True) as pipe:
             for key in self._list_keys():
                 pipe.lrange(key, 0, -1)
             return {entries.task_of(entries.text(job))[0] for jobs in pipe.execute() for job in jobs}
 
     def depths(self) -> dict[tuple[Priority, Stage], int]:
-        """Return the number of waiting tasks of each priority and stage."""
         with _mapped(), self.connection.pipeline(transaction=False) as pipe:
             lists = known_lists(self.connection)
             for name in lists:
@@ -176,10 +169,7 @@ class RqQueue:
         ]
 
     def holder(self, lease: Lease) -> tuple[str, Message | None]:
-        """Return worker and message of a lease; None for data that Redis has lost.
-
-        Call it for lost leases only: reading all leases remains one round trip.
-        """
+        """Return worker and message of a lost lease, one round trip each; None for data that Redis has lost."""
         with _mapped(), self.connection.pipeline(transaction=False) as pipe:
             pipe.hmget(job_key(entries.text(lease.key[1].partition(b":")[0])), "worker_name", "data")
             (found,) = pipe.execute(raise_on_error=False)  # the name may have a value of another type
@@ -203,7 +193,6 @@ class RqQueue:
         return [beat for data in found if (beat := entries.read(WorkerBeat, data)) is not None]
 
     def publish(self, *events: Event) -> None:
-        """Append events."""
         with _mapped(), self.connection.pipeline(transaction=False) as pipe:
             for event in events:
                 put_event(pipe, event)
@@ -220,7 +209,6 @@ class RqQueue:
             return self._known(self._of_group(">", limit, wait_s))
 
     def acknowledge(self, event_ids: Sequence[str]) -> None:
-        """Acknowledge events that are in the index."""
         if event_ids:
             with _mapped():
                 self.connection.xack(EVENTS, _GROUP, *event_ids)
@@ -275,16 +263,11 @@ class RqQueue:
             return False
 
     def resign(self, holder: str) -> None:
-        """Release the leadership, if held."""
         with _mapped(), suppress(LockError):
             self.connection.lock(LEAD).do_release(holder)
 
     def now(self, *, lease_s: float) -> QueueStatus:
-        """Return queue lengths, ages and workers for the metrics, at a cost independent of the queue's length.
-
-        Args:
-            lease_s: lifetime of a worker's registration after its heartbeat [s].
-        """
+        """Return queue lengths, ages and workers for the metrics, at a cost independent of the queue's length."""
         beats = self.workers()
         with _mapped(), self.connection.pipeline(transaction=False) as pipe:
             lists = known_lists(self.connection)
@@ -312,14 +295,12 @@ class RqQueue:
         return QueueStatus(depth, oldest, running, workers)
 
     def count(self, amounts: Mapping[str, float]) -> None:
-        """Add to the persistent sums."""
         with _mapped(), self.connection.pipeline(transaction=False) as pipe:
             for name, amount in amounts.items():
                 pipe.hincrbyfloat(METRICS, name, amount)
             pipe.execute()
 
     def counted(self) -> dict[str, float]:
-        """Return all persistent sums."""
         with _mapped():
             found = self.connection.hgetall(METRICS)
         sums: dict[str, float] = {}
@@ -347,14 +328,12 @@ class RqQueue:
             pipe.execute()
 
     def close(self) -> None:
-        """Close the connections."""
         self.connection.close()
 
     def _of_group(self, after: str, limit: int, wait_s: float) -> list[tuple[str, Event | None]]:
         """Read events of the controllers' consumer group; create it if necessary."""
-        read = partial(
-            self.connection.xreadgroup, _GROUP, _GROUP, {EVENTS: after}, count=limit, block=int(wait_s * 1000) or None
-        )
+        block = int(wait_s * 1000) or None
+        read = partial(self.connection.xreadgroup, _GROUP, _GROUP, {EVENTS: after}, count=limit, block=block)
         try:
             return entries.events(read())
         except ResponseError as error:
@@ -370,10 +349,9 @@ class RqQueue:
         return [(event_id, event) for event_id, event in found if event is not None]
 
     def _job(self, message: Message) -> Job:
+        data = message.model_dump(mode="json", by_alias=True)
         return new_job(
-            for_worker_of(
-                getattr(message, "revision", 0), message.stage, message.model_dump(mode="json", by_alias=True)
-            ),
+            for_worker_of(getattr(message, "revision", 0), message.stage, data),
             id=rq_id(message.task_id, message.attempt),
             connection=self.connection,
             description=f"{message.stage} {message.task_id}",
@@ -389,7 +367,6 @@ def open_queue(settings: Settings, *, patience: int = 3) -> RqQueue:
 
 
 def put_event(pipe: Any, event: Event) -> None:
-    """Append an event to the bounded stream."""
     pipe.xadd(EVENTS, {"e": event.model_dump_json(exclude_defaults=True)}, maxlen=EVENTS_KEPT, approximate=True)
 
 
@@ -399,7 +376,6 @@ def rq_id(task_id: str, attempt: int) -> str:
 
 
 def cancel_key(task_id: str) -> str:
-    """Return the key that requests a worker to stop a task."""
     return f"graspd:cancel:{task_id}"
 
 
@@ -437,7 +413,6 @@ def unlist_worker(connection: Any, left: Event) -> None:
 
 
 def worker_key(name: str) -> str:
-    """Return the key that a living worker renews."""
     return f"{_WORKER.decode()}{name}"
 
 

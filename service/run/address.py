@@ -28,12 +28,20 @@ _FILE: Final = "api.json"
 
 
 def record_address(folder: Path, url: str) -> None:
-    """Record atomically, readable by this user only, that this process's service has the address `url`."""
-    handle, name = tempfile.mkstemp(dir=folder, prefix=f".{_FILE}.")
+    """Record that this process's service has the address `url`."""
+    record = {"api_url": url, "pid": os.getpid(), "started": start_of(os.getpid())}
+    write_private(folder / _FILE, json.dumps(record))
+
+
+def write_private(file: Path, text: str) -> None:
+    """Write a file atomically, readable by this user only."""
+    handle, name = tempfile.mkstemp(dir=file.parent, prefix=f".{file.name}.")
     try:
-        with os.fdopen(handle, "w") as file:
-            json.dump({"api_url": url, "pid": os.getpid(), "started": start_of(os.getpid())}, file)
-        Path(name).replace(folder / _FILE)
+        with os.fdopen(handle, "w") as opened:
+            opened.write(text)
+            opened.flush()
+            os.fsync(opened.fileno())
+        Path(name).replace(file)
     except OSError:
         Path(name).unlink(missing_ok=True)
         raise
@@ -86,7 +94,6 @@ class ListenAddress:
 
     file: Path
     host: str
-    """Host name or address for the other machines."""
     address: str
     """Address of this machine to which the name resolves: Redis listens only there."""
     port: int
@@ -97,11 +104,7 @@ class ListenAddress:
         return f"redis://:{self.password}@{self.host}:{self.port}/0"
 
     def write(self, settings: Settings, api_url: str) -> None:
-        """Write the settings for workers, as lines for a shell and for `--env-file`.
-
-        Raises:
-            UnavailableError: the folder is not writable.
-        """
+        """Write the settings for workers, as lines for a shell and for `--env-file`; UnavailableError if refused."""
         said = {
             "GRASPD_REDIS_URL": self.redis_url,
             "GRASPD_STORE_URL": settings.resolved_store_url,
@@ -110,32 +113,21 @@ class ListenAddress:
         text = "".join(f"{name}={shlex.quote(value)}\n" for name, value in said.items())
         try:
             self.file.parent.mkdir(parents=True, exist_ok=True)
-            handle, name = tempfile.mkstemp(dir=self.file.parent, prefix=f".{self.file.name}.")
-            with os.fdopen(handle, "w") as opened:
-                opened.write(text)
-                opened.flush()
-                os.fsync(opened.fileno())
-            Path(name).replace(self.file)
+            write_private(self.file, text)
         except OSError as error:
             raise UnavailableError(f"{self.file} cannot be written: {error.strerror}") from None
 
     def forget(self) -> None:
         """Remove the file, unless another service has overwritten it."""
-        try:
+        with contextlib.suppress(OSError):
             if self.redis_url in self.file.read_text():
                 self.file.unlink(missing_ok=True)
-        except OSError:
-            return
 
 
 def joining(settings: Settings, file: Path, *, host: str | None = None, port: int = 0) -> ListenAddress:
-    """Return an address, a free port (or `port`) and a new password.
+    """Return an address of this machine, a free port (or `port`) and a new password.
 
-    Args:
-        host: host name for other machines; by default this machine's name.
-
-    Raises:
-        InputError: other machines cannot share the configured Redis or store through this file.
+    InputError: other machines cannot share the configured Redis or store through this file.
     """
     if settings.redis_url is not None:
         raise InputError("GRASPD_REDIS_URL names a Redis already: give that to the workers, and leave --share away")
@@ -144,9 +136,8 @@ def joining(settings: Settings, file: Path, *, host: str | None = None, port: in
     name = host or socket.gethostname()
     try:
         address = str(socket.getaddrinfo(name, None, type=socket.SOCK_STREAM)[0][4][0])
-        with socket.create_server(
-            (address, port), family=socket.AF_INET6 if ":" in address else socket.AF_INET
-        ) as probe:
+        family = socket.AF_INET6 if ":" in address else socket.AF_INET
+        with socket.create_server((address, port), family=family) as probe:
             free = int(probe.getsockname()[1])
     except OSError as error:
         raise InputError(f"Redis cannot listen on {name}:{port or 'any'}: {error.strerror}; see --share-host") from None

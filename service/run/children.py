@@ -14,7 +14,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Final
 
@@ -44,7 +44,7 @@ class Child:
     starts: int = 0
     _started: float = 0.0
     _pause: float = _FIRST_PAUSE_S
-    _not_before: float = field(default=0.0)
+    _not_before: float = 0.0
 
     @property
     def pid_file(self) -> Path | None:
@@ -93,12 +93,10 @@ class Child:
             self.start()
 
     def ask_to_stop(self) -> None:
-        """Send SIGTERM, if it runs."""
         if self.process is not None and self.process.poll() is None:
             self.process.send_signal(signal.SIGTERM)
 
     def join(self, deadline: float) -> None:
-        """Wait until the deadline of `time.monotonic`, then kill."""
         if self.process is not None:
             try:
                 self.process.wait(timeout=max(0.05, deadline - time.monotonic()))

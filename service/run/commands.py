@@ -6,6 +6,7 @@ import logging
 import os
 import signal
 import threading
+from contextlib import closing
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
@@ -109,34 +110,22 @@ def _run_controller(settings: Settings, stop: threading.Event) -> None:
     from graspd.service.queue.rq_queue import open_queue
 
     alive = HeartbeatFile(settings.heartbeat_file)
-    queue = open_queue(settings, patience=0)
-    leadership = Leadership(queue, lease_s=settings.lease_s, alive=alive, name=settings.controller_name)
-    try:
+    with closing(open_queue(settings, patience=0)) as queue:
+        leadership = Leadership(queue, lease_s=settings.lease_s, alive=alive, name=settings.controller_name)
         # A controller of another service must not stand by here: all would take it for their own.
         _identify(settings, stop, alive)
         while leadership.wait(stop):
-            with leadership.held(stop) as over:
-                # A fresh controller receives the events again that an earlier one did not finish.
-                services = Services.open(settings)
-                try:
-                    Controller(services).run(over)
-                finally:
-                    services.close()
-    finally:
-        queue.close()
+            # A fresh controller receives the events again that an earlier one did not finish.
+            with leadership.held(stop) as over, closing(Services.open(settings)) as services:
+                Controller(services).run(over)
 
 
 def _identify(settings: Settings, stop: threading.Event, alive: HeartbeatFile) -> None:
-    """Check that store, index and Redis belong to one service, once Redis answers.
-
-    Raises:
-        BusyError: one of them belongs to another service.
-    """
+    """Check that store, index and Redis belong to one service (else BusyError), once Redis answers."""
     from graspd.service.pipeline.backends import Services
     from graspd.service.pipeline.identity import identify
 
-    services = Services.open(settings, patience=0)
-    try:
+    with closing(Services.open(settings, patience=0)) as services:
         while not stop.is_set():
             alive.touch()
             try:
@@ -145,8 +134,6 @@ def _identify(settings: Settings, stop: threading.Event, alive: HeartbeatFile) -
             except QueueUnavailable as error:
                 log.warning("%s", error)
             stop.wait(settings.lease_s / 3)
-    finally:
-        services.close()
 
 
 @index_app.command(epilog="graspd admin index rebuild --check")
@@ -210,11 +197,8 @@ def export(
     from graspd.service.index.export import export as write
     from graspd.service.index.index import Index
 
-    index = Index(load_settings(data_dir=data_dir).resolved_index_url)
-    try:
+    with closing(Index(load_settings(data_dir=data_dir).resolved_index_url)) as index:
         rows = write(index.database, output)
-    finally:
-        index.close()
     if json:
         emit(rows)
     else:
@@ -233,23 +217,18 @@ def path(data_dir: DataDir = None) -> None:
 
 
 def _check_extras(workers: int) -> None:
-    """Raise UnavailableError if libraries of the children are not installed."""
     needed = ("httpx", "fastapi", "warp") if workers else ("httpx", "fastapi")
     if any(find_spec(library) is None for library in needed):
         raise UnavailableError("`graspd up` is not part of this install; run pip install 'graspd[all]'")
 
 
 def check_controller(settings: Settings) -> None:
-    """Raise UnavailableError without a recent heartbeat of a controller."""
     from graspd.service.pipeline.leading import PART
     from graspd.service.queue.rq_queue import open_queue
 
-    queue = open_queue(settings, patience=0)
-    try:
+    with closing(open_queue(settings, patience=0)) as queue:
         if not queue.announced(PART):
             raise UnavailableError("no controller sent a heartbeat lately; start `graspd controller`")
-    finally:
-        queue.close()
 
 
 def stop_on_signals() -> threading.Event:

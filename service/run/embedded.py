@@ -17,7 +17,7 @@ from typing import IO, Final
 
 from graspd.service.model.errors import BusyError, QueueUnavailable
 from graspd.service.queue.connection import password_file, socket_path
-from graspd.service.run.address import ListenAddress
+from graspd.service.run.address import ListenAddress, write_private
 from graspd.service.settings import Settings
 
 log = logging.getLogger(__name__)
@@ -30,11 +30,7 @@ _OF_DISK: Final = re.compile(r"No space left|Permission denied|Read-only file sy
 
 
 def find_server() -> tuple[Path, str]:
-    """Find a Redis server program; return it with the step of the search that found it.
-
-    Raises:
-        QueueUnavailable: none found; the message lists three solutions.
-    """
+    """Find a Redis server program, and the step of the search; QueueUnavailable lists three solutions."""
     for rung, find in _LADDER:
         path = find()
         if path is not None and os.access(path, os.X_OK):
@@ -46,11 +42,7 @@ def find_server() -> tuple[Path, str]:
 
 
 def server_command(settings: Settings, joining: ListenAddress | None = None) -> list[str]:
-    """Return the foreground command of the embedded Redis; create its folders. Call `own_redis` first.
-
-    Args:
-        joining: address for other machines; None: private socket only.
-    """
+    """Return the foreground command of the embedded Redis; create its folders. Call `own_redis` first."""
     server, _ = find_server()
     folder = settings.data_dir.resolve() / "redis"
     socket = socket_path(settings.data_dir)
@@ -75,24 +67,14 @@ def server_command(settings: Settings, joining: ListenAddress | None = None) -> 
     configuration = []
     if joining is not None:
         options |= {"port": str(joining.port), "bind": joining.address, "protected-mode": "yes"}
-        _write_private(secret, joining.password)
-        _write_private(folder / "redis.conf", f"requirepass {joining.password}\n")
+        write_private(secret, joining.password)
+        write_private(folder / "redis.conf", f"requirepass {joining.password}\n")
         configuration = [str(folder / "redis.conf")]
     return [str(server), *configuration, *(part for name, value in options.items() for part in (f"--{name}", value))]
 
 
-def _write_private(file: Path, text: str) -> None:
-    file.unlink(missing_ok=True)
-    with os.fdopen(os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as opened:
-        opened.write(text)
-
-
 def own_redis(settings: Settings) -> IO[str]:
-    """Lock a data folder's Redis folder for this process, until the returned file is closed.
-
-    Raises:
-        BusyError: another process runs it.
-    """
+    """Lock a data folder's Redis folder, until the returned file is closed; BusyError if another process runs it."""
     folder = settings.data_dir.resolve() / "redis"
     _private_folder(folder)
     return lock_file(folder / "lock", f"the Redis of {settings.data_dir}")

@@ -24,7 +24,6 @@ def die_with_parent(parent: int) -> None:
 
 
 def main(arguments: list[str]) -> None:
-    """Replace this process by the program."""
     die_with_parent(int(arguments[0]))
     os.execvp(arguments[1], arguments[1:])
 

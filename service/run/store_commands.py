@@ -16,11 +16,6 @@ store_app = typer.Typer(no_args_is_help=True, help="Verify and repair the store.
 app.add_typer(store_app, name="store")
 
 
-@store_app.callback()
-def store() -> None:
-    """Verify and repair the store."""
-
-
 @store_app.command(epilog="graspd admin store verify --repair")
 @reporting_errors
 def verify(
@@ -48,8 +43,8 @@ def verify(
         if not turn.is_mine():
             raise ConflictError("another `graspd admin store verify` reads this store; wait until it is done")
         shards, found, unsealed = 0, [], list[str]()
-        for key, wrong in scan(services.store, read=lambda size: turn.keep(), unsealed=unsealed.append):
-            turn.keep()
+        for key, wrong in scan(services.store, read=lambda size: turn.is_mine(), unsealed=unsealed.append):
+            turn.is_mine()
             shards += key.startswith(f"{names.SHARDS}/") and key.endswith(".json")
             found += [wrong] if wrong is not None else []
         services.index.damage.replace(found)

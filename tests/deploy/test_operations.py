@@ -2,41 +2,61 @@
 
 from __future__ import annotations
 
+import os
 import re
-from collections.abc import Iterator
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import closing
 from pathlib import Path
+from typing import Final
 
 import pytest
 
 from graspd.service.index.index import Index
-from graspd.service.index.rebuild import differences, rebuild
+from graspd.service.index.rebuild import differences
 from graspd.service.model.states import State
 from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.identity import identify
 from graspd.service.settings import Settings
 from graspd.service.store.library import publish_builtins
-from graspd.service.store.store import open_store
 from tests.conftest import REPOSITORY
-from tests.deploy import composition, page
+from tests.deploy import composition
 from tests.fakes import add_assets, request
-from tests.memory_queue import MemoryQueue
+from tests.indexes import open_services
 from tests.service.index.test_index import run_all
+from tests.shell import completed
+
+TEXT: Final = "\n".join((REPOSITORY / "docs" / "how-to" / page).read_text() for page in ("install.md", "operations.md"))
+_TRIED: Final = re.compile(r"<!-- tried: ([\w-]+) -->\n```sh\n(.*?)```", re.DOTALL)
+
+
+def run_block(name: str, folder: Path, environment: Mapping[str, str]) -> subprocess.CompletedProcess[str]:
+    """Run a marked block as a user would, `graspd` being that of this environment; a failing line ends it."""
+    shims = folder / "bin"
+    shims.mkdir(exist_ok=True)
+    shim = shims / "graspd"
+    shim.write_text(f'#!/bin/sh\nexec {sys.executable} -m graspd "$@"\n')
+    shim.chmod(0o755)
+    return completed(
+        ["bash", "-euo", "pipefail", "-c", dict(_TRIED.findall(TEXT))[name]],
+        cwd=folder,
+        env=os.environ | {"PATH": f"{shims}:{os.environ['PATH']}", "PYTHONPATH": str(REPOSITORY)} | dict(environment),
+    )
 
 
 @pytest.fixture
 def kept(tmp_path: Path) -> Iterator[Services]:
     """A data folder with a finished job and one that has not begun."""
-    settings = Settings(data_dir=tmp_path / "data")
-    index = Index(settings.resolved_index_url)
-    services = Services(settings, open_store(settings.resolved_store_url), index, MemoryQueue())
+    services = open_services(Settings(data_dir=tmp_path / "data"))
     identify(services)
     add_assets(services)
     publish_builtins(services.store)
     run_all(services, job_actions.submit(services, request(grasps=64, scenes=1))[0].id)
     job_actions.submit(services, request(grasps=32, seed=5))
     yield services
-    index.close()
+    services.close()
 
 
 def names_of(folder: Path) -> set[str]:
@@ -49,50 +69,24 @@ def test_a_back_up_restored_elsewhere_gives_the_same_index(kept: Services, tmp_p
     (data / "store" / "shards" / "half-written.h5#123").write_bytes(b"half")
     where = {"GRASPD_DATA_DIR": str(data), "NEW_DATA_DIR": str(fresh)}
     for step in ("back-up", "restore"):
-        done = page.run(step, tmp_path, where)
+        done = run_block(step, tmp_path, where)
         assert done.returncode == 0, done.stderr
     assert names_of(fresh / "store") == names_of(data / "store") - {"shards/half-written.h5#123"}
     assert (fresh / "keys.json").exists()
-    restored = Index(Settings(data_dir=fresh).resolved_index_url)
-    try:
+    with closing(Index(Settings(data_dir=fresh).resolved_index_url)) as restored:
         assert differences(restored, kept.store) == []
         jobs = {job.id: job.state for job in restored.jobs.page(limit=10).items}
         assert jobs == {job.id: job.state for job in kept.index.jobs.page(limit=10).items}
         assert set(jobs.values()) == {State.SUCCEEDED, State.QUEUED}
-    finally:
-        restored.close()
 
 
 def test_a_back_up_works_where_no_key_was_ever_made(kept: Services, tmp_path: Path) -> None:
-    done = page.run("back-up", tmp_path, {"GRASPD_DATA_DIR": str(kept.settings.data_dir)})
+    done = run_block("back-up", tmp_path, {"GRASPD_DATA_DIR": str(kept.settings.data_dir)})
     assert done.returncode == 0, done.stderr
 
 
-def test_a_damaged_copy_is_noticed(kept: Services, tmp_path: Path) -> None:
-    where = {"GRASPD_DATA_DIR": str(kept.settings.data_dir), "NEW_DATA_DIR": str(tmp_path / "new")}
-    assert page.run("back-up", tmp_path, where).returncode == 0
-    assert page.run("restore", tmp_path, where).returncode == 0
-    lost = next((tmp_path / "new" / "store" / "shards").rglob("*.json"))
-    lost.unlink()
-    restored = Index(Settings(data_dir=tmp_path / "new").resolved_index_url)
-    try:
-        assert differences(restored, open_store((tmp_path / "new" / "store").as_uri())) != []
-    finally:
-        restored.close()
-
-
-def test_an_empty_index_is_filled_from_the_store(kept: Services) -> None:
-    before = {job.id: job.state for job in kept.index.jobs.page(limit=10).items}
-    empty = Index(f"sqlite:///{kept.settings.data_dir / 'older.sqlite'}")
-    try:
-        rebuild(empty, kept.store)
-        assert {job.id: job.state for job in empty.jobs.page(limit=10).items} == before
-    finally:
-        empty.close()
-
-
 def test_keys_are_made_rotated_limited_and_revoked(tmp_path: Path) -> None:
-    done = page.run("keys", tmp_path, {"GRASPD_DATA_DIR": str(tmp_path / "data"), "COLUMNS": "200"})
+    done = run_block("keys", tmp_path, {"GRASPD_DATA_DIR": str(tmp_path / "data"), "COLUMNS": "200"})
     assert done.returncode == 0, done.stderr
     first, second = re.findall(r"^(gd_\S+)", done.stdout, re.MULTILINE)
     assert first != second
@@ -101,12 +95,7 @@ def test_keys_are_made_rotated_limited_and_revoked(tmp_path: Path) -> None:
 
 def test_every_profile_service_and_variant_on_the_page_exists() -> None:
     profiles = {name for service in composition.SERVICES.values() for name in service.get("profiles", ())}
-    assert set(re.findall(r"--profile (\S+)", page.TEXT)) <= profiles
-    assert set(re.findall(r"--scale ([\w-]+)=", page.TEXT)) <= composition.SERVICES.keys()
-    for variant in re.findall(r"apply -k (\S+)", page.TEXT):
+    assert set(re.findall(r"--profile (\S+)", TEXT)) <= profiles
+    assert set(re.findall(r"--scale ([\w-]+)=", TEXT)) <= composition.SERVICES.keys()
+    for variant in re.findall(r"apply -k (\S+)", TEXT):
         assert (REPOSITORY / variant / "kustomization.yaml").is_file()
-
-
-def test_every_setting_on_the_page_exists() -> None:
-    known = {f"GRASPD_{name.upper()}" for name in Settings.model_fields}
-    assert set(re.findall(r"\bGRASPD_[A-Z_]+\b", page.TEXT)) <= known

@@ -8,8 +8,8 @@ import shutil
 import ssl
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,9 +19,9 @@ import pytest
 from graspd.api.access.keys import KeyFile, Scope
 from tests.conftest import REPOSITORY
 from tests.servers import free_ports
+from tests.waiting import until
 
 NAME = "grasps.example.org"
-_READY_S = 120.0
 
 
 def served(folder: Path, api: int, plain: int, secure: int) -> Path:
@@ -85,16 +85,14 @@ def proxy(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Proxy]:
         timeout=60,
         event_hooks={"request": [lambda request: request.extensions.update(sni_hostname=NAME)]},
     )
+
+    def answers() -> bool:
+        with suppress(httpx.HTTPError):
+            return client.get("/healthz").status_code == 200
+        return False
+
     try:
-        deadline = time.monotonic() + _READY_S
-        while True:
-            try:
-                if client.get("/healthz").status_code == 200:
-                    break
-            except httpx.HTTPError:
-                pass
-            assert time.monotonic() < deadline, (folder / "api.log").read_text()
-            time.sleep(0.1)
+        until(answers, "the API answers through the proxy", logs=(folder / "api.log").read_text)
         yield Proxy(client, key, f"{NAME}:{secure}", plain)
     finally:
         client.close()

@@ -5,8 +5,8 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
+from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -27,8 +27,6 @@ from tests.servers import PostgresServer, S3Server, free_ports
 from tests.service.conftest import wait_for_redis
 from tests.shell import completed
 from tests.waiting import until
-
-_READY_S = 120.0
 
 
 @dataclass
@@ -61,16 +59,12 @@ class Topology:
         )
 
     def until_ready(self) -> None:
-        deadline = time.monotonic() + _READY_S
-        for port in self.ports:
-            while True:
-                try:
-                    if httpx.get(f"http://127.0.0.1:{port}/readyz", timeout=60, trust_env=False).status_code == 200:
-                        break
-                except httpx.HTTPError:
-                    pass
-                assert time.monotonic() < deadline, self.logs()
-                time.sleep(0.1)
+        def answers(port: int) -> bool:
+            with suppress(httpx.HTTPError):
+                return httpx.get(f"http://127.0.0.1:{port}/readyz", timeout=60, trust_env=False).status_code == 200
+            return False
+
+        until(lambda: all(map(answers, self.ports)), "both APIs are ready", logs=self.logs)
 
     def stop(self) -> None:
         for process in self.processes.values():
@@ -141,11 +135,8 @@ def test_the_services_of_the_compose_file_do_a_job_together(
     assert topology.graspd("worker-cpu", "worker", "--check").returncode == 0
     for name, value in topology.environment("api").items():
         monkeypatch.setenv(name, value)
-    index = Index(topology.variables["GRASPD_INDEX_URL"])
-    try:
+    with closing(Index(topology.variables["GRASPD_INDEX_URL"])) as index:
         assert differences(index, open_store(topology.variables["GRASPD_STORE_URL"])) == []
-    finally:
-        index.close()
 
 
 @pytest.mark.s3

@@ -16,8 +16,7 @@ from graspd.service.run.embedded import server_command
 from graspd.service.settings import Settings
 from graspd.service.store.store import open_store
 from tests.fakes import add_assets
-from tests.indexes import EmptySchemas, empty_index
-from tests.memory_queue import MemoryQueue
+from tests.indexes import EmptySchemas, open_services
 from tests.servers import PostgresServer
 from tests.waiting import until
 
@@ -84,8 +83,7 @@ def services(tmp_path: Path) -> Iterator[Services]:
     """A service without processes: memory store, SQLite index, memory queue, a hand `gripper` and an object `ball`;
     each batch is a task."""
     settings = Settings(data_dir=tmp_path, retry_backoff_s=0.0, task_s=0.0)
-    index = empty_index(settings.resolved_index_url)
-    made = Services(settings, open_store("memory://"), index, MemoryQueue())
+    made = open_services(settings, open_store("memory://"))
     add_assets(made)
     yield made
     made.close()

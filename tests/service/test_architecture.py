@@ -56,7 +56,7 @@ TASK_ENGINE = (
     "worker/pool",
     *(
         f"service/pipeline/{name}.py"
-        for name in ("controller", "leading", "lease_reaper", "ranges", "metrics", "tagging", "recording")
+        for name in ("controller", "leading", "lease_reaper", "ranges", "tagging", "recording")
     ),
 )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import random
@@ -20,17 +21,24 @@ from rq.serializers import JSONSerializer
 from graspd.service.index.queries.grasps import GraspFilter
 from graspd.service.index.rebuild import differences, rebuild
 from graspd.service.model import names
-from graspd.service.model.errors import BusyError
-from graspd.service.model.states import State
+from graspd.service.model.errors import BusyError, QueueUnavailable
+from graspd.service.model.planning import plan
+from graspd.service.model.states import Priority, Stage, State
 from graspd.service.pipeline import job_actions
+from graspd.service.pipeline.datasets import actions
 from graspd.service.queue.allowed import TASK_FUNCTION
 from graspd.service.queue.rq_queue import RqQueue
 from graspd.service.run.supervisor import Supervisor
 from graspd.service.settings import Settings
+from graspd.service.store.manifests import ShardManifest, load_shard
+from graspd.service.store.records import read_record
 from graspd.service.store.shards import read_shard
 from graspd.worker.stages.context import TaskContext
-from tests.fakes import fake_synthesize, message_for
+from tests.dataset_status import status
+from tests.fakes import fake_synthesize, message_for, record_of
 from tests.fakes import request as wanted
+from tests.service.pipeline.datasets.makers import add_asset
+from tests.service.pipeline.datasets.makers import wanted as wanted_dataset
 from tests.system.conftest import System, alive, starting
 from tests.waiting import PATIENCE_S, until
 
@@ -270,3 +278,129 @@ def test_random_kills_lose_nothing_and_repeat_nothing(
     system.until(lambda: not differences(system.services.index, system.services.store), "index and store agree")
     system.supervisor.stop()
     assert not [pid for pid in everyone if alive(pid)]
+
+
+def submitted(system: System, grasps: int, *, span: int) -> str:
+    """A job in bulk whose tasks have so many batches."""
+    record = job_actions.prepare(system.services, wanted(grasps=grasps), priority=Priority.BULK)
+    return job_actions.enter(system.services, record.model_copy(update={"span": span}))[0].id
+
+
+def test_the_range_of_a_killed_worker_is_made_again_once(start: Start) -> None:
+    system = start(lease_s=2.0)
+    system.hold.touch()
+    job = submitted(system, 32 * 5, span=3)
+    running = system.services.index.jobs.tasks
+    system.until(lambda: len(running(job=job, state=State.RUNNING).items) == 1, "the worker holds a range")
+    killed = system.kill("worker-0")
+    system.until(lambda: not alive(killed), "it is dead")
+    system.hold.unlink()
+    (done,) = system.finish(job)
+    assert (done.state, done.grasps) == (State.SUCCEEDED, 160)
+    (attempt,) = system.services.index.jobs.attempts(job=job)
+    assert attempt.kind == "WorkerLost" and f"-{killed}-" in attempt.worker
+    record = record_of(system.services, job)
+    made = [load_shard(system.services.store, Stage.SYNTHESIZE, task.output) for task in plan(record)]
+    assert [(shard.attributes["batch"], shard.attributes["batch_rows"]) for shard in made] == [
+        (0, "[32, 32, 32]"),
+        (3, "[32, 32]"),
+    ]
+    rows = np.concatenate([shard["grasp/joint_positions"] for shard in made])
+    assert len(np.unique(rows, axis=0)) == 160, "no batch is there twice"
+
+
+def test_a_worker_killed_before_its_event_has_its_task_done(start: Start, tmp_path: Path) -> None:
+    killed = tmp_path / "killed"
+    system = start(environment={"FAKE_DIE_UNTOLD": str(killed)})
+    job = submitted(system, 96, span=3)
+    (done,) = system.finish(job)
+    assert (done.state, done.grasps) == (State.SUCCEEDED, 96)
+    keys = sorted(entry.key for entry in system.services.store.list("shards"))
+    assert keys == [f"shards/base/{killed.read_text()}.{ending}" for ending in ("h5", "json")]
+    assert not system.services.index.jobs.attempts(job=job), "no attempt was used up"
+
+
+@pytest.mark.slow
+def test_a_range_that_kills_its_worker_takes_no_other_one_down(start: Start) -> None:
+    system = start(environment={"FAKE_POISON": "2", "FAKE_SECONDS": "0.2"}, lease_s=2.0, retry_backoff_s=0.1)
+    job = submitted(system, 32 * 6, span=2)
+    (done,) = system.finish(job)
+    assert done.state is State.FAILED
+    tasks = sorted(system.services.index.jobs.tasks(job=job).items, key=lambda task: task.batch)
+    assert [(task.batch, task.state) for task in tasks] == [
+        (0, State.SUCCEEDED),
+        (2, State.FAILED),
+        (4, State.SUCCEEDED),
+    ]
+    assert [attempt.task_id for attempt in system.services.index.jobs.attempts(job=job)] == [tasks[1].id] * 3
+
+
+OBJECTS = tuple(f"object-{i}" for i in range(20))
+
+
+def made(system: System) -> dict[str, str]:
+    """When each shard was made."""
+    store = system.services.store
+    keys = [entry.key for entry in store.list(names.SHARDS) if entry.key.endswith(".json")]
+    return {key: read_record(ShardManifest, store, key).created for key in keys}
+
+
+def test_a_dataset_goes_on_after_everything_was_killed(start: Start) -> None:
+    system = start(environment={"FAKE_SECONDS": "0.1"}, lease_s=2.0, retry_backoff_s=0.1)
+    for name in OBJECTS:
+        add_asset(system.services, "object", name)
+    request = wanted_dataset("kitchen", hands=("gripper",), objects=OBJECTS, scenes=1)
+    actions.create(system.services, request)
+    system.until(
+        lambda: system.services.index.datasets.get("kitchen").states[State.SUCCEEDED] >= 5, "a quarter is done"
+    )
+    system.hold.touch()
+    for pid in system.supervisor.pids.values():
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+    before = made(system)
+    assert len(before) < 2 * len(OBJECTS)
+    system.until(lambda: _redis_answers(system), "Redis is started again")
+    again, new = actions.create(system.services, request)
+    assert not new and not again.state.is_final
+    system.hold.unlink()
+    system.until(lambda: system.services.index.datasets.get("kitchen").state.is_final, "the dataset is done")
+    after = made(system)
+    assert {key: after[key] for key in before} == before
+    assert len(after) == 2 * len(OBJECTS)
+    assert {cell.state for cell in status(system.services.index, "kitchen").cells} == {State.SUCCEEDED}
+    assert differences(system.services.index, system.services.store) == []
+    taken, _ = actions.snapshot(system.services, "kitchen")
+    assert taken.complete and len(taken.shards) == len(after)
+
+
+@pytest.mark.slow
+def test_a_dataset_that_is_cancelled_stops_and_stays_so(start: Start) -> None:
+    system = start(environment={"FAKE_SECONDS": "0.3"}, lease_s=2.0, retry_backoff_s=0.1)
+    for name in OBJECTS:
+        add_asset(system.services, "object", name)
+    actions.create(system.services, wanted_dataset("kitchen", hands=("gripper",), objects=OBJECTS))
+    system.until(lambda: system.services.index.datasets.get("kitchen").states[State.SUCCEEDED] >= 2, "two are done")
+    system.hold.touch()
+    actions.cancel(system.services, "kitchen")
+    system.until(lambda: system.services.index.datasets.get("kitchen").state is State.CANCELLED, "it is cancelled")
+    system.kill("controller")
+    system.until(lambda: _waits_for_nothing(system), "nothing waits for it any more")
+    # A task that was at its end when the cancellation came has succeeded; the new controller hears of it.
+    system.until(
+        lambda: not differences(system.services.index, system.services.store), "the index is what the store says"
+    )
+    states = {cell.state for cell in status(system.services.index, "kitchen").cells}
+    assert states == {State.SUCCEEDED, State.CANCELLED}
+
+
+def _redis_answers(system: System) -> bool:
+    try:
+        system.services.queue.ping()
+    except QueueUnavailable:
+        return False
+    return True
+
+
+def _waits_for_nothing(system: System) -> bool:
+    return not system.services.queue.waiting() and not system.services.queue.leases()

@@ -1,4 +1,4 @@
-"""Workers that come, go and step aside as they should, whose turn it is, and a machine with too much to do."""
+"""Workers that come, go and step aside, whose turn it is, and parts that go away in the middle of the work."""
 
 from __future__ import annotations
 
@@ -15,19 +15,18 @@ from pathlib import Path
 import httpx
 import pytest
 
+from graspd.service.index.rebuild import differences
 from graspd.service.model.clock import timestamp
 from graspd.service.model.states import Priority, State
 from graspd.service.pipeline import job_actions
 from tests.fakes import request
+from tests.servers import PostgresServer, S3Server
 from tests.system.conftest import System
 
+pytestmark = pytest.mark.chaos
 Start = Callable[..., System]
-
-
 #: Batches of a dataset that wait in the queue before a later small job.
 _WAITING = 500
-
-
 #: Of these may be done before it: those that run, every fourth turn, and what one worker does while the other has it.
 _BEFORE_IT = 150
 
@@ -37,7 +36,6 @@ def makers(system: System) -> set[str]:
     return {shard.worker for shard in system.services.index.shards.page(limit=200).items}
 
 
-@pytest.mark.chaos
 def test_a_worker_that_leaks_makes_room_before_it_holds_too_much(start: Start) -> None:
     system = start(environment={"FAKE_LEAK_MB": "200"}, worker_max_memory_mb=450)
     (done,) = system.finish(system.submit(request(grasps=32 * 6)))
@@ -47,7 +45,6 @@ def test_a_worker_that_leaks_makes_room_before_it_holds_too_much(start: Start) -
     assert "lost" not in {worker.state for worker in system.services.index.overview.workers()}
 
 
-@pytest.mark.chaos
 def test_a_worker_that_was_stopped_is_not_shown_as_lost(start: Start) -> None:
     system = start()
     system.until(system.services.index.overview.workers, "the worker is listed")
@@ -64,7 +61,6 @@ def test_a_worker_that_was_stopped_is_not_shown_as_lost(start: Start) -> None:
     assert "lost" not in seen
 
 
-@pytest.mark.chaos
 def test_a_worker_that_was_killed_is_shown_as_lost(start: Start) -> None:
     system = start(lease_s=2.0)
     system.until(system.services.index.overview.workers, "the worker is listed")
@@ -73,7 +69,6 @@ def test_a_worker_that_was_killed_is_shown_as_lost(start: Start) -> None:
     system.until(lambda: "lost" in states(), "it is lost")
 
 
-@pytest.mark.chaos
 def test_somebody_at_a_screen_does_not_wait_for_a_dataset(start: Start) -> None:
     system = start(workers=2, environment={"FAKE_SECONDS": "0.3"})
     bulk = job_actions.submit(system.services, request(grasps=100_000), priority=Priority.BULK)[0].id
@@ -92,7 +87,6 @@ def test_somebody_at_a_screen_does_not_wait_for_a_dataset(start: Start) -> None:
     assert len(between) <= _BEFORE_IT, f"of {_WAITING} batches that waited before it, {len(between)} went first"
 
 
-@pytest.mark.chaos
 def test_steady_small_jobs_do_not_stop_a_dataset(start: Start) -> None:
     system = start(environment={"FAKE_SECONDS": "0.05"})
     bulk = job_actions.submit(system.services, request(grasps=3200), priority=Priority.BULK)[0].id
@@ -123,8 +117,7 @@ def test_steady_small_jobs_do_not_stop_a_dataset(start: Start) -> None:
         thread.join()
 
 
-@pytest.mark.chaos
-def test_a_worker_whose_engine_breaks_returns_when_it_is_fixed(start: Callable[..., System], tmp_path: Path) -> None:
+def test_a_worker_whose_engine_breaks_returns_when_it_is_fixed(start: Start, tmp_path: Path) -> None:
     broken = tmp_path / "broken"
     system = start(api=True, environment={"FAKE_BROKEN": str(broken)})
     system.finish(system.submit(request(seed=1)))
@@ -147,8 +140,7 @@ def test_a_worker_whose_engine_breaks_returns_when_it_is_fixed(start: Callable[.
     assert system.services.index.jobs.attempts() == [], "it cost no attempt"
 
 
-@pytest.mark.chaos
-def test_a_worker_that_cannot_load_its_engine_takes_no_task(start: Callable[..., System], tmp_path: Path) -> None:
+def test_a_worker_that_cannot_load_its_engine_takes_no_task(start: Start, tmp_path: Path) -> None:
     broken = tmp_path / "broken"
     system = start(environment={"FAKE_BROKEN": str(broken)})
     broken.touch()
@@ -163,12 +155,8 @@ def test_a_worker_that_cannot_load_its_engine_takes_no_task(start: Callable[...,
 
 #: Busy processes a core.
 BUSY = 7.5
-
-
 #: A busy process ends by itself, should nobody end it [s].
 _LONGEST_S = 600
-
-
 _BUSY = f"import time\nend = time.monotonic() + {_LONGEST_S}\nwhile time.monotonic() < end: pass"
 
 
@@ -187,10 +175,9 @@ def load() -> Iterator[None]:
             process.wait()
 
 
-@pytest.mark.chaos
 @pytest.mark.slow
 @pytest.mark.timeout(_LONGEST_S)
-def test_on_a_busy_machine_no_worker_is_lost(start: Callable[..., System]) -> None:
+def test_on_a_busy_machine_no_worker_is_lost(start: Start) -> None:
     """Each task holds the interpreter lock for two leases, as a kernel that compiles does."""
     system = start(workers=2, environment={"FAKE_LOCK_S": "4"}, lease_s=2.0, task_attempts=1)
     # That they start is no part of it, and would take the tests beside this one their processors for long.
@@ -201,3 +188,83 @@ def test_on_a_busy_machine_no_worker_is_lost(start: Callable[..., System]) -> No
     assert system.services.index.jobs.attempts() == []
     assert (done.state, done.grasps) == (State.SUCCEEDED, 32 * 2)
     assert "lost" not in {worker.state for worker in system.services.index.overview.workers()}
+
+
+@pytest.fixture
+def own_s3(s3_server: S3Server, monkeypatch: pytest.MonkeyPatch) -> Iterator[S3Server]:
+    """An S3 server that the test may kill."""
+    with S3Server() as server:
+        for name, value in server.environment.items():
+            monkeypatch.setenv(name, value)
+        yield server
+
+
+@pytest.fixture
+def own_postgres(postgres_server: PostgresServer) -> Iterator[PostgresServer]:
+    """A PostgreSQL that the test may kill."""
+    with PostgresServer() as server:
+        yield server
+
+
+def messages(system: System, job: str) -> list[str]:
+    return [task.message or "" for task in system.services.index.jobs.tasks(job=job, limit=200).items]
+
+
+def finish_and_compare(system: System, job: str, grasps: int) -> None:
+    (done,) = system.finish(job)
+    assert (done.state, done.grasps) == (State.SUCCEEDED, grasps)
+    assert system.services.index.jobs.attempts(job=job) == [], "it costs no attempt"
+    system.until(lambda: not differences(system.services.index, system.services.store), "index and store agree")
+
+
+@pytest.mark.s3
+def test_a_store_killed_in_the_middle_is_waited_for(start: Start, own_s3: S3Server) -> None:
+    system = start(workers=2, environment={"FAKE_SECONDS": "0.2"}, store_url=own_s3.url, retry_backoff_s=0.2)
+    system.finish(system.submit(request(seed=1)))
+    system.hold.touch()
+    job = system.submit(request(grasps=32 * 20))
+    system.until(lambda: system.services.index.jobs.get(job).state is State.RUNNING, "a task of it runs")
+    own_s3.kill()
+    system.hold.unlink()
+    system.until(lambda: any(m.startswith("waits: the store") for m in messages(system, job)), "tasks say so")
+    assert not system.services.index.jobs.get(job).state.is_final
+    own_s3.start()
+    finish_and_compare(system, job, 32 * 20)
+
+
+@pytest.mark.postgres
+def test_an_index_killed_in_the_middle_is_caught_up_with(start: Start, own_postgres: PostgresServer) -> None:
+    system = start(index_url=own_postgres.database())
+    system.finish(system.submit(request(seed=1)))
+    system.hold.touch()
+    job = system.submit(request(grasps=32 * 20))
+    system.until(lambda: len(system.services.queue.waiting()) >= 4, "more waits than the one that runs")
+    own_postgres.kill()
+    made = len(list(system.services.store.list("shards")))
+    system.hold.unlink()
+    system.until(lambda: len(list(system.services.store.list("shards"))) > made + 4, "workers go on without it")
+    own_postgres.start()
+    finish_and_compare(system, job, 32 * 20)
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of 1 MB."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", str(folder)]
+    if os.getuid() != 0 or subprocess.run(mount, capture_output=True, check=False).returncode:
+        pytest.skip("only root may mount a small file system")
+    yield folder
+    subprocess.run(["umount", "--lazy", str(folder)], check=True)
+
+
+def test_a_full_disk_is_waited_for_until_there_is_room(start: Start, small_disk: Path) -> None:
+    system = start(store_url=(small_disk / "store").as_uri(), retry_backoff_s=0.2)
+    job = system.submit(request(grasps=32 * 100))
+    says = "No space left on device"
+    system.until(lambda: any(says in message for message in messages(system, job)), "a task says so")
+    time.sleep(1.0)  # some more candidates
+    assert not system.services.index.jobs.get(job).state.is_final
+    subprocess.run(["mount", "-o", "remount,size=64m", str(small_disk)], check=True)
+    finish_and_compare(system, job, 32 * 100)

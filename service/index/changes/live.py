@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 from sqlalchemy import Connection, delete, select, update
 
 from graspd.service.index.bulk import update_rows, upsert
-from graspd.service.index.changes.rows import clean, settle
-from graspd.service.index.database import Database, chunks
+from graspd.service.index.changes.rows import NO_PROGRESS, clean, settle
+from graspd.service.index.database import IndexPart, chunks, rows_among
 from graspd.service.index.tables import assets, jobs, tasks, workers
 from graspd.service.model.states import State
 from graspd.service.model.workers import WorkerBeat
@@ -18,32 +17,23 @@ from graspd.service.model.workers import WorkerBeat
 _UNFINISHED = tasks.c.state.in_((State.QUEUED.value, State.RUNNING.value))
 
 
-@dataclass(frozen=True)
-class Live:
+class Live(IndexPart):
     """Writes of data that the store does not contain."""
-
-    database: Database
 
     def set_running(self, workers: Mapping[str, str]) -> dict[str, State]:
         """Mark tasks as taken; `workers` maps tasks to workers. Return the changed states of jobs."""
         running = State.RUNNING.value
         with self.database.writing() as connection:
-            jobs_of: dict[str, str] = {}
-            for some in chunks(list(workers)):
-                waiting = tasks.c.id.in_(some) & (tasks.c.state == State.QUEUED.value)
-                found = connection.execute(select(tasks.c.id, tasks.c.job_id).where(waiting))
-                jobs_of |= {row.id: row.job_id for row in found}
-            rows = [
-                {"id": task, "state": running, "queued": True, "worker": clean(workers[task], 128)}
-                | {"progress_done": 0.0, "progress_total": 0.0}
-                for task in jobs_of
-            ]
+            waiting = select(tasks.c.id, tasks.c.job_id).where(tasks.c.state == State.QUEUED.value)
+            jobs_of = {row.id: row.job_id for row in rows_among(connection, waiting, tasks.c.id, workers)}
+            started = {"state": running, "queued": True, "progress_done": 0.0, "progress_total": 0.0}
+            rows = [{"id": task, **started, "worker": clean(workers[task], 128)} for task in jobs_of]
             update_rows(connection, tasks, rows, state=State.QUEUED.value)
             touched = sorted(set(jobs_of.values()))
             for some in chunks(touched):
                 # A running job stays running: its other tasks need no check.
-                waiting = jobs.c.id.in_(some) & (jobs.c.state == State.QUEUED.value)
-                connection.execute(update(jobs).where(waiting).values(state=running))
+                of_waiting = update(jobs).where(jobs.c.id.in_(some), jobs.c.state == State.QUEUED.value)
+                connection.execute(of_waiting.values(state=running))
             return dict.fromkeys(touched, State.RUNNING)
 
     def set_progress(self, progress: Mapping[str, tuple[float, float, str]]) -> None:
@@ -56,7 +46,6 @@ class Live:
             update_rows(connection, tasks, rows, state=State.RUNNING.value)
 
     def set_queued(self, task_ids: Sequence[str]) -> None:
-        """Mark tasks as queued."""
         with self.database.writing() as connection:
             for some in chunks(task_ids):
                 connection.execute(update(tasks).where(tasks.c.id.in_(some), _UNFINISHED).values(queued=True))
@@ -64,13 +53,9 @@ class Live:
     def set_waiting(
         self, task_ids: Sequence[str], *, not_before: float = 0.0, message: str | None = None
     ) -> dict[str, State]:
-        """Mark tasks as neither queued nor with a worker, to be queued again after `not_before`.
-
-        Returns:
-            the states of the jobs concerned.
-        """
+        """Mark tasks as neither queued nor with a worker, not due before `not_before`; return their jobs' states."""
         values = {"queued": False, "not_before": not_before, "state": State.QUEUED.value, "worker": None}
-        values |= {"progress_done": 0.0, "progress_total": 0.0, "progress_message": message and clean(message)}
+        values |= {**NO_PROGRESS, "progress_message": message and clean(message)}
         touched: set[str] = set()
         with self.database.writing() as connection:
             for some in chunks(task_ids):
@@ -119,7 +104,6 @@ class Live:
             self._forget(connection, [row.name for row in gone if row.seen < forget_before])
 
     def forget_workers(self, names: Sequence[str]) -> None:
-        """Delete workers that stopped in order."""
         with self.database.writing() as connection:
             self._forget(connection, names)
 
@@ -128,7 +112,6 @@ class Live:
             connection.execute(delete(workers).where(workers.c.name.in_(some)))
 
     def add_asset_attempt(self, digest: str, number: int, *, not_before: float) -> None:
-        """Record a check without a result."""
         values = {"last_attempt": number, "queued": False, "not_before": not_before}
         with self.database.writing() as connection:
             connection.execute(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, Final
 
 from sqlalchemy import Connection, delete, select, update
@@ -12,6 +11,7 @@ from sqlalchemy import Connection, delete, select, update
 from graspd.service.index.bulk import upsert
 from graspd.service.index.changes.rows import (
     ENTERING,
+    NO_PROGRESS,
     Row,
     asset_row,
     attempt_row,
@@ -24,7 +24,7 @@ from graspd.service.index.changes.rows import (
     shard_row,
     task_rows,
 )
-from graspd.service.index.database import Database, chunks
+from graspd.service.index.database import IndexPart, chunks, rows_among
 from graspd.service.index.tables import (
     assets,
     attempts,
@@ -56,16 +56,15 @@ from graspd.service.store.manifests import ShardManifest
 RANGES_AT_ONCE: Final = 500
 
 
-@dataclass(frozen=True)
-class Changes:
+class Changes(IndexPart):
     """Records of the store. `within` makes a write part of a larger transaction."""
-
-    database: Database
 
     def add_job(self, record: JobRecord, *, within: Connection | None = None) -> State:
         """Add a job with all its tasks; tasks whose shard exists have succeeded."""
         with self.database.writing(within) as connection:
-            return self._add_job(connection, record)
+            self._upsert_job(connection, record)
+            self._upsert_tasks(connection, list(task_rows(record)))
+            return settle(connection, record.id)
 
     def enter_job(self, record: JobRecord, *, within: Connection) -> None:
         """Add a job with its first tasks; `enter_more` adds the others of large jobs."""
@@ -76,8 +75,7 @@ class Changes:
     def entering(self) -> list[str]:
         """Return the jobs with tasks that are not yet entered."""
         query = select(notes.c.name).where(notes.c.name.startswith(ENTERING)).order_by(notes.c.name)
-        with self.database.reading() as connection:
-            return [name.removeprefix(ENTERING) for name in connection.scalars(query)]
+        return [name.removeprefix(ENTERING) for name in self.database.column(query)]
 
     def enter_more(self, job_id: str, record: JobRecord | None) -> None:
         """Add the next tasks of such a job; None: its record is deleted, and no more follow."""
@@ -92,43 +90,63 @@ class Changes:
     def add_manifests(
         self, manifests: Iterable[ShardManifest], *, within: Connection | None = None
     ) -> dict[str, State]:
-        """Add shards and their grasps, and mark all tasks of any job that make them as succeeded.
-
-        Returns:
-            the states of the jobs concerned.
-        """
+        """Add shards and their grasps; the tasks of any job that make them have succeeded. Return the jobs' states."""
+        new = {manifest.shard_id: manifest for manifest in manifests}
+        touched: defaultdict[str, set[int]] = defaultdict(set)
         with self.database.writing(within) as connection:
-            return self._add_manifests(connection, list(manifests))
-
-    def add_manifest(self, manifest: ShardManifest) -> dict[str, State]:
-        """Add one shard."""
-        return self.add_manifests([manifest])
+            charged = self._askers(connection, list(new))
+            rows = [shard_row(manifest) | {"charged": charged.get(shard, "")} for shard, manifest in new.items()]
+            upsert(connection, shards, rows, keep=("charged",))
+            upsert(connection, grasps, [row for manifest in new.values() for row in grasp_rows(manifest)])
+            for some in chunks(list(new)):
+                made = update(tasks).where(tasks.c.shard_id == shards.c.id, shards.c.id.in_(some))
+                made = made.values(_outcome(*_OUTCOME)).returning(tasks.c.job_id, tasks.c.batch)
+                for job, batch in connection.execute(made):
+                    touched[job].add(batch)
+            return settle_batches(connection, touched)
 
     def add_attempt(
         self, attempt: AttemptRecord, *, not_before: float = 0.0, within: Connection | None = None
     ) -> State | None:
         """Add a failed attempt. Return the job's state, or None for an unknown task.
 
-        Args:
-            not_before: `time.time` before which the next attempt must not be queued.
+        The next attempt must not be queued before `time.time` is `not_before`.
         """
         with self.database.writing(within) as connection:
-            return self._add_attempt(connection, attempt, not_before)
+            if connection.scalar(select(tasks.c.id).where(tasks.c.id == attempt.task_id)) is None:
+                return None  # of a deleted job, or a forged one
+            upsert(connection, attempts, [attempt_row(attempt)])
+            values: dict[str, Any] = {
+                "last_attempt": attempt.number,
+                "exhausted": attempt.last,
+                "reason": clean(attempt.reason),
+                "finished": attempt.ended if attempt.last else None,
+                "worker": clean(attempt.worker, 128) if attempt.last else None,
+                "state": State.QUEUED.value,
+            }
+            values |= {"queued": False, "not_before": not_before, **NO_PROGRESS}
+            is_next = (tasks.c.done.is_(False), tasks.c.last_attempt < attempt.number)
+            changed = update(tasks).where(tasks.c.id == attempt.task_id, *is_next).values(**values)
+            touched = connection.execute(changed.returning(tasks.c.job_id, tasks.c.batch)).first()
+            return None if touched is None else settle(connection, touched.job_id, [touched.batch])
 
     def set_job_events(self, job_id: str, events: Sequence[JobEvent], *, within: Connection | None = None) -> State:
         """Set the actions of users on a job: all its events so far, in order."""
+        cancelled = bool(events) and events[-1].what == "cancelled"
         with self.database.writing(within) as connection:
-            return self._set_job_events(connection, job_id, events)
+            connection.execute(update(jobs).where(jobs.c.id == job_id).values(cancelled=cancelled))
+            for event in events:
+                for task_id, upto in event.retried.items():
+                    task = (tasks.c.id == task_id, tasks.c.done.is_(False), tasks.c.retried_upto < upto)
+                    fresh = {"reason": None, "finished": None, "worker": None, "queued": False, "not_before": 0.0}
+                    connection.execute(update(tasks).where(*task, tasks.c.last_attempt <= upto).values(**fresh))
+                    connection.execute(update(tasks).where(*task).values(retried_upto=upto))
+            return settle(connection, job_id)
 
     def add_asset(self, asset: Asset, check: Mapping[str, Any] | None, *, within: Connection | None = None) -> None:
         """Add a hand or object with the result of its check, None while that is pending."""
         with self.database.writing(within) as connection:
             upsert(connection, assets, [asset_row(asset, check)], keep=("last_attempt", "queued", "not_before"))
-
-    def _add_job(self, connection: Connection, record: JobRecord) -> State:
-        self._upsert_job(connection, record)
-        self._upsert_tasks(connection, list(task_rows(record)))
-        return settle(connection, record.id)
 
     def _upsert_job(self, connection: Connection, record: JobRecord) -> None:
         upsert(connection, jobs, [job_row(record)], keep=("state", "cancelled", "finished", "reason"))
@@ -151,74 +169,17 @@ class Changes:
         settle(connection, record.id, [number * record.span for number in some])
 
     def _finished_shards(self, connection: Connection, ids: Sequence[str]) -> dict[str, dict[str, Any]]:
-        found: dict[str, dict[str, Any]] = {}
-        for some in chunks(ids):
-            query = select(shards.c.id, *_OUTCOME).where(shards.c.id.in_(some))
-            for row in connection.execute(query).mappings():
-                found[row["id"]] = _outcome(row["worker"], row["device"], row["seconds"], row["created"])
-        return found
-
-    def _add_manifests(self, connection: Connection, given: Sequence[ShardManifest]) -> dict[str, State]:
-        manifests = list({manifest.shard_id: manifest for manifest in given}.values())
-        charged = self._askers(connection, [manifest.shard_id for manifest in manifests])
-        rows = [shard_row(manifest) | {"charged": charged.get(manifest.shard_id, "")} for manifest in manifests]
-        upsert(connection, shards, rows, keep=("charged",))
-        upsert(connection, grasps, [row for manifest in manifests for row in grasp_rows(manifest)])
-        touched: defaultdict[str, set[int]] = defaultdict(set)
-        for some in chunks([manifest.shard_id for manifest in given]):
-            done = (
-                update(tasks)
-                .where(tasks.c.shard_id == shards.c.id, shards.c.id.in_(some))
-                .values(_outcome(*_OUTCOME))
-                .returning(tasks.c.job_id, tasks.c.batch)
-            )
-            for job, batch in connection.execute(done):
-                touched[job].add(batch)
-        return settle_batches(connection, touched)
+        rows = rows_among(connection, select(shards.c.id, *_OUTCOME), shards.c.id, ids)
+        return {shard: _outcome(*outcome) for shard, *outcome in rows}
 
     def _askers(self, connection: Connection, ids: Sequence[str]) -> dict[str, str]:
         """Return the project of the first job that requested each shard, if it has one."""
         found: dict[str, str] = {}
-        for some in chunks(ids):
-            query = select(tasks.c.shard_id, jobs.c.project).join(jobs, jobs.c.id == tasks.c.job_id)
-            query = query.where(tasks.c.shard_id.in_(some)).order_by(jobs.c.created, jobs.c.id)
-            for shard, project in connection.execute(query):
-                found.setdefault(shard, project)
+        query = select(tasks.c.shard_id, jobs.c.project).join(jobs, jobs.c.id == tasks.c.job_id)
+        oldest_first = query.order_by(jobs.c.created, jobs.c.id)
+        for shard, project in rows_among(connection, oldest_first, tasks.c.shard_id, ids):
+            found.setdefault(shard, project)
         return found
-
-    def _add_attempt(self, connection: Connection, attempt: AttemptRecord, not_before: float) -> State | None:
-        if connection.scalar(select(tasks.c.id).where(tasks.c.id == attempt.task_id)) is None:
-            return None  # of a deleted job, or a forged one
-        upsert(connection, attempts, [attempt_row(attempt)])
-        values: dict[str, Any] = {
-            "last_attempt": attempt.number,
-            "exhausted": attempt.last,
-            "reason": clean(attempt.reason),
-        }
-        values |= {
-            "finished": attempt.ended if attempt.last else None,
-            "worker": clean(attempt.worker, 128) if attempt.last else None,
-        }
-        values |= {"queued": False, "not_before": not_before, "state": State.QUEUED.value}
-        values |= {"progress_done": 0.0, "progress_total": 0.0, "progress_message": None}
-        touched = connection.execute(
-            update(tasks)
-            .where(tasks.c.id == attempt.task_id, tasks.c.done.is_(False), tasks.c.last_attempt < attempt.number)
-            .values(**values)
-            .returning(tasks.c.job_id, tasks.c.batch)
-        ).first()
-        return None if touched is None else settle(connection, touched.job_id, [touched.batch])
-
-    def _set_job_events(self, connection: Connection, job_id: str, events: Sequence[JobEvent]) -> State:
-        cancelled = bool(events) and events[-1].what == "cancelled"
-        connection.execute(update(jobs).where(jobs.c.id == job_id).values(cancelled=cancelled))
-        for event in events:
-            for task_id, upto in event.retried.items():
-                task = (tasks.c.id == task_id, tasks.c.done.is_(False), tasks.c.retried_upto < upto)
-                fresh = {"reason": None, "finished": None, "worker": None, "queued": False, "not_before": 0.0}
-                connection.execute(update(tasks).where(*task, tasks.c.last_attempt <= upto).values(**fresh))
-                connection.execute(update(tasks).where(*task).values(retried_upto=upto))
-        return settle(connection, job_id)
 
 
 _OUTCOME = (shards.c.worker, shards.c.device, shards.c.seconds, shards.c.created)
@@ -226,40 +187,20 @@ _OUTCOME = (shards.c.worker, shards.c.device, shards.c.seconds, shards.c.created
 
 def _outcome(worker: Any, device: Any, seconds: Any, created: Any) -> dict[str, Any]:
     """Return the columns that a task row takes from its shard: values, or columns."""
-    return {
-        "done": True,
-        "worker": worker,
-        "device": device,
-        "seconds": seconds,
-        "finished": created,
-        "reason": None,
-        "queued": False,
-        "not_before": 0.0,
-        "progress_done": 0.0,
-        "progress_total": 0.0,
-        "progress_message": None,
-    }
+    made = {"done": True, "worker": worker, "device": device, "seconds": seconds, "finished": created}
+    return {**made, "reason": None, "queued": False, "not_before": 0.0, **NO_PROGRESS}
 
 
-@dataclass(frozen=True)
-class DatasetChanges:
+class DatasetChanges(IndexPart):
     """Writes of datasets. `within` makes a write part of a larger transaction."""
 
-    database: Database
-
     def add(self, record: DatasetRecord, *, within: Connection | None = None) -> None:
-        """Add a dataset with its cells; later actions of users stay unchanged."""
         row = {
-            "name": record.name,
-            "digest": record.digest,
+            **{name: getattr(record, name) for name in ("name", "digest", "revisions", "created", "owner", "project")},
             "hands": [member.model_dump() for member in record.hands],
             "objects": [member.model_dump() for member in record.objects],
             "options": record.options.model_dump(mode="json"),
-            "revisions": record.revisions,
             "cells": len(record.jobs),
-            "created": record.created,
-            "owner": record.owner,
-            "project": record.project,
             "cancelled": False,
             "events": 0,
             "applied": 0,
@@ -294,29 +235,18 @@ class DatasetChanges:
             connection.execute(update(datasets).where(datasets.c.name == name).values(**values))
 
     def add_snapshot(self, snapshot: Snapshot, *, within: Connection | None = None) -> None:
-        """Add a snapshot, without its list of shards."""
-        row = {
-            "dataset": snapshot.dataset,
-            "digest": snapshot.digest,
-            "created": snapshot.created,
-            "complete": snapshot.complete,
-            "shards": len(snapshot.shards),
-            "grasps": snapshot.grasps,
-            "valid": snapshot.valid,
-            "size_bytes": snapshot.size_bytes,
-        }
+        plain = ("dataset", "digest", "created", "complete", "grasps", "valid", "size_bytes")
+        row = {name: getattr(snapshot, name) for name in plain} | {"shards": len(snapshot.shards)}
         with self.database.writing(within) as connection:
             upsert(connection, dataset_snapshots, [row])
 
     def add_object_set(self, found: ObjectSet, *, within: Connection | None = None) -> None:
-        """Add a version of a named set of objects."""
-        row = {"name": found.name, "digest": found.digest, "objects": list(found.objects), "created": found.created}
-        row |= {"project": found.project}
+        row = {name: getattr(found, name) for name in ("name", "digest", "created", "project")}
+        row |= {"objects": list(found.objects)}
         with self.database.writing(within) as connection:
             upsert(connection, object_sets, [row])
 
-    def set_progress(self, name: str, *, applied: int | None = None, planned: bool | None = None) -> None:
-        """Set the planner's progress on a dataset."""
-        values = {k: v for k, v in {"applied": applied, "planned": planned}.items() if v is not None}
+    def set_progress(self, name: str, **values: int) -> None:
+        """Set the columns `applied` or `planned`."""
         with self.database.writing() as connection:
             connection.execute(update(datasets).where(datasets.c.name == name).values(**values))

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 from sqlalchemy import Connection, delete, exists, func, insert, or_, select, update
 
-from graspd.service.index.database import Database
+from graspd.service.index.database import IndexPart
 from graspd.service.index.tables import (
     assets,
     attempts,
@@ -26,11 +25,8 @@ from graspd.service.model.errors import NotFoundError
 from graspd.service.model.states import AssetKind, Priority, State
 
 
-@dataclass(frozen=True)
-class Removals:
+class Removals(IndexPart):
     """`within` makes a read or write part of a larger transaction, so that checks still hold at the write."""
-
-    database: Database
 
     def user_of_asset(self, asset: AssetView, *, within: Connection) -> str:
         """Return what needs a hand, object or network, in a few words; empty if nothing does."""
@@ -64,37 +60,30 @@ class Removals:
         return f"belongs to dataset {dataset!r}; delete that first" if dataset else ""
 
     def attempts_of(self, job_id: str, *, within: Connection) -> tuple[tuple[str, int], ...]:
-        """Return task and number of each failed attempt of a job."""
         query = select(attempts.c.task_id, attempts.c.number).where(attempts.c.job_id == job_id)
-        return tuple((task, number) for task, number in within.execute(query))
+        return tuple((row.task_id, row.number) for row in within.execute(query))
 
     def snapshots_of(self, dataset: str, *, within: Connection) -> int:
-        """Return the number of snapshots of a dataset."""
         query = select(func.count()).where(dataset_snapshots.c.dataset == dataset)
         return int(within.scalar(query) or 0)
 
     def planned_only(self, ids: Sequence[str]) -> list[str]:
         """Return those of the jobs that only a dataset's planner made and that no dataset contains."""
-        query = select(jobs.c.id).where(
-            jobs.c.id.in_(ids), jobs.c.priority == Priority.BULK.value, jobs.c.origin.is_(None)
-        )
-        query = query.where(~exists().where(dataset_cells.c.job_id == jobs.c.id))
-        with self.database.reading() as connection:
-            return list(connection.scalars(query))
+        planned = (jobs.c.priority == Priority.BULK.value, jobs.c.origin.is_(None))
+        needed = exists().where(dataset_cells.c.job_id == jobs.c.id)
+        query = select(jobs.c.id).where(jobs.c.id.in_(ids), *planned, ~needed)
+        return self.database.column(query)
 
     def unneeded_shards(self, ids: Sequence[str]) -> set[str]:
         """Return those of the shards that exist and that no task of any job makes or reads."""
         query = select(shards.c.id).where(shards.c.id.in_(ids), ~exists().where(tasks.c.shard_id == shards.c.id))
-        with self.database.reading() as connection:
-            return set(connection.scalars(query))
+        return set(self.database.column(query))
 
     def remove_asset(self, kind: AssetKind, digest: str, *, within: Connection | None = None) -> None:
-        """Remove a hand, object or network."""
         with self.database.writing(within) as connection:
             connection.execute(delete(assets).where(assets.c.kind == kind.value, assets.c.digest == digest))
 
     def remove_job(self, job_id: str, *, within: Connection | None = None) -> None:
-        """Remove a job, its tasks and their attempts."""
         with self.database.writing(within) as connection:
             of_job = select(tasks.c.id).where(tasks.c.job_id == job_id)
             gone = or_(attempts.c.job_id == job_id, attempts.c.task_id.in_(of_job))
@@ -103,7 +92,6 @@ class Removals:
             connection.execute(delete(jobs).where(jobs.c.id == job_id))
 
     def remove_dataset(self, name: str, *, within: Connection | None = None) -> None:
-        """Remove a dataset with its cells and snapshots."""
         with self.database.writing(within) as connection:
             connection.execute(delete(dataset_snapshots).where(dataset_snapshots.c.dataset == name))
             connection.execute(delete(dataset_cells).where(dataset_cells.c.dataset == name))
@@ -120,7 +108,6 @@ class Removals:
 
 
 def _remember_cost(shard: str, connection: Connection) -> None:
-    """Add the cost of a deleted shard to its project's costs of that day."""
     row = connection.execute(select(shards).where(shards.c.id == shard)).mappings().first()
     if row is None:
         return

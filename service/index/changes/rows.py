@@ -12,7 +12,7 @@ from sqlalchemy import ColumnElement, Connection, exists, func, literal, select,
 
 from graspd.service.index.database import chunks
 from graspd.service.index.outbox import note_ends
-from graspd.service.index.tables import attempts, jobs, notes, tasks
+from graspd.service.index.tables import attempts, jobs, notes, shards, tasks
 from graspd.service.model.domain import Asset, JobOptions
 from graspd.service.model.errors import LoadError, SceneError
 from graspd.service.model.planning import TaskFacts, batch_ready, batch_states, job_state, plan, stages_of
@@ -28,23 +28,17 @@ _LONGEST_TEXT: Final = 2000
 
 
 def job_row(record: JobRecord) -> Row:
-    """Return the row of a job at submission."""
+    plain = ("id", "hand_digest", "object_digest", "owner", "project", "span", "created")
     return {
-        "id": record.id,
+        **{name: getattr(record, name) for name in plain},
         "state": State.QUEUED.value,
         "priority": record.priority.value,
         "hand": record.request.hand,
         "object": record.request.object,
-        "hand_digest": record.hand_digest,
-        "object_digest": record.object_digest,
         "request": record.request.model_dump(mode="json"),
         "revisions": dict(record.revisions),
         "origin": record.origin and record.origin.model_dump(exclude_defaults=True),
-        "owner": record.owner,
-        "project": record.project,
         "cancelled": False,
-        "span": record.span,
-        "created": record.created,
         "finished": None,
         "reason": None,
         "neighbours": beside(record.request),
@@ -58,8 +52,18 @@ def beside(options: JobOptions) -> str:
     return " ".join(dict.fromkeys(one.digest or "" for one in options.beside))
 
 
+NO_PROGRESS: Final = {"progress_done": 0.0, "progress_total": 0.0, "progress_message": None}
+_UNSTARTED: Final = {
+    "state": State.QUEUED.value,
+    **dict.fromkeys(("ready", "done", "exhausted", "queued"), False),
+    **dict.fromkeys(("last_attempt", "retried_upto"), 0),
+    **dict.fromkeys(("reason", "worker", "device", "seconds", "finished")),
+    "not_before": 0.0,
+    **NO_PROGRESS,
+}
+
+
 def task_rows(record: JobRecord, ranges: range | None = None) -> Iterator[Row]:
-    """Yield the initial rows of a job's tasks, for all ranges or some."""
     order = stages_of(record.request)
     for task in plan(record, ranges):
         yield {
@@ -72,23 +76,8 @@ def task_rows(record: JobRecord, ranges: range | None = None) -> Iterator[Row]:
             "priority": record.priority.value,
             "inputs": list(task.inputs),
             "shard_id": task.output,
-            "state": State.QUEUED.value,
-            "ready": False,
-            "done": False,
-            "last_attempt": 0,
-            "exhausted": False,
-            "retried_upto": 0,
-            "reason": None,
-            "worker": None,
-            "device": None,
-            "seconds": None,
-            "finished": None,
             "created": record.created,
-            "queued": False,
-            "not_before": 0.0,
-            "progress_done": 0.0,
-            "progress_total": 0.0,
-            "progress_message": None,
+            **_UNSTARTED,
         }
 
 
@@ -98,55 +87,28 @@ def clean(text: str, length: int | None = None) -> str:
 
 
 def attempt_row(attempt: AttemptRecord) -> Row:
-    """Return the row of a failed attempt."""
     return {
-        "task_id": attempt.task_id,
-        "number": attempt.number,
-        "job_id": attempt.job_id,
+        **{name: getattr(attempt, name) for name in ("task_id", "number", "job_id", "started", "ended", "last")},
         "stage": attempt.stage.value,
         "kind": clean(attempt.kind, 64),
         "reason": clean(attempt.reason),
         "trace": attempt.trace and clean(attempt.trace),
         "worker": clean(attempt.worker, 128),
-        "started": attempt.started,
-        "ended": attempt.ended,
-        "last": attempt.last,
     }
 
 
 def shard_row(manifest: ShardManifest) -> Row:
-    """Return the row of a shard; its grasps have separate rows."""
+    plain = [column.name for column in shards.columns if column.name not in ("id", "charged", "manifest")]
     return {
+        **{name: getattr(manifest, name) for name in plain},
         "id": manifest.shard_id,
-        "kind": manifest.kind,
         "stage": manifest.stage.value,
-        "key": manifest.key,
-        "sha256": manifest.sha256,
-        "size_bytes": manifest.size_bytes,
-        "count": manifest.count,
-        "valid": manifest.valid,
-        "candidates": manifest.candidates,
-        "rechecked": manifest.rechecked,
-        "recheck_held": manifest.recheck_held,
-        "validated": manifest.validated,
-        "hand": manifest.hand,
-        "object": manifest.object,
-        "hand_digest": manifest.hand_digest,
-        "object_digest": manifest.object_digest,
-        "batch": manifest.batch,
-        "batches": manifest.batches,
-        "seed": manifest.seed,
         "inputs": list(manifest.inputs),
-        "device": manifest.device,
-        "worker": manifest.worker,
-        "seconds": manifest.seconds,
-        "created": manifest.created,
         "manifest": manifest.model_dump(mode="json", exclude={"grasps"}),
     }
 
 
 def grasp_rows(manifest: ShardManifest) -> list[Row]:
-    """Return the rows of a base shard's grasps; none for other shards."""
     of_shard = {
         "shard_id": manifest.shard_id,
         "hand": manifest.hand,
@@ -161,18 +123,11 @@ def grasp_rows(manifest: ShardManifest) -> list[Row]:
 def asset_row(asset: Asset, check: Mapping[str, Any] | None) -> Row:
     """Return the row of a hand, object or network. Built-in assets need no check."""
     found = check or ({"verdict": "accept"} if asset.builtin else {})
+    plain = ("digest", "name", "filename", "size_bytes", "created", "builtin", "owner", "project", "shared")
     return {
+        **{name: getattr(asset, name) for name in plain},
         "kind": asset.kind.value,
-        "digest": asset.digest,
-        "name": asset.name,
-        "filename": asset.filename,
         "files": list(asset.files),
-        "size_bytes": asset.size_bytes,
-        "created": asset.created,
-        "builtin": asset.builtin,
-        "owner": asset.owner,
-        "project": asset.project,
-        "shared": asset.shared,
         "verdict": found.get("verdict"),
         "message": found.get("message") and clean(found["message"], _LONGEST_TEXT),
         "repairs": [clean(str(one), _LONGEST_TEXT) for one in (found.get("repairs") or [])[:_MOST_REPAIRS]],
@@ -192,17 +147,7 @@ def _short(facts: dict[str, Any]) -> dict[str, Any]:
 
 #: Jobs whose states are derived together.
 _JOBS_AT_ONCE: Final = 200
-_FACTS = (
-    tasks.c.id,
-    tasks.c.batch,
-    tasks.c.stage,
-    tasks.c.state,
-    tasks.c.ready,
-    tasks.c.done,
-    tasks.c.last_attempt,
-    tasks.c.exhausted,
-    tasks.c.retried_upto,
-)
+_FACTS: Final = ("stage", "done", "last_attempt", "exhausted", "retried_upto")
 
 #: Option of a connection that suppresses reports of ends.
 QUIET: Final = "graspd_quiet"
@@ -212,21 +157,14 @@ _WHOSE: Final = (jobs.c.project, jobs.c.owner)
 
 
 def settle(connection: Connection, job_id: str, batches: Collection[int] | None = None) -> State:
-    """Derive the states of a job's tasks, for some batches or all, then the job's own.
-
-    Returns:
-        the job's state.
-    """
+    """Derive the states of a job's tasks, for some batches or all, then the job's own, and return that."""
     return settle_batches(connection, {job_id: batches})[job_id]
 
 
 def settle_batches(connection: Connection, touched: Mapping[str, Collection[int] | None]) -> dict[str, State]:
-    """Derive the states for some batches, or all (None), of many jobs at once.
+    """Derive the states for some batches, or all (None), of many jobs at once; return the states of these jobs.
 
     If the first batch finds no grasp in its scenes, the job's other batches are skipped: they end as if cancelled.
-
-    Returns:
-        the states of these jobs.
     """
     states: dict[str, State] = {}
     for some in chunks(list(touched), _JOBS_AT_ONCE):
@@ -248,7 +186,8 @@ def _settle_tasks(connection: Connection, touched: Mapping[str, Collection[int] 
         *(tasks.c.job_id.in_(some) for some in chunks(whole)),
         *(tuple_(tasks.c.job_id, tasks.c.batch).in_(some) for some in chunks(pairs)),
     ):
-        query = select(tasks.c.job_id, *_FACTS).where(wanted).order_by(tasks.c.job_id, tasks.c.batch, tasks.c.position)
+        query = select(*(tasks.c[name] for name in ("job_id", "id", "batch", "state", "ready", *_FACTS)))
+        query = query.where(wanted).order_by(tasks.c.job_id, tasks.c.batch, tasks.c.position)
         rows += connection.execute(query).mappings()
     changes: defaultdict[tuple[str, bool], list[str]] = defaultdict(list)
     for (job, _), chain in groupby(rows, key=lambda row: (row["job_id"], row["batch"])):
@@ -275,17 +214,7 @@ def _hopeless() -> ColumnElement[bool]:
 
 def _changes(chain: Sequence[Any], *, cancelled: bool) -> list[tuple[str, str, bool]]:
     """Return the tasks of a batch whose state or readiness differs from the facts, with the new values."""
-    facts = [
-        TaskFacts(
-            stage=row["stage"],
-            done=row["done"],
-            last_attempt=row["last_attempt"],
-            exhausted=row["exhausted"],
-            retried_upto=row["retried_upto"],
-            running=row["state"] == State.RUNNING,
-        )
-        for row in chain
-    ]
+    facts = [TaskFacts(running=row["state"] == State.RUNNING, **{name: row[name] for name in _FACTS}) for row in chain]
     states = batch_states(facts, job_cancelled=cancelled)
     return [
         (row["id"], state.value, ready)

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
 from typing import Any, Final
 
-from sqlalchemy import ColumnElement, Connection, Float, case, cast, func, literal, select, tuple_
+from sqlalchemy import ColumnElement, Connection, Float, case, cast, func, literal, select
 
-from graspd.service.index import project_scope
-from graspd.service.index.database import Database
-from graspd.service.index.project_scope import seen_datasets
-from graspd.service.index.queries.jobs import outcomes_of
+from graspd.service.index.database import IndexPart
+from graspd.service.index.project_scope import page_rows, seen
+from graspd.service.index.queries.jobs import SHARE_DONE, outcomes_of
 from graspd.service.index.tables import attempts, dataset_cells, dataset_snapshots, datasets, jobs, shards, tasks
 from graspd.service.index.views import CellView, DatasetView, Page, SnapshotView
 from graspd.service.model.domain import JobOptions
@@ -22,37 +20,19 @@ from graspd.service.model.projects import EVERYTHING, ProjectScope
 from graspd.service.model.records import SnapshotShard
 from graspd.service.model.states import Stage, State
 
-_SHARE: Final[ColumnElement[float]] = case(
-    (tasks.c.state == State.SUCCEEDED.value, 1.0),
-    (tasks.c.progress_total > 0, tasks.c.progress_done / tasks.c.progress_total),
-    else_=0.0,
-)
 _IS_BASE: Final = shards.c.stage == Stage.SYNTHESIZE.value
 
 
-@dataclass(frozen=True)
-class Datasets:
-    """Reads of datasets."""
-
-    database: Database
-
+class Datasets(IndexPart):
     def page(
         self, *, limit: int = 50, cursor: str | None = None, scope: ProjectScope = EVERYTHING
     ) -> Page[DatasetView]:
-        """Return a page of datasets, newest first."""
-        size = project_scope.page_size(limit)
-        query = select(datasets).where(*seen_datasets(scope))
-        query = query.order_by(datasets.c.created.desc(), datasets.c.name.desc()).limit(size + 1)
-        if cursor is not None:
-            query = query.where(tuple_(datasets.c.created, datasets.c.name) < project_scope.decode(cursor, str, str))
+        query, key = select(datasets).where(*seen(scope, datasets)), (datasets.c.created, datasets.c.name)
         with self.database.reading() as connection:
-            rows = connection.execute(query).mappings().all()
-            views = [_dataset_view(connection, row) for row in rows[:size]]
-        last = views[-1] if len(rows) > size else None
-        return Page(items=views, next=last and project_scope.encode(last.created, last.name))
+            rows, following = page_rows(connection, query, *key, limit=limit, cursor=cursor)
+            return Page(items=[_dataset_view(connection, row) for row in rows], next=following)
 
     def get(self, name: str, *, scope: ProjectScope = EVERYTHING) -> DatasetView:
-        """Return a dataset; NotFoundError if there is none."""
         with self.database.reading() as connection:
             view = _dataset_view(connection, _dataset_row(connection, name, scope))
             if view.reason is None:
@@ -61,15 +41,13 @@ class Datasets:
             return view.model_copy(update={"outcomes": outcomes_of(connection, tasks.c.job_id.in_(cells))})
 
     def unfinished(self, names: Collection[str]) -> set[str]:
-        """Return those of the names whose dataset has not ended."""
         query = select(datasets).where(datasets.c.name.in_(sorted(names)))
         with self.database.reading() as connection:
             rows = connection.execute(query).mappings().all()
             return {row["name"] for row in rows if not _state(row, _states(connection, row)).is_final}
 
     def ended(self, *, within: Connection) -> dict[str, int]:
-        """Return the ended datasets, with their number of events."""
-        rows = within.execute(select(datasets)).mappings().all()
+        rows = self.database.rows(select(datasets), within)
         return {row["name"]: row["events"] for row in rows if _state(row, _states(within, row)).is_final}
 
     def cells(
@@ -81,31 +59,22 @@ class Datasets:
         cursor: str | None = None,
         scope: ProjectScope = EVERYTHING,
     ) -> Page[CellView]:
-        """Return a page of a dataset's cells by position."""
-        size = project_scope.page_size(limit)
         with self.database.reading() as connection:
             dataset = _dataset_row(connection, name, scope)
             now = _cell_state(dataset["cancelled"])
+            planned = jobs.c.id.is_not(None).label("planned")
             query = (
-                select(
-                    dataset_cells,
-                    now.label("state"),
-                    jobs.c.id.is_not(None).label("planned"),
-                    jobs.c.reason,
-                    jobs.c.span,
-                )
+                select(dataset_cells, now.label("state"), planned, jobs.c.reason, jobs.c.span)
                 .outerjoin(jobs, jobs.c.id == dataset_cells.c.job_id)
                 .where(dataset_cells.c.dataset == name)
-                .order_by(dataset_cells.c.position)
-                .limit(size + 1)
             )
             if state is not None:
                 query = query.where(now == state.value)
-            if cursor is not None:
-                query = query.where(dataset_cells.c.position > project_scope.decode(cursor, int)[0])
-            rows = connection.execute(query).mappings().all()
-            views = _cell_views(connection, rows[:size], JobOptions.model_validate(dataset["options"]))
-        return Page(items=views, next=project_scope.encode(views[-1].position) if len(rows) > size else None)
+            rows, following = page_rows(
+                connection, query, dataset_cells.c.position, limit=limit, cursor=cursor, descending=False
+            )
+            views = _cell_views(connection, rows, JobOptions.model_validate(dataset["options"]))
+        return Page(items=views, next=following)
 
     def shards(self, name: str) -> list[SnapshotShard]:
         """Return all shards of a dataset: cell by cell, batch by batch, stage by stage."""
@@ -118,31 +87,24 @@ class Datasets:
         )
         with self.database.reading() as connection:
             _dataset_row(connection, name)
-            rows = connection.execute(query).mappings().all()
-        return [SnapshotShard(**row) for row in rows]
+            return [SnapshotShard(**row) for row in connection.execute(query).mappings()]
 
     def snapshots(
         self, name: str, *, limit: int = 50, cursor: str | None = None, scope: ProjectScope = EVERYTHING
     ) -> Page[SnapshotView]:
-        """Return a page of a dataset's snapshots, newest first."""
-        size = project_scope.page_size(limit)
-        key = (dataset_snapshots.c.created, dataset_snapshots.c.digest)
         query = select(dataset_snapshots).where(dataset_snapshots.c.dataset == name)
-        query = query.order_by(*(part.desc() for part in key)).limit(size + 1)
-        if cursor is not None:
-            query = query.where(tuple_(*key) < project_scope.decode(cursor, str, str))
+        key = (dataset_snapshots.c.created, dataset_snapshots.c.digest)
         with self.database.reading() as connection:
             _dataset_row(connection, name, scope)
-            views = [SnapshotView(**row) for row in connection.execute(query).mappings()]
-        last = views[size - 1] if len(views) > size else None
-        return Page(items=views[:size], next=last and project_scope.encode(last.created, last.digest))
+            rows, following = page_rows(connection, query, *key, limit=limit, cursor=cursor)
+        return Page(items=[SnapshotView(**row) for row in rows], next=following)
 
 
 def _dataset_row(connection: Connection, name: str, scope: ProjectScope = EVERYTHING) -> Any:
-    query = select(datasets).where(datasets.c.name == name, *seen_datasets(scope))
+    query = select(datasets).where(datasets.c.name == name, *seen(scope, datasets))
     row = connection.execute(query).mappings().first()
     if row is None:
-        known = select(datasets.c.name).where(*seen_datasets(scope)).order_by(datasets.c.created.desc())
+        known = select(datasets.c.name).where(*seen(scope, datasets)).order_by(datasets.c.created.desc())
         names = list(connection.scalars(known.limit(SEARCHED)))
         raise NotFoundError(f"there is no dataset {name!r}{known_names(name, names)}")
     return row
@@ -217,14 +179,13 @@ def _tasks_of_dataset(connection: Connection, name: str, options: JobOptions) ->
 
 
 def _work(connection: Connection, where: ColumnElement[bool]) -> dict[str, Any]:
-    """Return totals of the cells' tasks: number, done, failed, running, shares, time of the last end."""
     query = (
         select(
             func.count().label("tasks"),
             _count(tasks.c.state == State.SUCCEEDED.value).label("done"),
             _count(tasks.c.state == State.FAILED.value).label("failed"),
             _count(tasks.c.state == State.RUNNING.value).label("running"),
-            func.coalesce(func.sum(cast(_SHARE, Float)), 0.0).label("share"),
+            func.coalesce(func.sum(cast(SHARE_DONE, Float)), 0.0).label("share"),
             func.max(tasks.c.finished).label("finished"),
         )
         .select_from(dataset_cells)
@@ -235,7 +196,6 @@ def _work(connection: Connection, where: ColumnElement[bool]) -> dict[str, Any]:
 
 
 def _made(connection: Connection, where: ColumnElement[bool]) -> dict[str, Any]:
-    """Return content and cost of the cells' shards."""
     query = (
         select(*_MADE)
         .select_from(dataset_cells)
@@ -284,7 +244,7 @@ def _cell_views(connection: Connection, rows: Sequence[Any], options: JobOptions
 
 def _work_by_job(connection: Connection, ids: Sequence[str]) -> dict[str, dict[str, float]]:
     query = (
-        select(tasks.c.job_id, tasks.c.state, func.count(), func.sum(cast(_SHARE, Float)))
+        select(tasks.c.job_id, tasks.c.state, func.count(), func.sum(cast(SHARE_DONE, Float)))
         .where(tasks.c.job_id.in_(ids))
         .group_by(tasks.c.job_id, tasks.c.state)
     )

@@ -9,7 +9,7 @@ from typing import Any
 
 from sqlalchemy import Column, ColumnElement, exists, or_, select
 
-from graspd.service.index.database import Database, chunks
+from graspd.service.index.database import IndexPart, rows_among
 from graspd.service.index.tables import assets, dataset_cells, datasets, jobs, tasks
 from graspd.service.model.domain import JobOptions
 from graspd.service.model.planning import MAX_BACKOFF_S, PlannedTask, RoundRobin, WaitingJob, interleave, share_of
@@ -38,12 +38,7 @@ class ReadyCheck:
     last_attempt: int
 
 
-@dataclass(frozen=True)
-class Feed:
-    """Reads of the controller."""
-
-    database: Database
-
+class Feed(IndexPart):
     def waiting_jobs(self, priority: Priority, *, now: float) -> list[WaitingJob]:
         """Return jobs with tasks that may be queued, oldest first."""
         due = _due(tasks.c.not_before, now)
@@ -55,9 +50,8 @@ class Feed:
             )
             .order_by(jobs.c.created, jobs.c.id)
         )
-        with self.database.reading() as connection:
-            rows = connection.execute(query).all()
-        return [WaitingJob(row.id, share_of(row.project, (row.origin or {}).get("key", ""))) for row in rows]
+        rows = self.database.rows(query)
+        return [WaitingJob(row["id"], share_of(row["project"], (row["origin"] or {}).get("key", ""))) for row in rows]
 
     def ready_tasks(self, priority: Priority, turns: RoundRobin, *, now: float, limit: int) -> list[ReadyTask]:
         """Return at most `limit` tasks to queue: round-robin over projects or keys, then over their jobs."""
@@ -78,20 +72,17 @@ class Feed:
             .order_by(tasks.c.batch)
             .limit(limit)
         )
-        with self.database.reading() as connection:
-            rows = connection.execute(query).mappings().all()
+        rows = self.database.rows(query)
         record = _record(rows[0]) if rows else None
         return [_ready(row, record) for row in rows if record is not None]
 
     def ready_checks(self, *, now: float, limit: int) -> list[ReadyCheck]:
-        """Return uploads to be checked, oldest first."""
         open_ = (assets.c.verdict.is_(None), assets.c.queued.is_(False), _due(assets.c.not_before, now))
         query = select(assets).where(*open_).order_by(assets.c.created).limit(limit)
-        with self.database.reading() as connection:
-            return [
-                ReadyCheck(AssetKind(row["kind"]), row["name"], row["digest"], row["last_attempt"])
-                for row in connection.execute(query).mappings()
-            ]
+        return [
+            ReadyCheck(AssetKind(row["kind"]), row["name"], row["digest"], row["last_attempt"])
+            for row in self.database.rows(query)
+        ]
 
     def believed_queued(self) -> tuple[set[str], set[tuple[AssetKind, str]]]:
         """Return unfinished tasks, and checks of assets, that are marked as queued."""
@@ -103,42 +94,25 @@ class Feed:
             return set(connection.scalars(of_tasks)), checks
 
     def outputs(self, task_ids: Collection[str]) -> dict[str, tuple[str, str]]:
-        """Return stage and shard id of tasks."""
         query = select(tasks.c.id, tasks.c.stage, tasks.c.shard_id)
         with self.database.reading() as connection:
-            return {
-                task: (stage, shard)
-                for some in chunks(list(task_ids))
-                for task, stage, shard in connection.execute(query.where(tasks.c.id.in_(some)))
-            }
+            rows = rows_among(connection, query, tasks.c.id, task_ids)
+            return {task: (stage, shard) for task, stage, shard in rows}
 
     def cancelled(self, task_ids: Collection[str]) -> set[str]:
-        """Return the cancelled ones of the tasks."""
         query = select(tasks.c.id).where(tasks.c.state == State.CANCELLED.value)
         with self.database.reading() as connection:
-            return {
-                task
-                for some in chunks(list(task_ids))
-                for task in connection.scalars(query.where(tasks.c.id.in_(some)))
-            }
-
-    def has_jobs(self) -> bool:
-        """Check whether the index has any job."""
-        with self.database.reading() as connection:
-            return connection.scalar(select(jobs.c.id).limit(1)) is not None
+            return {row.id for row in rows_among(connection, query, tasks.c.id, task_ids)}
 
     def failed_tasks(self, job_id: str) -> dict[str, int]:
         """Return failed and cancelled tasks of a job with the number of their last attempt."""
         final = tasks.c.state.in_((State.FAILED.value, State.CANCELLED.value))
         query = select(tasks.c.id, tasks.c.last_attempt).where(tasks.c.job_id == job_id, final)
-        with self.database.reading() as connection:
-            return {row.id: row.last_attempt for row in connection.execute(query)}
+        return {row["id"]: row["last_attempt"] for row in self.database.rows(query)}
 
     def unfinished_tasks(self, job_id: str) -> list[str]:
         """Return tasks of a job that are queued or with a worker."""
-        query = select(tasks.c.id).where(tasks.c.job_id == job_id, tasks.c.queued.is_(True))
-        with self.database.reading() as connection:
-            return list(connection.scalars(query))
+        return self.database.column(select(tasks.c.id).where(tasks.c.job_id == job_id, tasks.c.queued.is_(True)))
 
 
 _OF_THE_JOB = ("request", "revisions", "span", "origin", "hand_digest", "object_digest")
@@ -177,12 +151,7 @@ class DatasetWork:
     project: str
 
 
-@dataclass(frozen=True)
-class DatasetFeed:
-    """Reads of the planner."""
-
-    database: Database
-
+class DatasetFeed(IndexPart):
     def in_work(self) -> list[DatasetWork]:
         """Return datasets with cells to plan or with events for their jobs, the oldest first."""
         query = (
@@ -190,23 +159,13 @@ class DatasetFeed:
             .where(or_(datasets.c.planned.is_(False), datasets.c.applied < datasets.c.events))
             .order_by(datasets.c.created, datasets.c.name)
         )
-        with self.database.reading() as connection:
-            return [
-                DatasetWork(
-                    row["name"],
-                    JobOptions.model_validate(row["options"]),
-                    row["revisions"],
-                    row["cancelled"],
-                    row["events"],
-                    row["applied"],
-                    row["owner"],
-                    row["project"],
-                )
-                for row in connection.execute(query).mappings()
-            ]
+        plain = ("name", "revisions", "cancelled", "events", "applied", "owner", "project")
+        return [
+            DatasetWork(options=JobOptions.model_validate(row["options"]), **{name: row[name] for name in plain})
+            for row in self.database.rows(query)
+        ]
 
     def cells_to_plan(self, name: str, *, after: int, limit: int) -> list[Cell]:
-        """Return the next cells without a job, after a position."""
         query = (
             select(dataset_cells)
             .outerjoin(jobs, jobs.c.id == dataset_cells.c.job_id)
@@ -214,27 +173,24 @@ class DatasetFeed:
             .order_by(dataset_cells.c.position)
             .limit(limit)
         )
-        with self.database.reading() as connection:
-            return [
-                Cell(
-                    row["position"],
-                    Member(name=row["hand"], digest=row["hand_digest"]),
-                    Member(name=row["object"], digest=row["object_digest"]),
-                    row["job_id"],
-                    row["fidelity"] or "",
-                    row["choice"] and Choice.model_validate(row["choice"]),
-                )
-                for row in connection.execute(query).mappings()
-            ]
+        return [
+            Cell(
+                row["position"],
+                Member(name=row["hand"], digest=row["hand_digest"]),
+                Member(name=row["object"], digest=row["object_digest"]),
+                row["job_id"],
+                row["fidelity"] or "",
+                row["choice"] and Choice.model_validate(row["choice"]),
+            )
+            for row in self.database.rows(query)
+        ]
 
     def cells_in_states(
         self, name: str, states: Collection[State], *, after: int, limit: int, unshared: bool
     ) -> list[tuple[int, str]]:
         """Return positions and jobs of the next cells in some states, after a position.
 
-        Args:
-            unshared: omit jobs that another, uncancelled dataset waits for too, and those that another key
-                submitted.
+        `unshared` omits jobs that another, uncancelled dataset waits for too, and those that another key submitted.
         """
         query = (
             select(dataset_cells.c.position, dataset_cells.c.job_id)
@@ -245,13 +201,10 @@ class DatasetFeed:
             .limit(limit)
         )
         if unshared:
-            other = dataset_cells.alias()
             query = query.join(datasets, datasets.c.name == dataset_cells.c.dataset)
             query = query.where(jobs.c.owner == datasets.c.owner)
-            others = datasets.alias()
-            waits = (other.c.job_id == dataset_cells.c.job_id, other.c.dataset != name)
-            query = query.where(
-                ~exists().where(*waits, others.c.name == other.c.dataset, others.c.cancelled.is_(False))
-            )
-        with self.database.reading() as connection:
-            return [(position, job) for position, job in connection.execute(query)]
+            other, others = dataset_cells.alias(), datasets.alias()
+            same_job = (other.c.job_id == dataset_cells.c.job_id, other.c.dataset != name)
+            waits = (*same_job, others.c.name == other.c.dataset, others.c.cancelled.is_(False))
+            query = query.where(~exists().where(*waits))
+        return [(row["position"], row["job_id"]) for row in self.database.rows(query)]

@@ -35,9 +35,8 @@ from sqlalchemy import (
 )
 from sqlalchemy.sql.operators import in_op, is_
 
-from graspd.service.index import project_scope
-from graspd.service.index.database import Database, chunks
-from graspd.service.index.project_scope import seen_shards
+from graspd.service.index.database import IndexPart, chunks
+from graspd.service.index.project_scope import decode, encode, page_size, seen_shards
 from graspd.service.index.tables import dataset_cells, grasps, jobs, shards, tagged, tasks
 from graspd.service.index.views import GraspView, Page
 from graspd.service.model.base import Model
@@ -64,12 +63,7 @@ _BEST_FIRST = GraspSort()
 _AT_ONCE: Final = 400
 
 
-@dataclass(frozen=True)
-class Grasps:
-    """Reads of grasps."""
-
-    database: Database
-
+class Grasps(IndexPart):
     def page(
         self,
         where: GraspFilter | None = None,
@@ -78,42 +72,31 @@ class Grasps:
         limit: int = 50,
         cursor: str | None = None,
     ) -> Page[GraspView]:
-        """Return a page of grasps in the order of a metric; those without it come last."""
-        size = project_scope.page_size(limit)
-        start = None if cursor is None else project_scope.decode(cursor, (float, int, str, type(None)), str, int)
+        size = page_size(limit)
+        start = None if cursor is None else decode(cursor, (float, int, str, type(None)), str, int)
         with self.database.reading() as connection:
             rows = search(connection, where, sort, size + 1, start)
-        views = [_view(row) for row in rows[:size]]
+        views = [GraspView(**row) for row in rows[:size]]
         last = rows[size - 1] if len(rows) > size else None
-        return Page(items=views, next=last and project_scope.encode(last[sort.by], last["shard_id"], last["row"]))
+        return Page(items=views, next=last and encode(last[sort.by], last["shard_id"], last["row"]))
 
     def get(self, shard_id: str, row: int, *, scope: ProjectScope = EVERYTHING) -> GraspView:
-        """Return one grasp by its shard and row; NotFoundError if there is none."""
         query = select(grasps).where(grasps.c.shard_id == shard_id, grasps.c.row == row)
-        query = query.where(*seen_shards(scope, grasps.c.shard_id))
-        with self.database.reading() as connection:
-            found = connection.execute(query).mappings().first()
-        if found is None:
+        found = self.database.rows(query.where(*seen_shards(scope, grasps.c.shard_id)))
+        if not found:
             raise NotFoundError(f"there is no grasp {row} in shard {shard_id!r}")
-        return _view(found)
+        return GraspView(**found[0])
 
     def members(self, where: GraspFilter, *, limit: int) -> list[Grasp]:
-        """Return shard and row of at most `limit` grasps that pass, in this order."""
         query = select(grasps.c.shard_id, grasps.c.row).order_by(grasps.c.shard_id, grasps.c.row).limit(limit)
-        with self.database.reading() as connection:
-            return [(shard, row) for shard, row in connection.execute(query.where(*sql_conditions(where)))]
+        return [(found["shard_id"], found["row"]) for found in self.database.rows(query.where(*sql_conditions(where)))]
 
     def listed(self, wanted: Sequence[Grasp]) -> Iterator[GraspView]:
         """Yield grasps by shard and row, in that order; missing ones are omitted."""
         for some in chunks(sorted(wanted), _AT_ONCE):
             query = select(grasps).where(tuple_(grasps.c.shard_id, grasps.c.row).in_(some))
-            with self.database.reading() as connection:
-                rows = connection.execute(query.order_by(grasps.c.shard_id, grasps.c.row)).mappings().all()
-            yield from map(_view, rows)
-
-
-def _view(row: Any) -> GraspView:
-    return GraspView(**{name: row[name] for name in GraspView.model_fields})
+            for row in self.database.rows(query.order_by(grasps.c.shard_id, grasps.c.row)):
+                yield GraspView(**row)
 
 
 #: Most rows that are fetched by an index and sorted: faster than a scan of a million rows.
@@ -155,7 +138,6 @@ class Condition:
         return self._of(self.column if groups is None or self.group in groups else _plain(self.column))
 
     def on(self, rows: Subquery) -> ColumnElement[bool]:
-        """Return the test for grasps of a subquery."""
         return self._of(rows.c[str(self.column.key)])
 
     def _of(self, column: ColumnElement[Any]) -> ColumnElement[bool]:
@@ -165,8 +147,6 @@ class Condition:
 
 @dataclass(frozen=True)
 class Tagged:
-    """Grasps with a tag."""
-
     tag: str
     group: str = "tag"
 
@@ -202,11 +182,7 @@ Test = Condition | Tagged | ExpressionCondition
 
 
 def conditions(where: GraspFilter | None) -> list[Test]:
-    """Return a filter as a conjunction of conditions.
-
-    Raises:
-        InputError: its expression is invalid, or uses values that the index lacks.
-    """
+    """Return a filter as a conjunction; InputError for an invalid expression, or values that the index lacks."""
     where = where or GraspFilter()
     found: list[Test] = []
     if where.shard is not None:
@@ -222,11 +198,8 @@ def conditions(where: GraspFilter | None) -> list[Test]:
     if where.where is not None:
         found.append(ExpressionCondition(parsed(where.where)))
     if where.project is not None:
-        found.append(
-            Condition(
-                "project", grasps.c.shard_id, in_op, _of_project(where.project).with_only_columns(tasks.c.shard_id)
-            )
-        )
+        made = _of_project(where.project).with_only_columns(tasks.c.shard_id)
+        found.append(Condition("project", grasps.c.shard_id, in_op, made))
     for name, wanted in (("hand", where.hand), ("object", where.object)):
         if wanted is not None:
             found.append(Condition("pair", grasps.c[name], operator.eq, wanted))
@@ -237,8 +210,7 @@ def conditions(where: GraspFilter | None) -> list[Test]:
     if validated is not None:
         found.append(Condition("flag", grasps.c.success, operator.ne if validated else operator.eq, None))
     if where.scene is not None:
-        anyone = where.scene == "any"
-        compared, kind = (operator.ne, "free") if anyone else (operator.eq, where.scene)
+        compared, kind = (operator.ne, "free") if where.scene == "any" else (operator.eq, where.scene)
         found.append(Condition("flag", grasps.c.scene_kind, compared, kind))
     if where.robust_weakest is not None:
         found.append(Condition("flag", grasps.c.robust_weakest, operator.eq, where.robust_weakest))
@@ -257,11 +229,7 @@ def sql_conditions(where: GraspFilter | None) -> list[ColumnElement[bool]]:
 def search(
     connection: Connection, where: GraspFilter | None, sort: GraspSort, size: int, start: tuple[Any, ...] | None
 ) -> list[Any]:
-    """Return the first `size` rows after a position; rows without the metric come last.
-
-    Args:
-        start: metric, shard id and row of the previous grasp.
-    """
+    """Return the first `size` rows after `start`, the metric, shard id and row of the previous grasp."""
     wanted = conditions(where)
     few = _few(connection, where, wanted)
     rows: list[Any] = []
@@ -357,13 +325,11 @@ def _number(connection: Connection, where: GraspFilter, group: str, wanted: Sequ
 
 
 def _of_project(project: str) -> Select[Any]:
-    """Select tasks that make grasps for the jobs of a project."""
     joined = select(tasks.c.id).join(jobs, jobs.c.id == tasks.c.job_id)
     return joined.where(jobs.c.project == project, tasks.c.stage == Stage.SYNTHESIZE.value)
 
 
 def _of_dataset(dataset: str) -> Select[Any]:
-    """Select tasks that make grasps for the cells of a dataset."""
     joined = select(tasks.c.id).join(dataset_cells, dataset_cells.c.job_id == tasks.c.job_id)
     return joined.where(dataset_cells.c.dataset == dataset, tasks.c.stage == Stage.SYNTHESIZE.value)
 
@@ -391,8 +357,7 @@ def _plain(column: ColumnElement[Any]) -> ColumnElement[Any]:
 def truth(node: Node, grasps: Columns) -> ColumnElement[bool]:
     """Return an expression in SQL: true or false for each row, never unknown, so `not` is a complement.
 
-    Raises:
-        InputError: it uses values that the index lacks.
+    InputError: it uses values that the index lacks.
     """
     if isinstance(node, Connective):
         return (or_ if node.word == "or" else and_)(*(truth(part, grasps) for part in node.parts))
@@ -428,22 +393,18 @@ class GraspFilter(Model):
     job: str | None = None
     shard: str | None = None
     dataset: str | None = None
-    """Grasps of its cells."""
     tag: str | None = None
-    """Id of a tag of the grasps."""
     where: str | None = None
     """An expression of `service.model.where`."""
     project: str | None = None
     """Project of the jobs; None: all."""
     validated: bool | None = None
-    """Whether the validator gave a verdict."""
     valid: bool | None = None
     """False: validated, and not valid."""
     success: bool | None = None
     scene: str | None = None
     """Kind of the scene in which it was planned; any: all but free."""
     neighbours: bool | None = None
-    """Whether that scene contained neighbours."""
     lift_hard: bool | None = None
     robust_weakest: str | None = None
     """Axis of the first model in which the grasp fails."""

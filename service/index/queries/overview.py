@@ -8,11 +8,10 @@ from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from typing import Any, Final
 
-from sqlalchemy import ColumnElement, Select, and_, case, func, select
+from sqlalchemy import ColumnElement, Connection, Select, Table, case, func, select
 
-from graspd.service.index import project_scope
-from graspd.service.index.database import Database
-from graspd.service.index.project_scope import seen_attempts, seen_jobs, seen_shards, seen_tasks
+from graspd.service.index.database import Database, IndexPart
+from graspd.service.index.project_scope import page_size, seen, seen_shards, seen_with_job
 from graspd.service.index.tables import attempts, damage, jobs, shards, spent, tasks, workers
 from graspd.service.index.views import FailureGroup, MatrixCell, Stats, Throughput, UsageDay, WorkerView
 from graspd.service.model.clock import age_of
@@ -22,36 +21,24 @@ from graspd.service.model.projects import EVERYTHING, ProjectScope
 from graspd.service.model.states import Stage, State
 
 
-@dataclass(frozen=True)
-class Overview:
-    """Reads of the whole service."""
-
-    database: Database
-
+class Overview(IndexPart):
     def workers(self) -> list[WorkerView]:
-        """Return workers, the living first."""
         query = select(workers).order_by(case((workers.c.state == "lost", 1), else_=0), workers.c.name)
-        with self.database.reading() as connection:
-            rows = connection.execute(query).mappings().all()
-        return [WorkerView(**row) for row in rows]
+        return [WorkerView(**row) for row in self.database.rows(query)]
 
     def stats(self, *, scope: ProjectScope = EVERYTHING) -> Stats:
-        """Return totals over everything in scope."""
         alive = select(func.count()).select_from(workers).where(workers.c.state != "lost")
         sums = (func.count(), *_MADE, func.sum(shards.c.size_bytes))
-        seen = seen_shards(scope, shards.c.id)
+        by_kind = select(shards.c.kind, *sums).where(*seen_shards(scope, shards.c.id)).group_by(shards.c.kind)
         with self.database.reading() as connection:
-            of_jobs = connection.execute(_counted(jobs.c.state, *seen_jobs(scope))).all()
-            of_tasks = connection.execute(_counted(tasks.c.state, *seen_tasks(scope))).all()
-            of_shards = {
-                kind: tuple(map(int, row))
-                for kind, *row in connection.execute(select(shards.c.kind, *sums).where(*seen).group_by(shards.c.kind))
-            }
+            of_jobs = _by_state(connection, jobs, *seen(scope, jobs))
+            of_tasks = _by_state(connection, tasks, *seen_with_job(scope, tasks))
+            of_shards = {kind: tuple(map(int, row)) for kind, *row in connection.execute(by_kind)}
             living = connection.scalar(alive)
         _, made, valid, candidates, validated, _ = of_shards.get("base", (0,) * 6)
         return Stats(
-            jobs=_by_state(of_jobs),
-            tasks=_by_state(of_tasks),
+            jobs=of_jobs,
+            tasks=of_tasks,
             grasps=made,
             valid=valid,
             candidates=candidates,
@@ -81,44 +68,32 @@ class Overview:
 
     def failures(self, *, limit: int = 20, scope: ProjectScope = EVERYTHING) -> list[FailureGroup]:
         """Return failed attempts by stage and error, the most frequent first."""
-        newest = func.max(attempts.c.ended)
-        seen = seen_attempts(scope)
-        count = func.count()
+        count, newest = func.count(), func.max(attempts.c.ended)
+        in_scope = seen_with_job(scope, attempts)
+        of_tasks = func.count(attempts.c.task_id.distinct())
         query = (
             select(
                 attempts.c.stage,
                 attempts.c.kind,
-                count,
-                func.count(attempts.c.task_id.distinct()),
-                newest.label("seen"),
+                count.label("attempts"),
+                of_tasks.label("tasks"),
+                newest.label("last_seen"),
             )
-            .where(*seen)
+            .where(*in_scope)
             .group_by(attempts.c.stage, attempts.c.kind)
             .order_by(count.desc(), newest.desc())
-            .limit(project_scope.page_size(limit))
+            .limit(page_size(limit))
         )
         groups = []
         with self.database.reading() as connection:
-            for stage, kind, number, of_tasks, last in connection.execute(query).all():
-                same = and_(attempts.c.stage == stage, attempts.c.kind == kind, attempts.c.ended == last)
-                example = connection.execute(
-                    select(attempts.c.reason, attempts.c.task_id).where(same, *seen).limit(1)
-                ).one()
-                groups.append(
-                    FailureGroup(
-                        stage=stage,
-                        kind=kind,
-                        attempts=number,
-                        tasks=of_tasks,
-                        example=example.reason,
-                        task_id=example.task_id,
-                        last_seen=last,
-                    )
-                )
+            for row in connection.execute(query).mappings().all():
+                same = (attempts.c.stage == row["stage"], attempts.c.kind == row["kind"])
+                example = select(attempts.c.reason.label("example"), attempts.c.task_id)
+                example = example.where(*same, attempts.c.ended == row["last_seen"], *in_scope).limit(1)
+                groups.append(FailureGroup(**row, **connection.execute(example).mappings().one()))
         return groups
 
     def matrix(self, *, scope: ProjectScope = EVERYTHING) -> list[MatrixCell]:
-        """Return jobs, task states and yield of each hand x object."""
         of_tasks = select(tasks.c.job_id, tasks.c.state, func.count()).group_by(tasks.c.job_id, tasks.c.state)
         made = (
             select(shards.c.hand, shards.c.object, *_MADE)
@@ -128,11 +103,10 @@ class Overview:
         cells: dict[tuple[str, str], dict[str, int]] = {}
         with self.database.reading() as connection:
             pairs = {}
-            of_jobs = select(jobs.c.id, jobs.c.hand, jobs.c.object).where(*seen_jobs(scope))
-            for job, *pair in connection.execute(of_jobs):
-                cell = cells.setdefault((pair[0], pair[1]), dict.fromkeys(_CELL, 0))
-                cell["jobs"] += 1
-                pairs[job] = cell
+            of_jobs = select(jobs.c.id, jobs.c.hand, jobs.c.object).where(*seen(scope, jobs))
+            for job, hand, obj in connection.execute(of_jobs):
+                pairs[job] = cells.setdefault((hand, obj), dict.fromkeys(_CELL, 0))
+                pairs[job]["jobs"] += 1
             for job, state, number in connection.execute(of_tasks):
                 if state in _CELL and job in pairs:
                     pairs[job][state] += int(number)
@@ -154,21 +128,16 @@ _MADE = (
 )
 
 
-def _counted(column: ColumnElement[Any], *tests: ColumnElement[bool]) -> Select[Any]:
-    """Count rows by value of a column."""
-    return select(column, func.count()).where(*tests).group_by(column)
-
-
-def _by_state(rows: Any) -> dict[State, int]:
-    found = {State(state): int(count) for state, count in rows}
+def _by_state(connection: Connection, table: Table, *tests: ColumnElement[bool]) -> dict[State, int]:
+    query = select(table.c.state, func.count()).where(*tests).group_by(table.c.state)
+    found = {State(state): int(count) for state, count in connection.execute(query)}
     return {state: found.get(state, 0) for state in State}
 
 
 def _bucket(created: str, bucket_s: int) -> str:
     seconds = datetime.fromisoformat(created).timestamp()
-    return (
-        datetime.fromtimestamp(seconds - seconds % bucket_s, UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
-    )
+    start = datetime.fromtimestamp(seconds - seconds % bucket_s, UTC)
+    return start.isoformat(timespec="seconds").replace("+00:00", "Z")
 
 
 #: Unfinished jobs are counted up to here.
@@ -198,81 +167,52 @@ def read_index(database: Database) -> IndexStatus:
             counted[state] = int(connection.scalar(count_jobs(state)) or 0)
             first = connection.scalar(oldest_job(state))
             oldest[state] = (first and age_of(first)) or 0.0
-        damaged = int(connection.scalar(count_damage()) or 0)
+        some = select(damage.c.key).limit(MOST_JOBS).subquery()
+        damaged = int(connection.scalar(select(func.count()).select_from(some)) or 0)
         made, valid = connection.execute(made_since(since)).one()
     return IndexStatus(counted, oldest, int(made or 0) / RATE_WINDOW_S, int(valid or 0) / RATE_WINDOW_S, damaged)
 
 
 def count_jobs(state: State) -> Select[Any]:
-    """Count jobs in a state, up to `MOST_JOBS`."""
     some = select(jobs.c.id).where(jobs.c.state == state.value).limit(MOST_JOBS).subquery()
     return select(func.count()).select_from(some)
 
 
-def count_damage() -> Select[Any]:
-    """Count damaged objects, up to `MOST_JOBS`."""
-    return select(func.count()).select_from(select(damage.c.key).limit(MOST_JOBS).subquery())
-
-
 def oldest_job(state: State) -> Select[Any]:
-    """Select the time when the oldest job in a state was submitted."""
     return select(jobs.c.created).where(jobs.c.state == state.value).order_by(jobs.c.created).limit(1)
 
 
 def made_since(when: datetime) -> Select[Any]:
-    """Sum grasps and valid grasps of the base shards made since a time."""
+    """Sum grasps and valid grasps."""
     text = when.isoformat(timespec="milliseconds").replace("+00:00", "Z")
     base = (shards.c.kind == "base", shards.c.created >= text)
     return select(func.sum(shards.c.count), func.sum(shards.c.valid)).where(*base)
 
 
-@dataclass(frozen=True)
-class Usage:
-    """Reads of usage."""
-
-    database: Database
-
+class Usage(IndexPart):
     def days(self, since: str, until: str, *, scope: ProjectScope = EVERYTHING) -> list[UsageDay]:
-        """Return the usage of each project by day, without empty days, the newest first.
-
-        Args:
-            since, until: first and last day, such as 2026-11-22.
-        """
+        """Return the usage of each project by day (2026-11-22), without empty days, the newest first."""
         day = func.substr(shards.c.created, 1, 10).label("day")
-        made = select(
-            shards.c.charged,
-            day,
-            shards.c.device,
-            _base(shards.c.count),
-            _base(shards.c.valid),
-            func.count(),
-            func.sum(shards.c.seconds),
-        ).where(shards.c.created >= since, shards.c.created < f"{until}T99")
-        gone = select(spent).where(spent.c.day >= since, spent.c.day <= until)
+        sums = (_base(shards.c.count), _base(shards.c.valid), func.count(), func.sum(shards.c.seconds))
+        made = select(shards.c.charged, day, shards.c.device, *sums)
+        made = made.where(shards.c.created >= since, shards.c.created < f"{until}T99")
+        gone = select(spent).where(spent.c.day >= since, spent.c.day <= until, *seen(scope, spent))
         if not scope.everything:
             made = made.where(shards.c.charged == scope.project)
-            gone = gone.where(spent.c.project == scope.project)
-        sums: dict[tuple[str, str], dict[str, float]] = defaultdict(lambda: defaultdict(float))
+        days: dict[tuple[str, str], dict[str, Any]] = defaultdict(lambda: dict.fromkeys(_USED, 0))
         with self.database.reading() as connection:
             live = connection.execute(made.group_by(shards.c.charged, day, shards.c.device)).all()
             for project, when, device, grasps, valid, tasks, seconds in [*live, *connection.execute(gone).all()]:
-                found = sums[when, project]
+                found = days[when, project]
                 found["grasps"] += int(grasps)
                 found["valid"] += int(valid)
                 found["tasks"] += int(tasks)
-                found[_seconds_on(device)] += float(seconds)
-        return [
-            UsageDay(
-                project=project,
-                day=when,
-                grasps=int(found["grasps"]),
-                valid=int(found["valid"]),
-                tasks=int(found["tasks"]),
-                gpu_seconds=round(found["gpu_seconds"], 3),
-                cpu_seconds=round(found["cpu_seconds"], 3),
-            )
-            for (when, project), found in sorted(sums.items(), key=lambda item: (-_number(item[0][0]), item[0][1]))
-        ]
+                found["gpu_seconds" if device.startswith("cuda") else "cpu_seconds"] += float(seconds)
+        views = []
+        for (when, project), found in sorted(days.items(), key=lambda item: (-_number(item[0][0]), item[0][1])):
+            seconds = {name: round(float(found[name]), 3) for name in ("gpu_seconds", "cpu_seconds")}
+            views.append(UsageDay(project=project, day=when, **{**found, **seconds}))
+        return views
 
     def gpu_seconds(self, project: str, day: str) -> float:
         """Return the GPU workers' time for a project's requests on one day [s]."""
@@ -283,12 +223,11 @@ def _base(column: ColumnElement[Any]) -> ColumnElement[Any]:
     return func.sum(case((shards.c.kind == "base", column), else_=0))
 
 
-def _seconds_on(device: str) -> str:
-    return "gpu_seconds" if device.startswith("cuda") else "cpu_seconds"
-
-
 def _number(day: str) -> int:
     return int(day.replace("-", ""))
+
+
+_USED: Final = ("grasps", "valid", "tasks", "gpu_seconds", "cpu_seconds")
 
 
 #: Most tasks read per stage, the newest first: old measurements of a machine matter less.
@@ -316,12 +255,7 @@ class BatchCost:
         return self.valid if self.request.counted == "valid" else self.count
 
 
-@dataclass(frozen=True)
-class Costs:
-    """Reads of costs."""
-
-    database: Database
-
+class Costs(IndexPart):
     def of_batches(self, stage: Stage, *, limit: int = _NEWEST, scope: ProjectScope = EVERYTHING) -> list[BatchCost]:
         """Return the newest finished batches of a stage, from at most `limit` tasks."""
         columns = [shards.c[name] for name in BatchCost.__dataclass_fields__ if name != "request"]
@@ -331,6 +265,5 @@ class Costs:
             .order_by(shards.c.created.desc(), shards.c.id.desc())
             .limit(limit)
         )
-        with self.database.reading() as connection:
-            rows = connection.execute(query).mappings().all()
+        rows = self.database.rows(query)
         return [BatchCost(**{**row, "request": JobRequest.model_validate(row["request"])}) for row in rows]

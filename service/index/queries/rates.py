@@ -27,7 +27,6 @@ class Rate:
 
     seconds_per_try: float
     valid_yield: float
-    """Valid grasps per candidate."""
     bytes_per_grasp: float
     origin: str
     batches: int
@@ -106,14 +105,8 @@ STORED_PICTURE: Final = StageRate(2.1, 1.34e6, ORIGIN, 0)
 
 
 class Rates:
-    """Measurements of one time."""
-
     def __init__(self, batches: Iterable[BatchCost], options: JobOptions, devices: Collection[str]) -> None:
-        """Group the batches of `synthesize` that were made with these options.
-
-        Args:
-            devices: devices of the present workers; empty: all devices count.
-        """
+        """Group the batches of `synthesize` that were made with these options on these devices; empty: on all."""
         self._options = options
         self._groups: dict[Hashable, list[BatchCost]] = defaultdict(list)
         recipe = recipe_of(options)
@@ -126,7 +119,6 @@ class Rates:
         self._known: dict[Hashable, Rate] = {}
 
     def of(self, hand: str, obj: str) -> Rate:
-        """Return the rate of a cell."""
         levels: tuple[tuple[Hashable, str], ...] = (
             ((hand, obj), f"{hand} on {obj}"),
             (hand, f"{hand} on other objects"),
@@ -238,7 +230,6 @@ def recipe_of(options: JobOptions) -> Hashable:
 
 
 def _on(machine: Machine, stored: StageRate) -> StageRate:
-    """Scale a stored rate to this machine."""
     seconds = stored.seconds * machine.factor
     return replace(stored, seconds=seconds, origin=machine.scaled(stored.origin), spread=machine.stored_spread)
 

@@ -10,15 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy import ColumnElement, Connection, Integer, cast, func, select
 
-from graspd.service.index.database import Database
+from graspd.service.index.database import IndexPart
 from graspd.service.index.queries.grasps import GraspFilter, Metric, conditions, sql_conditions
 from graspd.service.index.tables import dataset_cells, grasps, shards, tasks
 
 
 @dataclass(frozen=True)
 class MetricSummary:
-    """Summary of one metric over the grasps that have it."""
-
     count: int
     mean: float
     low: float
@@ -37,16 +35,6 @@ class Distribution:
 
 
 @dataclass(frozen=True)
-class Distributions:
-    """Several metrics over one sample of the grasps that pass a filter."""
-
-    looked_at: int
-    share: float
-    """Share of randomly drawn shards whose grasps were read; 1.0: all."""
-    metrics: dict[Metric, Distribution]
-
-
-@dataclass(frozen=True)
 class GraspKinds:
     """Grasp types, and the cells of the sphere of approaches; grasps without either are omitted."""
 
@@ -55,12 +43,7 @@ class GraspKinds:
     cells: dict[int, int]
 
 
-@dataclass(frozen=True)
-class Statistics:
-    """Reads of all grasps that pass a filter."""
-
-    database: Database
-
+class Statistics(IndexPart):
     def summaries(self, where: GraspFilter, metrics: Sequence[Metric]) -> dict[Metric, MetricSummary]:
         """Return count, mean and range of each metric; metrics without any grasp are omitted."""
         columns = [
@@ -91,25 +74,15 @@ class Statistics:
                 counts[min(int(at), bins - 1)] += int(count)
         return counts
 
-    def distributions(
-        self, where: GraspFilter, metrics: Sequence[Metric], *, bins: int = 20, at_most: int = 20_000
-    ) -> Distributions:
-        """Return the distribution of each metric from at most about `at_most` grasps of the job, pair or all.
-
-        The id of a shard is a digest, so ids below a bound are a fair sample, and they are adjacent in the index.
-        """
-        share, values = self._values(where, metrics, at_most)
-        found = {metric: _distribution(values[:, at], bins) for at, metric in enumerate(metrics)}
-        return Distributions(len(values), share, {metric: data for metric, data in found.items() if data is not None})
-
     def side_by_side(
         self, filters: Sequence[GraspFilter], metrics: Sequence[Metric], *, bins: int = 20, at_most: int = 20_000
     ) -> dict[Metric, list[Distribution | None]]:
-        """Return one distribution per metric and filter in common bins; None without grasps.
+        """Return one distribution per metric and filter in common bins, from at most about `at_most` grasps each.
 
-        Grasps are sampled as in `distributions`.
+        None without grasps. The id of a shard is a digest, so ids below a bound are a fair sample, and they are
+        adjacent in the index.
         """
-        samples = [self._values(where, metrics, at_most)[1] for where in filters]
+        samples = [self._values(where, metrics, at_most) for where in filters]
         found: dict[Metric, list[Distribution | None]] = {}
         for at, metric in enumerate(metrics):
             columns = [values[:, at] for values in samples]
@@ -119,21 +92,19 @@ class Statistics:
                 found[metric] = [_distribution(column, bins, ends) for column in columns]
         return found
 
-    def _values(self, where: GraspFilter, metrics: Sequence[Metric], at_most: int) -> tuple[float, NDArray[np.float64]]:
-        """Return the sampled share of shards, and the metrics (N, M) of their grasps; nan: not measured."""
+    def _values(self, where: GraspFilter, metrics: Sequence[Metric], at_most: int) -> NDArray[np.float64]:
+        """Return the metrics (N, M) of the sampled grasps; nan: not measured."""
         with self.database.reading() as connection:
-            share, tests = _sampled(connection, where, at_most)
-            query = select(*(grasps.c[metric] for metric in metrics)).where(*tests)
+            query = select(*(grasps.c[metric] for metric in metrics)).where(*_sampled(connection, where, at_most))
             rows = [tuple(row) for row in connection.execute(query)]
-        return share, np.array(rows, float).reshape(-1, len(metrics))
+        return np.array(rows, float).reshape(-1, len(metrics))
 
     def kinds(self, where: GraspFilter, *, at_most: int = 20_000) -> GraspKinds:
-        """Return types and directions, from about `at_most` grasps as sampled by `distributions`."""
+        """Return types and directions, from about `at_most` grasps as sampled by `side_by_side`."""
         columns = grasps.c.grasp_type, grasps.c.approach_cell
         with self.database.reading() as connection:
-            _, tests = _sampled(connection, where, at_most)
-            query = select(*columns, func.count()).where(*tests).group_by(*columns)
-            rows = [tuple(row) for row in connection.execute(query)]
+            query = select(*columns, func.count()).where(*_sampled(connection, where, at_most)).group_by(*columns)
+            rows = connection.execute(query).all()
         found = GraspKinds({}, {})
         for kind, cell, count in rows:
             for counts, value in ((found.types, kind), (found.cells, cell)):
@@ -142,13 +113,11 @@ class Statistics:
         return found
 
 
-def _sampled(connection: Connection, where: GraspFilter, at_most: int) -> tuple[float, list[ColumnElement[bool]]]:
-    """Return the share of shards with about `at_most` grasps, and the filter restricted to these."""
+def _sampled(connection: Connection, where: GraspFilter, at_most: int) -> list[ColumnElement[bool]]:
+    """Return the filter restricted to a share of shards with about `at_most` grasps."""
     share = min(1.0, at_most / max(1, _size(connection, where)))
     tests = [c.sql(["shard", "job", "dataset"]) for c in conditions(where)]
-    if share < 1.0:
-        tests.append(grasps.c.shard_id < f"{round(share * 16**8):08x}")
-    return share, tests
+    return [*tests, grasps.c.shard_id < f"{round(share * 16**8):08x}"] if share < 1.0 else tests
 
 
 def _size(connection: Connection, where: GraspFilter) -> int:
@@ -167,12 +136,10 @@ def _size(connection: Connection, where: GraspFilter) -> int:
     return int(connection.scalar(query) or 0)
 
 
-def _distribution(
-    values: NDArray[np.float64], bins: int, ends: tuple[float, float] | None = None
-) -> Distribution | None:
+def _distribution(values: NDArray[np.float64], bins: int, ends: tuple[float, float]) -> Distribution | None:
     known = values[np.isfinite(values)]
     if not known.size:
         return None
-    low, high = ends or (float(known.min()), float(known.max()))
+    low, high = ends
     counts, _ = np.histogram(known, bins, (low, high)) if high > low else ([known.size] + [0] * (bins - 1), None)
     return Distribution(known.size, float(known.mean()), low, high, [int(n) for n in counts])

@@ -12,16 +12,17 @@ from graspd.service.model import names
 from graspd.service.model.clock import timestamp
 from graspd.service.model.digests import digest_json
 from graspd.service.model.domain import JobOptions
-from graspd.service.model.errors import ConflictError, InputError, LimitError, NotFoundError
+from graspd.service.model.errors import ConflictError, InputError, NotFoundError
 from graspd.service.model.projects import EVERYTHING, ProjectScope
 from graspd.service.model.records import DatasetRecord, Member, ObjectSet, Snapshot, object_set_of
 from graspd.service.model.scene_spec import NamedNeighbour, SceneDocument
 from graspd.service.model.states import AssetKind, State
 from graspd.service.pipeline.backends import Services
-from graspd.service.pipeline.datasets.spec import MAX_CELLS, DatasetRequest, Matrix, describe
+from graspd.service.pipeline.datasets.cost import objects_of
+from graspd.service.pipeline.datasets.spec import DatasetRequest, Matrix, describe
 from graspd.service.pipeline.fidelity_choice import Resolver
 from graspd.service.pipeline.recording import recording
-from graspd.service.pipeline.usable import usable, with_neighbours, with_network
+from graspd.service.pipeline.usable import refuse_deleted, usable, with_neighbours, with_network
 from graspd.service.store.records import (
     Put,
     add_dataset_event,
@@ -38,20 +39,14 @@ def create(
 ) -> tuple[DatasetView, bool]:
     """Record a dataset; the controller plans its jobs. Equal hands, objects and options give one dataset.
 
-    Args:
-        owner: id of the submitting API key, also for its jobs.
-        scope: which hands, objects and networks it may name, and the project of it and its jobs.
-
     Returns:
         the dataset, and whether it is new. A failed or cancelled one is returned unchanged: see `retry`.
 
     Raises:
         NotFoundError: unknown hand, object, neighbour, network or set.
-        InputError: one of them failed its check; the network is of another hand; no chart contains a
-            fidelity that meets the target.
+        InputError: one of them failed its check; the network is of another hand; no chart meets the target.
         ConflictError: a check is still running, or another dataset has the name.
         LimitError: more than `MAX_CELLS` cells.
-        QueueUnavailable, StoreUnavailable, IndexUnavailable: nothing was recorded.
     """
     hands, objects = members(services, request, scope)
     shared, beside = with_neighbours(services, request.shared, scope)
@@ -76,8 +71,7 @@ def create(
         if not new and (other := _difference(record, hands, objects, shared)):
             raise ConflictError(f"there is another dataset named {record.name!r} ({other}); take another name")
         refuse_pending(services.store, "dataset", record.name)
-        if missing := services.index.assets.missing(wanted, within=connection):
-            raise NotFoundError(f"there is no {missing[0]} any more; it was deleted just now")
+        refuse_deleted(services, wanted, connection)
         services.index.write_dataset.add(record, within=connection)
     return services.index.datasets.get(record.name), new
 
@@ -85,11 +79,8 @@ def create(
 def cancel(services: Services, name: str) -> DatasetView:
     """Stop a dataset: plan no more jobs and cancel its unfinished ones. Finished shards stay.
 
-    A job continues if another dataset waits for it or another key submitted it.
-
-    Raises:
-        NotFoundError: unknown dataset.
-        ConflictError: it is finished or cancelled already.
+    A job continues if another dataset waits for it or another key submitted it. NotFoundError for an unknown dataset,
+    ConflictError for one that is finished or cancelled already.
     """
     with recording(services) as (connection, put):
         dataset = services.index.datasets.get(name)
@@ -100,12 +91,7 @@ def cancel(services: Services, name: str) -> DatasetView:
 
 
 def retry(services: Services, name: str) -> DatasetView:
-    """Restart failed and cancelled cells of a dataset with fresh attempts. Finished work is not repeated.
-
-    Raises:
-        NotFoundError: unknown dataset.
-        ConflictError: no cell failed or was cancelled.
-    """
+    """Restart failed and cancelled cells of a dataset with fresh attempts; ConflictError if there are none."""
     with recording(services) as (connection, put):
         dataset = services.index.datasets.get(name)
         if not dataset.cancelled and not dataset.states[State.FAILED] and not dataset.states[State.CANCELLED]:
@@ -117,12 +103,7 @@ def retry(services: Services, name: str) -> DatasetView:
 def snapshot(services: Services, name: str) -> tuple[Snapshot, bool]:
     """Record the present shards of a dataset. Equal shards give the same snapshot.
 
-    Returns:
-        the snapshot, and whether it is new.
-
-    Raises:
-        NotFoundError: unknown dataset.
-        ConflictError: the dataset has no shard yet.
+    Return the snapshot, and whether it is new; NotFoundError without the dataset, ConflictError without a shard.
     """
     dataset = services.index.datasets.get(name)
     held = tuple(services.index.datasets.shards(name))
@@ -159,17 +140,13 @@ def add_object_set(
     scope: ProjectScope = EVERYTHING,
     may_follow: Callable[[str, str], None] = lambda owner, project: None,
 ) -> ObjectSetView:
-    """Give objects a common name. Equal objects change nothing; others make a new version.
+    """Give objects a common name. Equal objects change nothing; others make a new version, with the owner of the set.
 
     Args:
-        owner: id of the requesting API key; a new version keeps the owner of the set.
-        scope: which objects it may name, and the project that a new set belongs to.
         may_follow: called with owner and project of the set before a new version; raises if that is refused.
 
     Raises:
-        NotFoundError: unknown object.
-        InputError: an object failed its check, or none is given.
-        ConflictError: a check is still running.
+        NotFoundError, InputError, ConflictError: as in `usable`, or no object is given.
     """
     assets = [services.index.assets.get(AssetKind.OBJECT, one, scope=scope) for one in objects]
     wanted = tuple(asset.name for asset in assets)
@@ -187,10 +164,7 @@ def add_object_set(
             known = read_record(ObjectSet, services.store, names.object_set(name, after))
             owner, project = known.owner, known.project
             may_follow(owner, project)
-        if missing := services.index.assets.missing(
-            [(AssetKind.OBJECT, one.digest) for one in assets], within=connection
-        ):
-            raise NotFoundError(f"there is no {missing[0]} any more; it was deleted just now")
+        refuse_deleted(services, [(AssetKind.OBJECT, one.digest) for one in assets], connection)
         found = object_set_of(name, wanted, after=after, owner=owner, project=project)
         if not put(key := names.object_set(name, found.digest), found):
             # An earlier request ended before it wrote the row.
@@ -203,19 +177,14 @@ def add_object_set(
 
 def members(services: Services, matrix: Matrix, scope: ProjectScope = EVERYTHING) -> tuple[list[Member], list[Member]]:
     """Return the present hands and objects of a matrix with sets expanded; errors as in `create`."""
-    objects = dict.fromkeys(matrix.objects)
-    for name in matrix.sets:
-        objects |= dict.fromkeys(services.index.object_sets.get(name, scope=scope).objects)
-    if len(matrix.hands) * len(objects) > MAX_CELLS:
-        raise LimitError(f"{len(matrix.hands)} hands x {len(objects)} objects is over {MAX_CELLS} cells; split it")
+    objects = objects_of(services.index, matrix, scope)
     hands = _members(services, AssetKind.HAND, matrix.hands, scope)
     return hands, _members(services, AssetKind.OBJECT, objects, scope)
 
 
 def _members(services: Services, kind: AssetKind, wanted: Iterable[str], scope: ProjectScope) -> list[Member]:
     assets = [usable(services, kind, name, scope) for name in wanted]
-    found = [Member(name=asset.name, digest=asset.digest) for asset in assets]
-    return list(dict.fromkeys(found))
+    return list(dict.fromkeys(Member(name=asset.name, digest=asset.digest) for asset in assets))
 
 
 def _present(services: Services, name: str) -> DatasetRecord:

@@ -52,14 +52,10 @@ class _Sums:
     cells: dict[tuple[str, Rate], int] = field(default_factory=lambda: defaultdict(int))
 
 
-def _explicit(request: JobRequest) -> JobRequest:
-    return request
-
-
 def estimate(
     index: Index,
     matrix: Matrix,
-    resolve: Callable[[JobRequest], JobRequest] = _explicit,
+    resolve: Callable[[JobRequest], JobRequest] = lambda request: request,
     *,
     costs: Batches | None = None,
     scope: ProjectScope = EVERYTHING,
@@ -67,21 +63,11 @@ def estimate(
     """Estimate the cost of a matrix. Hands and objects need not exist yet.
 
     Args:
-        resolve: replaces `auto` by a fidelity; not needed without `auto`.
+        resolve: replaces `auto` by a fidelity; InputError if no chart contains one that meets the target.
         costs: returns the finished batches of a stage; None: read from the index.
         scope: which sets of objects the matrix may name, and whose measurements count.
-
-    Raises:
-        NotFoundError: unknown set.
-        InputError: no chart contains a fidelity that meets the target.
-        LimitError: more than `MAX_CELLS` cells.
     """
-    objects = list(matrix.objects)
-    for name in matrix.sets:
-        objects += [one for one in index.object_sets.get(name, scope=scope).objects if one not in objects]
-    cells = len(matrix.hands) * len(objects)
-    if cells > MAX_CELLS:
-        raise LimitError(f"{len(matrix.hands)} hands x {len(objects)} objects is over {MAX_CELLS} cells; split it")
+    objects = objects_of(index, matrix, scope)
     options = matrix.shared
     devices = {worker.device for worker in index.overview.workers() if worker.state != "lost"}
     costs = costs or partial(index.costs.of_batches, scope=scope)
@@ -95,13 +81,21 @@ def estimate(
                 rates[chosen.knobs.name] = Rates(batches, chosen, devices)
             sums.machine = rates[chosen.knobs.name].machine
             _add_cell(sums, hand, rates[chosen.knobs.name].of(hand, obj), options)
-    later = _later_rates(costs, options, sums.machine)
-    return _estimate(options, cells, sums, later, _assets(index, matrix.hands, _once(objects, options), scope))
+    scene = scene_rate(costs(Stage.SCENE) if options.scenes else [], options, sums.machine)
+    picture = picture_rate(costs(Stage.RENDER) if options.views else [], options, sums.machine)
+    with_neighbours = list(dict.fromkeys([*objects, *(one.object for one in options.beside)]))
+    known = _assets(index, matrix.hands, with_neighbours, scope)
+    return _estimate(options, len(matrix.hands) * len(objects), sums, (scene, picture), known)
 
 
-def _once(objects: list[str], options: JobOptions) -> list[str]:
-    """Return the objects of all cells, including neighbours."""
-    return list(dict.fromkeys([*objects, *(one.object for one in options.beside)]))
+def objects_of(index: Index, matrix: Matrix, scope: ProjectScope) -> list[str]:
+    """Return the objects of a matrix with sets expanded; LimitError for more than `MAX_CELLS` cells."""
+    objects = dict.fromkeys(matrix.objects)
+    for name in matrix.sets:
+        objects |= dict.fromkeys(index.object_sets.get(name, scope=scope).objects)
+    if len(matrix.hands) * len(objects) > MAX_CELLS:
+        raise LimitError(f"{len(matrix.hands)} hands x {len(objects)} objects is over {MAX_CELLS} cells; split it")
+    return list(objects)
 
 
 def _add_cell(sums: _Sums, hand: str, rate: Rate, options: JobOptions) -> None:
@@ -125,7 +119,8 @@ def _estimate(
     batches = cells * -(-options.grasps // BATCH_SIZE)
     stages = stages_of(options)
     scene, picture = later
-    pixels = batches * _pictures(options) * options.width * options.height / 1e6
+    pictures = options.scenes * options.views * (2 if options.stereo else 1)
+    pixels = batches * pictures * options.width * options.height / 1e6
     seconds = {Stage.SYNTHESIZE: sums.seconds}
     ends = {Stage.SYNTHESIZE: (sums.low, sums.high)}
     storage = {"base": sums.base_bytes}
@@ -184,15 +179,6 @@ def _plan(
         network_bytes=round(moved),
         network_bytes_per_s=moved / seconds if seconds else 0.0,
     )
-
-
-def _later_rates(costs: Batches, options: JobOptions, machine: Machine) -> tuple[StageRate, StageRate]:
-    scene = scene_rate(costs(Stage.SCENE) if options.scenes else [], options, machine)
-    return scene, picture_rate(costs(Stage.RENDER) if options.views else [], options, machine)
-
-
-def _pictures(options: JobOptions) -> int:
-    return options.scenes * options.views * (2 if options.stereo else 1)
 
 
 def _assets(index: Index, hands: Sequence[str], objects: Sequence[str], scope: ProjectScope) -> tuple[float, list[str]]:

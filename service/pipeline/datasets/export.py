@@ -21,14 +21,8 @@ _CHUNK: Final = 1 << 20
 def export_shards(snapshot: Snapshot, folder: Path, fetch: Fetch, progress: Progress | None = None) -> int:
     """Export the HDF5 files as `HAND/OBJECT/KIND-BATCH.h5`, with `SHA256SUMS` and `snapshot.json`.
 
-    `snapshot.json` is written last: a folder that contains it is complete.
-
-    Returns:
-        number of fetched files.
-
-    Raises:
-        DamagedShard: the checksum of a file differs from the snapshot's.
-        StoreUnavailable: a file could not be fetched.
+    `snapshot.json` is written last: a folder that contains it is complete. Return the number of fetched files;
+    DamagedShard: the checksum of a file differs from the snapshot's.
     """
     _make(folder)
     fetched = size = 0
@@ -51,7 +45,6 @@ FORMATS: Final[dict[str, Callable[[Snapshot, Path, Fetch, Progress | None], int]
 
 
 def path_of(shard: SnapshotShard) -> str:
-    """Return the path of a shard in the folder."""
     return f"{shard.hand}/{shard.object}/{shard.kind}-{shard.batch:05}.h5"
 
 

@@ -36,11 +36,7 @@ class DatasetRounds:
         self._positions: dict[tuple[str, int], int] = {}
 
     def advance(self, budget_s: float = BUDGET_S) -> bool:
-        """Work for at most `budget_s`. Return whether work is left.
-
-        Raises:
-            UnavailableError: a backend is unavailable; call again later.
-        """
+        """Work for at most `budget_s`. Return whether work is left."""
         deadline = self._clock() + budget_s
         for work in self._services.index.dataset_feed.in_work():
             if not self._pass_on(work, deadline) or not self._plan(work, deadline):

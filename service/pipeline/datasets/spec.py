@@ -45,7 +45,6 @@ class Matrix(JobOptions):
 
     @property
     def shared(self) -> JobOptions:
-        """Options that all cells share."""
         return JobOptions(**{name: getattr(self, name) for name in JobOptions.model_fields})
 
 
@@ -73,13 +72,7 @@ def describe(
 ) -> DatasetRecord:
     """Return the record of a dataset. Its digest follows from hands, objects, options and fidelities only.
 
-    Args:
-        choose: replaces `auto` by a fidelity, and returns how it was chosen.
-        owner: id of the submitting API key; no part of the digest.
-        project: project of that key; its jobs belong to it.
-
-    Raises:
-        InputError: no fidelity meets the target on one of the cells.
+    `choose` replaces `auto` by a fidelity, or raises InputError if none meets the target on one of the cells.
     """
     cells = [(hand, obj, *choose(request_of(options, hand.name, obj.name))) for hand in hands for obj in objects]
     # A chosen fidelity has a name.

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import secrets
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing, contextmanager
+from contextlib import AbstractContextManager, closing
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 from urllib.parse import unquote, urlsplit
@@ -51,65 +52,52 @@ def is_there(settings: Settings) -> bool:
     return settings.redis_url is not None or socket_path(settings.data_dir).exists()
 
 
-@contextmanager
-def redis_connection(settings: Settings) -> Iterator[Redis]:
-    """Yield a client with a short timeout."""
-    client = connect(redis_url(settings), patience=0, timeout_s=_TIMEOUT_S)
-    try:
-        yield client
-    finally:
-        client.close()
+def redis_connection(settings: Settings) -> AbstractContextManager[Redis]:
+    return closing(connect(redis_url(settings), patience=0, timeout_s=_TIMEOUT_S))
 
 
 def redis(settings: Settings) -> Finding:
     """Check the Redis of `GRASPD_REDIS_URL` or of the data folder."""
-    name = "redis"
     if not is_there(settings):
         try:
             _, rung = find_server()
         except QueueUnavailable as error:
-            return bad(name, "no service runs on this data folder, and there is no Redis to start", str(error))
-        return skipped(name, f"no service runs on this data folder; `graspd up` starts the Redis of {rung}")
+            return bad("no service runs on this data folder, and there is no Redis to start", str(error))
+        return skipped(f"no service runs on this data folder; `graspd up` starts the Redis of {rung}")
     try:
         with redis_connection(settings) as client:
-            return _check_redis(name, settings, client, _info(client))
+            return _check_redis(settings, client, dict(client.info()))
     except (RedisError, OSError) as error:
-        return bad(name, f"{_shown(settings)} does not answer: {_line(error)}", _fix(error, settings))
+        return bad(f"{_shown(settings)} does not answer: {_line(error)}", _fix(error, settings))
 
 
-def _check_redis(name: str, settings: Settings, client: Redis, info: Mapping[str, Any]) -> Finding:
+def _check_redis(settings: Settings, client: Redis, info: Mapping[str, Any]) -> Finding:
     version = str(info.get("redis_version", "0"))
     if int(info.get("cluster_enabled", 0)):
-        return bad(name, "it is a Redis Cluster: tasks move between keys of several nodes", "name a plain Redis")
+        return bad("it is a Redis Cluster: tasks move between keys of several nodes", "name a plain Redis")
     if info.get("role") != "master":
-        return bad(name, f"it is a {info.get('role')}: it cannot be written", "name the primary in GRASPD_REDIS_URL")
+        return bad(f"it is a {info.get('role')}: it cannot be written", "name the primary in GRASPD_REDIS_URL")
     most, policy = int(info.get("maxmemory", 0)), str(info.get("maxmemory_policy", "noeviction"))
     if most and policy != "noeviction":
         fix = "redis-cli config set maxmemory-policy noeviction, and the same line in its configuration"
-        return bad(name, f"maxmemory-policy is {policy}: when memory is full, it throws tasks away without a word", fix)
+        return bad(f"maxmemory-policy is {policy}: when memory is full, it throws tasks away without a word", fix)
     used = int(info.get("used_memory", 0))
     if most and used > _FULL * most:
         return bad(
-            name,
-            f"{used >> 20} of {most >> 20} MiB are used",
-            "redis-cli config set maxmemory to more; see who else uses it",
+            f"{used >> 20} of {most >> 20} MiB are used", "redis-cli config set maxmemory to more; see who else uses it"
         )
     seconds = _write(client)
     line = f"Redis {version} at {_shown(settings)}, {1000 * seconds:.1f} ms, {used >> 20} MiB"
     if tuple(int(part) for part in version.split(".")[:2]) < _OLDEST:
-        return warning(
-            name, f"{line}: older than 6.2, on which graspd was tried", "install Redis 6.2 or newer, or Valkey"
-        )
+        return warning(f"{line}: older than 6.2, on which graspd was tried", "install Redis 6.2 or newer, or Valkey")
     if _is_open(settings):
         fix = "requirepass in its configuration, or an ACL, and the password in GRASPD_REDIS_URL"
-        return warning(name, f"{line}: it asks for no password, and who writes to it can start tasks", fix)
+        return warning(f"{line}: it asks for no password, and who writes to it can start tasks", fix)
     if seconds > _SLOW_REDIS_S:
         return warning(
-            name,
-            f"{line}: a task takes some 109 operations",
-            "put Redis nearer to the workers, or look after the network",
+            f"{line}: a task takes some 109 operations", "put Redis nearer to the workers, or look after the network"
         )
-    return good(name, line)
+    return good(line)
 
 
 def _write(client: Redis) -> float:
@@ -127,33 +115,25 @@ def _write(client: Redis) -> float:
 
 def persistence(settings: Settings) -> Finding:
     """Check whether Redis restores its tasks after a crash."""
-    name = "redis-persistence"
     if not is_there(settings):
-        return skipped(name, "no service runs on this data folder; the Redis of `graspd up` keeps a log of writes")
+        return skipped("no service runs on this data folder; the Redis of `graspd up` keeps a log of writes")
     try:
         with redis_connection(settings) as client:
-            info = _info(client)
+            info = dict(client.info())
     except (RedisError, OSError):
-        return skipped(name, "Redis does not answer")
+        return skipped("Redis does not answer")
     fix = "make room on the disk of Redis and see its log; then redis-cli bgrewriteaof"
     if int(info.get("aof_enabled", 0)):
         for what in ("aof_last_write_status", "aof_last_bgrewrite_status"):
             if info.get(what, "ok") != "ok":
-                return bad(name, f"the log of writes fails ({what}: {info[what]})", fix)
-        return good(name, "the log of writes is on: a killed Redis comes back with its tasks")
+                return bad(f"the log of writes fails ({what}: {info[what]})", fix)
+        return good("the log of writes is on: a killed Redis comes back with its tasks")
     if info.get("rdb_last_bgsave_status", "ok") != "ok":
-        return bad(
-            name, "its snapshots fail, and it may refuse writes", "make room on the disk of Redis and see its log"
-        )
+        return bad("its snapshots fail, and it may refuse writes", "make room on the disk of Redis and see its log")
     return warning(
-        name,
         "the log of writes is off: after a crash nothing runs until the controller has queued everything again",
         "redis-cli config set appendonly yes, and `appendonly yes` in its configuration",
     )
-
-
-def _info(client: Redis) -> dict[str, Any]:
-    return dict(client.info())
 
 
 def _shown(settings: Settings) -> str:
@@ -199,54 +179,50 @@ _SETTLES_S: Final = 3.0
 
 def index(settings: Settings) -> Finding:
     """Check connection, integrity and schema of the index; changes nothing."""
-    name = "index"
     try:
         found = look(settings.resolved_index_url)
     except IndexDamaged as error:
-        return bad(name, str(error), "graspd admin index rebuild: it is moved aside and made again from the store")
+        return bad(str(error), "graspd admin index rebuild: it is moved aside and made again from the store")
     except InputError as error:
-        return bad(name, str(error), "see the message, and GRASPD_INDEX_URL")
+        return bad(str(error), "see the message, and GRASPD_INDEX_URL")
     except UnavailableError as error:
         fix = "start the database; see host, user, password and database in GRASPD_INDEX_URL"
-        return bad(name, str(error), fix if settings.index_url is not None else "see who may read the file")
+        return bad(str(error), fix if settings.index_url is not None else "see who may read the file")
     if found is None:
-        return _absent(name, settings)
-    return _check_index(name, settings, found)
+        return _absent(settings)
+    return _check_index(settings, found)
 
 
-def _absent(name: str, settings: Settings) -> Finding:
+def _absent(settings: Settings) -> Finding:
     if settings.index_url is None:
-        return skipped(name, _NONE_HERE)
+        return skipped(_NONE_HERE)
     where = existing(Path(str(make_url(settings.resolved_index_url).database)).resolve())
-    return good(name, f"the index is made at the first start, in {where}")
+    return good(f"the index is made at the first start, in {where}")
 
 
-def _check_index(name: str, settings: Settings, found: IndexCondition) -> Finding:
+def _check_index(settings: Settings, found: IndexCondition) -> Finding:
     parsed = make_url(settings.resolved_index_url)
     url = parsed.set(query={}).render_as_string(hide_password=True)
     line = f"{found.kind} at {url}, revision {found.revision or 'none'}"
     if not found.may_write:
-        return bad(name, f"{line}: it cannot be written", "name the primary, and grant CREATE and USAGE on the schema")
+        return bad(f"{line}: it cannot be written", "name the primary, and grant CREATE and USAGE on the schema")
     if found.revision and not found.is_ready and found.revision > found.newest:
         return bad(
-            name,
             f"{line}: a newer graspd made it; this one knows {found.newest}",
             "install the newer version here, or graspd admin index rebuild: it is made again from the store",
         )
     if found.revision and not found.is_ready:
         return bad(
-            name,
-            f"{line}: this graspd has {found.newest}",
-            "graspd admin index rebuild: it is made again from the store",
+            f"{line}: this graspd has {found.newest}", "graspd admin index rebuild: it is made again from the store"
         )
     if not found.is_ready:
-        return warning(name, line, "the next start makes its tables")
+        return warning(line, "the next start makes its tables")
     used, most = found.connections
     if most and used > _CROWDED * most:
         return warning(
-            name, f"{line}: {used} of {most} connections are used", "raise max_connections, or run fewer api processes"
+            f"{line}: {used} of {most} connections are used", "raise max_connections, or run fewer api processes"
         )
-    return good(name, line)
+    return good(line)
 
 
 def _openable(settings: Settings) -> str:
@@ -265,9 +241,9 @@ def _openable(settings: Settings) -> str:
 
 def index_identity(settings: Settings) -> Finding:
     """Check whether store, index and Redis belong to one service; changes nothing."""
-    name, folder = "identity", local_store(settings)
+    folder = local_store(settings)
     if folder is not None and not folder.exists():
-        return skipped(name, "there is no store yet")
+        return skipped("there is no store yet")
     store = open_store(settings.resolved_store_url)
     said, redis = None, None
     if not _openable(settings):
@@ -279,72 +255,62 @@ def index_identity(settings: Settings) -> Finding:
                 redis = queue.service()
         except QueueUnavailable:
             if said is None:
-                return skipped(name, "there is no index here, and Redis does not answer")
+                return skipped("there is no index here, and Redis does not answer")
     found = Identity(service_ids(store), said, redis, recorded(settings.data_dir.resolve()), settings.store_url is None)
     if why := found.refusal(store.url):
-        return bad(name, why, "see the message, and GRASPD_STORE_URL, GRASPD_INDEX_URL, GRASPD_REDIS_URL")
+        return bad(why, "see the message, and GRASPD_STORE_URL, GRASPD_INDEX_URL, GRASPD_REDIS_URL")
     if not found.chain:
-        return skipped(name, "no service has worked on this store yet")
-    return good(
-        name, "store, index and Redis belong to one service" if said else "store and Redis belong to one service"
-    )
+        return skipped("no service has worked on this store yet")
+    return good("store, index and Redis belong to one service" if said else "store and Redis belong to one service")
 
 
 def index_is_store(settings: Settings, *, full: bool = False, settles_s: float = _SETTLES_S) -> Finding:
-    """Compare the rows with the store. Differences in only one of two comparisons are still being indexed.
-
-    Args:
-        full: compare all rows, regardless of their number.
-        settles_s: pause before the second comparison [s].
-    """
-    name = "index-is-store"
+    """Compare the rows with the store. Differences in only one of two comparisons are still being indexed."""
     if why := _openable(settings):
-        return skipped(name, why)
+        return skipped(why)
     store = open_store(settings.resolved_store_url)
     with closing(Index(settings.resolved_index_url)) as opened:
         made = opened.notes.completeness()
         if made is None:
             return warning(
-                name, "the index is new, and lacks what the store has", "start graspd controller: it fills the index"
+                "the index is new, and lacks what the store has", "start graspd controller: it fills the index"
             )
         with opened.database.reading() as connection:
             count = int(connection.scalar(select(func.count()).select_from(shards)) or 0)
         whole = full or count <= _ALL_SHARDS
-        chosen = None if whole else draw(opened, store)
-        found = differences(opened, store) if chosen is None else compare(opened, store, chosen)
-        if found:
+        compared = (
+            partial(differences, opened, store) if whole else partial(compare, opened, store, draw(opened, store))
+        )
+        if found := compared():
             time.sleep(settles_s)
-            again = set(differences(opened, store) if chosen is None else compare(opened, store, chosen))
+            again = set(compared())
             found = [line for line in found if line in again]
     if found:
         # A missing shard changes rows of tasks and jobs: list the cause first.
         found.sort(key=lambda line: not line.startswith("shards "))
         more = f", and {len(found) - 3} more" if len(found) > 3 else ""
-        return bad(name, f"{'; '.join(found[:3])}{more}", _REBUILD)
+        return bad(f"{'; '.join(found[:3])}{more}", _REBUILD)
     what = f"all rows of {count} shards" if whole else f"a sample of {count} shards (--full compares all)"
-    return good(name, f"{what} are what the store says")
+    return good(f"{what} are what the store says")
 
 
 def store_damage(settings: Settings) -> Finding:
     """Report the findings of the controller's integrity scan, or of `graspd admin store verify`."""
-    name = "damage"
     if why := _openable(settings):
-        return skipped(name, why)
+        return skipped(why)
     with closing(Index(settings.resolved_index_url)) as opened:
         count, known = opened.damage.known(limit=1)
         note, made = opened.notes.scan_note(), opened.notes.completeness()
     if count:
         return bad(
-            name,
             f"{count} objects of the store are damaged or missing, {known[0].key}: {known[0].what}",
             "graspd admin store verify --repair",
         )
     if made is not None and made.left_out:
         fix = "put copies in their place, then graspd admin index rebuild"
-        return bad(name, f"{made.left_out} damaged records are left out of the index, {made.names[0]}", fix)
+        return bad(f"{made.left_out} damaged records are left out of the index, {made.names[0]}", fix)
     if not settings.integrity_scan_mb_per_s:
         return warning(
-            name,
             "no damage is known, and the integrity scan is off",
             "GRASPD_INTEGRITY_SCAN_MB_PER_S=1, or graspd admin store verify at times",
         )
@@ -353,7 +319,7 @@ def store_damage(settings: Settings) -> Finding:
         if note.ended
         else "not read through yet; graspd admin store verify does at once"
     )
-    return good(name, f"nothing is known to be damaged; {when}")
+    return good(f"nothing is known to be damaged; {when}")
 
 
 _FOLDER: Final = "health"
@@ -370,18 +336,18 @@ _CREDENTIALS: Final = (
 
 def store(settings: Settings) -> Finding:
     """Try every operation that graspd uses on an object with a name of its own."""
-    name, folder = "store", local_store(settings)
+    folder = local_store(settings)
     if folder is not None and not folder.exists():
-        return good(name, f"{folder} is made at the first start, below {existing(folder)}")
+        return good(f"{folder} is made at the first start, below {existing(folder)}")
     try:
         opened = open_store(settings.resolved_store_url, public_endpoint=settings.store_public_endpoint)
-        return check_store(name, opened)
+        return check_store(opened)
     except GraspdError as error:
         fix = f"make room below {folder}, and let user and group write there" if folder else _CREDENTIALS
-        return bad(name, str(error), fix)
+        return bad(str(error), fix)
 
 
-def check_store(name: str, opened: Store) -> Finding:
+def check_store(opened: Store) -> Finding:
     """Return the finding on an open store. Raises GraspdError if an operation fails."""
     key = f"{_FOLDER}/doctor-{secrets.token_hex(8)}"
     start = time.perf_counter()
@@ -394,15 +360,15 @@ def check_store(name: str, opened: Store) -> Finding:
         wrong = "an object that was removed is still there"
     if wrong:
         fix = "name a store that keeps this: a local disk, Amazon, Google, Azure, SeaweedFS, Ceph, or a recent MinIO"
-        return bad(name, f"{opened.url}: {wrong}", fix)
+        return bad(f"{opened.url}: {wrong}", fix)
     line = (
         f"{opened.url} gives what it takes, lists, removes, and refuses a name that is taken ({1000 * seconds:.0f} ms)"
     )
     if opened.url.startswith("memory:"):
-        return warning(name, f"{opened.url} is gone with its process", "GRASPD_STORE_URL=file:///FOLDER or s3://BUCKET")
+        return warning(f"{opened.url} is gone with its process", "GRASPD_STORE_URL=file:///FOLDER or s3://BUCKET")
     if seconds > _SLOW_STORE_S:
-        return warning(name, f"{line}: that is slow", "put the store nearer, or look after the network")
-    return good(name, line)
+        return warning(f"{line}: that is slow", "put the store nearer, or look after the network")
+    return good(line)
 
 
 def _try(opened: Store, key: str) -> str:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Final
 
@@ -23,7 +23,6 @@ class Condition(StrEnum):
 
     GOOD = "good"
     WARNING = "warning"
-    """It works, at some cost."""
     BAD = "bad"
     """It does not work, or will lose data."""
     SKIPPED = "skipped"
@@ -32,13 +31,10 @@ class Condition(StrEnum):
 
 @dataclass(frozen=True)
 class Finding:
-    """Result of one check."""
-
-    name: str
     condition: Condition
     message: str
     fix: str = ""
-    """Fix for the user; "" if none is necessary."""
+    name: str = ""
 
     @property
     def ok(self) -> bool:
@@ -48,8 +44,6 @@ class Finding:
 
 @dataclass(frozen=True)
 class Check:
-    """A check with its timeout."""
-
     name: str
     look: Callable[[], Finding]
     limit_s: float = 60.0
@@ -75,31 +69,30 @@ class _Run:
 
     def finding(self, deadline: float) -> Finding:
         self._thread.join(max(0.0, deadline - time.monotonic()))
-        if self._finding is not None:
-            return self._finding
-        return bad(self.check.name, f"no answer within {self.check.limit_s:.0f} s", self.check.mend_hang)
+        hangs = bad(f"no answer within {self.check.limit_s:.0f} s", self.check.mend_hang)
+        return replace(self._finding or hangs, name=self.check.name)
 
     def _run(self) -> None:
         try:
             self._finding = self.check.look()
         except GraspdError as error:
-            self._finding = bad(self.check.name, str(error), "see the message")
+            self._finding = bad(str(error), "see the message")
         except Exception as error:
             line = " ".join(f"{type(error).__name__}: {error}".split())[:300]
-            self._finding = bad(self.check.name, f"the check itself broke off: {line}", "tell the authors of graspd")
+            self._finding = bad(f"the check itself broke off: {line}", "tell the authors of graspd")
 
 
-def good(name: str, message: str) -> Finding:
-    return Finding(name, Condition.GOOD, message)
+def good(message: str) -> Finding:
+    return Finding(Condition.GOOD, message)
 
 
-def warning(name: str, message: str, fix: str) -> Finding:
-    return Finding(name, Condition.WARNING, message, fix)
+def warning(message: str, fix: str) -> Finding:
+    return Finding(Condition.WARNING, message, fix)
 
 
-def bad(name: str, message: str, fix: str) -> Finding:
-    return Finding(name, Condition.BAD, message, fix)
+def bad(message: str, fix: str) -> Finding:
+    return Finding(Condition.BAD, message, fix)
 
 
-def skipped(name: str, why: str) -> Finding:
-    return Finding(name, Condition.SKIPPED, why)
+def skipped(why: str) -> Finding:
+    return Finding(Condition.SKIPPED, why)

@@ -9,12 +9,13 @@ from __future__ import annotations
 import json
 import secrets
 import socket
+import time
 import urllib.error
 import urllib.request
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import closing, suppress
-from datetime import UTC, datetime
+from datetime import datetime
 from typing import Any, Final
 
 from redis.exceptions import RedisError
@@ -42,33 +43,30 @@ _AWAY: Final = "Redis does not answer"
 
 def controller(settings: Settings) -> Finding:
     """Check for a recent heartbeat of a controller."""
-    name = "controller"
     if not is_there(settings):
-        return skipped(name, _IDLE)
+        return skipped(_IDLE)
     try:
         with closing(open_queue(settings, patience=0)) as queue:
             lives = queue.announced(PART)
     except QueueUnavailable:
-        return skipped(name, _AWAY)
+        return skipped(_AWAY)
     if not lives:
         return bad(
-            name,
             "no controller gave a sign of life: finished tasks are not taken up, and nothing is queued",
             "graspd controller",
         )
-    return good(name, "a controller lives")
+    return good("a controller lives")
 
 
 def workers(settings: Settings) -> Finding:
     """Check whether every stage has a healthy worker of this version."""
-    name = "workers"
     if not is_there(settings):
-        return skipped(name, _IDLE)
+        return skipped(_IDLE)
     try:
         with closing(open_queue(settings, patience=0)) as queue:
-            return _check_workers(name, queue.workers(), _waiting(queue))
+            return _check_workers(queue.workers(), _waiting(queue))
     except QueueUnavailable:
-        return skipped(name, _AWAY)
+        return skipped(_AWAY)
 
 
 def _waiting(queue: RqQueue) -> Counter[Stage]:
@@ -78,73 +76,61 @@ def _waiting(queue: RqQueue) -> Counter[Stage]:
     return +found
 
 
-def _check_workers(name: str, beats: list[WorkerBeat], waiting: Counter[Stage]) -> Finding:
+def _check_workers(beats: list[WorkerBeat], waiting: Counter[Stage]) -> Finding:
     if other := [beat for beat in beats if beat.version != PACKAGE_VERSION]:
         some = ", ".join(sorted({f"{beat.version} on {beat.host}" for beat in other})[:3])
         return bad(
-            name,
-            f"{len(other)} workers are of another version: {some}",
-            f"install graspd {PACKAGE_VERSION} there as well",
+            f"{len(other)} workers are of another version: {some}", f"install graspd {PACKAGE_VERSION} there as well"
         )
     if ill := [beat for beat in beats if beat.state == "quarantined"]:
         fix = f"on {ill[0].host}: graspd doctor --only gpu,kernels,disk"
-        return bad(name, f"{len(ill)} workers are in quarantine, {ill[0].name}: {ill[0].reason}", fix)
+        return bad(f"{len(ill)} workers are in quarantine, {ill[0].name}: {ill[0].reason}", fix)
     served = {stage for beat in beats for stage in beat.stages}
     if alone := sorted(stage.value for stage in waiting if stage not in served):
         tasks = sum(number for stage, number in waiting.items() if stage not in served)
         return bad(
-            name,
-            f"{tasks} tasks wait, and no worker takes {', '.join(alone)}",
-            f"graspd worker --stages {','.join(alone)}",
+            f"{tasks} tasks wait, and no worker takes {', '.join(alone)}", f"graspd worker --stages {','.join(alone)}"
         )
     if not beats:
-        return warning(name, "there is none; nothing waits for one", "graspd worker, or graspd up --workers 1")
+        return warning("there is none; nothing waits for one", "graspd worker, or graspd up --workers 1")
     states = Counter(beat.state for beat in beats)
     told = ", ".join(f"{number} {state}" for state, number in sorted(states.items()))
-    return good(name, f"{told}, on {len({beat.host for beat in beats})} machines; {sum(waiting.values())} tasks wait")
+    return good(f"{told}, on {len({beat.host for beat in beats})} machines; {sum(waiting.values())} tasks wait")
 
 
 def port(settings: Settings) -> Finding:
     """Check whether this service's API answers, or its port is free."""
-    name = "port"
     url = recorded_address(settings.data_dir)
     if url is None and "api_url" in settings.model_fields_set:
         url = settings.api_url
     if url is not None:
-        return _check_api(name, url)
+        return _check_api(url)
     where = f"{settings.host}:{settings.port}"
     if settings.port and (found := _readyz(f"http://{_reachable(settings.host)}:{settings.port}")) is not None:
         if found:
-            return _check_api(name, f"http://{_reachable(settings.host)}:{settings.port}")
-        return bad(
-            name, f"{where} is taken by something that is no graspd", "stop it, or set GRASPD_PORT (0: any free one)"
-        )
-    return _bind(name, settings, where)
+            return _check_api(f"http://{_reachable(settings.host)}:{settings.port}")
+        return bad(f"{where} is taken by something that is no graspd", "stop it, or set GRASPD_PORT (0: any free one)")
+    return _bind(settings, where)
 
 
-def _check_api(name: str, url: str) -> Finding:
+def _check_api(url: str) -> Finding:
     found = _readyz(url)
     if found is None:
         return bad(
-            name,
-            f"no API answers at {url}",
-            "start graspd up or graspd api there; see proxy, firewall and GRASPD_API_URL",
+            f"no API answers at {url}", "start graspd up or graspd api there; see proxy, firewall and GRASPD_API_URL"
         )
     if not found:
-        return bad(name, f"what answers at {url} is no graspd", "set GRASPD_API_URL to the address of the API")
+        return bad(f"what answers at {url} is no graspd", "set GRASPD_API_URL to the address of the API")
     if not found.get("ok"):
         away = [part for part, state in found["parts"].items() if not state.get("ok")]
-        return bad(name, f"the API at {url} is not ready: {', '.join(away)}", "see these parts above")
-    return good(name, f"the API at {url} is ready")
+        return bad(f"the API at {url} is not ready: {', '.join(away)}", "see these parts above")
+    return good(f"the API at {url} is ready")
 
 
 def _readyz(url: str) -> dict[str, Any] | None:
     """Return an API's answer; {} if it is not graspd's, None if there is no answer."""
-    opener = (
-        urllib.request.build_opener(urllib.request.ProxyHandler({}))
-        if "//127.0.0.1" in url
-        else urllib.request.build_opener()
-    )
+    own = [urllib.request.ProxyHandler({})] if "//127.0.0.1" in url else []
+    opener = urllib.request.build_opener(*own)
     try:
         with opener.open(f"{url.rstrip('/')}/readyz", timeout=_HTTP_S) as answer:
             body = answer.read(65536)
@@ -167,13 +153,13 @@ def _reachable(host: str) -> str:
     return {"0.0.0.0": "127.0.0.1", "::": "[::1]"}.get(host, host)
 
 
-def _bind(name: str, settings: Settings, where: str) -> Finding:
+def _bind(settings: Settings, where: str) -> Finding:
     try:
         with closing(socket.create_server((settings.host, settings.port))):
-            return good(name, f"{where} is free")
+            return good(f"{where} is free")
     except OSError as error:
         fix = "set GRASPD_HOST to an address of this machine, and GRASPD_PORT to a port above 1023"
-        return bad(name, f"{where} cannot be bound: {error.strerror or error}", fix)
+        return bad(f"{where} cannot be bound: {error.strerror or error}", fix)
 
 
 _OFF_S: Final = 2.0
@@ -183,35 +169,32 @@ _FIX: Final = "timedatectl set-ntp true, or chronyd, on the machine that is wron
 
 def clocks(settings: Settings) -> Finding:
     """Compare the clocks of the other machines with this one."""
-    name = "clocks"
     offsets = dict(_offsets(settings))
     if not offsets:
-        return skipped(name, "no clock but this machine's is within reach")
+        return skipped("no clock but this machine's is within reach")
     line = ", ".join(
         f"{who} {offset:+.1f} s" for who, offset in sorted(offsets.items(), key=lambda one: -abs(one[1]))[:5]
     )
     most = max(abs(offset) for offset in offsets.values())
     if most > _WRONG_S:
-        return bad(
-            name, f"clocks differ from this one: {line}; S3 refuses such requests, and keys expire wrongly", _FIX
-        )
+        return bad(f"clocks differ from this one: {line}; S3 refuses such requests, and keys expire wrongly", _FIX)
     if most > _OFF_S:
-        return warning(name, f"clocks differ from this one: {line}", _FIX)
-    return good(name, f"within {_OFF_S:.0f} s: {line}")
+        return warning(f"clocks differ from this one: {line}", _FIX)
+    return good(f"within {_OFF_S:.0f} s: {line}")
 
 
 def _offsets(settings: Settings) -> Iterator[tuple[str, float]]:
     """Yield name and clock offset to this machine [s]; other checks report missing parts."""
     if is_there(settings):
         with suppress(RedisError, OSError), redis_connection(settings) as client:
-            before = _now()
+            before = time.time()
             seconds, micros = client.time()
-            yield "Redis", seconds + micros / 1e6 - (before + _now()) / 2
+            yield "Redis", seconds + micros / 1e6 - (before + time.time()) / 2
         with suppress(GraspdError), closing(open_queue(settings, patience=0)) as queue:
             beats = queue.workers()
             # Any age up to the next due heartbeat is normal; only the excess is clock offset.
             due = 4 / 3 * settings.lease_s
-            ages = {beat.host: _now() - _seconds(beat.seen) for beat in beats}
+            ages = {beat.host: time.time() - _seconds(beat.seen) for beat in beats}
             yield from ((host, -age if age < 0 else min(0.0, due - age)) for host, age in ages.items())
     if settings.index_url is not None and make_url(settings.resolved_index_url).get_backend_name() == "postgresql":
         with suppress(SQLAlchemyError, GraspdError):
@@ -226,8 +209,9 @@ def _of_postgres(url: str | URL) -> float:
     engine = connect_postgres(url)
     try:
         with engine.connect() as connected:
-            before = _now()
-            return float(connected.scalar(text("SELECT extract(epoch FROM clock_timestamp())"))) - (before + _now()) / 2
+            before = time.time()
+            theirs = float(connected.scalar(text("SELECT extract(epoch FROM clock_timestamp())")))
+            return theirs - (before + time.time()) / 2
     finally:
         engine.dispose()
 
@@ -235,10 +219,10 @@ def _of_postgres(url: str | URL) -> float:
 def _of_store(settings: Settings) -> float:
     """Return the store's time of a new object; some stores have whole seconds only."""
     store, key = open_store(settings.resolved_store_url), f"health/clock-{secrets.token_hex(8)}"
-    before = _now()
+    before = time.time()
     try:
         store.put(key, b"1")
-        after = _now()
+        after = time.time()
         made = _seconds(store.stamp(key)[1])
     finally:
         store.delete(key)
@@ -247,7 +231,3 @@ def _of_store(settings: Settings) -> float:
 
 def _seconds(when: str) -> float:
     return datetime.fromisoformat(when).timestamp()
-
-
-def _now() -> float:
-    return datetime.now(UTC).timestamp()

@@ -58,50 +58,35 @@ _EXTRAS: Final = ("api", "worker", "embedded", "postgres", "otel", "usd", "arm",
 
 
 def local_store(settings: Settings) -> Path | None:
-    """Return the folder of a local store; None for a bucket."""
     return local_folder(settings.resolved_store_url)
 
 
 def disk(settings: Settings, *, usage: Callable[[Path], tuple[int, int, int]] = shutil.disk_usage) -> Finding:
-    """Check the disk space for data, results, caches and scratch files.
-
-    Args:
-        usage: returns total, used and free bytes of a folder's file system.
-    """
+    """Check the disk space for data, results, caches and scratch files."""
     found = []
-    for what, folder in _folders(settings):
+    for what, folder, variable in _folders(settings):
         there = existing(folder)
         free = usage(there)[2]
         facts = os.statvfs(there)
         if facts.f_files and facts.f_favail < _FEW_INODES:
-            return bad(
-                "disk", f"{what} ({folder}): only {facts.f_favail} more files fit", f"remove files below {there}"
-            )
-        found.append((free, what, folder))
-    free, what, folder = min(found, key=lambda one: one[0] // _GIB)
+            return bad(f"{what} ({folder}): only {facts.f_favail} more files fit", f"remove files below {there}")
+        found.append((free, what, folder, variable))
+    free, what, folder, variable = min(found, key=lambda one: one[0] // _GIB)
     line = f"{free / _GIB:.1f} GiB free for {what} ({folder})"
     if free < _DISK_BAD:
-        return bad("disk", f"only {line}", f"make room below {existing(folder)}, or move it: {_mover(what)}")
+        return bad(f"only {line}", f"make room below {existing(folder)}, or move it: {variable}")
     if free < _DISK_LOW:
-        return warning("disk", f"only {line}", f"make room soon, or move it: {_mover(what)}")
-    return good("disk", f"at least {line}")
+        return warning(f"only {line}", f"make room soon, or move it: {variable}")
+    return good(f"at least {line}")
 
 
-def _folders(settings: Settings) -> Iterable[tuple[str, Path]]:
-    yield "the data folder", settings.data_dir.resolve()
+def _folders(settings: Settings) -> Iterable[tuple[str, Path, str]]:
+    """Yield name and path of each folder, and the variable that moves it."""
+    yield "the data folder", settings.data_dir.resolve(), "GRASPD_DATA_DIR"
     if (store := local_store(settings)) is not None:
-        yield "the store", store
-    yield "caches", user_cache.folder("doctor").parent
-    yield "scratch files", Path(tempfile.gettempdir())
-
-
-def _mover(what: str) -> str:
-    return {
-        "the data folder": "GRASPD_DATA_DIR",
-        "the store": "GRASPD_STORE_URL",
-        "caches": "XDG_CACHE_HOME",
-        "scratch files": "TMPDIR",
-    }[what]
+        yield "the store", store, "GRASPD_STORE_URL"
+    yield "caches", user_cache.folder("doctor").parent, "XDG_CACHE_HOME"
+    yield "scratch files", Path(tempfile.gettempdir()), "TMPDIR"
 
 
 def existing(folder: Path) -> Path:
@@ -111,30 +96,27 @@ def existing(folder: Path) -> Path:
 
 def data_folder(settings: Settings, *, mounts: Path = Path("/proc/self/mounts")) -> Finding:
     """Check whether the data folder is writable, private to its user, and on a local disk."""
-    name, folder = "data-folder", settings.data_dir.resolve()
+    folder = settings.data_dir.resolve()
     there = existing(folder)
     if not os.access(there, os.W_OK | os.X_OK):
-        return bad(
-            name, f"{there} cannot be written by user {os.getuid()}", f"chown it, or set GRASPD_DATA_DIR: {folder}"
-        )
+        return bad(f"{there} cannot be written by user {os.getuid()}", f"chown it, or set GRASPD_DATA_DIR: {folder}")
     kept_here = [
         what for what, url in (("the index (SQLite)", settings.index_url), ("Redis", settings.redis_url)) if url is None
     ]
     kind = filesystem(there, mounts)
     if kind in _NETWORK and kept_here:
         return warning(
-            name,
             f"{folder} is on a network ({kind}), and {' and '.join(kept_here)} would be kept there: locks may fail",
             "set GRASPD_DATA_DIR to a disk of this machine and GRASPD_STORE_URL=file:///SHARED/FOLDER; or name a "
             "PostgreSQL and a Redis by GRASPD_INDEX_URL and GRASPD_REDIS_URL",
         )
     if there != folder:
-        return good(name, f"{folder} is made at the first start")
+        return good(f"{folder} is made at the first start")
     if stat.S_IMODE(folder.stat().st_mode) & 0o077:
         return warning(
-            name, f"others can read {folder}: it holds requests, results and hashes of keys", f"chmod 700 {folder}"
+            f"others can read {folder}: it holds requests, results and hashes of keys", f"chmod 700 {folder}"
         )
-    return good(name, f"{folder}, {kind or 'a file system of unknown kind'}, for its user alone")
+    return good(f"{folder}, {kind or 'a file system of unknown kind'}, for its user alone")
 
 
 def filesystem(folder: Path, mounts: Path = Path("/proc/self/mounts")) -> str:
@@ -153,31 +135,24 @@ def filesystem(folder: Path, mounts: Path = Path("/proc/self/mounts")) -> str:
 
 
 def versions(requirements: Iterable[str] | None = None) -> Finding:
-    """Check Python and library versions against the requirements of this graspd.
-
-    Args:
-        requirements: requirement strings of a package; by default those of the installed graspd.
-    """
-    name = "versions"
+    """Check Python and library versions against `requirements`, by default those of the installed graspd."""
     try:
         own = importlib.metadata.distribution("graspd")
     except importlib.metadata.PackageNotFoundError:
-        return bad(name, "graspd runs from a folder and is not installed", "pip install -e '.[all]' in that folder")
+        return bad("graspd runs from a folder and is not installed", "pip install -e '.[all]' in that folder")
     if own.version != PACKAGE_VERSION:
         fix = "install it again: pip install -e '.[all]', or the wheel"
-        return bad(name, f"the code is graspd {PACKAGE_VERSION}, its install says {own.version}", fix)
+        return bad(f"the code is graspd {PACKAGE_VERSION}, its install says {own.version}", fix)
     python = SpecifierSet(str(own.metadata["Requires-Python"]))
     if platform.python_version() not in python:
-        return bad(
-            name, f"Python {platform.python_version()} is none of {python}", "make an environment with Python 3.12"
-        )
+        return bad(f"Python {platform.python_version()} is none of {python}", "make an environment with Python 3.12")
     wrong = [
         line for text in (requirements if requirements is not None else own.requires or ()) if (line := _unmet(text))
     ]
     if wrong:
         needed = " ".join(f"'{line.partition(' (')[0]}'" for line in wrong)
-        return bad(name, f"libraries that do not fit: {'; '.join(wrong)}", f"pip install {needed}")
-    return good(name, f"graspd {PACKAGE_VERSION}, Python {platform.python_version()}, and libraries that fit")
+        return bad(f"libraries that do not fit: {'; '.join(wrong)}", f"pip install {needed}")
+    return good(f"graspd {PACKAGE_VERSION}, Python {platform.python_version()}, and libraries that fit")
 
 
 def _unmet(text: str) -> str:
@@ -197,20 +172,13 @@ def _unmet(text: str) -> str:
 
 
 def limits(*, files: int | None = None, memory: int | None = None) -> Finding:
-    """Report cores, memory and open files available to this process.
-
-    Args:
-        files, memory: replace the system's values.
-    """
-    name = "limits"
+    """Report cores, memory and open files available to this process."""
     files = resource.getrlimit(resource.RLIMIT_NOFILE)[0] if files is None else files
     files = 2**31 if files == resource.RLIM_INFINITY else files
     memory = available_memory() if memory is None else memory
     line = f"{available_cores()} cores, {memory / _GIB:.1f} GiB of memory, {files} open files"
     if memory < _MEMORY_LOW:
-        return warning(name, f"{line}: a worker takes up to 2 GiB", "give the container, job or machine more memory")
+        return warning(f"{line}: a worker takes up to 2 GiB", "give the container, job or machine more memory")
     if files < _FILES_LOW:
-        return warning(
-            name, f"{line}: streams and uploads take one each", "ulimit -n 4096, or LimitNOFILE=4096 of systemd"
-        )
-    return good(name, line)
+        return warning(f"{line}: streams and uploads take one each", "ulimit -n 4096, or LimitNOFILE=4096 of systemd")
+    return good(line)

@@ -23,12 +23,10 @@ from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.controller import Controller
 from graspd.service.run.commands import app
 from graspd.service.settings import Settings
-from graspd.service.store.library import stored_assets
 from graspd.service.store.records import add_job_event, read_record
-from graspd.service.store.store import open_store
 from tests.damage import overwrite
 from tests.fakes import add_assets, fail_task, make_shard, message_for, record_of, request
-from tests.indexes import empty_index
+from tests.indexes import empty_index, open_services
 from tests.memory_queue import MemoryQueue
 from tests.waiting import Clock
 
@@ -39,9 +37,7 @@ DAMAGED = b'{"x": 1}'
 @pytest.fixture
 def services(tmp_path: Path) -> Iterator[Services]:
     """A service on files with some jobs."""
-    settings = Settings(data_dir=tmp_path, retry_backoff_s=0.0)
-    index = empty_index(settings.resolved_index_url)
-    made = Services(settings, open_store(settings.resolved_store_url), index, MemoryQueue())
+    made = open_services(Settings(data_dir=tmp_path, retry_backoff_s=0.0))
     add_assets(made)
     for seed in range(GOOD):
         job_actions.submit(made, request(seed=seed))
@@ -68,12 +64,8 @@ def of_job(services: Services) -> str:
 
 
 def of_manifest(services: Services) -> str:
-    return names.shard_manifest(*made_one(services))
-
-
-def made_one(services: Services) -> tuple[object, str]:  # type: ignore[type-arg]
     made = make_shard(services.store, message_for(seed=99))
-    return made.stage, made.shard_id
+    return names.shard_manifest(made.stage, made.shard_id)
 
 
 def of_attempt(services: Services) -> str:
@@ -86,11 +78,11 @@ def of_event(services: Services) -> str:
 
 
 def of_asset(services: Services) -> str:
-    return names.asset_record(*next(a for a in stored_assets(services.store) if a[0] is AssetKind.OBJECT))
+    return names.asset_record(AssetKind.OBJECT, services.index.assets.get(AssetKind.OBJECT, "ball").digest)
 
 
 def of_check(services: Services) -> str:
-    return names.asset_check(*next(a for a in stored_assets(services.store) if a[0] is AssetKind.OBJECT))
+    return names.asset_check(AssetKind.OBJECT, services.index.assets.get(AssetKind.OBJECT, "ball").digest)
 
 
 def of_dataset(services: Services) -> str:
@@ -122,6 +114,14 @@ def test_a_damaged_record_is_left_out_of_a_lost_index_and_named(
     assert made is not None
     assert (made.left_out, made.names) == (1, (key,))
     fresh.index.close()
+
+
+def test_a_check_names_a_damaged_record_and_exits_with_1(services: Services) -> None:
+    rebuild(services.index, services.store)
+    key = of_job(services)
+    overwrite(services.store, key, DAMAGED)
+    told = CliRunner().invoke(app, ["index", "rebuild", "--check", "--data-dir", str(services.settings.data_dir)])
+    assert told.exit_code == 1 and key in told.output
 
 
 def test_a_record_that_was_mended_is_there_again(services: Services) -> None:
@@ -234,12 +234,3 @@ def test_a_controller_outlives_a_damaged_index(services: Services, harm: Callabl
             continue
     assert shown(services.index) == GOOD
     assert differences(services.index, services.store) == []
-
-
-def test_a_check_names_a_damaged_record_and_exits_with_1(services: Services) -> None:
-    rebuild(services.index, services.store)
-    key = of_job(services)
-    overwrite(services.store, key, DAMAGED)
-    told = CliRunner().invoke(app, ["index", "rebuild", "--check", "--data-dir", str(services.settings.data_dir)])
-    assert told.exit_code == 1
-    assert key in told.output

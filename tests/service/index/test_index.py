@@ -15,29 +15,26 @@ from typing import Any
 
 import pytest
 from pydantic import SecretStr
-from sqlalchemy import delete, update
+from sqlalchemy import delete, insert, update
 
 from graspd.service.index import tables
 from graspd.service.index.index import Index
 from graspd.service.index.queries.grasps import GraspFilter, GraspSort
 from graspd.service.index.rebuild import differences, rebuild
 from graspd.service.index.views import GraspView
-from graspd.service.model import names
 from graspd.service.model.clock import timestamp
 from graspd.service.model.errors import ConflictError, IndexUnavailable, InputError, NotFoundError, StoreUnavailable
-from graspd.service.model.messages import Origin
 from graspd.service.model.planning import OUTCOMES, RoundRobin, message_of, plan
-from graspd.service.model.records import JobRecord
 from graspd.service.model.states import AssetKind, Priority, Stage, State
 from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.backends import Services
 from graspd.service.settings import Settings
-from graspd.service.store.records import put_record
 from graspd.service.store.store import Store, open_store
 from tests.fakes import add_assets, fail_task, make_shard, make_task, record_of, request, with_settings
 from tests.indexes import empty_index
 from tests.memory_queue import MemoryQueue
 from tests.servers import PostgresServer
+from tests.service.index.test_projects import enter
 from tests.waiting import PATIENCE_S
 
 
@@ -230,8 +227,8 @@ def test_the_jobs_of_a_key_are_fed_in_turn_batch_by_batch(services: Services) ->
 
 def test_a_key_with_many_jobs_gets_no_more_turns(services: Services) -> None:
     for seed in range(5):
-        _submit_as(services, "greedy", seed)
-    _submit_as(services, "modest", 9)
+        enter(services, "", seed, key="greedy", batches=20)
+    enter(services, "", 9, key="modest", batches=20)
     turns = RoundRobin()
     owners: list[str] = []
     for limit in (1, 2, 3, 10, 4):  # room as it comes up, round by round
@@ -239,14 +236,6 @@ def test_a_key_with_many_jobs_gets_no_more_turns(services: Services) -> None:
         services.index.live.set_queued([task.task.id for task in ready])
         owners += [task.job.origin.key for task in ready if task.job.origin is not None]
     assert owners.count("greedy") == owners.count("modest") == 10
-
-
-def _submit_as(services: Services, key: str, seed: int) -> None:
-    """A bulk job of 20 batches, none of them in the queue yet."""
-    record = job_actions.prepare(services, request(grasps=640, seed=seed), priority=Priority.BULK)
-    record = record.model_copy(update={"origin": Origin(key=key)})
-    put_record(services.store, names.job_record(record.id), record)
-    services.index.write.add_job(record)
 
 
 def test_a_clock_set_back_does_not_strand_a_task(services: Services) -> None:
@@ -319,8 +308,11 @@ def test_every_kind_of_damage_to_the_index_is_seen_and_mended(services: Services
         connection.execute(delete(tables.grasps).where(tables.grasps.c.row == 0))
         connection.execute(update(tables.shards).values(seconds=99.0))
         connection.execute(update(tables.tasks).where(tables.tasks.c.done.is_(True)).values(state="failed"))
+        connection.execute(insert(tables.object_sets).values(name="x", digest="x", objects=[], created="x"))
     found = differences(services.index, services.store)
-    assert {line.split()[0] for line in found} >= {"grasps", "shards"}
+    assert {line.split()[0] for line in found} >= {"grasps", "shards", "object_sets"}
+    for words in ("not in the index", "not in the store", "the store says"):
+        assert any(words in line for line in found)
     rebuild(services.index, services.store)
     assert differences(services.index, services.store) == []
 
@@ -347,8 +339,6 @@ SEARCHED = [
     GraspFilter(hand="gripper", object="ball"),
     GraspFilter(hand="gripper", object="cube"),
 ]
-
-
 WAYS: list[tuple[int, tuple[int, ...]]] = [(1000, (8, 16)), (0, (8, 16)), (0, (1000,))]
 
 
@@ -409,7 +399,7 @@ def test_writers_at_once_leave_the_rows_of_the_store(services: Services, index_u
         thread.start()
     try:
         for message in messages:
-            services.index.write.add_manifest(make_shard(services.store, message))
+            services.index.write.add_manifests([make_shard(services.store, message)])
     finally:
         done.set()
         for thread in threads:
@@ -465,18 +455,9 @@ def processes(index_url: str, tmp_path: Path) -> Iterator[list[Services]]:
         yield made
 
 
-def enter(services: Services, place: int, seed: int, *, batches: int = 1) -> JobRecord:
-    """A job whose id begins with a digit."""
-    record = job_actions.prepare(services, request(grasps=32 * batches, seed=seed), priority=Priority.BULK)
-    record = record.model_copy(update={"id": f"{place:x}{seed:031x}"})
-    put_record(services.store, names.job_record(record.id), record)
-    services.index.write.add_job(record)
-    return record
-
-
 def test_controllers_at_once_leave_the_rows_of_the_store(processes: list[Services]) -> None:
     """Each indexes two jobs of eight; each job wants what a job of another wants as well."""
-    jobs = [enter(processes[0], 2 * place, place % 4, batches=2) for place in range(8)]
+    jobs = [enter(processes[0], "", place % 4, where=2 * place, batches=2) for place in range(8)]
     messages = {job.id: [message_of(job, task, attempt=1, max_attempt=3) for task in plan(job)] for job in jobs}
     made = {message.output: make_shard(processes[0].store, message) for job in jobs[:4] for message in messages[job.id]}
     begun = threading.Barrier(CONTROLLERS)

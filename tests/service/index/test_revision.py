@@ -90,7 +90,7 @@ def test_an_index_of_an_older_graspd_is_refused_or_emptied(url: str, engine: Eng
     engine.dispose()
     index = Index(url, anew=True)
     assert index.database.was == "0007"
-    assert not index.feed.has_jobs()
+    assert not index.jobs.page().items
     assert index.notes.completeness() is None, "the controller fills it if nobody else does"
     index.close()
     assert columns(engine) == wanted
@@ -106,7 +106,7 @@ def test_an_index_of_a_newer_graspd_is_refused_with_the_ways_out(url: str, engin
 def test_an_index_of_this_revision_keeps_its_rows_whoever_asks(url: str) -> None:
     index = Index(url, anew=True)
     assert index.database.was == ""
-    assert index.feed.has_jobs()
+    assert index.jobs.page().items
     index.close()
 
 

@@ -58,12 +58,11 @@ def test_a_histogram_counts_as_numpy_does(index: Index, values: np.ndarray) -> N
 
 
 def test_distributions_of_few_grasps_are_exact(index: Index, values: np.ndarray) -> None:
-    found = index.statistics.distributions(GraspFilter(valid=True), ("epsilon", "contact_area_cm2"), bins=BINS)
+    found = index.statistics.side_by_side([GraspFilter(valid=True)], ("epsilon", "contact_area_cm2"), bins=BINS)
     passed = values[::2]
-    counts, _ = np.histogram(passed, BINS)
-    assert (found.looked_at, found.share, set(found.metrics)) == (len(passed), 1.0, {"epsilon"})
-    assert found.metrics["epsilon"].counts == counts.tolist()
-    assert found.metrics["epsilon"].mean == pytest.approx(passed.mean())
+    ((one,),) = found.values()
+    assert one is not None and one.counts == np.histogram(passed, BINS)[0].tolist()
+    assert one.mean == pytest.approx(passed.mean())
 
 
 def test_distributions_of_many_grasps_come_from_a_fair_sample(index: Index) -> None:
@@ -74,11 +73,10 @@ def test_distributions_of_many_grasps_come_from_a_fair_sample(index: Index) -> N
             rows = [made | {"row": row, "epsilon": number / 400} for row in range(8)]
             connection.execute(insert(grasps), rows)
             connection.execute(insert(shards), _shard(shard, hand="a", object="b", count=8))
-    found = index.statistics.distributions(GraspFilter(hand="a", object="b"), ("epsilon",), at_most=800)
-    assert found.share == pytest.approx(0.25)
+    (found,) = index.statistics.side_by_side([GraspFilter(hand="a", object="b")], ("epsilon",), at_most=800)["epsilon"]
     # 100 shards are expected; the number drawn has a standard deviation of 9, their mean one of 0.03.
-    assert 60 * 8 < found.looked_at < 140 * 8
-    assert found.metrics["epsilon"].mean == pytest.approx(0.5, abs=0.12)
+    assert found is not None and 60 * 8 < found.count < 140 * 8
+    assert found.mean == pytest.approx(0.5, abs=0.12)
 
 
 def _shard(shard: str, **fields: object) -> dict[str, object]:

@@ -18,13 +18,13 @@ from graspd.service.model.states import AssetKind, Stage, State
 from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.controller import Controller
+from graspd.service.pipeline.job_actions import Routes
 from graspd.service.pipeline.lease_reaper import LOST_AFTER_S
-from graspd.service.pipeline.routes import Routes
 from graspd.service.queue.port import Event, EventKind
 from graspd.service.store.library import publish_asset, stored_assets
 from graspd.worker.process.runner import Runner
 from graspd.worker.stages.context import StopReason, TaskContext
-from tests.fakes import HAND_FILES, fake_stages, make_shard, request, with_settings
+from tests.fakes import HAND_FILES, fake_stages, request, with_settings
 from tests.indexes import empty_index
 from tests.memory_queue import Delivery, MemoryQueue
 from tests.waiting import Clock, until
@@ -161,16 +161,6 @@ def test_a_worker_that_was_only_slow_changes_nothing(bench: Bench) -> None:
     assert bench.services.index.overview.stats().grasps == 32
 
 
-def test_a_worker_lost_after_its_manifest_costs_no_attempt(bench: Bench) -> None:
-    job, _ = job_actions.submit(bench.services, request())
-    delivery = bench.take()
-    assert isinstance(delivery.message, TaskMessage)
-    make_shard(bench.services.store, delivery.message)
-    bench.pass_time(bench.services.settings.lease_s + 2)
-    assert bench.services.index.jobs.get(job.id).state is State.SUCCEEDED
-    assert bench.services.index.jobs.attempts(job=job.id) == []
-
-
 def test_a_task_that_kills_every_worker_stops_after_its_attempts(bench: Bench) -> None:
     job, _ = job_actions.submit(bench.services, request(scenes=1))
     for _ in range(bench.services.settings.task_attempts):
@@ -240,17 +230,15 @@ def test_while_the_store_is_away_what_does_not_need_it_is_known(bench: Bench, mo
     assert bench.services.index.jobs.attempts(job=job.id) == []
 
 
-def test_a_task_handed_back_at_shutdown_costs_no_attempt(bench: Bench) -> None:
+def test_a_task_handed_back_at_shutdown_is_queued_at_once(bench: Bench) -> None:
     def told_to_stop(message: TaskMessage, context: TaskContext) -> None:
         context.stop(StopReason.SHUTDOWN)
         context.check()
 
-    job, _ = job_actions.submit(bench.services, request())
+    job_actions.submit(bench.services, request())
     bench.do(bench.take(), synthesize=told_to_stop)
     bench.pass_time(1)
-    again = bench.take()
-    assert again.message.attempt == 1
-    assert bench.services.index.jobs.get(job.id).state is State.QUEUED
+    assert bench.take().message.attempt == 1
 
 
 def test_redis_lost_whole_loses_no_task(bench: Bench) -> None:
@@ -324,6 +312,19 @@ def test_a_check_queued_meanwhile_is_queued_once(bench: Bench, monkeypatch: pyte
     monkeypatch.setattr(MemoryQueue, "leases", lambda _: [])
     bench.controller._look_after_queue()
     assert bench.queue.waiting() == set(), "the worker's check waits a second time"
+
+
+def test_an_upload_is_checked_and_what_was_found_is_indexed(bench: Bench) -> None:
+    add_upload(bench)
+
+    def check(message: IngestMessage, context: TaskContext) -> None:
+        found = {"verdict": "repair", "message": "one hole closed", "repairs": ["hole"], "facts": {"faces": 12}}
+        context.store.put(names.asset_check(message.kind, message.digest), json.dumps(found).encode())
+
+    bench.work_off(ingest=check)
+    view = bench.services.index.assets.get(AssetKind.HAND, "upload")
+    assert (view.verdict, view.repairs, view.facts) == ("repair", ["hole"], {"faces": 12})
+    assert differences(bench.services.index, bench.services.store) == []
 
 
 def test_a_check_that_failed_is_told_and_tried_again(bench: Bench) -> None:
@@ -409,19 +410,6 @@ def test_the_window_is_refilled_as_it_empties(bench: Bench) -> None:
         bench.pass_time(1)
     assert deepest == 4
     assert bench.services.index.jobs.get(job.id).state is State.SUCCEEDED
-
-
-def test_an_upload_is_checked_and_what_was_found_is_indexed(bench: Bench) -> None:
-    add_upload(bench)
-
-    def check(message: IngestMessage, context: TaskContext) -> None:
-        found = {"verdict": "repair", "message": "one hole closed", "repairs": ["hole"], "facts": {"faces": 12}}
-        context.store.put(names.asset_check(message.kind, message.digest), json.dumps(found).encode())
-
-    bench.work_off(ingest=check)
-    view = bench.services.index.assets.get(AssetKind.HAND, "upload")
-    assert (view.verdict, view.repairs, view.facts) == ("repair", ["hole"], {"faces": 12})
-    assert differences(bench.services.index, bench.services.store) == []
 
 
 def test_an_upload_that_kills_every_worker_is_refused(bench: Bench) -> None:

@@ -148,8 +148,6 @@ def test_what_is_not_done_is_due_at_once(work: Callable[[], object]) -> None:
 
 
 WorkOff = Callable[[], list[tuple[str, int]]]
-
-
 LARGE = 32 * (2 * RANGES_AT_ONCE + 1)
 
 
@@ -159,30 +157,16 @@ def entered(services: Services) -> int:
 
 
 @pytest.fixture
-def now() -> list[float]:
-    """The time that the entering reads."""
-    return [0.0]
-
-
-@pytest.fixture
-def entering(services: Services, now: list[float]) -> Controller:
-    """One that leads already: the index is whole."""
-    made = Controller(services, clock=lambda: now[0])
-    made.round()
-    return made
-
-
-@pytest.fixture
-def work_off(services: Services, entering: Controller, now: list[float]) -> WorkOff:
+def work_off(services: Services, controller: Controller) -> WorkOff:
     """Enters all that is left, and gives the job and the number of rows of each turn."""
 
     def enter() -> list[tuple[str, int]]:
         turns = []
         while services.index.write.entering():
             before = entered(services)
-            now[0] += 10.0
-            entering.round()
-            turns.append((entering._entered, entered(services) - before))
+            controller._clock.now += 10.0
+            controller.round()
+            turns.append((controller._entered, entered(services) - before))
         return turns
 
     return enter

@@ -1,18 +1,25 @@
-"""Submit, cancel and retry."""
+"""Jobs of a user: submit, cancel and retry; those planned in scenes: what is refused, their stages, end and grasps."""
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 
+from graspd.service.index.queries.grasps import GraspFilter, GraspSort
 from graspd.service.index.rebuild import differences
+from graspd.service.index.views import AssetView
 from graspd.service.model import names
-from graspd.service.model.errors import ConflictError, InputError, NotFoundError, QueueUnavailable
-from graspd.service.model.states import AssetKind, Priority, State
+from graspd.service.model.errors import ConflictError, NotFoundError, QueueUnavailable, SceneError
+from graspd.service.model.planning import plan
+from graspd.service.model.records import JobRecord
+from graspd.service.model.states import AssetKind, Priority, Stage, State
 from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.backends import Services
-from graspd.service.store.library import publish_asset
+from graspd.service.pipeline.job_actions import check_scene
+from graspd.service.store.library import load_asset
 from graspd.service.store.records import job_events
-from tests.fakes import HAND_FILES, request, with_settings
+from tests.fakes import fail_task, make_task, record_of, request, with_settings
 from tests.memory_queue import MemoryQueue
 from tests.service.index.test_index import fail, run_all
 
@@ -20,14 +27,6 @@ from tests.service.index.test_index import fail, run_all
 def queue_of(services: Services) -> MemoryQueue:
     assert isinstance(services.queue, MemoryQueue)
     return services.queue
-
-
-def test_a_submitted_job_is_in_store_index_and_queue(services: Services) -> None:
-    job, new = job_actions.submit(services, request(grasps=64, scenes=1))
-    assert new
-    assert services.store.exists(names.job_record(job.id))
-    assert [stage.tasks for stage in job.stages] == [2, 2]
-    assert len(services.queue.waiting()) == 2, "only what may start"
 
 
 def test_the_same_request_is_the_same_job(services: Services) -> None:
@@ -44,22 +43,6 @@ def test_an_unknown_hand_or_object_leaves_nothing_behind(services: Services) -> 
         with pytest.raises(NotFoundError, match="unknown"):
             job_actions.submit(services, request(**changes))
     assert list(services.store.list(names.JOBS)) == []
-
-
-@pytest.mark.parametrize(
-    ("check", "error", "why"),
-    [
-        ({"verdict": "refuse", "message": "it has no joints"}, InputError, "it has no joints"),
-        (None, ConflictError, "still being checked"),
-    ],
-)
-def test_a_hand_that_was_not_found_good_cannot_be_used(
-    services: Services, check: dict[str, str] | None, error: type[Exception], why: str
-) -> None:
-    asset = publish_asset(services.store, AssetKind.HAND, "broken", HAND_FILES | {"extra": b"1"})
-    services.index.write.add_asset(asset, check)
-    with pytest.raises(error, match=why):
-        job_actions.submit(services, request(hand="broken"))
 
 
 def test_without_redis_nothing_is_recorded_of_a_submit(services: Services, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -123,3 +106,140 @@ def test_a_retried_job_gets_fresh_attempts(services: Services) -> None:
     assert delivery is not None
     assert (delivery.message.attempt, delivery.message.max_attempt) == (4, 6)
     assert len(services.index.jobs.attempts(job=job.id)) == 3, "the history stays"
+
+
+def submit(services: Services, **changes: object) -> JobRecord:
+    return record_of(services, job_actions.submit(services, request(**{"scene": "table", **changes}))[0].id)
+
+
+def make(services: Services, job: JobRecord, stage: Stage, batch: int = 0) -> None:
+    make_task(services, job, next(task for task in plan(job) if task.stage is stage and task.batch == batch))
+
+
+def fail_batch(services: Services, job: JobRecord, batch: int, kind: str, number: int = 1) -> None:
+    """The last attempt at a batch's grasps."""
+    task = next(task for task in plan(job) if task.stage is Stage.SYNTHESIZE and task.batch == batch)
+    fail_task(services, job.id, task, number, kind=kind, reason="none of 128 candidates is valid in its scene")
+
+
+def states(services: Services, job: JobRecord) -> dict[tuple[int, Stage], State]:
+    return {(task.batch, task.stage): task.state for task in services.index.jobs.tasks(job=job.id).items}
+
+
+def test_scenes_are_made_before_grasps_and_told_in_that_order(services: Services) -> None:
+    job = submit(services, grasps=64, views=1)
+    assert len(services.queue.waiting()) == 2, "the scenes of both batches"
+    told = services.index.jobs.get(job.id).stages
+    order = (Stage.SCENE, Stage.SYNTHESIZE, Stage.RENDER)
+    assert [(stage.stage, stage.tasks) for stage in told] == [(stage, 2) for stage in order]
+    make(services, job, Stage.SCENE)
+    ready = [(task.task.batch, task.task.stage) for task in services.index.feed.ready_of_job(job.id, limit=9)]
+    assert ready == [(0, Stage.SYNTHESIZE)], "the other batch's scenes are queued already"
+
+
+@pytest.mark.parametrize("kind", ["SceneError", "LoadError"])
+def test_a_job_ends_when_its_first_batch_finds_nothing(services: Services, kind: str) -> None:
+    job = submit(services, grasps=128)
+    for batch in range(2):
+        make(services, job, Stage.SCENE, batch)
+    make(services, job, Stage.SYNTHESIZE, 1)
+    fail_batch(services, job, 0, kind)
+    ended = services.index.jobs.get(job.id)
+    assert (ended.state, ended.reason) == (State.FAILED, "none of 128 candidates is valid in its scene")
+    found = states(services, job)
+    assert found[0, Stage.SYNTHESIZE] is State.FAILED
+    assert found[1, Stage.SYNTHESIZE] is State.SUCCEEDED, "what is made stays"
+    assert {found[batch, stage] for batch in (2, 3) for stage in (Stage.SCENE, Stage.SYNTHESIZE)} == {State.CANCELLED}
+    assert services.index.feed.ready_of_job(job.id, limit=9) == []
+
+
+def test_a_retry_takes_up_the_batches_that_were_not_made(services: Services) -> None:
+    job = submit(services, grasps=64)
+    make(services, job, Stage.SCENE)
+    fail_batch(services, job, 0, "SceneError")
+    job_actions.retry(services, job.id)
+    found = states(services, job)
+    assert {found[0, Stage.SYNTHESIZE], found[1, Stage.SCENE], found[1, Stage.SYNTHESIZE]} == {State.QUEUED}
+    fail_batch(services, job, 0, "SceneError", number=2)
+    assert states(services, job)[1, Stage.SCENE] is State.CANCELLED
+
+
+@pytest.mark.parametrize(("batch", "kind"), [(1, "SceneError"), (0, "WorkerLost")])
+def test_a_later_batch_or_another_fault_stops_no_other_batch(services: Services, batch: int, kind: str) -> None:
+    job = submit(services, grasps=96)
+    for one in range(2):
+        make(services, job, Stage.SCENE, one)
+    fail_batch(services, job, batch, kind)
+    found = states(services, job)
+    assert found[batch, Stage.SYNTHESIZE] is State.FAILED
+    assert found[1 - batch, Stage.SYNTHESIZE] is State.QUEUED
+    assert found[2, Stage.SCENE] is State.QUEUED
+    assert services.index.jobs.get(job.id).state is State.RUNNING
+
+
+def test_grasps_are_found_by_their_scene(services: Services) -> None:
+    free = record_of(services, job_actions.submit(services, request())[0].id)
+    make(services, free, Stage.SYNTHESIZE)
+    table, inside = submit(services), submit(services, scene="bin", seed=1)
+    for job in (table, inside):
+        make(services, job, Stage.SCENE)
+        make(services, job, Stage.SYNTHESIZE)
+
+    def count(**where: object) -> int:
+        return len(services.index.grasps.page(GraspFilter.model_validate(where), limit=200).items)
+
+    assert [count(scene=kind) for kind in ("free", "table", "bin", "shelf", "any", None)] == [32, 32, 32, 0, 64, 96]
+    held = count(scene="table", lift_hard=True)
+    assert held == count(scene="table", valid=True) > 0
+    assert count(lift_hard=True, scene="free") == 0
+    far = services.index.grasps.page(
+        GraspFilter(at_least={"clearance_m": 0.5}), sort=GraspSort(by="clearance_m"), limit=200
+    ).items
+    assert far and {grasp.scene_kind for grasp in far} == {"table", "bin"}
+    assert far[0].clearance_m == max(grasp.clearance_m for grasp in far)
+
+
+UPRIGHT = [1.0, 0, 0, 0]
+GROUND = {"kind": "half_space", "normal": [0, 0, 2], "offset": 0.2}
+SLOPE = {"kind": "box", "size": [0.2, 0.2, 0.2], "pose": [0.5, 0, 0, 0.8, 0, 0.6, 0]}
+
+
+def ball(centre: Any) -> AssetView:
+    what = {"kind": AssetKind.OBJECT, "name": "ball", "digest": "b" * 32, "filename": "ball.stl", "files": []}
+    found = {"verdict": "accept", "message": None, "repairs": [], "facts": {"centre_of_mass_m": centre}}
+    return AssetView(**what, **found, size_bytes=1, created="", builtin=False)
+
+
+@pytest.mark.parametrize(
+    ("supports", "target", "said"),
+    [
+        # The plane lies at 0.2 / |normal| = 0.1 m, the centre at 0.03.
+        ([GROUND], [0, 0, 0, *UPRIGHT], "support 0 of its scene: its centre lies 70 mm deep"),
+        ([GROUND], [0, 0, 0.0995, *UPRIGHT], None),
+        # The box's middle is 20 mm from the centre, whichever way the box is turned.
+        ([GROUND, SLOPE], [0.52, 0, 0.3, *UPRIGHT], None),
+        ([SLOPE], [0.5, 0, -0.03, *UPRIGHT], "support 0 of its scene: its centre lies 100 mm deep"),
+        # Turned upside down about x the centre hangs below the frame.
+        ([GROUND], [0, 0, 0.12, 0, 1, 0, 0], "support 0 of its scene: its centre lies 10 mm deep"),
+    ],
+)
+def test_a_target_whose_centre_lies_in_a_support_is_refused(supports: Any, target: Any, said: str | None) -> None:
+    wanted = request(scene={"supports": supports, "target": target})
+    if said is None:
+        check_scene(wanted, ball([0, 0, 0.03]))
+        return
+    with pytest.raises(SceneError, match=said):
+        check_scene(wanted, ball([0, 0, 0.03]))
+
+
+def test_where_the_centre_is_not_known_a_worker_tells() -> None:
+    check_scene(request(scene={"supports": [GROUND], "target": [0, 0, -1, *UPRIGHT]}), ball(None))
+
+
+def test_a_refused_scene_leaves_no_job_behind(services: Services) -> None:
+    asset = services.index.assets.get(AssetKind.OBJECT, "ball")
+    facts = {"verdict": "accept", "facts": {"centre_of_mass_m": [0.0, 0.0, 0.0]}}
+    services.index.write.add_asset(load_asset(services.store, AssetKind.OBJECT, asset.digest), facts)
+    with pytest.raises(SceneError, match="ball stands in support 0"):
+        job_actions.submit(services, request(scene={"supports": [GROUND], "target": [0, 0, 0, *UPRIGHT]}))
+    assert list(services.store.list(names.JOBS)) == []

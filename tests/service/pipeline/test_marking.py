@@ -1,28 +1,38 @@
-"""An index or a store that was exchanged for an older copy is not believed."""
+"""Store and index stay in step: an older copy of either is not believed, and what was answered 503 is in neither."""
 
 from __future__ import annotations
 
 import shutil
+import sqlite3
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
+from sqlalchemy import Connection, make_url
+from sqlalchemy.exc import OperationalError
 
+from graspd.service.index import database
 from graspd.service.index import rebuild as rebuilding
 from graspd.service.index.index import Index
 from graspd.service.index.notes import Notes
 from graspd.service.index.rebuild import differences
+from graspd.service.model import names
 from graspd.service.model.clock import timestamp
+from graspd.service.model.errors import IndexUnavailable
 from graspd.service.model.planning import message_of, plan
-from graspd.service.pipeline import controller, job_actions
+from graspd.service.model.states import AssetKind
+from graspd.service.pipeline import controller, job_actions, tagging
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.datasets import actions
+from graspd.service.pipeline.datasets.spec import DatasetRequest
+from graspd.service.pipeline.deletion import delete_asset, delete_job
 from graspd.service.queue.port import Event, EventKind
 from graspd.service.settings import Settings
-from graspd.service.store.store import open_store
-from tests.fakes import add_assets, make_shard, record_of, request
-from tests.memory_queue import MemoryQueue
+from tests.fakes import add_assets, make_shard, make_task, record_of, request
+from tests.indexes import open_services
 
 
 @pytest.fixture
@@ -40,10 +50,7 @@ def rebuilt(monkeypatch: pytest.MonkeyPatch) -> list[object]:
 
 def in_service(folder: Path, act: Callable[[Services], object] = lambda services: None) -> list[str]:
     """A controller starts, a user does something, the controller stops; how the index then differs from the store."""
-    settings = Settings(data_dir=folder)
-    store = open_store(settings.resolved_store_url)
-    services = Services(settings, store, Index(settings.resolved_index_url), MemoryQueue())
-    try:
+    with closing(open_services(Settings(data_dir=folder))) as services:
         working = controller.Controller(services)
         working.round()
         add_assets(services)
@@ -52,9 +59,7 @@ def in_service(folder: Path, act: Callable[[Services], object] = lambda services
         stop = threading.Event()
         stop.set()
         working.run(stop)
-        return [line for line in differences(services.index, store) if not line.startswith("assets ")]
-    finally:
-        services.close()
+        return [line for line in differences(services.index, services.store) if not line.startswith("assets ")]
 
 
 def submit(seed: int) -> Callable[[Services], object]:
@@ -135,9 +140,7 @@ def test_an_index_exchanged_meanwhile_is_made_anew(tmp_path: Path, rebuilt: list
     in_service(data, submit(1))
     copy_index(data, backup)
     in_service(data, submit(2))
-    settings = Settings(data_dir=data)
-    store = open_store(settings.resolved_store_url)
-    services = Services(settings, store, Index(settings.resolved_index_url), MemoryQueue())
+    services = open_services(Settings(data_dir=data))
     working = controller.Controller(services)
     working.round()
     for file in data.glob("index.sqlite*"):
@@ -163,3 +166,80 @@ def test_a_controller_killed_between_index_and_store_is_harmless(
         in_service(data, submit(2))
     assert in_service(data) == []
     assert rebuilt == []
+
+
+ALL = (names.JOBS, names.DATASETS, names.OBJECT_SETS, names.TAGS, names.DELETIONS)
+
+
+def finished(services: Services, **changes: object) -> str:
+    """A job that succeeded."""
+    job, _ = job_actions.submit(services, request(**changes))
+    for task in plan(record := record_of(services, job.id)):
+        make_task(services, record, task)
+    return job.id
+
+
+def create(services: Services) -> object:
+    return actions.create(services, DatasetRequest(name="d", hands=["gripper"], objects=["ball"], grasps=1))
+
+
+def cancelled(services: Services) -> str:
+    job, _ = job_actions.submit(services, request(seed=1))
+    job_actions.cancel(services, job.id)
+    return job.id
+
+
+NOBODYS: dict[str, Any] = {"project": "", "owner": "", "permit": lambda tag: None}
+#: What is there before, and what a user does then, given the id of that.
+ACTS: dict[str, tuple[Callable[[Services], str | object], Callable[[Services, str], object]]] = {
+    "submit": (lambda services: "", lambda services, _: job_actions.submit(services, request())),
+    "cancel": (lambda services: job_actions.submit(services, request())[0].id, job_actions.cancel),
+    "retry": (cancelled, job_actions.retry),
+    "delete a job": (finished, delete_job),
+    "delete an object": (lambda _: "ball", lambda services, name: delete_asset(services, AssetKind.OBJECT, name)),
+    "create": (lambda services: "", lambda services, _: create(services)),
+    "cancel a dataset": (create, lambda services, _: actions.cancel(services, "d")),
+    "name objects": (lambda services: "", lambda services, _: actions.add_object_set(services, "s", ["ball"])),
+    "tag": (lambda services: "", lambda services, _: tagging.give(services, "t", [("a" * 32, 0)], **NOBODYS)),
+}
+
+
+@contextmanager
+def locked(services: Services, monkeypatch: pytest.MonkeyPatch) -> Iterator[Services]:
+    """Another process holds the index."""
+    monkeypatch.setattr(database, "_BUSY_TIMEOUT_S", 0.05)
+    index = Index(services.settings.resolved_index_url)
+    with (
+        closing(index),
+        closing(sqlite3.connect(str(make_url(services.settings.resolved_index_url).database))) as other,
+    ):
+        other.execute("BEGIN IMMEDIATE")
+        yield Services(services.settings, services.store, index, services.queue)
+
+
+@contextmanager
+def full(services: Services, monkeypatch: pytest.MonkeyPatch) -> Iterator[Services]:
+    """No room on the disk when rows are to be kept."""
+
+    def refuse(self: Connection) -> None:
+        raise OperationalError("COMMIT", {}, Exception("database or disk is full"))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Connection, "commit", refuse)
+        yield services
+
+
+@pytest.mark.parametrize("away", [locked, full])
+@pytest.mark.parametrize("what", ACTS)
+def test_nothing_is_left_of_what_the_index_refused(
+    services: Services, monkeypatch: pytest.MonkeyPatch, what: str, away: Callable[..., Iterator[Services]]
+) -> None:
+    prepare, act = ACTS[what]
+    subject = str(prepare(services))
+    before = {entry.key for folder in ALL for entry in services.store.list(folder)}
+    with away(services, monkeypatch) as refusing, pytest.raises(IndexUnavailable):  # type: ignore[attr-defined]
+        act(refusing, subject)
+    assert {entry.key for folder in ALL for entry in services.store.list(folder)} == before
+    assert differences(services.index, services.store) == []
+    act(services, subject)
+    assert differences(services.index, services.store) == []

@@ -19,8 +19,8 @@ from graspd.service.model.messages import TaskMessage
 from graspd.service.model.series import SERIES, parse_field
 from graspd.service.model.states import Priority, Stage, State
 from graspd.service.pipeline.backends import Services
+from graspd.service.pipeline.indexer import MOST_KINDS, OTHER_KIND, Tally
 from graspd.service.pipeline.job_actions import submit
-from graspd.service.pipeline.metrics import MOST_KINDS, OTHER_KIND, Tally
 from graspd.service.queue.rq_queue import WORKERS, RqQueue, worker_key
 from tests.conftest import REPOSITORY
 from tests.fakes import beat_of, make_shard, message_for, request
@@ -39,9 +39,6 @@ class Sums:
             assert parsed is not None
             key = (parsed[0], *parsed[1])
             self.sums[key] = self.sums.get(key, 0.0) + amount
-
-    def counted(self) -> dict[str, float]:
-        return {}
 
 
 def tasks(count: int) -> list[TaskMessage]:
@@ -76,7 +73,7 @@ def test_damage_of_the_store_is_told(services: Services) -> None:
 def test_unfinished_jobs_and_the_latest_yield_are_told(services: Services) -> None:
     submit(services, request(grasps=32))
     manifest = make_shard(services.store, message_for())
-    services.index.write.add_manifest(manifest)
+    services.index.write.add_manifests([manifest])
     found = overview.read_index(services.index.database)
     assert found.jobs[State.QUEUED] == 1
     assert 0 <= found.oldest_s[State.QUEUED] < 60
@@ -108,16 +105,6 @@ def test_the_cost_of_a_look_does_not_grow_with_the_queue(rq_queue: RqQueue) -> N
     few = commands()
     rq_queue.enqueue(tasks(40), Priority.BULK)
     assert commands() == few
-
-
-def test_forged_entries_in_redis_do_not_break_the_metrics(rq_queue: RqQueue) -> None:
-    rq_queue.connection.rpush("rq:queue:bulk-scene", "forged")
-    rq_queue.connection.sadd(WORKERS, "forged")
-    rq_queue.connection.set(worker_key("forged"), b"\xff{")
-    found = rq_queue.now(lease_s=6)
-    assert found.depth[Priority.BULK, Stage.SCENE] == 1
-    assert (Priority.BULK, Stage.SCENE) not in found.oldest_s
-    assert not found.workers
 
 
 def test_sums_outlive_the_process_that_counts(rq_queue: RqQueue) -> None:

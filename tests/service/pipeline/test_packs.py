@@ -26,14 +26,13 @@ from graspd.service.store.records import put_record
 from tests.damage import flipped, overwrite
 from tests.fakes import record_of, request
 from tests.packs import pack, tasks_of
-from tests.service.pipeline.on_store import parts_on
 from tests.service.pipeline.test_controller import Bench
-from tests.service.pipeline.test_integrity import findings, work_off
+from tests.service.pipeline.test_integrity import findings, service_on, work_off
 
 
 @pytest.fixture
-def services(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Services]:
-    yield from parts_on("files", request, tmp_path)
+def services(tmp_path: Path) -> Iterator[Services]:
+    yield from service_on(tmp_path, (tmp_path / "store").as_uri())
 
 
 def submit(services: Services, batches: int) -> tuple[str, list[Any]]:

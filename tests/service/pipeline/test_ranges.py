@@ -1,9 +1,10 @@
-"""How many batches a task has: by what was measured, by who is there, and never more than a fair share."""
+"""How many batches a task has, by what was measured and who is there, and which workers it waits for."""
 
 from __future__ import annotations
 
+import json
 import math
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import pytest
@@ -13,23 +14,121 @@ from pydantic import ValidationError
 
 from graspd.service.index.changes.records import Changes
 from graspd.service.index.rebuild import differences
-from graspd.service.model.planning import message_of, plan
+from graspd.service.model.domain import JobRequest
+from graspd.service.model.planning import message_of, needed_schema, plan
 from graspd.service.model.records import JobRecord
 from graspd.service.model.states import AssetKind, Priority, Stage, State
 from graspd.service.model.version import SCHEMA_OF_RANGES, STAGE_REVISIONS, TASK_SCHEMA
-from graspd.service.model.workers import WorkerBeat
+from graspd.service.model.workers import FIRST_SCHEMA, Requirements, WorkerBeat, own_ability
 from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.datasets import actions
 from graspd.service.pipeline.datasets.spec import DatasetRequest
+from graspd.service.pipeline.job_actions import Route, Routes
 from graspd.service.pipeline.ranges import TaskRanges, span_of
-from graspd.service.settings import Settings
+from graspd.service.queue import entries
+from graspd.service.queue.lists import known_lists, queue_name, queue_names
+from graspd.service.queue.rq_queue import RqQueue
 from graspd.service.store.library import publish_asset
 from graspd.service.store.manifests import ShardManifest, publish_shard
 from graspd.worker.stages.context import TaskContext, shard_of
-from tests.fakes import OBJECT_FILES, beat_of, fake_stages, request, with_settings
+from tests.fakes import OBJECT_FILES, beat_of, fake_stages, message_for, request, with_settings
 from tests.planning import plan_all
 from tests.service.pipeline.test_controller import Bench
+
+OWN = own_ability()
+REVISION = OWN.revisions["synthesize"]
+NEED = Requirements(Stage.SYNTHESIZE, OWN.schemas[0], OWN.schemas[1], REVISION)
+
+
+def beat(
+    *, schemas: tuple[int, int] = OWN.schemas, revision: int = REVISION, stage: Stage = Stage.SYNTHESIZE
+) -> WorkerBeat:
+    return beat_of(stages=(stage,), schemas=schemas, revisions={**OWN.revisions, "synthesize": revision})
+
+
+NEXT = beat(revision=REVISION + 1)
+
+
+@pytest.mark.parametrize(
+    ("present", "need", "place"),
+    [
+        ([], NEED, Route()),
+        ([beat()], NEED, Route()),
+        ([beat(), beat(stage=Stage.SCENE, revision=1)], NEED, Route()),
+        ([beat(), NEXT], NEED, Route(apart=True)),
+        ([beat(), beat(schemas=(9, 9))], NEED, Route(apart=True)),
+        ([beat(schemas=(2, 9)), beat(schemas=(2, 2))], replace(NEED, schema=3, newest=9), Route(apart=True)),
+        ([beat(schemas=(4, 9))], replace(NEED, schema=2, newest=5), Route()),
+    ],
+)
+def test_a_task_goes_where_those_look_who_can_do_it(
+    present: list[WorkerBeat], need: Requirements, place: Route
+) -> None:
+    assert Routes(present).place(need) == place
+
+
+@pytest.mark.parametrize(
+    ("present", "need", "why"),
+    [
+        ([NEXT], NEED, f"revision {REVISION} of synthesize is needed, and revision {REVISION + 1} is made"),
+        ([], replace(NEED, revision=1), "revision 1 of synthesize is needed"),
+        ([beat(schemas=(2, 2))], replace(NEED, schema=3, newest=3), "schema 3 of tasks is needed, and 2 is the newest"),
+        ([beat(schemas=(5, 6))], replace(NEED, newest=4), "schema 4 of tasks is the newest it may have"),
+    ],
+)
+def test_what_nobody_can_do_is_held_back_with_the_reason(
+    present: list[WorkerBeat], need: Requirements, why: str
+) -> None:
+    assert why in Routes(present).place(need).held
+
+
+def test_a_task_asks_for_the_schema_of_its_newest_field() -> None:
+    since = {"friction": 3, "touch": 4}
+    assert needed_schema(request(), since) == OWN.schemas[0]
+    assert needed_schema(request(friction=0.5), since) == 3
+    assert needed_schema(request(friction=0.5, fidelity="draft"), {**since, "fidelity": 4}) == 4
+    assert isinstance(request(), JobRequest)
+
+
+def test_a_worker_that_does_not_say_what_it_can_is_given_no_task() -> None:
+    now = beat()
+    told = asdict(now)
+    assert entries.read(WorkerBeat, json.dumps(told).encode()) == now
+    for name in ("schemas", "revisions"):
+        del told[name]
+    old = entries.read(WorkerBeat, json.dumps(told).encode())
+    assert old is not None and Routes([old]).place(NEED).held
+
+
+def test_a_worker_looks_apart_only_for_what_it_can_do() -> None:
+    names = queue_names([Stage.SYNTHESIZE], ability=OWN)
+    apart = [f"interactive-synthesize.{schema}.{REVISION}" for schema in range(FIRST_SCHEMA, OWN.schemas[1] + 1)]
+    assert names[: len(apart) + 1] == [*apart, "interactive-synthesize"]
+
+
+def test_tasks_that_wait_apart_are_seen_and_leave(rq_queue: RqQueue) -> None:
+    message = message_for()
+    name = f"rq:queue:{queue_name(Priority.BULK, Stage.SYNTHESIZE, NEED)}"
+    assert rq_queue.enqueue([message], Priority.BULK, apart=True) == 1
+    assert rq_queue.connection.llen(name) == 1
+    assert rq_queue.waiting() == {message.task_id}
+    assert rq_queue.depths()[Priority.BULK, Stage.SYNTHESIZE] == 1
+    assert rq_queue.now(lease_s=6).depth[Priority.BULK, Stage.SYNTHESIZE] == 1
+    rq_queue.clear_untaken([beat(), NEXT])
+    assert rq_queue.waiting() == {message.task_id}
+    rq_queue.clear_untaken([NEXT])
+    assert rq_queue.waiting() == set()
+    assert known_lists(rq_queue.connection) == known_lists(rq_queue.connection)[:8]
+    assert rq_queue.enqueue([message], Priority.BULK) == 1, "nothing of it is left"
+
+
+def test_forged_names_of_lists_are_nobodys(rq_queue: RqQueue) -> None:
+    forged = [f"rq:queue:bulk-synthesize.{n}.1" for n in range(200)]
+    rq_queue.connection.sadd("rq:queues", "rq:queue:other.2.10", "rq:queue:bulk-synthesize.x.1", b"\xff", *forged)
+    assert len(known_lists(rq_queue.connection)) == 8 + 64
+    rq_queue.connection.set("rq:queues", "no set")
+    assert len(known_lists(rq_queue.connection)) == 8
 
 
 @pytest.fixture
@@ -54,7 +153,7 @@ def measured(services: Services, seconds: float) -> None:
     made = fake_stages()[Stage.SYNTHESIZE](message, TaskContext(services.store))
     manifest, data = shard_of(message, made, device="cpu", seconds=seconds, worker="w")
     publish_shard(services.store, manifest, data)
-    services.index.write.add_manifest(manifest)
+    services.index.write.add_manifests([manifest])
 
 
 def span(services: Services, grasps: int, priority: Priority = Priority.BULK, **changes: object) -> int:
@@ -79,18 +178,6 @@ def test_a_task_of_a_larger_job_lasts_as_the_settings_say(services: Services) ->
     assert 20 <= span(services, 32 * 1000) <= 40
     measured(services, 60.0)
     assert span(services, 32 * 1000) == 1
-
-
-def test_a_job_of_ten_thousand_grasps_makes_few_objects(services: Services) -> None:
-    here(services, worker())
-
-    def objects(services: Services) -> int:
-        return 2 * len(list(plan(job_actions.prepare(services, request(grasps=10_000), priority=Priority.BULK))))
-
-    assert objects(replace(services, settings=Settings(data_dir=services.settings.data_dir))) == 80, "on two cores"
-    measured(services, 0.1)
-    assert objects(services) <= 12
-    assert objects(with_settings(services, task_s=0.0)) == 626
 
 
 def test_workers_share_a_job_fairly(services: Services) -> None:

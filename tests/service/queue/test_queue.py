@@ -14,7 +14,7 @@ from rq.serializers import JSONSerializer
 from graspd.service.model.clock import timestamp
 from graspd.service.model.messages import IngestMessage, TaskMessage
 from graspd.service.model.states import Priority, Stage
-from graspd.service.queue.lists import queue_names
+from graspd.service.queue.lists import held_key, list_key, queue_name, queue_names
 from graspd.service.queue.port import BULK_EVERY, Event, EventKind
 from graspd.service.queue.rq_queue import LEAD, RqQueue, lease_state, list_worker, renew_lease, worker_key
 from graspd.worker.process.heartbeat import Heartbeat
@@ -376,3 +376,40 @@ def test_a_forged_worker_is_left_out_and_hides_no_other(rq_queue: RqQueue, data:
     rq_queue.connection.sadd("graspd:workers", "forged")
     rq_queue.connection.set(worker_key("forged"), data)
     assert [beat.name for beat in rq_queue.workers()] == ["true"]
+
+
+BULK = queue_name(Priority.BULK, Stage.SYNTHESIZE)
+
+
+def cost_of_a_sweep(queue: RqQueue) -> int:
+    """Commands that Redis does for it."""
+    before = queue.connection.info("stats")["total_commands_processed"]
+    queue.leases()
+    return int(queue.connection.info("stats")["total_commands_processed"] - before)
+
+
+def test_all_leases_are_read_in_one_round_trip(rq_queue: RqQueue) -> None:
+    rq_queue.connection.zadd(held_key(BULK), {"a-1:x": 1.0})
+    few = cost_of_a_sweep(rq_queue)
+    rq_queue.connection.zadd(held_key(BULK), {f"{number}-1:x": 1.0 for number in range(500)})
+    assert len(rq_queue.leases()) == 501
+    assert cost_of_a_sweep(rq_queue) == few
+
+
+def test_tasks_are_added_together_and_none_twice(rq_queue: RqQueue) -> None:
+    tasks = [task(f"{number:032x}") for number in range(700)]
+    assert rq_queue.enqueue(tasks[:10], Priority.BULK) == 10
+    assert rq_queue.enqueue(tasks, Priority.BULK) == 690
+    assert rq_queue.waiting() == {task.task_id for task in tasks}
+    assert sum(rq_queue.depths().values()) == 700
+    rq_queue.connection.delete(list_key(BULK))
+    assert rq_queue.enqueue(tasks, Priority.BULK) == 0, "what the queue knows is not added again"
+    assert rq_queue.enqueue(tasks, Priority.BULK, again=True) == 700
+
+
+def test_unreadable_events_stay_nobodys_work(rq_queue: RqQueue) -> None:
+    rq_queue.connection.xadd("graspd:events", {"e": "rubbish"})
+    rq_queue.publish(Event(kind=EventKind.STARTED, at=timestamp(), task_id="a"))
+    ((event_id, _),) = rq_queue.consume(limit=9, wait_s=0)
+    rq_queue.acknowledge([event_id])
+    assert rq_queue.connection.xpending("graspd:events", "keeper")["pending"] == 0

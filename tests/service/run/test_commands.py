@@ -1,4 +1,4 @@
-"""The commands of the service: exit codes, one-line errors, JSON."""
+"""The commands of the service: exit codes, one-line errors, JSON, private data, settings of the children."""
 
 from __future__ import annotations
 
@@ -6,14 +6,16 @@ import json
 import os
 import signal
 import socket
+import stat
 import subprocess
 import sys
 import threading
 from pathlib import Path
+from typing import Any
 
 import pytest
 import typer
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, Field, SecretStr
 from typer.testing import CliRunner
 
 from graspd import cli as program
@@ -22,11 +24,11 @@ from graspd.service.model.errors import InputError, StoreUnavailable, Unavailabl
 from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.backends import Services
 from graspd.service.run.commands import app
-from graspd.service.run.supervisor import _SETTLED, Supervisor
+from graspd.service.run.supervisor import _SETTLED, Supervisor, _stated
 from graspd.service.settings import Settings
 from graspd.service.store.store import open_store
+from tests.conftest import REPOSITORY
 from tests.fakes import request
-from tests.service.index.test_index import run_all
 
 runner = CliRunner()
 
@@ -97,17 +99,6 @@ def on_disk(services: Services) -> Services:
     return Services(services.settings, store, services.index, services.queue)
 
 
-def test_a_rebuild_of_a_sound_index_finds_no_difference(services: Services) -> None:
-    services = on_disk(services)
-    job, _ = job_actions.submit(services, request())
-    run_all(services, job.id)
-    shown = runner.invoke(app, ["index", "rebuild", "--data-dir", str(services.settings.data_dir), "--json"])
-    assert shown.exit_code == 0, shown.output
-    told = json.loads(shown.stdout.splitlines()[-1])
-    assert (told["differences"], told["changed"]) == ([], False)
-    assert (told["jobs"], told["shards"]) == (1, 1)
-
-
 @pytest.mark.parametrize("command", [["store", "verify"], ["index", "rebuild", "--check"], ["index", "rebuild"]])
 def test_what_reads_a_store_makes_none_where_there_is_none(tmp_path: Path, command: list[str]) -> None:
     shown = runner.invoke(program.build(), ["admin", *command, "--data-dir", str(tmp_path / "mistyped")])
@@ -128,7 +119,11 @@ def test_a_check_tells_differences_and_changes_nothing(services: Services) -> No
         shown = runner.invoke(app, damaged)
         assert shown.exit_code == 1
         assert "not in the index" in shown.output
-    assert runner.invoke(app, damaged[:2] + damaged[3:]).exit_code == 0
+    rebuild = [*damaged[:2], "--json", *damaged[3:]]
+    assert [json.loads(runner.invoke(app, rebuild).stdout.splitlines()[-1])["changed"] for _ in range(2)] == [
+        True,
+        False,
+    ]
     assert runner.invoke(app, damaged).exit_code == 0
 
 
@@ -188,7 +183,84 @@ def test_the_controller_ends_well_on_sigterm(tmp_path: Path) -> None:
         assert controller.wait(timeout=60) == 0
 
 
-def test_the_children_of_up_get_every_setting() -> None:
-    """A setting given in Python or on the command line must not stop at the parent."""
-    settled_by_up = {"data_dir", "redis_url", "host", "port", "api_url"}
-    assert set(_SETTLED) <= settled_by_up
+@pytest.mark.parametrize("was_open", [True, False])
+def test_a_service_keeps_its_data_from_other_users(tmp_path: Path, was_open: bool) -> None:
+    folder = tmp_path / "data"
+    if was_open:
+        folder.mkdir()
+        folder.chmod(0o755)
+    environment = os.environ | {"GRASPD_DATA_DIR": str(folder), "GRASPD_REDIS_URL": f"unix://{tmp_path}/none.sock"}
+    program = (
+        "from graspd.service.cli import keep_private, load_settings\n"
+        "from graspd.service.pipeline.backends import Services\n"
+        "settings = load_settings()\n"
+        "keep_private(settings)\n"
+        "services = Services.open(settings)\n"
+        "services.store.put('jobs/a/job.json', b'1')\n"
+        "services.close()\n"
+    )
+    subprocess.run([sys.executable, "-c", program], env=environment, check=True, timeout=120, umask=0o022)
+    modes = {path: stat.S_IMODE(path.stat().st_mode) for path in (folder, *folder.rglob("*"))}
+    assert {path: oct(mode) for path, mode in modes.items() if mode & 0o077} == {}
+    assert modes[folder] == 0o700
+
+
+@pytest.mark.parametrize("room", ["api/server_command.py", "service/run/commands.py", "graspd/commands/worker.py"])
+def test_every_service_command_is_private(room: str) -> None:
+    text = (REPOSITORY / room).read_text()
+    assert text.count('log_to_stderr(settings, "') == text.count("keep_private(settings)") > 0
+
+
+#: Values of each setting that its default is none of; texts hold what shells, JSON and URLs give a meaning.
+_ODD = "a b\"c'd%20#e?f,ü{}"
+_TEXTS = ("store_url", "store_public_endpoint", "proxy_addresses", "webhook_networks", "controller_name", "device")
+_SECRETS = ("index_url", "api_key", "proxy_secret", "webhook_secret")
+_PATHS = ("keys_file", "kernels", "heartbeat_file")
+VALUES: dict[str, Any] = {
+    **dict.fromkeys(_TEXTS, _ODD),
+    **dict.fromkeys(_SECRETS, SecretStr(f"{_ODD} and at least sixteen")),
+    **{name: Path(f"/srv/{_ODD}/{name}") for name in _PATHS},
+    "proxy_groups": {'lab, the "first"': "vision:submit", "ü": ":admin", "*": ":read"},
+    "metrics_need_key": False,
+    "log_level": "DEBUG",
+    "log_format": "json",
+    "prefilter": "off",
+    "join": "4",
+    "worker_number": 0,
+    "api_root_path": "/graspd",
+    "lease_s": 4 / 3,
+    "quota_jobs_per_day": 7,
+}
+
+
+def value_of(name: str) -> Any:
+    if name in VALUES:
+        return VALUES[name]
+    default = Settings.model_fields[name].default
+    assert isinstance(default, int | float), f"the test has no value for {name}"
+    return default + 1
+
+
+def test_only_what_up_settles_itself_does_not_reach_the_children() -> None:
+    assert set(_SETTLED) <= {"data_dir", "redis_url", "host", "port", "api_url"}
+
+
+@pytest.mark.parametrize("name", sorted(Settings.model_fields.keys() - _SETTLED))
+def test_a_setting_reaches_the_children(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    given = Settings(**{name: value_of(name)})
+    for variable, text in _stated(given).items():
+        monkeypatch.setenv(variable, text)
+    assert getattr(Settings(), name) == getattr(given, name)
+
+
+@pytest.mark.parametrize(
+    "name", [name for name, field in Settings.model_fields.items() if field.default is None and name not in _SETTLED]
+)
+def test_a_setting_taken_back_does_not_come_from_the_environment(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    value = value_of(name)
+    monkeypatch.setenv(
+        f"GRASPD_{name.upper()}", value.get_secret_value() if isinstance(value, SecretStr) else str(value)
+    )
+    for variable, text in _stated(Settings(**{name: None})).items():
+        monkeypatch.setenv(variable, text)
+    assert getattr(Settings(), name) is None

@@ -159,7 +159,7 @@ def _finish(services: Services, record: JobRecord, change: Change) -> None:
         message = message_of(record, task, attempt=1, max_attempt=3)
         manifest, data = shard_of(message, output, device="cpu", seconds=SECONDS[task.stage], worker="w1")
         publish_shard(services.store, manifest, data)
-        services.index.write.add_manifest(manifest)
+        services.index.write.add_manifests([manifest])
 
 
 def _base(rng: np.random.Generator, joints: tuple[str, ...], count: int, batch: int) -> dict[str, Array]:

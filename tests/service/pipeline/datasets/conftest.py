@@ -12,8 +12,7 @@ from graspd.service.pipeline.backends import Services
 from graspd.service.settings import Settings
 from graspd.service.store.store import open_store
 from tests.fakes import add_assets
-from tests.indexes import empty_index
-from tests.memory_queue import MemoryQueue
+from tests.indexes import open_services
 from tests.service.pipeline.datasets.makers import add_asset
 
 
@@ -31,7 +30,7 @@ def services(tmp_path: Path) -> Iterator[Services]:
 
 def _service(folder: Path, url: str) -> Iterator[Services]:
     settings = Settings(data_dir=folder, retry_backoff_s=0.0, task_s=0.0, index_url=SecretStr(url))
-    made = Services(settings, open_store("memory://"), empty_index(url), MemoryQueue())
+    made = open_services(settings, open_store("memory://"))
     add_assets(made)
     for kind, name in (("hand", "claw"), ("object", "cube"), ("object", "cone")):
         add_asset(made, kind, name)

@@ -9,9 +9,11 @@ from graspd.service.model import names
 from graspd.service.model.planning import plan
 from graspd.service.model.states import AssetKind, Stage
 from graspd.service.pipeline.backends import Services
+from graspd.service.pipeline.datasets import actions
 from graspd.service.pipeline.datasets.spec import DatasetRequest
 from graspd.service.store.library import publish_asset
 from tests.fakes import fail_task, make_task, record_of
+from tests.planning import plan_all
 
 
 def add_asset(services: Services, kind: str, name: str, *, content: str = "", verdict: str | None = "accept") -> str:
@@ -38,6 +40,14 @@ def finish(services: Services, job: str, *, batches: int | None = None, lost: di
             make_task(services, record, task, **({"outcomes": lost} if lost else {}))
 
 
+def done(services: Services, name: str = "grasps", **changes: Any) -> None:
+    """A dataset whose tasks are all done."""
+    actions.create(services, wanted(name, **changes))
+    plan_all(services)
+    for job in jobs_of(services, name):
+        finish(services, job)
+
+
 def fail(services: Services, job: str, reason: str = "it broke") -> None:
     """The first task of each batch of a job, failed for the last time."""
     for task in plan(record_of(services, job)):
@@ -46,5 +56,4 @@ def fail(services: Services, job: str, reason: str = "it broke") -> None:
 
 
 def jobs_of(services: Services, name: str) -> list[str]:
-    """Jobs of a dataset's cells, in their order."""
     return [cell.job_id for cell in services.index.datasets.cells(name, limit=200).items]

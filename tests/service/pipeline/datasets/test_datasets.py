@@ -1,18 +1,19 @@
-"""A dataset from its creation to its end and its export; and that the store tells it all."""
+"""A dataset from its creation to its end and its export; its options; and that the store tells it all."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import h5py
 import pytest
 
 from graspd.service.index.rebuild import differences, rebuild
-from graspd.service.model import names
+from graspd.service.model import digests, names
 from graspd.service.model.domain import JobRequest
 from graspd.service.model.errors import (
     ConflictError,
@@ -23,20 +24,24 @@ from graspd.service.model.errors import (
     StoreUnavailable,
 )
 from graspd.service.model.planning import OUTCOMES
-from graspd.service.model.records import Snapshot, SnapshotShard
+from graspd.service.model.records import DatasetRecord, Snapshot, SnapshotShard, request_of
+from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.model.states import AssetKind, Priority, State
+from graspd.service.model.studies import IN_SCENE
 from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.datasets import actions
 from graspd.service.pipeline.datasets.cost import estimate
-from graspd.service.pipeline.datasets.export import export_shards, path_of
+from graspd.service.pipeline.datasets.export import Fetch, export_shards, path_of
 from graspd.service.pipeline.datasets.rounds import DatasetRounds
-from graspd.service.store.records import job_events
+from graspd.service.pipeline.datasets.spec import DatasetRequest
+from graspd.service.pipeline.fidelity_choice import Resolver
+from graspd.service.store.records import charts_of, job_events, load_dataset, publish
 from graspd.service.store.store import open_store
 from tests.dataset_status import status
-from tests.fakes import with_settings
+from tests.fakes import record_of
 from tests.planning import plan_all
-from tests.service.pipeline.datasets.makers import add_asset, fail, finish, jobs_of, wanted
+from tests.service.pipeline.datasets.makers import add_asset, done, fail, finish, jobs_of, wanted
 
 
 def test_a_dataset_has_a_job_for_each_hand_and_object(either: Services) -> None:
@@ -163,6 +168,14 @@ def test_a_dataset_that_found_fewer_grasps_tells_the_outcomes(either: Services) 
     assert "3 slipped;" in reasons[0] and f"2 {OUTCOMES['turned']}, 1 slipped;" in reasons[1]
 
 
+def test_datasets_come_newest_first_in_pages(services: Services) -> None:
+    for name in ("a", "b", "c"):
+        actions.create(services, wanted(name))
+    first = services.index.datasets.page(limit=2)
+    rest = services.index.datasets.page(limit=2, cursor=first.next)
+    assert sorted(view.name for view in first.items + rest.items) == ["a", "b", "c"] and rest.next is None
+
+
 def test_cells_come_in_pages_and_by_state(either: Services) -> None:
     actions.create(either, wanted(objects=("ball", "cube", "cone")))
     plan_all(either)
@@ -171,14 +184,6 @@ def test_cells_come_in_pages_and_by_state(either: Services) -> None:
     first = either.index.datasets.cells("grasps", state=State.SUCCEEDED, limit=2)
     rest = either.index.datasets.cells("grasps", state=State.SUCCEEDED, limit=2, cursor=first.next)
     assert [cell.position for cell in first.items + rest.items] == [1, 2, 3] and rest.next is None
-
-
-def test_datasets_come_newest_first_in_pages(services: Services) -> None:
-    for name in ("a", "b", "c"):
-        actions.create(services, wanted(name))
-    first = services.index.datasets.page(limit=2)
-    rest = services.index.datasets.page(limit=2, cursor=first.next)
-    assert sorted(view.name for view in first.items + rest.items) == ["a", "b", "c"] and rest.next is None
 
 
 def test_cancel_stops_what_is_planned_and_what_is_not(services: Services) -> None:
@@ -242,22 +247,11 @@ def test_an_event_reaches_a_job_once(services: Services) -> None:
     assert [event.what for event in job_events(services.store, jobs_of(services, "grasps")[1])] == ["cancelled"]
 
 
-def test_a_large_dataset_leaves_the_queue_to_others(services: Services) -> None:
-    services = with_settings(services, queue_window=10)
-    actions.create(services, wanted(grasps=320))
-    plan_all(services)
-    assert len(services.queue.waiting()) == 10
-    assert services.queue.depths()[(Priority.INTERACTIVE, "synthesize")] == 0
-    assert services.index.datasets.get("grasps").tasks == 40
-
-
 def test_the_store_alone_tells_everything(either: Services) -> None:
     actions.add_object_set(either, "round", ["ball", "cone"])
-    actions.create(either, wanted("a"))
+    done(either, "a")
     actions.create(either, wanted("b", objects=(), sets=("round",)))
     plan_all(either)
-    for job in jobs_of(either, "a"):
-        finish(either, job)
     actions.snapshot(either, "a")
     actions.cancel(either, "b")
     plan_all(either)
@@ -271,12 +265,9 @@ def test_the_store_alone_tells_everything(either: Services) -> None:
 
 def test_a_difference_between_index_and_store_is_found(services: Services) -> None:
     actions.create(services, wanted())
-    services.index.write_dataset.set_events("grasps", [])
     actions.add_dataset_event(services.store, "grasps", "cancelled")
-    assert differences(services.index, services.store) == [
-        "datasets grasps: cancelled is False, the store says True",
-        "datasets grasps: events is 0, the store says 1",
-    ]
+    found = differences(services.index, services.store)
+    assert found[0] == "datasets grasps: cancelled is False, the store says True" and len(found) == 2
 
 
 def test_a_set_of_objects_is_spelled_out_at_creation(services: Services) -> None:
@@ -318,30 +309,17 @@ def test_the_same_shards_are_the_same_snapshot(services: Services) -> None:
 
 @pytest.fixture
 def snapshot(services: Services) -> Snapshot:
-    actions.create(services, wanted(scenes=1))
-    plan_all(services)
-    for job in jobs_of(services, "grasps"):
-        finish(services, job)
+    done(services, scenes=1)
     return actions.snapshot(services, "grasps")[0]
 
 
-class Source:
-    """The store as a source of shards, which counts what it gives and can break off."""
-
-    def __init__(self, services: Services, *, breaks_at: int = -1) -> None:
-        self._services = services
-        self._breaks_at = breaks_at
-        self.given = 0
-
-    def __call__(self, shard: SnapshotShard) -> Iterator[bytes]:
-        if self.given == self._breaks_at:
-            raise StoreUnavailable("away")
-        self.given += 1
-        yield from self._services.store.stream(shard.key)
+@pytest.fixture
+def source(services: Services) -> Fetch:
+    return lambda shard: services.store.stream(shard.key)
 
 
-def test_every_file_is_there_with_its_checksum(services: Services, snapshot: Snapshot, tmp_path: Path) -> None:
-    assert export_shards(snapshot, tmp_path / "out", Source(services)) == 8
+def test_every_file_is_there_with_its_checksum(source: Fetch, snapshot: Snapshot, tmp_path: Path) -> None:
+    assert export_shards(snapshot, tmp_path / "out", source) == 8
     check = subprocess.run(["sha256sum", "-c", "--quiet", "SHA256SUMS"], cwd=tmp_path / "out", check=False)
     assert check.returncode == 0
     assert Snapshot.model_validate_json((tmp_path / "out" / "snapshot.json").read_text()) == snapshot
@@ -349,30 +327,142 @@ def test_every_file_is_there_with_its_checksum(services: Services, snapshot: Sna
         assert file.attrs["hand"] == "claw" and len(file["grasp/hand_pose"]) == 32
 
 
-def test_an_export_that_broke_off_is_gone_on_with(services: Services, snapshot: Snapshot, tmp_path: Path) -> None:
+def test_an_export_that_broke_off_is_gone_on_with(source: Fetch, snapshot: Snapshot, tmp_path: Path) -> None:
+    def breaks_off(shard: SnapshotShard) -> Iterable[bytes]:
+        if shard == snapshot.shards[5]:
+            raise StoreUnavailable("away")
+        return source(shard)
+
     with pytest.raises(StoreUnavailable):
-        export_shards(snapshot, tmp_path / "out", Source(services, breaks_at=5))
+        export_shards(snapshot, tmp_path / "out", breaks_off)
     assert not (tmp_path / "out" / "snapshot.json").exists() and not list(tmp_path.rglob("*.part"))
-    assert export_shards(snapshot, tmp_path / "out", Source(services)) == 3
+    assert export_shards(snapshot, tmp_path / "out", source) == 3
 
 
-def test_a_file_that_was_changed_is_fetched_again(services: Services, snapshot: Snapshot, tmp_path: Path) -> None:
-    export_shards(snapshot, tmp_path, Source(services))
+def test_a_file_that_was_changed_is_fetched_again(source: Fetch, snapshot: Snapshot, tmp_path: Path) -> None:
+    export_shards(snapshot, tmp_path, source)
     spoilt = tmp_path / path_of(snapshot.shards[0])
     spoilt.write_bytes(b"x" * snapshot.shards[0].size_bytes)
-    assert export_shards(snapshot, tmp_path, Source(services)) == 1
+    assert export_shards(snapshot, tmp_path, source) == 1
     assert hashlib.sha256(spoilt.read_bytes()).hexdigest() == snapshot.shards[0].sha256
 
 
-def test_a_wrong_checksum_leaves_no_file(services: Services, snapshot: Snapshot, tmp_path: Path) -> None:
+def test_a_wrong_checksum_leaves_no_file(snapshot: Snapshot, tmp_path: Path) -> None:
     with pytest.raises(DamagedShard, match=snapshot.shards[0].id):
         export_shards(snapshot, tmp_path / "out", lambda shard: [b"something else"])
     assert [path for path in (tmp_path / "out").rglob("*") if path.is_file()] == []
 
 
-def test_a_folder_that_cannot_be_made_is_the_callers_mistake(
-    services: Services, snapshot: Snapshot, tmp_path: Path
-) -> None:
+def test_a_folder_that_cannot_be_made_is_the_callers_mistake(source: Fetch, snapshot: Snapshot, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="cannot be made"):
-        export_shards(snapshot, tmp_path / "file" / "out", Source(services))
+        export_shards(snapshot, tmp_path / "file" / "out", source)
+
+
+ANNEALED = {"method": "graspit", "options": {"keep": 20, "steps": 40000}}
+AUTO = {"fidelity": "auto", "target": "gsr>=0.6"}
+
+
+def run_of(fidelity: str, speed: float, reached: float, hand: str, object_: str, way: str = "") -> dict[str, Any]:
+    what = {"method": "fast_graspd", "fidelity": fidelity, "hand": hand, "object": object_}
+    if way:
+        return what | {"way": way, "end_to_end_per_second": speed, "lift": reached}
+    return what | {"valid_per_second": speed, "gsr": reached, "epsilon": 0.3, "pd_mm": 0.1}
+
+
+def chart(created: str = "2026-11-21T10:00:00.000Z", *, claw: str = "fine") -> dict[str, Any]:
+    """The gripper needs standard on all but the cube, the claw a fidelity of one's choice on all."""
+    runs = [run_of("draft", 40, 0.3, "gripper", "ball"), run_of("standard", 15, 0.8, "gripper", "ball")]
+    runs += [run_of("draft", 40, 0.9, "gripper", "cube"), run_of(claw, 6, 0.7, "claw", "elsewhere")]
+    return {"created": created, "runs": runs}
+
+
+#: Of each cell, by that chart.
+CHOSEN = ["standard", "draft", "fine", "fine"]
+
+
+def requests_of(services: Services, name: str = "grasps") -> list[JobRequest]:
+    plan_all(services)
+    return [record_of(services, job).request for job in jobs_of(services, name)]
+
+
+def test_a_cell_without_options_is_the_job_it_always_was(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The id was computed by graspd 0.1.0 before datasets had options."""
+    monkeypatch.setattr(digests, "STAGE_REVISIONS", {"synthesize": 1})
+    given = {"name": "x", "hands": ["allegro"], "objects": ["mug"], "grasps": 64, "scenes": 2}
+    request = request_of(DatasetRequest.model_validate(given).shared, "allegro", "mug")
+    assert digests.job_id(request, "0" * 32, "1" * 32) == "3451e42bdce0eab4549fc73883b4bbbd"
+
+
+def test_options_of_the_method_are_those_of_each_cells_job(either: Services) -> None:
+    actions.create(either, wanted(**ANNEALED))
+    assert [(r.method, r.options) for r in requests_of(either)] == 4 * [("graspit", {"keep": 20, "steps": 40000})]
+    with pytest.raises(ConflictError, match="its options is"):
+        actions.create(either, wanted(**ANNEALED | {"options": {"keep": 5}}))
+
+
+def test_with_auto_each_cell_gets_what_the_chart_promises_for_it(either: Services) -> None:
+    publish(either.store, "charts", chart())
+    actions.create(either, wanted(**AUTO))
+    assert [(r.fidelity, r.target) for r in requests_of(either)] == [(fidelity, "") for fidelity in CHOSEN]
+    assert [cell.fidelity for cell in either.index.datasets.cells("grasps").items] == CHOSEN
+    assert either.index.datasets.get("grasps").options.target == "gsr>=0.6"
+    rebuild(either.index, either.store)
+    assert [cell.fidelity for cell in either.index.datasets.cells("grasps").items] == CHOSEN
+
+
+def test_a_later_chart_changes_nothing_of_a_dataset(services: Services) -> None:
+    publish(services.store, "charts", chart())
+    actions.create(services, wanted(**AUTO))
+    before = jobs_of(services, "grasps")
+    actions.create(services, wanted("named", fidelity="fine"))
+    assert before[2:] == jobs_of(services, "named")[2:], "each is the job of that fidelity"
+    publish(services.store, "charts", chart("2026-11-21T11:00:00.000Z", claw="draft"))
+    _, new = actions.create(services, wanted(**AUTO))
+    assert not new and jobs_of(services, "grasps") == before
+    publish(services.store, "charts", {"created": "2026-11-21T12:00:00.000Z", "runs": []})
+    assert actions.create(services, wanted(**AUTO))[1] is False
+
+
+def test_a_target_out_of_reach_on_one_cell_makes_no_dataset(services: Services) -> None:
+    publish(services.store, "charts", chart())
+    with pytest.raises(InputError, match=r"no fidelity of fast_graspd meets gsr>=0\.75"):
+        actions.create(services, wanted(**AUTO | {"target": "gsr>=0.75"}))
+    assert not services.store.exists(names.dataset_record("grasps"))
+
+
+def test_the_cost_of_auto_is_that_of_the_chosen_fidelities(services: Services) -> None:
+    publish(services.store, "charts", chart())
+    both = estimate(services.index, wanted(hands=("gripper",), **AUTO), Resolver(services.store))
+    apart = [
+        estimate(services.index, wanted(hands=("gripper",), objects=(obj,), fidelity=fidelity))
+        for obj, fidelity in (("ball", "standard"), ("cube", "draft"))
+    ]
+    assert both.seconds == pytest.approx(sum(one.seconds for one in apart))
+
+
+def test_a_record_from_before_has_neither_and_is_read(services: Services) -> None:
+    actions.create(services, wanted())
+    stored = json.loads(services.store.get(names.dataset_record("grasps")))
+    stored["options"] = {k: v for k, v in stored["options"].items() if k not in ("options", "target")}
+    del stored["fidelities"]
+    assert DatasetRecord.model_validate(stored) == load_dataset(services.store, "grasps")
+
+
+def test_each_cell_in_scenes_says_how_its_fidelity_was_chosen(either: Services) -> None:
+    runs = [run_of("draft", 20, lift, "gripper", obj, IN_SCENE) for obj, lift in (("ball", 0.8), ("cube", 0.92))]
+    runs += [run_of("standard", 15, lift, "gripper", obj, IN_SCENE) for obj, lift in (("ball", 0.95), ("cube", 0.99))]
+    place = SceneSpec(kind="table")
+    created = {"created": "2026-11-21T10:00:00.000Z", "scene": place.model_dump(mode="json")}
+    key = publish(either.store, charts_of(place), created | {"runs": runs})
+    actions.create(either, wanted(fidelity="auto", target="lift>=0.9", scene="table"))
+    rebuild(either.index, either.store)
+    cells = either.index.datasets.cells("grasps").items
+    assert [cell.fidelity for cell in cells] == ["standard", "draft", "standard", "standard"]
+    assert [(c.choice.measured_on, c.choice.reached, c.choice.chart) for c in cells if c.choice] == [
+        (on, reached, key)
+        for on, reached in [("hand and object", 0.95), ("hand and object", 0.92), ("all", 0.97), ("all", 0.97)]
+    ]
+    plan_all(either)
+    assert [record_of(either, job).choice for job in jobs_of(either, "grasps")] == [cell.choice for cell in cells]
+    assert len(load_dataset(either.store, "grasps").choices) == 3

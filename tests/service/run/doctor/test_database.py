@@ -22,7 +22,7 @@ from graspd.service.run.doctor.checks import Condition, Finding
 from graspd.service.settings import Settings
 from graspd.service.store.store import open_store
 from tests.fakes import add_assets, request
-from tests.indexes import empty_index
+from tests.indexes import open_services
 from tests.memory_queue import MemoryQueue
 from tests.servers import PostgresServer, free_ports
 from tests.service.index.test_index import fail, run_all
@@ -33,14 +33,12 @@ Look = Callable[[], Finding]
 @pytest.fixture
 def kept(tmp_path: Path) -> Iterator[Services]:
     """A data folder with a job of two batches, done."""
-    settings = Settings(data_dir=tmp_path)
-    index = empty_index(settings.resolved_index_url)
-    services = Services(settings, open_store(settings.resolved_store_url), index, MemoryQueue())
+    services = open_services(Settings(data_dir=tmp_path))
     add_assets(services)
     run_all(services, job_actions.submit(services, request(grasps=64))[0].id)
-    index.notes.set_complete()
+    services.index.notes.set_complete()
     yield services
-    index.close()
+    services.close()
 
 
 @pytest.fixture(params=["whole", "sample"])
@@ -85,8 +83,7 @@ def test_a_manifest_or_row_that_is_gone_or_differs_is_bad(
     shard = shard_of(kept).stem
     harm(kept)
     found = look()
-    assert not found.ok
-    assert shard in found.message and words in found.message
+    assert not found.ok and shard in found.message and words in found.message
     assert "index rebuild" in found.fix
 
 
@@ -103,8 +100,7 @@ def test_known_damage_is_told_with_its_mend(kept: Services) -> None:
     assert backends.store_damage(kept.settings).condition is Condition.GOOD
     kept.index.damage.mark([Damage("shards/base/x.h5", "has another checksum", "x")])
     found = backends.store_damage(kept.settings)
-    assert not found.ok
-    assert "shards/base/x.h5" in found.message
+    assert not found.ok and "shards/base/x.h5" in found.message
     assert found.fix == "graspd admin store verify --repair"
 
 
@@ -122,8 +118,7 @@ def test_a_damaged_file_is_bad_and_left_where_it_is(kept: Services) -> None:
         beside.unlink()
     file.write_bytes(b"no database" * 1000)
     found = backends.index(kept.settings)
-    assert not found.ok
-    assert "graspd admin index rebuild" in found.fix
+    assert not found.ok and "graspd admin index rebuild" in found.fix
     assert backends.index_is_store(kept.settings).condition is Condition.SKIPPED
     assert file.read_bytes() == b"no database" * 1000
 
@@ -158,8 +153,7 @@ def test_a_postgresql_that_is_away_or_refuses_is_bad(tmp_path: Path, postgres_se
     stranger = f"postgresql+psycopg://graspd:hidden@127.0.0.1:{postgres_server.port}/postgres"
     for url in (away, stranger):
         found = backends.index(Settings(data_dir=tmp_path, index_url=url))
-        assert not found.ok
-        assert "GRASPD_INDEX_URL" in found.fix
+        assert not found.ok and "GRASPD_INDEX_URL" in found.fix
         assert "hidden" not in str(found)
 
 
@@ -173,8 +167,7 @@ def test_an_index_in_postgresql_is_compared_too(kept: Services, postgres_server:
     fail(Services(settings, open_store("memory://"), index, MemoryQueue()), job, 0, 1, last=False)
     index.close()
     found = backends.index_is_store(settings, settles_s=0.0)
-    assert not found.ok
-    assert "attempts" in found.message
+    assert not found.ok and "attempts" in found.message
 
 
 def test_the_kinds_of_shards_are_all_sampled() -> None:

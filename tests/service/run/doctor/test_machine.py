@@ -99,7 +99,7 @@ def test_findings_come_in_order_and_one_that_hangs_is_bad() -> None:
 
     def hang() -> Finding:
         hold.wait(30)
-        return good("hangs", "late")
+        return good("late")
 
     def break_off() -> Finding:
         raise ZeroDivisionError("by nothing")
@@ -111,7 +111,7 @@ def test_findings_come_in_order_and_one_that_hangs_is_bad() -> None:
         Check("hangs", hang, limit_s=0.05, mend_hang="restart it"),
         Check("breaks", break_off),
         Check("away", away),
-        Check("good", lambda: good("good", "fine")),
+        Check("good", lambda: good("fine")),
     ]
     try:
         found = list(run_checks(checks))
@@ -148,13 +148,12 @@ def test_a_wrong_secret_is_bad_and_the_mend_names_the_variables(
 ) -> None:
     monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "of-somebody-else")
     found = store(Settings(data_dir=tmp_path, store_url=s3_url))
-    assert not found.ok
-    assert "AWS_SECRET_ACCESS_KEY" in found.fix
+    assert not found.ok and "AWS_SECRET_ACCESS_KEY" in found.fix
     assert "of-somebody-else" not in str(found)
 
 
 def test_a_store_in_memory_is_gone_with_its_process() -> None:
-    assert check_store("store", open_store("memory://")).condition is Condition.WARNING
+    assert check_store(open_store("memory://")).condition is Condition.WARNING
 
 
 class Overwriting(Store):
@@ -184,6 +183,5 @@ class Keeping(Store):
     ("kind", "word"), [(Overwriting, "overwritten"), (Deaf, "not in the list"), (Keeping, "still there")]
 )
 def test_a_store_that_breaks_a_promise_is_bad(kind: type[Store], word: str) -> None:
-    found = check_store("store", kind(MemoryStore(), "fake://"))
-    assert not found.ok
-    assert word in found.message
+    found = check_store(kind(MemoryStore(), "fake://"))
+    assert not found.ok and word in found.message
