@@ -186,7 +186,6 @@ class DeviceObstacles:
             features.axis = wp.array(found.axis, dtype=wp.vec3)
             features.radius = wp.array(found.radius, dtype=wp.float32)
             features.margin = wp.array(kept, dtype=wp.float32)
-            features.weight = wp.ones(len(found), dtype=wp.float32)
             features.tip = wp.array(np.isin(found.body, hand.fingertips), dtype=wp.int32)
             features.first = wp.array(found.first, dtype=wp.int32)
             balls = [_feature_ball(found, k) for k in range(len(found.first) - 1)]

@@ -110,7 +110,7 @@ class Projection:
         out.add(
             kernels.keep_best,
             d.capacity,
-            inputs=[d.depths.points, d.depths.object, d.depths.links, d.depths.obstacles, wp.float64(BETTER_M), now],
+            inputs=[*d.depths.kinds, wp.float64(BETTER_M), now],
             outputs=[d.active, self.residuals.count, best, self._depth],
         )
         return out
@@ -131,74 +131,26 @@ class Projection:
         return HandState(pivot, to_wxyz(rotation), q)
 
     def _add_equations(self, out: Launches) -> None:
-        m, d, o, r = self.model, self.data, self.options, self.residuals
-        c, pose = d.contacts, [d.body_p, d.body_q]
-        out.add(
-            kernels.point_residuals,
-            (d.capacity, m.lanes),
-            inputs=[
-                m.lane,
-                d.active,
-                c.count,
-                c.body,
-                c.point,
-                c.normal,
-                c.distance,
-                o.near,
-                o.target,
-                o.hold,
-                o.hold_target,
-                o.hold_weight,
-            ],
-            outputs=[r],
-        )
-        out.add(
-            kernels.sample_residuals,
-            (d.capacity, m.pieces),
-            inputs=[m.hand.pieces, m.obj.sorted_samples, d.active, *pose, o.sample_near, o.target],
-            outputs=[r],
-        )
-        out.add(
-            kernels.self_residuals,
-            (d.capacity, m.pieces),
-            inputs=[m.hand.pieces, m.body_points, d.active, *pose, o.self_near, o.self_target],
-            outputs=[r],
-        )
-        if m.obstacles is not None:
-            out.add(
-                obstacles.residuals,
-                (d.capacity, m.pieces),
-                inputs=[
-                    m.obstacles.features,
-                    m.obstacles.solids,
-                    d.active,
-                    d.scene,
-                    *pose,
-                    o.obstacle_near,
-                    o.obstacle_target,
-                ],
-                outputs=[r],
-            )
-        if m.obstacles is not None and m.obstacles.any_solid:
-            out.add(
-                solids.residuals,
-                (d.capacity, m.pieces),
-                inputs=[
-                    m.obstacles.features,
-                    m.hand.pieces,
-                    m.obstacles.solids,
-                    d.active,
-                    d.scene,
-                    *pose,
-                    o.obstacle_near,
-                    o.obstacle_target,
-                ],
-                outputs=[r],
-            )
+        m, d, o, outputs = self.model, self.data, self.options, [self.residuals]
+        c, pose = d.contacts, [d.active, *d.bodies]
+        points = [c.count, c.body, c.point, c.normal, c.distance]
+        inputs = [m.lane, d.active, *points, o.near, o.target, o.hold, o.hold_target, o.hold_weight]
+        out.add(kernels.point_residuals, (d.capacity, m.lanes), inputs=inputs, outputs=outputs)
+        over = (d.capacity, m.pieces)
+        inputs = [m.hand.pieces, m.obj.sorted_samples, *pose, o.sample_near, o.target]
+        out.add(kernels.sample_residuals, over, inputs=inputs, outputs=outputs)
+        inputs = [m.hand.pieces, m.body_points, *pose, o.self_near, o.self_target]
+        out.add(kernels.self_residuals, over, inputs=inputs, outputs=outputs)
+        if (around := m.obstacles) is not None:
+            terms = [d.active, d.scene, *d.bodies, o.obstacle_near, o.obstacle_target]
+            out.add(obstacles.residuals, over, inputs=[around.features, around.solids, *terms], outputs=outputs)
+            if around.any_solid:
+                inputs = [around.features, m.hand.pieces, around.solids, *terms]
+                out.add(solids.residuals, over, inputs=inputs, outputs=outputs)
         out.add(
             kernels.normal_equations,
             (d.capacity, self._lanes),
-            inputs=[m.hand.tree, self._lane, d.active, d.pivot, d.body_p, d.axis, r],
+            inputs=[m.hand.tree, self._lane, d.active, d.pivot, d.body_p, d.axis, self.residuals],
             outputs=[self._row, self.matrix, self.vector],
         )
 
@@ -208,5 +160,5 @@ class Projection:
             kernels.step,
             d.capacity,
             inputs=[*self._limits, self._scale, wp.float64(o.damping), wp.float64(o.step), d.active, self.residuals],
-            outputs=[self._factor, self._move, self.matrix, self.vector, now, d.pivot, d.rotation, d.q],
+            outputs=[self._factor, self._move, self.matrix, self.vector, now, *d.root_and_joints],
         )

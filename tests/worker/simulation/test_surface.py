@@ -24,6 +24,20 @@ from tests.worker.simulation.rigs import ball, object_of
 FLOAT32 = 2e-8
 
 
+@wp.kernel
+def measure(
+    skin_in: surface.Surface,
+    point_in: wp.array(dtype=wp.vec3),
+    exact_below_in: wp.float32,
+    distance_out: wp.array(dtype=wp.float32),
+    normal_out: wp.array(dtype=wp.vec3),
+):
+    i = wp.tid()
+    sample = surface.distance(skin_in, point_in[i], 0.2, exact_below_in, 0.2)
+    distance_out[i] = sample.distance
+    normal_out[i] = sample.normal
+
+
 def probe(
     obj: ObjectModel, points: np.ndarray, *, alpha: float, cell: float = 0.0, exact_below: float = 1.0
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -32,7 +46,7 @@ def probe(
     with wp.ScopedDevice("cpu"):
         distance, normal = wp.zeros(len(points)), wp.zeros(len(points), dtype=wp.vec3)
         at = wp.array(points - obj.centre_of_mass, dtype=wp.vec3)
-        wp.launch(surface.probe, len(points), inputs=[device.surface, at, 0.2, exact_below], outputs=[distance, normal])
+        wp.launch(measure, len(points), inputs=[device.surface, at, exact_below], outputs=[distance, normal])
         return distance.numpy().astype(float), normal.numpy().astype(float)
 
 

@@ -28,7 +28,6 @@ def counts(x: wp.float32):
 
 @wp.func
 def add_wrench(wrench: Wrenches, b: wp.int32, body: wp.int32, force: wp.vec3, torque: wp.vec3):
-    """Add to the wrench on a body of hand b."""
     for i in range(3):
         wp.atomic_add(wrench, b, body, i, counts(force[i]))
         wp.atomic_add(wrench, b, body, 3 + i, counts(torque[i]))
