@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Any
 
@@ -25,13 +26,10 @@ Chooser = Callable[[list[Shard]], list[NDArray[np.bool_]]]
 
 @dataclass(frozen=True)
 class Subset:
-    """Result of writing a subset."""
-
     looked_at: int
     kept: int
     files: list[Path]
-    passed_over: int
-    """Scene and views shards, whose rows refer to grasps by number and are not transferred."""
+    passed_over: int  # scene and views shards, whose rows refer to grasps by number and are not transferred
 
 
 def shards_of(source: str, snapshot: str | None = None) -> Shards:
@@ -51,15 +49,8 @@ def shards_of(source: str, snapshot: str | None = None) -> Shards:
 
 def base_shards(shards: Shards) -> Iterator[list[Shard]]:
     """Group base shards by hand and object."""
-    pair, together = ("", ""), list[Shard]()
-    for file in shards.of("base"):
-        if (file.hand, file.object) != pair and together:
-            yield together
-            together = []
-        pair = (file.hand, file.object)
-        together.append(read_shard(shards.path(file), kind="base"))
-    if together:
-        yield together
+    for _, files in groupby(shards.of("base"), key=lambda file: (file.hand, file.object)):
+        yield [read_shard(shards.path(file), kind="base") for file in files]
 
 
 def write_subset(shards: Shards, choose: Chooser, out: Path, *, said: Mapping[str, Any]) -> Subset:

@@ -26,12 +26,9 @@ class WorkItem:
     """Work item: `work(shared, part)`."""
 
     work: Callable[[Any, Any], Any]
-    key: str
-    """Key of the data shared with other items."""
-    shared: bytes | None
-    """Pickled shared data; None: sent before."""
+    key: str  # key of the data shared with other items
+    shared: bytes | None  # pickled shared data; None: sent before
     forget: tuple[str, ...]
-    """Keys to evict."""
     part: Any
 
 

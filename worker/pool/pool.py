@@ -56,8 +56,7 @@ class _Request:
     key: str
     shared: Any
     done: Callable[[int], None]
-    dropped_at: float | None = None
-    """Time at which the last caller stopped waiting."""
+    dropped_at: float | None = None  # time at which the last caller stopped waiting
 
     @cached_property
     def pickled(self) -> bytes:

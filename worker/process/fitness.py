@@ -60,8 +60,7 @@ class Fitness:
         self._check = check
         self._failed: dict[str, tuple[Stage, str]] = {}
         self._can_pass = True
-        self.reason = ""
-        """Reason why the worker is unfit; "" while it is fit."""
+        self.reason = ""  # reason why the worker is unfit; "" while it is fit
 
     def try_engine(self, stages: Collection[Stage]) -> bool:
         """Check the engine for these stages."""

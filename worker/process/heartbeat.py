@@ -53,8 +53,7 @@ class Heartbeat:
         self._alive, self._is_stopped = HeartbeatFile(alive), is_stopped
         self._changed, self._over = threading.Event(), threading.Event()
         self._away = False
-        self.interval_s = min(BEAT_S, lease_s / 3)
-        """Interval of heartbeats [s]."""
+        self.interval_s = min(BEAT_S, lease_s / 3)  # interval of heartbeats [s]
         self._thread = threading.Thread(target=self._run, name="heartbeat", daemon=True)
 
     def start(self) -> None:

@@ -35,9 +35,7 @@ class Setup:
     settings: Settings
     stages: tuple[Stage, ...]
     worker: str
-    """Name of its worker."""
-    patient: bool
-    """Whether to wait in quarantine until the first check passes."""
+    patient: bool  # whether to wait in quarantine until the first check passes
 
 
 class Link:

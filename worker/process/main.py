@@ -78,12 +78,9 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
         self._queue, self._engine, self._heartbeat = queue, engine, heart
         self._stages, self._taken, self._limit_s = stages, 0, limit_s
         self.tasks_done = 0
-        self.told_to_stop = False
-        """Whether a signal requested a stop."""
-        self.found_none = False
-        """Whether it ended because no task was waiting."""
-        self.engine_is: Condition = "fit"
-        """State of the engine after the last task."""
+        self.told_to_stop = False  # whether a signal requested a stop
+        self.found_none = False  # whether it ended because no task was waiting
+        self.engine_is: Condition = "fit"  # state of the engine after the last task
 
     def check_service(self) -> None:
         """Raise BusyError if Redis belongs to another service, InputError if the device is unknown."""

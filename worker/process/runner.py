@@ -64,8 +64,7 @@ class Runner:
         self._publish = publish
         self._fitness = fitness
         self._check_device = check_device
-        self.device_lost = ""
-        """Reason why this process can run no more tasks on its device; "" while it can."""
+        self.device_lost = ""  # reason why this process can run no more tasks on its device; "" while it can
 
     def run(self, raw: Mapping[str, Any], context: TaskContext) -> Event | None:
         """Run a task.

@@ -36,10 +36,8 @@ class Cameras:
 
     width: int
     height: int
-    intrinsics: Floats
-    """(3, 3) [px]"""
-    extrinsics: Floats
-    """(V, 4, 4) table to camera."""
+    intrinsics: Floats  # (3, 3) [px]
+    extrinsics: Floats  # (V, 4, 4) table to camera
 
     def __len__(self) -> int:
         return len(self.extrinsics)
@@ -138,7 +136,6 @@ def stereo_pair(extrinsics: Floats, baseline: float) -> tuple[Floats, Floats]:
 #: Tolerance of rotations in a file: six digits are usual in JSON written by hand.
 ROTATION_ERROR: Final = 1e-5
 
-_Point = Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)]
 _Row3 = Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)]
 _Row4 = Annotated[list[FiniteFloat], Field(min_length=4, max_length=4)]
 
@@ -147,10 +144,8 @@ _Row4 = Annotated[list[FiniteFloat], Field(min_length=4, max_length=4)]
 class GivenCameras:
     """Given cameras; missing values are sampled or default."""
 
-    intrinsics: Floats | None = None
-    """(3, 3) K [px], common to all cameras."""
-    extrinsics: Floats | None = None
-    """(C, 4, 4) table to camera, the same in every scene."""
+    intrinsics: Floats | None = None  # (3, 3) K [px], common to all cameras
+    extrinsics: Floats | None = None  # (C, 4, 4) table to camera, the same in every scene
     width: int | None = None
     height: int | None = None
 
@@ -172,8 +167,8 @@ class _Pinhole(_Model):
 
 class _Camera(_Model):
     extrinsics: Annotated[list[_Row4], Field(min_length=4, max_length=4)] | None = None
-    eye: _Point | None = None
-    target: _Point | None = None
+    eye: _Row3 | None = None
+    target: _Row3 | None = None
 
     @model_validator(mode="after")
     def _one_way(self) -> _Camera:

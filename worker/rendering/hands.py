@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import accumulate
 from typing import Final
 
 import numpy as np
@@ -34,12 +35,9 @@ class DrawnHand:
     hand: HandModel
     grasp: NDArray[np.int32]
     """(S,) row of the grasp in the scene shard (in the base shard if planned in its scene); -1: no hand."""
-    hand_pose: Floats
-    """(S, 7) root link in the table frame; ignored where there is no grasp."""
-    joint_positions: Floats
-    """(S, J)"""
-    wrist: Floats | None = None
-    """(S, U) wrist angles for drawing the links above the hand's root; None: not drawn."""
+    hand_pose: Floats  # (S, 7) root link in the table frame; ignored where there is no grasp
+    joint_positions: Floats  # (S, J)
+    wrist: Floats | None = None  # (S, U) wrist angles for drawing the links above the hand's root; None: not drawn
 
     def body_poses(self) -> Floats:
         """Return poses (S, B, 7) of the drawn bodies in the table frame."""
@@ -98,16 +96,6 @@ def drawn_bodies(hand: HandModel) -> list[int]:
     return [part.body for part in hand_parts(hand)]
 
 
-def hand_solids(hand: HandModel) -> list[Solid]:
-    """Return the drawn meshes, each in the frame of its body."""
-    return [part.solid for part in hand_parts(hand)]
-
-
-def hand_looks(hand: HandModel) -> list[Appearance]:
-    """Return the material of each drawn solid."""
-    return [part.look for part in hand_parts(hand)]
-
-
 _parts: LRUCache[str, tuple[MovingSolid, ...]] = LRUCache(16)
 _lock = threading.Lock()
 
@@ -116,7 +104,8 @@ def _drawn(hand: HandModel) -> Iterator[MovingSolid]:
     seen = {mesh.body for mesh in hand.visuals.meshes}
     for body in range(hand.bodies):
         if body not in seen:
-            yield from _pieces(hand, body)
+            if pieces := [(piece.vertices, piece.faces) for piece in hand.pieces if piece.body == body]:
+                yield MovingSolid(body, _merge(pieces), _own_look(hand, body))
             continue
         of_colour: dict[tuple[float, float, float] | None, list[VisualMesh]] = {}
         for mesh in hand.visuals.meshes:
@@ -127,12 +116,6 @@ def _drawn(hand: HandModel) -> Iterator[MovingSolid]:
             yield MovingSolid(body, _merge([(m.vertices, m.faces) for m in meshes]), look)
 
 
-def _pieces(hand: HandModel, body: int) -> Iterator[MovingSolid]:
-    pieces = [(piece.vertices, piece.faces) for piece in hand.pieces if piece.body == body]
-    if pieces:
-        yield MovingSolid(body, _merge(pieces), _own_look(hand, body))
-
-
 def _own_look(hand: HandModel, body: int) -> Appearance:
     """Return the material of a body without a colour: palm, finger or fingertip."""
     if body in hand.fingertips:
@@ -141,10 +124,9 @@ def _own_look(hand: HandModel, body: int) -> Appearance:
 
 
 def _merge(meshes: list[tuple[Floats, Ints]]) -> Solid:
-    vertices, faces, normals, count = [], [], [], 0
-    for points, triangles in meshes:
-        vertices.append(points)
-        faces.append(triangles + count)
-        normals.append(corner_normals(points, triangles))
-        count += len(points)
-    return Solid(np.concatenate(vertices), np.concatenate(faces), np.concatenate(normals))
+    starts = accumulate((len(points) for points, _ in meshes), initial=0)
+    return Solid(
+        np.concatenate([points for points, _ in meshes]),
+        np.concatenate([triangles + start for (_, triangles), start in zip(meshes, starts, strict=False)]),
+        np.concatenate([corner_normals(points, triangles) for points, triangles in meshes]),
+    )

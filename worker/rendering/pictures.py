@@ -10,19 +10,18 @@ from numpy.typing import NDArray
 
 from graspd.service.model.colours import hexadecimal
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply, quat_rotate
-
-#: Sides 120 degrees apart, measured from the side view of the hand [rad].
 from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
 from graspd.worker.grasps import moved
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.rendering.cameras import Cameras, intrinsics, look_at
-from graspd.worker.rendering.hands import drawn_bodies, hand_looks, hand_solids
+from graspd.worker.rendering.hands import hand_parts
 from graspd.worker.rendering.kernels.shading import CATCHER
 from graspd.worker.rendering.scenery import Appearance, Box, CameraShot, Lamp, Solid
 from graspd.worker.rendering.tracer import Tracer
 
+#: Sides 120 degrees apart, measured from the side view of the hand [rad].
 THREE_SIDES: Final = tuple(np.radians([-35.0, 85.0, 205.0]).tolist())
 ELEVATION: Final = np.radians(20.0)
 FIELD_OF_VIEW: Final = np.radians(24.0)
@@ -80,12 +79,8 @@ def grasp_pictures(
     hand_pose = moved(np.atleast_2d(np.asarray(hand_pose, float)), np.negative(obj.centre))
     obj = obj.centred
     joints = np.atleast_2d(np.asarray(joint_positions, float))
-    solids: list[Solid | Box] = [
-        Box(FLOOR_SIZE),
-        Solid(obj.vertices, obj.faces, obj.corner_normals),
-        *hand_solids(hand),
-    ]
-    stage = Tracer(solids, run.device)
+    thing = Solid(obj.vertices, obj.faces, obj.corner_normals)
+    stage = Tracer([Box(FLOOR_SIZE), thing, *(part.solid for part in hand_parts(hand))], run.device)
     shots = []
     for start in range(0, len(hand_pose), _TOGETHER):
         part = slice(start, start + _TOGETHER)
@@ -105,33 +100,54 @@ def _shoot(
     samples: int,
     run: ExecutionContext,
 ) -> NDArray[np.uint8]:
-    worlds, (width, height) = len(bodies), size
+    worlds, parts = len(bodies), hand_parts(hand)
     points = np.concatenate(
         [np.broadcast_to(obj.hull_vertices, (worlds, *obj.hull_vertices.shape)), hand_points(hand, bodies)], axis=1
     )
-    floor = np.tile(IDENTITY_POSE, (worlds, 1))
-    floor[:, 2] = points[..., 2].min(axis=1) - 0.01 - 0.5 * FLOOR_SIZE[2]
-    shown = drawn_bodies(hand)
-    poses = np.concatenate([floor[:, None], np.tile(IDENTITY_POSE, (worlds, 1, 1)), bodies[:, shown]], axis=1)
-    stage.place(poses, [[FLOOR, OBJECT_LOOK, *hand_looks(hand)]] * worlds)
-    k = intrinsics(width, height, FIELD_OF_VIEW)
+    still = np.stack([[floor_pose(world), IDENTITY_POSE] for world in points])
+    stage.place(
+        np.concatenate([still, bodies[:, [part.body for part in parts]]], axis=1),
+        [[FLOOR, OBJECT_LOOK, *(part.look for part in parts)]] * worlds,
+    )
+    k = intrinsics(*size, FIELD_OF_VIEW)
     sides = []
     for azimuth in azimuths:
         angles = np.array([side_of(hand, world) + azimuth for world in bodies])
-        shot = CameraShot(
-            world=np.arange(worlds, dtype=np.int32),
-            extrinsics=np.stack([_camera(obj, points[w], angles[w], k, size) for w in range(worlds)]),
-            intrinsics=k,
-            width=width,
-            height=height,
-            samples=samples,
-            toward_lamp=TOWARD_LAMP,
-            # The lamp turns with the camera, so that no side is dark.
-            turn=-angles,
-            lamps=[STUDIO] * worlds,
-        )
-        sides.append(stage.shoot(shot, run.quiet()).rgb)
+        cameras = np.stack([_camera(obj, points[w], angles[w], k, size) for w in range(worlds)])
+        sides.append(stage.shoot(studio_shot(cameras, k, size, angles, samples), run.quiet()).rgb)
     return np.stack(sides, axis=1)
+
+
+def floor_pose(points: Floats) -> Floats:
+    """Return the pose (7,) of the studio floor, just below points (..., 3)."""
+    pose = IDENTITY_POSE.copy()
+    pose[2] = points[..., 2].min() - 0.01 - 0.5 * FLOOR_SIZE[2]
+    return pose
+
+
+def studio_shot(
+    cameras: Floats,
+    k: Floats,
+    size: tuple[int, int],
+    angles: Floats,
+    samples: int,
+    *,
+    world: NDArray[np.intp] | None = None,
+    toward_lamp: Floats = TOWARD_LAMP,
+) -> CameraShot:
+    """Return cameras (V, 4, 4) in studio light that turns with azimuths (worlds,) [rad], so that no side is dark.
+    `world` (V,): that of each camera; by default its own."""
+    return CameraShot(
+        world=(np.arange(len(angles)) if world is None else world).astype(np.int32),
+        extrinsics=cameras,
+        intrinsics=k,
+        width=size[0],
+        height=size[1],
+        samples=samples,
+        toward_lamp=toward_lamp,
+        turn=-angles,
+        lamps=[STUDIO] * len(angles),
+    )
 
 
 def side_of(hand: HandModel, bodies: Floats) -> float:

@@ -63,8 +63,7 @@ class CameraPlan:
     views: int
     width: int
     height: int
-    baseline_m: float | None
-    """Baseline of stereo pairs; None: mono."""
+    baseline_m: float | None  # baseline of stereo pairs; None: mono
     given: GivenCameras = SAMPLED
 
     @property

@@ -58,12 +58,9 @@ class Lamp:
 class Pictures:
     """Pictures of V cameras."""
 
-    rgb: NDArray[np.uint8]
-    """(V, H, W, 3) sRGB"""
-    depth: NDArray[np.float32]
-    """(V, H, W) along the optical axis [m]; inf: nothing."""
-    shape: NDArray[np.int64]
-    """(V, H, W) index of the solid at the pixel's centre; -1: nothing."""
+    rgb: NDArray[np.uint8]  # (V, H, W, 3) sRGB
+    depth: NDArray[np.float32]  # (V, H, W) along the optical axis [m]; inf: nothing
+    shape: NDArray[np.int64]  # (V, H, W) index of the solid at the pixel's centre; -1: nothing
     normal: NDArray[np.float32] | None = None
     """(V, H, W, 3) unit shading normal in the world's frame, zero for nothing; only if requested."""
 
@@ -72,24 +69,17 @@ class Pictures:
 class CameraShot:
     """Cameras with their worlds, and the light."""
 
-    world: NDArray[np.int32]
-    """(V,)"""
-    extrinsics: Floats
-    """(V, 4, 4) world to camera: x right, y down, z forward."""
+    world: NDArray[np.int32]  # (V,)
+    extrinsics: Floats  # (V, 4, 4) world to camera: x right, y down, z forward
     intrinsics: Floats
     width: int
     height: int
     samples: int
-    toward_lamp: Floats
-    """(3,) unit; in the frame in which worlds are turned by `turn`."""
-    turn: Floats
-    """(worlds,) angle about z by which each world is turned under the lamp [rad]."""
-    lamps: Sequence[Lamp]
-    """One per world."""
+    toward_lamp: Floats  # (3,) unit; in the frame in which worlds are turned by `turn`
+    turn: Floats  # (worlds,) angle about z by which each world is turned under the lamp [rad]
+    lamps: Sequence[Lamp]  # one per world
     normals: bool = False
-    """Whether to compute normals."""
-    shaded: bool = True
-    """False: trace rays without shading, to measure the cost of the bare ray tracer."""
+    shaded: bool = True  # False: trace rays without shading, to measure the cost of the bare ray tracer
 
 
 Supports = Sequence[HalfSpace | BoxSupport]

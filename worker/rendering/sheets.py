@@ -41,23 +41,19 @@ def best(quality: Arrays, count: int, among: NDArray[np.bool_]) -> NDArray[np.in
 def best_kept(scene: Arrays, base: Arrays) -> NDArray[np.int32]:
     """Return the row (S,) of each scene's valid grasp with the largest epsilon; -1: none."""
     epsilon = _quoted(base, "quality/epsilon")[np.asarray(scene["grasp/base_index"])]
-    score = np.where(np.asarray(scene["grasp/valid"], bool), epsilon, -np.inf)
-    rows = np.full(len(scene["scene/object_pose"]), -1, np.int32)
-    for s in range(len(rows)):
-        mine = np.flatnonzero(np.asarray(scene["grasp/scene_index"]) == s)
-        if len(mine) and np.isfinite(score[mine]).any():
-            rows[s] = mine[np.argmax(score[mine])]
-    return rows
+    return _best_of_scenes(scene, np.where(np.asarray(scene["grasp/valid"], bool), epsilon, -np.inf))
 
 
 def best_in_scenes(base: Arrays, among: NDArray[np.bool_]) -> NDArray[np.int32]:
     """Return the row (S,) with the largest epsilon planned in each scene, among a mask (N,); -1: none."""
-    score = np.where(among, np.nan_to_num(_quoted(base, "quality/epsilon"), nan=-1.0), -np.inf)
-    scene = np.asarray(base["grasp/scene_index"])
-    rows = np.full(len(base["scene/object_pose"]), -1, np.int32)
+    return _best_of_scenes(base, np.where(among, np.nan_to_num(_quoted(base, "quality/epsilon"), nan=-1.0), -np.inf))
+
+
+def _best_of_scenes(columns: Arrays, score: Floats) -> NDArray[np.int32]:
+    rows = np.full(len(columns["scene/object_pose"]), -1, np.int32)
     for s in range(len(rows)):
-        mine = np.flatnonzero((scene == s) & among)
-        if len(mine):
+        mine = np.flatnonzero(np.asarray(columns["grasp/scene_index"]) == s)
+        if len(mine) and np.isfinite(score[mine]).any():
             rows[s] = mine[np.argmax(score[mine])]
     return rows
 
@@ -125,14 +121,8 @@ def views_page(views: Arrays, *, title: str, subtitle: str = "") -> bytes:
         "hand": lambda view: _colours(views, "image/rgb_hand", view),
     }
     heads = [head for head in columns if (stereo or head != "right") and (head != "hand" or "image/rgb_hand" in views)]
-    height, width = np.asarray(views["image/rgb"]).shape[1:3]
-    page, draw, top = _page(len(heads), len(first), width, height, title, subtitle, head=_HEAD + 24)
-    for column, head in enumerate(heads):
-        x = MARGIN + column * (width + GAP)
-        text(draw, (x, top - 10), head, 15, QUIET)
-        for row, view in enumerate(first.tolist()):
-            page.paste(columns[head](view), (x, top + row * (height + GAP)))
-    return png(page)
+    rows = [[columns[head](view) for head in heads] for view in first.tolist()]
+    return label_page(rows, heads, (), title=title, subtitle=subtitle)
 
 
 def scene_cells(views: Arrays) -> list[Image.Image]:
@@ -152,17 +142,18 @@ def label_page(
     title: str,
     subtitle: str = "",
 ) -> bytes:
-    """Return a PNG of a table of pictures: column heads, and names below the first pictures of each row."""
+    """Return a PNG of a table of pictures: column heads, and names, if any, below the first pictures of each row."""
     width, height = rows[0][0].size
-    page, draw, top = _page(len(heads), len(rows), width, height + _NAME, title, subtitle, head=_HEAD + 24)
+    line = height + (_NAME if names else 0)
+    page, draw, top = _page(len(heads), len(rows), width, line, title, subtitle, head=_HEAD + 24)
     for column, head in enumerate(heads):
         text(draw, (MARGIN + column * (width + GAP), top - 10), head, 15, QUIET)
-    for row, (cells, below) in enumerate(zip(rows, names, strict=True)):
-        y = top + row * (height + _NAME + GAP)
+    for row, (cells, below) in enumerate(zip(rows, names or [()] * len(rows), strict=True)):
+        y = top + row * (line + GAP)
         for column, cell in enumerate(cells):
             page.paste(cell, (MARGIN + column * (width + GAP), y))
         for column, name in enumerate(below):
-            text(draw, (MARGIN + column * (width + GAP), y + height + _NAME - 4), name, 14, INK)
+            text(draw, (MARGIN + column * (width + GAP), y + line - 4), name, 14, INK)
     return png(page)
 
 
@@ -224,13 +215,10 @@ def _scale_bar(image: Image.Image, near: float, far: float) -> None:
 
 
 def _segments(views: Arrays, view: int) -> Image.Image:
-    return Image.fromarray(_SEGMENT[_segment_rows(views, view)])
-
-
-def _segment_rows(views: Arrays, view: int) -> NDArray[np.intp]:
-    """Return rows of `_SEGMENT`: neighbours cycle through the colours after the object's."""
+    """Draw the labels; neighbours cycle through the colours after the object's."""
     labels = np.asarray(views["image/segmentation"][view], np.intp)
-    return np.where(labels > OBJECT, OBJECT + 1 + (labels - OBJECT - 1) % (len(_SEGMENT) - OBJECT - 1), labels)
+    beside = OBJECT + 1 + (labels - OBJECT - 1) % (len(_SEGMENT) - OBJECT - 1)
+    return Image.fromarray(_SEGMENT[np.where(labels > OBJECT, beside, labels)])
 
 
 def _boxes(views: Arrays, view: int) -> Image.Image:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -46,41 +46,26 @@ _GOLDEN: Final = np.pi * (3.0 - np.sqrt(5.0))
 _R2: Final = np.array([0.7548776662466927, 0.5698402909980532])
 
 
-@dataclass
 class Tracer:
-    """Solids in many worlds. Build once, then `place` and `shoot` repeatedly.
+    """Solids in many worlds. Build once, then `place` and `shoot` repeatedly."""
 
-    Args:
-        solids: the P solids of each world, same in every world.
-        device: Warp device.
-    """
-
-    solids: Sequence[Solid | Box]
-    device: str
-    _meshes: list[Any] = field(init=False, repr=False)
-    """Keeps the trees that the shapes refer to alive."""
-    _shapes: NDArray[Any] = field(init=False, repr=False)
-    """(P,) of `rays.PlacedSolid`, before placement."""
-    _corner_normals: Any = field(init=False, repr=False)
-    _corners: Floats = field(init=False, repr=False)
-    """(P, 8, 3) corners of the solids' bounds."""
-    _placed: Any = field(init=False, repr=False)
-    _materials: Any = field(init=False, repr=False)
-
-    def __post_init__(self) -> None:
+    def __init__(self, solids: Sequence[Solid | Box], device: str) -> None:
+        """`solids`: the P solids of each world, same in every world; `device`: of Warp."""
         backend.start()
-        self._shapes = np.zeros(len(self.solids), _PLACED.numpy_dtype())
-        self._meshes, normals, first = [], [np.zeros((0, 3))], 0
-        for k, solid in enumerate(self.solids):
+        self.device = device
+        shapes: NDArray[Any] = np.zeros(len(solids), _PLACED.numpy_dtype())
+        self._meshes, normals, first = list[Any](), [np.zeros((0, 3))], 0  # the meshes keep the shapes' trees alive
+        for k, solid in enumerate(solids):
             if isinstance(solid, Box):
-                self._shapes["half"][k] = 0.5 * np.asarray(solid.size)
+                shapes["half"][k] = 0.5 * np.asarray(solid.size)
             else:
-                self._meshes.append(_mesh(solid, self.device))
+                self._meshes.append(_mesh(solid, device))
                 normals.append(np.reshape(solid.corner_normals, (-1, 3)))
-                self._shapes["mesh"][k], self._shapes["first_corner"][k] = self._meshes[-1].id, first
+                shapes["mesh"][k], shapes["first_corner"][k] = self._meshes[-1].id, first
                 first += len(normals[-1])
-        self._corner_normals = wp.array(np.concatenate(normals), dtype=wp.vec3f, device=self.device)
-        self._corners = np.stack([_corners(solid) for solid in self.solids])
+        self._shapes = shapes
+        self._corner_normals: Any = wp.array(np.concatenate(normals), dtype=wp.vec3f, device=device)
+        self._corners = np.stack([_corners(solid) for solid in solids])
 
     def place(self, poses: Floats, looks: Sequence[Sequence[Appearance]]) -> None:
         """Place the solids in their worlds.
@@ -94,9 +79,9 @@ class Tracer:
         placed = np.tile(self._shapes, (len(poses), 1))
         placed["place"], placed["turn"] = poses[..., :3], np.swapaxes(quat_to_matrix(poses[..., 3:]), -1, -2)
         placed["lower"], placed["upper"] = corners.min(axis=2) - _SLACK_M, corners.max(axis=2) + _SLACK_M
-        self._placed = wp.array(placed, dtype=_PLACED, device=self.device)
+        self._placed: Any = wp.array(placed, dtype=_PLACED, device=self.device)
         every = _structs([look for world in looks for look in world], Material, self.device)
-        self._materials = every.reshape(poses.shape[:2])
+        self._materials: Any = every.reshape(poses.shape[:2])
 
     def shoot(self, shot: CameraShot, run: ExecutionContext = DEFAULT_CONTEXT) -> Pictures:
         """Trace all cameras.
@@ -134,7 +119,8 @@ class _Film:
         back = quat_from_axis_angle(np.array([0.0, 0.0, 1.0]), -np.asarray(shot.turn))
         toward = quat_rotate(back[:, None], np.array([one.toward for one in passes]))
         self._toward = wp.array(toward, dtype=wp.vec3f, device=device)
-        self._cameras = _xyzw(pose_from_matrix(np.asarray(np.linalg.inv(shot.extrinsics), np.float64)))
+        poses = pose_from_matrix(np.asarray(np.linalg.inv(shot.extrinsics), np.float64))
+        self._cameras = np.asarray(poses[..., [0, 1, 2, 4, 5, 6, 3]], np.float32)
 
     def expose(
         self, views: NDArray[np.intp], threads: int, pool: ThreadPoolExecutor
@@ -193,20 +179,13 @@ def _structs(things: Sequence[Any], struct: Any, device: str) -> Any:
     return wp.array(np.array(rows, kind), dtype=struct, device=device)
 
 
-def _xyzw(poses: Floats) -> NDArray[np.float32]:
-    return np.asarray(poses[..., [0, 1, 2, 4, 5, 6, 3]], np.float32)
-
-
 @dataclass(frozen=True)
 class LightPass:
     """One ray through every pixel, one directional light."""
 
-    shift: tuple[float, float]
-    """Offset of the ray from the pixel's centre [px]."""
-    toward: Floats
-    """(3,) unit direction to the light."""
-    lamp_weight: float
-    """Weights with which the mean over all passes is one lamp and one sky."""
+    shift: tuple[float, float]  # offset of the ray from the pixel's centre [px]
+    toward: Floats  # (3,) unit direction to the light
+    lamp_weight: float  # weights with which the mean over all passes is one lamp and one sky
     sky_weight: float
 
 

@@ -140,8 +140,7 @@ class DeviceObject:
     mesh: Any
     samples: Any
     bvh: Any
-    sorted_samples: Any
-    """The samples sorted by the cells of a grid."""
+    sorted_samples: Any  # the samples sorted by the cells of a grid
 
     @classmethod
     def create(cls, obj: ObjectModel, device: str, *, samples: Floats, phong_alpha: float, cell: float) -> DeviceObject:
@@ -201,10 +200,8 @@ def sorted_samples(samples: Floats, size: float = SAMPLE_CELL_M) -> Any:
 class PosedBodies:
     """The L bodies of a hand in P postures, object frame."""
 
-    chain: Any
-    """The hand, `kernels.chain.Chain`."""
-    bodies: Any
-    """Poses (P, L) of the bodies, `kernels.chain.Bodies`."""
+    chain: Any  # the hand, `kernels.chain.Chain`
+    bodies: Any  # poses (P, L) of the bodies, `kernels.chain.Bodies`
 
     @classmethod
     def of(cls, hand: HandModel, hand_pose: Floats, joint_positions: Floats, device: str = "cpu") -> PosedBodies:

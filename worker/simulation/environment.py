@@ -33,10 +33,8 @@ CLEAR_M: Final = 0.002
 class Obstacle:
     """A convex body: the points x with n.x <= d for each of its planes (n, d)."""
 
-    planes: Floats
-    """(K, 4) outward unit normal and offset [m]."""
-    corners: Floats
-    """(V, 3) corners [m]; none for unbounded bodies, as a half-space."""
+    planes: Floats  # (K, 4) outward unit normal and offset [m]
+    corners: Floats  # (V, 3) corners [m]; none for unbounded bodies, as a half-space
     edges: NDArray[np.intp] = field(default_factory=lambda: np.zeros((0, 2), np.intp))
     """(E, 2) corners joined by an edge."""
     tips_m: float | None = None
@@ -98,8 +96,7 @@ class Environment:
     """One scene in the object frame."""
 
     obstacles: tuple[Obstacle, ...]
-    up: Floats
-    """(3,) unit vector against gravity."""
+    up: Floats  # (3,) unit vector against gravity
 
 
 @dataclass(frozen=True)
@@ -107,24 +104,18 @@ class Neighbour:
     """Another object in a scene, as convex pieces in its own frame."""
 
     obj: ObjectModel
-    pieces: tuple[Floats, ...]
-    """Corners (V, 3) of each piece, as the validator simulates them."""
-    solids: tuple[Obstacle, ...]
-    """Slightly enlarged pieces with few faces, as a hand avoids them."""
-    error_m: float
-    """Largest excess of a solid over its piece [m]."""
-    about_centre: Neighbour | None = None
-    """The neighbour about its centre; None: it already is."""
+    pieces: tuple[Floats, ...]  # corners (V, 3) of each piece, as the validator simulates them
+    solids: tuple[Obstacle, ...]  # slightly enlarged pieces with few faces, as a hand avoids them
+    error_m: float  # largest excess of a solid over its piece [m]
+    about_centre: Neighbour | None = None  # the neighbour about its centre; None: it already is
 
 
 @dataclass(frozen=True)
 class Scenes:
     """S scenes of one object with common supports and neighbours."""
 
-    supports: tuple[Obstacle, ...]
-    """Tables, boards and walls in the scene frame, z up."""
-    object_pose: Floats
-    """(S, 7) of the object in the scene frame."""
+    supports: tuple[Obstacle, ...]  # tables, boards and walls in the scene frame, z up
+    object_pose: Floats  # (S, 7) of the object in the scene frame
     neighbours: tuple[Neighbour, ...] = ()
     neighbour_pose: Floats = field(default_factory=lambda: np.zeros((0, 0, 7)))
     """(S, M, 7) of the neighbours in the scene frame."""
@@ -143,12 +134,9 @@ class Scenes:
 class PlacedGrasps:
     """N grasps, each in one of S scenes with common supports and neighbours."""
 
-    supports: tuple[Obstacle, ...]
-    """Tables, boards and walls in the scene frame, z up."""
-    object_pose: Floats
-    """(S, 7) of the object in the scene frame."""
-    index: NDArray[np.intp]
-    """(N,) scene of each grasp."""
+    supports: tuple[Obstacle, ...]  # tables, boards and walls in the scene frame, z up
+    object_pose: Floats  # (S, 7) of the object in the scene frame
+    index: NDArray[np.intp]  # (N,) scene of each grasp
     neighbours: tuple[Neighbour, ...] = ()
     neighbour_pose: Floats = field(default_factory=lambda: np.zeros((0, 0, 7)))
     """(S, M, 7) of the neighbours in the scene frame."""

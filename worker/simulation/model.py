@@ -40,25 +40,20 @@ class LossOptions:
     friction: float = 0.8
     stiffness: float = 1.0
     passes: int = 4
-    step: float = 1e-3
-    """Free motion of the object in one step, v dt [m]."""
+    step: float = 1e-3  # free motion of the object in one step, v dt [m]
     leak: float = 0.1
     leak_length: float = 0.02
     one_sided: bool = True
-    band: float = 0.03
-    """Points farther than dilation + band from the surface are ignored [m]."""
-    exact_below: float = 0.004
-    """Distances below this are computed from the mesh, above from the grid [m]."""
+    band: float = 0.03  # points farther than dilation + band from the surface are ignored [m]
+    exact_below: float = 0.004  # distances below this are computed from the mesh, above from the grid [m]
     range_weight: float = 0.005
     limit_weight: float = 0.0
     self_margin: float = 1e-3
     pull: float = 0.0
     """Attraction of points without contact, as strong as the penetration term at this depth [m].
     It fades with their distance."""
-    pull_length: float = 0.013
-    """Distance over which the attraction falls to 1/e [m]."""
-    simulate: bool = True
-    """False: no simulation; every point near the object is attracted. A control for benchmarks."""
+    pull_length: float = 0.013  # distance over which the attraction falls to 1/e [m]
+    simulate: bool = True  # False: no simulation; every point near the object is attracted. A control for benchmarks
 
 
 @dataclass(frozen=True)
@@ -68,20 +63,15 @@ class Model:
     hand: DeviceHand
     obj: DeviceObject
     options: LossOptions
-    obstacles: DeviceObstacles | None
-    """Obstacles that the hands must avoid; None: none."""
-    count: int
-    """Hand points."""
+    obstacles: DeviceObstacles | None  # obstacles that the hands must avoid; None: none
+    count: int  # hand points
     point_body: Any
     point_position: Any
     point_weight: Any
-    body_points: Any
-    """Points tested against other links."""
-    self_scale: float
-    """Weight of one body point."""
+    body_points: Any  # points tested against other links
+    self_scale: float  # weight of one body point
     physics: Any
-    motions: Any
-    """(M,) free motions of the object."""
+    motions: Any  # (M,) free motions of the object
 
     @staticmethod
     def create(

@@ -34,14 +34,10 @@ FAR_M: Final = 0.1
 class PosedFeatures:
     """The F features of a hand in P postures."""
 
-    centre: Floats
-    """(P, F, 3)"""
-    axis: Floats
-    """(P, F, 3); zero: a ball."""
-    radius: Floats
-    """(F,)"""
-    rim: NDArray[np.bool_]
-    """(F,)"""
+    centre: Floats  # (P, F, 3)
+    axis: Floats  # (P, F, 3); zero: a ball
+    radius: Floats  # (F,)
+    rim: NDArray[np.bool_]  # (F,)
 
     @classmethod
     def of(cls, hand: HandModel, postures: Posture) -> PosedFeatures:
@@ -150,8 +146,7 @@ class DeviceObstacles:
 
     features: Any
     solids: Any
-    any_solid: bool
-    """Whether an obstacle is no half-space."""
+    any_solid: bool  # whether an obstacle is no half-space
 
     @classmethod
     def create(

@@ -29,28 +29,20 @@ BETTER_M: Final = 1e-5
 class ProjectionOptions:
     """Clearances of the projection, in metres."""
 
-    near: float = 2e-4
-    """Hand points closer to the object than this are moved ..."""
-    target: float = 3.5e-4
-    """... to this distance."""
-    hold: float = 2e-3
-    """Points closer than this are contacts, drawn to `hold_target` with weight `hold_weight`."""
+    near: float = 2e-4  # hand points closer to the object than this are moved ...
+    target: float = 3.5e-4  # ... to this distance
+    hold: float = 2e-3  # points closer than this are contacts, drawn to `hold_target` with weight `hold_weight`
     hold_target: float = 5e-4
     hold_weight: float = 0.02
-    sample_near: float = 2.5e-4
-    """Object samples closer to a link than this are moved to `target`."""
+    sample_near: float = 2.5e-4  # object samples closer to a link than this are moved to `target`
     self_near: float = 2e-4
     self_target: float = 5e-4
-    obstacle_near: float = 2e-4
-    """Hand features closer to an obstacle than their margin plus this are moved ..."""
-    obstacle_target: float = 5e-4
-    """... to their margin plus this."""
-    damping: float = 1e-3
-    """Damping per residual."""
+    obstacle_near: float = 2e-4  # hand features closer to an obstacle than their margin plus this are moved ...
+    obstacle_target: float = 5e-4  # ... to their margin plus this
+    damping: float = 1e-3  # damping per residual
     scale: tuple[float, float, float] = (1.0, 12.5, 25.0)
     """Translation [m], rotation and joints [rad] that move a hand's surface equally: levers of 8 and 4 cm."""
-    step: float = 3e-3
-    """Largest step in units of the scaled variables [m]."""
+    step: float = 3e-3  # largest step in units of the scaled variables [m]
 
 
 def _residuals(capacity: int) -> Any:

@@ -52,8 +52,7 @@ class TaskContext:
     ) -> None:
         """`join`: number of batches planned in one launch; `tell`: receives done, total and a message."""
         self.store, self.device, self.join = store, run.device, join
-        self.run = replace(run, progress=self.progress, cancelled=self.cancelled)
-        """Execution context for the engine."""
+        self.run = replace(run, progress=self.progress, cancelled=self.cancelled)  # execution context for the engine
         self._tell = tell
         self._tell_again = 0.0
         self._stop = threading.Event()

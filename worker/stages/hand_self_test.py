@@ -74,14 +74,10 @@ class SelfTest:
     by_object: dict[str, float]
     table: float
     table_n: int
-    best: BestGrasp | None = None
-    """None: no grasp held."""
-    lost: float = 0.0
-    """Share of failed grasps that lost the object during closing; the others slip under the pushes."""
-    give_m: float = math.inf
-    """Fingertip motion within which its stiffest servo goes from zero to its limit [m]."""
-    limit: Limit | None = None
-    """Payload on a table at full actuator force; None: it lifts nothing."""
+    best: BestGrasp | None = None  # None: no grasp held
+    lost: float = 0.0  # share of failed grasps that lost the object during closing; the others slip under the pushes
+    give_m: float = math.inf  # fingertip motion within which its stiffest servo goes from zero to its limit [m]
+    limit: Limit | None = None  # payload on a table at full actuator force; None: it lifts nothing
 
     @property
     def line(self) -> str:

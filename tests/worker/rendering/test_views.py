@@ -25,7 +25,7 @@ from graspd.worker.rendering.cameras import (
     sample_hemisphere,
     stereo_pair,
 )
-from graspd.worker.rendering.views import TABLE_SIZE
+from graspd.worker.rendering.scenery import TABLE_SIZE
 from tests.worker.models import object_from_mesh
 
 #: What a view promises of its depth [m]; float32 rays over half a metre err by less than a tenth of it.

@@ -14,8 +14,7 @@ PER_UNIT = wp.constant(68719476736.0)
 #: Largest component that one thread may add: hands far inside an object reach about 1e4.
 MOST = wp.constant(1.0e6)
 
-Wrenches = wp.array3d(dtype=wp.int64)
-"""(B, L, 6)."""
+Wrenches = wp.array3d(dtype=wp.int64)  # (B, L, 6)
 
 
 @wp.func
