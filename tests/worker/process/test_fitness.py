@@ -29,6 +29,7 @@ class Bench:
         self.engine_works = True
         self.error: Exception | None = None
         self.checked: list[tuple[Stage, ...]] = []
+        self.told: list[dict[str, str]] = []
         self.fitness = Fitness(self.store, self._check)
 
     def _check(self, stages: Collection[Stage]) -> None:
@@ -43,23 +44,15 @@ class Bench:
             return fake_synthesize(message, context)
 
         runner = Runner({Stage.SYNTHESIZE: stage}, worker="w", publish=lambda event: None, fitness=self.fitness)
-        event = runner.run(message.model_dump(mode="json", by_alias=True), TaskContext(self.store))
-        assert event is not None
-        return event
+        return runner.run(message.model_dump(mode="json", by_alias=True), TaskContext(self.store))
+
+    def sits_out(self, told_to_stop: bool = False) -> bool:
+        """Whether it is fit again after its quarantine."""
+        return self.fitness.sit_out((Stage.SYNTHESIZE,), lambda **facts: self.told.append(facts), lambda: told_to_stop)
 
     def fail(self, seed: int) -> Event:
         self.error = RuntimeError("no result")
         return self.run(message_for(seed=seed).model_copy(update={"task_id": f"{seed:032x}"}))
-
-
-class Listing:
-    """What a worker told about itself."""
-
-    def __init__(self) -> None:
-        self.told: list[dict[str, str]] = []
-
-    def update(self, **facts: str) -> None:
-        self.told.append(facts)
 
 
 @pytest.fixture
@@ -118,12 +111,11 @@ def test_a_success_in_between_ends_the_row(bench: Bench) -> None:
 
 
 def test_a_worker_comes_back_once_its_engine_works(bench: Bench) -> None:
-    listing = Listing()
     bench.engine_works = False
     assert not bench.fitness.try_engine((Stage.SYNTHESIZE,))
     bench.engine_works = True
-    assert bench.fitness.sit_out((Stage.SYNTHESIZE,), listing.update, lambda: False)
-    assert listing.told == [
+    assert bench.sits_out()
+    assert bench.told == [
         {"state": "quarantined", "reason": "synthesize: ImportError: libcuda.so.1"},
         {"state": "idle", "reason": ""},
     ]
@@ -132,17 +124,17 @@ def test_a_worker_comes_back_once_its_engine_works(bench: Bench) -> None:
 def test_a_worker_whose_engine_stays_broken_gives_up_after_some_tries(bench: Bench) -> None:
     bench.engine_works = False
     assert not bench.fitness.try_engine((Stage.SYNTHESIZE,))
-    assert not bench.fitness.sit_out((Stage.SYNTHESIZE,), Listing().update, lambda: False)
+    assert not bench.sits_out()
     assert len(bench.checked) == 1 + len(module.PAUSES_S)
 
 
 def test_a_fault_that_the_check_cannot_see_is_not_cured_by_passing_it(bench: Bench) -> None:
     test_failures_in_a_row_that_others_do_not_have_are_the_workers(bench)
-    assert not bench.fitness.sit_out((Stage.SYNTHESIZE,), Listing().update, lambda: False), "a fresh process must start"
+    assert not bench.sits_out(), "a fresh process must start"
 
 
 def test_a_worker_in_quarantine_stops_when_told(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "PAUSES_S", (600.0,))
     bench.engine_works = False
     assert not bench.fitness.try_engine((Stage.SYNTHESIZE,))
-    assert not bench.fitness.sit_out((Stage.SYNTHESIZE,), Listing().update, lambda: True)
+    assert not bench.sits_out(told_to_stop=True)

@@ -139,17 +139,10 @@ def test_cameras_keep_object_in_a_narrow_field_or_are_refused(ball) -> None:
 
 def test_a_camera_file_says_the_same_as_the_arrays(tmp_path):
     place = look_at(np.array([0.4, 0.1, 0.3]), np.array([0, 0, 0.05]))
+    cameras = [{"eye": [0.4, 0.1, 0.3], "target": [0, 0, 0.05]}, {"extrinsics": place.round(7).tolist()}]
+    pinhole = {"fx": 600, "fy": 601, "cx": 320, "cy": 240}
     path = tmp_path / "cameras.json"
-    path.write_text(
-        json.dumps(
-            {
-                "width": 640,
-                "height": 480,
-                "intrinsics": {"fx": 600, "fy": 601, "cx": 320, "cy": 240},
-                "cameras": [{"eye": [0.4, 0.1, 0.3], "target": [0, 0, 0.05]}, {"extrinsics": place.round(7).tolist()}],
-            }
-        )
-    )
+    path.write_text(json.dumps({"width": 640, "height": 480, "intrinsics": pinhole, "cameras": cameras}))
     given = read_cameras(path)
     assert (given.width, given.height) == (640, 480)
     np.testing.assert_array_equal(given.intrinsics, [[600, 0, 320], [0, 601, 240], [0, 0, 1]])

@@ -23,7 +23,6 @@ from graspd.worker.rendering.cameras import (
     intrinsics,
     look_at,
     sample_hemisphere,
-    stereo_pair,
 )
 from graspd.worker.rendering.scenery import TABLE_SIZE
 from tests.worker.models import object_from_mesh
@@ -97,8 +96,6 @@ def test_depths_are_of_sphere_and_plane_and_infinite_elsewhere(ball_views, ball)
         assert seen.sum() > 500
         assert np.array_equal(seen, square_on)
         assert np.abs(ball_views["image/depth"][view] - depth)[seen].max() < DEPTH_M
-    for view in range(4):
-        origin, rays = world_rays(ball_views, view)
         table = ball_views["image/segmentation"][view] == 1
         depth = -origin[2] / rays[..., 2]
         on_top = np.abs((origin + depth[..., None] * rays)[..., :2]).max(axis=-1) < 0.4 * min(TABLE_SIZE[:2])
@@ -108,15 +105,6 @@ def test_depths_are_of_sphere_and_plane_and_infinite_elsewhere(ball_views, ball)
     nothing = low["image/segmentation"] == 0
     assert nothing.any()
     assert np.array_equal(np.isinf(low["image/depth"]), nothing)
-
-
-def test_unprojected_depth_lies_on_the_mesh(mug, mug_poses, mug_views):
-    points = cameras(mug_views).unproject(np.where(np.isfinite(mug_views["image/depth"]), mug_views["image/depth"], 1))
-    for view, scene in enumerate(mug_views["camera/scene_index"]):
-        seen = points[view][mug_views["image/segmentation"][view] == 2]
-        placed = trimesh.Trimesh(apply(mug_poses[scene], mug.vertices), mug.faces, process=False)
-        _, distance, _ = trimesh.proximity.closest_point(placed, seen[::7])
-        assert distance.max() < 5e-4
 
 
 def test_point_projected_by_cameras_matrices_lands_on_its_pixel(mug_views):
@@ -152,7 +140,6 @@ def test_boxes_are_tight_around_mask_and_contain_what_is_visible(mug_views) -> N
         cells = np.argwhere(mask)
         (top, left), (bottom, right) = cells.min(axis=0), cells.max(axis=0) + 1
         assert mug_views["box/bounding_box_2d_tight"][view].tolist() == [left, top, right, bottom]
-    for view in range(len(mug_views["camera/eye"])):
         tight, loose = (mug_views[f"box/bounding_box_2d_{kind}"][view] for kind in ("tight", "loose"))
         # A pixel whose centre is covered reaches half a pixel past the outline.
         assert np.all(loose[:2] <= tight[:2] + 0.5) and np.all(loose[2:] >= tight[2:] - 0.5)
@@ -197,13 +184,12 @@ def test_segmentation_agrees_with_a_brute_force_ray_caster(mug, mug_poses, mug_v
 
 def test_the_same_seed_gives_the_same_pixels_whatever_is_beside(mug, mug_poses, mug_views) -> None:
     again = shoot(mug, mug_poses)
+    other, alone = shoot(mug, mug_poses, seed=2), shoot(mug, mug_poses[:1])
     for name, values in mug_views.items():
         np.testing.assert_array_equal(values, again[name])
-    other = shoot(mug, mug_poses, seed=2)
     assert not np.array_equal(mug_views["camera/extrinsics"], other["camera/extrinsics"])
-    alone = shoot(mug, mug_poses[:1])
-    np.testing.assert_array_equal(alone["image/rgb"], mug_views["image/rgb"][:4])
-    np.testing.assert_array_equal(alone["image/segmentation"], mug_views["image/segmentation"][:4])
+    for name in ("image/rgb", "image/segmentation"):
+        np.testing.assert_array_equal(alone[name], mug_views[name][:4])
 
 
 @pytest.mark.parametrize(
@@ -231,15 +217,6 @@ def test_columns_are_of_a_views_shard_and_mono_pictures_say_so(mug_views, ball) 
     assert mono["camera/stereo_baseline_m"].tolist() == [0.0, 0.0]
     with pytest.raises(InputError, match="at least one"):
         shoot(ball, REST, views=0)
-
-
-def test_the_object_casts_a_shadow(ball, ball_views):
-    """The darkest table pixels near the ball are much darker than the table's median."""
-    views = shoot(ball, REST, views=4, stereo=False, samples=8)
-    brightness = views["image/rgb"].astype(float).mean(axis=-1)
-    for view in range(4):
-        table = brightness[view][views["image/segmentation"][view] == 1]
-        assert np.percentile(table, 2) < 0.75 * np.median(table)
 
 
 def test_a_cancelled_render_stops_and_progress_ends_with_all(ball, monkeypatch) -> None:
@@ -276,37 +253,15 @@ def sampled(seed: int, views: int = 12) -> Cameras:
 
 
 def test_a_camera_looks_at_its_target_upright_in_its_field() -> None:
-    matrix = look_at(np.array([0.3, 0.2, 0.4]), CENTRE)
-    camera = Cameras(320, 240, intrinsics(320, 240), matrix[None])
-    pixels, depth = camera.project(CENTRE + np.array([[0, 0, 0], [0, 0, 0.05]]))
-    np.testing.assert_allclose(pixels[0, 0], [160, 120], atol=1e-9)
-    assert depth[0, 0] == pytest.approx(np.linalg.norm(CENTRE - [0.3, 0.2, 0.4]))
-    assert pixels[0, 1, 0] == pytest.approx(160, abs=1e-9)
-    assert pixels[0, 1, 1] < 120
     k = intrinsics(320, 240)
+    camera = Cameras(320, 240, k, look_at(np.array([0.3, 0.2, 0.4]), CENTRE)[None])
+    pixels, depth = camera.project(CENTRE + np.array([[0, 0, 0], [0, 0, 0.05]]))
+    np.testing.assert_allclose(pixels[0, :, 0], [160, 160], atol=1e-9)
+    assert pixels[0, 0, 1] == pytest.approx(120) and pixels[0, 1, 1] < 120
+    assert depth[0, 0] == pytest.approx(np.linalg.norm(CENTRE - [0.3, 0.2, 0.4]))
     assert 2 * np.arctan(120 / k[1, 1]) == pytest.approx(FIELD_OF_VIEW)
     top = pixel_rays(k, 320, 240)[0, 0]
     np.testing.assert_allclose(top, [-159.5 / k[0, 0], -119.5 / k[1, 1], 1.0])
-
-
-def test_extrinsics_are_rigid_and_the_right_eye_stands_along_x():
-    for eye in ((0.0, 0.0, 0.5), (0.3, -0.2, 0.1)):
-        rotation = look_at(np.array(eye), np.zeros(3))[:3, :3]
-        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
-        assert np.linalg.det(rotation) == pytest.approx(1.0)
-    middle = look_at(np.array([0.3, 0.2, 0.4]), CENTRE)
-    pair = Cameras(320, 240, intrinsics(320, 240), np.stack(stereo_pair(middle, 0.06)))
-    np.testing.assert_allclose(pair.centre[1] - pair.centre[0], 0.06 * middle[0, :3], atol=1e-12)
-    np.testing.assert_array_equal(pair.extrinsics[0, :3, :3], pair.extrinsics[1, :3, :3])
-
-
-def test_unprojecting_what_was_projected_gives_the_point_back():
-    camera = sampled(0, views=3)
-    depth = np.random.default_rng(0).uniform(0.2, 0.6, (3, 240, 320))
-    points = camera.unproject(depth).reshape(3, -1, 3)
-    pixels, back = camera.project(points)
-    np.testing.assert_allclose(back.reshape(depth.shape), depth, atol=1e-12)
-    np.testing.assert_allclose(pixels[1].reshape(240, 320, 2)[5, 7], [7.5, 5.5], atol=1e-9)
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -224,7 +224,6 @@ def test_batch_has_the_same_bits_where_threads_come_in_any_order(monkeypatch: py
         (part,) = planner.optimise_batch(
             two_finger_hand(), box, PlanRequest(2, FIDELITY, seed=3), ExecutionContext("cpu", threads=1)
         )
-        assert part.state is not None
         states.append(part.state)
     for name in ("pivot", "rotation", "q"):
         assert (getattr(states[0], name) == getattr(states[1], name)).all()
@@ -300,8 +299,6 @@ def test_replayed_graphs_give_the_very_hands_of_plain_launches(monkeypatch: pyte
     assert graphs.captured == 3  # the coarse and the fine phase, and the projection
     steps = FIDELITY.coarse_iterations + FIDELITY.fine_iterations + FIDELITY.polish_iterations
     assert graphs.replayed == steps
-    assert plain.state is not None
-    assert replayed.state is not None
     for name in ("pivot", "rotation", "q"):
         np.testing.assert_array_equal(getattr(plain.state, name), getattr(replayed.state, name))
 

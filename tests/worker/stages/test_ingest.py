@@ -73,7 +73,7 @@ def test_a_hand_is_tried_if_its_record_says_so(context: TaskContext, monkeypatch
     monkeypatch.setattr(hand_self_test, "self_test", stand_in)
     files = {"asset.json": b'{"file": "gripper.urdf"}', "gripper.urdf": gripper_urdf()}
     untried = run(context.store, context, files, AssetKind.HAND)
-    assert not candidates and "self_test" not in untried["facts"]  # type: ignore[operator]
+    assert not candidates and "self_test" not in untried["facts"]
     asset = store_files(context.store, AssetKind.HAND, "mine", {**files, "note.txt": b"x"}, said={"self_test": True})
     record_asset(context.store, asset)
     message = IngestMessage(schema_=1, task_id="i", kind=AssetKind.HAND, name="mine", digest=asset.digest)
@@ -109,7 +109,7 @@ def test_a_disk_without_room_says_nothing_about_the_file(
 
     def full(arguments: list[str], **options: object) -> object:
         # The child cannot write what it found.
-        return command([*arguments[:6], str(target), *arguments[7:]], **options)  # type: ignore[call-overload]
+        return command([*arguments[:6], str(target), *arguments[7:]], **options)
 
     monkeypatch.setattr(ingest.subprocess, "Popen", full)
     with pytest.raises(OSError, match="No space left on device"):
@@ -121,7 +121,7 @@ def child_does(monkeypatch: pytest.MonkeyPatch, code: str) -> None:
     command = ingest.subprocess.Popen
 
     def other(arguments: list[str], **options: object) -> object:
-        return command([sys.executable, "-c", f"import os, signal, sys\n{code}", arguments[6]], **options)  # type: ignore[call-overload]
+        return command([sys.executable, "-c", f"import os, signal, sys\n{code}", arguments[6]], **options)
 
     monkeypatch.setattr(ingest.subprocess, "Popen", other)
 
@@ -160,7 +160,7 @@ def test_a_check_that_is_stopped_ends_its_child(
     popen = ingest.subprocess.Popen
 
     def spy(*args: object, **kwargs: object) -> object:
-        child = popen(*args, **kwargs)  # type: ignore[call-overload]
+        child = popen(*args, **kwargs)
         pids.append(child.pid)
         context.stop(reason)
         return child
@@ -233,7 +233,7 @@ def upload(store: Store, kind: AssetKind, filename: str, data: bytes, options: d
     outcome = Runner({Stage.INGEST: ingest.run}, worker="w", publish=lambda event: None).run(
         message.model_dump(mode="json", by_alias=True), TaskContext(store)
     )
-    assert outcome is not None and outcome.kind is EventKind.FINISHED, outcome
+    assert outcome.kind is EventKind.FINISHED, outcome
     return json.loads(store.get(names.asset_check(kind, asset.digest)))
 
 
@@ -376,7 +376,7 @@ def rough(segments: int) -> bytes:
 def test_a_mesh_that_costs_too_much_is_refused_the_next_taken(limits: dict[str, int], says: str) -> None:
     context, start = TaskContext(open_store("memory://")), computed()
     files = {"asset.json": b'{"file": "m.stl"}', "m.stl": rough(512)}
-    found, _ = ingest.check_in_child(AssetKind.OBJECT, "rough", files, context, **limits)  # type: ignore[arg-type]
+    found, _ = ingest.check_in_child(AssetKind.OBJECT, "rough", files, context, **limits)
     assert found["verdict"] == "refuse" and says in found["message"]
     assert computed() - start < BOUND_S
     feasible = {"asset.json": b'{"file": "m.stl"}', **BALL}

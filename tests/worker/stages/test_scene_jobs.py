@@ -72,7 +72,7 @@ def test_grasps_stand_in_the_scenes_that_were_made_first(table: Bench) -> None:
     assert len(first["grasp/valid"]) == 0
     manifest = load_manifest(table.store, Stage.SYNTHESIZE, str(base.attributes["shard_id"]))
     assert manifest.valid == 6 == (base["quality/lift_outcome"] == 1).sum()
-    assert all(one.clearance_m >= 0.002 and one.lift_hard is not None for one in manifest.grasps)  # type: ignore[operator]
+    assert all(one.clearance_m >= 0.002 and one.lift_hard is not None for one in manifest.grasps)
     assert 0 < manifest.info["lift_share"] <= manifest.info["clear_share"] <= 1
 
 
@@ -121,7 +121,7 @@ def test_neighbours_in_a_bin_stand_in_scenes_grasps_and_pictures(table: Bench) -
     assert base["scene/neighbour_pose"].shape == (1, 2, 7)
     np.testing.assert_array_equal(base["scene/neighbour_pose"], first["scene/neighbour_pose"])
     scenes = placed_of_shard(base)
-    assert scenes is not None and len(scenes.neighbours) == 2
+    assert len(scenes.neighbours) == 2
     assert table.store.exists(names.asset_model(AssetKind.OBJECT, beside[0]["digest"])), "viewers show it"
     alone = render_alone(bench, base)
     assert (views["image/depth"] != alone["image/depth"]).any(), "they are in the picture"
@@ -207,7 +207,7 @@ def test_a_forged_task_with_a_nonsense_scene_is_refused(table: Bench, nonsense: 
     task = next(plan(table.job))
     message = message_of(table.job, task, attempt=1, max_attempt=3).model_dump(mode="json", by_alias=True)
     message["request"]["scene"] = nonsense
-    runner = Runner(STAGES, worker="w", publish=lambda event: None)  # type: ignore[arg-type]
+    runner = Runner(STAGES, worker="w", publish=lambda event: None)
     with pytest.raises(TaskRefused, match="no task of graspd"):
         runner.run(message, TaskContext(open_store(tmp_path.as_uri())))
     assert list(tmp_path.iterdir()) == []
