@@ -219,6 +219,13 @@ def test_columns_are_of_a_views_shard_and_mono_pictures_say_so(mug_views, ball) 
         shoot(ball, REST, views=0)
 
 
+def test_the_object_casts_a_shadow(ball) -> None:
+    views = shoot(ball, REST, views=4, stereo=False, samples=8)
+    for picture, labels in zip(views["image/rgb"], views["image/segmentation"], strict=True):
+        brightness = picture.astype(float).mean(axis=-1)[labels == 1]
+        assert np.percentile(brightness, 2) < 0.75 * np.median(brightness)
+
+
 def test_a_cancelled_render_stops_and_progress_ends_with_all(ball, monkeypatch) -> None:
     monkeypatch.setattr("graspd.worker.rendering.tracer.PIXELS_OF_A_CORE", 1)
     answers = iter([False, True])
