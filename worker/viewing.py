@@ -104,7 +104,6 @@ class Models:
             self._around.append(node)
 
     def show_scene(self, on: bool) -> None:
-        """Show or hide supports and neighbours."""
         for node in self._around:
             node.visible = on
 
@@ -184,7 +183,7 @@ def missing() -> str:
 
 @dataclass(frozen=True)
 class ViewerContent:
-    """Content of a viewer: a base shard with its hand, object and neighbours."""
+    """A base shard with its hand, object and neighbours."""
 
     shard: Shard
     hand: HandModel
@@ -197,10 +196,7 @@ class Viewer:
 
     def __init__(self, shown: ViewerContent, *, host: str = "127.0.0.1", port: int = 8080) -> None:
         """Start the server on a port (0: any free one; else the first free one from there on).
-
-        Raises:
-            InputError: viser is not installed, the file holds no grasps, or the address cannot be used.
-        """
+        Raises InputError: viser is not installed, the file holds no grasps, or the address cannot be used."""
         if said := missing():
             raise InputError(said)
         self._shown, self._arrays = shown, shown.shard.arrays

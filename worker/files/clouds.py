@@ -31,10 +31,7 @@ def write_clouds(clouds: Clouds, folder: Path, said: Mapping[str, Any]) -> dict[
 
     An npz has the keys of a sample (docs/how-to/clouds.md) stacked over its C clouds. Arrays with a row per grasp are
     concatenated cloud by cloud; `grasp/count` (C,) is the number of rows of each cloud.
-
-    Raises:
-        ConflictError: the folder exists and is not empty.
-    """
+    Raises ConflictError: the folder exists and is not empty."""
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise ConflictError(f"{folder} is there already; name another folder")
     folder.mkdir(parents=True, exist_ok=True)
@@ -66,10 +63,7 @@ _hands: LRUCache[Any, HandModel] = LRUCache(8)
 
 def hand_surface(shard: Shard, rows: NDArray[np.intp]) -> Floats:
     """Return points (K, H, 3) on the hand's surface at contact of rows (K,) of a base shard, in the object's frame [m].
-
-    Raises:
-        NotFoundError: the hand of the shard is not available here.
-    """
+    Raises NotFoundError: the hand of the shard is not available here."""
     hand = _hand(shard)
     points = sample_surface(hand, POINTS)
     pose, joints = (np.asarray(shard[f"grasp/{part}"], float)[rows] for part in ("hand_pose", "joint_positions"))

@@ -47,10 +47,7 @@ class Balance:
 
     def __call__(self, shards: list[Shard]) -> list[NDArray[np.bool_]]:
         """Return masks of selected grasps: valid, drawn at random by the seed, limited per category.
-
-        Raises:
-            InputError: a shard lacks the category.
-        """
+        Raises InputError: a shard lacks the category."""
         kinds = self._kinds(shards)
         wanted = np.concatenate([validity.valid(shard.arrays) for shard in shards])
         if self.min_distance > 0 and wanted.any():

@@ -79,10 +79,7 @@ def remembered(hand: str, obj: str, options: Mapping[str, Any]) -> dict[str, Att
 
 def find(sought: AssetReference) -> AssetFiles:
     """Find the files of a hand or object: built in, at the shard's path, in the store or shard's folder.
-
-    Raises:
-        NotFoundError: in none of these; the message lists the places.
-    """
+    Raises NotFoundError: in none of these; the message lists the places."""
     if sought.name in builtin_names(sought.kind):
         files = builtin_files(sought.kind, sought.name)
         if digest_files(sought.kind, files) == sought.digest:
@@ -257,10 +254,7 @@ def _neighbour(shard: Shard, name: str, digest: str, source: str) -> ObjectModel
 
 def placed_of_shard(shard: Shard) -> PlacedGrasps | None:
     """Return the scenes of a base shard's grasps; None if they were planned around a free object.
-
-    Raises:
-        InputError: the shard's scene attribute is invalid.
-    """
+    Raises InputError: the shard's scene attribute is invalid."""
     if "scene/object_pose" not in shard.arrays or "grasp/scene_index" not in shard.arrays:
         return None
     if (spec := scene_spec_of(shard)) is None:

@@ -34,10 +34,7 @@ class Subset:
 
 def shards_of(source: str, snapshot: str | None = None) -> Shards:
     """Return the shards of a file or folder, or of a dataset in this machine's store by name.
-
-    Raises:
-        NotFoundError: none of these exists.
-    """
+    Raises NotFoundError: none of these exists."""
     if "/" in source or source in (".", "..") or Path(source).exists():
         return open_shards(Path(source))
     try:
@@ -57,10 +54,7 @@ def write_subset(shards: Shards, choose: Chooser, out: Path, *, said: Mapping[st
     """Write base shards of selected grasps, `HAND/OBJECT/base-BATCH.h5`, and the selection, `subset.json`.
 
     Shards without selected grasps are left out. All columns of a grasp, including its scene, are unchanged.
-
-    Raises:
-        InputError: the folder contains files already or cannot be made; or nothing is selected.
-    """
+    Raises InputError: the folder contains files already or cannot be made; or nothing is selected."""
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"{out} is there already; choose a folder that is not")
     looked_at = kept = 0
@@ -89,10 +83,7 @@ EveryOption = Annotated[bool, typer.Option("--all", help="Select all grasps, inc
 
 def choose(base: Shard, *, unvalidated: bool = False, every: bool = False) -> tuple[NDArray[np.bool_], str]:
     """Select grasps (N,), and return a name for the selection.
-
-    Raises:
-        InputError: both options at once, or no such grasp; the message states what the shard contains.
-    """
+    Raises InputError: both options at once, or no such grasp; the message states what the shard contains."""
     if unvalidated and every:
         raise InputError("--unvalidated and --all exclude each other")
     count = len(base["quality/valid"])

@@ -50,8 +50,6 @@ class ProcessLost(GraspdError):
 
 @dataclass(eq=False)
 class _Request:
-    """Request of one caller."""
-
     work: Callable[[Any, Any], Any]
     key: str
     shared: Any
@@ -80,11 +78,9 @@ class Pool(AbstractContextManager["Pool"]):
 
     @property
     def pids(self) -> list[int]:
-        """Return the ids of running processes."""
         return [place.process.pid for place in self._places if place.process is not None]
 
     def start(self) -> None:
-        """Start the processes if they are not running."""
         with self._changing:
             for place in self._places if not (self._started or self._closed) else ():
                 with suppress(OSError):  # reported on use of the process

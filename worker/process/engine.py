@@ -67,7 +67,6 @@ class Engine:
         self._context: TaskContext | None = None
 
     def serve(self) -> None:
-        """Process orders until `end`."""
         with self._connection:
             threading.Thread(target=self._listen, name="engine-orders", daemon=True).start()
             try:
@@ -90,7 +89,6 @@ class Engine:
             self._do(about)
 
     def update(self, **facts: str | float) -> None:
-        """Send facts for the list of workers."""
         self._say("facts", facts)
 
     def _start(self) -> None:
@@ -209,13 +207,10 @@ class TaskResources:
         return Pool(count, MODULES) if count > 1 else None
 
     def close(self) -> None:
-        """End all resources started for tasks."""
         if (pool := vars(self).get("_pool")) is not None:
             pool.close()
 
     def context(self, raw: Mapping[str, Any], update: Callable[..., None]) -> TaskContext:
-        """Return the context of a task; `update` receives its progress."""
-
         def tell(done: float, total: float, message: str) -> None:
             update(done=done, total=total, message=message[:200])
 

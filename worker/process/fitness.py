@@ -52,8 +52,6 @@ def first_loss(task: str) -> bool:
 
 
 class Fitness:
-    """State of a worker's fitness."""
-
     def __init__(self, store: Store, check: Check | None = None) -> None:
         """Without `check` only results of other workers decide."""
         self._store = store
@@ -63,7 +61,6 @@ class Fitness:
         self.reason = ""  # reason why the worker is unfit; "" while it is fit
 
     def try_engine(self, stages: Collection[Stage]) -> bool:
-        """Check the engine for these stages."""
         try:
             if self._check is not None:
                 self._check(stages)
@@ -75,7 +72,6 @@ class Fitness:
         return True
 
     def passed(self) -> None:
-        """Record that a task succeeded here."""
         self._failed.clear()
 
     def doubt(self, message: Message, error: Exception) -> str:
@@ -93,11 +89,7 @@ class Fitness:
         return self.reason
 
     def sit_out(self, stages: Collection[Stage], update: Callable[..., None], told_to_stop: Callable[[], bool]) -> bool:
-        """Wait in quarantine; return whether the worker is fit again. Ends early if the worker must stop.
-
-        Args:
-            update: receives facts for the list of workers.
-        """
+        """Wait in quarantine and tell `update` so; return whether the worker is fit again, or False if it must stop."""
         log.warning("this worker takes no tasks: %s", self.reason)
         for pause in PAUSES_S:
             update(state="quarantined", reason=self.reason)

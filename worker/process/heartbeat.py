@@ -40,14 +40,8 @@ class Heartbeat:
         alive: Path | None = None,
         is_stopped: Callable[[], bool] = lambda: False,
     ) -> None:
-        """
-        Args:
-            url: of Redis.
-            beat: initial entry in the list of workers.
-            lease_s: lifetime of the registration after a heartbeat [s].
-            alive: a file that is touched with each heartbeat.
-            is_stopped: whether the worker hangs although this thread runs: then there is no heartbeat.
-        """
+        """`lease_s`: lifetime of the registration after a heartbeat [s]; `alive`: a file that is touched with each one;
+        `is_stopped`: whether the worker hangs although this thread runs: then there is no heartbeat."""
         self._connection: Any = connect(url, patience=0, timeout_s=_ANSWER_S)
         self._facts, self._lease_s = asdict(beat), lease_s
         self._alive, self._is_stopped = HeartbeatFile(alive), is_stopped

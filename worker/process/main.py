@@ -143,7 +143,6 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
                 due = time.monotonic() + self._heartbeat.interval_s
 
     def _pass_on(self, word: str, about: Any) -> None:
-        """Process facts and events from the engine."""
         if word == "refused":
             raise about
         if word == "facts":

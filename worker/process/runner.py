@@ -38,11 +38,7 @@ from graspd.worker.process.fitness import Fitness, first_loss
 from graspd.worker.stages.context import StageFunction, StopReason, TaskContext, shard_of
 
 log = logging.getLogger(__name__)
-
-
-Publish = Callable[[Event], None]
 _TRACE_CHARACTERS: Final = 8000
-
 _STOPPED: Final = {StopReason.CANCELLED: EventKind.CANCELLED, StopReason.SHUTDOWN: EventKind.RETURNED}
 
 
@@ -54,7 +50,7 @@ class Runner:
         stages: Mapping[Stage, StageFunction],
         *,
         worker: str,
-        publish: Publish,
+        publish: Callable[[Event], None],
         fitness: Fitness | None = None,
         check_device: Callable[[str], None] = check_device,
     ) -> None:

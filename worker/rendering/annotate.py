@@ -53,10 +53,7 @@ ALL: Final = "all"
 
 def parse_channels(words: Iterable[str]) -> tuple[str, ...]:
     """Return the channels in fixed order, without duplicates; `all` stands for every one.
-
-    Raises:
-        InputError: a channel is unknown.
-    """
+    Raises InputError: a channel is unknown."""
     wanted = {word.strip() for word in words if word.strip()}
     if unknown := sorted(wanted - {*EXTRA_CHANNELS, ALL}):
         meant = did_you_mean(unknown[0], EXTRA_CHANNELS)

@@ -71,10 +71,7 @@ def intrinsics(width: int, height: int, field_of_view: float = FIELD_OF_VIEW) ->
 
 def narrow_field(k: Floats, width: int, height: int) -> float:
     """Return the opening angle of the widest cone around the optical axis within the picture [rad].
-
-    Raises:
-        InputError: the principal point lies outside the picture.
-    """
+    Raises InputError: the principal point lies outside the picture."""
     slopes = [k[0, 2] / k[0, 0], (width - k[0, 2]) / k[0, 0], k[1, 2] / k[1, 1], (height - k[1, 2]) / k[1, 1]]
     if min(slopes) <= 0:
         raise InputError(
@@ -190,10 +187,7 @@ def read_cameras(path: Path) -> GivenCameras:
 
     All keys are optional: `width`, `height` [px]; `intrinsics`, a 3 x 3 matrix or `fx fy cx cy` [px]; `cameras`, a list
     of `{"extrinsics": 4 x 4}` (table to camera) or `{"eye": [x, y, z], "target": [x, y, z]}` (table frame [m]).
-
-    Raises:
-        InputError: the file cannot be read, or describes no possible camera.
-    """
+    Raises InputError: the file cannot be read, or describes no possible camera."""
     try:
         file = _File.model_validate_json(path.read_bytes())
     except OSError as error:

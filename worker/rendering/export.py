@@ -33,10 +33,7 @@ def export_images(views: Shard, folder: Path, *, depth: DepthFormat = "exr") -> 
     `rgb_hand_NNNN.png`. Once: `labels.json`.
 
     The folder is created if absent. Return the files.
-
-    Raises:
-        InputError: the folder cannot be written, or has such files already.
-    """
+    Raises InputError: the folder cannot be written, or has such files already."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

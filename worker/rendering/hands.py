@@ -47,7 +47,6 @@ class DrawnHand:
 
     @property
     def parts(self) -> tuple[MovingSolid, ...]:
-        """The drawn solids."""
         return drawn_parts(self.hand, mounted=self.wrist is not None)
 
 

@@ -58,24 +58,11 @@ def grasp_pictures(
     run: ExecutionContext = DEFAULT_CONTEXT,
     samples: int = SAMPLES,
 ) -> NDArray[np.uint8]:
-    """Render N grasps from A sides.
+    """Render N grasps, root poses (N, 7) in the object frame and joints (N, J), from A sides: (N, A, H, W, 3) sRGB.
 
-    Args:
-        hand: the hand; its convex pieces are drawn.
-        obj: the object, its z axis up.
-        hand_pose: (N, 7) pose of the root link in the object frame.
-        joint_positions: (N, J).
-        size: width and height [px].
-        azimuths: A sides [rad] about the vertical; 0 looks across the direction in which the palm approaches.
-        run: polled for cancellation between passes.
-        samples: rays per pixel.
-
-    Returns:
-        (N, A, H, W, 3) sRGB.
-
-    Raises:
-        TaskCancelled: `run.cancelled()` returned True.
-    """
+    Azimuths [rad] are about the object's z axis; 0 looks across the direction in which the palm approaches. The hand's
+    convex pieces frame the picture of this size [px].
+    Raises TaskCancelled: `run.cancelled()` returned True."""
     hand_pose = moved(np.atleast_2d(np.asarray(hand_pose, float)), np.negative(obj.centre))
     obj = obj.centred
     joints = np.atleast_2d(np.asarray(joint_positions, float))

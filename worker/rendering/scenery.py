@@ -98,13 +98,8 @@ def slabs(supports: Supports) -> list[Box]:
 
 
 def slab_poses(supports: Supports, middle: Floats, yaw: float) -> Floats:
-    """Return poses (P, 7) of the boxes of `slabs` in the scene frame.
-
-    Args:
-        supports: of the scene.
-        middle: (3,) position of the object.
-        yaw: turn of half-spaces' slabs about their normal [rad].
-    """
+    """Return poses (P, 7) of the boxes of `slabs` in the scene frame, for an object at `middle` (3,).
+    `yaw` turns half-spaces' slabs about their normal [rad]."""
     poses = [_box_pose(s) if isinstance(s, BoxSupport) else _slab_pose(s, middle, yaw) for s in supports]
     return np.array(poses).reshape(-1, 7)
 

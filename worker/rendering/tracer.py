@@ -68,12 +68,7 @@ class Tracer:
         self._corners = np.stack([_corners(solid) for solid in solids])
 
     def place(self, poses: Floats, looks: Sequence[Sequence[Appearance]]) -> None:
-        """Place the solids in their worlds.
-
-        Args:
-            poses: (worlds, P, 7) of each solid in its world.
-            looks: for each world the P materials.
-        """
+        """Place the solids in their worlds: poses (worlds, P, 7), and for each world the P materials."""
         poses = np.asarray(poses, float)
         corners = apply(poses[:, :, None], self._corners)
         placed = np.tile(self._shapes, (len(poses), 1))
@@ -86,14 +81,9 @@ class Tracer:
     def shoot(self, shot: CameraShot, run: ExecutionContext = DEFAULT_CONTEXT) -> Pictures:
         """Trace all cameras.
 
-        Args:
-            shot: cameras and light.
-            run: its threads share the rows of each picture, a GPU takes many pictures at once; receives finished
-                pictures and is polled before each launch.
-
-        Raises:
-            TaskCancelled: `run.cancelled()` returned True.
-        """
+        The threads of `run` share the rows of each picture; a GPU takes many pictures at once. `run` receives finished
+        pictures and is polled before each launch.
+        Raises TaskCancelled: `run.cancelled()` returned True."""
         cuda = wp.get_device(self.device).is_cuda
         threads = 1 if cuda else min(run.cores, shot.height)
         count, pixels = len(shot.world), len(shot.world) * shot.height * shot.width

@@ -79,7 +79,6 @@ class PictureScenes:
         return replace(self, object_pose=to_centre(self.object_pose, obj.centre), neighbours=beside)
 
     def scene(self, number: int) -> int:
-        """Return the scene of a grasp."""
         return 0 if self.index is None else int(self.index[number])
 
 
@@ -95,25 +94,11 @@ def way_pictures(
     run: ExecutionContext = DEFAULT_CONTEXT,
     samples: int = SAMPLES,
 ) -> NDArray[np.uint8]:
-    """Render N grasps, F postures each, from A sides.
+    """Render N grasps, F postures each in the frame of the object at rest, from A sides: (N, A, F, H, W, 3) sRGB.
 
-    Args:
-        hand: its bodies are drawn.
-        obj: the object, carried along by each posture.
-        frames: for each grasp F postures in the frame of the object at rest.
-        around: the scenes.
-        size: width and height [px].
-        sides: A sides of each grasp, ordered by how much of object and fingers they show.
-        whole: frame the whole hand; else parts far from the object may leave the picture.
-        run: polled for cancellation between passes.
-        samples: rays per pixel.
-
-    Returns:
-        (N, A, F, H, W, 3) sRGB.
-
-    Raises:
-        TaskCancelled: `run.cancelled()` returned True.
-    """
+    Sides are ordered by how much of object and fingers they show. `whole` frames the whole hand; else parts far from
+    the object may leave the picture.
+    Raises TaskCancelled: `run.cancelled()` returned True."""
     if not frames:
         return np.zeros((0, sides, 0, size[1], size[0], 3), np.uint8)
     stage = _Stage(hand, obj, around, len(frames[0]), run, np.inf if whole else _NEAR_M)
@@ -223,27 +208,17 @@ _PALETTE_OF: Final = 9
 
 
 def animation_kind(suffix: str) -> str:
-    """Return the suffix in lower case.
-
-    Raises:
-        InputError: no animation format has this suffix.
-    """
+    """Return the suffix in lower case; raise InputError if no animation format has it."""
     if (small := suffix.lower()) not in KINDS:
         raise InputError(f"an animation is written as {', '.join(KINDS)}, not as {suffix or 'a file without suffix'}")
     return small
 
 
 def animation(pictures: NDArray[np.uint8], seconds: Sequence[float], suffix: str) -> bytes:
-    """Encode a looping film.
+    """Encode a looping film of pictures (F, H, W, 3) sRGB; `suffix` is one of `KINDS`.
 
-    Args:
-        pictures: (F, H, W, 3) sRGB.
-        seconds: (F,) duration of each; files store milliseconds, a GIF hundredths of a second.
-        suffix: one of `KINDS`.
-
-    Raises:
-        InputError: no animation format has this suffix.
-    """
+    Durations [s] are stored in milliseconds, in a GIF in hundredths of a second.
+    Raises InputError: no animation format has this suffix."""
     kind = animation_kind(suffix)
     images = [Image.fromarray(picture) for picture in pictures]
     if kind == ".gif":

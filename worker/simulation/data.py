@@ -156,10 +156,7 @@ class Data:
 
     def set_schedule(self, schedule: Schedule) -> None:
         """Upload the per-iteration tables; earlier records keep the tables they were recorded with.
-
-        Raises:
-            ValueError: a dilation above `MAX_DILATION`.
-        """
+        Raises ValueError: a dilation above `MAX_DILATION`."""
         if len(schedule) and schedule.dilation.max() > MAX_DILATION:
             raise ValueError(f"the dilation may be at most {MAX_DILATION} m")
         with wp.ScopedDevice(self.device):

@@ -47,10 +47,7 @@ class Obstacle:
     @classmethod
     def half_space(cls, normal: Sequence[float] | Floats, offset: float) -> Obstacle:
         """Return everything below the plane n.x = offset; the normal need not have unit length.
-
-        Raises:
-            InputError: the normal is zero or not finite.
-        """
+        Raises InputError: the normal is zero or not finite."""
         n = np.asarray(normal, float)
         length = float(np.linalg.norm(n))
         if n.shape != (3,) or not np.isfinite(n).all() or not np.isfinite(offset) or length < 1e-9:
@@ -60,10 +57,7 @@ class Obstacle:
     @classmethod
     def box(cls, pose: Sequence[float] | Floats, size: Sequence[float] | Floats) -> Obstacle:
         """Return a box of full extents `size` (3,) [m] about the origin of `pose` (7,).
-
-        Raises:
-            InputError: an extent is not positive, or a number is not finite.
-        """
+        Raises InputError: an extent is not positive, or a number is not finite."""
         pose, half = np.asarray(pose, float), np.asarray(size, float) / 2
         if half.shape != (3,) or not np.isfinite(half).all() or (half <= 0).any():
             raise InputError(f"a box needs three extents above 0; got {size}")

@@ -33,11 +33,8 @@ _MOST_CELLS: Final = 96
 def add_grid(skin: Any, obj: ObjectModel, mesh: Any, cell: float) -> None:
     """Add the distance grid and the lists of its cells to a surface, on the current Warp device.
 
-    Args:
-        skin: a `surface.Surface` without them, its `cells.faces` filled; written to.
-        obj: its object.
-        mesh: its `warp.Mesh`, vertices about the centre of mass.
-        cell: cell size of the grid [m].
+    `skin` is a `surface.Surface` with `cells.faces`; `mesh` is its `warp.Mesh`, vertices about the centre of mass;
+    `cell` is the cell size of the grid [m].
     """
     low = obj.vertices.min(axis=0) - obj.centre_of_mass - FIELD_REACH
     high = obj.vertices.max(axis=0) - obj.centre_of_mass + FIELD_REACH

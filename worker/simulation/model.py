@@ -82,11 +82,7 @@ class Model:
         options: LossOptions,
         obstacles: DeviceObstacles | None = None,
     ) -> Model:
-        """Create the model and upload the points to the hand's device.
-
-        Raises:
-            InputError: unknown contact solver.
-        """
+        """Create the model, points on the hand's device; raise InputError for an unknown contact solver."""
         if options.contact_solver not in SOLVERS:
             raise InputError(f"unknown contact solver {options.contact_solver!r}; choose one of {', '.join(SOLVERS)}")
         weight = points.area * (REFERENCE_POINTS / points.area.sum())

@@ -37,12 +37,8 @@ def mounting_room(
 ) -> tuple[Floats, Floats]:
     """Choose wrist angles that stay constant while the hand moves; return the mounting's clearance.
 
-    Args:
-        hand: the hand.
-        poses: (N, P, 7) poses of the root of each of N hands, object frame.
-        scenes: the environments.
-        which: (N,) scene of each hand; by default the first.
-        enough: clearance from obstacles at which the search ends [m].
+    `poses` (N, P, 7) are those of the root of each of N hands, object frame; `which` (N,) the scene of each, by default
+    the first. The search ends at a clearance of `enough` [m].
 
     Returns:
         (N, K) wrist angles: the first of `wrist_positions` with enough clearance, among those whose points have it,

@@ -158,14 +158,9 @@ class DeviceObstacles:
         *,
         margin: float | Floats = MARGIN_M,
     ) -> DeviceObstacles:
-        """Upload obstacles.
+        """Upload obstacles in the object frame.
 
-        Args:
-            hand: the hand.
-            scenes: the environments, object frame.
-            centre: (3,) the object's centre of mass, object frame.
-            device: Warp device.
-            margin: clearance [m], of all features or (L,) of each body.
+        `centre` (3,) is the object's centre of mass; `margin` the clearance [m] of all features, or (L,) of each body.
         """
         found = hand.features
         kept = np.broadcast_to(np.asarray(margin, float), hand.bodies)[found.body]

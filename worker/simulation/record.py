@@ -54,10 +54,7 @@ def record_iteration(m: Model, d: Data, optimizer: str, *, patience: int = 0) ->
     """Record one iteration: gradient and step.
 
     With a `patience`, a grasp without improvement for so many iterations is switched off and costs nothing more.
-
-    Raises:
-        InputError: unknown optimizer.
-    """
+    Raises InputError: unknown optimizer."""
     out = record_evaluation(m, d)
     add_step(out, m, d, optimizer, patience=patience)
     return out

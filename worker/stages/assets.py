@@ -48,7 +48,6 @@ _lock = threading.RLock()
 
 
 def hand_of(store: Store, message: TaskMessage) -> HandModel:
-    """Load the hand of a task."""
     name, digest = message.request.hand, message.hand_digest
     key = (store.url, AssetKind.HAND, name, digest)
 
@@ -103,10 +102,7 @@ def _neighbour(store: Store, name: str, digest: str) -> ObjectModel:
 
 def keep_network(store: Store, message: TaskMessage) -> None:
     """Cache the network that a task's method takes, if any, under the digest in the method's options.
-
-    Raises:
-        NotFoundError, InputError: it is not in the store, or does not match its digest.
-    """
+    Raises NotFoundError, InputError: it is not in the store, or does not match its digest."""
     if not (digest := message.request.network):
         return
 

@@ -99,12 +99,8 @@ def shard_of(
 ) -> tuple[ShardManifest, bytes]:
     """Build the shard of a stage: its manifest and its HDF5 bytes.
 
-    Args:
-        lost: manifest of the file that this one replaces; its time and worker are retained.
-
-    Raises:
-        InputError: the columns do not fit the schema.
-    """
+    Time and worker of `lost`, the manifest of the file that this one replaces, are retained.
+    Raises InputError: the columns do not fit the schema."""
     kind = SHARD_KINDS[message.stage]
     request = message.request
     attributes: dict[str, Attribute] = {

@@ -81,7 +81,6 @@ class SelfTest:
 
     @property
     def line(self) -> str:
-        """Return a summary in one line."""
         share = f"{100 * self.gsr:.0f} % hold"
         lifts = f"{100 * self.table:.0f} % lift off a table"
         if self.gsr >= READY and self.table >= TABLE_READY:
@@ -104,7 +103,6 @@ class SelfTest:
         return "most slip when pushed: look at effort, stiffness and pads"
 
     def facts(self) -> dict[str, Any]:
-        """Return the facts that a check reports."""
         return {
             "gsr": self.gsr,
             "n": self.n,
@@ -133,10 +131,7 @@ def failed(reason: str, says: str = "suspicious") -> dict[str, Any]:
 
 def tried_softly(hand: Callable[[], HandModel], run: ExecutionContext = DEFAULT_CONTEXT) -> dict[str, Any]:
     """Return the facts of a self-test; no grasp, or a failed test, is reported and not raised.
-
-    Raises:
-        TaskCancelled: `run.cancelled()` returned True.
-    """
+    Raises TaskCancelled: `run.cancelled()` returned True."""
     try:
         return self_test(hand(), run).facts()
     except InputError as error:
@@ -158,13 +153,6 @@ def self_test(
     Then test grasps of the same objects on a table.
 
     There is no time limit: on a busy machine it would change the verdict.
-
-    Args:
-        hand: the hand.
-        run: receives progress; polled often for cancellation.
-        grasps: total number of free grasps.
-        on_table: total number of grasps of objects on a table.
-        seed: seed of all random numbers.
 
     Raises:
         InputError: a hand finds no start around one of the objects.

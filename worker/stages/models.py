@@ -55,7 +55,6 @@ def publish_model(store: Store, kind: AssetKind, model: HandModel | ObjectModel)
 
 
 def write_builtins(folder: Path = _BUILTIN) -> None:
-    """Write the models of all built-in hands and objects."""
     folder.mkdir(exist_ok=True)
     for kind in AssetKind:
         for name in builtin_names(kind):
