@@ -66,30 +66,23 @@ class DeviceHand:
             tree.multiplier = wp.array(hand.multiplier, dtype=wp.float32)
             tree.offset = wp.array(hand.offset, dtype=wp.float32)
             tree.pivot = wp.vec3(*hand.palm.centre)
-            return cls(
-                model=hand,
-                device=device,
-                tree=tree,
-                pieces=_device_pieces(hand),
-                lower=wp.array(hand.lower, dtype=wp.float32),
-                upper=wp.array(hand.upper, dtype=wp.float32),
-            )
+            lower, upper = (wp.array(limit, dtype=wp.float32) for limit in (hand.lower, hand.upper))
+            return cls(hand, device, tree, _device_pieces(hand), lower, upper)
 
 
 def _device_pieces(hand: HandModel) -> Any:
     out = pieces.Pieces()
-    rows = [_piece_row(piece) for piece in hand.pieces]
-    planes = [row[4] for row in rows]
+    size, position, rotation, half, planes = zip(*map(_piece_row, hand.pieces), strict=True)
     starts = np.concatenate([[0], np.cumsum([len(p) for p in planes])])
     apart = np.ones((hand.bodies, hand.bodies), dtype=np.int32) - np.eye(hand.bodies, dtype=np.int32)
     for a, b in hand.neighbours:
         apart[a, b] = apart[b, a] = 0
     out.body = wp.array([p.body for p in hand.pieces], dtype=wp.int32)
     out.kind = wp.array([_KINDS[p.kind] for p in hand.pieces], dtype=wp.int32)
-    out.size = wp.array(np.array([row[0] for row in rows]), dtype=wp.vec3)
-    out.pose_p = wp.array(np.array([row[1] for row in rows]), dtype=wp.vec3)
-    out.pose_q = wp.array(to_xyzw(np.array([row[2] for row in rows])), dtype=wp.quat)
-    out.half = wp.array(np.array([row[3] for row in rows]), dtype=wp.vec3)
+    out.size = wp.array(np.array(size), dtype=wp.vec3)
+    out.pose_p = wp.array(np.array(position), dtype=wp.vec3)
+    out.pose_q = wp.array(to_xyzw(np.array(rotation)), dtype=wp.quat)
+    out.half = wp.array(np.array(half), dtype=wp.vec3)
     out.first_plane = wp.array(starts, dtype=wp.int32)
     out.planes = wp.array(np.concatenate([*planes, np.zeros((1, 4))]), dtype=wp.vec4)
     out.apart = wp.array(apart, dtype=wp.int32)
@@ -144,14 +137,10 @@ class DeviceObject:
 
     @classmethod
     def create(cls, obj: ObjectModel, device: str, *, samples: Floats, phong_alpha: float, cell: float) -> DeviceObject:
-        """Upload an object.
+        """Upload an object with points (S, 3) on its surface, object frame [m].
 
-        Args:
-            obj: the object.
-            device: Warp device.
-            samples: (S, 3) points on its surface, object frame [m].
-            phong_alpha: 0: flat faces, 1: full Phong projection.
-            cell: cell size of the distance grid [m]; 0: none, every distance is exact.
+        `phong_alpha` is 0 for flat faces, 1 for full Phong projection; `cell` the cell size of the distance grid [m],
+        0: none, every distance is exact.
         """
         with wp.ScopedDevice(device):
             points = wp.array(obj.vertices - obj.centre_of_mass, dtype=wp.vec3)

@@ -116,7 +116,11 @@ class Scenes:
 
     def centred(self, obj: ObjectModel) -> Scenes:
         """Return the scenes with the frames of their object `obj` and of the neighbours at their centres."""
-        return Scenes(self.supports, *_centred(obj, self.object_pose, self.neighbours, self.neighbour_pose))
+        poses = np.array(self.neighbour_pose, float)
+        for number, one in enumerate(self.neighbours):
+            poses[:, number] = to_centre(poses[:, number], one.obj.centre)
+        neighbours = tuple(one.about_centre or one for one in self.neighbours)
+        return Scenes(self.supports, to_centre(self.object_pose, obj.centre), neighbours, poses)
 
     def placed(self, index: NDArray[np.intp]) -> PlacedGrasps:
         """Return grasps in these scenes, by scene number (N,)."""
@@ -185,29 +189,14 @@ class PlacedGrasps:
         return taken
 
 
-def _centred(
-    obj: ObjectModel, object_pose: Floats, neighbours: tuple[Neighbour, ...], neighbour_pose: Floats
-) -> tuple[Floats, tuple[Neighbour, ...], Floats]:
-    poses = np.array(neighbour_pose, float)
-    for number, one in enumerate(neighbours):
-        poses[:, number] = to_centre(poses[:, number], one.obj.centre)
-    return to_centre(object_pose, obj.centre), tuple(one.about_centre or one for one in neighbours), poses
-
-
 def placed_together(parts: Sequence[PlacedGrasps]) -> PlacedGrasps:
     """Join grasps of several sets, each in its own scenes; supports and neighbours are common."""
     first = parts[0]
     if len(parts) == 1:
         return first
     before = np.cumsum([0, *(len(part.object_pose) for part in parts)])
-    whole = replace(
-        first,
-        object_pose=np.concatenate([part.object_pose for part in parts]),
-        index=np.concatenate([part.index + start for part, start in zip(parts, before, strict=False)]),
-        neighbour_pose=np.concatenate([part.neighbour_pose for part in parts])
-        if first.neighbours
-        else first.neighbour_pose,
-    )
+    index = np.concatenate([part.index + start for part, start in zip(parts, before, strict=False)])
+    whole = scenes_together([part.everywhere for part in parts]).placed(index)
     vars(whole)["scenes"] = tuple(scene for part in parts for scene in part.scenes)  # not recomputed
     return whole
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
@@ -44,20 +45,22 @@ def add_grid(skin: Any, obj: ObjectModel, mesh: Any, cell: float) -> None:
     skin.field_cell = cell
     # A distance has slope at most 1: trilinear interpolation between corners is off by less than half a diagonal.
     skin.field_error = 0.5 * cell
-    if not wp.get_device().is_cpu:
+
+    def fill() -> None:
         skin.field = _sampled(skin, shape)
-        _list(skin, obj, mesh)
+        grid = (skin.field, skin.field_origin, skin.field_cell)
+        skin.cells = list_cells(skin.cells.faces, mesh, *grid, LISTED_M + skin.field_error)
+
+    if not wp.get_device().is_cpu:
+        fill()
         return
 
     def make() -> Arrays:
-        skin.field = _sampled(skin, shape)
-        _list(skin, obj, mesh)
+        fill()
         return {"field": skin.field.numpy(), **{name: getattr(skin.cells, name).numpy() for name in _LISTS}}
 
-    def fits(kept: Arrays) -> bool:
-        return _fits(kept, shape, len(obj.faces))
-
     terms = (obj.content, repr(cell), repr(float(skin.alpha)), *map(binary_name, (surface, nearest)))
+    fits = partial(_fits, shape=shape, faces=len(obj.faces))
     kept = arrays_kept_or_made("object_grids", terms, (sys.modules[__name__],), make, fits=fits)
     skin.field = wp.array(kept["field"], dtype=wp.float32)
     for name, kind in _LISTS.items():
@@ -70,20 +73,9 @@ _LISTS: Final = {"first": wp.int32, "face": wp.int32, "key": wp.float32}
 
 def _sampled(skin: Any, shape: tuple[int, ...]) -> Any:
     """Return the distances at the corners of the grid."""
-    field = wp.empty(shape, dtype=wp.float32)
-    wp.launch(
-        surface.sample_field,
-        dim=shape,
-        inputs=[skin, skin.field_origin, skin.field_cell, 4 * FIELD_REACH],
-        outputs=[field],
-    )
+    field, inputs = wp.empty(shape, dtype=wp.float32), [skin, skin.field_origin, skin.field_cell, 4 * FIELD_REACH]
+    wp.launch(surface.sample_field, dim=shape, inputs=inputs, outputs=[field])
     return field
-
-
-def _list(skin: Any, obj: ObjectModel, mesh: Any) -> None:
-    skin.cells = list_cells(
-        skin.cells.faces, mesh, skin.field, skin.field_origin, skin.field_cell, LISTED_M + skin.field_error
-    )
 
 
 def _fits(kept: Arrays, shape: tuple[int, ...], faces: int) -> bool:
@@ -157,20 +149,12 @@ def list_cells(faces: Any, mesh: Any, field: Any, low: Any, size: float, within:
     shape = [n - 1 for n in field.shape]
     radius = wp.zeros(int(np.prod(shape)), dtype=wp.float32)
     count = wp.zeros(len(radius), dtype=wp.int32)
-    wp.launch(
-        nearest.count_faces,
-        len(radius),
-        inputs=[mesh.id, cells.faces, low, size, field, within],
-        outputs=[radius, count],
-    )
+    inputs = [mesh.id, cells.faces, low, size, field, within]
+    wp.launch(nearest.count_faces, len(radius), inputs=inputs, outputs=[radius, count])
     first = np.concatenate([[0], np.cumsum(count.numpy())])
     cells.first = wp.array(first, dtype=wp.int32)
     cells.face = wp.empty(int(first[-1]), dtype=wp.int32)
     cells.key = wp.empty(int(first[-1]), dtype=wp.float32)
-    wp.launch(
-        nearest.list_faces,
-        len(radius),
-        inputs=[mesh.id, cells.faces, low, size, wp.vec3i(*shape), radius, cells.first],
-        outputs=[cells.face, cells.key],
-    )
+    inputs = [mesh.id, cells.faces, low, size, wp.vec3i(*shape), radius, cells.first]
+    wp.launch(nearest.list_faces, len(radius), inputs=inputs, outputs=[cells.face, cells.key])
     return cells

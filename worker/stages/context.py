@@ -120,18 +120,11 @@ def shard_of(
         "inputs": list(message.inputs),
         **output.attributes,
     }
-    counts = check_columns(kind, output.arrays)  # type: ignore[arg-type]
-    data = write_shard(kind, output.arrays, attributes)  # type: ignore[arg-type]
+    columns = output.arrays
+    counts = check_columns(kind, columns)  # type: ignore[arg-type]
+    data = write_shard(kind, columns, attributes)  # type: ignore[arg-type]
     manifest = manifest_of(
-        message,
-        data,
-        output.arrays,
-        attributes,
-        counts,
-        device=device,
-        seconds=seconds,
-        worker=worker,
-        info=output.info,
+        message, data, columns, attributes, counts, device=device, seconds=seconds, worker=worker, info=output.info
     )
     return manifest, data
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from graspd.service.model.domain import BATCH_SIZE, JobOptions
 from graspd.service.model.errors import InputError
 from graspd.service.model.scene_spec import SceneSpec
-from graspd.service.model.transforms import Floats, apply
+from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply
 from graspd.worker.control.postures import squeeze
 from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
 from graspd.worker.generation import ValidatedBatch, validated_grasps
@@ -46,9 +46,6 @@ OF_REACH: Final = 0.5
 WIDTH_M: Final = (0.012, 0.08)
 #: Sum of normal forces of a second squeeze, for the payload: actuators reach their limits [N].
 STRONG_N: Final = 1000.0
-_IDENTITY: Final = np.array([0.0, 0, 0, 1, 0, 0, 0])
-
-
 #: Servos that go from zero to their limit within less fingertip motion than this press by chance [m].
 SOFT_M: Final = 0.0015
 log = logging.getLogger(__name__)
@@ -203,7 +200,7 @@ def _give(hand: HandModel) -> float:
         return math.inf
     step = 1e-4
     q = hand.preshape + np.concatenate([np.zeros((1, hand.dofs)), step * np.eye(hand.dofs)])
-    poses = body_poses(hand, np.tile(_IDENTITY, (len(q), 1)), hand.expand(q))
+    poses = body_poses(hand, np.tile(IDENTITY_POSE, (len(q), 1)), hand.expand(q))
     pads = np.stack([apply(poses[:, tip], fingertip_pad(hand, tip).centre) for tip in hand.fingertips], axis=1)
     lever = np.linalg.norm(pads[1:] - pads[0], axis=2).max(axis=1) / step
     closes = (hand.closing != 0) & (lever > 0)
@@ -211,12 +208,15 @@ def _give(hand: HandModel) -> float:
 
 
 def _batches(hand: HandModel, obj: ObjectModel, count: int, seed: int, run: ExecutionContext) -> list[ValidatedBatch]:
-    found = []
-    for batch, first in enumerate(range(0, count, BATCH_SIZE)):
-        size = min(BATCH_SIZE, count - first)
-        request = JobOptions(want="candidates", grasps=size, seed=seed, validation="standard")
-        found.append(validated_grasps(hand, obj, request, count=size, batch=batch, run=run))
-    return found
+    sizes = [min(BATCH_SIZE, count - first) for first in range(0, count, BATCH_SIZE)]
+    return [
+        validated_grasps(hand, obj, _request(size, seed), count=size, batch=batch, run=run)
+        for batch, size in enumerate(sizes)
+    ]
+
+
+def _request(count: int, seed: int) -> JobOptions:
+    return JobOptions(want="candidates", grasps=count, seed=seed, validation="standard")
 
 
 def _lifted(
@@ -225,21 +225,13 @@ def _lifted(
     """Test grasps of an object on a table.
     Return the number of planned grasps, the share that lifts, and the payload at full actuator force."""
     scenes, _ = scenes_of(TABLE, obj, count=TABLE_SCENES, seed=seed)
-    request = JobOptions(want="candidates", grasps=count, seed=seed, validation="standard")
-    found = validated_grasps(hand, obj, request, count=count, scenes=scenes, run=run)
+    found = validated_grasps(hand, obj, _request(count, seed), count=count, scenes=scenes, run=run)
     grasps, about = found.grasps.moved(np.negative(obj.centre)), obj.centred
     strong = replace(grasps, squeeze=squeeze(hand, about, grasps.grasp, total_normal_force=STRONG_N))
     both = joined([grasps, strong])
     assert both.scene is not None
-    limit = limit_of(
-        hand,
-        about,
-        both,
-        pieces=decompose(about),
-        placed=scenes.centred(obj).placed(both.scene),
-        least=1,
-        run=run.quiet(),
-    )
+    placed, pieces = scenes.centred(obj).placed(both.scene), decompose(about)
+    limit = limit_of(hand, about, both, pieces=pieces, placed=placed, least=1, run=run.quiet())
     return found.planned, found.shares["lift_share"], limit and replace(limit, grasps=count)
 
 
@@ -258,7 +250,7 @@ def fitting_width(hand: HandModel) -> float:
     """Return the width of objects that suit a hand [m]."""
     if (jaws := jaws_of(hand)) is not None:
         return float(np.clip(OF_OPENING * jaws.opening, *WIDTH_M))
-    poses = body_poses(hand, _IDENTITY, hand.expand(hand.preshape))[0]
+    poses = body_poses(hand, IDENTITY_POSE, hand.expand(hand.preshape))[0]
     tips = np.array([_tip(hand, body, poses[body]) for body in hand.fingertips or (hand.bodies - 1,)])
     reach = float(np.median(np.linalg.norm(tips - hand.palm.centre, axis=1)))
     # Objects thinner than the least gap between opposed pads do not suit a hand.
@@ -282,9 +274,8 @@ def plain_objects(width: float) -> dict[str, ObjectModel]:
         "box": trimesh.creation.box((width, 1.2 * width, 1.8 * width)),
         "cylinder": trimesh.creation.cylinder(width / 2, 2 * width, sections=48),
     }
-    return {
-        name: load_object(
-            {f"{name}.stl": bytes(mesh.export(file_type="stl"))}, name=name, digest=f"{number:032x}", face_error_m=3e-4
-        )
-        for number, (name, mesh) in enumerate(meshes.items())
-    }
+    objects = {}
+    for number, (name, mesh) in enumerate(meshes.items()):
+        files = {f"{name}.stl": bytes(mesh.export(file_type="stl"))}
+        objects[name] = load_object(files, name=name, digest=f"{number:032x}", face_error_m=3e-4)
+    return objects
