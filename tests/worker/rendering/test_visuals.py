@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
 
-from graspd.worker.hands.load import hand_from_path, load_hand
+from graspd.worker.hands.load import load_hand
 from graspd.worker.hands.model import HandModel
 from graspd.worker.rendering.hands import drawn_bodies, hand_parts, without_visuals
 from graspd.worker.stages.models import hand_glb
-from tests.worker.commands_run import graspd, refused
+from tests.worker.commands_run import refused
 from tests.worker.hands.urdfs import joint, link, robot
 
 BOX = '<collision><geometry><box size="0.02 0.02 0.04"/></geometry></collision>'
@@ -59,27 +57,6 @@ def test_a_model_for_viewers_has_the_colours(hand: HandModel) -> None:
         for colour in np.unique(mesh.visual.vertex_colors[:, :3], axis=0).tolist()
     }
     assert {(255, 0, 0), (0, 0, 255)} <= colours
-
-
-def test_what_check_writes_leaves_nothing_to_guess(tmp_path: Path) -> None:
-    fingers = [link("a", BOX), link("b", BOX)]
-    joints = [
-        joint("ja", "palm", "a", origin="0.02 0 0.02", axis="0 -1 0"),
-        joint("jb", "palm", "b", origin="-0.02 0 0.02"),
-    ]
-    urdf = tmp_path / "claw.urdf"
-    urdf.write_bytes(robot(link("palm", BOX), *fingers, *joints))
-    said = "--palm palm --approach 0,0,1 --pre-shape ja=0.2 --closing ja=-1 --fingertips a"
-    target = tmp_path / "asset.json"
-    facts = graspd(f"hands check --no-self-test {said} --write", target, urdf)["facts"]
-    assert json.loads(target.read_text())["file"] == "claw.urdf"
-    hand = hand_from_path(urdf)
-    assert hand.closing.tolist() == [-1, 1] and hand.preshape[0] == pytest.approx(0.2)
-    assert [hand.body_names[tip] for tip in hand.fingertips] == ["a"]
-    found = graspd("hands check --no-self-test", urdf)["facts"]
-    for key in ("palm_centre", "palm_approach", "closing", "preshape", "fingertips", "root"):
-        assert found[key] == facts[key]
-    assert "palm" not in found["guessed"] and "closing" not in found["guessed"]
 
 
 @pytest.mark.parametrize("said", ["--closing ja=2", "--closing ja", "--xacro x"])
