@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -242,7 +242,10 @@ def synthesized(
     run = run if progress is None else replace(run, progress=progress)
     run = run if cancelled is None else replace(run, cancelled=cancelled)
     joined = batches_at_once(chosen, join)
-    with _pool(processes_at_once(chosen, processes, threads=threads)) as pool:
+    count = processes_at_once(chosen, processes, threads=threads)
+    with Pool(count, MODULES) if count > 1 else nullcontext() as pool:
+        if pool is not None:
+            pool.start()  # while the first grasps are planned
         run = replace(run, pool=pool)
         batches = validated_batches(
             model, thing, request, sizes=sizes, join=joined, scenes=where, run=run, partial=partial
@@ -262,17 +265,6 @@ def synthesized(
     if made.reason is not None:
         attributes["reason"] = made.reason
     return made
-
-
-@contextmanager
-def _pool(processes: int) -> Iterator[Pool | None]:
-    """Start a pool of processes while the first grasps are planned; None for one process."""
-    if processes == 1:
-        yield None
-        return
-    with Pool(processes, MODULES) as pool:
-        pool.start()
-        yield pool
 
 
 def _as_stored(place: SceneSpec, others: Sequence[ObjectModel]) -> dict[str, Any]:

@@ -176,9 +176,6 @@ class Runner:
             started=started,
             last=last,
         )
-        return self._recorded(message, attempt, context)
-
-    def _recorded(self, message: Message, attempt: AttemptRecord, context: TaskContext) -> Event:
         try:
             if isinstance(message, TaskMessage) and _has_manifest(message, context):
                 # The task has already succeeded: another worker was faster, or a lost file could not be made again.
@@ -189,18 +186,10 @@ class Runner:
         return self._event(EventKind.FAILED, message, message=attempt.reason, last=attempt.last)
 
     def _event(self, kind: EventKind, task: Message, **more: Any) -> Event:
-        facts: dict[str, Any] = {"output": output_of(task)}
+        facts: dict[str, Any] = {"output": output_of(task), "stage": task.stage, "attempt": task.attempt}
         if isinstance(task, TaskMessage):
             facts |= {"job_id": task.job_id, "batch": task.batch}
-        return Event(
-            kind=kind,
-            at=timestamp(),
-            task_id=task.task_id,
-            stage=task.stage,
-            attempt=task.attempt,
-            worker=self._worker,
-            **facts | more,
-        )
+        return Event(kind=kind, at=timestamp(), task_id=task.task_id, worker=self._worker, **facts | more)
 
 
 def _has_manifest(message: TaskMessage, context: TaskContext) -> bool:

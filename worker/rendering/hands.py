@@ -9,7 +9,7 @@ from itertools import accumulate
 from typing import Final
 
 import numpy as np
-from cachetools import LRUCache
+from cachetools import LRUCache, cached
 from numpy.typing import NDArray
 
 from graspd.service.model.colours import hexadecimal, linear
@@ -59,15 +59,13 @@ class MovingSolid:
     look: Appearance
 
 
+@cached(LRUCache(16), key=lambda hand: hand.content, lock=threading.Lock())
 def hand_parts(hand: HandModel) -> tuple[MovingSolid, ...]:
     """Return the visual meshes of a hand in their colours; for bodies without any, collision pieces.
 
     Where no visual element states a colour, palm, fingers and fingertips have default appearances.
     """
-    with _lock:
-        if hand.content not in _parts:
-            _parts[hand.content] = tuple(_drawn(hand))
-        return _parts[hand.content]
+    return tuple(_drawn(hand))
 
 
 def drawn_parts(hand: HandModel, *, mounted: bool) -> tuple[MovingSolid, ...]:
@@ -93,10 +91,6 @@ def without_visuals(hand: HandModel) -> HandModel:
 def drawn_bodies(hand: HandModel) -> list[int]:
     """Return the body of each drawn solid; a body of several colours is repeated."""
     return [part.body for part in hand_parts(hand)]
-
-
-_parts: LRUCache[str, tuple[MovingSolid, ...]] = LRUCache(16)
-_lock = threading.Lock()
 
 
 def _drawn(hand: HandModel) -> Iterator[MovingSolid]:

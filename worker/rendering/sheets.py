@@ -249,19 +249,9 @@ RULE: Final = (222, 224, 226)
 ACCENT: Final = (31, 132, 126)
 
 #: Anchors of the depth colours, near to far: even steps of lightness from light to dark, hue from sand to indigo.
-_DEPTH: Final = np.array(
-    [
-        [252, 243, 207],
-        [250, 206, 130],
-        [243, 158, 93],
-        [220, 103, 92],
-        [173, 63, 107],
-        [113, 43, 109],
-        [54, 32, 84],
-        [16, 16, 40],
-    ],
-    float,
-)
+_DEPTH: Final = np.frombuffer(
+    bytes.fromhex("fcf3cf face82 f39e5d dc675c ad3f6b 712b6d 362054 101028"), np.uint8
+).reshape(-1, 3)
 
 
 @lru_cache(maxsize=16)
@@ -290,7 +280,8 @@ def depth_colours(depth: NDArray[np.float32], near: float, far: float) -> NDArra
     """Return colours (..., 3) of depths: light is near, dark is far, grey is nothing."""
     t = np.clip((np.where(np.isfinite(depth), depth, near) - near) / max(far - near, 1e-9), 0, 1) * (len(_DEPTH) - 1)
     low = np.minimum(t.astype(int), len(_DEPTH) - 2)
-    mixed = _DEPTH[low] + (t - low)[..., None] * (_DEPTH[low + 1] - _DEPTH[low])
+    anchors = _DEPTH.astype(float)
+    mixed = anchors[low] + (t - low)[..., None] * (anchors[low + 1] - anchors[low])
     return np.where(np.isfinite(depth)[..., None], mixed, 214.0).round().astype(np.uint8)
 
 

@@ -112,9 +112,7 @@ class _Film:
         poses = pose_from_matrix(np.asarray(np.linalg.inv(shot.extrinsics), np.float64))
         self._cameras = np.asarray(poses[..., [0, 1, 2, 4, 5, 6, 3]], np.float32)
 
-    def expose(
-        self, views: NDArray[np.intp], threads: int, pool: ThreadPoolExecutor
-    ) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]:
+    def expose(self, views: NDArray[np.intp], threads: int, pool: ThreadPoolExecutor) -> tuple[NDArray[Any], ...]:
         """Return colour, depth, shapes and normals of some views; each thread takes rows of all pictures."""
         tracer, shot, device = self._tracer, self._shot, self._tracer.device
         size, world, k = (len(views), shot.height, shot.width), shot.world[views], shot.intrinsics
@@ -137,17 +135,14 @@ class _Film:
             threads,
         ]
 
+        outputs = [rgb, depth, shape, normal]
+
         def rows(first: int) -> None:
-            wp.launch(
-                exposure.expose,
-                dim=(size[0], len(range(first, size[1], threads)), size[2]),
-                inputs=[*inputs, first],
-                outputs=[rgb, depth, shape, normal],
-                device=device,
-            )
+            dim = (size[0], len(range(first, size[1], threads)), size[2])
+            wp.launch(exposure.expose, dim=dim, inputs=[*inputs, first], outputs=outputs, device=device)
 
         list(pool.map(rows, range(threads)))
-        return rgb.numpy(), depth.numpy(), shape.numpy(), normal.numpy()
+        return tuple(array.numpy() for array in outputs)
 
 
 def _mesh(solid: Solid, device: str) -> Any:

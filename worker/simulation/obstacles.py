@@ -65,13 +65,8 @@ def _solid_distances(hand: HandModel, postures: Posture, scene: Environment) -> 
         position: Any = wp.array(bodies[..., :3], dtype=wp.vec3)
         rotation: Any = wp.array(to_xyzw(bodies[..., 3:]), dtype=wp.quat)
         least = wp.full((len(bodies), hand.bodies), FAR_M, dtype=wp.float32)
-        launch(
-            solid_kernels.distances,
-            (len(bodies), len(hand.pieces)),
-            inputs=[obstacles.features, device.pieces, obstacles.solids, position, rotation, FAR_M],
-            outputs=[least],
-            device="cpu",
-        )
+        inputs = [obstacles.features, device.pieces, obstacles.solids, position, rotation, FAR_M]
+        launch(solid_kernels.distances, (len(bodies), len(hand.pieces)), inputs=inputs, outputs=[least], device="cpu")
     return least.numpy().astype(float)
 
 

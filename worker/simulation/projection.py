@@ -99,12 +99,11 @@ class Projection:
         """Place the hands and keep the states that are better than all before."""
         d, o = self.data, self.options
         out = record_placement(self.model, d, within=max(o.near, o.hold))
-        out.add(
-            kernels.keep_best,
-            d.capacity,
-            inputs=[*d.depths.kinds, wp.float64(BETTER_M), now],
-            outputs=[d.active, self.residuals.count, best, self._depth],
+        inputs, outputs = (
+            [*d.depths.kinds, wp.float64(BETTER_M), now],
+            [d.active, self.residuals.count, best, self._depth],
         )
+        out.add(kernels.keep_best, d.capacity, inputs=inputs, outputs=outputs)
         return out
 
     def _states(self, state: HandState) -> Any:
@@ -139,18 +138,12 @@ class Projection:
             if around.any_solid:
                 inputs = [around.features, m.hand.pieces, around.solids, *terms]
                 out.add(solids.residuals, over, inputs=inputs, outputs=outputs)
-        out.add(
-            kernels.normal_equations,
-            (d.capacity, self._lanes),
-            inputs=[m.hand.tree, self._lane, d.active, d.pivot, d.body_p, d.axis, self.residuals],
-            outputs=[self._row, self.matrix, self.vector],
-        )
+        inputs = [m.hand.tree, self._lane, d.active, d.pivot, d.body_p, d.axis, self.residuals]
+        outputs = [self._row, self.matrix, self.vector]
+        out.add(kernels.normal_equations, (d.capacity, self._lanes), inputs=inputs, outputs=outputs)
 
     def _add_step(self, out: Launches, now: Any) -> None:
         d, o = self.data, self.options
-        out.add(
-            kernels.step,
-            d.capacity,
-            inputs=[*self._limits, self._scale, wp.float64(o.damping), wp.float64(o.step), d.active, self.residuals],
-            outputs=[self._factor, self._move, self.matrix, self.vector, now, *d.root_and_joints],
-        )
+        inputs = [*self._limits, self._scale, wp.float64(o.damping), wp.float64(o.step), d.active, self.residuals]
+        outputs = [self._factor, self._move, self.matrix, self.vector, now, *d.root_and_joints]
+        out.add(kernels.step, d.capacity, inputs=inputs, outputs=outputs)

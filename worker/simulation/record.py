@@ -63,12 +63,8 @@ def record_iteration(m: Model, d: Data, optimizer: str, *, patience: int = 0) ->
 def add_poses(out: Launches, m: Model, d: Data) -> None:
     """Add poses of all bodies; accumulators of an iteration are set to zero."""
     counts = [d.contacts.count, d.contacts.near_count]
-    out.add(
-        kinematics.forward,
-        d.capacity,
-        inputs=[m.hand.tree, d.active, *d.root_and_joints],
-        outputs=[*d.bodies, d.axis, d.wrench, *counts, d.depths.points, d.depths.object, d.depths.links],
-    )
+    outputs = [*d.bodies, d.axis, d.wrench, *counts, d.depths.points, d.depths.object, d.depths.links]
+    out.add(kinematics.forward, d.capacity, inputs=[m.hand.tree, d.active, *d.root_and_joints], outputs=outputs)
 
 
 def add_distances(out: Launches, m: Model, d: Data, *, within: float | None = None) -> None:
@@ -76,12 +72,8 @@ def add_distances(out: Launches, m: Model, d: Data, *, within: float | None = No
     found, o = d.marked or d.contacts, m.options
     nearness = [o.band, o.exact_below, o.band] if within is None else [o.band, within, within]
     points = [m.point_body, m.point_position, m.point_weight]
-    out.add(
-        surface.gather,
-        (d.capacity, m.lanes),
-        inputs=[m.obj.surface, *nearness, NEAR_GAP, m.lane, *points, *d.dilation, *d.bodies],
-        outputs=[*found.arrays, found.mark],
-    )
+    inputs = [m.obj.surface, *nearness, NEAR_GAP, m.lane, *points, *d.dilation, *d.bodies]
+    out.add(surface.gather, (d.capacity, m.lanes), inputs=inputs, outputs=[*found.arrays, found.mark])
     if (marked := d.marked) is not None:
         counts = [marked.kept_in, marked.near_in]
         out.add(packing.count_marks, marked.kept_in.shape, inputs=[d.active, marked.mark], outputs=counts)
@@ -116,12 +108,8 @@ def add_penalties(out: Launches, m: Model, d: Data, *, room: float = 0.0) -> Non
     o, c = m.options, d.contacts
     weight = [d.active, d.iteration, d.schedule.penetration]
     contacts = [c.count, c.body, c.point, c.normal, c.distance, c.weight, c.gradient]
-    out.add(
-        penalties.points_to_bodies,
-        (d.capacity, m.lanes),
-        inputs=[o.pull, o.pull_length, m.lane, *weight, *contacts],
-        outputs=[d.wrench, d.depths.points],
-    )
+    inputs, outputs = [o.pull, o.pull_length, m.lane, *weight, *contacts], [d.wrench, d.depths.points]
+    out.add(penalties.points_to_bodies, (d.capacity, m.lanes), inputs=inputs, outputs=outputs)
     if (around := m.obstacles) is None:
         return
     out.add(obstacles.clear, d.capacity, inputs=[d.active], outputs=[d.depths.obstacles])
@@ -136,24 +124,16 @@ def add_penalties(out: Launches, m: Model, d: Data, *, room: float = 0.0) -> Non
 
 def add_object_penalty(out: Launches, m: Model, d: Data) -> None:
     """Add the term of the object's samples inside links."""
-    weight = [d.active, d.iteration, d.schedule.object_penetration]
-    out.add(
-        pieces.object_in_pieces,
-        (d.capacity, m.pieces),
-        inputs=[m.hand.pieces, m.obj.sorted_samples, REFERENCE_SAMPLES / len(m.obj.samples), *weight, *d.bodies],
-        outputs=[d.wrench, d.depths.object],
-    )
+    weight = [REFERENCE_SAMPLES / len(m.obj.samples), d.active, d.iteration, d.schedule.object_penetration]
+    inputs, outputs = [m.hand.pieces, m.obj.sorted_samples, *weight, *d.bodies], [d.wrench, d.depths.object]
+    out.add(pieces.object_in_pieces, (d.capacity, m.pieces), inputs=inputs, outputs=outputs)
 
 
 def add_self_penalty(out: Launches, m: Model, d: Data, margin: float) -> None:
     """Add the term of links inside links, or closer than `margin` [m]."""
-    weight = [d.active, d.iteration, d.schedule.self_penetration]
-    out.add(
-        pieces.pieces_in_pieces,
-        (d.capacity, m.pieces),
-        inputs=[m.hand.pieces, m.body_points, m.self_scale, margin, *weight, *d.bodies],
-        outputs=[d.wrench, d.depths.links],
-    )
+    weight = [m.self_scale, margin, d.active, d.iteration, d.schedule.self_penetration]
+    inputs, outputs = [m.hand.pieces, m.body_points, *weight, *d.bodies], [d.wrench, d.depths.links]
+    out.add(pieces.pieces_in_pieces, (d.capacity, m.pieces), inputs=inputs, outputs=outputs)
 
 
 def add_root_gradient(out: Launches, m: Model, d: Data) -> None:

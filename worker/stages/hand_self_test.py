@@ -100,30 +100,15 @@ class SelfTest:
         return "most slip when pushed: look at effort, stiffness and pads"
 
     def facts(self) -> dict[str, Any]:
-        return {
-            "gsr": self.gsr,
-            "n": self.n,
-            "table": self.table,
-            "table_n": self.table_n,
-            "width_m": self.width_m,
-            "by_object": self.by_object,
-            "says": self.line,
-            "limit": self.limit and self.limit.facts(),
-        }
+        limit = self.limit and self.limit.facts()
+        shares = {"gsr": self.gsr, "n": self.n, "table": self.table, "table_n": self.table_n}
+        return shares | {"width_m": self.width_m, "by_object": self.by_object, "says": self.line, "limit": limit}
 
 
 def failed(reason: str, says: str = "suspicious") -> dict[str, Any]:
     """Return the facts of a hand that could not be tested."""
-    return {
-        "gsr": 0.0,
-        "n": 0,
-        "table": 0.0,
-        "table_n": 0,
-        "width_m": 0.0,
-        "by_object": {},
-        "says": f"{says}: {reason}",
-        "limit": None,
-    }
+    shares = {"gsr": 0.0, "n": 0, "table": 0.0, "table_n": 0}
+    return shares | {"width_m": 0.0, "by_object": {}, "says": f"{says}: {reason}", "limit": None}
 
 
 def tried_softly(hand: Callable[[], HandModel], run: ExecutionContext = DEFAULT_CONTEXT) -> dict[str, Any]:
