@@ -46,7 +46,6 @@ class Models:
     """Nodes under `/grasp` (the frame of the object at rest) and `/scene`."""
 
     def __init__(self, scene: Any, hand: HandModel, obj: ObjectModel, *, mounted: bool = False) -> None:
-        """Build the nodes; `mounted` adds the links above the hand's root."""
         self._scene, self._hand, self._mounted = scene, hand, mounted
         self._probe: Probe = probe_of(hand, obj, hand_points=POINTS, object_points=64)
         scene.set_up_direction("+z")
@@ -72,7 +71,6 @@ class Models:
         return nodes
 
     def show_collision(self, on: bool) -> None:
-        """Draw the hand by its collision shapes or by its visual meshes, where it has these."""
         if self.collisions:
             for nodes, shown in ((self.bodies, not on), (self.collisions, on)):
                 for node in nodes:
@@ -218,7 +216,6 @@ class Viewer:
 
     @property
     def _wrist(self) -> Floats | None:
-        """(1, U) wrist angles of the shown grasp; None: the file has none."""
         return wrists_of(self._shown.shard, np.array([self.row]))
 
     @property
@@ -313,7 +310,6 @@ class Viewer:
             control.on_update(lambda _: self.show())
 
     def _load(self) -> None:
-        """Load scene, trajectory and figures of the current grasp."""
         shard, row = self._shown.shard, self.row
         self._way = way_of(shard, row)
         number = int(self._arrays["grasp/scene_index"][row]) if "grasp/scene_index" in self._arrays else 0
@@ -362,7 +358,6 @@ def _served(host: str, port: int) -> Any:
 
 
 def _choices(shard: Shard) -> dict[str, NDArray[np.intp]]:
-    """Return rows of each kind of grasps in the file: valid, lifted at half the friction, feasible, all."""
     found: dict[str, NDArray[np.intp]] = {}
     for name in ("valid", "lift_hard", "feasible"):
         column = shard.arrays.get(f"quality/{name}")

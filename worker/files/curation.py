@@ -63,7 +63,6 @@ class Balance:
         return np.split(chosen, np.cumsum([len(shard["quality/valid"]) for shard in shards])[:-1])
 
     def _kinds(self, shards: list[Shard]) -> NDArray[np.int64]:
-        """Return the categories (N, len(by)) of each grasp."""
         columns = []
         for name in self.by:
             if name == "face":

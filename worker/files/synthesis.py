@@ -162,7 +162,6 @@ class SynthesisResult:
         return round(float(known.mean()), digits) if len(known) else None
 
     def _shares(self) -> dict[str, float]:
-        """Return shares of all planned grasps: clear, lifted, lifted at half friction."""
         planned = sum(batch.planned for batch in self.batches)
         return {
             name: round(sum(batch.shares[name] * batch.planned for batch in self.batches) / max(1, planned), 4)

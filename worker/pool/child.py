@@ -59,7 +59,6 @@ def serve(connection: Connection, modules: Sequence[str]) -> None:
 
 
 def _answer(order: bytes, kept: dict[str, Any]) -> bytes:
-    """Return pickled success and the result or error."""
     try:
         wanted: WorkItem = pickle.loads(order)
         for key in wanted.forget:

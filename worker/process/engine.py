@@ -135,7 +135,6 @@ class Engine:
         self._say("idle", self._look_after_itself())
 
     def _look_after_itself(self) -> Condition:
-        """Check between two tasks whether the engine is fit, and whether it should end."""
         if self._runner.device_lost:
             log.error("this worker ends: %s", self._runner.device_lost)
             return "unfit"
@@ -180,7 +179,6 @@ class TaskResources:
         self._memory_mb = settings.worker_max_memory_mb or available_memory() / 2 / 2**20
 
     def outgrown(self) -> str:
-        """Return the reason to replace this process by a fresh one, "" if there is none."""
         beside = sum(resident_mb(pid) for pid in pool.pids) if (pool := vars(self).get("_pool")) is not None else 0.0
         if (held := resident_mb() + beside) > self._memory_mb:
             return f"it holds {held:.0f} MiB, over {self._memory_mb:.0f} (GRASPD_WORKER_MAX_MEMORY_MB)"

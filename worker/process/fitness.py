@@ -105,7 +105,6 @@ class Fitness:
         return False
 
     def _done_elsewhere(self, *, except_for: str) -> list[str]:
-        """Return the tasks that failed here since the last success and whose result now exists."""
         try:
             return [
                 task

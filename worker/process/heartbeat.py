@@ -54,7 +54,6 @@ class Heartbeat:
         self._thread.start()
 
     def update(self, **facts: str | float) -> None:
-        """Update facts such as the state, the name of the device, or the progress of the task."""
         self._facts.update(facts)
         self._changed.set()
 

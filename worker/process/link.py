@@ -46,7 +46,6 @@ class Link:
         self._connection, self._process = connection, process
 
     def say(self, word: str, about: Any = None) -> None:
-        """Send an order; a lost engine does not receive it."""
         with suppress(OSError):
             self._connection.send((word, about))
 
@@ -63,7 +62,6 @@ class Link:
         return self._process is not None and is_stopped(self._process.pid)
 
     def kill(self) -> None:
-        """Kill the engine at once."""
         if self._process is not None:
             self._process.kill()
 

@@ -63,7 +63,6 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
     def __init__(
         self, queue: RqQueue, engine: Link, heart: Heartbeat, *, stages: Collection[Stage], name: str, limit_s: float
     ) -> None:
-        """`limit_s` is the time limit of a task [s]."""
         super().__init__(
             queues=queue_names(stages, ability=own_ability()),
             name=name,

@@ -63,14 +63,8 @@ class Runner:
         self.device_lost = ""  # reason why this process can run no more tasks on its device; "" while it can
 
     def run(self, raw: Mapping[str, Any], context: TaskContext) -> Event | None:
-        """Run a task.
-
-        Returns:
-            event for the controller; None if the task no longer belongs to this worker.
-
-        Raises:
-            TaskRefused: the message cannot be read, so there is no task to fail.
-        """
+        """Run a task; return the event for the controller, None if the task no longer belongs to this worker.
+        Raises TaskRefused: the message cannot be read, so there is no task to fail."""
         message = parse_message(raw)
         subjects = _subjects(message)
         parent = message.origin.traceparent if isinstance(message, TaskMessage) and message.origin else ""
@@ -193,7 +187,6 @@ class Runner:
 
 
 def _has_manifest(message: TaskMessage, context: TaskContext) -> bool:
-    """Check whether a readable manifest shows that the task has succeeded; a damaged one is ignored."""
     try:
         return load_manifest(context.store, message.stage, message.output).shard_id == message.output
     except (NotFoundError, DamagedError):
@@ -212,7 +205,6 @@ def parse_message(raw: Mapping[str, Any]) -> Message:
 
 
 def _subjects(message: Message) -> dict[str, Any]:
-    """Return the fields of every log line of a task."""
     found: dict[str, Any] = {"task": message.task_id, "attempt": message.attempt}
     if isinstance(message, TaskMessage):
         origin = message.origin or Origin()

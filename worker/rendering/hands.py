@@ -110,7 +110,6 @@ def _drawn(hand: HandModel) -> Iterator[MovingSolid]:
 
 
 def _own_look(hand: HandModel, body: int) -> Appearance:
-    """Return the material of a body without a colour: palm, finger or fingertip."""
     if body in hand.fingertips:
         return _TIP
     return _PALM if body == 0 else _HAND

@@ -146,7 +146,6 @@ def side_of(hand: HandModel, bodies: Floats) -> float:
 
 
 def _camera(obj: ObjectModel, points: Floats, angle: float, k: Floats, size: tuple[int, int]) -> Floats:
-    """Return extrinsics of a camera that frames the near parts with the share `_FILL`."""
     middle = 0.5 * (obj.hull_vertices.min(axis=0) + obj.hull_vertices.max(axis=0))
     reach = np.linalg.norm(obj.hull_vertices - middle, axis=1).max()
     return fit_camera(points[np.linalg.norm(points - middle, axis=1) < reach + _NEAR_M], angle, k, size)

@@ -171,7 +171,6 @@ def _shoot(
 
 
 def _row(pictures: NDArray[np.uint8], captions: Sequence[str]) -> Image.Image:
-    """Join pictures in a row with a caption under each, in few colours."""
     return _page(pictures, captions).quantize(192, dither=Image.Dither.NONE)
 
 
@@ -219,7 +218,6 @@ def _dots(points: Floats, radius: float) -> Solid:
 
 
 def _arrow(length: float) -> Solid:
-    """Return an arrow from the origin along z."""
     shaft = manifold3d.Manifold.cylinder(0.72 * length, 0.03 * length, 0.03 * length, 32)
     head = manifold3d.Manifold.cylinder(0.28 * length, 0.09 * length, 0.0, 32).translate((0, 0, 0.72 * length))
     vertices, faces = from_manifold(shaft + head)

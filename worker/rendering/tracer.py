@@ -99,8 +99,6 @@ class Tracer:
 
 
 class _Film:
-    """Device data common to all pictures of a shot."""
-
     def __init__(self, tracer: Tracer, shot: CameraShot) -> None:
         self._tracer, self._shot, device = tracer, shot, tracer.device
         passes = light_passes(shot.samples, shot.toward_lamp)

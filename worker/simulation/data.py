@@ -105,7 +105,6 @@ class Data:
 
     @property
     def bodies(self) -> list[Any]:
-        """Positions and rotations of the bodies."""
         return [self.body_p, self.body_q]
 
     @property
@@ -121,9 +120,7 @@ class Data:
         self, state: HandState, active: NDArray[np.bool_] | None = None, dilation: Floats | None = None
     ) -> None:
         """Load up to `capacity` hands; the rest is switched off. Optimiser moments are cleared.
-
-        `dilation` (n,) multiplies the schedule's dilation for each hand; by default 1.
-        """
+        `dilation` (n,) multiplies the schedule's dilation for each hand; by default 1."""
         n = len(state.pivot)
         scale = np.ones(self.capacity, dtype=np.float32)
         if dilation is not None:
@@ -163,7 +160,6 @@ class Data:
             self.schedule = Tables(schedule, self.unit)
 
     def deepest(self, n: int) -> Floats:
-        """Return the deepest penetration (n,) of each hand at the last evaluation, of all kinds [m]."""
         return np.max([kind.numpy()[:n] for kind in self.depths.kinds], axis=0)
 
     def near_share(self, reach: float, n: int) -> Floats:
@@ -176,7 +172,6 @@ class Data:
         return share.numpy().astype(float)
 
     def state(self, n: int) -> HandState:
-        """Return the first n hands, in float64."""
         pivot, rotation, q = (array.numpy()[:n].astype(float) for array in self.root_and_joints)
         return HandState(pivot, to_wxyz(rotation), q)
 

@@ -241,7 +241,6 @@ def chain_of(hand: HandModel, device: str) -> Any:
 
 
 def _chain(hand: HandModel) -> Any:
-    """Upload the hand as `kernels.chain.Chain` to the current device."""
     out, features = kernels.Chain(), hand.features
     joint = np.zeros(hand.bodies, np.int32)
     joint[hand.joint_body] = np.arange(len(hand.joint_body))

@@ -163,7 +163,6 @@ class PlacedGrasps:
 
     @property
     def everywhere(self) -> Scenes:
-        """The scenes, without the grasps."""
         return Scenes(self.supports, self.object_pose, self.neighbours, self.neighbour_pose)
 
     def centred(self, obj: ObjectModel) -> PlacedGrasps:
@@ -183,7 +182,6 @@ class PlacedGrasps:
         )
 
     def take(self, rows: NDArray[np.intp] | slice) -> PlacedGrasps:
-        """Return some of the grasps, in the order of `rows`."""
         taken = replace(self, index=self.index[rows])
         vars(taken)["scenes"] = self.scenes  # unchanged, so not recomputed
         return taken

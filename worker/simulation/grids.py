@@ -72,7 +72,6 @@ _LISTS: Final = {"first": wp.int32, "face": wp.int32, "key": wp.float32}
 
 
 def _sampled(skin: Any, shape: tuple[int, ...]) -> Any:
-    """Return the distances at the corners of the grid."""
     field, inputs = wp.empty(shape, dtype=wp.float32), [skin, skin.field_origin, skin.field_cell, 4 * FIELD_REACH]
     wp.launch(surface.sample_field, dim=shape, inputs=inputs, outputs=[field])
     return field

@@ -114,7 +114,6 @@ class Model:
 
     @property
     def lanes(self) -> int:
-        """Threads per hand."""
         return -(-self.count // self.lane)
 
     @property

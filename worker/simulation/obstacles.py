@@ -41,7 +41,6 @@ class PosedFeatures:
 
     @classmethod
     def of(cls, hand: HandModel, postures: Posture) -> PosedFeatures:
-        """Place the features of a hand in these postures."""
         features = hand.features
         bodies = body_poses(hand, postures.hand_pose, postures.joint_positions)[:, features.body]
         centre = quat_rotate(bodies[..., 3:], features.centre) + bodies[..., :3]
@@ -107,14 +106,12 @@ def body_room(
 
 
 def _more(obstacle: Obstacle) -> float:
-    """Return the distance added for fingertips at an obstacle [m]."""
     return 0.0 if obstacle.tips_m is None else CLEAR_M - obstacle.tips_m
 
 
 def _half_space_room(
     hand: HandModel, postures: Posture, scenes: Sequence[Environment], which: NDArray[np.integer[Any]]
 ) -> Floats:
-    """Compute `body_room` (P, L) of the half-spaces alone."""
     every = [[o for o in scene.obstacles if not len(o.corners)] for scene in scenes]
     flat, count = [o for one in every for o in one], len(postures)
     posed, spaces = PosedBodies.of(hand, postures.hand_pose, postures.joint_positions), chain_kernels.HalfSpaces()

@@ -78,11 +78,7 @@ class Projection:
             self._depth = wp.empty(B, dtype=wp.float64)
 
     def run(self, state: HandState, iterations: int) -> tuple[HandState, Floats]:
-        """Run at most `iterations` steps from `state`.
-
-        Returns:
-            The best state of each hand, and its deepest penetration (n,) [m].
-        """
+        """Run at most `iterations` steps; return the best state of each hand, and its deepest penetration (n,) [m]."""
         data, n = self.data, len(state.pivot)
         data.set_schedule(still_schedule())
         data.set_state(state)
@@ -96,7 +92,6 @@ class Projection:
         return self._found(best, n), self._depth.numpy()[:n].copy()
 
     def _validated(self, now: Any, best: Any) -> Launches:
-        """Place the hands and keep the states that are better than all before."""
         d, o = self.data, self.options
         out = record_placement(self.model, d, within=max(o.near, o.hold))
         inputs, outputs = (

@@ -66,11 +66,9 @@ class TaskContext:
             self._tell(done, total, message)
 
     def cancelled(self) -> bool:
-        """Check whether to stop at the next launch."""
         return self._stop.is_set()
 
     def check(self) -> None:
-        """Raise TaskCancelled if the task should stop."""
         if self._stop.is_set():
             raise TaskCancelled(f"stopped: {self._reason}")
 

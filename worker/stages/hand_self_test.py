@@ -165,7 +165,6 @@ def self_test(
 
 
 def _joined(limits: list[Limit]) -> Limit | None:
-    """Combine the payloads of several objects; None: nothing was lifted."""
     if not limits:
         return None
     lifts, bound = (max(getattr(one, name) for one in limits) for name in ("lifts_kg", "bound_kg"))

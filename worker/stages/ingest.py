@@ -128,7 +128,6 @@ def _environment() -> dict[str, str]:
 
 
 def _wait(child: subprocess.Popen[bytes], context: TaskContext) -> int:
-    """Return the exit code of the child. If the task is cancelled, end the child and raise TaskCancelled."""
     try:
         while True:
             context.check()

@@ -112,7 +112,6 @@ def object_glb(obj: ObjectModel) -> bytes:
 
 
 def _found(hand: HandModel) -> dict[str, Any]:
-    """Return the facts that a user reviews and corrects."""
     drives = {
         joint: {
             "dof": hand.dof_names[hand.dof[body]],
@@ -145,7 +144,6 @@ def _body_primitives(
 
 
 def _joined(document: Document, meshes: list[tuple[Floats, Ints, Colour | None]]) -> dict[str, Any] | None:
-    """Build one primitive from vertices, faces and sRGB colours."""
     if not meshes:
         return None
     starts = np.cumsum([0, *(len(vertices) for vertices, _, _ in meshes)])
@@ -161,7 +159,6 @@ def _joined(document: Document, meshes: list[tuple[Floats, Ints, Colour | None]]
 
 
 def _light_visuals(hand: HandModel) -> tuple[VisualMesh, ...]:
-    """Return the visual meshes, simplified to at most `MAX_FACES` triangles in total."""
     meshes = hand.visuals.meshes
     excess = sum(len(mesh.faces) for mesh in meshes) / MAX_FACES
     return meshes if excess <= 1 else tuple(lighter(mesh, excess) for mesh in meshes)

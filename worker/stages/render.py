@@ -51,7 +51,6 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
 
 
 def _beside(base: Shard, message: TaskMessage, context: TaskContext) -> Neighbours | None:
-    """Load the other objects of the scenes; None if the object is alone."""
     others = neighbours_of(context.store, message)
     return Neighbours(others, np.asarray(base["scene/neighbour_pose"], float)) if others else None
 

@@ -85,7 +85,6 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
 
 
 def _output(found: ValidatedBatch, columns: Mapping[str, NDArray[Any]]) -> Output:
-    """Return the columns and records of one batch."""
     info: dict[str, Any] = {f"{name}_seconds": round(value, 4) for name, value in found.seconds.items()}
     info |= {name: round(value, 4) for name, value in found.shares.items()}
     info |= {"rejected": found.rejected, "outcomes": found.outcomes, "planned": found.planned}
@@ -94,7 +93,6 @@ def _output(found: ValidatedBatch, columns: Mapping[str, NDArray[Any]]) -> Outpu
 
 
 def _scene_columns(message: TaskMessage, context: TaskContext) -> list[dict[str, NDArray[Any]]]:
-    """Return the object poses in the scenes of each batch; empty for free objects."""
     request = message.request
     if not request.in_scene:
         return []
@@ -110,7 +108,6 @@ def _scene_columns(message: TaskMessage, context: TaskContext) -> list[dict[str,
 
 
 def _scenes(message: TaskMessage, columns: dict[str, NDArray[Any]], context: TaskContext) -> Scenes:
-    """Return the scenes of a batch with supports and neighbours."""
     scenes = Scenes(supports_of(message.request.place), columns["scene/object_pose"])
     if not (others := neighbours_of(context.store, message)):
         return scenes
