@@ -52,7 +52,6 @@ def base_shards(shards: Shards) -> Iterator[list[Shard]]:
 
 def write_subset(shards: Shards, choose: Chooser, out: Path, *, said: Mapping[str, Any]) -> Subset:
     """Write base shards of selected grasps, `HAND/OBJECT/base-BATCH.h5`, and the selection, `subset.json`.
-
     Shards without selected grasps are left out. All columns of a grasp, including its scene, are unchanged.
     Raises InputError: the folder contains files already or cannot be made; or nothing is selected."""
     if out.exists() and (not out.is_dir() or any(out.iterdir())):

@@ -82,9 +82,7 @@ Condition = Literal["fit", "unfit", "outgrown"]
 
 def start_engine(setup: Setup, program: Sequence[str] = (sys.executable, "-m", "graspd.worker.process.engine")) -> Link:
     """Start an engine in a fresh process, which ends with this one; CUDA contexts do not survive a fork.
-
-    Call it from the main thread: the kernel ties a child to the thread that starts it.
-    """
+    Call it from the main thread: the kernel ties a child to the thread that starts it."""
     ours, process = start_child([sys.executable, "-m", "graspd.service.run.launch", str(os.getpid()), *program])
     link = Link(ours, process)
     # The values only: the library that reads settings takes 8 MiB per process.

@@ -234,12 +234,7 @@ def run_worker(
 ) -> bool:
     """Run tasks until a stop is requested; with `burst` until none waits, with `max_tasks` that many.
 
-    Args:
-        idle_s: with `burst`: time without a task after which none waits [s].
-        start: starts the engine.
-
-    Returns:
-        False if the worker ended because of a failure.
+    With `burst`, none waits after `idle_s` without a task [s]. Return False if the worker ended because of a failure.
 
     Raises:
         InputError: there is no such device.

@@ -62,9 +62,7 @@ class MovingSolid:
 @cached(LRUCache(16), key=lambda hand: hand.content, lock=threading.Lock())
 def hand_parts(hand: HandModel) -> tuple[MovingSolid, ...]:
     """Return the visual meshes of a hand in their colours; for bodies without any, collision pieces.
-
-    Where no visual element states a colour, palm, fingers and fingertips have default appearances.
-    """
+    Where no visual element states a colour, palm, fingers and fingertips have default appearances."""
     return tuple(_drawn(hand))
 
 

@@ -216,7 +216,6 @@ def animation_kind(suffix: str) -> str:
 
 def animation(pictures: NDArray[np.uint8], seconds: Sequence[float], suffix: str) -> bytes:
     """Encode a looping film of pictures (F, H, W, 3) sRGB; `suffix` is one of `KINDS`.
-
     Durations [s] are stored in milliseconds, in a GIF in hundredths of a second.
     Raises InputError: no animation format has this suffix."""
     kind = animation_kind(suffix)

@@ -111,9 +111,7 @@ def faces_of(obj: ObjectModel) -> Any:
 
 def feature_normals(vertices: Floats, faces: NDArray[np.integer[Any]]) -> Floats:
     """Return unnormalised angle-weighted normals (F, 7, 3): inside, edges ab, bc, ca, corners a, b, c.
-
-    Vertices at the same place count as one. Faces without an area are ignored.
-    """
+    Vertices at the same place count as one. Faces without an area are ignored."""
     places, same = np.unique(vertices, axis=0, return_inverse=True)
     faces = same.reshape(-1)[faces]
     corner = places[faces]

@@ -29,9 +29,7 @@ OPTIMIZERS: Final = ("adam", "gd")
 
 def record_placement(m: Model, d: Data, *, room: float = 0.0, within: float | None = None) -> Launches:
     """Record contacts and penetration depths only; `room` is added to each feature's margin [m].
-
-    `within`: only contacts within this distance are needed, exactly [m]; it does not change the depths.
-    """
+    `within`: only contacts within this distance are needed, exactly [m]; it does not change the depths."""
     out = Launches(m.device)
     add_poses(out, m, d)
     add_distances(out, m, d, within=within)
@@ -52,7 +50,6 @@ def record_evaluation(m: Model, d: Data) -> Launches:
 
 def record_iteration(m: Model, d: Data, optimizer: str, *, patience: int = 0) -> Launches:
     """Record one iteration: gradient and step.
-
     With a `patience`, a grasp without improvement for so many iterations is switched off and costs nothing more.
     Raises InputError: unknown optimizer."""
     out = record_evaluation(m, d)

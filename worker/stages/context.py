@@ -96,7 +96,6 @@ def shard_of(
     message: TaskMessage, output: Output, *, device: str, seconds: float, worker: str, lost: ShardManifest | None = None
 ) -> tuple[ShardManifest, bytes]:
     """Build the shard of a stage: its manifest and its HDF5 bytes.
-
     Time and worker of `lost`, the manifest of the file that this one replaces, are retained.
     Raises InputError: the columns do not fit the schema."""
     kind = SHARD_KINDS[message.stage]

@@ -132,9 +132,7 @@ def self_test(
     seed: int = 0,
 ) -> SelfTest:
     """Test grasps of a sphere, a box and a cylinder with the defaults of `JobOptions`, in equal numbers.
-    Then test grasps of the same objects on a table.
-
-    There is no time limit: on a busy machine it would change the verdict.
+    Then test grasps of the same objects on a table. A time limit would change the verdict on a busy machine.
 
     Raises:
         InputError: a hand finds no start around one of the objects.
