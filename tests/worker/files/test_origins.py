@@ -92,16 +92,9 @@ def test_an_evaluation_says_the_same(made: Any, tmp_path: Path, place: str, scen
 def test_pictures_are_the_same(made: Any, boxes: dict[str, Path], tmp_path: Path, place: str) -> None:
     seen = []
     for at in ("origin", place):
-        grasp = made[at, "free"].arrays
-        pictures = grasp_pictures(
-            load_case(file_of(made[at, "free"], tmp_path / f"{at}.h5")).hand,
-            object_from_path(boxes[at]),
-            grasp["grasp/hand_pose"][:1],
-            grasp["grasp/joint_positions"][:1],
-            (48, 48),
-            samples=2,
-        )
-        seen.append(pictures)
+        hand = load_case(file_of(made[at, "free"], tmp_path / f"{at}.h5")).hand
+        pose, joints = (made[at, "free"].arrays[f"grasp/{name}"][:1] for name in ("hand_pose", "joint_positions"))
+        seen.append(grasp_pictures(hand, object_from_path(boxes[at]), pose, joints, (48, 48), samples=2))
     np.testing.assert_array_equal(*seen)
 
 
