@@ -163,8 +163,7 @@ def _srgb(linear: float) -> float:
 #: Playback: seconds between two named postures, and between two frames.
 STOP_S: Final = 1.2
 FRAME_S: Final = 0.04
-#: Contact threshold at which epsilon is quoted [m].
-_QUOTED_M: Final = 0.005
+_QUOTED_M: Final = 0.005  # contact threshold at which epsilon is quoted [m]
 #: Distance of the first view from the object [m], and the angle between candidate views [rad].
 _EYE_M: Final = 0.7
 _STEP: Final = np.pi / 8

@@ -22,8 +22,7 @@ from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.surface import sample_surface
 
-#: Keys of a sample that state its origin.
-_WORDS = ("hand", "object", "shard_id", "base_id")
+_WORDS = ("hand", "object", "shard_id", "base_id")  # keys of a sample that state its origin
 
 
 def write_clouds(clouds: Clouds, folder: Path, said: Mapping[str, Any]) -> dict[str, int]:

@@ -117,8 +117,7 @@ _SETTINGS: Final = (
     "hand_digest",
     "object_digest",
 )
-#: Grasps with equal pose and joints to this many digits (metres, radians) are identical.
-_DIGITS: Final = 6
+_DIGITS: Final = 6  # grasps with equal pose and joints to this many digits (metres, radians) are identical
 
 
 @dataclass

@@ -40,7 +40,6 @@ from graspd.worker.scenes.neighbours import Neighbours
 from graspd.worker.scenes.placement import neighbour_of
 from graspd.worker.simulation.environment import PlacedGrasps, Scenes
 
-#: File suffixes of hands and objects.
 SUFFIXES: Final = {AssetKind.HAND: (".urdf", ".xml", ".zip"), AssetKind.OBJECT: (*READERS, ".zip")}
 #: Largest number of files searched in the shard's folder and its subfolders.
 LOOKED_AT: Final = 200

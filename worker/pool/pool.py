@@ -32,14 +32,10 @@ from graspd.worker.pool.child import WorkItem
 log = logging.getLogger(__name__)
 #: Modules for the work of a worker; not imported here, so that a worker starts before its engine.
 MODULES: Final = ("graspd.worker.validation.validator", "graspd.worker.quality.table")
-#: Number of shared data cached per process: two for a pair that is validated and measured.
-KEPT: Final = 8
-#: Interval of checks for a stop [s].
-_LOOK_S: Final = 0.1
-#: Time after which a process that still works on an abandoned item is ended [s].
-_PATIENCE_S: Final = 20.0
-#: Processes compute on the CPU and take no GPU memory.
-_NO_GPU: Final = {"CUDA_VISIBLE_DEVICES": ""}
+KEPT: Final = 8  # number of shared data cached per process: two for a pair that is validated and measured
+_LOOK_S: Final = 0.1  # interval of checks for a stop [s]
+_PATIENCE_S: Final = 20.0  # time after which a process that still works on an abandoned item is ended [s]
+_NO_GPU: Final = {"CUDA_VISIBLE_DEVICES": ""}  # processes compute on the CPU and take no GPU memory
 
 
 class ProcessLost(GraspdError):

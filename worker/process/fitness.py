@@ -28,10 +28,8 @@ from graspd.service.store.store import Store
 from graspd.worker.process.selfcheck import EngineError
 
 log = logging.getLogger(__name__)
-#: Check of the engine for some stages; raises EngineError.
-Check = Callable[[Collection[Stage]], None]
-#: Pauses before the checks of a worker in quarantine [s].
-PAUSES_S: Final = (2.0, 5.0, 10.0, 20.0)
+Check = Callable[[Collection[Stage]], None]  # check of the engine for some stages; raises EngineError
+PAUSES_S: Final = (2.0, 5.0, 10.0, 20.0)  # pauses before the checks of a worker in quarantine [s]
 #: This many tasks that failed here and succeeded elsewhere make a worker unfit.
 _DONE_ELSEWHERE: Final = 2
 _REMEMBERED: Final = 16

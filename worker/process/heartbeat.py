@@ -22,10 +22,8 @@ log = logging.getLogger(__name__)
 #: Interval of heartbeats if three fit a lease [s]: a cancelled task must stop within two seconds, and each heartbeat
 #: reads the key of cancellations.
 BEAT_S: Final = 0.8
-#: Least interval between two updates [s].
-_SHORTEST_INTERVAL_S: Final = 0.1
-#: Longest wait for a response of Redis [s].
-_ANSWER_S: Final = 3.0
+_SHORTEST_INTERVAL_S: Final = 0.1  # least interval between two updates [s]
+_ANSWER_S: Final = 3.0  # longest wait for a response of Redis [s]
 
 
 class Heartbeat:

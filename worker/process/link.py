@@ -20,8 +20,7 @@ from graspd.worker.stages.context import StopReason
 if TYPE_CHECKING:
     from graspd.service.settings import Settings
 
-#: Time for an engine to end by itself [s].
-_END_S: Final = 3.0
+_END_S: Final = 3.0  # time for an engine to end by itself [s]
 
 
 class EngineLost(Exception):

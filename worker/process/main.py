@@ -40,19 +40,14 @@ from graspd.worker.process.link import Condition, EngineLost, Link, Setup, Start
 from graspd.worker.stages.context import StopReason
 
 log = logging.getLogger(__name__)
-#: Reconnection attempts of a worker, for about a minute: longer than a restart of Redis.
-_PATIENCE: Final = 60
-#: Time that RQ waits for a task before its maintenance [s]: its `worker_ttl` less 15.
-_WORKER_TTL_S: Final = 20
+_PATIENCE: Final = 60  # reconnection attempts of a worker, for about a minute: longer than a restart of Redis
+_WORKER_TTL_S: Final = 20  # time that RQ waits for a task before its maintenance [s]: its `worker_ttl` less 15
 #: RQ's maintenance is off: see docs/adr/0003-silence-is-judged-by-one-clock.md.
 _NEVER_S: Final = 10**9
 _REFUSED_PAUSE_S: Final = 0.5
-#: Longest wait between two attempts to reach Redis [s].
-_LONGEST_RETRY_S: Final = 2.0
-#: Longest delay until a worker notices a request to stop [s].
-_LOOK_S: Final = 0.1
-#: Time for an engine to stop by itself before it is ended [s].
-STUCK_AFTER_S: Final = 60.0
+_LONGEST_RETRY_S: Final = 2.0  # longest wait between two attempts to reach Redis [s]
+_LOOK_S: Final = 0.1  # longest delay until a worker notices a request to stop [s]
+STUCK_AFTER_S: Final = 60.0  # time for an engine to stop by itself before it is ended [s]
 
 
 class GraspWorker(SimpleWorker):  # type: ignore[misc]

@@ -20,14 +20,10 @@ from graspd.service.model.transforms import Floats
 
 FIELD_OF_VIEW: Final = np.radians(40.0)
 BASELINE_M: Final = 0.06
-#: Elevation of a sampled camera above the table [rad].
-ELEVATION: Final = (np.radians(18.0), np.radians(62.0))
-#: Share of the smaller field of view that the object's bounding ball fills.
-FILL: Final = (0.7, 1.0)
-#: Below this distance a stereo pair does not have the whole object in both pictures [m].
-NEAREST_M: Final = 0.25
-#: Largest distance of the optical axis from the object's centre, in bounding radii.
-AIM_JITTER: Final = 0.15
+ELEVATION: Final = (np.radians(18.0), np.radians(62.0))  # elevation of a sampled camera above the table [rad]
+FILL: Final = (0.7, 1.0)  # share of the smaller field of view that the object's bounding ball fills
+NEAREST_M: Final = 0.25  # below this distance a stereo pair does not have the whole object in both pictures [m]
+AIM_JITTER: Final = 0.15  # largest distance of the optical axis from the object's centre, in bounding radii
 
 
 @dataclass(frozen=True)
@@ -130,8 +126,7 @@ def stereo_pair(extrinsics: Floats, baseline: float) -> tuple[Floats, Floats]:
     return left, right
 
 
-#: Tolerance of rotations in a file: six digits are usual in JSON written by hand.
-ROTATION_ERROR: Final = 1e-5
+ROTATION_ERROR: Final = 1e-5  # tolerance of rotations in a file: six digits are usual in JSON written by hand
 
 _Row3 = Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)]
 _Row4 = Annotated[list[FiniteFloat], Field(min_length=4, max_length=4)]
@@ -147,8 +142,7 @@ class GivenCameras:
     height: int | None = None
 
 
-#: Default intrinsics, sampled poses.
-SAMPLED: Final = GivenCameras()
+SAMPLED: Final = GivenCameras()  # default intrinsics, sampled poses
 
 
 class _Model(BaseModel):

@@ -24,8 +24,7 @@ from graspd.worker.rendering.scenery import Appearance, Solid
 _HAND: Final = Appearance(hexadecimal("#59636e"), roughness=0.42, metalness=0.35)
 _PALM: Final = Appearance(hexadecimal("#434b54"), roughness=0.48, metalness=0.35)
 _TIP: Final = Appearance(hexadecimal("#2fa7a0"), roughness=0.38)
-#: Depth of a hidden hand: under the floor, out of every picture [m].
-_AWAY_M: Final = -50.0
+_AWAY_M: Final = -50.0  # depth of a hidden hand: under the floor, out of every picture [m]
 
 
 @dataclass(frozen=True)

@@ -28,11 +28,9 @@ FIELD_OF_VIEW: Final = np.radians(24.0)
 SAMPLES: Final = 12
 #: Hand parts farther than this from the object's hull are not framed: a forearm may leave the picture [m].
 _NEAR_M: Final = 0.14
-#: Grasps traced together: bounds the memory.
-_TOGETHER: Final = 16
+_TOGETHER: Final = 16  # grasps traced together: bounds the memory
 
-#: Share of the picture's width or height that hand and object take up.
-_FILL: Final = 0.86
+_FILL: Final = 0.86  # share of the picture's width or height that hand and object take up
 #: Left of the camera, above it, in front of the object: camera looks along -x of the turned world.
 TOWARD_LAMP: Final = np.array([0.45, -0.45, 0.77]) / np.linalg.norm([0.45, -0.45, 0.77])
 FLOOR_SIZE: Final = (6.0, 6.0, 0.02)

@@ -51,14 +51,11 @@ _DOTS: Final = 60
 _AXES: Final = tuple(Appearance(hexadecimal(code), roughness=0.5) for code in ("#c8343c", "#3c9a4a", "#3566c8"))
 _FRAME_SHARE: Final = 0.25
 _CLOSING_ARROW_SHARE: Final = 0.22
-#: Opacity of the transparent housing.
 _OPACITY: Final = 0.35
-#: Position of parts that are not drawn [m].
-_AWAY_M: Final = -50.0
+_AWAY_M: Final = -50.0  # position of parts that are not drawn [m]
 #: Views of a hand, by the camera's azimuth [rad].
 _SIDES: Final = {"from the right": 0.0, "from behind": np.radians(-90.0), "from the front": np.radians(90.0)}
-#: Length of the arrow over the largest extent of the hand.
-_ARROW_SHARE: Final = 0.4
+_ARROW_SHARE: Final = 0.4  # length of the arrow over the largest extent of the hand
 #: View towards the palm from the side on which the approach points right [rad].
 _HAND_AZIMUTH: Final = np.radians(32.0)
 _OBJECT_AZIMUTHS: Final = tuple(np.radians([-50.0, 40.0, 130.0]).tolist())

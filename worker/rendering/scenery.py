@@ -84,12 +84,9 @@ class CameraShot:
 
 Supports = Sequence[HalfSpace | BoxSupport]
 
-#: A half-space is drawn as a slab whose top is its plane [m].
-TABLE_SIZE: Final = (1.2, 0.9, 0.04)
-#: Default support of objects.
-TABLE: Final = (HalfSpace(),)
-#: A slab lies below the origin; below the object if that is farther away [m].
-_FAR_M: Final = 0.35
+TABLE_SIZE: Final = (1.2, 0.9, 0.04)  # a half-space is drawn as a slab whose top is its plane [m]
+TABLE: Final = (HalfSpace(),)  # default support of objects
+_FAR_M: Final = 0.35  # a slab lies below the origin; below the object if that is farther away [m]
 
 
 def slabs(supports: Supports) -> list[Box]:

@@ -37,8 +37,7 @@ PIXELS_OF_A_GPU: Final = 4_000_000
 #: Margin of bounds around their solid, so that rounding in float32 loses no ray [m].
 _SLACK_M: Final = 1e-5
 _PLACED: Final[Any] = rays.PlacedSolid
-#: Radius of the lamp's disc as seen from the table [rad].
-LAMP_RADIUS: Final = np.radians(3.5)
+LAMP_RADIUS: Final = np.radians(3.5)  # radius of the lamp's disc as seen from the table [rad]
 #: Sine of the elevation above which the sky shines.
 SKY_EDGE: Final = 0.35
 _GOLDEN: Final = np.pi * (3.0 - np.sqrt(5.0))

@@ -47,10 +47,8 @@ FREE_STRIP: Final = ("pregrasp", "grasp", "squeeze")
 #: Candidate sides: number around, and their heights above the horizon [rad].
 _AROUND: Final = 16
 _HEIGHTS: Final = tuple(np.radians([20.0, 35.0, 52.0]).tolist())
-#: Least angle between two sides of one grasp, if possible [rad].
-_APART: Final = np.radians(50.0)
-#: Edge of the pictures that rate the sides [px].
-_GLANCE: Final = 48
+_APART: Final = np.radians(50.0)  # least angle between two sides of one grasp, if possible [rad]
+_GLANCE: Final = 48  # edge of the pictures that rate the sides [px]
 #: Direction of the lamp under a board: from the front, as high as a window.
 _UNDER_A_BOARD: Final = np.array([0.85, -0.42, 0.32]) / np.linalg.norm([0.85, -0.42, 0.32])
 #: Hand parts farther than this from the object are not framed [m].
@@ -203,8 +201,7 @@ KINDS: Final[dict[str, dict[str, Any]]] = {
     ".webp": {"format": "WEBP", "quality": 82, "method": 4},
     ".png": {"format": "PNG", "default_image": False},
 }
-#: Pictures whose colours make the palette of a GIF.
-_PALETTE_OF: Final = 9
+_PALETTE_OF: Final = 9  # pictures whose colours make the palette of a GIF
 
 
 def animation_kind(suffix: str) -> str:

@@ -28,8 +28,7 @@ from graspd.worker.rendering.scene_setup import CameraPlan, Setting
 from graspd.worker.rendering.scenery import TABLE, Pictures, Supports
 from graspd.worker.scenes.neighbours import Neighbours
 
-#: Passes per picture; half of them light the scene with the lamp, half with the sky.
-SAMPLES: Final = 12
+SAMPLES: Final = 12  # passes per picture; half of them light the scene with the lamp, half with the sky
 
 Arrays = dict[str, NDArray[np.generic]]
 

@@ -21,10 +21,8 @@ from graspd.worker.simulation.kernels import kinematics, nearest, pieces, surfac
 
 #: Kernels' numbers for `ConvexPiece.kind`.
 _KINDS: Final = {"box": 0, "sphere": 1, "cylinder": 2, "capsule": 3, "hull": 4}
-#: Cells that sort the object's samples [m].
-SAMPLE_CELL_M: Final = 0.008
-#: Travel of a sliding joint that moves a fingertip as much as one radian of a revolute joint [m].
-SLIDE_M: Final = 0.05
+SAMPLE_CELL_M: Final = 0.008  # cells that sort the object's samples [m]
+SLIDE_M: Final = 0.05  # travel of a sliding joint that moves a fingertip as much as one radian of a revolute joint [m]
 
 
 def to_xyzw(quaternion: Floats) -> Floats:

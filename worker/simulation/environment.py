@@ -20,8 +20,7 @@ from graspd.service.model.transforms import Floats, compose, invert, quat_conjug
 from graspd.worker.objects.mesh_geometry import to_centre
 from graspd.worker.objects.model import ObjectModel
 
-#: Direction against gravity in the scene frame.
-UP: Final = np.array([0.0, 0.0, 1.0])
+UP: Final = np.array([0.0, 0.0, 1.0])  # direction against gravity in the scene frame
 #: Length of a hand's straight approach to its pregrasp, and of the lift [m].
 STANDOFF_M: Final = 0.10
 RISE_M: Final = 0.10

@@ -23,12 +23,9 @@ from graspd.worker.simulation.kernels import nearest, surface
 
 Arrays = Mapping[str, NDArray[Any]]
 
-#: Largest distance from the surface that is looked up [m].
-FIELD_REACH: Final = 0.06
-#: Cells within this distance plus the grid's error of the surface list their nearest faces [m].
-LISTED_M: Final = 0.004
-#: Most cells a side: a large object has a coarser grid, whose larger error is accounted for.
-_MOST_CELLS: Final = 96
+FIELD_REACH: Final = 0.06  # largest distance from the surface that is looked up [m]
+LISTED_M: Final = 0.004  # cells within this distance plus the grid's error of the surface list their nearest faces [m]
+_MOST_CELLS: Final = 96  # most cells a side: a large object has a coarser grid, whose larger error is accounted for
 
 
 def add_grid(skin: Any, obj: ObjectModel, mesh: Any, cell: float) -> None:

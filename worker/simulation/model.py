@@ -17,18 +17,13 @@ from graspd.worker.simulation.obstacles import DeviceObstacles
 
 #: Weights of points are areas in units of 1/800 of the hand's surface: the loss does not depend on their number.
 REFERENCE_POINTS: Final = 800
-#: Number of object samples at which each has weight 1.
-REFERENCE_SAMPLES: Final = 2000
+REFERENCE_SAMPLES: Final = 2000  # number of object samples at which each has weight 1
 #: Number of hand points against other links at which each has weight 1.
 REFERENCE_SELF_POINTS: Final = 1000
-#: Kernels of the contact step by their names.
 SOLVERS: Final = {"direct": contact.direct, "jacobi": contact.jacobi, "gauss_seidel": contact.gauss_seidel}
-#: Contacts with at most this gap are listed for the direct solver: four steps of the object [m].
-NEAR_GAP: Final = 4e-3
-#: Points per thread: on the CPU a thread costs as much as a point; on CUDA every point has its own.
-CPU_LANE: Final = 64
-#: Largest dilation of a schedule [m].
-MAX_DILATION: Final = 0.1
+NEAR_GAP: Final = 4e-3  # contacts with at most this gap are listed for the direct solver: four steps of the object [m]
+CPU_LANE: Final = 64  # points per thread: on the CPU a thread costs as much as a point; on CUDA every point has its own
+MAX_DILATION: Final = 0.1  # largest dilation of a schedule [m]
 
 
 @dataclass(frozen=True)

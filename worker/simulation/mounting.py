@@ -23,8 +23,7 @@ from graspd.worker.simulation.obstacles import MARGIN_M, obstacle_room
 #: Points of a mounting: the outermost in so many directions, then so many corners spread over it.
 OUTERMOST: Final = 20
 SPREAD: Final = 40
-#: Wrist positions of a hand whose exact clearances are computed.
-TRIES: Final = 4
+TRIES: Final = 4  # wrist positions of a hand whose exact clearances are computed
 
 
 def mounting_room(

@@ -26,8 +26,7 @@ from graspd.worker.simulation.launches import launch
 
 #: Clearance of hands from obstacles in planning [m]: twice a scene's requirement, as trajectories are swept in steps.
 MARGIN_M: Final = 0.004
-#: Distances from solids are capped at this [m].
-FAR_M: Final = 0.1
+FAR_M: Final = 0.1  # distances from solids are capped at this [m]
 
 
 @dataclass(frozen=True)

@@ -17,12 +17,9 @@ from graspd.worker.simulation.launches import Launches
 from graspd.worker.simulation.model import Model
 from graspd.worker.simulation.record import record_placement
 
-#: Residuals per grasp and iteration.
-CAPACITY: Final = 1024
-#: Residuals per GPU thread that are added to the equations.
-CUDA_LANE: Final = 16
-#: A state is better than another if its penetration is less by more than this [m].
-BETTER_M: Final = 1e-5
+CAPACITY: Final = 1024  # residuals per grasp and iteration
+CUDA_LANE: Final = 16  # residuals per GPU thread that are added to the equations
+BETTER_M: Final = 1e-5  # a state is better than another if its penetration is less by more than this [m]
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,6 @@ from graspd.worker.simulation.kernels import (
 from graspd.worker.simulation.launches import Launches
 from graspd.worker.simulation.model import NEAR_GAP, REFERENCE_SAMPLES, SOLVERS, Model
 
-#: Optimisers of `record_iteration`.
 OPTIMIZERS: Final = ("adam", "gd")
 
 

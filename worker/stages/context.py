@@ -26,8 +26,7 @@ from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
 if TYPE_CHECKING:
     from graspd.service.store.store import Store
 
-#: Least time between two progress reports [s]: enough for a moving progress bar.
-REPORT_EVERY_S: Final = 1.0
+REPORT_EVERY_S: Final = 1.0  # least time between two progress reports [s]: enough for a moving progress bar
 
 
 class StopReason(StrEnum):

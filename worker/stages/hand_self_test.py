@@ -44,8 +44,7 @@ TABLE_SCENES: Final = 2
 OF_OPENING: Final = 0.55
 OF_REACH: Final = 0.5
 WIDTH_M: Final = (0.012, 0.08)
-#: Sum of normal forces of a second squeeze, for the payload: actuators reach their limits [N].
-STRONG_N: Final = 1000.0
+STRONG_N: Final = 1000.0  # sum of normal forces of a second squeeze, for the payload: actuators reach their limits [N]
 #: Servos that go from zero to their limit within less fingertip motion than this press by chance [m].
 SOFT_M: Final = 0.0015
 log = logging.getLogger(__name__)

@@ -61,14 +61,10 @@ def write_builtins(folder: Path = _BUILTIN) -> None:
             (folder / f"{kind.value}-{name}.glb").write_bytes(model_of(kind, name, builtin_files(kind, name)))
 
 
-#: Hand points from which a viewer measures the distance to the object.
-SURFACE_POINTS: Final = 3000
-#: Most triangles of all visual meshes of a hand, so that a browser draws them at once.
-MAX_FACES: Final = 60_000
-#: Most points of a pad.
-PAD_POINTS: Final = 60
-#: sRGB of parts without a colour, if other parts have one.
-_GREY: Final = (0.45, 0.5, 0.55)
+SURFACE_POINTS: Final = 3000  # hand points from which a viewer measures the distance to the object
+MAX_FACES: Final = 60_000  # most triangles of all visual meshes of a hand, so that a browser draws them at once
+PAD_POINTS: Final = 60  # most points of a pad
+_GREY: Final = (0.45, 0.5, 0.55)  # sRGB of parts without a colour, if other parts have one
 
 
 def hand_glb(hand: HandModel) -> bytes:

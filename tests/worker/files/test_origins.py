@@ -26,8 +26,7 @@ PLACES = {"origin": (0.0, 0.0, 0.0), "6 m": (5.0, -3.0, 2.0), "UTM": (500_000.0,
 AWAY = pytest.mark.parametrize("place", ["6 m", "UTM"])
 SCENES = pytest.mark.parametrize("scene", ["free", "table"])
 REQUEST = JobOptions(grasps=2, want="candidates", rechecks=0, fidelity=FIDELITIES["draft"], seed=1)
-#: Of positions in the frame of the file [m].
-ROUNDING_M = 1e-6
+ROUNDING_M = 1e-6  # of positions in the frame of the file [m]
 
 
 @pytest.fixture(scope="module")

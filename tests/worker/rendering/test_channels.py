@@ -24,8 +24,7 @@ from tests.worker.models import object_from_mesh, two_finger_hand
 SIZE = (96, 72)
 RADIUS = 0.04
 REST = np.array([[0.02, -0.01, RADIUS, 1.0, 0, 0, 0], [0.0, 0.03, RADIUS, 0, 1.0, 0, 0]])
-#: Normals are stored with 11 bits.
-HALF_PRECISION = 5e-4
+HALF_PRECISION = 5e-4  # normals are stored with 11 bits
 #: Interpolated normals of the ball's 20 480 facets; float32 rays.
 FACET_NORMAL = 2e-3
 DEPTH_M = 1e-4

@@ -104,8 +104,7 @@ def test_sidecar_tells_the_camera_and_a_second_export_is_refused(views, tmp_path
         export_images(views, tmp_path)
 
 
-#: What a view promises of its depth [m]: tests/worker/rendering/test_views.py.
-DEPTH_M = 1e-4
+DEPTH_M = 1e-4  # what a view promises of its depth [m]: tests/worker/rendering/test_views.py
 
 
 def test_points_of_a_rendered_object_lie_on_its_mesh(tmp_path: Path) -> None:

@@ -27,8 +27,7 @@ from graspd.worker.rendering.cameras import (
 from graspd.worker.rendering.scenery import TABLE_SIZE
 from tests.worker.models import object_from_mesh
 
-#: What a view promises of its depth [m]; float32 rays over half a metre err by less than a tenth of it.
-DEPTH_M = 1e-4
+DEPTH_M = 1e-4  # what a view promises of its depth [m]; float32 rays over half a metre err by less than a tenth of it
 
 SIZE = (96, 72)
 RADIUS = 0.05

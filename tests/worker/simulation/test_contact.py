@@ -14,8 +14,7 @@ from graspd.worker.simulation.kernels import contact
 from graspd.worker.simulation.model import NEAR_GAP, initial_motions
 from graspd.worker.simulation.reference import Contacts, World
 
-#: float32 solves of 6 x 6 systems with condition numbers up to 1e3, motions of 1e-3 m.
-END_TOLERANCE = 2e-6
+END_TOLERANCE = 2e-6  # float32 solves of 6 x 6 systems with condition numbers up to 1e3, motions of 1e-3 m
 #: Cosine between the kernel's adjoint and central differences: contacts that switch on or off within the difference,
 #: and the fixed slip direction, are what differs.
 COSINE = 0.97

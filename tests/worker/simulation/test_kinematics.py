@@ -20,10 +20,8 @@ from graspd.worker.simulation.kernels import kinematics, wrenches
 from graspd.worker.simulation.record import record_placement
 from tests.worker.simulation.rigs import ball, rig
 
-#: float32 positions of a hand 0.2 m large through at most 8 joints.
-FK_TOLERANCE = 3e-7
-#: URDF origins given to 6 digits, read by two parsers in float64.
-PARSER_TOLERANCE = 1e-9
+FK_TOLERANCE = 3e-7  # float32 positions of a hand 0.2 m large through at most 8 joints
+PARSER_TOLERANCE = 1e-9  # URDF origins given to 6 digits, read by two parsers in float64
 
 REAL_HANDS = {
     "allegro": "allegro/allegro_hand_right.urdf",

@@ -37,8 +37,7 @@ from tests.worker.models import object_from_mesh, two_finger_hand
 HAND = two_finger_hand()
 BOX = object_from_mesh(trimesh.creation.box((0.06, 0.04, 0.05)))
 HANDS = 6
-#: Distances, rows and poses are in single precision, so steps of millimetres are good to this.
-SINGLE = 2e-6
+SINGLE = 2e-6  # distances, rows and poses are in single precision, so steps of millimetres are good to this
 
 
 def pressing() -> HandState:

@@ -19,8 +19,7 @@ from graspd.worker.simulation.kernels import pieces, surface
 from graspd.worker.simulation.sampling import object_samples
 from tests.worker.simulation.rigs import ball, object_of
 
-#: float32 coordinates of size 0.1 m.
-FLOAT32 = 2e-8
+FLOAT32 = 2e-8  # float32 coordinates of size 0.1 m
 
 
 @wp.kernel

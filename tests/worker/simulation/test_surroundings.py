@@ -156,8 +156,7 @@ def mujoco_distances(hand, postures: Posture, obstacle: Obstacle) -> np.ndarray:
 UP = np.array([0.0, 0.0, 1.0])
 BOX = Obstacle.box([0, 0, 0, 1, 0, 0, 0], [0.1, 0.1, 0.1])
 R, L = 0.01, 0.06
-#: float32 coordinates of 0.1 m, and the end of the search along an edge.
-EXACT = 2e-6
+EXACT = 2e-6  # float32 coordinates of 0.1 m, and the end of the search along an edge
 
 
 def link(kind: str) -> HandModel:

@@ -181,10 +181,8 @@ def test_finding_that_is_long_and_check_that_complains_are_told(
 
 
 UPLOAD_BYTES = 64 * 2**20
-#: The limit of archives that are refused before any of them is unpacked.
-DOOR_BYTES = 4 * 2**20
-#: What is promised for any upload, as time of computing [s].
-BOUND_S = 30.0
+DOOR_BYTES = 4 * 2**20  # the limit of archives that are refused before any of them is unpacked
+BOUND_S = 30.0  # what is promised for any upload, as time of computing [s]
 #: Children at a time: as many as the smallest machine has cores.
 TOGETHER = 2
 BALL = stl(sphere(segments=24))

@@ -79,8 +79,7 @@ def test_what_cannot_be_read_is_made_again(store: Store, data: bytes) -> None:
     same(prepared_object(spoilt, DIGEST, name="balls", face_error_m=3e-4), fresh)
 
 
-#: Positions are single precision: half a micrometre at half a metre.
-TOLERANCE_M = 5e-7
+TOLERANCE_M = 5e-7  # positions are single precision: half a micrometre at half a metre
 
 
 def scene_of(data: bytes) -> trimesh.Scene:

@@ -23,8 +23,7 @@ from graspd.worker.stages.context import StopReason, TaskContext
 from graspd.worker.stages.ranges import base_rows, batches_of
 from tests.worker.stages.jobs import end_of, job_of
 
-#: Batches as small as they can be, so that several take a few seconds.
-SIZE = 3
+SIZE = 3  # batches as small as they can be, so that several take a few seconds
 
 
 @pytest.fixture(autouse=True)

@@ -6,8 +6,7 @@ are so few that a ray tests the bounds of each.
 
 import warp as wp
 
-#: Maximum length of rays [m].
-FAR = wp.constant(100.0)
+FAR = wp.constant(100.0)  # maximum length of rays [m]
 #: Offset of shadow rays from their surface, along its normal [m].
 CLEAR = wp.constant(1.0e-4)
 _TINY = wp.constant(1.0e-15)

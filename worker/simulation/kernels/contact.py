@@ -18,8 +18,7 @@ wp.set_module_options({"enable_backward": False})
 vec6 = wp.types.vector(length=6, dtype=wp.float32)
 mat66 = wp.types.matrix(shape=(6, 6), dtype=wp.float32)
 
-#: Norms are smoothed below this length [m]: |x| has no gradient at 0.
-SMOOTH = wp.constant(1.0e-5)
+SMOOTH = wp.constant(1.0e-5)  # norms are smoothed below this length [m]: |x| has no gradient at 0
 
 
 @wp.struct

@@ -14,8 +14,7 @@ wp.set_module_options({"enable_backward": False})
 #: Gap over which the normal turns from the surface's own to the direction of the closest point [m].
 BLEND = wp.constant(2.0e-4)
 
-#: Bound on the error of distances between positions of some metres [m].
-ROUNDING = wp.constant(1.0e-6)
+ROUNDING = wp.constant(1.0e-6)  # bound on the error of distances between positions of some metres [m]
 
 
 @wp.struct

@@ -12,8 +12,7 @@ wp.set_module_options({"enable_backward": False})
 NONE = wp.constant(0)
 KEPT = wp.constant(1)
 NEAR = wp.constant(2)
-#: Marks counted per thread.
-CHUNK = wp.constant(32)
+CHUNK = wp.constant(32)  # marks counted per thread
 
 
 @wp.kernel

@@ -10,8 +10,7 @@ from graspd.worker.simulation.kernels.surface import Surface, cube_around, cube_
 
 wp.set_module_options({"enable_backward": False})
 
-#: Random directions, of which the one most perpendicular to the pair is used.
-WAYS = wp.constant(4)
+WAYS = wp.constant(4)  # random directions, of which the one most perpendicular to the pair is used
 
 
 @wp.struct

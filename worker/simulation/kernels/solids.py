@@ -19,8 +19,7 @@ wp.set_module_options({"enable_backward": False})
 #: Evaluations between the tangents, and tolerance of the value at their intersection [m].
 LOOKS = wp.constant(20)
 EXACT = wp.constant(wp.float32(1.0e-8))
-#: A point this far outside a plane's face counts as on it [m].
-ON_FACE = wp.constant(wp.float32(1.0e-5))
+ON_FACE = wp.constant(wp.float32(1.0e-5))  # a point this far outside a plane's face counts as on it [m]
 
 
 @wp.struct

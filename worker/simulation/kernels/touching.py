@@ -10,12 +10,9 @@ from graspd.worker.simulation.kernels.distance import Skin, nearest
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
-#: Edges of a friction pyramid.
-EDGES = wp.constant(8)
-#: Angle between adjacent edges.
-TURN = wp.constant(wp.float64(math.tau / 8))
-#: Rows of a balance before those of the torques: the wrench and the sum of normal forces.
-FIRST_TORQUE = wp.constant(7)
+EDGES = wp.constant(8)  # edges of a friction pyramid
+TURN = wp.constant(wp.float64(math.tau / 8))  # angle between adjacent edges
+FIRST_TORQUE = wp.constant(7)  # rows of a balance before those of the torques: the wrench and the sum of normal forces
 
 
 @wp.struct

@@ -11,8 +11,7 @@ wp.set_module_options({"enable_backward": False})
 #: Value of one count: 2^-36, below the rounding of any float32 above 1e-4. Sums may reach 1.3e8.
 UNIT = wp.constant(1.0 / 68719476736.0)
 PER_UNIT = wp.constant(68719476736.0)
-#: Largest component that one thread may add: hands far inside an object reach about 1e4.
-MOST = wp.constant(1.0e6)
+MOST = wp.constant(1.0e6)  # largest component that one thread may add: hands far inside an object reach about 1e4
 
 Wrenches = wp.array3d(dtype=wp.int64)  # (B, L, 6)
 
