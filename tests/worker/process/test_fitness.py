@@ -1,4 +1,4 @@
-"""Which failures are the worker's own."""
+"""Which failures are the worker's own, and its check of itself with the real engine."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ from graspd.service.model.states import Stage
 from graspd.service.queue.port import Event, EventKind
 from graspd.service.store.records import task_attempts
 from graspd.service.store.store import Store, open_store
+from graspd.worker import generation
 from graspd.worker.process import fitness as module
 from graspd.worker.process.fitness import Fitness
 from graspd.worker.process.runner import Runner
-from graspd.worker.process.selfcheck import EngineError
+from graspd.worker.process.selfcheck import EngineError, check_engine
 from graspd.worker.stages.context import TaskContext
 from tests.fakes import fake_synthesize, make_shard, message_for
 
@@ -138,3 +139,31 @@ def test_a_worker_in_quarantine_stops_when_told(bench: Bench, monkeypatch: pytes
     bench.engine_works = False
     assert not bench.fitness.try_engine((Stage.SYNTHESIZE,))
     assert not bench.sits_out(told_to_stop=True)
+
+
+@pytest.mark.parametrize("stage", Stage)
+def test_the_engine_of_every_stage_passes(stage: Stage) -> None:
+    check_engine(lambda: "cpu", (stage,))
+
+
+def test_an_engine_that_breaks_is_told_in_a_line_with_its_stage(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*args: Any, **options: Any) -> None:
+        raise ImportError("libwarp.so: cannot open\nshared object file")
+
+    monkeypatch.setattr(generation, "validated_grasps", broken)
+    with pytest.raises(EngineError) as caught:
+        check_engine(lambda: "cpu", (Stage.SYNTHESIZE,))
+    assert str(caught.value) == "synthesize: ImportError: libwarp.so: cannot open shared object file"
+
+
+def test_an_engine_that_gives_nonsense_does_not_pass(monkeypatch: pytest.MonkeyPatch) -> None:
+    plan = generation.validated_grasps
+
+    def nonsense(*args: Any, **options: Any) -> Any:
+        found = plan(*args, **options)
+        found.grasps.grasp.hand_pose[:] = float("nan")
+        return found
+
+    monkeypatch.setattr(generation, "validated_grasps", nonsense)
+    with pytest.raises(EngineError, match="no number"):
+        check_engine(lambda: "cpu", (Stage.SYNTHESIZE,))

@@ -18,8 +18,10 @@ from graspd.service.model.transforms import apply, compose, invert, quat_rotate
 from graspd.service.readers.trajectories import Waypoint
 from graspd.worker.grasps import Posture
 from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.load import load_hand
+from graspd.worker.hands.model import HandModel
 from graspd.worker.rendering import Extras, render, sheets
-from graspd.worker.rendering.hands import DrawnHand, drawn_bodies
+from graspd.worker.rendering.hands import DrawnHand, drawn_bodies, hand_parts, without_visuals
 from graspd.worker.rendering.pictures import THREE_SIDES, grasp_pictures
 from graspd.worker.rendering.scenery import TABLE, TABLE_SIZE, seen_share, slab_poses, slabs
 from graspd.worker.rendering.sheets import (
@@ -34,6 +36,9 @@ from graspd.worker.rendering.sheets import (
     views_page,
 )
 from graspd.worker.rendering.trajectory_pictures import KINDS, PictureScenes, animation, way_pictures
+from graspd.worker.stages.models import hand_glb
+from tests.worker.commands_run import refused
+from tests.worker.hands.urdfs import joint, link, robot
 from tests.worker.models import object_from_mesh, two_finger_hand
 
 HAND = two_finger_hand()
@@ -311,3 +316,52 @@ def test_a_table_looks_the_same_named_or_not(block):
     options = {"views": 1, "stereo": False, "width": 48, "height": 36, "seed": 3, "samples": 2}
     named = render(block, REST, **options, extras=Extras(supports=SPECS["table"]))
     np.testing.assert_array_equal(named["image/rgb"], render(block, REST, **options)["image/rgb"])
+
+
+SHAPE = '<collision><geometry><box size="0.02 0.02 0.04"/></geometry></collision>'
+RED = '<material name="red"><color rgba="1 0 0 1"/></material>'
+SEEN = (
+    f'<visual><geometry><box size="0.06 0.06 0.01"/></geometry>{RED}</visual>'
+    '<visual><geometry><mesh filename="part.stl"/></geometry><material name="blue"/></visual>'
+    '<visual><geometry><mesh filename="missing.stl"/></geometry></visual>'
+)
+
+
+@pytest.fixture(scope="module")
+def coloured() -> HandModel:
+    blue = '<material name="blue"><color rgba="0 0 1 1"/></material>'
+    urdf = robot(blue, link("palm", SHAPE + SEEN), link("a", SHAPE), joint("j", "palm", "a"))
+    part = bytes(trimesh.creation.icosphere(1, 0.01).export(file_type="stl"))
+    return load_hand({"h.urdf": urdf, "part.stl": part}, name="h", digest="0" * 32)
+
+
+def test_what_is_seen_has_its_colours_else_collision_shapes(coloured: HandModel) -> None:
+    palm = [part for part in hand_parts(coloured) if part.body == 0]
+    assert sorted((part.look.base, len(part.solid.faces)) for part in palm) == [((0, 0, 1), 80), ((1, 0, 0), 12)]
+    (finger,) = [part for part in hand_parts(coloured) if part.body == 1]
+    assert np.ptp(finger.solid.vertices, axis=0) == pytest.approx([0.02, 0.02, 0.04])
+
+
+def test_collision_shapes_are_drawn_on_a_toggle(coloured: HandModel) -> None:
+    bare = without_visuals(coloured)
+    assert bare.pieces is coloured.pieces and bare.content != coloured.content
+    assert drawn_bodies(bare) == [0, 1] and drawn_bodies(coloured) == [0, 0, 1]
+    assert np.ptp(hand_parts(bare)[0].solid.vertices, axis=0) == pytest.approx([0.02, 0.02, 0.04])
+    above = without_visuals(replace(coloured, mounting=coloured)).mounting
+    assert above is not None and drawn_bodies(above) == [0, 1]
+
+
+def test_a_model_for_viewers_has_the_colours(coloured: HandModel) -> None:
+    scene = trimesh.load(trimesh.util.wrap_as_stream(hand_glb(coloured)), file_type="glb")
+    colours = {
+        tuple(colour)
+        for mesh in scene.geometry.values()
+        if len(getattr(mesh, "faces", ()))
+        for colour in np.unique(mesh.visual.vertex_colors[:, :3], axis=0).tolist()
+    }
+    assert {(255, 0, 0), (0, 0, 255)} <= colours
+
+
+@pytest.mark.parametrize("said", ["--closing ja=2", "--closing ja", "--xacro x"])
+def test_an_option_that_cannot_be_read_is_the_callers_mistake(said: str) -> None:
+    assert said.split()[0] in refused(f"hands check allegro --no-self-test {said}")
