@@ -51,23 +51,23 @@ class Models:
         scene.set_up_direction("+z")
         self.rest = scene.add_frame("/grasp", show_axes=False)
         self.thing = scene.add_frame("/grasp/object", show_axes=False)
-        scene.add_mesh_simple("/grasp/object/mesh", obj.vertices, obj.faces, color=_OBJECT, flat_shading=True)
+        self._mesh("/grasp/object/mesh", obj, _OBJECT)
         self.bodies = self._nodes(hand, "hand")
-        #: The hand's collision shapes, where its visual meshes differ from them.
+        # The hand's collision shapes, where its visual meshes differ from them.
         self._bare = without_visuals(hand) if hand.visuals.meshes else None
         self.collisions = self._nodes(self._bare, "collision") if self._bare else []
         self.show_collision(False)
         self.contacts: Any = None
         self._around: list[Any] = []
 
+    def _mesh(self, path: str, solid: Any, colour: tuple[int, ...]) -> Any:
+        return self._scene.add_mesh_simple(path, solid.vertices, solid.faces, color=colour, flat_shading=True)
+
     def _nodes(self, hand: HandModel, name: str) -> list[Any]:
         nodes = []
         for number, part in enumerate(drawn_parts(hand, mounted=self._mounted)):
             colour = tuple(round(255 * _srgb(share)) for share in part.look.base)
-            path, solid = f"/grasp/{name}/{number}", part.solid
-            nodes.append(
-                self._scene.add_mesh_simple(path, solid.vertices, solid.faces, color=colour, flat_shading=True)
-            )
+            nodes.append(self._mesh(f"/grasp/{name}/{number}", part.solid, colour))
         return nodes
 
     def show_collision(self, on: bool) -> None:
@@ -93,13 +93,11 @@ class Models:
                     f"/scene/support{k}", *_disc(support, object_pose[:3]), color=_TABLE, side="front"
                 )
             self._around.append(node)
-        for k, other in enumerate(neighbours.objects if neighbours else ()):
-            node = self._scene.add_mesh_simple(
-                f"/scene/neighbour{k}", other.vertices, other.faces, color=_NEIGHBOUR, flat_shading=True
-            )
-            assert neighbours is not None
-            _place(node, neighbours.poses[number, k])
-            self._around.append(node)
+        if neighbours is not None:
+            for k, other in enumerate(neighbours.objects):
+                node = self._mesh(f"/scene/neighbour{k}", other, _NEIGHBOUR)
+                _place(node, neighbours.poses[number, k])
+                self._around.append(node)
 
     def show_scene(self, on: bool) -> None:
         for node in self._around:
@@ -137,9 +135,9 @@ def _place(node: Any, pose: Floats) -> None:
     node.wxyz = pose[3:] / np.linalg.norm(pose[3:])
 
 
-def _disc(plane: HalfSpace, middle: Floats, corners: int = 96) -> tuple[Floats, NDArray[np.int64]]:
+def _disc(plane: HalfSpace, middle: Floats) -> tuple[Floats, NDArray[np.int64]]:
     """Return a disc in the plane of a half-space around the foot of a point, visible from outside only."""
-    normal = np.asarray(plane.normal, float)
+    corners, normal = 96, np.asarray(plane.normal, float)
     length = float(np.linalg.norm(normal))
     normal = normal / length
     beside = np.cross(normal, [1.0, 0, 0] if abs(normal[0]) < 0.9 else [0, 1.0, 0])
@@ -341,14 +339,11 @@ class Viewer:
 def _served(host: str, port: int) -> Any:
     import viser
 
-    if port == 0:
-        with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
-            try:
-                probe.bind((host, 0))
-            except OSError as error:
-                raise InputError(f"cannot serve on {host}: {error.strerror or error}") from None
-            port = int(probe.getsockname()[1])
     try:
+        if port == 0:
+            with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
+                probe.bind((host, 0))
+                port = int(probe.getsockname()[1])
         # viser prints a greeting with the address, which graspd prints itself.
         with contextlib.redirect_stdout(io.StringIO()):
             return viser.ViserServer(host=host, port=port, label="graspd view", verbose=False)

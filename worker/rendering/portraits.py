@@ -61,7 +61,7 @@ _HAND_AZIMUTH: Final = np.radians(32.0)
 _OBJECT_AZIMUTHS: Final = tuple(np.radians([-50.0, 40.0, 130.0]).tolist())
 
 
-def hand_portrait(hand: HandModel, *, device: str = "cpu") -> Image.Image:
+def hand_portrait(hand: HandModel) -> Image.Image:
     """Draw the hand open, in its pre-shape and closing; an arrow on the palm's centre shows the approach."""
     parts, upright = hand_parts(hand), _upright(hand)
     named = {"open": posture(hand, 0.0), "pre-shape": hand.preshape, "closing": posture(hand, _CLOSING_SHARE)}
@@ -75,10 +75,10 @@ def hand_portrait(hand: HandModel, *, device: str = "cpu") -> Image.Image:
     poses = np.concatenate([bodies[:, [part.body for part in parts]], np.tile(palm, (len(named), 1, 1))], axis=1)
     looks = [*(part.look for part in parts), _ARROW]
     solids = [*(part.solid for part in parts), arrow]
-    return _row(_shoot(solids, poses, looks, points, [_HAND_AZIMUTH] * len(named), device), list(named))
+    return _row(_shoot(solids, poses, looks, points, [_HAND_AZIMUTH] * len(named)), list(named))
 
 
-def hand_sides(hand: HandModel, *, device: str = "cpu") -> Image.Image:
+def hand_sides(hand: HandModel) -> Image.Image:
     """Draw the hand's collision shapes, about to close, from three sides; the palm is half transparent.
 
     Three thin arrows are the palm's frame (x red, y green, z blue: the approach). The orange arrow is the approach;
@@ -116,7 +116,7 @@ def hand_sides(hand: HandModel, *, device: str = "cpu") -> Image.Image:
     without = poses.copy()
     without[[number for number, part in enumerate(parts) if part.body == 0], 2] = _AWAY_M
     whole, open_ = (
-        _shoot(solids, np.tile(row, (len(_SIDES), 1, 1)), looks, seen, list(_SIDES.values()), device).astype(float)
+        _shoot(solids, np.tile(row, (len(_SIDES), 1, 1)), looks, seen, list(_SIDES.values())).astype(float)
         for row in (poses, without)
     )
     blended = (_OPACITY * whole + (1 - _OPACITY) * open_).round().astype(np.uint8)
@@ -131,14 +131,14 @@ def above(first: Image.Image, second: Image.Image) -> Image.Image:
     return page
 
 
-def object_portrait(obj: ObjectModel, *, device: str = "cpu") -> Image.Image:
+def object_portrait(obj: ObjectModel) -> Image.Image:
     """Draw the prepared mesh from three sides, z up."""
     obj = obj.centred
     solid = Solid(obj.vertices, obj.faces, obj.corner_normals)
     extents = " x ".join(f"{1e3 * extent:.0f}" for extent in np.ptp(obj.vertices, axis=0))
     captions = [f"{obj.name}, {extents} mm", f"{len(obj.faces)} faces", f"within {1e3 * obj.deviation_m:.2f} mm"]
     poses = np.tile(IDENTITY_POSE, (len(captions), 1, 1))
-    return _row(_shoot([solid], poses, [OBJECT_LOOK], obj.vertices, _OBJECT_AZIMUTHS, device), captions)
+    return _row(_shoot([solid], poses, [OBJECT_LOOK], obj.vertices, _OBJECT_AZIMUTHS), captions)
 
 
 def write_png(image: Image.Image, path: Path) -> None:
@@ -150,16 +150,11 @@ def write_png(image: Image.Image, path: Path) -> None:
 
 
 def _shoot(
-    solids: Sequence[Solid],
-    poses: Floats,
-    looks: list[Appearance],
-    points: Floats,
-    azimuths: Sequence[float],
-    device: str,
+    solids: Sequence[Solid], poses: Floats, looks: list[Appearance], points: Floats, azimuths: Sequence[float]
 ) -> NDArray[np.uint8]:
     """Render W worlds (W, H, W, 3), each from its azimuth; every camera frames the same points."""
     worlds = len(poses)
-    stage = Tracer([Box(FLOOR_SIZE), *solids], device)
+    stage = Tracer([Box(FLOOR_SIZE), *solids], "cpu")
     floors = np.tile(floor_pose(points), (worlds, 1, 1))
     stage.place(np.concatenate([floors, poses], axis=1), [[FLOOR, *looks]] * worlds)
     k = intrinsics(*SIZE, FIELD_OF_VIEW)

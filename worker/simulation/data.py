@@ -116,9 +116,7 @@ class Data:
         """Arguments of kernels that dilate the object."""
         return [self.active, self.iteration, self.schedule.dilation, self.dilation_scale]
 
-    def set_state(
-        self, state: HandState, active: NDArray[np.bool_] | None = None, dilation: Floats | None = None
-    ) -> None:
+    def set_state(self, state: HandState, *, dilation: Floats | None = None) -> None:
         """Load up to `capacity` hands; the rest is switched off. Optimiser moments are cleared.
         `dilation` (n,) multiplies the schedule's dilation for each hand; by default 1."""
         n = len(state.pivot)
@@ -127,7 +125,7 @@ class Data:
             scale[:n] = dilation
         self.dilation_scale.assign(scale)
         mask = np.zeros(self.capacity, dtype=np.int32)
-        mask[:n] = 1 if active is None else active
+        mask[:n] = 1
         self._assign(self.pivot, state.pivot)
         self._assign(self.rotation, to_xyzw(state.rotation))
         self._assign(self.q, state.q)

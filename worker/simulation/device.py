@@ -167,11 +167,11 @@ class DeviceObject:
             return replace(self, samples=samples, bvh=wp.Bvh(samples, samples), sorted_samples=cells)
 
 
-def sorted_samples(samples: Floats, size: float = SAMPLE_CELL_M) -> Any:
-    """Sort points (S, 3) [m] by the cells of a grid of this size [m], on the current Warp device."""
+def sorted_samples(samples: Floats) -> Any:
+    """Sort points (S, 3) [m] by the cells of a grid, on the current Warp device."""
     low = samples.min(axis=0)
     # At most 64 cells a side: a large object has larger ones.
-    size = max(size, float((samples.max(axis=0) - low).max()) / 64)
+    size = max(SAMPLE_CELL_M, float((samples.max(axis=0) - low).max()) / 64)
     cell = np.floor((samples - low) / size).astype(int)
     shape = cell.max(axis=0) + 1
     index = np.ravel_multi_index(tuple(cell.T), tuple(shape))

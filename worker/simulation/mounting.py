@@ -27,17 +27,12 @@ TRIES: Final = 4  # wrist positions of a hand whose exact clearances are compute
 
 
 def mounting_room(
-    hand: HandModel,
-    poses: Floats,
-    scenes: Sequence[Environment],
-    which: NDArray[np.integer[Any]] | None = None,
-    *,
-    enough: float = CLEAR_M,
+    hand: HandModel, poses: Floats, scenes: Sequence[Environment], which: NDArray[np.integer[Any]] | None = None
 ) -> tuple[Floats, Floats]:
     """Choose wrist angles that stay constant while the hand moves; return the mounting's clearance.
 
     `poses` (N, P, 7) are those of the root of each of N hands, object frame; `which` (N,) the scene of each, by default
-    the first. The search ends at a clearance of `enough` [m].
+    the first. The search ends at a clearance of `CLEAR_M`.
 
     Returns:
         (N, K) wrist angles: the first of `wrist_positions` with enough clearance, among those whose points have it,
@@ -48,7 +43,7 @@ def mounting_room(
     if mounting is None:
         return np.zeros((count, 0)), np.full(count, np.inf)
     scene_of = np.zeros(count, np.intp) if which is None else which.astype(np.intp)
-    return _solved(mounting, poses, scenes, scene_of, point_room(mounting, poses, scenes, scene_of), enough)
+    return _solved(mounting, poses, scenes, scene_of, point_room(mounting, poses, scenes, scene_of), CLEAR_M)
 
 
 def mounting_lack(

@@ -152,19 +152,19 @@ def _load(store: Store, digest: str, *, name: str, face_error_m: float) -> Objec
 _pieces_lock = threading.Lock()
 
 
-def pieces_of(store: Store, obj: ObjectModel, *, cache: Path | None = None) -> ConvexPieces:
+def pieces_of(store: Store, obj: ObjectModel) -> ConvexPieces:
     """Return an object's pieces from this machine's cache or the store, else compute and store them.
 
     Raises:
         MeshError: the object has no usable pieces.
         StoreUnavailable: the store does not respond.
     """
-    file = piece_file(obj, cache)
+    file = piece_file(obj)
     key = names.object_pieces(obj.digest, file.stem)
     with _pieces_lock:  # tasks of one object start at once: one of them makes the pieces
         if not file.is_file():
             _fetch(store, key, file)
-        pieces = decompose(obj, cache=cache)
+        pieces = decompose(obj)
         if file.is_file() and not store.exists(key):
             put_sealed(store, key, file.read_bytes())
         return pieces

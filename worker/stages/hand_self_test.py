@@ -123,12 +123,7 @@ def tried_softly(hand: Callable[[], HandModel], run: ExecutionContext = DEFAULT_
 
 
 def self_test(
-    hand: HandModel,
-    run: ExecutionContext = DEFAULT_CONTEXT,
-    *,
-    grasps: int = GRASPS,
-    on_table: int = TABLE_GRASPS,
-    seed: int = 0,
+    hand: HandModel, run: ExecutionContext = DEFAULT_CONTEXT, *, grasps: int = GRASPS, on_table: int = TABLE_GRASPS
 ) -> SelfTest:
     """Test grasps of a sphere, a box and a cylinder with the defaults of `JobOptions`, in equal numbers.
     Then test grasps of the same objects on a table. A time limit would change the verdict on a busy machine.
@@ -146,8 +141,8 @@ def self_test(
     for number, (name, obj) in enumerate(objects.items()):
         part = run.part(number / len(objects), (number + 1) / len(objects))
         free, standing = (count // 3 + (number < count % 3) for count in (grasps, on_table))
-        found = _batches(hand, obj, free, seed, part.part(0.0, 0.7))
-        lifted += [_lifted(hand, obj, standing, seed, part.part(0.7, 1.0))]
+        found = _batches(hand, obj, free, part.part(0.0, 0.7))
+        lifted += [_lifted(hand, obj, standing, part.part(0.7, 1.0))]
         held[name] = [bool(value == 1) for batch in found for value in batch.columns["quality/success"]]
         lost += [bool(one) for batch in found for one in _lost(batch)]
         better = [_best(obj, batch) for batch in found]
@@ -188,25 +183,23 @@ def _give(hand: HandModel) -> float:
     return float(np.min((hand.effort / hand.stiffness * lever)[closes], initial=math.inf))
 
 
-def _batches(hand: HandModel, obj: ObjectModel, count: int, seed: int, run: ExecutionContext) -> list[ValidatedBatch]:
+def _batches(hand: HandModel, obj: ObjectModel, count: int, run: ExecutionContext) -> list[ValidatedBatch]:
     sizes = [min(BATCH_SIZE, count - first) for first in range(0, count, BATCH_SIZE)]
     return [
-        validated_grasps(hand, obj, _request(size, seed), count=size, batch=batch, run=run)
+        validated_grasps(hand, obj, _request(size), count=size, batch=batch, run=run)
         for batch, size in enumerate(sizes)
     ]
 
 
-def _request(count: int, seed: int) -> JobOptions:
-    return JobOptions(want="candidates", grasps=count, seed=seed, validation="standard")
+def _request(count: int) -> JobOptions:
+    return JobOptions(want="candidates", grasps=count, validation="standard")
 
 
-def _lifted(
-    hand: HandModel, obj: ObjectModel, count: int, seed: int, run: ExecutionContext
-) -> tuple[int, float, Limit | None]:
+def _lifted(hand: HandModel, obj: ObjectModel, count: int, run: ExecutionContext) -> tuple[int, float, Limit | None]:
     """Test grasps of an object on a table.
     Return the number of planned grasps, the share that lifts, and the payload at full actuator force."""
-    scenes, _ = scenes_of(TABLE, obj, count=TABLE_SCENES, seed=seed)
-    found = validated_grasps(hand, obj, _request(count, seed), count=count, scenes=scenes, run=run)
+    scenes, _ = scenes_of(TABLE, obj, count=TABLE_SCENES, seed=0)
+    found = validated_grasps(hand, obj, _request(count), count=count, scenes=scenes, run=run)
     grasps, about = found.grasps.moved(np.negative(obj.centre)), obj.centred
     strong = replace(grasps, squeeze=squeeze(hand, about, grasps.grasp, total_normal_force=STRONG_N))
     both = joined([grasps, strong])

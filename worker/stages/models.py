@@ -54,11 +54,11 @@ def publish_model(store: Store, kind: AssetKind, model: HandModel | ObjectModel)
         put_sealed(store, key, hand_glb(model) if isinstance(model, HandModel) else object_glb(model))
 
 
-def write_builtins(folder: Path = _BUILTIN) -> None:
-    folder.mkdir(exist_ok=True)
+def write_builtins() -> None:
+    _BUILTIN.mkdir(exist_ok=True)
     for kind in AssetKind:
         for name in builtin_names(kind):
-            (folder / f"{kind.value}-{name}.glb").write_bytes(model_of(kind, name, builtin_files(kind, name)))
+            (_BUILTIN / f"{kind.value}-{name}.glb").write_bytes(model_of(kind, name, builtin_files(kind, name)))
 
 
 SURFACE_POINTS: Final = 3000  # hand points from which a viewer measures the distance to the object

@@ -109,7 +109,7 @@ def test_a_contact_sheet_holds_every_picture_unchanged(pictures):
         windows = np.lib.stride_tricks.sliding_window_view(sheet[..., 0], (4, 80))
         assert (windows == picture[30:34, :, 0]).all(axis=(2, 3)).any()
     assert tuple(sheet[0, 0]) == PAPER
-    assert opened(three_sides_sheet(pictures, title="block", columns=1)).shape[1] >= 3 * 80
+    assert opened(three_sides_sheet(pictures, title="block")).shape[1] >= 3 * 80
 
 
 @pytest.mark.parametrize(("stereo", "cells"), [(True, 5), (False, 4)])

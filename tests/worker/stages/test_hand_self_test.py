@@ -110,13 +110,13 @@ def test_objects_are_no_thinner_than_opposed_pads_come_together(monkeypatch: pyt
 def test_a_busy_machine_leaves_nothing_out(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("time.monotonic", count(0.0, 1e4).__next__)
 
-    def batches(hand: HandModel, obj: ObjectModel, count: int, seed: int, run: ExecutionContext) -> Any:
+    def batches(hand: HandModel, obj: ObjectModel, count: int, run: ExecutionContext) -> Any:
         run.progress(1, 10, "planning")
         run.check("planning")
         return [held(count)]
 
     monkeypatch.setattr(hand_self_test, "_batches", batches)
-    monkeypatch.setattr(hand_self_test, "_lifted", lambda hand, obj, count, seed, run: (count, 0.5, None))
+    monkeypatch.setattr(hand_self_test, "_lifted", lambda hand, obj, count, run: (count, 0.5, None))
     found = tried_softly(gripper)
     assert (found["table_n"], found["table"]) == (16, 0.5)
     assert (found["n"], sorted(found["by_object"])) == (64, ["box", "cylinder", "sphere"])
