@@ -159,13 +159,8 @@ def by_newton(poses: np.ndarray, what: CameraShot) -> dict[str, np.ndarray]:
         # It lets 0.3 of the light through every shadow.
         lit = light.numpy()[..., 0] / cosine > 0.65
     nothing = index == 0xFFFFFFFF
-    return {
-        "shape": np.where(nothing, -1, index % len(SOLIDS)),
-        "depth": depth.numpy(),
-        "normal": normal.numpy(),
-        "lit": lit,
-        "facing": ~nothing & (cosine > 0.05),
-    }
+    found = {"shape": np.where(nothing, -1, index % len(SOLIDS)), "depth": depth.numpy(), "normal": normal.numpy()}
+    return found | {"lit": lit, "facing": ~nothing & (cosine > 0.05)}
 
 
 @pytest.fixture(scope="module")
@@ -196,18 +191,10 @@ def test_shadows_lie_where_newtons_lie(poses: np.ndarray, theirs: dict[str, np.n
     points = np.einsum("nij,nj->ni", inverse[view, :3, :3], inside) + inverse[view, :3, 3]
     points += 1e-4 * theirs["normal"][view, row, column]
     shadowed = wp.zeros(len(points), dtype=wp.int32, device="cpu")
-    wp.launch(
-        _in_the_way,
-        dim=len(points),
-        device="cpu",
-        outputs=[shadowed],
-        inputs=[
-            tracer._placed,
-            wp.array(what.world[view], dtype=wp.int32, device="cpu"),
-            wp.array(points.astype(np.float32), dtype=wp.vec3f, device="cpu"),
-            wp.vec3f(*TOWARD_LAMP),
-        ],
-    )
+    world = wp.array(what.world[view], dtype=wp.int32, device="cpu")
+    at = wp.array(points.astype(np.float32), dtype=wp.vec3f, device="cpu")
+    inputs = [tracer._placed, world, at, wp.vec3f(*TOWARD_LAMP)]
+    wp.launch(_in_the_way, dim=len(points), device="cpu", inputs=inputs, outputs=[shadowed])
     lit = theirs["lit"][view, row, column]
     assert 0.05 < np.mean(~lit) < 0.5
     assert np.mean((shadowed.numpy() == 0) == lit) >= 1 - OUTLINE

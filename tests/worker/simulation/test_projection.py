@@ -131,13 +131,9 @@ def test_the_order_of_residuals_moves_no_bit() -> None:
     for sums in (found.matrix, found.vector):
         sums.zero_()
     d, m = found.data, found.model
-    wp.launch(
-        kernels.normal_equations,
-        (HANDS, found._lanes),
-        inputs=[m.hand.tree, found._lane, d.active, d.pivot, d.body_p, d.axis, r],
-        outputs=[found._row, found.matrix, found.vector],
-        device="cpu",
-    )
+    inputs = [m.hand.tree, found._lane, d.active, d.pivot, d.body_p, d.axis, r]
+    outputs = [found._row, found.matrix, found.vector]
+    wp.launch(kernels.normal_equations, (HANDS, found._lanes), inputs=inputs, outputs=outputs, device="cpu")
     np.testing.assert_array_equal(found.matrix.numpy(), before[0])
     np.testing.assert_array_equal(found.vector.numpy(), before[1])
 
@@ -197,13 +193,9 @@ def test_marked_points_get_the_slots_of_a_counter(count: int) -> None:
     point, real = wp.zeros((4, count), dtype=wp.vec3), wp.zeros((4, count), dtype=wp.float32)
     body, near = (wp.full((4, count), -1, dtype=wp.int32) for _ in range(2))
     totals = [wp.full(4, -1, dtype=wp.int32) for _ in range(2)]
-    wp.launch(
-        packing.pack,
-        (4, count),
-        inputs=[active, marked, *counts, index, point, point, real, real],
-        outputs=[totals[0], body, point, point, real, real, real, totals[1], near],
-        device="cpu",
-    )
+    inputs = [active, marked, *counts, index, point, point, real, real]
+    outputs = [totals[0], body, point, point, real, real, real, totals[1], near]
+    wp.launch(packing.pack, (4, count), inputs=inputs, outputs=outputs, device="cpu")
     for b in (0, 1, 3):
         kept, close = np.flatnonzero(mark[b]), np.flatnonzero(mark[b] == packing.NEAR)
         assert totals[0].numpy()[b] == len(kept)

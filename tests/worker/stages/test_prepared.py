@@ -28,7 +28,7 @@ from graspd.worker.stages import assets
 from graspd.worker.stages.assets import prepared_object
 from graspd.worker.stages.context import batch_seed
 from graspd.worker.stages.models import hand_glb, model_of, object_glb, publish_model
-from tests.fakes import request
+from tests.fakes import message_for, request
 from tests.worker.objects.shapes import join, sphere, stl
 
 #: Two balls in one another: a repair to remember.
@@ -118,19 +118,7 @@ def test_a_model_is_published_once(tmp_path: Path) -> None:
 
 
 def message(**changes: Any) -> TaskMessage:
-    fields = {
-        "schema_": 1,
-        "task_id": "t",
-        "job_id": "j",
-        "stage": Stage.RENDER,
-        "batch": 0,
-        "count": 32,
-        "request": request(),
-        "hand_digest": "a" * 32,
-        "object_digest": "b" * 32,
-        "output": "c" * 32,
-    }
-    return TaskMessage(**fields | changes)
+    return message_for(Stage.RENDER, scenes=1, views=1).model_copy(update=changes)
 
 
 @pytest.mark.parametrize(

@@ -26,7 +26,6 @@ from graspd.service.store.records import read_record
 from graspd.service.store.shards import Shard
 from graspd.service.store.store import Store, open_store
 from graspd.worker.files.provenance import placed_of_shard
-from graspd.worker.files.synthesis import synthesized
 from graspd.worker.process.runner import Runner
 from graspd.worker.rendering import Extras
 from graspd.worker.rendering import render as pictures
@@ -81,14 +80,6 @@ def test_grasps_stand_in_the_scenes_that_were_made_first(table: Bench) -> None:
     assert manifest.valid == 6 == (base["quality/lift_outcome"] == 1).sum()
     assert all(one.clearance_m >= 0.002 and one.lift_hard is not None for one in manifest.grasps)
     assert 0 < manifest.info["lift_share"] <= manifest.info["clear_share"] <= 1
-
-
-def test_the_first_batch_is_what_synth_makes_with_the_same_seed(table: Bench) -> None:
-    request = table.job.request
-    alone = synthesized("barrett", "block", request, place=request.place, scenes=2, device="cpu", threads=2)
-    base = table.made(Stage.SYNTHESIZE)
-    for name in ("grasp/hand_pose", "grasp/approach", "grasp/lift", "scene/object_pose", "quality/clearance_m"):
-        np.testing.assert_array_equal(base[name], alone.arrays[name])
 
 
 def test_pictures_show_the_scene_with_and_without_the_best_hand(table: Bench) -> None:
