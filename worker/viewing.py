@@ -46,33 +46,31 @@ class Models:
     """Nodes under `/grasp` (the frame of the object at rest) and `/scene`."""
 
     def __init__(self, scene: Any, hand: HandModel, obj: ObjectModel, *, mounted: bool = False) -> None:
-        """Build the nodes; `mounted` adds the links above the hand's root."""
         self._scene, self._hand, self._mounted = scene, hand, mounted
         self._probe: Probe = probe_of(hand, obj, hand_points=POINTS, object_points=64)
         scene.set_up_direction("+z")
         self.rest = scene.add_frame("/grasp", show_axes=False)
         self.thing = scene.add_frame("/grasp/object", show_axes=False)
-        scene.add_mesh_simple("/grasp/object/mesh", obj.vertices, obj.faces, color=_OBJECT, flat_shading=True)
+        self._mesh("/grasp/object/mesh", obj, _OBJECT)
         self.bodies = self._nodes(hand, "hand")
-        #: The hand's collision shapes, where its visual meshes differ from them.
+        # The hand's collision shapes, where its visual meshes differ from them.
         self._bare = without_visuals(hand) if hand.visuals.meshes else None
         self.collisions = self._nodes(self._bare, "collision") if self._bare else []
         self.show_collision(False)
         self.contacts: Any = None
         self._around: list[Any] = []
 
+    def _mesh(self, path: str, solid: Any, colour: tuple[int, ...]) -> Any:
+        return self._scene.add_mesh_simple(path, solid.vertices, solid.faces, color=colour, flat_shading=True)
+
     def _nodes(self, hand: HandModel, name: str) -> list[Any]:
         nodes = []
         for number, part in enumerate(drawn_parts(hand, mounted=self._mounted)):
             colour = tuple(round(255 * _srgb(share)) for share in part.look.base)
-            path, solid = f"/grasp/{name}/{number}", part.solid
-            nodes.append(
-                self._scene.add_mesh_simple(path, solid.vertices, solid.faces, color=colour, flat_shading=True)
-            )
+            nodes.append(self._mesh(f"/grasp/{name}/{number}", part.solid, colour))
         return nodes
 
     def show_collision(self, on: bool) -> None:
-        """Draw the hand by its collision shapes or by its visual meshes, where it has these."""
         if self.collisions:
             for nodes, shown in ((self.bodies, not on), (self.collisions, on)):
                 for node in nodes:
@@ -95,16 +93,13 @@ class Models:
                     f"/scene/support{k}", *_disc(support, object_pose[:3]), color=_TABLE, side="front"
                 )
             self._around.append(node)
-        for k, other in enumerate(neighbours.objects if neighbours else ()):
-            node = self._scene.add_mesh_simple(
-                f"/scene/neighbour{k}", other.vertices, other.faces, color=_NEIGHBOUR, flat_shading=True
-            )
-            assert neighbours is not None
-            _place(node, neighbours.poses[number, k])
-            self._around.append(node)
+        if neighbours is not None:
+            for k, other in enumerate(neighbours.objects):
+                node = self._mesh(f"/scene/neighbour{k}", other, _NEIGHBOUR)
+                _place(node, neighbours.poses[number, k])
+                self._around.append(node)
 
     def show_scene(self, on: bool) -> None:
-        """Show or hide supports and neighbours."""
         for node in self._around:
             node.visible = on
 
@@ -140,9 +135,9 @@ def _place(node: Any, pose: Floats) -> None:
     node.wxyz = pose[3:] / np.linalg.norm(pose[3:])
 
 
-def _disc(plane: HalfSpace, middle: Floats, corners: int = 96) -> tuple[Floats, NDArray[np.int64]]:
+def _disc(plane: HalfSpace, middle: Floats) -> tuple[Floats, NDArray[np.int64]]:
     """Return a disc in the plane of a half-space around the foot of a point, visible from outside only."""
-    normal = np.asarray(plane.normal, float)
+    corners, normal = 96, np.asarray(plane.normal, float)
     length = float(np.linalg.norm(normal))
     normal = normal / length
     beside = np.cross(normal, [1.0, 0, 0] if abs(normal[0]) < 0.9 else [0, 1.0, 0])
@@ -166,8 +161,7 @@ def _srgb(linear: float) -> float:
 #: Playback: seconds between two named postures, and between two frames.
 STOP_S: Final = 1.2
 FRAME_S: Final = 0.04
-#: Contact threshold at which epsilon is quoted [m].
-_QUOTED_M: Final = 0.005
+_QUOTED_M: Final = 0.005  # contact threshold at which epsilon is quoted [m]
 #: Distance of the first view from the object [m], and the angle between candidate views [rad].
 _EYE_M: Final = 0.7
 _STEP: Final = np.pi / 8
@@ -184,7 +178,7 @@ def missing() -> str:
 
 @dataclass(frozen=True)
 class ViewerContent:
-    """Content of a viewer: a base shard with its hand, object and neighbours."""
+    """A base shard with its hand, object and neighbours."""
 
     shard: Shard
     hand: HandModel
@@ -197,10 +191,7 @@ class Viewer:
 
     def __init__(self, shown: ViewerContent, *, host: str = "127.0.0.1", port: int = 8080) -> None:
         """Start the server on a port (0: any free one; else the first free one from there on).
-
-        Raises:
-            InputError: viser is not installed, the file holds no grasps, or the address cannot be used.
-        """
+        Raises InputError: viser is not installed, the file holds no grasps, or the address cannot be used."""
         if said := missing():
             raise InputError(said)
         self._shown, self._arrays = shown, shown.shard.arrays
@@ -222,7 +213,6 @@ class Viewer:
 
     @property
     def _wrist(self) -> Floats | None:
-        """(1, U) wrist angles of the shown grasp; None: the file has none."""
         return wrists_of(self._shown.shard, np.array([self.row]))
 
     @property
@@ -317,7 +307,6 @@ class Viewer:
             control.on_update(lambda _: self.show())
 
     def _load(self) -> None:
-        """Load scene, trajectory and figures of the current grasp."""
         shard, row = self._shown.shard, self.row
         self._way = way_of(shard, row)
         number = int(self._arrays["grasp/scene_index"][row]) if "grasp/scene_index" in self._arrays else 0
@@ -350,14 +339,11 @@ class Viewer:
 def _served(host: str, port: int) -> Any:
     import viser
 
-    if port == 0:
-        with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
-            try:
-                probe.bind((host, 0))
-            except OSError as error:
-                raise InputError(f"cannot serve on {host}: {error.strerror or error}") from None
-            port = int(probe.getsockname()[1])
     try:
+        if port == 0:
+            with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
+                probe.bind((host, 0))
+                port = int(probe.getsockname()[1])
         # viser prints a greeting with the address, which graspd prints itself.
         with contextlib.redirect_stdout(io.StringIO()):
             return viser.ViserServer(host=host, port=port, label="graspd view", verbose=False)
@@ -366,7 +352,6 @@ def _served(host: str, port: int) -> Any:
 
 
 def _choices(shard: Shard) -> dict[str, NDArray[np.intp]]:
-    """Return rows of each kind of grasps in the file: valid, lifted at half the friction, feasible, all."""
     found: dict[str, NDArray[np.intp]] = {}
     for name in ("valid", "lift_hard", "feasible"):
         column = shard.arrays.get(f"quality/{name}")

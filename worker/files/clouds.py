@@ -22,25 +22,15 @@ from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.surface import sample_surface
 
-#: Keys of a sample that state its origin.
-_WORDS = ("hand", "object", "shard_id", "base_id")
+_WORDS = ("hand", "object", "shard_id", "base_id")  # keys of a sample that state its origin
 
 
 def write_clouds(clouds: Clouds, folder: Path, said: Mapping[str, Any]) -> dict[str, int]:
-    """Write all clouds: `clouds-NNNNN.npz`, and `clouds.json` with their settings.
+    """Write all clouds: `clouds-NNNNN.npz`, and `clouds.json` with `said` and the returned numbers of files and clouds.
 
     An npz has the keys of a sample (docs/how-to/clouds.md) stacked over its C clouds. Arrays with a row per grasp are
     concatenated cloud by cloud; `grasp/count` (C,) is the number of rows of each cloud.
-
-    Args:
-        said: entries of `clouds.json` besides the numbers.
-
-    Returns:
-        numbers of files, clouds and empty clouds.
-
-    Raises:
-        ConflictError: the folder exists and is not empty.
-    """
+    Raises ConflictError: the folder exists and is not empty."""
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise ConflictError(f"{folder} is there already; name another folder")
     folder.mkdir(parents=True, exist_ok=True)
@@ -56,7 +46,6 @@ def write_clouds(clouds: Clouds, folder: Path, said: Mapping[str, Any]) -> dict[
 
 
 def stacked(samples: list[dict[str, Any]]) -> dict[str, Any]:
-    """Stack the samples of one shard into arrays."""
     found: dict[str, NDArray[Any]] = {name: np.array(str(samples[0][name])) for name in _WORDS}
     found["grasp/count"] = np.array([len(sample["grasp/base_row"]) for sample in samples], np.int32)
     for name in samples[0]:
@@ -72,15 +61,8 @@ _hands: LRUCache[Any, HandModel] = LRUCache(8)
 
 
 def hand_surface(shard: Shard, rows: NDArray[np.intp]) -> Floats:
-    """Return points (K, H, 3) on the hand's surface at contact in the object's frame [m].
-
-    Args:
-        shard: a base shard.
-        rows: (K,) its grasps.
-
-    Raises:
-        NotFoundError: the hand of the shard is not available here.
-    """
+    """Return points (K, H, 3) on the hand's surface at contact of rows (K,) of a base shard, in the object's frame [m].
+    Raises NotFoundError: the hand of the shard is not available here."""
     hand = _hand(shard)
     points = sample_surface(hand, POINTS)
     pose, joints = (np.asarray(shard[f"grasp/{part}"], float)[rows] for part in ("hand_pose", "joint_positions"))

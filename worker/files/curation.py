@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 from typing import Any, Final
 
 import numpy as np
@@ -33,13 +34,10 @@ class Balance:
     """Balanced selection; a `Chooser` of `worker.files.subsets` for the shards of one hand and object."""
 
     by: Sequence[str]
-    at_most: int = 0
-    """Largest number per category; 0: that of the median category."""
-    min_distance: float = 0.0
-    """Least distance of two selected grasps [m], see `worker.quality.diversity`; 0: any."""
+    at_most: int = 0  # largest number per category; 0: that of the median category
+    min_distance: float = 0.0  # least distance of two selected grasps [m], see `worker.quality.diversity`; 0: any
     seed: int = 0
-    hand: str | None = None
-    """The hand's file if the shards do not lead to it; only distances need it."""
+    hand: str | None = None  # the hand's file if the shards do not lead to it; only distances need it
 
     def __post_init__(self) -> None:
         if unknown := [one for one in self.by if one not in KINDS]:
@@ -49,10 +47,7 @@ class Balance:
 
     def __call__(self, shards: list[Shard]) -> list[NDArray[np.bool_]]:
         """Return masks of selected grasps: valid, drawn at random by the seed, limited per category.
-
-        Raises:
-            InputError: a shard lacks the category.
-        """
+        Raises InputError: a shard lacks the category."""
         kinds = self._kinds(shards)
         wanted = np.concatenate([validity.valid(shard.arrays) for shard in shards])
         if self.min_distance > 0 and wanted.any():
@@ -68,7 +63,6 @@ class Balance:
         return np.split(chosen, np.cumsum([len(shard["quality/valid"]) for shard in shards])[:-1])
 
     def _kinds(self, shards: list[Shard]) -> NDArray[np.int64]:
-        """Return the categories (N, len(by)) of each grasp."""
         columns = []
         for name in self.by:
             if name == "face":
@@ -123,14 +117,11 @@ _SETTINGS: Final = (
     "hand_digest",
     "object_digest",
 )
-#: Grasps with equal pose and joints to this many digits (metres, radians) are identical.
-_DIGITS: Final = 6
+_DIGITS: Final = 6  # grasps with equal pose and joints to this many digits (metres, radians) are identical
 
 
 @dataclass
 class _Side:
-    """One of the two datasets."""
-
     grasps: dict[tuple[str, str], Counter[bytes]] = field(default_factory=dict)
     valid: Counter[tuple[str, str]] = field(default_factory=Counter)
     settings: dict[str, set[str]] = field(default_factory=dict)
@@ -138,9 +129,8 @@ class _Side:
     @classmethod
     def of(cls, shards: Shards) -> _Side:
         side = cls()
-        for together in base_shards(shards):
-            for shard in together:
-                side._add(shard)
+        for shard in chain.from_iterable(base_shards(shards)):
+            side._add(shard)
         return side
 
     def _add(self, shard: Shard) -> None:
@@ -180,17 +170,9 @@ def difference(first: Shards, second: Shards) -> Row:
         if mine == theirs and a.valid[pair] == b.valid[pair]:
             same += 1
             continue
-        rows.append(
-            {
-                "hand": pair[0],
-                "object": pair[1],
-                "first": mine.total(),
-                "second": theirs.total(),
-                "valid_first": a.valid[pair],
-                "valid_second": b.valid[pair],
-                "common": (mine & theirs).total(),
-            }
-        )
+        grasps = {"first": mine.total(), "second": theirs.total()}
+        valid = {"valid_first": a.valid[pair], "valid_second": b.valid[pair]}
+        rows.append({"hand": pair[0], "object": pair[1], **grasps, **valid, "common": (mine & theirs).total()})
     settings = {
         name: {"first": sorted(a.settings.get(name, ())), "second": sorted(b.settings.get(name, ()))}
         for name in _SETTINGS

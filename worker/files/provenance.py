@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import zip_longest
+from itertools import islice, zip_longest
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final
@@ -28,8 +28,8 @@ from graspd.service.store.library import load_asset_files
 from graspd.service.store.shards import Shard, json_attribute
 from graspd.service.store.store import open_store
 from graspd.worker.grasps import Columns
-from graspd.worker.hands.load import files_from_path, hand_from_path, load_hand
 from graspd.worker.hands.load import files_from_path as hand_files
+from graspd.worker.hands.load import hand_from_path, load_hand
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.formats import READERS
 from graspd.worker.objects.model import ObjectModel
@@ -40,7 +40,6 @@ from graspd.worker.scenes.neighbours import Neighbours
 from graspd.worker.scenes.placement import neighbour_of
 from graspd.worker.simulation.environment import PlacedGrasps, Scenes
 
-#: File suffixes of hands and objects.
 SUFFIXES: Final = {AssetKind.HAND: (".urdf", ".xml", ".zip"), AssetKind.OBJECT: (*READERS, ".zip")}
 #: Largest number of files searched in the shard's folder and its subfolders.
 LOOKED_AT: Final = 200
@@ -52,17 +51,12 @@ _FILES: Final[dict[AssetKind, Callable[[Path], tuple[str, dict[str, bytes], dict
 
 @dataclass(frozen=True)
 class AssetReference:
-    """Reference to a hand or an object in a shard."""
-
     kind: AssetKind
     name: str
     digest: str
-    source: str = ""
-    """Path of the original file."""
-    options: Mapping[str, Any] | None = None
-    """Further options, such as `keep_largest`."""
-    folder: Path | None = None
-    """Folder of the shard."""
+    source: str = ""  # path of the original file
+    options: Mapping[str, Any] | None = None  # further options, such as `keep_largest`
+    folder: Path | None = None  # folder of the shard
 
 
 @dataclass(frozen=True)
@@ -84,17 +78,15 @@ def remembered(hand: str, obj: str, options: Mapping[str, Any]) -> dict[str, Att
 
 def find(sought: AssetReference) -> AssetFiles:
     """Find the files of a hand or object: built in, at the shard's path, in the store or shard's folder.
-
-    Raises:
-        NotFoundError: in none of these; the message lists the places.
-    """
+    Raises NotFoundError: in none of these; the message lists the places."""
     if sought.name in builtin_names(sought.kind):
         files = builtin_files(sought.kind, sought.name)
         if digest_files(sought.kind, files) == sought.digest:
             return AssetFiles(files, {})
     looked: list[str] = []
-    for path in _paths(sought, looked):
-        if (found := at(sought, path)) is not None:
+    if sought.source:
+        looked.append(f"at {sought.source}, where the shard was made")
+        if (found := at(sought, Path(sought.source))) is not None:
             return found
     if (found := _stored(sought, looked)) is not None:
         return found
@@ -105,12 +97,6 @@ def find(sought: AssetReference) -> AssetFiles:
         f"the {sought.kind} {sought.name!r} of digest {sought.digest[:12]} is not {', not '.join(looked)}; "
         f"name its file: --{sought.kind}"
     )
-
-
-def _paths(sought: AssetReference, looked: list[str]) -> Iterator[Path]:
-    if sought.source:
-        looked.append(f"at {sought.source}, where the shard was made")
-        yield Path(sought.source)
 
 
 def _stored(sought: AssetReference, looked: list[str]) -> AssetFiles | None:
@@ -130,7 +116,7 @@ def _beside(sought: AssetReference, looked: list[str]) -> Iterator[Path]:
     looked.append(f"in {sought.folder}")
     near = (path for pattern in ("*", "*/*") for path in sorted(sought.folder.glob(pattern)))
     fitting = (path for path in near if path.suffix.lower() in SUFFIXES[sought.kind])
-    yield from (path for _, path in zip(range(LOOKED_AT), fitting, strict=False))
+    yield from islice(fitting, LOOKED_AT)
 
 
 def at(sought: AssetReference, path: Path) -> AssetFiles | None:
@@ -149,7 +135,6 @@ def at(sought: AssetReference, path: Path) -> AssetFiles | None:
 
 
 def options_of(attribute: object) -> dict[str, Any]:
-    """Return options from a shard's attribute; empty if it has none."""
     try:
         said = from_json(str(attribute or "{}"))
     except ValueError:
@@ -179,9 +164,8 @@ def hand_of_shard(shard: Shard, given: str | None) -> HandModel:
 
 
 def hand_files_of_shard(shard: Shard, given: str | None) -> AssetFiles:
-    """Return the files of `hand_of_shard`, with the options to load them with."""
     if given:
-        _, files, stated = files_from_path(given)
+        _, files, stated = hand_files(given)
         return AssetFiles(files, stated)
     return find(_wanted(shard, AssetKind.HAND))
 
@@ -191,21 +175,17 @@ def object_of_shard(shard: Shard, given: str | None) -> ObjectModel:
     said = shard.attributes
     # Older shards lack these attributes: the values were the same for all objects.
     mass, friction = (float(said.get(key, default)) for key, default in _MATTER.items())  # type: ignore[arg-type]
-    return _object_of_shard(shard, given).weighing(mass=mass, friction=friction)
-
-
-def _object_of_shard(shard: Shard, given: str | None) -> ObjectModel:
-    knobs = options_of(shard.attributes.get("fidelity"))
-    stated = knobs.get("face_error_m")
+    stated = options_of(said.get("fidelity")).get("face_error_m")
     error = float(stated) if isinstance(stated, int | float) else 3e-4
     wanted = _wanted(shard, AssetKind.OBJECT)
     if not given:
-        return _loaded(wanted, find(wanted), error)
-    if (found := at(wanted, Path(given))) is not None:
-        return _loaded(wanted, found, error)
-    obj = object_from_path(given, face_error_m=error)
-    _check(shard, "object", obj.digest, given)
-    return obj
+        obj = _loaded(wanted, find(wanted), error)
+    elif (found := at(wanted, Path(given))) is not None:
+        obj = _loaded(wanted, found, error)
+    else:
+        obj = object_from_path(given, face_error_m=error)
+        _check(shard, "object", obj.digest, given)
+    return obj.weighing(mass=mass, friction=friction)
 
 
 def _loaded(wanted: AssetReference, found: AssetFiles, face_error_m: float) -> ObjectModel:
@@ -273,10 +253,7 @@ def _neighbour(shard: Shard, name: str, digest: str, source: str) -> ObjectModel
 
 def placed_of_shard(shard: Shard) -> PlacedGrasps | None:
     """Return the scenes of a base shard's grasps; None if they were planned around a free object.
-
-    Raises:
-        InputError: the shard's scene attribute is invalid.
-    """
+    Raises InputError: the shard's scene attribute is invalid."""
     if "scene/object_pose" not in shard.arrays or "grasp/scene_index" not in shard.arrays:
         return None
     if (spec := scene_spec_of(shard)) is None:
@@ -288,12 +265,11 @@ def placed_of_shard(shard: Shard) -> PlacedGrasps | None:
     return scenes.placed(np.asarray(shard["grasp/scene_index"], np.intp))
 
 
-def _check(shard: Shard, kind: str, digest: str, given: str | None) -> None:
+def _check(shard: Shard, kind: str, digest: str, given: str) -> None:
     expected = str(shard.attributes.get(f"{kind}_digest", ""))
     if expected != digest:
-        name = given or str(shard.attributes.get(kind, ""))
         raise ConflictError(
-            f"the {shard.kind} shard was made with the {kind} of digest {expected[:12]}, but {name!r} has "
+            f"the {shard.kind} shard was made with the {kind} of digest {expected[:12]}, but {given!r} has "
             f"{digest[:12]}; give the file it was made with as --{kind}"
         )
 
@@ -340,13 +316,8 @@ def base_attributes(
 ) -> dict[str, Attribute]:
     """Return the attributes of a base shard: joints, request, scene, candidates, terms of validation.
 
-    Args:
-        hand: the hand.
-        obj: the object as validated.
-        request: friction, want, validator and scene.
-        candidates: number of candidates up to the last selected one.
-        verdict_key: digest of the terms of the verdicts; None: not validated.
-        outcomes: numbers of rejected candidates by outcome.
+    `candidates` counts up to the last selected one; `verdict_key` is the digest of the terms of the verdicts, None: not
+    validated; `outcomes` are the numbers of rejected candidates.
     """
     said: dict[str, Attribute] = {
         "joint_names": list(hand.joint_names),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Any
 
@@ -25,21 +26,15 @@ Chooser = Callable[[list[Shard]], list[NDArray[np.bool_]]]
 
 @dataclass(frozen=True)
 class Subset:
-    """Result of writing a subset."""
-
     looked_at: int
     kept: int
     files: list[Path]
-    passed_over: int
-    """Scene and views shards, whose rows refer to grasps by number and are not transferred."""
+    passed_over: int  # scene and views shards, whose rows refer to grasps by number and are not transferred
 
 
 def shards_of(source: str, snapshot: str | None = None) -> Shards:
     """Return the shards of a file or folder, or of a dataset in this machine's store by name.
-
-    Raises:
-        NotFoundError: none of these exists.
-    """
+    Raises NotFoundError: none of these exists."""
     if "/" in source or source in (".", "..") or Path(source).exists():
         return open_shards(Path(source))
     try:
@@ -51,25 +46,14 @@ def shards_of(source: str, snapshot: str | None = None) -> Shards:
 
 def base_shards(shards: Shards) -> Iterator[list[Shard]]:
     """Group base shards by hand and object."""
-    pair, together = ("", ""), list[Shard]()
-    for file in shards.of("base"):
-        if (file.hand, file.object) != pair and together:
-            yield together
-            together = []
-        pair = (file.hand, file.object)
-        together.append(read_shard(shards.path(file), kind="base"))
-    if together:
-        yield together
+    for _, files in groupby(shards.of("base"), key=lambda file: (file.hand, file.object)):
+        yield [read_shard(shards.path(file), kind="base") for file in files]
 
 
 def write_subset(shards: Shards, choose: Chooser, out: Path, *, said: Mapping[str, Any]) -> Subset:
     """Write base shards of selected grasps, `HAND/OBJECT/base-BATCH.h5`, and the selection, `subset.json`.
-
     Shards without selected grasps are left out. All columns of a grasp, including its scene, are unchanged.
-
-    Raises:
-        InputError: the folder contains files already or cannot be made; or nothing is selected.
-    """
+    Raises InputError: the folder contains files already or cannot be made; or nothing is selected."""
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"{out} is there already; choose a folder that is not")
     looked_at = kept = 0
@@ -98,10 +82,7 @@ EveryOption = Annotated[bool, typer.Option("--all", help="Select all grasps, inc
 
 def choose(base: Shard, *, unvalidated: bool = False, every: bool = False) -> tuple[NDArray[np.bool_], str]:
     """Select grasps (N,), and return a name for the selection.
-
-    Raises:
-        InputError: both options at once, or no such grasp; the message states what the shard contains.
-    """
+    Raises InputError: both options at once, or no such grasp; the message states what the shard contains."""
     if unvalidated and every:
         raise InputError("--unvalidated and --all exclude each other")
     count = len(base["quality/valid"])

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -17,6 +17,7 @@ from graspd.service.model.local_options import LocalOptions
 from graspd.service.model.metrics import DIRECTION_CELLS, GraspType, entropy_bits
 from graspd.service.model.planning import shortfall, totals
 from graspd.service.model.scene_spec import SceneSpec
+from graspd.service.model.transforms import Floats
 from graspd.service.store.columns import Attribute
 from graspd.service.store.shards import json_attribute
 from graspd.worker.engines.devices import Device
@@ -61,12 +62,9 @@ class SynthesisResult:
     batches: list[ValidatedBatch]
     request: JobOptions
     place: SceneSpec
-    interrupted: bool
-    """Whether it was stopped early."""
-    seconds: float
-    """Wall time without loading of the files [s]."""
-    rolling: int = 0
-    """Scenes in which the object may roll, see `rolling_poses`."""
+    interrupted: bool  # whether it was stopped early
+    seconds: float  # wall time without loading of the files [s]
+    rolling: int = 0  # scenes in which the object may roll, see `rolling_poses`
 
     @property
     def reason(self) -> str | None:
@@ -99,7 +97,6 @@ class SynthesisResult:
         return None if len(self.arrays["quality/valid"]) else self.batches[0].limit
 
     def summary(self) -> dict[str, Any]:
-        """Return a summary for users, as JSON values."""
         count, request = len(self.arrays["quality/valid"]), self.request
         told: dict[str, Any] = {
             "grasps": count,
@@ -123,9 +120,11 @@ class SynthesisResult:
             },
         }
         if request.measures_payload:
-            told["payload_kg"] = self._median_payload()
+            payload = self._known("payload_kg")
+            told["payload_kg"] = round(float(np.median(payload)), 4) if len(payload) else None
         if request.shake:
-            told["shake_share"] = self._shake_share()
+            margin = self._known("shake_margin")
+            told["shake_share"] = round(float((margin < 1).mean()), 4) if len(margin) else None
         if self.limit is not None:
             told["limit"] = self.limit.facts()
         told |= self._diversity()
@@ -142,7 +141,6 @@ class SynthesisResult:
         return told
 
     def _diversity(self) -> dict[str, Any]:
-        """Return types of the grasps, and entropies of types and approach directions."""
         types = np.bincount(np.asarray(self.arrays["quality/grasp_type"], int), minlength=len(GraspType))
         cells = np.bincount(np.asarray(self.arrays["quality/approach_cell"], int), minlength=DIRECTION_CELLS)
         return {
@@ -152,16 +150,9 @@ class SynthesisResult:
             "direction_entropy_bits": round(entropy_bits(cells.tolist()), 4),
         }
 
-    def _median_payload(self) -> float | None:
-        values = np.asarray(self.arrays["quality/payload_kg"], float)
-        known = values[np.isfinite(values)]
-        return round(float(np.median(known)), 4) if len(known) else None
-
-    def _shake_share(self) -> float | None:
-        """Return the share of shaken grasps that survive."""
-        values = np.asarray(self.arrays["quality/shake_margin"], float)
-        known = values[np.isfinite(values)]
-        return round(float((known < 1).mean()), 4) if len(known) else None
+    def _known(self, name: str) -> Floats:
+        values = np.asarray(self.arrays[f"quality/{name}"], float)
+        return values[np.isfinite(values)]
 
     def _mean(self, name: str, digits: int) -> float | None:
         values = self.arrays[f"quality/{name}"]
@@ -171,7 +162,6 @@ class SynthesisResult:
         return round(float(known.mean()), digits) if len(known) else None
 
     def _shares(self) -> dict[str, float]:
-        """Return shares of all planned grasps: clear, lifted, lifted at half friction."""
         planned = sum(batch.planned for batch in self.batches)
         return {
             name: round(sum(batch.shares[name] * batch.planned for batch in self.batches) / max(1, planned), 4)
@@ -180,14 +170,7 @@ class SynthesisResult:
 
 
 def synthesized_as(hand: str, obj: str, options: LocalOptions, **run: Any) -> SynthesisResult:
-    """Run `synthesized` with a local user's options.
-
-    Args:
-        hand: see `synthesized`.
-        obj: see `synthesized`.
-        options: options of the user.
-        run: prefilter, processes, progress, cancelled and partial of `synthesized`.
-    """
+    """Run `synthesized` with a local user's options; `run`: further arguments."""
     return synthesized(
         hand,
         obj,
@@ -258,7 +241,10 @@ def synthesized(
     run = run if progress is None else replace(run, progress=progress)
     run = run if cancelled is None else replace(run, cancelled=cancelled)
     joined = batches_at_once(chosen, join)
-    with _pool(processes_at_once(chosen, processes, threads=threads)) as pool:
+    count = processes_at_once(chosen, processes, threads=threads)
+    with Pool(count, MODULES) if count > 1 else nullcontext() as pool:
+        if pool is not None:
+            pool.start()  # while the first grasps are planned
         run = replace(run, pool=pool)
         batches = validated_batches(
             model, thing, request, sizes=sizes, join=joined, scenes=where, run=run, partial=partial
@@ -278,17 +264,6 @@ def synthesized(
     if made.reason is not None:
         attributes["reason"] = made.reason
     return made
-
-
-@contextmanager
-def _pool(processes: int) -> Iterator[Pool | None]:
-    """Start a pool of processes while the first grasps are planned; None for one process."""
-    if processes == 1:
-        yield None
-        return
-    with Pool(processes, MODULES) as pool:
-        pool.start()
-        yield pool
 
 
 def _as_stored(place: SceneSpec, others: Sequence[ObjectModel]) -> dict[str, Any]:

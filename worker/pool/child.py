@@ -26,12 +26,9 @@ class WorkItem:
     """Work item: `work(shared, part)`."""
 
     work: Callable[[Any, Any], Any]
-    key: str
-    """Key of the data shared with other items."""
-    shared: bytes | None
-    """Pickled shared data; None: sent before."""
+    key: str  # key of the data shared with other items
+    shared: bytes | None  # pickled shared data; None: sent before
     forget: tuple[str, ...]
-    """Keys to evict."""
     part: Any
 
 
@@ -62,7 +59,6 @@ def serve(connection: Connection, modules: Sequence[str]) -> None:
 
 
 def _answer(order: bytes, kept: dict[str, Any]) -> bytes:
-    """Return pickled success and the result or error."""
     try:
         wanted: WorkItem = pickle.loads(order)
         for key in wanted.forget:

@@ -32,14 +32,10 @@ from graspd.worker.pool.child import WorkItem
 log = logging.getLogger(__name__)
 #: Modules for the work of a worker; not imported here, so that a worker starts before its engine.
 MODULES: Final = ("graspd.worker.validation.validator", "graspd.worker.quality.table")
-#: Number of shared data cached per process: two for a pair that is validated and measured.
-KEPT: Final = 8
-#: Interval of checks for a stop [s].
-_LOOK_S: Final = 0.1
-#: Time after which a process that still works on an abandoned item is ended [s].
-_PATIENCE_S: Final = 20.0
-#: Processes compute on the CPU and take no GPU memory.
-_NO_GPU: Final = {"CUDA_VISIBLE_DEVICES": ""}
+KEPT: Final = 8  # number of shared data cached per process: two for a pair that is validated and measured
+_LOOK_S: Final = 0.1  # interval of checks for a stop [s]
+_PATIENCE_S: Final = 20.0  # time after which a process that still works on an abandoned item is ended [s]
+_NO_GPU: Final = {"CUDA_VISIBLE_DEVICES": ""}  # processes compute on the CPU and take no GPU memory
 
 
 class ProcessLost(GraspdError):
@@ -50,14 +46,11 @@ class ProcessLost(GraspdError):
 
 @dataclass(eq=False)
 class _Request:
-    """Request of one caller."""
-
     work: Callable[[Any, Any], Any]
     key: str
     shared: Any
     done: Callable[[int], None]
-    dropped_at: float | None = None
-    """Time at which the last caller stopped waiting."""
+    dropped_at: float | None = None  # time at which the last caller stopped waiting
 
     @cached_property
     def pickled(self) -> bytes:
@@ -81,11 +74,9 @@ class Pool(AbstractContextManager["Pool"]):
 
     @property
     def pids(self) -> list[int]:
-        """Return the ids of running processes."""
         return [place.process.pid for place in self._places if place.process is not None]
 
     def start(self) -> None:
-        """Start the processes if they are not running."""
         with self._changing:
             for place in self._places if not (self._started or self._closed) else ():
                 with suppress(OSError):  # reported on use of the process

@@ -67,7 +67,6 @@ class Engine:
         self._context: TaskContext | None = None
 
     def serve(self) -> None:
-        """Process orders until `end`."""
         with self._connection:
             threading.Thread(target=self._listen, name="engine-orders", daemon=True).start()
             try:
@@ -90,7 +89,6 @@ class Engine:
             self._do(about)
 
     def update(self, **facts: str | float) -> None:
-        """Send facts for the list of workers."""
         self._say("facts", facts)
 
     def _start(self) -> None:
@@ -137,7 +135,6 @@ class Engine:
         self._say("idle", self._look_after_itself())
 
     def _look_after_itself(self) -> Condition:
-        """Check between two tasks whether the engine is fit, and whether it should end."""
         if self._runner.device_lost:
             log.error("this worker ends: %s", self._runner.device_lost)
             return "unfit"
@@ -182,7 +179,6 @@ class TaskResources:
         self._memory_mb = settings.worker_max_memory_mb or available_memory() / 2 / 2**20
 
     def outgrown(self) -> str:
-        """Return the reason to replace this process by a fresh one, "" if there is none."""
         beside = sum(resident_mb(pid) for pid in pool.pids) if (pool := vars(self).get("_pool")) is not None else 0.0
         if (held := resident_mb() + beside) > self._memory_mb:
             return f"it holds {held:.0f} MiB, over {self._memory_mb:.0f} (GRASPD_WORKER_MAX_MEMORY_MB)"
@@ -209,13 +205,10 @@ class TaskResources:
         return Pool(count, MODULES) if count > 1 else None
 
     def close(self) -> None:
-        """End all resources started for tasks."""
         if (pool := vars(self).get("_pool")) is not None:
             pool.close()
 
     def context(self, raw: Mapping[str, Any], update: Callable[..., None]) -> TaskContext:
-        """Return the context of a task; `update` receives its progress."""
-
         def tell(done: float, total: float, message: str) -> None:
             update(done=done, total=total, message=message[:200])
 

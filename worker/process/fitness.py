@@ -28,10 +28,8 @@ from graspd.service.store.store import Store
 from graspd.worker.process.selfcheck import EngineError
 
 log = logging.getLogger(__name__)
-#: Check of the engine for some stages; raises EngineError.
-Check = Callable[[Collection[Stage]], None]
-#: Pauses before the checks of a worker in quarantine [s].
-PAUSES_S: Final = (2.0, 5.0, 10.0, 20.0)
+Check = Callable[[Collection[Stage]], None]  # check of the engine for some stages; raises EngineError
+PAUSES_S: Final = (2.0, 5.0, 10.0, 20.0)  # pauses before the checks of a worker in quarantine [s]
 #: This many tasks that failed here and succeeded elsewhere make a worker unfit.
 _DONE_ELSEWHERE: Final = 2
 _REMEMBERED: Final = 16
@@ -52,19 +50,15 @@ def first_loss(task: str) -> bool:
 
 
 class Fitness:
-    """State of a worker's fitness."""
-
     def __init__(self, store: Store, check: Check | None = None) -> None:
         """Without `check` only results of other workers decide."""
         self._store = store
         self._check = check
         self._failed: dict[str, tuple[Stage, str]] = {}
         self._can_pass = True
-        self.reason = ""
-        """Reason why the worker is unfit; "" while it is fit."""
+        self.reason = ""  # reason why the worker is unfit; "" while it is fit
 
     def try_engine(self, stages: Collection[Stage]) -> bool:
-        """Check the engine for these stages."""
         try:
             if self._check is not None:
                 self._check(stages)
@@ -76,7 +70,6 @@ class Fitness:
         return True
 
     def passed(self) -> None:
-        """Record that a task succeeded here."""
         self._failed.clear()
 
     def doubt(self, message: Message, error: Exception) -> str:
@@ -94,11 +87,7 @@ class Fitness:
         return self.reason
 
     def sit_out(self, stages: Collection[Stage], update: Callable[..., None], told_to_stop: Callable[[], bool]) -> bool:
-        """Wait in quarantine; return whether the worker is fit again. Ends early if the worker must stop.
-
-        Args:
-            update: receives facts for the list of workers.
-        """
+        """Wait in quarantine and tell `update` so; return whether the worker is fit again, or False if it must stop."""
         log.warning("this worker takes no tasks: %s", self.reason)
         for pause in PAUSES_S:
             update(state="quarantined", reason=self.reason)
@@ -114,7 +103,6 @@ class Fitness:
         return False
 
     def _done_elsewhere(self, *, except_for: str) -> list[str]:
-        """Return the tasks that failed here since the last success and whose result now exists."""
         try:
             return [
                 task

@@ -22,10 +22,8 @@ log = logging.getLogger(__name__)
 #: Interval of heartbeats if three fit a lease [s]: a cancelled task must stop within two seconds, and each heartbeat
 #: reads the key of cancellations.
 BEAT_S: Final = 0.8
-#: Least interval between two updates [s].
-_SHORTEST_INTERVAL_S: Final = 0.1
-#: Longest wait for a response of Redis [s].
-_ANSWER_S: Final = 3.0
+_SHORTEST_INTERVAL_S: Final = 0.1  # least interval between two updates [s]
+_ANSWER_S: Final = 3.0  # longest wait for a response of Redis [s]
 
 
 class Heartbeat:
@@ -40,28 +38,20 @@ class Heartbeat:
         alive: Path | None = None,
         is_stopped: Callable[[], bool] = lambda: False,
     ) -> None:
-        """
-        Args:
-            url: of Redis.
-            beat: initial entry in the list of workers.
-            lease_s: lifetime of the registration after a heartbeat [s].
-            alive: a file that is touched with each heartbeat.
-            is_stopped: whether the worker hangs although this thread runs: then there is no heartbeat.
-        """
+        """`lease_s`: lifetime of the registration after a heartbeat [s]; `alive`: a file that is touched with each one;
+        `is_stopped`: whether the worker hangs although this thread runs: then there is no heartbeat."""
         self._connection: Any = connect(url, patience=0, timeout_s=_ANSWER_S)
         self._facts, self._lease_s = asdict(beat), lease_s
         self._alive, self._is_stopped = HeartbeatFile(alive), is_stopped
         self._changed, self._over = threading.Event(), threading.Event()
         self._away = False
-        self.interval_s = min(BEAT_S, lease_s / 3)
-        """Interval of heartbeats [s]."""
+        self.interval_s = min(BEAT_S, lease_s / 3)  # interval of heartbeats [s]
         self._thread = threading.Thread(target=self._run, name="heartbeat", daemon=True)
 
     def start(self) -> None:
         self._thread.start()
 
     def update(self, **facts: str | float) -> None:
-        """Update facts such as the state, the name of the device, or the progress of the task."""
         self._facts.update(facts)
         self._changed.set()
 

@@ -20,8 +20,7 @@ from graspd.worker.stages.context import StopReason
 if TYPE_CHECKING:
     from graspd.service.settings import Settings
 
-#: Time for an engine to end by itself [s].
-_END_S: Final = 3.0
+_END_S: Final = 3.0  # time for an engine to end by itself [s]
 
 
 class EngineLost(Exception):
@@ -35,9 +34,7 @@ class Setup:
     settings: Settings
     stages: tuple[Stage, ...]
     worker: str
-    """Name of its worker."""
-    patient: bool
-    """Whether to wait in quarantine until the first check passes."""
+    patient: bool  # whether to wait in quarantine until the first check passes
 
 
 class Link:
@@ -48,7 +45,6 @@ class Link:
         self._connection, self._process = connection, process
 
     def say(self, word: str, about: Any = None) -> None:
-        """Send an order; a lost engine does not receive it."""
         with suppress(OSError):
             self._connection.send((word, about))
 
@@ -65,7 +61,6 @@ class Link:
         return self._process is not None and is_stopped(self._process.pid)
 
     def kill(self) -> None:
-        """Kill the engine at once."""
         if self._process is not None:
             self._process.kill()
 
@@ -86,9 +81,7 @@ Condition = Literal["fit", "unfit", "outgrown"]
 
 def start_engine(setup: Setup, program: Sequence[str] = (sys.executable, "-m", "graspd.worker.process.engine")) -> Link:
     """Start an engine in a fresh process, which ends with this one; CUDA contexts do not survive a fork.
-
-    Call it from the main thread: the kernel ties a child to the thread that starts it.
-    """
+    Call it from the main thread: the kernel ties a child to the thread that starts it."""
     ours, process = start_child([sys.executable, "-m", "graspd.service.run.launch", str(os.getpid()), *program])
     link = Link(ours, process)
     # The values only: the library that reads settings takes 8 MiB per process.

@@ -40,19 +40,14 @@ from graspd.worker.process.link import Condition, EngineLost, Link, Setup, Start
 from graspd.worker.stages.context import StopReason
 
 log = logging.getLogger(__name__)
-#: Reconnection attempts of a worker, for about a minute: longer than a restart of Redis.
-_PATIENCE: Final = 60
-#: Time that RQ waits for a task before its maintenance [s]: its `worker_ttl` less 15.
-_WORKER_TTL_S: Final = 20
+_PATIENCE: Final = 60  # reconnection attempts of a worker, for about a minute: longer than a restart of Redis
+_WORKER_TTL_S: Final = 20  # time that RQ waits for a task before its maintenance [s]: its `worker_ttl` less 15
 #: RQ's maintenance is off: see docs/adr/0003-silence-is-judged-by-one-clock.md.
 _NEVER_S: Final = 10**9
 _REFUSED_PAUSE_S: Final = 0.5
-#: Longest wait between two attempts to reach Redis [s].
-_LONGEST_RETRY_S: Final = 2.0
-#: Longest delay until a worker notices a request to stop [s].
-_LOOK_S: Final = 0.1
-#: Time for an engine to stop by itself before it is ended [s].
-STUCK_AFTER_S: Final = 60.0
+_LONGEST_RETRY_S: Final = 2.0  # longest wait between two attempts to reach Redis [s]
+_LOOK_S: Final = 0.1  # longest delay until a worker notices a request to stop [s]
+STUCK_AFTER_S: Final = 60.0  # time for an engine to stop by itself before it is ended [s]
 
 
 class GraspWorker(SimpleWorker):  # type: ignore[misc]
@@ -63,7 +58,6 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
     def __init__(
         self, queue: RqQueue, engine: Link, heart: Heartbeat, *, stages: Collection[Stage], name: str, limit_s: float
     ) -> None:
-        """`limit_s` is the time limit of a task [s]."""
         super().__init__(
             queues=queue_names(stages, ability=own_ability()),
             name=name,
@@ -78,12 +72,9 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
         self._queue, self._engine, self._heartbeat = queue, engine, heart
         self._stages, self._taken, self._limit_s = stages, 0, limit_s
         self.tasks_done = 0
-        self.told_to_stop = False
-        """Whether a signal requested a stop."""
-        self.found_none = False
-        """Whether it ended because no task was waiting."""
-        self.engine_is: Condition = "fit"
-        """State of the engine after the last task."""
+        self.told_to_stop = False  # whether a signal requested a stop
+        self.found_none = False  # whether it ended because no task was waiting
+        self.engine_is: Condition = "fit"  # state of the engine after the last task
 
     def check_service(self) -> None:
         """Raise BusyError if Redis belongs to another service, InputError if the device is unknown."""
@@ -146,7 +137,6 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
                 due = time.monotonic() + self._heartbeat.interval_s
 
     def _pass_on(self, word: str, about: Any) -> None:
-        """Process facts and events from the engine."""
         if word == "refused":
             raise about
         if word == "facts":
@@ -239,12 +229,7 @@ def run_worker(
 ) -> bool:
     """Run tasks until a stop is requested; with `burst` until none waits, with `max_tasks` that many.
 
-    Args:
-        idle_s: with `burst`: time without a task after which none waits [s].
-        start: starts the engine.
-
-    Returns:
-        False if the worker ended because of a failure.
+    With `burst`, none waits after `idle_s` without a task [s]. Return False if the worker ended because of a failure.
 
     Raises:
         InputError: there is no such device.

@@ -38,11 +38,7 @@ from graspd.worker.process.fitness import Fitness, first_loss
 from graspd.worker.stages.context import StageFunction, StopReason, TaskContext, shard_of
 
 log = logging.getLogger(__name__)
-
-
-Publish = Callable[[Event], None]
 _TRACE_CHARACTERS: Final = 8000
-
 _STOPPED: Final = {StopReason.CANCELLED: EventKind.CANCELLED, StopReason.SHUTDOWN: EventKind.RETURNED}
 
 
@@ -54,7 +50,7 @@ class Runner:
         stages: Mapping[Stage, StageFunction],
         *,
         worker: str,
-        publish: Publish,
+        publish: Callable[[Event], None],
         fitness: Fitness | None = None,
         check_device: Callable[[str], None] = check_device,
     ) -> None:
@@ -64,18 +60,11 @@ class Runner:
         self._publish = publish
         self._fitness = fitness
         self._check_device = check_device
-        self.device_lost = ""
-        """Reason why this process can run no more tasks on its device; "" while it can."""
+        self.device_lost = ""  # reason why this process can run no more tasks on its device; "" while it can
 
     def run(self, raw: Mapping[str, Any], context: TaskContext) -> Event | None:
-        """Run a task.
-
-        Returns:
-            event for the controller; None if the task no longer belongs to this worker.
-
-        Raises:
-            TaskRefused: the message cannot be read, so there is no task to fail.
-        """
+        """Run a task; return the event for the controller, None if the task no longer belongs to this worker.
+        Raises TaskRefused: the message cannot be read, so there is no task to fail."""
         message = parse_message(raw)
         subjects = _subjects(message)
         parent = message.origin.traceparent if isinstance(message, TaskMessage) and message.origin else ""
@@ -181,9 +170,6 @@ class Runner:
             started=started,
             last=last,
         )
-        return self._recorded(message, attempt, context)
-
-    def _recorded(self, message: Message, attempt: AttemptRecord, context: TaskContext) -> Event:
         try:
             if isinstance(message, TaskMessage) and _has_manifest(message, context):
                 # The task has already succeeded: another worker was faster, or a lost file could not be made again.
@@ -194,22 +180,13 @@ class Runner:
         return self._event(EventKind.FAILED, message, message=attempt.reason, last=attempt.last)
 
     def _event(self, kind: EventKind, task: Message, **more: Any) -> Event:
-        facts: dict[str, Any] = {"output": output_of(task)}
+        facts: dict[str, Any] = {"output": output_of(task), "stage": task.stage, "attempt": task.attempt}
         if isinstance(task, TaskMessage):
             facts |= {"job_id": task.job_id, "batch": task.batch}
-        return Event(
-            kind=kind,
-            at=timestamp(),
-            task_id=task.task_id,
-            stage=task.stage,
-            attempt=task.attempt,
-            worker=self._worker,
-            **facts | more,
-        )
+        return Event(kind=kind, at=timestamp(), task_id=task.task_id, worker=self._worker, **facts | more)
 
 
 def _has_manifest(message: TaskMessage, context: TaskContext) -> bool:
-    """Check whether a readable manifest shows that the task has succeeded; a damaged one is ignored."""
     try:
         return load_manifest(context.store, message.stage, message.output).shard_id == message.output
     except (NotFoundError, DamagedError):
@@ -228,7 +205,6 @@ def parse_message(raw: Mapping[str, Any]) -> Message:
 
 
 def _subjects(message: Message) -> dict[str, Any]:
-    """Return the fields of every log line of a task."""
     found: dict[str, Any] = {"task": message.task_id, "attempt": message.attempt}
     if isinstance(message, TaskMessage):
         origin = message.origin or Origin()

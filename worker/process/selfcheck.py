@@ -36,15 +36,8 @@ class EngineError(GraspdError):
 
 
 def check_engine(device: Callable[[], str], stages: Collection[Stage], *, threads: int = 0) -> None:
-    """Check the engines of these stages.
-
-    Args:
-        device: returns the name of the Warp device.
-        threads: CPU threads of a task; 0: all cores.
-
-    Raises:
-        EngineError: a part fails to load, compile or run, or gives implausible results; the message names it.
-    """
+    """Check the engines of these stages; `device` returns the name of the Warp device.
+    Raises EngineError: a part fails to load, compile or run, or gives implausible results; the message names it."""
     started, name = time.monotonic(), "device"
     try:
         of_device = device()

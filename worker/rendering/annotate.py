@@ -19,9 +19,7 @@ BACKGROUND, TABLE, OBJECT = 0, 1, 2
 
 def tight_boxes(segmentation: NDArray[np.uint8]) -> NDArray[np.float32]:
     """Return boxes (V, 4) x_min y_min x_max y_max [px] of visible object pixels (V, H, W); nan: none.
-
-    Edges are pixel edges: a single pixel (i, j) gives i, j, i + 1, j + 1.
-    """
+    Edges are pixel edges: a single pixel (i, j) gives i, j, i + 1, j + 1."""
     mask = segmentation == OBJECT
     boxes = np.full((len(mask), 4), np.nan, np.float32)
     for view in np.flatnonzero(mask.any(axis=(1, 2))):
@@ -53,10 +51,7 @@ ALL: Final = "all"
 
 def parse_channels(words: Iterable[str]) -> tuple[str, ...]:
     """Return the channels in fixed order, without duplicates; `all` stands for every one.
-
-    Raises:
-        InputError: a channel is unknown.
-    """
+    Raises InputError: a channel is unknown."""
     wanted = {word.strip() for word in words if word.strip()}
     if unknown := sorted(wanted - {*EXTRA_CHANNELS, ALL}):
         meant = did_you_mean(unknown[0], EXTRA_CHANNELS)
@@ -72,11 +67,7 @@ def ray_distance(depth: NDArray[np.float32], k: Floats) -> NDArray[np.float32]:
 
 def occlusion_ratio(segmentation: NDArray[np.uint8], alone: NDArray[np.bool_]) -> NDArray[np.float32]:
     """Return the occluded share (V,) of the object's pixels; nan: not in the picture.
-
-    Args:
-        segmentation: (V, H, W) labels of the whole scene.
-        alone: (V, H, W) pixels of the object with nothing else in the scene.
-    """
+    `segmentation` (V, H, W) labels the scene, `alone` (V, H, W) are the object's pixels with nothing else in it."""
     whole = alone.sum(axis=(1, 2)).astype(float)
     seen = (alone & (segmentation == OBJECT)).sum(axis=(1, 2))
     return np.where(whole > 0, 1.0 - seen / np.maximum(whole, 1.0), np.nan).astype(np.float32)

@@ -20,14 +20,10 @@ from graspd.service.model.transforms import Floats
 
 FIELD_OF_VIEW: Final = np.radians(40.0)
 BASELINE_M: Final = 0.06
-#: Elevation of a sampled camera above the table [rad].
-ELEVATION: Final = (np.radians(18.0), np.radians(62.0))
-#: Share of the smaller field of view that the object's bounding ball fills.
-FILL: Final = (0.7, 1.0)
-#: Below this distance a stereo pair does not have the whole object in both pictures [m].
-NEAREST_M: Final = 0.25
-#: Largest distance of the optical axis from the object's centre, in bounding radii.
-AIM_JITTER: Final = 0.15
+ELEVATION: Final = (np.radians(18.0), np.radians(62.0))  # elevation of a sampled camera above the table [rad]
+FILL: Final = (0.7, 1.0)  # share of the smaller field of view that the object's bounding ball fills
+NEAREST_M: Final = 0.25  # below this distance a stereo pair does not have the whole object in both pictures [m]
+AIM_JITTER: Final = 0.15  # largest distance of the optical axis from the object's centre, in bounding radii
 
 
 @dataclass(frozen=True)
@@ -36,10 +32,8 @@ class Cameras:
 
     width: int
     height: int
-    intrinsics: Floats
-    """(3, 3) [px]"""
-    extrinsics: Floats
-    """(V, 4, 4) table to camera."""
+    intrinsics: Floats  # (3, 3) [px]
+    extrinsics: Floats  # (V, 4, 4) table to camera
 
     def __len__(self) -> int:
         return len(self.extrinsics)
@@ -73,10 +67,7 @@ def intrinsics(width: int, height: int, field_of_view: float = FIELD_OF_VIEW) ->
 
 def narrow_field(k: Floats, width: int, height: int) -> float:
     """Return the opening angle of the widest cone around the optical axis within the picture [rad].
-
-    Raises:
-        InputError: the principal point lies outside the picture.
-    """
+    Raises InputError: the principal point lies outside the picture."""
     slopes = [k[0, 2] / k[0, 0], (width - k[0, 2]) / k[0, 0], k[1, 2] / k[1, 1], (height - k[1, 2]) / k[1, 1]]
     if min(slopes) <= 0:
         raise InputError(
@@ -135,10 +126,8 @@ def stereo_pair(extrinsics: Floats, baseline: float) -> tuple[Floats, Floats]:
     return left, right
 
 
-#: Tolerance of rotations in a file: six digits are usual in JSON written by hand.
-ROTATION_ERROR: Final = 1e-5
+ROTATION_ERROR: Final = 1e-5  # tolerance of rotations in a file: six digits are usual in JSON written by hand
 
-_Point = Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)]
 _Row3 = Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)]
 _Row4 = Annotated[list[FiniteFloat], Field(min_length=4, max_length=4)]
 
@@ -147,16 +136,13 @@ _Row4 = Annotated[list[FiniteFloat], Field(min_length=4, max_length=4)]
 class GivenCameras:
     """Given cameras; missing values are sampled or default."""
 
-    intrinsics: Floats | None = None
-    """(3, 3) K [px], common to all cameras."""
-    extrinsics: Floats | None = None
-    """(C, 4, 4) table to camera, the same in every scene."""
+    intrinsics: Floats | None = None  # (3, 3) K [px], common to all cameras
+    extrinsics: Floats | None = None  # (C, 4, 4) table to camera, the same in every scene
     width: int | None = None
     height: int | None = None
 
 
-#: Default intrinsics, sampled poses.
-SAMPLED: Final = GivenCameras()
+SAMPLED: Final = GivenCameras()  # default intrinsics, sampled poses
 
 
 class _Model(BaseModel):
@@ -172,8 +158,8 @@ class _Pinhole(_Model):
 
 class _Camera(_Model):
     extrinsics: Annotated[list[_Row4], Field(min_length=4, max_length=4)] | None = None
-    eye: _Point | None = None
-    target: _Point | None = None
+    eye: _Row3 | None = None
+    target: _Row3 | None = None
 
     @model_validator(mode="after")
     def _one_way(self) -> _Camera:
@@ -195,10 +181,7 @@ def read_cameras(path: Path) -> GivenCameras:
 
     All keys are optional: `width`, `height` [px]; `intrinsics`, a 3 x 3 matrix or `fx fy cx cy` [px]; `cameras`, a list
     of `{"extrinsics": 4 x 4}` (table to camera) or `{"eye": [x, y, z], "target": [x, y, z]}` (table frame [m]).
-
-    Raises:
-        InputError: the file cannot be read, or describes no possible camera.
-    """
+    Raises InputError: the file cannot be read, or describes no possible camera."""
     try:
         file = _File.model_validate_json(path.read_bytes())
     except OSError as error:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -32,17 +32,8 @@ def export_images(views: Shard, folder: Path, *, depth: DepthFormat = "exr") -> 
     `view_NNNN.json`; where the shard has them `distance_to_camera_NNNN`, `normals_NNNN.exr` (half, X Y Z) and
     `rgb_hand_NNNN.png`. Once: `labels.json`.
 
-    Args:
-        views: a views shard.
-        folder: destination; created if absent.
-        depth: format of distances.
-
-    Returns:
-        The files.
-
-    Raises:
-        InputError: the folder cannot be written, or has such files already.
-    """
+    The folder is created if absent. Return the files.
+    Raises InputError: the folder cannot be written, or has such files already."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -66,9 +57,8 @@ def _one(views: Shard, view: int, folder: Path, depth: DepthFormat) -> list[Path
     ]
     for dataset, name in _DISTANCES.items():
         if dataset in views.arrays:
-            metres = np.asarray(views[dataset][view], np.float32)
-            write: Callable[[Path, NDArray[np.float32]], Path] = _exr_z if depth == "exr" else _png_metres
-            written.append(write(path(name, depth), metres))
+            metres, file = np.asarray(views[dataset][view], np.float32), path(name, depth)
+            written.append(export_exr(file, "Z", [metres]) if depth == "exr" else _png_metres(file, metres))
     if "image/normals" in views.arrays:
         written.append(export_exr(path("normals", "exr"), "XYZ", np.moveaxis(views["image/normals"][view], -1, 0)))
     if "image/rgb_hand" in views.arrays:
@@ -117,10 +107,6 @@ def _png_metres(path: Path, metres: NDArray[np.float32]) -> Path:
     steps = np.where(np.isfinite(metres), np.asarray(metres, float) / PNG_STEP_M, 0.0)
     # Distances beyond 16 bits are clipped to the largest value instead of wrapping round.
     return export_png(path, np.clip(np.rint(steps), 0, 65535).astype(np.uint16))
-
-
-def _exr_z(path: Path, metres: NDArray[np.float32]) -> Path:
-    return export_exr(path, "Z", [metres])
 
 
 def export_exr(path: Path, names: str, planes: Sequence[NDArray[Any]] | NDArray[Any]) -> Path:

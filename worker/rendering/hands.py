@@ -5,10 +5,11 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import accumulate
 from typing import Final
 
 import numpy as np
-from cachetools import LRUCache
+from cachetools import LRUCache, cached
 from numpy.typing import NDArray
 
 from graspd.service.model.colours import hexadecimal, linear
@@ -23,8 +24,7 @@ from graspd.worker.rendering.scenery import Appearance, Solid
 _HAND: Final = Appearance(hexadecimal("#59636e"), roughness=0.42, metalness=0.35)
 _PALM: Final = Appearance(hexadecimal("#434b54"), roughness=0.48, metalness=0.35)
 _TIP: Final = Appearance(hexadecimal("#2fa7a0"), roughness=0.38)
-#: Depth of a hidden hand: under the floor, out of every picture [m].
-_AWAY_M: Final = -50.0
+_AWAY_M: Final = -50.0  # depth of a hidden hand: under the floor, out of every picture [m]
 
 
 @dataclass(frozen=True)
@@ -34,12 +34,9 @@ class DrawnHand:
     hand: HandModel
     grasp: NDArray[np.int32]
     """(S,) row of the grasp in the scene shard (in the base shard if planned in its scene); -1: no hand."""
-    hand_pose: Floats
-    """(S, 7) root link in the table frame; ignored where there is no grasp."""
-    joint_positions: Floats
-    """(S, J)"""
-    wrist: Floats | None = None
-    """(S, U) wrist angles for drawing the links above the hand's root; None: not drawn."""
+    hand_pose: Floats  # (S, 7) root link in the table frame; ignored where there is no grasp
+    joint_positions: Floats  # (S, J)
+    wrist: Floats | None = None  # (S, U) wrist angles for drawing the links above the hand's root; None: not drawn
 
     def body_poses(self) -> Floats:
         """Return poses (S, B, 7) of the drawn bodies in the table frame."""
@@ -49,7 +46,6 @@ class DrawnHand:
 
     @property
     def parts(self) -> tuple[MovingSolid, ...]:
-        """The drawn solids."""
         return drawn_parts(self.hand, mounted=self.wrist is not None)
 
 
@@ -62,15 +58,11 @@ class MovingSolid:
     look: Appearance
 
 
+@cached(LRUCache(16), key=lambda hand: hand.content, lock=threading.Lock())
 def hand_parts(hand: HandModel) -> tuple[MovingSolid, ...]:
     """Return the visual meshes of a hand in their colours; for bodies without any, collision pieces.
-
-    Where no visual element states a colour, palm, fingers and fingertips have default appearances.
-    """
-    with _lock:
-        if hand.content not in _parts:
-            _parts[hand.content] = tuple(_drawn(hand))
-        return _parts[hand.content]
+    Where no visual element states a colour, palm, fingers and fingertips have default appearances."""
+    return tuple(_drawn(hand))
 
 
 def drawn_parts(hand: HandModel, *, mounted: bool) -> tuple[MovingSolid, ...]:
@@ -98,25 +90,12 @@ def drawn_bodies(hand: HandModel) -> list[int]:
     return [part.body for part in hand_parts(hand)]
 
 
-def hand_solids(hand: HandModel) -> list[Solid]:
-    """Return the drawn meshes, each in the frame of its body."""
-    return [part.solid for part in hand_parts(hand)]
-
-
-def hand_looks(hand: HandModel) -> list[Appearance]:
-    """Return the material of each drawn solid."""
-    return [part.look for part in hand_parts(hand)]
-
-
-_parts: LRUCache[str, tuple[MovingSolid, ...]] = LRUCache(16)
-_lock = threading.Lock()
-
-
 def _drawn(hand: HandModel) -> Iterator[MovingSolid]:
     seen = {mesh.body for mesh in hand.visuals.meshes}
     for body in range(hand.bodies):
         if body not in seen:
-            yield from _pieces(hand, body)
+            if pieces := [(piece.vertices, piece.faces) for piece in hand.pieces if piece.body == body]:
+                yield MovingSolid(body, _merge(pieces), _own_look(hand, body))
             continue
         of_colour: dict[tuple[float, float, float] | None, list[VisualMesh]] = {}
         for mesh in hand.visuals.meshes:
@@ -127,24 +106,16 @@ def _drawn(hand: HandModel) -> Iterator[MovingSolid]:
             yield MovingSolid(body, _merge([(m.vertices, m.faces) for m in meshes]), look)
 
 
-def _pieces(hand: HandModel, body: int) -> Iterator[MovingSolid]:
-    pieces = [(piece.vertices, piece.faces) for piece in hand.pieces if piece.body == body]
-    if pieces:
-        yield MovingSolid(body, _merge(pieces), _own_look(hand, body))
-
-
 def _own_look(hand: HandModel, body: int) -> Appearance:
-    """Return the material of a body without a colour: palm, finger or fingertip."""
     if body in hand.fingertips:
         return _TIP
     return _PALM if body == 0 else _HAND
 
 
 def _merge(meshes: list[tuple[Floats, Ints]]) -> Solid:
-    vertices, faces, normals, count = [], [], [], 0
-    for points, triangles in meshes:
-        vertices.append(points)
-        faces.append(triangles + count)
-        normals.append(corner_normals(points, triangles))
-        count += len(points)
-    return Solid(np.concatenate(vertices), np.concatenate(faces), np.concatenate(normals))
+    starts = accumulate((len(points) for points, _ in meshes), initial=0)
+    return Solid(
+        np.concatenate([points for points, _ in meshes]),
+        np.concatenate([triangles + start for (_, triangles), start in zip(meshes, starts, strict=False)]),
+        np.concatenate([corner_normals(points, triangles) for points, triangles in meshes]),
+    )

@@ -10,30 +10,27 @@ from numpy.typing import NDArray
 
 from graspd.service.model.colours import hexadecimal
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply, quat_rotate
-
-#: Sides 120 degrees apart, measured from the side view of the hand [rad].
 from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
 from graspd.worker.grasps import moved
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.rendering.cameras import Cameras, intrinsics, look_at
-from graspd.worker.rendering.hands import drawn_bodies, hand_looks, hand_solids
+from graspd.worker.rendering.hands import hand_parts
 from graspd.worker.rendering.kernels.shading import CATCHER
 from graspd.worker.rendering.scenery import Appearance, Box, CameraShot, Lamp, Solid
 from graspd.worker.rendering.tracer import Tracer
 
+#: Sides 120 degrees apart, measured from the side view of the hand [rad].
 THREE_SIDES: Final = tuple(np.radians([-35.0, 85.0, 205.0]).tolist())
 ELEVATION: Final = np.radians(20.0)
 FIELD_OF_VIEW: Final = np.radians(24.0)
 SAMPLES: Final = 12
 #: Hand parts farther than this from the object's hull are not framed: a forearm may leave the picture [m].
 _NEAR_M: Final = 0.14
-#: Grasps traced together: bounds the memory.
-_TOGETHER: Final = 16
+_TOGETHER: Final = 16  # grasps traced together: bounds the memory
 
-#: Share of the picture's width or height that hand and object take up.
-_FILL: Final = 0.86
+_FILL: Final = 0.86  # share of the picture's width or height that hand and object take up
 #: Left of the camera, above it, in front of the object: camera looks along -x of the turned world.
 TOWARD_LAMP: Final = np.array([0.45, -0.45, 0.77]) / np.linalg.norm([0.45, -0.45, 0.77])
 FLOOR_SIZE: Final = (6.0, 6.0, 0.02)
@@ -59,33 +56,16 @@ def grasp_pictures(
     run: ExecutionContext = DEFAULT_CONTEXT,
     samples: int = SAMPLES,
 ) -> NDArray[np.uint8]:
-    """Render N grasps from A sides.
+    """Render N grasps, root poses (N, 7) in the object frame and joints (N, J), from A sides: (N, A, H, W, 3) sRGB.
 
-    Args:
-        hand: the hand; its convex pieces are drawn.
-        obj: the object, its z axis up.
-        hand_pose: (N, 7) pose of the root link in the object frame.
-        joint_positions: (N, J).
-        size: width and height [px].
-        azimuths: A sides [rad] about the vertical; 0 looks across the direction in which the palm approaches.
-        run: polled for cancellation between passes.
-        samples: rays per pixel.
-
-    Returns:
-        (N, A, H, W, 3) sRGB.
-
-    Raises:
-        TaskCancelled: `run.cancelled()` returned True.
-    """
+    Azimuths [rad] are about the object's z axis; 0 looks across the direction in which the palm approaches. The hand's
+    convex pieces frame the picture of this size [px].
+    Raises TaskCancelled: `run.cancelled()` returned True."""
     hand_pose = moved(np.atleast_2d(np.asarray(hand_pose, float)), np.negative(obj.centre))
     obj = obj.centred
     joints = np.atleast_2d(np.asarray(joint_positions, float))
-    solids: list[Solid | Box] = [
-        Box(FLOOR_SIZE),
-        Solid(obj.vertices, obj.faces, obj.corner_normals),
-        *hand_solids(hand),
-    ]
-    stage = Tracer(solids, run.device)
+    thing = Solid(obj.vertices, obj.faces, obj.corner_normals)
+    stage = Tracer([Box(FLOOR_SIZE), thing, *(part.solid for part in hand_parts(hand))], run.device)
     shots = []
     for start in range(0, len(hand_pose), _TOGETHER):
         part = slice(start, start + _TOGETHER)
@@ -105,33 +85,54 @@ def _shoot(
     samples: int,
     run: ExecutionContext,
 ) -> NDArray[np.uint8]:
-    worlds, (width, height) = len(bodies), size
+    worlds, parts = len(bodies), hand_parts(hand)
     points = np.concatenate(
         [np.broadcast_to(obj.hull_vertices, (worlds, *obj.hull_vertices.shape)), hand_points(hand, bodies)], axis=1
     )
-    floor = np.tile(IDENTITY_POSE, (worlds, 1))
-    floor[:, 2] = points[..., 2].min(axis=1) - 0.01 - 0.5 * FLOOR_SIZE[2]
-    shown = drawn_bodies(hand)
-    poses = np.concatenate([floor[:, None], np.tile(IDENTITY_POSE, (worlds, 1, 1)), bodies[:, shown]], axis=1)
-    stage.place(poses, [[FLOOR, OBJECT_LOOK, *hand_looks(hand)]] * worlds)
-    k = intrinsics(width, height, FIELD_OF_VIEW)
+    still = np.stack([[floor_pose(world), IDENTITY_POSE] for world in points])
+    stage.place(
+        np.concatenate([still, bodies[:, [part.body for part in parts]]], axis=1),
+        [[FLOOR, OBJECT_LOOK, *(part.look for part in parts)]] * worlds,
+    )
+    k = intrinsics(*size, FIELD_OF_VIEW)
     sides = []
     for azimuth in azimuths:
         angles = np.array([side_of(hand, world) + azimuth for world in bodies])
-        shot = CameraShot(
-            world=np.arange(worlds, dtype=np.int32),
-            extrinsics=np.stack([_camera(obj, points[w], angles[w], k, size) for w in range(worlds)]),
-            intrinsics=k,
-            width=width,
-            height=height,
-            samples=samples,
-            toward_lamp=TOWARD_LAMP,
-            # The lamp turns with the camera, so that no side is dark.
-            turn=-angles,
-            lamps=[STUDIO] * worlds,
-        )
-        sides.append(stage.shoot(shot, run.quiet()).rgb)
+        cameras = np.stack([_camera(obj, points[w], angles[w], k, size) for w in range(worlds)])
+        sides.append(stage.shoot(studio_shot(cameras, k, size, angles, samples), run.quiet()).rgb)
     return np.stack(sides, axis=1)
+
+
+def floor_pose(points: Floats) -> Floats:
+    """Return the pose (7,) of the studio floor, just below points (..., 3)."""
+    pose = IDENTITY_POSE.copy()
+    pose[2] = points[..., 2].min() - 0.01 - 0.5 * FLOOR_SIZE[2]
+    return pose
+
+
+def studio_shot(
+    cameras: Floats,
+    k: Floats,
+    size: tuple[int, int],
+    angles: Floats,
+    samples: int,
+    *,
+    world: NDArray[np.intp] | None = None,
+    toward_lamp: Floats = TOWARD_LAMP,
+) -> CameraShot:
+    """Return cameras (V, 4, 4) in studio light that turns with azimuths (worlds,) [rad], so that no side is dark.
+    `world` (V,): that of each camera; by default its own."""
+    return CameraShot(
+        world=(np.arange(len(angles)) if world is None else world).astype(np.int32),
+        extrinsics=cameras,
+        intrinsics=k,
+        width=size[0],
+        height=size[1],
+        samples=samples,
+        toward_lamp=toward_lamp,
+        turn=-angles,
+        lamps=[STUDIO] * len(angles),
+    )
 
 
 def side_of(hand: HandModel, bodies: Floats) -> float:
@@ -143,7 +144,6 @@ def side_of(hand: HandModel, bodies: Floats) -> float:
 
 
 def _camera(obj: ObjectModel, points: Floats, angle: float, k: Floats, size: tuple[int, int]) -> Floats:
-    """Return extrinsics of a camera that frames the near parts with the share `_FILL`."""
     middle = 0.5 * (obj.hull_vertices.min(axis=0) + obj.hull_vertices.max(axis=0))
     reach = np.linalg.norm(obj.hull_vertices - middle, axis=1).max()
     return fit_camera(points[np.linalg.norm(points - middle, axis=1) < reach + _NEAR_M], angle, k, size)

@@ -22,17 +22,17 @@ from graspd.worker.objects.mesh_geometry import corner_normals, from_manifold
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.rendering import sheets
 from graspd.worker.rendering.cameras import intrinsics
-from graspd.worker.rendering.hands import drawn_bodies, hand_looks, hand_solids, without_visuals
+from graspd.worker.rendering.hands import hand_parts, without_visuals
 from graspd.worker.rendering.pictures import (
     FIELD_OF_VIEW,
     FLOOR,
     FLOOR_SIZE,
     OBJECT_LOOK,
-    STUDIO,
-    TOWARD_LAMP,
     fit_camera,
+    floor_pose,
+    studio_shot,
 )
-from graspd.worker.rendering.scenery import Appearance, Box, CameraShot, Solid
+from graspd.worker.rendering.scenery import Appearance, Box, Solid
 from graspd.worker.rendering.tracer import Tracer
 
 #: Size of one picture of a portrait [px].
@@ -51,23 +51,19 @@ _DOTS: Final = 60
 _AXES: Final = tuple(Appearance(hexadecimal(code), roughness=0.5) for code in ("#c8343c", "#3c9a4a", "#3566c8"))
 _FRAME_SHARE: Final = 0.25
 _CLOSING_ARROW_SHARE: Final = 0.22
-#: Opacity of the transparent housing.
 _OPACITY: Final = 0.35
-#: Position of parts that are not drawn [m].
-_AWAY_M: Final = -50.0
+_AWAY_M: Final = -50.0  # position of parts that are not drawn [m]
 #: Views of a hand, by the camera's azimuth [rad].
 _SIDES: Final = {"from the right": 0.0, "from behind": np.radians(-90.0), "from the front": np.radians(90.0)}
-#: Length of the arrow over the largest extent of the hand.
-_ARROW_SHARE: Final = 0.4
+_ARROW_SHARE: Final = 0.4  # length of the arrow over the largest extent of the hand
 #: View towards the palm from the side on which the approach points right [rad].
 _HAND_AZIMUTH: Final = np.radians(32.0)
 _OBJECT_AZIMUTHS: Final = tuple(np.radians([-50.0, 40.0, 130.0]).tolist())
 
 
-def hand_portrait(hand: HandModel, *, device: str = "cpu") -> Image.Image:
+def hand_portrait(hand: HandModel) -> Image.Image:
     """Draw the hand open, in its pre-shape and closing; an arrow on the palm's centre shows the approach."""
-    shown = drawn_bodies(hand)
-    upright = _upright(hand)
+    parts, upright = hand_parts(hand), _upright(hand)
     named = {"open": posture(hand, 0.0), "pre-shape": hand.preshape, "closing": posture(hand, _CLOSING_SHARE)}
     joints = hand.expand(np.array(list(named.values())))
     bodies = np.array(body_poses(hand, np.tile(upright, (len(named), 1)), joints))
@@ -76,13 +72,13 @@ def hand_portrait(hand: HandModel, *, device: str = "cpu") -> Image.Image:
     arrow = _arrow(_ARROW_SHARE * extent)
     palm = compose(upright, np.concatenate([hand.palm.centre, _quat_of_z(hand.palm.approach)]))
     points = np.concatenate([*(c.reshape(-1, 3) for c in corners), apply(palm, arrow.vertices)])
-    poses = np.concatenate([bodies[:, shown], np.tile(palm, (len(named), 1, 1))], axis=1)
-    looks = [*hand_looks(hand), _ARROW]
-    solids = [*hand_solids(hand), arrow]
-    return _row(_shoot(solids, poses, looks, points, [_HAND_AZIMUTH] * len(named), device), list(named))
+    poses = np.concatenate([bodies[:, [part.body for part in parts]], np.tile(palm, (len(named), 1, 1))], axis=1)
+    looks = [*(part.look for part in parts), _ARROW]
+    solids = [*(part.solid for part in parts), arrow]
+    return _row(_shoot(solids, poses, looks, points, [_HAND_AZIMUTH] * len(named)), list(named))
 
 
-def hand_sides(hand: HandModel, *, device: str = "cpu") -> Image.Image:
+def hand_sides(hand: HandModel) -> Image.Image:
     """Draw the hand's collision shapes, about to close, from three sides; the palm is half transparent.
 
     Three thin arrows are the palm's frame (x red, y green, z blue: the approach). The orange arrow is the approach;
@@ -90,7 +86,7 @@ def hand_sides(hand: HandModel, *, device: str = "cpu") -> Image.Image:
     or the inner sides of fingertips.
     """
     bare = without_visuals(hand)
-    upright = _upright(bare)
+    parts, upright = hand_parts(bare), _upright(bare)
     closer = np.clip(bare.preshape + 0.1 * bare.closing * bare.span, bare.lower, bare.upper)
     bodies, after = np.array(body_poses(bare, np.tile(upright, (2, 1)), bare.expand(np.stack([bare.preshape, closer]))))
     corners: dict[int, list[Floats]] = {body: [] for body in range(bare.bodies)}
@@ -113,15 +109,14 @@ def hand_sides(hand: HandModel, *, device: str = "cpu") -> Image.Image:
     marks += [
         (_dots(pad.points, _DOT_SHARE * extent), _PAD, bodies[pad.body]) for pad in pads_of(hand) if len(pad.points)
     ]
-    poses = np.stack([*bodies[drawn_bodies(bare)], *(pose for _, _, pose in marks)])
-    solids = [*hand_solids(bare), *(solid for solid, _, _ in marks)]
-    looks = [*hand_looks(bare), *(look for _, look, _ in marks)]
-    ends = [apply(pose, solid.vertices) for solid, _, pose in marks]
-    seen = np.concatenate([points, *ends])
+    poses = np.stack([*(bodies[part.body] for part in parts), *(pose for _, _, pose in marks)])
+    solids = [*(part.solid for part in parts), *(solid for solid, _, _ in marks)]
+    looks = [*(part.look for part in parts), *(look for _, look, _ in marks)]
+    seen = np.concatenate([points, *(apply(pose, solid.vertices) for solid, _, pose in marks)])
     without = poses.copy()
-    without[np.array([body == 0 for body in drawn_bodies(bare)] + [False] * len(marks)), 2] = _AWAY_M
+    without[[number for number, part in enumerate(parts) if part.body == 0], 2] = _AWAY_M
     whole, open_ = (
-        _shoot(solids, np.tile(row, (len(_SIDES), 1, 1)), looks, seen, list(_SIDES.values()), device).astype(float)
+        _shoot(solids, np.tile(row, (len(_SIDES), 1, 1)), looks, seen, list(_SIDES.values())).astype(float)
         for row in (poses, without)
     )
     blended = (_OPACITY * whole + (1 - _OPACITY) * open_).round().astype(np.uint8)
@@ -136,14 +131,14 @@ def above(first: Image.Image, second: Image.Image) -> Image.Image:
     return page
 
 
-def object_portrait(obj: ObjectModel, *, device: str = "cpu") -> Image.Image:
+def object_portrait(obj: ObjectModel) -> Image.Image:
     """Draw the prepared mesh from three sides, z up."""
     obj = obj.centred
     solid = Solid(obj.vertices, obj.faces, obj.corner_normals)
     extents = " x ".join(f"{1e3 * extent:.0f}" for extent in np.ptp(obj.vertices, axis=0))
     captions = [f"{obj.name}, {extents} mm", f"{len(obj.faces)} faces", f"within {1e3 * obj.deviation_m:.2f} mm"]
     poses = np.tile(IDENTITY_POSE, (len(captions), 1, 1))
-    return _row(_shoot([solid], poses, [OBJECT_LOOK], obj.vertices, _OBJECT_AZIMUTHS, device), captions)
+    return _row(_shoot([solid], poses, [OBJECT_LOOK], obj.vertices, _OBJECT_AZIMUTHS), captions)
 
 
 def write_png(image: Image.Image, path: Path) -> None:
@@ -155,36 +150,19 @@ def write_png(image: Image.Image, path: Path) -> None:
 
 
 def _shoot(
-    solids: Sequence[Solid],
-    poses: Floats,
-    looks: list[Appearance],
-    points: Floats,
-    azimuths: Sequence[float],
-    device: str,
+    solids: Sequence[Solid], poses: Floats, looks: list[Appearance], points: Floats, azimuths: Sequence[float]
 ) -> NDArray[np.uint8]:
     """Render W worlds (W, H, W, 3), each from its azimuth; every camera frames the same points."""
-    worlds, (width, height) = len(poses), SIZE
-    floor = IDENTITY_POSE.copy()
-    floor[2] = points[:, 2].min() - 0.01 - 0.5 * FLOOR_SIZE[2]
-    stage = Tracer([Box(FLOOR_SIZE), *solids], device)
-    stage.place(np.concatenate([np.tile(floor, (worlds, 1, 1)), poses], axis=1), [[FLOOR, *looks]] * worlds)
-    k = intrinsics(width, height, FIELD_OF_VIEW)
-    shot = CameraShot(
-        world=np.arange(worlds, dtype=np.int32),
-        extrinsics=np.stack([fit_camera(points, angle, k, SIZE) for angle in azimuths]),
-        intrinsics=k,
-        width=width,
-        height=height,
-        samples=_SAMPLES,
-        toward_lamp=TOWARD_LAMP,
-        turn=-np.asarray(azimuths),
-        lamps=[STUDIO] * worlds,
-    )
-    return stage.shoot(shot).rgb
+    worlds = len(poses)
+    stage = Tracer([Box(FLOOR_SIZE), *solids], "cpu")
+    floors = np.tile(floor_pose(points), (worlds, 1, 1))
+    stage.place(np.concatenate([floors, poses], axis=1), [[FLOOR, *looks]] * worlds)
+    k = intrinsics(*SIZE, FIELD_OF_VIEW)
+    cameras = np.stack([fit_camera(points, angle, k, SIZE) for angle in azimuths])
+    return stage.shoot(studio_shot(cameras, k, SIZE, np.asarray(azimuths), _SAMPLES)).rgb
 
 
 def _row(pictures: NDArray[np.uint8], captions: Sequence[str]) -> Image.Image:
-    """Join pictures in a row with a caption under each, in few colours."""
     return _page(pictures, captions).quantize(192, dither=Image.Dither.NONE)
 
 
@@ -232,7 +210,6 @@ def _dots(points: Floats, radius: float) -> Solid:
 
 
 def _arrow(length: float) -> Solid:
-    """Return an arrow from the origin along z."""
     shaft = manifold3d.Manifold.cylinder(0.72 * length, 0.03 * length, 0.03 * length, 32)
     head = manifold3d.Manifold.cylinder(0.28 * length, 0.09 * length, 0.0, 32).translate((0, 0, 0.72 * length))
     vertices, faces = from_manifold(shaft + head)

@@ -63,8 +63,7 @@ class CameraPlan:
     views: int
     width: int
     height: int
-    baseline_m: float | None
-    """Baseline of stereo pairs; None: mono."""
+    baseline_m: float | None  # baseline of stereo pairs; None: mono
     given: GivenCameras = SAMPLED
 
     @property
@@ -148,7 +147,6 @@ class Setting:
         return self._named(self.stage(run.device, poses).shoot(replace(self.shot, samples=1, shaded=False), run))
 
     def shoot_with(self, drawn: DrawnHand, run: ExecutionContext) -> Pictures:
-        """Render the same pictures with a hand."""
         key = (*self._key(), drawn.hand.content, drawn.wrist is not None, run.device)
         stage = _kept(key, lambda: [*self._solids(), *(part.solid for part in drawn.parts)], run.device)
         shown = [part.look for part in drawn.parts]
@@ -158,13 +156,11 @@ class Setting:
         return self._named(stage.shoot(self.shot, run))
 
     def stage(self, device: str, poses: Floats | None = None) -> Tracer:
-        """Return the stage of these objects, cached for the next call, with everything placed."""
         stage = _kept((*self._key(), device), self._solids, device)
         stage.place(self._poses if poses is None else poses, self.looks)
         return stage
 
     def _named(self, pictures: Pictures) -> Pictures:
-        """Merge all supports to one label."""
         extra = len(self._slabs) - 1
         return replace(pictures, shape=np.where(pictures.shape < 0, -1, np.maximum(pictures.shape - extra, 0)))
 
@@ -176,8 +172,6 @@ class Setting:
 
 
 class _Scene:
-    """Random properties of one scene."""
-
     def __init__(
         self,
         objects: Sequence[ObjectModel],

@@ -58,12 +58,9 @@ class Lamp:
 class Pictures:
     """Pictures of V cameras."""
 
-    rgb: NDArray[np.uint8]
-    """(V, H, W, 3) sRGB"""
-    depth: NDArray[np.float32]
-    """(V, H, W) along the optical axis [m]; inf: nothing."""
-    shape: NDArray[np.int64]
-    """(V, H, W) index of the solid at the pixel's centre; -1: nothing."""
+    rgb: NDArray[np.uint8]  # (V, H, W, 3) sRGB
+    depth: NDArray[np.float32]  # (V, H, W) along the optical axis [m]; inf: nothing
+    shape: NDArray[np.int64]  # (V, H, W) index of the solid at the pixel's centre; -1: nothing
     normal: NDArray[np.float32] | None = None
     """(V, H, W, 3) unit shading normal in the world's frame, zero for nothing; only if requested."""
 
@@ -72,34 +69,24 @@ class Pictures:
 class CameraShot:
     """Cameras with their worlds, and the light."""
 
-    world: NDArray[np.int32]
-    """(V,)"""
-    extrinsics: Floats
-    """(V, 4, 4) world to camera: x right, y down, z forward."""
+    world: NDArray[np.int32]  # (V,)
+    extrinsics: Floats  # (V, 4, 4) world to camera: x right, y down, z forward
     intrinsics: Floats
     width: int
     height: int
     samples: int
-    toward_lamp: Floats
-    """(3,) unit; in the frame in which worlds are turned by `turn`."""
-    turn: Floats
-    """(worlds,) angle about z by which each world is turned under the lamp [rad]."""
-    lamps: Sequence[Lamp]
-    """One per world."""
+    toward_lamp: Floats  # (3,) unit; in the frame in which worlds are turned by `turn`
+    turn: Floats  # (worlds,) angle about z by which each world is turned under the lamp [rad]
+    lamps: Sequence[Lamp]  # one per world
     normals: bool = False
-    """Whether to compute normals."""
-    shaded: bool = True
-    """False: trace rays without shading, to measure the cost of the bare ray tracer."""
+    shaded: bool = True  # False: trace rays without shading, to measure the cost of the bare ray tracer
 
 
 Supports = Sequence[HalfSpace | BoxSupport]
 
-#: A half-space is drawn as a slab whose top is its plane [m].
-TABLE_SIZE: Final = (1.2, 0.9, 0.04)
-#: Default support of objects.
-TABLE: Final = (HalfSpace(),)
-#: A slab lies below the origin; below the object if that is farther away [m].
-_FAR_M: Final = 0.35
+TABLE_SIZE: Final = (1.2, 0.9, 0.04)  # a half-space is drawn as a slab whose top is its plane [m]
+TABLE: Final = (HalfSpace(),)  # default support of objects
+_FAR_M: Final = 0.35  # a slab lies below the origin; below the object if that is farther away [m]
 
 
 def slabs(supports: Supports) -> list[Box]:
@@ -108,13 +95,8 @@ def slabs(supports: Supports) -> list[Box]:
 
 
 def slab_poses(supports: Supports, middle: Floats, yaw: float) -> Floats:
-    """Return poses (P, 7) of the boxes of `slabs` in the scene frame.
-
-    Args:
-        supports: of the scene.
-        middle: (3,) position of the object.
-        yaw: turn of half-spaces' slabs about their normal [rad].
-    """
+    """Return poses (P, 7) of the boxes of `slabs` in the scene frame, for an object at `middle` (3,).
+    `yaw` turns half-spaces' slabs about their normal [rad]."""
     poses = [_box_pose(s) if isinstance(s, BoxSupport) else _slab_pose(s, middle, yaw) for s in supports]
     return np.array(poses).reshape(-1, 7)
 

@@ -41,23 +41,19 @@ def best(quality: Arrays, count: int, among: NDArray[np.bool_]) -> NDArray[np.in
 def best_kept(scene: Arrays, base: Arrays) -> NDArray[np.int32]:
     """Return the row (S,) of each scene's valid grasp with the largest epsilon; -1: none."""
     epsilon = _quoted(base, "quality/epsilon")[np.asarray(scene["grasp/base_index"])]
-    score = np.where(np.asarray(scene["grasp/valid"], bool), epsilon, -np.inf)
-    rows = np.full(len(scene["scene/object_pose"]), -1, np.int32)
-    for s in range(len(rows)):
-        mine = np.flatnonzero(np.asarray(scene["grasp/scene_index"]) == s)
-        if len(mine) and np.isfinite(score[mine]).any():
-            rows[s] = mine[np.argmax(score[mine])]
-    return rows
+    return _best_of_scenes(scene, np.where(np.asarray(scene["grasp/valid"], bool), epsilon, -np.inf))
 
 
 def best_in_scenes(base: Arrays, among: NDArray[np.bool_]) -> NDArray[np.int32]:
     """Return the row (S,) with the largest epsilon planned in each scene, among a mask (N,); -1: none."""
-    score = np.where(among, np.nan_to_num(_quoted(base, "quality/epsilon"), nan=-1.0), -np.inf)
-    scene = np.asarray(base["grasp/scene_index"])
-    rows = np.full(len(base["scene/object_pose"]), -1, np.int32)
+    return _best_of_scenes(base, np.where(among, np.nan_to_num(_quoted(base, "quality/epsilon"), nan=-1.0), -np.inf))
+
+
+def _best_of_scenes(columns: Arrays, score: Floats) -> NDArray[np.int32]:
+    rows = np.full(len(columns["scene/object_pose"]), -1, np.int32)
     for s in range(len(rows)):
-        mine = np.flatnonzero((scene == s) & among)
-        if len(mine):
+        mine = np.flatnonzero(np.asarray(columns["grasp/scene_index"]) == s)
+        if len(mine) and np.isfinite(score[mine]).any():
             rows[s] = mine[np.argmax(score[mine])]
     return rows
 
@@ -99,17 +95,12 @@ def contact_sheet(
 
 
 def three_sides_sheet(
-    pictures: NDArray[np.uint8],
-    captions: Sequence[Sequence[tuple[str, str]]] = (),
-    *,
-    title: str,
-    subtitle: str = "",
-    columns: int = 2,
+    pictures: NDArray[np.uint8], captions: Sequence[Sequence[tuple[str, str]]] = (), *, title: str, subtitle: str = ""
 ) -> bytes:
-    """Return a PNG of N grasps from three sides (N, 3, H, W, 3): one strip per grasp, `columns` per row."""
+    """Return a PNG of N grasps from three sides (N, 3, H, W, 3): one strip per grasp, two per row."""
     seam = np.full((*pictures.shape[:1], pictures.shape[2], 4, 3), PAPER, np.uint8)
     strips = np.concatenate([part for side in np.moveaxis(pictures, 1, 0) for part in (seam, side)][1:], axis=2)
-    return contact_sheet(strips, captions, title=title, subtitle=subtitle, columns=columns)
+    return contact_sheet(strips, captions, title=title, subtitle=subtitle, columns=2)
 
 
 def views_page(views: Arrays, *, title: str, subtitle: str = "") -> bytes:
@@ -125,14 +116,8 @@ def views_page(views: Arrays, *, title: str, subtitle: str = "") -> bytes:
         "hand": lambda view: _colours(views, "image/rgb_hand", view),
     }
     heads = [head for head in columns if (stereo or head != "right") and (head != "hand" or "image/rgb_hand" in views)]
-    height, width = np.asarray(views["image/rgb"]).shape[1:3]
-    page, draw, top = _page(len(heads), len(first), width, height, title, subtitle, head=_HEAD + 24)
-    for column, head in enumerate(heads):
-        x = MARGIN + column * (width + GAP)
-        text(draw, (x, top - 10), head, 15, QUIET)
-        for row, view in enumerate(first.tolist()):
-            page.paste(columns[head](view), (x, top + row * (height + GAP)))
-    return png(page)
+    rows = [[columns[head](view) for head in heads] for view in first.tolist()]
+    return label_page(rows, heads, (), title=title, subtitle=subtitle)
 
 
 def scene_cells(views: Arrays) -> list[Image.Image]:
@@ -152,17 +137,18 @@ def label_page(
     title: str,
     subtitle: str = "",
 ) -> bytes:
-    """Return a PNG of a table of pictures: column heads, and names below the first pictures of each row."""
+    """Return a PNG of a table of pictures: column heads, and names, if any, below the first pictures of each row."""
     width, height = rows[0][0].size
-    page, draw, top = _page(len(heads), len(rows), width, height + _NAME, title, subtitle, head=_HEAD + 24)
+    line = height + (_NAME if names else 0)
+    page, draw, top = _page(len(heads), len(rows), width, line, title, subtitle, head=_HEAD + 24)
     for column, head in enumerate(heads):
         text(draw, (MARGIN + column * (width + GAP), top - 10), head, 15, QUIET)
-    for row, (cells, below) in enumerate(zip(rows, names, strict=True)):
-        y = top + row * (height + _NAME + GAP)
+    for row, (cells, below) in enumerate(zip(rows, names or [()] * len(rows), strict=True)):
+        y = top + row * (line + GAP)
         for column, cell in enumerate(cells):
             page.paste(cell, (MARGIN + column * (width + GAP), y))
         for column, name in enumerate(below):
-            text(draw, (MARGIN + column * (width + GAP), y + height + _NAME - 4), name, 14, INK)
+            text(draw, (MARGIN + column * (width + GAP), y + line - 4), name, 14, INK)
     return png(page)
 
 
@@ -224,13 +210,10 @@ def _scale_bar(image: Image.Image, near: float, far: float) -> None:
 
 
 def _segments(views: Arrays, view: int) -> Image.Image:
-    return Image.fromarray(_SEGMENT[_segment_rows(views, view)])
-
-
-def _segment_rows(views: Arrays, view: int) -> NDArray[np.intp]:
-    """Return rows of `_SEGMENT`: neighbours cycle through the colours after the object's."""
+    """Draw the labels; neighbours cycle through the colours after the object's."""
     labels = np.asarray(views["image/segmentation"][view], np.intp)
-    return np.where(labels > OBJECT, OBJECT + 1 + (labels - OBJECT - 1) % (len(_SEGMENT) - OBJECT - 1), labels)
+    beside = OBJECT + 1 + (labels - OBJECT - 1) % (len(_SEGMENT) - OBJECT - 1)
+    return Image.fromarray(_SEGMENT[np.where(labels > OBJECT, beside, labels)])
 
 
 def _boxes(views: Arrays, view: int) -> Image.Image:
@@ -261,19 +244,9 @@ RULE: Final = (222, 224, 226)
 ACCENT: Final = (31, 132, 126)
 
 #: Anchors of the depth colours, near to far: even steps of lightness from light to dark, hue from sand to indigo.
-_DEPTH: Final = np.array(
-    [
-        [252, 243, 207],
-        [250, 206, 130],
-        [243, 158, 93],
-        [220, 103, 92],
-        [173, 63, 107],
-        [113, 43, 109],
-        [54, 32, 84],
-        [16, 16, 40],
-    ],
-    float,
-)
+_DEPTH: Final = np.frombuffer(
+    bytes.fromhex("fcf3cf face82 f39e5d dc675c ad3f6b 712b6d 362054 101028"), np.uint8
+).reshape(-1, 3)
 
 
 @lru_cache(maxsize=16)
@@ -302,7 +275,8 @@ def depth_colours(depth: NDArray[np.float32], near: float, far: float) -> NDArra
     """Return colours (..., 3) of depths: light is near, dark is far, grey is nothing."""
     t = np.clip((np.where(np.isfinite(depth), depth, near) - near) / max(far - near, 1e-9), 0, 1) * (len(_DEPTH) - 1)
     low = np.minimum(t.astype(int), len(_DEPTH) - 2)
-    mixed = _DEPTH[low] + (t - low)[..., None] * (_DEPTH[low + 1] - _DEPTH[low])
+    anchors = _DEPTH.astype(float)
+    mixed = anchors[low] + (t - low)[..., None] * (anchors[low + 1] - anchors[low])
     return np.where(np.isfinite(depth)[..., None], mixed, 214.0).round().astype(np.uint8)
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -37,8 +37,7 @@ PIXELS_OF_A_GPU: Final = 4_000_000
 #: Margin of bounds around their solid, so that rounding in float32 loses no ray [m].
 _SLACK_M: Final = 1e-5
 _PLACED: Final[Any] = rays.PlacedSolid
-#: Radius of the lamp's disc as seen from the table [rad].
-LAMP_RADIUS: Final = np.radians(3.5)
+LAMP_RADIUS: Final = np.radians(3.5)  # radius of the lamp's disc as seen from the table [rad]
 #: Sine of the elevation above which the sky shines.
 SKY_EDGE: Final = 0.35
 _GOLDEN: Final = np.pi * (3.0 - np.sqrt(5.0))
@@ -46,69 +45,44 @@ _GOLDEN: Final = np.pi * (3.0 - np.sqrt(5.0))
 _R2: Final = np.array([0.7548776662466927, 0.5698402909980532])
 
 
-@dataclass
 class Tracer:
-    """Solids in many worlds. Build once, then `place` and `shoot` repeatedly.
+    """Solids in many worlds. Build once, then `place` and `shoot` repeatedly."""
 
-    Args:
-        solids: the P solids of each world, same in every world.
-        device: Warp device.
-    """
-
-    solids: Sequence[Solid | Box]
-    device: str
-    _meshes: list[Any] = field(init=False, repr=False)
-    """Keeps the trees that the shapes refer to alive."""
-    _shapes: NDArray[Any] = field(init=False, repr=False)
-    """(P,) of `rays.PlacedSolid`, before placement."""
-    _corner_normals: Any = field(init=False, repr=False)
-    _corners: Floats = field(init=False, repr=False)
-    """(P, 8, 3) corners of the solids' bounds."""
-    _placed: Any = field(init=False, repr=False)
-    _materials: Any = field(init=False, repr=False)
-
-    def __post_init__(self) -> None:
+    def __init__(self, solids: Sequence[Solid | Box], device: str) -> None:
+        """`solids`: the P solids of each world, same in every world; `device`: of Warp."""
         backend.start()
-        self._shapes = np.zeros(len(self.solids), _PLACED.numpy_dtype())
-        self._meshes, normals, first = [], [np.zeros((0, 3))], 0
-        for k, solid in enumerate(self.solids):
+        self.device = device
+        shapes: NDArray[Any] = np.zeros(len(solids), _PLACED.numpy_dtype())
+        self._meshes, normals, first = list[Any](), [np.zeros((0, 3))], 0  # the meshes keep the shapes' trees alive
+        for k, solid in enumerate(solids):
             if isinstance(solid, Box):
-                self._shapes["half"][k] = 0.5 * np.asarray(solid.size)
+                shapes["half"][k] = 0.5 * np.asarray(solid.size)
             else:
-                self._meshes.append(_mesh(solid, self.device))
+                self._meshes.append(_mesh(solid, device))
                 normals.append(np.reshape(solid.corner_normals, (-1, 3)))
-                self._shapes["mesh"][k], self._shapes["first_corner"][k] = self._meshes[-1].id, first
+                shapes["mesh"][k], shapes["first_corner"][k] = self._meshes[-1].id, first
                 first += len(normals[-1])
-        self._corner_normals = wp.array(np.concatenate(normals), dtype=wp.vec3f, device=self.device)
-        self._corners = np.stack([_corners(solid) for solid in self.solids])
+        self._shapes = shapes
+        self._corner_normals: Any = wp.array(np.concatenate(normals), dtype=wp.vec3f, device=device)
+        self._corners = np.stack([_corners(solid) for solid in solids])
 
     def place(self, poses: Floats, looks: Sequence[Sequence[Appearance]]) -> None:
-        """Place the solids in their worlds.
-
-        Args:
-            poses: (worlds, P, 7) of each solid in its world.
-            looks: for each world the P materials.
-        """
+        """Place the solids in their worlds: poses (worlds, P, 7), and for each world the P materials."""
         poses = np.asarray(poses, float)
         corners = apply(poses[:, :, None], self._corners)
         placed = np.tile(self._shapes, (len(poses), 1))
         placed["place"], placed["turn"] = poses[..., :3], np.swapaxes(quat_to_matrix(poses[..., 3:]), -1, -2)
         placed["lower"], placed["upper"] = corners.min(axis=2) - _SLACK_M, corners.max(axis=2) + _SLACK_M
-        self._placed = wp.array(placed, dtype=_PLACED, device=self.device)
+        self._placed: Any = wp.array(placed, dtype=_PLACED, device=self.device)
         every = _structs([look for world in looks for look in world], Material, self.device)
-        self._materials = every.reshape(poses.shape[:2])
+        self._materials: Any = every.reshape(poses.shape[:2])
 
     def shoot(self, shot: CameraShot, run: ExecutionContext = DEFAULT_CONTEXT) -> Pictures:
         """Trace all cameras.
 
-        Args:
-            shot: cameras and light.
-            run: its threads share the rows of each picture, a GPU takes many pictures at once; receives finished
-                pictures and is polled before each launch.
-
-        Raises:
-            TaskCancelled: `run.cancelled()` returned True.
-        """
+        The threads of `run` share the rows of each picture; a GPU takes many pictures at once. `run` receives finished
+        pictures and is polled before each launch.
+        Raises TaskCancelled: `run.cancelled()` returned True."""
         cuda = wp.get_device(self.device).is_cuda
         threads = 1 if cuda else min(run.cores, shot.height)
         count, pixels = len(shot.world), len(shot.world) * shot.height * shot.width
@@ -124,8 +98,6 @@ class Tracer:
 
 
 class _Film:
-    """Device data common to all pictures of a shot."""
-
     def __init__(self, tracer: Tracer, shot: CameraShot) -> None:
         self._tracer, self._shot, device = tracer, shot, tracer.device
         passes = light_passes(shot.samples, shot.toward_lamp)
@@ -134,11 +106,10 @@ class _Film:
         back = quat_from_axis_angle(np.array([0.0, 0.0, 1.0]), -np.asarray(shot.turn))
         toward = quat_rotate(back[:, None], np.array([one.toward for one in passes]))
         self._toward = wp.array(toward, dtype=wp.vec3f, device=device)
-        self._cameras = _xyzw(pose_from_matrix(np.asarray(np.linalg.inv(shot.extrinsics), np.float64)))
+        poses = pose_from_matrix(np.asarray(np.linalg.inv(shot.extrinsics), np.float64))
+        self._cameras = np.asarray(poses[..., [0, 1, 2, 4, 5, 6, 3]], np.float32)
 
-    def expose(
-        self, views: NDArray[np.intp], threads: int, pool: ThreadPoolExecutor
-    ) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]:
+    def expose(self, views: NDArray[np.intp], threads: int, pool: ThreadPoolExecutor) -> tuple[NDArray[Any], ...]:
         """Return colour, depth, shapes and normals of some views; each thread takes rows of all pictures."""
         tracer, shot, device = self._tracer, self._shot, self._tracer.device
         size, world, k = (len(views), shot.height, shot.width), shot.world[views], shot.intrinsics
@@ -161,17 +132,14 @@ class _Film:
             threads,
         ]
 
+        outputs = [rgb, depth, shape, normal]
+
         def rows(first: int) -> None:
-            wp.launch(
-                exposure.expose,
-                dim=(size[0], len(range(first, size[1], threads)), size[2]),
-                inputs=[*inputs, first],
-                outputs=[rgb, depth, shape, normal],
-                device=device,
-            )
+            dim = (size[0], len(range(first, size[1], threads)), size[2])
+            wp.launch(exposure.expose, dim=dim, inputs=[*inputs, first], outputs=outputs, device=device)
 
         list(pool.map(rows, range(threads)))
-        return rgb.numpy(), depth.numpy(), shape.numpy(), normal.numpy()
+        return tuple(array.numpy() for array in outputs)
 
 
 def _mesh(solid: Solid, device: str) -> Any:
@@ -193,20 +161,13 @@ def _structs(things: Sequence[Any], struct: Any, device: str) -> Any:
     return wp.array(np.array(rows, kind), dtype=struct, device=device)
 
 
-def _xyzw(poses: Floats) -> NDArray[np.float32]:
-    return np.asarray(poses[..., [0, 1, 2, 4, 5, 6, 3]], np.float32)
-
-
 @dataclass(frozen=True)
 class LightPass:
     """One ray through every pixel, one directional light."""
 
-    shift: tuple[float, float]
-    """Offset of the ray from the pixel's centre [px]."""
-    toward: Floats
-    """(3,) unit direction to the light."""
-    lamp_weight: float
-    """Weights with which the mean over all passes is one lamp and one sky."""
+    shift: tuple[float, float]  # offset of the ray from the pixel's centre [px]
+    toward: Floats  # (3,) unit direction to the light
+    lamp_weight: float  # weights with which the mean over all passes is one lamp and one sky
     sky_weight: float
 
 

@@ -30,13 +30,14 @@ from graspd.worker.rendering.pictures import (
     FLOOR_SIZE,
     OBJECT_LOOK,
     SAMPLES,
-    STUDIO,
     TOWARD_LAMP,
     fit_camera,
+    floor_pose,
     hand_points,
     side_of,
+    studio_shot,
 )
-from graspd.worker.rendering.scenery import Appearance, Box, CameraShot, Solid, Supports, seen_share, slab_poses, slabs
+from graspd.worker.rendering.scenery import Appearance, Box, Solid, Supports, seen_share, slab_poses, slabs
 from graspd.worker.rendering.tracer import Tracer
 from graspd.worker.scenes.neighbours import Neighbours
 
@@ -46,10 +47,8 @@ FREE_STRIP: Final = ("pregrasp", "grasp", "squeeze")
 #: Candidate sides: number around, and their heights above the horizon [rad].
 _AROUND: Final = 16
 _HEIGHTS: Final = tuple(np.radians([20.0, 35.0, 52.0]).tolist())
-#: Least angle between two sides of one grasp, if possible [rad].
-_APART: Final = np.radians(50.0)
-#: Edge of the pictures that rate the sides [px].
-_GLANCE: Final = 48
+_APART: Final = np.radians(50.0)  # least angle between two sides of one grasp, if possible [rad]
+_GLANCE: Final = 48  # edge of the pictures that rate the sides [px]
 #: Direction of the lamp under a board: from the front, as high as a window.
 _UNDER_A_BOARD: Final = np.array([0.85, -0.42, 0.32]) / np.linalg.norm([0.85, -0.42, 0.32])
 #: Hand parts farther than this from the object are not framed [m].
@@ -65,13 +64,10 @@ class PictureScenes:
     """Scenes of N grasps: S scenes of an object with common supports, or one free object."""
 
     supports: Supports = ()
-    object_pose: Floats = field(default_factory=lambda: np.array(IDENTITY_POSE)[None])
-    """(S, 7) in the scene frame."""
-    index: NDArray[np.intp] | None = None
-    """(N,) scene of each grasp; None: all in the first."""
+    object_pose: Floats = field(default_factory=lambda: np.array(IDENTITY_POSE)[None])  # (S, 7) in the scene frame
+    index: NDArray[np.intp] | None = None  # (N,) scene of each grasp; None: all in the first
     neighbours: Neighbours | None = None
-    wrist: Floats | None = None
-    """(N, U) wrist angles for drawing the links above the hand's root; None: not drawn."""
+    wrist: Floats | None = None  # (N, U) wrist angles for drawing the links above the hand's root; None: not drawn
 
     def centred(self, obj: ObjectModel) -> PictureScenes:
         """Return the scenes with the frames of their object `obj` and of the neighbours at their centres."""
@@ -81,7 +77,6 @@ class PictureScenes:
         return replace(self, object_pose=to_centre(self.object_pose, obj.centre), neighbours=beside)
 
     def scene(self, number: int) -> int:
-        """Return the scene of a grasp."""
         return 0 if self.index is None else int(self.index[number])
 
 
@@ -97,25 +92,11 @@ def way_pictures(
     run: ExecutionContext = DEFAULT_CONTEXT,
     samples: int = SAMPLES,
 ) -> NDArray[np.uint8]:
-    """Render N grasps, F postures each, from A sides.
+    """Render N grasps, F postures each in the frame of the object at rest, from A sides: (N, A, F, H, W, 3) sRGB.
 
-    Args:
-        hand: its bodies are drawn.
-        obj: the object, carried along by each posture.
-        frames: for each grasp F postures in the frame of the object at rest.
-        around: the scenes.
-        size: width and height [px].
-        sides: A sides of each grasp, ordered by how much of object and fingers they show.
-        whole: frame the whole hand; else parts far from the object may leave the picture.
-        run: polled for cancellation between passes.
-        samples: rays per pixel.
-
-    Returns:
-        (N, A, F, H, W, 3) sRGB.
-
-    Raises:
-        TaskCancelled: `run.cancelled()` returned True.
-    """
+    Sides are ordered by how much of object and fingers they show. `whole` frames the whole hand; else parts far from
+    the object may leave the picture.
+    Raises TaskCancelled: `run.cancelled()` returned True."""
     if not frames:
         return np.zeros((0, sides, 0, size[1], size[0], 3), np.uint8)
     stage = _Stage(hand, obj, around, len(frames[0]), run, np.inf if whole else _NEAR_M)
@@ -134,12 +115,11 @@ class _Stage:
         run: ExecutionContext,
         near_m: float,
     ) -> None:
-        self.hand, self.obj, self.frames, self.run = hand, obj.centred, frames, run
+        self.hand, self.frames, self.run, self.near_m = hand, frames, run, near_m
         self.centre, self.around = np.array(obj.centre), around.centred(obj)
-        around, obj = self.around, self.obj
-        self.near_m = near_m
+        self.obj = obj = obj.centred
+        around = self.around
         self.others = around.neighbours.objects if around.neighbours else ()
-        self.lamp = TOWARD_LAMP
         self.boxes = slabs(around.supports) or [Box(FLOOR_SIZE)]
         objects = [Solid(o.vertices, o.faces, o.corner_normals) for o in (obj, *self.others)]
         parts = drawn_parts(hand, mounted=around.wrist is not None)
@@ -163,45 +143,26 @@ class _Stage:
         middles = 0.5 * (solid.min(axis=1) + solid.max(axis=1))
         reach = float(np.linalg.norm(solid - middles[:, None], axis=2).max()) + self.near_m
         near = points[np.linalg.norm(points - middles[:, None], axis=2) < reach]
-        self._place(scene, things, drawn, float(points[..., 2].min()), middles[0])
+        self._place(scene, things, drawn, floor_pose(points), middles[0])
         above = middles[0] + np.array([0, 0, _HIGH_M])
         covered = seen_share(self.around.supports, above, middles[:1]) < 1
-        self.lamp = _UNDER_A_BOARD if covered else TOWARD_LAMP
+        lamp = _UNDER_A_BOARD if covered else TOWARD_LAMP
         grasp = next((k for k, point in enumerate(way) if point.name == "grasp"), 0)
         k = intrinsics(*size, FIELD_OF_VIEW)
         pictures = []
         for angle, height in self._best_sides(grasp, near, side_of(self.hand, bodies[grasp]), sides):
-            camera = fit_camera(near, angle, k, size, elevation=height)
-            shot = self._shot(np.arange(self.frames), np.stack([camera] * self.frames), k, size, angle, samples)
+            cameras = np.stack([fit_camera(near, angle, k, size, elevation=height)] * self.frames)
+            shot = studio_shot(cameras, k, size, np.full(self.frames, angle), samples, toward_lamp=lamp)
             pictures.append(self.tracer.shoot(shot, self.run.quiet()).rgb)
         return np.stack(pictures)
 
-    def _place(self, scene: int, things: Floats, drawn: Floats, lowest: float, middle: Floats) -> None:
-        if self.around.supports:
-            standing = slab_poses(self.around.supports, middle, 0.0)
-        else:
-            standing = IDENTITY_POSE[None] + np.array([0, 0, lowest - 0.01 - 0.5 * FLOOR_SIZE[2], 0, 0, 0, 0])
+    def _place(self, scene: int, things: Floats, drawn: Floats, floor: Floats, middle: Floats) -> None:
+        standing = slab_poses(self.around.supports, middle, 0.0) if self.around.supports else floor[None]
         beside = self.around.neighbours.poses[scene] if self.around.neighbours else np.zeros((0, 7))
         still = np.concatenate([standing, things[0][None], beside])
         poses = np.tile(still, (self.frames, 1, 1))
         poses[:, len(standing)] = things
         self.tracer.place(np.concatenate([poses, drawn], axis=1), [self.looks] * self.frames)
-
-    def _shot(
-        self, world: NDArray[np.intp], cameras: Floats, k: Floats, size: tuple[int, int], angle: float, samples: int
-    ) -> CameraShot:
-        return CameraShot(
-            world=world.astype(np.int32),
-            extrinsics=cameras,
-            intrinsics=k,
-            width=size[0],
-            height=size[1],
-            samples=samples,
-            toward_lamp=self.lamp,
-            # The lamp turns with the camera, so that no side is dark.
-            turn=np.full(self.frames, -angle),
-            lamps=[STUDIO] * self.frames,
-        )
 
     def _best_sides(self, world: int, near: Floats, first: float, count: int) -> list[tuple[float, float]]:
         """Return azimuth and height [rad] of the sides that show most, apart from one another.
@@ -214,8 +175,8 @@ class _Stage:
         far = 1.15 * float(np.linalg.norm(near - centre, axis=1).max()) / np.sin(FIELD_OF_VIEW / 2)
         eyes = [centre + far * np.array([np.cos(a) * np.cos(h), np.sin(a) * np.cos(h), np.sin(h)]) for a, h in sides]
         cameras = np.stack([look_at(eye, centre) for eye in eyes])
-        k = intrinsics(_GLANCE, _GLANCE, FIELD_OF_VIEW)
-        glance = self._shot(np.full(len(sides), world), cameras, k, (_GLANCE, _GLANCE), first, 1)
+        k, size, worlds = intrinsics(_GLANCE, _GLANCE, FIELD_OF_VIEW), (_GLANCE, _GLANCE), np.full(len(sides), world)
+        glance = studio_shot(cameras, k, size, np.full(self.frames, first), 1, world=worlds)
         seen = self.tracer.shoot(replace(glance, shaded=False), self.run.quiet()).shape
         thing = len(self.boxes)
         first_of_hand = thing + 1 + len(self.others)
@@ -240,32 +201,20 @@ KINDS: Final[dict[str, dict[str, Any]]] = {
     ".webp": {"format": "WEBP", "quality": 82, "method": 4},
     ".png": {"format": "PNG", "default_image": False},
 }
-#: Pictures whose colours make the palette of a GIF.
-_PALETTE_OF: Final = 9
+_PALETTE_OF: Final = 9  # pictures whose colours make the palette of a GIF
 
 
 def animation_kind(suffix: str) -> str:
-    """Return the suffix in lower case.
-
-    Raises:
-        InputError: no animation format has this suffix.
-    """
+    """Return the suffix in lower case; raise InputError if no animation format has it."""
     if (small := suffix.lower()) not in KINDS:
         raise InputError(f"an animation is written as {', '.join(KINDS)}, not as {suffix or 'a file without suffix'}")
     return small
 
 
 def animation(pictures: NDArray[np.uint8], seconds: Sequence[float], suffix: str) -> bytes:
-    """Encode a looping film.
-
-    Args:
-        pictures: (F, H, W, 3) sRGB.
-        seconds: (F,) duration of each; files store milliseconds, a GIF hundredths of a second.
-        suffix: one of `KINDS`.
-
-    Raises:
-        InputError: no animation format has this suffix.
-    """
+    """Encode a looping film of pictures (F, H, W, 3) sRGB; `suffix` is one of `KINDS`.
+    Durations [s] are stored in milliseconds, in a GIF in hundredths of a second.
+    Raises InputError: no animation format has this suffix."""
     kind = animation_kind(suffix)
     images = [Image.fromarray(picture) for picture in pictures]
     if kind == ".gif":

@@ -25,13 +25,10 @@ from graspd.worker.rendering.annotate import (
 from graspd.worker.rendering.cameras import BASELINE_M, SAMPLED, Cameras, GivenCameras
 from graspd.worker.rendering.hands import DrawnHand
 from graspd.worker.rendering.scene_setup import CameraPlan, Setting
-from graspd.worker.rendering.scenery import TABLE, TABLE_SIZE, Pictures, Supports
+from graspd.worker.rendering.scenery import TABLE, Pictures, Supports
 from graspd.worker.scenes.neighbours import Neighbours
 
-__all__ = ["SAMPLES", "TABLE_SIZE", "Extras", "render"]
-
-#: Passes per picture; half of them light the scene with the lamp, half with the sky.
-SAMPLES: Final = 12
+SAMPLES: Final = 12  # passes per picture; half of them light the scene with the lamp, half with the sky
 
 Arrays = dict[str, NDArray[np.generic]]
 
@@ -40,15 +37,11 @@ Arrays = dict[str, NDArray[np.generic]]
 class Extras:
     """Options of a render beyond an object alone from sampled cameras, in colour, depth and segmentation."""
 
-    channels: Sequence[str] = ()
-    """Of `service.model.domain.EXTRA_CHANNELS`."""
-    cameras: GivenCameras = SAMPLED
-    """Given intrinsics and poses instead of sampled ones."""
+    channels: Sequence[str] = ()  # of `service.model.domain.EXTRA_CHANNELS`
+    cameras: GivenCameras = SAMPLED  # given intrinsics and poses instead of sampled ones
     neighbours: Neighbours | None = None
-    drawn: DrawnHand | None = None
-    """Hands of `image/rgb_hand`; they are in no other picture."""
-    supports: Supports = TABLE
-    """Supports of the object; all are labelled as the table."""
+    drawn: DrawnHand | None = None  # hands of `image/rgb_hand`; they are in no other picture
+    supports: Supports = TABLE  # supports of the object; all are labelled as the table
 
 
 NO_EXTRAS: Final = Extras()

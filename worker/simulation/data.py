@@ -23,10 +23,10 @@ class Tables:
     """A schedule on the device; its rate of joints is multiplied by the `unit` (D,) of each dof."""
 
     def __init__(self, schedule: Schedule, unit: Floats) -> None:
-        self.dilation = wp.array(schedule.dilation, dtype=wp.float32)
-        self.penetration = wp.array(schedule.penetration, dtype=wp.float32)
-        self.object_penetration = wp.array(schedule.object_penetration, dtype=wp.float32)
-        self.self_penetration = wp.array(schedule.self_penetration, dtype=wp.float32)
+        tables = (schedule.dilation, schedule.penetration, schedule.object_penetration, schedule.self_penetration)
+        self.dilation, self.penetration, self.object_penetration, self.self_penetration = (
+            wp.array(table, dtype=wp.float32) for table in tables
+        )
         joints = schedule.rates[:, 2:] * unit
         self.rates = wp.array(np.concatenate([schedule.rates[:, :2], joints], axis=1), dtype=wp.float32)
 
@@ -37,16 +37,17 @@ class Contacts:
 
     def __init__(self, capacity: int, points: int) -> None:
         shape = (capacity, points)
-        self.count = wp.zeros(capacity, dtype=wp.int32)
-        self.body = wp.empty(shape, dtype=wp.int32)
-        self.point = wp.empty(shape, dtype=wp.vec3)
-        self.normal = wp.empty(shape, dtype=wp.vec3)
-        self.distance = wp.empty(shape, dtype=wp.float32)
-        self.weight = wp.empty(shape, dtype=wp.float32)
-        self.gradient = wp.empty(shape, dtype=wp.float32)
-        self.near_count = wp.zeros(capacity, dtype=wp.int32)
-        self.near = wp.empty(shape, dtype=wp.int32)
+        self.count, self.near_count = (wp.zeros(capacity, dtype=wp.int32) for _ in range(2))
+        self.body, self.near = (wp.empty(shape, dtype=wp.int32) for _ in range(2))
+        self.point, self.normal = (wp.empty(shape, dtype=wp.vec3) for _ in range(2))
+        self.distance, self.weight, self.gradient = (wp.empty(shape, dtype=wp.float32) for _ in range(3))
         self.mark = wp.zeros((0, 0), dtype=wp.int32)
+
+    @property
+    def arrays(self) -> list[Any]:
+        """All but the marks, in the order of kernels' arguments."""
+        measured = [self.count, self.body, self.point, self.normal, self.distance, self.weight]
+        return [*measured, self.gradient, self.near_count, self.near]
 
 
 class MarkedContacts(Contacts):
@@ -56,22 +57,16 @@ class MarkedContacts(Contacts):
         super().__init__(capacity, points)
         self.mark = wp.zeros((capacity, points), dtype=wp.int32)
         chunks = (capacity, -(-points // packing.CHUNK))
-        self.kept_in = wp.zeros(chunks, dtype=wp.int32)
-        self.near_in = wp.zeros(chunks, dtype=wp.int32)
+        self.kept_in, self.near_in = (wp.zeros(chunks, dtype=wp.int32) for _ in range(2))
 
 
 class Depths:
-    """Deepest penetrations (B,) at the last evaluation [m]."""
+    """Deepest penetrations (B,) at the last evaluation [m]: hand points in the object, the object in links, links in
+    links, and the shortfall of the hand's distance from obstacles."""
 
     def __init__(self, capacity: int) -> None:
-        self.points = wp.zeros(capacity, dtype=wp.float32)
-        """Hand points in the object."""
-        self.object = wp.zeros(capacity, dtype=wp.float32)
-        """The object in links."""
-        self.links = wp.zeros(capacity, dtype=wp.float32)
-        """Links in links."""
-        self.obstacles = wp.zeros(capacity, dtype=wp.float32)
-        """Shortfall of the hand's distance from obstacles."""
+        self.kinds = [wp.zeros(capacity, dtype=wp.float32) for _ in range(4)]
+        self.points, self.object, self.links, self.obstacles = self.kinds
 
 
 class Data:
@@ -104,28 +99,33 @@ class Data:
         self.axis = wp.zeros((B, L), dtype=wp.vec3)
         self.wrench = wp.zeros((B, L, 6), dtype=wp.int64)
         self.loss = wp.zeros((B, M), dtype=wp.float32)
-        self.end = wp.zeros((B, M), dtype=contact.vec6)
-        self.adjoint = wp.zeros((B, M), dtype=contact.vec6)
-        self.gradient = wp.zeros((B, 6 + D), dtype=wp.float32)
-        self.first = wp.zeros((B, 6 + D), dtype=wp.float32)
-        self.second = wp.zeros((B, 6 + D), dtype=wp.float32)
-        self.best = wp.zeros(B, dtype=wp.float32)
-        self.waited = wp.zeros(B, dtype=wp.int32)
+        self.end, self.adjoint = (wp.zeros((B, M), dtype=contact.vec6) for _ in range(2))
+        self.gradient, self.first, self.second = (wp.zeros((B, 6 + D), dtype=wp.float32) for _ in range(3))
+        self.best, self.waited = wp.zeros(B, dtype=wp.float32), wp.zeros(B, dtype=wp.int32)
 
-    def set_state(
-        self, state: HandState, active: NDArray[np.bool_] | None = None, dilation: Floats | None = None
-    ) -> None:
+    @property
+    def bodies(self) -> list[Any]:
+        return [self.body_p, self.body_q]
+
+    @property
+    def root_and_joints(self) -> list[Any]:
+        return [self.pivot, self.rotation, self.q]
+
+    @property
+    def dilation(self) -> list[Any]:
+        """Arguments of kernels that dilate the object."""
+        return [self.active, self.iteration, self.schedule.dilation, self.dilation_scale]
+
+    def set_state(self, state: HandState, *, dilation: Floats | None = None) -> None:
         """Load up to `capacity` hands; the rest is switched off. Optimiser moments are cleared.
-
-        `dilation` (n,) multiplies the schedule's dilation for each hand; by default 1.
-        """
+        `dilation` (n,) multiplies the schedule's dilation for each hand; by default 1."""
         n = len(state.pivot)
         scale = np.ones(self.capacity, dtype=np.float32)
         if dilation is not None:
             scale[:n] = dilation
         self.dilation_scale.assign(scale)
         mask = np.zeros(self.capacity, dtype=np.int32)
-        mask[:n] = 1 if active is None else active
+        mask[:n] = 1
         self._assign(self.pivot, state.pivot)
         self._assign(self.rotation, to_xyzw(state.rotation))
         self._assign(self.q, state.q)
@@ -151,40 +151,27 @@ class Data:
 
     def set_schedule(self, schedule: Schedule) -> None:
         """Upload the per-iteration tables; earlier records keep the tables they were recorded with.
-
-        Raises:
-            ValueError: a dilation above `MAX_DILATION`.
-        """
+        Raises ValueError: a dilation above `MAX_DILATION`."""
         if len(schedule) and schedule.dilation.max() > MAX_DILATION:
             raise ValueError(f"the dilation may be at most {MAX_DILATION} m")
         with wp.ScopedDevice(self.device):
             self.schedule = Tables(schedule, self.unit)
 
     def deepest(self, n: int) -> Floats:
-        """Return the deepest penetration (n,) of each hand at the last evaluation, of all kinds [m]."""
-        kinds = (self.depths.points, self.depths.object, self.depths.links, self.depths.obstacles)
-        return np.max([kind.numpy()[:n] for kind in kinds], axis=0)
+        return np.max([kind.numpy()[:n] for kind in self.depths.kinds], axis=0)
 
     def near_share(self, reach: float, n: int) -> Floats:
         """Return shares (n,) of hands' surface closer to the object than `reach` [m], at the last evaluation."""
         c = self.contacts
+        inputs = [reach, float(REFERENCE_POINTS), c.count, c.distance, c.weight]
         with wp.ScopedDevice(self.device):
             share = wp.empty(n, dtype=wp.float32)
-            wp.launch(
-                penalties.near_share,
-                n,
-                inputs=[reach, float(REFERENCE_POINTS), c.count, c.distance, c.weight],
-                outputs=[share],
-            )
+            wp.launch(penalties.near_share, n, inputs=inputs, outputs=[share])
         return share.numpy().astype(float)
 
     def state(self, n: int) -> HandState:
-        """Return the first n hands, in float64."""
-        return HandState(
-            self.pivot.numpy()[:n].astype(float),
-            to_wxyz(self.rotation.numpy()[:n].astype(float)),
-            self.q.numpy()[:n].astype(float),
-        )
+        pivot, rotation, q = (array.numpy()[:n].astype(float) for array in self.root_and_joints)
+        return HandState(pivot, to_wxyz(rotation), q)
 
     def _assign(self, array: Any, values: Floats) -> None:
         padded = np.zeros((self.capacity, values.shape[1]), dtype=np.float32)

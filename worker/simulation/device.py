@@ -21,10 +21,8 @@ from graspd.worker.simulation.kernels import kinematics, nearest, pieces, surfac
 
 #: Kernels' numbers for `ConvexPiece.kind`.
 _KINDS: Final = {"box": 0, "sphere": 1, "cylinder": 2, "capsule": 3, "hull": 4}
-#: Cells that sort the object's samples [m].
-SAMPLE_CELL_M: Final = 0.008
-#: Travel of a sliding joint that moves a fingertip as much as one radian of a revolute joint [m].
-SLIDE_M: Final = 0.05
+SAMPLE_CELL_M: Final = 0.008  # cells that sort the object's samples [m]
+SLIDE_M: Final = 0.05  # travel of a sliding joint that moves a fingertip as much as one radian of a revolute joint [m]
 
 
 def to_xyzw(quaternion: Floats) -> Floats:
@@ -66,30 +64,23 @@ class DeviceHand:
             tree.multiplier = wp.array(hand.multiplier, dtype=wp.float32)
             tree.offset = wp.array(hand.offset, dtype=wp.float32)
             tree.pivot = wp.vec3(*hand.palm.centre)
-            return cls(
-                model=hand,
-                device=device,
-                tree=tree,
-                pieces=_device_pieces(hand),
-                lower=wp.array(hand.lower, dtype=wp.float32),
-                upper=wp.array(hand.upper, dtype=wp.float32),
-            )
+            lower, upper = (wp.array(limit, dtype=wp.float32) for limit in (hand.lower, hand.upper))
+            return cls(hand, device, tree, _device_pieces(hand), lower, upper)
 
 
 def _device_pieces(hand: HandModel) -> Any:
     out = pieces.Pieces()
-    rows = [_piece_row(piece) for piece in hand.pieces]
-    planes = [row[4] for row in rows]
+    size, position, rotation, half, planes = zip(*map(_piece_row, hand.pieces), strict=True)
     starts = np.concatenate([[0], np.cumsum([len(p) for p in planes])])
     apart = np.ones((hand.bodies, hand.bodies), dtype=np.int32) - np.eye(hand.bodies, dtype=np.int32)
     for a, b in hand.neighbours:
         apart[a, b] = apart[b, a] = 0
     out.body = wp.array([p.body for p in hand.pieces], dtype=wp.int32)
     out.kind = wp.array([_KINDS[p.kind] for p in hand.pieces], dtype=wp.int32)
-    out.size = wp.array(np.array([row[0] for row in rows]), dtype=wp.vec3)
-    out.pose_p = wp.array(np.array([row[1] for row in rows]), dtype=wp.vec3)
-    out.pose_q = wp.array(to_xyzw(np.array([row[2] for row in rows])), dtype=wp.quat)
-    out.half = wp.array(np.array([row[3] for row in rows]), dtype=wp.vec3)
+    out.size = wp.array(np.array(size), dtype=wp.vec3)
+    out.pose_p = wp.array(np.array(position), dtype=wp.vec3)
+    out.pose_q = wp.array(to_xyzw(np.array(rotation)), dtype=wp.quat)
+    out.half = wp.array(np.array(half), dtype=wp.vec3)
     out.first_plane = wp.array(starts, dtype=wp.int32)
     out.planes = wp.array(np.concatenate([*planes, np.zeros((1, 4))]), dtype=wp.vec4)
     out.apart = wp.array(apart, dtype=wp.int32)
@@ -140,19 +131,14 @@ class DeviceObject:
     mesh: Any
     samples: Any
     bvh: Any
-    sorted_samples: Any
-    """The samples sorted by the cells of a grid."""
+    sorted_samples: Any  # the samples sorted by the cells of a grid
 
     @classmethod
     def create(cls, obj: ObjectModel, device: str, *, samples: Floats, phong_alpha: float, cell: float) -> DeviceObject:
-        """Upload an object.
+        """Upload an object with points (S, 3) on its surface, object frame [m].
 
-        Args:
-            obj: the object.
-            device: Warp device.
-            samples: (S, 3) points on its surface, object frame [m].
-            phong_alpha: 0: flat faces, 1: full Phong projection.
-            cell: cell size of the distance grid [m]; 0: none, every distance is exact.
+        `phong_alpha` is 0 for flat faces, 1 for full Phong projection; `cell` the cell size of the distance grid [m],
+        0: none, every distance is exact.
         """
         with wp.ScopedDevice(device):
             points = wp.array(obj.vertices - obj.centre_of_mass, dtype=wp.vec3)
@@ -181,11 +167,11 @@ class DeviceObject:
             return replace(self, samples=samples, bvh=wp.Bvh(samples, samples), sorted_samples=cells)
 
 
-def sorted_samples(samples: Floats, size: float = SAMPLE_CELL_M) -> Any:
-    """Sort points (S, 3) [m] by the cells of a grid of this size [m], on the current Warp device."""
+def sorted_samples(samples: Floats) -> Any:
+    """Sort points (S, 3) [m] by the cells of a grid, on the current Warp device."""
     low = samples.min(axis=0)
     # At most 64 cells a side: a large object has larger ones.
-    size = max(size, float((samples.max(axis=0) - low).max()) / 64)
+    size = max(SAMPLE_CELL_M, float((samples.max(axis=0) - low).max()) / 64)
     cell = np.floor((samples - low) / size).astype(int)
     shape = cell.max(axis=0) + 1
     index = np.ravel_multi_index(tuple(cell.T), tuple(shape))
@@ -201,10 +187,8 @@ def sorted_samples(samples: Floats, size: float = SAMPLE_CELL_M) -> Any:
 class PosedBodies:
     """The L bodies of a hand in P postures, object frame."""
 
-    chain: Any
-    """The hand, `kernels.chain.Chain`."""
-    bodies: Any
-    """Poses (P, L) of the bodies, `kernels.chain.Bodies`."""
+    chain: Any  # the hand, `kernels.chain.Chain`
+    bodies: Any  # poses (P, L) of the bodies, `kernels.chain.Bodies`
 
     @classmethod
     def of(cls, hand: HandModel, hand_pose: Floats, joint_positions: Floats, device: str = "cpu") -> PosedBodies:
@@ -255,7 +239,6 @@ def chain_of(hand: HandModel, device: str) -> Any:
 
 
 def _chain(hand: HandModel) -> Any:
-    """Upload the hand as `kernels.chain.Chain` to the current device."""
     out, features = kernels.Chain(), hand.features
     joint = np.zeros(hand.bodies, np.int32)
     joint[hand.joint_body] = np.arange(len(hand.joint_body))

@@ -20,8 +20,7 @@ from graspd.service.model.transforms import Floats, compose, invert, quat_conjug
 from graspd.worker.objects.mesh_geometry import to_centre
 from graspd.worker.objects.model import ObjectModel
 
-#: Direction against gravity in the scene frame.
-UP: Final = np.array([0.0, 0.0, 1.0])
+UP: Final = np.array([0.0, 0.0, 1.0])  # direction against gravity in the scene frame
 #: Length of a hand's straight approach to its pregrasp, and of the lift [m].
 STANDOFF_M: Final = 0.10
 RISE_M: Final = 0.10
@@ -33,10 +32,8 @@ CLEAR_M: Final = 0.002
 class Obstacle:
     """A convex body: the points x with n.x <= d for each of its planes (n, d)."""
 
-    planes: Floats
-    """(K, 4) outward unit normal and offset [m]."""
-    corners: Floats
-    """(V, 3) corners [m]; none for unbounded bodies, as a half-space."""
+    planes: Floats  # (K, 4) outward unit normal and offset [m]
+    corners: Floats  # (V, 3) corners [m]; none for unbounded bodies, as a half-space
     edges: NDArray[np.intp] = field(default_factory=lambda: np.zeros((0, 2), np.intp))
     """(E, 2) corners joined by an edge."""
     tips_m: float | None = None
@@ -49,10 +46,7 @@ class Obstacle:
     @classmethod
     def half_space(cls, normal: Sequence[float] | Floats, offset: float) -> Obstacle:
         """Return everything below the plane n.x = offset; the normal need not have unit length.
-
-        Raises:
-            InputError: the normal is zero or not finite.
-        """
+        Raises InputError: the normal is zero or not finite."""
         n = np.asarray(normal, float)
         length = float(np.linalg.norm(n))
         if n.shape != (3,) or not np.isfinite(n).all() or not np.isfinite(offset) or length < 1e-9:
@@ -62,10 +56,7 @@ class Obstacle:
     @classmethod
     def box(cls, pose: Sequence[float] | Floats, size: Sequence[float] | Floats) -> Obstacle:
         """Return a box of full extents `size` (3,) [m] about the origin of `pose` (7,).
-
-        Raises:
-            InputError: an extent is not positive, or a number is not finite.
-        """
+        Raises InputError: an extent is not positive, or a number is not finite."""
         pose, half = np.asarray(pose, float), np.asarray(size, float) / 2
         if half.shape != (3,) or not np.isfinite(half).all() or (half <= 0).any():
             raise InputError(f"a box needs three extents above 0; got {size}")
@@ -98,8 +89,7 @@ class Environment:
     """One scene in the object frame."""
 
     obstacles: tuple[Obstacle, ...]
-    up: Floats
-    """(3,) unit vector against gravity."""
+    up: Floats  # (3,) unit vector against gravity
 
 
 @dataclass(frozen=True)
@@ -107,31 +97,29 @@ class Neighbour:
     """Another object in a scene, as convex pieces in its own frame."""
 
     obj: ObjectModel
-    pieces: tuple[Floats, ...]
-    """Corners (V, 3) of each piece, as the validator simulates them."""
-    solids: tuple[Obstacle, ...]
-    """Slightly enlarged pieces with few faces, as a hand avoids them."""
-    error_m: float
-    """Largest excess of a solid over its piece [m]."""
-    about_centre: Neighbour | None = None
-    """The neighbour about its centre; None: it already is."""
+    pieces: tuple[Floats, ...]  # corners (V, 3) of each piece, as the validator simulates them
+    solids: tuple[Obstacle, ...]  # slightly enlarged pieces with few faces, as a hand avoids them
+    error_m: float  # largest excess of a solid over its piece [m]
+    about_centre: Neighbour | None = None  # the neighbour about its centre; None: it already is
 
 
 @dataclass(frozen=True)
 class Scenes:
     """S scenes of one object with common supports and neighbours."""
 
-    supports: tuple[Obstacle, ...]
-    """Tables, boards and walls in the scene frame, z up."""
-    object_pose: Floats
-    """(S, 7) of the object in the scene frame."""
+    supports: tuple[Obstacle, ...]  # tables, boards and walls in the scene frame, z up
+    object_pose: Floats  # (S, 7) of the object in the scene frame
     neighbours: tuple[Neighbour, ...] = ()
     neighbour_pose: Floats = field(default_factory=lambda: np.zeros((0, 0, 7)))
     """(S, M, 7) of the neighbours in the scene frame."""
 
     def centred(self, obj: ObjectModel) -> Scenes:
         """Return the scenes with the frames of their object `obj` and of the neighbours at their centres."""
-        return Scenes(self.supports, *_centred(obj, self.object_pose, self.neighbours, self.neighbour_pose))
+        poses = np.array(self.neighbour_pose, float)
+        for number, one in enumerate(self.neighbours):
+            poses[:, number] = to_centre(poses[:, number], one.obj.centre)
+        neighbours = tuple(one.about_centre or one for one in self.neighbours)
+        return Scenes(self.supports, to_centre(self.object_pose, obj.centre), neighbours, poses)
 
     def placed(self, index: NDArray[np.intp]) -> PlacedGrasps:
         """Return grasps in these scenes, by scene number (N,)."""
@@ -143,12 +131,9 @@ class Scenes:
 class PlacedGrasps:
     """N grasps, each in one of S scenes with common supports and neighbours."""
 
-    supports: tuple[Obstacle, ...]
-    """Tables, boards and walls in the scene frame, z up."""
-    object_pose: Floats
-    """(S, 7) of the object in the scene frame."""
-    index: NDArray[np.intp]
-    """(N,) scene of each grasp."""
+    supports: tuple[Obstacle, ...]  # tables, boards and walls in the scene frame, z up
+    object_pose: Floats  # (S, 7) of the object in the scene frame
+    index: NDArray[np.intp]  # (N,) scene of each grasp
     neighbours: tuple[Neighbour, ...] = ()
     neighbour_pose: Floats = field(default_factory=lambda: np.zeros((0, 0, 7)))
     """(S, M, 7) of the neighbours in the scene frame."""
@@ -177,7 +162,6 @@ class PlacedGrasps:
 
     @property
     def everywhere(self) -> Scenes:
-        """The scenes, without the grasps."""
         return Scenes(self.supports, self.object_pose, self.neighbours, self.neighbour_pose)
 
     def centred(self, obj: ObjectModel) -> PlacedGrasps:
@@ -197,19 +181,9 @@ class PlacedGrasps:
         )
 
     def take(self, rows: NDArray[np.intp] | slice) -> PlacedGrasps:
-        """Return some of the grasps, in the order of `rows`."""
         taken = replace(self, index=self.index[rows])
         vars(taken)["scenes"] = self.scenes  # unchanged, so not recomputed
         return taken
-
-
-def _centred(
-    obj: ObjectModel, object_pose: Floats, neighbours: tuple[Neighbour, ...], neighbour_pose: Floats
-) -> tuple[Floats, tuple[Neighbour, ...], Floats]:
-    poses = np.array(neighbour_pose, float)
-    for number, one in enumerate(neighbours):
-        poses[:, number] = to_centre(poses[:, number], one.obj.centre)
-    return to_centre(object_pose, obj.centre), tuple(one.about_centre or one for one in neighbours), poses
 
 
 def placed_together(parts: Sequence[PlacedGrasps]) -> PlacedGrasps:
@@ -218,14 +192,8 @@ def placed_together(parts: Sequence[PlacedGrasps]) -> PlacedGrasps:
     if len(parts) == 1:
         return first
     before = np.cumsum([0, *(len(part.object_pose) for part in parts)])
-    whole = replace(
-        first,
-        object_pose=np.concatenate([part.object_pose for part in parts]),
-        index=np.concatenate([part.index + start for part, start in zip(parts, before, strict=False)]),
-        neighbour_pose=np.concatenate([part.neighbour_pose for part in parts])
-        if first.neighbours
-        else first.neighbour_pose,
-    )
+    index = np.concatenate([part.index + start for part, start in zip(parts, before, strict=False)])
+    whole = scenes_together([part.everywhere for part in parts]).placed(index)
     vars(whole)["scenes"] = tuple(scene for part in parts for scene in part.scenes)  # not recomputed
     return whole
 

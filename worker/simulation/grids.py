@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
@@ -22,22 +23,16 @@ from graspd.worker.simulation.kernels import nearest, surface
 
 Arrays = Mapping[str, NDArray[Any]]
 
-#: Largest distance from the surface that is looked up [m].
-FIELD_REACH: Final = 0.06
-#: Cells within this distance plus the grid's error of the surface list their nearest faces [m].
-LISTED_M: Final = 0.004
-#: Most cells a side: a large object has a coarser grid, whose larger error is accounted for.
-_MOST_CELLS: Final = 96
+FIELD_REACH: Final = 0.06  # largest distance from the surface that is looked up [m]
+LISTED_M: Final = 0.004  # cells within this distance plus the grid's error of the surface list their nearest faces [m]
+_MOST_CELLS: Final = 96  # most cells a side: a large object has a coarser grid, whose larger error is accounted for
 
 
 def add_grid(skin: Any, obj: ObjectModel, mesh: Any, cell: float) -> None:
     """Add the distance grid and the lists of its cells to a surface, on the current Warp device.
 
-    Args:
-        skin: a `surface.Surface` without them, its `cells.faces` filled; written to.
-        obj: its object.
-        mesh: its `warp.Mesh`, vertices about the centre of mass.
-        cell: cell size of the grid [m].
+    `skin` is a `surface.Surface` with `cells.faces`; `mesh` is its `warp.Mesh`, vertices about the centre of mass;
+    `cell` is the cell size of the grid [m].
     """
     low = obj.vertices.min(axis=0) - obj.centre_of_mass - FIELD_REACH
     high = obj.vertices.max(axis=0) - obj.centre_of_mass + FIELD_REACH
@@ -47,20 +42,22 @@ def add_grid(skin: Any, obj: ObjectModel, mesh: Any, cell: float) -> None:
     skin.field_cell = cell
     # A distance has slope at most 1: trilinear interpolation between corners is off by less than half a diagonal.
     skin.field_error = 0.5 * cell
-    if not wp.get_device().is_cpu:
+
+    def fill() -> None:
         skin.field = _sampled(skin, shape)
-        _list(skin, obj, mesh)
+        grid = (skin.field, skin.field_origin, skin.field_cell)
+        skin.cells = list_cells(skin.cells.faces, mesh, *grid, LISTED_M + skin.field_error)
+
+    if not wp.get_device().is_cpu:
+        fill()
         return
 
     def make() -> Arrays:
-        skin.field = _sampled(skin, shape)
-        _list(skin, obj, mesh)
+        fill()
         return {"field": skin.field.numpy(), **{name: getattr(skin.cells, name).numpy() for name in _LISTS}}
 
-    def fits(kept: Arrays) -> bool:
-        return _fits(kept, shape, len(obj.faces))
-
     terms = (obj.content, repr(cell), repr(float(skin.alpha)), *map(binary_name, (surface, nearest)))
+    fits = partial(_fits, shape=shape, faces=len(obj.faces))
     kept = arrays_kept_or_made("object_grids", terms, (sys.modules[__name__],), make, fits=fits)
     skin.field = wp.array(kept["field"], dtype=wp.float32)
     for name, kind in _LISTS.items():
@@ -72,21 +69,9 @@ _LISTS: Final = {"first": wp.int32, "face": wp.int32, "key": wp.float32}
 
 
 def _sampled(skin: Any, shape: tuple[int, ...]) -> Any:
-    """Return the distances at the corners of the grid."""
-    field = wp.empty(shape, dtype=wp.float32)
-    wp.launch(
-        surface.sample_field,
-        dim=shape,
-        inputs=[skin, skin.field_origin, skin.field_cell, 4 * FIELD_REACH],
-        outputs=[field],
-    )
+    field, inputs = wp.empty(shape, dtype=wp.float32), [skin, skin.field_origin, skin.field_cell, 4 * FIELD_REACH]
+    wp.launch(surface.sample_field, dim=shape, inputs=inputs, outputs=[field])
     return field
-
-
-def _list(skin: Any, obj: ObjectModel, mesh: Any) -> None:
-    skin.cells = list_cells(
-        skin.cells.faces, mesh, skin.field, skin.field_origin, skin.field_cell, LISTED_M + skin.field_error
-    )
 
 
 def _fits(kept: Arrays, shape: tuple[int, ...], faces: int) -> bool:
@@ -123,9 +108,7 @@ def faces_of(obj: ObjectModel) -> Any:
 
 def feature_normals(vertices: Floats, faces: NDArray[np.integer[Any]]) -> Floats:
     """Return unnormalised angle-weighted normals (F, 7, 3): inside, edges ab, bc, ca, corners a, b, c.
-
-    Vertices at the same place count as one. Faces without an area are ignored.
-    """
+    Vertices at the same place count as one. Faces without an area are ignored."""
     places, same = np.unique(vertices, axis=0, return_inverse=True)
     faces = same.reshape(-1)[faces]
     corner = places[faces]
@@ -160,20 +143,12 @@ def list_cells(faces: Any, mesh: Any, field: Any, low: Any, size: float, within:
     shape = [n - 1 for n in field.shape]
     radius = wp.zeros(int(np.prod(shape)), dtype=wp.float32)
     count = wp.zeros(len(radius), dtype=wp.int32)
-    wp.launch(
-        nearest.count_faces,
-        len(radius),
-        inputs=[mesh.id, cells.faces, low, size, field, within],
-        outputs=[radius, count],
-    )
+    inputs = [mesh.id, cells.faces, low, size, field, within]
+    wp.launch(nearest.count_faces, len(radius), inputs=inputs, outputs=[radius, count])
     first = np.concatenate([[0], np.cumsum(count.numpy())])
     cells.first = wp.array(first, dtype=wp.int32)
     cells.face = wp.empty(int(first[-1]), dtype=wp.int32)
     cells.key = wp.empty(int(first[-1]), dtype=wp.float32)
-    wp.launch(
-        nearest.list_faces,
-        len(radius),
-        inputs=[mesh.id, cells.faces, low, size, wp.vec3i(*shape), radius, cells.first],
-        outputs=[cells.face, cells.key],
-    )
+    inputs = [mesh.id, cells.faces, low, size, wp.vec3i(*shape), radius, cells.first]
+    wp.launch(nearest.list_faces, len(radius), inputs=inputs, outputs=[cells.face, cells.key])
     return cells

@@ -32,7 +32,6 @@ class Launches:
         self._graph = None
 
     def named(self) -> list[tuple[str, Any]]:
-        """Return name and launch of each kernel, in order."""
         return list(self._commands)
 
     def run(self, times: int = 1) -> None:

@@ -17,18 +17,13 @@ from graspd.worker.simulation.obstacles import DeviceObstacles
 
 #: Weights of points are areas in units of 1/800 of the hand's surface: the loss does not depend on their number.
 REFERENCE_POINTS: Final = 800
-#: Number of object samples at which each has weight 1.
-REFERENCE_SAMPLES: Final = 2000
+REFERENCE_SAMPLES: Final = 2000  # number of object samples at which each has weight 1
 #: Number of hand points against other links at which each has weight 1.
 REFERENCE_SELF_POINTS: Final = 1000
-#: Kernels of the contact step by their names.
 SOLVERS: Final = {"direct": contact.direct, "jacobi": contact.jacobi, "gauss_seidel": contact.gauss_seidel}
-#: Contacts with at most this gap are listed for the direct solver: four steps of the object [m].
-NEAR_GAP: Final = 4e-3
-#: Points per thread: on the CPU a thread costs as much as a point; on CUDA every point has its own.
-CPU_LANE: Final = 64
-#: Largest dilation of a schedule [m].
-MAX_DILATION: Final = 0.1
+NEAR_GAP: Final = 4e-3  # contacts with at most this gap are listed for the direct solver: four steps of the object [m]
+CPU_LANE: Final = 64  # points per thread: on the CPU a thread costs as much as a point; on CUDA every point has its own
+MAX_DILATION: Final = 0.1  # largest dilation of a schedule [m]
 
 
 @dataclass(frozen=True)
@@ -40,25 +35,20 @@ class LossOptions:
     friction: float = 0.8
     stiffness: float = 1.0
     passes: int = 4
-    step: float = 1e-3
-    """Free motion of the object in one step, v dt [m]."""
+    step: float = 1e-3  # free motion of the object in one step, v dt [m]
     leak: float = 0.1
     leak_length: float = 0.02
     one_sided: bool = True
-    band: float = 0.03
-    """Points farther than dilation + band from the surface are ignored [m]."""
-    exact_below: float = 0.004
-    """Distances below this are computed from the mesh, above from the grid [m]."""
+    band: float = 0.03  # points farther than dilation + band from the surface are ignored [m]
+    exact_below: float = 0.004  # distances below this are computed from the mesh, above from the grid [m]
     range_weight: float = 0.005
     limit_weight: float = 0.0
     self_margin: float = 1e-3
     pull: float = 0.0
     """Attraction of points without contact, as strong as the penetration term at this depth [m].
     It fades with their distance."""
-    pull_length: float = 0.013
-    """Distance over which the attraction falls to 1/e [m]."""
-    simulate: bool = True
-    """False: no simulation; every point near the object is attracted. A control for benchmarks."""
+    pull_length: float = 0.013  # distance over which the attraction falls to 1/e [m]
+    simulate: bool = True  # False: no simulation; every point near the object is attracted. A control for benchmarks
 
 
 @dataclass(frozen=True)
@@ -68,20 +58,15 @@ class Model:
     hand: DeviceHand
     obj: DeviceObject
     options: LossOptions
-    obstacles: DeviceObstacles | None
-    """Obstacles that the hands must avoid; None: none."""
-    count: int
-    """Hand points."""
+    obstacles: DeviceObstacles | None  # obstacles that the hands must avoid; None: none
+    count: int  # hand points
     point_body: Any
     point_position: Any
     point_weight: Any
-    body_points: Any
-    """Points tested against other links."""
-    self_scale: float
-    """Weight of one body point."""
+    body_points: Any  # points tested against other links
+    self_scale: float  # weight of one body point
     physics: Any
-    motions: Any
-    """(M,) free motions of the object."""
+    motions: Any  # (M,) free motions of the object
 
     @staticmethod
     def create(
@@ -92,11 +77,7 @@ class Model:
         options: LossOptions,
         obstacles: DeviceObstacles | None = None,
     ) -> Model:
-        """Create the model and upload the points to the hand's device.
-
-        Raises:
-            InputError: unknown contact solver.
-        """
+        """Create the model, points on the hand's device; raise InputError for an unknown contact solver."""
         if options.contact_solver not in SOLVERS:
             raise InputError(f"unknown contact solver {options.contact_solver!r}; choose one of {', '.join(SOLVERS)}")
         weight = points.area * (REFERENCE_POINTS / points.area.sum())
@@ -128,7 +109,6 @@ class Model:
 
     @property
     def lanes(self) -> int:
-        """Threads per hand."""
         return -(-self.count // self.lane)
 
     @property

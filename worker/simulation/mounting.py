@@ -23,26 +23,16 @@ from graspd.worker.simulation.obstacles import MARGIN_M, obstacle_room
 #: Points of a mounting: the outermost in so many directions, then so many corners spread over it.
 OUTERMOST: Final = 20
 SPREAD: Final = 40
-#: Wrist positions of a hand whose exact clearances are computed.
-TRIES: Final = 4
+TRIES: Final = 4  # wrist positions of a hand whose exact clearances are computed
 
 
 def mounting_room(
-    hand: HandModel,
-    poses: Floats,
-    scenes: Sequence[Environment],
-    which: NDArray[np.integer[Any]] | None = None,
-    *,
-    enough: float = CLEAR_M,
+    hand: HandModel, poses: Floats, scenes: Sequence[Environment], which: NDArray[np.integer[Any]] | None = None
 ) -> tuple[Floats, Floats]:
     """Choose wrist angles that stay constant while the hand moves; return the mounting's clearance.
 
-    Args:
-        hand: the hand.
-        poses: (N, P, 7) poses of the root of each of N hands, object frame.
-        scenes: the environments.
-        which: (N,) scene of each hand; by default the first.
-        enough: clearance from obstacles at which the search ends [m].
+    `poses` (N, P, 7) are those of the root of each of N hands, object frame; `which` (N,) the scene of each, by default
+    the first. The search ends at a clearance of `CLEAR_M`.
 
     Returns:
         (N, K) wrist angles: the first of `wrist_positions` with enough clearance, among those whose points have it,
@@ -53,7 +43,7 @@ def mounting_room(
     if mounting is None:
         return np.zeros((count, 0)), np.full(count, np.inf)
     scene_of = np.zeros(count, np.intp) if which is None else which.astype(np.intp)
-    return _solved(mounting, poses, scenes, scene_of, point_room(mounting, poses, scenes, scene_of), enough)
+    return _solved(mounting, poses, scenes, scene_of, point_room(mounting, poses, scenes, scene_of), CLEAR_M)
 
 
 def mounting_lack(

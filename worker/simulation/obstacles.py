@@ -26,26 +26,20 @@ from graspd.worker.simulation.launches import launch
 
 #: Clearance of hands from obstacles in planning [m]: twice a scene's requirement, as trajectories are swept in steps.
 MARGIN_M: Final = 0.004
-#: Distances from solids are capped at this [m].
-FAR_M: Final = 0.1
+FAR_M: Final = 0.1  # distances from solids are capped at this [m]
 
 
 @dataclass(frozen=True)
 class PosedFeatures:
     """The F features of a hand in P postures."""
 
-    centre: Floats
-    """(P, F, 3)"""
-    axis: Floats
-    """(P, F, 3); zero: a ball."""
-    radius: Floats
-    """(F,)"""
-    rim: NDArray[np.bool_]
-    """(F,)"""
+    centre: Floats  # (P, F, 3)
+    axis: Floats  # (P, F, 3); zero: a ball
+    radius: Floats  # (F,)
+    rim: NDArray[np.bool_]  # (F,)
 
     @classmethod
     def of(cls, hand: HandModel, postures: Posture) -> PosedFeatures:
-        """Place the features of a hand in these postures."""
         features = hand.features
         bodies = body_poses(hand, postures.hand_pose, postures.joint_positions)[:, features.body]
         centre = quat_rotate(bodies[..., 3:], features.centre) + bodies[..., :3]
@@ -69,13 +63,8 @@ def _solid_distances(hand: HandModel, postures: Posture, scene: Environment) -> 
         position: Any = wp.array(bodies[..., :3], dtype=wp.vec3)
         rotation: Any = wp.array(to_xyzw(bodies[..., 3:]), dtype=wp.quat)
         least = wp.full((len(bodies), hand.bodies), FAR_M, dtype=wp.float32)
-        launch(
-            solid_kernels.distances,
-            (len(bodies), len(hand.pieces)),
-            inputs=[obstacles.features, device.pieces, obstacles.solids, position, rotation, FAR_M],
-            outputs=[least],
-            device="cpu",
-        )
+        inputs = [obstacles.features, device.pieces, obstacles.solids, position, rotation, FAR_M]
+        launch(solid_kernels.distances, (len(bodies), len(hand.pieces)), inputs=inputs, outputs=[least], device="cpu")
     return least.numpy().astype(float)
 
 
@@ -116,14 +105,12 @@ def body_room(
 
 
 def _more(obstacle: Obstacle) -> float:
-    """Return the distance added for fingertips at an obstacle [m]."""
     return 0.0 if obstacle.tips_m is None else CLEAR_M - obstacle.tips_m
 
 
 def _half_space_room(
     hand: HandModel, postures: Posture, scenes: Sequence[Environment], which: NDArray[np.integer[Any]]
 ) -> Floats:
-    """Compute `body_room` (P, L) of the half-spaces alone."""
     every = [[o for o in scene.obstacles if not len(o.corners)] for scene in scenes]
     flat, count = [o for one in every for o in one], len(postures)
     posed, spaces = PosedBodies.of(hand, postures.hand_pose, postures.joint_positions), chain_kernels.HalfSpaces()
@@ -150,8 +137,7 @@ class DeviceObstacles:
 
     features: Any
     solids: Any
-    any_solid: bool
-    """Whether an obstacle is no half-space."""
+    any_solid: bool  # whether an obstacle is no half-space
 
     @classmethod
     def create(
@@ -163,14 +149,9 @@ class DeviceObstacles:
         *,
         margin: float | Floats = MARGIN_M,
     ) -> DeviceObstacles:
-        """Upload obstacles.
+        """Upload obstacles in the object frame.
 
-        Args:
-            hand: the hand.
-            scenes: the environments, object frame.
-            centre: (3,) the object's centre of mass, object frame.
-            device: Warp device.
-            margin: clearance [m], of all features or (L,) of each body.
+        `centre` (3,) is the object's centre of mass; `margin` the clearance [m] of all features, or (L,) of each body.
         """
         found = hand.features
         kept = np.broadcast_to(np.asarray(margin, float), hand.bodies)[found.body]
@@ -186,7 +167,6 @@ class DeviceObstacles:
             features.axis = wp.array(found.axis, dtype=wp.vec3)
             features.radius = wp.array(found.radius, dtype=wp.float32)
             features.margin = wp.array(kept, dtype=wp.float32)
-            features.weight = wp.ones(len(found), dtype=wp.float32)
             features.tip = wp.array(np.isin(found.body, hand.fingertips), dtype=wp.int32)
             features.first = wp.array(found.first, dtype=wp.int32)
             balls = [_feature_ball(found, k) for k in range(len(found.first) - 1)]

@@ -17,40 +17,29 @@ from graspd.worker.simulation.launches import Launches
 from graspd.worker.simulation.model import Model
 from graspd.worker.simulation.record import record_placement
 
-#: Residuals per grasp and iteration.
-CAPACITY: Final = 1024
-#: Residuals per GPU thread that are added to the equations.
-CUDA_LANE: Final = 16
-#: A state is better than another if its penetration is less by more than this [m].
-BETTER_M: Final = 1e-5
+CAPACITY: Final = 1024  # residuals per grasp and iteration
+CUDA_LANE: Final = 16  # residuals per GPU thread that are added to the equations
+BETTER_M: Final = 1e-5  # a state is better than another if its penetration is less by more than this [m]
 
 
 @dataclass(frozen=True)
 class ProjectionOptions:
     """Clearances of the projection, in metres."""
 
-    near: float = 2e-4
-    """Hand points closer to the object than this are moved ..."""
-    target: float = 3.5e-4
-    """... to this distance."""
-    hold: float = 2e-3
-    """Points closer than this are contacts, drawn to `hold_target` with weight `hold_weight`."""
+    near: float = 2e-4  # hand points closer to the object than this are moved ...
+    target: float = 3.5e-4  # ... to this distance
+    hold: float = 2e-3  # points closer than this are contacts, drawn to `hold_target` with weight `hold_weight`
     hold_target: float = 5e-4
     hold_weight: float = 0.02
-    sample_near: float = 2.5e-4
-    """Object samples closer to a link than this are moved to `target`."""
+    sample_near: float = 2.5e-4  # object samples closer to a link than this are moved to `target`
     self_near: float = 2e-4
     self_target: float = 5e-4
-    obstacle_near: float = 2e-4
-    """Hand features closer to an obstacle than their margin plus this are moved ..."""
-    obstacle_target: float = 5e-4
-    """... to their margin plus this."""
-    damping: float = 1e-3
-    """Damping per residual."""
+    obstacle_near: float = 2e-4  # hand features closer to an obstacle than their margin plus this are moved ...
+    obstacle_target: float = 5e-4  # ... to their margin plus this
+    damping: float = 1e-3  # damping per residual
     scale: tuple[float, float, float] = (1.0, 12.5, 25.0)
     """Translation [m], rotation and joints [rad] that move a hand's surface equally: levers of 8 and 4 cm."""
-    step: float = 3e-3
-    """Largest step in units of the scaled variables [m]."""
+    step: float = 3e-3  # largest step in units of the scaled variables [m]
 
 
 def _residuals(capacity: int) -> Any:
@@ -86,11 +75,7 @@ class Projection:
             self._depth = wp.empty(B, dtype=wp.float64)
 
     def run(self, state: HandState, iterations: int) -> tuple[HandState, Floats]:
-        """Run at most `iterations` steps from `state`.
-
-        Returns:
-            The best state of each hand, and its deepest penetration (n,) [m].
-        """
+        """Run at most `iterations` steps; return the best state of each hand, and its deepest penetration (n,) [m]."""
         data, n = self.data, len(state.pivot)
         data.set_schedule(still_schedule())
         data.set_state(state)
@@ -104,15 +89,13 @@ class Projection:
         return self._found(best, n), self._depth.numpy()[:n].copy()
 
     def _validated(self, now: Any, best: Any) -> Launches:
-        """Place the hands and keep the states that are better than all before."""
         d, o = self.data, self.options
         out = record_placement(self.model, d, within=max(o.near, o.hold))
-        out.add(
-            kernels.keep_best,
-            d.capacity,
-            inputs=[d.depths.points, d.depths.object, d.depths.links, d.depths.obstacles, wp.float64(BETTER_M), now],
-            outputs=[d.active, self.residuals.count, best, self._depth],
+        inputs, outputs = (
+            [*d.depths.kinds, wp.float64(BETTER_M), now],
+            [d.active, self.residuals.count, best, self._depth],
         )
+        out.add(kernels.keep_best, d.capacity, inputs=inputs, outputs=outputs)
         return out
 
     def _states(self, state: HandState) -> Any:
@@ -131,82 +114,28 @@ class Projection:
         return HandState(pivot, to_wxyz(rotation), q)
 
     def _add_equations(self, out: Launches) -> None:
-        m, d, o, r = self.model, self.data, self.options, self.residuals
-        c, pose = d.contacts, [d.body_p, d.body_q]
-        out.add(
-            kernels.point_residuals,
-            (d.capacity, m.lanes),
-            inputs=[
-                m.lane,
-                d.active,
-                c.count,
-                c.body,
-                c.point,
-                c.normal,
-                c.distance,
-                o.near,
-                o.target,
-                o.hold,
-                o.hold_target,
-                o.hold_weight,
-            ],
-            outputs=[r],
-        )
-        out.add(
-            kernels.sample_residuals,
-            (d.capacity, m.pieces),
-            inputs=[m.hand.pieces, m.obj.sorted_samples, d.active, *pose, o.sample_near, o.target],
-            outputs=[r],
-        )
-        out.add(
-            kernels.self_residuals,
-            (d.capacity, m.pieces),
-            inputs=[m.hand.pieces, m.body_points, d.active, *pose, o.self_near, o.self_target],
-            outputs=[r],
-        )
-        if m.obstacles is not None:
-            out.add(
-                obstacles.residuals,
-                (d.capacity, m.pieces),
-                inputs=[
-                    m.obstacles.features,
-                    m.obstacles.solids,
-                    d.active,
-                    d.scene,
-                    *pose,
-                    o.obstacle_near,
-                    o.obstacle_target,
-                ],
-                outputs=[r],
-            )
-        if m.obstacles is not None and m.obstacles.any_solid:
-            out.add(
-                solids.residuals,
-                (d.capacity, m.pieces),
-                inputs=[
-                    m.obstacles.features,
-                    m.hand.pieces,
-                    m.obstacles.solids,
-                    d.active,
-                    d.scene,
-                    *pose,
-                    o.obstacle_near,
-                    o.obstacle_target,
-                ],
-                outputs=[r],
-            )
-        out.add(
-            kernels.normal_equations,
-            (d.capacity, self._lanes),
-            inputs=[m.hand.tree, self._lane, d.active, d.pivot, d.body_p, d.axis, r],
-            outputs=[self._row, self.matrix, self.vector],
-        )
+        m, d, o, outputs = self.model, self.data, self.options, [self.residuals]
+        c, pose = d.contacts, [d.active, *d.bodies]
+        points = [c.count, c.body, c.point, c.normal, c.distance]
+        inputs = [m.lane, d.active, *points, o.near, o.target, o.hold, o.hold_target, o.hold_weight]
+        out.add(kernels.point_residuals, (d.capacity, m.lanes), inputs=inputs, outputs=outputs)
+        over = (d.capacity, m.pieces)
+        inputs = [m.hand.pieces, m.obj.sorted_samples, *pose, o.sample_near, o.target]
+        out.add(kernels.sample_residuals, over, inputs=inputs, outputs=outputs)
+        inputs = [m.hand.pieces, m.body_points, *pose, o.self_near, o.self_target]
+        out.add(kernels.self_residuals, over, inputs=inputs, outputs=outputs)
+        if (around := m.obstacles) is not None:
+            terms = [d.active, d.scene, *d.bodies, o.obstacle_near, o.obstacle_target]
+            out.add(obstacles.residuals, over, inputs=[around.features, around.solids, *terms], outputs=outputs)
+            if around.any_solid:
+                inputs = [around.features, m.hand.pieces, around.solids, *terms]
+                out.add(solids.residuals, over, inputs=inputs, outputs=outputs)
+        inputs = [m.hand.tree, self._lane, d.active, d.pivot, d.body_p, d.axis, self.residuals]
+        outputs = [self._row, self.matrix, self.vector]
+        out.add(kernels.normal_equations, (d.capacity, self._lanes), inputs=inputs, outputs=outputs)
 
     def _add_step(self, out: Launches, now: Any) -> None:
         d, o = self.data, self.options
-        out.add(
-            kernels.step,
-            d.capacity,
-            inputs=[*self._limits, self._scale, wp.float64(o.damping), wp.float64(o.step), d.active, self.residuals],
-            outputs=[self._factor, self._move, self.matrix, self.vector, now, d.pivot, d.rotation, d.q],
-        )
+        inputs = [*self._limits, self._scale, wp.float64(o.damping), wp.float64(o.step), d.active, self.residuals]
+        outputs = [self._factor, self._move, self.matrix, self.vector, now, *d.root_and_joints]
+        out.add(kernels.step, d.capacity, inputs=inputs, outputs=outputs)

@@ -8,7 +8,7 @@ import zipfile
 from collections.abc import Callable, Hashable
 from contextlib import suppress
 from pathlib import Path
-from typing import TypeVar, cast
+from typing import Any
 
 from cachetools import LRUCache
 
@@ -41,38 +41,27 @@ from graspd.worker.stages.context import TaskContext
 from graspd.worker.stages.models import SHOWN_ERROR_M, publish_model
 from graspd.worker.validation.decomposition import ConvexPieces, decompose, piece_file
 
-T = TypeVar("T")
 #: Number of cached assets: a worker in a hands x objects dataset alternates between a few.
 _cache: LRUCache[Hashable, object] = LRUCache(16)
 _lock = threading.RLock()
 
 
 def hand_of(store: Store, message: TaskMessage) -> HandModel:
-    """Load the hand of a task."""
     name, digest = message.request.hand, message.hand_digest
-    key = (store.url, AssetKind.HAND, name, digest)
 
     def load() -> HandModel:
         hand = load_hand(load_hand_files(store, digest), name=name, digest=digest)
         publish_model(store, AssetKind.HAND, hand)
         return hand
 
-    return _cached(key, load)
+    return _cached((store.url, AssetKind.HAND, name, digest), load)
 
 
 def object_of(store: Store, message: TaskMessage) -> ObjectModel:
     """Load the object of a task, simplified within the tolerance of its fidelity."""
     request, digest = message.request, message.object_digest
     name, error = request.object, request.knobs.face_error_m
-    key = (
-        store.url,
-        AssetKind.OBJECT,
-        name,
-        digest,
-        error,
-        request.validation == "dexgraspbench",
-        *request.matter.items(),
-    )
+    terms = (error, request.validation == "dexgraspbench", *request.matter.items())
 
     def load() -> ObjectModel:
         obj = prepared_object(store, digest, name=name, face_error_m=error)
@@ -82,7 +71,7 @@ def object_of(store: Store, message: TaskMessage) -> ObjectModel:
             publish_model(store, AssetKind.OBJECT, shown)
         return as_asked(obj, request)
 
-    return _cached(key, load)
+    return _cached((store.url, AssetKind.OBJECT, name, digest, *terms), load)
 
 
 def neighbours_of(store: Store, message: TaskMessage) -> list[ObjectModel]:
@@ -103,10 +92,7 @@ def _neighbour(store: Store, name: str, digest: str) -> ObjectModel:
 
 def keep_network(store: Store, message: TaskMessage) -> None:
     """Cache the network that a task's method takes, if any, under the digest in the method's options.
-
-    Raises:
-        NotFoundError, InputError: it is not in the store, or does not match its digest.
-    """
+    Raises NotFoundError, InputError: it is not in the store, or does not match its digest."""
     if not (digest := message.request.network):
         return
 
@@ -125,12 +111,12 @@ def beside_attributes(message: TaskMessage) -> dict[str, Attribute]:
     return {"neighbours": [one.object for one in beside], "neighbour_digests": [one.digest or "" for one in beside]}
 
 
-def _cached(key: Hashable, load: Callable[[], T]) -> T:
+def _cached(key: Hashable, load: Callable[[], Any]) -> Any:
     # Tasks of one pair start at the same time: one of them loads.
     with _lock:
         if key not in _cache:
             _cache[key] = load()
-        return cast("T", _cache[key])
+        return _cache[key]
 
 
 def prepared_object(store: Store, digest: str, *, name: str, face_error_m: float) -> ObjectModel:
@@ -166,19 +152,19 @@ def _load(store: Store, digest: str, *, name: str, face_error_m: float) -> Objec
 _pieces_lock = threading.Lock()
 
 
-def pieces_of(store: Store, obj: ObjectModel, *, cache: Path | None = None) -> ConvexPieces:
+def pieces_of(store: Store, obj: ObjectModel) -> ConvexPieces:
     """Return an object's pieces from this machine's cache or the store, else compute and store them.
 
     Raises:
         MeshError: the object has no usable pieces.
         StoreUnavailable: the store does not respond.
     """
-    file = piece_file(obj, cache)
+    file = piece_file(obj)
     key = names.object_pieces(obj.digest, file.stem)
     with _pieces_lock:  # tasks of one object start at once: one of them makes the pieces
         if not file.is_file():
             _fetch(store, key, file)
-        pieces = decompose(obj, cache=cache)
+        pieces = decompose(obj)
         if file.is_file() and not store.exists(key):
             put_sealed(store, key, file.read_bytes())
         return pieces

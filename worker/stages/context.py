@@ -26,8 +26,7 @@ from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
 if TYPE_CHECKING:
     from graspd.service.store.store import Store
 
-#: Least time between two progress reports [s]: enough for a moving progress bar.
-REPORT_EVERY_S: Final = 1.0
+REPORT_EVERY_S: Final = 1.0  # least time between two progress reports [s]: enough for a moving progress bar
 
 
 class StopReason(StrEnum):
@@ -52,8 +51,7 @@ class TaskContext:
     ) -> None:
         """`join`: number of batches planned in one launch; `tell`: receives done, total and a message."""
         self.store, self.device, self.join = store, run.device, join
-        self.run = replace(run, progress=self.progress, cancelled=self.cancelled)
-        """Execution context for the engine."""
+        self.run = replace(run, progress=self.progress, cancelled=self.cancelled)  # execution context for the engine
         self._tell = tell
         self._tell_again = 0.0
         self._stop = threading.Event()
@@ -67,11 +65,9 @@ class TaskContext:
             self._tell(done, total, message)
 
     def cancelled(self) -> bool:
-        """Check whether to stop at the next launch."""
         return self._stop.is_set()
 
     def check(self) -> None:
-        """Raise TaskCancelled if the task should stop."""
         if self._stop.is_set():
             raise TaskCancelled(f"stopped: {self._reason}")
 
@@ -99,13 +95,8 @@ def shard_of(
     message: TaskMessage, output: Output, *, device: str, seconds: float, worker: str, lost: ShardManifest | None = None
 ) -> tuple[ShardManifest, bytes]:
     """Build the shard of a stage: its manifest and its HDF5 bytes.
-
-    Args:
-        lost: manifest of the file that this one replaces; its time and worker are retained.
-
-    Raises:
-        InputError: the columns do not fit the schema.
-    """
+    Time and worker of `lost`, the manifest of the file that this one replaces, are retained.
+    Raises InputError: the columns do not fit the schema."""
     kind = SHARD_KINDS[message.stage]
     request = message.request
     attributes: dict[str, Attribute] = {
@@ -125,18 +116,11 @@ def shard_of(
         "inputs": list(message.inputs),
         **output.attributes,
     }
-    counts = check_columns(kind, output.arrays)  # type: ignore[arg-type]
-    data = write_shard(kind, output.arrays, attributes)  # type: ignore[arg-type]
+    columns = output.arrays
+    counts = check_columns(kind, columns)  # type: ignore[arg-type]
+    data = write_shard(kind, columns, attributes)  # type: ignore[arg-type]
     manifest = manifest_of(
-        message,
-        data,
-        output.arrays,
-        attributes,
-        counts,
-        device=device,
-        seconds=seconds,
-        worker=worker,
-        info=output.info,
+        message, data, columns, attributes, counts, device=device, seconds=seconds, worker=worker, info=output.info
     )
     return manifest, data
 

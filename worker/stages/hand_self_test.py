@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from graspd.service.model.domain import BATCH_SIZE, JobOptions
 from graspd.service.model.errors import InputError
 from graspd.service.model.scene_spec import SceneSpec
-from graspd.service.model.transforms import Floats, apply
+from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply
 from graspd.worker.control.postures import squeeze
 from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
 from graspd.worker.generation import ValidatedBatch, validated_grasps
@@ -44,11 +44,7 @@ TABLE_SCENES: Final = 2
 OF_OPENING: Final = 0.55
 OF_REACH: Final = 0.5
 WIDTH_M: Final = (0.012, 0.08)
-#: Sum of normal forces of a second squeeze, for the payload: actuators reach their limits [N].
-STRONG_N: Final = 1000.0
-_IDENTITY: Final = np.array([0.0, 0, 0, 1, 0, 0, 0])
-
-
+STRONG_N: Final = 1000.0  # sum of normal forces of a second squeeze, for the payload: actuators reach their limits [N]
 #: Servos that go from zero to their limit within less fingertip motion than this press by chance [m].
 SOFT_M: Final = 0.0015
 log = logging.getLogger(__name__)
@@ -74,18 +70,13 @@ class SelfTest:
     by_object: dict[str, float]
     table: float
     table_n: int
-    best: BestGrasp | None = None
-    """None: no grasp held."""
-    lost: float = 0.0
-    """Share of failed grasps that lost the object during closing; the others slip under the pushes."""
-    give_m: float = math.inf
-    """Fingertip motion within which its stiffest servo goes from zero to its limit [m]."""
-    limit: Limit | None = None
-    """Payload on a table at full actuator force; None: it lifts nothing."""
+    best: BestGrasp | None = None  # None: no grasp held
+    lost: float = 0.0  # share of failed grasps that lost the object during closing; the others slip under the pushes
+    give_m: float = math.inf  # fingertip motion within which its stiffest servo goes from zero to its limit [m]
+    limit: Limit | None = None  # payload on a table at full actuator force; None: it lifts nothing
 
     @property
     def line(self) -> str:
-        """Return a summary in one line."""
         share = f"{100 * self.gsr:.0f} % hold"
         lifts = f"{100 * self.table:.0f} % lift off a table"
         if self.gsr >= READY and self.table >= TABLE_READY:
@@ -108,39 +99,20 @@ class SelfTest:
         return "most slip when pushed: look at effort, stiffness and pads"
 
     def facts(self) -> dict[str, Any]:
-        """Return the facts that a check reports."""
-        return {
-            "gsr": self.gsr,
-            "n": self.n,
-            "table": self.table,
-            "table_n": self.table_n,
-            "width_m": self.width_m,
-            "by_object": self.by_object,
-            "says": self.line,
-            "limit": self.limit and self.limit.facts(),
-        }
+        limit = self.limit and self.limit.facts()
+        shares = {"gsr": self.gsr, "n": self.n, "table": self.table, "table_n": self.table_n}
+        return shares | {"width_m": self.width_m, "by_object": self.by_object, "says": self.line, "limit": limit}
 
 
 def failed(reason: str, says: str = "suspicious") -> dict[str, Any]:
     """Return the facts of a hand that could not be tested."""
-    return {
-        "gsr": 0.0,
-        "n": 0,
-        "table": 0.0,
-        "table_n": 0,
-        "width_m": 0.0,
-        "by_object": {},
-        "says": f"{says}: {reason}",
-        "limit": None,
-    }
+    shares = {"gsr": 0.0, "n": 0, "table": 0.0, "table_n": 0}
+    return shares | {"width_m": 0.0, "by_object": {}, "says": f"{says}: {reason}", "limit": None}
 
 
 def tried_softly(hand: Callable[[], HandModel], run: ExecutionContext = DEFAULT_CONTEXT) -> dict[str, Any]:
     """Return the facts of a self-test; no grasp, or a failed test, is reported and not raised.
-
-    Raises:
-        TaskCancelled: `run.cancelled()` returned True.
-    """
+    Raises TaskCancelled: `run.cancelled()` returned True."""
     try:
         return self_test(hand(), run).facts()
     except InputError as error:
@@ -151,24 +123,10 @@ def tried_softly(hand: Callable[[], HandModel], run: ExecutionContext = DEFAULT_
 
 
 def self_test(
-    hand: HandModel,
-    run: ExecutionContext = DEFAULT_CONTEXT,
-    *,
-    grasps: int = GRASPS,
-    on_table: int = TABLE_GRASPS,
-    seed: int = 0,
+    hand: HandModel, run: ExecutionContext = DEFAULT_CONTEXT, *, grasps: int = GRASPS, on_table: int = TABLE_GRASPS
 ) -> SelfTest:
     """Test grasps of a sphere, a box and a cylinder with the defaults of `JobOptions`, in equal numbers.
-    Then test grasps of the same objects on a table.
-
-    There is no time limit: on a busy machine it would change the verdict.
-
-    Args:
-        hand: the hand.
-        run: receives progress; polled often for cancellation.
-        grasps: total number of free grasps.
-        on_table: total number of grasps of objects on a table.
-        seed: seed of all random numbers.
+    Then test grasps of the same objects on a table. A time limit would change the verdict on a busy machine.
 
     Raises:
         InputError: a hand finds no start around one of the objects.
@@ -183,8 +141,8 @@ def self_test(
     for number, (name, obj) in enumerate(objects.items()):
         part = run.part(number / len(objects), (number + 1) / len(objects))
         free, standing = (count // 3 + (number < count % 3) for count in (grasps, on_table))
-        found = _batches(hand, obj, free, seed, part.part(0.0, 0.7))
-        lifted += [_lifted(hand, obj, standing, seed, part.part(0.7, 1.0))]
+        found = _batches(hand, obj, free, part.part(0.0, 0.7))
+        lifted += [_lifted(hand, obj, standing, part.part(0.7, 1.0))]
         held[name] = [bool(value == 1) for batch in found for value in batch.columns["quality/success"]]
         lost += [bool(one) for batch in found for one in _lost(batch)]
         better = [_best(obj, batch) for batch in found]
@@ -199,7 +157,6 @@ def self_test(
 
 
 def _joined(limits: list[Limit]) -> Limit | None:
-    """Combine the payloads of several objects; None: nothing was lifted."""
     if not limits:
         return None
     lifts, bound = (max(getattr(one, name) for one in limits) for name in ("lifts_kg", "bound_kg"))
@@ -219,43 +176,36 @@ def _give(hand: HandModel) -> float:
         return math.inf
     step = 1e-4
     q = hand.preshape + np.concatenate([np.zeros((1, hand.dofs)), step * np.eye(hand.dofs)])
-    poses = body_poses(hand, np.tile(_IDENTITY, (len(q), 1)), hand.expand(q))
+    poses = body_poses(hand, np.tile(IDENTITY_POSE, (len(q), 1)), hand.expand(q))
     pads = np.stack([apply(poses[:, tip], fingertip_pad(hand, tip).centre) for tip in hand.fingertips], axis=1)
     lever = np.linalg.norm(pads[1:] - pads[0], axis=2).max(axis=1) / step
     closes = (hand.closing != 0) & (lever > 0)
     return float(np.min((hand.effort / hand.stiffness * lever)[closes], initial=math.inf))
 
 
-def _batches(hand: HandModel, obj: ObjectModel, count: int, seed: int, run: ExecutionContext) -> list[ValidatedBatch]:
-    found = []
-    for batch, first in enumerate(range(0, count, BATCH_SIZE)):
-        size = min(BATCH_SIZE, count - first)
-        request = JobOptions(want="candidates", grasps=size, seed=seed, validation="standard")
-        found.append(validated_grasps(hand, obj, request, count=size, batch=batch, run=run))
-    return found
+def _batches(hand: HandModel, obj: ObjectModel, count: int, run: ExecutionContext) -> list[ValidatedBatch]:
+    sizes = [min(BATCH_SIZE, count - first) for first in range(0, count, BATCH_SIZE)]
+    return [
+        validated_grasps(hand, obj, _request(size), count=size, batch=batch, run=run)
+        for batch, size in enumerate(sizes)
+    ]
 
 
-def _lifted(
-    hand: HandModel, obj: ObjectModel, count: int, seed: int, run: ExecutionContext
-) -> tuple[int, float, Limit | None]:
+def _request(count: int) -> JobOptions:
+    return JobOptions(want="candidates", grasps=count, validation="standard")
+
+
+def _lifted(hand: HandModel, obj: ObjectModel, count: int, run: ExecutionContext) -> tuple[int, float, Limit | None]:
     """Test grasps of an object on a table.
     Return the number of planned grasps, the share that lifts, and the payload at full actuator force."""
-    scenes, _ = scenes_of(TABLE, obj, count=TABLE_SCENES, seed=seed)
-    request = JobOptions(want="candidates", grasps=count, seed=seed, validation="standard")
-    found = validated_grasps(hand, obj, request, count=count, scenes=scenes, run=run)
+    scenes, _ = scenes_of(TABLE, obj, count=TABLE_SCENES, seed=0)
+    found = validated_grasps(hand, obj, _request(count), count=count, scenes=scenes, run=run)
     grasps, about = found.grasps.moved(np.negative(obj.centre)), obj.centred
     strong = replace(grasps, squeeze=squeeze(hand, about, grasps.grasp, total_normal_force=STRONG_N))
     both = joined([grasps, strong])
     assert both.scene is not None
-    limit = limit_of(
-        hand,
-        about,
-        both,
-        pieces=decompose(about),
-        placed=scenes.centred(obj).placed(both.scene),
-        least=1,
-        run=run.quiet(),
-    )
+    placed, pieces = scenes.centred(obj).placed(both.scene), decompose(about)
+    limit = limit_of(hand, about, both, pieces=pieces, placed=placed, least=1, run=run.quiet())
     return found.planned, found.shares["lift_share"], limit and replace(limit, grasps=count)
 
 
@@ -274,7 +224,7 @@ def fitting_width(hand: HandModel) -> float:
     """Return the width of objects that suit a hand [m]."""
     if (jaws := jaws_of(hand)) is not None:
         return float(np.clip(OF_OPENING * jaws.opening, *WIDTH_M))
-    poses = body_poses(hand, _IDENTITY, hand.expand(hand.preshape))[0]
+    poses = body_poses(hand, IDENTITY_POSE, hand.expand(hand.preshape))[0]
     tips = np.array([_tip(hand, body, poses[body]) for body in hand.fingertips or (hand.bodies - 1,)])
     reach = float(np.median(np.linalg.norm(tips - hand.palm.centre, axis=1)))
     # Objects thinner than the least gap between opposed pads do not suit a hand.
@@ -298,9 +248,8 @@ def plain_objects(width: float) -> dict[str, ObjectModel]:
         "box": trimesh.creation.box((width, 1.2 * width, 1.8 * width)),
         "cylinder": trimesh.creation.cylinder(width / 2, 2 * width, sections=48),
     }
-    return {
-        name: load_object(
-            {f"{name}.stl": bytes(mesh.export(file_type="stl"))}, name=name, digest=f"{number:032x}", face_error_m=3e-4
-        )
-        for number, (name, mesh) in enumerate(meshes.items())
-    }
+    objects = {}
+    for number, (name, mesh) in enumerate(meshes.items()):
+        files = {f"{name}.stl": bytes(mesh.export(file_type="stl"))}
+        objects[name] = load_object(files, name=name, digest=f"{number:032x}", face_error_m=3e-4)
+    return objects

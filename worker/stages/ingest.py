@@ -89,17 +89,8 @@ def check_in_child(
     with tempfile.TemporaryDirectory(prefix="graspd-ingest-") as folder:
         source, target, errors = (Path(folder) / file for file in ("files.zip", "check.json", "errors.txt"))
         source.write_bytes(pack(files))
-        limits = [str(memory_bytes), str(cpu_s)]
-        command = [
-            sys.executable,
-            "-m",
-            "graspd.worker.stages.ingest",
-            kind.value,
-            name,
-            str(source),
-            str(target),
-            *limits,
-        ]
+        arguments = [kind.value, name, str(source), str(target), str(memory_bytes), str(cpu_s)]
+        command = [sys.executable, "-m", "graspd.worker.stages.ingest", *arguments]
         # A file of limited size: a full pipe would block the child, and reading from one has no limit.
         with (
             errors.open("wb") as stderr,
@@ -137,14 +128,11 @@ def _environment() -> dict[str, str]:
 
 
 def _wait(child: subprocess.Popen[bytes], context: TaskContext) -> int:
-    """Return the exit code of the child. If the task is cancelled, end the child and raise TaskCancelled."""
     try:
         while True:
             context.check()
-            try:
+            with contextlib.suppress(subprocess.TimeoutExpired):
                 return child.wait(timeout=0.1)
-            except subprocess.TimeoutExpired:
-                continue
     finally:
         if child.poll() is None:
             os.killpg(child.pid, signal.SIGKILL)
@@ -169,11 +157,8 @@ def _refused(kind: AssetKind, name: str, why: str) -> dict[str, Any]:
 def _child(kind: str, name: str, source: str, target: str, memory_bytes: str, cpu_s: str) -> None:
     # The hard limit stays: its signal equals that of a machine out of memory, and children have their own limits.
     resource.setrlimit(resource.RLIMIT_CPU, (int(cpu_s), resource.getrlimit(resource.RLIMIT_CPU)[1]))
-    for limit, value in (
-        (resource.RLIMIT_AS, int(memory_bytes)),
-        (resource.RLIMIT_CORE, 0),
-        (resource.RLIMIT_FSIZE, _MODEL_BYTES),
-    ):
+    limits = {resource.RLIMIT_AS: int(memory_bytes), resource.RLIMIT_CORE: 0, resource.RLIMIT_FSIZE: _MODEL_BYTES}
+    for limit, value in limits.items():
         resource.setrlimit(limit, (value, value))
     files = unpack(Path(source).read_bytes(), limit_bytes=UNPACKED_LIMIT_BYTES)
     if AssetKind(kind) is AssetKind.HAND:

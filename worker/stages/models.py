@@ -54,22 +54,17 @@ def publish_model(store: Store, kind: AssetKind, model: HandModel | ObjectModel)
         put_sealed(store, key, hand_glb(model) if isinstance(model, HandModel) else object_glb(model))
 
 
-def write_builtins(folder: Path = _BUILTIN) -> None:
-    """Write the models of all built-in hands and objects."""
-    folder.mkdir(exist_ok=True)
+def write_builtins() -> None:
+    _BUILTIN.mkdir(exist_ok=True)
     for kind in AssetKind:
         for name in builtin_names(kind):
-            (folder / f"{kind.value}-{name}.glb").write_bytes(model_of(kind, name, builtin_files(kind, name)))
+            (_BUILTIN / f"{kind.value}-{name}.glb").write_bytes(model_of(kind, name, builtin_files(kind, name)))
 
 
-#: Hand points from which a viewer measures the distance to the object.
-SURFACE_POINTS: Final = 3000
-#: Most triangles of all visual meshes of a hand, so that a browser draws them at once.
-MAX_FACES: Final = 60_000
-#: Most points of a pad.
-PAD_POINTS: Final = 60
-#: sRGB of parts without a colour, if other parts have one.
-_GREY: Final = (0.45, 0.5, 0.55)
+SURFACE_POINTS: Final = 3000  # hand points from which a viewer measures the distance to the object
+MAX_FACES: Final = 60_000  # most triangles of all visual meshes of a hand, so that a browser draws them at once
+PAD_POINTS: Final = 60  # most points of a pad
+_GREY: Final = (0.45, 0.5, 0.55)  # sRGB of parts without a colour, if other parts have one
 
 
 def hand_glb(hand: HandModel) -> bytes:
@@ -113,7 +108,6 @@ def object_glb(obj: ObjectModel) -> bytes:
 
 
 def _found(hand: HandModel) -> dict[str, Any]:
-    """Return the facts that a user reviews and corrects."""
     drives = {
         joint: {
             "dof": hand.dof_names[hand.dof[body]],
@@ -146,7 +140,6 @@ def _body_primitives(
 
 
 def _joined(document: Document, meshes: list[tuple[Floats, Ints, Colour | None]]) -> dict[str, Any] | None:
-    """Build one primitive from vertices, faces and sRGB colours."""
     if not meshes:
         return None
     starts = np.cumsum([0, *(len(vertices) for vertices, _, _ in meshes)])
@@ -162,7 +155,6 @@ def _joined(document: Document, meshes: list[tuple[Floats, Ints, Colour | None]]
 
 
 def _light_visuals(hand: HandModel) -> tuple[VisualMesh, ...]:
-    """Return the visual meshes, simplified to at most `MAX_FACES` triangles in total."""
     meshes = hand.visuals.meshes
     excess = sum(len(mesh.faces) for mesh in meshes) / MAX_FACES
     return meshes if excess <= 1 else tuple(lighter(mesh, excess) for mesh in meshes)

@@ -25,7 +25,6 @@ _OF_SOME: Final = {"quality/recheck": np.int8(-1)}
 
 
 def sizes_of(message: TaskMessage) -> list[int]:
-    """Return the number of grasps of each batch of a task."""
     return [min(BATCH_SIZE, message.count - first) for first in range(0, message.count, BATCH_SIZE)]
 
 
@@ -38,13 +37,8 @@ def batches_of(message: TaskMessage) -> list[TaskMessage]:
 
 
 def joined(message: TaskMessage, made: Sequence[Output], *, base_rows: Sequence[range] = ()) -> Output:
-    """Join the outputs of batches into one shard; the output of a single batch is unchanged.
-
-    Args:
-        message: the task.
-        made: outputs of its batches, with equal columns except for rechecks.
-        base_rows: rows of each batch in the base shard, for columns that refer to them.
-    """
+    """Join the outputs of batches, with equal columns except for rechecks; that of a single batch is unchanged.
+    Columns that refer to rows of the base shard follow `base_rows`, the rows of each batch in it."""
     if len(made) == 1:
         return made[0]
     kind = SHARD_KINDS[message.stage]
@@ -68,11 +62,7 @@ def joined(message: TaskMessage, made: Sequence[Output], *, base_rows: Sequence[
 
 
 def base_rows(base: Shard, message: TaskMessage) -> list[range]:
-    """Return the rows of each batch of a task in its base shard.
-
-    Raises:
-        DamagedShard: it has other batches.
-    """
+    """Return the rows of each batch of a task in its base shard. Raises DamagedShard: it has other batches."""
     said = base.attributes.get("batch_rows")
     counts = [len(base.arrays["grasp/hand_pose"])] if said is None else json.loads(str(said))
     if len(counts) != len(sizes_of(message)):

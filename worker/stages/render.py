@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from graspd.service.model.messages import TaskMessage
@@ -29,12 +31,8 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
     said: dict[str, Attribute] = {"scene_shard": message.inputs[0]}
     extras = Extras(channels=request.channels)
     if request.in_scene:
-        extras = Extras(
-            channels=request.channels,
-            supports=supports_in(request.place),
-            drawn=_drawn(shard, message, context),
-            neighbours=_beside(shard, message, context),
-        )
+        drawn, beside = _drawn(shard, message, context), _beside(shard, message, context)
+        extras = replace(extras, supports=supports_in(request.place), drawn=drawn, neighbours=beside)
         said = {"base_shard": message.inputs[0], "scene": json_attribute(request.place.told())}
         said |= beside_attributes(message)
     context.check()
@@ -53,7 +51,6 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
 
 
 def _beside(base: Shard, message: TaskMessage, context: TaskContext) -> Neighbours | None:
-    """Load the other objects of the scenes; None if the object is alone."""
     others = neighbours_of(context.store, message)
     return Neighbours(others, np.asarray(base["scene/neighbour_pose"], float)) if others else None
 

@@ -50,10 +50,7 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
 
 def _before_grasps(message: TaskMessage, context: TaskContext) -> Output:
     """Place the object and its neighbours in `request.scenes` scenes.
-
-    Raises:
-        SceneError: they do not fit, penetrate each other, or do not come to rest.
-    """
+    Raises SceneError: they do not fit, penetrate each other, or do not come to rest."""
     hand, obj = hand_of(context.store, message), object_of(context.store, message)
     place = message.request.place
     # The first batch equals the scenes of `graspd synth` with the same seed.

@@ -85,22 +85,14 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
 
 
 def _output(found: ValidatedBatch, columns: Mapping[str, NDArray[Any]]) -> Output:
-    """Return the columns and records of one batch."""
-    seconds = {f"{name}_seconds": round(value, 4) for name, value in found.seconds.items()}
-    shares = {name: round(value, 4) for name, value in found.shares.items()}
-    info = {
-        **seconds,
-        **shares,
-        "rejected": found.rejected,
-        "outcomes": found.outcomes,
-        "planned": found.planned,
-        **_json(found.grasps.info),
-    }
+    info: dict[str, Any] = {f"{name}_seconds": round(value, 4) for name, value in found.seconds.items()}
+    info |= {name: round(value, 4) for name, value in found.shares.items()}
+    info |= {"rejected": found.rejected, "outcomes": found.outcomes, "planned": found.planned}
+    info |= _plain(found.grasps.info)
     return Output({**found.grasps.to_columns(), **found.columns, **columns}, info=info)
 
 
 def _scene_columns(message: TaskMessage, context: TaskContext) -> list[dict[str, NDArray[Any]]]:
-    """Return the object poses in the scenes of each batch; empty for free objects."""
     request = message.request
     if not request.in_scene:
         return []
@@ -116,10 +108,8 @@ def _scene_columns(message: TaskMessage, context: TaskContext) -> list[dict[str,
 
 
 def _scenes(message: TaskMessage, columns: dict[str, NDArray[Any]], context: TaskContext) -> Scenes:
-    """Return the scenes of a batch with supports and neighbours."""
     scenes = Scenes(supports_of(message.request.place), columns["scene/object_pose"])
-    others = neighbours_of(context.store, message)
-    if not others:
+    if not (others := neighbours_of(context.store, message)):
         return scenes
     beside = tuple(neighbour_of(other) for other in others)
     return replace(scenes, neighbours=beside, neighbour_pose=columns["scene/neighbour_pose"])
@@ -141,14 +131,10 @@ def _check_hope(message: TaskMessage, batch: int, found: ValidatedBatch, *, in_s
         )
 
 
-def _json(info: dict[str, object]) -> dict[str, object]:
+def _plain(value: Any) -> Any:
     """Convert the planner's records for JSON, with None for nan and infinity."""
-
-    def plain(value: Any) -> Any:
-        if isinstance(value, dict):
-            return {str(key): plain(part) for key, part in value.items()}
-        if isinstance(value, list | tuple):
-            return [plain(part) for part in value]
-        return None if isinstance(value, float) and not math.isfinite(value) else value
-
-    return {key: plain(value) for key, value in info.items()}
+    if isinstance(value, dict):
+        return {str(key): _plain(part) for key, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(part) for part in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

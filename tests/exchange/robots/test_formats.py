@@ -25,7 +25,7 @@ from graspd.service.store.shards import read_shard, write_shard
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.urdf import read_urdf
-from graspd.worker.rendering.hands import drawn_bodies, hand_solids
+from graspd.worker.rendering.hands import hand_parts
 from tests.conftest import REPOSITORY
 from tests.exchange.robots.arms import write_arm
 from tests.exchange.robots.shards import COMMON, make, run
@@ -236,8 +236,8 @@ def expected(shard: Path, row: int) -> tuple[dict[str, np.ndarray], np.ndarray]:
         body_poses(case.hand, grasp.hand_pose[row], grasp.joint_positions[row])[0]
     )
     found = {
-        case.hand.body_names[body]: trimesh.transform_points(solid.vertices, bodies[body])
-        for body, solid in zip(drawn_bodies(case.hand), hand_solids(case.hand), strict=True)
+        case.hand.body_names[part.body]: trimesh.transform_points(part.solid.vertices, bodies[part.body])
+        for part in hand_parts(case.hand)
     }
     return found, pose_to_matrix(at)
 

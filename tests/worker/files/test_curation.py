@@ -1,4 +1,4 @@
-"""Parts of datasets: chosen by an expression or by kind, balanced, and compared."""
+"""Parts of datasets: chosen by an expression or by kind, balanced, compared, and as files of clouds."""
 
 from __future__ import annotations
 
@@ -13,10 +13,12 @@ from typer.testing import CliRunner
 from graspd.commands.curate import app
 from graspd.exchange.inputs import expand
 from graspd.service.model.errors import InputError
-from graspd.service.readers import Grasps, open_shards
+from graspd.service.readers import Grasps, Pictures, open_shards
+from graspd.service.readers.clouds import OF_GRASPS
 from graspd.service.store.shards import Shard, read_shard, write_shard
 from graspd.worker.files.curation import Balance, faces
 from graspd.worker.files.subsets import choose
+from tests.service.readers import box_scenes
 from tests.worker.models import quality_columns
 
 COUNT = 40
@@ -143,3 +145,42 @@ def test_valid_grasps_are_taken_unless_others_are_asked_for() -> None:
 def test_none_of_that_kind_is_told_with_the_mend(base: Shard, wish: dict[str, bool], fix: str) -> None:
     with pytest.raises(InputError, match=fix):
         choose(base, **wish)
+
+
+@pytest.fixture(scope="module")
+def boxes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return box_scenes.write(tmp_path_factory.mktemp("box"))
+
+
+def test_files_hold_every_sample_whole(boxes: Path, tmp_path: Path) -> None:
+    said = ["--points", "200", "--noise", "stereo", "--seed", "4", "-o", tmp_path / "out", "--json"]
+    done = run("clouds", boxes, *said)
+    assert done.exit_code == 0, done.output
+    assert json.loads(done.output) == {"folder": str(tmp_path / "out"), "files": 1, "clouds": 6, "empty": 0}
+    samples = Pictures(open_shards(boxes)).clouds(200, noise="stereo", seed=4)
+    with np.load(tmp_path / "out" / "clouds-00000.npz") as found:
+        ends = np.cumsum(found["grasp/count"])
+        for index, sample in enumerate(samples):
+            for name, value in sample.items():
+                of_grasps = slice(ends[index] - found["grasp/count"][index], ends[index])
+                part = found[name]
+                part = part[of_grasps] if name.startswith(OF_GRASPS) else part if part.ndim == 0 else part[index]
+                np.testing.assert_array_equal(part, value)
+    told = json.loads((tmp_path / "out" / "clouds.json").read_text())
+    assert (told["noise"], told["seed"], told["frame"], told["clouds"]) == ("stereo", 4, "camera", 6)
+
+
+def test_what_cannot_be_written_is_told_in_a_line(boxes: Path, tmp_path: Path) -> None:
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "thesis.tex").write_text("")
+    (tmp_path / "none").mkdir()
+    (tmp_path / "none" / "base.h5").write_bytes((boxes / "base.h5").read_bytes())
+    for source, out, words in (
+        (boxes, tmp_path / "full", "is there already"),
+        (tmp_path / "none", tmp_path / "new", "has no pictures"),
+        (tmp_path / "away", tmp_path / "new", "does not exist"),
+    ):
+        done = run("clouds", source, "-o", out)
+        assert done.exit_code == 2
+        assert words in done.output and len(done.output.strip().splitlines()) == 1
+    assert not (tmp_path / "new").exists()

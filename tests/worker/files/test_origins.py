@@ -26,8 +26,7 @@ PLACES = {"origin": (0.0, 0.0, 0.0), "6 m": (5.0, -3.0, 2.0), "UTM": (500_000.0,
 AWAY = pytest.mark.parametrize("place", ["6 m", "UTM"])
 SCENES = pytest.mark.parametrize("scene", ["free", "table"])
 REQUEST = JobOptions(grasps=2, want="candidates", rechecks=0, fidelity=FIDELITIES["draft"], seed=1)
-#: Of positions in the frame of the file [m].
-ROUNDING_M = 1e-6
+ROUNDING_M = 1e-6  # of positions in the frame of the file [m]
 
 
 @pytest.fixture(scope="module")
@@ -92,16 +91,9 @@ def test_an_evaluation_says_the_same(made: Any, tmp_path: Path, place: str, scen
 def test_pictures_are_the_same(made: Any, boxes: dict[str, Path], tmp_path: Path, place: str) -> None:
     seen = []
     for at in ("origin", place):
-        grasp = made[at, "free"].arrays
-        pictures = grasp_pictures(
-            load_case(file_of(made[at, "free"], tmp_path / f"{at}.h5")).hand,
-            object_from_path(boxes[at]),
-            grasp["grasp/hand_pose"][:1],
-            grasp["grasp/joint_positions"][:1],
-            (48, 48),
-            samples=2,
-        )
-        seen.append(pictures)
+        hand = load_case(file_of(made[at, "free"], tmp_path / f"{at}.h5")).hand
+        pose, joints = (made[at, "free"].arrays[f"grasp/{name}"][:1] for name in ("hand_pose", "joint_positions"))
+        seen.append(grasp_pictures(hand, object_from_path(boxes[at]), pose, joints, (48, 48), samples=2))
     np.testing.assert_array_equal(*seen)
 
 

@@ -13,17 +13,16 @@ from graspd.service.model.messages import TaskMessage
 from graspd.service.model.states import Priority, Stage
 from graspd.service.queue.port import Event, EventKind
 from graspd.service.queue.rq_queue import RqQueue
-from graspd.service.settings import Settings
 from graspd.service.store.manifests import shard_exists
 from graspd.service.store.records import task_attempts
 from graspd.service.store.store import Store, open_store
 from graspd.worker.engines.devices import DeviceLost
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.pool.pool import ProcessLost
-from graspd.worker.process import engine, main
+from graspd.worker.process import engine
 from graspd.worker.process.runner import Runner
 from graspd.worker.stages.context import TaskContext
-from tests.fakes import engine_of, fake_synthesize, message_for
+from tests.fakes import fake_synthesize, message_for
 
 
 @pytest.fixture(autouse=True)
@@ -42,16 +41,15 @@ def garbled(message: TaskMessage, context: TaskContext) -> Any:
 
 def run(store: Store, message: TaskMessage, stage: Any, check: Any = broken) -> tuple[Event | None, Runner]:
     runner = Runner({Stage.SYNTHESIZE: stage}, worker="w", publish=lambda event: None, check_device=check)
-    return runner.run(
-        message.model_dump(mode="json", by_alias=True), TaskContext(store, ExecutionContext("cuda:0"))
-    ), runner
+    context = TaskContext(store, ExecutionContext("cuda:0"))
+    return runner.run(message.model_dump(mode="json", by_alias=True), context), runner
 
 
 @pytest.mark.parametrize("stage", [fake_synthesize, garbled])
 def test_the_task_goes_back_without_a_result_or_an_attempt(stage: Any) -> None:
     store, message = open_store("memory://"), message_for()
     event, runner = run(store, message, stage)
-    assert event is not None and event.kind is EventKind.RETURNED
+    assert event.kind is EventKind.RETURNED
     assert "CUDA error 700" in event.message and "CUDA error 700" in runner.device_lost
     assert not shard_exists(store, message.stage, message.output)
     assert not list(task_attempts(store, message.task_id))
@@ -61,7 +59,7 @@ def test_a_task_that_takes_down_one_gpu_after_the_other_uses_up_its_attempts() -
     store, message = open_store("memory://"), message_for()
     run(store, message, fake_synthesize)
     event, _ = run(store, message, fake_synthesize)
-    assert event is not None and event.kind is EventKind.FAILED
+    assert event.kind is EventKind.FAILED
     (attempt,) = task_attempts(store, message.task_id)
     assert (attempt.kind, attempt.last) == ("DeviceLost", False)
 
@@ -72,32 +70,24 @@ def test_a_task_over_which_a_process_beside_the_worker_ended_goes_back_once_and_
 
     store, message = open_store("memory://"), message_for()
     event, runner = run(store, message, lost, lambda device: None)
-    assert event is not None and (event.kind, runner.device_lost) == (EventKind.RETURNED, "")
+    assert (event.kind, runner.device_lost) == (EventKind.RETURNED, "")
     assert "signal 9" in event.message and not list(task_attempts(store, message.task_id))
     event, _ = run(store, message, lost, lambda device: None)
-    assert event is not None and event.kind is EventKind.FAILED, "a task that ends each must use up its attempts"
+    assert event.kind is EventKind.FAILED, "a task that ends each must use up its attempts"
 
 
 def test_a_device_that_works_is_not_blamed() -> None:
     event, runner = run(open_store("memory://"), message_for(), garbled, lambda device: None)
-    assert event is not None and (event.kind, runner.device_lost) == (EventKind.FAILED, "")
+    assert (event.kind, runner.device_lost) == (EventKind.FAILED, "")
 
 
 def test_the_worker_ends_and_leaves_the_other_tasks(
-    rq_queue: RqQueue,
-    redis_server: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
+    rq_queue: RqQueue, work: Any, kinds: Any, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(engine, "Runner", partial(Runner, check_device=broken))
     rq_queue.enqueue([message_for(), message_for(seed=1)], Priority.BULK)
-    settings = Settings(redis_url=redis_server, data_dir=tmp_path, device="cpu")  # type: ignore[arg-type]
     with caplog.at_level(logging.ERROR):
-        assert not main.run_worker(settings, start=engine_of({Stage.SYNTHESIZE: fake_synthesize})), (
-            "its supervisor should know"
-        )
-    kinds = [event.kind for _, event in rq_queue.tail("0", limit=10, wait_s=0)]
-    assert kinds[:2] == [EventKind.STARTED, EventKind.RETURNED] and kinds.count(EventKind.STARTED) == 1
+        assert not work({Stage.SYNTHESIZE: fake_synthesize}, burst=False), "its supervisor should know"
+    assert kinds()[:2] == [EventKind.STARTED, EventKind.RETURNED] and kinds().count(EventKind.STARTED) == 1
     assert rq_queue.leases() == []
     assert any(line.startswith("this worker ends: CUDA error 700") for line in caplog.messages)

@@ -4,25 +4,35 @@ from __future__ import annotations
 
 import os
 import signal
+import struct
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
+from multiprocessing import Pipe
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from graspd.service.model.states import Priority
+from graspd.service.model.states import Priority, Stage
 from graspd.service.queue.port import EventKind
 from graspd.service.queue.rq_queue import RqQueue
-from graspd.worker.process import main
+from graspd.service.settings import Settings
+from graspd.service.store.store import open_store
+from graspd.worker.engines.devices import Device
+from graspd.worker.process import engine, main
+from graspd.worker.process.engine import Engine, TaskResources
 from graspd.worker.process.heartbeat import Heartbeat
-from graspd.worker.process.link import EngineLost, Link, is_stopped
+from graspd.worker.process.link import EngineLost, Link, Setup, is_stopped
 from graspd.worker.process.main import GraspWorker
 from graspd.worker.stages.context import StopReason, TaskContext
 from tests.fakes import message_for
 from tests.waiting import until
+from tests.worker.pool import works
+from tests.worker.process.test_heartbeat import beat_of
 
 LEASE_S = 2.0
 TASK = message_for()
@@ -134,10 +144,10 @@ def test_a_worker_whose_engine_was_stopped_keeps_no_lease(start: Start) -> None:
 def test_no_engine_outlives_its_worker(start: Start) -> None:
     worker = start()
     worker.begin()
-    engine = worker.engine
+    pid = worker.engine
     worker.process.kill()
     worker.process.wait()
-    until(lambda: is_stopped(engine), "the engine ended")
+    until(lambda: is_stopped(pid), "the engine ended")
     assert worker.queue.leases(), "the controller finds the lease"
 
 
@@ -149,23 +159,17 @@ def test_a_worker_ends_with_its_engine_and_leaves_the_lease_to_the_controller(st
     assert worker.queue.leases() and worker.events() == [EventKind.STARTED]
 
 
-def test_a_worker_without_a_task_that_loses_its_engine_leaves(start: Start, tmp_path: Path) -> None:
-    broken = tmp_path / "broken"
-    broken.touch()
+@pytest.mark.parametrize("which", ["engine", "worker"])
+def test_a_worker_in_quarantine_leaves_when_it_or_its_engine_ends(start: Start, tmp_path: Path, which: str) -> None:
+    (broken := tmp_path / "broken").touch()
     worker = start({"FAKE_BROKEN": str(broken)}, state="quarantined")
-    os.kill(worker.engine, signal.SIGKILL)
-    assert worker.process.wait(60) == 1
-    assert worker.events() == [EventKind.LEFT] and worker.states() == []
-
-
-def test_a_worker_that_is_told_to_stop_while_it_checks_its_engine_leaves(start: Start, tmp_path: Path) -> None:
-    broken = tmp_path / "broken"
-    broken.touch()
-    worker = start({"FAKE_BROKEN": str(broken)}, state="quarantined")
-    engine = worker.engine
-    worker.process.send_signal(signal.SIGTERM)
-    worker.process.wait(60)
-    assert worker.events() == [EventKind.LEFT] and is_stopped(engine)
+    pid = worker.engine
+    if which == "engine":
+        os.kill(pid, signal.SIGKILL)
+    else:
+        worker.process.send_signal(signal.SIGTERM)
+    assert worker.process.wait(60) == (1 if which == "engine" else 0)
+    assert worker.events() == [EventKind.LEFT] and worker.states() == [] and is_stopped(pid)
 
 
 class Deaf(Link):
@@ -189,19 +193,53 @@ class Deaf(Link):
 def test_an_engine_is_stopped_when_the_time_of_a_task_is_over_and_then_ended(
     rq_queue: RqQueue, redis_server: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from tests.worker.process.test_heartbeat import beat_of
-
     monkeypatch.setattr(main, "STUCK_AFTER_S", 0.2)
-    engine = Deaf()
+    deaf = Deaf()
     heart = Heartbeat(redis_server, beat_of(), lease_s=LEASE_S)
-    worker = GraspWorker(rq_queue, engine, heart, stages=[TASK.stage], name="w", limit_s=0.2)
+    worker = GraspWorker(rq_queue, deaf, heart, stages=[TASK.stage], name="w", limit_s=0.2)
     with pytest.raises(EngineLost):
         worker.admit()
-    assert engine.told == [None, StopReason.TIMEOUT] and engine.killed
+    assert deaf.told == [None, StopReason.TIMEOUT] and deaf.killed
 
 
 def test_the_first_reason_to_stop_stands() -> None:
-    context = TaskContext(None)  # type: ignore[arg-type]
+    context = TaskContext(None)
     context.stop(StopReason.SHUTDOWN)
     context.stop(StopReason.LEASE_LOST)
     assert context.stop_reason is StopReason.SHUTDOWN
+
+
+def test_half_an_order_does_not_break_the_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    broken: list[threading.ExceptHookArgs] = []
+    monkeypatch.setattr(threading, "excepthook", broken.append)
+    ours, theirs = Pipe()
+    settings = Settings(data_dir=tmp_path, store_url=f"file://{tmp_path}/store", device="cuda:99")
+    header = struct.pack("!i", 1)
+    os.write(ours.fileno(), header[:2])
+    Engine(theirs, Setup(settings, tuple(Stage), "a-worker", patient=False)).serve()
+    assert ours.recv()[0] == "refused"
+    with suppress(BrokenPipeError):  # where the engine closed its end before it went on reading
+        os.write(ours.fileno(), header[2:])
+    until(lambda: "engine-orders" not in {thread.name for thread in threading.enumerate()}, "its listener ends")
+    assert not broken, broken[0].exc_value
+
+
+def resources(folder: Path, processes: int) -> TaskResources:
+    settings = Settings(data_dir=folder, processes=processes)
+    return TaskResources(settings, open_store("memory://"), Device("cpu"))
+
+
+def test_tasks_that_make_grasps_share_the_processes_of_their_worker(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(engine, "MODULES", ())  # these need none of the engine
+    worker = resources(tmp_path, 2)
+    try:
+        assert [worker.pool(stage) for stage in Stage if stage is not Stage.SYNTHESIZE] == [None] * (len(Stage) - 1)
+        pool = worker.pool(Stage.SYNTHESIZE)
+        assert pool is worker.pool(Stage.SYNTHESIZE) and pool.processes == 2
+        assert pool.map(works.times, "three", 3, [1, 2]) == [3, 6]
+    finally:
+        worker.close()
+    assert resources(tmp_path, 1).pool(Stage.SYNTHESIZE) is None
+    assert resources(tmp_path, 0).pool(Stage.SYNTHESIZE) is None, "on a CPU threads do it, where nobody says otherwise"

@@ -1,4 +1,4 @@
-"""Which failures are the worker's own."""
+"""Which failures are the worker's own, and its check of itself with the real engine."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ from graspd.service.model.states import Stage
 from graspd.service.queue.port import Event, EventKind
 from graspd.service.store.records import task_attempts
 from graspd.service.store.store import Store, open_store
+from graspd.worker import generation
 from graspd.worker.process import fitness as module
 from graspd.worker.process.fitness import Fitness
 from graspd.worker.process.runner import Runner
-from graspd.worker.process.selfcheck import EngineError
+from graspd.worker.process.selfcheck import EngineError, check_engine
 from graspd.worker.stages.context import TaskContext
 from tests.fakes import fake_synthesize, make_shard, message_for
 
@@ -29,6 +30,7 @@ class Bench:
         self.engine_works = True
         self.error: Exception | None = None
         self.checked: list[tuple[Stage, ...]] = []
+        self.told: list[dict[str, str]] = []
         self.fitness = Fitness(self.store, self._check)
 
     def _check(self, stages: Collection[Stage]) -> None:
@@ -43,23 +45,15 @@ class Bench:
             return fake_synthesize(message, context)
 
         runner = Runner({Stage.SYNTHESIZE: stage}, worker="w", publish=lambda event: None, fitness=self.fitness)
-        event = runner.run(message.model_dump(mode="json", by_alias=True), TaskContext(self.store))
-        assert event is not None
-        return event
+        return runner.run(message.model_dump(mode="json", by_alias=True), TaskContext(self.store))
+
+    def sits_out(self, told_to_stop: bool = False) -> bool:
+        """Whether it is fit again after its quarantine."""
+        return self.fitness.sit_out((Stage.SYNTHESIZE,), lambda **facts: self.told.append(facts), lambda: told_to_stop)
 
     def fail(self, seed: int) -> Event:
         self.error = RuntimeError("no result")
         return self.run(message_for(seed=seed).model_copy(update={"task_id": f"{seed:032x}"}))
-
-
-class Listing:
-    """What a worker told about itself."""
-
-    def __init__(self) -> None:
-        self.told: list[dict[str, str]] = []
-
-    def update(self, **facts: str) -> None:
-        self.told.append(facts)
 
 
 @pytest.fixture
@@ -118,12 +112,11 @@ def test_a_success_in_between_ends_the_row(bench: Bench) -> None:
 
 
 def test_a_worker_comes_back_once_its_engine_works(bench: Bench) -> None:
-    listing = Listing()
     bench.engine_works = False
     assert not bench.fitness.try_engine((Stage.SYNTHESIZE,))
     bench.engine_works = True
-    assert bench.fitness.sit_out((Stage.SYNTHESIZE,), listing.update, lambda: False)
-    assert listing.told == [
+    assert bench.sits_out()
+    assert bench.told == [
         {"state": "quarantined", "reason": "synthesize: ImportError: libcuda.so.1"},
         {"state": "idle", "reason": ""},
     ]
@@ -132,17 +125,45 @@ def test_a_worker_comes_back_once_its_engine_works(bench: Bench) -> None:
 def test_a_worker_whose_engine_stays_broken_gives_up_after_some_tries(bench: Bench) -> None:
     bench.engine_works = False
     assert not bench.fitness.try_engine((Stage.SYNTHESIZE,))
-    assert not bench.fitness.sit_out((Stage.SYNTHESIZE,), Listing().update, lambda: False)
+    assert not bench.sits_out()
     assert len(bench.checked) == 1 + len(module.PAUSES_S)
 
 
 def test_a_fault_that_the_check_cannot_see_is_not_cured_by_passing_it(bench: Bench) -> None:
     test_failures_in_a_row_that_others_do_not_have_are_the_workers(bench)
-    assert not bench.fitness.sit_out((Stage.SYNTHESIZE,), Listing().update, lambda: False), "a fresh process must start"
+    assert not bench.sits_out(), "a fresh process must start"
 
 
 def test_a_worker_in_quarantine_stops_when_told(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "PAUSES_S", (600.0,))
     bench.engine_works = False
     assert not bench.fitness.try_engine((Stage.SYNTHESIZE,))
-    assert not bench.fitness.sit_out((Stage.SYNTHESIZE,), Listing().update, lambda: True)
+    assert not bench.sits_out(told_to_stop=True)
+
+
+@pytest.mark.parametrize("stage", Stage)
+def test_the_engine_of_every_stage_passes(stage: Stage) -> None:
+    check_engine(lambda: "cpu", (stage,))
+
+
+def test_an_engine_that_breaks_is_told_in_a_line_with_its_stage(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*args: Any, **options: Any) -> None:
+        raise ImportError("libwarp.so: cannot open\nshared object file")
+
+    monkeypatch.setattr(generation, "validated_grasps", broken)
+    with pytest.raises(EngineError) as caught:
+        check_engine(lambda: "cpu", (Stage.SYNTHESIZE,))
+    assert str(caught.value) == "synthesize: ImportError: libwarp.so: cannot open shared object file"
+
+
+def test_an_engine_that_gives_nonsense_does_not_pass(monkeypatch: pytest.MonkeyPatch) -> None:
+    plan = generation.validated_grasps
+
+    def nonsense(*args: Any, **options: Any) -> Any:
+        found = plan(*args, **options)
+        found.grasps.grasp.hand_pose[:] = float("nan")
+        return found
+
+    monkeypatch.setattr(generation, "validated_grasps", nonsense)
+    with pytest.raises(EngineError, match="no number"):
+        check_engine(lambda: "cpu", (Stage.SYNTHESIZE,))

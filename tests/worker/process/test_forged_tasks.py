@@ -13,10 +13,8 @@ from rq.serializers import JSONSerializer
 from graspd.service.model.states import Priority, Stage
 from graspd.service.queue.port import EventKind
 from graspd.service.queue.rq_queue import RqQueue
-from graspd.service.settings import Settings
-from graspd.worker.process.main import run_worker
 from graspd.worker.stages import scene
-from tests.fakes import engine_of, fake_synthesize, message_for
+from tests.fakes import fake_synthesize, message_for
 
 
 class Forged:
@@ -41,12 +39,9 @@ class Forged:
     ],
     ids=["kind", "path", "size", "number"],
 )
-def test_it_is_refused_and_the_worker_goes_on(
-    rq_queue: RqQueue, redis_server: str, tmp_path: Path, nonsense: Any
-) -> None:
-    rq_queue.enqueue([Forged(nonsense)], Priority.BULK)  # type: ignore[list-item]
-    settings = Settings(redis_url=redis_server, data_dir=tmp_path, device="cpu")  # type: ignore[arg-type]
-    assert run_worker(settings, start=engine_of({Stage.SCENE: scene.run}), burst=True), "the worker is none the worse"
+def test_it_is_refused_and_the_worker_goes_on(rq_queue: RqQueue, work: Any, tmp_path: Path, nonsense: Any) -> None:
+    rq_queue.enqueue([Forged(nonsense)], Priority.BULK)
+    assert work({Stage.SCENE: scene.run}), "the worker is none the worse"
     assert rq_queue.leases() == [] and sum(rq_queue.depths().values()) == 0
     assert not list(tmp_path.rglob("*.h5")) and not list(tmp_path.rglob("attempts/*"))
 
@@ -75,14 +70,10 @@ FORGERIES: dict[str, Callable[[Any, Path], object]] = {
 
 
 @pytest.mark.parametrize("what", FORGERIES)
-def test_what_is_no_task_is_passed_over(rq_queue: RqQueue, redis_server: str, tmp_path: Path, what: str) -> None:
+def test_what_is_no_task_is_passed_over(rq_queue: RqQueue, work: Any, kinds: Any, tmp_path: Path, what: str) -> None:
     witness = tmp_path / "witness"
     FORGERIES[what](rq_queue.connection, witness)
     rq_queue.enqueue([message_for()], Priority.BULK)
-    settings = Settings(redis_url=redis_server, data_dir=tmp_path, device="cpu")  # type: ignore[arg-type]
-    assert run_worker(settings, start=engine_of({Stage.SYNTHESIZE: fake_synthesize}), burst=True), (
-        "the worker is none the worse"
-    )
-    kinds = [event.kind for _, event in rq_queue.tail("0", limit=10, wait_s=0)]
-    assert kinds[:2] == [EventKind.STARTED, EventKind.FINISHED], "the task behind it is done"
+    assert work({Stage.SYNTHESIZE: fake_synthesize}), "the worker is none the worse"
+    assert kinds()[:2] == [EventKind.STARTED, EventKind.FINISHED], "the task behind it is done"
     assert not witness.exists() and rq_queue.leases() == []

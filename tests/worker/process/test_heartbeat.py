@@ -18,28 +18,15 @@ from tests.waiting import until
 LEASE_S = 2.0
 
 
-def beat_of(state: str = "idle") -> WorkerBeat:
+def beat_of() -> WorkerBeat:
     now = timestamp()
-    return WorkerBeat("w", "h", 1, "cpu", "CPU", tuple(Stage), "0", state, "", now, now)
-
-
-class Engine:
-    """One that can be stopped."""
-
-    is_stopped = False
+    return WorkerBeat("w", "h", 1, "cpu", "CPU", tuple(Stage), "0", "idle", "", now, now)
 
 
 @pytest.fixture
-def engine() -> Engine:
-    return Engine()
-
-
-@pytest.fixture
-def heart(rq_queue: RqQueue, redis_server: str, tmp_path: Path, engine: Engine) -> Iterator[Heartbeat]:
+def heart(rq_queue: RqQueue, redis_server: str, tmp_path: Path) -> Iterator[Heartbeat]:
     """A heart whose first beat was seen."""
-    heart = Heartbeat(
-        redis_server, beat_of(), lease_s=LEASE_S, alive=tmp_path / "alive", is_stopped=lambda: engine.is_stopped
-    )
+    heart = Heartbeat(redis_server, beat_of(), lease_s=LEASE_S, alive=tmp_path / "alive")
     heart.start()
     until(rq_queue.workers, "the first beat")
     yield heart
@@ -59,13 +46,6 @@ def test_a_worker_that_leaves_is_not_lost(heart: Heartbeat, rq_queue: RqQueue) -
     heart.stop()
     assert rq_queue.workers() == []
     assert [event.kind for _, event in rq_queue.tail("0", limit=10, wait_s=0)] == [EventKind.LEFT]
-
-
-def test_a_worker_whose_engine_is_stopped_falls_silent(heart: Heartbeat, rq_queue: RqQueue, engine: Engine) -> None:
-    engine.is_stopped = True
-    until(lambda: rq_queue.workers() == [], "its registration ends")
-    engine.is_stopped = False
-    until(rq_queue.workers, "it gives signs of life again")
 
 
 def test_it_goes_on_when_redis_answers_again(heart: Heartbeat, rq_queue: RqQueue) -> None:

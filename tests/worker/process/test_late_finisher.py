@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import threading
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -13,15 +12,14 @@ from graspd.service.model.messages import TaskMessage
 from graspd.service.model.states import Priority, Stage
 from graspd.service.queue.port import EventKind
 from graspd.service.queue.rq_queue import RqQueue
-from graspd.service.settings import Settings
-from graspd.worker.process.main import GraspWorker, run_worker
+from graspd.worker.process.main import GraspWorker
 from graspd.worker.stages.context import TaskContext
-from tests.fakes import engine_of, fake_synthesize, message_for
+from tests.fakes import fake_synthesize, message_for
 from tests.waiting import until
 
 
 def test_a_task_that_was_taken_away_ends_in_a_line_and_no_traceback(
-    rq_queue: RqQueue, redis_server: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    rq_queue: RqQueue, work: Any, caplog: pytest.LogCaptureFixture
 ) -> None:
     def slow(message: TaskMessage, context: TaskContext) -> Any:
         (lease,) = rq_queue.leases()
@@ -29,21 +27,19 @@ def test_a_task_that_was_taken_away_ends_in_a_line_and_no_traceback(
         return fake_synthesize(message, TaskContext(context.store))
 
     rq_queue.enqueue([message_for()], Priority.BULK)
-    settings = Settings(redis_url=redis_server, data_dir=tmp_path, device="cpu")  # type: ignore[arg-type]
     with caplog.at_level(logging.INFO):
-        assert run_worker(settings, start=engine_of({Stage.SYNTHESIZE: slow}), burst=True)
+        assert work({Stage.SYNTHESIZE: slow})
     assert [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING] == []
     assert [record for record in caplog.records if "was taken from this worker" in record.getMessage()]
     assert not rq_queue.connection.keys("rq:job:*"), "nothing is left of it"
 
 
 def test_a_worker_that_an_error_broke_off_does_not_say_that_none_waits(
-    rq_queue: RqQueue, redis_server: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    rq_queue: RqQueue, work: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Batch scripts start it again then; where none waits any more, they end."""
-    settings = Settings(redis_url=redis_server, data_dir=tmp_path, device="cpu")  # type: ignore[arg-type]
     table = {Stage.SYNTHESIZE: fake_synthesize}
-    assert run_worker(settings, start=engine_of(table), burst=True), "none waits"
+    assert work(table), "none waits"
 
     def broken(*_: object) -> None:
         raise AttributeError("of another version")
@@ -51,13 +47,13 @@ def test_a_worker_that_an_error_broke_off_does_not_say_that_none_waits(
     rq_queue.enqueue([message_for()], Priority.BULK)
     with monkeypatch.context() as patch:
         patch.setattr(GraspWorker, "prepare_execution", broken)
-        assert not run_worker(settings, start=engine_of(table), burst=True)
+        assert not work(table)
     rq_queue.connection.flushdb()
     rq_queue.enqueue([message_for()], Priority.BULK)
-    assert run_worker(settings, start=engine_of(table), max_tasks=1), "as many as were wanted"
+    assert work(table, burst=False, max_tasks=1), "as many as were wanted"
 
 
-def test_the_end_of_a_task_waits_until_redis_takes_writes(rq_queue: RqQueue, redis_server: str, tmp_path: Path) -> None:
+def test_the_end_of_a_task_waits_until_redis_takes_writes(rq_queue: RqQueue, work: Any, kinds: Any) -> None:
     """Redis refuses writes here for want of replicas, as it does on a full disk."""
 
     def refuse(replicas: int) -> None:
@@ -70,11 +66,9 @@ def test_the_end_of_a_task_waits_until_redis_takes_writes(rq_queue: RqQueue, red
         return fake_synthesize(message, context)
 
     rq_queue.enqueue([message_for()], Priority.BULK)
-    settings = Settings(redis_url=redis_server, data_dir=tmp_path, device="cpu")  # type: ignore[arg-type]
     try:
-        assert run_worker(settings, start=engine_of({Stage.SYNTHESIZE: stage}), burst=True)
+        assert work({Stage.SYNTHESIZE: stage})
     finally:
         refuse(0)
     assert rq_queue.leases() == [] and not rq_queue.connection.keys("rq:job:*")
-    kinds = [event.kind for _, event in rq_queue.tail("0", limit=10, wait_s=0)]
-    assert kinds[:2] == [EventKind.STARTED, EventKind.FINISHED]
+    assert kinds()[:2] == [EventKind.STARTED, EventKind.FINISHED]

@@ -66,12 +66,10 @@ def test_colours_labels_depth_and_normals_come_back_exactly(views, tmp_path) -> 
         np.testing.assert_array_equal(pixels(tmp_path / f"rgb_{view:04}.png"), views["image/rgb"][view])
         labels = pixels(tmp_path / f"semantic_segmentation_{view:04}.png")
         np.testing.assert_array_equal(labels, views["image/segmentation"][view])
-    for view in range(2):
         depth = plane(tmp_path / f"distance_to_image_plane_{view:04}.exr", "Z")
         np.testing.assert_array_equal(depth, views["image/depth"][view])
-        np.testing.assert_array_equal(
-            plane(tmp_path / f"distance_to_camera_{view:04}.exr", "Z"), views["image/distance"][view]
-        )
+        distance = plane(tmp_path / f"distance_to_camera_{view:04}.exr", "Z")
+        np.testing.assert_array_equal(distance, views["image/distance"][view])
         for k, axis in enumerate("XYZ"):
             half = plane(tmp_path / f"normals_{view:04}.exr", axis)
             assert half.dtype == np.float16
@@ -91,7 +89,7 @@ def test_png_depth_is_right_to_half_a_step(views, tmp_path) -> None:
     assert not list(tmp_path.glob("distance*.exr"))
 
 
-def test_sidecar_tells_the_camera_and_what_is_not_seen_is_null(views, tmp_path):
+def test_sidecar_tells_the_camera_and_a_second_export_is_refused(views, tmp_path):
     export_images(views, tmp_path)
     left, right = (json.loads((tmp_path / f"view_{view:04}.json").read_text()) for view in range(2))
     assert (left["eye"], right["eye"], right["scene"], left["width"], left["height"]) == ("left", "right", 1, W, H)
@@ -102,29 +100,22 @@ def test_sidecar_tells_the_camera_and_what_is_not_seen_is_null(views, tmp_path):
     assert right["bounding_box_2d_tight"] is None and right["occlusion_ratio"] is None
     labels = json.loads((tmp_path / "labels.json").read_text())
     assert [labels[k]["class"] for k in "0123"] == ["background", "table", "mug", "block"]
-
-
-def test_a_second_export_does_not_mix_with_the_first(views, tmp_path):
-    export_images(views, tmp_path)
     with pytest.raises(InputError, match="exported views already"):
         export_images(views, tmp_path)
 
 
-#: What a view promises of its depth [m]: tests/worker/rendering/test_views.py.
-DEPTH_M = 1e-4
+DEPTH_M = 1e-4  # what a view promises of its depth [m]: tests/worker/rendering/test_views.py
 
 
 def test_points_of_a_rendered_object_lie_on_its_mesh(tmp_path: Path) -> None:
     mesh = trimesh.creation.capsule(height=0.05, radius=0.03, count=[24, 24])
-    views = render(
-        object_from_mesh(mesh, "box"), box_scenes.POSES, views=2, stereo=False, width=96, height=72, seed=1, samples=2
-    )
+    options = {"views": 2, "stereo": False, "width": 96, "height": 72, "seed": 1, "samples": 2}
+    views = render(object_from_mesh(mesh, "box"), box_scenes.POSES, **options)
     folder = box_scenes.write(tmp_path / "set")
     said = {"hand": "claw", "object": "box", "batch": 0, "shard_id": "c" * 32, "base_shard": "b" * 32}
     (folder / "views.h5").write_bytes(write_shard("views", views, said))
     pictures = Pictures(open_shards(folder))
-    fused = pictures.clouds(300, fuse=True, frame="object")
-    for sample in [*pictures.clouds(300, frame="object"), *fused]:
+    for sample in (*pictures.clouds(300, frame="object"), *pictures.clouds(300, fuse=True, frame="object")):
         _, distance, face = trimesh.proximity.closest_point(mesh, sample["cloud/points"].astype(float))
         assert distance.max() < DEPTH_M
         cosine = np.einsum("pc,pc->p", mesh.face_normals[face], sample["cloud/normals"])
@@ -149,7 +140,6 @@ def test_surface_of_the_hand_of_a_shard_follows_its_kinematics() -> None:
     palm = points.body == 0
     for row in range(2):
         np.testing.assert_allclose(found[row, palm], apply(pose[row], points.position[palm]), atol=1e-12)
-    at_rest = hand_surface(
-        Shard("base", said, {**shard.arrays, "grasp/joint_positions": joints[[0, 0]]}), np.array([1])
-    )
+    still = Shard("base", said, {**shard.arrays, "grasp/joint_positions": joints[[0, 0]]})
+    at_rest = hand_surface(still, np.array([1]))
     assert np.abs(at_rest[0, ~palm] - found[1, ~palm]).max() > 0.01

@@ -18,8 +18,10 @@ from graspd.service.model.transforms import apply, compose, invert, quat_rotate
 from graspd.service.readers.trajectories import Waypoint
 from graspd.worker.grasps import Posture
 from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.load import load_hand
+from graspd.worker.hands.model import HandModel
 from graspd.worker.rendering import Extras, render, sheets
-from graspd.worker.rendering.hands import DrawnHand, drawn_bodies
+from graspd.worker.rendering.hands import DrawnHand, drawn_bodies, hand_parts, without_visuals
 from graspd.worker.rendering.pictures import THREE_SIDES, grasp_pictures
 from graspd.worker.rendering.scenery import TABLE, TABLE_SIZE, seen_share, slab_poses, slabs
 from graspd.worker.rendering.sheets import (
@@ -34,11 +36,16 @@ from graspd.worker.rendering.sheets import (
     views_page,
 )
 from graspd.worker.rendering.trajectory_pictures import KINDS, PictureScenes, animation, way_pictures
+from graspd.worker.stages.models import hand_glb
+from tests.worker.commands_run import refused
+from tests.worker.hands.urdfs import joint, link, robot
 from tests.worker.models import object_from_mesh, two_finger_hand
 
 HAND = two_finger_hand()
 POSES = np.array([[0, 0, -0.06, 1.0, 0, 0, 0], [0, 0, 0.06, 0, 1.0, 0, 0]])
 JOINTS = np.array([[0.1, 0.1], [0.3, 0.3]])
+REST = np.array([[0, 0, 0.03, 1.0, 0, 0, 0]])
+TABLE_SCENE = PictureScenes((HalfSpace(),), REST)
 
 
 @pytest.fixture(scope="module")
@@ -102,27 +109,19 @@ def test_a_contact_sheet_holds_every_picture_unchanged(pictures):
         windows = np.lib.stride_tricks.sliding_window_view(sheet[..., 0], (4, 80))
         assert (windows == picture[30:34, :, 0]).all(axis=(2, 3)).any()
     assert tuple(sheet[0, 0]) == PAPER
-    assert opened(three_sides_sheet(pictures, title="block", columns=1)).shape[1] >= 3 * 80
+    assert opened(three_sides_sheet(pictures, title="block")).shape[1] >= 3 * 80
 
 
 @pytest.mark.parametrize(("stereo", "cells"), [(True, 5), (False, 4)])
-def test_a_views_page_has_a_row_per_placement(block, stereo, cells):
-    pose = np.array([[0, 0, 0.03, 1.0, 0, 0, 0]])
-    views = render(block, pose, views=2, stereo=stereo, width=64, height=48, seed=0, samples=2)
-    page = opened(views_page(views, title="block"))
-    assert page.shape[1] > cells * 64
-    assert page.shape[0] > 2 * 48
-
-
-def test_views_page_shows_pictures_with_hand_where_there_are_any(block):
-    pose = np.array([[0, 0, 0.03, 1.0, 0, 0, 0]])
-    views = render(block, pose, views=1, stereo=False, width=64, height=48, seed=0, samples=2)
+def test_a_views_page_has_a_row_per_placement_and_a_column_for_a_hand(block, stereo, cells):
+    views = render(block, REST, views=2, stereo=stereo, width=64, height=48, seed=0, samples=2)
     without = opened(views_page(views, title="block"))
-    views["image/rgb_hand"] = np.full((1, 48, 64, 3), [255, 0, 255], np.uint8)
+    assert without.shape[1] > cells * 64 and without.shape[0] > 2 * 48
+    views["image/rgb_hand"] = np.full((len(views["image/rgb"]), 48, 64, 3), [255, 0, 255], np.uint8)
     page = opened(views_page(views, title="block"))
     assert page.shape[1] == without.shape[1] + 64 + GAP
     shown = (page == [255, 0, 255]).all(axis=-1)
-    assert shown.sum() == 48 * 64 and not shown[:, : without.shape[1] - MARGIN].any()
+    assert shown.sum() == 2 * 48 * 64 and not shown[:, : without.shape[1] - MARGIN].any()
 
 
 def test_boxes_are_drawn_the_loose_ones_with_the_wider_line() -> None:
@@ -145,7 +144,6 @@ def test_depth_colours_darken_with_distance_and_grey_is_nothing():
     assert colours[4].tolist() == [214, 214, 214]
 
 
-REST = np.array([[0, 0, 0.03, 1.0, 0, 0, 0]])
 DOWN = np.array([0, 0, 0.06, 0, 1.0, 0, 0])
 
 
@@ -163,14 +161,14 @@ def orange(picture: np.ndarray) -> np.ndarray:
 
 def test_every_posture_of_every_grasp_is_drawn_from_every_side(block):
     frames = [[at("grasp"), at("lift", 0.1)]] * 2
-    drawn = way_pictures(HAND, block, frames, PictureScenes((HalfSpace(),), REST), (48, 36), sides=3, samples=2)
+    drawn = way_pictures(HAND, block, frames, TABLE_SCENE, (48, 36), sides=3, samples=2)
     assert drawn.shape == (2, 3, 2, 36, 48, 3)
     assert all(orange(picture).sum() > 10 for picture in drawn.reshape(-1, 36, 48, 3))
 
 
 def test_the_lifted_object_is_higher_in_the_picture(block):
     frames = [[at("grasp"), at("lift", 0.1)]]
-    (low, high) = way_pictures(HAND, block, frames, PictureScenes((HalfSpace(),), REST), (64, 64), samples=2)[0, 0]
+    (low, high) = way_pictures(HAND, block, frames, TABLE_SCENE, (64, 64), samples=2)[0, 0]
     assert np.argwhere(orange(high))[:, 0].mean() < np.argwhere(orange(low))[:, 0].mean() - 10
     (floating,) = way_pictures(HAND, block, [[at("grasp")]], PictureScenes(), (48, 48), samples=2)[0, 0]
     assert orange(floating).sum() > 20, "a free grasp floats over a floor"
@@ -178,11 +176,12 @@ def test_the_lifted_object_is_higher_in_the_picture(block):
 
 def test_whole_hand_is_in_the_picture_where_that_is_asked_for(block):
     frames = [[replace(at("", 0.5), carried=np.zeros(3)), at("grasp")]]
-    around = PictureScenes((HalfSpace(),), REST)
-    near, whole = (way_pictures(HAND, block, frames, around, (48, 48), whole=w, samples=2)[0, 0] for w in (False, True))
+    near, whole = (
+        way_pictures(HAND, block, frames, TABLE_SCENE, (48, 48), whole=w, samples=2)[0, 0] for w in (False, True)
+    )
     # The camera steps back for the hand that is far above: the block is smaller, and what is drawn ends above the rim.
     assert 0 < orange(whole[1]).sum() < 0.5 * orange(near[1]).sum()
-    empty = way_pictures(HAND, block, [frames[0][1:]], around, (48, 48), samples=2)[0, 0, 0]
+    empty = way_pictures(HAND, block, [frames[0][1:]], TABLE_SCENE, (48, 48), samples=2)[0, 0, 0]
     assert np.abs(whole[0][:2].astype(int) - empty[0, 0]).max() < 40
 
 
@@ -192,8 +191,10 @@ def test_no_wall_stands_between_the_object_and_the_camera(block, side):
     size = (0.02, 0.5, 0.5) if x else (0.5, 0.02, 0.5)
     wall = Box(size=size, pose=(x, y, 0.25, 1, 0, 0, 0))
     around = PictureScenes((HalfSpace(), wall), REST)
-    free = way_pictures(HAND, block, [[at("grasp")]], PictureScenes((HalfSpace(),), REST), (48, 48), samples=2)[0, 0, 0]
-    walled = way_pictures(HAND, block, [[at("grasp")]], around, (48, 48), samples=2)[0, 0, 0]
+    free, walled = (
+        way_pictures(HAND, block, [[at("grasp")]], scenes, (48, 48), samples=2)[0, 0, 0]
+        for scenes in (TABLE_SCENE, around)
+    )
     assert orange(walled).sum() > 0.5 * orange(free).sum()
 
 
@@ -201,9 +202,8 @@ def test_each_grasp_stands_in_its_own_scene(block):
     turned = np.array([[0, 0, 0.02, np.sqrt(0.5), np.sqrt(0.5), 0, 0]])
     around = PictureScenes((HalfSpace(),), np.concatenate([REST, turned]), np.array([0, 1]))
     first, second = way_pictures(HAND, block, [[at("grasp")]] * 2, around, (48, 48), samples=2)[:, 0, 0]
-    alone = way_pictures(HAND, block, [[at("grasp")]], PictureScenes((HalfSpace(),), turned), (48, 48), samples=2)[
-        0, 0, 0
-    ]
+    around = PictureScenes((HalfSpace(),), turned)
+    alone = way_pictures(HAND, block, [[at("grasp")]], around, (48, 48), samples=2)[0, 0, 0]
     np.testing.assert_array_equal(second, alone)
     assert (first != second).any()
 
@@ -212,10 +212,10 @@ def test_links_above_root_are_drawn_at_the_angles_of_the_wrist(block):
     # A copy of the hand behind its root serves as a forearm with two wrist joints.
     back = np.array([0, 0, -0.12])
     forearm = replace(HAND, pieces=tuple(replace(p, vertices=p.vertices + back) for p in HAND.pieces))
-    mounted, around = replace(HAND, mounting=forearm), PictureScenes((HalfSpace(),), REST)
+    mounted = replace(HAND, mounting=forearm)
 
     def picture(hand, wrist) -> np.ndarray:
-        where = replace(around, wrist=wrist if wrist is None else np.array([wrist]))
+        where = replace(TABLE_SCENE, wrist=wrist if wrist is None else np.array([wrist]))
         return way_pictures(hand, block, [[at("grasp")]], where, (48, 48), whole=True, samples=2)[0, 0, 0].astype(int)
 
     bare, straight, bent = picture(mounted, None), picture(mounted, [0.0, 0.0]), picture(mounted, [0.9, 0.9])
@@ -244,15 +244,10 @@ def test_every_picture_is_shown_for_its_time_and_again(suffix):
     with Image.open(io.BytesIO(animation(colours(), SECONDS, suffix))) as film:
         assert film.n_frames == 3
         assert film.info.get("loop") == 0
-        shown = []
-        for frame, wanted in zip(ImageSequence.Iterator(film), colours(), strict=True):
+        for frame, wanted, shown in zip(ImageSequence.Iterator(film), colours(), [500, 50, 1200], strict=True):
             # WebP is lossy: a plain colour comes back within a few of 256 steps.
             assert np.abs(np.asarray(frame.convert("RGB")).astype(int) - wanted).max() <= 6
-            shown.append(frame.info["duration"])
-    assert shown == [500, 50, 1200]
-
-
-def test_a_file_that_holds_no_animation_is_refused():
+            assert frame.info["duration"] == shown
     with pytest.raises(InputError, match="not as a file without suffix"):
         animation(colours(), SECONDS, "")
 
@@ -262,17 +257,9 @@ def test_the_object_is_carried_with_the_hand_from_where_it_rests():
     heights = dict(zip(POSTURES, (0.2, 0.1, 0.1, 0.1, 0.1, 0.35), strict=True))
     poses = {name: rest + np.array([0, 0, height, 0, 0, 0, 0]) for name, height in heights.items()}
     closing = dict(zip(POSTURES, (0.0, 0.0, 0.5, 1.0, 1.2, 1.2), strict=True))
-    found = Executions(
-        None,
-        None,
-        ToolFrame("palm", rest[0]),
-        "scene",
-        np.zeros(1, np.intp),
-        rest,
-        {name: Posture(poses[name], np.full((1, 1), closing[name])) for name in POSTURES},
-        None,
-        {},
-    )
+    postures = {name: Posture(poses[name], np.full((1, 1), closing[name])) for name in POSTURES}
+    tool, rows = ToolFrame("palm", rest[0]), np.zeros(1, np.intp)
+    found = Executions(None, None, tool, "scene", rows, rest, postures, None, {})
     way = timed(straight_paths(found, 0), ["joint"], np.ones(1), speed=1.0)
     points = waypoints(found, way)
     assert len(points) == len(way.time)
@@ -290,7 +277,6 @@ def test_the_object_is_carried_with_the_hand_from_where_it_rests():
 
 
 SPECS = {kind: supports_in(SceneSpec(kind=kind)) for kind in ("table", "bin", "shelf")}
-POSE = np.array([[0, 0, 0.03, 1.0, 0, 0, 0]])
 
 
 @pytest.mark.parametrize("normal", [(0, 0, 1), (1, 0, 0), (0, -2, 0), (1, 2, 3), (0, 0, -1)])
@@ -305,10 +291,9 @@ def test_the_top_of_a_half_spaces_slab_is_its_plane(normal):
 
 
 def test_a_box_keeps_its_size_and_hides_what_is_behind_it() -> None:
-    box = Box(size=(0.02, 0.4, 0.2), pose=(0.12, 0, 0.1, 1, 0, 0, 0))
-    assert slabs([box])[0].size == (0.02, 0.4, 0.2)
-    np.testing.assert_array_equal(slab_poses([box], np.zeros(3), 0.7)[0], box.pose)
     wall = [Box(size=(0.02, 0.4, 0.2), pose=(0.12, 0, 0.1, 1, 0, 0, 0))]
+    assert slabs(wall)[0].size == (0.02, 0.4, 0.2)
+    np.testing.assert_array_equal(slab_poses(wall, np.zeros(3), 0.7)[0], wall[0].pose)
     points = np.array([[0, 0, 0.05], [0, 0, 0.5]])
     assert seen_share(wall, np.array([0.5, 0, 0.1]), points) == 0.5
     assert seen_share(wall, np.array([-0.5, 0, 0.1]), points) == 1.0
@@ -320,7 +305,7 @@ def test_a_box_keeps_its_size_and_hides_what_is_behind_it() -> None:
 @pytest.mark.parametrize("kind", ["bin", "shelf"])
 def test_every_camera_sees_the_object_past_walls_and_boards(block, kind):
     extras = Extras(supports=SPECS[kind], channels=("occlusion",))
-    views = render(block, POSE, views=4, stereo=False, width=48, height=36, seed=3, samples=2, extras=extras)
+    views = render(block, REST, views=4, stereo=False, width=48, height=36, seed=3, samples=2, extras=extras)
     labels = np.asarray(views["image/segmentation"])
     assert ((labels == 2).sum(axis=(1, 2)) > 20).all()
     assert set(np.unique(labels)) <= {0, 1, 2}, "all supports are labelled as the table"
@@ -329,5 +314,54 @@ def test_every_camera_sees_the_object_past_walls_and_boards(block, kind):
 
 def test_a_table_looks_the_same_named_or_not(block):
     options = {"views": 1, "stereo": False, "width": 48, "height": 36, "seed": 3, "samples": 2}
-    named = render(block, POSE, **options, extras=Extras(supports=SPECS["table"]))
-    np.testing.assert_array_equal(named["image/rgb"], render(block, POSE, **options)["image/rgb"])
+    named = render(block, REST, **options, extras=Extras(supports=SPECS["table"]))
+    np.testing.assert_array_equal(named["image/rgb"], render(block, REST, **options)["image/rgb"])
+
+
+SHAPE = '<collision><geometry><box size="0.02 0.02 0.04"/></geometry></collision>'
+RED = '<material name="red"><color rgba="1 0 0 1"/></material>'
+SEEN = (
+    f'<visual><geometry><box size="0.06 0.06 0.01"/></geometry>{RED}</visual>'
+    '<visual><geometry><mesh filename="part.stl"/></geometry><material name="blue"/></visual>'
+    '<visual><geometry><mesh filename="missing.stl"/></geometry></visual>'
+)
+
+
+@pytest.fixture(scope="module")
+def coloured() -> HandModel:
+    blue = '<material name="blue"><color rgba="0 0 1 1"/></material>'
+    urdf = robot(blue, link("palm", SHAPE + SEEN), link("a", SHAPE), joint("j", "palm", "a"))
+    part = bytes(trimesh.creation.icosphere(1, 0.01).export(file_type="stl"))
+    return load_hand({"h.urdf": urdf, "part.stl": part}, name="h", digest="0" * 32)
+
+
+def test_what_is_seen_has_its_colours_else_collision_shapes(coloured: HandModel) -> None:
+    palm = [part for part in hand_parts(coloured) if part.body == 0]
+    assert sorted((part.look.base, len(part.solid.faces)) for part in palm) == [((0, 0, 1), 80), ((1, 0, 0), 12)]
+    (finger,) = [part for part in hand_parts(coloured) if part.body == 1]
+    assert np.ptp(finger.solid.vertices, axis=0) == pytest.approx([0.02, 0.02, 0.04])
+
+
+def test_collision_shapes_are_drawn_on_a_toggle(coloured: HandModel) -> None:
+    bare = without_visuals(coloured)
+    assert bare.pieces is coloured.pieces and bare.content != coloured.content
+    assert drawn_bodies(bare) == [0, 1] and drawn_bodies(coloured) == [0, 0, 1]
+    assert np.ptp(hand_parts(bare)[0].solid.vertices, axis=0) == pytest.approx([0.02, 0.02, 0.04])
+    above = without_visuals(replace(coloured, mounting=coloured)).mounting
+    assert above is not None and drawn_bodies(above) == [0, 1]
+
+
+def test_a_model_for_viewers_has_the_colours(coloured: HandModel) -> None:
+    scene = trimesh.load(trimesh.util.wrap_as_stream(hand_glb(coloured)), file_type="glb")
+    colours = {
+        tuple(colour)
+        for mesh in scene.geometry.values()
+        if len(getattr(mesh, "faces", ()))
+        for colour in np.unique(mesh.visual.vertex_colors[:, :3], axis=0).tolist()
+    }
+    assert {(255, 0, 0), (0, 0, 255)} <= colours
+
+
+@pytest.mark.parametrize("said", ["--closing ja=2", "--closing ja", "--xacro x"])
+def test_an_option_that_cannot_be_read_is_the_callers_mistake(said: str) -> None:
+    assert said.split()[0] in refused(f"hands check allegro --no-self-test {said}")

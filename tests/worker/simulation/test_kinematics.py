@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import mujoco
@@ -19,10 +20,8 @@ from graspd.worker.simulation.kernels import kinematics, wrenches
 from graspd.worker.simulation.record import record_placement
 from tests.worker.simulation.rigs import ball, rig
 
-#: float32 positions of a hand 0.2 m large through at most 8 joints.
-FK_TOLERANCE = 3e-7
-#: URDF origins given to 6 digits, read by two parsers in float64.
-PARSER_TOLERANCE = 1e-9
+FK_TOLERANCE = 3e-7  # float32 positions of a hand 0.2 m large through at most 8 joints
+PARSER_TOLERANCE = 1e-9  # URDF origins given to 6 digits, read by two parsers in float64
 
 REAL_HANDS = {
     "allegro": "allegro/allegro_hand_right.urdf",
@@ -41,6 +40,23 @@ def random_state(hand: HandModel, count: int, seed: int = 0) -> HandState:
 
 def root_poses(hand: HandModel, state: HandState) -> np.ndarray:
     return np.concatenate([state.pivot - quat_rotate(state.rotation, hand.palm.centre), state.rotation], axis=1)
+
+
+def moved(state: HandState, column: int, step: float) -> HandState:
+    pivot, rotation, q = state.pivot.copy(), state.rotation.copy(), state.q.copy()
+    if column < 3:
+        pivot[0, column] += step
+    elif column < 6:
+        rotation[0] = quat_multiply(quat_from_axis_angle(np.eye(3)[column - 3], np.array(step)), rotation[0])
+    else:
+        q[0, column - 6] += step
+    return HandState(pivot, rotation, q)
+
+
+def differences(energy: Callable[[HandState], float], state: HandState, columns: int, step: float) -> np.ndarray:
+    """Central differences by the columns of a gradient: root translation, root rotation, dofs."""
+    ends = [[energy(moved(state, c, s)) for s in (step, -step)] for c in range(columns)]
+    return np.array([(high - low) / (2 * step) for high, low in ends])
 
 
 @pytest.mark.parametrize("name", ["allegro", "barrett", "shadow"])
@@ -105,28 +121,11 @@ def test_transpose_is_the_derivative_of_the_map_it_belongs_to(name: str) -> None
     force = rng.normal(size=(hand.bodies, 3))
     joints = hand.expand(state.q)
 
-    def work(pivot: np.ndarray, rotation: np.ndarray, q: np.ndarray) -> float:
-        root = np.concatenate([pivot - quat_rotate(rotation, hand.palm.centre), rotation], axis=-1)
-        poses = body_poses(hand, root, hand.expand(q))[0]
+    def work(at: HandState) -> float:
+        poses = body_poses(hand, root_poses(hand, at), hand.expand(at.q))[0]
         return float((apply(poses, local) * force).sum())
 
-    step, expected = 1e-6, []
-    for k in range(3):
-        d = step * np.eye(3)[k]
-        args = (state.rotation, state.q)
-        expected.append((work(state.pivot + d, *args) - work(state.pivot - d, *args)) / (2 * step))
-    for k in range(3):
-        turned = [
-            quat_multiply(quat_from_axis_angle(np.eye(3)[k], np.array(s * step)), state.rotation[0])[None]
-            for s in (1, -1)
-        ]
-        expected.append((work(state.pivot, turned[0], state.q) - work(state.pivot, turned[1], state.q)) / (2 * step))
-    for k in range(hand.dofs):
-        d = step * np.eye(hand.dofs)[k]
-        expected.append(
-            (work(state.pivot, state.rotation, state.q + d) - work(state.pivot, state.rotation, state.q - d))
-            / (2 * step)
-        )
+    expected = differences(work, state, 6 + hand.dofs, step=1e-6)
     model, data = rig(hand, ball(), capacity=1)
     data.set_state(state)
     record_placement(model, data).run()
@@ -134,12 +133,7 @@ def test_transpose_is_the_derivative_of_the_map_it_belongs_to(name: str) -> None
     points = apply(poses, local)
     wrench = np.concatenate([force, np.cross(points, force)], axis=1)
     data.wrench.assign(np.round(wrench[None] / wrenches.UNIT).astype(np.int64))
-    wp.launch(
-        kinematics.backward,
-        1,
-        inputs=[model.hand.tree, data.active, data.pivot, data.body_p, data.axis],
-        outputs=[data.wrench, data.gradient],
-        device="cpu",
-    )
+    inputs = [model.hand.tree, data.active, data.pivot, data.body_p, data.axis]
+    wp.launch(kinematics.backward, 1, inputs=inputs, outputs=[data.wrench, data.gradient], device="cpu")
     # Sums of up to 23 float32 products of size 1.
     np.testing.assert_allclose(data.gradient.numpy()[0], expected, atol=2e-5)

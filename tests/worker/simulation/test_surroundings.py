@@ -20,7 +20,7 @@ from graspd.worker.simulation.environment import CLEAR_M, Environment, Obstacle,
 from graspd.worker.simulation.obstacles import FAR_M, PosedFeatures, body_room, obstacle_room
 from tests.worker.models import piece, two_finger_hand
 
-TILTED = np.array([0.1, -0.2, 0.3, 0.8, 0.2, -0.4, 0.4]) / [1, 1, 1, 1, 1, 1, 1]
+TILTED = np.array([0.1, -0.2, 0.3, 0.8, 0.2, -0.4, 0.4])
 TILTED[3:] /= np.linalg.norm(TILTED[3:])
 
 
@@ -40,9 +40,8 @@ def test_distances_are_closed_forms_and_a_bound_beyond_edges() -> None:
 def test_frames_keep_distances_and_up_is_against_gravity() -> None:
     points = np.random.default_rng(1).normal(size=(50, 3))
     for obstacle in (Obstacle.half_space([1, 2, 3], 0.4), Obstacle.box(TILTED, [0.3, 0.5, 0.7])):
-        np.testing.assert_allclose(
-            obstacle.seen_from(TILTED).distance(points), obstacle.distance(apply(TILTED, points)), atol=1e-12
-        )
+        found = obstacle.seen_from(TILTED).distance(points)
+        np.testing.assert_allclose(found, obstacle.distance(apply(TILTED, points)), atol=1e-12)
     placed = PlacedGrasps((Obstacle.half_space([0, 0, 1], 0),), TILTED[None], np.zeros(1, int))
     np.testing.assert_allclose(quat_rotate(TILTED[3:], placed.scenes[0].up), [0, 0, 1], atol=1e-12)
 
@@ -68,10 +67,8 @@ def test_the_distance_of_a_hand_from_a_plane_is_mujocos(name: str) -> None:
     hand, rng = hand_from_path(name), np.random.default_rng(3)
     q = hand.lower + rng.random((8, hand.dofs)) * (hand.upper - hand.lower)
     rotation = rng.normal(size=(8, 4))
-    pose = np.concatenate(
-        [rng.normal(size=(8, 3)) * 0.1, rotation / np.linalg.norm(rotation, axis=1, keepdims=True)], 1
-    )
-    postures = Posture(pose, hand.expand(q))
+    rotation /= np.linalg.norm(rotation, axis=1, keepdims=True)
+    postures = Posture(np.column_stack([rng.normal(size=(8, 3)) * 0.1, rotation]), hand.expand(q))
     plane = Obstacle.half_space([0.3, -0.5, 0.8], -0.2)
     found = obstacle_room(hand, postures, [Environment((plane,), plane.planes[0, :3])])
     np.testing.assert_allclose(found, mujoco_distances(hand, postures, plane), atol=1e-5)
@@ -159,8 +156,7 @@ def mujoco_distances(hand, postures: Posture, obstacle: Obstacle) -> np.ndarray:
 UP = np.array([0.0, 0.0, 1.0])
 BOX = Obstacle.box([0, 0, 0, 1, 0, 0, 0], [0.1, 0.1, 0.1])
 R, L = 0.01, 0.06
-#: float32 coordinates of 0.1 m, and the end of the search along an edge.
-EXACT = 2e-6
+EXACT = 2e-6  # float32 coordinates of 0.1 m, and the end of the search along an edge
 
 
 def link(kind: str) -> HandModel:
@@ -173,10 +169,7 @@ def link(kind: str) -> HandModel:
         "hull": (trimesh.creation.box((L, 2 * R, 2 * R)), ()),
     }
     mesh, size = made[kind]
-    fields = {name: getattr(base, name) for name in base.__dataclass_fields__}
-    return HandModel(
-        **{**fields, "digest": f"{hash(kind) & 0xFFFF:032x}", "pieces": (piece(0, mesh, kind, size, (0, 0, 0)),)}
-    )
+    return replace(base, digest=f"{hash(kind) & 0xFFFF:032x}", pieces=(piece(0, mesh, kind, size, (0, 0, 0)),))
 
 
 def distance(kind: str, at: tuple[float, ...], obstacle: Obstacle, turn: tuple[float, ...] = (1, 0, 0, 0)) -> float:

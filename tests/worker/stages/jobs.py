@@ -44,11 +44,10 @@ def job_of(store: Store, span: int = 1, **request: Any) -> JobRecord:
 
 def end_of(store: Store, job: JobRecord) -> Event:
     """The end of the last of a job's tasks, or of the first one that fails."""
-    runner = Runner(STAGES, worker="w", publish=lambda event: None)  # type: ignore[arg-type]
+    runner = Runner(STAGES, worker="w", publish=lambda event: None)
     for task in plan(job):
         message = message_of(job, task, attempt=1, max_attempt=3).model_dump(mode="json", by_alias=True)
         event = runner.run(message, TaskContext(store, ExecutionContext(threads=2)))
-        assert event is not None
         if event.kind is not EventKind.FINISHED:
             break
     return event

@@ -55,75 +55,59 @@ def run(store: Store, context: TaskContext, files: dict[str, bytes], kind: Asset
 
 def test_objects_are_taken_with_facts_or_refused_with_a_reason(context: TaskContext) -> None:
     found = run(context.store, context, OBJECT, AssetKind.OBJECT)
-    assert found["verdict"] in ("accept", "repair"), found["message"]
-    assert found["facts"]
+    assert found["verdict"] in ("accept", "repair") and found["facts"]
     found = run(context.store, context, OBJECT | {"t.obj": b"not a mesh"}, AssetKind.OBJECT)
-    assert found["verdict"] == "refuse"
-    assert "t.obj" in str(found["message"])
+    assert found["verdict"] == "refuse" and "t.obj" in str(found["message"])
 
 
 def test_a_hand_is_tried_if_its_record_says_so(context: TaskContext, monkeypatch: pytest.MonkeyPatch) -> None:
     """The trial itself is tested beside it: here that it runs on the hand that was checked, and what is kept."""
-    candidates = []
+    files = {"asset.json": b'{"file": "gripper.urdf"}', "gripper.urdf": gripper_urdf()}
 
     def stand_in(hand: HandModel, run: ExecutionContext) -> SelfTest:
-        candidates.append(hand.name)
+        if hand.name == "other":
+            raise InputError("no way in")
         return SelfTest(0.9, 64, 0.04, {"box": 0.9}, 0.8, 16)
 
+    def tried(name: str) -> tuple[str, str]:
+        own = {**files, "note.txt": name.encode()}
+        asset = store_files(context.store, AssetKind.HAND, name, own, said={"self_test": True})
+        record_asset(context.store, asset)
+        ingest.run(IngestMessage(schema_=1, task_id="i", kind=AssetKind.HAND, name=name, digest=asset.digest), context)
+        found = json.loads(context.store.get(names.asset_check(AssetKind.HAND, asset.digest)))
+        return found["verdict"], found["facts"]["self_test"]["says"]
+
     monkeypatch.setattr(hand_self_test, "self_test", stand_in)
-    files = {"asset.json": b'{"file": "gripper.urdf"}', "gripper.urdf": gripper_urdf()}
-    untried = run(context.store, context, files, AssetKind.HAND)
-    assert not candidates and "self_test" not in untried["facts"]  # type: ignore[operator]
-    asset = store_files(context.store, AssetKind.HAND, "mine", {**files, "note.txt": b"x"}, said={"self_test": True})
-    record_asset(context.store, asset)
-    message = IngestMessage(schema_=1, task_id="i", kind=AssetKind.HAND, name="mine", digest=asset.digest)
-    ingest.run(message, context)
-    found = json.loads(context.store.get(names.asset_check(AssetKind.HAND, asset.digest)))
-    assert candidates == ["mine"]
-    assert found["facts"]["self_test"]["says"] == "ready: 90 % hold, 80 % lift off a table"
-
-    def finds_none(hand: HandModel, run: ExecutionContext) -> SelfTest:
-        raise InputError("no way in")
-
-    monkeypatch.setattr(hand_self_test, "self_test", finds_none)
-    other = {**files, "note.txt": b"y"}
-    asset = store_files(context.store, AssetKind.HAND, "other", other, said={"self_test": True})
-    record_asset(context.store, asset)
-    ingest.run(message.model_copy(update={"digest": asset.digest, "name": "other"}), context)
-    found = json.loads(context.store.get(names.asset_check(AssetKind.HAND, asset.digest)))
-    assert (found["verdict"], found["facts"]["self_test"]["says"]) == ("accept", "suspicious: no way in")
+    assert "self_test" not in run(context.store, context, files, AssetKind.HAND)["facts"]
+    assert tried("mine") == ("accept", "ready: 90 % hold, 80 % lift off a table")
+    assert tried("other") == ("accept", "suspicious: no way in")
 
 
 def test_a_check_that_wants_too_much_memory_is_a_refusal(context: TaskContext) -> None:
     found, _ = ingest.check_in_child(AssetKind.OBJECT, "big", OBJECT, context, memory_bytes=64 * 2**20)
-    assert found["verdict"] == "refuse"
-    assert "needs more than 0.0625 GiB of memory" in found["message"]
+    assert found["verdict"] == "refuse" and "needs more than 0.0625 GiB of memory" in found["message"]
+
+
+def start_instead(monkeypatch: pytest.MonkeyPatch, other: Callable[[list[str]], list[str]]) -> None:
+    """The check starts what `other` makes of its command."""
+    start = ingest.subprocess.Popen
+    monkeypatch.setattr(ingest.subprocess, "Popen", lambda command, **options: start(other(command), **options))
 
 
 def test_a_disk_without_room_says_nothing_about_the_file(
     context: TaskContext, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    command = ingest.subprocess.Popen
-    # A link: whatever becomes of the name, the device stays.
+    # A link: whatever becomes of the name, the device stays. The child cannot write what it found.
     (target := tmp_path / "check.json").symlink_to("/dev/full")
-
-    def full(arguments: list[str], **options: object) -> object:
-        # The child cannot write what it found.
-        return command([*arguments[:6], str(target), *arguments[7:]], **options)  # type: ignore[call-overload]
-
-    monkeypatch.setattr(ingest.subprocess, "Popen", full)
+    start_instead(monkeypatch, lambda command: [*command[:6], str(target), *command[7:]])
     with pytest.raises(OSError, match="No space left on device"):
         ingest.check_in_child(AssetKind.OBJECT, "t", OBJECT, context)
 
 
 def child_does(monkeypatch: pytest.MonkeyPatch, code: str) -> None:
     """Children do this instead of a check; `sys.argv[1]` is where they would leave their finding."""
-    command = ingest.subprocess.Popen
-
-    def other(arguments: list[str], **options: object) -> object:
-        return command([sys.executable, "-c", f"import os, signal, sys\n{code}", arguments[6]], **options)  # type: ignore[call-overload]
-
-    monkeypatch.setattr(ingest.subprocess, "Popen", other)
+    program = [sys.executable, "-c", f"import os, signal, sys\n{code}"]
+    start_instead(monkeypatch, lambda command: [*program, command[6]])
 
 
 def test_check_that_machine_killed_says_nothing_about_the_file(
@@ -160,7 +144,7 @@ def test_a_check_that_is_stopped_ends_its_child(
     popen = ingest.subprocess.Popen
 
     def spy(*args: object, **kwargs: object) -> object:
-        child = popen(*args, **kwargs)  # type: ignore[call-overload]
+        child = popen(*args, **kwargs)
         pids.append(child.pid)
         context.stop(reason)
         return child
@@ -197,10 +181,8 @@ def test_finding_that_is_long_and_check_that_complains_are_told(
 
 
 UPLOAD_BYTES = 64 * 2**20
-#: The limit of archives that are refused before any of them is unpacked.
-DOOR_BYTES = 4 * 2**20
-#: What is promised for any upload, as time of computing [s].
-BOUND_S = 30.0
+DOOR_BYTES = 4 * 2**20  # the limit of archives that are refused before any of them is unpacked
+BOUND_S = 30.0  # what is promised for any upload, as time of computing [s]
 #: Children at a time: as many as the smallest machine has cores.
 TOGETHER = 2
 BALL = stl(sphere(segments=24))
@@ -233,7 +215,7 @@ def upload(store: Store, kind: AssetKind, filename: str, data: bytes, options: d
     outcome = Runner({Stage.INGEST: ingest.run}, worker="w", publish=lambda event: None).run(
         message.model_dump(mode="json", by_alias=True), TaskContext(store)
     )
-    assert outcome is not None and outcome.kind is EventKind.FINISHED, outcome
+    assert outcome.kind is EventKind.FINISHED, outcome
     return json.loads(store.get(names.asset_check(kind, asset.digest)))
 
 
@@ -262,34 +244,19 @@ def test_a_bad_file_gets_its_verdict_from_the_checking_child(shared_data: Path, 
     assert len(entries) >= (len(chosen) or 40) and not wrong
 
 
-def big_entity_bomb() -> bytes:
-    """Ten levels of ten: 10^10 characters once expanded."""
-    levels = "".join(f'<!ENTITY e{i} "{f"&e{i - 1};" * 10}">' for i in range(1, 11))
-    return f'<!DOCTYPE robot [<!ENTITY e0 "x">{levels}]><robot name="&e10;"/>'.encode()
-
-
-def external_entity() -> bytes:
-    return b'<!DOCTYPE robot [<!ENTITY x SYSTEM "file:///etc/passwd">]><robot name="h"><link name="&x;"/></robot>'
-
-
-def huge_promise() -> bytes:
-    """4 10^9 faces of 50 bytes: 200 GB."""
-    return b"promise".ljust(80) + struct.pack("<I", 4_000_000_000) + bytes(600)
-
-
-def ply_promise() -> bytes:
-    header = "ply\nformat binary_little_endian 1.0\nelement vertex 4000000000\n"
-    return (header + PLY_POINT + "end_header\n").encode() + bytes(64)
+#: Ten levels of ten: 10^10 characters once expanded.
+LEVELS = "".join(f'<!ENTITY e{i} "{f"&e{i - 1};" * 10}">' for i in range(1, 11))
+ENTITY_BOMB = f'<!DOCTYPE robot [<!ENTITY e0 "x">{LEVELS}]><robot name="&e10;"/>'.encode()
+EXTERNAL = b'<!DOCTYPE robot [<!ENTITY x SYSTEM "file:///etc/passwd">]><robot name="h"><link name="&x;"/></robot>'
+#: 4 10^9 faces of 50 bytes: 200 GB.
+HUGE_STL = b"promise".ljust(80) + struct.pack("<I", 4_000_000_000) + bytes(600)
+PLY_HEADER = f"ply\nformat binary_little_endian 1.0\nelement vertex 4000000000\n{PLY_POINT}end_header\n"
 
 
 @cache
 def zip_bomb() -> bytes:
     """Little that unpacks to more than eight times the limit."""
     return zipped({f"{i}.stl": bytes(DOOR_BYTES) for i in range(9)})
-
-
-def nested_bomb() -> bytes:
-    return zipped({"inner.zip": zipped({"innermost.zip": zip_bomb()})})
 
 
 def symlink() -> bytes:
@@ -318,10 +285,10 @@ def unusual_zip() -> bytes:
 @pytest.mark.parametrize(
     ("filename", "data", "says"),
     [
-        ("bomb.urdf", big_entity_bomb(), "entit"),
-        ("external.urdf", external_entity(), "entit"),
-        ("promise.stl", huge_promise(), "truncated"),
-        ("promise.ply", ply_promise(), ""),
+        ("bomb.urdf", ENTITY_BOMB, "entit"),
+        ("external.urdf", EXTERNAL, "entit"),
+        ("promise.stl", HUGE_STL, "truncated"),
+        ("promise.ply", PLY_HEADER.encode() + bytes(64), ""),
         ("far.obj", b"v 1e300 0 0\nv 0 1e300 0\nv 0 0 1e300\nf 1 2 3\nf 1 3 2\n", "exceeds"),
     ],
     ids=lambda value: value if isinstance(value, str) and "." in value else "",
@@ -340,7 +307,7 @@ def test_an_attack_is_refused_and_the_worker_does_the_next_task(filename: str, d
     [
         (lambda: zipped({"../../../tmp/slip.stl": BALL["m.stl"]}), "leaves its folder"),
         (lambda: zipped({"/tmp/slip.stl": BALL["m.stl"]}), "leaves its folder"),
-        (nested_bomb, "holds no object file"),
+        (lambda: zipped({"inner.zip": zipped({"innermost.zip": zip_bomb()})}), "holds no object file"),
         (zip_bomb, "unpacks to more"),
         (symlink, "symbolic link"),
         (lambda: zipped({f"{i}.obj": b"v" for i in range(3000)}), "3000 files"),
@@ -352,12 +319,8 @@ def test_an_attack_is_refused_and_the_worker_does_the_next_task(filename: str, d
 def test_an_archive_that_attacks_is_refused_at_the_door(archive: Callable[[], bytes], says: str) -> None:
     data, start = archive(), computed()
     with pytest.raises(InputError, match=says):
-        publish_asset(
-            open_store("memory://"),
-            AssetKind.OBJECT,
-            "upload",
-            files_of_upload(AssetKind.OBJECT, "archive.zip", data, limit_bytes=DOOR_BYTES),
-        )
+        files = files_of_upload(AssetKind.OBJECT, "archive.zip", data, limit_bytes=DOOR_BYTES)
+        publish_asset(open_store("memory://"), AssetKind.OBJECT, "upload", files)
     assert computed() - start < BOUND_S
 
 
@@ -376,7 +339,7 @@ def rough(segments: int) -> bytes:
 def test_a_mesh_that_costs_too_much_is_refused_the_next_taken(limits: dict[str, int], says: str) -> None:
     context, start = TaskContext(open_store("memory://")), computed()
     files = {"asset.json": b'{"file": "m.stl"}', "m.stl": rough(512)}
-    found, _ = ingest.check_in_child(AssetKind.OBJECT, "rough", files, context, **limits)  # type: ignore[arg-type]
+    found, _ = ingest.check_in_child(AssetKind.OBJECT, "rough", files, context, **limits)
     assert found["verdict"] == "refuse" and says in found["message"]
     assert computed() - start < BOUND_S
     feasible = {"asset.json": b'{"file": "m.stl"}', **BALL}

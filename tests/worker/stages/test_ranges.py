@@ -23,8 +23,7 @@ from graspd.worker.stages.context import StopReason, TaskContext
 from graspd.worker.stages.ranges import base_rows, batches_of
 from tests.worker.stages.jobs import end_of, job_of
 
-#: Batches as small as they can be, so that several take a few seconds.
-SIZE = 3
+SIZE = 3  # batches as small as they can be, so that several take a few seconds
 
 
 @pytest.fixture(autouse=True)
@@ -54,28 +53,17 @@ def test_a_range_is_its_batches_one_after_the_other(request_of: dict[str, Any]) 
     for stage, whole, manifest in together:
         parts = [shard for of, shard, _ in apart if of is stage]
         of_parts = [one for of, _, one in apart if of is stage]
-        scenes = (
-            np.cumsum([0, *(len(part["scene/object_pose"]) for part in parts)])
-            if "scene/object_pose" in whole.arrays
-            else None
-        )
+        scenes = np.cumsum([0, *(len(part.arrays.get("scene/object_pose", ())) for part in parts)])
         bases = np.cumsum([0, *(len(shard["grasp/hand_pose"]) for of, shard, _ in apart if of is Stage.SYNTHESIZE)])
         assert whole.arrays.keys() == {path for part in parts for path in part.arrays}
         for path, column in whole.arrays.items():
             if path == "quality/thresholds_m":
                 np.testing.assert_array_equal(column, parts[0][path])
                 continue
-            pieces = [
-                # Only some batches are rechecked.
-                part[path] if path in part.arrays else np.full(len(part["grasp/hand_pose"]), -1)
-                for part in parts
-                if path in part.arrays or path == "quality/recheck"
-            ]
-            if path == "grasp/scene_index":
-                assert scenes is not None
-                pieces = [piece + first for piece, first in zip(pieces, scenes, strict=False)]
-            elif path == "grasp/base_index":
-                pieces = [piece + first for piece, first in zip(pieces, bases, strict=False)]
+            # Only some batches are rechecked.
+            pieces = [part.arrays.get(path, np.full(len(part["grasp/hand_pose"]), -1)) for part in parts]
+            if (firsts := {"grasp/scene_index": scenes, "grasp/base_index": bases}.get(path)) is not None:
+                pieces = [piece + first for piece, first in zip(pieces, firsts, strict=False)]
             np.testing.assert_array_equal(column, np.concatenate(pieces), err_msg=path)
         assert manifest.batches == 3
         assert manifest.valid == sum(one.valid for one in of_parts)

@@ -11,8 +11,7 @@ wp.set_module_options({"enable_backward": False})
 class LightPass:
     """One directional light, one ray through every pixel."""
 
-    shift: wp.vec2f
-    """Offset of the ray from the pixel's centre [px]."""
+    shift: wp.vec2f  # offset of the ray from the pixel's centre [px]
     lamp_weight: wp.float32
     sky_weight: wp.float32
 

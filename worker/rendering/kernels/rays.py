@@ -6,8 +6,7 @@ are so few that a ray tests the bounds of each.
 
 import warp as wp
 
-#: Maximum length of rays [m].
-FAR = wp.constant(100.0)
+FAR = wp.constant(100.0)  # maximum length of rays [m]
 #: Offset of shadow rays from their surface, along its normal [m].
 CLEAR = wp.constant(1.0e-4)
 _TINY = wp.constant(1.0e-15)
@@ -17,31 +16,22 @@ _TINY = wp.constant(1.0e-15)
 class PlacedSolid:
     """A solid in a world."""
 
-    lower: wp.vec3f
-    """Bounds along the axes of the world [m]."""
+    lower: wp.vec3f  # bounds along the axes of the world [m]
     upper: wp.vec3f
-    place: wp.vec3f
-    """Origin of the solid [m]."""
-    turn: wp.mat33f
-    """Rotation from the world's axes to the solid's."""
-    mesh: wp.uint64
-    """Id of a `wp.Mesh` in its own frame; 0: a box around its origin."""
-    half: wp.vec3f
-    """Half the extents of the box [m]."""
-    first_corner: wp.int32
-    """First index of the mesh's corner normals."""
+    place: wp.vec3f  # origin of the solid [m]
+    turn: wp.mat33f  # rotation from the world's axes to the solid's
+    mesh: wp.uint64  # id of a `wp.Mesh` in its own frame; 0: a box around its origin
+    half: wp.vec3f  # half the extents of the box [m]
+    first_corner: wp.int32  # first index of the mesh's corner normals
 
 
 @wp.struct
 class RayHit:
     """First hit of a ray."""
 
-    shape: wp.int32
-    """-1: nothing."""
-    distance: wp.float32
-    """In lengths of the ray's direction."""
-    normal: wp.vec3f
-    """Unit normal in the world's frame; on meshes interpolated between corner normals."""
+    shape: wp.int32  # -1: nothing
+    distance: wp.float32  # in lengths of the ray's direction
+    normal: wp.vec3f  # unit normal in the world's frame; on meshes interpolated between corner normals
 
 
 @wp.func

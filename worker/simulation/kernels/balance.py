@@ -90,12 +90,10 @@ def objective(
 
 @wp.kernel
 def nonnegative(
-    # In:
     matrix_in: wp.array3d(dtype=wp.float64),
     target_in: wp.array(dtype=wp.float64),
     ridge_in: wp.float64,
     count_in: wp.array(dtype=wp.int32),
-    # Out:
     work_inout: Workspace,
     x_out: wp.array2d(dtype=wp.float64),
     sound_out: wp.array(dtype=wp.int32),

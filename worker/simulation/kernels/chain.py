@@ -49,7 +49,6 @@ def place_body(chain: Chain, bodies: Bodies, p: wp.int32, body: wp.int32, value:
 
 @wp.func
 def joint_value(chain: Chain, body: wp.int32, q: wp.float64):
-    """Return the value of a body's joint at a value of its dof."""
     return chain.multiplier[body] * q + chain.offset[body]
 
 
@@ -61,13 +60,7 @@ def joint_axis(chain: Chain, bodies: Bodies, p: wp.int32, body: wp.int32):
 
 @wp.kernel
 def pose(
-    # Model:
-    chain_in: Chain,
-    # Inputs:
-    root_in: wp.array2d(dtype=wp.float64),
-    joints_in: wp.array2d(dtype=wp.float64),
-    # Outputs:
-    bodies_out: Bodies,
+    chain_in: Chain, root_in: wp.array2d(dtype=wp.float64), joints_in: wp.array2d(dtype=wp.float64), bodies_out: Bodies
 ):
     """Compute poses (P, L) of bodies from roots (P, 7), w x y z, and joints (P, J). Launch over P."""
     p = wp.tid()
@@ -88,20 +81,15 @@ class HalfSpaces:
 
 @wp.kernel
 def rooms(
-    # Model:
     chain_in: Chain,
     spaces_in: HalfSpaces,
-    # Inputs:
     scene_in: wp.array(dtype=wp.int32),
     body_p_in: wp.array2d(dtype=wp.vec3d),
     body_q_in: wp.array2d(dtype=wp.quatd),
-    # Outputs:
     room_inout: wp.array2d(dtype=wp.float64),
 ):
     """Lower `room_inout` (P, L) to the signed distance of bodies from the half-spaces of their scene (P,).
-
-    Launch over (P, L).
-    """
+    Launch over (P, L)."""
     p, body = wp.tid()
     place, turned = body_p_in[p, body], body_q_in[p, body]
     least = room_inout[p, body]

@@ -18,8 +18,7 @@ wp.set_module_options({"enable_backward": False})
 vec6 = wp.types.vector(length=6, dtype=wp.float32)
 mat66 = wp.types.matrix(shape=(6, 6), dtype=wp.float32)
 
-#: Norms are smoothed below this length [m]: |x| has no gradient at 0.
-SMOOTH = wp.constant(1.0e-5)
+SMOOTH = wp.constant(1.0e-5)  # norms are smoothed below this length [m]: |x| has no gradient at 0
 
 
 @wp.struct
@@ -126,11 +125,9 @@ def leaked(pull: wp.float32, gap: wp.float32, physics: Physics):
 
 @wp.kernel
 def direct(
-    # Model:
     physics_in: Physics,
     motion_in: wp.array(dtype=vec6),
     passes_in: wp.int32,
-    # Data in:
     active_in: wp.array(dtype=wp.int32),
     iteration_in: wp.array(dtype=wp.int32),
     dilation_in: wp.array(dtype=wp.float32),
@@ -142,7 +139,6 @@ def direct(
     weight_in: wp.array2d(dtype=wp.float32),
     near_count_in: wp.array(dtype=wp.int32),
     near_in: wp.array2d(dtype=wp.int32),
-    # Data out:
     loss_out: wp.array2d(dtype=wp.float32),
     end_out: wp.array2d(dtype=vec6),
     adjoint_out: wp.array2d(dtype=vec6),
@@ -205,10 +201,8 @@ def direct(
 
 @wp.kernel
 def direct_gradient(
-    # Model:
     physics_in: Physics,
     lane_in: wp.int32,
-    # Data in:
     active_in: wp.array(dtype=wp.int32),
     iteration_in: wp.array(dtype=wp.int32),
     dilation_in: wp.array(dtype=wp.float32),
@@ -220,7 +214,6 @@ def direct_gradient(
     weight_in: wp.array2d(dtype=wp.float32),
     end_in: wp.array2d(dtype=vec6),
     adjoint_in: wp.array2d(dtype=vec6),
-    # Data out:
     gradient_out: wp.array2d(dtype=wp.float32),
 ):
     """Compute dL/drho of each contact after `direct`, over all simulations in order. Over (B, N / lane)."""
@@ -264,11 +257,9 @@ def inverse_mass_along(physics: Physics, j: vec6):
 
 @wp.kernel
 def gauss_seidel(
-    # Model:
     physics_in: Physics,
     motion_in: wp.array(dtype=vec6),
     passes_in: wp.int32,
-    # Data in:
     active_in: wp.array(dtype=wp.int32),
     iteration_in: wp.array(dtype=wp.int32),
     dilation_in: wp.array(dtype=wp.float32),
@@ -278,7 +269,6 @@ def gauss_seidel(
     normal_in: wp.array2d(dtype=wp.vec3),
     distance_in: wp.array2d(dtype=wp.float32),
     weight_in: wp.array2d(dtype=wp.float32),
-    # Data out:
     states_out: wp.array3d(dtype=vec6),
     loss_out: wp.array2d(dtype=wp.float32),
     end_out: wp.array2d(dtype=vec6),
@@ -354,11 +344,9 @@ def gauss_seidel(
 
 @wp.kernel
 def jacobi(
-    # Model:
     physics_in: Physics,
     motion_in: wp.array(dtype=vec6),
     passes_in: wp.int32,
-    # Data in:
     active_in: wp.array(dtype=wp.int32),
     iteration_in: wp.array(dtype=wp.int32),
     dilation_in: wp.array(dtype=wp.float32),
@@ -368,7 +356,6 @@ def jacobi(
     normal_in: wp.array2d(dtype=wp.vec3),
     distance_in: wp.array2d(dtype=wp.float32),
     weight_in: wp.array2d(dtype=wp.float32),
-    # Data out:
     states_out: wp.array3d(dtype=vec6),
     loss_out: wp.array2d(dtype=wp.float32),
     end_out: wp.array2d(dtype=vec6),

@@ -45,13 +45,10 @@ def is_apart(solids: Solids, s: int, a: wp.vec3, b: wp.vec3, c: wp.vec3):
 
 @wp.kernel
 def faces_in_solids(
-    # Model:
     mesh_in: wp.uint64,
     solids_in: Solids,
-    # In:
     solid_in: wp.array(dtype=wp.int32),
     pose_in: wp.array(dtype=wp.transform),
-    # Out:
     crossed_out: wp.array(dtype=wp.int32),
 ):
     """Write 1 if a face of the mesh may reach into solid `solid_in` with its body at `pose_in`, else 0."""

@@ -14,8 +14,7 @@ wp.set_module_options({"enable_backward": False})
 #: Gap over which the normal turns from the surface's own to the direction of the closest point [m].
 BLEND = wp.constant(2.0e-4)
 
-#: Bound on the error of distances between positions of some metres [m].
-ROUNDING = wp.constant(1.0e-6)
+ROUNDING = wp.constant(1.0e-6)  # bound on the error of distances between positions of some metres [m]
 
 
 @wp.struct
@@ -110,12 +109,9 @@ def nearest(skin: Skin, p: wp.vec3, reach: wp.float32):
 
 @wp.kernel
 def mesh_distance(
-    # Model:
     skin_in: Skin,
-    # In:
     reach_in: wp.float32,
     point_in: wp.array(dtype=wp.vec3),
-    # Out:
     distance_out: wp.array(dtype=wp.float32),
     closest_out: wp.array(dtype=wp.vec3),
     normal_out: wp.array(dtype=wp.vec3),
@@ -130,20 +126,15 @@ def mesh_distance(
 
 @wp.kernel
 def pieces_distance(
-    # Model:
     pieces_in: Pieces,
-    # In:
     piece_p_in: wp.array2d(dtype=wp.vec3),
     piece_q_in: wp.array2d(dtype=wp.quat),
     reach_in: wp.float32,
     point_in: wp.array(dtype=wp.vec3),
-    # Out:
     distance_inout: wp.array2d(dtype=wp.float32),
 ):
     """Compute the least distance of S points to each of P pieces for B grasps, within `reach`.
-
-    Launch over (B, S); `distance_inout` (B, P) holds `reach` before.
-    """
+    Launch over (B, S); `distance_inout` (B, P) holds `reach` before."""
     b, s = wp.tid()
     for piece in range(pieces_in.body.shape[0]):
         offset = point_in[s] - piece_p_in[b, piece]
@@ -155,14 +146,11 @@ def pieces_distance(
 
 @wp.kernel
 def self_distance(
-    # Model:
     pieces_in: Pieces,
-    # In:
     piece_p_in: wp.array2d(dtype=wp.vec3),
     piece_q_in: wp.array2d(dtype=wp.quat),
     body_in: wp.array(dtype=wp.int32),
     point_in: wp.array2d(dtype=wp.vec3),
-    # Out:
     depth_inout: wp.array2d(dtype=wp.float32),
 ):
     """Compute the depth (B, L) of each body in others with counted contact, or of others in it.
@@ -210,15 +198,12 @@ def placed_at(origin: wp.vec3d, place: wp.vec3d, turned: wp.quatd, point: wp.vec
 
 @wp.kernel
 def body_gaps(
-    # Model:
     skin_in: Skin,
     points_in: BodyPoints,
     origin_in: wp.vec3d,
-    # In:
     reach_in: wp.float32,
     body_p_in: wp.array2d(dtype=wp.vec3d),
     body_q_in: wp.array2d(dtype=wp.quatd),
-    # Out:
     gap_inout: wp.array2d(dtype=wp.float32),
 ):
     """Lower `gap_inout` (P, L) to the least distance of bodies' points from the object, within `reach`.
@@ -244,15 +229,12 @@ def body_gaps(
 
 @wp.kernel
 def place_pieces(
-    # Model:
     pieces_in: Pieces,
     origin_in: wp.vec3d,
     frame_p_in: wp.array(dtype=wp.vec3d),
     frame_q_in: wp.array(dtype=wp.quatd),
-    # In:
     body_p_in: wp.array2d(dtype=wp.vec3d),
     body_q_in: wp.array2d(dtype=wp.quatd),
-    # Out:
     piece_p_out: wp.array2d(dtype=wp.vec3),
     piece_q_out: wp.array2d(dtype=wp.quat),
 ):

@@ -298,7 +298,6 @@ def grow_to_nearest(
 
 @wp.kernel
 def measure_hulls(
-    # In:
     point_in: wp.array2d(dtype=vec6),
     count_in: wp.array(dtype=wp.int32),
     whole_in: wp.array(dtype=wp.int32),
@@ -309,7 +308,6 @@ def measure_hulls(
     rounding_in: wp.array(dtype=wp.float64),
     mark_in: wp.array(dtype=wp.int64),
     stamp_in: int,
-    # Out:
     hull_inout: Hull,
     result_out: wp.array2d(dtype=wp.float64),
 ):

@@ -37,15 +37,12 @@ def on_way(
 
 @wp.kernel
 def place_on_way(
-    # Model:
     chain_in: Chain,
     fingers_in: Fingers,
     hands_in: Hands,
-    # In:
     jams_in: FingerJams,
     open_in: wp.array2d(dtype=wp.float64),
     way_in: wp.float64,
-    # Out:
     bodies_out: Bodies,
 ):
     """Place bodies of hands at this share of their path. Launch over B."""
@@ -62,22 +59,18 @@ def place_on_way(
 
 @wp.func
 def deepen(fingers: Fingers, depth: wp.array2d(dtype=wp.float32), b: wp.int32, body: wp.int32, deep: wp.float32):
-    """Record a depth of a body for its finger."""
     if fingers.of_body[body] >= 0:
         wp.atomic_max(depth, b, fingers.of_body[body], deep)
 
 
 @wp.kernel
 def finger_depth(
-    # Model:
     pieces_in: Pieces,
     points_in: BodyPoints,
     fingers_in: Fingers,
-    # In:
     bodies_in: Bodies,
     piece_p_in: wp.array2d(dtype=wp.vec3),
     piece_q_in: wp.array2d(dtype=wp.quat),
-    # Out:
     jams_inout: FingerJams,
 ):
     """Compute each finger's greatest depth in the rest of the hand, or of that in it. Over (B, L)."""
@@ -105,12 +98,7 @@ def finger_depth(
 
 
 @wp.kernel
-def limit_depth(
-    # In:
-    more_in: wp.float32,
-    # Out:
-    jams_inout: FingerJams,
-):
+def limit_depth(more_in: wp.float32, jams_inout: FingerJams):
     """Set the limit to the depth in the grasp plus `more`; reset depths. Launch over B."""
     b = wp.tid()
     for f in range(jams_inout.share.shape[1]):
@@ -119,12 +107,7 @@ def limit_depth(
 
 
 @wp.kernel
-def hold_back(
-    # In:
-    less_in: wp.float64,
-    # Out:
-    jams_inout: FingerJams,
-):
+def hold_back(less_in: wp.float64, jams_inout: FingerJams):
     """Reduce the path of jammed fingers to a share `less`; finish hands without any. Reset depths. Over B."""
     b = wp.tid()
     if jams_inout.going[b] == 0:
@@ -139,15 +122,7 @@ def hold_back(
 
 
 @wp.kernel
-def take_way(
-    # Model:
-    fingers_in: Fingers,
-    hands_in: Hands,
-    # In:
-    jams_in: FingerJams,
-    # Out:
-    open_inout: wp.array2d(dtype=wp.float64),
-):
+def take_way(fingers_in: Fingers, hands_in: Hands, jams_in: FingerJams, open_inout: wp.array2d(dtype=wp.float64)):
     """Write the dofs of fingers after jams are held back. Launch over (B, D)."""
     b, d = wp.tid()
     open_inout[b, d] = hands_in.q[b, d] + on_way(fingers_in, hands_in, jams_in, open_inout, b, d)
@@ -165,16 +140,13 @@ class Retreat:
 
 @wp.kernel
 def hand_clearance(
-    # Model:
     skin_in: Skin,
     points_in: Points,
     lane_in: wp.int32,
     approach_in: wp.vec3d,
     wanted_in: wp.float32,
-    # In:
     back_in: wp.float64,
     bodies_in: Bodies,
-    # Out:
     retreat_inout: Retreat,
 ):
     """Compute the least distance of hands moved `back` against their palm's approach. Over (B, N / lane)."""
@@ -189,13 +161,7 @@ def hand_clearance(
 
 
 @wp.kernel
-def measure_retreat(
-    # In:
-    wanted_in: wp.float32,
-    step_in: wp.int32,
-    # Out:
-    retreat_inout: Retreat,
-):
+def measure_retreat(wanted_in: wp.float32, step_in: wp.int32, retreat_inout: Retreat):
     """Select the first sufficient retreat, or the one with the largest distance. Launch over B."""
     b = wp.tid()
     if retreat_inout.going[b] == 0:

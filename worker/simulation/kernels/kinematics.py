@@ -24,14 +24,11 @@ class Tree:
 
 @wp.kernel
 def forward(
-    # Model:
     tree_in: Tree,
-    # Data in:
     active_in: wp.array(dtype=wp.int32),
     pivot_in: wp.array(dtype=wp.vec3),
     rotation_in: wp.array(dtype=wp.quat),
     q_in: wp.array2d(dtype=wp.float32),
-    # Data out:
     body_p_out: wp.array2d(dtype=wp.vec3),
     body_q_out: wp.array2d(dtype=wp.quat),
     axis_out: wp.array2d(dtype=wp.vec3),
@@ -73,14 +70,11 @@ def forward(
 
 @wp.kernel
 def backward(
-    # Model:
     tree_in: Tree,
-    # Data in:
     active_in: wp.array(dtype=wp.int32),
     pivot_in: wp.array(dtype=wp.vec3),
     body_p_in: wp.array2d(dtype=wp.vec3),
     axis_in: wp.array2d(dtype=wp.vec3),
-    # Data out:
     wrench_inout: Wrenches,
     gradient_out: wp.array2d(dtype=wp.float32),
 ):

@@ -141,14 +141,12 @@ def cell_centre(place: wp.vec3i, low: wp.vec3, size: wp.float32):
 
 @wp.kernel
 def count_faces(
-    # In:
     mesh_in: wp.uint64,
     faces_in: Faces,
     low_in: wp.vec3,
     size_in: wp.float32,
     field_in: wp.array3d(dtype=wp.float32),
     within_in: wp.float32,
-    # Out:
     radius_out: wp.array(dtype=wp.float32),
     count_out: wp.array(dtype=wp.int32),
 ):
@@ -186,7 +184,6 @@ def count_faces(
 
 @wp.kernel
 def list_faces(
-    # In:
     mesh_in: wp.uint64,
     faces_in: Faces,
     low_in: wp.vec3,
@@ -194,7 +191,6 @@ def list_faces(
     shape_in: wp.vec3i,
     radius_in: wp.array(dtype=wp.float32),
     first_in: wp.array(dtype=wp.int32),
-    # Out:
     face_out: wp.array(dtype=wp.int32),
     key_out: wp.array(dtype=wp.float32),
 ):

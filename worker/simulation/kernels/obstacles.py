@@ -24,7 +24,6 @@ class Features:
     axis: wp.array(dtype=wp.vec3)  # body frame; zero: a ball
     radius: wp.array(dtype=wp.float32)
     margin: wp.array(dtype=wp.float32)  # clearance [m]; negative: it may penetrate
-    weight: wp.array(dtype=wp.float32)
     tip: wp.array(dtype=wp.int32)  # 1: of a fingertip
     first: wp.array(dtype=wp.int32)  # (P + 1,) features of a piece
     middle: wp.array(dtype=wp.vec3)  # (P,) centre of a ball around the features of a piece, body frame
@@ -65,7 +64,6 @@ class Obstacles:
 def posed(
     features: Features, i: wp.int32, b: wp.int32, body_p: wp.array2d(dtype=wp.vec3), body_q: wp.array2d(dtype=wp.quat)
 ):
-    """Return feature i of hand b."""
     out = Feature()
     out.body = features.body[i]
     rotation = body_q[b, out.body]
@@ -150,12 +148,7 @@ def may_meet(
 
 
 @wp.kernel
-def clear(
-    # Data in:
-    active_in: wp.array(dtype=wp.int32),
-    # Data out:
-    depth_out: wp.array(dtype=wp.float32),
-):
+def clear(active_in: wp.array(dtype=wp.int32), depth_out: wp.array(dtype=wp.float32)):
     """Reset depths. Launch over B."""
     b = wp.tid()
     if active_in[b] != 0:
@@ -164,19 +157,15 @@ def clear(
 
 @wp.kernel
 def penalty(
-    # Model:
     features_in: Features,
     obstacles_in: Obstacles,
-    # Data in:
     active_in: wp.array(dtype=wp.int32),
     scene_in: wp.array(dtype=wp.int32),
     iteration_in: wp.array(dtype=wp.int32),
     weight_in: wp.array(dtype=wp.float32),
     body_p_in: wp.array2d(dtype=wp.vec3),
     body_q_in: wp.array2d(dtype=wp.quat),
-    # In:
     room_in: wp.float32,
-    # Data out:
     wrench_inout: Wrenches,
     depth_inout: wp.array(dtype=wp.float32),
 ):
@@ -189,7 +178,7 @@ def penalty(
         return
     for i in range(features_in.first[piece], features_in.first[piece + 1]):
         f = posed(features_in, i, b, body_p_in, body_q_in)
-        weight = 2.0 * weight_in[iteration_in[0]] * features_in.weight[i]
+        weight = 2.0 * weight_in[iteration_in[0]]
         for k in range(obstacles_in.first[scene_in[b]], obstacles_in.first_solid[scene_in[b]]):
             nd = obstacle_distance(obstacles_in, k, f)
             short = nd[3] - kept(features_in, obstacles_in, i, k, room_in)
@@ -203,18 +192,14 @@ def penalty(
 
 @wp.kernel
 def residuals(
-    # Model:
     features_in: Features,
     obstacles_in: Obstacles,
-    # Data in:
     active_in: wp.array(dtype=wp.int32),
     scene_in: wp.array(dtype=wp.int32),
     body_p_in: wp.array2d(dtype=wp.vec3),
     body_q_in: wp.array2d(dtype=wp.quat),
-    # In:
     near_in: wp.float32,
     target_in: wp.float32,
-    # Out:
     residuals_out: Residuals,
 ):
     """Emit residuals: features within margin + near of a half-space move to margin + target. Over (B, P)."""

@@ -56,13 +56,10 @@ def opened(
 
 @wp.kernel
 def body_wrenches(
-    # Model:
     points_in: Points,
-    # In:
     bodies_in: Bodies,
     touching_in: NearbySurface,
     reach_in: wp.float32,
-    # Out:
     force_out: wp.array2d(dtype=wp.vec3d),
     torque_out: wp.array2d(dtype=wp.vec3d),
 ):
@@ -83,13 +80,10 @@ def body_wrenches(
 
 @wp.kernel
 def leave(
-    # Model:
     chain_in: Chain,
     fingers_in: Fingers,
     plain_in: wp.float64,
-    # In:
     bodies_in: Bodies,
-    # Out:
     force_inout: wp.array2d(dtype=wp.vec3d),
     torque_inout: wp.array2d(dtype=wp.vec3d),
     away_out: wp.array2d(dtype=wp.float64),
@@ -139,14 +133,7 @@ def leave(
 
 @wp.kernel
 def open_plainly(
-    # Model:
-    fingers_in: Fingers,
-    stuck_in: wp.float32,
-    # In:
-    first_in: Sweep,
-    # Out:
-    sweep_out: Sweep,
-    step_out: wp.array(dtype=wp.int32),
+    fingers_in: Fingers, stuck_in: wp.float32, first_in: Sweep, sweep_out: Sweep, step_out: wp.array(dtype=wp.int32)
 ):
     """Restart hands with a finger that moved less than `stuck`, against `closing`. Launch over B."""
     b = wp.tid()
@@ -163,14 +150,11 @@ def open_plainly(
 
 @wp.kernel
 def place_opening(
-    # Model:
     chain_in: Chain,
     fingers_in: Fingers,
     hands_in: Hands,
     wanted_in: wp.float32,
-    # In:
     step_in: wp.array(dtype=wp.int32),
-    # Out:
     sweep_inout: Sweep,
     bodies_out: Bodies,
 ):
@@ -189,15 +173,12 @@ def place_opening(
 
 @wp.kernel
 def finger_clearance(
-    # Model:
     skin_in: Skin,
     points_in: Points,
     fingers_in: Fingers,
     lane_in: wp.int32,
     wanted_in: wp.float32,
-    # In:
     bodies_in: Bodies,
-    # Out:
     sweep_inout: Sweep,
 ):
     """Compute the least distance of each finger that is not clear yet. Launch over (B, N / lane)."""
@@ -214,13 +195,7 @@ def finger_clearance(
 
 
 @wp.kernel
-def measure_opening(
-    # In:
-    wanted_in: wp.float32,
-    step_in: wp.array(dtype=wp.int32),
-    # Out:
-    sweep_inout: Sweep,
-):
+def measure_opening(wanted_in: wp.float32, step_in: wp.array(dtype=wp.int32), sweep_inout: Sweep):
     """Select each finger's first clear step, or the farthest; stop hands with all fingers clear. Over B."""
     b = wp.tid()
     if sweep_inout.going[b] == 0:
@@ -238,14 +213,11 @@ def measure_opening(
 
 @wp.kernel
 def take_opening(
-    # Model:
     fingers_in: Fingers,
     hands_in: Hands,
     stuck_in: wp.float32,
-    # In:
     first_in: Sweep,
     plain_in: Sweep,
-    # Out:
     open_out: wp.array2d(dtype=wp.float64),
 ):
     """Write dofs (B, D) of each finger's best opening: plain if it beats the other, or `stuck`.

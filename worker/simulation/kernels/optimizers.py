@@ -34,18 +34,14 @@ def move(
 
 @wp.kernel
 def adam(
-    # Model:
     lower_in: wp.array(dtype=wp.float32),
     upper_in: wp.array(dtype=wp.float32),
-    # Data in:
     active_in: wp.array(dtype=wp.int32),
     iteration_in: wp.array(dtype=wp.int32),
     rate_in: wp.array2d(dtype=wp.float32),
     gradient_in: wp.array2d(dtype=wp.float32),
-    # In:
     beta1_in: wp.float32,
     beta2_in: wp.float32,
-    # Data out:
     first_inout: wp.array2d(dtype=wp.float32),
     second_inout: wp.array2d(dtype=wp.float32),
     pivot_inout: wp.array(dtype=wp.vec3),
@@ -81,17 +77,13 @@ def adam(
 
 @wp.kernel
 def gradient_descent(
-    # Model:
     lower_in: wp.array(dtype=wp.float32),
     upper_in: wp.array(dtype=wp.float32),
-    # Data in:
     active_in: wp.array(dtype=wp.int32),
     iteration_in: wp.array(dtype=wp.int32),
     rate_in: wp.array2d(dtype=wp.float32),
     gradient_in: wp.array2d(dtype=wp.float32),
-    # In:
     clamp_in: wp.int32,
-    # Data out:
     pivot_inout: wp.array(dtype=wp.vec3),
     rotation_inout: wp.array(dtype=wp.quat),
     q_inout: wp.array2d(dtype=wp.float32),
@@ -116,32 +108,24 @@ def gradient_descent(
 
 
 @wp.kernel
-def advance(
-    # Data out:
-    iteration_inout: wp.array(dtype=wp.int32),
-):
+def advance(iteration_inout: wp.array(dtype=wp.int32)):
     """Count an iteration on the device: schedules are read there, so a captured graph is replayed. Over 1."""
     iteration_inout[0] = iteration_inout[0] + 1
 
 
 @wp.kernel
 def converge(
-    # Data in:
     loss_in: wp.array2d(dtype=wp.float32),
     point_depth_in: wp.array(dtype=wp.float32),
     object_depth_in: wp.array(dtype=wp.float32),
     self_depth_in: wp.array(dtype=wp.float32),
-    # In:
     patience_in: wp.int32,
-    # Data out:
     best_inout: wp.array(dtype=wp.float32),
     waited_inout: wp.array(dtype=wp.int32),
     active_inout: wp.array(dtype=wp.int32),
 ):
     """Switch off a grasp whose merit has not improved by 1 % for `patience` iterations. Launch over B.
-
-    The merit is L_stable plus the penetration depths in millimetres, without the changing weights of a schedule.
-    """
+    The merit is L_stable plus the penetration depths in millimetres, without the changing weights of a schedule."""
     b = wp.tid()
     if active_inout[b] == 0:
         return

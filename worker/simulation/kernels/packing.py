@@ -12,16 +12,13 @@ wp.set_module_options({"enable_backward": False})
 NONE = wp.constant(0)
 KEPT = wp.constant(1)
 NEAR = wp.constant(2)
-#: Marks counted per thread.
-CHUNK = wp.constant(32)
+CHUNK = wp.constant(32)  # marks counted per thread
 
 
 @wp.kernel
 def count_marks(
-    # Data in:
     active_in: wp.array(dtype=wp.int32),
     mark_in: wp.array2d(dtype=wp.int32),
-    # Data out:
     kept_out: wp.array2d(dtype=wp.int32),
     near_out: wp.array2d(dtype=wp.int32),
 ):
@@ -57,7 +54,6 @@ def before(
 
 @wp.kernel
 def pack(
-    # Data in:
     active_in: wp.array(dtype=wp.int32),
     mark_in: wp.array2d(dtype=wp.int32),
     kept_in: wp.array2d(dtype=wp.int32),
@@ -67,7 +63,6 @@ def pack(
     normal_in: wp.array2d(dtype=wp.vec3),
     distance_in: wp.array2d(dtype=wp.float32),
     weight_in: wp.array2d(dtype=wp.float32),
-    # Data out:
     count_out: wp.array(dtype=wp.int32),
     body_out: wp.array2d(dtype=wp.int32),
     point_out: wp.array2d(dtype=wp.vec3),

@@ -9,12 +9,9 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.kernel
 def points_to_bodies(
-    # Model:
-    clearance_in: wp.float32,
     pull_in: wp.float32,
     pull_length_in: wp.float32,
     lane_in: wp.int32,
-    # Data in:
     active_in: wp.array(dtype=wp.int32),
     iteration_in: wp.array(dtype=wp.int32),
     penetration_weight_in: wp.array(dtype=wp.float32),
@@ -25,16 +22,14 @@ def points_to_bodies(
     distance_in: wp.array2d(dtype=wp.float32),
     weight_in: wp.array2d(dtype=wp.float32),
     gradient_in: wp.array2d(dtype=wp.float32),
-    # Data out:
     wrench_inout: Wrenches,
     depth_inout: wp.array(dtype=wp.float32),
 ):
     """Compute the wrench gradient on bodies from dL/drho, penetration and attraction term.
 
-    Penetration: w sum w_i min(rho - clearance, 0)^2. Attraction: -2 w d l sum w_i exp(-rho / l) of points beyond the
-    clearance, with d = `pull` and l = `pull_length` [m].
-
-    The distance grows along the object's outward normal (normals are taken as constant). Launch over (B, N / lane).
+    Penetration: w sum w_i min(rho, 0)^2. Attraction: -2 w d l sum w_i exp(-rho / l) of points outside, with d = `pull`
+    and l = `pull_length` [m]. The distance grows along the object's outward normal (normals are taken as constant).
+    Launch over (B, N / lane).
     """
     b, part = wp.tid()
     if active_in[b] == 0:
@@ -43,8 +38,8 @@ def points_to_bodies(
     for i in range(part * lane_in, wp.min((part + 1) * lane_in, count_in[b])):
         rho = distance_in[b, i]
         g = gradient_in[b, i]
-        if rho < clearance_in:
-            g += penetration * weight_in[b, i] * (rho - clearance_in)
+        if rho < 0.0:
+            g += penetration * weight_in[b, i] * rho
             wp.atomic_max(depth_inout, b, -rho)
         elif pull_in > 0.0:
             g += penetration * pull_in * weight_in[b, i] * wp.exp(-rho / pull_length_in)
@@ -56,21 +51,16 @@ def points_to_bodies(
 
 @wp.kernel
 def joints(
-    # Model:
     lower_in: wp.array(dtype=wp.float32),
     upper_in: wp.array(dtype=wp.float32),
     range_weight_in: wp.float32,
     limit_weight_in: wp.float32,
-    # Data in:
     active_in: wp.array(dtype=wp.int32),
     q_in: wp.array2d(dtype=wp.float32),
-    # Data out:
     gradient_inout: wp.array2d(dtype=wp.float32),
 ):
     """Add the gradient of L_range + L_limit (paper, section III-D). Launch over (B, D).
-
-    L_range = w sum ((q - mid) / half)^2; L_limit = w sum max(lower - q, 0, q - upper)^2.
-    """
+    L_range = w sum ((q - mid) / half)^2; L_limit = w sum max(lower - q, 0, q - upper)^2."""
     b, d = wp.tid()
     if active_in[b] == 0:
         return
@@ -85,14 +75,11 @@ def joints(
 
 @wp.kernel
 def near_share(
-    # In:
     reach_in: wp.float32,
     whole_in: wp.float32,
-    # Data in:
     count_in: wp.array(dtype=wp.int32),
     distance_in: wp.array2d(dtype=wp.float32),
     weight_in: wp.array2d(dtype=wp.float32),
-    # Out:
     share_out: wp.array(dtype=wp.float32),
 ):
     """Compute the share of the `whole` weight of a hand's points that is within `reach` [m].
@@ -107,15 +94,12 @@ def near_share(
 
 @wp.kernel
 def attract(
-    # Model:
     pull_in: wp.float32,
     length_in: wp.float32,
-    # Data in:
     active_in: wp.array(dtype=wp.int32),
     count_in: wp.array(dtype=wp.int32),
     distance_in: wp.array2d(dtype=wp.float32),
     weight_in: wp.array2d(dtype=wp.float32),
-    # Data out:
     gradient_out: wp.array2d(dtype=wp.float32),
 ):
     """Attract free points to the object, fading with distance: control without simulation. Over (B, N)."""

@@ -190,24 +190,19 @@ def clip_depth(pieces: Pieces, piece: wp.int32, x: wp.vec3, above: wp.float32):
 
 @wp.kernel
 def object_in_pieces(
-    # Model:
     pieces_in: Pieces,
     samples_in: Samples,
     sample_weight_in: wp.float32,
-    # Data in:
     active_in: wp.array(dtype=wp.int32),
     iteration_in: wp.array(dtype=wp.int32),
     weight_in: wp.array(dtype=wp.float32),
     body_p_in: wp.array2d(dtype=wp.vec3),
     body_q_in: wp.array2d(dtype=wp.quat),
-    # Data out:
     wrench_inout: Wrenches,
     depth_inout: wp.array(dtype=wp.float32),
 ):
     """Add the gradient of w sum depth^2 over object samples in a piece; deepest per grasp. Over (B, P).
-
-    Moving the body by +n deepens a sample nearest to the face with outward normal n: its gradient is 2 w depth n.
-    """
+    Moving the body by +n deepens a sample nearest to the face with outward normal n: its gradient is 2 w depth n."""
     b, piece = wp.tid()
     if active_in[b] == 0:
         return
@@ -289,25 +284,20 @@ def may_touch(
 
 @wp.kernel
 def pieces_in_pieces(
-    # Model:
     pieces_in: Pieces,
     points_in: BodyPoints,
     point_weight_in: wp.float32,
     margin_in: wp.float32,
-    # Data in:
     active_in: wp.array(dtype=wp.int32),
     iteration_in: wp.array(dtype=wp.int32),
     weight_in: wp.array(dtype=wp.float32),
     body_p_in: wp.array2d(dtype=wp.vec3),
     body_q_in: wp.array2d(dtype=wp.quat),
-    # Data out:
     wrench_inout: Wrenches,
     depth_inout: wp.array(dtype=wp.float32),
 ):
     """Add the gradient of w sum (depth + margin)^2 over hand points inside pieces of other bodies.
-
-    Launch over (B, P).
-    """
+    Launch over (B, P)."""
     b, piece = wp.tid()
     if active_in[b] == 0:
         return

@@ -64,28 +64,22 @@ def emit(
 
 @wp.kernel
 def point_residuals(
-    # Model:
     lane_in: wp.int32,
-    # Data in:
     active_in: wp.array(dtype=wp.int32),
     count_in: wp.array(dtype=wp.int32),
     body_in: wp.array2d(dtype=wp.int32),
     point_in: wp.array2d(dtype=wp.vec3),
     normal_in: wp.array2d(dtype=wp.vec3),
     distance_in: wp.array2d(dtype=wp.float32),
-    # In:
     near_in: wp.float32,
     target_in: wp.float32,
     hold_in: wp.float32,
     hold_target_in: wp.float32,
     hold_weight_in: wp.float32,
-    # Out:
     residuals_out: Residuals,
 ):
     """Emit residuals: points closer than `near` move to `target`, those within `hold` are weakly held.
-
-    Launch over (B, N / lane).
-    """
+    Launch over (B, N / lane)."""
     b, part = wp.tid()
     if active_in[b] == 0:
         return
@@ -100,17 +94,13 @@ def point_residuals(
 
 @wp.kernel
 def sample_residuals(
-    # Model:
     pieces_in: Pieces,
     samples_in: Samples,
-    # Data in:
     active_in: wp.array(dtype=wp.int32),
     body_p_in: wp.array2d(dtype=wp.vec3),
     body_q_in: wp.array2d(dtype=wp.quat),
-    # In:
     near_in: wp.float32,
     target_in: wp.float32,
-    # Out:
     residuals_out: Residuals,
 ):
     """Emit residuals that move object samples within `near` of a link to `target`. Launch over (B, P)."""
@@ -139,17 +129,13 @@ def sample_residuals(
 
 @wp.kernel
 def self_residuals(
-    # Model:
     pieces_in: Pieces,
     points_in: BodyPoints,
-    # Data in:
     active_in: wp.array(dtype=wp.int32),
     body_p_in: wp.array2d(dtype=wp.vec3),
     body_q_in: wp.array2d(dtype=wp.quat),
-    # In:
     near_in: wp.float32,
     target_in: wp.float32,
-    # Out:
     residuals_out: Residuals,
 ):
     """Emit residuals that move points of a link within `near` of another to `target`. Launch over (B, P)."""
@@ -209,17 +195,13 @@ def fixed(x: wp.float32):
 
 @wp.kernel
 def normal_equations(
-    # Model:
     tree_in: Tree,
     lane_in: wp.int32,
-    # Data in:
     active_in: wp.array(dtype=wp.int32),
     pivot_in: wp.array(dtype=wp.vec3),
     body_p_in: wp.array2d(dtype=wp.vec3),
     axis_in: wp.array2d(dtype=wp.vec3),
-    # In:
     residuals_in: Residuals,
-    # Out:
     row_out: wp.array2d(dtype=wp.float32),
     matrix_inout: wp.array3d(dtype=wp.int64),
     vector_inout: wp.array2d(dtype=wp.int64),
@@ -271,17 +253,13 @@ class States:
 
 @wp.kernel
 def keep_best(
-    # Data in:
     point_depth_in: wp.array(dtype=wp.float32),
     object_depth_in: wp.array(dtype=wp.float32),
     self_depth_in: wp.array(dtype=wp.float32),
     obstacle_depth_in: wp.array(dtype=wp.float32),
-    # In:
     better_in: wp.float64,
     now_in: States,
-    # Data out:
     active_inout: wp.array(dtype=wp.int32),
-    # Out:
     count_out: wp.array(dtype=wp.int32),
     best_inout: States,
     depth_inout: wp.array(dtype=wp.float64),
@@ -305,23 +283,18 @@ def keep_best(
 
 @wp.kernel
 def step(
-    # Model:
     lower_in: wp.array(dtype=wp.float64),
     upper_in: wp.array(dtype=wp.float64),
     scale_in: wp.array(dtype=wp.float64),
     damping_in: wp.float64,
     longest_in: wp.float64,
-    # Data in:
     active_in: wp.array(dtype=wp.int32),
-    # In:
     residuals_in: Residuals,
-    # Out:
     factor_out: wp.array3d(dtype=wp.float64),
     move_out: wp.array2d(dtype=wp.float64),
     matrix_inout: wp.array3d(dtype=wp.int64),
     vector_inout: wp.array2d(dtype=wp.int64),
     state_inout: States,
-    # Data out:
     pivot_out: wp.array(dtype=wp.vec3),
     rotation_out: wp.array(dtype=wp.quat),
     q_out: wp.array2d(dtype=wp.float32),

@@ -10,8 +10,7 @@ from graspd.worker.simulation.kernels.surface import Surface, cube_around, cube_
 
 wp.set_module_options({"enable_backward": False})
 
-#: Random directions, of which the one most perpendicular to the pair is used.
-WAYS = wp.constant(4)
+WAYS = wp.constant(4)  # random directions, of which the one most perpendicular to the pair is used
 
 
 @wp.struct
@@ -117,26 +116,21 @@ def drawn(
 
 @wp.kernel
 def reach(
-    # Model:
     surface_in: Surface,
     grips_in: Grips,
-    # In:
     seed_in: wp.array(dtype=wp.int32),
     first_in: wp.array(dtype=wp.int32),
     draws_in: wp.int32,
     alike_in: wp.vec2,
     room_in: wp.vec2,
     retreat_in: wp.array(dtype=wp.float32),
-    # Out:
     number_out: wp.array(dtype=wp.int32),
     pivot_out: wp.array(dtype=wp.vec3),
     rotation_out: wp.array(dtype=wp.quat),
     q_out: wp.array2d(dtype=wp.float32),
 ):
     """Find the first clear draw of each start from number `first` on, and its number; -1: none of `draws`.
-
-    Launch over B.
-    """
+    Launch over B."""
     b = wp.tid()
     number_out[b] = -1
     for k in range(first_in[b], draws_in):

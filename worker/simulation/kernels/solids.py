@@ -19,8 +19,7 @@ wp.set_module_options({"enable_backward": False})
 #: Evaluations between the tangents, and tolerance of the value at their intersection [m].
 LOOKS = wp.constant(20)
 EXACT = wp.constant(wp.float32(1.0e-8))
-#: A point this far outside a plane's face counts as on it [m].
-ON_FACE = wp.constant(wp.float32(1.0e-5))
+ON_FACE = wp.constant(wp.float32(1.0e-5))  # a point this far outside a plane's face counts as on it [m]
 
 
 @wp.struct
@@ -177,7 +176,6 @@ def over_face(obstacles: Obstacles, k: wp.int32, x: wp.vec3):
 
 @wp.func
 def apart(
-    features: Features,
     pieces: Pieces,
     obstacles: Obstacles,
     piece: wp.int32,
@@ -236,20 +234,16 @@ def nearest_edge(
 
 @wp.kernel
 def penalty(
-    # Model:
     features_in: Features,
     pieces_in: Pieces,
     obstacles_in: Obstacles,
-    # Data in:
     active_in: wp.array(dtype=wp.int32),
     scene_in: wp.array(dtype=wp.int32),
     iteration_in: wp.array(dtype=wp.int32),
     weight_in: wp.array(dtype=wp.float32),
     body_p_in: wp.array2d(dtype=wp.vec3),
     body_q_in: wp.array2d(dtype=wp.quat),
-    # In:
     room_in: wp.float32,
-    # Data out:
     wrench_inout: Wrenches,
     depth_inout: wp.array(dtype=wp.float32),
 ):
@@ -259,10 +253,10 @@ def penalty(
         return
     body = pieces_in.body[piece]
     first = features_in.first[piece]
-    weight = 2.0 * weight_in[iteration_in[0]] * features_in.weight[first]
+    weight = 2.0 * weight_in[iteration_in[0]]
     for k in range(obstacles_in.first_solid[scene_in[b]], obstacles_in.first[scene_in[b] + 1]):
         keep = kept(features_in, obstacles_in, first, k, room_in)
-        if apart(features_in, pieces_in, obstacles_in, piece, k, b, keep, body_p_in, body_q_in):
+        if apart(pieces_in, obstacles_in, piece, k, b, keep, body_p_in, body_q_in):
             continue
         for i in range(first, features_in.first[piece + 1]):
             f = posed(features_in, i, b, body_p_in, body_q_in)
@@ -283,19 +277,15 @@ def penalty(
 
 @wp.kernel
 def residuals(
-    # Model:
     features_in: Features,
     pieces_in: Pieces,
     obstacles_in: Obstacles,
-    # Data in:
     active_in: wp.array(dtype=wp.int32),
     scene_in: wp.array(dtype=wp.int32),
     body_p_in: wp.array2d(dtype=wp.vec3),
     body_q_in: wp.array2d(dtype=wp.quat),
-    # In:
     near_in: wp.float32,
     target_in: wp.float32,
-    # Out:
     residuals_out: Residuals,
 ):
     """Emit residuals: terms of `penalty` within margin + near move to margin + target. Over (B, P)."""
@@ -308,7 +298,7 @@ def residuals(
         margin = kept(features_in, obstacles_in, first, k, 0.0)
         keep = margin + near_in
         target = margin + target_in
-        if apart(features_in, pieces_in, obstacles_in, piece, k, b, keep, body_p_in, body_q_in):
+        if apart(pieces_in, obstacles_in, piece, k, b, keep, body_p_in, body_q_in):
             continue
         for i in range(first, features_in.first[piece + 1]):
             f = posed(features_in, i, b, body_p_in, body_q_in)
@@ -323,27 +313,21 @@ def residuals(
 
 @wp.kernel
 def distances(
-    # Model:
     features_in: Features,
     pieces_in: Pieces,
     obstacles_in: Obstacles,
-    # Data in:
     body_p_in: wp.array2d(dtype=wp.vec3),
     body_q_in: wp.array2d(dtype=wp.quat),
-    # In:
     reach_in: wp.float32,
-    # Out:
     distance_inout: wp.array2d(dtype=wp.float32),
 ):
     """Compute the least distance (B, L) of each body from the solids of scene 0, at most `reach`.
-
-    A feature over no face of an obstacle is farther from it than an edge of the obstacle from the link. Over (B, P).
-    """
+    A feature over no face of an obstacle is farther from it than an edge of the obstacle from the link. Over (B, P)."""
     b, piece = wp.tid()
     body = pieces_in.body[piece]
     least = reach_in
     for k in range(obstacles_in.first_solid[0], obstacles_in.first[1]):
-        if apart(features_in, pieces_in, obstacles_in, piece, k, b, least, body_p_in, body_q_in):
+        if apart(pieces_in, obstacles_in, piece, k, b, least, body_p_in, body_q_in):
             continue
         for i in range(features_in.first[piece], features_in.first[piece + 1]):
             f = posed(features_in, i, b, body_p_in, body_q_in)

@@ -220,13 +220,10 @@ def distance(surface: Surface, point: wp.vec3, reach: wp.float32, exact_below: w
 
 @wp.kernel
 def sample_field(
-    # Model:
     surface_in: Surface,
-    # In:
     origin_in: wp.vec3,
     cell_in: wp.float32,
     reach_in: wp.float32,
-    # Out:
     field_out: wp.array3d(dtype=wp.float32),
 ):
     """Fill a grid with mesh distances. Launch over the grid."""
@@ -236,27 +233,7 @@ def sample_field(
 
 
 @wp.kernel
-def probe(
-    # Model:
-    surface_in: Surface,
-    # In:
-    point_in: wp.array(dtype=wp.vec3),
-    reach_in: wp.float32,
-    exact_below_in: wp.float32,
-    # Out:
-    distance_out: wp.array(dtype=wp.float32),
-    normal_out: wp.array(dtype=wp.vec3),
-):
-    """Compute distances and normals at given points. Launch over the points."""
-    i = wp.tid()
-    sample = distance(surface_in, point_in[i], reach_in, exact_below_in, reach_in)
-    distance_out[i] = sample.distance
-    normal_out[i] = sample.normal
-
-
-@wp.kernel
 def gather(
-    # Model:
     surface_in: Surface,
     band_in: wp.float32,
     exact_in: wp.float32,
@@ -266,14 +243,12 @@ def gather(
     body_in: wp.array(dtype=wp.int32),
     position_in: wp.array(dtype=wp.vec3),
     weight_in: wp.array(dtype=wp.float32),
-    # Data in:
     active_in: wp.array(dtype=wp.int32),
     iteration_in: wp.array(dtype=wp.int32),
     dilation_in: wp.array(dtype=wp.float32),
     dilation_scale_in: wp.array(dtype=wp.float32),
     body_p_in: wp.array2d(dtype=wp.vec3),
     body_q_in: wp.array2d(dtype=wp.quat),
-    # Data out:
     count_inout: wp.array(dtype=wp.int32),
     contact_body_out: wp.array2d(dtype=wp.int32),
     contact_point_out: wp.array2d(dtype=wp.vec3),

@@ -10,12 +10,9 @@ from graspd.worker.simulation.kernels.distance import Skin, nearest
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
-#: Edges of a friction pyramid.
-EDGES = wp.constant(8)
-#: Angle between adjacent edges.
-TURN = wp.constant(wp.float64(math.tau / 8))
-#: Rows of a balance before those of the torques: the wrench and the sum of normal forces.
-FIRST_TORQUE = wp.constant(7)
+EDGES = wp.constant(8)  # edges of a friction pyramid
+TURN = wp.constant(wp.float64(math.tau / 8))  # angle between adjacent edges
+FIRST_TORQUE = wp.constant(7)  # rows of a balance before those of the torques: the wrench and the sum of normal forces
 
 
 @wp.struct
@@ -40,21 +37,17 @@ class NearbySurface:
 
 @wp.func
 def point_of(points: Points, bodies: Bodies, b: wp.int32, i: wp.int32):
-    """Return the position of a point of a hand."""
     body = points.body[i]
     return bodies.position[b, body] + wp.quat_rotate(bodies.rotation[b, body], points.position[i])
 
 
 @wp.kernel
 def touch(
-    # Model:
     skin_in: Skin,
     points_in: Points,
     lane_in: wp.int32,
-    # In:
     bodies_in: Bodies,
     reach_in: wp.float32,
-    # Out:
     touching_out: NearbySurface,
 ):
     """Find the surface near all points of hands. Launch over (B, N / lane)."""
@@ -78,16 +71,13 @@ def apart(touching: NearbySurface, radius: wp.float64, b: wp.int32, i: wp.int32,
 
 @wp.kernel
 def choose(
-    # Model:
     points_in: Points,
     finger_in: wp.array(dtype=wp.int32),
-    # In:
     touching_in: NearbySurface,
     near_in: wp.float32,
     far_in: wp.float32,
     facing_in: wp.float64,
     radius_in: wp.float64,
-    # Out:
     touches_out: wp.array2d(dtype=wp.bool),
     list_out: wp.array2d(dtype=wp.int32),
     least_out: wp.array2d(dtype=wp.float64),
@@ -167,11 +157,9 @@ def first_tangent(n: wp.vec3d):
 
 @wp.kernel
 def columns(
-    # Model:
     chain_in: Chain,
     effort_in: wp.array(dtype=wp.float64),
     points_in: Points,
-    # In:
     bodies_in: Bodies,
     touching_in: NearbySurface,
     chosen_in: wp.array2d(dtype=wp.int32),
@@ -179,7 +167,6 @@ def columns(
     friction_in: wp.float64,
     radius_in: wp.float64,
     sum_in: wp.float64,
-    # Out:
     matrix_out: wp.array3d(dtype=wp.float64),
 ):
     """Compute columns (B, C * E, 7 + D) of the balance. Launch over (B, C).
@@ -223,9 +210,7 @@ def columns(
 
 @wp.kernel
 def scale_torques(
-    # In:
     weight_in: wp.float64,
-    # Out:
     count_inout: wp.array(dtype=wp.int32),
     matrix_inout: wp.array3d(dtype=wp.float64),
     unit_out: wp.array(dtype=wp.float64),
@@ -248,15 +233,12 @@ def scale_torques(
 
 @wp.kernel
 def hold(
-    # Model:
     effort_in: wp.array(dtype=wp.float64),
-    # In:
     matrix_in: wp.array3d(dtype=wp.float64),
     share_in: wp.array2d(dtype=wp.float64),
     count_in: wp.array(dtype=wp.int32),
     unit_in: wp.array(dtype=wp.float64),
     total_in: wp.float64,
-    # Out:
     residual_out: wp.array(dtype=wp.float64),
     torque_out: wp.array2d(dtype=wp.float64),
 ):

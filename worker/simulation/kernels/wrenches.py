@@ -11,11 +11,9 @@ wp.set_module_options({"enable_backward": False})
 #: Value of one count: 2^-36, below the rounding of any float32 above 1e-4. Sums may reach 1.3e8.
 UNIT = wp.constant(1.0 / 68719476736.0)
 PER_UNIT = wp.constant(68719476736.0)
-#: Largest component that one thread may add: hands far inside an object reach about 1e4.
-MOST = wp.constant(1.0e6)
+MOST = wp.constant(1.0e6)  # largest component that one thread may add: hands far inside an object reach about 1e4
 
-Wrenches = wp.array3d(dtype=wp.int64)
-"""(B, L, 6)."""
+Wrenches = wp.array3d(dtype=wp.int64)  # (B, L, 6)
 
 
 @wp.func
@@ -28,7 +26,6 @@ def counts(x: wp.float32):
 
 @wp.func
 def add_wrench(wrench: Wrenches, b: wp.int32, body: wp.int32, force: wp.vec3, torque: wp.vec3):
-    """Add to the wrench on a body of hand b."""
     for i in range(3):
         wp.atomic_add(wrench, b, body, i, counts(force[i]))
         wp.atomic_add(wrench, b, body, 3 + i, counts(torque[i]))

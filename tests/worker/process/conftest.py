@@ -1,0 +1,31 @@
+"""A worker in this process."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from graspd.service.queue.port import EventKind
+from graspd.service.queue.rq_queue import RqQueue
+from graspd.service.settings import Settings
+from graspd.worker.process.main import run_worker
+from tests.fakes import engine_of
+
+
+@pytest.fixture
+def work(rq_queue: RqQueue, redis_server: str, tmp_path: Path) -> Callable[..., bool]:
+    """Runs a worker with a table of stages, until no task waits; whether it ended well."""
+    settings = Settings(redis_url=redis_server, data_dir=tmp_path, device="cpu")
+
+    def run(table: Any, **options: Any) -> bool:
+        return run_worker(settings, start=engine_of(table), **{"burst": True} | options)
+
+    return run
+
+
+@pytest.fixture
+def kinds(rq_queue: RqQueue) -> Callable[[], list[EventKind]]:
+    return lambda: [event.kind for _, event in rq_queue.tail("0", limit=100, wait_s=0)]
