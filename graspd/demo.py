@@ -16,7 +16,7 @@ from graspd.api.formatting import count, duration, metric
 from graspd.api.models import GraspQuery, JobDetail
 from graspd.client.client import Client
 from graspd.client.reports import JobDisplay, job_summary, means_of, yield_of
-from graspd.service.cli import JsonFlag, emit, load_settings, plain_console, reporting_errors, write_output
+from graspd.service.cli import CommandGroup, JsonFlag, emit, load_settings, plain_console, write_output
 from graspd.service.command_options import parsed_options
 from graspd.service.index.views import GraspView
 from graspd.service.model.domain import JobRequest
@@ -27,7 +27,7 @@ from graspd.service.store import validity
 from graspd.service.store.assets import builtin_files
 from graspd.service.store.shards import Shard, read_shard
 
-app = typer.Typer()
+app = CommandGroup()
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,6 @@ _SAMPLES: Final = 8
 
 
 @app.command("demo", epilog="graspd demo --out demo-out --grasps 32 --scenes 2 --views 3")
-@reporting_errors
 def demo(
     out: Annotated[Path, typer.Option(help="Folder for the service's data and the results.")] = Path("demo-out"),
     hand: Annotated[str, typer.Option(help="Built-in hand.")] = "allegro",

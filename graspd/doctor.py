@@ -14,13 +14,13 @@ from typing import Annotated, Final
 import typer
 
 from graspd.cli import missing_extra
-from graspd.service.cli import JsonFlag, emit, load_settings, reporting_errors
+from graspd.service.cli import CommandGroup, JsonFlag, emit, load_settings
 from graspd.service.model.errors import InputError
 from graspd.service.run.doctor import backends, fleet, machine
 from graspd.service.run.doctor.checks import THREADS, Check, Condition, Finding, run_checks, skipped
 from graspd.service.settings import Settings
 
-app = typer.Typer(no_args_is_help=False)
+app = CommandGroup(no_args_is_help=False)
 _COLOURS: Final = {
     Condition.GOOD: typer.colors.GREEN,
     Condition.WARNING: typer.colors.YELLOW,
@@ -30,7 +30,6 @@ _COLOURS: Final = {
 
 
 @app.command(epilog="graspd doctor --only redis,store,clocks")
-@reporting_errors
 def doctor(
     only: Annotated[str | None, typer.Option(help="Checks to run, separated by commas; default: all.")] = None,
     full: Annotated[bool, typer.Option("--full", help="Compare the whole index with the store, not a sample.")] = False,

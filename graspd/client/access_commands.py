@@ -12,10 +12,10 @@ from graspd.api.access.keys import Key, KeyFile, KeyLimits, ProjectLimits, Scope
 from graspd.api.formatting import minute
 from graspd.client.client import path_of
 from graspd.client.reports import UrlOption, YesOption, confirm, open_client, say_deleted
-from graspd.service.cli import JsonFlag, emit, load_settings, plain_console, plain_table, reporting_errors
+from graspd.service.cli import CommandGroup, JsonFlag, emit, load_settings, plain_console, plain_table
 from graspd.service.model.errors import InputError
 
-keys_app = typer.Typer(no_args_is_help=True, help="Make, list, rotate, limit and revoke API keys.")
+keys_app = CommandGroup(no_args_is_help=True, help="Make, list, rotate, limit and revoke API keys.")
 
 _UNITS: Final = {"s": "seconds", "m": "minutes", "h": "hours", "d": "days"}
 
@@ -33,7 +33,6 @@ JobsOption = Annotated[int | None, typer.Option(min=0, help="New jobs per day (U
 
 
 @keys_app.command("add", epilog="graspd keys add alice --scope submit --expires 90d --grasps-in-flight 100000")
-@reporting_errors
 def add_key(
     name: NameArgument,
     scope: Annotated[Scope, typer.Option(help="Scope of the key.")] = Scope.SUBMIT,
@@ -53,7 +52,6 @@ def add_key(
 
 
 @keys_app.command("rotate", epilog="graspd keys rotate alice --grace 24h")
-@reporting_errors
 def rotate_key(
     name: NameArgument,
     grace: Annotated[
@@ -69,7 +67,6 @@ def rotate_key(
 
 
 @keys_app.command("limit", epilog="graspd keys limit alice --requests-per-minute 60 --jobs-per-day 100")
-@reporting_errors
 def limit_key(
     name: NameArgument,
     requests_per_minute: RequestsOption = None,
@@ -90,7 +87,6 @@ def limit_key(
 
 
 @keys_app.command("list", epilog="graspd keys list --json")
-@reporting_errors
 def list_keys(json: JsonFlag = False) -> None:
     """List all keys, without their secrets."""
     found = _key_file().list()
@@ -108,7 +104,6 @@ def list_keys(json: JsonFlag = False) -> None:
 
 
 @keys_app.command("revoke", epilog="graspd keys revoke alice")
-@reporting_errors
 def revoke_key(name: NameArgument, json: JsonFlag = False) -> None:
     """Revoke a key; it is refused from the next request on."""
     _key_file().revoke(name)
@@ -159,11 +154,10 @@ def _key_file() -> KeyFile:
     return KeyFile(load_settings().resolved_keys_file)
 
 
-projects_app = typer.Typer(no_args_is_help=True, help="List projects of keys and set their limits.")
+projects_app = CommandGroup(no_args_is_help=True, help="List projects of keys and set their limits.")
 
 
 @projects_app.command("list", epilog="graspd projects list --json")
-@reporting_errors
 def list_projects(json: JsonFlag = False) -> None:
     """List projects of keys, and their limits. `graspd keys add NAME --project PROJECT` makes one."""
     file = KeyFile(load_settings().resolved_keys_file)
@@ -188,7 +182,6 @@ def list_projects(json: JsonFlag = False) -> None:
 @projects_app.command(
     "limit", epilog="graspd projects limit vision --grasps-per-day 1000000 --gpu-seconds-per-day 86400"
 )
-@reporting_errors
 def limit_project(
     name: Annotated[str, typer.Argument(help="Name of the project.")],
     grasps_in_flight: Annotated[int | None, typer.Option(min=0, help="Grasps in unfinished jobs; 0: no limit.")] = None,
@@ -220,7 +213,7 @@ def _project_limits(limits: ProjectLimits) -> str:
     return ", ".join(f"{value} {name.replace('_', ' ')}" for name, value in found.items()) or "none"
 
 
-webhooks_app = typer.Typer(
+webhooks_app = CommandGroup(
     no_args_is_help=True, help="Webhooks that receive a notification when jobs and datasets end."
 )
 
@@ -228,7 +221,6 @@ IdArgument = Annotated[str, typer.Argument(metavar="ID", help="Id of the webhook
 
 
 @webhooks_app.command("add", epilog="graspd webhooks add https://ci.example.org/graspd --on succeeded,failed")
-@reporting_errors
 def add_webhook(
     address: Annotated[str, typer.Argument(help="URL that receives the POST requests: https://host/path.")],
     on: Annotated[
@@ -249,7 +241,6 @@ def add_webhook(
 
 
 @webhooks_app.command("list", epilog="graspd webhooks list")
-@reporting_errors
 def list_webhooks(url: UrlOption = None, json: JsonFlag = False) -> None:
     """List webhooks that the key may change."""
     with open_client(url) as client:
@@ -264,7 +255,6 @@ def list_webhooks(url: UrlOption = None, json: JsonFlag = False) -> None:
 
 
 @webhooks_app.command("log", epilog="graspd webhooks log 1a2b3c")
-@reporting_errors
 def show_log(webhook: IdArgument, url: UrlOption = None, json: JsonFlag = False) -> None:
     """List deliveries of a webhook, newest first."""
     with open_client(url) as client:
@@ -281,7 +271,6 @@ def show_log(webhook: IdArgument, url: UrlOption = None, json: JsonFlag = False)
 
 
 @webhooks_app.command("delete", epilog="graspd webhooks delete 1a2b3c")
-@reporting_errors
 def delete_webhook(webhook: IdArgument, yes: YesOption = False, url: UrlOption = None, json: JsonFlag = False) -> None:
     """Delete a webhook and its secret."""
     with open_client(url) as client:

@@ -18,7 +18,7 @@ import typer
 from graspd.api.uploads import name_of_upload
 from graspd.client.client import Client
 from graspd.client.reports import UrlOption, open_client, show_asset
-from graspd.service.cli import JsonFlag, emit, reporting_errors
+from graspd.service.cli import JsonFlag, emit
 from graspd.service.command_options import with_options
 from graspd.service.model.errors import InputError
 from graspd.service.model.states import AssetKind
@@ -47,7 +47,6 @@ _SELF_TEST_S: Final = 900.0
 
 
 @with_options(HandWords, "asset")
-@reporting_errors
 def add_hand(
     file: Annotated[Path, typer.Argument(help="URDF, xacro or MJCF file with its meshes, its folder, or a ZIP of it.")],
     name: NameOption = None,
@@ -71,7 +70,6 @@ def add_hand(
 
 
 @with_options(SweptOptions, "asset")
-@reporting_errors
 def add_object(
     file: Annotated[Path, typer.Argument(help="Mesh, ZIP with one mesh, or folder or ZIP of many objects.")],
     name: NameOption = None,
@@ -97,7 +95,6 @@ def add_object(
     add(options=options, shared=shared, wait=wait, url=url, json=json)
 
 
-@reporting_errors
 def add_network(
     file: Annotated[Path, typer.Argument(help="NPZ file of the schema graspd/proposals@1.")],
     name: NameOption = None,

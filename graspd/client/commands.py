@@ -25,7 +25,7 @@ from graspd.client.reports import (
     show_job,
     watch,
 )
-from graspd.service.cli import JsonFlag, emit, plain_console, plain_table, reporting_errors
+from graspd.service.cli import CommandGroup, JsonFlag, emit, plain_console, plain_table
 from graspd.service.command_options import pairs, parsed_options, with_options
 from graspd.service.model.domain import NETWORK_METHODS, JobOptions, JobRequest
 from graspd.service.model.errors import InputError
@@ -33,14 +33,13 @@ from graspd.service.model.scene_spec import scene_option
 from graspd.service.model.states import AssetKind, State
 from graspd.service.store.asset_summary import hand_line, self_test_line
 
-app = typer.Typer(no_args_is_help=True)
+app = CommandGroup(no_args_is_help=True)
 
 JobArgument = Annotated[str, typer.Argument(help="Job id, or a prefix of it.")]
 
 
 @app.command(epilog="graspd submit --hand allegro --object mug.stl --grasps 320 --scenes 2 --views 3 --wait")
 @with_options(JobOptions, "job")
-@reporting_errors
 def submit(
     hand: Annotated[str, typer.Option(help="Name of a hand, or a URDF or ZIP to upload.")],
     object: Annotated[str, typer.Option(help="Name of an object, or a mesh file to upload.")],
@@ -68,7 +67,6 @@ def submit(
 
 
 @app.command(epilog="graspd jobs --state running")
-@reporting_errors
 def jobs(
     state: Annotated[State | None, typer.Option(help="Only jobs in this state.")] = None,
     limit: Annotated[int, typer.Option(min=1, max=200, help="Maximum number of jobs.")] = 20,
@@ -92,7 +90,6 @@ def jobs(
 
 
 @app.command(epilog="graspd status 3f2a --json")
-@reporting_errors
 def status(job_id: JobArgument, url: UrlOption = None, json: JsonFlag = False) -> None:
     """Show stages, progress and quality of a job."""
     with open_client(url) as client:
@@ -100,7 +97,6 @@ def status(job_id: JobArgument, url: UrlOption = None, json: JsonFlag = False) -
 
 
 @app.command(epilog="graspd cancel 3f2a")
-@reporting_errors
 def cancel(job_id: JobArgument, url: UrlOption = None, json: JsonFlag = False) -> None:
     """Cancel a job; its results remain."""
     with open_client(url) as client:
@@ -108,7 +104,6 @@ def cancel(job_id: JobArgument, url: UrlOption = None, json: JsonFlag = False) -
 
 
 @app.command(epilog="graspd delete 3f2a")
-@reporting_errors
 def delete(job_id: JobArgument, yes: YesOption = False, url: UrlOption = None, json: JsonFlag = False) -> None:
     """Delete an ended job. After a grace time its shards are deleted, unless another job uses them."""
     with open_client(url) as client:
@@ -120,7 +115,6 @@ def delete(job_id: JobArgument, yes: YesOption = False, url: UrlOption = None, j
 
 
 @app.command("restore", epilog="graspd restore 3f2a")
-@reporting_errors
 def restore_job(
     job_id: Annotated[str, typer.Argument(help="Id of a deleted job, or a prefix of it.")],
     url: UrlOption = None,
@@ -133,7 +127,6 @@ def restore_job(
 
 
 @app.command(epilog="graspd retry 3f2a --wait")
-@reporting_errors
 def retry(
     job_id: JobArgument,
     wait: Annotated[bool, typer.Option("--wait", help="Show progress until the job ends.")] = False,
@@ -149,7 +142,6 @@ def retry(
 
 
 @app.command(epilog="graspd logs 3f2a")
-@reporting_errors
 def logs(job_id: JobArgument, url: UrlOption = None, json: JsonFlag = False) -> None:
     """Show failed attempts of a job with their reasons."""
     with open_client(url) as client:
@@ -170,10 +162,9 @@ def logs(job_id: JobArgument, url: UrlOption = None, json: JsonFlag = False) -> 
 def asset_commands(kind: AssetKind) -> typer.Typer:
     """Create `graspd hands ...`, `graspd objects ...` or `graspd networks ...`."""
     verbs = "Add, list, show and delete" if kind is AssetKind.NETWORK else "Check, add, list, show and delete"
-    group = typer.Typer(no_args_is_help=True, help=f"{verbs} {kind.value}s.")
+    group = CommandGroup(no_args_is_help=True, help=f"{verbs} {kind.value}s.")
 
     @group.command("list", help=f"List {kind.value}s, by default without refused ones.")
-    @reporting_errors
     def list_assets(
         refused: Annotated[bool, typer.Option("--refused", help="Include refused ones.")] = False,
         url: UrlOption = None,
@@ -197,7 +188,6 @@ def asset_commands(kind: AssetKind) -> typer.Typer:
         plain_console().print(table)
 
     @group.command("show", help=f"Show a {kind.value} with the findings of its check.")
-    @reporting_errors
     def show(
         name: Annotated[str, typer.Argument(help="Name of the asset.")], url: UrlOption = None, json: JsonFlag = False
     ) -> None:
@@ -211,7 +201,6 @@ def asset_commands(kind: AssetKind) -> typer.Typer:
         help=f"Delete a {kind.value} that no job, dataset or set of objects uses.",
         epilog=f"graspd {kind.value}s delete my_{kind.value}",
     )
-    @reporting_errors
     def delete_asset(
         name: Annotated[str, typer.Argument(help="Name or digest of the asset.")],
         yes: YesOption = False,
@@ -230,7 +219,6 @@ def asset_commands(kind: AssetKind) -> typer.Typer:
         help=f"Restore a deleted {kind.value} within the grace time.",
         epilog=f"graspd {kind.value}s restore my_{kind.value}",
     )
-    @reporting_errors
     def restore_asset(
         name: Annotated[str, typer.Argument(help="Name or digest of the asset.")],
         url: UrlOption = None,
@@ -249,7 +237,6 @@ networks_app.command("add", epilog="graspd networks add barrett.npz")(add_networ
 
 
 @objects_app.command("sets", epilog="graspd objects sets")
-@reporting_errors
 def sets(url: UrlOption = None, json: JsonFlag = False) -> None:
     """List sets of objects; `graspd objects add FOLDER` makes one."""
     with open_client(url) as client:

@@ -26,7 +26,7 @@ from graspd.client.reports import (
     say_deleted,
     watch_dataset,
 )
-from graspd.service.cli import JsonFlag, emit, plain_console, plain_table, reporting_errors
+from graspd.service.cli import CommandGroup, JsonFlag, emit, plain_console, plain_table
 from graspd.service.command_options import parsed_options, with_options
 from graspd.service.index.views import DatasetView
 from graspd.service.model.domain import JobOptions
@@ -37,8 +37,8 @@ from graspd.service.pipeline.datasets.export import FORMATS
 from graspd.service.pipeline.datasets.spec import DatasetRequest, Matrix
 from graspd.service.store.object_sets import Objects, files_of_set
 
-app = typer.Typer(no_args_is_help=True)
-group = typer.Typer(no_args_is_help=True, help="Datasets of hands x objects: cost, status, snapshots, files.")
+app = CommandGroup(no_args_is_help=True)
+group = CommandGroup(no_args_is_help=True, help="Datasets of hands x objects: cost, status, snapshots, files.")
 app.add_typer(group, name="datasets")
 
 NameArgument = Annotated[str, typer.Argument(help="Name of the dataset.")]
@@ -52,7 +52,6 @@ WaitOption = Annotated[bool, typer.Option("--wait", help="Show progress until th
 
 @group.command(epilog="graspd datasets create kitchen --hands allegro,shadow --objects ./ycb --grasps 1000")
 @with_options(JobOptions, "job")
-@reporting_errors
 def create(
     name: Annotated[str | None, typer.Argument(help="Name of the dataset; default: the name in the spec.")] = None,
     hands: HandsOption = None,
@@ -100,7 +99,6 @@ def create(
 
 @group.command(epilog="graspd datasets estimate --hands allegro --objects mug --grasps 1000000 --scenes 2 --views 3")
 @with_options(JobOptions, "job")
-@reporting_errors
 def estimate(
     hands: HandsOption = None,
     objects: ObjectsOption = None,
@@ -122,7 +120,6 @@ def estimate(
 
 
 @group.command("list", epilog="graspd datasets list")
-@reporting_errors
 def list_datasets(
     limit: Annotated[int, typer.Option(min=1, max=200, help="Maximum number of datasets.")] = 20,
     url: UrlOption = None,
@@ -148,7 +145,6 @@ def list_datasets(
 
 
 @group.command(epilog="graspd datasets status kitchen --state failed")
-@reporting_errors
 def status(
     name: NameArgument,
     state: Annotated[State | None, typer.Option(help="Only cells in this state.")] = None,
@@ -166,7 +162,6 @@ def status(
 
 
 @group.command(epilog="graspd datasets cancel kitchen")
-@reporting_errors
 def cancel(name: NameArgument, url: UrlOption = None, json: JsonFlag = False) -> None:
     """Cancel a dataset; its results remain."""
     with open_client(url) as client:
@@ -174,7 +169,6 @@ def cancel(name: NameArgument, url: UrlOption = None, json: JsonFlag = False) ->
 
 
 @group.command(epilog="graspd datasets delete kitchen")
-@reporting_errors
 def delete(
     name: NameArgument,
     yes: YesOption = False,
@@ -195,14 +189,12 @@ def delete(
 
 
 @group.command("restore", epilog="graspd datasets restore kitchen")
-@reporting_errors
 def restore_dataset(name: NameArgument, url: UrlOption = None, json: JsonFlag = False) -> None:
     """Restore a deleted dataset with its jobs and snapshots, within the grace time."""
     restore(url, "dataset", name, json=json)
 
 
 @group.command(epilog="graspd datasets retry kitchen --wait")
-@reporting_errors
 def retry(name: NameArgument, wait: WaitOption = False, url: UrlOption = None, json: JsonFlag = False) -> None:
     """Restart failed and cancelled jobs; existing results are reused."""
     with open_client(url) as client:
@@ -214,7 +206,6 @@ def retry(name: NameArgument, wait: WaitOption = False, url: UrlOption = None, j
 
 
 @group.command(epilog="graspd datasets snapshot kitchen")
-@reporting_errors
 def snapshot(name: NameArgument, url: UrlOption = None, json: JsonFlag = False) -> None:
     """Record the present shards of a dataset as an immutable list."""
     with open_client(url) as client:
@@ -230,7 +221,6 @@ def snapshot(name: NameArgument, url: UrlOption = None, json: JsonFlag = False) 
 
 
 @group.command(epilog="graspd datasets export kitchen -o kitchen-v1 --snapshot 3f2a...")
-@reporting_errors
 def export(
     name: NameArgument,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write; an interrupted export is continued.")],

@@ -11,10 +11,10 @@ import typer
 from graspd.api.formatting import count, minute
 from graspd.client.client import path_of
 from graspd.client.reports import UrlOption, YesOption, confirm, open_client, restore, say_deleted
-from graspd.service.cli import JsonFlag, emit, plain_console, plain_table, reporting_errors
+from graspd.service.cli import CommandGroup, JsonFlag, emit, plain_console, plain_table
 from graspd.service.model.errors import InputError
 
-app = typer.Typer(no_args_is_help=True, help="Tag grasps of the service; list and export tagged ones.")
+app = CommandGroup(no_args_is_help=True, help="Tag grasps of the service; list and export tagged ones.")
 
 #: Longest wait for the first byte while the service writes the file [s].
 _PATIENCE_S: Final = 600.0
@@ -29,7 +29,6 @@ DatasetOption = Annotated[str | None, typer.Option(help="Only grasps of this dat
 
 
 @app.command("list", epilog="graspd tags list")
-@reporting_errors
 def list_tags(url: UrlOption = None, json: JsonFlag = False) -> None:
     """List tags with their numbers of grasps."""
     with open_client(url) as client:
@@ -44,7 +43,6 @@ def list_tags(url: UrlOption = None, json: JsonFlag = False) -> None:
 
 
 @app.command("add", epilog='graspd tags add good --dataset kitchen --where "epsilon > 0.3 and lift"')
-@reporting_errors
 def add_tag(
     tag: NameArgument,
     grasps: GraspsArgument = None,
@@ -61,7 +59,6 @@ def add_tag(
 
 
 @app.command("remove", epilog='graspd tags remove good --where "penetration_depth_mm > 1"')
-@reporting_errors
 def remove_tag(
     tag: NameArgument,
     grasps: GraspsArgument = None,
@@ -80,7 +77,6 @@ def remove_tag(
 
 
 @app.command("delete", epilog="graspd tags delete good")
-@reporting_errors
 def delete_tag(tag: NameArgument, yes: YesOption = False, url: UrlOption = None, json: JsonFlag = False) -> None:
     """Delete a tag; its grasps remain."""
     path = path_of("tags", tag)
@@ -92,14 +88,12 @@ def delete_tag(tag: NameArgument, yes: YesOption = False, url: UrlOption = None,
 
 
 @app.command("restore", epilog="graspd tags restore good")
-@reporting_errors
 def restore_tag(tag: NameArgument, url: UrlOption = None, json: JsonFlag = False) -> None:
     """Restore a deleted tag of grasps within the grace time."""
     restore(url, "tag", tag, json=json)
 
 
 @app.command("export", epilog="graspd tags export good -o good.zip")
-@reporting_errors
 def export_tag(
     tag: NameArgument,
     out: Annotated[Path, typer.Option("--out", "-o", help="File to write: .zip (base shards), .csv or .json (rows).")],

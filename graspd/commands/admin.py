@@ -10,18 +10,17 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from graspd.service.cli import JsonFlag, emit, reporting_errors
+from graspd.service.cli import CommandGroup, JsonFlag, emit
 from graspd.service.model.errors import InputError
 from graspd.worker.engines.devices import Device
 
 if TYPE_CHECKING:
     from graspd.worker.objects.model import ObjectModel
 
-app = typer.Typer(add_completion=False)
+app = CommandGroup(add_completion=False)
 
 
 @app.command(epilog="graspd admin kernels ./kernels --arch 90")
-@reporting_errors
 def kernels(
     folder: Annotated[Path, typer.Argument(help="Folder of the kernels, to be set as GRASPD_KERNELS.")],
     arch: Annotated[list[int] | None, typer.Option(help="GPU architecture, such as 90; repeatable.")] = None,
@@ -53,7 +52,6 @@ def kernels(
 
 
 @app.command("bench-render", epilog="graspd admin bench-render --object mug --size 320x240 --size 640x480")
-@reporting_errors
 def bench_render(
     object: Annotated[str, typer.Option(help="Mesh or built-in object.")] = "mug",
     size: Annotated[list[str] | None, typer.Option(help="Picture size, WIDTHxHEIGHT; repeatable.")] = None,
@@ -78,7 +76,6 @@ def bench_render(
 
 
 @app.command(epilog="graspd admin gallery --object mug --object banana.stl -o docs/images/scenes")
-@reporting_errors
 def gallery(
     object: Annotated[list[str] | None, typer.Option(help="Built-in object, mesh, or NAME=MESH; repeatable.")] = None,
     hand: Annotated[list[str] | None, typer.Option(help="URDF or built-in hand; repeatable.")] = None,

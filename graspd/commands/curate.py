@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from graspd.service.cli import JsonFlag, emit, plain_console, plain_table, reporting_errors
+from graspd.service.cli import CommandGroup, JsonFlag, emit, plain_console, plain_table
 from graspd.service.model.errors import InputError
 from graspd.service.readers import Pictures
 from graspd.service.readers.clouds import Frame
@@ -17,8 +17,8 @@ from graspd.worker.files.clouds import hand_surface, write_clouds
 from graspd.worker.files.curation import KINDS, Balance, difference
 from graspd.worker.files.subsets import Subset, shards_of, write_subset
 
-app = typer.Typer(no_args_is_help=True, add_completion=False)
-group = typer.Typer(no_args_is_help=True, help="Select grasps of files and datasets by their metrics.")
+app = CommandGroup(no_args_is_help=True, add_completion=False)
+group = CommandGroup(no_args_is_help=True, help="Select grasps of files and datasets by their metrics.")
 app.add_typer(group, name="grasps")
 
 SourceArgument = Annotated[str, typer.Argument(help="File, folder of shards, or name of a dataset in the store.")]
@@ -31,7 +31,6 @@ def grasps() -> None:
 
 
 @group.command(epilog='graspd grasps where "epsilon > 0.3 and lift and robust >= 0.75" --from kitchen -o subset')
-@reporting_errors
 def where(
     expression: Annotated[
         str, typer.Argument(help="Expression of metrics, valid, feasible, held and lift with and, or, not.")
@@ -53,7 +52,6 @@ def where(
 
 
 @app.command(epilog="graspd datasets balance kitchen --by type,direction -o even")
-@reporting_errors
 def balance(
     source: SourceArgument,
     out: OutOption,
@@ -79,7 +77,6 @@ def balance(
 
 
 @app.command(epilog="graspd datasets diff kitchen-v1 kitchen-v2 --json")
-@reporting_errors
 def diff(first: SourceArgument, second: SourceArgument, json: JsonFlag = False) -> None:
     """Compare two datasets, or two snapshots, given as NAME@SNAPSHOT."""
     found = difference(*(shards_of(*_version(one)) for one in (first, second)))
@@ -126,7 +123,6 @@ def _tell(found: Subset, out: Path, *, json: bool) -> None:
 
 
 @app.command(epilog="graspd clouds kitchen --points 1024 --noise stereo -o clouds")
-@reporting_errors
 def clouds(
     source: Annotated[str, typer.Argument(help="Folder of shards with pictures, or name of a dataset in the store.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write; it must be new or empty.")],

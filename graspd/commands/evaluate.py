@@ -12,7 +12,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedCo
 from rich.table import Table
 
 from graspd.exchange.inputs import expand, load_case
-from graspd.service.cli import JsonFlag, emit, plain_console, reporting_errors
+from graspd.service.cli import CommandGroup, JsonFlag, emit, plain_console
 from graspd.service.model.errors import InputError, one_of
 from graspd.service.model.metrics import AXIS_MEANINGS, MOST_ROBUST_MODELS
 from graspd.service.store.shards import carried, json_attribute, read_shard, write_shard
@@ -24,7 +24,7 @@ from graspd.worker.validation.key import Level
 from graspd.worker.validation.lifting import LiftLevel
 from graspd.worker.validation.robust import Robustness
 
-app = typer.Typer(add_completion=False)
+app = CommandGroup(add_completion=False)
 
 #: Columns of the printed table: key, heading, digits.
 _COLUMNS: Final = (
@@ -43,7 +43,6 @@ _COLUMNS: Final = (
 
 
 @app.command(name="evaluate", epilog="graspd evaluate grasps.h5 --level dexgraspbench")
-@reporting_errors
 def evaluate_command(
     files: Annotated[
         list[Path],

@@ -11,7 +11,7 @@ import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from graspd.exchange.opening import opened
-from graspd.service.cli import JsonFlag, emit, load_settings, plain_console, reporting_errors
+from graspd.service.cli import CommandGroup, JsonFlag, emit, load_settings, plain_console
 from graspd.service.model.errors import InputError, one_of
 from graspd.service.store import validity
 from graspd.service.store.shards import read_shard
@@ -19,7 +19,7 @@ from graspd.service.store.store import open_store
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.files.subsets import EveryOption, UnvalidatedOption, choose
 
-app = typer.Typer(no_args_is_help=True)
+app = CommandGroup(no_args_is_help=True)
 
 #: Formats of robots and their simulators; the first has two names.
 ROBOTS: Final = ("moveit", "urdf+yaml", "mujoco", "usd", "glb", "isaac", "csv")
@@ -32,7 +32,6 @@ IMPORTS: Final = ("dexgraspbench", "dexlearn", *NAMED, "dexgraspnet", "dexgraspn
 
 
 @app.command(epilog="graspd export grasps.h5 --format dexgraspbench -o bench")
-@reporting_errors
 def export(
     source: Annotated[Path, typer.Argument(help="Shard; for webdataset and training a folder of shards.")],
     format_: Annotated[str, typer.Option("--format", help=", ".join(EXPORTS) + ".")] = "images",
@@ -109,7 +108,6 @@ def export(
 @app.command(
     "import", epilog="graspd import grasps.npy --format dexgraspnet --hand shadow --object mug.obj -o imported"
 )
-@reporting_errors
 def import_(
     source: Annotated[Path, typer.Argument(help="File or folder of grasps.")],
     format_: Annotated[str, typer.Option("--format", help=", ".join(IMPORTS) + ".")],
@@ -269,7 +267,6 @@ def _summary(file: Path) -> dict[str, Any]:
 
 
 @app.command(epilog="graspd datasets card kitchen -o kitchen-v1 --licence CC-BY-4.0")
-@reporting_errors
 def card(
     source: Annotated[
         str, typer.Argument(metavar="NAME", help="Dataset of the store, or folder of shards, such as ./kitchen-v1.")

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from graspd.service.cli import JsonFlag, emit, reporting_errors
+from graspd.service.cli import CommandGroup, JsonFlag, emit
 from graspd.service.command_options import with_options
 from graspd.service.model.errors import GraspdError, InputError
 from graspd.service.model.object_options import ObjectOptions
@@ -18,12 +18,11 @@ from graspd.service.store.object_sets import Objects, files_of_set
 from graspd.worker.objects.check import check_object
 from graspd.worker.objects.prepare import files_from_path, object_from_path
 
-app = typer.Typer(add_completion=False)
+app = CommandGroup(add_completion=False)
 
 
 @app.command("check", epilog="graspd objects check banana.stl --units mm --picture banana.png")
 @with_options(ObjectOptions, "asset")
-@reporting_errors
 def check(
     file: Annotated[
         str, typer.Argument(help="Mesh (STL, OBJ, PLY, OFF, GLB), built-in object, or folder or ZIP of one or many.")

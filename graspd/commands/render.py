@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 from graspd.commands.grasp_sheet import GraspAnimation, GraspSheet
-from graspd.service.cli import JsonFlag, emit, plain_console, reporting_errors, write_output
+from graspd.service.cli import CommandGroup, JsonFlag, emit, plain_console, write_output
 from graspd.service.model.errors import InputError
 from graspd.service.model.scene_spec import supports_in
 from graspd.service.model.transforms import compose
@@ -45,14 +45,13 @@ from graspd.worker.rendering.trajectory_pictures import animation_kind
 from graspd.worker.rendering.views import Extras
 from graspd.worker.rendering.views import render as render_views
 
-app = typer.Typer(add_completion=False)
+app = CommandGroup(add_completion=False)
 
 _Device = Annotated[str, typer.Option(help="Warp device: cpu, cuda:0, or auto.")]
 _Object = Annotated[str | None, typer.Option(help="Object file; default: found by its digest.")]
 
 
 @app.command(epilog="graspd render scenes.h5 --views 3 --stereo -o views.h5 --page views.png")
-@reporting_errors
 def render(
     scenes: Annotated[Path, typer.Argument(help="Scene shard, or base shard of grasps in scenes.")],
     views: Annotated[int, typer.Option(min=1, max=4096, help="Camera placements per scene.")] = 3,
@@ -129,7 +128,6 @@ def render(
 
 
 @app.command(epilog="graspd pictures grasps.h5 -o sheet.png --three-sides")
-@reporting_errors
 def pictures(
     grasps: Annotated[Path, typer.Argument(help="Base shard, as written by `graspd synth`.")],
     count: Annotated[
@@ -261,7 +259,6 @@ def _progress(quiet: bool) -> Progress:
 
 
 @app.command(epilog="graspd view grasps.h5")
-@reporting_errors
 def view(
     grasps: Annotated[Path, typer.Argument(help="Base shard, as written by `graspd synth`.")],
     host: Annotated[

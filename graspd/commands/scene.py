@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from graspd.service.cli import JsonFlag, emit, reporting_errors, write_output
+from graspd.service.cli import CommandGroup, JsonFlag, emit, write_output
 from graspd.service.store.columns import Attribute
 from graspd.service.store.shards import read_shard, write_shard
 from graspd.worker.files.provenance import (
@@ -28,11 +28,10 @@ from graspd.worker.scenes.neighbours import Neighbours, drop_together
 from graspd.worker.scenes.rest import rolling_note, rolling_poses
 from graspd.worker.scenes.simulate import drop
 
-app = typer.Typer(add_completion=False)
+app = CommandGroup(add_completion=False)
 
 
 @app.command(epilog="graspd scene grasps.h5 --scenes 4 -o scenes.h5")
-@reporting_errors
 def scene(
     grasps: Annotated[Path, typer.Argument(help="Base shard, as written by `graspd synth`.")],
     scenes: Annotated[int, typer.Option(min=1, max=4096, help="Number of scenes.")] = 2,

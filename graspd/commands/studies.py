@@ -14,7 +14,7 @@ from typing import Annotated, Any, Final
 
 import typer
 
-from graspd.service.cli import JsonFlag, emit, load_settings, reporting_errors
+from graspd.service.cli import CommandGroup, JsonFlag, emit, load_settings
 from graspd.service.model.clock import timestamp
 from graspd.service.model.cores import available_cores
 from graspd.service.model.errors import InputError, one_of
@@ -27,11 +27,10 @@ from graspd.service.model.version import PACKAGE_VERSION
 from graspd.worker.engines.devices import Device
 from graspd.worker.execution_context import ExecutionContext
 
-app = typer.Typer()
+app = CommandGroup()
 
 
 @app.command(epilog="graspd bench --hand allegro --object mug --batch 1 --batch 32 --out bench")
-@reporting_errors
 def bench(
     hand: Annotated[str, typer.Option(help="URDF, ZIP with a URDF, or built-in hand.")] = "allegro",
     object_: Annotated[str, typer.Option("--object", help="Mesh or built-in object.")] = "mug",
@@ -105,7 +104,6 @@ STUDIES: Final = (
 
 
 @app.command(epilog="graspd stability --only gradient --only starts --out stability --publish")
-@reporting_errors
 def stability(
     only: Annotated[list[str] | None, typer.Option(help=f"Study: {', '.join(STUDIES)}; repeatable.")] = None,
     hand: Annotated[str, typer.Option(help="URDF or built-in hand.")] = "allegro",
@@ -192,7 +190,6 @@ PEERS = ("fast_graspd", "graspit", "graspd2022", "dfc", "autograsp")
 
 
 @app.command(epilog="graspd chart --methods fast_graspd,autograsp --hands allegro --objects mug,bottle --out chart")
-@reporting_errors
 def chart(
     methods: Annotated[
         str, typer.Option(help="Planners, separated by commas; also as NAME:OPTION=VALUE@GRASPS_PER_CALL.")

@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 import typer
 
 from graspd.service.cli import (
+    CommandGroup,
     JsonFlag,
     emit,
     engine_settings,
     fail,
     plain_console,
-    reporting_errors,
     told_to_stop,
     write_output,
 )
@@ -30,14 +30,13 @@ from graspd.service.store.shards import write_shard
 if TYPE_CHECKING:
     from graspd.worker.execution_context import Progress as Report
 
-app = typer.Typer()
+app = CommandGroup()
 #: Exit code of a run that found fewer grasps than requested.
 FEWER: Final = 3
 
 
 @app.command(epilog="graspd synth --hand allegro --object mug -n 32 -o grasps.h5")
 @with_options(LocalOptions, "synth")
-@reporting_errors
 def synth(
     hand: Annotated[str, typer.Option(help="URDF, ZIP with a URDF, or name of a built-in hand.")],
     object_: Annotated[str, typer.Option("--object", help="Mesh (STL, OBJ, PLY, GLB, OFF) or built-in object.")],

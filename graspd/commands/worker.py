@@ -11,17 +11,16 @@ from typing import Annotated
 
 import typer
 
-from graspd.service.cli import keep_private, load_settings, log_to_stderr, reporting_errors
+from graspd.service.cli import CommandGroup, keep_private, load_settings, log_to_stderr
 from graspd.service.model.errors import InputError, UnavailableError
 from graspd.service.model.libraries import imports
 from graspd.service.model.states import Stage
 from graspd.service.settings import Settings
 
-app = typer.Typer(no_args_is_help=True)
+app = CommandGroup(no_args_is_help=True)
 
 
 @app.command(epilog="graspd worker --workers 4 --stages synthesize,render")
-@reporting_errors
 def worker(
     device: Annotated[str | None, typer.Option(help="Device: cpu, cuda:0, ... or auto; GRASPD_DEVICE.")] = None,
     stages: Annotated[str | None, typer.Option(help="Stages to serve, separated by commas; default: all.")] = None,

@@ -6,13 +6,13 @@ import json
 from pathlib import Path
 
 import pytest
-import typer
 from starlette.testclient import TestClient
 from typer.testing import CliRunner
 
 from graspd.client import add_commands
 from graspd.client.add_commands import add_object, upload_of
 from graspd.client.client import Client
+from graspd.service.cli import CommandGroup
 from graspd.service.model.errors import InputError
 from graspd.service.model.states import AssetKind
 from graspd.service.store.asset_options import sizes_of
@@ -38,7 +38,7 @@ def add(monkeypatch: pytest.MonkeyPatch, http: TestClient, *arguments: str) -> t
     client._http = http
     monkeypatch.setattr(client, "close", lambda: None)
     monkeypatch.setattr(add_commands, "open_client", lambda url: client)
-    app = typer.Typer()
+    app = CommandGroup()
     app.command()(add_object)
     result = CliRunner().invoke(app, [*arguments, "--no-wait", "--json"])
     return result.exit_code, json.loads(result.stdout.splitlines()[-1])
