@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 
 from graspd.exchange.dexgraspnet2_graspness import SceneGraspness, surface_samples
 from graspd.exchange.imported import ImportedGrasps, completed, joints_by_name, scaled_object, verdicts
-from graspd.exchange.plan import ExportPart, ExportSummary, PictureReference, by_scene, looks, plain_name
+from graspd.exchange.plan import ExportPart, ExportSummary, PictureReference, by_scene, plain_name
 from graspd.service.model.base import why
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import Floats, apply, compose, invert, pose_from_matrix, pose_to_matrix
@@ -69,27 +69,12 @@ _MEMBERS: Final = 1024
 def write(
     lots: Sequence[ExportPart], pictures: Pictures, folder: Path, out: frozenset[str], noise: DepthNoise | None = None
 ) -> ExportSummary:
-    """Write each scene that has pictures and grasps.
-
-    Args:
-        lots: grasps, planned in the scenes or carried over into them.
-        pictures: pictures of the scenes.
-        folder: laid out like a checkout; created if missing.
-        out: held-out objects.
-        noise: depth camera whose noise is applied; None: perfect depth.
-
-    Returns:
-        numbers of grasps, scenes, views and files of grasps.
-
-    Raises:
-        InputError: the folder already exists, there are no pictures, there are more scenes than numbers in the
-            splits, or a joint has the name of another key.
-    """
+    """Write each scene that has pictures and grasps, planned in it or carried over into it."""
     top = folder / "data"
     if top.exists():
         raise InputError(f"{top} is there already; give another folder as --output")
     known = {lot.id: lot for lot in lots}
-    seen = by_scene(list(looks(pictures))).values()
+    seen = by_scene(pictures)
     scenes = [some for some in seen if some[0].base in known and len(some[0].rows)]
     if not scenes:
         if any(some[0].base in known for some in seen):
@@ -139,7 +124,7 @@ def _write_scene(
     kinds = ((path / "depth_gt", "png"), (path / "label_gt", "png"), (path / "meta", "mat"), (values, "npy"))
     for folder, _ in kinds:
         folder.mkdir(parents=True)
-    first = pose_to_matrix(invert(pose_from_matrix(some[0].extrinsics)))
+    first = pose_to_matrix(_camera(some[0]))
     poses = [pose_to_matrix(compose(pose_from_matrix(some[0].extrinsics), _camera(look))) for look in some]
     np.save(path / "cam0_wrt_table.npy", first)
     np.save(path / "camera_poses.npy", np.array([poses[view % len(some)] for view in range(VIEWS)]))
@@ -194,26 +179,17 @@ def _write_grasps(look: PictureReference, lot: ExportPart, folder: Path, graspne
     arrays: dict[str, Any] = {"translation": matrices[:, :3, 3], "rotation": matrices[:, :3, :3], "point": point}
     arrays |= {name: some["grasp"].joint_positions[:, k] for k, name in enumerate(names)}
     # Its loader ignores these arrays; they are needed to import the grasps unchanged.
-    arrays |= {
-        f"{name}_qpos": np.concatenate([placed[name], some[name].joint_positions], axis=1)
-        for name in ("pregrasp", "squeeze")
-    }
+    for name in ("pregrasp", "squeeze"):
+        arrays[f"{name}_qpos"] = np.concatenate([placed[name], some[name].joint_positions], axis=1)
     arrays |= {"success": lot.verdict[look.rows], "row": look.rows}
     folder.mkdir(parents=True)
     np.savez_compressed(folder / f"{lot.name}.npz", **arrays)
 
 
 def read(path: Path, *, hand: str, obj: str, number: int = 0) -> list[ImportedGrasps]:
-    """Read the grasps of one object in one scene, in the object's frame.
+    """Read `dex_grasps_new/SCENE/HAND/OBJECT.npz` in its folder `data` with the scene's `meta`; object frame.
 
-    Args:
-        path: `dex_grasps_new/SCENE/HAND/OBJECT.npz`, in its folder `data` with the scene's `meta`.
-        hand: URDF or built-in hand with their root link and joints.
-        obj: mesh of the object.
-        number: index of the object in the scene, from 0.
-
-    Raises:
-        InputError: the file is of another kind, its scene is missing, or its joints are not the hand's.
+    `number` is the index of the object in the scene, from 0.
     """
     found = load_npz(path)
     try:
@@ -232,17 +208,12 @@ def read(path: Path, *, hand: str, obj: str, number: int = 0) -> list[ImportedGr
     except ValueError as error:
         raise InputError(f"{path} has not one value of each joint for each of {count} grasps: {error}") from None
     grasp = Posture(compose(away, pose_from_matrix(matrices)), joints_by_name(model, names, values, what=str(path)))
-    published = found.get("success")
-    set_ = _with_ours(path, model, found, grasp, away)
-    return [
-        ImportedGrasps(
-            model,
-            thing,
-            completed(model, thing, grasp) if set_ is None else set_,
-            path.stem,
-            published=None if published is None or len(np.ravel(published)) != count else verdicts(published),
-        )
-    ]
+    grasps = _with_ours(path, model, found, grasp, away)
+    if grasps is None:
+        grasps = completed(model, thing, grasp)
+    success = found.get("success")
+    published = None if success is None or np.size(success) != count else verdicts(success)
+    return [ImportedGrasps(model, thing, grasps, path.stem, published=published)]
 
 
 def _with_ours(
@@ -283,11 +254,7 @@ def _object_pose(path: Path, number: int) -> Floats:
 
 
 def load_npz(path: Path) -> dict[str, NDArray[Any]]:
-    """Load the arrays of a `.npz` file.
-
-    Raises:
-        InputError: the file is missing, contains objects, or unpacks to more than `LARGEST`.
-    """
+    """Load the arrays of a `.npz` file without objects that unpacks to at most `LARGEST`."""
     try:
         with zipfile.ZipFile(path) as archive:
             members = archive.infolist()

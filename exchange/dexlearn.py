@@ -8,7 +8,7 @@ The folder overlays a checkout of DexLearn (Chen et al., baselines of BODex and 
     object/graspd/vision_data/azure_kinect_dk/SCENE_ID/partial_pc_NN.npy    (P, 3) points [m]
 
 Root poses and points share one frame: the table's or, for grasps of a free object, the object's. Roots and joints are
-those of a hand model that DexGraspBench evaluates, see `bench_mapping`.
+those of a hand model that DexGraspBench evaluates, see `bench_hand`.
 """
 
 from __future__ import annotations

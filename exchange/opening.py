@@ -19,11 +19,7 @@ from graspd.service.parquet import arrow
 
 @contextmanager
 def opened(folder: Path) -> Iterator[None]:
-    """Open all files that are written into a folder within this context, regardless of their names.
-
-    Raises:
-        GraspdError: a library of the target cannot read a file.
-    """
+    """Open all files that are written into a folder within this context; GraspdError if a library cannot read one."""
     before = _stamps(folder)
     yield
     for path, stamp in sorted(_stamps(folder).items()):

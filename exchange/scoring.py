@@ -34,23 +34,8 @@ def write_scored(
 ) -> Path:
     """Validate and measure a set of grasps and write it as a base shard, its object's mesh beside it.
 
-    Grasps in scenes are tested by a lift; the hand's trajectory is replanned, as for our own grasps.
-
-    Args:
-        found: the grasps.
-        origin: stored in the shard's attributes.
-        folder: output folder; created if missing.
-        validator: level of the verdicts, or none.
-        friction: Coulomb coefficient of the metrics.
-        ordinal: index of the set, part of the file's name.
-        run: receives the progress; polled for cancellation.
-
-    Returns:
-        the shard's path.
-
-    Raises:
-        InputError: the level is unknown, or the file already exists.
-        MeshError: the object has no convex pieces for the validator.
+    Grasps in scenes are tested by a lift; the hand's trajectory is replanned, as for our own grasps. `validation` is
+    the level of the verdicts, or none; `ordinal` is the index of the set, part of the file's name.
     """
     name = plain_name(found.name)
     path = folder / f"{plain_name(found.hand.name)}-{name}-{ordinal:03}.h5"

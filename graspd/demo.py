@@ -113,7 +113,7 @@ def run(
     top = client.grasps(GraspQuery(job=job.id, valid=True), limit=10).items
     folder = out / "shards"
     folder.mkdir(exist_ok=True)
-    files = [client.download(shard, folder / f"{shard.kind}-{shard.batch:04}.h5") for shard in job.shards]
+    files = [client.save(shard.file, folder / f"{shard.kind}-{shard.batch:04}.h5") for shard in job.shards]
     return job, top, sorted(files)
 
 

@@ -17,7 +17,7 @@ from graspd.worker.hands.collisions import resting_neighbours
 from graspd.worker.hands.load import HandSource, body_model, files_from_path
 from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.options import HandOptions
-from graspd.worker.hands.robot import FREE, MOVING, Robot, chain_to
+from graspd.worker.hands.robot import FREE, MOVING, chain_to
 from graspd.worker.hands.tree import build_tree
 
 
@@ -40,11 +40,6 @@ def read_arm(path: str | Path, mount: str, hand_pose: Floats) -> Arm:
 
     Links below the mount, such as a gripper, are omitted. Joints that do not lead to it are fixed at zero, or at the
     nearest value inside their limits.
-
-    Raises:
-        NotFoundError: the file is missing.
-        HandError: the description is unusable.
-        InputError: the mount link is missing, or no joint moves it.
     """
     name, files, stated = files_from_path(path)
     source = HandSource.read(files, stated, name=name, digest=digest_files(AssetKind.HAND, files))
@@ -52,7 +47,8 @@ def read_arm(path: str | Path, mount: str, hand_pose: Floats) -> Arm:
     if mount not in robot.links:
         near = ", ".join(list(robot.links)[-6:])
         raise InputError(f"the arm {name} has no link {mount[:80]!r} to mount a hand on; its last links: {near}")
-    moving = [joint.name for joint in chain_to(robot, mount) if joint.type in MOVING]
+    chain = {joint.name: joint.type for joint in chain_to(robot, mount)}
+    moving = {name for name, kind in chain.items() if kind in MOVING}
     if not moving:
         raise InputError(f"no joint of the arm {name} moves the link {mount!r}; name the link behind its last joint")
     chosen = HandOptions(
@@ -60,28 +56,17 @@ def read_arm(path: str | Path, mount: str, hand_pose: Floats) -> Arm:
         xacro=source.options.xacro,
         root=robot.root,
         drop=tuple(joint.child for joint in robot.joints.values() if joint.parent == mount),
-        fix={joint: _rest(robot, joint) for joint in _others(robot, moving, mount)},
+        fix={
+            joint.name: float(np.clip(0.0, joint.lower, joint.upper))
+            for joint in robot.joints.values()
+            if joint.name not in moving and joint.type != "fixed" and (joint.name not in chain or joint.type in FREE)
+        },
     )
     tree = build_tree(robot, chosen)
     model = body_model(replace(source, options=chosen), tree)
     model = replace(model, neighbours=resting_neighbours(model))
     body, pose = tree.links[mount]
     return Arm(model, mount, body, np.asarray(pose, float), hand_pose)
-
-
-def _others(robot: Robot, moving: list[str], mount: str) -> list[str]:
-    """Return the fixed joints: those that do not lead to the mount, and a floating base's."""
-    chain = {joint.name for joint in chain_to(robot, mount)}
-    return [
-        name
-        for name, joint in robot.joints.items()
-        if name not in moving and joint.type != "fixed" and (name not in chain or joint.type in FREE)
-    ]
-
-
-def _rest(robot: Robot, joint: str) -> float:
-    limits = robot.joints[joint]
-    return float(np.clip(0.0, limits.lower, limits.upper))
 
 
 @dataclass(frozen=True)
@@ -95,11 +80,7 @@ class Description:
 
 
 def describe(files: Mapping[str, bytes], options: Mapping[str, Any] | None = None) -> Description:
-    """Return the description of a hand's files; see `load_hand`.
-
-    Raises:
-        HandError: the files describe no usable hand.
-    """
+    """Return the description of a hand's files; see `load_hand`."""
     source = HandSource.read(files, options)
     robot, tree = source.robot, build_tree(source.robot, source.options)
     return Description(

@@ -61,7 +61,6 @@ class Bundle:
         return thing, hand
 
     def name(self, row: int) -> str:
-        """Return the name of a grasp, after its row in the shard."""
         return f"grasp_{self.found.rows[row]:04}"
 
     @property

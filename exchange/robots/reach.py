@@ -47,17 +47,11 @@ class ReachResult:
     """Executable grasps of N."""
 
     rows: list[int] = field(default_factory=list)
-    """Indices of the executable grasps."""
     paths: list[list[Path]] = field(default_factory=list)
     """Their motions; joints are the arm's, then the hand's."""
     refused: Counter[str] = field(default_factory=Counter)
     """How many of the others for which reason."""
     candidates: int = 0
-
-    @property
-    def share(self) -> float:
-        """Share of the candidates that the arm reaches."""
-        return len(self.rows) / max(1, self.candidates)
 
 
 class ReachSearch:
@@ -243,13 +237,6 @@ class ArmScene:
                 return " and ".join(self._told(int(geom)) for geom in contact.geom)
         return ""
 
-    def qpos(self, arm_joints: Floats, hand_joints: Floats) -> Floats:
-        """Return the model's coordinates."""
-        found = np.zeros(self.model.nq)
-        found[self.arm_qpos] = self.arm.model.expand(arm_joints)
-        found[self.hand_qpos] = hand_joints
-        return found
-
     def _told(self, geom: int) -> str:
         body = self.model.body(int(self.model.geom_bodyid[geom])).name
         for prefix, names in (("arm", self.arm.model.body_names), ("hand", self.hand.body_names)):
@@ -278,14 +265,12 @@ class ArmScene:
         arm, hand = self.arm.model, self.hand
         open_ = hand.expand(hand.preshape)
         data.mocap_pos[0] = [0, 0, 1e3]
-        count: dict[tuple[int, int], int] = {}
+        count = Counter[tuple[int, ...]]()
         for _ in range(SAMPLES):
             self._put(model, data, rng.uniform(arm.lower, arm.upper), open_)
             mujoco.mj_kinematics(model, data)
             mujoco.mj_collision(model, data)
-            pairs = {tuple(sorted(model.geom_bodyid[c.geom].tolist())) for c in data.contact if c.dist < 0}
-            for pair in pairs:
-                count[pair] = count.get(pair, 0) + 1
+            count.update({tuple(sorted(model.geom_bodyid[c.geom].tolist())) for c in data.contact if c.dist < 0})
         for (a, b), times in sorted(count.items()):
             # The first link turns at the base; any other link that is always in a support means a wrong base.
             if times >= ALWAYS * SAMPLES and (a or model.body(b).name == "arm1"):

@@ -28,28 +28,13 @@ def write_tables(bundle: Bundle, folder: Path) -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     joints = bundle.found.hand.joint_names
     of_trajectory = bundle.trajectories[0].joint_names
+    facts = ("row", "frame", "tool_frame", "scene", "valid", "success", "epsilon")
+    of_object = (f"object_{part}" for part in POSE_PARTS)
+    moving = ("grasp", "phase", "time_s", *POSE_PARTS, *of_trajectory)
     return [
-        _table(
-            folder / "grasps.csv",
-            (
-                "grasp",
-                "row",
-                "frame",
-                "tool_frame",
-                "scene",
-                "valid",
-                "success",
-                "epsilon",
-                *(f"object_{part}" for part in POSE_PARTS),
-            ),
-            _grasps(bundle),
-        ),
+        _table(folder / "grasps.csv", ("grasp", *facts, *of_object), _grasps(bundle)),
         _table(folder / "postures.csv", ("grasp", "posture", *POSE_PARTS, *joints), _postures(bundle)),
-        _table(
-            folder / "trajectories.csv",
-            ("grasp", "phase", "time_s", *POSE_PARTS, *of_trajectory),
-            _trajectories(bundle),
-        ),
+        _table(folder / "trajectories.csv", moving, _trajectories(bundle)),
     ]
 
 

@@ -11,8 +11,8 @@ import typer
 from graspd.api.access.keys import Key, KeyFile, KeyLimits, ProjectLimits, Scope
 from graspd.api.formatting import minute
 from graspd.client.client import path_of
-from graspd.client.reports import UrlOption, YesOption, confirm, open_client, say_deleted
-from graspd.service.cli import CommandGroup, JsonFlag, emit, load_settings, plain_console, plain_table
+from graspd.client.reports import UrlOption, YesOption, confirm, open_client, print_rows, say_deleted
+from graspd.service.cli import CommandGroup, JsonFlag, emit, load_settings
 from graspd.service.model.errors import InputError
 
 keys_app = CommandGroup(no_args_is_help=True, help="Make, list, rotate, limit and revoke API keys.")
@@ -45,9 +45,14 @@ def add_key(
     json: JsonFlag = False,
 ) -> None:
     """Make a key and show it once. Limits default to those of the settings."""
-    limits = _limits(requests_per_minute, concurrency, grasps_in_flight, jobs_per_day)
+    given = _given(
+        requests_per_minute=requests_per_minute,
+        concurrency=concurrency,
+        grasps_in_flight=grasps_in_flight,
+        jobs_per_day=jobs_per_day,
+    )
     lifetime = duration(expires) if expires else None
-    token = _key_file().add(name, scope, lifetime=lifetime, limits=limits, project=project)
+    token = _key_file().add(name, scope, lifetime=lifetime, limits=KeyLimits(**given), project=project)
     _show_token(name, scope, token, json=json)
 
 
@@ -76,10 +81,15 @@ def limit_key(
     json: JsonFlag = False,
 ) -> None:
     """Change the limits of a key, from the next request on."""
-    wanted = _limits(requests_per_minute, concurrency, grasps_in_flight, jobs_per_day)
-    if not wanted.model_fields_set:
+    given = _given(
+        requests_per_minute=requests_per_minute,
+        concurrency=concurrency,
+        grasps_in_flight=grasps_in_flight,
+        jobs_per_day=jobs_per_day,
+    )
+    if not given:
         raise InputError("give at least one limit, such as --jobs-per-day 100")
-    limits = _key_file().limit(name, wanted)
+    limits = _key_file().limit(name, KeyLimits(**given))
     if json:
         emit({"name": name, "limits": limits.model_dump(exclude_none=True)})
         return
@@ -95,12 +105,13 @@ def list_keys(json: JsonFlag = False) -> None:
         return
     has_projects = any(key.project for key in found)
     names = ["name", "scope", *(["project"] if has_projects else []), "state", "created", "expires", "limits"]
-    table = plain_table(*names, whole=("state", "created", "expires"))
+    rows = []
     for key in found:
         of = [key.project or "-"] if has_projects else []
         times = minute(key.created), minute(key.expires)
-        table.add_row(key.name, key.scope, *of, _state(key), *times, _key_limits(key.limits))
-    plain_console().print(table if found else "no key; the service is open, but only to this machine")
+        rows.append((key.name, key.scope, *of, _state(key), *times, _key_limits(key.limits)))
+    empty = "no key; the service is open, but only to this machine"
+    print_rows(names, rows, whole=("state", "created", "expires"), empty=empty)
 
 
 @keys_app.command("revoke", epilog="graspd keys revoke alice")
@@ -121,14 +132,8 @@ def duration(text: str) -> timedelta:
     return timedelta(**{_UNITS[match[2]]: int(match[1])})
 
 
-def _limits(requests: int | None, concurrency: int | None, grasps: int | None, jobs: int | None) -> KeyLimits:
-    given = {
-        "requests_per_minute": requests,
-        "concurrency": concurrency,
-        "grasps_in_flight": grasps,
-        "jobs_per_day": jobs,
-    }
-    return KeyLimits(**{name: value for name, value in given.items() if value is not None})
+def _given(**limits: int | None) -> dict[str, int]:
+    return {name: value for name, value in limits.items() if value is not None}
 
 
 def _show_token(name: str, scope: Scope, token: str, *, json: bool) -> None:
@@ -160,23 +165,22 @@ projects_app = CommandGroup(no_args_is_help=True, help="List projects of keys an
 @projects_app.command("list", epilog="graspd projects list --json")
 def list_projects(json: JsonFlag = False) -> None:
     """List projects of keys, and their limits. `graspd keys add NAME --project PROJECT` makes one."""
-    file = KeyFile(load_settings().resolved_keys_file)
+    file = _key_file()
     live: dict[str, list[str]] = {}
     for key in file.list():
         if key.is_live and key.name not in live.setdefault(key.project, []):
             live[key.project].append(key.name)
     found = file.projects()
     if json:
-        rows = [
-            {"project": name, "keys": live.get(name, []), "limits": limits.model_dump(exclude_none=True)}
-            for name, limits in found.items()
-        ]
-        emit({"projects": rows})
+        plain = {name: limits.model_dump(exclude_none=True) for name, limits in found.items()}
+        emit({"projects": [{"project": name, "keys": live.get(name, []), "limits": plain[name]} for name in found]})
         return
-    table = plain_table("project", "keys", "limits")
-    for name, limits in found.items():
-        table.add_row(name, ", ".join(live.get(name, [])) or "no valid key", _project_limits(limits))
-    plain_console().print(table if found else "no project yet; `graspd keys add NAME --project PROJECT` makes one")
+    rows = [
+        (name, ", ".join(live.get(name, [])) or "no valid key", _project_limits(limits))
+        for name, limits in found.items()
+    ]
+    empty = "no project yet; `graspd keys add NAME --project PROJECT` makes one"
+    print_rows(("project", "keys", "limits"), rows, empty=empty)
 
 
 @projects_app.command(
@@ -193,15 +197,12 @@ def limit_project(
     json: JsonFlag = False,
 ) -> None:
     """Change the shared limits of a project's keys, from the next submission on."""
-    given = {
-        "grasps_in_flight": grasps_in_flight,
-        "grasps_per_day": grasps_per_day,
-        "gpu_seconds_per_day": gpu_seconds_per_day,
-    }
-    wanted = ProjectLimits(**{limit: value for limit, value in given.items() if value is not None})
-    if not wanted.model_fields_set:
+    given = _given(
+        grasps_in_flight=grasps_in_flight, grasps_per_day=grasps_per_day, gpu_seconds_per_day=gpu_seconds_per_day
+    )
+    if not given:
         raise InputError("give at least one limit, such as --grasps-per-day 1000000")
-    limits = KeyFile(load_settings().resolved_keys_file).limit_project(name, wanted)
+    limits = _key_file().limit_project(name, ProjectLimits(**given))
     if json:
         emit({"project": name, "limits": limits.model_dump(exclude_none=True)})
         return
@@ -248,10 +249,9 @@ def list_webhooks(url: UrlOption = None, json: JsonFlag = False) -> None:
     if json:
         emit({"webhooks": found})
         return
-    table = plain_table("id", "address", "on", "since", whole=("id", "since"))
-    for one in found:
-        table.add_row(one["id"], one["url"], ", ".join(one["states"]), minute(one["created"]))
-    plain_console().print(table if found else "no webhook yet; `graspd webhooks add URL` makes one")
+    rows = [(one["id"], one["url"], ", ".join(one["states"]), minute(one["created"])) for one in found]
+    empty = "no webhook yet; `graspd webhooks add URL` makes one"
+    print_rows(("id", "address", "on", "since"), rows, whole=("id", "since"), empty=empty)
 
 
 @webhooks_app.command("log", epilog="graspd webhooks log 1a2b3c")
@@ -262,12 +262,12 @@ def show_log(webhook: IdArgument, url: UrlOption = None, json: JsonFlag = False)
     if json:
         emit({"deliveries": found})
         return
-    table = plain_table("what", "ended", "delivery", "attempts", "last", "", whole=("ended", "delivery", "last"))
+    rows = []
     for one in found:
         what = f"{one['kind']} {one['subject'][:12] if one['kind'] == 'job' else one['subject']}"
-        tried = (str(one["attempts"]), minute(one["tried"]))
-        table.add_row(what, one["ended"], one["state"], *tried, one["detail"])
-    plain_console().print(table if found else "no delivery yet")
+        rows.append((what, one["ended"], one["state"], str(one["attempts"]), minute(one["tried"]), one["detail"]))
+    names = ("what", "ended", "delivery", "attempts", "last", "")
+    print_rows(names, rows, whole=("ended", "delivery", "last"), empty="no delivery yet")
 
 
 @webhooks_app.command("delete", epilog="graspd webhooks delete 1a2b3c")

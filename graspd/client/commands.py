@@ -19,13 +19,14 @@ from graspd.client.reports import (
     YesOption,
     confirm,
     open_client,
+    print_rows,
     restore,
     say_deleted,
     show_asset,
     show_job,
     watch,
 )
-from graspd.service.cli import CommandGroup, JsonFlag, emit, plain_console, plain_table
+from graspd.service.cli import CommandGroup, JsonFlag, emit, plain_console
 from graspd.service.command_options import pairs, parsed_options, with_options
 from graspd.service.model.domain import NETWORK_METHODS, JobOptions, JobRequest
 from graspd.service.model.errors import InputError
@@ -79,14 +80,15 @@ def jobs(
     if json:
         emit({"jobs": [job.model_dump(mode="json") for job in page.items], "next": page.next})
         return
-    names = ("job", "state", "hand", "object", "progress", "grasps", "created")
-    table = plain_table(*names, whole=("job", "state", "created"))
+    rows = []
     for job in page.items:
         made = job.valid if job.standing == "valid" else job.grasps
         done = f"{count(made)} of {count(job.requested)} {job.standing}"
-        pair, last = (job.hand, job.object), (percent(job.progress), done, minute(job.created))
-        table.add_row(job.id[:12], job.state, *pair, *last)
-    plain_console().print(table if page.items else "no job yet; `graspd submit --hand allegro --object mug` makes one")
+        last = (percent(job.progress), done, minute(job.created))
+        rows.append((job.id[:12], job.state, job.hand, job.object, *last))
+    names = ("job", "state", "hand", "object", "progress", "grasps", "created")
+    empty = "no job yet; `graspd submit --hand allegro --object mug` makes one"
+    print_rows(names, rows, whole=("job", "state", "created"), empty=empty)
 
 
 @app.command(epilog="graspd status 3f2a --json")
@@ -178,14 +180,14 @@ def asset_commands(kind: AssetKind) -> typer.Typer:
             return
         # All networks have the same file name, so their hand is shown instead.
         second = "hand" if kind is AssetKind.NETWORK else "file"
-        table = plain_table("name", second, "size", "check", "digest", whole=("size", "digest"))
+        rows = []
         for asset in assets:
             origin = "built-in" if asset.builtin else (asset.verdict or "waiting")
             if says := self_test_line(asset.facts):
                 origin += f"; {says}"
             named = hand_line(asset.facts) if kind is AssetKind.NETWORK else asset.filename
-            table.add_row(asset.name, named, size(asset.size_bytes), origin, asset.digest[:12])
-        plain_console().print(table)
+            rows.append((asset.name, named, size(asset.size_bytes), origin, asset.digest[:12]))
+        print_rows(("name", second, "size", "check", "digest"), rows, whole=("size", "digest"))
 
     @group.command("show", help=f"Show a {kind.value} with the findings of its check.")
     def show(
@@ -244,12 +246,11 @@ def sets(url: UrlOption = None, json: JsonFlag = False) -> None:
     if json:
         emit({"sets": [one.model_dump(mode="json") for one in found]})
         return
-    table = plain_table("set", "objects", "")
-    for one in found:
-        table.add_row(
-            one.name, count(len(one.objects)), ", ".join(one.objects[:5]) + (", ..." * (len(one.objects) > 5))
-        )
-    plain_console().print(table if found else "no set yet; `graspd objects add FOLDER` makes one")
+    rows = [
+        (one.name, count(len(one.objects)), ", ".join(one.objects[:5]) + ", ..." * (len(one.objects) > 5))
+        for one in found
+    ]
+    print_rows(("set", "objects", ""), rows, empty="no set yet; `graspd objects add FOLDER` makes one")
 
 
 app.add_typer(hands_app, name="hands")

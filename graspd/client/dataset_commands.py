@@ -22,11 +22,12 @@ from graspd.client.reports import (
     print_cells,
     print_dataset,
     print_estimate,
+    print_rows,
     restore,
     say_deleted,
     watch_dataset,
 )
-from graspd.service.cli import CommandGroup, JsonFlag, emit, plain_console, plain_table
+from graspd.service.cli import CommandGroup, JsonFlag, emit, plain_console
 from graspd.service.command_options import parsed_options, with_options
 from graspd.service.index.views import DatasetView
 from graspd.service.model.domain import JobOptions
@@ -131,17 +132,14 @@ def list_datasets(
     if json:
         emit({"datasets": [dataset.model_dump(mode="json") for dataset in page.items], "next": page.next})
         return
-    table = plain_table(
-        "dataset", "state", "cells", "progress", "grasps", "size", "created", whole=("state", "size", "created")
-    )
+    rows = []
     for one in page.items:
         made = f"{count(one.counted)} {one.options.standing} of {count(one.asked)}"
-        cells = count(one.cells)
-        table.add_row(
-            one.name, one.state, cells, percent(one.progress), made, size(one.size_bytes), minute(one.created)
-        )
+        last = (percent(one.progress), made, size(one.size_bytes), minute(one.created))
+        rows.append((one.name, one.state, count(one.cells), *last))
+    names = ("dataset", "state", "cells", "progress", "grasps", "size", "created")
     empty = "no dataset yet; `graspd datasets create NAME --hands allegro --objects mug,bottle` makes one"
-    plain_console().print(table if page.items else empty)
+    print_rows(names, rows, whole=("state", "size", "created"), empty=empty)
 
 
 @group.command(epilog="graspd datasets status kitchen --state failed")
@@ -293,13 +291,12 @@ def _estimate(client: Client, matrix: dict[str, Any], files: Objects | None) -> 
 
 
 def _upload(client: Client, files: Objects, set_name: str, console: Console) -> list[str]:
-    """Upload the objects of a folder and make them a set; return the refused ones, which are excluded."""
-    told = upload_set(client, files, say=lambda line: console.print(line, soft_wrap=True))
-    taken = [one["name"] for one in told if one["verdict"] != "refuse"]
-    if not taken:
+    """Upload the objects of a folder as a set; return the refused ones, which are excluded."""
+    told = upload_set(client, files, set_name, say=lambda line: console.print(line, soft_wrap=True))
+    refused = [one["name"] for one in told if one["verdict"] == "refuse"]
+    if len(refused) == len(told):
         raise InputError(f"none of the {len(told)} objects can be used; reasons are above")
-    client.add_object_set(set_name, taken)
-    return [one["name"] for one in told if one["verdict"] == "refuse"]
+    return refused
 
 
 def _confirmed() -> bool:

@@ -63,18 +63,7 @@ class PlanRequest:
 def wanted(
     spec: Path | None, *, name: str | None, hands: str | None, objects: str | None, options: dict[str, Any]
 ) -> PlanRequest:
-    """Combine spec and options; options take precedence.
-
-    Args:
-        spec: file, if one was given.
-        name: name of the dataset; empty if neither contains it.
-        hands: comma-separated, as `--hands`.
-        objects: as `--objects`.
-        options: result of `with_options`.
-
-    Raises:
-        InputError: no hands or no objects, no such file, or an unknown key or invalid value in it.
-    """
+    """Combine spec and options, which take precedence; the name is empty if neither contains it."""
     given = dict(options)
     if "options" in given:
         given["options"] = pairs(given["options"])
@@ -97,14 +86,13 @@ def wanted(
 
 def read_spec(file: Path) -> dict[str, Any]:
     """Return the keys of a spec; raise InputError if the file is none."""
+    kind, load = ("JSON", json.loads) if file.suffix == ".json" else ("TOML", tomllib.loads)
     try:
-        text = file.read_text()
+        found = load(file.read_text())
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{file} cannot be read: {why(error)}") from None
-    try:
-        found = json.loads(text) if file.suffix == ".json" else tomllib.loads(text)
     except (ValueError, RecursionError) as error:
-        raise InputError(f"{file} is no {'JSON' if file.suffix == '.json' else 'TOML'}: {error}") from None
+        raise InputError(f"{file} is no {kind}: {error}") from None
     if not isinstance(found, dict):
         raise InputError(f"{file} must hold the keys of a dataset: hands, objects, grasps, ...")
     try:

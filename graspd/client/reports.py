@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Sequence
-from types import TracebackType
+from collections.abc import Collection, Sequence
 from typing import Annotated, Any, Final, Self
 
 import typer
@@ -17,7 +16,7 @@ from rich.progress import BarColumn, Progress, ProgressColumn, Task, TaskID, Tex
 from rich.text import Text
 
 from graspd.api.formatting import count, duration, metric, percent, size, valid_yield, worker_time
-from graspd.api.models import Diversity, Job, JobDetail, StageStatus
+from graspd.api.models import Job, JobDetail, StageStatus
 from graspd.client.client import Client, path_of
 from graspd.service.cli import emit, load_settings, plain_console, plain_table
 from graspd.service.index.views import CellView, DatasetView, Validated
@@ -35,9 +34,7 @@ UrlOption = Annotated[
 
 
 def open_client(url: str | None, *, key: str | None = None) -> Client:
-    """Return a client of the API from the option, the settings or the data folder.
-
-    The key is that of the settings, unless one is given."""
+    """Return a client of the API from the option, the settings or the data folder; the key is that of the settings."""
     settings = load_settings()
     if key is None and settings.api_key:
         key = settings.api_key.get_secret_value()
@@ -77,6 +74,16 @@ def restore(url: str | None, what: str, name: str, *, json: bool) -> None:
         emit({"restored": found["id"], "kind": what})
     else:
         typer.echo(f"{what} {name} is restored")
+
+
+def print_rows(
+    headings: Sequence[str], rows: Sequence[Sequence[str]], *, whole: Collection[str] = (), empty: str = ""
+) -> None:
+    """Print a table, or the text for an empty one. `whole`: columns whose cells stay on one line."""
+    table = plain_table(*headings, whole=whole)
+    for row in rows:
+        table.add_row(*row)
+    plain_console().print(table if rows or not empty else empty)
 
 
 def watch(client: Client, job_id: str) -> JobDetail:
@@ -149,12 +156,10 @@ def yield_of(job: JobDetail) -> str:
     level = job.request.validation
     if level == "none":
         return f"{count(job.grasps)} stored grasps of {count(job.candidates)} candidates; not validated"
-    recheck = (
-        f"; {job.recheck_held} of {job.rechecked} rechecked hold under the DexGraspBench protocol"
-        if job.rechecked
-        else ""
-    )
-    return f"{count(job.valid)} valid grasps of {count(job.candidates)} candidates, level {level}{recheck}"
+    line = f"{count(job.valid)} valid grasps of {count(job.candidates)} candidates, level {level}"
+    if not job.rechecked:
+        return line
+    return f"{line}; {job.recheck_held} of {job.rechecked} rechecked hold under the DexGraspBench protocol"
 
 
 def means_of(job: JobDetail) -> str:
@@ -163,15 +168,6 @@ def means_of(job: JobDetail) -> str:
     return (
         f"mean ε {metric(mean.epsilon)}, contact {metric(mean.contact_area_cm2)} cm², "
         f"intersection {metric(mean.intersection_volume_cm3)} cm³"
-    )
-
-
-def diversity_of(found: Diversity) -> str:
-    """Format types and directions in one line."""
-    types = ", ".join(f"{count(number)} {name}" for name, number in found.types.items())
-    return (
-        f"{types} ({found.type_entropy_bits:.2f} bit); {found.directions_used} of {found.directions} directions "
-        f"({found.direction_entropy_bits:.2f} bit)"
     )
 
 
@@ -193,8 +189,11 @@ def _print_job(job: JobDetail, url: str) -> None:
     console.print(table)
     if job.grasps:
         console.print(f"{yield_of(job)}; {means_of(job)}")
-        if job.diversity:
-            console.print(diversity_of(job.diversity))
+        if found := job.diversity:
+            types = ", ".join(f"{count(number)} {name}" for name, number in found.types.items())
+            directions = f"{found.directions_used} of {found.directions} directions"
+            entropy = f"({found.type_entropy_bits:.2f} bit)", f"({found.direction_entropy_bits:.2f} bit)"
+            console.print(f"{types} {entropy[0]}; {directions} {entropy[1]}")
 
 
 _LINE_EVERY_S: Final = 2.0
@@ -233,9 +232,7 @@ class JobDisplay:
         self._progress.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._progress.stop()
 
     def update(self, job: Job) -> None:
@@ -250,9 +247,14 @@ class JobDisplay:
 
     def _draw(self, stage: StageStatus, job: Job) -> None:
         if stage.stage not in self._bars:
-            scale, unit = (job.requested / stage.tasks, "grasps") if stage.stage is Stage.SYNTHESIZE else (1, "tasks")
+            made, unit = _size_of(stage, job)
             self._bars[stage.stage] = self._progress.add_task(
-                stage.stage.value, total=stage.tasks, start=False, message="", scale=scale, unit=unit
+                stage.stage.value,
+                total=stage.tasks,
+                start=False,
+                message="",
+                scale=made / max(1, stage.tasks),
+                unit=unit,
             )
         bar = self._bars[stage.stage]
         if stage.state is not State.QUEUED and not self._progress.tasks[bar].started:
@@ -269,22 +271,20 @@ class JobDisplay:
         self._console.print(self._line(stage, job, now))
 
     def _line(self, stage: StageStatus, job: Job, now: float) -> str:
-        elapsed = now - self._started.get(stage.stage, now)
+        elapsed, (made, unit) = now - self._started.get(stage.stage, now), _size_of(stage, job)
         words = f"{stage.stage.value:<11} {stage.state.value:<10} {100 * stage.progress:3.0f} %"
         if stage.state is State.SUCCEEDED:
             seconds = stage.seconds or elapsed
-            return f"{words}  {_rate_words(stage, job, 1 / seconds)}  in {duration(seconds)}" if seconds else words
+            return f"{words}  {metric(made / seconds)} {unit}/s  in {duration(seconds)}" if seconds else words
         if stage.state is State.RUNNING and elapsed > 1 and 0 < stage.progress < 1:
             pace = stage.progress / elapsed
-            return f"{words}  {_rate_words(stage, job, pace)}  {duration((1 - stage.progress) / pace)} left"
+            return f"{words}  {metric(made * pace)} {unit}/s  {duration((1 - stage.progress) / pace)} left"
         return words
 
 
-def _rate_words(stage: StageStatus, job: Job, pace: float) -> str:
-    """Format the rate in the unit of the stage; `pace` is the share of the stage per second."""
-    if stage.stage is Stage.SYNTHESIZE:
-        return f"{metric(job.requested * pace)} grasps/s"
-    return f"{metric(stage.tasks * pace)} tasks/s"
+def _size_of(stage: StageStatus, job: Job) -> tuple[int, str]:
+    """Return how many things a stage makes, and their name."""
+    return (job.requested, "grasps") if stage.stage is Stage.SYNTHESIZE else (stage.tasks, "tasks")
 
 
 #: A table with more hands does not fit a terminal: each cell then has a line.
@@ -349,15 +349,16 @@ def print_cells(dataset: DatasetView, cells: Sequence[CellView], console: Consol
     if len(dataset.hands) > _MOST_COLUMNS:
         table = plain_table("hand", "object", "job", "", whole=("job",))
         for cell in cells:
-            table.add_row(
-                cell.hand, cell.object, cell.job_id[:12], _words(cell, dataset.options), style=_STYLES[cell.state]
-            )
+            words = _words(cell, dataset.options)
+            table.add_row(cell.hand, cell.object, cell.job_id[:12], words, style=_STYLES[cell.state])
     else:
         table = plain_table("", *dataset.hands)
         at = {(cell.hand, cell.object): cell for cell in cells}
         for obj in dataset.objects:
             found = [at.get((hand, obj)) for hand in dataset.hands]
-            table.add_row(obj, *(_styled(cell, dataset.options) if cell else "" for cell in found))
+            table.add_row(
+                obj, *(Text(_words(cell, dataset.options), _STYLES[cell.state]) if cell else "" for cell in found)
+            )
     console.print(table)
     for cell in [cell for cell in cells if cell.reason][:5]:
         console.print(f"{cell.hand} on {cell.object}: {cell.reason}", soft_wrap=True)
@@ -389,10 +390,6 @@ def watch_dataset(client: Client, name: str, console: Console) -> DatasetView:
 def _yield(made: Validated) -> str:
     """Format the yield in short form: `at 94 % of the validated`."""
     return f"at {valid_yield(made)}" if made.validated else "not validated"
-
-
-def _styled(cell: CellView, options: JobOptions) -> Text:
-    return Text(_words(cell, options), style=_STYLES[cell.state])
 
 
 def _words(cell: CellView, options: JobOptions) -> str:

@@ -10,8 +10,8 @@ import typer
 
 from graspd.api.formatting import count, minute
 from graspd.client.client import path_of
-from graspd.client.reports import UrlOption, YesOption, confirm, open_client, restore, say_deleted
-from graspd.service.cli import CommandGroup, JsonFlag, emit, plain_console, plain_table
+from graspd.client.reports import UrlOption, YesOption, confirm, open_client, print_rows, restore, say_deleted
+from graspd.service.cli import CommandGroup, JsonFlag, emit
 from graspd.service.model.errors import InputError
 
 app = CommandGroup(no_args_is_help=True, help="Tag grasps of the service; list and export tagged ones.")
@@ -36,10 +36,9 @@ def list_tags(url: UrlOption = None, json: JsonFlag = False) -> None:
     if json:
         emit({"tags": found})
         return
-    table = plain_table("tag", "grasps", "changed", whole=("grasps", "changed"))
-    for one in found:
-        table.add_row(one["name"], count(one["grasps"]), minute(one["changed"]))
-    plain_console().print(table if found else "no tag yet; `graspd tags add TAG --where EXPRESSION` tags grasps")
+    rows = [(one["name"], count(one["grasps"]), minute(one["changed"])) for one in found]
+    empty = "no tag yet; `graspd tags add TAG --where EXPRESSION` tags grasps"
+    print_rows(("tag", "grasps", "changed"), rows, whole=("grasps", "changed"), empty=empty)
 
 
 @app.command("add", epilog='graspd tags add good --dataset kitchen --where "epsilon > 0.3 and lift"')
@@ -113,7 +112,6 @@ def export_tag(
 
 
 def _selection(grasps: list[str] | None, **filters: str | None) -> dict[str, Any]:
-    """Return the body of a request: grasps by name, or a filter."""
     given = {name: value for name, value in filters.items() if value is not None}
     if grasps and given:
         raise InputError("give SHARD:ROW, or --where, --job and --dataset, not both")
