@@ -39,11 +39,8 @@ class Results:
     page: Path
 
     def as_json(self) -> dict[str, Any]:
-        return {
-            "shards": [str(path) for path in self.shards],
-            "pictures": [str(path) for path in self.pictures],
-            "page": str(self.page),
-        }
+        several = {name: list(map(str, getattr(self, name))) for name in ("shards", "pictures")}
+        return several | {"page": str(self.page)}
 
 
 _SHOWN_GRASPS: Final = 12
@@ -64,19 +61,8 @@ def demo(
     json: JsonFlag = False,
 ) -> None:
     """Make grasps, scenes and pictures of built-in data, and a results page."""
-    request = parsed_options(
-        JobRequest,
-        {
-            "hand": hand,
-            "object": object,
-            "grasps": grasps,
-            "scenes": scenes,
-            "views": views,
-            "stereo": views > 0,
-            "fidelity": fidelity,
-            "seed": seed,
-        },
-    )
+    asked: dict[str, Any] = {"hand": hand, "object": object, "grasps": grasps, "fidelity": fidelity, "seed": seed}
+    request = parsed_options(JobRequest, asked | {"scenes": scenes, "views": views, "stereo": views > 0})
     console = plain_console(stderr=json)
     out.mkdir(parents=True, exist_ok=True)
     settings = load_settings(data_dir=out / "service", host="127.0.0.1", port=0)
@@ -96,14 +82,7 @@ def demo(
 def run(
     client: Client, request: JobRequest, out: Path, console: Console
 ) -> tuple[JobDetail, list[GraspView], list[Path]]:
-    """Submit the job, watch it, and fetch its files.
-
-    Returns:
-        the job, its ten best grasps by epsilon, and the paths of its shards.
-
-    Raises:
-        TaskError: the job did not succeed.
-    """
+    """Submit the job, watch it, and fetch its files: return it, its ten best grasps by epsilon, and its shards."""
     job = client.submit(request)
     console.print(f"job {job.id[:12]}: {request.grasps} grasps of {request.hand} on {request.object}")
     with JobDisplay(console) as display:
@@ -130,12 +109,9 @@ def print_results(console: Console, best: list[GraspView], job: JobDetail, paths
     for stage in job.stages:
         console.print(f"{stage.stage.value:<11} {count(stage.tasks)} × {duration(stage.seconds / stage.tasks)}")
     console.print()
-    for what, path in (
-        *(("shard", path) for path in paths.shards),
-        *(("picture", path) for path in paths.pictures),
-        ("page", paths.page),
-    ):
-        console.print(f"{what:<8} {path}", soft_wrap=True)
+    for what, some in (("shard", paths.shards), ("picture", paths.pictures), ("page", [paths.page])):
+        for path in some:
+            console.print(f"{what:<8} {path}", soft_wrap=True)
 
 
 def write_pages(out: Path, job: JobDetail, shards: list[Path]) -> Results:
@@ -166,12 +142,9 @@ def draw_grasps(job: JobDetail, base: Shard) -> bytes:
     from graspd.worker.rendering.sheets import best, contact_sheet, figures
 
     backend.start()
-    hand_files, object_files = (
-        builtin_files(kind, name) for kind, name in ((AssetKind.HAND, job.hand), (AssetKind.OBJECT, job.object))
-    )
-    hand = load_hand(hand_files, name=job.hand, digest=job.hand_digest)
-    error_m = job.request.knobs.face_error_m
-    obj = load_object(object_files, name=job.object, digest=job.object_digest, face_error_m=error_m)
+    hand = load_hand(builtin_files(AssetKind.HAND, job.hand), name=job.hand, digest=job.hand_digest)
+    files, error_m = builtin_files(AssetKind.OBJECT, job.object), job.request.knobs.face_error_m
+    obj = load_object(files, name=job.object, digest=job.object_digest, face_error_m=error_m)
     rows = best(base.arrays, _SHOWN_GRASPS, validity.valid(base.arrays))
     poses, joints = (np.asarray(base[f"grasp/{name}"], float)[rows] for name in ("hand_pose", "joint_positions"))
     pictures = grasp_pictures(hand, obj, poses, joints, samples=_SAMPLES)[:, 0]

@@ -38,15 +38,8 @@ def kernels(
     files = backend.bake(backend.modules(), architectures=architectures, cpu=cpu)
     size = sum(file.stat().st_size for file in files)
     if json:
-        emit(
-            {
-                "folder": str(folder),
-                "files": len(files),
-                "bytes": size,
-                "architectures": list(architectures),
-                "cpu": cpu,
-            }
-        )
+        made = {"folder": str(folder), "files": len(files), "bytes": size}
+        emit(made | {"architectures": list(architectures), "cpu": cpu})
     else:
         typer.echo(f"{len(files)} kernel files, {size / 1e6:.1f} MB, in {folder}; GRASPD_KERNELS={folder.resolve()}")
 

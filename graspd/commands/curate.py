@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -43,10 +43,9 @@ def where(
 ) -> None:
     """Write the grasps that satisfy an expression as new base shards."""
     test = parse(expression)
-    shards = shards_of(source)
     said = {"where": expression, "from": source}
     found = write_subset(
-        shards, lambda together: [test(shard.arrays, shard.attributes) for shard in together], out, said=said
+        shards_of(source), lambda some: [test(shard.arrays, shard.attributes) for shard in some], out, said=said
     )
     _tell(found, out, json=json)
 
@@ -112,10 +111,9 @@ def _listed(values: list[str]) -> str:
 
 
 def _tell(found: Subset, out: Path, *, json: bool) -> None:
-    told: dict[str, Any] = {"folder": str(out), "looked_at": found.looked_at, "kept": found.kept}
-    told["shards"] = len(found.files)
     if json:
-        emit(told | {"passed_over": found.passed_over})
+        counts = {"looked_at": found.looked_at, "kept": found.kept, "shards": len(found.files)}
+        emit({"folder": str(out), **counts, "passed_over": found.passed_over})
         return
     typer.echo(f"{out}: {found.kept} of {found.looked_at} grasps in {len(found.files)} shards")
     if found.passed_over:
@@ -158,19 +156,9 @@ def clouds(
     found = pictures.clouds(
         points, noise=camera, frame=frame, fuse=fuse, scene=scene, voxel_m=voxel, hand_surface=surface, seed=seed
     )
-    said = {
-        "source": source,
-        "points": points,
-        "noise": noise,
-        "frame": found.frame,
-        "fuse": fuse,
-        "scene": scene,
-        "voxel_m": voxel,
-        "graspness": graspness,
-        "unvalidated": unvalidated,
-        "seed": seed,
-    }
-    done = write_clouds(found, out, said)
+    said = {"source": source, "points": points, "noise": noise, "frame": found.frame, "fuse": fuse, "scene": scene}
+    more = {"voxel_m": voxel, "graspness": graspness, "unvalidated": unvalidated, "seed": seed}
+    done = write_clouds(found, out, said | more)
     if json:
         emit({"folder": str(out), **done})
         return

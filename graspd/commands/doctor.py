@@ -15,7 +15,6 @@ from graspd.service.model.states import Stage
 from graspd.service.run.doctor.checks import Check, Finding, bad, good, warning
 from graspd.service.settings import Settings
 
-_MODULE: Final = "graspd.commands.doctor"
 _GPU_S: Final = 120.0
 #: Time limit for compiling all kernels from scratch, on a slow machine [s].
 _KERNELS_S: Final = 900.0
@@ -27,11 +26,9 @@ Child = Callable[[Sequence[str]], "subprocess.CompletedProcess[str]"]
 
 
 def checks_of(settings: Settings) -> list[Check]:
-    """Return the checks of the engine's GPUs and kernels."""
+    hung = "restart the driver, or the machine; see dmesg"
     return [
-        Check(
-            "gpu", lambda: gpu(settings), limit_s=_GPU_S + 5, mend_hang="restart the driver, or the machine; see dmesg"
-        ),
+        Check("gpu", lambda: gpu(settings), limit_s=_GPU_S + 5, mend_hang=hung),
         Check("kernels", lambda: kernels(settings), limit_s=_KERNELS_S + 5, mend_hang="see `top`, then retry"),
     ]
 
@@ -39,25 +36,23 @@ def checks_of(settings: Settings) -> list[Check]:
 def run_child(arguments: Sequence[str]) -> subprocess.CompletedProcess[str]:
     """Run this module as a process. Raises subprocess.TimeoutExpired."""
     limit_s = _GPU_S if arguments[0] == "gpus" else _KERNELS_S
-    command = [sys.executable, "-m", _MODULE, *arguments]
     return subprocess.run(
-        command, capture_output=True, text=True, check=False, timeout=limit_s, stdin=subprocess.DEVNULL
+        [sys.executable, "-m", "graspd.commands.doctor", *arguments],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=limit_s,
+        stdin=subprocess.DEVNULL,
     )
 
 
 def gpu(settings: Settings, *, child: Child = run_child, has_driver: Callable[[], bool] | None = None) -> Finding:
-    """Check which GPUs Warp finds, and whether their memory is free.
-
-    Args:
-        child: runs this module.
-        has_driver: whether the machine appears to have a GPU.
-    """
+    """Check which GPUs Warp finds, and whether their memory is free. `child` runs this module."""
     name = "gpu"
     found, wrong = _answer(child, ["gpus"])
     if wrong:
-        return bad(
-            name, f"the GPUs cannot be queried: {wrong}", "see nvidia-smi and dmesg; restart the driver or the machine"
-        )
+        fix = "see nvidia-smi and dmesg; restart the driver or the machine"
+        return bad(name, f"the GPUs cannot be queried: {wrong}", fix)
     gpus: list[dict[str, Any]] = found["gpus"]
     needed = f"the driver has CUDA {_dotted(found['driver'])}, Warp is built for {_dotted(found['toolkit'])}"
     fix = "a driver of R580 or newer; in containers the NVIDIA container toolkit and --gpus all; CUDA_VISIBLE_DEVICES"
@@ -67,19 +62,16 @@ def gpu(settings: Settings, *, child: Child = run_child, has_driver: Callable[[]
         if (has_driver or _has_driver)():
             return bad(name, f"this machine has an NVIDIA driver, and no GPU can be used; {needed}", fix)
         return good(name, "none; work runs on the CPU")
-    if settings.device.startswith("cuda") and settings.device not in [one["name"] for one in gpus]:
-        return bad(
-            name,
-            f"GRASPD_DEVICE is {settings.device}, there are {', '.join(one['name'] for one in gpus)}",
-            "set it to one of these, or auto",
-        )
+    names = [one["name"] for one in gpus]
+    if settings.device.startswith("cuda") and settings.device not in names:
+        message = f"GRASPD_DEVICE is {settings.device}, there are {', '.join(names)}"
+        return bad(name, message, "set it to one of these, or auto")
     line = ", ".join(
         f"{one['name']} {one['model']} {one['free'] / _GIB:.0f} of {one['total'] / _GIB:.0f} GiB free" for one in gpus
     )
     if full := [one["name"] for one in gpus if one["free"] < _MEMORY_LOW]:
-        return warning(
-            name, line, f"see nvidia-smi: other processes fill {',  '.join(full)}; launches are halved until they fit"
-        )
+        fix = f"see nvidia-smi: other processes fill {',  '.join(full)}; launches are halved until they fit"
+        return warning(name, line, fix)
     return good(name, f"{line}; {needed}")
 
 
@@ -88,17 +80,13 @@ def kernels(settings: Settings, *, child: Child = run_child) -> Finding:
     name = "kernels"
     found, wrong = _answer(child, ["kernels", settings.device])
     if wrong:
-        return bad(
-            name,
-            f"the engine does not run: {wrong}",
-            "pip install 'graspd[worker]'; see disk and memory; dmesg lists killed processes",
-        )
+        fix = "pip install 'graspd[worker]'; see disk and memory; dmesg lists killed processes"
+        return bad(name, f"the engine does not run: {wrong}", fix)
+    device, cache = found["device"], found["cache"]
     if found["error"]:
-        fix = f"see the message; for a damaged cache remove {found['cache']}"
-        return bad(name, f"on {found['device']}: {found['error']}", fix)
-    return good(
-        name, f"plausible grasps, scenes and pictures of a ball on {found['device']}; kernel cache {found['cache']}"
-    )
+        fix = f"see the message; for a damaged cache remove {cache}"
+        return bad(name, f"on {device}: {found['error']}", fix)
+    return good(name, f"plausible grasps, scenes and pictures of a ball on {device}; kernel cache {cache}")
 
 
 def _answer(child: Child, arguments: Sequence[str]) -> tuple[dict[str, Any], str]:

@@ -28,17 +28,9 @@ app = CommandGroup(add_completion=False)
 
 #: Columns of the printed table: key, heading, digits.
 _COLUMNS: Final = (
-    ("n", "n", 0),
-    ("gsr", "GSR", 2),
-    ("sgs", "SGS", 2),
-    ("pd_mm", "PD", 2),
-    ("spd_mm", "SPD", 2),
-    ("ca_cm2", "CA", 1),
-    ("iv_cm3", "IV", 2),
-    ("epsilon", "ε", 2),
-    ("wrench_volume", "Vol", 2),
-    ("sd_cm", "SD", 2),
-    ("diversity", "D", 2),
+    *(("n", "n", 0), ("gsr", "GSR", 2), ("sgs", "SGS", 2), ("pd_mm", "PD", 2), ("spd_mm", "SPD", 2)),
+    *(("ca_cm2", "CA", 1), ("iv_cm3", "IV", 2), ("epsilon", "ε", 2), ("wrench_volume", "Vol", 2)),
+    *(("sd_cm", "SD", 2), ("diversity", "D", 2)),
 )
 
 

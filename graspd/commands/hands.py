@@ -73,7 +73,6 @@ def check(
 
 
 def _tried(file: str, options: dict[str, Any], *, quiet: bool) -> dict[str, Any]:
-    """Return the facts of the self-test, with progress on a terminal."""
     from graspd.worker.stages.hand_self_test import tried_softly
 
     with _bar("self-test   ", "starting; the first run on a machine compiles its kernels", quiet=quiet) as run:

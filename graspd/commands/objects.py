@@ -51,7 +51,7 @@ def check(
 
 
 def _several(file: str) -> Objects | None:
-    """Return the objects of a folder, or of a ZIP of several; None for one object, readable or not."""
+    """Return the objects of a folder, or of a ZIP of several; None for one object."""
     if file in builtin_names(AssetKind.OBJECT) and not Path(file).is_file():
         return None
     try:

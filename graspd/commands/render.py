@@ -97,7 +97,8 @@ def render(
         drawn=_drawn_in(scene, hand) if scene.kind == "base" else _drawn(scene, with_hand, hand),
         supports=TABLE if spec is None else supports_in(spec),
     )
-    with _progress(json) as bar:
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=plain_console(stderr=True), disable=json, transient=True) as bar:
         task = bar.add_task("rendering", total=None)
         result = render_views(
             obj,
@@ -200,9 +201,8 @@ def _scenes(path: Path) -> Shard:
     """Read a scene shard, or a base shard whose grasps were planned in scenes."""
     shard = read_shard(path)
     if shard.kind == "base" and "scene/object_pose" not in shard.arrays:
-        raise InputError(
-            f"{path} has grasps around a free object: a scene shard is needed here; make one: graspd scene"
-        )
+        fix = "a scene shard is needed here; make one: graspd scene"
+        raise InputError(f"{path} has grasps around a free object: {fix}")
     if shard.kind == "views":
         raise InputError(f"{path} is a views shard; a scene shard is needed here")
     return shard
@@ -215,13 +215,8 @@ def _drawn_in(base: Shard, hand: str | None) -> DrawnHand | None:
     if not len(base["grasp/hand_pose"]):
         return None
     poses, joints = (np.asarray(base[f"grasp/{name}"], float)[rows] for name in ("hand_pose", "joint_positions"))
-    return DrawnHand(
-        hand_of_shard(base, hand),
-        rows,
-        compose(np.asarray(base["scene/object_pose"], float), poses),
-        joints,
-        wrists_of(base, rows),
-    )
+    placed = compose(np.asarray(base["scene/object_pose"], float), poses)
+    return DrawnHand(hand_of_shard(base, hand), rows, placed, joints, wrists_of(base, rows))
 
 
 def _drawn(scene: Shard, base_file: Path | None, hand: str | None) -> DrawnHand | None:
@@ -234,9 +229,8 @@ def _drawn(scene: Shard, base_file: Path | None, hand: str | None) -> DrawnHand 
     rows = best_kept(scene.arrays, base.arrays)
     source = np.asarray(scene["grasp/base_index"])[rows]
     if len(source) and source.max() >= len(base["grasp/joint_positions"]):
-        raise InputError(
-            f"{base_file} has fewer grasps than the scenes were made of; give the base shard they come from"
-        )
+        fix = "give the base shard they come from"
+        raise InputError(f"{base_file} has fewer grasps than the scenes were made of; {fix}")
     joints = np.asarray(base["grasp/joint_positions"], float)[source]
     poses = np.asarray(scene["grasp/hand_pose"], float)[rows]
     return DrawnHand(model, rows, poses, joints, wrists_of(scene, rows))
@@ -244,18 +238,6 @@ def _drawn(scene: Shard, base_file: Path | None, hand: str | None) -> DrawnHand 
 
 def _show(bar: Progress, task: TaskID, done: float, total: float, message: str) -> None:
     bar.update(task, completed=done, total=total, description=message)
-
-
-def _progress(quiet: bool) -> Progress:
-    return Progress(
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-        console=plain_console(stderr=True),
-        disable=quiet,
-        transient=True,
-    )
 
 
 @app.command(epilog="graspd view grasps.h5")
@@ -273,8 +255,6 @@ def view(
 
     if said := missing():
         raise InputError(said)
-    from graspd.worker.files.provenance import hand_of_shard, neighbours_of_shard, object_of_shard
-
     base = read_shard(grasps, kind="base")
     shown = ViewerContent(base, hand_of_shard(base, hand), object_of_shard(base, object), neighbours_of_shard(base, []))
     ended = threading.Event()
@@ -283,9 +263,8 @@ def view(
     viewer = Viewer(shown, host=host, port=port)
     try:
         typer.echo(f"{grasps}: {viewer.url}")
-        typer.echo(
-            f"from another machine: {forwarding(viewer.server.get_port())}, then the same address; Ctrl-C ends it"
-        )
+        command = forwarding(viewer.server.get_port())
+        typer.echo(f"from another machine: {command}, then the same address; Ctrl-C ends it")
         ended.wait()
     finally:
         viewer.close()

@@ -69,11 +69,8 @@ def scene(
     rolling = rolling_poses(obj, poses)
     reasons = count_rejections(result["grasp/rejection"])
     if json:
-        emit(
-            {"file": str(output), "scenes": scenes, "grasps": total, "clear": clear, "rejected": reasons}
-            | {"rolling_scenes": rolling}
-            | {"seconds": round(seconds, 2)}
-        )
+        found = {"file": str(output), "scenes": scenes, "grasps": total, "clear": clear, "rejected": reasons}
+        emit(found | {"rolling_scenes": rolling, "seconds": round(seconds, 2)})
         return
     typer.echo(f"{output}: {scenes} scenes, {clear} of {total} grasps are clear, {seconds:.1f} s")
     if any(reasons.values()):

@@ -85,13 +85,7 @@ def run_workers(
     *,
     program: Sequence[str] = (sys.executable, "-m", "graspd"),
 ) -> None:
-    """Keep `count` processes alive until `stop`; process k takes the k-th GPU (`worker.engines.devices`).
-
-    Args:
-        arguments: command line of each; their settings come from the environment as well.
-        settings: how long a worker may take to stop.
-        stop: event that ends all processes.
-    """
+    """Keep `count` processes alive until `stop`; process k takes the k-th GPU (`worker.engines.devices`)."""
     from graspd.service.run.children import Child, keep_alive, stop_children
 
     of_each = [{"GRASPD_WORKER_NUMBER": str(number), "GRASPD_WORKERS_HERE": str(count)} for number in range(count)]
