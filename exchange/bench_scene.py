@@ -17,7 +17,7 @@ import numpy as np
 import trimesh
 
 from graspd.exchange.bench_hand import HandMapping
-from graspd.exchange.imported import load_npy, mesh_file, write_obj
+from graspd.exchange.imported import load_npy, mesh_file, urdf_of, write_obj
 from graspd.service.model.errors import InputError
 from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, compose, invert
@@ -51,9 +51,9 @@ def write_object(obj: ObjectModel, name: str, root: Path) -> tuple[Path, Path]:
     # The evaluator reads every file of this folder as a piece: remove those of an earlier export.
     for old in meshes.iterdir():
         old.unlink()
-    for number, (corners, faces) in enumerate(pieces):
-        write_obj(meshes / f"convex_piece_{number:03}.obj", corners, faces)
-    (root / folder / "urdf" / "coacd.urdf").write_text(_urdf(name, len(pieces)))
+    written = [write_obj(meshes / f"convex_piece_{k:03}.obj", *piece) for k, piece in enumerate(pieces)]
+    urdf = urdf_of(name, "object", [f"meshes/{file.name}" for file in written])
+    (root / folder / "urdf" / "coacd.urdf").write_text(urdf)
     solid = sum(volume("hull", (), corners, faces) for corners, faces in pieces)
     (root / folder / "info" / "simplified.json").write_text(json.dumps(_facts(obj, solid), indent=1) + "\n")
     save_record(root / scene, _scene(name, f"floating/{SCALE}", IDENTITY_POSE))
@@ -102,14 +102,6 @@ def _scene(name: str, place: str, pose: Floats) -> dict[str, Any]:
         "urdf_path": f"{folder}/urdf/coacd.urdf",
     }
     return {"scene_id": f"{name}/{place}", "scene": {name: thing}, "task": {"type": "force_closure", "obj_name": name}}
-
-
-def _urdf(name: str, pieces: int) -> str:
-    lines = [f'<robot name="{name}">', '  <link name="object">']
-    for number in range(pieces):
-        mesh = f'<geometry><mesh filename="meshes/convex_piece_{number:03}.obj"/></geometry>'
-        lines += [f"    <visual>{mesh}</visual>", f"    <collision>{mesh}</collision>"]
-    return "\n".join([*lines, "  </link>", "</robot>", ""])
 
 
 def check_table(placed: PlacedGrasps) -> None:

@@ -55,10 +55,7 @@ NAME: Final = "graspd"
 
 
 def read(path: Path, *, hand: str, obj: str) -> list[ImportedGrasps]:
-    """Read grasps of a file or folder: one set per scale, grasps on tables in separate sets.
-
-    Without a mapping beside the grasps, `hand` must have their root and joints.
-    """
+    """Read a file or folder: one set per scale, grasps on tables apart. Without a mapping, `hand` has their joints."""
     # Descriptions of scenes are pickled dictionaries too.
     files = [path] if path.is_file() else [f for f in sorted(path.rglob("*.npy")) if "scene_cfg" not in f.parts]
     if not files:
@@ -149,15 +146,13 @@ def postures(mapping: HandMapping, hand: HandModel, grasps: GraspSet, row: int, 
 
 
 def _rows(file: Path) -> list[Row]:
-    """Return the grasps of a file: one, or several if `..._qpos` have one more axis.
-
-    A file without the object's pose names a scene that contains it.
-    """
+    """Return the grasps of a file: one, or several if `..._qpos` have one more axis."""
     found = load_npy(file)
     if not isinstance(found, dict):
         raise InputError(f"{file} holds no dictionary; DexGraspBench has one a file")
     if missing := [f"{name}_qpos" for name in POSTURES if f"{name}_qpos" not in found]:
         raise InputError(f"{file} has no {missing[0]}")
+    # A file without the object's pose names a scene that has it.
     if "obj_pose" not in found and "scene_path" in found:
         found |= object_of_scene(file, str(found["scene_path"]))
     count = {len(found[f"{name}_qpos"]) if np.ndim(found[f"{name}_qpos"]) == 2 else 0 for name in POSTURES}

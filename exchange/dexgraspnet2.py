@@ -103,7 +103,6 @@ def write(
 def _numbers(
     held: bool, scenes: list[list[PictureReference]], known: dict[str, ExportPart], out: frozenset[str]
 ) -> Iterator[int]:
-    """Yield the scene numbers of one side, as in its splits."""
     count = sum((known[some[0].base].name in out) is held for some in scenes)
     room = [number for numbers in (HELD_OUT if held else TRAIN) for number in numbers]
     if count > len(room):
@@ -219,7 +218,6 @@ def read(path: Path, *, hand: str, obj: str, number: int = 0) -> list[ImportedGr
 def _with_ours(
     path: Path, hand: HandModel, found: dict[str, NDArray[Any]], grasp: Posture, away: Floats
 ) -> GraspSet | None:
-    """Return the grasps with our extra postures before and after contact; None if there are none."""
     if not {"pregrasp_qpos", "squeeze_qpos"} <= set(found):
         return None
     parts = []

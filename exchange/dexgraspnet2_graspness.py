@@ -81,17 +81,10 @@ class SceneGraspness:
     def of_view(
         self, depth: Floats, labels: NDArray[np.uint8], intrinsics: Floats, camera: Floats, object_pose: Floats
     ) -> NDArray[np.float32]:
-        """Return the graspness of the loader's cloud of a picture.
+        """Return the graspness (N, 1) of the loader's cloud of a picture, row by row; 0 on neighbours.
 
-        Args:
-            depth: (H, W) as in the loader [m]; 0: nothing.
-            labels: (H, W) 0 background, 1 the object of the grasps, others its neighbours; some pixel is labelled.
-            intrinsics: (3, 3) of a camera with pixel units [px].
-            camera: (4, 4) camera pose in the table's frame.
-            object_pose: (7,) pose of the object in the camera.
-
-        Returns:
-            (N, 1) for the N points, row by row of the picture; 0 on neighbours, which have no grasps.
+        `depth` (H, W) is 0 where nothing is [m]; `labels` (H, W) are 0 for background, 1 for the object of the grasps,
+        at least one pixel; `intrinsics` (3, 3) [px]; `camera` (4, 4) is in the table's frame, `object_pose` (7,) in it.
         """
         cloud = back_projected(depth, intrinsics)
         inside = in_workspace(cloud, depth, labels, camera)
@@ -154,10 +147,7 @@ def summed(samples: Floats, pointed: NDArray[np.intp]) -> Floats:
 
 
 def back_projected(depth: Floats, intrinsics: Floats) -> Floats:
-    """Return (H, W, 3) points of a picture in its camera [m], bit for bit as in the loader.
-
-    One point more or less at the workspace's edge would shift all values behind it to other points.
-    """
+    """Return (H, W, 3) points of a picture in its camera [m], bit for bit as in the loader: their number must agree."""
     u, v = np.meshgrid(np.arange(depth.shape[1]), np.arange(depth.shape[0]))
     x = (u - intrinsics[0, 2]) * depth / intrinsics[0, 0]
     y = (v - intrinsics[1, 2]) * depth / intrinsics[1, 1]

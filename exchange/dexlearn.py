@@ -76,7 +76,6 @@ _Part = tuple[ExportPart, Path, int, NDArray[np.intp]]
 
 
 def _scenes(lots: Sequence[ExportPart], folder: Path) -> _Scenes:
-    """Write objects and scenes; scenes of an object are numbered across its shards."""
     scenes: _Scenes = {}
     free: dict[str, Path] = {}
     count = Counter[str]()
@@ -181,7 +180,6 @@ def _record(mapping: HandMapping, lot: ExportPart, rows: NDArray[np.intp], scene
 
 
 def _configure(folder: Path, name: str, lot: ExportPart, types: list[str]) -> None:
-    """Write DexLearn's configuration of the data."""
     values: dict[str, Any] = {
         "num_workers": 8,
         "num_points": POINTS,

@@ -157,10 +157,7 @@ def convention(hand: HandModel) -> dict[str, Any]:
 
 
 def read(path: Path, *, hand: str, obj: str, object_name: str = "") -> list[ImportedGrasps]:
-    """Read a record, a tar file of records, or a folder of tar files; without joints, fingers close until contact.
-
-    The hand's root link is the base link of the gripper; `object_name` is the UUID, optional with a single object.
-    """
+    """Read a record, a tar file of records, or a folder of tar files; without joints, fingers close until contact."""
     file, record = _found(path, object_name)
     try:
         scale, grasps = float(record["object"]["scale"]), record["grasps"]
@@ -183,7 +180,6 @@ def read(path: Path, *, hand: str, obj: str, object_name: str = "") -> list[Impo
 
 
 def _grasps(file: str, hand: HandModel, record: dict[str, Any], pose: Floats) -> GraspSet | None:
-    """Return the grasps with our additional joints; None if there are none."""
     grasps, names = record["grasps"], record.get("gripper", {}).get("joint_names")
     if not names or not all(f"{name}_joints" in grasps for name in POSTURES):
         return None
@@ -198,7 +194,6 @@ def _grasps(file: str, hand: HandModel, record: dict[str, Any], pose: Floats) ->
 
 
 def _found(path: Path, uuid: str) -> tuple[str, dict[str, Any]]:
-    """Return the record of an object, and its name for errors."""
     if path.suffix == ".json":
         with path.open("rb") as stream:
             return str(path), _parsed(str(path), stream.read(LARGEST + 1))

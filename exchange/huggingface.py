@@ -154,7 +154,6 @@ def _grasps(lot: ExportPart) -> list[dict[str, Any]]:
 
 
 def _groups(pictures: Pictures, names: Mapping[str, str], noise: DepthNoise | None) -> Iterator[list[dict[str, Any]]]:
-    """Yield the pictures of some base shards; `names` are those of their objects."""
     group: list[dict[str, Any]] = []
     for index, sample in enumerate(pictures):
         if sample["base_id"] in names:
@@ -196,10 +195,7 @@ def png(pixels: NDArray[Any]) -> dict[str, Any]:
 
 
 def read(path: Path, *, hand: str, obj: str, object_name: str = "") -> list[ImportedGrasps]:
-    """Read a file, or `grasps/*.parquet` of a folder; free grasps and those on tables are separate sets.
-
-    `object_name` is the object's name in the file, optional with a single object.
-    """
+    """Read a file, or `grasps/*.parquet` of a folder; free grasps and those on tables are separate sets."""
     files = [path] if path.is_file() else sorted((path / "grasps").glob("*.parquet"))
     columns: dict[str, list[Any]] = {}
     for file in files:

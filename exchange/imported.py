@@ -62,10 +62,7 @@ def verdicts(values: Sequence[Any] | NDArray[Any]) -> NDArray[np.int8]:
 
 
 def joints_by_name(hand: HandModel, names: Sequence[str], values: Any, *, what: str) -> Floats:
-    """Return (N, J) joint positions in the hand's order from (N, n) values in the order of `names`.
-
-    Joints that the source lacks follow a mimic or stay at their middle.
-    """
+    """Return (N, J) joints of the hand from (N, n) values of `names`; others follow a mimic or stay at their middle."""
     given = np.atleast_2d(np.asarray(values, float))
     if given.shape[1] != len(names):
         raise InputError(f"{what}: {given.shape[1]} joint values for {len(names)} joints")
@@ -101,6 +98,15 @@ def write_obj(path: Path, vertices: Any, faces: Any, comment: str = "metres") ->
     lines += [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in faces]
     path.write_text("\n".join(lines) + "\n")
     return path
+
+
+def urdf_of(name: str, link: str, meshes: Sequence[str]) -> str:
+    """Return the URDF of one link made of meshes."""
+    lines = [f'<robot name="{name}">', f'  <link name="{link}">']
+    for mesh in meshes:
+        geometry = f'<geometry><mesh filename="{mesh}"/></geometry>'
+        lines += [f"    <visual>{geometry}</visual>", f"    <collision>{geometry}</collision>"]
+    return "\n".join([*lines, "  </link>", "</robot>", ""])
 
 
 _HARMLESS: Final = {

@@ -67,10 +67,7 @@ _INDEXED: Final = {
 
 
 def write(lots: Sequence[ExportPart], pictures: Pictures, folder: Path, out: frozenset[str]) -> ExportSummary:
-    """Write an episode for each grasp of one hand whose scene has a picture; several pictures are used in turn.
-
-    Episodes of held-out objects come last, split `test`.
-    """
+    """Write an episode for each grasp whose scene has a picture (several in turn); held-out objects come last."""
     parquet.arrow()
     if (folder / "meta").exists():
         raise InputError(f"{folder} holds a data set already; give another folder as --output")
@@ -97,7 +94,6 @@ def write(lots: Sequence[ExportPart], pictures: Pictures, folder: Path, out: fro
 def _seen(
     lot: ExportPart, seen: Mapping[tuple[str, int], list[PictureReference]]
 ) -> Iterator[tuple[int, PictureReference]]:
-    """Yield the lot's rows with a picture of their scene."""
     assert lot.placed is not None
     for k, row in enumerate(lot.rows.tolist()):
         if found := seen.get((lot.id, int(lot.placed.index[row]))):
@@ -250,10 +246,7 @@ _LARGEST = 2**22
 
 
 def read(path: Path, *, hand: str, obj: str, object_name: str = "") -> list[ImportedGrasps]:
-    """Read the grasps on one object, on tables, with trajectories if all have equal numbers of waypoints.
-
-    `object_name` is the object's name in the tasks, optional with a single task.
-    """
+    """Read the grasps on one object, on tables, with trajectories if all have equal numbers of waypoints."""
     names = _names(path)
     task = _task(path, object_name)
     ways, rest, numbers = _ways(path, task)
@@ -279,7 +272,6 @@ def read(path: Path, *, hand: str, obj: str, object_name: str = "") -> list[Impo
 
 
 def _names(path: Path) -> list[str]:
-    """Return the joints of the states, in order."""
     file = path / "meta" / "info.json"
     try:
         with file.open("rb") as stream:

@@ -47,10 +47,7 @@ class ExportPart:
 
 
 def held_out(kinds: Mapping[str, str], share: float) -> frozenset[str]:
-    """Return the held-out objects: `share` of the kinds, at least one and not all, by the order of a hash.
-
-    A kind is never split, see `exchange.training_export`; of a single kind nothing is held out.
-    """
+    """Return the objects of `share` of the kinds, by the order of a hash: not none, not all, none of a single one."""
     order = sorted(set(kinds.values()), key=lambda kind: hashlib.sha256(kind.encode()).digest())
     chosen = order[: min(max(1, round(share * len(order))), len(order) - 1)]
     return frozenset(name for name, kind in kinds.items() if kind in chosen)

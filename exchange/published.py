@@ -73,7 +73,6 @@ def read_ddgc(path: Path, *, hand: str, obj: str, number: int = 0) -> list[Impor
 
 
 def _names(hand: HandModel) -> list[str]:
-    """Return the hand's joint for each role."""
     names = []
     for role in ROLES:
         found = [name for name in hand.joint_names if re.search(role, name)]

@@ -29,7 +29,6 @@ from graspd.exchange.robots.reach import ReachSearch
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import IDENTITY_POSE
 from graspd.service.store.shards import Shard, read_shard
-from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
 from graspd.worker.files.provenance import hand_files_of_shard
 from graspd.worker.files.subsets import choose
 from graspd.worker.rendering.sheets import best as best_of
@@ -56,9 +55,7 @@ class RobotExportOptions:
     mount_pose: str | None = None
 
 
-def export_grasps(
-    source: Path, format_: str, wishes: RobotExportOptions, folder: Path, run: ExecutionContext = DEFAULT_CONTEXT
-) -> ExportSummary:
+def export_grasps(source: Path, format_: str, wishes: RobotExportOptions, folder: Path) -> ExportSummary:
     """Write grasps of a base shard in the format of a robot or its simulator."""
     if not 0 < wishes.speed <= 1:
         raise InputError(f"--speed is {wishes.speed:g}; give a share of the velocity limits above 0 and at most 1")
@@ -81,27 +78,21 @@ def export_grasps(
         ]
         bundle = Bundle(found, trajectories, description)
     else:
-        bundle = _carried(found, description, limits, wishes, written, run)
+        bundle = _carried(found, description, limits, wishes, written)
     paths = _write(bundle, format_, folder, files.files)
     written.counts |= {"grasps": len(bundle.found), "files": len(paths)}
     return written
 
 
 def _carried(
-    found: Executions,
-    description: Description,
-    limits: Limits,
-    wishes: RobotExportOptions,
-    written: ExportSummary,
-    run: ExecutionContext,
+    found: Executions, description: Description, limits: Limits, wishes: RobotExportOptions, written: ExportSummary
 ) -> Bundle:
-    """Return the grasps that the arm can execute, with its trajectories."""
     assert wishes.arm is not None and wishes.mount is not None
     base = IDENTITY_POSE if wishes.base is None else parse_pose(wishes.base, "--base")
     mount_pose = IDENTITY_POSE if wishes.mount_pose is None else parse_pose(wishes.mount_pose, "--mount-pose")
     arm = read_arm(wishes.arm, wishes.mount, mount_pose)
     reach = ReachSearch(arm, base, found, decompose(found.obj))
-    reached = reach.all(wishes.best, run)
+    reached = reach.all(wishes.best)
     why = ", ".join(f"{count} {reason}" for reason, count in reached.refused.most_common(3))
     if not reached.rows:
         raise InputError(

@@ -43,8 +43,7 @@ class TrainingExportOptions:
 def export_training(source: Path, format_: str, wishes: TrainingExportOptions, folder: Path) -> ExportSummary:
     """Write the grasps of a folder of shards in a training format.
 
-    Writers take the grasps (`lots`), the pictures of their scenes, the held-out objects (`out`) and the noise of a
-    depth camera (None: perfect depth); they refuse a folder that already contains such files.
+    Writers take grasps (`lots`), pictures of their scenes, held-out objects (`out`) and the noise of a depth camera.
     """
     if not 0 < wishes.held_out < 1:
         raise InputError(f"--held-out is {wishes.held_out:g}; give a share of the objects between 0 and 1")
@@ -64,7 +63,6 @@ def export_training(source: Path, format_: str, wishes: TrainingExportOptions, f
 
 
 def _lots(shards: Shards, format_: str, wishes: TrainingExportOptions) -> list[ExportPart]:
-    """Return the requested grasps of all base shards that have some."""
     lots: list[ExportPart] = []
     digests: dict[str, str] = {}
     refused: InputError | None = None

@@ -27,10 +27,7 @@ _COLUMNS: Final = ("image/rgb", "image/depth", "image/segmentation", "camera/int
 def write(
     shards: Shards, folder: Path, *, pictures_a_file: int = 1000, valid: bool = True, unvalidated: bool = False
 ) -> list[Path]:
-    """Write `pictures-NNNNNN.tar` files of views shards with the scene and base shards they were made of.
-
-    `valid` and `unvalidated` select the grasps, see `Pictures`.
-    """
+    """Write `pictures-NNNNNN.tar` of views shards with their scene and base shards; `Pictures` selects the grasps."""
     pictures = Pictures(
         shards, _COLUMNS, grasp_quality=("quality/epsilon", "quality/success"), valid=valid, unvalidated=unvalidated
     )

@@ -371,11 +371,7 @@ def open(
 
 
 def joined(shards: Sequence[Shard]) -> Grasps:
-    """Concatenate the grasps of base shards of one hand; columns missing from some shards are omitted.
-
-    Raises:
-        InputError: there are no shards, or their joints or contact thresholds differ.
-    """
+    """Concatenate the grasps of base shards of one hand; columns missing from some shards are omitted."""
     if not shards:
         raise InputError("there is no file of grasps here")
     first = shards[0]

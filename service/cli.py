@@ -174,6 +174,14 @@ def emit(value: BaseModel | dict[str, Any]) -> None:
     typer.echo(json.dumps(plain, allow_nan=False, default=str))
 
 
+def report(value: BaseModel | dict[str, Any], text: str, *, json: bool) -> None:
+    """Print a result as JSON or as text."""
+    if json:
+        emit(value)
+    else:
+        typer.echo(text)
+
+
 def load_settings(**overrides: Any) -> Settings:
     """Load the settings of the environment and the given command options; InputError for a bad value."""
     from graspd.service.settings import GONE, Settings

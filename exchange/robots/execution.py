@@ -98,10 +98,7 @@ def executions(
     tool: ToolFrame,
     quality: dict[str, NDArray[Any]],
 ) -> Executions:
-    """Return the grasps with a trajectory, as planned in their scene or here for a free object; see `Executions`.
-
-    For a free object a straight retreat of 10 cm may be impossible; InputError if it is for all grasps.
-    """
+    """Return the grasps with a trajectory, as planned in their scene, or here for a free object if it can be left."""
     frame, at = "object", np.tile(IDENTITY_POSE, (len(grasps), 1))
     free = np.ones(len(grasps), bool)
     if placed is None or grasps.approach is None or grasps.coming is None or grasps.lift is None:

@@ -12,7 +12,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from graspd.exchange.imported import mesh_file
+from graspd.exchange.imported import mesh_file, urdf_of
 from graspd.exchange.plan import plain_name
 from graspd.exchange.robots.bundle import Bundle, dump_yaml, numbers
 from graspd.exchange.robots.execution import RobotTrajectory
@@ -135,10 +135,6 @@ def _hand(folder: Path, files: Mapping[str, bytes]) -> list[Path]:
 def _object(bundle: Bundle, folder: Path) -> list[Path]:
     obj, name = bundle.found.obj, plain_name(bundle.found.obj.name)
     folder.mkdir(parents=True, exist_ok=True)
-    mesh = f'<geometry><mesh filename="{name}.obj"/></geometry>'
-    urdf = folder / f"{name}.urdf"
-    urdf.write_text(
-        f'<robot name="{name}">\n  <link name="{name}">\n    <visual>{mesh}</visual>\n'
-        f"    <collision>{mesh}</collision>\n  </link>\n</robot>\n"
-    )
-    return [mesh_file(obj, folder / f"{name}.obj"), urdf]
+    urdf, mesh = folder / f"{name}.urdf", folder / f"{name}.obj"
+    urdf.write_text(urdf_of(name, name, [mesh.name]))
+    return [mesh_file(obj, mesh), urdf]

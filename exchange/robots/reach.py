@@ -20,7 +20,6 @@ from graspd.exchange.robots.execution import Executions, Path, straight_paths
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import Floats
 from graspd.worker.engines.mujoco_warnings import ARENA
-from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
 from graspd.worker.hands.model import HandModel, JointType
 from graspd.worker.simulation.environment import Obstacle
 from graspd.worker.validation.decomposition import ConvexPieces
@@ -73,11 +72,10 @@ class ReachSearch:
         self._limits = [mink.ConfigurationLimit(self._model)]
         self._order = np.array([int(self._model.joint(f"arm{b}").qposadr[0]) for b in arm.model.joint_body], np.intp)
 
-    def all(self, wanted: int = 0, run: ExecutionContext = DEFAULT_CONTEXT) -> ReachResult:
+    def all(self, wanted: int = 0) -> ReachResult:
         """Search all grasps, or in order until `wanted` are found."""
         reached = ReachResult()
         for row in range(len(self.found)):
-            run.check("the search of an arm's ways")
             reached.candidates += 1
             paths, reason = self.one(row)
             if paths is None:
@@ -85,7 +83,6 @@ class ReachSearch:
             else:
                 reached.rows.append(row)
                 reached.paths.append(paths)
-            run.progress(row + 1, len(self.found), "inverse kinematics")
             if wanted and len(reached.rows) >= wanted:
                 break
         return reached
@@ -108,7 +105,6 @@ class ReachSearch:
         return None, reason
 
     def _from(self, q: Floats, ways: list[Path], row: int) -> tuple[list[Path] | None, str]:
-        """Return the motions from one start, or the reason why there are none."""
         approach, *others = ways
         arrived = self._solve(q, approach.hand_pose[-1], STEPS)
         if arrived is None:
@@ -278,7 +274,6 @@ class ArmScene:
 
 
 def _add_tree(spec: Any, root: Any, model: HandModel, prefix: str, contact: dict[str, int]) -> list[Any]:
-    """Add bodies with joints and shapes below `root`, which is body 0."""
     bodies = [root]
     for b in range(1, model.bodies):
         pose = model.origin[b]

@@ -12,7 +12,7 @@ from graspd.api.access.keys import Key, KeyFile, KeyLimits, ProjectLimits, Scope
 from graspd.api.formatting import minute
 from graspd.client.client import path_of
 from graspd.client.reports import UrlOption, YesOption, confirm, open_client, print_rows, say_deleted
-from graspd.service.cli import CommandGroup, JsonFlag, emit, load_settings
+from graspd.service.cli import CommandGroup, JsonFlag, load_settings, report
 from graspd.service.model.errors import InputError
 
 keys_app = CommandGroup(no_args_is_help=True, help="Make, list, rotate, limit and revoke API keys.")
@@ -90,19 +90,15 @@ def limit_key(
     if not given:
         raise InputError("give at least one limit, such as --jobs-per-day 100")
     limits = _key_file().limit(name, KeyLimits(**given))
-    if json:
-        emit({"name": name, "limits": limits.model_dump(exclude_none=True)})
-        return
-    typer.echo(f"limits of {name}: {_key_limits(limits)}")
+    document = {"name": name, "limits": limits.model_dump(exclude_none=True)}
+    report(document, f"limits of {name}: {_key_limits(limits)}", json=json)
 
 
 @keys_app.command("list", epilog="graspd keys list --json")
 def list_keys(json: JsonFlag = False) -> None:
     """List all keys, without their secrets."""
     found = _key_file().list()
-    if json:
-        emit({"keys": [key.model_dump(mode="json", exclude={"sha256"}) for key in found]})
-        return
+    document = {"keys": [key.model_dump(mode="json", exclude={"sha256"}) for key in found]}
     has_projects = any(key.project for key in found)
     names = ["name", "scope", *(["project"] if has_projects else []), "state", "created", "expires", "limits"]
     rows = []
@@ -111,17 +107,14 @@ def list_keys(json: JsonFlag = False) -> None:
         times = minute(key.created), minute(key.expires)
         rows.append((key.name, key.scope, *of, _state(key), *times, _key_limits(key.limits)))
     empty = "no key; the service is open, but only to this machine"
-    print_rows(names, rows, whole=("state", "created", "expires"), empty=empty)
+    print_rows(document, names, rows, whole=("state", "created", "expires"), empty=empty, json=json)
 
 
 @keys_app.command("revoke", epilog="graspd keys revoke alice")
 def revoke_key(name: NameArgument, json: JsonFlag = False) -> None:
     """Revoke a key; it is refused from the next request on."""
     _key_file().revoke(name)
-    if json:
-        emit({"name": name, "revoked": True})
-        return
-    typer.echo(f"the key {name} is revoked")
+    report({"name": name, "revoked": True}, f"the key {name} is revoked", json=json)
 
 
 def duration(text: str) -> timedelta:
@@ -137,11 +130,9 @@ def _given(**limits: int | None) -> dict[str, int]:
 
 
 def _show_token(name: str, scope: Scope, token: str, *, json: bool) -> None:
-    if json:
-        emit({"name": name, "scope": scope, "key": token})
-        return
-    typer.echo(token)
-    typer.echo("This is the only time the key is shown. Send it as `Authorization: Bearer ...`.", err=True)
+    report({"name": name, "scope": scope, "key": token}, token, json=json)
+    if not json:
+        typer.echo("This is the only time the key is shown. Send it as `Authorization: Bearer ...`.", err=True)
 
 
 def _state(key: Key) -> str:
@@ -171,16 +162,14 @@ def list_projects(json: JsonFlag = False) -> None:
         if key.is_live and key.name not in live.setdefault(key.project, []):
             live[key.project].append(key.name)
     found = file.projects()
-    if json:
-        plain = {name: limits.model_dump(exclude_none=True) for name, limits in found.items()}
-        emit({"projects": [{"project": name, "keys": live.get(name, []), "limits": plain[name]} for name in found]})
-        return
+    plain = {name: limits.model_dump(exclude_none=True) for name, limits in found.items()}
+    document = {"projects": [{"project": name, "keys": live.get(name, []), "limits": plain[name]} for name in found]}
     rows = [
         (name, ", ".join(live.get(name, [])) or "no valid key", _project_limits(limits))
         for name, limits in found.items()
     ]
     empty = "no project yet; `graspd keys add NAME --project PROJECT` makes one"
-    print_rows(("project", "keys", "limits"), rows, empty=empty)
+    print_rows(document, ("project", "keys", "limits"), rows, empty=empty, json=json)
 
 
 @projects_app.command(
@@ -203,10 +192,8 @@ def limit_project(
     if not given:
         raise InputError("give at least one limit, such as --grasps-per-day 1000000")
     limits = _key_file().limit_project(name, ProjectLimits(**given))
-    if json:
-        emit({"project": name, "limits": limits.model_dump(exclude_none=True)})
-        return
-    typer.echo(f"limits of {name}: {_project_limits(limits)}")
+    document = {"project": name, "limits": limits.model_dump(exclude_none=True)}
+    report(document, f"limits of {name}: {_project_limits(limits)}", json=json)
 
 
 def _project_limits(limits: ProjectLimits) -> str:
@@ -234,11 +221,9 @@ def add_webhook(
     states = [one.strip() for one in on.split(",") if one.strip()]
     with open_client(url) as client:
         made = client.send("POST", "/v1/webhooks", json={"url": address, "states": states}).json()
-    if json:
-        emit(made)
-        return
-    typer.echo(made["secret"])
-    typer.echo(f"webhook {made['id']}. This is the only time its secret is shown.", err=True)
+    report(made, made["secret"], json=json)
+    if not json:
+        typer.echo(f"webhook {made['id']}. This is the only time its secret is shown.", err=True)
 
 
 @webhooks_app.command("list", epilog="graspd webhooks list")
@@ -246,12 +231,9 @@ def list_webhooks(url: UrlOption = None, json: JsonFlag = False) -> None:
     """List webhooks that the key may change."""
     with open_client(url) as client:
         found = client.send("GET", "/v1/webhooks").json()
-    if json:
-        emit({"webhooks": found})
-        return
     rows = [(one["id"], one["url"], ", ".join(one["states"]), minute(one["created"])) for one in found]
-    empty = "no webhook yet; `graspd webhooks add URL` makes one"
-    print_rows(("id", "address", "on", "since"), rows, whole=("id", "since"), empty=empty)
+    names, empty = ("id", "address", "on", "since"), "no webhook yet; `graspd webhooks add URL` makes one"
+    print_rows({"webhooks": found}, names, rows, whole=("id", "since"), empty=empty, json=json)
 
 
 @webhooks_app.command("log", epilog="graspd webhooks log 1a2b3c")
@@ -259,15 +241,13 @@ def show_log(webhook: IdArgument, url: UrlOption = None, json: JsonFlag = False)
     """List deliveries of a webhook, newest first."""
     with open_client(url) as client:
         found = client.send("GET", path_of("webhooks", webhook, "deliveries")).json()
-    if json:
-        emit({"deliveries": found})
-        return
     rows = []
     for one in found:
         what = f"{one['kind']} {one['subject'][:12] if one['kind'] == 'job' else one['subject']}"
         rows.append((what, one["ended"], one["state"], str(one["attempts"]), minute(one["tried"]), one["detail"]))
     names = ("what", "ended", "delivery", "attempts", "last", "")
-    print_rows(names, rows, whole=("ended", "delivery", "last"), empty="no delivery yet")
+    whole = ("ended", "delivery", "last")
+    print_rows({"deliveries": found}, names, rows, whole=whole, empty="no delivery yet", json=json)
 
 
 @webhooks_app.command("delete", epilog="graspd webhooks delete 1a2b3c")

@@ -40,16 +40,7 @@ View = TypeVar("View", bound=BaseModel)
 
 
 class Client:
-    """Connection to one graspd API. Usable as a context manager.
-
-    Args:
-        url: address of the API, e.g. http://127.0.0.1:8000.
-        key: Bearer key, if the service requires one.
-        transport: replaces the network in tests.
-
-    Raises:
-        InputError: the address or the key cannot be used.
-    """
+    """Connection to one graspd API. Usable as a context manager. `transport` replaces the network in tests."""
 
     def __init__(self, url: str, *, key: str | None = None, transport: httpx.BaseTransport | None = None) -> None:
         address = _address(url.strip().rstrip("/"))
@@ -130,10 +121,7 @@ class Client:
             raise InputError(f"{path} cannot be read: {error.strerror}") from None
 
     def wait_checked(self, kind: AssetKind, digest: str, *, timeout_s: float = 120.0) -> AssetView:
-        """Return an uploaded asset after its check; raise UnavailableError if no worker checked it in time.
-
-        It is named by its digest: after a refusal, the name may refer to another asset.
-        """
+        """Return an uploaded asset after its check; after a refusal, its name may refer to another asset."""
         deadline = time.monotonic() + timeout_s
         while (asset := self.asset(kind, digest)).verdict is None:
             if time.monotonic() > deadline:
@@ -233,7 +221,6 @@ class Client:
         return TypeAdapter(list[ObjectSetView]).validate_json(self.send("GET", "/v1/object-sets").content)
 
     def _pages(self, kind: type[View], path: str, **params: Any) -> Iterator[View]:
-        """Yield all items of a paginated list."""
         params |= {"limit": _PAGE, "cursor": None}
         while True:
             page: Page[Any] = self._document(Page[kind], "GET", path, params=params)  # type: ignore[valid-type]

@@ -77,9 +77,7 @@ def jobs(
     """List jobs, newest first."""
     with open_client(url) as client:
         page = client.jobs(state=state, limit=limit)
-    if json:
-        emit({"jobs": [job.model_dump(mode="json") for job in page.items], "next": page.next})
-        return
+    document = {"jobs": [job.model_dump(mode="json") for job in page.items], "next": page.next}
     rows = []
     for job in page.items:
         made = job.valid if job.standing == "valid" else job.grasps
@@ -88,7 +86,7 @@ def jobs(
         rows.append((job.id[:12], job.state, job.hand, job.object, *last))
     names = ("job", "state", "hand", "object", "progress", "grasps", "created")
     empty = "no job yet; `graspd submit --hand allegro --object mug` makes one"
-    print_rows(names, rows, whole=("job", "state", "created"), empty=empty)
+    print_rows(document, names, rows, whole=("job", "state", "created"), empty=empty, json=json)
 
 
 @app.command(epilog="graspd status 3f2a --json")
@@ -175,9 +173,7 @@ def asset_commands(kind: AssetKind) -> typer.Typer:
         """List all, by default without refused ones."""
         with open_client(url) as client:
             assets = list(client.assets(kind, refused=refused))
-        if json:
-            emit({f"{kind.value}s": [asset.model_dump(mode="json") for asset in assets]})
-            return
+        document = {f"{kind.value}s": [asset.model_dump(mode="json") for asset in assets]}
         # All networks have the same file name, so their hand is shown instead.
         second = "hand" if kind is AssetKind.NETWORK else "file"
         rows = []
@@ -187,7 +183,8 @@ def asset_commands(kind: AssetKind) -> typer.Typer:
                 origin += f"; {says}"
             named = hand_line(asset.facts) if kind is AssetKind.NETWORK else asset.filename
             rows.append((asset.name, named, size(asset.size_bytes), origin, asset.digest[:12]))
-        print_rows(("name", second, "size", "check", "digest"), rows, whole=("size", "digest"))
+        names = ("name", second, "size", "check", "digest")
+        print_rows(document, names, rows, whole=("size", "digest"), json=json)
 
     @group.command("show", help=f"Show a {kind.value} with the findings of its check.")
     def show(
@@ -243,14 +240,13 @@ def sets(url: UrlOption = None, json: JsonFlag = False) -> None:
     """List sets of objects; `graspd objects add FOLDER` makes one."""
     with open_client(url) as client:
         found = client.object_sets()
-    if json:
-        emit({"sets": [one.model_dump(mode="json") for one in found]})
-        return
+    document = {"sets": [one.model_dump(mode="json") for one in found]}
     rows = [
         (one.name, count(len(one.objects)), ", ".join(one.objects[:5]) + ", ..." * (len(one.objects) > 5))
         for one in found
     ]
-    print_rows(("set", "objects", ""), rows, empty="no set yet; `graspd objects add FOLDER` makes one")
+    empty = "no set yet; `graspd objects add FOLDER` makes one"
+    print_rows(document, ("set", "objects", ""), rows, empty=empty, json=json)
 
 
 app.add_typer(hands_app, name="hands")
@@ -277,7 +273,6 @@ def _uploaded(client: Client, kind: AssetKind, value: str) -> str:
 
 
 def _full_id(client: Client, prefix: str) -> str:
-    """Return the id of the one recent job with this prefix."""
     if len(prefix) >= 32:
         return prefix
     return _only_one([job.id for job in client.jobs(limit=200).items], prefix)

@@ -27,7 +27,7 @@ from graspd.client.reports import (
     say_deleted,
     watch_dataset,
 )
-from graspd.service.cli import CommandGroup, JsonFlag, emit, plain_console
+from graspd.service.cli import CommandGroup, JsonFlag, emit, plain_console, report
 from graspd.service.command_options import parsed_options, with_options
 from graspd.service.index.views import DatasetView
 from graspd.service.model.domain import JobOptions
@@ -129,9 +129,7 @@ def list_datasets(
     """List datasets, newest first."""
     with open_client(url) as client:
         page = client.datasets(limit=limit)
-    if json:
-        emit({"datasets": [dataset.model_dump(mode="json") for dataset in page.items], "next": page.next})
-        return
+    document = {"datasets": [dataset.model_dump(mode="json") for dataset in page.items], "next": page.next}
     rows = []
     for one in page.items:
         made = f"{count(one.counted)} {one.options.standing} of {count(one.asked)}"
@@ -139,7 +137,7 @@ def list_datasets(
         rows.append((one.name, one.state, count(one.cells), *last))
     names = ("dataset", "state", "cells", "progress", "grasps", "size", "created")
     empty = "no dataset yet; `graspd datasets create NAME --hands allegro --objects mug,bottle` makes one"
-    print_rows(names, rows, whole=("state", "size", "created"), empty=empty)
+    print_rows(document, names, rows, whole=("state", "size", "created"), empty=empty, json=json)
 
 
 @group.command(epilog="graspd datasets status kitchen --state failed")
@@ -208,14 +206,12 @@ def snapshot(name: NameArgument, url: UrlOption = None, json: JsonFlag = False) 
     """Record the present shards of a dataset as an immutable list."""
     with open_client(url) as client:
         taken = client.take_snapshot(name)
-    if json:
-        emit(taken)
-        return
     whole = "complete" if taken.complete else "the dataset is not complete"
-    typer.echo(
+    line = (
         f"{taken.digest}  {count(taken.shards)} shards, {count(taken.grasps)} grasps of which {count(taken.valid)} "
         f"are valid, {size(taken.size_bytes)}; {whole}"
     )
+    report(taken, line, json=json)
 
 
 @group.command(epilog="graspd datasets export kitchen -o kitchen-v1 --snapshot 3f2a...")
@@ -249,14 +245,11 @@ def export(
 
             fetched = FORMATS[format](taken, out, lambda shard: client.fetch(path_of("shards", shard.id, "file")), show)
     told = {"dataset": name, "snapshot": taken.digest, "out": str(out), "files": len(taken.shards), "fetched": fetched}
-    if json:
-        emit({**told, "bytes": taken.size_bytes, "complete": taken.complete})
-    else:
-        typer.echo(f"{out}: {count(len(taken.shards))} files, {size(taken.size_bytes)}, snapshot {taken.digest}")
+    line = f"{out}: {count(len(taken.shards))} files, {size(taken.size_bytes)}, snapshot {taken.digest}"
+    report({**told, "bytes": taken.size_bytes, "complete": taken.complete}, line, json=json)
 
 
 def _matrix(client: Client, asked: PlanRequest) -> tuple[Objects | None, dict[str, Any]]:
-    """Return the files of a set that must still be uploaded, and the requested matrix."""
     objects = asked.objects
     names = [word.strip() for word in objects.split(",") if word.strip()]
     matrix: dict[str, Any] = {"hands": [w.strip() for w in asked.hands.split(",") if w.strip()], **asked.options}

@@ -18,7 +18,7 @@ from rich.text import Text
 from graspd.api.formatting import count, duration, metric, percent, size, valid_yield, worker_time
 from graspd.api.models import Job, JobDetail, StageStatus
 from graspd.client.client import Client, path_of
-from graspd.service.cli import emit, load_settings, plain_console, plain_table
+from graspd.service.cli import emit, load_settings, plain_console, plain_table, report
 from graspd.service.index.views import CellView, DatasetView, Validated
 from graspd.service.model.domain import JobOptions
 from graspd.service.model.errors import InputError, TaskError
@@ -58,11 +58,8 @@ def confirm(question: str, what: str, *, yes: bool) -> None:
 
 def say_deleted(what: str, name: str, *, json: bool, undo: str = "") -> None:
     """Report a deletion, and the command that undoes it."""
-    if json:
-        emit({"deleted": name, "kind": what})
-        return
-    typer.echo(f"{what} {name} is deleted")
-    if undo:
+    report({"deleted": name, "kind": what}, f"{what} {name} is deleted", json=json)
+    if undo and not json:
         typer.echo(f"`{undo}` restores it within the grace time (GRASPD_SHARD_GRACE_S)", err=True)
 
 
@@ -70,16 +67,22 @@ def restore(url: str | None, what: str, name: str, *, json: bool) -> None:
     """Restore a deleted resource and report it."""
     with open_client(url) as client:
         found = client.send("POST", path_of(f"{what}s", name, "restore")).json()
-    if json:
-        emit({"restored": found["id"], "kind": what})
-    else:
-        typer.echo(f"{what} {name} is restored")
+    report({"restored": found["id"], "kind": what}, f"{what} {name} is restored", json=json)
 
 
 def print_rows(
-    headings: Sequence[str], rows: Sequence[Sequence[str]], *, whole: Collection[str] = (), empty: str = ""
+    document: dict[str, Any],
+    headings: Sequence[str],
+    rows: Sequence[Sequence[str]],
+    *,
+    whole: Collection[str] = (),
+    empty: str = "",
+    json: bool,
 ) -> None:
-    """Print a table, or the text for an empty one. `whole`: columns whose cells stay on one line."""
+    """Print a list as JSON, or as a table (`empty` instead of an empty one); columns `whole` are not broken."""
+    if json:
+        emit(document)
+        return
     table = plain_table(*headings, whole=whole)
     for row in rows:
         table.add_row(*row)
@@ -200,8 +203,6 @@ _LINE_EVERY_S: Final = 2.0
 
 
 class _Rate(ProgressColumn):
-    """Column with the rate in the unit of the stage."""
-
     def render(self, task: Task) -> Text:
         speed = task.finished_speed or task.speed
         if not speed:
@@ -329,7 +330,6 @@ def print_estimate(found: Estimate, console: Console) -> None:
 
 
 def print_dataset(dataset: DatasetView, console: Console) -> None:
-    """Print a dataset in three lines."""
     states = ", ".join(f"{count(n)} {state.value}" for state, n in dataset.states.items() if n)
     left = f", {duration(dataset.eta_s)} left" if dataset.eta_s is not None else ""
     console.print(f"{dataset.name}  {dataset.state.value}  {percent(dataset.progress)}{left}")

@@ -11,7 +11,7 @@ import typer
 from graspd.api.formatting import count, minute
 from graspd.client.client import path_of
 from graspd.client.reports import UrlOption, YesOption, confirm, open_client, print_rows, restore, say_deleted
-from graspd.service.cli import CommandGroup, JsonFlag, emit
+from graspd.service.cli import CommandGroup, JsonFlag, report
 from graspd.service.model.errors import InputError
 
 app = CommandGroup(no_args_is_help=True, help="Tag grasps of the service; list and export tagged ones.")
@@ -33,12 +33,9 @@ def list_tags(url: UrlOption = None, json: JsonFlag = False) -> None:
     """List tags with their numbers of grasps."""
     with open_client(url) as client:
         found = client.send("GET", "/v1/tags").json()
-    if json:
-        emit({"tags": found})
-        return
     rows = [(one["name"], count(one["grasps"]), minute(one["changed"])) for one in found]
     empty = "no tag yet; `graspd tags add TAG --where EXPRESSION` tags grasps"
-    print_rows(("tag", "grasps", "changed"), rows, whole=("grasps", "changed"), empty=empty)
+    print_rows({"tags": found}, ("tag", "grasps", "changed"), rows, whole=("grasps", "changed"), empty=empty, json=json)
 
 
 @app.command("add", epilog='graspd tags add good --dataset kitchen --where "epsilon > 0.3 and lift"')
@@ -105,10 +102,7 @@ def export_tag(
         raise InputError(f"{out}: the name of the file must end in .zip, .csv or .json")
     with open_client(url) as client:
         client.save("/v1/grasps/export", out, params={"tag": tag, "format": format}, patience_s=_PATIENCE_S)
-    if json:
-        emit({"tag": tag, "file": str(out), "bytes": out.stat().st_size})
-    else:
-        typer.echo(str(out))
+    report({"tag": tag, "file": str(out), "bytes": out.stat().st_size}, str(out), json=json)
 
 
 def _selection(grasps: list[str] | None, **filters: str | None) -> dict[str, Any]:
@@ -126,8 +120,6 @@ def _selection(grasps: list[str] | None, **filters: str | None) -> dict[str, Any
 
 
 def _tell(change: dict[str, Any], words: str, *, json: bool) -> None:
-    if json:
-        emit(change)
-        return
     tag = change["tag"]
-    typer.echo(f"{count(change['changed'])} grasps {words} {tag['name']}; {count(tag['grasps'])} grasps have the tag")
+    line = f"{count(change['changed'])} grasps {words} {tag['name']}; {count(tag['grasps'])} grasps have the tag"
+    report(change, line, json=json)

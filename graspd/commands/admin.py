@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from graspd.service.cli import CommandGroup, JsonFlag, emit
+from graspd.service.cli import CommandGroup, JsonFlag, report
 from graspd.service.model.errors import InputError
 from graspd.worker.engines.devices import Device
 
@@ -37,11 +37,9 @@ def kernels(
     architectures = (arch or backend.ARCHITECTURES) if cuda else ()
     files = backend.bake(backend.modules(), architectures=architectures, cpu=cpu)
     size = sum(file.stat().st_size for file in files)
-    if json:
-        made = {"folder": str(folder), "files": len(files), "bytes": size}
-        emit(made | {"architectures": list(architectures), "cpu": cpu})
-    else:
-        typer.echo(f"{len(files)} kernel files, {size / 1e6:.1f} MB, in {folder}; GRASPD_KERNELS={folder.resolve()}")
+    made = {"folder": str(folder), "files": len(files), "bytes": size, "architectures": list(architectures), "cpu": cpu}
+    line = f"{len(files)} kernel files, {size / 1e6:.1f} MB, in {folder}; GRASPD_KERNELS={folder.resolve()}"
+    report(made, line, json=json)
 
 
 @app.command("bench-render", epilog="graspd admin bench-render --object mug --size 320x240 --size 640x480")
@@ -62,10 +60,7 @@ def bench_render(
     for width, height in [_size(text) for text in size or ["320x240", "640x480"]]:
         typer.echo(f"{width} x {height} on {used}", err=True)
         results.append(measure(obj, width=width, height=height, device=used, repeats=repeats))
-    if json:
-        emit({"results": results})
-    else:
-        typer.echo(tables(results))
+    report({"results": results}, tables(results), json=json)
 
 
 @app.command(epilog="graspd admin gallery --object mug --object banana.stl -o docs/images/scenes")
@@ -89,10 +84,8 @@ def gallery(
         seed=seed,
         say=lambda line: typer.echo(line, err=True),
     )
-    if json:
-        emit({"files": [str(file) for file in files]})
-    else:
-        typer.echo("\n".join(map(str, files)))
+    names = [str(file) for file in files]
+    report({"files": names}, "\n".join(names), json=json)
 
 
 def _object(text: str) -> ObjectModel:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from graspd.service.cli import CommandGroup, JsonFlag, emit, plain_console, plain_table
+from graspd.service.cli import CommandGroup, JsonFlag, emit, plain_console, plain_table, report
 from graspd.service.model.errors import InputError
 from graspd.service.readers import Pictures
 from graspd.service.readers.clouds import Frame
@@ -111,12 +111,10 @@ def _listed(values: list[str]) -> str:
 
 
 def _tell(found: Subset, out: Path, *, json: bool) -> None:
-    if json:
-        counts = {"looked_at": found.looked_at, "kept": found.kept, "shards": len(found.files)}
-        emit({"folder": str(out), **counts, "passed_over": found.passed_over})
-        return
-    typer.echo(f"{out}: {found.kept} of {found.looked_at} grasps in {len(found.files)} shards")
-    if found.passed_over:
+    counts = {"looked_at": found.looked_at, "kept": found.kept, "shards": len(found.files)}
+    line = f"{out}: {found.kept} of {found.looked_at} grasps in {len(found.files)} shards"
+    report({"folder": str(out), **counts, "passed_over": found.passed_over}, line, json=json)
+    if found.passed_over and not json:
         typer.echo(f"{found.passed_over} shards of scenes and pictures are not copied", err=True)
 
 
@@ -159,7 +157,5 @@ def clouds(
     said = {"source": source, "points": points, "noise": noise, "frame": found.frame, "fuse": fuse, "scene": scene}
     more = {"voxel_m": voxel, "graspness": graspness, "unvalidated": unvalidated, "seed": seed}
     done = write_clouds(found, out, said | more)
-    if json:
-        emit({"folder": str(out), **done})
-        return
-    typer.echo(f"{out}: {done['clouds']} clouds in {done['files']} files, {done['empty']} of them empty")
+    line = f"{out}: {done['clouds']} clouds in {done['files']} files, {done['empty']} of them empty"
+    report({"folder": str(out), **done}, line, json=json)

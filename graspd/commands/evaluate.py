@@ -143,7 +143,6 @@ def _checked_level(protocol: str, level: str) -> str:
 
 
 def _tell(rows: list[dict[str, Any]], foreign: str, *, json: bool) -> None:
-    """Print the rows of all files and their totals, as a table or as JSON."""
     whole = combine([{key: value for key, value in row.items() if key != "file"} for row in rows])
     if json:
         verdicts = [{"file": row["file"], **one} for row in rows for one in row.pop("verdicts", [])]
@@ -160,7 +159,6 @@ def _tell(rows: list[dict[str, Any]], foreign: str, *, json: bool) -> None:
 
 
 def _copies(paths: list[Path], files: list[Path], out: Path | None, *, robust: int, hard: bool) -> dict[Path, Path]:
-    """Return the path of each file's copy; empty without --out."""
     if out is None:
         return {}
     if not robust or hard or len(paths) != 1:
@@ -169,7 +167,6 @@ def _copies(paths: list[Path], files: list[Path], out: Path | None, *, robust: i
 
 
 def _said_of_models(whole: dict[str, Any]) -> str:
-    """Describe the robustness of the verdicts, with the most harmful axis first."""
     words = {axis.word: name for axis, name in AXIS_MEANINGS.items()}
     axes = sorted(whole["robust_axes"].items(), key=lambda pair: pair[1]["share"])
     each = ", ".join(f"{words[axis]} {one['share']:.2f}" for axis, one in axes)
@@ -231,11 +228,7 @@ def _cell(value: float | None, digits: int) -> str:
 
 
 def copy_paths(source: Path, files: list[Path], out: Path) -> list[Path]:
-    """Return `out` for a file; for a folder, the same subpaths in `out`, which must be new or empty.
-
-    Raises:
-        InputError: a file is no shard, would be overwritten, or lies in no folder.
-    """
+    """Return `out` for a file; for a folder, the same subpaths in `out`, which must be new or empty."""
     if other := next((file for file in files if file.suffix != ".h5"), None):
         raise InputError(f"{other} is no shard of graspd: only these have columns for the shares")
     if source.is_dir():
@@ -248,11 +241,7 @@ def copy_paths(source: Path, files: list[Path], out: Path) -> list[Path]:
 
 
 def write_copy(source: Path, out: Path, found: Robustness) -> None:
-    """Write a base shard with the robust shares of its grasps; all else, including its id, is unchanged.
-
-    Raises:
-        InputError: it is no base shard, or the copy cannot be written.
-    """
+    """Write a base shard with the robust shares of its grasps; all else, including its id, is unchanged."""
     shard = read_shard(source, kind="base")
     said = json_attribute({"models": found.held.shape[1], "wanted": found.wanted})
     data = write_shard("base", {**shard.arrays, **found.columns}, {**carried(shard), "robust": said})

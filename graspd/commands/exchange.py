@@ -13,7 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from graspd.exchange.opening import opened
 from graspd.exchange.plan import ExportSummary
-from graspd.service.cli import CommandGroup, JsonFlag, emit, load_settings, plain_console
+from graspd.service.cli import CommandGroup, JsonFlag, load_settings, plain_console, report
 from graspd.service.model.errors import InputError, one_of
 from graspd.service.store import validity
 from graspd.service.store.shards import read_shard
@@ -96,11 +96,10 @@ def export(
             done = _bench(source, hand, object_, output, unvalidated=unvalidated, every=every)
         else:
             done = _pictures(source, format_, depth, output)
-    if json:
-        emit({"folder": str(output), "format": format_, **done.counts, **({"notes": done.notes} if done.notes else {})})
-        return
-    typer.echo(f"{output}: " + ", ".join(f"{n} {what}" for what, n in done.counts.items() if isinstance(n, int)))
-    for note in done.notes:
+    told = {"folder": str(output), "format": format_, **done.counts, **({"notes": done.notes} if done.notes else {})}
+    line = f"{output}: " + ", ".join(f"{n} {what}" for what, n in done.counts.items() if isinstance(n, int))
+    report(told, line, json=json)
+    for note in () if json else done.notes:
         typer.echo(note, err=True)
 
 
@@ -146,16 +145,18 @@ def import_(
     ]
     (output / "source.json").write_text(jsonlib.dumps(vars(said), indent=1) + "\n")
     found = [_summary(file) for file in files]
-    if json:
-        emit({"folder": str(output), "shards": found})
-        return
+    lines = []
     for one in found:
         validated = "not validated" if validation == "none" else f"{one['valid']} valid at level {validation}"
-        typer.echo(f"{one['file']}: {one['grasps']} grasps, {one['feasible']} feasible, {validated}{_compared(one)}")
+        lines.append(f"{one['file']}: {one['grasps']} grasps, {one['feasible']} feasible, {validated}{_compared(one)}")
+    report({"folder": str(output), "shards": found}, "\n".join(lines), json=json)
 
 
 def read_sets(format_: str, source: Path, hand: str | None, obj: str | None, options: dict[str, Any]) -> list[Any]:
-    """Return the sets of grasps in a file of that format; `obj` is a mesh at scale 1."""
+    """Return the sets of grasps in a file of that format.
+
+    `hand` is a URDF or built-in, `obj` a mesh at scale 1; the object's name is optional in a file of a single object.
+    """
     from graspd.exchange import dexgraspbench, dexgraspnet2, graspgen, huggingface, lerobot, published
 
     if format_ not in IMPORTS:
@@ -219,7 +220,6 @@ def _bench(
 
 
 def _compared(one: dict[str, Any]) -> str:
-    """Describe how published verdicts of imported grasps agree with ours."""
     words = f"; {one['published']} have a published verdict" if one["published"] else ""
     if one["agreement_published"] is not None:
         words += f", {one['agreement_published']:.0%} of them equal to ours"
@@ -283,8 +283,5 @@ def card(
     made = found["composition"]
     told = {"out": str(out), "dataset": found["name"], "snapshot": (found["snapshot"] or {}).get("digest")}
     told |= {"grasps": made["grasps"], "valid": made["valid"], "pictures": made["pictures"], "plots": found["plots"]}
-    if json:
-        emit(told)
-    else:
-        plots = len(found["plots"])
-        typer.echo(f"{out}/README.md: {made['valid']:,} valid grasps, {plots} plots, checksums, card.json")
+    plots = len(found["plots"])
+    report(told, f"{out}/README.md: {made['valid']:,} valid grasps, {plots} plots, checksums, card.json", json=json)

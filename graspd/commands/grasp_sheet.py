@@ -149,7 +149,6 @@ class GraspAnimation:
     run: ExecutionContext
     width: int | None = None
     """Width [px]; None: `WIDTH`."""
-    samples: int = FILM_SAMPLES
 
     def file(self, suffix: str) -> bytes:
         """Return the film as GIF, WebP or animated PNG."""
@@ -185,7 +184,7 @@ class GraspAnimation:
         around = around_of(self.shard, np.array([row]))
         size = (width, round(HIGH * width))
         (sides,) = way_pictures(
-            self.hand, self.obj, [way], around, size, whole=True, run=self.run, samples=self.samples
+            self.hand, self.obj, [way], around, size, whole=True, run=self.run, samples=FILM_SAMPLES
         )
         return np.asarray(sides[0])
 

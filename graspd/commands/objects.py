@@ -63,7 +63,6 @@ def _several(file: str) -> Objects | None:
 
 
 def _check_set(objects: Objects, options: dict[str, Any], *, json: bool) -> None:
-    """Print one line per object; a refused object does not stop the others."""
     reports = []
     for name, files in objects.items():
         reports.append({"name": name, **check_object(files, name, **options)})

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 from graspd.commands.grasp_sheet import GraspAnimation, GraspSheet
-from graspd.service.cli import CommandGroup, JsonFlag, emit, plain_console, write_output
+from graspd.service.cli import CommandGroup, JsonFlag, plain_console, report, write_output
 from graspd.service.model.errors import InputError
 from graspd.service.model.scene_spec import supports_in
 from graspd.service.model.transforms import compose
@@ -122,10 +122,8 @@ def render(
         title = f"Views of {scene.attributes.get('object', 'the object')}"
         subtitle = f"{count} pictures, {size[0]} x {size[1]} pixels"
         write_output(page, views_page(result, title=title, subtitle=subtitle))
-    if json:
-        emit({"file": str(output), "pictures": count, "seconds": round(seconds, 2), "device": used})
-    else:
-        typer.echo(f"{output}: {count} pictures, {seconds:.1f} s on {used}")
+    told = {"file": str(output), "pictures": count, "seconds": round(seconds, 2), "device": used}
+    report(told, f"{output}: {count} pictures, {seconds:.1f} s on {used}", json=json)
 
 
 @app.command(epilog="graspd pictures grasps.h5 -o sheet.png --three-sides")
@@ -182,10 +180,8 @@ def pictures(
         sheet = GraspSheet(base, *models, "way" if way else "three sides" if three else "one side", run, size)
         page = sheet.png(subtitle=f"{len(rows)} of {among} {word}{'' if row else ', by epsilon at 5 mm'}")
     write_output(output, with_palette(page) if palette and not animate else page)
-    if json:
-        emit({"file": str(output), "grasps": len(rows), "of": among, "kind": word, "rows": rows.tolist()})
-    else:
-        typer.echo(f"{output}: {'' if row else 'the best '}{len(rows)} of {among} {word}")
+    told = {"file": str(output), "grasps": len(rows), "of": among, "kind": word, "rows": rows.tolist()}
+    report(told, f"{output}: {'' if row else 'the best '}{len(rows)} of {among} {word}", json=json)
 
 
 def _named_rows(base: Shard, rows: list[int], chosen: NDArray[np.bool_], word: str) -> NDArray[np.intp]:
@@ -198,7 +194,6 @@ def _named_rows(base: Shard, rows: list[int], chosen: NDArray[np.bool_], word: s
 
 
 def _scenes(path: Path) -> Shard:
-    """Read a scene shard, or a base shard whose grasps were planned in scenes."""
     shard = read_shard(path)
     if shard.kind == "base" and "scene/object_pose" not in shard.arrays:
         fix = "a scene shard is needed here; make one: graspd scene"

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Final
 
 import typer
 
-from graspd.service.cli import CommandGroup, JsonFlag, emit, load_settings
+from graspd.service.cli import CommandGroup, JsonFlag, load_settings, report
 from graspd.service.model.clock import timestamp
 from graspd.service.model.cores import available_cores
 from graspd.service.model.errors import InputError, one_of
@@ -69,10 +69,7 @@ def bench(
     )
     if out is not None:
         write(result, out)
-    if json:
-        emit(result)
-    else:
-        typer.echo(table(result))
+    report(result, table(result), json=json)
 
 
 def _fidelities(names: list[str] | None, points: list[int] | None, errors: list[float] | None) -> list[Fidelity]:
@@ -122,12 +119,10 @@ def stability(
     if out is not None:
         write(found, out)
     key = _publish(STABILITY, found.as_json(), data_dir) if publish else None
-    if json:
-        good = {one.name: {panel: one.share(panel) for panel in one.panels} for one in found.maps}
-        still = {one.name: one.still_breaks() for one in found.maps}
-        emit({"good": good, "still_breaks": still, "out": None if out is None else str(out), "published": key})
-    else:
-        typer.echo(markdown(found))
+    good = {one.name: {panel: one.share(panel) for panel in one.panels} for one in found.maps}
+    still = {one.name: one.still_breaks() for one in found.maps}
+    told = {"good": good, "still_breaks": still, "out": None if out is None else str(out), "published": key}
+    report(told, markdown(found), json=json)
 
 
 def _measured(names: tuple[str, ...], hand: str, obj: str, *, quick: bool, long: bool, threads: int) -> Stability:
@@ -273,10 +268,7 @@ def _finish(result: dict[str, Any], out: Path | None, data_dir: Path | None, *, 
         write(result, out)
     if publish:
         _publish(kind_of(result), result, data_dir)
-    if json:
-        emit(result)
-    else:
-        typer.echo(markdown(result))
+    report(result, markdown(result), json=json)
 
 
 def _read_chart(path: Path) -> dict[str, Any]:
@@ -294,7 +286,6 @@ def _read_chart(path: Path) -> dict[str, Any]:
 
 
 def _place(scene: str) -> SceneSpec | None:
-    """Return the scene of a chart; None: around free objects."""
     if scene == "free":
         return None
     spec = parse_scene(scene)

@@ -14,10 +14,10 @@ import typer
 from graspd.service.cli import (
     CommandGroup,
     JsonFlag,
-    emit,
     engine_settings,
     fail,
     plain_console,
+    report,
     told_to_stop,
     write_output,
 )
@@ -78,10 +78,7 @@ def synth(
         shard = write_shard("base", made.arrays, {**made.attributes, "shard_id": id_of_columns(made.arrays)})
         write_output(out, shard)
     found = {"file": str(out), **made.summary()}
-    if json:
-        emit(found)
-    else:
-        typer.echo(_said(found | ({"reason": None} if made.interrupted else {})))
+    report(found, _said(found | ({"reason": None} if made.interrupted else {})), json=json)
     if made.interrupted:
         fail(f"interrupted: {out} contains {found['grasps']} of {asked.grasps} grasps", 128 + stop[0])
     if made.reason is not None:
@@ -116,7 +113,6 @@ def _bar(*, quiet: bool) -> Iterator[Report]:
 
 
 def _said_of_models(found: dict[str, Any]) -> str:
-    """Describe the robustness of the verdicts in one line."""
     share, not_robust = found["robust_share"], found["not_robust"]
     if share is None:
         return (
@@ -129,7 +125,6 @@ def _said_of_models(found: dict[str, Any]) -> str:
 
 
 def _said(found: dict[str, Any]) -> str:
-    """Return the summary as one line, and further lines for details and the reason of a shortfall."""
     validated, mean = found["validation"] != "none", found["mean"]
     word = "valid" if validated else "feasible"
     lines = [

@@ -35,7 +35,7 @@ ID = "0123456789ab"
 CREATED = "2026-11-26T03:14:11.123456Z"
 
 
-_DONE = {"state": State.SUCCEEDED, "progress": 1.0, "created": CREATED}
+_DONE = {"state": State.SUCCEEDED, "progress": 1.0, "created": CREATED, "model_dump": dict}
 _JOB = {"id": ID + "0" * 20, "hand": NAME, "object": NAME, "standing": "valid"}
 JOB = SimpleNamespace(**dict.fromkeys(("valid", "grasps", "requested"), 100_000), **_JOB, **_DONE)
 
@@ -45,7 +45,14 @@ DATASET = SimpleNamespace(**_DATASET, **_DONE, options=JobOptions())
 
 
 ASSET = SimpleNamespace(
-    name=NAME, filename=NAME, size_bytes=10**6, builtin=False, verdict="ok", facts={}, digest=ID + "0" * 52
+    name=NAME,
+    filename=NAME,
+    size_bytes=10**6,
+    builtin=False,
+    verdict="ok",
+    facts={},
+    digest=ID + "0" * 52,
+    model_dump=dict,
 )
 
 
