@@ -16,7 +16,7 @@ from xml.etree.ElementTree import Element, SubElement
 
 import mujoco
 import numpy as np
-from pydantic_core import from_json
+from pydantic import TypeAdapter, ValidationError
 
 from graspd.exchange.imported import write_obj
 from graspd.service.model.errors import InputError
@@ -204,7 +204,6 @@ class HandMapping:
 
     hand: str
     root_link: str
-    """Our root link in the URDF."""
     config: str
     """Configuration of the benchmark that names the model: `hand=...`."""
     model: str
@@ -213,7 +212,6 @@ class HandMapping:
     joints: tuple[tuple[str, str], ...]
     """(model's joint, URDF's joint) in the order of `qpos`; angles are the same."""
     links: tuple[tuple[str, str], ...] = ()
-    """(model's body, URDF's link)"""
 
     def qpos(self, hand: HandModel, root: Floats, joints: Floats) -> Floats:
         """Return `qpos` (7 + J,) from our root's pose (7,) and our joints (J,)."""
@@ -253,15 +251,12 @@ def _read(path: Path) -> HandMapping | None:
     if not path.is_file():
         return None
     try:
-        said: dict[str, Any] = from_json(path.read_bytes())
-        pose = tuple(float(value) for value in said["root_in_model"])
-        joints, links = (tuple((str(a), str(b)) for a, b in said[key]) for key in ("joints", "links"))
-        hand, root, config, model = (str(said[key]) for key in ("hand", "root_link", "config", "model"))
-    except (ValueError, TypeError, KeyError):
+        found = TypeAdapter(HandMapping).validate_json(path.read_bytes())
+    except ValidationError:
         raise InputError(f"{path} is no mapping of a hand; export the grasps again or remove it") from None
-    if len(pose) != len(IDENTITY_POSE):
-        raise InputError(f"{path}: root_in_model has {len(pose)} numbers instead of {len(IDENTITY_POSE)}")
-    return HandMapping(hand, root, config, model, pose, joints, links)
+    if (numbers := len(found.root_in_model)) != len(IDENTITY_POSE):
+        raise InputError(f"{path}: root_in_model has {numbers} numbers instead of {len(IDENTITY_POSE)}")
+    return found
 
 
 _SHADOW: Final = tuple(

@@ -48,7 +48,6 @@ class ImportedGrasps:
     published: NDArray[np.int8] | None = None
     """(N,) success as published: 1, 0, -1 unknown."""
     placed: PlacedGrasps | None = None
-    """Scenes of the grasps, if any."""
 
 
 def completed(hand: HandModel, obj: ObjectModel, grasp: Posture) -> GraspSet:

@@ -39,7 +39,6 @@ class Case:
     published: NDArray[np.int8] | None = None
     """(N,) success as published: 1, 0, -1 unknown."""
     placed: PlacedGrasps | None = None
-    """Scenes in which the grasps were planned, if any."""
 
     @property
     def centred(self) -> Case:

@@ -29,7 +29,7 @@ from typing import Any, Final
 import numpy as np
 from pydantic_core import from_json
 
-from graspd.exchange.imported import ImportedGrasps, completed, joints_by_name, load_npy, scaled_object
+from graspd.exchange.imported import ImportedGrasps, completed, joints_by_name, load_npy, scaled_object, verdicts
 from graspd.service.model.base import why
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import (
@@ -199,7 +199,7 @@ def read_reference(path: Path, *, hand: str | None = None, obj: str | None = Non
         joints = joints_by_name(model, stored["hand"]["joint_names"], values, what=str(path))
     except (KeyError, IndexError, TypeError, ValueError) as error:
         raise InputError(f"{path} is no file of reference grasps: {error!r}") from None
-    published = np.array([_flag(row.get("pick_success_published")) for row in rows], np.int8)
+    published = verdicts([row.get("pick_success_published") for row in rows])
     grasps = completed(model, thing, Posture(pose, joints))
     return [ImportedGrasps(model, thing, grasps, str(stored["object"]), published=published)]
 
@@ -218,7 +218,3 @@ def _stored(path: Path) -> dict[str, Any]:
     if not isinstance(found, dict):
         raise InputError(f"{path} is no file of reference grasps: it holds no object")
     return found
-
-
-def _flag(value: object) -> int:
-    return -1 if value is None else int(bool(value))

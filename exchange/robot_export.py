@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from graspd.exchange.inputs import load_case
 from graspd.exchange.plan import ExportSummary
-from graspd.exchange.robots.arm import Description, describe, read_arm
 from graspd.exchange.robots.bundle import Bundle, Carrier
 from graspd.exchange.robots.execution import (
     ASSUMED_M_S,
@@ -25,7 +24,7 @@ from graspd.exchange.robots.execution import (
     timed,
     tool_frame,
 )
-from graspd.exchange.robots.reach import ReachSearch
+from graspd.exchange.robots.reach import Description, ReachSearch, describe, read_arm
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import IDENTITY_POSE
 from graspd.service.store.shards import Shard, read_shard

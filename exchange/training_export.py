@@ -35,7 +35,6 @@ class TrainingExportOptions:
     unvalidated: bool = False
     every: bool = False
     held_out: float = 0.2
-    """Share of held-out objects."""
     noise: str = ""
     """Name of a depth camera; empty: perfect depth."""
 

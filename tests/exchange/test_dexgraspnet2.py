@@ -15,13 +15,13 @@ import scipy.io
 import trimesh
 
 from graspd.exchange import dexgraspnet2
-from graspd.exchange.dexgraspnet2 import load_npz
-from graspd.exchange.dexgraspnet2_graspness import (
+from graspd.exchange.dexgraspnet2 import (
     SAMPLES,
     SceneGraspness,
     back_projected,
     in_workspace,
     lines_of_sight,
+    load_npz,
     pointed_at,
     summed,
     surface_samples,

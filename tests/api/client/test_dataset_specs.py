@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from graspd.client.job_options import PlanRequest, read_spec, wanted
+from graspd.client.dataset_commands import PlanRequest, read_spec, wanted
 from graspd.service.model.errors import InputError
 from graspd.service.pipeline.datasets.spec import MAX_CELLS
 

@@ -70,7 +70,7 @@ class Service:
     """Answers each list with one row."""
 
     def jobs(self, **_: Any) -> Any:
-        return SimpleNamespace(items=[JOB])
+        return SimpleNamespace(items=[JOB], next=None)
 
     def assets(self, _: Any, **__: Any) -> Iterator[Any]:
         yield ASSET
@@ -80,7 +80,7 @@ class Service:
         return SimpleNamespace(json=lambda: [rows])
 
     def datasets(self, **_: Any) -> Any:
-        return SimpleNamespace(items=[DATASET])
+        return SimpleNamespace(items=[DATASET], next=None)
 
 
 @pytest.fixture

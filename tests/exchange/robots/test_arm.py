@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 import yourdfpy
 
-from graspd.exchange.robots.arm import read_arm
 from graspd.exchange.robots.execution import ASSUMED_RAD_S
+from graspd.exchange.robots.reach import read_arm
 from graspd.service.model.transforms import IDENTITY_POSE, compose, pose_from_matrix
 from tests.exchange.robots.arms import JOINTS, write_arm
 from tests.exchange.robots.shards import run
