@@ -11,12 +11,12 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="torch is not installed; `pip install torch` runs these tests")
 
-from examples.train_grasp_predictor.evaluator import Attempts, Ensemble, Evaluator, Hands, learned, scores  # noqa: E402
+from examples.train_grasp_predictor.evaluator import Attempts, Evaluator, Hands, learned, scores  # noqa: E402
 from examples.train_grasp_predictor.network import Proposer  # noqa: E402
 from examples.train_grasp_predictor.practice import TrainingRun  # noqa: E402
-from examples.train_grasp_predictor.refinement import BEGUN, RefinedHands, moved  # noqa: E402
+from examples.train_grasp_predictor.refinement import BEGUN, RefinedHands  # noqa: E402
 from examples.train_grasp_predictor.samples import Scene, Sight, TrainedModel, sights, taught  # noqa: E402
-from examples.train_grasp_predictor.training import TrainingData, train, turned  # noqa: E402
+from examples.train_grasp_predictor.training import TrainingData, train  # noqa: E402
 from examples.train_grasp_predictor.without_network import SQUEEZE, across  # noqa: E402
 from graspd.baselines.learned import network as net  # noqa: E402
 from graspd.service.model import transforms  # noqa: E402
@@ -49,14 +49,6 @@ def test_what_torch_learns_is_what_the_planner_runs() -> None:
             x = x + made.velocity(x, time, seen.expand(5, -1), torch.ones(5)) / 16
     # Sixteen steps of float32 in another order of sums.
     np.testing.assert_allclose(found, x.numpy(), atol=2e-5)
-
-
-def test_a_turn_about_the_vertical_keeps_lengths_and_heights() -> None:
-    vectors = torch.randn(4, 6, 3, generator=torch.Generator().manual_seed(0))
-    found = turned(vectors, torch.full((4, 1), torch.pi / 2))
-    torch.testing.assert_close(found[..., 0], -vectors[..., 1], atol=1e-6, rtol=0)
-    torch.testing.assert_close(found[..., 1], vectors[..., 0], atol=1e-6, rtol=0)
-    torch.testing.assert_close(found[..., 2], vectors[..., 2])
 
 
 @pytest.fixture
@@ -136,37 +128,6 @@ def test_a_verdict_is_of_how_hand_object_and_table_lie(hand: HandModel) -> None:
     np.testing.assert_allclose(scores(evaluator, hand, sight, hands), same, atol=1e-3)
 
 
-def test_moves_stay_within_the_limits_and_none_leaves_a_hand(hand: HandModel) -> None:
-    hands = hands_at(hand, np.zeros((40, 3)))
-    rng = np.random.default_rng(0)
-    still = moved(hand, hands, 0.0, rng)
-    for name, part in vars(hands).items():
-        np.testing.assert_allclose(getattr(still, name), part, atol=1e-12)
-    far = moved(hand, hands, np.full(40, 100.0), rng)
-    assert (hand.reduce(far.joints) >= hand.lower - 1e-9).all()
-    assert (hand.reduce(far.joints) <= hand.upper + 1e-9).all()
-    np.testing.assert_allclose(np.linalg.norm(far.approach, axis=1), 1.0)
-
-
-def test_moves_squeeze_more_or_less_and_keep_the_fingers_way(hand: HandModel) -> None:
-    hands = hands_at(hand, np.zeros((40, 3)))
-    middle = np.tile(hand.expand(0.5 * (hand.lower + hand.upper)), (40, 1))  # no limit is near
-    hands = dataclasses.replace(hands, joints=middle, pregrasp=middle, squeeze=middle)
-    found = moved(hand, hands, 1.0, np.random.default_rng(0))
-    np.testing.assert_allclose(found.pregrasp, found.joints, atol=1e-12)
-    harder = hand.reduce(found.squeeze) - hand.reduce(found.joints)
-    assert (np.abs(harder[:, hand.closing == 0]) < 1e-12).all()
-    assert (harder @ hand.closing > 0).any() and (harder @ hand.closing < 0).any()
-
-
-def test_evaluators_together_say_what_they_say_on_average(hand: HandModel) -> None:
-    torch.manual_seed(0)
-    members = [Evaluator(hand).eval() for _ in range(3)]
-    hands = hands_at(hand, np.random.default_rng(0).normal(0, 0.05, (5, 3)))
-    each = [scores(member, hand, ball(), hands) for member in members]
-    np.testing.assert_allclose(scores(Ensemble(members), hand, ball(), hands), np.mean(each, axis=0), atol=1e-5)
-
-
 class Wish(torch.nn.Module):
     """Thinks the more of a hand the nearer it is to a place."""
 
@@ -187,18 +148,6 @@ def test_hands_move_to_where_the_evaluator_believes_in_them(hand: HandModel) -> 
     assert chosen[0] < 0.03  # of hands around 3 cm the nearest
     assert moved_on[0] < 0.5 * chosen[0]
     assert moved_on[0] < moved_on[1]
-
-
-def test_tries_of_two_rounds_keep_their_picture_and_verdict(hand: HandModel) -> None:
-    high = ball()
-    low = dataclasses.replace(high, points=high.points - [0.0, 0.0, 0.1])
-    one = Attempts.of(hand, [high, low], [hands_at(hand, np.full((1, 3), 0.1 * k)) for k in (1, 2)], np.array([1, 0]))
-    other = Attempts.of(hand, [low], [hands_at(hand, np.full((3, 3), 0.3))], np.array([0, 1, 1]))
-    both = one.and_those(other)
-    heights = both.points[both.picture].mean(dim=1)[:, 2].numpy() - 0.2
-    np.testing.assert_allclose(heights, [0.0, -0.1, -0.1, -0.1, -0.1], atol=0.01)
-    np.testing.assert_allclose(both.hands.place[:, 0].numpy(), [0.1, 0.2, 0.3, 0.3, 0.3], rtol=1e-6)
-    assert both.lifted.tolist() == [1, 0, 0, 1, 1]
 
 
 @pytest.mark.slow

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -53,6 +55,21 @@ def on_tables(tmp_path_factory: pytest.TempPathFactory) -> Path:
         write_shard("views", seen.arrays, {**seen.attributes, **mug, "shard_id": seen_id, "base_shard": base_id})
     )
     return folder
+
+
+@pytest.fixture(scope="session")
+def exported(on_tables: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+    """Folder of these in a training format."""
+
+    @cache
+    def export(format_: str) -> Path:
+        folder = tmp_path_factory.mktemp(format_) / "data"
+        every = "" if format_ in ("dexgraspnet2", "graspgen") else "--all "
+        told = graspd(f"export --format {format_} {every}-o", folder, on_tables)
+        assert told["grasps"] == 16
+        return folder
+
+    return export
 
 
 @pytest.fixture(scope="session")

@@ -12,6 +12,7 @@ import io
 import json
 import re
 import tarfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,7 @@ from graspd.service.store.shards import Shard
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
-from tests.worker.commands_run import graspd, refused
+from tests.worker.commands_run import refused
 from tests.worker.hands.grippers import OPENING, gripper
 
 #: JSON gives float64 back as it was; what is left is a quaternion made a matrix [m].
@@ -37,11 +38,8 @@ ROUNDING_M = 1e-12
 
 
 @pytest.fixture(scope="module")
-def data(on_tables: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("graspgen") / "data"
-    said = graspd("export --format graspgen -o", folder, on_tables)
-    assert (said["grasps"], said["objects"], said["files"]) == (16, 2, 1)
-    return folder
+def data(exported: Callable[[str], Path]) -> Path:
+    return exported("graspgen")
 
 
 def record_of(data: Path, uuid: str) -> dict[str, Any]:
@@ -102,16 +100,6 @@ def test_the_jaws_of_a_gripper_close_along_x_of_its_convention() -> None:
     assert said["width"] == pytest.approx(OPENING, abs=1e-5)
     # The pads reach from 70 to 110 mm in front of the base link.
     assert 0.07 < said["depth"] < 0.11
-
-
-def test_grasps_come_back_as_they_were(data: Path, stored: Shard) -> None:
-    (back,) = graspgen.read(data / "grasps" / "barrett", hand="barrett", obj="block", object_name="block")
-    for name in graspgen.POSTURES:
-        found = getattr(back.grasps, name)
-        np.testing.assert_array_equal(found.joint_positions, stored[f"{name}/joint_positions"])
-        np.testing.assert_allclose(found.hand_pose[:, :3], stored[f"{name}/hand_pose"][:, :3], atol=ROUNDING_M)
-    assert back.published is not None
-    np.testing.assert_array_equal(back.published == 1, validity.valid(stored.arrays))
 
 
 def test_of_grasps_without_joints_fingers_close_until_they_touch(data: Path, hand: HandModel, tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from PIL import Image
 from benchmarks.results import manifest, page
 from benchmarks.results.__main__ import main
 from benchmarks.results.manifest import DOCS, INDEX, digests, faults, load, staleness, there
-from benchmarks.results.running import Runner, slim
+from benchmarks.results.running import Runner
 from benchmarks.results.studies import BY_NAME, STUDIES, Study, is_raw
 from graspd.service.model.version import STAGE_REVISIONS
 from tests.conftest import REPOSITORY
@@ -60,20 +60,6 @@ def test_a_page_links_no_raw_result_and_pictures_get_a_palette(tmp_path: Path) -
     assert (tmp_path / "docs/results/page.md").read_text() == "`all`, [seen](seen.png)"
     with Image.open(tmp_path / "docs/results/seen.png") as picture:
         assert picture.mode == "P"
-
-
-def test_a_picture_that_would_show_steps_keeps_its_colours(tmp_path: Path) -> None:
-    Image.merge("RGB", [Image.effect_noise((99, 99), 50) for _ in "RGB"]).save(tmp_path / "depth.png")
-    before = (tmp_path / "depth.png").read_bytes()
-    slim(tmp_path / "depth.png")
-    assert (tmp_path / "depth.png").read_bytes() == before
-
-
-def test_raw_results_stand_beside_the_pages_alone(tmp_path: Path) -> None:
-    run = (*ADD.run, ADD.run[0].replace("total.txt", "sum.json"))
-    runner(tmp_path).run(Study("add", "a sum", ("results/sum.json",), run, prints=ADD.prints))
-    assert (tmp_path / "docs/results/sum.json").is_file()
-    assert set(load(tmp_path / "docs")["add"]["files"]) == {"results/sum.md"}
 
 
 def test_each_file_belongs_to_one_study() -> None:
@@ -148,22 +134,10 @@ def test_a_study_that_holds_is_not_run_again(tmp_path: Path) -> None:
     assert (tmp_path / "docs/results/total.txt").read_text() == "2"
 
 
-def test_older_algorithms_are_run_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    runner(tmp_path).run(ADD)
-    monkeypatch.setitem(STAGE_REVISIONS, "synthesize", STAGE_REVISIONS["synthesize"] + 1)
-    assert not runner(tmp_path).holds(ADD)
-
-
 def test_a_study_that_fails_leaves_no_record(tmp_path: Path) -> None:
     fails = Study("add", "a sum", ADD.files, (*ADD.run, "python -c 'raise SystemExit(3)'"))
     assert "`python -c 'raise SystemExit(3)'` ended with 3" in runner(tmp_path).run(fails)
     assert load(tmp_path / "docs") == {}
-
-
-def test_what_a_study_lacks_is_said(tmp_path: Path) -> None:
-    assert runner(tmp_path).run(BY_NAME["foreign"]) == "left out: needs DATA, SOURCES"
-    assert runner(tmp_path).run(BY_NAME["predictor-page"]) == "left out: a page written by hand"
-    assert runner(tmp_path, quick=True).run(BY_NAME["matrix"]) == "left out: has no little run"
 
 
 def test_folders_of_this_machine_are_not_in_the_figures(tmp_path: Path) -> None:

@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import httpx
 import pytest
 from typer.testing import CliRunner
 
@@ -265,17 +264,6 @@ def test_keys_are_made_listed_and_revoked(graspd: Shell, tmp_path: Path) -> None
     assert [(key["name"], key["revoked"]) for key in shell.json("keys", "list")["keys"]] == [("lab", None)]
     shell.json("keys", "revoke", "lab")
     assert shell.json("keys", "list")["keys"][0]["revoked"] is not None
-
-
-def test_an_idempotency_key_binds_to_its_request(service: Supervisor) -> None:
-    body = {"hand": "allegro", "object": "mug", "seed": 5}
-    with httpx.Client(
-        base_url=service.api_url, headers={"Idempotency-Key": "one"}, trust_env=False, timeout=60
-    ) as http:
-        first, second = (http.post("/v1/jobs", json=body) for _ in range(2))
-        other = http.post("/v1/jobs", json=body | {"seed": 6})
-    assert first.json()["id"] == second.json()["id"]
-    assert (other.status_code, "Idempotency-Key" in other.json()["detail"]) == (422, True)
 
 
 def test_the_keys_that_scripts_rely_on_are_there() -> None:
