@@ -39,6 +39,15 @@ def test_a_grasp_has_each_field_that_is_read(bench: Path, hand: HandModel, grasp
         assert found["obj_scale"] == 1.0 and found["obj_pose"].tolist() == [0, 0, 0, 1, 0, 0, 0]
         assert {found[f"{name}_qpos"].shape for name in dexgraspbench.POSTURES} == {(7 + len(hand.joint_names),)}
         assert not Path(found["obj_path"]).is_absolute()
+    file = bench / found["scene_path"]
+    scene = np.load(file, allow_pickle=True).item()
+    thing = scene["scene"][scene["task"]["obj_name"]]
+    for key in ("file_path", "info_path", "urdf_path"):
+        assert (file.parent / thing[key]).is_file()
+    # The converters take the object's folder to be two above its mesh.
+    assert (file.parent / thing["file_path"]).resolve().parents[1] == (bench / found["obj_path"]).resolve()
+    assert thing["scale"].tolist() == [1, 1, 1] and thing["pose"].tolist() == found["obj_pose"].tolist()
+    assert json.loads((bench / "assets/object/graspd/valid_split/all.json").read_text()) == ["block"]
 
 
 def test_the_object_weighs_what_the_evaluator_wants(bench: Path, block: ObjectModel) -> None:
@@ -105,19 +114,6 @@ def test_a_hand_of_meshes_is_loaded_with_them(
     meshes = {found.model.mesh(number).name for number in range(found.model.nmesh)}
     hulls = {f"{PREFIX}piece_{k:03}" for k, piece in enumerate(hand.pieces) if piece.kind == "hull"}
     assert hulls and hulls <= meshes
-
-
-def test_the_scene_names_files_that_are_there(bench: Path) -> None:
-    record = np.load(files_of(bench, "graspd_barrett")[0], allow_pickle=True).item()
-    file = bench / record["scene_path"]
-    scene = np.load(file, allow_pickle=True).item()
-    thing = scene["scene"][scene["task"]["obj_name"]]
-    for key in ("file_path", "info_path", "urdf_path"):
-        assert (file.parent / thing[key]).is_file()
-    # The converters take the object's folder to be two above its mesh.
-    assert (file.parent / thing["file_path"]).resolve().parents[1] == (bench / record["obj_path"]).resolve()
-    assert thing["scale"].tolist() == [1, 1, 1] and thing["pose"].tolist() == record["obj_pose"].tolist()
-    assert json.loads((bench / "assets/object/graspd/valid_split/all.json").read_text()) == ["block"]
 
 
 #: Index fingertip frame of the benchmark's Allegro, from its model: palm turned by the quaternion 0 1 0 1 in the world.

@@ -35,11 +35,8 @@ LIMP = 3
 def shard(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Candidates in two scenes: most lift, the first `LIMP` do not, for they squeeze no more than the open hand."""
     out = tmp_path_factory.mktemp("scenes") / "g.h5"
-    graspd(
-        f"synth --hand barrett --object block --scene table --scenes 2 -n {COUNT} --want candidates "
-        "--fidelity draft -o",
-        out,
-    )
+    words = "--hand barrett --object block --scene table --scenes 2 --want candidates --fidelity draft"
+    graspd(f"synth {words} -n {COUNT} -o", out)
     made = read_shard(out, kind="base")
     squeeze, held = np.array(made["squeeze/joint_positions"]), np.array(made["quality/success"])
     squeeze[:LIMP], held[:LIMP] = made["pregrasp/joint_positions"][:LIMP], 0
@@ -60,15 +57,11 @@ def stored(shard: Path) -> Shard:
     return read_shard(shard, kind="base")
 
 
-def row_of(file: Path) -> int:
-    return int(file.stem)
-
-
 def test_a_grasp_stands_where_its_object_lies_on_the_table(bench: Path, stored: Shard) -> None:
     files = files_of(bench, CONFIG, EXPERIMENT)
-    assert sorted(map(row_of, files)) == list(range(COUNT))
+    assert sorted(int(file.stem) for file in files) == list(range(COUNT))
     for file in files:
-        row, found = row_of(file), np.load(file, allow_pickle=True).item()
+        row, found = int(file.stem), np.load(file, allow_pickle=True).item()
         scene = int(stored["grasp/scene_index"][row])
         assert file.parent.name == f"scale100_pose{scene:03}"
         np.testing.assert_array_equal(found["obj_pose"], stored["scene/object_pose"][scene])
@@ -85,16 +78,13 @@ def test_the_way_in_ends_at_the_pregrasp_and_scenes_have_a_table(bench: Path, st
         assert way.shape == (stored["grasp/approach"].shape[1], width)
         np.testing.assert_allclose(way[-1, :3], pregrasp[:3], atol=ROUNDING_M)
         assert np.linalg.norm(way[0, :3] - pregrasp[:3]) == pytest.approx(0.1)
-        np.testing.assert_allclose(
-            found["lift_qpos"] - found["squeeze_qpos"], [0, 0, 0.1, *[0] * (width - 3)], atol=1e-8
-        )
-    for file in files_of(bench, CONFIG, EXPERIMENT):
-        record = np.load(file, allow_pickle=True).item()
-        path = bench / record["scene_path"]
+        raised = found["lift_qpos"] - found["squeeze_qpos"]
+        np.testing.assert_allclose(raised, [0, 0, 0.1, *[0] * (width - 3)], atol=1e-8)
+        path = bench / found["scene_path"]
         scene = np.load(path, allow_pickle=True).item()
         assert scene["scene_id"] == f"block/tabletop/{path.stem}"
         thing, table = scene["scene"][scene["task"]["obj_name"]], scene["scene"]["table"]
-        np.testing.assert_array_equal(thing["pose"], record["obj_pose"])
+        np.testing.assert_array_equal(thing["pose"], found["obj_pose"])
         assert table["type"] == "plane" and table["pose"].tolist() == [0, 0, 0, 1, 0, 0, 0]
         for key in ("file_path", "info_path", "urdf_path"):
             assert (path.parent / thing[key]).is_file()
@@ -104,7 +94,7 @@ def test_its_loader_puts_hand_and_object_where_they_stand(bench: Path, hand: Han
     file = files_of(bench, CONFIG, EXPERIMENT)[-1]
     found = load(bench, file, CONFIG, tabletop=True)
     found.at(found.grasp["grasp_qpos"])
-    row = row_of(file)
+    row = int(file.stem)
     pose, joints = (stored[f"grasp/{name}"][row : row + 1] for name in ("hand_pose", "joint_positions"))
     for name, ours in zip(body_names(hand), body_poses(hand, pose, joints)[0], strict=True):
         there = compose(found.grasp["obj_pose"], ours)
@@ -130,7 +120,7 @@ def test_its_tabletop_test_says_what_our_letter_says(bench: Path, shard: Path) -
     decided, apart = 0, []
     for file in files_of(bench, CONFIG, EXPERIMENT):
         held, moved, turned = tabletop_test(load(bench, file, CONFIG, tabletop=True))
-        mine, worst = ours[row_of(file)], max(moved / 0.05, turned / 15)
+        mine, worst = ours[int(file.stem)], max(moved / 0.05, turned / 15)
         # Two models of one hand, one of them through files of text and float32: contacts at the limit may part them.
         if abs(worst - 1) > 0.1:
             decided += 1
@@ -146,7 +136,7 @@ def test_grasps_on_a_table_come_back_with_scenes_and_verdicts(bench: Path, shard
     folder = bench / "output" / f"{EXPERIMENT}_{CONFIG}"
     (back,) = dexgraspbench.read(folder, hand="barrett", obj="block")
     assert back.placed is not None
-    rows = [row_of(file) for file in sorted(folder.rglob("*.npy"))]
+    rows = [int(file.stem) for file in sorted(folder.rglob("*.npy"))]
     given = GraspSet.from_columns(stored.arrays).take(np.array(rows))
     assert given.approach is not None and back.grasps.approach is not None
     np.testing.assert_allclose(back.grasps.approach[..., :3], given.approach[..., :3], atol=ROUNDING_M)

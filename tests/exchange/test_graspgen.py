@@ -85,15 +85,12 @@ def test_its_grasps_are_ours_with_their_verdicts(
     np.testing.assert_allclose(mesh.bounds, [block.vertices.min(0), block.vertices.max(0)], atol=1e-8)
 
 
-def test_a_gripper_is_turned_into_its_convention(data: Path, hand: HandModel) -> None:
+def test_hands_are_turned_into_its_convention_and_jaws_close_along_x(data: Path, hand: HandModel) -> None:
     said = yaml.safe_load((data / "grippers" / "barrett.yaml").read_text())
     place, turn = said["transform_offset_from_asset_to_graspgen_convention"]
     matrix = Rotation.from_quat(turn).as_matrix()  # x y z w, as SciPy has it
     np.testing.assert_allclose(matrix[:, 2], hand.palm.approach, atol=1e-12)
     assert place == [0, 0, 0] and said["width"] > 0.05 and said["depth"] > 0.02
-
-
-def test_the_jaws_of_a_gripper_close_along_x_of_its_convention() -> None:
     said = graspgen.convention(gripper())
     turn = Rotation.from_quat(said["transform_offset_from_asset_to_graspgen_convention"][1]).as_matrix()
     assert np.abs(turn[:, 0]) == pytest.approx([1, 0, 0], abs=1e-9) and turn[:, 2] == pytest.approx([0, 0, 1], abs=1e-9)

@@ -21,7 +21,6 @@ from tests.shell import completed
 #: `graspd jobs`, <pre>graspd jobs</pre>, epilog="graspd jobs".
 _NAMED = re.compile(r'(?:`|>|epilog=")(graspd\s+[a-z](?:(?!\.\.\.)[^"`{}<…,;])*)')
 
-
 ALL = [line for page in PAGES for line in lines_of(page)]
 
 
@@ -94,16 +93,12 @@ def test_only_an_error_directly_below_a_command_is_its_own(tmp_path: Path) -> No
 _FOLDERS = (REPOSITORY.glob("*.md"), *((REPOSITORY / name).rglob("*.md") for name in ("docs", "examples")))
 LINKING = sorted(page for pages in _FOLDERS for page in pages if page.is_file())
 
-
 #: Sources whose comments, messages and help name pages.
 SOURCES = (*PACKAGES, "benchmarks", "docker", "examples")
 
-
 _LINKED = re.compile(r"(?<![\w/.])(?:docs|README|CONTRIBUTING|ARCHITECTURE|SECURITY)[\w/-]*\.md\b")
 
-
 _CODE = re.compile(r"^```.*?^```|`[^`\n]*`", re.DOTALL | re.MULTILINE)
-
 
 _LINK = re.compile(r"\]\(([^()\s]+)\)|(?:src|href)=\"([^\"]+)\"")
 
@@ -147,9 +142,7 @@ def test_pages_that_sources_name_exist(room: str) -> None:
 
 DOCS = REPOSITORY / "docs"
 
-
 QUESTIONS: list[dict[str, Any]] = yaml.safe_load((REPOSITORY / "tests" / "docs_questions.yaml").read_text())
-
 
 #: Results that a reader looks at before another search.
 LOOKED_AT = 5

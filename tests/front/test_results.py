@@ -66,6 +66,7 @@ def test_each_file_belongs_to_one_study() -> None:
     held = [path for study in STUDIES for path in digests(study, DOCS)]
     assert len(held) == len(set(held))
     assert set(held) == there(DOCS)
+    assert (DOCS / INDEX).read_text() == page.index(load(DOCS)), "run: make docs"
 
 
 @pytest.mark.parametrize("path", page.PAGES, ids=lambda path: path.name)
@@ -86,10 +87,6 @@ def test_what_the_atlas_finds_broken_is_among_the_limits(path: Path) -> None:
     assert rows
     told = (DOCS / "explanation" / "limits.md").read_text()
     assert str(path.relative_to(DOCS)) in told or all(row[5] == "nothing" for row in rows)
-
-
-def test_the_index_says_what_the_manifest_says() -> None:
-    assert (DOCS / INDEX).read_text() == page.index(load(DOCS)), "run: make docs"
 
 
 def test_a_figure_of_older_algorithms_is_shown_as_stale() -> None:
@@ -124,7 +121,10 @@ def test_every_command_of_the_list_is_there() -> None:
             assert program == "cp", line
 
 
-def test_a_study_that_holds_is_not_run_again(tmp_path: Path) -> None:
+def test_a_study_that_holds_is_not_run_again_and_one_that_fails_leaves_no_record(tmp_path: Path) -> None:
+    fails = Study("add", "a sum", ADD.files, (*ADD.run, "python -c 'raise SystemExit(3)'"))
+    assert "`python -c 'raise SystemExit(3)'` ended with 3" in runner(tmp_path).run(fails)
+    assert load(tmp_path / "docs") == {}
     assert runner(tmp_path).run(ADD).startswith("made")
     assert (tmp_path / "docs/results/total.txt").read_text() == "2"
     assert (tmp_path / "docs/results/sum.md").read_text().endswith("done\n")
@@ -132,12 +132,6 @@ def test_a_study_that_holds_is_not_run_again(tmp_path: Path) -> None:
     (tmp_path / "docs/results/total.txt").write_text("3")
     assert runner(tmp_path).run(ADD).startswith("made")
     assert (tmp_path / "docs/results/total.txt").read_text() == "2"
-
-
-def test_a_study_that_fails_leaves_no_record(tmp_path: Path) -> None:
-    fails = Study("add", "a sum", ADD.files, (*ADD.run, "python -c 'raise SystemExit(3)'"))
-    assert "`python -c 'raise SystemExit(3)'` ended with 3" in runner(tmp_path).run(fails)
-    assert load(tmp_path / "docs") == {}
 
 
 def test_folders_of_this_machine_are_not_in_the_figures(tmp_path: Path) -> None:

@@ -19,6 +19,7 @@ from graspd.service.store.shards import write_shard
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.objects.prepare import object_from_path
 from tests.front.test_grasps import columns, shard
+from tests.worker.models import attributes_of
 
 KEY = "a-key-that-nobody-sees"
 
@@ -36,9 +37,8 @@ def known(tmp_path_factory: pytest.TempPathFactory) -> graspd.Grasps:
     for name in ("grasp", "pregrasp", "squeeze"):
         made[f"{name}/hand_pose"] = np.tile([0.0, 0, 0.2, 1, 0, 0, 0], (3, 1))
         made[f"{name}/joint_positions"] = np.tile(hand.expand(hand.preshape), (3, 1))
-    said = {"hand": hand.name, "hand_digest": hand.digest, "object": obj.name, "object_digest": obj.digest}
     file = tmp_path_factory.mktemp("known") / "g.h5"
-    file.write_bytes(write_shard("base", made, {**said, "joint_names": list(hand.joint_names)}))
+    file.write_bytes(write_shard("base", made, attributes_of(hand, obj)))
     return graspd.open(file)
 
 
@@ -105,13 +105,6 @@ def test_reprs_are_short_and_show_no_key(grasps: graspd.Grasps) -> None:
     assert repr(grasps.pregrasp) == "<6 postures of 3 joints>"
     assert re.fullmatch(r"<grasp at \(.*\) m, 3 joints, epsilon 5, valid>", repr(grasps[5]))
     assert all(len(repr(one)) < 120 for one in (client, grasps, grasps.pregrasp, grasps[0]))
-
-
-def test_a_client_tells_the_range(grasps: graspd.Grasps) -> None:
-    with pytest.raises(graspd.InputError, match="views: must be at least 0 and at most 256; got 999"):
-        graspd.Client("http://127.0.0.1:1").submit("allegro", "mug", views=999)
-    with pytest.raises(IndexError, match="no grasp 6; of 6 the last is 5"):
-        _ = grasps[6]
 
 
 def test_grasps_of_another_object_are_not_saved_as_the_firsts(tmp_path: Path) -> None:

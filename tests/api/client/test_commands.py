@@ -197,50 +197,29 @@ def test_an_object_is_added_from_a_file_and_its_licence_kept(graspd: Shell, tmp_
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("--hand", "claw", "--object", "mug"), "'claw'"),
-        (("--hand", "allegro", "--object", "teapot"), "'teapot'"),
-        (("--hand", "allegro", "--object", "mug", "-n", "0"), "--grasps"),
-        (("--hand", "allegro", "--object", "mug", "-n", "-5"), "--grasps"),
-        (("--hand", "allegro", "--object", "mug", "--fidelity", "perfect"), "standard"),
-        (("--hand", "allegro", "--object", "mug", "--views", "2"), "scenes"),
-        (("--hand", "allegro", "--object", "mug", "--with", "block"), "neighbours stand in a scene"),
-        (("--hand", "allegro", "--object", "mug", "--scene", "bin", "--with", "teapot"), "no object 'teapot'"),
-        (("--hand", "allegro", "--object", "mug", "--channels", "infrared"), "channels"),
-        (("--hand", "allegro", "--object", "nowhere/box.stl"), "nowhere/box.stl"),
+        ("submit --hand claw --object mug", "'claw'"),
+        ("submit --hand alegro --object mug", "did you mean allegro?"),
+        ("submit --hand allegro --object teapot", "'teapot'"),
+        ("submit --hand allegro --object mug --fidelity perfect", "standard"),
+        ("submit --hand allegro --object mug --views 2", "scenes"),
+        ("submit --hand allegro --object mug --with block", "neighbours stand in a scene"),
+        ("submit --hand allegro --object mug --scene bin --with teapot", "no object 'teapot'"),
+        ("submit --hand allegro --object mug --channels infrared", "channels"),
+        ("datasets estimate --hands alegro --objects mug", "did you mean allegro?"),
+        *((f"{command} 0123456789", "0123456789") for command in ("status", "cancel", "retry", "logs")),
     ],
 )
-def test_a_mistake_is_one_line_and_exit_2(graspd: Shell, arguments: tuple[str, ...], words: str) -> None:
-    done = graspd("submit", *arguments)
+def test_a_mistake_is_one_line_and_exit_2(graspd: Shell, arguments: str, words: str) -> None:
+    done = graspd(*arguments.split())
     assert done.returncode == 2
-    assert words in said(done)
+    assert words in (done.stderr if arguments.startswith("datasets") else said(done))
 
 
-@pytest.mark.parametrize(
-    "command", ["submit --hand alegro --object mug", "datasets estimate --hands alegro --objects mug --scenes 0"]
-)
-def test_an_unknown_name_is_followed_by_the_one_that_is_like_it(graspd: Shell, command: str) -> None:
-    done = graspd(*command.split())
-    assert done.returncode == 2
-    assert "'alegro'" in done.stderr and "did you mean allegro?" in done.stderr
-
-
-@pytest.mark.parametrize("command", ["status", "cancel", "retry", "logs"])
-def test_an_unknown_job_is_exit_2(graspd: Shell, command: str) -> None:
-    done = graspd(command, "0123456789")
-    assert done.returncode == 2
-    assert "0123456789" in said(done)
-
-
-def test_no_service_is_exit_1_and_says_how_to_start_one(graspd: Shell) -> None:
+def test_no_service_and_an_address_that_is_no_graspd_are_told(graspd: Shell) -> None:
     done = Shell(graspd.environment | {"GRASPD_API_URL": "http://127.0.0.1:9"}).apart("jobs")
-    assert done.returncode == 1
-    assert "graspd up" in said(done)
-
-
-def test_an_address_that_is_no_graspd_is_said_so(graspd: Shell) -> None:
+    assert done.returncode == 1 and "graspd up" in said(done)
     done = graspd("jobs", "--url", f"{graspd.environment['GRASPD_API_URL']}/static/")
-    assert done.returncode == 2
-    assert "static" in said(done)
+    assert done.returncode == 2 and "static" in said(done)
 
 
 def test_an_api_that_cannot_start_says_why_in_one_line(graspd: Shell, tmp_path: Path) -> None:
