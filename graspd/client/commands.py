@@ -170,7 +170,6 @@ def asset_commands(kind: AssetKind) -> typer.Typer:
         url: UrlOption = None,
         json: JsonFlag = False,
     ) -> None:
-        """List all, by default without refused ones."""
         with open_client(url) as client:
             assets = list(client.assets(kind, refused=refused))
         document = {f"{kind.value}s": [asset.model_dump(mode="json") for asset in assets]}
@@ -190,7 +189,6 @@ def asset_commands(kind: AssetKind) -> typer.Typer:
     def show(
         name: Annotated[str, typer.Argument(help="Name of the asset.")], url: UrlOption = None, json: JsonFlag = False
     ) -> None:
-        """Show one with the findings of its check."""
         with open_client(url) as client:
             asset = client.asset(kind, name)
         show_asset(asset.model_dump(mode="json"), json=json)
@@ -206,7 +204,6 @@ def asset_commands(kind: AssetKind) -> typer.Typer:
         url: UrlOption = None,
         json: JsonFlag = False,
     ) -> None:
-        """Delete one that no job, dataset or set of objects uses."""
         with open_client(url) as client:
             client.asset(kind, name)
             confirm(f"Delete the {kind.value} {name}?", f"the {kind.value} {name}", yes=yes)
@@ -223,7 +220,6 @@ def asset_commands(kind: AssetKind) -> typer.Typer:
         url: UrlOption = None,
         json: JsonFlag = False,
     ) -> None:
-        """Restore a deleted one, within the grace time."""
         restore(url, kind.value, name, json=json)
 
     return group

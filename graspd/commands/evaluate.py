@@ -163,7 +163,15 @@ def _copies(paths: list[Path], files: list[Path], out: Path | None, *, robust: i
         return {}
     if not robust or hard or len(paths) != 1:
         raise InputError("-o needs --robust N, no --hard, and one file or folder")
-    return dict(zip(files, copy_paths(paths[0], files, out), strict=True))
+    if other := next((file for file in files if file.suffix != ".h5"), None):
+        raise InputError(f"{other} is no shard of graspd: only these have columns for the shares")
+    if paths[0].is_dir():
+        if out.exists() and (not out.is_dir() or any(out.iterdir())):
+            raise InputError(f"{out} is there already; choose a folder that is not")
+        return {file: out / file.relative_to(paths[0]) for file in files}
+    if not out.parent.is_dir() or out.is_dir():
+        raise InputError(f"{out} is no file that can be written: choose one in a folder that is there")
+    return {files[0]: out}
 
 
 def _said_of_models(whole: dict[str, Any]) -> str:
@@ -225,19 +233,6 @@ def _foreign(whole: dict[str, Any], name: str) -> str:
 
 def _cell(value: float | None, digits: int) -> str:
     return "-" if value is None else f"{value:.{digits}f}"
-
-
-def copy_paths(source: Path, files: list[Path], out: Path) -> list[Path]:
-    """Return `out` for a file; for a folder, the same subpaths in `out`, which must be new or empty."""
-    if other := next((file for file in files if file.suffix != ".h5"), None):
-        raise InputError(f"{other} is no shard of graspd: only these have columns for the shares")
-    if source.is_dir():
-        if out.exists() and (not out.is_dir() or any(out.iterdir())):
-            raise InputError(f"{out} is there already; choose a folder that is not")
-        return [out / file.relative_to(source) for file in files]
-    if not out.parent.is_dir() or out.is_dir():
-        raise InputError(f"{out} is no file that can be written: choose one in a folder that is there")
-    return [out]
 
 
 def write_copy(source: Path, out: Path, found: Robustness) -> None:

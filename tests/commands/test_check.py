@@ -19,7 +19,6 @@ WARM = 60
 
 
 def check(*arguments: str) -> tuple[int, dict[str, Any]]:
-    """Exit code and report of `graspd ... --json`."""
     untried = ["--no-self-test"] if arguments[0] == "hands" else []
     result = CliRunner().invoke(build(), [*arguments, *untried, "--json"])
     return result.exit_code, json.loads(result.stdout.splitlines()[-1])

@@ -11,7 +11,7 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="torch is not installed; `pip install torch` runs these tests")
 
-from examples.train_grasp_predictor.evaluator import Attempts, Evaluator, Hands, learned, scores  # noqa: E402
+from examples.train_grasp_predictor.evaluator import Attempts, Hands, learned, scores  # noqa: E402
 from examples.train_grasp_predictor.network import Proposer  # noqa: E402
 from examples.train_grasp_predictor.practice import TrainingRun  # noqa: E402
 from examples.train_grasp_predictor.refinement import BEGUN, RefinedHands  # noqa: E402
@@ -19,11 +19,8 @@ from examples.train_grasp_predictor.samples import Scene, Sight, TrainedModel, s
 from examples.train_grasp_predictor.training import TrainingData, train  # noqa: E402
 from examples.train_grasp_predictor.without_network import SQUEEZE, across  # noqa: E402
 from graspd.baselines.learned import network as net  # noqa: E402
-from graspd.service.model import transforms  # noqa: E402
 from graspd.service.readers import open_shards  # noqa: E402
 from graspd.service.store.network_file import ProposalNetwork  # noqa: E402
-from graspd.worker.engines import backend  # noqa: E402
-from graspd.worker.hands.load import hand_from_path  # noqa: E402
 from graspd.worker.hands.model import HandModel  # noqa: E402
 from graspd.worker.objects.prepare import object_from_path  # noqa: E402
 from tests.service.readers import box_scenes  # noqa: E402
@@ -70,12 +67,6 @@ def test_training_comes_nearer_to_the_grasps_that_it_is_shown(tmp_path: Path) ->
     assert late.loss < 0.9 * early.loss
 
 
-@pytest.fixture(scope="module")
-def hand() -> HandModel:
-    backend.start()
-    return hand_from_path("barrett")
-
-
 def ball() -> Sight:
     """A ball of 4 cm radius whose middle is 20 cm above the table."""
     rng = np.random.default_rng(0)
@@ -108,24 +99,6 @@ def test_an_evaluator_tells_hands_at_the_object_from_others(hand: HandModel) -> 
     others, near = around(32)
     found = scores(evaluator, hand, sight, others)
     assert found[near].min() > found[~near].max()
-
-
-@pytest.mark.usefixtures("one_thread")
-def test_a_verdict_is_of_how_hand_object_and_table_lie(hand: HandModel) -> None:
-    torch.manual_seed(0)
-    evaluator, sight = Evaluator(hand).eval(), ball()
-    hands = hands_at(hand, np.array([[0.02, 0.01, 0.33]]))
-    turn, there = np.array([np.cos(0.5), 0.0, 0.0, np.sin(0.5)]), np.array([0.4, -0.3, 0.0])
-    pose = transforms.compose(np.array([*there, *turn]), hands.hand_pose)
-    elsewhere = Sight(
-        sight.scene,
-        transforms.quat_rotate(turn, sight.points) + there,
-        transforms.quat_rotate(turn, sight.normals),
-        sight.object_pose,
-    )
-    same = scores(evaluator, hand, elsewhere, dataclasses.replace(hands, hand_pose=pose))
-    # float32, and points whose nearest one is a tie.
-    np.testing.assert_allclose(scores(evaluator, hand, sight, hands), same, atol=1e-3)
 
 
 class Wish(torch.nn.Module):

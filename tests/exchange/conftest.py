@@ -74,5 +74,4 @@ def exported(on_tables: Path, tmp_path_factory: pytest.TempPathFactory) -> Calla
 
 @pytest.fixture(scope="session")
 def stored(on_tables: Path) -> Shard:
-    """The block's grasps among these."""
     return read_shard(on_tables / "block.h5", kind="base")

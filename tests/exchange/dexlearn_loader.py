@@ -93,7 +93,6 @@ def _glob(pattern: str) -> list[str]:
 
 
 def _matrices(quaternions: np.ndarray) -> np.ndarray:
-    """(..., 3, 3) of (..., 4), w x y z."""
     w, x, y, z = np.moveaxis(quaternions / np.linalg.norm(quaternions, axis=-1, keepdims=True), -1, 0)
     rows = (
         (w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)),

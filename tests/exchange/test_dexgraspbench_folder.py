@@ -187,7 +187,6 @@ def test_grasps_for_benchmarks_own_model_come_back_as_they_were(block: ObjectMod
 
 
 def random_postures(hand: HandModel) -> GraspSet:
-    """Two grasps in which every joint and the root stand anywhere."""
     rng = np.random.default_rng(7)
     parts = []
     for _ in range(3):
@@ -203,8 +202,6 @@ def assert_at(body: Any, pose: np.ndarray) -> None:
 
 
 def _chain(root: list[float], chain: list[Any]) -> str:
-    """A single finger with a free root as MJCF."""
-
     def text(values: list[float]) -> str:
         return " ".join(map(str, values))
 

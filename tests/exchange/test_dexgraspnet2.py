@@ -178,7 +178,6 @@ def test_grasps_of_others_have_no_more_than_their_joints(root: Path, tmp_path: P
 
 
 def moved(root: Path, file: Path, folder: Path) -> Path:
-    """A place for another file of the same scene."""
     scene = file.parents[1].name
     meta = folder / "data" / "scenes" / scene / "realsense" / "meta"
     meta.mkdir(parents=True)

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from graspd.commands.exchange import read_sets
 from graspd.exchange import dexgraspbench, published
+from graspd.exchange.bench_scene import save_record
 from graspd.exchange.imported import Origin, joints_by_name, load_npy, scaled_object, verdicts
 from graspd.exchange.scoring import write_scored
 from graspd.service.model.errors import InputError
@@ -46,26 +47,20 @@ def test_a_file_that_would_run_code_is_refused_and_does_not(tmp_path: Path, monk
             load_npy(Path("x.npy"))
 
 
-def test_dexgraspbench_there_and_back_is_the_same_grasp(
+def test_dexgraspbench_there_and_back_is_the_same_grasp_also_of_a_moved_object(
     hand: HandModel, block: ObjectModel, grasps: GraspSet, tmp_path: Path
 ) -> None:
-    dexgraspbench.write(hand, block, grasps, range(len(grasps)), tmp_path)
+    (path, *_) = dexgraspbench.write(hand, block, grasps, range(len(grasps)), tmp_path)
     (back,) = dexgraspbench.read(tmp_path, hand="barrett", obj="block")
     np.testing.assert_allclose(back.grasps.squeeze.hand_pose, grasps.squeeze.hand_pose, atol=TINY)
     np.testing.assert_array_equal(back.grasps.pregrasp.joint_positions, grasps.pregrasp.joint_positions)
     ours, theirs = (validate(hand, block, some).success for some in (grasps, back.grasps))
     np.testing.assert_array_equal(theirs, ours)
-
-
-def test_dexgraspbench_grasps_are_in_their_moved_objects_frame(
-    hand: HandModel, block: ObjectModel, grasps: GraspSet, tmp_path: Path
-) -> None:
-    (path, *_) = dexgraspbench.write(hand, block, grasps, [0], tmp_path)
     row = load_npy(path)
     moved = np.array([0.3, -0.2, 0.7, *Rotation.from_euler("xyz", [0.3, 1.1, -2.0]).as_quat(scalar_first=True)])
     for name in dexgraspbench.POSTURES:
         row[f"{name}_qpos"][:7] = compose(moved, row[f"{name}_qpos"][:7])
-    np.save(path, np.array(row | {"obj_pose": moved}, dtype=object), allow_pickle=True)
+    save_record(path, row | {"obj_pose": moved})
     (back,) = dexgraspbench.read(path, hand="barrett", obj="block")
     place, turn = back.grasps.grasp.hand_pose[0, :3], quat_to_matrix(back.grasps.grasp.hand_pose[0, 3:])
     np.testing.assert_allclose(place, grasps.grasp.hand_pose[0, :3], atol=TINY)
@@ -76,7 +71,7 @@ def test_dexgraspbench_scales_are_sets_and_another_hand_is_told(
     hand: HandModel, block: ObjectModel, grasps: GraspSet, tmp_path: Path
 ) -> None:
     paths = dexgraspbench.write(hand, block, grasps, range(2), tmp_path)
-    np.save(paths[0], np.array(load_npy(paths[0]) | {"obj_scale": 0.5}, dtype=object), allow_pickle=True)
+    save_record(paths[0], load_npy(paths[0]) | {"obj_scale": 0.5})
     sets = dexgraspbench.read(tmp_path, hand="barrett", obj="block")
     assert [one.scale for one in sets] == [0.5, 1.0]
     assert np.ptp(sets[0].obj.vertices, axis=0) == pytest.approx(np.ptp(block.vertices, axis=0) / 2, rel=1e-6)
@@ -214,9 +209,13 @@ def test_grasps_of_a_training_format_come_back_with_scenes_and_verdicts(
 
 
 @pytest.mark.parametrize(
-    ("name", "source", "says"),
-    [("foo", "", "no import format"), ("ddgc", "none", "does not exist"), ("multidex", "", "--robot and --name")],
+    ("name", "hand", "says"),
+    [
+        ("foo", "h", "no import format"),
+        ("multidex", "h", "--robot and --name"),
+        ("ddgc", None, "name both: --hand and --object"),
+    ],
 )
-def test_what_no_import_can_read_is_told(name: str, source: str, says: str, tmp_path: Path) -> None:
+def test_what_no_import_can_read_is_told(name: str, hand: str | None, says: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=says):
-        read_sets(name, tmp_path / source, "h", "o", {"robot": "", "object_name": "", "number": 0})
+        read_sets(name, tmp_path, hand, "o", {"robot": "", "object_name": "", "number": 0})

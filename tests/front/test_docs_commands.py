@@ -69,27 +69,6 @@ def test_blocks_of_both_kinds_are_read_and_comments_are_not(tmp_path: Path) -> N
     assert [line.text for line in lines_of(page)] == ["graspd jobs", "graspd synth -n 4"]
 
 
-@pytest.mark.parametrize(
-    ("shown", "missed"),
-    [
-        ("mug: 8 grasps, 7 valid\n ...\n", ""),
-        ("graspd: refused: the mesh is 1.8 m long, too large to grasp; say --units mm\n", ""),
-        ("mug: 9 grasps\nnothing of this line\n", "nothing of this line"),
-        ("bottle: 3 faces, repaired\n", "bottle: 3 faces, repaired"),
-    ],
-)
-def test_what_a_page_shows_is_compared_but_for_numbers(shown: str, missed: str) -> None:
-    came = "mug: 12 grasps, 12 valid\ngraspd: refused: the mesh is 178.5 m long, too large to grasp; say --units mm\n"
-    assert Line("page.md", "graspd jobs", shown=shown).misses(came) == missed
-
-
-def test_only_an_error_directly_below_a_command_is_its_own(tmp_path: Path) -> None:
-    page = tmp_path / "page.md"
-    error, block = "```\ngraspd: there is none\n```\n", "```sh\ngraspd jobs\ngraspd tags list\n```\n"
-    page.write_text(f"{block}\n{error}\n{block}\nText between.\n\n{error}")
-    assert [line.refused for line in lines_of(page)] == [False, True, False, False]
-
-
 _FOLDERS = (REPOSITORY.glob("*.md"), *((REPOSITORY / name).rglob("*.md") for name in ("docs", "examples")))
 LINKING = sorted(page for pages in _FOLDERS for page in pages if page.is_file())
 

@@ -40,7 +40,6 @@ PROSE = [
 
 
 def jobs() -> dict[str, Any]:
-    """All jobs of all workflows by their names."""
     return {name: job for file in WORKFLOWS for name, job in yaml.safe_load(file.read_text())["jobs"].items()}
 
 

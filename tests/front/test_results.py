@@ -8,7 +8,6 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
-from PIL import Image
 
 from benchmarks.results import manifest, page
 from benchmarks.results.__main__ import main
@@ -52,16 +51,6 @@ def test_git_keeps_what_readers_see_and_no_raw_results() -> None:
     assert sum(file.read_text().count("\n") for file in texts) <= MOST_LINES
 
 
-def test_a_page_links_no_raw_result_and_pictures_get_a_palette(tmp_path: Path) -> None:
-    draws = "from PIL import Image; Image.merge('RGB', [Image.effect_noise((99, 99), 50)] * 3).save(sys.argv[2])"
-    writes = "open(sys.argv[1], 'w').write('[all](raw.json), [seen](seen.png)')"
-    line = f'python -c "import sys; {writes}; {draws}" OUT/results/page.md OUT/results/seen.png'
-    assert runner(tmp_path).run(Study("add", "a page", ("results/page.md", "results/seen.png"), (line,))) != "holds"
-    assert (tmp_path / "docs/results/page.md").read_text() == "`all`, [seen](seen.png)"
-    with Image.open(tmp_path / "docs/results/seen.png") as picture:
-        assert picture.mode == "P"
-
-
 def test_each_file_belongs_to_one_study() -> None:
     held = [path for study in STUDIES for path in digests(study, DOCS)]
     assert len(held) == len(set(held))
@@ -96,16 +85,6 @@ def test_a_figure_of_older_algorithms_is_shown_as_stale() -> None:
     assert "| older: synthesize |" in page.index({"robust": record})
     assert "| current |" in page.index({"robust": record | {"stage_revisions": dict(STAGE_REVISIONS)}})
     assert staleness(study, record | {"stage_revisions": dict(STAGE_REVISIONS)}) == ""
-
-
-def test_a_revision_leaves_figures_fresh_but_those_it_changes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(STAGE_REVISIONS, "synthesize", 9)
-    monkeypatch.setattr(
-        manifest, "SAME", {("synthesize", 9): (8, frozenset({"robust"})), ("synthesize", 8): (7, frozenset({"chart"}))}
-    )
-    made = {number: {"stage_revisions": STAGE_REVISIONS | {"synthesize": number}} for number in (6, 7, 8, 9)}
-    stale = {name: [n for n in made if staleness(BY_NAME[name], made[n])] for name in ("quality", "robust", "chart")}
-    assert stale == {"quality": [6], "robust": [6, 7, 8], "chart": [6, 7]}
 
 
 def test_every_command_of_the_list_is_there() -> None:

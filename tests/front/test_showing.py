@@ -31,7 +31,6 @@ def grasps(tmp_path: Path) -> graspd.Grasps:
 
 @pytest.fixture(scope="module")
 def known(tmp_path_factory: pytest.TempPathFactory) -> graspd.Grasps:
-    """Grasps of a built-in hand on a built-in object."""
     hand, obj = hand_from_path("barrett"), object_from_path("block", face_error_m=3e-4)
     made = columns(3)
     for name in ("grasp", "pregrasp", "squeeze"):

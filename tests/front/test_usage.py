@@ -79,7 +79,6 @@ def test_completion_knows_commands_without_the_engine(typed: str, offered: str) 
 
 
 def commands(command: Any, path: str) -> Iterator[tuple[str, Any]]:
-    """A command and all below it, those of other packages loaded."""
     if isinstance(command, graspd.cli.Deferred):
         command = graspd.cli.load(command.module, path.rpartition(" ")[2])
     yield path, command
@@ -89,7 +88,6 @@ def commands(command: Any, path: str) -> Iterator[tuple[str, Any]]:
 
 @pytest.fixture(scope="module")
 def every() -> dict[str, Any]:
-    """All commands of graspd by what a user types."""
     return {
         path: one
         for name, module, _, _ in graspd.cli.COMMANDS

@@ -17,7 +17,6 @@ CREATE = ("datasets", "create", "kitchen", "--hands", "allegro,barrett", "--obje
 
 
 def until(service: Supervisor, name: str, state: State) -> None:
-    """Wait until the controller has brought every cell to a state."""
     with Client(service.api_url) as client:
         cells = client.cells
         waiting.until(

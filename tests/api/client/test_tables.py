@@ -77,8 +77,6 @@ class Service:
 
 @pytest.fixture
 def shown(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[str]]:
-    """Lines of a command on such a terminal."""
-
     @contextmanager
     def opened(_: str | None) -> Iterator[Service]:
         yield Service()

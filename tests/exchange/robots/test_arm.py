@@ -142,18 +142,6 @@ def test_speeds_that_the_arm_does_not_state_are_assumed_and_told(free_shard: Pat
     assert any(f"6 joints have no velocity limit (pan, shoulder, elbow, ...): {ASSUMED_RAD_S:g}" in n for n in notes)
 
 
-@pytest.mark.parametrize("name", ["panda_description/urdf/panda_collision.urdf"])
-def test_a_real_arm_carries_grasps(table_shard: Path, tmp_path: Path, name: str) -> None:
-    """Where the package example-robot-data is installed."""
-    packages = [Path(entry) / "cmeel.prefix/share/example-robot-data/robots" for entry in sys.path]
-    folder = next((one for one in packages if (one / name).is_file()), None)
-    if folder is None:
-        pytest.skip("example-robot-data is not installed")
-    carried = ["--arm", folder / name, "--mount-pose", MOUNT_POSE, "--base", "-0.5 0 0 1 0 0 0"]
-    found = graspd("export --format csv --all --mount panda_link8 -o", tmp_path, table_shard, *carried)
-    assert found["reach_share"] > 0
-
-
 @pytest.mark.parametrize("kind", ["floating", "planar"])
 def test_an_arm_on_a_base_that_floats_stands_still_there(kind: str, tmp_path: Path) -> None:
     urdf = write_arm(tmp_path)

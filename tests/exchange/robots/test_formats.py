@@ -78,7 +78,6 @@ def test_isaac_names_prims_that_the_usd_export_has(tmp_path: Path) -> None:
 
 
 def validated(shard: Path) -> list[bool]:
-    """What the validator says of each row."""
     case = load_case(shard)
     protocol = "dexgraspbench" if case.placed is None else "lift"
     return [one["held"] for one in graspd(f"evaluate --protocol {protocol}", shard)["verdicts"]]
