@@ -118,18 +118,21 @@ def write_pages(out: Path, job: JobDetail, shards: list[Path]) -> Results:
     """Write the contact sheet of the best grasps, views of the first batch, and an index.html with both."""
     from graspd.worker.rendering.sheets import views_page
 
-    pictures = []
+    pages: dict[str, bytes] = {}
     bases = [path for path in shards if path.name.startswith("base")]
     views = [path for path in shards if path.name.startswith("views")]
     if bases:
-        pictures.append(_write(out / "grasps.png", draw_grasps(job, read_shard(bases[0], kind="base"))))
+        pages["grasps.png"] = draw_grasps(job, read_shard(bases[0], kind="base"))
     if views:
         title = f"Views of the {job.object}"
         data = read_shard(views[0], kind="views")
         subtitle = f"{len(data['image/rgb'])} pictures of {job.request.scenes} scenes; depth in metres"
-        pictures.append(_write(out / "views.png", views_page(data.arrays, title=title, subtitle=subtitle)))
-    page = _write(out / "index.html", html_page(job, pictures, shards, out).encode())
-    return Results(shards, pictures, page)
+        pages["views.png"] = views_page(data.arrays, title=title, subtitle=subtitle)
+    pictures = [out / name for name in pages]
+    pages["index.html"] = html_page(job, pictures, shards, out).encode()
+    for name, content in pages.items():
+        write_output(out / name, content)
+    return Results(shards, pictures, out / "index.html")
 
 
 def draw_grasps(job: JobDetail, base: Shard) -> bytes:
@@ -162,11 +165,6 @@ def html_page(job: JobDetail, pictures: list[Path], shards: list[Path], out: Pat
     )
     files = "".join(f"<li><a href='{p.relative_to(out)}'>{p.relative_to(out)}</a></li>" for p in shards)
     return _HTML.format(title=title, yields=escape(yield_of(job)), job=job.id, images=images, files=files)
-
-
-def _write(path: Path, data: bytes) -> Path:
-    write_output(path, data)
-    return path
 
 
 _ALT: Final = {"grasps": "The best grasps with their quality", "views": "Rendered views with depth and segmentation"}

@@ -106,6 +106,12 @@ def show_job(job: JobDetail, *, json: bool, url: str, must_succeed: bool = True)
         raise TaskError(f"job {job.id[:12]} is {job.state}{why}; `graspd retry {job.id[:12]}` runs it again")
 
 
+_SUMMARY: Final = (
+    *("grasps", "valid", "candidates", "validated", "valid_yield", "rechecked", "recheck_held"),
+    *("note", "progress", "reason", "outcomes"),
+)
+
+
 def job_summary(job: JobDetail) -> dict[str, Any]:
     """Return keys for scripts (DESIGN.md §5): job, state, grasps, valid, stages, mean, shards; and more."""
     return {
@@ -115,23 +121,9 @@ def job_summary(job: JobDetail) -> dict[str, Any]:
         "object": job.object,
         "fidelity": job.fidelity,
         "choice": job.choice and job.choice.model_dump(),
-        "grasps": job.grasps,
-        "valid": job.valid,
-        "candidates": job.candidates,
-        "validated": job.validated,
-        "valid_yield": job.valid_yield,
-        "rechecked": job.rechecked,
-        "recheck_held": job.recheck_held,
-        "note": job.note,
-        "progress": job.progress,
-        "reason": job.reason,
-        "outcomes": job.outcomes,
+        **{name: getattr(job, name) for name in _SUMMARY},
         "stages": {stage.stage.value: {"tasks": stage.tasks, "seconds": stage.seconds} for stage in job.stages},
-        "mean": {
-            name: value
-            for name, value in job.mean.model_dump().items()
-            if name in ("epsilon", "contact_area_cm2", "intersection_volume_cm3")
-        },
+        "mean": job.mean.model_dump(include={"epsilon", "contact_area_cm2", "intersection_volume_cm3"}),
         "shards": [shard.id for shard in job.shards],
     }
 

@@ -12,7 +12,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedCo
 from rich.table import Table
 
 from graspd.exchange.inputs import expand, load_case
-from graspd.service.cli import CommandGroup, JsonFlag, emit, plain_console
+from graspd.service.cli import CommandGroup, JsonFlag, emit, plain_console, write_output
 from graspd.service.model.errors import InputError, one_of
 from graspd.service.model.metrics import AXIS_MEANINGS, MOST_ROBUST_MODELS
 from graspd.service.store.shards import carried, json_attribute, read_shard, write_shard
@@ -240,10 +240,8 @@ def write_copy(source: Path, out: Path, found: Robustness) -> None:
     shard = read_shard(source, kind="base")
     said = json_attribute({"models": found.held.shape[1], "wanted": found.wanted})
     data = write_shard("base", {**shard.arrays, **found.columns}, {**carried(shard), "robust": said})
-    part = out.with_name(f".{out.name}.part")
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
-        part.write_bytes(data)
-        part.replace(out)
+        write_output(out, data)
     except OSError as error:
         raise InputError(f"{out} cannot be written: {error.strerror}") from None
