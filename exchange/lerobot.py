@@ -143,7 +143,11 @@ class _Writer:
             "index": self.frames + np.arange(count),
             "task_index": np.full(count, self.tasks[lot.name]),
         }
-        self._keep({STATE: way[:-1], ACTION: way[1:], OBJECT: np.tile(rest, (count, 1)), **numbers}, colour)
+        values = {STATE: way[:-1], ACTION: way[1:], OBJECT: np.tile(rest, (count, 1)), **numbers}
+        for name, some in values.items():
+            self._values.setdefault(name, []).append(some.reshape(len(some), -1))
+        # A tenth of the pixels is enough for statistics of colours.
+        self._values.setdefault(PICTURE, []).append(colour.reshape(-1, colour.shape[-1])[::10] / 255)
         self.episodes.append(
             {
                 EPISODE: number,
@@ -170,12 +174,6 @@ class _Writer:
             }
             for k in range(count)
         ]
-
-    def _keep(self, values: Mapping[str, NDArray[Any]], colour: NDArray[Any]) -> None:
-        for name, some in values.items():
-            self._values.setdefault(name, []).append(some.reshape(len(some), -1))
-        # A tenth of the pixels is enough for statistics of colours.
-        self._values.setdefault(PICTURE, []).append(colour.reshape(-1, colour.shape[-1])[::10] / 255)
 
     def meta(self, train: int) -> None:
         meta, total = self.folder / "meta", len(self.episodes)

@@ -148,7 +148,11 @@ def import_(
     lines = []
     for one in found:
         validated = "not validated" if validation == "none" else f"{one['valid']} valid at level {validation}"
-        lines.append(f"{one['file']}: {one['grasps']} grasps, {one['feasible']} feasible, {validated}{_compared(one)}")
+        if one["published"]:
+            validated += f"; {one['published']} have a published verdict"
+        if one["agreement_published"] is not None:
+            validated += f", {one['agreement_published']:.0%} of them equal to ours"
+        lines.append(f"{one['file']}: {one['grasps']} grasps, {one['feasible']} feasible, {validated}")
     report({"folder": str(output), "shards": found}, "\n".join(lines), json=json)
 
 
@@ -217,13 +221,6 @@ def _bench(
     rows = np.flatnonzero(mask)
     written = dexgraspbench.write(case.hand, case.obj, case.grasps, rows.tolist(), output, case.placed)
     return ExportSummary({"grasps": len(written), "files": len(written)})
-
-
-def _compared(one: dict[str, Any]) -> str:
-    words = f"; {one['published']} have a published verdict" if one["published"] else ""
-    if one["agreement_published"] is not None:
-        words += f", {one['agreement_published']:.0%} of them equal to ours"
-    return words
 
 
 def _summary(file: Path) -> dict[str, Any]:

@@ -229,14 +229,11 @@ def chart(
     if quick:
         hands, objects, fidelities = (_parts(text)[0] for text in (hands, objects, fidelities))
         batches, peer_batch, repeats, models_around = [4], 2, 1, 2
+    levels = _parts(fidelities)
+    if unknown := [name for name in levels if name not in FIDELITIES]:
+        raise InputError(f"unknown fidelity {unknown[0]!r}; choose of {one_of(unknown[0], FIDELITIES)}")
     chosen = settings_of(
-        _parts(methods),
-        known_fidelities(_parts(fidelities)),
-        batches=batches,
-        peer_batch=peer_batch,
-        options=option or [],
-        quick=quick,
-        run=on,
+        _parts(methods), levels, batches=batches, peer_batch=peer_batch, options=option or [], quick=quick, run=on
     )
     models, things = [hand_from_path(part) for part in _parts(hands)], _things(_parts(objects))
     said = {"command": shlex.join(["graspd", *(_short(word) for word in sys.argv[1:])]), "remark": remark}
@@ -317,13 +314,6 @@ def _number(text: str) -> int:
     if not text.isdigit() or not 1 <= int(text) <= 4096:
         raise InputError(f"--batch {text!r} is no number of grasps from 1 to 4096")
     return int(text)
-
-
-def known_fidelities(names: Sequence[str]) -> list[str]:
-    """Return the names if all are known; else raise InputError."""
-    if unknown := [name for name in names if name not in FIDELITIES]:
-        raise InputError(f"unknown fidelity {unknown[0]!r}; choose of {one_of(unknown[0], FIDELITIES)}")
-    return list(names)
 
 
 def _things(objects: Sequence[str]) -> list[Any]:

@@ -56,7 +56,13 @@ def worker(
     if workers > 1:
         if burst or once or max_tasks is not None:
             raise InputError("--burst, --once and --max-tasks are for a single worker")
-        _run_several(workers, settings, stages)
+        from graspd.service.run.commands import stop_on_signals
+
+        _parse_stages(stages)
+        arguments = ["worker", "--device", settings.device, "--threads", str(settings.threads)]
+        arguments += ["--join", settings.join, "--processes", str(settings.processes)]
+        arguments += ["--data-dir", str(settings.data_dir), *(("--stages", stages) if stages else ())]
+        run_workers(workers, arguments, settings, stop_on_signals())
         return
     with imports():
         from graspd.worker.process.main import run_worker
@@ -65,16 +71,6 @@ def worker(
         settings, stages=_parse_stages(stages), burst=burst or once, idle_s=idle, max_tasks=1 if once else max_tasks
     )
     raise typer.Exit(0 if ended_well else 1)
-
-
-def _run_several(count: int, settings: Settings, stages: str | None) -> None:
-    from graspd.service.run.commands import stop_on_signals
-
-    _parse_stages(stages)
-    arguments = ["worker", "--device", settings.device, "--threads", str(settings.threads)]
-    arguments += ["--join", settings.join, "--processes", str(settings.processes)]
-    arguments += ["--data-dir", str(settings.data_dir), *(("--stages", stages) if stages else ())]
-    run_workers(count, arguments, settings, stop_on_signals())
 
 
 def run_workers(
