@@ -164,16 +164,12 @@ class _Writer:
             }
         )
         self.frames += count
-        return [
-            {
-                STATE: way[k].tolist(),
-                ACTION: way[k + 1].tolist(),
-                OBJECT: rest.tolist(),
-                PICTURE: picture,
-                **{name: values[k].item() for name, values in numbers.items()},
-            }
-            for k in range(count)
-        ]
+        still = {OBJECT: rest.tolist(), PICTURE: picture}
+        rows = []
+        for k in range(count):
+            moving = {STATE: way[k].tolist(), ACTION: way[k + 1].tolist()}
+            rows.append(moving | still | {name: values[k].item() for name, values in numbers.items()})
+        return rows
 
     def meta(self, train: int) -> None:
         meta, total = self.folder / "meta", len(self.episodes)

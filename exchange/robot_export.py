@@ -120,15 +120,9 @@ def _found(
     mask, word = choose(shard, unvalidated=wishes.unvalidated, every=wishes.every)
     rows = best_of(shard.arrays, len(mask), mask) if wishes.best else np.flatnonzero(mask)
     tool = tool_frame(wishes.tool, case.hand.root_link, description.links)
-    found = executions(
-        case.hand,
-        case.obj,
-        case.grasps.take(rows),
-        rows=rows,
-        tool=tool,
-        quality=_quality(shard, rows),
-        placed=None if case.placed is None else case.placed.take(rows),
-    )
+    grasps, placed = case.grasps.take(rows), None if case.placed is None else case.placed.take(rows)
+    quality = _quality(shard, rows)
+    found = executions(case.hand, case.obj, grasps, rows=rows, tool=tool, quality=quality, placed=placed)
     if lost := len(rows) - len(found):
         written.notes.append(f"{lost} of {len(rows)} {word} have no straight way of 10 cm free of the object: left out")
     return found

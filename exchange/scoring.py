@@ -41,15 +41,9 @@ def write_scored(
     if path.exists():
         raise InputError(f"{path} exists already; give another folder as --output")
     try:
-        request = JobRequest(
-            hand=plain_name(found.hand.name),
-            object=name,
-            grasps=max(1, len(found.grasps)),
-            want="candidates",
-            validation=validation,
-            friction=friction,
-            rechecks=0,
-        )
+        wanted = {"grasps": max(1, len(found.grasps)), "want": "candidates", "rechecks": 0}
+        pair = {"hand": plain_name(found.hand.name), "object": name}
+        request = JobRequest.model_validate(pair | wanted | {"validation": validation, "friction": friction})
     except ValueError:
         raise InputError(f"unknown level {validation!r}; choose dexgraspbench, standard, fast or none") from None
     scenes = None if found.placed is None else found.placed.everywhere

@@ -42,17 +42,10 @@ def _grasps(bundle: Bundle) -> Iterable[list[Any]]:
     found = bundle.found
     for row in range(len(found)):
         scene = "" if found.placed is None else int(found.placed.index[row])
-        validated = [int(found.quality["valid"][row]), int(found.quality["success"][row])]
-        yield [
-            bundle.name(row),
-            int(found.rows[row]),
-            bundle.frame,
-            found.tool.name,
-            scene,
-            *validated,
-            *numbers(found.quality["epsilon"][row]),
-            *numbers(bundle.seen(found.object_pose[row])),
-        ]
+        place = [bundle.name(row), int(found.rows[row]), bundle.frame, found.tool.name, scene]
+        verdicts = [int(found.quality[name][row]) for name in ("valid", "success")]
+        pose = numbers(bundle.seen(found.object_pose[row]))
+        yield [*place, *verdicts, *numbers(found.quality["epsilon"][row]), *pose]
 
 
 def _postures(bundle: Bundle) -> Iterable[list[Any]]:

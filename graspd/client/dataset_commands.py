@@ -327,14 +327,8 @@ def export(
     """Write a snapshot's files into a folder; each is verified against its checksum."""
     if format not in FORMATS:
         raise InputError(f"there is no format {format!r}; there are: {one_of(format, FORMATS)}")
-    columns = (
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        TextColumn("{task.fields[files]}"),
-        DownloadColumn(),
-        TransferSpeedColumn(),
-        TimeRemainingColumn(),
-    )
+    label, counts = TextColumn("{task.description}", markup=False), TextColumn("{task.fields[files]}")
+    columns = (label, BarColumn(), counts, DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn())
     with open_client(url) as client:
         taken = client.snapshot(name, snapshot or client.take_snapshot(name).digest)
         console = plain_console(stderr=True)

@@ -99,13 +99,8 @@ def evaluate_command(
     other = None if validation_hand is None else hand_from_path(validation_hand, drag=True)
     twins = _joint_map(joint_map)
     rows: list[dict[str, Any]] = []
-    columns = (
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        TextColumn("{task.completed:.0f}/{task.total:.0f}"),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
+    name, done = TextColumn("{task.description}", markup=False), TextColumn("{task.completed:.0f}/{task.total:.0f}")
+    columns = (name, BarColumn(), done, TimeElapsedColumn(), TimeRemainingColumn())
     with Progress(*columns, console=plain_console(stderr=True), disable=json, transient=True) as bar:
         task = bar.add_task("reading", total=1)
         listed = [one for path in files for one in expand(path)]
@@ -114,6 +109,9 @@ def evaluate_command(
             case = load_case(file, hand=hand, obj=object)
             if copies and (case.placed is None) == (protocol == "lift"):
                 raise InputError(f"{file} stores shares of its own protocol: a lift in scenes, else six pushes")
+            twin = None
+            if other is not None:
+                twin = same_hand(case.hand, other, twins, tolerance_m=validation_tolerance / 1e3)
             row = evaluate(
                 case,
                 protocol=protocol,  # type: ignore[arg-type]
@@ -121,9 +119,7 @@ def evaluate_command(
                 hard=hard,
                 friction=friction,
                 models=robust,
-                validation_hand=None
-                if other is None
-                else same_hand(case.hand, other, twins, tolerance_m=validation_tolerance / 1e3),
+                validation_hand=twin,
                 tell=partial(write_copy, file, copies[file]) if copies else lambda found: None,
                 run=ExecutionContext(threads=threads, progress=partial(_show, bar, task, case.name)),
             )

@@ -169,15 +169,9 @@ class GraspAnimation:
     def _executed(self, row: np.intp) -> Executions:
         one, placed = np.array([row]), placed_of_shard(self.shard)
         grasps = GraspSet.from_columns(self.shard.arrays).take(one)
-        return executions(
-            self.hand,
-            self.obj,
-            grasps,
-            rows=one,
-            placed=None if placed is None else placed.take(one),
-            tool=tool_frame(None, self.hand.root_link, {}),
-            quality={},
-        )
+        placed = None if placed is None else placed.take(one)
+        tool = tool_frame(None, self.hand.root_link, {})
+        return executions(self.hand, self.obj, grasps, rows=one, placed=placed, tool=tool, quality={})
 
     def _drawn(self, row: np.intp, way: Sequence[Waypoint]) -> NDArray[np.uint8]:
         width = self.width or WIDTH
