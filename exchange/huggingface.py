@@ -157,7 +157,7 @@ def _groups(pictures: Pictures, names: Mapping[str, str], noise: DepthNoise | No
     group: list[dict[str, Any]] = []
     for index, sample in enumerate(pictures):
         if sample["base_id"] in names:
-            depth = CloudView.of(sample, noise, np.random.default_rng(index)).seen
+            depth = CloudView(sample, noise, np.random.default_rng(index)).seen
             group.append(_picture(sample, names[sample["base_id"]], depth))
         if len(group) == _PICTURES_AT_ONCE:
             yield group
