@@ -7,14 +7,13 @@ from typing import Annotated
 import typer
 
 from graspd.service import telemetry
-from graspd.service.cli import keep_private, load_settings, log_to_stderr, reporting_errors
+from graspd.service.cli import CommandGroup, keep_private, load_settings, log_to_stderr
 from graspd.service.model.libraries import imports
 
-app = typer.Typer(add_completion=False)
+app = CommandGroup(add_completion=False)
 
 
 @app.command(epilog="graspd api --port 8000")
-@reporting_errors
 def api(
     host: Annotated[str | None, typer.Option(help="Address to bind; default: GRASPD_HOST.")] = None,
     port: Annotated[int | None, typer.Option(min=0, max=65535, help="Port; 0: any free port.")] = None,

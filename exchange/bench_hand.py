@@ -16,7 +16,7 @@ from xml.etree.ElementTree import Element, SubElement
 
 import mujoco
 import numpy as np
-from pydantic_core import from_json
+from pydantic import TypeAdapter, ValidationError
 
 from graspd.exchange.imported import write_obj
 from graspd.service.model.errors import InputError
@@ -32,15 +32,7 @@ _COLOUR: Final = (0.87, 0.45, 0.2, 1.0)
 
 
 def write_hand(hand: HandModel, config: str, root: Path) -> Path:
-    """Write model and configuration of a hand below `root`, laid out like a checkout of DexGraspBench.
-
-    Args:
-        hand: the hand.
-        config: name of the configuration, `hand=...` of the evaluator.
-
-    Returns:
-        the model's file, relative to `root`.
-    """
+    """Write model and configuration (`hand=...` of the evaluator) of a hand; return the model, relative to `root`."""
     folder = Path("assets") / "hand" / config
     (root / folder / "meshes").mkdir(parents=True, exist_ok=True)
     for number, piece in enumerate(hand.pieces):
@@ -55,13 +47,12 @@ def write_hand(hand: HandModel, config: str, root: Path) -> Path:
 
 
 def joint_order(file: Path) -> tuple[str, ...]:
-    """Return the joints of a model in the order of its `qpos`: MuJoCo's order, not the URDF's."""
+    """Return the joints of a model in MuJoCo's order, that of its `qpos`."""
     model = mujoco.MjModel.from_xml_path(str(file))
     return tuple(model.joint(number).name for number in range(model.njnt))
 
 
 def body_names(hand: HandModel) -> tuple[str, ...]:
-    """Return the name of each body in the model."""
     return tuple(f"{'root' if b == 0 else _finger(hand, b)}_{name}" for b, name in enumerate(hand.body_names))
 
 
@@ -168,32 +159,23 @@ def _add_drives(equality: Element, actuators: Element, hand: HandModel) -> None:
     for d, name in enumerate(hand.dof_names):
         if (tendon := pulled.get(d)) is not None:
             if d == min(tendon.dofs):
-                limit = tendon.limit(hand.effort)
-                SubElement(
-                    actuators,
-                    "position",
-                    name=name,
-                    tendon=tendon.name,
-                    kp=_text([tendon.gain(hand.stiffness)]),
-                    forcerange=_text([-limit, limit]),
-                )
+                gain, limit = tendon.gain(hand.stiffness), tendon.limit(hand.effort)
+                _add_actuator(actuators, name, {"tendon": tendon.name}, gain, limit)
             continue
         lead, *others = [int(b) for b in hand.joint_body if hand.dof[b] == d]
         m = float(hand.multiplier[lead])
-        limit = float(hand.effort[d]) / abs(m)
-        SubElement(
-            actuators,
-            "position",
-            name=name,
-            joint=_joint_of(hand, lead),
-            kp=_text([float(hand.stiffness[d]) / m**2]),
-            forcerange=_text([-limit, limit]),
-        )
+        gain, limit = float(hand.stiffness[d]) / m**2, float(hand.effort[d]) / abs(m)
+        _add_actuator(actuators, name, {"joint": _joint_of(hand, lead)}, gain, limit)
         for b in others:
             ratio = float(hand.multiplier[b]) / m
             start = float(hand.offset[b]) - ratio * float(hand.offset[lead])
             pair = {"joint1": _joint_of(hand, b), "joint2": _joint_of(hand, lead)}
             SubElement(equality, "joint", {**pair, "polycoef": _text([start, ratio, 0, 0, 0]), **_COUPLING})
+
+
+def _add_actuator(actuators: Element, name: str, driven: dict[str, str], gain: float, limit: float) -> None:
+    values = {"kp": _text([gain]), "forcerange": _text([-limit, limit])}
+    SubElement(actuators, "position", {"name": name, **driven, **values})
 
 
 def _add_tendons(tendons: Element, hand: HandModel) -> None:
@@ -222,7 +204,6 @@ class HandMapping:
 
     hand: str
     root_link: str
-    """Our root link in the URDF."""
     config: str
     """Configuration of the benchmark that names the model: `hand=...`."""
     model: str
@@ -231,7 +212,6 @@ class HandMapping:
     joints: tuple[tuple[str, str], ...]
     """(model's joint, URDF's joint) in the order of `qpos`; angles are the same."""
     links: tuple[tuple[str, str], ...] = ()
-    """(model's body, URDF's link)"""
 
     def qpos(self, hand: HandModel, root: Floats, joints: Floats) -> Floats:
         """Return `qpos` (7 + J,) from our root's pose (7,) and our joints (J,)."""
@@ -253,17 +233,13 @@ class HandMapping:
         return [hand.joint_names.index(name) for name in names]
 
     def write(self, folder: Path) -> None:
-        """Write it as JSON."""
         said = asdict(self) | {"unit": "m, rad", "quaternion": "w x y z", "qpos": "root position, quaternion, joints"}
+        folder.mkdir(parents=True, exist_ok=True)
         (folder / FILE).write_text(json.dumps(said, indent=1) + "\n")
 
 
 def mapping_of(file: Path) -> HandMapping | None:
-    """Load the mapping in the parent of a grasp file's folder; None if there is none.
-
-    Raises:
-        InputError: it exists and cannot be read.
-    """
+    """Load the mapping in the parent of a grasp file's folder; None if there is none."""
     for above in file.resolve().parents:
         if above.name in _FOLDERS:
             return _read(above.parent / FILE)
@@ -275,20 +251,12 @@ def _read(path: Path) -> HandMapping | None:
     if not path.is_file():
         return None
     try:
-        said: dict[str, Any] = from_json(path.read_bytes())
-        pose = tuple(float(value) for value in said["root_in_model"])
-        joints, links = (tuple((str(a), str(b)) for a, b in said[key]) for key in ("joints", "links"))
-        hand, root, config, model = (str(said[key]) for key in ("hand", "root_link", "config", "model"))
-    except (ValueError, TypeError, KeyError):
+        found = TypeAdapter(HandMapping).validate_json(path.read_bytes())
+    except ValidationError:
         raise InputError(f"{path} is no mapping of a hand; export the grasps again or remove it") from None
-    if len(pose) != len(IDENTITY_POSE):
-        raise InputError(f"{path}: root_in_model has {len(pose)} numbers instead of {len(IDENTITY_POSE)}")
-    return HandMapping(hand, root, config, model, pose, joints, links)
-
-
-def link_names(hand: HandModel) -> tuple[tuple[str, str], ...]:
-    """Return (body of our model, link of the URDF) of every body."""
-    return tuple(zip(body_names(hand), hand.body_names, strict=True))
+    if (numbers := len(found.root_in_model)) != len(IDENTITY_POSE):
+        raise InputError(f"{path}: root_in_model has {numbers} numbers instead of {len(IDENTITY_POSE)}")
+    return found
 
 
 _SHADOW: Final = tuple(

@@ -1,27 +1,33 @@
-"""Grasps on a table in the format of DexGraspBench's tabletop test: export and import.
+"""Objects and scenes in DexGraspBench's layout, and grasps on a table in the format of its tabletop test.
 
-All poses in the files are in the table's frame, z up, its top at z = 0; the evaluator has a floor there and nothing
-else. Fields besides those of every grasp: `approach_qpos` (W, 7 + J) from the standoff to the pregrasp with the hand
-open, and `lift_qpos` (7 + J,), the raised squeeze. The evaluator raises a flying hand itself; arms use these fields.
+An object has a mesh, convex pieces, facts, and scenes: afloat at scale 1, and on a table. All poses in the files of a
+table are in its frame, z up, its top at z = 0; the evaluator has a floor there and nothing else. Fields besides those
+of every grasp: `approach_qpos` (W, 7 + J) from the standoff to the pregrasp with the hand open, and `lift_qpos`
+(7 + J,), the raised squeeze. The evaluator raises a flying hand itself; arms use these fields.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any, Final
 
 import numpy as np
+import trimesh
 
 from graspd.exchange.bench_hand import HandMapping
-from graspd.exchange.imported import load_npy
+from graspd.exchange.imported import load_npy, mesh_file, urdf_of, write_obj
 from graspd.service.model.errors import InputError
 from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, compose, invert
 from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.model import HandModel
+from graspd.worker.hands.primitives import hull, volume
+from graspd.worker.objects.model import ObjectModel
 from graspd.worker.scenes.kinds import supports_of
 from graspd.worker.simulation.environment import PlacedGrasps
+from graspd.worker.validation.decomposition import decompose
 
 Row = dict[str, Any]
 
@@ -29,6 +35,73 @@ Row = dict[str, Any]
 TABLETOP: Final = "tabletop"
 #: Tolerance of equal poses, and of a floor's height at z = 0 [m, and in quaternions].
 SAME: Final = 1e-9
+#: Folder of a set of objects in a checkout of DexGraspBench.
+SET: Final = Path("assets") / "object" / "graspd"
+SCALE: Final = "scale100"
+
+
+def write_object(obj: ObjectModel, name: str, root: Path) -> tuple[Path, Path]:
+    """Write an object and its scene below `root`, laid out like a checkout; return folder and scene, both relative."""
+    folder, scene = SET / "processed_data" / name, SET / "scene_cfg" / name / "floating" / f"{SCALE}.npy"
+    for part in (folder / "mesh", folder / "info", folder / "urdf" / "meshes", SET / "valid_split"):
+        (root / part).mkdir(parents=True, exist_ok=True)
+    mesh_file(obj, root / folder / "mesh" / "simplified.obj")
+    pieces = [hull(corners) for corners in decompose(obj).vertices]
+    meshes = root / folder / "urdf" / "meshes"
+    # The evaluator reads every file of this folder as a piece: remove those of an earlier export.
+    for old in meshes.iterdir():
+        old.unlink()
+    written = [write_obj(meshes / f"convex_piece_{k:03}.obj", *piece) for k, piece in enumerate(pieces)]
+    urdf = urdf_of(name, "object", [f"meshes/{file.name}" for file in written])
+    (root / folder / "urdf" / "coacd.urdf").write_text(urdf)
+    solid = sum(volume("hull", (), corners, faces) for corners, faces in pieces)
+    (root / folder / "info" / "simplified.json").write_text(json.dumps(_facts(obj, solid), indent=1) + "\n")
+    save_record(root / scene, _scene(name, f"floating/{SCALE}", IDENTITY_POSE))
+    split = root / SET / "valid_split" / "all.json"
+    names = json.loads(split.read_text()) if split.is_file() else []
+    split.write_text(json.dumps(sorted({*names, name}), indent=1) + "\n")
+    return folder, scene
+
+
+def _facts(obj: ObjectModel, solid: float) -> dict[str, Any]:
+    """Return facts with the scale of density: at density 1 the weighed pieces have this mass."""
+    _, extents = trimesh.bounds.oriented_bounds(obj.hull_vertices)
+    return {
+        "gravity_center": obj.centre_of_mass.tolist(),
+        "obb": np.asarray(extents, float).tolist(),
+        "scale": 1.0,
+        "density": 1.0,
+        "mass": solid,
+    }
+
+
+def write_table(name: str, pose: Floats, number: int, root: Path) -> Path:
+    """Write the scene of an exported object at `pose` (7,) on a table; return its file, relative to `root`."""
+    place = f"{TABLETOP}/{SCALE}_pose{number:03}"
+    file = SET / "scene_cfg" / name / f"{place}.npy"
+    scene = _scene(name, place, pose)
+    scene["scene"]["table"] = {"type": "plane", "pose": IDENTITY_POSE.copy(), "size": np.array([0.0, 0.0, 1.0])}
+    save_record(root / file, scene)
+    return file
+
+
+def save_record(file: Path, record: Row) -> None:
+    """Write a dictionary as DexGraspBench does: a pickle in a `.npy` file."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    np.save(file, np.array(record, dtype=object), allow_pickle=True)
+
+
+def _scene(name: str, place: str, pose: Floats) -> dict[str, Any]:
+    folder = f"../../../processed_data/{name}"
+    thing = {
+        "type": "rigid_object",
+        "scale": np.ones(3),
+        "pose": np.array(pose, float),
+        "file_path": f"{folder}/mesh/simplified.obj",
+        "info_path": f"{folder}/info/simplified.json",
+        "urdf_path": f"{folder}/urdf/coacd.urdf",
+    }
+    return {"scene_id": f"{name}/{place}", "scene": {name: thing}, "task": {"type": "force_closure", "obj_name": name}}
 
 
 def check_table(placed: PlacedGrasps) -> None:
@@ -69,14 +142,9 @@ def placed_of(obj_pose: Floats) -> PlacedGrasps:
 
 
 def object_of_scene(file: Path, scene_path: str) -> Row:
-    """Return `obj_pose` and `obj_scale` of a scene's object.
+    """Return `obj_pose` and `obj_scale` of the object in the scene that a grasp's file names.
 
-    Args:
-        file: a grasp's file that names the scene.
-        scene_path: relative to a folder above `file`, and below its `assets`.
-
-    Raises:
-        InputError: the path leads elsewhere, the file is missing, or it is no scene.
+    Its path is relative to a folder above the file, and below that folder's `assets`; InputError if it leads elsewhere.
     """
     place = PurePosixPath(scene_path)
     if place.is_absolute() or ".." in place.parts or place.parts[:1] != ("assets",):
@@ -98,10 +166,7 @@ def object_of_scene(file: Path, scene_path: str) -> Row:
 def with_way(
     hand: HandModel, grasps: GraspSet, rows: Sequence[Row], obj_pose: Floats, mapping: HandMapping | None
 ) -> GraspSet:
-    """Add approach and lift from files, in the object frame, if all files agree.
-
-    They must have equal numbers of waypoints, and joints that do not move along the approach.
-    """
+    """Add approach and lift from files, in the object frame, if all have as many waypoints and one open hand."""
     if not all({"approach_qpos", "lift_qpos"} <= set(row) for row in rows):
         return grasps
     ways = [np.asarray(row["approach_qpos"], float) for row in rows]

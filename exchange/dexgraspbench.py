@@ -19,21 +19,25 @@ import numpy as np
 from graspd.exchange.bench_hand import (
     GRASPS,
     HandMapping,
+    body_names,
     joint_order,
-    link_names,
     mapping_of,
     of_the_benchmark,
     write_hand,
 )
-from graspd.exchange.bench_object import SCALE, write_object, write_table
 from graspd.exchange.bench_scene import (
+    SCALE,
     TABLETOP,
+    Row,
     check_table,
     is_tabletop,
     object_of_scene,
     placed_of,
+    save_record,
     tabletop_fields,
     with_way,
+    write_object,
+    write_table,
 )
 from graspd.exchange.imported import ImportedGrasps, load_npy, scaled_object
 from graspd.exchange.plan import plain_name
@@ -45,23 +49,13 @@ from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.simulation.environment import PlacedGrasps
 
-Row = dict[str, Any]
 POSTURES: Final = ("pregrasp", "grasp", "squeeze")
 #: Prefix of the configurations of our hands, and name of the experiment.
 NAME: Final = "graspd"
 
 
 def read(path: Path, *, hand: str, obj: str) -> list[ImportedGrasps]:
-    """Read grasps of one hand on one object: one set per scale, grasps on tables in separate sets.
-
-    Args:
-        path: a file, or a folder that is searched recursively.
-        hand: URDF or built-in hand; without a mapping beside the grasps, the one that matches their root and joints.
-        obj: mesh or built-in object at scale 1.
-
-    Raises:
-        InputError: files are missing, are for several models of a hand, or do not fit the hand.
-    """
+    """Read a file or folder: one set per scale, grasps on tables apart. Without a mapping, `hand` has their joints."""
     # Descriptions of scenes are pickled dictionaries too.
     files = [path] if path.is_file() else [f for f in sorted(path.rglob("*.npy")) if "scene_cfg" not in f.parts]
     if not files:
@@ -92,15 +86,8 @@ def write(
     """Write grasps with all files of DexGraspBench's evaluator: the folder completes its checkout.
 
     The object has scale 1. It is at the origin or, for `placed` grasps, on its table, as in the tabletop test; both are
-    separate experiments. The hand is written as a model of our own. If the benchmark has a model of the same hand, the
-    grasps are also written for that one.
-
-    Returns:
-        the files of the grasps, one each, for our model of the hand.
-
-    Raises:
-        InputError: the grasps' scenes are more than a table.
-        MeshError: the object's convex pieces do not match its shape.
+    separate experiments. The hand is written as a model of our own, whose files are returned. If the benchmark has a
+    model of the same hand, the grasps are also written for that one.
     """
     if placed is not None:
         check_table(placed)
@@ -115,7 +102,6 @@ def write(
     paths: list[Path] = []
     for mapping in models_of(hand, folder):
         out = folder / "output" / f"{experiment(placed)}_{mapping.config}"
-        out.mkdir(parents=True, exist_ok=True)
         mapping.write(out)
         written = [out / GRASPS / name / f"{SCALE}_pose{number[row]:03}" / f"{row}.npy" for row in rows]
         for row, file in zip(rows, written, strict=True):
@@ -129,8 +115,7 @@ def write(
             record |= postures(mapping, hand, grasps, row, None if placed is None else pose)
             if placed is not None:
                 record |= tabletop_fields(mapping, hand, grasps, row, pose)
-            file.parent.mkdir(parents=True, exist_ok=True)
-            np.save(file, np.array(record, dtype=object), allow_pickle=True)
+            save_record(file, record)
         paths = paths or written
     return paths
 
@@ -139,16 +124,9 @@ def models_of(hand: HandModel, folder: Path) -> list[HandMapping]:
     """Return mappings for our hand model, written below `folder`, and the benchmark's if it has one."""
     config = f"{NAME}_{plain_name(hand.name)}"
     model = write_hand(hand, config, folder)
-    order = joint_order(folder / model)
-    ours = HandMapping(
-        hand.name,
-        hand.root_link,
-        config,
-        model.as_posix(),
-        tuple(IDENTITY_POSE),
-        tuple((j, j) for j in order),
-        link_names(hand),
-    )
+    joints = tuple((name, name) for name in joint_order(folder / model))
+    links = tuple(zip(body_names(hand), hand.body_names, strict=True))
+    ours = HandMapping(hand.name, hand.root_link, config, model.as_posix(), tuple(IDENTITY_POSE), joints, links)
     return [ours, *filter(None, [of_the_benchmark(hand)])]
 
 
@@ -168,15 +146,13 @@ def postures(mapping: HandMapping, hand: HandModel, grasps: GraspSet, row: int, 
 
 
 def _rows(file: Path) -> list[Row]:
-    """Return the grasps of a file: one, or several if `..._qpos` have one more axis.
-
-    A file without the object's pose names a scene that contains it.
-    """
+    """Return the grasps of a file: one, or several if `..._qpos` have one more axis."""
     found = load_npy(file)
     if not isinstance(found, dict):
         raise InputError(f"{file} holds no dictionary; DexGraspBench has one a file")
     if missing := [f"{name}_qpos" for name in POSTURES if f"{name}_qpos" not in found]:
         raise InputError(f"{file} has no {missing[0]}")
+    # A file without the object's pose names a scene that has it.
     if "obj_pose" not in found and "scene_path" in found:
         found |= object_of_scene(file, str(found["scene_path"]))
     count = {len(found[f"{name}_qpos"]) if np.ndim(found[f"{name}_qpos"]) == 2 else 0 for name in POSTURES}
@@ -194,7 +170,6 @@ def _part(value: Any, k: int, count: set[int]) -> Any:
 
 
 def _scaled(row: Row) -> Row:
-    """Apply `scene_scale` to the object's scale."""
     if "scene_scale" not in row:
         return row
     return row | {"obj_scale": _scale(row) * float(np.ravel(row["scene_scale"])[0])}
@@ -215,27 +190,25 @@ def _set(
     on_table: bool,
 ) -> ImportedGrasps:
     pose = np.array([np.ravel(row.get("obj_pose", IDENTITY_POSE)) for row in rows], float)
-    parts = {name: _posture(path, hand, name, rows, pose, mapping) for name in POSTURES}
-    grasps = GraspSet(parts["grasp"], parts["pregrasp"], parts["squeeze"], np.full(len(rows), np.nan))
+
+    def posture(name: str) -> Posture:
+        try:
+            qpos = np.array([np.ravel(row[f"{name}_qpos"]) for row in rows], float)
+        except ValueError as error:
+            raise InputError(f"{path}: {name}_qpos has not one length in all files: {error}") from None
+        if qpos.shape[1] != 7 + len(hand.joint_names):
+            raise InputError(
+                f"{path}: {name}_qpos has {qpos.shape[1]} numbers, {hand.name} needs 7 + {len(hand.joint_names)}; "
+                "is --hand the right hand?"
+            )
+        root, joints = (qpos[:, :7], qpos[:, 7:]) if mapping is None else mapping.posture(hand, qpos)
+        return Posture(compose(invert(pose), root), joints)
+
+    pregrasp, grasp, squeeze = map(posture, POSTURES)
+    grasps = GraspSet(grasp, pregrasp, squeeze, np.full(len(rows), np.nan))
     published = np.array([int(bool(row["succ_flag"])) if "succ_flag" in row else -1 for row in rows], np.int8)
     name = str(rows[0].get("obj_path", obj.name)).rstrip("/").rsplit("/", 1)[-1]
     placed = placed_of(pose) if on_table else None
     if placed is not None:
         grasps = replace(with_way(hand, grasps, rows, pose, mapping), scene=placed.index)
     return ImportedGrasps(hand, obj, grasps, name, scale, published, placed)
-
-
-def _posture(
-    path: Path, hand: HandModel, name: str, rows: list[Row], obj_pose: Floats, mapping: HandMapping | None
-) -> Posture:
-    try:
-        qpos = np.array([np.ravel(row[f"{name}_qpos"]) for row in rows], float)
-    except ValueError as error:
-        raise InputError(f"{path}: {name}_qpos has not one length in all files: {error}") from None
-    if qpos.shape[1] != 7 + len(hand.joint_names):
-        raise InputError(
-            f"{path}: {name}_qpos has {qpos.shape[1]} numbers, {hand.name} needs 7 + {len(hand.joint_names)}; "
-            "is --hand the right hand?"
-        )
-    root, joints = (qpos[:, :7], qpos[:, 7:]) if mapping is None else mapping.posture(hand, qpos)
-    return Posture(compose(invert(obj_pose), root), joints)

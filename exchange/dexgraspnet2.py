@@ -15,6 +15,24 @@ Zhang et al., DexGraspNet 2.0, CoRL 2024. Below `data/`, NNNN is a scene and VVV
         (P, 1) f4 graspness of the P points of its loader for the view, in pixel order
 
 Its loader puts pixel (u, v) at u, v; ours has pixel centres at +0.5. The intrinsics account for this.
+
+Graspness is a distance-weighted number of grasps that aim at a point. The values follow their
+src/preprocess/dex_graspness.py, the clouds their src/utils/pc.py, both as in zcyqyq/DexTouch-sim2real at
+7824d859a8da1d942bc38709a9d217dfb548db5d. An object is 1,000 points of its surface:
+
+    grasp g aims from the palm at the middle between its thumb and its other fingers
+    seen    points ahead within 30 degrees of that line, at most 20 mm farther along it than the first of them
+    p_g     the seen point with the least angle / 10 degrees + height / 15 mm
+    value   of a point: the sum over all grasps of 10^(-150 d), d its distance from p_g [m]; no share and
+        no logarithm: their loader computes the logarithm of value + 0.001
+    pixel   on the object: the value of the nearest point; elsewhere 0
+
+Theirs uses thumb and middle finger of a LEAP hand and the centre of its palm's box; here it is any hand's thumb, the
+mean of its other fingertips, and the palm's surface. If no point is seen, theirs stops; here the point nearest to the
+palm counts. For the nearest point theirs documents 15 mm but compares 0.015 with a squared distance, which pytorch3d's
+`knn_points` returns. The actual 122 mm are used here.
+
+`service.readers.clouds.graspness` differs: it is the share of grasps whose hand touches a point.
 """
 
 from __future__ import annotations
@@ -23,6 +41,7 @@ import shutil
 import zipfile
 import zlib
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from typing import Any, Final
@@ -30,20 +49,165 @@ from typing import Any, Final
 import numpy as np
 import scipy.io
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
 
-from graspd.exchange.dexgraspnet2_graspness import SceneGraspness, surface_samples
 from graspd.exchange.imported import ImportedGrasps, completed, joints_by_name, scaled_object, verdicts
-from graspd.exchange.plan import ExportPart, ExportSummary, PictureReference, by_scene, looks, plain_name
+from graspd.exchange.plan import ExportPart, ExportSummary, PictureReference, by_scene, plain_name
 from graspd.service.model.base import why
 from graspd.service.model.errors import InputError
-from graspd.service.model.transforms import Floats, apply, compose, invert, pose_from_matrix, pose_to_matrix
+from graspd.service.model.transforms import (
+    IDENTITY_POSE,
+    Floats,
+    apply,
+    compose,
+    invert,
+    pose_from_matrix,
+    pose_to_matrix,
+    quat_rotate,
+)
 from graspd.service.readers import DepthNoise, Pictures
 from graspd.service.readers.clouds import CloudView
 from graspd.worker.grasps import GraspSet, Posture
+from graspd.worker.hands.jaws import fingertip_pad
+from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
+from graspd.worker.hands.surface import OVERSAMPLING, farthest_points
+from graspd.worker.objects.distance import sample_faces
+from graspd.worker.objects.model import ObjectModel
 from graspd.worker.rendering.annotate import OBJECT
 from graspd.worker.rendering.export import export_png
+
+SAMPLES: Final = 1000
+#: Half the opening of a grasp's view cone [rad], and its depth beyond the first point [m].
+CONE: Final = np.pi / 6
+BAND_M: Final = 0.02
+#: Angle [rad] and height beyond the first point [m] that halve the weight of a seen point.
+ANGLE_HALF: Final = np.pi / 18
+HEIGHT_HALF_M: Final = 0.015
+#: Powers of ten by which a grasp's weight falls per metre from its aim point.
+FALL_PER_M: Final = 150.0
+#: Largest distance of a pixel from the point whose value it takes [m].
+REACH_M: Final = 0.015**0.5
+#: Points farther from the box around all objects are not in the cloud [m].
+OUTLIER_M: Final = 0.02
+#: Grasps that are evaluated at once: some 6 MB per array.
+_AT_ONCE: Final = 256
+
+
+def surface_samples(obj: ObjectModel) -> Floats:
+    """Sample (`SAMPLES`, 3) even surface points of an object, in its frame [m]; equal for equal objects."""
+    many = sample_faces(obj.vertices, obj.faces.astype(np.int64), OVERSAMPLING * SAMPLES)[0]
+    return many[farthest_points(many, SAMPLES)]
+
+
+@dataclass(frozen=True)
+class SceneGraspness:
+    """Graspness of one scene's object, from all its grasps there."""
+
+    samples: Floats
+    """(S, 3) points of the object's surface, in its frame [m]."""
+    pointed: NDArray[np.intp]
+    """(K,) index of the point that each grasp aims at."""
+    values: Floats
+    """(S,) graspness of the points, between 0 and K."""
+
+    @classmethod
+    def of(cls, hand: HandModel, grasps: Posture, samples: Floats) -> SceneGraspness:
+        """Compute it from K grasps in the object's frame; without grasps all values are 0."""
+        pointed = pointed_at(*lines_of_sight(hand, grasps), samples)
+        return cls(samples, pointed, summed(samples, pointed))
+
+    def of_view(
+        self, depth: Floats, labels: NDArray[np.uint8], intrinsics: Floats, camera: Floats, object_pose: Floats
+    ) -> NDArray[np.float32]:
+        """Return the graspness (N, 1) of the loader's cloud of a picture, row by row; 0 on neighbours.
+
+        `depth` (H, W) is 0 where nothing is [m]; `labels` (H, W) are 0 for background, 1 for the object of the grasps,
+        at least one pixel; `intrinsics` (3, 3) [px]; `camera` (4, 4) is in the table's frame, `object_pose` (7,) in it.
+        """
+        cloud = back_projected(depth, intrinsics)
+        inside = in_workspace(cloud, depth, labels, camera)
+        found = np.zeros(np.count_nonzero(inside), np.float32)
+        mine = labels[inside] == 1
+        points = apply(invert(object_pose), cloud[inside][mine])
+        # A point without a neighbour within reach gets an index past the last one.
+        nearest = cKDTree(self.samples).query(points, distance_upper_bound=REACH_M)[1]
+        found[mine] = np.append(self.values, 0)[nearest]
+        return found[:, None]
+
+
+def lines_of_sight(hand: HandModel, grasps: Posture) -> tuple[Floats, Floats]:
+    """Return origins (K, 3) and unit directions (K, 3) of K grasps' lines of sight, in their frame [m].
+
+    The thumb is the fingertip that is on average farthest from the others before the hand closes. For hands with one
+    fingertip, or with fingers that meet in the palm, the line is the approach.
+    """
+    palm = apply(grasps.hand_pose, hand.palm.centre)
+    line = quat_rotate(grasps.hand_pose[:, 3:], hand.palm.approach)
+    if len(hand.fingertips) < 2:
+        return palm, line
+    open_ = _fingertips(hand, Posture(IDENTITY_POSE[None], hand.expand(hand.preshape)[None]))[0]
+    thumb = int(cdist(open_, open_).sum(axis=1).argmax())
+    tips = _fingertips(hand, grasps)
+    middle = 0.5 * (tips[:, thumb] + np.delete(tips, thumb, axis=1).mean(axis=1))
+    length = np.linalg.norm(middle - palm, axis=1, keepdims=True)
+    return palm, np.where(length > 1e-6, (middle - palm) / np.maximum(length, 1e-6), line)
+
+
+def _fingertips(hand: HandModel, grasps: Posture) -> Floats:
+    """Return (K, F, 3) contact points of the fingertips [m]."""
+    pads = np.array([fingertip_pad(hand, tip).centre for tip in hand.fingertips])
+    return apply(body_poses(hand, grasps.hand_pose, grasps.joint_positions)[:, list(hand.fingertips)], pads)
+
+
+def pointed_at(palm: Floats, line: Floats, samples: Floats) -> NDArray[np.intp]:
+    """Return (K,) aim points' indices in `samples` (S, 3), seen from `palm` along unit `line` (K, 3) [m]."""
+    found = np.empty(len(palm), np.intp)
+    for first in range(0, len(palm), _AT_ONCE):
+        some = slice(first, first + _AT_ONCE)
+        away = samples - palm[some, None]
+        distance = np.linalg.norm(away, axis=2)
+        height = np.einsum("ksi,ki->ks", away, line[some])
+        angle = np.arccos(np.clip(height / np.maximum(distance, 1e-12), -1, 1))
+        seen = (height > 0) & (angle < CONE)
+        beyond = height - np.where(seen, height, np.inf).min(axis=1, keepdims=True)
+        seen &= beyond < BAND_M
+        cost = np.where(seen, angle / ANGLE_HALF + beyond / HEIGHT_HALF_M, np.inf)
+        found[some] = np.where(seen.any(axis=1), cost.argmin(axis=1), distance.argmin(axis=1))
+    return found
+
+
+def summed(samples: Floats, pointed: NDArray[np.intp]) -> Floats:
+    """Return (S,) graspness of points (S, 3) [m] from the aim points' indices (K,)."""
+    count = np.bincount(pointed, minlength=len(samples))
+    some = np.flatnonzero(count)
+    # Sum per point, not per grasp: at most S x S numbers for any number of grasps.
+    return np.asarray(10.0 ** (-FALL_PER_M * cdist(samples, samples[some])) @ count[some], float)
+
+
+def back_projected(depth: Floats, intrinsics: Floats) -> Floats:
+    """Return (H, W, 3) points of a picture in its camera [m], bit for bit as in the loader: their number must agree."""
+    u, v = np.meshgrid(np.arange(depth.shape[1]), np.arange(depth.shape[0]))
+    x = (u - intrinsics[0, 2]) * depth / intrinsics[0, 0]
+    y = (v - intrinsics[1, 2]) * depth / intrinsics[1, 1]
+    return np.stack([x, y, depth], axis=-1)
+
+
+def in_workspace(cloud: Floats, depth: Floats, labels: NDArray[np.uint8], camera: Floats) -> NDArray[np.bool_]:
+    """Return (H, W) pixels whose points (H, W, 3) the loader keeps.
+
+    These have a depth and lie in the box around all labelled pixels, on the table. As in the loader, labelled pixels
+    without depth extend the box, at the camera.
+    """
+    whole = np.concatenate([cloud.reshape(-1, 3), np.ones((depth.size, 1))], axis=1)
+    there = np.einsum("ab,nb->na", camera, whole)[:, :3]
+    objects = there[labels.reshape(-1) > 0]
+    low, high = objects.min(axis=0) - OUTLIER_M, objects.max(axis=0) + OUTLIER_M
+    inside = ((there > low) & (there < high)).all(axis=1)
+    return np.asarray(inside.reshape(depth.shape) & (depth > 0))
+
 
 CAMERA: Final = "realsense"
 #: Views of a scene, from which its loader samples.
@@ -69,27 +233,12 @@ _MEMBERS: Final = 1024
 def write(
     lots: Sequence[ExportPart], pictures: Pictures, folder: Path, out: frozenset[str], noise: DepthNoise | None = None
 ) -> ExportSummary:
-    """Write each scene that has pictures and grasps.
-
-    Args:
-        lots: grasps, planned in the scenes or carried over into them.
-        pictures: pictures of the scenes.
-        folder: laid out like a checkout; created if missing.
-        out: held-out objects.
-        noise: depth camera whose noise is applied; None: perfect depth.
-
-    Returns:
-        numbers of grasps, scenes, views and files of grasps.
-
-    Raises:
-        InputError: the folder already exists, there are no pictures, there are more scenes than numbers in the
-            splits, or a joint has the name of another key.
-    """
+    """Write each scene that has pictures and grasps, planned in it or carried over into it."""
     top = folder / "data"
     if top.exists():
         raise InputError(f"{top} is there already; give another folder as --output")
     known = {lot.id: lot for lot in lots}
-    seen = by_scene(list(looks(pictures))).values()
+    seen = by_scene(pictures)
     scenes = [some for some in seen if some[0].base in known and len(some[0].rows)]
     if not scenes:
         if any(some[0].base in known for some in seen):
@@ -118,7 +267,6 @@ def write(
 def _numbers(
     held: bool, scenes: list[list[PictureReference]], known: dict[str, ExportPart], out: frozenset[str]
 ) -> Iterator[int]:
-    """Yield the scene numbers of one side, as in its splits."""
     count = sum((known[some[0].base].name in out) is held for some in scenes)
     room = [number for numbers in (HELD_OUT if held else TRAIN) for number in numbers]
     if count > len(room):
@@ -139,7 +287,7 @@ def _write_scene(
     kinds = ((path / "depth_gt", "png"), (path / "label_gt", "png"), (path / "meta", "mat"), (values, "npy"))
     for folder, _ in kinds:
         folder.mkdir(parents=True)
-    first = pose_to_matrix(invert(pose_from_matrix(some[0].extrinsics)))
+    first = pose_to_matrix(_camera(some[0]))
     poses = [pose_to_matrix(compose(pose_from_matrix(some[0].extrinsics), _camera(look))) for look in some]
     np.save(path / "cam0_wrt_table.npy", first)
     np.save(path / "camera_poses.npy", np.array([poses[view % len(some)] for view in range(VIEWS)]))
@@ -194,26 +342,17 @@ def _write_grasps(look: PictureReference, lot: ExportPart, folder: Path, graspne
     arrays: dict[str, Any] = {"translation": matrices[:, :3, 3], "rotation": matrices[:, :3, :3], "point": point}
     arrays |= {name: some["grasp"].joint_positions[:, k] for k, name in enumerate(names)}
     # Its loader ignores these arrays; they are needed to import the grasps unchanged.
-    arrays |= {
-        f"{name}_qpos": np.concatenate([placed[name], some[name].joint_positions], axis=1)
-        for name in ("pregrasp", "squeeze")
-    }
+    for name in ("pregrasp", "squeeze"):
+        arrays[f"{name}_qpos"] = np.concatenate([placed[name], some[name].joint_positions], axis=1)
     arrays |= {"success": lot.verdict[look.rows], "row": look.rows}
     folder.mkdir(parents=True)
     np.savez_compressed(folder / f"{lot.name}.npz", **arrays)
 
 
 def read(path: Path, *, hand: str, obj: str, number: int = 0) -> list[ImportedGrasps]:
-    """Read the grasps of one object in one scene, in the object's frame.
+    """Read `dex_grasps_new/SCENE/HAND/OBJECT.npz` in its folder `data` with the scene's `meta`; object frame.
 
-    Args:
-        path: `dex_grasps_new/SCENE/HAND/OBJECT.npz`, in its folder `data` with the scene's `meta`.
-        hand: URDF or built-in hand with their root link and joints.
-        obj: mesh of the object.
-        number: index of the object in the scene, from 0.
-
-    Raises:
-        InputError: the file is of another kind, its scene is missing, or its joints are not the hand's.
+    `number` is the index of the object in the scene, from 0.
     """
     found = load_npz(path)
     try:
@@ -232,23 +371,17 @@ def read(path: Path, *, hand: str, obj: str, number: int = 0) -> list[ImportedGr
     except ValueError as error:
         raise InputError(f"{path} has not one value of each joint for each of {count} grasps: {error}") from None
     grasp = Posture(compose(away, pose_from_matrix(matrices)), joints_by_name(model, names, values, what=str(path)))
-    published = found.get("success")
-    set_ = _with_ours(path, model, found, grasp, away)
-    return [
-        ImportedGrasps(
-            model,
-            thing,
-            completed(model, thing, grasp) if set_ is None else set_,
-            path.stem,
-            published=None if published is None or len(np.ravel(published)) != count else verdicts(published),
-        )
-    ]
+    grasps = _with_ours(path, model, found, grasp, away)
+    if grasps is None:
+        grasps = completed(model, thing, grasp)
+    success = found.get("success")
+    published = None if success is None or np.size(success) != count else verdicts(success)
+    return [ImportedGrasps(model, thing, grasps, path.stem, published=published)]
 
 
 def _with_ours(
     path: Path, hand: HandModel, found: dict[str, NDArray[Any]], grasp: Posture, away: Floats
 ) -> GraspSet | None:
-    """Return the grasps with our extra postures before and after contact; None if there are none."""
     if not {"pregrasp_qpos", "squeeze_qpos"} <= set(found):
         return None
     parts = []
@@ -283,11 +416,7 @@ def _object_pose(path: Path, number: int) -> Floats:
 
 
 def load_npz(path: Path) -> dict[str, NDArray[Any]]:
-    """Load the arrays of a `.npz` file.
-
-    Raises:
-        InputError: the file is missing, contains objects, or unpacks to more than `LARGEST`.
-    """
+    """Load the arrays of a `.npz` file without objects that unpacks to at most `LARGEST`."""
     try:
         with zipfile.ZipFile(path) as archive:
             members = archive.infolist()

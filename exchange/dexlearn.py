@@ -8,13 +8,14 @@ The folder overlays a checkout of DexLearn (Chen et al., baselines of BODex and 
     object/graspd/vision_data/azure_kinect_dk/SCENE_ID/partial_pc_NN.npy    (P, 3) points [m]
 
 Root poses and points share one frame: the table's or, for grasps of a free object, the object's. Roots and joints are
-those of a hand model that DexGraspBench evaluates, see `bench_mapping`.
+those of a hand model that DexGraspBench evaluates, see `bench_hand`.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -22,8 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspd.exchange.bench_hand import COLLECTED, HandMapping
-from graspd.exchange.bench_object import SET, write_object, write_table
-from graspd.exchange.bench_scene import TABLETOP, check_table
+from graspd.exchange.bench_scene import SET, TABLETOP, check_table, save_record, write_object, write_table
 from graspd.exchange.dexgraspbench import POSTURES, experiment, models_of, postures
 from graspd.exchange.plan import ExportPart, ExportSummary, PictureReference, looks, object_points
 from graspd.service.model.errors import InputError
@@ -42,22 +42,7 @@ _FREE: Final = -1
 def write(
     lots: Sequence[ExportPart], pictures: Pictures, folder: Path, out: frozenset[str], noise: DepthNoise | None = None
 ) -> ExportSummary:
-    """Write grasps and the clouds of their cameras.
-
-    Args:
-        lots: grasps, free or on tables.
-        pictures: pictures of their scenes; may be none.
-        folder: laid out like a checkout of DexLearn.
-        out: held-out objects.
-        noise: depth camera whose noise is applied; None: perfect depth.
-
-    Returns:
-        numbers of grasps, scenes, clouds and files.
-
-    Raises:
-        InputError: the folder already exists, or scenes are more than a table.
-        MeshError: an object's convex pieces do not match its shape.
-    """
+    """Write grasps, free or on tables, and the clouds of their cameras."""
     if (folder / SET).exists():
         raise InputError(f"{folder} holds objects of an export already; give another folder as --output")
     for lot in lots:
@@ -71,10 +56,16 @@ def write(
     elif bare:
         done.counts["scenes"] -= bare
         done.notes.append(f"{bare} scenes are seen by no picture; their grasps are left out")
-    for group in _groups(lots):
+    groups: dict[tuple[str, bool], list[ExportPart]] = defaultdict(list)
+    for lot in lots:
+        groups[lot.hand.digest, lot.placed is None].append(lot)
+    for group in groups.values():
         _write_group(group, scenes, folder, out, done, seen=bool(clouds))
     names = {lot.name for lot in lots}
-    _splits(folder / SET / "valid_split", names, out, done)
+    if not out:
+        done.notes.append("one object: train.json and test.json both name it, so the test tells nothing of unseen ones")
+    for split, some in (("train", names - out), ("test", out or names)):
+        (folder / SET / "valid_split" / f"{split}.json").write_text(json.dumps(sorted(some), indent=1) + "\n")
     return done
 
 
@@ -85,10 +76,9 @@ _Part = tuple[ExportPart, Path, int, NDArray[np.intp]]
 
 
 def _scenes(lots: Sequence[ExportPart], folder: Path) -> _Scenes:
-    """Write objects and scenes; scenes of an object are numbered across its shards."""
     scenes: _Scenes = {}
     free: dict[str, Path] = {}
-    count: dict[str, int] = {}
+    count = Counter[str]()
     for lot in lots:
         if lot.name not in free:
             free[lot.name] = write_object(lot.obj, lot.name, folder)[1]
@@ -97,8 +87,8 @@ def _scenes(lots: Sequence[ExportPart], folder: Path) -> _Scenes:
             continue
         poses = np.asarray(lot.placed.object_pose, float)
         for scene in sorted({int(lot.placed.index[row]) for row in lot.rows}):
-            number = count[lot.name] = count.get(lot.name, -1) + 1
-            scenes[lot.id, scene] = write_table(lot.name, poses[scene], number, folder)
+            scenes[lot.id, scene] = write_table(lot.name, poses[scene], count[lot.name], folder)
+            count[lot.name] += 1
     return scenes
 
 
@@ -107,38 +97,26 @@ def _clouds(
 ) -> tuple[int, int]:
     """Write the object's cloud of each picture; return the numbers of clouds and of scenes without one."""
     on_table = {lot.id: lot.placed is not None for lot in lots}
-    written: dict[Path, int] = {}
+    written = Counter[Path]()
     for look in looks(pictures):
         scene = scenes.get((look.base, look.scene if on_table.get(look.base) else _FREE))
         if scene is None or not len(points := points_of(pictures, look, noise, on_table=on_table[look.base])):
             continue
-        number = written[scene] = written.get(scene, -1) + 1
-        place = folder / VISION / _scene_id(scene)
+        place = folder / VISION / scene.relative_to(SET / "scene_cfg").with_suffix("")
         place.mkdir(parents=True, exist_ok=True)
-        np.save(place / f"partial_pc_{number:02}.npy", points.astype(np.float32))
+        np.save(place / f"partial_pc_{written[scene]:02}.npy", points.astype(np.float32))
+        written[scene] += 1
     bare = set(scenes.values()) - set(written)
     for scene in bare if written else ():
         # Its test samples a cloud of every scene in the folder.
         (folder / scene).unlink()
-    return sum(number + 1 for number in written.values()), len(bare)
+    return written.total(), len(bare)
 
 
 def points_of(pictures: Pictures, look: PictureReference, noise: DepthNoise | None, *, on_table: bool) -> Floats:
     """Return (P, 3) object points of a picture, in the table's frame, or the object's without a table [m]."""
     points = object_points(pictures[look.index], look.index, noise)
     return points if on_table else apply(invert(look.object_pose), points)
-
-
-def _scene_id(scene: Path) -> Path:
-    return scene.relative_to(SET / "scene_cfg").with_suffix("")
-
-
-def _groups(lots: Sequence[ExportPart]) -> Iterable[list[ExportPart]]:
-    """Yield lots of one hand that are all free or all on tables: each group is a data set."""
-    groups: dict[tuple[str, bool], list[ExportPart]] = {}
-    for lot in lots:
-        groups.setdefault((lot.hand.digest, lot.placed is None), []).append(lot)
-    return groups.values()
 
 
 def _write_group(
@@ -153,11 +131,10 @@ def _write_group(
     for mapping in models_of(lots[0].hand, folder):
         name = f"{experiment(lots[0].placed)}_{mapping.config}"
         top = folder / "assets" / "grasp" / name
-        top.mkdir(parents=True, exist_ok=True)
         mapping.write(top)
         for lot, scene, kind, rows in parts:
             file = top / COLLECTED / TYPES[kind] / lot.name / scene.parent.name / f"{scene.stem}_{lot.tag}.npy"
-            _save(file, _record(mapping, lot, rows, scene))
+            save_record(file, _record(mapping, lot, rows, scene))
         done.counts["files"] += len(parts)
         _configure(folder, name, lots[0], [TYPES[kind] for kind in listed])
 
@@ -184,9 +161,9 @@ def _in_both(kind: int, parts: Sequence[_Part], out: frozenset[str]) -> bool:
 
 
 def _untyped(parts: Sequence[_Part]) -> Iterator[tuple[ExportPart, Path, NDArray[np.intp]]]:
-    together: dict[tuple[str, Path], list[_Part]] = {}
+    together: dict[tuple[str, Path], list[_Part]] = defaultdict(list)
     for part in parts:
-        together.setdefault((part[0].id, part[1]), []).append(part)
+        together[part[0].id, part[1]].append(part)
     for (_, scene), some in together.items():
         yield some[0][0], scene, np.sort(np.concatenate([part[3] for part in some]))
 
@@ -202,13 +179,7 @@ def _record(mapping: HandMapping, lot: ExportPart, rows: NDArray[np.intp], scene
     return record | {"succ_flag": lot.verdict[rows], "row": np.asarray(rows)}
 
 
-def _save(file: Path, record: dict[str, Any]) -> None:
-    file.parent.mkdir(parents=True, exist_ok=True)
-    np.save(file, np.array(record, dtype=object), allow_pickle=True)
-
-
 def _configure(folder: Path, name: str, lot: ExportPart, types: list[str]) -> None:
-    """Write DexLearn's configuration of the data."""
     values: dict[str, Any] = {
         "num_workers": 8,
         "num_points": POINTS,
@@ -228,10 +199,3 @@ def _configure(folder: Path, name: str, lot: ExportPart, types: list[str]) -> No
     file = folder / "dexlearn" / "config" / "data" / f"{name}.yaml"
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_text("".join(f"{key}: {json.dumps(value)}\n" for key, value in values.items()))
-
-
-def _splits(folder: Path, names: set[str], out: frozenset[str], done: ExportSummary) -> None:
-    if not out:
-        done.notes.append("one object: train.json and test.json both name it, so the test tells nothing of unseen ones")
-    for split, some in (("train", names - out), ("test", out or names)):
-        (folder / f"{split}.json").write_text(json.dumps(sorted(some), indent=1) + "\n")

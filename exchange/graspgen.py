@@ -17,7 +17,7 @@ from __future__ import annotations
 import io
 import json
 import tarfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -57,19 +57,7 @@ _AT_ONCE: Final = 256
 
 
 def write(lots: Sequence[ExportPart], folder: Path, out: frozenset[str]) -> ExportSummary:
-    """Write all validated grasps of each hand, good and bad.
-
-    Args:
-        lots: grasps; their `rows` are the validated ones.
-        folder: output folder; created if missing.
-        out: held-out objects: `valid.txt`.
-
-    Returns:
-        numbers of grasps, of good ones among them, of objects and of tar files.
-
-    Raises:
-        InputError: the folder already contains such files.
-    """
+    """Write all validated grasps of each hand, good and bad; held-out objects are in `valid.txt`."""
     if (folder / "grasps").exists():
         raise InputError(f"{folder} holds grasps already; give another folder as --output")
     done = ExportSummary({"grasps": 0, "good": 0, "objects": 0, "files": 0})
@@ -78,10 +66,9 @@ def write(lots: Sequence[ExportPart], folder: Path, out: frozenset[str]) -> Expo
     for uuid, obj in meshes.items():
         mesh_file(obj, folder / "objects" / f"{uuid}.obj")
     _json(folder / "objects" / "map_uuid_to_path.json", {uuid: f"{uuid}.obj" for uuid in meshes})
-    hands = {lot.hand.digest: lot.hand for lot in lots}
-    for hand in hands.values():
-        some = [lot for lot in lots if lot.hand.digest == hand.digest]
-        _write_hand(hand, some, folder, {uuid_of(lot) for lot in lots if lot.name in out}, done)
+    held = {uuid_of(lot) for lot in lots if lot.name in out}
+    for hand in {lot.hand.digest: lot.hand for lot in lots}.values():
+        _write_hand(hand, [lot for lot in lots if lot.hand.digest == hand.digest], folder, held, done)
     done.counts["objects"] = len(meshes)
     return done
 
@@ -93,10 +80,10 @@ def uuid_of(lot: ExportPart) -> str:
 
 def _write_hand(hand: HandModel, lots: list[ExportPart], folder: Path, out: set[str], done: ExportSummary) -> None:
     name = plain_name(hand.name)
-    records = {uuid: _record(hand, list(some)) for uuid, some in _by_object(lots)}
+    uuids = sorted({uuid_of(lot) for lot in lots})
+    records = {uuid: _record(hand, [lot for lot in lots if uuid_of(lot) == uuid]) for uuid in uuids}
     (folder / "grasps" / name).mkdir(parents=True)
     index: dict[str, int] = {}
-    uuids = sorted(records)
     for number, first in enumerate(range(0, len(uuids), PER_SHARD)):
         with tarfile.open(folder / "grasps" / name / f"shard_{number:03}.tar", "w") as tar:
             for uuid in uuids[first : first + PER_SHARD]:
@@ -113,8 +100,7 @@ def _write_hand(hand: HandModel, lots: list[ExportPart], folder: Path, out: set[
     for split, some in (("train", set(uuids) - out), ("valid", set(uuids) & out if out else set(uuids))):
         (folder / "splits" / name / f"{split}.txt").write_text("".join(f"{uuid}\n" for uuid in sorted(some)))
     (folder / "grippers").mkdir(exist_ok=True)
-    values = convention(hand)
-    text = "".join(f"{key}: {json.dumps(value)}\n" for key, value in values.items())
+    text = "".join(f"{key}: {json.dumps(value)}\n" for key, value in convention(hand).items())
     (folder / "grippers" / f"{name}.yaml").write_text(text)
     good = {uuid: sum(record["grasps"]["object_in_gripper"]) for uuid, record in records.items()}
     done.counts["grasps"] += sum(len(record["grasps"]["transforms"]) for record in records.values())
@@ -123,11 +109,6 @@ def _write_hand(hand: HandModel, lots: list[ExportPart], folder: Path, out: set[
         done.notes.append(
             f"GraspGen's generator leaves out objects with fewer than {FEWEST} good grasps: {few[0]}, say"
         )
-
-
-def _by_object(lots: list[ExportPart]) -> Iterator[tuple[str, list[ExportPart]]]:
-    for uuid in sorted({uuid_of(lot) for lot in lots}):
-        yield uuid, [lot for lot in lots if uuid_of(lot) == uuid]
 
 
 def _record(hand: HandModel, lots: list[ExportPart]) -> dict[str, Any]:
@@ -176,17 +157,7 @@ def convention(hand: HandModel) -> dict[str, Any]:
 
 
 def read(path: Path, *, hand: str, obj: str, object_name: str = "") -> list[ImportedGrasps]:
-    """Read the grasps of one object. If the record has no joints, fingers close until contact.
-
-    Args:
-        path: a record, a tar file of them, or a folder of tar files.
-        hand: URDF or built-in hand: the gripper, whose root link is the base link.
-        obj: mesh of the object at scale 1.
-        object_name: the object's UUID; optional with a single object.
-
-    Raises:
-        InputError: files or object are missing, or the record is too large.
-    """
+    """Read a record, a tar file of records, or a folder of tar files; without joints, fingers close until contact."""
     file, record = _found(path, object_name)
     try:
         scale, grasps = float(record["object"]["scale"]), record["grasps"]
@@ -202,15 +173,13 @@ def read(path: Path, *, hand: str, obj: str, object_name: str = "") -> list[Impo
     if not 0 < scale < np.inf:
         raise InputError(f"{file} has an object of scale {scale:g}")
     model, thing = hand_from_path(hand), scaled_object(obj, scale)
-    set_ = _grasps(file, model, record, pose_from_matrix(matrices))
-    if set_ is None:
-        set_ = completed(model, thing, closed_at(model, thing, pose_from_matrix(matrices)))
+    pose = pose_from_matrix(matrices)
+    made = _grasps(file, model, record, pose) or completed(model, thing, closed_at(model, thing, pose))
     name = object_name or Path(str(record["object"].get("file", ""))).stem or thing.name
-    return [ImportedGrasps(model, thing, set_, name, scale, held.astype(np.int8))]
+    return [ImportedGrasps(model, thing, made, name, scale, held.astype(np.int8))]
 
 
 def _grasps(file: str, hand: HandModel, record: dict[str, Any], pose: Floats) -> GraspSet | None:
-    """Return the grasps with our additional joints; None if there are none."""
     grasps, names = record["grasps"], record.get("gripper", {}).get("joint_names")
     if not names or not all(f"{name}_joints" in grasps for name in POSTURES):
         return None
@@ -225,7 +194,6 @@ def _grasps(file: str, hand: HandModel, record: dict[str, Any], pose: Floats) ->
 
 
 def _found(path: Path, uuid: str) -> tuple[str, dict[str, Any]]:
-    """Return the record of an object, and its name for errors."""
     if path.suffix == ".json":
         with path.open("rb") as stream:
             return str(path), _parsed(str(path), stream.read(LARGEST + 1))

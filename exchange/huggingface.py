@@ -80,18 +80,7 @@ _PICTURES_AT_ONCE: Final = 50
 def write(
     lots: Sequence[ExportPart], pictures: Pictures, folder: Path, out: frozenset[str], noise: DepthNoise | None = None
 ) -> ExportSummary:
-    """Write both tables, of training and of held-out objects.
-
-    Args:
-        lots: grasps.
-        pictures: pictures of their scenes, with colour; may be none.
-        folder: output folder; created if missing.
-        out: held-out objects: split `test`.
-        noise: depth camera whose noise is applied; None: perfect depth.
-
-    Raises:
-        InputError: pyarrow is missing, or the folder already contains such a table.
-    """
+    """Write both tables, of training and of held-out objects (split `test`)."""
     parquet.arrow()
     if (folder / "grasps").exists():
         raise InputError(f"{folder} holds a table of grasps already; give another folder as --output")
@@ -112,7 +101,20 @@ def write(
             groups = _groups(pictures, shown, noise)
             done.counts["pictures"] += parquet.write(file, parquet.schema_of(PICTURES), groups)
             done.counts["files"] += 1
-    (folder / "README.md").write_text(_card([split for split, some in sides.items() if some], seen=bool(len(pictures))))
+    splits = [split for split, some in sides.items() if some]
+    tables = [
+        {
+            "config_name": table,
+            "default": table == "grasps",
+            "data_files": [{"split": split, "path": f"{table}/{split}-*.parquet"} for split in splits],
+        }
+        for table in (["grasps", "pictures"] if len(pictures) else ["grasps"])
+    ]
+    # The head of a data set's card: JSON is YAML.
+    (folder / "README.md").write_text(
+        f"---\nconfigs: {json.dumps(tables)}\n---\n\n# Grasps made with graspd\n\n"
+        "Columns, units and frames: docs/how-to/exchange/huggingface.md of graspd.\n"
+    )
     return done
 
 
@@ -152,10 +154,8 @@ def _grasps(lot: ExportPart) -> list[dict[str, Any]]:
 
 
 def _groups(pictures: Pictures, names: Mapping[str, str], noise: DepthNoise | None) -> Iterator[list[dict[str, Any]]]:
-    """Yield the pictures of some base shards; `names` are those of their objects."""
     group: list[dict[str, Any]] = []
-    for index in range(len(pictures)):
-        sample = pictures[index]
+    for index, sample in enumerate(pictures):
         if sample["base_id"] in names:
             depth = CloudView(sample, noise, np.random.default_rng(index)).seen
             group.append(_picture(sample, names[sample["base_id"]], depth))
@@ -188,41 +188,14 @@ def _picture(sample: Mapping[str, Any], name: str, depth: Floats) -> dict[str, A
 
 
 def png(pixels: NDArray[Any]) -> dict[str, Any]:
-    """Return a picture in the format of Hugging Face's readers."""
+    """Return a picture for Hugging Face's readers."""
     data = io.BytesIO()
     Image.fromarray(np.ascontiguousarray(pixels)).save(data, format="PNG", compress_level=1)
     return {"bytes": data.getvalue(), "path": None}
 
 
-def _card(splits: list[str], *, seen: bool) -> str:
-    """Return the head of the data set's card: JSON is YAML."""
-    tables = [
-        {
-            "config_name": table,
-            "default": table == "grasps",
-            "data_files": [{"split": split, "path": f"{table}/{split}-*.parquet"} for split in splits],
-        }
-        for table in (["grasps", "pictures"] if seen else ["grasps"])
-    ]
-    head = f"---\nconfigs: {json.dumps(tables)}\n---\n\n"
-    return (
-        head
-        + "# Grasps made with graspd\n\nColumns, units and frames: docs/how-to/exchange/huggingface.md of graspd.\n"
-    )
-
-
 def read(path: Path, *, hand: str, obj: str, object_name: str = "") -> list[ImportedGrasps]:
-    """Read the grasps of one object; free grasps and those on tables are separate sets.
-
-    Args:
-        path: a file of grasps, or a folder with `grasps/*.parquet`.
-        hand: URDF or built-in hand; joints are found by name.
-        obj: mesh of the object.
-        object_name: the object's name in the file; optional with a single object.
-
-    Raises:
-        InputError: pyarrow, the file or the object is missing, or a scene is not a table.
-    """
+    """Read a file, or `grasps/*.parquet` of a folder; free grasps and those on tables are separate sets."""
     files = [path] if path.is_file() else sorted((path / "grasps").glob("*.parquet"))
     columns: dict[str, list[Any]] = {}
     for file in files:

@@ -43,13 +43,11 @@ class ImportedGrasps:
     obj: ObjectModel
     grasps: GraspSet
     name: str
-    """Name of the object in the source."""
+    """Name of the object in the source, and scale factor of its mesh there."""
     scale: float = 1.0
-    """Scale factor of the object's mesh in the source."""
     published: NDArray[np.int8] | None = None
     """(N,) success as published: 1, 0, -1 unknown."""
     placed: PlacedGrasps | None = None
-    """Scenes of the grasps, if any."""
 
 
 def completed(hand: HandModel, obj: ObjectModel, grasp: Posture) -> GraspSet:
@@ -63,13 +61,7 @@ def verdicts(values: Sequence[Any] | NDArray[Any]) -> NDArray[np.int8]:
 
 
 def joints_by_name(hand: HandModel, names: Sequence[str], values: Any, *, what: str) -> Floats:
-    """Return (N, J) joint positions in the hand's order from (N, n) values in the order of `names`.
-
-    Joints that the source lacks follow a mimic or stay at their middle.
-
-    Raises:
-        InputError: a name is not a joint of the hand, or the widths differ.
-    """
+    """Return (N, J) joints of the hand from (N, n) values of `names`; others follow a mimic or stay at their middle."""
     given = np.atleast_2d(np.asarray(values, float))
     if given.shape[1] != len(names):
         raise InputError(f"{what}: {given.shape[1]} joint values for {len(names)} joints")
@@ -85,13 +77,7 @@ def joints_by_name(hand: HandModel, names: Sequence[str], values: Any, *, what: 
 
 
 def scaled_object(path: str | Path, scale: float = 1.0) -> ObjectModel:
-    """Load a mesh or built-in object, its size multiplied by `scale`.
-
-    Sources with scales use the numbers of the file, so no unit is guessed.
-
-    Raises:
-        NotFoundError, MeshError: see `object_from_path`.
-    """
+    """Load a mesh or built-in object times `scale`; sources with scales use the file's numbers: no unit is guessed."""
     if scale == 1.0:
         return object_from_path(path)
     plain = object_from_path(path, options={"units": "m"})
@@ -111,6 +97,15 @@ def write_obj(path: Path, vertices: Any, faces: Any, comment: str = "metres") ->
     lines += [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in faces]
     path.write_text("\n".join(lines) + "\n")
     return path
+
+
+def urdf_of(name: str, link: str, meshes: Sequence[str]) -> str:
+    """Return the URDF of one link made of meshes."""
+    lines = [f'<robot name="{name}">', f'  <link name="{link}">']
+    for mesh in meshes:
+        geometry = f'<geometry><mesh filename="{mesh}"/></geometry>'
+        lines += [f"    <visual>{geometry}</visual>", f"    <collision>{geometry}</collision>"]
+    return "\n".join([*lines, "  </link>", "</robot>", ""])
 
 
 _HARMLESS: Final = {
@@ -133,11 +128,7 @@ class _Reader(pickle.Unpickler):
 
 
 def load_npy(path: Path) -> Any:
-    """Load a `.npy` file: an array, or the one object in it.
-
-    Raises:
-        InputError: it is no NumPy file, or it would run code.
-    """
+    """Load a `.npy` file: an array, or the one object in it; InputError if it would run code."""
     try:
         with path.open("rb") as file:
             if (array := _plain(file)) is not None:

@@ -13,7 +13,7 @@ from graspd.exchange import dexgraspbench, published
 from graspd.service.model.errors import InputError, NotFoundError
 from graspd.service.store.shards import kind_of, open_shard, read_shard
 from graspd.worker.files.provenance import hand_of_shard, object_of_shard, placed_of_shard
-from graspd.worker.grasps import GraspSet, Posture
+from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.simulation.environment import PlacedGrasps
@@ -39,7 +39,6 @@ class Case:
     published: NDArray[np.int8] | None = None
     """(N,) success as published: 1, 0, -1 unknown."""
     placed: PlacedGrasps | None = None
-    """Scenes in which the grasps were planned, if any."""
 
     @property
     def centred(self) -> Case:
@@ -53,14 +52,9 @@ class Case:
 
 
 def expand(path: Path) -> list[Path]:
-    """Return a path itself, or the base shards and reference grasps of a folder without `.npy` files.
-
-    Raises:
-        InputError: a folder without any grasps.
-    """
+    """Return a path itself, or the base shards and reference grasps of a folder without `.npy` files."""
     if not path.is_dir() or any(path.rglob("*.npy")):
         return [path]
-    # Shards have JSON files with metadata beside them: snapshot.json, subset.json, card.json.
     shards = (file for file in path.rglob("*.h5") if not _of_scenes(file))
     found = sorted([*shards, *(file for file in path.rglob("*.json") if file.name not in BESIDE_SHARDS)])
     if not found:
@@ -75,29 +69,27 @@ def _of_scenes(path: Path) -> bool:
 
 
 def load_case(path: Path, *, hand: str | None = None, obj: str | None = None) -> Case:
-    """Read a file or folder of grasps.
+    """Read a base shard (HDF5), a reference-grasps JSON, or a folder with DexGraspBench `.npy` files.
 
-    Args:
-        path: a base shard (HDF5), a reference-grasps JSON, or a folder with DexGraspBench `.npy` files.
-        hand: URDF or built-in hand; overrides the file's.
-        obj: mesh or built-in object; overrides the file's.
-
-    Raises:
-        NotFoundError: the file is missing.
-        InputError: the format is unknown, or it does not fit the hand.
+    `hand` (URDF or built-in) and `obj` (mesh or built-in) override those of the file.
     """
     if path.is_dir():
         return _bench_folder(path, hand, obj)
     if not path.is_file():
         raise NotFoundError(f"{path} does not exist")
-    return _reference(path, hand, obj) if path.suffix == ".json" else _shard(path, hand, obj)
+    if path.suffix != ".json":
+        return _shard(path, hand, obj)
+    (found,) = published.read_reference(path, hand=hand, obj=obj)
+    friction = published.friction(path)
+    return Case(path.name, found.hand, found.obj, found.grasps, friction=friction, published=found.published)
 
 
 def _shard(path: Path, hand: str | None, obj: str | None) -> Case:
     shard = read_shard(path, kind="base")
     model, thing = hand_of_shard(shard, hand), object_of_shard(shard, obj)
     grasps = GraspSet.from_columns(shard.arrays)
-    _check_joints(path, model, grasps.grasp)
+    if (joints := grasps.grasp.joint_positions.shape[1]) != len(model.joint_names):
+        raise InputError(f"{path} has {joints} joints, {model.name} {len(model.joint_names)}; give --hand")
     said = shard.attributes
     return Case(
         path.name,
@@ -111,13 +103,6 @@ def _shard(path: Path, hand: str | None, obj: str | None) -> Case:
     )
 
 
-def _reference(path: Path, hand: str | None, obj: str | None) -> Case:
-    (found,) = published.read_reference(path, hand=hand, obj=obj)
-    return Case(
-        path.name, found.hand, found.obj, found.grasps, friction=published.friction(path), published=found.published
-    )
-
-
 def _bench_folder(path: Path, hand: str | None, obj: str | None) -> Case:
     if hand is None or obj is None:
         raise InputError("a DexGraspBench folder does not hold the hand and the object; name both: --hand and --object")
@@ -127,10 +112,3 @@ def _bench_folder(path: Path, hand: str | None, obj: str | None) -> Case:
         raise InputError(f"{path} holds {len(sets)} kinds of grasps ({kinds}); give the folder of one")
     found = sets[0]
     return Case(path.name, found.hand, found.obj, found.grasps, published=found.published, placed=found.placed)
-
-
-def _check_joints(path: Path, hand: HandModel, grasp: Posture) -> None:
-    if grasp.joint_positions.shape[1] != len(hand.joint_names):
-        raise InputError(
-            f"{path} has {grasp.joint_positions.shape[1]} joints, {hand.name} {len(hand.joint_names)}; give --hand"
-        )

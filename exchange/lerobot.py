@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from graspd.exchange.bench_scene import placed_of
 from graspd.exchange.huggingface import png
 from graspd.exchange.imported import ImportedGrasps, joints_by_name, scaled_object, verdicts
-from graspd.exchange.plan import ExportPart, ExportSummary, PictureReference, by_scene, looks
+from graspd.exchange.plan import ExportPart, ExportSummary, PictureReference, by_scene
 from graspd.service import parquet
 from graspd.service.model.base import why
 from graspd.service.model.errors import InputError
@@ -37,12 +37,8 @@ from graspd.worker.hands.load import hand_from_path
 
 VERSION: Final = "v3.0"
 FPS: Final = 10
-STATE, ACTION, OBJECT, PICTURE = (
-    "observation.state",
-    "action",
-    "observation.environment_state",
-    "observation.images.scene",
-)
+STATE, ACTION = "observation.state", "action"
+OBJECT, PICTURE = "observation.environment_state", "observation.images.scene"
 EPISODE: Final = "episode_index"
 #: Additional columns in the list of episodes.
 VERDICT: Final = "graspd/verdict"
@@ -71,18 +67,7 @@ _INDEXED: Final = {
 
 
 def write(lots: Sequence[ExportPart], pictures: Pictures, folder: Path, out: frozenset[str]) -> ExportSummary:
-    """Write an episode for each grasp whose scene has a picture; several pictures are used in turn.
-
-    Args:
-        lots: grasps planned in scenes, of one hand.
-        pictures: pictures of the scenes, with colour.
-        folder: the data set; created if missing.
-        out: held-out objects: their episodes come last, split `test`.
-
-    Raises:
-        InputError: pyarrow is missing, the data set exists, grasps are of several hands or of free objects, or
-            pictures are missing or differ in size.
-    """
+    """Write an episode for each grasp whose scene has a picture (several in turn); held-out objects come last."""
     parquet.arrow()
     if (folder / "meta").exists():
         raise InputError(f"{folder} holds a data set already; give another folder as --output")
@@ -91,7 +76,7 @@ def write(lots: Sequence[ExportPart], pictures: Pictures, folder: Path, out: fro
     ways = [lot for lot in sorted(lots, key=lambda lot: lot.name in out) if lot.placed is not None]
     if not ways:
         raise InputError("grasps of free objects have no way to their object; plan them in a scene: --scene table")
-    seen = {(some[0].base, some[0].scene): some for some in by_scene(list(looks(pictures))).values()}
+    seen = {(some[0].base, some[0].scene): some for some in by_scene(pictures)}
     episodes = [(lot, row, look) for lot in ways for row, look in _seen(lot, seen)]
     if not episodes:
         raise InputError("no picture shows the scene of a grasp; put views beside the grasps: graspd render")
@@ -109,7 +94,6 @@ def write(lots: Sequence[ExportPart], pictures: Pictures, folder: Path, out: fro
 def _seen(
     lot: ExportPart, seen: Mapping[tuple[str, int], list[PictureReference]]
 ) -> Iterator[tuple[int, PictureReference]]:
-    """Yield the lot's rows with a picture of their scene."""
     assert lot.placed is not None
     for k, row in enumerate(lot.rows.tolist()):
         if found := seen.get((lot.id, int(lot.placed.index[row]))):
@@ -125,8 +109,6 @@ def postures_of(lot: ExportPart, row: int) -> Floats:
 
 
 class _Writer:
-    """Files of frames, and metadata of all of them."""
-
     def __init__(self, folder: Path, lot: ExportPart, pictures: Pictures, tasks: dict[str, int]) -> None:
         self.folder, self.hand, self.pictures, self.tasks = folder, lot.hand, pictures, tasks
         self.frames, self.episodes = 0, list[dict[str, Any]]()
@@ -137,20 +119,12 @@ class _Writer:
         """Write a file, each episode as a row group."""
         number = len(self.episodes) // _EPISODES
         width = 7 + len(self.hand.joint_names)
-        columns = {
-            STATE: f"float32[{width}]",
-            ACTION: f"float32[{width}]",
-            OBJECT: "float32[7]",
-            PICTURE: parquet.IMAGE,
-        }
-        place = {"data/chunk_index": number // _FILES, "data/file_index": number % _FILES}
-        path = (
-            self.folder
-            / "data"
-            / f"chunk-{place['data/chunk_index']:03}"
-            / f"file-{place['data/file_index']:03}.parquet"
-        )
-        parquet.write(path, parquet.schema_of(columns | NUMBERS), (self._episode(*one, place) for one in episodes))
+        moving = {STATE: f"float32[{width}]", ACTION: f"float32[{width}]"}
+        columns = {**moving, OBJECT: "float32[7]", PICTURE: parquet.IMAGE, **NUMBERS}
+        chunk, file = divmod(number, _FILES)
+        place = {"data/chunk_index": chunk, "data/file_index": file}
+        path = self.folder / "data" / f"chunk-{chunk:03}" / f"file-{file:03}.parquet"
+        parquet.write(path, parquet.schema_of(columns), (self._episode(*one, place) for one in episodes))
 
     def _episode(
         self, lot: ExportPart, row: int, look: PictureReference, place: Mapping[str, int]
@@ -169,7 +143,11 @@ class _Writer:
             "index": self.frames + np.arange(count),
             "task_index": np.full(count, self.tasks[lot.name]),
         }
-        self._keep({STATE: way[:-1], ACTION: way[1:], OBJECT: np.tile(rest, (count, 1)), **numbers}, colour)
+        values = {STATE: way[:-1], ACTION: way[1:], OBJECT: np.tile(rest, (count, 1)), **numbers}
+        for name, some in values.items():
+            self._values.setdefault(name, []).append(some.reshape(len(some), -1))
+        # A tenth of the pixels is enough for statistics of colours.
+        self._values.setdefault(PICTURE, []).append(colour.reshape(-1, colour.shape[-1])[::10] / 255)
         self.episodes.append(
             {
                 EPISODE: number,
@@ -186,25 +164,14 @@ class _Writer:
             }
         )
         self.frames += count
-        return [
-            {
-                STATE: way[k].tolist(),
-                ACTION: way[k + 1].tolist(),
-                OBJECT: rest.tolist(),
-                PICTURE: picture,
-                **{name: values[k].item() for name, values in numbers.items()},
-            }
-            for k in range(count)
-        ]
-
-    def _keep(self, values: Mapping[str, NDArray[Any]], colour: NDArray[Any]) -> None:
-        for name, some in values.items():
-            self._values.setdefault(name, []).append(some.reshape(len(some), -1))
-        # A tenth of the pixels is enough for statistics of colours.
-        self._values.setdefault(PICTURE, []).append(colour.reshape(-1, colour.shape[-1])[::10] / 255)
+        still = {OBJECT: rest.tolist(), PICTURE: picture}
+        rows = []
+        for k in range(count):
+            moving = {STATE: way[k].tolist(), ACTION: way[k + 1].tolist()}
+            rows.append(moving | still | {name: values[k].item() for name, values in numbers.items()})
+        return rows
 
     def meta(self, train: int) -> None:
-        """Write the metadata: the first `train` episodes are for training."""
         meta, total = self.folder / "meta", len(self.episodes)
         meta.mkdir(parents=True)
         splits = {"train": f"0:{train}"} | ({"test": f"{train}:{total}"} if train < total else {})
@@ -249,7 +216,6 @@ class _Writer:
 
 
 def task_of(name: str) -> str:
-    """Return the text of an episode's task."""
     return f"lift the {name}"
 
 
@@ -274,17 +240,7 @@ _LARGEST = 2**22
 
 
 def read(path: Path, *, hand: str, obj: str, object_name: str = "") -> list[ImportedGrasps]:
-    """Read the grasps on one object, on tables, with trajectories if all have equal numbers of waypoints.
-
-    Args:
-        path: the data set.
-        hand: URDF or built-in hand; joints are found by name.
-        obj: mesh of the object.
-        object_name: its name in the tasks; optional with a single task.
-
-    Raises:
-        InputError: pyarrow, data set or object is missing, or the data set is not from graspd.
-    """
+    """Read the grasps on one object, on tables, with trajectories if all have equal numbers of waypoints."""
     names = _names(path)
     task = _task(path, object_name)
     ways, rest, numbers = _ways(path, task)
@@ -310,7 +266,6 @@ def read(path: Path, *, hand: str, obj: str, object_name: str = "") -> list[Impo
 
 
 def _names(path: Path) -> list[str]:
-    """Return the joints of the states, in order."""
     file = path / "meta" / "info.json"
     try:
         with file.open("rb") as stream:
@@ -334,9 +289,7 @@ def _task(path: Path, object_name: str) -> int:
 
 def _ways(path: Path, task: int) -> tuple[list[Floats], Floats, list[int]]:
     """Return all postures (W, 7 + J) of a task's episodes, the object's poses, and the episodes' numbers."""
-    ways: list[Floats] = []
-    rest: list[Floats] = []
-    numbers: list[int] = []
+    ways, rest, numbers = list[Floats](), list[Floats](), list[int]()
     wanted = (STATE, ACTION, OBJECT, EPISODE, "frame_index", "task_index")
     for file in sorted((path / "data").glob("*/*.parquet")):
         found: dict[str, Any] = parquet.read(file, wanted)
@@ -357,7 +310,6 @@ def _ways(path: Path, task: int) -> tuple[list[Floats], Floats, list[int]]:
 
 
 def _verdicts(path: Path, episodes: list[int]) -> NDArray[np.int8] | None:
-    """Return (N,) verdicts of the list of episodes."""
     found: dict[Any, Any] = {}
     for file in sorted((path / "meta" / "episodes").glob("*/*.parquet")):
         columns = parquet.read(file, (EPISODE, VERDICT))

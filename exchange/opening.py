@@ -19,11 +19,7 @@ from graspd.service.parquet import arrow
 
 @contextmanager
 def opened(folder: Path) -> Iterator[None]:
-    """Open all files that are written into a folder within this context, regardless of their names.
-
-    Raises:
-        GraspdError: a library of the target cannot read a file.
-    """
+    """Open all files that are written into a folder within this context; GraspdError if a library cannot read one."""
     before = _stamps(folder)
     yield
     for path, stamp in sorted(_stamps(folder).items()):
@@ -81,20 +77,11 @@ def _rows(path: Path) -> None:
             raise ValueError("its rows have different lengths")
 
 
-def _arrays(path: Path) -> None:
-    # Our own file, just written: DexGraspBench's are pickled dictionaries.
-    np.load(path, allow_pickle=True)
-
-
 def _hdf5(path: Path) -> None:
     import h5py
 
     with h5py.File(path) as file:
         file.visititems(lambda _, item: item[()] if isinstance(item, h5py.Dataset) else None)
-
-
-def _table(path: Path) -> None:
-    arrow().parquet.ParquetFile(path).read_row_group(0)
 
 
 def _tar(path: Path) -> None:
@@ -128,10 +115,11 @@ READERS: Final[dict[str, tuple[str, Callable[[Path], Any]]]] = {
     ".json": ("json", lambda path: json.loads(path.read_bytes())),
     ".jsonl": ("json", lambda path: [json.loads(line) for line in path.read_text().splitlines()]),
     ".csv": ("csv", _rows),
-    ".npy": ("NumPy", _arrays),
-    ".npz": ("NumPy", _arrays),
+    # Our own files, just written: DexGraspBench's are pickled dictionaries.
+    ".npy": ("NumPy", lambda path: np.load(path, allow_pickle=True)),
+    ".npz": ("NumPy", np.load),
     ".h5": ("h5py", _hdf5),
-    ".parquet": ("pyarrow", _table),
+    ".parquet": ("pyarrow", lambda path: arrow().parquet.ParquetFile(path).read_row_group(0)),
     ".tar": ("tarfile", _tar),
     ".png": ("Pillow", _picture),
     ".exr": ("OpenEXR", _depth),

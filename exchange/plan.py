@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import re
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import chain, count
 from typing import Any, Final
 
 import numpy as np
@@ -27,14 +29,12 @@ class ExportPart:
     """Exported grasps of one base shard."""
 
     id: str
-    """Id of the shard."""
     name: str
     """Name of the object, fit for files; a repeated name gets a part of the later object's digest."""
     hand: HandModel
     obj: ObjectModel
     grasps: GraspSet
     rows: NDArray[np.intp]
-    """Exported rows."""
     verdict: NDArray[np.int8]
     """(N,) verdicts: 1 held, 0 dropped, -1 not validated."""
     shard: Shard
@@ -47,17 +47,9 @@ class ExportPart:
 
 
 def held_out(kinds: Mapping[str, str], share: float) -> frozenset[str]:
-    """Return the held-out objects: `share` of them, at least one and not all, by the order of a hash.
-
-    Args:
-        kinds: kind of each object by name, see `exchange.training_export`. A kind is never split.
-
-    Returns:
-        their names; none if there is a single kind.
-    """
+    """Return the objects of `share` of the kinds, by the order of a hash: not none, not all, none of a single one."""
     order = sorted(set(kinds.values()), key=lambda kind: hashlib.sha256(kind.encode()).digest())
-    count = min(max(1, round(share * len(order))), len(order) - 1)
-    chosen = set(order[:count])
+    chosen = order[: min(max(1, round(share * len(order))), len(order) - 1)]
     return frozenset(name for name, kind in kinds.items() if kind in chosen)
 
 
@@ -102,12 +94,12 @@ def object_points(sample: Mapping[str, Any], index: int, noise: DepthNoise | Non
     return view.points(*view.pixels(whole=False))
 
 
-def by_scene(found: Sequence[PictureReference]) -> dict[tuple[str, int], list[PictureReference]]:
+def by_scene(pictures: Pictures) -> list[list[PictureReference]]:
     """Group pictures by views shard and scene, in order."""
-    scenes: dict[tuple[str, int], list[PictureReference]] = {}
-    for look in found:
-        scenes.setdefault((look.shard, look.scene), []).append(look)
-    return scenes
+    scenes: dict[tuple[str, int], list[PictureReference]] = defaultdict(list)
+    for look in looks(pictures):
+        scenes[look.shard, look.scene].append(look)
+    return list(scenes.values())
 
 
 @dataclass
@@ -134,8 +126,6 @@ def prim_names(names: Sequence[str]) -> list[str]:
     """Return names of prims with one parent; repeated ones are numbered."""
     found: list[str] = []
     for name in map(prim_name, names):
-        number = 1
-        while (one := name if number == 1 else f"{name}_{number}") in found:
-            number += 1
-        found.append(one)
+        numbered = chain([name], (f"{name}_{number}" for number in count(2)))
+        found.append(next(one for one in numbered if one not in found))
     return found

@@ -29,12 +29,11 @@ from typing import Any, Final
 import numpy as np
 from pydantic_core import from_json
 
-from graspd.exchange.imported import ImportedGrasps, completed, joints_by_name, load_npy, scaled_object
+from graspd.exchange.imported import ImportedGrasps, completed, joints_by_name, load_npy, scaled_object, verdicts
 from graspd.service.model.base import why
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import (
     Floats,
-    compose,
     pose_from_matrix,
     quat_from_axis_angle,
     quat_from_matrix,
@@ -53,16 +52,9 @@ ROLES: Final = tuple(
 
 
 def read_ddgc(path: Path, *, hand: str, obj: str, number: int = 0) -> list[ImportedGrasps]:
-    """Read the grasps of one object of a scene.
+    """Read `barrett_translation_K.npy`, with `barrett_representation_K.npy` beside it: object `number` of the scene.
 
-    Args:
-        path: `barrett_translation_K.npy`; its `barrett_representation_K.npy` is in the same folder.
-        hand: URDF or built-in Barrett hand whose joints name finger (1, 2, 3) and phalanx (spread or prox, med, dist).
-        obj: mesh of the object.
-        number: index of the object in the scene.
-
-    Raises:
-        InputError: the files are invalid, or the scene lacks the object.
+    Joints of the Barrett hand name finger (1, 2, 3) and phalanx (spread or prox, med, dist).
     """
     beside = path.with_name(path.name.replace("translation", "representation"))
     if beside == path or not beside.is_file():
@@ -75,12 +67,12 @@ def read_ddgc(path: Path, *, hand: str, obj: str, number: int = 0) -> list[Impor
         raise InputError(f"{path}: object {number} has grasps of shape {place.shape} and joints of {values.shape}")
     model, thing = hand_from_path(hand), scaled_object(obj)
     pose = np.concatenate([place[:, :3], place[:, 6:], place[:, 3:6]], axis=1)
-    grasp = Posture(pose, joints_by_name(model, _names(model), values * _signs(model), what=str(path)))
+    names = _names(model)
+    grasp = Posture(pose, joints_by_name(model, names, values * _signs(model, names), what=str(path)))
     return [ImportedGrasps(model, thing, completed(model, thing, grasp), thing.name)]
 
 
 def _names(hand: HandModel) -> list[str]:
-    """Return the hand's joint for each role."""
     names = []
     for role in ROLES:
         found = [name for name in hand.joint_names if re.search(role, name)]
@@ -90,15 +82,11 @@ def _names(hand: HandModel) -> list[str]:
     return names
 
 
-def _signs(hand: HandModel) -> np.ndarray:
+def _signs(hand: HandModel, names: list[str]) -> Floats:
     """Return signs: -1 where the hand's joint closes towards negative angles."""
-    high, low = hand.expand(hand.upper[None])[0], hand.expand(hand.lower[None])[0]
-    return np.array(
-        [
-            1.0 if max(high[k], low[k]) > -min(high[k], low[k]) else -1.0
-            for k in (hand.joint_names.index(name) for name in _names(hand))
-        ]
-    )
+    order = [hand.joint_names.index(name) for name in names]
+    ends = np.array([hand.expand(limit[None])[0][order] for limit in (hand.lower, hand.upper)])
+    return np.where(ends.max(axis=0) > -ends.min(axis=0), 1.0, -1.0)
 
 
 _TRANSLATION: Final = ("WRJTx", "WRJTy", "WRJTz")
@@ -106,19 +94,8 @@ _ROTATION: Final = ("WRJRx", "WRJRy", "WRJRz")
 _MUJOCO: Final = "robot0:"
 
 
-def read_dexgraspnet(path: Path, *, hand: str, obj: str, root_offset: np.ndarray | None = None) -> list[ImportedGrasps]:
-    """Read the grasps of one object, one set for each scale.
-
-    Args:
-        path: the object's `.npy`.
-        hand: URDF or built-in hand.
-        obj: the object's mesh at scale 1.
-        root_offset: (7,) pose of the hand's root link in the frame that the source uses as root; identity by
-            default.
-
-    Raises:
-        InputError: the file is invalid, or its joints are not the hand's.
-    """
+def read_dexgraspnet(path: Path, *, hand: str, obj: str) -> list[ImportedGrasps]:
+    """Read the `.npy` of an object: one set for each scale."""
     found = load_npy(path)
     rows = list(found) if isinstance(found, list | np.ndarray) else []
     if not rows or not all(isinstance(row, dict) and "qpos" in row for row in rows):
@@ -130,12 +107,12 @@ def read_dexgraspnet(path: Path, *, hand: str, obj: str, root_offset: np.ndarray
     sets = []
     for scale, some in sorted(by_scale.items()):
         thing = scaled_object(obj, scale)
-        grasps = completed(model, thing, _grasp(path, model, some, root_offset))
+        grasps = completed(model, thing, _grasp(path, model, some))
         sets.append(ImportedGrasps(model, thing, grasps, path.stem, scale))
     return sets
 
 
-def _grasp(path: Path, hand: HandModel, rows: list[dict[str, Any]], root_offset: Any) -> Posture:
+def _grasp(path: Path, hand: HandModel, rows: list[dict[str, Any]]) -> Posture:
     try:
         place = np.array([[row["qpos"][name] for name in _TRANSLATION] for row in rows], float)
         angles = np.array([[row["qpos"][name] for name in _ROTATION] for row in rows], float)
@@ -145,8 +122,6 @@ def _grasp(path: Path, hand: HandModel, rows: list[dict[str, Any]], root_offset:
         raise InputError(f"{path}: a grasp has no {error}") from None
     turns = [quat_from_axis_angle(axis, angles[:, k]) for k, axis in enumerate(np.eye(3))]
     pose = np.concatenate([place, quat_multiply(turns[2], quat_multiply(turns[1], turns[0]))], axis=1)
-    if root_offset is not None:
-        pose = compose(pose, np.asarray(root_offset, float))
     return Posture(pose, joints_by_name(hand, [_urdf_name(name, hand) for name in names], values, what=str(path)))
 
 
@@ -160,17 +135,9 @@ def _urdf_name(name: str, hand: HandModel) -> str:
 
 
 def read_multidex(path: Path, *, hand: str, obj: str, robot: str, object_name: str) -> list[ImportedGrasps]:
-    """Read the grasps of one robot on one object.
+    """Read the grasps of one robot (`allegro`) on one object (`contactdb+mug`) in `cmap_dataset.pt`.
 
-    Args:
-        path: `cmap_dataset.pt`. torch loads tensors and plain values only.
-        hand: URDF or built-in hand: the robot.
-        obj: mesh of the object.
-        robot: the robot's name in the file, such as `allegro`.
-        object_name: the object's name in the file, such as `contactdb+mug`.
-
-    Raises:
-        InputError: torch is missing, or the file is invalid or lacks that robot and object.
+    torch loads tensors and plain values only.
     """
     rows = [row for row in _metadata(path) if len(row) >= 3 and row[-1] == robot and row[-2] == object_name]
     if not rows:
@@ -219,11 +186,7 @@ def _metadata(path: Path) -> list[Any]:
 
 
 def read_reference(path: Path, *, hand: str | None = None, obj: str | None = None) -> list[ImportedGrasps]:
-    """Read the grasps of one file; hand and object default to those that the file names.
-
-    Raises:
-        InputError: the file is invalid.
-    """
+    """Read the grasps of one file; hand and object default to those that the file names."""
     stored = _stored(path)
     try:
         rows = stored["grasps"]
@@ -236,7 +199,7 @@ def read_reference(path: Path, *, hand: str | None = None, obj: str | None = Non
         joints = joints_by_name(model, stored["hand"]["joint_names"], values, what=str(path))
     except (KeyError, IndexError, TypeError, ValueError) as error:
         raise InputError(f"{path} is no file of reference grasps: {error!r}") from None
-    published = np.array([_flag(row.get("pick_success_published")) for row in rows], np.int8)
+    published = verdicts([row.get("pick_success_published") for row in rows])
     grasps = completed(model, thing, Posture(pose, joints))
     return [ImportedGrasps(model, thing, grasps, str(stored["object"]), published=published)]
 
@@ -255,7 +218,3 @@ def _stored(path: Path) -> dict[str, Any]:
     if not isinstance(found, dict):
         raise InputError(f"{path} is no file of reference grasps: it holds no object")
     return found
-
-
-def _flag(value: object) -> int:
-    return -1 if value is None else int(bool(value))

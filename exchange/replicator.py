@@ -21,27 +21,15 @@ from graspd.service.store.shards import Shard
 from graspd.worker.rendering.annotate import BACKGROUND, OBJECT, TABLE
 from graspd.worker.rendering.export import export_images
 
-_BOX_2D: Final = np.dtype(
-    [
-        ("semanticId", "<u4"),
-        ("x_min", "<i4"),
-        ("y_min", "<i4"),
-        ("x_max", "<i4"),
-        ("y_max", "<i4"),
-        ("occlusionRatio", "<f4"),
-    ]
-)
+_ID: Final = ("semanticId", "<u4")
+_OCCLUSION: Final = ("occlusionRatio", "<f4")
+_BOX_2D: Final = np.dtype([_ID, *((f"{axis}_{end}", "<i4") for end in ("min", "max") for axis in "xy"), _OCCLUSION])
 _BOX_3D: Final = np.dtype(
     [
-        ("semanticId", "<u4"),
-        ("x_min", "<f4"),
-        ("y_min", "<f4"),
-        ("z_min", "<f4"),
-        ("x_max", "<f4"),
-        ("y_max", "<f4"),
-        ("z_max", "<f4"),
+        _ID,
+        *((f"{axis}_{end}", "<f4") for end in ("min", "max") for axis in "xyz"),
         ("transform", "<f4", (4, 4)),
-        ("occlusionRatio", "<f4"),
+        _OCCLUSION,
     ]
 )
 #: Width of the sensor for the focal length, USD's default [mm].
@@ -52,14 +40,7 @@ _FLIP: Final = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def write(views: Shard, folder: Path) -> list[Path]:
-    """Write every picture of a views shard with its annotations.
-
-    Returns:
-        the files.
-
-    Raises:
-        InputError: the folder is not writable, or already contains such files.
-    """
+    """Write every picture of a views shard with its annotations; return the files."""
     written = export_images(views, folder, depth="exr")
     name = str(views.attributes.get("object", "object"))
     for view in range(len(views["camera/eye"])):
@@ -68,14 +49,10 @@ def write(views: Shard, folder: Path) -> list[Path]:
 
 
 def box_3d(corners: Floats, extrinsics: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return the corners of an object-aligned box in its own frame, and its frame in the world.
+    """Return corners (3,), (3,) of an object-aligned box in its own centred frame, and that frame in the world.
 
-    Args:
-        corners: (8, 3) in the camera frame; corner k takes the maximum of x, y, z where bit 0, 1, 2 of k is set.
-        extrinsics: (4, 4) world to camera.
-
-    Returns:
-        (3,), (3,), and (4, 4) acting on row vectors; the box's frame is centred in it.
+    The frame (4, 4) acts on row vectors. Of the corners (8, 3) in the camera frame, corner k takes the maximum of
+    x, y, z where bit 0, 1, 2 of k is set.
     """
     world = (corners - extrinsics[:3, 3]) @ extrinsics[:3, :3]
     edges = np.stack([world[1 << axis] - world[0] for axis in range(3)])

@@ -4,21 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from graspd.exchange.inputs import load_case
 from graspd.exchange.plan import ExportSummary
-from graspd.exchange.robots.arm import Description, describe, read_arm
 from graspd.exchange.robots.bundle import Bundle, Carrier
 from graspd.exchange.robots.execution import (
     ASSUMED_M_S,
     ASSUMED_RAD_S,
     Executions,
     Limits,
-    RobotTrajectory,
     executions,
     hand_limits,
     parse_pose,
@@ -26,19 +24,14 @@ from graspd.exchange.robots.execution import (
     timed,
     tool_frame,
 )
-from graspd.exchange.robots.reach import ReachSearch
-from graspd.service.model.errors import InputError, one_of
+from graspd.exchange.robots.reach import Description, ReachSearch, describe, read_arm
+from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import IDENTITY_POSE
 from graspd.service.store.shards import Shard, read_shard
-from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
 from graspd.worker.files.provenance import hand_files_of_shard
 from graspd.worker.files.subsets import choose
 from graspd.worker.rendering.sheets import best as best_of
 from graspd.worker.validation.decomposition import decompose
-
-FORMATS: Final = ("mujoco", "usd", "glb", "moveit", "isaac", "csv")
-#: Other names of formats.
-ALIASES: Final = {"urdf+yaml": "moveit"}
 
 
 @dataclass(frozen=True)
@@ -61,21 +54,14 @@ class RobotExportOptions:
     mount_pose: str | None = None
 
 
-def export_grasps(
-    source: Path, format_: str, wishes: RobotExportOptions, folder: Path, run: ExecutionContext = DEFAULT_CONTEXT
-) -> ExportSummary:
-    """Write grasps of a base shard in the format of a robot or its simulator.
-
-    Raises:
-        InputError: the format is unknown, no grasps match or can be reached, a tool frame or mount is invalid, or
-            an extra package is missing.
-    """
-    format_ = ALIASES.get(format_, format_)
-    if format_ not in FORMATS:
-        raise InputError(f"there is no robot format {format_!r}; choose one of {one_of(format_, FORMATS)}")
+def export_grasps(source: Path, format_: str, wishes: RobotExportOptions, folder: Path) -> ExportSummary:
+    """Write grasps of a base shard in the format of a robot or its simulator."""
     if not 0 < wishes.speed <= 1:
         raise InputError(f"--speed is {wishes.speed:g}; give a share of the velocity limits above 0 and at most 1")
-    _check_arm(wishes)
+    if wishes.arm is None and (wishes.mount or wishes.base or wishes.mount_pose):
+        raise InputError("--mount, --mount-pose and --base go with an arm; name its file: --arm ARM.urdf")
+    if wishes.arm is not None and not wishes.mount:
+        raise InputError("an arm needs the link that the hand is mounted on: --mount LINK")
     shard = read_shard(source, kind="base")
     files = hand_files_of_shard(shard, wishes.hand)
     description = describe(files.files, files.options)
@@ -85,40 +71,27 @@ def export_grasps(
     written.notes += _assumptions(limits)
     if wishes.arm is None:
         found = found.take(np.arange(len(found))[: wishes.best or None])
-        trajectories = [_trajectory(found, row, limits, wishes.speed) for row in range(len(found))]
+        names, velocity = found.hand.joint_names, limits.velocity
+        trajectories = [
+            timed(straight_paths(found, row), names, velocity, speed=wishes.speed) for row in range(len(found))
+        ]
         bundle = Bundle(found, trajectories, description)
     else:
-        bundle = _carried(found, description, limits, wishes, written, run)
+        bundle = _carried(found, description, limits, wishes, written)
     paths = _write(bundle, format_, folder, files.files)
     written.counts |= {"grasps": len(bundle.found), "files": len(paths)}
     return written
 
 
-def _check_arm(wishes: RobotExportOptions) -> None:
-    """Raise InputError for an arm without mount or base, or these without an arm."""
-    if wishes.arm is None:
-        if wishes.mount or wishes.base or wishes.mount_pose:
-            raise InputError("--mount, --mount-pose and --base go with an arm; name its file: --arm ARM.urdf")
-        return
-    if not wishes.mount:
-        raise InputError("an arm needs the link that the hand is mounted on: --mount LINK")
-
-
 def _carried(
-    found: Executions,
-    description: Description,
-    limits: Limits,
-    wishes: RobotExportOptions,
-    written: ExportSummary,
-    run: ExecutionContext,
+    found: Executions, description: Description, limits: Limits, wishes: RobotExportOptions, written: ExportSummary
 ) -> Bundle:
-    """Return the grasps that the arm can execute, with its trajectories."""
     assert wishes.arm is not None and wishes.mount is not None
     base = IDENTITY_POSE if wishes.base is None else parse_pose(wishes.base, "--base")
     mount_pose = IDENTITY_POSE if wishes.mount_pose is None else parse_pose(wishes.mount_pose, "--mount-pose")
     arm = read_arm(wishes.arm, wishes.mount, mount_pose)
     reach = ReachSearch(arm, base, found, decompose(found.obj))
-    reached = reach.all(wishes.best, run)
+    reached = reach.all(wishes.best)
     why = ", ".join(f"{count} {reason}" for reason, count in reached.refused.most_common(3))
     if not reached.rows:
         raise InputError(
@@ -126,7 +99,7 @@ def _carried(
         )
     written.counts |= {
         "candidates": reached.candidates,
-        "reach_share": round(reached.share, 4),
+        "reach_share": round(len(reached.rows) / max(1, reached.candidates), 4),
         "refused": dict(reached.refused),
     }
     if reached.refused:
@@ -147,15 +120,9 @@ def _found(
     mask, word = choose(shard, unvalidated=wishes.unvalidated, every=wishes.every)
     rows = best_of(shard.arrays, len(mask), mask) if wishes.best else np.flatnonzero(mask)
     tool = tool_frame(wishes.tool, case.hand.root_link, description.links)
-    found = executions(
-        case.hand,
-        case.obj,
-        case.grasps.take(rows),
-        rows=rows,
-        tool=tool,
-        quality=_quality(shard, rows),
-        placed=None if case.placed is None else case.placed.take(rows),
-    )
+    grasps, placed = case.grasps.take(rows), None if case.placed is None else case.placed.take(rows)
+    quality = _quality(shard, rows)
+    found = executions(case.hand, case.obj, grasps, rows=rows, tool=tool, quality=quality, placed=placed)
     if lost := len(rows) - len(found):
         written.notes.append(f"{lost} of {len(rows)} {word} have no straight way of 10 cm free of the object: left out")
     return found
@@ -167,10 +134,6 @@ def _quality(shard: Shard, rows: NDArray[np.intp]) -> dict[str, NDArray[Any]]:
     thresholds = np.asarray(arrays["quality/thresholds_m"], float)
     epsilon = np.asarray(arrays["quality/epsilon"], float)[:, int(np.argmin(np.abs(thresholds - 0.005)))]
     return {"valid": np.asarray(arrays["quality/valid"])[rows], "success": success[rows], "epsilon": epsilon[rows]}
-
-
-def _trajectory(found: Executions, row: int, limits: Limits, speed: float) -> RobotTrajectory:
-    return timed(straight_paths(found, row), found.hand.joint_names, limits.velocity, speed=speed)
 
 
 def _assumptions(limits: Limits) -> list[str]:
@@ -186,18 +149,13 @@ def _assumptions(limits: Limits) -> list[str]:
 def _write(bundle: Bundle, format_: str, folder: Path, hand_files: dict[str, bytes]) -> list[Path]:
     from graspd.exchange.robots import moveit, mujoco_scene, posed_meshes, tables
 
-    if format_ == "csv":
-        return tables.write_tables(bundle, folder)
-    if format_ == "isaac":
-        return tables.write_isaac(bundle, folder)
-    if format_ == "glb":
-        return posed_meshes.write_glb(bundle, folder)
-    if format_ == "usd":
-        return posed_meshes.write_usd(bundle, folder)
-    if format_ == "moveit":
+    if format_ in ("moveit", "urdf+yaml"):
         return moveit.write(bundle, folder, hand_files)
-    if format_ == "mujoco":
-        return mujoco_scene.write_scene(bundle, folder, decompose(bundle.found.obj)) + mujoco_scene.write_arm(
-            bundle, folder
-        )
-    raise InputError(format_)
+    writers = {
+        "csv": tables.write_tables,
+        "isaac": tables.write_isaac,
+        "glb": posed_meshes.write_glb,
+        "usd": posed_meshes.write_usd,
+        "mujoco": mujoco_scene.write,
+    }
+    return writers[format_](bundle, folder)

@@ -35,37 +35,15 @@ def write_scored(
     """Validate and measure a set of grasps and write it as a base shard, its object's mesh beside it.
 
     Grasps in scenes are tested by a lift; the hand's trajectory is replanned, as for our own grasps.
-
-    Args:
-        found: the grasps.
-        origin: stored in the shard's attributes.
-        folder: output folder; created if missing.
-        validator: level of the verdicts, or none.
-        friction: Coulomb coefficient of the metrics.
-        ordinal: index of the set, part of the file's name.
-        run: receives the progress; polled for cancellation.
-
-    Returns:
-        the shard's path.
-
-    Raises:
-        InputError: the level is unknown, or the file already exists.
-        MeshError: the object has no convex pieces for the validator.
     """
     name = plain_name(found.name)
     path = folder / f"{plain_name(found.hand.name)}-{name}-{ordinal:03}.h5"
     if path.exists():
         raise InputError(f"{path} exists already; give another folder as --output")
     try:
-        request = JobRequest(
-            hand=plain_name(found.hand.name),
-            object=name,
-            grasps=max(1, len(found.grasps)),
-            want="candidates",
-            validation=validation,
-            friction=friction,
-            rechecks=0,
-        )
+        wanted = {"grasps": max(1, len(found.grasps)), "want": "candidates", "rechecks": 0}
+        pair = {"hand": plain_name(found.hand.name), "object": name}
+        request = JobRequest.model_validate(pair | wanted | {"validation": validation, "friction": friction})
     except ValueError:
         raise InputError(f"unknown level {validation!r}; choose dexgraspbench, standard, fast or none") from None
     scenes = None if found.placed is None else found.placed.everywhere

@@ -15,7 +15,7 @@ import numpy as np
 
 from graspd.exchange.inputs import load_case
 from graspd.exchange.plan import ExportPart, ExportSummary, held_out, plain_name
-from graspd.service.model.errors import InputError, one_of
+from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import Floats
 from graspd.service.readers import Pictures, Shards, open_shards
 from graspd.service.readers.clouds import COLUMNS
@@ -24,11 +24,6 @@ from graspd.service.store import validity
 from graspd.service.store.shards import Shard, read_shard
 from graspd.worker.files.subsets import choose
 from graspd.worker.objects.model import ObjectModel
-
-FORMATS: Final = ("dexlearn", "dexgraspnet2", "graspgen", "huggingface", "lerobot")
-
-#: Formats that distinguish good and bad grasps.
-LABELLED: Final = ("graspgen",)
 
 
 @dataclass(frozen=True)
@@ -40,7 +35,6 @@ class TrainingExportOptions:
     unvalidated: bool = False
     every: bool = False
     held_out: float = 0.2
-    """Share of held-out objects."""
     noise: str = ""
     """Name of a depth camera; empty: perfect depth."""
 
@@ -48,27 +42,13 @@ class TrainingExportOptions:
 def export_training(source: Path, format_: str, wishes: TrainingExportOptions, folder: Path) -> ExportSummary:
     """Write the grasps of a folder of shards in a training format.
 
-    Raises:
-        InputError: the format is unknown, no grasps match, the share is invalid, or the format's writer refuses.
+    Writers take grasps (`lots`), pictures of their scenes, held-out objects (`out`) and the noise of a depth camera.
     """
-    if format_ not in FORMATS:
-        raise InputError(f"there is no training format {format_!r}; choose one of {one_of(format_, FORMATS)}")
     if not 0 < wishes.held_out < 1:
         raise InputError(f"--held-out is {wishes.held_out:g}; give a share of the objects between 0 and 1")
     shards = open_shards(source)
     lots = _lots(shards, format_, wishes)
     out = held_out(families({lot.name: lot.obj for lot in lots}), wishes.held_out)
-    return _write(format_, lots, shards, wishes, folder, out)
-
-
-def _write(
-    format_: str,
-    lots: list[ExportPart],
-    shards: Shards,
-    wishes: TrainingExportOptions,
-    folder: Path,
-    out: frozenset[str],
-) -> ExportSummary:
     from graspd.exchange import dexgraspnet2, dexlearn, graspgen, huggingface, lerobot
 
     if format_ == "graspgen":
@@ -82,7 +62,6 @@ def _write(
 
 
 def _lots(shards: Shards, format_: str, wishes: TrainingExportOptions) -> list[ExportPart]:
-    """Return the requested grasps of all base shards that have some."""
     lots: list[ExportPart] = []
     digests: dict[str, str] = {}
     refused: InputError | None = None
@@ -107,8 +86,8 @@ def _lots(shards: Shards, format_: str, wishes: TrainingExportOptions) -> list[E
 
 
 def _chosen(shard: Shard, format_: str, wishes: TrainingExportOptions) -> np.ndarray:
-    """Return (N,) exported grasps. A format with labels gets good and bad ones."""
-    if format_ not in LABELLED:
+    """Return (N,) exported grasps. GraspGen, which has labels, gets good and bad ones."""
+    if format_ != "graspgen":
         return choose(shard, unvalidated=wishes.unvalidated, every=wishes.every)[0]
     validated = validity.validated(shard.arrays)
     if wishes.unvalidated or not validated.any():

@@ -27,21 +27,7 @@ _COLUMNS: Final = ("image/rgb", "image/depth", "image/segmentation", "camera/int
 def write(
     shards: Shards, folder: Path, *, pictures_a_file: int = 1000, valid: bool = True, unvalidated: bool = False
 ) -> list[Path]:
-    """Write `pictures-NNNNNN.tar` files.
-
-    Args:
-        shards: views shards with the scene and base shards they were made of.
-        folder: output folder; created if missing.
-        pictures_a_file: samples in one tar file.
-        valid: only valid grasps; False: all of them.
-        unvalidated: write feasible grasps without validation instead of valid ones.
-
-    Returns:
-        the files.
-
-    Raises:
-        InputError: the shards contain no picture, or the folder already contains tar files.
-    """
+    """Write `pictures-NNNNNN.tar` of views shards with their scene and base shards; `Pictures` selects the grasps."""
     pictures = Pictures(
         shards, _COLUMNS, grasp_quality=("quality/epsilon", "quality/success"), valid=valid, unvalidated=unvalidated
     )
@@ -56,7 +42,9 @@ def write(
         with tarfile.open(path, "w") as tar:
             for index in range(first, min(first + pictures_a_file, len(pictures))):
                 for name, data in _members(shards, pictures[index]):
-                    _add(tar, f"{index:08}.{name}", data)
+                    entry = tarfile.TarInfo(f"{index:08}.{name}")
+                    entry.size = len(data)
+                    tar.addfile(entry, io.BytesIO(data))
         written.append(path)
     return written
 
@@ -94,14 +82,8 @@ _SHOWN: dict[str, Shard] = {}
 
 
 def _views(shards: Shards, shard: str) -> Shard:
-    """Return the views shard without its pictures, cached while its samples are written."""
+    """Return the views shard without its depth, cached while its samples are written."""
     if shard not in _SHOWN:
         _SHOWN.clear()
         _SHOWN[shard] = read_shard(shards.path(shards.by_id(shard)), kind="views", without=("image/depth",))
     return _SHOWN[shard]
-
-
-def _add(tar: tarfile.TarFile, name: str, data: bytes) -> None:
-    entry = tarfile.TarInfo(name)
-    entry.size = len(data)
-    tar.addfile(entry, io.BytesIO(data))

@@ -38,27 +38,11 @@ if TYPE_CHECKING:
 
     __version__: str
 
-_ERRORS: Final = "graspd.service.model.errors"
-#: Public name, and the module that defines it.
+#: Module that defines a public name; the others are errors.
 _LIVES_IN: Final = {
     "synthesize": "graspd.synthesis",
-    "open": "graspd.grasps",
-    "Grasps": "graspd.grasps",
-    "Grasp": "graspd.grasps",
-    "Postures": "graspd.grasps",
-    "Client": "graspd.remote",
-    "Job": "graspd.remote",
-    "GraspdError": _ERRORS,
-    "InputError": _ERRORS,
-    "NotFoundError": _ERRORS,
-    "ConflictError": _ERRORS,
-    "MeshError": _ERRORS,
-    "HandError": _ERRORS,
-    "LimitError": _ERRORS,
-    "UnavailableError": _ERRORS,
-    "BusyError": _ERRORS,
-    "DamagedError": _ERRORS,
-    "TaskError": _ERRORS,
+    **dict.fromkeys(("open", "Grasps", "Grasp", "Postures"), "graspd.grasps"),
+    **dict.fromkeys(("Client", "Job"), "graspd.remote"),
 }
 
 __all__ = [
@@ -87,10 +71,10 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     if name == "__version__":
         return import_module("graspd.service.model.version").PACKAGE_VERSION
-    if name not in _LIVES_IN:
+    if name not in __all__:
         raise AttributeError(f"module 'graspd' has no attribute {name!r}")
     with imports():
-        found = getattr(import_module(_LIVES_IN[name]), name)
+        found = getattr(import_module(_LIVES_IN.get(name, "graspd.service.model.errors")), name)
     globals()[name] = found
     return found
 

@@ -81,7 +81,6 @@ PACKAGES: Final[dict[str, tuple[str, str]]] = {
     "graspd.demo": ("warp", "all"),
 }
 
-
 #: Class of typer, or of click in an older typer.
 UsageError: Final[Any] = typer.BadParameter.__base__
 

@@ -16,7 +16,7 @@ from graspd.api.formatting import count, duration, metric
 from graspd.api.models import GraspQuery, JobDetail
 from graspd.client.client import Client
 from graspd.client.reports import JobDisplay, job_summary, means_of, yield_of
-from graspd.service.cli import JsonFlag, emit, load_settings, plain_console, reporting_errors, write_output
+from graspd.service.cli import CommandGroup, JsonFlag, emit, load_settings, plain_console, write_output
 from graspd.service.command_options import parsed_options
 from graspd.service.index.views import GraspView
 from graspd.service.model.domain import JobRequest
@@ -27,7 +27,7 @@ from graspd.service.store import validity
 from graspd.service.store.assets import builtin_files
 from graspd.service.store.shards import Shard, read_shard
 
-app = typer.Typer()
+app = CommandGroup()
 
 
 @dataclass(frozen=True)
@@ -39,11 +39,8 @@ class Results:
     page: Path
 
     def as_json(self) -> dict[str, Any]:
-        return {
-            "shards": [str(path) for path in self.shards],
-            "pictures": [str(path) for path in self.pictures],
-            "page": str(self.page),
-        }
+        several = {name: list(map(str, getattr(self, name))) for name in ("shards", "pictures")}
+        return several | {"page": str(self.page)}
 
 
 _SHOWN_GRASPS: Final = 12
@@ -52,7 +49,6 @@ _SAMPLES: Final = 8
 
 
 @app.command("demo", epilog="graspd demo --out demo-out --grasps 32 --scenes 2 --views 3")
-@reporting_errors
 def demo(
     out: Annotated[Path, typer.Option(help="Folder for the service's data and the results.")] = Path("demo-out"),
     hand: Annotated[str, typer.Option(help="Built-in hand.")] = "allegro",
@@ -65,19 +61,8 @@ def demo(
     json: JsonFlag = False,
 ) -> None:
     """Make grasps, scenes and pictures of built-in data, and a results page."""
-    request = parsed_options(
-        JobRequest,
-        {
-            "hand": hand,
-            "object": object,
-            "grasps": grasps,
-            "scenes": scenes,
-            "views": views,
-            "stereo": views > 0,
-            "fidelity": fidelity,
-            "seed": seed,
-        },
-    )
+    asked: dict[str, Any] = {"hand": hand, "object": object, "grasps": grasps, "fidelity": fidelity, "seed": seed}
+    request = parsed_options(JobRequest, asked | {"scenes": scenes, "views": views, "stereo": views > 0})
     console = plain_console(stderr=json)
     out.mkdir(parents=True, exist_ok=True)
     settings = load_settings(data_dir=out / "service", host="127.0.0.1", port=0)
@@ -97,14 +82,7 @@ def demo(
 def run(
     client: Client, request: JobRequest, out: Path, console: Console
 ) -> tuple[JobDetail, list[GraspView], list[Path]]:
-    """Submit the job, watch it, and fetch its files.
-
-    Returns:
-        the job, its ten best grasps by epsilon, and the paths of its shards.
-
-    Raises:
-        TaskError: the job did not succeed.
-    """
+    """Submit the job, watch it, and fetch its files: return it, its ten best grasps by epsilon, and its shards."""
     job = client.submit(request)
     console.print(f"job {job.id[:12]}: {request.grasps} grasps of {request.hand} on {request.object}")
     with JobDisplay(console) as display:
@@ -114,7 +92,7 @@ def run(
     top = client.grasps(GraspQuery(job=job.id, valid=True), limit=10).items
     folder = out / "shards"
     folder.mkdir(exist_ok=True)
-    files = [client.download(shard, folder / f"{shard.kind}-{shard.batch:04}.h5") for shard in job.shards]
+    files = [client.save(shard.file, folder / f"{shard.kind}-{shard.batch:04}.h5") for shard in job.shards]
     return job, top, sorted(files)
 
 
@@ -131,30 +109,30 @@ def print_results(console: Console, best: list[GraspView], job: JobDetail, paths
     for stage in job.stages:
         console.print(f"{stage.stage.value:<11} {count(stage.tasks)} × {duration(stage.seconds / stage.tasks)}")
     console.print()
-    for what, path in (
-        *(("shard", path) for path in paths.shards),
-        *(("picture", path) for path in paths.pictures),
-        ("page", paths.page),
-    ):
-        console.print(f"{what:<8} {path}", soft_wrap=True)
+    for what, some in (("shard", paths.shards), ("picture", paths.pictures), ("page", [paths.page])):
+        for path in some:
+            console.print(f"{what:<8} {path}", soft_wrap=True)
 
 
 def write_pages(out: Path, job: JobDetail, shards: list[Path]) -> Results:
     """Write the contact sheet of the best grasps, views of the first batch, and an index.html with both."""
     from graspd.worker.rendering.sheets import views_page
 
-    pictures = []
+    pages: dict[str, bytes] = {}
     bases = [path for path in shards if path.name.startswith("base")]
     views = [path for path in shards if path.name.startswith("views")]
     if bases:
-        pictures.append(_write(out / "grasps.png", draw_grasps(job, read_shard(bases[0], kind="base"))))
+        pages["grasps.png"] = draw_grasps(job, read_shard(bases[0], kind="base"))
     if views:
         title = f"Views of the {job.object}"
         data = read_shard(views[0], kind="views")
         subtitle = f"{len(data['image/rgb'])} pictures of {job.request.scenes} scenes; depth in metres"
-        pictures.append(_write(out / "views.png", views_page(data.arrays, title=title, subtitle=subtitle)))
-    page = _write(out / "index.html", html_page(job, pictures, shards, out).encode())
-    return Results(shards, pictures, page)
+        pages["views.png"] = views_page(data.arrays, title=title, subtitle=subtitle)
+    pictures = [out / name for name in pages]
+    pages["index.html"] = html_page(job, pictures, shards, out).encode()
+    for name, content in pages.items():
+        write_output(out / name, content)
+    return Results(shards, pictures, out / "index.html")
 
 
 def draw_grasps(job: JobDetail, base: Shard) -> bytes:
@@ -167,12 +145,9 @@ def draw_grasps(job: JobDetail, base: Shard) -> bytes:
     from graspd.worker.rendering.sheets import best, contact_sheet, figures
 
     backend.start()
-    hand_files, object_files = (
-        builtin_files(kind, name) for kind, name in ((AssetKind.HAND, job.hand), (AssetKind.OBJECT, job.object))
-    )
-    hand = load_hand(hand_files, name=job.hand, digest=job.hand_digest)
-    error_m = job.request.knobs.face_error_m
-    obj = load_object(object_files, name=job.object, digest=job.object_digest, face_error_m=error_m)
+    hand = load_hand(builtin_files(AssetKind.HAND, job.hand), name=job.hand, digest=job.hand_digest)
+    files, error_m = builtin_files(AssetKind.OBJECT, job.object), job.request.knobs.face_error_m
+    obj = load_object(files, name=job.object, digest=job.object_digest, face_error_m=error_m)
     rows = best(base.arrays, _SHOWN_GRASPS, validity.valid(base.arrays))
     poses, joints = (np.asarray(base[f"grasp/{name}"], float)[rows] for name in ("hand_pose", "joint_positions"))
     pictures = grasp_pictures(hand, obj, poses, joints, samples=_SAMPLES)[:, 0]
@@ -190,11 +165,6 @@ def html_page(job: JobDetail, pictures: list[Path], shards: list[Path], out: Pat
     )
     files = "".join(f"<li><a href='{p.relative_to(out)}'>{p.relative_to(out)}</a></li>" for p in shards)
     return _HTML.format(title=title, yields=escape(yield_of(job)), job=job.id, images=images, files=files)
-
-
-def _write(path: Path, data: bytes) -> Path:
-    write_output(path, data)
-    return path
 
 
 _ALT: Final = {"grasps": "The best grasps with their quality", "views": "Rendered views with depth and segmentation"}

@@ -66,8 +66,8 @@ def html_of(grasps: Grasps) -> str:
         png = _picture(grasps)
     # A notebook must display its grasps even if a file, engine or driver is missing.
     except Exception:
-        return head + _table(grasps)
-    if len(png) > PICTURE_BYTES:
+        png = b""
+    if not 0 < len(png) <= PICTURE_BYTES:
         return head + _table(grasps)
     data = base64.b64encode(png).decode()
     return f'{head}<img alt="the best of them" style="max-width:100%" src="data:image/png;base64,{data}">'
@@ -83,10 +83,8 @@ def viewer_of(grasps: Grasps, *, host: str, port: int) -> Viewer:
     if said := missing():
         raise InputError(said)
     shard = grasps.shard()
-    shown = ViewerContent(
-        shard, hand_of_shard(shard, None), object_of_shard(shard, None), neighbours_of_shard(shard, [])
-    )
-    return Viewer(shown, host=host, port=port)
+    hand, obj = hand_of_shard(shard, None), object_of_shard(shard, None)
+    return Viewer(ViewerContent(shard, hand, obj, neighbours_of_shard(shard, [])), host=host, port=port)
 
 
 def _picture(grasps: Grasps) -> bytes:

@@ -14,13 +14,13 @@ from typing import Annotated, Final
 import typer
 
 from graspd.cli import missing_extra
-from graspd.service.cli import JsonFlag, emit, load_settings, reporting_errors
+from graspd.service.cli import CommandGroup, JsonFlag, emit, load_settings
 from graspd.service.model.errors import InputError
 from graspd.service.run.doctor import backends, fleet, machine
 from graspd.service.run.doctor.checks import THREADS, Check, Condition, Finding, run_checks, skipped
 from graspd.service.settings import Settings
 
-app = typer.Typer(no_args_is_help=False)
+app = CommandGroup(no_args_is_help=False)
 _COLOURS: Final = {
     Condition.GOOD: typer.colors.GREEN,
     Condition.WARNING: typer.colors.YELLOW,
@@ -30,7 +30,6 @@ _COLOURS: Final = {
 
 
 @app.command(epilog="graspd doctor --only redis,store,clocks")
-@reporting_errors
 def doctor(
     only: Annotated[str | None, typer.Option(help="Checks to run, separated by commas; default: all.")] = None,
     full: Annotated[bool, typer.Option("--full", help="Compare the whole index with the store, not a sample.")] = False,
@@ -70,23 +69,18 @@ def _end(code: int) -> None:
 
 def all_checks(settings: Settings, *, full: bool = False) -> list[Check]:
     """Return the checks of all packages; those of a missing package report that it is not installed."""
-    return [*checks_of(settings, full=full), *_of_api(settings), *_of_worker(settings)]
-
-
-def _of_api(settings: Settings) -> list[Check]:
+    checks = checks_of(settings, full=full)
     if missing_extra("graspd.api"):
-        return [_absent("keys", "api")]
-    from graspd.api.access.doctor import keys
+        checks.append(_absent("keys", "api"))
+    else:
+        from graspd.api.access.doctor import keys
 
-    return [Check("keys", lambda: keys(settings))]
-
-
-def _of_worker(settings: Settings) -> list[Check]:
+        checks.append(Check("keys", partial(keys, settings)))
     if missing_extra("graspd.commands"):
-        return [_absent("gpu", "worker"), _absent("kernels", "worker")]
+        return [*checks, _absent("gpu", "worker"), _absent("kernels", "worker")]
     from graspd.commands.doctor import checks_of as of_worker
 
-    return of_worker(settings)
+    return checks + of_worker(settings)
 
 
 def _absent(name: str, extra: str) -> Check:
@@ -116,6 +110,7 @@ _FULL_S: Final = 24 * 3600.0
 
 def checks_of(settings: Settings, *, full: bool = False) -> list[Check]:
     """Return the checks that need neither engine nor API. `full`: compare the whole index with the store."""
+    full_s = _FULL_S if full else 120.0
     return [
         Check("disk", partial(machine.disk, settings)),
         Check("data-folder", partial(machine.data_folder, settings)),
@@ -126,9 +121,7 @@ def checks_of(settings: Settings, *, full: bool = False) -> list[Check]:
         Check("store", partial(backends.store, settings), limit_s=120.0),
         Check("index", partial(backends.index, settings)),
         Check("identity", partial(backends.index_identity, settings)),
-        Check(
-            "index-is-store", partial(backends.index_is_store, settings, full=full), limit_s=_FULL_S if full else 120.0
-        ),
+        Check("index-is-store", partial(backends.index_is_store, settings, full=full), limit_s=full_s),
         Check("damage", partial(backends.store_damage, settings)),
         Check("clocks", partial(fleet.clocks, settings), limit_s=120.0),
         Check("controller", partial(fleet.controller, settings)),

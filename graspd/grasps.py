@@ -29,7 +29,7 @@ Array = NDArray[Any]
 Rows = NDArray[Any] | Sequence[int] | Sequence[bool]
 
 _METRICS: Final = {metric.name: metric for metric in GRASP_METRICS}
-_PER_GRASP: Final = frozenset(path for path, column in SCHEMAS["base"].items() if column.shape.split()[0] == "N")
+_PER_GRASP: Final = {"object", *(path for path, it in SCHEMAS["base"].items() if it.shape.split()[0] == "N")}
 _THRESHOLDS: Final = "quality/thresholds_m"
 _SCENES: Final = ("scene/object_pose", "scene/rest_probability")
 _INDEX: Final = "grasp/scene_index"
@@ -112,10 +112,8 @@ class Grasps:
         chosen = rows if isinstance(rows, slice) else np.asarray(rows)
         if isinstance(chosen, np.ndarray) and not len(chosen):
             chosen = chosen.astype(int)
-        kept = {path: data[chosen] if self._per_grasp(path) else data for path, data in self._columns.items()}
+        kept = {path: data[chosen] if path in _PER_GRASP else data for path, data in self._columns.items()}
         return Grasps(kept, self._attributes, self._path)
-
-    # Identity.
 
     @property
     def hand(self) -> str:
@@ -149,8 +147,6 @@ class Grasps:
         """Numbers of dropped candidates by outcome (docs/explanation/quality.md)."""
         return {name: int(count) for name, count in json.loads(str(self._attributes.get("outcomes", "{}"))).items()}
 
-    # Postures.
-
     @property
     def hand_pose(self) -> Floats:
         """(N, 7) root link at contact, in the object frame: x y z [m], unit quaternion w x y z."""
@@ -181,8 +177,6 @@ class Grasps:
         """Squeeze postures raised by 10 cm; only for grasps planned in a scene."""
         return Postures(self.column("grasp/lift"), self.column("squeeze/joint_positions"))
 
-    # Poses in the scene.
-
     @property
     def object_pose(self) -> Floats:
         """(N, 7) object in each grasp's scene, z up; only for grasps planned in a scene."""
@@ -192,8 +186,6 @@ class Grasps:
     def hand_pose_in_scene(self) -> Floats:
         """(N, 7) `hand_pose` in each grasp's scene, z up; only for grasps planned in a scene."""
         return compose(self.object_pose, self.hand_pose)
-
-    # Quality.
 
     @property
     def is_valid(self) -> NDArray[np.bool_]:
@@ -240,8 +232,6 @@ class Grasps:
             raise InputError(f"these grasps have no column {path!r}; they have {', '.join(sorted(self._columns))}")
         return self._columns[path]
 
-    # Selection.
-
     def valid(self) -> Grasps:
         """Select the valid grasps."""
         return self[self.is_valid]
@@ -264,8 +254,6 @@ class Grasps:
         values = np.asarray(self.metric(metric), float)
         order = np.argsort(values if self._known(metric).less_is_better else -values, kind="stable")
         return self[order[np.isfinite(values[order])][:count]]
-
-    # Display.
 
     def to_pandas(self) -> Any:
         """Return a `pandas.DataFrame` with one row per grasp.
@@ -297,8 +285,6 @@ class Grasps:
         from graspd.display import viewer_of
 
         return viewer_of(self, host=host, port=port)
-
-    # Files.
 
     def shard(self) -> Shard:
         """Return the grasps as a base shard, with the content that `save` writes.
@@ -341,10 +327,6 @@ class Grasps:
         metrics = {name: float(self.metric(name)[row]) for name in self.metrics}
         return Grasp(self.hand_pose[row], joints, bool(self.is_valid[row]), metrics)
 
-    @staticmethod
-    def _per_grasp(path: str) -> bool:
-        return path in _PER_GRASP or path == "object"
-
 
 def open(
     source: str | Path | Sequence[str | Path],
@@ -371,11 +353,7 @@ def open(
 
 
 def joined(shards: Sequence[Shard]) -> Grasps:
-    """Concatenate the grasps of base shards of one hand; columns missing from some shards are omitted.
-
-    Raises:
-        InputError: there are no shards, or their joints or contact thresholds differ.
-    """
+    """Concatenate the grasps of base shards of one hand; columns missing from some shards are omitted."""
     if not shards:
         raise InputError("there is no file of grasps here")
     first = shards[0]

@@ -54,6 +54,14 @@ def reporting_errors(command: Callable[P, R]) -> Callable[P, R]:
     return wrapper
 
 
+class CommandGroup(typer.Typer):
+    """Commands that report errors in one line, see `reporting_errors`."""
+
+    def command(self, *names: Any, **options: Any) -> Callable[[Callable[P, R]], Callable[P, R]]:  # type: ignore[override]
+        add = super().command(*names, **options)
+        return lambda command: add(reporting_errors(command))
+
+
 def at_the_door(command: Callable[[], object]) -> None:
     """Run the command line; report system errors in one line. Other exceptions are bugs and keep their trace."""
     for descriptor in range(3):
@@ -164,6 +172,14 @@ def plain_table(*headings: str, whole: Collection[str] = ()) -> Table:
 def emit(value: BaseModel | dict[str, Any]) -> None:
     plain = value.model_dump(mode="json") if isinstance(value, BaseModel) else value
     typer.echo(json.dumps(plain, allow_nan=False, default=str))
+
+
+def report(value: BaseModel | dict[str, Any], text: str, *, json: bool) -> None:
+    """Print a result as JSON or as text."""
+    if json:
+        emit(value)
+    else:
+        typer.echo(text)
 
 
 def load_settings(**overrides: Any) -> Settings:

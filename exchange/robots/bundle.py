@@ -10,9 +10,8 @@ import numpy as np
 import yaml
 
 from graspd.exchange.plan import plain_name, prim_names
-from graspd.exchange.robots.arm import Arm, Description
 from graspd.exchange.robots.execution import Executions, Path, RobotTrajectory
-from graspd.exchange.robots.reach import ArmScene
+from graspd.exchange.robots.reach import Arm, ArmScene, Description
 from graspd.service.model.transforms import Floats, compose, invert
 
 
@@ -37,7 +36,6 @@ class Bundle:
     """One per grasp; joints are the arm's, if there is one, then the hand's."""
     description: Description
     carrier: Carrier | None = None
-    """The arm, if there is one."""
 
     @property
     def frame(self) -> str:
@@ -61,7 +59,6 @@ class Bundle:
         return thing, hand
 
     def name(self, row: int) -> str:
-        """Return the name of a grasp, after its row in the shard."""
         return f"grasp_{self.found.rows[row]:04}"
 
     @property

@@ -65,28 +65,9 @@ class Executions:
     def __len__(self) -> int:
         return len(self.rows)
 
-    @property
-    def scene_index(self) -> NDArray[np.intp]:
-        """(N,) index of each grasp's scene; 0 for a free object."""
-        return np.zeros(len(self), np.intp) if self.placed is None else self.placed.index
-
     def tool_pose(self, posture: str) -> Floats:
         """Return (N, 7) tool frames in a posture."""
         return compose(self.postures[posture].hand_pose, self.tool.pose)
-
-    @property
-    def approach(self) -> Floats:
-        """(N, 3) unit vectors of the approach."""
-        return self._direction("standoff", "arrival")
-
-    @property
-    def retreat(self) -> Floats:
-        """(N, 3) unit vectors of the retreat with the object."""
-        return self._direction("squeeze", "lift")
-
-    def _direction(self, start: str, end: str) -> Floats:
-        way = self.postures[end].hand_pose[:, :3] - self.postures[start].hand_pose[:, :3]
-        return np.asarray(way / np.linalg.norm(way, axis=1, keepdims=True))
 
     @property
     def lifted_object_pose(self) -> Floats:
@@ -117,23 +98,7 @@ def executions(
     tool: ToolFrame,
     quality: dict[str, NDArray[Any]],
 ) -> Executions:
-    """Return grasps with trajectories, as planned in their scene or here for a free object.
-
-    Args:
-        hand: the hand.
-        obj: the object.
-        grasps: N grasps.
-        rows: (N,) their rows in the shard.
-        placed: scene of each grasp; None for a free object.
-        tool: the tool frame.
-        quality: (N,) columns that are passed on.
-
-    Returns:
-        grasps with a trajectory. For a free object a straight retreat of 10 cm may be impossible.
-
-    Raises:
-        InputError: no grasp has a trajectory.
-    """
+    """Return the grasps with a trajectory, as planned in their scene, or here for a free object if it can be left."""
     frame, at = "object", np.tile(IDENTITY_POSE, (len(grasps), 1))
     free = np.ones(len(grasps), bool)
     if placed is None or grasps.approach is None or grasps.coming is None or grasps.lift is None:
@@ -172,11 +137,7 @@ _SLACK = 1e-2
 
 
 def parse_pose(text: str, what: str) -> Floats:
-    """Parse (7,) from `x y z qw qx qy qz`, separated by spaces or commas [m, 1].
-
-    Raises:
-        InputError: not seven finite numbers, or no unit quaternion.
-    """
+    """Parse (7,) from `x y z qw qx qy qz` with a unit quaternion, separated by spaces or commas [m, 1]."""
     try:
         values = np.array([float(part) for part in text[:400].replace(",", " ").split()])
     except ValueError:
@@ -191,15 +152,9 @@ def parse_pose(text: str, what: str) -> Floats:
 
 
 def tool_frame(text: str | None, root_link: str, links: Mapping[str, tuple[int, Floats]]) -> ToolFrame:
-    """Return the user's tool frame: a link that no finger moves, or a pose in the root link's frame.
+    """Return the user's tool frame: a link that no finger moves, or a pose in the root link's frame (the default).
 
-    Args:
-        text: a link's name or seven numbers; None: the root link itself.
-        root_link: name of the hand's root link.
-        links: body and pose of each link, see `Description`.
-
-    Raises:
-        InputError: the link is missing, it moves with a finger, or the numbers are no pose.
+    `links` has body and pose of each link, see `Description`.
     """
     if not text or text == root_link:
         return ToolFrame(root_link, IDENTITY_POSE.copy())
@@ -298,13 +253,9 @@ def straight_paths(found: Executions, row: int, points: int = 2) -> list[Path]:
 
 
 def timed(paths: Sequence[Path], names: Sequence[str], velocity: Floats, *, speed: float) -> RobotTrajectory:
-    """Time the motions in sequence, each at rest at both ends.
+    """Time the motions in sequence, each at rest at both ends; each starts at the end of the previous one.
 
-    Args:
-        paths: the motions; each starts at the end of the previous one.
-        names: (J,) names of the joints.
-        velocity: (J,) limits [rad/s or m/s].
-        speed: used share of these limits and of the hand's; above 0, at most 1.
+    `speed` is the used share of the limits `velocity` (J,) [rad/s or m/s] and of the hand's; above 0, at most 1.
     """
     phase, time, pose, joints = [paths[0].phase], [0.0], [paths[0].hand_pose[:1]], [paths[0].joints[:1]]
     for path in paths:
@@ -319,14 +270,9 @@ def timed(paths: Sequence[Path], names: Sequence[str], velocity: Floats, *, spee
         left = np.minimum(at.astype(int), len(path.joints) - 2)
         rest = at - left
         joints.append((1 - rest)[:, None] * path.joints[left] + rest[:, None] * path.joints[left + 1])
-        pose.append(
-            np.array(
-                [
-                    _poses(path.hand_pose[k], path.hand_pose[k + 1], np.array([r]))[0]
-                    for k, r in zip(left, rest, strict=True)
-                ]
-            )
-        )
+        pose += [
+            _poses(path.hand_pose[k], path.hand_pose[k + 1], np.array([r])) for k, r in zip(left, rest, strict=True)
+        ]
     found, when = np.concatenate(joints), np.array(time)
     rate = np.gradient(found, when, axis=0)
     rate[[0, -1]] = 0.0

@@ -12,7 +12,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from graspd.exchange.imported import mesh_file
+from graspd.exchange.imported import mesh_file, urdf_of
 from graspd.exchange.plan import plain_name
 from graspd.exchange.robots.bundle import Bundle, dump_yaml, numbers
 from graspd.exchange.robots.execution import RobotTrajectory
@@ -24,23 +24,12 @@ LEAST_SHARE: Final = 0.5
 
 
 def write(bundle: Bundle, folder: Path, hand_files: Mapping[str, bytes]) -> list[Path]:
-    """Write `grasps.yaml`, `trajectories/GRASP.yaml`, the hand's files in `hand/`, the mesh in `object/`.
-
-    Args:
-        bundle: the grasps.
-        folder: output folder.
-        hand_files: the hand's URDF and meshes.
-
-    Raises:
-        InputError: a file of the hand has a name that leads out of its folder.
-    """
+    """Write `grasps.yaml`, `trajectories/GRASP.yaml`, the hand's URDF and meshes in `hand/`, the mesh in `object/`."""
     (folder / "trajectories").mkdir(parents=True, exist_ok=True)
-    grasps = folder / "grasps.yaml"
-    dump_yaml(grasps, [_grasp(bundle, row) for row in range(len(bundle.found))])
-    written = [grasps]
+    written = [dump_yaml(folder / "grasps.yaml", [_grasp(bundle, row) for row in range(len(bundle.found))])]
     for row, trajectory in enumerate(bundle.trajectories):
-        written.append(folder / "trajectories" / f"{bundle.name(row)}.yaml")
-        dump_yaml(written[-1], _trajectory(bundle, trajectory))
+        file = folder / "trajectories" / f"{bundle.name(row)}.yaml"
+        written.append(dump_yaml(file, _trajectory(bundle, trajectory)))
     return written + _hand(folder / "hand", hand_files) + _object(bundle, folder / "object")
 
 
@@ -80,11 +69,6 @@ def _header(bundle: Bundle) -> dict[str, Any]:
 def _pose(pose: Floats) -> dict[str, Any]:
     x, y, z, qw, qx, qy, qz = numbers(pose)
     return {"position": {"x": x, "y": y, "z": z}, "orientation": {"x": qx, "y": qy, "z": qz, "w": qw}}
-
-
-def _transform(pose: Floats) -> dict[str, Any]:
-    found = _pose(pose)
-    return {"translation": found["position"], "rotation": found["orientation"]}
 
 
 def _translation(bundle: Bundle, row: int, start: str, end: str) -> dict[str, Any]:
@@ -127,10 +111,11 @@ def _trajectory(bundle: Bundle, path: RobotTrajectory) -> dict[str, Any]:
         _point(joints[kept], time, rate[kept])
         for joints, time, rate in zip(path.joints, path.time, path.velocity, strict=True)
     ]
-    ways = [
-        {"transforms": [_transform(pose)], "velocities": [], "accelerations": [], "time_from_start": _duration(time)}
-        for pose, time in zip(bundle.seen_tool(path.hand_pose), path.time, strict=True)
-    ]
+    ways = []
+    for pose, time in zip(map(_pose, bundle.seen_tool(path.hand_pose)), path.time, strict=True):
+        transform = {"translation": pose["position"], "rotation": pose["orientation"]}
+        empty: dict[str, list[float]] = {"velocities": [], "accelerations": []}
+        ways.append({"transforms": [transform], **empty, "time_from_start": _duration(time)})
     floating = {"header": _header(bundle), "joint_names": [bundle.found.tool.name], "points": ways}
     return {"joint_trajectory": _joint_trajectory(bundle, names, points), "multi_dof_joint_trajectory": floating}
 
@@ -150,16 +135,6 @@ def _hand(folder: Path, files: Mapping[str, bytes]) -> list[Path]:
 def _object(bundle: Bundle, folder: Path) -> list[Path]:
     obj, name = bundle.found.obj, plain_name(bundle.found.obj.name)
     folder.mkdir(parents=True, exist_ok=True)
-    mesh = f'<geometry><mesh filename="{name}.obj"/></geometry>'
-    lines = [
-        f'<robot name="{name}">',
-        f'  <link name="{name}">',
-        f"    <visual>{mesh}</visual>",
-        f"    <collision>{mesh}</collision>",
-        "  </link>",
-        "</robot>",
-        "",
-    ]
-    urdf = folder / f"{name}.urdf"
-    urdf.write_text("\n".join(lines))
-    return [mesh_file(obj, folder / f"{name}.obj"), urdf]
+    urdf, mesh = folder / f"{name}.urdf", folder / f"{name}.obj"
+    urdf.write_text(urdf_of(name, name, [mesh.name]))
+    return [mesh_file(obj, mesh), urdf]

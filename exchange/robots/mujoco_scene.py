@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
-from itertools import zip_longest
+from itertools import product, zip_longest
 from pathlib import Path
 from typing import Any, Final
 from xml.etree.ElementTree import Element, SubElement
@@ -21,7 +21,7 @@ from graspd.exchange.robots.execution import POSTURES, Executions
 from graspd.service.model.matter import ACCELERATION
 from graspd.service.model.transforms import compose
 from graspd.worker.hands.model import HandModel
-from graspd.worker.validation.decomposition import ConvexPieces
+from graspd.worker.validation.decomposition import decompose
 from graspd.worker.validation.model import MujocoOptions, Scene, build, scene_spec
 
 #: Colours of the hand, the object, and everything else.
@@ -30,15 +30,9 @@ _COLOURS: Final = ("0.36 0.45 0.58 1", "0.87 0.45 0.2 1", "0.75 0.75 0.72 1")
 _SPEC_NAMES: Final = {"vertex": "uservert"}
 
 
-def write_scene(bundle: Bundle, folder: Path, pieces: ConvexPieces) -> list[Path]:
-    """Write `scene.xml`, which needs no other file, and `replay.py`, which plays and validates its grasps.
-
-    Args:
-        bundle: the grasps.
-        folder: output folder.
-        pieces: the object's convex pieces, as in the validator.
-    """
-    found = bundle.found
+def write(bundle: Bundle, folder: Path) -> list[Path]:
+    """Write `scene.xml`, which needs no other file, `replay.py`, which validates its grasps, and an arm's `arm.xml`."""
+    found, pieces = bundle.found, decompose(bundle.found.obj)
     folder.mkdir(parents=True, exist_ok=True)
     around = ((), ()) if found.placed is None else (found.placed.supports, found.placed.neighbours)
     physics = MujocoOptions()
@@ -54,13 +48,15 @@ def write_scene(bundle: Bundle, folder: Path, pieces: ConvexPieces) -> list[Path
     SubElement(one(tree, ".//body[@name='object']"), "site", site)
     _settle(tree, found)
     dress(tree, found, ("body0", "object", "supports", *(f"neighbour{k}" for k in range(len(scene.neighbours)))))
-    _add_keys(tree, bundle, scene)
+    keys = SubElement(tree, "keyframe")
+    for row, posture in product(range(len(found)), POSTURES):
+        SubElement(keys, "key", {"name": f"{bundle.name(row)}/{posture}", **_key(found, scene, posture, row)})
     rename(tree, _names(found.hand))
     ElementTree.indent(tree)
     file, script = folder / "scene.xml", folder / "replay.py"
     file.write_text(ElementTree.tostring(tree, encoding="unicode") + "\n")
     script.write_text(Path(__file__).with_name("replay.py").read_text())
-    return [file, script]
+    return [file, script, *_write_arm(bundle, folder)]
 
 
 def _restore_digits(tree: Element, spec: Any) -> None:
@@ -102,24 +98,12 @@ def dress(tree: Element, found: Executions, names: tuple[str, ...]) -> None:
                 geom.set("rgba", colour)
     world, size = one(tree, "worldbody"), 2 * found.obj.radius + 0.3
     middle = found.object_pose[0, :3]
-    world.insert(
-        0,
-        Element(
-            "light", pos=element_text(middle + np.array([0.5, -0.5, 2.0])), dir="-0.25 0.25 -1", diffuse="0.9 0.9 0.9"
-        ),
-    )
+    above = element_text(middle + np.array([0.5, -0.5, 2.0]))
+    world.insert(0, Element("light", pos=above, dir="-0.25 0.25 -1", diffuse="0.9 0.9 0.9"))
     visual = SubElement(tree, "visual")
     SubElement(visual, "headlight", ambient="0.4 0.4 0.4", diffuse="0.4 0.4 0.4")
     SubElement(visual, "global", azimuth="130", elevation="-25", offwidth="1280", offheight="960")
     SubElement(tree, "statistic", center=element_text(middle), extent=element_text([size]))
-
-
-def _add_keys(tree: Element, bundle: Bundle, scene: Scene) -> None:
-    keys = SubElement(tree, "keyframe")
-    for row in range(len(bundle.found)):
-        for posture in POSTURES:
-            name = f"{bundle.name(row)}/{posture}"
-            SubElement(keys, "key", {"name": name, **_key(bundle.found, scene, posture, row)})
 
 
 def _key(found: Executions, scene: Scene, posture: str, row: int) -> dict[str, str]:
@@ -134,7 +118,7 @@ def _key(found: Executions, scene: Scene, posture: str, row: int) -> dict[str, s
     qpos[scene.object_qpos : scene.object_qpos + 7] = compose(at, np.array([*scene.centre, 1, 0, 0, 0]))
     for k, free in enumerate(scene.neighbours):
         assert found.placed is not None and found.placed.neighbour_pose is not None
-        rest = found.placed.neighbour_pose[found.scene_index[row], k]
+        rest = found.placed.neighbour_pose[found.placed.index[row], k]
         qpos[free.qpos : free.qpos + 7] = compose(rest, np.array([*free.centre, 1, 0, 0, 0]))
     control = scene.controls(command.joint_positions[row])
     return {
@@ -163,7 +147,6 @@ def rename(tree: Element, names: Mapping[str, str]) -> None:
 
 
 def one(tree: Element, path: str) -> Element:
-    """Return an element that must exist."""
     found = tree.find(path)
     assert found is not None, path
     return found
@@ -174,8 +157,7 @@ def element_text(values: Any) -> str:
     return " ".join(f"{float(value):.17g}" for value in np.ravel(values))
 
 
-def write_arm(bundle: Bundle, folder: Path) -> list[Path]:
-    """Write `arm.xml` if there is an arm."""
+def _write_arm(bundle: Bundle, folder: Path) -> list[Path]:
     if (carrier := bundle.carrier) is None:
         return []
     tree = ElementTree.fromstring(carrier.world.spec.to_xml())
@@ -203,14 +185,8 @@ def _add_arm_keys(tree: Element, bundle: Bundle, carrier: Carrier) -> None:
             thing = found.lifted_object_pose[row] if posture == "lift" else found.object_pose[row]
             qpos = np.zeros(world.model.nq)
             qpos[world.arm_qpos], qpos[world.hand_qpos] = joints[:arms], joints[arms:]
-            SubElement(
-                keys,
-                "key",
-                name=f"{bundle.name(row)}/{posture}",
-                qpos=element_text(qpos),
-                mpos=element_text(thing[:3]),
-                mquat=element_text(thing[3:]),
-            )
+            at = {"mpos": element_text(thing[:3]), "mquat": element_text(thing[3:])}
+            SubElement(keys, "key", {"name": f"{bundle.name(row)}/{posture}", "qpos": element_text(qpos), **at})
 
 
 def _arm_names(bundle: Bundle, carrier: Carrier) -> dict[str, str]:

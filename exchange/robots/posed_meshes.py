@@ -17,7 +17,6 @@ from graspd.exchange.robots.execution import Executions, RobotTrajectory, posed_
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import Floats, pose_to_matrix
 from graspd.worker.hands.kinematics import body_poses
-from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.primitives import hull
 from graspd.worker.hands.robot import Ints
 from graspd.worker.objects.glb_document import Document, plain
@@ -85,38 +84,31 @@ class Solid:
 
 
 def hand_meshes(found: Executions) -> list[Solid]:
-    """Return one mesh for each visible body of the hand, in the body's frame."""
-    hand = found.hand
-    return [
-        Solid(
-            _name_of(hand, number),
-            part.solid.vertices,
-            part.solid.faces,
-            part.solid.corner_normals,
-            part.look.base,
-            part.body,
-        )
-        for number, part in enumerate(hand_parts(hand))
-    ]
+    """Return one mesh for each visible body of the hand, in the body's frame; second and later ones are numbered."""
+    bodies, made = drawn_bodies(found.hand), []
+    for number, part in enumerate(hand_parts(found.hand)):
+        before = bodies[:number].count(bodies[number])
+        name = found.hand.body_names[bodies[number]] + (f"_{before + 1}" if before else "")
+        solid = part.solid
+        made.append(Solid(name, solid.vertices, solid.faces, solid.corner_normals, part.look.base, part.body))
+    return made
 
 
 def object_mesh(found: Executions) -> Solid:
     """Return the object's mesh in its own frame."""
-    return Solid(
-        plain_name(found.obj.name), found.obj.vertices, found.obj.faces, found.obj.corner_normals, OBJECT_COLOUR
-    )
+    obj = found.obj
+    return Solid(plain_name(obj.name), obj.vertices, obj.faces, obj.corner_normals, OBJECT_COLOUR)
 
 
 def support_meshes(found: Executions) -> list[Solid]:
     """Return the supports in the frame of the scene; half-spaces as slabs around the objects."""
     supports = () if found.placed is None else found.placed.supports
     middle = found.object_pose[:, :3].mean(axis=0)
-    return [_support(f"support_{k}", _corners(one, middle)) for k, one in enumerate(supports)]
-
-
-def _support(name: str, corners: Floats) -> Solid:
-    vertices, faces = hull(corners)
-    return Solid(name, vertices, faces, corner_normals(vertices, faces), SUPPORT_COLOUR)
+    hulls = [hull(_corners(one, middle)) for one in supports]
+    return [
+        Solid(f"support_{k}", vertices, faces, corner_normals(vertices, faces), SUPPORT_COLOUR)
+        for k, (vertices, faces) in enumerate(hulls)
+    ]
 
 
 def _corners(support: Obstacle, middle: Floats) -> Floats:
@@ -132,22 +124,11 @@ def _corners(support: Obstacle, middle: Floats) -> Floats:
     return np.array([foot + width * (a * across + b * beside) + thickness * c * normal for a, b, c in ends])
 
 
-def _name_of(hand: HandModel, number: int) -> str:
-    """Return a body's name; its second and later solids are numbered."""
-    bodies = drawn_bodies(hand)
-    before = bodies[:number].count(bodies[number])
-    return hand.body_names[bodies[number]] + (f"_{before + 1}" if before else "")
-
-
 RATE: Final = 24.0
 
 
 def write_usd(bundle: Bundle, folder: Path) -> list[Path]:
-    """Write `GRASP.usd` with `/World/HAND/LINK`, `/World/OBJECT` and `/World/scene`.
-
-    Raises:
-        InputError: usd-core is not installed.
-    """
+    """Write `GRASP.usd` with `/World/HAND/LINK`, `/World/OBJECT` and `/World/scene`."""
     try:
         from pxr import Usd, UsdGeom
     except ImportError:
@@ -168,7 +149,9 @@ def write_usd(bundle: Bundle, folder: Path) -> list[Path]:
         object_prim, hand_prim = bundle.prims
         root = f"/World/{hand_prim}"
         UsdGeom.Xform.Define(stage, root)
-        bodies, times = _bodies(found, trajectory), RATE * trajectory.time
+        # The hand's joints are the trajectory's last ones.
+        joints = trajectory.joints[:, -len(found.hand.joint_names) :]
+        bodies, times = body_poses(found.hand, trajectory.hand_pose, joints), RATE * trajectory.time
         at_grasp = posed_bodies(found, "grasp", row)
         for solid, name in zip(moving, prim_names([solid.name for solid in moving]), strict=True):
             _add(stage, f"{root}/{name}", solid, at_grasp[solid.body], bodies[:, solid.body], times)
@@ -178,12 +161,6 @@ def write_usd(bundle: Bundle, folder: Path) -> list[Path]:
             _add(stage, f"/World/scene/{solid.name}", solid)
         stage.Save()
     return written
-
-
-def _bodies(found: Executions, trajectory: RobotTrajectory) -> Floats:
-    """Return (K, L, 7) hand bodies at each point; the hand's joints are the trajectory's last ones."""
-    joints = trajectory.joints[:, -len(found.hand.joint_names) :]
-    return body_poses(found.hand, trajectory.hand_pose, joints)
 
 
 def _object_poses(found: Executions, row: int, trajectory: RobotTrajectory) -> Floats:

@@ -1,4 +1,4 @@
-"""Grasps that an arm can execute: inverse kinematics along the trajectory, limits, MuJoCo collisions.
+"""An arm that carries a hand, and the grasps that it can execute: inverse kinematics, limits, MuJoCo collisions.
 
 Differential inverse kinematics by mink: each step is a quadratic program in the joints' increments that respects their
 limits. Between consecutive poses of the trajectory the arm must not jump.
@@ -6,8 +6,9 @@ limits. Between consecutive poses of the trajectory the arm must not jump.
 
 from __future__ import annotations
 
+import pathlib
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
@@ -15,16 +16,89 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.exchange.robots.arm import Arm
 from graspd.exchange.robots.execution import Executions, Path, straight_paths
+from graspd.service.model.digests import digest_files
 from graspd.service.model.errors import InputError
+from graspd.service.model.states import AssetKind
 from graspd.service.model.transforms import Floats
 from graspd.worker.engines.mujoco_warnings import ARENA
-from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
+from graspd.worker.hands.collisions import resting_neighbours
+from graspd.worker.hands.load import HandSource, body_model, files_from_path
 from graspd.worker.hands.model import HandModel, JointType
+from graspd.worker.hands.options import HandOptions
+from graspd.worker.hands.robot import FREE, MOVING, chain_to
+from graspd.worker.hands.tree import build_tree
 from graspd.worker.simulation.environment import Obstacle
 from graspd.worker.validation.decomposition import ConvexPieces
 from graspd.worker.validation.model import add_shape
+
+
+@dataclass(frozen=True)
+class Arm:
+    """The chain of an arm with all its links but those below the mount."""
+
+    model: HandModel
+    """Bodies, joints, limits and convex pieces; it has no palm and no fingers."""
+    mount: str
+    mount_body: int
+    mount_pose: Floats
+    """(7,) mount link in its body's frame."""
+    hand_pose: Floats
+    """(7,) hand's root link in the mount link."""
+
+
+def read_arm(path: str | pathlib.Path, mount: str, hand_pose: Floats) -> Arm:
+    """Read the arm of a URDF, its folder or a ZIP.
+
+    Links below the mount, such as a gripper, are omitted. Joints that do not lead to it are fixed at zero, or at the
+    nearest value inside their limits.
+    """
+    name, files, stated = files_from_path(path)
+    source = HandSource.read(files, stated, name=name, digest=digest_files(AssetKind.HAND, files))
+    robot = source.robot
+    if mount not in robot.links:
+        near = ", ".join(list(robot.links)[-6:])
+        raise InputError(f"the arm {name} has no link {mount[:80]!r} to mount a hand on; its last links: {near}")
+    chain = {joint.name: joint.type for joint in chain_to(robot, mount)}
+    moving = {name for name, kind in chain.items() if kind in MOVING}
+    if not moving:
+        raise InputError(f"no joint of the arm {name} moves the link {mount!r}; name the link behind its last joint")
+    chosen = HandOptions(
+        file=source.main,
+        xacro=source.options.xacro,
+        root=robot.root,
+        drop=tuple(joint.child for joint in robot.joints.values() if joint.parent == mount),
+        fix={
+            joint.name: float(np.clip(0.0, joint.lower, joint.upper))
+            for joint in robot.joints.values()
+            if joint.name not in moving and joint.type != "fixed" and (joint.name not in chain or joint.type in FREE)
+        },
+    )
+    tree = build_tree(robot, chosen)
+    model = body_model(replace(source, options=chosen), tree)
+    model = replace(model, neighbours=resting_neighbours(model))
+    body, pose = tree.links[mount]
+    return Arm(model, mount, body, np.asarray(pose, float), hand_pose)
+
+
+@dataclass(frozen=True)
+class Description:
+    """Links and joints of a hand."""
+
+    links: Mapping[str, tuple[int, Floats]]
+    """Each link below the root: its body, and its pose (7,) in the body's frame."""
+    mimics: frozenset[str]
+    """Joints that the description couples to others: its readers move them by themselves."""
+
+
+def describe(files: Mapping[str, bytes], options: Mapping[str, Any] | None = None) -> Description:
+    """Return the description of a hand's files; see `load_hand`."""
+    source = HandSource.read(files, options)
+    robot, tree = source.robot, build_tree(source.robot, source.options)
+    return Description(
+        dict(tree.links), frozenset(name for name in tree.joint_names if robot.joints[name].mimic is not None)
+    )
+
 
 #: Tolerance of the hand's pose [m, rad].
 NEAR_M: Final = 1e-4
@@ -47,17 +121,11 @@ class ReachResult:
     """Executable grasps of N."""
 
     rows: list[int] = field(default_factory=list)
-    """Indices of the executable grasps."""
     paths: list[list[Path]] = field(default_factory=list)
     """Their motions; joints are the arm's, then the hand's."""
     refused: Counter[str] = field(default_factory=Counter)
     """How many of the others for which reason."""
     candidates: int = 0
-
-    @property
-    def share(self) -> float:
-        """Share of the candidates that the arm reaches."""
-        return len(self.rows) / max(1, self.candidates)
 
 
 class ReachSearch:
@@ -79,11 +147,10 @@ class ReachSearch:
         self._limits = [mink.ConfigurationLimit(self._model)]
         self._order = np.array([int(self._model.joint(f"arm{b}").qposadr[0]) for b in arm.model.joint_body], np.intp)
 
-    def all(self, wanted: int = 0, run: ExecutionContext = DEFAULT_CONTEXT) -> ReachResult:
+    def all(self, wanted: int = 0) -> ReachResult:
         """Search all grasps, or in order until `wanted` are found."""
         reached = ReachResult()
         for row in range(len(self.found)):
-            run.check("the search of an arm's ways")
             reached.candidates += 1
             paths, reason = self.one(row)
             if paths is None:
@@ -91,7 +158,6 @@ class ReachSearch:
             else:
                 reached.rows.append(row)
                 reached.paths.append(paths)
-            run.progress(row + 1, len(self.found), "inverse kinematics")
             if wanted and len(reached.rows) >= wanted:
                 break
         return reached
@@ -114,7 +180,6 @@ class ReachSearch:
         return None, reason
 
     def _from(self, q: Floats, ways: list[Path], row: int) -> tuple[list[Path] | None, str]:
-        """Return the motions from one start, or the reason why there are none."""
         approach, *others = ways
         arrived = self._solve(q, approach.hand_pose[-1], STEPS)
         if arrived is None:
@@ -243,13 +308,6 @@ class ArmScene:
                 return " and ".join(self._told(int(geom)) for geom in contact.geom)
         return ""
 
-    def qpos(self, arm_joints: Floats, hand_joints: Floats) -> Floats:
-        """Return the model's coordinates."""
-        found = np.zeros(self.model.nq)
-        found[self.arm_qpos] = self.arm.model.expand(arm_joints)
-        found[self.hand_qpos] = hand_joints
-        return found
-
     def _told(self, geom: int) -> str:
         body = self.model.body(int(self.model.geom_bodyid[geom])).name
         for prefix, names in (("arm", self.arm.model.body_names), ("hand", self.hand.body_names)):
@@ -278,14 +336,12 @@ class ArmScene:
         arm, hand = self.arm.model, self.hand
         open_ = hand.expand(hand.preshape)
         data.mocap_pos[0] = [0, 0, 1e3]
-        count: dict[tuple[int, int], int] = {}
+        count = Counter[tuple[int, ...]]()
         for _ in range(SAMPLES):
             self._put(model, data, rng.uniform(arm.lower, arm.upper), open_)
             mujoco.mj_kinematics(model, data)
             mujoco.mj_collision(model, data)
-            pairs = {tuple(sorted(model.geom_bodyid[c.geom].tolist())) for c in data.contact if c.dist < 0}
-            for pair in pairs:
-                count[pair] = count.get(pair, 0) + 1
+            count.update({tuple(sorted(model.geom_bodyid[c.geom].tolist())) for c in data.contact if c.dist < 0})
         for (a, b), times in sorted(count.items()):
             # The first link turns at the base; any other link that is always in a support means a wrong base.
             if times >= ALWAYS * SAMPLES and (a or model.body(b).name == "arm1"):
@@ -293,7 +349,6 @@ class ArmScene:
 
 
 def _add_tree(spec: Any, root: Any, model: HandModel, prefix: str, contact: dict[str, int]) -> list[Any]:
-    """Add bodies with joints and shapes below `root`, which is body 0."""
     bodies = [root]
     for b in range(1, model.bodies):
         pose = model.origin[b]

@@ -28,28 +28,13 @@ def write_tables(bundle: Bundle, folder: Path) -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     joints = bundle.found.hand.joint_names
     of_trajectory = bundle.trajectories[0].joint_names
+    facts = ("row", "frame", "tool_frame", "scene", "valid", "success", "epsilon")
+    of_object = (f"object_{part}" for part in POSE_PARTS)
+    moving = ("grasp", "phase", "time_s", *POSE_PARTS, *of_trajectory)
     return [
-        _table(
-            folder / "grasps.csv",
-            (
-                "grasp",
-                "row",
-                "frame",
-                "tool_frame",
-                "scene",
-                "valid",
-                "success",
-                "epsilon",
-                *(f"object_{part}" for part in POSE_PARTS),
-            ),
-            _grasps(bundle),
-        ),
+        _table(folder / "grasps.csv", ("grasp", *facts, *of_object), _grasps(bundle)),
         _table(folder / "postures.csv", ("grasp", "posture", *POSE_PARTS, *joints), _postures(bundle)),
-        _table(
-            folder / "trajectories.csv",
-            ("grasp", "phase", "time_s", *POSE_PARTS, *of_trajectory),
-            _trajectories(bundle),
-        ),
+        _table(folder / "trajectories.csv", moving, _trajectories(bundle)),
     ]
 
 
@@ -57,17 +42,10 @@ def _grasps(bundle: Bundle) -> Iterable[list[Any]]:
     found = bundle.found
     for row in range(len(found)):
         scene = "" if found.placed is None else int(found.placed.index[row])
-        validated = [int(found.quality["valid"][row]), int(found.quality["success"][row])]
-        yield [
-            bundle.name(row),
-            int(found.rows[row]),
-            bundle.frame,
-            found.tool.name,
-            scene,
-            *validated,
-            *numbers(found.quality["epsilon"][row]),
-            *numbers(bundle.seen(found.object_pose[row])),
-        ]
+        place = [bundle.name(row), int(found.rows[row]), bundle.frame, found.tool.name, scene]
+        verdicts = [int(found.quality[name][row]) for name in ("valid", "success")]
+        pose = numbers(bundle.seen(found.object_pose[row]))
+        yield [*place, *verdicts, *numbers(found.quality["epsilon"][row]), *pose]
 
 
 def _postures(bundle: Bundle) -> Iterable[list[Any]]:

@@ -11,11 +11,11 @@ import typer
 from graspd.api.access.keys import Key, KeyFile, KeyLimits, ProjectLimits, Scope
 from graspd.api.formatting import minute
 from graspd.client.client import path_of
-from graspd.client.reports import UrlOption, YesOption, confirm, open_client, say_deleted
-from graspd.service.cli import JsonFlag, emit, load_settings, plain_console, plain_table, reporting_errors
+from graspd.client.reports import UrlOption, YesOption, confirm, open_client, print_rows, say_deleted
+from graspd.service.cli import CommandGroup, JsonFlag, load_settings, report
 from graspd.service.model.errors import InputError
 
-keys_app = typer.Typer(no_args_is_help=True, help="Make, list, rotate, limit and revoke API keys.")
+keys_app = CommandGroup(no_args_is_help=True, help="Make, list, rotate, limit and revoke API keys.")
 
 _UNITS: Final = {"s": "seconds", "m": "minutes", "h": "hours", "d": "days"}
 
@@ -33,7 +33,6 @@ JobsOption = Annotated[int | None, typer.Option(min=0, help="New jobs per day (U
 
 
 @keys_app.command("add", epilog="graspd keys add alice --scope submit --expires 90d --grasps-in-flight 100000")
-@reporting_errors
 def add_key(
     name: NameArgument,
     scope: Annotated[Scope, typer.Option(help="Scope of the key.")] = Scope.SUBMIT,
@@ -46,14 +45,18 @@ def add_key(
     json: JsonFlag = False,
 ) -> None:
     """Make a key and show it once. Limits default to those of the settings."""
-    limits = _limits(requests_per_minute, concurrency, grasps_in_flight, jobs_per_day)
+    given = _given(
+        requests_per_minute=requests_per_minute,
+        concurrency=concurrency,
+        grasps_in_flight=grasps_in_flight,
+        jobs_per_day=jobs_per_day,
+    )
     lifetime = duration(expires) if expires else None
-    token = _key_file().add(name, scope, lifetime=lifetime, limits=limits, project=project)
+    token = _key_file().add(name, scope, lifetime=lifetime, limits=KeyLimits(**given), project=project)
     _show_token(name, scope, token, json=json)
 
 
 @keys_app.command("rotate", epilog="graspd keys rotate alice --grace 24h")
-@reporting_errors
 def rotate_key(
     name: NameArgument,
     grace: Annotated[
@@ -69,7 +72,6 @@ def rotate_key(
 
 
 @keys_app.command("limit", epilog="graspd keys limit alice --requests-per-minute 60 --jobs-per-day 100")
-@reporting_errors
 def limit_key(
     name: NameArgument,
     requests_per_minute: RequestsOption = None,
@@ -79,43 +81,40 @@ def limit_key(
     json: JsonFlag = False,
 ) -> None:
     """Change the limits of a key, from the next request on."""
-    wanted = _limits(requests_per_minute, concurrency, grasps_in_flight, jobs_per_day)
-    if not wanted.model_fields_set:
+    given = _given(
+        requests_per_minute=requests_per_minute,
+        concurrency=concurrency,
+        grasps_in_flight=grasps_in_flight,
+        jobs_per_day=jobs_per_day,
+    )
+    if not given:
         raise InputError("give at least one limit, such as --jobs-per-day 100")
-    limits = _key_file().limit(name, wanted)
-    if json:
-        emit({"name": name, "limits": limits.model_dump(exclude_none=True)})
-        return
-    typer.echo(f"limits of {name}: {_key_limits(limits)}")
+    limits = _key_file().limit(name, KeyLimits(**given))
+    document = {"name": name, "limits": limits.model_dump(exclude_none=True)}
+    report(document, f"limits of {name}: {_key_limits(limits)}", json=json)
 
 
 @keys_app.command("list", epilog="graspd keys list --json")
-@reporting_errors
 def list_keys(json: JsonFlag = False) -> None:
     """List all keys, without their secrets."""
     found = _key_file().list()
-    if json:
-        emit({"keys": [key.model_dump(mode="json", exclude={"sha256"}) for key in found]})
-        return
+    document = {"keys": [key.model_dump(mode="json", exclude={"sha256"}) for key in found]}
     has_projects = any(key.project for key in found)
     names = ["name", "scope", *(["project"] if has_projects else []), "state", "created", "expires", "limits"]
-    table = plain_table(*names, whole=("state", "created", "expires"))
+    rows = []
     for key in found:
         of = [key.project or "-"] if has_projects else []
         times = minute(key.created), minute(key.expires)
-        table.add_row(key.name, key.scope, *of, _state(key), *times, _key_limits(key.limits))
-    plain_console().print(table if found else "no key; the service is open, but only to this machine")
+        rows.append((key.name, key.scope, *of, _state(key), *times, _key_limits(key.limits)))
+    empty = "no key; the service is open, but only to this machine"
+    print_rows(document, names, rows, whole=("state", "created", "expires"), empty=empty, json=json)
 
 
 @keys_app.command("revoke", epilog="graspd keys revoke alice")
-@reporting_errors
 def revoke_key(name: NameArgument, json: JsonFlag = False) -> None:
     """Revoke a key; it is refused from the next request on."""
     _key_file().revoke(name)
-    if json:
-        emit({"name": name, "revoked": True})
-        return
-    typer.echo(f"the key {name} is revoked")
+    report({"name": name, "revoked": True}, f"the key {name} is revoked", json=json)
 
 
 def duration(text: str) -> timedelta:
@@ -126,22 +125,14 @@ def duration(text: str) -> timedelta:
     return timedelta(**{_UNITS[match[2]]: int(match[1])})
 
 
-def _limits(requests: int | None, concurrency: int | None, grasps: int | None, jobs: int | None) -> KeyLimits:
-    given = {
-        "requests_per_minute": requests,
-        "concurrency": concurrency,
-        "grasps_in_flight": grasps,
-        "jobs_per_day": jobs,
-    }
-    return KeyLimits(**{name: value for name, value in given.items() if value is not None})
+def _given(**limits: int | None) -> dict[str, int]:
+    return {name: value for name, value in limits.items() if value is not None}
 
 
 def _show_token(name: str, scope: Scope, token: str, *, json: bool) -> None:
-    if json:
-        emit({"name": name, "scope": scope, "key": token})
-        return
-    typer.echo(token)
-    typer.echo("This is the only time the key is shown. Send it as `Authorization: Bearer ...`.", err=True)
+    report({"name": name, "scope": scope, "key": token}, token, json=json)
+    if not json:
+        typer.echo("This is the only time the key is shown. Send it as `Authorization: Bearer ...`.", err=True)
 
 
 def _state(key: Key) -> str:
@@ -159,36 +150,31 @@ def _key_file() -> KeyFile:
     return KeyFile(load_settings().resolved_keys_file)
 
 
-projects_app = typer.Typer(no_args_is_help=True, help="List projects of keys and set their limits.")
+projects_app = CommandGroup(no_args_is_help=True, help="List projects of keys and set their limits.")
 
 
 @projects_app.command("list", epilog="graspd projects list --json")
-@reporting_errors
 def list_projects(json: JsonFlag = False) -> None:
     """List projects of keys, and their limits. `graspd keys add NAME --project PROJECT` makes one."""
-    file = KeyFile(load_settings().resolved_keys_file)
+    file = _key_file()
     live: dict[str, list[str]] = {}
     for key in file.list():
         if key.is_live and key.name not in live.setdefault(key.project, []):
             live[key.project].append(key.name)
     found = file.projects()
-    if json:
-        rows = [
-            {"project": name, "keys": live.get(name, []), "limits": limits.model_dump(exclude_none=True)}
-            for name, limits in found.items()
-        ]
-        emit({"projects": rows})
-        return
-    table = plain_table("project", "keys", "limits")
-    for name, limits in found.items():
-        table.add_row(name, ", ".join(live.get(name, [])) or "no valid key", _project_limits(limits))
-    plain_console().print(table if found else "no project yet; `graspd keys add NAME --project PROJECT` makes one")
+    plain = {name: limits.model_dump(exclude_none=True) for name, limits in found.items()}
+    document = {"projects": [{"project": name, "keys": live.get(name, []), "limits": plain[name]} for name in found]}
+    rows = [
+        (name, ", ".join(live.get(name, [])) or "no valid key", _project_limits(limits))
+        for name, limits in found.items()
+    ]
+    empty = "no project yet; `graspd keys add NAME --project PROJECT` makes one"
+    print_rows(document, ("project", "keys", "limits"), rows, empty=empty, json=json)
 
 
 @projects_app.command(
     "limit", epilog="graspd projects limit vision --grasps-per-day 1000000 --gpu-seconds-per-day 86400"
 )
-@reporting_errors
 def limit_project(
     name: Annotated[str, typer.Argument(help="Name of the project.")],
     grasps_in_flight: Annotated[int | None, typer.Option(min=0, help="Grasps in unfinished jobs; 0: no limit.")] = None,
@@ -200,19 +186,14 @@ def limit_project(
     json: JsonFlag = False,
 ) -> None:
     """Change the shared limits of a project's keys, from the next submission on."""
-    given = {
-        "grasps_in_flight": grasps_in_flight,
-        "grasps_per_day": grasps_per_day,
-        "gpu_seconds_per_day": gpu_seconds_per_day,
-    }
-    wanted = ProjectLimits(**{limit: value for limit, value in given.items() if value is not None})
-    if not wanted.model_fields_set:
+    given = _given(
+        grasps_in_flight=grasps_in_flight, grasps_per_day=grasps_per_day, gpu_seconds_per_day=gpu_seconds_per_day
+    )
+    if not given:
         raise InputError("give at least one limit, such as --grasps-per-day 1000000")
-    limits = KeyFile(load_settings().resolved_keys_file).limit_project(name, wanted)
-    if json:
-        emit({"project": name, "limits": limits.model_dump(exclude_none=True)})
-        return
-    typer.echo(f"limits of {name}: {_project_limits(limits)}")
+    limits = _key_file().limit_project(name, ProjectLimits(**given))
+    document = {"project": name, "limits": limits.model_dump(exclude_none=True)}
+    report(document, f"limits of {name}: {_project_limits(limits)}", json=json)
 
 
 def _project_limits(limits: ProjectLimits) -> str:
@@ -220,7 +201,7 @@ def _project_limits(limits: ProjectLimits) -> str:
     return ", ".join(f"{value} {name.replace('_', ' ')}" for name, value in found.items()) or "none"
 
 
-webhooks_app = typer.Typer(
+webhooks_app = CommandGroup(
     no_args_is_help=True, help="Webhooks that receive a notification when jobs and datasets end."
 )
 
@@ -228,7 +209,6 @@ IdArgument = Annotated[str, typer.Argument(metavar="ID", help="Id of the webhook
 
 
 @webhooks_app.command("add", epilog="graspd webhooks add https://ci.example.org/graspd --on succeeded,failed")
-@reporting_errors
 def add_webhook(
     address: Annotated[str, typer.Argument(help="URL that receives the POST requests: https://host/path.")],
     on: Annotated[
@@ -241,47 +221,36 @@ def add_webhook(
     states = [one.strip() for one in on.split(",") if one.strip()]
     with open_client(url) as client:
         made = client.send("POST", "/v1/webhooks", json={"url": address, "states": states}).json()
-    if json:
-        emit(made)
-        return
-    typer.echo(made["secret"])
-    typer.echo(f"webhook {made['id']}. This is the only time its secret is shown.", err=True)
+    report(made, made["secret"], json=json)
+    if not json:
+        typer.echo(f"webhook {made['id']}. This is the only time its secret is shown.", err=True)
 
 
 @webhooks_app.command("list", epilog="graspd webhooks list")
-@reporting_errors
 def list_webhooks(url: UrlOption = None, json: JsonFlag = False) -> None:
     """List webhooks that the key may change."""
     with open_client(url) as client:
         found = client.send("GET", "/v1/webhooks").json()
-    if json:
-        emit({"webhooks": found})
-        return
-    table = plain_table("id", "address", "on", "since", whole=("id", "since"))
-    for one in found:
-        table.add_row(one["id"], one["url"], ", ".join(one["states"]), minute(one["created"]))
-    plain_console().print(table if found else "no webhook yet; `graspd webhooks add URL` makes one")
+    rows = [(one["id"], one["url"], ", ".join(one["states"]), minute(one["created"])) for one in found]
+    names, empty = ("id", "address", "on", "since"), "no webhook yet; `graspd webhooks add URL` makes one"
+    print_rows({"webhooks": found}, names, rows, whole=("id", "since"), empty=empty, json=json)
 
 
 @webhooks_app.command("log", epilog="graspd webhooks log 1a2b3c")
-@reporting_errors
 def show_log(webhook: IdArgument, url: UrlOption = None, json: JsonFlag = False) -> None:
     """List deliveries of a webhook, newest first."""
     with open_client(url) as client:
         found = client.send("GET", path_of("webhooks", webhook, "deliveries")).json()
-    if json:
-        emit({"deliveries": found})
-        return
-    table = plain_table("what", "ended", "delivery", "attempts", "last", "", whole=("ended", "delivery", "last"))
+    rows = []
     for one in found:
         what = f"{one['kind']} {one['subject'][:12] if one['kind'] == 'job' else one['subject']}"
-        tried = (str(one["attempts"]), minute(one["tried"]))
-        table.add_row(what, one["ended"], one["state"], *tried, one["detail"])
-    plain_console().print(table if found else "no delivery yet")
+        rows.append((what, one["ended"], one["state"], str(one["attempts"]), minute(one["tried"]), one["detail"]))
+    names = ("what", "ended", "delivery", "attempts", "last", "")
+    whole = ("ended", "delivery", "last")
+    print_rows({"deliveries": found}, names, rows, whole=whole, empty="no delivery yet", json=json)
 
 
 @webhooks_app.command("delete", epilog="graspd webhooks delete 1a2b3c")
-@reporting_errors
 def delete_webhook(webhook: IdArgument, yes: YesOption = False, url: UrlOption = None, json: JsonFlag = False) -> None:
     """Delete a webhook and its secret."""
     with open_client(url) as client:

@@ -5,7 +5,6 @@ A hand is a folder, or a description with the files it needs, which are packed i
 from __future__ import annotations
 
 import json
-import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
@@ -18,7 +17,7 @@ import typer
 from graspd.api.uploads import name_of_upload
 from graspd.client.client import Client
 from graspd.client.reports import UrlOption, open_client, show_asset
-from graspd.service.cli import JsonFlag, emit, reporting_errors
+from graspd.service.cli import JsonFlag, emit
 from graspd.service.command_options import with_options
 from graspd.service.model.errors import InputError
 from graspd.service.model.states import AssetKind
@@ -47,7 +46,6 @@ _SELF_TEST_S: Final = 900.0
 
 
 @with_options(HandWords, "asset")
-@reporting_errors
 def add_hand(
     file: Annotated[Path, typer.Argument(help="URDF, xacro or MJCF file with its meshes, its folder, or a ZIP of it.")],
     name: NameOption = None,
@@ -71,7 +69,6 @@ def add_hand(
 
 
 @with_options(SweptOptions, "asset")
-@reporting_errors
 def add_object(
     file: Annotated[Path, typer.Argument(help="Mesh, ZIP with one mesh, or folder or ZIP of many objects.")],
     name: NameOption = None,
@@ -97,7 +94,6 @@ def add_object(
     add(options=options, shared=shared, wait=wait, url=url, json=json)
 
 
-@reporting_errors
 def add_network(
     file: Annotated[Path, typer.Argument(help="NPZ file of the schema graspd/proposals@1.")],
     name: NameOption = None,
@@ -138,9 +134,6 @@ def upload_of(path: Path) -> Iterator[tuple[Path, str]]:
     """Yield the file to send, and the name of the hand's description in it (empty: chosen by the service).
 
     The file is the path itself, or a temporary ZIP of the files it needs.
-
-    Raises:
-        InputError, LimitError: see `files_of_hand`.
     """
     alone = not path.is_dir() and (path.suffix.lower() not in SUFFIXES or not path.is_file())
     files, main = ({}, "") if alone else files_of_hand(path)
@@ -190,22 +183,16 @@ def add_set(
     url: str | None,
     json: bool,
 ) -> None:
-    """Upload objects, wait for all checks, and make a set; a refused object does not stop the others.
-
-    Raises:
-        InputError: some were refused; each is listed first.
-    """
+    """Upload objects as a set and report it; InputError if some were refused, after each is listed."""
     with open_client(url) as client:
         say = None if json else typer.echo
-        told = upload_set(client, objects, prefix=prefix, options=options, shared=shared, wait=wait, say=say)
-        taken = [one["name"] for one in told if one["verdict"] != "refuse"]
-        if taken:
-            client.add_object_set(name, taken)
+        told = upload_set(client, objects, name, prefix=prefix, options=options, shared=shared, wait=wait, say=say)
     refused = [one["name"] for one in told if one["verdict"] == "refuse"]
+    taken = len(told) - len(refused)
     if json:
         emit({"objects": told, "refused": refused, "set": name if taken else None})
     elif taken:
-        typer.echo(f"set {name}: {len(taken)} objects; `graspd datasets create NAME --hands HANDS --objects {name}`")
+        typer.echo(f"set {name}: {taken} objects; `graspd datasets create NAME --hands HANDS --objects {name}`")
     if refused:
         raise InputError(f"{len(refused)} of {len(told)} objects were refused: {', '.join(refused[:5])}")
 
@@ -213,6 +200,7 @@ def add_set(
 def upload_set(
     client: Client,
     objects: Objects,
+    set_name: str,
     *,
     prefix: str | None = None,
     options: dict[str, Any] | None = None,
@@ -220,10 +208,9 @@ def upload_set(
     wait: bool = True,
     say: Callable[[str], None] | None = None,
 ) -> list[dict[str, Any]]:
-    """Upload objects and wait for their checks; return name, verdict, message and repairs of each.
+    """Upload objects, wait for their checks, and make a set; a refused object does not stop the others.
 
-    Args:
-        say: called with a line for each object as soon as its check is done.
+    Return name, verdict, message and repairs of each; `say` gets a line for each as soon as its check is done.
     """
     told = [
         _upload(client, f"{prefix}-{name}" if prefix else name, files, options or {}, shared=shared)
@@ -235,24 +222,20 @@ def upload_set(
             one.update(verdict=asset.verdict, message=asset.message or "", repairs=asset.repairs)
         if say is not None:
             say(verdict_line(one))
+    if taken := [one["name"] for one in told if one["verdict"] != "refuse"]:
+        client.add_object_set(set_name, taken)
     return told
 
 
 def _upload(
     client: Client, name: str, files: dict[str, bytes], options: dict[str, Any], *, shared: bool
 ) -> dict[str, Any]:
-    """Upload one object of a set; return its name and present state."""
     try:
-        with tempfile.TemporaryDirectory(prefix="graspd-set-") as folder:
+        with TemporaryDirectory(prefix="graspd-set-") as folder:
             archive = Path(folder) / "object.zip"
             archive.write_bytes(pack(files))
             asset = client.upload(AssetKind.OBJECT, archive, name=name, options=options, shared=shared)
     except InputError as error:
         return {"name": name, "verdict": "refuse", "message": str(error), "repairs": []}
-    return {
-        "name": asset.name,
-        "digest": asset.digest,
-        "verdict": asset.verdict,
-        "message": asset.message or "",
-        "repairs": asset.repairs,
-    }
+    told = {"name": asset.name, "digest": asset.digest, "verdict": asset.verdict}
+    return told | {"message": asset.message or "", "repairs": asset.repairs}

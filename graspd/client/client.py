@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Final, Self, TypeVar
 from urllib.parse import quote
 
@@ -15,7 +15,7 @@ from httpx_sse import EventSource
 from pydantic import BaseModel, TypeAdapter
 
 from graspd.api.formatting import is_loopback
-from graspd.api.models import GraspQuery, Health, Job, JobDetail, Shard
+from graspd.api.models import GraspQuery, Job, JobDetail
 from graspd.service.index.views import AssetView, CellView, DatasetView, GraspView, ObjectSetView, Page, SnapshotView
 from graspd.service.model.domain import JobRequest
 from graspd.service.model.errors import ERRORS, GraspdError, InputError, RateError, UnavailableError, without_secrets
@@ -40,16 +40,7 @@ View = TypeVar("View", bound=BaseModel)
 
 
 class Client:
-    """Connection to one graspd API. Usable as a context manager.
-
-    Args:
-        url: address of the API, e.g. http://127.0.0.1:8000.
-        key: Bearer key, if the service requires one.
-        transport: replaces the network in tests.
-
-    Raises:
-        InputError: the address or the key cannot be used.
-    """
+    """Connection to one graspd API. Usable as a context manager. `transport` replaces the network in tests."""
 
     def __init__(self, url: str, *, key: str | None = None, transport: httpx.BaseTransport | None = None) -> None:
         address = _address(url.strip().rstrip("/"))
@@ -68,48 +59,43 @@ class Client:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:
         self._http.close()
 
-    def submit(self, request: JobRequest, *, idempotency_key: str | None = None) -> JobDetail:
+    def submit(self, request: JobRequest) -> JobDetail:
         """Submit a job; an identical request returns the same job."""
-        headers = {"Idempotency-Key": idempotency_key} if idempotency_key else {}
-        answer = self.send("POST", "/v1/jobs", json=request.model_dump(mode="json"), headers=headers)
-        return JobDetail.model_validate_json(answer.content)
+        return self._document(JobDetail, "POST", "/v1/jobs", json=request.model_dump(mode="json"))
 
     def job(self, job_id: str) -> JobDetail:
-        return JobDetail.model_validate_json(self.send("GET", path_of("jobs", job_id)).content)
+        return self._document(JobDetail, "GET", path_of("jobs", job_id))
 
-    def jobs(self, *, state: State | None = None, limit: int = 50, cursor: str | None = None) -> Page[Job]:
+    def jobs(self, *, state: State | None = None, limit: int = 50) -> Page[Job]:
         """Return jobs, newest first."""
-        params = {"state": state, "limit": limit, "cursor": cursor}
-        return Page[Job].model_validate_json(self.send("GET", "/v1/jobs", params=params).content)
+        return self._document(Page[Job], "GET", "/v1/jobs", params={"state": state, "limit": limit})
 
     def cancel(self, job_id: str) -> JobDetail:
-        return JobDetail.model_validate_json(self.send("POST", path_of("jobs", job_id, "cancel")).content)
+        return self._document(JobDetail, "POST", path_of("jobs", job_id, "cancel"))
 
     def delete(self, path: str, **params: Any) -> None:
         """Delete the resource at an address: `/v1/jobs/ID`, `/v1/objects/NAME`."""
         self.send("DELETE", path, params=params)
 
     def retry(self, job_id: str) -> JobDetail:
-        return JobDetail.model_validate_json(self.send("POST", path_of("jobs", job_id, "retry")).content)
+        return self._document(JobDetail, "POST", path_of("jobs", job_id, "retry"))
 
-    def grasps(self, query: GraspQuery, *, limit: int = 50, cursor: str | None = None) -> Page[GraspView]:
-        params = query.model_dump(mode="json", exclude_none=True) | {"limit": limit, "cursor": cursor}
-        return Page[GraspView].model_validate_json(self.send("GET", "/v1/grasps", params=params).content)
+    def grasps(self, query: GraspQuery, *, limit: int = 50) -> Page[GraspView]:
+        params = query.model_dump(mode="json", exclude_none=True) | {"limit": limit}
+        return self._document(Page[GraspView], "GET", "/v1/grasps", params=params)
 
     def assets(self, kind: AssetKind, *, refused: bool = False) -> Iterator[AssetView]:
         """Yield all hands, objects or networks; refused ones only on request."""
         return self._pages(AssetView, f"/v1/{kind.value}s", refused=refused)
 
     def asset(self, kind: AssetKind, name: str) -> AssetView:
-        return AssetView.model_validate_json(self.send("GET", path_of(f"{kind.value}s", name)).content)
+        return self._document(AssetView, "GET", path_of(f"{kind.value}s", name))
 
     def upload(
         self,
@@ -129,17 +115,13 @@ class Client:
         fields |= {name: "true" for name, wanted in {"self_test": self_test, "shared": shared}.items() if wanted}
         try:
             with path.open("rb") as file:
-                answer = self.send("POST", f"/v1/{kind.value}s", files={"file": (path.name, file)}, data=fields)
+                sent = {"file": (path.name, file)}
+                return self._document(AssetView, "POST", f"/v1/{kind.value}s", files=sent, data=fields)
         except OSError as error:
             raise InputError(f"{path} cannot be read: {error.strerror}") from None
-        return AssetView.model_validate_json(answer.content)
 
     def wait_checked(self, kind: AssetKind, digest: str, *, timeout_s: float = 120.0) -> AssetView:
-        """Return an uploaded asset after its check; raise UnavailableError if no worker checked it in time.
-
-        Args:
-            digest: digest of its files: after a refusal, the name may refer to another asset.
-        """
+        """Return an uploaded asset after its check; after a refusal, its name may refer to another asset."""
         deadline = time.monotonic() + timeout_s
         while (asset := self.asset(kind, digest)).verdict is None:
             if time.monotonic() > deadline:
@@ -153,13 +135,9 @@ class Client:
     ) -> Iterator[bytes]:
         """Yield chunks of a file from the API; each may take at most `patience_s` [s]."""
         timeout = httpx.Timeout(patience_s, connect=_CONNECT_S)
-        with _Translated(self.url), self._http.stream("GET", path, params=params, timeout=timeout) as answer:
+        with _translated(self.url), self._http.stream("GET", path, params=params, timeout=timeout) as answer:
             _raise_for(answer)
             yield from answer.iter_bytes()
-
-    def download(self, shard: Shard, path: Path) -> Path:
-        """Download the file of a shard; `path` appears once it is complete."""
-        return self.save(shard.file, path)
 
     def save(
         self, address: str, path: Path, *, params: dict[str, str] | None = None, patience_s: float = _PATIENCE_S
@@ -174,11 +152,6 @@ class Client:
         finally:
             draft.unlink(missing_ok=True)
         return path
-
-    def health(self) -> Health:
-        """Return the state of the parts, even if one of them is down."""
-        with _Translated(self.url):
-            return Health.model_validate_json(self._http.get("/readyz").content)
 
     def watch(self, job_id: str) -> Iterator[Job]:
         """Yield a job at each change until it ends; reconnects after a restart of the API."""
@@ -202,65 +175,62 @@ class Client:
         return self.job(job_id)
 
     def create_dataset(self, request: DatasetRequest) -> DatasetView:
-        answer = self.send("POST", "/v1/datasets", json=_matrix_body(request))
-        return DatasetView.model_validate_json(answer.content)
+        return self._document(DatasetView, "POST", "/v1/datasets", json=_matrix_body(request))
 
     def estimate(self, matrix: Matrix) -> Estimate:
         """Estimate the cost of a matrix of datasets."""
         body = {name: value for name, value in _matrix_body(matrix).items() if name in Matrix.model_fields}
-        return Estimate.model_validate_json(self.send("POST", "/v1/datasets/estimate", json=body).content)
+        return self._document(Estimate, "POST", "/v1/datasets/estimate", json=body)
 
-    def datasets(self, *, limit: int = 50, cursor: str | None = None) -> Page[DatasetView]:
+    def datasets(self, *, limit: int = 50) -> Page[DatasetView]:
         """Return datasets, newest first."""
-        answer = self.send("GET", "/v1/datasets", params={"limit": limit, "cursor": cursor})
-        return Page[DatasetView].model_validate_json(answer.content)
+        return self._document(Page[DatasetView], "GET", "/v1/datasets", params={"limit": limit})
 
     def dataset(self, name: str) -> DatasetView:
-        return DatasetView.model_validate_json(self.send("GET", path_of("datasets", name)).content)
+        return self._document(DatasetView, "GET", path_of("datasets", name))
 
     def cells(self, name: str, *, state: State | None = None) -> Iterator[CellView]:
         """Yield all cells of a dataset, or those in a state."""
         return self._pages(CellView, path_of("datasets", name, "cells"), state=state)
 
     def cancel_dataset(self, name: str) -> DatasetView:
-        return DatasetView.model_validate_json(self.send("POST", path_of("datasets", name, "cancel")).content)
+        return self._document(DatasetView, "POST", path_of("datasets", name, "cancel"))
 
     def retry_dataset(self, name: str) -> DatasetView:
-        return DatasetView.model_validate_json(self.send("POST", path_of("datasets", name, "retry")).content)
+        return self._document(DatasetView, "POST", path_of("datasets", name, "retry"))
 
     def take_snapshot(self, name: str) -> SnapshotView:
-        return SnapshotView.model_validate_json(self.send("POST", path_of("datasets", name, "snapshots")).content)
+        return self._document(SnapshotView, "POST", path_of("datasets", name, "snapshots"))
 
     def snapshot(self, name: str, digest: str) -> Snapshot:
         """Return a snapshot with its list of shards."""
-        return Snapshot.model_validate_json(self.send("GET", path_of("datasets", name, "snapshots", digest)).content)
+        return self._document(Snapshot, "GET", path_of("datasets", name, "snapshots", digest))
 
     def watch_dataset(self, name: str) -> Iterator[DatasetView]:
         """Yield a dataset every second until it ends."""
-        while True:
-            dataset = self.dataset(name)
+        while not (dataset := self.dataset(name)).state.is_final:
             yield dataset
-            if dataset.state.is_final:
-                return
             time.sleep(_DATASET_POLL_S)
+        yield dataset
 
     def add_object_set(self, name: str, objects: Iterable[str]) -> ObjectSetView:
-        answer = self.send("POST", "/v1/object-sets", json={"name": name, "objects": list(objects)})
-        return ObjectSetView.model_validate_json(answer.content)
+        body = {"name": name, "objects": list(objects)}
+        return self._document(ObjectSetView, "POST", "/v1/object-sets", json=body)
 
     def object_sets(self) -> list[ObjectSetView]:
         return TypeAdapter(list[ObjectSetView]).validate_json(self.send("GET", "/v1/object-sets").content)
 
     def _pages(self, kind: type[View], path: str, **params: Any) -> Iterator[View]:
-        """Yield all items of a paginated list."""
-        cursor: str | None = None
+        params |= {"limit": _PAGE, "cursor": None}
         while True:
-            answer = self.send("GET", path, params={"limit": _PAGE, "cursor": cursor, **params})
-            page = Page[kind].model_validate_json(answer.content)  # type: ignore[valid-type]
+            page: Page[Any] = self._document(Page[kind], "GET", path, params=params)  # type: ignore[valid-type]
             yield from page.items
-            cursor = page.next
-            if cursor is None:
+            params["cursor"] = page.next
+            if page.next is None:
                 return
+
+    def _document(self, kind: type[View], method: str, path: str, **options: Any) -> View:
+        return kind.model_validate_json(self.send(method, path, **options).content)
 
     def _comes_back(self, timeout_s: float = 30.0) -> bool:
         deadline = time.monotonic() + timeout_s
@@ -274,7 +244,7 @@ class Client:
         return False
 
     def _events(self, path: str) -> Iterator[tuple[str, Any]]:
-        with _Translated(self.url), self._http.stream("GET", path, timeout=_STREAM_TIMEOUT) as answer:
+        with _translated(self.url), self._http.stream("GET", path, timeout=_STREAM_TIMEOUT) as answer:
             _raise_for(answer)
             yield from events_of(answer)
 
@@ -282,7 +252,7 @@ class Client:
         """Send a request and return the response; raise the error of a problem document."""
         given = {name: value for name, value in (params or {}).items() if value is not None}
         for wait in (*_WAITS_S, None):
-            with _Translated(self.url):
+            with _translated(self.url):
                 answer = self._http.request(method, path, params=given or None, **options)
             if wait is None or not _is_too_fast(answer):
                 break
@@ -332,24 +302,16 @@ def events_of(answer: httpx.Response) -> Iterator[tuple[str, Any]]:
             yield event.event, event.json()
 
 
-class _Translated:
-    """Context that converts network errors to UnavailableError."""
-
-    def __init__(self, url: str) -> None:
-        self.url = url
-
-    def __enter__(self) -> None:
-        return None
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if isinstance(error, httpx.ConnectError | httpx.ConnectTimeout):
-            raise UnavailableError(
-                f"no graspd answers at {self.url}; start one with `graspd up`, or set GRASPD_API_URL"
-            ) from None
-        if isinstance(error, httpx.HTTPError | httpx.InvalidURL):
-            raise UnavailableError(f"the connection to {self.url} broke: {error or type(error).__name__}") from None
+@contextmanager
+def _translated(url: str) -> Iterator[None]:
+    """Convert network errors to UnavailableError."""
+    try:
+        yield
+    except (httpx.ConnectError, httpx.ConnectTimeout):
+        fix = "start one with `graspd up`, or set GRASPD_API_URL"
+        raise UnavailableError(f"no graspd answers at {url}; {fix}") from None
+    except (httpx.HTTPError, httpx.InvalidURL) as error:
+        raise UnavailableError(f"the connection to {url} broke: {error or type(error).__name__}") from None
 
 
 def _raise_for(answer: httpx.Response) -> None:

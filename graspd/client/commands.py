@@ -19,13 +19,14 @@ from graspd.client.reports import (
     YesOption,
     confirm,
     open_client,
+    print_rows,
     restore,
     say_deleted,
     show_asset,
     show_job,
     watch,
 )
-from graspd.service.cli import JsonFlag, emit, plain_console, plain_table, reporting_errors
+from graspd.service.cli import CommandGroup, JsonFlag, emit, plain_console
 from graspd.service.command_options import pairs, parsed_options, with_options
 from graspd.service.model.domain import NETWORK_METHODS, JobOptions, JobRequest
 from graspd.service.model.errors import InputError
@@ -33,14 +34,13 @@ from graspd.service.model.scene_spec import scene_option
 from graspd.service.model.states import AssetKind, State
 from graspd.service.store.asset_summary import hand_line, self_test_line
 
-app = typer.Typer(no_args_is_help=True)
+app = CommandGroup(no_args_is_help=True)
 
 JobArgument = Annotated[str, typer.Argument(help="Job id, or a prefix of it.")]
 
 
 @app.command(epilog="graspd submit --hand allegro --object mug.stl --grasps 320 --scenes 2 --views 3 --wait")
 @with_options(JobOptions, "job")
-@reporting_errors
 def submit(
     hand: Annotated[str, typer.Option(help="Name of a hand, or a URDF or ZIP to upload.")],
     object: Annotated[str, typer.Option(help="Name of an object, or a mesh file to upload.")],
@@ -68,7 +68,6 @@ def submit(
 
 
 @app.command(epilog="graspd jobs --state running")
-@reporting_errors
 def jobs(
     state: Annotated[State | None, typer.Option(help="Only jobs in this state.")] = None,
     limit: Annotated[int, typer.Option(min=1, max=200, help="Maximum number of jobs.")] = 20,
@@ -78,21 +77,19 @@ def jobs(
     """List jobs, newest first."""
     with open_client(url) as client:
         page = client.jobs(state=state, limit=limit)
-    if json:
-        emit({"jobs": [job.model_dump(mode="json") for job in page.items], "next": page.next})
-        return
-    names = ("job", "state", "hand", "object", "progress", "grasps", "created")
-    table = plain_table(*names, whole=("job", "state", "created"))
+    document = {"jobs": [job.model_dump(mode="json") for job in page.items], "next": page.next}
+    rows = []
     for job in page.items:
         made = job.valid if job.standing == "valid" else job.grasps
         done = f"{count(made)} of {count(job.requested)} {job.standing}"
-        pair, last = (job.hand, job.object), (percent(job.progress), done, minute(job.created))
-        table.add_row(job.id[:12], job.state, *pair, *last)
-    plain_console().print(table if page.items else "no job yet; `graspd submit --hand allegro --object mug` makes one")
+        last = (percent(job.progress), done, minute(job.created))
+        rows.append((job.id[:12], job.state, job.hand, job.object, *last))
+    names = ("job", "state", "hand", "object", "progress", "grasps", "created")
+    empty = "no job yet; `graspd submit --hand allegro --object mug` makes one"
+    print_rows(document, names, rows, whole=("job", "state", "created"), empty=empty, json=json)
 
 
 @app.command(epilog="graspd status 3f2a --json")
-@reporting_errors
 def status(job_id: JobArgument, url: UrlOption = None, json: JsonFlag = False) -> None:
     """Show stages, progress and quality of a job."""
     with open_client(url) as client:
@@ -100,7 +97,6 @@ def status(job_id: JobArgument, url: UrlOption = None, json: JsonFlag = False) -
 
 
 @app.command(epilog="graspd cancel 3f2a")
-@reporting_errors
 def cancel(job_id: JobArgument, url: UrlOption = None, json: JsonFlag = False) -> None:
     """Cancel a job; its results remain."""
     with open_client(url) as client:
@@ -108,7 +104,6 @@ def cancel(job_id: JobArgument, url: UrlOption = None, json: JsonFlag = False) -
 
 
 @app.command(epilog="graspd delete 3f2a")
-@reporting_errors
 def delete(job_id: JobArgument, yes: YesOption = False, url: UrlOption = None, json: JsonFlag = False) -> None:
     """Delete an ended job. After a grace time its shards are deleted, unless another job uses them."""
     with open_client(url) as client:
@@ -120,7 +115,6 @@ def delete(job_id: JobArgument, yes: YesOption = False, url: UrlOption = None, j
 
 
 @app.command("restore", epilog="graspd restore 3f2a")
-@reporting_errors
 def restore_job(
     job_id: Annotated[str, typer.Argument(help="Id of a deleted job, or a prefix of it.")],
     url: UrlOption = None,
@@ -133,7 +127,6 @@ def restore_job(
 
 
 @app.command(epilog="graspd retry 3f2a --wait")
-@reporting_errors
 def retry(
     job_id: JobArgument,
     wait: Annotated[bool, typer.Option("--wait", help="Show progress until the job ends.")] = False,
@@ -149,7 +142,6 @@ def retry(
 
 
 @app.command(epilog="graspd logs 3f2a")
-@reporting_errors
 def logs(job_id: JobArgument, url: UrlOption = None, json: JsonFlag = False) -> None:
     """Show failed attempts of a job with their reasons."""
     with open_client(url) as client:
@@ -170,38 +162,33 @@ def logs(job_id: JobArgument, url: UrlOption = None, json: JsonFlag = False) -> 
 def asset_commands(kind: AssetKind) -> typer.Typer:
     """Create `graspd hands ...`, `graspd objects ...` or `graspd networks ...`."""
     verbs = "Add, list, show and delete" if kind is AssetKind.NETWORK else "Check, add, list, show and delete"
-    group = typer.Typer(no_args_is_help=True, help=f"{verbs} {kind.value}s.")
+    group = CommandGroup(no_args_is_help=True, help=f"{verbs} {kind.value}s.")
 
     @group.command("list", help=f"List {kind.value}s, by default without refused ones.")
-    @reporting_errors
     def list_assets(
         refused: Annotated[bool, typer.Option("--refused", help="Include refused ones.")] = False,
         url: UrlOption = None,
         json: JsonFlag = False,
     ) -> None:
-        """List all, by default without refused ones."""
         with open_client(url) as client:
             assets = list(client.assets(kind, refused=refused))
-        if json:
-            emit({f"{kind.value}s": [asset.model_dump(mode="json") for asset in assets]})
-            return
+        document = {f"{kind.value}s": [asset.model_dump(mode="json") for asset in assets]}
         # All networks have the same file name, so their hand is shown instead.
         second = "hand" if kind is AssetKind.NETWORK else "file"
-        table = plain_table("name", second, "size", "check", "digest", whole=("size", "digest"))
+        rows = []
         for asset in assets:
             origin = "built-in" if asset.builtin else (asset.verdict or "waiting")
             if says := self_test_line(asset.facts):
                 origin += f"; {says}"
             named = hand_line(asset.facts) if kind is AssetKind.NETWORK else asset.filename
-            table.add_row(asset.name, named, size(asset.size_bytes), origin, asset.digest[:12])
-        plain_console().print(table)
+            rows.append((asset.name, named, size(asset.size_bytes), origin, asset.digest[:12]))
+        names = ("name", second, "size", "check", "digest")
+        print_rows(document, names, rows, whole=("size", "digest"), json=json)
 
     @group.command("show", help=f"Show a {kind.value} with the findings of its check.")
-    @reporting_errors
     def show(
         name: Annotated[str, typer.Argument(help="Name of the asset.")], url: UrlOption = None, json: JsonFlag = False
     ) -> None:
-        """Show one with the findings of its check."""
         with open_client(url) as client:
             asset = client.asset(kind, name)
         show_asset(asset.model_dump(mode="json"), json=json)
@@ -211,14 +198,12 @@ def asset_commands(kind: AssetKind) -> typer.Typer:
         help=f"Delete a {kind.value} that no job, dataset or set of objects uses.",
         epilog=f"graspd {kind.value}s delete my_{kind.value}",
     )
-    @reporting_errors
     def delete_asset(
         name: Annotated[str, typer.Argument(help="Name or digest of the asset.")],
         yes: YesOption = False,
         url: UrlOption = None,
         json: JsonFlag = False,
     ) -> None:
-        """Delete one that no job, dataset or set of objects uses."""
         with open_client(url) as client:
             client.asset(kind, name)
             confirm(f"Delete the {kind.value} {name}?", f"the {kind.value} {name}", yes=yes)
@@ -230,13 +215,11 @@ def asset_commands(kind: AssetKind) -> typer.Typer:
         help=f"Restore a deleted {kind.value} within the grace time.",
         epilog=f"graspd {kind.value}s restore my_{kind.value}",
     )
-    @reporting_errors
     def restore_asset(
         name: Annotated[str, typer.Argument(help="Name or digest of the asset.")],
         url: UrlOption = None,
         json: JsonFlag = False,
     ) -> None:
-        """Restore a deleted one, within the grace time."""
         restore(url, kind.value, name, json=json)
 
     return group
@@ -249,20 +232,17 @@ networks_app.command("add", epilog="graspd networks add barrett.npz")(add_networ
 
 
 @objects_app.command("sets", epilog="graspd objects sets")
-@reporting_errors
 def sets(url: UrlOption = None, json: JsonFlag = False) -> None:
     """List sets of objects; `graspd objects add FOLDER` makes one."""
     with open_client(url) as client:
         found = client.object_sets()
-    if json:
-        emit({"sets": [one.model_dump(mode="json") for one in found]})
-        return
-    table = plain_table("set", "objects", "")
-    for one in found:
-        table.add_row(
-            one.name, count(len(one.objects)), ", ".join(one.objects[:5]) + (", ..." * (len(one.objects) > 5))
-        )
-    plain_console().print(table if found else "no set yet; `graspd objects add FOLDER` makes one")
+    document = {"sets": [one.model_dump(mode="json") for one in found]}
+    rows = [
+        (one.name, count(len(one.objects)), ", ".join(one.objects[:5]) + ", ..." * (len(one.objects) > 5))
+        for one in found
+    ]
+    empty = "no set yet; `graspd objects add FOLDER` makes one"
+    print_rows(document, ("set", "objects", ""), rows, empty=empty, json=json)
 
 
 app.add_typer(hands_app, name="hands")
@@ -289,7 +269,6 @@ def _uploaded(client: Client, kind: AssetKind, value: str) -> str:
 
 
 def _full_id(client: Client, prefix: str) -> str:
-    """Return the id of the one recent job with this prefix."""
     if len(prefix) >= 32:
         return prefix
     return _only_one([job.id for job in client.jobs(limit=200).items], prefix)

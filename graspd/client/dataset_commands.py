@@ -1,19 +1,23 @@
-"""`graspd datasets`: datasets of hands x objects, from cost estimate to export."""
+"""`graspd datasets`: datasets of hands x objects, from spec and cost estimate to export."""
 
 from __future__ import annotations
 
+import json
+import math
 import sys
+import tomllib
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from pydantic import Field, model_validator
 from rich.console import Console
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn, TransferSpeedColumn
 
 from graspd.api.formatting import count, minute, percent, size
 from graspd.client.add_commands import name_of_set, upload_set
 from graspd.client.client import Client, path_of
-from graspd.client.job_options import PlanRequest, SpecOption, wanted
 from graspd.client.reports import (
     UrlOption,
     YesOption,
@@ -22,23 +26,121 @@ from graspd.client.reports import (
     print_cells,
     print_dataset,
     print_estimate,
+    print_rows,
     restore,
     say_deleted,
     watch_dataset,
 )
-from graspd.service.cli import JsonFlag, emit, plain_console, plain_table, reporting_errors
-from graspd.service.command_options import parsed_options, with_options
+from graspd.service.cli import CommandGroup, JsonFlag, emit, plain_console, report
+from graspd.service.command_options import pairs, parsed_options, with_options
 from graspd.service.index.views import DatasetView
+from graspd.service.model.base import Name, why
 from graspd.service.model.domain import JobOptions
 from graspd.service.model.errors import InputError, TaskError, did_you_mean, one_of
+from graspd.service.model.options import accepted
+from graspd.service.model.scene_spec import known_name, scene_option
 from graspd.service.model.states import AssetKind, State
 from graspd.service.pipeline.datasets.estimate import Estimate
 from graspd.service.pipeline.datasets.export import FORMATS
 from graspd.service.pipeline.datasets.spec import DatasetRequest, Matrix
 from graspd.service.store.object_sets import Objects, files_of_set
 
-app = typer.Typer(no_args_is_help=True)
-group = typer.Typer(no_args_is_help=True, help="Datasets of hands x objects: cost, status, snapshots, files.")
+SpecOption = Annotated[
+    Path | None, typer.Option("--spec", help="TOML or JSON file of the dataset; options take precedence.")
+]
+
+
+class Spec(JobOptions):
+    """Keys of a spec: those of a job's options, and these."""
+
+    SUBMITTED = True
+
+    name: Name | None = None
+    hands: tuple[Name, ...] = ()
+    objects: str | tuple[str, ...] = Field((), description="as `--objects`; folders are relative to the spec")
+    total_grasps: int | None = Field(
+        None, ge=1, description="grasps over all hands and objects, shared evenly; replaces `grasps`"
+    )
+
+    @model_validator(mode="after")
+    def _one_number(self) -> Spec:
+        if self.total_grasps is not None and "grasps" in self.model_fields_set:
+            raise ValueError("total_grasps replaces grasps: give one of them")
+        return self
+
+
+@dataclass(frozen=True)
+class PlanRequest:
+    """Request of a command, from a spec and options."""
+
+    name: str
+    hands: str
+    objects: str
+    options: dict[str, Any]
+    total: int | None = None
+
+    def shared_out(self, matrix: dict[str, Any], objects: int) -> dict[str, Any]:
+        """Return the matrix with grasps per cell; a total over all cells is divided and rounded up."""
+        if self.total is None or not objects:
+            return matrix
+        return matrix | {"grasps": math.ceil(self.total / (len(matrix["hands"]) * objects))}
+
+
+def wanted(
+    spec: Path | None, *, name: str | None, hands: str | None, objects: str | None, options: dict[str, Any]
+) -> PlanRequest:
+    """Combine spec and options, which take precedence; the name is empty if neither contains it."""
+    given = dict(options)
+    if "options" in given:
+        given["options"] = pairs(given["options"])
+    if "scene" in given:
+        given["scene"] = scene_option(given["scene"])
+    if "neighbours" in given:
+        given["neighbours"] = [known_name(one) for one in given["neighbours"]]
+    said = read_spec(spec) if spec is not None else {}
+    total = None if "grasps" in given else said.pop("total_grasps", None)
+    said.pop("total_grasps", None)
+    found_name = name or said.pop("name", "")
+    found_hands = hands or ",".join(said.get("hands", ()))
+    found_objects = objects or _objects(spec, said.get("objects", ()))
+    for what, found in (("hands", found_hands), ("objects", found_objects)):
+        if not found:
+            raise InputError(f"give the {what}: --{what}, or {what} in the file of --spec")
+    rest = {key: value for key, value in said.items() if key not in ("name", "hands", "objects")}
+    return PlanRequest(found_name, found_hands, found_objects, {**rest, **given}, total)
+
+
+def read_spec(file: Path) -> dict[str, Any]:
+    """Return the keys of a spec; raise InputError if the file is none."""
+    kind, load = ("JSON", json.loads) if file.suffix == ".json" else ("TOML", tomllib.loads)
+    try:
+        found = load(file.read_text())
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{file} cannot be read: {why(error)}") from None
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{file} is no {kind}: {error}") from None
+    if not isinstance(found, dict):
+        raise InputError(f"{file} must hold the keys of a dataset: hands, objects, grasps, ...")
+    try:
+        if isinstance(found.get("scene"), str):
+            found["scene"] = scene_option(found["scene"], beside=file.parent)
+        if isinstance(beside := found.get("neighbours"), list):
+            found["neighbours"] = [known_name(one) if isinstance(one, str) else one for one in beside]
+        spec = accepted(Spec, found)
+    except InputError as error:
+        raise InputError(f"{file}: {error}") from None
+    return spec.model_dump(mode="json", exclude_unset=True)
+
+
+def _objects(spec: Path | None, said: Any) -> str:
+    if not isinstance(said, str):
+        return ",".join(said)
+    beside = spec.parent / said if spec is not None else Path(said)
+    return str(beside) if "/" in said and beside.exists() else said
+
+
+app = CommandGroup(no_args_is_help=True)
+group = CommandGroup(no_args_is_help=True, help="Datasets of hands x objects: cost, status, snapshots, files.")
 app.add_typer(group, name="datasets")
 
 NameArgument = Annotated[str, typer.Argument(help="Name of the dataset.")]
@@ -52,7 +154,6 @@ WaitOption = Annotated[bool, typer.Option("--wait", help="Show progress until th
 
 @group.command(epilog="graspd datasets create kitchen --hands allegro,shadow --objects ./ycb --grasps 1000")
 @with_options(JobOptions, "job")
-@reporting_errors
 def create(
     name: Annotated[str | None, typer.Argument(help="Name of the dataset; default: the name in the spec.")] = None,
     hands: HandsOption = None,
@@ -100,7 +201,6 @@ def create(
 
 @group.command(epilog="graspd datasets estimate --hands allegro --objects mug --grasps 1000000 --scenes 2 --views 3")
 @with_options(JobOptions, "job")
-@reporting_errors
 def estimate(
     hands: HandsOption = None,
     objects: ObjectsOption = None,
@@ -122,7 +222,6 @@ def estimate(
 
 
 @group.command("list", epilog="graspd datasets list")
-@reporting_errors
 def list_datasets(
     limit: Annotated[int, typer.Option(min=1, max=200, help="Maximum number of datasets.")] = 20,
     url: UrlOption = None,
@@ -131,24 +230,18 @@ def list_datasets(
     """List datasets, newest first."""
     with open_client(url) as client:
         page = client.datasets(limit=limit)
-    if json:
-        emit({"datasets": [dataset.model_dump(mode="json") for dataset in page.items], "next": page.next})
-        return
-    table = plain_table(
-        "dataset", "state", "cells", "progress", "grasps", "size", "created", whole=("state", "size", "created")
-    )
+    document = {"datasets": [dataset.model_dump(mode="json") for dataset in page.items], "next": page.next}
+    rows = []
     for one in page.items:
         made = f"{count(one.counted)} {one.options.standing} of {count(one.asked)}"
-        cells = count(one.cells)
-        table.add_row(
-            one.name, one.state, cells, percent(one.progress), made, size(one.size_bytes), minute(one.created)
-        )
+        last = (percent(one.progress), made, size(one.size_bytes), minute(one.created))
+        rows.append((one.name, one.state, count(one.cells), *last))
+    names = ("dataset", "state", "cells", "progress", "grasps", "size", "created")
     empty = "no dataset yet; `graspd datasets create NAME --hands allegro --objects mug,bottle` makes one"
-    plain_console().print(table if page.items else empty)
+    print_rows(document, names, rows, whole=("state", "size", "created"), empty=empty, json=json)
 
 
 @group.command(epilog="graspd datasets status kitchen --state failed")
-@reporting_errors
 def status(
     name: NameArgument,
     state: Annotated[State | None, typer.Option(help="Only cells in this state.")] = None,
@@ -166,7 +259,6 @@ def status(
 
 
 @group.command(epilog="graspd datasets cancel kitchen")
-@reporting_errors
 def cancel(name: NameArgument, url: UrlOption = None, json: JsonFlag = False) -> None:
     """Cancel a dataset; its results remain."""
     with open_client(url) as client:
@@ -174,7 +266,6 @@ def cancel(name: NameArgument, url: UrlOption = None, json: JsonFlag = False) ->
 
 
 @group.command(epilog="graspd datasets delete kitchen")
-@reporting_errors
 def delete(
     name: NameArgument,
     yes: YesOption = False,
@@ -195,14 +286,12 @@ def delete(
 
 
 @group.command("restore", epilog="graspd datasets restore kitchen")
-@reporting_errors
 def restore_dataset(name: NameArgument, url: UrlOption = None, json: JsonFlag = False) -> None:
     """Restore a deleted dataset with its jobs and snapshots, within the grace time."""
     restore(url, "dataset", name, json=json)
 
 
 @group.command(epilog="graspd datasets retry kitchen --wait")
-@reporting_errors
 def retry(name: NameArgument, wait: WaitOption = False, url: UrlOption = None, json: JsonFlag = False) -> None:
     """Restart failed and cancelled jobs; existing results are reused."""
     with open_client(url) as client:
@@ -214,23 +303,19 @@ def retry(name: NameArgument, wait: WaitOption = False, url: UrlOption = None, j
 
 
 @group.command(epilog="graspd datasets snapshot kitchen")
-@reporting_errors
 def snapshot(name: NameArgument, url: UrlOption = None, json: JsonFlag = False) -> None:
     """Record the present shards of a dataset as an immutable list."""
     with open_client(url) as client:
         taken = client.take_snapshot(name)
-    if json:
-        emit(taken)
-        return
     whole = "complete" if taken.complete else "the dataset is not complete"
-    typer.echo(
+    line = (
         f"{taken.digest}  {count(taken.shards)} shards, {count(taken.grasps)} grasps of which {count(taken.valid)} "
         f"are valid, {size(taken.size_bytes)}; {whole}"
     )
+    report(taken, line, json=json)
 
 
 @group.command(epilog="graspd datasets export kitchen -o kitchen-v1 --snapshot 3f2a...")
-@reporting_errors
 def export(
     name: NameArgument,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write; an interrupted export is continued.")],
@@ -242,14 +327,8 @@ def export(
     """Write a snapshot's files into a folder; each is verified against its checksum."""
     if format not in FORMATS:
         raise InputError(f"there is no format {format!r}; there are: {one_of(format, FORMATS)}")
-    columns = (
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        TextColumn("{task.fields[files]}"),
-        DownloadColumn(),
-        TransferSpeedColumn(),
-        TimeRemainingColumn(),
-    )
+    label, counts = TextColumn("{task.description}", markup=False), TextColumn("{task.fields[files]}")
+    columns = (label, BarColumn(), counts, DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn())
     with open_client(url) as client:
         taken = client.snapshot(name, snapshot or client.take_snapshot(name).digest)
         console = plain_console(stderr=True)
@@ -261,14 +340,11 @@ def export(
 
             fetched = FORMATS[format](taken, out, lambda shard: client.fetch(path_of("shards", shard.id, "file")), show)
     told = {"dataset": name, "snapshot": taken.digest, "out": str(out), "files": len(taken.shards), "fetched": fetched}
-    if json:
-        emit({**told, "bytes": taken.size_bytes, "complete": taken.complete})
-    else:
-        typer.echo(f"{out}: {count(len(taken.shards))} files, {size(taken.size_bytes)}, snapshot {taken.digest}")
+    line = f"{out}: {count(len(taken.shards))} files, {size(taken.size_bytes)}, snapshot {taken.digest}"
+    report({**told, "bytes": taken.size_bytes, "complete": taken.complete}, line, json=json)
 
 
 def _matrix(client: Client, asked: PlanRequest) -> tuple[Objects | None, dict[str, Any]]:
-    """Return the files of a set that must still be uploaded, and the requested matrix."""
     objects = asked.objects
     names = [word.strip() for word in objects.split(",") if word.strip()]
     matrix: dict[str, Any] = {"hands": [w.strip() for w in asked.hands.split(",") if w.strip()], **asked.options}
@@ -303,13 +379,12 @@ def _estimate(client: Client, matrix: dict[str, Any], files: Objects | None) -> 
 
 
 def _upload(client: Client, files: Objects, set_name: str, console: Console) -> list[str]:
-    """Upload the objects of a folder and make them a set; return the refused ones, which are excluded."""
-    told = upload_set(client, files, say=lambda line: console.print(line, soft_wrap=True))
-    taken = [one["name"] for one in told if one["verdict"] != "refuse"]
-    if not taken:
+    """Upload the objects of a folder as a set; return the refused ones, which are excluded."""
+    told = upload_set(client, files, set_name, say=lambda line: console.print(line, soft_wrap=True))
+    refused = [one["name"] for one in told if one["verdict"] == "refuse"]
+    if len(refused) == len(told):
         raise InputError(f"none of the {len(told)} objects can be used; reasons are above")
-    client.add_object_set(set_name, taken)
-    return [one["name"] for one in told if one["verdict"] == "refuse"]
+    return refused
 
 
 def _confirmed() -> bool:

@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Sequence
-from types import TracebackType
+from collections.abc import Collection, Sequence
 from typing import Annotated, Any, Final, Self
 
 import typer
@@ -17,9 +16,9 @@ from rich.progress import BarColumn, Progress, ProgressColumn, Task, TaskID, Tex
 from rich.text import Text
 
 from graspd.api.formatting import count, duration, metric, percent, size, valid_yield, worker_time
-from graspd.api.models import Diversity, Job, JobDetail, StageStatus
+from graspd.api.models import Job, JobDetail, StageStatus
 from graspd.client.client import Client, path_of
-from graspd.service.cli import emit, load_settings, plain_console, plain_table
+from graspd.service.cli import emit, load_settings, plain_console, plain_table, report
 from graspd.service.index.views import CellView, DatasetView, Validated
 from graspd.service.model.domain import JobOptions
 from graspd.service.model.errors import InputError, TaskError
@@ -35,9 +34,7 @@ UrlOption = Annotated[
 
 
 def open_client(url: str | None, *, key: str | None = None) -> Client:
-    """Return a client of the API from the option, the settings or the data folder.
-
-    The key is that of the settings, unless one is given."""
+    """Return a client of the API from the option, the settings or the data folder; the key is that of the settings."""
     settings = load_settings()
     if key is None and settings.api_key:
         key = settings.api_key.get_secret_value()
@@ -61,11 +58,8 @@ def confirm(question: str, what: str, *, yes: bool) -> None:
 
 def say_deleted(what: str, name: str, *, json: bool, undo: str = "") -> None:
     """Report a deletion, and the command that undoes it."""
-    if json:
-        emit({"deleted": name, "kind": what})
-        return
-    typer.echo(f"{what} {name} is deleted")
-    if undo:
+    report({"deleted": name, "kind": what}, f"{what} {name} is deleted", json=json)
+    if undo and not json:
         typer.echo(f"`{undo}` restores it within the grace time (GRASPD_SHARD_GRACE_S)", err=True)
 
 
@@ -73,10 +67,26 @@ def restore(url: str | None, what: str, name: str, *, json: bool) -> None:
     """Restore a deleted resource and report it."""
     with open_client(url) as client:
         found = client.send("POST", path_of(f"{what}s", name, "restore")).json()
+    report({"restored": found["id"], "kind": what}, f"{what} {name} is restored", json=json)
+
+
+def print_rows(
+    document: dict[str, Any],
+    headings: Sequence[str],
+    rows: Sequence[Sequence[str]],
+    *,
+    whole: Collection[str] = (),
+    empty: str = "",
+    json: bool,
+) -> None:
+    """Print a list as JSON, or as a table (`empty` instead of an empty one); columns `whole` are not broken."""
     if json:
-        emit({"restored": found["id"], "kind": what})
-    else:
-        typer.echo(f"{what} {name} is restored")
+        emit(document)
+        return
+    table = plain_table(*headings, whole=whole)
+    for row in rows:
+        table.add_row(*row)
+    plain_console().print(table if rows or not empty else empty)
 
 
 def watch(client: Client, job_id: str) -> JobDetail:
@@ -96,6 +106,12 @@ def show_job(job: JobDetail, *, json: bool, url: str, must_succeed: bool = True)
         raise TaskError(f"job {job.id[:12]} is {job.state}{why}; `graspd retry {job.id[:12]}` runs it again")
 
 
+_SUMMARY: Final = (
+    *("grasps", "valid", "candidates", "validated", "valid_yield", "rechecked", "recheck_held"),
+    *("note", "progress", "reason", "outcomes"),
+)
+
+
 def job_summary(job: JobDetail) -> dict[str, Any]:
     """Return keys for scripts (DESIGN.md §5): job, state, grasps, valid, stages, mean, shards; and more."""
     return {
@@ -105,23 +121,9 @@ def job_summary(job: JobDetail) -> dict[str, Any]:
         "object": job.object,
         "fidelity": job.fidelity,
         "choice": job.choice and job.choice.model_dump(),
-        "grasps": job.grasps,
-        "valid": job.valid,
-        "candidates": job.candidates,
-        "validated": job.validated,
-        "valid_yield": job.valid_yield,
-        "rechecked": job.rechecked,
-        "recheck_held": job.recheck_held,
-        "note": job.note,
-        "progress": job.progress,
-        "reason": job.reason,
-        "outcomes": job.outcomes,
+        **{name: getattr(job, name) for name in _SUMMARY},
         "stages": {stage.stage.value: {"tasks": stage.tasks, "seconds": stage.seconds} for stage in job.stages},
-        "mean": {
-            name: value
-            for name, value in job.mean.model_dump().items()
-            if name in ("epsilon", "contact_area_cm2", "intersection_volume_cm3")
-        },
+        "mean": job.mean.model_dump(include={"epsilon", "contact_area_cm2", "intersection_volume_cm3"}),
         "shards": [shard.id for shard in job.shards],
     }
 
@@ -149,12 +151,10 @@ def yield_of(job: JobDetail) -> str:
     level = job.request.validation
     if level == "none":
         return f"{count(job.grasps)} stored grasps of {count(job.candidates)} candidates; not validated"
-    recheck = (
-        f"; {job.recheck_held} of {job.rechecked} rechecked hold under the DexGraspBench protocol"
-        if job.rechecked
-        else ""
-    )
-    return f"{count(job.valid)} valid grasps of {count(job.candidates)} candidates, level {level}{recheck}"
+    line = f"{count(job.valid)} valid grasps of {count(job.candidates)} candidates, level {level}"
+    if not job.rechecked:
+        return line
+    return f"{line}; {job.recheck_held} of {job.rechecked} rechecked hold under the DexGraspBench protocol"
 
 
 def means_of(job: JobDetail) -> str:
@@ -163,15 +163,6 @@ def means_of(job: JobDetail) -> str:
     return (
         f"mean ε {metric(mean.epsilon)}, contact {metric(mean.contact_area_cm2)} cm², "
         f"intersection {metric(mean.intersection_volume_cm3)} cm³"
-    )
-
-
-def diversity_of(found: Diversity) -> str:
-    """Format types and directions in one line."""
-    types = ", ".join(f"{count(number)} {name}" for name, number in found.types.items())
-    return (
-        f"{types} ({found.type_entropy_bits:.2f} bit); {found.directions_used} of {found.directions} directions "
-        f"({found.direction_entropy_bits:.2f} bit)"
     )
 
 
@@ -193,16 +184,17 @@ def _print_job(job: JobDetail, url: str) -> None:
     console.print(table)
     if job.grasps:
         console.print(f"{yield_of(job)}; {means_of(job)}")
-        if job.diversity:
-            console.print(diversity_of(job.diversity))
+        if found := job.diversity:
+            types = ", ".join(f"{count(number)} {name}" for name, number in found.types.items())
+            directions = f"{found.directions_used} of {found.directions} directions"
+            entropy = f"({found.type_entropy_bits:.2f} bit)", f"({found.direction_entropy_bits:.2f} bit)"
+            console.print(f"{types} {entropy[0]}; {directions} {entropy[1]}")
 
 
 _LINE_EVERY_S: Final = 2.0
 
 
 class _Rate(ProgressColumn):
-    """Column with the rate in the unit of the stage."""
-
     def render(self, task: Task) -> Text:
         speed = task.finished_speed or task.speed
         if not speed:
@@ -233,9 +225,7 @@ class JobDisplay:
         self._progress.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._progress.stop()
 
     def update(self, job: Job) -> None:
@@ -250,9 +240,14 @@ class JobDisplay:
 
     def _draw(self, stage: StageStatus, job: Job) -> None:
         if stage.stage not in self._bars:
-            scale, unit = (job.requested / stage.tasks, "grasps") if stage.stage is Stage.SYNTHESIZE else (1, "tasks")
+            made, unit = _size_of(stage, job)
             self._bars[stage.stage] = self._progress.add_task(
-                stage.stage.value, total=stage.tasks, start=False, message="", scale=scale, unit=unit
+                stage.stage.value,
+                total=stage.tasks,
+                start=False,
+                message="",
+                scale=made / max(1, stage.tasks),
+                unit=unit,
             )
         bar = self._bars[stage.stage]
         if stage.state is not State.QUEUED and not self._progress.tasks[bar].started:
@@ -269,22 +264,20 @@ class JobDisplay:
         self._console.print(self._line(stage, job, now))
 
     def _line(self, stage: StageStatus, job: Job, now: float) -> str:
-        elapsed = now - self._started.get(stage.stage, now)
+        elapsed, (made, unit) = now - self._started.get(stage.stage, now), _size_of(stage, job)
         words = f"{stage.stage.value:<11} {stage.state.value:<10} {100 * stage.progress:3.0f} %"
         if stage.state is State.SUCCEEDED:
             seconds = stage.seconds or elapsed
-            return f"{words}  {_rate_words(stage, job, 1 / seconds)}  in {duration(seconds)}" if seconds else words
+            return f"{words}  {metric(made / seconds)} {unit}/s  in {duration(seconds)}" if seconds else words
         if stage.state is State.RUNNING and elapsed > 1 and 0 < stage.progress < 1:
             pace = stage.progress / elapsed
-            return f"{words}  {_rate_words(stage, job, pace)}  {duration((1 - stage.progress) / pace)} left"
+            return f"{words}  {metric(made * pace)} {unit}/s  {duration((1 - stage.progress) / pace)} left"
         return words
 
 
-def _rate_words(stage: StageStatus, job: Job, pace: float) -> str:
-    """Format the rate in the unit of the stage; `pace` is the share of the stage per second."""
-    if stage.stage is Stage.SYNTHESIZE:
-        return f"{metric(job.requested * pace)} grasps/s"
-    return f"{metric(stage.tasks * pace)} tasks/s"
+def _size_of(stage: StageStatus, job: Job) -> tuple[int, str]:
+    """Return how many things a stage makes, and their name."""
+    return (job.requested, "grasps") if stage.stage is Stage.SYNTHESIZE else (stage.tasks, "tasks")
 
 
 #: A table with more hands does not fit a terminal: each cell then has a line.
@@ -329,7 +322,6 @@ def print_estimate(found: Estimate, console: Console) -> None:
 
 
 def print_dataset(dataset: DatasetView, console: Console) -> None:
-    """Print a dataset in three lines."""
     states = ", ".join(f"{count(n)} {state.value}" for state, n in dataset.states.items() if n)
     left = f", {duration(dataset.eta_s)} left" if dataset.eta_s is not None else ""
     console.print(f"{dataset.name}  {dataset.state.value}  {percent(dataset.progress)}{left}")
@@ -349,15 +341,16 @@ def print_cells(dataset: DatasetView, cells: Sequence[CellView], console: Consol
     if len(dataset.hands) > _MOST_COLUMNS:
         table = plain_table("hand", "object", "job", "", whole=("job",))
         for cell in cells:
-            table.add_row(
-                cell.hand, cell.object, cell.job_id[:12], _words(cell, dataset.options), style=_STYLES[cell.state]
-            )
+            words = _words(cell, dataset.options)
+            table.add_row(cell.hand, cell.object, cell.job_id[:12], words, style=_STYLES[cell.state])
     else:
         table = plain_table("", *dataset.hands)
         at = {(cell.hand, cell.object): cell for cell in cells}
         for obj in dataset.objects:
             found = [at.get((hand, obj)) for hand in dataset.hands]
-            table.add_row(obj, *(_styled(cell, dataset.options) if cell else "" for cell in found))
+            table.add_row(
+                obj, *(Text(_words(cell, dataset.options), _STYLES[cell.state]) if cell else "" for cell in found)
+            )
     console.print(table)
     for cell in [cell for cell in cells if cell.reason][:5]:
         console.print(f"{cell.hand} on {cell.object}: {cell.reason}", soft_wrap=True)
@@ -389,10 +382,6 @@ def watch_dataset(client: Client, name: str, console: Console) -> DatasetView:
 def _yield(made: Validated) -> str:
     """Format the yield in short form: `at 94 % of the validated`."""
     return f"at {valid_yield(made)}" if made.validated else "not validated"
-
-
-def _styled(cell: CellView, options: JobOptions) -> Text:
-    return Text(_words(cell, options), style=_STYLES[cell.state])
 
 
 def _words(cell: CellView, options: JobOptions) -> str:

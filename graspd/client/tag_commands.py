@@ -10,11 +10,11 @@ import typer
 
 from graspd.api.formatting import count, minute
 from graspd.client.client import path_of
-from graspd.client.reports import UrlOption, YesOption, confirm, open_client, restore, say_deleted
-from graspd.service.cli import JsonFlag, emit, plain_console, plain_table, reporting_errors
+from graspd.client.reports import UrlOption, YesOption, confirm, open_client, print_rows, restore, say_deleted
+from graspd.service.cli import CommandGroup, JsonFlag, report
 from graspd.service.model.errors import InputError
 
-app = typer.Typer(no_args_is_help=True, help="Tag grasps of the service; list and export tagged ones.")
+app = CommandGroup(no_args_is_help=True, help="Tag grasps of the service; list and export tagged ones.")
 
 #: Longest wait for the first byte while the service writes the file [s].
 _PATIENCE_S: Final = 600.0
@@ -29,22 +29,16 @@ DatasetOption = Annotated[str | None, typer.Option(help="Only grasps of this dat
 
 
 @app.command("list", epilog="graspd tags list")
-@reporting_errors
 def list_tags(url: UrlOption = None, json: JsonFlag = False) -> None:
     """List tags with their numbers of grasps."""
     with open_client(url) as client:
         found = client.send("GET", "/v1/tags").json()
-    if json:
-        emit({"tags": found})
-        return
-    table = plain_table("tag", "grasps", "changed", whole=("grasps", "changed"))
-    for one in found:
-        table.add_row(one["name"], count(one["grasps"]), minute(one["changed"]))
-    plain_console().print(table if found else "no tag yet; `graspd tags add TAG --where EXPRESSION` tags grasps")
+    rows = [(one["name"], count(one["grasps"]), minute(one["changed"])) for one in found]
+    empty = "no tag yet; `graspd tags add TAG --where EXPRESSION` tags grasps"
+    print_rows({"tags": found}, ("tag", "grasps", "changed"), rows, whole=("grasps", "changed"), empty=empty, json=json)
 
 
 @app.command("add", epilog='graspd tags add good --dataset kitchen --where "epsilon > 0.3 and lift"')
-@reporting_errors
 def add_tag(
     tag: NameArgument,
     grasps: GraspsArgument = None,
@@ -61,7 +55,6 @@ def add_tag(
 
 
 @app.command("remove", epilog='graspd tags remove good --where "penetration_depth_mm > 1"')
-@reporting_errors
 def remove_tag(
     tag: NameArgument,
     grasps: GraspsArgument = None,
@@ -80,7 +73,6 @@ def remove_tag(
 
 
 @app.command("delete", epilog="graspd tags delete good")
-@reporting_errors
 def delete_tag(tag: NameArgument, yes: YesOption = False, url: UrlOption = None, json: JsonFlag = False) -> None:
     """Delete a tag; its grasps remain."""
     path = path_of("tags", tag)
@@ -92,14 +84,12 @@ def delete_tag(tag: NameArgument, yes: YesOption = False, url: UrlOption = None,
 
 
 @app.command("restore", epilog="graspd tags restore good")
-@reporting_errors
 def restore_tag(tag: NameArgument, url: UrlOption = None, json: JsonFlag = False) -> None:
     """Restore a deleted tag of grasps within the grace time."""
     restore(url, "tag", tag, json=json)
 
 
 @app.command("export", epilog="graspd tags export good -o good.zip")
-@reporting_errors
 def export_tag(
     tag: NameArgument,
     out: Annotated[Path, typer.Option("--out", "-o", help="File to write: .zip (base shards), .csv or .json (rows).")],
@@ -112,14 +102,10 @@ def export_tag(
         raise InputError(f"{out}: the name of the file must end in .zip, .csv or .json")
     with open_client(url) as client:
         client.save("/v1/grasps/export", out, params={"tag": tag, "format": format}, patience_s=_PATIENCE_S)
-    if json:
-        emit({"tag": tag, "file": str(out), "bytes": out.stat().st_size})
-    else:
-        typer.echo(str(out))
+    report({"tag": tag, "file": str(out), "bytes": out.stat().st_size}, str(out), json=json)
 
 
 def _selection(grasps: list[str] | None, **filters: str | None) -> dict[str, Any]:
-    """Return the body of a request: grasps by name, or a filter."""
     given = {name: value for name, value in filters.items() if value is not None}
     if grasps and given:
         raise InputError("give SHARD:ROW, or --where, --job and --dataset, not both")
@@ -134,8 +120,6 @@ def _selection(grasps: list[str] | None, **filters: str | None) -> dict[str, Any
 
 
 def _tell(change: dict[str, Any], words: str, *, json: bool) -> None:
-    if json:
-        emit(change)
-        return
     tag = change["tag"]
-    typer.echo(f"{count(change['changed'])} grasps {words} {tag['name']}; {count(tag['grasps'])} grasps have the tag")
+    line = f"{count(change['changed'])} grasps {words} {tag['name']}; {count(tag['grasps'])} grasps have the tag"
+    report(change, line, json=json)

@@ -10,18 +10,17 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from graspd.service.cli import JsonFlag, emit, reporting_errors
+from graspd.service.cli import CommandGroup, JsonFlag, report
 from graspd.service.model.errors import InputError
 from graspd.worker.engines.devices import Device
 
 if TYPE_CHECKING:
     from graspd.worker.objects.model import ObjectModel
 
-app = typer.Typer(add_completion=False)
+app = CommandGroup(add_completion=False)
 
 
 @app.command(epilog="graspd admin kernels ./kernels --arch 90")
-@reporting_errors
 def kernels(
     folder: Annotated[Path, typer.Argument(help="Folder of the kernels, to be set as GRASPD_KERNELS.")],
     arch: Annotated[list[int] | None, typer.Option(help="GPU architecture, such as 90; repeatable.")] = None,
@@ -38,22 +37,12 @@ def kernels(
     architectures = (arch or backend.ARCHITECTURES) if cuda else ()
     files = backend.bake(backend.modules(), architectures=architectures, cpu=cpu)
     size = sum(file.stat().st_size for file in files)
-    if json:
-        emit(
-            {
-                "folder": str(folder),
-                "files": len(files),
-                "bytes": size,
-                "architectures": list(architectures),
-                "cpu": cpu,
-            }
-        )
-    else:
-        typer.echo(f"{len(files)} kernel files, {size / 1e6:.1f} MB, in {folder}; GRASPD_KERNELS={folder.resolve()}")
+    made = {"folder": str(folder), "files": len(files), "bytes": size, "architectures": list(architectures), "cpu": cpu}
+    line = f"{len(files)} kernel files, {size / 1e6:.1f} MB, in {folder}; GRASPD_KERNELS={folder.resolve()}"
+    report(made, line, json=json)
 
 
 @app.command("bench-render", epilog="graspd admin bench-render --object mug --size 320x240 --size 640x480")
-@reporting_errors
 def bench_render(
     object: Annotated[str, typer.Option(help="Mesh or built-in object.")] = "mug",
     size: Annotated[list[str] | None, typer.Option(help="Picture size, WIDTHxHEIGHT; repeatable.")] = None,
@@ -71,14 +60,10 @@ def bench_render(
     for width, height in [_size(text) for text in size or ["320x240", "640x480"]]:
         typer.echo(f"{width} x {height} on {used}", err=True)
         results.append(measure(obj, width=width, height=height, device=used, repeats=repeats))
-    if json:
-        emit({"results": results})
-    else:
-        typer.echo(tables(results))
+    report({"results": results}, tables(results), json=json)
 
 
 @app.command(epilog="graspd admin gallery --object mug --object banana.stl -o docs/images/scenes")
-@reporting_errors
 def gallery(
     object: Annotated[list[str] | None, typer.Option(help="Built-in object, mesh, or NAME=MESH; repeatable.")] = None,
     hand: Annotated[list[str] | None, typer.Option(help="URDF or built-in hand; repeatable.")] = None,
@@ -99,10 +84,8 @@ def gallery(
         seed=seed,
         say=lambda line: typer.echo(line, err=True),
     )
-    if json:
-        emit({"files": [str(file) for file in files]})
-    else:
-        typer.echo("\n".join(map(str, files)))
+    names = [str(file) for file in files]
+    report({"files": names}, "\n".join(names), json=json)
 
 
 def _object(text: str) -> ObjectModel:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
-from graspd.service.cli import JsonFlag, emit, plain_console, plain_table, reporting_errors
+from graspd.service.cli import CommandGroup, JsonFlag, emit, plain_console, plain_table, report
 from graspd.service.model.errors import InputError
 from graspd.service.readers import Pictures
 from graspd.service.readers.clouds import Frame
@@ -17,8 +17,8 @@ from graspd.worker.files.clouds import hand_surface, write_clouds
 from graspd.worker.files.curation import KINDS, Balance, difference
 from graspd.worker.files.subsets import Subset, shards_of, write_subset
 
-app = typer.Typer(no_args_is_help=True, add_completion=False)
-group = typer.Typer(no_args_is_help=True, help="Select grasps of files and datasets by their metrics.")
+app = CommandGroup(no_args_is_help=True, add_completion=False)
+group = CommandGroup(no_args_is_help=True, help="Select grasps of files and datasets by their metrics.")
 app.add_typer(group, name="grasps")
 
 SourceArgument = Annotated[str, typer.Argument(help="File, folder of shards, or name of a dataset in the store.")]
@@ -31,7 +31,6 @@ def grasps() -> None:
 
 
 @group.command(epilog='graspd grasps where "epsilon > 0.3 and lift and robust >= 0.75" --from kitchen -o subset')
-@reporting_errors
 def where(
     expression: Annotated[
         str, typer.Argument(help="Expression of metrics, valid, feasible, held and lift with and, or, not.")
@@ -44,16 +43,14 @@ def where(
 ) -> None:
     """Write the grasps that satisfy an expression as new base shards."""
     test = parse(expression)
-    shards = shards_of(source)
     said = {"where": expression, "from": source}
     found = write_subset(
-        shards, lambda together: [test(shard.arrays, shard.attributes) for shard in together], out, said=said
+        shards_of(source), lambda some: [test(shard.arrays, shard.attributes) for shard in some], out, said=said
     )
     _tell(found, out, json=json)
 
 
 @app.command(epilog="graspd datasets balance kitchen --by type,direction -o even")
-@reporting_errors
 def balance(
     source: SourceArgument,
     out: OutOption,
@@ -79,7 +76,6 @@ def balance(
 
 
 @app.command(epilog="graspd datasets diff kitchen-v1 kitchen-v2 --json")
-@reporting_errors
 def diff(first: SourceArgument, second: SourceArgument, json: JsonFlag = False) -> None:
     """Compare two datasets, or two snapshots, given as NAME@SNAPSHOT."""
     found = difference(*(shards_of(*_version(one)) for one in (first, second)))
@@ -115,18 +111,14 @@ def _listed(values: list[str]) -> str:
 
 
 def _tell(found: Subset, out: Path, *, json: bool) -> None:
-    told: dict[str, Any] = {"folder": str(out), "looked_at": found.looked_at, "kept": found.kept}
-    told["shards"] = len(found.files)
-    if json:
-        emit(told | {"passed_over": found.passed_over})
-        return
-    typer.echo(f"{out}: {found.kept} of {found.looked_at} grasps in {len(found.files)} shards")
-    if found.passed_over:
+    counts = {"looked_at": found.looked_at, "kept": found.kept, "shards": len(found.files)}
+    line = f"{out}: {found.kept} of {found.looked_at} grasps in {len(found.files)} shards"
+    report({"folder": str(out), **counts, "passed_over": found.passed_over}, line, json=json)
+    if found.passed_over and not json:
         typer.echo(f"{found.passed_over} shards of scenes and pictures are not copied", err=True)
 
 
 @app.command(epilog="graspd clouds kitchen --points 1024 --noise stereo -o clouds")
-@reporting_errors
 def clouds(
     source: Annotated[str, typer.Argument(help="Folder of shards with pictures, or name of a dataset in the store.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write; it must be new or empty.")],
@@ -162,20 +154,8 @@ def clouds(
     found = pictures.clouds(
         points, noise=camera, frame=frame, fuse=fuse, scene=scene, voxel_m=voxel, hand_surface=surface, seed=seed
     )
-    said = {
-        "source": source,
-        "points": points,
-        "noise": noise,
-        "frame": found.frame,
-        "fuse": fuse,
-        "scene": scene,
-        "voxel_m": voxel,
-        "graspness": graspness,
-        "unvalidated": unvalidated,
-        "seed": seed,
-    }
-    done = write_clouds(found, out, said)
-    if json:
-        emit({"folder": str(out), **done})
-        return
-    typer.echo(f"{out}: {done['clouds']} clouds in {done['files']} files, {done['empty']} of them empty")
+    said = {"source": source, "points": points, "noise": noise, "frame": found.frame, "fuse": fuse, "scene": scene}
+    more = {"voxel_m": voxel, "graspness": graspness, "unvalidated": unvalidated, "seed": seed}
+    done = write_clouds(found, out, said | more)
+    line = f"{out}: {done['clouds']} clouds in {done['files']} files, {done['empty']} of them empty"
+    report({"folder": str(out), **done}, line, json=json)

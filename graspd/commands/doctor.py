@@ -15,7 +15,6 @@ from graspd.service.model.states import Stage
 from graspd.service.run.doctor.checks import Check, Finding, bad, good, warning
 from graspd.service.settings import Settings
 
-_MODULE: Final = "graspd.commands.doctor"
 _GPU_S: Final = 120.0
 #: Time limit for compiling all kernels from scratch, on a slow machine [s].
 _KERNELS_S: Final = 900.0
@@ -27,11 +26,9 @@ Child = Callable[[Sequence[str]], "subprocess.CompletedProcess[str]"]
 
 
 def checks_of(settings: Settings) -> list[Check]:
-    """Return the checks of the engine's GPUs and kernels."""
+    hung = "restart the driver, or the machine; see dmesg"
     return [
-        Check(
-            "gpu", lambda: gpu(settings), limit_s=_GPU_S + 5, mend_hang="restart the driver, or the machine; see dmesg"
-        ),
+        Check("gpu", lambda: gpu(settings), limit_s=_GPU_S + 5, mend_hang=hung),
         Check("kernels", lambda: kernels(settings), limit_s=_KERNELS_S + 5, mend_hang="see `top`, then retry"),
     ]
 
@@ -39,9 +36,13 @@ def checks_of(settings: Settings) -> list[Check]:
 def run_child(arguments: Sequence[str]) -> subprocess.CompletedProcess[str]:
     """Run this module as a process. Raises subprocess.TimeoutExpired."""
     limit_s = _GPU_S if arguments[0] == "gpus" else _KERNELS_S
-    command = [sys.executable, "-m", _MODULE, *arguments]
     return subprocess.run(
-        command, capture_output=True, text=True, check=False, timeout=limit_s, stdin=subprocess.DEVNULL
+        [sys.executable, "-m", "graspd.commands.doctor", *arguments],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=limit_s,
+        stdin=subprocess.DEVNULL,
     )
 
 

@@ -12,7 +12,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedCo
 from rich.table import Table
 
 from graspd.exchange.inputs import expand, load_case
-from graspd.service.cli import JsonFlag, emit, plain_console, reporting_errors
+from graspd.service.cli import CommandGroup, JsonFlag, emit, plain_console, write_output
 from graspd.service.model.errors import InputError, one_of
 from graspd.service.model.metrics import AXIS_MEANINGS, MOST_ROBUST_MODELS
 from graspd.service.store.shards import carried, json_attribute, read_shard, write_shard
@@ -24,26 +24,17 @@ from graspd.worker.validation.key import Level
 from graspd.worker.validation.lifting import LiftLevel
 from graspd.worker.validation.robust import Robustness
 
-app = typer.Typer(add_completion=False)
+app = CommandGroup(add_completion=False)
 
 #: Columns of the printed table: key, heading, digits.
 _COLUMNS: Final = (
-    ("n", "n", 0),
-    ("gsr", "GSR", 2),
-    ("sgs", "SGS", 2),
-    ("pd_mm", "PD", 2),
-    ("spd_mm", "SPD", 2),
-    ("ca_cm2", "CA", 1),
-    ("iv_cm3", "IV", 2),
-    ("epsilon", "ε", 2),
-    ("wrench_volume", "Vol", 2),
-    ("sd_cm", "SD", 2),
-    ("diversity", "D", 2),
+    *(("n", "n", 0), ("gsr", "GSR", 2), ("sgs", "SGS", 2), ("pd_mm", "PD", 2), ("spd_mm", "SPD", 2)),
+    *(("ca_cm2", "CA", 1), ("iv_cm3", "IV", 2), ("epsilon", "ε", 2), ("wrench_volume", "Vol", 2)),
+    *(("sd_cm", "SD", 2), ("diversity", "D", 2)),
 )
 
 
 @app.command(name="evaluate", epilog="graspd evaluate grasps.h5 --level dexgraspbench")
-@reporting_errors
 def evaluate_command(
     files: Annotated[
         list[Path],
@@ -108,13 +99,8 @@ def evaluate_command(
     other = None if validation_hand is None else hand_from_path(validation_hand, drag=True)
     twins = _joint_map(joint_map)
     rows: list[dict[str, Any]] = []
-    columns = (
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        TextColumn("{task.completed:.0f}/{task.total:.0f}"),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
+    name, done = TextColumn("{task.description}", markup=False), TextColumn("{task.completed:.0f}/{task.total:.0f}")
+    columns = (name, BarColumn(), done, TimeElapsedColumn(), TimeRemainingColumn())
     with Progress(*columns, console=plain_console(stderr=True), disable=json, transient=True) as bar:
         task = bar.add_task("reading", total=1)
         listed = [one for path in files for one in expand(path)]
@@ -123,6 +109,9 @@ def evaluate_command(
             case = load_case(file, hand=hand, obj=object)
             if copies and (case.placed is None) == (protocol == "lift"):
                 raise InputError(f"{file} stores shares of its own protocol: a lift in scenes, else six pushes")
+            twin = None
+            if other is not None:
+                twin = same_hand(case.hand, other, twins, tolerance_m=validation_tolerance / 1e3)
             row = evaluate(
                 case,
                 protocol=protocol,  # type: ignore[arg-type]
@@ -130,9 +119,7 @@ def evaluate_command(
                 hard=hard,
                 friction=friction,
                 models=robust,
-                validation_hand=None
-                if other is None
-                else same_hand(case.hand, other, twins, tolerance_m=validation_tolerance / 1e3),
+                validation_hand=twin,
                 tell=partial(write_copy, file, copies[file]) if copies else lambda found: None,
                 run=ExecutionContext(threads=threads, progress=partial(_show, bar, task, case.name)),
             )
@@ -152,7 +139,6 @@ def _checked_level(protocol: str, level: str) -> str:
 
 
 def _tell(rows: list[dict[str, Any]], foreign: str, *, json: bool) -> None:
-    """Print the rows of all files and their totals, as a table or as JSON."""
     whole = combine([{key: value for key, value in row.items() if key != "file"} for row in rows])
     if json:
         verdicts = [{"file": row["file"], **one} for row in rows for one in row.pop("verdicts", [])]
@@ -169,16 +155,22 @@ def _tell(rows: list[dict[str, Any]], foreign: str, *, json: bool) -> None:
 
 
 def _copies(paths: list[Path], files: list[Path], out: Path | None, *, robust: int, hard: bool) -> dict[Path, Path]:
-    """Return the path of each file's copy; empty without --out."""
     if out is None:
         return {}
     if not robust or hard or len(paths) != 1:
         raise InputError("-o needs --robust N, no --hard, and one file or folder")
-    return dict(zip(files, copy_paths(paths[0], files, out), strict=True))
+    if other := next((file for file in files if file.suffix != ".h5"), None):
+        raise InputError(f"{other} is no shard of graspd: only these have columns for the shares")
+    if paths[0].is_dir():
+        if out.exists() and (not out.is_dir() or any(out.iterdir())):
+            raise InputError(f"{out} is there already; choose a folder that is not")
+        return {file: out / file.relative_to(paths[0]) for file in files}
+    if not out.parent.is_dir() or out.is_dir():
+        raise InputError(f"{out} is no file that can be written: choose one in a folder that is there")
+    return {files[0]: out}
 
 
 def _said_of_models(whole: dict[str, Any]) -> str:
-    """Describe the robustness of the verdicts, with the most harmful axis first."""
     words = {axis.word: name for axis, name in AXIS_MEANINGS.items()}
     axes = sorted(whole["robust_axes"].items(), key=lambda pair: pair[1]["share"])
     each = ", ".join(f"{words[axis]} {one['share']:.2f}" for axis, one in axes)
@@ -239,36 +231,13 @@ def _cell(value: float | None, digits: int) -> str:
     return "-" if value is None else f"{value:.{digits}f}"
 
 
-def copy_paths(source: Path, files: list[Path], out: Path) -> list[Path]:
-    """Return `out` for a file; for a folder, the same subpaths in `out`, which must be new or empty.
-
-    Raises:
-        InputError: a file is no shard, would be overwritten, or lies in no folder.
-    """
-    if other := next((file for file in files if file.suffix != ".h5"), None):
-        raise InputError(f"{other} is no shard of graspd: only these have columns for the shares")
-    if source.is_dir():
-        if out.exists() and (not out.is_dir() or any(out.iterdir())):
-            raise InputError(f"{out} is there already; choose a folder that is not")
-        return [out / file.relative_to(source) for file in files]
-    if not out.parent.is_dir() or out.is_dir():
-        raise InputError(f"{out} is no file that can be written: choose one in a folder that is there")
-    return [out]
-
-
 def write_copy(source: Path, out: Path, found: Robustness) -> None:
-    """Write a base shard with the robust shares of its grasps; all else, including its id, is unchanged.
-
-    Raises:
-        InputError: it is no base shard, or the copy cannot be written.
-    """
+    """Write a base shard with the robust shares of its grasps; all else, including its id, is unchanged."""
     shard = read_shard(source, kind="base")
     said = json_attribute({"models": found.held.shape[1], "wanted": found.wanted})
     data = write_shard("base", {**shard.arrays, **found.columns}, {**carried(shard), "robust": said})
-    part = out.with_name(f".{out.name}.part")
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
-        part.write_bytes(data)
-        part.replace(out)
+        write_output(out, data)
     except OSError as error:
         raise InputError(f"{out} cannot be written: {error.strerror}") from None

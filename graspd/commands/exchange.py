@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json as jsonlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -11,7 +12,8 @@ import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from graspd.exchange.opening import opened
-from graspd.service.cli import JsonFlag, emit, load_settings, plain_console, reporting_errors
+from graspd.exchange.plan import ExportSummary
+from graspd.service.cli import CommandGroup, JsonFlag, load_settings, plain_console, report
 from graspd.service.model.errors import InputError, one_of
 from graspd.service.store import validity
 from graspd.service.store.shards import read_shard
@@ -19,20 +21,20 @@ from graspd.service.store.store import open_store
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.files.subsets import EveryOption, UnvalidatedOption, choose
 
-app = typer.Typer(no_args_is_help=True)
+app = CommandGroup(no_args_is_help=True)
 
 #: Formats of robots and their simulators; the first has two names.
 ROBOTS: Final = ("moveit", "urdf+yaml", "mujoco", "usd", "glb", "isaac", "csv")
 #: Training formats: they take a folder of shards.
 TRAINING: Final = ("dexlearn", "dexgraspnet2", "graspgen", "huggingface", "lerobot")
 EXPORTS: Final = ("images", "replicator", "webdataset", "dexgraspbench", *TRAINING, *ROBOTS)
-#: Imports that take one object, selected by `--name`.
-NAMED: Final = ("graspgen", "huggingface", "lerobot")
-IMPORTS: Final = ("dexgraspbench", "dexlearn", *NAMED, "dexgraspnet", "dexgraspnet2", "multidex", "ddgc", "reference")
+IMPORTS: Final = (
+    *("dexgraspbench", "dexlearn", "graspgen", "huggingface", "lerobot"),
+    *("dexgraspnet", "dexgraspnet2", "multidex", "ddgc", "reference"),
+)
 
 
 @app.command(epilog="graspd export grasps.h5 --format dexgraspbench -o bench")
-@reporting_errors
 def export(
     source: Annotated[Path, typer.Argument(help="Shard; for webdataset and training a folder of shards.")],
     format_: Annotated[str, typer.Option("--format", help=", ".join(EXPORTS) + ".")] = "images",
@@ -76,40 +78,34 @@ def export(
         raise InputError(f"there is no export format {format_!r}; choose one of {one_of(format_, EXPORTS)}")
     if depth not in ("exr", "png"):
         raise InputError(f"there is no depth format {depth!r}; use exr or png")
-    notes: list[str] = []
     with opened(output):
         if format_ in ROBOTS:
             from graspd.exchange.robot_export import RobotExportOptions, export_grasps
 
-            wishes = RobotExportOptions(
-                hand, object_, unvalidated, every, best, tool, speed, arm, mount, base, mount_pose
-            )
+            of_robot = (best, tool, speed, arm, mount, base, mount_pose)
+            wishes = RobotExportOptions(hand, object_, unvalidated, every, *of_robot)
             done = export_grasps(source, format_, wishes, output)
-            written, notes = done.counts, done.notes
         elif format_ in TRAINING:
             from graspd.exchange.training_export import TrainingExportOptions, export_training
 
             training = TrainingExportOptions(hand, object_, unvalidated, every, held_out, noise)
             done = export_training(source, format_, training, output)
-            written, notes = done.counts, done.notes
         elif format_ == "webdataset":
-            written = _webdataset(source, output, unvalidated=unvalidated, every=every)
+            done = _webdataset(source, output, unvalidated=unvalidated, every=every)
         elif format_ == "dexgraspbench":
-            written = _bench(source, hand, object_, output, unvalidated=unvalidated, every=every)
+            done = _bench(source, hand, object_, output, unvalidated=unvalidated, every=every)
         else:
-            written = _pictures(source, format_, depth, output)
-    if json:
-        emit({"folder": str(output), "format": format_, **written, **({"notes": notes} if notes else {})})
-        return
-    typer.echo(f"{output}: " + ", ".join(f"{n} {what}" for what, n in written.items() if isinstance(n, int)))
-    for note in notes:
+            done = _pictures(source, format_, depth, output)
+    told = {"folder": str(output), "format": format_, **done.counts, **({"notes": done.notes} if done.notes else {})}
+    line = f"{output}: " + ", ".join(f"{n} {what}" for what, n in done.counts.items() if isinstance(n, int))
+    report(told, line, json=json)
+    for note in () if json else done.notes:
         typer.echo(note, err=True)
 
 
 @app.command(
     "import", epilog="graspd import grasps.npy --format dexgraspnet --hand shadow --object mug.obj -o imported"
 )
-@reporting_errors
 def import_(
     source: Annotated[Path, typer.Argument(help="File or folder of grasps.")],
     format_: Annotated[str, typer.Option("--format", help=", ".join(IMPORTS) + ".")],
@@ -142,36 +138,30 @@ def import_(
 
     options: dict[str, Any] = {"robot": robot, "object_name": name, "number": number}
     sets = read_sets(format_, source, hand, object_, options)
-    said = Origin(format_, origin, licence)
+    said, run = Origin(format_, origin, licence), ExecutionContext(threads=threads)
     files = [
-        write_scored(
-            one,
-            said,
-            output,
-            validation=validation,
-            friction=friction,
-            ordinal=k,
-            run=ExecutionContext(threads=threads),
-        )
+        write_scored(one, said, output, validation=validation, friction=friction, ordinal=k, run=run)
         for k, one in enumerate(sets)
     ]
     (output / "source.json").write_text(jsonlib.dumps(vars(said), indent=1) + "\n")
     found = [_summary(file) for file in files]
-    if json:
-        emit({"folder": str(output), "shards": found})
-        return
+    lines = []
     for one in found:
         validated = "not validated" if validation == "none" else f"{one['valid']} valid at level {validation}"
-        typer.echo(f"{one['file']}: {one['grasps']} grasps, {one['feasible']} feasible, {validated}{_compared(one)}")
+        if one["published"]:
+            validated += f"; {one['published']} have a published verdict"
+        if one["agreement_published"] is not None:
+            validated += f", {one['agreement_published']:.0%} of them equal to ours"
+        lines.append(f"{one['file']}: {one['grasps']} grasps, {one['feasible']} feasible, {validated}")
+    report({"folder": str(output), "shards": found}, "\n".join(lines), json=json)
 
 
 def read_sets(format_: str, source: Path, hand: str | None, obj: str | None, options: dict[str, Any]) -> list[Any]:
     """Return the sets of grasps in a file of that format.
 
-    Raises:
-        InputError: unknown format, a missing option, or a file in another format.
+    `hand` is a URDF or built-in, `obj` a mesh at scale 1; the object's name is optional in a file of a single object.
     """
-    from graspd.exchange import dexgraspbench, dexgraspnet2, published
+    from graspd.exchange import dexgraspbench, dexgraspnet2, graspgen, huggingface, lerobot, published
 
     if format_ not in IMPORTS:
         raise InputError(f"there is no import format {format_!r}; choose one of {one_of(format_, IMPORTS)}")
@@ -181,31 +171,25 @@ def read_sets(format_: str, source: Path, hand: str | None, obj: str | None, opt
         return published.read_reference(source, hand=hand, obj=obj)
     if hand is None or obj is None:
         raise InputError(f"{format_} files do not hold the hand and the object; name both: --hand and --object")
-    if format_ in ("dexgraspbench", "dexlearn"):
-        return dexgraspbench.read(source, hand=hand, obj=obj)
-    if format_ in NAMED:
-        return _named(format_, source, hand, obj, str(options["object_name"]))
-    if format_ == "dexgraspnet":
-        return published.read_dexgraspnet(source, hand=hand, obj=obj)
-    if format_ == "dexgraspnet2":
-        return dexgraspnet2.read(source, hand=hand, obj=obj, number=int(options["number"]))
-    if format_ == "ddgc":
-        return published.read_ddgc(source, hand=hand, obj=obj, number=int(options["number"]))
-    if not options["robot"] or not options["object_name"]:
+    if format_ == "multidex" and not (options["robot"] and options["object_name"]):
         raise InputError("a multidex file holds many robots and objects; name one of each: --robot and --name")
-    return published.read_multidex(
-        source, hand=hand, obj=obj, robot=options["robot"], object_name=options["object_name"]
-    )
+    # Reader of each format, and its own options.
+    readers: dict[str, tuple[Callable[..., list[Any]], tuple[str, ...]]] = {
+        "dexgraspbench": (dexgraspbench.read, ()),
+        "dexlearn": (dexgraspbench.read, ()),
+        "graspgen": (graspgen.read, ("object_name",)),
+        "huggingface": (huggingface.read, ("object_name",)),
+        "lerobot": (lerobot.read, ("object_name",)),
+        "dexgraspnet": (published.read_dexgraspnet, ()),
+        "dexgraspnet2": (dexgraspnet2.read, ("number",)),
+        "ddgc": (published.read_ddgc, ("number",)),
+        "multidex": (published.read_multidex, ("robot", "object_name")),
+    }
+    read, names = readers[format_]
+    return read(source, hand=hand, obj=obj, **{name: options[name] for name in names})
 
 
-def _named(format_: str, source: Path, hand: str, obj: str, name: str) -> list[Any]:
-    from graspd.exchange import graspgen, huggingface, lerobot
-
-    read = {"graspgen": graspgen.read, "huggingface": huggingface.read, "lerobot": lerobot.read}[format_]
-    return list(read(source, hand=hand, obj=obj, object_name=name))
-
-
-def _pictures(source: Path, format_: str, depth: str, output: Path) -> dict[str, int]:
+def _pictures(source: Path, format_: str, depth: str, output: Path) -> ExportSummary:
     from graspd.exchange import replicator
     from graspd.worker.rendering.export import export_images
 
@@ -214,21 +198,21 @@ def _pictures(source: Path, format_: str, depth: str, output: Path) -> dict[str,
         written = replicator.write(views, output)
     else:
         written = export_images(views, output, depth="exr" if depth == "exr" else "png")
-    return {"pictures": len(views["camera/eye"]), "files": len(written)}
+    return ExportSummary({"pictures": len(views["camera/eye"]), "files": len(written)})
 
 
-def _webdataset(source: Path, output: Path, *, unvalidated: bool, every: bool) -> dict[str, int]:
+def _webdataset(source: Path, output: Path, *, unvalidated: bool, every: bool) -> ExportSummary:
     from graspd.exchange import webdataset
     from graspd.service.readers import Pictures, open_shards
 
     shards = open_shards(source)
     written = webdataset.write(shards, output, valid=not every, unvalidated=unvalidated)
-    return {"pictures": len(Pictures(shards)), "files": len(written)}
+    return ExportSummary({"pictures": len(Pictures(shards)), "files": len(written)})
 
 
 def _bench(
     source: Path, hand: str | None, obj: str | None, output: Path, *, unvalidated: bool, every: bool
-) -> dict[str, int]:
+) -> ExportSummary:
     from graspd.exchange import dexgraspbench
     from graspd.exchange.inputs import load_case
 
@@ -236,19 +220,7 @@ def _bench(
     mask, _ = choose(read_shard(source, kind="base"), unvalidated=unvalidated, every=every)
     rows = np.flatnonzero(mask)
     written = dexgraspbench.write(case.hand, case.obj, case.grasps, rows.tolist(), output, case.placed)
-    return {"grasps": len(written), "files": len(written)}
-
-
-def _compared(one: dict[str, Any]) -> str:
-    """Describe how published verdicts of imported grasps agree with ours."""
-    if not one["published"]:
-        return ""
-    words = f"; {one['published']} have a published verdict"
-    return (
-        words
-        if one["agreement_published"] is None
-        else f"{words}, {one['agreement_published']:.0%} of them equal to ours"
-    )
+    return ExportSummary({"grasps": len(written), "files": len(written)})
 
 
 def _summary(file: Path) -> dict[str, Any]:
@@ -269,7 +241,6 @@ def _summary(file: Path) -> dict[str, Any]:
 
 
 @app.command(epilog="graspd datasets card kitchen -o kitchen-v1 --licence CC-BY-4.0")
-@reporting_errors
 def card(
     source: Annotated[
         str, typer.Argument(metavar="NAME", help="Dataset of the store, or folder of shards, such as ./kitchen-v1.")
@@ -293,24 +264,21 @@ def card(
             raise InputError(f"{source} is a folder; --snapshot goes with the name of a dataset")
         contents = contents_of_folder(Path(source))
     else:
-        contents = contents_of_store(
-            open_store(load_settings(data_dir=data_dir).resolved_store_url, make=False), source, snapshot
-        )
+        store = open_store(load_settings(data_dir=data_dir).resolved_store_url, make=False)
+        contents = contents_of_store(store, source, snapshot)
     if assets is not None:
         contents = with_provenance(contents, assets)
     columns = (TextColumn("shards"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     console = plain_console(stderr=True)
     with Progress(*columns, console=console, disable=json or not console.is_terminal, transient=True) as bar:
         task = bar.add_task("", total=len(contents.shards))
-        found = write_card(
-            contents, out, licence=licence, source=text, progress=lambda done, total: bar.update(task, completed=done)
-        )
+
+        def show(done: int, total: int) -> None:
+            bar.update(task, completed=done)
+
+        found = write_card(contents, out, licence=licence, source=text, progress=show)
     made = found["composition"]
     told = {"out": str(out), "dataset": found["name"], "snapshot": (found["snapshot"] or {}).get("digest")}
     told |= {"grasps": made["grasps"], "valid": made["valid"], "pictures": made["pictures"], "plots": found["plots"]}
-    if json:
-        emit(told)
-    else:
-        typer.echo(
-            f"{out}/README.md: {made['valid']:,} valid grasps, {len(found['plots'])} plots, checksums, card.json"
-        )
+    plots = len(found["plots"])
+    report(told, f"{out}/README.md: {made['valid']:,} valid grasps, {plots} plots, checksums, card.json", json=json)

@@ -98,29 +98,13 @@ class GraspSheet:
         sides = 3 if self.kind == "three sides" else 1
         if self.scene:
             return self._drawn([[_named(way_of(self.shard, int(row)), "grasp")] for row in self.rows], sides)[:, :, 0]
-        shown = Posture.from_columns(self.shard.arrays).take(self.rows)
-        return grasp_pictures(
-            self.hand,
-            self.obj,
-            shown.hand_pose,
-            shown.joint_positions,
-            self.size,
-            THREE_SIDES[:sides],
-            run=self.run,
-            samples=LOOKS[self.kind][1],
-        )
+        shown, samples = Posture.from_columns(self.shard.arrays).take(self.rows), LOOKS[self.kind][1]
+        at = (shown.hand_pose, shown.joint_positions, self.size, THREE_SIDES[:sides])
+        return grasp_pictures(self.hand, self.obj, *at, run=self.run, samples=samples)
 
     def _drawn(self, frames: list[list[Waypoint]], sides: int) -> NDArray[np.uint8]:
-        return way_pictures(
-            self.hand,
-            self.obj,
-            frames,
-            around_of(self.shard, self.rows),
-            self.size,
-            sides=sides,
-            run=self.run,
-            samples=LOOKS[self.kind][1],
-        )
+        around, samples = around_of(self.shard, self.rows), LOOKS[self.kind][1]
+        return way_pictures(self.hand, self.obj, frames, around, self.size, sides=sides, run=self.run, samples=samples)
 
 
 def around_of(shard: Shard, rows: NDArray[np.intp]) -> PictureScenes:
@@ -165,64 +149,44 @@ class GraspAnimation:
     run: ExecutionContext
     width: int | None = None
     """Width [px]; None: `WIDTH`."""
-    samples: int = FILM_SAMPLES
 
     def file(self, suffix: str) -> bytes:
-        """Return the film as GIF, WebP or animated PNG.
-
-        Raises:
-            InputError: another suffix, or a grasp has no trajectory that is free of the object.
-        """
+        """Return the film as GIF, WebP or animated PNG."""
         animation_kind(suffix)
         pictures: list[NDArray[np.uint8]] = []
         seconds: list[float] = []
         for row in self.rows:
             found = self._executed(row)
-            way = _timed(found)
+            limits, names = hand_limits(found.hand), found.hand.joint_names
+            way = timed(straight_paths(found, 0), names, limits.velocity, speed=SPEED)
             pictures.append(self._drawn(row, waypoints(found, way)))
-            seconds += _shown(way)
+            shown = [STEP_S, *np.diff(way.time).tolist()]
+            shown[0] += BEFORE_S
+            shown[-1] += AFTER_S
+            seconds += shown
         return animation(np.concatenate(pictures), seconds, suffix)
 
     def _executed(self, row: np.intp) -> Executions:
         one, placed = np.array([row]), placed_of_shard(self.shard)
         grasps = GraspSet.from_columns(self.shard.arrays).take(one)
-        return executions(
-            self.hand,
-            self.obj,
-            grasps,
-            rows=one,
-            placed=None if placed is None else placed.take(one),
-            tool=tool_frame(None, self.hand.root_link, {}),
-            quality={},
-        )
+        placed = None if placed is None else placed.take(one)
+        tool = tool_frame(None, self.hand.root_link, {})
+        return executions(self.hand, self.obj, grasps, rows=one, placed=placed, tool=tool, quality={})
 
     def _drawn(self, row: np.intp, way: Sequence[Waypoint]) -> NDArray[np.uint8]:
         width = self.width or WIDTH
         around = around_of(self.shard, np.array([row]))
         size = (width, round(HIGH * width))
         (sides,) = way_pictures(
-            self.hand, self.obj, [way], around, size, whole=True, run=self.run, samples=self.samples
+            self.hand, self.obj, [way], around, size, whole=True, run=self.run, samples=FILM_SAMPLES
         )
         return np.asarray(sides[0])
 
 
 def waypoints(found: Executions, way: RobotTrajectory) -> list[Waypoint]:
     """Return the points of the first grasp's trajectory, in the frame of the object at rest."""
-    rest = found.object_pose[0]
-    poses = compose(invert(rest), way.hand_pose)
+    poses = compose(invert(found.object_pose[0]), way.hand_pose)
     held = way.phase.index("lift")
     carried = np.where(np.arange(len(poses))[:, None] < held, 0.0, poses[:, :3] - poses[held - 1, :3])
     closed = way.phase.index("squeeze") - 1
     return [Waypoint("grasp" if k == closed else "", pose, way.joints[k], carried[k]) for k, pose in enumerate(poses)]
-
-
-def _timed(found: Executions) -> RobotTrajectory:
-    limits = hand_limits(found.hand)
-    return timed(straight_paths(found, 0), found.hand.joint_names, limits.velocity, speed=SPEED)
-
-
-def _shown(way: RobotTrajectory) -> list[float]:
-    seconds = [STEP_S, *np.diff(way.time).tolist()]
-    seconds[0] += BEFORE_S
-    seconds[-1] += AFTER_S
-    return seconds

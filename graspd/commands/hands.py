@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from graspd.service.cli import JsonFlag, emit, plain_console, reporting_errors
+from graspd.service.cli import CommandGroup, JsonFlag, emit, plain_console
 from graspd.service.command_options import with_options
 from graspd.service.model.errors import GraspdError, InputError
 from graspd.service.model.states import AssetKind
@@ -24,12 +24,11 @@ from graspd.worker.hands.load import files_from_path, hand_from_path, main_file
 from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.options import parse_options
 
-app = typer.Typer(add_completion=False)
+app = CommandGroup(add_completion=False)
 
 
 @app.command("check", epilog="graspd hands check my_hand.urdf --palm base_link --approach 0,0,1 --picture my_hand.png")
 @with_options(HandWords, "asset")
-@reporting_errors
 def check(
     file: Annotated[
         str, typer.Argument(help="URDF, xacro or MJCF file, its folder, a ZIP of it, or name of a built-in hand.")
@@ -74,7 +73,6 @@ def check(
 
 
 def _tried(file: str, options: dict[str, Any], *, quiet: bool) -> dict[str, Any]:
-    """Return the facts of the self-test, with progress on a terminal."""
     from graspd.worker.stages.hand_self_test import tried_softly
 
     with _bar("self-test   ", "starting; the first run on a machine compiles its kernels", quiet=quiet) as run:

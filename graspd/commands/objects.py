@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from graspd.service.cli import JsonFlag, emit, reporting_errors
+from graspd.service.cli import CommandGroup, JsonFlag, emit
 from graspd.service.command_options import with_options
 from graspd.service.model.errors import GraspdError, InputError
 from graspd.service.model.object_options import ObjectOptions
@@ -18,12 +18,11 @@ from graspd.service.store.object_sets import Objects, files_of_set
 from graspd.worker.objects.check import check_object
 from graspd.worker.objects.prepare import files_from_path, object_from_path
 
-app = typer.Typer(add_completion=False)
+app = CommandGroup(add_completion=False)
 
 
 @app.command("check", epilog="graspd objects check banana.stl --units mm --picture banana.png")
 @with_options(ObjectOptions, "asset")
-@reporting_errors
 def check(
     file: Annotated[
         str, typer.Argument(help="Mesh (STL, OBJ, PLY, OFF, GLB), built-in object, or folder or ZIP of one or many.")
@@ -52,7 +51,7 @@ def check(
 
 
 def _several(file: str) -> Objects | None:
-    """Return the objects of a folder, or of a ZIP of several; None for one object, readable or not."""
+    """Return the objects of a folder, or of a ZIP of several; None for one object."""
     if file in builtin_names(AssetKind.OBJECT) and not Path(file).is_file():
         return None
     try:
@@ -64,7 +63,6 @@ def _several(file: str) -> Objects | None:
 
 
 def _check_set(objects: Objects, options: dict[str, Any], *, json: bool) -> None:
-    """Print one line per object; a refused object does not stop the others."""
     reports = []
     for name, files in objects.items():
         reports.append({"name": name, **check_object(files, name, **options)})

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 from graspd.commands.grasp_sheet import GraspAnimation, GraspSheet
-from graspd.service.cli import JsonFlag, emit, plain_console, reporting_errors, write_output
+from graspd.service.cli import CommandGroup, JsonFlag, plain_console, report, write_output
 from graspd.service.model.errors import InputError
 from graspd.service.model.scene_spec import supports_in
 from graspd.service.model.transforms import compose
@@ -45,14 +45,13 @@ from graspd.worker.rendering.trajectory_pictures import animation_kind
 from graspd.worker.rendering.views import Extras
 from graspd.worker.rendering.views import render as render_views
 
-app = typer.Typer(add_completion=False)
+app = CommandGroup(add_completion=False)
 
 _Device = Annotated[str, typer.Option(help="Warp device: cpu, cuda:0, or auto.")]
 _Object = Annotated[str | None, typer.Option(help="Object file; default: found by its digest.")]
 
 
 @app.command(epilog="graspd render scenes.h5 --views 3 --stereo -o views.h5 --page views.png")
-@reporting_errors
 def render(
     scenes: Annotated[Path, typer.Argument(help="Scene shard, or base shard of grasps in scenes.")],
     views: Annotated[int, typer.Option(min=1, max=4096, help="Camera placements per scene.")] = 3,
@@ -98,7 +97,8 @@ def render(
         drawn=_drawn_in(scene, hand) if scene.kind == "base" else _drawn(scene, with_hand, hand),
         supports=TABLE if spec is None else supports_in(spec),
     )
-    with _progress(json) as bar:
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=plain_console(stderr=True), disable=json, transient=True) as bar:
         task = bar.add_task("rendering", total=None)
         result = render_views(
             obj,
@@ -122,14 +122,11 @@ def render(
         title = f"Views of {scene.attributes.get('object', 'the object')}"
         subtitle = f"{count} pictures, {size[0]} x {size[1]} pixels"
         write_output(page, views_page(result, title=title, subtitle=subtitle))
-    if json:
-        emit({"file": str(output), "pictures": count, "seconds": round(seconds, 2), "device": used})
-    else:
-        typer.echo(f"{output}: {count} pictures, {seconds:.1f} s on {used}")
+    told = {"file": str(output), "pictures": count, "seconds": round(seconds, 2), "device": used}
+    report(told, f"{output}: {count} pictures, {seconds:.1f} s on {used}", json=json)
 
 
 @app.command(epilog="graspd pictures grasps.h5 -o sheet.png --three-sides")
-@reporting_errors
 def pictures(
     grasps: Annotated[Path, typer.Argument(help="Base shard, as written by `graspd synth`.")],
     count: Annotated[
@@ -183,10 +180,8 @@ def pictures(
         sheet = GraspSheet(base, *models, "way" if way else "three sides" if three else "one side", run, size)
         page = sheet.png(subtitle=f"{len(rows)} of {among} {word}{'' if row else ', by epsilon at 5 mm'}")
     write_output(output, with_palette(page) if palette and not animate else page)
-    if json:
-        emit({"file": str(output), "grasps": len(rows), "of": among, "kind": word, "rows": rows.tolist()})
-    else:
-        typer.echo(f"{output}: {'' if row else 'the best '}{len(rows)} of {among} {word}")
+    told = {"file": str(output), "grasps": len(rows), "of": among, "kind": word, "rows": rows.tolist()}
+    report(told, f"{output}: {'' if row else 'the best '}{len(rows)} of {among} {word}", json=json)
 
 
 def _named_rows(base: Shard, rows: list[int], chosen: NDArray[np.bool_], word: str) -> NDArray[np.intp]:
@@ -199,12 +194,10 @@ def _named_rows(base: Shard, rows: list[int], chosen: NDArray[np.bool_], word: s
 
 
 def _scenes(path: Path) -> Shard:
-    """Read a scene shard, or a base shard whose grasps were planned in scenes."""
     shard = read_shard(path)
     if shard.kind == "base" and "scene/object_pose" not in shard.arrays:
-        raise InputError(
-            f"{path} has grasps around a free object: a scene shard is needed here; make one: graspd scene"
-        )
+        fix = "a scene shard is needed here; make one: graspd scene"
+        raise InputError(f"{path} has grasps around a free object: {fix}")
     if shard.kind == "views":
         raise InputError(f"{path} is a views shard; a scene shard is needed here")
     return shard
@@ -217,13 +210,8 @@ def _drawn_in(base: Shard, hand: str | None) -> DrawnHand | None:
     if not len(base["grasp/hand_pose"]):
         return None
     poses, joints = (np.asarray(base[f"grasp/{name}"], float)[rows] for name in ("hand_pose", "joint_positions"))
-    return DrawnHand(
-        hand_of_shard(base, hand),
-        rows,
-        compose(np.asarray(base["scene/object_pose"], float), poses),
-        joints,
-        wrists_of(base, rows),
-    )
+    placed = compose(np.asarray(base["scene/object_pose"], float), poses)
+    return DrawnHand(hand_of_shard(base, hand), rows, placed, joints, wrists_of(base, rows))
 
 
 def _drawn(scene: Shard, base_file: Path | None, hand: str | None) -> DrawnHand | None:
@@ -236,9 +224,8 @@ def _drawn(scene: Shard, base_file: Path | None, hand: str | None) -> DrawnHand 
     rows = best_kept(scene.arrays, base.arrays)
     source = np.asarray(scene["grasp/base_index"])[rows]
     if len(source) and source.max() >= len(base["grasp/joint_positions"]):
-        raise InputError(
-            f"{base_file} has fewer grasps than the scenes were made of; give the base shard they come from"
-        )
+        fix = "give the base shard they come from"
+        raise InputError(f"{base_file} has fewer grasps than the scenes were made of; {fix}")
     joints = np.asarray(base["grasp/joint_positions"], float)[source]
     poses = np.asarray(scene["grasp/hand_pose"], float)[rows]
     return DrawnHand(model, rows, poses, joints, wrists_of(scene, rows))
@@ -248,20 +235,7 @@ def _show(bar: Progress, task: TaskID, done: float, total: float, message: str) 
     bar.update(task, completed=done, total=total, description=message)
 
 
-def _progress(quiet: bool) -> Progress:
-    return Progress(
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-        console=plain_console(stderr=True),
-        disable=quiet,
-        transient=True,
-    )
-
-
 @app.command(epilog="graspd view grasps.h5")
-@reporting_errors
 def view(
     grasps: Annotated[Path, typer.Argument(help="Base shard, as written by `graspd synth`.")],
     host: Annotated[
@@ -276,8 +250,6 @@ def view(
 
     if said := missing():
         raise InputError(said)
-    from graspd.worker.files.provenance import hand_of_shard, neighbours_of_shard, object_of_shard
-
     base = read_shard(grasps, kind="base")
     shown = ViewerContent(base, hand_of_shard(base, hand), object_of_shard(base, object), neighbours_of_shard(base, []))
     ended = threading.Event()
@@ -286,9 +258,8 @@ def view(
     viewer = Viewer(shown, host=host, port=port)
     try:
         typer.echo(f"{grasps}: {viewer.url}")
-        typer.echo(
-            f"from another machine: {forwarding(viewer.server.get_port())}, then the same address; Ctrl-C ends it"
-        )
+        command = forwarding(viewer.server.get_port())
+        typer.echo(f"from another machine: {command}, then the same address; Ctrl-C ends it")
         ended.wait()
     finally:
         viewer.close()

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from graspd.service.cli import JsonFlag, emit, reporting_errors, write_output
+from graspd.service.cli import CommandGroup, JsonFlag, report, write_output
 from graspd.service.store.columns import Attribute
 from graspd.service.store.shards import read_shard, write_shard
 from graspd.worker.files.provenance import (
@@ -28,11 +28,10 @@ from graspd.worker.scenes.neighbours import Neighbours, drop_together
 from graspd.worker.scenes.rest import rolling_note, rolling_poses
 from graspd.worker.scenes.simulate import drop
 
-app = typer.Typer(add_completion=False)
+app = CommandGroup(add_completion=False)
 
 
 @app.command(epilog="graspd scene grasps.h5 --scenes 4 -o scenes.h5")
-@reporting_errors
 def scene(
     grasps: Annotated[Path, typer.Argument(help="Base shard, as written by `graspd synth`.")],
     scenes: Annotated[int, typer.Option(min=1, max=4096, help="Number of scenes.")] = 2,
@@ -69,15 +68,11 @@ def scene(
     clear, total = int(result["grasp/valid"].sum()), len(result["grasp/valid"])
     rolling = rolling_poses(obj, poses)
     reasons = count_rejections(result["grasp/rejection"])
-    if json:
-        emit(
-            {"file": str(output), "scenes": scenes, "grasps": total, "clear": clear, "rejected": reasons}
-            | {"rolling_scenes": rolling}
-            | {"seconds": round(seconds, 2)}
-        )
-        return
-    typer.echo(f"{output}: {scenes} scenes, {clear} of {total} grasps are clear, {seconds:.1f} s")
+    found = {"file": str(output), "scenes": scenes, "grasps": total, "clear": clear, "rejected": reasons}
+    found |= {"rolling_scenes": rolling, "seconds": round(seconds, 2)}
+    lines = [f"{output}: {scenes} scenes, {clear} of {total} grasps are clear, {seconds:.1f} s"]
     if any(reasons.values()):
-        typer.echo("too near: " + ", ".join(f"{n} {reason.replace('_', ' ')}" for reason, n in reasons.items() if n))
+        lines.append("too near: " + ", ".join(f"{n} {reason.replace('_', ' ')}" for reason, n in reasons.items() if n))
     if (note := rolling_note(rolling, scenes)) is not None:
-        typer.echo(note)
+        lines.append(note)
+    report(found, "\n".join(lines), json=json)

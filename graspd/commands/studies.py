@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import json as json_
 import shlex
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from json import loads
+from json import dumps, loads
 from pathlib import Path
 from typing import Annotated, Any, Final
 
 import typer
 
-from graspd.service.cli import JsonFlag, emit, load_settings, reporting_errors
+from graspd.service.cli import CommandGroup, JsonFlag, load_settings, report
 from graspd.service.model.clock import timestamp
 from graspd.service.model.cores import available_cores
 from graspd.service.model.errors import InputError, one_of
@@ -24,14 +23,16 @@ from graspd.service.model.renamed import renamed_chart
 from graspd.service.model.scene_spec import SceneSpec, parse_scene
 from graspd.service.model.studies import Stability, from_json
 from graspd.service.model.version import PACKAGE_VERSION
+from graspd.service.store.records import STABILITY, kind_of
+from graspd.service.store.records import publish as publish_record
+from graspd.service.store.store import open_store
 from graspd.worker.engines.devices import Device
 from graspd.worker.execution_context import ExecutionContext
 
-app = typer.Typer()
+app = CommandGroup()
 
 
 @app.command(epilog="graspd bench --hand allegro --object mug --batch 1 --batch 32 --out bench")
-@reporting_errors
 def bench(
     hand: Annotated[str, typer.Option(help="URDF, ZIP with a URDF, or built-in hand.")] = "allegro",
     object_: Annotated[str, typer.Option("--object", help="Mesh or built-in object.")] = "mug",
@@ -64,14 +65,11 @@ def bench(
         device=resolved,
         repeats=repeats,
         joins=join or [1],
-        say=lambda line: typer.echo(line, err=True),
+        say=_say,
     )
     if out is not None:
         write(result, out)
-    if json:
-        emit(result)
-    else:
-        typer.echo(table(result))
+    report(result, table(result), json=json)
 
 
 def _fidelities(names: list[str] | None, points: list[int] | None, errors: list[float] | None) -> list[Fidelity]:
@@ -81,31 +79,17 @@ def _fidelities(names: list[str] | None, points: list[int] | None, errors: list[
         raise InputError(f"unknown fidelity {unknown[0]!r}; choose one of {one_of(unknown[0], FIDELITIES)}")
     found = [FIDELITIES[name] for name in chosen]
     changes: list[dict[str, Any]] = [{"fine_points": n, "name": f"{chosen[0]}/points={n}"} for n in points or []]
-    changes += [{"face_error_m": e, "name": f"{chosen[0]}/error={json_.dumps(e)}"} for e in errors or []]
+    changes += [{"face_error_m": e, "name": f"{chosen[0]}/error={dumps(e)}"} for e in errors or []]
     return found + [Fidelity(**(found[0].model_dump() | change)) for change in changes]
 
 
 STUDIES: Final = (
-    "time_step",
-    "stiffness",
-    "contact_count",
-    "gradient",
-    "shapes",
-    "starts",
-    "rates",
-    "length",
-    "hands",
-    "model_errors",
-    "peers",
-    "scene_height",
-    "scene_wall",
-    "scene_neighbours",
-    "scene_size",
+    *("time_step", "stiffness", "contact_count", "gradient", "shapes", "starts", "rates", "length", "hands"),
+    *("model_errors", "peers", "scene_height", "scene_wall", "scene_neighbours", "scene_size"),
 )
 
 
 @app.command(epilog="graspd stability --only gradient --only starts --out stability --publish")
-@reporting_errors
 def stability(
     only: Annotated[list[str] | None, typer.Option(help=f"Study: {', '.join(STUDIES)}; repeatable.")] = None,
     hand: Annotated[str, typer.Option(help="URDF or built-in hand.")] = "allegro",
@@ -134,13 +118,11 @@ def stability(
         found = _measured(tuple(only or STUDIES), hand, object_, quick=quick, long=long, threads=threads)
     if out is not None:
         write(found, out)
-    key = _publish_maps(found, data_dir) if publish else None
-    if json:
-        good = {one.name: {panel: one.share(panel) for panel in one.panels} for one in found.maps}
-        still = {one.name: one.still_breaks() for one in found.maps}
-        emit({"good": good, "still_breaks": still, "out": None if out is None else str(out), "published": key})
-    else:
-        typer.echo(markdown(found))
+    key = _publish(STABILITY, found.as_json(), data_dir) if publish else None
+    good = {one.name: {panel: one.share(panel) for panel in one.panels} for one in found.maps}
+    still = {one.name: one.still_breaks() for one in found.maps}
+    told = {"good": good, "still_breaks": still, "out": None if out is None else str(out), "published": key}
+    report(told, markdown(found), json=json)
 
 
 def _measured(names: tuple[str, ...], hand: str, obj: str, *, quick: bool, long: bool, threads: int) -> Stability:
@@ -150,7 +132,6 @@ def _measured(names: tuple[str, ...], hand: str, obj: str, *, quick: bool, long:
     import warp as wp
 
     from graspd.studies.stability.studies import run
-    from graspd.worker.execution_context import ExecutionContext
 
     maps = run(names, hand, obj, quick=quick, long=long, work=ExecutionContext(threads=threads), say=_say)
     command = shlex.join(["graspd", *(Path(word).name if "/" in word else word for word in sys.argv[1:])])
@@ -173,12 +154,8 @@ def _joined(parts: list[Stability]) -> Stability:
     return replace(parts[-1], command=commands, maps=list(maps.values()))
 
 
-def _publish_maps(found: Stability, data_dir: Path | None) -> str:
-    from graspd.service.store.records import STABILITY, publish
-    from graspd.service.store.store import open_store
-
-    store = open_store(load_settings(data_dir=data_dir).resolved_store_url)
-    key = publish(store, STABILITY, found.as_json())
+def _publish(kind: str, document: dict[str, Any], data_dir: Path | None) -> str:
+    key = publish_record(open_store(load_settings(data_dir=data_dir).resolved_store_url), kind, document)
     _say(f"published as {key}")
     return key
 
@@ -192,7 +169,6 @@ PEERS = ("fast_graspd", "graspit", "graspd2022", "dfc", "autograsp")
 
 
 @app.command(epilog="graspd chart --methods fast_graspd,autograsp --hands allegro --objects mug,bottle --out chart")
-@reporting_errors
 def chart(
     methods: Annotated[
         str, typer.Option(help="Planners, separated by commas; also as NAME:OPTION=VALUE@GRASPS_PER_CALL.")
@@ -251,16 +227,13 @@ def chart(
     on = ExecutionContext(Device(device).resolve(), threads)
     batches, models_around = [_number(part) for part in _parts(batch)], ROBUST_MODELS
     if quick:
-        hands, objects, fidelities = (_first(text) for text in (hands, objects, fidelities))
+        hands, objects, fidelities = (_parts(text)[0] for text in (hands, objects, fidelities))
         batches, peer_batch, repeats, models_around = [4], 2, 1, 2
+    levels = _parts(fidelities)
+    if unknown := [name for name in levels if name not in FIDELITIES]:
+        raise InputError(f"unknown fidelity {unknown[0]!r}; choose of {one_of(unknown[0], FIDELITIES)}")
     chosen = settings_of(
-        _parts(methods),
-        known_fidelities(_parts(fidelities)),
-        batches=batches,
-        peer_batch=peer_batch,
-        options=option or [],
-        quick=quick,
-        run=on,
+        _parts(methods), levels, batches=batches, peer_batch=peer_batch, options=option or [], quick=quick, run=on
     )
     models, things = [hand_from_path(part) for part in _parts(hands)], _things(_parts(objects))
     said = {"command": shlex.join(["graspd", *(_short(word) for word in sys.argv[1:])]), "remark": remark}
@@ -272,11 +245,12 @@ def chart(
     if place is None:
         from graspd.studies.chart.chart import chart as run
 
-        result = run(models, things, chosen, repeats=repeats, models=models_around, say=_say, keep=keep) | said
+        result = run(models, things, chosen, repeats=repeats, models=models_around, say=_say, keep=keep)
     else:
         from graspd.studies.chart.scenes import scene_chart
 
-        result = scene_chart(models, things, chosen, place, models=models_around, work=work, say=_say, keep=keep) | said
+        result = scene_chart(models, things, chosen, place, models=models_around, work=work, say=_say, keep=keep)
+    result |= said
     if sweep:
         result["sweeps"] = turn(
             models[0], things[0], batch=batches[0], repeats=repeats, quick=quick, run=on, knobs=knob or (), say=_say
@@ -290,11 +264,8 @@ def _finish(result: dict[str, Any], out: Path | None, data_dir: Path | None, *, 
     if out is not None:
         write(result, out)
     if publish:
-        _publish_chart(result, data_dir)
-    if json:
-        emit(result)
-    else:
-        typer.echo(markdown(result))
+        _publish(kind_of(result), result, data_dir)
+    report(result, markdown(result), json=json)
 
 
 def _read_chart(path: Path) -> dict[str, Any]:
@@ -312,7 +283,6 @@ def _read_chart(path: Path) -> dict[str, Any]:
 
 
 def _place(scene: str) -> SceneSpec | None:
-    """Return the scene of a chart; None: around free objects."""
     if scene == "free":
         return None
     spec = parse_scene(scene)
@@ -340,21 +310,10 @@ def _parts(text: str) -> list[str]:
     return parts
 
 
-def _first(text: str) -> str:
-    return _parts(text)[0]
-
-
 def _number(text: str) -> int:
     if not text.isdigit() or not 1 <= int(text) <= 4096:
         raise InputError(f"--batch {text!r} is no number of grasps from 1 to 4096")
     return int(text)
-
-
-def known_fidelities(names: Sequence[str]) -> list[str]:
-    """Return the names if all are known; else raise InputError."""
-    if unknown := [name for name in names if name not in FIDELITIES]:
-        raise InputError(f"unknown fidelity {unknown[0]!r}; choose of {one_of(unknown[0], FIDELITIES)}")
-    return list(names)
 
 
 def _things(objects: Sequence[str]) -> list[Any]:
@@ -367,11 +326,3 @@ def _things(objects: Sequence[str]) -> list[Any]:
     for text in objects:
         load(text, 1e-3)  # report a wrong file before an hour of work
     return [ChartObject(name_of(Path(text)), partial(load, text)) for text in objects]
-
-
-def _publish_chart(result: dict[str, Any], data_dir: Path | None) -> None:
-    from graspd.service.store.records import kind_of, publish
-    from graspd.service.store.store import open_store
-
-    key = publish(open_store(load_settings(data_dir=data_dir).resolved_store_url), kind_of(result), result)
-    _say(f"published as {key}")

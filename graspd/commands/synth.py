@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 import typer
 
 from graspd.service.cli import (
+    CommandGroup,
     JsonFlag,
-    emit,
     engine_settings,
     fail,
     plain_console,
-    reporting_errors,
+    report,
     told_to_stop,
     write_output,
 )
@@ -30,14 +30,13 @@ from graspd.service.store.shards import write_shard
 if TYPE_CHECKING:
     from graspd.worker.execution_context import Progress as Report
 
-app = typer.Typer()
+app = CommandGroup()
 #: Exit code of a run that found fewer grasps than requested.
 FEWER: Final = 3
 
 
 @app.command(epilog="graspd synth --hand allegro --object mug -n 32 -o grasps.h5")
 @with_options(LocalOptions, "synth")
-@reporting_errors
 def synth(
     hand: Annotated[str, typer.Option(help="URDF, ZIP with a URDF, or name of a built-in hand.")],
     object_: Annotated[str, typer.Option("--object", help="Mesh (STL, OBJ, PLY, GLB, OFF) or built-in object.")],
@@ -79,10 +78,7 @@ def synth(
         shard = write_shard("base", made.arrays, {**made.attributes, "shard_id": id_of_columns(made.arrays)})
         write_output(out, shard)
     found = {"file": str(out), **made.summary()}
-    if json:
-        emit(found)
-    else:
-        typer.echo(_said(found | ({"reason": None} if made.interrupted else {})))
+    report(found, _said(found | ({"reason": None} if made.interrupted else {})), json=json)
     if made.interrupted:
         fail(f"interrupted: {out} contains {found['grasps']} of {asked.grasps} grasps", 128 + stop[0])
     if made.reason is not None:
@@ -99,13 +95,8 @@ def _bar(*, quiet: bool) -> Iterator[Report]:
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
     began = time.perf_counter()
-    columns = (
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        TextColumn("{task.fields[rate]}"),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
+    what, rate = TextColumn("{task.description}", markup=False), TextColumn("{task.fields[rate]}")
+    columns = (what, BarColumn(), rate, TimeElapsedColumn(), TimeRemainingColumn())
     with Progress(*columns, console=plain_console(stderr=True), transient=True) as bar:
         task = bar.add_task("starting", total=None, rate="")
 
@@ -117,7 +108,6 @@ def _bar(*, quiet: bool) -> Iterator[Report]:
 
 
 def _said_of_models(found: dict[str, Any]) -> str:
-    """Describe the robustness of the verdicts in one line."""
     share, not_robust = found["robust_share"], found["not_robust"]
     if share is None:
         return (
@@ -130,7 +120,6 @@ def _said_of_models(found: dict[str, Any]) -> str:
 
 
 def _said(found: dict[str, Any]) -> str:
-    """Return the summary as one line, and further lines for details and the reason of a shortfall."""
     validated, mean = found["validation"] != "none", found["mean"]
     word = "valid" if validated else "feasible"
     lines = [

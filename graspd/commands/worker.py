@@ -11,17 +11,16 @@ from typing import Annotated
 
 import typer
 
-from graspd.service.cli import keep_private, load_settings, log_to_stderr, reporting_errors
+from graspd.service.cli import CommandGroup, keep_private, load_settings, log_to_stderr
 from graspd.service.model.errors import InputError, UnavailableError
 from graspd.service.model.libraries import imports
 from graspd.service.model.states import Stage
 from graspd.service.settings import Settings
 
-app = typer.Typer(no_args_is_help=True)
+app = CommandGroup(no_args_is_help=True)
 
 
 @app.command(epilog="graspd worker --workers 4 --stages synthesize,render")
-@reporting_errors
 def worker(
     device: Annotated[str | None, typer.Option(help="Device: cpu, cuda:0, ... or auto; GRASPD_DEVICE.")] = None,
     stages: Annotated[str | None, typer.Option(help="Stages to serve, separated by commas; default: all.")] = None,
@@ -57,7 +56,13 @@ def worker(
     if workers > 1:
         if burst or once or max_tasks is not None:
             raise InputError("--burst, --once and --max-tasks are for a single worker")
-        _run_several(workers, settings, stages)
+        from graspd.service.run.commands import stop_on_signals
+
+        _parse_stages(stages)
+        arguments = ["worker", "--device", settings.device, "--threads", str(settings.threads)]
+        arguments += ["--join", settings.join, "--processes", str(settings.processes)]
+        arguments += ["--data-dir", str(settings.data_dir), *(("--stages", stages) if stages else ())]
+        run_workers(workers, arguments, settings, stop_on_signals())
         return
     with imports():
         from graspd.worker.process.main import run_worker
@@ -68,16 +73,6 @@ def worker(
     raise typer.Exit(0 if ended_well else 1)
 
 
-def _run_several(count: int, settings: Settings, stages: str | None) -> None:
-    from graspd.service.run.commands import stop_on_signals
-
-    _parse_stages(stages)
-    arguments = ["worker", "--device", settings.device, "--threads", str(settings.threads)]
-    arguments += ["--join", settings.join, "--processes", str(settings.processes)]
-    arguments += ["--data-dir", str(settings.data_dir), *(("--stages", stages) if stages else ())]
-    run_workers(count, arguments, settings, stop_on_signals())
-
-
 def run_workers(
     count: int,
     arguments: Sequence[str],
@@ -86,13 +81,7 @@ def run_workers(
     *,
     program: Sequence[str] = (sys.executable, "-m", "graspd"),
 ) -> None:
-    """Keep `count` processes alive until `stop`; process k takes the k-th GPU (`worker.engines.devices`).
-
-    Args:
-        arguments: command line of each; their settings come from the environment as well.
-        settings: how long a worker may take to stop.
-        stop: event that ends all processes.
-    """
+    """Keep `count` processes alive until `stop`; process k takes the k-th GPU (`worker.engines.devices`)."""
     from graspd.service.run.children import Child, keep_alive, stop_children
 
     of_each = [{"GRASPD_WORKER_NUMBER": str(number), "GRASPD_WORKERS_HERE": str(count)} for number in range(count)]

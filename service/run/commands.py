@@ -13,15 +13,7 @@ from typing import Annotated
 
 import typer
 
-from graspd.service.cli import (
-    JsonFlag,
-    emit,
-    keep_private,
-    load_settings,
-    log_to_stderr,
-    plain_console,
-    reporting_errors,
-)
+from graspd.service.cli import CommandGroup, JsonFlag, emit, keep_private, load_settings, log_to_stderr, plain_console
 from graspd.service.model import names
 from graspd.service.model.errors import IndexDamaged, QueueUnavailable, UnavailableError, without_secrets
 from graspd.service.settings import Settings
@@ -29,15 +21,14 @@ from graspd.service.telemetry import HeartbeatFile
 
 log = logging.getLogger(__name__)
 
-app = typer.Typer(no_args_is_help=True)
-index_app = typer.Typer(no_args_is_help=True, help="Rebuild the index from the store or export its tables.")
+app = CommandGroup(no_args_is_help=True)
+index_app = CommandGroup(no_args_is_help=True, help="Rebuild the index from the store or export its tables.")
 app.add_typer(index_app, name="index")
 
 DataDir = Annotated[Path | None, typer.Option("--data-dir", help="Data folder of graspd; GRASPD_DATA_DIR.")]
 
 
 @app.command(epilog="graspd up --workers 2 --port 8000")
-@reporting_errors
 def up(
     workers: Annotated[int, typer.Option(min=0, help="Worker processes on this machine.")] = 1,
     host: Annotated[str | None, typer.Option(help="Address of the API; GRASPD_HOST.")] = None,
@@ -85,7 +76,6 @@ def up(
 
 
 @app.command(epilog="graspd controller")
-@reporting_errors
 def controller(
     check: Annotated[
         bool, typer.Option("--check", help="Only check for a live controller; exit code 1 if there is none.")
@@ -137,7 +127,6 @@ def _identify(settings: Settings, stop: threading.Event, alive: HeartbeatFile) -
 
 
 @index_app.command(epilog="graspd admin index rebuild --check")
-@reporting_errors
 def rebuild(
     check: Annotated[bool, typer.Option("--check", help="Print differences without changing anything.")] = False,
     data_dir: DataDir = None,
@@ -187,7 +176,6 @@ def rebuild(
 
 
 @index_app.command(epilog="graspd admin index export -o tables")
-@reporting_errors
 def export(
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write, with a file for each table.")],
     data_dir: DataDir = None,
@@ -207,7 +195,6 @@ def export(
 
 
 @index_app.command(epilog="graspd admin index path")
-@reporting_errors
 def path(data_dir: DataDir = None) -> None:
     """Print the location of the index, without the password of its URL."""
     from sqlalchemy import make_url

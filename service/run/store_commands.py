@@ -7,17 +7,16 @@ from typing import Annotated
 
 import typer
 
-from graspd.service.cli import JsonFlag, emit, load_settings, reporting_errors
+from graspd.service.cli import CommandGroup, JsonFlag, emit, load_settings
 from graspd.service.model import names
 from graspd.service.model.errors import ConflictError
 
-app = typer.Typer(no_args_is_help=True)
-store_app = typer.Typer(no_args_is_help=True, help="Verify and repair the store.")
+app = CommandGroup(no_args_is_help=True)
+store_app = CommandGroup(no_args_is_help=True, help="Verify and repair the store.")
 app.add_typer(store_app, name="store")
 
 
 @store_app.command(epilog="graspd admin store verify --repair")
-@reporting_errors
 def verify(
     repair: Annotated[
         bool, typer.Option("--repair", help="Move damaged objects aside and queue the tasks that make them again.")
@@ -76,7 +75,6 @@ def verify(
 
 
 @store_app.command(epilog="graspd admin store upgrade")
-@reporting_errors
 def upgrade(
     data_dir: Annotated[Path | None, typer.Option("--data-dir", help="Data folder of graspd; GRASPD_DATA_DIR.")] = None,
     json: JsonFlag = False,

@@ -43,14 +43,11 @@ def scene_shard(base) -> Path:
     return base.with_name("scenes.h5")
 
 
-def test_scene_writes_every_grasp_in_every_scene(scene_shard):
+def test_each_grasp_is_in_each_scene_and_each_placement_a_stereo_pair(scene_shard):
     shard = read_shard(scene_shard, kind="scene")
     assert shard["scene/object_pose"].shape == (2, 7)
     assert shard["grasp/base_index"].tolist() == [0, 1, 2, 0, 1, 2]
     assert (shard.attributes["object"], shard.attributes["seed"]) == ("block", 5)
-
-
-def test_render_makes_a_stereo_pair_per_placement_and_a_page(scene_shard):
     output, page = scene_shard.with_name("views.h5"), scene_shard.with_name("views.png")
     found = graspd(f"render --views 2 --stereo {SMALL} -o", output, "--page", page, scene_shard)
     assert found["pictures"] == 8
@@ -161,19 +158,6 @@ def test_render_writes_the_channels_cameras_and_hand_asked_for(base, scene_shard
     # The hand of the base shard is high above the table: its best grasp by epsilon is the last.
     kept = read_shard(scene_shard, kind="scene")["grasp/base_index"][views["camera/hand_grasp"]]
     assert kept.tolist() == [2, 2]
-
-
-def test_three_sides_of_a_grasp_take_fewer_rays_than_a_picture(base, monkeypatch):
-    traced = []
-
-    def count(hand, obj, pose, joints, size, sides, *, samples, **options):
-        traced.append(len(sides) * size[0] * size[1] * samples)
-        return np.zeros((len(pose), len(sides), size[1], size[0], 3), np.uint8)
-
-    monkeypatch.setattr(grasp_sheet, "grasp_pictures", count)
-    for words in ("", "--three-sides", "--three-sides --size 300"):
-        graspd(f"pictures {words} -o", base.with_name("sheet.png"), base)
-    assert traced[1] < 0.6 * traced[0] and traced[2] == 2 * traced[0]
 
 
 def test_neighbours_travel_from_scene_to_labels_of_pictures(base):

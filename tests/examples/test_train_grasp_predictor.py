@@ -9,38 +9,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from examples.train_grasp_predictor import execution, sources
-from examples.train_grasp_predictor.evaluation import FACE, OBJECT, Exam, examined
-from examples.train_grasp_predictor.samples import (
-    Scene,
-    Sight,
-    TrainedModel,
-    apart,
-    each_scene,
-    rows_of,
-    sights,
-    taught,
-)
-from examples.train_grasp_predictor.table import markdown
-from examples.train_grasp_predictor.without_network import SQUEEZE, Nearest, across
+from examples.train_grasp_predictor import execution
+from examples.train_grasp_predictor.evaluation import OBJECT, Exam, examined
+from examples.train_grasp_predictor.samples import Scene, Sight, each_scene, rows_of, sights, taught
+from examples.train_grasp_predictor.without_network import SQUEEZE, across
 from graspd.baselines.learned.network import Proposals, decode
 from graspd.service.model.transforms import apply, compose, invert, quat_from_axis_angle, quat_rotate, quat_to_matrix
 from graspd.service.readers import open_shards
-from graspd.worker.engines import backend
 from graspd.worker.grasps import GraspSet, Posture
-from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.prepare import object_from_path
 from tests.service.readers import box_scenes
 
 JOINTS = 3
 Floats = np.ndarray[Any, np.dtype[np.float64]]
-
-
-@pytest.fixture(scope="module")
-def hand() -> HandModel:
-    backend.start()
-    return hand_from_path("barrett")
 
 
 def poses(count: int, seed: int) -> Floats:
@@ -99,28 +81,6 @@ def test_only_valid_grasps_are_taught_each_in_its_scene(tmp_path: Path) -> None:
     assert {scene.number: len(rows) for scene, rows in each_scene(found)} == {0: 3, 1: 2}
 
 
-def test_the_face_held_back_looks_least_like_the_others() -> None:
-    around = np.deg2rad(np.arange(0, 360, 30))
-    sides = np.stack([np.cos(around), np.sin(around), np.zeros(12)], axis=1)
-    assert apart(np.concatenate([sides[:5], [[0, 0, 1.0]], sides[5:]])) == 5
-
-
-def test_most_alike_grasps_lie_nearer_than_most_unlike_ones() -> None:
-    rng = np.random.default_rng(0)
-    rows = rng.normal(size=(40, 12 + 3 * JOINTS))
-    scene = Scene("block", "a" * 64, 0)
-    given = TrainedModel([scene] * 40, rows, np.ones(40), np.ones(40, bool), np.ones(40))
-    held = sources.Held(open_shards([]), [])
-    held.poses[scene] = np.array([0, 0, 0, 1.0, 0, 0, 0])
-
-    def width(part: TrainedModel) -> float:
-        return float(np.linalg.norm(part.rows[:, None, :3] - part.rows[None, :, :3], axis=2).mean())
-
-    alike, unlike = (sources.spread(given, held, 10, alike=alike) for alike in (True, False))
-    assert len(alike) == len(unlike) == 10
-    assert width(alike) < width(given) < width(unlike)
-
-
 def test_without_a_network_fingers_close_across_the_narrow_side(hand: HandModel) -> None:
     sight = block_of((0.18, 0.05, 0.12), turned=0.7, at=(0.1, -0.05))
     found = across(hand, sight, 4, squeeze=SQUEEZE, rng=np.random.default_rng(0))
@@ -131,23 +91,6 @@ def test_without_a_network_fingers_close_across_the_narrow_side(hand: HandModel)
         low = (points[points[:, 2] < 0.11] - sight.anchor) @ narrow  # of the fingers, below the top of the block
         assert low.min() < -0.02
         assert low.max() > 0.02
-
-
-def test_the_nearest_picture_gives_its_grasps_turned_with_it() -> None:
-    shown, asked = block_of((0.18, 0.05, 0.12)), block_of((0.18, 0.05, 0.12), turned=np.pi / 2, at=(0.3, 0.1))
-    other = block_of((0.06, 0.06, 0.06))
-    other = Sight(Scene("cube", "b" * 64, 0), other.points, other.normals, other.object_pose)
-    rows = rows_of(grasps_of(), np.repeat(shown.object_pose[None], 5, axis=0))
-    parts = [
-        TrainedModel([sight.scene] * 5, given, np.ones(5), np.ones(5, bool), np.ones(5))
-        for sight, given in ((shown, rows), (other, rows + 5.0))
-    ]
-    found = Nearest([shown, other], parts).propose(asked, 5, np.random.default_rng(0))
-    # The same hand in the object's frame; a block looks the same after half a turn.
-    own = {tuple(np.round(place, 6)) for place in apply(invert(shown.object_pose), rows[:, :3])}
-    there = apply(invert(asked.object_pose), found.hand_pose[:, :3])
-    half = there * [-1, -1, 1]
-    assert own in ({tuple(np.round(place, 6)) for place in side} for side in (there, half))
 
 
 def test_a_hand_that_would_stand_in_the_table_is_raised(hand: HandModel) -> None:
@@ -162,22 +105,6 @@ def test_a_hand_that_would_stand_in_the_table_is_raised(hand: HandModel) -> None
     assert lowest > -1e-3  # fingertips may touch the table; points of the surface are known to less than that
 
 
-def test_fingers_open_as_wide_as_the_table_has_room_for(hand: HandModel) -> None:
-    sight = block_of((0.06, 0.06, 0.12))
-    given = across(hand, sight, 1, squeeze=SQUEEZE, rng=np.random.default_rng(0))
-    lying = quat_from_axis_angle(np.array([0, 1.0, 0]), np.array(np.pi / 2))
-
-    def beside_the_table(height: float) -> execution.Ready:
-        """The hand on its side, its fingers open up and down, so far above the table."""
-        pose = np.array([[0.0, 0.0, height, *lying]])
-        return execution.made_ready(hand, replace(given, hand_pose=pose, approach=np.array([[1.0, 0, 0]])), sight)
-
-    high, low = beside_the_table(0.5), beside_the_table(0.0)
-    np.testing.assert_array_equal(high.opened, execution.wider(hand, given.pregrasp, execution.OPENED[0]))
-    np.testing.assert_array_equal(low.opened, execution.wider(hand, given.pregrasp, execution.OPENED[-1]))
-    np.testing.assert_array_equal(high.hands.hand_pose[:, 2], 0.5)
-
-
 @pytest.mark.parametrize(("off", "clear"), [(0.5, False), (2.0, True)])
 def test_a_hand_is_clear_that_keeps_its_distance_on_its_way(hand: HandModel, off: float, clear: bool) -> None:
     sight = block_of((0.06, 0.06, 0.12))
@@ -190,26 +117,6 @@ def test_a_hand_is_clear_that_keeps_its_distance_on_its_way(hand: HandModel, off
     side = swept[np.argmax(swept[:, 0])] + [off * execution.SEEN_M, 0.0, 0.0]
     beside = replace(sight, points=np.vstack([sight.points, side]), normals=np.vstack([sight.normals, [1.0, 0, 0]]))
     assert execution.made_ready(hand, given, beside).clear.all() == clear
-
-
-def test_where_a_hand_is_to_squeeze_raises_it_by_nothing(hand: HandModel) -> None:
-    sight = block_of((0.06, 0.06, 0.12))
-    given = across(hand, sight, 1, squeeze=SQUEEZE, rng=np.random.default_rng(0))
-
-    def lowest(joints: Floats) -> float:
-        return float(execution.hand_points(hand, given.hand_pose, joints)[..., 2].min())
-
-    # Of wider and tighter hands the ones that reach lowest and least low; the table is half-way between the two.
-    every = [execution.tighter(hand, given.joints, by) for by in np.linspace(-2.0, 2.0, 17)]
-    low, high = min(every, key=lowest), max(every, key=lowest)
-    assert lowest(low) < lowest(high) - 0.02
-    pose = given.hand_pose.copy()
-    pose[:, 2] -= 0.5 * (lowest(low) + lowest(high))
-    gentle = replace(given, hand_pose=pose, joints=high, pregrasp=high, squeeze=high)
-    once, again = (
-        execution.made_ready(hand, one, sight).hands.hand_pose for one in (gentle, replace(gentle, squeeze=low))
-    )
-    np.testing.assert_array_equal(once, again)
 
 
 @pytest.mark.slow
@@ -240,27 +147,3 @@ def _block_seen(vertices: Floats) -> tuple[Floats, Floats, Floats]:
     pose = np.array([0, 0, -low[2], 1.0, 0, 0, 0])
     middle = (low + high) / 2
     return whole.points + np.array([middle[0], middle[1], 0.0]), whole.normals, pose
-
-
-def test_the_table_says_what_seeds_differ_by() -> None:
-    rows = [
-        {
-            "hand": "barrett",
-            "source": "scenes in the loop",
-            "seed": seed,
-            "grasps": 640,
-            "views": 100,
-            "object": name,
-            "kind": kind,
-            "lift": lift,
-            "best": lift,
-            "hard": 0.1,
-            "table": 0.0,
-            "epsilon": 0.3,
-        }
-        for seed, lift in ((0, 0.5), (1, 0.7))
-        for name, kind in (("mug", OBJECT), ("can", FACE))
-    ]
-    text = markdown(rows)
-    assert "| scenes in the loop | 640 | 100 | 0.60 ± 0.14 |" in text
-    assert "| can, unseen face | 0.60 |" in text

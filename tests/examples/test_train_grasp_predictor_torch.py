@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -11,21 +9,12 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="torch is not installed; `pip install torch` runs these tests")
 
-from examples.train_grasp_predictor.evaluator import Attempts, Ensemble, Evaluator, Hands, learned, scores  # noqa: E402
 from examples.train_grasp_predictor.network import Proposer  # noqa: E402
-from examples.train_grasp_predictor.practice import TrainingRun  # noqa: E402
-from examples.train_grasp_predictor.refinement import BEGUN, RefinedHands, moved  # noqa: E402
-from examples.train_grasp_predictor.samples import Scene, Sight, TrainedModel, sights, taught  # noqa: E402
-from examples.train_grasp_predictor.training import TrainingData, train, turned  # noqa: E402
-from examples.train_grasp_predictor.without_network import SQUEEZE, across  # noqa: E402
+from examples.train_grasp_predictor.samples import sights, taught  # noqa: E402
+from examples.train_grasp_predictor.training import TrainingData, train  # noqa: E402
 from graspd.baselines.learned import network as net  # noqa: E402
-from graspd.service.model import transforms  # noqa: E402
 from graspd.service.readers import open_shards  # noqa: E402
 from graspd.service.store.network_file import ProposalNetwork  # noqa: E402
-from graspd.worker.engines import backend  # noqa: E402
-from graspd.worker.hands.load import hand_from_path  # noqa: E402
-from graspd.worker.hands.model import HandModel  # noqa: E402
-from graspd.worker.objects.prepare import object_from_path  # noqa: E402
 from tests.service.readers import box_scenes  # noqa: E402
 
 
@@ -51,167 +40,11 @@ def test_what_torch_learns_is_what_the_planner_runs() -> None:
     np.testing.assert_allclose(found, x.numpy(), atol=2e-5)
 
 
-def test_a_turn_about_the_vertical_keeps_lengths_and_heights() -> None:
-    vectors = torch.randn(4, 6, 3, generator=torch.Generator().manual_seed(0))
-    found = turned(vectors, torch.full((4, 1), torch.pi / 2))
-    torch.testing.assert_close(found[..., 0], -vectors[..., 1], atol=1e-6, rtol=0)
-    torch.testing.assert_close(found[..., 1], vectors[..., 0], atol=1e-6, rtol=0)
-    torch.testing.assert_close(found[..., 2], vectors[..., 2])
-
-
-@pytest.fixture
-def one_thread() -> Iterator[None]:
-    """Threads of torch that wait for one another on a busy machine take minutes for seconds."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
-
-
-@pytest.mark.usefixtures("one_thread")
 def test_training_comes_nearer_to_the_grasps_that_it_is_shown(tmp_path: Path) -> None:
+    torch.set_num_threads(1)  # those that wait for one another on a busy machine take minutes for seconds
     box_scenes.write(tmp_path)
     shards = open_shards(tmp_path)
     lessons = TrainingData.of(sights(shards, noise="stereo"), [taught(shards, "box")])
     assert len(lessons) == box_scenes.VIEWS
     early, late = (train(lessons, steps=steps, seed=0) for steps in (10, 40))
     assert late.loss < 0.9 * early.loss
-
-
-@pytest.fixture(scope="module")
-def hand() -> HandModel:
-    backend.start()
-    return hand_from_path("barrett")
-
-
-def ball() -> Sight:
-    """A ball of 4 cm radius whose middle is 20 cm above the table."""
-    rng = np.random.default_rng(0)
-    normals = rng.normal(size=(512, 3))
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    middle = np.array([0.0, 0.0, 0.2])
-    return Sight(Scene("ball", "a" * 64, 0), middle + 0.04 * normals, normals, np.array([*middle, 1.0, 0, 0, 0]))
-
-
-def hands_at(hand: HandModel, places: np.ndarray) -> net.Proposals:
-    """Open hands that look down, all alike but for their places (N, 3)."""
-    n = len(places)
-    pose = np.concatenate([places, np.tile([0.0, 1.0, 0.0, 0.0], (n, 1))], axis=1)
-    joints = np.tile(hand.expand(0.5 * (hand.lower + hand.upper)[None]), (n, 1))
-    return net.Proposals(pose, np.tile([0.0, 0.0, -1.0], (n, 1)), joints, joints, joints)
-
-
-@pytest.mark.usefixtures("one_thread")
-def test_an_evaluator_tells_hands_at_the_object_from_others(hand: HandModel) -> None:
-    sight, rng = ball(), np.random.default_rng(1)
-
-    def around(count: int) -> tuple[net.Proposals, np.ndarray]:
-        near = np.arange(count) % 2 == 0
-        places = rng.normal(0, 0.01, (count, 3)) + np.array([0.0, 0.0, 0.35])
-        places[~near, 0] += 0.15
-        return hands_at(hand, places), near
-
-    hands, near = around(64)
-    evaluator = learned(hand, Attempts.of(hand, [sight], [hands], near), steps=30, seed=0)
-    others, near = around(32)
-    found = scores(evaluator, hand, sight, others)
-    assert found[near].min() > found[~near].max()
-
-
-@pytest.mark.usefixtures("one_thread")
-def test_a_verdict_is_of_how_hand_object_and_table_lie(hand: HandModel) -> None:
-    torch.manual_seed(0)
-    evaluator, sight = Evaluator(hand).eval(), ball()
-    hands = hands_at(hand, np.array([[0.02, 0.01, 0.33]]))
-    turn, there = np.array([np.cos(0.5), 0.0, 0.0, np.sin(0.5)]), np.array([0.4, -0.3, 0.0])
-    pose = transforms.compose(np.array([*there, *turn]), hands.hand_pose)
-    elsewhere = Sight(
-        sight.scene,
-        transforms.quat_rotate(turn, sight.points) + there,
-        transforms.quat_rotate(turn, sight.normals),
-        sight.object_pose,
-    )
-    same = scores(evaluator, hand, elsewhere, dataclasses.replace(hands, hand_pose=pose))
-    # float32, and points whose nearest one is a tie.
-    np.testing.assert_allclose(scores(evaluator, hand, sight, hands), same, atol=1e-3)
-
-
-def test_moves_stay_within_the_limits_and_none_leaves_a_hand(hand: HandModel) -> None:
-    hands = hands_at(hand, np.zeros((40, 3)))
-    rng = np.random.default_rng(0)
-    still = moved(hand, hands, 0.0, rng)
-    for name, part in vars(hands).items():
-        np.testing.assert_allclose(getattr(still, name), part, atol=1e-12)
-    far = moved(hand, hands, np.full(40, 100.0), rng)
-    assert (hand.reduce(far.joints) >= hand.lower - 1e-9).all()
-    assert (hand.reduce(far.joints) <= hand.upper + 1e-9).all()
-    np.testing.assert_allclose(np.linalg.norm(far.approach, axis=1), 1.0)
-
-
-def test_moves_squeeze_more_or_less_and_keep_the_fingers_way(hand: HandModel) -> None:
-    hands = hands_at(hand, np.zeros((40, 3)))
-    middle = np.tile(hand.expand(0.5 * (hand.lower + hand.upper)), (40, 1))  # no limit is near
-    hands = dataclasses.replace(hands, joints=middle, pregrasp=middle, squeeze=middle)
-    found = moved(hand, hands, 1.0, np.random.default_rng(0))
-    np.testing.assert_allclose(found.pregrasp, found.joints, atol=1e-12)
-    harder = hand.reduce(found.squeeze) - hand.reduce(found.joints)
-    assert (np.abs(harder[:, hand.closing == 0]) < 1e-12).all()
-    assert (harder @ hand.closing > 0).any() and (harder @ hand.closing < 0).any()
-
-
-def test_evaluators_together_say_what_they_say_on_average(hand: HandModel) -> None:
-    torch.manual_seed(0)
-    members = [Evaluator(hand).eval() for _ in range(3)]
-    hands = hands_at(hand, np.random.default_rng(0).normal(0, 0.05, (5, 3)))
-    each = [scores(member, hand, ball(), hands) for member in members]
-    np.testing.assert_allclose(scores(Ensemble(members), hand, ball(), hands), np.mean(each, axis=0), atol=1e-5)
-
-
-class Wish(torch.nn.Module):
-    """Thinks the more of a hand the nearer it is to a place."""
-
-    def forward(self, points: torch.Tensor, normals: torch.Tensor, hands: Hands) -> torch.Tensor:
-        return -100.0 * (hands.place - torch.tensor([0.0, 0.0, 0.6])).norm(dim=1)
-
-
-def test_hands_move_to_where_the_evaluator_believes_in_them(hand: HandModel) -> None:
-    def source(sight: Sight, count: int, rng: np.random.Generator) -> net.Proposals:
-        assert count == BEGUN
-        return hands_at(hand, rng.normal(0, 0.01, (count, 3)) + np.array([0.0, 0.03, 0.6]))
-
-    def best(rounds: tuple[float, ...]) -> np.ndarray:
-        refined = RefinedHands(hand, Wish(), source, rounds)(ball(), 2, np.random.default_rng(0))
-        return np.linalg.norm(refined.hand_pose[:, :3] - [0.0, 0.0, 0.6], axis=1)
-
-    chosen, moved_on = best(()), best((1.0, 0.7, 0.5, 0.4))
-    assert chosen[0] < 0.03  # of hands around 3 cm the nearest
-    assert moved_on[0] < 0.5 * chosen[0]
-    assert moved_on[0] < moved_on[1]
-
-
-def test_tries_of_two_rounds_keep_their_picture_and_verdict(hand: HandModel) -> None:
-    high = ball()
-    low = dataclasses.replace(high, points=high.points - [0.0, 0.0, 0.1])
-    one = Attempts.of(hand, [high, low], [hands_at(hand, np.full((1, 3), 0.1 * k)) for k in (1, 2)], np.array([1, 0]))
-    other = Attempts.of(hand, [low], [hands_at(hand, np.full((3, 3), 0.3))], np.array([0, 1, 1]))
-    both = one.and_those(other)
-    heights = both.points[both.picture].mean(dim=1)[:, 2].numpy() - 0.2
-    np.testing.assert_allclose(heights, [0.0, -0.1, -0.1, -0.1, -0.1], atol=0.01)
-    np.testing.assert_allclose(both.hands.place[:, 0].numpy(), [0.1, 0.2, 0.3, 0.3, 0.3], rtol=1e-6)
-    assert both.lifted.tolist() == [1, 0, 0, 1, 1]
-
-
-@pytest.mark.slow
-def test_practice_lifts_what_is_known_to_lift(hand: HandModel) -> None:
-    block = object_from_path("block")
-    pose = np.array([0.0, 0.0, -block.vertices[:, 2].min(), 1.0, 0, 0, 0])
-    points = block.vertices[np.random.default_rng(0).choice(len(block.vertices), 512)] + pose[:3]
-    sight = Sight(Scene("block", "a" * 64, 0), points, np.tile([0, 0, 1.0], (512, 1)), pose)
-    held = across(hand, sight, 4, squeeze=SQUEEZE, rng=np.random.default_rng(0))
-    rows = net.encode(held, np.zeros(3))
-    given = TrainedModel([sight.scene] * 4, rows, np.ones(4), np.ones(4, bool), np.ones(4))
-    far = dataclasses.replace(held, hand_pose=held.hand_pose + np.array([0.5, 0, 0, 0, 0, 0, 0]))
-    practice = TrainingRun(hand, {"block": block}, [given], [sight], lambda *_: far)
-    tries = practice.candidates(practice.beginning, 1, np.random.default_rng(0))
-    assert not tries.lifted[:4].any()  # what the source proposed
-    assert tries.lifted[4:].mean() >= 0.25  # grasps of the data, moved or not

@@ -32,7 +32,6 @@ class Loaded:
         mujoco.mj_forward(self.model, self.data)
 
     def controls(self, qpos: np.ndarray) -> np.ndarray:
-        """Actuators' targets: their moments times the hand's joints."""
         dense = np.zeros((self.model.nu, self.model.nv))
         data = self.data
         mujoco.mju_sparse2dense(dense, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind)
@@ -128,7 +127,6 @@ def tabletop_test(found: Loaded) -> tuple[bool, float, float]:
 
 
 def _move(found: Loaded, a: np.ndarray, b: np.ndarray) -> None:
-    """Ten stages of ten steps."""
     rotations = Slerp([0, 1], Rotation.from_quat([a[3:7], b[3:7]], scalar_first=True))
     begin, end = found.controls(a), found.controls(b)
     for share in np.linspace(0, 1, 11)[1:]:
@@ -139,5 +137,4 @@ def _move(found: Loaded, a: np.ndarray, b: np.ndarray) -> None:
 
 
 def files_of(root: Path, config: str, experiment: str = "graspd") -> list[Path]:
-    """What the evaluator finds with `hand=config exp_name=experiment`."""
     return sorted((root / "output" / f"{experiment}_{config}" / "graspdata").glob("**/*.npy"))

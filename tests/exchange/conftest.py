@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -56,6 +58,20 @@ def on_tables(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
+def exported(on_tables: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+    """Folder of these in a training format."""
+
+    @cache
+    def export(format_: str) -> Path:
+        folder = tmp_path_factory.mktemp(format_) / "data"
+        every = "" if format_ in ("dexgraspnet2", "graspgen") else "--all "
+        told = graspd(f"export --format {format_} {every}-o", folder, on_tables)
+        assert told["grasps"] == 16
+        return folder
+
+    return export
+
+
+@pytest.fixture(scope="session")
 def stored(on_tables: Path) -> Shard:
-    """The block's grasps among these."""
     return read_shard(on_tables / "block.h5", kind="base")

@@ -44,7 +44,6 @@ class Sample:
 
 
 def views_of(split: range) -> list[tuple[str, int]]:
-    """What is drawn from: 256 views of each scene of a split."""
     return [(f"scene_{number:04}", view) for number in split for view in range(256)]
 
 

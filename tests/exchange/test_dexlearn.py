@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import mujoco
@@ -10,11 +11,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from graspd.exchange import dexgraspbench, dexlearn
+from graspd.exchange import bench_scene, dexgraspbench, dexlearn
 from graspd.exchange.bench_hand import body_names
 from graspd.exchange.plan import held_out, looks
 from graspd.service.model.errors import InputError
-from graspd.service.model.transforms import apply, compose, invert, pose_to_matrix
+from graspd.service.model.transforms import apply, invert, pose_to_matrix
 from graspd.service.readers import Pictures, open_shards
 from graspd.service.readers.clouds import COLUMNS
 from graspd.service.readers.depth_noise import noise_of
@@ -33,11 +34,8 @@ POINT_M = 2e-5
 
 
 @pytest.fixture(scope="module")
-def checkout(on_tables: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("dexlearn")
-    said = graspd("export --format dexlearn --all -o", folder, on_tables)
-    assert (said["grasps"], said["scenes"], said["clouds"]) == (16, 4, 8)
-    return folder
+def checkout(exported: Callable[[str], Path]) -> Path:
+    return exported("dexlearn")
 
 
 def test_all_that_may_be_drawn_is_there(checkout: Path) -> None:
@@ -99,47 +97,24 @@ def test_a_cloud_of_a_free_object_lies_on_it_where_it_is_itself(on_tables: Path,
         assert 1e-4 < np.abs(trimesh.proximity.closest_point(mesh, noisy)[1]).max() < 0.05
 
 
-def test_collected_grasps_come_back_with_scenes_and_verdicts(checkout: Path, stored: Shard) -> None:
-    sets = dexgraspbench.read(checkout / "assets" / "grasp" / NAME / "succ_collect", hand="barrett", obj="block")
-    (back,) = sets
-    assert back.placed is not None and len(back.grasps) == 16
-    for k in range(len(back.grasps)):
-        place = compose(back.placed.object_pose[back.placed.index[k]], back.grasps.grasp.hand_pose[k])
-        ours = compose(stored["scene/object_pose"][stored["grasp/scene_index"]], stored["grasp/hand_pose"])
-        (row,) = np.flatnonzero(np.abs(ours[:, :3] - place[:3]).max(axis=1) < ROUNDING_M)
-        np.testing.assert_array_equal(back.grasps.squeeze.joint_positions[k], stored["squeeze/joint_positions"][row])
-        assert back.published is not None and back.published[k] == stored["quality/success"][row]
-
-
-def test_a_file_that_names_only_its_scene_is_read_with_it(checkout: Path, tmp_path: Path) -> None:
+def test_a_file_that_names_only_its_scene_is_read_with_it_and_none_that_lies_elsewhere(
+    checkout: Path, tmp_path: Path
+) -> None:
     copy = tmp_path / "checkout"
     shutil.copytree(checkout, copy)
     (file, *_) = sorted((copy / "assets" / "grasp" / NAME / "succ_collect").rglob("*.npy"))
     record = np.load(file, allow_pickle=True).item()
     pose = record.pop("obj_pose")[0]
     record["scene_scale"] = np.full(len(record["row"]), 0.5)
-    save(file, record)
+    bench_scene.save_record(file, record)
     (found,) = dexgraspbench.read(file, hand="barrett", obj="block")
     assert found.placed is not None and found.scale == 0.5
     np.testing.assert_allclose(found.placed.object_pose[0], pose, atol=ROUNDING_M)
 
-
-@pytest.mark.parametrize(
-    ("path", "says"),
-    [
-        ("/etc/passwd", "below assets"),
-        ("assets/../../secret.npy", "below assets"),
-        ("other/scene.npy", "below assets"),
-        ("assets/none.npy", "which is in no folder above"),
-    ],
-)
-def test_a_scene_that_lies_elsewhere_is_refused(checkout: Path, tmp_path: Path, path: str, says: str) -> None:
-    (file, *_) = sorted((checkout / "assets" / "grasp" / NAME / "succ_collect").rglob("*.npy"))
-    record = np.load(file, allow_pickle=True).item()
-    del record["obj_pose"]
-    save(tmp_path / "x.npy", record | {"scene_path": path})
-    with pytest.raises(InputError, match=says):
-        dexgraspbench.read(tmp_path / "x.npy", hand="barrett", obj="block")
+    for path in ("/etc/passwd", "assets/../../secret.npy", "other/scene.npy", "assets/none.npy"):
+        bench_scene.save_record(tmp_path / "x.npy", record | {"scene_path": path})
+        with pytest.raises(InputError, match="in no folder above" if path == "assets/none.npy" else "below assets"):
+            dexgraspbench.read(tmp_path / "x.npy", hand="barrett", obj="block")
 
 
 def test_without_pictures_nothing_to_see_is_told(on_tables: Path, tmp_path: Path) -> None:
@@ -160,7 +135,3 @@ def every(checkout: Path, name: str) -> list:  # type: ignore[type-arg]
     data = Data(checkout, NAME)
     split = next(split for split in ("train", "test") if name in data.split(split))
     return [sample for sample in data.samples(split) if name in sample.file.parts]
-
-
-def save(file: Path, record: dict[str, object]) -> None:
-    np.save(file, np.array(record, dtype=object), allow_pickle=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,13 +11,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from graspd.commands.exchange import IMPORTS, read_sets
+from graspd.commands.exchange import read_sets
 from graspd.exchange import dexgraspbench, published
-from graspd.exchange.imported import Origin, load_npy, verdicts
+from graspd.exchange.bench_scene import save_record
+from graspd.exchange.imported import Origin, joints_by_name, load_npy, scaled_object, verdicts
 from graspd.exchange.scoring import write_scored
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import compose, quat_to_matrix
-from graspd.service.store.shards import read_shard
+from graspd.service.store.shards import Shard, read_shard
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
@@ -45,32 +47,20 @@ def test_a_file_that_would_run_code_is_refused_and_does_not(tmp_path: Path, monk
             load_npy(Path("x.npy"))
 
 
-def test_a_verdict_of_others_is_yes_no_or_none() -> None:
-    assert verdicts([1, 0, True, False, 1.0]).tolist() == [1, 0, 1, 0, 1]
-    assert verdicts([None, "yes", 300, float("nan")]).tolist() == [-1] * 4
-    assert verdicts(np.array([[1], [0], [-1]])).tolist() == [1, 0, -1]
-
-
-def test_dexgraspbench_there_and_back_is_the_same_grasp(
+def test_dexgraspbench_there_and_back_is_the_same_grasp_also_of_a_moved_object(
     hand: HandModel, block: ObjectModel, grasps: GraspSet, tmp_path: Path
 ) -> None:
-    dexgraspbench.write(hand, block, grasps, range(len(grasps)), tmp_path)
+    (path, *_) = dexgraspbench.write(hand, block, grasps, range(len(grasps)), tmp_path)
     (back,) = dexgraspbench.read(tmp_path, hand="barrett", obj="block")
     np.testing.assert_allclose(back.grasps.squeeze.hand_pose, grasps.squeeze.hand_pose, atol=TINY)
     np.testing.assert_array_equal(back.grasps.pregrasp.joint_positions, grasps.pregrasp.joint_positions)
     ours, theirs = (validate(hand, block, some).success for some in (grasps, back.grasps))
     np.testing.assert_array_equal(theirs, ours)
-
-
-def test_dexgraspbench_grasps_are_in_their_moved_objects_frame(
-    hand: HandModel, block: ObjectModel, grasps: GraspSet, tmp_path: Path
-) -> None:
-    (path, *_) = dexgraspbench.write(hand, block, grasps, [0], tmp_path)
     row = load_npy(path)
     moved = np.array([0.3, -0.2, 0.7, *Rotation.from_euler("xyz", [0.3, 1.1, -2.0]).as_quat(scalar_first=True)])
     for name in dexgraspbench.POSTURES:
         row[f"{name}_qpos"][:7] = compose(moved, row[f"{name}_qpos"][:7])
-    np.save(path, np.array(row | {"obj_pose": moved}, dtype=object), allow_pickle=True)
+    save_record(path, row | {"obj_pose": moved})
     (back,) = dexgraspbench.read(path, hand="barrett", obj="block")
     place, turn = back.grasps.grasp.hand_pose[0, :3], quat_to_matrix(back.grasps.grasp.hand_pose[0, 3:])
     np.testing.assert_allclose(place, grasps.grasp.hand_pose[0, :3], atol=TINY)
@@ -81,7 +71,7 @@ def test_dexgraspbench_scales_are_sets_and_another_hand_is_told(
     hand: HandModel, block: ObjectModel, grasps: GraspSet, tmp_path: Path
 ) -> None:
     paths = dexgraspbench.write(hand, block, grasps, range(2), tmp_path)
-    np.save(paths[0], np.array(load_npy(paths[0]) | {"obj_scale": 0.5}, dtype=object), allow_pickle=True)
+    save_record(paths[0], load_npy(paths[0]) | {"obj_scale": 0.5})
     sets = dexgraspbench.read(tmp_path, hand="barrett", obj="block")
     assert [one.scale for one in sets] == [0.5, 1.0]
     assert np.ptp(sets[0].obj.vertices, axis=0) == pytest.approx(np.ptp(block.vertices, axis=0) / 2, rel=1e-6)
@@ -94,7 +84,7 @@ def test_dexgraspnets_angles_turn_about_the_fixed_axes(tmp_path: Path) -> None:
     angles = np.array([0.4, -1.2, 2.2])
     qpos = dict(zip(("WRJRx", "WRJRy", "WRJRz"), angles, strict=True)) | {"WRJTx": 0.1, "WRJTy": 0.2, "WRJTz": -0.3}
     path = _dexgraspnet(tmp_path, qpos | {"robot0:FFJ2": 0.5}, scale=1.0)
-    (found,) = published.read_dexgraspnet(path, hand="shadow", obj="block")
+    (found,) = read_sets("dexgraspnet", path, "shadow", "block", {})
     expected = Rotation.from_euler("xyz", angles).as_matrix()  # SciPy's lower-case letters are fixed axes too
     np.testing.assert_allclose(quat_to_matrix(found.grasps.grasp.hand_pose[0, 3:]), expected, atol=TINY)
     np.testing.assert_allclose(found.grasps.grasp.hand_pose[0, :3], [0.1, 0.2, -0.3])
@@ -131,9 +121,8 @@ def test_multidex_gives_the_grasps_of_one_robot_on_one_object(hand: HandModel, t
     q = torch.cat([torch.tensor([0.1, 0.2, 0.3, 1.0, 0, 0, 0, 1, 0]), torch.full((joints,), 0.4)])
     rows = [(q, "ycb+block", "barrett"), (q + 1, "ycb+cup", "barrett"), (q, "ycb+block", "allegro")]
     torch.save({"info": {}, "metadata": rows}, tmp_path / "cmap_dataset.pt")
-    (found,) = published.read_multidex(
-        tmp_path / "cmap_dataset.pt", hand="barrett", obj="block", robot="barrett", object_name="ycb+block"
-    )
+    options = {"robot": "barrett", "object_name": "ycb+block"}
+    (found,) = read_sets("multidex", tmp_path / "cmap_dataset.pt", "barrett", "block", options)
     np.testing.assert_allclose(found.grasps.grasp.hand_pose, [[0.1, 0.2, 0.3, 1, 0, 0, 0]], atol=1e-6)  # float32
     np.testing.assert_allclose(found.grasps.grasp.joint_positions, 0.4, atol=1e-6)
 
@@ -145,7 +134,7 @@ def test_ddgcs_quaternion_and_joints_are_put_in_our_order(hand: HandModel, tmp_p
         rows = np.empty(2, dtype=object)
         rows[:] = [[], values.tolist()]
         np.save(tmp_path / f"barrett_{name}_3.npy", rows, allow_pickle=True)
-    (found,) = published.read_ddgc(tmp_path / "barrett_translation_3.npy", hand="barrett", obj="block", number=1)
+    (found,) = read_sets("ddgc", tmp_path / "barrett_translation_3.npy", "barrett", "block", {"number": 1})
     np.testing.assert_allclose(found.grasps.grasp.hand_pose[0, 3:], [np.cos(0.5), 0, 0, np.sin(0.5)], atol=TINY)
     joints = dict(zip(hand.joint_names, found.grasps.grasp.joint_positions[0], strict=True))
     assert abs(joints["finger_3_medial"]) == pytest.approx(0.7)
@@ -167,57 +156,66 @@ def test_imported_grasps_are_scored_and_say_where_they_come_from(
 
 
 def test_published_reference_grasps_come_in_by_name(shared_data: Path) -> None:
-    from graspd.exchange import published
-
     path = shared_data / "reference_grasps" / "frogger_allegro" / "061_foam_brick.json"
-    (found,) = published.read_reference(path)
+    (found,) = read_sets("reference", path, None, None, {})
     assert (len(found.grasps), found.name) == (28, "061_foam_brick")
     assert found.published is not None
     assert found.published.mean() == pytest.approx(0.64, abs=0.005)  # the rate that DATA.md states
 
 
 def test_a_missing_joint_is_told_and_two_scales_are_two_objects() -> None:
-    from graspd.exchange.imported import joints_by_name
-
     with pytest.raises(InputError, match="has no joint 'elbow'"):
         joints_by_name(hand_from_path("barrett"), ["elbow"], [[0.0]], what="x")
-    from graspd.exchange.imported import scaled_object
-
+    assert verdicts([1, 0, True, None, "yes", 300, float("nan")]).tolist() == [1, 0, 1, -1, -1, -1, -1]
     # What is kept of a pair between calls is found by digest.
     assert len({scaled_object("block", scale).digest for scale in (1.0, 0.5, 2.0)}) == 3
 
 
-#: What reads each format.
-READERS = {
-    "dexgraspbench": "dexgraspbench.read",
-    "dexlearn": "dexgraspbench.read",
-    "graspgen": "graspgen.read",
-    "huggingface": "huggingface.read",
-    "lerobot": "lerobot.read",
-    "dexgraspnet": "published.read_dexgraspnet",
-    "dexgraspnet2": "dexgraspnet2.read",
-    "multidex": "published.read_multidex",
-    "ddgc": "published.read_ddgc",
-    "reference": "published.read_reference",
-}
-
-
-@pytest.mark.parametrize("name", IMPORTS)
-def test_each_format_has_its_reader(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for reader in set(READERS.values()):
-        told = [reader]
-        monkeypatch.setattr(f"graspd.exchange.{reader}", lambda *_, told=told, **__: told)
-    options = {"robot": "r", "object_name": "o", "number": 0}
-    assert read_sets(name, tmp_path, "h", "o", options) == [READERS[name]]
-    if name != "reference":
-        with pytest.raises(InputError, match="name both: --hand and --object"):
-            read_sets(name, tmp_path, "h", None, options)
+#: Files of the block's grasps, and how they are rounded: by text of 12 digits, matrices, float32 [m, rad].
+@pytest.mark.parametrize(
+    ("name", "files", "rounding"),
+    [
+        ("dexgraspnet2", "data/dex_grasps_new/*/*/block.npz", 1e-9),
+        ("dexlearn", "assets/grasp/graspd_tabletop_graspd_barrett/succ_collect/*/block", 1e-8),
+        ("graspgen", "grasps/barrett", 1e-9),
+        ("huggingface", "", 1e-9),
+        ("lerobot", "", 1e-6),
+    ],
+)
+def test_grasps_of_a_training_format_come_back_with_scenes_and_verdicts(
+    name: str, files: str, rounding: float, exported: Callable[[str], Path], stored: Shard
+) -> None:
+    if name in ("huggingface", "lerobot"):
+        pytest.importorskip("pyarrow")
+    options, found = {"robot": "", "object_name": "block", "number": 0}, []
+    for file in sorted(exported(name).glob(files)) if files else [exported(name)]:
+        for back in read_sets(name, file, "barrett", "block", options):
+            assert back.published is not None and (back.placed is None) == (name in ("dexgraspnet2", "graspgen"))
+            for k, pose in enumerate(back.grasps.grasp.hand_pose):
+                (row,) = np.flatnonzero(np.abs(stored["grasp/hand_pose"][:, :3] - pose[:3]).max(axis=1) < rounding)
+                found.append(int(row))
+                assert back.published[k] == stored["quality/valid"][row]
+                for what in dexgraspbench.POSTURES:
+                    given, ours = getattr(back.grasps, what), stored[f"{what}/hand_pose"][row]
+                    np.testing.assert_allclose(given.hand_pose[k, :3], ours[:3], atol=rounding)
+                    assert abs(given.hand_pose[k, 3:] @ ours[3:]) == pytest.approx(1, abs=1e-6)
+                    joints = stored[f"{what}/joint_positions"][row]
+                    np.testing.assert_allclose(given.joint_positions[k], joints, atol=rounding)
+                if back.placed is not None:
+                    rest = stored["scene/object_pose"][stored["grasp/scene_index"][row]]
+                    there = back.placed.object_pose[back.placed.index[k]]
+                    np.testing.assert_allclose(there, rest, atol=rounding)
+    assert sorted(found) == np.flatnonzero(stored["quality/valid"]).tolist()
 
 
 @pytest.mark.parametrize(
-    ("name", "source", "says"),
-    [("foo", "", "no import format"), ("ddgc", "none", "does not exist"), ("multidex", "", "--robot and --name")],
+    ("name", "hand", "says"),
+    [
+        ("foo", "h", "no import format"),
+        ("multidex", "h", "--robot and --name"),
+        ("ddgc", None, "name both: --hand and --object"),
+    ],
 )
-def test_what_no_import_can_read_is_told(name: str, source: str, says: str, tmp_path: Path) -> None:
+def test_what_no_import_can_read_is_told(name: str, hand: str | None, says: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=says):
-        read_sets(name, tmp_path / source, "h", "o", {"robot": "", "object_name": "", "number": 0})
+        read_sets(name, tmp_path, hand, "o", {"robot": "", "object_name": "", "number": 0})

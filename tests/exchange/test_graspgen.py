@@ -12,6 +12,7 @@ import io
 import json
 import re
 import tarfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,7 @@ from graspd.service.store.shards import Shard
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
-from tests.worker.commands_run import graspd, refused
+from tests.worker.commands_run import refused
 from tests.worker.hands.grippers import OPENING, gripper
 
 #: JSON gives float64 back as it was; what is left is a quaternion made a matrix [m].
@@ -37,11 +38,8 @@ ROUNDING_M = 1e-12
 
 
 @pytest.fixture(scope="module")
-def data(on_tables: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("graspgen") / "data"
-    said = graspd("export --format graspgen -o", folder, on_tables)
-    assert (said["grasps"], said["objects"], said["files"]) == (16, 2, 1)
-    return folder
+def data(exported: Callable[[str], Path]) -> Path:
+    return exported("graspgen")
 
 
 def record_of(data: Path, uuid: str) -> dict[str, Any]:
@@ -87,31 +85,18 @@ def test_its_grasps_are_ours_with_their_verdicts(
     np.testing.assert_allclose(mesh.bounds, [block.vertices.min(0), block.vertices.max(0)], atol=1e-8)
 
 
-def test_a_gripper_is_turned_into_its_convention(data: Path, hand: HandModel) -> None:
+def test_hands_are_turned_into_its_convention_and_jaws_close_along_x(data: Path, hand: HandModel) -> None:
     said = yaml.safe_load((data / "grippers" / "barrett.yaml").read_text())
     place, turn = said["transform_offset_from_asset_to_graspgen_convention"]
     matrix = Rotation.from_quat(turn).as_matrix()  # x y z w, as SciPy has it
     np.testing.assert_allclose(matrix[:, 2], hand.palm.approach, atol=1e-12)
     assert place == [0, 0, 0] and said["width"] > 0.05 and said["depth"] > 0.02
-
-
-def test_the_jaws_of_a_gripper_close_along_x_of_its_convention() -> None:
     said = graspgen.convention(gripper())
     turn = Rotation.from_quat(said["transform_offset_from_asset_to_graspgen_convention"][1]).as_matrix()
     assert np.abs(turn[:, 0]) == pytest.approx([1, 0, 0], abs=1e-9) and turn[:, 2] == pytest.approx([0, 0, 1], abs=1e-9)
     assert said["width"] == pytest.approx(OPENING, abs=1e-5)
     # The pads reach from 70 to 110 mm in front of the base link.
     assert 0.07 < said["depth"] < 0.11
-
-
-def test_grasps_come_back_as_they_were(data: Path, stored: Shard) -> None:
-    (back,) = graspgen.read(data / "grasps" / "barrett", hand="barrett", obj="block", object_name="block")
-    for name in graspgen.POSTURES:
-        found = getattr(back.grasps, name)
-        np.testing.assert_array_equal(found.joint_positions, stored[f"{name}/joint_positions"])
-        np.testing.assert_allclose(found.hand_pose[:, :3], stored[f"{name}/hand_pose"][:, :3], atol=ROUNDING_M)
-    assert back.published is not None
-    np.testing.assert_array_equal(back.published == 1, validity.valid(stored.arrays))
 
 
 def test_of_grasps_without_joints_fingers_close_until_they_touch(data: Path, hand: HandModel, tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,6 @@ from graspd.service.readers import Pictures, open_shards
 from graspd.service.store.shards import Shard
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
-from tests.worker.commands_run import graspd
 
 pq = pytest.importorskip("pyarrow.parquet", reason="pyarrow is not installed; pip install 'graspd[parquet]'")
 #: Poses in float64 from one frame into another [m].
@@ -28,11 +28,8 @@ ROUNDING_M = 1e-12
 
 
 @pytest.fixture(scope="module")
-def folder(on_tables: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("huggingface") / "data"
-    said = graspd("export --format huggingface --all -o", out, on_tables)
-    assert (said["grasps"], said["pictures"], said["files"]) == (16, 8, 4)
-    return out
+def folder(exported: Callable[[str], Path]) -> Path:
+    return exported("huggingface")
 
 
 def configs(folder: Path) -> dict[str, dict[str, list[Path]]]:
@@ -105,17 +102,6 @@ def test_picture_has_what_was_seen_and_fingertips_where_they_are(
         at = compose(stored["scene/object_pose"][row["scene"]], stored["grasp/hand_pose"][some])
         on_table = body_poses(hand, at, stored["grasp/joint_positions"][some])[:, tip, :3]
         np.testing.assert_allclose(tips, apply(camera, on_table), atol=ROUNDING_M * 1e3)
-
-
-def test_grasps_come_back_as_they_were_with_tables_and_verdicts(folder: Path, stored: Shard) -> None:
-    (back,) = huggingface.read(folder, hand="barrett", obj="block", object_name="block")
-    assert back.placed is not None and back.published is not None
-    np.testing.assert_array_equal(back.published, stored["quality/success"])
-    for name in huggingface.POSTURES:
-        np.testing.assert_array_equal(getattr(back.grasps, name).hand_pose, stored[f"{name}/hand_pose"])
-        np.testing.assert_array_equal(getattr(back.grasps, name).joint_positions, stored[f"{name}/joint_positions"])
-    poses = stored["scene/object_pose"][stored["grasp/scene_index"]]
-    np.testing.assert_array_equal(back.placed.object_pose[back.placed.index], poses)
 
 
 def test_what_is_no_table_of_grasps_is_told(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

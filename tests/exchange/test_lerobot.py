@@ -11,6 +11,7 @@ import io
 import itertools
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from graspd.service.readers import Pictures, open_shards
 from graspd.service.store.shards import Shard
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
-from tests.worker.commands_run import graspd, refused
+from tests.worker.commands_run import refused
 
 pq = pytest.importorskip("pyarrow.parquet", reason="pyarrow is not installed; pip install 'graspd[parquet]'")
 #: Joints and roots are float32 there: 6e-8 of a radian or metre, along a finger of 0.2 m and a chain of 4 [m].
@@ -33,11 +34,8 @@ FLOAT32_M = 1e-6
 
 
 @pytest.fixture(scope="module")
-def root(on_tables: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("lerobot") / "data"
-    said = graspd("export --format lerobot --all -o", folder, on_tables)
-    assert (said["grasps"], said["files"]) == (16, 1)
-    return folder
+def root(exported: Callable[[str], Path]) -> Path:
+    return exported("lerobot")
 
 
 def frames(root: Path) -> list[dict[str, Any]]:
@@ -132,15 +130,9 @@ def test_an_episode_is_the_way_of_its_grasp(root: Path, on_tables: Path, hand: H
         assert any(np.array_equal(some[0]["observation.images.scene"], one) for one in seen)
 
 
-def test_grasps_come_back_with_their_ways_and_verdicts(root: Path, stored: Shard) -> None:
+def test_grasps_come_back_with_their_ways(root: Path, stored: Shard) -> None:
     (back,) = lerobot.read(root, hand="barrett", obj="block", object_name="block")
-    assert back.placed is not None and back.published is not None and back.grasps.lift is not None
-    assert back.grasps.approach is not None
-    np.testing.assert_array_equal(back.published, stored["quality/success"])
-    for name in ("pregrasp", "grasp", "squeeze"):
-        found = getattr(back.grasps, name)
-        np.testing.assert_allclose(found.hand_pose[:, :3], stored[f"{name}/hand_pose"][:, :3], atol=FLOAT32_M)
-        np.testing.assert_allclose(found.joint_positions, stored[f"{name}/joint_positions"], atol=FLOAT32_M)
+    assert back.grasps.approach is not None and back.grasps.lift is not None
     np.testing.assert_allclose(back.grasps.approach[..., :3], stored["grasp/approach"][..., :3], atol=FLOAT32_M)
     np.testing.assert_allclose(back.grasps.lift.hand_pose[:, :3], stored["grasp/lift"][:, :3], atol=FLOAT32_M)
 

@@ -98,7 +98,6 @@ def test_2d_boxes_are_whole_pixels_of_what_is_in_view(views: Shard, tmp_path: Pa
 
 @pytest.fixture
 def shards(tmp_path: Path) -> Shards:
-    """A finished job with pictures."""
     from tests.api import factories
 
     settings = Settings(data_dir=tmp_path)

@@ -1,26 +1,30 @@
-"""Tutorials, docs/reference/python.md, the notebook and what needs a service, run as printed."""
+"""README and docs: what they print runs, commands and links exist, questions are answered, and the site is strict."""
 
 from __future__ import annotations
 
 import html
-import inspect
 import json
+import math
 import os
 import re
 import shlex
 import sys
+from collections import Counter
 from collections.abc import Iterator
+from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import httpx
 import pytest
+import yaml
 
 import graspd
 from graspd.service.run.supervisor import Supervisor
 from graspd.service.settings import Settings
-from tests.conftest import REPOSITORY
-from tests.docs_commands import run_page
+from tests.conftest import PACKAGES, REPOSITORY
+from tests.docs_commands import NOT_RUN, PAGES, Line, lines_of, run_page
 from tests.shell import completed
 from tests.waiting import PATIENCE_S, until_a_worker_is_idle
 from tests.worker.hands.my_hand import write_my_hand
@@ -50,18 +54,6 @@ def test_the_page_runs_as_it_is_printed(environment: dict[str, str], tmp_path: P
     assert "<8 grasps of allegro on mug, 8 valid>" in said
     assert "<8 grasps of barrett on mug, 8 valid>" in said
     assert "no_such_file.stl" in said
-
-
-def test_every_public_name_has_a_docstring_that_begins_short() -> None:
-    named = {name: getattr(graspd, name) for name in graspd.__all__ if not name.startswith("_")}
-    for name, value in list(named.items()):
-        if inspect.isclass(value):
-            named |= {f"{name}.{part}": one for part, one in vars(value).items() if not part.startswith("_")}
-    told = {
-        name: inspect.getdoc(value) or "" for name, value in named.items() if callable(value) or hasattr(value, "fget")
-    }
-    assert len(told) > 40
-    assert {name: text for name, text in told.items() if not 0 < len(text.partition("\n")[0]) <= 100} == {}
 
 
 def test_the_code_on_the_pages_of_the_dashboard_runs(environment: dict[str, str], tmp_path: Path) -> None:
@@ -129,3 +121,187 @@ def test_the_lines_that_read_the_first_grasps_run(tmp_path: Path, monkeypatch: p
     exec(block, said)
     best = said["best"]
     assert (len(best), best.joint_positions.shape) == (3, (3, 16)) and (best.metric("epsilon") > 0).all()
+
+
+#: `graspd jobs`, <pre>graspd jobs</pre>, epilog="graspd jobs".
+_NAMED = re.compile(r'(?:`|>|epilog=")(graspd\s+[a-z](?:(?!\.\.\.)[^"`{}<…,;])*)')
+
+ALL = [line for page in PAGES for line in lines_of(page)]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_commands_of_a_page_are_those_of_the_command_line(page: Path) -> None:
+    faults = {line.text: line.fault() for line in lines_of(page)}
+    assert {text: fault for text, fault in faults.items() if fault} == {}
+
+
+def test_commands_in_sentences_messages_and_help_exist() -> None:
+    files = [*REPOSITORY.glob("*.md")]
+    for room in (*PACKAGES, "docker", "docs"):
+        files += [file for file in (REPOSITORY / room).rglob("*") if file.suffix in {".html", ".md", ".py", ".yaml"}]
+    # The changelog names commands of older releases.
+    named = {(f.name, one) for f in files if f.name != "CHANGELOG.md" for one in _NAMED.findall(f.read_text())}
+    assert len(named) > 200
+    faults = {(file, one): Line(file, one).fault() for file, one in named}
+    assert {one: fault for one, fault in faults.items() if fault} == {}
+
+
+def test_every_exception_is_needed() -> None:
+    assert sum(not line.reason for line in ALL) >= 60
+    for what, why in NOT_RUN:
+        assert any(line.reason == why for line in ALL), f"nothing is left out for {what}"
+
+
+@pytest.mark.parametrize(
+    ("text", "fault"),
+    [
+        ("graspd synth --hand allegro --object mug -n 4 -o g.h5", ""),
+        ("graspd synth --hnd allegro", "synth has no --hnd"),
+        ("graspd synthesize mug", "no command synthesize"),
+        ("graspd datasets creat x", "datasets has no creat"),
+        ("A=1 graspd jobs | head && python -m benchmarks.no_such", "no module benchmarks.no_such"),
+        ("make no-such-verb DATA=x", "make has no no-such-verb"),
+    ],
+)
+def test_what_the_command_line_does_not_know_is_found(text: str, fault: str) -> None:
+    assert Line("page.md", text).fault() == fault
+
+
+def test_blocks_of_both_kinds_are_read_and_comments_are_not(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    fenced, indented = "```sh\ngraspd jobs   # list\n```\n", "    graspd synth \\\n        -n 4\n"
+    page.write_text(f"# T\n\n{fenced}\n{indented}\n    said: graspd\n\nEnd.\n")
+    assert [line.text for line in lines_of(page)] == ["graspd jobs", "graspd synth -n 4"]
+
+
+_FOLDERS = (REPOSITORY.glob("*.md"), *((REPOSITORY / name).rglob("*.md") for name in ("docs", "examples")))
+LINKING = sorted(page for pages in _FOLDERS for page in pages if page.is_file())
+
+#: Sources whose comments, messages and help name pages.
+SOURCES = (*PACKAGES, "benchmarks", "docker", "examples")
+
+_LINKED = re.compile(r"(?<![\w/.])(?:docs|README|CONTRIBUTING|ARCHITECTURE|SECURITY)[\w/-]*\.md\b")
+
+_CODE = re.compile(r"^```.*?^```|`[^`\n]*`", re.DOTALL | re.MULTILINE)
+
+_LINK = re.compile(r"\]\(([^()\s]+)\)|(?:src|href)=\"([^\"]+)\"")
+
+
+def anchors(page: Path) -> set[str]:
+    """Names that GitHub gives the headings of a page."""
+    text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.DOTALL | re.MULTILINE)
+    found: dict[str, int] = {}
+    names = set()
+    for heading in re.findall(r"^#+ +(.+?)\s*$", text, re.MULTILINE):
+        plain = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", heading)
+        name = re.sub(r"[^\w\- ]", "", plain.lower()).replace(" ", "-")
+        count = found.get(name, 0)
+        found[name] = count + 1
+        names.add(f"{name}-{count}" if count else name)
+    return names
+
+
+@pytest.mark.parametrize("page", LINKING, ids=lambda page: str(page.relative_to(REPOSITORY)))
+def test_links_of_a_page_lead_somewhere(page: Path) -> None:
+    dead = []
+    for one, other in _LINK.findall(_CODE.sub("", page.read_text())):
+        link = one or other
+        if re.match(r"[a-z]+:", link):
+            continue
+        place, _, anchor = link.partition("#")
+        target = (page.parent / place).resolve() if place else page
+        if not target.exists() or (anchor and target.suffix == ".md" and anchor not in anchors(target)):
+            dead.append(link)
+    assert dead == []
+
+
+@pytest.mark.parametrize("room", SOURCES)
+def test_pages_that_sources_name_exist(room: str) -> None:
+    suffixes = {".py", ".sh", ".toml", ".yaml", ".yml", ".sbatch", ".html", ".ipynb"}
+    files = [file for file in (REPOSITORY / room).rglob("*") if file.suffix in suffixes]
+    assert files
+    named = {(str(file.relative_to(REPOSITORY)), page) for file in files for page in _LINKED.findall(file.read_text())}
+    assert {(file, page) for file, page in named if not (REPOSITORY / page).is_file()} == set()
+
+
+DOCS = REPOSITORY / "docs"
+
+QUESTIONS: list[dict[str, Any]] = yaml.safe_load((REPOSITORY / "tests" / "docs_questions.yaml").read_text())
+
+#: Results that a reader looks at before another search.
+LOOKED_AT = 5
+
+
+@cache
+def pages() -> dict[str, Counter[str]]:
+    """Words of each page, those of its headings ten times, as searches weigh them."""
+    found = {}
+    for page in DOCS.rglob("*.md"):
+        text = page.read_text().lower()
+        headings = " ".join(re.findall(r"^#+ (.*)$", text, re.MULTILINE))
+        found[str(page.relative_to(DOCS))] = Counter(re.findall(r"\w+", text + f" {headings}" * 10))
+    return found
+
+
+def ranked(search: str) -> list[str]:
+    """Pages by BM25 (Robertson and Zaragoza 2009: k1 = 1.2, b = 0.75), as the site's search ranks them."""
+    mean = sum(words.total() for words in pages().values()) / len(pages())
+    scores: Counter[str] = Counter()
+    for word in re.findall(r"\w+", search.lower()):
+        having = sum(word in words for words in pages().values())
+        rare = math.log(1 + (len(pages()) - having + 0.5) / (having + 0.5))
+        for page, words in pages().items():
+            scores[page] += rare * 2.2 * words[word] / (words[word] + 1.2 * (0.25 + 0.75 * words.total() / mean))
+    return [page for page, _ in scores.most_common()]
+
+
+@pytest.mark.parametrize("asked", QUESTIONS, ids=lambda asked: asked["question"])
+def test_a_question_is_answered_within_one_search_and_one_page(asked: dict[str, Any]) -> None:
+    text = (DOCS / asked["page"]).read_text()
+    assert [words for words in asked["words"] if words not in text] == []
+    assert asked["page"] in ranked(asked["search"])[:LOOKED_AT]
+
+
+#: What a browser fetches by itself: a link that a reader follows may lead anywhere.
+_FETCHED = re.compile(
+    r"<(?:script|img|iframe|source)[^>]* src=\"((?:https?:)?//[^\"]+)|<link[^>]* href=\"((?:https?:)?//[^\"]+)"
+)
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    if not (find_spec("material") and find_spec("mkdocstrings")):
+        pytest.skip("needs pip install '.[docs]'; make docs-site brings it")
+    folder = tmp_path_factory.mktemp("site")
+    done = completed(
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", folder], cwd=REPOSITORY
+    )
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+def test_every_page_of_the_docs_is_a_page_of_the_site(site: Path) -> None:
+    pages = [page.relative_to(REPOSITORY / "docs") for page in (REPOSITORY / "docs").rglob("*.md")]
+    names = {page.with_name("index.html" if page.name == "README.md" else f"{page.stem}.html") for page in pages}
+    assert {name for name in names if not (site / name).is_file()} == set()
+    assert "First grasps" in (site / "index.html").read_text()
+
+
+def test_the_site_fetches_nothing_from_elsewhere(site: Path) -> None:
+    fetched = {
+        (str(page.relative_to(site)), one or other)
+        for page in site.rglob("*.html")
+        for one, other in _FETCHED.findall(page.read_text())
+    }
+    styles = {
+        (str(sheet.relative_to(site)), url)
+        for sheet in site.rglob("*.css")
+        for url in re.findall(r"(?:@import|url\()\s*[\"']?((?:https?:)?//[^\"')]+)", sheet.read_text())
+    }
+    assert fetched | styles == set()
+
+
+def test_every_public_name_is_in_the_reference(site: Path) -> None:
+    text = (site / "reference" / "api.html").read_text()
+    names = {name for name in graspd.__all__ if not name.startswith("_")}
+    assert {name for name in names if not re.search(rf'id="[\w.]+\.{name}"', text)} == set()

@@ -30,12 +30,9 @@ def test_a_full_disk_behind_the_output_is_one_line(command: str) -> None:
     assert done.stderr == "graspd: No space left on device; make room, or name another place\n"
 
 
-def test_a_reader_that_has_enough_is_no_fault() -> None:
+def test_a_reader_that_has_enough_and_a_closed_output_are_no_fault() -> None:
     done = run(f"set -o pipefail; {GRASPD} --help | true")
     assert (done.returncode, done.stderr) in ((0, ""), (1, ""))
-
-
-def test_a_closed_output_is_no_fault() -> None:
     done = run(f"{GRASPD} --version >&-")
     assert (done.returncode, done.stderr) == (0, "")
 
@@ -91,7 +88,6 @@ def test_a_fault_of_graspd_keeps_its_trace() -> None:
 #: Words of the libraries that read files, and of pydantic and click.
 FOREIGN = ("Errno", "pydantic", "nable to open", "nput should", "Traceback", "Error:", "<unicode string>")
 
-
 #: FILE stands for what is not there, or is of no kind; the suffix is what a user would give.
 _TYPED = """
     synth --hand FILE.urdf --object mug -o OUT.h5
@@ -118,7 +114,6 @@ COMMANDS = (
         for name in IMPORTS
     ),
 )
-
 
 #: Sent to the service as they are: what they hold is its business.
 ABSENT = (

@@ -27,7 +27,6 @@ def words(name: str) -> set[str]:
 
 
 def names() -> dict[str, set[str]]:
-    """Names by their kind."""
     found: dict[str, set[str]] = {kind: set() for kind in ("class", "module", "option", "setting", "column")}
     for package in PACKAGES:
         for file in (REPOSITORY / package).rglob("*.py"):

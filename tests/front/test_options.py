@@ -18,20 +18,9 @@ from graspd.service.docs import STUB, keywords_stub
 from graspd.service.model.domain import JobOptions, JobRequest
 from graspd.service.model.errors import InputError
 from graspd.service.model.local_options import LocalOptions
-from graspd.service.model.options import rows, type_text
+from graspd.service.model.options import rows
 from tests.conftest import REPOSITORY
 from tests.one_more_option import FLAG, MEANING, NAME
-
-
-@pytest.mark.parametrize("join", ["0", 0, -1, "many", 1.5, ""])
-def test_join_is_named_as_the_caller_spells_it(join: Any) -> None:
-    line = f"join: must be a number of batches from 1 to 9999, or auto; got {join!r}"
-    with pytest.raises(InputError) as typed:
-        parsed_options(LocalOptions, {"join": join})
-    assert str(typed.value) == f"--{line}"
-    with pytest.raises(InputError) as called:
-        graspd.synthesize("barrett", "block", join=join)
-    assert str(called.value) == line
 
 
 @pytest.mark.parametrize(
@@ -42,6 +31,9 @@ def test_join_is_named_as_the_caller_spells_it(join: Any) -> None:
         ({"options": "steps"}, "--option: ", "options: "),
         ({"min_payload": -1}, "--min-payload: ", "min_payload: "),
         ({"payload": "perhaps"}, "--payload: ", "payload: "),
+        ({"join": "many"}, "--join: must be a number of batches from 1 to 9999, or auto; got 'many'", "join: must be"),
+        ({"friction": 9}, "--friction: ", "friction: must be more than 0 and at most 3; got 9"),
+        ({"threads": -1}, "--threads: ", "threads: must be at least 0; got -1"),
     ],
 )
 def test_every_message_is_in_the_words_of_the_caller(wrong: dict[str, Any], typed: str, called: str) -> None:
@@ -91,14 +83,6 @@ def test_the_signature_has_defaults_and_plain_types() -> None:
     assert (shown["touch"].default, shown["touch"].annotation) == (None, "float | None")
     assert all(one.kind is one.KEYWORD_ONLY for name, one in shown.items() if name not in ("hand", "object"))
     assert "views" in inspect.signature(graspd.Client.submit).parameters
-
-
-def test_types_lose_their_bounds_and_keep_their_choices() -> None:
-    types = {name: type_text(field.annotation) for name, field in JobOptions.model_fields.items()}
-    assert types["mass"] == "float | None"
-    assert types["want"] == 'Literal["valid", "candidates"]'
-    assert types["neighbours"] == "Sequence[str | Mapping[str, Any]]"
-    assert types["options"] == "Mapping[str, int | float | str]"
 
 
 def test_one_more_option_is_found_in_all_places(tmp_path: Path) -> None:

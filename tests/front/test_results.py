@@ -8,12 +8,11 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
-from PIL import Image
 
 from benchmarks.results import manifest, page
 from benchmarks.results.__main__ import main
 from benchmarks.results.manifest import DOCS, INDEX, digests, faults, load, staleness, there
-from benchmarks.results.running import Runner, slim
+from benchmarks.results.running import Runner
 from benchmarks.results.studies import BY_NAME, STUDIES, Study, is_raw
 from graspd.service.model.version import STAGE_REVISIONS
 from tests.conftest import REPOSITORY
@@ -52,34 +51,11 @@ def test_git_keeps_what_readers_see_and_no_raw_results() -> None:
     assert sum(file.read_text().count("\n") for file in texts) <= MOST_LINES
 
 
-def test_a_page_links_no_raw_result_and_pictures_get_a_palette(tmp_path: Path) -> None:
-    draws = "from PIL import Image; Image.merge('RGB', [Image.effect_noise((99, 99), 50)] * 3).save(sys.argv[2])"
-    writes = "open(sys.argv[1], 'w').write('[all](raw.json), [seen](seen.png)')"
-    line = f'python -c "import sys; {writes}; {draws}" OUT/results/page.md OUT/results/seen.png'
-    assert runner(tmp_path).run(Study("add", "a page", ("results/page.md", "results/seen.png"), (line,))) != "holds"
-    assert (tmp_path / "docs/results/page.md").read_text() == "`all`, [seen](seen.png)"
-    with Image.open(tmp_path / "docs/results/seen.png") as picture:
-        assert picture.mode == "P"
-
-
-def test_a_picture_that_would_show_steps_keeps_its_colours(tmp_path: Path) -> None:
-    Image.merge("RGB", [Image.effect_noise((99, 99), 50) for _ in "RGB"]).save(tmp_path / "depth.png")
-    before = (tmp_path / "depth.png").read_bytes()
-    slim(tmp_path / "depth.png")
-    assert (tmp_path / "depth.png").read_bytes() == before
-
-
-def test_raw_results_stand_beside_the_pages_alone(tmp_path: Path) -> None:
-    run = (*ADD.run, ADD.run[0].replace("total.txt", "sum.json"))
-    runner(tmp_path).run(Study("add", "a sum", ("results/sum.json",), run, prints=ADD.prints))
-    assert (tmp_path / "docs/results/sum.json").is_file()
-    assert set(load(tmp_path / "docs")["add"]["files"]) == {"results/sum.md"}
-
-
 def test_each_file_belongs_to_one_study() -> None:
     held = [path for study in STUDIES for path in digests(study, DOCS)]
     assert len(held) == len(set(held))
     assert set(held) == there(DOCS)
+    assert (DOCS / INDEX).read_text() == page.index(load(DOCS)), "run: make docs"
 
 
 @pytest.mark.parametrize("path", page.PAGES, ids=lambda path: path.name)
@@ -102,10 +78,6 @@ def test_what_the_atlas_finds_broken_is_among_the_limits(path: Path) -> None:
     assert str(path.relative_to(DOCS)) in told or all(row[5] == "nothing" for row in rows)
 
 
-def test_the_index_says_what_the_manifest_says() -> None:
-    assert (DOCS / INDEX).read_text() == page.index(load(DOCS)), "run: make docs"
-
-
 def test_a_figure_of_older_algorithms_is_shown_as_stale() -> None:
     study = BY_NAME["robust"]
     record = load(DOCS)["robust"] | {"stage_revisions": STAGE_REVISIONS | {"synthesize": 1}}
@@ -113,16 +85,6 @@ def test_a_figure_of_older_algorithms_is_shown_as_stale() -> None:
     assert "| older: synthesize |" in page.index({"robust": record})
     assert "| current |" in page.index({"robust": record | {"stage_revisions": dict(STAGE_REVISIONS)}})
     assert staleness(study, record | {"stage_revisions": dict(STAGE_REVISIONS)}) == ""
-
-
-def test_a_revision_leaves_figures_fresh_but_those_it_changes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(STAGE_REVISIONS, "synthesize", 9)
-    monkeypatch.setattr(
-        manifest, "SAME", {("synthesize", 9): (8, frozenset({"robust"})), ("synthesize", 8): (7, frozenset({"chart"}))}
-    )
-    made = {number: {"stage_revisions": STAGE_REVISIONS | {"synthesize": number}} for number in (6, 7, 8, 9)}
-    stale = {name: [n for n in made if staleness(BY_NAME[name], made[n])] for name in ("quality", "robust", "chart")}
-    assert stale == {"quality": [6], "robust": [6, 7, 8], "chart": [6, 7]}
 
 
 def test_every_command_of_the_list_is_there() -> None:
@@ -138,7 +100,10 @@ def test_every_command_of_the_list_is_there() -> None:
             assert program == "cp", line
 
 
-def test_a_study_that_holds_is_not_run_again(tmp_path: Path) -> None:
+def test_a_study_that_holds_is_not_run_again_and_one_that_fails_leaves_no_record(tmp_path: Path) -> None:
+    fails = Study("add", "a sum", ADD.files, (*ADD.run, "python -c 'raise SystemExit(3)'"))
+    assert "`python -c 'raise SystemExit(3)'` ended with 3" in runner(tmp_path).run(fails)
+    assert load(tmp_path / "docs") == {}
     assert runner(tmp_path).run(ADD).startswith("made")
     assert (tmp_path / "docs/results/total.txt").read_text() == "2"
     assert (tmp_path / "docs/results/sum.md").read_text().endswith("done\n")
@@ -146,24 +111,6 @@ def test_a_study_that_holds_is_not_run_again(tmp_path: Path) -> None:
     (tmp_path / "docs/results/total.txt").write_text("3")
     assert runner(tmp_path).run(ADD).startswith("made")
     assert (tmp_path / "docs/results/total.txt").read_text() == "2"
-
-
-def test_older_algorithms_are_run_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    runner(tmp_path).run(ADD)
-    monkeypatch.setitem(STAGE_REVISIONS, "synthesize", STAGE_REVISIONS["synthesize"] + 1)
-    assert not runner(tmp_path).holds(ADD)
-
-
-def test_a_study_that_fails_leaves_no_record(tmp_path: Path) -> None:
-    fails = Study("add", "a sum", ADD.files, (*ADD.run, "python -c 'raise SystemExit(3)'"))
-    assert "`python -c 'raise SystemExit(3)'` ended with 3" in runner(tmp_path).run(fails)
-    assert load(tmp_path / "docs") == {}
-
-
-def test_what_a_study_lacks_is_said(tmp_path: Path) -> None:
-    assert runner(tmp_path).run(BY_NAME["foreign"]) == "left out: needs DATA, SOURCES"
-    assert runner(tmp_path).run(BY_NAME["predictor-page"]) == "left out: a page written by hand"
-    assert runner(tmp_path, quick=True).run(BY_NAME["matrix"]) == "left out: has no little run"
 
 
 def test_folders_of_this_machine_are_not_in_the_figures(tmp_path: Path) -> None:

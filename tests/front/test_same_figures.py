@@ -22,10 +22,11 @@ from graspd.worker.simulation.environment import Environment, Obstacle
 from graspd.worker.simulation.obstacles import DeviceObstacles
 
 HANDS = ("allegro/allegro_hand_right.urdf", "barrett_bh280/bh280.urdf", "shadow/shadow_hand_right.urdf")
+BUILT_IN = ("allegro", "barrett", "shadow")
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("file", [*HANDS, "allegro", "barrett", "shadow"])
+@pytest.mark.parametrize("file", [*HANDS, *BUILT_IN])
 def test_pads_of_the_hands_hold_the_objects_of_the_docs(file: str, shared_data: Path) -> None:
     hand = hand_from_path(shared_data / "hands" / file if "/" in file else file)
     meshes = sorted((shared_data / "objects").glob("*/clean.stl"))
@@ -34,15 +35,10 @@ def test_pads_of_the_hands_hold_the_objects_of_the_docs(file: str, shared_data: 
     assert not any(sizes.values()), sizes
 
 
-@pytest.mark.parametrize("file", [*HANDS, "allegro", "barrett", "shadow"])
-def test_no_hand_of_the_docs_is_a_gripper(file: str, shared_data: Path) -> None:
+@pytest.mark.parametrize("file", [*HANDS, *BUILT_IN])
+def test_no_hand_of_the_docs_is_a_gripper_and_pads_hold_the_built_in_objects(file: str, shared_data: Path) -> None:
     hand = hand_from_path(shared_data / "hands" / file if "/" in file else file)
     assert hand.dofs > MAX_DOFS
-
-
-@pytest.mark.parametrize("name", ["allegro", "barrett", "shadow"])
-def test_pads_of_the_hands_hold_the_built_in_objects(name: str) -> None:
-    hand = hand_from_path(name)
     sizes = {obj: size_to_pads(hand, crossings_of(object_from_path(obj)).width) for obj in ("mug", "bottle", "block")}
     assert not any(sizes.values()), sizes
 

@@ -8,7 +8,6 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -49,14 +48,6 @@ def test_a_mistake_is_one_line(command: str, line: str) -> None:
     assert done.stderr.startswith(f"graspd: {line}") and done.stderr.count("\n") == 1
 
 
-GROUPS = ["Make grasps", "Use grasps", "Service", "Administration"]
-
-
-def test_the_overview_has_four_groups() -> None:
-    shown = CliRunner().invoke(build(), ["--help"], prog_name="graspd").stdout
-    assert re.findall(r"─ ([A-Z][a-z ]+) ─", shown) == ["Options", *GROUPS]
-
-
 def test_a_group_without_a_command_shows_its_help() -> None:
     done = CliRunner().invoke(build(), ["tags"], prog_name="graspd")
     assert done.exit_code == 2 and not done.stderr
@@ -87,17 +78,7 @@ def test_completion_knows_commands_without_the_engine(typed: str, offered: str) 
     assert done.stderr.strip() == "False"
 
 
-@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
-def test_completion_can_be_installed(shell: str, tmp_path: Path) -> None:
-    # Without it typer would look at the processes above for the shell.
-    names = {"_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION": "1", "HOME": str(tmp_path)}
-    done = python(f"sys.argv[1:] = ['--install-completion', '{shell}']; main()", **names)
-    written = "".join(path.read_text() for path in tmp_path.rglob("*graspd*"))
-    assert f"_GRASPD_COMPLETE=complete_{shell}" in written, done.stderr
-
-
 def commands(command: Any, path: str) -> Iterator[tuple[str, Any]]:
-    """A command and all below it, those of other packages loaded."""
     if isinstance(command, graspd.cli.Deferred):
         command = graspd.cli.load(command.module, path.rpartition(" ")[2])
     yield path, command
@@ -107,7 +88,6 @@ def commands(command: Any, path: str) -> Iterator[tuple[str, Any]]:
 
 @pytest.fixture(scope="module")
 def every() -> dict[str, Any]:
-    """All commands of graspd by what a user types."""
     return {
         path: one
         for name, module, _, _ in graspd.cli.COMMANDS

@@ -6,13 +6,13 @@ import json
 from pathlib import Path
 
 import pytest
-import typer
 from starlette.testclient import TestClient
 from typer.testing import CliRunner
 
 from graspd.client import add_commands
 from graspd.client.add_commands import add_object, upload_of
 from graspd.client.client import Client
+from graspd.service.cli import CommandGroup
 from graspd.service.model.errors import InputError
 from graspd.service.model.states import AssetKind
 from graspd.service.store.asset_options import sizes_of
@@ -38,7 +38,7 @@ def add(monkeypatch: pytest.MonkeyPatch, http: TestClient, *arguments: str) -> t
     client._http = http
     monkeypatch.setattr(client, "close", lambda: None)
     monkeypatch.setattr(add_commands, "open_client", lambda url: client)
-    app = typer.Typer()
+    app = CommandGroup()
     app.command()(add_object)
     result = CliRunner().invoke(app, [*arguments, "--no-wait", "--json"])
     return result.exit_code, json.loads(result.stdout.splitlines()[-1])
@@ -51,18 +51,10 @@ def test_a_folder_is_uploaded_and_a_bad_object_stops_nothing(
     assert (code, told["refused"]) == (2, ["broken"])
     known = {asset["name"] for asset in http.get(f"/v1/{AssetKind.OBJECT.value}s").json()["items"]}
     assert {"003_cracker_box", "025_mug"} <= known and "broken" not in known
-
-
-def test_adding_a_set_again_changes_nothing(monkeypatch: pytest.MonkeyPatch, http: TestClient, folder: Path) -> None:
-    add(monkeypatch, http, str(folder))
     before = http.get("/v1/objects").json()
-    add(monkeypatch, http, str(folder))
-    assert http.get("/v1/objects").json() == before
-
-
-def test_a_name_goes_before_those_of_the_set(monkeypatch: pytest.MonkeyPatch, http: TestClient, folder: Path) -> None:
-    _, told = add(monkeypatch, http, str(folder), "--name", "ycb")
-    assert told["refused"] == ["ycb-broken"]
+    add(monkeypatch, http, str(folder), "--units", "mm")
+    assert http.get("/v1/objects").json() == before, "adding it again changes nothing"
+    assert add(monkeypatch, http, str(folder), "--name", "ycb")[1]["refused"] == ["ycb-broken"]
 
 
 def test_a_sweep_makes_an_object_of_each_size_and_a_set_of_them(
@@ -119,29 +111,20 @@ def sent(path: Path) -> set[str]:
         return set(unpack(upload.read_bytes(), limit_bytes=10_000))
 
 
-def test_a_urdf_brings_the_meshes_that_it_names(hand_folder: Path) -> None:
+def test_a_urdf_brings_the_meshes_that_it_names_and_a_folder_all(hand_folder: Path) -> None:
     assert sent(hand_folder / "claw.urdf") == {"claw.urdf", "meshes/a.stl", "meshes/b.stl"}
-
-
-def test_a_folder_brings_urdf_and_all_meshes_inside(hand_folder: Path) -> None:
     (hand_folder / "asset.json").write_text("{}")
     assert sent(hand_folder) == {"asset.json", "claw.urdf", "meshes/a.stl", "meshes/b.stl", "meshes/c.stl"}
+    with upload_of(hand_folder) as (upload, _):
+        assert upload.name == "claw.zip"
+    assert not upload.exists()
 
 
-def test_the_upload_is_named_after_the_hand(hand_folder: Path) -> None:
-    for path in (hand_folder, hand_folder / "claw.urdf"):
-        with upload_of(path) as (upload, _):
-            assert upload.name == "claw.zip"
-        assert not upload.exists()
-
-
-def test_other_files_are_sent_as_they_are(hand_folder: Path, tmp_path: Path) -> None:
+def test_other_files_are_sent_as_they_are(tmp_path: Path) -> None:
     (tmp_path / "plain.urdf").write_text("<robot/>")
-    for path in (tmp_path / "plain.urdf", tmp_path / "hand_folder.zip", tmp_path / "missing.urdf"):
+    for path in (tmp_path / "plain.urdf", tmp_path / "hand.zip", tmp_path / "missing.urdf"):
         with upload_of(path) as (upload, _):
             assert upload == path
-
-
-def test_a_folder_without_a_urdf_is_a_mistake(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="holds no URDF"), upload_of(tmp_path):
+    (tmp_path / "none").mkdir()
+    with pytest.raises(InputError, match="holds no URDF"), upload_of(tmp_path / "none"):
         pass

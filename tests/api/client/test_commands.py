@@ -1,4 +1,4 @@
-"""The commands against the real service: embedded Redis, file store, SQLite, API process. No worker, so jobs wait."""
+"""The commands against the real service: embedded Redis, file store, SQLite, controller, API. No worker: jobs wait."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import httpx
 import pytest
 from typer.testing import CliRunner
 
 from graspd.api.models import JobDetail, MeanMetrics
 from graspd.cli import build
+from graspd.client.client import Client
 from graspd.client.reports import job_summary
 from graspd.service.model.domain import JobRequest
 from graspd.service.model.states import AssetKind, State
@@ -28,6 +28,7 @@ from graspd.service.store.library import load_asset_files
 from graspd.service.store.network_file import to_bytes
 from graspd.service.store.records import publish
 from graspd.service.store.store import open_store
+from tests import waiting
 from tests.networks import random_network
 from tests.service.pipeline.test_fidelity_choice import scene_chart
 from tests.shell import completed
@@ -93,15 +94,15 @@ def test_a_submitted_job_is_listed_shown_cancelled_and_retried(graspd: Shell) ->
 
 def test_a_job_asks_for_pictures_and_neighbours(graspd: Shell, tmp_path: Path) -> None:
     pair = ("--hand", "allegro", "--object", "mug")
-    pictures = (*pair, "--scenes", "1", "--views", "1")
-    rich = graspd.json("submit", *pictures, "--channels", "normals", "--width", "640", "--height", "480")
-    assert rich["state"] == "queued"
-    assert rich["job"] != graspd.json("submit", *pictures)["job"], "other pictures are another job"
-    named = graspd.json("submit", *pair, "--scene", "bin", "--with", "block", "--with", "bottle")
-    assert named["state"] == "queued"
-    assert named["job"] != graspd.json("submit", *pair, "--scene", "bin", "--with", "block")["job"]
     (tmp_path / "s.yaml").write_text("supports: [{kind: half_space}]\nneighbours: [{object: block}]\n")
-    assert graspd.json("submit", *pair, "--scene", str(tmp_path / "s.yaml"))["state"] == "queued"
+    asked = (
+        "--scenes 1 --views 1",
+        "--scenes 1 --views 1 --channels normals --width 640 --height 480",
+        "--scene bin --with block",
+        "--scene bin --with block --with bottle",
+        f"--scene {tmp_path / 's.yaml'}",
+    )
+    assert len({graspd.json("submit", *pair, *words.split())["job"] for words in asked}) == len(asked)
 
 
 def test_the_built_in_hands_and_objects_are_there(graspd: Shell) -> None:
@@ -165,7 +166,6 @@ def test_at_a_terminal_the_question_is_answered(graspd: Shell, answer: str, code
 
 
 def _deletable(graspd: Shell, kind: str) -> tuple[str, str]:
-    """Name of a thing that may be deleted, and words of the question."""
     pair = ("--hand", "allegro", "--object", "mug", "--seed", str(zlib.crc32(os.urandom(8)) >> 2))
     thing = f"t{os.urandom(4).hex()}"
     if kind == "delete":
@@ -198,50 +198,29 @@ def test_an_object_is_added_from_a_file_and_its_licence_kept(graspd: Shell, tmp_
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("--hand", "claw", "--object", "mug"), "'claw'"),
-        (("--hand", "allegro", "--object", "teapot"), "'teapot'"),
-        (("--hand", "allegro", "--object", "mug", "-n", "0"), "--grasps"),
-        (("--hand", "allegro", "--object", "mug", "-n", "-5"), "--grasps"),
-        (("--hand", "allegro", "--object", "mug", "--fidelity", "perfect"), "standard"),
-        (("--hand", "allegro", "--object", "mug", "--views", "2"), "scenes"),
-        (("--hand", "allegro", "--object", "mug", "--with", "block"), "neighbours stand in a scene"),
-        (("--hand", "allegro", "--object", "mug", "--scene", "bin", "--with", "teapot"), "no object 'teapot'"),
-        (("--hand", "allegro", "--object", "mug", "--channels", "infrared"), "channels"),
-        (("--hand", "allegro", "--object", "nowhere/box.stl"), "nowhere/box.stl"),
+        ("submit --hand claw --object mug", "'claw'"),
+        ("submit --hand alegro --object mug", "did you mean allegro?"),
+        ("submit --hand allegro --object teapot", "'teapot'"),
+        ("submit --hand allegro --object mug --fidelity perfect", "standard"),
+        ("submit --hand allegro --object mug --views 2", "scenes"),
+        ("submit --hand allegro --object mug --with block", "neighbours stand in a scene"),
+        ("submit --hand allegro --object mug --scene bin --with teapot", "no object 'teapot'"),
+        ("submit --hand allegro --object mug --channels infrared", "channels"),
+        ("datasets estimate --hands alegro --objects mug", "did you mean allegro?"),
+        *((f"{command} 0123456789", "0123456789") for command in ("status", "cancel", "retry", "logs")),
     ],
 )
-def test_a_mistake_is_one_line_and_exit_2(graspd: Shell, arguments: tuple[str, ...], words: str) -> None:
-    done = graspd("submit", *arguments)
+def test_a_mistake_is_one_line_and_exit_2(graspd: Shell, arguments: str, words: str) -> None:
+    done = graspd(*arguments.split())
     assert done.returncode == 2
-    assert words in said(done)
+    assert words in (done.stderr if arguments.startswith("datasets") else said(done))
 
 
-@pytest.mark.parametrize(
-    "command", ["submit --hand alegro --object mug", "datasets estimate --hands alegro --objects mug --scenes 0"]
-)
-def test_an_unknown_name_is_followed_by_the_one_that_is_like_it(graspd: Shell, command: str) -> None:
-    done = graspd(*command.split())
-    assert done.returncode == 2
-    assert "'alegro'" in done.stderr and "did you mean allegro?" in done.stderr
-
-
-@pytest.mark.parametrize("command", ["status", "cancel", "retry", "logs"])
-def test_an_unknown_job_is_exit_2(graspd: Shell, command: str) -> None:
-    done = graspd(command, "0123456789")
-    assert done.returncode == 2
-    assert "0123456789" in said(done)
-
-
-def test_no_service_is_exit_1_and_says_how_to_start_one(graspd: Shell) -> None:
+def test_no_service_and_an_address_that_is_no_graspd_are_told(graspd: Shell) -> None:
     done = Shell(graspd.environment | {"GRASPD_API_URL": "http://127.0.0.1:9"}).apart("jobs")
-    assert done.returncode == 1
-    assert "graspd up" in said(done)
-
-
-def test_an_address_that_is_no_graspd_is_said_so(graspd: Shell) -> None:
+    assert done.returncode == 1 and "graspd up" in said(done)
     done = graspd("jobs", "--url", f"{graspd.environment['GRASPD_API_URL']}/static/")
-    assert done.returncode == 2
-    assert "static" in said(done)
+    assert done.returncode == 2 and "static" in said(done)
 
 
 def test_an_api_that_cannot_start_says_why_in_one_line(graspd: Shell, tmp_path: Path) -> None:
@@ -267,17 +246,6 @@ def test_keys_are_made_listed_and_revoked(graspd: Shell, tmp_path: Path) -> None
     assert shell.json("keys", "list")["keys"][0]["revoked"] is not None
 
 
-def test_an_idempotency_key_binds_to_its_request(service: Supervisor) -> None:
-    body = {"hand": "allegro", "object": "mug", "seed": 5}
-    with httpx.Client(
-        base_url=service.api_url, headers={"Idempotency-Key": "one"}, trust_env=False, timeout=60
-    ) as http:
-        first, second = (http.post("/v1/jobs", json=body) for _ in range(2))
-        other = http.post("/v1/jobs", json=body | {"seed": 6})
-    assert first.json()["id"] == second.json()["id"]
-    assert (other.status_code, "Idempotency-Key" in other.json()["detail"]) == (422, True)
-
-
 def test_the_keys_that_scripts_rely_on_are_there() -> None:
     asked = {"hand": "allegro", "object": "mug", "method": "fast_graspd", "fidelity": "standard", "requested": 32}
     found = {"grasps": 32, "valid": 20, "progress": 1.0, "created": "2026-01-01T00:00:00Z", "stages": []}
@@ -301,3 +269,100 @@ def test_a_job_with_a_target_says_how_its_fidelity_was_chosen(graspd: Shell, ser
     assert graspd.json(*asked, "lift>=0.9")["choice"]["reached"] == 0.95
     done = graspd(*asked, "gsr>=0.8")
     assert done.returncode == 2 and "charts in scenes hold lift, lift_dexgraspbench, lift_hard, robust" in said(done)
+
+
+CREATE = ("datasets", "create", "kitchen", "--hands", "allegro,barrett", "--objects", "mug,block", "--grasps", "64")
+
+
+def until(service: Supervisor, name: str, state: State) -> None:
+    with Client(service.api_url) as client:
+        cells = client.cells
+        waiting.until(
+            lambda: all(cell.planned and cell.state is state for cell in cells(name)), f"all of {name} is {state}"
+        )
+
+
+def test_a_dataset_is_created_listed_cancelled_and_retried(graspd: Shell, service: Supervisor) -> None:
+    made = graspd.json(*CREATE, "--yes")
+    assert made["estimate"]["cells"] == made["dataset"]["cells"] == 4
+    assert "kitchen" in {dataset["name"] for dataset in graspd.json("datasets", "list")["datasets"]}
+    until(service, "kitchen", State.QUEUED)
+    graspd.json("datasets", "cancel", "kitchen")
+    until(service, "kitchen", State.CANCELLED)
+    assert graspd.json("datasets", "status", "kitchen")["state"] == "cancelled"
+    graspd.json("datasets", "retry", "kitchen")
+    until(service, "kitchen", State.QUEUED)
+
+
+def test_the_matrix_is_a_table_of_objects_and_hands(graspd: Shell) -> None:
+    graspd.json("datasets", "create", "table", *CREATE[3:], "--seed", "7", "--yes")
+    lines = [line.split() for line in graspd("datasets", "status", "table").stdout.splitlines()]
+    head = lines.index(["allegro", "barrett"])
+    assert lines[head + 1 : head + 3] == [["mug", "queued", "queued"], ["block", "queued", "queued"]]
+
+
+def test_a_dataset_takes_options_of_its_method(graspd: Shell) -> None:
+    method = ("--method", "graspit", "--option", "keep=20", "--option", "steps=40000")
+    made = graspd.json("datasets", "create", "annealed", *CREATE[3:], *method, "--yes")
+    assert made["dataset"]["options"]["options"] == {"keep": 20, "steps": 40000}
+    done = graspd("datasets", "create", "odd", *CREATE[3:], "--option", "keep")
+    assert done.returncode == 2 and "write it as name=value" in said(done)
+
+
+def test_nobody_at_the_terminal_or_no_name_means_nothing_starts(graspd: Shell) -> None:
+    done = graspd("datasets", "create", "silent", *CREATE[3:])
+    assert done.returncode == 2 and "--yes" in said(done)
+    assert "256 grasps" in done.stdout
+    assert graspd("datasets", "status", "silent").returncode == 2
+    done = graspd("datasets", "create", "--hands", "allegro", "--objects", "mug")
+    assert done.returncode == 2 and "give a name" in said(done)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ("--hands foot", "there is no hand or object 'foot'"),
+        ("--objects no/such/folder", "there is no folder no/such/folder"),
+        ("--grasps 0", "--grasps: "),
+        ("--views 2", "views need scenes"),
+        ("--fidelity superb", "unknown fidelity"),
+        ("--fidelity auto --target gsr>=0.5", "graspd chart --publish"),
+    ],
+)
+def test_a_mistake_is_one_line_that_says_what(graspd: Shell, changes: str, words: str) -> None:
+    done = graspd(*CREATE, *changes.split(), "--yes")
+    assert done.returncode == 2 and words in said(done)
+
+
+def test_a_set_goes_by_its_name_beside_its_folder(
+    graspd: Shell, service: Supervisor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with Client(service.api_url) as client:
+        client.add_object_set("kit", ["mug", "block"])
+    (tmp_path / "kit").mkdir()
+    (tmp_path / "kit" / "cup.stl").write_bytes(b"solid cup\nendsolid cup\n")
+    monkeypatch.chdir(tmp_path)
+    cells = {
+        place: graspd.json("datasets", "estimate", "--hands", "allegro", "--objects", place)["cells"]
+        for place in ("kit", "./kit")
+    }
+    assert cells == {"kit": 2, "./kit": 1}
+
+
+def test_a_snapshot_of_nothing_is_refused(graspd: Shell, tmp_path: Path) -> None:
+    graspd.json("datasets", "create", "empty", *CREATE[3:], "--seed", "9", "--yes")
+    export = ("datasets", "export", "empty", "-o", str(tmp_path))
+    assert "no shard yet" in said(graspd("datasets", "snapshot", "empty"))
+    assert "no shard yet" in said(graspd(*export))
+    assert "there is no format 'zip'" in said(graspd(*export, "--format", "zip"))
+
+
+def test_a_spec_in_a_file_is_what_the_options_would_say(graspd: Shell, tmp_path: Path) -> None:
+    spec = tmp_path / "kitchen.toml"
+    spec.write_text('name = "spec"\nhands = ["allegro", "barrett"]\nobjects = ["mug", "block"]\ntotal_grasps = 250\n')
+    dry = graspd.json("datasets", "create", "--spec", str(spec), "--dry-run")["estimate"]
+    assert (dry["cells"], dry["asked"]) == (4, 252)  # 63 each: a quarter of 250, rounded up
+    found = graspd.json("datasets", "estimate", "--spec", str(spec), "--objects", "mug", "--grasps", "10")
+    assert (found["cells"], found["asked"]) == (2, 20)
+    made = graspd.json("datasets", "create", "--spec", str(spec), "--yes")["dataset"]
+    assert (made["name"], made["asked"]) == ("spec", 252)

@@ -1,4 +1,4 @@
-"""Specs of datasets in files: what they say, what options say over them, what is wrong with them."""
+"""Specs of datasets in files, and options over them: what they say, and what is wrong with them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from typing import Any
 
 import pytest
 
-from graspd.client.job_options import PlanRequest, read_spec, wanted
+from graspd.client.dataset_commands import PlanRequest, read_spec, wanted
+from graspd.service.command_options import pairs
 from graspd.service.model.errors import InputError
 from graspd.service.pipeline.datasets.spec import MAX_CELLS
 
@@ -73,11 +74,19 @@ def test_a_folder_of_objects_lies_beside_the_spec(tmp_path: Path) -> None:
 def test_a_spec_that_cannot_be_used_says_what_is_wrong(tmp_path: Path, text: str, words: str) -> None:
     with pytest.raises(InputError, match=words):
         asked(spec(tmp_path, text))
-
-
-def test_a_spec_that_is_not_there_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"none\.toml cannot be read"):
         read_spec(tmp_path / "none.toml")
+
+
+@pytest.mark.parametrize(
+    ("text", "value"), [("20", 20), ("-3", -3), ("0.5", 0.5), ("007", "007"), ("nan", "nan"), ("", ""), ("a=b", "a=b")]
+)
+def test_what_is_written_as_a_number_is_one(text: str, value: object) -> None:
+    """`--option keep=20` is the job that `{"keep": 20}` is over HTTP: a string would be another."""
+    found = pairs([f"keep={text}"])
+    assert found == {"keep": value} and type(found["keep"]) is type(value)
+    with pytest.raises(InputError, match="name=value"):
+        pairs(["keep"])
 
 
 def test_the_million_of_the_examples_is_a_spec() -> None:
@@ -107,12 +116,7 @@ def test_neighbours_are_named_in_spec_option_and_scene_file(tmp_path: Path) -> N
     (tmp_path / "shelf.yaml").write_text("supports: [{kind: half_space}]\nneighbours: [{object: block}]\n")
     document = asked(spec(tmp_path, text.replace("table", "shelf.yaml"))).options["scene"]
     assert [one["object"] for one in document["neighbours"]] == ["block"]
-
-
-def test_a_neighbour_of_a_dataset_that_is_a_file_is_added_first(tmp_path: Path) -> None:
-    text = 'hands = ["allegro"]\nobjects = ["mug"]\nscene = "table"\n'
-    words = "parts/bracket.stl is a file: `graspd objects add parts/bracket.stl` first"
-    with pytest.raises(InputError, match=words):
-        asked(spec(tmp_path, text + 'neighbours = ["parts/bracket.stl"]'))
-    with pytest.raises(InputError, match=words):
-        asked(spec(tmp_path, text), neighbours=["parts/bracket.stl"])
+    words, part = "parts/bracket.stl is a file: `graspd objects add parts/bracket.stl` first", "parts/bracket.stl"
+    for file, options in ((text + f'neighbours = ["{part}"]', {}), (text, {"neighbours": [part]})):
+        with pytest.raises(InputError, match=words):
+            asked(spec(tmp_path, file), **options)

@@ -28,32 +28,31 @@ from tests.planning import plan_all
 
 NAME = "[red]mug[/] :mug: " + "a-very-long-name-of-an-object-that-somebody-gave-to-it"[:46]
 
-
 ID = "0123456789ab"
-
 
 CREATED = "2026-11-26T03:14:11.123456Z"
 
-
-_DONE = {"state": State.SUCCEEDED, "progress": 1.0, "created": CREATED}
+_DONE = {"state": State.SUCCEEDED, "progress": 1.0, "created": CREATED, "model_dump": dict}
 _JOB = {"id": ID + "0" * 20, "hand": NAME, "object": NAME, "standing": "valid"}
 JOB = SimpleNamespace(**dict.fromkeys(("valid", "grasps", "requested"), 100_000), **_JOB, **_DONE)
-
 
 _DATASET = {"name": NAME, "cells": 1000, "counted": 10**6, "asked": 10**6, "size_bytes": 10**9 + 1}
 DATASET = SimpleNamespace(**_DATASET, **_DONE, options=JobOptions())
 
-
 ASSET = SimpleNamespace(
-    name=NAME, filename=NAME, size_bytes=10**6, builtin=False, verdict="ok", facts={}, digest=ID + "0" * 52
+    name=NAME,
+    filename=NAME,
+    size_bytes=10**6,
+    builtin=False,
+    verdict="ok",
+    facts={},
+    digest=ID + "0" * 52,
+    model_dump=dict,
 )
-
 
 TAG = {"name": NAME, "grasps": 10**6, "changed": CREATED}
 
-
 WEBHOOK = {"id": ID, "url": "https://example.org/" + NAME, "states": ["failed", "succeeded"], "created": CREATED}
-
 
 _ENDED = {"kind": "job", "subject": ID, "ended": "succeeded", "state": "delivered"}
 DELIVERY = _ENDED | {"attempts": 3, "tried": CREATED, "detail": NAME}
@@ -63,7 +62,7 @@ class Service:
     """Answers each list with one row."""
 
     def jobs(self, **_: Any) -> Any:
-        return SimpleNamespace(items=[JOB])
+        return SimpleNamespace(items=[JOB], next=None)
 
     def assets(self, _: Any, **__: Any) -> Iterator[Any]:
         yield ASSET
@@ -73,13 +72,11 @@ class Service:
         return SimpleNamespace(json=lambda: [rows])
 
     def datasets(self, **_: Any) -> Any:
-        return SimpleNamespace(items=[DATASET])
+        return SimpleNamespace(items=[DATASET], next=None)
 
 
 @pytest.fixture
 def shown(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[str]]:
-    """Lines of a command on such a terminal."""
-
     @contextmanager
     def opened(_: str | None) -> Iterator[Service]:
         yield Service()
@@ -154,9 +151,6 @@ def test_a_report_names_the_standing_of_what_it_counts(services: Services, valid
     validated = "not validated" if validation == "none" else "at"
     assert f"per {word} grasp" in out.getvalue() and f"{made}/32 {validated}" in out.getvalue()
     assert not re.search(rf"\b{other}\b", out.getvalue())
+    assert JobOptions(want="candidates", validation="none").standing == "kept"
     reasons = [line for line in out.getvalue().splitlines() if line.startswith("reason: ")]
     assert reasons == ([] if validation == "none" else [f"reason: {dataset.reason}"])
-
-
-def test_candidate_grasps_that_nobody_judges_are_merely_kept() -> None:
-    assert JobOptions(want="candidates", validation="none").standing == "kept"

@@ -95,7 +95,7 @@ def test_the_client_works_below_a_prefix(http: TestClient, services: Services, t
 
     with Client(f"{BASE_URL}{PREFIX}/", transport=httpx.MockTransport(forward)) as client:
         (shard,) = client.job(job.id).shards
-        assert client.download(shard, tmp_path / "x.h5").stat().st_size > 0
+        assert client.save(shard.file, tmp_path / "x.h5").stat().st_size > 0
 
 
 def test_what_is_no_address_of_this_host_stays() -> None:

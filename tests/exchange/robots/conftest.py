@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -15,25 +16,15 @@ def engine() -> None:
     backend.start()
 
 
-@pytest.fixture(scope="session")
-def free_shard(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Barrett grasps of a free block, feasible or not, as they come."""
-    return make(FREE, tmp_path_factory.mktemp("free") / "grasps.h5")
+def _shard(name: str, words: str) -> Any:
+    @pytest.fixture(scope="session", name=name)
+    def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+        return make(words, tmp_path_factory.mktemp(name) / "grasps.h5")
+
+    return made
 
 
-@pytest.fixture(scope="session")
-def table_shard(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Barrett grasps of a bottle that lies on tables, as they come."""
-    return make(TABLE, tmp_path_factory.mktemp("table") / "grasps.h5")
-
-
-@pytest.fixture(scope="session")
-def pressing_shard(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Barrett grasps of a bottle, whose fingertips may press into the table."""
-    return make(PRESSING, tmp_path_factory.mktemp("pressing") / "grasps.h5")
-
-
-@pytest.fixture(scope="session")
-def clutter_shard(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Barrett grasps of a bottle with a block beside it."""
-    return make(CLUTTER, tmp_path_factory.mktemp("clutter") / "grasps.h5")
+# Barrett grasps as they come, feasible or not: of a free block, of a bottle on tables, with fingertips that may press
+# into the table, and with a block beside it.
+free_shard, table_shard = _shard("free_shard", FREE), _shard("table_shard", TABLE)
+pressing_shard, clutter_shard = _shard("pressing_shard", PRESSING), _shard("clutter_shard", CLUTTER)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from graspd.client.job_options import read_spec
+from graspd.client.dataset_commands import read_spec
 from graspd.commands.studies import _read_maps as read_stability
 from graspd.exchange.bench_hand import _read as read_mapping
 from graspd.exchange.published import friction
