@@ -37,7 +37,7 @@ _LITTLE = "--hands barrett --objects 077_rubiks_cube --grasps 4"
 
 
 _TRAIN = (
-    "python -m examples.train_grasp_predictor --shards WORK/tables --free WORK/free --peer WORK/peer "
+    "python -m examples.train_grasp_predictor --shards WORK/tables --free WORK/free --baseline WORK/baseline "
     "--meshes DATA/objects --held-out 006_mustard_bottle,025_mug,035_power_drill,061_foam_brick "
     "-o OUT/results/predictor.json"
 )
@@ -113,7 +113,7 @@ STUDIES: Final = (
         ("results/chart.*", "results/sweeps.png"),
         (
             f"graspd chart --hands {_ALLEGRO},{_BARRETT} --objects {_mesh('006_mustard_bottle')},{_mesh('025_mug')},"
-            f"{_mesh('035_power_drill')},{_mesh('011_banana')} --batch 32 --peer-batch 8 --repeats 2 --sweep "
+            f"{_mesh('035_power_drill')},{_mesh('011_banana')} --batch 32 --baseline-batch 8 --repeats 2 --sweep "
             "--out OUT/results",
         ),
         ("graspd chart --quick --hands barrett --objects block --out OUT/results",),
@@ -124,7 +124,7 @@ STUDIES: Final = (
         ("results/scenes-chart/*",),
         (
             f"graspd chart --scene table --hands {_ALLEGRO},{_BARRETT} --objects {_mesh('025_mug')},"
-            f"{_mesh('006_mustard_bottle')},{_mesh('003_cracker_box')} --batch 24 --peer-batch 24 --threads 1 "
+            f"{_mesh('006_mustard_bottle')},{_mesh('003_cracker_box')} --batch 24 --baseline-batch 24 --threads 1 "
             "--work WORK/scenes-chart --out OUT/results/scenes-chart",
         ),
         (
@@ -147,8 +147,11 @@ STUDIES: Final = (
         "hands-stability",
         "where hands, wrong models and other methods break",
         ("results/hands-stability/*",),
-        ("graspd stability --only hands --only model_errors --only peers --out OUT/results/hands-stability",),
-        ("graspd stability --quick --only hands --only model_errors --only peers --out OUT/results/hands-stability",),
+        ("graspd stability --only hands --only model_errors --only baselines --out OUT/results/hands-stability",),
+        (
+            "graspd stability --quick --only hands --only model_errors --only baselines "
+            "--out OUT/results/hands-stability",
+        ),
     ),
     Study(
         "scenes-stability",

@@ -31,7 +31,7 @@ from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.prepare import object_from_path
 
-FREE, PEER = "free, filtered", "graspit, filtered"
+FREE, BASELINE = "free, filtered", "graspit, filtered"
 ACROSS, NEAREST = "no network: across", "no network: nearest"
 #: What becomes of the first row without its parts, and of the controls with its evaluator.
 DEFAULT_CONTEXT, UNMOVED = "proposals alone", "chosen, not moved"
@@ -94,7 +94,7 @@ class Study:
     def makers(self) -> dict[str, Callable[[str], TrainedModel]]:
         """From a source to what it teaches of an object; the first is what the others are compared with."""
         made: dict[str, Callable[[str], TrainedModel]] = {sources.SCENES: self.usual}
-        made |= {name: partial(self.put_into, name) for name in (FREE, PEER) if name in self.others}
+        made |= {name: partial(self.put_into, name) for name in (FREE, BASELINE) if name in self.others}
         return made
 
     def ablations(self) -> dict[str, Callable[[str], TrainedModel]]:
@@ -120,7 +120,7 @@ def main(
     held_out: Annotated[str, Option(help="Objects to evaluate on, with commas; none of them is trained on.")] = "",
     hand: Annotated[str, Option(help="URDF or built-in hand of the data.")] = "barrett",
     free: Annotated[str, Option(help="Shards of valid grasps of free objects, to be put on tables and filtered.")] = "",
-    peer: Annotated[str, Option(help="The same of the graspit baseline.")] = "",
+    baseline: Annotated[str, Option(help="The same of the graspit baseline.")] = "",
     raw: Annotated[
         str, Option(help="Shards planned on tables with `want candidates`, with views: failures told.")
     ] = "",
@@ -144,7 +144,9 @@ def main(
     def opened(where: str) -> Shards:
         return open_shards(where).only(hands=[model.name])
 
-    others = {name: opened(where) for name, where in ((FREE, free), (PEER, peer), (sources.FAILED, raw)) if where}
+    others = {
+        name: opened(where) for name, where in ((FREE, free), (BASELINE, baseline), (sources.FAILED, raw)) if where
+    }
     study = Study(model, opened(shards), others, meshes, [name for name in held_out.split(",") if name], grasps)
     rows: list[Row] = json.loads(output.read_text()) if output.exists() else []
     drawn: dict[str, dict[str, Any]] = {}

@@ -1,16 +1,16 @@
 #!/bin/bash
 # Grasps of free objects to compare with: bash examples/train_grasp_predictor/data.sh OBJECTS OUT, OBJECTS a folder of
-# OBJECT/clean.stl. Writes OUT/free and OUT/peer; what is there already is not made again.
+# OBJECT/clean.stl. Writes OUT/free and OUT/baseline; what is there already is not made again.
 set -eu
 objects=$1 out=$2
-mkdir -p "$out/free" "$out/peer"
+mkdir -p "$out/free" "$out/baseline"
 for hand in barrett allegro; do
     for name in 003_cracker_box 005_tomato_soup_can 011_banana 024_bowl 037_scissors 048_hammer 056_tennis_ball \
             077_rubiks_cube koala spot; do
         mesh=$objects/$name/clean.stl
         [ -f "$out/free/$hand-$name.h5" ] ||
             graspd synth --hand $hand --object "$mesh" -n 160 -o "$out/free/$hand-$name.h5" || [ $? = 3 ] # fewer
-        [ -f "$out/peer/$hand-$name.h5" ] || graspd synth --hand $hand --object "$mesh" --method graspit \
-            --option keep=20 --want candidates -n 192 -o "$out/peer/$hand-$name.h5" || [ $? = 3 ]
+        [ -f "$out/baseline/$hand-$name.h5" ] || graspd synth --hand $hand --object "$mesh" --method graspit \
+            --option keep=20 --want candidates -n 192 -o "$out/baseline/$hand-$name.h5" || [ $? = 3 ]
     done
 done

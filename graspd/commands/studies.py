@@ -85,7 +85,7 @@ def _fidelities(names: list[str] | None, points: list[int] | None, errors: list[
 
 STUDIES: Final = (
     *("time_step", "stiffness", "contact_count", "gradient", "shapes", "starts", "rates", "length", "hands"),
-    *("model_errors", "peers", "scene_height", "scene_wall", "scene_neighbours", "scene_size"),
+    *("model_errors", "baselines", "scene_height", "scene_wall", "scene_neighbours", "scene_size"),
 )
 
 
@@ -179,7 +179,7 @@ def chart(
         str, typer.Option(help="Fidelities of methods that have them, separated by commas.")
     ] = ",".join(OFFERED),
     batch: Annotated[str, typer.Option(help="Grasps per call, separated by commas; each is run.")] = "32",
-    peer_batch: Annotated[int, typer.Option(min=1, help="Grasps per call of methods with a budget of steps.")] = 8,
+    baseline_batch: Annotated[int, typer.Option(min=1, help="Grasps per call of methods with a budget of steps.")] = 8,
     repeats: Annotated[int, typer.Option(min=1, help="Timed calls per setting, hand and object.")] = 2,
     option: Annotated[
         list[str] | None,
@@ -228,12 +228,18 @@ def chart(
     batches, models_around = [_number(part) for part in _parts(batch)], ROBUST_MODELS
     if quick:
         hands, objects, fidelities = (_parts(text)[0] for text in (hands, objects, fidelities))
-        batches, peer_batch, repeats, models_around = [4], 2, 1, 2
+        batches, baseline_batch, repeats, models_around = [4], 2, 1, 2
     levels = _parts(fidelities)
     if unknown := [name for name in levels if name not in FIDELITIES]:
         raise InputError(f"unknown fidelity {unknown[0]!r}; choose of {one_of(unknown[0], FIDELITIES)}")
     chosen = settings_of(
-        _parts(methods), levels, batches=batches, peer_batch=peer_batch, options=option or [], quick=quick, run=on
+        _parts(methods),
+        levels,
+        batches=batches,
+        baseline_batch=baseline_batch,
+        options=option or [],
+        quick=quick,
+        run=on,
     )
     models, things = [hand_from_path(part) for part in _parts(hands)], _things(_parts(objects))
     said = {"command": shlex.join(["graspd", *(_short(word) for word in sys.argv[1:])]), "remark": remark}

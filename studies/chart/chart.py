@@ -124,14 +124,14 @@ def settings_of(
     fidelities: Sequence[str],
     *,
     batches: Sequence[int],
-    peer_batch: int,
+    baseline_batch: int,
     options: Sequence[str],
     quick: bool,
     run: ExecutionContext,
 ) -> list[Setting]:
     """Return a setting for every method, fidelity and batch; methods without fidelities have one each.
 
-    Methods with a step budget take seconds per grasp and get `peer_batch` grasps per call, others the first batch.
+    Methods with a step budget take seconds per grasp and get `baseline_batch` grasps per call, others the first batch.
 
     Raises:
         InputError: a method is unknown, or an option belongs to none of them.
@@ -147,7 +147,7 @@ def settings_of(
         if known.has_fidelities:
             found += [Setting(name, f, FIDELITIES[f], batch=b, **common) for f in fidelities for b in batches]
         else:
-            size = peer_batch if "steps" in known.options.model_fields else batches[0]
+            size = baseline_batch if "steps" in known.options.model_fields else batches[0]
             label = " ".join(f"{key}={value}" for key, value in changes.items()) or LABEL
             found.append(Setting(name, label, FIDELITIES["standard"], batch=size_given or size, **common))
     return found

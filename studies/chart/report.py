@@ -266,7 +266,7 @@ def _scene_head(chart: Row) -> str:
         f"Objects: {objects}.{_remark(chart)}\n\n"
         f"- *{IN_SCENE}*: planned for the scene\n"
         f"- *{FILTERED}*: planned around a free object and put into the same scenes, grasp i into scene i in turn: all "
-        "that peers can do\n"
+        "that baselines can do\n"
         "- *clear*: free of what stands there, coming, closing and lifting\n"
         "- *lifted*: clear, and lifted by MuJoCo (level *lift*); *dexgraspbench*: lifted in DexGraspBench's test; "
         "*half friction*: lifted at that too; shares of all candidates\n"

@@ -79,7 +79,7 @@ def run(
         "model_errors": lambda: model_errors.model_error_map(
             beside(ALL_HANDS), thing, few_errors, every=3 if quick else 1
         ),
-        "peers": lambda: peer_map(
+        "baselines": lambda: baseline_map(
             model, options, methods=METHODS[:2] if quick else METHODS, shapes={"cube": (60,)} if quick else SHAPES
         ),
         "scene_height": lambda: scenes.height_map(
@@ -114,7 +114,7 @@ SHAPES: Final[dict[str, tuple[float, ...]]] = {
 }
 
 
-def peer_map(
+def baseline_map(
     hand: HandModel, options: MapOptions, *, methods: Sequence[str], shapes: dict[str, tuple[float, ...]]
 ) -> StabilityMap:
     cells = []
@@ -125,7 +125,7 @@ def peer_map(
             options.say(f"{family} {value:g} {method}: {cell.outcome} {cell.value:.2f} {cell.note}")
             cells.append(cell)
     return StabilityMap(
-        "peers",
+        "baselines",
         f"{options.count} grasps of {hand.name} by each method on shapes that are hard",
         "the shape's parameter",
         "method",

@@ -93,7 +93,12 @@ def test_a_wrong_option_is_the_callers_mistake(arguments: list[str]) -> None:
 
 
 def test_method_can_be_charted_with_options_and_batch_of_its_own() -> None:
-    given = {"peer_batch": 4, "options": ["graspit:steps=40000"], "quick": False, "run": ExecutionContext(threads=1)}
+    given = {
+        "baseline_batch": 4,
+        "options": ["graspit:steps=40000"],
+        "quick": False,
+        "run": ExecutionContext(threads=1),
+    }
     plain, kept = settings_of(["graspit", "graspit:keep=5@10"], ["draft"], batches=[32], **given)
     assert (plain.fidelity, plain.batch, plain.options) == ("as published", 4, {"steps": "40000"})
     assert (kept.fidelity, kept.batch, kept.options) == ("keep=5", 10, {"steps": "40000", "keep": "5"})
