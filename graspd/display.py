@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import math
 import time
 from html import escape
 from typing import TYPE_CHECKING, Any, Final
@@ -63,7 +64,7 @@ def html_of(grasps: Grasps) -> str:
     """Return `repr` and a picture of the best grasps as HTML; without a picture, a table of their metrics."""
     head = f"<p>{escape(repr(grasps))}</p>"
     try:
-        png = _picture(grasps)
+        png = sheet_of(grasps, PICTURED, EDGE, PICTURE_S)
     # A notebook must display its grasps even if a file, engine or driver is missing.
     except Exception:
         png = b""
@@ -87,23 +88,30 @@ def viewer_of(grasps: Grasps, *, host: str, port: int) -> Viewer:
     return Viewer(ViewerContent(shard, hand, obj, neighbours_of_shard(shard, [])), host=host, port=port)
 
 
-def _picture(grasps: Grasps) -> bytes:
+def sheet_of(grasps: Grasps, count: int, edge: int, limit_s: float = math.inf) -> bytes:
+    """Return a PNG sheet of the best `count` grasps, `edge` pixels each.
+
+    Raises:
+        InputError: there are no grasps, or they are on several objects.
+        NotFoundError: the file of the hand or the object is not found.
+        TaskCancelled: after `limit_s` [s].
+    """
     from graspd.commands.grasp_sheet import GraspSheet
     from graspd.worker.engines.devices import Device
     from graspd.worker.execution_context import ExecutionContext
     from graspd.worker.files.provenance import hand_of_shard, object_of_shard
 
-    shard, until = grasps.shard(), time.monotonic() + PICTURE_S
-    rows = _best(grasps)
+    shard, until = grasps.shard(), time.monotonic() + limit_s
+    rows = _best(grasps, count)
     if not len(rows):
         raise InputError("there is no grasp to draw")
     hand, obj = hand_of_shard(shard, None), object_of_shard(shard, None)
     run = ExecutionContext(Device("auto").resolve(), cancelled=lambda: time.monotonic() > until)
-    return GraspSheet(shard, hand, obj, rows, "one side", run, EDGE).png(subtitle=f"best {len(rows)} by epsilon")
+    return GraspSheet(shard, hand, obj, rows, "one side", run, edge).png(subtitle=f"best {len(rows)} by epsilon")
 
 
 def _table(grasps: Grasps) -> str:
-    rows = _best(grasps)
+    rows = _best(grasps, PICTURED)
     names = [name for name in _FIGURES if name in grasps.metrics]
     head = "".join(f"<th>{escape(name)}</th>" for name in ("row", "valid", *names))
     values = {name: grasps.metric(name) for name in names}
@@ -116,7 +124,7 @@ def _table(grasps: Grasps) -> str:
     return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
 
 
-def _best(grasps: Grasps) -> np.ndarray:
-    """Return rows of the best grasps by epsilon, valid ones first."""
+def _best(grasps: Grasps, count: int) -> np.ndarray:
+    """Return rows of the best `count` grasps by epsilon, valid ones first."""
     epsilon = np.nan_to_num(np.asarray(grasps.metric("epsilon"), float), nan=-1.0)
-    return np.lexsort((-epsilon, ~grasps.is_valid))[:PICTURED]
+    return np.lexsort((-epsilon, ~grasps.is_valid))[:count]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -22,6 +23,8 @@ from graspd.service.store.manifests import INDEX_THRESHOLD_M
 from graspd.service.store.shards import Shard, read_shard, write_shard
 
 if TYPE_CHECKING:
+    from PIL.Image import Image
+
     from graspd.worker.viewing import Viewer
 
 Array = NDArray[Any]
@@ -269,6 +272,19 @@ class Grasps:
         from graspd.display import frame_of
 
         return frame_of(self)
+
+    def plot(self, count: int = 4, *, edge: int = 320) -> Image:
+        """Draw the best grasps by epsilon on one sheet, valid ones first, each in a square of `edge` pixels.
+
+        Raises:
+            InputError: there are no grasps, or they are on several objects.
+            NotFoundError: the file of the hand or the object is not found.
+        """
+        import PIL.Image
+
+        from graspd.display import sheet_of
+
+        return PIL.Image.open(io.BytesIO(sheet_of(self, count, edge)))
 
     def view(self, *, host: str = "127.0.0.1", port: int = 8080) -> Viewer:
         """Serve the grasps in 3D to a browser until `close()` of the result; `url` is its address.

@@ -189,6 +189,15 @@ def test_names_cannot_write_html(tmp_path: Path) -> None:
     assert "<script>" not in html and "<b>" not in html
 
 
+def test_plot_is_a_picture_of_the_best(known: graspd.Grasps, grasps: graspd.Grasps) -> None:
+    one, two = known.plot(1, edge=240), known.plot(2, edge=240)
+    assert one.width < two.width < 3 * one.width
+    with pytest.raises(graspd.InputError, match="no grasp to draw"):
+        known[[]].plot()
+    with pytest.raises(graspd.NotFoundError, match="claw"):
+        grasps.plot()
+
+
 def test_the_viewer_serves_them(known: graspd.Grasps) -> None:
     pytest.importorskip("viser", reason="needs the extra: pip install graspd[view]")
     viewer = known.view(port=0)
