@@ -96,8 +96,8 @@ def must_own(owner: str, what: str, project: str = "") -> None:
         assert key is not None
         raise ForeignResource(
             403,
-            f"{what} was not submitted with the key {key.name!r}; the key that submitted it can do this, or one with "
-            "scope admin",
+            f"{what} is not of the key {key.name!r}; a key of its project can do this (without a project: the key that "
+            "submitted it), or one with scope admin",
         )
 
 

@@ -238,7 +238,7 @@ def _rims(faces: Indices) -> list[list[int]] | None:
 def _open(mesh: RepairedMesh, options: ObjectOptions) -> RepairedMesh:
     holes = topology.open_edges(mesh.faces)
     if options.allow_open:
-        note = f"not watertight: {holes} open edges; the mass is that of the convex hull"
+        note = f"not watertight: {holes} open edges; volume, centre of mass and inertia are those of the convex hull"
         return replace(mesh, watertight=False, notes=(*mesh.notes, note))
     what = f"{holes} open edges" if holes else "faces that no winding makes consistent"
     raise MeshError.with_fixes(
