@@ -83,7 +83,7 @@ def test_the_documentation_stays_short() -> None:
         if REPOSITORY / "docs" / "results" not in page.parents
     }
     assert words[REPOSITORY / "README.md"] <= 900 and words[REPOSITORY / "CONTRIBUTING.md"] <= 700
-    assert sum(words.values()) <= 41_000
+    assert sum(words.values()) <= 41_500
     assert len((REPOSITORY / "ARCHITECTURE.md").read_text().splitlines()) <= 300
 
 
