@@ -27,8 +27,8 @@ SELF_WEIGHT: Final = 2e4
 #: hold at half friction. Half this length hardly changes results of a Barrett hand; twice this length draws the slender
 #: fingers of a Shadow hand into thin walls.
 PULL: Final = 3e-4
-#: The same for the projection around a free object: more points are attracted than among obstacles, so more of the hand
-#: touches. This adds about half of the depth that the samples of `pairs.DENSER` save.
+#: Projection around a free object: points are attracted from farther away than among obstacles, so more of the hand
+#: touches. The attraction adds about half of the penetration that the samples of `pairs.DENSER` remove.
 AROUND: Final = ProjectionOptions(hold=5e-3)
 
 
