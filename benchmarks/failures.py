@@ -1,7 +1,7 @@
 """The failures that are left: the worst objects of each hand, what became of their grasps, and pictures of some.
 
 usage: python -m benchmarks.failures DATA_DIR [--work DIR] [--hands allegro ...] [--objects NAME ...] [--out FOLDER]
-DATA_DIR holds hands/ and objects/. Raw standard grasps are validated at level certificate; stopped runs go on
+DATA_DIR holds hands/ and objects/. Candidates at fidelity standard are validated at level standard; stopped runs go on
 (cells.py). Writes failures.md, failures.json and a picture for each of the worst objects under `--out`/failures.
 """
 

@@ -52,8 +52,8 @@ def bench(
 ) -> dict[str, Any]:
     """Run each fidelity x batch x joins x threads once; `say` receives a line per run.
 
-    `load` loads the object at a fidelity's simplification error bound [m]; `joins` are numbers of batches per launch. The
-    median of `repeats` timed calls is reported, after an untimed call. A GPU ignores `threads`.
+    `load` loads the object at a fidelity's simplification error bound [m]; `joins` are numbers of batches per launch.
+    The median of `repeats` timed calls is reported, after an untimed call. A GPU ignores `threads`.
 
     Returns:
         `device`, `runs[]` with the keys of the command line's contract, `start` with cold and warm seconds,
