@@ -1,4 +1,4 @@
-"""Documents that extend those of the index. Times are RFC 3339 in UTC; field names contain units."""
+"""Documents of the API that extend those of the index. Times are RFC 3339 in UTC; field names contain units."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Definitions of every series of `/metrics`, and the names under which their sums are stored."""
+"""Definitions of all series of `/metrics`, and the names of their stored sums."""
 
 from __future__ import annotations
 
