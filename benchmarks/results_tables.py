@@ -166,7 +166,7 @@ def markdown(hand: str, rows: list[dict[str, Any]], total: dict[str, Any], comma
             "| --- |" + " --: |" * len(PRINTED),
             *body,
             "",
-            f"GSR: share that holds, normal and at half the friction. robust: share of {ROBUST_MODELS} models around "
+            f"GSR: share that holds, at full and at half friction. robust: share of {ROBUST_MODELS} models around "
             "the "
             "nominal one in which a valid grasp holds, on average. SGS: holding grasps per second, "
             "made and validated (*standard*), seconds being CPU time over two cores. PD, SPD: penetration, "
