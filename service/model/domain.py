@@ -59,7 +59,7 @@ _REFEREES_IN_WORDS: Final = {
 _FACES_IN_WORDS: Final = {"drawn": "as dropped", "all": "every stable face"}
 _WANTS_IN_WORDS: Final = {"valid": "valid grasps", "candidates": "all candidates"}
 _SCENES_IN_WORDS: Final = {"free": "free object", "table": "table", "bin": "bin", "shelf": "shelf"}
-SHAKE_NEEDS_A_SCENE: Final = "shake moves what was lifted out of a scene: choose one, such as table"
+SHAKE_NEEDS_A_SCENE: Final = "shake moves an object lifted out of a scene: choose a scene, such as table"
 
 
 def _sparse(default: Any, **facts: Any) -> Any:
@@ -317,10 +317,10 @@ class JobOptions(Model):
         if self.shake and not self.in_scene:
             raise ValueError(SHAKE_NEEDS_A_SCENE)
         if self.method in NETWORK_METHODS and not self.network:
-            raise ValueError(f"method {self.method} needs the option network: the name of one that the service keeps")
+            raise ValueError(f"method {self.method} needs the option network: the name of a network in the service")
         if self.method in NETWORK_METHODS and not has_table(self.place):
             raise ValueError(
-                f"method {self.method} proposes grasps of things on a table: choose scene table or bin, or a document "
+                f"method {self.method} proposes grasps of objects on a table: choose scene table or bin, or a document "
                 "with a level half-space"
             )
 
@@ -330,9 +330,9 @@ class JobOptions(Model):
         if self.models:
             raise ValueError("robust counts verdicts: choose a validator")
         if self.measures_payload:
-            raise ValueError("payload is what the validator sees lifted: choose one")
+            raise ValueError("payload is measured by a validator: choose one")
         if self.shake:
-            raise ValueError("shake is of what the validator sees lifted: choose one")
+            raise ValueError("shake is simulated by a validator: choose one")
 
     @property
     def measures_payload(self) -> bool:
@@ -430,7 +430,7 @@ def check_known(options: JobOptions) -> None:
     if any(one.digest is None for one in options.beside):
         raise ValueError("each neighbour of a stored job has the digest of its files")
     if options.network and not re.fullmatch(DIGEST, options.network):
-        raise ValueError("the network of a stored job is said by the digest of its files")
+        raise ValueError("the network of a stored job has the digest of its files")
 
 
 class Asset(Model):

@@ -174,7 +174,7 @@ class DatasetRecord(Record):
         if len(self.fidelities) != (len(self.jobs) if self.options.fidelity == AUTO else 0):
             raise ValueError("a dataset has a fidelity for each cell if its own is auto, and else none")
         if self.chosen and (len(self.chosen) != len(self.jobs) or max(self.chosen) >= len(self.choices)):
-            raise ValueError("a dataset says of each cell how its fidelity was chosen, or of none")
+            raise ValueError("a dataset has the reasons of chosen fidelities for all cells or for none")
         return self
 
     def cells(self) -> Iterator[Cell]:

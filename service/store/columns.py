@@ -104,7 +104,7 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
             "largest ratio of displacement or rotation to its limit under the pushes; below 1: held",
         ),
         "quality/validated_by": _code(
-            "engine of the verdict `success`: 0 MuJoCo on the CPU, which alone certifies, 1 MuJoCo Warp, the prefilter"
+            "engine of the verdict `success`: 0 MuJoCo on the CPU (the reference), 1 MuJoCo Warp (the prefilter)"
         ),
         "quality/recheck": _flag(
             "verdict under the unmodified DexGraspBench protocol: 1 held, 0 dropped, -1 not rechecked"
