@@ -133,7 +133,8 @@ def settings_of(
 ) -> list[Setting]:
     """Return a setting for every method, fidelity and batch; methods without fidelities have one each.
 
-    Methods with a step budget need seconds per grasp: they get `baseline_batch` grasps per call, others the first batch.
+    Methods with a step budget need seconds per grasp: they get `baseline_batch` grasps per call, others the first
+    batch.
 
     Raises:
         InputError: a method is unknown, or an option belongs to none of them.

@@ -270,7 +270,7 @@ def _scene_head(chart: Row) -> str:
         f"- *{IN_SCENE}*: planned for the scene\n"
         f"- *{FILTERED}*: planned around a free object and placed into the same scenes, grasp i into scene i in "
         "turn; baselines have only this mode\n"
-        "- *clear*: no contact with supports on the approach, while closing and on the lift\n"
+        "- *clear*: no contact with supports or neighbours on the approach, while closing and on the lift\n"
         "- *lifted*: clear, and lifted by MuJoCo (level *lift*); *dexgraspbench*: lifted in DexGraspBench's test; "
         "*half friction*: also lifted at half friction; all are shares of all candidates\n"
         f"- *robust*: mean share of {chart['models']} models around the nominal one in which a lifted grasp is also "

@@ -313,8 +313,13 @@ def test_what_stands_out_in_the_figures_is_told(kitchen: Case) -> None:
     told = "\n".join(findings(card | {"quality": {"allegro": {"robust_share": {"median": 0.625}}}}))
     assert "allegro: half of them hold in at most 62 % of the models around the nominal one" in told
     # two bins of 5 degrees hold 160 of 200; those within 10 degrees of the horizontal, sin(10 deg) of the sphere
-    assert "**Preferred directions**: of all palms over the table, 80 % within 10° of the horizontal (17 % under" in told
-    assert "In 20 % of the pairs that are clear of the table, the palm approaches from 45° or more" in told and "vertical" not in told
+    assert (
+        "**Preferred directions**: of all palms over the table, 80 % within 10° of the horizontal (17 % under" in told
+    )
+    assert (
+        "In 20 % of the pairs that are clear of the table, the palm approaches from 45° or more" in told
+        and "vertical" not in told
+    )
 
 
 def test_a_still_joint_is_told_and_no_flaw_that_is_not_there(kitchen: Case) -> None:
