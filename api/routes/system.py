@@ -112,7 +112,7 @@ Name = Annotated[str, Path(max_length=64, description="its name, or its id")]
 
 @deletion_router.get("/v1/deletions", dependencies=READ)
 def list_deletions(deletions: DeletionsOf) -> list[DeletionView]:
-    """List what can be restored, newest first."""
+    """List deletions that can be undone, newest first."""
     return deletions.recent()
 
 

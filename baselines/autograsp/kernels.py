@@ -21,7 +21,7 @@ class Closing:
     """Closing motion of a hand; D dofs, L bodies."""
 
     direction: wp.array(dtype=wp.float32)  # (D,) -1, 0, +1
-    moves: wp.array2d(dtype=wp.int32)  # (D, L): 1 where the dof moves the body
+    moves: wp.array2d(dtype=wp.int32)  # (D, L): 1 if the dof moves the body
     lever: wp.array2d(dtype=wp.float32)  # (D, L): upper bound on the motion of a body's points per unit of the dof
     finger: wp.array(dtype=wp.int32)  # (D,) group number, equal for dofs that move a common body
     lower: wp.array(dtype=wp.float32)

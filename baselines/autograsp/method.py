@@ -100,7 +100,7 @@ def levers(hand: HandModel, points: SurfacePoints) -> Floats:
 
 
 def finger_groups(moves: NDArray[np.bool_]) -> NDArray[np.int32]:
-    """Return (D,) numbers, equal for dofs that move a common body, from (D, L)."""
+    """Return group numbers (D,), equal for dofs that move a common body; `moves` is (D, L)."""
     group = np.arange(len(moves))
     for d in range(len(moves)):
         for e in range(d):

@@ -93,7 +93,7 @@ class JobRecord(Record):
 
 
 class JobEvent(Record):
-    """A later user action on a job. `retried` maps each failed task to its last attempt to ignore."""
+    """A later user action on a job. `retried` maps each failed task to its last attempt before the retry."""
 
     number: int = Field(ge=1)
     what: Literal["cancelled", "retried"]

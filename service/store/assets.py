@@ -20,7 +20,7 @@ from graspd.service.model.states import AssetKind
 from graspd.service.store.descriptions import MAX_BYTES, parse_description
 
 _EPOCH: Final = (1980, 1, 1, 0, 0, 0)
-#: Creation date of built-in assets, that of the release: repeated publication writes the same manifest.
+#: Creation date of built-in assets: that of the release, so that repeated publication writes the same manifest.
 _BUILTIN_CREATED: Final = "2026-11-21T00:00:00Z"
 MAX_FILES: Final = 2000
 #: zlib's message for lack of memory, to distinguish it from damage.

@@ -61,7 +61,7 @@ class Contents:
     gaps: Mapping[Pair, tuple[int, str]] = field(default_factory=dict)
     """For each cell, number of batches missing in the snapshot, and the reason."""
     root: Path | None = None
-    """Folder of the shards, if they are files."""
+    """Folder of the shards; None for shards in a store."""
 
 
 def contents_of_store(store: Store, dataset: str, snapshot: str | None = None, cache: Path | None = None) -> Contents:

@@ -35,7 +35,7 @@ OPENING_STEP: Final = 0.05
 SLIDING_STEP_M: Final = 0.002
 OPENING_STEPS: Final = 24
 #: A finger may penetrate the rest of the hand by this much more than in the grasp [m]. This is checked at these shares
-#: of its path. A finger that jams opens half as far; after so many checks it does not open.
+#: of its path. A finger that jams opens half as far and is checked again; if the last check fails, it does not open.
 JAM_M: Final = 5e-4
 WAY: Final = (1 / 3, 2 / 3, 1.0)
 JAM_LOOKS: Final = 4
