@@ -1,4 +1,4 @@
-"""HTTP application. It keeps no state between requests that another process would need."""
+"""HTTP application. It has no state between requests that other processes would need."""
 
 from __future__ import annotations
 
@@ -87,8 +87,8 @@ def create_app(settings: Settings, services: Services | None = None) -> FastAPI:
     problems.install(app, problem_page)
     pages.install(app, opened)
     for router in (*_ROUTERS, *map(asset_router, AssetKind), *datasets.routers, *pages.routers):
-        # Add the routes built at import: `include_router` would rebuild them at the first request. It would also
-        # silence warnings for the whole process, which is unsafe if two applications are built at once.
+        # Add the routes built at import: `include_router` would rebuild them at the first request, and would silence
+        # warnings for the whole process, which is unsafe while another application is built.
         app.router.routes.extend(router.routes)
     app.mount("/static", StaticFiles(directory=STATIC), name="static")
     _add_middleware(app, settings, keys, proxy, rates)
@@ -105,7 +105,7 @@ def check_exposure(host: str, keys: KeyFile) -> None:
 
 
 def _add_middleware(app: FastAPI, settings: Settings, keys: KeyFile, proxy: Proxy, rates: Rates) -> None:
-    """Add, from the inside out: body limits, authentication and rates, same-origin check, request ids."""
+    """Add middleware from the inside out: body limits, authentication and rates, same-origin check, request ids."""
     app.add_middleware(Head)
     uploads = frozenset({*(f"/v1/{kind.value}s" for kind in AssetKind), "/submit"})
     app.add_middleware(BodyLimit, upload_paths=uploads, upload_bytes=settings.max_upload_bytes)

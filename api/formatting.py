@@ -44,7 +44,7 @@ def valid_yield(made: Any) -> str:
 
 
 def worker_time(stage: Any) -> str:
-    """Format the time workers spent on a stage for its job; reused results are counted separately."""
+    """Format the worker time of a stage for its job; reused results are counted separately."""
     if not stage.reused:
         return duration(stage.seconds) if stage.seconds else NONE
     if stage.reused == stage.succeeded:
@@ -85,7 +85,7 @@ def minute(value: str | None) -> str:
 
 
 def stamp(value: str) -> str:
-    """Format an RFC 3339 time for readers without JavaScript; the script shows it relative to now."""
+    """Format an RFC 3339 time for readers without JavaScript; the script replaces it by the time relative to now."""
     return datetime.fromisoformat(value).strftime("%Y-%m-%d %H:%M UTC")
 
 
@@ -93,7 +93,7 @@ _PLACES: Final = {"table": "on a table", "bin": "in a bin", "shelf": "on a shelf
 
 
 def place(kind: str) -> str:
-    """Describe where grasps of a kind of scene are used; empty: a free object."""
+    """Describe the kind of scene of grasps; empty: a free object."""
     return _PLACES.get(kind, "")
 
 

@@ -19,7 +19,7 @@ Values = dict[str, dict[tuple[str, ...], float]]
 
 
 class Metrics:
-    """Counts and times the requests of this process; renders them together with a snapshot of the service."""
+    """Counts and durations of this process's requests, rendered together with a snapshot of the service."""
 
     def __init__(self) -> None:
         self.registry = CollectorRegistry()
@@ -42,7 +42,7 @@ class Metrics:
 
 
 class Snapshot:
-    """State of the service at a scrape. Series of a part that does not answer are omitted."""
+    """State of the service at a scrape. Series of parts that do not answer are omitted."""
 
     def __init__(self) -> None:
         self._values: Values = defaultdict(dict)

@@ -1,4 +1,4 @@
-"""Documents that extend those of the index. Times are RFC 3339 in UTC; field names contain units."""
+"""Documents of the API that extend those of the index. Times are RFC 3339 in UTC; field names contain units."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ class JobDetail(Job):
     choice: Choice | None = Field(None, description="how a chart resolved the fidelity auto, if requested")
     note: str | None = Field(None, description="note on the numbers; absent: none")
     outcomes: dict[str, int] = Field(
-        {}, description="rejected candidates by outcome, of a job that found fewer grasps than requested"
+        {}, description="rejected candidates by outcome, of a job that found fewer grasps than wanted"
     )
     rechecked: int = Field(0, description="valid grasps validated again under the unmodified DexGraspBench protocol")
     recheck_held: int = Field(0, description="rechecked grasps that held")
@@ -140,7 +140,7 @@ class Waypoint(BaseModel):
     """One posture on the trajectory of a grasp, in the frame of the object at rest."""
 
     name: str = Field(description="standoff, pregrasp, grasp, squeeze, lift; empty: an intermediate posture")
-    place: float = Field(description="position on a slider: named postures at 0, 1, 2, ..., others evenly between")
+    place: float = Field(description="position on a slider: named postures at 0, 1, 2, ..., others evenly spaced")
     hand_pose: list[float] = Field(description="pose of the root link: x y z [m], quaternion w x y z")
     joint_positions: list[float] = Field(description="joint positions in the order of joint_names [rad or m]")
     carried: list[float] = Field(description="displacement of the object from rest: x y z [m]")
@@ -188,7 +188,7 @@ class GraspDetail(GraspView):
     pushes: list[Push] = Field(description="verdict per direction of push; empty: not validated")
     verdict_margin: float | None = Field(None, description="largest ratio of motion to its limit; below 1: held")
     validated_by: Literal["mujoco", "mujoco_warp"] | None = Field(
-        None, description="engine of the verdict: MuJoCo on the CPU, which certifies, or MuJoCo Warp, the prefilter"
+        None, description="engine of the verdict: MuJoCo on the CPU (the reference) or MuJoCo Warp (the prefilter)"
     )
     recheck: bool | None = Field(
         None, description="verdict under the unmodified DexGraspBench protocol; None: not rechecked"
@@ -229,7 +229,7 @@ class Selection(BaseModel):
     @model_validator(mode="after")
     def _is_one_of_both(self) -> Self:
         if (self.grasps is None) == (self.filter is None):
-            raise ValueError("name the grasps, or give a filter: one of both")
+            raise ValueError("give either names of grasps or a filter")
         return self
 
 

@@ -116,12 +116,12 @@ def describe(error: Exception) -> tuple[str, str, int, str]:
 
 
 def _is_full(error: BaseException | None) -> bool:
-    """Check whether the disk was full. FastAPI turns an error while it reads a body into a bad request."""
+    """Check whether the disk was full: FastAPI reports an error during the reading of a body as a bad request."""
     return isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
 
 
 def plain(text: str) -> str:
-    """Replace lone surrogates: JSON may contain them, UTF-8 cannot encode them."""
+    """Replace lone surrogates, which JSON may contain but UTF-8 cannot encode."""
     return text.encode(errors="replace").decode()
 
 
@@ -183,7 +183,7 @@ def request_id_of(request: Request) -> str | None:
 
 
 def install(app: FastAPI, page: Callable[[Request, dict[str, Any]], Response]) -> None:
-    """Convert every exception to a problem document, or for dashboard addresses in a browser to a `page` of it."""
+    """Convert every exception to a problem document; a browser gets it as a `page` for dashboard addresses."""
 
     def answer_any(request: Request, error: Exception) -> Response:
         if _is_page(request):
@@ -199,7 +199,7 @@ def install(app: FastAPI, page: Callable[[Request, dict[str, Any]], Response]) -
         assert isinstance(error, RequestValidationError)
         return validation_answer(request, error)
 
-    #: Used by the outermost middleware if no handler was reached.
+    #: Handler of the outermost middleware for requests that reached no other handler.
     app.state.answer_error = answer_any
     for kind in (GraspdError, ApiError, HTTPException):
         app.add_exception_handler(kind, any_error)

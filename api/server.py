@@ -1,8 +1,8 @@
-"""Server of the application: one uvicorn in this process, on a socket that is bound first of all.
+"""Server of the application: one uvicorn server in this process, on a socket that is bound first.
 
-uvicorn limits the time between requests, `BodyLimit` that between pieces of a body. Without `TimedProtocol` a
-connection with partial or no headers stays open forever. So does one whose body continues after its answer: nothing
-reads this body, and each byte restarts the time between requests.
+uvicorn limits the time between requests; `BodyLimit` limits the time between pieces of a body. Without `TimedProtocol`
+two kinds of connections would stay open forever: those with partial or no headers, and those whose body continues after
+the response. No code reads such a body, and each of its bytes restarts uvicorn's limit.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from graspd.api.app import create_app
 from graspd.service.model.errors import BusyError, InputError
 from graspd.service.settings import Settings
 
-#: A stop waits at most this long for open event streams, which end only with their clients [s].
+#: Longest wait of a stop for open event streams, which only clients end [s].
 _GRACE_S = 3
 _TOO_SLOW: Final = b"HTTP/1.1 408 Request Timeout\r\nConnection: close\r\nContent-Length: 0\r\n\r\n"
 
@@ -32,7 +32,7 @@ _TOO_SLOW: Final = b"HTTP/1.1 408 Request Timeout\r\nConnection: close\r\nConten
 def bind(host: str, port: int) -> socket.socket:
     """Return a listening socket; BusyError if the port is taken, InputError if it cannot be bound."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    # asyncio disables Nagle's delay only on sockets with an explicit protocol; else each body arrives 40 ms late.
+    # asyncio disables Nagle's algorithm only on sockets with an explicit protocol; otherwise each body is 40 ms late.
     listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
@@ -50,7 +50,7 @@ def serve(settings: Settings) -> None:
     """Answer requests until SIGINT or SIGTERM."""
     listener = bind(settings.host, settings.port)
     with listener:
-        # Spool uploads here, not in /tmp, which may be in memory.
+        # Spool uploads in this folder, because /tmp may be in memory.
         spool = settings.data_dir / "uploads"
         spool.mkdir(parents=True, exist_ok=True)
         tempfile.tempdir = str(spool)
@@ -66,8 +66,8 @@ def configuration(app: ASGIApp, settings: Settings) -> uvicorn.Config:
         app,
         http=TimedProtocol,
         ws="none",
-        # A trusted proxy may claim any client address and so evade limits per address. None is trusted, including
-        # loopback, unless the variable lists it.
+        # A trusted proxy may state any client address and so evade limits per address. No proxy, including loopback,
+        # is trusted unless the variable lists it.
         proxy_headers=bool(os.environ.get("FORWARDED_ALLOW_IPS")),
         log_config=None,
         access_log=False,
@@ -78,11 +78,11 @@ def configuration(app: ASGIApp, settings: Settings) -> uvicorn.Config:
 
 
 class TimedProtocol(H11Protocol):
-    """HTTP/1.1 connection with time limits that trickling bytes do not extend."""
+    """HTTP/1.1 connection with time limits that single bytes do not extend."""
 
     #: Limit from the start of a connection, or the first byte of a later request, to the end of its headers [s].
     headers_s = 20.0
-    #: Limit for the rest of a body after its answer [s]: a client that still sends may read the answer first.
+    #: Time limit for the rest of a body after its response [s]: a client that still sends may read the response first.
     rest_s = 5.0
     _patience: asyncio.TimerHandle | None = None
 

@@ -32,7 +32,7 @@ from graspd.worker.simulation.data import HandState
 
 T = TypeVar("T")
 
-#: Resolution of hand and object for baselines whose source states none.
+#: Resolution of hand and object for baselines whose publication states none.
 GROUND: Final = Fidelity(
     name="peers", coarse_points=400, fine_points=1000, object_points=4000, polish_iterations=0, phong_alpha=0.0
 )
@@ -41,7 +41,7 @@ _lock: Final = threading.Lock()
 
 
 def search_of(make: Callable[..., T], pair: Pair, *options: object) -> T:
-    """Return `make(pair, *options)`, which a method computes once; the most recent ones are cached."""
+    """Return `make(pair, *options)`; the most recent results are cached."""
     key = (make, id(pair), *options)
     with _lock:
         if key not in _searches:
@@ -51,7 +51,7 @@ def search_of(make: Callable[..., T], pair: Pair, *options: object) -> T:
 
 
 def ground_of(hand: HandModel, obj: ObjectModel, device: str, *kernels: ModuleType) -> Pair:
-    """Return the pair on a device; load the caller's kernel modules, which only one thread may do."""
+    """Return the pair on a device; also load the caller's kernel modules, in one thread only."""
     pair = pair_of(hand, obj, GROUND, device)
     with _lock:
         for module in kernels:
@@ -60,7 +60,7 @@ def ground_of(hand: HandModel, obj: ObjectModel, device: str, *kernels: ModuleTy
 
 
 def free_starts(pair: Pair, *, seed: int, batch: int, indices: range) -> HandState:
-    """Sample a free start for each grasp, its palm towards a random surface point (Grasp'D, 2022)."""
+    """Sample a collision-free start for each grasp, with the palm towards a random surface point (Grasp'D, 2022)."""
     return sample_starts(pair.model(pair.coarse), seed=seed, batch=batch, indices=indices, each=1)
 
 
@@ -76,7 +76,7 @@ def joined(states: list[HandState]) -> HandState:
 
 
 def grasp_set(pair: Pair, state: HandState, began: float, info: dict[str, object]) -> GraspSet:
-    """Return hands as grasps with their postures; `began` is the planner's start by `time.perf_counter`."""
+    """Return hands as grasps with all postures; `began` is the planner's start time by `time.perf_counter`."""
     hand, obj, device = pair.hand.model, pair.fine.obj.model, pair.hand.device
     seconds = time.perf_counter() - began
     grasp = posture_of(hand, obj, state)
@@ -84,14 +84,15 @@ def grasp_set(pair: Pair, state: HandState, began: float, info: dict[str, object
     return GraspSet(grasp, opened, pressed, np.full(len(grasp), np.nan), seconds=seconds, info=info)
 
 
-#: Inner side: when the fingers close, the surface moves within 45 degrees of its normal; on the palm it faces ahead.
+#: Inner side: surface that moves within 45 degrees of its normal when the fingers close; on the palm, surface that
+#: faces along the approach.
 INSIDE_COS: Final = 0.7
 SAMPLES: Final = 1200
 STEP: Final = 1e-4
 
 
 def inside_points(hand: HandModel, *, each: int, on_palm: int) -> SurfacePoints:
-    """Return well-spread points: at most `each` per closing link, `on_palm` on the palm, none elsewhere."""
+    """Return evenly spread points on the inner side: at most `each` per closing link, `on_palm` on the palm."""
     points = sample_surface(hand, SAMPLES)
     inside = _inside(hand, points)
     chosen: list[NDArray[np.intp]] = []

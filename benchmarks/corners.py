@@ -38,9 +38,9 @@ WALL: Final = (0.02, 0.15)
 HEAD = """# Lifts beside walls and among neighbours
 
 `python -m benchmarks.corners DATA`: shares of {grasps} candidates on a box of 50 x 60 x 80 mm that are clear of
-what stands around, that lift, and that lift at half the friction, by the gap; seed {seed}, density 700 kg/m3. Slot:
-walls on both sides along x, as high as the box; neighbours: boxes of the same size on all four sides. Nothing lifts out
-of gaps narrower than a fingertip (Allegro 24 mm, Barrett 19 mm, Shadow 15 mm) on every axis.
+obstacles, that lift, and that lift at half friction, by the gap; seed {seed}, density 700 kg/m3. Slot:
+walls on both sides along x, as high as the box; neighbours: boxes of the same size on all four sides. No grasp lifts
+out of gaps narrower than a fingertip (Allegro 24 mm, Barrett 19 mm, Shadow 15 mm) on every axis.
 
 """
 

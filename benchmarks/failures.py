@@ -1,7 +1,7 @@
-"""The failures that are left: the worst objects of each hand, what became of their grasps, and pictures of some.
+"""Remaining failures: the worst objects of each hand, outcomes of their grasps, and pictures of some.
 
 usage: python -m benchmarks.failures DATA_DIR [--work DIR] [--hands allegro ...] [--objects NAME ...] [--out FOLDER]
-DATA_DIR holds hands/ and objects/. Raw standard grasps are validated at level certificate; stopped runs go on
+DATA_DIR holds hands/ and objects/. Candidates at fidelity standard are validated at level standard; stopped runs go on
 (cells.py). Writes failures.md, failures.json and a picture for each of the worst objects under `--out`/failures.
 """
 
@@ -92,14 +92,14 @@ def why(found: dict[str, Any]) -> str:
         )
     for name, text, unit, digits in (
         ("residual", "contact forces that do not balance at μ = 0.3, residual", "", 3),
-        ("uneven_mm", "fingers that touch one after another, apart by", " mm", 1),
+        ("uneven_mm", "fingers that touch one after another, distance between first and last", " mm", 1),
     ):
         values = np.array(found[name])
         if held.any() and np.median(values[lost]) > 1.5 * np.median(values[held]) + 1e-3:
             said.append(
                 f"{text} {_median(values[lost], digits)}{unit} ({_median(values[held], digits)} where it holds)"
             )
-    return "; ".join(said) or "none of the figures tells the lost ones from those that hold"
+    return "; ".join(said) or "no figure distinguishes failed from held grasps"
 
 
 def _median(values: NDArray[np.float64], digits: int) -> str:
@@ -132,12 +132,12 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("docs/results"))
     args = parser.parse_args()
     lines = [
-        "# The failures left\n",
-        f"Raw `standard` grasps, seed {SEED}, {args.grasps} on each object, validated at level `standard` (revision "
-        f"{STAGE_REVISIONS['synthesize']} of synthesize). Of each hand up to {WORST} objects on which most are lost, "
-        f"of {len(args.objects or []) or 'all'} objects. Made by `python -m benchmarks.failures DATA --objects ...`; a "
-        "margin is the worst motion over its limit. The pictures show the moment of contact: up to three that fail, "
-        "then one that holds. What is said of a pair are medians over its lost grasps.\n",
+        "# Remaining failures\n",
+        f"{args.grasps} candidates on each object at fidelity `standard`, seed {SEED}, validated at level `standard` "
+        f"(revision {STAGE_REVISIONS['synthesize']} of synthesize). For each hand the up to {WORST} objects with most "
+        f"failures, of {len(args.objects or []) or 'all'} objects. Made by `python -m benchmarks.failures DATA "
+        "--objects ...`. A margin is the worst motion over its limit. The pictures show the moment of contact: up to "
+        "three grasps that fail, then one that holds. Figures of a pair are medians over its failed grasps.\n",
     ]
     told: list[dict[str, Any]] = []
     drawn: set[Path] = set()

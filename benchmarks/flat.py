@@ -28,10 +28,10 @@ DENSITY: Final = 700.0
 BOXES: Final = (
     (60, 60, 5), (60, 60, 10), (60, 60, 15), (60, 60, 20), (100, 20, 5), (100, 20, 10), (100, 20, 20),
 )  # fmt: skip
-HEAD = """# Table lifts of flat and thin things
+HEAD = """# Table lifts of flat and thin objects
 
 `python -m benchmarks.flat DATA`: shares of candidates that are clear of the table, that lift, and that lift at half
-the friction. {grasps} candidates a pair, {scenes} scenes, seed {seed}, density 700 kg/m3. Boxes are named by their
+the friction. {grasps} candidates per pair, {scenes} scenes, seed {seed}, density 700 kg/m3. Boxes are named by their
 extents in mm; the screwdriver has a handle of 28 x 100 mm and a shaft of 6 x 100 mm.
 
 """
@@ -64,7 +64,7 @@ def main() -> None:
     parser.add_argument("--page", type=Path, help="file for the table in Markdown")
     parser.add_argument("--keep", type=Path, help="folder for the grasps")
     given = parser.parse_args()
-    rows = ["| hand | thing | clear | lift | half friction |", "|---|---|---|---|---|"]
+    rows = ["| hand | object | clear | lift | half friction |", "|---|---|---|---|---|"]
     with tempfile.TemporaryDirectory() as folder:
         for hand in given.hands:
             for name in given.things:

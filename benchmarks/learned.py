@@ -50,7 +50,7 @@ TITLES = {
     "method": "method",
     "found": "first found",
     "first": "CPU s to the first",
-    "valid": "valid of tried",
+    "valid": "valid share of candidates",
     "rate": "valid per CPU s",
     "gain": "rate over fast_graspd",
 }
@@ -122,12 +122,12 @@ def page(rows: Sequence[dict[str, Any]], networks: dict[str, str], command: str)
     lines = [
         "# Seeds from a network",
         "",
-        f"graspd {PACKAGE_VERSION}, `{command}`: a table, {FIDELITY.name} fidelity, certified, one thread. The first: "
-        f"processor time until one grasp is valid, the median over {seeds} seeds, those included that gave up after "
-        f"{BUDGET:g} tries. Valid of tried and the rate: one batch of {many}. Planning, verdicts and metrics count; "
-        "loading does not.",
+        f"graspd {PACKAGE_VERSION}, `{command}`: a table, {FIDELITY.name} fidelity, validated by lifts, one thread. "
+        f"CPU s to the first: processor time until one grasp is valid, median over {seeds} seeds, including those that "
+        f"stopped after {BUDGET:g} candidates. Valid share and rate: one batch of {many}. Times include planning, "
+        "validation and metrics, but not loading.",
         "",
-        *(f"- `{digest}`: {about or 'says nothing of itself'}" for digest, about in networks.items()),
+        *(f"- `{digest}`: {about or 'no description'}" for digest, about in networks.items()),
         "",
         table(rows),
         "",

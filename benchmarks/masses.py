@@ -24,8 +24,8 @@ from graspd.worker.files.synthesis import SynthesisResult, synthesized
 SEED = 1200
 HEAD = """# Table lifts of objects with their own masses
 
-`python -m benchmarks.masses DATA`: shares of candidates that lift an object of its published mass off a table, and
-that do at half the friction, beside the same for 0.1 kg. {grasps} candidates a pair, {scenes} scenes, seed {seed}.
+`python -m benchmarks.masses DATA`: shares of candidates that lift an object of its published mass off a table, at
+full and at half friction, and the same shares for 0.1 kg. {grasps} candidates per pair, {scenes} scenes, seed {seed}.
 
 """
 

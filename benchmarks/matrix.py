@@ -204,14 +204,14 @@ def page(found: DatasetView, cells: list[CellView], facts: dict[str, str], optio
         f"`python -m benchmarks.matrix DATA --data-dir DIR --out docs/results/matrix.md`, {options}",
         "",
         f"graspd {PACKAGE_VERSION}, {platform.machine()}, {available_cores()} CPU cores, {found.created[:10]}. URDFs",
-        "and meshes went in as they are, without an option. Every process was killed with -9 in the middle; then the",
-        "same commands went on.",
+        "and meshes were used unchanged, without options. Every process was killed with -9 in the middle; then the",
+        "same commands resumed the work.",
         "",
         "| what | |",
         "| --- | --- |",
         *(f"| {name} | {value} |" for name, value in facts.items()),
         "",
-        "Each cell: valid grasps of those asked for, valid share of candidates, seconds of a worker per valid grasp.",
+        "Each cell: valid grasps of those wanted, valid share of candidates, worker seconds per valid grasp.",
         "",
         f"| object | {' | '.join(found.hands)} |",
         "| --- " * (len(found.hands) + 1) + "|",
@@ -222,7 +222,7 @@ def page(found: DatasetView, cells: list[CellView], facts: dict[str, str], optio
     failed = [cell for cell in cells if cell.reason]
     lines += ["", *(f"- {cell.hand} on {cell.object} failed: {cell.reason}" for cell in failed)]
     if missing := [cell for cell in cells if not cell.state.is_final]:
-        lines += ["", f"{len(missing)} of {len(cells)} cells were still to be done when this page was written."]
+        lines += ["", f"{len(missing)} of {len(cells)} cells were unfinished when this page was written."]
     return "\n".join(lines).rstrip() + "\n"
 
 

@@ -112,9 +112,9 @@ def page(result: dict[str, Any]) -> str:
         f"    {result['command']}",
         "",
         f"{result['date']}: {result['device']}, {result['cores']} cores, {result['versions']}. Fidelity *standard*, "
-        f"seed {SEED}. Wall milliseconds for one grasp of a launch on {result['hands_object']}, by one process, then "
-        f"validation and metrics on the CPU, of at most {VALIDATED} grasps. *Moved*: how far a hand lies from where "
-        "the same launch put it before.",
+        f"seed {SEED}. Wall milliseconds per grasp of a launch on {result['hands_object']}, in one process, then "
+        f"of validation and metrics on the CPU for at most {VALIDATED} grasps. *Moved*: distance between the hands of "
+        "two equal launches.",
         "",
         "| hand | a launch | planner ms | postures ms | candidates/s | validate ms | table ms | hold | moved mm |",
         "| --- | --: | --: | --: | --: | --: | --: | --: | --: |",
@@ -128,8 +128,8 @@ def page(result: dict[str, Any]) -> str:
             )
     lines += [
         "",
-        "The grasps are as good as the CPU's: GPU / CPU of the same seeds, validated and measured by the same code "
-        f"({result['grasps']} grasps of a pair; a share is good to {1.96 * (0.25 / result['grasps']) ** 0.5:.2f}).",
+        "Quality of grasps on GPU / CPU for equal seeds, validated and measured by the same code "
+        f"({result['grasps']} grasps per pair; a share has an error of {1.96 * (0.25 / result['grasps']) ** 0.5:.2f}).",
         "",
         "| hand | object | hold | ε | depth mm | contact cm² |",
         "| --- | --- | --: | --: | --: | --: |",

@@ -43,12 +43,12 @@ SEED: Final = 1500
 #: Sums of normal forces [N].
 FORCES_N: Final = (100.0, 200.0, 400.0, 1000.0)
 OBJECTS: Final = ("005_tomato_soup_can", "006_mustard_bottle", "025_mug", "061_foam_brick")
-HEAD: Final = """# Payload of grasps: error and price
+HEAD: Final = """# Payload of grasps: error and cost
 
-`python -m benchmarks.payload DATA{option}`: the payload of valid grasps over that by whole tests of each mass, and CPU
-time a grasp of both. The last column is of the pair where it is least: the largest load capacity of its grasps over
-the largest payload of them, squeezed as planned and with 100 to 1000 N. {grasps} grasps wanted a pair, {objects},
-seed {seed}.
+`python -m benchmarks.payload DATA{option}`: ratio of the payload of valid grasps to the payload by full tests of each
+mass, and CPU time per grasp of both. Last column, smallest value over the pairs: largest load capacity of a pair's
+grasps over their largest payload, squeezed as planned and with 100 to 1000 N. {grasps} grasps wanted per pair,
+{objects}, seed {seed}.
 
 """
 Floats = NDArray[np.float64]

@@ -1,4 +1,4 @@
-"""What certificate and quality table take with threads and with processes; prints Markdown.
+"""Cost of validation and quality table with threads and with processes; prints Markdown.
 
 usage: python -m benchmarks.processes DATA_DIR [--grasps 256] [--hand allegro] [--object mug] [--ways 1t 2t 2p]
 

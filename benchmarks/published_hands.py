@@ -137,12 +137,13 @@ def page(done: dict[str, Any]) -> str:
     grasps = next(iter(done.values()))["grasps"]
     earlier = sum(not row["key"].endswith(f"-{REVISIONS}") for row in done.values())
     return (
-        "# Published hands: the self-test's verdict, and what they lift\n\n"
-        "`python -m benchmarks.published_hands DIR --data DATA`: for each hand as published its self-test (*free* "
-        "and *table*: the shares that hold and that lift), and beside it the share of candidates that lift an object "
-        f"off a table, {grasps} of each object, standard fidelity, seed {SEED}. *Too wide*: the hand opens to less "
-        f"than {FITTING:.0%} of the pairs of opposite places. The verdict agrees where a hand is "
-        f"ready and lifts {TABLE_READY:.0%} or more, or neither: {agreeing} of {len(done)} do. Of earlier "
+        "# Published hands: self-test and lifts\n\n"
+        "`python -m benchmarks.published_hands DIR --data DATA`: self-test of each hand as published (*free* "
+        "and *table*: shares that hold and that lift), and share of candidates that lift each object "
+        f"off a table, {grasps} candidates per object, standard fidelity, seed {SEED}. *Too wide*: the hand opens "
+        "wide enough "
+        f"for less than {FITTING:.0%} of the antipodal pairs. The verdict agrees if a hand is "
+        f"ready and lifts {TABLE_READY:.0%} or more, or neither: {agreeing} of {len(done)} agree. Of earlier "
         f"revisions than today's: {earlier} rows (their keys are in the JSON).\n\n"
         f"| hand | from | dofs | verdict | free | table | {' | '.join(OBJECTS)} | mean | agrees | self-test [s] |\n"
         f"| --- | --- | --: | --- | --: | --: | {'--: | ' * len(OBJECTS)}--: | --- | --: |\n" + "\n".join(rows) + "\n"

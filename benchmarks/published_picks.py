@@ -348,9 +348,9 @@ def markdown(
             f"{one['fails_both']}, {one['fails_here_alone']} | {one['p_against_constant']:.2g} | {area} |"
         )
     lines.append(
-        f"\n{rows[0]['n']} picks. p: that a test which knows nothing would differ from the constant as luckily "
-        "(McNemar, exact, both sides). "
-        "AUC: chance that a picked grasp moves less in the test than one that was not; "
+        f"\n{rows[0]['n']} picks. p: probability that an uninformative test differs this much from the constant "
+        "answer (McNemar, exact, "
+        "two-sided). AUC: probability that a picked grasp moves less in the test than one not picked; "
         + ", ".join(f"{name} {value:.2f}" for name, value in auc.items())
         + ".\n"
     )
@@ -359,7 +359,7 @@ def markdown(
         f"| {one['object']} | {one['n']} | {one['picked']:.2f} | {' | '.join(f'{one[words]:.2f}' for words in SHOWN)} |"
         for one in objects
     ]
-    lines.append("\nHolds that are none, validated by the six pushes:\n")
+    lines.append("\nNegative controls (postures that cannot hold), validated by the six pushes:\n")
     for name, one in nothing.items():
         why = ", ".join(f"{count} {reason}" for reason, count in one["reasons"].items())
         lines.append(f"- {name}: {one['held']} of {one['n']} hold; {why}.")

@@ -155,7 +155,7 @@ def markdown(hand: str, rows: list[dict[str, Any]], total: dict[str, Any], comma
             f"# Quality of {hand.capitalize()} grasps",
             "",
             f"graspd {PACKAGE_VERSION}, `{command}`: {rows[0]['n']} candidates on each of {len(rows)} objects, "
-            f"real URDF, standard fidelity, seed {SEED}. Validator: MuJoCo, DexGraspBench protocol, level *letter*.",
+            f"real URDF, standard fidelity, seed {SEED}. Validator: MuJoCo, level *dexgraspbench*.",
             "",
             f"**GSR {total['gsr']:.3f}, hard {total['gsr_hard']:.3f}; OSR {total['osr']:.2f}, hard "
             f"{total['osr_hard']:.2f}; {total['sgs']:.1f} holding grasps per second of two cores, "
@@ -166,7 +166,7 @@ def markdown(hand: str, rows: list[dict[str, Any]], total: dict[str, Any], comma
             "| --- |" + " --: |" * len(PRINTED),
             *body,
             "",
-            f"GSR: share that holds, normal and at half the friction. robust: share of {ROBUST_MODELS} models around "
+            f"GSR: share that holds, at full and at half friction. robust: share of {ROBUST_MODELS} models around "
             "the "
             "nominal one in which a valid grasp holds, on average. SGS: holding grasps per second, "
             "made and validated (*standard*), seconds being CPU time over two cores. PD, SPD: penetration, "

@@ -129,14 +129,13 @@ def page(done: list[dict[str, Any]], objects: list[str], draws: int) -> str:
     hands = [one["hand"] for one in done]
     held = ", ".join(f"{one['hand']} {one['held']}" for one in done)
     lines = [
-        "# How far a verdict can be trusted",
+        "# Robustness of verdicts",
         "",
         f"Made by `python -m benchmarks.robust`. Standard candidates on {', '.join(objects)}, "
         f"{done[0]['candidates'] // len(objects)} on each; those that hold in the nominal model ({held}) "
-        f"were validated again in models that differ in one thing, {draws} draws of each for every grasp "
-        "(collision shapes and couplings: each kind once). A hundred percent would be a verdict that no such "
-        "difference moves. Cells: share "
-        "that still holds, 95 % interval of Wilson taken as if all verdicts were independent.",
+        f"were validated again in models with one difference, {draws} draws of each difference per grasp "
+        "(collision shapes and couplings: each kind once). Cells: share that still holds, with the 95 % interval of "
+        "Wilson as for independent verdicts.",
         "",
         f"| what differs | {' | '.join(hands)} |",
         f"| --- |{' --- |' * len(hands)}",
@@ -146,9 +145,8 @@ def page(done: list[dict[str, Any]], objects: list[str], draws: int) -> str:
     lines += [f"| {name} | {' | '.join(_cell(one['rows'].get(name)) for one in done)} |" for name in names]
     lines += [
         "",
-        f"As `--robust` validates: {ROBUST_MODELS} models a grasp, each along one axis, axes in random order. "
-        "*First "
-        "lost to*: what differed in the first model in which a grasp failed, of those that failed in any.",
+        f"Validation as by `--robust`: {ROBUST_MODELS} models per grasp, each along one axis, axes in random order. "
+        "*First failure*: difference of the first model in which a grasp failed.",
         "",
         "| | " + " | ".join(hands) + " |",
         f"| --- |{' --- |' * len(hands)}",
@@ -158,16 +156,18 @@ def page(done: list[dict[str, Any]], objects: list[str], draws: int) -> str:
         cells_ = [_cell([one["reached"][f"{wanted:g}"], one["held"]]) for one in done]
         lines.append(f"| share ≥ {wanted:g} | {' | '.join(cells_)} |")
     lines += [
-        "| first lost to | "
+        "| first failure | "
         + " | ".join(", ".join(f"{name} {n}" for name, n in list(one["weakest"].items())[:4]) for one in done)
         + " |",
-        "| core-ms a candidate, nominal verdict | " + " | ".join(f"{one['nominal_cpu_ms']:.0f}" for one in done) + " |",
+        "| core-ms per candidate, nominal verdict | "
+        + " | ".join(f"{one['nominal_cpu_ms']:.0f}" for one in done)
+        + " |",
     ]
     for wanted in ("0", *(f"{share:g}" for share in SHARES)):
-        what = "all models" if wanted == "0" else f"until {wanted} is sure"
+        what = "all models" if wanted == "0" else f"until {wanted} is decided"
         each = " | ".join(f"{one['cpu_ms'][wanted]:.0f} ({one['validated'][wanted]:.1f} models)" for one in done)
-        lines.append(f"| core-ms a grasp that holds, {what} | {each} |")
-    return "\n".join([*lines, "", "CPU time beside other programs: good to some ten percent.", ""])
+        lines.append(f"| core-ms per held grasp, {what} | {each} |")
+    return "\n".join([*lines, "", "CPU time was measured under other load; its error is about 10 %.", ""])
 
 
 def _cell(counts: list[int] | None) -> str:

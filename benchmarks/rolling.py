@@ -30,9 +30,9 @@ from graspd.worker.validation.model import FRICTION, MujocoOptions, add_object
 SEED, DROPS, SECONDS = 5, 64, 0.8
 HEAD: Final = """# Rest poses that roll or topple
 
-`python -m benchmarks.rolling DATA`: per object the resting faces that {drops} drops end on, the largest turn that 1 mm
-of change of the surface allows by geometry, whether they are kept or why not, and the largest turn in simulation with
-the object's own convex pieces and with {variants} changes of them by up to 1 mm.
+`python -m benchmarks.rolling DATA`: for each object its resting faces in {drops} drops; the largest rotation that a
+change of the surface by 1 mm allows by geometry; whether the face is used, or the reason why not; and the largest
+rotation in simulation, with the object's own convex pieces and with {variants} changes of these by up to 1 mm.
 
 """
 

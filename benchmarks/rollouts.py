@@ -1,9 +1,9 @@
-"""What it changes that hands are tried before one is taken: free candidates chosen by merit alone, and by the trial.
+"""Effect of rollouts: candidates around free objects selected by merit alone, and by rollouts.
 
 usage: python -m benchmarks.rollouts DATA --work WORK --out FOLDER [--hands ...] [--objects ...] [--grasps 8]
 
-Both ways of a pair are made in one run; times are processor time of one thread, those of planning with the postures
-and, where hands are tried, the trials. DATA holds hands/ and objects/. A pair that WORK knows is not made again.
+Both selections of a pair are measured in one run. Times are processor time of one thread for planning, postures and, if
+used, rollouts. DATA holds hands/ and objects/. Pairs with results in WORK are not repeated.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from graspd.worker.validation.validator import validate
 #: Neither a seed that any setting was chosen with.
 SEED, WARM_SEED = 2027, 1
 FIDELITY = FIDELITIES["standard"]
-WAYS: Final = {"merit": "by merit", "rollout": "tried"}
+WAYS: Final = {"merit": "by merit", "rollout": "by rollout"}
 #: Friction and threshold of ε as in the paper's table 2; its best ten are a third of these at most.
 FRICTION, THRESHOLD_M = 1.0, 0.005
 ONE = ExecutionContext(threads=1)
@@ -82,14 +82,14 @@ def row(hand: str, way: str, pairs: list[dict[str, Any]]) -> str:
 def page(done: dict[str, dict[str, dict[str, Any]]], count: int) -> str:
     titles = (
         "hand",
-        "hands chosen",
+        "selection",
         "GSR",
         "worst object",
         "hard",
         "planner ms",
         "validator ms",
-        "ms a valid grasp",
-        "ms a hard one",
+        "ms per held grasp",
+        "ms per hard one",
         "PD mm",
         "CA cm²",
         "ε",
@@ -97,13 +97,13 @@ def page(done: dict[str, dict[str, dict[str, Any]]], count: int) -> str:
     objects = len(next(iter(done.values())))
     return "\n".join(
         [
-            "# Hands that are tried",
+            "# Candidates selected by rollouts",
             "",
             f"`python -m benchmarks.rollouts DATA --out docs/results`: {count} candidates of each hand on each "
-            f"of {objects} objects, seed {SEED}, free, validated at level standard, both ways in one run. *By merit*: "
-            "the hand whose contacts balance best; *tried*: the first that holds in a short test. *hard*: holds at "
-            "half the friction, too. Times are core-ms of a candidate, then of one that holds. PD: median of objects' "
-            "medians; CA and ε: means of the best third by ε.",
+            f"of {objects} objects, seed {SEED}, free, validated at level standard, both selections in one run. "
+            "*By merit*: the hand with the best contact balance; *by rollout*: the first that holds in a short test. "
+            "*hard*: also holds at half friction. Times are core-ms per candidate, then per held candidate. PD: median "
+            "of objects' medians; CA and ε: means of the best third by ε.",
             "",
             f"| {' | '.join(titles)} |",
             f"| --- | --- |{' --: |' * (len(titles) - 2)}",

@@ -55,16 +55,16 @@ TITLES = {
     "count": "grasps",
     "faces": "faces",
     "clear_contact": "clear at contact",
-    "clear_way": "clear on the way",
-    "pushes_of_clear": "of these six pushes",
-    "dexgraspbench": "letter, clear",
+    "clear_way": "clear trajectory",
+    "pushes_of_clear": "held in six pushes, of clear",
+    "dexgraspbench": "dexgraspbench, clear",
     "lift": "lift",
     "hard": "lift, half friction",
-    "faces_held": "faces with one",
+    "faces_held": "faces with a lift",
     "reach": "faces in reach",
-    "reach_held": "of these with one",
+    "reach_held": "with a lift, of faces in reach",
     "filter_lift": "free, filtered: lift",
-    "price": "CPU over free",
+    "price": "CPU time over free",
     "gain": "valid/s over filtered",
     "of_free": "valid/s over free valid/s",
 }
@@ -189,10 +189,10 @@ def page(results: dict[str, list[dict[str, Any]]]) -> str:
         "# Grasps planned in scenes",
         "",
         f"graspd {PACKAGE_VERSION}, `{COMMAND}`: real URDFs, {FIDELITY.name} fidelity, seed {SEED}; a table, each "
-        "stable resting face that at least 3 % of drops end on. Shares are of all candidates unless it says otherwise; "
-        "seconds are CPU time of planning. A face is in reach if two points of the object that look away from each "
-        "other lie 4 mm clear of the table, less than 30 degrees from level, and no farther apart than the hand's "
-        "opposed fingers open. Where no filtered grasp lifts, the gain is counted as if one had: it is more.",
+        "stable resting face that at least 3 % of drops end on. Shares are of all candidates unless stated otherwise; "
+        "seconds are CPU time of planning. A face is in reach if the object then has an antipodal pair of points 4 mm "
+        "clear of the table, less than 30 degrees from level, and no wider than the hand's opposed fingers open. If "
+        "no filtered grasp lifts, the gain is a lower bound, computed with one lifted grasp.",
     ]
     for name, rows in results.items():
         lines += ["", f"## {name}", "", table(rows)]
@@ -206,9 +206,10 @@ def page(results: dict[str, list[dict[str, Any]]]) -> str:
     free_seconds = sum(row["free_seconds"] * row["filter_count"] for row in every)
     lines += [
         "",
-        f"Planned in their scenes {lifted} of {raw} grasps lift, {lifted / seconds:.2f} a second; planned free and "
-        f"filtered {filtered} of {sum(row['filter_count'] for row in every)}, {filtered / free_seconds:.3f} a second: "
-        f"{lifted / seconds * free_seconds / max(filtered, 1):.0f} times as many.",
+        f"Of grasps planned in their scenes, {lifted} of {raw} lift, {lifted / seconds:.2f} per second. Of free "
+        "grasps, "
+        f"filtered, {filtered} of {sum(row['filter_count'] for row in every)} lift, {filtered / free_seconds:.3f} per "
+        f"second. The ratio is {lifted / seconds * free_seconds / max(filtered, 1):.0f}.",
     ]
     return "\n".join(
         [*lines, "", "## All pairs", "", *table(every).splitlines()[:2], table(every).splitlines()[-1], ""]

@@ -38,9 +38,9 @@ SCENES: Final = 4
 SEEDS: Final = (11, 3)  # of the scenes, of the grasps
 COUNTS: Final = ("grasps", "clear", "contact", "closing", "lift", "coming")
 COLUMNS: Final = ("hand", "object", "scene", "beside", *COUNTS)
-ABOUT: Final = """Raw `draft` grasps of the built-in hands. *Beside*: neighbours in the scene. *Clear*: 2 mm from
-everything all the way. The others come too near to something at contact, while they close, in their lift, or only as
-they come in, straight over 10 cm: what an approach that bends could save at most."""
+ABOUT: Final = """Candidates of the built-in hands at fidelity `draft`. *Beside*: neighbours in the scene. *Clear*: at
+least 2 mm from all obstacles on the whole trajectory. Other grasps are too close to an obstacle at contact, while
+closing, on the lift, or only on the straight approach of 10 cm; a curved approach could save at most the last ones."""
 
 
 def blocked(way: Trajectory) -> dict[str, int]:

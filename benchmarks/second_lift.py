@@ -31,9 +31,9 @@ from graspd.worker.hands.model import HandModel, JointType
 SEED: Final = 1400
 HEAD: Final = """# A second lift of valid grasps
 
-`python -m benchmarks.second_lift DATA`: of grasps that are valid for objects of their published masses on a table,
-those that another lift test lifts as well: real gravity, MuJoCo's default contacts at 1 ms, other convex pieces, a
-stiff slide, 1 s up and 2 s of hold at friction 0.6. {grasps} grasps wanted a pair, {scenes} scenes, seed {seed}.
+`python -m benchmarks.second_lift DATA`: share of the grasps valid for objects of published mass on a table that
+also lift in another test: real gravity, MuJoCo's default contacts at 1 ms, other convex pieces, a
+stiff slide, 1 s up and 2 s of hold at friction 0.6. {grasps} grasps wanted per pair, {scenes} scenes, seed {seed}.
 
 """
 FRICTION: Final = "0.6 0.01 0.0001"

@@ -74,7 +74,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
     sys.stdout.write(
-        "| hand | level | n | held | agreement (95 %) | false accepts, rejects | CPU ms per raw | certified/s |\n"
+        "| hand | level | n | held | agreement (95 %) | false accepts, rejects | CPU ms per candidate | valid/s |\n"
         "| --- | --- | --: | --: | --: | --: | --: | --: |\n"
     )
     done = []

@@ -1,6 +1,6 @@
 """Throughput of the planner over fidelities, batches, threads, hand points and object faces: table, JSON and plot.
 
-An iteration is timed launch by launch, a batch in kernels and on the host.
+Iterations are timed launch by launch, batches by kernel time and host time.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from graspd.worker.simulation.launches import kernel_seconds
 from graspd.worker.simulation.model import Model
 from graspd.worker.simulation.record import record_iteration
 
-#: Largest number of grasps per launch for which host time is reported.
+#: Most grasps per launch for which host time is reported.
 LARGE: Final = 1024
 
 
@@ -52,12 +52,12 @@ def bench(
 ) -> dict[str, Any]:
     """Run each fidelity x batch x joins x threads once; `say` receives a line per run.
 
-    `load` loads the object at a fidelity's simplification error bound [m]; `joins` are batches in one launch. Of
-    `repeats` timed calls after an untimed one the median is reported. A GPU ignores `threads`.
+    `load` loads the object at a fidelity's simplification error bound [m]; `joins` are numbers of batches per launch.
+    The median of `repeats` timed calls is reported, after an untimed call. A GPU ignores `threads`.
 
     Returns:
         `device`, `runs[]` with the keys of the command line's contract, `start` with cold and warm seconds,
-        `host_ms_per_grasp` (None on a GPU, where waiting threads spin), `kernels`.
+        `host_ms_per_grasp` (None on a GPU, where waiting threads are busy), `kernels`.
     """
     first = fidelities[0]
     nominal = load(first.face_error_m)
@@ -139,12 +139,12 @@ def _peak_memory_mb(device: str) -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
-#: Timed iterations, launch by launch, from the middle of a phase.
+#: Number of iterations that are timed launch by launch, in the middle of a phase.
 SAMPLED: Final = 12
 
 
 def kernel_shares(pair: Pair, fidelity: Fidelity, count: int) -> dict[str, Any]:
-    """Return ms per iteration of both phases, shares of kernels, and closest-point queries per second.
+    """Return ms per iteration of each phase, time shares of kernels, and closest-point queries per second.
 
     `count` grasps are planned at once, on one thread.
     """
@@ -174,7 +174,7 @@ def kernel_shares(pair: Pair, fidelity: Fidelity, count: int) -> dict[str, Any]:
 def _iterations_used(
     model: Model, data: Data, state: HandState, schedule: Schedule, fidelity: Fidelity, phase: str
 ) -> float:
-    """Return the mean iterations until a hand is switched off; the coarse phase always runs to its end."""
+    """Return the mean number of iterations until a hand stops; the coarse phase always runs to its end."""
     if phase == "coarse" or not fidelity.patience:
         return float(len(schedule))
     data.set_schedule(schedule)
@@ -190,7 +190,7 @@ def _iterations_used(
 def _timed(
     model: Model, data: Data, state: HandState, schedule: Schedule, fidelity: Fidelity
 ) -> tuple[dict[str, float], HandState]:
-    """Return kernel seconds per iteration, medians over `SAMPLED` iterations mid-schedule."""
+    """Return kernel seconds per iteration, medians over `SAMPLED` iterations in the middle of the schedule."""
     data.set_schedule(schedule)
     data.set_state(state)
     launches = record_iteration(model, data, fidelity.optimizer)
@@ -210,10 +210,10 @@ def _timed(
 
 
 def host_ms(hand: HandModel, obj: ObjectModel, fidelity: Fidelity, count: int) -> float:
-    """Return host time per candidate on the CPU [ms]: one thread outside the planner's kernels.
+    """Return host time per candidate on the CPU [ms]: time of one thread outside the planner's kernels.
 
-    It includes starts, merits, projection, the postures around the grasp, copies and launches. An earlier batch of
-    `count` grasps warms up caches.
+    It includes starts, merits, projection, the postures around the grasp, copies and launches. A first batch of
+    `count` grasps fills the caches.
     """
     run = ExecutionContext("cpu", threads=1)
     plan(hand, obj, PlanRequest(count, fidelity, seed=1), run)
@@ -230,7 +230,7 @@ def device_name(device: str) -> str:
 
 
 def clock_of(device: str) -> Callable[[], float]:
-    """Return core-seconds of all threads on a CPU (nearly independent of load), wall clock on a GPU."""
+    """Return a clock: core-seconds of all threads on a CPU (nearly independent of load), wall clock on a GPU."""
     return time.process_time if device == "cpu" else time.perf_counter
 
 

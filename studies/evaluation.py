@@ -37,9 +37,9 @@ from graspd.worker.validation.validator import Verdicts, validate
 
 Protocol = Literal["dexgraspbench", "displacement", "lift"]
 
-#: Contact threshold of the row's area, epsilon and volume: the paper's [m].
+#: Contact threshold of contact area, epsilon and volume [m]: the paper's.
 THRESHOLD_M: Final = 0.005
-#: Keys of the row, and metrics of a grasp.
+#: Keys of the row, and their metrics of a grasp.
 COLUMNS: Final = {
     "pd_mm": "penetration_depth_mm",
     "spd_mm": "self_penetration_depth_mm",
@@ -48,7 +48,7 @@ COLUMNS: Final = {
     "epsilon": "epsilon",
     "wrench_volume": "wrench_volume",
 }
-#: Seed of the models around the nominal one, used by no job: so results do not confirm a job's own choice.
+#: Seed of the models around the nominal one. No job uses it, so that these models are independent of a job's selection.
 MODELS_SEED: Final = 2**31
 
 
@@ -65,16 +65,16 @@ def evaluate(
     cache: Path | None = None,
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> dict[str, Any]:
-    """Return one row of numbers; None for undefined ones: too thin an object has no verdict.
+    """Return one row of numbers; undefined ones are None, such as the success rate of an object too thin to validate.
 
-    Level dexgraspbench uses the protocol's own mass and friction, the others the object's.
+    Level dexgraspbench uses the mass and friction of its protocol, other levels those of the object.
 
     Keys: n, protocol, level, hard, mu, mass_kg, object_friction; gsr (share that holds), osr (1 if any holds), sgs
     (held grasps per second of planning and validation; of planning alone: sgs_without_validation), pd_mm and spd_mm
     (penetration, self-penetration), ca_cm2, iv_cm3, epsilon, wrench_volume, cdc_mm, sd_cm: medians; diversity: variance
     explained by the first principal component; nearest_mm: distance of the two most similar grasps. verdicts, after
-    validation: see `_told`. With `models` models around the nominal one, by the same protocol: robust_share, the mean
-    over held grasps, robust_n, their number, robust_axes, the share by axis; `tell` receives the result of each grasp.
+    validation: see `_told`. With `models` models around the nominal one: robust_share (mean over held grasps), robust_n
+    (number of these grasps), robust_axes (share by axis); `tell` receives the result of each grasp.
     With protocol lift also clear_share (no collision with the scene in approach, closing and lift). With another model
     of the hand as `validation_hand` also `ForeignVerdicts.facts`, and in the verdicts held_foreign and reason_foreign.
 
@@ -162,7 +162,7 @@ def _success(case: Case, verdicts: Verdicts) -> dict[str, Any]:
 def _with_ways(case: Case, placed: PlacedGrasps) -> tuple[GraspSet, NDArray[np.bool_]]:
     way, grasps = plan_way(case.hand, case.obj, case.grasps, placed), case.grasps
     if grasps.approach is None or grasps.coming is None:
-        # Imported files have grasps, but rarely trajectories.
+        # Imported files have grasps but rarely have trajectories.
         grasps = replace(grasps, approach=way.approach, coming=way.open, lift=way.lift)
     return grasps, way.clear
 
@@ -183,7 +183,7 @@ def _lifted(verdicts: LiftVerdicts, clear: NDArray[np.bool_]) -> dict[str, Any]:
 
 
 def _in_models(found: Robustness, verdicts: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return shares of a row; add each verdict's share and first failing axis, None if not tested."""
+    """Return shares of a row; add to each verdict its share and first failing axis, None if not tested."""
     tried = np.isfinite(found.share)
     for one, share, weakest in zip(verdicts, found.share, found.weakest, strict=True):
         known = math.isfinite(share)
@@ -205,7 +205,7 @@ def _told(
     reasons: Sequence[str],
     kind: type[IntEnum],
 ) -> list[dict[str, Any]]:
-    """Return per grasp: row, held, outcomes of its pushes or of its lift, margin (None: diverged), reason."""
+    """Return for each grasp: row, held, outcomes of its pushes or lift, margin (None: diverged), reason."""
     return [
         {
             "row": row,
@@ -245,12 +245,12 @@ _MEDIANS: Final = (*COLUMNS, "cdc_mm", "sd_cm", "diversity")
 
 
 def combine(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """Combine rows of several objects: rates over grasps, osr over objects, medians of medians."""
+    """Combine rows of several objects: rates over all grasps, osr over objects, medians of the rows' medians."""
     if len(rows) == 1:
         return dict(rows[0])
     out: dict[str, Any] = {"n": sum(row["n"] for row in rows)}
     for key in ("protocol", "level", "hard", "mu"):
-        # Values that differ between rows have no common value.
+        # No common value if the rows differ.
         out[key] = rows[0][key] if all(row[key] == rows[0][key] for row in rows) else None
     validated = [row for row in rows if row["gsr"] is not None]
     out["gsr"] = _rate(validated, "gsr", "n")
@@ -265,7 +265,7 @@ def combine(rows: list[dict[str, Any]]) -> dict[str, Any]:
         out |= share_counts({key: sum(one[key] for one in counted) for key in counted[0]})
         out["fingertips_mm"] = max(row["fingertips_mm"] for row in rows if "foreign_held" in row)
     for key in ("sgs", "sgs_without_validation"):
-        # Held grasps over the seconds of all rows together.
+        # Held grasps of all rows over the seconds of all rows.
         timed = [row for row in validated if row[key]]
         seconds = sum(row["gsr"] * row["n"] / row[key] for row in timed)
         out[key] = _plain(sum(row["gsr"] * row["n"] for row in timed) / seconds) if timed else None
@@ -295,7 +295,7 @@ def _models(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _rate(rows: list[dict[str, Any]], key: str, weight: str) -> float | None:
-    """Return the mean of rows that have the key, weighted by the grasps of the rate."""
+    """Return the mean over rows that have the key, weighted by their number of grasps."""
     known = [row for row in rows if row[key] is not None]
     total = sum(row[weight] for row in known)
     return _plain(sum(row[key] * row[weight] for row in known) / total) if total else None

@@ -1,4 +1,4 @@
-"""Gallery pages: camera views of objects at rest, hands in grasps that fit there, and crowded tables."""
+"""Gallery pages: camera views of objects at rest, hands in clear grasps, and tables with several objects."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ from graspd.worker.scenes import Neighbours, drop, drop_together, transfer
 Say = Callable[[str], None]
 #: Size of one picture [px].
 SIZE: Final = (300, 225)
-#: Rays per pixel, for pictures that people view.
+#: Rays per pixel, for pictures of high quality.
 SAMPLES: Final = 32
-#: Grasps per scene, scenes, and rounds until one grasp is clear of the table.
+#: Number of grasps per scene, of scenes, and of rounds until one grasp is clear of the table.
 GRASPS: Final = 32
 SCENES: Final = 24
 ROUNDS: Final = 4
-#: Cosine of the elevation of the camera beside a neighbour.
+#: Cosine of the camera's elevation for views past a neighbour.
 _LEVEL: Final = 0.94
 _CHANNELS: Final = ("left", "right", "depth", "normals", "segmentation", "boxes")
 
@@ -82,19 +82,19 @@ def _hands(hands: Sequence[HandModel], objects: Sequence[ObjectModel], device: s
         cells, below = [], []
         for hand in hands:
             drawn, pose, kept, tried = _fitting(hand, obj, device, seed)
-            say(f"{hand.name} on {obj.name}: {kept} of {tried} grasps stay clear")
+            say(f"{hand.name} on {obj.name}: {kept} of {tried} grasps are clear of the table")
             extras = Extras(cameras=GivenCameras(extrinsics=_camera(drawn, obj, pose)[None]), drawn=drawn)
             seen = _seen(obj, pose[None], device, seed + k, extras, stereo=False)
             cells.append(Image.fromarray(np.asarray(seen["image/rgb_hand"][0], np.uint8)))
-            below.append(f"{obj.name}: {kept} of {tried} fit")
+            below.append(f"{obj.name}: {kept} of {tried} are clear")
         rows.append(cells)
         names.append(below)
-    subtitle = "a hand that stays clear of the table all the way; an object alone: none of those tried fits"
+    subtitle = "hand on a trajectory clear of the table; object alone: no clear grasp was found"
     return label_page(rows, [hand.name for hand in hands], names, title="Grasps on the table", subtitle=subtitle)
 
 
 def _fitting(hand: HandModel, obj: ObjectModel, device: str, seed: int) -> tuple[DrawnHand, Floats, int, int]:
-    """Return the grasp with the largest clearance, its scene's pose, and numbers of clear and all grasps."""
+    """Return the grasp with the largest clearance, the object's pose, and the numbers of clear and of all grasps."""
     scenes = drop(obj, count=SCENES, seed=seed)["scene/object_pose"]
     kept, tried, best = 0, 0, -np.inf
     for batch in range(ROUNDS):
@@ -124,7 +124,7 @@ def _camera(drawn: DrawnHand, obj: ObjectModel, pose: Floats) -> Floats:
     points = np.concatenate([apply(bodies[p.body], p.vertices) for p in hand.pieces])
     solid = apply(pose, obj.hull_vertices)
     middle = 0.5 * (solid.min(axis=0) + solid.max(axis=0))
-    # A forearm may leave the picture.
+    # A forearm may extend beyond the picture.
     near = points[np.linalg.norm(points - middle, axis=1) < obj.radius + 0.12] if drawn.grasp[0] >= 0 else points[:0]
     near = np.concatenate([near, solid])
     centre = 0.5 * (near.min(axis=0) + near.max(axis=0))
@@ -152,7 +152,7 @@ def _neighbours(objects: Sequence[ObjectModel], device: str, seed: int) -> bytes
 
 
 def _past(poses: Floats, obj: ObjectModel, beside: Neighbours) -> GivenCameras:
-    """Return a camera that sees the object past its nearest neighbour, which hides a part."""
+    """Return a camera that sees the object past its nearest neighbour, which hides a part of it."""
     middles = np.stack([apply(pose, o.centre_of_mass) for o, pose in zip(beside.objects, beside.poses[0], strict=True)])
     middle = apply(poses[0], obj.centre_of_mass)
     nearest = int(np.argmin(np.linalg.norm(middles - middle, axis=1)))

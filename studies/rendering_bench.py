@@ -1,4 +1,4 @@
-"""Cost of pictures: images per second, shares of tracing, shading, annotation, compression, writing."""
+"""Rendering benchmark: images per second; time shares of tracing, shading, annotation, compression and writing."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ COMPRESSIONS: Final[dict[str, dict[str, Any]]] = {
 
 
 class Timing(NamedTuple):
-    """Seconds of repeated runs: core-seconds on a CPU, nearly independent of other load; else wall clock."""
+    """Seconds of repeated runs: core-seconds on a CPU (nearly independent of other load), else wall clock."""
 
     median: float
     spread: float
@@ -50,8 +50,8 @@ def bench_render(obj: ObjectModel, *, width: int, height: int, device: str, repe
 
     Returns:
         `images`, `images_per_second` (rendered, annotated, compressed and written), `rendered_per_second` (in memory),
-        `bare_per_second` (the ray tracer alone with the same rays), their quotient `of_bare`, `share` of each part,
-        `spread` of the repeats, and `compression`: bytes and seconds of each storage option.
+        `bare_per_second` (the ray tracer alone with the same rays), their ratio `of_bare`, `share` of each part,
+        `spread` of the repeats, and `compression` (bytes and seconds of each storage option).
     """
     poses = drop(obj, count=SCENES, seed=0)["scene/object_pose"]
     setting = Setting([obj], poses[:, None], CameraPlan(VIEWS, width, height, None), seed=0, samples=SAMPLES)
@@ -113,7 +113,7 @@ def _timed(run: Callable[[], object], *, clock: Callable[[], float], repeats: in
 
 
 def _store(arrays: Mapping[str, NDArray[np.generic]], options: dict[str, Any], timer: Timer) -> dict[str, float]:
-    """Return bytes, and seconds of writing and reading, for a shard's pictures with one storage option."""
+    """Return bytes and seconds of writing and reading a shard's pictures with one storage option."""
     pictures = {path: array for path, array in arrays.items() if path.startswith("image/")}
 
     def write() -> bytes:

@@ -1,4 +1,4 @@
-"""Execution context of a computation: device, progress, cancellation and the shared cores; parallel parts of it."""
+"""Execution context of a computation (device, progress, cancellation, shared cores), and parallel maps."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from graspd.service.model.errors import TaskCancelled
 from graspd.worker.pool.pool import Pool
 
 PrefilterMode = Literal["auto", "on", "off"]
-#: Receives the amount done, the total and a short message; called often, from any thread.
+#: Receives the amount done, the total and a short message; called often, by any thread.
 Progress = Callable[[float, float, str], None]
-#: Returns whether to stop; called often, from any thread.
+#: Returns whether to stop; called often, by any thread.
 Cancelled = Callable[[], bool]
 
 
@@ -32,7 +32,7 @@ def _never() -> bool:
 
 
 class CoreSharing:
-    """Number of parallel parts that share the cores; a part that ends leaves its cores to the others."""
+    """Number of parallel parts that share the cores; a part that ends frees its cores for the others."""
 
     def __init__(self, members: int) -> None:
         self.members = members
@@ -46,28 +46,28 @@ class CoreSharing:
 @dataclass(frozen=True)
 class ExecutionContext:
     """Where and how a computation runs.
-    Results do not depend on it, except for rounding on a GPU and for the engine that validates."""
+    Results are independent of it, except for rounding on a GPU and for the engine that validates."""
 
     device: str = "cpu"
     threads: int = 0
-    """CPU threads; 0: one per core this process may use."""
+    """CPU threads; 0: one per core that this process may use."""
     progress: Progress = _silent
     cancelled: Cancelled = _never
     prefilter: PrefilterMode = "auto"
-    """Whether MuJoCo Warp decides the clear verdicts; auto: on a GPU, where it is installed."""
+    """Whether MuJoCo Warp decides clear verdicts; auto: on a GPU, if it is installed."""
     pool: Pool | None = None
-    """Processes that validate and measure; None: threads of this process."""
+    """Processes for validation and measurement; None: threads of this process."""
     sharing: CoreSharing | None = None
     """Parallel parts that share the cores, this one included; None: all cores are available."""
 
     @property
     def cores(self) -> int:
-        """Number of CPU threads with the default resolved; an equal share of the cores where parts share them."""
+        """Number of CPU threads, the default resolved; parallel parts get equal shares."""
         every = self.threads or available_cores()
         return every if self.sharing is None else max(1, every // max(1, self.sharing.members))
 
     def part(self, start: float, end: float) -> ExecutionContext:
-        """Return the context of a part, whose progress runs from share `start` to `end` of the whole."""
+        """Return the context of a part, with progress from `start` to `end` as shares of the whole."""
 
         def tell(done: float, total: float, message: str) -> None:
             self.progress(start + (end - start) * (done / total if total > 0 else 0.0), 1.0, message)
@@ -93,7 +93,7 @@ class Count:
             self._run.progress(self._done, self._total, self._what)
 
 
-#: On the CPU with all its cores, without progress or cancellation.
+#: CPU with all its cores, without progress or cancellation.
 DEFAULT_CONTEXT: Final = ExecutionContext()
 
 
@@ -103,7 +103,7 @@ R = TypeVar("R")
 
 @dataclass
 class ProgressShares:
-    """Combined progress of all parts, in the unit of their sizes."""
+    """Combined progress of all parts, weighted by their sizes."""
 
     sizes: Sequence[int]
     told: Progress
@@ -123,10 +123,10 @@ def parallel_map(
     parts: Sequence[T], work: Callable[[T, ExecutionContext], R], run: ExecutionContext, *, size: Callable[[T], int]
 ) -> list[R]:
     """Run `work` on every part in parallel; return the results in order.
-    Each part has its own share of the cores, and of the progress by `size`. The first failure stops the others.
+    Each part has its own share of the cores and, by `size`, of the progress. The first failure stops the others.
 
     Raises:
-        Exception: the error of the first part that failed, once all have ended.
+        Exception: the error of the first part that failed, after all parts have ended.
     """
     if len(parts) == 1:
         return [work(parts[0], run)]
@@ -189,7 +189,7 @@ def measured(
     run: ExecutionContext,
     name: str,
 ) -> NDArray[np.float64]:
-    """Return measurements (count,) on grasps that are `held` (count,), None: all; nan for the others."""
+    """Return measurements (count,) on the grasps that are `held` (count,), None: on all; nan for the others."""
 
     def asked(test: T, row: int) -> float:
         run.check("the validator")

@@ -1,8 +1,8 @@
 """Generation of validated grasps: rounds of candidates until enough are valid or the budget ends.
 
-A grasp is feasible if it passes the geometric gate, and valid if it is feasible and the validator holds it. Without
-validation, feasible grasps are counted instead and none is valid. Where a job wants a share of models, only valid
-grasps that hold in that share count. Expensive steps come last: grasps that the validator drops are not measured, and
+A grasp is feasible if it passes the geometric gate, and valid if it is feasible and held by the validator. Without
+validation, feasible grasps are counted instead and none is valid. If a job wants a share of models, a valid grasp
+counts only if it holds in that share. Expensive steps come last: grasps that are not held are not measured, and
 grasps that are not valid are not validated in further models.
 """
 
@@ -47,12 +47,13 @@ from graspd.worker.validation.protocol import DIRECTIONS, Outcome
 from graspd.worker.validation.robust import reaches, robust, robustness
 from graspd.worker.validation.validator import prefiltered, validate
 
-#: Reasons to reject a grasp: its numbers are not finite, an obstacle of its scene blocks it, the validator dropped it,
-#: it failed the geometric gate, held in too few models, lifts too little, or is a near-duplicate of a selected one.
+#: Reasons to reject a grasp: its numbers are not finite; an obstacle of its scene blocks it; it was not held by the
+#: validator; it failed the geometric gate; it held in too few models; its payload is too small; it is a near-duplicate
+#: of a selected grasp.
 REJECTIONS: Final = ("diverged", "blocked", "dropped", "gate", "not_robust", "weak", "alike")
-#: Outcomes of other names than their rejections; those of the validator are `dropped`.
+#: Names of outcomes that differ from the names of their rejections; verdicts of the validator are `dropped`.
 _REJECTION_OF: Final = {"no_place": "blocked", **{f"gate_{name}": "gate" for name in GATES}}
-#: Outcome names of pushes and of lifts that drop a grasp.
+#: Names of the outcomes in which a push or a lift drops a grasp.
 _PUSHED: Final = {
     Outcome.PENETRATION: "penetration",
     Outcome.LOST_WHILE_CLOSING: "lost_while_closing",
@@ -63,7 +64,7 @@ _PUSHED: Final = {
 _LIFTED: Final = {outcome: outcome.name.lower() for outcome in LiftOutcome if outcome > LiftOutcome.LIFTED} | {
     LiftOutcome.DIVERGED: "unstable"
 }
-#: Verdicts on candidates from the planner's rollouts, of lifts or of pushes.
+#: Verdicts on candidates from the planner's rollouts, by lifts or by pushes.
 Known = dict[str, Any]
 #: Progress of a round after planning, validation and measurement.
 PARTS: Final = (0.6, 0.8, 1.0)
@@ -74,7 +75,7 @@ class ValidatedBatch:
     grasps: GraspSet
     columns: Arrays
     candidates: int
-    """Number of candidates up to the last selected grasp; all where fewer were found than wanted."""
+    """Number of candidates up to the last selected grasp; all candidates if fewer grasps were found than wanted."""
     rejected: dict[str, int]
     """Number of rejected candidates, by `REJECTIONS`."""
     outcomes: dict[str, int]
@@ -84,13 +85,12 @@ class ValidatedBatch:
     planned: int
     seconds: dict[str, float] = field(default_factory=dict)
     shares: dict[str, float] = field(default_factory=dict)
-    """In scenes, shares of all candidates:
-    clear_share (free of obstacles at contact, on the approach and in the lift), lift_share (also lifted),
-    lift_hard_share (also lifted at half the friction)."""
+    """In scenes, shares of all candidates: clear_share (no obstacle at contact, on the approach and in the lift),
+    lift_share (also lifted), lift_hard_share (also lifted at half friction)."""
     narrow: str | None = None
-    """In scenes without a valid grasp, the geometric reason, see `why_narrow`."""
+    """In scenes without a valid grasp, the geometric reason; see `why_narrow`."""
     limit: Limit | None = None
-    """Payload limit of the best grasps, where none is selected because of the weight."""
+    """Payload limit of the best grasps, if none is selected because of the weight."""
 
     def moved(self, by: Sequence[float]) -> ValidatedBatch:
         return replace(self, grasps=self.grasps.moved(by))
@@ -111,19 +111,19 @@ def validated_grasps(
     """Plan one batch of a job: `count` valid grasps, or as many as the budget finds.
 
     Args:
-        request: method, fidelity, seed, friction, level, budget; whether valid grasps or `count` of any kind.
-        count: grasps wanted; feasible ones where nothing is validated.
+        request: method, fidelity, seed, friction, level, budget; and whether `count` grasps must be valid.
+        count: number of grasps wanted; without validation, of feasible grasps.
         batch: number of the batch within its job.
-        scenes: scenes of the grasps, in turn; valid then means lifted out of its scene. None: free object.
+        scenes: scenes of the grasps, in turn; then valid means lifted out of the scene. None: free object.
         pieces: computes the object's convex pieces; runs in parallel with the planning of the first round.
         run: receives progress and is polled for cancellation; its device is the planner's.
-        partial: when cancelled, return the grasps that were validated before.
+        partial: on cancellation, return the grasps that are validated so far.
 
     Raises:
         HandError: no two digits of the hand oppose each other.
         InputError: the object does not fit into the gripper.
         MeshError: the object has no usable convex pieces.
-        TaskCancelled: `run.cancelled()` returned True; with `partial`, before anything was validated.
+        TaskCancelled: `run.cancelled()` returned True; with `partial`, before any grasp was validated.
     """
     require_graspable(hand, obj)
     with Scoring(hand, obj, request, scenes=scenes, pieces=pieces, run=run) as scoring:
@@ -139,7 +139,7 @@ def validated_grasps(
 
 
 def require_graspable(hand: HandModel, obj: ObjectModel) -> None:
-    """Raise HandError where no two digits oppose each other, InputError where the object does not fit the gripper."""
+    """Raise HandError if no two digits oppose each other, InputError if the object does not fit into the gripper."""
     require_opposing(hand)
     fitting_pairs(hand, obj.centred)
 
@@ -154,9 +154,9 @@ def scored(
     pieces: Callable[[ObjectModel], ConvexPieces] = decompose,
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> ValidatedBatch:
-    """Validate and measure existing grasps as `request` specifies; all of them are returned.
+    """Validate and measure existing grasps as `request` specifies; return all of them.
 
-    With `scenes` they are validated in the scenes that `grasps.scene` numbers.
+    With `scenes`, each grasp is validated in the scene with its number in `grasps.scene`.
 
     Raises:
         MeshError: the object has no usable convex pieces.
@@ -169,7 +169,7 @@ def scored(
 
 
 class Scoring:
-    """Verdicts and metrics of a job's grasps; those of one grasp do not depend on the others."""
+    """Verdicts and metrics of a job's grasps; those of a grasp are independent of the other grasps."""
 
     def __init__(
         self,
@@ -181,7 +181,7 @@ class Scoring:
         pieces: Callable[[ObjectModel], ConvexPieces],
         run: ExecutionContext,
     ) -> None:
-        """Start the decomposition of the object, where grasps are validated."""
+        """Start the decomposition of the object, if grasps are validated."""
         self.hand, self.obj, self.request, self.run = hand, obj.centred, request, run
         self.centre = obj.centre
         self.scenes = None if scenes is None else scenes.centred(obj)
@@ -198,7 +198,7 @@ class Scoring:
         self.run = replace(self.run, cancelled=DEFAULT_CONTEXT.cancelled)
 
     def rollout(self, known: Known) -> Rollout | None:
-        """Return the rollout of candidates, where there is a validator.
+        """Return the rollout of candidates; None: there is no validator.
         Verdicts at the validator's own level are added to `known`."""
         if self.pieces is None:
             return None
@@ -219,7 +219,7 @@ class Scoring:
         return self.request.validation
 
     def prefiltered(self, planned: GraspSet) -> PrefilterVerdicts | None:
-        """Return the GPU prefilter's verdicts on the finite grasps; None: it takes no part."""
+        """Return the GPU prefilter's verdicts on the finite grasps; None: the prefilter is not used."""
         if self.pieces is None or self.scenes is not None or not first_terms(self.hand, self._level, self.run):
             return None
         finite = planned.take(np.flatnonzero(planned.finite))
@@ -235,7 +235,8 @@ class Scoring:
         prefilter: PrefilterVerdicts | None = None,
     ) -> Round:
         """Validate and measure grasps, and select the wanted ones, near-duplicates included.
-        Grasps that are not finite are rejected. `known` are verdicts on candidates, `prefilter` those of the GPU."""
+        Grasps with numbers that are not finite are rejected. `known` has verdicts on candidates, `prefilter` those of
+        the GPU."""
         fates = np.where(planned.finite, "kept", "diverged").astype(object)
         seconds = {"planner": 0.0, "validation": 0.0, "quality": 0.0}
         finite = np.flatnonzero(fates == "kept")
@@ -306,8 +307,8 @@ class Scoring:
     def _further_tests(
         self, grasps: GraspSet, in_models: NDArray[np.bool_], valid: NDArray[np.bool_], run: ExecutionContext
     ) -> Arrays:
-        """Return the wanted columns of further tests: of grasps `in_models` (N,) robustness (exact for candidates),
-        of `valid` ones (N,) payload and shake."""
+        """Return columns of the further tests that are wanted.
+        Grasps `in_models` (N,) get robustness (exact for candidates), `valid` ones (N,) payload and shake."""
         request, columns = self.request, dict[str, NDArray[Any]]()
         if not (request.models or request.measures_payload or request.shake):
             return columns
@@ -329,7 +330,7 @@ class Scoring:
             ).columns
         if request.measures_payload:
             found = payloads(self.hand, self.obj, grasps, placed=placed, held=valid, **common)
-            # A valid grasp lifted at least the object's own mass.
+            # A valid grasp has lifted at least the object's own mass.
             columns["quality/payload_kg"] = np.where(valid & np.isnan(found), self.obj.mass, found)
         if request.shake:
             assert placed is not None, "shake goes with a scene"
@@ -337,7 +338,7 @@ class Scoring:
         return columns
 
     def placed(self, grasps: GraspSet) -> PlacedGrasps | None:
-        """Return the grasps with their scenes; None: the object is free."""
+        """Return the grasps with their scenes; None: free object."""
         if self.scenes is None:
             return None
         assert grasps.scene is not None
@@ -356,18 +357,18 @@ class Needed:
     number: int
     rows: range
     begun: int
-    """Number of the batch's candidates planned before the round."""
+    """Number of the batch's candidates that were planned before this round."""
     progress: tuple[float, float]
-    """Progress of the batch before these rows, and expected progress after them at the rate so far."""
+    """Progress of the batch before these rows, and the expected progress after them at the rate so far."""
 
 
 class Batch:
-    """One batch in progress: the candidates it needs next and the rounds so far."""
+    """A batch in progress: the candidates that it needs next, and the rounds so far."""
 
     def __init__(
         self, scoring: Scoring, number: int, count: int, run: ExecutionContext, scenes: range | None = None
     ) -> None:
-        """Begin a batch; `run` reports its progress, `scenes` are its part of the job's scenes, None: all."""
+        """Begin a batch. `run` reports its progress; `scenes` is its part of the job's scenes, None: all."""
         self.scoring, self.number, self.count, self.run = scoring, number, count, run
         self.request = scoring.request
         self.rounds: list[Round] = []
@@ -380,16 +381,16 @@ class Batch:
         self._kept = np.zeros((0, POINTS, 3))
         self._needs = self._all_needed()
         self.needed = next(self._needs, None)
-        """Candidates to make and add next; None: the batch can be finished."""
+        """Candidates to make and add next; None: the batch is ready for `finish`."""
 
     def _all_needed(self) -> Iterator[Needed]:
-        """Yield what is needed until `count` grasps are found or the budget is used up, one after each `add`."""
+        """Yield the needs of each round, until `count` grasps are found or the budget is used up; `add` must follow."""
         wish, count = self.request, self.count
         if wish.want == "candidates":
             yield Needed(0, range(count), self.candidates, (0.0, 1.0))
             return
         budget, number, valid = math.ceil(wish.budget * count), 0, 0
-        # In scenes a retry costs as much as another candidate.
+        # In scenes a retry has the cost of another candidate.
         while size := next_round(count, valid, self.candidates, budget - self.repeated):
             first = 0
             while first < size and valid < count:
@@ -418,7 +419,7 @@ class Batch:
         self.needed = next(self._needs, None)
 
     def _hopeless(self) -> bool:
-        """Check whether the latest grasps, none selected, show that the hand lifts far less than is wanted."""
+        """Check whether the latest grasps, none of them selected, show that the hand lifts far less than wanted."""
         scoring = self.scoring
         if scoring.pieces is None or (self.limit is not None and self.limit.grasps >= ENOUGH):
             return False
@@ -433,7 +434,7 @@ class Batch:
     @property
     def _in_parts(self) -> bool:
         """Whether a round may be made in parts, so that it ends as soon as enough grasps are found.
-        The CPU runs parts in parallel parts; a GPU makes the whole round in the time of a few grasps."""
+        The CPU runs the parts in parallel; a GPU makes the whole round in the time of a few grasps."""
         return not self.scoring.run.device.startswith("cuda") and method(self.request.method).in_parts
 
     def made(self, asked: Needed) -> Round:
@@ -447,7 +448,7 @@ class Batch:
             hand, obj, request, run = self.scoring.hand, self.scoring.obj, self.request, own.part(0.0, PARTS[0])
             found = synthesize(hand, obj, wanted, run, method=request.method, options=request.options)
             told = self.told(wanted, found)
-            # Verdicts and metrics are many short jobs: they may use all cores, whatever the other parts do.
+            # Verdicts and metrics are many short tasks: they may use all cores, also while other parts run.
             made = self.scoring.scored(told, replace(own, sharing=None), known)
             return self.noted(replace(asked, rows=part), made, told)
 
@@ -480,12 +481,12 @@ class Batch:
         return PlanRequest(len(rows), knobs, seed, number, placed, rollout, rows.start, others_have_place)
 
     def told(self, wanted: PlanRequest, planned: GraspSet) -> GraspSet:
-        """Return the grasps to validate and store: positions on the grid, scenes numbered as in the job."""
+        """Return the grasps to validate and store: positions on the grid, scene numbers of the job."""
         index = None if wanted.placed is None else self._scenes.start + wanted.placed.index
         return replace(planned, scene=index).moved(np.zeros(3))
 
     def noted(self, asked: Needed, made: Round, told: GraspSet) -> Round:
-        """Return the round with the planner's info, and start the rechecks of the batch's first grasps."""
+        """Return the round with the planner's info; the batch's first grasps also start the rechecks."""
         made.planned = [told]
         made.grasps = replace(made.grasps, info=told.info, seconds=told.seconds)
         made.seconds["planner"] += told.seconds
@@ -504,8 +505,8 @@ class Batch:
         grasps = joined([part.grasps for part in rounds])
         columns = joined_columns([part.columns for part in rounds])
         fates = np.concatenate([part.fates for part in rounds])
-        # The last round may find more grasps than were missing. Only candidates up to the last selected grasp count,
-        # else the share of valid ones would look worse than it is.
+        # The last round may find more grasps than needed. Only candidates up to the last selected grasp count; with the
+        # others the share of valid ones would be too low.
         places = np.flatnonzero(fates == "kept")
         candidates = int(places[count - 1]) + 1 if len(places) >= count else len(fates)
         absent = {"blocked"} if scoring.scenes is None else set()
@@ -552,7 +553,7 @@ class Batch:
         }
 
     def _second_opinions(self, grasps: GraspSet, valid: NDArray[np.uint8]) -> Arrays:
-        """Return displacements of all grasps and, where wanted, robustness and rechecks.
+        """Return displacements of all grasps and, if wanted, robustness and rechecks.
         Rechecks validate the first valid grasps at level `dexgraspbench`."""
         scoring = self.scoring
         assert scoring.pieces is not None
@@ -575,7 +576,7 @@ class Batch:
 
     def _begin_rechecks(self, first: Round) -> None:
         """Start rechecks of a batch's first grasps, which later rounds do not change.
-        They run in the background thread, and `finish` waits for them."""
+        They run in the background thread; `finish` waits for them."""
         count = self.request.rechecks_of(self.number)
         if self.scoring.pieces is None or not count:
             return

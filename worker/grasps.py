@@ -12,16 +12,16 @@ from numpy.typing import ArrayLike, NDArray
 from graspd.service.model.transforms import Floats
 
 Columns = Mapping[str, NDArray[Any]]
-#: The only column of a base shard without a row per grasp.
+#: The only column of a base shard that does not have one row per grasp.
 THRESHOLDS: Final = "quality/thresholds_m"
-#: Columns of grasps in scenes; either all are present or none.
+#: Columns of grasps in scenes; either all of them are present or none.
 _IN_SCENES: Final = ("scene_index", "approach", "approach_joint_positions", "lift")
-#: Postures of every `GraspSet`, and its arrays by grasp that are there only in scenes.
+#: Postures of every `GraspSet`, and its arrays that exist only in scenes, with one row per grasp.
 _POSTURES: Final = ("grasp", "pregrasp", "squeeze")
 _ARRAYS: Final = ("approach", "coming", "scene", "wrist")
 
-#: Step of positions [m]. Doubles hold its multiples exactly up to 8,388 km. Grasps on the grid therefore move into the
-#: frame of a file and back with identical bits.
+#: Grid step of positions [m]. Doubles represent its multiples exactly up to 8,388 km. Grasps on the grid therefore move
+#: to the frame of a file and back with identical bits.
 GRID_M: Final = 2.0**-30
 
 
@@ -30,7 +30,7 @@ def on_grid(positions: ArrayLike) -> Floats:
 
 
 def moved(pose: ArrayLike, by: ArrayLike) -> Floats:
-    """Move poses (..., 7) by a vector (3,) of their parent's frame, on the grid."""
+    """Move poses (..., 7) by a vector (3,) in their parent's frame, and round positions to the grid."""
     pose = np.array(pose, float)
     pose[..., :3] = on_grid(pose[..., :3] + np.asarray(by, float))
     return pose
@@ -43,7 +43,7 @@ class Posture:
     hand_pose: Floats
     """(N, 7) pose of the hand's root link in the object frame: x y z, then quaternion w x y z."""
     joint_positions: Floats
-    """(N, J) all moving joints in `HandModel.joint_names` order [rad or m]."""
+    """(N, J) positions of all moving joints in `HandModel.joint_names` order [rad or m]."""
 
     def __len__(self) -> int:
         return len(self.hand_pose)
@@ -56,7 +56,7 @@ class Posture:
 
     @classmethod
     def from_columns(cls, columns: Columns, name: str = "grasp") -> Posture:
-        """Return the postures `name` (grasp, pregrasp or squeeze) of a base shard."""
+        """Return the postures called `name` (grasp, pregrasp or squeeze) of a base shard."""
         pose, joints = (np.asarray(columns[f"{name}/{what}"], float) for what in ("hand_pose", "joint_positions"))
         return cls(pose, joints)
 
@@ -72,15 +72,15 @@ class GraspSet:
     """(N,) L_stable of the planner; nan where the planner has none."""
     seconds: float = 0.0
     info: dict[str, object] = field(default_factory=dict)
-    """The planner's records: loss curves, iteration counts. JSON values only."""
+    """Records of the planner: loss curves, iteration counts. JSON values only."""
     approach: Floats | None = None
-    """(N, W, 7) hand poses from standoff to pregrasp, with the joint positions `coming`; only in scenes."""
+    """(N, W, 7) hand poses from standoff to pregrasp, with joint positions `coming`; only in scenes."""
     coming: Floats | None = None
     """(N, J) joint positions of the open hand on its approach; only in scenes."""
     scene: NDArray[np.intp] | None = None
-    """(N,) the scene of each grasp; only in scenes."""
+    """(N,) number of each grasp's scene; only in scenes."""
     lift: Posture | None = None
-    """N squeeze postures raised against gravity; only in scenes."""
+    """N squeeze postures moved up against gravity; only in scenes."""
     wrist: Floats | None = None
     """(N, K) wrist angles above the hand's root, in the order of `HandModel.mounting.joint_names` [rad].
     Only in scenes, for hands with a wrist."""
@@ -98,7 +98,7 @@ class GraspSet:
         return np.asarray(np.isfinite(rows).all(axis=1))
 
     def take(self, rows: NDArray[np.intp] | slice) -> GraspSet:
-        """Return some of the grasps, in the order of `rows`; the planner's info on the whole set stays."""
+        """Return some of the grasps, in the order of `rows`; the planner's info still covers the whole set."""
         changed: dict[str, Any] = {}
         for name in (*_POSTURES, "lift", "stability_loss", *_ARRAYS):
             if (part := getattr(self, name)) is not None:
@@ -106,13 +106,13 @@ class GraspSet:
         return replace(self, **changed, attempts=0)
 
     def moved(self, by: ArrayLike) -> GraspSet:
-        """Return the grasps and trajectories moved by a vector (3,) [m], into a frame with another origin."""
+        """Return the grasps and trajectories moved by a vector (3,) [m], to a frame with another origin."""
         postures = {name: getattr(self, name).moved(by) for name in _POSTURES}
         approach = None if self.approach is None else moved(self.approach, by)
         return replace(self, **postures, approach=approach, lift=None if self.lift is None else self.lift.moved(by))
 
     def to_columns(self) -> dict[str, NDArray[Any]]:
-        """Return the posture columns of a base shard; the planner's loss is a column of the quality table."""
+        """Return the posture columns of a base shard; the planner's loss belongs to the quality table."""
         parts = {"grasp": self.grasp, "pregrasp": self.pregrasp, "squeeze": self.squeeze}
         columns: dict[str, NDArray[Any]] = {f"{name}/hand_pose": part.hand_pose for name, part in parts.items()}
         columns |= {f"{name}/joint_positions": part.joint_positions for name, part in parts.items()}
@@ -144,7 +144,7 @@ class GraspSet:
 
 
 def joined(sets: Sequence[GraspSet]) -> GraspSet:
-    """Join several sets of one hand on one object; the info is that of the first set."""
+    """Join several sets of one hand on one object; the first set provides the info."""
     whole: dict[str, Any] = {"seconds": sum(one.seconds for one in sets), "info": dict(sets[0].info)}
     for name in (*_POSTURES, "lift", "stability_loss", *_ARRAYS):
         parts = [getattr(one, name) for one in sets]
@@ -154,7 +154,7 @@ def joined(sets: Sequence[GraspSet]) -> GraspSet:
 
 
 def joined_columns(parts: Sequence[Columns]) -> dict[str, NDArray[Any]]:
-    """Join base columns of several sets; the thresholds are common to all."""
+    """Join base columns of several sets; all sets have the same thresholds."""
     return {
         path: parts[0][path] if path == THRESHOLDS else np.concatenate([part[path] for part in parts])
         for path in parts[0]

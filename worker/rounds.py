@@ -16,12 +16,12 @@ from graspd.worker.grasps import THRESHOLDS, GraspSet, joined, joined_columns
 
 Arrays = dict[str, NDArray[Any]]
 
-#: Seed stride of a batch's rounds, beyond the batch numbers of any job: a job has at most 31,250 batches.
+#: Seed stride between a batch's rounds, above the batch numbers of any job: a job has at most 31,250 batches.
 ROUND_STRIDE: Final = 1 << 20
-#: Fewest grasps of a round, and of a part of one.
+#: Fewest grasps of a round, and of a part of a round.
 SMALLEST_ROUND: Final = 8
 SMALLEST_PART: Final = 8
-#: Least share of valid grasps that a round expects, however bad the rounds before: rounds stay finite and few.
+#: Least share of valid grasps that is assumed for the next round, however few were valid before: it bounds the rounds.
 _LEAST_RATE: Final = 0.1
 
 
@@ -30,11 +30,11 @@ class Round:
     grasps: GraspSet
     columns: Arrays
     rows: NDArray[np.intp]
-    """Rows of the selected grasps among the planned ones."""
+    """Row numbers of the selected grasps among the planned ones."""
     fates: NDArray[np.object_]
-    """Result of each planned grasp: kept, or one of `service.model.planning.OUTCOMES`."""
+    """Result of each planned grasp: selected, or one of `service.model.planning.OUTCOMES`."""
     in_scene: dict[str, NDArray[np.bool_]]
-    """In scenes: which planned grasps were clear, lifted, lifted at half friction."""
+    """In scenes, masks of planned grasps: clear, lifted, lifted at half friction."""
     seconds: dict[str, float]
     repeated: int = 0
     planned: list[GraspSet] = field(default_factory=list)
@@ -68,8 +68,8 @@ class Round:
 
 
 def next_round(wanted: int, valid: int, candidates: int, budget: int) -> int:
-    """Return the number of grasps to plan next: those missing at the rate so far, and 10 % more.
-    `wanted` valid ones are wanted, at most `budget` are planned; 0: enough are found or the budget is used up."""
+    """Return the number of grasps to plan next: those missing at the rate so far, plus 10 %.
+    `wanted` is the number of valid grasps, `budget` the most to plan; 0: enough are found or the budget is used up."""
     if valid >= wanted or candidates >= budget:
         return 0
     if candidates == 0:
@@ -78,7 +78,7 @@ def next_round(wanted: int, valid: int, candidates: int, budget: int) -> int:
 
 
 def enough(wanted: int, valid: int, candidates: int) -> int:
-    """Return the grasps expected to be enough at the rate so far, and 10 % more; see `next_round`."""
+    """Return the number of grasps expected to be enough at the rate so far, plus 10 %; see `next_round`."""
     if candidates == 0:
         return wanted
     return math.ceil(1.1 * (wanted - valid) / max(valid / candidates, _LEAST_RATE))

@@ -1,4 +1,4 @@
-"""Several batches of a job: one after the other, or in waves that are planned in one launch each."""
+"""Several batches of a job: one after the other, or in waves that share one launch of the planner."""
 
 from __future__ import annotations
 
@@ -46,17 +46,17 @@ def validated_batches(
     """Plan consecutive batches of a job; each has the same result as with `validated_grasps`.
 
     Args:
-        sizes: grasps wanted for each batch.
+        sizes: number of grasps wanted for each batch.
         first: number of the first batch within its job.
-        join: batches whose grasps are planned in one launch; 1: one batch after the other.
+        join: number of batches that are planned in one launch; 1: one batch after the other.
         scenes: see `validated_grasps`; common to all batches, or one per batch.
         pieces: computes the object's convex pieces; called once.
-        partial: when cancelled, return the batches validated before; the last one may be incomplete.
+        partial: on cancellation, return the batches validated so far; the last one may be incomplete.
         checked: called with the number of each finished batch and its result; may raise.
-        empty_on: errors after which a batch has no grasps; not for a job's first batch, nor if all fail.
+        empty_on: errors that give a batch without grasps; not for a job's first batch, nor if all batches fail.
 
     Raises:
-        Exception: the error of the first batch that failed; the others are stopped.
+        Exception: the error of the first batch that failed; the others are cancelled.
     """
     known: list[ConvexPieces] = []
 
@@ -90,7 +90,7 @@ def validated_batches(
     return [one or _nothing(like) for one in ordered]
 
 
-#: Number of a batch within its job, with its result.
+#: Number of a batch within its job, and its result.
 Made = tuple[int, ValidatedBatch | Exception]
 
 
@@ -123,7 +123,7 @@ class _Job:
                 own.progress(1.0, 1.0, "done")
 
     def in_waves(self, join: int) -> Generator[Made]:
-        """Plan what `join` batches need next in one launch; meanwhile validate and measure the wave before."""
+        """Plan the needs of `join` batches in one launch, while the wave before is validated and measured."""
         require_graspable(self.hand, self.obj)
         stop, shares = threading.Event(), ProgressShares(self.sizes, self.run.progress)
         run = replace(self.run, cancelled=lambda: stop.is_set() or self.run.cancelled())
@@ -174,7 +174,7 @@ class _Wave:
 
 
 def _next_wave(waiting: deque[Batch], fresh: Iterator[Batch], most: int) -> list[Batch]:
-    """Return batches that together fill one launch; those already begun go first."""
+    """Return batches that together fill one launch; batches in progress go first."""
     found, size = list[Batch](), 0
     while (batch := waiting.popleft() if waiting else next(fresh, None)) is not None:
         assert batch.needed is not None
@@ -187,7 +187,7 @@ def _next_wave(waiting: deque[Batch], fresh: Iterator[Batch], most: int) -> list
 
 
 def _planned(scoring: Scoring, batches: Sequence[Batch]) -> _Wave:
-    """Plan what the batches need, in the single thread that owns the device."""
+    """Plan the needs of the batches, in the single thread that owns the device."""
     known: Known = {}
     rollout, request, asked = scoring.rollout(known), scoring.request, list[BatchRequest]()
     for batch in batches:

@@ -1,13 +1,13 @@
 """Authentication of a request by key, session cookie or proxy; permissions of the caller.
 
-The service is open while no key was ever made and it binds to this machine only. After the first key it stays closed,
-even if the last key is revoked or expired.
+The service is open as long as no key was ever made and it binds only to this machine. After the first key it stays
+closed, even if the last key is revoked or expired.
 
-A proxy in front may sign people in (OIDC); it is trusted only from its address and with its secret.
+A proxy in front of the service may authenticate people (OIDC); it is trusted only from its address and with its secret.
 
-It sends `Authorization: Basic user:secret`, which oauth2-proxy builds from `--basic-auth-password`, and the person's
-groups in X-Forwarded-Groups. Any client can send such headers, so both the connection's address and the secret must
-be the proxy's, and duplicate headers are refused.
+The proxy sends `Authorization: Basic user:secret`, which oauth2-proxy builds from `--basic-auth-password`, and the
+person's groups in X-Forwarded-Groups. Any client can send such headers, so both the connection's address and the secret
+must be the proxy's, and duplicate headers are refused.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from graspd.service.model.projects import EVERYTHING, PATTERN, ProjectScope
 from graspd.service.settings import Settings
 
 SESSION_COOKIE: Final = "graspd_session"
-#: Headers added by proxies: in an open service they reveal that requests of others arrive here.
+#: Headers added by proxies; in an open service they reveal that a proxy forwards requests of others.
 _OF_PROXIES: Final = ("x-forwarded-for", "x-forwarded-host", "forwarded", "via", "x-real-ip")
 
 caller: ContextVar[Key | None] = ContextVar("caller", default=None)
@@ -44,7 +44,7 @@ def caller_id() -> str:
 
 
 def project_scope() -> ProjectScope:
-    """Return what the present caller may see: its key's project; all with `admin` or in an open service."""
+    """Return the scope of the present caller: its key's project; all projects with `admin` or in an open service."""
     key = caller.get()
     return EVERYTHING if key is None else ProjectScope(key.project, everything=key.scope.includes(Scope.ADMIN))
 
@@ -72,7 +72,7 @@ def authorize(request: HTTPConnection, scope: Scope) -> Key | None:
 
 
 def may_still(request: HTTPConnection, scope: Scope) -> bool:
-    """Check whether a long answer may continue: its key may have been revoked or expired meanwhile."""
+    """Check whether a long response may continue, since its key may have been revoked or expired."""
     keys: KeyFile = request.app.state.keys
     if keys.is_open:
         return True
@@ -110,7 +110,7 @@ def is_allowed(request: HTTPConnection, scope: Scope) -> bool:
 
 
 def _refuse_strangers(request: HTTPConnection) -> None:
-    """Restrict an open service to this machine: refuse others, and proxies, which may serve anyone."""
+    """Restrict an open service to this machine: refuse other machines, and proxies, which may serve anyone."""
     passed_on = next((name for name in _OF_PROXIES if name in request.headers), None)
     address = request.client.host if request.client else ""
     if passed_on is None and not _is_elsewhere(address):
@@ -137,12 +137,12 @@ def _is_elsewhere(address: str) -> bool:
     try:
         return not ipaddress.ip_address(address).is_loopback
     except ValueError:
-        # A unix socket has no address; a test client has an invented one.
+        # A unix socket has no address; a test client has a fictitious one.
         return False
 
 
 GROUPS: Final = "x-forwarded-groups"
-#: Placeholder for a group: any person who is signed in.
+#: Group name that means any authenticated person.
 ANYBODY: Final = "*"
 _LEAST_SECRET: Final = 16
 _LONGEST_USER: Final = 200
@@ -168,7 +168,7 @@ class Proxy:
         return bool(self._secret)
 
     def find(self, scope: AsgiScope) -> Key | None:
-        """Return the authenticated person as a key with the rights of their first group in the settings, or None."""
+        """Return a key for the authenticated person, with the rights of their first group in the settings, or None."""
         if not self.is_on or not self._is_from_proxy(scope):
             return None
         headers = Headers(scope=scope)
@@ -207,7 +207,7 @@ class Proxy:
 
 def _key_of(user: str, project: str, scope: Scope) -> Key:
     digest = hashlib.sha256(f"proxy {user}".encode()).hexdigest()
-    # Names of stored keys contain no @, so no counters are shared.
+    # Names of stored keys contain no @, so that people and keys have separate counters.
     name = user[:48] if "@" in user else f"{user[:48]}@proxy"
     return Key(id=digest[:16], name=name, scope=scope, project=project, sha256=digest, created="")
 

@@ -1,4 +1,4 @@
-"""Bearer keys with scopes. A key is shown once, when it is made; only its SHA-256 is stored.
+"""Bearer keys with scopes. A key is shown only once, at its creation; only its SHA-256 is stored.
 
 All API processes read the keys from one JSON file (mode 600). A key made, rotated or revoked on the command line takes
 effect at the next request.
@@ -66,7 +66,7 @@ class ProjectLimits(BaseModel):
 
 
 class Key(BaseModel):
-    """Key as stored. Rotation retains its id; no later key with the same name has this id."""
+    """Key as stored. Rotation does not change its id; later keys with the same name have other ids."""
 
     id: str = ""
     name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._@+-]{0,63}$")
@@ -80,7 +80,7 @@ class Key(BaseModel):
 
     @model_validator(mode="after")
     def _has_an_id(self) -> Self:
-        # Keys older than ids: during a rotation, the old and the new secret share their name and so this id.
+        # For keys older than ids: during a rotation the old and the new secret have the same name and thus the same id.
         self.id = self.id or _sha256(f"name {self.name}")[:16]
         return self
 
@@ -98,7 +98,7 @@ class _Document(BaseModel):
 
 
 class KeyFile:
-    """File of the keys. If callers can authenticate without a key, it is `closed` even before the first key."""
+    """File of the keys. With another means of authentication the service is `closed` even before the first key."""
 
     def __init__(self, path: Path, *, closed: bool = False) -> None:
         self.path = path
@@ -111,7 +111,7 @@ class KeyFile:
 
     @property
     def is_open(self) -> bool:
-        """Whether no key was ever made, so that anyone on this machine may use the service."""
+        """Whether no key was ever made, so that all users of this machine may use the service."""
         return not self._closed and not self._read().keys
 
     @property
@@ -127,7 +127,7 @@ class KeyFile:
         limits: KeyLimits | None = None,
         project: str = "",
     ) -> str:
-        """Make a key and return it; it cannot be shown again. An empty project is the one without a name."""
+        """Make a key and return it; it cannot be shown again. An empty project is the unnamed project."""
         with self._changing() as document:
             if any(key.name == name and key.is_live for key in document.keys):
                 raise ConflictError(f"there is a key named {name!r}; revoke or rotate it, or take another name")
@@ -153,7 +153,7 @@ class KeyFile:
         return token
 
     def rotate(self, name: str, *, grace: timedelta = timedelta(0), lifetime: timedelta | None = None) -> str:
-        """Return a new secret for a key; the old one stays valid for `grace`. Scope, project, limits stay."""
+        """Return a new secret for a key; the old one stays valid for `grace`. Scope, project and limits persist."""
         token = PREFIX + secrets.token_urlsafe(32)
         with self._changing() as document:
             old = _live(document, name)
@@ -244,7 +244,7 @@ class KeyFile:
 
     @contextmanager
     def _changing(self) -> Iterator[_Document]:
-        """Yield a copy of the document that replaces the file at the end; a lock serializes commands."""
+        """Yield a copy of the document, which replaces the file at the end; a lock serialises commands."""
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
             with self.path.with_name(f".{self.path.name}.lock").open("w") as lock:

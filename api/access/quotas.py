@@ -1,8 +1,8 @@
-"""Quotas of a key, and of a project's keys together: grasps in unfinished jobs, and requests per day. Idempotency keys.
+"""Quotas of a key, and of all keys of a project: grasps in unfinished jobs, and requests per day; idempotency keys.
 
-Redis counts them in one atomic step for all API processes. Its loss resets quotas, but loses no job. From submission to
-end, a job counts with its requested grasps. The index is asked for ended jobs only if the quota would be exceeded, so a
-submission needs one round trip.
+Redis counts them in one atomic step for all API processes. Loss of Redis resets quotas, but no job is lost. From
+submission to end, a job counts with its requested grasps. The index is asked for ended jobs only if the quota would be
+exceeded, so a submission needs one round trip.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ end
 return {'', '0'}
 """
 
-#: Settles a claim once the job is in the index; a claim of the same job that created nothing may have dropped it.
+#: Settles a claim once the job is in the index; another claim of the same job may already have dropped the entry.
 _SETTLE: Final = """
 local known = redis.call('HGET', KEYS[1], ARGV[1])
 if not known then redis.call('HINCRBY', KEYS[1], 'grasps', ARGV[2]) end
@@ -103,7 +103,7 @@ end
 
 @dataclass
 class SubmissionClaim:
-    """Result that a submission sets: `counts` is False if the job existed already."""
+    """Result of a submission: `counts` is False if the job existed already."""
 
     counts: bool = True
 
@@ -141,7 +141,7 @@ class _Holder:
 
 
 class Quotas:
-    """Counters of all keys and projects. `unfinished` returns those of the given job ids whose job has not ended."""
+    """Counters of all keys and projects. `unfinished` returns the given ids of jobs that have not ended."""
 
     def __init__(
         self,
@@ -160,7 +160,7 @@ class Quotas:
 
     @contextmanager
     def claim(self, key: Key | None, job: str, grasps: int, *, is_new: bool = True) -> Iterator[SubmissionClaim]:
-        """Count a job submitted or retried (not `is_new`) in this context, unless that fails or makes nothing new."""
+        """Count a job submitted or retried (not `is_new`) in this context, unless that fails or creates no job."""
         claim = SubmissionClaim()
         if key is None:
             yield claim
@@ -211,14 +211,14 @@ class Quotas:
                     self._connection.eval(_SETTLE, 1, holder.held, job, grasps, number)
                 else:
                     self._connection.eval(_UNDO, 1, holder.held, job, number)
-                # Of two claims of one job, the one that created it counts as one of today.
+                # If two claims are for one job, only the claim that created it counts as a job of today.
                 if today and met == "shared" and claim.counts:
                     self._connection.incrby(holder.day, today)
                 if today and met == "" and not claim.counts:
                     self._connection.decrby(holder.day, today)
 
     def _claim(self, holder: _Holder, job: str, grasps: int, number: str, today: int) -> str:
-        """Return how it is counted: `shared` by another pending claim, `known`, `unknown` without Redis, or empty."""
+        """Return how a job is counted: `shared` by another pending claim, `known`, `unknown` (no Redis), or empty."""
         met, amount = self._ask(holder, job, grasps, number, today)
         if met == "grasps":
             with self._forgiving(holder):
@@ -237,7 +237,7 @@ class Quotas:
         return met.decode(), int(amount)
 
     def _forget_ended(self, holder: _Holder) -> None:
-        """Drop ended jobs, but neither pending ones, which the index lacks, nor those claimed again meanwhile."""
+        """Drop ended jobs, except pending ones, which the index lacks, and jobs claimed again meanwhile."""
         found = [word.decode(errors="replace") for word in self._connection.eval(_ENTERED, 1, holder.held)]
         entries = dict(zip(found[::2], found[1::2], strict=True))
         ended = sorted(entries.keys() - set(self._unfinished(list(entries))))
@@ -263,7 +263,7 @@ DATASET_PREFIX: Final = "dataset:"
 
 
 def unfinished(index: Index, ids: Collection[str]) -> set[str]:
-    """Return those of the jobs and datasets, named as in quotas, that have not ended."""
+    """Return the given jobs and datasets, named as in quotas, that have not ended."""
     names = {one.removeprefix(DATASET_PREFIX) for one in ids if one.startswith(DATASET_PREFIX)}
     found = index.jobs.unfinished([one for one in ids if not one.startswith(DATASET_PREFIX)])
     return found | {DATASET_PREFIX + name for name in index.datasets.unfinished(names)}
@@ -276,8 +276,8 @@ _FREE: Final = "if redis.call('GET', KEYS[1]) == ARGV[1] then redis.call('DEL', 
 class Idempotency:
     """Idempotency-Key (IETF draft): the same key with a different body is an input error.
 
-    Identical requests give the same job even without a key, because its id depends on its content. So no answer is
-    stored, only the content of each key, in Redis for a day: its loss loses a check, never a job.
+    Identical requests give the same job even without a key, because a job's id depends on its content. Redis stores for
+    a day only the content of each key, not the response: its loss loses a check, never a job.
     """
 
     def __init__(self, connection: Any) -> None:

@@ -65,8 +65,8 @@ class Assets:
     ) -> AssetView:
         """Store an upload. The controller queues the check of a hand or an object; a network is checked here.
 
-        With `self_test` the check of a hand ends with grasps. Every project may use what is `shared`. With `rename` it
-        gets the next free name if the name is taken; known content retains its own name.
+        With `self_test` the check of a hand ends with grasps. All projects may use `shared` assets. With `rename` the
+        asset gets the next free name if its name is taken; content that exists already keeps its name.
         """
         found = network_report(files, name) if kind is AssetKind.NETWORK else None
         project = project_scope().project
@@ -84,9 +84,9 @@ class Assets:
         said = {"owner": caller_id(), "project": project, "shared": shared, "self_test": self_test}
         asset = library.store_files(store, kind, name, files, said=said)
         if found is not None:
-            # Write the check before the record: the record makes it effective, and no worker checks a network.
+            # Write a network's check, which no worker makes, before the record: the record makes it effective.
             put_document(store, names.asset_check(kind, asset.digest), found)
-        # With two simultaneous uploads of one name, the later one must see the record of the earlier one.
+        # With two simultaneous uploads under one name, the later one must find the record of the earlier one.
         with recording(self._services) as (connection, put):
             self._refuse_taken(kind, name, asset.digest)
             asset = library.record_asset(store, asset, put)
@@ -98,9 +98,9 @@ class Assets:
         return facts_of(self.model(asset))
 
     def correct(self, name: str, corrections: HandCorrections, new_name: str = "") -> AssetView:
-        """Create a hand from the same files with corrected facts in `asset.json`; its check is queued.
+        """Create a hand from the same files with corrected facts in `asset.json`, and queue its check.
 
-        Without a new name it gets the name with the next free number.
+        Without a new name the hand gets its old name with the next free number.
         """
         hand = self.one(AssetKind.HAND, name)
         facts = self.hand_facts(hand)
@@ -114,7 +114,7 @@ class Assets:
             raise LimitError(f"what is said of the hand takes more than {MAX_BYTES} bytes; correct less")
         files["asset.json"] = text
         if not new_name:
-            # The same corrections give the same hand.
+            # Equal corrections give the same hand.
             for mark in ({}, marks_of(files, project_scope().project)):
                 files.update(mark)
                 if known := self._find(AssetKind.HAND, digest_files(AssetKind.HAND, files)):
@@ -138,7 +138,7 @@ class Assets:
         log.info("%s %s deleted", kind, asset.name)
 
     def _mark(self, kind: AssetKind, name: str, files: MutableMapping[str, bytes], project: str) -> str:
-        """Add the project's mark to the files, which makes them private to it; return their digest."""
+        """Add the project's mark to the files, which makes them private to the project; return their digest."""
         files.update(marks_of(files, ""))
         digest = digest_files(kind, files)
         if not project:

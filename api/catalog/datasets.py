@@ -1,6 +1,6 @@
 """Datasets, named sets of objects, and comparison of two datasets.
 
-Until it ends, a dataset counts against its key's quota as one job with all its grasps. Only its owner changes it.
+Until it ends, a dataset counts against its key's quota as one job with all its grasps. Only its owner may change it.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class Datasets:
         return actions.cancel(self._services, name)
 
     def retry(self, name: str) -> DatasetView:
-        """Run `actions.retry`; restarted cells count against the quota."""
+        """Restart a dataset by `actions.retry`; restarted cells count against the quota."""
         dataset = self._owned(name)
         again = dataset.states[State.FAILED] + dataset.states[State.CANCELLED]
         grasps = again * dataset.options.grasps
@@ -102,7 +102,7 @@ class Datasets:
         return load_snapshot(self._services.store, name, digest)
 
     def add_object_set(self, name: str, objects: tuple[str, ...]) -> ObjectSetView:
-        """Name a set of objects; other objects under the same name are its next version."""
+        """Name a set of objects; other objects under the same name become its next version."""
         return actions.add_object_set(
             self._services,
             name,
@@ -138,14 +138,14 @@ class Datasets:
         return dataset
 
 
-#: Most cells compared one by one; a longer table would be unreadable.
+#: Most cells that are compared one by one; a longer table would be unreadable.
 MOST_CELLS: Final = 1000
 _AT_ONCE: Final = 200
 
 
 @dataclass(frozen=True)
 class Pair:
-    """Hand and object with its cell in both datasets; None: the dataset has no such cell."""
+    """Hand and object with their cell in each dataset; None: the dataset has no such cell."""
 
     hand: str
     object: str
@@ -154,7 +154,7 @@ class Pair:
 
     @property
     def gain(self) -> float | None:
-        """Difference of the yields, the other's minus this one's, if both have candidates."""
+        """Yield of the other dataset minus yield of this one, if both have candidates."""
         if self.one is None or self.other is None or None in (self.one.valid_yield, self.other.valid_yield):
             return None
         return (self.other.valid_yield or 0.0) - (self.one.valid_yield or 0.0)

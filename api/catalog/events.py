@@ -1,4 +1,4 @@
-"""Server-sent events, ended when their key ends; the feed of ended jobs and datasets; webhooks."""
+"""Server-sent events (streams end when their key becomes invalid), feed of ended jobs and datasets, webhooks."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ class Webhooks:
         return self._services.index.outbox.hook(hook.id), secret_of(master.get_secret_value(), hook.id)
 
     def all(self) -> list[WebhookView]:
-        """Return webhooks that the caller may change: addresses of others may contain credentials."""
+        """Return webhooks that the caller may change; addresses of other webhooks may contain credentials."""
         hooks = self._services.index.outbox.hooks(scope=project_scope())
         return [hook for hook in hooks if may_change(hook.owner, hook.project)]
 

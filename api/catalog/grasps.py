@@ -39,7 +39,7 @@ from graspd.service.store.store import Store
 
 _KEPT_STATISTICS: Final = 256
 _BINS: Final = 20
-#: Filters of the index that requests name alike.
+#: Filters of the index with equal names in requests.
 _SHARED: Final = GraspFilter.model_fields.keys() & models.GraspQuery.model_fields.keys()
 MEAN_METRICS: Final[tuple[Metric, ...]] = tuple(metric.name for metric in indexed(IndexLevel.OFFERED))
 
@@ -57,14 +57,14 @@ class Grasps:
         return self._index.grasps.page(self._filter(query), sort=sort, limit=limit, cursor=cursor)
 
     def members(self, query: models.GraspQuery) -> list[Grasp]:
-        """Return identifiers of all grasps that pass every filter; LimitError if a selection may not hold so many."""
+        """Return identifiers of all grasps that pass every filter; LimitError if they are too many for a selection."""
         found = self._index.grasps.members(self._filter(query), limit=MOST_TAGGED + 1)
         if len(found) > MOST_TAGGED:
             raise LimitError(f"more than {MOST_TAGGED} grasps pass this filter, which is the most at once; narrow it")
         return found
 
     def listed(self, places: Sequence[Grasp]) -> Iterator[GraspView]:
-        """Yield grasps by identifier, which must be visible to the caller; deleted ones are omitted."""
+        """Yield grasps by identifier; all must be visible to the caller, and deleted grasps are omitted."""
         return self._index.grasps.listed(places)
 
     def _filter(self, query: models.GraspQuery) -> GraspFilter:
@@ -95,7 +95,7 @@ class Grasps:
     def _read_statistics(
         self, job_id: str, validated: bool, count: int
     ) -> tuple[list[models.Histogram], models.Diversity | None]:
-        """Read the statistics of a job; `count` only distinguishes cached results."""
+        """Read the statistics of a job; `count` is only part of the cache key."""
         where, known = GraspFilter(job=job_id, valid=True if validated else None), self._index.statistics
         histograms = [
             models.Histogram(
@@ -125,12 +125,12 @@ def _bounds(query: models.GraspQuery, end: Literal["min", "max"]) -> dict[Metric
     return found if query.type is None else {"grasp_type": float(GraspType[query.type.upper()])} | found
 
 
-#: Cached base shards. One of 32 grasps takes about 60 kB; a page needs at most one shard per row.
+#: Number of cached base shards. A shard of 32 grasps takes about 60 kB; a page needs at most one shard per row.
 _KEPT_SHARDS: Final = 64
 _POSTURES: Final = ("pregrasp", "grasp", "squeeze")
 _OUTCOME: Final = "quality/verdict_outcome"
 _LIFT: Final = "quality/lift_outcome"
-#: Meanings of the numbers of both columns, from their descriptions in the schema.
+#: Meanings of the codes in both columns, from the schema's descriptions.
 _OUTCOMES, _LIFT_OUTCOMES = (
     {int(code): words for code, words in re.findall(r"(\d) ([a-z ]+)", SCHEMAS["base"][column].description)}
     for column in (_OUTCOME, _LIFT)

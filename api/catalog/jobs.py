@@ -1,4 +1,4 @@
-"""Jobs: submission within quotas, progress, rate and expected end, changes by their owners; and their shards."""
+"""Jobs (submission within quotas, progress, rate, expected end, changes by their owners) and their shards."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from graspd.service.telemetry import bind
 
 log = logging.getLogger(__name__)
 _PAGE: Final = 200
-#: Waiting tasks that are searched for a reason to wait.
+#: Most waiting tasks for which the reason of waiting is determined.
 _LOOKED_AT: Final = 20
 _ORDER: Final = {stage: place for place, stage in enumerate(Stage)}
 _KEPT_LOSSES: Final = 256
@@ -56,20 +56,20 @@ class Shards:
         return _shard(self._services.index.shards.get(shard_id, scope=project_scope()))
 
     def intact(self, shard_id: str) -> Shard:
-        """Return a shard whose file matches its checksum; a file is read again only after it changed."""
+        """Return a shard whose file matches its checksum; a file is read again only after a change."""
         shard = self.one(shard_id)
         self._checked.check(shard.key, shard.sha256)
         return shard
 
     def address(self, shard: Shard) -> str | None:
-        """Return the address at which the store itself serves the file to GET; None if it does not."""
+        """Return the address at which the store serves the file to GET; None if only the API serves it."""
         return self._services.store.sign(shard.key)
 
     def size(self, shard: Shard) -> int:
         return self._services.store.size(shard.key)
 
     def stream(self, shard: Shard, start: int, length: int) -> Iterator[bytes]:
-        """Yield bytes of the file in chunks; DamagedShard if they changed since the file was found intact."""
+        """Yield bytes of the file in chunks; DamagedShard if they changed since the check of the file."""
         return self._checked.stream(shard.key, shard.sha256, start, length)
 
     def job_of(self, shard_id: str) -> str | None:
@@ -110,7 +110,8 @@ class Jobs:
                 job, is_new = job_actions.enter(self._services, record)
                 claim.counts = is_new
                 log.info("job submitted" if is_new else "job was there already")
-        # An identical job may exist by fidelity name; a request with a target still gets the choice made for it.
+        # An identical job may exist under a fidelity's name; a request with a target still gets the fidelity chosen for
+        # it.
         return self._detail(job).model_copy(update={"choice": record.choice or job.choice})
 
     def cancel(self, job_id: str) -> JobDetail:
@@ -203,16 +204,16 @@ class Jobs:
         )
 
     def _running(self, job_id: str) -> list[TaskView]:
-        """Return running tasks, then the first waiting ones that give a reason."""
+        """Return running tasks, then the first waiting tasks that have a reason."""
         tasks = self._services.index.jobs.tasks
         running = tasks(job=job_id, state=State.RUNNING, limit=_PAGE).items
         waiting = tasks(job=job_id, state=State.QUEUED, limit=_LOOKED_AT).items
         return [*running, *(task for task in waiting if task.message)]
 
 
-#: Shortest time between two observations [s]: below it, report times dominate the measured rate.
+#: Shortest time between two observations [s]: with a shorter one, report times would dominate the rate.
 _LEAST_SPAN_S: Final = 1.0
-#: Least share done: before it, a task spent its time on loading.
+#: Least share done for a rate: before this share, a task mostly loads data.
 _LEAST_SHARE: Final = 0.03
 _KEPT_TASKS: Final = 4096
 
@@ -220,7 +221,7 @@ _KEPT_TASKS: Final = 4096
 class TaskRates:
     """Rates of running tasks, from the first and the latest observation of each.
 
-    The observations are a cache of one process; after its loss the rates are unknown for a second.
+    The observations are a cache of this process; without them the rates are unknown for about a second.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -242,7 +243,7 @@ class TaskRates:
 
 
 def stage_statuses(job: JobView, tasks: Sequence[TaskView], paces: TaskRates) -> list[StageStatus]:
-    """Return the stages of a job; `tasks` are its running tasks, and waiting ones that give a reason."""
+    """Return the stages of a job; `tasks` are its running tasks, and waiting ones that have a reason."""
     return [_status(stage, [task for task in tasks if task.stage is stage.stage], paces) for stage in job.stages]
 
 

@@ -45,7 +45,7 @@ _DAMAGE_SHOWN: Final = 5
 _FAILURES_SHOWN: Final = 4
 MINUTES: Final = 60
 _JOBS_WATCHED: Final = 20
-#: Least time between two computations of the fingerprint, for any number of watching pages [s].
+#: Least time between two computations of the fingerprint [s], for any number of open pages.
 FINGERPRINT_S: Final = 1.0
 
 
@@ -81,7 +81,7 @@ class Overview:
         ]
 
     def task_of(self, worker: Worker) -> TaskView | None:
-        """Return a worker's task; None for a check of an upload, which is no task of the index."""
+        """Return a worker's task; None for a check of an upload, which is not a task in the index."""
         if worker.state != "busy" or not worker.task_id:
             return None
         try:
@@ -147,7 +147,7 @@ class Overview:
         return digest_json({"stats": self.stats().model_dump(mode="json"), "workers": workers, "jobs": moving})
 
     def _seen(self, tasks: Iterable[str]) -> set[str]:
-        """Return those tasks that are in scope or belong to no job, such as the check of an upload."""
+        """Return the tasks that are in scope or belong to no job, such as checks of uploads."""
         wanted, scope = set(tasks), project_scope()
         return wanted if scope.everything else wanted - self._services.index.jobs.out_of_scope(wanted, scope)
 
@@ -171,7 +171,7 @@ class Probes:
         self._known: tuple[float, Health] | None = None
         self._hanging: dict[str, _Probe] = {}
         self._service: str | None = None
-        """Service that Redis belonged to at the last probe."""
+        """Service to which Redis belonged at the last probe."""
         self._lock = threading.Lock()
 
     def health(self) -> Health:
@@ -196,7 +196,7 @@ class Probes:
         return Health(ok=all(part.ok for part in parts.values()), parts=parts, controller=controller, workers=workers)
 
     def _redis(self) -> Part:
-        """Probe Redis; one of another service is not ready: its controller ignores the jobs of this one."""
+        """Probe Redis; that of another service is not ready, because its controller ignores jobs of this one."""
         part, service = _answering(self._services.queue.ping()), self._services.queue.service()
         if service != self._service:
             try:
@@ -209,7 +209,7 @@ class Probes:
         return part
 
     def _index(self) -> Part:
-        """Probe the index; an incomplete one is not ready, because jobs would appear to be missing."""
+        """Probe the index; an incomplete index is not ready, because jobs would appear to be missing."""
         part, made = _answering(self._services.index.database.ping()), self._services.index.notes.completeness()
         if made is None:
             return part.model_copy(update={"ok": False, "detail": _INCOMPLETE})
@@ -258,7 +258,7 @@ _COLUMNS: Final = tuple(UsageDay.model_fields)
 
 
 class Usage:
-    """Usage in the caller's scope: the key's project, or all with `admin`."""
+    """Usage in the caller's scope: the key's project, or all projects with `admin`."""
 
     def __init__(self, services: Services, keys: KeyFile) -> None:
         self._services = services

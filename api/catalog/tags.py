@@ -46,7 +46,7 @@ class Tags:
         return next(tag for tag in self.all() if tag.id == wanted)
 
     def of(self, grasps: Collection[Grasp]) -> dict[Grasp, list[str]]:
-        """Return the tag names of each of these grasps that has tags."""
+        """Return the tag names of each of the given grasps that has tags."""
         return self._services.index.tags.of(grasps, scope=project_scope())
 
     def chosen(self, selection: Selection) -> list[Grasp]:
@@ -85,7 +85,7 @@ class Tags:
         log.info("tag %s removed", name)
 
     def _mine(self, project: str) -> int:
-        """Return the number of tags of the project; without a project name, of the caller's key."""
+        """Return the number of tags of the project; for the unnamed project, of the caller's key."""
         found = self._services.index.tags.all(scope=ProjectScope(project, everything=False))
         return sum(bool(project) or may_change(tag.owner, tag.project) for tag in found)
 
@@ -114,7 +114,7 @@ class Export:
 
 
 class GraspExports:
-    """Writes selected grasps into files, which stay on the service's disk until they are sent."""
+    """Writes selected grasps to files, which stay on the service's disk until they are sent."""
 
     def __init__(self, services: Services, grasps: Grasps, tags: Tags) -> None:
         self._services = services
@@ -122,7 +122,7 @@ class GraspExports:
         self._tags = tags
 
     def made(self, places: Sequence[Grasp], format: Format, said: Mapping[str, Any]) -> Export:
-        """Write a file of these grasps, which must be visible to the caller; `said` describes the selection in it."""
+        """Write a file of these grasps, which must be visible to the caller; `said` describes the selection."""
         file = TemporaryFile()  # noqa: SIM115 (it is closed once it is sent)
         try:
             {"csv": self._csv, "json": self._json, "zip": self._zip}[format](file, places, said)

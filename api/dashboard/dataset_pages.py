@@ -29,7 +29,7 @@ from graspd.service.model.states import AssetKind, State
 from graspd.service.pipeline.datasets.spec import DatasetRequest
 
 PAGE_SIZE: Final = 20
-#: Largest matrix shown as a table; larger ones are shown as a paginated list, which is easier to read.
+#: Most cells of a matrix that is shown as a table; larger ones are shown as a paginated list.
 MATRIX_CELLS: Final = 1000
 _CELLS_AT_ONCE: Final = 200
 Fields = Annotated[FormData, fields_of(4000)]
@@ -149,7 +149,7 @@ def _jobs_of(jobs: Jobs, pairs: Iterable[tuple[str, str]], action: str) -> list[
 
 
 def _each(do: Callable[[Any], Any], wanted: Iterable[Any]) -> tuple[int, int]:
-    """Apply an action; return how often it succeeded, and how often owner or state did not allow it."""
+    """Apply an action; return the numbers of successes, and of refusals because of owner or state."""
     done = left = 0
     for one in wanted:
         try:

@@ -25,7 +25,7 @@ HEIGHT: Final = 160.0
 
 @dataclass(frozen=True)
 class Plot:
-    """Line or bars: SVG points for browsers without scripts, and numbers for the script."""
+    """Line or bars: SVG points for display without scripts, and numbers for the script."""
 
     label: str
     points: str
@@ -85,7 +85,7 @@ def minutes(values: Sequence[int], start: float) -> Plot:
 
 
 def bars(histogram: Histogram, path: str, where: dict[str, str]) -> list[Bar]:
-    """Return the bars of a histogram; each links to the page `path` of the grasps in its range and `where`."""
+    """Return the bars of a histogram; each links to the page `path` of grasps in the bar's range that match `where`."""
     width, top = (histogram.high - histogram.low) / len(histogram.counts), max(histogram.counts) or 1
     made = []
     for index, number in enumerate(histogram.counts):
@@ -110,7 +110,7 @@ class TwinBar:
 
 
 def twins(both: Sequence[Distribution | None]) -> list[TwinBar]:
-    """Return the bins of two distributions over the same range, as shares of their own grasps."""
+    """Return the bins of two distributions over the same range, each as shares of its own grasps."""
     first = next(each for each in both if each is not None)
     bins = len(first.counts)
     shares = [[n / each.count for n in each.counts] if each is not None else [0.0] * bins for each in both]
@@ -127,7 +127,7 @@ def _share(value: float, low: float, high: float) -> float:
 
 #: Steps of the colour scale; the style sheet has a class for each.
 STEPS: Final = 10
-#: Most objects on a page; those with jobs come first.
+#: Most objects on a page; objects with jobs come first.
 _ROWS: Final = 60
 
 
@@ -135,8 +135,8 @@ _ROWS: Final = 60
 class Tile:
     """One hand on one object.
 
-    `made` counts grasps of its `standing`; `share` is the valid share of the validated ones. The checkbox sends
-    `value`; the link is `href`."""
+    `made` counts grasps of status `standing`; `share` is the valid share of validated ones. The checkbox sends `value`;
+    the link is `href`."""
 
     hand: str
     object: str
@@ -151,7 +151,7 @@ class Tile:
     progress: float | None = None
     note: str = ""
     scene: str = "free"
-    """Kind of scene in which its grasps are valid."""
+    """Kind of scene for which the grasps are valid."""
 
     @property
     def shade(self) -> str:
@@ -302,7 +302,7 @@ def _panel(one: studies.StabilityMap, name: str) -> Panel:
     squares = {(cell.x, cell.y): _square(one, cell, ringed=one.is_divided and cell.reached) for cell in cells}
     line = one.lines.get(name, [])
     if any(isinstance(x, str) for x in xs):
-        # Words fit better before a row than under a narrow column.
+        # Texts fit better before a row than below a narrow column.
         rows = [(studies.tick(x), [squares.get((x, y)) for y in ys]) for x in xs]
         return Panel(name, one.y, one.x, [studies.tick(y) for y in ys], rows, "")
     upward = ys if all(isinstance(y, str) for y in ys) else ys[::-1]

@@ -1,8 +1,8 @@
-"""Hand and object of a job's form: a known one, or a file from the user.
+"""Hand and object of a job's form: a known asset, or a file from the user.
 
 The form shows exactly what the job will use. A refused file is neither dropped nor replaced by a known object: it stays
-in the store, the form refers to it, and the next submission checks it again with the form's options. Fixes suggested by
-a refusal are buttons of the form: users need not know options of the command line.
+in the store, the form refers to it, and the next submission checks it again with the form's options. Each fix suggested
+by a refusal is a button of the form, so users need no options of the command line.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from graspd.service.store.descriptions import json_object
 
 _CHECK_WAIT_S: Final = 15.0
 UNITS: Final = (("m", "metres"), ("mm", "millimetres"), ("cm", "centimetres"), ("in", "inches"))
-#: Text of a button, by the option that it sets.
+#: Text of each button, by the option that the button sets.
 _FIXES: Final = {
     "keep_largest": "Keep only the largest part",
     "compound": "Treat the parts as one rigid body",
     "allow_open": "Accept the open mesh",
 }
-#: Options with a value from the user: label of the field, its attributes, text of the button.
+#: Options with a value from the user: label and attributes of the field, text of the button.
 _ASKED: Final = {
     "scale_to": ("Longest side [mm]", 'type="number" min="1" max="3000" step="any"', "Scale to this size"),
     "root": ("Link", 'type="text" maxlength="200"', "Use as root link"),
@@ -45,17 +45,17 @@ class Fix:
     """Button that checks a refused file again."""
 
     value: str
-    """Keys of `asset.json` that it sets, as JSON; null stands for the value of the field beside the button."""
+    """Keys of `asset.json` that the button sets, as JSON; null means the value of the field next to the button."""
     words: str
     asks: str = ""
-    """Key whose value is in a field beside the button; empty: none."""
+    """Key whose value is in the field next to the button; empty: none."""
     label: str = ""
     attributes: str = ""
 
 
 @dataclass(frozen=True)
 class Refusal:
-    """Reason why a file cannot be used, as text for a page."""
+    """Reason why a file cannot be used, as texts for a page."""
 
     problem: str
     fixes: tuple[Fix, ...] = ()
@@ -66,18 +66,18 @@ class AssetChoice:
     """Hand or object of a form."""
 
     name: str = ""
-    """Name of the job's asset; empty: none yet."""
+    """Name of the job's asset; empty: not chosen yet."""
     refused: Refusal | None = None
     file: str = ""
     held: str = ""
-    """Digest of that file in the store; empty: it must be chosen again."""
+    """Digest of the refused file in the store; empty: the user must choose the file again."""
 
     def place(self, kind: AssetKind) -> str:
         return FILE_FIELDS[kind] if self.file else kind.value
 
 
 def chosen(request: Request, assets: Assets, fields: FormData, kind: AssetKind) -> AssetChoice:
-    """Return the hand or object of a submitted form: its file, a known one, or its refused file."""
+    """Return the hand or object of a submitted form: a new file, a known asset, or the refused file."""
     file, known = fields.get(FILE_FIELDS[kind]), _text(fields, kind.value)
     if isinstance(file, UploadFile) and file.filename:
         try:
@@ -144,7 +144,7 @@ def _store(request: Request, assets: Assets, kind: AssetKind, file: UploadFile, 
 
 
 def _again(assets: Assets, kind: AssetKind, digest: str, fields: FormData) -> AssetView:
-    """Store the file again with the units of the form, or with the options of the pressed button."""
+    """Store the refused file again, with the form's units or with the options of the pressed button."""
     before, said = assets.one(kind, digest), pressed(fields, kind)
     if not said and kind is AssetKind.OBJECT and (units := _units(fields)) != _text(fields, "held_units"):
         said = {"units": units}
@@ -173,7 +173,7 @@ def pressed(fields: FormData, kind: AssetKind) -> dict[str, Any]:
 
 
 def _checked(assets: Assets, asset: AssetView) -> AssetChoice:
-    """Wait briefly for the check of an upload, so that one press of the button is enough."""
+    """Wait briefly for the check of an upload, so that the user presses the button only once."""
     deadline = time.monotonic() + _CHECK_WAIT_S
     while asset.verdict is None and time.monotonic() < deadline:
         time.sleep(0.2)
@@ -184,7 +184,7 @@ def _checked(assets: Assets, asset: AssetView) -> AssetChoice:
 
 
 def choices(assets: Assets, kind: AssetKind, shown: str, one: AssetChoice) -> list[tuple[str, str]]:
-    """Return the names to choose from, always including the one that the form shows."""
+    """Return the names to choose from, including the name that the form shows."""
     known = asset_choices(assets, kind)
     if one.refused:
         return [("", f"your file {one.file} (refused)" if one.file else f"select a {kind.value}"), *known]
@@ -199,7 +199,7 @@ def asset_choices(assets: Assets, kind: AssetKind) -> list[tuple[str, str]]:
         known = assets.page(kind, limit=200).items
     except GraspdError:
         return []
-    # Of several versions of a name, use the newest.
+    # Use the newest version of each name.
     newest = {asset.name: asset for asset in reversed(known)}
     return [
         (name, name if one.builtin or one.verdict else f"{name} (being checked)")

@@ -1,4 +1,4 @@
-"""Form of a job: estimated cost for each fidelity; submit, cancel and retry. Needs no JavaScript."""
+"""Form of a job: estimated cost for each fidelity; submission, cancellation and retry. It needs no JavaScript."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ router = APIRouter(include_in_schema=False)
 
 
 def fields_of(most: int) -> Any:
-    """Return a dependency: the fields of a form, of which there may be at most this number."""
+    """Return a dependency that reads the fields of a form, at most `most`."""
 
     async def fields(request: Request) -> AsyncIterator[FormData]:
         async with request.form(max_fields=most) as found:
@@ -101,7 +101,7 @@ def refused(request: Request, kind: AssetKind, digest: str, assets: AssetsOf) ->
 async def submit(request: Request, jobs: JobsOf, assets: AssetsOf) -> HTMLResponse | RedirectResponse:
     async with request.form(max_files=2, max_fields=32) as fields:
         sent = any(isinstance(value, UploadFile) and value.filename for value in fields.values())
-        # A refused file that the form refers to is read and checked like an uploaded one.
+        # A refused file that the form refers to is read and checked like an upload.
         has_upload = sent or any(fields.get(f"{kind.value}_held") for kind in FILE_FIELDS)
         run = request.app.state.forms.run if has_upload else run_in_threadpool
         return await run(_submit, request, jobs, assets, fields)
@@ -131,12 +131,12 @@ def _submit(request: Request, jobs: Jobs, assets: Assets, fields: FormData) -> H
     }
     form |= {one.name: fields.get(one.name) == "true" for one in inputs_of() if one.kind == "checkbox"}
     things = {kind: chosen(request, assets, fields, kind) for kind in FILE_FIELDS}
-    # No default: a form that names no object gets none.
+    # No default, so that a form without an object has none.
     form |= {kind.value: one.name for kind, one in things.items()}
     shown = DEFAULTS | form | {"units": fields.get("units") or "m"}
     refused = {one.place(kind): one.refused.problem for kind, one in things.items() if one.refused}
     if any(fields.get(f"{kind.value}_fix") for kind in FILE_FIELDS):
-        # The button of a suggestion only shows its result; the next press submits.
+        # A suggestion's button only shows its result; the next press of the submit button submits.
         return _form(request, assets, shown, things=things, errors=refused, status=422 if refused else 200)
     try:
         named = {kind.value: one.name or "unnamed" for kind, one in things.items()}
@@ -157,7 +157,7 @@ def _by_field(error: ValidationError) -> dict[str, str]:
     errors: dict[str, str] = {}
     for entry in error.errors():
         said = words(entry)
-        # A rule over several fields has no field of its own; its message mostly starts with the name of one.
+        # An error about several fields has no field; its message mostly starts with the name of one.
         word = said.partition(" ")[0]
         whole = next((name for name in DEFAULTS if word in (name, name.rpartition("_")[2])), "scenes")
         errors.setdefault(str(entry["loc"][0]) if entry["loc"] else whole, said)
@@ -194,7 +194,7 @@ def _form(
     )
 
 
-#: Cache time [s]: costs of batches change slowly, and reading two thousand takes as long as a page may.
+#: Cache lifetime [s]: costs of batches change slowly, and reading two thousand of them is slow for a page.
 KEPT_S: Final = 60.0
 WORDS: Final = {
     "draft": "Fewest points and starts, for a first look.",
@@ -213,7 +213,7 @@ class FidelityPrice:
     """Time of one worker for the whole job [s]; None: unknown."""
     low: float | None
     high: float | None
-    """Interval of the time [s]."""
+    """Interval of the estimated time [s]."""
     valid_yield: float | None
     origin: str
 
@@ -224,7 +224,7 @@ def listed(text: str) -> list[str]:
 
 
 class Expectations:
-    """Estimates for the form of a job; its state is only a cache of the costs of batches."""
+    """Estimates for the form of a job; the only state is a cache of batch costs."""
 
     def __init__(self, index: Index) -> None:
         self._index = index
@@ -232,8 +232,8 @@ class Expectations:
         self._lock = threading.Lock()
 
     def of(self, form: Mapping[str, Any]) -> list[FidelityPrice]:
-        """Estimate every offered fidelity for a form; without numbers if that is not possible."""
-        # An empty field counts as not given.
+        """Estimate the cost of every offered fidelity for a form; without numbers if that is not possible."""
+        # Ignore empty fields.
         wanted = {
             key: value for key, value in form.items() if key not in ("hand", "object", "fidelity") and value != ""
         }

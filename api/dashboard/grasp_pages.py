@@ -28,11 +28,11 @@ from graspd.service.model.states import AssetKind
 
 PAGE_SIZES: Final = {"cards": 24, "table": 50}
 COLUMNS: Final = tuple((metric.name, metric.column_title, metric.unit) for metric in indexed(IndexLevel.OFFERED))
-#: Metrics of which less is better: the first click sorts them in ascending order.
+#: Metrics for which less is better: the first click sorts in ascending order.
 _LESS_IS_BETTER: Final = frozenset(metric.name for metric in indexed() if metric.less_is_better)
 _BESIDE_VERDICT: Final = frozenset({"contact_links", "robustness", "robust_share", "grasp_type", "approach_cell"})
 
-#: Difference along each axis of the models around the nominal one.
+#: Description of each axis along which models differ from the nominal one.
 _WEAKEST: Final = {axis.word: words for axis, words in AXIS_MEANINGS.items()}
 
 router = APIRouter(include_in_schema=False)
@@ -42,10 +42,10 @@ router = APIRouter(include_in_schema=False)
 def grasps_page(
     request: Request, grasps: GraspsOf, shards: ShardsOf, assets: AssetsOf, tags: TagsOf
 ) -> HTMLResponse | RedirectResponse:
-    """List all grasps with filters, order and pages. The URL contains them all, without empty fields."""
+    """List all grasps with filters, order and pages. The URL contains these settings, without empty fields."""
     given = {key: value for key, value in request.query_params.items() if value}
     if len(given) < len(request.query_params):
-        # Forms send every field; the URL that is shown and shared should be short.
+        # Forms send every field; the visible URL should be short.
         return RedirectResponse(f"/grasps?{urlencode(given)}" if given else "/grasps", status_code=303)
     said = did(given)
     cursor, view = given.pop("cursor", None), given.pop("view", "cards")
@@ -179,7 +179,7 @@ async def export(request: Request, tags: TagsOf, exports: ExportsOf, fields: Fie
 
 
 def did(given: dict[str, str]) -> str:
-    """Describe the result of the last action; remove its parameters from those of the URL."""
+    """Describe the result of the last action; remove the action's parameters from `given`."""
     what, done, name = (given.pop(key, "") for key in ("did", "done", "named"))
     if what not in _DONE or not (done.isascii() and done.isdigit()) or len(done) > 9:
         return ""
@@ -219,7 +219,7 @@ def _selection(fields: FormData) -> Selection:
 def _filter(fields: FormData) -> list[tuple[str, str]]:
     text = str(fields.get("filter", ""))
     try:
-        # A truncated filter would select more than the list shows.
+        # A truncated filter would select more grasps than the list shows.
         if len(text) > _LONGEST_FILTER:
             raise ValueError
         return parse_qsl(text, max_num_fields=100)

@@ -1,4 +1,4 @@
-"""Pages of hands: the list, and one hand in 3D with a form to correct its guesses."""
+"""Pages of hands: the list, and one hand in 3D with a form to correct guesses about it."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ router = APIRouter(prefix="/hands", include_in_schema=False)
 def hands_page(
     request: Request, assets: AssetsOf, cursor: Annotated[str | None, Query(max_length=512)] = None
 ) -> HTMLResponse:
-    """Refused hands are included: their page says why."""
+    """Refused hands are included; their pages state the reason."""
     page = assets.page(AssetKind.HAND, limit=PAGE_SIZE, cursor=cursor, refused=True)
-    # Facts mix data from the upload with findings of the check, so they may be of any type.
+    # Facts contain data from the upload as well as findings of the check, so they may be of any type.
     numbers = {
         hand.digest: [
             len(told) if isinstance(told, list) else 0 for told in map(hand.facts.get, ("dofs", "fingertips"))
@@ -106,7 +106,7 @@ def _page(
 
 
 def _facts(assets: Assets, hand: AssetView) -> tuple[HandFacts | None, str]:
-    """Return the facts of a hand, or why it cannot be shown; neither during its check."""
+    """Return the facts of a hand, or the reason why it cannot be shown; neither while its check runs."""
     try:
         return assets.hand_facts(hand), ""
     except NotFoundError:

@@ -97,15 +97,15 @@ def _pictures(job: JobDetail) -> list[dict[str, Any]]:
     ]
 
 
-#: Cached shards. One of 48 pictures takes a few megabytes; a page requests several pictures of it.
+#: Number of cached shards. A shard of 48 pictures takes a few megabytes; a page requests several of its pictures.
 _KEPT_SHARDS: Final = 2
-#: From near to far: light and warm to dark and cool, with monotonically falling lightness.
+#: Colours of depth from near to far: light and warm to dark and cool, with monotonically falling lightness.
 _DEPTH_COLOURS: Final = np.array(
     [(252, 244, 190), (250, 203, 116), (240, 148, 87), (205, 92, 103), (142, 58, 121), (78, 38, 108), (24, 18, 56)],
     np.float64,
 )
 _NOTHING: Final = (12, 15, 20)
-#: Background, table, object, then the neighbours.
+#: Colours of background, table, object, then of neighbours.
 _CLASSES: Final = np.array(
     [(24, 29, 33), (96, 108, 118), (23, 163, 152), (227, 171, 98), (88, 134, 214), (190, 98, 160), (150, 178, 82)],
     np.uint8,

@@ -1,6 +1,6 @@
 """Pages of the whole service: home, workers, charts, failure maps, usage, deletions, problem types, and the session.
 
-Sign-in with a key sets a signed cookie, which is valid as long as the key.
+Sign-in with a key sets a signed cookie, which is valid as long as the key is.
 """
 
 from __future__ import annotations
@@ -144,13 +144,13 @@ def stability_page(request: Request, store: StoreOf) -> HTMLResponse:
 
 
 def is_recent(worker: WorkerView) -> bool:
-    """Check whether to show a worker; a lost one remains for a while, so that its loss is noticed."""
+    """Check whether to show a worker; a lost worker stays visible for a while, so that users notice its loss."""
     age = datetime.now(UTC) - datetime.fromisoformat(worker.seen)
     return worker.state != "lost" or age < _LOST_SHOWN
 
 
 def stage_depths(overview: Overview) -> list[tuple[str, int]]:
-    """Return waiting tasks by stage; empty if Redis does not answer, which the page reports elsewhere."""
+    """Return waiting tasks by stage; empty if Redis does not answer, which another part of the page reports."""
     try:
         depths = overview.depths()
     except UnavailableError:
@@ -195,14 +195,14 @@ def usage_page(request: Request, usage: UsageOf, since: Since = None, until: Unt
     )
 
 
-#: Characters of a job's id that its page shows, and that confirm its deletion.
+#: Number of characters of a job's id that its page shows, and that confirm its deletion.
 SHORT_ID = 12
 Typed = Annotated[str, Form(max_length=64)]
 
 
 @router.get("/deleted", dependencies=READ)
 def deleted_page(request: Request, deletions: DeletionsOf, done: str = "") -> HTMLResponse:
-    """Show what can be restored; `done` is the id of the latest deletion."""
+    """Show the deletions that can be undone; `done` is the id of the latest deletion."""
     found = deletions.recent()
     return render(request, "deleted.html", found=found, just_now=next((one for one in found if one.id == done), None))
 

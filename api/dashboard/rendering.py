@@ -27,7 +27,7 @@ NAVIGATION: Final = (
     ("/chart", "Chart"),
     ("/stability", "Stability"),
 )
-#: Pages shown only if there are keys: then usage can be attributed.
+#: Pages shown only if there are keys, which usage is attributed to.
 _WITH_KEYS: Final = (("/usage", "Usage"),)
 
 
@@ -52,7 +52,7 @@ def render(request: Request, template: str, *, status: int = 200, **context: Any
         "navigation": NAVIGATION if request.app.state.keys.is_open else NAVIGATION + _WITH_KEYS,
         "version": PACKAGE_VERSION,
         "signed_in": not request.app.state.keys.is_open,
-        # Actions that the key does not permit have no button; the routes refuse them too.
+        # Actions that the key does not permit have no button; routes also refuse them.
         "may_submit": is_allowed(request, Scope.SUBMIT),
         "may_change": may_change,
         "grace_s": request.app.state.settings.shard_grace_s,
@@ -63,7 +63,7 @@ def render(request: Request, template: str, *, status: int = 200, **context: Any
 
 
 def base_url(request: Request) -> str:
-    """Return the address of the service as the visitor sees it, without a trailing slash."""
+    """Return the address of the service in the visitor's browser, without a trailing slash."""
     return f"{str(request.base_url).rstrip('/')}{request.app.state.settings.api_root_path or ''}"
 
 

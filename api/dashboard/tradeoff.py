@@ -1,6 +1,6 @@
 """Charts of speed against accuracy, published by `graspd chart`: read, aggregated, drawn as SVG.
 
-There is one for free objects and one for each kind of scene. They measure different tasks, so they share no points.
+There is one chart for free objects and one for each kind of scene: they measure different tasks.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _LEFT, _RIGHT, _TOP, _BOTTOM = 64, 24, 16, 46
 _LETTER, _LINE, _AWAY, _DOT = 6.9, 15.0, 12.0, 7.0
 #: Vertical offsets of a label from its point, in order of preference [px].
 _MOVES: Final = (0.0, 15.0, -15.0, 30.0, -30.0, 45.0, -45.0, 60.0, -60.0)
-#: Fidelity of methods that have none; their label is their name.
+#: Fidelity of methods without fidelities; their label is their name.
 _NO_FIDELITY: Final = "as published"
 
 
@@ -37,7 +37,7 @@ class Axis:
     unit: str = "%"
     more_is_better: bool = True
     factor: float = 100.0
-    """Factor from the stored number."""
+    """Factor on the stored number."""
 
 
 #: Accuracies of grasps around free objects, and of grasps in scenes; the first one is the default.
@@ -58,7 +58,7 @@ IN_SCENES: Final[dict[str, Axis]] = {
 
 
 class Run(BaseModel):
-    """One method at one fidelity on one hand and object; in scenes, planned there or filtered afterwards."""
+    """One method at one fidelity on one hand and object; in scenes, planned in the scene or filtered afterwards."""
 
     method: str
     fidelity: str
@@ -92,7 +92,7 @@ class Run(BaseModel):
 
     @property
     def found(self) -> int | None:
-        """Number of valid grasps, in a scene lifted ones; None in charts of graspd 0.1."""
+        """Number of valid grasps, in scenes of lifted grasps; None in charts of graspd 0.1."""
         return self.kept if self.lift_count is None else self.lift_count
 
     @property
@@ -101,7 +101,7 @@ class Run(BaseModel):
 
     @property
     def first_s(self) -> float | None:
-        """Time until the first of them [s]."""
+        """Time to the first of these grasps [s]."""
         return self.seconds_to_first_valid if self.seconds_to_first is None else self.seconds_to_first
 
 
@@ -159,7 +159,7 @@ class Drawing:
     y_ticks: list[tuple[float, str]]
     axis: Axis
     nothing: list[str]
-    """Methods and fidelities without a grasp: they have no place on an axis of speeds."""
+    """Methods and fidelities without a grasp, which have no speed."""
 
 
 def load(store: Store) -> list[Measured]:
@@ -219,7 +219,7 @@ def _point(runs: list[Run], axis: str, scale: float, names: list[str]) -> Point 
         fidelity=runs[0].fidelity,
         pairs=len(runs),
         speed=speed,
-        # For pairs without a grasp this time is unknown: a mean without them would be too favourable.
+        # The time of pairs without a grasp is unknown; a mean over the others would be too favourable.
         first_valid_s=sum(firsts) / len(firsts) if len(firsts) == len(runs) else None,
         accuracy=scale * sum(values) / len(values),
         series=names.index(runs[0].name) % 6,
@@ -229,7 +229,7 @@ def _point(runs: list[Run], axis: str, scale: float, names: list[str]) -> Point 
 def _speed(runs: Sequence[Run]) -> float:
     """Return the number of grasps found per second of total time; 0 if there are none.
 
-    Charts of graspd 0.1 contain only speeds. These differ by a factor between objects, so their mean is geometric.
+    Charts of graspd 0.1 contain only speeds. Speeds of objects differ by factors, so their mean is geometric.
     """
     if all(run.found is not None for run in runs) and (seconds := sum(run.seconds for run in runs)):
         return sum(run.found or 0 for run in runs) / seconds
@@ -245,7 +245,7 @@ def _labelled(points: list[Point]) -> list[Point]:
         offers = [(move, is_left) for move in _MOVES for is_left in (False, True)]
         boxes = [point.label_box(move, is_left=is_left) for move, is_left in offers]
         costs = [sum(_covered(box, other) for other in taken) + _outside(box) for box in boxes]
-        # Of equal places the first one, which is the nearest.
+        # Among equal places use the first one, which is the nearest.
         best = costs.index(min(costs))
         move, is_left = offers[best]
         taken.append(boxes[best])

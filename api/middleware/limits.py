@@ -1,7 +1,7 @@
-"""Limits of requests: rates and number at once for each caller, and permission, size and duration of bodies.
+"""Limits of requests: rate and concurrency for each caller; permission, size and duration of bodies.
 
-Rates follow GCRA (ITU-T I.371 annex A): a leaky bucket stored as one number per caller, the time at which the bucket is
-empty again. Requests in progress form a sorted set with an expiry time each, so that requests of a killed process
+Rates follow GCRA (ITU-T I.371 annex A): a leaky bucket, stored as one number per caller: the time at which the bucket
+is empty again. Requests in progress form a sorted set with an expiry time each, so that requests of a killed process
 expire. Times come from Redis's clock, so clocks of the API machines do not matter.
 """
 
@@ -31,16 +31,16 @@ from graspd.service.model.errors import LimitError
 from graspd.service.settings import Settings
 from graspd.service.telemetry import bind
 
-#: Paths that cost nothing and are polled often, by browsers and monitoring.
+#: Paths without limits: they are cheap, and browsers and monitoring poll them often.
 _FREE: Final = ("/static/", "/healthz", "/readyz")
 
 
 class RateLimit(HttpMiddleware):
     """Finds the key of a request (`scope["state"]["key"]`) and enforces the limits of that key.
 
-    A request without a key counts against its address. An open service serves one machine and counts nothing.
+    A request without a key counts against its address. An open service serves only one machine and has no limits.
 
-    Refusals are 429 with Retry-After; every counted answer carries RateLimit and RateLimit-Policy
+    Refusals are 429 with Retry-After; every counted response has RateLimit and RateLimit-Policy
     (draft-ietf-httpapi-ratelimit-headers-10).
     """
 
@@ -68,7 +68,7 @@ class RateLimit(HttpMiddleware):
         request = Request(scope)
         name = f"key:{key.name}" if key else f"address:{request.client.host if request.client else ''}"
         allowance = _allowance_of(key, self.settings)
-        # Not the request's id: a caller may choose that, and so count many requests as one.
+        # Not the request's id: a caller could choose equal ids, so that many requests count as one.
         number = uuid.uuid4().hex
         admission = await self.rates.enter(name, allowance, number)
         if admission is None:
@@ -85,7 +85,7 @@ class RateLimit(HttpMiddleware):
             if message["type"] == "http.response.start":
                 MutableHeaders(scope=message).update(headers)
             elif time.monotonic() - kept > HELD_S / 3:
-                # A long answer renews the request's entry.
+                # A long response renews the request's entry.
                 kept = time.monotonic()
                 await self.rates.keep(name, number)
             await send(message)
@@ -131,7 +131,7 @@ WINDOW_S: Final = 60
 #: A request without renewal for this long no longer counts as in progress [s].
 HELD_S: Final = 60.0
 _ANSWER_S: Final = 0.5
-#: Pause after a failure of Redis [s]: limits do not justify a delay of every request.
+#: Time without limits after a failure of Redis [s], because limits do not justify a delay of every request.
 _PAUSE_S: Final = 1.0
 
 _ENTER: Final = """
@@ -186,7 +186,7 @@ class Admission:
     refused: str
     remaining: int
     seconds: float
-    """Time until the full allowance is available again, or if refused, until a retry makes sense."""
+    """Time until the full allowance is available again; for a refused request, until a retry can succeed."""
 
 
 class Rates:
@@ -199,7 +199,7 @@ class Rates:
         self._silent_until = 0.0
 
     async def enter(self, caller: str, allowance: Allowance, request: str) -> Admission | None:
-        """Count a new request; None if nothing is limited or Redis does not answer."""
+        """Count a new request; None if there is no limit or Redis does not answer."""
         if allowance.per_minute <= 0 and allowance.concurrency <= 0:
             return None
         arguments = (allowance.per_minute, WINDOW_S, allowance.concurrency, request, HELD_S)
@@ -242,14 +242,14 @@ def _seconds_up(seconds: float) -> int:
     return max(1, math.ceil(seconds))
 
 
-#: Limit of a JSON body or a form without a file: job requests take a few hundred bytes.
+#: Size limit of a JSON body or a form without a file; job requests take a few hundred bytes.
 MAX_BODY_BYTES: Final = 1 << 20
 PIECE_S: Final = 30.0
-#: Least rate of a body; without it, single bytes would hold a connection forever [bytes/s].
+#: Least transfer rate of a body [bytes/s]; otherwise single bytes could keep a connection open forever.
 LEAST_BYTES_S: Final = 16 << 10
-#: Allowance for multipart framing and the other fields of an upload.
+#: Additional size for multipart framing and the other fields of an upload.
 _FORM_SLACK_BYTES: Final = 64 << 10
-#: Most digits of a Content-Length: Python parses thousands of digits slowly, or refuses them.
+#: Most digits of a Content-Length; Python parses thousands of digits slowly, or refuses them.
 _MOST_DIGITS: Final = 18
 
 
@@ -280,7 +280,7 @@ class BodyLimit(HttpMiddleware):
         async def counted() -> Message:
             nonlocal received, is_whole, refusal
             try:
-                # After the body, only a disconnect can arrive, and the answer may take any time.
+                # After the body only a disconnect can arrive, and the response may take any time.
                 async with asyncio.timeout(None if is_whole else self.piece_s):
                     message = await receive()
             except TimeoutError:
@@ -294,7 +294,7 @@ class BodyLimit(HttpMiddleware):
                 return {"type": "http.disconnect"}
             if received > limit:
                 refusal = _too_large(limit)
-                # Simulate a disconnect, so that the application stops; its answer is replaced below.
+                # Simulate a disconnect, so that the application stops; its response is replaced below.
                 return {"type": "http.disconnect"}
             return message
 
@@ -311,10 +311,10 @@ class BodyLimit(HttpMiddleware):
 
 
 def _body_refusal(scope: Scope, limit: int, *, is_upload: bool) -> Exception | None:
-    """Return why a body is refused before it is read; None: it is not."""
+    """Return the reason to refuse a body before it is read; None: no reason."""
     given = dict(scope["headers"])
     if b"transfer-encoding" in given and b"content-length" in given:
-        # Two lengths: a proxy may have used the other one, and the remainder would be read as the next request.
+        # With two lengths, a proxy may have used the other one: the rest would be parsed as the next request.
         return ApiError(400, "Transfer-Encoding and Content-Length exclude each other")
     encoding = given.get(b"content-encoding", b"").decode("latin-1").strip().lower()
     if encoding not in ("", "identity") and scope["method"] not in SAFE_METHODS:
@@ -328,7 +328,7 @@ def _body_refusal(scope: Scope, limit: int, *, is_upload: bool) -> Exception | N
         return _too_large(limit)
     if declared != b"0" or b"transfer-encoding" in given:
         try:
-            # Routes check further.
+            # Routes make further checks.
             if is_upload:
                 authorize(Request(scope), KeyScope.SUBMIT)
             elif scope["path"].startswith("/v1/"):

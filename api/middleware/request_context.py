@@ -1,7 +1,7 @@
 """Middleware of all routes: request ids, security headers, HEAD (RFC 9110 §9.3.2), prefix, origin.
 
-Inside, paths have no prefix. It is removed from incoming paths here, unless the proxy already did so, and added to
-addresses in response headers. Addresses in pages get it at rendering (`with_prefix`).
+The application's paths have no prefix. The prefix is removed from incoming paths here, unless the proxy already did so,
+and added to addresses in response headers. Rendering adds it to addresses in pages (`with_prefix`).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from graspd.service.telemetry import bind
 
 _access = logging.getLogger("graspd.access")
 _log = logging.getLogger("graspd.api")
-#: Paths that monitoring requests every few seconds.
+#: Paths that monitoring systems request every few seconds.
 _QUIET: Final = ("/static/", "/healthz", "/readyz", "/metrics")
 
 SAFE_METHODS: Final = frozenset({"GET", "HEAD", "OPTIONS"})
@@ -48,7 +48,7 @@ _SECURITY_HEADERS: Final = {
 
 
 class HttpMiddleware:
-    """Middleware of HTTP requests; the start and the end of the application pass it."""
+    """Middleware of HTTP requests; lifespan events of the application pass unchanged."""
 
     def __init__(self, app: ASGIApp) -> None:
         self.app = app
@@ -142,7 +142,7 @@ class Head(HttpMiddleware):
             nonlocal is_over
             if message["type"] == "http.response.start":
                 await send(message)
-                # An endless stream needs the disconnect; an answer with a length closes its files itself.
+                # An endless stream needs the disconnect; a response with a length closes its files.
                 is_last = all(name.lower() != b"content-length" for name, _ in message["headers"])
             else:
                 is_last = not message.get("more_body", False)
@@ -158,7 +158,7 @@ class Head(HttpMiddleware):
             scope["method"], scope["headers"] = "HEAD", headers
 
 
-#: Attribute whose value is an address on this host. Text from users contains no quotes in a page.
+#: HTML attributes whose value is an address on this host. In a page, texts from users contain no quotes.
 _ADDRESS: Final = re.compile(r'(?<=\s)((?:href|src|action|formaction|hx-[a-z-]+|data-[a-z-]+)=")(?=/(?!/))')
 _COOKIE_PATH: Final = re.compile(r";\s*Path=/(?=;|$)", re.IGNORECASE)
 
@@ -206,7 +206,7 @@ class SameOrigin(HttpMiddleware):
     """Refuses requests that a page of another site triggers in a visitor's browser.
 
     Browsers send the origin of the requesting page (Sec-Fetch-Site, Origin); other clients do not. While no keys
-    exist, only names of this machine are accepted as host, which prevents DNS rebinding.
+    exist, only names of this machine are accepted as the host, to prevent DNS rebinding.
     """
 
     def __init__(self, app: ASGIApp, *, allowed_hosts: frozenset[str] | None) -> None:

@@ -34,7 +34,7 @@ from graspd.service.model.states import AssetKind
 from graspd.service.store.descriptions import HandCorrections
 
 _GLB: Final = "model/gltf-binary"
-#: Uploads unpacked and packed at once in this process; each may hold one file of its size in memory.
+#: Most uploads unpacked and packed at once in this process; each may need the size of one of its files in memory.
 _AT_ONCE: Final = BoundedSemaphore(UPLOADS)
 _TURN_S: Final = 20.0
 
@@ -155,9 +155,11 @@ def store_upload(
     options: str = "",
     **said: bool,
 ) -> AssetView:
-    """Store an asset of immutable content and its check task. Until then the upload is a temporary file.
+    """Store an upload as an asset with immutable content, and its check task. Before that the upload is a temporary
+    file.
 
-    `said`: `self_test`, `shared` and `rename`, as in `Assets.add`. The number of uploads bounds the memory they use.
+    `said`: `self_test`, `shared` and `rename`, as in `Assets.add`. The number of uploads is limited, which bounds their
+    memory.
     """
     filename = file.filename or ""
     with _one_of_few():

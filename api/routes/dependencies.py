@@ -66,7 +66,7 @@ SUBMIT: Final = [Depends(may_submit)]
 
 
 def may_scrape(request: Request) -> None:
-    """Allow callers that may read; or everyone, if the settings say so."""
+    """Allow callers that may read, or all callers if the settings permit it."""
     if request.app.state.settings.metrics_need_key:
         authorize(request, Scope.READ)
 
@@ -119,14 +119,14 @@ PagingOf = Annotated[Paging, Depends(_paging)]
 
 
 def next_address(request: Request, cursor: str) -> str:
-    """Return path and query of the page at a cursor."""
+    """Return path and query of the page that starts at a cursor."""
     url = request.url.include_query_params(cursor=cursor)
     return f"{url.path}?{url.query}"
 
 
-#: Uploads unpacked and packed at once; each may hold one file of its size in memory.
+#: Most uploads unpacked and packed at once; each may need the size of one of its files in memory.
 UPLOADS: Final = 4
-#: Forms with an upload at once: they also wait for its check.
+#: Most forms with an upload at once; they also wait for the check of the upload.
 FORMS: Final = 8
 EXPORTS: Final = 2
 _MOST_WAITING: Final = 32
@@ -168,7 +168,7 @@ _TAGS: Final = re.compile(r'\s*((?:W/)?"[^"]*")\s*(?:,|$)')
 
 
 def is_known(headers: Headers, etag: str) -> bool:
-    """Check whether If-None-Match names the strong tag of this file, so that the answer is 304."""
+    """Check whether If-None-Match has the strong tag of this file, so that the response is 304."""
     given = headers.getlist("if-none-match")
     return any(value.strip() == "*" for value in given) or etag in {
         tag.removeprefix("W/") for value in given for tag in _TAGS.findall(value)
@@ -176,6 +176,6 @@ def is_known(headers: Headers, etag: str) -> bool:
 
 
 def range_applies(headers: Headers, etag: str) -> bool:
-    """Check whether Range applies: If-Range is absent or names this file. No dates are sent or matched."""
+    """Check whether Range applies: If-Range is absent or has this file's tag. Dates are neither sent nor matched."""
     given = headers.get("if-range")
     return given is None or given.strip() == etag

@@ -82,7 +82,7 @@ def delete(job_id: str, jobs: JobsOf) -> None:
 
 
 def known_job(job_id: str, jobs: JobsOf) -> None:
-    """Refuse an unknown job before its event stream starts: afterwards the status cannot change."""
+    """Refuse an unknown job before its event stream starts, because the HTTP status cannot change later."""
     jobs.moving(job_id)
 
 
@@ -101,7 +101,7 @@ async def watch(job_id: str, request: Request, jobs: JobsOf) -> AsyncIterable[Se
 shard_router = APIRouter(prefix="/v1/shards", tags=["shards"])
 
 _MEDIA_TYPE = "application/x-hdf5"
-#: No file size has more than 18 digits; a longer number is no valid range, and the whole file is sent.
+#: Most digits of a file size. A longer number in a range is invalid, and the whole file is sent.
 _RANGE = re.compile(r"bytes=([0-9]{0,18})-([0-9]{0,18})")
 
 

@@ -76,7 +76,7 @@ usage_router = APIRouter(tags=["usage"])
 
 
 def _day(said: object) -> object:
-    """Reject numbers, which would be seconds since 1970, and times, which would be cut to their day."""
+    """Reject numbers, which would mean seconds since 1970, and times, which would be reduced to their day."""
     if isinstance(said, str) and not re.fullmatch(r"[0-9]{4}-[0-9]{2}-[0-9]{2}", said):
         raise ValueError("a day is written as 2026-01-31")
     return said
@@ -112,7 +112,7 @@ Name = Annotated[str, Path(max_length=64, description="its name, or its id")]
 
 @deletion_router.get("/v1/deletions", dependencies=READ)
 def list_deletions(deletions: DeletionsOf) -> list[DeletionView]:
-    """List what can be restored, newest first."""
+    """List deletions that can be undone, newest first."""
     return deletions.recent()
 
 

@@ -21,9 +21,9 @@ class Closing:
     """Closing motion of a hand; D dofs, L bodies."""
 
     direction: wp.array(dtype=wp.float32)  # (D,) -1, 0, +1
-    moves: wp.array2d(dtype=wp.int32)  # (D, L): 1 where the dof moves the body
+    moves: wp.array2d(dtype=wp.int32)  # (D, L): 1 if the dof moves the body
     lever: wp.array2d(dtype=wp.float32)  # (D, L): upper bound on the motion of a body's points per unit of the dof
-    finger: wp.array(dtype=wp.int32)  # (D,) dofs with a common body share a number
+    finger: wp.array(dtype=wp.int32)  # (D,) group number, equal for dofs that move a common body
     lower: wp.array(dtype=wp.float32)
     upper: wp.array(dtype=wp.float32)
 
@@ -67,7 +67,7 @@ def object_to_pieces(
     # Data out:
     near_inout: wp.array2d(dtype=wp.float32),
 ):
-    """Lower these distances by object samples within `margin`, for edges between points. Over (B, P)."""
+    """Reduce these distances by object samples within `margin`, for edges between hand points. Over (B, P)."""
     b, piece = wp.tid()
     if active_in[b] == 0:
         return
@@ -126,7 +126,7 @@ def nearest_of(
     near: wp.array2d(dtype=wp.float32),
     pair: wp.array3d(dtype=wp.float32),
 ):
-    """Return the distance of a body to obstacles of dof d; each of two fingers gets half their gap."""
+    """Return the distance of a body from obstacles to dof d; of a gap between two fingers, each gets one half."""
     least = near[b, body]
     for other in range(near.shape[1]):
         if closing.moves[d, other] == 0:
@@ -150,7 +150,7 @@ def close(
     stopped_inout: wp.array2d(dtype=wp.int32),
     q_inout: wp.array2d(dtype=wp.float32),
 ):
-    """Stop dofs that move a touching body; close the others less than any point's gap. Launch over B.
+    """Stop dofs that move a touching body; close the others by less than any point's gap. Launch over B.
 
     The points of body a move by at most the sum of lever[d, a] |dq_d| over the closing dofs d. With one step for all
     dofs of a finger, step = share * gap / sum lever, no contact is skipped (conservative advancement).
@@ -202,7 +202,7 @@ def advance(
     active_inout: wp.array(dtype=wp.int32),
     pivot_inout: wp.array(dtype=wp.vec3),
 ):
-    """Move the hand along its approach to `standoff` between its nearest body and the object. Over B."""
+    """Move the hand along its approach until its nearest body is `standoff` from the object. Over B."""
     b = wp.tid()
     if active_inout[b] == 0:
         return

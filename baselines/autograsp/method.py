@@ -1,7 +1,7 @@
-"""GraspIt!'s autograsp: a random free start, an approach to the object, fingers close until contact.
+"""GraspIt!'s autograsp: random collision-free start, approach to the object, closing of the fingers until contact.
 
-GraspIt! closes joints in small steps and goes back after a collision. Here the steps follow from distances, with the
-same result, contact within `TOUCH_M`, and no tunnelling.
+GraspIt! closes joints in small steps and moves back after a collision. Here step lengths follow from distances. The
+result is the same, contact within `TOUCH_M`, and no step tunnels through the object.
 """
 
 from __future__ import annotations
@@ -68,13 +68,13 @@ METHOD: Final = Method(
     uses=("face_error_m",),
 )
 
-#: Contact: GraspIt!'s threshold layer [m].
+#: Largest distance of a contact: GraspIt!'s threshold layer [m].
 TOUCH_M: Final = 2e-4
-#: Largest distance that is computed [m].
+#: Larger distances count as this [m].
 REACH_M: Final = 0.03
-#: Gap between fingers below which they slow each other [m].
+#: Fingers with a smaller gap reduce each other's steps [m].
 MARGIN_M: Final = 0.005
-#: Share of a gap crossed in one step: large distances come from a grid with errors up to a third.
+#: Share of a gap that is crossed in one step: large distances come from a grid with errors up to a third.
 SHARE: Final = 0.6
 #: Longest closing step [rad], and largest number of steps.
 LARGEST: Final = 0.1
@@ -100,7 +100,7 @@ def levers(hand: HandModel, points: SurfacePoints) -> Floats:
 
 
 def finger_groups(moves: NDArray[np.bool_]) -> NDArray[np.int32]:
-    """Return (D,) numbers, equal for dofs that move a common body, from (D, L)."""
+    """Return group numbers (D,), equal for dofs that move a common body; `moves` is (D, L)."""
     group = np.arange(len(moves))
     for d in range(len(moves)):
         for e in range(d):
@@ -111,7 +111,7 @@ def finger_groups(moves: NDArray[np.bool_]) -> NDArray[np.int32]:
 
 @dataclass(frozen=True)
 class ClosedHands:
-    """Hands after closing, and the reason why each dof stopped: (B, D) 0 none, 1 contact, 2 its limit."""
+    """Hands after closing, and why each dof stopped (B, D): 0 not stopped, 1 contact, 2 limit."""
 
     state: HandState
     stopped: NDArray[np.int32]
@@ -124,7 +124,7 @@ class HandCloser:
         self.pair, self.capacity = pair, capacity
         self.hand = pair.hand.model
         self.model = Model.create(pair.hand, pair.fine.obj, pair.fine.points, pair.coarse.own, pair.options)
-        # Only the kinematics runs.
+        # Only kinematics is computed.
         self.data = Data(self.model, capacity)
         self._poses = Launches(self.model.device)
         add_poses(self._poses, self.model, self.data)
@@ -165,7 +165,7 @@ class HandCloser:
         return self.data.state(n)
 
     def close(self, state: HandState) -> ClosedHands:
-        """Close fingers until contact or limits; the root and dofs that do not close (spreads) stay."""
+        """Close fingers until contact or limits; the root and dofs that do not close (spreads) do not move."""
         n, data = len(state.pivot), self.data
         data.set_state(state)
         idle = np.tile((self.hand.closing == 0).astype(np.int32) * 2, (self.capacity, 1))

@@ -26,7 +26,7 @@ W_DISTANCE = wp.constant(100.0)
 W_PENETRATION = wp.constant(100.0)
 W_SELF = wp.constant(10.0)
 W_JOINTS = wp.constant(1.0)
-#: Key points of the hand nearer than this count as self-penetration [m].
+#: Key points of the hand closer than this to each other count as self-penetration [m].
 GAP = wp.constant(0.02)
 STEP0 = wp.constant(0.005)
 STEP_EVERY = wp.constant(50.0)
@@ -36,7 +36,7 @@ COOL = wp.constant(0.95)
 MU = wp.constant(0.98)
 #: Probability of a new contact.
 SWAP = wp.constant(0.5)
-#: Largest distance that is computed [m].
+#: Larger distances count as this [m].
 FAR = wp.constant(1.0)
 
 
@@ -72,8 +72,8 @@ def propose(
 ):
     """Step down the gradient, redraw each contact with probability 1/2, reset energies. Launch over B.
 
-    The source divides by the root mean square over its batch. Here it is taken over translation, rotation and joints of
-    the grasp itself (columns 0 to 2 of `moment`), so that grasps of a batch are independent.
+    The published code divides by the root mean square over its batch. Here it is the one over translation, rotation and
+    joints of each grasp (columns 0 to 2 of `moment`), so that grasps of a batch are independent.
     """
     b = wp.tid()
     it = iteration_in[0]
@@ -176,7 +176,7 @@ def penetration(
         if in_box(local, half):
             nd = piece_distance(pieces_in, piece, local)
             if nd[3] < 0.0:
-                # Motion of the body along the face's normal deepens the sample.
+                # Motion of the body along the face's normal increases the sample's depth.
                 f = W_PENETRATION * wp.quat_rotate(q, wp.vec3(nd[0], nd[1], nd[2]))
                 total -= nd[3]
                 force += f

@@ -1,6 +1,6 @@
 """Differentiable force closure: DexGraspNet's starts around the convex hull, then annealed descent.
 
-All hands are returned; info contains which of them the source would accept.
+All hands are returned; `info` lists those that the published code would accept.
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ from graspd.worker.simulation.launches import Launches
 from graspd.worker.simulation.model import Model
 from graspd.worker.simulation.record import add_poses, add_root_gradient
 
-#: Bounds of the source on force closure, distance and penetration.
+#: Bounds of the published code on force closure, distance and penetration.
 PASSES: Final = (0.3, 0.005, 0.001)
-#: Distance of the palm from the hull [m]: the source puts the root, a palm's length behind, at 0.2 to 0.3.
+#: Distance of the palm from the hull [m]: the published code puts the root, one palm length behind, at 0.2 to 0.3.
 DISTANCE: Final = (0.1, 0.2)
 #: Largest tilt of the approach from the hull's normal [rad].
 TILT: Final = np.pi / 6
@@ -110,10 +110,10 @@ def _start(hand: HandModel, obj: ObjectModel, rng: np.random.Generator) -> tuple
 
 Ints = NDArray[np.int32]
 
-#: Contact candidates on each link and on the palm.
+#: Number of contact candidates on each link and on the palm.
 EACH: Final = 12
 ON_PALM: Final = 24
-#: Object samples used for penetration.
+#: Number of object samples for penetration.
 SAMPLES: Final = 2000
 #: Energies: force closure, distance, penetration, self-penetration, joint limits.
 TERMS: Final = 5
@@ -122,7 +122,7 @@ INFINITE: Final = 1e30
 
 
 def key_points(hand: HandModel) -> tuple[Ints, Floats, Ints, Ints]:
-    """Return bodies (K,), piece centres (K, 3), and the pairs to separate: those not close at rest."""
+    """Return bodies (K,), piece centres (K, 3), and the pairs that repel each other: those not close at rest."""
     body = np.array([piece.body for piece in hand.pieces], np.int32)
     place = np.array([piece.vertices.mean(axis=0) for piece in hand.pieces])
     rest = apply(body_poses(hand, IDENTITY_POSE, hand.expand(hand.preshape))[0][body], place)
@@ -145,7 +145,7 @@ class Descent:
         hand = pair.hand.model
         self.obj = pair.fine.obj.thinned(SAMPLES)
         self.candidates = inside_points(hand, each=EACH, on_palm=ON_PALM)
-        # Contains the proposals; only its kinematics runs.
+        # Model of the proposals; only its kinematics is computed.
         self.model = Model.create(pair.hand, self.obj, pair.coarse.points, pair.coarse.own, pair.options)
         self.proposal = Data(self.model, self.n)
         self.device = self.model.device

@@ -5,9 +5,9 @@ object's surface, dilated by r, exerts the force
 
     f = -k c n - min(kf |v_t|, mu k c) v_t / |v_t|,   c = max(r - d, 0).
 
-The relaxation gives every point and velocity its own force F. Two descents alternate: F moves to the nearest forces
-that stop the object (`relax`), and the hand moves so that contact forces become F, by the gradient of sum |f - F|^2.
-Points without contact leak a share of that gradient, which attracts them.
+In the relaxation every point and velocity has its own force F. Two descents alternate: F moves to the nearest forces
+that stop the object (`relax`), and the hand moves so that contact forces approach F, by the gradient of sum |f - F|^2.
+Points without contact get a share of that gradient (leak), which attracts them.
 """
 
 import warp as wp
@@ -31,7 +31,7 @@ class ForceModel:
     tolerance: wp.float32  # residual below which the object counts as stopped [N]
     damping: wp.float32
     rate: wp.float32  # of forces and multipliers
-    warmup: wp.float32  # iterations over which rates grow to their final value
+    warmup: wp.float32  # number of iterations in which rates grow to their final value
 
 
 @wp.func
@@ -161,7 +161,7 @@ def relax(
         t = wp.cross(x, force) / physics.gyration
         wp.atomic_add(total_inout, b, j, vec6(force[0], force[1], force[2], t[0], t[1], t[2]))
         slope_sum += 2.0 * wp.dot(actual - force, force_slope(physics, depth, n, v))
-    # The depth falls as the distance grows.
+    # The depth decreases as the distance grows.
     g_distance = -slope_sum
     if g_distance != 0.0 and sample.distance < 1.0e2:
         f = g_distance * n

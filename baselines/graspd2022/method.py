@@ -1,6 +1,6 @@
-"""Grasp'D: free starts, descent with relaxed forces, no selection and no repair, as in the source.
+"""Grasp'D: collision-free starts and descent with relaxed forces; no selection or repair, as published.
 
-The object is a grid of signed distances with trilinear interpolation: the error is of second order in the cell size.
+The object is a grid of signed distances with trilinear interpolation; its error is of second order in the cell size.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class Search:
         self.points = sample_surface(pair.hand.model, POINTS)
 
     def run(self, starts: HandState, *, steps: int, tell: StepCounter) -> tuple[HandState, Floats]:
-        """Return hands after `steps` iterations, and their force residuals of the task, (n,), relative to 1."""
+        """Return hands after `steps` iterations, and the force residuals (n,) of their tasks; 1: no contact force."""
         n = len(starts.pivot)
         back = quat_rotate(starts.rotation, self.pair.hand.model.palm.approach)
         batch = _Batch(self, replace(starts, pivot=starts.pivot - BACKOFF_M * back), steps)
@@ -89,9 +89,9 @@ METHOD: Final = Method(
     uses=("face_error_m",),
     quick={"steps": 60},
 )
-#: Hand points: the source's hand has 778 vertices.
+#: Number of hand points: the published hand has 778 vertices.
 POINTS: Final = 778
-#: The source's constants, SI units: stiffness, viscous friction, friction, time step, speed, mass.
+#: Published constants in SI units: stiffness, viscous friction, friction, time step, speed, mass.
 STIFFNESS: Final = 1e5
 VISCOUS: Final = 1e3
 FRICTION: Final = 0.5
@@ -107,7 +107,7 @@ FORCE_RATE: Final = 1e-2
 RATES: Final = (1e-3, 2e-3, 3e-3)
 BETAS: Final = (0.9, 0.999)
 WARMUP: Final = 200
-#: Initial distance of the dilated object from the hand [m], and of hands behind the nearest free place [m].
+#: Initial distance of the dilated object from the hand, and of hands beyond their nearest free place [m].
 APART_M: Final = 0.01
 BACKOFF_M: Final = 0.05
 CHUNK: Final = 25
@@ -116,7 +116,7 @@ PAD_M: Final = 0.10
 
 
 def schedule(steps: int) -> Schedule:
-    """Return the schedule: dilation falls to 0 over the first half; rates grow over `WARMUP` iterations."""
+    """Return the schedule: dilation falls to 0 over the first half; rates grow during the first `WARMUP` iterations."""
     at = np.arange(steps)
     dilation = MAX_DILATION * np.clip(1.0 - at / max(0.5 * steps, 1.0), 0.0, 1.0)
     rates = np.minimum(at / WARMUP, 1.0)[:, None] * np.array(RATES)

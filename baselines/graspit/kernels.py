@@ -22,18 +22,18 @@ from graspd.worker.simulation.kernels.surface import Surface, field_distance
 
 wp.set_module_options({"enable_backward": False})
 
-#: First value of the counter: with 70,000 steps a planner makes 40,000 moves.
+#: Initial value of the counter k: with 70,000 steps a planner makes 40,000 moves.
 FIRST_STEP = 30_000
 VARIABLES = wp.constant(8)
 T0 = wp.constant(1e6)
 C = wp.constant(7.0)
 ROOT = wp.constant(1.0 / 8)
 SCALE = wp.constant(1e-6)
-#: Most neighbours drawn for one step until one is collision-free; without one the step does not count.
+#: Most draws of a collision-free neighbour per step; if all fail the step does not count.
 TRIES = wp.constant(11)
-#: Most draws of one variable until it is inside its bounds.
+#: Most draws of one variable for a value inside its bounds.
 REDRAWS = wp.constant(100)
-#: Largest distance that is computed [m].
+#: Larger distances count as this [m].
 FAR = wp.constant(1.0)
 vec8 = wp.types.vector(length=8, dtype=wp.float32)
 
@@ -129,7 +129,7 @@ def clashes(problem: Problem, x: vec8):
 
 @wp.func
 def inside(problem: Problem, point: wp.vec3):
-    """Return 1 for a point inside the object; the grid decides where it is certain."""
+    """Return 1 for a point inside the object; the grid decides clear cases."""
     coarse = field_distance(problem.surface, point).distance
     if coarse > problem.surface.field_error:
         return 0
@@ -278,7 +278,7 @@ def begin(
 
 @wp.func
 def unlikeness(problem: Problem, x: vec8, y: vec8):
-    """Return the mean difference of two states over their largest jumps."""
+    """Return the mean difference of two states, relative to the largest jumps."""
     total = float(0.0)
     for i in range(VARIABLES):
         apart = wp.abs(x[i] - y[i])
@@ -298,7 +298,7 @@ def remember(
     best: wp.array2d(dtype=vec8),
     best_energy: wp.array2d(dtype=wp.float32),
 ):
-    """Insert a better state into the list of the best; it replaces a near-duplicate, else the worst."""
+    """Insert a better state into the list of best states; it replaces a near-duplicate, or else the worst state."""
     row = wp.int32(0)
     for k in range(best_energy.shape[1]):
         if best_energy[b, k] > best_energy[b, row]:

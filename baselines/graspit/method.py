@@ -1,11 +1,11 @@
 """GraspIt!'s annealing: one chain per grasp over eigengrasps, then autograsp from its best state.
 
-Virtual contacts are a few points of a hand: two on each link's inner side, and on the palm. GraspIt! ships them as
-files for its own hands; here they are computed for any hand.
+Virtual contacts are a few points of a hand: two on each link's inner side, and some on the palm. GraspIt! has files of
+them for its own hands; here they are computed for any hand.
 
 GraspIt! has eigengrasps for Barrett (spread; all fingers) and the human hand (flexion of the knuckles with a little of
 the distal joints; knuckles against distal joints), none for Allegro or Shadow. Here a hand with one closing dof per
-finger gets Barrett's, any other the human hand's, by the position of a joint along its finger.
+finger uses Barrett's. Any other hand uses the human hand's, by the position of each joint along its finger.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from graspd.worker.simulation.record import record_placement
 
 
 class Search:
-    """Simulated annealing of one hand on one object; chains share everything but their states."""
+    """Simulated annealing of one hand on one object; chains differ only in their states."""
 
     def __init__(self, pair: Pair) -> None:
         self.pair, self.hand = pair, pair.hand.model
@@ -74,8 +74,8 @@ class Search:
         """Return the `keep` best states of each chain, best first, grouped by chain.
 
         Args:
-            seeds: of the chains.
-            steps: counter of the schedule at which a chain ends.
+            seeds: seeds of the chains.
+            steps: value of the schedule's counter at which a chain ends.
             keep: length of the list of best states.
             tell: called with one unit of work per move.
 
@@ -160,18 +160,18 @@ PLACE_JUMP: Final = 0.15
 ANGLES: Final = ((0.0, np.pi), (-np.pi, np.pi), (0.0, np.pi))
 ANGLE_JUMPS: Final = (np.pi / 5, np.pi / 2, np.pi / 2)
 PHI: Final = 4
-#: Postures per side of the self-collision test, and the overlap of real hand models at rest [m].
+#: Grid size per amplitude of the self-collision test, and tolerated overlap, present in real hand models at rest [m].
 CLASH_GRID: Final = 49
 CLASH_M: Final = 2e-3
-#: Uniform draws for a legal start, and rounds between two checks for cancellation.
+#: Number of uniform draws for a legal start, and of rounds between two checks for cancellation.
 START_TRIES: Final = 5000
 ROUNDS: Final = 500
-#: Rounds without a free neighbour also count, up to this multiple of the moves.
+#: Limit on rounds, as a multiple of the moves; rounds without a free neighbour count.
 PATIENCE: Final = 3
-#: Two states of the list are near-duplicates below this (GraspIt!).
+#: Two states with a smaller difference are near-duplicates (GraspIt!).
 ALIKE: Final = 0.2
 NOT_YET: Final = 1e9
-#: Contacts on each link that closes, and on the palm.
+#: Number of virtual contacts on each closing link, and on the palm.
 EACH: Final = 2
 ON_PALM: Final = 3
 
@@ -192,7 +192,7 @@ def clash_grid(pair: Pair, eigen: Eigengrasps) -> NDArray[np.int32]:
 
 
 def _sorted(best: Floats, energy: Floats, begun: Floats) -> Floats:
-    """Return (chains * keep, 8) best states first; missing ones are the chain's best, or its start."""
+    """Return states (chains * keep, 8), best first; missing states are copies of the chain's best, or its start."""
     out = np.empty_like(best)
     for c, (states, energies) in enumerate(zip(best, energy, strict=True)):
         found = [k for k in np.argsort(energies, kind="stable") if energies[k] < NOT_YET / 2]
@@ -219,7 +219,7 @@ class Eigengrasps:
     directions: Floats
     """(2, D)"""
     limits: Floats
-    """(2, 2) least and largest amplitude of each, beyond which no joint moves"""
+    """(2, 2) least and largest amplitude of each direction, beyond which no joint moves"""
 
     def posture(self, amplitudes: Floats, hand: HandModel) -> Floats:
         return np.clip(self.origin + np.asarray(amplitudes) @ self.directions, hand.lower, hand.upper)

@@ -1,1 +1,1 @@
-"""Grasps that a network proposes from a camera's view of the object, optimised by fast_graspd."""
+"""Grasps proposed by a network from a camera's view of the object and optimised by fast_graspd."""

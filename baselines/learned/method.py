@@ -50,7 +50,7 @@ class LearnedPlanner:
         return plan(hand, obj, wanted, run, warm=self._seeds(hand))
 
     def joined(self, hand: HandModel, obj: ObjectModel, asked: Sequence[BatchRequest]) -> list[GraspSet | Exception]:
-        """See `worker.planners.Joined`."""
+        """See `worker.planners.port.BatchPlanner`."""
         return plan_joined(hand, obj, asked, warm=self._seeds(hand))
 
     def _seeds(self, hand: HandModel) -> Seeds:
@@ -76,9 +76,9 @@ METHOD: Final = Method(
     files={"network": keep_file},
 )
 
-#: Steps back along the approach while the hand collides [m].
+#: Retreat steps along the approach for a hand in collision [m].
 RETREATS: Final = (0.0, 0.01, 0.02, 0.035, 0.055, 0.08)
-#: Proposals of a grasp, divided among its starts: the number computed at once.
+#: Number of proposals per grasp, computed at once and divided among its starts.
 PROPOSALS: Final = 32
 #: Largest distance of a start's palm from the object's bounding ball [m].
 FAR_M: Final = 0.15
@@ -125,7 +125,7 @@ class Seeds:
     def _proposed(
         self, model: Model, generators: list[np.random.Generator], each: int, placed: PlacedGrasps
     ) -> tuple[HandState, Floats]:
-        """Return proposed open hands (n * draws) by start, and (n * draws, 3) directions out; object frame."""
+        """Return open hands (n * draws), grouped by start, and retreat directions (n * draws, 3); object frame."""
         hand, obj, table = model.hand.model, model.obj.model, table_height(placed.supports)
         seen, draws = SurfaceView.of(obj), max(1, PROPOSALS // each)
         pivot, rotation, q, away = [], [], [], []
@@ -151,7 +151,7 @@ def table_height(supports: Sequence[Obstacle]) -> float:
     """Return z of the table among the supports of a scene [m].
 
     Raises:
-        SceneError: there is no table: no half-space below a level plane.
+        SceneError: there is no table, that is no half-space below a horizontal plane.
     """
     heights = [float(o.planes[0, 3]) for o in supports if len(o.planes) == 1 and o.planes[0, :3] @ UP > UPRIGHT]
     if not heights:
@@ -162,9 +162,9 @@ def table_height(supports: Sequence[Obstacle]) -> float:
 def _clear(
     model: Model, drawn: HandState, away: Floats, scene: NDArray[np.intp], placed: PlacedGrasps
 ) -> tuple[HandState, Floats]:
-    """Return per start (n) the free hand with fewest steps back, and its depth (n,) [m]; inf if none.
+    """Return for each start (n) the free hand with the fewest retreat steps, and its depth (n,) [m]; inf if none.
 
-    A hand without clearance from obstacles is raised first.
+    A hand that lacks clearance from obstacles is first raised.
     """
     count, probe = len(scene), Probe(model, len(scene), room=ROOM)
     draws = len(drawn.pivot) // count
@@ -201,8 +201,8 @@ ELEVATION: Final = (np.radians(18.0), np.radians(62.0))
 HALF_FIELD: Final = np.radians(20.0)
 FILL: Final = (0.7, 1.0)
 NEAREST_M: Final = 0.25
-#: Points of the surface, and pixels across the bounding ball; each pixel shows its nearest point. A pixel gets about
-#: five visible points, so that few hidden points show through hollow objects.
+#: Number of surface points, and of pixels across the bounding ball; each pixel shows its nearest point. A pixel covers
+#: about five visible points, so that few hidden points appear through hollow objects.
 DENSE: Final = 32768
 PIXELS: Final = 48
 
@@ -215,11 +215,11 @@ class SurfaceView:
     points: Floats
     """(DENSE, 3) in the object frame [m]."""
     normals: Floats
-    """(DENSE, 3) unit, outward."""
+    """(DENSE, 3) unit outward normals."""
 
     @classmethod
     def of(cls, obj: ObjectModel) -> SurfaceView:
-        """Sample points uniformly over the area, equal for equal objects."""
+        """Sample points uniformly over the area; equal objects get equal points."""
         rng = np.random.default_rng(0)
         corners = obj.vertices[obj.faces]
         cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

@@ -32,9 +32,9 @@ from graspd.service.store.network_file import BLOCKS, CONDITION, ENCODER, POSE, 
 
 #: Unit of lengths in the encoder's input and in the condition [m].
 LENGTH_M: Final = 0.1
-#: Matrix products are cut into 32 rows and at most this many multiplications. OpenBLAS computes such products on one
-#: thread each; another size or another split would round differently. So a proposal depends neither on the number of
-#: others nor on the machine's cores.
+#: Matrix products are split into parts of 32 rows and at most this many multiplications. OpenBLAS computes such a part
+#: on one thread; other sizes or splits would round differently. So a proposal is independent of the number of
+#: proposals and of the machine's cores.
 _ROWS: Final = 32
 _MULTIPLICATIONS: Final = 2**18
 _TINY: Final = 1e-6
@@ -42,7 +42,7 @@ _TINY: Final = 1e-6
 
 @dataclass(frozen=True)
 class Proposals:
-    """n grasps in the frame of the cloud. Joint positions may exceed limits, which are no network input."""
+    """n grasps in the frame of the cloud. Joint positions may exceed limits, which the network does not know."""
 
     hand_pose: Floats
     """(n, 7) pose of the hand's root link at the grasp: x y z [m], quaternion w x y z."""
@@ -86,10 +86,10 @@ def propose(
         points: (P, 3) visible points of the object, in a frame with z up [m].
         normals: (P, 3) unit, toward the camera.
         table_height: z of the table [m].
-        count: proposals.
+        count: number of proposals.
         rng: source of the noise.
-        label: 1: grasps that hold; 0: grasps that fail.
-        spread: standard deviation of the noise. Below 1, as in training, grasps are likelier and less diverse.
+        label: 1 for grasps that hold, 0 for grasps that fail.
+        spread: standard deviation of the noise; 1 as in training. Below 1, grasps are likelier and less diverse.
 
     Raises:
         InputError: the cloud or the network's output is not finite.
@@ -103,7 +103,7 @@ def propose(
 def cloud_inputs(points: ArrayLike, normals: ArrayLike, table_height: float) -> tuple[Floats32, Floats]:
     """Return the encoder's input (P, 7) of a cloud, and its anchor (3,) [m].
 
-    A point's row: from the anchor / 0.1 m, normal, height above the table / 0.1 m.
+    Row of a point: offset from the anchor / 0.1 m, normal, height above the table / 0.1 m.
 
     Raises:
         InputError: the cloud is empty, of another shape, or not finite.
@@ -184,10 +184,10 @@ def decode(rows: ArrayLike, anchor: ArrayLike) -> Proposals:
 
 @dataclass(frozen=True)
 class _Layer:
-    """A linear layer, cut as in `_MULTIPLICATIONS`."""
+    """A linear layer, split as in `_MULTIPLICATIONS`."""
 
     weight: Floats32
-    """(T, in, out of a part) the transposed weight in T parts, the last one padded with zeros."""
+    """(T, inputs, outputs of a part) transposed weight in T parts; the last part is padded with zeros."""
     bias: Floats32
 
     @classmethod
@@ -212,7 +212,7 @@ class _Layer:
 
 
 def _layers(network: ProposalNetwork) -> Mapping[str, _Layer]:
-    """Return the layers by name, cut once per network."""
+    """Return the layers by name, split once per network."""
     if "layers" not in vars(network):
         names = [name.removesuffix(".bias") for name in network.weights if name.endswith(".bias")]
         vars(network)["layers"] = {name: _Layer.of(network, name) for name in names}
@@ -231,7 +231,7 @@ def _velocity(layers: Mapping[str, _Layer], x: Floats32, t: float, condition: Fl
 
 
 def _silu(x: Floats32) -> Floats32:
-    """Return x times its logistic function, by a tangent that cannot overflow."""
+    """Return x times its logistic function, computed by tanh, which cannot overflow."""
     half = np.float32(0.5)
     return np.asarray(x * half * (1 + np.tanh(x * half)), np.float32)
 

@@ -527,7 +527,7 @@ STUDIES: Final = (
     ),
     Study(
         "hands-gallery",
-        "published hands, each tried on plain objects",
+        "published hands, each tested on simple objects",
         ("results/hands-gallery.json", "results/hands-gallery.md", "images/hands-gallery/*"),
         ("python -m benchmarks.gallery --sources SOURCES --out OUT",),
         ("python -m benchmarks.gallery --sources SOURCES --only robotiq-2f-85 --grasps 3 --out OUT",),

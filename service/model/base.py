@@ -18,7 +18,7 @@ class Model(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
-#: A name given by a user. File names and URLs contain it: letters, digits, dot, dash and underscore only.
+#: A name given by a user: only letters, digits, dot, dash and underscore, because file names and URLs contain it.
 NAME: Final = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
 Name = Annotated[str, Field(pattern=NAME)]
 #: Name of a tag: words of such characters, separated by single spaces.
@@ -29,7 +29,7 @@ TagName = Annotated[
 #: Lower-case hexadecimal SHA-256, shortened to 32 digits (128 bits).
 DIGEST: Final = r"^[0-9a-f]{32}$"
 Digest = Annotated[str, Field(pattern=DIGEST)]
-#: An id or nothing. Any client can write to Redis, so values read from there are bounded by this pattern.
+#: An id or an empty text. Any client can write to Redis, so this pattern bounds the values read from there.
 Word = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{0,64}$")]
 
 _WORDS: Final = {
@@ -44,22 +44,22 @@ _WORDS: Final = {
     **dict.fromkeys(("float_type", "float_parsing"), "must be a number"),
     **dict.fromkeys(("bool_type", "bool_parsing"), "must be true or false"),
 }
-#: Types of pydantic errors about bounds, with the name of the bound.
+#: Pydantic's error types for bounds, with the name of each bound.
 _BOUNDS: Final = {"greater_than_equal": "ge", "greater_than": "gt", "less_than_equal": "le", "less_than": "lt"}
 _NAMES: Final = "must begin with a letter or digit and hold at most 64 letters, digits, dots, dashes and underscores"
-#: Beginning of pydantic's messages, which names the subject instead of the field.
+#: Beginning of pydantic's messages, which the field's name replaces.
 _SUBJECT: Final = re.compile(r"^(Value error, )|^\w+ should ")
 _CLASS: Final = re.compile(r"_[A-Z]\w*$|constrained-\w+$")
-#: Typer's message about choices; pydantic has them as `expected`.
+#: Typer's message about choices; pydantic's key for them is `expected`.
 _CHOICES: Final = re.compile(r"'(?P<word>.*?)' is not one of (?P<expected>'.*')")
 
 
 def refusal(
     error: ValidationError, model: type[BaseModel] | None = None, names: Mapping[str, str] | None = None
 ) -> str:
-    """Return the first error after its location: `scene.touch: must be at least -1`; with a model, the whole range."""
+    """Return the first error after its location: `scene.touch: must be at least -1`; with `model`, the whole range."""
     first = error.errors(include_url=False)[0]
-    # For a union of models, pydantic adds the name of the one it validated.
+    # For a union of models, pydantic adds the name of the model that it tested.
     place = [str(part) for part in first["loc"] if not _CLASS.match(str(part))]
     if place and names:
         named = names.get(place[0], place[0])
@@ -105,5 +105,5 @@ def words(entry: Mapping[str, Any]) -> str:
 
 
 def why(error: Exception) -> str:
-    """Return a library's message about a file; of a system error the text without number and path."""
+    """Return a library's message about a file; for a system error, only its text without number and path."""
     return getattr(error, "strerror", None) or str(error)

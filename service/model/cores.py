@@ -1,4 +1,4 @@
-"""CPU cores and memory of this process: limits of affinity and control groups, not of the machine."""
+"""CPU cores and memory available to this process, by affinity and control groups."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ _V1: Final = ("cpu", "cpu,cpuacct")
 
 
 def available_cores(root: Path = ROOT) -> int:
-    """Return the cores for this process: its affinity, or its control group's quota, rounded up, if less."""
+    """Return the number of cores for this process: its affinity or, if less, its control group's quota, rounded up."""
     given = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return max(1, min([given, *(math.ceil(quota) for quota in _lately(root, int(time.monotonic() / _LATELY_S)))]))
 
 
 @lru_cache(maxsize=1)
 def _lately(root: Path, moment: int) -> list[float]:
-    """Return the quotas, cached per time slot; reading the files takes milliseconds."""
+    """Return the quotas, cached per time slot, because reading the files takes milliseconds."""
     return list(_quotas(root))
 
 
@@ -59,7 +59,7 @@ def _memory_limits(root: Path) -> Iterator[int]:
 
 
 def _groups(root: Path) -> Iterator[tuple[str, str]]:
-    """Yield the process's control groups and their ancestors, with controllers; none: cgroup v2."""
+    """Yield the process's control groups and their ancestors, each with its controllers; no controllers: cgroup v2."""
     for line in _text(root / "proc/self/cgroup").splitlines():
         _, controllers, path = [*line.split(":", 2), "", ""][:3]
         for group in (PurePosixPath(path), *PurePosixPath(path).parents):

@@ -1,4 +1,4 @@
-"""Content addresses: digests of a result's inputs, so repeated runs of a task name one object."""
+"""Content addresses: digests of a result's inputs, so that repeated runs of a task give one object."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from graspd.service.model.renamed import original
 from graspd.service.model.states import AssetKind, Stage
 from graspd.service.model.version import STAGE_REVISIONS
 
-#: Increment if payloads change while the grasps do not.
+#: Increment when payloads change but grasps do not.
 _PAYLOAD_REVISION: Final = 2
 
 
@@ -37,7 +37,7 @@ def digest_files(kind: AssetKind, files: Mapping[str, bytes]) -> str:
 
 
 def digest_variant(digest: str, options: Mapping[str, object] | None) -> str:
-    """Return the digest of a hand or object read with extra options; without options, `digest` itself."""
+    """Return the digest of a hand or object that is read with further options; without options, `digest`."""
     return digest_json({"files": digest, "options": dict(options)}) if options else digest
 
 
@@ -52,7 +52,7 @@ def shard_id(
     revision: int,
     inputs: Iterable[str] = (),
 ) -> str:
-    """Return the id of the shard that a stage makes from its inputs: only those that affect the result count."""
+    """Return the id of the shard that a stage makes from its inputs; only inputs that affect the result count."""
     inputs_of: dict[str, object] = {
         "stage": stage,
         "revision": revision,
@@ -76,7 +76,7 @@ def shard_id(
     elif stage is Stage.SCENE:
         inputs_of |= {"scenes": request.scenes}
         if request.in_scene:
-            # Scenes made before the grasps need the object as the planner sees it.
+            # Scenes made before the grasps use the planner's mesh of the object.
             inputs_of |= {"scene": request.place.model_dump(mode="json"), "face_error_m": request.knobs.face_error_m}
     elif stage is Stage.RENDER:
         inputs_of |= {k: getattr(request, k) for k in ("views", "stereo", "width", "height", "channels")}
@@ -87,7 +87,7 @@ def _verdict_text(request: JobRequest, batches: range) -> dict[str, object]:
     found: dict[str, object] = {}
     if request.want == "valid":
         found |= {"want": request.want, "budget": request.budget}
-        # The default is covered by the stage's revision.
+        # The revision of the stage covers the default.
         found |= {} if request.min_distance == MIN_DISTANCE_M else {"min_distance": request.min_distance}
     if request.validation != "none":
         rechecks = sum(map(request.rechecks_of, batches))

@@ -32,21 +32,21 @@ from graspd.service.model.scene_spec import (
 )
 from graspd.service.model.states import AssetKind
 
-#: Number of grasps of a batch: the unit of seeds and of kernel launches.
+#: Number of grasps of a batch, which is the unit of seeds and of kernel launches.
 BATCH_SIZE: Final = 32
-#: Optional channels besides colour, depth and segmentation, in the order of shards and digests.
+#: Channels that are optional, unlike colour, depth and segmentation; in the order of shards and digests.
 EXTRA_CHANNELS: Final = ("distance", "normals", "occlusion")
 
-#: Default rechecks per job and batches per recheck: the DexGraspBench protocol takes as long for one grasp as planning,
-#: validating and measuring two or three valid ones.
+#: Default rechecks per job and batches per recheck: for one grasp, the DexGraspBench protocol takes as long
+#: as planning, validation and measurement of two or three valid grasps.
 RECHECKS: Final = 8
 _RECHECK_EVERY: Final = 2
 
-#: graspd's own methods without support for scenes; workers report those of other packages.
+#: graspd's own methods that cannot plan in scenes; workers report those of other packages.
 FREE_ONLY_METHODS: Final = ("autograsp", "dfc", "graspd2022", "graspit")
 #: Methods that start from network proposals for an object on a table; their option `network` names the network.
 NETWORK_METHODS: Final = ("learned",)
-#: graspd's own methods; other packages add more.
+#: graspd's own methods; other packages can add methods.
 METHODS: Final = ("fast_graspd", "graspit", "graspd2022", "dfc", *NETWORK_METHODS, "autograsp")
 #: Default number of scenes of a batch planned in scenes.
 SCENES: Final = 4
@@ -59,11 +59,11 @@ _REFEREES_IN_WORDS: Final = {
 _FACES_IN_WORDS: Final = {"drawn": "as dropped", "all": "every stable face"}
 _WANTS_IN_WORDS: Final = {"valid": "valid grasps", "candidates": "all candidates"}
 _SCENES_IN_WORDS: Final = {"free": "free object", "table": "table", "bin": "bin", "shelf": "shelf"}
-SHAKE_NEEDS_A_SCENE: Final = "shake moves what was lifted out of a scene: choose one, such as table"
+SHAKE_NEEDS_A_SCENE: Final = "shake moves an object lifted out of a scene: choose a scene, such as table"
 
 
 def _sparse(default: Any, **facts: Any) -> Any:
-    """Return a field omitted from documents at its default, so that other jobs keep their ids and records."""
+    """Return a field that documents omit at its default, so that ids and records of jobs without it are unchanged."""
     return Field(default, exclude_if=lambda value: value == default, **facts)
 
 
@@ -275,7 +275,7 @@ class JobOptions(Model):
     @field_validator("channels")
     @classmethod
     def _in_order(cls, value: tuple[str, ...]) -> tuple[str, ...]:
-        # Sorted: the order of channels must not make another job.
+        # Sort: another order of channels must give the same job.
         return tuple(name for name in EXTRA_CHANNELS if name in value)
 
     @model_validator(mode="before")
@@ -317,10 +317,10 @@ class JobOptions(Model):
         if self.shake and not self.in_scene:
             raise ValueError(SHAKE_NEEDS_A_SCENE)
         if self.method in NETWORK_METHODS and not self.network:
-            raise ValueError(f"method {self.method} needs the option network: the name of one that the service keeps")
+            raise ValueError(f"method {self.method} needs the option network: the name of a network in the service")
         if self.method in NETWORK_METHODS and not has_table(self.place):
             raise ValueError(
-                f"method {self.method} proposes grasps of things on a table: choose scene table or bin, or a document "
+                f"method {self.method} proposes grasps of objects on a table: choose scene table or bin, or a document "
                 "with a level half-space"
             )
 
@@ -330,9 +330,9 @@ class JobOptions(Model):
         if self.models:
             raise ValueError("robust counts verdicts: choose a validator")
         if self.measures_payload:
-            raise ValueError("payload is what the validator sees lifted: choose one")
+            raise ValueError("payload is measured by a validator: choose one")
         if self.shake:
-            raise ValueError("shake is of what the validator sees lifted: choose one")
+            raise ValueError("shake is simulated by a validator: choose one")
 
     @property
     def measures_payload(self) -> bool:
@@ -340,13 +340,13 @@ class JobOptions(Model):
 
     @property
     def matter(self) -> dict[str, float]:
-        """The given mass, density and friction of the object; empty: none given."""
+        """Mass, density and friction of the object as far as given; empty: none."""
         said = {"mass": self.mass, "density": self.density, "object_friction": self.object_friction}
         return {name: value for name, value in said.items() if value is not None}
 
     @property
     def models(self) -> int:
-        """Perturbed models for validation of each valid grasp, besides the nominal one; 0: none."""
+        """Number of perturbed models in which each valid grasp is validated; 0: only the nominal model."""
         return self.robust_models or (ROBUST_MODELS if self.robust else 0)
 
     @property
@@ -360,7 +360,7 @@ class JobOptions(Model):
 
     @property
     def beside(self) -> tuple[NamedNeighbour, ...]:
-        """Neighbours of the scene document, then dropped neighbours."""
+        """Neighbours: first those of the scene document, then dropped ones."""
         placed = self.scene.neighbours if isinstance(self.scene, SceneDocument) else ()
         return (*placed, *self._dropped)
 
@@ -398,7 +398,7 @@ class JobOptions(Model):
         return "kept" if self.counted == "feasible" and self.want == "candidates" else self.counted
 
     def rechecks_of(self, batch: int) -> int:
-        """Return the number of rechecks of a batch: of the first ones, or by default of every other batch."""
+        """Return the number of rechecks of a batch; only the first batches, by default every other, have rechecks."""
         if self.validation in ("none", "dexgraspbench"):
             return 0
         if self.rechecks == RECHECKS:
@@ -426,11 +426,11 @@ def batches_of(grasps: int) -> int:
 
 
 def check_known(options: JobOptions) -> None:
-    """Raise ValueError if a neighbour or the network has no digest: a name may refer to other files later."""
+    """Raise ValueError if a neighbour or the network has no digest: later a name may refer to other files."""
     if any(one.digest is None for one in options.beside):
         raise ValueError("each neighbour of a stored job has the digest of its files")
     if options.network and not re.fullmatch(DIGEST, options.network):
-        raise ValueError("the network of a stored job is said by the digest of its files")
+        raise ValueError("the network of a stored job has the digest of its files")
 
 
 class Asset(Model):
@@ -450,5 +450,5 @@ class Asset(Model):
     facts: dict[str, object] = Field(default_factory=dict, description="measurements of ingest")
     self_test: bool = Field(False, description="for a hand: whether its check includes the self-test")
 
-    # A newer graspd may have written further fields.
+    # Ignore further fields of a newer graspd.
     model_config = ConfigDict(frozen=True, extra="ignore")

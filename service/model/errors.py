@@ -3,7 +3,7 @@
     GraspdError
     ├── InputError                the caller's mistake: exit 2, HTTP 422
     │   ├── NotFoundError         unknown job, hand, object, shard: exit 2, HTTP 404
-    │   ├── ConflictError         the request clashes with what is there: exit 2, HTTP 409
+    │   ├── ConflictError         the request conflicts with the present state: exit 2, HTTP 409
     │   ├── MeshError             an object mesh that cannot be used
     │   ├── HandError             a hand description that cannot be used
     │   ├── SceneError            a scene without space for the object, or without any grasp
@@ -26,7 +26,8 @@
 A message is one line that states the problem and the fix. `exit_code` and `status` map errors to exit codes and HTTP
 statuses; `slug` names the problem type (RFC 9457).
 
-Messages and log lines never contain secrets, whatever they quote. Functions for "did you mean" hints are here too.
+Messages and log lines never contain secrets, even in quoted texts. This module also has functions for "did you mean"
+hints.
 """
 
 from __future__ import annotations
@@ -65,7 +66,7 @@ class InputError(GraspdError):
 
 
 class NotFoundError(InputError):
-    """The named thing does not exist."""
+    """The named resource does not exist."""
 
     slug, status, title = "not-found", 404, "Not found"
 
@@ -77,7 +78,7 @@ class ConflictError(InputError):
 
 
 class AssetError(InputError):
-    """A hand or an object cannot be used; `facts` are findings before the error, for the report of a check."""
+    """A hand or an object cannot be used; `facts` are findings up to the error, for the report of a check."""
 
     def __init__(self, message: str = "", *, facts: Mapping[str, Any] | None = None) -> None:
         super().__init__(message)
@@ -85,7 +86,7 @@ class AssetError(InputError):
 
     @classmethod
     def with_fixes(cls, problem: str, hint: str, *fixes: Mapping[str, Any], **facts: Any) -> Self:
-        """Make an error with fixes as options of commands (`hint`) and as keys of `asset.json` (None: any value)."""
+        """Create an error with fixes: command options (`hint`) and keys of `asset.json` (None: any value)."""
         return cls(f"{problem}; {hint}", facts={"problem": problem, "options_suggested": list(fixes), **facts})
 
 
@@ -211,7 +212,7 @@ def _below(kind: type[GraspdError]) -> Iterator[type[GraspdError]]:
 ERRORS: Final = {error.slug: error for error in _below(GraspdError) if error is not AssetError}
 ERRORS[GraspdError.slug] = GraspdError
 
-#: User and password of a URL, up to the last @: an unquoted password may contain an @ or a slash.
+#: User and password of a URL, up to the last @, because an unquoted password may contain an @ or a slash.
 _LOGIN: Final = re.compile(r"(?<=://)[^/\s\"'<>][^\s\"'<>]*@")
 _PARAMETER: Final = re.compile(
     r"([?&][\w.%-]*(?:password|passwd|token|secret|signature|credential|sig|key)=)[^&\s\"'<>]+", re.IGNORECASE
@@ -232,7 +233,7 @@ _LISTED: Final = 20
 
 
 def known_names(word: str, names: Sequence[str]) -> str:
-    """Return `; there are: A, B` for the first of at most `SEARCHED` names, and the most similar one."""
+    """Return `; there are: A, B` with the first names, and the most similar of at most `SEARCHED` names."""
     listed = ", ".join(names[:_LISTED]) + (", ..." if len(names) > _LISTED else "")
     return f"; there are: {listed or 'none yet'}{did_you_mean(word, names)}"
 

@@ -88,11 +88,11 @@ FIDELITIES: Final[dict[str, Fidelity]] = {
 }
 
 
-#: Requests the cheapest fidelity that meets the target; a stored job has that fidelity instead.
+#: Value of requests for the cheapest fidelity that meets the target; the stored job has that fidelity.
 AUTO: Final = "auto"
 
 
-#: Fidelities offered to users; the others are for comparisons.
+#: Fidelities for users; the others are for comparisons.
 OFFERED: Final = ("draft", "standard", "fine")
 
 

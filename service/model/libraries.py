@@ -1,7 +1,7 @@
 """Installed libraries: cached versions, and imports without garbage collection.
 
-The modules of one process hold half a million objects. Each garbage collection during imports scans all of them, and so
-does each full one later, the last at exit: half of the time of start and exit.
+The modules of one process contain half a million objects. Garbage collections during imports, and full collections
+later and at exit, scan all of them. This takes half of the time of start and exit.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ _ours = False
 
 
 def own_process() -> None:
-    """Declare this process as graspd's own: collections exclude imported objects, which stay until exit."""
+    """Mark this process as graspd's own: garbage collection excludes imported objects, which stay until exit."""
     global _ours
     _ours = True
 

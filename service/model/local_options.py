@@ -1,4 +1,4 @@
-"""Options for grasps made in this process: those of a job, with files for names, and of the run."""
+"""Options for grasps made in this process: options of a job, with files instead of names, and options of the run."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from graspd.service.model.scene_spec import MOST_NEIGHBOURS, MOST_SCENES, SceneS
 
 _LOCAL: Final[tuple[Place, ...]] = ("synth", "python")
 _COMMAND: Final[tuple[Place, ...]] = ("synth",)
-#: Fields of a job that describe the place of its grasps; in this process `SceneSpec` replaces them.
+#: Fields of a job that describe its scene; in this process `SceneSpec` replaces them.
 _OF_PLACE: Final = {"scene", "faces", "neighbours", "touch", "scenes"}
 
 
@@ -47,7 +47,7 @@ class LocalOptions(MeshOptions, JobOptions):
         description="measure the heaviest mass that each valid grasp lifts; default of graspd synth in scenes "
         "with a given mass",
     )
-    # A value may be a file path; a job has its digest instead.
+    # A value may be a file path; a job has the file's digest instead.
     options: Annotated[dict[str, Any], Option("advanced", _LOCAL, "--option")] = Field(
         default_factory=dict, description="option of the planner, such as steps=20000 or network=net.npz"
     )
@@ -97,7 +97,7 @@ class LocalOptions(MeshOptions, JobOptions):
         return {name: value for name in sorted(given) if (value := getattr(self, name))}
 
     def request(self, options: dict[str, Any]) -> JobOptions:
-        """Return the job without its place and rechecks. `options` has digests for files; InputError for a bad one."""
+        """Return the job without scene and rechecks. `options` has digests instead of files; InputError if invalid."""
         shared = {name: getattr(self, name) for name in JobOptions.model_fields.keys() - _OF_PLACE}
-        # Rechecks sample many jobs; a single file can be validated under the DexGraspBench protocol completely.
+        # Rechecks are a sample over many jobs; a single file can be validated completely at level `dexgraspbench`.
         return accepted(JobOptions, shared | {"fidelity": self.knobs, "options": options, "rechecks": 0})

@@ -13,20 +13,20 @@ from graspd.service.model.states import AssetKind, Stage
 
 
 class Origin(Model):
-    """Origin of a job, for logs and traces of its tasks; the queue is shared fairly between keys."""
+    """Origin of a job, for logs and traces of its tasks and for fair scheduling between keys."""
 
     request: str = Field("", max_length=64, description="id of the HTTP request")
     key: str = Field("", max_length=64, description="name of the API key")
     traceparent: str = Field("", max_length=64, description="W3C trace context")
 
-    # A newer API may have written further fields.
+    # Ignore further fields of a newer API.
     model_config = ConfigDict(frozen=True, extra="ignore")
 
 
 class TaskMessage(Model):
-    """Message for a task: a worker needs only this and the store."""
+    """Message for a task; a worker needs only this message and the store."""
 
-    # The message has the field `schema`, which is an attribute of BaseModel in Python: hence the alias.
+    # The alias is needed because the message's field `schema` is an attribute of BaseModel.
     schema_: int = Field(alias="schema", description="oldest schema that can express the message")
     newest_schema: int = Field(0, ge=0, description="newest schema known to the writer; 0: the same as `schema`")
     task_id: Word

@@ -43,7 +43,7 @@ def filters() -> dict[str, Any]:
 
 
 def with_fields(**parts: Mapping[str, Any]) -> Callable[[type[M]], type[M]]:
-    """Decorate a model of fields: insert each part before the field of its name, `last` at the end."""
+    """Decorate a model: insert each part of fields before the field with the part's name, `last` at the end."""
 
     def made(model: type[M]) -> type[M]:
         base: type[BaseModel] = next(base for base in model.__bases__ if issubclass(base, BaseModel))

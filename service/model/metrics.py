@@ -2,8 +2,8 @@
 
 Storage (`service.store.columns`), manifests, index, API, dashboard, dataset cards and docs derive from this table. A
 new metric needs a row here and a function that computes it (`MEASURES` in `worker.quality.table`); make it `optional`,
-since older shards lack it. The index adds its column when it is next opened (`service.index.database`). A yes or no
-about a grasp is a verdict, not a metric.
+since older shards lack it. The index adds its column when it is next opened (`service.index.database`). A yes-or-no
+property of a grasp is a verdict, not a metric.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final, Literal
 
-#: Shorter names are symbols and keep their case.
+#: Names shorter than this are symbols with unchanged case.
 _SYMBOL: Final = 4
 
 
@@ -27,15 +27,15 @@ class IndexLevel(IntEnum):
     SORTED = 2
     """Also a database index, for ranges and sorting."""
     OFFERED = 3
-    """Also filters, means and distributions of a job's grasps in API and dashboard."""
+    """Also for filters, means and distributions of a job's grasps in API and dashboard."""
 
 
 @dataclass(frozen=True)
 class GraspMetric:
     name: str
-    """Its dataset in a base shard is `quality/{name}`; this name is used everywhere else."""
+    """Name of the metric everywhere except in base shards, where its dataset is `quality/{name}`."""
     units: str
-    """As stated in the shard: `cm^2`; `1`: none."""
+    """Unit as in the shard, such as `cm^2`; `1`: no unit."""
     meaning: str
     title: str
     short: str = ""
@@ -43,15 +43,15 @@ class GraspMetric:
     """One value per contact threshold; the index has the value at `INDEX_THRESHOLD_M`."""
     whole: bool = False
     code: bool = False
-    """A number that encodes a category; its sums and means are meaningless."""
+    """Whether the number encodes a category, so that sums and means are meaningless."""
     optional: bool = False
     indexed: IndexLevel = IndexLevel.OFFERED
     bounds: tuple[float, float] = (0, math.inf)
     less_is_better: bool = False
     digits: int | None = None
-    """Decimal places in the table of a card; None: not in the table."""
+    """Decimal places in a card's table; None: not in this table."""
     plot: Literal["no", "whole", "cut"] = "no"
-    """Whether a card shows its distribution, and whether it cuts a long tail."""
+    """Whether a card plots its distribution, and whether the plot ends at the 99th percentile."""
 
     @property
     def path(self) -> str:
@@ -257,7 +257,7 @@ MOST_ROBUST_MODELS: Final = 64
 
 
 class Axis(IntEnum):
-    """Parameter perturbed from the nominal model. Shards contain the numbers: append new axes at the end."""
+    """Parameter perturbed from the nominal model. Shards contain its numbers: add new axes at the end only."""
 
     NONE = 0
     SHAPES = 1
@@ -304,14 +304,16 @@ class GraspType(IntEnum):
     LATERAL = 3
 
 
-#: Directions fall into cells of equal area: bands of equal height z (Archimedes), each cut into equal azimuths.
+#: Directions fall into cells of equal area: bands of equal height z (Archimedes), each divided into equal azimuth
+#: ranges.
 BANDS: Final = 4
 SECTORS: Final = 12
 
 DIRECTION_CELLS: Final = BANDS * SECTORS
 
 #: Distance below which two grasps of a job are near-duplicates [m]: mean over corresponding points of the hand's
-#: surface. Twice as much is hardly visible in a picture; less than 1 of 100 pairs of batches has such a pair.
+#: surface. Twice this distance is hardly visible in a picture; fewer than 1 in 100 pairs of batches have
+#: near-duplicates.
 MIN_DISTANCE_M: Final = 0.005
 
 

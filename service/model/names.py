@@ -1,4 +1,4 @@
-"""Keys of the object store: every key graspd writes is built here (table in ARCHITECTURE.md)."""
+"""Keys of the object store: this module builds every key that graspd writes (table in ARCHITECTURE.md)."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ TAGS: Final = "tags"
 SERVICE: Final = "service"
 MARKS: Final = "marks"
 
-#: Folder under `shards/`, and HDF5 kind, of each stage's result.
+#: Kind of each stage's result: folder under `shards/` and HDF5 kind.
 SHARD_KINDS: Final[dict[Stage, str]] = {Stage.SYNTHESIZE: "base", Stage.SCENE: "scene", Stage.RENDER: "views"}
 
 
@@ -142,7 +142,7 @@ def refuse_long(name: str) -> str:
 
 @lru_cache(maxsize=4096)
 def fitted(name: str, most: int = MOST) -> str:
-    """Return the name, shortened if too long: its beginning and a digest keep it unique; logged once."""
+    """Return the name, shortened if too long to its beginning and a digest, so that it is unique; logged once."""
     if len(name) <= most:
         return name
     short = f"{name[: most - 9]}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"

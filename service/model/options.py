@@ -1,4 +1,4 @@
-"""Metadata of job options besides type, default, bounds and description; tables derived from it.
+"""Metadata of job options in addition to type, default, bounds and description; tables derived from the options.
 
 `rows` is the only source for the command line, the dashboard's forms, the Python signatures and the docs' tables.
 """
@@ -21,7 +21,7 @@ from graspd.service.model.errors import InputError
 
 ModelT = TypeVar("ModelT", bound=BaseModel)
 FunctionT = TypeVar("FunctionT", bound=Callable[..., Any])
-#: Users of an option: a job of the service, the command `graspd synth`, `graspd.synthesize`, an asset's file.
+#: Places of an option: a job of the service, the command `graspd synth`, `graspd.synthesize`, an asset's file.
 Place = Literal["job", "synth", "python", "asset"]
 EVERYWHERE: Final[tuple[Place, ...]] = ("job", "synth", "python")
 JOB: Final[tuple[Place, ...]] = ("job",)
@@ -37,7 +37,7 @@ class Form:
     """Values with their labels; empty: a text field."""
     placeholder: str = ""
     cells: bool = False
-    """Whether a dataset's form has it too."""
+    """Whether the form of a dataset also has the option."""
 
 
 @dataclass(frozen=True)
@@ -45,13 +45,13 @@ class Option:
     group: Literal["basic", "advanced"] = "advanced"
     places: tuple[Place, ...] = EVERYWHERE
     flags: str = ""
-    """Flags on the command line, separated by spaces; empty: `--` and the name."""
+    """Flags on the command line, separated by spaces; empty: `--` and the option's name."""
     keyword: str = ""
-    """Keyword of `graspd.synthesize`; empty: the name."""
+    """Keyword of `graspd.synthesize`; empty: the option's name."""
     typed: str = ""
-    """Description for values typed by a user, if it differs from the HTTP document."""
+    """Description for command line and form, if it differs from the HTTP document."""
     schema: int = 0
-    """First schema of task messages with the field; 0: all."""
+    """First schema of task messages that has the field; 0: all have it."""
 
 
 @dataclass(frozen=True)
@@ -140,7 +140,7 @@ def keywords_of(model: type[BaseModel], place: Place) -> list[tuple[str, Row, st
 
 
 def type_text(annotation: Any) -> str:
-    """Format an annotation for callers: without bounds; a model as the mapping from which it is made."""
+    """Format an annotation for callers: without bounds, and a model as the mapping that it is made from."""
     origin, inner = get_origin(annotation), get_args(annotation)
     if origin is Annotated:
         return type_text(inner[0])

@@ -22,7 +22,7 @@ from graspd.service.model.records import JobRecord
 from graspd.service.model.states import AssetKind, Priority, Stage, State
 from graspd.service.model.version import OLDEST_TASK_SCHEMA, SCHEMA_OF_NETWORKS, SCHEMA_OF_RANGES, TASK_SCHEMA
 
-#: Largest interactive job: a user waits for it. Larger jobs run in bulk.
+#: Most grasps of an interactive job, for which a user waits. Larger jobs run in bulk.
 INTERACTIVE_GRASPS: Final = 4 * BATCH_SIZE
 
 MAX_BACKOFF_S: Final = 300.0
@@ -30,7 +30,7 @@ MAX_BACKOFF_S: Final = 300.0
 
 @dataclass(frozen=True)
 class PlannedTask:
-    """Task of a job: batches from `batch` on, for `count` grasps. `inputs` and `output` are shard ids."""
+    """Task of a job: batches from number `batch` on, `count` grasps in all. `inputs` and `output` are shard ids."""
 
     id: str
     stage: Stage
@@ -44,11 +44,11 @@ class PlannedTask:
 class TaskFacts:
     stage: Stage
     done: bool = False
-    """Whether the manifest of its shard is in the store."""
+    """Whether the manifest of the task's shard is in the store."""
     last_attempt: int = 0
     exhausted: bool = False
     retried_upto: int = 0
-    """Attempts up to this number are ignored: a user retried the job."""
+    """Last attempt before a user's retry of the job; attempts up to this number are ignored."""
     running: bool = False
 
 
@@ -73,7 +73,7 @@ def ranges_of(grasps: int, span: int) -> int:
 
 
 def plan(job: JobRecord, ranges: range | None = None) -> Iterator[PlannedTask]:
-    """Yield the tasks of a job, for all ranges or some, each range in the order of its stages."""
+    """Yield the tasks of a job for all or some `ranges`, range by range in the order of stages."""
     request = job.request
     digests = {"hand_digest": job.hand_digest, "object_digest": job.object_digest}
     for number in ranges if ranges is not None else range(ranges_of(request.grasps, job.span)):
@@ -110,13 +110,13 @@ def message_of(job: JobRecord, task: PlannedTask, *, attempt: int, max_attempt: 
     )
 
 
-#: First schema of each newer option. A job that uses one needs a worker with that schema; all other jobs also go to
-#: older workers.
+#: First schema of each newer option. A job with such an option needs a worker with that schema; older workers can run
+#: all other jobs.
 _SCHEMAS: Final = {row.name: row.option.schema for row in rows(JobOptions, "job") if row.option.schema}
 
 
 def needed_schema(request: JobRequest, since: Mapping[str, int] = _SCHEMAS) -> int:
-    """Return the oldest schema that can express a request: that of its newest option in use."""
+    """Return the oldest schema that can express a request, which is that of its newest option in use."""
     fields = JobRequest.model_fields
     used = [schema for name, schema in since.items() if getattr(request, name) != fields[name].get_default()]
     used += [SCHEMA_OF_NETWORKS] if request.network else []
@@ -146,7 +146,7 @@ def ingest_message(kind: AssetKind, name: str, digest: str, *, attempt: int, max
 
 
 def batch_states(chain: Sequence[TaskFacts], *, job_cancelled: bool) -> list[State]:
-    """Return the states of one range's tasks; one behind a failed or cancelled task is cancelled."""
+    """Return the states of one range's tasks; tasks after a failed or cancelled one are cancelled."""
     states: list[State] = []
     blocked = False
     for facts in chain:
@@ -185,9 +185,10 @@ def _own_state(facts: TaskFacts, *, job_cancelled: bool) -> State:
 
 
 T = TypeVar("T")
-#: Jobs served in one scheduling round; the others follow in the next rounds.
+#: Most jobs in one scheduling round; the others follow in later rounds.
 JOBS_A_ROUND: Final = 64
-#: Number of remembered turns: more than jobs with waiting tasks, or a forgotten job would come first again.
+#: Number of remembered turns. It exceeds the number of jobs with waiting tasks, because a forgotten job comes first
+#: again.
 _REMEMBERED: Final = 100_000
 
 
@@ -206,14 +207,14 @@ def share_of(project: str, key: str) -> str:
 
 
 class RoundRobin:
-    """Fair scheduling state: who was served last. Losing it with the process costs at most one turn."""
+    """Fair scheduling state: who was served last. Its loss, when the process ends, costs at most one turn."""
 
     def __init__(self) -> None:
         self._served: dict[str, int] = {}
         self._count = 0
 
     def order(self, jobs: Iterable[WaitingJob], limit: int) -> list[tuple[WaitingJob, int]]:
-        """Return the next jobs and how many of their tasks to queue, about `limit` tasks in all."""
+        """Return the next jobs, each with the number of its tasks to queue; about `limit` tasks in total."""
         of_key: dict[str, list[WaitingJob]] = defaultdict(list)
         for job in sorted(jobs, key=lambda job: self._served.get(f"job {job.id}", 0)):
             of_key[job.key].append(job)
@@ -275,7 +276,7 @@ def told(outcomes: Mapping[str, int]) -> str:
 def shortfall(
     found: int, wanted: int, counted: str, candidates: int, budget: float, outcomes: Mapping[str, int], limit: str = ""
 ) -> str | None:
-    """Explain why fewer grasps were found than wanted; None if all were. `limit`: the hand's, not the budget's."""
+    """Explain why fewer grasps were found than wanted; None if all were found. `limit`: the hand's payload limit."""
     if found >= wanted:
         return None
     lost, tries = told(outcomes), candidates + outcomes.get("repeated", 0)
@@ -286,7 +287,7 @@ def shortfall(
 
 
 def limit_told(hand: str, friction: float, grasps: int, lifts: float, bound: float, wanted: float | None = None) -> str:
-    """Describe a hand's lifting limit in a sentence; `bound` [kg] is that of actuators and friction, inf: none."""
+    """Describe a hand's payload limit in a sentence; `bound` [kg] is that of actuators and friction, inf: none."""
     most = f", and at most {bound:.2g} kg by actuator effort" if math.isfinite(bound) else ""
     less = "" if wanted is None else f"; {wanted:.3g} kg are wanted"
     return f"{hand} lifts {lifts:.2g} kg at friction {friction:g} in the best of {grasps} grasps{most}{less}"

@@ -8,21 +8,21 @@ from typing import Annotated, Final
 
 from pydantic import Field
 
-#: Lower case, so that no two names differ only in case.
+#: Pattern of project names: lower case, so that names never differ only in case.
 PATTERN: Final = r"^[a-z0-9][a-z0-9-]{0,31}$"
 #: Project of a key, job or dataset; empty: the unnamed project.
 Project = Annotated[str, Field(pattern=rf"^$|{PATTERN}")]
-#: Extra file of an upload that only its project may see. It makes the same mesh in two projects two objects, so digests
+#: File that is added to a private upload of a project. The same mesh in two projects thus has two digests, and digests
 #: reveal nothing about other projects.
 MARK: Final = "graspd-project.txt"
 
 
 @dataclass(frozen=True)
 class ProjectScope:
-    """Visibility: the things of one project and shared hands and objects, or everything."""
+    """Visible resources: those of one project plus shared hands and objects, or all resources."""
 
     project: str = ""
-    """Project whose names take precedence if two projects use the same one."""
+    """Project whose resource is used if two projects have the same name."""
     everything: bool = True
 
     def sees(self, project: str) -> bool:
@@ -34,5 +34,5 @@ EVERYTHING: Final = ProjectScope()
 
 
 def marks_of(files: Mapping[str, bytes], project: str) -> dict[str, bytes]:
-    """Return the mark of a private upload; of a shared one, an empty file over any existing mark."""
+    """Return the mark of a private upload; for a shared one, an empty file that replaces an existing mark."""
     return {MARK: project.encode()} if project or MARK in files else {}

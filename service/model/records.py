@@ -1,7 +1,7 @@
-"""JSON records of the store besides shards: jobs, datasets, tags, user actions, failed attempts.
+"""JSON records of the store: jobs, datasets, tags, user actions, failed attempts.
 
-`datasets/{name}/dataset.json` lists the jobs of its cells, so that a dataset does not change when algorithms, or the
-meaning of a name, change later.
+`datasets/{name}/dataset.json` lists the jobs of its cells, so that later changes of algorithms or names do not change a
+dataset.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ from graspd.service.model.projects import Project
 from graspd.service.model.states import AssetKind, Priority, Stage
 from graspd.service.model.version import STAGE_REVISIONS
 
-#: Largest number of batches of a task.
+#: Most batches of a task.
 MOST_BATCHES: Final = 64
 
 
 class Record(BaseModel):
-    """Base class of the records. Unknown fields are ignored: a newer graspd may have written them."""
+    """Base class of the records. Unknown fields, as of a newer graspd, are ignored."""
 
     model_config = ConfigDict(frozen=True, extra="ignore")
 
 
 class Choice(Record):
-    """How a chart resolved the fidelity `auto`."""
+    """Fidelity that a chart selected for `auto`, with the reason."""
 
     target: str = Field(description="required accuracy")
     chart: str = Field(description="key of the chart in the store")
@@ -93,7 +93,7 @@ class JobRecord(Record):
 
 
 class JobEvent(Record):
-    """A later user action on a job. `retried` maps each failed task to its last attempt to ignore."""
+    """A later user action on a job. `retried` maps each failed task to its last attempt before the retry."""
 
     number: int = Field(ge=1)
     what: Literal["cancelled", "retried"]
@@ -126,7 +126,7 @@ class AttemptRecord(Record):
 
 
 class Member(Record):
-    """A hand or object of a dataset, pinned to the version at creation."""
+    """A hand or object of a dataset, in the version at the dataset's creation."""
 
     name: Name
     digest: Digest
@@ -142,7 +142,7 @@ class Cell:
     job_id: str
     fidelity: str = ""
     choice: Choice | None = None
-    """Reason of that choice; None also for datasets from before it was recorded."""
+    """Reason for that choice; None also for datasets older than this field."""
 
 
 class DatasetRecord(Record):
@@ -174,7 +174,7 @@ class DatasetRecord(Record):
         if len(self.fidelities) != (len(self.jobs) if self.options.fidelity == AUTO else 0):
             raise ValueError("a dataset has a fidelity for each cell if its own is auto, and else none")
         if self.chosen and (len(self.chosen) != len(self.jobs) or max(self.chosen) >= len(self.choices)):
-            raise ValueError("a dataset says of each cell how its fidelity was chosen, or of none")
+            raise ValueError("a dataset has the reasons of chosen fidelities for all cells or for none")
         return self
 
     def cells(self) -> Iterator[Cell]:
@@ -186,7 +186,7 @@ class DatasetRecord(Record):
 
 
 class DatasetEvent(Record):
-    """A later user action on a dataset. The last one decides whether it is cancelled."""
+    """A later user action on a dataset. The last action decides whether the dataset is cancelled."""
 
     number: int = Field(ge=1)
     what: Literal["cancelled", "retried"]
@@ -210,7 +210,7 @@ class SnapshotShard(Record):
     @field_validator("key")
     @classmethod
     def _taken_apart(cls, key: str, info: ValidationInfo) -> str:
-        # A snapshot of 0.2 may refer to a part of a pack; its shards have had files of their own since.
+        # A snapshot of 0.2 may refer to a part of a pack; each shard has its own file now.
         stages = {kind: stage for stage, kind in names.SHARD_KINDS.items()}
         return names.shard_file(stages[info.data["kind"]], info.data["id"]) if "@" in key else key
 
@@ -277,7 +277,7 @@ def object_set_of(
     )
 
 
-#: Limits: tags of one project (of one key without a project), and grasps of one tag.
+#: Most tags of one project (or of one key without a project), and most grasps of one tag.
 MOST_TAGS: Final = 100
 MOST_TAGGED: Final = 20_000
 #: A grasp: shard id and row.
@@ -286,7 +286,7 @@ Row = Annotated[int, Field(ge=0, lt=2**31)]
 
 
 class Tag(Record):
-    """`tags/{id}/{number:06}.json`: a tag after a user's change. The last one is current; `gone`: deleted."""
+    """`tags/{id}/{number:06}.json`: version of a tag after a user's change. The last is current; `gone`: deleted."""
 
     version: Literal[1] = 1
     id: Digest

@@ -1,6 +1,6 @@
 """Names of graspd 0.2 in stores, shards and queues, with their present names.
 
-Old names are read everywhere, but written only into tasks for workers of 0.2.
+Old names are accepted everywhere when reading, but written only into tasks for workers of 0.2.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ COLUMNS: Final = {
 _REVISIONS: Final = {"synthesize": 23, "scene": 2, "render": 4}
 _OLD: Final = re.compile(rb'"(?:' + b"|".join([*map(str.encode, KEYS), *map(str.encode, _LEVELS), b"raw"]) + rb')"')
 
-#: Measures of charts: success by the unmodified protocol, free or lifted, and speed of all candidates.
+#: Measures of charts: success under the unmodified protocol (free or lifted), and speed over all candidates.
 _CHART: Final = re.compile(r"^(lift_)?(?:(letter)(?=_low$|_high$|_count$|$)|raw(?=_end_to_end_per_second$))")
 
 
@@ -44,7 +44,7 @@ def has_old_names(document: bytes) -> bool:
 
 def renamed(value: Any) -> Any:
     if isinstance(value, dict):
-        # Beside a method stand the planner's own options, whose names are not ours.
+        # The options next to a method are the planner's own, so they are not renamed.
         own = {"options"} if "method" in value else set()
         found = {KEYS.get(key, key): inner if key in own else renamed(inner) for key, inner in value.items()}
         for key, names in VALUES.items():
@@ -74,7 +74,7 @@ def _of_chart(name: str) -> str:
 
 
 def original(request: dict[str, Any]) -> dict[str, Any]:
-    """Return a job's request with the names of graspd 0.2: addresses of jobs and shards are digests of these."""
+    """Return a job's request with the names of graspd 0.2: ids of jobs and shards are digests of these names."""
     return {
         _OLD_KEYS.get(key, key): _OLD_VALUES[key].get(value, value) if key in _OLD_VALUES else value
         for key, value in request.items()
@@ -82,7 +82,7 @@ def original(request: dict[str, Any]) -> dict[str, Any]:
 
 
 def for_worker_of(revision: int, stage: str, message: dict[str, Any]) -> dict[str, Any]:
-    """Convert a task message to the names of its revision: rolling upgrades also have workers of 0.2."""
+    """Convert a task message to the names of its revision: during rolling upgrades workers of 0.2 also run."""
     request = message.get("request")
     if not isinstance(request, dict) or not 0 < revision <= _REVISIONS.get(stage, 0):
         return message

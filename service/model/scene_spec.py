@@ -20,7 +20,7 @@ from graspd.service.model.errors import InputError, did_you_mean
 SceneKind = Literal["free", "table", "bin", "shelf", "file"]
 KINDS: Final = ("free", "table", "bin", "shelf")
 MOST_SUPPORTS: Final = 32
-#: Clearance of fingertips to supports [mm]: lower limit, that of the whole hand, default.
+#: Values of the clearance of fingertips from supports [mm]: lower limit, clearance of the whole hand, default.
 LEAST_TOUCH: Final = -1.0
 MOST_TOUCH: Final = 2.0
 TOUCH: Final = 0.0
@@ -91,14 +91,14 @@ Supports = tuple[Annotated[HalfSpace | Box, Field(discriminator="kind")], ...]
 
 
 class SceneSpec(Model):
-    """Surroundings of the object: supports and neighbours."""
+    """Environment of the object: supports and neighbours."""
 
     kind: SceneKind = "free"
     supports: Supports = Field((), max_length=MOST_SUPPORTS)
     target: Pose | None = None
     """Pose of the object in the scene; None: it is dropped onto the support below."""
     faces: Literal["drawn", "all"] = "drawn"
-    """drawn: resting faces as frequent as after drops; all: one scene for each stable face."""
+    """drawn: resting faces with their frequency after drops; all: one scene for each stable face."""
 
     touch: Touch = TOUCH
     """Clearance of fingertips to supports [mm]: 2, as for the rest of the hand; 0: contact allowed; below: they press.
@@ -122,7 +122,7 @@ class SceneSpec(Model):
         return self
 
     def told(self) -> dict[str, Any]:
-        """Return the scene for a shard's attribute; digests of neighbours have their own attribute."""
+        """Return the scene for a shard's attribute; neighbours' digests are in another attribute."""
         return self.model_dump(mode="json", exclude={"neighbours": {"__all__": {"digest"}}})
 
     def _check_neighbours(self) -> None:
@@ -142,7 +142,7 @@ class SceneSpec(Model):
 def parse_scene(
     text: str, *, faces: str = "drawn", touch: float | None = None, beside: Sequence[str] = ()
 ) -> SceneSpec:
-    """Parse a user's scene: one of `KINDS`, or a file; None: `touch` of the file. InputError in one line."""
+    """Parse a user's scene: one of `KINDS`, or a file. `touch` None: the file's value. InputError if it is invalid."""
     if faces not in ("drawn", "all"):
         raise InputError(f"unknown faces {faces!r}; choose drawn or all")
     path = Path(text)
@@ -319,7 +319,7 @@ def scene_of(
     touch: float = TOUCH,
     beside: Sequence[NeighbourSpec] = (),
 ) -> SceneSpec:
-    """Return the scene of a request, with more neighbours than its document has; ValueError if they do not fit."""
+    """Return the scene of a request, with neighbours in addition to those of its document; ValueError if invalid."""
     try:
         if not isinstance(option, SceneDocument):
             return SceneSpec(kind=option, faces=faces, touch=touch, neighbours=tuple(beside))
@@ -332,7 +332,7 @@ def scene_of(
 
 
 def known_name(text: str) -> str:
-    """Return the name of an object; InputError for a file, which the service does not have."""
+    """Return the name of an object; InputError for a file, because the service needs a name."""
     if "/" in text or Path(text).is_file():
         raise InputError(f"the neighbour {text} is a file: `graspd objects add {text}` first, then give its name")
     return text
@@ -341,7 +341,7 @@ def known_name(text: str) -> str:
 def scene_option(
     text: str, *, beside: Path | None = None, named: Callable[[str], str] = known_name
 ) -> str | dict[str, Any]:
-    """Return the scene for a request from a user's text; `named` maps a neighbour in a file to the service's name."""
+    """Return the scene of a request from a user's text; `named` maps neighbours in a file to names in the service."""
     if text in KINDS:
         return text
     is_file = Path(text).suffix.lower() in SCENE_FILES

@@ -1,4 +1,4 @@
-"""Definitions of every series of `/metrics`, and the names under which their sums are stored."""
+"""Definitions of all series of `/metrics`, and the names of their stored sums."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ _ALL: Final = (
     ),
     Series("graspd_shards_total", "counter", ("stage",), "shards written", "controller"),
     Series("graspd_shard_bytes_total", "counter", ("stage",), "bytes of the shards written", "controller"),
-    Series("graspd_stage_seconds", "histogram", ("stage",), "time of a worker for one task", "controller"),
+    Series("graspd_stage_seconds", "histogram", ("stage",), "duration of one task on a worker", "controller"),
     Series(
         "graspd_task_failures_total", "counter", ("stage", "kind"), "failed attempts by name of the error", "controller"
     ),

@@ -37,7 +37,7 @@ class AssetKind(StrEnum):
 
 
 class Priority(StrEnum):
-    """Priority of a task: `interactive` goes first, except for every fourth task of a worker."""
+    """Priority of a task: `interactive` tasks come first, except for every fourth task of a worker."""
 
     INTERACTIVE = "interactive"
     BULK = "bulk"

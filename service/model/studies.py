@@ -1,4 +1,4 @@
-"""Records of studies: stability maps, and terms of charts of speed against accuracy."""
+"""Records of studies: stability maps, and keys of charts of speed against accuracy."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pydantic import BeforeValidator, TypeAdapter
 
 Outcome = Literal["good", "weak", "broken", "refused"]
 
-#: From best to worst; `refused` is separate: a guard rejected the input before any computation.
+#: Outcomes from best to worst; `refused` is separate: a check rejected the input before the computation.
 OUTCOMES: Final[tuple[Outcome, ...]] = ("good", "weak", "broken", "refused")
 #: JSON has no nan.
 _Number = Annotated[float, BeforeValidator(lambda value: math.nan if value is None else value)]
@@ -52,7 +52,7 @@ class StabilityMap:
     lines: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
     """Theoretical boundaries to draw over the panel of that name."""
     reach: str = ""
-    """Which cells a job can reach, and why no others."""
+    """Which cells a job can reach, with the reason."""
 
     def share(self, panel: str) -> float:
         cells = self.of(panel)
@@ -100,7 +100,7 @@ class Stability:
 
 
 def from_json(record: Mapping[str, Any]) -> Stability:
-    """Read a record of `as_json`; ValueError if it is none."""
+    """Read a record of `as_json`; ValueError if it is invalid."""
     return _RECORD.validate_python(record)
 
 
@@ -120,7 +120,7 @@ def reachable(cells: Iterable[MapCell], where: Callable[[MapCell], bool]) -> lis
 
 
 def short(value: float) -> str:
-    """Format a number in at most five characters, to fit a small square."""
+    """Format a number in at most five characters, for a small cell."""
     size = abs(value)
     if not math.isfinite(value):
         return "" if math.isnan(value) else "∞"
@@ -136,7 +136,7 @@ def tick(value: float | str) -> str:
 
 
 def between(ticks: Sequence[Any], value: float) -> float:
-    """Return the position of a value on logarithmic ticks, in steps from the first; extrapolates."""
+    """Return the position of a value on logarithmic ticks, in steps from the first tick; extrapolates."""
     logs, at = [math.log(tick) for tick in ticks], math.log(value)
     if len(logs) < 2:
         return 0.0
@@ -145,7 +145,7 @@ def between(ticks: Sequence[Any], value: float) -> float:
 
 
 def _exponent(text: str) -> str:
-    """Shorten an exponent (1e-05 to 1e-5), or use one where that is shorter."""
+    """Shorten an exponent (1e-05 to 1e-5), or use an exponent where the result is shorter."""
     if "e" not in text:
         digits = f"{float(text):e}".split("e")
         shorter = f"{digits[0].rstrip('0').rstrip('.')}e{int(digits[1])}"
@@ -168,7 +168,7 @@ _RECORD: Final = TypeAdapter(Stability)
 IN_SCENE: Final = "in the scene"
 FILTERED: Final = "free, filtered"
 
-#: Accuracies of a target and whether more is better: for free objects, and in scenes.
+#: Accuracies that a target can have, and whether more is better: for free objects, and in scenes.
 FREE: Final = {"gsr": True, "dexgraspbench": True, "hard": True, "robust": True, "epsilon": True, "pd_mm": False}
 IN_SCENES: Final = {"lift": True, "lift_dexgraspbench": True, "lift_hard": True, "robust": True}
 

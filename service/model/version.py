@@ -1,4 +1,4 @@
-"""Versions in every content address: change one when the bytes of a result may change."""
+"""Versions that are part of every content address: increase one when the bytes of a result may change."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Final
 
 PACKAGE_VERSION: Final = "0.2.0"
 
-#: Newest schema of task messages, and the oldest that this version still reads. A message carries the range of schemas
+#: Newest schema of task messages, and the oldest that this version still reads. A message contains the range of schemas
 #: that can read it, so workers of two versions may run in parallel (`service/model/workers.py`).
 TASK_SCHEMA: Final = 6
 OLDEST_TASK_SCHEMA: Final = 2

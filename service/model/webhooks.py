@@ -16,7 +16,7 @@ from graspd.service.model.records import Record
 
 End = Literal["succeeded", "failed", "cancelled"]
 MAX_URL: Final = 500
-#: Limits: webhooks of one project, and waiting deliveries of one webhook.
+#: Most webhooks of one project, and most waiting deliveries of one webhook.
 MOST_HOOKS: Final = 20
 MOST_WAITING: Final = 1000
 SIGNATURE: Final = "X-Graspd-Signature"
@@ -37,7 +37,7 @@ class Webhook(Record):
 
 
 def check_url(url: str) -> str:
-    """Return the URL; InputError unless it is http or https, with a host and without a user."""
+    """Return the URL; InputError unless its scheme is http or https, with a host and without a user."""
     try:
         parts = urlsplit(url)
         host, _ = parts.hostname, parts.port
@@ -51,7 +51,7 @@ def check_url(url: str) -> str:
 
 
 def secret_of(master: str, webhook: str) -> str:
-    """Return the secret that signs a webhook's bodies; it is derived, never stored."""
+    """Return the secret that signs a webhook's bodies; it is derived from `master`, never stored."""
     return "whsec_" + hmac.new(master.encode(), f"webhook {webhook}".encode(), hashlib.sha256).hexdigest()
 
 

@@ -5,9 +5,9 @@
     factor       not factor | ( expression ) | NAME | NAME op VALUE
     op           < <= > >= = == !=
 
-Metrics are compared with numbers, `hand`, `object` and `type` with words; flags stand alone. Comparisons with a missing
-number are false. The text is parsed to a tree and never evaluated as code. `service.readers.where` applies it to base
-shards, `service.index.queries.grasps` to the index.
+Metrics are compared with numbers; `hand`, `object` and `type` are compared with words; flags need no comparison.
+Comparisons with a missing number are false. The text is parsed to a tree and never evaluated as code.
+`service.readers.where` applies it to base shards, `service.index.queries.grasps` to the index.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from typing import Final
 from graspd.service.model.errors import InputError, one_of
 from graspd.service.model.metrics import GRASP_METRICS, GraspType
 
-#: Largest length and nesting depth of an expression.
+#: Limits on length and nesting depth of an expression.
 LONGEST: Final = 1000
 _DEEPEST: Final = 40
 _METRICS: Final = {metric.name: metric for metric in GRASP_METRICS if not metric.code}
@@ -42,7 +42,7 @@ class Flag:
 
 @dataclass(frozen=True)
 class MetricComparison:
-    """Comparison of a metric that is not a code with a number."""
+    """Comparison of a numeric metric (not a code) with a number."""
 
     name: str
     op: str
@@ -107,7 +107,7 @@ def _tokens(text: str) -> list[_Token]:
 
 
 class _Parser:
-    """Recursive-descent parser over the tokens; `at` is the next one."""
+    """Recursive-descent parser over the tokens; `at` is the index of the next token."""
 
     def __init__(self, tokens: list[_Token]) -> None:
         self.tokens, self.at = tokens, 0

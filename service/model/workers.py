@@ -1,7 +1,7 @@
 """Reports and capabilities of workers, requirements of tasks: several versions run in parallel.
 
-A message carries a range of schemas: the oldest that can express it, and the newest known to its writer. A worker reads
-a range too, and has one revision of each stage.
+A message contains a range of schemas: from the oldest that can express it to the newest known to its writer. A worker
+also reads a range, and has one revision of each stage.
 """
 
 from __future__ import annotations
@@ -44,11 +44,11 @@ class WorkerBeat:
     seen: Annotated[str, Field(max_length=32)]
     reason: Annotated[str, Field(max_length=300)] = ""
     schemas: tuple[Count, Count] = (0, 0)
-    """Oldest and newest readable task message; workers of graspd 0.1 report none and get no tasks."""
+    """Oldest and newest task message that the worker can read; workers of graspd 0.1 report none and get no tasks."""
     revisions: Annotated[dict[HostWord, Count], Field(max_length=16)] = field(default_factory=dict)
     done: Amount = 0.0
     total: Amount = 0.0
-    """Total work of its task, of which `done` is finished; 0: unknown."""
+    """Total work of the task, in the unit of `done`; 0: unknown."""
     message: Annotated[str, Field(max_length=300)] = ""
 
     @classmethod
@@ -72,7 +72,7 @@ class Requirements:
     schema: int
     newest: int
     revision: int
-    """Revision of the stage; 0 for the check of an asset, which has none."""
+    """Revision of the stage; 0 for the check of an asset, which has no revision."""
 
 
 @dataclass(frozen=True)

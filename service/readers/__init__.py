@@ -6,8 +6,8 @@
     shards = open_shards("s3://bucket/graspd", dataset="kitchen")          # a dataset's newest snapshot, cached here
     grasps = Grasps(shards)                                                # grasps[i]: one grasp as a dictionary
     arrays = grasps.arrays("grasp/hand_pose", "quality/epsilon")           # all of them as arrays
-    pictures = Pictures(shards)                                            # a picture with the grasps of its scene
-    clouds = pictures.clouds(points=1024, noise="stereo")                  # as a depth camera sees it, in points
+    pictures = Pictures(shards)                                            # a picture and the grasps of its scene
+    clouds = pictures.clouds(points=1024, noise="stereo")                  # point clouds of a simulated depth camera
 
 `service.readers.torch_data` wraps them for PyTorch; no other module here imports torch. Names are imported on first
 use, because reading a single shard needs few of them.

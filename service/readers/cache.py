@@ -45,7 +45,7 @@ class ShardCache:
         try:
             check_content(path, sha256)
             facts = path.stat()
-            # Marks the file as recently used for eviction. The modification time stays: it marks the file as verified.
+            # Mark the file as recently used. Its modification time is unchanged, because it marks the file as verified.
             os.utime(path, ns=(time.time_ns(), facts.st_mtime_ns))
         except (FileNotFoundError, DamagedShard):
             return False
@@ -64,7 +64,7 @@ class ShardCache:
 
 
 def check_not_forked(store: Store, process: int) -> None:
-    """Refuse a remote store in a fork of the process that opened it: its requests would never return."""
+    """Raise an error for a remote store in a fork of the process that opened it: requests would never return."""
     if os.getpid() != process and not store.url.startswith(("file:", "memory:")):
         raise InputError(
             f"{store.url} cannot be read in a fork of the process that opened it; "
@@ -83,8 +83,8 @@ def prefetched(
     Args:
         source: the samples.
         order: their indices; by default all in order.
-        workers: threads.
-        ahead: samples read in advance and not yet consumed; bounds the memory.
+        workers: number of threads.
+        ahead: most samples read in advance and not yet consumed; bounds the memory.
 
     Raises:
         InputError: a number is less than one.

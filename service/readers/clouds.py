@@ -1,4 +1,4 @@
-"""Labelled point clouds from pictures, with perfect or simulated camera depth; nothing is stored."""
+"""Labelled point clouds from pictures, with perfect or simulated camera depth; clouds are not stored."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from graspd.service.store.shards import Shard
 
 Array = NDArray[Any]
 Ints = NDArray[np.intp]
-#: Maps a base shard and K of its rows to points (K, H, 3) on the hand's surface in the object's frame [m].
+#: Function from a base shard and K of its rows to points (K, H, 3) on the hand's surface in the object's frame [m].
 HandSurface = Callable[[Shard, Ints], Floats]
 Frame = Literal["camera", "table", "object"]
 FRAMES: Final[tuple[Frame, ...]] = ("camera", "table", "object")
@@ -32,11 +32,11 @@ TOUCH_M: Final = 0.005
 
 
 class Clouds(Sequence[dict[str, Any]]):
-    """Point clouds of single views, or of all views of a scene fused. `clouds[i]` is a dictionary:
+    """Point clouds of single views, or fused from all views of a scene. `clouds[i]` is a dictionary:
 
         cloud/points (P, 3) [m]; cloud/normals (P, 3), unit, toward the camera that saw the point
         cloud/object (P,) 1 where the pixel shows the object; cloud/pixel (P, 3): view, row, column
-        cloud/seen: number of points to draw from; if fewer than P, some points repeat; if none, all values are zero
+        cloud/seen: number of visible points; if fewer than P, some points repeat; if none, all values are zero
         cloud/graspness (P,), optional: share of the scene's K grasps whose hand touches the point
         camera/intrinsics (3, 3) K [px], camera/extrinsics (4, 4) E, table to camera; for fused views (V, ...)
         table/plane (4,) n and d of n.x = d, the table's top; table/height [m] of the top along n in the table's frame
@@ -76,7 +76,7 @@ class Clouds(Sequence[dict[str, Any]]):
             postures: postures to return for each grasp, among pregrasp, grasp and squeeze.
             hand_surface: enables graspness; `graspd.readers.hand_surface` is one.
             touch_m: largest distance of a contact [m].
-            seed: of the sampled points and the noise; the same seed and `epoch` give the same clouds.
+            seed: seed of the sampled points and the noise; equal seeds and epochs give equal clouds.
 
         Raises:
             InputError: an unknown noise, frame or posture, or a number out of range.
@@ -144,7 +144,7 @@ class Clouds(Sequence[dict[str, Any]]):
         return cloud | {"cloud/seen": seen}
 
     def _graspness(self, views: Sequence[CloudView], pixel: Ints, scenes: Scenes, scene: int) -> Floats:
-        """Compute graspness at the true points: noise changes the measured points, not the contacts."""
+        """Compute graspness at the points without noise: noise changes measured points, not contacts."""
         assert self._surface is not None
         points = _of(views, pixel, CloudView.true_points)
         on_object = transforms.apply(transforms.invert(scenes.object_pose(scene)), points)
@@ -207,8 +207,8 @@ def graspness(points: NDArray[Any], hands: NDArray[Any], *, touch_m: float = TOU
     """Compute the share of the grasps whose hand touches each point.
 
     Wang et al. 2021 (Graspness Discovery in Clutters, eq. 1) sample poses of a parallel gripper around each point and
-    count those that hold and are clear. A hand with fingers touches several places and its grasps are optimised, not
-    sampled. Here each point counts the valid grasps of its scene that touch it.
+    count those that hold and are clear. A multi-finger hand touches several places, and its grasps are optimised
+    instead of sampled. Here graspness counts the valid grasps of a scene that touch the point.
 
     Args:
         points: (P, 3) in the object's frame [m].

@@ -17,7 +17,7 @@ Sources: Nguyen, Izadi, Lovell 2012, Modeling Kinect Sensor Noise (3DIMPVT), eq.
 Accuracy and Resolution of Kinect Depth Data (Sensors 12); Handa et al. 2014, A Benchmark for RGB-D Visual Odometry
 (ICRA); Grunnet-Jepsen et al., Intel white papers on tuning and on subpixel linearity of the D400 series, and his
 answers in librealsense issues 999 and 3904; Microsoft, Azure Kinect DK depth camera; Toelgyessy et al. 2021,
-Evaluation of the Azure Kinect (Sensors 21), as BlenderProc reads its figures.
+Evaluation of the Azure Kinect (Sensors 21), with the values used by BlenderProc.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class DepthNoise:
     mixed: bool = False
     """Pixels on an edge mix the depths on both of its sides."""
     steepest_deg: float = 80.0
-    """Largest angle of incidence with a measurement."""
+    """Largest angle of incidence at which the camera measures depth."""
     most_disparity_px: float = np.inf
     """Largest disparity of the search range."""
     dropout: float = 0.0
@@ -142,10 +142,10 @@ def incidence(depth: Floats, k: Floats) -> Floats:
 
 
 def shadows(depth: Floats, focal_baseline: float) -> Bools:
-    """Find the pixels (H, W) hidden from a right eye; disparity [px] is `focal_baseline` [px m] / depth.
+    """Find the pixels (H, W) hidden from the right eye; disparity [px] is `focal_baseline` [px m] / depth.
 
-    Each pixel is projected into the other picture, where the nearest surface remains. Pixels more than one pixel of
-    disparity behind that surface are hidden, as a left-right check finds; so are pixels outside the picture.
+    Each pixel is projected into the other picture, which shows the nearest surface. Pixels are hidden if they are more
+    than one pixel of disparity behind that surface (as in a left-right check), or outside the picture.
     """
     height, width = depth.shape
     with np.errstate(divide="ignore"):

@@ -51,7 +51,7 @@ class Shards:
     store: Store | None = None
     cache: ShardCache | None = None
     stream: bool = False
-    """Pictures of the store are read by byte ranges and not cached."""
+    """Whether pictures of the store are read by byte ranges, without a cache."""
 
     def __len__(self) -> int:
         return len(self.files)
@@ -68,7 +68,7 @@ class Shards:
         return tuple(file for file in self.files if file.kind == kind)
 
     def by_id(self, shard: str) -> ShardFile:
-        """Return a shard by its id; NotFoundError if it is not among these."""
+        """Return a shard by its id; NotFoundError if it is not among these shards."""
         if shard not in self._by_id:
             raise NotFoundError(f"shard {shard[:12]} is not among the {len(self)} shards given")
         return self._by_id[shard]
@@ -123,8 +123,8 @@ def open_shards(
         snapshot: digest of another snapshot of that dataset.
         cache: folder for files of a store; by default `$XDG_CACHE_HOME/graspd/shards`.
         cache_bytes: size limit of the cache [bytes].
-        stream: read pictures from the store by byte ranges on demand, without a cache. Their bytes are checked when
-            they are unpacked, not against the SHA-256 of the shard.
+        stream: read pictures from the store by byte ranges on demand, without a cache. Damage is detected on
+            unpacking, not by the SHA-256 of the shard.
 
     Raises:
         NotFoundError: no such file, job, dataset or snapshot.

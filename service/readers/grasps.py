@@ -16,7 +16,7 @@ from graspd.service.store.columns import SCHEMAS, check_known
 from graspd.service.store.shards import open_shard, read_column
 
 Array = NDArray[Any]
-#: Maps the columns of one base shard to a mask (N,) of the selected grasps.
+#: Function from the columns of one base shard to a mask (N,) of selected grasps.
 Where = Callable[[Mapping[str, Array]], Array]
 
 DEFAULT_COLUMNS: Final = (
@@ -36,7 +36,7 @@ _KEPT: Final = 256
 
 
 class Grasps(Sequence[dict[str, Any]]):
-    """Grasps of base shards. `grasps[i]` holds column rows and `hand`, `object`, `shard_id`, `row`.
+    """Grasps of base shards. `grasps[i]` is a dictionary of column rows and `hand`, `object`, `shard_id`, `row`.
 
     Names, units and frames of columns are those of docs/reference/dataset.md. Swept metrics have one value per contact
     threshold of the shard.
@@ -69,7 +69,7 @@ class Grasps(Sequence[dict[str, Any]]):
         self._files = shards.of("base")
         self._memory: OrderedDict[str, dict[str, Array]] = OrderedDict()
         self._rows = [self._kept(file) for file in self._files]
-        #: Index (shards,) after the last grasp of each base shard.
+        #: (shards,) end index of each base shard's grasps.
         self.ends = np.cumsum([len(rows) for rows in self._rows], dtype=np.int64)
 
     def __len__(self) -> int:

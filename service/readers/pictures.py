@@ -62,7 +62,7 @@ class Pictures(Sequence[dict[str, Any]]):
 
     `object/pose` (7,) is the pose of the object's frame in the camera frame.
 
-    In a stereo pair the left eye comes before the right.
+    In a stereo pair the left picture comes before the right one.
     """
 
     def __init__(
@@ -84,7 +84,7 @@ class Pictures(Sequence[dict[str, Any]]):
             clear: only grasps that are clear of table and neighbours in this scene.
             valid: only valid grasps; False: all grasps of the base shards.
             unvalidated: select instead only feasible grasps without validation.
-            with_grasps_only: leave out pictures of scenes without a grasp.
+            with_grasps_only: omit pictures of scenes without a grasp.
 
         Raises:
             InputError: unknown column.
@@ -133,7 +133,7 @@ class Pictures(Sequence[dict[str, Any]]):
     def _add(self, file: ShardFile, *, with_grasps_only: bool) -> None:
         with self.shards.opened(file) as opened:
             scenes = np.asarray(opened["camera/scene_index"])
-            # Grasps planned in scenes have these in their base shard.
+            # For grasps planned in scenes these are in the base shard.
             scene_shard = str(opened.attrs.get("base_shard") or opened.attrs.get("scene_shard") or "")
             if not scene_shard:
                 raise InputError(
@@ -159,7 +159,7 @@ class Pictures(Sequence[dict[str, Any]]):
 
     def scenes_of(self, shard: str) -> Scenes:
         found = self._scenes.get(shard)
-        if found is None:  # concurrent threads may both build it; either result is right
+        if found is None:  # concurrent threads may both build it, with equal results
             found = self._scenes[shard] = Scenes(self.shards, shard, self._quality, **self._which)
             if len(self._scenes) > _KEPT:
                 self._scenes.popitem(last=False)

@@ -1,7 +1,7 @@
 """Reader of pictures in a store by byte ranges: read-ahead, no HDF5 library, no disk cache.
 
-A picture is one zlib-compressed chunk of its column; its checksum (Adler-32) shows damage. Any number of threads can
-read and unpack byte ranges, while the HDF5 library runs one thread at a time.
+A picture is one zlib-compressed chunk of its column; its checksum (Adler-32) reveals damage. Any number of threads can
+read and unpack byte ranges, whereas the HDF5 library runs only one thread at a time.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from graspd.service.store.integrity import gone
 from graspd.service.store.shards import open_shard, read_column
 from graspd.service.store.store import Store
 
-#: Offset and length [bytes]; offset and the bytes from there.
+#: Offset and length [bytes]; offset and the bytes from this offset.
 Range = tuple[int, int]
 Span = tuple[int, memoryview]
 #: Largest request when pictures are read in sequence [bytes]; a smaller shard is read whole.
@@ -39,7 +39,7 @@ _OBJECTS: Final = 256
 GAP_BYTES: Final = 1 << 16
 #: Block size for HDF5 metadata [bytes], which lies at the beginning and scattered in the file.
 _BLOCK_BYTES: Final = 1 << 14
-#: Threads request neighbouring pictures nearly in order; this is the tolerance in rows.
+#: Tolerance in rows for reading in sequence: several threads request pictures only nearly in order.
 _NEARLY: Final = 16
 
 
@@ -75,8 +75,8 @@ class RangeReader:
         except GraspdError as error:
             if opened and source.failed is None:
                 raise
-            # HDF5 reports only a failed read; the store's error has the reason. A new error is raised, because a
-            # reference to the old one keeps objects that HDF5 could not open, which crashes at exit (h5py 3.16).
+            # HDF5 reports only a failed read; the store's error has the reason. Raise a new error: a reference to the
+            # old one keeps objects alive that HDF5 could not open, which crashes at exit (h5py 3.16).
             told = source.failed or error
             problem = type(told)(*told.args)
             del told
@@ -84,7 +84,7 @@ class RangeReader:
             raise problem
 
     def read(self, key: str, wanted: Sequence[Range], row: int, further: Callable[[int], Sequence[Range]]) -> list[Any]:
-        """Return the bytes of some ranges of a row; `further` maps another row to its ranges, empty after the last."""
+        """Return the bytes of some ranges of a row; `further` returns another row's ranges, none after the last row."""
         held = self._of(key)
         with held.lock:
             if not all(_covers(held.spans, one) for one in wanted):
@@ -177,7 +177,8 @@ class _Source(io.RawIOBase):
             try:
                 self._spans.append(self._get((first, last - first)))
             except GraspdError as error:
-                # HDF5 would print an exception of this function and continue: return zeros, which it cannot parse.
+                # HDF5 would print an exception from here and continue. Zeros make it stop, because it cannot parse
+                # them.
                 self.failed = error.with_traceback(None)
                 self._spans.append((first, memoryview(bytes(last - first))))
         data = _cut(self._spans, wanted)
@@ -208,7 +209,7 @@ def _cut(spans: Sequence[Span], one: Range) -> memoryview:
 
 
 Array = NDArray[Any]
-#: Maps (offset, length) pairs [bytes] to their bytes.
+#: Function from (offset, length) pairs [bytes] to their bytes.
 ReadRanges = Callable[[list[tuple[int, int]]], Sequence[bytes | memoryview]]
 
 _SHUFFLE: Final = h5py.h5z.FILTER_SHUFFLE
@@ -229,14 +230,14 @@ class _Packed:
         if not self.shuffled or size == 1:
             return raw.copy().view(self.dtype).reshape(self.shape)
         turned = np.empty((len(raw) // size, size), np.uint8)
-        for byte, column in enumerate(raw.reshape(size, -1)):  # byte by byte: twice as fast as transposing
+        for byte, column in enumerate(raw.reshape(size, -1)):  # one byte plane at a time: twice as fast as transposing
             turned[:, byte] = column
         return turned.reshape(-1).view(self.dtype).reshape(self.shape)
 
 
 @dataclass(frozen=True)
 class RowTable:
-    """Columns of a shard: file positions of the rows of packed columns, values of all others."""
+    """Columns of a shard: file positions of the rows in packed columns, values of other columns."""
 
     name: str
     packed: dict[str, _Packed]

@@ -7,7 +7,7 @@ from graspd.service.readers.torch_data import Samples, ShuffledShards, collate
 shards = open_shards("demo-out/shards")
 DataLoader(Samples(Pictures(shards)), batch_size=16, shuffle=True, num_workers=4, collate_fn=collate)
 DataLoader(Samples(Pictures(shards).clouds(1024, noise="stereo")), batch_size=64, collate_fn=collate)
-DataLoader(ShuffledShards(shards, seed=1), batch_size=256, num_workers=4)     # larger than memory
+DataLoader(ShuffledShards(shards, seed=1), batch_size=256, num_workers=4)     # for data larger than memory
 """
 
 from __future__ import annotations
@@ -32,19 +32,19 @@ def tensors(sample: Sample) -> Sample:
 
 
 def collate(samples: Sequence[Sample]) -> Sample:
-    """Collate one batch by stacking; grasps of a picture's or cloud's scene stay a list of tensors."""
+    """Collate one batch by stacking; grasps of scenes (pictures, clouds) stay a list of tensors."""
     pictures = "grasp/base_row" in samples[0]
     batch: Sample = {}
     for name in samples[0]:
         values = [sample[name] for sample in samples]
-        # Scenes may have equal numbers of grasps by chance; the type of the batch must not depend on that.
+        # Scenes may have equal numbers of grasps by chance, but the type of the batch must not depend on this.
         listed = pictures and name.startswith(OF_GRASPS)
         batch[name] = values if listed else default_collate(values)
     return batch
 
 
 class Samples(Dataset[Sample]):
-    """Map-style dataset of `Grasps`, `Pictures` or `Clouds` for a `DataLoader`, also with processes."""
+    """Map-style dataset of `Grasps`, `Pictures` or `Clouds` for a `DataLoader`, also with worker processes."""
 
     def __init__(self, source: Sequence[Sample], transform: Callable[[Sample], Sample] = tensors) -> None:
         self._source, self._transform = source, transform
@@ -84,7 +84,7 @@ class ShuffledShards(IterableDataset[Sample]):
             valid: select only valid grasps.
             unvalidated: select instead only feasible grasps without validation.
             where: further selection: a function of the columns that returns a mask.
-            buffer: number of grasps among which the next one is drawn.
+            buffer: number of grasps from which the next one is drawn.
             seed: seed of the order; `epoch` changes it.
             rank: rank of this process in a distributed run.
             ranks: number of processes of the distributed run.

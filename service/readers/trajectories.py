@@ -15,7 +15,7 @@ from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.model.transforms import Floats, slerp
 from graspd.service.store.shards import Shard
 
-#: Names of the stops: postures where a phase begins or ends. Waypoints between them have no name.
+#: Names of the stops, postures at which a phase begins or ends. Waypoints between stops have no name.
 STOPS: Final = ("standoff", "pregrasp", "grasp", "squeeze", "lift")
 
 
@@ -30,13 +30,14 @@ class Waypoint:
     joint_positions: Floats
     """(J,) [rad or m]"""
     carried: Floats
-    """(3,) displacement of the carried object from rest [m]."""
+    """(3,) displacement of the lifted object from its rest position [m]."""
 
 
 def way_of(shard: Shard, row: int) -> list[Waypoint]:
     """Return the trajectory of a grasp: pregrasp, grasp, squeeze; approach and lift if present.
 
-    The last waypoint of an approach and the pregrasp share a hand pose; there the open fingers move to the pregrasp.
+    The last waypoint of an approach and the pregrasp have the same hand pose; between them the open fingers close to
+    the pregrasp.
     """
     rest = np.zeros(3)
 
@@ -56,7 +57,7 @@ def way_of(shard: Shard, row: int) -> list[Waypoint]:
 
 
 def stop_places(way: Sequence[Waypoint]) -> Floats:
-    """Return the slider position (W,) of each waypoint: stops at 0, 1, 2, ..., others evenly between."""
+    """Return the slider position (W,) of each waypoint: 0, 1, 2, ... for stops, evenly spaced between them."""
     stops = [k for k, point in enumerate(way) if point.name]
     return np.interp(np.arange(len(way)), stops, np.arange(len(stops)))
 

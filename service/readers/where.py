@@ -17,7 +17,7 @@ from graspd.service.store.manifests import INDEX_THRESHOLD_M
 
 Array = NDArray[Any]
 Mask = NDArray[np.bool_]
-#: Maps the columns and attributes (hand, object) of a base shard to a mask (N,).
+#: Function from columns and attributes (hand, object) of a base shard to a mask (N,).
 Test = Callable[[Mapping[str, Array], Mapping[str, Any]], Mask]
 
 _METRICS: Final = {metric.name: metric for metric in GRASP_METRICS}
@@ -28,7 +28,7 @@ _FLAGS: Final = {"held": "quality/success", "lift": "quality/lift_outcome", "lif
 
 
 def parse(text: str) -> Test:
-    """Compile an expression to a test; InputError if it is none. Comparisons with a missing metric or nan are false."""
+    """Compile an expression to a test, or raise InputError. Comparisons with a missing metric or nan are false."""
     tree = parsed(text)
     return lambda columns, said: _mask(tree, columns, said)
 

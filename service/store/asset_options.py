@@ -1,4 +1,4 @@
-"""Command-line options of a hand or an object, as keys of its `asset.json`."""
+"""Command-line options of a hand or an object, stored as keys of its `asset.json`."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class HandWords(Model):
 
 
 class SweptOptions(ObjectOptions):
-    """Options of an object, including several sizes to make it in."""
+    """Options of an object, with several sizes for `--scale-to`."""
 
     scale_to: Annotated[str | None, _TYPED] = Field(  # type: ignore[assignment]
         None, description="longest extent after scaling [m]; 0.06,0.08,0.1: one object per size"
@@ -57,7 +57,7 @@ def provenance(licence: str | None, source: str | None) -> dict[str, Any]:
 
 
 def hand_options(**given: Any) -> dict[str, Any]:
-    """Return the keys of a hand's `asset.json` for options of `HandWords`; absent ones are omitted."""
+    """Return the keys of a hand's `asset.json` for options of `HandWords`; omit absent options."""
     words = HandWords(**given)
     options: dict[str, Any] = {
         "file": words.urdf,

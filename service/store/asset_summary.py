@@ -1,4 +1,4 @@
-"""Summary of an asset's check for users: sizes and guesses. The check's messages list the repairs."""
+"""Summary of an asset's check for users: sizes and guesses. Repairs are in the check's messages."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import typer
 
 from graspd.service.model.states import AssetKind
 
-#: Surface displacement from rounding that is not reported [m].
+#: Surface displacements up to this are rounding and are not reported [m].
 _NOTHING_M = 1e-7
 _OVERRIDES = {"palm": "--palm LINK --approach x,y,z", "preshape": "--pre-shape JOINT=VALUE,..."}
 

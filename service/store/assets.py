@@ -20,12 +20,12 @@ from graspd.service.model.states import AssetKind
 from graspd.service.store.descriptions import MAX_BYTES, parse_description
 
 _EPOCH: Final = (1980, 1, 1, 0, 0, 0)
-#: Built-in assets have the date of the release, so that repeated publication writes the same manifest.
+#: Creation date of built-in assets: that of the release, so that repeated publication writes the same manifest.
 _BUILTIN_CREATED: Final = "2026-11-21T00:00:00Z"
 MAX_FILES: Final = 2000
-#: zlib's message for lack of memory, which is not damage.
+#: zlib's message for lack of memory, to distinguish it from damage.
 _NO_MEMORY: Final = "Error -4 "
-#: Limits of one name and of all names together: every list of hands or objects contains them.
+#: Limits on the length of one name and of all names together: every list of hands or objects contains them.
 MAX_NAME: Final = 255
 MAX_NAMES: Final = 128 << 10
 #: Limit on unpacked size over packed size: robot meshes compress about 4:1, so only ZIP bombs exceed it.
@@ -59,7 +59,7 @@ def unpack(data: bytes, *, limit_bytes: int) -> dict[str, bytes]:
     total = 0
     for name, entry in _entries(archive).items():
         with _damage_said(entry), archive.open(entry) as stream:
-            content = stream.read(limit_bytes - total + 1)  # regardless of the size in its header
+            content = stream.read(limit_bytes - total + 1)  # not trusting the size in its header
         total += len(content)
         if total > limit_bytes:
             raise LimitError(f"the archive unpacks to more than {limit_bytes} bytes")
@@ -77,7 +77,7 @@ def unpack_file(path: Path) -> dict[str, bytes]:
 
 
 def without_common_folder(files: dict[str, _T]) -> dict[str, _T]:
-    """Remove the folder's name from all names if the archive is of one whole folder."""
+    """Remove the folder's name from all names if the archive contains one folder."""
     tops = {name.partition("/")[0] for name in files}
     if len(tops) == 1 and all("/" in name for name in files):
         return {name.partition("/")[2]: entry for name, entry in files.items()}
@@ -85,7 +85,7 @@ def without_common_folder(files: dict[str, _T]) -> dict[str, _T]:
 
 
 class ZipFiles(MutableMapping[str, bytes]):
-    """Files of a ZIP on disk, unpacked in pieces on demand; digests are of the true contents. Files can be added."""
+    """Files of a ZIP on disk, unpacked in pieces on demand; digests cover the unpacked contents. Files can be added."""
 
     def __init__(self, file: IO[bytes], *, limit_bytes: int) -> None:
         self._archive = _open_zip(file)
@@ -155,7 +155,7 @@ def _entries(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
         if entry.flag_bits & 1:
             raise InputError(f"the archive entry {name!r} is encrypted; pack it without a password")
         if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-            # Other methods can request gigabytes of memory before the first byte.
+            # Other compression methods can request gigabytes of memory before the first byte.
             raise InputError(f"the archive entry {name!r} is compressed in an unusual way; use plain deflate")
         found[name] = entry
     if sum(map(len, found)) > MAX_NAMES:
@@ -216,7 +216,7 @@ def builtin_names(kind: AssetKind) -> tuple[str, ...]:
 
 
 def describe(kind: AssetKind, name: str, files: Mapping[str, bytes], *, created: str, builtin: bool = False) -> Asset:
-    """Make the asset record of files with an `asset.json` whose key `file` is the main file."""
+    """Create the asset record of files; the key `file` of their `asset.json` is the main file."""
     described = parse_description(asset_json(files), f"{kind.value} {name!r}")
     main = described.file
     if main not in files:

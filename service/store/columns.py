@@ -104,7 +104,7 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
             "largest ratio of displacement or rotation to its limit under the pushes; below 1: held",
         ),
         "quality/validated_by": _code(
-            "engine of the verdict `success`: 0 MuJoCo on the CPU, which alone certifies, 1 MuJoCo Warp, the prefilter"
+            "engine of the verdict `success`: 0 MuJoCo on the CPU (the reference), 1 MuJoCo Warp (the prefilter)"
         ),
         "quality/recheck": _flag(
             "verdict under the unmodified DexGraspBench protocol: 1 held, 0 dropped, -1 not rechecked"
@@ -115,7 +115,7 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
             "perturbed parameter of the first model in which the grasp does not hold: 0 none, "
             + ", ".join(f"{axis:d} {words}" for axis, words in AXIS_MEANINGS.items())
         ),
-        # Grasps planned for a scene state the scene, the approach and the lift.
+        # Grasps planned in scenes also have the scene, the approach and the lift.
         "scene/object_pose": _absent("S 7", "f8", "m, 1", "scene", "object frame at rest in each scene; z is up"),
         "scene/rest_probability": _absent("S", "f8", "1", "none", _REST),
         "scene/neighbour_pose": _absent(

@@ -1,4 +1,4 @@
-"""`asset.json`, a small JSON object whose meaning workers check, and corrections of guesses about a hand."""
+"""`asset.json`, a small JSON object that workers validate, and corrections of guesses about a hand."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pydantic_core import from_json, to_json
 from graspd.service.model.base import Model, refusal
 from graspd.service.model.errors import ConflictError, InputError
 
-#: The built-in hands need 2 KB; every list of hands or objects contains these facts.
+#: Size limit of facts: every list of hands or objects contains them; built-in hands need 2 KB.
 MAX_BYTES: Final = 64 << 10
 MAX_FACTS_BYTES: Final = 8 << 10
 _MAX_DEPTH: Final = 6
@@ -72,7 +72,7 @@ def _is_plain(value: Any, depth: int) -> bool:
     return not isinstance(value, int) or abs(value) <= _MAX_NUMBER
 
 
-#: Far above any hand: the largest in use have about sixty joints.
+#: Limit far above any hand: the largest in use have about sixty joints.
 MAX_ENTRIES: Final = 256
 #: Largest distance of the palm from its link's frame [m].
 MAX_CENTRE_M: Final = 2.0
@@ -122,7 +122,7 @@ class HandFacts(BaseModel):
     links: list[str]
     """Links at and below the root."""
     bodies: list[str]
-    """Those of them that are the root or moved by a joint."""
+    """Links among these that are the root or moved by a joint."""
 
 
 def facts_of(model: bytes) -> HandFacts:
@@ -148,7 +148,7 @@ def described(facts: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def corrected(said: Mapping[str, Any], facts: HandFacts, corrections: HandCorrections) -> dict[str, Any]:
-    """Return an `asset.json` with all given, found and corrected values; InputError for a value out of its limits."""
+    """Return an `asset.json` with all given, found and corrected values; InputError for a value out of range."""
     _check(facts, corrections)
     found = described(facts.model_dump())
     turned = {name for name, way in corrections.closing.items() if way != facts.closing[name]}

@@ -25,7 +25,7 @@ _TAKEN: Final = (*SUFFIXES, ".yaml", ".yml", ".stl", ".obj", ".ply", ".off", ".g
 _REFERENCE: Final = re.compile(r"""file(?:name)?\s*=\s*["']([^"']+)["']""")
 _FOLDER: Final = re.compile(r"""(?:mesh|asset)dir\s*=\s*["']([^"']*)["']""")
 _MAX_INCLUDED: Final = 32
-#: Folders of descriptions in a ROS package: the meshes are in sibling folders, not below.
+#: Folders of descriptions in a ROS package: meshes are in sibling folders.
 _OF_PACKAGES: Final = ("urdf", "robots", "xacro", "mjcf")
 _ABOVE: Final = 4
 
@@ -33,8 +33,8 @@ _ABOVE: Final = 4
 def files_of_hand(path: Path) -> tuple[dict[str, Path], str]:
     """Find a hand's files with relative names, and the name of its description (empty for a folder).
 
-    With a description: the files that it names, relative to the ROS package around it or else to its own folder. Links
-    that lead out of the hand's folder are ignored.
+    For a description: the files that it names, relative to the ROS package around it or else to its own folder. Links
+    to targets outside the hand's folder are ignored.
     """
     files, main = (_of_folder(path), "") if path.is_dir() else _of_description(path)
     return files | _looks(files, path.resolve() if path.is_dir() else _package(path.resolve())), main
@@ -81,7 +81,7 @@ def _of_description(path: Path) -> tuple[dict[str, Path], str]:
     root = _package(path)
     main = path.relative_to(root).as_posix()
     if path.is_file() and format_of(path.name, path.read_bytes()) == "xacro":
-        # Includes are only known after expansion.
+        # The expansion of xacro reveals included files.
         files = _below(root if (root / "package.xml").is_file() else path.parent, root)
     else:
         files = {name: root / name for name in sorted(_named_by(path, root))}
@@ -100,7 +100,7 @@ def _package(path: Path) -> Path:
 
 
 def _named_by(path: Path, root: Path) -> set[str]:
-    """Return names of files below the root to which a description and its includes may refer."""
+    """Return names of the files below the root that a description and its includes may refer to."""
     seen, waiting = {path}, [path]
     bases, folders, references = set(), {""}, set()
     found: set[str] = set()
@@ -130,7 +130,7 @@ def _names(written: str, base: str, folder: str, root: Path) -> Iterator[str]:
 
 
 def _on_disk(name: str, root: Path) -> str:
-    """Return the name of a file below the root in its actual capitals; empty if there is none."""
+    """Return the name of a file below the root in its actual upper and lower case; empty if there is none."""
     if _inside(root / name, root):
         return posixpath.normpath(name)
     at = root
@@ -154,7 +154,7 @@ def _inside(file: Path, root: Path) -> bool:
 
 
 Format = Literal["urdf", "xacro", "mjcf"]
-#: Size of the head searched for a root element [bytes]; no tool writes one later.
+#: Size of the file's head that is searched for a root element [bytes]; no tool writes it later.
 _HEAD_BYTES: Final = 1 << 16
 _PROLOG: Final = re.compile(r"\s*(?:<\?.*?\?>|<!--.*?-->|<!DOCTYPE(?:[^\[>]|\[.*?\])*>)", re.DOTALL)
 _ROOT: Final = re.compile(r"\s*<([A-Za-z_][\w:.-]*)")
@@ -186,7 +186,7 @@ def format_of(name: str, data: bytes) -> Format | None:
     found = _FORMATS_OF.get(_root_element(text[:_HEAD_BYTES]))
     if found == "urdf" and any(sign in _COMMENT.sub("", text) for sign in _MACROS):
         return "xacro"
-    # Otherwise the suffix decides, so that the reader reports the error in the file.
+    # Otherwise decide by the suffix, so that the reader reports the error in the file.
     return found or {".urdf": "urdf", ".xacro": "xacro", ".mjcf": "mjcf"}.get(suffix)  # type: ignore[return-value]
 
 
@@ -206,11 +206,11 @@ def text_of(data: bytes) -> str:
 
 
 def main_of(files: Mapping[str, bytes], wanted: str = "", *, where: str = "the hand") -> str:
-    """Return the file that describes the hand; InputError if none, or several, fit `wanted`, a part of its name."""
+    """Return the file that describes the hand; InputError unless exactly one matches `wanted`, a part of its name."""
     known = {name: kind for name in sorted(files) if (kind := format_of(name, _described_head(files, name)))}
     if wanted:
         return _named(wanted, [name for name in sorted(files) if name in known or name == wanted], where)
-    # A part of a xacro description may contain no macros.
+    # An included part of a xacro description may contain no macros.
     kinds_of = {name: "xacro" if name.lower().endswith(".xacro") else kind for name, kind in known.items()}
     for chosen in ("urdf", "xacro", "mjcf"):
         found = [name for name, kind in kinds_of.items() if kind == chosen]

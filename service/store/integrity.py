@@ -1,8 +1,8 @@
 """Checksums of stored objects and of shards in folders; seals inside objects.
 
-A seal is the digest of the object with the 64 digits of the seal as zeros. It is the first field `checksum` of a JSON
-record, the comment of a ZIP (also `.npz`), or in the `extras` of a binary glTF's document. Objects of graspd 0.2 have
-no seal and are read as before.
+A seal is the digest of the object, computed with zeros in place of the seal's 64 digits. It is the first field
+`checksum` of a JSON record, the comment of a ZIP (also `.npz`), or in the `extras` of a binary glTF's document. Objects
+of graspd 0.2 have no seal and are read without this check.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ CHECKSUM_LISTS: Final = ("SHA256SUMS", "checksums.sha256")
 _DIGEST: Final = re.compile(r"[0-9a-f]{64}")
 _LEVELS: Final = 3
 FIX: Final = "`graspd admin store verify --repair` makes it again where that is possible"
-#: Lifetime of a successful check [s]: bits can rot without a new modification time.
+#: Lifetime of a successful check [s]: bits can change without a new modification time.
 _BELIEVED_S: Final = 3600.0
 _REMEMBERED: Final = 100_000
 
@@ -122,7 +122,7 @@ def _of_block(data: bytes) -> bytes:
 
 
 def check_file(path: Path) -> None:
-    """Check a shard in a folder, once while it is unchanged, against the manifest or checksum list there, if any."""
+    """Check a shard in a folder against its manifest or checksum list, if any; once per version of the file."""
     if _known.get(path) != _file_stamp(path):
         check_content(path, _expected(path))
 
@@ -160,7 +160,7 @@ def _expected(path: Path) -> str | None:
 
 
 def _of_manifest(path: Path) -> str | None:
-    """Return the checksum in the manifest beside a file, as in the store's own folder."""
+    """Return the checksum in the manifest next to a file, as in the store's folder."""
     try:
         said = json.loads(path.with_suffix(".json").read_bytes())
         digest = said["sha256"] if str(said["key"]).endswith(f"/{path.name}") else None
@@ -182,7 +182,7 @@ _GLB: Final = b'{"extras":{"checksum":"'
 _ZIP: Final = b"sha256:"
 #: Size of a document's header and the header of its first chunk [bytes].
 _GLB_AT: Final = 20
-#: Head of an object that may contain the digits if preceding bytes were lost or added [bytes].
+#: Size of the object's head that may contain the seal's digits if earlier bytes were lost or added [bytes].
 _SLACK: Final = 4
 _END: Final = struct.Struct("<4s4H2LH")
 _END_MARK: Final = b"PK\x05\x06"
@@ -204,7 +204,7 @@ def put_document(store: Store, key: str, document: Mapping[str, Any]) -> bool:
 
 
 def get_document(store: Store, key: str) -> dict[str, Any]:
-    """Read the JSON of `put_document`; errors of `get_sealed`, DamagedError also if not a JSON object."""
+    """Read the JSON of `put_document`; errors as in `get_sealed`; DamagedError also if it is not a JSON object."""
     try:
         found = json.loads(get_sealed(store, key))
     except ValueError:
@@ -216,7 +216,7 @@ def get_document(store: Store, key: str) -> dict[str, Any]:
 
 
 def sealed(key: str, data: bytes) -> bytes:
-    """Return the object with its seal. Other formats than JSON object, ZIP and glTF do not change."""
+    """Return the object with its seal; formats other than JSON object, ZIP and glTF are unchanged."""
     if key.endswith(".json") and data[:1] == b"{":
         data, at = _JSON + _ZEROS + b'",' + data[1:], len(_JSON)
     elif key.endswith(".glb") and data[:4] == b"glTF" and data[_GLB_AT : _GLB_AT + 1] == b"{":

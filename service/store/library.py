@@ -20,7 +20,7 @@ from graspd.service.store.records import Put, put_record, read_record
 from graspd.service.store.store import Store
 
 log = logging.getLogger(__name__)
-#: The upload limit bounds archives packed by the service; this only stops a manipulated store.
+#: Size limit against a manipulated store; archives packed by the service have the upload limit.
 UNPACKED_LIMIT_BYTES: Final = 2 * 2**30
 
 
@@ -34,7 +34,7 @@ def publish_asset(
 def store_files(
     store: Store, kind: AssetKind, name: str, files: Mapping[str, bytes], said: Mapping[str, object] | None = None
 ) -> Asset:
-    """Store the archive of an asset, which does not exist for readers yet; InputError for an invalid `asset.json`.
+    """Store the archive of an asset, which readers do not see yet; InputError for an invalid `asset.json`.
 
     `said` are further fields of the record. Private files contain their project's mark (`service.model.projects`).
     """
@@ -88,7 +88,7 @@ def publish_builtins(store: Store) -> list[Asset]:
                 log.warning("the built-in %s %s cannot be used: %s", kind.value, name, error)
             key = names.asset_model(kind, asset.digest)
             model = sealed(key, builtin_model(kind, name))
-            # The model depends on program and asset: one of an older version is replaced.
+            # The model depends on code and asset: a model of an older version is replaced.
             if not store.put(key, model) and store.get(key) != model:
                 store.delete(key)
                 store.put(key, model)

@@ -1,4 +1,4 @@
-"""Manifest of a shard: written last and create-only; all data that the index needs."""
+"""Manifest of a shard: written last and create-only; it has all data that the index needs."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ class ShardManifest(Record):
     @model_validator(mode="before")
     @classmethod
     def _tried_what_it_holds(cls, data: Any) -> Any:
-        # Early shards always contained every candidate.
+        # Shards of early versions contained all candidates.
         if isinstance(data, dict) and "candidates" not in data and data.get("kind") == "base":
             return {**data, "candidates": data.get("counts", {}).get("N", 0)}
         return data
@@ -98,7 +98,7 @@ class ShardManifest(Record):
 
     @property
     def validated(self) -> int:
-        """Candidates tested by geometric gate and validator, the base of the valid share; 0 without validator."""
+        """Number of candidates tested by gate and validator, the base of the valid share; 0 without validator."""
         has_verdicts = any(grasp.success is not None for grasp in self.grasps)
         return self.candidates if has_verdicts or (not self.grasps and self.request.validation != "none") else 0
 
@@ -185,9 +185,9 @@ def _summaries(
 
 
 def publish_shard(store: Store, manifest: ShardManifest, data: bytes) -> bool:
-    """Store a shard, manifest last. False if it exists, which is success too."""
+    """Store a shard, manifest last; return False if it exists already, which is also success."""
     if not store.put(manifest.key, data):
-        # Two workers raced, or one died between the two writes: the manifest describes the bytes in the store.
+        # Two workers wrote at once, or one died between both writes: describe the bytes that are in the store.
         manifest = described_again(manifest.model_dump(mode="json"), store.get(manifest.key))
     return put_record(store, names.shard_manifest(manifest.stage, manifest.shard_id), manifest)
 
@@ -206,7 +206,7 @@ def shard_exists(store: Store, stage: Stage, shard: str) -> bool:
 
 
 def described_again(said: Mapping[str, Any], data: bytes) -> ShardManifest:
-    """Rebuild the manifest of a file; other fields come from an existing manifest, as JSON, of the shard."""
+    """Rebuild the manifest of a file; `said`, an existing manifest of the shard as JSON, provides the other fields."""
     pictures = tuple(path for path in SCHEMAS["views"] if path.startswith("image/"))
     shard = read_shard(data, without=pictures, name=said["key"])
     told = {"sha256": hashlib.sha256(data).hexdigest(), "size_bytes": len(data)}

@@ -25,13 +25,13 @@ class Reference:
     """Candidate names in the upload, in order of preference."""
     scheme: str = ""
     tails: tuple[str, ...] = ()
-    """With a scheme: path tails that may be below any folder; all but the bare file name."""
+    """For names with a scheme: path tails, except the bare file name, that may be below any folder."""
 
 
 def read_reference(written: str, base: str) -> Reference:
-    """Resolve a name, with either kind of slashes, and spaces or `%20`; InputError continues after the name.
+    """Resolve a name with slashes or backslashes, spaces or `%20`; the message of InputError continues after the name.
 
-    A ROS package may be packed with or without its folder and those above, and next to other packages.
+    A ROS package may be packed with or without its folder and parent folders, and next to other packages.
     `package://NAME/a/b.stl` is NAME/a/b.stl, a/b.stl or b.stl, from the description's folder or from the top.
     """
     text = written.strip().replace("\\", "/")
@@ -40,7 +40,7 @@ def read_reference(written: str, base: str) -> Reference:
     if found and scheme not in _OURS:
         raise InputError("is no file of this hand; put it beside the URDF")
     rest = text[found.end() :] if found else text
-    # A package is not below the description's folder: dots in its path are relative to the package.
+    # A package is not below the description's folder: `..` in its path is relative to the package.
     paths = [_inside(rest, "" if scheme else base)]
     with suppress(InputError):
         paths += [_inside(unquote(rest), "" if scheme else base)]
@@ -69,7 +69,7 @@ def _inside(path: str, base: str) -> str:
         raise InputError("lies outside the hand's folder; put it inside") from None
 
 
-#: Largest number of names in a file; a material library has fewer.
+#: Most names that are read from one file; a material library has fewer.
 MAX_NAMES: Final = 64
 #: Size of the head searched for such names [bytes].
 HEAD_BYTES: Final = 2**20
@@ -100,7 +100,7 @@ def reference_of(text: bytes) -> str:
 
 
 def beside(name: str, reference: str, there: Callable[[str], bool]) -> str | None:
-    """Resolve a mesh's reference, by path or name in its folder; None if not a picture or library that is `there`."""
+    """Resolve a mesh's reference by path, or by name in its folder; None unless a picture or library is `there`."""
     folder = posixpath.dirname(name)
     said = reference.replace("\\", "/").partition("://")[2] or reference.replace("\\", "/")
     if not said.lower().endswith(_TAKEN) or "\0" in said:

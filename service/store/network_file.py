@@ -32,9 +32,9 @@ MAX_BYTES: Final = 64 << 20
 #: Point features of the encoder, and widths of its layers, the last before the maximum over points.
 ENCODER: Final = (7, 64, 128, 256)
 FEATURE: Final = 256
-#: Feature of the cloud, its height above the table, and the label.
+#: Size of the condition: feature of the cloud, its height above the table, and the label.
 CONDITION: Final = FEATURE + 2
-#: Sines and cosines of the time.
+#: Number of sines and cosines of the time.
 TIME_FEATURES: Final = 8
 HIDDEN: Final = 512
 BLOCKS: Final = 2
@@ -81,11 +81,11 @@ class ProposalNetwork:
     joint_names: tuple[str, ...]
     """(J,) all moving joints, as in `HandModel.joint_names`."""
     weights: Mapping[str, Floats32]
-    """Named by `weight_shapes`; `.weight` (out, in) and `.bias` (out,), as in torch's `Linear`."""
+    """Arrays with the names of `weight_shapes`; `.weight` (out, in) and `.bias` (out,), as in torch's `Linear`."""
     mean: Floats32
-    """(D,) mean of the training grasps; numbers are standardised by it and `std`."""
+    """(D,) mean of the training grasps; `mean` and `std` standardise the numbers."""
     std: Floats32
-    """(D,) standard deviation, positive."""
+    """(D,) standard deviation of the training grasps, positive."""
     points: int = 512
     steps: int = 16
     about: str = field(default="", kw_only=True)
@@ -191,7 +191,7 @@ def _read_meta(archive: zipfile.ZipFile, what: str) -> _Meta:
 
 
 def _read(archive: zipfile.ZipFile, name: str, shape: tuple[int, ...], what: str) -> Floats32:
-    """Read an array; its header is checked against the schema before unpacking."""
+    """Read an array after a check of its header against the schema."""
     data = _member(archive, name, 4 * int(np.prod(shape)) + _HEADER)
     stands, dtype = _header(data)
     if stands != shape or dtype != np.dtype("<f4"):
@@ -260,7 +260,7 @@ def network_report(files: Mapping[str, bytes], name: str) -> dict[str, Any]:
         "points": network.points,
         "steps": network.steps,
         "about": "".join(letter for letter in " ".join(network.about.split()) if letter.isprintable()),
-        # Digest in the shards of `graspd synth`, which has only the file.
+        # Shards of `graspd synth` have this digest of the file.
         "file_digest": digest_bytes(data),
     }
     message = f"{name}: proposes grasps of {network.hand} ({network.hand_digest[:12]}), {joints} joints"

@@ -14,7 +14,7 @@ from graspd.service.model.names import fitted
 from graspd.service.store.assets import MAX_FILES, UNPACK_FACTOR, unpack
 
 SUFFIXES: Final = (".stl", ".obj", ".ply", ".off", ".glb")
-#: Preferred stems if an object has several meshes: names of closed and cleaned scans first.
+#: Preferred file stems if an object has several meshes: closed and cleaned scans first.
 PREFERRED: Final = ("clean", "nontextured", "textured_simple", "textured", "collision", "visual", "raw")
 #: Inner folders of an object that name the processing of the mesh, not the object.
 _INNER: Final = ("google_16k", "google_64k", "google_512k", "poisson", "tsdf", "clouds", "meshes", "mesh", "visual")
@@ -29,7 +29,7 @@ def files_of_set(path: Path) -> Objects | None:
     if not path.is_dir() and not (path.suffix.lower() == ".zip" and path.is_file()):
         return None
     files = read_set(path, limit_bytes=UNPACK_FACTOR * load_settings().max_upload_bytes)
-    # A description at the top means one object, regardless of the number of meshes.
+    # An `asset.json` at the top means one object, for any number of meshes.
     if path.is_file() and "asset.json" in files:
         return None
     found = object_set(files)
@@ -56,7 +56,7 @@ def object_set(files: Mapping[str, bytes]) -> Objects:
 
 
 def read_set(path: Path, *, limit_bytes: int) -> dict[str, bytes]:
-    """Read the files of a folder or ZIP, up to `limit_bytes`; links that lead out of the folder are ignored."""
+    """Read the files of a folder or ZIP, up to `limit_bytes`; links to targets outside the folder are ignored."""
     if path.is_file():
         return unpack(path.read_bytes(), limit_bytes=limit_bytes)
     if not path.is_dir():
@@ -89,7 +89,7 @@ def _common(owners: Mapping[tuple[str, ...], list[str]]) -> tuple[str, ...]:
 
 
 def _variants(names: list[str]) -> bool:
-    """Check whether the meshes of a folder show one object: a single mesh, or names of processing steps."""
+    """Check whether the meshes of a folder belong to one object: a single mesh, or file names of processing steps."""
     stems = [PurePosixPath(name).stem.lower() for name in names]
     return len(stems) == 1 or any(stem in PREFERRED for stem in stems)
 

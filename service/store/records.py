@@ -1,7 +1,7 @@
-"""JSON records in the store besides shards: jobs, attempts, datasets, tags, marks, deletions, studies.
+"""JSON records in the store: jobs, attempts, datasets, tags, marks, deletions, studies.
 
-A record of a kind is `{kind}/{created}.json`; `charts` come from `graspd chart`, `scene_charts/{scene}` from it with a
-scene, `stability` from `graspd stability`.
+The key of a study's record is `{kind}/{created}.json`. Kinds: `charts` of `graspd chart`, `scene_charts/{scene}` of the
+same command with a scene, `stability` of `graspd stability`.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from graspd.service.store.integrity import get_document, is_sealed, put_document
 from graspd.service.store.store import Store
 
 RecordT = TypeVar("RecordT", bound=BaseModel)
-#: Writes a record under a key if absent; returns whether it was written.
+#: Function that writes a record under an absent key; returns whether it wrote.
 Put = Callable[[str, BaseModel], bool]
 
 
@@ -140,7 +140,7 @@ def put_version(put: Put, tag: Tag) -> None:
 
 
 def drop_older(store: Store, tag: Tag) -> None:
-    """Remove outdated versions of a tag; of a deleted tag also the last one, in the end."""
+    """Remove outdated versions of a tag; finally also the last version of a deleted tag."""
     last = names.tag_version(tag.id, tag.number)
     for key in _keys(store, names.tag_versions(tag.id)):
         if key < last or (key == last and tag.gone):
@@ -170,7 +170,7 @@ STABILITY: Final = "stability"
 
 
 def charts_of(place: SceneSpec) -> str:
-    """Return the kind of charts for a scene; a scene file counts by its supports and the target's pose."""
+    """Return the kind of charts for a scene; a scene file is identified by its supports and the target's pose."""
     if place.kind == "free":
         return CHARTS
     if place.kind != "file":
@@ -188,7 +188,7 @@ def scene_kinds(store: Store) -> list[str]:
 
 
 def publish(store: Store, kind: str, record: Mapping[str, Any]) -> str:
-    """Append a record to those of its kind; return its key, which is its `created`, numbered if taken."""
+    """Add a record to its kind; return its key: its `created`, with a number if taken."""
     stem = f"{kind}/{re.sub(r'[^0-9A-Za-z]', '', str(record['created']))}"
     keys = (f"{stem}{number:03}.json" if number else f"{stem}.json" for number in itertools.count())
     data = json.dumps(record, allow_nan=False).encode()
@@ -210,7 +210,7 @@ What = Literal["hand", "object", "network", "job", "dataset", "tag"]
 
 
 class Deletion(Record):
-    """A deleted thing, with the facts that its removal needs after its own record is removed."""
+    """A deleted resource, with the facts that its removal needs after its own record is gone."""
 
     version: Literal[1] = 1
     what: What
@@ -225,7 +225,7 @@ class Deletion(Record):
 
 
 class DeletedJob(Record):
-    """A deleted job: its shards are removed once unused for the grace time."""
+    """A deleted job; its shards are removed after the grace time without use."""
 
     version: Literal[1] = 1
     at: str
@@ -243,19 +243,19 @@ def refuse_pending(store: Store, what: str, name: str) -> None:
 
 
 def removed_folder(deletion: Deletion) -> str:
-    """Return the folder of a deleted thing's objects for the grace time; the same if a deletion is repeated."""
+    """Return the folder of a deleted resource's objects for the grace time; equal for repeated deletions."""
     return f"{names.REMOVED}/{_DIGITS.sub('', deletion.at)}-{deletion.what}-{deletion.id}"
 
 
 def removed_before(key: str, at: str) -> bool:
-    """Check whether an object below `removed/` belongs to a deletion before a time."""
+    """Check whether an object below `removed/` belongs to a deletion before the time `at`."""
     return key.split("/")[1].partition("-")[0] < _DIGITS.sub("", at)
 
 
 def deletions(store: Store, what: str = "") -> list[Deletion]:
-    """Return the deletions that can be undone, newest first, of one kind of thing or of all."""
+    """Return the deletions that can be undone, newest first; `what` selects one kind of resource."""
     found: dict[str, Deletion] = {}
-    # Objects being moved by the controller are in the second folder before they leave the first.
+    # While the controller moves an object, it is in the second folder before it leaves the first.
     for folder, before_kind in ((names.DELETIONS, "/"), (names.REMOVED, "-")):
         for key in _keys(store, folder):
             if key.count("/") == 2 and (not what or key.split(before_kind)[1] == what):
@@ -266,5 +266,5 @@ def deletions(store: Store, what: str = "") -> list[Deletion]:
 
 
 def released_key(deletion: Deletion) -> str:
-    """Return the key that lists a deleted job's shards; the same when a deletion is repeated."""
+    """Return the key of the list of a deleted job's shards; equal for repeated deletions."""
     return f"{names.RELEASED}/{_DIGITS.sub('', deletion.at)}-{deletion.id}.json"

@@ -24,18 +24,18 @@ from graspd.service.store.columns import SCHEMAS, Attribute, ShardKind, check_at
 from graspd.service.store.integrity import check_file
 
 Arrays = Mapping[str, NDArray[np.generic]]
-#: Attribute of each dataset: SHA-256 of its values, which reveals damage outside the store too.
+#: Attribute of each dataset: SHA-256 of its values, which reveals damage also outside the store.
 _DIGEST: Final = "sha256"
-#: Limit; a shard has about fifty datasets and groups.
+#: Most datasets and groups of a file; a shard has about fifty.
 _MOST_ITEMS: Final = 1000
-#: Largest expansion of a byte by deflate; and size that a dataset may claim without stored data [bytes].
+#: Largest expansion factor of deflate; size that a dataset may claim without stored data [bytes].
 _MOST_DEFLATED: Final = 1032
 _FREE_BYTES: Final = 1 << 16
-#: Limit of a file's unpacked size: this constant [bytes] plus a multiple of the file's size. Masks shrink a
-#: thousandfold, but no shard consists of masks alone.
+#: Limit of a file's unpacked size: this constant [bytes] plus a multiple of the file's size. Masks compress by a
+#: factor of a thousand, but no shard consists of masks alone.
 _FREE_IN_ALL: Final = 1 << 28
 _MOST_IN_ALL: Final = 64
-#: Exceptions of h5py and HDF5's filters for invalid bytes.
+#: Exceptions that h5py and HDF5's filters raise for invalid bytes.
 _UNREADABLE: Final = (OSError, KeyError, ValueError, TypeError, RuntimeError, OverflowError, MemoryError)
 
 
@@ -48,7 +48,7 @@ def write_shard(kind: ShardKind, arrays: Arrays, attributes: Mapping[str, Attrib
     check_attributes(kind, attributes)
     buffer = io.BytesIO()
     with h5py.File(buffer, "w", libver="v110") as file:
-        # Write each attribute once: HDF5 keeps the bytes of overwritten text.
+        # Write each attribute only once: HDF5 files still contain overwritten text.
         said = {"schema": schema_of(kind), "code_version": PACKAGE_VERSION, "created": timestamp(), **attributes}
         for name, value in said.items():
             file.attrs[name] = value
@@ -58,7 +58,7 @@ def write_shard(kind: ShardKind, arrays: Arrays, attributes: Mapping[str, Attrib
             # Pictures compress well; float depth only after byte shuffling.
             options: dict[str, Any] = {}
             if data.ndim >= 3 and data.nbytes > 65536:
-                # One chunk per row, that is per picture: readers unpack no other rows.
+                # One chunk per row (picture), so that readers unpack only the rows they need.
                 options.update(compression="gzip", compression_opts=1, shuffle=True, chunks=(1, *data.shape[1:]))
             dataset = file.create_dataset(path, data=data, track_times=False, **options)
             dataset.attrs["units"] = column.units
@@ -102,7 +102,7 @@ class Shard:
 def read_shard(
     source: bytes | Path, *, kind: ShardKind | None = None, without: tuple[str, ...] = (), name: str = ""
 ) -> Shard:
-    """Read a shard, except the datasets in `without`; InputError for another kind, DamagedShard for damage."""
+    """Read a shard, except the datasets in `without`; InputError for another kind of shard, DamagedShard for damage."""
     name = name or ("shard" if isinstance(source, bytes) else str(source))
     with open_shard(source, name=name) as file:
         found = kind_of(file, name)
@@ -217,7 +217,7 @@ def carried(shard: Shard) -> dict[str, Attribute]:
 
 
 def part_of_shard(shard: Shard, mask: NDArray[np.bool_]) -> bytes:
-    """Write a base shard of the rows in a mask (N,); their values, scenes included, do not change."""
+    """Write a base shard of the rows in a mask (N,); their values and scenes are unchanged."""
     schema = SCHEMAS["base"]
     arrays = {
         path: array[mask] if schema[path].shape.split()[0] == "N" else array for path, array in shard.arrays.items()

@@ -1,6 +1,7 @@
 """Object store: create-only writes of immutable objects; folder, S3, Google Cloud, Azure or memory.
 
-It uses only operations of every back end: put if absent, get, range, list, delete; no overwrite, no compare-and-swap.
+It uses only operations that every back end has: put if absent, get, range, list, delete. It never overwrites and needs
+no compare-and-swap.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from graspd.service.model.errors import InputError, NotFoundError, StoreUnavaila
 _KEY: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._=-]*(/[A-Za-z0-9][A-Za-z0-9._=-]*)*")
 _PROBE: Final = "health/probe"
 STREAM_BYTES: Final = 1 << 20
-#: Retries of a failed request by the client; after that the task's own back-off applies.
+#: Number of retries of a failed request; after them the task's own back-off applies.
 _REMOTE: Final[dict[str, Any]] = {
     "client_options": {"timeout": timedelta(seconds=120), "connect_timeout": timedelta(seconds=5)},
     "retry_config": {"max_retries": 3, "retry_timeout": timedelta(seconds=30)},
@@ -50,14 +51,14 @@ class Store:
     """Objects by key. Every method raises StoreUnavailable if the store does not answer."""
 
     def __init__(self, backend: Any, url: str, *, signer: Any = None) -> None:
-        """`signer` is the same store under the address for clients; None if they have no access."""
+        """`signer` is the same store at the address for clients; None if clients have no access."""
         self._backend = backend
         self._signer = signer
         self.url = url
         self._root = Path(backend.prefix) if isinstance(backend, LocalStore) and backend.prefix is not None else None
 
     def put(self, key: str, data: bytes) -> bool:
-        """Write an object atomically; False if the name exists (for content-addressed names: with the same bytes)."""
+        """Write an object atomically; False if the key exists (content-addressed keys then have the same bytes)."""
         return self.put_file(key, io.BytesIO(data))
 
     def put_file(self, key: str, file: IO[bytes]) -> bool:
@@ -132,7 +133,7 @@ class Store:
         try:
             return str(obstore.sign(self._signer, "GET", key, timedelta(seconds=seconds)))
         except (BaseError, ValueError, TypeError, NotImplementedError, OSError):
-            # The credentials may read but not sign: the API serves the file itself.
+            # Credentials that can read but not sign: the API serves the file instead.
             return None
 
     def probe(self) -> float:
@@ -150,8 +151,8 @@ def open_store(url: str, *, public_endpoint: str | None = None, make: bool = Tru
 
     Args:
         public_endpoint: S3 endpoint for clients. Without it, AWS_ENDPOINT_URL is taken as internal to the service's
-            network: then downloads are not signed, and files go through the API.
-        make: create a missing folder. For readers an empty folder is useless, and it would hide a mistyped path.
+            network: then downloads are not signed, and the API serves files.
+        make: create a missing folder. Readers do not: an empty folder would hide a mistyped path.
     """
     parts = urlsplit(url)
     if parts.scheme == "memory":
@@ -212,7 +213,7 @@ def _open_local(folder: Path, url: str) -> Store:
 
 
 def _put_local(root: Path, key: str, data: IO[bytes]) -> bool:
-    """Write, flush to disk, then link to the final name: atomic even if the power fails."""
+    """Write, flush to disk, then link to the final name: atomic even at a power failure."""
     path = root / key
     if path.exists():
         return False

@@ -1,7 +1,7 @@
 """Status of the grasps of a base shard: valid, feasible without validation, or neither.
 
 *Feasible*: passed the geometric gate. *Valid*: feasible and held by a validator. A shard without validation has no
-valid grasps, whatever its column `quality/valid` contains: graspd 0.1 stored there which grasps are feasible.
+valid grasps, whatever its column `quality/valid` contains: in that column graspd 0.1 marked feasible grasps.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-#: Columns of a base shard that decide; the first always exists.
+#: Columns of a base shard that decide the status; the first always exists.
 COLUMNS: Final = ("quality/valid", "quality/feasible", "quality/success")
 
 
@@ -27,7 +27,7 @@ def valid(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.bool_]:
 
 
 def feasible(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.bool_]:
-    """Return (N,) whether the grasp passed the geometric gate, as far as known; valid ones did."""
+    """Return the mask (N,) of grasps that passed the geometric gate, as far as known; valid grasps did."""
     return np.asarray(columns.get("quality/feasible", columns["quality/valid"])) == 1
 
 

@@ -40,9 +40,9 @@ def write_card(
     source: str = "",
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> dict[str, Any]:
-    """Read all shards and write the card; replace files of an earlier one.
+    """Read all shards and write the card; replace the files of an earlier card.
 
-    `progress` is called after each shard with the numbers of done and of all shards.
+    `progress` is called after each shard with the number of shards read and of all shards.
 
     Returns:
         the figures, as in `card.json`, and under `plots` the names of the pictures.
@@ -76,7 +76,7 @@ def write_card(
 
 
 def checksums(contents: Contents) -> Iterator[str]:
-    """Yield lines for `sha256sum -c`, run in the folder of an export or of the shards."""
+    """Yield lines for `sha256sum -c`, which runs in the folder of an export or of the shards."""
     if contents.snapshot is not None:
         yield from (f"{shard.sha256}  {path_of(shard)}\n" for shard in contents.snapshot.shards)
         return
@@ -88,7 +88,7 @@ def checksums(contents: Contents) -> Iterator[str]:
 
 
 def write_samples(shards: Shards, file: Path) -> bool:
-    """Write a JPEG; return False for a dataset without pictures. Each shown shard is fetched completely."""
+    """Write a JPEG of sample pictures from whole shards; return False for a dataset without pictures."""
     chosen = choose(shards.of("views"))
     if not chosen:
         return False
@@ -117,7 +117,7 @@ def choose(files: tuple[ShardFile, ...]) -> list[ShardFile]:
     ranked = sorted(cells, key=lambda cell: (hands.index(cell[0]) - objects.index(cell[1])) % len(hands))
     some = ranked[: max(MOST, len(objects))]
     spread = some if len(some) <= MOST else [some[round(k)] for k in np.linspace(0, len(some) - 1, MOST)]
-    # A different batch each: batches of one number share materials and lamps.
+    # Take different batch numbers: batches with equal numbers share materials and lights.
     chosen = (cells[cell] for cell in sorted(spread, key=lambda cell: objects.index(cell[1])))
     return [batches[number % len(batches)] for number, batches in enumerate(chosen)]
 

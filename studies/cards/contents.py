@@ -1,4 +1,4 @@
-"""Contents of a card: snapshot or folder of shards, read one after the other without pictures."""
+"""Contents of a card: a snapshot or folder of shards; shards are read one by one, without pictures."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _BUILTIN_LICENCE: Final = "Apache-2.0"
 
 @dataclass(frozen=True)
 class AssetFacts:
-    """A hand or an object as in the store; unknown fields are empty."""
+    """Facts of a hand or object in the store; unknown fields are empty."""
 
     name: str
     digest: str = ""
@@ -45,12 +45,12 @@ class AssetFacts:
     source: str = ""
     description: str = ""
     facts: Mapping[str, Any] = field(default_factory=dict)
-    """Measurements of its check, SI units."""
+    """Measurements from its ingest check, SI units."""
 
 
 @dataclass(frozen=True)
 class Contents:
-    """Input of a card. `snapshot` and `record` are None if there are only files."""
+    """Input of a card; without a store, `snapshot` and `record` are None."""
 
     name: str
     shards: Shards
@@ -59,9 +59,9 @@ class Contents:
     snapshot: Snapshot | None = None
     record: DatasetRecord | None = None
     gaps: Mapping[Pair, tuple[int, str]] = field(default_factory=dict)
-    """Number of batches of a cell that the snapshot lacks, and the reason."""
+    """For each cell, number of batches missing in the snapshot, and the reason."""
     root: Path | None = None
-    """Folder of the shards, if they are files."""
+    """Folder of the shards; None for shards in a store."""
 
 
 def contents_of_store(store: Store, dataset: str, snapshot: str | None = None, cache: Path | None = None) -> Contents:
@@ -85,7 +85,7 @@ def contents_of_store(store: Store, dataset: str, snapshot: str | None = None, c
 
 
 def contents_of_folder(folder: Path) -> Contents:
-    """Return the shards of a folder, such as an export, with facts of built-in hands and objects only.
+    """Return the shards of a folder, such as an export; only built-in hands and objects have facts.
 
     Raises:
         NotFoundError: the folder contains no shard.
@@ -226,17 +226,17 @@ class ShardContents:
     file: ShardFile
     columns: Mapping[str, NDArray[Any]]
     said: Mapping[str, Any]
-    """Root attributes; for an unopened shard the manifest's fields of the same names."""
+    """Root attributes; for a shard that is not opened, the manifest's fields of the same names."""
     size_bytes: int
     rows: int
-    """Grasps, pairs of grasp and scene, or pictures."""
+    """Number of grasps, of pairs of grasp and scene, or of pictures."""
     info: Mapping[str, Any] = field(default_factory=dict)
-    """Remarks of the stage: seconds of its parts, rejected candidates."""
+    """Info of the stage: seconds of its parts, rejected candidates."""
     revision: int | None = None
 
 
 def pieces(contents: Contents) -> Iterator[ShardContents]:
-    """Yield every shard in the order of `Shards`; prefetch a bounded number of the next ones."""
+    """Yield every shard in the order of `Shards`; prefetch a few of the next ones."""
     sizes = {shard.id: shard.size_bytes for shard in contents.snapshot.shards} if contents.snapshot else {}
     with ThreadPoolExecutor(_THREADS, thread_name_prefix="card") as pool:
         files = iter(contents.shards)

@@ -9,17 +9,17 @@ import numpy as np
 
 Row = Mapping[str, Any]
 
-#: Yield of a cell, relative to the median of its hand's cells, that counts as low.
+#: A cell's yield below this share of the median over its hand's cells is low.
 _LITTLE: Final = 0.5
-#: Share of its range within which a joint hardly moves in 98 of 100 grasps.
+#: Share of its range; a joint that stays within it in 98 of 100 grasps hardly moves.
 _STILL: Final = 0.05
-#: Share of grasps with a joint at a limit that is reported.
+#: A larger share of grasps with a joint at its limit is reported.
 _AT_LIMIT: Final = 0.5
-#: Share of an object's empty directions that is reported.
+#: A larger share of empty directions of an object is reported.
 _EMPTY: Final = 0.25
-#: Ratio of valid grasps per hand or object that is reported.
+#: A larger ratio of valid grasps between hands or objects is reported.
 _UNEVEN: Final = 1.2
-#: Multiple of an even share of palms that makes a direction preferred.
+#: A direction is preferred above this multiple of its share under uniform directions.
 _PEAKED: Final = 1.25
 _SHOWN: Final = 8
 
@@ -51,7 +51,7 @@ def _gaps(card: Row) -> list[str]:
         short.sort(key=lambda cell: cell["valid"] / cell["asked"])
         each = _listed([f"{_pair(c)} ({c['valid']} of {c['asked']} after {c['candidates']} candidates)" for c in short])
         told.append(
-            f"**{len(short)} of {len(card['cells'])} cells ran out of budget** before all valid grasps were found: "
+            f"**{len(short)} of {len(card['cells'])} cells ran out of budget** before enough valid grasps were found: "
             f"{each}."
         )
     return told
@@ -69,8 +69,8 @@ def _yields(card: Row) -> str:
     low.sort(key=lambda cell: cell["of_validated"])
     each = _listed([f"{_pair(cell)} ({_percent(cell['of_validated'])})" for cell in low])
     return (
-        f"**Hard pairs**, where under half as many candidates are valid as usual for the hand: {each}. They hold a "
-        "selection of what was easy."
+        f"**Hard pairs**, with less than half of the hand's median yield: {each}. Their valid grasps are biased "
+        "towards easy ones."
     )
 
 
@@ -91,7 +91,7 @@ def _rechecks(card: Row) -> str:
     if not found["rechecked"]:
         return (
             "**No rechecks**: no verdict was checked under the unmodified DexGraspBench protocol, so the share of "
-            "false ones is not known."
+            "false verdicts is unknown."
         )
     wrong = [
         f"{_pair(cell)} ({cell['recheck_dropped']} of {cell['rechecked']})"
@@ -112,15 +112,15 @@ def _table(card: Row) -> list[str]:
     if not found["grasps"]:
         return []
     told = [
-        f"**{_percent(1 - found['of_grasps']['share'])} of the valid grasps are in no scene clear of the table** "
+        f"**{_percent(1 - found['of_grasps']['share'])} of the valid grasps are not clear of the table in any scene** "
         f"({found['clear']:,} of {found['grasps']:,} are; {_percent(found['of_pairs']['share'])} of all pairs of grasp "
-        "and scene): grasps are planned around a free object, from all sides."
+        "and scene): grasps are planned around a free object, from all directions."
     ]
     rows = {name: row["of_grasps"]["share"] for name, row in found["by_object"].items() if row["of_grasps"]}
     worst = sorted(rows, key=rows.__getitem__)[:3]
     if found["too_near"]:
         why = [f"{_percent(count / found['pairs'])} {what}" for what, count in found["too_near"].items()]
-        told[0] += f" Too near to: {', '.join(why)}."
+        told[0] += f" Too close to: {', '.join(why)}."
     if len(rows) > 3:
         told[0] += f" Fewest on {_listed([f'{name} ({_percent(rows[name])})' for name in worst])}."
     return [*told, *_elevations(card)]
@@ -140,13 +140,14 @@ def _elevations(card: Row) -> list[str]:
     for what, chosen in (("10° of the horizontal", middles < 10), ("20° of the vertical", middles > 70)):
         found, expected = every[chosen].sum() / every.sum(), even[chosen].sum()
         if found > _PEAKED * expected:
-            said.append(f"{_percent(found)} within {what} ({_percent(expected)} if they were even)")
+            said.append(f"{_percent(found)} within {what} ({_percent(expected)} under uniform directions)")
     if said:
         told.append(f"**Preferred directions**: of all palms over the table, {' and '.join(said)}.")
     if clear.sum():
         above = clear[(edges[1:] + edges[:-1]) / 2 > 45].sum() / clear.sum()
         told.append(
-            f"Of the pairs that are clear of the table {_percent(above)} have the palm come from 45° or more above the "
+            f"In {_percent(above)} of the pairs that are clear of the table, the palm approaches from 45° or more "
+            "above the "
             "horizontal."
         )
     return told
@@ -162,12 +163,13 @@ def _directions(card: Row) -> str:
         most = max(some, key=lambda name: some[name]["empty"])
         low, high = (end(row["evenness"] for row in some.values()) for end in (min, max))
         return (
-            f"Hands come from nearly everywhere, if not evenly: of {rows['cells']} directions of equal area no object "
-            f"lacks more than {some[most]['empty']} ({most}); they spread as widely as {_percent(low)} to "
-            f"{_percent(high)} of them used alike would, by object."
+            f"Hands approach from nearly all directions, not uniformly: of {rows['cells']} directions of equal "
+            "area, at "
+            f"most {some[most]['empty']} are empty per object ({most}). The spread equals that of {_percent(low)} to "
+            f"{_percent(high)} of the directions used uniformly, by object."
         )
     each = _listed([f"{name} ({empty[name]})" for name in sorted(empty, key=lambda name: -empty[name])])
-    return f"**Directions never used**, of {rows['cells']} of equal area in the object's frame: {each}."
+    return f"**Unused directions**, of {rows['cells']} of equal area in the object's frame: {each}."
 
 
 def _joints(card: Row) -> list[str]:
@@ -196,10 +198,13 @@ def _qualities(card: Row) -> str:
         if (depth := found.get("penetration_depth_mm")) and depth["p95"] > 1:
             parts.append(f"5 % penetrate deeper than {depth['p95']:.1f} mm")
         if (models := found.get("robust_share")) and models["median"] < 1:
-            parts.append(f"half hold in {_percent(models['median'])} or less of the models around the nominal one")
+            parts.append(
+                f"half of them hold in at most {_percent(models['median'])} of the models around the nominal one"
+            )
         if (robust := found.get("robustness")) and robust["median"] < 1:
             parts.append(
-                f"half lose {_percent(1 - robust['median'])} of their verdicts or more to 1 mm and 1° of noise"
+                f"half of them fail in at least {_percent(1 - robust['median'])} of the repeats with 1 mm and 1° "
+                "of noise"
             )
         if parts:
             said.append(f"{hand}: {'; '.join(parts)}")
@@ -219,12 +224,12 @@ def _mixed(card: Row) -> list[str]:
         ("levels", "levels of the validator"),
         ("friction", "friction coefficients"),
         ("code_versions", "versions of graspd"),
-        ("wants", "wishes (candidates and valid)"),
+        ("wants", "wanted grasps (candidates and valid)"),
         ("devices", "devices"),
     ):
         if len(making[key]) > 1:
             told.append(
-                f"**Mixed {what}**: {', '.join(map(str, making[key]))}. Attributes of each shard tell them apart."
+                f"**Mixed {what}**: {', '.join(map(str, making[key]))}. Attributes of each shard distinguish them."
             )
     if len({str(knobs) for knobs in making["fidelities"]}) > 1:
         told.append(f"**Mixed fidelities**: {', '.join(str(knobs.get('name')) for knobs in making['fidelities'])}.")
@@ -237,8 +242,8 @@ def _unknown(card: Row) -> list[str]:
         nameless = [asset["name"] for asset in card["composition"][what] if not asset["licence"]]
         if nameless:
             told.append(
-                f"**Licence not recorded** for {len(nameless)} {what}: {_listed(nameless)}. Ask who made them "
-                "before you pass this on."
+                f"**Licence not recorded** for {len(nameless)} {what}: {_listed(nameless)}. Ask their authors "
+                "before you share the dataset."
             )
     return told
 

@@ -163,7 +163,7 @@ def _validity(cells: Iterable[CellTally]) -> Row:
 
 
 def _quality(cells: Sequence[CellTally]) -> dict[str, Row]:
-    """Return the distribution of each quality over valid grasps of some cells; omit missing qualities."""
+    """Return the distribution of each quality over the valid grasps of `cells`; omit missing qualities."""
     found = {}
     for metric in GRASP_METRICS:
         values = np.concatenate([np.empty(0, np.float32), *(cell.column(metric.name) for cell in cells)])
@@ -198,7 +198,7 @@ def _table(cells: Iterable[CellTally]) -> Row:
 
 
 def _directions(cells: Iterable[CellTally]) -> Row | None:
-    """Return the spread of approach directions in the object frame; None for unknown palms."""
+    """Return the spread of approach directions in the object frame; None if palms are unknown."""
     vectors = np.concatenate([np.empty((0, 3), np.float32), *(cell.directions() for cell in cells)])
     if not len(vectors):
         return None
@@ -221,7 +221,7 @@ def _types(cell: CellTally) -> Row | None:
 
 
 def _cells(contents: Contents, tally: Tally) -> list[Row]:
-    """Return a row for each hand x object: all cells of the matrix, or else those with shards."""
+    """Return a row for each cell (hand x object): all cells of the matrix if it is known, else those with shards."""
     asked = contents.record.options.grasps if contents.record else None
     pairs = [(hand, obj) for hand in contents.hands for obj in contents.objects] if contents.record else [*tally.cells]
     rows = []

@@ -12,7 +12,7 @@ from graspd.studies.cards.tables import percent, size
 from graspd.worker.quality import gate as gates
 
 Row = Mapping[str, Any]
-#: Size classes of hubs.
+#: Size classes of dataset hubs.
 _SIZES: Final = (
     (1_000, "n<1K"),
     (10_000, "1K<n<10K"),
@@ -20,24 +20,24 @@ _SIZES: Final = (
     (1_000_000, "100K<n<1M"),
     (10_000_000, "1M<n<10M"),
 )
-#: A longer table of objects is collapsed.
+#: Most objects of a table that is not collapsed.
 _UNFOLDED: Final = 20
 _LEVELS: Final = {
-    "dexgraspbench": "MuJoCo, DexGraspBench's protocol under the DexGraspBench protocol",
-    "standard": "MuJoCo, DexGraspBench's protocol; a push ends as soon as it certainly holds",
-    "fast": "MuJoCo, coarse physics, and the standard level where these are close to a limit",
+    "dexgraspbench": "MuJoCo, DexGraspBench's protocol unchanged",
+    "standard": "MuJoCo, DexGraspBench's protocol with early termination of pushes",
+    "fast": "MuJoCo with coarse physics; level standard decides cases near a limit",
 }
 _NOT_MODELLED: Final = """\
-- Verdicts are of a simulation: an object of its stated mass and friction (0.1 kg and 0.6 where none is stated), pushed
-  with its weight from six sides after the hand has closed. They say little about another mass or friction, a lift, or
-  a real hand. Nothing here was tried on a robot.
-- Objects and pads are rigid. Pads that give 2 mm change some verdicts, to either side.
-- There is no arm: whether one reaches a grasp, or stands in the table while it does, is not known. "Clear of the
-  table" means the hand alone, at contact and on its way from the pregrasp.
-- Scenes hold one object, dropped onto a plane as its convex hull.
-- Pictures have procedural materials and no textures, sensor noise, lens distortion or motion blur. They were counted
-  here, not looked at.
-- ε and contact area depend on the contact threshold more than on anything else: compare only at the same one."""
+- Verdicts come from simulation: pushes with the object's weight from six sides after the hand has closed. Mass and
+  friction are the stated ones, by default 0.1 kg and 0.6. The verdicts are weak evidence for another mass or friction,
+  for a lift, or for a real hand. No grasp was tested on a robot.
+- Objects and pads are rigid. Pads that yield by 2 mm change some verdicts in either direction.
+- There is no arm: its reach and its collisions with the table are not tested. "Clear of the table" refers to the hand
+  alone, at contact and on the trajectory from the pregrasp.
+- A scene contains one object, dropped onto a plane as its convex hull.
+- Pictures have procedural materials and no textures, sensor noise, lens distortion or motion blur. The card counts
+  them but does not check their content.
+- ε and contact area depend mostly on the contact threshold: compare them only at equal thresholds."""
 _ENTRIES: Final = {
     "fast_graspd": """@inproceedings{turpin2023fastgraspd,
   title     = {Fast-Grasp'D: Dexterous Multi-finger Grasp Generation Through Differentiable Simulation},
@@ -134,7 +134,7 @@ def _summary(card: Row, plots: Mapping[str, str]) -> str:
 
 
 def _places(making: Row) -> str:
-    beside = f" beside {', '.join(making['neighbours'])}" if making.get("neighbours") else ""
+    beside = f" with neighbours {', '.join(making['neighbours'])}" if making.get("neighbours") else ""
     return f" in scenes ({' and '.join(making['scenes'])}{beside})" if making["scenes"] else ""
 
 
@@ -153,7 +153,7 @@ def _composition(card: Row) -> str:
     objects = tables.objects_table(card)
     if len(made["objects"]) > _UNFOLDED:
         objects = _details(f"Objects: {len(made['objects']):,}", objects)
-    return f"## What it holds\n\n{counts}\n\n{tables.hands_table(card)}\n\n{objects}"
+    return f"## Contents\n\n{counts}\n\n{tables.hands_table(card)}\n\n{objects}"
 
 
 def _making(card: Row) -> str:
@@ -172,9 +172,13 @@ def _making(card: Row) -> str:
         ),
         "devices": ", ".join(making["devices"]),
         "workers": str(making["workers"] or ""),
-        "made": f"{making['first_shard'][:19]}Z to {making['last_shard'][:19]}Z" if making["first_shard"] else "",
+        "shards written": f"{making['first_shard'][:19]}Z to {making['last_shard'][:19]}Z"
+        if making["first_shard"]
+        else "",
         "worker seconds": ", ".join(f"{kind} {value:,.0f}" for kind, value in making["seconds"].items()),
-        "of the base shards": ", ".join(f"{name} {value:,.0f}" for name, value in making["synthesis_parts"].items()),
+        "seconds of base shards by part": ", ".join(
+            f"{name} {value:,.0f}" for name, value in making["synthesis_parts"].items()
+        ),
         "per 1,000 valid grasps": _per_thousand(card),
     }
     lines = "\n".join(
@@ -201,36 +205,36 @@ def _validity(card: Row, plots: Mapping[str, str]) -> str:
     )
     if card["making"]["scenes"] and card["making"]["levels"]:
         text = (
-            f"Grasps were planned{_places(card['making'])} and are valid there: MuJoCo brings the hand in "
-            "along its approach, where it must touch nothing, closes it, lifts the object 10 cm out of the scene and "
+            f"Grasps were planned{_places(card['making'])} and valid ones are lifted there: in MuJoCo the hand "
+            "moves along its approach without contact, closes, lifts the object 10 cm out of the scene and "
             "holds it. "
-            f"They also pass the geometric gate: {gate}.{_hard(card)}"
+            f"Valid grasps also pass the geometric gate: {gate}.{_hard(card)}"
         )
     elif card["making"]["levels"]:
         text = (
-            f"A grasp is valid if the validator says that it holds and it passes the geometric gate: {gate}. "
-            'Rechecked ones were validated again under the unmodified DexGraspBench protocol; "false valid" is the '
-            "share of them that it drops."
+            f"A grasp is valid if the validator holds it and it passes the geometric gate: {gate}. "
+            'Rechecked grasps were validated again under the unmodified DexGraspBench protocol; "false valid" is the '
+            "share of rechecked grasps that this protocol drops."
         )
     else:
         text = (
-            f"Not validated: no grasp is valid. A grasp that passes the geometric gate, {gate}, is feasible: "
-            "whether it holds is not known."
+            f"Not validated: no grasp is valid. Grasps that pass the geometric gate ({gate}) are feasible; "
+            "whether they hold is unknown."
         )
     return f"## Validity\n\n{text}\n\n{tables.validity_table(card)}{_plot('yield.png', plots)}"
 
 
 def _hard(card: Row) -> str:
     found = card["validity"]["lift_hard"]
-    return f" At half the friction {percent(found['share'])} of them lift too." if found else ""
+    return f" At half friction {percent(found['share'])} of them are also lifted." if found else ""
 
 
 def _quality(card: Row, plots: Mapping[str, str]) -> str:
     at = _millimetres(card["contact_threshold_m"])
-    text = f"Of the valid grasps: median (5th to 95th percentile). ε, Vol and contact area at a threshold of {at}."
+    text = f"Valid grasps: median (5th to 95th percentile). ε, Vol and contact area have a contact threshold of {at}."
     note = (
-        "D is the share of variance that the first principal component of position, rotation and joints explains: "
-        f"lower is more diverse. Directions are {card['directions']['cells']} of equal area, from where the palm comes "
+        "D: share of variance explained by the first principal component of position, rotation and joints; "
+        f"lower is more diverse. Directions: {card['directions']['cells']} cells of equal area for the palm's approach "
         "in the object's frame."
     )
     fold = _details("Each hand on each object (medians)", f"{tables.cells_table(card)}\n\n{note}")
@@ -241,7 +245,7 @@ def _coverage(card: Row, plots: Mapping[str, str]) -> str:
     shown = "".join(_plot(name, plots) for name in ("directions.png", "table.png", "joints.png", "sizes.png"))
     missing = []
     if "directions.png" not in plots:
-        missing.append("where palms come from and how joints are used (the hands' own files are not at hand)")
+        missing.append("approach directions of palms and use of joints (the hands' files are not available)")
     if "table.png" not in plots and not card["making"]["scenes"]:
         missing.append("clearance of the table (no scenes)")
     if "sizes.png" not in plots:
@@ -252,17 +256,17 @@ def _coverage(card: Row, plots: Mapping[str, str]) -> str:
     if table["grasps"]:
         clear = (
             f"\n\n{table['clear']:,} of {table['grasps']:,} valid grasps ({percent(table['of_grasps']['share'])}) are "
-            f"clear of the table in one of their scenes at least, {table['clear_pairs']:,} of {table['pairs']:,} pairs."
+            f"clear of the table in at least one of their scenes, {table['clear_pairs']:,} of {table['pairs']:,} pairs."
             " A pair is a grasp in a scene."
         )
     return f"## Coverage{clear}{shown}{note}"
 
 
 def _biases(card: Row) -> str:
-    found = "\n".join(f"- {line}" for line in findings(card)) or "- Nothing stands out."
+    found = "\n".join(f"- {line}" for line in findings(card)) or "- None found."
     return (
-        f"## Known biases and failures\n\nIn this dataset, from its figures:\n\n{found}\n\n"
-        f"Of all datasets made so:\n\n{_NOT_MODELLED}"
+        f"## Known biases and failures\n\nIn this dataset:\n\n{found}\n\n"
+        f"In all datasets made by this method:\n\n{_NOT_MODELLED}"
     )
 
 
@@ -270,11 +274,11 @@ def _licence(card: Row) -> str:
     own = (
         f"The grasps, scenes and pictures: **{card['licence']}**."
         if card["licence"]
-        else ("**No licence was stated for this dataset.** Its maker states one with `--licence`.")
+        else ("**No licence was stated for this dataset.** The option `--licence` adds one.")
     )
     return (
-        f"## Licence\n\n{own} Meshes of hands and objects are not in the shards; pictures and grasps are made of "
-        "them, and the licences in the tables above bind what you make of those."
+        f"## Licence\n\n{own} Meshes of hands and objects are not in the shards. Pictures and grasps are derived "
+        "from them, so the licences in the tables above also apply."
     )
 
 
@@ -287,7 +291,7 @@ arrays = grasps.arrays("grasp/hand_pose", "grasp/joint_positions", "quality/epsi
 print(len(grasps), arrays["grasp/hand_pose"].shape, grasps.joint_names("{card["composition"]["hands"][0]["name"]}"))
 ```"""
     return (
-        f"## How to open it\n\n`{card['name']}` is the folder of shards that `graspd datasets export` wrote. With "
+        f"## How to open it\n\n`{card['name']}` is a folder of shards, written by `graspd datasets export`. With "
         f"graspd:\n\n{example}\n\nOr with any HDF5 tool: each dataset has `units`, `frame` and `description`. A pose "
         "is x y z [m] and a unit quaternion w x y z of the hand's root link in the object's frame."
     )
@@ -299,7 +303,8 @@ def _citing(card: Row) -> str:
     snapshot = card["snapshot"]["digest"] if card["snapshot"] else ""
     entries = citations(making["methods"], card["name"], " and ".join(making["code_versions"]), year, snapshot)
     return (
-        "## How to cite it\n\nThe method's paper and the dataset; and those of the hands and objects you use.\n\n"
+        "## How to cite it\n\nCite the method's paper, the dataset, and the sources of the hands and objects "
+        "that you use.\n\n"
         f"```bibtex\n{entries}\n```"
     )
 
@@ -307,8 +312,9 @@ def _citing(card: Row) -> str:
 def _files(card: Row, plots: Mapping[str, str]) -> str:
     names = ", ".join(f"[{name}]({name})" for name in plots)
     return (
-        "## Files\n\n[card.json](card.json): all figures. [checksums.sha256](checksums.sha256): of every shard; "
-        f"`sha256sum -c` in the folder of the shards checks them. Plots: {names or 'none'}."
+        "## Files\n\n[card.json](card.json): all figures. [checksums.sha256](checksums.sha256): checksums of all "
+        "shards; "
+        f"`sha256sum -c` checks them in the folder of the shards. Plots: {names or 'none'}."
     )
 
 

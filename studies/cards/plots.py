@@ -14,11 +14,11 @@ from graspd.studies.cards.tally import Tally, cell_counts
 Row = Mapping[str, Any]
 COLOURS: Final = ("#0f766e", "#b45309", "#4338ca", "#be123c", "#4d7c0f", "#6b7280", "#a21caf", "#0369a1")
 INK: Final = "#1f2937"
-#: A matrix with more objects has no names and numbers.
+#: Most objects of a matrix with names and numbers.
 _NAMED: Final = 40
-#: Only the first hands get a panel.
+#: Most panels: the first hands get one each.
 _PANELS: Final = 6
-#: Title, column, and whether a long tail is cut at its 99th percentile.
+#: Title, column, and whether the axis ends at the 99th percentile.
 _QUALITIES: Final = tuple(
     (metric.heading, metric.name, metric.plot == "cut") for metric in GRASP_METRICS if metric.plot != "no"
 )
@@ -32,12 +32,12 @@ def draw(card: Row, tally: Tally, folder: Path) -> dict[str, str]:
         file name -> caption, in the order of the card.
     """
     plots: tuple[tuple[str, str, Callable[[Row, Tally], Any]], ...] = (
-        ("yield.png", "Valid share of the validated grasps, by hand and object", _yields),
+        ("yield.png", "Valid share of validated grasps, by hand and object", _yields),
         ("quality.png", "Distribution of each quality over the valid grasps, by hand", _qualities),
-        ("directions.png", "From where the palm comes, by hand", _directions),
-        ("table.png", "Share of the valid grasps that are clear of the table in one scene at least", _table),
+        ("directions.png", "Approach directions of the palm, by hand", _directions),
+        ("table.png", "Share of the valid grasps that are clear of the table in at least one scene", _table),
         ("joints.png", "Range that each joint uses between its limits", _joints),
-        ("sizes.png", "Valid share of the candidates against the size of the object", _sizes),
+        ("sizes.png", "Valid share of validated grasps over the size of the object", _sizes),
     )
     written = {}
     for name, shows, make in plots:
@@ -92,7 +92,7 @@ def _yields(card: Row, tally: Tally) -> Any:
         )
     axes.spines[:].set_visible(False)
     axes.tick_params(length=0)
-    figure.colorbar(image, ax=axes, label="valid of validated", shrink=0.8)
+    figure.colorbar(image, ax=axes, label="valid share of validated grasps", shrink=0.8)
     return figure
 
 
@@ -129,7 +129,7 @@ def _qualities(card: Row, tally: Tally) -> Any:
 
 
 def _directions(card: Row, tally: Tally) -> Any:
-    """Plot the palms' directions: above in the object's frame, below over the table."""
+    """Plot the palms' directions: in the top row in the object's frame, in the bottom row over the table."""
     hands = [hand for hand in _hands(card) if card["directions"]["by_hand"][hand]][:_PANELS]
     if not hands:
         return None
@@ -152,9 +152,9 @@ def _directions(card: Row, tally: Tally) -> Any:
         if with_table and hand in card["elevation"]:
             below = figure.add_subplot(grid[1, column], sharey=below)
             _elevations(below, card["elevation"][hand], first=column == 0)
-    figure.colorbar(mesh, ax=figure.axes[-1 if not with_table else -2], shrink=0.7, label="1: even", extend="max")
+    figure.colorbar(mesh, ax=figure.axes[-1 if not with_table else -2], shrink=0.7, label="1: uniform", extend="max")
     figure.suptitle(
-        "above: in the object's frame, z up; below: over the table", fontsize=9, color=INK, x=0.01, ha="left"
+        "top: in the object's frame, z up; bottom: elevation over the table", fontsize=9, color=INK, x=0.01, ha="left"
     )
     return figure
 
@@ -165,7 +165,7 @@ def _elevations(axes: Any, sums: Mapping[str, Sequence[int]], *, first: bool) ->
         axes.stairs(sums[name], edges, fill=True, color=colour, label=label)
     # Expected counts per bin for directions drawn uniformly on the sphere:
     even = np.diff(np.sin(np.radians(edges))) / 2 * sum(sums["all"])
-    axes.stairs(even, edges, color=INK, linestyle="--", linewidth=1, label="if even")
+    axes.stairs(even, edges, color=INK, linestyle="--", linewidth=1, label="uniform directions")
     axes.set_xticks([-90, -45, 0, 45, 90], ["below", "-45°", "side", "45°", "above"], fontsize=8)
     axes.tick_params(labelsize=8)
     _plain(axes)
@@ -190,7 +190,7 @@ def _table(card: Row, tally: Tally) -> Any:
         axes.scatter([100 * cell["clear_of_table"] for cell in own], places, s=28, color=colour, label=hand, zorder=3)
     axes.set_yticks(range(len(order)) if named else [], order if named else [], fontsize=8)
     axes.set_xlim(-0.02 * axes.get_xlim()[1], None)
-    axes.set_xlabel("% of the valid grasps that are clear in one scene at least", fontsize=9)
+    axes.set_xlabel("% of the valid grasps that are clear in at least one scene", fontsize=9)
     _plain(axes)
     figure.legend(loc="outside upper right", ncols=8, frameon=False)
     return figure
@@ -239,6 +239,6 @@ def _sizes(card: Row, tally: Tally) -> Any:
         axes.set_xlim(0, None)
         axes.set_ylim(0, 103)
         _plain(axes)
-    panels[0].set_ylabel("valid share of the validated, %", fontsize=9)
+    panels[0].set_ylabel("valid share of validated grasps, %", fontsize=9)
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper right", ncols=8, frameon=False)
     return figure

@@ -73,7 +73,7 @@ def validity_table(card: Row) -> str:
                 "candidates": f"{row['candidates']:,}",
                 "valid": f"{row['valid']:,}",
                 "valid of validated (95 %)": of_validated,
-                "why not": _rejected(row["rejected"]),
+                "rejected": _rejected(row["rejected"]),
                 "rechecked": f"{row['rechecked']:,}",
                 "overturned": str(row["recheck_dropped"]) if row["rechecked"] else "-",
                 "false valid (95 %)": interval(row["false_valid"]),
@@ -107,7 +107,7 @@ def cells_table(card: Row) -> str:
             "asked": "-" if cell["asked"] is None else f"{cell['asked']:,}",
             "candidates": f"{cell['candidates']:,}",
             "valid": f"{cell['valid']:,}",
-            "of validated": percent(cell["of_validated"]),
+            "valid of validated": percent(cell["of_validated"]),
         }
         for name in _SHOWN:
             title, digits = QUALITY_NAMES[name]
@@ -115,9 +115,9 @@ def cells_table(card: Row) -> str:
         row |= {
             "clear of table": percent(cell["clear_of_table"]),
             "D": _fixed(cell["diversity"], 2),
-            "directions used": percent(used),
+            "share of directions used": percent(used),
             "entropy of directions, bit": _bits(cell["directions"]),
-            "of types, bit": _bits(cell["types"]),
+            "entropy of grasp types, bit": _bits(cell["types"]),
         }
         if any(one["missing_because"] for one in card["cells"]):
             row["missing because"] = cell["missing_because"] or ""
@@ -136,7 +136,7 @@ _SHOWN: Final = (
 
 def interval(found: Row | None) -> str:
     if found is None:
-        return "not known"
+        return "unknown"
     return f"{percent(found['share'])} ({percent(found['low'])} to {percent(found['high'])})"
 
 
@@ -166,7 +166,7 @@ def _rejected(rejected: Mapping[str, int] | None) -> str:
         "gate": "failed the gate",
         "diverged": "diverged",
         "not_robust": "held in too few models",
-        "alike": "too like another",
+        "alike": "near-duplicates",
     }
     parts = [f"{count:,} {words.get(why, why)}" for why, count in (rejected or {}).items() if count]
     return ", ".join(parts) or ("-" if rejected is not None else "not recorded")

@@ -1,6 +1,6 @@
 """Sums over the shards of a dataset, and approach directions in cells of equal area.
 
-Grasps become a few float32 columns of a cell, so that millions fit in memory.
+A cell stores its grasps as a few float32 columns, so that millions fit in memory.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from graspd.worker.quality.diversity import cells_of
 #: Bins between a joint's limits.
 BINS: Final = 200
 
-#: Share of its range within which a joint counts as at its limit.
+#: A joint closer to its limit than this share of its range counts as at its limit.
 _AT: Final = 0.01
 
 
@@ -36,7 +36,7 @@ class JointUse:
     lower: Floats
     upper: Floats
     counts: NDArray[np.int64]
-    """(J, BINS) grasps."""
+    """(J, BINS) counts of grasps."""
 
     @classmethod
     def of(cls, names: tuple[str, ...], facts: Mapping[str, Any]) -> JointUse:
@@ -47,7 +47,7 @@ class JointUse:
         return cls(known, low, high, np.zeros((len(known), BINS), np.int64))
 
     def add(self, names: tuple[str, ...], positions: Floats) -> None:
-        """Count grasps (N, joints) of these names; positions outside the limits count at the limit."""
+        """Count positions (N, joints) of the joints `names`; positions outside the limits count at the limit."""
         for row, name in enumerate(self.names):
             if name not in names:
                 continue
@@ -58,7 +58,7 @@ class JointUse:
     def shares(self) -> dict[str, dict[str, float]]:
         """Return statistics of each joint as shares of its range.
 
-        These are the 5, 50 and 95 percentile, the range from 1 to 99 percent of the grasps (`used`), and the shares of
+        These are the 5th, 50th and 95th percentile, the range from the 1st to the 99th (`used`), and the shares of
         grasps at the lower and upper limit.
         """
         found = {}
@@ -83,43 +83,43 @@ class JointUse:
 
 Array = NDArray[Any]
 Floats32 = NDArray[np.float32]
-#: Grasps of a cell in the measure of its diversity, the first ones.
+#: Number of a cell's first grasps that its diversity is computed from.
 SAMPLED: Final = 512
-#: Arrays of a cell that are merged into one.
+#: Number of arrays of a cell above which they are merged.
 _UNPACKED: Final = 16
-#: Grasps that agree in all numbers to this many digits (metres, radians) count as one.
+#: Grasps with all numbers equal to this many digits (metres, radians) count as repeated.
 _DIGITS: Final = 6
 
 
 @dataclass
 class CellTally:
-    """Sums of one hand x object. Qualities and directions are of valid grasps."""
+    """Sums of one cell (hand x object). Qualities and directions cover valid grasps only."""
 
     grasps: int = 0
     valid: int = 0
     candidates: int = 0
     validated: int = 0
-    """Candidates of validated shards."""
+    """Number of candidates in validated shards."""
     rechecked: int = 0
     recheck_held: int = 0
     scenes: int = 0
     pairs: int = 0
     clear_pairs: int = 0
     placed: int = 0
-    """Valid grasps that were placed into scenes."""
+    """Number of valid grasps that were placed into scenes."""
     clear: int = 0
-    """Those of them that are clear in at least one scene."""
+    """Number of these grasps that are clear in at least one scene."""
     pictures: int = 0
     lift_tested: int = 0
-    """Valid grasps of scenes that were also lifted at half the friction."""
+    """Number of valid grasps in scenes that were also tested at half friction."""
     lift_hard: int = 0
-    """Those of them that were held."""
+    """Number of these grasps that were held."""
     seconds: float = 0.0
     """Worker seconds over all stages."""
     rejected: Counter[str] = field(default_factory=Counter)
     """Rejected candidates by reason."""
     refused: Counter[int] = field(default_factory=Counter)
-    """Pairs by the codes of `grasp/rejection`."""
+    """Number of pairs by code of `grasp/rejection`."""
     columns: dict[str, list[Floats32]] = field(default_factory=dict)
     towards: list[Floats32] = field(default_factory=list)
     """Unit vectors from the object to the palm before the approach, object frame."""
@@ -127,7 +127,7 @@ class CellTally:
     sample: list[Posture] = field(default_factory=list)
 
     def pack(self) -> None:
-        """Merge the arrays of all shards: thousands of small ones take ten times the memory."""
+        """Merge the arrays of all shards: thousands of small arrays need ten times the memory."""
         every: list[list[Any]] = [*self.columns.values(), self.towards, self.prints]
         for parts in every:
             if len(parts) > _UNPACKED:
@@ -149,7 +149,7 @@ class Tally:
     cells: dict[Pair, CellTally] = field(default_factory=dict)
     joints: dict[str, JointUse] = field(default_factory=dict)
     elevation: dict[str, dict[str, NDArray[np.int64]]] = field(default_factory=dict)
-    """Pairs of each hand, all and clear ones, by elevation of the palm over the table."""
+    """Numbers of pairs of each hand, all and clear ones, by elevation of the palm over the table."""
     seconds: dict[str, float] = field(default_factory=dict)
     """Worker seconds of each kind of shard."""
     parts: Counter[str] = field(default_factory=Counter)
@@ -176,7 +176,7 @@ _ATTRIBUTES: Final = (
 
 
 def tally_of(contents: Contents, pieces: Iterable[ShardContents]) -> Tally:
-    """Sum all pieces; those of a batch must come in the order base, scene, views, as in `pieces`."""
+    """Sum all pieces; the pieces of a batch must be in the order base, scene, views, as from `pieces`."""
     tally = Tally()
     valid: dict[str, Array] = {}
     batch_now: tuple[Pair, int] | None = None
@@ -286,7 +286,8 @@ def _add_scene(
     sums["clear"] += elevations(towards[clear])
 
 
-#: Fewer grasps leave cells empty by chance: with this many uniform ones, e^-5 of a cell, 0.3 of all 48.
+#: Fewest grasps for statements on empty cells: with this many uniform ones a cell is empty with probability e^-5, which
+#: gives 0.3 empty cells of 48.
 ENOUGH: Final = 5 * DIRECTION_CELLS
 #: Elevations from -90 to 90 degrees.
 ELEVATION_BINS: Final = 36
@@ -302,6 +303,6 @@ def cell_counts(directions: NDArray[Any], bands: int = BANDS, sectors: int = SEC
 
 
 def elevations(directions: NDArray[Any]) -> NDArray[np.int64]:
-    """Return (ELEVATION_BINS,) counts of unit vectors (N, 3) by their angle over the horizontal."""
+    """Return (ELEVATION_BINS,) counts of unit vectors (N, 3) by their angle above the horizontal."""
     degrees = np.degrees(np.arcsin(np.clip(directions[:, 2], -1.0, 1.0)))
     return np.histogram(degrees, bins=ELEVATION_BINS, range=(-90, 90))[0].astype(np.int64)

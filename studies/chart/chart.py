@@ -25,7 +25,8 @@ from graspd.worker.validation.decomposition import decompose
 
 Say = Callable[[str], None]
 
-#: Error bound of the object for measurement and validation of all settings [m]: it reveals the cost of coarser meshes.
+#: Error bound of the object's mesh for measurement and validation [m], equal for all settings: it reveals the cost of
+#: coarser meshes in planning.
 TRUE_ERROR_M: Final = FIDELITIES["standard"].face_error_m
 
 
@@ -47,7 +48,7 @@ def chart(
     say: Say,
     keep: Callable[[dict[str, Any]], None],
 ) -> dict[str, Any]:
-    """Run all settings on all pairs, each held grasp in `models` models around the nominal one.
+    """Run all settings on all pairs; validate each held grasp in `models` models around the nominal one.
 
     `say` receives a line per cell, `keep` the partial result after each pair.
 
@@ -108,7 +109,8 @@ def _row(cell: Rollout, hand: HandModel, thing: ChartObject) -> dict[str, Any]:
 def _line(run: dict[str, Any]) -> str:
     return (
         f"{run['method']:11s} {run['fidelity']:13s} {run['hand']:18s} {run['object']:20s} "
-        f"{run['end_to_end_per_second']:8.3f} valid/s  letter {run['dexgraspbench']:.2f}  hard {run['hard']:.2f}  "
+        f"{run['end_to_end_per_second']:8.3f} valid/s  dexgraspbench {run['dexgraspbench']:.2f}  hard "
+        f"{run['hard']:.2f}  "
         f"eps {run['epsilon']:.3f}  PD {run['pd_mm']:.2f} mm"
     )
 
@@ -131,7 +133,8 @@ def settings_of(
 ) -> list[Setting]:
     """Return a setting for every method, fidelity and batch; methods without fidelities have one each.
 
-    Methods with a step budget take seconds per grasp and get `baseline_batch` grasps per call, others the first batch.
+    Methods with a step budget need seconds per grasp: they get `baseline_batch` grasps per call, others the first
+    batch.
 
     Raises:
         InputError: a method is unknown, or an option belongs to none of them.

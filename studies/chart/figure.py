@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from graspd.studies.chart.statistics import most_valid
 
 Row = Mapping[str, Any]
-#: Text at a point, from its row and all rows.
+#: Function from a point's row and all rows to its label.
 PointLabel = Callable[[Row, Sequence[Row]], str]
 
-#: Title and key of the accuracies over speed.
+#: Title and key of each accuracy that is plotted over speed.
 PANELS: Final = (
     ("Success under the DexGraspBench protocol", "dexgraspbench"),
     ("Success at half the friction", "hard"),
@@ -33,7 +33,7 @@ IN_SCENES: Final = (
     ("Robust share of lifted grasps", "robust"),
 )
 SPEED: Final = "end_to_end_per_second"
-#: Shares.
+#: Keys of accuracies that are shares.
 OF_ONE: Final = frozenset({"dexgraspbench", "hard", "robust", "lift", "lift_dexgraspbench", "lift_hard"})
 COLOURS: Final = ("#0f766e", "#b45309", "#4338ca", "#be123c", "#4d7c0f", "#6b7280", "#a21caf", "#0369a1")
 MARKERS: Final = ("o", "s", "D", "^", "v", "P", "X", "<")
@@ -67,7 +67,7 @@ def draw_hands(
     words: tuple[str, str],
     label: PointLabel | None = None,
 ) -> None:
-    """Plot a panel per hand: one accuracy over speed, both in `words`; `label` returns a point's label."""
+    """Plot a panel per hand, accuracy over speed; `words` has the axis labels, `label` returns a point's label."""
     from matplotlib.figure import Figure
 
     columns = min(3, len(by_hand))
@@ -153,7 +153,7 @@ def _panel(
     labels = []
     for row in rows:
         colour, marker = styles[row["method"]]
-        # Without valid grasps: at the upper bound, hollow, with an arrow to lower values.
+        # Without valid grasps the marker is hollow, at the upper bound, with an arrow to lower values.
         none = not row[x]
         at = most_valid(row) if none else row[x]
         bars: dict[str, Any] = {
@@ -184,14 +184,14 @@ def _ends(row: Row, key: str) -> tuple[float, float] | None:
 
 
 def _logarithmic(axes: Any, values: Sequence[float]) -> None:
-    """Set a logarithmic axis of at least a decade, with plain numbers, and space for labels on the right."""
+    """Set a logarithmic axis of at least one decade, with plain numbers and space for labels on the right."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     axes.set_xscale("log")
     low, high = min(values, default=1.0), max(values, default=1.0)
     wider = max(1.0, (10 / (high / low)) ** 0.5)
     axes.set_xlim(low / wider / 1.4, high * wider * 2.2)
-    # Over four decades the intermediate numbers would overlap.
+    # With more than four decades intermediate numbers would overlap.
     axes.xaxis.set_major_locator(LogLocator(subs=(1.0,) if high > 1e3 * low else (1.0, 2.0, 5.0)))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.xaxis.set_minor_formatter(NullFormatter())
@@ -202,7 +202,7 @@ def _error(row: Row, key: str) -> list[list[float]]:
 
 
 def _label(row: Row, rows: Sequence[Row]) -> str:
-    """Return the fidelity, with the batch if there are several; the method's name if it has one setting."""
+    """Return the fidelity, with the batch size if there are several; the method's name if it has only one setting."""
     own = [r for r in rows if r["method"] == row["method"]]
     if len(own) == 1:
         return str(row["method"])
@@ -211,7 +211,7 @@ def _label(row: Row, rows: Sequence[Row]) -> str:
 
 
 def one_of_several(row: Row, rows: Sequence[Row]) -> str:
-    """Return the fidelity if a method has several; the legend names the others."""
+    """Return the fidelity if the method has several, else no text: the legend has the method's name."""
     return str(row["fidelity"]) if sum(r["method"] == row["method"] for r in rows) > 1 else ""
 
 
@@ -239,7 +239,7 @@ def draw_sweeps(rows: Sequence[Row], file: Path) -> None:
         axes.spines[["top", "right"]].set_visible(False)
     for axes in panels.flat[len(knobs) :]:
         axes.set_visible(False)
-    # All panels share an axis from zero, so that differences are to scale.
+    # All panels share an axis from zero, so that differences are comparable.
     panels.flat[0].set_xlim(0, 1.35 * max(row["speedup"] for row in rows))
     for axes in panels.flat[len(knobs) - columns : len(knobs)]:
         axes.tick_params(labelbottom=True)
@@ -251,16 +251,16 @@ def draw_sweeps(rows: Sequence[Row], file: Path) -> None:
 Boxes = NDArray[np.float64]
 
 SIZE_PT: Final = 8
-#: Distances of a label from its point [pt], preferred ones first: from the third on a line connects them.
+#: Distances of a label from its point [pt], preferred ones first; from the third on a line connects both.
 _REACHES_PT: Final = (8.0, 15.0, 26.0, 38.0, 52.0)
 #: Directions from the point, preferred ones first [degrees].
 _TURNS: Final = (30, -30, 150, -150, 90, -90, 0, 180, 60, -60, 120, -120)
 #: Half the width of a marker [pt], and of a bar.
 _MARKER_PT: Final = 5.5
 _BAR_PT: Final = 1.5
-#: Cost of a covered share of a label: by another label or a point, by a bar, outside of the panel.
+#: Cost per share of a label that is covered by another label or a point, covered by a bar, or outside the panel.
 _COVERED, _CROSSED, _OUTSIDE = 100.0, 8.0, 200.0
-#: Cost of one step in distance, of being nearer to another point, and of the next direction.
+#: Cost of the next distance, of a label nearer to another point, and of the next direction.
 _FARTHER, _TAKEN, _TURNED = 1.0, 2.5, 0.05
 _ROUNDS: Final = 6
 
@@ -275,7 +275,7 @@ class Label:
     text: str
     colour: str
     x_bar: tuple[float, float] | None = None
-    """Ends of the point's bars."""
+    """Ends of the point's error bars."""
     y_bar: tuple[float, float] | None = None
 
 
@@ -298,7 +298,7 @@ def _place(axes: Any, pixels: float, labels: Sequence[Label]) -> list[Any]:
     offered = {index: _candidates(points[index], _size(axes, labels[index].text), pixels) for index in worded}
     fixed = {index: _fixed_costs(offered[index], points, index, bars, inside) for index in worded}
     chosen = dict.fromkeys(worded, 0)
-    # Each label in turn takes the best place given the others, until none moves.
+    # Each label in turn moves to the best place given the others, until no label moves.
     for _ in range(_ROUNDS):
         before = dict(chosen)
         for index in worded:
@@ -343,7 +343,7 @@ def _write(axes: Any, label: Label, point: Boxes, box: Boxes, pixels: float, *, 
     style |= {"arrowprops": line if led else None, "path_effects": [withStroke(linewidth=2, foreground="white")]}
     where = {"xytext": offset, "textcoords": "offset points", "annotation_clip": False}
     note = axes.annotate(label.text, (label.x, label.y), **where, **style)
-    # The layout was computed without it: a label must not move the panels below the others.
+    # The layout was computed without labels: they must not move the panels.
     note.set_in_layout(False)
     return note
 
@@ -362,7 +362,7 @@ def _candidates(point: Boxes, size: tuple[float, float], pixels: float) -> list[
     for reach, turn in product(_REACHES_PT, _TURNS):
         across, up = math.cos(math.radians(turn)), math.sin(math.radians(turn))
         corner = point + reach * pixels * np.array([across, up])
-        # The label's nearest corner or side is at that place.
+        # The label's nearest corner or side touches that place.
         left = corner[0] - size[0] * (0.5 - 0.5 * _side(across))
         bottom = corner[1] - size[1] * (0.5 - 0.5 * _side(up))
         found.append(np.array([left, bottom, left + size[0], bottom + size[1]]))

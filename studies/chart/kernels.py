@@ -1,4 +1,4 @@
-"""Kernels that only a comparison needs."""
+"""Kernels used only in comparisons."""
 
 import warp as wp
 

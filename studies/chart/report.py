@@ -36,7 +36,7 @@ SCENE_COLUMNS: Final = (
     *("seconds_to_first", "note"),
 )
 
-#: Accuracies of the summary, and their formats.
+#: Accuracies of the summary with their number formats.
 ACCURACIES: Final = (("dexgraspbench", ".2f"), ("hard", ".2f"), ("robust", ".2f"), ("epsilon", ".3f"), ("pd_mm", ".2f"))
 
 
@@ -53,7 +53,7 @@ def write(chart: Row, folder: Path) -> None:
     if "scene" in chart:
         draw_scenes([named(row) for row in chart["summary"]], pictures, second=second_of(chart))
         hands = {hand: [named(row) for row in rows] for hand, rows in chart["by_hand"].items()}
-        words = ("share of all candidates that is lifted", f"lifted grasps per {second_of(chart)}, end to end")
+        words = ("lifted share of all candidates", f"lifted grasps per {second_of(chart)}, end to end")
         draw_hands(hands, by_hand, key="lift", words=words, label=one_of_several)
     else:
         draw(chart["summary"], pictures)
@@ -77,16 +77,17 @@ def _page(chart: Row) -> str:
     parts += ["## Each hand and object", runs_table(chart["runs"])]
     parts += [
         "## The best ten by epsilon",
-        "Means over each pair's best ten grasps by ε (as the paper's table 2 takes them), then over objects.",
+        "Means over each pair's best ten grasps by ε (as in table 2 of the paper), then over objects.",
         best_table(chart["runs"]),
     ]
     if chart.get("sweeps"):
         one = chart["sweeps"][0]
         head = (
-            f"{one['hand']} on {one['object']}, {one['grasps']} grasps a value, standard with one knob turned; "
-            "speed is against the default."
+            f"{one['hand']} on {one['object']}, {one['grasps']} grasps per value, fidelity standard with one "
+            "setting changed; "
+            "speed is relative to the default."
         )
-        parts += ["## What each knob costs and buys", head, "![Knobs](sweeps.png)", sweeps_table(chart["sweeps"])]
+        parts += ["## Cost and benefit of each setting", head, "![Settings](sweeps.png)", sweeps_table(chart["sweeps"])]
     return "\n\n".join(part for part in parts if part)
 
 
@@ -108,16 +109,17 @@ def _head(chart: Row) -> str:
     return (
         f"# Speed against accuracy\n\n{_command(chart)}{chart['device']}, {chart['threads']} threads, graspd "
         f"{chart['versions']['graspd']}, Warp {chart['versions']['warp']}, {chart['created']}. Hands: {hands}. "
-        f"Objects: {objects}. Warm, repeats in turn.{_remark(chart)}\n\n"
+        f"Objects: {objects}. Settings are warmed up; their repeats are interleaved.{_remark(chart)}\n\n"
         f"- *valid*: holds in MuJoCo (DexGraspBench protocol, level *{chart['validation']['level']}*) and is feasible\n"
-        "- speeds are end to end, as a job works: planned, validated, and measured where it holds; *planner's*: grasps "
-        "that hold over the seconds of planner and postures alone; on a CPU a second is one of one core\n"
-        "- *dexgraspbench*: holds under the unmodified protocol; *hard*: at half the friction; *robust*: share of "
-        f"{chart['models']} models around the nominal one in which a grasp that holds does, on average\n"
+        "- speeds are end to end, as in a job: planning, validation, and metrics of held grasps; *planner's*: "
+        "held grasps "
+        "over the seconds of planner and postures alone; on a CPU a second is one core-second\n"
+        "- *dexgraspbench*: holds under the unmodified protocol; *hard*: at half the friction; *robust*: mean share of "
+        f"{chart['models']} models around the nominal one in which a held grasp also holds\n"
         f"- ε, contact: μ = {chart['friction']:g}, within {1e3 * chart['threshold_m']:g} mm; ε and penetration are "
         "medians of a pair's grasps, then means over the pairs\n"
-        "- bars and ±: 95 % (Wilson for shares, else bootstrap); hollow: none is valid, the most that there can be; "
-        "bold: nobody faster is better\n\n"
+        "- bars and ±: 95 % (Wilson for shares, else bootstrap); hollow: no valid grasp, upper bound of the speed; "
+        "bold: no faster setting is better\n\n"
         "![Speed against accuracy](chart.png)"
     )
 
@@ -162,9 +164,9 @@ def _ratios(rows: Sequence[Row]) -> str:
         return ""
     best = max(own, key=lambda r: r[SPEED])
     lines = [
-        "fast_graspd at its default (standard) against each other method, same run:",
+        "fast_graspd at its default (standard) relative to each other method, same run:",
         "",
-        "| against | valid/s | dexgraspbench | ε | penetration mm |",
+        "| relative to | valid/s | dexgraspbench | ε | penetration mm |",
         "| --- | --: | --: | --: | --: |",
     ]
     for row in others:
@@ -219,9 +221,9 @@ def _mean(values: Sequence[float | None]) -> float:
 
 
 def sweeps_table(sweeps: Sequence[Row]) -> str:
-    """Return a row per knob value: gain in speed and loss in accuracy against the default's row."""
+    """Return a row per knob value: gain in speed and loss in accuracy relative to the default's row."""
     lines = [
-        "| knob | value | s/grasp | speed | GSR | ε | penetration mm |",
+        "| setting | value | s/grasp | speed | GSR | ε | penetration mm |",
         "| --- | --- | --: | --: | --: | --: | --: |",
     ]
     lines += [
@@ -234,7 +236,7 @@ def sweeps_table(sweeps: Sequence[Row]) -> str:
 
 
 def second_of(chart: Row) -> str:
-    """Return the name of its second: core-seconds on a CPU, wall-clock seconds on a GPU."""
+    """Return the unit of time of the chart: core-seconds on a CPU, wall-clock seconds on a GPU."""
     return "CPU second" if str(chart["device"]).startswith("cpu") else "second"
 
 
@@ -259,28 +261,29 @@ def _scene_page(chart: Row) -> str:
 
 def _scene_head(chart: Row) -> str:
     hands, objects = _names(chart)
-    seconds = "CPU seconds, all cores together" if second_of(chart) == "CPU second" else "seconds that pass"
+    seconds = "core-seconds of the CPU" if second_of(chart) == "CPU second" else "wall-clock seconds"
     return (
-        f"# In the scene, or filtered\n\n{_command(chart)}{chart['device']}, graspd {chart['versions']['graspd']}, "
+        f"# Planned in the scene, or filtered\n\n{_command(chart)}{chart['device']}, graspd "
+        f"{chart['versions']['graspd']}, "
         f"{chart['created']}. Scene: {chart['scene']['kind']}, faces {chart['scene']['faces']}. Hands: {hands}. "
         f"Objects: {objects}.{_remark(chart)}\n\n"
         f"- *{IN_SCENE}*: planned for the scene\n"
-        f"- *{FILTERED}*: planned around a free object and put into the same scenes, grasp i into scene i in turn: all "
-        "that baselines can do\n"
-        "- *clear*: free of what stands there, coming, closing and lifting\n"
+        f"- *{FILTERED}*: planned around a free object and placed into the same scenes, grasp i into scene i in "
+        "turn; baselines have only this mode\n"
+        "- *clear*: no contact with supports or neighbours on the approach, while closing and on the lift\n"
         "- *lifted*: clear, and lifted by MuJoCo (level *lift*); *dexgraspbench*: lifted in DexGraspBench's test; "
-        "*half friction*: lifted at that too; shares of all candidates\n"
-        f"- *robust*: share of {chart['models']} models around the nominal one in which a lifted grasp is lifted, on "
-        "average\n"
-        f"- speed: lifted grasps over {seconds}, end to end: planner, postures, way, lift, and "
-        "the metrics of what is lifted; *planner's*: over those of planner and postures\n"
-        "- bars: 95 % (Wilson); hollow: none was lifted, the most that there can be"
+        "*half friction*: also lifted at half friction; all are shares of all candidates\n"
+        f"- *robust*: mean share of {chart['models']} models around the nominal one in which a lifted grasp is also "
+        "lifted\n"
+        f"- speed: lifted grasps over {seconds}, end to end: planner, postures, trajectory, lift, and "
+        "metrics of lifted grasps; *planner's*: over the seconds of planner and postures\n"
+        "- bars: 95 % (Wilson); hollow: no lifted grasp, upper bound of the speed"
     )
 
 
 def _summary(rows: Sequence[Row], second: str) -> str:
     lines = [
-        "| way | method | fidelity | n | clear | lifted | dexgraspbench | half friction | robust | "
+        "| mode | method | fidelity | n | clear | lifted | dexgraspbench | half friction | robust | "
         f"lifted per {second} | planner's | first, {second.removesuffix('econd')} | pairs with one | "
         "× over filtered |",
         "| --- | --- | --- | --: | --: | --: | --: | --: | --: | --: | --: | --: | --: | --: |",
@@ -294,8 +297,8 @@ def _summary(rows: Sequence[Row], second: str) -> str:
             f"{row['pairs_with_one']} of {row['pairs']} | {gain} |"
         )
     note = (
-        "× over filtered: planner's speed, median of the pairs in which the same fidelity, filtered, had any at all. "
-        "Bold: nobody faster is better."
+        "× over filtered: gain in the planner's speed, median over pairs with lifted filtered grasps. "
+        "Bold: no faster setting is better."
     )
     return "\n".join(lines) + f"\n\n{note}"
 
@@ -306,7 +309,7 @@ def _bold(row: Row, key: str) -> str:
 
 def _runs(runs: Sequence[Row], second: str) -> str:
     lines = [
-        "| hand | object | way | method | fidelity | n | clear | lifted | dexgraspbench | half friction | robust | "
+        "| hand | object | mode | method | fidelity | n | clear | lifted | dexgraspbench | half friction | robust | "
         f"lifted per {second} |",
         "| --- | --- | --- | --- | --- | --: | --: | --: | --: | --: | --: | --: |",
     ]

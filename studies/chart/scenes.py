@@ -1,10 +1,10 @@
-"""Grasps planned in a scene against grasps of a free object, filtered in the same scene.
+"""Comparison of grasps planned in a scene with grasps of a free object that are filtered in the same scene.
 
-A setting of a method that plans in scenes runs in both modes, others only in the second. Grasp i uses scene i of the
-object's stable faces in turn, in both modes, with the same tests: clear trajectory, lifted, lifted under the unmodified
-protocol, at half the friction, and in models around the nominal one. Speed is lifted grasps over seconds, on a CPU
-core-seconds, which are independent of other load: of planner and postures alone, and end to end, with trajectory,
-validator and the metrics of lifted grasps.
+Methods that plan in scenes run in both modes, other methods only in the second. In both modes grasp i uses scene i of
+the object's stable faces, in turn. The tests are the same: clear trajectory, lift, lift under the unmodified protocol,
+lift at half friction, and lift in models around the nominal one. Speed is lifted grasps over seconds (on a CPU
+core-seconds, which are independent of other load): once for planner and postures alone, once end to end, with
+trajectory, validator and metrics of lifted grasps.
 """
 
 from __future__ import annotations
@@ -46,21 +46,21 @@ from graspd.worker.validation.robust import robust
 Row = dict[str, Any]
 Say = Callable[[str], None]
 
-#: Shares of all candidates, by their column.
+#: Columns with shares of all candidates.
 SHARES: Final = ("clear", "lift", "lift_dexgraspbench", "lift_hard")
 SPEEDS: Final = (("valid_per_second", "seconds"), ("end_to_end_per_second", "end_seconds"))
-#: Increase it when a row has other columns: cached results are then discarded.
+#: Increase when the columns of a row change: cached results are then discarded.
 FORM: Final = 2
-#: Candidates per second, by the speed that counts lifted ones.
+#: For each speed in lifted grasps, the key of the speed in candidates.
 RAW: Final = {"valid_per_second": "grasps_per_second", "end_to_end_per_second": "candidates_end_to_end_per_second"}
-#: Above this time per grasp no extra run times the first one [s].
+#: Above this time per grasp [s] the time to the first grasp is not measured in an extra run.
 _SHORT_S: Final = 1.0
 _NOTHING: Final = {**{f"{name}_count": 0 for name in SHARES}, "robust_sum": 0.0, "first_seconds": 0.0}
 
 
 @dataclass
 class ObjectScenes:
-    """An object in its scenes, which are made for the first setting without a cached result."""
+    """An object and its scenes, which are created for the first setting without a cached result."""
 
     thing: ChartObject
     spec: SceneSpec
@@ -91,10 +91,10 @@ def scene_chart(
     say: Say,
     keep: Callable[[Row], None],
 ) -> Row:
-    """Run all settings on all pairs; a setting's `batch` is the number of its grasps on each pair.
+    """Run all settings on all pairs; a setting's `batch` is its number of grasps per pair.
 
-    Each lifted grasp is lifted again in `models` models around the nominal one. `work` is a folder with the result of
-    each setting on each pair, from which an interrupted run resumes. `say` receives a line per cell, `keep` the partial
+    Each lifted grasp is lifted again in `models` models around the nominal one. `work` is a folder for the results of
+    each setting and pair; an interrupted run resumes from it. `say` receives a line per cell, `keep` the partial
     result after each pair.
 
     Returns:
@@ -120,7 +120,7 @@ def _ways(settings: Sequence[Setting]) -> list[tuple[Setting, str]]:
 
 
 def _kept(setting: Setting, way: str, hand: HandModel, place: ObjectScenes, models: int, work: Path | None) -> Row:
-    """Return the setting's result on the pair, from its file if cached."""
+    """Return the setting's result on the pair, from its cache file if it exists."""
     said = {
         "way": way,
         "method": setting.method,
@@ -134,7 +134,7 @@ def _kept(setting: Setting, way: str, hand: HandModel, place: ObjectScenes, mode
         return said | _tried(setting, way, hand, place, models)
     told = place.spec.model_dump(mode="json")
     terms = [FORM, models, said, setting.knobs.model_dump(mode="json"), told, hand.digest, place.true.digest]
-    # Results depend on the planners' code too: another revision or device starts anew.
+    # Results also depend on the planners' code: another revision or device does not use the cache.
     device = [] if setting.run.device == "cpu" else [setting.run.device]
     file = work / f"{digest_json([*terms, STAGE_REVISIONS['synthesize'], *device])}.json"
     if not file.is_file():
@@ -172,7 +172,7 @@ def _tried(setting: Setting, way: str, hand: HandModel, place: ObjectScenes, mod
             row["first_seconds"] = clock() - began
         row |= validated.counts(models)
     except InputError as error:
-        # A scene without a free approach, or a pair that the method refuses.
+        # The scene has no free approach, or the method refuses the pair.
         note = str(error)
     row["first_grasps"] = few
     told = figures([row])
@@ -213,9 +213,9 @@ class ValidatedGrasps:
         return rows[found.success == 1]
 
     def counts(self, models: int) -> Row:
-        """Count clear grasps, also lifted ones, by DexGraspBench's protocol, and at half the friction.
+        """Count grasps that are clear, lifted, lifted by DexGraspBench's protocol, and lifted at half friction.
 
-        For lifted grasps, it also sums the shares of models in which they are lifted.
+        Also sum, over lifted grasps, the shares of models in which they are lifted.
         """
         lifted = self.lifted
         grasps, placed = self.grasps.take(lifted), self.placed.take(lifted)
@@ -233,7 +233,7 @@ class ValidatedGrasps:
 def figures(rows: Sequence[Mapping[str, Any]]) -> Row:
     """Return shares of all candidates with 95 % intervals (Wilson), and lifted grasps per second.
 
-    `robust` is the mean share of models over lifted grasps. All grasps weigh equally. A refused cell has no time.
+    `robust` is the mean share of models over lifted grasps. All grasps have equal weight. A refused cell has no time.
     """
     grasps = sum(row["grasps"] for row in rows)
     found: Row = {"grasps": grasps}
@@ -257,7 +257,7 @@ def figures(rows: Sequence[Mapping[str, Any]]) -> Row:
 def summed(runs: Sequence[Row]) -> list[Row]:
     """Return a row for each mode, method and fidelity over all pairs.
 
-    `gain` compares with the same fidelity, filtered: the median over pairs in which that found any.
+    `gain` is relative to mode filtered at the same fidelity: the median over pairs with lifted filtered grasps.
     """
     groups: dict[tuple[str, str, str, int], list[Row]] = {}
     for run in runs:

@@ -11,19 +11,19 @@ from graspd.service.model.transforms import Floats
 from graspd.studies.chart.trials import Rollout
 from graspd.worker.quality.intervals import wilson, wilson_of_mean
 
-#: Bootstrap draws; error bars are their 2.5 and 97.5 percentiles.
+#: Number of bootstrap draws; error bars are their 2.5 and 97.5 percentiles.
 DRAWS: Final = 400
 BAR: Final = (2.5, 97.5)
 #: Accuracies, and whether more is better. The first three are not in sweeps.
 METRICS: Final = {"dexgraspbench": True, "hard": True, "robust": True, "gsr": True, "epsilon": True, "pd_mm": False}
 #: Speeds that are plotted against accuracies.
 SPEEDS: Final = ("valid_per_second", "end_to_end_per_second")
-#: Metrics for which a cell's median counts; for `gsr` the mean.
+#: Metrics summarised by a cell's median; `gsr` by the mean.
 MEDIANS: Final = ("epsilon", "pd_mm", "spd_mm", "ca_cm2", "iv_cm3", "wrench_volume")
 
 
 def figures(cell: Rollout) -> dict[str, Any]:
-    """Return the keys of a run: speed, accuracy, and `KEY_low`, `KEY_high` of each."""
+    """Return the values of a run: speed, accuracy, and `KEY_low`, `KEY_high` of each."""
     held, kept = (np.concatenate(rows).astype(float) for rows in (cell.success, cell.kept))
     seconds = np.array(cell.seconds)
     row: dict[str, Any] = {
@@ -50,20 +50,20 @@ def figures(cell: Rollout) -> dict[str, Any]:
 
 
 def widen(row: dict[str, Any], valid: int, grasps: int, per_second: float) -> None:
-    """Widen bars of success and dependent speed by the counts; speed keeps the wider of its two bars."""
+    """Widen the bars of success and of the dependent speed by the counts; speed keeps the wider bars."""
     row["gsr_low"], row["gsr_high"] = wilson(valid, grasps)
     widen_speed(row, "valid_per_second", valid, grasps, per_second)
 
 
 def widen_speed(row: dict[str, Any], key: str, valid: int, grasps: int, per_second: float) -> None:
-    """Widen bars of a speed to at least those of the share of counted grasps."""
+    """Widen the bars of a speed to at least those that follow from the share of counted grasps."""
     low, high = wilson(valid, grasps)
     row[f"{key}_low"] = min(row[f"{key}_low"], low * per_second)
     row[f"{key}_high"] = max(row[f"{key}_high"], high * per_second)
 
 
 def _scrutinised(cell: Rollout) -> dict[str, Any]:
-    """Return success by DexGraspBench's protocol and at half friction, and held grasps' share of models."""
+    """Return success by DexGraspBench's protocol and at half friction, and the robust share of held grasps."""
     row: dict[str, Any] = {}
     for key, verdicts in (("dexgraspbench", cell.dexgraspbench), ("hard", cell.hard)):
         held = np.concatenate(verdicts) == 1
@@ -80,7 +80,7 @@ def _scrutinised(cell: Rollout) -> dict[str, Any]:
 def first_valid(share: float, seconds: Sequence[float], grasps: int) -> float | None:
     """Return expected seconds until repeated calls give a valid grasp; None if none was valid.
 
-    The median of the calls' `seconds` counts.
+    The time of a call is the median of `seconds`.
     """
     if share <= 0 or not seconds:
         return None
@@ -109,7 +109,7 @@ def _draws(cell: Rollout) -> dict[str, Floats]:
 def summed(runs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Return one row per method, fidelity and batch, over all hands and objects.
 
-    Speed is all valid grasps over all seconds; accuracies are means over the pairs, with bars that shrink accordingly.
+    Speed is all valid grasps over all seconds; accuracies are means over the pairs, with bars of these means.
     """
     groups: dict[tuple[str, str, int], list[dict[str, Any]]] = {}
     for run in runs:
@@ -142,11 +142,11 @@ def summed(runs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def mark_fronts(rows: Sequence[dict[str, Any]], metrics: Mapping[str, bool]) -> None:
-    """Add `front`: the accuracies in which no row that is faster end to end is better; True: more is better."""
+    """Add `front`: the accuracies in which no faster row (end to end) is better. `metrics`: True if more is better."""
     for row in rows:
         row["front"] = []
     for key, more in metrics.items():
-        # Methods without valid grasps are on no front: a hand without contact has no penetration either.
+        # Exclude methods without valid grasps: a hand without contact has no penetration either.
         able = [row for row in rows if row["end_to_end_per_second"] and row[key] is not None]
         for index in pareto([(row["end_to_end_per_second"], row[key] if more else -row[key]) for row in able]):
             able[index]["front"].append(key)
@@ -172,7 +172,7 @@ def _ratio_bar(runs: Sequence[dict[str, Any]], key: str, seconds: str, side: str
 def most_valid(row: Mapping[str, Any]) -> float:
     """Return the 95 % upper bound on valid grasps per second, end to end, if none of n is valid.
 
-    It is a share of 3 / n. In scenes it bounds the lifted grasps.
+    The bound on the share is 3 / n. In scenes it applies to lifted grasps.
     """
     raw = row.get("candidates_end_to_end_per_second", row["grasps_per_second"])
     return float(raw) * min(1.0, 3.0 / row["grasps"])

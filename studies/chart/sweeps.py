@@ -1,6 +1,6 @@
-"""One-at-a-time sweeps of fast_graspd's knobs: loss of accuracy and gain in speed.
+"""One-at-a-time sweeps of fast_graspd's settings: loss of accuracy and gain in speed.
 
-Some knobs are no part of a fidelity: passes of the contact solver, culling by grid and band, and whether the M
+Some settings are not part of a fidelity: passes of the contact solver, culling by grid and band, and whether the M
 simulations share one closest-point query per hand point (the default) or make M queries (as in the paper's code).
 """
 
@@ -57,10 +57,10 @@ def _options(**changes: Any) -> Change:
 
 
 def turns(quick: bool = False, knobs: Sequence[str] = ()) -> list[KnobValue]:
-    """Return all knobs, few of them, or the named ones; each includes the default value.
+    """Return values of all settings, of a few (`quick`), or of the named ones; each setting includes its default.
 
     Raises:
-        InputError: a name is not a knob.
+        InputError: a name is not a setting.
     """
 
     def knob(name: str, between: str, **values: Sequence[Any]) -> list[KnobValue]:
@@ -105,10 +105,10 @@ def sweep(
     knobs: Sequence[str],
     say: Callable[[str], None],
 ) -> list[dict[str, Any]]:
-    """Return one row per knob and value: `knob`, `value`, `default`, `speedup` and a run's figures.
+    """Return one row per setting (`knob`) and value: `knob`, `value`, `default`, `speedup` and a run's figures.
 
-    Values run in turn, repeat by repeat. `speedup` is the default's cost over the value's: in processor seconds on a
-    CPU, which are independent of other load, in seconds on a GPU.
+    Values are interleaved, repeat by repeat. `speedup` is the default's cost over the value's. The cost is in
+    core-seconds on a CPU, independent of other load, and in wall-clock seconds on a GPU.
     """
     wp.load_module(module=kernels, device=run.device)
     default = KnobValue("", "default")
@@ -122,7 +122,7 @@ def sweep(
             cells[turn.knob, turn.value] = Rollout(setting, hand, thing.load(turn.fidelity.face_error_m), true, pieces)
     for _ in range(repeats):
         for cell in cells.values():
-            # More settings than the device caches: each is prepared just before it is timed.
+            # There are more settings than the device caches, so each is prepared just before it is timed.
             cell.warm_up()
             cell.repeat()
     base = figures(cells[default.knob, default.value])
@@ -148,7 +148,7 @@ def _make(
 
 
 class QueryPerVelocity(Pair):
-    """Every simulated velocity makes its own distance queries; the results are equal."""
+    """Pair in which every simulated velocity makes its own distance queries, with equal results."""
 
     def iteration(self, model: Model, data: Data, optimizer: str, patience: int) -> Launches:
         out = Launches(model.device)

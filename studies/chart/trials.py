@@ -29,14 +29,14 @@ from graspd.worker.validation.displacement import simulated_displacement_cm
 from graspd.worker.validation.robust import robust
 from graspd.worker.validation.validator import validate
 
-#: Coulomb coefficient of epsilon and wrench volume: the paper's.
+#: Coulomb coefficient for epsilon and wrench volume: the paper's.
 FRICTION: Final = 1.0
-#: A seed that no setting was tuned with; repeats take the next ones.
+#: First seed, not used for tuning of any setting; repeats use the following seeds.
 SEED: Final = 4711
 WARM_SEED: Final = 1
-#: Seed of the models around the nominal one: used by no job and not by `graspd evaluate`.
+#: Seed of the models around the nominal one; neither jobs nor `graspd evaluate` use it.
 MODELS_SEED: Final = 2**31 + 1
-#: Grasps per object in the paper's table 2: the best by epsilon.
+#: Number of best grasps by epsilon per object, as in table 2 of the paper.
 BEST: Final = 10
 
 
@@ -54,12 +54,12 @@ class Setting:
     knobs: Fidelity
     options: Mapping[str, Any] = field(default_factory=dict)
     batch: int = 32
-    """Grasps per call, and per repeat."""
+    """Number of grasps per call, which is one repeat."""
     warm: Mapping[str, Any] = field(default_factory=dict)
     """Options of the call before the first timed one."""
     run: ExecutionContext = DEFAULT_CONTEXT
     make: Make | None = None
-    """Alternative planner for sweeps of settings that no fidelity contains."""
+    """Alternative planner for sweeps of settings that are not part of a fidelity."""
 
     def grasps(
         self,
@@ -72,7 +72,7 @@ class Setting:
         rollout: Tried | None = None,
         warm: bool = False,
     ) -> GraspSet:
-        """Make grasps, in the scenes if `placed`; methods with rollouts run them by `rollout`."""
+        """Plan grasps, in scenes if `placed`; methods with rollouts use `rollout`."""
         if self.make is not None:
             return self.make(hand, obj, count, seed)
         options = {**self.options, **(self.warm if warm else {})}
@@ -87,9 +87,9 @@ class Rollout:
     setting: Setting
     hand: HandModel
     obj: ObjectModel
-    """Object of the planner."""
+    """Object for the planner."""
     true: ObjectModel
-    """Object of metrics and validator: the same for all settings."""
+    """Object for metrics and validator, the same for all settings."""
     pieces: ConvexPieces
     """Convex pieces of `true`."""
     seconds: list[float] = field(default_factory=list)
@@ -100,16 +100,16 @@ class Rollout:
     success: list[NDArray[np.int8]] = field(default_factory=list)
     """Verdicts of the standard level."""
     kept: list[NDArray[np.int8]] = field(default_factory=list)
-    """1 valid: the grasp is held and feasible."""
+    """1: valid, that is held and feasible."""
     columns: list[dict[str, Floats]] = field(default_factory=list)
     first_calls: list[float] = field(default_factory=list)
-    """Seconds of calls of `first_grasps` grasps, end to end."""
+    """Seconds of calls with `first_grasps` grasps, end to end."""
     first_grasps: int = 1
     dexgraspbench: list[NDArray[np.int8]] = field(default_factory=list)
-    """Verdicts of the unmodified DexGraspBench protocol; like `hard` and `shares` set by `scrutinise`."""
+    """Verdicts of the unmodified DexGraspBench protocol; `scrutinise` sets these, `hard` and `shares`."""
     hard: list[NDArray[np.int8]] = field(default_factory=list)
     shares: list[Floats] = field(default_factory=list)
-    """Share of other models that hold a grasp; nan if the nominal one does not."""
+    """Share of other models in which a grasp holds; nan if it does not hold in the nominal one."""
 
     @cached_property
     def tried(self) -> Tried | None:
@@ -121,7 +121,7 @@ class Rollout:
         return clock_of(self.setting.run.device)
 
     def warm_up(self) -> None:
-        """Make one untimed call, which prepares kernels, grids and samples."""
+        """Make one untimed call to prepare kernels, grids and samples."""
         self.setting.grasps(self.hand, self.obj, 1, WARM_SEED, rollout=self.tried, warm=True)
 
     def repeat(self) -> None:
@@ -143,7 +143,7 @@ class Rollout:
         self.columns.append(columns)
 
     def _finished(self, found: GraspSet) -> tuple[NDArray[np.int8], NDArray[np.int8], dict[str, Floats]]:
-        """Process planned grasps like a job: return verdicts, valid ones, and columns of held ones."""
+        """Validate and measure planned grasps as in a job: return verdicts, valid flags, and columns of held grasps."""
         success = validate(self.hand, self.true, found, pieces=self.pieces, run=self.setting.run).success
         held = np.flatnonzero(success == 1)
         table = self._measured(found.take(held))
@@ -168,7 +168,7 @@ class Rollout:
             self.shares.append(shares)
 
     def time_first(self, grasps: int) -> None:
-        """Time a call of few grasps, the wait for a valid one; above 1 s per grasp, derive it from the batch."""
+        """Time a call with few grasps (first valid one); above 1 s per grasp, derive the time from the batch."""
         self.first_grasps = grasps
         each = self.end_seconds[-1] / self.setting.batch
         if each > 1.0:
@@ -182,7 +182,7 @@ class Rollout:
         return np.concatenate([columns[key] for columns in self.columns])
 
     def best(self) -> dict[str, float]:
-        """Return means over the `BEST` grasps by epsilon, with simulated displacement: a row of table 2."""
+        """Return means over the `BEST` grasps by epsilon, with simulated displacement: a row of the paper's table 2."""
         order = np.argsort(-self.values("epsilon"), kind="stable")[:BEST]
         pose, joints = (
             np.concatenate([getattr(found.grasp, name) for found in self.made])[order]

@@ -1,6 +1,7 @@
 """Hard objects and hands: thin, sharp, open, tiny, huge; few or many fingers, coupled drives.
 
-All go through ingest. The hands are a family: equal three-joint fingers in a ring, which lean outward while open.
+All are ingested like uploads. The hands are a family: equal three-joint fingers in a ring, which lean outward when
+open.
 """
 
 from __future__ import annotations
@@ -28,9 +29,9 @@ from graspd.worker.objects.prepare import load_object
 
 MILLIMETRES: Final = 1e-3
 #: Text for maps of candidates: measure of a cell, bounds of bad values, and symptom for users.
-MEASURE: Final = "share of candidates that are valid: held by the validator, and past the geometric gate"
-BOUNDS: Final = "weak: under a half; broken: none, or a number that is none"
-SHOWS: Final = "few or no valid grasps: a job ends with a note that its budget found fewer than asked for"
+MEASURE: Final = "valid share of candidates: held by the validator and accepted by the geometric gate"
+BOUNDS: Final = "weak: below 0.5; broken: 0, or a value that is not finite"
+SHOWS: Final = "few or no valid grasps: a job ends with a note that its budget found fewer than wanted"
 
 
 def sheet(thickness_mm: float) -> Any:
@@ -53,7 +54,7 @@ def tunnel(diameter_mm: float) -> Any:
 
 
 def corner(depth_mm: float) -> Any:
-    """Return a cross of two bars: four concave corners of the given depth."""
+    """Return a cross of two bars, with four concave corners of the given depth."""
     deep = depth_mm * MILLIMETRES
     arms = [trimesh.creation.box((0.03 + 2 * deep, 0.03, 0.05)), trimesh.creation.box((0.03, 0.03 + 2 * deep, 0.05))]
     return trimesh.boolean.union(arms, engine="manifold")
@@ -98,16 +99,16 @@ DEFECTS: Final[dict[str, Callable[[Any], Any]]] = {
     "inside out": _inverted,
     "every other face inside out": _half_inverted,
 }
-#: Meshes that ingest refuses or closes.
+#: Defects that ingest refuses or closes.
 CLOSED: Final = tuple(name for name in DEFECTS if name != _ALLOW_OPEN)
 
 
 @dataclass(frozen=True)
 class MapOptions:
-    """Jobs behind the cells of a map."""
+    """Settings of the jobs behind the cells of a map."""
 
     count: int
-    """Grasps of each."""
+    """Number of grasps of each job."""
     fidelity: str = "draft"
     run: ExecutionContext = DEFAULT_CONTEXT
     say: Callable[[str], None] = lambda line: None
@@ -131,17 +132,17 @@ def shape_map(
         cells.append(cell)
     return StabilityMap(
         "shapes",
-        f"{options.count} grasps of {hand.name} on shapes that are hard",
+        f"{options.count} grasps of {hand.name} on hard shapes",
         "the shape's parameter",
         "fidelity",
         MEASURE,
         BOUNDS,
         reachable(cells, lambda cell: True),
         SHOWS,
-        "ingest refuses what has no inside and says `thin` where walls are; gate and validator flag grasps that "
-        "sink in; a job that finds too few says so",
+        "ingest refuses meshes without an inside and reports `thin` walls; gate and validator reject grasps with "
+        "deep penetration; a job with too few valid grasps reports it",
         "tests/studies/test_stability.py::test_a_shape_is_refused_or_its_grasps_are_sound",
-        reach="all: users bring such shapes",
+        reach="all: users have such shapes",
     )
 
 
@@ -166,8 +167,8 @@ def shape_cell(
     Args:
         hand: the hand.
         place: panel, x and y of the cell.
-        mesh: is prepared like an upload.
-        options: size of the job, and where it runs.
+        mesh: mesh in metres; it is prepared like an upload.
+        options: size and execution context of the job.
         allow_open: whether the mesh may be open.
         asked: fidelity or method of the job.
     """
@@ -200,7 +201,7 @@ COUPLINGS: Final[tuple[Coupling, ...]] = ("each joint", "distal follows", "a dri
 SIZES: Final = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0)
 #: Rotation of the distal joint over that of the previous one.
 RATIOS: Final = (-0.5, 0.0, 0.5, 1.0, 1.5, 2.0)
-#: Cube that they hold [mm].
+#: Cube that these hands grasp [mm].
 CUBE_MM: Final = 50.0
 
 #: Palm, links and their radius [m] of a hand of size 1, from the palm outward.
@@ -216,8 +217,8 @@ def ring_hand(fingers: int, *, coupling: Coupling = "each joint", size: float = 
     """Return a hand of equal fingers around a palm.
 
     Args:
-        fingers: their number.
-        coupling: joints that a drive moves.
+        fingers: number of fingers.
+        coupling: which joints one drive moves.
         size: size relative to a human hand.
         ratio: rotation of a coupled distal joint over the middle one's.
 
@@ -252,7 +253,7 @@ def _finger(k: int, base: str, coupling: Coupling, size: float, ratio: float) ->
 
 
 def _mimic(k: int, j: int, coupling: Coupling, ratio: float) -> str:
-    """Return the joint that a joint follows, if it is no drive."""
+    """Return the mimic element of a joint that follows another one; empty for driven joints."""
     leads = {"each joint": (k, j), "distal follows": (k, min(j, 1)), "a drive a finger": (k, 0), "one drive": (0, 0)}
     lead = leads[coupling]
     if lead == (k, j):
@@ -292,15 +293,15 @@ def hand_map(
         cells.append(cell)
     return StabilityMap(
         "hands",
-        f"{options.count} grasps of a cube of {CUBE_MM:g} mm in hands that are hard, {options.fidelity}",
+        f"{options.count} grasps of a cube of {CUBE_MM:g} mm with hard hands, {options.fidelity}",
         "the hand's parameter",
-        "what a drive moves",
+        "joints per drive",
         MEASURE,
         BOUNDS,
         reachable(cells, lambda cell: True),
         "few or no valid grasps, and a low share in the hand's self-test",
-        "a hand without two parts that oppose each other is refused; the self-test of a new hand says which share "
-        "holds plain objects; a job that finds too few says so",
+        "a hand without two opposed parts is refused; the self-test of a new hand reports the share of grasps that "
+        "hold simple objects; a job with too few valid grasps reports it",
         "tests/studies/test_stability.py::test_palm_without_fingers_is_refused_and_three_of_them_hold",
-        reach="all: users bring such hands",
+        reach="all: users have such hands",
     )

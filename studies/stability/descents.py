@@ -24,12 +24,12 @@ from graspd.worker.simulation.record import record_iteration
 
 Say = Callable[[str], None]
 
-#: Displacements of the start along the approach [m]: towards the object; negative is away from it.
+#: Displacements of the start along the approach [m]: positive towards the object, negative away from it.
 MOVES_M: Final = (-0.5, -0.2, -0.1, -0.05, 0.0, 0.03, 0.06, 0.1)
 #: Factors on the optimiser's rates, and on the penetration weights.
 RATES: Final = (0.01, 0.1, 0.3, 1.0, 3.0, 10.0, 100.0)
 WEIGHTS: Final = (0.0, 0.01, 0.1, 1.0, 10.0, 100.0)
-#: Names of the panels: plain descent uses rates tuned for Adam, unlike `optimizer: gd`.
+#: Names of the panels. Plain descent uses the rates tuned for Adam, unlike `optimizer: gd`.
 _OPTIMIZERS: Final = {"adam": "Adam", "gd": "plain descent, Adam's rates"}
 LENGTHS: Final = (100, 1_000, 10_000)
 LONG: Final = 100_000
@@ -43,9 +43,9 @@ RESIDUAL: Final = (0.35, 0.9)
 class Descent:
     state: HandState
     depths: Floats
-    """(n,) deepest penetration after the projection [m], as in a job: before, it is millimetres."""
+    """(n,) deepest penetration after the projection [m], as in a job; before the projection it is millimetres."""
     drift: float
-    """Largest deviation of a quaternion's length from 1 before the projection, which normalises it."""
+    """Largest deviation of a quaternion's norm from 1, before the projection normalises it."""
 
 
 def descend(
@@ -60,8 +60,8 @@ def descend(
 ) -> Descent:
     """Run coarse and fine phase and projection from given hands.
 
-    `rates` and `weights` are factors on the rates and on the weights of penetration. `iterations` are those of the fine
-    phase, with its last row repeated; default: the fidelity's.
+    `rates` and `weights` are factors on the rates and on the weights of penetration. `iterations` is the length of the
+    fine phase, whose last row is repeated; default: the fidelity's.
     """
     n = len(state.pivot)
     for side, schedule in ((pair.coarse, coarse_schedule(fidelity)), (pair.fine, fine_schedule(fidelity))):
@@ -78,7 +78,7 @@ def descend(
         data.set_state(state)
         record_iteration(model, data, optimizer).run(steps)
         state = data.state(n)
-    # The projection normalises quaternions: the drift of the descent is measured before.
+    # Measure the drift before the projection, which normalises quaternions.
     drift = float(np.abs(np.linalg.norm(state.rotation, axis=1) - 1.0).max())
     state, depths = Projection(model, data, AROUND).run(state, fidelity.polish_iterations)
     return Descent(state, depths, drift)
@@ -97,16 +97,16 @@ def start_map(hand: HandModel, obj: ObjectModel, *, count: int, say: Say) -> Sta
     return StabilityMap(
         "starts",
         f"{count} starts moved along the approach",
-        "way towards the object [m]",
+        "displacement towards the object [m]",
         "fidelity",
         _MEASURE,
         _BOUNDS,
         reachable(cells, lambda cell: cell.x == 0.0),
-        "a hand that stays away has no contacts; one that begins inside stays tangled",
-        "the planner's own starts are drawn back until nothing touches; the merit drops hands that hold nothing, the "
-        "gate those that sink in",
+        "a hand that stays away has no contacts; a hand that starts inside the object stays there",
+        "the planner's own starts retreat until they are free of contact; the merit rejects hands without contact "
+        "balance, the gate rejects penetration",
         "tests/studies/test_stability.py::test_a_start_that_is_too_far_is_flagged",
-        reach="0 m: the planner draws its starts itself",
+        reach="0 m: the planner draws the starts",
     )
 
 
@@ -130,10 +130,10 @@ def rate_map(
         _MEASURE,
         _BOUNDS,
         reachable(cells, lambda cell: (cell.panel, cell.x, cell.y) == (_OPTIMIZERS["adam"], 1.0, 1.0)),
-        "hands jump past the object or sink into it",
-        "rates and weights are fixed by the schedule; hands that are no numbers are dropped, others validated",
+        "hands jump past the object or penetrate it",
+        "the schedule fixes rates and weights; hands with numbers that are not finite are rejected, others validated",
         "tests/worker/test_certified.py::test_hands_that_are_no_numbers_are_dropped_and_counted",
-        reach="Adam at 1 and 1: rates and weights are no options of a job; `optimizer: gd` brings the paper's own",
+        reach="Adam at 1 and 1: rates and weights are no options of a job; `optimizer: gd` uses those of the paper",
     )
 
 
@@ -152,23 +152,24 @@ def length_map(hand: HandModel, obj: ObjectModel, *, lengths: Sequence[int], say
         f"Long runs of the fine phase, {hand.name} on {obj.name}",
         "iterations",
         "measure",
-        _MEASURE + "; the largest departure of a quaternion's length from 1",
+        _MEASURE + "; the largest deviation of a quaternion's norm from 1",
         _BOUNDS + "; drift: 1e-5, 1e-3",
         reachable(cells, lambda cell: True),
-        "poses that are no rotations any more, hands that creep away",
-        "quaternions are normalised in each step; a grasp that does not improve is frozen after `patience` iterations",
+        "poses with invalid rotations, hands that drift away",
+        "quaternions are normalised in each step; a grasp that does not improve stops after `patience` iterations",
         "tests/studies/test_stability.py::test_a_long_run_does_not_drift",
-        reach="all: a fidelity of one's own may ask for 100,000 iterations",
+        reach="all: a custom fidelity may have 100,000 iterations",
     )
 
 
 _ORDER: Final = ("good", "weak", "broken")
 _MEASURE: Final = (
-    "median residual of balanced contact forces (1: nothing holds); ↓ how deep the hands are [mm], where that is worse"
+    "median residual of balanced contact forces (1: no balance); ↓ median penetration [mm], if that is the worse "
+    "measure"
 )
 _BOUNDS: Final = (
     f"weak: residual {RESIDUAL[0]:g} or {DEPTH_MM[0]:g} mm deep; "
-    f"broken: {RESIDUAL[1]:g}, {DEPTH_MM[1]:g} mm, or no number"
+    f"broken: {RESIDUAL[1]:g}, {DEPTH_MM[1]:g} mm, or a value that is not finite"
 )
 
 

@@ -20,7 +20,7 @@ from graspd.worker.simulation.model import initial_motions
 from graspd.worker.simulation.reference import Contacts, World
 
 PASSES: Final = 12
-#: Sizes of the held ball [m], and largest depth or gap of its contacts, over the step of 1 mm.
+#: Sizes of the held ball [m], and largest depth or gap of its contacts as a multiple of the step (1 mm).
 SIZES_M: Final = (0.0005, 0.002, 0.01, 0.04, 0.15, 0.5)
 GAPS: Final = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0)
 STEP_M: Final = 1e-3
@@ -93,11 +93,11 @@ def gradient_map(sizes: Sequence[float], gaps: Sequence[float], *, repeats: int)
         "sine of the angle between the gradients, median of some contact sets",
         f"weak: {ANGLE[0]:g}; broken: {ANGLE[1]:g}",
         reachable(cells, lambda cell: True),
-        "the descent wanders: losses stay where they were however many iterations are run",
-        "a descent that does not improve stops after `patience` iterations; of several starts the best is kept, judged "
-        "by the balance of forces and not by the loss",
+        "the descent wanders: the loss does not fall, even with more iterations",
+        "a descent that does not improve stops after `patience` iterations; the best of several starts is selected by "
+        "the balance of forces, not by the loss",
         "tests/studies/test_stability.py::test_gradients_agree_at_the_sizes_of_hands_and_their_objects",
-        reach="all: `contact_solver` offers each, and objects have every size",
+        reach="all: option `contact_solver` has each value, and objects have any size",
     )
 
 

@@ -1,6 +1,6 @@
 """Integrators alone: a ball thrown into a cage of contact points, step by step, in float64.
 
-The cage is fixed, the ball flies inside it. A feasible integrator adds no energy, keeps the ball in the cage and
+The cage is fixed and the ball flies inside it. A good integrator adds no energy, keeps the ball in the cage and
 prevents penetration. The position-based ones are those of `worker.simulation.reference`, the reference of the kernels'
 tests; the force-based one is the penalty force of Grasp'D (2022) under semi-implicit Euler.
 """
@@ -21,11 +21,11 @@ from graspd.worker.simulation import reference
 from graspd.worker.simulation.model import LossOptions
 from graspd.worker.simulation.reference import Contacts, World
 
-#: From contacts (with present distances), free motion and world to the permitted motion.
+#: Function from contacts (with present distances), free motion and world to the permitted motion.
 Solver = Callable[[Contacts, Floats, World], Floats]
 
 RADIUS_M: Final = 0.035
-#: Gap between ball and cage at the start [m], at most the ball's flight in this many steps, so that it arrives.
+#: Gap between ball and cage at the start [m], at most the distance that the ball flies in this many steps.
 GAP_M: Final = 2e-3
 FLIGHT_STEPS: Final = 10
 STEPS: Final = 60
@@ -37,7 +37,7 @@ ENERGY: Final = (1.02, 2.0)
 FRICTION: Final = 0.8
 VISCOUS: Final = 10.0
 
-#: Cells of balls show the worse of the two values.
+#: A ball's cell shows the worse of the two values.
 _BALL_MEASURE: Final = "× largest kinetic energy over the first (∞: it blew up), else how deep it sank [mm]"
 
 TIME_STEPS: Final = (1e-5, 1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2)
@@ -70,7 +70,7 @@ def ball_world(dt: float, speed: float) -> World:
 
 
 def position_based(solver: Solver, *, dt: float, speed: float) -> tuple[float, float]:
-    """Return largest energy over the first, and deepest sink [m], of a ball; position-based integrator."""
+    """Return a ball's largest energy over its initial one, and deepest penetration [m]; position-based integrator."""
     points = _cage_around(dt, speed)
     world = ball_world(dt, speed)
 
@@ -86,7 +86,7 @@ def position_based(solver: Solver, *, dt: float, speed: float) -> tuple[float, f
 
 
 def force_based(*, dt: float, speed: float, stiffness: float, mass: float = 1.0) -> tuple[float, float]:
-    """Return the same under penalty forces -k c n and friction; `stiffness` [N/m], `mass` [kg]."""
+    """Return the same for penalty forces -k c n with friction; `stiffness` [N/m], `mass` [kg]."""
     points = _cage_around(dt, speed)
     inertia = 0.4 * mass * RADIUS_M**2
 
@@ -103,7 +103,7 @@ def force_based(*, dt: float, speed: float, stiffness: float, mass: float = 1.0)
 
 
 def _extremes(points: Floats, flight: Iterator[tuple[Floats, float]]) -> tuple[float, float]:
-    """Return largest energy and deepest sink of a flight: centres, and energies over the first."""
+    """Return largest energy and deepest penetration of a flight, given as centres and energies over the initial one."""
     most, deepest = 1.0, 0.0
     for centre, energy in flight:
         most, deepest = max(most, energy), max(deepest, _sunk(points, centre))
@@ -123,7 +123,7 @@ def _penalty(contacts: Contacts, v: Floats, w: Floats, stiffness: float) -> tupl
 
 
 def _sunk(points: Floats, centre: Floats) -> float:
-    """Return the deepest cage point's depth in the ball; the ball's size once it has left the cage [m]."""
+    """Return the depth of the deepest cage point in the ball [m]; the ball's size once the ball has left the cage."""
     if float(np.linalg.norm(centre)) > 2 * RADIUS_M:
         return 2 * RADIUS_M
     return max(0.0, RADIUS_M - float(np.linalg.norm(points - centre, axis=1).min()))
@@ -182,8 +182,8 @@ def time_step_map(time_steps: Sequence[float], speeds: Sequence[float]) -> Stabi
         f"weak: energy × {ENERGY[0]:g} or {SINK_M[0] * 1e3:g} mm deep; broken: energy × {ENERGY[1]:g} or "
         f"{SINK_M[1] * 1e3:g} mm deep",
         cells,
-        "an object that is thrown out of the hand, or hands that sink into it",
-        "the planner takes one step of 1 mm (time step x speed), where its integrators are good; the validator steps "
+        "an object that is thrown out of the hand, or hands that penetrate it",
+        "the planner uses one step of 1 mm (time step x speed), where its integrators are good; the validator uses "
         "MuJoCo's implicit solver",
         "tests/studies/test_stability.py::test_planners_own_step_lies_where_its_integrators_are_good",
         reach=f"the offered solvers at a step of {1e3 * step:g} mm; the step is no option of a job",
@@ -211,7 +211,7 @@ def stiffness_map(stiffnesses: Sequence[float], masses: Sequence[float], time_st
         # Semi-implicit Euler on m x'' = -k x is stable for dt < 2 sqrt(m / k).
         lines[panel] = [(k, 2 * math.sqrt(mass / k)) for k in stiffnesses]
     cells += [
-        _ball_cell("direct (has no such knob)", k, dt, position_based(SOLVERS["direct (default)"], dt=dt, speed=0.3))
+        _ball_cell("direct (no such setting)", k, dt, position_based(SOLVERS["direct (default)"], dt=dt, speed=0.3))
         for k in stiffnesses
         for dt in time_steps
     ]
@@ -223,7 +223,7 @@ def stiffness_map(stiffnesses: Sequence[float], masses: Sequence[float], time_st
         _BALL_MEASURE,
         "as in time_step; the line is dt = 2 sqrt(m / k), above which one contact alone is unstable",
         cells,
-        "soft contacts let the hand sink in, stiff ones throw the object; the band between them narrows with dt",
+        "soft contacts allow penetration, stiff ones throw the object; the range between them narrows with dt",
         "only `graspd2022` uses penalty forces, and only for a static balance without time steps",
         "tests/studies/test_stability.py::test_a_penalty_force_blows_up_above_the_bound_of_theory",
         lines,
@@ -244,13 +244,13 @@ def contact_count_map(counts: Sequence[int]) -> StabilityMap:
         "A step of 1 mm into a wall of contact points",
         "contact points",
         "initial depth [m]",
-        "motion left into or out of the wall, over the step",
-        "weak: 0.25 of the step; broken: 1, more than came in",
+        "remaining motion into or out of the wall, over the step",
+        "weak: 0.25 of the step; broken: 1, more than the initial motion",
         cells,
         "more points on the same finger push harder; losses and gradients grow with the sampling",
-        "summed Jacobi is not offered; the direct solver weighs points by the area they stand for",
+        "summed Jacobi is not offered; the direct solver weights points by the area that they represent",
         "tests/studies/test_stability.py::test_summed_jacobi_overshoots_with_the_number_of_contacts",
-        reach="the offered solvers, with any number of contacts: it is the number of hand points that touch",
+        reach="the offered solvers, with any number of contacts, which is the number of touching hand points",
     )
 
 

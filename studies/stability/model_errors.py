@@ -1,7 +1,7 @@
 """Model errors: grasps held in the validator's model, validated in models with a single error.
 
-Amounts range from those of `--robust` (`worker.validation.variant`) to where few grasps are held. Displacements and
-rotations have an own direction for each grasp.
+Amounts of error range from those of `--robust` (`worker.validation.variant`) to amounts at which few grasps are held.
+Each grasp has its own direction of displacements and rotations.
 """
 
 from __future__ import annotations
@@ -108,21 +108,21 @@ def model_error_map(
     errors: Sequence[str] = tuple(ERRORS),
     every: int = 1,
 ) -> StabilityMap:
-    """Map the share of valid grasps that are held despite one error; `every` thins out the amounts."""
+    """Map the share of valid grasps that are held despite one error; `every` selects each n-th amount."""
     cells = [cell for hand in hands for cell in _cells(hand, obj, options, errors, every)]
     return StabilityMap(
         "model_errors",
-        f"{options.count} valid grasps of {obj.name}, validated in models that are wrong",
-        "by how much",
+        f"{options.count} valid grasps of {obj.name}, validated in models with errors",
+        "amount of the error",
         "hand",
-        "share of the grasps that hold there, too",
+        "share of the grasps that also hold in this model",
         f"weak: under {WEAK:g}; broken: under {BROKEN:g}",
         cells,
-        "a grasp that is valid here fails on a robot that is another one",
-        "`--robust` keeps what holds in the wanted share of models that are off by so much; `robust_share` and "
-        "`robust_weakest` are stored. What is farther off is another hand: `graspd evaluate --validation-hand`",
+        "a valid grasp fails on a robot that differs from the model",
+        "`--robust` selects grasps that hold in the wanted share of models with such errors; `robust_share` and "
+        "`robust_weakest` are stored. For larger errors, test another hand model: `graspd evaluate --validation-hand`",
         "tests/studies/test_stability.py::test_amounts_within_reach_are_those_that_robust_draws",
-        reach="amounts that `--robust` draws: a job that asks for it is validated there",
+        reach="amounts that `--robust` draws",
     )
 
 

@@ -11,7 +11,7 @@ from typing import Any, Final
 
 from graspd.service.model.studies import OUTCOMES, MapCell, Stability, StabilityMap, between, counts, tick
 
-#: Distinguishable by lightness alone, from calm to alarming: (fill, text).
+#: Colours (fill, text) by outcome, distinguishable by lightness alone.
 COLOURS: Final = {
     "good": ("#bfe0dc", "#14403a"),
     "weak": ("#eeb544", "#3b2a00"),
@@ -22,7 +22,7 @@ COLOURS: Final = {
 _COLUMNS: Final = 3
 #: Sizes of the numbers on cells [pt], largest first; if the last does not fit, the cell is blank.
 _FONT_SIZES: Final = (7.0, 6.0, 5.0)
-#: Longer names of ticks are broken into lines.
+#: Tick labels are wrapped at this number of characters.
 _TICK_LETTERS: Final = 14
 
 
@@ -41,25 +41,25 @@ def write(found: Stability, folder: Path) -> list[Path]:
 def markdown(found: Stability) -> str:
     """Return the page: tests, failures, symptoms, guards, and remaining failures."""
     said = ", ".join(f"{name} {value}" for name, value in found.versions.items())
-    lines = ["# Where it breaks", "", f"`{found.command}`; {said}.", "", *_still_breaks(found.maps)]
+    lines = ["# Failure maps", "", f"`{found.command}`; {said}.", "", *_still_breaks(found.maps)]
     for one in found.maps:
         lines += [f"## {one.title}", "", f"![{one.title}](stability-{one.name}.png)", ""]
-        lines += [f"On the cells: {one.measure}. {one.bounds[0].upper()}{one.bounds[1:]}.", ""]
+        lines += [f"Numbers in the cells: {one.measure}. {one.bounds[0].upper()}{one.bounds[1:]}.", ""]
         lines += ["| panel | good | weak | broken | refused |", "| --- | --: | --: | --: | --: |"]
         lines += [f"| {panel} | {_row(one.of(panel))} |" for panel in one.panels]
-        lines += ["", f"- shows as: {one.shows}", f"- guard: {one.guard}"]
+        lines += ["", f"- symptom: {one.shows}", f"- guard: {one.guard}"]
         if one.guard_test:
             lines.append(f"- test of the guard: `{one.guard_test}`")
-        lines += [f"- within reach of a job: {one.reach}", ""]
+        lines += [f"- cells that a job can reach: {one.reach}", ""]
     return "\n".join(lines)
 
 
 def _still_breaks(maps: Sequence[StabilityMap]) -> list[str]:
     """Return broken cells that a job can reach: failures that no guard prevents."""
     lines = ["## What still breaks", ""]
-    lines += ["Only the cells that a job can come to, whatever it asks for. The other cells of the maps need settings"]
-    lines += ["that no job has: there the guard is that they cannot be asked for.", ""]
-    lines += ["| map | good | weak | broken | refused | what still breaks | how a user sees it |"]
+    lines += ["Only cells that some job can reach. The other cells of the maps need settings"]
+    lines += ["that jobs do not have, so no further guard is needed.", ""]
+    lines += ["| map | good | weak | broken | refused | remaining failures | symptom |"]
     lines += ["| --- | --: | --: | --: | --: | --- | --- |"]
     for one in maps:
         broken = one.still_breaks()
@@ -73,7 +73,7 @@ def _row(cells: Sequence[MapCell]) -> str:
 
 
 def draw(one: StabilityMap, path: Path) -> None:
-    """Plot a panel for each method or family, a square for each cell."""
+    """Plot one panel per method or family, with one square per cell."""
     from matplotlib.figure import Figure
     from matplotlib.patches import Patch
 
@@ -91,7 +91,7 @@ def draw(one: StabilityMap, path: Path) -> None:
     present = [outcome for outcome, number in counts(one.cells).items() if number]
     handles = [Patch(color=COLOURS[outcome][0], label=outcome) for outcome in OUTCOMES if outcome in present]
     if one.is_divided:
-        handles.append(Patch(facecolor="none", edgecolor="#14191d", linewidth=1.4, label="within reach of a job"))
+        handles.append(Patch(facecolor="none", edgecolor="#14191d", linewidth=1.4, label="a job can reach this"))
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False)
     figure.suptitle(one.title, x=0.01, ha="left", fontsize=13, fontweight="bold")
     figure.draw_without_rendering()

@@ -48,10 +48,10 @@ NEIGHBOURS: Final[dict[str, tuple[tuple[int, int], ...]]] = {
 RATIOS: Final = (0.05, 0.1, 0.2, 0.3, 0.4, 0.6, 0.8)
 KINDS: Final = ("free", "table", "bin", "shelf")
 
-_MEASURE: Final = "share of candidates that are lifted out of the scene; – where no hand came in clear"
+_MEASURE: Final = "share of candidates that are lifted out of the scene; –: no candidate was clear"
 _FEWER: Final = (
-    "what is not clear on its way or not lifted is never valid; a run whose budget ends first says how many were "
-    "found; a scene that leaves no way to the object is refused in a line"
+    "a grasp without a clear trajectory or without a lift is never valid; a run whose budget ends reports how many "
+    "it found; a scene without a free approach is refused with a message"
 )
 #: A box's sides [mm], and the scene in which it stands.
 Placement = tuple[tuple[float, ...], SceneSpec]
@@ -70,7 +70,7 @@ def height_map(
         ("height [mm]", "side of the footprint [mm]"),
         cells,
         "test_a_plate_flat_on_a_table_ends_with_fewer_and_says_so",
-        "users bring such things",
+        "users have such objects",
     )
 
 
@@ -87,7 +87,7 @@ def wall_map(
         ("distance from the walls [mm]", "walls"),
         cells,
         "test_object_in_a_narrow_well_is_refused_or_comes_out_valid",
-        "bins, shelves and files bring such walls",
+        "bins, shelves and scene files have such walls",
     )
 
 
@@ -100,11 +100,11 @@ def neighbour_map(
     ]
     return _map(
         "scene_neighbours",
-        f"{options.count} grasps of a box of {_TARGET} among its like, {options.fidelity}",
+        f"{options.count} grasps of a box of {_TARGET} among equal boxes, {options.fidelity}",
         ("gap between them [mm]", "fixed boxes around it"),
         cells,
         "test_a_box_among_boxes_is_lifted_out_or_not_valid",
-        "clutter is like that",
+        "clutter has such neighbours",
     )
 
 
@@ -118,13 +118,13 @@ def size_map(
     spans = ", ".join(f"{hand.name} {1e3 * span_of(hand):.0f} mm" for hand in hands)
     return _map(
         "scene_size",
-        f"{options.count} grasps of cubes as large as a part of the hand's span, {options.fidelity}",
+        f"{options.count} grasps of cubes of different sizes relative to the hand's span, {options.fidelity}",
         ("side of the cube over the hand's span", "scene"),
         cells,
         "test_a_cube_that_does_not_fit_its_bin_is_refused",
-        "users bring such things",
-        measure=f"{_MEASURE}; free: that hold six pushes; span, between fingertips before the grasp: {spans}",
-        guard=_FEWER + "; an object larger than the bin or the shelf is refused in a line",
+        "users have such objects",
+        measure=f"{_MEASURE}; scene free: held in the six pushes; span: largest distance between fingertips: {spans}",
+        guard=_FEWER + "; an object larger than the bin or the shelf is refused with a message",
     )
 
 
@@ -144,9 +144,9 @@ def _map(
         title,
         *axes,
         measure,
-        "weak: under a half; broken: none",
+        "weak: below 0.5; broken: 0",
         reachable(cells, lambda cell: True),
-        "few or no valid grasps: `clear_share` and `lift_share` of `graspd synth --json` say which of both is missing",
+        "few or no valid grasps: `clear_share` and `lift_share` of `graspd synth --json` show which of the two is low",
         guard,
         f"tests/studies/test_stability.py::{guard_test}",
         reach=f"all: {reach}",
@@ -154,7 +154,7 @@ def _map(
 
 
 def span_of(hand: HandModel) -> float:
-    """Return the largest distance between the centres of two fingertips in the preshape [m]."""
+    """Return the largest distance between the centres of two fingertips in the pre-shape [m]."""
     root = np.array([[0.0, 0, 0, 1, 0, 0, 0]])
     poses = body_poses(hand, root, hand.expand(hand.preshape[None]))[0]
     tips = [piece for piece in hand.pieces if piece.body in hand.fingertips]
@@ -170,7 +170,7 @@ def _standing(sides_mm: tuple[float, ...], around: Iterable[Box] = ()) -> Placem
 
 
 def _walls(directions: Sequence[tuple[int, int]], gap_mm: float) -> list[Box]:
-    """Return walls that are three times as long as high, so that they end far away."""
+    """Return walls three times as long as high, so that their ends are far away."""
     high, thick = (value * MILLIMETRES for value in WALL_MM)
     found = []
     for x, y in directions:
@@ -201,7 +201,7 @@ def _cell(hand: HandModel, x: float | str, y: float | str, placement: Placement,
 
 
 def planned(hand: HandModel, sides_mm: Sequence[float], spec: SceneSpec, options: MapOptions) -> ValidatedBatch:
-    """Return candidates of a box of these sides [mm] in a scene, prepared like a user's.
+    """Return candidates of a box of these sides [mm] in a scene; the box is prepared like an upload.
 
     Raises:
         GraspdError: the box or the scene is refused.

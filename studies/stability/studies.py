@@ -15,9 +15,9 @@ from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.prepare import object_from_path
 
-#: Further hands, for effects of a hand's size and build.
+#: Further hands, for effects of size and structure.
 OTHER_HANDS: Final = ("barrett",)
-#: Hands for effects of drives.
+#: Hands for effects of different drives.
 ALL_HANDS: Final = ("allegro", "barrett", "shadow")
 
 
@@ -102,9 +102,9 @@ def run(
     return found
 
 
-#: Methods for a free object; the first is graspd's own.
+#: Methods that plan around a free object; the first is graspd's own, the others are baselines.
 METHODS: Final = ("fast_graspd", "autograsp", "dfc", "graspit", "graspd2022")
-#: Parameters of each family: an easy one and hard ones.
+#: Parameters of each family of shapes: an easy one and hard ones.
 SHAPES: Final[dict[str, tuple[float, ...]]] = {
     "plate": (1, 10),
     "wedge": (10, 80),
@@ -126,14 +126,15 @@ def baseline_map(
             cells.append(cell)
     return StabilityMap(
         "baselines",
-        f"{options.count} grasps of {hand.name} by each method on shapes that are hard",
+        f"{options.count} grasps of {hand.name} by each method on hard shapes",
         "the shape's parameter",
         "method",
         MEASURE,
         BOUNDS,
         reachable(cells, lambda cell: True),
         SHOWS,
-        "what a method leaves in the object or the validator drops is never valid; a job that finds too few says so",
+        "grasps with deep penetration, or dropped by the validator, are never valid; a job with too few valid "
+        "grasps reports it",
         "tests/studies/test_stability.py::test_a_job_whose_every_grasp_is_bad_ends_with_none",
-        reach="all: any job may name another method",
+        reach="all: a job may use any method",
     )

@@ -1,4 +1,4 @@
-"""Squeeze posture of a gripper: its jaws close to contact, then press with force over gain."""
+"""Squeeze posture of a gripper: its jaws close to contact, then press by force over position gain."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from graspd.worker.hands.jaws import Jaws
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.quality.probe import Probe
 
-#: Largest gap of a pad from the object that is closed [m].
+#: A pad farther from the object than this does not close [m].
 GAP_M: Final = 0.005
-#: A drive that presses with its limit is commanded this many times the required travel.
+#: A drive whose limit sets the force is commanded this many times the required travel.
 STALL: Final = 2.0
 #: Least speed of a pad for a dof to count as moving it [m/rad or 1].
 LEAST_WAY: Final = 1e-4
@@ -22,7 +22,7 @@ LEAST_WAY: Final = 1e-4
 
 def jaw_squeeze(probe: Probe, jaws: Jaws, grasp: Posture, *, total_normal_force: float) -> Posture:
     """Compute N commanded postures of a gripper, within its stroke; the root is unchanged.
-    Each pad presses with half of `total_normal_force` [N], or with what the limits of the dofs allow: a dof that moves
+    Each pad presses with half of `total_normal_force` [N], or less if effort limits require it: a dof that moves
     both pads divides its limit between them. Commands are clipped to the stroke, because a gripper commanded beyond it
     reports an error instead of pressing."""
     hand = probe.hand
@@ -30,11 +30,11 @@ def jaw_squeeze(probe: Probe, jaws: Jaws, grasp: Posture, *, total_normal_force:
     gaps = np.maximum(_gaps(probe, jaws, grasp), 0.0)
     speed = np.abs(jaws.speeds(q))
     ways = np.maximum(speed.sum(axis=2), 1e-9)
-    # Both pads press equally, or they would push the object away: the weaker one sets the force.
+    # Both pads press equally, or they would push the object away. The weaker pad sets the force.
     able = np.where(ways > LEAST_WAY, hand.effort / ways, np.inf).min(axis=1)
     force = np.where((gaps < GAP_M).all(axis=1), np.minimum(0.5 * total_normal_force, able), 0.0)
-    # A single drive at its limit holds both pads by their coupling. Commanded farther, it still presses with its limit,
-    # and yielding contacts cost no force. Two drives at their limits would yield to any push.
+    # A single drive at its limit holds both pads by their coupling. A command beyond the required travel does not add
+    # force, but prevents a loss of force in compliant contacts. Two drives at their limits would yield to any push.
     stalls = (np.count_nonzero(hand.closing) == 1) & (able < 0.5 * total_normal_force)
     press = np.where(stalls, STALL, 1.0) * force
     travel = np.where(speed > LEAST_WAY, np.minimum(gaps, GAP_M)[:, None], 0.0).sum(axis=2) / ways

@@ -20,28 +20,28 @@ from graspd.worker.simulation.kernels import distance, jamming, opening, optimiz
 from graspd.worker.simulation.launches import Launches, launch
 
 #: Fingers open up to this distance from the object [m]. It covers the errors of a calibrated arm; fingers that open
-#: farther return faster and kick the object away more often.
+#: farther arrive faster on closing and kick the object away more often.
 CLEARANCE_M: Final = 0.003
-#: A finger that cannot move this far along its contact normals opens plainly [m].
+#: A finger that cannot move this far along its contact normals opens against `HandModel.closing` alone [m].
 STUCK_M: Final = 0.003
-#: The root retreats only if the open hand is closer than this [m]: a palm in contact kicks the object, but so does a
-#: palm that returns from afar while the fingers close.
+#: The root retreats only if the open hand is closer than this to the object [m]. A palm in contact kicks the object,
+#: but so does a palm that moves back from afar while the fingers close.
 PALM_CLEARANCE_M: Final = 0.0005
-#: Share of plain opening, against `HandModel.closing`, in a finger's opening direction; the rest follows the contact
-#: normals, so that the finger returns without dragging the object along.
+#: Share of the direction against `HandModel.closing` in a finger's opening direction. The rest follows the contact
+#: normals, so that the finger does not drag the object along when it closes.
 PLAIN_OPENING: Final = 0.3
-#: Opening steps of each finger [rad], of sliding ones [m], and their number.
+#: Opening steps of revolute [rad] and prismatic joints [m], and the number of steps.
 OPENING_STEP: Final = 0.05
 SLIDING_STEP_M: Final = 0.002
 OPENING_STEPS: Final = 24
-#: A finger may penetrate the rest of the hand by this much more than in the grasp [m]. It is checked at these shares of
-#: its path. A finger that jams opens half as far; at the last of so many checks it does not open.
+#: A finger may penetrate the rest of the hand by this much more than in the grasp [m]. This is checked at these shares
+#: of its path. A finger that jams opens half as far and is checked again; if the last check fails, it does not open.
 JAM_M: Final = 5e-4
 WAY: Final = (1 / 3, 2 / 3, 1.0)
 JAM_LOOKS: Final = 4
 RETREATS_M: Final = (0.0, 0.0025, 0.005, 0.0075, 0.010, 0.015, 0.020)
 
-#: Returns for hands `rows` which fingers are blocked on paths of dofs (n, K, D).
+#: Returns which fingers are blocked on paths (n, K, D) of the dofs, for the hands `rows`.
 Blocked = Callable[[NDArray[np.intp], Floats], NDArray[np.bool_]]
 
 
@@ -67,7 +67,7 @@ def count_fingers(hand: HandModel) -> int:
 
 
 class Openings:
-    """N hands opened together from their grasps: dofs `q` (N, D) and open dofs `wide`; None: to be found."""
+    """N hands opened together from their grasps: dofs `q` (N, D) and open dofs `wide` (None: to be computed)."""
 
     def __init__(self, posing: PostureData, hand_pose: Floats, q: Floats, wide: Floats | None = None) -> None:
         self.posing, self.hand_pose, self.q = posing, hand_pose, q
@@ -82,7 +82,7 @@ class Openings:
         self.bodies = posing.bodies(self.count)
 
     def open_from(self, grasp: Posture) -> None:
-        """Open each finger by itself as far from the object as possible; `grasp` is the start."""
+        """Open each finger on its own as far from the object as possible; `grasp` is the start."""
         first, plain = self._sweep(), self._sweep()
         self._leave(grasp, first)
         self._step(first)
@@ -93,7 +93,7 @@ class Openings:
 
     def without_jams(self, blocked: Blocked | None = None) -> Floats:
         """Return the open dofs (N, D), reduced towards the grasp where fingers jam or `blocked` applies.
-        Fingers that jam never reach the grasp when they close again."""
+        A finger that jams while opening would not reach the grasp when it closes again."""
         jams = self._jams()
         depth = self._depths(jams)
         depth[0].run()

@@ -1,8 +1,8 @@
-"""Postures around a grasp: the pregrasp, open and clear, and the squeeze, which presses.
+"""Postures around a grasp: the open pregrasp without contact, and the squeeze, which presses.
 
 They affect a grasp's success more than the optimiser does (Dexonomy, table VI).
 
-A finger that rests on the table sweeps through it when it opens: such hands start from a slightly higher pregrasp.
+A finger that rests on the table would sweep through it when it opens: such hands have a slightly higher pregrasp.
 """
 
 from __future__ import annotations
@@ -27,25 +27,26 @@ from graspd.worker.simulation.obstacles import body_room, obstacle_room
 
 #: Clearance of opening fingers from obstacles [m].
 ROOM_M: Final = 0.0025
-#: Share of its range by which a joint opens beyond the pregrasp for the approach: fingers that reach around the object
-#: would sweep it away.
+#: Further opening of a joint on the approach, as a share of its range beyond the pregrasp: otherwise fingers that reach
+#: around the object would sweep it away.
 WIDE: Final = 0.4
 
-#: Hand points for checks of postures; those within this distance of the object press on it [m], at most so many.
+#: Hand points that check a posture; those within this distance of the object press on it [m], at most this many.
 _POINTS: Final = 600
 PRESSING_M: Final = 0.003
 MAX_PRESSING: Final = 16
-#: Points of a finger that stands off press within this distance [m]: its command closes it, else the other fingers push
-#: a free object past it.
+#: Points of a finger that stands off press within this distance [m]. The command must close this finger, or else the
+#: other fingers push a free object past it.
 CLOSING_M: Final = 0.009
-#: A finger between these distances stands off: it could touch and does not. Farther ones are not part of the grasp [m].
+#: A finger stands off if its distance is in this range [m]: it could touch but does not. Fingers farther away are not
+#: part of the grasp.
 STANDS_OFF_M: Final = (0.005, 0.02)
-#: Sum of the contact forces' normal components [N] and the Coulomb coefficient that balances them. It is less than the
-#: object's, because forces at the edge of their cones slip as soon as a contact is slightly displaced.
+#: Sum of the contact forces' normal components [N] and the Coulomb coefficient for their balance. It is smaller than
+#: the object's, because forces at the edge of their friction cones slip after a small displacement of the contact.
 TOTAL_NORMAL_FORCE: Final = 50.0
 FRICTION: Final = 0.3
-#: Least and largest sum over the object's weight: 50 N push a light flat object out from between fingertips, which bear
-#: against its upper edges. At 0.1 kg the most is 50 N.
+#: Least and largest ratio of that sum to the object's weight. A sum of 50 N pushes a light flat object out from between
+#: fingertips that touch its upper edges. The largest ratio gives 50 N at 0.1 kg.
 OF_WEIGHT: Final = (10.0, 50.0)
 
 
@@ -53,9 +54,9 @@ def pregrasp(
     hand: HandModel, obj: ObjectModel, grasp: Posture, placed: PlacedGrasps | None = None, *, device: str = "cpu"
 ) -> Posture:
     """Compute N postures from which the hand closes.
-    Every finger leaves the object along its contact normals until its points are `CLEARANCE_M` away. It stops earlier
-    at other fingers or, where the grasps are `placed`, at an obstacle of their scene. Then the root retreats along the
-    palm's approach while the hand is in contact, and rises where fingers would dip into a support they may touch."""
+    Every finger moves away from the object along its contact normals until its points are `CLEARANCE_M` away. It stops
+    earlier at other fingers or, where the grasps are `placed`, at an obstacle of their scene. Then the root retreats
+    along the palm's approach until contact ends, and rises where fingers would penetrate a support they may touch."""
     posing = posing_of(hand, obj, points=_POINTS, device=device)
     poses, joints = np.zeros((len(grasp), 7)), np.zeros((len(grasp), len(hand.joint_names)))
     for rows in posing.parts(len(grasp)):
@@ -69,8 +70,8 @@ def pregrasp(
 
 
 def wide_open(hand: HandModel, obj: ObjectModel, pregrasp: Posture, placed: PlacedGrasps) -> Floats:
-    """Return joint positions (N, J) for the approach: fingers opened plainly by `WIDE` of their range.
-    They stop where they would run into one another or into an obstacle."""
+    """Return joint positions (N, J) for the approach: fingers opened against `HandModel.closing` by `WIDE` of their
+    range. They stop before they touch one another or an obstacle."""
     posing = posing_of(hand, obj, points=_POINTS, device="cpu")
     joints = np.zeros((len(pregrasp), len(hand.joint_names)))
     for rows in posing.parts(len(pregrasp)):
@@ -123,7 +124,7 @@ def normal_force(obj: ObjectModel) -> float:
 
 
 def touching_links(hand: HandModel, obj: ObjectModel, grasp: Posture, *, device: str = "cpu") -> NDArray[np.int32]:
-    """Return the number (N,) of the hand's bodies in contact, counted as in the geometric gate."""
+    """Return the number (N,) of the hand's bodies in contact, by the rule of the geometric gate."""
     return posing_of(hand, obj, points=_POINTS, device=device).touching_links(grasp)
 
 
@@ -138,7 +139,7 @@ def _in_the_way(hand: HandModel, opening: Openings, placed: PlacedGrasps | None)
     if placed is None:
         return None
     pose = opening.hand_pose
-    # A finger may be closer to an obstacle in the grasp than allowed: opening must not bring it closer still.
+    # In the grasp a finger may be closer to an obstacle than allowed: opening must not bring it even closer.
     room = np.minimum(_finger_room(hand, pose, opening.q[:, None], placed), ROOM_M)
 
     def blocked(rows: NDArray[np.intp], way: Floats) -> NDArray[np.bool_]:
@@ -161,26 +162,26 @@ def _finger_room(hand: HandModel, hand_pose: Floats, paths: Floats, placed: Plac
     return out
 
 
-#: Clearance of the open, and of the closing hand [m]: above the required one, as trajectories are checked in steps.
+#: Clearance of the open, and of the closing hand [m]; above the required one, since trajectories are checked in steps.
 RAISE_OPEN_M: Final = CLEAR_M + 0.0025
 
 RAISE_CLOSING_M: Final = CLEAR_M + 0.0003
-#: Checked shares of the trajectory to the grasp: those of the sweep, without the grasp itself.
+#: Shares of the trajectory to the grasp that are checked: those of the sweep, without the grasp itself.
 RAISE_LOOKS: Final = tuple(np.arange(8) / 8)
-#: Most that a hand is raised [m]: from higher it would come down on the object.
+#: Largest raise of a hand [m]: from higher up it would press the object down.
 HIGHEST_RAISE_M: Final = 0.008
 
 
 def raised(hand: HandModel, grasp: Posture, pregrasp: Posture, placed: PlacedGrasps) -> Posture:
-    """Return pregrasps (N) raised against gravity by the clearance lacking on the straight trajectory.
-    Pregrasps that lack none, or too much, are unchanged."""
+    """Return pregrasps (N), raised against gravity by the missing clearance on the straight trajectory.
+    Pregrasps with enough clearance, or with more missing than `HIGHEST_RAISE_M`, are unchanged."""
     poses = np.array(pregrasp.hand_pose, float)
     near = np.array([any(one.tips_m is not None for one in scene.obstacles) for scene in placed.scenes], bool)
     rows = np.flatnonzero(near[placed.index])
     if not len(rows):
         return pregrasp
     lack = _lack(hand, grasp.take(rows), pregrasp.take(rows), placed.take(rows))
-    # The initial raise diminishes along the trajectory.
+    # The raise at the pregrasp decreases to zero along the trajectory.
     height = (lack / (1 - np.array(RAISE_LOOKS))).max(axis=1)
     height = np.where(height <= HIGHEST_RAISE_M, height, 0.0)
     up = np.array([scene.up for scene in placed.scenes])[placed.index[rows]]
@@ -189,7 +190,7 @@ def raised(hand: HandModel, grasp: Posture, pregrasp: Posture, placed: PlacedGra
 
 
 def _lack(hand: HandModel, grasp: Posture, pregrasp: Posture, placed: PlacedGrasps) -> Floats:
-    """Return the lack of clearance (n, looks) of hands at the shares `RAISE_LOOKS` of their trajectory."""
+    """Return the missing clearance (n, looks) of hands at the shares `RAISE_LOOKS` of their trajectory."""
     share = np.array(RAISE_LOOKS)[None, :, None]
     pose = (1 - share) * pregrasp.hand_pose[:, None] + share * grasp.hand_pose[:, None]
     pose[..., 3:] = pregrasp.hand_pose[:, None, 3:]  # a pregrasp has the orientation of its grasp

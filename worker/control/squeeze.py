@@ -1,7 +1,7 @@
-"""Contact forces that balance and hold an object, and the torques with which a hand exerts them.
+"""Contact forces that balance and hold an object, and the joint torques that exert them.
 
 The hand is position-controlled: q_squeeze = q + Kp^-1 sum_i J_i^T f_i (Dexonomy). The forces f are non-negative
-combinations of friction pyramid edges without a net wrench, whose normal components sum to a given force.
+combinations of friction pyramid edges without a net wrench, and their normal components sum to a given force.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from graspd.worker.simulation.kernels import balance as kernels
 from graspd.worker.simulation.kernels import touching
 from graspd.worker.simulation.launches import launch
 
-#: Weight of each edge's own size: distributes the load over equally good contacts.
+#: Weight of the squared size of each edge force: distributes the load over equally good contacts.
 SPREAD: Final = 0.1
-#: Weight of joint torques, relative to the hardest one to exert: prefers forces in which the hand is strong.
+#: Weight of joint torques, relative to the hardest one to exert: prefers forces that need little torque.
 TORQUE: Final = 0.05
-#: Weight of the sum of normal forces: it is met closely, then exactly by scaling, balanced or not.
+#: Weight of the sum of normal forces in the fit; the exact sum follows by scaling, balanced or not.
 SUM: Final = 10.0
 
 
@@ -42,8 +42,8 @@ def balanced(
 ) -> tuple[Floats, Floats]:
     """Compute balanced contact forces of grasps within the hand's torque limits: residuals and torques of `HoldForces`.
     Their normal components sum to `total` [N]. Where torques exceed a limit, all forces are scaled together, which
-    keeps the balance. At most `most` hand points press, the most spread out: those within the first `reach` of the
-    object, of a finger without contact those within the second [m]."""
+    keeps the balance. At most `most` hand points press, the most spread out. A point presses if it is within the first
+    `reach` of the object, or within the second for a finger without contact [m]."""
     bodies, near = posing.touch(grasp, max(reach))
     count, points, radius = len(grasp), len(posing.probe.points), posing.probe.obj.radius
     rows = int(touching.FIRST_TORQUE) + posing.hand.dofs
@@ -72,7 +72,7 @@ def balanced(
 
 def solved(matrix: Any, target: Floats, ridge: float, count: Any) -> Any:
     """Return the x >= 0 (B, K) that minimise |M x - t|^2 + ridge^2 |x|^2 for B systems, on their device.
-    `matrix` (B, K, R) has the columns of M, `count` (B,) says how many of them are used; x is 0 for the others."""
+    `matrix` (B, K, R) has the columns of M; the first `count` (B,) of them are used; x is 0 for the others."""
     (batch, columns, rows), device = matrix.shape, matrix.device
     with wp.ScopedDevice(device):
         work = kernels.Workspace()

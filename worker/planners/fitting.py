@@ -1,6 +1,6 @@
 """Check before planning whether an object fits between the jaws of a gripper.
 
-Two opposite fingers can hold an object at pairs of surface points that face away from each other.
+Two opposite fingers can hold an object at two surface points whose normals point in opposite directions.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def fitting_pairs(hand: HandModel, obj: ObjectModel) -> Pairs | None:
     )
 
 
-#: Number of points from which lines enter the object, and the standard deviation of their tilt from the normal [rad].
+#: Number of surface points from which rays are cast, and the standard deviation of their tilt from the normal [rad].
 _POINTS: Final = 768
 _TILT: Final = 0.08
 #: Cosine of the angle between a line and the surface normal at its exit: 20 degrees.
@@ -55,7 +55,8 @@ _CHUNK: Final = 64
 
 @dataclass(frozen=True)
 class Pairs:
-    """P pairs of points (P, 3), object frame [m]. The space between them may be hollow: two fingers go around it."""
+    """P pairs of points (P, 3), object frame [m]. The space between them may be hollow: fingers grasp it from
+    outside."""
 
     start: Floats
     end: Floats
@@ -68,7 +69,7 @@ class Pairs:
 
 @cached_by_content(16)
 def antipodal_pairs(obj: ObjectModel) -> Pairs:
-    """Cast lines inwards from points spread evenly over the area; each exit from the solid gives a pair."""
+    """Cast rays inwards from evenly spread surface points; each point where a ray leaves the solid gives a pair."""
     rng = np.random.default_rng(0xA47)
     corners, normal, _ = surface_of(obj)
     start, face = even_points(obj, _POINTS, rng)
@@ -107,8 +108,8 @@ def even_points(obj: ObjectModel, count: int, rng: np.random.Generator) -> tuple
 
 
 def _exits(start: Floats, way: Floats, corners: Floats, normal: Floats) -> tuple[NDArray[np.intp], Floats]:
-    """Intersect rays (n, 3), (n, 3) with triangles (F, 3, 3); return ray index and distance [m] of exits.
-    An exit is at a face whose normal points along the ray (Moeller and Trumbore 1997)."""
+    """Intersect rays (n, 3), (n, 3) with triangles (F, 3, 3); return ray index and distance [m] of the exit points.
+    A ray exits through a face whose normal points along the ray (Moeller and Trumbore 1997)."""
     edge1, edge2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     p = np.cross(way[:, None], edge2[None])
     determinant = np.einsum("nfj,fj->nf", p, edge1)

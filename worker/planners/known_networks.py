@@ -1,5 +1,5 @@
-"""Networks of this process by digest, so that a method's option names a network without a file.
-A file has its own digest; a network of the service has the digest of its asset."""
+"""Cache of proposal networks in this process, by digest: a method's option names a network without a file.
+The digest is that of a local file, or of the service's asset."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Interface of a grasp planner, implemented by `fast_graspd`, its peers and planners of third parties."""
+"""Interface of a grasp planner, implemented by `fast_graspd`, the baselines and planners of third parties."""
 
 from __future__ import annotations
 
@@ -19,9 +19,10 @@ from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.simulation.environment import PlacedGrasps
 
-#: Scores (N,) of N grasps, in their scenes or around a free object (None). Smaller is better: below 1 no further
-#: candidate is needed, from 2 on further ones pay. The third argument has the score to beat for each, inf if there is
-#: none: a rollout may end once it is not better by a class (0, 1). Called by several threads at once.
+#: Scores (N,) of N grasps, in their scenes or around a free object (None). Smaller is better. Below 1 no further
+#: candidate is needed; from 2 on, more candidates are worth their cost. The third argument is the score to beat for
+#: each grasp, inf if there is none: a rollout may stop early if it cannot reach a better class (below 1, below 2).
+#: Several threads may call it at once.
 Rollout = Callable[[GraspSet, PlacedGrasps | None, NDArray[np.float64]], NDArray[np.float64]]
 
 
@@ -41,20 +42,21 @@ class PlanRequest:
     placed: PlacedGrasps | None = None
     """Scenes: grasp i is in scene `placed.index[i]`; None: around a free object."""
     rollout: Rollout | None = None
-    """Rollout that chooses among the candidates of a grasp; None: the planner's own merit chooses."""
+    """Rollout that scores the candidates of a grasp; None: the planner's own merit selects one."""
     first: int = 0
-    """Number of the first grasp within its batch; above 0 only for methods that plan batches `in_parts`."""
+    """Number of the first grasp within its batch; above 0 only for methods with `in_parts`."""
     others_have_place: bool = False
-    """Whether grasps of the batch that are planned elsewhere have starts in their scenes.
-    These grasps are then planned even if none has a start, and end blocked."""
+    """Whether other parts of the batch, planned elsewhere, have starts in their scenes.
+    If so, the grasps of this part are returned as blocked even if none of them has a start."""
 
 
 class Planner(Protocol):
     """Plans `wanted.count` grasps of a hand on an object.
 
-    A grasp depends on seed, batch and index within the batch only, not on the other grasps; on the CPU bit for bit.
+    A grasp depends only on seed, batch and its index within the batch, not on the other grasps. On the CPU, results
+    are bit-identical.
     `run.progress(done, total, message)` may be called often; `run.cancelled()` is polled between launches.
-    `wanted.placed` is None except for methods that plan `in_scenes`.
+    `wanted.placed` is None except for methods with `in_scenes`.
 
     Raises:
         TaskCancelled: `run.cancelled()` returned True.
@@ -72,11 +74,12 @@ class BatchRequest:
 
 
 class BatchPlanner(Protocol):
-    """Plans several batches of a hand on an object in one launch, of one fidelity and on one device.
-    All are around a free object, or all in scenes with the same supports and neighbours (`PlacedGrasps.fixed`).
+    """Plans several batches of a hand on an object in one launch, with one fidelity and on one device.
+    All batches are around a free object, or all are in scenes with the same supports and neighbours
+    (`PlacedGrasps.fixed`).
 
-    Each batch equals the result of the `Planner` alone; on the CPU bit for bit. A batch that fails is replaced by its
-    error, TaskCancelled if its own `run.cancelled()` returned True; the others continue."""
+    Each batch equals the result of the `Planner` for this batch alone; on the CPU bit for bit. The result of a failed
+    batch is its error: TaskCancelled if its own `run.cancelled()` returned True. The other batches continue."""
 
     def __call__(
         self, hand: HandModel, obj: ObjectModel, asked: Sequence[BatchRequest]
@@ -104,16 +107,16 @@ class Method:
     free: bool = True
     """Whether it plans around free objects."""
     in_parts: bool = False
-    """Whether it plans the grasps of a batch from `PlanRequest.first` on without those before it."""
+    """Whether it can start a batch at the grasp `PlanRequest.first`, without planning the grasps before it."""
     options: type[Options] = Options
     """Class of its options."""
     uses: tuple[str, ...] = ()
     """Settings of `Fidelity` that affect its grasps; the others are ignored."""
     joined: Callable[[Any], BatchPlanner] | None = None
-    """Factory of the planner of several batches in one launch; None: it plans them one by one."""
+    """Factory of the planner of several batches in one launch; None: batches are planned one by one."""
     files: Mapping[str, Callable[[Path], str]] = field(default_factory=dict)
     """Options that users give as files, each with a function that caches the file in this process.
-    The function returns the file's digest, the option's value."""
+    The function returns the file's digest, which becomes the option's value."""
     quick: Mapping[str, Any] = field(default_factory=dict)
     """Options for a short call, for warm-up and quick checks; its grasps need not be good."""
 

@@ -62,7 +62,7 @@ def planner(name: str, options: Mapping[str, Any] | None = None, *, in_scenes: b
     """Return the planner of a method with its options; strings are parsed as the option's type.
 
     Raises:
-        InputError: unknown method, unknown option or value out of range; or it cannot plan in scenes as requested.
+        InputError: unknown method, unknown option or value out of range; or `in_scenes`, which the method cannot do.
     """
     known = method(name)
     if in_scenes and not known.in_scenes:
@@ -74,7 +74,7 @@ def planner(name: str, options: Mapping[str, Any] | None = None, *, in_scenes: b
 
 
 def joined(name: str, options: Mapping[str, Any] | None = None) -> BatchPlanner | None:
-    """Return a method's planner of several batches in one launch; None: it plans them one by one."""
+    """Return a method's planner of several batches in one launch; None: batches are planned one by one."""
     make = method(name).joined
     return make(_options(name, options)) if make is not None else None
 

@@ -1,7 +1,7 @@
-"""Parts of a batch, one per CPU thread: Warp releases the interpreter lock while a kernel runs.
+"""Parts of a batch, one per CPU thread: Warp releases the GIL while a kernel runs.
 
-Warp's CPU backend runs a launch on the calling thread, so threads use all cores. On a GPU a batch is one part, halved
-while memory does not suffice. A grasp's result does not depend on its part.
+Warp's CPU backend runs a launch on the calling thread, so several threads use all cores. On a GPU a batch is one part;
+it is halved until memory suffices. A grasp's result does not depend on its part.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ class StepCounter:
         self._run.check("the synthesis")
         with self._lock:
             self._done += work
-            # Work that is repeated in halves counts twice.
+            # Grasps that are repeated in smaller parts count twice.
             self._run.progress(min(self._done, self._total), self._total, message)
 
 
 def cut(count: int, run: ExecutionContext, *, least: int = 1) -> list[range]:
     """Cut a batch into contiguous, nearly equal parts: one on a GPU, at most one per thread on a CPU.
-    A thread pays for at least `least` grasps."""
+    Each part has at least `least` grasps."""
     if wp.get_device(run.device).is_cuda:
         return [range(count)]
     parts = max(1, min(run.cores, count // least))
@@ -51,9 +51,9 @@ def cut(count: int, run: ExecutionContext, *, least: int = 1) -> list[range]:
 
 
 def run_parts(parts: list[range], work: Callable[[range], T]) -> list[T]:
-    """Run `work` on every part, each in its own thread, in order.
-    A part that exceeds a GPU's memory is split in two, one after the other, down to single grasps: there may be more
-    results than parts."""
+    """Run `work` on every part, each in its own thread; return the results in order.
+    A part that exceeds a GPU's memory is split in two, repeatedly if needed, down to single grasps. The halves run one
+    after the other, so there may be more results than parts."""
     if len(parts) == 1:
         return _fitted(parts[0], work)
     with ThreadPoolExecutor(len(parts), thread_name_prefix="synthesize") as pool:
@@ -69,7 +69,7 @@ def _fitted(part: range, work: Callable[[range], T]) -> list[T]:
         log.warning(
             "too little memory on the GPU for %d grasps in one launch; they are made in halves: %s", len(part), error
         )
-    # The error is freed by now, with the frames that held earlier allocations.
+    # The error is freed by now, and with it the stack frames that held earlier allocations.
     gc.collect()
     middle = part.start + len(part) // 2
     return [*_fitted(range(part.start, middle), work), *_fitted(range(middle, part.stop), work)]

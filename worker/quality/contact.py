@@ -14,7 +14,7 @@ from graspd.worker.hands.model import HandModel
 LINK_CONTACT_M: Final = 0.002
 #: Cap of contact distances in the contact distance consistency [m] (DexGraspBench's contact margin).
 CONSISTENCY_CAP_M: Final = 0.010
-#: Most contacts of a wrench space: the cost of its hull grows with their number, its radius hardly does.
+#: Most contacts of a wrench space: the cost of its hull grows with their number, its radius hardly grows.
 MAX_CONTACTS: Final = 20
 
 
@@ -22,7 +22,7 @@ def contact_area_cm2(distance: Floats, area: Floats, thresholds_m: Floats) -> Fl
     """Compute the hand area (B, T) within each threshold (T,) of the object's surface, on either side [cm^2].
     The distances (B, N) are signed [m]; each point represents an `area` (N,) [m^2]."""
     near = np.abs(distance)
-    # Row by row: the rounding of a matrix product depends on its number of rows.
+    # One row at a time: the rounding of a matrix product depends on its number of rows.
     return np.stack([np.where(near < t, area, 0.0).sum(axis=-1) for t in thresholds_m], axis=-1) * 1e4
 
 
@@ -30,12 +30,12 @@ def spread_contacts(
     near: NDArray[np.bool_], place: Floats, normal: Floats, *, scale: float, limit: int
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Choose at most `limit` of the points `near` (B, T, N) of each grasp and threshold, spread as widely as possible.
-    They differ by place (B, N, 3) over `scale`, the torque scale [m], and by normal (B, N, 3).
+    Spread is measured by position (B, N, 3) over `scale`, the torque scale [m], and by normal (B, N, 3).
     Return indices (B, T, limit) and their number (B, T); further indices are undefined."""
     grasps, sets, _ = near.shape
     count = near.sum(axis=2)
     width = max(int(count.max(initial=0)), limit)
-    # The points of each set moved to the front, in their order.
+    # Move the points of each set to the front, in their order.
     order = np.argsort(~near, axis=2, kind="stable")[..., :width].reshape(grasps * sets, -1)
     inside = np.arange(order.shape[1]) < count.reshape(-1, 1)
     rows = np.repeat(np.arange(grasps), sets)[:, None]
@@ -50,7 +50,7 @@ def spread_contacts(
 
 
 def _farthest(points: Floats, inside: NDArray[np.bool_], count: int) -> NDArray[np.intp]:
-    """Return points (S, count) chosen as by `farthest_points` from each set (S, W, K), if `inside` (S, W)."""
+    """Select points (S, count) by the rule of `farthest_points` from each set (S, W, K), if `inside` (S, W)."""
     rows = np.arange(len(points))
     mean = np.einsum("sw,swk->sk", inside.astype(float), points) / np.maximum(inside.sum(axis=1), 1)[:, None]
     start = np.where(inside, ((points - mean[:, None]) ** 2).sum(axis=2), -1.0)

@@ -14,18 +14,18 @@ from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.surface import sample_surface
 
-#: Points of the hand's surface that compare two postures, spread evenly over it.
+#: Number of surface points of the hand for the comparison of two postures, spread evenly.
 POINTS: Final = 64
 #: Pairs of grasps compared at a time.
 _PAIRS: Final = 4096
-#: Largest set whose pairs are all compared: SciPy, whose tree finds the near pairs of many, is slow to load.
+#: Largest set with a comparison of all pairs. For larger sets a SciPy tree finds near pairs; SciPy is slow to import.
 FEW: Final = 256
 
 
 def explained_variance(posture: Posture) -> Floats:
     """Compute the explained variance of (translation, rotation vector, joints), largest first.
-    The entries are shares of variance along the principal components. Diversity D is the first entry: near 1 all grasps
-    lie on a line of variants, lower is more diverse. Units stay metres and radians, as in DexGraspBench. Empty for
+    The entries are shares of variance along the principal components. Diversity D is the first entry: near 1, all
+    grasps vary along one line; lower is more diverse. Units stay metres and radians, as in DexGraspBench. Empty for
     fewer than 2 grasps."""
     if len(posture) < 2:
         return np.zeros(0)
@@ -40,8 +40,8 @@ def explained_variance(posture: Posture) -> Floats:
 
 def hand_points(hand: HandModel, posture: Posture) -> Floats:
     """Return the positions (N, P, 3) of the same `POINTS` surface points in N postures, object frame [m].
-    The distance of two grasps is the mean distance of these points [m]. This metric joins the hand's pose and joints
-    and weighs a joint by the motion it causes. It does not identify grasps that an object's symmetry makes equivalent.
+    The distance of two grasps is the mean distance of these points [m]. It covers the hand's pose and its joints, each
+    weighted by the motion that it causes. Grasps that are equivalent by an object's symmetry still count as different.
     """
     points = sample_surface(hand, POINTS)
     poses = body_poses(hand, posture.hand_pose, posture.joint_positions)
@@ -64,7 +64,7 @@ def nearest(points: Floats) -> float | None:
     middles = cKDTree(points.mean(axis=1))
     near = np.asarray(middles.query(middles.data, k=2)[1])
     rows = np.arange(len(points))
-    # With equal mean points the first neighbour need not be the point itself.
+    # If mean points coincide, the first neighbour need not be the point itself.
     bound = float(distances(points, rows, np.where(near[:, 0] == rows, near[:, 1], near[:, 0])).min())
     # The mean distance of points is at least the distance of their means.
     pairs = middles.query_pairs(bound, output_type="ndarray")

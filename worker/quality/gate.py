@@ -1,4 +1,4 @@
-"""The geometric gate: rejects grasps whose hand penetrates the object or itself, whatever the verdict."""
+"""The geometric gate: rejects grasps with penetration of the object or of the hand itself, whatever the verdict."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 #: Deepest hand-object penetration [mm]: about the deformation of a finger pad under load, and a fifth of the limit of
 #: the field's protocols (10 mm).
 MAX_PENETRATION_MM: Final = 2.0
-#: Deepest hand-hand penetration [mm]: collision shapes of neighbouring links overlap by this much in real hand models.
+#: Deepest hand-hand penetration [mm]: collision shapes of neighbouring links overlap by about this much in hand models.
 MAX_SELF_PENETRATION_MM: Final = 3.0
-#: Links in contact: a single link cannot hold anything against gravity from every side.
+#: Fewest links in contact: a single link cannot hold an object against gravity in every direction.
 MIN_CONTACT_LINKS: Final = 2
 
 

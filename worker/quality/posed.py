@@ -74,7 +74,7 @@ class PostureData:
 
     def touching_links(self, posture: Posture) -> NDArray[np.int32]:
         """Count (N,) bodies of posed hands with points closer to the object than `LINK_CONTACT_M`.
-        The quality table, which also tests object points, finds at least as many."""
+        The quality table also tests object points, so it counts at least as many."""
         return contact_links(self._gaps(posture, LINK_CONTACT_M, self.points.body.numpy()))
 
     def finger_gaps(self, posture: Posture, reach: float) -> Floats:
@@ -82,7 +82,8 @@ class PostureData:
         return self._gaps(posture, reach, self.finger.numpy()[self.points.body.numpy()])
 
     def _gaps(self, posture: Posture, reach: float, part: NDArray[np.int32]) -> Floats:
-        """Return the same (N, P) for points grouped by `part` (points,); -1: ignored."""
+        """Return least distances (N, P) of hand points grouped by `part` (points,), at most `reach` [m]; -1:
+        ignored."""
         parts = distinct_values(part[part >= 0])
         found = np.full((len(posture), len(parts)), reach)
         for rows in self.parts(len(posture)):

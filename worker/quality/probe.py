@@ -27,14 +27,14 @@ from graspd.worker.simulation.kernels import distance as kernels
 from graspd.worker.simulation.launches import launch
 from graspd.worker.simulation.sampling import object_samples
 
-#: Hand points that measure contact area and penetration; the optimiser's own points use other seeds.
+#: Number of hand points that measure contact area and penetration; the optimiser uses points of other seeds.
 HAND_POINTS: Final = 2000
 OBJECT_POINTS: Final = 3000
-#: Held-out sample: a metric must not be measured at the very points that were optimised.
+#: Seed of a held-out sample: metrics must not be measured at the points of the optimisation.
 SEED: Final = 7919
-#: Distances are capped at this [m].
+#: Larger distances count as this [m].
 REACH_M: Final = 0.012
-#: Cells along the longest side of the grid that finds points beyond reach.
+#: Cells along the longest side of the grid by which points beyond reach are found.
 COARSE_CELLS: Final = 32
 #: Hand and object normals of a contact are opposite to within 60 degrees.
 FACING_COS: Final = -0.5
@@ -67,7 +67,7 @@ class Distances(NearestPoints):
 
 
 class Probe:
-    """A (hand, object) pair prepared for distance queries. Thread-safe."""
+    """A hand and an object prepared for distance queries. Thread-safe."""
 
     def __init__(
         self,
@@ -85,7 +85,7 @@ class Probe:
         self._piece_body = np.array([p.body for p in hand.pieces], np.intp)
         self._piece_frame = np.array([_kernel_frame(p.kind, p.pose, p.vertices) for p in hand.pieces])
         with wp.ScopedDevice(device):
-            # Loading here prevents threads from compiling the same module at once.
+            # Load here, so that threads do not compile the same module at once.
             wp.load_module(module=kernels, device=device)
             self._body = wp.array(self.points.body, dtype=wp.int32)
             self.body_points = _by_body(self.points, hand.bodies)
@@ -122,7 +122,7 @@ class Probe:
                 return {"coarse": self._query(points.reshape(-1, 3))[0].reshape(counts).astype(np.float32)}
 
             if wp.get_device().is_cpu:
-                # Cached on disk: every process needs it first of all, and it depends on the object alone.
+                # Cached on disk: every process needs it at its start, and it depends on the object alone.
                 terms = (obj.content, binary_name(kernels))
                 kept = arrays_kept_or_made(
                     "coarse_grids", terms, (sys.modules[__name__],), make, fits=lambda kept: _is_grid(kept, counts)
@@ -134,7 +134,7 @@ class Probe:
 
     @cached_property
     def sample_spacing(self) -> float:
-        """Distance between neighbouring object points if they were on a square grid [m]."""
+        """Spacing of the object points on an equivalent square grid [m]."""
         return float(np.sqrt(face_areas(self.obj.vertices, self.obj.faces).sum() / len(self.samples)))
 
     def signed_distance(self, points: Floats, *, reach: float = REACH_M) -> tuple[Floats, Floats, Floats]:
@@ -156,8 +156,8 @@ class Probe:
 
     def body_gaps(self, hand_pose: Floats, joint_positions: Floats, *, reach: float = REACH_M) -> Floats:
         """Return the least signed distance (P, L) of each body's points from the object in P postures.
-        At most `reach`; inf where a body has no points. Equals `signed_distance` of `posed_points`, for many
-        postures."""
+        Distances are at most `reach`; inf where a body has no points. Equals `signed_distance` of `posed_points`, but
+        is faster for many postures."""
         posed, shape = (
             PosedBodies.of(self.hand, hand_pose, joint_positions, self.device),
             (len(hand_pose), self.hand.bodies),
@@ -214,7 +214,7 @@ class Probe:
         return least
 
     def self_depth(self, bodies: Floats, points: Floats) -> Floats:
-        """Return the depth (B, L) of each body in others with counted contact, or of others in it [m]."""
+        """Return the depth (B, L) of each body in other bodies, or of others in it, where contact counts [m]."""
         with wp.ScopedDevice(self.device):
             own = wp.array(points - self.obj.centre_of_mass, dtype=wp.vec3)
             depth = wp.zeros((len(bodies), self.hand.bodies), dtype=wp.float32)
@@ -239,7 +239,7 @@ class Probe:
 
 
 def _turned(bodies: Floats, body: NDArray[np.integer[Any]], vectors: Floats) -> Floats:
-    """Rotate vectors (N, 3) of the bodies (N,) with them; return (B, N, 3)."""
+    """Rotate vectors (N, 3) with their bodies (N,); return (B, N, 3)."""
     rotation = quat_to_matrix(bodies[..., 3:])
     turned: Floats = np.einsum("bnij,nj->bni", rotation[:, body], vectors)
     return turned

@@ -1,11 +1,11 @@
 """The quality table: every metric of every grasp of one hand on one object, and the grasp types.
 
-Types are those of Napier (1956) and of the GRASP taxonomy (Feix et al., IEEE THMS 2016), decided by the opposition that
-Iberall (1987) found in them:
+Types are those of Napier (1956) and of the GRASP taxonomy (Feix et al., IEEE THMS 2016), by opposition (Iberall 1987):
 
-    power      palm opposition: the palm touches, or at least two digits wrap: they touch with more than their last
-    links, and not by a side lateral    side opposition: at least half of the touching digits do so by a side precision
-    pad opposition: all others in which two digits touch
+- power, palm opposition: the palm touches, or at least two digits wrap: they touch with more than their last links,
+  and not by a side;
+- lateral, side opposition: at least half of the touching digits do so by a side;
+- precision, pad opposition: all others in which two digits touch.
 
 They are tested in this order. A *digit* is a chain of bodies that ends in a fingertip; all other bodies are palm. A
 digit touches *by a side* if more than half of its surface within 2 mm of the object faces along the axis of its
@@ -55,7 +55,7 @@ Columns = dict[str, NDArray[np.generic]]
 #: Contact thresholds [m]: the literature's tight one, the paper's (Table 2), and DDGC's.
 DEFAULT_THRESHOLDS_M: Final = (0.002, 0.005, 0.009)
 DEFAULT_FRICTION: Final = 1.0
-#: Grasps per thread at a time: small enough to cancel soon, large enough to fill a kernel launch.
+#: Grasps per thread at a time: few enough for a quick cancellation, enough to fill a kernel launch.
 CHUNK: Final = 16
 
 
@@ -77,7 +77,7 @@ class _Pair:
 
 _pairs: LRUCache[str, _Pair] = LRUCache(4)
 _lock = threading.Lock()
-# Solids that outlive the interpreter are reported as leaks by their library.
+# Their library reports solids that outlive the interpreter as leaks.
 atexit.register(_pairs.clear)
 
 
@@ -96,8 +96,8 @@ def measure(
     Args:
         friction: Coulomb coefficient of the wrench space.
         thresholds_m: T contact thresholds, at most `REACH_M` [m].
-        every_volume: compute the volume at all thresholds; else only at the index's, nan at the others: a volume takes
-            ten times as long as an epsilon.
+        every_volume: compute the volume at all thresholds. Otherwise only at the index's threshold, nan at the others:
+            a volume takes ten times as long as an epsilon.
         run: receives the number of finished grasps; polled for cancellation between chunks.
 
     Returns:
@@ -132,7 +132,7 @@ class _Terms:
 
     @cached_property
     def pair(self) -> _Pair:
-        """Cached, since a batch is measured a few grasps at a time."""
+        """Cached, since a batch is measured in chunks of a few grasps."""
         content = content_of(self)
         with _lock:
             if content not in _pairs:
@@ -190,7 +190,7 @@ class _Chunk:
         return epsilon.reshape(count.shape), volume.reshape(count.shape)
 
     def shared_volume(self) -> Floats:
-        # A face of the object may enter a piece between two object points, half a diagonal of their grid from either.
+        # A face of the object may enter a piece between object points, up to half a diagonal of their grid from them.
         near = self.found.piece_distance < self.pair.probe.sample_spacing
         if self.pair.volume.exact:
             near = self.pair.overlap.of(self.found, near)
@@ -214,7 +214,7 @@ MEASURES: Final[dict[str, Callable[[_Chunk], NDArray[np.generic]]]] = {
 
 #: Cosine between a digit's surface and its axis of flexion above which the surface is a side: 45 degrees.
 SIDE_COS: Final = float(np.sqrt(0.5))
-#: Digits that must touch with more than their last links where the palm does not touch.
+#: Number of digits that must touch with more than their last links if the palm does not touch.
 ENVELOPING: Final = 2
 
 
@@ -248,7 +248,7 @@ def _by_sides(
 
 
 def _flexion(hand: HandModel) -> Floats:
-    """Return the axis (L, 3) about which each body closes, in its own frame; 0: it does not close or turn."""
+    """Return the axis (L, 3) about which each body closes, in its own frame; 0: not closing, or not revolute."""
     # A body turns about its joint's axis, which is therefore constant in its frame.
     bends = (hand.joint_type == JointType.REVOLUTE) & (hand.dof >= 0)
     bends &= np.where(hand.dof >= 0, hand.closing[hand.dof], 0.0) != 0

@@ -1,4 +1,4 @@
-"""Volume shared by hand and object: exact boolean of solids, or voxels where the object is no solid.
+"""Volume shared by hand and object: exact boolean of solids, or voxels where the object is not closed.
 
 Also the pieces that may share volume, and the depth of penetration.
 """
@@ -22,7 +22,7 @@ from graspd.worker.simulation.device import to_xyzw
 from graspd.worker.simulation.kernels import crossing as kernels
 from graspd.worker.simulation.launches import launch
 
-#: Edge of a voxel in the fallback [m]: the error is at most half an edge times the shared volume's surface.
+#: Edge of a voxel in the fallback [m]: the error is at most half an edge times the surface of the shared volume.
 VOXEL_M: Final = 5e-4
 #: Solids are built in millimetres: manifold3d uses single precision, whose tolerance suits numbers around 100.
 _UNIT: Final = 1e3
@@ -57,7 +57,7 @@ class SharedVolume:
         parts = [part for part in (self._object ^ solid for solid in posed) if not part.is_empty()]
         if not parts:
             return 0.0
-        # Intersections rarely overlap, so their union is cheap; the union of whole pieces is not.
+        # Intersections rarely overlap, so their union is cheap; a union of whole pieces is expensive.
         whole = parts[0] if len(parts) == 1 else m3d.Manifold.batch_boolean(parts, m3d.OpType.Add)
         return float(whole.volume()) / _UNIT**3 * 1e6
 
@@ -119,15 +119,15 @@ def _hull(piece: ConvexPiece) -> m3d.Manifold:
     return m3d.Manifold.hull_points(np.ascontiguousarray(piece.vertices * _UNIT, dtype=np.float32))
 
 
-#: Planes are distinguished by so many digits [m, and of unit normals].
+#: Planes are distinct if they differ in this many digits [m, and of unit normals].
 _DIGITS: Final = 7
 
 
 class Overlap:
     """Conservative overlap test of a hand's pieces with a closed object.
     A piece is excluded only if it shares no volume: no face of the object reaches into it, none of its corners is in
-    the object, and nothing of the object is in it. A face also counts if only a plane through
-    two edges would separate it."""
+    the object, and no part of the object is in it. The test is conservative: a face also counts as reaching in if only
+    a plane through one edge of each would separate it."""
 
     def __init__(self, hand: HandModel, probe: Probe) -> None:
         self._probe = probe
@@ -187,14 +187,15 @@ def _planes(piece: ConvexPiece) -> Floats:
     length = np.linalg.norm(normal, axis=1)
     normal = normal[length > 0] / length[length > 0, None]
     offset = (normal @ piece.vertices.T).max(axis=1)
-    # One of the planes that are equal except for rounding, itself unrounded.
+    # Select one of the planes that are equal up to rounding, without rounding it.
     _, first = np.unique(np.round(np.column_stack([normal, offset]), _DIGITS), axis=0, return_index=True)
     return np.column_stack([normal, offset])[first]
 
 
 def penetration_depth(found: Distances) -> Floats:
     """Return the deepest penetration (B,), of hand points in the object and object points in the hand [m].
-    One direction alone is blind: a thin wall passes between hand points, a small fingertip between object points."""
+    One direction alone misses cases: a thin wall passes between hand points, a small fingertip between object
+    points."""
     hand_in_object = np.maximum(0.0, -found.distance).max(axis=1)
     object_in_hand = np.maximum(0.0, -found.piece_distance).max(axis=1)
     deepest: Floats = np.maximum(hand_in_object, object_in_hand)

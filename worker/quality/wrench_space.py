@@ -1,8 +1,8 @@
 """Grasp wrench space by the conventions of GraspIt! (Miller & Allen 2004): epsilon and volume.
 
-Epsilon follows Ferrari & Canny 1992. Each contact's friction cone is a pyramid of 8 edges with unit normal component, f
-= n + mu (cos a t1 + sin a t2); its torque about the centre of mass is divided by the object's largest radius. The space
-is the convex hull of all edges: normal forces sum to at most 1 (L1).
+Epsilon follows Ferrari & Canny 1992. Each contact's friction cone is a pyramid of 8 edges with unit normal component,
+f = n + mu (cos a t1 + sin a t2). The torque of an edge about the centre of mass is divided by the object's largest
+radius. The space is the convex hull of all edges: normal forces sum to at most 1 (L1).
 
 Epsilon is the radius of the largest ball around the origin inside the space: 0 where the origin is not inside (GraspIt!
 reports -1 there). Flat spaces have epsilon 0 and volume 0.
@@ -24,7 +24,7 @@ from graspd.worker.simulation.launches import launch
 EDGES: Final = 8
 #: Ratio of least to largest singular value below which a set of wrenches is flat.
 FLATNESS: Final = 1e-7
-#: Number of points from which our own hull is faster.
+#: Number of points from which this module's hull is faster than Qhull.
 MANY: Final = 24
 
 
@@ -61,7 +61,7 @@ def measure_spaces(
 ) -> tuple[Floats, Floats]:
     """Compute epsilon and volume (S,) of many wrench spaces of edge wrenches (S, N, E, D).
     Each space uses its first `contacts` (S,) contacts. The volume is nan where `with_volume` (S,) is false: epsilon
-    alone is as exact, in a tenth of the time."""
+    alone has the same accuracy, in a tenth of the time."""
     epsilon, volume = np.full((2, len(edge_wrenches)), np.nan)
     none = np.asarray(contacts) == 0
     epsilon[none], volume[none] = 0.0, 0.0
@@ -77,13 +77,13 @@ def measure_spaces(
 
 
 def _measure_by_qhull(edge_wrenches: Floats) -> tuple[float, float]:
-    """Compute epsilon and volume where our own hull does not apply: few, flat, or too many contacts."""
+    """Compute epsilon and volume by Qhull where `measure_hulls` does not apply: few, flat, or too many contacts."""
     from scipy.spatial import ConvexHull, QhullError
 
     points = edge_wrenches.reshape(-1, edge_wrenches.shape[-1])
     if len(points) <= points.shape[1] or _flat(points):
         return 0.0, 0.0
-    # Joggled input is fastest and simplicial; exact merging is the fallback.
+    # Joggled input is fastest and gives simplices; exact merging is the fallback.
     for options in ("QJ", "Qt Qx"):
         try:
             hull = ConvexHull(points, qhull_options=options)
@@ -98,25 +98,25 @@ def _flat(points: Floats) -> bool:
     return bool(spread[-1] <= FLATNESS * max(spread[0], 1e-300))
 
 
-#: Points are moved randomly by this share of the largest coordinate, so that no 7 of them lie in one hyperplane. Less
-#: leaves slivers whose planes are rounding errors, more is an error itself; on cubes the volume is off by 4e-8.
+#: Random shift of the points, as a share of the largest coordinate, so that no 7 of them lie in one hyperplane. Smaller
+#: shifts leave slivers with planes dominated by rounding; larger ones distort. On cubes the volume is off by 4e-8.
 JOGGLE: Final = 1e-8
-#: Most facets alive at once: 160 random points have some 13,000.
+#: Most facets that exist at once: 160 random points have some 13,000.
 CAPACITY: Final = 40_000
-#: Entries of the hash table of ridges; one inserted point makes some thousands at most.
+#: Entries of the hash table of ridges; inserting one point creates some thousands at most.
 _TABLE: Final = 1 << 16
 MAX_POINTS: Final = 512
 _DIMENSION: Final = 6
-#: A point less than this share of the largest coordinate above a plane is on it: products of coordinates round by some
-#: 1e-15, and the error of ε is no larger than this.
+#: A point above a plane by less than this share of the largest coordinate counts as on it. Products of coordinates have
+#: rounding errors of some 1e-15; the error of ε is not larger than this share.
 _ROUNDING: Final = 1e-13
-#: Ratio of least to greatest distance in a first simplex below which points count as flat.
+#: Ratio of least to greatest distance in the initial simplex below which points count as flat.
 _FLAT: Final = 1e-6
 _LAST_STAMP: Final = 2**31 - 2 * MAX_POINTS
 
 
 class _Workspace(threading.local):
-    """Arrays that the hulls of one thread use in turn."""
+    """Arrays that are reused by all hulls of one thread."""
 
     _lock = threading.Lock()
 
@@ -141,7 +141,7 @@ class _Workspace(threading.local):
         self.next_stamp = 1
 
     def stamps(self, count: int) -> int:
-        """Return the first of `count` stamps that no entry of the table has."""
+        """Return the first of `count` stamps that no entry of the table uses."""
         if self.next_stamp + count > _LAST_STAMP:
             self.hull.stamp.zero_()
             self.next_stamp = 1
@@ -158,11 +158,11 @@ def measure_hulls(clouds: Floats, count: NDArray[np.integer], whole: NDArray[np.
 
     Args:
         clouds: (H, P, 6) points, P at most `MAX_POINTS`; each hull uses its first `count` (H,).
-        whole: (H,) whether the volume is wanted; else the hull is built only where it is nearest to the origin, in a
-            tenth of the time, with an equally exact radius.
+        whole: (H,) whether the volume is wanted. Otherwise only the part of the hull nearest to the origin is built,
+            in a tenth of the time, with an equally exact radius.
 
     Returns:
-        Distance (H,) of the nearest facet from the origin, at most 0 where the origin is outside, and volume (H,), nan
+        Distance (H,) from the origin to the nearest facet, at most 0 where the origin is outside, and volume (H,), nan
         where it is not wanted. Both are nan where there is no closed hull of at most `CAPACITY` facets."""
     radius, volume = np.full((2, len(clouds)), np.nan)
     some = np.flatnonzero(np.asarray(count) > _DIMENSION)
@@ -218,7 +218,7 @@ def _grown(
 def _simplices(
     points: Floats, own: NDArray[np.bool_], count: NDArray[Any]
 ) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-    """Return distant points (H, 7), each farthest from the flat through those before, and flat hulls (H,)."""
+    """Return the corners (H, 7) of simplices, each farthest from the span of those before, and flat hulls (H,)."""
     rows = np.arange(len(points))
     mean = points.sum(axis=1) / count[:, None]
     far = np.where(own, ((points - mean[:, None]) ** 2).sum(axis=2), -1.0)
@@ -238,8 +238,8 @@ def _simplices(
 
 def _planes(corner: Floats) -> tuple[Floats, Floats]:
     """Return planes (H, 7, 6), (H, 7) of the facets of simplices (H, 7, 6) about the origin.
-    Facet i omits corner i. n x - d is minus 6! times the volume of the simplex of x and the facet: the barycentric
-    coordinate of corner i, times the determinant of the edges."""
+    Facet i omits corner i. n x - d is minus 6! times the volume of the simplex of x and the facet. It equals the
+    barycentric coordinate of corner i, times the determinant of the edges."""
     edges = corner[:, 1:] - corner[:, :1]
     size = np.abs(np.linalg.det(edges))[:, None, None]
     slope = np.swapaxes(np.linalg.inv(edges), 1, 2)

@@ -27,7 +27,7 @@ _TABLE: Final = Obstacle.half_space(UP, 0.0)
 
 
 class Rejection(IntEnum):
-    """Reason to reject a grasp in a scene; of several, the first in this order."""
+    """Reason to reject a grasp in a scene; if several apply, the first in this order."""
 
     NONE = 0
     TABLE_AT_CONTACT = 1
@@ -41,20 +41,20 @@ def transfer(
 ) -> dict[str, NDArray[np.generic]]:
     """Transfer every grasp to every scene and compute the clearance of the hand and its mounting.
 
-    The wrist of a mounting has the first angles that keep it off the table; neighbours do not decide them.
+    The wrist of a mounting takes the first angles that clear the table; neighbours are ignored in this choice.
 
     Args:
         grasp: N postures at contact, object frame.
-        pregrasp: N postures before contact, object frame; the hand moves straight from it to the grasp.
+        pregrasp: N postures before contact, object frame; the hand moves in a straight line from pregrasp to grasp.
         object_pose: (S, 7) rest poses in the table frame.
         neighbours: other objects on the table, which the hand must also avoid.
 
     Returns:
         Datasets of the scene shard with K = S N rows, scene-major: `grasp/base_index`, `grasp/scene_index`,
-        `grasp/hand_pose` (K, 7), `grasp/table_clearance_m` (K,): lowest point of the hand at the grasp, the pregrasp
-        and between them; `grasp/contact_table_clearance_m` (K,): the same at the grasp alone; `grasp/valid` (K,): 1
+        `grasp/hand_pose` (K, 7), `grasp/table_clearance_m` (K,): height of the hand's lowest point from pregrasp to
+        grasp; `grasp/contact_table_clearance_m` (K,): the same at the grasp alone; `grasp/valid` (K,): 1
         where both are at least `MARGIN_M`; `grasp/rejection` (K,): a `Rejection`. With neighbours also
-        `grasp/neighbour_clearance_m` (K,), of hands on a wrist `grasp/wrist_positions` (K, U).
+        `grasp/neighbour_clearance_m` (K,); for hands on a wrist also `grasp/wrist_positions` (K, U).
 
     Raises:
         InputError: grasps and pregrasps differ in number.
@@ -128,7 +128,7 @@ def _beside(
 
 
 def _clearance(hand: HandModel, grasp: Posture, pregrasp: Posture, object_pose: Floats) -> Floats:
-    """Return the lowest point (S, N, 2) of the hand at contact, and on its approach, table frame [m]."""
+    """Return the height (S, N, 2) of the hand's lowest point at contact, and on its approach, table frame [m]."""
     features = PosedFeatures.of(hand, approach(grasp, pregrasp))
     on_path = np.array([features.distance(_TABLE.seen_from(pose)).min(axis=1) for pose in object_pose])
     on_path = on_path.reshape(len(object_pose), len(grasp), -1)
@@ -138,8 +138,8 @@ def _clearance(hand: HandModel, grasp: Posture, pregrasp: Posture, object_pose: 
 def _mounting_clearance(
     hand: HandModel, grasp: Posture, pregrasp: Posture, object_pose: Floats
 ) -> tuple[Floats, Floats]:
-    """Return wrist angles (S, N, K) and the mounting's lowest points (S, N, 2) [m]; inf without one.
-    The points are at contact and anywhere on the approach."""
+    """Return wrist angles (S, N, K) and heights (S, N, 2) of the mounting's lowest point [m]; inf without a mounting.
+    The two heights are those at contact and on the approach, as in `_clearance`."""
     path = approach(grasp, pregrasp).hand_pose.reshape(len(grasp), PATH_POSTURES, 7)
     angles, heights = [], []
     for pose in object_pose:

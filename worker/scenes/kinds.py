@@ -18,9 +18,9 @@ from graspd.worker.simulation.environment import Obstacle
 
 #: Least gap between an object and a wall [m].
 GAP: Final = 0.01
-#: With `faces all`, faces on which a smaller share of drops ends are skipped.
+#: With `faces all`, faces on which a smaller share of the drops comes to rest are skipped.
 LEAST_PROBABILITY: Final = 0.03
-#: Tolerated depth of an object in its support [m]: rest poses are exact, those of files are rounded.
+#: Tolerated penetration of an object into its support [m]: rest poses are exact, those of files are rounded.
 SUNK: Final = 5e-4
 
 
@@ -34,7 +34,7 @@ def supports_of(spec: SceneSpec) -> tuple[Obstacle, ...]:
 
 
 def room_in(spec: SceneSpec) -> tuple[float, float] | None:
-    """Return the rectangle, x by y about the origin, inside walls or on the board [m]; None: no walls."""
+    """Return the sides x and y of the rectangle about the origin, inside walls or on the board [m]; None: no walls."""
     return {"bin": BIN_SIZE, "shelf": (SHELF_SIZE[1], SHELF_SIZE[0])}.get(spec.kind)
 
 
@@ -45,7 +45,7 @@ def rest_poses(spec: SceneSpec, obj: ObjectModel, *, count: int, seed: int) -> d
         `scene/object_pose` (S, 7) in the scene frame, `scene/rest_probability` (S,), `scene/drop_seconds` (S,).
 
     Raises:
-        SceneError: the object does not fit between the supports, or stands in one.
+        SceneError: the object does not fit between the supports, or a support penetrates it.
         MeshError: it never comes to rest.
     """
     if spec.target is not None:
@@ -92,13 +92,13 @@ def _each_face(obj: ObjectModel, seed: int) -> dict[str, Floats]:
 
 
 def turned(pose: Floats, angle: float) -> Floats:
-    """Return the pose turned about the vertical through the origin."""
+    """Return the pose rotated about the vertical axis through the origin."""
     about = np.concatenate([np.zeros(3), quat_from_axis_angle(np.array([0.0, 0, 1]), np.asarray(angle))])
     return compose(about, pose)
 
 
 def inside(obj: ObjectModel, pose: Floats, size: tuple[float, float], rng: np.random.Generator) -> Floats:
-    """Move the pose to a random place in a rectangle x by y [m] about the origin; SceneError: there is no room."""
+    """Move the pose to a random place in a rectangle x by y [m] about the origin; SceneError: it does not fit."""
     corners = quat_rotate(pose[3:], obj.hull_vertices)[:, :2]
     low, high = corners.min(axis=0), corners.max(axis=0)
     room = np.asarray(size) / 2 - GAP
@@ -112,7 +112,7 @@ def inside(obj: ObjectModel, pose: Floats, size: tuple[float, float], rng: np.ra
 
 
 def check_free(obj: ObjectModel, poses: Floats, supports: tuple[Obstacle, ...]) -> None:
-    """Raise SceneError where a pose (S, 7) puts the object deeper into a support than rounding does."""
+    """Raise SceneError where, at a pose (S, 7), the object penetrates a support by more than the rounding error."""
     for pose in poses:
         corners = quat_rotate(pose[3:], obj.hull_vertices) + pose[:3]
         for number, support in enumerate(supports):

@@ -1,10 +1,10 @@
 """Several objects in a scene: dropped together on a table, or placed beside one at rest.
 
-Also the clearance of hands from neighbours. Collision shapes are convex hulls: exact against the table and conservative
-among objects, since nothing is ever placed in another object's hollow.
+Also the clearance of hands from neighbours. Collision shapes are convex hulls. They are exact against the table and
+conservative between objects, since no object is ever placed in another object's hollow.
 
-An object placed beside another rests as it fell by itself, so its pose is exact. Position and turn about the vertical
-are drawn until its hull is clear of walls and of the others.
+An object placed beside another has its rest pose from a drop of its own, so its pose is exact. Position and rotation
+about the vertical are drawn until its hull is clear of walls and of the other objects.
 """
 
 from __future__ import annotations
@@ -44,11 +44,12 @@ from graspd.worker.simulation.environment import Obstacle
 from graspd.worker.validation.model import add_shape
 
 TIMEOUT_S: Final = 6.0
-#: Distance of falling neighbours from the object, as a multiple of the sum of both bounding radii.
+#: Distance of dropped neighbours from the object, as a multiple of the sum of both bounding radii.
 RING: Final = (1.0, 1.25)
 #: Largest distance of resting neighbours from the middle of the table [m].
 NEIGHBOUR_REACH: Final = 0.4
-#: Laying an object flat lifts it by the penetration of MuJoCo's soft contacts; more means that it lay on something [m].
+#: Laying an object flat raises it by the penetration of MuJoCo's soft contacts; a larger rise means that the object
+#: lay on another one [m].
 MAX_LIFT: Final = 0.003
 #: Clearances are capped at this [m].
 FARTHEST_M: Final = 0.1
@@ -112,7 +113,7 @@ class _Heap:
         self.data = mujoco.MjData(self.model)
 
     def redo_until_rest(self, key: tuple[int, int]) -> tuple[Floats, int, float]:
-        """Drop until all rest; return poses (1 + M, 7), the face the object rests on, and seconds."""
+        """Drop until all objects rest; return poses (1 + M, 7), the object's resting face, and seconds."""
         for attempt in range(MAX_ATTEMPTS):
             if (found := self._drop_once(np.random.default_rng([*key, attempt]))) is not None:
                 return found
@@ -163,7 +164,7 @@ class _Heap:
         return None
 
     def _at_rest(self, seconds: float, rng: np.random.Generator) -> tuple[Floats, int, float] | None:
-        """Return the poses laid flat; None if something leans, lies on another, rolled away or would overlap."""
+        """Return the poses laid flat; None if an object leans, lies on another, rolled away or would overlap."""
         flat, first = [], -1
         for k, (obj, pose) in enumerate(zip(self.objects, self.data.qpos.reshape(-1, 7).copy(), strict=True)):
             pose[3:] /= np.linalg.norm(pose[3:])
@@ -220,13 +221,13 @@ def _add_piece(spec: Any, body: Any, name: str, piece: ConvexPiece) -> None:
         add_shape(spec, body.add_geom(), piece, name)
 
 
-#: Least gap between two objects [m]; from walls it is that of the object, `GAP`.
+#: Least gap between two objects [m]; from walls the least gap is `GAP`, as for the object.
 BETWEEN: Final = 0.005
-#: Draws of all neighbours of a scene, and of each of them.
+#: Number of draws of all neighbours of a scene, and of each neighbour.
 _DRAWS: Final = 32
 _PLACES: Final = 100
-#: Largest distance of a neighbour's centre from the object's, as a multiple of the sum of both bounding radii; it grows
-#: by that much with each failed draw.
+#: Largest distance of a neighbour's centre from the object's, as a multiple of the sum of both bounding radii. Each
+#: failed draw increases it by this amount.
 _REACH: Final = 1.25
 _FARTHER: Final = 0.1
 
@@ -247,11 +248,11 @@ def lay_beside(
     Args:
         again: pose (7,) of the object in scene i at attempt k.
         others: the neighbours; each rests on z = 0.
-        within: x by y about the origin that they must not leave [m].
+        within: sides x and y of a rectangle about the origin; all neighbours stay inside [m].
 
     Raises:
-        SceneError: they do not all fit.
-        MeshError: one never comes to rest, or is flat."""
+        SceneError: the neighbours do not all fit.
+        MeshError: a neighbour never comes to rest, or is flat."""
     resting = [drop(one, count=count, seed=_seed_of(seed, k))["scene/object_pose"] for k, one in enumerate(others)]
     hulls = _Hulls([obj, *others], supports, within)
     poses = np.zeros((count, 1 + len(others), 7))
@@ -272,7 +273,7 @@ def lay_beside(
 
 
 def _seed_of(seed: int, number: int) -> int:
-    """Return a seed of a neighbour's own: copies of one object must not rest identically."""
+    """Return the seed of one neighbour: copies of one object must not rest in the same pose."""
     return int(np.random.SeedSequence([seed, 1 + number]).generate_state(1)[0])
 
 
@@ -317,7 +318,7 @@ class _Hulls:
         return np.asarray((quat_rotate(pose[3:], self.objects[number].centre_of_mass) + pose[:3])[:2])
 
     def room(self, number: int, pose: Floats) -> tuple[Floats, Floats]:
-        """Return the least and greatest shift (2,), (2,) along x and y that keeps an object within the walls."""
+        """Return the smallest and largest shift (2,), (2,) along x and y that keeps an object inside the walls."""
         corners = self._corners(number, pose)[:, :2]
         return -self._room - corners.min(axis=0), self._room - corners.max(axis=0)
 
@@ -330,7 +331,7 @@ class _Hulls:
         return quat_rotate(pose[3:], self.objects[number].hull_vertices) + pose[:3]
 
     def apart(self, poses: Sequence[Floats]) -> bool:
-        """Check whether the last of the poses, of the first objects, is `BETWEEN` away from the others."""
+        """Check whether the object of the last pose is `BETWEEN` away from the objects of the other poses."""
         last = len(poses) - 1
         self._data.mocap_pos[: last + 1] = [pose[:3] for pose in poses]
         self._data.mocap_quat[: last + 1] = [pose[3:] for pose in poses]
@@ -340,8 +341,8 @@ class _Hulls:
 
 
 def _beyond(support: Obstacle, corners: Floats) -> bool:
-    """Check whether a hull lies beyond one plane of a support: on an upward plane, `GAP` away from others.
-    A plane separates two convex bodies. Where only an edge against an edge would separate them, the result is False."""
+    """Check whether one plane of a support separates it from a hull: upward planes at no gap, others at `GAP`.
+    A plane separates two convex bodies. False if only a plane through one edge of each would separate them."""
     room = (corners @ support.planes[:, :3].T - support.planes[:, 3]).min(axis=0)
     least = np.where(support.planes[:, 2] > 1 - 1e-6, -SUNK, GAP)
     return bool((room >= least).any())

@@ -24,7 +24,7 @@ from graspd.worker.scenes.neighbours import drop_together, lay_beside
 from graspd.worker.simulation.environment import Neighbour, Obstacle, Scenes
 from graspd.worker.validation.decomposition import decompose
 
-#: Most convex pieces of a neighbour: no hand reaches into a neighbour's hollow, so hollows may be filled.
+#: Most convex pieces of a neighbour. Hollows may be filled, since no hand reaches into a neighbour's hollow.
 MOST_PIECES: Final = 8
 
 
@@ -43,14 +43,14 @@ def _neighbour(obj: ObjectModel) -> Neighbour:
     try:
         pieces = decompose(obj).vertices
     except MeshError:
-        pieces = (obj.hull_vertices,)  # an oversized shape is safe for an obstacle
+        pieces = (obj.hull_vertices,)  # an obstacle may be larger than the object
     pieces = joined_pieces(pieces)
     solids = [outer_solid(piece) for piece in pieces]
     return Neighbour(obj, pieces, tuple(solid for solid, _ in solids), max(error for _, error in solids))
 
 
 def joined_pieces(pieces: Sequence[Floats], most: int = MOST_PIECES) -> tuple[Floats, ...]:
-    """Merge pieces to at most `most`, each time the two whose common hull adds the least volume."""
+    """Merge pieces until at most `most` remain; each step joins the two whose common hull adds the least volume."""
     left = list(pieces)
     volume = [union_volume((piece,)) for piece in left]
 
@@ -83,8 +83,8 @@ def scenes_of(
         there are neighbours, `scene/neighbour_pose` (S, M, 7).
 
     Raises:
-        SceneError: things overlap, or do not fit.
-        MeshError: something never comes to rest, or is flat.
+        SceneError: objects overlap, or do not fit.
+        MeshError: an object never comes to rest, or is flat.
     """
     whole, poses = _scenes_of(
         _centred_spec(spec, obj, others), obj.centred, [other.centred for other in others], count=count, seed=seed
@@ -100,7 +100,7 @@ def scenes_of(
 
 
 def _centred_spec(spec: SceneSpec, obj: ObjectModel, others: Sequence[ObjectModel]) -> SceneSpec:
-    """Return the specification with its poses given for the centres of the objects."""
+    """Return the specification with poses of the objects' centres instead of their mesh origins."""
 
     def told(pose: Any, thing: ObjectModel) -> Any:
         return None if pose is None else tuple(to_centre(pose, thing.centre).tolist())
@@ -128,7 +128,7 @@ def _scenes_of(
         try:
             poses = drop_together(obj, others, count=count, seed=seed)
         except MeshError:
-            # Too many never come to rest apart.
+            # Too many objects never come to rest without touching.
             poses = _laid(SceneSpec(kind="table"), obj, others, supports, count=count, seed=seed)
         check_free(obj, poses["scene/object_pose"], supports)
     else:
@@ -151,7 +151,7 @@ def _laid(
     count: int,
     seed: int,
 ) -> dict[str, Floats]:
-    """Place the object as it rests alone and the others beside it; move it elsewhere if they do not fit."""
+    """Place the object in its own rest pose and the neighbours beside it; move the object if they do not fit."""
     poses = rest_poses(spec, obj, count=count, seed=seed)
     alone, size = poses["scene/object_pose"], room_in(spec)
 
@@ -175,7 +175,7 @@ def _check_apart(things: Sequence[Neighbour], poses: Floats) -> None:
 
 
 def gaps_between(things: Sequence[Neighbour], poses: Floats, farthest: float = 0.1) -> dict[tuple[int, int], Floats]:
-    """Return signed distances (S,) of each pair of things at poses (S, T, 7), at most `farthest` [m]."""
+    """Return signed distances (S,) of each pair of objects at poses (S, T, 7), at most `farthest` [m]."""
     spec: Any = mujoco.MjSpec()
     first = [0]
     for number, thing in enumerate(things):
@@ -198,18 +198,18 @@ def gaps_between(things: Sequence[Neighbour], poses: Floats, farthest: float = 0
     return gaps
 
 
-#: Most faces of a solid, and the excess over its piece below which it needs no more [m].
+#: Most faces of a simplified hull, and the excess over its piece below which no more faces are added [m].
 MOST_PLANES: Final = 48
 ENOUGH_M: Final = 1e-3
-#: Corners nearer than this are merged [m].
+#: Corners closer than this are merged [m].
 _SAME_M: Final = 1e-7
 
 
 def outer_solid(corners: Floats) -> tuple[Obstacle, float]:
     """Return a convex solid of at most `MOST_PLANES` faces around points (V, 3).
 
-    It begins as their box. While it exceeds the points' hull by more than `ENOUGH_M`, its farthest corner is cut off by
-    the face of the hull that it is farthest from. It never cuts into the hull.
+    It begins as the bounding box of the points. While it exceeds their hull by more than `ENOUGH_M`, its farthest
+    corner is cut off along the hull's face that is farthest from this corner. It never cuts into the hull.
 
     Return the solid, and its largest excess over the points' hull [m]; raise MeshError if the points lie in a plane.
     """

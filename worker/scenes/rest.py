@@ -1,4 +1,4 @@
-"""Static rest of a convex hull on a plane: its stable faces, and the face that it tips to.
+"""Static rest of a convex hull on a plane: its stable faces, and the next face onto which it tips.
 
 A rigid body touches a plane only with its convex hull. A resting face is therefore a face of the hull whose polygon
 contains the projection of the centre of mass (Goldberg et al., "Part pose statistics", 1999).
@@ -24,9 +24,9 @@ COPLANAR_ANGLE = np.radians(0.05)
 STABILITY_MARGIN = 1e-4
 #: Resting faces whose normals differ by less than this count as one: scanned flat bottoms fall into many facets [rad].
 SAME_FACE_ANGLE = np.radians(2.0)
-#: Uncertainty of the surface [m]: that of convex pieces, or of a real object.
+#: Uncertainty of the surface, in convex pieces and in real objects [m].
 CHANGE_M = 1e-3
-#: A pose that may turn farther than this under such a change rolls [rad].
+#: The object rolls if such a change of its surface may turn it by more than this [rad].
 ROLLS = np.radians(20.0)
 
 
@@ -43,9 +43,9 @@ class RestingFaces:
     height: Floats
     """(C,) height of the centre of mass above each face [m]."""
     sides: Ints
-    """(E, 2) a face, and the one across one of its edges."""
+    """(E, 2) pairs of adjacent faces; a row is one edge of its first face."""
     margin: Floats
-    """(E,) distance of the centre of mass inside that edge, in projection [m]."""
+    """(E,) distance from that edge to the projected centre of mass, positive inside the face [m]."""
     width: Floats
     """(E,) width of the face across that edge [m]."""
 
@@ -54,9 +54,10 @@ class RestingFaces:
         return np.flatnonzero(self.successor == np.arange(len(self.successor))).astype(np.int32)
 
     def looseness(self, face: int) -> tuple[float, float]:
-        """Return how far the object may turn [rad] and its centre of mass sink [m] if `CHANGE_M` tips it.
-        It crosses edges over which a tilt of the face by that change of the surface moves the centre of mass."""
-        from scipy.sparse import csr_array  # slow to load
+        """Return how far the object may turn [rad] and its centre of mass sink [m] after a tilt of `face`.
+        The tilt is that of a change of the surface by `CHANGE_M`; the object tips over all edges that this tilt
+        moves the centre of mass across."""
+        from scipy.sparse import csr_array  # slow to import
         from scipy.sparse.csgraph import breadth_first_order
 
         here, there = self.sides.T
@@ -72,13 +73,13 @@ class RestingFaces:
         return self.looseness(face)[1] > CHANGE_M
 
     def rolls(self, face: int) -> bool:
-        """Check whether such a change may turn the object farther than `ROLLS`: it is round there."""
+        """Check whether such a change may turn the object by more than `ROLLS`: its surface is round there."""
         return self.looseness(face)[0] > ROLLS
 
 
 def rolling_poses(obj: ObjectModel, poses: Floats) -> int:
-    """Count the rest poses (S, 7) on a table in which the object, round there, may roll.
-    A change of its surface by `CHANGE_M` may turn it farther than `ROLLS`."""
+    """Count the rest poses (S, 7) on a table in which the object may roll, because its surface is round there.
+    A change of its surface by `CHANGE_M` may turn it by more than `ROLLS`."""
     faces = resting_faces(obj.centred)
     return sum(faces.rolls(settle(faces, pose[3:])[0]) for pose in np.asarray(poses, float))
 
@@ -95,7 +96,7 @@ def rolling_note(rolling: int, scenes: int) -> str | None:
 
 def resting_faces(obj: ObjectModel) -> RestingFaces:
     """Compute the faces of the object's convex hull and how it tips over them; raise MeshError for a flat hull."""
-    import trimesh  # slow to load, seldom needed
+    import trimesh  # slow to import
 
     mesh = trimesh.Trimesh(obj.hull_vertices, obj.hull_faces, process=False)
     label = _merge_coplanar(mesh)
@@ -132,7 +133,7 @@ def _merge_coplanar(mesh: trimesh.Trimesh) -> Ints:
 
 def _edges(mesh: trimesh.Trimesh, label: Ints, normal: Floats, centre: Floats) -> tuple[Ints, Floats, Floats]:
     """Return each edge of each flat face: faces on both sides (E, 2), distances and extents (E,) [m].
-    The distance is that of the projected point inside the edge; the extent is the face's, across the edge."""
+    The distance is from the edge to the projected centre of mass; the extent is the face's width across the edge."""
     edges, pairs = mesh.face_adjacency_edges, mesh.face_adjacency
     corners = [np.unique(mesh.faces[label == face]) for face in range(int(label.max()) + 1)]
     sides, margins, widths = [], [], []
@@ -156,7 +157,7 @@ def settle(faces: RestingFaces, quaternion: Floats) -> tuple[int, float]:
     Start at the most downward face and tip over edges until a face is stable."""
     down = quat_rotate(np.asarray(quaternion) * np.array([1.0, -1, -1, -1]), np.array([0.0, 0.0, -1.0]))
     face = int(np.argmax(faces.normal @ down))
-    # Tipping lowers the centre of mass, so it ends; the bound guards against rounding on spheres.
+    # Each tip lowers the centre of mass, so the loop ends; the bound guards against rounding errors on spheres.
     for _ in range(len(faces.normal)):
         following = int(faces.successor[face])
         if following == face:

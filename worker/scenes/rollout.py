@@ -1,5 +1,5 @@
-"""Rollouts of candidates: in a scene clearance and a short lift, around a free object short pushes
-(`worker.validation.prescreening`). Candidates that pass get the validator's own test."""
+"""Rollouts of candidates: in a scene a clearance check and a short lift, around a free object short pushes
+(`worker.validation.prescreening`). Candidates that pass are validated in the whole test."""
 
 from __future__ import annotations
 
@@ -25,13 +25,14 @@ from graspd.worker.validation.lifting import KnownLifts, LiftLevel, validate_lif
 from graspd.worker.validation.prescreening import SLIPS, LiftRollouts, push_rollout
 from graspd.worker.validation.validator import KnownRollouts, validate
 
-#: Added to the score of a candidate that would lift but whose approach is blocked. It is worse than any with a free
-#: approach that drops the object, since most of these have one; better than a lost object.
+#: Added to the score of a candidate that would lift but whose approach is blocked. The sum is worse than the score of
+#: any candidate that drops the object after a free approach, since most grasps have a free approach. It is better than
+#: the score of a lost object.
 BLOCKED: Final = 8.0
-#: Added where only the validator sees contact on the approach, because the object's convex pieces stand out from it:
-#: level `dexgraspbench` does not test the approach.
+#: Added if only the validator detects contact on the approach: the object's convex pieces protrude from its surface.
+#: Level `dexgraspbench` does not test the approach.
 TOUCHES: Final = 2.0
-#: Penalty of a candidate that holds in the short rollout but does not lift, relative to one that lifts.
+#: Added to the score of a candidate that passes the short rollout but does not lift.
 FALLS: Final = 0.4
 #: Highest score of a candidate that lifts at half the friction.
 BEST: Final = 0.99
@@ -48,7 +49,8 @@ def rollout_on(
     level: Level = "standard",
 ) -> Callable[[GraspSet, PlacedGrasps | None, Floats], Floats] | None:
     """Return the rollout for `run`; None: the planner's loss decides. `known` caches verdicts of `level`.
-    Around free objects a GPU plans faster than the CPU simulates; in scenes it waits for the rollouts, on all threads.
+    Around free objects a GPU has no rollouts, because it plans faster than the CPU simulates. In scenes it waits for
+    the rollouts, which use all threads.
     """
     on_gpu = run.device.startswith("cuda")
     if not in_scenes:
@@ -93,8 +95,8 @@ def lift_rollout(
 ) -> Callable[[GraspSet, PlacedGrasps | None, Floats], Floats]:
     """Return a `worker.planners.Rollout` that scores grasps (N,) in scenes by short lifts.
     Scores are below 1 for grasps with a clear trajectory that lift at half friction, below 2 at full friction.
-    Candidates that hold the hanging object briefly get the validator's lift: a squeeze may turn an object out of the
-    hand slowly at first. `threads` are per call; planners on the CPU already call from all their threads."""
+    Candidates that hold the hanging object briefly are validated by the whole lift test, because a squeeze may turn
+    an object out of the hand slowly at first. `threads` are per call; on the CPU, planners already use all threads."""
     shorts, run = LiftRollouts(hand, obj, pieces, threads=threads), ExecutionContext(threads=threads)
 
     def rollout(grasps: GraspSet, placed: PlacedGrasps | None, beat: Floats | None = None) -> Floats:
@@ -102,7 +104,7 @@ def lift_rollout(
         beat = np.full(len(grasps), np.inf) if beat is None else beat
         grasps = grasps.moved(np.zeros(3))
         score = shorts.scores(grasps, placed, beat)
-        # Candidates that cannot beat the previous score are skipped.
+        # Skip candidates that cannot beat the previous score.
         held = np.flatnonzero((score < SLIPS + 1.0) & (score < beat))
         if not len(held):
             return score
@@ -135,12 +137,12 @@ def lift_rollout(
 
 Arrays = dict[str, NDArray[Any]]
 
-#: Clearances are capped at this [m].
+#: Larger clearances count as this [m].
 FARTHEST_M: Final = 1.0
 
 
 def lift_level(validation: str) -> LiftLevel:
-    """Return the level of the lift test for a job's validation; `dexgraspbench` stays itself in scenes."""
+    """Return the level of the lift test for a job's validation; `dexgraspbench` is also a level of scenes."""
     return "dexgraspbench" if validation == "dexgraspbench" else "lift"
 
 
@@ -156,11 +158,11 @@ def scene_verdicts(
     run: ExecutionContext,
 ) -> tuple[GraspSet, Arrays]:
     """Plan the trajectories of grasps in their scenes, and validate those that are clear.
-    Grasps that do not lift are not tested at half the friction. Without `pieces` grasps are only checked for clearance.
+    Grasps that do not lift are not tested at half the friction. Without `pieces`, only clearance is checked.
 
     Returns:
-        The grasps with `approach`, `coming`, `lift` and `wrist`; columns of the base shard, `quality/success` being the
-        verdict of the lift (-1: not clear)."""
+        The grasps with `approach`, `coming`, `lift` and `wrist`; and columns of the base shard, with the lift's
+        verdict in `quality/success` (-1: not clear)."""
     assert grasps.scene is not None
     placed = scenes.placed(grasps.scene)
     way = plan_way(hand, obj, grasps, placed)

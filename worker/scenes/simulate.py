@@ -26,24 +26,25 @@ from graspd.worker.objects.model import ObjectModel
 from graspd.worker.scenes import rest as resting
 from graspd.worker.scenes.rest import RestingFaces, lay_flat, resting_faces, same_face, settle
 
-#: Any density will do: the motion of a free body on a plane does not depend on it [kg/m^3].
+#: Density of the object; its value has no effect on the motion of a free body on a plane [kg/m^3].
 DENSITY: Final = 500.0
 TIMESTEP_S: Final = 0.002
-#: At rest, no point of the object moves faster than this for a whole window.
+#: At rest, no point of the object moves faster than this during a whole window.
 REST_SPEED: Final = 0.01
 REST_WINDOW_S: Final = 0.1
 TIMEOUT_S: Final = 4.0
 #: Gap between table and object at release [m].
 DROP_HEIGHT: Final = (0.005, 0.05)
-#: An object that rests farther from the middle of the table than this has rolled away [m].
+#: An object that rests farther than this from the middle of the table has rolled away [m].
 REACH: Final = 0.25
-#: Largest turn that may lay the object flat on its face; beyond it the object was not at rest [rad].
+#: Largest rotation that may lay the object flat on its face; a larger one means that it was not at rest [rad].
 MAX_SETTLE_ANGLE: Final = np.radians(5.0)
 MAX_ATTEMPTS: Final = 50
-#: Drops behind `scene/rest_probability`; a share of 64 is known to +-6 % (one standard deviation at one half).
+#: Number of drops behind `scene/rest_probability`; a share of 64 drops has a standard deviation of at most 6 %.
 REFERENCE_DROPS: Final = 64
 _REFERENCE_SEED: Final = 2**31
-#: Friction: sliding 0.8, and enough torsional and rolling friction (lengths, m) that a can or a ball stops on a cloth.
+#: Friction: sliding 0.8; torsional and rolling friction (lengths, m) at which a can or a ball comes to rest, as on
+#: cloth.
 _CONTACT: Final[dict[str, Any]] = {"friction": [0.8, 0.005, 0.002], "condim": 6, "solref": [0.006, 1]}
 
 
@@ -66,13 +67,13 @@ class _Table:
 def drop(obj: ObjectModel, *, count: int, seed: int) -> dict[str, Floats]:
     """Drop an object onto a table until it rests, `count` times.
 
-    Drops are redone with a new sample if they time out, roll away or end on no face that stays stable if the surface
-    changes by a millimetre. An object that rolls is laid on a steady face, see `steadied`. Scene i depends on the
-    object, the seed and i alone.
+    A drop is repeated with a new sample if it times out, if the object rolls away, or if no resting face is stable
+    under a change of the surface by one millimetre. An object that rolls is laid on a steady face, see `steadied`.
+    Scene i depends only on the object, the seed and i.
 
     Returns:
         `scene/object_pose` (S, 7) with the lowest point of the object at z = 0; `scene/rest_probability` (S,), the
-        share of `REFERENCE_DROPS` fixed drops (and this one) that rest on the same face; `scene/drop_seconds` (S,).
+        share of `REFERENCE_DROPS` reference drops (plus this one) on the same face; `scene/drop_seconds` (S,).
 
     Raises:
         InputError: count or seed is negative.
@@ -98,8 +99,8 @@ def steadied(
     obj: ObjectModel, faces: RestingFaces, face: int, pose: Floats, rng: np.random.Generator
 ) -> tuple[int, Floats]:
     """Return the face on which a centred object stays after coming to rest on `face`, and its pose (7,).
-    Where it may roll there, draw one of the faces of the reference drops on which it does not, with their frequency. An
-    object that is round on all of them stays as it lies."""
+    If it may roll there, draw one of the steady faces of the reference drops, with their frequency. If the object is
+    round on all of these faces, its pose is unchanged."""
     if not faces.rolls(face) or not (steady := _steady_faces(obj)):
         return face, pose
     chosen = int(rng.choice(steady))
@@ -107,12 +108,12 @@ def steadied(
 
 
 def rest_probability(obj: ObjectModel, faces: Sequence[int]) -> Floats:
-    """Return the share (S,) of `REFERENCE_DROPS` drops, and the scene's own, that rest on each face."""
+    """Return the share (S,) of drops on each face, over `REFERENCE_DROPS` drops and the scene's own drop."""
     return (reference_share(obj, faces) * REFERENCE_DROPS + 1.0) / (REFERENCE_DROPS + 1.0)
 
 
 def reference_share(obj: ObjectModel, faces: Sequence[int]) -> Floats:
-    """Return the share (S,) of `REFERENCE_DROPS` drops of the object alone that rest on each face."""
+    """Return the share (S,) of `REFERENCE_DROPS` drops of the object alone that end on each face."""
     if not faces:
         return np.zeros(0)
     obj = obj.centred
@@ -122,7 +123,7 @@ def reference_share(obj: ObjectModel, faces: Sequence[int]) -> Floats:
 
 @cached_by_content(64)
 def _reference_faces(obj: ObjectModel) -> tuple[int, ...]:
-    """Return the faces that the reference drops rest on: two seconds of computation, cached on disk."""
+    """Return the resting faces of the reference drops; two seconds of computation, cached on disk."""
     code = (sys.modules[__name__], resting)
 
     def drops() -> dict[str, NDArray[Any]]:
@@ -163,7 +164,7 @@ def spec_above_table(objects: Sequence[ObjectModel]) -> Any:
 
 
 def add_hull(spec: Any, body: Any, name: str, vertices: Floats, faces: NDArray[Any], **options: Any) -> None:
-    """Add a convex hull to a body of a MuJoCo specification, with options of the geom."""
+    """Add a convex hull to a body of a MuJoCo specification, with the geom's `options`."""
     mesh = spec.add_mesh(name=name, inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)
     mesh.uservert = np.asarray(vertices, np.float32).ravel()
     mesh.userface = np.asarray(faces, np.int32).ravel()
@@ -212,7 +213,7 @@ def _run(table: _Table) -> float | None:
     model, data, quiet = table.model, table.data, 0
     for step in range(round(TIMEOUT_S / TIMESTEP_S)):
         mujoco.mj_step(model, data)
-        # Velocity of the body frame's origin and spin in the body frame: the spin bounds the speed of any point.
+        # Linear velocity of the frame's origin, angular velocity in the body frame: it bounds the speed of any point.
         spin = data.qvel[3:]
         centre_velocity = data.qvel[:3] + quat_rotate(data.qpos[3:], np.cross(spin, table.obj.centre_of_mass))
         speed = np.linalg.norm(centre_velocity) + table.obj.radius * np.linalg.norm(spin)

@@ -1,11 +1,11 @@
 """Trajectories of the hand: from a standoff to the pregrasp, closing and lift, with their clearances.
 
-In a scene the lift goes against gravity. Around a free object it is the retreat along the approach. The hand's mounting
-must stay clear as the hand does, at wrist angles constant over the trajectory. Clearances are those of `body_room`:
-fingertips that may touch a support count as farther from it. They are exact against half-spaces. Against boxes and
+In a scene the lift is a motion against gravity; around a free object it is the retreat along the approach. The hand's
+mounting must be clear as well, at wrist angles that are constant over the trajectory. Clearances are those of
+`body_room`, with more tolerance for fingertips that may touch a support. They are exact for half-spaces. For boxes and
 neighbours' pieces they are distances of the hand's features from planes: exact at corners, else a lower bound.
 
-The approach in a scene has a direction and an opening of the hand that avoid contact with object and obstacles.
+The approach in a scene has a direction and an opening of the hand without contact with object and obstacles.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from graspd.worker.simulation.mounting import mounting_room, wrist_room
 from graspd.worker.simulation.obstacles import obstacle_room
 
 _POINTS: Final = 600
-#: Around a free object: tilts of the retreat from the palm's own direction [rad], each to so many sides.
+#: Around a free object: tilts of the retreat from the palm's own direction [rad], and the number of sides of each tilt.
 TILTS: Final = (0.4, 0.8, 1.2)
 SIDES: Final = 8
 #: Points of hand and object in the check of a trajectory around a free object.
@@ -47,7 +47,7 @@ class Trajectory:
     open: Floats
     """(N, J) joint positions of the open hand on its approach."""
     lift: Posture
-    """N squeeze postures raised against gravity."""
+    """N squeeze postures moved up against gravity."""
     contact: Floats
     """(N,) least clearance from obstacles at the grasp [m]."""
     closing: Floats
@@ -61,8 +61,8 @@ class Trajectory:
     wrist: Floats
     """(N, K) angles of the wrist above the hand's root; K is 0 where it has none."""
     mounting: Floats
-    """(N,) least clearance of the hand's mounting at the grasp, in closing and on the lift [m].
-    On the approach it is part of the hand."""
+    """(N,) least clearance of the hand's mounting at the grasp, while the hand closes, and on the lift [m].
+    On the approach the mounting counts as part of the hand."""
 
     @property
     def least(self) -> Floats:
@@ -77,7 +77,7 @@ class Trajectory:
 
 
 def plan_way(hand: HandModel, obj: ObjectModel, grasps: GraspSet, placed: PlacedGrasps) -> Trajectory:
-    """Plan each grasp's trajectory in its scene: the first free direction of retreat, else the freest."""
+    """Plan each grasp's trajectory in its scene: the first free direction of retreat, else the one with most space."""
     probe = probe_of(hand, obj, hand_points=_POINTS, object_points=64)
     count, scenes, which = len(grasps), placed.scenes, np.asarray(placed.index, np.intp)
     rise = RISE_M * np.array([scene.up for scene in scenes])[which]
@@ -106,9 +106,9 @@ def plan_way(hand: HandModel, obj: ObjectModel, grasps: GraspSet, placed: Placed
 
 
 def plan_free_way(hand: HandModel, obj: ObjectModel, grasps: GraspSet) -> Trajectory:
-    """Plan trajectories around an object that stands alone: a retreat of `STANDOFF_M` free of the object.
-    The palm's own direction of retreat comes first, then directions ever farther from it. `lift` is the squeeze posture
-    after that retreat, with the object in hand. There are no obstacles, so all clearances are infinite."""
+    """Plan trajectories around a free object: a retreat of `STANDOFF_M` without contact with the object.
+    The palm's own direction of retreat is tested first, then directions with larger and larger tilt. `lift` is the
+    squeeze posture after that retreat, with the object in hand. Without obstacles all clearances are infinite."""
     hand_points, object_points = _FREE_POINTS
     probe = probe_of(hand, obj, hand_points=hand_points, object_points=object_points)
     nowhere = PlacedGrasps((), IDENTITY_POSE[None], np.zeros(len(grasps), np.intp))
@@ -135,13 +135,13 @@ def _opened(probe: Probe, pregrasp: Posture, joints: Floats) -> Posture:
 
 
 def _unit(ways: Floats, instead: Floats) -> Floats:
-    """Return unit directions (n, 3); `instead` for zero vectors."""
+    """Normalise vectors (n, 3); zero vectors become `instead`."""
     length = np.linalg.norm(ways, axis=1, keepdims=True)
     return np.where(length > 1e-6, ways / np.maximum(length, 1e-6), instead)
 
 
 def _tilted(axis: Floats, tilt: float, side: int) -> Floats:
-    """Return unit vectors (n, 3) tilted by `tilt` [rad] from axes (n, 3), towards one of `SIDES` sides."""
+    """Return unit vectors (n, 3) tilted by `tilt` [rad] from axes (n, 3), to the side of the number `side`."""
     least = np.eye(3)[np.argmin(np.abs(axis), axis=1)]
     across = _unit(np.cross(axis, least), least)
     leaning = quat_rotate(quat_from_axis_angle(across, np.full(len(axis), tilt)), axis)
@@ -149,7 +149,7 @@ def _tilted(axis: Floats, tilt: float, side: int) -> Floats:
 
 
 def _retreat(hand_pose: Floats, way: Floats, steps: int) -> Floats:
-    """Return poses (n, steps, 7) from `STANDOFF_M` along ways (n, 3) to the hands' poses."""
+    """Return poses (n, steps, 7) from `STANDOFF_M` along directions `way` (n, 3) to the hands' poses."""
     poses = np.repeat(hand_pose[:, None], steps, axis=1)
     poses[..., :3] += np.linspace(STANDOFF_M, 0.0, steps)[:, None] * way[:, None]
     return poses
@@ -158,8 +158,8 @@ def _retreat(hand_pose: Floats, way: Floats, steps: int) -> Floats:
 def _coming(
     probe: Probe, pregrasp: Posture, scene: Environment, ways: Sequence[Floats]
 ) -> tuple[Floats, Floats, NDArray[np.bool_], Floats]:
-    """Return approaches along the first of `ways`, (n, 3) each, that is free, or else the freest.
-    Waypoints (n, W, 7), least clearance (n,), contact with the object (n,), and direction of retreat (n, 3)."""
+    """Return approaches along the first free direction of `ways`, (n, 3) each, or else the one with most clearance.
+    The result has waypoints (n, W, 7), least clearance (n,), contact with the object (n,), and direction (n, 3)."""
     count, looks = len(pregrasp), (WAYPOINTS - 1) * LOOKS + 1
     best = np.full(count, -np.inf)
     least = np.zeros(count)
@@ -173,7 +173,7 @@ def _coming(
         postures = Posture(poses.reshape(-1, 7), joints)
         room = obstacle_room(probe.hand, postures, [scene]).reshape(len(open_), looks).min(axis=1)
         gap = _gaps(probe, postures).reshape(len(open_), looks)
-        # The pregrasp itself may be closer than the margin: the approach must not be closer than it.
+        # The pregrasp itself may be closer than the margin; the approach may be as close, but not closer.
         hits = gap[:, :-1].min(axis=1) < np.minimum(OBJECT_MARGIN_M, gap[:, -1]) - 5e-4
         score = np.minimum(room, MARGIN_M) - hits
         better = score > best[open_]
@@ -191,20 +191,20 @@ def _gaps(probe: Probe, postures: Posture) -> Floats:
     return np.minimum(found.distance.min(axis=1), found.piece_distance.min(axis=1))
 
 
-#: Least and wanted distance of hand points from the object on the approach [m]. Between checked points, and where the
-#: object's convex pieces stand out, it is less.
+#: Least and preferred distance of hand points from the object on the approach [m]. The true distance is smaller
+#: between checked points, and where the object's convex pieces protrude.
 OBJECT_MARGIN_M: Final = 0.001
 OBJECT_WANTED_M: Final = 0.004
-#: The hand on its approach may be this much closer to the object than at its pregrasp [m].
+#: On its approach the hand may be closer to the object than at its pregrasp, by at most this [m].
 NEARER_M: Final = 5e-4
-#: Postures stored on the approach, from standoff to pregrasp; number of checks between two of them, and while the hand
-#: closes to the pregrasp.
+#: Number of postures stored on the approach, from standoff to pregrasp; number of checks between two of them; number of
+#: checks while the hand closes to the pregrasp.
 WAYPOINTS: Final = 6
 LOOKS: Final = 4
 _CLOSING: Final = 4
-#: Directions of retreat to try: the palm's own, mixed with these shares of the direction against gravity.
+#: Directions of retreat to test: the palm's own, mixed with these shares of the direction against gravity.
 SHARES_UP: Final = (0.0, 0.25, 0.5, 0.75, 1.0)
-#: Openings of the hand, as shares from the pregrasp to wide open. Each is tried with all directions.
+#: Openings of the hand, as shares of the range from the pregrasp to wide open. Each is tested with all directions.
 OPENNESS: Final = (1.0, 0.5, 0.0)
 
 
@@ -240,7 +240,7 @@ def _seen(
     probe: Probe, pregrasp: Posture, opened: Floats, wrist: Floats, way: Floats, placed: PlacedGrasps
 ) -> tuple[Floats, Floats]:
     """Return least clearances (n,) of open hands and mountings that retreat along `way` (n, 3).
-    Also the least distances (n,) of hands from the object until they have closed to the pregrasp."""
+    Also return the least distances (n,) of hands from the object until they have closed to the pregrasp."""
     count, looks = len(pregrasp), (WAYPOINTS - 1) * LOOKS + 1
     poses = np.repeat(pregrasp.hand_pose[:, None], looks + _CLOSING, axis=1)
     poses[:, :looks, :3] += np.linspace(STANDOFF_M, 0.0, looks)[:, None] * way[:, None]
@@ -253,7 +253,7 @@ def _seen(
     free = room.reshape(count, looks).min(axis=1)
     rows = np.flatnonzero(free >= MARGIN_M)
     if (mounting := probe.hand.mounting) is not None and len(rows):
-        # A mounting is thicker than a finger: it is checked half as often, where the hand itself is clear.
+        # A mounting is thicker than a finger: half as many checks suffice, and only if the hand itself is clear.
         mounted = wrist_room(mounting, poses[rows, :looks:2], wrist[rows], scenes, which[rows])
         free[rows] = np.minimum(free[rows], mounted)
     # Larger distances count equally.
@@ -264,7 +264,7 @@ def _seen(
     for part in (fingers, ~fingers):
         if part.any():
             near = gap[..., part].min(axis=2)
-            # The pregrasp itself may be closer than wanted: the approach must not be closer than it.
+            # The pregrasp itself may be closer than preferred; the approach may be as close, but not closer.
             short = near[:, :-1].min(axis=1) - np.minimum(OBJECT_WANTED_M, near[:, -1] - NEARER_M)
             least = np.minimum(least, OBJECT_WANTED_M + short)
     return free, least

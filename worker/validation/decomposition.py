@@ -1,8 +1,8 @@
-"""Convex decomposition of objects by CoACD (Wei et al. 2022), measured before use, cached on disk.
+"""Convex decomposition of objects by CoACD (Wei et al. 2022), with a check of its quality, cached on disk.
 
-The validator's engine sees only the pieces. Pieces that fill a hollow therefore falsify every grasp of it. Count,
-volume ratio and excess are stored with every verdict; a large excess is refused. The excess is the volume that the
-union of the pieces adds, divided by the object's surface area: the mean height of the added material.
+The validator's engine simulates only the pieces. Pieces that fill a hollow therefore falsify every verdict on it.
+Count, volume ratio and excess are stored with every verdict; pieces with a large excess are refused. The excess is the
+volume added by the union of the pieces, divided by the object's surface area: the mean height of the added material.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ from graspd.worker.objects.topology import face_areas
 
 log = logging.getLogger(__name__)
 
-#: Pieces with at most this mean excess are good [m]: verdicts are insensitive to a smaller one.
+#: Pieces with at most this mean excess are good [m]: a smaller excess hardly changes verdicts.
 GOOD_EXCESS_M: Final = 8.5e-4
 #: Largest accepted mean excess [m].
 MAX_EXCESS_M: Final = 2e-3
-#: CoACD's concavity thresholds from coarse to fine; the first with good pieces is used.
+#: CoACD's concavity thresholds from coarse to fine; the first that gives good pieces is used.
 THRESHOLDS: Final = (0.1, 0.05, 0.03)
 MAX_PIECES: Final = 64
-#: Preprocessing inflates near-convex scans by 9 to 17 % and takes a minute; our meshes are closed already.
+#: CoACD's preprocessing is off: it inflates near-convex scans by 9 to 17 % and takes a minute; meshes are closed here.
 _COACD: Final = {
     "preprocess_mode": "off",
     "resolution": 1000,
@@ -52,7 +52,7 @@ _COACD: Final = {
 }
 #: CPU time limit of one CoACD run [s]; beyond it the coarser result is used and a warning is logged.
 CPU_S: Final = 300
-#: Pieces below this volume are splinters that the engine cannot build [m^3].
+#: Pieces below this volume are splinters that MuJoCo cannot build [m^3].
 _MIN_VOLUME: Final = 1e-9
 
 
@@ -104,7 +104,7 @@ def decompose(obj: ObjectModel, *, cache: Path | None = None) -> ConvexPieces:
 
 
 def piece_file(obj: ObjectModel, cache: Path | None = None) -> Path:
-    """Return the cache file of an object's pieces; its stem is a digest of all that determines them."""
+    """Return the cache file of an object's pieces; its stem is a digest of everything that determines them."""
     mesh = obj.centred
     shape = hashlib.sha256(mesh.vertices.tobytes() + mesh.faces.tobytes()).hexdigest()
     settings = [_COACD, THRESHOLDS, GOOD_EXCESS_M, version_of("coacd")]

@@ -1,7 +1,8 @@
-"""Simulated displacement: slip of an object in a rigid hand in 0.15 s of gravity (Hasson et al. 2019).
+"""Simulated displacement of an object in a rigid hand during 0.15 s of gravity (Hasson et al. 2019).
 
-The hand is fixed in its grasp posture. The object, of 1 kg and friction 3, falls along -z of its frame for 35 steps of
-1/240 s. Free fall is 10.7 cm. The protocol was made for PyBullet, with a restitution of 0.5 that MuJoCo does not have.
+The hand is fixed in its grasp posture. The object has 1 kg and friction 3; gravity acts along -z of its frame for 35
+steps of 1/240 s. In free fall it would move by 10.7 cm. The protocol was made for PyBullet, with a restitution of 0.5;
+MuJoCo has no restitution.
 """
 
 from __future__ import annotations
@@ -67,7 +68,7 @@ def _model(hand: HandModel, obj: ObjectModel, pieces: ConvexPieces) -> Any:
     spec.option.gravity = [0, 0, -GRAVITY]
     friction = [FRICTION, 0.005, 1e-4]
     for b in range(hand.bodies):
-        # Mocap bodies do not move by themselves: one model serves all grasps.
+        # Mocap bodies move only on command, so one model serves all grasps.
         body = spec.worldbody.add_body(name=f"body{b}", mocap=True)
         for i, piece in enumerate(hand.pieces):
             if piece.body == b:

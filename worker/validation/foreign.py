@@ -1,7 +1,7 @@
-"""Verdicts in another model of the same hand: planned with one model, validated with the other.
+"""Verdicts in another model of the same hand: grasps planned with one model are validated in the other.
 
-The mechanism comes from the other model: shapes, masses, joint frames, limits, couplings, armature and dry friction.
-The controller belongs to the grasp: commanded postures, gains, torque limits and, with the gains, the damping.
+The other model provides the mechanism: shapes, masses, joint frames, limits, couplings, armature and dry friction. The
+grasp's own model provides the controller: commanded postures, gains, torque limits and, with the gains, the damping.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ class ForeignVerdicts:
     same: SameHand
 
     def facts(self) -> dict[str, Any]:
-        """Return validation_hand, the other model's name; fingertips_mm, its fingertips' distance from ours;
-        foreign_key, terms of its verdicts; and `share_counts`."""
+        """Return validation_hand, the other model's name; fingertips_mm, the distance of its fingertips from those of
+        the grasp's model; foreign_key, the terms of its verdicts; and `share_counts`."""
         a, b = self.nominal.success == 1, self.foreign.success == 1
         return {
             "validation_hand": self.same.theirs.name,
@@ -53,9 +53,9 @@ class ForeignVerdicts:
 
 
 def share_counts(held: Mapping[str, int]) -> dict[str, Any]:
-    """Return shares from counts of grasps that hold in both models, in one alone, or in neither.
-    foreign_held: the counts; agreement: share with the same verdict in both; foreign_share: of the grasps that hold
-    nominally, the share that holds in the other model; foreign_gsr: the share of all that does. None: no grasps."""
+    """Return shares from counts of grasps that hold in both models, in one alone, or in neither; None: no grasps.
+    foreign_held: the counts. agreement: share of grasps with the same verdict in both models. foreign_share: share of
+    nominally held grasps that also hold in the other model. foreign_gsr: share of all grasps that hold in it."""
     n, nominal = sum(held.values()), held["both"] + held["nominal"]
 
     def share(part: int, whole: int) -> float | None:
@@ -78,7 +78,7 @@ def foreign_verdicts(
     pieces: ConvexPieces,
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> ForeignVerdicts:
-    """Validate grasps of `same.ours` in the other model, on the terms of their nominal verdicts."""
+    """Validate grasps of `same.ours` in the other model, with the settings of their nominal verdicts."""
     level = cast(Level, nominal.level)
     moved = in_other_model(same, grasps)
     found = validate(driven_as(same), obj, moved, level=level, hard=nominal.hard, pieces=pieces, run=run)
@@ -86,10 +86,10 @@ def foreign_verdicts(
 
 
 def driven_as(same: SameHand) -> HandModel:
-    """Return the other model with the gains and limits of ours.
-    A dof of gain k and limit e that moves n joints by m_i gives each of them the gain k / (n m_i^2) and the limit
-    e / (n |m_i|). It takes sum(m_i^2 k_i) and sum(|m_i| e_i) from joints. So the drive along the joints' common
-    motion stays the same, whether a model turns them as one or hangs them on a tendon of equal pulls."""
+    """Return the other model with the gains and limits of `same.ours`. A dof with gain k and limit e that moves n
+    joints by m_i gives each joint the gain k / (n m_i^2) and the limit e / (n |m_i|). Conversely, its gain and limit
+    are sum(m_i^2 k_i) and sum(|m_i| e_i) of its joints. So the drive along the joints' common motion is the same,
+    whether a model couples them or connects them by a tendon."""
     ours, theirs = same.ours, same.theirs
     gain, limit = _of_joints(ours)
     gain, limit = gain[same.joints], limit[same.joints]
@@ -120,7 +120,7 @@ def in_other_model(same: SameHand, grasps: GraspSet) -> GraspSet:
 
 
 def with_our_shapes(same: SameHand) -> HandModel:
-    """Return the other model with our collision shapes, to isolate the effect of shapes on verdicts."""
+    """Return the other model with the collision shapes of `same.ours`: isolates the effect of shapes on verdicts."""
     there = np.zeros(same.ours.bodies, np.intp)
     there[same.bodies] = np.arange(same.theirs.bodies)
     frames = invert(same.frames)[there]
@@ -128,7 +128,7 @@ def with_our_shapes(same: SameHand) -> HandModel:
 
 
 def with_their_shapes(same: SameHand) -> HandModel:
-    """Return our model with the collision shapes of the other."""
+    """Return `same.ours` with the collision shapes of the other model."""
     pieces = tuple(_moved(p, int(same.bodies[p.body]), same.frames[p.body]) for p in same.theirs.pieces)
     return _dressed(same.ours, pieces)
 

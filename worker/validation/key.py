@@ -1,5 +1,4 @@
-"""Key of a verdict: digest of everything that affects it.
-Rates of verdicts with different keys are not comparable."""
+"""Key of a verdict: digest of everything that affects it. Success rates with different keys are not comparable."""
 
 from __future__ import annotations
 
@@ -22,12 +21,12 @@ from graspd.worker.validation.decomposition import ConvexPieces
 
 Level = Literal["dexgraspbench", "standard", "fast"]
 
-#: Increase when the code of the protocol or of the scene changes verdicts, constants aside.
+#: Increase when a change of the protocol's or the scene's code, other than a constant, changes verdicts.
 REVISION: Final = 6
 
 _EARLY: Final = ("FIRST_LOOK_S", "INTERVAL_S", "SURE", "LOST_ROTATION")
-#: Constants that affect a verdict, by module, and those that only one level reads. Other constants of these modules
-#: affect none.
+#: Constants that affect a verdict, by module; below, those that only one level uses. Other constants of these modules
+#: affect no verdict.
 MOVES: Final[dict[ModuleType, tuple[str, ...]]] = {
     protocol: ("DIRECTIONS", "MAX_DISPLACEMENT_M", "MAX_ROTATION", "MAX_PENETRATION_M", "STAGES", "STAGE_S", "HOLD_S"),
     matter: ("ACCELERATION",),
@@ -71,10 +70,10 @@ LEVEL_MOVES: Final[dict[Level, dict[ModuleType, tuple[str, ...]]]] = {
 def verdict_key(
     hand: HandModel, obj: ObjectModel, level: Level, hard: bool, *, pieces: ConvexPieces, prefilter: Sequence[Any] = ()
 ) -> str:
-    """Return the digest of the terms of a verdict: all that determines it except the grasp's postures.
+    """Return the digest of the terms of a verdict: everything that determines it except the grasp's postures.
     It covers level, friction, masses, gains and torque limits, the rules of pregrasp and squeeze, shapes of the hand,
     convex pieces of the object, the constants of `MOVES` and of the level, version of the engine; and `prefilter`,
-    the prefilter's terms where it takes part."""
+    the prefilter's terms if it is used."""
     shapes = b"".join(np.round(p.vertices, 9).tobytes() + np.round(p.pose, 9).tobytes() for p in hand.pieces)
     return digest_json(
         {
@@ -89,9 +88,9 @@ def verdict_key(
             "pieces": pieces.digest,
             "physics": asdict(model.MujocoOptions().hardened() if hard else model.MujocoOptions()),
             "constants": [_values(MOVES), _values(LEVEL_MOVES[level])],
-            # Only for grippers: the keys of hands stay unchanged.
+            # Only for grippers, so that the keys of other hands stay unchanged.
             **({"several_contacts": flag} if (flag := model.several_contacts(hand)) else {}),
-            # Only for hands with tendons, likewise.
+            # Only for hands with tendons, for the same reason.
             **({"tendons": [[*t.dofs, *t.coefficients] for t in hand.tendons]} if hand.tendons else {}),
             **({"drag": [hand.drag.armature.tolist(), hand.drag.dry_friction.tolist()]} if hand.drag else {}),
             **({"prefilter": list(prefilter)} if prefilter else {}),

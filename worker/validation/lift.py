@@ -1,10 +1,10 @@
 """The lift test: the object rests in its scene; the hand closes, squeezes, lifts and holds it.
 
 dexgraspbench: DexGraspBench's tabletop test as published: from the pregrasp, 1 N down, 10 cm up in 0.4 s, no hold.
-lift: the hand comes from its standoff and must touch nothing on its approach. Fingertips may touch supports, or press
-into them as deep as the scene allows. It rises smoothly in 0.8 s and holds for 2 s, with level standard's early end.
-Neighbours are free bodies on the table; at level lift they must not move by 2 cm or topple.
-The world of the simulation is the object frame; the scene is placed under it as when the object came to rest.
+lift: the hand starts at its standoff and must touch nothing on its approach. Fingertips may touch supports, or press
+into them as deep as the scene allows. The hand rises smoothly in 0.8 s and holds for 2 s, with early termination as at
+level standard. Neighbours are free bodies on the table; they must not move by 2 cm or topple.
+The world frame of the simulation is the object frame at rest; the scene is placed around it accordingly.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ from graspd.worker.simulation.environment import RISE_M, PlacedGrasps
 from graspd.worker.validation.model import Scene, blend
 from graspd.worker.validation.protocol import MAX_PENETRATION_M, MAX_ROTATION, STAGE_S, STAGES, Outcome, Rollout, Test
 
-#: Largest displacement [m] and tilt [rad] of a neighbour; it may turn about the vertical.
+#: Largest displacement [m] and tilt [rad] of a neighbour; rotation about the vertical is allowed.
 NEIGHBOUR_MOVED_M: Final = 0.02
 NEIGHBOUR_TILTED: Final = MAX_ROTATION
-#: Postures checked between two waypoints of an approach.
+#: Number of postures checked between two waypoints of an approach.
 LOOKS: Final = 4
-#: Largest penetration of the open hand into the object's convex pieces on its approach [m]: where the hand is clear of
-#: the object's surface, the pieces stand out by up to this much. Supports are exact.
+#: Largest penetration of the open hand into the object's convex pieces on its approach [m]: the pieces protrude by up
+#: to this much from a surface that the hand does not touch. Supports are exact.
 OVERHANG_M: Final = 0.002
-#: Steps of the rise, their length [s], and the share of the rise after each: minimum jerk (Flash and Hogan, "The
-#: coordination of arm movements", 1985), at most 0.9 m/s2 for 10 cm in 0.8 s. A published stage commands 25 m/s2.
+#: Number of steps of the rise, their length [s], and the share of the rise after each: minimum jerk (Flash and Hogan,
+#: "The coordination of arm movements", 1985), at most 0.9 m/s2 for 10 cm in 0.8 s. The published test has 25 m/s2.
 RISING: Final = 100
 RISING_S: Final = 0.008
 #: Steps of the rise between two checks for a lost object.
@@ -58,7 +58,7 @@ class LiftOutcome(IntEnum):
 class LiftTest:
     outcome: LiftOutcome = LiftOutcome.NOT_TRIED
     margin: float = 0.0
-    """Worst displacement or rotation from the commanded pose over its limit, from the lift's end on."""
+    """Worst displacement or rotation from the commanded pose over its limit, after the end of the lift."""
     steps: int = 0
 
     @property
@@ -77,7 +77,7 @@ class Lift(Test):
         self._beside = placed.neighbours_of(0)
 
     def dexgraspbench(self, grasps: GraspSet, row: int) -> LiftTest:  # type: ignore[override]
-        """Run the published test: the object's world pose is checked once, after the rise."""
+        """Run the published test: one check of the object's world pose, after the rise."""
         self._in_hand = False
         if (rollout := self._begin(grasps, row)).outcome is not LiftOutcome.NOT_TRIED:
             return rollout
@@ -108,7 +108,7 @@ class Lift(Test):
         return rollout
 
     def _begin(self, grasps: GraspSet, row: int) -> LiftTest:
-        """Set up the grasp's scene, object at rest; gravity acts on the object alone, as published."""
+        """Set up the grasp's scene with the object at rest; gravity acts on the object alone, as published."""
         self._steps, number = 0, int(self.placed.index[row])
         self._scene_pose = invert(np.asarray(self.placed.object_pose[number], float))
         self._up = self.placed.scenes[number].up
@@ -169,7 +169,7 @@ class Lift(Test):
         return bool((distance < -allowed)[on_support].any() or (distance[of_hand & ~on_support] < -OVERHANG_M).any())
 
     def _rise(self, grasps: GraspSet, row: int, path: Floats = SMOOTHLY, step_s: float = RISING_S) -> None:
-        """Raise the root to the top; except at level dexgraspbench, stop where the object is lost."""
+        """Raise the root to the top; except at level dexgraspbench, stop as soon as the object is lost."""
         root = np.asarray(grasps.squeeze.hand_pose[row], float)
         self.scene.command(self.data, root, grasps.squeeze.joint_positions[row])
         for number, share in enumerate(path):
@@ -192,9 +192,10 @@ class Lift(Test):
         return turned if yielded is None else quat_multiply(quat_conjugate(yielded[1]), turned)
 
     def _yielded(self) -> tuple[Floats, Floats] | None:
-        """Return the root's position (3,) and its rotation (4,) from the command; None: fixed or irrelevant.
-        The protocol's weld yields by 10 degrees under a hammer, which no arm does: an object that only follows the hand
-        has not moved in it."""
+        """Return the root's position (3,) and its rotation (4,) relative to the command.
+        None: the root is fixed, or the object is not in the hand.
+        The protocol's weld yields by 10 degrees under a hammer, unlike an arm. An object that only follows this
+        deviation has not moved in the hand."""
         at = self.scene.root_qpos
         if at < 0 or not self._in_hand:
             return None

@@ -28,7 +28,7 @@ LiftLevel = Literal["dexgraspbench", "lift"]
 #: Finished lifts, by `lift_of`.
 KnownLifts = dict[str, LiftTest]
 LEVELS: Final[tuple[LiftLevel, ...]] = get_args(LiftLevel)
-#: Increase when the code of the lift test changes verdicts, constants aside.
+#: Increase when a change of the lift test's code, other than a constant, changes verdicts.
 REVISION: Final = 4
 _MOVES: Final = {surroundings: ("RISE_M",), protocol: ("LOOKS", "OVERHANG_M", "LOSSES"), postures: ("ROOM_M", "WIDE")}
 
@@ -72,13 +72,13 @@ def validate_lifts(
         obj: the object, with its mass and friction; `ObjectModel.published` has those of the protocol.
         grasps: N grasps with pregrasp, squeeze and, for level lift, approach.
         placed: their scenes; `index` has one for each grasp.
-        hard: sliding friction halved, torsional friction a tenth, of supports too.
+        hard: sliding friction halved, torsional friction a tenth; also for supports.
         pieces: convex pieces of the object; by default its CoACD pieces.
-        known: finished lifts of this hand, object and level, which are reused; new ones are added.
+        known: finished lifts of this hand, object and level, which are reused; new ones are added to it.
         run: receives the number of finished grasps; polled for cancellation between grasps.
 
     Raises:
-        InputError: unknown level, or no scene or approach to lift from.
+        InputError: unknown level, or a grasp has no scene or approach.
         MeshError: the object has no usable convex pieces.
         TaskCancelled: `run.cancelled()` returned True.
     """
@@ -122,7 +122,7 @@ def lift_of(grasps: GraspSet, row: int, placed: PlacedGrasps, *, hard: bool) -> 
 
 
 def require_ways(grasps: GraspSet, placed: PlacedGrasps, level: LiftLevel) -> None:
-    """Raise InputError for an unknown level, or where a grasp has no scene or approach to lift from."""
+    """Raise InputError for an unknown level, or if a grasp has no scene or approach."""
     if level not in LEVELS:
         raise InputError(f"unknown level {level!r} of the lift test; choose one of {', '.join(LEVELS)}")
     if len(placed.index) != len(grasps) or (level == "lift" and grasps.approach is None):
@@ -132,7 +132,7 @@ def require_ways(grasps: GraspSet, placed: PlacedGrasps, level: LiftLevel) -> No
 def lift_key(
     hand: HandModel, obj: ObjectModel, placed: PlacedGrasps, level: LiftLevel, hard: bool, *, pieces: ConvexPieces
 ) -> str:
-    """Return the digest of a lift's terms: those of the six pushes, the supports, the lift's constants."""
+    """Return the digest of a lift's terms: those of the push test, the supports, and the lift's constants."""
     pushes = verdict_key(hand, obj, "dexgraspbench" if level == "dexgraspbench" else "standard", hard, pieces=pieces)
     supports = b"".join(np.round(s.planes, 9).tobytes() for s in placed.supports)
     constants = {name: getattr(module, name) for module, names in _MOVES.items() for name in names}

@@ -31,14 +31,15 @@ HARD: Final = (0.5, 0.1)
 DAMPING_TIME: Final = 0.02
 HAND_SOLIMP: Final = (0.5, 0.99, 1e-4, 0.5, 2.0)
 HAND_SOLREF: Final = (0.005, 1.0)
-#: Couplings are stiffer than contacts, or a pressed finger would stretch them; 2 steps is MuJoCo's floor.
+#: Time constant of couplings: stiffer than contacts, or a pressed finger would stretch them; 2 steps is MuJoCo's
+#: minimum.
 COUPLING_SOLREF: Final = (0.008, 1.0)
 COUPLING_SOLIMP: Final = (0.98, 0.999, 1e-4, 0.5, 2.0)
-#: Defaults of today's engine that version 3.3.2, pinned by DexGraspBench, does not have: several contacts for a pair
-#: of convex pieces, and a solver for each island of contacts.
+#: Features of today's MuJoCo that version 3.3.2, pinned by DexGraspBench, lacks. They are off here: several contacts
+#: for a pair of convex pieces, and a solver for each island of contacts.
 NOT_IN_3_3_2: Final = int(mujoco.mjtDisableBit.mjDSBL_MULTICCD) | int(mujoco.mjtDisableBit.mjDSBL_ISLAND)
-#: Degrees of freedom from which sparse Jacobians cost less; the engine's own rule is 60. Lifts take .77 of the time
-#: with 28 (Allegro), .73 with 34 (Shadow); 1.09 with 20 (Barrett). Verdicts are the same except for rounding.
+#: Degrees of freedom from which sparse Jacobians cost less; MuJoCo's own rule is 60. With sparse Jacobians lifts take
+#: .77 of the time for 28 dofs (Allegro), .73 for 34 (Shadow), 1.09 for 20 (Barrett). Verdicts differ only by rounding.
 SPARSE: Final = 24
 #: A body without geometry has the inertia of a ball of this radius [m].
 _BARE_RADIUS: Final = 0.01
@@ -54,18 +55,18 @@ class MujocoOptions:
     timestep: float = 0.004
     noslip_iterations: int = 2
     root: str = "weld"
-    """weld: free root held to a mocap body (the protocol); fixed: the root itself is the mocap body."""
+    """weld: free root, welded to a mocap body (the protocol); fixed: the root itself is the mocap body."""
     friction: tuple[float, float] = FRICTION
     """Sliding and torsional friction with an object of `FRICTION`; scaled for other objects."""
 
     def hardened(self) -> MujocoOptions:
-        """Return the options with the friction of the hard protocol."""
+        """Return the options with the friction of the hard protocol, `HARD`."""
         slide, twist = self.friction
         return replace(self, friction=(slide * HARD[0], twist * HARD[1]))
 
 
-#: Coarse physics for the clear cases at level fast. At 6 ms a contact is as stiff as at 4 ms (two steps are less than
-#: the 12.5 ms of hand and object contacts), at 8 ms it is not.
+#: Coarse physics for clear cases at level fast. Up to 6 ms, two steps are shorter than the 12.5 ms time constant of
+#: contacts between hand and object, so contacts are as stiff as at 4 ms; at 8 ms they are softer.
 COARSE: Final = MujocoOptions(timestep=0.006, root="fixed")
 
 
@@ -94,10 +95,10 @@ class Scene:
     joint_qpos: NDArray[np.intp]
     """(J,) in `HandModel.joint_names` order."""
     dof_gain: Floats
-    """(D,) value of each dof's leading joint = gain q + shift."""
+    """(D,) `dof_gain * q + dof_shift` is the position of each dof's leading joint."""
     dof_shift: Floats
     pulls: Floats | None
-    """(A, D) controls of the actuators from these values; None: they are the values."""
+    """(A, D) matrix from these values to the actuators' controls; None: both are equal."""
     centre: Floats
     """(3,) the object's centre of mass in the object frame."""
     mass: float
@@ -106,7 +107,7 @@ class Scene:
     neighbours: tuple[FreeBody, ...]
     tip_geoms: NDArray[np.bool_]
     pressing: Floats
-    """(G,) how deep approaching fingertips may press into a geom [m]; above 0 where supports allow it."""
+    """(G,) depth by which fingertips on their approach may press into a geom [m]; above 0 where supports allow it."""
 
     @property
     def push(self) -> float:
@@ -201,7 +202,7 @@ def scene_spec(
     """Return the spec that `build` compiles.
     Names: `body0` ..., `joint1` ..., `dof0` ... (actuators), object, supports, `neighbour0` ..."""
     spec = mujoco.MjSpec()
-    # MJCF angles are degrees by default: radians would freeze every finger silently.
+    # MJCF angles are degrees by default: limits in radians would lock every finger without an error.
     spec.compiler.degree = False
     option = spec.option
     option.timestep = physics.timestep
@@ -223,8 +224,8 @@ def scene_spec(
 
 
 def several_contacts(hand: HandModel) -> int:
-    """Return the flags of `NOT_IN_3_3_2` that a gripper needs: its flat pads touch flat sides in an area.
-    On a single contact point the object would turn as no real one does. The protocol was made for rounded fingers."""
+    """Return the flags of `NOT_IN_3_3_2` that a gripper needs: its flat pads touch flat sides over an area.
+    With a single contact point the object would rotate unrealistically. The protocol was made for rounded fingers."""
     return int(mujoco.mjtDisableBit.mjDSBL_MULTICCD) if jaws_of(hand) is not None else 0
 
 
@@ -268,7 +269,7 @@ def _add_joint(body: Any, hand: HandModel, b: int) -> None:
 
 def _mechanism(hand: HandModel, b: int, d: int) -> dict[str, Any]:
     """Return joint properties that the protocol lacks.
-    A tendon drives a joint permanently against its limit, which therefore is as stiff as a coupling."""
+    A tendon presses a joint permanently against its limit; the limit is therefore as stiff as a coupling."""
     found: dict[str, Any] = {}
     if hand.drag is not None:
         found |= {"armature": float(hand.drag.armature[b]), "frictionloss": float(hand.drag.dry_friction[b])}
@@ -335,7 +336,7 @@ def _add_actuators(spec: Any, hand: HandModel) -> None:
             if d == min(tendon.dofs):
                 _add_tendon(spec, hand, tendon, f"dof{d}", leading)
             continue
-        # The actuator acts on the joint: a dof's gain and limit are converted by the joint's multiplier.
+        # The actuator acts on one joint: the dof's gain and limit are converted by this joint's multiplier.
         m = float(hand.multiplier[lead])
         actuator = spec.add_actuator(name=f"dof{d}", target=f"joint{lead}", trntype=mujoco.mjtTrn.mjTRN_JOINT)
         actuator.set_to_position(kp=float(hand.stiffness[d]) / m**2)
@@ -373,7 +374,7 @@ def add_object(
     """Add a free body of a mass [kg], frame at the centre of mass, from corners (V, 3) of each piece."""
     body = spec.worldbody.add_body(name=name, pos=obj.centre_of_mass)
     body.add_freejoint(name=name)
-    # By default MuJoCo would use the body's position in its parent as the position of its mass.
+    # By default MuJoCo would place the centre of mass at the body's position in its parent.
     body.mass, body.ipos = mass, [0, 0, 0]
     body.fullinertia = (mass * obj.inertia)[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
     body.explicitinertial = True
@@ -405,13 +406,13 @@ def blend(a: Posture, b: Posture, row: int, share: float) -> tuple[Floats, Float
 
 
 def leading_bodies(hand: HandModel) -> NDArray[np.intp]:
-    """Return the body (D,) whose joint carries each dof's actuator: the first, as `HandModel.reduce`."""
+    """Return the body (D,) whose joint carries each dof's actuator: the dof's first joint, as in `HandModel.reduce`."""
     drives = hand.dof[hand.joint_body]
     return np.array([hand.joint_body[int(np.flatnonzero(drives == d)[0])] for d in range(hand.dofs)], np.intp)
 
 
 def _add_tendon(spec: Any, hand: HandModel, tendon: Tendon, name: str, leading: NDArray[np.intp]) -> None:
-    """Add one actuator on the sum of joints; the joints are not coupled otherwise."""
+    """Add one actuator on the sum of joints; the joints are not coupled in any other way."""
     cord = spec.add_tendon(name=name)
     for d, pull in zip(tendon.dofs, tendon.coefficients, strict=True):
         cord.wrap_joint(f"joint{leading[d]}", pull)

@@ -1,17 +1,17 @@
 """Payload of grasps: heaviest mass that each lifts or holds; shake test; limit and load capacity.
 
-The hand closes once around the object with its own mass. Then other masses hang or are pushed, until their motion shows
-the outcome: first the mass that the closed hand's forces and friction bear, then closer and closer masses. Each hangs
-from the state of the heaviest one so far.
+The hand closes once around the object with its own mass. Then the mass is varied: the object hangs, or is pushed, until
+its motion decides. The search for the heaviest mass begins at the friction bound of the closed hand. Each
+test starts from the final state of the heaviest mass that passed.
 
-The shake moves a lifted object to and fro, first along x of the scene, then along y. The hand stands still and the
-object feels the inertial force of the motion. Accelerations begin at zero; the constant velocity that this adds to the
-hand has no effect (Galilei).
+The shake moves a lifted object to and fro, first along x of the scene, then along y. In the simulation the hand is at
+rest and the inertial force of the motion acts on the object. Accelerations begin at zero; the constant velocity that
+this adds to the hand has no effect (Galilean invariance).
 
-Load capacity: the heaviest object that contact forces could bear within actuator limits and friction. A linear program
-for each grasp: contact forces inside friction pyramids balance the weight and all torques about the centre of mass, and
-no drive exceeds its effort. It is an upper bound: it chooses forces that no controller can, and its pyramids enclose
-the cones. Forces against the palm, across joints, or towards a joint's stop cost no effort.
+Load capacity: the heaviest object that contact forces could bear within actuator limits and friction. One linear
+program per grasp: contact forces inside friction pyramids balance the weight and all torques about the centre of mass,
+and no drive exceeds its effort. It is an upper bound: it may choose forces that no controller can exert, and its
+pyramids enclose the cones. Forces against the palm, across joints, or towards a joint's stop cost no effort.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ from graspd.worker.validation.model import Scene, scene_of
 from graspd.worker.validation.prescreening import HANGING_CLOSING, LIFTING, FixedRootScene
 from graspd.worker.validation.protocol import DIRECTIONS, LOST, Outcome, Test
 
-#: Resolution of payloads, a ratio; they are rounded down.
+#: Resolution of payloads, as a ratio; payloads are rounded down.
 TOLD: Final = 1.03
 #: First mass as a share of the friction bound (median over the grasps of `benchmarks.payload`), and first step.
 FIRST: Final = 0.75
@@ -66,26 +66,26 @@ class _Weighed(Test):
         self.scene = replace(self.scene, mass=mass)
         model.body_mass[body] = mass
         model.body_inertia[body] = self._inertia * (mass / self._own)
-        # Contact stiffness depends on inverse inertias, which follow from the mass. The next restored state or start of
-        # a grasp overwrites what this leaves in the data.
+        # Contact stiffness depends on inverse inertias, which follow from the mass. The change also overwrites state in
+        # `data`, which the next restored state or the start of a grasp resets.
         mujoco.mj_setConst(model, self.data)
 
     def _bound(self, against: Floats) -> float:
         """Return the mass [kg] whose weight along -`against` (3,) the contacts of the closed hand bear.
-        An estimate from their present normal forces and friction, which a load changes."""
+        This estimate uses their present normal forces and friction, which a load changes."""
         contact, model = self.data.contact, self.scene.model
         at_object = model.geom_bodyid[contact.geom] == self.scene.object_body
         rows = np.flatnonzero(
             self.scene.hand_geoms[contact.geom].any(axis=1) & at_object.any(axis=1) & (contact.efc_address >= 0)
         )
-        # A normal points from the first geom to the second.
+        # The contact normal points from the first geom to the second.
         along = contact.frame[rows, :3] @ against * np.where(at_object[rows, 1], 1, -1)
         slide = contact.friction[rows, 0] * np.sqrt(np.maximum(0.0, 1 - along**2))
         return float(self.data.efc_force[contact.efc_address[rows]] @ (along + slide)) / ACCELERATION
 
     def _heaviest(self, bears: Callable[[float], bool], first: float) -> float:
-        """Return the heaviest mass [kg] for which `bears` is true, at least the object's; search from `first`.
-        nan: not even the object's own."""
+        """Return the heaviest mass [kg] for which `bears` is true; the search begins at `first`.
+        It is at least the object's mass; nan: `bears` is false even for the object's own mass."""
         low, high, step, borne = self._own, math.inf, STEP, False
         mass = min(max(first, low), MOST_KG)
         while True:
@@ -151,7 +151,7 @@ class PushPayload(_Weighed):
                 self._restore()
                 self._push(direction)
                 if self._ahead(WATCHED) >= 1.0:
-                    # Start with this direction for the next masses.
+                    # The next masses start with this direction.
                     weakest_first.remove(direction)
                     weakest_first.insert(0, direction)
                     return False
@@ -181,8 +181,8 @@ def payloads(
     return measured(len(grasps), held, make, lambda test, row: test.payload(grasps, row), run=run, name="payload")
 
 
-#: Grasps that must lift a light object before their payload counts as the hand's limit; else the grasps' shape may be
-#: the cause. It weighs as much as an object without a stated mass, or this share of the wanted mass.
+#: Fewest grasps that must lift a light object before their payload counts as the hand's limit; with fewer, the grasps'
+#: shape may be the cause. The light object has the default mass, or this share of the wanted mass.
 LEAST: Final = 2
 LIGHT: Final = 1 / 8
 #: Number of grasps after which no further ones need to be tested.
@@ -199,14 +199,14 @@ class Limit:
     friction: float
     grasps: int
     lifts_kg: float
-    """Payload of the best grasp, by simulated lifts."""
+    """Largest payload of the grasps, from simulated lifts."""
     bound_kg: float
     """Largest load capacity of a grasp (`worker.validation.payload`)."""
     wanted_kg: float | None = None
 
     @property
     def hopeless(self) -> bool:
-        """Whether the wanted payload is so much larger that no further grasps need to be tested."""
+        """Whether the wanted payload is so far above the limit that no further grasps need to be tested."""
         return self.grasps >= ENOUGH and self.wanted_kg is not None and self.wanted_kg > HOPELESS * self.lifts_kg
 
     @property
@@ -214,7 +214,7 @@ class Limit:
         return limit_told(self.hand, self.friction, self.grasps, self.lifts_kg, self.bound_kg, self.wanted_kg)
 
     def facts(self) -> dict[str, Any]:
-        """Return the values for JSON; no bound: None."""
+        """Return the values for JSON; an infinite bound becomes None."""
         bound = round(self.bound_kg, 3) if math.isfinite(self.bound_kg) else None
         return {"lifts_kg": round(self.lifts_kg, 3), "bound_kg": bound, "grasps": self.grasps, "says": self.line}
 
@@ -230,8 +230,8 @@ def limit_of(
     least: int = LEAST,
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> Limit | None:
-    """Return the payload limit of N grasps; None: the `wanted` mass [kg] is lifted, or fewer than `least` grasps lift a
-    light object."""
+    """Return the payload limit of N grasps. None: a grasp lifts the `wanted` mass [kg], or fewer than `least` grasps
+    lift a light object."""
     if len(grasps) < least:
         return None
     light = obj.weighing(mass=MASS_KG if wanted is None else min(MASS_KG, LIGHT * wanted))
@@ -260,7 +260,7 @@ class Shake(FixedRootScene):
     """Shake tests of grasps in one scene. Not thread-safe."""
 
     def margin(self, grasps: GraspSet, row: int) -> float:
-        """Return the worst displacement or rotation in the hand over its limit; 1 or more: the object is lost."""
+        """Return the worst displacement or rotation in the hand over its limit; from 1 on the object is lost."""
         if not self._closed(grasps, row):
             return LOST
         self._hang(0.0, self.scene.mass)
@@ -289,8 +289,8 @@ def shake_margins(
     held: NDArray[np.bool_] | None = None,
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> Floats:
-    """Return shake margins (N,), the worst displacement or rotation over its limit; nan: not `held` (N,).
-    Below 1 the grasp holds."""
+    """Return shake margins (N,): worst displacement or rotation over its limit; below 1 the grasp holds.
+    nan: grasps that are not `held` (N,)."""
 
     def make() -> Shake:
         return Shake(scene_of(hand, obj, pieces, LIFTING, placed.supports, placed.neighbours), placed)
@@ -299,10 +299,10 @@ def shake_margins(
 
 
 _POINTS: Final = 600
-#: Hand points within this distance may make contact while the hand closes [m]; at most this many, the most spread out.
+#: Hand points within this distance may make contact while the hand closes [m]; at most this many, widely spread.
 WITHIN_M: Final = 0.01
 MOST: Final = 32
-#: A joint within this share of its range from its limit rests on its stop.
+#: A joint closer to its limit than this share of its range rests on its stop.
 AT_STOP: Final = 0.02
 #: Result of `linprog`.
 _UNBOUNDED: Final = 3
@@ -310,7 +310,7 @@ _UNBOUNDED: Final = 3
 
 def capacities(hand: HandModel, obj: ObjectModel, grasp: Posture, against: Floats) -> Floats:
     """Compute load capacities (N,) [kg]; 0: no contact; inf: no drive and no friction limits it.
-    `against` (N, K, 3) are unit vectors against the weight; the least of K counts."""
+    `against` (N, K, 3) are unit vectors against the weight; the least of the K capacities is returned."""
     probe = posing_of(hand, obj, points=_POINTS, device="cpu").probe
     found = probe.touch(grasp)
     facing = (found.distance < WITHIN_M) & probe.facing(found)

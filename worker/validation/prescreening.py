@@ -1,10 +1,10 @@
-"""Short tests in coarse physics: rollouts that rank a planner's candidates.
+"""Short tests with coarse physics: rollouts that rank a planner's candidates.
 
-The hand closes and squeezes around the object in a fraction of the time of the whole test. In a scene the support then
-vanishes, and most of the object's weight pulls for a moment. A free object is pushed towards the corners of a
-tetrahedron, with nearly twice its weight. All this happens at half the friction. Objects that slip are pulled once more
-from the same closed hand at full friction, in a scene with a third more than the weight. The result is not a verdict:
-it ranks candidates at a fifth of a verdict's cost, and the whole test still validates the selected ones.
+The hand closes and squeezes around the object in a fraction of the time of the full test. In a scene the support is
+then removed, and most of the object's weight pulls for a moment. A free object is pushed towards the corners of a
+tetrahedron, with nearly twice its weight. Friction is halved in these tests. Objects that slip are tested once more
+from the same closed hand at full friction; in a scene the pull is then a third above the weight. The result is not a
+verdict: it ranks candidates at a fifth of a verdict's cost, and the full test still validates the selected ones.
 """
 
 from __future__ import annotations
@@ -31,40 +31,41 @@ from graspd.worker.validation.protocol import LOST, STAGE_S, Outcome, Test
 
 T = TypeVar("T")
 
-#: The root is fixed, because the protocol's root on a spring costs twice as much. In so short a time nothing slips for
-#: lack of iterations against slip.
+#: The root is fixed, because the protocol's compliant root costs twice as much. MuJoCo's iterations against slip are
+#: off: in so short a time they make no difference.
 PHYSICS: Final = MujocoOptions(timestep=0.006, root="fixed", noslip_iterations=0)
-#: The same for a lift: under the weight of a real object coarser contacts creep.
+#: The same for a lift: with coarser contacts the object creeps under its own weight.
 LIFTING: Final = MujocoOptions(root="fixed")
-#: Stages of closing and of squeezing, then of hanging.
+#: Number of stages of closing and of squeezing; number of stages of hanging.
 CLOSING: Final = 2
 HANGING: Final = 6
-#: The same for a free object and a push.
+#: The same numbers for a free object and a push.
 FREE_CLOSING: Final = 3
 PUSHED: Final = 2
-#: Pull on the hanging object at half the friction, at full friction, and of a push, in object weights. Rejecting a good
-#: candidate costs more than one that the whole test then drops. Of 32 Allegro candidates that lift at half the
-#: friction, 1.3 weights reject 19, these 9. Of 63 that hold a free object at half friction, 2 weights and two stages of
-#: closing rejected 14, now 9. An object that is not held must be lost when a push ends. At full friction the pull
-#: exceeds the weight: of 25 candidates that lift .8 of it another lift test drops 10, of 21 that lift 1.3 of it 3.
+#: Pulls in object weights: hanging at half friction, hanging at full friction, and push. Rejecting a good candidate
+#: costs more than accepting one that fails the full test. Of 32 Allegro candidates that lift at half friction, 1.3
+#: weights reject 19, the present value 9. Of 63 that hold a free object at half friction, 2 weights and two stages of
+#: closing rejected 14, the present values 9. An object that is not held must be lost when a push ends. At full friction
+#: the pull exceeds the weight: 10 of 25 candidates that lift .8 of it fail another lift test, but 3 of 21 that lift
+#: 1.3.
 HANGS: Final = 0.8
 HANGS_WHOLE: Final = 1.3
 PULL: Final = 1.8
-#: Ratio to a limit from which on the object is lost.
+#: Ratio of motion to its limit from which on the object is lost.
 GONE: Final = 1.5
-#: Push directions of a free object: no direction is farther than 71 degrees from all of them.
+#: Push directions of a free object: every direction is within 71 degrees of one of them.
 CORNERS: Final = np.array([(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)]) / np.sqrt(3.0)
 #: Distance by which supports are removed [m]: more than the height of any scene.
 AWAY_M: Final = 10.0
-#: Added to the score of grasps that hold at full friction only.
+#: Added to the score of grasps that hold only at full friction.
 SLIPS: Final = 1.0
-#: Score of grasps that start in too deep penetration.
+#: Score of grasps that start in deep penetration.
 DEEP: Final = 20.0
 
 
 @dataclass(frozen=True)
 class Frictions:
-    """The scene built with `PHYSICS`, at half and at full friction; all else is the same."""
+    """Compiled scenes at half and at full friction, with `PHYSICS`; everything else is the same."""
 
     half: Scene
     whole: Scene
@@ -78,8 +79,8 @@ class LiftRollout(Lift):
         self._scenes = scenes
 
     def score(self, grasps: GraspSet, row: int, beat: float = np.inf) -> float:
-        """Return displacement or rotation over its limit after hanging at half the friction; below 1: lifted.
-        Otherwise the same at full friction, plus `SLIPS`; or `beat`, where that is already below 1 + `SLIPS`."""
+        """Return displacement or rotation over its limit after hanging at half friction; below 1: lifted. If it is not
+        below 1, return the same at full friction plus `SLIPS`, or `beat` if `beat` is below 1 + `SLIPS`."""
         self.scene = self._scenes.half
         if self._begin(grasps, row).outcome is not LiftOutcome.NOT_TRIED:
             return DEEP
@@ -97,7 +98,7 @@ class LiftRollout(Lift):
 
     def _hung(self, weights: float, enough: float = GONE) -> float:
         """Return displacement or rotation over its limit, extrapolated to `HOLD_S` after support removal.
-        The present value once that reaches `enough`."""
+        As soon as the present value reaches `enough`, return it without extrapolation."""
         self.data.mocap_pos[1] = self._scene_pose[:3] - AWAY_M * self._up
         self.data.xfrc_applied[self.scene.object_body, :3] = -weights * self.scene.push * self._up
         return self._ahead(HANGING, enough)
@@ -112,7 +113,7 @@ class PushRollout(Test):
 
     def score(self, grasps: GraspSet, row: int) -> float:
         """Return the worst displacement or rotation over its limit in pushes at half friction; below 1: held.
-        Otherwise the same at full friction, plus `SLIPS`."""
+        If it is not below 1, return the same at full friction plus `SLIPS`."""
         self.scene = self._scenes.half
         if self._start(grasps, row).outcomes[0] is Outcome.PENETRATION:
             return DEEP
@@ -126,7 +127,7 @@ class PushRollout(Test):
         return SLIPS + self._pushed()
 
     def _pushed(self) -> float:
-        """Return the worst displacement or rotation over its limit, up to the first push that breaks it."""
+        """Return the worst displacement or rotation over its limit; stop at the first push that exceeds a limit."""
         worst = 0.0
         for corner in CORNERS:
             self._restore()
@@ -139,7 +140,7 @@ class PushRollout(Test):
 
 
 class _Shorts:
-    """Short tests of one hand and one object, thread-safe; scenes are compiled on first use.
+    """Short tests of one hand and one object; thread-safe. Scenes are compiled on first use.
     All grasps must have the same supports and neighbours."""
 
     def __init__(
@@ -196,11 +197,11 @@ def push_rollout(
     return rollout
 
 
-#: Stages of closing and of squeezing.
+#: Number of stages of closing and of squeezing.
 HANGING_CLOSING: Final = 4
-#: Pull of a hanging object, in its weights: mean of a smooth rise while it accelerates (`lift.SMOOTHLY`).
+#: Pull on a hanging object, in weights: mean over the accelerating part of a smooth rise (`lift.SMOOTHLY`).
 RISING: Final = 1.06
-#: Duration of a load change, in steps [s]; a sudden change would weigh up to twice.
+#: Duration of a load change, in steps [s]; a sudden change would act like up to twice the load.
 LOADING_S: Final = 0.04
 LOADS: Final = 5
 

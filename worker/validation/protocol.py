@@ -1,6 +1,7 @@
 """DexGraspBench's force-closure test of one grasp, at three levels of cost.
 
-dexgraspbench: as published. Each of the 6 pushes starts from the closed hand, as if closed anew, and is held for 2 s.
+dexgraspbench: as published. Each of the 6 pushes starts from the closed hand and is held for 2 s. The published test
+closes the hand anew for each push, with the same result.
 standard: the same physics; a push ends as soon as linear extrapolation to 2 s stays inside half of the limits.
 fast: coarser physics (fixed root, 6 ms); where the margin is not clear, level standard decides.
 """
@@ -25,25 +26,25 @@ DIRECTIONS: Final = ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0
 MAX_DISPLACEMENT_M: Final = 0.05
 MAX_ROTATION: Final = math.radians(15.0)
 MAX_PENETRATION_M: Final = 0.010
-#: Each of the two motions consists of stages of equal length; a push is checked at intervals.
+#: Both motions (to the grasp, to the squeeze) have stages of equal length; a push is checked at intervals.
 STAGES: Final = 10
 STAGE_S: Final = 0.04
 HOLD_S: Final = 2.0
 DEXGRASPBENCH_INTERVAL_S: Final = 0.2
-#: Sequential test: first check and interval. Earlier checks miss slow creepers under a weak squeeze.
+#: Sequential test: time of the first check, and interval. Earlier checks miss slow creep under a weak squeeze.
 FIRST_LOOK_S: Final = 0.08
 INTERVAL_S: Final = 0.04
-#: Share of the limits for extrapolated motion. Faster motion is simulated until it slows, breaks a limit, or 2 s are
-#: over. Of 250 Shadow grasps accepted at the full limits 11 creep out later, at half of them 4.
+#: Share of the limits for extrapolated motion. Faster motion is simulated until it slows down, exceeds a limit, or
+#: lasts for 2 s. Of 250 Shadow grasps accepted at the full limits 11 slip out later; at half of the limits 4 do.
 SURE: Final = 0.5
-#: Share of the limits for motion extrapolated in a short test, below which the object counts as still.
+#: Share of the limits for extrapolated motion in a short test; below it the object counts as still.
 STILL: Final = 0.5
-#: Excess of a state that is not finite.
+#: Ratio to the limit of a state that is not finite.
 LOST: Final = 10.0
-#: Rotation while closing or rising beyond which the object is lost; no passing grasp was observed beyond half of it.
+#: Rotation during closing or rising above which the object is lost; no passing grasp reached half of it.
 LOST_ROTATION: Final = math.radians(30.0)
-#: Coarse physics are trusted where their worst displacement or rotation over its limit is outside this band. Their
-#: false accepts move little: a band that begins at 0.7 of the limit leaves nearly twice as many.
+#: Coarse physics are trusted if their worst displacement or rotation over its limit is outside this band. Their false
+#: accepts have small motion: a band that begins at 0.7 of the limit leaves nearly twice as many.
 FAST_BAND: Final = (0.3, 3.0)
 
 
@@ -68,7 +69,7 @@ class ValidatedBy(IntEnum):
 class Rollout:
     outcomes: list[Outcome] = field(default_factory=lambda: [Outcome.NOT_TRIED] * len(DIRECTIONS))
     margin: float = 0.0
-    """Worst displacement or rotation over its limit, from the end of the squeeze on."""
+    """Worst displacement or rotation over its limit, after the end of the squeeze."""
     penetration_m: float = 0.0
     self_penetration_m: float = 0.0
     steps: int = 0
@@ -103,7 +104,7 @@ class Test:
         self._close(grasps, row)
         self._save()
         for direction in range(len(DIRECTIONS)):
-            # The simulation is deterministic: closing anew would lead to this very state, bit for bit.
+            # The simulation is deterministic: closing again would give this very state, bit for bit.
             self._restore()
             self._push(direction)
             outcome = Outcome.HELD
@@ -119,12 +120,12 @@ class Test:
         return rollout
 
     def standard(self, grasps: GraspSet, row: int) -> Rollout:
-        """Close once, branch the pushes from there, and end each as soon as it is decided."""
+        """Close once, start every push from that state, and end each push as soon as it is decided."""
         rollout = self._start(grasps, row)
         if rollout.outcomes[0] is Outcome.PENETRATION:
             return rollout
         if not self._close(grasps, row, give_up=True) or self._validate(rollout) is not Outcome.HELD:
-            # Wrong only if a push brings the object back inside the limits: not observed in 690 grasps.
+            # Wrong only if a push brings the object back inside the limits, which none of 690 grasps did.
             rollout.margin = max(rollout.margin, self._excess())
             rollout.steps = self._steps
             return rollout.fail(Outcome.DIVERGED if void(self.data) else Outcome.LOST_WHILE_CLOSING)
@@ -142,7 +143,7 @@ class Test:
         self._steps = 0
         rollout = Rollout()
         rollout.penetration_m, rollout.self_penetration_m = self._depths(grasps.grasp, row)
-        # As published, the depth at the simulation's start decides. The depth at the grasp is only reported.
+        # As published, the depth at the start of the simulation decides; the depth at the grasp is for information.
         if max(self._depths(grasps.pregrasp, row)) > MAX_PENETRATION_M:
             return rollout.fail(Outcome.PENETRATION)
         return rollout
@@ -169,8 +170,8 @@ class Test:
         return float(depth[hand & ~within].max(initial=0.0)), float(depth[hand & within].max(initial=0.0))
 
     def _close(self, grasps: GraspSet, row: int, *, give_up: bool = False, stages: int = STAGES) -> bool:
-        """Move from pregrasp over grasp to squeeze, each in `stages` stages; return whether the object stayed.
-        With `give_up`, stop as soon as the object is lost; otherwise return True."""
+        """Move from pregrasp through grasp to squeeze, each in `stages` stages; return whether the object stayed.
+        With `give_up`, return False as soon as the object is lost; without, always return True."""
         self._put(grasps.pregrasp.hand_pose[row], grasps.pregrasp.joint_positions[row])
         for hand_pose, joints in self._way(grasps, row, stages):
             self.scene.command(self.data, hand_pose, joints)
@@ -184,7 +185,7 @@ class Test:
         return moved > MAX_DISPLACEMENT_M or turned > LOST_ROTATION
 
     def _way(self, grasps: GraspSet, row: int, stages: int = STAGES) -> Iterator[tuple[Floats, Floats]]:
-        """Yield commanded postures (7,), (J,) from pregrasp over grasp to squeeze, one per stage."""
+        """Yield commanded postures (7,), (J,) from pregrasp through grasp to squeeze, one per stage."""
         for a, b in ((grasps.pregrasp, grasps.grasp), (grasps.grasp, grasps.squeeze)):
             for stage in range(1, stages + 1):
                 yield blend(a, b, row, stage / stages)
@@ -200,7 +201,7 @@ class Test:
         self.data.xfrc_applied[self.scene.object_body, :3] = self.scene.push * np.array(DIRECTIONS[direction])
 
     def _hold(self, rollout: Rollout) -> Outcome:
-        """Sequential test: reject on a broken limit; accept when extrapolation to 2 s stays well inside it."""
+        """Sequential test: reject if a limit is exceeded; accept if extrapolation to 2 s stays well inside it."""
         elapsed = FIRST_LOOK_S - INTERVAL_S
         self._run(elapsed)
         before, turned_before = self._offset(), self._motion()[1]
@@ -220,8 +221,8 @@ class Test:
         return Outcome.HELD
 
     def _ahead(self, stages: int, enough: float = 1.0) -> float:
-        """Return displacement or rotation over its limit, extrapolated to `HOLD_S` from now.
-        Simulate at most `stages` stages; return the present value as soon as it reaches `enough`."""
+        """Return displacement or rotation over its limit, extrapolated from now to `HOLD_S`.
+        Simulate at most `stages` stages; as soon as the present value reaches `enough`, return it."""
         before = self._excess()
         for stage in range(1, stages + 1):
             self._run(STAGE_S)

@@ -1,7 +1,7 @@
-"""The same hand with other collision shapes, as another author of its model might have drawn them.
+"""The same hand with other collision shapes, as in another author's model of it.
 
-hull: one convex hull per link; primitive: the box, cylinder or capsule nearest to each hull; capsule: a capsule for
-each piece that is about as thick as wide. Any of these may also be grown or shrunk.
+hull: one convex hull per link; primitive: the best-fitting box, cylinder or capsule of each hull; capsule: a capsule
+for each piece whose width and thickness are similar. Any of these may also be grown or shrunk.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from graspd.worker.hands.primitives import hull, sample, signed_distance, tessel
 
 Fit = Literal["own", "hull", "primitive", "capsule"]
 
-#: A capsule replaces no piece whose width over thickness is larger.
+#: A piece with a larger ratio of width to thickness is not replaced by a capsule.
 WIDE: Final = 1.5
-#: Shrinking leaves at least this share of a piece's half thickness.
+#: A shrunk piece keeps at least this share of its half thickness.
 _LEFT: Final = 0.5
 _SAMPLES: Final = 400
 #: Least length of a capsule over its radius.
@@ -32,7 +32,7 @@ _PRIMITIVES: Final = ("box", "cylinder", "capsule")
 
 def refitted(hand: HandModel, fit: Fit, grown_m: float = 0.0) -> HandModel:
     """Return the hand with its collision shapes replaced, then grown by `grown_m` [m] (negative: shrunk).
-    Contacts between bodies that touch at rest in their new shapes are ignored, as in the hand itself."""
+    Contacts between bodies whose new shapes touch at rest are ignored, as in the original hand."""
     pieces = hand.pieces
     if fit == "hull":
         pieces = _hulls(hand)
@@ -60,8 +60,8 @@ def fits_of(hand: HandModel) -> frozenset[Fit]:
 
 def grown(piece: ConvexPiece, by_m: float) -> ConvexPiece:
     """Return a piece with its surface offset by `by_m` [m] along all face normals (negative: inwards).
-    Boxes and cylinders keep their edges, capsules and spheres are exact. Corners of a hull are cut at the offset
-    surface of the Minkowski sum with a ball. A piece too thin to shrink keeps half of its thickness."""
+    Boxes and cylinders keep their edges; capsules and spheres are exact. Corners of a hull are cut at the offset
+    surface of the Minkowski sum with a ball. A piece too thin to shrink by this much keeps half of its thickness."""
     if piece.kind == "hull":
         vertices, faces = hull(_offset(piece.vertices, by_m))
         return replace(piece, vertices=vertices, faces=faces)
@@ -108,7 +108,7 @@ def _fitted(piece: ConvexPiece, fit: Fit) -> ConvexPiece:
 
 def _moments(piece: ConvexPiece) -> tuple[float, Floats, Floats, Floats]:
     """Return volume, centre, principal variances (3,) in ascending order, and the axes as columns."""
-    import trimesh  # slow to load, as SciPy below
+    import trimesh  # slow to import, as SciPy below
 
     solid = trimesh.Trimesh(piece.vertices, piece.faces, process=False)
     inertia = np.asarray(solid.moment_inertia)
@@ -120,7 +120,7 @@ def _moments(piece: ConvexPiece) -> tuple[float, Floats, Floats, Floats]:
 
 def _thickness(piece: ConvexPiece) -> tuple[float, bool]:
     """Return the least half thickness [m] of a box of the same second moments, and whether the
-    section is about as thick as wide."""
+    width of the section is similar to its thickness."""
     _, _, spread, _ = _moments(piece)
     low, middle, _ = np.sqrt(3 * spread)
     return float(low), bool(middle <= WIDE * low)
@@ -131,7 +131,7 @@ def _like(piece: ConvexPiece, kind: str) -> ConvexPiece:
     solid, centre, spread, axes = _moments(piece)
     long = 2
     if kind == "cylinder" and spread[2] - spread[1] < spread[1] - spread[0]:
-        # A disc: its axis is the short one.
+        # A disc: its short axis is the symmetry axis.
         long = 0
     order = [(long + 1) % 3, (long + 2) % 3, long]
     spread, axes = spread[order], axes[:, order]
@@ -149,8 +149,9 @@ def _like(piece: ConvexPiece, kind: str) -> ConvexPiece:
 
 def _capsule(solid: float, across: float) -> tuple[float, float]:
     """Return radius and length of a capsule of a volume [m^3] and a variance across its axis [m^2].
-    The variance is at least the sphere's. A cylinder's variance is r^2 / 4, a ball's r^2 / 5, a capsule's r^2 (1 / 4 -
-    s / 20) if its caps are the share s of its volume. Iterated: s grows with r^3 and moves r little."""
+    The variance is at least the sphere's. A cylinder's variance is r^2 / 4, a ball's r^2 / 5. A capsule's is
+    r^2 (1 / 4 - s / 20), where s is its caps' share of the volume. The solution iterates: s grows with r^3 and has
+    little effect on r."""
     radius = 2 * math.sqrt(across)
     for _ in range(20):
         caps = min(1.0, 4 / 3 * math.pi * radius**3 / solid)
@@ -167,8 +168,8 @@ def _distance(one: ConvexPiece, piece: ConvexPiece) -> float:
 
 def _offset(vertices: Floats, by_m: float) -> Floats:
     """Return the corners of a convex solid with its faces moved outward by `by_m` [m].
-    It intersects half-spaces of the faces and, if growing, of the corners' mean normals, each at the distance of the
-    sum with a ball. A solid that grows by 1 mm has its support 1 mm farther in all of these directions."""
+    The result is the intersection of half-spaces along the face normals and, if growing, the mean normals at corners.
+    In these directions its support function is that of the Minkowski sum with a ball."""
     from scipy.spatial import ConvexHull, HalfspaceIntersection
 
     scale = float(np.ptp(vertices, axis=0).max())

@@ -1,8 +1,8 @@
 """Robustness: verdicts in other models of the same hand and object, and with the object displaced.
 
-A grasp is validated in k models, each of which departs from the nominal one along one axis (`variant`). Axes alternate
-in random order. All is drawn from the seed and the grasp's own numbers: a grasp gets the same models in any set, and
-the first 8 of 16 are those of 8.
+A grasp is validated in k models. Each departs from the nominal model along one axis (`variant`); axes alternate in
+random order. Models depend only on the seed and the grasp's own numbers: a grasp gets the same models in any set, and
+the first 8 of 16 models are the same as with 8.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from graspd.worker.validation.validator import validate
 from graspd.worker.validation.variant import Models, Variant, about_centre, dealt, draw
 
 NOT_VALIDATED: Final = -1
-#: Tolerance of wanted shares: 0.9 of 10 models is 9 of them.
+#: Numerical tolerance of wanted shares: 0.9 of 10 models is exactly 9.
 _EXACT: Final = 1e-9
 
 
@@ -40,7 +40,7 @@ class Robustness:
     """Verdicts on N grasps in k models."""
 
     held: NDArray[np.int8]
-    """(N, k) 1 held, 0 not, -1 not validated: the grasp was not tested, or its share was decided."""
+    """(N, k) 1 held, 0 not, -1 not validated: the grasp was not tested, or earlier models decided its share."""
     axis: NDArray[np.uint8]
     wanted: float
     seconds: float
@@ -48,7 +48,7 @@ class Robustness:
     @property
     def share(self) -> Floats:
         """(N,) share of the models in which a grasp holds; nan: not tested.
-        After an early end it is a lower bound if the wanted share was reached, an upper bound if it was missed."""
+        After an early end the share is a lower bound if the wanted share was reached, else an upper bound."""
         models = self.held.shape[1]
         held, failed = (self.held == 1).sum(axis=1), (self.held == 0).sum(axis=1)
         reached = held >= needed(self.wanted, models)
@@ -57,7 +57,7 @@ class Robustness:
 
     @property
     def weakest(self) -> NDArray[np.uint8]:
-        """(N,) `Axis` of the first model in which a grasp does not hold; 0: none."""
+        """(N,) `Axis` of the first model in which a grasp does not hold; 0: it holds in all."""
         failed = self.held == 0
         first = failed.argmax(axis=1)
         return np.where(failed.any(axis=1), self.axis[np.arange(len(first)), first], np.uint8(Axis.NONE))
@@ -67,7 +67,7 @@ class Robustness:
         return {"quality/robust_share": self.share, "quality/robust_weakest": self.weakest}
 
     def by_axis(self) -> dict[Axis, tuple[int, int]]:
-        """Return for each validated axis the number of models in which a grasp held, and of all models."""
+        """Return for each validated axis the number of models in which a grasp held, and the number of models."""
         counts = {}
         for axis in Axis:
             found = self.held[(self.axis == axis) & (self.held != NOT_VALIDATED)]
@@ -77,7 +77,7 @@ class Robustness:
 
 
 def needed(wanted: float, models: int) -> int:
-    """Return the number of models in which a grasp must hold for the wanted share; 0: all of them."""
+    """Return the number of models in which a grasp must hold for the wanted share; 0 (no share): all of them."""
     return math.ceil(wanted * models - _EXACT) if wanted > 0 else models
 
 

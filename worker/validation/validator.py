@@ -25,7 +25,7 @@ from graspd.worker.validation.prefilter.prefilter import PrefilterVerdicts, firs
 from graspd.worker.validation.protocol import DIRECTIONS, FAST_BAND, Outcome, Rollout, Test
 
 log = logging.getLogger(__name__)
-#: Grasps per task of a process pool: few, so that many processes share the grasps of one batch.
+#: Grasps per task of a process pool: few, so that many processes share one batch.
 _CHUNK: Final = 2
 LEVELS: Final = ("dexgraspbench", "standard", "fast")
 #: Finished rollouts, by `postures_key` of one grasp.
@@ -34,7 +34,7 @@ KnownRollouts = dict[str, Rollout]
 
 @dataclass(frozen=True)
 class Verdicts:
-    """Verdicts of the validator on N grasps. Rates of verdicts with different terms are not comparable."""
+    """Verdicts of the validator on N grasps. Success rates with different terms are not comparable."""
 
     success: NDArray[np.int8]
     """(N,) 1 held in all six directions, 0 not."""
@@ -43,7 +43,7 @@ class Verdicts:
     margin: Floats
     """(N,) worst displacement or rotation over its limit."""
     penetration_depth_mm: Floats
-    """(N,) hand-object, with the engine's convex pieces."""
+    """(N,) penetration of hand and object, measured with the engine's convex pieces."""
     self_penetration_depth_mm: Floats
     level: str
     hard: bool
@@ -61,7 +61,7 @@ class Verdicts:
     seconds: float
     steps: int
     rechecked: int = 0
-    """Verdicts of the prefilter rechecked on the CPU; where they differ, the CPU's stands."""
+    """Prefilter verdicts that the CPU rechecked; where they differ, the CPU's verdict is used."""
     contradicted: int = 0
 
     @property
@@ -91,7 +91,7 @@ def validate(
 ) -> Verdicts:
     """Validate grasps by DexGraspBench's force-closure protocol; levels: see `worker.validation.protocol`.
 
-    MuJoCo releases the interpreter lock while it steps, so threads use a few cores; for many `run` has a pool. Where
+    MuJoCo releases the GIL while it steps, so threads use a few cores; for many cores `run` has a process pool. If
     `run` has a prefilter, it decides the clear cases, see `worker.validation.prefilter.prefilter`.
 
     Args:
@@ -101,8 +101,8 @@ def validate(
         level: dexgraspbench, standard, or fast.
         hard: sliding friction halved, torsional friction a tenth.
         pieces: convex pieces of the object; by default its CoACD pieces.
-        known: finished CPU rollouts on these terms, which are reused; new ones are added.
-        prefilter: result of `prefiltered` on these grasps and terms; None: it is computed.
+        known: finished CPU rollouts with the same terms, which are reused; new ones are added to it.
+        prefilter: result of `prefiltered` on these grasps with the same terms; None: it is computed.
         run: receives the number of finished grasps; polled for cancellation between grasps.
 
     Raises:
@@ -115,7 +115,7 @@ def validate(
     began = time.perf_counter()
     pieces = pieces or decompose(obj)
     prefilter_terms = first_terms(hand, level, run)
-    # The prefilter leaves only cases near a limit, for which coarse physics would defer to level standard as well.
+    # The prefilter leaves only cases near a limit. For these, coarse physics would defer to level standard anyway.
     of_the_cpu: Level = "standard" if prefilter_terms else level
     case = _Case(hand, obj, pieces, of_the_cpu, hard)
     terms = verdict_key(hand, obj, level, hard, pieces=pieces, prefilter=prefilter_terms)
@@ -236,7 +236,7 @@ class _Tests:
             return self._full.standard(grasps, row)
         rollout = self._coarse.standard(grasps, row)
         low, high = FAST_BAND
-        # A penetration has no margin: it is geometric, the same in either physics.
+        # Penetration has no margin: it is geometric, the same in coarse and full physics.
         clear = rollout.outcomes[0] is Outcome.PENETRATION or not low < rollout.margin < high
         if clear and Outcome.DIVERGED not in rollout.outcomes:
             return rollout

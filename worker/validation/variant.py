@@ -1,7 +1,7 @@
 """Variants of the validator's model: other plausible shapes, drives, tendons, masses and poses.
 
-A `Variant` describes a model's departure from the nominal one; `draw` draws one, `Models` validates in it: shapes are
-recompiled, numbers changed in a copy.
+A `Variant` describes how a model departs from the nominal one. `draw` draws a variant, and `Models` validates in it:
+new shapes are recompiled, other numbers are changed in a copy.
 """
 
 from __future__ import annotations
@@ -30,19 +30,19 @@ from graspd.worker.validation.refit import Fit, fits_of, refitted
 
 Vector = tuple[float, float, float]
 
-#: Range of each axis. Shapes grow or shrink by this [m].
+#: Range of each axis. Growth of shapes, negative for shrinking [m].
 GROWTH_M: Final = 1e-3
-#: Factors of drives and of the mass.
+#: Factors of drive gains and of the object's mass.
 FACTOR: Final = 2.0
-#: Armature [kg m^2] and dry friction [N m] of DexGraspBench's Shadow, which the protocol otherwise omits.
+#: Armature [kg m^2] and dry friction [N m] of DexGraspBench's Shadow hand, which the protocol omits for other hands.
 ARMATURE: Final = 2e-4
 DRY_FRICTION: Final = 0.01
-#: Sliding friction over the nominal 0.6; the torsional coefficient scales with it.
+#: Sliding friction over the nominal 0.6; the torsional coefficient scales with the same factor.
 FRICTIONS: Final = (0.4 / 0.6, 0.8 / 0.6)
 CENTRE_M: Final = 5e-3
 SHIFT_M: Final = 2e-3
 TURN: Final = float(np.radians(2.0))
-#: Latest start of a finger after the first, as a share of the time of closing (0.8 s).
+#: Latest start of a finger after the first one, as a share of the closing time (0.8 s).
 LATEST: Final = 0.25
 
 Coupling = Literal["own", "compliant", "separate", "ratio"]
@@ -50,7 +50,7 @@ Coupling = Literal["own", "compliant", "separate", "ratio"]
 
 @dataclass(frozen=True)
 class Variant:
-    """A model near the nominal one; by default the nominal one. Lengths [m]; factors of the model's own values."""
+    """A model near the nominal one (the default). Lengths in m; factors apply to the model's own values."""
 
     fit: Fit = "own"
     """Replacement of the hand's collision shapes, see `refit`."""
@@ -61,12 +61,12 @@ class Variant:
     """Dry friction of every joint [N m or N]; None: the model's own."""
     damping: float = 1.0
     gain: float = 1.0
-    """Position gain over the model's own; torque limits stay."""
+    """Factor on the position gain; torque limits are unchanged."""
     coupling: Coupling = "own"
-    """compliant: couplings yield under load; separate, ratio: other readings of tendons, see `recoupled`."""
+    """compliant: couplings yield under load; separate, ratio: other interpretations of tendons, see `recoupled`."""
     friction: float = 1.0
     mass: float = 1.0
-    """Mass of the object over the model's own; pushes equal its weight and grow with it."""
+    """Factor on the object's mass; pushes equal its weight and grow with it."""
     centre_m: Vector = (0.0, 0.0, 0.0)
     object_shift_m: Vector = (0.0, 0.0, 0.0)
     """Shift of the object, in its frame [m]."""
@@ -75,7 +75,7 @@ class Variant:
     hand_shift_m: Vector = (0.0, 0.0, 0.0)
     """Constant offset of the hand's root, in its own frame [m]."""
     lags: tuple[float, ...] = ()
-    """Per fingertip, delay of its finger after the first, as a share of the time of closing."""
+    """Delay of each fingertip's finger after the first one, as a share of the closing time."""
 
 
 NOMINAL: Final = Variant()
@@ -89,13 +89,13 @@ def axes_of(hand: HandModel) -> tuple[Axis, ...]:
 
 
 def couplings_of(hand: HandModel) -> tuple[Coupling, ...]:
-    """Return other readings of a hand's couplings: dofs that drive several joints, and tendons."""
+    """Return other interpretations of a hand's couplings: dofs that drive several joints, and tendons."""
     rigid: tuple[Coupling, ...] = ("compliant",) if len(hand.joint_body) > hand.dofs else ()
     return (*rigid, "separate", "ratio") if hand.tendons else rigid
 
 
 def dealt(hand: HandModel, models: int, seed: tuple[int, ...]) -> list[Axis]:
-    """Return the axes of a grasp's first models: all of the hand's in random order, then again."""
+    """Return the axes of a grasp's first models: all axes of the hand in random order, then a repetition."""
     axes = axes_of(hand)
     rounds = range(-(-models // len(axes)))
     return [axes[i] for k in rounds for i in np.random.default_rng((*seed, k)).permutation(len(axes))][:models]
@@ -107,7 +107,7 @@ def draw(axis: Axis, hand: HandModel, rng: np.random.Generator) -> Variant:
     Directions are uniform on the sphere, sizes uniform in their range, factors log-uniform.
 
     Raises:
-        ValueError: the axis is none, or the hand has no couplings.
+        ValueError: no axis is given, or the hand has no couplings.
     """
     match axis:
         case Axis.SHAPES:
@@ -139,7 +139,7 @@ def draw(axis: Axis, hand: HandModel, rng: np.random.Generator) -> Variant:
 
 
 def together(variants: Iterable[Variant]) -> Variant:
-    """Combine variants along several axes; where two change the same value, the later one counts."""
+    """Combine variants along several axes; if two change the same value, the later one is used."""
     own, changed = asdict(NOMINAL), dict[str, Any]()
     for one in variants:
         changed |= {name: value for name, value in asdict(one).items() if value != own[name]}
@@ -173,9 +173,9 @@ def _vector(rng: np.random.Generator, most: float) -> Vector:
 
 
 def recoupled(hand: HandModel, coupling: Coupling) -> HandModel:
-    """Return the hand with its tendons read otherwise; itself without tendons, or for other readings.
-    separate: each joint of a tendon gets the drive it would have without the tendon. ratio: joints of a tendon turn as
-    one, by equal angles with their coefficients' signs, with the sum of their drives' gains and limits."""
+    """Return the hand with another interpretation of its tendons; unchanged without tendons, or for other couplings.
+    separate: each joint of a tendon gets the drive it would have without the tendon. ratio: joints of a tendon turn
+    together, by equal angles with their coefficients' signs; gain and limit are the sums over their drives."""
     if not hand.tendons or coupling not in ("separate", "ratio"):
         return hand
     if coupling == "separate":
@@ -214,14 +214,14 @@ def recoupled(hand: HandModel, coupling: Coupling) -> HandModel:
 
 
 def nearest(hand: HandModel, joints: Floats) -> Floats:
-    """Return the joint positions (N, J) nearest to the given ones that a hand of fewer dofs can take."""
+    """Return joint positions (N, J), feasible for a hand with fewer dofs, that are nearest to the given ones."""
     dof, rate = hand.dof[hand.joint_body], hand.multiplier[hand.joint_body]
     drive = np.zeros((len(dof), hand.dofs))
     drive[np.arange(len(dof)), dof] = rate
     return hand.expand((joints - hand.offset[hand.joint_body]) @ np.linalg.pinv(drive).T)
 
 
-#: Compliant couplings: MuJoCo's default constraint, 2.5 times as slow as the protocol's and softer.
+#: Solver parameters of compliant couplings: MuJoCo's default, 2.5 times as slow as the protocol's, and softer.
 COMPLIANT_SOLREF: Final = (0.02, 1.0)
 COMPLIANT_SOLIMP: Final = (0.9, 0.95, 1e-3, 0.5, 2.0)
 #: Compiled parts of a variant: shapes, their growth, drives.
@@ -229,7 +229,7 @@ _Build = tuple[Fit, float, Coupling]
 
 
 class Models:
-    """Models around the nominal one of a hand, an object and its surroundings. Thread-safe."""
+    """Models around the nominal one, for a hand, an object and its environment. Thread-safe."""
 
     def __init__(
         self,
@@ -249,19 +249,19 @@ class Models:
 
     def standard(self, grasps: GraspSet, row: int, variant: Variant) -> Rollout:
         """Return the verdict of level standard on one grasp in a variant.
-        The nominal variant reproduces the verdict of `validate` bit for bit."""
+        For the nominal variant it equals the verdict of `validate` bit for bit."""
         test = VariantTest(self.scene(variant), variant, self._lags(variant))
         return test.standard(self._taken(test.scene, seen(self.obj, grasps, row, variant)), 0)
 
     def lift(
         self, grasps: GraspSet, row: int, placed: PlacedGrasps, variant: Variant, *, dexgraspbench: bool = False
     ) -> LiftTest:
-        """Lift a grasp in a variant; the nominal one reproduces `validate_lifts` bit for bit.
+        """Lift a grasp in a variant; for the nominal one the result equals `validate_lifts` bit for bit.
 
         Args:
             grasps: the grasps, with their approach except at level dexgraspbench.
-            placed: the scenes of all grasps; their supports and neighbours are those of these models.
-            dexgraspbench: run the published test instead of the whole one.
+            placed: the scenes of all grasps, with the supports and neighbours of these models.
+            dexgraspbench: run the published test instead of the full one.
         """
         number = int(placed.index[row])
         variant = upright(variant, placed.scenes[number].up)
@@ -275,7 +275,7 @@ class Models:
         return test.dexgraspbench(one, 0) if dexgraspbench else test.lift(one, 0)
 
     def _taken(self, scene: Scene, one: GraspSet) -> GraspSet:
-        """Project the grasp on a hand of fewer dofs, which cannot take all postures."""
+        """Project the grasp onto the postures of a hand with fewer dofs."""
         if scene.hand.dofs < self.hand.dofs:
             for part in (one.grasp, one.pregrasp, one.squeeze):
                 part.joint_positions = nearest(scene.hand, part.joint_positions)
@@ -298,7 +298,7 @@ class Models:
         return _with_numbers(scene, variant)
 
     def _lags(self, variant: Variant) -> Floats | None:
-        """Return delays (J,) of joints, as shares of the time of closing; None: all start at once."""
+        """Return delays (J,) of joints, as shares of the closing time; None: all start at once."""
         if not any(variant.lags):
             return None
         lags = np.array([0.0, *variant.lags])
@@ -306,7 +306,7 @@ class Models:
 
 
 class _OneByOne(Test):
-    """A test in which fingers may begin to close one after another."""
+    """A test in which fingers may start to close one after another."""
 
     __test__ = False
     _lags: Floats | None = None
@@ -320,7 +320,7 @@ class _OneByOne(Test):
             even = stage / stages
             part = int(even >= 1)
             pose, _ = blend(parts[part], parts[part + 1], row, even - part)
-            # Delayed joints move faster: all arrive at the same time.
+            # Delayed joints move faster, so that all arrive at the same time.
             late = np.clip((even / 2 - self._lags) / (1 - self._lags.max()), 0, 1) * 2
             joints = [part.joint_positions[row] for part in parts]
             first, second = np.minimum(late, 1), np.maximum(late - 1, 0)
@@ -353,7 +353,7 @@ class VariantLift(_OneByOne, Lift):
 
 
 def _with_numbers(scene: Scene, variant: Variant) -> Scene:
-    """Return the scene with a variant's numbers in a copy of its model; itself if nothing changes."""
+    """Return the scene with a variant's numbers in a copy of its model; the same scene if nothing changes."""
     compiled = "own" if variant.coupling == "compliant" else variant.coupling
     plain = replace(
         variant, armature=None, dry_friction=None, damping=1.0, gain=1.0, friction=1.0, mass=1.0, coupling=compiled
@@ -381,7 +381,7 @@ def _with_numbers(scene: Scene, variant: Variant) -> Scene:
 
 
 def seen(obj: ObjectModel, grasps: GraspSet, row: int, variant: Variant) -> GraspSet:
-    """Return one grasp relative to the object, for a variant with displaced object or hand."""
+    """Return one grasp relative to the object, for a variant that displaces object or hand."""
     one = grasps.take(np.array([row]))
     if not (moves_object(variant) or any(variant.hand_shift_m)):
         return one
@@ -401,7 +401,7 @@ def moves_object(variant: Variant) -> bool:
 
 
 def motion_of(obj: ObjectModel, variant: Variant) -> Floats:
-    """Return the motion (7,) from the nominal to the displaced object, in its frame."""
+    """Return the motion (7,) from the nominal to the displaced object, in the object's frame."""
     turn = np.array(variant.object_turn)
     angle = float(np.linalg.norm(turn))
     turned = quat_from_axis_angle(turn / angle if angle else np.array([1.0, 0, 0]), np.array(angle))
@@ -409,14 +409,14 @@ def motion_of(obj: ObjectModel, variant: Variant) -> Floats:
 
 
 def about_centre(obj: ObjectModel, shift: Floats, turn: Floats) -> Floats:
-    """Return the motion (7,) of an object: a turn (4,) about its centre of mass and a shift (3,) [m]."""
+    """Return the motion (7,) of an object: a rotation (4,) about its centre of mass and a shift (3,) [m]."""
     about = np.concatenate([obj.centre_of_mass + shift, turn])
     return compose(about, np.concatenate([-obj.centre_of_mass, [1.0, 0, 0, 0]]))
 
 
 def upright(variant: Variant, up: Floats) -> Variant:
-    """Restrict a variant to an object on a support: shifts along the support, turns about the vertical.
-    `up` (3,) is against gravity, in the object frame."""
+    """Restrict a variant to an object on a support: shifts along the support, rotations about the vertical.
+    `up` (3,) is the direction against gravity, in the object frame."""
     if not moves_object(variant):
         return variant
     shift, turn = np.array(variant.object_shift_m), np.array(variant.object_turn)
@@ -425,7 +425,7 @@ def upright(variant: Variant, up: Floats) -> Variant:
 
 
 def _fingers(hand: HandModel) -> NDArray[np.intp]:
-    """Return the index (J,) in `hand.fingertips` of the fingertip that a joint moves; -1: several or none."""
+    """Return the index (J,) in `hand.fingertips` of the one fingertip that a joint moves; -1: several or none."""
     moved: list[set[int]] = [set() for _ in range(hand.bodies)]
     for place, tip in enumerate(hand.fingertips):
         body = tip

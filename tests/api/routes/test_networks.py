@@ -93,8 +93,8 @@ def test_a_file_larger_than_any_network_is_not_read(monkeypatch: pytest.MonkeyPa
     ("changes", "status", "words"),
     [
         ({"hand": "allegro"}, 422, "proposes grasps of barrett"),
-        ({"scene": "free"}, 422, "things on a table"),
-        ({"scene": {"supports": [{"kind": "half_space", "normal": [0, 0.1, 1]}]}}, 422, "things on a table"),
+        ({"scene": "free"}, 422, "objects on a table"),
+        ({"scene": {"supports": [{"kind": "half_space", "normal": [0, 0.1, 1]}]}}, 422, "objects on a table"),
         ({"options": {"network": "none"}}, 404, "there is no network 'none'; there are: net"),
         ({"options": {"network": "/etc/passwd"}}, 404, "there is no network"),
     ],

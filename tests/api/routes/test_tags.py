@@ -135,7 +135,7 @@ def test_what_is_not_there_or_too_much_gets_no_tag(
         return str(answer.json()["detail"])
 
     assert "no grasp 32" in refused(404, grasps=named(made.shard_id, 1, 32))
-    assert "one of both" in refused(422)
+    assert "either names of grasps or a filter" in refused(422)
     assert "no grasp passes" in refused(422, filter={"min_epsilon": 1000})
     for name in ("", " ", "two  spaces", "a\tb", "a\u00a0b", "a/b", "-a", "a" * 65):
         refused(422, name=name, grasps=named(made.shard_id, 1))

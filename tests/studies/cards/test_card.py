@@ -128,8 +128,8 @@ def test_the_card_of_a_dataset_says_where_its_grasps_are_valid(tmp_path: Path) -
     made = closed(tmp_path, scene="bin", neighbours=("mug",), views=0)
     assert (made.card["making"]["scenes"], made.card["making"]["neighbours"]) == (["bin"], ["mug"])
     assert made.card["validity"]["lift_hard"]["share"] == pytest.approx(0.5, abs=0.02)
-    assert "valid grasps in scenes (bin beside mug) of 2 robot hands" in made.page
-    assert "At half the friction 50 % of them lift too." in made.page
+    assert "valid grasps in scenes (bin with neighbours mug) of 2 robot hands" in made.page
+    assert "At half friction 50 % of them are also lifted." in made.page
     # What is said of free grasps is not said of these.
     assert "planned around a free object" not in made.page and "clearance of the table (no scenes)" not in made.page
 
@@ -293,7 +293,7 @@ def test_directions_that_no_hand_comes_from_are_told(tmp_path: Path) -> None:
     found = closed(tmp_path, change=from_above, grasps=160, scenes=0, views=0)
     rows = found.card["directions"]["by_object"]
     assert rows["mug"]["empty"] > 40 > rows["block"]["empty"]
-    assert "**Directions never used**" in found.page and f"mug ({rows['mug']['empty']})" in found.page
+    assert "**Unused directions**" in found.page and f"mug ({rows['mug']['empty']})" in found.page
 
 
 def test_a_cell_that_ran_out_of_budget_is_told(tmp_path: Path) -> None:
@@ -311,10 +311,15 @@ def test_what_stands_out_in_the_figures_is_told(kitchen: Case) -> None:
     level[17:19], level[30] = 80, 40
     card = kitchen.card | {"elevation": {"barrett": {"all": level.tolist(), "clear": level.tolist()}}}
     told = "\n".join(findings(card | {"quality": {"allegro": {"robust_share": {"median": 0.625}}}}))
-    assert "allegro: half hold in 62 % or less of the models around the nominal one" in told
+    assert "allegro: half of them hold in at most 62 % of the models around the nominal one" in told
     # two bins of 5 degrees hold 160 of 200; those within 10 degrees of the horizontal, sin(10 deg) of the sphere
-    assert "**Preferred directions**: of all palms over the table, 80 % within 10° of the horizontal (17 % if" in told
-    assert "clear of the table 20 % have the palm come from 45° or more" in told and "vertical" not in told
+    assert (
+        "**Preferred directions**: of all palms over the table, 80 % within 10° of the horizontal (17 % under" in told
+    )
+    assert (
+        "In 20 % of the pairs that are clear of the table, the palm approaches from 45° or more" in told
+        and "vertical" not in told
+    )
 
 
 def test_a_still_joint_is_told_and_no_flaw_that_is_not_there(kitchen: Case) -> None:

@@ -1,16 +1,16 @@
-"""Antipodal starts: opposed fingers around a pair of surface points, opened slightly wider than it.
+"""Antipodal starts: opposed fingers around a pair of surface points, opened slightly wider than the pair.
 
-The two surface points face away from each other (antipodal points: Nguyen, "Constructing force-closure grasps", 1988).
-Pairs are found by comparing samples of the surface with one another.
+The normals of the two surface points are opposite (antipodal points: Nguyen, "Constructing force-closure grasps",
+1988). Pairs are found by comparing samples of the surface with one another.
 
-A few outline points per posture give the distance by which a hand must rise to be clear of obstacles. The test is
+A few outline points per posture give the distance by which a hand must rise to be clear of obstacles. This test is
 cheap enough for many more hands than the exact collision test.
 
-Around a free object, too, hands start around drawn pairs no wider than the hand opens (`ReachSampling`). In most draws
-a finger or the palm penetrates the object: balls in the hand reject these before the simulation checks a draw.
+Around a free object, hands also start at random pairs that are no wider than the hand opens (`ReachSampling`). In most
+draws a finger or the palm penetrates the object: balls in the hand reject these draws before the simulation checks.
 
-A fingertip is modelled as a ball as wide as the hand's thinnest fingertip, beside an end of a pair that the hand could
-hold. Space for this ball is necessary for a grasp between opposed fingertips, not sufficient.
+A fingertip is modelled as a ball with the thickness of the hand's thinnest fingertip, next to an end of a pair. Space
+for this ball is necessary for a grasp between opposed fingertips, but not sufficient.
 """
 
 from __future__ import annotations
@@ -50,30 +50,30 @@ from graspd.worker.simulation.model import Model
 from graspd.worker.simulation.mounting import OUTERMOST, points_of
 from graspd.worker.simulation.obstacles import MARGIN_M
 
-#: Number of surface samples that form pairs, and the least cosine between a pair's line and its normals: within the
-#: friction cones of half the friction. With 0.9 Allegro lifts .39 of six objects at half friction and Shadow .30; with
-#: 0.96 they lift .42 and .39.
+#: Number of surface samples that form pairs, and the least cosine between a pair's line and its normals: inside the
+#: friction cones at half friction. With 0.9, Allegro lifts .39 of six objects at half friction and Shadow .30; with
+#: 0.96, .42 and .39.
 SAMPLES: Final = 500
 ACROSS: Final = 0.96
 #: Least distance of the two points [m].
 THINNEST_M: Final = 0.002
 #: Clearance between pad and object, on each side [m].
 ROOM_M: Final = (0.003, 0.015)
-#: At this horizontal distance from the centre of mass [m] the chance of a pair falls by a factor of e. It is at least
-#: `FAR` of the best pair's. Steep pairs and pairs that are hard to reach are rarer still. With 30 mm and 0.02 Allegro
-#: holds 0.28 of six objects at half friction, with these values 0.38.
+#: At this horizontal distance from the centre of mass [m] the probability of a pair falls by a factor of e. It is at
+#: least `FAR` times that of the best pair. Steep pairs and pairs that are hard to reach have even lower probability.
+#: With 30 mm and 0.02 Allegro holds 0.28 of six objects at half friction, with these values 0.38.
 BESIDE_M: Final = 0.02
 FAR: Final = 0.005
 STEEP: Final = 0.5
 SELDOM: Final = 0.1
-#: Largest distance of the pads from the ends of the pair at which a candidate counts as near enough [m].
+#: Largest distance of the pads from the ends of the pair at which a candidate counts as close enough [m].
 NEAR_M: Final = 0.008
-#: Number of hands whose draws are compared at once; more would only take memory.
+#: Number of hands whose draws are compared at once; more would only need more memory.
 AT_ONCE: Final = 256
 #: Least cosine between an approach from above and the vertical, for flat objects.
 UPRIGHT: Final = 0.9
-#: Noise of the posture as a share of each joint's range; number of directions compared per draw; tolerance of postures
-#: below and above the drawn width [m].
+#: Noise of the posture as a share of each joint's range; number of directions compared per draw; tolerances of postures
+#: narrower and wider than the drawn width [m].
 NOISE: Final = 0.03
 WAYS: Final = 4
 ALIKE_M: Final = (0.002, 0.006)
@@ -81,7 +81,7 @@ ALIKE_M: Final = (0.002, 0.006)
 
 @dataclass(frozen=True)
 class Crossings:
-    """P pairs of surface points that face away from each other: middle (P, 3) [m], axis (P, 3), width (P,) [m]."""
+    """P pairs of opposite surface points: middle (P, 3) [m], axis (P, 3), width (P,) [m]."""
 
     middle: Floats
     axis: Floats
@@ -110,16 +110,16 @@ def crossings_of(obj: ObjectModel) -> Crossings:
 
 @dataclass(frozen=True)
 class Openings:
-    """Pairs that a hand may grasp in one scene."""
+    """Pairs in one scene that a hand may grasp."""
 
     pairs: Crossings
     sums: Floats
-    """(P,) cumulative chance; empty if there is no pair."""
+    """(P,) cumulative probability; empty if there is no pair."""
     known: Oppositions
     up: Floats
-    """(3,) against gravity, object frame."""
+    """(3,) direction against gravity, object frame."""
     upright: bool
-    """Whether the hand comes from above and grasps level pairs only."""
+    """Whether the hand approaches from above and grasps level pairs only."""
     within_reach: bool
     """Whether a pair is nearly level, clear of obstacles, and no wider than the hand opens.
     This is the geometric condition for a grasp between opposed fingers from above or from the side."""
@@ -128,7 +128,7 @@ class Openings:
     def of(
         cls, known: Oppositions, obj: ObjectModel, scene: Environment, *, tip: float = 0.0, upright: bool = False
     ) -> Openings:
-        """Select pairs beside which fingertips of thickness `tip` [m] fit."""
+        """Select pairs with space for fingertips of thickness `tip` [m] at both ends."""
         pairs = crossings_of(obj)
         level = np.abs(pairs.axis @ scene.up) < STEEP
         fits = pairs.width + 2 * ROOM_M[0] <= known.widest
@@ -152,7 +152,7 @@ class Openings:
 
     @classmethod
     def in_scene(cls, hand: HandModel, obj: ObjectModel, scene: Environment) -> Openings:
-        """Select pairs for fingertips that rest beside a flat object, or else for the pads."""
+        """Select pairs for fingertips that rest next to a flat object, or else for the pads."""
         ends = pinches_of(hand, float(np.ptp(obj.hull_vertices @ scene.up)))
         tip = thinnest_fingertip(hand)
         flat = cls.of(ends, obj, scene, tip=tip, upright=True)
@@ -160,7 +160,7 @@ class Openings:
 
 
 def room_beside(pairs: Crossings, scene: Environment, width: float) -> Floats:
-    """Return the least clearance (P,) of balls of diameter `width` beside the ends of pairs [m].
+    """Return the least clearance (P,) of balls of diameter `width` at the ends of pairs [m].
     Walls and neighbours count; the object's own support is ignored."""
     out = np.full(len(pairs), np.inf)
     for obstacle in scene.obstacles:
@@ -173,7 +173,7 @@ def room_beside(pairs: Crossings, scene: Environment, width: float) -> Floats:
 
 @dataclass(frozen=True)
 class AntipodalHands:
-    """n hands that oppose their fingers across the object, turned by (n, 3, 3); they retreat along `away` (n, 3)."""
+    """n hands with fingers on both sides of the object, orientation (n, 3, 3); they retreat along `away` (n, 3)."""
 
     known: Oppositions
     posture: NDArray[np.intp]
@@ -183,14 +183,14 @@ class AntipodalHands:
     turn: Floats
     away: Floats
     deep: Floats
-    """(n,) distance of the pads beyond the pair, which brings the palm nearer to the object [m]."""
+    """(n,) distance of the pads beyond the pair; a larger one brings the palm nearer to the object [m]."""
 
     def q(self, hand: HandModel, normal: Floats) -> Floats:
         known = self.known.q[self.posture]
         return np.clip(known + NOISE * hand.span * normal, hand.lower, hand.upper)
 
     def beside(self, moved: Floats) -> Floats:
-        """Return the distance (n, ...) of the pair beside or in front of pads moved by (n, ..., 3) [m].
+        """Return the distance (n, ...) of the pair from pads that have moved by (n, ..., 3), sideways or ahead [m].
         A pair nearer to the palm also lies between the fingers."""
         away = self.away.reshape(len(self.deep), *(1,) * (moved.ndim - 2), 3)
         off = moved - self.deep.reshape((*away.shape[:-1], 1)) * away
@@ -199,7 +199,7 @@ class AntipodalHands:
 
 
 def across(hand: HandModel, obj: ObjectModel, opening: Openings, uniform: Floats, ways: Floats) -> AntipodalHands:
-    """Place hands across the object by random numbers (n, 6); `ways` (K, 3) are free directions away from it."""
+    """Place hands across pairs by random numbers (n, 6); `ways` (K, 3) are free directions away from the object."""
     known = opening.known
     if opening.upright and (upright := ways @ opening.up > UPRIGHT).any():
         ways = ways[upright]
@@ -209,7 +209,7 @@ def across(hand: HandModel, obj: ObjectModel, opening: Openings, uniform: Floats
     low = np.searchsorted(known.width, width - ALIKE_M[0])
     high = np.maximum(np.searchsorted(known.width, width + ALIKE_M[1]), low + 1)
     posture = np.minimum(low + (uniform[:, 3] * (high - low)).astype(int), len(known) - 1)
-    # Of a few free directions, choose the one most nearly perpendicular to the line.
+    # Among a few free directions, choose the one most nearly perpendicular to the pair's line.
     share = (uniform[:, 4:5] + np.arange(WAYS) * 0.6180339887) % 1.0
     tried = ways[(share * len(ways)).astype(int)]
     best = np.abs(np.einsum("nki,ni->nk", tried, axis)).argmin(axis=1)
@@ -217,7 +217,7 @@ def across(hand: HandModel, obj: ObjectModel, opening: Openings, uniform: Floats
     turn = frames(axis, -tried[np.arange(len(tried)), best]) @ np.swapaxes(frames(known.axis[posture], palm), -1, -2)
     away = -np.einsum("nij,nj->ni", turn, palm)
     reach = known.middle[posture] - hand.palm.centre
-    # The depth ranges from a fingertip grasp to the palm against the object.
+    # The depth ranges from a fingertip grasp to a palm in contact with the object.
     deep = np.maximum(np.einsum("ni,ni->n", reach, palm), 0.0) * uniform[:, 5]
     pivot = opening.pairs.middle[pair] - np.einsum("nij,nj->ni", turn, reach) - deep[:, None] * away
     return AntipodalHands(known, posture, pivot - obj.centre_of_mass, turn, away, deep)
@@ -235,8 +235,8 @@ def promising(
     keep: int,
 ) -> tuple[NDArray[np.intp], Floats]:
     """Select the `keep` of C draws per hand that need the least rise to clear the obstacles, (n, keep).
-    Also return the distance of the pair from between the pads (n, keep) [m]. Near enough draws keep their order.
-    `uniform` (n, C, 6) and `ways`: see `across`; `room`: clearance to keep in addition to the margin [m]."""
+    Also return the distance of the pair from between the pads (n, keep) [m]. Close enough draws keep their order.
+    `uniform` (n, C, 6) and `ways`: see `across`; `room`: clearance in addition to the margin [m]."""
     count, draws, _ = uniform.shape
     outlines, off = outlines_of(hand, opening.known.q), np.zeros((count, draws))
     for rows in np.array_split(np.arange(count), 1 + count // AT_ONCE):
@@ -248,7 +248,7 @@ def promising(
 
 
 def frames(first: Floats, second: Floats) -> Floats:
-    """Return rotations (n, 3, 3) with first column `first` (n, 3) and second column nearest to `second`."""
+    """Return rotations (n, 3, 3) with first column `first` (n, 3) and second column closest to `second`."""
     y = second - np.einsum("ni,ni->n", first, second)[:, None] * first
     helper = np.eye(3)[np.argmin(np.abs(first), axis=1)]
     other = helper - np.einsum("ni,ni->n", first, helper)[:, None] * first
@@ -257,7 +257,7 @@ def frames(first: Floats, second: Floats) -> Floats:
     return np.stack([first, y, np.cross(first, y)], axis=-1)
 
 
-#: Number of directions in which outermost points are taken, for the fingertips and for the rest of the hand.
+#: Number of directions of outermost points, for the fingertips and for the rest of the hand.
 DIRECTIONS: Final = 20
 
 
@@ -275,8 +275,8 @@ class PostureOutlines:
     def lacks(
         self, posture: NDArray[np.intp], turn: Floats, centre: Floats, scene: Environment, *, room: float
     ) -> Floats:
-        """Return the clearance (n,) that hands and mountings lack to the margin plus `room` [m], at least 0.
-        They have postures (n,), rotations (n, 3, 3) and palm centres (n, 3), object frame [m]."""
+        """Return the clearance (n,) missing at hands and mountings, relative to the margin plus `room` [m], at least 0.
+        Hands have postures (n,), rotations (n, 3, 3) and palm centres (n, 3), object frame [m]."""
         place = np.matmul(self.points[posture], np.swapaxes(turn, -1, -2)) + centre[:, None]
         lack = np.zeros(len(posture))
         for obstacle in scene.obstacles:
@@ -285,7 +285,7 @@ class PostureOutlines:
         return np.maximum(lack, self._mounting_lacks(turn, centre, scene, MARGIN_M + room))
 
     def _mounting_lacks(self, turn: Floats, centre: Floats, scene: Environment, wanted: float) -> Floats:
-        """Return the clearance (n,) that mountings lack to `wanted` at their best wrist position [m]."""
+        """Return the clearance (n,) that mountings miss relative to `wanted`, at their best wrist position [m]."""
         least = np.full(len(turn), np.inf if len(self.mounting) else 0.0)
         for points in self.mounting:
             rows = np.flatnonzero(least > 0.0)
@@ -312,13 +312,13 @@ def outlines_of(hand: HandModel, q: Floats) -> PostureOutlines:
     return PostureOutlines(np.concatenate(points, axis=1) - hand.palm.centre, np.concatenate(tips), mounting)
 
 
-#: Gaps wider than this count as this wide, and the resolution of narrower ones [m].
+#: Wider gaps count as this wide; resolution of narrower gaps [m].
 WIDEST_M: Final = 0.064
 EXACT_M: Final = 0.0005
 
 
 def why_narrow(hand: HandModel, obj: ObjectModel, scenes: Sequence[Environment]) -> str | None:
-    """Explain why no fingertips of a hand can hold an object in any scene; None if no reason is found."""
+    """Explain why fingertips of a hand cannot hold an object in any scene; None if no reason is found."""
     known, pairs = oppositions_of(hand), crossings_of(obj)
     if not len(known) or not len(pairs):
         return None
@@ -345,7 +345,7 @@ def why_narrow(hand: HandModel, obj: ObjectModel, scenes: Sequence[Environment])
 
 
 def _widest_gap(pairs: Crossings, fits: NDArray[np.bool_], scene: Environment, thin: float) -> float:
-    """Return the diameter of the widest ball beside both ends of a pair [m]; steep pairs need space below."""
+    """Return the diameter of the widest ball next to both ends of a pair [m]; steep pairs need space below."""
     level, above = np.abs(pairs.axis @ scene.up) < STEEP, np.ones(len(pairs), bool)
     for obstacle in scene.obstacles:
         above &= np.minimum(*(obstacle.distance(end) for end in pairs.ends())) >= thin
@@ -360,12 +360,12 @@ def _widest_gap(pairs: Crossings, fits: NDArray[np.bool_], scene: Environment, t
     return low
 
 
-#: Draws per start, and the number of draws clear by the ball test that the simulation checks.
+#: Number of draws per start, and number of draws clear by the ball test that the simulation checks.
 DRAWS: Final = 512
 LOOKS: Final = 8
-#: Chance of a pair far from the centre of mass, relative to a pair through it.
+#: Probability of a pair far from the centre of mass, relative to a pair through it.
 FAR_ACROSS: Final = 0.05
-#: Number of balls in the hand and their radius [m]: they touch its surface from within and protrude from thinner links.
+#: Number of balls in the hand and their radius [m]: they touch its surface from inside and protrude from thinner links.
 BALLS: Final = 96
 BALL_M: Final = 0.005
 #: An object is small if all its pairs are narrower than this and than the smallest gap of the hand's pads [m].
@@ -379,17 +379,17 @@ class ReachSampling:
     model: Model
     grips: Any
     only: bool
-    """Whether all starts reach across, because the object is too small or too wide for the pads.
-    Starts that face a random point then rarely succeed."""
+    """Whether all starts are antipodal, because the object is too small or too wide for the pads.
+    Starts with the palm towards a random point then rarely succeed."""
 
     @classmethod
     def of(cls, model: Model) -> ReachSampling | None:
-        """Return None if the hand opposes no fingers, or the object is too wide everywhere."""
+        """Return None if the hand has no opposed fingers, or the object is too wide everywhere."""
         known = _grips(model.hand.model, model.obj.model, model.device)
         return None if known is None else cls(model, *known)
 
     def starts(self, seeds: NDArray[np.int32], first: NDArray[np.int32], retreats: Floats) -> tuple[HandState, Any]:
-        """Return hands (n,) of the first draws, from numbers `first` (n,) on, that pass the ball test.
+        """Return hands (n,) of the first draws that pass the ball test; draws are numbered from `first` (n,).
         Also return the draws' numbers (n,), -1 if there is none. `retreats`: ascending steps from the object [m]."""
         m, count = self.model, len(seeds)
         with wp.ScopedDevice(m.device):
@@ -415,7 +415,7 @@ def size_to_pads(hand: HandModel, width: Floats) -> Size | None:
 
 
 def _postures(hand: HandModel, width: Floats, size: Size | None) -> Oppositions:
-    """Return the postures for pairs of the widths (P,), empty if none holds a pair."""
+    """Return the postures for pairs of the widths (P,), empty if none fits a pair."""
     if size == "wide" and width.min() + 2 * ROOM_M[0] > widest_span(hand):
         return Oppositions.of_none(hand)
     known = oppositions_of(hand) if size is None else spans_of(hand, size)
@@ -424,7 +424,7 @@ def _postures(hand: HandModel, width: Floats, size: Size | None) -> Oppositions:
 
 @cached_by_content(8)
 def _grips(hand: HandModel, obj: ObjectModel, device: str) -> tuple[Any, bool] | None:
-    """Return `ReachSampling.grips` and `.only`; None if no posture holds a pair."""
+    """Return `ReachSampling.grips` and `.only`; None if no posture fits a pair."""
     pairs, out = crossings_of(obj), kernels.Grips()
     size = size_to_pads(hand, pairs.width)
     known = _postures(hand, pairs.width, size)
@@ -447,7 +447,7 @@ def _grips(hand: HandModel, obj: ObjectModel, device: str) -> tuple[Any, bool] |
         out.opened = wp.array(known.width, dtype=wp.float32)
         out.balls = wp.array(balls, dtype=wp.vec3)
         out.radius = BALL_M - SLACK_M
-        # Objects that are too small or too wide are held where space was found, never nearer to the palm.
+        # Objects that are too small or too wide are held where there was space, never nearer to the palm.
         out.deep = 0.0 if size else 1.0
         out.palm = wp.vec3(*hand.palm.approach)
         out.noise = wp.array(NOISE * hand.span, dtype=wp.float32)

@@ -1,4 +1,4 @@
-"""Batches planned in one launch: the batch of each grasp, and the batches that stopped.
+"""Batches planned in one launch: the batch of each grasp, and which batches have stopped.
 
 A batch stops when it is cancelled or fails; the other batches continue.
 """
@@ -30,7 +30,7 @@ class Batches:
     """Grasps of several batches, one batch after the other; a row is a grasp."""
 
     def __init__(self, asked: Sequence[BatchRequest], obj: ObjectModel, warm: WarmStart | None = None) -> None:
-        """All batches have one fidelity; all or none are in scenes with the same fixed surroundings.
+        """All batches have one fidelity; either all or none are in scenes, with the same supports and neighbours.
         In scenes, `warm` proposes the starts of hands; None: `scene_starts` finds them."""
         self.asked, self.warm = asked, warm
         wanted = [one.wanted for one in asked]
@@ -47,7 +47,7 @@ class Batches:
         self.index = np.concatenate([one.first + np.arange(one.count) for one in wanted])
         """(n,) number of each row within its batch."""
         self.opened = np.zeros(len(self.owner), bool)
-        """(n,) whether hands of a row start more open than their pre-shape, in which no start was clear."""
+        """(n,) whether the hands of a row start more open than their pre-shape, because no start was clear in it."""
         self.errors: dict[int, Exception] = {}
         """Errors of the batches that stopped."""
         self._steps = [StepCounter(one.wanted.count * (hands(self.fidelity) + 1), one.run) for one in asked]
@@ -57,7 +57,7 @@ class Batches:
         """Free directions of each scene."""
         for owner, scenes in enumerate(placed):
             try:
-                # All scenes of a batch or none: a scene's directions are found by its number.
+                # Either all or none: a scene's directions are found by its number.
                 self.ways += [free_ways(scene, obj) for scene in scenes.scenes]
             except InputError as error:
                 self.ways += [np.zeros((0, 3))] * len(scenes.scenes)
@@ -65,7 +65,7 @@ class Batches:
 
     @property
     def has_rollout(self) -> bool:
-        """Whether candidates go through a rollout; around a free object only where the fidelity seats several."""
+        """Whether candidates are tested in rollouts; for a free object only if the fidelity has several finalists."""
         first = self.asked[0].wanted
         several = first.placed is not None or first.fidelity.finalists > 1
         return several and all(one.wanted.rollout is not None for one in self.asked)
@@ -85,7 +85,7 @@ class Batches:
         return rows
 
     def step(self, rows: Rows, work: float, message: str) -> None:
-        """Report so much work for each of the rows; stop batches that are cancelled.
+        """Report an amount of work for each of the rows; stop batches that are cancelled.
         Raise the first batch's error if all have stopped."""
         owners, counts = np.unique(self.owner[rows], return_counts=True)
         for owner, count in zip(owners.tolist(), counts.tolist(), strict=True):
@@ -98,7 +98,7 @@ class Batches:
             raise self.errors[min(self.errors)]
 
     def generators(self, rows: Rows, attempt: Rows) -> list[np.random.Generator]:
-        """Return generators for the starts of these rows at attempts (n,), those of one grasp side by side."""
+        """Return generators for the starts of these rows at attempts (n,); generators of one grasp are adjacent."""
         starts = self.fidelity.starts
         wanted = [self.asked[owner].wanted for owner in self.owner[rows].tolist()]
         numbers = zip(wanted, self.index[rows].tolist(), attempt.tolist(), strict=True)
@@ -110,7 +110,7 @@ class Batches:
 
     def rollout(self, grasps: GraspSet, rows: Rows, beat: Floats) -> Floats:
         """Score (n,) grasps of these rows by their batches' rollouts, against the scores `beat` (n,).
-        All grasps of a batch that stopped count as good enough."""
+        Grasps of stopped batches count as good enough."""
         owners, scores = self.owner[rows], np.zeros(len(grasps))
         placed = self.placed.take(rows) if self.placed is not None else None
         for owner in distinct_values(owners):

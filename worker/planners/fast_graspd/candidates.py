@@ -17,15 +17,15 @@ from graspd.worker.objects.model import ObjectModel
 from graspd.worker.simulation.data import HandState
 from graspd.worker.simulation.environment import PlacedGrasps
 
-#: Candidates of each grasp that are seated and simulated at once: seating costs half of a rollout.
+#: Number of a grasp's candidates that are seated (fine phase) and simulated at once: seating costs half of a rollout.
 TOGETHER: Final = 2
-#: Merit above which a seated hand has no rollout unless its grasp has no other candidate: of 176 such hands of Allegro
-#: and Shadow 3 lifted at half friction.
+#: A seated hand with a merit above this has no rollout unless its grasp has no other candidate: of 176 such hands of
+#: Allegro and Shadow 3 lifted at half friction.
 HOPEFUL: Final = 0.3
-#: Score above which a grasp counts as failed: the object is lost, or the trajectory is blocked.
+#: A grasp with a score above this has failed: the object is lost, or the trajectory is blocked.
 POOR: Final = 7.0
-#: Share of the force in a second rollout of a hand that nearly holds at half friction. Of 144 hands of Shadow .80 lift
-#: with the whole force, .83 with half, .92 with the best of six forces.
+#: Share of the squeeze force in a second rollout of a hand that nearly holds at half friction. Of 144 hands of Shadow
+#: .80 lift with the whole force, .83 with half, .92 with the best of six forces.
 GENTLER: Final = 0.5
 NEARLY: Final = 2.5
 #: Score of candidates without a rollout.
@@ -48,13 +48,13 @@ def with_postures(
 
 @dataclass(frozen=True)
 class Refinements:
-    """Hands after the fine phase, those of a grasp side by side."""
+    """Hands after the fine phase; hands of one grasp are adjacent."""
 
     state: HandState
     losses: Floats
     merit: Floats
     infeasible: NDArray[np.bool_]
-    """Whether its depth or number of touching links fails the geometric gate: then it has no rollout."""
+    """Whether the depth or the number of touching links fails the geometric gate: such hands have no rollout."""
 
 
 Seat = Callable[[NDArray[np.intp], NDArray[np.intp]], Refinements]
@@ -62,7 +62,7 @@ Seat = Callable[[NDArray[np.intp], NDArray[np.intp]], Refinements]
 """Seats the hands of some grasps (n,), given the rows (n, each) of their starts."""
 
 RolloutOf = Callable[[GraspSet, NDArray[np.intp], Floats], Floats]
-"""Scores (k,) grasps with the numbers (k,) against the scores to beat; see `worker.planners.Rollout`."""
+"""Scores (k,) grasps of the numbers (k,) against the scores to beat; see `worker.planners.Rollout`."""
 
 
 @dataclass
@@ -82,7 +82,7 @@ class Selection:
     def take(
         self, found: GraspSet, seated: Refinements, rows: NDArray[np.intp], which: NDArray[np.intp], score: Floats
     ) -> None:
-        """Take candidates `rows` (k,) of the grasps `which` (k,) where they are better."""
+        """Store candidates `rows` (k,) of the grasps `which` (k,) where they are better."""
         state, losses = seated.state[rows], seated.losses[rows]
         for k in np.flatnonzero(score < self.score[which]):
             grasp = int(which[k])
@@ -106,9 +106,9 @@ def tried(
     together: int = TOGETHER,
     device: str = "cpu",
 ) -> Selection:
-    """Return each grasp's first candidate with a good enough rollout, or else the one with least score.
-    `together` candidates of each grasp are seated and simulated in the order (n, each) of merit, then as many again
-    for grasps without a good one. Unbalanced or infeasible hands have no rollout, but a grasp's first one is taken."""
+    """Return each grasp's first candidate with a good enough rollout, or else the one with the smallest score.
+    `together` candidates of each grasp are seated and simulated in the order (n, each) of merit, then as many again for
+    grasps without a good one. Unbalanced or infeasible hands have no rollout; a grasp's first hand is still used."""
     taken, left = Selection.none(len(order), hand.dofs), np.arange(len(order))
     for wave in np.split(order, range(together, order.shape[1], together), axis=1):
         if not len(left):
@@ -151,8 +151,8 @@ def _gentler(
     rollout: RolloutOf,
     device: str,
 ) -> None:
-    """Give hands (k,) that nearly lift a gentler squeeze where it improves the score.
-    Soft fingers act as springs: the harder they press, the more they turn the object out of the hand."""
+    """Use a smaller squeeze force for hands (k,) that nearly lift, if it improves the score.
+    Soft fingers act as springs: a larger force turns the object farther out of the hand."""
     poor = np.flatnonzero((score >= 1.0) & (score < NEARLY))
     if not len(poor):
         return
@@ -164,18 +164,18 @@ def _gentler(
     score[poor[better]] = again[better]
 
 
-#: Coulomb coefficient for the balance of contacts: lower than in any test, so that balanced grasps have a reserve.
+#: Coulomb coefficient for the balance of contacts: lower than in any test, for a reserve.
 FRICTION: Final = 0.3
-#: The same in scenes: hands that balance with it mostly lift at half friction (AUC .80 of seated hands of Allegro and
-#: Shadow whose merit is below .1; .74 with `FRICTION`).
+#: The same in scenes: hands that balance at this friction mostly lift at half friction (AUC .80 of seated hands of
+#: Allegro and Shadow whose merit is below .1; .74 with `FRICTION`).
 SCENE_FRICTION: Final = 0.15
-#: Weight of L_stable against the residual of the balance.
+#: Weight of L_stable relative to the residual of the balance.
 STABILITY: Final = 0.05
-#: Weight of penetration [1/m] above the tolerance [m]: one millimetre more outweighs most of an unbalanced grasp.
+#: Weight of penetration [1/m] above the tolerance [m]: one more millimetre outweighs most of the residual.
 DEPTH: Final = 200.0
 TOLERATED_M: Final = 5e-4
 #: Weight of the share of the hand's surface near a free object after the coarse phase, and the distance that counts as
-#: near [m]. Of equally balanced hands, the one that encloses more of the object is refined or simulated first.
+#: near [m]. Among equally balanced hands, those that enclose more of the object are refined or simulated first.
 NEARNESS: Final = 2.0
 NEAR_M: Final = 0.005
 
@@ -196,7 +196,8 @@ def merits(
     device: str = "cpu",
 ) -> Floats:
     """Compute merits (n,); smaller is better.
-    Residual of contact forces balanced with `friction`, a share of L_stable (n,), and excess `depths` (n,) [m]."""
+    The merit sums the residual of contact forces balanced with `friction`, a share of L_stable (n,), and excess
+    `depths` (n,) [m]."""
     holds = hold_forces(hand, obj, posture_of(hand, obj, state), friction=friction, device=device)
     merit = holds.residual + STABILITY * losses
     if depths is not None:
@@ -205,7 +206,7 @@ def merits(
 
 
 def ranked(merit: Floats, grasps: int) -> NDArray[np.intp]:
-    """Return rows (grasps, each) of each grasp's hands, the best first; hands of a grasp lie side by side."""
+    """Return rows (grasps, each) of each grasp's hands, the best first; hands of one grasp are adjacent."""
     each = merit.reshape(grasps, -1)
     # The stable sort keeps hands of equal merit in the order of their starts.
     return np.argsort(each, axis=1, kind="stable") + np.arange(grasps)[:, None] * each.shape[1]

@@ -1,4 +1,4 @@
-"""Device data shared by the batches of one (hand, object, fidelity), cached between batches."""
+"""Device data that batches of one (hand, object, fidelity) share, cached between batches."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from graspd.worker.simulation.sampling import object_samples
 
 #: Cell of the coarse distance grid [m].
 FIELD_CELL: Final = 0.005
-#: Hand points tested against other links, and object samples tested against links, in the coarse phase and the fine.
+#: Number of hand points, and of object samples, tested against links in the coarse phase and in the fine phase.
 COARSE_SELF_POINTS: Final = 400
 FINE_SELF_POINTS: Final = 1000
 COARSE_SAMPLES: Final = 1500
-#: Factor on the fidelity's object samples and their maximum, around a free object. Penetration between two samples is
-#: not detected; with the fidelity's own number it is .2 mm at the median.
+#: Factor on the fidelity's object samples around a free object, and their maximum. Penetration between two samples is
+#: not detected; its median is .2 mm with the fidelity's own number.
 DENSER, DENSEST = 3, 12_000
 #: Number of pairs cached on the device.
 KEPT: Final = 4
@@ -48,14 +48,14 @@ class Pair:
     hand: DeviceHand
 
     def model(self, side: PhaseGeometry, obstacles: DeviceObstacles | None = None, *, pulled: bool = True) -> Model:
-        """Return the model of hand and object for a phase; the attraction term is off among obstacles.
-        There, fingers that could enclose the object are kept away from the table."""
+        """Return the model of hand and object for a phase; among obstacles it has no attraction term.
+        There, fingers that could enclose the object stay away from the table."""
         options = self.options if obstacles is None and pulled else replace(self.options, pull=0.0)
         return Model.create(self.hand, side.obj, side.points, side.own, options, obstacles)
 
 
 def pair_of(hand: HandModel, obj: ObjectModel, fidelity: Fidelity, device: str, *, in_scenes: bool = False) -> Pair:
-    """Return the pair, cached. Without projection out of a free object it also has the fidelity's samples."""
+    """Return the pair, cached. If no projection out of a free object follows, samples are those of the fidelity."""
     count = fidelity.object_points
     if fidelity.polish_iterations and not in_scenes:
         count = max(count, min(DENSER * count, DENSEST))

@@ -1,6 +1,6 @@
 """The planner: starts, coarse phase, fine phase and projection of batches in one launch.
 
-A launch is divided into one part per CPU thread. A grasp does not depend on the other grasps of its launch.
+A launch is divided into one part per CPU thread. A grasp is independent of the other grasps of its launch.
 """
 
 from __future__ import annotations
@@ -54,23 +54,23 @@ from graspd.worker.simulation.record import record_iteration
 
 Rows = NDArray[np.intp]
 
-#: Iterations between two checks for cancellation.
+#: Number of iterations between two checks for cancellation.
 CHUNK: Final = 10
-#: Fewest grasps for which a thread pays.
+#: Fewest grasps per thread.
 PART: Final = 4
-#: Merit above which a grasp is retried: a fifth (Shadow) to a half of such grasps hold, and most others.
+#: A grasp with a larger merit is retried: a fifth (Shadow) to a half of such grasps hold, and most of the others.
 SET_OUT_AGAIN: Final = 0.05
-#: The same for scores of a rollout, see `worker.planners.port.Rollout`: a tenth to a quarter of such grasps hold.
+#: The same for rollout scores, see `worker.planners.port.Rollout`: a tenth to a quarter of such grasps hold.
 FAILED: Final = 2.0
 #: Largest number of retries of grasps with rollouts. A further attempt is as productive as the first ones, so the yield
-#: per second hardly depends on it. Fewer grasps of a hard pair fail.
+#: per second hardly changes, but fewer grasps of a hard pair fail.
 ATTEMPTS: Final = 20
-#: Score of a free grasp that holds while a finger does not touch: it is retried up to `CLOSER` times, then the best
+#: Score of a free grasp that holds without contact at one finger: it is retried up to `CLOSER` times, then the best
 #: attempt is selected.
 STANDS: Final = 1.99
 CLOSER: Final = 2
-#: Scores above which grasps in scenes are retried, per attempt. The first attempt includes grasps that lift at full
-#: friction only: an attempt costs half of another grasp, and one in ten of these then lifts at half friction.
+#: Grasps in scenes with larger scores are retried; one value per attempt. The first value includes grasps that lift at
+#: full friction only: an attempt costs half of another grasp, and one in ten of them then lifts at half friction.
 IN_SCENES: Final = (1.0, FAILED, FAILED, FAILED, FAILED)
 #: Largest number of attempts of one grasp at once.
 AHEAD: Final = 4
@@ -84,11 +84,11 @@ class LaunchPart:
     state: HandState
     loss: Floats
     merit: Floats
-    """(n,) merit of the chosen hand, or its rollout score; 0 where there was no choice."""
+    """(n,) merit or rollout score of the selected hand; 0 if there was no selection."""
     curve: list[Floats] = field(default_factory=list)
     """(n,) mean L_stable of each grasp's hands, every `CHUNK` iterations."""
     grasps: GraspSet | None = None
-    """Grasps with their postures, where these were requested or a rollout needed them."""
+    """Grasps with their postures, if requested or needed by a rollout."""
     attempts: Rows = field(default_factory=lambda: np.zeros(0, int))
 
     def __post_init__(self) -> None:
@@ -152,12 +152,12 @@ def _pair(hand: HandModel, obj: ObjectModel, wanted: PlanRequest, run: Execution
 
 
 def optimise_batch(hand: HandModel, obj: ObjectModel, wanted: PlanRequest, run: ExecutionContext) -> list[LaunchPart]:
-    """Run starts, optimisation and projection of a batch, without the postures around each grasp."""
+    """Run starts, optimisation and projection of a batch, without pregrasp and squeeze postures."""
     return optimise_pair(_pair(hand, obj, wanted, run), wanted, run)
 
 
 def optimise_pair(pair: Pair, wanted: PlanRequest, run: ExecutionContext) -> list[LaunchPart]:
-    """Do the same for a pair that is already on `run.device`; its geometry may differ from the fidelity's."""
+    """Run `optimise_batch` for a pair on `run.device`; its geometry may differ from the fidelity's."""
     batches = Batches([BatchRequest(wanted, run)], pair.fine.obj.model)
     parts = optimise(pair, batches, run)
     batches.left()
@@ -165,8 +165,8 @@ def optimise_pair(pair: Pair, wanted: PlanRequest, run: ExecutionContext) -> lis
 
 
 def optimise(pair: Pair, batches: Batches, run: ExecutionContext, *, postures: bool = False) -> list[LaunchPart]:
-    """Do the same for several batches; return the parts of those that did not stop, and perhaps others.
-    `postures` adds the postures around the grasps. Raise the first batch's error if all have stopped."""
+    """Run several batches; return the parts of those that did not stop, possibly with others.
+    `postures` adds the pregrasp and squeeze postures. Raise the first batch's error if all have stopped."""
     launch = _Launch(pair, batches)
     begun = _begun(launch, batches.left(), run)
     rows = _with_place(launch, begun)
@@ -188,12 +188,12 @@ def optimise(pair: Pair, batches: Batches, run: ExecutionContext, *, postures: b
 
 @dataclass(frozen=True)
 class _Launch:
-    """Models of a pair for each phase and the batches planned with them, shared by all threads."""
+    """Models of a pair for each phase and the batches planned with them; all threads share it."""
 
     pair: Pair
     batches: Batches
     pulled: bool = True
-    """Whether the attraction term is on, for free objects."""
+    """Whether the attraction term is on; only for free objects."""
     coarse: Model = field(init=False)
     fine: Model = field(init=False)
 
@@ -214,7 +214,7 @@ class _Launch:
         return merits(hand, obj, state, losses, depths, friction=friction, device=device)
 
     def infeasible(self, state: HandState, depths: Floats) -> NDArray[np.bool_]:
-        """Check (n,) whether hands of these depths [m] fail the geometric gate; used before rollouts."""
+        """Check (n,) whether hands of these depths [m] fail the geometric gate; such hands have no rollout."""
         if not self.batches.has_rollout:
             return np.zeros(len(depths), bool)
         hand, obj, device = self.pair.hand.model, self.pair.fine.obj.model, self.pair.hand.device
@@ -224,13 +224,13 @@ class _Launch:
 
 @dataclass(frozen=True)
 class _Begun:
-    """Starts of the hands of grasps, those of one grasp side by side."""
+    """Starts of the hands of grasps; hands of one grasp are adjacent."""
 
     rows: Rows
     state: HandState
     depth: Floats
     touch: Floats | None
-    """Share of the dilation at which each hand touches; None: all of it."""
+    """Share of the dilation at which each hand touches; None: the whole dilation."""
 
     def take(self, which: NDArray[np.intp], each: int) -> _Begun:
         hands = (which[:, None] * each + np.arange(each)).ravel()
@@ -258,7 +258,7 @@ def _set_out(launch: _Launch, rows: Rows, attempt: Rows) -> _Begun:
     fidelity, placed, generators = batches.fidelity, launch.placed(rows), batches.generators(rows, attempt)
     if placed is None:
         state, depth = starts.clear_starts(coarse, generators, each=fidelity.starts)
-        # At later attempts only grasps that opened at the first may open: the others already have starts and keep them.
+        # In later attempts only grasps that opened in the first may open; the others have clear starts.
         may_open = np.repeat(batches.opened[rows] | (attempt == 0), fidelity.starts)
         opened = starts.open_further(coarse, generators, state, depth, may_open)
         batches.opened[rows] |= opened.reshape(len(rows), -1).any(axis=1)
@@ -271,7 +271,7 @@ def _set_out(launch: _Launch, rows: Rows, attempt: Rows) -> _Begun:
 
 def _with_place(launch: _Launch, begun: _Begun) -> Rows:
     """Return the rows of the batches that found starts.
-    Around a free object every grasp must have one; in scenes one per batch suffices, made here or elsewhere."""
+    Around a free object every grasp must have one. In scenes one per batch suffices, in this part or in another."""
     batches = launch.batches
     deep = begun.depth.reshape(len(begun.rows), -1)
     owners = batches.owner[begun.rows]
@@ -291,7 +291,7 @@ def _work(launch: _Launch, begun: _Begun) -> LaunchPart:
     data = _in_scenes(Data(launch.coarse, n * fidelity.starts), placed, fidelity.starts)
     data.set_schedule(coarse_schedule(fidelity))
     data.set_state(begun.state, dilation=begun.touch)
-    # The dilation shrinks during the coarse phase and changes its loss, so nothing converges before its end.
+    # During the coarse phase the dilation shrinks and changes the loss, so nothing converges before its end.
     launches = record_iteration(launch.coarse, data, fidelity.optimizer, patience=0)
     curve: list[Floats] = []
     state = _descend(launches, data, batches, rows, fidelity.coarse_iterations, "coarse optimization", curve)
@@ -323,9 +323,9 @@ def _work(launch: _Launch, begun: _Begun) -> LaunchPart:
 
 
 def _tried_again(launch: _Launch, part: LaunchPart, run: ExecutionContext) -> LaunchPart:
-    """Retry grasps that fail their rollout or, if free, balance poorly; keep the first good or the best.
-    The last few grasps would leave cores idle, and a hand costs a third more in a small launch. They make some attempts
-    ahead; attempts after a good one are dropped, so the result equals that of sequential attempts."""
+    """Retry grasps that fail their rollout or, if free, have poor balance; select the first good or the best attempt.
+    The last few grasps would leave cores idle, and a hand costs a third more in a small launch. Several of their
+    attempts therefore run at once. Attempts after a good one are dropped, so the result equals sequential attempts."""
     closer = (STANDS,) * CLOSER + (FAILED,) * (ATTEMPTS - CLOSER)
     limits: tuple[float, ...] = closer if launch.batches.has_rollout else (SET_OUT_AGAIN,)
     if launch.batches.placed is not None:
@@ -347,15 +347,15 @@ def _tried_again(launch: _Launch, part: LaunchPart, run: ExecutionContext) -> La
 
 
 def _set_out_again(launch: _Launch, rows: Rows, attempt: Rows, run: ExecutionContext) -> LaunchPart:
-    """Run later attempts (n,) of grasps; the merit of those without a start is inf.
-    The attraction term is off: with it half as many hold on a bowl's wall."""
+    """Run later attempts (n,) of grasps; the merit of grasps without a start is inf.
+    The attraction term is off: with it, half as many grasps hold on a bowl's wall."""
     launch = replace(launch, pulled=False)
 
     def work(which: range) -> LaunchPart:
         some = slice(which.start, which.stop)
         begun = _set_out(launch, rows[some], attempt[some])
         made = _work(launch, begun)
-        # As at the first attempt: every hand needs a start around a free object, one hand per grasp in scenes.
+        # As in the first attempt: around a free object every hand needs a start, in scenes one hand per grasp.
         deep = begun.depth.reshape(len(made.rows), -1)
         lost = (deep.max(axis=1) if launch.batches.placed is None else deep.min(axis=1)) > NO_PLACE
         return replace(made, merit=np.where(lost, np.inf, made.merit))
@@ -371,14 +371,14 @@ def _posed(launch: _Launch, part: LaunchPart) -> LaunchPart:
 
 @dataclass
 class _Seats:
-    """Fine phase and projection of hands after the coarse phase."""
+    """Fine phase and projection of hands that have passed the coarse phase."""
 
     launch: _Launch
     rows: Rows
     state: HandState
     losses: Floats
     curve: list[Floats]
-    """Loss curve, continued by the hands that are seated first."""
+    """Loss curve, continued by the first hands that are seated."""
 
     def seated(self, rows: NDArray[np.intp], which: NDArray[np.intp]) -> Refinements:
         launch, flat = self.launch, rows.ravel()
@@ -392,7 +392,7 @@ class _Seats:
         state = _descend(launches, data, launch.batches, mine, fidelity.fine_iterations, "refinement", curve)
         if fidelity.fine_iterations:
             losses = _losses(data, len(flat))
-        # Without iterations this only measures each hand's depth.
+        # Without iterations this only measures the depth of each hand.
         options = AROUND if launch.batches.placed is None else ProjectionOptions()
         state, depths = Projection(launch.fine, data, options).run(state, fidelity.polish_iterations)
         merit = launch.merits(state, losses, depths) if rows.shape[1] > 1 else np.zeros(len(flat))
@@ -412,7 +412,7 @@ def _losses(data: Data, n: int) -> Floats:
 def _descend(
     launches: Launches, data: Data, batches: Batches, rows: Rows, iterations: int, name: str, curve: list[Floats]
 ) -> HandState:
-    """Optimise the hands of grasps `rows` for so many iterations, except batches that stop meanwhile."""
+    """Optimise the hands of grasps `rows` for a number of iterations; batches that stop meanwhile are excluded."""
     done, out = 0, len(batches.errors)
     each = data.capacity // len(rows)
     while done < iterations:

@@ -1,9 +1,10 @@
-"""Sampling of approaches in scenes from the free directions, for all hands at once.
-Most starts are antipodal; the others face a random point of the object, as in `starts`.
-A start keeps `ROOM` from obstacles besides the later margin, so that the optimisation can turn the hand.
+"""Sampling of starts in scenes from the free approach directions, for all hands at once.
+Most starts are antipodal; in the others the palm faces a random point of the object, as in `starts`.
+A start has `ROOM` more clearance from obstacles than the later margin, so that the optimisation can rotate the hand.
 
-Before the expensive phases `hindrance` tests whether each hand can leave its grasp: open, back along the approach, and
-closed, by the lift. A hand hooked around an edge holds well but cannot get there; one close below a board cannot lift.
+Before the expensive phases `hindrance` tests whether each hand can leave its grasp: by opening and retreating along the
+approach, and by the lift when closed. A hand hooked around an edge holds well but cannot reach its grasp; one close
+below a board cannot lift.
 """
 
 from __future__ import annotations
@@ -37,26 +38,26 @@ from graspd.worker.simulation.environment import RISE_M, STANDOFF_M, Environment
 from graspd.worker.simulation.model import Model
 from graspd.worker.simulation.mounting import mounting_lack
 
-#: Clearance of a start from obstacles besides the margin it keeps later [m].
+#: Clearance of a start from obstacles in addition to the later margin [m].
 ROOM: Final = 0.006
-#: Nearest and farthest distance of a palm from the random point that it faces [m].
+#: Nearest and farthest distance of a palm from the random point in front of it [m].
 GAP: Final = (0.004, 0.02)
-#: Steps of retreat on contact [m]: longer than for a free object, since fingers must not reach the table.
+#: Retreat steps after contact [m]: longer than for a free object, since fingers must not reach the table.
 RETREATS: Final = (0.0, 0.01, 0.02, 0.035, 0.055, 0.08, 0.11)
 #: Draws per start before the least penetrating one is selected.
 DRAWS: Final = 96
 #: Draws whose random numbers are drawn together.
 DRAWN: Final = 8
-#: Half the width of a palm [m], number of approach directions, and the least cosine to the nearest free one.
+#: Half the width of a palm [m], number of approach directions, and least cosine to the nearest free direction.
 PALM_RADIUS: Final = 0.04
 DIRECTIONS: Final = 256
 NEAR_WAY: Final = 0.98
-#: `REACHING` of `EVERY` starts of a grasp are antipodal, each with the `REACHES` most promising of `CANDIDATES` draws.
+#: `REACHING` of `EVERY` starts of a grasp are antipodal, each from the best `REACHES` of `CANDIDATES` draws.
 EVERY: Final = 8
 REACHING: Final = 7
 REACHES: Final = 8
 CANDIDATES: Final = 48
-#: Uniform numbers of one draw: face, two for the point, roll, gap, share and goal of a turn.
+#: Uniform numbers of one draw: face, two for the point, roll, gap, share and goal of a rotation.
 _UNIFORM: Final = 7
 
 
@@ -66,8 +67,8 @@ _AcrossPairs = list[tuple[NDArray[np.intp], AntipodalHands]]
 
 def free_ways(scene: Environment, obj: ObjectModel) -> Floats:
     """Return free approach directions (K, 3), unit vectors in the object frame.
-    Along them a ball as wide as a palm leaves the object without touching an obstacle on `STANDOFF_M`.
-    Raise InputError if there is none."""
+    Along a free direction, a ball of a palm's width can move from the object by `STANDOFF_M` without contact with an
+    obstacle. Raise InputError if there is none."""
     ways = spread_directions(DIRECTIONS)
     out = ((obj.hull_vertices - obj.centre_of_mass) @ ways.T).max(axis=0)
     path = out[:, None] + PALM_RADIUS + np.linspace(0.0, STANDOFF_M, 9)
@@ -92,10 +93,11 @@ def clear_scene_starts(
     model: Model, generators: list[np.random.Generator], *, each: int, placed: PlacedGrasps, ways: Sequence[Floats]
 ) -> tuple[HandState, Floats]:
     """Return a start for each generator, `each` per grasp, and its depth (n,) [m].
-    That is the first clear draw, or the least deep; of antipodal ones the clear draw with the best placed pair.
+    The start is the first clear draw, or the least deep one; for antipodal starts, the clear draw with the best placed
+    pair.
 
-    In a narrow scene some grasps find no clear start: they end blocked, and the batch consists of the others.
-    `ways` are `free_ways` of each scene."""
+    In a narrow scene some grasps find no clear start: they are returned as blocked, and the others form the batch.
+    `ways` are the `free_ways` of each scene."""
     hand, obj = model.hand.model, model.obj.model
     probe = Probe(model, len(generators), room=ROOM)
     used = set(placed.index.tolist())
@@ -117,7 +119,7 @@ def clear_scene_starts(
         if not len(rows):
             break
         if number == normal.shape[1]:
-            # Most starts need a few draws: numbers of later draws are generated on demand.
+            # Most starts need a few draws: random numbers of later draws are generated on demand.
             normal = np.concatenate([normal, _normal(generators, rows, hand.dofs)], axis=1)
         reach = reaching[rows] & (number < REACHES)
         numbers = np.where(reach, order[rows, min(number, REACHES - 1)], number)
@@ -149,10 +151,11 @@ def _normal(generators: list[np.random.Generator], rows: NDArray[np.intp], dofs:
 def _depths(
     probe: Probe, states: HandState, placed: PlacedGrasps, scene: NDArray[np.intp], worth: NDArray[np.bool_]
 ) -> Floats:
-    """Return depths (n, len(RETREATS)) [m] of hands and mountings in scenes (n,); inf if not computed.
-    They run from the farthest distance with `worth` (n, len(RETREATS)) inwards while clear.
+    """Return depths (n, len(RETREATS)) [m] of hands and mountings in scenes (n,); inf if not computed. Depths are
+    computed inwards, from the farthest distance with `worth` (n, len(RETREATS)), while they are clear.
 
-    Most draws fail for reasons that no retreat fixes, and hardly any is clear nearer than where it is not."""
+    Most draws fail for reasons that no retreat fixes. Hardly any draw is clear closer than at a distance that is
+    not."""
     found, open_ = np.full((len(scene), len(RETREATS)), np.inf), np.ones(len(scene), bool)
     for k in reversed(range(len(RETREATS))):
         left = np.flatnonzero(open_ & worth[:, k])
@@ -170,7 +173,7 @@ def _depths(
 def _mounting_lack(
     probe: Probe, states: HandState, placed: PlacedGrasps, scene: NDArray[np.intp], *, exact: bool
 ) -> Floats:
-    """Return the clearance (n,) that mountings of hands in scenes (n,) lack to the margin plus `ROOM` [m]."""
+    """Return the clearance (n,) that mountings in scenes (n,) miss relative to the margin plus `ROOM` [m]."""
     hand, obj = probe.model.hand.model, probe.model.obj.model
     poses = posture_of(hand, obj, states).hand_pose
     return mounting_lack(hand, poses, placed.scenes, scene, room=ROOM, exact=exact)
@@ -184,10 +187,10 @@ def _raise(
     scene: NDArray[np.intp],
     probe: Probe,
 ) -> Floats:
-    """Lift draws `rows` in scenes (n,), at all distances, by the clearance of the nearest that is lacking.
+    """Raise draws `rows` in scenes (n,), at all distances, by the clearance missing at the nearest distance.
     Return the distance (n, len(RETREATS)) of their pairs from between the pads [m], 0 for other draws.
 
-    Steps of retreat are too coarse for low objects: fingers would end above the object, not beside it."""
+    Retreat steps are too coarse for low objects: fingers would end above the object, not beside it."""
     off = np.zeros((len(scene), len(RETREATS)))
     if not len(rows):
         return off
@@ -215,7 +218,7 @@ class _Around:
     def order(
         self, uniform: Floats, scene: NDArray[np.intp], reaching: NDArray[np.bool_], placed: PlacedGrasps
     ) -> tuple[NDArray[np.intp], Floats]:
-        """Return (n, REACHES) draws of antipodal hands, see `promising`; inf for others."""
+        """Return (n, REACHES) draws of antipodal hands, see `promising`; inf for other hands."""
         order, least = np.zeros((len(scene), REACHES), np.intp), np.full((len(scene), REACHES), np.inf)
         for s in np.unique(scene[reaching]):
             rows = np.flatnonzero(reaching & (scene == s))
@@ -249,7 +252,7 @@ class _Around:
         return at_distances(pivot, rotation, q), reaching
 
     def _towards(self, uniform: Floats, normal: Floats, ways: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-        """Place hands that face random points of the surface, in the form of `across` but without a pair."""
+        """Place hands whose palms face random surface points; the result is like that of `across`, without a pair."""
         hand, obj = self.hand, self.obj
         corners, normals, sums = surface_of(obj)
         face = np.minimum(np.searchsorted(sums, uniform[:, 0]), len(sums) - 1)
@@ -265,7 +268,7 @@ class _Around:
 
 
 def _turned(away: Floats, ways: Floats, random: Floats) -> Floats:
-    """Return a direction (3,) near a free one, else turn it towards a random free one until it is."""
+    """Return `away` (3,) if it is near a free direction, else rotate it towards a random free one until it is."""
     if (ways @ away).max() >= NEAR_WAY:
         return away
     goal = ways[int(random[1] * len(ways))]
@@ -285,12 +288,12 @@ def _tilted(normals: Floats, angles: Floats) -> Floats:
     return np.asarray(normals * np.cos(angle) + np.cross(unit, normals) * np.sin(angle))
 
 
-#: Shares of their range by which fingers have opened, and the distance that the hand has moved back [m].
+#: Opening of the fingers as shares of their range, and the distance of the hand's retreat [m].
 OUT: Final = ((0.2, 0.0), (0.3, 0.015), (0.4, 0.04))
-#: Tolerated depth [m]: a hand can open differently from this simple motion.
+#: Tolerated depth [m]: the real opening of a hand can differ from this simple motion.
 TOLERATED_M: Final = 0.001
-#: Merit lost per metre of depth. The weight is small: hands that hold well enclose the object, and most of them find
-#: another trajectory out.
+#: Merit lost per metre of depth. The weight is small: hands that hold well enclose the object, and most of them leave
+#: it along another trajectory.
 WEIGHT: Final = 25.0
 DEEPEST_M: Final = 0.01
 #: Shares of the lift at which obstacles above are checked.
@@ -299,7 +302,7 @@ UP: Final = (0.5, 1.0)
 
 def hindrance(model: Model, state: HandState, placed: PlacedGrasps) -> Floats:
     """Compute the merit (n,) that hands lose for a blocked retreat or lift in their scenes.
-    It grows with the depth of the hand in object or obstacles on the way, or of its mounting at the grasp."""
+    It grows with the depth of the hand in object or obstacles on the trajectory, or of its mounting at the grasp."""
     hand, obj = model.hand.model, model.obj.model
     mounted = mounting_lack(hand, posture_of(hand, obj, state).hand_pose, placed.scenes, placed.index)
     deep = np.maximum(_back(model, state, placed.index), mounted)

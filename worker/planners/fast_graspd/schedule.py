@@ -1,5 +1,5 @@
 """Weights per iteration, and the interface of starts that another method proposes.
-The coarse phase shrinks the dilation, the fine phase seats the hand."""
+The coarse phase shrinks the dilation; the fine phase seats the hand."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ PAPER_RATES: Final = (1e-3, 1e-3, 1e-3)
 #: Largest dilation of the object [m].
 DILATION: Final = 0.01
 SELF_WEIGHT: Final = 2e4
-#: Length of the attraction term, see `LossOptions` [m]: the planner prefers enclosing grasps, and more of them hold at
-#: half friction. Half of it gains a Barrett hand little; twice of it draws the slender fingers of a Shadow hand into
-#: thin walls.
+#: Length of the attraction term, see `LossOptions` [m]. With it the planner prefers enclosing grasps, and more of them
+#: hold at half friction. Half this length hardly changes results of a Barrett hand; twice this length draws the slender
+#: fingers of a Shadow hand into thin walls.
 PULL: Final = 3e-4
-#: Projection around a free object: it attracts points from farther away than among obstacles, so more of the hand
-#: touches. It costs about half of the depth that the samples of `pairs.DENSER` save.
+#: Projection around a free object: points are attracted from farther away than among obstacles, so more of the hand
+#: touches. The attraction adds about half of the penetration that the samples of `pairs.DENSER` remove.
 AROUND: Final = ProjectionOptions(hold=5e-3)
 
 
 def loss_options(fidelity: Fidelity) -> LossOptions:
-    """Return the simulation options of a fidelity; plain descent has limits as a penalty, as in the paper."""
+    """Return the simulation options of a fidelity; plain gradient descent has limits as a penalty, as in the paper."""
     paper = fidelity.optimizer == "gd"
     return LossOptions(
         contact_solver=fidelity.contact_solver,
@@ -51,7 +51,7 @@ def loss_options(fidelity: Fidelity) -> LossOptions:
 
 def in_scene(fidelity: Fidelity) -> Fidelity:
     """Return the fidelity for scenes: obstacles leave fewer good approaches, so more hands are needed.
-    They start with the object between their fingers, so few iterations suffice."""
+    Their starts have the object between the fingers, so few iterations suffice."""
     return fidelity.model_copy(
         update={
             "starts": min(5 * fidelity.starts // 2, 64),
@@ -64,7 +64,7 @@ def in_scene(fidelity: Fidelity) -> Fidelity:
 
 
 def with_rollout(fidelity: Fidelity) -> Fidelity:
-    """Return the fidelity for free objects with rollouts: retries replace half of the first starts."""
+    """Return the fidelity for free objects with rollouts: retries replace half of the initial starts."""
     return fidelity.model_copy(update={"starts": -(-fidelity.starts // 2)})
 
 
@@ -77,7 +77,7 @@ def _decayed(rates: tuple[float, float, float], count: int, to: float) -> Floats
 
 
 def coarse_schedule(fidelity: Fidelity) -> Schedule:
-    """Return weights with dilation to 0 over the first four fifths and penetration weight times 10."""
+    """Return weights in which the dilation falls to 0 over the first four fifths, with penetration weight times 10."""
     n = fidelity.coarse_iterations
     dilation = DILATION * np.clip(1.0 - np.arange(n) / max(0.8 * n, 1.0), 0.0, 1.0)
     if fidelity.optimizer == "gd":

@@ -1,10 +1,10 @@
-"""Starts of hands: in every second one of a grasp the palm faces a random surface point nearby.
-The others reach across the object (`ReachSampling`), as do all if it is too small or too wide for the pads.
+"""Starts of hands: in every second start of a grasp the palm faces a random surface point nearby.
+The other starts are antipodal (`ReachSampling`); all are if the object is too small or too wide for the pads.
 
-A start must be free of contact: hands that start inside a thin wall never leave it.
+A start must be free of contact: hands that start inside a thin wall never leave the wall.
 
-For a gripper a pair of opposite surface points is drawn. The jaws open slightly wider than the pair, are placed around
-it and turned by a random angle about the line that joins the points.
+For a gripper a pair of opposite surface points is drawn. The jaws open slightly wider than the pair and are placed
+around it, at a random angle about the line through the points.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ from graspd.worker.simulation.data import Data, HandState
 from graspd.worker.simulation.model import Model
 from graspd.worker.simulation.record import record_placement
 
-#: Distance of the palm from the surface [m]: nearest, farthest, then the steps of retreat on contact.
+#: Distance of the palm from the surface [m]: nearest, farthest, then the retreat steps after contact.
 GAP: Final = (0.002, 0.012)
 RETREATS: Final = (0.0, 0.01, 0.02, 0.03)
-#: Palm distance of hands that open further to find a start: their fingers are around the object already.
+#: Palm distance of hands that open further to find a start: the object is already between their fingers.
 OPENED_GAP: Final = (0.004, 0.02)
 #: Tilt of the approach away from the surface normal, standard deviation [rad].
 TILT: Final = 0.25
@@ -47,7 +47,7 @@ POSTURE_NOISE: Final = 0.08
 CLEAR: Final = 0.001
 #: Draws per grasp before the least penetrating one is selected.
 DRAWS: Final = 48
-#: Opening of hands without a start in their pre-shape, as shares of the remaining range, and draws at each.
+#: Opening of hands without a start in their pre-shape, as shares of the remaining range, and number of draws at each.
 OPENED: Final = (0.5, 1.0)
 OPENED_DRAWS: Final = 24
 #: Depth above which a start is rejected [m].
@@ -67,7 +67,7 @@ def frames_about(z: Floats) -> Floats:
 
 
 class _Pair:
-    """Data shared by all draws of a hand around an object: its faces (F), the distance `gap` of the palm [m]."""
+    """Data for all draws of a hand around an object: its faces (F), the distance `gap` of the palm [m]."""
 
     def __init__(self, hand: HandModel, obj: ObjectModel, gap: tuple[float, float] = GAP) -> None:
         self.hand, self.centre, self.gap = hand, obj.centre_of_mass, gap
@@ -81,7 +81,7 @@ class _Pair:
 
 
 def _numbers(generators: list[np.random.Generator], dofs: int) -> tuple[Floats, Floats]:
-    """Return random numbers of draws, in the order in which they are drawn.
+    """Return random numbers of draws, in the order of their generation.
     Uniform (n, 5): face, two for the point, roll, gap. Normal (n, 2 + D): tilt, then noise of the pre-shape."""
     uniform, normal = np.empty((len(generators), 5)), np.empty((len(generators), 2 + dofs))
     for i, rng in enumerate(generators):
@@ -94,7 +94,7 @@ def _numbers(generators: list[np.random.Generator], dofs: int) -> tuple[Floats, 
 
 
 def draw(pair: _Pair, generators: list[np.random.Generator]) -> tuple[HandState, Floats]:
-    """Draw one start per generator at its nearest distance; also return the palms' directions (n, 3)."""
+    """Draw one start per generator, at its nearest distance; also return the palms' directions (n, 3)."""
     hand, (uniform, noise) = pair.hand, _numbers(generators, pair.hand.dofs)
     face = pair.share.searchsorted(uniform[:, 0], side="right")
     point = points_in(pair.corners[face], uniform[:, 1:2], uniform[:, 2:3])
@@ -134,7 +134,7 @@ class Probe:
 
     def depths(self, states: HandState) -> Floats:
         """Return the deepest penetration of each hand (n,) [m].
-        It covers hand in object, object in links, links in links, and lacking clearance from obstacles."""
+        It covers hand in object, object in links, links in links, and missing clearance from obstacles."""
         self.data.set_state(states)
         self._touching.run()
         return self.data.deepest(len(states.pivot)).astype(float)
@@ -171,8 +171,8 @@ def no_place(model: Model) -> InputError:
 
 def clear_starts(model: Model, generators: list[np.random.Generator], *, each: int = 1) -> tuple[HandState, Floats]:
     """Return a start per generator, the least deep of its draws, and its depth (n,) [m]; most are clear.
-    Of the `each` starts of a grasp every second one, not the first, reaches across the object where possible. All do
-    if the object is too small or too wide for the hand's pads."""
+    Of the `each` starts of a grasp, every second one but not the first is antipodal if possible. All are if the object
+    is too small or too wide for the hand's pads."""
     hand, obj = model.hand.model, model.obj.model
     count, jaws = len(generators), JawStarts.of(hand, obj)
     retreats = RETREATS if jaws is None else JAW_RETREATS
@@ -196,9 +196,9 @@ def clear_starts(model: Model, generators: list[np.random.Generator], *, each: i
 def open_further(
     model: Model, generators: list[np.random.Generator], state: HandState, depth: Floats, wanted: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
-    """Retry with more open hands where `clear_starts` found no clear start, of those `wanted` (n,).
-    The pre-shape of some hands leaves no gap as wide as the object. `generators` are in the state that `clear_starts`
-    left; better starts replace its results. Return which (n,) were opened."""
+    """Retry starts that were not clear, among those `wanted` (n,), with more open hands.
+    The pre-shape of some hands leaves no gap as wide as the object. `generators` continue from the state after
+    `clear_starts`; better starts replace its results. Return a mask (n,) of the opened starts."""
     hand, obj = model.hand.model, model.obj.model
     lost = wanted & (depth > NO_PLACE)
     if not lost.any() or JawStarts.of(hand, obj) is not None:
@@ -226,7 +226,7 @@ def _draw_until_clear(
     deepest: Floats,
 ) -> None:
     """Store the nearest clear start of each of `rows`, or the least deep, in `best` and `deepest`.
-    `drawn` draws the given rows at each distance of retreat."""
+    `drawn` draws the given rows at each retreat distance."""
     for _ in range(draws):
         if not len(rows):
             return
@@ -251,7 +251,7 @@ def _reach(
     best: HandState,
     deepest: Floats,
 ) -> None:
-    """Store those of the starts `rows` that reach across the object and are clear in `best` and `deepest`."""
+    """Store clear antipodal starts among `rows` in `best` and `deepest`."""
     seeds = np.array([generators[i].integers(2**31) for i in rows], np.int32)
     first = np.zeros(len(rows), np.int32)
     left = np.arange(len(rows))
@@ -277,16 +277,17 @@ def put(states: HandState, rows: NDArray[np.intp], others: HandState) -> None:
 
 #: Clearance between each pad and the object [m]: least and most.
 ROOM_M: Final = (0.002, 0.005)
-#: Range of the pair's position ahead of the middle of the pads, as a share of their length; then the further distance
-#: that the hand stays back on contact.
+#: Range of the pair's position ahead of the middle of the pads, as a share of their length; then the further retreat
+#: of the hand on contact.
 AHEAD: Final = (-0.25, 0.25)
 
 JAW_RETREATS: Final = (0.0, 0.25, 0.5, 0.75)
-#: Shortest and longest length of pads for that share [m].
+#: Shortest and longest pad length for that share [m].
 LENGTH_M: Final = (0.01, 0.05)
 #: Uniform numbers of one draw: pair, side, angle, clearance, place.
 UNIFORM: Final = 5
-#: Distance of a line from the centre of mass at which its chance falls to exp(-1/2), as a share of the object's radius.
+#: Distance of a pair's line from the centre of mass at which its probability falls to exp(-1/2), as a share of the
+#: object's radius.
 CENTRAL: Final = 0.35
 
 

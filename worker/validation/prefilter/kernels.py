@@ -1,8 +1,8 @@
 """Schedule of level standard for many worlds: close, push six ways, check, take the next grasp.
 
 A tick is the simulation between two checks (`protocol.INTERVAL_S`). After each tick every world checks its own object.
-Worlds do not wait for each other; a world with a decided verdict takes the next grasp of the queue. Quaternions are w x
-y z, stored in the order of `wp.quat`'s components as in MuJoCo Warp.
+Worlds do not wait for each other; a world takes the next grasp of the queue when its verdict is decided. Quaternions
+are w x y z, stored in `wp.quat` in this order as in MuJoCo Warp.
 """
 
 from typing import Final
@@ -14,15 +14,15 @@ from graspd.worker.validation.protocol import Outcome
 
 wp.set_module_options({"enable_backward": False})
 
-#: A verdict is clear if the worst motion is below the first share of its limit, or above the second. The margins of a
-#: grasp that holds differ between both engines by 0.11 at the 99th percentile (benchmarks.prefilter).
+#: A verdict is clear if the worst motion is below the first share of its limit, or above the second. For grasps that
+#: hold, margins of both engines differ by 0.11 at the 99th percentile (benchmarks.prefilter).
 BAND: Final = (0.8, 1.2)
-#: Ticks of a push after it breaks a limit; if still in the band then, the verdict is not clear.
+#: Ticks of a push after it exceeds a limit; if the motion is then still in the band, the verdict is not clear.
 PATIENCE: Final = 5
-#: Ticks (of `protocol.INTERVAL_S`) after which a grasp stays undecided. A grasp that holds takes 32 at least, 1 of 100
-#: more than 47; a few slow creepers would delay the whole launch.
+#: Ticks (of `protocol.INTERVAL_S`) after which a grasp stays undecided. Grasps that hold take at least 32, 1 in 100 of
+#: them more than 47; a few slow ones would delay the whole launch.
 MOST_TICKS: Final = 48
-#: Ticks of one stage of closing, of closing in all, until the first check of a push, and of a whole push.
+#: Ticks of one stage of closing, of the whole closing, until the first check of a push, and of a whole push.
 STAGE = wp.constant(round(protocol.STAGE_S / protocol.INTERVAL_S))
 STAGES = wp.constant(protocol.STAGES)
 FIRST_LOOK = wp.constant(round(protocol.FIRST_LOOK_S / protocol.INTERVAL_S))
@@ -37,7 +37,7 @@ LOST = wp.constant(int(Outcome.LOST_WHILE_CLOSING))
 DISPLACED = wp.constant(int(Outcome.DISPLACED))
 ROTATED = wp.constant(int(Outcome.ROTATED))
 DIVERGED = wp.constant(int(Outcome.DIVERGED))
-#: A broken limit is clear above this ratio, or final after this many ticks; a grasp ends after this many ticks.
+#: An exceeded limit is clear above this ratio, or final after this many ticks; a grasp ends after this many ticks.
 CLEAR = wp.constant(BAND[1])
 PATIENT = wp.constant(PATIENCE)
 MOST = wp.constant(MOST_TICKS)
@@ -88,7 +88,7 @@ class Worlds:
     looks: wp.array(dtype=wp.int32)
     """Ticks of the present push."""
     broken: wp.array(dtype=wp.int32)
-    """Outcome of the limit that the present push broke; 0: none."""
+    """Outcome for the limit that the present push exceeded; 0: none."""
     before: wp.array(dtype=wp.vec3)
     turned_before: wp.array(dtype=wp.float32)
     qpos: wp.array2d(dtype=wp.float32)
@@ -240,7 +240,7 @@ def look(
     state_out: wp.array(dtype=wp.int32),
 ):
     """Check the state after a tick.
-    `state_out`: places of the queue taken, worlds with a grasp, grasps in the queue."""
+    `state_out`: number of queue entries taken, worlds with a grasp, grasps in the queue."""
     w = wp.tid()
     g = worlds_out.grasp[w]
     if g < 0:

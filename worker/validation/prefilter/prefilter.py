@@ -1,12 +1,12 @@
-"""The GPU prefilter in MuJoCo Warp: it gives the clear verdicts.
+"""The GPU prefilter in MuJoCo Warp: it decides clear verdicts.
 
-MuJoCo on the CPU gives all other verdicts, and rechecks a sample of the clear ones. At level `standard` the prefilter
-only rejects: clear failures end there, all others are validated on the CPU. At level `fast` its clear verdicts stand
-both ways. It has no part in level `dexgraspbench` or in lifts.
+MuJoCo on the CPU decides all other verdicts, and rechecks a sample of the clear ones. At level `standard` the prefilter
+only rejects: clear failures are final, all other grasps are validated on the CPU. At level `fast` clear verdicts of
+both kinds are final. The prefilter is not used at level `dexgraspbench` or for lifts.
 
-The model is the validator's own, compiled once; what differs between grasps (postures, commands, pushes) is data. A
-pool of worlds takes grasps from a queue on the device, so a launch stays full until the queue is empty, and one graph
-serves any number of grasps.
+The model is the validator's own, compiled once; data that differ between grasps (postures, commands, pushes) are
+arrays. A pool of worlds takes grasps from a queue on the device, so a launch stays full until the queue is empty, and
+one graph serves any number of grasps.
 """
 
 from __future__ import annotations
@@ -40,15 +40,15 @@ from graspd.worker.validation.protocol import INTERVAL_S, Outcome, Rollout, Vali
 
 log = logging.getLogger(__name__)
 
-#: One clear verdict in so many is validated on the CPU as well.
+#: One clear verdict in this many is also validated on the CPU.
 RECHECK_ONE_IN: Final = 50
-#: Increase when the code changes the prefilter's verdicts, constants aside.
+#: Increase when a change of the code, other than a constant, changes the prefilter's verdicts.
 REVISION: Final = 1
 #: Pool sizes, for few grasps and for many; with arbitrary sizes nearly every launch would build a new pool.
 WORLDS: Final = {"cuda": (256, 1024), "cpu": (8, 32)}
-#: Number of cached pools, each with its model, arrays and graph: those of the pairs validated last.
+#: Number of cached pools, each with its model, arrays and graph, for the pairs validated last.
 _KEPT_POOLS: Final = 4
-#: Largest share of rechecked verdicts that the CPU may contradict, beyond one, before the prefilter is not trusted.
+#: Largest share of rechecked verdicts that the CPU may contradict (one more is allowed) while the prefilter is trusted.
 _MOST_CONTRADICTED: Final = 0.05
 
 
@@ -57,7 +57,7 @@ class PrefilterOutcomes:
     """Outcomes of N grasps in the worlds."""
 
     outcome: NDArray[np.uint8]
-    """(N, 6) `Outcome` of each push; an undecided grasp has pushes that were not simulated."""
+    """(N, 6) `Outcome` of each push; an undecided grasp has pushes without a simulation."""
     margin: Floats
     """(N,) worst displacement or rotation over its limit."""
     penetration_m: Floats
@@ -173,7 +173,7 @@ class WorldPool:
         )
 
     def _room_for(self, n: int) -> None:
-        """Allocate arrays for at least `n` grasps. They change rarely, because a graph refers to its arrays."""
+        """Allocate arrays for at least `n` grasps. Allocation is rare, because graphs refer to these arrays."""
         if n <= self._capacity:
             return
         rows, model, self._graph = max(self.worlds, 1 << (n - 1).bit_length()), self.scene.model, None
@@ -264,23 +264,24 @@ class PrefilterVerdicts:
     """Verdicts of the prefilter on N grasps."""
 
     stands: dict[int, Rollout]
-    """Verdicts that stand, by row. All other rows are for the CPU."""
+    """Final verdicts, by row. The CPU validates all other rows."""
     rechecked: dict[int, bool]
-    """Clear verdicts that the CPU rechecks, by row: whether the prefilter held the grasp."""
+    """Clear verdicts that the CPU rechecks, by row; True: the prefilter held the grasp."""
 
     def contradicted(self, rollouts: dict[int, Rollout]) -> int:
         return sum(rollouts[row].success != held for row, held in self.rechecked.items())
 
     def believed(self, contradicted: int) -> bool:
-        """Check whether few enough verdicts were contradicted to trust the rest."""
+        """Check whether so few verdicts were contradicted that the others are trusted."""
         return contradicted <= max(1, _MOST_CONTRADICTED * len(self.rechecked))
 
 
 def first_terms(hand: HandModel, level: str, run: ExecutionContext) -> list[Any]:
-    """Return the prefilter's terms where it takes part in verdicts of a level, for `verdict_key`.
+    """Return the prefilter's terms for `verdict_key`; empty if it is not used for verdicts of this level.
 
-    Grippers have none: their flat pads touch in an area, over which the engines distribute contacts differently. Hands
-    with tendons have none: the engines differ on a tenth of Shadow's grasps (docs/explanation/quality.md).
+    It is not used for grippers: their flat pads touch over an area, where the engines distribute contacts differently.
+    It is not used for hands with tendons: the engines differ on a tenth of Shadow's grasps
+    (docs/explanation/quality.md).
 
     Raises:
         InputError: the prefilter is required but not installed.
@@ -319,7 +320,7 @@ def screened(scene: Scene, terms: str, grasps: GraspSet, *, level: str, run: Exe
 
 
 def _pool(scene: Scene, terms: str, device: str, count: int) -> WorldPool:
-    """Return a pool for `count` grasps of a scene, cached: making a graph takes longer than one use."""
+    """Return a cached pool for `count` grasps of a scene: making a graph takes longer than one use of it."""
     few, many = WORLDS[device.partition(":")[0]]
     size = few if count <= few else many
     key = (terms, device, size)
@@ -332,7 +333,7 @@ def _pool(scene: Scene, terms: str, device: str, count: int) -> WorldPool:
 
 
 def _drawn(grasps: GraspSet) -> NDArray[np.bool_]:
-    """Select (N,) one grasp in `RECHECK_ONE_IN` by the digest of its pose, independent of its batch."""
+    """Select (N,) one grasp in `RECHECK_ONE_IN` by the digest of its pose, independently of its batch."""
     pose = np.ascontiguousarray(grasps.grasp.hand_pose, float)
     digests = (hashlib.sha256(row.tobytes()).digest() for row in pose)
     return np.array([int.from_bytes(one[:8], "big") % RECHECK_ONE_IN == 0 for one in digests], bool)
@@ -349,7 +350,7 @@ def _rollout(found: PrefilterOutcomes, row: int, scene: Scene) -> Rollout:
     )
 
 
-#: Initial capacity of contacts and constraint rows per world: twice the need observed for grasps of three hands.
+#: Initial capacity of contacts and constraint rows per world: twice the observed need of grasps of three hands.
 CONTACTS: Final = 96
 ROWS: Final = 256
 #: Largest number of times that the capacity is doubled when it overflows.
