@@ -250,7 +250,7 @@ class Part(BaseModel):
     """State of one part that the API needs."""
 
     ok: bool
-    latency_ms: float | None = Field(None, description="absent if it does not respond")
+    latency_ms: float | None = Field(None, description="response time [ms]; null: no response")
     detail: str = ""
 
 

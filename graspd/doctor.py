@@ -33,7 +33,7 @@ _COLOURS: Final = {
 def doctor(
     only: Annotated[str | None, typer.Option(help="Checks to run, separated by commas; default: all.")] = None,
     full: Annotated[bool, typer.Option("--full", help="Compare the whole index with the store, not a sample.")] = False,
-    data_dir: Annotated[Path | None, typer.Option(help="Data folder of graspd; GRASPD_DATA_DIR.")] = None,
+    data_dir: Annotated[Path | None, typer.Option(help="Data folder of graspd; default: GRASPD_DATA_DIR.")] = None,
     json: JsonFlag = False,
 ) -> None:
     """Check disk, clocks, versions, Redis, store, index, GPU, kernels and ports, and suggest fixes.

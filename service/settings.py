@@ -112,7 +112,9 @@ class Settings(BaseSettings):
     )
     task_attempts: int = Field(3, ge=1, le=20, description="attempts of a task before its job fails")
     task_s: float = Field(
-        60.0, ge=0, description="target duration of tasks of larger jobs, from measured rates [s]; 0: one batch each"
+        60.0,
+        ge=0,
+        description="target duration of a task of a large job [s]; measured rates give its number of batches; 0: one batch",
     )
     task_timeout_s: float = Field(1800.0, gt=0, description="longest run of one task [s]")
     worker_max_memory_mb: int = Field(

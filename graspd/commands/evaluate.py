@@ -43,7 +43,7 @@ def evaluate_command(
     protocol: Annotated[
         str,
         typer.Option(
-            help="dexgraspbench: six pushes; lift: out of the scene of the grasps; displacement: only the "
+            help="dexgraspbench: six pushes; lift: lift test in the scene of each grasp; displacement: only the "
             "slip in 0.15 s."
         ),
     ] = "dexgraspbench",
@@ -70,7 +70,7 @@ def evaluate_command(
     ] = 0,
     friction: Annotated[
         float | None,
-        typer.Option(min=0.01, max=3.0, help="Coulomb friction coefficient of ε; default: that of the file."),
+        typer.Option(min=0.01, max=3.0, help="Coulomb friction coefficient for ε; default: that of the file."),
     ] = None,
     validation_hand: Annotated[
         str | None, typer.Option(help="Second model of the same hand, URDF or MJCF, for an additional validation.")

@@ -252,7 +252,9 @@ def card(
     assets: Annotated[
         Path | None, typer.Option(help="JSON file with missing licences and sources of hands and objects.")
     ] = None,
-    data_dir: Annotated[Path | None, typer.Option("--data-dir", help="Data folder of graspd; GRASPD_DATA_DIR.")] = None,
+    data_dir: Annotated[
+        Path | None, typer.Option("--data-dir", help="Data folder of graspd; default: GRASPD_DATA_DIR.")
+    ] = None,
     json: JsonFlag = False,
 ) -> None:
     """Write a dataset's card: contents, origin, quality and biases; with plots and checksums."""

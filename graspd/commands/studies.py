@@ -103,7 +103,7 @@ def stability(
         typer.Option("--from", help="Draw and publish the maps of a stability.json without measuring; repeatable."),
     ] = None,
     publish: Annotated[bool, typer.Option("--publish", help="Publish to the store, for the dashboard.")] = False,
-    data_dir: Annotated[Path | None, typer.Option(help="Data folder of graspd; GRASPD_DATA_DIR.")] = None,
+    data_dir: Annotated[Path | None, typer.Option(help="Data folder of graspd; default: GRASPD_DATA_DIR.")] = None,
     json: JsonFlag = False,
 ) -> None:
     """Map where integrators and the planner fail."""
@@ -207,7 +207,7 @@ def chart(
     publish: Annotated[
         bool, typer.Option("--publish", help="Publish to the store, for the dashboard and `fidelity: auto`.")
     ] = False,
-    data_dir: Annotated[Path | None, typer.Option(help="Data folder of graspd; GRASPD_DATA_DIR.")] = None,
+    data_dir: Annotated[Path | None, typer.Option(help="Data folder of graspd; default: GRASPD_DATA_DIR.")] = None,
     json: JsonFlag = False,
 ) -> None:
     """Compare speed and accuracy: methods and fidelities on the same hands and objects, in MuJoCo."""

@@ -44,7 +44,7 @@ def worker(
     check: Annotated[
         bool, typer.Option("--check", help="Only check for a live worker on this host; exit code 1 if there is none.")
     ] = False,
-    data_dir: Annotated[Path | None, typer.Option(help="Data folder of graspd; GRASPD_DATA_DIR.")] = None,
+    data_dir: Annotated[Path | None, typer.Option(help="Data folder of graspd; default: GRASPD_DATA_DIR.")] = None,
 ) -> None:
     """Run one or several workers, each on one device, until stopped."""
     settings = load_settings(device=device, threads=threads, join=join, processes=processes, data_dir=data_dir)

@@ -247,15 +247,17 @@ class EndView(View):
 
 
 class WebhookView(View):
-    """An address that receives ends."""
+    """A webhook: address that receives a message when a job or dataset ends."""
 
     id: str
     url: str
-    states: list[str] = Field(description="states of the reported ends: succeeded, failed, cancelled")
+    states: list[str] = Field(description="final states that are reported: succeeded, failed, cancelled")
     created: str
     owner: str = Field("", description="id of the key that created it")
     project: str = Field("", description="project whose jobs and datasets it reports")
-    seen: int = Field(0, description="sequence number of the last processed end")
+    seen: int = Field(
+        0, description="sequence number of the last ended job or dataset for which deliveries were created"
+    )
 
 
 class TagView(View):

@@ -25,7 +25,7 @@ app = CommandGroup(no_args_is_help=True)
 index_app = CommandGroup(no_args_is_help=True, help="Rebuild the index from the store or export its tables.")
 app.add_typer(index_app, name="index")
 
-DataDir = Annotated[Path | None, typer.Option("--data-dir", help="Data folder of graspd; GRASPD_DATA_DIR.")]
+DataDir = Annotated[Path | None, typer.Option("--data-dir", help="Data folder of graspd; default: GRASPD_DATA_DIR.")]
 
 
 @app.command(epilog="graspd up --workers 2 --port 8000")

@@ -21,7 +21,9 @@ def verify(
     repair: Annotated[
         bool, typer.Option("--repair", help="Move damaged objects aside and queue the tasks that make them again.")
     ] = False,
-    data_dir: Annotated[Path | None, typer.Option("--data-dir", help="Data folder of graspd; GRASPD_DATA_DIR.")] = None,
+    data_dir: Annotated[
+        Path | None, typer.Option("--data-dir", help="Data folder of graspd; default: GRASPD_DATA_DIR.")
+    ] = None,
     json: JsonFlag = False,
 ) -> None:
     """Verify all objects of the store and report damaged or missing ones; exit code 1 if any remain.
@@ -76,7 +78,9 @@ def verify(
 
 @store_app.command(epilog="graspd admin store upgrade")
 def upgrade(
-    data_dir: Annotated[Path | None, typer.Option("--data-dir", help="Data folder of graspd; GRASPD_DATA_DIR.")] = None,
+    data_dir: Annotated[
+        Path | None, typer.Option("--data-dir", help="Data folder of graspd; default: GRASPD_DATA_DIR.")
+    ] = None,
     json: JsonFlag = False,
 ) -> None:
     """Replace packs of graspd 0.2 by one file per shard; a controller does the same at its start."""

@@ -151,7 +151,11 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
         "grasp/scene_index": Column("K", "i4", "1", "none", "row of the scene in /scene"),
         "grasp/hand_pose": Column("K 7", "f8", "m, 1", "table", f"posture at contact: {_POSE}"),
         "grasp/table_clearance_m": Column(
-            "K", "f8", "m", "table", "lowest point of the hand above the table, at contact and on the approach"
+            "K",
+            "f8",
+            "m",
+            "table",
+            "height of the lowest point of hand and forearm above the table, from pregrasp to grasp",
         ),
         "grasp/valid": Column("K", "u1", "bool", "none", "1: hand clear at contact and on the approach"),
         "grasp/rejection": _code(
@@ -160,7 +164,7 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
             "K",
         ),
         "grasp/contact_table_clearance_m": _absent(
-            "K", "f8", "m", "table", "lowest point of the hand above the table at contact"
+            "K", "f8", "m", "table", "height of the lowest point of hand and forearm above the table, at contact"
         ),
         "grasp/neighbour_clearance_m": _absent(
             "K",
@@ -255,7 +259,7 @@ ATTRIBUTES: Final[dict[str, RootAttribute]] = {
     "joint_names": RootAttribute("texts", "order of the hand's joints", _BASE),
     "wrist_joint_names": RootAttribute(
         "texts",
-        "joints of the wrist above the hand's root, order of `grasp/wrist_positions`; absent: none",
+        "wrist joints above the hand's root, in the order of `grasp/wrist_positions`; absent if there are none",
         ("base", "scene"),
     ),
     "root_link": RootAttribute("text", "link of the hand to which poses refer"),
@@ -269,7 +273,7 @@ ATTRIBUTES: Final[dict[str, RootAttribute]] = {
     "grasps_wanted": RootAttribute("integer", "number of grasps requested, if the command was interrupted", _BASE),
     "robust": RootAttribute(
         "text",
-        "JSON: perturbed models in which each valid grasp was validated, and the required share; absent: none",
+        "JSON: perturbed models in which each valid grasp was validated, and the required share; absent if there are none",
         _BASE,
     ),
     "verdict_level": RootAttribute("text", "level of validation; `none`: not validated", _BASE),

@@ -90,7 +90,9 @@ class PalmCorrection(Model):
     """The palm in the frame of a link, with the hand in its pre-shape. Missing values are guessed again."""
 
     link: Text
-    centre: tuple[Length, Length, Length] | None = Field(None, description="grasp centre of the palm [m]")
+    centre: tuple[Length, Length, Length] | None = Field(
+        None, description="origin of the palm frame, in the frame of `link` [m]"
+    )
     approach: tuple[Share, Share, Share] | None = Field(None, description="direction out of the palm; any length")
 
 
