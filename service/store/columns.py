@@ -273,7 +273,7 @@ ATTRIBUTES: Final[dict[str, RootAttribute]] = {
     "grasps_wanted": RootAttribute("integer", "number of grasps requested, if the command was interrupted", _BASE),
     "robust": RootAttribute(
         "text",
-        "JSON: perturbed models in which each valid grasp was validated, and the required share; absent if there are none",
+        "JSON: perturbed models in which each valid grasp was validated, and the required share; absent: not requested",
         _BASE,
     ),
     "verdict_level": RootAttribute("text", "level of validation; `none`: not validated", _BASE),
