@@ -1,7 +1,7 @@
 """What a valid grasp costs from the planner to its row in the shard, of two checkouts in one run; prints Markdown.
 
 usage: python -m benchmarks.chain BEFORE AFTER DATA_DIR [--grasps 64] [--pairs allegro:mug shadow:bottle] [--json OUT]
-       python -m benchmarks.chain BEFORE AFTER --service [--pictures] [--grasps 256] [--pairs ...] [--json OUT]
+       python -m benchmarks.chain BEFORE AFTER --service [--pictures] [--method autograsp] [--grasps 256] [--pairs ...] [--json OUT]
 
 BEFORE and AFTER are checkouts of graspd; DATA_DIR holds hands/. Each stage is run by one thread and timed by processor
 time: other programs on the machine change the ratios little. Nothing is stored or sent: that part is in
@@ -165,9 +165,8 @@ def compare_services(given: argparse.Namespace) -> dict[str, Any]:
         hand, obj = pair.split(":")
         roots = [root.resolve() for root in (given.before, given.after)]
         alone = run(roots[0], hand, obj, "64", str(100 + number))
-        both = [
-            through_service(root, hand, obj, given.grasps or 256, PILOT if given.pictures else {}) for root in roots
-        ]
+        wanted = {"method": given.method} | (PILOT if given.pictures else {})
+        both = [through_service(root, hand, obj, given.grasps or 256, wanted) for root in roots]
         found[pair] = dict(zip(("planner", "before", "after"), (alone, *both), strict=True))
         lines = service_table(pair, *both, raw_ms=alone["ms"]["planner"] / alone["candidates"])
         sys.stdout.write("\n".join(lines) + "\n")
@@ -194,6 +193,7 @@ def main() -> None:
     parser.add_argument("data", type=Path, nargs="?")
     parser.add_argument("--service", action="store_true", help="jobs through the whole service")
     parser.add_argument("--pictures", action="store_true", help="with --service: and pictures, as the pilot has them")
+    parser.add_argument("--method", default="fast_graspd", help="with --service: a planner that both have unchanged")
     parser.add_argument("--grasps", type=int, help="of each pair, in batches of 32: 64 candidates, or 256 valid ones")
     parser.add_argument("--pairs", nargs="*", default=["allegro:mug", "shadow:bottle"])
     parser.add_argument("--json", type=Path)
