@@ -1,7 +1,7 @@
 """What a valid grasp costs from the planner to its row in the shard, of two checkouts in one run; prints Markdown.
 
 usage: python -m benchmarks.chain BEFORE AFTER DATA_DIR [--grasps 64] [--pairs allegro:mug shadow:bottle] [--json OUT]
-       python -m benchmarks.chain BEFORE AFTER --service [--pictures] [--method autograsp] [--grasps 256] [--pairs ...] [--json OUT]
+       python -m benchmarks.chain BEFORE AFTER --service [--pictures] [--method autograsp] [--grasps 256] [--pairs ...]
 
 BEFORE and AFTER are checkouts of graspd; DATA_DIR holds hands/. Each stage is run by one thread and timed by processor
 time: other programs on the machine change the ratios little. Nothing is stored or sent: that part is in
