@@ -46,7 +46,7 @@ ROWS: dict[str, list[tuple[str, str, int, dict[str, str]]]] = {
             8,
             {"{{stage}}": "sum by (stage) (max by (priority, stage) (graspd_tasks_running))"},
         ),
-        ("Oldest signs of life", "s", 8, {"{{worker}}": "topk(5, max by (worker) (graspd_worker_lease_age_seconds))"}),
+        ("Oldest heartbeats", "s", 8, {"{{worker}}": "topk(5, max by (worker) (graspd_worker_lease_age_seconds))"}),
         (
             "Seconds of a task: half, and 95 of 100",
             "s",

@@ -140,7 +140,7 @@ class LeaseReaper:
         attempt = AttemptRecord.of(
             message,
             kind="WorkerLost",
-            reason=f"worker {worker} was lost: no sign of life for {self._services.settings.lease_s:g} s",
+            reason=f"worker {worker} was lost: no heartbeat for {self._services.settings.lease_s:g} s",
             worker=worker,
             last=message.attempt >= message.max_attempt,
         )

@@ -71,7 +71,7 @@ def test_a_task_whose_worker_is_killed_runs_again_once(system: System) -> None:
     (attempt,) = system.services.index.jobs.attempts(job=job)
     assert attempt.kind == "WorkerLost"
     settings = system.services.settings
-    assert f"no sign of life for {settings.lease_s:g} s" in attempt.reason
+    assert f"no heartbeat for {settings.lease_s:g} s" in attempt.reason
     assert settings.lease_s + settings.controller_interval_s + settings.retry_backoff_s < RECOVERY_S
     assert len(system.services.index.grasps.page(GraspFilter(job=job), limit=200).items) == 32
     (base,) = system.services.index.shards.page(job=job, kind="base").items

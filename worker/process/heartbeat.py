@@ -85,4 +85,4 @@ class Heartbeat:
             self._away = False
         except (RedisError, OSError) as error:
             if not away:
-                log.warning("no sign of life could be given: %s", error)
+                log.warning("no heartbeat could be sent: %s", error)

@@ -52,8 +52,7 @@ def controller(settings: Settings) -> Finding:
         return skipped(_AWAY)
     if not lives:
         return bad(
-            "no controller gave a sign of life: finished tasks are not taken up, and nothing is queued",
-            "graspd controller",
+            "no heartbeat from a controller: finished tasks are not indexed, and nothing is queued", "graspd controller"
         )
     return good("a controller lives")
 

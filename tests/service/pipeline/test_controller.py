@@ -112,7 +112,7 @@ def test_a_task_of_a_lost_worker_is_queued_with_its_reason_kept(bench: Bench) ->
     assert again.message.attempt == 2
     (attempt,) = bench.services.index.jobs.attempts(job=job.id)
     assert (attempt.kind, attempt.last) == ("WorkerLost", False)
-    assert "no sign of life for 6 s" in attempt.reason
+    assert "no heartbeat for 6 s" in attempt.reason
     bench.do(again)
     bench.pass_time(1)
     assert bench.services.index.jobs.get(job.id).state is State.SUCCEEDED
