@@ -16,6 +16,7 @@ import numpy as np
 from benchmarks.cells import SEED, Cell, cell_parser, cells, write_json
 from graspd.service.model.metrics import ROBUST_MODELS
 from graspd.service.model.version import PACKAGE_VERSION
+from graspd.studies.evaluation import COLUMNS
 from graspd.worker.quality.contact import contact_distance_consistency_mm
 from graspd.worker.quality.diversity import explained_variance
 from graspd.worker.quality.probe import HAND_POINTS, OBJECT_POINTS, probe_of
@@ -32,14 +33,6 @@ PAPER = {
     "barrett": {"ca_cm2": 55.7, "iv_cm3": 4.70, "epsilon": 0.23, "wrench_volume": 5.09, "sd_cm": 1.40},
     "allegro": {"ca_cm2": 49.2, "iv_cm3": 5.62, "epsilon": 0.18, "wrench_volume": 3.42, "sd_cm": 1.66},
     "shadow": {"ca_cm2": 58.6, "iv_cm3": 6.34, "epsilon": 0.18, "wrench_volume": 3.42, "sd_cm": 2.42},
-}
-COLUMNS = {
-    "pd_mm": "penetration_depth_mm",
-    "spd_mm": "self_penetration_depth_mm",
-    "ca_cm2": "contact_area_cm2",
-    "iv_cm3": "intersection_volume_cm3",
-    "epsilon": "epsilon",
-    "wrench_volume": "wrench_volume",
 }
 #: Columns of the printed table: key, heading, digits.
 PRINTED = (
