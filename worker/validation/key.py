@@ -24,7 +24,7 @@ Level = Literal["dexgraspbench", "standard", "fast"]
 #: Increase when a change of the protocol's or the scene's code, other than a constant, changes verdicts.
 REVISION: Final = 6
 
-_EARLY: Final = ("FIRST_LOOK_S", "INTERVAL_S", "SURE", "LOST_ROTATION")
+_EARLY: Final = ("FIRST_LOOK_S", "INTERVAL_S", "SURE", "AHEAD", "LOST_ROTATION")
 #: Constants that affect a verdict, by module; below, those that only one level uses. Other constants of these modules
 #: affect no verdict.
 MOVES: Final[dict[ModuleType, tuple[str, ...]]] = {

@@ -31,6 +31,7 @@ PUSHES = wp.constant(len(protocol.DIRECTIONS))
 MOVED = wp.constant(protocol.MAX_DISPLACEMENT_M)
 TURNED = wp.constant(protocol.MAX_ROTATION)
 SURE = wp.constant(protocol.SURE)
+AHEAD = wp.constant(protocol.AHEAD)
 LOST_TURN = wp.constant(protocol.LOST_ROTATION)
 HELD = wp.constant(int(Outcome.HELD))
 LOST = wp.constant(int(Outcome.LOST_WHILE_CLOSING))
@@ -286,7 +287,7 @@ def look(
                     found_out.outcome[g, number] = worlds_out.broken[w]
                     over = True
             else:
-                more = float(HOLD - looks)
+                more = AHEAD * float(HOLD - looks)
                 ahead = wp.length(now + more * (now - worlds_out.before[w]))
                 turns = angle + more * (angle - worlds_out.turned_before[w])
                 if looks >= HOLD or (ahead < SURE * MOVED and turns < SURE * TURNED):
