@@ -68,13 +68,14 @@ def hold_rollout(
     level: Level = "standard",
 ) -> Callable[[GraspSet, PlacedGrasps | None, Floats], Floats]:
     """Return a `worker.planners.Rollout` that scores free grasps (N,) by short pushes.
-    Scores are below 2 for grasps that also hold against the six pushes."""
+    Scores are below 2 for grasps that also hold against the six pushes, if they are better than the score to beat."""
     short, run = push_rollout(hand, obj, pieces), ExecutionContext(threads=1)
 
     def rollout(grasps: GraspSet, placed: PlacedGrasps | None, beat: Floats | None = None) -> Floats:
         grasps = grasps.moved(np.zeros(3))
         score = short(grasps, placed, np.zeros(0))
-        held = np.flatnonzero(score < SLIPS + 1.0)
+        # Skip candidates that cannot beat the previous score.
+        held = np.flatnonzero((score < SLIPS + 1.0) & (score < (np.inf if beat is None else beat)))
         if len(held):
             verdicts = validate(hand, obj, grasps.take(held), level=level, pieces=pieces(), known=known, run=run)
             fell = held[verdicts.success != 1]
@@ -118,13 +119,14 @@ def lift_rollout(
 
     def lifted(grasps: GraspSet, placed: PlacedGrasps, score: Floats, beat: Floats) -> Floats:
         lift = partial(validate_lifts, hand, obj, level=level, pieces=pieces(), known=known, run=run)
-        out, barely = np.maximum(score, SLIPS), score >= SLIPS
-        some = np.flatnonzero(~barely)
-        hard = lift(grasps.take(some), placed.take(some), hard=True).success == 1
-        out[some[hard]] = np.minimum(score[some[hard]], BEST)
-        barely[some[~hard]] = True
-        out[barely & (beat < SLIPS + 1.0)] = beat[barely & (beat < SLIPS + 1.0)]
-        some = np.flatnonzero(~barely | (beat >= SLIPS + 1.0))
+        out = np.maximum(score, SLIPS)
+        some = np.flatnonzero(score < SLIPS)
+        hard = some[lift(grasps.take(some), placed.take(some), hard=True).success == 1]
+        out[hard] = np.minimum(score[hard], BEST)
+        some = np.setdiff1d(np.arange(len(score)), hard)
+        lost = some[beat[some] < SLIPS + 1.0]
+        out[lost] = beat[lost]
+        some = some[beat[some] >= SLIPS + 1.0]
         full = lift(grasps.take(some), placed.take(some))
         fell = full.success != 1
         out[some[fell]] = SLIPS + 1.0 + FALLS * np.minimum(score[some[fell]], 1.0)
@@ -158,7 +160,8 @@ def scene_verdicts(
     run: ExecutionContext,
 ) -> tuple[GraspSet, Arrays]:
     """Plan the trajectories of grasps in their scenes, and validate those that are clear.
-    Grasps that do not lift are not tested at half the friction. Without `pieces`, only clearance is checked.
+    At level lift, a grasp that lifts at half friction is not tested at full friction. Without `pieces`, only clearance
+    is checked.
 
     Returns:
         The grasps with `approach`, `coming`, `lift` and `wrist`; and columns of the base shard, with the lift's
@@ -174,17 +177,18 @@ def scene_verdicts(
     columns["quality/success"] = success
     if pieces is None:
         return grasps, columns
-    common: dict[str, Any] = {"pieces": pieces, "run": run}
-    lifts = validate_lifts(hand, obj, grasps.take(clear), placed.take(clear), level=level, known=known, **common)
-    success[clear] = lifts.success
+    common: dict[str, Any] = {"level": level, "pieces": pieces, "known": known, "run": run}
     outcome, margin = np.zeros(count, np.uint8), np.full(count, np.nan)
-    outcome[clear], margin[clear] = lifts.outcome, lifts.margin
-    lifted = clear[outcome[clear] == LiftOutcome.LIFTED]
     hard = np.full(count, -1, np.int8)
-    if len(lifted):
-        hard[lifted] = validate_lifts(
-            hand, obj, grasps.take(lifted), placed.take(lifted), level=level, hard=True, known=known, **common
-        ).success
+    hard[clear], left = 0, clear
+    for half in (True, False):
+        lifts = validate_lifts(hand, obj, grasps.take(left), placed.take(left), hard=half, **common)
+        outcome[left], margin[left] = lifts.outcome, lifts.margin
+        if half:
+            hard[left] = lifts.success
+            left = left[lifts.success != 1] if level == "lift" else left
+    success[clear] = outcome[clear] == LiftOutcome.LIFTED
+    hard[outcome != LiftOutcome.LIFTED] = -1
     columns |= {"quality/lift_outcome": outcome, "quality/lift_hard": hard, "quality/verdict_margin": margin}
     return grasps, columns
 

@@ -29,7 +29,7 @@ LiftLevel = Literal["dexgraspbench", "lift"]
 KnownLifts = dict[str, LiftTest]
 LEVELS: Final[tuple[LiftLevel, ...]] = get_args(LiftLevel)
 #: Increase when a change of the lift test's code, other than a constant, changes verdicts.
-REVISION: Final = 4
+REVISION: Final = 5
 _MOVES: Final = {surroundings: ("RISE_M",), protocol: ("LOOKS", "OVERHANG_M", "LOSSES"), postures: ("ROOM_M", "WIDE")}
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from graspd.worker.grasps import joined
+from graspd.worker.grasps import GraspSet, joined
 from graspd.worker.scenes import rollout as rollouts
 from graspd.worker.scenes.rollout import BEST, FALLS, TOUCHES, hold_rollout, lift_rollout
 from graspd.worker.simulation.environment import PlacedGrasps
@@ -122,3 +122,16 @@ def test_free_grasp_that_the_validator_drops_is_no_good_candidate(
     monkeypatch.setattr(rollouts, "push_rollout", lambda *_: lambda grasps, *_: np.array([0.2, 4.0, 4.0]))
     monkeypatch.setattr(rollouts, "validate", lambda *_, **__: type("Verdicts", (), {"success": np.array([verdict])}))
     assert hold_rollout(HAND, BOX, lambda: WHOLE)(MANY, None).tolist() == pytest.approx([score, 4.0, 4.0])
+
+
+def test_a_free_grasp_that_cannot_beat_another_is_not_validated(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rollouts, "push_rollout", lambda *_: lambda grasps, *_: np.array([0.6, 0.7, 0.8]))
+    validated: list[int] = []
+
+    def held(hand: object, obj: object, grasps: GraspSet, **_: object) -> object:
+        validated.append(len(grasps))
+        return type("Verdicts", (), {"success": np.ones(len(grasps))})
+
+    monkeypatch.setattr(rollouts, "validate", held)
+    found = hold_rollout(HAND, BOX, lambda: WHOLE)(MANY, None, np.array([0.5, 0.7, np.inf]))
+    assert (validated, found.tolist()) == ([1], [0.6, 0.7, 0.8])
