@@ -19,9 +19,9 @@ from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.simulation.environment import PlacedGrasps
 
-#: Scores (N,) of N grasps, in their scenes or around a free object (None). Smaller is better. Below 1 no further
-#: candidate is needed; from 2 on, more candidates are worth their cost. The third argument is the score to beat for
-#: each grasp, inf if there is none: a rollout may stop early if it cannot reach a better class (below 1, below 2).
+#: Scores (N,) of N grasps, in their scenes or around a free object (None). Smaller is better: below 1 a grasp holds at
+#: half friction, below 2 at full friction; from 2 on, more candidates are worth their cost. The third argument is the
+#: score to beat for each grasp, inf if there is none. A rollout may stop early if it cannot beat this score.
 #: Several threads may call it at once.
 Rollout = Callable[[GraspSet, PlacedGrasps | None, NDArray[np.float64]], NDArray[np.float64]]
 

@@ -17,7 +17,7 @@ from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners import PlanRequest, synthesize
 from graspd.worker.planners.fast_graspd import candidates, planner
 from graspd.worker.planners.fast_graspd.candidates import GENTLER, Refinements
-from graspd.worker.planners.fast_graspd.planner import ATTEMPTS, CLOSER
+from graspd.worker.planners.fast_graspd.planner import FAILED, FREE, STANDS
 from graspd.worker.planners.fast_graspd.schedule import PULL
 from graspd.worker.scenes.kinds import rest_poses, supports_of
 from graspd.worker.scenes.rollout import lift_rollout
@@ -233,13 +233,23 @@ def test_a_grasp_nobody_holds_sets_out_as_often_as_it_may(free, attempts: list[i
         return np.array(scores[-len(grasps) :])
 
     found = synthesize(hand, obj, replace(wanted, count=1, rollout=never), ExecutionContext(threads=1))
-    assert attempts == list(range(1 + ATTEMPTS))
+    assert attempts == list(range(1 + len(FREE)))
     # Half of the hands that set out without a trial at each attempt, and of them those that can be valid are tried.
-    assert ATTEMPTS // 2 < len(scores) <= (1 + ATTEMPTS) * QUICK.starts // 2
+    assert len(FREE) // 2 < len(scores) <= (1 + len(FREE)) * QUICK.starts // 2
     assert len(found) == 1
 
 
-@pytest.mark.parametrize(("score", "made"), [(0.5, 1 + CLOSER), (1.5, 1 + CLOSER), (2.5, 1 + ATTEMPTS)])
+@pytest.mark.parametrize(("score", "made"), [(0.1, 1), (0.7, 2), (1.5, 2)])
+def test_a_grasp_that_may_slip_at_half_friction_has_one_retry(
+    free, attempts: list[int], score: float, made: int
+) -> None:
+    hand, obj, wanted, _ = free
+    rollout = lambda grasps, *_: np.full(len(grasps), score)  # noqa: E731
+    synthesize(hand, obj, replace(wanted, count=1, rollout=rollout), ExecutionContext(threads=1))
+    assert attempts == list(range(made))
+
+
+@pytest.mark.parametrize(("score", "made"), [(0.1, 3), (1.5, 3), (2.5, 1 + len(FREE))])
 def test_a_grasp_whose_finger_stands_off_sets_out_again(
     free, attempts: list[int], monkeypatch: pytest.MonkeyPatch, score: float, made: int
 ) -> None:
@@ -260,10 +270,10 @@ def test_of_grasps_that_hold_one_whose_fingers_touch_is_chosen(free, monkeypatch
 
     rollout = lambda grasps, *_: np.full(len(grasps), 0.1 if not seen else 1.5)  # noqa: E731
     one = replace(wanted, count=1, rollout=rollout)
-    monkeypatch.setattr(planner, "CLOSER", 0)
+    monkeypatch.setattr(planner, "FREE", ())
     first = synthesize(hand, obj, one, ExecutionContext(threads=1))
     seen.clear()
-    monkeypatch.setattr(planner, "CLOSER", 1)
+    monkeypatch.setattr(planner, "FREE", (STANDS,))
     monkeypatch.setattr(planner, "standing_off", off_at_first)
     assert (synthesize(hand, obj, one, ExecutionContext(threads=1)).grasp.hand_pose != first.grasp.hand_pose).any()
 
@@ -278,7 +288,7 @@ def test_hands_are_drawn_to_an_object_at_their_first_start_alone(free, monkeypat
         return work(launch, begun)
 
     monkeypatch.setattr(planner, "_work", watched)
-    monkeypatch.setattr(planner, "ATTEMPTS", 2)
+    monkeypatch.setattr(planner, "FREE", (FAILED, FAILED))
     never = replace(wanted, count=1, rollout=lambda grasps, *_: np.full(len(grasps), 9.0))
     synthesize(hand, obj, never, ExecutionContext(threads=1))
     assert pulls[0] == (PULL, PULL)

@@ -27,6 +27,7 @@ from graspd.worker.planners.fast_graspd import scene_starts, starts
 from graspd.worker.planners.fast_graspd.batches import Batches, finalists
 from graspd.worker.planners.fast_graspd.candidates import (
     FRICTION,
+    GOOD,
     NEAR_M,
     NEARNESS,
     SCENE_FRICTION,
@@ -62,13 +63,12 @@ PART: Final = 4
 SET_OUT_AGAIN: Final = 0.05
 #: The same for rollout scores, see `worker.planners.port.Rollout`: a tenth to a quarter of such grasps hold.
 FAILED: Final = 2.0
-#: Largest number of retries of grasps with rollouts. A further attempt is as productive as the first ones, so the yield
-#: per second hardly changes, but fewer grasps of a hard pair fail.
-ATTEMPTS: Final = 20
-#: Score of a free grasp that holds without contact at one finger: it is retried up to `CLOSER` times, then the best
-#: attempt is selected.
+#: Score of a free grasp that holds without contact at one finger.
 STANDS: Final = 1.99
-CLOSER: Final = 2
+#: Free grasps with larger scores are retried; one value per attempt. The first value includes grasps that may slip at
+#: half friction, the second those with a finger off the object. A further attempt at failed grasps is as productive as
+#: the first ones, so the yield per second hardly changes, but fewer grasps of a hard pair fail.
+FREE: Final = (GOOD, STANDS, *(FAILED,) * 18)
 #: Grasps in scenes with larger scores are retried; one value per attempt. The first value includes grasps that lift at
 #: full friction only: an attempt costs half of another grasp, and one in ten of them then lifts at half friction.
 IN_SCENES: Final = (1.0, FAILED, FAILED, FAILED, FAILED)
@@ -326,8 +326,7 @@ def _tried_again(launch: _Launch, part: LaunchPart, run: ExecutionContext) -> La
     """Retry grasps that fail their rollout or, if free, have poor balance; select the first good or the best attempt.
     The last few grasps would leave cores idle, and a hand costs a third more in a small launch. Several of their
     attempts therefore run at once. Attempts after a good one are dropped, so the result equals sequential attempts."""
-    closer = (STANDS,) * CLOSER + (FAILED,) * (ATTEMPTS - CLOSER)
-    limits: tuple[float, ...] = closer if launch.batches.has_rollout else (SET_OUT_AGAIN,)
+    limits: tuple[float, ...] = FREE if launch.batches.has_rollout else (SET_OUT_AGAIN,)
     if launch.batches.placed is not None:
         limits = IN_SCENES
     done = 0
