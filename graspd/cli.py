@@ -184,7 +184,7 @@ def build() -> typer.Typer:
     """Build the root command with a lightweight entry for every command."""
     app = typer.Typer(
         cls=LazyGroup,
-        help="A grasp-dataset factory: stable, contact-rich multi-finger grasps by differentiable simulation.",
+        help="Make datasets of stable, contact-rich multi-finger grasps by differentiable simulation.",
         epilog="Try `graspd demo`, or `graspd COMMAND --help`.",
         no_args_is_help=True,
         pretty_exceptions_enable=False,

@@ -94,8 +94,8 @@ class Settings(BaseSettings):
         0,
         ge=0,
         le=1024,
-        description="processes for validation and metrics. 1: the worker itself; 0: with a GPU one per core less "
-        "one, else 1",
+        description="processes for validation and metrics. 1: the worker itself; 0: with a GPU the number of cores "
+        "minus one, else 1",
     )
     workers_here: int = Field(1, ge=1, description="workers on this machine that share its cores and memory")
     join: str = Field(
@@ -108,21 +108,23 @@ class Settings(BaseSettings):
     controller_name: str | None = Field(
         None,
         max_length=200,
-        description="name of a controller; after a restart under the same name it leads at once; unset: a new name",
+        description="name of a controller; a restart under the same name leads at once; unset: a new name",
     )
     task_attempts: int = Field(3, ge=1, le=20, description="attempts of a task before its job fails")
     task_s: float = Field(
         60.0,
         ge=0,
-        description="target duration of tasks of large jobs [s]; measured rates give their batches; 0: one batch",
+        description="target duration of tasks of large jobs [s]; it sets the number of batches per task; 0: one batch",
     )
     task_timeout_s: float = Field(1800.0, gt=0, description="longest run of one task [s]")
     worker_max_memory_mb: int = Field(
         0,
         ge=0,
-        description="resident memory of a worker above which a new one replaces it [MiB]; 0: half of the machine's",
+        description="resident memory of a worker above which a new one replaces it [MiB]; 0: half of all memory",
     )
-    retry_backoff_s: float = Field(2.0, ge=0, description="wait before the second attempt [s]; doubles with each")
+    retry_backoff_s: float = Field(
+        2.0, ge=0, description="wait before the second attempt [s]; doubled before each further one"
+    )
     max_upload_bytes: int = Field(
         64 * 2**20, gt=0, description="largest upload of a hand, object or network over HTTP [bytes]"
     )

@@ -170,7 +170,7 @@ def _did(request: Request) -> str:
     if given.get("did") not in _DONE or not done.isdigit() or not left.isdigit():
         return ""
     if given["did"] == "snapshot":
-        return "The snapshot is taken; it lists all present shards."
+        return "The snapshot is taken; it lists all shards made so far."
     what = "job" if done == "1" else "jobs"
     unchanged = f"; {left} unchanged: owned by another key, or not in a suitable state" if left != "0" else ""
     return f"{done} {what} {_DONE[given['did']]}{unchanged}."

@@ -135,8 +135,8 @@ _ROWS: Final = 60
 class Tile:
     """One hand on one object.
 
-    `made` counts grasps of status `standing`; `share` is the valid share of validated ones. The checkbox sends `value`;
-    the link is `href`."""
+    `made` counts grasps of status `standing`; `share` is the valid share of validated candidates. The checkbox sends
+    `value`; the link is `href`."""
 
     hand: str
     object: str

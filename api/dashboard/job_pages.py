@@ -123,10 +123,10 @@ class Pictures:
         with open_shard(self._fetch(key, sha256), name=key) as file:
             path = f"image/{channel}"
             if path not in file:
-                raise NotFoundError("the shard holds no pictures; only a views shard does")
+                raise NotFoundError("the shard has no pictures; only views shards have pictures")
             pictures = file[path]
             if not 0 <= index < len(pictures):
-                raise NotFoundError(f"the shard holds {len(pictures)} pictures; there is no picture {index}")
+                raise NotFoundError(f"the shard has {len(pictures)} pictures; there is no picture {index}")
             pixels = _PAINTERS[channel](pictures[index])
         image = Image.fromarray(pixels)
         if width is not None and width < image.width:

@@ -27,7 +27,7 @@ NAVIGATION: Final = (
     ("/chart", "Chart"),
     ("/stability", "Stability"),
 )
-#: Pages shown only if there are keys, which usage is attributed to.
+#: Pages shown only if there are API keys: usage is counted per key.
 _WITH_KEYS: Final = (("/usage", "Usage"),)
 
 

@@ -147,7 +147,9 @@ NameArgument = Annotated[str, typer.Argument(help="Name of the dataset.")]
 HandsOption = Annotated[str | None, typer.Option("--hands", help="Names of hands: allegro,shadow.")]
 ObjectsOption = Annotated[
     str | None,
-    typer.Option("--objects", help="Objects or sets by name: mug,ycb; or a folder or ZIP, which becomes a set."),
+    typer.Option(
+        "--objects", help="Names of objects or sets: mug,ycb; or a folder or ZIP, which is uploaded as a set."
+    ),
 ]
 WaitOption = Annotated[bool, typer.Option("--wait", help="Show progress until the dataset ends.")]
 
@@ -355,7 +357,7 @@ def _matrix(client: Client, asked: PlanRequest) -> tuple[Objects | None, dict[st
         matrix |= {"objects": sorted(files), "sets": [name_of_set(path)]}
         return files, asked.shared_out(matrix, len(files))
     if objects not in known and path.is_file():
-        raise InputError(f"{objects} is one object; `graspd objects add {objects}`, then name it here")
+        raise InputError(f"{objects} is one object; run `graspd objects add {objects}`, then give its name here")
     if "/" in objects:
         raise InputError(f"there is no folder {objects}; give one that exists, or names of objects and sets")
     single = [name for name in names if name not in known]
@@ -365,7 +367,7 @@ def _matrix(client: Client, asked: PlanRequest) -> tuple[Objects | None, dict[st
 
 
 def _estimate(client: Client, matrix: dict[str, Any], files: Objects | None) -> Estimate:
-    """Return the cost; raise InputError for a name that is unknown and not about to be uploaded."""
+    """Return the cost; raise InputError for an unknown name that is not among the files to upload."""
     asked = matrix | {"sets": []} if files is not None else matrix
     found = client.estimate(parsed_options(Matrix, asked))
     unknown = [name for name in found.unknown if name not in (files or {})]
@@ -373,7 +375,7 @@ def _estimate(client: Client, matrix: dict[str, Any], files: Objects | None) -> 
         known = [one.name for kind in (AssetKind.HAND, AssetKind.OBJECT) for one in client.assets(kind)]
         raise InputError(
             f"there is no hand or object {', '.join(map(repr, unknown[:5]))}; `graspd hands list` and `graspd objects "
-            f"list` show what there is{did_you_mean(unknown[0], known)}"
+            f"list` show the known ones{did_you_mean(unknown[0], known)}"
         )
     return found
 

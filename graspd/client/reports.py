@@ -113,7 +113,7 @@ _SUMMARY: Final = (
 
 
 def job_summary(job: JobDetail) -> dict[str, Any]:
-    """Return keys for scripts (DESIGN.md §5): job, state, grasps, valid, stages, mean, shards; and more."""
+    """Return the keys for scripts: job, state, grasps, valid, stages, mean, shards and others."""
     return {
         "job": job.id,
         "state": job.state.value,
@@ -380,7 +380,7 @@ def watch_dataset(client: Client, name: str, console: Console) -> DatasetView:
 
 
 def _yield(made: Validated) -> str:
-    """Format the yield in short form: `at 94 % of the validated`."""
+    """Format the yield in short form: `at 94 %`."""
     return f"at {valid_yield(made)}" if made.validated else "not validated"
 
 

@@ -115,7 +115,7 @@ def _selection(grasps: list[str] | None, **filters: str | None) -> dict[str, Any
         return {"filter": given}
     places = [one.partition(":") for one in grasps]
     if wrong := next((one for one, (_, _, row) in zip(grasps, places, strict=True) if not row.isdigit()), None):
-        raise InputError(f"{wrong!r} names no grasp; write SHARD:ROW")
+        raise InputError(f"{wrong!r} does not name a grasp; write SHARD:ROW")
     return {"grasps": [{"shard_id": shard, "row": int(row)} for shard, _, row in places]}
 
 

@@ -22,7 +22,7 @@ app = CommandGroup(add_completion=False)
 
 @app.command(epilog="graspd admin kernels ./kernels --arch 90")
 def kernels(
-    folder: Annotated[Path, typer.Argument(help="Folder of the kernels, to be set as GRASPD_KERNELS.")],
+    folder: Annotated[Path, typer.Argument(help="Folder for the kernels; set GRASPD_KERNELS to it.")],
     arch: Annotated[list[int] | None, typer.Option(help="GPU architecture, such as 90; repeatable.")] = None,
     cuda: Annotated[bool, typer.Option(help="Compile binaries for GPUs.")] = True,
     cpu: Annotated[bool, typer.Option(help="Compile objects for CPUs with this CPU's instruction set.")] = True,
@@ -101,5 +101,5 @@ def _size(text: str) -> tuple[int, int]:
         raise InputError(f"{text!r} is no picture size; write WIDTHxHEIGHT, such as 320x240")
     width, height = int(match[1]), int(match[2])
     if not (16 <= width <= 4096 and 16 <= height <= 4096):
-        raise InputError(f"a picture has 16 to 4096 pixels a side; {text} does not")
+        raise InputError(f"width and height of a picture must be 16 to 4096 pixels; got {text}")
     return width, height

@@ -33,7 +33,7 @@ def grasps() -> None:
 @group.command(epilog='graspd grasps where "epsilon > 0.3 and lift and robust >= 0.75" --from kitchen -o subset')
 def where(
     expression: Annotated[
-        str, typer.Argument(help="Expression of metrics, valid, feasible, held and lift with and, or, not.")
+        str, typer.Argument(help="Expression of metrics and verdicts (valid, feasible, held, lift) with and, or, not.")
     ],
     out: OutOption,
     source: Annotated[
@@ -56,7 +56,7 @@ def balance(
     out: OutOption,
     by: Annotated[str, typer.Option(help=f"Kinds, separated by commas: {', '.join(KINDS)}.")] = "type,direction",
     at_most: Annotated[
-        int, typer.Option(min=0, help="Maximum number of grasps per kind, hand and object; 0: that of the median kind.")
+        int, typer.Option(min=0, help="Maximum number of grasps per kind, hand and object; 0: the median over kinds.")
     ] = 0,
     min_distance: Annotated[
         float,
@@ -64,7 +64,7 @@ def balance(
             min=0, max=0.1, help="Minimum distance between grasps of a hand on an object, over all batches [m]; 0: any."
         ),
     ] = 0.0,
-    hand: Annotated[str | None, typer.Option(help="Hand file for distances, if it is not found by its digest.")] = None,
+    hand: Annotated[str | None, typer.Option(help="Hand file for distances; default: found by its digest.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the random selection within a kind.")] = 0,
     json: JsonFlag = False,
 ) -> None:

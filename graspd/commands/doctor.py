@@ -60,7 +60,7 @@ def gpu(settings: Settings, *, child: Child = run_child, has_driver: Callable[[]
         )
     gpus: list[dict[str, Any]] = found["gpus"]
     needed = f"the driver has CUDA {_dotted(found['driver'])}, Warp is built for {_dotted(found['toolkit'])}"
-    fix = "a driver of R580 or newer; in containers the NVIDIA container toolkit and --gpus all; CUDA_VISIBLE_DEVICES"
+    fix = "install driver R580 or newer; in containers the NVIDIA container toolkit, --gpus all; CUDA_VISIBLE_DEVICES"
     if not gpus:
         if settings.device.startswith("cuda"):
             return bad(f"GRASPD_DEVICE is {settings.device}, and no GPU is found; {needed}", fix)

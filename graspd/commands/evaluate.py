@@ -44,7 +44,7 @@ def evaluate_command(
         str,
         typer.Option(
             help="dexgraspbench: six pushes; lift: lift test in the scene of each grasp; displacement: only the "
-            "slip in 0.15 s."
+            "object's displacement in 0.15 s."
         ),
     ] = "dexgraspbench",
     level: Annotated[
@@ -52,7 +52,7 @@ def evaluate_command(
         typer.Option(help="Level of validation: dexgraspbench, standard or fast; of a lift: dexgraspbench or lift."),
     ] = "",
     hard: Annotated[
-        bool, typer.Option("--hard", help="Half the friction and a tenth of the torsional friction.")
+        bool, typer.Option("--hard", help="Use half the friction and a tenth of the torsional friction.")
     ] = False,
     hand: Annotated[
         str | None, typer.Option(help="Hand file; default: the hand of the grasp file, found by its digest.")
@@ -65,7 +65,7 @@ def evaluate_command(
         typer.Option(
             min=0,
             max=MOST_ROBUST_MODELS,
-            help="Models around the nominal one in which held grasps are validated again, such as 8.",
+            help="Number of perturbed models in which held grasps are validated again, such as 8.",
         ),
     ] = 0,
     friction: Annotated[
@@ -91,7 +91,9 @@ def evaluate_command(
     """Measure grasps and validate them in an independent engine. Metrics are medians, ε and areas at 5 mm."""
     level = _checked_level(protocol, level)
     if robust and protocol == "displacement":
-        raise InputError("--robust validates pushes or lifts in other models: choose --protocol dexgraspbench or lift")
+        raise InputError(
+            "--robust repeats pushes or lifts in perturbed models: choose --protocol dexgraspbench or lift"
+        )
     if validation_hand is None and joint_map:
         raise InputError("--joint-map needs --validation-hand")
     if validation_hand is not None and protocol != "dexgraspbench":
@@ -108,7 +110,9 @@ def evaluate_command(
         for file in listed:
             case = load_case(file, hand=hand, obj=object)
             if copies and (case.placed is None) == (protocol == "lift"):
-                raise InputError(f"{file} stores shares of its own protocol: a lift in scenes, else six pushes")
+                raise InputError(
+                    f"{file}: -o needs --protocol lift for grasps in scenes, else --protocol dexgraspbench"
+                )
             twin = None
             if other is not None:
                 twin = same_hand(case.hand, other, twins, tolerance_m=validation_tolerance / 1e3)
@@ -160,13 +164,13 @@ def _copies(paths: list[Path], files: list[Path], out: Path | None, *, robust: i
     if not robust or hard or len(paths) != 1:
         raise InputError("-o needs --robust N, no --hard, and one file or folder")
     if other := next((file for file in files if file.suffix != ".h5"), None):
-        raise InputError(f"{other} is no shard of graspd: only these have columns for the shares")
+        raise InputError(f"{other} is no shard of graspd: only shards can store the shares")
     if paths[0].is_dir():
         if out.exists() and (not out.is_dir() or any(out.iterdir())):
-            raise InputError(f"{out} is there already; choose a folder that is not")
+            raise InputError(f"{out} already exists; choose a new or empty folder")
         return {file: out / file.relative_to(paths[0]) for file in files}
     if not out.parent.is_dir() or out.is_dir():
-        raise InputError(f"{out} is no file that can be written: choose one in a folder that is there")
+        raise InputError(f"{out} cannot be written: choose a file in an existing folder")
     return {files[0]: out}
 
 
@@ -176,7 +180,7 @@ def _said_of_models(whole: dict[str, Any]) -> str:
     each = ", ".join(f"{words[axis]} {one['share']:.2f}" for axis, one in axes)
     return (
         f"robust: {whole['robust_n']} held grasps hold in {whole['robust_share']:.2f} of {whole['robust_models']} "
-        f"models around the nominal one\nby difference: {each}"
+        f"perturbed models\nby perturbed parameter: {each}"
     )
 
 
@@ -222,7 +226,7 @@ def _foreign(whole: dict[str, Any], name: str) -> str:
     share = _cell(whole["foreign_share"], 2)
     return (
         f"{name}, fingertips within {whole['fingertips_mm']:.2f} mm: GSR {_cell(whole['foreign_gsr'], 2)}; "
-        f"of {held['both'] + held['nominal']} that hold nominally {held['both']} hold there ({share}); "
+        f"{held['both']} of {held['both'] + held['nominal']} grasps that hold nominally also hold here ({share}); "
         f"agreement {_cell(whole['agreement'], 2)}"
     )
 

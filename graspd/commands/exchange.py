@@ -36,7 +36,7 @@ IMPORTS: Final = (
 
 @app.command(epilog="graspd export grasps.h5 --format dexgraspbench -o bench")
 def export(
-    source: Annotated[Path, typer.Argument(help="Shard; for webdataset and training a folder of shards.")],
+    source: Annotated[Path, typer.Argument(help="Shard; for webdataset and training formats a folder of shards.")],
     format_: Annotated[str, typer.Option("--format", help=", ".join(EXPORTS) + ".")] = "images",
     hand: Annotated[str | None, typer.Option(help="Hand file; default: found by its digest.")] = None,
     object_: Annotated[str | None, typer.Option("--object", help="Object file; default: found by its digest.")] = None,
@@ -117,7 +117,7 @@ def import_(
     ] = None,
     robot: Annotated[str, typer.Option(help="multidex: name of the robot in the file.")] = "",
     name: Annotated[str, typer.Option(help="multidex, graspgen, huggingface, lerobot: name of the object.")] = "",
-    number: Annotated[int, typer.Option(help="ddgc, dexgraspnet2: object of the scene.")] = 0,
+    number: Annotated[int, typer.Option(help="ddgc, dexgraspnet2: number of the object in the scene.")] = 0,
     validation: Annotated[
         str, typer.Option(help="Level of validation: dexgraspbench, standard, fast or none.")
     ] = "standard",
@@ -170,9 +170,9 @@ def read_sets(format_: str, source: Path, hand: str | None, obj: str | None, opt
     if format_ == "reference":
         return published.read_reference(source, hand=hand, obj=obj)
     if hand is None or obj is None:
-        raise InputError(f"{format_} files do not hold the hand and the object; name both: --hand and --object")
+        raise InputError(f"{format_} files contain neither hand nor object; give --hand and --object")
     if format_ == "multidex" and not (options["robot"] and options["object_name"]):
-        raise InputError("a multidex file holds many robots and objects; name one of each: --robot and --name")
+        raise InputError("a multidex file contains many robots and objects; select one of each by --robot and --name")
     # Reader of each format, and its own options.
     readers: dict[str, tuple[Callable[..., list[Any]], tuple[str, ...]]] = {
         "dexgraspbench": (dexgraspbench.read, ()),

@@ -103,7 +103,7 @@ def _draw(hand: HandModel, picture: Path, *, collision: bool) -> None:
 
 
 def _write(file: str, options: dict[str, Any], report: dict[str, Any], target: Path) -> None:
-    """Write an asset.json with the settings from files, options and guesses; it leaves nothing to guess."""
+    """Write an asset.json with all settings: from files, from options, and guessed ones."""
     _, files, stated = files_from_path(file)
     settings = parse_options(files, {**stated, **options})
     said = settings.model_dump(mode="json", exclude_unset=True)

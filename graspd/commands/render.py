@@ -189,7 +189,7 @@ def _named_rows(base: Shard, rows: list[int], chosen: NDArray[np.bool_], word: s
         if row >= len(chosen):
             raise InputError(f"{base.path} has the rows 0 to {len(chosen) - 1}: there is no row {row}")
         if not chosen[row]:
-            raise InputError(f"row {row} of {base.path} is none of its {word}; --all takes any")
+            raise InputError(f"row {row} of {base.path} is not among its {word}; --all permits every row")
     return np.array(rows, np.intp)
 
 
@@ -215,7 +215,7 @@ def _drawn_in(base: Shard, hand: str | None) -> DrawnHand | None:
 
 
 def _drawn(scene: Shard, base_file: Path | None, hand: str | None) -> DrawnHand | None:
-    """Return the best grasp by epsilon that each scene kept, for `--with-hand`."""
+    """Return the best clear grasp of each scene by epsilon, for `--with-hand`."""
     if base_file is None:
         return None
     base = read_shard(base_file, kind="base")
@@ -224,8 +224,8 @@ def _drawn(scene: Shard, base_file: Path | None, hand: str | None) -> DrawnHand 
     rows = best_kept(scene.arrays, base.arrays)
     source = np.asarray(scene["grasp/base_index"])[rows]
     if len(source) and source.max() >= len(base["grasp/joint_positions"]):
-        fix = "give the base shard they come from"
-        raise InputError(f"{base_file} has fewer grasps than the scenes were made of; {fix}")
+        fix = "give the base shard of these scenes"
+        raise InputError(f"{base_file} has fewer grasps than the scenes refer to; {fix}")
     joints = np.asarray(base["grasp/joint_positions"], float)[source]
     poses = np.asarray(scene["grasp/hand_pose"], float)[rows]
     return DrawnHand(model, rows, poses, joints, wrists_of(scene, rows))

@@ -40,10 +40,10 @@ def bench(
     batch: Annotated[list[int] | None, typer.Option(min=1, help="Grasps per call; repeatable.")] = None,
     join: Annotated[list[int] | None, typer.Option(min=1, help="Batches per launch; repeatable.")] = None,
     threads: Annotated[list[int] | None, typer.Option(min=1, help="CPU threads; repeatable.")] = None,
-    points: Annotated[
-        list[int] | None, typer.Option(min=16, help="Sweep the hand points of the fine phase too.")
+    points: Annotated[list[int] | None, typer.Option(min=16, help="Also measure these numbers of hand points.")] = None,
+    face_error: Annotated[
+        list[float] | None, typer.Option(min=0, help="Also measure these face error bounds [m].")
     ] = None,
-    face_error: Annotated[list[float] | None, typer.Option(min=0, help="Sweep the face error bound too [m].")] = None,
     device: Annotated[str, typer.Option(help="Device: cpu, cuda:0 or auto.")] = "auto",
     repeats: Annotated[int, typer.Option(min=1, help="Timed calls per run, of which the median is reported.")] = 3,
     out: Annotated[Path | None, typer.Option(help="Folder for bench.json, bench.md and bench.png.")] = None,
@@ -110,7 +110,7 @@ def stability(
     from graspd.studies.stability.report import markdown, write
 
     if unknown := [name for name in only or [] if name not in STUDIES]:
-        raise InputError(f"there is no study {unknown[0]!r}; choose of {one_of(unknown[0], STUDIES)}")
+        raise InputError(f"there is no study {unknown[0]!r}; choose one of {one_of(unknown[0], STUDIES)}")
     if source:
         found = _joined([_read_maps(path) for path in source])
         found = replace(found, maps=[one for one in found.maps if not only or one.name in only])
@@ -178,7 +178,9 @@ def chart(
     fidelities: Annotated[
         str, typer.Option(help="Fidelities of methods that have them, separated by commas.")
     ] = ",".join(OFFERED),
-    batch: Annotated[str, typer.Option(help="Grasps per call, separated by commas; each is run.")] = "32",
+    batch: Annotated[
+        str, typer.Option(help="Grasps per call; several values, separated by commas, are all measured.")
+    ] = "32",
     baseline_batch: Annotated[int, typer.Option(min=1, help="Grasps per call of methods with a budget of steps.")] = 8,
     repeats: Annotated[int, typer.Option(min=1, help="Timed calls per setting, hand and object.")] = 2,
     option: Annotated[
@@ -186,9 +188,10 @@ def chart(
         typer.Option(help="Option of a method as METHOD:NAME=VALUE, such as graspit:steps=40000; repeatable."),
     ] = None,
     quick: Annotated[bool, typer.Option("--quick", help="Small run: seconds instead of an hour.")] = False,
-    sweep: Annotated[bool, typer.Option("--sweep", help="Sweep the knobs of fast_graspd, one at a time.")] = False,
+    sweep: Annotated[bool, typer.Option("--sweep", help="Vary the settings of fast_graspd, one at a time.")] = False,
     knob: Annotated[
-        list[str] | None, typer.Option(help="With --sweep: only this knob, such as 'contact solver'; repeatable.")
+        list[str] | None,
+        typer.Option(help="With --sweep: vary only this setting, such as 'contact solver'; repeatable."),
     ] = None,
     threads: Annotated[int, typer.Option(min=0, help="CPU threads; 0: one per core.")] = 0,
     device: Annotated[str, typer.Option(help="Device: cpu, cuda:0 or auto.")] = "auto",
@@ -196,7 +199,9 @@ def chart(
     remark: Annotated[str, typer.Option(help="Note on the conditions, for the report.")] = "",
     scene: Annotated[
         str,
-        typer.Option(help="free; or table, bin, shelf or a file: grasps planned there and free grasps placed there."),
+        typer.Option(
+            help="free, table, bin, shelf or a file. In a scene, free grasps transferred to it are compared too."
+        ),
     ] = "free",
     work: Annotated[
         Path | None, typer.Option(help="With --scene: folder of results, in which a stopped run continues.")
@@ -231,7 +236,7 @@ def chart(
         batches, baseline_batch, repeats, models_around = [4], 2, 1, 2
     levels = _parts(fidelities)
     if unknown := [name for name in levels if name not in FIDELITIES]:
-        raise InputError(f"unknown fidelity {unknown[0]!r}; choose of {one_of(unknown[0], FIDELITIES)}")
+        raise InputError(f"unknown fidelity {unknown[0]!r}; choose one of {one_of(unknown[0], FIDELITIES)}")
     chosen = settings_of(
         _parts(methods),
         levels,
@@ -284,7 +289,7 @@ def _read_chart(path: Path) -> dict[str, Any]:
     if not isinstance(found, dict) or not {"created", "runs"} <= found.keys():
         raise InputError(f"{path} is no chart.json; `graspd chart --out FOLDER` writes one")
     if missing := [key for key in ("summary", "by_hand", "models") if key not in found]:
-        raise InputError(f"{path} has no {missing[0]}: an earlier graspd measured it, measure again")
+        raise InputError(f"{path} has no {missing[0]}, because an earlier graspd wrote it; measure again")
     return found
 
 
@@ -293,7 +298,7 @@ def _place(scene: str) -> SceneSpec | None:
         return None
     spec = parse_scene(scene)
     if spec.neighbours:
-        raise InputError(f"{scene} has neighbours; the chart compares methods among supports alone: leave them out")
+        raise InputError(f"{scene} has neighbours, which a chart does not support; remove them")
     # The object is dropped onto each of its stable faces.
     return spec if spec.target is not None else parse_scene(scene, faces="all")
 

@@ -111,12 +111,13 @@ def _said_of_models(found: dict[str, Any]) -> str:
     share, not_robust = found["robust_share"], found["not_robust"]
     if share is None:
         return (
-            f"none is robust; {not_robust} hold in the nominal model, but in too few of {found['robust_models']} others"
+            f"no grasp is robust; {not_robust} hold in the nominal model, but in too few of "
+            f"{found['robust_models']} perturbed models"
         )
-    models = f"of {found['robust_models']} models around the nominal one"
+    models = f"of {found['robust_models']} perturbed models"
     if not (wanted := found["robust_wanted"]) or found["want"] != "valid":
-        return f"they hold in {share:.0%} {models}"
-    return f"each holds in {wanted:.0%} {models} or more; {not_robust} held grasps are not robust"
+        return f"the valid grasps hold in {share:.0%} {models}"
+    return f"each grasp holds in at least {wanted:.0%} {models}; {not_robust} held grasps are not robust"
 
 
 def _said(found: dict[str, Any]) -> str:

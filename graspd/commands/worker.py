@@ -29,7 +29,7 @@ def worker(
     ] = 1,
     threads: Annotated[int | None, typer.Option(min=0, help="CPU threads; 0: one per core; GRASPD_THREADS.")] = None,
     join: Annotated[
-        str | None, typer.Option(help="Batches of one pair per launch of the planner, or auto; GRASPD_JOIN.")
+        str | None, typer.Option(help="Batches of a task per launch of the planner, or auto; GRASPD_JOIN.")
     ] = None,
     processes: Annotated[
         int | None,

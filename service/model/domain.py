@@ -127,11 +127,11 @@ class JobOptions(Model):
     touch: Annotated[
         Touch,
         Option(),
-        Form("scenes", "Fingertip clearance", "to supports; 0: contact allowed, 2: as the hand", cells=True),
+        Form("scenes", "Fingertip clearance", "to supports; 0: contact allowed, 2: as for the hand", cells=True),
     ] = _sparse(
         TOUCH,
-        description="clearance of fingertips to the supports of their scene [mm]. 2: as the rest of the hand; 0: "
-        "contact allowed; negative: they may press into the support, for flat objects",
+        description="clearance of fingertips to the supports of their scene [mm]. 2: as for the rest of the hand; 0: "
+        "contact allowed; negative: fingertips may press into the support, for flat objects",
     )
     scenes: Annotated[
         int, Option("basic"), Form("scenes", "Scenes", "per batch; 0: none, or 4 unless the scene is free")
@@ -140,7 +140,7 @@ class JobOptions(Model):
         0, ge=0, le=256, description="camera placements per scene"
     )
     stereo: Annotated[bool, Option(places=JOB), Form("scenes", "Cameras", "Stereo: left and right eye")] = Field(
-        False, description="left and right picture per placement instead of one"
+        False, description="render a left and a right picture per placement"
     )
     width: Annotated[int, Option(places=JOB), Form("scenes", "Width")] = Field(
         320, ge=16, le=4096, description="picture width [px]"
@@ -171,7 +171,7 @@ class JobOptions(Model):
         Literal["valid", "candidates"], Option("basic"), Form("grasps", "Counted grasps", choices=_WANTS_IN_WORDS)
     ] = Field(
         "valid",
-        description="kind of grasps that count. valid: valid ones (feasible ones without validation); candidates: all",
+        description="kind of grasps that count. valid: only valid (without validation feasible) ones; candidates: all",
     )
     budget: Annotated[float, Option()] = Field(
         4.0, ge=1, le=100, description="maximum number of candidates per requested valid grasp"
@@ -193,15 +193,14 @@ class JobOptions(Model):
     ] = Field(
         "standard",
         description="level of validation in MuJoCo. fast: MuJoCo Warp on a GPU decides clear cases; none: "
-        "grasps are feasible at best",
+        "no grasp counts as valid",
     )
     rechecks: Annotated[int, Option(places=JOB)] = Field(
         RECHECKS,
         ge=0,
         le=10_000,
-        description=f"valid grasps validated again at level dexgraspbench. The default, {RECHECKS}, is spread "
-        "over the job, one per 64 grasps, at a twentieth of its time; other numbers take the "
-        "first ones",
+        description="number of valid grasps validated again at level dexgraspbench. The default checks one grasp in "
+        f"64, at most {RECHECKS}, in a twentieth of the job's time; other numbers check the first valid grasps",
     )
     robustness: Annotated[int, Option(places=JOB)] = Field(
         0, ge=0, le=20, description="number of verdicts under noise for each valid grasp"
@@ -218,7 +217,7 @@ class JobOptions(Model):
         le=1,
         allow_inf_nan=False,
         description="share of perturbed models in which a grasp must hold to count; 0: no requirement. With want "
-        "candidates, all are stored regardless of their share",
+        "candidates, all grasps are stored",
     )
     robust_models: Annotated[int, Option()] = _sparse(
         0,
@@ -261,8 +260,8 @@ class JobOptions(Model):
         "",
         max_length=40,
         description="required accuracy for fidelity `auto`, such as gsr>=0.6, dexgraspbench>=0.9 or pd_mm<=1; in a "
-        "scene lift>=0.9, lift_hard or robust. Submission selects the cheapest fidelity that meets it "
-        "in the stored chart of such grasps",
+        "scene lift>=0.9, lift_hard or robust. The job uses the cheapest fidelity that meets the target in "
+        "the published chart of free grasps or of the scene",
     )
 
     @field_validator("fidelity")
@@ -301,7 +300,7 @@ class JobOptions(Model):
             )
         self._check_scene()
         if self.views and not self.scenes:
-            raise ValueError("views need scenes: ask for scenes >= 1")
+            raise ValueError("views need scenes: set scenes >= 1")
         if self.validation == "none":
             self._check_without_validation()
         return self
@@ -309,7 +308,7 @@ class JobOptions(Model):
     def _check_scene(self) -> None:
         if self.place.kind != "free":
             if self.method in FREE_ONLY_METHODS:
-                raise ValueError(f"method {self.method} plans around free objects only: with a scene take fast_graspd")
+                raise ValueError(f"method {self.method} plans around free objects only: in a scene use fast_graspd")
             if self.robustness:
                 raise ValueError("robustness repeats the six pushes of free grasps: it goes with scene free")
         if not self.SUBMITTED:

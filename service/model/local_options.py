@@ -39,12 +39,12 @@ class LocalOptions(MeshOptions, JobOptions):
     )
     touch: Annotated[Touch | None, Option(places=_LOCAL)] = Field(  # type: ignore[assignment]
         None,
-        description="clearance of fingertips to supports [mm]; default: that of the scene file, else 0. 2: as the "
-        "rest of the hand; 0: contact allowed; negative: they may press into the support",
+        description="clearance of fingertips to supports [mm]; default: that of the scene file, else 0. 2: as for "
+        "the rest of the hand; 0: contact allowed; negative: fingertips may press into the support",
     )
     payload: Annotated[bool, Option("advanced", _LOCAL, "--payload/--no-payload")] = Field(
         False,
-        description="measure the heaviest mass that each valid grasp lifts; default of graspd synth in scenes "
+        description="measure the heaviest mass that each valid grasp lifts; graspd synth does so by default in scenes "
         "with a given mass",
     )
     # A value may be a file path; a job has the file's digest instead.

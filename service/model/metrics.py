@@ -184,7 +184,7 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
     GraspMetric(
         "shake_margin",
         "1",
-        "largest ratio of displacement or rotation in the hand to its limit, shaken after the lift; "
+        "largest ratio of displacement or rotation in the hand to its limit while shaken after the lift; "
         "below 1: held; nan: not shaken",
         title="Motion when shaken",
         short="Shaken",
@@ -238,7 +238,7 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
     GraspMetric(
         "stability_loss",
         "1",
-        "stability loss L_stable of the planner; nan: it has none",
+        "stability loss L_stable of the planner; nan: the planner has none",
         title="Stability loss",
         indexed=IndexLevel.SORTED,
         bounds=(-math.inf, math.inf),

@@ -23,19 +23,39 @@ class Series:
 
 _ALL: Final = (
     Series("graspd_queue_depth", "gauge", ("priority", "stage"), "waiting tasks", "queue"),
-    Series("graspd_queue_oldest_task_seconds", "gauge", ("priority", "stage"), "age of the oldest one", "queue"),
+    Series(
+        "graspd_queue_oldest_task_seconds", "gauge", ("priority", "stage"), "age of the oldest waiting task", "queue"
+    ),
     Series("graspd_tasks_running", "gauge", ("priority", "stage"), "tasks that workers are running", "queue"),
     Series(
         "graspd_workers", "gauge", ("state",), "workers by state: checking, idle, busy, stopping, quarantined", "queue"
     ),
-    Series("graspd_worker_lease_age_seconds", "gauge", ("worker", "device"), "time since its last heartbeat", "queue"),
+    Series(
+        "graspd_worker_lease_age_seconds",
+        "gauge",
+        ("worker", "device"),
+        "time since the worker's last heartbeat",
+        "queue",
+    ),
     Series("graspd_controller_up", "gauge", (), "1: a controller sent a heartbeat recently", "queue"),
     Series("graspd_jobs_unfinished", "gauge", ("state",), "queued and running jobs, counted up to 10,000", "index"),
     Series("graspd_job_oldest_seconds", "gauge", ("state",), "age of the oldest queued and running job", "index"),
-    Series("graspd_grasps_per_second", "gauge", ("verdict",), "grasps stored in the last minute: all, valid", "index"),
+    Series(
+        "graspd_grasps_per_second",
+        "gauge",
+        ("verdict",),
+        "grasps stored per second, mean of the last minute: all, valid",
+        "index",
+    ),
     Series("graspd_store_damaged", "gauge", (), "objects of the store known to be damaged or missing", "index"),
     Series("graspd_part_up", "gauge", ("part",), "1: the part (redis, index or store) responds", "probe"),
-    Series("graspd_part_latency_seconds", "gauge", ("part",), "duration of a ping, a read or a small write", "probe"),
+    Series(
+        "graspd_part_latency_seconds",
+        "gauge",
+        ("part",),
+        "response time of the part: a ping, a read or a small write",
+        "probe",
+    ),
     Series(
         "graspd_grasps_total",
         "counter",
@@ -49,7 +69,13 @@ _ALL: Final = (
     Series(
         "graspd_task_failures_total", "counter", ("stage", "kind"), "failed attempts by name of the error", "controller"
     ),
-    Series("graspd_task_handbacks_total", "counter", ("stage", "kind"), "deferred, returned, cancelled", "controller"),
+    Series(
+        "graspd_task_handbacks_total",
+        "counter",
+        ("stage", "kind"),
+        "unfinished tasks that workers gave back: deferred, returned, cancelled",
+        "controller",
+    ),
     Series(
         "graspd_jobs_ended_total", "counter", ("state",), "jobs that succeeded, failed or were cancelled", "controller"
     ),

@@ -57,7 +57,7 @@ def _code(description: str, shape: str = "N") -> Column:
 
 def _wrist(rows: str) -> Column:
     description = (
-        "wrist angles above the hand's root that keep the links above it free of collision, order in attribute"
+        "angles of wrist joints above the hand's root at which all links above the root are clear, order in attribute"
     )
     return _absent(f"{rows} U", "f8", "rad", "joint", f"{description} wrist_joint_names")
 
@@ -236,11 +236,11 @@ _BASE: Final = ("base",)
 ATTRIBUTES: Final[dict[str, RootAttribute]] = {
     "schema": RootAttribute("text", "`graspd/base@2`, `graspd/scene@1` or `graspd/views@1`"),
     "hand": RootAttribute("text", "name of the hand"),
-    "hand_digest": RootAttribute("text", "digest of its files"),
-    "hand_source": RootAttribute("text", "path from which a local command read it; absent: built in"),
+    "hand_digest": RootAttribute("text", "digest of the hand's files"),
+    "hand_source": RootAttribute("text", "path from which a local command read the hand; absent: built in"),
     "object": RootAttribute("text", "name of the object"),
-    "object_digest": RootAttribute("text", "digest of its files"),
-    "object_source": RootAttribute("text", "path from which a local command read it; absent: built in"),
+    "object_digest": RootAttribute("text", "digest of the object's files"),
+    "object_source": RootAttribute("text", "path from which a local command read the object; absent: built in"),
     "object_options": RootAttribute("text", "options for reading the mesh, as JSON"),
     "object_mass_kg": RootAttribute("number", "mass of the object in simulation [kg]", _BASE),
     "object_friction": RootAttribute("number", "Coulomb coefficient of the object's contacts in simulation", _BASE),
@@ -248,14 +248,14 @@ ATTRIBUTES: Final[dict[str, RootAttribute]] = {
     "method": RootAttribute("text", "planner"),
     "fidelity": RootAttribute("text", "settings of the fidelity, as JSON"),
     "seed": RootAttribute("integer", "seed; with batch and digests it determines the result"),
-    "batch": RootAttribute("integer", "number of the batch in its job; of several, the first"),
+    "batch": RootAttribute("integer", "number of the first batch of the shard in its job"),
     "batch_rows": RootAttribute("text", "JSON: rows of each batch, in order; absent: one batch", _BASE),
-    "device": RootAttribute("text", "device that made it"),
+    "device": RootAttribute("text", "device of the computation"),
     "seconds": RootAttribute("number", "computing time [s]"),
     "created": RootAttribute("text", "time of creation, RFC 3339"),
-    "code_version": RootAttribute("text", "version of graspd that made it"),
+    "code_version": RootAttribute("text", "version of graspd that made the shard"),
     "shard_id": RootAttribute("text", "name of the shard in the store"),
-    "inputs": RootAttribute("texts", "names of the shards from which it was made"),
+    "inputs": RootAttribute("texts", "names of the shards from which this one was made"),
     "joint_names": RootAttribute("texts", "order of the hand's joints", _BASE),
     "wrist_joint_names": RootAttribute(
         "texts",
@@ -269,7 +269,7 @@ ATTRIBUTES: Final[dict[str, RootAttribute]] = {
     ),
     "candidates": RootAttribute("integer", "candidates planned until the last stored grasp", _BASE),
     "outcomes": RootAttribute("text", "JSON: rejected candidates by outcome", _BASE),
-    "reason": RootAttribute("text", "why a command found fewer grasps than requested; absent: it found all", _BASE),
+    "reason": RootAttribute("text", "why a command found fewer grasps than requested; absent: none are missing", _BASE),
     "grasps_wanted": RootAttribute("integer", "number of grasps requested, if the command was interrupted", _BASE),
     "robust": RootAttribute(
         "text",
@@ -278,9 +278,7 @@ ATTRIBUTES: Final[dict[str, RootAttribute]] = {
     ),
     "verdict_level": RootAttribute("text", "level of validation; `none`: not validated", _BASE),
     "verdict_key": RootAttribute(
-        "text",
-        "digest of everything that decides the verdicts; verdicts of different keys must not be mixed in one number",
-        _BASE,
+        "text", "digest of everything that decides the verdicts; do not average verdicts with different keys", _BASE
     ),
     "scene": RootAttribute(
         "text", "scene of the grasps, as JSON; absent: planned around a free object", ("base", "scene", "views")

@@ -129,7 +129,7 @@ def test_a_row_that_is_no_valid_grasp_is_drawn_only_with_all(base):
     arrays = dict(shard.arrays) | {"quality/valid": np.array([1, 0, 1], np.uint8)}
     failed.write_bytes(write_shard("base", arrays, shard.attributes))
     words = ("pictures --row 1 --size 32 --device cpu -o", base.with_name("row.png"), failed)
-    assert "--all takes any" in refused(*words)
+    assert "--all permits every row" in refused(*words)
     assert graspd(*words, "--all")["rows"] == [1]
 
 

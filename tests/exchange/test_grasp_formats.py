@@ -213,7 +213,7 @@ def test_grasps_of_a_training_format_come_back_with_scenes_and_verdicts(
     [
         ("foo", "h", "no import format"),
         ("multidex", "h", "--robot and --name"),
-        ("ddgc", None, "name both: --hand and --object"),
+        ("ddgc", None, "give --hand and --object"),
     ],
 )
 def test_what_no_import_can_read_is_told(name: str, hand: str | None, says: str, tmp_path: Path) -> None:

@@ -47,9 +47,9 @@ def test_grasps_in_scenes_are_robust_if_other_models_lift_them(tmp_path: Path) -
     assert copy.attributes["shard_id"] == grasps.attributes["shard_id"]
     for path in ("grasp/hand_pose", "quality/success"):
         assert np.array_equal(copy.column(path), grasps.column(path))
-    for wrong, words in (([], "its own protocol"), (["--protocol", "lift", "--hard"], "no --hard")):
+    for wrong, words in (([], "needs --protocol lift"), (["--protocol", "lift", "--hard"], "no --hard")):
         refused = CliRunner().invoke(evaluate, [str(file), "--robust", "2", *wrong, "-o", str(tmp_path / "no.h5")])
         assert refused.exit_code == 2 and words in refused.output + refused.stderr
     refused = CliRunner().invoke(evaluate, [str(tmp_path / "made"), *lift, "-o", str(copies)])
-    assert refused.exit_code == 2 and "is there already" in refused.output + refused.stderr
+    assert refused.exit_code == 2 and "already exists" in refused.output + refused.stderr
     assert not (tmp_path / "no.h5").exists()
